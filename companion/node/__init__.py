@@ -1,1 +1,1 @@
-"""The running node: live service, replay, demo, and what keeps them going.               [shell]"""
+"""The running node: live service, replay, demo, and their surroundings."""

@@ -1,8 +1,8 @@
-"""How many UAVs this machine carries, measured with a sky of its own.                    [shell]
+"""Number of UAVs that this machine can serve, measured with simulated traffic.
 
-UAVs that fly straight report to a pipeline in this process, few of them and then more. What reports
-and updates take of a processor grows with their number; the number is told at which they take
-``SHARE`` of it. The rest is for recording, answers and what else the machine does.
+UAVs on straight courses report to a pipeline in this process, first a few, then more. The processor
+time of reports and updates grows with their number; the result is the number at which it reaches
+``SHARE``. The rest is left for recording, HTTP and other programs.
 """
 
 import time
@@ -16,13 +16,13 @@ from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
 from companion.values import Event, Frame, Source, Tick
 
-SHARE: Final = 0.5  # share of one processor that reports and updates may take
-RATE_HZ: Final = 10  # reports a second of each UAV
+SHARE: Final = 0.5  # fraction of one processor that reports and updates may take
+RATE_HZ: Final = 10  # reports per second of each UAV
 FEW: Final = 4
-MORE: Final = 16  # UAVs that are flown to tell how the time grows with them
-MOST: Final = 250  # UAVs beyond which nothing is told: they are too many more than were flown
+MORE: Final = 16  # simulated UAVs in the second run
+MOST: Final = 250  # largest result: more would be extrapolated too far
 SETTLED_S: Final = 2
-MEASURED_S: Final = 3  # flight before it is measured, and while it is
+MEASURED_S: Final = 3  # duration of the flight before and during the measurement
 HOME: Final = (47.0, 8.0, 500.0)
 _S: Final = 1_000_000_000
 _BEGIN_NS: Final = 1_700_000_000 * _S
@@ -30,7 +30,7 @@ _BEGIN_NS: Final = 1_700_000_000 * _S
 
 @dataclass(frozen=True, slots=True)
 class Capacity:
-    """What was measured."""
+    """Result of the measurement."""
 
     uavs: int | None  # UAVs that take SHARE of a processor; None: more than MOST
     report_s: float  # time that a report takes
@@ -40,9 +40,10 @@ class Capacity:
 def measure(
     settings: Settings, clock_s: Callable[[], float] = time.process_time, processor: float = 1.0
 ) -> Capacity:
-    """Fly ``FEW`` and then ``MORE`` UAVs about an array of these settings; takes a second or so.
+    """Simulate ``FEW`` and then ``MORE`` UAVs around an array of these settings; takes about a
+    second.
 
-    ``processor`` is the share of one that this process is allowed at all.
+    ``processor`` is the fraction of one processor that this process may use.
     """
     update_hz = settings.beams.update_hz
     few, more = (_flown(settings, number, clock_s) for number in (FEW, MORE))
@@ -61,7 +62,7 @@ class _Took:
 
 
 def _flown(settings: Settings, number: int, clock_s: Callable[[], float]) -> _Took:
-    """Mean times of a report and of an update with so many UAVs in the sky."""
+    """Return the mean times of a report and of an update with this number of UAVs."""
     center = {"source": ",".join(map(str, HOME))}
     pipeline = Pipeline(settings.override(center=center, beams={"targets": "all"}))
     took_s, counts = {Frame: 0.0, Tick: 0.0}, {Frame: 0, Tick: 0}
@@ -75,7 +76,7 @@ def _flown(settings: Settings, number: int, clock_s: Callable[[], float]) -> _To
 
 
 def _sky(number: int, update_hz: float) -> Iterator[Event]:
-    """Reports and ticks in the order of time; the UAVs fly outwards, each its own way."""
+    """Yield reports and ticks in order of time; the UAVs fly outwards on different courses."""
     frame = LocalFrame(*HOME)
     update_ns, due_ns = round(_S / update_hz), _BEGIN_NS
     for step in range((SETTLED_S + MEASURED_S) * RATE_HZ):

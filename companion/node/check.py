@@ -1,8 +1,7 @@
-"""Whether this machine and this site are ready, and what would hold beams back.          [shell]
+"""Check of this machine and site for ``companion check``.
 
-What settings ask of the machine is looked at first (``companion.node.machine``); then the service
-itself listens for a while, records nothing, and its own words are judged. The first thing to ask
-for where something does not work.
+First the requirements of the settings are checked on this machine (``companion.node.machine``);
+then the service listens for a while without recording, and its state is assessed.
 """
 
 import time
@@ -24,9 +23,9 @@ from companion.settings.outlets import DriveSettings, RecordSettings
 from companion.values import Level, UserError, Verdict, kind_of
 from companion.views import uav_state
 
-TIMED_UPDATES: Final = 5  # times that beams are computed to tell how long that takes
+TIMED_UPDATES: Final = 5  # number of timed computations of beams
 BUSY: Final = 0.3
-"""Share of the time between updates that beams may take before that is worth a thought."""
+"""Fraction of the update interval that beams may take before it is reported."""
 NOISY: Final = 0.01  # share of frames with a wrong checksum from which on a link is noisy
 FORMATS: Final = {
     "sbs": "BaseStation lines (30003)",
@@ -34,8 +33,8 @@ FORMATS: Final = {
     "rid": "Remote ID in JSON",
     "cot": "Cursor on Target",
 }
-"""What receivers of other kinds than MAVLink say, by the scheme of their links."""
-NAMED_MAX: Final = 8  # most vehicles that a line names
+"""Formats of receivers other than MAVLink, by the scheme of their links."""
+NAMED_MAX: Final = 8  # largest number of vehicles named in a line
 
 
 def check(
@@ -46,21 +45,24 @@ def check(
     insecure: bool = False,
     show: Callable[[str], None] = lambda _: None,
 ) -> Iterator[Finding]:
-    """Findings, the static ones first; then listens for ``seconds`` over the links that stand.
+    """Yield findings, static ones first; then listen for ``seconds`` over the usable links.
 
-    ``show`` is told what goes on meanwhile. Sends what ``[presence]`` allows, as a run would.
+    ``show`` is called with the current activity. Sends what ``[presence]`` allows, like a run.
     """
     faulty = set[str]()
     for finding in machine.look(settings, token=token, insecure=insecure):
         if finding.grade is Grade.FAULT:
             faulty.add(finding.subject.removeprefix("link "))
         yield finding
-    show("measuring what this machine carries")
+    show("measuring the capacity of this machine")
     yield _capacity(settings)
     urls = [url for url in settings.links.urls if url not in faulty]
     if not settings.links.urls:
         yield Finding(
-            subject="links", grade=Grade.FAULT, text="none", remedy="say --link udpin:0.0.0.0:14550"
+            subject="links",
+            grade=Grade.FAULT,
+            text="none",
+            remedy="give --link udpin:0.0.0.0:14550, or set `[links] urls`",
         )
     if urls and seconds > 0:
         show(f"listening for {seconds:g} s")
@@ -77,25 +79,25 @@ def _capacity(settings: Settings) -> Finding:
             subject="settings",
             grade=Grade.FAULT,
             text=str(error),
-            remedy="correct the settings, or the file that they name",
+            remedy="correct this setting, or the file that it names",
         )
-    most = f"more than {capacity.MOST}" if found.uavs is None else f"some {found.uavs}"
+    most = f"more than {capacity.MOST}" if found.uavs is None else f"about {found.uavs}"
     text = (
-        f"carries {most} UAVs at {capacity.RATE_HZ} reports a second each"
+        f"{most} UAVs at {capacity.RATE_HZ} reports a second each"
         f" (a report takes {found.report_s * 1e3:.2f} ms,"
         f" an update of {capacity.MORE} beams {found.update_s * 1e3:.1f} ms)"
     )
     if share < 1:
-        text += f"; this process is allowed {share * 100:.0f} % of a processor"
+        text += f"; this process may use {share * 100:.0f} % of a processor"
     if found.uavs is not None and found.uavs < capacity.FEW:
         return Finding(
-            subject="capacity", grade=Grade.DOUBT, text=text, remedy="lower [beams] update_hz"
+            subject="capacity", grade=Grade.DOUBT, text=text, remedy="lower `[beams] update_hz`"
         )
     return Finding(subject="capacity", grade=Grade.OK, text=text)
 
 
 def _to_listen(settings: Settings, urls: list[str]) -> Settings:
-    """The settings of a run that keeps nothing, over those links."""
+    """Return the settings of a run over these links that records and sends nothing else."""
     source = settings.center.source or "home"
     kept = settings.override(links={"urls": urls}, center={"source": source})
     keys = {url: key for url, key in kept.signing.keys.items() if url in urls}
@@ -112,7 +114,7 @@ def _to_listen(settings: Settings, urls: list[str]) -> Settings:
 
 
 def _listen(settings: Settings, seconds: float) -> Service:
-    """A service that ran so long, with nobody to see it but this process."""
+    """Run a service for this time, reachable only from this process."""
     with bind("127.0.0.1:0", token=None, insecure=False) as http:
         service = Service(settings=settings, say=lambda _: None)
         run_until_stopped(lambda until: service.run(http, None, until), seconds)
@@ -126,26 +128,26 @@ def _reception(service: Service, settings: Settings) -> Iterator[Finding]:
     names = [track.uav for track in update.tracks] if update else []
     own = [uav for uav in names if kind_of(uav).reports_itself]
     if settings.center.source is None:
-        heard = f"; heard: {', '.join(own[:NAMED_MAX])}" if own else ""
-        remedy = f"say --center SYSID:COMPID or LAT,LON,ALT{heard}"
+        heard = f"; received: {', '.join(own[:NAMED_MAX])}" if own else ""
+        remedy = f"give --center SYSID:COMPID or LAT,LON,ALT{heard}"
         yield Finding(
             subject="carrier",
             grade=Grade.FAULT,
-            text="nobody said what carries the array",
+            text="the carrier of the array is not set",
             remedy=remedy,
         )
         return
     subject = f"carrier {settings.center.source}"
     if update is None or update.unfit is not None:
-        unfit = "no beam update was made" if update is None else str(update.unfit)
+        unfit = "no beam update yet" if update is None else str(update.unfit)
         remedy = (
-            f"is it one of {', '.join(own[:NAMED_MAX])}?"
+            f"check its id; received: {', '.join(own[:NAMED_MAX])}"
             if own
-            else "no vehicle is received: check the links"
+            else "check the links: no vehicle is received"
         )
         yield Finding(subject=subject, grade=Grade.FAULT, text=unfit, remedy=remedy)
     else:
-        yield Finding(subject=subject, grade=Grade.OK, text="its place and attitude are known")
+        yield Finding(subject=subject, grade=Grade.OK, text="its position and attitude are known")
     yield from _uavs(service)
     yield from _speed(service, settings.beams.update_hz)
 
@@ -154,79 +156,77 @@ def _links(service: Service) -> Iterator[Finding]:
     for link in service.links():
         subject, heard = f"link {link.url}", sorted(map(str, link.components))
         bad = link.bad_crc
-        said = f"{link.frames} frames of {', '.join(heard[:NAMED_MAX]) or 'nobody'}"
+        said = f"{link.frames} frames from {', '.join(heard[:NAMED_MAX]) or 'no component'}"
         scheme = link.url.partition(":")[0]
         if scheme not in MAVLINK and link.frames == 0 and link.bytes > 0:
             yield _not_understood(subject, scheme, link)
         elif link.frames == 0 and link.bytes > 0:
-            remedy = "another baud rate? signed with another key? not MAVLink at all?"
+            remedy = "check the baud rate, the signing key, and that the sender speaks MAVLink"
             yield Finding(
                 subject=subject,
                 grade=Grade.FAULT,
-                text=f"{link.bytes} bytes, and no MAVLink in them",
+                text=f"{link.bytes} bytes without a valid MAVLink frame",
                 remedy=remedy,
             )
         elif link.frames == 0:
             yield Finding(
-                subject=subject, grade=Grade.FAULT, text="heard nothing", remedy=_silent(link.url)
+                subject=subject,
+                grade=Grade.FAULT,
+                text="nothing received",
+                remedy=_silent(link.url),
             )
         elif bad > NOISY * link.frames:
             yield Finding(
                 subject=subject,
                 grade=Grade.DOUBT,
                 text=f"{said}; {bad} with a wrong checksum",
-                remedy="is the line noisy?",
+                remedy="check the line for noise",
             )
         else:
             yield Finding(subject=subject, grade=Grade.OK, text=said)
 
 
 def _not_understood(subject: str, scheme: str, link: LinkStatus) -> Finding:
-    """A receiver of another kind that sent bytes, and no position of anybody."""
+    """Return the finding for a receiver that sent bytes, but no position."""
     refused = ", ".join(f"{count} {reason}" for reason, count in link.lost.items())
     if not refused:
         return Finding(
-            subject=subject,
-            grade=Grade.DOUBT,
-            text=f"{link.bytes} bytes, and no aircraft in them yet",
+            subject=subject, grade=Grade.DOUBT, text=f"{link.bytes} bytes, no aircraft yet"
         )
-    said = f"{link.bytes} bytes, and nothing of use in them ({refused})"
+    said = f"{link.bytes} bytes without usable data ({refused})"
     return Finding(
         subject=subject,
         grade=Grade.FAULT,
         text=said,
-        remedy=f"is this the port that says {FORMATS[scheme]}?",
+        remedy=f"check that this port sends {FORMATS[scheme]}",
     )
 
 
 def _silent(url: str) -> str:
     if url.startswith(("rid:udp", "cot:udp")):
-        return f"does anybody send {FORMATS[url.partition(':')[0]]} here?"
+        return f"send {FORMATS[url.partition(':')[0]]} to this address"
     if url.startswith(("udpin", "tcpin")):
         port = url.rpartition(":")[2]
-        return f"does anybody send here? MAVProxy: --out udp:THIS_MACHINE:{port}"
+        return f"send MAVLink to this machine and port; MAVProxy: --out udp:THIS_MACHINE:{port}"
     if url.startswith("zenoh"):
-        return f"does anybody say {url.partition(':')[2].partition('?')[0]}/out there?"
+        return f"check that a node publishes {url.partition(':')[2].partition('?')[0]}/out"
     if url.startswith("serial"):
-        return "is MAVLink on that port of the autopilot (SERIALn_PROTOCOL = 2), at this baud rate?"
-    return "does anybody answer there?"
+        return "enable MAVLink on the autopilot's port (SERIALn_PROTOCOL = 2) at this baud rate"
+    return "check the address, and that a program serves it"
 
 
 def _uavs(service: Service) -> Iterator[Finding]:
     verdicts = service.pipeline.health.verdicts
     shown = [one for one in uav_state.states(service, service.now_ns()) if one.target]
     if not shown:
-        remedy = "wait for a position fix; see what /v1/uavs refuses"
+        remedy = "wait for a position fix; see `rejected` in /v1/status"
         yield Finding(
-            subject="UAVs",
-            grade=Grade.FAULT,
-            text="no UAV that gets a beam was received",
-            remedy=remedy,
+            subject="UAVs", grade=Grade.FAULT, text="no UAV with a beam was received", remedy=remedy
         )
     for one in shown:
         track = one.track
         name, dt_s = track.uav, track.dt_s
-        pace = "one report" if dt_s is None else f"reports each {dt_s:.2f} s"
+        pace = "one report" if dt_s is None else f"a report every {dt_s:.2f} s"
         text = f"{track.state}, {pace}, bound {track.bound_m:.1f} m"
         yield _judged(name, text, verdicts.get(name))
 
@@ -234,7 +234,7 @@ def _uavs(service: Service) -> Iterator[Finding]:
 def _judged(name: str, text: str, verdict: Verdict | None) -> Finding:
     found = Finding(subject=f"UAV {name}", grade=Grade.OK, text=text)
     if verdict is None:
-        return replace(found, grade=Grade.DOUBT, text=f"not judged: {text}")
+        return replace(found, grade=Grade.DOUBT, text=f"not assessed: {text}")
     text = f"{verdict.level}: {text}"
     if verdict.level is Level.GOOD or verdict.blame is None:
         return replace(found, text=text)
@@ -247,10 +247,10 @@ def _speed(service: Service, update_hz: float) -> Iterator[Finding]:
         TIMED_UPDATES // 2
     ]
     share = took_s * update_hz
-    text = f"beams take {took_s * 1e3:.1f} ms, {share:.0%} of the time between updates"
+    text = f"beams take {took_s * 1e3:.1f} ms, {share:.0%} of the update interval"
     if share > BUSY:
         yield Finding(
-            subject="this machine", grade=Grade.DOUBT, text=text, remedy="lower [beams] update_hz"
+            subject="this machine", grade=Grade.DOUBT, text=text, remedy="lower `[beams] update_hz`"
         )
     else:
         yield Finding(subject="this machine", grade=Grade.OK, text=text)

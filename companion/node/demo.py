@@ -1,4 +1,4 @@
-"""The demo: the paper's scenario over loopback UDP into the service.                     [shell]"""
+"""The demo: the paper's scenario over loopback UDP into the service."""
 
 import asyncio
 from typing import Final
@@ -11,10 +11,10 @@ LINK: Final = "udpin:127.0.0.1:0"  # link of the demo; the system chooses the po
 
 
 def settings(directory: str) -> Settings:
-    """The service's settings for the paper's scenario.
+    """Return the service's settings for the paper's scenario.
 
-    Speeds are up to 125 m/s, with gusts of a fifth added. The acceleration is that of circling and
-    of the gusts: R w^2 + 0.2 R w 10 w at R = 250 m and w = 0.5 rad/s (docs/math.md 8.2).
+    Speeds are up to 125 m/s plus gusts of a fifth. The acceleration is that of circling and of the
+    gusts: R w^2 + 0.2 R w 10 w at R = 250 m and w = 0.5 rad/s (docs/math.md 8.2).
     """
     return Settings().override(
         center={"source": "5:1"},
@@ -31,7 +31,7 @@ def settings(directory: str) -> Settings:
 
 
 async def traffic(link_url: str) -> None:
-    """Fly the scenario to where the service listens, until cancelled."""
+    """Fly the scenario and send it to the service's link, until cancelled."""
     target = link_url.replace("udpin:", "udpout:", 1)
     await player.fly(scenario.paper(), [target])
     await asyncio.get_running_loop().create_future()

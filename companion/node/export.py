@@ -1,4 +1,4 @@
-"""An export: logs through the same fold as a replay, and all of it into tables.         [shell]"""
+"""Export: logs through the same fold as a replay, written as tables."""
 
 import time
 from collections.abc import Callable, Sequence
@@ -29,15 +29,14 @@ def export(
     progress: Callable[[int, float, float], None],
     latency_s: float = 0.0,
 ) -> dict[str, Any]:
-    """Write the tables of some logs to a folder; returns the summary of a replay, and the files.
+    """Write the tables of some logs to a folder; return the summary of a replay, and the files.
 
         logs       as for ``replay``, and so are ``settings``, ``progress`` and ``latency_s``
-        where      the folder; made if missing
+        where      the folder; created if missing
         form       a key of ``companion.recording.tables.folder.FORMATS``
 
-    What was there under the names of the tables is replaced when all is written, and left alone
-    otherwise. Raises ``LogError`` for a log that cannot be used, ``UserError`` where a package is
-    missing, ``OSError`` where the folder cannot be written.
+    Existing tables are replaced only after all are written. Raises ``LogError`` for an unusable
+    log, ``UserError`` if a package is missing, ``OSError`` if the folder cannot be written.
     """
     events = log_events(logs, settings, latency_s)
     run, offset_ns = Run(settings, None), utc_offset_ns(logs)
@@ -65,9 +64,9 @@ def export_space(
     progress: Callable[[int, float, float], None],
     latency_s: float = 0.0,
 ) -> dict[str, Any]:
-    """Write tracks and beams in space to a file of a folder, for Rerun; returns a summary.
+    """Write tracks and beams in 3D to a file in a folder, for Rerun; return a summary.
 
-    Arguments and errors are those of ``export``; the file gets its name when it is whole.
+    Arguments and errors as for ``export``; the file gets its final name when it is complete.
     """
     events = log_events(logs, settings, latency_s)
     run = Run(settings, None)

@@ -1,7 +1,7 @@
-"""The links, their signatures, and the service's own messages.                           [shell]
+"""The links, their signing, and the service's own messages.
 
-What is received goes on as events, in the order in which it came. What is sent is what
-``[presence]`` allows, and nothing else.
+Received frames are passed on as events, in order of arrival. Only what ``[presence]`` allows is
+sent.
 """
 
 import asyncio
@@ -23,7 +23,7 @@ from companion.settings.section import ConfigError
 from companion.values import Event, Frame, Notice, Reason, Rejection, Severity, Source, UserError
 
 SETUP_SIGNING: Final = 256  # message that carries a signing key in plain; it is never recorded
-SAVE_EVERY_S: Final = 0.25  # time between two checks whether signing timestamps are due to be saved
+SAVE_EVERY_S: Final = 0.25  # interval of checks whether signing timestamps must be saved
 
 
 class Gateway:
@@ -35,7 +35,7 @@ class Gateway:
         notify  takes messages for the operator
         now_ns  the node's timeline
 
-    Raises ``ConfigError`` where the settings ask for presence and do not say as which system.
+    Raises ``ConfigError`` if the settings enable presence without a system id.
     """
 
     def __init__(
@@ -56,18 +56,17 @@ class Gateway:
         self._duplicate_ids = DuplicateIds({*settings.links.routers, *signed})
         self._settings = settings
         self.links: list[Link] = []
-        self.lag = ArrivalLag()  # how far behind the arrival of datagrams their processing is
+        self.lag = ArrivalLag()  # delay from the arrival of datagrams to their processing
 
     def open(self) -> None:
-        """Make the links and claim their addresses.
+        """Open the links and bind their addresses.
 
-        Raises ``LinkError`` where one cannot be had, or where the key or the timestamps of a signed
-        one cannot be used.
+        Raises ``LinkError`` if a link, or the key or timestamps of a signed one, is unusable.
         """
         signing = self._settings.signing
         unknown = [url for url in signing.keys if url not in self._settings.links.urls]
         if unknown:
-            raise LinkError(f"signing.keys: {unknown[0]} is not among the links")
+            raise LinkError(f"signing.keys: {unknown[0]} is not in links.urls; add or remove it")
         if signing.keys:
             self._timestamps = Timestamps(Path(signing.timestamps))
         for number, url in enumerate(self._settings.links.urls):
@@ -75,7 +74,9 @@ class Gateway:
             link.open()
             self.links.append(link)
             if link.url.scheme == "udpout" and self._component is None:
-                text = f"{url} is silent, for [presence] is off: nobody there learns of it"
+                text = (
+                    f"{url} sends nothing, so no peer can answer: set `[presence] enabled = true`"
+                )
                 self._notify(
                     Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=url, text=text)
                 )
@@ -112,7 +113,7 @@ class Gateway:
                 group.create_task(self._save(self._timestamps), name="signing timestamps")
 
     def close(self) -> None:
-        """Save the signing timestamps, once ``run`` has ended.
+        """Save the signing timestamps, after ``run`` has ended.
 
         Raises ``LinkError`` if that fails.
         """
@@ -122,7 +123,7 @@ class Gateway:
     async def _save(self, timestamps: Timestamps) -> None:
         """Save signing timestamps off the event loop.
 
-        A disk error is reported once, and tried again.
+        A disk error is reported once, and saving is retried.
         """
         failing = False
         while True:
@@ -165,8 +166,8 @@ class Gateway:
     def _notify_duplicates(self) -> None:
         for who, peers in self._duplicate_ids.found:
             text = (
-                f"{who} is heard from {' and '.join(peers)}, which contradict each other: not"
-                " believed; [links] routers names whom to believe"
+                f"{who}: reports from {' and '.join(peers)} contradict each other and are rejected;"
+                " add the trusted peer to `[links] routers`"
             )
             self._notify(
                 Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=who, text=text)
@@ -175,13 +176,13 @@ class Gateway:
 
     @property
     def has_component(self) -> bool:
-        """Whether this service says anything of itself."""
+        """Whether this service sends messages of its own."""
         return self._component is not None
 
     def speak(self, fit: bool, uavs: Iterable[Source]) -> None:
-        """Send what is due. Call it some ten times a second.
+        """Send due messages. Call it about ten times a second.
 
-        ``fit``: the service can be relied on. ``uavs``: those whose positions matter.
+        ``fit``: the service is ready. ``uavs``: the UAVs whose positions matter.
         """
         if self._component is None:
             return
@@ -193,7 +194,7 @@ class Gateway:
                 self._send_to(target, message)
 
     def _send_to(self, target: Source, message: Outgoing) -> None:
-        """Send over the link on which the target was heard last."""
+        """Send over the link on which the target was last received."""
         heard = [
             (link.status.components[target].heard_ns, number)
             for number, link in enumerate(self.links)
@@ -203,12 +204,12 @@ class Gateway:
             self.links[max(heard)[1]].send_to(target, message)
 
     def rates(self) -> list[MessageRate]:
-        """The message rates that are asked for, and how far asking has come."""
+        """Return the requested message rates and their state."""
         return self._component.rates() if self._component else []
 
 
 def component(settings: Settings) -> ServiceComponent | None:
-    """The service as a MAVLink component; None where it is to be silent. Raises ``ConfigError``."""
+    """Return the service as a MAVLink component; None without presence. Raises ``ConfigError``."""
     given, center = settings.presence, settings.center.source
     if not given.enabled:
         return None
@@ -217,8 +218,8 @@ def component(settings: Settings) -> ServiceComponent | None:
     sysid = given.system_id or (carrier.sysid if carrier else None)
     if sysid is None:
         raise ConfigError(
-            "presence.system_id is needed: the array stands on its own, and a component is one"
-            " of a system, such as 200"
+            "presence.system_id is missing: a fixed array has no vehicle's system id; set one,"
+            " such as 200"
         )
     try:
         return ServiceComponent(

@@ -1,4 +1,4 @@
-"""What a run needs of this machine: ports, devices, disk, time.                          [shell]"""
+"""Requirements of a run on this machine: ports, devices, disk, time."""
 
 import ctypes
 import errno
@@ -22,14 +22,14 @@ from companion.settings.model import Settings
 from companion.values import UserError
 
 SCARCE_BYTES: Final = 2_000_000_000
-"""Free disk below which recordings are in danger: some hours of four UAVs."""
+"""Free disk space below which recordings are at risk: some hours of four UAVs."""
 BUFFER_BYTES: Final = 1_000_000
 """Receive buffer below which bursts of UDP may be lost (docs/links.md)."""
-UNSYNCHRONISED: Final = 5  # what adjtimex(2) answers where nothing keeps the clock: TIME_ERROR
+UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2): the clock is not synchronised
 
 
 class Grade(StrEnum):
-    """How a thing was found: in order, worth a thought, or a fault that stops a run."""
+    """Grade of a finding: in order, doubtful, or a fault that prevents a run."""
 
     OK = "ok"
     DOUBT = "doubt"
@@ -38,7 +38,7 @@ class Grade(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One thing that was looked at: what it is, how it was found, and what to do about it."""
+    """One checked item: its name, its grade, and a remedy."""
 
     subject: str
     grade: Grade
@@ -47,7 +47,7 @@ class Finding:
 
 
 def look(settings: Settings, *, token: str | None, insecure: bool) -> Iterator[Finding]:
-    """Findings on all that settings ask of this machine, nothing of which is kept open."""
+    """Yield findings about this machine's ports, devices, disk and clock; nothing is kept open."""
     yield _served(settings.server.listen, token=token, insecure=insecure)
     for url in settings.links.urls:
         yield _link(parse_link(url))
@@ -64,9 +64,9 @@ def _served(listen: str, *, token: str | None, insecure: bool) -> Finding:
         bind(listen, token=token, insecure=insecure).close()
     except UserError as error:
         busy = os.strerror(errno.EADDRINUSE) in str(error)
-        remedy = "stop the other program, or --listen 127.0.0.1:8081" if busy else ""
+        remedy = "stop the other program, or give --listen 127.0.0.1:8081" if busy else ""
         return Finding(subject=subject, grade=Grade.FAULT, text=str(error), remedy=remedy)
-    return Finding(subject=subject, grade=Grade.OK, text="the page and the API can be served here")
+    return Finding(subject=subject, grade=Grade.OK, text="available for the page and the API")
 
 
 def _link(url: LinkUrl) -> Finding:
@@ -76,16 +76,16 @@ def _link(url: LinkUrl) -> Finding:
     if url.scheme == "zenoh":
         return _zenoh(subject, url)
     if not url.listens:
-        return Finding(subject=subject, grade=Grade.OK, text="calls from here")
+        return Finding(subject=subject, grade=Grade.OK, text="connects to its peer")
     kind = socket.SOCK_STREAM if url.scheme == "tcpin" else socket.SOCK_DGRAM
     try:
         bound(url, kind).close()
     except OSError as error:
-        remedy = "another program has it: stop that, or choose another port"
+        remedy = "stop the program that uses it, or choose another port"
         if error.errno != errno.EADDRINUSE:
-            remedy = "name an address of this machine, such as 0.0.0.0"
+            remedy = "give an address of this machine, such as 0.0.0.0"
         return Finding(subject=subject, grade=Grade.FAULT, text=reason(error), remedy=remedy)
-    return Finding(subject=subject, grade=Grade.OK, text="can be listened on")
+    return Finding(subject=subject, grade=Grade.OK, text="available for listening")
 
 
 def _zenoh(subject: str, url: LinkUrl) -> Finding:
@@ -94,32 +94,34 @@ def _zenoh(subject: str, url: LinkUrl) -> Finding:
     except UserError as error:
         return Finding(subject=subject, grade=Grade.FAULT, text=str(error))
     return Finding(
-        subject=subject, grade=Grade.OK, text="Zenoh is here, and can read its endpoints"
+        subject=subject, grade=Grade.OK, text="Zenoh is installed, and its endpoints are valid"
     )
 
 
 def _device(subject: str, device: Path) -> Finding:
     if not device.exists():
         there = sorted(str(path) for path in Path("/dev").glob("tty[AUT][CMSH][MABS]*"))
-        remedy = f"is it plugged in? there is {', '.join(there)}" if there else "is it plugged in?"
+        remedy = "check that it is plugged in"
+        if there:
+            remedy += f"; devices: {', '.join(there)}"
         return Finding(
-            subject=subject, grade=Grade.FAULT, text="there is no such device", remedy=remedy
+            subject=subject, grade=Grade.FAULT, text="device does not exist", remedy=remedy
         )
     if not os.access(device, os.R_OK | os.W_OK):
         group = grp.getgrgid(device.stat().st_gid).gr_name
         remedy = f"sudo usermod -a -G {group} $USER, then log in again"
         return Finding(
-            subject=subject, grade=Grade.FAULT, text="may not be opened by this user", remedy=remedy
+            subject=subject, grade=Grade.FAULT, text="no permission to open it", remedy=remedy
         )
-    return Finding(subject=subject, grade=Grade.OK, text="is there, and may be opened")
+    return Finding(subject=subject, grade=Grade.OK, text="device exists and can be opened")
 
 
 def _buffers() -> Iterator[Finding]:
     try:
         granted = int(Path("/proc/sys/net/core/rmem_max").read_text(encoding="ascii"))
     except (OSError, ValueError):
-        return  # not Linux: links say what they were granted
-    text = f"the system grants UDP links {granted / 1e3:.0f} kB"
+        return  # not Linux: links report their buffer size
+    text = f"the system allows UDP links {granted / 1e3:.0f} kB"
     if granted < BUFFER_BYTES:
         remedy = f"for thousands of frames a second: sysctl -w net.core.rmem_max={4 * BUFFER_BYTES}"
         yield Finding(subject="receive buffer", grade=Grade.DOUBT, text=text, remedy=remedy)
@@ -131,7 +133,7 @@ def _disk(folder: Path) -> Finding:
     subject = f"recordings {folder}"
     where = folder.parent if folder.suffix == ".mcap" else folder
     while not where.exists() and where != where.parent:
-        where = where.parent  # it is made when the first recording begins
+        where = where.parent  # created when the first recording begins
     try:
         with tempfile.TemporaryFile(dir=where):
             free = shutil.disk_usage(where).free
@@ -140,7 +142,7 @@ def _disk(folder: Path) -> Finding:
             subject=subject,
             grade=Grade.FAULT,
             text=reason(error),
-            remedy="choose a folder that can be written",
+            remedy="choose a writable folder in `[recording] directory`",
         )
     text = f"{free / 1e9:.1f} GB free"
     if free < SCARCE_BYTES:
@@ -148,16 +150,17 @@ def _disk(folder: Path) -> Finding:
             subject=subject,
             grade=Grade.DOUBT,
             text=text,
-            remedy="make room: a full disk ends a recording",
+            remedy="free some space: a full disk ends a recording",
         )
     return Finding(subject=subject, grade=Grade.OK, text=text)
 
 
 def processor_share(root: Path = Path("/")) -> float:
-    """The share of one processor that this process may have by its control groups; 1: all of it.
+    """Return the fraction of one processor that control groups allow this process; 1 without a
+    quota.
 
-    A quota, as of a container, stops the process for a part of the time, of which the time that it
-    takes of a processor knows nothing. ``root`` is where the system's files are.
+    A quota, as of a container, suspends the process for part of the time, which processor time does
+    not show. ``root`` is the root of the system's files.
     """
     try:
         lines = (root / "proc/self/cgroup").read_text(encoding="utf-8").splitlines()
@@ -177,25 +180,25 @@ def processor_share(root: Path = Path("/")) -> float:
 
 
 def _quota(folder: Path) -> float:
-    """The quota of one control group, of either version; infinite where it has none."""
+    """Return the quota of one control group, of either version; infinite without one."""
     names = (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us"))
     for name in names:
         try:
             quota, period = " ".join((folder / one).read_text() for one in name).split()
             return float(quota) / float(period) if float(quota) > 0 else math.inf
-        except (OSError, ValueError):  # none, "max", or the other version
+        except (OSError, ValueError):  # missing, "max", or the other version
             continue
     return math.inf
 
 
 def _clock() -> Iterator[Finding]:
-    """Whether the wall clock is kept by something, as adjtimex(2) has it."""
+    """Check whether the wall clock is synchronised, by adjtimex(2)."""
     try:
         state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512))
     except (OSError, AttributeError):
         return  # not Linux
     if state == UNSYNCHRONISED:
-        text = "nothing keeps this machine's clock right: times in recordings are as it has them"
+        text = "the clock is not synchronised: times in recordings may be wrong"
         yield Finding(
             subject="wall clock",
             grade=Grade.DOUBT,
@@ -203,4 +206,4 @@ def _clock() -> Iterator[Finding]:
             remedy="run chrony or systemd-timesyncd",
         )
     elif state >= 0:
-        yield Finding(subject="wall clock", grade=Grade.OK, text="is kept right")
+        yield Finding(subject="wall clock", grade=Grade.OK, text="synchronised")

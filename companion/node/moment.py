@@ -1,4 +1,4 @@
-"""A log up to one time: what the program knew then.                                      [shell]"""
+"""State of the pipeline at one time of a log."""
 
 from collections.abc import Callable, Sequence
 from datetime import datetime
@@ -15,11 +15,11 @@ from companion.values import Update, UserError
 PROGRESS_EVERY: Final = 20_000  # events between two calls of progress
 
 ENDS_NS: Final = 60_000_000_000
-"""How far the ends of a log may be off its first and last event: stamps may step back or leap."""
+"""Tolerance of a log's ends against its first and last event, as stamps may step or jump."""
 
 
 class MomentError(UserError):
-    """A time that the log does not hold. The message is one line for the user."""
+    """Time that is not in the log."""
 
 
 def look(
@@ -31,18 +31,18 @@ def look(
     progress: Callable[[float], None] | None = None,
     latency_s: float = 0.0,
 ) -> tuple[Pipeline, Update]:
-    """The pipeline after all events up to a time, and the beams it makes then.
+    """Return the pipeline after all events up to a time, and its beams at that time.
 
         logs      as for a replay
         settings  as for a replay
-        at        seconds from the log's first event, or a time with its date and zone (RFC 3339),
-                  by the node's wall clock as it was set last
-        lead_s    how far ahead of that time the beams are applied
-        progress  called now and then with seconds of log
+        at        seconds from the log's first event, or a date and time with zone (RFC 3339),
+                  by the node's wall clock
+        lead_s    time from then until the beams are applied
+        progress  called occasionally with seconds of log
         latency_s as for a replay
 
-    Raises ``MomentError`` for text that is no time or a time that the log does not reach;
-    ``LogError`` and ``ConfigError`` as for a replay.
+    Raises ``MomentError`` for an invalid time, or one outside the log; ``LogError`` and
+    ``ConfigError`` as for a replay.
     """
     span_ns, offset_ns = ends.span_ns(logs), utc_offset_ns(logs)
     if span_ns is not None:
@@ -67,7 +67,7 @@ def look(
 
 
 def _require_within(at: str, span_ns: tuple[int, int], utc_offset_ns: int) -> None:
-    """Refuse a time that lies far outside the ends of the logs, before they are read."""
+    """Reject a time far outside the ends of the logs, before they are read."""
     first_ns, last_ns = span_ns
     at_ns = _time_ns(at, first_ns, utc_offset_ns)
     if at_ns > last_ns + ENDS_NS:
@@ -85,9 +85,8 @@ def _time_ns(text: str, begins_ns: int, utc_offset_ns: int) -> int:
         then = datetime.fromisoformat(text)
     except ValueError as error:
         raise MomentError(
-            f"--at {text}: neither seconds from the beginning nor a time such as"
-            " 2026-01-01T12:00:00Z"
+            f"--at {text}: neither seconds from the start nor a time such as 2026-01-01T12:00:00Z"
         ) from error
     if then.tzinfo is None:
-        raise MomentError(f"--at {text}: say the zone, such as Z")
+        raise MomentError(f"--at {text}: time zone is missing; append Z for UTC")
     return round(then.timestamp() * 1e9) - utc_offset_ns

@@ -1,6 +1,6 @@
-"""What is known, said to others at a steady rate on links of its own ([out]).           [shell]
+"""Tracks sent to other programs at a steady rate, on separate links ([out]).
 
-What comes in over these links is not read.
+Data received over these links is ignored.
 """
 
 import asyncio
@@ -53,18 +53,18 @@ class Outlet:
                 self._frames.append(link)
 
     def links(self) -> list[LinkStatus]:
-        """Counts of each link; those for events go by the names that the settings have."""
+        """Return the counts of each link; links for events under their names in the settings."""
         named = zip(self._events, self._named, strict=True)
         events = [replace(link.status, url=text) for link, text in named]
         return [*(link.status for link in self._frames), *events]
 
     def open(self) -> None:
-        """Claim the addresses of links that listen. Raises ``LinkError`` where one is not free."""
+        """Bind the addresses of links that listen. Raises ``LinkError`` if one is in use."""
         for link in (*self._frames, *self._events):
             link.open()
 
     async def run(self) -> None:
-        """Serve the links and say what is known, until cancelled."""
+        """Serve the links and send positions, until cancelled."""
         async with asyncio.TaskGroup() as group:
             for link in (*self._frames, *self._events):
                 group.create_task(link.run(), name=f"out {link.url}")
@@ -72,7 +72,7 @@ class Outlet:
                 group.create_task(self._speak(), name="out")
 
     async def _speak(self) -> None:
-        """Speak at the rate; times missed while the loop was held up are left out."""
+        """Send at the rate; times missed while the loop was blocked are skipped."""
         loop = asyncio.get_running_loop()
         period_s = 1 / self._settings.rate_hz
         due_s = loop.time()

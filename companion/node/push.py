@@ -1,7 +1,7 @@
-"""Weights pushed to machines as each update is made, over UDP and shared memory.          [shell]
+"""Records of each update, pushed over UDP and shared memory.
 
-Nobody is waited for, and nothing is queued: while a guarantee is computed, updates that come are
-left out but for the newest.
+No receiver is waited for, and nothing is queued: while a guaranteed gain is computed, only the
+newest update is kept.
 """
 
 import asyncio
@@ -21,13 +21,14 @@ from companion.values import Notice, Severity, Update, UserError
 from companion.views import guaranteed_gain, records
 
 LARGEST_DATAGRAM: Final = 65_000
-"""Bytes that fit into a datagram of either family with room to spare."""
+"""Limit on the size of a datagram, below that of both address families."""
 WELL: Final = 50
-"""Datagrams that go out in a row before it is said: a refusal is told to one that comes later."""
+"""Successful datagrams in a row before recovery is reported: errors arrive late."""
 
 
 class Push:
-    """The ways of ``[records]``. Call ``open`` for early errors, then ``run`` until cancelled."""
+    """The outputs of ``[records]``. Call ``open`` for early errors, then ``run`` until
+    cancelled."""
 
     def __init__(
         self,
@@ -50,7 +51,7 @@ class Push:
         self._fresh = asyncio.Event()
 
     def open(self) -> None:
-        """Open all ways. Raises ``UserError`` where one cannot be opened."""
+        """Open all outputs. Raises ``UserError`` if one cannot be opened."""
         for text in self._settings.udp:
             host, port = host_and_port(text)
             family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -70,7 +71,7 @@ class Push:
             self._fresh.set()
 
     async def run(self) -> None:
-        """Push updates as they come, until cancelled."""
+        """Push updates until cancelled."""
         while True:
             await self._fresh.wait()
             self._fresh.clear()
@@ -95,22 +96,22 @@ class Push:
     def _say(self, text: str, sock: socket.socket, record: bytes) -> None:
         try:
             sock.send(record)
-        except OSError as error:  # nobody listens there, or the line is full: the next is newer
+        except OSError as error:  # no receiver, or a full queue: the next record is newer anyway
             if text not in self._refused:
-                self._tell(Severity.WARNING, f"records to {text} are refused: {error.strerror}")
+                self._tell(Severity.WARNING, f"records to {text} fail: {error.strerror}")
             self._refused[text] = 0
         else:
             if text in self._refused:
                 self._refused[text] += 1
                 if self._refused[text] >= WELL:
                     del self._refused[text]
-                    self._tell(Severity.INFO, f"records to {text} go out")
+                    self._tell(Severity.INFO, f"records to {text} are sent again")
 
     def _tell(self, severity: Severity, text: str) -> None:
         self._notify(Notice(t_ns=self._now_ns(), severity=severity, subject="records", text=text))
 
     def close(self) -> None:
-        """Close all ways."""
+        """Close all outputs."""
         for sock in self._sockets.values():
             with contextlib.suppress(OSError):
                 sock.close()

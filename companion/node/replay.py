@@ -1,4 +1,4 @@
-"""Replay: logs through the same fold as the live service, as fast as it goes.            [shell]"""
+"""Replay: logs through the same fold as the live service, as fast as possible."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,14 +30,14 @@ from companion.settings.origins import Origin, Origins, changed, of_options
 from companion.values import Estimate, Event, Output, Refuted, Tick, Tock, Update
 
 FLUSH_EVERY_S: Final = 1.0  # time between two flushes of the recording
-TICKED: Final = "mcap"  # kind of log that holds the ticks of the run from which it was recorded
+TICKED: Final = "mcap"  # kind of log that contains the ticks of its run
 
 
 def settings_for(logs: Sequence[Path], config: Path | None, center: str | None) -> Settings:
-    """The settings of a replay: a given file, else those in a recording, else the defaults.
+    """Return the settings of a replay: from a given file, else from a recording, else the defaults.
 
     ``center`` may name one of the logs: the vehicle that wrote it carries the array. Raises
-    ``LogError`` or ``ConfigError`` where a log or the settings cannot be used.
+    ``LogError`` or ``ConfigError`` for an unusable log or settings.
     """
     return layers_for(logs, config, center)[0]
 
@@ -45,10 +45,10 @@ def settings_for(logs: Sequence[Path], config: Path | None, center: str | None) 
 def layers_for(
     logs: Sequence[Path], config: Path | None, center: str | None
 ) -> tuple[Settings, Origins]:
-    """The settings as by ``settings_for``, and where each comes from.
+    """Return the settings as ``settings_for``, and the origin of each.
 
-    A recording holds every setting: what is at its default there counts as that, and so does what
-    does not make estimates or beams (``Settings.from_recording``).
+    A recording contains every setting. Values at their default, and sections that do not affect
+    estimates or beams (``Settings.from_recording``), count as defaults.
     """
     options = {"center": {"source": center_of(logs, center)}}
     recorded = read_settings(logs[0]) if config is None else None
@@ -65,7 +65,8 @@ def layers_for(
 
 
 def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Writer:
-    """A recording of the replay: at ``out``, else in the settings' directory or ``recordings/``."""
+    """Return the recording of the replay: at ``out``, else in the settings' directory or
+    ``recordings/``."""
     complete, kept = embedded(settings), settings.recording
     first_ns = next(read_flight(logs)).t_ns
     where = out or Path(kept.directory or "recordings")
@@ -84,7 +85,7 @@ def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Wr
 
 
 class Run:
-    """A replay under way: the pipeline, its figures so far, and its recording."""
+    """A replay in progress: the pipeline, its figures so far, and its recording."""
 
     def __init__(self, settings: Settings, writer: Writer | None) -> None:
         self.pipeline = Pipeline(settings)
@@ -99,13 +100,13 @@ class Run:
 
     @property
     def took_s(self) -> float:
-        """Seconds since it began."""
+        """Seconds since the start."""
         return time.monotonic() - self._started_s
 
     def step(self, event: Event) -> list[Output]:
-        """Take in the next event; returns its outputs.
+        """Process the next event; return its outputs.
 
-        Raises ``OSError`` where it cannot be recorded.
+        Raises ``OSError`` if it cannot be recorded.
         """
         outputs = self.pipeline.step(event)
         self.tally.event(event)
@@ -123,9 +124,9 @@ class Run:
         return outputs
 
     def finish(self) -> dict[str, Any]:
-        """Close the recording and sum up.
+        """Close the recording and return the summary.
 
-        Raises ``OSError`` where the recording cannot be written.
+        Raises ``OSError`` if the recording cannot be written.
         """
         digest = self.pipeline.digest.hexdigest()
         recording = self.writer.close({"digest": digest}) if self.writer else None
@@ -145,18 +146,18 @@ def replay(
     progress: Callable[[int, float, float], None] | None = None,
     latency_s: float = 0.0,
 ) -> dict[str, Any]:
-    """Run logs through a pipeline and sum up, as ``companion replay --json`` prints it.
+    """Run logs through a pipeline and return the summary that ``companion replay --json`` prints.
 
         logs      merged by time; the parts of one run follow one another
-        settings  those of the pipeline
-        record    makes the recording, once the logs are open; None: there is none
-        speed     multiple of the log's own speed; None: as fast as it goes
-        progress  called now and then with frames, seconds of log, and seconds since it began
-        latency_s of vehicles' own logs, which tell no arrivals: from a sample to its arrival
+        settings  settings of the pipeline
+        record    creates the recording, once the logs are open; None: no recording
+        speed     multiple of the log's own speed; None: as fast as possible
+        progress  called occasionally with frames, seconds of log, and seconds since the start
+        latency_s time from a sample to its arrival, for onboard logs, which contain no arrivals
 
-    ``logs`` in the summary are the vehicles whose own logs were read, ``missing`` is what the parts
-    lack. Raises ``LogError`` for a log that cannot be used, ``OSError`` where the recording cannot
-    be written.
+    In the summary, ``logs`` are the vehicles whose onboard logs were read, ``missing`` is what the
+    parts lack. Raises ``LogError`` for an unusable log, ``OSError`` if the recording cannot be
+    written.
     """
     events = log_events(logs, settings, latency_s)
     writer = record() if record else None
@@ -174,21 +175,21 @@ def replay(
 
 
 def length_s(logs: Sequence[Path]) -> float | None:
-    """How long some logs are together, by their ends; None where these do not tell."""
+    """Return the total length of some logs, by their ends; None if unknown."""
     span_ns = ends.span_ns(logs)
     return None if span_ns is None else (span_ns[1] - span_ns[0]) * 1e-9
 
 
 def vehicle_logs(logs: Sequence[Path]) -> list[dict[str, Any]]:
-    """The vehicles whose own logs are among these, as JSON. Raises ``LogError``."""
+    """Return the vehicles whose onboard logs are among these, as JSON. Raises ``LogError``."""
     return [one.as_json() for one in vehicles(logs)]
 
 
 def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0) -> Iterator[Event]:
-    """All events in order of time, with ticks; those of several parts of one run as they were.
+    """Return all events in order of time, with ticks; those of several parts of one run unchanged.
 
-    ``latency_s`` is as for ``replay``. Raises ``LogError`` where a log cannot be used, or one part
-    of a run is given twice.
+    ``latency_s`` as for ``replay``. Raises ``LogError`` for an unusable log, or if one part of a
+    run is given twice.
     """
     if len(logs) == 1 and log_kind(logs[0]) == TICKED:
         return read_log(logs[0])
@@ -200,17 +201,17 @@ def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0)
 
 
 def in_order(logs: Sequence[Path]) -> list[Path] | None:
-    """The parts of one run, in their order; None where the logs are not that.
+    """Return the parts of one run in order; None if the logs are not that.
 
-    Raises ``LogError`` where one cannot be read, or is given twice.
+    Raises ``LogError`` if one is unreadable or given twice.
     """
     return _in_order(_stories(logs))
 
 
 def missing(logs: Sequence[Path]) -> list[str]:
-    """What recordings say of events that they do not hold, one line each.
+    """Return what recordings report as missing, one line each.
 
-    A replay of such recordings cannot come to the live run's digest. Raises ``LogError`` as for a
+    A replay of such recordings cannot reproduce the live run's digest. Raises ``LogError`` as for a
     replay.
     """
     stories = _stories(logs)
@@ -232,7 +233,7 @@ def _in_order(stories: dict[Path, Story]) -> list[Path] | None:
 
 
 def _paced(events: Iterable[Event], speed: float) -> Iterator[Event]:
-    """Hold each event back until its time, at ``speed`` times the time of the log."""
+    """Delay each event until its time, at ``speed`` times the speed of the log."""
     first: tuple[int, float] | None = None
     for event in events:
         if first is None:

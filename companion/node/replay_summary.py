@@ -1,4 +1,4 @@
-"""What a replay comes to, as ``companion replay --json`` prints it."""
+"""Summary of a replay, as ``companion replay --json`` prints it."""
 
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
@@ -12,7 +12,7 @@ from companion.values import Estimate, Event, Update, kind_of
 
 @dataclass(slots=True, kw_only=True)
 class Tally:
-    """Figures of a replay, gathered as it goes."""
+    """Figures collected during a replay."""
 
     reports: Counter[str] = field(default_factory=Counter)
     dt_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
@@ -30,10 +30,10 @@ class Tally:
         """Note the time span of the events."""
         if self.first_ns is None:
             self.first_ns = event.t_ns
-        self.last_ns = max(self.last_ns, event.t_ns)  # a frame may be taken in after a later tick
+        self.last_ns = max(self.last_ns, event.t_ns)  # a frame may be processed after a later tick
 
     def estimate(self, estimate: Estimate) -> None:
-        """Take in an accepted report."""
+        """Count an accepted report."""
         fix = estimate.fix
         self.reports[fix.uav] += 1
         self.reacquired[fix.uav] += estimate.reacquired
@@ -43,7 +43,7 @@ class Tally:
             self.innovation_m[fix.uav].append(estimate.innovation_m)
 
     def update(self, update: Update) -> None:
-        """Take in a beam update; those without beams do not count."""
+        """Count a beam update; those without beams do not count."""
         condition = update.beams.condition_number
         if condition is None:
             return
@@ -53,7 +53,7 @@ class Tally:
 
 
 def summary(pipeline: Pipeline, tally: Tally) -> dict[str, Any]:
-    """The figures of a replay; ``unaimed`` says why nothing was aimed at."""
+    """Return the figures of a replay; ``unaimed`` says why no beam was computed."""
     now_ns = tally.last_ns
     tracks = {track.uav: track for track in pipeline.tracks(now_ns, now_ns)}
     carrier = str(pipeline.center.place)
@@ -96,7 +96,7 @@ def summary(pipeline: Pipeline, tally: Tally) -> dict[str, Any]:
 
 
 def _unaimed(pipeline: Pipeline, tally: Tally) -> str | None:
-    """Why nothing was aimed at in all of the log; None where something was."""
+    """Return why no beam was computed in the whole log; None if one was."""
     update = pipeline.last_update
     if tally.updates:
         return None
@@ -112,12 +112,12 @@ def _unaimed(pipeline: Pipeline, tally: Tally) -> str | None:
         return f"{first.uav}: {first.reason}"
     others = [uav for uav in pipeline.tracker.uavs if uav != pipeline.center.vehicle]
     if others and not any(kind_of(uav).reports_itself for uav in others):
-        return 'only relayed aircraft were heard, and [beams] targets is not "all"'
+        return 'only relayed aircraft were received, and [beams] targets is not "all"'
     if others:
-        return "every UAV had been silent for too long"
+        return "every UAV was silent for too long"
     refused = pipeline.refusals.total.most_common(1)
-    seen = f"; most of what was refused: {refused[0][0]}" if refused else ""
-    return f"no UAV reported a position that could be used{seen}"
+    seen = f"; most frequent rejection: {refused[0][0]}" if refused else ""
+    return f"no UAV reported a usable position{seen}"
 
 
 def _percentile(values: list[float], percent: float) -> float | None:

@@ -1,11 +1,11 @@
-"""Records in shared memory: a ring that one process writes and any number follow.       [shell]
+"""Records in shared memory: a ring buffer with one writing process and any number of readers.
 
-The file is mapped by all. A header of 64 bytes, then slots of equal size, each a lock (8 bytes),
-the length of its record (4), 4 bytes of nothing, and the record. Record n, from 0, is in slot n
-modulo the number of slots. Its lock is 2 n + 1 while it is written and 2 n + 2 once it is whole; a
-reader copies the record and looks at the lock before and after (a seqlock). Nobody ever waits for a
-reader: one that falls a whole ring behind knows by ``written`` how many records it lost. What a
-processor may reorder is found by the record's own checksum.
+All processes map the file. It has a header of 64 bytes, then slots of equal size: a lock (8 bytes),
+the length of the record (4), 4 reserved bytes, and the record. Record n, from 0, is in slot n
+modulo the number of slots. Its lock is 2 n + 1 while it is being written and 2 n + 2 when it is
+complete; a reader copies the record and compares the lock before and after (a seqlock). The writer
+never waits for a reader: a reader that falls a whole ring behind sees by ``written`` how many
+records it lost. The record's own checksum detects reordering by the processor.
 """
 
 import contextlib
@@ -20,28 +20,29 @@ from companion.values import UserError
 
 MAGIC: Final = b"UAVBRING"
 VERSION: Final = 1
-SLOTS: Final = 256  # a quarter of a second at 1000 records/s, for a reader that is held up
+SLOTS: Final = 256  # a quarter of a second at 1000 records/s, for a delayed reader
 SLOT_BYTES: Final = 1 << 16
-"""Memory is taken as it is touched: a slot costs what its largest record takes."""
+"""Size of a slot. Memory is allocated on first use, so a slot costs the size of its largest record.
+"""
 HEAD_BYTES: Final = 64
 SLOT_HEAD_BYTES: Final = 16
 LARGEST_RECORD: Final = SLOT_BYTES - SLOT_HEAD_BYTES
-LIVE: Final = 1  # state of a ring that is written to; 0: its writer has ended
+LIVE: Final = 1  # state of a ring with a writer; 0: its writer has ended
 
 
 def _require_ring(path: Path) -> None:
-    """Raise ``UserError`` where there is a file that no ring may replace."""
+    """Raise ``UserError`` if a file exists that is not a ring."""
     if path.exists():
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
-                raise UserError(f"{path} is there and is no ring of records")
+                raise UserError(f"{path} exists and is not a ring of records; choose another name")
 
 
 class Ring:
-    """The writer's end. Raises ``UserError`` for a place that cannot be used.
+    """The writer's end. Raises ``UserError`` for an unusable path.
 
-    The file takes the place of an earlier ring of that name, which its readers keep until they open
-    it anew; a file that is no ring stays as it is. Readable by the owner and the group.
+    The file replaces an earlier ring of that name, which its readers keep until they reopen it; a
+    file that is not a ring is kept. Readable by the owner and the group.
     """
 
     def __init__(self, path: Path) -> None:
@@ -58,7 +59,7 @@ class Ring:
                 self._identity = os.fstat(fd).st_ino
             finally:
                 os.close(fd)
-            self._words = np.frombuffer(self._map, dtype="<u8")  # stores of 8 bytes are whole
+            self._words = np.frombuffer(self._map, dtype="<u8")  # stores of 8 bytes are atomic
             self._halves = np.frombuffer(self._map, dtype="<u4")
             self._halves[2:6] = VERSION, SLOTS, SLOT_BYTES, LIVE
             self._map[: len(MAGIC)] = MAGIC
@@ -79,7 +80,7 @@ class Ring:
         self._words[3] = self.written
 
     def close(self) -> None:
-        """Tell readers that nothing more comes, and take the name away if it is still this ring."""
+        """Mark the ring as ended, and delete its file unless another ring has replaced it."""
         self._halves[5] = 0
         del self._words, self._halves
         self._map.close()

@@ -1,10 +1,10 @@
-"""A replay with the same page and API as a live run.                                     [shell]
+"""A replay with the page and API of a live run.
 
 The replayed pipeline is served, and "now" is the time of the log's newest event: each answer is
-what the live service would have given then. No event is left out, however slow the machine is, so
-the digest at the end is that of a replay without a page.
+that of the live service at that time. No event is skipped, however slow the machine, so the final
+digest equals that of a replay without a page.
 
-Over 300 lines: the server's whole view of a node, a method for each question.
+Over 300 lines: the server's whole view of a node, a method for each query.
 """
 
 import asyncio
@@ -47,25 +47,25 @@ from companion.views.series import Series
 from companion.views.state import RecordingStatus, ReplayStatus
 
 SLICE_S: Final = 0.005
-"""Time slice: the longest time that the replay holds the event loop."""
+"""Longest time that the replay blocks the event loop."""
 MEASURED_AT_ONCE: Final = 20_000
-"""Events read at once while measuring the log; measuring can be stopped only in between."""
+"""Events read at once while measuring the log's length; it can be stopped only in between."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayRequest:
-    """What is to be replayed, and how.
+    """Parameters of a replay.
 
     latency_s as in ``companion.node.replay.replay``
-    area_map  the map under the plan view: of the user's own settings, not of a recording's
+    area_map  the map under the plan view, from the user's own settings, not from a recording
     """
 
-    logs: Sequence[Path]  # the logs
-    settings: Settings  # those of the pipeline
+    logs: Sequence[Path]
+    settings: Settings  # settings of the pipeline
     speed: float | None  # as in companion.node.replay.replay
-    record: Callable[[], Writer] | None  # makes the recording of the replay; None: there is none
+    record: Callable[[], Writer] | None  # creates the recording of the replay; None: no recording
     latency_s: float = 0.0
-    origins: Origins = field(default_factory=dict)  # where the settings come from
+    origins: Origins = field(default_factory=dict)  # origins of the settings
     area_map: str | None = None
 
 
@@ -80,7 +80,7 @@ def serve(
     """Replay and serve on ``listen`` (HOST:PORT) until SIGINT or SIGTERM.
 
     ``show`` gets the summary: see ``ServedReplay.run``. Raises ``LogError``, ``ConfigError``,
-    ``ListenError`` or ``OSError`` for what cannot be used.
+    ``ListenError`` or ``OSError`` for unusable arguments.
     """
     with bind(listen, token=token, insecure=insecure) as http:
         node = ServedReplay(asked, _say)
@@ -93,10 +93,10 @@ def _say(text: str) -> None:
 
 
 class ServedReplay:
-    """A replay as the server sees it (``companion.views.state.Node``).
+    """Replay with the interface of a node (``companion.views.state.Node``).
 
-    ``say`` gets the messages that a live run would show to the operator. Raises ``LogError`` for a
-    log, ``ConfigError`` for settings, ``OSError`` for a recording that cannot be used.
+    ``say`` gets the notices of a live run. Raises ``LogError`` for an unusable log, ``ConfigError``
+    for settings, ``OSError`` for a recording.
     """
 
     def __init__(self, asked: ReplayRequest, say: Callable[[str], None]) -> None:
@@ -137,8 +137,8 @@ class ServedReplay:
         """Replay, and serve until ``until`` is set, also after the log has ended.
 
         ``show`` gets the summary (see ``companion.node.replay.replay``) when the log has ended, or
-        the summary so far when ``until`` is set before that. Raises ``LogError`` for a log that
-        turns out to be unusable, ``OSError`` where the recording cannot be written.
+        the summary so far if ``until`` is set before. Raises ``LogError`` for an unusable log,
+        ``OSError`` if the recording cannot be written.
         """
         answering = asyncio.Event()
         server = Server(node=self, token=token, answering=answering, area=self._area)
@@ -161,7 +161,7 @@ class ServedReplay:
             raise failed
 
     async def _replay(self, until: asyncio.Event) -> None:
-        """Step through every event at its time, until told to stop."""
+        """Process every event at its time, until stopped."""
         loop = asyncio.get_running_loop()
         began_s, first_ns = loop.time(), self._now_ns
         slice_s = flush_s = began_s
@@ -188,7 +188,7 @@ class ServedReplay:
 
     def _step(self, event: Event) -> None:
         outputs = self._run.step(event)
-        self._now_ns = max(self._now_ns, event.t_ns)  # a frame may be taken in after a later tick
+        self._now_ns = max(self._now_ns, event.t_ns)  # a frame may be processed after a later tick
         match event:
             case Frame():
                 self.last_messages.add(event)
@@ -209,39 +209,39 @@ class ServedReplay:
     def _updated(self, now_ns: int) -> None:
         self._rates.count(now_ns, self.pipeline.frames, self.pipeline.updates)
         self.series.add(self.pipeline)
-        self._ticked.set()  # wakes those who wait now;
+        self._ticked.set()  # wakes all current waiters;
         self._ticked.clear()  # later ones wait for the next tick
 
     async def _measure(self) -> None:
-        """Find the length of the log by reading it through, beside the replay."""
+        """Measure the length of the log by reading all of it, during the replay."""
         events, first_ns = self._measured
         last_ns: int | None = first_ns
         while last_ns is not None:
             end_ns, last_ns = last_ns, await asyncio.to_thread(_last_ns, events)
         self._of_s = (end_ns - first_ns) * 1e-9
 
-    # --- what the server looks at -----------------------------------------------------------
+    # --- interface of the server ------------------------------------------------------------
 
     def now_ns(self) -> int:
-        """The latest time of an event so far."""
+        """Return the latest time of an event so far."""
         return self._now_ns
 
     def uptime_s(self) -> float:
-        """Seconds since the replay began, whatever its speed."""
+        """Return seconds since the start of the replay, in real time."""
         return time.monotonic() - self._started_s
 
     def links(self) -> list[LinkStatus]:
-        """Links found in the log, with the counts that frames allow; "up" until the log ends."""
+        """Return the links in the log, with counts from its frames; "up" until the log ends."""
         for link in self._links.values():
             link.status.state = "down" if self._finished else "up"
         return [link.status for link in self._links.values()]
 
     def out_links(self) -> list[LinkStatus]:
-        """A replay passes nothing on."""
+        """Return nothing: a replay sends nothing to other programs."""
         return []
 
     def recording(self) -> RecordingStatus:
-        """State of the replay's recording."""
+        """Return the state of the replay's recording."""
         writer = self._run.writer
         if writer is None:
             return RecordingStatus(state="off", file=None, bytes=0, messages=0, dropped=0)
@@ -254,11 +254,12 @@ class ServedReplay:
         )
 
     def rates(self) -> dict[str, float | None]:
-        """Frames and updates per second of the log."""
+        """Return frames and updates per second of the log."""
         return self._rates.newest()
 
     def unfit(self) -> list[str]:
-        """Why the live service would not have been fit to be used then; that the replay is over."""
+        """Return why the live service was not ready at that time, and whether the replay has
+        finished."""
         update = self.pipeline.last_update
         reasons = ["the replay has finished"] if self._finished else []
         if update is None:
@@ -266,11 +267,11 @@ class ServedReplay:
         return [*reasons, update.unfit] if update.unfit else reasons
 
     def message_rates(self) -> list[MessageRate]:
-        """Empty: a replay asks nobody for anything."""
+        """Return nothing: a replay sends no requests."""
         return []
 
     def events(self) -> list[Notice]:
-        """The newest notices, the oldest of them first."""
+        """Return the newest notices, oldest first."""
         return list(self._notices)
 
     async def ticked(self) -> None:
@@ -278,10 +279,10 @@ class ServedReplay:
         await self._ticked.wait()
 
     def fleet_status(self) -> None:
-        """None: a recording has no more of a fleet than who was served."""
+        """Return None: a recording contains of a fleet only the UAVs served."""
 
     def replay(self) -> ReplayStatus:
-        """Progress of the replay."""
+        """Return the progress of the replay."""
         return ReplayStatus(
             log=self.name,
             speed=self._speed,
@@ -292,7 +293,7 @@ class ServedReplay:
 
 
 class _ReplayedLink:
-    """Counts of one link, from its frames in the log, which does not tell its peers apart."""
+    """Counts of one link, from its frames in the log, which does not distinguish its peers."""
 
     def __init__(self, url: str) -> None:
         self.status = LinkStatus(url=url)
@@ -306,6 +307,6 @@ class _ReplayedLink:
 
 
 def _last_ns(events: Iterator[Event]) -> int | None:
-    """Time of the last of the next ``MEASURED_AT_ONCE`` events; None where there are none."""
+    """Return the time of the last of the next ``MEASURED_AT_ONCE`` events; None without any."""
     newest = deque(islice(events, MEASURED_AT_ONCE), maxlen=1)
     return newest[0].t_ns if newest else None

@@ -1,6 +1,6 @@
-"""The live service: links, timer, recorder and HTTP around one pipeline.                 [shell]
+"""The live service: links, timer, recorder and HTTP around one pipeline.
 
-Over 300 lines: it holds the parts of the running service together.
+Over 300 lines: it connects all parts of the running service.
 """
 
 import asyncio
@@ -49,13 +49,13 @@ from companion.views.state import RecordingStatus
 
 
 class Service:
-    """A running node, as the HTTP server sees it. ``answering`` is set once HTTP is served.
+    """A running node, with the interface of the HTTP server. ``answering`` is set once HTTP is
+    served.
 
-    ``clock`` is this machine's unless a test brings another one.
-
-    ``say`` gets one line for the operator whenever something changes. Raises ``LinkError`` if a
-    link cannot be opened, ``ConfigError`` if the settings cannot be used, ``OSError`` if the
-    recording cannot be opened, ``LiveError`` if the live channels cannot be served.
+    ``clock`` is this machine's unless a test provides another one. ``say`` gets one line for the
+    operator per notice. Raises ``LinkError`` if a link cannot be opened, ``ConfigError`` for
+    unusable settings, ``OSError`` if the recording cannot be opened, ``LiveError`` if the live
+    channels cannot be served.
     """
 
     def __init__(
@@ -125,7 +125,7 @@ class Service:
     ) -> None:
         """Serve until ``until`` is set, then finish the recording.
 
-        ``others`` are further coroutines to run beside, as for the demo; they are cancelled at the
+        ``others`` are coroutines that run alongside, as for the demo; they are cancelled at the
         end.
         """
         server = Server(node=self, token=token, answering=self.answering, area=self._area)
@@ -156,7 +156,7 @@ class Service:
                 self._push.close()
                 self._traffic.close()
                 self._aimer.shutdown()
-            finally:  # a disk that takes no timestamps is no reason to lose the recording
+            finally:  # a failure to save timestamps must not lose the recording
                 await self._finish()
 
     async def _finish(self) -> None:
@@ -179,12 +179,12 @@ class Service:
             now_ns=now_ns,
         )
 
-    # --- what drives the pipeline -----------------------------------------------------------
+    # --- input of the pipeline --------------------------------------------------------------
 
     def _hear(self, event: Event) -> None:
-        """Take in what came over this node's own links."""
+        """Process an event of this node's own links."""
         if self.fleet is not None:
-            self.fleet.on_event(event)  # first: others wait for it
+            self.fleet.on_event(event)  # first: other nodes wait for it
         self._step(event)
 
     def _step(self, event: Event) -> None:
@@ -201,13 +201,13 @@ class Service:
                 self._show(output)
 
     def _follow_wall_clock(self) -> None:
-        """Have the times that are said follow this machine's clock, where that was set."""
+        """Adjust the offset to UTC if this machine's clock was set."""
         offset_ns = self._timeline.set_to_ns()
         if offset_ns is not None:
             self._step(ClockSet(self._timeline.now_ns(), offset_ns))
 
     async def _driven(self) -> None:
-        """Drive the device of ``[drive]``; its mistakes end it, and not the service."""
+        """Drive the device of ``[drive]``; a user's error ends the drive, not the service."""
         if self._device is None:
             return
         loop, kept = asyncio.get_running_loop(), self._settings
@@ -240,15 +240,16 @@ class Service:
             )
             await run_in_thread(drive)
         except UserError as error:
-            text = f"the device is driven no more: {error}"
+            text = f"driving of the device has ended: {error}"
             self._notify(
                 Notice(t_ns=self.now_ns(), severity=Severity.ERROR, subject="drive", text=text)
             )
 
     async def _end_on_defect(self) -> None:
-        """Wait for a defect of the fold and raise it, which ends the service.
+        """Raise a defect of the fold, which ends the service.
 
-        A link's callback would only log it, and a half-changed state must not point beams.
+        A link's callback would only log it, and beams must not be computed from an inconsistent
+        state.
         """
         raise await self._defects.get()
 
@@ -259,7 +260,7 @@ class Service:
             self._live.put(event, outputs)
 
     def _notify(self, notice: Notice) -> None:
-        """Record and show a notice that the pipeline did not make."""
+        """Record and show a notice that did not come from the pipeline."""
         self._hand_over(None, [notice])
         self._show(notice)
 
@@ -270,13 +271,13 @@ class Service:
             )
 
     def _tell_of_machine(self) -> None:
-        """Tell once that this machine does not keep up, and once that it does again."""
+        """Publish a notice when this machine becomes overloaded, and when it recovers."""
         machine = behind(self.arrival_lag.seen(self.now_ns()))
         if (machine is not None) is self._is_behind:
             return
         self._is_behind = machine is not None
         if machine is None:
-            text, severity = "this machine keeps up again", Severity.INFO
+            text, severity = "this machine is no longer overloaded", Severity.INFO
         else:
             text, severity = f"{machine.reason}; {machine.remedy}", Severity.WARNING
         self._notify(Notice(t_ns=self.now_ns(), severity=severity, subject="machine", text=text))
@@ -286,13 +287,11 @@ class Service:
         self._say(notice.text)
 
     async def _tick(self) -> None:
-        """Tick at the update rate; ticks missed while the loop was held up are left out.
+        """Tick at the update rate; ticks missed while the loop was blocked are skipped.
 
-        Beams are made on a thread of their own: what is received meanwhile is taken in, and those
-        who ask are answered.
-
-        Updates take at most half of the time: with more UAVs than can be served at that rate there
-        are fewer updates, and no frame is lost to them.
+        Beams are computed on a separate thread, so that events and requests are processed
+        meanwhile. Updates take at most half of the time: with too many UAVs for the rate there are
+        fewer updates, and no frame is lost.
         """
         loop = asyncio.get_running_loop()
         period_s = 1 / self._settings.beams.update_hz
@@ -312,7 +311,7 @@ class Service:
                 self._traffic.speak(not self.unfit(), self.pipeline.reporters())
             self._tell_of_machine()
             self.series.add(self.pipeline)
-            self._ticked.set()  # wakes those who wait now;
+            self._ticked.set()  # wakes all current waiters;
             self._ticked.clear()  # later ones wait for the next tick
             ended_s = loop.time()
             due_s = max(due_s + period_s, ended_s + spent_s + (ended_s - began_s))
@@ -320,10 +319,10 @@ class Service:
             self.lateness.observe(loop.time() - due_s)
 
     async def _update(self) -> float:
-        """Predict the UAVs, make the beams on a thread, and take them in; the first ones at once.
+        """Predict the UAVs, compute the beams on a thread, and take them; the first ones directly.
 
-        Who finds the service running is to find an update. Returns the seconds that this took from
-        others: on the loop, and of the processor.
+        The first request must already find an update. Returns the seconds used, on the loop and of
+        the processor.
         """
         loop, now_ns = asyncio.get_running_loop(), self._timeline.now_ns
         began_s = loop.time()
@@ -336,10 +335,10 @@ class Service:
             spent_s += loop.time() - began_s
         return spent_s
 
-    # --- what the server looks at -----------------------------------------------------------
+    # --- interface of the server ------------------------------------------------------------
 
     def now_ns(self) -> int:
-        """The present time on the node's timeline."""
+        """Return the present time on the node's timeline."""
         return self._timeline.now_ns()
 
     async def ticked(self) -> None:
@@ -347,31 +346,31 @@ class Service:
         await self._ticked.wait()
 
     def uptime_s(self) -> float:
-        """Seconds since the service was made."""
+        """Return seconds since the service was created."""
         return (self.now_ns() - self._started_ns) * 1e-9
 
     def links(self) -> list[LinkStatus]:
-        """Counts of each link."""
+        """Return the counts of each link."""
         return [link.status for link in self._traffic.links]
 
     def out_links(self) -> list[LinkStatus]:
-        """Counts of each link of ``[out]``."""
+        """Return the counts of each link of ``[out]``."""
         return self._outlet.links()
 
     def events(self) -> list[Notice]:
-        """The newest notices, the oldest of them first."""
+        """Return the newest notices, oldest first."""
         return list(self.notices)
 
     def message_rates(self) -> list[MessageRate]:
-        """The message rates that are asked for, and how far asking has come."""
+        """Return the requested message rates and their state."""
         return self._traffic.rates()
 
     def rates(self) -> dict[str, float | None]:
-        """Frames and updates per second over the last seconds."""
+        """Return frames and updates per second over the last seconds."""
         return self._rates.newest()
 
     def recording(self) -> RecordingStatus:
-        """State of the recording."""
+        """Return the state of the recording."""
         recorder = self._recorder
         if recorder is None:
             return RecordingStatus(state="off", file=None, bytes=0, messages=0, dropped=0)
@@ -387,12 +386,12 @@ class Service:
         )
 
     def unfit(self) -> list[str]:
-        """Why the service is not fit to be used; empty when it is."""
+        """Return why the service is not ready; empty if it is."""
         update = self.pipeline.last_update
         states = [link.status.state for link in self._traffic.links]
         reasons = [] if "up" in states else ["no link is up"]
         machine = behind(self.arrival_lag.seen(self.now_ns()))
-        if machine is not None:  # of which all that is late or old then is but a symptom
+        if machine is not None:  # late updates and old data are only symptoms of it
             return [*reasons, machine.reason]
         if update is None or self.updates_late():
             reasons.append("beam updates are late")
@@ -401,23 +400,20 @@ class Service:
         return reasons
 
     def updates_late(self) -> bool:
-        """Whether the newest beam update is older than it can be while all is well."""
+        """Return whether the newest beam update is older than normal operation allows."""
         update = self.pipeline.last_update
         late_s = 1.0 + 5 / self._settings.beams.update_hz
         return update is None or (self.now_ns() - update.t_ns) * 1e-9 > late_s
 
     def replay(self) -> None:
-        """None: this is a live run."""
+        """Return None: this is a live run."""
 
     def fleet_status(self) -> FleetStatus | None:
-        """This node's place in a fleet; None where it is part of none."""
+        """Return this node's state in its fleet; None without a fleet."""
         return None if self.fleet is None else self.fleet.status()
 
     async def _recover_leftovers(self) -> None:
-        """Recover recordings that an earlier run left open when it was killed.
-
-        Off the event loop.
-        """
+        """Recover recordings that an earlier, killed run left open, off the event loop."""
         directory = self._settings.recording.directory
         if directory is None:
             return
@@ -438,9 +434,9 @@ class Service:
         )
 
     def _open_live(self) -> LiveChannels | None:
-        """The live channels, on this machine alone, since their protocol has no token.
+        """Open the live channels on this machine only, since their protocol has no token.
 
-        None if not asked for.
+        None if not requested.
         """
         port = self._settings.server.foxglove
         if port is None:
@@ -458,7 +454,7 @@ class Service:
         kept = self._settings.recording
         where = Path(kept.directory or "")
         if part.number > 1 and where.suffix == ".mcap" and not where.is_dir():
-            where = where.parent  # a file was asked for: later parts go into its folder
+            where = where.parent  # a file was requested: later parts go into its folder
         return Writer(
             where=where,
             settings_toml=self._settings.to_toml(),
@@ -474,15 +470,15 @@ class Service:
 
 
 def _took_s(work: Callable[[], object]) -> float:
-    """Do work on this thread; the processor time that it took."""
+    """Do work on this thread; return the processor time used."""
     began_s = time.thread_time()
     work()
     return time.thread_time() - began_s
 
 
 def require_center(settings: Settings) -> None:
-    """Raise ``UserError`` unless the settings say what carries the array."""
+    """Raise ``UserError`` unless the settings name the carrier of the array."""
     if settings.center.source is None:
         raise UserError(
-            "say what carries the array: --center SYSID:COMPID, LAT,LON,ALT[,HEADING] or home"
+            "center.source is not set; give --center SYSID:COMPID, LAT,LON,ALT[,HEADING] or home"
         )

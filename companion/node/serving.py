@@ -1,4 +1,4 @@
-"""Serves a node over HTTP until told to stop; shared by live runs and replays.           [shell]"""
+"""HTTP service of a node until it is stopped; shared by live runs and replays."""
 
 import asyncio
 import contextlib
@@ -21,15 +21,15 @@ from companion.views.state import Node
 
 T = TypeVar("T")
 
-RATE_WINDOW_S: Final = 2.0  # time over which frames and updates per second are counted
-NOTICES_KEPT: Final = 200  # newest notices kept
+RATE_WINDOW_S: Final = 2.0  # time over which frames and updates per second are averaged
+NOTICES_KEPT: Final = 200
 STREAM_TAKES_BYTES: Final = 1024  # largest message accepted from a WebSocket client
 FAREWELL_S: Final = 2
-"""How long the shutdown waits for clients that do not read, and for unfinished downloads."""
+"""Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
 
 
 class Server(uvicorn.Server):
-    """uvicorn around a node, which leaves the signals to its caller.
+    """uvicorn for a node, without signal handlers.
 
     ``serve(sockets=[bound socket])`` runs until ``should_exit`` is set; ``answering`` is set once
     it accepts requests. ``token`` and ``area``: see ``create_app``.
@@ -54,13 +54,13 @@ class Server(uvicorn.Server):
         self._answering = answering
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
-        """Begin to accept requests; see ``uvicorn.Server.startup``."""
+        """Start to accept requests; see ``uvicorn.Server.startup``."""
         await super().startup(sockets)
         self._answering.set()
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
-        """Capture no signals."""
+        """Install no signal handlers."""
         yield
 
 
@@ -77,7 +77,7 @@ class RateMeter:
             self._counts.popleft()
 
     def newest(self) -> dict[str, float | None]:
-        """``frames_hz`` and ``updates_hz``; None before there is an interval."""
+        """Return ``frames_hz`` and ``updates_hz``; None before the second count."""
         if len(self._counts) < 2:
             return {"frames_hz": None, "updates_hz": None}
         (t0, frames0, updates0), (t1, frames1, updates1) = self._counts[0], self._counts[-1]
@@ -89,7 +89,7 @@ class RateMeter:
 
 
 def address(http: socket.socket) -> str:
-    """The URL of what is served on a bound socket."""
+    """Return the URL of a bound socket."""
     host, port = http.getsockname()[:2]
     return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 
@@ -101,9 +101,9 @@ async def pause(until: asyncio.Event, seconds: float) -> None:
 
 
 async def in_daemon_thread(work: Callable[[], T]) -> T:
-    """Run a function on a daemon thread, for which the end of the service does not wait.
+    """Run a function on a daemon thread, which the shutdown of the service does not wait for.
 
-    It must leave nothing half done behind that matters.
+    The function must tolerate being cut off at any point.
     """
     loop = asyncio.get_running_loop()
     done: asyncio.Future[T] = loop.create_future()
@@ -113,7 +113,7 @@ async def in_daemon_thread(work: Callable[[], T]) -> T:
             settle = partial(done.set_result, work())
         except Exception as error:
             settle = partial(done.set_exception, error)
-        with contextlib.suppress(RuntimeError):  # the loop is closed: nobody waits any more
+        with contextlib.suppress(RuntimeError):  # the loop is closed: no caller is waiting
             loop.call_soon_threadsafe(lambda: None if done.done() else settle())
 
     threading.Thread(target=run, name="background", daemon=True).start()
@@ -123,10 +123,10 @@ async def in_daemon_thread(work: Callable[[], T]) -> T:
 def run_until_stopped(
     main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None = None
 ) -> None:
-    """Run ``main`` on an event loop of its own.
+    """Run ``main`` on a new event loop.
 
-    ``main`` is given an event, which is set by SIGINT, by SIGTERM, or when ``seconds`` have passed;
-    it must then finish.
+    ``main`` gets an event that is set by SIGINT, SIGTERM, or after ``seconds``; it must then
+    finish.
     """
     _tame_interpreter()
     with asyncio.Runner(loop_factory=_loop_factory()) as runner:
@@ -145,12 +145,12 @@ async def _stopped_by_signal(
 
 
 def _tame_interpreter() -> None:
-    """Keep garbage collection and threads from holding up the event loop.
+    """Keep garbage collection and threads from blocking the event loop.
 
-    A collection takes time in proportion to what it examines: what is loaded by now is left out,
-    small collections are frequent and full ones rare (measured at 10 000 frames/s: 3 ms for 2 000
-    objects, 50 ms for 50 000). The recorder's thread yields after a millisecond, because each
-    answer over HTTP waits for the interpreter several times.
+    The time of a collection is proportional to the objects that it examines. Objects loaded by now
+    are exempt; small collections are frequent and full ones rare (measured at 10 000 frames/s: 3 ms
+    for 2 000 objects, 50 ms for 50 000). The recorder's thread yields after a millisecond, because
+    each HTTP answer waits for the interpreter several times.
     """
     sys.setswitchinterval(0.001)
     gc.collect()
@@ -159,7 +159,8 @@ def _tame_interpreter() -> None:
 
 
 def _loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
-    """The loop factory of uvloop, which keeps up with ten times the datagrams; None without uvloop.
+    """Return the loop factory of uvloop, which handles ten times as many datagrams; None without
+    it.
 
     Measured: docs/field-notes.md 3.
     """

@@ -1,4 +1,4 @@
-"""Starts and stops the live service from the command line.                               [shell]"""
+"""Start and stop of the live service from the command line."""
 
 import asyncio
 import os
@@ -16,20 +16,20 @@ from companion.settings.model import Settings
 from companion.settings.origins import Origins
 from companion.values import UserError
 
-STATUS_EVERY_S: Final = 1.0  # time between two words on how it goes
+STATUS_EVERY_S: Final = 1.0  # time between two status lines
 
 
 class Console(Protocol):
-    """How a run speaks to whoever started it."""
+    """Output of a run to the terminal or pipe that started it."""
 
     def say(self, text: str) -> None:
-        """Say a line of something that happened."""
+        """Print a line about an event."""
 
     def serves(self, text: str) -> None:
-        """Say where it serves, or at the end what it recorded."""
+        """Print the address served, or at the end the recording."""
 
     def show(self, service: Service) -> None:
-        """Show how it goes."""
+        """Print the status."""
 
 
 def run(
@@ -45,21 +45,21 @@ def run(
 ) -> None:
     """Serve until SIGINT, SIGTERM or ``seconds`` have passed; then finish the recording.
 
-        settings   those of the service
-        voice      how it speaks
-        origins    where the settings come from, for who reads them
-        token      bearer token that HTTP asks for; None: none
-        insecure   serve beyond this machine without a token
-        traffic    coroutine run beside, with the address of the first link
-        seconds    how long to run; None: until a signal
+        settings   settings of the service
+        voice      its output
+        origins    origins of the settings, for display
+        token      bearer token required for HTTP; None: none
+        insecure   serve other machines without a token
+        traffic    coroutine that runs alongside, called with the URL of the first link
+        seconds    duration; None: until a signal
         open_page  open the dashboard in a browser
 
-    A service manager that started this process is told how it goes (``companion.node.systemd``).
-    Raises ``UserError`` or ``OSError`` where the settings do not allow to start.
+    A service manager that started this process is notified (``companion.node.systemd``). Raises
+    ``UserError`` or ``OSError`` if the settings do not allow a start.
     """
     require_center(settings)
     if not settings.links.urls:
-        raise UserError("say where MAVLink comes from: --link udpin:0.0.0.0:14550")
+        raise UserError("links.urls is empty; give --link udpin:0.0.0.0:14550")
     manager = systemd.manager(os.environ)
     http = bind(settings.server.listen, token=token, insecure=insecure)
     with http:
@@ -78,7 +78,7 @@ def run(
 
 
 async def _keep_shown(service: Service, voice: Console) -> None:
-    """Show how it goes, again and again."""
+    """Print the status periodically."""
     while True:
         await asyncio.sleep(STATUS_EVERY_S)
         voice.show(service)

@@ -1,13 +1,12 @@
-"""Tells systemd how the service is doing, by its notification protocol.                  [shell]
+"""Notification of systemd about the state of the service, by its protocol.
 
-One datagram per message goes to the Unix socket that ``NOTIFY_SOCKET`` names, lines of
-``NAME=value`` (sd_notify(3)). With ``WatchdogSec`` in the unit, ``WATCHDOG_USEC`` and
-``WATCHDOG_PID`` say how long the service may be silent (sd_watchdog_enabled(3)). Other supervisors
-speak this protocol as well.
+Each message is one datagram to the Unix socket ``NOTIFY_SOCKET``, with lines of ``NAME=value``
+(sd_notify(3)). With ``WatchdogSec`` in the unit, ``WATCHDOG_USEC`` and ``WATCHDOG_PID`` give the
+longest allowed silence (sd_watchdog_enabled(3)). Other supervisors use this protocol as well.
 
-A sign of life is sent only while the event loop turns and beam updates are made in time: a service
-that hangs, or that makes no beams any more, is silent, and is started again. What a restart does
-not mend (a link that is down, no UAV in the air, a full disk) is only said in the status line.
+A keep-alive is sent only while the event loop runs and beam updates are on time. A service that
+hangs, or computes no beams, stays silent and is restarted. Faults that a restart does not fix (a
+link that is down, no UAV in the air, a full disk) only appear in the status line.
 """
 
 import asyncio
@@ -22,20 +21,20 @@ from companion.node.serving import pause
 from companion.values import TrackState, UserError
 
 OPENING_S: Final = 1.0
-"""How long links may take to open before the service is said to be ready without them."""
+"""Longest wait for links to open before the service reports that it is ready."""
 STATUS_EVERY_S: Final = 5.0
-"""Time between two status lines where no watchdog asks for signs of life."""
+"""Time between two status lines without a watchdog."""
 LATE_AGAIN: Final = 0.05
 """Fraction of the watchdog's time after which late updates are checked again.
 
-A short delay at the very moment of a sign of life then does not cost a restart.
+A short delay at the moment of a keep-alive then does not cause a restart.
 """
 
 
 class Manager:
     """The service manager's socket.
 
-    ``watchdog_s`` is how long it tolerates silence; None: for ever. Raises ``UserError`` for an
+    ``watchdog_s`` is the longest allowed silence; None: unlimited. Raises ``UserError`` for an
     address that is neither a path nor an abstract name (``@NAME``).
     """
 
@@ -47,7 +46,7 @@ class Manager:
         self.watchdog_s = watchdog_s
 
     def tell(self, *lines: str) -> str | None:
-        """Send one message. Returns why it could not be sent, or None. Never waits."""
+        """Send one message. Returns the error text, or None. Never blocks."""
         message = "\n".join(lines).encode()
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as out:
@@ -59,9 +58,9 @@ class Manager:
 
 
 def manager(environ: Mapping[str, str]) -> Manager | None:
-    """The manager that started this process; None where there is none.
+    """Return the manager that started this process; None if there is none.
 
-    Raises ``UserError`` where its environment variables make no sense.
+    Raises ``UserError`` for invalid environment variables.
     """
     address = environ.get("NOTIFY_SOCKET")
     return Manager(address, _watchdog_s(environ)) if address else None
@@ -70,19 +69,20 @@ def manager(environ: Mapping[str, str]) -> Manager | None:
 def _watchdog_s(environ: Mapping[str, str]) -> float | None:
     pid, usec = environ.get("WATCHDOG_PID"), environ.get("WATCHDOG_USEC")
     if usec is None or (pid is not None and pid != str(os.getpid())):
-        return None  # it is not asked for, or of another process
+        return None  # not requested, or for another process
     if not usec.isdecimal() or int(usec) == 0:
-        raise UserError(f"WATCHDOG_USEC: {usec!r} is not a number of microseconds above 0")
+        raise UserError(f"WATCHDOG_USEC: {usec!r} is not a positive number of microseconds")
     return int(usec) * 1e-6
 
 
 async def keep_informed(
     manager: Manager, service: Service, say: Callable[[str], None], until: asyncio.Event
 ) -> None:
-    """Tell the manager that the service is ready, then that it is alive, and at last that it stops.
+    """Notify the manager that the service is ready, then that it is alive, and finally that it
+    stops.
 
-    Ready means that HTTP answers and every link is open (an absent peer is not waited for). Returns
-    when ``until`` is set. A message that cannot be sent is reported once.
+    Ready means that HTTP answers and every link is open, with or without a peer. Returns when
+    ``until`` is set. A message that cannot be sent is reported once.
     """
     await service.answering.wait()
     loop = asyncio.get_running_loop()
@@ -96,21 +96,21 @@ async def keep_informed(
         trouble = manager.tell(*signs, f"STATUS={status_line(service)}")
         ready = ready or trouble is None
         if trouble and not failing:
-            say(f"systemd cannot be told how the service is: {trouble}")
+            say(f"systemd cannot be notified: {trouble}")
         failing = trouble is not None
         await pause(until, _wait_s(manager.watchdog_s, late or failing))
     manager.tell("STOPPING=1", "STATUS=finishing the recording")
 
 
 def _wait_s(watchdog_s: float | None, again: bool) -> float:
-    """Time to the next message: half the watchdog's time, as sd_watchdog_enabled(3) advises."""
+    """Return the time to the next message: half the watchdog's, by sd_watchdog_enabled(3)."""
     if watchdog_s is None:
         return STATUS_EVERY_S
     return watchdog_s * (LATE_AGAIN if again else 0.5)
 
 
 def status_line(service: Service) -> str:
-    """One line for the operator: UAVs by state, links, the recording."""
+    """Return one line for the operator: UAVs by state, links, the recording."""
     update, links = service.pipeline.last_update, service.links()
     states = Counter(track.state for track in update.tracks) if update else Counter()
     uavs = ", ".join(f"{states[state]} {state}" for state in TrackState if states[state])

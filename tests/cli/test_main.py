@@ -36,8 +36,8 @@ def test_help_has_an_example(command: str) -> None:
         (["design", "--dt", "-1"], "positive number of seconds"),
         (["design", "--dt", "nan"], "positive number of seconds"),
         (["design", "--dt", "0.1", "--alpha", "2"], "alpha lies strictly between 0 and 1"),
-        (["run"], "say what carries the array"),
-        (["run", "--center", "5:1"], "say where MAVLink comes from"),
+        (["run"], "center.source is not set; give --center"),
+        (["run", "--center", "5:1"], "links.urls is empty; give --link"),
         (["run", "--center", "5"], "'5' is not SYSID:COMPID"),
         (["run", "--center", "5:1", "--link", "foo"], "'foo' is not udpin:HOST:PORT"),
         (

@@ -167,7 +167,7 @@ def test_a_time_of_day_is_the_same_as_seconds(cut_log: Path) -> None:
         ("inf", "neither seconds"),
         ("noon", "neither seconds"),
         ("", "neither seconds"),
-        ("2026-01-01T00:00:00", "say the zone"),
+        ("2026-01-01T00:00:00", "time zone is missing"),
         ("0", "no beams at 0: no report yet"),
     ],
 )

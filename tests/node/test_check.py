@@ -34,7 +34,7 @@ def test_ports_that_are_taken_are_faults() -> None:
         assert found[f"http {listen}"].grade is Grade.FAULT
         assert "--listen" in found[f"http {listen}"].remedy
         assert found[f"link {url}"].grade is Grade.FAULT
-        assert "another program" in found[f"link {url}"].remedy
+        assert "stop the program" in found[f"link {url}"].remedy
     found = looked(server={"listen": listen}, links={"urls": [url]})
     assert found[f"http {listen}"].grade is Grade.OK
     assert found[f"link {url}"].grade is Grade.OK
@@ -75,19 +75,19 @@ def test_silence_and_a_missing_carrier_are_told(tmp_path: Path) -> None:
         links={"urls": ["udpin:127.0.0.1:0"]}, server={"listen": "127.0.0.1:0"}
     )
     found = list(check(settings, 0.2))
-    (heard,) = (each for each in found if each.text == "heard nothing")
+    (heard,) = (each for each in found if each.text == "nothing received")
     assert "MAVProxy" in heard.remedy
     carrier = found[-1]
     assert (carrier.subject, carrier.grade) == ("carrier", Grade.FAULT)
-    assert carrier.text == "nobody said what carries the array"
-    assert carrier.remedy == "say --center SYSID:COMPID or LAT,LON,ALT"
+    assert carrier.text == "the carrier of the array is not set"
+    assert carrier.remedy == "give --center SYSID:COMPID or LAT,LON,ALT"
 
 
 @pytest.mark.parametrize(
     ("said", "grade", "text"),
     [
-        (b"GET / HTTP/1.1\r\n", Grade.FAULT, "nothing of use in them (16 garbage)"),
-        (b"MSG,8,5,211,4CA2D6,10057,,,,,,,,,,,,,,,,0\r\n", Grade.DOUBT, "no aircraft in them yet"),
+        (b"GET / HTTP/1.1\r\n", Grade.FAULT, "without usable data (16 garbage)"),
+        (b"MSG,8,5,211,4CA2D6,10057,,,,,,,,,,,,,,,,0\r\n", Grade.DOUBT, "no aircraft yet"),
     ],
 )
 def test_a_receiver_that_says_something_else_is_told(said: bytes, grade: Grade, text: str) -> None:
@@ -109,8 +109,8 @@ def test_a_receiver_that_says_something_else_is_told(said: bytes, grade: Grade, 
         accepted[0].close()
     _, judged = (each for each in found if each.subject == f"link {url}")
     assert judged.grade is grade and text in judged.text
-    (silent,) = (each for each in found if each.text == "heard nothing")
-    assert silent.remedy == "does anybody send Cursor on Target here?"
+    (silent,) = (each for each in found if each.text == "nothing received")
+    assert silent.remedy == "send Cursor on Target to this address"
 
 
 @pytest.mark.full

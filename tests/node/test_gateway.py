@@ -178,4 +178,4 @@ def test_two_peers_that_contradict_each_other_are_said_once_and_not_believed(
     believed = [one for one in stepped[-50:] if isinstance(one, Frame)]
     assert len(believed) == (25 if routers else 0)
     (told,) = said
-    assert "1:1 is heard from 127.0.0.1:5 and 127.0.0.1:6, which contradict" in told.text
+    assert "1:1: reports from 127.0.0.1:5 and 127.0.0.1:6 contradict each other" in told.text

@@ -39,12 +39,12 @@ def test_who_does_not_listen_is_said_once_and_that_it_does_after_a_while() -> No
 
         await pushed(WELL)  # every second one is told that the one before was refused
         assert [one.text.partition(":")[2] for one in notices] == [
-            f"{to[1]} are refused: Connection refused"
+            f"{to[1]} fail: Connection refused"
         ]
         with socket.socket(type=socket.SOCK_DGRAM) as listener:
             listener.bind(to)
             await pushed(WELL + 1)
-        assert [one.text for one in notices[1:]] == [f"records to {to[0]}:{to[1]} go out"]
+        assert [one.text for one in notices[1:]] == [f"records to {to[0]}:{to[1]} are sent again"]
         task.cancel()
 
     push.open()

@@ -101,8 +101,8 @@ def test_every_log_survives(name: str, uavs: int | None) -> None:
     summary = json.loads(done.stdout)
     assert "Traceback" not in done.stderr
     unaimed = {
-        "real_bluerobotics_server.tlog": "no UAV reported a position that could be used",
-        "adsb_pymodes_real.tlog": "only relayed aircraft were heard",
+        "real_bluerobotics_server.tlog": "no UAV reported a usable position",
+        "adsb_pymodes_real.tlog": "only relayed aircraft were received",
     }
     assert done.returncode == (name in unaimed)
     assert (summary["unaimed"] or "").startswith(unaimed.get(name, ""))

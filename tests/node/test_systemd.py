@@ -154,7 +154,7 @@ def test_a_manager_that_is_away_is_said_once_and_tried_again(
         heard.wait_for("READY=1", HANG_S)
         _, _, err = node.stop()
     complaints = [line for line in err.splitlines() if "systemd" in line]
-    assert complaints == ["systemd cannot be told how the service is: No such file or directory"]
+    assert complaints == ["systemd cannot be notified: No such file or directory"]
 
 
 def test_without_a_manager_there_is_none() -> None:

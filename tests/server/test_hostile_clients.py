@@ -262,7 +262,9 @@ def test_a_pattern_of_everything_is_not_drawn(
         monkeypatch.setattr("companion.server.beam_routes.MOST_ANGLES", 14_000)
         told = client.get("/v1/pattern?points=3600")
         assert told.status_code == 422
-        assert told.json()["title"] == "too large: 4 beams at 3600 angles; give uav, or fewer points"
+        assert (
+            told.json()["title"] == "too large: 4 beams at 3600 angles; give uav, or fewer points"
+        )
         assert client.get("/v1/pattern?points=3601&uav=1:1").status_code == 200
 
 

@@ -1,1 +1,1 @@
-"""Beams applied to hardware: the loop, where beams come from, and a file for each device."""
+"""Beams applied to hardware: the loop, the sources of beams, and a module for each device."""

@@ -1,10 +1,10 @@
-"""ADAR1000 chips on Linux's SPI: ``adar1000:0.0,0.1``.                                  [shell]
+"""ADAR1000 chips on Linux's SPI: ``adar1000:0.0,0.1``.
 
-Registers of the data sheet, as the Linux driver (iio/beamformer/adar1000) has them: a word of 24
-bits, 0 to write, the chip's address, 13 bits of register, 8 of value; gains on receive from 0x10,
-vector modulator on receive from 0x14 (I and Q by turns), 0x28 to load what was written (bit 0 for
-receive). Chips that share a chip select are told apart by address: here the place of the chip in
-the table, modulo 4. It was never on the air: what is tested is what a chip's registers would hold.
+Registers of the data sheet, as in the Linux driver (iio/beamformer/adar1000): a word of 24 bits, 0
+to write, the chip's address, 13 bits of register, 8 of value; receive gains from 0x10, receive
+vector modulators from 0x14 (alternately I and Q), 0x28 to load the written values (bit 0 for
+receive). Chips that share a chip select differ by address: here the index of the chip in the table,
+modulo 4. Never tested on hardware: the tests check the resulting register values.
 """
 
 from typing import Any, Final
@@ -17,7 +17,7 @@ RX_GAIN: Final = 0x10
 RX_MODULATOR: Final = 0x14
 LOAD: Final = 0x28
 LOAD_RX: Final = 0x01
-BYPASSED: Final = 0x80  # bit of a gain register that takes the attenuator out
+BYPASSED: Final = 0x80  # bit of a gain register that bypasses the attenuator
 FULL_GAIN: Final = BYPASSED | 127
 CLOCK_HZ: Final = 10_000_000
 
@@ -33,11 +33,11 @@ class Chips:
         self._lines: list[Any] = []
 
     def check(self, safe: SafeState) -> None:
-        """They have them all."""
+        """Accept every safe state."""
         require(safe, tuple(SafeState), "an ADAR1000")
 
     def open(self) -> None:
-        """Open the lines. Raises ``UserError`` without spidev."""
+        """Open the SPI devices. Raises ``UserError`` without spidev."""
         try:
             import spidev
         except ImportError as error:
@@ -57,7 +57,7 @@ class Chips:
         self._write(command.registers)
 
     def rest(self, safe: SafeState) -> None:
-        """Hold, look along boresight, or silence every channel."""
+        """Hold, point to boresight, or mute every channel."""
         if safe is SafeState.HOLD:
             return
         i, q = vector_modulator(0)
@@ -65,7 +65,7 @@ class Chips:
         self._send([[(gain, i, q)] * ADAR1000_CHANNELS for _ in self._places])
 
     def close(self) -> None:
-        """Let go of the lines."""
+        """Close the SPI devices."""
         for line in self._lines:
             line.close()
         self._lines = []
@@ -73,14 +73,14 @@ class Chips:
     def _write(self, registers: IntArray) -> None:
         chips: list[list[tuple[int, int, int]]] = [[] for _ in self._places]
         if registers[:, 0].max() >= len(chips):
-            have = f"{len(chips)} chips for {registers[:, 0].max() + 1} of the array"
-            raise UserError(f"adar1000: {have}")
+            needed = registers[:, 0].max() + 1
+            raise UserError(f"adar1000: {len(chips)} chips given, the array has {needed}; list all")
         for chip, _, _, _, gain, attenuated, i, q in registers.tolist():
             chips[chip].append((gain | (0 if attenuated else BYPASSED), i, q))
         self._send(chips)
 
     def _send(self, chips: list[list[tuple[int, int, int]]]) -> None:
-        """Registers of all chips first, then the pulses close together."""
+        """Write the registers of all chips first, then the load pulses close together."""
         try:
             for place, (line, channels) in enumerate(zip(self._lines, chips, strict=True)):
                 for number, (gain, i, q) in enumerate(channels):

@@ -1,12 +1,11 @@
-"""A gimbal by MAVLink: ``gimbal:HOST:PORT:SYSID:COMPID``, and ``gimbal-roi:``.          [shell]
+"""A gimbal by MAVLink: ``gimbal:HOST:PORT:SYSID:COMPID``, and ``gimbal-roi:``.
 
-GIMBAL_MANAGER_SET_PITCHYAW points it, yaw from north and pitch from the horizon
-(https://mavlink.io/en/services/gimbal_v2.html). Or DO_SET_ROI_LOCATION tells it the place of the
-UAV, and it points there by its own position and attitude: for one that is elsewhere than the array,
-or moves. Where the gimbal says its own attitude
-(GIMBAL_DEVICE_ATTITUDE_STATUS), its lag is found from it. Messages are sent under
-MAV_COMP_ID_ONBOARD_COMPUTER of that system. It was never on the air: what is tested is what
-pymavlink reads of it.
+GIMBAL_MANAGER_SET_PITCHYAW points it, with yaw from north and pitch from the horizon
+(https://mavlink.io/en/services/gimbal_v2.html). DO_SET_ROI_LOCATION sends the position of the UAV
+instead, and the gimbal points there by its own position and attitude: for a gimbal away from the
+array, or on a moving carrier. If the gimbal reports its attitude (GIMBAL_DEVICE_ATTITUDE_STATUS),
+its lag is estimated from it. Messages are sent as MAV_COMP_ID_ONBOARD_COMPUTER of that system.
+Never tested on hardware: the tests decode the messages with pymavlink.
 """
 
 import math
@@ -30,12 +29,12 @@ ATTITUDE_STATUS: Final = 285
 IN_EARTH_FRAME: Final = 4 | 8 | 16 | 64
 """GIMBAL_MANAGER_FLAGS: roll, pitch and yaw locked, and yaw from north."""
 YAW_FROM_NORTH: Final = 16 | 64
-"""GIMBAL_DEVICE_FLAGS of an attitude whose yaw is from north: either says so."""
+"""GIMBAL_DEVICE_FLAGS of an attitude whose yaw is from north: either one."""
 ONBOARD_COMPUTER: Final = 191
 
 
 class Gimbal:
-    """A gimbal; its boresight is north, level."""
+    """A gimbal; its boresight is north and level."""
 
     takes = DeviceInput.POINTING
 
@@ -53,15 +52,15 @@ class Gimbal:
 
     @property
     def lead_s(self) -> float:
-        """Its lag, as its own attitude shows it; 0 before that, or where it says none."""
+        """Lag estimated from its attitude reports; 0 without any."""
         return self._lag.lag_s
 
     def check(self, safe: SafeState) -> None:
-        """A gimbal radiates nothing that could be muted."""
+        """Reject muting: a gimbal does not radiate."""
         require(safe, (SafeState.HOLD, SafeState.BORESIGHT), "a gimbal")
 
     def open(self) -> None:
-        """Open a socket to it; whether it is there is not known."""
+        """Open a UDP socket; the gimbal may be absent."""
         host, port = self._address
         try:
             found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)[0]
@@ -73,7 +72,7 @@ class Gimbal:
             raise DeviceError(f"gimbal at {host}:{port}: {error.strerror or error}") from error
 
     def apply(self, command: DeviceCommand) -> None:
-        """Hear where it points, and point."""
+        """Read the reported attitudes, and point."""
         self._hear()
         yaw_rad = _near(command.bearing_rad, self._last_rad)
         self._last_rad = yaw_rad
@@ -81,26 +80,26 @@ class Gimbal:
         self._lag.note_command(self._now_ns(), yaw_rad)
 
     def rest(self, safe: SafeState) -> None:
-        """Stay where it was told to point last, or go to its boresight."""
+        """Keep the last direction, or point to boresight."""
         if safe is SafeState.BORESIGHT:
             self._point(DeviceCommand(valid_at_ns=0, unfit=None))
 
     def close(self) -> None:
-        """Let go of the socket."""
+        """Close the socket."""
         if self._socket:
             self._socket.close()
             self._socket = None
 
     def _point(self, command: DeviceCommand) -> None:
-        """Say where to point; the direction of a command without one is boresight."""
+        """Send the direction; without one it is boresight."""
         yaw_rad = math.remainder(command.bearing_rad, 2 * math.pi)
-        rates = math.nan, math.nan  # of pitch and yaw: not commanded
+        rates = math.nan, math.nan  # pitch and yaw rates are not commanded
         whom = *self.target, 0  # every gimbal of that manager
         angles = command.above_rad, yaw_rad
         self.say(SET_PITCHYAW, struct.pack("<I4f3B", IN_EARTH_FRAME, *angles, *rates, *whom))
 
     def say(self, msgid: int, payload: bytes) -> None:
-        """Send a message to it."""
+        """Send a message to the gimbal."""
         own = Source(self.target[0], ONBOARD_COMPUTER)
         raw = pack(Outgoing(own, msgid, payload), self._sequence)
         self._sequence = (self._sequence + 1) & 0xFF
@@ -112,7 +111,7 @@ class Gimbal:
             raise DeviceError(f"gimbal: {error.strerror or error}") from error
 
     def _hear(self) -> None:
-        """Take the attitudes that have come."""
+        """Read the attitudes received so far."""
         while self._socket is not None:
             try:
                 data = self._socket.recv(2048)
@@ -135,17 +134,17 @@ class Gimbal:
 
 
 class RoiGimbal(Gimbal):
-    """A gimbal that is told places; at its boresight it is free of them."""
+    """A gimbal that gets positions instead of directions; boresight cancels the position."""
 
     def _point(self, command: DeviceCommand) -> None:
-        """Say which place to look at, or none."""
+        """Send the position to point at, or cancel it."""
         lat_deg, lon_deg, alt_m = command.place or (0.0, 0.0, 0.0)
         number = DO_SET_ROI_NONE if command.place is None else DO_SET_ROI_LOCATION
         where = round(lat_deg * 1e7), round(lon_deg * 1e7), alt_m
-        whom = *self.target, 0, 0, 0  # MAV_FRAME_GLOBAL: above mean sea level; not of a mission
+        whom = *self.target, 0, 0, 0  # MAV_FRAME_GLOBAL: above mean sea level; no mission
         self.say(COMMAND_INT, struct.pack("<4f2ifH5B", 0.0, 0.0, 0.0, 0.0, *where, number, *whom))
 
 
 def _near(angle_rad: float, other_rad: float) -> float:
-    """The same angle within half a turn of another one."""
+    """Return the angle plus full turns, within half a turn of the other one."""
     return other_rad + math.remainder(angle_rad - other_rad, 2 * math.pi)

@@ -1,8 +1,8 @@
-"""The loop that takes beams at the update rate and applies them to a device.             [shell]
+"""The loop that fetches beams at the update rate and applies them to a device.
 
-It runs on a thread of its own and asks for beams that are right when the device will have them: the
-lead is the time from asking to being applied, as it was of late, or the lag that a mount shows by
-itself.
+It runs on its own thread and requests beams for the time at which the device will have applied
+them. The lead is the recent median time from request to application, or the lag that a mount
+reports.
 """
 
 import statistics
@@ -17,15 +17,15 @@ import numpy as np
 
 from companion.values import IntArray, UserError
 
-REMEMBERED: Final = 1000  # updates of which times are kept
-LEADING: Final = 51  # updates whose median time is the next one's lead
-RETRY_NS: Final = 1_000_000_000  # time between two attempts to reach a device
+REMEMBERED: Final = 1000  # updates whose times are kept
+LEADING: Final = 51  # updates whose median time is the next lead
+RETRY_NS: Final = 1_000_000_000  # time between two attempts to open a device
 LATE_SHARE: Final = 0.1
-"""Share of the time between two updates by which one may come after its moment."""
+"""Fraction of the update interval by which an update may be late."""
 
 
 class SafeState(StrEnum):
-    """State of a device while there is nothing to apply, and at the end."""
+    """State of a device without beams, and after the end."""
 
     HOLD = "hold"
     BORESIGHT = "boresight"
@@ -41,52 +41,52 @@ class DeviceInput(StrEnum):
 
 
 class DeviceError(Exception):
-    """A device that failed, or that cannot be reached; it is tried again."""
+    """Failure of a device, or a device that is unreachable; it is retried."""
 
 
 class SourceLostError(Exception):
-    """A service that does not answer."""
+    """Service that does not answer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DeviceCommand:
-    """What is to be applied.
+    """Command to a device.
 
-    place        of the UAV: latitude and longitude in degrees, height above mean sea level in
-                 metres; None where it is not known
-    registers    (M, 8), as the text for ADAR1000 has them: chip, channel, element, phase code,
-                 gain code, attenuator, I and Q; None where nobody asked
+    place        position of the UAV: latitude and longitude in degrees, height above mean sea level
+                 in metres; None if unknown
+    registers    (M, 8), as in the text for ADAR1000: chip, channel, element, phase code,
+                 gain code, attenuator, I and Q; None if not requested
     """
 
-    valid_at_ns: int  # for when it is right
-    unfit: str | None  # why there is nothing to apply; None: there is
-    uav: str = ""  # who is served
+    valid_at_ns: int  # time for which it is computed
+    unfit: str | None  # why there is nothing to apply; None: there is a beam
+    uav: str = ""  # UAV that is served
     bearing_rad: float = 0.0  # from true north, clockwise
     above_rad: float = 0.0  # above the horizon
     place: tuple[float, float, float] | None = None
     registers: IntArray | None = None
-    stored: int | None = None  # index of the codebook's best beam; None where nobody asked
+    stored: int | None = None  # index of the codebook's best beam; None if not requested
 
 
 class BeamSource(Protocol):
-    """Where beams come from."""
+    """Source of beams."""
 
     def ask(self, lead_s: float) -> DeviceCommand:
-        """What is to be applied so long from now. Raises ``SourceLostError``."""
+        """Return the command for this time from now. Raises ``SourceLostError``."""
 
 
 class Device(Protocol):
-    """What beams are applied to. Every method may raise ``DeviceError``.
+    """Device to which beams are applied. Every method may raise ``DeviceError``.
 
-    lead_s  lag that the device shows by itself; None: the time to apply is all
+    lead_s  lag that the device itself shows; None: only the time to apply counts
     """
 
-    takes: DeviceInput  # what a command needs to hold
+    takes: DeviceInput  # required content of a command
 
     @property
     def lead_s(self) -> float | None: ...
     def check(self, safe: SafeState) -> None:
-        """Raise ``UserError`` for a safe state that the device does not have."""
+        """Raise ``UserError`` for a safe state that the device does not support."""
 
     def open(self) -> None: ...
     def apply(self, command: DeviceCommand) -> None: ...
@@ -94,32 +94,32 @@ class Device(Protocol):
         """Go to a safe state."""
 
     def close(self) -> None:
-        """Let go of the device; raises nothing."""
+        """Close the device; raises nothing."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveStatus:
-    """How it goes.
+    """State of a drive.
 
-    p50_ms, p99_ms time from asking to applied; None before there is one
+    p50_ms, p99_ms time from request to application; None before the first
     """
 
-    applied: int  # updates that the device has taken
-    rate_hz: float | None  # of late; None before there is one
+    applied: int  # updates that were applied
+    rate_hz: float | None  # recent rate of updates; None before the second
     p50_ms: float | None
     p99_ms: float | None
-    lead_ms: float  # what is asked ahead now
-    late: int  # updates that were applied after their moment
-    skipped: int  # moments that were left out, since the device was not ready
-    failures: int  # of the device; each is followed by a new attempt
-    resting: str | None  # why there is nothing to apply; None: there is
+    lead_ms: float  # current lead of requests
+    late: int  # updates that were applied too late
+    skipped: int  # updates that were skipped because the device was not ready
+    failures: int  # failures of the device, each followed by a new attempt
+    resting: str | None  # why there is nothing to apply; None: there is a beam
 
 
 class Drive:
-    """One device, driven.
+    """One device that is being driven.
 
-    ``say`` gets a line whenever something changes. Raises ``UserError`` for a safe state that the
-    device does not have.
+    ``say`` gets a line for each change. Raises ``UserError`` for a safe state that the device does
+    not support.
     """
 
     def __init__(
@@ -161,7 +161,7 @@ class Drive:
             self.end()
 
     def step(self) -> None:
-        """Take one update and apply it, or go to the safe state where there is none."""
+        """Fetch one update and apply it, or go to the safe state if there is none."""
         try:
             if not self._reached():
                 return
@@ -169,7 +169,7 @@ class Drive:
             try:
                 command = self._source.ask(self.lead_s)
             except SourceLostError as error:
-                self._rest(f"the service is lost: {error}")
+                self._rest(f"no answer from the service: {error}")
                 return
             if command.unfit is not None:
                 self._rest(command.unfit)
@@ -182,14 +182,14 @@ class Drive:
         self._took_ns.append(ended_ns - began_ns)
         self._at_ns.append(ended_ns)
         self._applied += 1
-        if self._device.lead_s is None:  # a mount is behind by nature, and led by its lag
+        if self._device.lead_s is None:  # a mount always lags, and its lag is compensated
             self._late += ended_ns > command.valid_at_ns + LATE_SHARE * self._period_ns
         if self._resting is not None:
             self._resting = None
             self._say("beams are applied")
 
     def end(self) -> None:
-        """Leave the device in its safe state, and let go of it."""
+        """Put the device into its safe state, and close it."""
         if self._open:
             try:
                 self._device.rest(self._safe)
@@ -200,14 +200,14 @@ class Drive:
 
     @property
     def lead_s(self) -> float:
-        """How far ahead beams are asked for."""
+        """Lead of the next request."""
         own_s = self._device.lead_s
         if own_s is not None:
             return own_s
         return statistics.median(list(self._took_ns)[-LEADING:]) * 1e-9 if self._took_ns else 0.0
 
     def status(self) -> DriveStatus:
-        """How it goes."""
+        """Return the state of the drive."""
         took, at = np.array(self._took_ns) * 1e-6, list(self._at_ns)
         spent_s = (at[-1] - at[0]) * 1e-9 if len(at) > 1 else 0.0
         return DriveStatus(
@@ -223,24 +223,24 @@ class Drive:
         )
 
     def _reached(self) -> bool:
-        """Whether the device is open; it is tried again once in a while."""
+        """Return whether the device is open; tries to open it at intervals."""
         if not self._open and self._now_ns() >= self._again_ns:
             self._device.open()
             self._open = True
-            self._say("the device is reached")
+            self._say("the device is connected")
         return self._open
 
     def _failed(self, error: DeviceError) -> None:
         if self._open or not self._failures:
             self._say(f"the device failed: {error}")
         self._failures += 1
-        self._resting = None  # what it does once it is back is not known
+        self._resting = None  # its state after a reconnection is unknown
         self._device.close()
         self._open = False
         self._again_ns = self._now_ns() + RETRY_NS
 
     def _rest(self, why: str) -> None:
-        """Go to the safe state, once for each reason."""
+        """Go to the safe state, once per reason."""
         if self._resting != why:
             if self._resting is None:
                 self._device.rest(self._safe)
@@ -249,6 +249,6 @@ class Drive:
 
 
 def require(safe: SafeState, allowed: tuple[SafeState, ...], device: str) -> None:
-    """Raise ``UserError`` for a safe state that a device does not have."""
+    """Raise ``UserError`` for a safe state that a device does not support."""
     if safe not in allowed:
-        raise UserError(f"{device} can {' or '.join(allowed)}, not {safe}")
+        raise UserError(f"{device} does not support {safe}; choose {' or '.join(allowed)}")

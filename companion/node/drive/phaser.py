@@ -1,11 +1,11 @@
-"""An Analog Devices CN0566 Phaser, by pyadi-iio: ``phaser:ip:phaser.local``.             [shell]
+"""An Analog Devices CN0566 Phaser, by pyadi-iio: ``phaser:ip:phaser.local``.
 
-Eight elements on two ADAR1000, on receive. Phase, gain and attenuator of every element are written
-and then latched once: ``set_chan_phase``, ``set_chan_gain`` and ``set_all_gain`` of ``adi.CN0566``
-latch at each call, and are not used. Its own calibration is left out, since the service's is in the
-registers already. Which chip and channel an element has is ``adi.CN0566``'s own map; elements count
-from 1 there. It was never on the air: what is tested is its own class over attributes of a libiio
-that records.
+Eight elements on two ADAR1000, receive only. Phase, gain and attenuator of every element are
+written, then latched once: ``set_chan_phase``, ``set_chan_gain`` and ``set_all_gain`` of
+``adi.CN0566`` latch at each call, and are not used. Its own calibration is not applied, since the
+registers already include the service's. The map from elements to chips and channels is that of
+``adi.CN0566``, where elements count from 1. Never tested on hardware: the tests run its own class
+on a mock of libiio.
 """
 
 from typing import Any, Final
@@ -19,7 +19,7 @@ FULL_GAIN: Final = 127
 
 
 class Phaser:
-    """A Phaser, found by a URI of libiio."""
+    """A Phaser at a libiio URI."""
 
     takes = DeviceInput.REGISTERS
     lead_s = None
@@ -30,37 +30,37 @@ class Phaser:
         self._shown: dict[int, tuple[int, int, int]] = {}
 
     def check(self, safe: SafeState) -> None:
-        """It has them all."""
+        """Accept every safe state."""
         require(safe, tuple(SafeState), "a Phaser")
 
     def open(self) -> None:
-        """Connect and put it on receive. Raises ``UserError`` without pyadi-iio."""
+        """Connect and switch to receive. Raises ``UserError`` without pyadi-iio."""
         try:
             from adi import CN0566
-        except (ImportError, AttributeError, OSError) as error:  # OSError: no libiio beneath it
+        except (ImportError, AttributeError, OSError) as error:  # OSError: libiio is missing
             raise UserError(f"a Phaser needs pyadi-iio and libiio: {error}") from error
         try:
             self._phaser = CN0566(uri=self._uri)
             self._phaser.configure(device_mode="rx")
-        except Exception as error:  # pyadi-iio raises no other
+        except Exception as error:  # pyadi-iio raises plain exceptions
             raise DeviceError(f"no Phaser at {self._uri}: {error}") from error
         self._shown = {}
 
     def apply(self, command: DeviceCommand) -> None:
-        """Write what has changed, and latch once."""
+        """Write changed registers, and latch once."""
         assert command.registers is not None
         self._set(self.settings_of(command.registers))
 
     @staticmethod
     def settings_of(registers: IntArray) -> dict[int, tuple[int, int, int]]:
-        """Phase code, gain code and attenuator of each element. Raises ``UserError``."""
+        """Return phase code, gain code and attenuator of each element. Raises ``UserError``."""
         rows = registers[:, 2:6].tolist()
         if sorted(element for element, *_ in rows) != list(range(ELEMENTS)):
             raise UserError(f"a Phaser has {ELEMENTS} elements, the array has {len(rows)}")
         return {element: (phase, gain, off) for element, phase, gain, off in rows}
 
     def rest(self, safe: SafeState) -> None:
-        """Hold, look along boresight, or silence every element."""
+        """Hold, point to boresight, or mute every element."""
         match safe:
             case SafeState.BORESIGHT:
                 self._set(dict.fromkeys(range(ELEMENTS), (0, FULL_GAIN, 0)))
@@ -70,7 +70,7 @@ class Phaser:
                 pass
 
     def close(self) -> None:
-        """Let go of it."""
+        """Release the Phaser."""
         self._phaser = None
 
     def _set(self, wanted: dict[int, tuple[int, int, int]]) -> None:

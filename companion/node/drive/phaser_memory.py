@@ -1,9 +1,9 @@
-"""A CN0566 Phaser by its beam memory: ``phaser-memory:ip:phaser.local``.                  [shell]
+"""A CN0566 Phaser by its beam memory: ``phaser-memory:ip:phaser.local``.
 
-The codebook is stored once, at opening; an update then says no more than which position of the
-memory each channel uses, and latches once. Two positions are kept for the safe states. Channels are
-pointed one by one: ``common_mem_enable`` of ``adi.adar1000`` writes another attribute than its own.
-It was never on the air: what is tested is its own class over attributes of a libiio that records.
+The codebook is stored once, when the device is opened; an update then only selects the memory
+position of each channel, and latches once. Two positions are reserved for the safe states. Channels
+are selected one by one: ``common_mem_enable`` of ``adi.adar1000`` writes a wrong attribute. Never
+tested on hardware: the tests run its own class on a mock of libiio.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ MUTE: Final = POSITIONS - 1
 
 
 class PhaserMemory(Phaser):
-    """A Phaser whose memory holds a codebook, given as registers (8, 8) of each beam."""
+    """A Phaser whose memory contains a codebook, given as registers (8, 8) of each beam."""
 
     takes = DeviceInput.STORED
 
@@ -31,7 +31,7 @@ class PhaserMemory(Phaser):
         self._position: int | None = None
 
     def open(self) -> None:
-        """Connect, store the codebook and point the channels to the memory."""
+        """Connect, store the codebook and switch the channels to the memory."""
         super().open()
         kept = dict(enumerate(self._beams))
         kept[BORESIGHT] = dict.fromkeys(range(ELEMENTS), (0, FULL_GAIN, 0))
@@ -48,12 +48,12 @@ class PhaserMemory(Phaser):
         self._position = None
 
     def apply(self, command: DeviceCommand) -> None:
-        """Point all channels to a beam, and latch once."""
+        """Select a beam for all channels, and latch once."""
         assert command.stored is not None
         self._use(command.stored)
 
     def rest(self, safe: SafeState) -> None:
-        """Hold, look along boresight, or silence every element."""
+        """Hold, point to boresight, or mute every element."""
         if safe is not SafeState.HOLD:
             self._use(BORESIGHT if safe is SafeState.BORESIGHT else MUTE)
 

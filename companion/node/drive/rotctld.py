@@ -1,7 +1,7 @@
-"""A rotator behind hamlib's rotctld: ``rotctld:HOST:PORT``.                              [shell]
+"""A rotator behind hamlib's rotctld: ``rotctld:HOST:PORT``.
 
-Its protocol is lines of text (rotctld(1) of hamlib): ``P AZ EL`` points, ``p`` asks where it
-points, ``S`` stops; answers end with ``RPRT 0``, or another number for an error.
+Its protocol is lines of text (rotctld(1) of hamlib): ``P AZ EL`` points, ``p`` returns the
+direction, ``S`` stops; answers end with ``RPRT 0``, or another number for an error.
 """
 
 import math
@@ -18,7 +18,7 @@ TIMEOUT_S: Final = 2.0
 
 
 class Rotator:
-    """Commanded to where the UAV will be after its own lag, within its limits.
+    """A rotator, commanded to the direction of the UAV after its own lag, within its limits.
 
     Its boresight is azimuth and elevation 0.
     """
@@ -36,15 +36,15 @@ class Rotator:
 
     @property
     def lead_s(self) -> float:
-        """Its lag, as its own reports show it; 0 before it has moved."""
+        """Lag estimated from its reports; 0 before it has moved."""
         return self._lag.lag_s
 
     def check(self, safe: SafeState) -> None:
-        """A rotator radiates nothing that could be muted."""
+        """Reject muting: a rotator does not radiate."""
         require(safe, (SafeState.HOLD, SafeState.BORESIGHT), "a rotator")
 
     def open(self) -> None:
-        """Connect, and ask for its limits."""
+        """Connect, and read its limits."""
         try:
             self._socket = socket.create_connection(self._address, TIMEOUT_S)
         except OSError as error:
@@ -59,10 +59,10 @@ class Rotator:
         self._last_deg = self._where_deg()[0]
 
     def apply(self, command: DeviceCommand) -> None:
-        """Note where it points now, and point.
+        """Read its direction, and point.
 
-        Asked first: a rotator that begins its motion anew at each command has had the whole time
-        since the one before.
+        The direction is read first: a rotator that restarts its motion at each command has then had
+        the whole interval.
         """
         seen_deg = self._where_deg()[0]
         self._lag.note_report(self._now_ns(), math.radians(seen_deg))
@@ -71,20 +71,20 @@ class Rotator:
         self._lag.note_command(self._now_ns(), math.radians(azimuth_deg))
 
     def rest(self, safe: SafeState) -> None:
-        """Stop where it is, or go to its park position."""
+        """Stop, or go to boresight."""
         if safe is SafeState.HOLD:
             self._ask("+S")
         else:
             self._point(0.0, 0.0)
 
     def close(self) -> None:
-        """Hang up."""
+        """Disconnect."""
         if self._socket:
             self._socket.close()
             self._socket = None
 
     def _near(self, azimuth_deg: float) -> float:
-        """The same azimuth within its limits, by the shortest way where there are two."""
+        """Return the same azimuth within its limits, by the shortest way if there are two."""
         low, high, _, _ = self._limits_deg
         turns = [azimuth_deg + 360.0 * n for n in (-2, -1, 0, 1, 2)]
         within = [one for one in turns if low <= one <= high]
@@ -100,11 +100,11 @@ class Rotator:
         text = self._ask("+p")
         found = re.search(r"Azimuth:\s*(-?[\d.]+)\s+Elevation:\s*(-?[\d.]+)", text)
         if found is None:
-            raise DeviceError(f"rotctld does not say where it points: {text[:80]!r}")
+            raise DeviceError(f"rotctld reports no direction: {text[:80]!r}")
         return float(found[1]), float(found[2])
 
     def _ask(self, command: str) -> str:
-        """The answer to a command in the extended form, which ends with RPRT."""
+        """Return the answer to a command in the extended form, which ends with RPRT."""
         if self._socket is None:
             raise DeviceError("not connected")
         try:
@@ -112,13 +112,13 @@ class Rotator:
             while not (found := re.search(rb"RPRT (-?\d+)\n", self._unread)):
                 more = self._socket.recv(4096)
                 if not more:
-                    raise DeviceError("rotctld hung up")
+                    raise DeviceError("rotctld closed the connection")
                 self._unread += more
         except OSError as error:
             raise DeviceError(f"rotctld: {error}") from error
         text, self._unread = self._unread[: found.end()], self._unread[found.end() :]
         if found[1] != b"0":
-            raise DeviceError(f"rotctld refuses {command!r}: error {found[1].decode()}")
+            raise DeviceError(f"rotctld rejects {command!r}: error {found[1].decode()}")
         return text.decode(errors="replace")
 
 

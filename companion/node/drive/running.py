@@ -1,4 +1,4 @@
-"""A drive as a command, and beside a service.                                           [shell]"""
+"""A drive as a command, and inside a service."""
 
 import asyncio
 import signal
@@ -9,7 +9,7 @@ from typing import Final
 from companion.node.drive.loop import Drive, DriveStatus
 
 STATUS_EVERY_S: Final = 1.0
-ENDS_S: Final = 5.0  # time for a device to go to its safe state at the end
+ENDS_S: Final = 5.0  # time limit for a device to reach its safe state at the end
 
 
 def run_until_stopped(
@@ -17,7 +17,7 @@ def run_until_stopped(
 ) -> None:
     """Drive until SIGINT, SIGTERM or ``seconds`` have passed; ``show`` is called once a second.
 
-    Raises what ended the drive.
+    Raises the exception that ended the drive.
     """
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -42,7 +42,7 @@ def run_until_stopped(
 
 
 async def run_in_thread(drive: Drive) -> None:
-    """Drive on a thread until cancelled; raises what ended it."""
+    """Drive on a thread until cancelled; raises the exception that ended the drive."""
     stop, failed = threading.Event(), list[BaseException]()
     loop, ended = asyncio.get_running_loop(), asyncio.Event()
 

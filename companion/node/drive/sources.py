@@ -1,4 +1,4 @@
-"""Where a drive takes its beams: a service over HTTP, or the one of this process.        [shell]"""
+"""Sources of a drive's beams: a service over HTTP, or the pipeline of this process."""
 
 import asyncio
 import math
@@ -25,18 +25,18 @@ from companion.views.as_json import as_json
 from companion.views.quantised import device_table
 
 ADAR1000: Final = WeightFormat.ADAR1000.media_type
-LEAST_MEAN: Final = 0.1  # length of the mean of unit directions below which they have no middle
-ANSWERS_S: Final = 5.0  # time after which an event loop that does not answer is lost
+LEAST_MEAN: Final = 0.1  # length of the mean of unit directions below which it is undefined
+ANSWERS_S: Final = 5.0  # timeout for an answer of the event loop
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamRequest:
-    """Whom to follow: the first of these that has a beam, else anybody if so; and for what.
+    """UAVs to follow: the first of these that has a beam, else any UAV if ``anybody``.
 
-    centre        a mount looks at the middle of all of them instead
-    stored_beams  size of the codebook that the device holds; None: it holds none
+    centre        a mount points at the centre of all of them instead
+    stored_beams  size of the codebook in the device; None: it has none
 
-    Raises ``UserError`` for a beam that is asked to look at a middle.
+    Raises ``UserError`` if an array is to point at a centre.
     """
 
     uavs: tuple[str, ...]
@@ -47,18 +47,18 @@ class BeamRequest:
 
     def __post_init__(self) -> None:
         if self.centre and self.takes is not DeviceInput.POINTING:
-            raise UserError('only a mount looks at the centre of several: aim = "first"')
+            raise UserError('aim = "centre" works only for a mount; set aim = "first"')
 
 
 class OverHttp:
-    """Beams of a service elsewhere."""
+    """Beams of a service over HTTP."""
 
     def __init__(self, client: Client, wanted: BeamRequest) -> None:
         self._client = client
         self._wanted = wanted
 
     def ask(self, lead_s: float) -> DeviceCommand:
-        """What is to be applied so long from now, in two questions for one moment at most."""
+        """Return the command for this time from now; takes at most two requests."""
         lead_ms = min(max(lead_s, 0.0), 10.0) * 1e3
         valid_at_ns = time.time_ns() + round(lead_ms * 1e6)
         try:
@@ -76,7 +76,7 @@ class OverHttp:
 
 
 class OfThisProcess:
-    """Beams of the pipeline of this process, which lives on an event loop."""
+    """Beams of the pipeline of this process, which runs on an event loop."""
 
     def __init__(
         self,
@@ -94,12 +94,12 @@ class OfThisProcess:
         self._wanted = wanted
 
     def ask(self, lead_s: float) -> DeviceCommand:
-        """What is to be applied so long from now: made on the loop, worded here."""
+        """Return the command for this time from now; only the beams come from the loop."""
         asked = asyncio.run_coroutine_threadsafe(self._look(lead_s), self._loop)
         try:
             update = asked.result(ANSWERS_S)
         except (TimeoutError, asyncio.CancelledError) as error:
-            raise SourceLostError("it does not answer") from error
+            raise SourceLostError("timeout") from error
         return shot_of(self._pipeline, self._equipment, update, self._wanted)
 
     async def _look(self, lead_s: float) -> Update:
@@ -109,7 +109,7 @@ class OfThisProcess:
 def shot_of(
     pipeline: Pipeline, equipment: Equipment, update: Update, wanted: BeamRequest
 ) -> DeviceCommand:
-    """What is to be applied of one update. Only the beam that is wanted is fitted to the device."""
+    """Return the command from one update. Only the requested beam is fitted to the device."""
     beams, text = update.beams, None
     uav = followed_uavs(beams.uavs, wanted)
     if update.unfit is None and uav is not None and wanted.takes is DeviceInput.REGISTERS:
@@ -133,13 +133,13 @@ def shot_of(
 
 
 def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
-    """The registers (M, 8) of each beam of the codebook. Raises ``UserError`` where there is none.
+    """Return the registers (M, 8) of each beam of the codebook. Raises ``UserError`` without one.
 
-    Each is fitted towards where it is strongest.
+    Each is fitted towards its direction of largest gain.
     """
     codebook = equipment.codebook
     if codebook is None:
-        raise UserError('there are no stored beams: [codebook] kind = "dft", or "file"')
+        raise UserError('[codebook]: no stored beams; set kind = "dft" or kind = "file"')
     wanted = [
         tables.WantedBeam(
             uav=str(k),
@@ -156,7 +156,7 @@ def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
 
 
 def followed_uavs(uavs: Collection[str], wanted: BeamRequest) -> str | None:
-    """Who of those that have beams is served; None where nobody is."""
+    """Return the UAV to serve of those that have beams; None if there is none."""
     uav = next((one for one in wanted.uavs if one in uavs), None)
     return next(iter(uavs), None) if uav is None and wanted.anybody else uav
 
@@ -164,7 +164,7 @@ def followed_uavs(uavs: Collection[str], wanted: BeamRequest) -> str | None:
 def command_for(
     told: dict[str, Any], text: str | None, wanted: BeamRequest, valid_at_ns: int
 ) -> DeviceCommand:
-    """The command for the requested UAV, from an answer of the API."""
+    """Return the command for the requested UAV, from an answer of the API."""
     if told["unfit"] is not None:
         return DeviceCommand(valid_at_ns=valid_at_ns, unfit=str(told["unfit"]))
     named = {beam["uav"]: beam for beam in told["beams"]}
@@ -184,7 +184,8 @@ def command_for(
         size = told["codebook_beams"]
         if size is None or wanted.stored_beams not in (None, size):
             return DeviceCommand(
-                valid_at_ns=valid_at_ns, unfit="the service has another codebook, or none"
+                valid_at_ns=valid_at_ns,
+                unfit="codebook of the service differs from --config, or is missing",
             )
         stored = beam["codebook"]["best"]
     return DeviceCommand(
@@ -200,7 +201,7 @@ def command_for(
 
 
 def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> DeviceCommand:
-    """The mean direction of these beams, and the mean of their places, which are near together."""
+    """Return the mean direction of these beams, and the mean of their positions."""
     bearing = np.radians([beam["bearing_deg"] for beam in beams])
     above = np.radians([beam["above_horizon_deg"] for beam in beams])
     level = np.cos(above)
@@ -211,7 +212,8 @@ def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> DeviceCommand:
     if math.hypot(north, east, up) < LEAST_MEAN * len(beams):
         return DeviceCommand(
             valid_at_ns=valid_at_ns,
-            unfit="they are all around: their mean direction is undefined; follow fewer UAVs",
+            unfit="mean direction of the UAVs is undefined, as they surround the array; follow"
+            " fewer UAVs",
         )
     lat_deg, alt_m = (
         statistics.fmean(beam[name] for beam in beams) for name in ("lat_deg", "alt_m")
@@ -230,7 +232,7 @@ def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> DeviceCommand:
 
 
 def registers_of(text: str, uav: str) -> IntArray:
-    """The registers (M, 8) of one UAV's beam in the text for ADAR1000; empty where it has none."""
+    """Return the registers (M, 8) of a UAV's beam in an ADAR1000 text; empty without a beam."""
     rows = [line.split(",") for line in text.splitlines()[1:]]
     return np.array(
         [

@@ -1,18 +1,18 @@
-"""What a drive can be told to drive; a device's file is loaded when it is asked for.      [shell]
+"""Targets of a drive; a device's module is loaded on first use.
 
     rotctld:HOST:PORT       a rotator behind hamlib's rotctld
     gimbal:HOST:PORT:SYSID:COMPID
                             a gimbal, by MAVLink's gimbal manager over UDP
     gimbal-roi:HOST:PORT:SYSID:COMPID
-                            the same, told places instead of directions
+                            the same, with positions instead of directions
     phaser:URI              an Analog Devices CN0566 (ip:phaser.local), by pyadi-iio
-    phaser-memory:URI       the same by its beam memory, which holds the codebook
+    phaser-memory:URI       the same by its beam memory, which contains the codebook
     adar1000:BUS.DEVICE...  ADAR1000 chips on Linux's SPI, in the order of the table's chips
-    none:pointing           nothing: a dry run prints what would be sent
-    none:adar1000           the same of registers
-    none:stored             the same of the codebook's beams
+    none:pointing           no device: a dry run prints the commands
+    none:adar1000           the same with registers
+    none:stored             the same with beams of the codebook
 
-IPv6 hosts stand in brackets.
+IPv6 hosts are in brackets.
 """
 
 import difflib
@@ -38,10 +38,10 @@ _GIMBAL: Final = re.compile(r"(.+):(\d{1,5}):(\d{1,3}):(\d{1,3})")
 def device(
     target: str, say: Callable[[str], None], codebook: Callable[[], Sequence[IntArray]]
 ) -> Device:
-    """The device of a target. Raises ``UserError``.
+    """Return the device of a target. Raises ``UserError``.
 
-    say       gets what a dry run would send
-    codebook  gives the registers (M, 8) of each stored beam; called where they are needed
+    say       prints the commands of a dry run
+    codebook  returns the registers (M, 8) of each stored beam; called if they are needed
     """
     kind, _, where = target.partition(":")
     match kind:
@@ -78,11 +78,11 @@ def device(
         raise UserError(f"{target!r} is not {FORMS[kind]}")
     near = difflib.get_close_matches(kind, FORMS, 1)
     meant = f"; did you mean {FORMS[near[0]]}?" if near else ""
-    raise UserError(f"{target!r} is none of {', '.join(FORMS.values())}{meant}")
+    raise UserError(f"{target!r} is unknown; give {', '.join(FORMS.values())}{meant}")
 
 
 class DryRun:
-    """A device that takes everything and only says it."""
+    """A device that accepts and prints every command."""
 
     lead_s = None
 
@@ -91,13 +91,13 @@ class DryRun:
         self._say = say
 
     def check(self, safe: SafeState) -> None:
-        """Any state will do."""
+        """Accept every safe state."""
 
     def open(self) -> None:
-        """There is nothing to open."""
+        """Do nothing."""
 
     def apply(self, shot: DeviceCommand) -> None:
-        """Say what would be sent."""
+        """Print the command."""
         if shot.stored is not None:
             self._say(f"{shot.uav}: stored beam {shot.stored}")
             return
@@ -110,8 +110,8 @@ class DryRun:
         self._say(f"{shot.uav}: element:phase/gain {' '.join(sets)}")
 
     def rest(self, safe: SafeState) -> None:
-        """Say where it would go."""
+        """Print the safe state."""
         self._say(f"safe state: {safe}")
 
     def close(self) -> None:
-        """There is nothing to close."""
+        """Do nothing."""

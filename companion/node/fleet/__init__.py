@@ -1,1 +1,1 @@
-"""This node's place in a fleet, over Zenoh."""
+"""A live node of a fleet, over Zenoh."""

@@ -1,29 +1,30 @@
-"""Nodes that are there and do not answer: their connection carries one way only.
+"""Nodes that are present but do not answer, because a connection works in one direction only.
 
-Seen with Zenoh 1.10 and two links to a neighbour, reliable and not: after a parting, one end may
-join a new link to what it still holds of the old ones, which the other end has given up. What one
-says the other then never hears, and neither finds out: signs of life come. Questions for a node's
-clock find out. Only a new session heals it.
+Seen with Zenoh 1.10 and two links to a neighbour, one reliable and one not. After a disconnection,
+one end may join a new link to the remains of the old ones, which the other end has dropped. Its
+messages are then lost, and neither end notices, since liveliness tokens still arrive. Clock
+requests detect this. Only a new session fixes it.
 """
 
 from collections.abc import Mapping
 from typing import Final
 
 MOST_NS: Final = 60_000_000_000
-"""Time between two sessions that is enough: a node that never answers, or names that somebody makes
-up, must not cost the others theirs.
+"""Limit on the time between two sessions.
+
+A node that never answers, or forged names, must not cost the others their sessions.
 """
 CALM_NS: Final = 600_000_000_000
-"""Time after a new session after which the next one may come as soon as the first."""
+"""Time after a new session after which the interval to the next one is reset."""
 HELD_UP_NS: Final = 3_000_000_000
-"""Time without a look after which this process was held up, and answers may wait for it."""
+"""Time without a check after which this process was suspended, and answers may still be queued."""
 
 
 class Unanswered:
-    """Since when questions to other nodes have had no answer.
+    """Start of the unanswered requests to each node.
 
-    A node may be silent for ``patience_ns``. From one new session to the next it is twice that at
-    least, and twice as long each time. ``alive`` are the nodes that show signs of life.
+    A node may be silent for ``patience_ns``. The time between two new sessions is at least twice
+    that, and doubles each time. ``alive`` are the nodes with a liveliness token.
     """
 
     def __init__(self, patience_ns: int) -> None:
@@ -35,22 +36,22 @@ class Unanswered:
         self._looked_ns: int | None = None
 
     def asked(self, now_ns: int, node: str) -> None:
-        """A node is asked."""
+        """Note a request to a node."""
         self._since.setdefault(node, now_ns)
 
     def answered(self, node: str) -> None:
-        """A node answered."""
+        """Note an answer of a node."""
         self._since.pop(node, None)
 
     def gone(self, now_ns: int, heard_ns: Mapping[str, int]) -> list[str]:
-        """Nodes that have shown nothing for long; ``heard_ns`` is when each was heard last."""
+        """Return nodes without a recent message; ``heard_ns``: time of each node's last one."""
         before_ns = now_ns - self._patience_ns
         return [n for n, at_ns in heard_ns.items() if n not in self.alive and at_ns < before_ns]
 
     def mute(self, now_ns: int, heard_ns: Mapping[str, int]) -> list[str]:
-        """Nodes that are there and have not answered for too long. All are waited for anew then.
+        """Return nodes that are present but have not answered for too long; then restart all waits.
 
-        There is who shows signs of life, or was heard since half of the patience.
+        A node is present if it has a liveliness token, or sent a message within half the patience.
         """
         if self._looked_ns is not None and now_ns - self._looked_ns > HELD_UP_NS:
             self._since.clear()

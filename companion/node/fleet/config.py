@@ -1,4 +1,4 @@
-"""What the settings of a fleet say of its Zenoh session."""
+"""Configuration of the Zenoh session from the settings of a fleet."""
 
 from pathlib import Path
 
@@ -8,20 +8,20 @@ from companion.settings.section import ConfigError
 
 
 def bus_config(settings: FleetSettings) -> BusConfig:
-    """What the settings say of the Zenoh session. Raises ``ConfigError``."""
+    """Return the configuration of the Zenoh session. Raises ``ConfigError``."""
     tls = None
     if settings.ca is not None:
         if settings.certificate is None or settings.key is None:
-            raise ConfigError("fleet.ca: a certificate and its key are needed as well")
+            raise ConfigError("fleet.ca: set fleet.certificate and fleet.key as well")
         tls = BusTls(
             ca=Path(settings.ca),
             certificate=Path(settings.certificate),
             private_key=Path(settings.key),
         )
     elif settings.certificate is not None or settings.key is not None:
-        raise ConfigError("fleet.certificate: fleet.ca is needed as well")
+        raise ConfigError("fleet.certificate: set fleet.ca as well")
     if settings.mode == "client" and not settings.connect:
-        raise ConfigError("fleet.connect: a client needs a router to connect to")
+        raise ConfigError("fleet.connect is empty; a client needs the address of a router")
     return BusConfig(
         mode=settings.mode,
         listen=settings.listen if settings.mode == "peer" else (),

@@ -1,4 +1,4 @@
-"""Listening to reports and offers of those nodes that are near, and of no others.        [shell]"""
+"""Subscriptions to the reports and offers of near nodes only."""
 
 from collections.abc import Callable
 
@@ -8,9 +8,9 @@ Take = Callable[[str, bytes], None]
 
 
 class Listening:
-    """What is subscribed to, by node. ``base`` is the site's key.
+    """Subscriptions by node. ``base`` is the site's key.
 
-    ``heard`` and ``offered`` are called with the key and the payload of what is said.
+    ``heard`` and ``offered`` are called with the key and the payload of a sample.
     """
 
     def __init__(self, *, bus: Bus, base: str, heard: Take, offered: Take) -> None:
@@ -20,7 +20,7 @@ class Listening:
         self._ends: dict[str, list[Callable[[], None]]] = {}
 
     def to(self, nodes: frozenset[str]) -> None:
-        """Listen to these nodes from now on."""
+        """Subscribe to these nodes, and to no others."""
         for node in nodes - self._ends.keys():
             self._ends[node] = [
                 self._bus.subscribe(f"{self._base}/{node}/{what}", take)

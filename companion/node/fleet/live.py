@@ -1,8 +1,8 @@
-"""The live node in a fleet: Zenoh on one side, ``FleetMember`` and pipeline on the other.  [shell]
+"""The live node of a fleet: connects Zenoh with ``FleetMember`` and the pipeline.
 
-What is said, how often and under which keys is described in docs/fleet.md.
+docs/fleet.md describes the messages, their rates and their keys.
 
-Over 300 lines: all that is said and heard meets here, the pipeline on one side, keys on the other.
+Over 300 lines: all messages meet here, between the pipeline and Zenoh's keys.
 """
 
 import asyncio
@@ -28,28 +28,28 @@ from companion.views.served import FleetStatus
 
 PREFIX: Final = "companion"
 PRIORITY: Final = "data_high"
-STANDING_S: Final = 0.2  # time between two words of this node on what it does
-ASKED_S: Final = 0.5  # time between two questions for another node's clock
-ANSWERED_S: Final = 3.0  # longest time that an answer may take
+STANDING_S: Final = 0.2  # time between two standings
+ASKED_S: Final = 0.5  # time between two requests for another node's clock
+ANSWERED_S: Final = 3.0  # timeout of an answer
 PATIENCE_S: Final = 6.0
-"""Least time without answers of a node that is there, after which all is connected anew."""
-RETRY_S: Final = 2.0  # time after which a session that could not be opened again is tried once more
-PATIENCE_LEASES: Final = 4.0  # the least such time in leases
+"""Least time without answers from a node that is present, after which the session is renewed."""
+RETRY_S: Final = 2.0  # time between two attempts to reopen a session
+PATIENCE_LEASES: Final = 4.0  # the same limit in leases
 LOOK_S: Final = 0.3
-"""Time between two looks at what to offer; its multiples are not those of updates."""
-OFFERED_S: Final = 1.0  # time between two tellings of offers, and of tracks
+"""Time between two batches of offers, out of step with the updates."""
+OFFERED_S: Final = 1.0  # time between two messages of offers, and of tracks
 
 
 class LiveFleetNode:
-    """This node among others. ``open`` blocks; ``run`` serves until cancelled.
+    """This node in a fleet. ``open`` blocks; ``run`` serves until cancelled.
 
         settings  [fleet], with a name
-        pipeline  what is shared and what is decided is about it
+        pipeline  pipeline of this node
         step      takes events for the pipeline
         notify    takes messages for the operator
         now_ns    the node's timeline
 
-    Raises ``ConfigError`` for settings that do not make sense together.
+    Raises ``ConfigError`` for inconsistent settings.
     """
 
     def __init__(
@@ -81,28 +81,28 @@ class LiveFleetNode:
         )
         self._around = Surroundings(pipeline, self.member)
         self._offers = Offers(pipeline, self.member.reception.silent_s)
-        self._session: Any = None  # of a peer, opened before there was a loop
-        self._bus: Bus | None = None  # once all is declared
+        self._session: Any = None  # session of a peer, opened before the loop runs
+        self._bus: Bus | None = None  # set after all declarations
         self._flushing: asyncio.TimerHandle | None = None
-        self._flush_ns = 0  # when that is due
+        self._flush_ns = 0  # due time of the flush
         self._has_twin = False
         self._listening: Listening | None = None
         patience_s = max(PATIENCE_S, PATIENCE_LEASES * settings.lease_s)
         self._unanswered = Unanswered(round(patience_s * 1e9))
 
-    # --- while it runs ----------------------------------------------------------------------
+    # --- life cycle -------------------------------------------------------------------------
 
     def open(self) -> None:
-        """Claim what can be had before the loop runs; blocks.
+        """Open the session of a peer before the loop runs; blocks.
 
-        Raises ``UserError`` where Zenoh or an endpoint cannot be had. A client's session needs its
-        router, for which nobody waits here.
+        Raises ``UserError`` if Zenoh or an endpoint is unavailable. A client's session needs its
+        router, which is not waited for here.
         """
         if self.settings.mode == "peer":
             self._session = open_peer(self._config)
 
     async def run(self) -> None:
-        """Take part until cancelled; a client that cannot says so, and serves alone."""
+        """Take part until cancelled; a client that cannot connect reports it, and serves alone."""
         has_taken_part = False
         while True:
             try:
@@ -119,10 +119,10 @@ class LiveFleetNode:
                 )
                 if not has_taken_part:
                     return
-                await asyncio.sleep(RETRY_S)  # what was this node's own until now is free again
+                await asyncio.sleep(RETRY_S)  # this node's former endpoints are free by then
 
     async def _take_part(self) -> None:
-        """Take part over one session, until it has to be another (``answering.py``)."""
+        """Take part with one session, until it must be renewed (``answering.py``)."""
         bus = Bus(self._config, asyncio.get_running_loop(), self._session)
         try:
             if self._session is None:
@@ -150,13 +150,13 @@ class LiveFleetNode:
             await asyncio.to_thread(bus.close)
 
     def _is_link_one_way(self, now_ns: int) -> bool:
-        """Whether a node is there, and does not answer; tells who is not there any more."""
+        """Return whether a present node does not answer; removes nodes that left."""
         heard_ns = {node: known.heard_ns for node, known in self.member.neighbours.items()}
         for node in self._unanswered.gone(now_ns, heard_ns):
             self._tell(self.member.node_left(now_ns, node))
         mute = self._unanswered.mute(now_ns, heard_ns)
         if mute:
-            text = f"no answer from {', '.join(mute)}, all nodes are connected anew"
+            text = f"no answer from {', '.join(mute)}; reconnecting to all nodes"
             self._notify(Notice(t_ns=now_ns, severity=Severity.WARNING, subject="fleet", text=text))
         return bool(mute)
 
@@ -166,7 +166,7 @@ class LiveFleetNode:
             await asyncio.sleep(period_s)
 
     async def _make_offers(self) -> None:
-        """Look what to offer, some UAVs at a time; what takes long is done off the loop."""
+        """Compute offers, some UAVs at a time, off the loop."""
         while True:
             make = self._offers.look(self._now_ns())
             if make is not None:
@@ -186,12 +186,12 @@ class LiveFleetNode:
     def _time(self, key: str, payload: bytes) -> bytes:
         return messages.CLOCK.pack(self._started_ns, self._now_ns())
 
-    # --- what this node hears itself, and decides -------------------------------------------
+    # --- own input and decisions ------------------------------------------------------------
 
     def on_event(self, event: Event) -> None:
-        """Take in what came over this node's own links, before the pipeline has it.
+        """Take in an event of this node's own links, before the pipeline.
 
-        What this node speaks for is told at once, unless something was told just now.
+        Frames for which this node is the speaker are published at once, within the rate limit.
         """
         now_ns = self._now_ns()
         if isinstance(event, Frame):
@@ -204,11 +204,11 @@ class LiveFleetNode:
             self._publish_received(now_ns)
 
     def ticked(self, now_ns: int) -> None:
-        """Decide whom this node serves. Call it at every update, after the pipeline had it."""
+        """Decide which UAVs this node serves. Call it after every update of the pipeline."""
         duty, notices = self.member.decide(now_ns)
         if duty is not None:
             self._step(duty)
-            self._stand(now_ns)  # at once: whom it took from another is served by two until then
+            self._stand(now_ns)  # at once: until then two nodes serve a UAV that was handed over
         self._tell(notices)
 
     def _publish_received(self, now_ns: int) -> None:
@@ -230,10 +230,10 @@ class LiveFleetNode:
         self._flushing = None
         self._publish_received(self._now_ns())
 
-    # --- what it says -----------------------------------------------------------------------
+    # --- output -----------------------------------------------------------------------------
 
     def _key(self, what: str, node: str | None = None) -> str:
-        """The key of what a node publishes; None: of what this node does."""
+        """Return the key under which a node publishes; None: this node."""
         return f"{PREFIX}/{self.settings.site}/{node or self.name}/{what}"
 
     def _put(
@@ -252,7 +252,7 @@ class LiveFleetNode:
             self._listening.to(self.member.near)
 
     def _offer(self, now_ns: int) -> None:
-        """Tell this node's offers and the tracks of those it serves, and look for phantoms."""
+        """Publish this node's offers and the tracks that it serves, and check for phantoms."""
         offers = dict(self._offers.made)
         self.member.set_offers(offers)
         self._put("offers", messages.offers(offers))
@@ -282,7 +282,7 @@ class LiveFleetNode:
             self._bus.ask(key, b"", ANSWERED_S, self._reading(node, self._now_ns()))
 
     def _reading(self, node: str, sent_ns: int) -> Callable[[bytes, int], None]:
-        """What takes the answer to a question that is sent now."""
+        """Return the callback for the answer to a request sent now."""
 
         def take(answer: bytes, arrived_ns: int) -> None:
             self._unanswered.answered(node)
@@ -295,10 +295,10 @@ class LiveFleetNode:
 
         return take
 
-    # --- what it hears of others ------------------------------------------------------------
+    # --- input from other nodes -------------------------------------------------------------
 
     def _node(self, key: str) -> str | None:
-        """The node that a key is of; None, and counted, where its name is none."""
+        """Return the node of a key; None for an invalid name, which is counted."""
         node = key.split("/")[-2]
         if is_node_name(node):
             return node
@@ -306,7 +306,7 @@ class LiveFleetNode:
         return None
 
     def _taking(self, take: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
-        """What takes samples of other nodes, counts them, and refuses those that are none."""
+        """Return a callback that passes valid samples of other nodes on, and counts the others."""
 
         def taken(key: str, payload: bytes) -> None:
             node = self._node(key)
@@ -335,7 +335,7 @@ class LiveFleetNode:
         self.member.take_standing(now_ns, said)
         serves = self.member.duties.serves
         if self.member.trust.is_trusted(node) and any(uav in serves for uav, _ in said.serves):
-            self.ticked(now_ns)  # one of them is to let go
+            self.ticked(now_ns)  # one of both nodes must drop it
 
     def _offered(self, node: str, payload: bytes) -> None:
         self.member.take_offers(self._now_ns(), node, messages.to_offers(payload))
@@ -350,7 +350,7 @@ class LiveFleetNode:
             return
         self._unanswered.alive.add(node)
         if node not in self.member.neighbours:
-            text = f"node {node} is there"
+            text = f"node {node} connected"
             now_ns = self._now_ns()
             self.member.node_joined(now_ns, node)
             self._notify(
@@ -361,7 +361,7 @@ class LiveFleetNode:
         if self._has_twin:
             return
         self._has_twin = True
-        text = f"another node says that it is {self.name} too: give each a name of its own"
+        text = f"another node is also named {self.name}; set a unique `[fleet] node` on each"
         self._notify(
             Notice(t_ns=self._now_ns(), severity=Severity.ERROR, subject="fleet", text=text)
         )
@@ -370,10 +370,10 @@ class LiveFleetNode:
         for notice in notices:
             self._notify(notice)
 
-    # --- what it knows ----------------------------------------------------------------------
+    # --- state ------------------------------------------------------------------------------
 
     def status(self) -> FleetStatus:
-        """This node's place in the fleet."""
+        """Return this node's state in the fleet."""
         return FleetStatus(
             member=self.member,
             site=self.settings.site,

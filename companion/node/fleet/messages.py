@@ -1,8 +1,7 @@
-"""What nodes tell one another, as protobuf described like a recording's messages.          [shell]
+"""Messages between nodes: protobuf, with the same descriptions as a recording's messages.
 
-Version 1 of the contract in docs/fleet.md: fields are added, and the number of one that is gone is
-never used again. What comes from others is read with limits, and anything that is no such message
-is a ``FleetMessageError``.
+Version 1 of the contract in docs/fleet.md: fields are added, and the number of a removed one is
+never reused. Received messages are parsed with limits; invalid ones raise ``FleetMessageError``.
 """
 
 import math
@@ -14,20 +13,20 @@ from google.protobuf.message import DecodeError
 from companion.recording import fields, schemas
 from companion.values import Offer, RoundTrip, Shared, SharedFrame, Standing
 
-FRAMES_MAX: Final = 4096  # most frames, or round trips, of one message
+FRAMES_MAX: Final = 4096  # limit on frames, and on round trips, in one message
 CLOCK: Final = struct.Struct("<qq")
-"""Answer to a question for the clock: when the node started, and its time now; ns."""
+"""Answer to a clock request: start of the node, and its present time; ns."""
 OFFERS_MAX: Final = 10_000
 NAME_MAX: Final = 64
 _LATEST_NS: Final = 1 << 62
 
 
 class FleetMessageError(ValueError):
-    """Bytes that are none of these messages, or that say what cannot be."""
+    """Malformed message, or one with impossible values."""
 
 
 def shared(said: Shared) -> bytes:
-    """What a node heard of late. Frames bear the nanoseconds since the first one."""
+    """Encode recently received frames. Frames have nanoseconds since the first one."""
     message = schemas.SharedMessage()
     first_ns = min((frame.heard_ns for frame in said.frames), default=0)
     message.first_ns, message.told_ns = first_ns, said.told_ns
@@ -39,23 +38,23 @@ def shared(said: Shared) -> bytes:
 
 
 def to_shared(data: bytes) -> Shared:
-    """Read what another node heard. Raises ``FleetMessageError``."""
+    """Decode another node's frames. Raises ``FleetMessageError``."""
     try:
         message = schemas.SharedMessage.FromString(data)
     except DecodeError as error:
-        raise FleetMessageError("no message of frames") from error
+        raise FleetMessageError("malformed message of frames") from error
     if len(message.frame) > FRAMES_MAX or len(message.trip) > FRAMES_MAX:
-        raise FleetMessageError("too many frames at once")
+        raise FleetMessageError("too many frames in one message")
     first_ns = message.first_ns
     frames = tuple(SharedFrame(_time(first_ns + one.after_ns), one.raw) for one in message.frame)
     trips = tuple(fields.value_of(RoundTrip, one) for one in message.trip)
     if any(max(trip.source) > 255 or max(trip.t_ns, trip.sent_ns) > _LATEST_NS for trip in trips):
-        raise FleetMessageError("a round trip with nobody")
+        raise FleetMessageError("round trip with an invalid source or time")
     return Shared(_time(message.told_ns), frames, trips)
 
 
 def standing(said: Standing) -> bytes:
-    """What a node says of itself."""
+    """Encode a node's standing."""
     message = schemas.StandingMessage(
         node=said.node, place=said.place or (), reach_m=said.reach_m, most=said.most
     )
@@ -68,15 +67,15 @@ def standing(said: Standing) -> bytes:
 
 
 def to_standing(data: bytes, node: str) -> Standing:
-    """Read what a node says of itself, under its own key. Raises ``FleetMessageError``."""
+    """Decode a node's standing, received under its own key. Raises ``FleetMessageError``."""
     try:
         message = schemas.StandingMessage.FromString(data)
     except DecodeError as error:
-        raise FleetMessageError("no message of a node") from error
+        raise FleetMessageError("malformed standing") from error
     if message.node != node:
-        raise FleetMessageError(f"it speaks for {message.node[:NAME_MAX]!r}")
+        raise FleetMessageError(f"name in the message differs: {message.node[:NAME_MAX]!r}")
     if len(message.serves) > OFFERS_MAX or len(message.handing) > OFFERS_MAX:
-        raise FleetMessageError("more UAVs than there can be")
+        raise FleetMessageError("too many UAVs in one message")
     place = tuple(message.place)
     if len(place) not in (0, 3) or not all(map(math.isfinite, place)):
         raise FleetMessageError("invalid place")
@@ -92,7 +91,7 @@ def to_standing(data: bytes, node: str) -> Standing:
 
 
 def offers(said: dict[str, Offer]) -> bytes:
-    """A node's offers, all of them."""
+    """Encode all offers of a node."""
     message = schemas.OffersMessage()
     message.offer.extend(schemas.message("Offer", one) for one in said.values())
     found: bytes = message.SerializeToString()
@@ -100,13 +99,13 @@ def offers(said: dict[str, Offer]) -> bytes:
 
 
 def to_offers(data: bytes) -> tuple[Offer, ...]:
-    """Read another node's offers. Raises ``FleetMessageError``."""
+    """Decode another node's offers. Raises ``FleetMessageError``."""
     try:
         message = schemas.OffersMessage.FromString(data)
     except DecodeError as error:
-        raise FleetMessageError("no message of offers") from error
+        raise FleetMessageError("malformed message of offers") from error
     if len(message.offer) > OFFERS_MAX:
-        raise FleetMessageError("more offers than there can be")
+        raise FleetMessageError("too many offers in one message")
     names = ("sure_db", "likely_db", "sinr_db", "heard_s")
     return tuple(
         Offer(
@@ -125,7 +124,7 @@ def _time(t_ns: int) -> int:
 
 def _number(value: float) -> float:
     if not math.isfinite(value) or abs(value) > 1e9:
-        raise FleetMessageError(f"{value} where a number is wanted")
+        raise FleetMessageError(f"number {value} is out of range")
     return value
 
 

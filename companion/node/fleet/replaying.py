@@ -1,7 +1,7 @@
-"""Recordings of a fleet's nodes, replayed together: their digests, and who served whom.    [shell]
+"""Recordings of a fleet's nodes, replayed together: their digests, and the UAVs that each served.
 
-Each recording holds all that its node used, what others told it included, so that each is replayed
-by itself. What is seen together is who served whom, on the nodes' own clocks.
+Each recording contains all input of its node, including frames from other nodes, so that each is
+replayed by itself. The assignment of UAVs to nodes is compared on the nodes' own clocks.
 """
 
 from bisect import bisect_right
@@ -17,7 +17,7 @@ from companion.settings.section import ConfigError
 from companion.values import Duty, Frame
 
 PROGRESS_EVERY: Final = 20_000  # frames between two calls of progress
-SAMPLE_NS: Final = 100_000_000  # time between two looks at who serves whom
+SAMPLE_NS: Final = 100_000_000  # sampling interval of the assignment
 
 
 @dataclass(slots=True, kw_only=True)
@@ -35,7 +35,7 @@ class NodeRun:
     duties: list[Duty] = field(default_factory=list)
 
     def serves(self, t_ns: int) -> tuple[str, ...]:
-        """Whom the node serves at a time."""
+        """Return the UAVs that the node serves at a time."""
         past = bisect_right(self.duties, t_ns, key=lambda duty: duty.t_ns)
         return self.duties[past - 1].serves if past else ()
 
@@ -43,11 +43,11 @@ class NodeRun:
 def replay(
     logs: Sequence[Path], progress: Callable[[int, float, float], None] | None = None
 ) -> dict[str, Any]:
-    """Replay each node's recording, and sum up, as ``companion replay --fleet --json`` prints it.
+    """Replay each node's recording; return the summary of ``companion replay --fleet --json``.
 
     Several recordings of a node are the parts of one run. ``progress`` is as for
-    ``companion.node.replay.replay``. Raises ``LogError`` for a log that is no node's recording, or
-    where two of one node are not of one run.
+    ``companion.node.replay.replay``. Raises ``LogError`` for a log that is not a node's recording,
+    or if two of one node are from different runs.
     """
     by_node: dict[str, list[Path]] = {}
     for log in logs:
@@ -76,18 +76,20 @@ def _name(log: Path) -> str:
         recorded = read_settings(log)
         text = recorded.text if recorded else ""
         name = sections(text, str(log)).get("fleet", {}).get("node")
-    except (AttributeError, ConfigError):  # "fleet" may be anything in what others wrote
+    except (AttributeError, ConfigError):  # "fleet" may be anything in a foreign recording
         name = None
     if not isinstance(name, str):
-        raise LogError(f"{log}: not a recording of a fleet's node: it has no [fleet] node")
+        raise LogError(f"{log}: not a recording of a fleet's node: no [fleet] node in it")
     return name
 
 
 def _one_run(name: str, logs: list[Path]) -> list[Path]:
-    """The recordings of one node in their order. Raises ``LogError`` where they are of two runs."""
+    """Return the recordings of one node in order. Raises ``LogError`` if they are from two runs."""
     ordered = logs if len(logs) == 1 else replaying.in_order(logs)
     if ordered is None:
-        raise LogError(f"{logs[0]}: two recordings are of node {name}: one after the other")
+        raise LogError(
+            f"{logs[0]}: recordings of node {name} are not parts of one run; give one run"
+        )
     return ordered
 
 
@@ -112,9 +114,9 @@ def _run(
 
 
 def _together(runs: Sequence[NodeRun]) -> dict[str, Any]:
-    """Shares of the time that all recorded in which UAVs had one node, several, or none.
+    """Return the fractions of the common time in which UAVs had one node, several, or none.
 
-    A UAV counts from the first time on at which any node serves it.
+    A UAV counts from the first time at which any node serves it.
     """
     begins_ns = max(run.first_ns for run in runs)
     ends_ns = min(run.last_ns for run in runs)

@@ -1,8 +1,8 @@
-"""How much a node tells the others, and is told."""
+"""Rates of sent and received fleet messages."""
 
 
 class Rate:
-    """Bits per second, by the bytes between two looks."""
+    """Bits per second, from the bytes between two calls of ``look``."""
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -10,7 +10,7 @@ class Rate:
         self._before: tuple[int, int] | None = None
 
     def look(self, now_ns: int) -> None:
-        """Work out the rate since the last look."""
+        """Compute the rate since the last call."""
         if self._before is not None and now_ns > self._before[0]:
             t_ns, had = self._before
             self.bps = 8e9 * (self.bytes - had) / (now_ns - t_ns)

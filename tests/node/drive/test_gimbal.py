@@ -121,7 +121,7 @@ def test_its_lag_is_found_from_its_attitude(
 
 
 def test_a_gimbal_is_not_muted() -> None:
-    with pytest.raises(UserError, match="hold or boresight, not mute"):
+    with pytest.raises(UserError, match="does not support mute; choose hold or boresight"):
         targets.device("gimbal:127.0.0.1:1:1:154", print, list).check(SafeState.MUTE)
 
 

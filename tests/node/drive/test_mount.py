@@ -247,7 +247,7 @@ def test_the_nearest_turn_within_the_limits_is_taken() -> None:
 
 
 def test_a_rotator_radiates_nothing_that_could_be_muted() -> None:
-    with pytest.raises(UserError, match="hold or boresight, not mute"):
+    with pytest.raises(UserError, match="does not support mute; choose hold or boresight"):
         Rotator("127.0.0.1", 1).check(SafeState.MUTE)
 
 

@@ -43,9 +43,9 @@ def node(
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
-        ({"ca": "ca.pem"}, "a certificate and its key are needed"),
-        ({"certificate": "me.pem"}, "fleet.ca is needed"),
-        ({"mode": "client"}, "a client needs a router"),
+        ({"ca": "ca.pem"}, "set fleet.certificate and fleet.key as well"),
+        ({"certificate": "me.pem"}, "set fleet.ca as well"),
+        ({"mode": "client"}, "a client needs the address of a router"),
     ],
 )
 def test_settings_that_make_no_sense_together(settings: dict[str, object], said: str) -> None:
@@ -172,8 +172,8 @@ def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
         for _ in range(2):
             wire.takes["standing"]("companion/site/north/standing", said)
         assert list(member.member.neighbours) == ["south"]
-        assert [one.text for one in notices if "too" in one.text] == [
-            "another node says that it is north too: give each a name of its own"
+        assert [one.text for one in notices if "another" in one.text] == [
+            "another node is also named north; set a unique `[fleet] node` on each"
         ]
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -291,7 +291,7 @@ def test_who_is_there_and_does_not_answer_makes_it_connect_anew() -> None:
     config = BusConfig(listen=(f"tcp/127.0.0.1:{port}",))
     with open_peer(config) as south:
         run_async(test())
-    assert "no answer from south, all nodes are connected anew" in notices
+    assert "no answer from south; reconnecting to all nodes" in notices
 
 
 def test_rates_are_in_bits() -> None:

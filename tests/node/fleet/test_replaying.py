@@ -92,7 +92,7 @@ def test_what_is_no_fleet_is_said(recorded: list[Path], tmp_path: Path) -> None:
     alone = record(tmp_path / "alone.mcap", None, events(0, []))
     with pytest.raises(LogError, match=r"no \[fleet\] node"):
         replaying.replay([recorded[0], alone])
-    with pytest.raises(LogError, match="two recordings are of node a"):
+    with pytest.raises(LogError, match="recordings of node a are not parts of one run"):
         replaying.replay([recorded[0], recorded[0]])
 
 

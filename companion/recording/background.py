@@ -1,10 +1,10 @@
-"""A recorder on a thread of its own, so that the event loop never waits for a disk.
+"""A recorder on its own thread, so that the event loop never waits for a disk.
 
-The queue is bounded; what does not fit is counted and reported. A disk that fails is tried again,
-less and less often, and one that is full as soon as it has room. What had not reached it is kept as
-far as the queue goes, and the recording goes on in a new file, which says what is missing.
+The queue is bounded; events that do not fit are counted and reported. After a disk error, writing
+is retried with growing delays; on a full disk, as soon as it has space. Events not yet on the disk
+are kept in the queue, and the recording continues in a new file, which states what is missing.
 
-Over 300 lines: one thread: its queue, its failures, its parts.
+Over 300 lines: one thread with its queue, its failures and its parts.
 """
 
 import errno
@@ -22,33 +22,35 @@ from companion.recording.writer import Writer
 from companion.values import ClockSet, Event, Output, Severity
 
 QUEUE_MAX: Final = 50_000
-"""Events waiting to be written at most: some seconds of the busiest stream.
+"""Limit on events waiting to be written: some seconds of the busiest stream.
 
-About 60 MB where twenty UAVs report ten times a second (1.3 kB for an event with its outputs)."""
+About 60 MB if twenty UAVs report ten times a second (1.3 kB per event with its outputs).
+"""
 GATHER_S: Final = 0.02
-"""How long events are left to gather: to wake the thread for each costs as much as to write it."""
-AT_ONCE: Final = 500  # events between two looks at whether a flush is due
+"""Time for which events are collected: waking the thread costs as much as writing one event."""
+AT_ONCE: Final = 500  # events between two checks whether a flush is due
 FLUSH_S: Final = 1.0  # time between two flushes to disk
 FLUSH_FIRST_S: Final = 0.1
-"""The same where a file begins, and twice as long after each: a short life leaves something too."""
-RETRY_FIRST_S: Final = 1.0
-"""Time before the first new attempt after a disk error; it doubles from one to the next.
-
-Whether a full disk has room is asked without trying it, at the pace of the first attempt.
+"""Time before the first flush of a file; it then doubles, so that a short run also leaves a file.
 """
-RETRY_MAX_S: Final = 30.0  # longest time between two attempts
-STOP_MAX_S: Final = 30.0  # how long the end of the service waits for a disk that does not answer
+RETRY_FIRST_S: Final = 1.0
+"""Time before the first retry after a disk error; it doubles each time.
+
+Free space on a full disk is checked without writing, at the interval of the first retry.
+"""
+RETRY_MAX_S: Final = 30.0  # longest time between two retries
+STOP_MAX_S: Final = 30.0  # longest wait for an unresponsive disk at the end of the service
 GO_ON_WITH: Final = 2000
-"""Events that are written at once where a recording goes on: some hundred kilobytes."""
+"""Events written at once when a recording continues: some hundred kilobytes."""
 ROOM_BYTES: Final = 8 << 20
-"""Free space needed to resume a recording; with less it would soon end again."""
+"""Free space needed to continue a recording; with less it would soon stop again."""
 
 _TOO_SLOW: Final = "the disk was too slow"
 
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """When a new part is begun: at a size in bytes, or after so many seconds; None: never."""
+    """When a new part begins: at a size in bytes, or after a time in seconds; None: never."""
 
     size_bytes: float | None = None
     after_s: float | None = None
@@ -70,17 +72,16 @@ class _Item(NamedTuple):
 
 
 class BackgroundRecorder:
-    """Records on a thread, with one ``Writer`` for each part from ``start`` to ``stop``.
+    """Recorder on a thread, with one ``Writer`` for each part from ``start`` to ``stop``.
 
-        open_part  makes the writer of a part. The first is made at once, and its ``OSError`` is
-                   raised to the caller; errors of later ones are handled here
+        open_part  creates the writer of a part. The first is created at once, and its ``OSError``
+                   is raised to the caller; errors of later ones are handled here
         geodetic   converts positions, for ``Encoder.output``
-        rotation   when a new part is begun
-        queue_max  events that may wait
+        rotation   when a new part begins
+        queue_max  limit on queued events
 
-    Attributes: ``failure`` says why nothing is written at present, ``dropped`` counts what was
-    handed over and is not recorded, ``messages`` what is, and ``bytes`` is the size of the newest
-    file.
+    Attributes: ``failure`` is the current error, ``dropped`` counts events that were not recorded,
+    ``messages`` those that were, and ``bytes`` is the size of the newest file.
     """
 
     def __init__(
@@ -94,7 +95,7 @@ class BackgroundRecorder:
         self.bytes = 0
         self.dropped = 0
         self.written_ns: int | None = None
-        """Time of the newest event that was written; None before the first."""
+        """Time of the newest written event; None before the first."""
         self.failure: str | None = None
         self._open_part = open_part
         self._geodetic = geodetic
@@ -102,14 +103,14 @@ class BackgroundRecorder:
         self._part = Part.first()
         self._writer = open_part(self._part)
         self._begun_s = time.monotonic()
-        self._finished_messages = 0  # messages in the parts before this one
-        self._queue: deque[_Item] = deque()  # bounded by ``put``; nobody waits at it
+        self._finished_messages = 0  # messages in earlier parts
+        self._queue: deque[_Item] = deque()  # bounded by ``put``, which never blocks
         self._queue_max = queue_max
         self._missed = 0
         self._overrun = False
-        self._unsafe: list[_Item] = []  # written, but not yet on the disk
+        self._unsafe: list[_Item] = []  # written, but not yet flushed to the disk
         self._clock_set: ClockSet | None = None
-        self._lost = 0  # events that may or may not be on a disk
+        self._lost = 0  # events that may or may not be on the disk
         self._why = _TOO_SLOW
         self._retry_s = RETRY_FIRST_S
         self._news: deque[tuple[Severity, str]] = deque(maxlen=100)
@@ -117,19 +118,19 @@ class BackgroundRecorder:
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
 
-    # --- the side of the event loop ---------------------------------------------------------
+    # --- called on the event loop -----------------------------------------------------------
 
     def start(self) -> None:
-        """Begin to write."""
+        """Start to write."""
         self._thread.start()
 
     def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
-        """Hand over an event and its outputs; an event of None for outputs without one.
+        """Queue an event and its outputs; the event is None for outputs without one.
 
-        Never waits. Called on one thread only.
+        Never blocks. Call it on one thread only.
 
-        Once the queue is full, nothing is accepted until half of it is written: one long hole can
-        be reported, a thousand short ones would be a recording of holes.
+        Once the queue is full, nothing is accepted until half of it is written: one long gap can be
+        reported, a thousand short ones would make the recording useless.
         """
         if self._overrun and len(self._queue) <= self._queue_max // 2:
             self._overrun = False
@@ -141,24 +142,26 @@ class BackgroundRecorder:
                 return
             self._overrun = True
             if self.failure is None:
-                self._tell(Severity.ERROR, "not all is recorded: the disk is too slow")
+                self._tell(Severity.ERROR, "some events are not recorded: the disk is too slow")
         self.dropped += 1
         self._missed += event is not None
 
     def stop(self, metadata: dict[str, str]) -> None:
-        """Write what is queued, finish the file and return when it is on the disk.
+        """Write the queue, finish the file and return when it is on the disk.
 
-        A disk that fails is tried once more; one that does not answer is waited for ``STOP_MAX_S``
-        seconds.
+        After a disk error, writing is retried once; an unresponsive disk is waited for
+        ``STOP_MAX_S`` seconds.
         """
         self._metadata = metadata
         self._stopping.set()
         self._thread.join(STOP_MAX_S)
         if self._thread.is_alive():
-            self._tell(Severity.ERROR, f"{self._writer.path} is not finished: no answer from disk")
+            self._tell(
+                Severity.ERROR, f"{self._writer.path} is incomplete: the disk does not answer"
+            )
 
     def news(self) -> list[tuple[Severity, str]]:
-        """Messages for the operator since the last call."""
+        """Return the messages for the operator since the last call."""
         told = []
         while self._news:
             told.append(self._news.popleft())
@@ -166,7 +169,7 @@ class BackgroundRecorder:
 
     @property
     def degraded(self) -> bool:
-        """True while something is not being recorded."""
+        """Whether some events are not being recorded."""
         return self.failure is not None or self._overrun
 
     @property
@@ -181,10 +184,10 @@ class BackgroundRecorder:
 
     @property
     def queued(self) -> int:
-        """Events that wait to be written."""
+        """Events waiting to be written."""
         return len(self._queue)
 
-    # --- the side of the thread -------------------------------------------------------------
+    # --- called on the thread ---------------------------------------------------------------
 
     def _run(self) -> None:
         while not self._record():
@@ -192,7 +195,7 @@ class BackgroundRecorder:
                 return
 
     def _record(self) -> bool:
-        """Write until stopped; False if that failed."""
+        """Write until stopped; return False after an error."""
         try:
             self._go_on()
             self._write_until_stopped()
@@ -203,12 +206,12 @@ class BackgroundRecorder:
         return True
 
     def _go_on(self) -> None:
-        """Begin a file with what the file before did not get."""
+        """Begin a file with the events that the previous file did not get."""
         if self._lost:
             t_ns = next((item.t_ns for item in self._unsafe if item.t_ns), self.written_ns or 0)
             self._writer.hole(Hole(t_ns, self._lost, self._why))
         waiting = self._unsafe
-        for begin in range(0, len(waiting), GO_ON_WITH):  # what fits into little room is kept
+        for begin in range(0, len(waiting), GO_ON_WITH):  # as much as fits on the disk is kept
             for item in waiting[begin : begin + GO_ON_WITH]:
                 self._write(item)
             self._writer.flush()
@@ -244,7 +247,7 @@ class BackgroundRecorder:
             self._writer.output(output, self._geodetic)
 
     def _say_utc(self, event: Event) -> None:
-        """Begin each file with what its times lack to be UTC, so that it can be read alone."""
+        """Begin each file with the offset to UTC, so that it can be read alone."""
         known = self._clock_set
         if isinstance(event, ClockSet):
             self._clock_set = event
@@ -273,17 +276,17 @@ class BackgroundRecorder:
             self._open_next()
 
     def _open_next(self) -> None:
-        """Open the next part, or the same one again if nothing of it is on a disk."""
+        """Open the next part, or the same part again if nothing of it is on the disk."""
         before = self._writer
         part = self._part.after(before.path.name) if before.flushed else self._part
         made = self._open_part(part)
         self._finished_messages += before.flushed
         self._writer, self._part, self._begun_s = made, part, time.monotonic()
 
-    # --- when the disk fails ----------------------------------------------------------------
+    # --- disk errors ------------------------------------------------------------------------
 
     def _fail(self, error: OSError) -> None:
-        """Handle a disk error; it is reported once, however often the disk is tried again."""
+        """Handle a disk error; it is reported once, not at every retry."""
         self._why = error.strerror or str(error)
         if self.failure is None:
             text = f"nothing is recorded: {self._writer.path}: {self._why}; trying again"
@@ -295,11 +298,11 @@ class BackgroundRecorder:
             self._unsafe.clear()
 
     def _reopen(self) -> bool:
-        """Try again until it works; False if the service ended before that."""
+        """Retry until it works; return False if the service ends before."""
         while True:
             stopped = self._stopping.wait(self._retry_s)
             try:
-                self._require_room()  # asked again as soon: it costs the disk nothing
+                self._require_room()  # checked at the same short interval, as it costs nothing
                 self._retry_s = min(2 * self._retry_s, RETRY_MAX_S)
                 self._open_next()
                 return True
@@ -313,7 +316,7 @@ class BackgroundRecorder:
         try:
             found = os.statvfs(self._writer.path.parent)
         except FileNotFoundError:
-            return  # the folder is made anew
+            return  # the folder will be created
         if found.f_bavail * found.f_frsize < ROOM_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 

@@ -1,4 +1,4 @@
-"""The program's values as messages of a recording, and back for those that are read back."""
+"""Conversion of the program's values to messages of a recording, and back for events."""
 
 import math
 from typing import Any, Final
@@ -19,9 +19,9 @@ from companion.values import (
 )
 
 FRAME_ID: Final = "wgs84"
-"""Frame of every LocationFix: the Earth's own, x through 0° E, z through the north pole."""
+"""Frame of every LocationFix: Earth-fixed, x through 0° E, z through the north pole."""
 OFFSET_MAX_NS: Final = 1 << 62
-"""Most that UTC can be off a timeline: 146 years, so that their sum has a date."""
+"""Limit on the offset of UTC from a timeline, 146 years, so that their sum is a valid date."""
 _LEVEL: Final = {
     Severity.INFO: schemas.LogMessage.INFO,
     Severity.WARNING: schemas.LogMessage.WARNING,
@@ -30,15 +30,15 @@ _LEVEL: Final = {
 
 
 def timestamp(t_ns: int) -> dict[str, int]:
-    """A ``google.protobuf.Timestamp``, or a ``Duration``, from nanoseconds."""
+    """Return a ``google.protobuf.Timestamp``, or a ``Duration``, from nanoseconds."""
     seconds, nanos = divmod(t_ns, 1_000_000_000)
     return {"seconds": seconds, "nanos": nanos}
 
 
 def fix(value: Fix) -> Any:
-    """The position that a UAV reported, with the report's own degrees.
+    """Return the position that a UAV reported, in the report's own degrees.
 
-    The covariance is made from the bounds on the report's noise, as that of ``predicted`` is.
+    The covariance is derived from the bounds on the report's noise, as in ``predicted``.
     """
     report = value.report
     message = schemas.LocationFixMessage(
@@ -53,13 +53,12 @@ def fix(value: Fix) -> Any:
 
 
 def predicted(track: Track, lat_deg: float, lon_deg: float, alt_m: float) -> Any:
-    """The predicted position of a UAV at ``valid_at_ns``, with a covariance made from its bound.
+    """Return the predicted position of a UAV at ``valid_at_ns``, with a covariance from its bound.
 
     The bound is a guarantee, not a statistic. The covariance is half the square of the horizontal
     bound on each of its two axes, and the square of the vertical one: its traces are the largest
-    mean square errors that any distribution within the bounds can have. A viewer's 1-sigma
-    ellipsoid is therefore on the safe side on average. There is no covariance without a finite
-    bound.
+    mean square errors of any distribution within the bounds. A viewer's 1-sigma ellipsoid is
+    therefore conservative on average. Without a finite bound there is no covariance.
     """
     message = schemas.LocationFixMessage(
         timestamp=timestamp(track.valid_at_ns),
@@ -74,14 +73,14 @@ def predicted(track: Track, lat_deg: float, lon_deg: float, alt_m: float) -> Any
 
 
 def _spread(message: Any, horizontal_m: float, vertical_m: float) -> None:
-    """Put bounds into a LocationFix as a covariance; east, north, up."""
+    """Set the covariance of a LocationFix from bounds; east, north, up."""
     plane_m2, height_m2 = horizontal_m**2 / 2, vertical_m**2
     message.position_covariance.extend((plane_m2, 0, 0, 0, plane_m2, 0, 0, 0, height_m2))
     message.position_covariance_type = schemas.LocationFixMessage.APPROXIMATED
 
 
 def log(value: Notice) -> Any:
-    """A notice as a line of a viewer's log panel, named after its subject."""
+    """Return a notice as a line of a viewer's log panel, named after its subject."""
     return schemas.LogMessage(
         timestamp=timestamp(value.t_ns),
         level=_LEVEL[value.severity],
@@ -90,13 +89,13 @@ def log(value: Notice) -> Any:
     )
 
 
-# --- and back -----------------------------------------------------------------------------------
+# --- decoding -----------------------------------------------------------------------------------
 
 
 def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
-    """Read a frame. Raises ``DecodeError`` for bytes that are no such message.
+    """Decode a frame. Raises ``DecodeError`` for malformed bytes.
 
-    ``sources`` holds the senders seen so far, so that one value for each is enough.
+    ``sources`` caches the senders seen so far, so that each has one value.
     """
     message = schemas.FrameMessage.FromString(data)
     ids = (message.sysid, message.compid)
@@ -115,12 +114,12 @@ def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
 
 
 def to_round_trip(data: bytes) -> RoundTrip:
-    """Read a round trip. Raises ``DecodeError`` for bytes that are no such message."""
+    """Decode a round trip. Raises ``DecodeError`` for malformed bytes."""
     return fields.value_of(RoundTrip, schemas.RoundTripMessage.FromString(data))
 
 
 def to_duty(data: bytes) -> Duty:
-    """Read a duty. Raises ``DecodeError``, or ``ValueError`` where it names too many."""
+    """Decode a duty. Raises ``DecodeError``, or ``ValueError`` if it names too many UAVs."""
     found = fields.value_of(Duty, schemas.DutyMessage.FromString(data))
     if max(len(found.serves), len(found.spares)) > DUTY_MAX:
         raise ValueError(f"duty of more than {DUTY_MAX} UAVs")
@@ -128,7 +127,7 @@ def to_duty(data: bytes) -> Duty:
 
 
 def to_clock_set(data: bytes) -> ClockSet:
-    """Read that the clock was set. Raises ``DecodeError``, or ``ValueError`` beyond all time."""
+    """Decode a change of the clock. Raises ``DecodeError``, or ``ValueError`` if out of range."""
     found = fields.value_of(ClockSet, schemas.ClockSetMessage.FromString(data))
     if abs(found.utc_offset_ns) > OFFSET_MAX_NS:
         raise ValueError("UTC offset out of range")
@@ -136,7 +135,7 @@ def to_clock_set(data: bytes) -> ClockSet:
 
 
 def to_rejection(data: bytes) -> Rejection | None:
-    """Read a rejection; None for one that the pipeline made, since it will make it again."""
+    """Decode a rejection; None for one by the pipeline, which a replay will repeat."""
     message = schemas.RejectionMessage.FromString(data)
     if not message.is_event:
         return None

@@ -1,13 +1,13 @@
-"""Walks an MCAP file in the order in which it was written, as far as it is intact.
+"""Parser of MCAP files in the order in which they were written, up to their damage.
 
-The index at a file's end is not used: a killed process leaves none, and it serves the order by
-time, which is not the order in which things happened. Where the end exists, its copies of the
-schemas and channels make up for a damaged chunk that held the originals.
+The index at a file's end is not used: a killed process leaves none, and it orders by time, which is
+not the order of events. If the end exists, its copies of the schemas and channels replace those of
+a damaged chunk.
 
-Layout: https://mcap.dev/spec. A chunk counts only when its checksum holds. A damaged chunk in the
-middle of a file is passed over and counted; a record that goes on past the end of the file ends the
-walk. No length is believed: each is held against what is there and against the limits below, so
-that memory and time are bounded by the size of the file, whoever made it.
+Layout: https://mcap.dev/spec. A chunk counts only if its checksum is valid. A damaged chunk in the
+middle of a file is skipped and counted; a record that extends past the end of the file ends the
+parsing. Lengths are checked against the file and against the limits below, so that memory and time
+are bounded by the size of the file, also for malicious files.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ from mcap.records import Attachment, Channel, Metadata, Schema, Statistics
 from companion.recording.unpacking import unpacked
 
 MAGIC: Final = b"\x89MCAP0\r\n"
-_HEADER: Final = struct.Struct("<BQ")  # opcode, length of what follows
+_HEADER: Final = struct.Struct("<BQ")  # opcode, length of the body
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _END: Final = struct.Struct("<BQQQI8s")
 """The footer record and the magic bytes.
@@ -38,32 +38,38 @@ to just before itself.
 _UNCHECKED: Final = 4 + len(MAGIC)
 
 LARGEST: Final = 1 << 25
-"""Most bytes of a record, or of a chunk's contents, that are read; chunks of this program have
-about a mebibyte, and the largest settings 27."""
+"""Limit on the size of a record, or of a chunk's contents.
+
+Chunks of this program have about 1 MiB, the largest settings 27 MiB.
+"""
 _LARGEST_MESSAGE: Final = 1 << 24
 _LARGEST_SUMMARY: Final = 1 << 26  # two weeks of a chunk a second
-_DESCRIPTIONS: Final = 1 << 25  # most bytes of all schemas and channels together
+_DESCRIPTIONS: Final = 1 << 25  # limit on all schemas and channels together, bytes
 _LARGEST_PAIRS: Final = 1 << 16
-"""Most bytes of a channel, or of a record of metadata: names and values, many of which are
-objects of far more bytes; those of this program have hundreds."""
-_PAIR: Final = 256  # bytes that a name and its value take in memory, beside their own
-_MOST: Final = 10_000  # most attachments, and most records of metadata, that are read of a file
-_PACKED: Final = 50
-"""Most bytes of contents for each byte of a file, beside one largest chunk: as much as ten times
-what is found in recordings, where a bomb has thousands."""
+"""Limit on a channel, or a metadata record, in bytes.
 
-# What torn or damaged bytes make the library raise; a failed checksum is a ValueError.
+Their names and values become objects of many more bytes; those of this program have hundreds.
+"""
+_PAIR: Final = 256  # overhead of a name and its value in memory, bytes
+_MOST: Final = 10_000  # limit each on attachments and on metadata records of a file
+_PACKED: Final = 50
+"""Limit on unpacked bytes per byte of a file, in addition to one largest chunk.
+
+Ten times the ratio found in recordings; a decompression bomb has thousands.
+"""
+
+# Exceptions of the library for damaged bytes; a failed checksum is a ValueError.
 _DAMAGE: Final = (McapError, struct.error, ValueError, OverflowError)
 
 
 _READ: Final = frozenset(
     (Opcode.ATTACHMENT, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 )
-"""Records beside chunks that are read; the others are indexes."""
+"""Records outside of chunks that are read; the others are indexes."""
 
 
 class Message(NamedTuple):
-    """A message of a recording, with the channel it is on."""
+    """A message of a recording, with its channel."""
 
     channel: Channel
     sequence: int
@@ -73,7 +79,7 @@ class Message(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """Bytes that could not be read, or whose meaning nothing describes."""
+    """Bytes that could not be read, or without a description."""
 
     size_bytes: int
 
@@ -84,22 +90,22 @@ Content = Message | Attachment | Metadata | Damage
 class Walk:
     """One pass over a file. Iterate once; its attributes are complete afterwards.
 
-    ``topics`` are those whose messages are returned; None: all; empty: none, and chunks are passed
-    over unread. Raises ``OSError`` where the file cannot be read.
+    ``topics`` limits the messages returned; None: all; empty: none, and chunks are skipped unread.
+    Raises ``OSError`` if the file cannot be read.
     """
 
     def __init__(self, path: Path, topics: frozenset[str] | None = None) -> None:
         self.schemas: dict[int, Schema] = {}
-        self._described: set[int] = {0}  # 0: a channel without a schema, of other programs
+        self._described: set[int] = {0}  # 0: a channel without a schema, by other programs
         self.channels: dict[int, Channel] = {}
-        self.complete = False  # true if the file's end is there, so that it was closed in order
-        self.lost_bytes = 0  # bytes that belong to no readable record
+        self.complete = False  # whether the file has its end, so was closed properly
+        self.lost_bytes = 0  # bytes outside of readable records
         self.path = path
         self._topics = topics
         self._described_bytes = 0
-        self._channel_bodies: dict[bytes, bytes] = {}  # by the bytes of its id, as it was read
+        self._channel_bodies: dict[bytes, bytes] = {}  # by the bytes of the channel's id
         self._counts: Counter[int] = Counter()  # attachments and metadata, by opcode
-        self._room = 0  # bytes that chunks may yet unpack to
+        self._room = 0  # remaining limit on unpacked bytes
 
     def __iter__(self) -> Iterator[Content]:
         self._read_descriptions()
@@ -117,13 +123,13 @@ class Walk:
                     yield Damage(_HEADER.size + length)
 
     def _read_descriptions(self) -> None:
-        """Read schemas and channels from the summary, if there is one and its checksum holds."""
-        with contextlib.suppress(*_DAMAGE):  # another program's: the data has them as well
+        """Read schemas and channels from the summary, if it exists and its checksum is valid."""
+        with contextlib.suppress(*_DAMAGE):  # then the data section has them as well
             for opcode, body in _split(_summary(self.path)):
                 self._describe(opcode, body)
 
     def _records(self, file: IO[bytes]) -> Iterator[tuple[int, int]]:
-        """(opcode, length) of the records up to the file's end, the file standing at the body."""
+        """Yield (opcode, length) of the records, with the file positioned at the body."""
         size = self.path.stat().st_size
         self._room = LARGEST + _PACKED * size
         at = len(file.read(len(MAGIC)))
@@ -147,7 +153,7 @@ class Walk:
         return opcode in _READ
 
     def _is_beyond(self, opcode: int) -> bool:
-        """Whether this is an attachment or a record of metadata more than any file has."""
+        """Return whether this attachment or metadata record exceeds the limit."""
         if opcode not in (Opcode.ATTACHMENT, Opcode.METADATA):
             return False
         self._counts[opcode] += 1
@@ -155,7 +161,7 @@ class Walk:
 
     def _contents(self, opcode: int, file: IO[bytes], length: int) -> Iterator[Content]:
         if length > (_LARGEST_PAIRS if opcode == Opcode.METADATA else LARGEST):
-            raise ValueError("no record is that large")
+            raise ValueError("record exceeds the size limit")
         body = file.read(length)
         if opcode == Opcode.CHUNK:
             data = unpacked(body, min(LARGEST, self._room))
@@ -169,7 +175,7 @@ class Walk:
             yield from self._in_chunk(_HEADER.pack(opcode, len(body)) + body)
 
     def _in_chunk(self, data: bytes) -> Iterator[Content]:
-        """The wanted messages of a chunk; remembers the schemas and channels between them."""
+        """Yield the wanted messages of a chunk; store the schemas and channels in it."""
         channels, topics = self.channels, self._topics
         orphaned = 0
         for opcode, body in _split(data):
@@ -188,12 +194,12 @@ class Walk:
                     publish_time_ns=publish_ns,
                     data=body[_MESSAGE.size :],
                 )
-        if orphaned:  # the chunk that described their channel was damaged
+        if orphaned:  # the chunk with the description of their channel was damaged
             self.lost_bytes += orphaned
             yield Damage(orphaned)
 
     def _describe(self, opcode: int, body: bytes) -> None:
-        """Remember a schema or a channel. Raises ``ValueError`` where they are too large."""
+        """Store a schema or a channel. Raises ``ValueError`` if it is too large."""
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(ReadDataStream(BytesIO(body)))
             if schema != self.schemas.get(schema.id):
@@ -204,7 +210,7 @@ class Walk:
             if body == self._channel_bodies.get(body[:2]):
                 return
             if len(body) > _LARGEST_PAIRS:
-                raise ValueError("no channel is that large")
+                raise ValueError("channel exceeds the size limit")
             self._take(len(body))
             channel = Channel.read(ReadDataStream(BytesIO(body)))
             self._take(_PAIR * len(channel.metadata))
@@ -212,28 +218,29 @@ class Walk:
             self._channel_bodies[body[:2]] = body
 
     def _take(self, size: int) -> None:
-        """Count what is described; once it is too much, nothing further is read."""
+        """Count bytes of descriptions. Raises ``ValueError`` beyond the limit."""
         self._described_bytes += size
         if self._described_bytes > _DESCRIPTIONS:
-            raise ValueError("no file describes so much")
+            raise ValueError("descriptions exceed the size limit")
 
 
 def _split(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """(opcode, body) of the records in a chunk. Raises ``ValueError`` where one is not whole."""
+    """Yield (opcode, body) of the records in a chunk. Raises ``ValueError`` for an incomplete
+    one."""
     at, end = 0, len(data)
     while at < end:
         opcode, length = _HEADER.unpack_from(data, at)
         start = at + _HEADER.size
         at = start + length
         if at > end or not opcode or (opcode == Opcode.MESSAGE and length > _LARGEST_MESSAGE):
-            raise ValueError("no record, or one that is longer than what holds it")
+            raise ValueError("invalid record, or one that exceeds its chunk")
         yield opcode, data[start:at]
 
 
 def span_ns(path: Path) -> tuple[int, int] | None:
-    """The first and last time of the messages of a finished file, by its summary; else None.
+    """Return the first and last time of a finished file's messages, from its summary; else None.
 
-    Raises ``OSError`` where the file cannot be read.
+    Raises ``OSError`` if the file cannot be read.
     """
     with contextlib.suppress(*_DAMAGE):
         for opcode, body in _split(_summary(path)):
@@ -245,7 +252,7 @@ def span_ns(path: Path) -> tuple[int, int] | None:
 
 
 def _summary(path: Path) -> bytes:
-    """The records of a file's summary; empty without one, or where its checksum does not hold."""
+    """Return the records of a file's summary; empty without one, or if its checksum is invalid."""
     size = path.stat().st_size
     with path.open("rb") as file:
         file.seek(max(0, size - _END.size))

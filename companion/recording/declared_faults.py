@@ -1,9 +1,8 @@
-"""Faults that a log declares: ``LOG.events.json`` beside it, a list of what was done to whom, when.
+"""Faults declared for a log: ``LOG.events.json`` beside it, a list of faults with vehicle and time.
 
 Each entry has ``unix`` (seconds), ``sysid`` and ``event``. A fault begins with such an entry and
-ends with the one that ends it (``gps_off`` with ``gps_on``, ``glitch25m`` with ``glitch_end``), or
-after the seconds that its name states (``link_drop12s``); one that nothing ends lasts to the end of
-the log.
+ends with its counterpart (``gps_off`` with ``gps_on``, ``glitch25m`` with ``glitch_end``), or after
+the seconds in its name (``link_drop12s``); without an end it lasts to the end of the log.
 """
 
 import json
@@ -30,9 +29,9 @@ class DeclaredFault:
 
 
 def declared_faults(log: Path) -> tuple[DeclaredFault, ...]:
-    """The faults that are declared beside a log; none where there is no such file.
+    """Return the faults declared beside a log; none without such a file.
 
-    Raises ``LogError`` where the file is not a list of events.
+    Raises ``LogError`` if the file is not a list of events.
     """
     path = log.with_name(log.name + SUFFIX)
     try:
@@ -45,7 +44,7 @@ def declared_faults(log: Path) -> tuple[DeclaredFault, ...]:
             for each in json.loads(text)
         ]
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
-        raise LogError(f"{path}: not a list of events with unix, sysid and event") from error
+        raise LogError(f"{path}: must be a list of entries with unix, sysid and event") from error
     return tuple(_faults(sorted(events)))
 
 
@@ -69,7 +68,8 @@ def _is_end(name: str) -> bool:
 
 
 def _ends(name: str, said: str) -> bool:
-    """Whether an entry ends a fault: ``X_on`` ends ``X_off``, ``X_end`` whatever begins with X."""
+    """Return whether an entry ends a fault: ``X_on`` ends ``X_off``, ``X_end`` all that begin with
+    X."""
     if said.endswith("_on"):
         return name == f"{said.removesuffix('_on')}_off"
     return said.endswith("_end") and name.startswith(said.removesuffix("_end"))

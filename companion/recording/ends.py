@@ -1,4 +1,4 @@
-"""When a log begins and ends, read off its two ends without reading what is between."""
+"""First and last time of a log, from its two ends without reading the rest."""
 
 import os
 from collections.abc import Sequence
@@ -10,16 +10,16 @@ from companion.recording import container
 from companion.recording.container import MAGIC
 from companion.recording.tlog import STAMP
 
-_TAIL: Final = 1 << 16  # bytes at the end of a telemetry log in which its last frame is looked for
+_TAIL: Final = 1 << 16  # bytes at the end of a telemetry log that are searched for its last frame
 _LONGEST_NS: Final = 10 * 86_400 * 1_000_000_000
-"""A log that seems to be longer has a wrong stamp at one end."""
+"""A log that seems longer has a wrong stamp at one end."""
 
 
 def span_ns(logs: Sequence[Path]) -> tuple[int, int] | None:
-    """First and last time of some logs together, ns since 1970.
+    """Return the first and last time of some logs together, ns since 1970.
 
-    None where the ends of one of them do not tell: raw MAVLink, a recording cut short, a log whose
-    stamps leap. Raises ``OSError`` for a file that cannot be read.
+    None if the ends of one of them are unknown: raw MAVLink, a truncated recording, jumping stamps.
+    Raises ``OSError`` for a file that cannot be read.
     """
     ends = [_ends_ns(log) for log in logs]
     known = [one for one in ends if one is not None]

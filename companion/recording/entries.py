@@ -1,7 +1,7 @@
-"""Events and outputs as messages on topics, for recordings and for live viewers.
+"""Encoding of events and outputs as messages on topics, for recordings and live viewers.
 
-Events that drove the pipeline are sent whole and in order. Of its outputs, every fix is sent;
-tracks, weights and the scene are sent at a limited rate, since a replay derives them again.
+Events, which drive the pipeline, are all sent, in order. Of the outputs, every fix is sent;
+tracks, weights and the scene are sent at a limited rate, since a replay computes them again.
 """
 
 from collections.abc import Callable
@@ -49,18 +49,18 @@ NAMED: Final = (
     (schemas.SCENE_TOPIC, schemas.SCENE_UPDATE),
     (schemas.LOG_TOPIC, schemas.LOG),
 )
-"""Topics that exist in any run; those of each UAV come with it."""
+"""Topics that exist in every run; those of a UAV are added with it."""
 
 
 class RateLimit:
-    """Limits a rate, by the times of what comes; a rate of None is no limit."""
+    """Rate limit, by the times of the items; None: no limit."""
 
     def __init__(self, rate_hz: float | None) -> None:
         self._period_ns = 0 if rate_hz is None else int(1e9 / rate_hz)
         self._due_ns: int | None = None
 
     def is_due(self, t_ns: int) -> bool:
-        """Whether it is time again. What comes a little early is not made up for by a burst."""
+        """Return whether the next item is due. An early item does not cause a burst later."""
         due_ns = self._due_ns
         if due_ns is None or not due_ns - self._period_ns <= t_ns < due_ns + self._period_ns:
             due_ns = t_ns
@@ -71,9 +71,9 @@ class RateLimit:
 
 
 class Encoder:
-    """Turns events and outputs into messages and passes them to ``emit``.
+    """Encoder of events and outputs into messages, which it passes to ``emit``.
 
-    weights_hz  greatest rate of tracks and weights, by the updates' own time; None: every
+    weights_hz  largest rate of tracks and weights, by the updates' own time; None: every
                 update
     scene       draws the scene; None: no scene
     """
@@ -115,8 +115,8 @@ class Encoder:
     def output(self, output: Output, geodetic: Geodetic) -> None:
         """Send an output. A rejection that is the last event itself is not sent twice.
 
-        A fix is sent at its arrival; its message bears the time at which it was true. ``geodetic``
-        is only called with the positions of an update's tracks, when there are any.
+        A fix is sent at its arrival; its message contains the time at which it was true.
+        ``geodetic`` is only called with the positions of an update's tracks, if there are any.
         """
         match output:
             case Estimate(fix=fix):

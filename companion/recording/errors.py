@@ -1,7 +1,7 @@
-"""The mistake of a user who gave a file that cannot be used."""
+"""The error for a file that cannot be used."""
 
 from companion.values import UserError
 
 
 class LogError(UserError):
-    """A file that cannot be used. The message is one line: the file, and why."""
+    """A file that cannot be used. The message is one line: the file, and the reason."""

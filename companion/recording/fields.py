@@ -1,6 +1,6 @@
-"""The fields of the recorded messages, derived from the described values of their classes.
+"""Fields of the recorded messages, derived from the described values of their classes.
 
-A field's number is that of its value's ``Meaning``: a number that has been written once keeps its
+A field's number comes from its value's ``Meaning``; a number once written never changes its
 meaning.
 """
 
@@ -34,15 +34,15 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class RecordedRejection:
-    """A rejection, and whether it drove the pipeline rather than coming out of it."""
+    """A rejection, and whether it is an event of the pipeline rather than its output."""
 
     rejection: Annotated[Rejection, Inline()]
-    is_event: Annotated[bool, Meaning("whether it was made while framing, before the pipeline", 7)]
+    is_event: Annotated[bool, Meaning("whether it comes from framing, before the pipeline", 7)]
 
 
 @dataclass(frozen=True, slots=True)
 class RecordedTrack:
-    """A track, and when the update was computed to which it belongs."""
+    """A track, and the time of its update."""
 
     track: Annotated[Track, Inline()]
     t_ns: Annotated[int, Meaning("when the update was computed", 14)]
@@ -97,7 +97,7 @@ CLASSES: Final[dict[str, type]] = {
 
 
 class Field(NamedTuple):
-    """One field of a message: its declaration, and how it is read from a value."""
+    """One field of a message: its declaration, and its getter."""
 
     number: int
     name: str
@@ -108,10 +108,10 @@ class Field(NamedTuple):
 
 @functools.cache
 def fields(message: str) -> tuple[Field, ...]:
-    """The fields of a recorded message, by number.
+    """Return the fields of a recorded message, by number.
 
     The protobuf type follows from the value's: times are fixed64, other integers uint32, vectors
-    and tuples repeated, what may be None optional; a ``Source`` is two fields, sysid and compid.
+    and tuples repeated, optional values optional; a ``Source`` is two fields, sysid and compid.
     """
     found = (one for member in members(CLASSES[message]) for one in _fields(member))
     return tuple(sorted(found, key=lambda one: one.number))
@@ -157,7 +157,7 @@ def _part(get: Callable[[Any], Any], part: str) -> Callable[[Any], Any]:
 
 
 def _listed(get: Callable[[Any], Any]) -> Callable[[Any], list[float]]:
-    """A vector as a list, empty where it is unknown."""
+    """Return a getter of a vector as a list, empty if unknown."""
 
     def listed(value: Any) -> list[float]:
         vector = get(value)
@@ -171,12 +171,12 @@ def _messages(name: str, get: Callable[[Any], Any]) -> Callable[[Any], list[dict
 
 
 def values(message: str, value: Any) -> dict[str, Any]:
-    """The fields of a message by name."""
+    """Return the fields of a message by name."""
     return {one.name: one.get(value) for one in fields(message)}
 
 
 def value_of(kind: type[T], found: Any) -> T:
-    """A flat value of a class, read back from its message."""
+    """Return a flat value of a class from its message."""
     values = {
         member.name: Source(found.sysid, found.compid)
         if member.type is Source

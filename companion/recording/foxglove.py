@@ -1,8 +1,8 @@
-"""The channels of a recording, live on a WebSocket for Foxglove and Lichtblick.
+"""Live channels of a recording on a WebSocket, for Foxglove and Lichtblick.
 
 Needs the package foxglove-sdk, which the extra ``live`` installs. The server is the package's, on
-threads of its own; the messages are made on a thread here. The event loop only hands over, and what
-a slow viewer cannot take is not sent.
+its own threads; the messages are encoded on a thread here. The event loop only queues events;
+events that a slow viewer cannot take are dropped.
 """
 
 import contextlib
@@ -19,27 +19,27 @@ from companion.recording.schemas import Schema
 from companion.values import Estimate, Event, Output, UserError
 
 QUEUE_MAX: Final = 10_000  # events waiting to be sent at most
-RATE_HZ: Final = 10.0  # greatest rate of tracks and weights: as often as anyone can see
-LOOK_S: Final = 0.2  # time between two checks whether anybody is watching
-NAME: Final = "companion"  # name of the server as viewers show it
+RATE_HZ: Final = 10.0  # largest rate of tracks and weights; faster changes are not visible
+LOOK_S: Final = 0.2  # time between two checks for viewers
+NAME: Final = "companion"  # name of the server in viewers
 
 _Item = tuple[Event | None, Sequence[Output]]
 
 
 class LiveError(UserError):
-    """The live channels cannot be served. The message is one line for the user."""
+    """The live channels cannot be served."""
 
 
 class LiveChannels:
-    """Serves events and outputs live, from ``start`` to ``stop``.
+    """Live server of events and outputs, from ``start`` to ``stop``.
 
-        host, port  where it listens, at once; port 0: any free one, and ``port`` then says which
+        host, port  address, bound at once; port 0: any free one, and ``port`` is then its number
         geodetic    converts positions, for ``Encoder.output``
         scene       draws the scene; None: no scene
-        rate_hz     greatest rate of tracks and weights; None: every update
+        rate_hz     largest rate of tracks and weights; None: every update
 
-    While nobody watches, no messages are made. Raises ``LiveError`` where the package is not
-    installed or the port cannot be had.
+    Without viewers, no messages are encoded. Raises ``LiveError`` if the package is not installed
+    or the port is unavailable.
     """
 
     def __init__(
@@ -72,13 +72,13 @@ class LiveChannels:
         self._thread = threading.Thread(target=self._run, name="foxglove", daemon=True)
 
     def start(self) -> None:
-        """Begin to send."""
+        """Start to send."""
         self._thread.start()
 
     def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
-        """Hand over an event and its outputs; an event of None for outputs without one.
+        """Queue an event and its outputs; the event is None for outputs without one.
 
-        Never waits.
+        Never blocks.
         """
         try:
             self._queue.put_nowait((event, outputs))
@@ -113,7 +113,7 @@ class LiveChannels:
                 self._encoder.output(output, self._geodetic)
 
     def _announce(self, outputs: Sequence[Output]) -> None:
-        """Announce the topics of each new UAV, watched or not: only then can they be asked for."""
+        """Announce the topics of each new UAV: viewers can subscribe only to announced topics."""
         for output in outputs:
             if isinstance(output, Estimate) and output.fix.uav not in self._announced:
                 self._announced.add(output.fix.uav)
@@ -139,6 +139,6 @@ def _foxglove() -> Any:
         import foxglove
     except ImportError as error:
         raise LiveError(
-            "server.foxglove needs the package foxglove-sdk: install the extra, [live]"
+            "server.foxglove needs the package foxglove-sdk; install the extra [live]"
         ) from error
     return foxglove

@@ -1,8 +1,8 @@
-"""Writes MCAP: chunks of messages with their indexes, attachments, metadata, and the summary.
+"""Writer of MCAP: chunks of messages with their indexes, attachments, metadata, and the summary.
 
-The library's writer makes objects of every message and packs each of its fields alone, which is
-most of the time that a recording takes. Here a message is one packed head and its bytes; what is
-rare (everything else) is written by the library's records. Reading stays with the library.
+The library's writer creates objects for every message and packs each of its fields separately,
+which takes most of the time of a recording. Here a message is one packed head and its bytes; rare
+records are written with the library. Reading uses the library.
 
 Layout: https://mcap.dev/spec.
 """
@@ -34,10 +34,10 @@ from zstandard import ZstdCompressor
 
 from companion.recording.container import MAGIC
 
-CHUNK_BYTES: Final = 1 << 20  # size of its contents at which a chunk is ended
+CHUNK_BYTES: Final = 1 << 20  # size of its contents at which a chunk ends
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
-"""Opcode, length of what follows, channel, sequence, log time and publish time of a message."""
-_FIELDS: Final = _MESSAGE.size - 9  # of a message's head, without opcode and length
+"""Opcode, length of the body, channel, sequence, log time and publish time of a message."""
+_FIELDS: Final = _MESSAGE.size - 9  # size of a message's head, without opcode and length
 _INDEX: Final = struct.Struct("<BQHI")  # opcode, length, channel, length of the entries
 _FOOTER_START: Final = struct.Struct("<BQQQ")  # the part of the footer that its checksum covers
 
@@ -49,10 +49,10 @@ def _bytes(record: McapRecord) -> bytes:
 
 
 class McapFile:
-    """An MCAP file that is written to a stream, which stays open.
+    """An MCAP file written to a stream, which stays open.
 
-    The caller gives log times of at least 0 and sequence numbers of 32 bits. Any method raises
-    ``OSError`` where the stream does.
+    Log times must be at least 0, sequence numbers below 2^32. Any method raises ``OSError`` if the
+    stream does.
     """
 
     def __init__(self, stream: BinaryIO) -> None:
@@ -61,7 +61,7 @@ class McapFile:
         self._schemas: list[Schema] = []
         self._channels: list[Channel] = []
         self._counts: dict[int, int] = {}  # messages by channel
-        self._times_ns: list[tuple[int, int]] = []  # least and greatest of each chunk
+        self._times_ns: list[tuple[int, int]] = []  # least and largest of each chunk
         self._chunks: list[ChunkIndex] = []
         self._attachments: list[AttachmentIndex] = []
         self._metadata: list[MetadataIndex] = []
@@ -72,10 +72,10 @@ class McapFile:
         stream.write(MAGIC)
         stream.write(_bytes(Header("", "companion")))
 
-    # --- what is written --------------------------------------------------------------------
+    # --- records ----------------------------------------------------------------------------
 
     def schema(self, name: str, encoding: str, data: bytes) -> int:
-        """Describe a type of message. Returns its id."""
+        """Add a schema. Returns its id."""
         number = len(self._schemas) + 1
         self._schemas.append(Schema(id=number, data=data, encoding=encoding, name=name))
         self._describe(self._schemas[-1])
@@ -84,7 +84,7 @@ class McapFile:
     def channel(
         self, topic: str, encoding: str, schema_id: int, metadata: Mapping[str, str] | None = None
     ) -> int:
-        """Begin a channel. Returns its id."""
+        """Add a channel. Returns its id."""
         number = len(self._channels) + 1
         channel = Channel(
             id=number,
@@ -138,19 +138,19 @@ class McapFile:
         )
 
     def metadata(self, name: str, data: Mapping[str, str]) -> None:
-        """Add a record of names and values."""
+        """Add a metadata record."""
         at = self._stream.tell()
         record = _bytes(Metadata(name, dict(data)))
         self._stream.write(record)
         self._metadata.append(MetadataIndex(at, len(record), name))
 
     def flush(self) -> None:
-        """End the chunk in progress and hand everything to the system."""
+        """End the current chunk and pass everything to the operating system."""
         self._end_chunk()
         self._stream.flush()
 
     def _end_chunk(self) -> None:
-        """Write the chunk and the indexes of its messages; descriptions alone make none."""
+        """Write the chunk and the indexes of its messages; without messages there is no chunk."""
         if not self._entries:
             return
         contents = b"".join(self._parts)
@@ -197,7 +197,7 @@ class McapFile:
     # --- the end ----------------------------------------------------------------------------
 
     def finish(self) -> None:
-        """End the chunk in progress, and write the summary and the footer."""
+        """End the current chunk, and write the summary and the footer."""
         self._end_chunk()
         self._stream.write(_bytes(DataEnd(0)))
         start = self._stream.tell()

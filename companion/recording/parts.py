@@ -1,8 +1,8 @@
-"""Runs in several files, and what is missing from them.
+"""Runs recorded in several files, and the events missing from them.
 
-A recording is cut into *parts* by size and time, and goes on in a new part when a disk that had
-failed works again. Each part says so at its head, so that a replay can put them together. Where
-events could not be recorded, a part has a record that says how many.
+A recording is split into *parts* by size and time, and continues in a new part after a disk error.
+Each part identifies itself, so that a replay can join them. Where events could not be recorded, a
+part has a record with their number.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,36 +20,36 @@ from companion.values import UserError, printable
 PART: Final = "part"
 HOLE: Final = "hole"
 HOLES_MAX: Final = 1000
-"""Holes of a file that are told one by one; what further ones lack is counted with the last."""
+"""Limit on holes listed individually; the events of further ones are added to the last."""
 WHY_MAX: Final = 200
 EVENTS_MAX: Final = (1 << 63) - 1
-NUMBER_DIGITS: Final = 9  # most digits of a part's number
+NUMBER_DIGITS: Final = 9  # limit on the digits of a part's number
 _LATEST_NS: Final = 1 << 62
 
 
 class Part(NamedTuple):
-    """Which part of which run a file is."""
+    """Identity of a part: its run, and its number in it."""
 
     run: str  # the same in all parts of a run
-    number: int  # counts from 1
-    continues: str  # name of the file before, as it was when this one was begun
+    number: int  # from 1
+    continues: str  # name of the previous file when this one began
 
     @classmethod
     def first(cls) -> Self:
-        """The first part of a new run."""
+        """Return the first part of a new run."""
         return cls(uuid4().hex, 1, "")
 
     def after(self, name: str) -> "Part":
-        """The part that follows this one, which is in the file ``name``."""
+        """Return the part that follows this one, which is in the file ``name``."""
         return Part(self.run, self.number + 1, name)
 
     def metadata(self) -> dict[str, str]:
-        """The part as it stands in a file."""
+        """Return the part as in a file."""
         return {"run": self.run, "number": str(self.number), "continues": self.continues}
 
     @classmethod
     def from_metadata(cls, found: Mapping[str, str]) -> "Part | None":
-        """Read a part; None where the metadata describe none."""
+        """Parse a part; None if the metadata are not one."""
         number = found.get("number", "")
         if not number.isdecimal() or len(number) > NUMBER_DIGITS or "run" not in found:
             return None
@@ -57,40 +57,40 @@ class Part(NamedTuple):
 
 
 class Hole(NamedTuple):
-    """A gap: ``events`` before ``t_ns``, and after those written before, were not recorded."""
+    """A gap: ``events`` before ``t_ns``, after those written before, were not recorded."""
 
     t_ns: int
     events: int
     why: str
 
     def metadata(self) -> dict[str, str]:
-        """The hole as it stands in a file."""
+        """Return the hole as in a file."""
         return {"t_ns": str(self.t_ns), "events": str(self.events), "why": self.why}
 
     @classmethod
     def from_metadata(cls, found: Mapping[str, str]) -> "Hole":
-        """Read a hole. Raises ``ValueError`` where the metadata describe none."""
+        """Parse a hole. Raises ``ValueError`` if the metadata are not one."""
         try:
             why = "".join(printable(found["why"][:WHY_MAX]).split("\n"))
             hole = cls(_whole(found["t_ns"]), _whole(found["events"]), why)
         except KeyError as error:
-            raise ValueError(f"a hole without {error}") from None
+            raise ValueError(f"hole without {error}") from None
         if hole.t_ns >= _LATEST_NS:
             raise ValueError("hole out of range")
         if hole.events > EVENTS_MAX:
-            raise ValueError("a hole of more events than there are")
+            raise ValueError("hole with too many events")
         return hole
 
 
 def _whole(text: str) -> int:
-    """A number of a hole. Raises ``ValueError`` where it is none, or of more digits than any."""
+    """Parse a number of a hole. Raises ``ValueError`` if it is invalid or has too many digits."""
     if not text.isdecimal() or len(text) > len(str(EVENTS_MAX)):
-        raise ValueError("a hole whose numbers are none")
+        raise ValueError("hole with an invalid number")
     return int(text)
 
 
 class Story(NamedTuple):
-    """A log's own account: which part it is, if one, and what is missing from it."""
+    """A log's statement about itself: its part, if any, and the events missing from it."""
 
     part: Part | None
     holes: tuple[Hole, ...]
@@ -99,7 +99,7 @@ class Story(NamedTuple):
 def read_story(path: Path) -> Story:
     """Read the story of a file; empty for a log that is not a recording.
 
-    Raises ``OSError`` where it cannot be read.
+    Raises ``OSError`` if it cannot be read.
     """
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -119,9 +119,9 @@ def read_story(path: Path) -> Story:
 
 
 def in_order(stories: Mapping[Path, Story]) -> list[Path] | None:
-    """Several parts of one run, in the order in which they were written; None for other logs.
+    """Return the parts of one run in the order in which they were written; None for other logs.
 
-    Raises ``UserError`` where two files are the same part.
+    Raises ``UserError`` if two files are the same part.
     """
     parts = {path: story.part for path, story in stories.items() if story.part is not None}
     if len(parts) < max(2, len(stories)) or len({part.run for part in parts.values()}) != 1:
@@ -129,12 +129,14 @@ def in_order(stories: Mapping[Path, Story]) -> list[Path] | None:
     ordered = sorted(parts, key=lambda path: parts[path].number)
     for one, other in pairwise(ordered):
         if parts[one].number == parts[other].number:
-            raise UserError(f"{one} and {other} are both part {parts[one].number} of one run")
+            raise UserError(
+                f"{one} and {other} are both part {parts[one].number} of one run; give it once"
+            )
     return ordered
 
 
 def missing(stories: Mapping[Path, Story], ordered: Sequence[Path]) -> list[str]:
-    """What a replay of these logs lacks, one line each; empty for a whole run."""
+    """Return what a replay of these logs lacks, one line each; empty for a complete run."""
     lines = []
     before = 0
     for path in ordered:
@@ -143,7 +145,7 @@ def missing(stories: Mapping[Path, Story], ordered: Sequence[Path]) -> list[str]
             skipped = range(before + 1, story.part.number)
             if skipped:
                 which = " to ".join(dict.fromkeys((str(skipped[0]), str(skipped[-1]))))
-                lines.append(f"{path}: part {which} of the run is not here")
+                lines.append(f"{path}: part {which} of the run is missing")
             before = story.part.number
         for hole in story.holes:
             at = datetime.fromtimestamp(hole.t_ns * 1e-9, tz=UTC).isoformat(timespec="seconds")

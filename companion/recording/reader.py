@@ -1,11 +1,10 @@
-"""Opens every kind of log, by what is in the file and never by its name.
+"""Reader of every kind of log, detected by content and never by name.
 
-Recordings of this program give back exactly the events that drove the live run, in that order;
-telemetry logs, raw MAVLink, captures and MCAP of others give the events that a live run would have
-had. What a vehicle wrote of itself becomes the frames that it would have sent: several such logs
-are one flight.
+Recordings of this program return exactly the events of the live run, in order; telemetry logs, raw
+MAVLink, captures and MCAP by others return the events of an equivalent live run. Onboard logs
+become the frames that the vehicle would have sent: several such logs are one flight.
 
-Over 300 lines: whatever the kind, what comes out are the same events.
+Over 300 lines: all kinds of logs become the same events.
 """
 
 import heapq
@@ -35,13 +34,13 @@ __all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flig
 LogKind = Literal["tlog", "mavlink", "mcap", "foreign-mcap", "capture", "dataflash", "ulog", "csv"]
 ATTACHMENTS: Final = frozenset(file.attachment for file in NAMED_FILES)
 _MAPPED_BYTES: Final = 1 << 26
-"""Size from which on a log is left to the system's pages rather than read into memory."""
+"""Size from which on a log is memory-mapped instead of read."""
 _LATEST_NS: Final = 1 << 62
-"""Latest time of an event, the year 2116: what is worked out from times stays in 63 bits."""
+"""Latest time of an event, the year 2116: results computed from times fit into 63 bits."""
 LARGEST_EVENT: Final = 1 << 21
-"""Most bytes of an event: a duty of all the names that it may have has no more."""
+"""Limit on the size of an event: that of a duty with the largest number of names."""
 _UNCERTAINTY_MAX_NS: Final = 3_600_000_000_000
-"""Greatest doubt of a frame's arrival: what is worked out from it stays in 63 bits."""
+"""Largest uncertainty of a frame's arrival: results computed from it fit into 63 bits."""
 _EVENT_TOPICS: Final = frozenset(
     (
         schemas.FRAMES_TOPIC,
@@ -56,17 +55,17 @@ _EVENT_TOPICS: Final = frozenset(
 
 
 def log_kind(path: Path) -> LogKind:
-    """The kind of a log. Raises ``LogError`` where the file is none."""
+    """Return the kind of a log. Raises ``LogError`` if the file is not a log."""
     return _open(path)[0]
 
 
 def read_log(log: Path | str, latency_s: float = 0.0) -> Iterator[Event]:
-    """The events of a log, in order. Raises ``LogError`` at once where the file cannot be used.
+    """Return the events of a log, in order. Raises ``LogError`` at once if the file is unusable.
 
-    ``Frame.link`` is the recorded link, or the file's name where the log knows of no links. A
-    recording cut short gives what is intact, and then ends; damage with intact events after it is a
-    ``Rejection`` of so many bytes of garbage. What a vehicle wrote of itself tells no arrivals:
-    its frames arrive ``latency_s`` after they were true.
+    ``Frame.link`` is the recorded link, or the file's name if the log has no links. A truncated
+    recording returns its intact events; damage before intact events becomes a ``Rejection`` of that
+    many bytes of garbage. Onboard logs have no arrivals: their frames arrive ``latency_s`` after
+    they were true.
     """
     path = Path(log)
     kind, data = _open(path)
@@ -84,7 +83,7 @@ def read_log(log: Path | str, latency_s: float = 0.0) -> Iterator[Event]:
 
 
 def _begun(path: Path, events: Iterator[Event], what: str, *kinds: type) -> Iterator[Event]:
-    """The events, among which there must be one of ``kinds``; what cannot be read is said now."""
+    """Return the events, which must include one of ``kinds``; raises errors at once."""
     before: list[Event] = []
     try:
         for event in events:
@@ -97,9 +96,9 @@ def _begun(path: Path, events: Iterator[Event], what: str, *kinds: type) -> Iter
 
 
 def read_flight(logs: Sequence[Path], latency_s: float = 0.0) -> Iterator[Event]:
-    """The events of logs of one flight, merged by time: see ``read_log``.
+    """Return the events of logs of one flight, merged by time: see ``read_log``.
 
-    Logs of one vehicle each are put on GPS time, and their vehicles told apart.
+    Logs of one vehicle each are converted to GPS time, with distinct ids for their vehicles.
     """
     if len(logs) == 1:
         return read_log(logs[0], latency_s)
@@ -112,18 +111,18 @@ def read_flight(logs: Sequence[Path], latency_s: float = 0.0) -> Iterator[Event]
 
 
 def vehicles(logs: Sequence[Path]) -> list[Vehicle]:
-    """The vehicles whose own logs are among these; empty where there are only logs of links.
+    """Return the vehicles of the onboard logs among these; empty without any.
 
-    Raises ``LogError`` for a log that cannot be used, or logs that are not one flight.
+    Raises ``LogError`` for an unusable log, or logs of different flights.
     """
     known = [(log, log_kind(log)) for log in logs]
     return together.opened([(log, kind) for log, kind in known if kind in together.READERS])
 
 
 def flights(logs: Sequence[Path]) -> list[tuple[Path, ...]]:
-    """Logs by flight: all of one vehicle each are one flight, and any other is one by itself.
+    """Group logs by flight: all onboard logs are one flight, any other log is one by itself.
 
-    Raises ``LogError`` for a log that cannot be used.
+    Raises ``LogError`` for an unusable log.
     """
     aboard = tuple(log for log in logs if log_kind(log) in together.READERS)
     alone: list[tuple[Path, ...]] = [(log,) for log in logs if log not in aboard]
@@ -131,9 +130,9 @@ def flights(logs: Sequence[Path]) -> list[tuple[Path, ...]]:
 
 
 def center_of(logs: Sequence[Path], center: str | None) -> str | None:
-    """What carries the array: as given, or the vehicle whose own log is named there.
+    """Return the carrier of the array: as given, or the vehicle whose onboard log is named.
 
-    Raises ``LogError`` where a log is named that holds more than one vehicle.
+    Raises ``LogError`` if the named log contains several vehicles.
     """
     named = [log for log in logs if center is not None and center in (str(log), log.name)]
     if not named:
@@ -141,11 +140,11 @@ def center_of(logs: Sequence[Path], center: str | None) -> str | None:
     for one in vehicles(logs):
         if one.path in named:
             return str(one.source)
-    raise LogError(f"{center}: not the log of one vehicle: name the carrier as SYSID:COMPID")
+    raise LogError(f"{center}: not the log of one vehicle; give the carrier as SYSID:COMPID")
 
 
 def read_parts(paths: Sequence[Path]) -> Iterator[Event]:
-    """The events of recordings one after the other; some of them may hold none.
+    """Return the events of recordings one after the other; some may contain none.
 
     As ``read_log``, but ``LogError`` is raised only when a file is reached.
     """
@@ -153,14 +152,14 @@ def read_parts(paths: Sequence[Path]) -> Iterator[Event]:
 
 
 class RecordedSettings(NamedTuple):
-    """The settings with which a recording was made."""
+    """Settings of the run that was recorded."""
 
     text: str  # TOML
-    files: dict[str, bytes]  # files that they name, by the names of their attachments
+    files: dict[str, bytes]  # files that they name, by name of the attachment
 
 
 def read_settings(path: Path) -> RecordedSettings | None:
-    """The settings with which a recording was made; None where the log has none."""
+    """Return the settings in a recording; None if the log has none."""
     if log_kind(path) != "mcap":
         return None
     files: dict[str, bytes] = {}
@@ -178,7 +177,7 @@ def read_settings(path: Path) -> RecordedSettings | None:
 
 
 def digest_of(path: Path) -> str | None:
-    """The digest to which the run came that a recording is of; None where it was cut short."""
+    """Return the digest in a recording; None if it is truncated."""
     if log_kind(path) != "mcap":
         return None
     for content in Walk(path, frozenset()):
@@ -188,14 +187,14 @@ def digest_of(path: Path) -> str | None:
 
 
 def utc_offset_ns(paths: Sequence[Path]) -> int:
-    """UTC less the timeline of recordings, by the last word in them; 0 where there is none.
+    """Return UTC less the timeline of recordings, by the last value in them; 0 without any.
 
-    Raises ``LogError`` where that word is none.
+    Raises ``LogError`` if that value is invalid.
     """
     offset_ns = 0
     for path in paths:
         walk = Walk(path, frozenset())
-        next(iter(walk), None)  # the end of the file, where it is there, has all channels
+        next(iter(walk), None)  # the end of the file, if it exists, has all channels
         topics = {channel.topic for channel in walk.channels.values()}
         if log_kind(path) == "mcap" and (not topics or schemas.CLOCK_TOPIC in topics):
             for content in Walk(path, frozenset((schemas.CLOCK_TOPIC,))):
@@ -212,7 +211,7 @@ def _offset_ns(path: Path, data: bytes) -> int:
 
 
 def _open(path: Path) -> tuple[LogKind, bytes]:
-    """The kind of a log, and its bytes unless it is one that is read piece by piece."""
+    """Return the kind of a log, and its bytes unless it is read piece by piece."""
     try:
         if not (path.is_file() or path.is_dir()) and path.exists():
             raise LogError(f"{path}: not a file")
@@ -227,7 +226,7 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
     except IsADirectoryError:
-        raise LogError(f"{path}: is a folder: name the logs in it") from None
+        raise LogError(f"{path}: is a folder; name the logs in it") from None
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     if not data:
@@ -244,19 +243,20 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
 
 
 def _whole(file: IO[bytes]) -> bytes:
-    """All bytes of a file; those of a large one are where the system keeps its pages."""
+    """Return all bytes of a file; a large one is memory-mapped."""
     size = file.seek(0, os.SEEK_END)
     if size > _MAPPED_BYTES:
-        # It is read as bytes are: by index, by slice and by regular expressions.
+        # It supports the same operations: index, slice and regular expressions.
         return cast(bytes, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ))
     file.seek(0)
     return file.read()
 
 
 def _ours(path: Path) -> bool:
-    """Whether this program wrote an MCAP file: one of its channels is ours, or it has none."""
+    """Return whether this program wrote an MCAP file: one of its channels is known, or it has
+    none."""
     walk = Walk(path, frozenset())
-    next(iter(walk), None)  # the end of the file, where it is there, has all channels
+    next(iter(walk), None)  # the end of the file, if it exists, has all channels
     if not walk.channels:
         walk = Walk(path, _EVENT_TOPICS)
         if any(isinstance(content, Message) for content in walk):
@@ -300,7 +300,7 @@ def _recorded(path: Path) -> Iterator[Event]:
 
 def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> Event | None:
     if len(data) > LARGEST_EVENT:
-        raise ValueError("an event that is longer than any")
+        raise ValueError(f"event is longer than {LARGEST_EVENT} bytes")
     if topic == schemas.FRAMES_TOPIC:
         frame = codec.to_frame(data, sources)
         if (
@@ -308,7 +308,7 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
             or max(frame.source) > 255
             or frame.doubt_ns > _UNCERTAINTY_MAX_NS
         ):
-            raise ValueError("a frame that is none")
+            raise ValueError("malformed frame")
         return frame
     if topic == schemas.TICKS_TOPIC:
         tick = schemas.TickMessage.FromString(data)
@@ -318,7 +318,7 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
     if topic == schemas.ROUND_TRIPS_TOPIC:
         trip = codec.to_round_trip(data)
         if max(trip.source) > 255:
-            raise ValueError("a round trip with nobody")
+            raise ValueError("round trip with an invalid source")
         return trip
     if topic == schemas.DUTIES_TOPIC:
         return codec.to_duty(data)

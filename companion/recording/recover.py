@@ -1,7 +1,7 @@
-"""Turns a recording that was cut short into a finished one.
+"""Recovery: completes a truncated recording.
 
-What is intact is written again as a recording is, so the result has its index and opens in every
-viewer. The torn original is removed only when its replacement is whole and on the disk.
+Intact content is written again like a recording, so the result has its index and opens in every
+viewer. The truncated original is removed only when its replacement is complete and on the disk.
 """
 
 import fcntl
@@ -21,16 +21,16 @@ from companion.recording.writer import ACTIVE, free_name, opened, sync_folder
 
 _PARTIAL: Final = ".recovering"
 CHANNELS_MAX: Final = 65_535
-"""Most channels with messages: those of a file are numbered from 1, in two bytes."""
+"""Limit on channels with messages: they are numbered from 1, in two bytes."""
 DAMAGED: Final = ".damaged"
 
 
 class UnreadableError(LogError):
-    """The file holds no recording at all."""
+    """The file contains no recording."""
 
 
 class BeingRecordedError(LogError):
-    """The recording is not a leftover: a process has it open."""
+    """The recording is still open in another process."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -40,16 +40,16 @@ class Recovered:
     path: Path  # the finished file
     messages: Mapping[str, int]  # number of messages by topic
     last_ns: int | None  # latest time among them; None without any
-    lost_bytes: int  # bytes of the torn file that could not be used
-    changed: bool  # False for a file that was complete and is left as it was
+    lost_bytes: int  # bytes of the original that could not be used
+    changed: bool  # False for a complete file, which is left unchanged
 
 
 def recover(path: Path) -> Recovered:
-    """Finish ``x.mcap.active`` as ``x.mcap``, a cut ``x.mcap`` as ``x.recovered.mcap``.
+    """Complete ``x.mcap.active`` as ``x.mcap``, a truncated ``x.mcap`` as ``x.recovered.mcap``.
 
-    No other file is overwritten: then it becomes ``x-1.mcap`` and so on. ``x.mcap.active`` is
-    removed when that is done, a cut ``x.mcap`` is kept. Raises ``LogError`` where the file is not
-    an MCAP file, is being recorded, cannot be read, or where its replacement cannot be written.
+    Existing files are never overwritten; then it becomes ``x-1.mcap`` and so on. ``x.mcap.active``
+    is removed afterwards, a truncated ``x.mcap`` is kept. Raises ``LogError`` if the file is not an
+    MCAP file, is being recorded, cannot be read, or if its replacement cannot be written.
     """
     try:
         return _recover(path)
@@ -64,11 +64,11 @@ def recover(path: Path) -> Recovered:
 def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
     """Recover every ``*.mcap.active`` in a folder.
 
-    One that is no recording, or does what nobody has foreseen, is reported and kept as
-    ``x.mcap.damaged``, so that it is not tried again at each start. Where the disk fails it is
+    A file that is not a recording, or causes an unexpected error, is reported and kept as
+    ``x.mcap.damaged``, so that it is not tried again at each start. After a disk error it is
     reported and left.
 
-    A file that is being recorded, by whatever process, is left alone and is not in the list.
+    A file that another process is recording is skipped, and is not in the list.
     """
     results: list[Recovered | LogError] = []
     for path in sorted(folder.glob(f"*.mcap{ACTIVE}")):
@@ -80,13 +80,13 @@ def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
             results.append(_keep_damaged(path, str(error)))
         except LogError as error:
             results.append(error)
-        except Exception as error:  # whatever a leftover does, the service starts
+        except Exception as error:  # no leftover may prevent the service from starting
             results.append(_keep_damaged(path, f"{path}: {type(error).__name__}: {error}"))
     return results
 
 
 def _keep_damaged(path: Path, why: str) -> LogError:
-    """Rename a leftover to ``x.mcap.damaged``; returns what is to be said."""
+    """Rename a leftover to ``x.mcap.damaged``; return the message about it."""
     aside = free_name(path.with_suffix(DAMAGED))
     try:
         path.rename(aside)
@@ -102,13 +102,13 @@ def _recover(path: Path) -> Recovered:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:
-            raise BeingRecordedError(f"{path}: is being recorded just now") from None
+            raise BeingRecordedError(f"{path}: is being recorded; stop that run first") from None
         return _rewrite(path, file.read(len(MAGIC)))
 
 
 def _rewrite(path: Path, head: bytes) -> Recovered:
     active = path.name.endswith(ACTIVE)
-    # A process killed at the very start may leave no more than a piece of the magic bytes.
+    # A process killed at the start may leave only some of the magic bytes.
     if not (head == MAGIC or (active and MAGIC.startswith(head))):
         raise UnreadableError(f"{path}: not an MCAP recording")
     final = path.with_suffix("") if active else path.with_suffix(".recovered.mcap")
@@ -134,7 +134,7 @@ def _rewrite(path: Path, head: bytes) -> Recovered:
 
 
 class _Tally:
-    """Counts what is kept."""
+    """Counts of recovered messages."""
 
     def __init__(self) -> None:
         self._messages: Counter[str] = Counter()
@@ -155,7 +155,7 @@ class _Tally:
 
 
 class _Copy:
-    """Writes what a walk finds into a new file, with new ids of schemas and channels."""
+    """Copies the contents of a walk to a new file, with new ids of schemas and channels."""
 
     def __init__(self, mcap: McapFile, walk: Walk, tally: _Tally) -> None:
         self._mcap = mcap
@@ -191,10 +191,10 @@ class _Copy:
     def _register(self, message: Message) -> int:
         channel = message.channel
         if len(self._channels) == CHANNELS_MAX:
-            raise UnreadableError(f"{self._walk.path}: more channels than a recording has")
+            raise UnreadableError(f"{self._walk.path}: more than {CHANNELS_MAX} channels")
         schema_id = self._schemas.get(channel.schema_id)
         if schema_id is None:
-            schema_id = 0  # of other programs: a channel without one
+            schema_id = 0  # other programs write channels without a schema
             if schema := self._walk.schemas.get(channel.schema_id):
                 schema_id = self._mcap.schema(schema.name, schema.encoding, schema.data)
             self._schemas[channel.schema_id] = schema_id

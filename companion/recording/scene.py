@@ -1,13 +1,12 @@
-"""The beams as a picture in space, for the 3D panel of a viewer.
+"""The beams as a 3D scene for viewers.
 
-Viewers want z upwards, so the frames are (REP 103 of ROS): ``map``, east-north-up at the origin of
-the local frame, child of ``wgs84``, the Earth's own; ``carrier``, forward-left-up, child of
+Viewers use z upwards, so the frames are (REP 103 of ROS): ``map``, east-north-up at the origin of
+the local frame, child of ``wgs84``, which is Earth-fixed; ``carrier``, forward-left-up, child of
 ``map``; ``array``, x along boresight, y to the left, z upwards, child of ``carrier``. The local
-frame is north-east-down and the body and array frames are forward-right-down: half a turn about x
-leads from those to these.
+frame is north-east-down and the body and array frames are forward-right-down: a rotation by half a
+turn around x converts them.
 
-What is drawn lives for some updates of the scene and then disappears by itself, such as the beam of
-a UAV that is lost.
+Drawn entities expire after some updates of the scene, such as the beam of a UAV that is lost.
 """
 
 import math
@@ -28,9 +27,9 @@ from companion.values import Carrier, FloatArray, Track, TrackState, Update
 MAP: Final = "map"
 CARRIER: Final = "carrier"
 ARRAY: Final = "array"
-LIFETIMES: Final = 3  # periods of the scene for which a drawn thing stays
+LIFETIMES: Final = 3  # lifetime of an entity, in periods of the scene
 WIDEST_RAD: Final = math.pi / 3
-"""Widest cone that is drawn: that of a line of elements would be open to one side."""
+"""Widest cone drawn: the beam of a line of elements is not limited in one direction."""
 HALF_POWER: Final = 0.886
 """Full width at half power of a uniform aperture, in wavelengths per aperture.
 
@@ -49,15 +48,15 @@ COLOURS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Draws updates for an array, ``rate_hz`` times a second (> 0)."""
+    """Drawing of updates for an array, ``rate_hz`` times a second (> 0)."""
 
     array: Array
     rate_hz: float
 
     def transforms(self, update: Update) -> list[Any]:
-        """``foxglove.FrameTransform``: the carrier in the map, and the array on it.
+        """Return ``foxglove.FrameTransform``: the carrier in the map, and the array on it.
 
-        Empty while the carrier's place is not known.
+        Empty while the carrier's position is unknown.
         """
         carrier = update.carrier
         if carrier is None:
@@ -71,24 +70,26 @@ class Scene:
         ]
 
     def origin(self, t_ns: int, lat_deg: float, lon_deg: float, alt_m: float) -> Any:
-        """``foxglove.FrameTransform``: where the map's origin stands on the Earth, and how.
+        """Return ``foxglove.FrameTransform``: position and orientation of the map's origin on the
+        Earth.
 
-        Degrees and metres; the parent is the Earth's own frame (EPSG 4978), in which heights above
-        the sea are taken for heights above the ellipsoid, as everywhere here.
+        Degrees and metres; the parent is the Earth-fixed frame (EPSG 4978). Heights above sea level
+        are used as heights above the ellipsoid, as everywhere here.
         """
         stands = LocalFrame(lat_deg, lon_deg, alt_m).origin_ecef_m
         ecef_from_map = (ENU_FROM_NED @ ned_from_ecef(lat_deg, lon_deg)).T
         return _transform(timestamp(t_ns), FRAME_ID, MAP, stands, ecef_from_map)
 
     def picture(self, update: Update) -> Any:
-        """``foxglove.SceneUpdate``: an entity for each UAV (place and bound) and for each beam."""
+        """Return ``foxglove.SceneUpdate``: an entity for each UAV (position and bound) and for each
+        beam."""
         entities = [self._uav(track, update.t_ns) for track in update.tracks]
         if update.carrier is not None and update.beams.beams:
             entities += self._beams(update, update.carrier)
         return schemas.SceneUpdateMessage(entities=entities)
 
     def _uav(self, track: Track, t_ns: int) -> Any:
-        """A name, a point, and the upright cylinder that holds the UAV, where it is finite."""
+        """Return a name, a point, and the upright cylinder of a UAV's bound, if it is finite."""
         north_m, east_m, down_m = track.position_ned_m.tolist()
         pose = {"position": {"x": east_m, "y": north_m, "z": -down_m}, "orientation": {"w": 1.0}}
         colour = COLOURS[track.state]
@@ -107,7 +108,8 @@ class Scene:
         return entity
 
     def _beams(self, update: Update, carrier: Carrier) -> Iterator[Any]:
-        """Cones from the array to the range of each UAV, as wide as its beam at half power."""
+        """Yield cones from the array to the range of each UAV, as wide as its beam at half
+        power."""
         towards = directions(update.beams)
         map_from_array = ENU_FROM_NED @ carrier.body_from_local.T @ self.array.array_from_body.T
         begin = ENU_FROM_NED @ line_of_sight.place_ned_m(carrier, self.array)
@@ -131,11 +133,11 @@ class Scene:
             yield entity
 
     def widths_rad(self, towards: FloatArray) -> FloatArray:
-        """Approximate full widths (N, 2) at half power across unit directions (N, 3).
+        """Return approximate full widths (N, 2) at half power across unit directions (N, 3).
 
-        Of the array frame, and horizontally and vertically in it: the widths of a uniform aperture
-        of the extent seen from there, at most ``WIDEST_RAD``. They are for drawing; ``patterns``
-        has the exact ones.
+        In the array frame, horizontally and vertically: the widths of a uniform aperture with the
+        extent seen from the direction, at most ``WIDEST_RAD``. For drawing only; ``patterns``
+        computes the exact ones.
         """
         array = self.array
         seen_m = array.elements_m @ _across(towards)[:, :, :2]
@@ -151,7 +153,7 @@ class Scene:
 
 
 def _across(towards: FloatArray) -> FloatArray:
-    """What leads to the array frame (N, 3, 3): right of and down across directions, and these."""
+    """Return rotations to the array frame (N, 3, 3): axes right of, below and along directions."""
     x, y, z = towards.T
     lengths = np.hypot(x, y)
     upright = lengths <= 1e-9  # straight up or down
@@ -184,10 +186,10 @@ def _vector(xyz: Any) -> dict[str, float]:
 
 
 def _quaternion(turned: FloatArray) -> dict[str, float]:
-    """The quaternion of a rotation matrix, parent from child.
+    """Return the quaternion of a rotation matrix, parent from child.
 
-    Found by its largest part (Shepperd 1978): the others are divided by it, so it must not be
-    small.
+    The largest component is computed first (Shepperd 1978): the others are divided by it, so it
+    must not be small.
     """
     m = turned.tolist()
     trace = m[0][0] + m[1][1] + m[2][2]

@@ -1,13 +1,13 @@
 """The messages of a recording: protobuf on every channel.
 
-Positions, log lines and the scene are Foxglove's own messages, which viewers draw as they are
+Positions, log lines and the scene are Foxglove's own messages, which viewers display directly
 (docs/field-notes.md 4). The fields of the others are the described values of their classes
-(``companion.values.described``), with the number that stands there: a number that has been written
-once keeps its meaning. A ``Schema`` carries the whole ``FileDescriptorSet``: a recording can be
-read by anyone, years from now, with nothing but the file.
+(``companion.values.described``), with their numbers; a number once written never changes its
+meaning. A ``Schema`` contains the complete ``FileDescriptorSet``, so that a recording can be
+decoded with nothing but the file.
 
-``FrameEncoder`` and ``encode_tick`` pack by hand the two messages that come by the thousand a
-second; the bytes are those of the generated classes (a test compares them).
+``FrameEncoder`` and ``encode_tick`` pack the two most frequent messages by hand; the bytes equal
+those of the generated classes (a test compares them).
 """
 
 import functools
@@ -32,7 +32,7 @@ from google.protobuf.message_factory import GetMessageClass
 from companion.recording import fields
 from companion.values import Frame
 
-RESERVED: Final = "reserved"  # stands in place of a field that is gone
+RESERVED: Final = "reserved"  # replaces a removed field
 _FLEET: Final[dict[str, list[str]]] = {
     "SharedFrame": ["uint64 after_ns", "bytes raw"],
     "Shared": ["fixed64 first_ns", "repeated SharedFrame frame", "repeated RoundTrip trip",
@@ -45,9 +45,9 @@ _FLEET: Final[dict[str, list[str]]] = {
     "Offers": ["repeated Offer offer"],
     "Tracks": ["repeated Track track"],
 }  # fmt: skip
-"""What the nodes of a fleet send one another (docs/fleet.md); they are in no recording.
+"""Messages between the nodes of a fleet (docs/fleet.md); they are not recorded.
 
-A field is "[repeated|optional] type name"; its number is its place in the list, so fields are only
+A field is "[repeated|optional] type name"; its number is its index in the list, so fields are only
 ever appended.
 """
 
@@ -64,12 +64,12 @@ _TYPES: Final = {
 
 
 def message(name: str, value: Any) -> Any:
-    """A described value as a protobuf message of this name."""
+    """Return a described value as a protobuf message of this name."""
     return _message(name)(**fields.values(name, value))
 
 
 def encode(name: str, value: Any) -> bytes:
-    """A described value as the bytes of a protobuf message of this name."""
+    """Return a described value as the bytes of a protobuf message of this name."""
     data: bytes = message(name, value).SerializeToString()
     return data
 
@@ -85,7 +85,7 @@ def _describe_field(into: DescriptorProto, number: int, declared: str) -> None:
     if label == ["repeated"]:
         field.label = FieldDescriptorProto.LABEL_REPEATED
     elif label == ["optional"]:
-        # proto3 keeps "not there" apart from 0 by a oneof of its own for each such field.
+        # proto3 distinguishes a missing value from 0 by a separate oneof for each such field.
         field.proto3_optional = True
         field.oneof_index = len(into.oneof_decl)
         into.oneof_decl.add(name=f"_{name}")
@@ -109,7 +109,7 @@ def _describe() -> FileDescriptorProto:
     return file
 
 
-_POOL: Final = DescriptorPool()  # of its own: names cannot clash with other protobuf users
+_POOL: Final = DescriptorPool()  # separate, so that names cannot clash with other protobuf users
 _POOL.Add(_describe())
 
 
@@ -140,14 +140,14 @@ SceneUpdateMessage: Final[Any] = SceneUpdate
 
 
 class Schema(NamedTuple):
-    """A message type as MCAP has it: full name, serialised ``FileDescriptorSet``."""
+    """A message type as in MCAP: full name, serialised ``FileDescriptorSet``."""
 
     name: str
     descriptor_set: bytes
 
 
 def _with_dependencies(message: Any) -> Schema:
-    """The schema of a message class: its file and all that it imports, dependencies first."""
+    """Return the schema of a message class: its file and all imports, dependencies first."""
     files = FileDescriptorSet()
     seen: set[str] = set()
 
@@ -194,9 +194,9 @@ SCENE_TOPIC: Final = "/scene"
 
 # Tag bytes: field number << 3 | wire type (0 varint, 1 eight bytes, 2 length-delimited).
 RAW_MAX: Final = 280
-"""Most bytes of a frame: 10 of head, 255 of payload, 2 of checksum, 13 of signature."""
+"""Largest frame in bytes: 10 header, 255 payload, 2 checksum, 13 signature."""
 _TIME = struct.Struct("<BQ")
-_IN_TWO = 0x10  # of a tick
+_IN_TWO = 0x10  # field of a tick
 _T_NS, _LINK, _SYSID, _COMPID, _MSGID, _RAW, _DOUBT_NS = (
     0x09, 0x12, 0x18, 0x20, 0x28, 0x32, 0x38,
 )  # fmt: skip
@@ -216,33 +216,33 @@ def _number(tag: int, value: int) -> bytes:
 
 
 def encode_tick(t_ns: int, *, in_two: bool = False) -> bytes:
-    """``companion.Tick``; ``t_ns`` in [0, 2⁶⁴)."""
+    """Encode ``companion.Tick``; ``t_ns`` in [0, 2⁶⁴)."""
     return (_TIME.pack(_T_NS, t_ns) if t_ns else b"") + _number(_IN_TWO, in_two)
 
 
 _RAW_HEADS: Final = (b"", *(bytes((_RAW,)) + _varint(size) for size in range(1, RAW_MAX + 1)))
-"""Tag and length of a frame's bytes, by their number; nothing where there are none."""
+"""Tag and length of a frame's bytes, by their number; empty for none."""
 
 
-HEADS_MAX: Final = 10_000  # heads of frames that are kept packed
+HEADS_MAX: Final = 10_000  # limit on cached heads of frames
 
 
 class FrameEncoder:
-    """Encodes ``companion.Frame`` messages; keeps the packed head of each (link, source, id) seen.
+    """Encoder of ``companion.Frame`` messages; caches the packed head of each (link, source, id).
 
-    There are a few hundred of those in hours of traffic, so that only its time and its bytes are
-    left to be packed for a frame.
+    Hours of traffic contain only a few hundred of them, so that for each frame only its time and
+    its bytes are packed.
     """
 
     def __init__(self) -> None:
         self._heads: dict[tuple[str, tuple[int, int], int], bytes] = {}
 
     def encode(self, frame: Frame) -> bytes:
-        """The message's bytes, as the generated class would serialise it."""
+        """Return the message's bytes, equal to those of the generated class."""
         key = (frame.link, frame.source, frame.msgid)
         head = self._heads.get(key)
         if head is None:
-            if len(self._heads) >= HEADS_MAX:  # a cache only: ids and links may be made up
+            if len(self._heads) >= HEADS_MAX:  # only a cache: ids and links may be forged
                 self._heads.clear()
             head = self._heads[key] = self._head(frame)
         t_ns, raw = frame.t_ns, frame.raw

@@ -1,8 +1,8 @@
-"""Tracks and beams in space as clouds of points, for viewers that draw nothing else: Rerun.
+"""Tracks and beams in 3D as point clouds, for Rerun, which draws nothing else.
 
 Rerun opens MCAP files and draws Foxglove's PointCloud and FrameTransform, but not the SceneUpdate
-of a recording; its own package is of 500 MB, and is not needed for this. A track is the places of
-its last ``TRAIL_S``, a beam points along its axis from the array to its UAV. What is lost is a
+of a recording; its own package has 500 MB and is not needed. A track is the positions of its last
+``TRAIL_S``, a beam is points along its axis from the array to its UAV. A lost UAV or beam becomes a
 cloud without points.
 """
 
@@ -33,9 +33,9 @@ _FIELDS: Final = (
 
 
 class SpaceFile:
-    """A file of clouds being written; use it as a context manager.
+    """A file of point clouds being written; use it as a context manager.
 
-    Raises ``OSError`` where it cannot be written.
+    Raises ``OSError`` if it cannot be written.
     """
 
     def __init__(self, path: Path, scene: Scene) -> None:
@@ -62,7 +62,7 @@ class SpaceFile:
         self._file.close()
 
     def add(self, update: Update, local: LocalFrame | None) -> None:
-        """Draw an update, as often as the scene is drawn."""
+        """Draw an update, at the rate of the scene."""
         if update.t_ns < self._due_ns or local is None:
             return
         self._due_ns = update.t_ns + round(1e9 / self._scene.rate_hz)

@@ -1,27 +1,28 @@
-"""A usable time line from time stamps that cannot be trusted.
+"""A usable time line from unreliable time stamps.
 
-Logs in the field have stamps that step back by a little (several links merged into one file), that
-leap by days or by 10¹² s for one frame, and that leap and stay there (the clock was set). A player
-that sleeps on their differences hangs (docs/field-notes.md 1). The time line returned here never
-steps back and never leaps by more than an hour: a stamp that does is clamped to the time before it.
-When the stamps after it go on from there, the clock was set, and the time line goes on with the
-shift that this makes. When they do not, it was one bad stamp, and nothing changes.
+Logs from the field have stamps that step back a little (several links merged into one file), that
+jump by days or by 10¹² s for one frame, or that jump permanently (the clock was set). A player that
+sleeps for their differences hangs (docs/field-notes.md 1). The time line returned here never steps
+back and never jumps by more than an hour: such a stamp is clamped to the previous time. If the
+following stamps continue from it, the clock was set, and the time line continues with that shift.
+Otherwise it was one bad stamp, and nothing changes.
 """
 
 from collections.abc import Sequence
 from typing import Final
 
 LARGEST_LEAP_NS: Final = 3_600_000_000_000
-"""Longest gap in a recording that is believed; a stamp beyond it is wrong."""
+"""Longest plausible gap in a recording; a stamp beyond it is wrong."""
 LINGERS_NS: Final = 1_000_000_000
-"""How long stamps must go on behind the time line before a step back counts as a set clock.
+"""Time for which stamps must continue behind the time line before a step back counts as a set
+clock.
 
-This is for steps of at most an hour: frames of a slower link between others step back and forth.
+For steps of at most an hour: frames of a slower link step back and forth among others.
 """
 _LATEST_START_NS: Final = 1 << 62
-"""Latest time at which a log may begin, the year 2116.
+"""Latest start of a log, the year 2116.
 
-Times then stay well inside 63 bits however long the log is.
+Times then fit into 63 bits however long the log is.
 """
 
 
@@ -30,10 +31,10 @@ def _goes_on(step_ns: int) -> bool:
 
 
 class RepairedStamps:
-    """Places one stamp after the other. ``first`` are the first few stamps, in nanoseconds.
+    """Time line of successive stamps. ``first`` are the first few stamps, in nanoseconds.
 
-    The time line starts at the first stamp; at the second where the first does not lead up to it
-    but the second leads up to the third; at 0 where that is no possible time.
+    It starts at the first stamp; at the second if only the second is consistent with the third; at
+    0 if the start is impossible.
     """
 
     def __init__(self, first: Sequence[int]) -> None:
@@ -46,12 +47,12 @@ class RepairedStamps:
         self._resumed: tuple[int, int] | None = None  # first and last stamp since clamping began
 
     def place(self, stamp_ns: int) -> int | None:
-        """Move on to this stamp; ``t_ns`` is then its time.
+        """Advance to this stamp; ``t_ns`` is then its time.
 
-        Returns None where the stamp was good, else by how many nanoseconds it is off (not 0).
+        Returns None for a good stamp, else its error in nanoseconds (not 0).
         """
         step_ns = stamp_ns + self._shift_ns - self.t_ns
-        if 0 <= step_ns <= LARGEST_LEAP_NS:  # ``_goes_on``, which would be most of the time
+        if 0 <= step_ns <= LARGEST_LEAP_NS:  # inlined ``_goes_on``, for speed
             self._resumed = None
             self.t_ns += step_ns
             if not self._absurd_start:

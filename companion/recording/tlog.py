@@ -1,7 +1,7 @@
-"""Logs of other programs: telemetry logs, and MAVLink as it came over the wire.
+"""Logs of other programs: telemetry logs, and raw MAVLink.
 
 A telemetry log (.tlog) has, before every frame, the Unix time in microseconds as eight bytes,
-big-endian. Raw MAVLink has no stamps; the sender's boot clock takes their place.
+big-endian. Raw MAVLink has no stamps; the sender's boot clock replaces them.
 """
 
 import re
@@ -26,20 +26,20 @@ from companion.values import Event, Frame, Reason, Rejection, Source
 STAMP: Final = 8  # bytes of the stamp before each frame of a telemetry log
 _PIECE: Final = 1 << 16
 _MANY_PAIRS: Final = 50
-_SEARCHED_BYTES: Final = 1 << 26  # bytes of a file in which MAVLink is looked for
+_SEARCHED_BYTES: Final = 1 << 26  # bytes of a file that are searched for MAVLink
 _TIMED: Final = frozenset((33, 30, 2))
-"""GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME: by their boot stamps raw MAVLink is dated."""
+"""GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME, whose boot stamps date raw MAVLink."""
 _magics = re.compile(b"[\xfd\xfe]").finditer
 
 
-# --- which kind ---------------------------------------------------------------------------------
+# --- detection ----------------------------------------------------------------------------------
 
 
 def sniff(data: bytes) -> Literal["tlog", "mavlink"] | None:
-    """The kind of a log, by what stands between frames that follow one another.
+    """Return the kind of a log, by the bytes between consecutive frames.
 
-    None where there is no MAVLink. A lone frame counts only at the start of the file, since one in
-    twenty megabytes of noise holds what looks like a frame.
+    None without MAVLink. A lone frame counts only at the start of the file, since twenty megabytes
+    of noise contain one by chance.
     """
     stamped = bare = 0
     at, end = 0, min(len(data), _SEARCHED_BYTES)
@@ -61,7 +61,7 @@ def sniff(data: bytes) -> Literal["tlog", "mavlink"] | None:
 
 
 def _next_frame(data: bytes, at: int, end: int) -> tuple[int, int]:
-    """Start of the first checked frame at or after ``at``, and its length (0: none)."""
+    """Return start and length of the first valid frame at or after ``at``; length 0: none."""
     for found in _magics(data, at, end):
         length = examine(data, found.start(), end)
         if length > 0:
@@ -73,10 +73,9 @@ def _next_frame(data: bytes, at: int, end: int) -> tuple[int, int]:
 
 
 _Stretch = tuple[int | None, Checked | None, dict[Reason, int]]
-"""The stamp of a frame of a telemetry log, ns; the frame; what had to be skipped to get to it.
+"""Stamp of a frame of a telemetry log, ns; the frame; bytes skipped before it.
 
-The stamp is None where the frame before it leaves no room for one, the frame where there are no
-more.
+The stamp is None if it does not fit before the frame, the frame is None at the end.
 """
 
 
@@ -84,10 +83,10 @@ _NOTHING: Final[dict[Reason, int]] = {}
 
 
 def read_tlog(data: bytes, link: str) -> Iterator[Event]:
-    """The events of a telemetry log, on a time line that never steps back nor leaps.
+    """Yield the events of a telemetry log, on a time line that never steps back or jumps.
 
-    A rejection has the time of the frame after it. A frame whose stamp is bad is still returned,
-    after a rejection that says so.
+    A rejection has the time of the following frame. A frame with a bad stamp is still returned,
+    after a rejection for the stamp.
     """
     ahead = _stretches(data)
     first = list(islice(ahead, 3))
@@ -139,10 +138,9 @@ def _stretches(data: bytes) -> Iterator[_Stretch]:
 
 
 def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:
-    """What lies in [at, stop), where no frame checks, counted as ``Splitter`` counts.
+    """Count the contents of [at, stop), which has no valid frame, as ``Splitter`` does.
 
-    Failed frames that stand one after the other, each behind its stamp, count once each; bytes that
-    belong to neither are garbage.
+    Consecutive invalid frames, each with its stamp, count once each; other bytes are garbage.
     """
     lost: dict[Reason, int] = {}
     end = len(data)
@@ -164,10 +162,10 @@ def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:
 
 
 def read_raw(data: bytes, link: str) -> Iterator[Event]:
-    """The events of raw MAVLink. Their time is the boot clock of the first source that sends one.
+    """Yield the events of raw MAVLink. Their time is the boot clock of the first source that sends
+    one.
 
-    It counts from the epoch and never steps back; frames before the first that tells the time get
-    the time of that one.
+    It starts at the epoch and never steps back; earlier frames get the time of the first stamp.
     """
     frames = (event for event in _split(data, link) if isinstance(event, Frame))
     first = next((one for one in frames if _boot_ns(one, one.source) is not None), None)
@@ -176,7 +174,7 @@ def read_raw(data: bytes, link: str) -> Iterator[Event]:
     for event in _split(data, link):
         stamp_ns = _boot_ns(event, clock) if isinstance(event, Frame) else None
         off_ns = None if stamp_ns is None else timeline.place(stamp_ns)
-        # Messages of one sender may be a little out of step: only more than that is a bad stamp.
+        # Messages of one sender may be slightly out of order: only more is a bad stamp.
         if off_ns is not None and abs(off_ns) > LINGERS_NS:
             yield _bad_stamp(timeline.t_ns, link, off_ns)
         yield _at(event, timeline.t_ns)

@@ -1,7 +1,7 @@
-"""Unpacks a chunk of an MCAP file, to no more than a given size, whatever it says of itself.
+"""Decompression of an MCAP chunk, limited to a given size whatever its header claims.
 
-A frame of zstd names the size of its contents, and the library makes room for that before it reads
-on: 131 kB asked for 4.2 GB. So it is looked at first.
+A zstd frame states the size of its contents, and the library allocates it before reading: 131 kB
+asked for 4.2 GB. So the size is checked first.
 """
 
 import struct
@@ -18,35 +18,35 @@ _UNKNOWN: Final = -1
 
 
 class DamagedChunkError(ValueError):
-    """A chunk that cannot be unpacked."""
+    """A chunk that cannot be decompressed."""
 
 
 def unpacked(body: bytes, most: int) -> bytes:
-    """The contents of a chunk's record, of at most ``most`` bytes.
+    """Return the contents of a chunk's record, at most ``most`` bytes.
 
-    Raises ``DamagedChunkError`` where they are more, are not what the chunk says of them, or are
-    packed in a way that is not known.
+    Raises ``DamagedChunkError`` if they are larger, do not match their header, or have an unknown
+    compression.
     """
     try:
         _, _, size, checksum, name = _HEAD.unpack_from(body)
         if name > _NAME_MAX:
-            raise DamagedChunkError("no compression has such a name")
+            raise DamagedChunkError("invalid name of a compression")
         at = _HEAD.size + name
         compression = body[_HEAD.size : at]
         (length,) = _SIZE.unpack_from(body, at)
     except struct.error as error:
-        raise DamagedChunkError("a chunk without its head") from error
+        raise DamagedChunkError("incomplete header of a chunk") from error
     if size > most or length > len(body) - at - _SIZE.size:
-        raise DamagedChunkError("larger than can be")
+        raise DamagedChunkError("chunk exceeds the size limit")
     packed = memoryview(body)[at + _SIZE.size : at + _SIZE.size + length]
     data = _unpack(compression, packed, size)
     if len(data) != size or (checksum and zlib.crc32(data) != checksum):
-        raise DamagedChunkError("not what was packed")
+        raise DamagedChunkError("size or checksum mismatch")
     return data
 
 
 def _unpack(compression: bytes, packed: memoryview, size: int) -> bytes:
-    """What is packed, if that is ``size`` bytes; else any number of at most one more."""
+    """Return the contents if they have ``size`` bytes; else at most one byte more."""
     match compression:
         case b"":
             return bytes(packed)
@@ -54,20 +54,20 @@ def _unpack(compression: bytes, packed: memoryview, size: int) -> bytes:
             return _zstd(packed, size)
         case b"lz4":
             return _lz4(packed, size)
-    raise DamagedChunkError("an unknown compression")
+    raise DamagedChunkError("unknown compression")
 
 
 def _zstd(packed: memoryview, size: int) -> bytes:
     try:
         if frame_content_size(packed) not in (size, _UNKNOWN):
-            raise DamagedChunkError("the frame is of another size than the chunk")
+            raise DamagedChunkError("size of the zstd frame differs from that of the chunk")
         return ZstdDecompressor().decompress(packed, max_output_size=size) if size else b""
     except ZstdError as error:
         raise DamagedChunkError(str(error)) from error
 
 
 def _lz4(packed: memoryview, size: int) -> bytes:
-    """No recording of this program has it, but those of others do."""
+    """Decompress lz4, which only other programs use."""
     from lz4.frame import LZ4FrameDecompressor
 
     try:

@@ -1,7 +1,7 @@
-"""Writes a recording: an MCAP file that replays to what happened, and that viewers can draw.
+"""Writer of a recording: an MCAP file that can be replayed, and that viewers can draw.
 
 While open the file is called ``….mcap.active``. After ``flush`` everything so far is on the disk
-and readable whatever happens to the process; ``close`` writes the index and removes the ending
+and readable, even if the process is killed; ``close`` writes the index and removes the suffix
 ``.active``. Not for use by two threads at once.
 """
 
@@ -34,16 +34,17 @@ MEDIA_TYPES: Final = {
     ".csv": "text/csv",
     ".npy": "application/x-npy",
 }
-"""Media types of attachments, by the endings of their names."""
+"""Media types of attachments, by the suffixes of their names."""
 VERSIONS: Final = "versions"
 SUMMARY: Final = "summary"
 
 
 class _Topics:
-    """The channels of a file by their topics; each is described with its first message.
+    """The channels of a file by topic; each is added with its first message.
 
-    Not part of the writer, which would then be part of its own encoder: such a circle keeps a
-    finished file's megabytes until a full garbage collection, and those are rare in the service.
+    Separate from the writer, which would otherwise reference itself through its encoder. Such a
+    cycle keeps a finished file's megabytes until a full garbage collection, which is rare in the
+    service.
     """
 
     def __init__(self, mcap: McapFile) -> None:
@@ -53,7 +54,7 @@ class _Topics:
         self._channel_ids: dict[str, int] = {}
 
     def add(self, topic: str, schema: schemas.Schema, t_ns: int, data: bytes) -> None:
-        """Write a message; ``Encoder`` calls it."""
+        """Write a message; called by ``Encoder``."""
         channel_id = self._channel_ids.get(topic) or self._channel(topic, schema)
         stamp_ns = t_ns if t_ns > 0 else 0
         self._mcap.message(channel_id, stamp_ns, stamp_ns, self.messages & 0xFFFFFFFF, data)
@@ -71,19 +72,19 @@ class _Topics:
 class Writer:
     """One recording, open from the start until ``close`` or ``abandon``.
 
-        where          a folder (made if missing), in which the file is called
+        where          a folder (created if missing), where the file is called
                        ``companion-YYYYmmddTHHMMSSZ.mcap`` after ``started_ns`` (UTC), with -1, -2 …
-                       where that is taken; or, when the name ends in ``.mcap``, the file itself,
-                       which replaces one of that name on ``close``
+                       if that exists; or, if the name ends in ``.mcap``, the file itself, which
+                       replaces an existing one on ``close``
         settings_toml  the settings, attached to the file
         files          files that the settings name, attached before them; by attachment
         versions       versions of programs, as a metadata record
         weights_hz     as for ``Encoder``
-        started_ns     when the recording begins
+        started_ns     start of the recording
         scene          as for ``Encoder``
-        part           which part of which run this is; None: it stands alone
+        part           its part of a run; None: not part of one
 
-    Any method raises ``OSError`` where the file cannot be written.
+    Any method raises ``OSError`` if the file cannot be written.
     """
 
     def __init__(
@@ -98,7 +99,7 @@ class Writer:
         scene: Scene | None = None,
         part: Part | None = None,
     ) -> None:
-        self.flushed = 0  # messages that are on the disk
+        self.flushed = 0  # messages on the disk
         self.size_bytes = 0  # size of the file at the last flush
         self._replace = where.suffix == ".mcap" and not where.is_dir()
         self._final = where if self._replace else _reserve(where, started_ns)
@@ -113,7 +114,7 @@ class Writer:
                 self._mcap.attachment(at_ns, at_ns, name, MEDIA_TYPES[Path(name).suffix], data)
             self._write_head(versions, part)
         except OSError:
-            self.salvage()  # a file without a head would be recovered as a recording of nothing
+            self.salvage()  # a file without a head would be recovered as an empty recording
             raise
 
     def _write_head(self, versions: Mapping[str, str], part: Part | None) -> None:
@@ -130,11 +131,12 @@ class Writer:
 
     @property
     def path(self) -> Path:
-        """Where the file is now: ``….mcap.active`` until it is closed."""
+        """Current path of the file: ``….mcap.active`` until it is closed."""
         return self._final if self._finished else _beside(self._final)
 
     def event(self, event: Event) -> None:
-        """Record what drives the pipeline: in the order of the calls, before its outputs."""
+        """Record an event that drives the pipeline: in the order of the calls, before its
+        outputs."""
         self._encoder.event(event)
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
@@ -147,20 +149,20 @@ class Writer:
         self._mcap.metadata(HOLE, hole.metadata())
 
     def flush(self) -> None:
-        """Write everything so far to the disk; a killed process then loses nothing of it.
+        """Write everything so far to the disk, where it survives a killed process.
 
-        Raises ``FileNotFoundError`` where the file is no longer in its place: what is written to a
-        removed file is lost with the process.
+        Raises ``FileNotFoundError`` if the file was removed or renamed: its contents would be lost
+        with the process.
         """
         self._mcap.flush()
         os.fsync(self._file.fileno())
         if not self._is_in_place():
-            raise FileNotFoundError(errno.ENOENT, "the file is no longer there", str(self.path))
+            raise FileNotFoundError(errno.ENOENT, "the file was removed", str(self.path))
         self.size_bytes = self._file.tell()
         self.flushed = self.messages
 
     def close(self, metadata: Mapping[str, str]) -> Path:
-        """Finish the file and give it its name; ``metadata``, if any, is its record ``summary``.
+        """Finish and rename the file; ``metadata``, if not empty, becomes its record ``summary``.
 
         Returns the file's path. Closing twice does nothing.
         """
@@ -183,18 +185,18 @@ class Writer:
         return self._final
 
     def abandon(self) -> None:
-        """Close the file as it is, ``.active``: what has been flushed can be recovered."""
+        """Close the file without finishing it: flushed content can be recovered."""
         self._file.close()
 
     def salvage(self) -> bool:
-        """Close a file that cannot be written, cut back to what was flushed last.
+        """Close an unwritable file, truncated to the last flush.
 
-        The rest can then go into another file; a file that holds no message is removed. Returns
-        False where it could not be cut: then it is not known what it holds of the rest.
+        The rest can then go into another file; a file without messages is removed. Returns False if
+        the truncation failed: then it is unknown which part of the rest the file contains.
         """
         if self._file.closed:
             return True
-        spare = os.dup(self._file.fileno())  # closing writes the buffer, which may fail
+        spare = os.dup(self._file.fileno())  # closing flushes the buffer, which may fail
         try:
             with contextlib.suppress(OSError):
                 self._file.close()
@@ -227,7 +229,7 @@ def _beside(final: Path) -> Path:
 
 
 def free_name(wanted: Path) -> Path:
-    """``x.mcap``, or the first of ``x-1.mcap``, ``x-2.mcap`` … that does not exist."""
+    """Return ``x.mcap``, or the first of ``x-1.mcap``, ``x-2.mcap`` … that does not exist."""
     candidate, number = wanted, 0
     while candidate.exists():
         number += 1
@@ -236,10 +238,10 @@ def free_name(wanted: Path) -> Path:
 
 
 def open_alone(path: Path) -> BufferedWriter:
-    """Open and empty a file that no other process is recording to.
+    """Open and truncate a file that no other process is recording to.
 
-    Raises ``BlockingIOError`` if one is. The lock goes with the process, however that ends, so it
-    also tells leftovers from live files.
+    Raises ``BlockingIOError`` if one is. The lock ends with the process, so it also distinguishes
+    leftovers from files in use.
     """
     file = opened(path, os.O_APPEND)
     try:
@@ -253,13 +255,13 @@ def open_alone(path: Path) -> BufferedWriter:
 
 
 def opened(path: Path, flags: int) -> BufferedWriter:
-    """A file to write, made if missing: where everybody flies is not for all to read."""
+    """Open a file for writing, created if missing and not readable by all users."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | flags, FILE_MODE)
     return os.fdopen(descriptor, "ab" if flags & os.O_APPEND else "wb")
 
 
 def _reserve(folder: Path, started_ns: int) -> Path:
-    """A name that no recording has, finished or open; its ``.active`` file now exists."""
+    """Return a name that no finished or open recording has; creates its ``.active`` file."""
     folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
     started = datetime.fromtimestamp(started_ns // 1_000_000_000, tz=UTC)
     name, number = f"companion-{started:%Y%m%dT%H%M%SZ}", 0
@@ -276,7 +278,7 @@ def _reserve(folder: Path, started_ns: int) -> Path:
 
 
 def sync_folder(folder: Path) -> None:
-    """Bring a folder to the disk: a new name is on the disk only when its folder is."""
+    """Flush a folder to the disk: a new name is durable only after that."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

@@ -113,7 +113,7 @@ def test_the_parts_of_a_run_replay_to_its_digest(start_node: Any, tmp_path: Path
     assert summary["missing"] == []
     assert logs[-1].name in out
     alone = replayed(logs[2])
-    assert alone["missing"] == [f"{logs[2]}: part 1 to 2 of the run is not here"]
+    assert alone["missing"] == [f"{logs[2]}: part 1 to 2 of the run is missing"]
     assert alone["frames"] > 0 and alone["digest"] != summary["digest"]
     assert len(replayed(logs[0], logs[2])["missing"]) == 1
 
@@ -138,6 +138,6 @@ def test_a_folder_taken_away_does_not_stop_the_beams(start_node: Any, tmp_path: 
     said = [line for line in err.splitlines() if "record" in line]
     assert len(said) == 2 and "nothing is recorded" in said[0] and "recording again" in said[1]
     (path,) = kept.iterdir()
-    assert replayed(path)["missing"] == [f"{path}: part 1 of the run is not here"]
+    assert replayed(path)["missing"] == [f"{path}: part 1 of the run is missing"]
     log = [notice for notice in read_metadata(path) if notice == "summary"]
     assert log == ["summary"]

@@ -52,7 +52,7 @@ def test_no_list_is_no_fault(tmp_path: Path) -> None:
 )
 def test_what_is_no_list_of_events(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.tlog.events.json").write_text(text)
-    with pytest.raises(LogError, match="not a list of events"):
+    with pytest.raises(LogError, match="must be a list of entries"):
         declared_faults(tmp_path / "a.tlog")
 
 

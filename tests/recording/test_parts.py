@@ -81,9 +81,9 @@ def test_a_recovered_part_keeps_its_place(
 def test_what_is_not_there_is_said(run_in_three: tuple[list[Path], list[Event], str]) -> None:
     one, two, three = run_in_three[0]
     assert missing_of([one, two]) == []  # of the end nobody can know
-    assert missing_of([one, three]) == [f"{three}: part 2 of the run is not here"]
-    assert missing_of([three]) == [f"{three}: part 1 to 2 of the run is not here"]
-    assert missing_of([three, two]) == [f"{two}: part 1 of the run is not here"]
+    assert missing_of([one, three]) == [f"{three}: part 2 of the run is missing"]
+    assert missing_of([three]) == [f"{three}: part 1 to 2 of the run is missing"]
+    assert missing_of([three, two]) == [f"{two}: part 1 of the run is missing"]
 
 
 def test_a_hole_is_said_where_it_is(tmp_path: Path) -> None:

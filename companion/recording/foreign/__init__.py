@@ -1,8 +1,8 @@
-"""Logs in the words of others, as the MAVLink that their vehicle would have sent.
+"""Logs in other formats, converted to the MAVLink that their vehicle would have sent.
 
-``kinds`` tells files by their first bytes. ``dataflash`` and ``ulog`` walk the bytes of an
-autopilot's own log and give columns; ``ardupilot``, ``receiver`` and ``px4`` say what the columns
-mean; ``csv_table`` reads tables. ``onboard`` holds the samples of one vehicle, whatever wrote them,
-and ``said`` makes frames of them. ``gps_time`` puts a boot clock on GPS time, and ``together``
-several logs on one timeline. ``packets`` and ``capture`` take MAVLink out of what is around it.
+``kinds`` detects files by their first bytes. ``dataflash`` and ``ulog`` parse an autopilot's
+onboard log into columns; ``ardupilot``, ``receiver`` and ``px4`` interpret the columns;
+``csv_table`` reads tables. ``onboard`` contains the samples of one vehicle in any format, and
+``said`` converts them to frames. ``gps_time`` maps a boot clock to GPS time, and ``together``
+several logs to one timeline. ``packets`` and ``capture`` extract MAVLink from its packets.
 """

@@ -1,8 +1,8 @@
-"""What the columns of ArduPilot's DataFlash log mean.
+"""Interpretation of ArduPilot's DataFlash log.
 
 Meanings and units: https://ardupilot.org/copter/docs/logmessages.html. POS is the position that
-GLOBAL_POSITION_INT sends; its velocity is that of the estimator's core in use (XKF1, or NKF1 of the
-estimator before it, by XKF4.PI and ATT.AEKF). SIM and SIM2 are the simulator's own.
+GLOBAL_POSITION_INT sends; its velocity is that of the estimator core in use (XKF1, or NKF1 of the
+older estimator, by XKF4.PI and ATT.AEKF). SIM and SIM2 come from the simulator.
 """
 
 from typing import Final
@@ -42,7 +42,7 @@ _VTOL: Final = 22
 
 
 def read(data: Bytes) -> Onboard:
-    """The samples of a log; what cannot be used is counted."""
+    """Return the samples of a log; unusable ones are counted."""
     walked = walk(data, _WANTED)
     tables = {name: table(data, walked, name) for name in _WANTED}
     lost: dict[Reason, int] = {}
@@ -71,7 +71,7 @@ def read(data: Bytes) -> Onboard:
 
 
 def _timed(of: DataflashTable, lost: dict[Reason, int]) -> DataflashTable:
-    """The rows in order of time; those of several cores or receivers at one time all stay."""
+    """Return the rows in order of time; rows of several cores or receivers at one time are kept."""
     boot_us = times(of)
     if len(boot_us) != len(of):
         count(lost, Reason.MALFORMED, len(of))
@@ -91,11 +91,11 @@ def _timed(of: DataflashTable, lost: dict[Reason, int]) -> DataflashTable:
     return of.rows(np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64))
 
 
-# --- who it is ------------------------------------------------------------------------------------
+# --- identity -------------------------------------------------------------------------------------
 
 
 def _identity(parameters: DataflashTable, versions: DataflashTable) -> tuple[int | None, int]:
-    """System id, where the log has it, and MAV_TYPE; 0 (generic) where it does not tell."""
+    """Return system id, if the log has it, and MAV_TYPE; 0 (generic) if unknown."""
     values: dict[bytes, float] = {}
     if "Name" in parameters and "Value" in parameters:
         names = np.char.rstrip(parameters.raw("Name").astype("S16"), b"\0")
@@ -116,7 +116,7 @@ def _identity(parameters: DataflashTable, versions: DataflashTable) -> tuple[int
 
 
 def _build(values: dict[bytes, float]) -> int:
-    """The kind of vehicle by the parameters that only it has; 0 where they do not tell."""
+    """Return the kind of vehicle by parameters that only it has; 0 if unknown."""
     if b"Q_ENABLE" in values:
         return 3
     return 2 if b"FRAME_CLASS" in values else 0
@@ -129,7 +129,7 @@ def _armed(of: DataflashTable) -> tuple[tuple[int, bool], ...]:
     return tuple(zip(times(of).tolist(), (state != 0).tolist(), strict=True))
 
 
-# --- where it was ---------------------------------------------------------------------------------
+# --- motion ---------------------------------------------------------------------------------------
 
 
 def _positions(
@@ -169,18 +169,18 @@ def _positions(
 def _received(
     fixes: Fixes, tables: dict[str, DataflashTable], notes: list[str]
 ) -> OnboardPositions | None:
-    """The receiver's own positions, where the log has no estimated ones."""
+    """Return the receiver's positions, if the log has no estimated ones."""
     fixed = fixes.fixed()
     if fixed is None:
         return None
-    notes.append("no POS in it: positions are those of the receiver")
+    notes.append("no POS: positions are those of the GNSS receiver")
     way = moved(fixed.boot_us, fixed.lat_1e7, fixed.lon_1e7, fixed.alt_m)
     velocity = _filled(np.full_like(way, np.nan), fixed.boot_us, fixes, way, notes)
     return fixed.positions(velocity, _headings(fixed.boot_us, tables["ATT"]))
 
 
 def _velocities(boot_us: IntArray, tables: dict[str, DataflashTable]) -> FloatArray:
-    """The estimator's velocities (N, 3) at times (N,); NaN where it has none."""
+    """Return the estimator's velocities (N, 3) at times (N,); NaN if unknown."""
     older = tables["ATT"].integers("AEKF")
     second = older is not None and len(older) > 0 and int(np.median(older)) == 2
     names = ("NKF1", "NKF4") if second or not len(tables["XKF1"]) else ("XKF1", "XKF4")
@@ -203,7 +203,7 @@ def _velocities(boot_us: IntArray, tables: dict[str, DataflashTable]) -> FloatAr
 def _filled(
     velocity: FloatArray, boot_us: IntArray, fixes: Fixes | None, way: FloatArray, notes: list[str]
 ) -> FloatArray:
-    """Velocities with what is missing put in: the receiver's over ground, else the way's."""
+    """Fill in missing velocities: the receiver's over ground, else from positions."""
     missing: BoolArray = np.array(np.isnan(velocity).any(axis=1))
     notes.append(f"no estimated velocity at {missing.sum()} of {len(boot_us)} positions")
     put = way.copy()

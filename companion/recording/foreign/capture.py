@@ -1,8 +1,8 @@
-"""MAVLink out of the packets of others: captures of a network, and MCAP files of other programs.
+"""MAVLink from packets: captures of a network, and MCAP files of other programs.
 
-Each way that packets go has a splitter of its own, as each peer of a live link has; segments of TCP
-are put in order first. In an MCAP, channels whose encoding, schema or topic speaks of MAVLink are
-searched for frames: whatever stands around a frame in a message is no frame, and is left.
+Each flow of packets has its own splitter, like each peer of a live link; TCP segments are put in
+order first. In an MCAP, channels whose encoding, schema or topic contains "mavlink" are searched
+for frames; other bytes in their messages are ignored.
 """
 
 from collections import OrderedDict
@@ -17,16 +17,17 @@ from companion.recording.stamps import LINGERS_NS, RepairedStamps
 from companion.values import Event, Frame, Reason, Rejection
 
 _FLOWS_MAX: Final = 512
-"""Ways that are followed at a time; beyond, the one that was silent longest is given up."""
+"""Limit on concurrent flows; beyond it, the least recently active one is ended."""
 _AHEAD_MAX: Final = 64
-"""Segments of TCP that wait for what is missing before them; beyond, it is taken for lost."""
+"""Limit on TCP segments that wait for a missing one; beyond it, the missing one counts as lost."""
 _MAGICS: Final = (b"\xfd", b"\xfe")
 
 
 def read_capture(path: Path) -> Iterator[Event]:
-    """The events of a capture; each link is a way, such as ``udp:10.0.0.2:14555>10.0.0.1:14550``.
+    """Yield the events of a capture; each flow is a link, such as
+    ``udp:10.0.0.2:14555>10.0.0.1:14550``.
 
-    Ways on which no frame is ever seen say nothing. Raises ``OSError`` where it cannot be read.
+    Flows without a frame return nothing. Raises ``OSError`` if the file cannot be read.
     """
     flows: OrderedDict[str, _Flow] = OrderedDict()
     timeline: RepairedStamps | None = None
@@ -64,7 +65,7 @@ def read_capture(path: Path) -> Iterator[Event]:
 
 
 class _Flow:
-    """One way of packets, and the frames in it. Silent until its first frame."""
+    """One flow of packets, and the frames in it. Returns nothing before its first frame."""
 
     def __init__(self, name: str) -> None:
         self._splitter = Splitter(name)
@@ -72,14 +73,14 @@ class _Flow:
         self._ahead: dict[int, bytes] = {}
 
     def take(self, t_ns: int, found: Segment) -> list[Frame | Rejection]:
-        """The frames that end in a packet."""
+        """Return the frames that end in a packet."""
         if found.tcp_seq is None:
             whole = self._splitter.feed(t_ns, found.payload)
             return self._frames_only(whole)
         return self._frames_only(self._splitter.feed(t_ns, self._in_order(found, found.tcp_seq)))
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """What is left when the way ends."""
+        """Return the rest when the flow ends."""
         rest = b"".join(self._ahead[seq] for seq in sorted(self._ahead))
         self._ahead.clear()
         return self._frames_only([*self._splitter.feed(t_ns, rest), *self._splitter.finish(t_ns)])
@@ -88,7 +89,7 @@ class _Flow:
         return events if self._splitter.frames else []
 
     def _in_order(self, found: Segment, seq: int) -> bytes:
-        """What can be handed on now: bytes that came before are dropped, later ones wait."""
+        """Return the bytes that are next in order: repeated bytes are dropped, later ones wait."""
         if found.tcp_syn:
             self._next = (seq + 1) & 0xFFFF_FFFF
             self._ahead.clear()
@@ -111,18 +112,18 @@ class _Flow:
         return [seq for seq in self._ahead if self._distance(seq) <= 0]
 
     def _distance(self, seq: int) -> int:
-        """How far a sequence number lies ahead of the next one that is wanted; it may wrap."""
+        """Return how far a sequence number is ahead of the next expected one; it may wrap."""
         assert self._next is not None
         return (seq - self._next + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
 
 
-# --- MCAP of others -------------------------------------------------------------------------------
+# --- MCAP of other programs -----------------------------------------------------------------------
 
 
 def read_mcap(path: Path) -> Iterator[Event]:
-    """The frames in the MAVLink channels of an MCAP that this program did not write.
+    """Yield the frames in the MAVLink channels of an MCAP by another program.
 
-    Each link is a topic. Raises ``OSError`` where it cannot be read.
+    Each link is a topic. Raises ``OSError`` if the file cannot be read.
     """
     timeline: RepairedStamps | None = None
     splitters: dict[int, Splitter | None] = {}
@@ -150,5 +151,5 @@ def read_mcap(path: Path) -> Iterator[Event]:
 
 
 def _is_frame(refused: Rejection) -> bool:
-    """Whether what was refused was meant as a frame, and is not what a message wraps it in."""
+    """Return whether a rejected sequence of bytes was a frame, and not a wrapper of one."""
     return refused.reason in (Reason.BAD_CRC, Reason.UNKNOWN_MESSAGE)

@@ -1,13 +1,13 @@
-"""A table of positions as text, with a header that says what each column is, and its unit.
+"""A table of positions as text, whose header names each column with its unit.
 
     # sysid = 3
     # mav_type = 2
     unix_s,lat_deg,lon_deg,alt_m,vn_mps,ve_mps,vd_mps,heading_deg
     1795314424.300,47.3984607,8.5455937,488.14,0.0,0.0,0.0,180.0
 
-Time is ``unix_s``, ``time`` (RFC 3339 with its zone) or, where nothing else is known, ``t_s`` from
-any beginning. Columns may be divided by commas, semicolons or tabs, and a cell may be empty. Lines
-that begin with ``#`` may give ``sysid``, ``compid`` and ``mav_type``. See docs/recording.md.
+Time is ``unix_s``, ``time`` (RFC 3339 with its zone) or, if only relative time is known, ``t_s``.
+Columns are separated by commas, semicolons or tabs, and a cell may be empty. Lines that begin with
+``#`` may set ``sysid``, ``compid`` and ``mav_type``. See docs/recording.md.
 """
 
 import csv
@@ -52,13 +52,13 @@ _RESOLUTION_S: Final = 1e-3
 
 
 class NoTableError(Exception):
-    """Raised with one line for the user where the text is no such table."""
+    """Text that is not a table of positions; the message is one line for the user."""
 
 
 def read(text: bytes | Bytes) -> Onboard:
-    """The samples of a table. Raises ``NoTableError`` where its header does not describe them.
+    """Return the samples of a table. Raises ``NoTableError`` if its header is unsuitable.
 
-    Of very many lines every n-th is read.
+    Of very many lines only every n-th is kept.
     """
     lines = _lines(text)
     said, header = _header(lines)
@@ -67,19 +67,19 @@ def read(text: bytes | Bytes) -> Onboard:
     missing = [name for name in PLACE if name not in names]
     if timed is None or missing:
         lacks = [*([] if timed else [" or ".join(TIMES)]), *missing]
-        raise NoTableError(f"text, and its header names no {', '.join(lacks)}: docs/recording.md")
+        raise NoTableError(f"text without a column {', '.join(lacks)}; see docs/recording.md")
     if len(set(names)) != len(names):
-        raise NoTableError("text, and its header names a column twice")
+        raise NoTableError("text whose header names a column twice; rename one")
     used = [(number, name) for number, name in enumerate(names) if name in COLUMNS]
     rows, bad = _rows(lines, header, used, timed)
     table = dict(zip([name for _, name in used], rows.T, strict=True))
     lost = {Reason.MALFORMED: bad} if bad else {}
-    notes = [f"not used of it: {name}" for name in names if name and name not in COLUMNS]
+    notes = [f"column not used: {name}" for name in names if name and name not in COLUMNS]
     return _onboard(table, timed, said, lost, notes)
 
 
 class _Reading(io.RawIOBase):
-    """Bytes as a file, which copies no more of them than is asked for."""
+    """Bytes as a file, without copying all of them."""
 
     def __init__(self, data: bytes | Bytes) -> None:
         self._data = memoryview(data) if isinstance(data, bytes) else data.data
@@ -96,14 +96,14 @@ class _Reading(io.RawIOBase):
 
 
 def _lines(data: bytes | Bytes) -> Iterator[str]:
-    """The lines of a text; of one that is longer than any should be, pieces."""
+    """Return the lines of a text; over-long lines in pieces."""
     raw = io.BufferedReader(_Reading(data))
     text = io.TextIOWrapper(raw, encoding="utf-8-sig", errors="replace")
     return iter(partial(text.readline, _LINE_MAX), "")
 
 
 def _header(lines: Iterator[str]) -> tuple[dict[str, int], str]:
-    """What the lines before the header say, and the header."""
+    """Return the values set before the header, and the header."""
     said: dict[str, int] = {}
     for number, line in enumerate(lines):
         if number > _NOTICES_MAX:
@@ -117,7 +117,7 @@ def _header(lines: Iterator[str]) -> tuple[dict[str, int], str]:
             if not value.isdecimal() or not 0 < int(value[:9]) <= _ID_LIMITS[name]:
                 raise NoTableError(f"a table whose {name} is not 1 to {_ID_LIMITS[name]}")
             said[name] = int(value)
-    raise NoTableError("text, and no table")
+    raise NoTableError("text without a table")
 
 
 def _cells(line: str) -> list[str]:
@@ -128,7 +128,7 @@ def _cells(line: str) -> list[str]:
 def _rows(
     lines: Iterable[str], header: str, used: list[tuple[int, str]], timed: str
 ) -> tuple[FloatArray, int]:
-    """The used columns of all lines that are numbers, (N, K), and how many lines are not.
+    """Return the used columns of all numeric lines, (N, K), and the number of other lines.
 
     An empty cell is NaN.
     """
@@ -196,7 +196,7 @@ def _onboard(
 
 
 def _times(seconds: FloatArray, timed: str) -> tuple[IntArray, GpsTime | None]:
-    """Microseconds since the first line, and the Unix time of these, where it is known."""
+    """Return microseconds since the first line, and their Unix time if known."""
     sound = np.abs(seconds) < LAST_UNIX_US * 1e-6
     whole_us = np.round(np.where(sound, seconds, -1.0) * 1e6).astype(np.int64)
     begin_us = int(np.median(whole_us[:9])) if len(whole_us) else 0
@@ -221,7 +221,7 @@ def _positions(
     given = np.stack([table.get(name, nothing) for name in _VELOCITY], axis=1)
     given = np.where(np.abs(given) < 1e4, given, np.nan)
     if np.isnan(given).any():
-        notes.append("velocities that it does not give are those between its positions")
+        notes.append("missing velocities are computed from the positions")
     height_m = table.get("height_m", nothing)
     return OnboardPositions(
         boot_us=boot_us,

@@ -1,12 +1,12 @@
-"""ArduPilot's DataFlash log: bytes to columns, as far as they are intact.
+"""Parser of ArduPilot's DataFlash log: bytes to columns, skipping damage.
 
-A message is A3 95, its type, and a body whose length and fields an FMT message (type 128) of that
-type describes (https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html,
-AP_Logger/LogStructure.h). There is no checksum: a message counts only if another begins right
-behind it, or the file ends there, so that bytes lost in the middle of one cost that one alone.
+A message is A3 95, its type, and a body whose length and fields are described by an FMT message
+(type 128) of that type (https://ardupilot.org/dev/docs/code-overview-adding-a-new-log-message.html,
+AP_Logger/LogStructure.h). There is no checksum: a message counts only if another one, or the end of
+the file, follows directly, so that lost bytes cost only the message around them.
 
-Messages are found by looking for their first two bytes everywhere at once, and then following from
-each to the next. Fields are read where they lie, for the messages that are asked for.
+The first two bytes of messages are searched in the whole file at once; then each message leads to
+the next. Fields are read in place, for the requested messages only.
 """
 
 import re
@@ -42,7 +42,7 @@ Column = NDArray[np.generic]
 
 
 class Format(NamedTuple):
-    """The layout of one type of message: its fields, and which are hundredths."""
+    """Layout of one type of message: its fields, and which are in hundredths."""
 
     name: str
     length: int
@@ -51,13 +51,13 @@ class Format(NamedTuple):
 
 
 class DataflashIndex(NamedTuple):
-    """What a log holds.
+    """Contents of a log.
 
     formats  by type
-    at       where the messages of each wanted type begin, in the order of the file; of very many
-             every n-th
-    lost     bytes that belong to no message
-    refused  descriptions of messages that cannot be: of another length, or twice and different
+    at       offsets of the messages of each wanted type, in the order of the file; of very many
+             only every n-th
+    lost     bytes outside of messages
+    refused  invalid descriptions of messages: inconsistent length, or repeated with a difference
     """
 
     formats: dict[int, Format]
@@ -67,7 +67,7 @@ class DataflashIndex(NamedTuple):
 
 
 class DataflashTable:
-    """The messages of one type, as columns. Empty where the log has none."""
+    """Messages of one type, as columns. Empty if the log has none."""
 
     def __init__(self, data: Bytes, layout: Format | None, at: IntArray) -> None:
         self._layout = layout
@@ -75,7 +75,7 @@ class DataflashTable:
         if layout is None or not len(at):
             self._records: NDArray[np.void] = np.zeros(0, dtype=[])
             return
-        # Every byte of the file as the beginning of a record: those that are one are taken.
+        # A view with a record at every byte of the file, from which the actual ones are taken.
         room = data.size - _HEAD - layout.fields.itemsize + 1
         everywhere = np.ndarray((room,), layout.fields, data, _HEAD, (1,))
         self._records = everywhere[at]
@@ -87,12 +87,12 @@ class DataflashTable:
         return self._records.dtype.names is not None and column in self._records.dtype.names
 
     def raw(self, column: str) -> Column:
-        """A column as it stands in the file, (N,)."""
+        """Return a column as in the file, (N,)."""
         found: Column = self._records[column]
         return found
 
     def numbers(self, column: str) -> NDArray[np.float64]:
-        """A column as numbers, (N,), in the units of the log; NaN where there is none such."""
+        """Return a column as numbers, (N,), in the units of the log; NaN if missing."""
         if column not in self or self._records[column].dtype.kind not in "iuf":
             return np.full(len(self), np.nan)
         assert self._layout is not None
@@ -100,17 +100,17 @@ class DataflashTable:
         return values / 100.0 if column in self._layout.hundredths else values
 
     def integers(self, column: str) -> IntArray | None:
-        """A column of integers, (N,); None where there is none such."""
+        """Return a column of integers, (N,); None if missing."""
         if column not in self or self._records[column].dtype.kind not in "iu":
             return None
         values = self._records[column]
-        if values.dtype == np.uint64:  # what is no time becomes negative
+        if values.dtype == np.uint64:  # impossible times become 0
             values = np.where(values < np.uint64(1 << 62), values, np.uint64(0)).astype(np.int64)
         found: IntArray = values.astype(np.int64)
         return found
 
     def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "DataflashTable":
-        """Some of the messages."""
+        """Return some of the messages."""
         picked = DataflashTable.__new__(DataflashTable)
         picked._layout, picked._at = self._layout, self._at[chosen]
         picked._records = self._records[chosen]
@@ -118,7 +118,7 @@ class DataflashTable:
 
 
 def walk(data: Bytes, wanted: Collection[str]) -> DataflashIndex:
-    """Find the messages of a log; those named in ``wanted`` are told where they are."""
+    """Index the messages of a log, with the offsets of those named in ``wanted``."""
     formats, refused = _describe(data)
     lengths = np.zeros(256, dtype=np.int64)
     asked = np.zeros(256, dtype=bool)
@@ -135,20 +135,20 @@ def walk(data: Bytes, wanted: Collection[str]) -> DataflashIndex:
 
 
 def table(data: Bytes, walked: DataflashIndex, name: str) -> DataflashTable:
-    """The messages of one name."""
+    """Return the messages of one name."""
     for number, layout in walked.formats.items():
         if layout.name == name and number in walked.at:
             return DataflashTable(data, layout, walked.at[number])
     return DataflashTable(data, None, np.zeros(0, dtype=np.int64))
 
 
-# --- what is described ----------------------------------------------------------------------------
+# --- descriptions ---------------------------------------------------------------------------------
 
 
 def _describe(data: Bytes) -> tuple[dict[int, Format], int]:
-    """The formats that a log describes, by type, and how many descriptions were refused.
+    """Return the formats in a log by type, and the number of rejected descriptions.
 
-    The first of a type counts: what its messages were written by.
+    The first description of a type counts, as its messages were written with it.
     """
     whole = memoryview(data.data)
     found: dict[int, Format] = {FORMAT: _OWN}
@@ -156,7 +156,7 @@ def _describe(data: Bytes) -> tuple[dict[int, Format], int]:
     for match in _formats(whole):
         body = bytes(whole[match.start() + _HEAD : match.start() + _FORMAT_LENGTH])
         if len(body) < _FORMAT_LENGTH - _HEAD or not _NAME.match(body[2:6]):
-            continue  # these bytes inside of another message
+            continue  # these bytes are inside another message
         layout = _format(body)
         if layout is None or found.setdefault(body[0], layout) != layout:
             refused += 1
@@ -164,7 +164,7 @@ def _describe(data: Bytes) -> tuple[dict[int, Format], int]:
 
 
 def _format(body: bytes) -> Format | None:
-    """A format by the body of its FMT message; None where it contradicts itself."""
+    """Return the format in the body of an FMT message; None if it is inconsistent."""
     length, name = body[1], body[2:6].rstrip(b"\0").decode("ascii")
     letters = body[6:22].rstrip(b"\0").decode("latin-1")
     columns = body[22:86].rstrip(b"\0").decode("latin-1").split(",")
@@ -196,11 +196,11 @@ _OWN: Final = Format(
 )
 
 
-# --- where messages are ---------------------------------------------------------------------------
+# --- offsets of messages --------------------------------------------------------------------------
 
 
 def _chains(data: Bytes, lengths: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Where messages begin, and their types, block by block of the file."""
+    """Yield the offsets of messages, and their types, by block of the file."""
     resume = 0
     for begin in range(0, data.size, _BLOCK):
         at, types = _heads(data, begin, min(begin + _BLOCK, data.size), lengths)
@@ -213,7 +213,8 @@ def _chains(data: Bytes, lengths: IntArray) -> Iterator[tuple[IntArray, IntArray
 
 
 def _heads(data: Bytes, begin: int, end: int, lengths: IntArray) -> tuple[IntArray, IntArray]:
-    """Places in [begin, end) that look like a message with another, or the end, behind it."""
+    """Return the offsets in [begin, end) of candidates: a message followed by another, or by the
+    end."""
     ahead = data[begin : end + 2 * _LONGEST + _HEAD]
     if ahead.size < _HEAD:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -231,9 +232,9 @@ def _heads(data: Bytes, begin: int, end: int, lengths: IntArray) -> tuple[IntArr
 
 
 def _followed(at: IntArray, behind: IntArray) -> IntArray:
-    """The rows that are reached from the first by following each message to the next.
+    """Return the rows reached from the first by following each message to the next.
 
-    Nearly always the next row is the next message; only where it is not is it looked for.
+    The next row is nearly always the next message; it is searched only if not.
     """
     if not len(at):
         return np.zeros(0, dtype=np.int64)

@@ -1,11 +1,11 @@
-"""A boot clock on Unix time, by the times of GPS fixes in the log of one vehicle.
+"""Unix time of a boot clock, from the GPS times of fixes in the log of one vehicle.
 
-Each fix says its GPS time; beside it stands the boot time at which the autopilot had it. The
-difference is the offset of the clocks, less what the receiver took to deliver. A line is laid
-through the differences: its slope is the drift of the boot clock, and what the differences stray
-from it is the uncertainty. What all fixes are late alike cannot be seen (``RECEIVER_LAG_S``).
+Each fix has its GPS time, and the boot time at which the autopilot received it. The difference is
+the offset of the clocks, less the delay of the receiver. A line is fitted to the differences: its
+slope is the drift of the boot clock, and the deviations from it are the uncertainty. A delay common
+to all fixes cannot be observed (``RECEIVER_LAG_S``).
 
-GPS time runs ahead of UTC by the leap seconds since 1980 (IERS Bulletin C).
+GPS time is ahead of UTC by the leap seconds since 1980 (IERS Bulletin C).
 """
 
 from dataclasses import dataclass
@@ -16,9 +16,9 @@ import numpy as np
 from companion.values import FloatArray, IntArray
 
 RECEIVER_LAG_S: Final = 0.2
-"""Greatest usual time between a fix and its delivery by a receiver.
+"""Largest usual delay between a fix and its delivery by a receiver.
 
-Two logs are put together no better than their receivers differ in it.
+The relative time of two logs is uncertain by the difference of their receivers.
 """
 GPS_EPOCH_S: Final = 315_964_800  # 1980-01-06, Unix time
 WEEK_S: Final = 604_800
@@ -26,11 +26,11 @@ _LEAPS: Final = (
     (1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (1_230_768_000, 15),
     (1_136_073_600, 14),
 )  # fmt: skip
-"""Unix time from which GPS time has been ahead by so many seconds; 13 before 2006."""
-FIRST_UNIX_US: Final = 1_104_537_600_000_000  # 2005: there was no such log before
-LAST_UNIX_US: Final = 4_102_444_800_000_000  # the year 2100. A time outside is no time
+"""Unix time from which GPS time is ahead by this many seconds; 13 before 2006."""
+FIRST_UNIX_US: Final = 1_104_537_600_000_000  # 2005: no such log is older
+LAST_UNIX_US: Final = 4_102_444_800_000_000  # the year 2100; other times are invalid
 _APART_US: Final = 1_000_000
-"""How far differences may be apart for one clock; others are of a receiver without the time."""
+"""Largest difference between offsets of one clock; others come from a receiver without the time."""
 _POINTS: Final = 100
 _DRIFT_SPAN_US: Final = 60_000_000
 _DRIFT_MAX: Final = 1e-3
@@ -44,17 +44,17 @@ class GpsTime:
     offset_us: int
     drift: float
     at_us: int
-    uncertainty_s: float  # what 95 of 100 fixes stray from it at most, and at least a millisecond
-    fixes: int  # how many fixes it rests on
+    uncertainty_s: float  # 95th percentile of the fixes' deviations, at least a millisecond
+    fixes: int  # number of fixes used
 
     def unix_us(self, boot_us: IntArray) -> IntArray:
-        """Unix times (N,) of boot times (N,), microseconds."""
+        """Return Unix times (N,) of boot times (N,), microseconds."""
         drifted: IntArray = np.round(self.drift * (boot_us - self.at_us)).astype(np.int64)
         return boot_us + self.offset_us + drifted
 
 
 def unix_us(week: IntArray, week_ms: IntArray) -> IntArray:
-    """Unix times (N,), microseconds, of GPS weeks and milliseconds in them; 0 where impossible."""
+    """Return Unix times (N,), us, of GPS weeks and milliseconds in them; 0 if impossible."""
     possible = (week > 0) & (week < 10_000) & (week_ms >= 0) & (week_ms < WEEK_S * 1000)
     gps_s = GPS_EPOCH_S + np.where(possible, week, 0) * WEEK_S
     ahead_s = np.full(len(week), 13)
@@ -65,9 +65,9 @@ def unix_us(week: IntArray, week_ms: IntArray) -> IntArray:
 
 
 def fit(boot_us: IntArray, fixed_us: IntArray) -> GpsTime | None:
-    """The line through fixes: the boot times at which they were had, and their Unix times.
+    """Fit a line to fixes: the boot times of their reception, and their Unix times.
 
-    A Unix time of 0 is unknown. None without a fix, or where most of them contradict one another.
+    A Unix time of 0 is unknown. None without a fix, or if most of them contradict each other.
     """
     sound = (fixed_us >= FIRST_UNIX_US) & (fixed_us <= LAST_UNIX_US) & (boot_us >= 0)
     sound &= boot_us < FIRST_UNIX_US
@@ -94,7 +94,7 @@ def fit(boot_us: IntArray, fixed_us: IntArray) -> GpsTime | None:
 
 
 def _slope(x: FloatArray, y: FloatArray) -> float:
-    """The median slope between pairs of points (Theil and Sen); 0 where they span no minute."""
+    """Return the median slope between pairs of points (Theil and Sen); 0 if they span no minute."""
     rows = np.unique(np.linspace(0, len(x) - 1, _POINTS).astype(np.int64))
     x, y = x[rows], y[rows]
     one, other = np.triu_indices(len(x), 1)

@@ -1,4 +1,4 @@
-"""Files by their first bytes: vehicles' own logs, captures, and what is no log, with what to do."""
+"""Detection of files by their first bytes: onboard logs, captures, and unsupported files."""
 
 from typing import Final, Literal
 
@@ -11,14 +11,14 @@ _PIECEWISE: Final[tuple[tuple[bytes, Piecewise], ...]] = (
     *((magic, "capture") for magic in (*PCAP, PCAPNG)),
 )
 _KINDS: Final[tuple[tuple[bytes, str], ...]] = (
-    (b"FMT, 128,", "a DataFlash log as text: give the .bin that it was made of"),
+    (b"FMT, 128,", "a DataFlash log as text: give the original .bin"),
     (b"\x1f\x8b", "compressed with gzip: gunzip it first"),
     (b"\x28\xb5\x2f\xfd", "compressed with zstd: unzstd it first"),
     (b"\xfd7zXZ\x00", "compressed with xz: unxz it first"),
     (b"BZh", "compressed with bzip2: bunzip2 it first"),
     (b"PK\x03\x04", "a zip archive: unpack it first"),
-    (b"#ROSBAG V2.0", "a ROS bag: it is not read"),
-    (b"SQLite format 3\x00", "a database, perhaps a ROS 2 bag: it is not read"),
+    (b"#ROSBAG V2.0", "a ROS bag, which is not supported"),
+    (b"SQLite format 3\x00", "a database, perhaps a ROS 2 bag, which is not supported"),
     (b"%PDF-", "a PDF document"),
     (b"\x89PNG", "a picture"),
     (b"\x7fELF", "a program"),
@@ -27,17 +27,17 @@ HEAD_BYTES: Final = max(len(magic) for magic, _ in _KINDS)
 
 
 def read_piecewise(head: bytes) -> Piecewise | None:
-    """The kind of a vehicle's own log, or a capture, that begins so; None if it is neither."""
+    """Return the kind of an onboard log or capture with these first bytes; None for others."""
     return next((kind for magic, kind in _PIECEWISE if head.startswith(magic)), None)
 
 
 def named(head: bytes) -> str | None:
-    """What a file is that begins with these bytes, and what to do; None if nothing is known."""
+    """Return kind and remedy of an unsupported file with these first bytes; None if unknown."""
     return next((name for magic, name in _KINDS if head.startswith(magic)), None)
 
 
 def looks_like_text(head: bytes) -> bool:
-    """Whether the first bytes of a file are text, such as a table or settings."""
+    """Return whether the first bytes of a file are text, such as a table or settings."""
     try:
         text = head.decode("utf-8")
     except UnicodeDecodeError as error:

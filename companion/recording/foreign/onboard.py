@@ -1,4 +1,4 @@
-"""What one vehicle wrote of itself: its samples, whatever the format they were written in.
+"""Samples in the onboard log of one vehicle, whatever its format.
 
 All times are microseconds of its boot clock. Arrays of one kind of sample have the same length and
 are in order of time.
@@ -13,12 +13,12 @@ import numpy as np
 from companion.recording.foreign.gps_time import GpsTime
 from companion.values import BoolArray, FloatArray, IntArray, Reason
 
-REBOOT_US: Final = 10_000_000  # a step back of a boot clock that is no mere disorder in the file
+REBOOT_US: Final = 10_000_000  # a larger step back of a boot clock is a reboot, not disorder
 NEAR_US: Final = 500_000
-"""How far a velocity or heading may be off a position that it is put beside."""
+"""Largest time between a position and the velocity or heading assigned to it."""
 _NEAR: Final = 4
 _WILD_US: Final = 120_000_000
-"""How far a stamp may be off the middle of those around it in the file."""
+"""Largest deviation of a stamp from the median of its neighbours in the file."""
 METRES_PER_DEGREE: Final = 111_195.0
 
 
@@ -49,7 +49,7 @@ class Attitudes:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Fixes:
-    """What the satellite receiver in use said, (N,) each."""
+    """Reports of the satellite receiver in use, (N,) each."""
 
     boot_us: IntArray
     unix_us: IntArray  # the time of the fix; 0: unknown
@@ -72,14 +72,14 @@ class Fixes:
         return velocity
 
     def fixed(self) -> "Fixes | None":
-        """Those with a position; None without any."""
+        """Return the fixes with a position; None without any."""
         rows = self.fix_type >= 3
         if not rows.any():
             return None
         return Fixes(**{one.name: getattr(self, one.name)[rows] for one in fields(self)})
 
     def positions(self, velocity_ned_mps: FloatArray, heading_deg: FloatArray) -> OnboardPositions:
-        """The receiver's own positions, where the log has no estimated ones."""
+        """Return the receiver's positions, for a log without estimated ones."""
         return OnboardPositions(
             boot_us=self.boot_us,
             lat_1e7=self.lat_1e7,
@@ -107,7 +107,7 @@ class Truth:
 class Onboard:
     """The log of one vehicle."""
 
-    sysid: int | None  # its MAVLink system id, if the log says it
+    sysid: int | None  # its MAVLink system id, if the log has it
     compid: int  # its component id
     mav_type: int  # MAV_TYPE
     autopilot: int  # MAV_AUTOPILOT
@@ -116,19 +116,20 @@ class Onboard:
     fixes: Fixes | None = None
     truth: Truth | None = None
     armed: tuple[tuple[int, bool], ...] = ()  # boot times and whether it was armed from then on
-    clock: GpsTime | None = None  # its boot clock on GPS time; None where the log has no time
-    lost: Mapping[Reason, int] = field(default_factory=dict)  # what of the file could not be used
-    notes: tuple[str, ...] = ()  # what had to be made up for, for the user
+    clock: GpsTime | None = None  # its boot clock on GPS time; None if the log has no GPS time
+    lost: Mapping[Reason, int] = field(default_factory=dict)  # unusable parts of the file
+    notes: tuple[str, ...] = ()  # substitutions for missing data, for the user
 
 
-# --- samples that can be used ---------------------------------------------------------------------
+# --- usable samples -------------------------------------------------------------------------------
 
 
 def in_time(boot_us: IntArray) -> tuple[IntArray, int]:
-    """The rows of samples in order of time, without those whose stamp is wild, and how many.
+    """Return the rows of samples in order of time, and the number of rows with an outlier stamp.
 
-    ``boot_us`` (N,) is in the order of the file. A stamp is wild if it is minutes off the middle of
-    its neighbours; samples of one time count once. After a reboot, time begins anew.
+    ``boot_us`` (N,) is in the order of the file. A stamp is an outlier, and dropped, if it is
+    minutes off the median of its neighbours; of several samples with one time the first is kept.
+    Time starts again after a reboot.
     """
     if not len(boot_us):
         return np.zeros(0, dtype=np.int64), 0
@@ -149,7 +150,8 @@ def in_time(boot_us: IntArray) -> tuple[IntArray, int]:
 
 
 def on_earth(lat_1e7: IntArray, lon_1e7: IntArray, *others: FloatArray) -> BoolArray:
-    """Whether each place (N,) is on Earth and all else of it (N,) a number in reach."""
+    """Return whether each position (N,) is on Earth, and the other values (N,) finite and
+    plausible."""
     sound: BoolArray = (np.abs(lat_1e7) <= 900_000_000) & (np.abs(lon_1e7) <= 1_800_000_000)
     for other in others:
         sound &= np.isfinite(other) & (np.abs(other) < 1e6)
@@ -157,21 +159,21 @@ def on_earth(lat_1e7: IntArray, lon_1e7: IntArray, *others: FloatArray) -> BoolA
 
 
 def sound_rows(values: FloatArray, most: float) -> BoolArray:
-    """Whether all numbers of each row (N, K) are finite and smaller than ``most``."""
-    sound: BoolArray = np.array((np.abs(values) < most).all(axis=1))  # which NaN is not
+    """Return whether all numbers of each row (N, K) are finite and smaller than ``most``."""
+    sound: BoolArray = np.array((np.abs(values) < most).all(axis=1))  # false for NaN
     return sound
 
 
 def vectors_between(
     at_us: IntArray, boot_us: IntArray, values: FloatArray, gap_us: int, most: float = 1e4
 ) -> FloatArray:
-    """As ``between`` for (N, K), of those rows alone that ``sound_rows`` takes."""
+    """Interpolate like ``between`` for (N, K), using only rows that pass ``sound_rows``."""
     sound = sound_rows(values, most)
     return between(at_us, boot_us[sound], values[sound], gap_us)
 
 
 def headings_between(at_us: IntArray, boot_us: IntArray, heading_rad: FloatArray) -> FloatArray:
-    """Headings at other times (M,), degrees; NaN where no sample is near."""
+    """Interpolate headings at other times (M,), degrees; NaN if no sample is near."""
     sound = np.isfinite(heading_rad) & (np.abs(heading_rad) < 1e3)
     if not sound.any():
         return np.full(len(at_us), np.nan)
@@ -179,9 +181,9 @@ def headings_between(at_us: IntArray, boot_us: IntArray, heading_rad: FloatArray
 
 
 def between(at_us: IntArray, boot_us: IntArray, values: FloatArray, gap_us: int) -> FloatArray:
-    """``values`` (N,) or (N, K) at other times (M,), linearly; NaN where no sample is near.
+    """Interpolate ``values`` (N,) or (N, K) linearly at other times (M,); NaN if no sample is near.
 
-    ``gap_us`` is how far off the nearest sample may be.
+    ``gap_us`` is the largest distance to the nearest sample.
     """
     if not len(boot_us):
         return np.full((len(at_us), *values.shape[1:]), np.nan)
@@ -197,7 +199,7 @@ def between(at_us: IntArray, boot_us: IntArray, values: FloatArray, gap_us: int)
 
 
 def moved(boot_us: IntArray, lat_1e7: IntArray, lon_1e7: IntArray, alt_m: FloatArray) -> FloatArray:
-    """Velocities (N, 3), north-east-down, m/s, by the way between neighbours; 0 for a lone one."""
+    """Return velocities (N, 3), north-east-down, m/s, from adjacent positions; 0 for one."""
     if len(boot_us) < 2:
         return np.zeros((len(boot_us), 3))
     t_s = _ascending_s(boot_us)
@@ -210,16 +212,16 @@ def moved(boot_us: IntArray, lat_1e7: IntArray, lon_1e7: IntArray, alt_m: FloatA
 
 
 def _ascending_s(boot_us: IntArray) -> FloatArray:
-    """Seconds since the first, strictly ascending: the stamps of a log step back at a reboot."""
+    """Return seconds since the first, strictly ascending, as stamps step back at a reboot."""
     t_s = (boot_us - boot_us[0]) * 1e-6
     ascending_s: FloatArray = np.maximum.accumulate(t_s) + np.arange(len(t_s)) * 1e-9
     return ascending_s
 
 
 def turned(boot_us: IntArray, euler_rad: FloatArray) -> FloatArray:
-    """Body rates (N, 3), rad/s, by the turn between neighbours; 0 for a lone attitude.
+    """Return body rates (N, 3), rad/s, from adjacent attitudes; 0 for a single one.
 
-    The rates of roll, pitch and yaw make the body's by the kinematics of Euler angles.
+    The rates of roll, pitch and yaw give those of the body by the kinematics of Euler angles.
     """
     if len(boot_us) < 2:
         return np.zeros((len(boot_us), 3))
@@ -237,7 +239,7 @@ def turned(boot_us: IntArray, euler_rad: FloatArray) -> FloatArray:
 
 
 def euler_of(quaternions: FloatArray) -> FloatArray:
-    """Roll, pitch and yaw (N, 3), rad, of quaternions (N, 4), wxyz, ned from body."""
+    """Return roll, pitch and yaw (N, 3), rad, of quaternions (N, 4), wxyz, ned from body."""
     w, x, y, z = quaternions.T
     return np.stack(
         [

@@ -1,8 +1,8 @@
-"""Packets of a capture: pcap and pcapng, Ethernet and its like, IPv4 and IPv6, UDP and TCP.
+"""Packets of a capture: pcap and pcapng, Ethernet and similar links, IPv4 and IPv6, UDP and TCP.
 
 Formats: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng; link types by
-https://www.tcpdump.org/linktypes.html. Packets whose ends were not captured, and fragments, give
-what is there of them or nothing; nothing in a packet is trusted to be as long as it says.
+https://www.tcpdump.org/linktypes.html. Truncated packets and fragments return their available part
+or nothing; no length in a packet is trusted.
 """
 
 import struct
@@ -15,9 +15,9 @@ PCAP: Final = {
     b"\x4d\x3c\xb2\xa1": ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
-"""The first bytes of a pcap: the order of its bytes, and nanoseconds of a unit of its stamps."""
+"""First bytes of a pcap, with its byte order and the nanoseconds per unit of its stamps."""
 PCAPNG: Final = b"\x0a\x0d\x0d\x0a"
-_LARGEST: Final = 1 << 18  # longest packet or block that is believed, bytes: no link carries more
+_LARGEST: Final = 1 << 18  # limit on a packet or block, bytes: more than any link carries
 _INTERFACES_MAX: Final = 1024
 _SECTION, _INTERFACE, _SIMPLE, _ENHANCED = 0x0A0D0D0A, 1, 3, 6
 _NANOSECONDS_OPTION: Final = 9
@@ -29,7 +29,7 @@ _V6_EXTENSIONS: Final = frozenset((0, 43, 60))
 
 
 class Packet(NamedTuple):
-    """A captured packet: when, ns since 1970; the type of its link; what was captured of it."""
+    """A captured packet: time, ns since 1970; link type; captured bytes."""
 
     t_ns: int
     link_type: int
@@ -37,7 +37,7 @@ class Packet(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """The payload of a packet: the way that it went, and for TCP where in its stream it stands."""
+    """The payload of a packet: its flow, and for TCP its sequence number."""
 
     flow: str
     payload: bytes
@@ -46,7 +46,7 @@ class Segment(NamedTuple):
 
 
 class Skipped(NamedTuple):
-    """Bytes of a capture that are no packets."""
+    """Bytes of a capture that are not packets."""
 
     size_bytes: int
 
@@ -55,7 +55,7 @@ class Skipped(NamedTuple):
 
 
 def packets(file: IO[bytes]) -> Iterator[Packet | Skipped]:
-    """The packets of a capture in the order of the file. What cannot be read ends it."""
+    """Yield the packets of a capture in the order of the file, up to the first invalid one."""
     head = file.read(4)
     if head == PCAPNG:
         yield from _blocks(file)
@@ -88,7 +88,7 @@ def _rest(file: IO[bytes]) -> int:
 
 
 class _Interface(NamedTuple):
-    """An interface of a pcapng: the type of its link, its unit of time, and its offset."""
+    """An interface of a pcapng: its link type, unit of time, and time offset."""
 
     link_type: int
     numerator_ns: int
@@ -102,7 +102,7 @@ def _blocks(file: IO[bytes]) -> Iterator[Packet | Skipped]:
     head = PCAPNG + file.read(4)
     last_ns = 0
     while len(head) == 8:
-        if head[:4] == PCAPNG:  # a section: its own order of bytes, its own interfaces
+        if head[:4] == PCAPNG:  # a section has its own byte order and interfaces
             magic = file.read(4)
             order = ">" if magic == b"\x1a\x2b\x3c\x4d" else "<"
             interfaces = []
@@ -148,7 +148,7 @@ def _interface(body: bytes, order: str) -> _Interface:
 def _packet(
     kind: int, body: bytes, order: str, interfaces: list[_Interface], last_ns: int
 ) -> Packet | None:
-    if kind == _SIMPLE:  # it has no time: that of the packet before it
+    if kind == _SIMPLE:  # without a time: that of the previous packet is used
         return Packet(last_ns, interfaces[0].link_type, body[4:]) if interfaces else None
     if len(body) < 20:
         return None
@@ -160,11 +160,11 @@ def _packet(
     return Packet(t_ns, at.link_type, body[20 : 20 + length])
 
 
-# --- what is in a packet --------------------------------------------------------------------------
+# --- contents of a packet -------------------------------------------------------------------------
 
 
 def segment(packet: Packet) -> Segment | None:
-    """The UDP or TCP payload of a packet; None for anything else."""
+    """Return the UDP or TCP payload of a packet; None for anything else."""
     data, at = packet.data, _network(packet)
     if at is None or at >= len(data):
         return None
@@ -175,7 +175,7 @@ def segment(packet: Packet) -> Segment | None:
 
 
 def _network(packet: Packet) -> int | None:
-    """Where the IP packet begins, by the type of the link."""
+    """Return the offset of the IP packet, by the link type."""
     data, kind = packet.data, packet.link_type
     match kind:
         case 1:  # Ethernet
@@ -183,13 +183,13 @@ def _network(packet: Packet) -> int | None:
             while int.from_bytes(data[at : at + 2], "big") in _VLANS:
                 at += 4
             return at + 2 if int.from_bytes(data[at : at + 2], "big") in _ETHERTYPES else None
-        case 0 | 108:  # loopback of BSD: an address family
+        case 0 | 108:  # BSD loopback: an address family
             return 4
-        case 12 | 14 | 101 | 228 | 229:  # IP itself
+        case 12 | 14 | 101 | 228 | 229:  # raw IP
             return 0
-        case 113:  # Linux, all interfaces
+        case 113:  # Linux cooked capture
             return 16 if int.from_bytes(data[14:16], "big") in _ETHERTYPES else None
-        case 276:  # the same, its second form
+        case 276:  # Linux cooked capture, version 2
             return 20 if int.from_bytes(data[0:2], "big") in _ETHERTYPES else None
     return None
 
@@ -200,9 +200,9 @@ def _v4(data: bytes, at: int) -> Segment | None:
     header = (data[at] & 0x0F) * 4
     length = int.from_bytes(data[at + 2 : at + 4], "big")
     fragment = int.from_bytes(data[at + 6 : at + 8], "big") & 0x3FFF
-    if header < 20 or fragment:  # a fragment, first or later: it is not put together
+    if header < 20 or fragment:  # fragments are not reassembled
         return None
-    end = at + length if header <= length else len(data)  # 0: left to the network card
+    end = at + length if header <= length else len(data)  # 0: set later by the network card
     source, target = (".".join(map(str, data[at + n : at + n + 4])) for n in (12, 16))
     return _transport(data[:end], at + header, data[at + 9], source, target)
 

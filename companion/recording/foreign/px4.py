@@ -1,7 +1,7 @@
-"""What the topics of PX4's ULog mean.
+"""Interpretation of PX4's ULog.
 
-Meanings and units: https://docs.px4.io/main/en/msg_docs/. GLOBAL_POSITION_INT is made as PX4 makes
-it, of vehicle_global_position and the velocity of vehicle_local_position; ``*_groundtruth`` is the
+Meanings and units: https://docs.px4.io/main/en/msg_docs/. GLOBAL_POSITION_INT is built as in PX4,
+from vehicle_global_position and the velocity of vehicle_local_position; ``*_groundtruth`` is the
 simulator's truth.
 """
 
@@ -47,13 +47,13 @@ Lost = dict[Reason, int]
 
 
 class UnknownFlagsError(Exception):
-    """Raised where a file says that it cannot be understood without knowing more."""
+    """A file with unknown incompatibility flags."""
 
 
 def read(data: Bytes) -> Onboard:
-    """The samples of a log; what cannot be used is counted.
+    """Return the samples of a log; unusable ones are counted.
 
-    Raises ``UnknownFlagsError`` where the file asks for what this reader does not know.
+    Raises ``UnknownFlagsError`` if the file requires an unsupported feature.
     """
     walked = walk(data, _WANTED)
     if walked.unknown:
@@ -64,7 +64,7 @@ def read(data: Bytes) -> Onboard:
     tables = {name: _timed(table(data, walked, name), lost) for name in _WANTED}
     gps = _timed(table(data, walked, *_GPS), {})
     fixes, clock = _fixes(gps, lost)
-    notes = [f"the logger itself lost data {walked.dropouts} times"] if walked.dropouts else []
+    notes = [f"dropouts of the logger: {walked.dropouts}"] if walked.dropouts else []
     status = tables["vehicle_status"]
     sysid, compid, mav_type = _identity(walked, status)
     return Onboard(
@@ -84,7 +84,7 @@ def read(data: Bytes) -> Onboard:
 
 
 def _times(of: UlogTable) -> IntArray:
-    """When samples were true: the time of what they are made of, where it is said."""
+    """Return the times of samples: that of their input if known, else that of their publication."""
     sampled = of.integers("timestamp_sample")
     found = of.integers("timestamp") if sampled is None or not sampled.all() else sampled
     return np.zeros(0, dtype=np.int64) if found is None else found
@@ -101,7 +101,7 @@ def _timed(of: UlogTable, lost: Lost) -> UlogTable:
 
 
 def _identity(walked: ulog.UlogIndex, status: UlogTable) -> tuple[int | None, int, int]:
-    """System id, component id and MAV_TYPE: by the parameters, else by the vehicle's status."""
+    """Return system id, component id and MAV_TYPE: from parameters, else from the status."""
 
     def stated(parameter: str, column: str) -> int | None:
         value = walked.parameters.get(parameter)
@@ -122,7 +122,7 @@ def _armed(status: UlogTable) -> tuple[tuple[int, bool], ...]:
 
 
 def _degrees(of: UlogTable, old: str, new: str) -> IntArray:
-    """Latitudes or longitudes, 1e-7 degrees: integers in old logs, degrees in new ones."""
+    """Return latitudes or longitudes, 1e-7 degrees: integers in old logs, degrees in new ones."""
     whole = of.integers(old)
     if whole is not None:
         return whole
@@ -200,11 +200,11 @@ def _place(of: UlogTable) -> tuple[IntArray, IntArray, FloatArray]:
 
 
 def _received(fixes: Fixes, local: UlogTable, notes: list[str]) -> OnboardPositions | None:
-    """The receiver's own positions, where the estimator had none."""
+    """Return the receiver's positions, if the estimator had none."""
     fixed = fixes.fixed()
     if fixed is None:
         return None
-    notes.append("no vehicle_global_position in it: positions are those of the receiver")
+    notes.append("no vehicle_global_position: positions are those of the GNSS receiver")
     velocity = moved(fixed.boot_us, fixed.lat_1e7, fixed.lon_1e7, fixed.alt_m)
     level = fixed.velocity_mps
     velocity[:, :2] = np.where(np.isfinite(level), level, velocity[:, :2])
@@ -222,7 +222,7 @@ def _headings(boot_us: IntArray, local: UlogTable) -> FloatArray:
 
 
 def _turns(of: UlogTable, lost: Lost) -> tuple[IntArray, FloatArray]:
-    """Times (N,) and quaternions (N, 4) of length 1."""
+    """Return times (N,) and quaternions (N, 4) of length 1."""
     quaternions = of.numbers("q", 4)
     length = np.linalg.norm(quaternions, axis=1) if len(of) else np.zeros(0)
     sound = np.abs(length - 1) < 0.1

@@ -1,6 +1,6 @@
-"""What ArduPilot's DataFlash log says of the satellite receiver in use: GPS and GPA.
+"""The satellite receiver in use, from ArduPilot's DataFlash log: GPS and GPA.
 
-GPA says beside each GPS how good it is, and when by the boot clock the fix was had (SMS).
+GPA has the accuracy of each GPS message, and the boot time at which the fix was received (SMS).
 """
 
 from typing import Final
@@ -18,7 +18,7 @@ _LATE_US: Final = 2e6
 
 
 def times(of: DataflashTable) -> IntArray:
-    """Boot times (N,) of messages, microseconds; empty where they have none."""
+    """Return boot times (N,) of messages, microseconds; empty if they have none."""
     exact = of.integers("TimeUS")
     if exact is not None:
         return exact
@@ -27,7 +27,7 @@ def times(of: DataflashTable) -> IntArray:
 
 
 def count(lost: dict[Reason, int], reason: Reason, number: int) -> None:
-    """Add to what could not be used."""
+    """Add to the counts of unusable data."""
     if number:
         lost[reason] = lost.get(reason, 0) + number
 
@@ -35,7 +35,7 @@ def count(lost: dict[Reason, int], reason: Reason, number: int) -> None:
 def fixes_of(
     gps: DataflashTable, accuracy: DataflashTable, lost: dict[Reason, int]
 ) -> tuple[Fixes | None, GpsTime | None]:
-    """What the receiver in use said, and the boot clock on GPS time."""
+    """Return the fixes of the receiver in use, and the boot clock on GPS time."""
     used, instance = gps.integers("U"), gps.integers("I")
     if used is not None and used.any():
         gps = gps.rows(used > 0)
@@ -82,7 +82,7 @@ def _by_time(boot_us: IntArray) -> IntArray:
 
 
 def _beside(boot_us: IntArray, gps: DataflashTable, accuracy: DataflashTable) -> FloatArray:
-    """Accuracies and the boot time at which the fix was had, ms, (N, 4), from GPA; NaN: unknown."""
+    """Return accuracies and the boot time of the fix, ms, (N, 4), from GPA; NaN: unknown."""
     found = np.full((len(boot_us), 4), np.nan)
     mine, other = gps.integers("I"), accuracy.integers("I")
     if mine is not None and other is not None and len(mine):
@@ -97,5 +97,5 @@ def _beside(boot_us: IntArray, gps: DataflashTable, accuracy: DataflashTable) ->
         values = accuracy.numbers(name)[nearest]
         found[:, column] = np.where(near & (values > 0), values, np.nan)
     late_us = boot_us - found[:, 3] * 1e3
-    found[~(np.abs(late_us) < _LATE_US), 3] = np.nan  # it is no boot time of this clock
+    found[~(np.abs(late_us) < _LATE_US), 3] = np.nan  # not a boot time of this clock
     return found

@@ -1,8 +1,8 @@
-"""Frames of MAVLink that say what one vehicle wrote of itself.
+"""MAVLink frames with the samples of an onboard log.
 
-Each sample is said once, at its own time: ATTITUDE, GLOBAL_POSITION_INT, GPS_RAW_INT with its
-accuracies, and SIM_STATE for the truth, right behind a stamped message of the same time where there
-is one, so that its time can be told. HEARTBEAT and SYSTEM_TIME come once a second. Layouts:
+Each sample is sent once, at its own time: ATTITUDE, GLOBAL_POSITION_INT, GPS_RAW_INT with its
+accuracies, and SIM_STATE for the truth, directly after a stamped message of the same time if there
+is one, which gives its time. HEARTBEAT and SYSTEM_TIME are sent once a second. Layouts:
 https://mavlink.io/en/messages/common.html.
 """
 
@@ -52,7 +52,7 @@ Payloads = NDArray[np.void]
 
 
 class _Said(NamedTuple):
-    """Messages of one kind, in order of time; of equal times the lower rank comes first."""
+    """Messages of one kind, in order of time; at equal times the lower rank comes first."""
 
     rank: int
     msgid: int
@@ -61,16 +61,16 @@ class _Said(NamedTuple):
 
 
 def frames(log: Onboard, link: str, source: Source, latency_s: float) -> Iterator[Event]:
-    """The events of a log: what of it was lost, and then its frames, in order of time.
+    """Yield the events of a log: rejections of unusable data, then its frames, in order of time.
 
-        link       the link that they are said to come over
-        source     who says them
+        link       link of the frames
+        source     sender of the frames
         latency_s  time from a sample to its arrival
 
-    Without GPS time the time line is that of the boot clock, from the epoch.
+    Without GPS time the timeline is the boot clock, from the epoch.
     """
     latency_ns = round(latency_s * 1e9)
-    with np.errstate(all="ignore"):  # what is out of reach is clipped
+    with np.errstate(all="ignore"):  # values out of range are clipped
         kinds = _kinds(log)
     order, boots = _in_order(kinds)
     unix_us = boots if log.clock is None else log.clock.unix_us(boots)
@@ -95,16 +95,16 @@ def frames(log: Onboard, link: str, source: Source, latency_s: float) -> Iterato
 
 
 def _rows(order: IntArray, times_ns: IntArray) -> Iterator[tuple[tuple[int, int], int]]:
-    """(kind, row) and time of every message, made from some of the arrays at a time."""
+    """Yield (kind, row) and time of every message, converted block by block."""
     for begin in range(0, len(order), _BLOCK):
         some = slice(begin, begin + _BLOCK)
         yield from zip(order[some].tolist(), times_ns[some].tolist(), strict=True)
 
 
 def _in_order(kinds: list[_Said]) -> tuple[IntArray, IntArray]:
-    """(kind, row) of every message in order of time, (N, 2), and their boot times (N,).
+    """Return (kind, row) of every message in order of time, (N, 2), and their boot times (N,).
 
-    A boot clock that steps back within one kind was restarted: what is said then comes later.
+    A boot clock that steps back within one kind was restarted; its later messages come last.
     """
     boots = np.concatenate([kind.boot_us for kind in kinds])
     lives = np.concatenate([_lives(kind.boot_us) for kind in kinds])
@@ -148,7 +148,7 @@ def _kinds(log: Onboard) -> list[_Said]:
 
 
 def _seconds(times: list[IntArray]) -> IntArray:
-    """The first time of all in each second of the boot clock, life after life."""
+    """Return the first time of all in each second of the boot clock, by boot."""
     every = np.concatenate([np.zeros(0, dtype=np.int64), *times])
     lives = np.concatenate([np.zeros(0, dtype=np.int64), *map(_lives, times)])
     order = np.lexsort((every, lives))
@@ -222,7 +222,7 @@ def _ms(boot_us: IntArray) -> Any:
 
 
 def _whole(values: FloatArray, kind: str, unknown: int = 0) -> Any:
-    """Values rounded to integers of a kind, at most as large as it holds; NaN: ``unknown``."""
+    """Round values to integers of a kind, clipped to its range; NaN becomes ``unknown``."""
     limits = np.iinfo(kind)
     bound = np.clip(np.nan_to_num(values, nan=0.0), limits.min, limits.max)
     return np.where(np.isnan(values), unknown, np.round(bound)).astype(kind)

@@ -1,18 +1,18 @@
-"""Every n-th of what comes: a log is as long as its maker likes, and memory is not."""
+"""Thinning of samples, as the length of a log is unlimited and memory is not."""
 
 from collections.abc import Iterable, MutableSequence, Sequence
 from typing import Final, Generic, TypeVar
 
 SAMPLES_MAX: Final = 200_000
-"""Most samples of one kind that are kept of a log: more than an hour at 50 Hz."""
+"""Limit on the samples of one kind kept of a log: more than an hour at 50 Hz."""
 
 T = TypeVar("T")
 
 
 class Thinned(Generic[T]):
-    """Keeps all that is added while there is room, and then every second, fourth, ...
+    """Keeps all items up to the limit, then every second, fourth, ...
 
-    ``kept`` is where it is kept, empty at first.
+    ``kept`` is the sequence that stores them, empty at first.
     """
 
     __slots__ = ("_seen", "kept", "stride")
@@ -29,7 +29,7 @@ class Thinned(Generic[T]):
         self._seen += 1
 
     def extend(self, some: Sequence[T]) -> None:
-        """Add some, in order."""
+        """Add several, in order."""
         self._keep(some[-self._seen % self.stride :: self.stride])
         self._seen += len(some)
 

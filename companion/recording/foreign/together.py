@@ -1,7 +1,7 @@
-"""Logs of one vehicle each, as one flight: who is who, and all on one timeline.
+"""Onboard logs of one vehicle each, joined to one flight: distinct ids and one timeline.
 
 The timeline is Unix time, by the GPS time in each log (``gps_time``). A vehicle has the system id
-that its log says; of two that say the same, the later one gets the next that is free.
+in its log; if two logs have the same, the later one gets the next free id.
 """
 
 import functools
@@ -27,13 +27,13 @@ READERS: Final[dict[str, Callable[[Bytes], Onboard]]] = {
     "ulog": px4.read,
     "csv": csv_table.read,
 }
-"""What reads the log of one vehicle, by the kind of log."""
-KEPT: Final = 8  # logs that are kept once they were read
+"""Readers of onboard logs, by the kind of log."""
+KEPT: Final = 8  # logs that are cached after reading
 _NAMES: Final = {"dataflash": "DataFlash", "ulog": "ULog", "csv": "a table"}
 
 
 class Vehicle(NamedTuple):
-    """The log of one vehicle of a flight, and the id that the vehicle has here."""
+    """The onboard log of one vehicle of a flight, and the id that the vehicle gets."""
 
     path: Path
     kind: str
@@ -42,9 +42,9 @@ class Vehicle(NamedTuple):
 
     @property
     def apart_s(self) -> float:
-        """Most that its times may be off beside another log's; 0 where they are taken as they are.
+        """Bound on the error of its times relative to other logs; 0 if they are used unchanged.
 
-        Receivers deliver up to ``RECEIVER_LAG_S`` late: each is half of that off its middle.
+        Receivers are late by 0 to ``RECEIVER_LAG_S``: by at most half of it off the middle.
         """
         clock = self.log.clock
         if clock is None or self.kind == "csv":
@@ -52,16 +52,16 @@ class Vehicle(NamedTuple):
         return clock.uncertainty_s + RECEIVER_LAG_S / 2
 
     def notice(self) -> str:
-        """One line for the user: who it is, how well its time is known, what was made up for."""
+        """Return one line for the user: vehicle, accuracy of its time, and substitutions."""
         clock = self.log.clock
         if clock is None:
-            when = "no GPS time in it: its time is that since boot"
+            when = "no GPS time: its time is that since boot"
         elif self.kind == "csv":
-            when = "its time is taken as it stands"
+            when = "its time is used unchanged"
         else:
             when = (
-                f"on GPS time to {clock.uncertainty_s:.3f} s by {clock.fixes} fixes, and to what"
-                f" receivers differ in delay, up to {RECEIVER_LAG_S:g} s"
+                f"on GPS time to {clock.uncertainty_s:.3f} s by {clock.fixes} fixes, plus the"
+                f" receiver's delay of up to {RECEIVER_LAG_S:g} s"
             )
         own = "" if self.log.sysid == self.source.sysid else self._renamed()
         who = f"{self.path.name}: {_NAMES[self.kind]}, vehicle {self.source}{own}"
@@ -69,11 +69,11 @@ class Vehicle(NamedTuple):
 
     def _renamed(self) -> str:
         if self.log.sysid is None:
-            return " (it names no id)"
-        return f" (it says {self.log.sysid}, which another has)"
+            return " (no id in the log)"
+        return f" (id {self.log.sysid} in the log is taken by another)"
 
     def as_json(self) -> dict[str, Any]:
-        """The same for a program."""
+        """Return the same as JSON."""
         clock = self.log.clock
         return {
             "log": self.path.name,
@@ -88,9 +88,9 @@ class Vehicle(NamedTuple):
 
 
 def opened(logs: Sequence[tuple[Path, str]]) -> list[Vehicle]:
-    """The vehicles of logs, given with their kinds.
+    """Return the vehicles of logs, given with their kinds.
 
-    Raises ``LogError`` for one that cannot be used, or several that are not one flight.
+    Raises ``LogError`` for an unusable log, or for logs of different flights.
     """
     read = [(path, kind, _read(path, kind)) for path, kind in logs]
     taken = {log.sysid for _, _, log in read if log.sysid is not None}
@@ -101,7 +101,7 @@ def opened(logs: Sequence[tuple[Path, str]]) -> list[Vehicle]:
         if sysid is None or sysid in given:
             sysid = next((free for free in range(1, 250) if free not in taken | given), None)
             if sysid is None:
-                raise LogError(f"{path}: there are no more system ids")
+                raise LogError(f"{path}: no free system id is left; give fewer logs")
         given.add(sysid)
         found.append(Vehicle(path=path, kind=kind, source=Source(sysid, log.compid), log=log))
     if len(found) > 1:
@@ -110,7 +110,7 @@ def opened(logs: Sequence[tuple[Path, str]]) -> list[Vehicle]:
 
 
 def events(vehicles: Sequence[Vehicle], latency_s: float) -> Iterator[Event]:
-    """The events of all of them in order of time, each sample arriving ``latency_s`` later."""
+    """Return their events in order of time, each sample arriving ``latency_s`` later."""
     each = [said.frames(one.log, one.path.name, one.source, latency_s) for one in vehicles]
     return heapq.merge(*each, key=lambda event: event.t_ns)
 
@@ -125,18 +125,18 @@ def _read(path: Path, kind: str) -> Onboard:
 
 @functools.lru_cache(maxsize=KEPT)
 def _read_once(path: Path, kind: str, _seen: tuple[int, int, int]) -> Onboard:
-    """The log in a file that is as it was ``_seen``: a command asks for it several times."""
+    """Return the log in a file with status ``_seen``; cached, as commands read it several times."""
     try:
-        with path.open("rb") as file:  # the map goes when nothing looks at it any more
+        with path.open("rb") as file:  # the map is closed with its last reference
             whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        with np.errstate(all="ignore"):  # damaged numbers are NaN, which is looked for
+        with np.errstate(all="ignore"):  # damaged numbers are NaN, and filtered
             log = READERS[kind](np.frombuffer(whole, dtype=np.uint8))
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     except csv_table.NoTableError as error:
         raise LogError(f"{path}: no MAVLink frame in it: it is {error}") from None
     except px4.UnknownFlagsError:
-        raise LogError(f"{path}: a ULog of a later kind, which cannot be read") from None
+        raise LogError(f"{path}: ULog with unsupported flags; update this program") from None
     if log.positions is None:
         raise LogError(f"{path}: {_NAMES[kind]}, but no position in it")
     return log
@@ -146,7 +146,9 @@ def _require_one_flight(vehicles: Sequence[Vehicle]) -> None:
     spans = []
     for one in vehicles:
         if one.log.clock is None:
-            raise LogError(f"{one.path}: no GPS time in it: it cannot be put beside other logs")
+            raise LogError(
+                f"{one.path}: no GPS time, so other logs cannot be joined; give it alone"
+            )
         assert one.log.positions is not None
         at_us = one.log.clock.unix_us(_ends(one.log.positions.boot_us))
         spans.append((int(at_us[0]), int(at_us[1]), one.path))
@@ -155,8 +157,8 @@ def _require_one_flight(vehicles: Sequence[Vehicle]) -> None:
         apart_s = (after[0] - before[1]) * 1e-6
         if apart_s > LARGEST_LEAP_NS * 1e-9:
             raise LogError(
-                f"{after[2]}: begins {apart_s / 3600:.1f} h after {before[2].name} ends:"
-                " they are not one flight"
+                f"{after[2]}: begins {apart_s / 3600:.1f} h after {before[2].name} ends;"
+                " give the logs of one flight"
             )
 
 

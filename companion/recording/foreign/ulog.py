@@ -1,8 +1,8 @@
-"""PX4's ULog: bytes to columns, as far as they are intact.
+"""Parser of PX4's ULog: bytes to columns, skipping damage.
 
 A file is a header of 16 bytes and then messages: size, type, body (https://docs.px4.io/main/en/
 dev_log/ulog_file_format.html). Topics are described by F, named by A, and sampled by D. There is no
-checksum: what does not fit is passed over up to where three messages in a row fit again.
+checksum: invalid bytes are skipped up to three consecutive valid messages.
 """
 
 import re
@@ -45,9 +45,9 @@ _candidates = re.compile(rb"(?=[\s\S]{2}[BFIMPQARDLCSO])").finditer
 
 
 class UlogTopic(NamedTuple):
-    """One instance of a topic: its fields, and where its samples lie in the file.
+    """One instance of a topic: its fields, and the offsets of its samples.
 
-    Of very many samples it is every n-th.
+    Of very many samples only every n-th is kept.
     """
 
     name: str
@@ -59,18 +59,18 @@ class UlogTopic(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class UlogIndex:
-    """What a log holds."""
+    """Contents of a log."""
 
-    topics: list[UlogTopic] = field(default_factory=list)  # of those wanted, the ones with samples
-    parameters: dict[str, float] = field(default_factory=dict)  # as they were at the start
-    lost: int = 0  # bytes that belong to no message
-    refused: int = 0  # descriptions and samples that do not fit one another
-    dropouts: int = 0  # how often the logger itself lost something
-    unknown: bool = False  # True if the file says that it cannot be read without knowing more
+    topics: list[UlogTopic] = field(default_factory=list)  # wanted topics
+    parameters: dict[str, float] = field(default_factory=dict)  # values at the start
+    lost: int = 0  # bytes outside of messages
+    refused: int = 0  # inconsistent descriptions and samples
+    dropouts: int = 0  # number of dropouts of the logger itself
+    unknown: bool = False  # whether the file has unknown incompatibility flags
 
 
 class UlogTable:
-    """The samples of a topic, as columns. Empty where the log has none."""
+    """Samples of a topic, as columns. Empty if the log has none."""
 
     def __init__(self, data: Bytes, topic: UlogTopic | None) -> None:
         self._records: NDArray[np.void] = np.zeros(0, dtype=[])
@@ -86,7 +86,7 @@ class UlogTable:
         return self._records.dtype.names is not None and column in self._records.dtype.names
 
     def numbers(self, column: str, width: int = 1) -> FloatArray:
-        """A column as numbers, (N,), or (N, ``width``) of an array; NaN where there is none."""
+        """Return a column as numbers, (N,), or (N, ``width``) of an array; NaN if missing."""
         shape = (len(self),) if width == 1 else (len(self), width)
         if column not in self:
             return np.full(shape, np.nan)
@@ -97,7 +97,7 @@ class UlogTable:
         return found
 
     def integers(self, column: str) -> IntArray | None:
-        """A column of integers, (N,); None where there is none such. What is no time becomes 0."""
+        """Return a column of integers, (N,); None if missing. Impossible times become 0."""
         if column not in self:
             return None
         values = self._records[column]
@@ -109,14 +109,14 @@ class UlogTable:
         return found
 
     def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "UlogTable":
-        """Some of the samples."""
+        """Return some of the samples."""
         picked = UlogTable.__new__(UlogTable)
         picked._records = self._records[chosen]
         return picked
 
 
 def table(data: Bytes, walked: UlogIndex, *names: str) -> UlogTable:
-    """The samples of the first of these topics that the log has, of its lowest instance."""
+    """Return the samples of the first of these topics in the log, from its lowest instance."""
     for name in names:
         there = [topic for topic in walked.topics if topic.name == name and len(topic.at)]
         if there:
@@ -125,7 +125,7 @@ def table(data: Bytes, walked: UlogIndex, *names: str) -> UlogTable:
 
 
 def walk(data: Bytes, wanted: Collection[str]) -> UlogIndex:
-    """Find the samples of the topics that are wanted, and the parameters."""
+    """Index the samples of the wanted topics, and the parameters."""
     return _Walker(data, wanted).walk()
 
 
@@ -151,7 +151,7 @@ class _Walker:
         return self._found
 
     def _parts(self) -> Iterator[int]:
-        """Where data were appended behind a file that was cut short (after a crash)."""
+        """Yield the offsets of data appended to a truncated file (after a crash)."""
         head = self._data[_HEADER : _HEADER + _MESSAGE.size + _FLAGS.size]
         if len(head) < _MESSAGE.size + _FLAGS.size or head[2] != _FLAG_BITS:
             return
@@ -161,7 +161,7 @@ class _Walker:
             yield from sorted(at for at in offsets if _HEADER < at < len(self._data))
 
     def _stretch(self, at: int, end: int) -> None:
-        """Take the messages of [at, end) in; what does not fit is passed over and counted."""
+        """Process the messages of [at, end); invalid bytes are skipped and counted."""
         data, unpack = self._data, _MESSAGE.unpack_from
         while at + 3 <= end:
             size, kind = unpack(data, at)
@@ -185,7 +185,7 @@ class _Walker:
         self._found.lost += end - at
 
     def _fits(self, at: int, end: int) -> int:
-        """The end of what begins at ``at``, if it can be a message; else 0."""
+        """Return the end of the message at ``at``, if it is plausible; else 0."""
         if at + 3 > end:
             return 0
         size, kind = _MESSAGE.unpack_from(self._data, at)
@@ -199,7 +199,8 @@ class _Walker:
         return int(stop)
 
     def _resume(self, at: int, end: int) -> int:
-        """The first place from ``at`` on where messages in a row fit; ``end`` without one."""
+        """Return the first offset from ``at`` on with consecutive valid messages; ``end`` without
+        one."""
         for match in _candidates(self._data, at, end):
             start = stop = match.start()
             for _ in range(_IN_A_ROW):
@@ -227,7 +228,7 @@ class _Walker:
     def _subscribe(self, instance: int, number: int, name: str) -> None:
         fields = self._formats.get(name)
         if number in self._topics:
-            return  # the first counts: its samples have been taken by it
+            return  # the first counts: its samples were parsed with it
         least, most = self._size(name, 0)
         if fields is None or least == 0:
             self._found.refused += 1
@@ -244,7 +245,7 @@ class _Walker:
         self._topics[number] = topic
 
     def _size(self, name: str, depth: int) -> tuple[int, int]:
-        """Bytes of a topic at least (without the padding at its end) and at most; 0 if unknown."""
+        """Return the least (without final padding) and largest size of a topic; 0 if unknown."""
         least = most = 0
         for each in filter(None, self._formats.get(name, "").split(";")):
             match = _FIELD.match(each)
@@ -272,7 +273,7 @@ class _Walker:
 
 
 def _layout(fields: str) -> np.dtype[np.void] | None:
-    """The fields up to the padding at the end; None for nested ones, or names that come twice."""
+    """Return the fields up to the final padding; None for nested fields, or repeated names."""
     described: list[tuple[str, str, tuple[int, ...]]] = []
     kept = 0
     for each in filter(None, fields.split(";")):

@@ -1,4 +1,4 @@
-"""Tables for other programs: what a column is, CSV and Parquet, and the folder of an export.
+"""Tables for other programs: columns, CSV and Parquet, and the folder of an export.
 
-``companion.views.tables`` says which tables there are and what stands in each column.
+``companion.views.tables`` defines the tables and their columns.
 """

@@ -1,4 +1,4 @@
-"""The columns of an exported table, made from the described values of a row's class."""
+"""Columns of an exported table, derived from the described values of a row's class."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -8,20 +8,20 @@ from typing import Any, Final
 
 from companion.values.described import Member, in_degrees, is_in_radians, is_vector, members, unit
 
-Value = str | int | float | bool | None  # a value in a table; None: unknown, or not there
+Value = str | int | float | bool | None  # a value in a table; None: unknown or missing
 _AXES: Final = ("north", "east", "down")
 
 
 class ColumnKind(StrEnum):
-    """What the values of a column are.
+    """Kind of the values of a column.
 
-    TEXT     words; empty words are unknown
-    NUMBER   64-bit floating point; what is not finite is unknown
-    TIME     the value is nanoseconds on the node's timeline, written in UTC with microseconds, cut
-             off
-    INTEGER  64 bits, always known: programs that read CSV make floats of integers with gaps, and
-             nanoseconds since 1970 do not fit into one
-    TRUTH    true or false, always known, likewise
+    TEXT     text; an empty text is unknown
+    NUMBER   64-bit floating point; a number that is not finite is unknown
+    TIME     the value is nanoseconds on the node's timeline, written in UTC with microseconds,
+             truncated
+    INTEGER  64 bits, always known: programs that read CSV convert integers with gaps to floats,
+             which cannot represent nanoseconds since 1970
+    TRUTH    true or false, always known for the same reason
     """
 
     TEXT = "text"
@@ -33,7 +33,7 @@ class ColumnKind(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Column:
-    """A column of a table; ``get`` takes its value from a row."""
+    """A column of a table; ``get`` returns its value from a row."""
 
     name: str
     kind: ColumnKind
@@ -42,7 +42,7 @@ class Column:
 
     @property
     def unit(self) -> str:
-        """The unit of its values; empty where they have none."""
+        """Unit of its values; empty without one."""
         return unit(self.name) if self.kind is not ColumnKind.TIME else "UTC"
 
 
@@ -50,8 +50,7 @@ class Column:
 class Table:
     """A table: its name, what a row is, and its columns in order.
 
-    ``former_names`` are those that columns had in the version before: they are still written, after
-    the others.
+    ``former_names`` are column names of the previous version, which are still written, last.
     """
 
     name: str
@@ -71,10 +70,10 @@ class Table:
         object.__setattr__(self, "columns", (*now.values(), *former))
 
     def row(self, item: Any, utc_offset_ns: int) -> list[Value]:
-        """The values of one row, in the order of the columns.
+        """Return the values of one row, in the order of the columns.
 
-        ``utc_offset_ns`` is UTC minus the node's timeline. Raises ``TypeError`` where a value is
-        None that may not be: a defect of the program.
+        ``utc_offset_ns`` is UTC minus the node's timeline. Raises ``TypeError`` if a required value
+        is None: a defect of the program.
         """
         values = [_CLEAN[column.kind](column.get(item)) for column in self.columns]
         if utc_offset_ns:
@@ -85,7 +84,7 @@ class Table:
 
 
 def _columns(row_class: type) -> Iterator[Column]:
-    """The columns of a class: a time gives two, a vector three, an angle is in degrees."""
+    """Yield the columns of a class: a time has two, a vector three, an angle is in degrees."""
     for member in members(row_class):
         name, get, meaning = member.name, member.get, member.meaning.text
         if "export" in member.meaning.absent:
@@ -122,7 +121,8 @@ def _kind(member: Member) -> ColumnKind:
 
 
 def _along(name: str, direction: str) -> str:
-    """``velocity_ned_mps`` to the north: ``velocity_north_mps``."""
+    """Return the name of a component: ``velocity_ned_mps`` to the north is
+    ``velocity_north_mps``."""
     stem, _, ending = name.rpartition("_")
     return f"{stem.removesuffix('_ned')}_{direction}_{ending}"
 
@@ -144,7 +144,7 @@ def _degrees(get: Callable[[Any], Any]) -> Callable[[Any], float | None]:
 
 
 def _text(value: object) -> str | None:
-    """Words that any program can read: what is not Unicode, as of a file's name, is escaped."""
+    """Return text that any program can read: invalid Unicode, as in a file's name, is escaped."""
     said = "" if value is None else str(value)
     if not said.isprintable():
         said = said.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")
@@ -161,7 +161,7 @@ def _time(value: int | None) -> int | None:
 
 def _truth(value: object) -> bool:
     if value is None:
-        raise TypeError("it is always known whether")
+        raise TypeError("a truth value may not be None")
     return bool(value)
 
 

@@ -1,4 +1,4 @@
-"""A table as CSV (RFC 4180), UTF-8, lines ended by a line feed; unknown is an empty field."""
+"""A table as CSV (RFC 4180), UTF-8, with line feeds; unknown values are empty fields."""
 
 import csv
 import io
@@ -8,11 +8,11 @@ from typing import IO, Final
 
 from companion.recording.tables.columns import ColumnKind, Table, Value
 
-_BEGINNING: Final = datetime(1970, 1, 1)  # UTC without saying so: what all readers take for a time
+_BEGINNING: Final = datetime(1970, 1, 1)  # UTC without a zone, which all readers parse as a time
 
 
 class CsvFile:
-    """Rows of one table, written to an open file as they come."""
+    """Rows of one table, written to an open file one by one."""
 
     def __init__(self, file: IO[bytes], table: Table) -> None:
         self._text = io.TextIOWrapper(file, encoding="utf-8", newline="")
@@ -22,7 +22,7 @@ class CsvFile:
         self._truths = [i for i, col in enumerate(table.columns) if col.kind is ColumnKind.TRUTH]
 
     def add(self, row: Sequence[Value]) -> None:
-        """Write a row. Raises ``OSError`` where it cannot be."""
+        """Write a row. Raises ``OSError`` if that fails."""
         cells = list(row)
         for i in self._times:
             cells[i] = utc(row[i])
@@ -31,13 +31,13 @@ class CsvFile:
         self._rows.writerow(cells)
 
     def finish(self) -> None:
-        """Write what is left; the file stays open. Raises ``OSError``."""
+        """Flush the rest; the file stays open. Raises ``OSError``."""
         self._text.flush()
         self._text.detach()
 
 
 def utc(t_ns: Value) -> str | None:
-    """A time as ``2026-11-20T13:00:00.123456``; None where there is none that has a year."""
+    """Return a time as ``2026-11-20T13:00:00.123456``; None if unknown or outside the calendar."""
     if not isinstance(t_ns, int):
         return None
     try:

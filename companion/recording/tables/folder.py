@@ -1,8 +1,8 @@
-"""The folder of an export: a file a table, which all get their names when the export is whole.
+"""The folder of an export: one file per table, renamed when the export is complete.
 
-While it is written a file is called ``….active``. ``export.json`` says what is in the folder. It is
-removed before the first table is replaced and written after the last, so that where it stands, the
-tables beside it are of one export.
+While being written a file is called ``….active``. ``export.json`` lists the contents of the folder.
+It is removed before the first table is replaced and written after the last, so that with it, all
+tables are of the same export.
 """
 
 import contextlib
@@ -18,11 +18,11 @@ from companion.recording.tables.csv_file import CsvFile
 from companion.recording.tables.parquet_file import ParquetFile
 from companion.recording.writer import ACTIVE, open_alone, sync_folder
 
-CONTENTS: Final = "export.json"  # what an export holds; written last
+CONTENTS: Final = "export.json"  # contents of an export; written last
 
 
 class TableFile(Protocol):
-    """One table being written, in whatever format."""
+    """One table being written, in any format."""
 
     def add(self, row: Sequence[Value]) -> None: ...
     def finish(self) -> None: ...
@@ -32,18 +32,18 @@ FORMATS: Final[dict[str, Callable[[IO[bytes], Table], TableFile]]] = {
     "csv": CsvFile,
     "parquet": ParquetFile,
 }
-"""How a table is written, by the ending of its file."""
+"""Writers of a table, by the suffix of its file."""
 
 
 class TableFolder:
     """The tables of one export, open from the start until ``close`` or the end of the ``with``.
 
-        where   the folder; made if missing
+        where   the folder; created if missing
         form    a key of ``FORMATS``
-        tables  what is written, each to its own file
+        tables  the tables, each for its own file
 
-    Raises ``UserError`` where a package is missing, ``OSError`` where the folder cannot be written,
-    and ``BlockingIOError`` where another process exports to it.
+    Raises ``UserError`` if a package is missing, ``OSError`` if the folder cannot be written, and
+    ``BlockingIOError`` if another process exports to it.
     """
 
     def __init__(self, where: Path, form: str, tables: Sequence[Table]) -> None:
@@ -62,18 +62,18 @@ class TableFolder:
             raise
 
     def add(self, table: str, item: Any, utc_offset_ns: int = 0) -> None:
-        """Write a row, made of ``item``: see ``Table.row``.
+        """Write a row for ``item``: see ``Table.row``.
 
-        Raises ``OSError`` where it cannot be written.
+        Raises ``OSError`` if that fails.
         """
         self._files[table].add(self._tables[table].row(item, utc_offset_ns))
         self.rows[table] += 1
 
     def close(self, said: Mapping[str, Any]) -> list[Path]:
-        """Finish the files, give them their names, and write ``export.json``; returns their paths.
+        """Finish and rename the files, and write ``export.json``; return their paths.
 
-        ``said`` of the export goes into ``export.json`` beside the files and their rows. Raises
-        ``OSError``; files then have their names, or have gone, but there is no ``export.json``.
+        ``said`` is added to ``export.json``, with the files and their numbers of rows. Raises
+        ``OSError``; some files may then be renamed, but there is no ``export.json``.
         """
         for name, file in self._files.items():
             file.finish()
@@ -94,7 +94,7 @@ class TableFolder:
         return [self._where / name for name in (*names.values(), CONTENTS)]
 
     def abandon(self) -> None:
-        """Remove what was written so far; what had its name keeps it."""
+        """Remove the files written so far, except renamed ones."""
         for name in self._open:
             self._active(self._name(name)).unlink(missing_ok=True)
         if self._open:
@@ -103,7 +103,7 @@ class TableFolder:
 
     def _shut(self) -> None:
         for file in self._open.values():
-            with contextlib.suppress(OSError):  # a full disk: the file is not wanted any more
+            with contextlib.suppress(OSError):  # a full disk: the file is removed anyway
                 file.close()
         self._open.clear()
 

@@ -1,6 +1,6 @@
 """A table as Parquet, written by pyarrow, which the extra ``parquet`` installs.
 
-The metadata of the schema say what a row is; those of a field, its unit and meaning.
+The metadata of the schema describe a row; those of a field, its unit and meaning.
 """
 
 from collections.abc import Sequence
@@ -9,14 +9,14 @@ from typing import IO, Any, Final
 from companion.recording.tables.columns import Column, ColumnKind, Table, Value
 from companion.values.extras import needs
 
-BATCH: Final = 8192  # rows of a group: as many are held in memory
+BATCH: Final = 8192  # rows per group, which are kept in memory
 ALWAYS: Final = (ColumnKind.INTEGER, ColumnKind.TRUTH)
 
 
 class ParquetFile:
-    """Rows of one table, written to an open file a group at a time.
+    """Rows of one table, written to an open file in groups.
 
-    Raises ``UserError`` where pyarrow is not installed.
+    Raises ``UserError`` if pyarrow is not installed.
     """
 
     def __init__(self, file: IO[bytes], table: Table) -> None:
@@ -35,7 +35,7 @@ class ParquetFile:
         types = {
             ColumnKind.TEXT: arrow.string(),
             ColumnKind.NUMBER: arrow.float64(),
-            ColumnKind.TIME: arrow.timestamp("us"),  # UTC without saying so, as in CSV
+            ColumnKind.TIME: arrow.timestamp("us"),  # UTC without a zone, as in CSV
             ColumnKind.INTEGER: arrow.int64(),
             ColumnKind.TRUTH: arrow.bool_(),
         }
@@ -43,13 +43,13 @@ class ParquetFile:
         return arrow.field(column.name, types[column.kind], column.kind not in ALWAYS, said)
 
     def add(self, row: Sequence[Value]) -> None:
-        """Take in a row, and write the group that it fills. Raises ``OSError``."""
+        """Add a row, and write the group when it is full. Raises ``OSError``."""
         self._waiting.append(row)
         if len(self._waiting) >= BATCH:
             self._write()
 
     def finish(self) -> None:
-        """Write what is left, and the file's end; the file stays open. Raises ``OSError``."""
+        """Write the rest, and the file's end; the file stays open. Raises ``OSError``."""
         self._write()
         self._writer.close()
 

@@ -31,7 +31,7 @@ def test_places_times_and_the_way_between_them() -> None:
     assert unix_us.tolist() == [1_795_000_000_000_000 + n * 100_000 for n in range(50)]
     assert at.lat_1e7.tolist() == [470_000_000 + n * 100 for n in range(50)]
     assert at.velocity_ned_mps == pytest.approx(np.tile((11.1195, 0, -10.0), (50, 1)), rel=1e-3)
-    assert log.notes == ("velocities that it does not give are those between its positions",)
+    assert log.notes == ("missing velocities are computed from the positions",)
 
 
 @pytest.mark.parametrize("divider", [",", ";", "\t"])
@@ -45,7 +45,7 @@ def test_dividers_and_line_ends(divider: str, newline: str, mark: str) -> None:
     assert at is not None
     assert at.velocity_ned_mps.tolist() == [[1.5, -2.5, 0.5], [0.0, 0.0, 0.0]]
     assert at.heading_deg[0] == 90 and np.isnan(at.heading_deg[1])
-    assert "not used of it: extra" in log.notes
+    assert "column not used: extra" in log.notes
 
 
 def test_times_with_their_zone() -> None:
@@ -71,18 +71,18 @@ def test_attitudes_and_accuracies_are_said(tmp_path: Path) -> None:
     assert one.log.fixes.accuracies.tolist() == [[1.5, 2.5, 0.3]] * 2
     kinds = [event.msgid for event in read_log(path) if isinstance(event, Frame)]
     assert kinds == [0, 2, 24, 30, 33] * 2
-    assert "its time is taken as it stands" in one.notice()
+    assert "its time is used unchanged" in one.notice()
 
 
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("lat,lon\n47.1,8.5\n", "names no unix_s or time or t_s, lat_deg, lon_deg, alt_m"),
-        ("unix_s,lat_deg,lon_deg\n1,47,8\n", "names no alt_m"),
+        ("lat,lon\n47.1,8.5\n", "without a column unix_s or time or t_s, lat_deg, lon_deg, alt_m"),
+        ("unix_s,lat_deg,lon_deg\n1,47,8\n", "without a column alt_m"),
         (f"{HEAD},alt_m\n", "twice"),
         (f"# sysid = 999\n{HEAD}\n", "sysid is not 1 to 255"),
-        ("# only words\n" * 200, "text, and no table"),
-        ("\n\n", "text, and no table"),
+        ("# only words\n" * 200, "text without a table"),
+        ("\n\n", "text without a table"),
     ],
 )
 def test_what_is_no_such_table_is_said(text: str, why: str) -> None:

@@ -52,7 +52,7 @@ def test_vehicles_of_one_id_are_told_apart(aeroplane: Path, tmp_path: Path) -> N
     again = Path(shutil.copy(aeroplane, tmp_path / "again.bin"))
     first, second = vehicles([aeroplane, again])
     assert (first.source.sysid, second.source.sysid) == (1, 2)
-    assert "it says 1, which another has" in second.notice()
+    assert "id 1 in the log is taken by another" in second.notice()
 
 
 def test_an_id_that_another_log_says_is_not_given_away(
@@ -62,7 +62,7 @@ def test_an_id_that_another_log_says_is_not_given_away(
     nameless.write_bytes(aeroplane.read_bytes().replace(b"MAV_SYSID", b"MAV_SISID"))
     found = [one.source.sysid for one in vehicles([nameless, aeroplane, carrier])]
     assert found == [2, 1, 5]
-    assert "it names no id" in vehicles([nameless])[0].notice()
+    assert "no id in the log" in vehicles([nameless])[0].notice()
 
 
 def test_a_log_may_name_the_carrier(aeroplane: Path, carrier: Path, cut_log: Path) -> None:
@@ -70,7 +70,7 @@ def test_a_log_may_name_the_carrier(aeroplane: Path, carrier: Path, cut_log: Pat
     assert center_of(both, str(carrier)) == center_of(both, carrier.name) == "5:1"
     assert center_of(both, "7:1") == "7:1"
     assert center_of(both, None) is None
-    with pytest.raises(LogError, match="name the carrier as SYSID:COMPID"):
+    with pytest.raises(LogError, match="give the carrier as SYSID:COMPID"):
         center_of([cut_log], cut_log.name)
 
 
@@ -83,7 +83,9 @@ def test_logs_of_one_vehicle_are_one_flight_and_others_each_their_own(
 def test_logs_of_different_days_are_no_flight(carrier: Path, tmp_path: Path) -> None:
     table = tmp_path / "late.csv"
     table.write_text("unix_s,lat_deg,lon_deg,alt_m\n1795400000,47,8,500\n1795400001,47,8,500\n")
-    with pytest.raises(LogError, match=r"late\.csv: begins 2\d\.\d h after .* not one flight"):
+    with pytest.raises(
+        LogError, match=r"late\.csv: begins 2\d\.\d h after .* give the logs of one flight"
+    ):
         read_flight([carrier, table])
 
 
@@ -91,7 +93,7 @@ def test_a_log_without_gps_time_stands_alone(carrier: Path, tmp_path: Path) -> N
     table = tmp_path / "plain.csv"
     table.write_text("t_s,lat_deg,lon_deg,alt_m\n0,47,8,500\n1,47,8,500\n")
     assert sum(isinstance(event, Frame) for event in read_log(table)) == 4
-    with pytest.raises(LogError, match="cannot be put beside other logs"):
+    with pytest.raises(LogError, match="no GPS time, so other logs cannot be joined"):
         read_flight([carrier, table])
 
 

@@ -1,16 +1,16 @@
-"""The frozen values that flow through the program, from a received frame to a set of weights.
+"""Frozen values that flow through the program, from a received frame to a set of weights.
 
 Conventions, here and everywhere:
 
-* Time is integer nanoseconds since the Unix epoch on the node's own timeline (``_ns``), which
-  is the wall clock of its start, and never steps; ``UtcNs`` is UTC, by the wall clock as set last.
+* Time is integer nanoseconds since the Unix epoch on the node's own timeline (``_ns``). The
+  timeline starts at the wall clock and never steps. ``UtcNs`` is UTC by the current wall clock.
 * The *local frame* is north-east-down (NED), metres, tangent to WGS84 at a fixed origin.
-* The *body frame* is forward-right-down (FRD), as MAVLink has it; so is the *array frame*, with
+* The *body frame* is forward-right-down (FRD), as in MAVLink; so is the *array frame*, with
   x along boresight.
-* ``a_from_b`` is the 3x3 matrix that takes coordinates in frame b to coordinates in frame a.
+* ``a_from_b`` is the 3x3 matrix that transforms coordinates in frame b to coordinates in frame a.
 * Unknown is ``None``, never 0.
 
-Arrays inside these values are not to be written to.
+Arrays inside these values must not be written to.
 """
 
 from companion.values.aimed import (

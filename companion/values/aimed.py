@@ -1,4 +1,4 @@
-"""Values that the beam stage makes: beams, the UAVs left out, and the weights of one update."""
+"""Output of the beam stage: beams, the UAVs left out, and the weights of one update."""
 
 from dataclasses import dataclass
 from enum import StrEnum
@@ -12,7 +12,8 @@ from companion.values.numbers import ComplexArray, FloatArray, IntArray
 
 
 class Method(DescribedEnum):
-    """How weights are computed; regularised zero forcing also replaces too costly zero forcing."""
+    """Way to compute the weights; regularised zero forcing also replaces zero forcing that costs
+    too much."""
 
     ZERO_FORCING = "zf", "zero forcing"
     REGULARISED = "rzf", "regularised zero forcing"
@@ -21,7 +22,7 @@ class Method(DescribedEnum):
 
 
 class ArrayKind(DescribedEnum):
-    """The geometry of an array, in the array frame (x boresight, y right, z down)."""
+    """Geometry of an array, in the array frame (x boresight, y right, z down)."""
 
     ULA = "ula", "uniform line along y"
     URA = "ura", "uniform rectangle of rows down and columns to the right"
@@ -31,7 +32,7 @@ class ArrayKind(DescribedEnum):
 
 
 class Power(DescribedEnum):
-    """How the beams of one time slot share the power."""
+    """Power allocation between the beams of one time slot."""
 
     EQUAL = "equal", "equally"
     MAX_MIN = "max-min", "so that the least SINR is as large as possible"
@@ -39,7 +40,7 @@ class Power(DescribedEnum):
 
 
 class Normalisation(DescribedEnum):
-    """How the columns of the weights F, (M, N), are scaled; their directions do not change.
+    """Scale of the columns of the weights F, (M, N); their directions do not change.
 
     A is the (M, N) steering matrix; see docs/math.md 7.
     """
@@ -51,7 +52,7 @@ class Normalisation(DescribedEnum):
 
 
 class Policy(DescribedEnum):
-    """What is done where zero forcing would cost a UAV too much gain."""
+    """Fallback where zero forcing would cost a UAV too much gain."""
 
     REGULARISE = "regularise", "add a diagonal loading to the Gram matrix"
     GROUP = "group", "serve groups of UAVs, each in a time slot of its own"
@@ -59,7 +60,7 @@ class Policy(DescribedEnum):
 
 
 class Widen(DescribedEnum):
-    """How wide beams are made."""
+    """Criterion for the width of beams."""
 
     LIKELY = "likely", "for the usual pointing error, with a guaranteed floor within the bound"
     GUARANTEE = "guarantee", "for the bound: the largest guaranteed gain within it"
@@ -67,9 +68,9 @@ class Widen(DescribedEnum):
 
 
 class WeightFormat(StrEnum):
-    """What weights can be written as, with the media type that HTTP names it by.
+    """Format of exported weights, with its HTTP media type.
 
-    Those of devices are this product's own names; the makers have registered none.
+    The media types of devices are this product's own; the manufacturers have registered none.
     """
 
     media_type: str
@@ -90,11 +91,10 @@ class WeightFormat(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Beam:
-    """One UAV's beam: where it points, how well, and how that direction changes.
+    """Beam of one UAV: its direction, rates of change, gain and pointing errors.
 
-    shaped_likely_rad, shaped_bound_rad  angles for which the main lobe is shaped: they follow
-        ``pointing_p95_rad`` and ``pointing_bound_rad`` no faster than a beam may change its shape;
-        0: not shaped
+    shaped_likely_rad, shaped_bound_rad  angles for which the main lobe is shaped; they follow
+        ``pointing_p95_rad`` and ``pointing_bound_rad``, with hysteresis; 0: not shaped
     """
 
     uav: Annotated[str, Meaning("UAV that the beam points at", 1, label="UAV", example="3:1")]
@@ -132,7 +132,7 @@ class Beam:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """A UAV that is tracked but has no beam, and the reason: as a cause and in words."""
+    """Tracked UAV without a beam, with the cause and the reason in words."""
 
     uav: Annotated[str, Meaning("UAV without a beam", 1)]
     cause: Cause
@@ -141,14 +141,14 @@ class LeftOut:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamSet:
-    """The beams and weights of one update.
+    """Beams and weights of one update.
 
     Zero forcing gives AᵀF = I within a time slot (no conjugate; diagonal under other
     normalisations): each UAV lies in a null of the others' beams. See docs/math.md 7.
     """
 
     t_ns: Annotated[
-        int, Meaning("when the update was computed", 1, absent={"api": "`age_s` says it"})
+        int, Meaning("when the update was computed", 1, absent={"api": "`age_s` replaces it"})
     ]
     valid_at_ns: Annotated[int, Meaning("when the beams are applied", 2)]
     beams: tuple[Beam, ...]
@@ -174,12 +174,12 @@ class BeamSet:
 
     @property
     def slots(self) -> IntArray:
-        """(N,), the time slot of each beam."""
+        """Time slot of each beam, (N,)."""
         return np.array([beam.group for beam in self.beams], dtype=np.int64)
 
     @property
     def ranges_m(self) -> FloatArray:
-        """(N,), the predicted range of each beam's UAV."""
+        """Predicted range of each beam's UAV, (N,)."""
         return np.array([beam.range_m for beam in self.beams], dtype=float)
 
     @property

@@ -1,4 +1,4 @@
-"""What the node's wall clock has to do with its timeline."""
+"""Relation between the node's wall clock and its timeline."""
 
 from dataclasses import dataclass
 from typing import Annotated, NewType
@@ -6,12 +6,12 @@ from typing import Annotated, NewType
 from companion.values.described import Meaning
 
 UtcNs = NewType("UtcNs", int)
-"""A time in UTC, ns since the Unix epoch, by the wall clock as it was set last."""
+"""UTC time, ns since the Unix epoch, by the wall clock as last set."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockSet:
-    """The node's wall clock was set, as by NTP; the node's timeline went on."""
+    """Step of the node's wall clock, as by NTP; the node's timeline did not step."""
 
     t_ns: Annotated[int, Meaning("when the change was noticed", 1)]
     utc_offset_ns: Annotated[

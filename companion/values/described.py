@@ -1,21 +1,21 @@
-"""What a value means where it leaves the program, declared once, beside the value.
+"""Description of each value that leaves the program, declared once, beside the value.
 
     age_s: Annotated[float, Meaning("age of the newest accepted report", 4)]
 
-Every way out derives from these declarations: the HTTP API and its OpenAPI document
+Every output derives from these declarations: the HTTP API and its OpenAPI document
 (``companion.server.models``), recordings (``companion.recording.fields``), exported tables
 (``companion.recording.tables``), the reference pages of ``docs`` and the labels of the dashboard.
 
-A described class is a dataclass or a ``NamedTuple``. A property is described in the annotation of
-what it returns. What has no ``Meaning`` stays inside the program.
+A described class is a dataclass or a ``NamedTuple``. A property is described in its return
+annotation. A field without a ``Meaning`` stays inside the program.
 
-The name of a value ends in its unit. Each way out writes that unit in its own form, by rule:
+The name of a value ends in its unit. Each output converts names and units by rule:
 
     inside, recording    API          export
     azimuth_rad          azimuth_deg  azimuth_deg
     azimuth_rate_radps   ..._degps    ..._degps
     valid_at_ns          valid_at     valid_at_ns and valid_at_utc
-    velocity_ned_mps     as it is     velocity_north_mps, velocity_east_mps, velocity_down_mps
+    velocity_ned_mps     unchanged    velocity_north_mps, velocity_east_mps, velocity_down_mps
 """
 
 import functools
@@ -27,7 +27,7 @@ from dataclasses import KW_ONLY, dataclass, field
 from enum import StrEnum
 from typing import Any, Final, Literal, NamedTuple, Self
 
-Way = Literal["api", "recording", "export"]  # a way out of the program
+Way = Literal["api", "recording", "export"]  # an output of the program
 NOWHERE: Final[Mapping[Way, str]] = types.MappingProxyType({})
 
 UNITS: Final = {
@@ -35,22 +35,22 @@ UNITS: Final = {
     "dbm": "dBm", "hz": "Hz", "mps": "m/s", "mps2": "m/s²", "degps": "deg/s", "dps": "deg/s",
     "radps": "rad/s", "ppm": "ppm", "bps": "bit/s", "bytes": "bytes", "utc": "UTC",
 }  # fmt: skip
-"""How the ending of a name writes its unit."""
+"""Unit symbol for each suffix of a name."""
 _DEGREES: Final = {"_rad": "_deg", "_radps": "_degps"}
 
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """What a value means, and how it leaves the program.
+    """Description of a value, and how each output writes it.
 
-    text        a phrase in plain English, without the unit, which the name has; it says what None
-                means where that is more than "unknown"
+    text        a phrase in plain English, without the unit; it gives the meaning of None
+                if that is more than "unknown"
     number      field number in the recording's protobuf message; None: not recorded
     label       short name for tables and charts of the dashboard
     example     for the OpenAPI document
-    wire        protobuf type, where the rule of ``companion.recording.fields`` gives another
-    absent      ways out that lack it, each with the reason
-    deprecated  what to use instead: the value goes with the next version
+    wire        protobuf type, if it differs from the rule of ``companion.recording.fields``
+    absent      outputs that omit it, each with the reason
+    deprecated  replacement: the value is removed in the next version
     """
 
     text: str
@@ -64,7 +64,7 @@ class Meaning:
 
 
 class DescribedEnum(StrEnum):
-    """An enumeration whose values are described: ``NAME = "value", "what it means"``."""
+    """Enumeration whose values are described: ``NAME = "value", "meaning"``."""
 
     meaning: str
 
@@ -77,24 +77,24 @@ class DescribedEnum(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Inline:
-    """Marks a described value whose own members stand in place of it."""
+    """Marker of a described value that is replaced by its own members."""
 
-    prefix: str = ""  # put before their names
-    omit: tuple[str, ...] = ()  # members that are left out
+    prefix: str = ""  # prepended to their names
+    omit: tuple[str, ...] = ()  # members left out
 
 
 class Member(NamedTuple):
     """One described value of a class."""
 
-    name: str  # as it is inside the program, an inlined one with its prefix
+    name: str  # name inside the program; with the prefix if inlined
     type: Any  # annotation without Annotated and without None
     optional: bool  # whether it may be None
-    meaning: Meaning  # what it means
-    get: Callable[[Any], Any]  # reads it from an instance
+    meaning: Meaning
+    get: Callable[[Any], Any]  # getter, called with an instance
 
 
 def members(described: Any) -> tuple[Member, ...]:
-    """The described values of a class, in the order in which they are declared."""
+    """Return the described values of a class, in the order of declaration."""
     found = _MEMBERS.get(described)
     if found is None:
         found = _MEMBERS[described] = tuple(_members(described))
@@ -105,18 +105,18 @@ _MEMBERS: Final[dict[Any, tuple[Member, ...]]] = {}
 
 
 def meaning(described: Any, name: str) -> Meaning:
-    """What one value of a class means. Raises ``KeyError`` where it is not described."""
+    """Return the meaning of one value of a class. Raises ``KeyError`` if it is not described."""
     return {member.name: member.meaning for member in members(described)}[name]
 
 
 def is_described(kind: Any) -> bool:
-    """True for a class whose values are described."""
+    """Return whether the values of a class are described."""
     is_class = isinstance(kind, type) and typing.get_origin(kind) is None
     return is_class and not issubclass(kind, str | int) and bool(members(kind))
 
 
 def bare(annotation: Any) -> tuple[Any, bool]:
-    """An annotation without ``Annotated``, ``NewType`` and None, and whether it admits None."""
+    """Strip ``Annotated``, ``NewType`` and None; return the type and whether None was allowed."""
     if typing.get_origin(annotation) is typing.Annotated:
         return bare(typing.get_args(annotation)[0])
     if isinstance(annotation, typing.NewType):
@@ -129,12 +129,12 @@ def bare(annotation: Any) -> tuple[Any, bool]:
 
 
 def is_vector(kind: Any) -> bool:
-    """True for the type of an array of numbers."""
+    """Return whether a type is that of a numpy array."""
     return "ndarray" in str(kind)
 
 
 def in_degrees(name: str) -> str:
-    """The name that an angle in radians, or its rate, has in degrees; other names as they are."""
+    """Convert the name of an angle or rate in radians to degrees; return other names unchanged."""
     for inside, outside in _DEGREES.items():
         if name.endswith(inside):
             return name.removesuffix(inside) + outside
@@ -142,12 +142,12 @@ def in_degrees(name: str) -> str:
 
 
 def is_in_radians(name: str) -> bool:
-    """True for the name of an angle in radians, or of its rate."""
+    """Return whether a name is that of an angle or rate in radians."""
     return name.endswith(tuple(_DEGREES))
 
 
 def unit(name: str) -> str:
-    """The unit in which a value of this name is written; empty where it has none."""
+    """Return the unit that a name ends in; empty if it has none."""
     return UNITS.get(name.rpartition("_")[2], "") if "_" in name else ""
 
 
@@ -171,7 +171,7 @@ def _members(described: type) -> Iterator[Member]:
 
 
 def _annotations(described: type) -> dict[str, Any]:
-    """Annotations of the fields and properties, those of base classes first."""
+    """Return the annotations of fields and properties, those of base classes first."""
     hints = typing.get_type_hints(described, include_extras=True)
     found: dict[str, Any] = {}
     for base in reversed(described.__mro__):
@@ -184,7 +184,7 @@ def _annotations(described: type) -> dict[str, Any]:
 
 
 def _metadata(annotation: Any) -> tuple[Any, ...]:
-    """What ``Annotated`` says, wherever it stands in an annotation."""
+    """Return the metadata of ``Annotated`` at any depth of an annotation."""
     if typing.get_origin(annotation) is typing.Annotated:
         inner, *said = typing.get_args(annotation)
         return (*said, *_metadata(inner))
@@ -192,7 +192,7 @@ def _metadata(annotation: Any) -> tuple[Any, ...]:
 
 
 def _chain(outer: str, inner: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Getter through an attribute: one call where both are attributes."""
+    """Return a getter through an attribute; one C call if both are attributes."""
     if isinstance(inner, operator.attrgetter):
         path = str(inner.__reduce__()[1][0])
         return operator.attrgetter(f"{outer}.{path}")

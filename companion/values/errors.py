@@ -1,21 +1,19 @@
-"""The base class of every error that a user can cause, and what others wrote as it is said."""
+"""Base class of every error that a user can cause, and the display of untrusted values."""
 
 from typing import Final
 
-SHOWN_MAX: Final = 200  # most characters of a value that an error repeats
+SHOWN_MAX: Final = 200  # longest value that an error message shows, characters
 
 
 class UserError(ValueError):
-    """A mistake made by the user of the program.
-
-    Its message is one line, and only that line is shown.
+    """Mistake of the program's user; only its one-line message is shown.
 
     Any other exception is a defect of the program and is shown with its traceback.
     """
 
 
 def shown(given: object) -> str:
-    """A value as an error says it."""
+    """Return the ``repr`` of a value as an error message shows it, cut to ``SHOWN_MAX``."""
     try:
         text = repr(given)
     except ValueError:  # Python's limit on the digits of an integer
@@ -24,5 +22,5 @@ def shown(given: object) -> str:
 
 
 def printable(text: str) -> str:
-    """A text without what a terminal takes for orders, such as escapes; its lines are kept."""
+    """Remove control characters, such as terminal escapes, from a text; keep its line breaks."""
     return "".join(char for char in text if char.isprintable() or char == "\n")

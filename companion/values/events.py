@@ -1,4 +1,4 @@
-"""Everything that drives the pipeline: frames, and what the node itself adds to them."""
+"""Events that drive the pipeline: frames, and events of the node itself."""
 
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -12,7 +12,7 @@ from companion.values.rejections import Rejection
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """The timer event at which beams are due."""
+    """Timer event at which beams are due."""
 
     t_ns: Annotated[int, Meaning("when beams are due", 1)]
     in_two: Annotated[
@@ -27,14 +27,14 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Tock:
-    """The beams of the preceding split tick are computed."""
+    """Event at which the beams of the preceding split tick are computed."""
 
     t_ns: Annotated[int, Meaning("when they are computed", 1)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoundTrip:
-    """A TIMESYNC request sent by this node, and its answer."""
+    """TIMESYNC request of this node, with its answer."""
 
     t_ns: Annotated[int, Meaning("when the answer was received", 1)]
     source: Annotated[Source, Meaning("component that answered", 2)]
@@ -49,12 +49,12 @@ class RoundTrip:
     ]
 
 
-DUTY_MAX: Final = 10_000  # most UAVs that a duty serves, and most that it spares
+DUTY_MAX: Final = 10_000  # most UAVs that a duty serves, and most that it protects
 
 
 @dataclass(frozen=True, slots=True)
 class Duty:
-    """The UAVs that this node of a fleet serves from now on, and those that it protects."""
+    """UAVs that this node of a fleet serves from now on, and those that it protects."""
 
     t_ns: Annotated[int, Meaning("when the duty begins", 1)]
     serves: Annotated[tuple[str, ...], Meaning("UAVs that get a beam", 2)]
@@ -64,13 +64,13 @@ class Duty:
 
 
 Event = Frame | Tick | Tock | Rejection | RoundTrip | ClockSet | Duty
-"""Everything that drives the pipeline, in the order in which it was taken in.
+"""Every event that drives the pipeline, in the order of processing.
 
-That is the order of time, but that a frame's time is its arrival: where the node was busy, a tick
-of a later time may have been taken in before it.
+This is the order of time, with one exception: a frame's time is its arrival. If the node was busy,
+a tick with a later time may precede the frame.
 
-A rejection made while framing is an event too: its bytes are gone, but that they came must be
-recorded. A round trip is an event because only the service knows which requests were its own; a
-clock that was set, because a replay is to say the times that the service said; a duty, because it
-is decided with other nodes.
+Framing emits rejections as events: the bytes are discarded, but their arrival must be recorded. A
+round trip is an event because only the service knows its own requests. ``ClockSet`` is an event so
+that a replay prints the same times as the service. A duty is one because other nodes take part in
+the decision.
 """

@@ -1,4 +1,4 @@
-"""Optional packages, and one line to a user who has not installed them."""
+"""Optional packages, and the one-line error if one is not installed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ from companion.values.errors import UserError
 
 @contextmanager
 def needs(package: str, extra: str, what: str) -> Iterator[None]:
-    """Wrap an import: raises ``UserError`` that says what to install if the package is missing."""
+    """Guard an import: raise ``UserError`` with the install command if the package is missing."""
     try:
         yield
     except ModuleNotFoundError as error:

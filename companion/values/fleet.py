@@ -1,4 +1,4 @@
-"""Values of a fleet: what the nodes of a site tell one another, and what each is to do."""
+"""Values of a fleet: the messages that its nodes exchange."""
 
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -8,7 +8,7 @@ from companion.values.events import RoundTrip
 
 
 class SharedFrame(NamedTuple):
-    """A frame that a node heard: when, on that node's timeline, and its bytes."""
+    """Frame that a node received: its arrival on that node's timeline, and its bytes."""
 
     heard_ns: int
     raw: bytes
@@ -16,24 +16,28 @@ class SharedFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """What a node heard of late and tells the others; times are on its own timeline."""
+    """Recent frames and round trips of a node, for the other nodes; times on its own timeline."""
 
-    told_ns: int  # when it tells
-    frames: tuple[SharedFrame, ...] = ()  # frames from vehicles, in the order in which they came
+    told_ns: int  # when it was published
+    frames: tuple[SharedFrame, ...] = ()  # frames from vehicles, in the order of arrival
     trips: tuple[RoundTrip, ...] = ()  # answers of vehicles to its TIMESYNC requests
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Offer:
-    """What a node's array would offer a UAV, if it served that UAV alone."""
+    """Gain and SNR that a node's array would give a UAV if it served that UAV alone."""
 
     uav: Annotated[str, Meaning("UAV of the offer", 1)]
-    sure_db: Annotated[float | None, Meaning("gain guaranteed wherever the UAV is; null: none", 2)]
-    likely_db: Annotated[float | None, Meaning("gain where the UAV usually is; null: none", 3)]
+    sure_db: Annotated[
+        float | None, Meaning("guaranteed gain within the pointing bound; null: none", 2)
+    ]
+    likely_db: Annotated[
+        float | None, Meaning("gain within the usual pointing error; null: none", 3)
+    ]
     sinr_db: Annotated[
         float | None,
         Meaning(
-            "SNR at the UAV with full power and the guaranteed gain, or else the likely gain", 4
+            "SNR at the UAV with full power and the guaranteed gain, else with the likely gain", 4
         ),
     ]
     heard_s: Annotated[
@@ -43,15 +47,15 @@ class Offer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Standing:
-    """What a node says of itself, some times a second.
+    """Status that a node publishes a few times a second.
 
     node       its name
     place      of its array: latitude and longitude in degrees, height above mean sea level in
-               metres; None: not known
-    reach_m    distance of the farthest UAV that it hears itself; None: none
-    most       UAVs that it serves at most
+               metres; None if unknown
+    reach_m    distance of the farthest UAV that it receives itself; None without one
+    most       largest number of UAVs that it serves
     serves     UAVs that it serves, each with its worth when it was claimed, dB
-    handing    UAVs that it serves until another node takes them: the UAV, and that node
+    handing    handovers in progress: the UAV, and the node that takes it over
     """
 
     node: str

@@ -1,4 +1,4 @@
-"""Values of the verdict on a UAV's link: how good it is, why, and what can be done."""
+"""Verdict on a UAV's link: its level, the cause, and the remedy."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -7,7 +7,7 @@ from companion.values.described import DescribedEnum, Meaning
 
 
 class Level(DescribedEnum):
-    """How good the link to a UAV is."""
+    """Quality of the link to a UAV."""
 
     GOOD = "good", "its beam has the gain that the link needs, guaranteed"
     WEAK = "weak", "its beam usually has the gain that the link needs"
@@ -15,14 +15,14 @@ class Level(DescribedEnum):
 
 
 class Cause(DescribedEnum):
-    """What limits a link most."""
+    """Main limit of a link."""
 
     CARRIER = "carrier", "the array's position or attitude is too uncertain"
     SILENT = "silent", "no report arrives"
     REFUSED = "refused", "reports arrive and are not used"
     RATE = "rate", "its reports are far apart"
     LATE = "late", "its reports arrive late"
-    AGILE = "agile", "it can turn away quickly"
+    AGILE = "agile", "it can change its velocity quickly"
     CLOCK = "clock", "its clock is too uncertain"
     POSITION = "position", "its reported positions are too inaccurate at this range"
     CROWDED = "crowded", "other UAVs are in the same direction, or the policy leaves it out"
@@ -34,7 +34,7 @@ class Cause(DescribedEnum):
 
 @dataclass(frozen=True, slots=True)
 class Blame:
-    """What holds a link back: the cause, in words, and what to do about it."""
+    """Cause of a weak link, with a reason in words and a remedy."""
 
     cause: Annotated[Cause, Meaning("what limits the link most; null where it is good")]
     reason: Annotated[str, Meaning("the cause in words", example="reports 1.1 s apart")]
@@ -43,18 +43,18 @@ class Blame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """How good the link to a UAV is."""
+    """Quality of the link to a UAV."""
 
     uav: str
-    level: Level  # how good
-    blame: Blame | None  # why it is not good; None where it is
-    since_ns: Annotated[int, Meaning("since when the link is so")]
+    level: Level
+    blame: Blame | None  # None if the link is good
+    since_ns: Annotated[int, Meaning("when the link reached this level")]
     needed_gain_db: Annotated[
         float | None, Meaning("array gain that the link needs; null without a beam")
     ] = None
     guaranteed_gain_db: Annotated[
-        float | None, Meaning("least array gain wherever the UAV can be; null: none")
+        float | None, Meaning("least array gain within the pointing bound; null: none")
     ] = None
     likely_gain_db: Annotated[
-        float | None, Meaning("least array gain where the UAV usually is; null: none")
+        float | None, Meaning("least array gain within the usual pointing error; null: none")
     ] = None

@@ -1,4 +1,4 @@
-"""Names: of senders of frames, and of UAVs."""
+"""Ids of frame senders and of UAVs."""
 
 from enum import Enum
 from functools import lru_cache
@@ -7,11 +7,11 @@ from typing import Final, NamedTuple, Self
 from companion.values.errors import UserError, shown
 
 DIGITS_MAX: Final = 18
-"""Most digits of an id: Python reads thousands, and then raises another error."""
+"""Most digits of an id: for thousands of them, ``int`` raises another error."""
 
 
 class Source(NamedTuple):
-    """The sender of a frame: MAVLink system and component id, written ``SYSID:COMPID``."""
+    """Sender of a frame: MAVLink system and component id, written ``SYSID:COMPID``."""
 
     sysid: int
     compid: int
@@ -21,13 +21,13 @@ class Source(NamedTuple):
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read ``SYSID:COMPID``. Raises ``UserError`` unless both are numbers from 0 to 255."""
+        """Parse ``SYSID:COMPID``. Raises ``UserError`` unless both are numbers from 0 to 255."""
         return cls(*_ids(text))
 
 
 @lru_cache(maxsize=4096)
 def _ids(text: str) -> tuple[int, int]:
-    """System and component id. A node reads the same names at every update."""
+    """Parse system and component id; cached, because every update parses the same names."""
     sysid, colon, compid = text.partition(":")
     if not (colon and sysid.isdecimal() and compid.isdecimal()):
         raise UserError(f"{shown(text)} is not SYSID:COMPID, such as 5:1")
@@ -37,11 +37,11 @@ def _ids(text: str) -> tuple[int, int]:
 
 
 class UavKind(Enum):
-    """What a UAV's id names, in the order in which one aircraft is best known.
+    """Kind of a UAV's id, best identification first.
 
-    Its own telemetry comes first, then what it broadcasts of itself, then what others report.
+    The aircraft's own telemetry comes first, then its broadcasts, then reports of others.
 
-        prefix         what its ids begin with, before a colon; empty for SYSID:COMPID
+        prefix         prefix of its ids, before a colon; empty for SYSID:COMPID
         pattern        regular expression of its ids
         may_be_manned  whether an aircraft of this kind may carry people
         rank           its place in this order, from 0
@@ -62,15 +62,15 @@ class UavKind(Enum):
         self.reports_itself = not prefix
 
     def uav(self, name: str) -> str:
-        """The id of an aircraft of this kind that is relayed under a name."""
+        """Return the id of an aircraft of this kind, from its name."""
         return f"{self.prefix}:{name}"
 
 
 _KINDS: Final = {kind.prefix: kind for kind in UavKind}
 UAV_FORMS: Final = "SYSID:COMPID, icao:HEX, rid:ID or cot:UID"
-"""How the ids of all kinds are written."""
+"""Formats of the ids of all kinds."""
 
 
 def kind_of(uav: str) -> UavKind:
-    """The kind of thing that an id names."""
+    """Return the kind of a UAV's id."""
     return _KINDS.get(uav.partition(":")[0], UavKind.VEHICLE)

@@ -4,7 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Vector = tuple[float, float, float]
-"""Three numbers, where there are few: arithmetic on them is several times that of small arrays."""
+"""Tuple of three numbers; arithmetic on it is several times faster than on small arrays."""
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
@@ -12,6 +12,6 @@ BoolArray = NDArray[np.bool_]
 
 
 def vector(array: FloatArray) -> Vector:
-    """An array of three numbers as a vector."""
+    """Convert an array of three numbers to a ``Vector``."""
     x, y, z = array.tolist()
     return x, y, z

@@ -10,7 +10,7 @@ from companion.values.tracked import Carrier, Estimate, Refuted, Track
 
 
 class Severity(DescribedEnum):
-    """How important a notice is to an operator."""
+    """Importance of a notice to an operator."""
 
     INFO = "info", "for information"
     WARNING = "warning", "something is worse than it should be"
@@ -19,7 +19,7 @@ class Severity(DescribedEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Notice:
-    """A message to the operator, emitted once when the state it describes changes."""
+    """Message to the operator, emitted once when the state that it describes changes."""
 
     t_ns: Annotated[int, Meaning("when it was issued")]
     severity: Annotated[Severity, Meaning("how important it is")]
@@ -29,17 +29,17 @@ class Notice:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Update:
-    """Every tracked UAV at the time of use, and the beams towards them.
+    """Every tracked UAV at the time of use, with its beams.
 
-    carrier  where the array is; None while that is not known, and then there are no beams
+    carrier  where the array is; None while unknown, and then there are no beams
     """
 
-    t_ns: int  # when the update was made, node time
+    t_ns: int  # when the update was computed, node time
     carrier: Carrier | None
-    unfit: str | None  # why there are no beams; None if the service is fit to be used
+    unfit: str | None  # why there are no beams; None if beams can be used
     tracks: tuple[Track, ...]  # every target, predicted to the time of use
-    beams: BeamSet  # the weights
+    beams: BeamSet
 
 
 Output = Rejection | Estimate | Notice | Refuted | Update
-"""Everything that the pipeline can return for an event."""
+"""Every value that the pipeline can return for an event."""

@@ -1,4 +1,4 @@
-"""Values that come in: frames, and the messages decoded from them."""
+"""Received values: frames, and the messages decoded from them."""
 
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -8,22 +8,22 @@ from companion.values.names import Source, UavKind
 
 
 class Frame(NamedTuple):
-    """One MAVLink frame whose checksum is right.
+    """MAVLink frame with a correct checksum.
 
-    It is a tuple because one is made for every frame received, wanted or not.
+    It is a tuple for speed: one is created for every frame received, used or not.
     """
 
     t_ns: Annotated[
         int, Meaning("arrival; for a frame that another node received, its latest arrival", 1)
     ]
-    link: Annotated[str, Meaning("link that it came over", 2)]
+    link: Annotated[str, Meaning("link over which it arrived", 2)]
     source: Annotated[Source, Meaning("sender: MAVLink system and component id", 3)]
     msgid: Annotated[int, Meaning("MAVLink message id", 5)]
     raw: Annotated[
         bytes, Meaning("whole frame, from the magic byte to the checksum or signature", 6)
     ]
     doubt_ns: Annotated[
-        int, Meaning("by how much the arrival may be earlier than stated", 7, wire="uint64")
+        int, Meaning("how much earlier than stated it may have arrived", 7, wire="uint64")
     ] = 0
 
     @property
@@ -38,13 +38,13 @@ class Frame(NamedTuple):
 
     @property
     def payload(self) -> bytes:
-        """The payload as sent; MAVLink 2 senders cut trailing zeros."""
+        """Payload as sent; MAVLink 2 senders truncate trailing zeros."""
         start = 10 if self.raw[0] == 0xFD else 6
         return self.raw[start : start + self.raw[1]]
 
 
 class AltitudeDatum(DescribedEnum):
-    """What an altitude is measured from."""
+    """Surface that an altitude is measured from."""
 
     MSL = "msl", "mean sea level"
     PRESSURE = (
@@ -55,11 +55,11 @@ class AltitudeDatum(DescribedEnum):
 
 
 class Accuracy(NamedTuple):
-    """How exact a report says that it is: radii that hold 68 % of errors, as GNSS receivers say.
+    """Accuracy that a report states: radii that hold 68 % of errors, as GNSS receivers give them.
 
-    Metres and m/s; None: unknown. What is stated for 95 % is brought to 68 % where it is read
-    (``mavlink/wire/accuracy.py``). ``vertical_m`` is that of a height above the ellipsoid, and
-    ``time_s`` the greatest error of the time at which the position was true.
+    Metres and m/s; None: unknown. Figures stated for 95 % are converted to 68 % when decoded
+    (``mavlink/wire/accuracy.py``). ``vertical_m`` refers to a height above the ellipsoid;
+    ``time_s`` is the largest error of the time at which the position was true.
     """
 
     horizontal_m: float | None = None
@@ -70,25 +70,25 @@ class Accuracy(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Report:
-    """A position that a UAV sent of itself, or that a receiver relayed of it.
+    """Position that a UAV sent of itself, or that a receiver relayed of it.
 
-        t_ns               when it arrived, node time
+        t_ns               arrival, node time
         lat_deg, lon_deg   WGS84
-        alt_m, alt_datum   height and what it is measured from
-        relative_alt_m     height above the UAV's home; None if not sent
+        alt_m, alt_datum   height and its datum
+        relative_alt_m     height above the UAV's home
         velocity_ne_mps    north and east, in the north-east-down frame at the UAV
         velocity_down_mps  positive down
         heading_deg        from true north, clockwise
-        boot_ms            the sender's clock since boot, or another that goes on, when the position
+        boot_ms            the sender's boot time, or another continuous clock, when the position
                            was true; None for ADS-B
         tslc_s             age of the position as stated by an ADS-B receiver, in place of
                            ``boot_ms``
         alt_age_s          time between the instants at which position and altitude were true; 0
-                           where one message held both
-        accuracy           how exact it says that it is; None where its message has no word for it
-        alt_step_m         step in which its message gives heights; 0: too small to count
+                           if one message held both
+        accuracy           stated accuracy; None if the message has no such field
+        alt_step_m         resolution of heights in its message; 0: negligible
 
-    None stands for what was not sent.
+    None: not sent.
     """
 
     t_ns: int
@@ -111,16 +111,16 @@ class Report:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdsbVehicle:
-    """An aircraft relayed by a receiver (ADSB_VEHICLE).
+    """Aircraft relayed by a receiver (ADSB_VEHICLE).
 
-        alt_m, alt_datum   height and what it is measured from; both None or neither
+        alt_m, alt_datum   height and its datum; both None or neither
         velocity_ne_mps    north and east, in the north-east-down frame at the aircraft
-        accuracy           how exact the transponder says that it is; None where no relay says
+        accuracy           accuracy that the transponder states; None if the relay does not send it
 
-    A field whose own validity flag is not set is None.
+    A field is None unless its own validity flag is set.
     """
 
-    t_ns: int  # when it arrived, node time
+    t_ns: int  # arrival, node time
     icao: int  # 24-bit ICAO address of the aircraft
     source: Source  # the relay, not the aircraft
     callsign: str | None
@@ -130,37 +130,37 @@ class AdsbVehicle:
     heading_deg: float | None  # from true north, clockwise
     velocity_ne_mps: tuple[float, float] | None
     velocity_down_mps: float | None  # positive down
-    tslc_s: int  # whole seconds since the aircraft was last heard
+    tslc_s: int  # whole seconds since the last message of the aircraft
     accuracy: Accuracy | None = None
 
     @property
     def uav(self) -> str:
-        """The aircraft's name here: ``icao:`` and six hexadecimal digits."""
+        """UAV id of the aircraft: ``icao:`` and six hexadecimal digits."""
         return UavKind.ADSB.uav(f"{self.icao:06X}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoteId:
-    """What a Remote ID receiver heard from one radio: an id, a position, or both.
+    """Message that a Remote ID receiver relays from one radio: an id, a position, or both.
 
-    None stands for what was not sent.
+    None: not sent.
     """
 
     t_ns: int
     source: Source
-    heard_as: str  # the radio's address, hexadecimal; empty where the receiver does not say
+    heard_as: str  # the radio's address, hexadecimal; empty if the receiver does not send it
     uas_id: str | None = None  # the aircraft's id
-    id_kind: int | None = None  # MAVLink's MAV_ODID_ID_TYPE of it
-    aircraft: int | None = None  # how many aircraft the sender says to stand for
+    id_kind: int | None = None  # type of the id, MAVLink's MAV_ODID_ID_TYPE
+    aircraft: int | None = None  # number of aircraft that the sender represents
     report: Report | None = None  # its position, under the name of the radio
-    is_flat: bool = False  # there was a position, and no height
+    is_flat: bool = False  # whether a position came without a height
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Attitude:
     """Body attitude and body rates (ATTITUDE).
 
-    Roll, pitch and yaw, in radians, turn the NED frame into the FRD body frame; the rates, in
+    Roll, pitch and yaw, in radians, rotate the NED frame into the FRD body frame; the rates, in
     rad/s, are about the body axes.
     """
 
@@ -177,7 +177,7 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Presence:
-    """A HEARTBEAT: a component exists. It does not prove that there is a vehicle."""
+    """HEARTBEAT of a component; it does not prove that there is a vehicle."""
 
     t_ns: int
     source: Source
@@ -190,7 +190,7 @@ class GnssStatus:
     """Fix type, height and stated accuracies of a GNSS receiver (GPS_RAW_INT).
 
     ``fix_type`` is MAVLink's GPS_FIX_TYPE, ``alt_m`` above mean sea level; accuracies are in metres
-    and m/s, None if not sent. ``time_us`` counts since boot or 1970, 0 if it is not known.
+    and m/s, None if not sent. ``time_us`` counts since boot or since 1970; 0 if unknown.
     """
 
     t_ns: int
@@ -205,7 +205,7 @@ class GnssStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SystemTime:
-    """The sender's Unix clock, in microseconds, beside its clock since boot (SYSTEM_TIME)."""
+    """Sender's Unix clock, in microseconds, with its boot time (SYSTEM_TIME)."""
 
     t_ns: int
     source: Source
@@ -215,11 +215,10 @@ class SystemTime:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EstimatorStatus:
-    """What an autopilot's estimator says of its attitude (EKF_STATUS_REPORT).
+    """Status of an autopilot's attitude estimator (EKF_STATUS_REPORT).
 
-    knows_attitude  whether it stands by its attitude at all
-    compass_ratio   how far compass and attitude contradict one another, over what the estimator
-                    accepts: beyond 1 it refuses its compass
+    knows_attitude  whether the estimator reports its attitude as valid
+    compass_ratio   compass innovation over the estimator's gate: above 1 it rejects the compass
     """
 
     t_ns: int

@@ -1,4 +1,4 @@
-"""What was received and not used, and why."""
+"""Received data that was not used, with the reason."""
 
 from dataclasses import dataclass
 from typing import Annotated
@@ -7,7 +7,7 @@ from companion.values.described import DescribedEnum, Meaning
 
 
 class Reason(DescribedEnum):
-    """Why something received was not used."""
+    """Why received data was not used."""
 
     GARBAGE = "garbage", "bytes between frames"
     BAD_CRC = "bad-crc", "frames with a wrong checksum"
@@ -16,7 +16,7 @@ class Reason(DescribedEnum):
     MALFORMED = "malformed", "messages with impossible field values"
     UNREACHABLE = "unreachable", "reports farther from the track than the aircraft can have flown"
     ALTITUDE_JUMP = "altitude-jump", "reports at an unreachable height: the datum has changed"
-    FROZEN = "frozen", "new time stamps on an old position, while the velocity says it moves"
+    FROZEN = "frozen", "new time stamps on an old position, although the reported velocity is not 0"
     SHARED_ID = "shared-id", "reports of two vehicles under one id"
     ZERO_POSITION = "zero-position", "reports near 0° N 0° E, which are sent before a fix"
     NO_POSITION = "no-position", "relayed aircraft without valid coordinates"
@@ -37,7 +37,7 @@ class Reason(DescribedEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rejection:
-    """Something received that was not used, and why."""
+    """Received data that was not used, with the reason."""
 
     t_ns: Annotated[int, Meaning("when it was received", 1)]
     source: Annotated[str, Meaning("UAV, sender, link or log that it came from", 2)]

@@ -1,4 +1,4 @@
-"""Values for where things are: fixes, estimates, tracks and the carrier of the array."""
+"""Positions: fixes, estimates, tracks and the carrier of the array."""
 
 import math
 from dataclasses import dataclass
@@ -13,8 +13,8 @@ from companion.values.received import Report
 class ReportNoise:
     """Bounds on the errors of one report.
 
-    apart_m  by how much the receiver's own altitudes differ from those reported of late, while it
-             is unknown which of them is wrong; 0 where they agree
+    apart_m  difference between the receiver's own altitudes and the recently reported ones, while
+             it is unknown which is wrong; 0 if they agree
     """
 
     horizontal_m: Annotated[float, Meaning("bound on the horizontal position error")]
@@ -26,7 +26,7 @@ class ReportNoise:
 
 
 class LimitSource(DescribedEnum):
-    """Where the limits of an aircraft come from."""
+    """Origin of an aircraft's limits."""
 
     SETTINGS = "settings", "[observer] in the settings"
     TYPE = "type", "the aircraft's type"
@@ -48,23 +48,23 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Refuted:
-    """An assumption that reports refuted, in the unit of its setting; it was raised."""
+    """Assumption that reports refuted, in the unit of its setting; it was raised."""
 
     t_ns: Annotated[int, Meaning("when it was refuted")]
     uav: str
     setting: Annotated[str, Meaning("setting whose assumption was refuted")]
     limit: Annotated[float, Meaning("assumed value")]
     proven: Annotated[float, Meaning("least value that the reports prove")]
-    raised_to: Annotated[float, Meaning("value assumed from then on, which fades over minutes")]
+    raised_to: Annotated[float, Meaning("value assumed from then on; it decays over minutes")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
-    """A report put on the node's timeline and into the local frame.
+    """Report placed on the node's timeline and in the local frame.
 
     sender_ns  when the position was true, on the sender's timeline; intervals between reports are
-               taken from it, since the link cannot disturb it
-    limits     what the aircraft is taken to be able to do; None: the observer's model
+               computed from it, since link delay does not affect it
+    limits     assumed limits of the aircraft; None: those of the observer's model
 
     ``arrival_ns - t_ns`` is the visible latency. A report without a sender's clock has ``sender_ns
     == t_ns``.
@@ -72,46 +72,47 @@ class Fix:
 
     uav: str
     sender_ns: int
-    t_ns: int  # the same instant on the node's timeline, as known on arrival
+    t_ns: int  # the same instant on the node's timeline, as estimated on arrival
     arrival_ns: int  # when the report arrived, node time
     position_ned_m: Vector  # in the local frame
     velocity_ned_mps: Vector | None  # in the local frame; None if not sent
     noise: ReportNoise  # bounds on the errors of both
-    report: Report  # the report itself
+    report: Report
     limits: Limits | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Estimate:
-    """The observer's answer to an accepted report, at the time of that report.
+    """Observer's answer to an accepted report, at the time of that report.
 
     A track is restarted from reports that disagree with it but agree with one another.
     ``innovation_m`` is None for the first report of a track; after a restart it is the jump.
     """
 
     fix: Fix  # the accepted report
-    position_ned_m: Vector  # local frame: the estimate before this report entered it
+    position_ned_m: Vector  # local frame: the estimate before this report was used
     bound_m: Annotated[float, Meaning("bound on the error of the prediction for this report")]
     innovation_m: Annotated[
         float | None, Meaning("distance from the prediction to the reported position")
     ]
-    dt_s: Annotated[float | None, Meaning("interval since the UAV's report before")]
+    dt_s: Annotated[float | None, Meaning("interval since the UAV's previous report")]
     reacquired: Annotated[bool, Meaning("whether this report restarted the track")] = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SenderTime:
-    """A time of the node, ``node_ns``, converted to a sender's timeline.
+    """Time of the node, ``node_ns``, converted to a sender's timeline.
 
     node_ns, sender_ns  the time on both timelines
-    before_s, after_s   by how much the true sender time may be less, or more, than ``sender_ns``
+    before_s, after_s   largest amounts by which the true sender time precedes or follows
+                        ``sender_ns``
     """
 
     node_ns: int
     sender_ns: int
     before_s: float
     after_s: float
-    usual_s: float = 0.0  # by how much it usually is: an estimate, no bound
+    usual_s: float = 0.0  # usual error of ``sender_ns``: an estimate, not a bound
 
     @property
     def bound_s(self) -> float:
@@ -120,7 +121,8 @@ class SenderTime:
 
 
 class TrackState(DescribedEnum):
-    """How old the newest report of a UAV is; the age limits are settings (``[tracks]``)."""
+    """State of a track, by the age of its newest report; the age limits are settings
+    (``[tracks]``)."""
 
     LIVE = "live", "reports arrive"
     COASTING = "coasting", "predicted without new reports"
@@ -128,15 +130,15 @@ class TrackState(DescribedEnum):
     LOST = "lost", "about to be dropped"
 
 
-_LOCAL_FRAME: Final = "coordinates of the node's own frame; `lat_deg` … and `north_m` … say where"
+_LOCAL_FRAME: Final = "coordinates of the node's own frame; see `lat_deg` … and `north_m` …"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
     """One UAV at the instant ``valid_at_ns``. Vectors are (3,), in the local frame.
 
-    The bounds hold if the settings' bounds on speed, acceleration and noise do (docs/math.md 5.6).
-    None stands for what is not known.
+    The bounds hold if the assumed limits of speed, acceleration and noise do (docs/math.md 5.6).
+    None: unknown.
     """
 
     uav: Annotated[str, Meaning("id of the UAV", 1, label="UAV", example="3:1")]
@@ -183,7 +185,7 @@ class Track:
     dt_s: Annotated[float | None, Meaning("interval between the last two reports", 9, label="ΔT")]
     latency_s: Annotated[
         float | None,
-        Meaning("age of the newest report at its arrival; negative: the autopilot predicts", 10),
+        Meaning("age of the newest report on arrival; negative: the autopilot predicts", 10),
     ]
     gamma: Annotated[
         float | None,
@@ -209,13 +211,13 @@ class Track:
 class Carrier:
     """Position and attitude of the array's carrier at the instant ``valid_at_ns``.
 
-    error_p95_m       error that positions usually stay below; None where that is not known
-    attitude_p95_rad  angle by which the attitude usually is off at most; None likewise
+    error_p95_m       estimated 95th percentile of the position error; None if unknown
+    attitude_p95_rad  estimated 95th percentile of the attitude error; None if unknown
     """
 
     valid_at_ns: int
     position_ned_m: FloatArray  # (3,), local frame
-    velocity_ned_mps: FloatArray | None  # (3,), local frame; None if not known
+    velocity_ned_mps: FloatArray | None  # (3,), local frame; None if unknown
     body_from_local: FloatArray  # (3, 3) rotation matrix
     body_rates_radps: FloatArray  # (3,), angular rates about the body axes
     bound_m: Annotated[float, Meaning("guaranteed bound on the error of the carrier's position")]

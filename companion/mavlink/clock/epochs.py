@@ -1,24 +1,25 @@
-"""Which line a stamp lies on: late frames, reboots, leaps, and the wrap of the boot clock.
+"""Assignment of stamps to lines: late frames, reboots, clock jumps, and the wrap of the boot clock.
 
-While a sender runs, its stamps lie on and above one line (``floor.py``). A stamp belongs to the
+While a sender runs, its stamps lie on or above one line (``floor.py``). A stamp belongs to the
 line while it is less than ``late_max_ns`` off it:
 
-- Stamps further off start a *run*. Three of a run that advance, over at least half a second, with
-  none between them that advances the line, are a new line; until then they have no time. If the
-  boot clock stepped back it is a reboot. If it leapt ahead it is the same boot with a new offset,
-  and the sender's timeline leaps with it.
-- A sender that restarts within ``late_max_ns`` of its boot steps back by no more than late frames
+- Stamps further off start a *run*. A run of three advancing stamps, over at least half a second
+  and with none between them that advances the line, becomes the new line; until then its stamps
+  have no time. If the boot clock stepped back, it is a reboot. If it jumped ahead, it is the same
+  boot with a new offset, and the sender's timeline jumps with it.
+- A sender that restarts within ``late_max_ns`` of its boot steps back no further than late frames
   do. Late frames catch up with the line, a restarted clock does not: five stamps from the first
-  seconds of a boot, over at least a second, none of which advances the line and all of which lag
-  equally (to a second), are a reboot. A clock that stood still lags in the same way, by more
-  than ``late_max_ns``, and goes on.
+  seconds of a boot, over at least a second, none of which advances the line and all of which are
+  equally late (to a second), are a reboot. A stalled clock is late in the same way, but by more
+  than ``late_max_ns``, and its stamps advance.
 - Stamps off the line that lie on a line of their own for three seconds, while the first line
   advances between them, belong to a second clock: two senders share one id.
-- A stamp that is more than a second early on a line of 20 says that all before it were late. It
-  counts once three of them do, over at least half a second; until then they have no time.
-- Frames of the previous line, which come for up to ``late_max_ns`` after it was left, have no time.
+- A stamp that is more than a second early on a line of 20 implies that all earlier ones were
+  late. It counts once three stamps over at least half a second agree; until then they have no
+  time.
+- Frames of the previous line that arrive within ``late_max_ns`` after it was left have no time.
 
-A reboot is therefore reported once, at the stamp that confirms it. One case is not told apart: a
+A reboot is therefore reported once, at the stamp that confirms it. One case is ambiguous: a
 second link that lags by seconds, and is the only one left within the first ``late_max_ns`` of a
 boot, looks like a reboot.
 """
@@ -35,20 +36,20 @@ WRAP_NS: Final = _WRAP_MS * _NS_PER_MS
 """Period of a boot clock: its 32-bit milliseconds wrap after 49.7 days."""
 _EARLY_NS: Final = -_NS
 """Least lateness of a stamp that fits an established line; negative: it may be 1 s early."""
-_ESTABLISHED: Final = 20  # stamps from which on a line is not moved by a single one
+_ESTABLISHED: Final = 20  # stamps of a line that a single early stamp can no longer move
 _RUN_KEPT: Final = 64  # stamps kept of a run
 _RIVAL_LASTS_NS: Final = 3 * _NS
-"""Time over which a second clock must be heard before it counts as one."""
+"""Least duration of a second clock that counts as one."""
 _RIVAL_SILENT_NS: Final = 10 * _NS  # silence after which a second clock is forgotten
 
 
 class PlacedStamp(NamedTuple):
-    """A stamp on a line."""
+    """Stamp placed on a line."""
 
     x_ns: int  # the sender's time since boot, unwrapped
     new_line: bool = False  # True for the first stamp on a new line
     rebooted: bool = False  # True if the new line was begun by a reboot
-    leapt_ns: int = 0  # by how much a new line is higher than the one before, else; 0 otherwise
+    leapt_ns: int = 0  # height of a new line without reboot above the previous one; else 0
 
 
 @dataclass(slots=True, kw_only=True)
@@ -61,7 +62,7 @@ class _RivalLine:
     begun_ns: int = 0
 
     def add(self, arrival_ns: int, boot_ms: int, spread_ns: int) -> bool:
-        """Add a stamp, dropping the earlier ones if it is more than ``spread_ns`` off them.
+        """Add a stamp; drop the earlier ones if it is more than ``spread_ns`` off them.
 
         Returns whether the stamp is now the newest of the run.
         """
@@ -87,12 +88,12 @@ class _RivalLine:
             self.stamps.clear()
 
     def lasts(self, count: int, span_ns: int) -> bool:
-        """Whether the run has at least ``count`` stamps over at least ``span_ns``."""
+        """Return whether the run has at least ``count`` stamps over at least ``span_ns``."""
         return len(self.stamps) >= count and self.stamps[-1][0] - self.stamps[0][0] >= span_ns
 
 
 class BootLine:
-    """The line of one sender's boot clock; ``observe`` takes its stamps in order of arrival.
+    """Line of one sender's boot clock; ``observe`` takes its stamps in order of arrival.
 
     window_ns, drift_max
                  as for ``Floor``
@@ -107,13 +108,13 @@ class BootLine:
         self.newest_ns = 0
         self._run = _RivalLine()
         self._rival = _RivalLine()
-        self._previous: tuple[Floor, int] | None = None  # the line before, and when it was left
+        self._previous: tuple[Floor, int] | None = None  # the previous line, and when it was left
 
     def observe(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
         """Place a stamp.
 
-        Returns None for a frame of the previous line, and for a stamp off the line that others have
-        not confirmed so far.
+        Returns None for a frame of the previous line, and for a stamp off the line that is not yet
+        confirmed by others.
         """
         if not self.floor.count:
             return self._accept(arrival_ns, boot_ms * _NS_PER_MS)
@@ -134,7 +135,7 @@ class BootLine:
         return self._begin_again(rebooted=stepped_back)
 
     def notice(self, arrival_ns: int, boot_ms: int) -> bool:
-        """Take in a stamp that cannot begin a line. Returns whether it lies on the present one."""
+        """Add a stamp that cannot start a line. Return whether it lies on the current one."""
         if not self.floor.count:
             return False
         x_ns = _unwrap(boot_ms, self.newest_ns)
@@ -145,21 +146,21 @@ class BootLine:
         return True
 
     def is_shared(self, arrival_ns: int) -> bool:
-        """Whether a second clock goes on beside the line: two senders then share one id."""
+        """Return whether a second clock runs beside the line: two senders then share one id."""
         self._rival.forget(arrival_ns)
         stamps = self._rival.stamps
         return len(stamps) >= 5 and stamps[-1][0] - self._rival.begun_ns >= _RIVAL_LASTS_NS
 
     def unwrap(self, boot_ms: int) -> int:
-        """Boot time in ns with the wraps added that bring it nearest to the newest stamp."""
+        """Convert boot milliseconds to ns, unwrapped to the value nearest to the newest stamp."""
         return _unwrap(boot_ms, self.newest_ns)
 
     def late_ns(self, arrival_ns: int, x_ns: int) -> int:
-        """Height of a stamp above the line, ns; negative where it lies under it."""
+        """Return the height of a stamp above the line, ns; negative below it."""
         return arrival_ns - x_ns - self.floor.at(x_ns)
 
     def fits(self, arrival_ns: int, x_ns: int) -> bool:
-        """Whether a stamp can belong to the line."""
+        """Return whether a stamp can belong to the line."""
         return bool(self.floor) and abs(self.late_ns(arrival_ns, x_ns)) <= self._late_max_ns
 
     def _accept(self, arrival_ns: int, x_ns: int) -> PlacedStamp:
@@ -168,7 +169,7 @@ class BootLine:
         return PlacedStamp(x_ns=x_ns)
 
     def _near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp | None:
-        """Place a stamp on the line: in order, late, or in the first seconds of a second boot."""
+        """Place a stamp near the line: in order, late, or early in a second boot."""
         if x_ns > self.newest_ns:
             early = self.late_ns(arrival_ns, x_ns) < _EARLY_NS
             if early and self.floor.count >= _ESTABLISHED:
@@ -176,7 +177,7 @@ class BootLine:
             self._run.stamps.clear()
         elif (
             x_ns < self.newest_ns
-            and x_ns < self._late_max_ns  # of the boot, not of a wrap
+            and x_ns < self._late_max_ns  # soon after the boot, not after a wrap
             and self._run.add(arrival_ns, boot_ms, _NS)
             and self._run.lasts(5, _NS)
         ):
@@ -184,9 +185,9 @@ class BootLine:
         return self._accept(arrival_ns, x_ns)
 
     def _ahead(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
-        """Place a stamp that shows all before it to have been late, once others confirm it.
+        """Place a stamp that implies that all earlier ones were late, once others confirm it.
 
-        One alone would move the clock by all that it is ahead, whoever made it up.
+        A single forged stamp could otherwise move the clock by any amount.
         """
         if not (self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(3, _NS // 2)):
             return None
@@ -204,7 +205,7 @@ class BootLine:
         return PlacedStamp(x_ns=x_ns)
 
     def _is_straggler(self, arrival_ns: int, boot_ms: int, late_ns: int) -> bool:
-        """Whether a stamp fits the previous line and not the present one."""
+        """Return whether a stamp fits the previous line and not the current one."""
         if self._previous is None:
             return False
         before, left_ns = self._previous
@@ -217,7 +218,7 @@ class BootLine:
         return fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
 
     def _begin_again(self, *, rebooted: bool) -> PlacedStamp:
-        """Make the run the line. After a reboot the sender's timeline begins anew."""
+        """Make the run the line. After a reboot the sender's timeline restarts."""
         stamps = list(self._run.stamps)
         self._run.stamps.clear()
         self._rival.stamps.clear()
@@ -234,7 +235,7 @@ class BootLine:
 
 
 def _unwrap(boot_ms: int, newest_ns: int) -> int:
-    """Boot time in ns, with the wraps added that bring it nearest to ``newest_ns``."""
+    """Convert boot milliseconds to ns, unwrapped to the value nearest to ``newest_ns``."""
     newest_ms = newest_ns // _NS_PER_MS
     step_ms = (boot_ms - newest_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
     return (newest_ms + step_ms) * _NS_PER_MS

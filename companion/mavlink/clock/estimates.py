@@ -1,4 +1,4 @@
-"""Values of a sender's clock: what is assumed of it, what is known of it, how it changed."""
+"""Values of a sender's clock: assumptions, estimates and changes."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from companion.values.described import DescribedEnum, Meaning
 
 
 class ClockKind(DescribedEnum):
-    """The evidence from which a sender's clock is estimated."""
+    """Evidence from which a sender's clock is estimated."""
 
     TIMESYNC = "timesync", "TIMESYNC round trips"
     GNSS = "gnss", "SYSTEM_TIME of a GNSS receiver"
@@ -24,17 +24,17 @@ class Guarantee(DescribedEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockAssumptions:
-    """What is assumed of a sender's clock and its link.
+    """Assumptions about a sender's clock and its link.
 
-    node_utc_error_s  bound on the node's distance from UTC; None: its timeline is not UTC
+    node_utc_error_s  bound on the difference between the node's timeline and UTC; None: unbounded
     """
 
     constant_delay_s: float = 0.0  # known smallest latency, which stamps alone cannot show
     trust_gnss: bool = False  # use SYSTEM_TIME, if node_utc_error_s is known
     node_utc_error_s: float | None = None
-    gnss_error_s: float = 0.02  # bound on the sender's distance from UTC
-    window_s: float = 60.0  # how far back latencies are sampled
-    drift_max_ppm: float = 250.0  # greatest drift taken for possible
+    gnss_error_s: float = 0.02  # bound on the error of the sender's UTC
+    window_s: float = 60.0  # time over which latencies are sampled
+    drift_max_ppm: float = 250.0  # largest drift assumed
     late_max_s: float = 10.0  # greatest lateness of any frame
 
     def __post_init__(self) -> None:
@@ -48,12 +48,10 @@ class ClockAssumptions:
 
 @dataclass(frozen=True, slots=True)
 class Stamp:
-    """A stamp placed on the sender's and the node's timelines.
+    """Stamp placed on the sender's and the node's timelines.
 
-    sender_ns  the sender's time since boot, past the wrap of its 32-bit milliseconds; it begins
-               anew after a reboot
-    latency_s  how long before its arrival the stamp was made, by all that is known now; at
-               least 0
+    node_utc_error_s  bound on the error of the node timeline against UTC; None: unbounded
+    latency_s  estimated age of the stamp on arrival, at least 0
     rebooted   True once, at the stamp that confirms a reboot
     """
 
@@ -64,7 +62,7 @@ class Stamp:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockEstimate:
-    """A sender's clock against the node's."""
+    """Estimate of a sender's clock relative to the node's."""
 
     kind: Annotated[ClockKind, Meaning("evidence that leaves the least uncertainty")]
     guarantee: Annotated[
@@ -94,13 +92,13 @@ class ClockEstimate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockChange:
-    """A change of a sender's clock, or of its link, beyond what was taken for possible.
+    """Change of a sender's clock, or of its link, beyond the assumed drift.
 
-    proven     whether evidence from both sides proves that the clock changed; else all frames are
-               late by that much, by the clock or by the link
-    step_s     by how much, seconds
-    drift_ppm  drift that this amounts to; inf where it is too quick for a drift
-    leapt      whether it is more than any frame is taken to be late: the clock's, by assumption
+    proven     whether two-way evidence proves that the clock changed; otherwise all frames are
+               late by that much, because of the clock or the link
+    step_s     size of the change, seconds
+    drift_ppm  drift equivalent to the change; inf if it is too fast for a drift
+    leapt      whether it exceeds the largest lateness of a frame: a clock jump, by assumption
     """
 
     proven: bool

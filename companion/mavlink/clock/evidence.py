@@ -1,17 +1,17 @@
-"""Evidence that certainly holds a sender's offset: round trips, and GNSS time at both ends.
+"""Two-sided evidence of a sender's offset: round trips, and GNSS time at both ends.
 
 A TIMESYNC round trip, sent and received on the node's clock and answered at ``remote`` on the
 sender's, proves that
 
     sent - remote  <=  offset  <=  received - remote
 
-however long the two ways took: the midpoint is within half the round trip (RFC 5905, section 8). A
-slow round trip proves little, but nothing false. GNSS time at both ends proves an interval as wide
-as both ends' errors.
+for any split of the delay between the two directions: the midpoint is within half the round trip
+(RFC 5905, section 8). A slow round trip gives a wide interval, but never a false one. GNSS time at
+both ends gives an interval as wide as the errors of both ends.
 
-All of them hold at once. The interval that they leave is widened with time by the greatest drift
-taken for possible. Evidence outside it refutes that drift: the clock stepped, or ran faster or
-slower. The newest wins then, and the doubt contains both until they agree (docs/math.md 6).
+All intervals hold at once. Their intersection is widened with time by the largest drift assumed.
+Evidence outside it refutes that drift: the clock stepped, or ran faster or slower. The newest
+evidence then counts, and the doubt interval contains both until they agree (docs/math.md 6).
 """
 
 import math
@@ -20,9 +20,9 @@ from typing import Final, NamedTuple
 
 AGREE: Final = 3  # pieces of evidence in a row after a contradiction that end the doubt
 STEP: Final = 0.02
-"""Least drift, a ratio, that is taken for a step: no clock runs like that for long."""
-RAISED: Final = 1.5  # multiple of the drift proven that is taken for possible from then on
-FADES_NS: Final = 60e9  # time constant with which a raised drift fades
+"""Least drift, a ratio, that counts as a step: no clock sustains such a rate error."""
+RAISED: Final = 1.5  # multiple of the proven drift that is assumed from then on
+FADES_NS: Final = 60e9  # time constant with which a raised drift decays
 
 
 class Interval(NamedTuple):
@@ -35,9 +35,9 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DriftProven:
-    """A drift beyond what was taken for possible: ``drift``, a ratio; inf for a step at once.
+    """Drift beyond the assumed one: ``drift``, a ratio; inf for a sudden step.
 
-    ``step_ns`` is by how much the offset lies outside what was known.
+    ``step_ns`` is the distance of the offset from the interval expected.
     """
 
     drift: float
@@ -45,9 +45,9 @@ class DriftProven:
 
 
 class OffsetEvidence:
-    """What the evidence of one kind leaves of the offset.
+    """Interval of the offset from all evidence of one kind.
 
-    drift_max    greatest drift taken for possible, a ratio
+    drift_max    largest drift assumed, a ratio
     """
 
     def __init__(self, drift_max: float) -> None:
@@ -59,18 +59,21 @@ class OffsetEvidence:
         self._agreed = 0
 
     def clear(self) -> None:
-        """Forget everything, because the sender's clock has a new offset."""
+        """Discard all evidence, because the sender's clock has a new offset."""
         self._known = self._doubt = None
 
     def drift_at(self, x_ns: int) -> float:
-        """Greatest drift taken for possible at a sender time, a ratio."""
+        """Return the largest drift assumed at a sender time, a ratio."""
         if not self._raised:
             return self._drift_max
         faded = self._raised * math.exp(-max(0, x_ns - self._raised_ns) / FADES_NS)
         return max(self._drift_max, faded)
 
     def add(self, new: Interval) -> DriftProven | None:
-        """Take in evidence. Returns what it proves of the drift; None if it fits what is known."""
+        """Add evidence.
+
+        Return the drift that it proves; None if it agrees with earlier evidence.
+        """
         before = self._known
         if before is None:
             self._known = new
@@ -102,7 +105,7 @@ class OffsetEvidence:
         return Interval(x_ns, one.low_ns - slack, one.high_ns + slack)
 
     def newest(self, x_ns: int) -> Interval:
-        """What the evidence since the newest contradiction leaves at a sender time.
+        """Return the interval at a sender time, from evidence since the newest contradiction.
 
         There must be some.
         """
@@ -110,7 +113,8 @@ class OffsetEvidence:
         return self._aged(self._known, x_ns)
 
     def at(self, x_ns: int) -> Interval | None:
-        """What is left at a sender time, every doubt included; None without evidence."""
+        """Return the interval at a sender time, including the doubt interval; None without
+        evidence."""
         if self._known is None:
             return None
         known = self._aged(self._known, x_ns)

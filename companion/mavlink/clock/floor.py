@@ -1,24 +1,24 @@
-"""The floor under (arrival - stamp): what frames that only come, and never answer, show of a clock.
+"""Floor of (arrival - stamp): the bound on a clock offset from one-way frames alone.
 
-What is seen of a sender is
+Observed of a sender is
 
     y = arrival - boot = offset + latency,     latency >= its least value >= 0
 
-No frame arrives before it was sent, so the offset is nowhere above any y; and since it changes by
-no more than the greatest drift D, a y once seen limits it for ever:
+No frame arrives before it was sent, so the offset is nowhere above any y. Since it changes by no
+more than the largest drift D, every y bounds it at all times:
 
     offset(x) <= min over all stamps of  y_k + D |x - x_k|     (``upper_bound``, docs/math.md 6)
 
-That limit is one number, aged by D: nothing that still proves something is forgotten, and there is
-no cliff at the end of a window.
+This bound is one number, aged by D: no useful evidence is discarded, and the bound does not jump
+at the end of a window.
 
-A clock that stands still for a moment and a link that is slower from now on look alike: every y is
-higher. They cannot be distinguished, so both are kept: ``upper_bound`` holds if the clock ran on,
-``line`` begins again where all frames have lain above it for long, far beyond what their spread
-explains (``lateness.py``). Likewise where frames come steadily later for a whole window: a clock
-that is slow, or a queue that fills. The line follows it, and a level floor is kept beside it until
-no queue can be that long. Before that, the least of the last few frames is taken for possible: the
-offset is below it whatever the clock did before them.
+A clock that stalls for a moment and a link that becomes slower look alike: every y is higher. They
+cannot be distinguished, so both are kept. ``upper_bound`` holds if the clock did not stall.
+``line`` restarts where all frames have been above it for long, far beyond their usual spread
+(``lateness.py``). The same holds if frames arrive steadily later for a whole window: the clock is
+slow, or a queue fills. The line follows the slope, and a level floor is kept beside it until no
+queue can be that long. Before that, the least height of the last few frames is assumed possible:
+the offset is below it whatever the clock did earlier.
 """
 
 from collections import deque
@@ -32,14 +32,14 @@ from companion.mavlink.clock.lateness import CHANGE, LEAST_CHANGE_NS, LateSpell,
 LIKELY_DRIFT: Final = 50e-6
 """Drift of an ordinary crystal, by which the most likely line rises while no frame touches it."""
 FEWEST, RECENT = 3, 8
-"""Frames the least of which limits the offset whatever the clock did before.
+"""Number of last frames whose least height bounds the offset, whatever the clock did before.
 
-So many always; so few where their lateness is no part of the spread.
+``RECENT`` always; ``FEWEST`` if their lateness exceeds the spread.
 """
 WORST_LATENCY_NS: Final = 5e9
-"""Greatest latency of a frame; radios have been seen to deliver 4.8 s late."""
+"""Greatest latency of a frame; radios have delivered up to 4.8 s late."""
 START_NS: Final = 250_000_000
-"""Time that counts as one frame at the start, where the first few may all be slow together."""
+"""Time that counts as one frame at the start, when the first few may all be slow together."""
 _RARE: Final = 7.0
 """Once in 1000 the least of n exponential latencies exceeds the true minimum by 7/n of a mean."""
 
@@ -47,17 +47,18 @@ _RARE: Final = 7.0
 class Heights(NamedTuple):
     """Heights of a floor at one sender time, ns."""
 
-    upper_bound: int  # above the offset if the clock ran within its drift
-    highest: int  # above the offset, even if the clock changed before the last frames
-    line: int  # the most likely height of the floor
-    least: int  # the least height that the frame nearest to the offset can have
+    upper_bound: int  # upper bound of the offset if the clock stayed within its drift
+    highest: int  # upper bound of the offset even if the clock changed before the last frames
+    line: int  # most likely height of the floor
+    least: int  # least possible height of the frame nearest to the offset
 
 
 class _Level:
-    """The floor under stamps that lie along a slope, if the clock ran within its drift after all.
+    """Level floor under stamps with a steady slope: it holds if a queue, not drift, caused the
+    slope.
 
-    upper_bound height above the offset then, at the newest stamp, above the level base
-    touched_ns  sender time of the stamp that it comes from
+    upper_bound bound on the offset in that case, at the newest stamp, relative to the level base
+    touched_ns  sender time of the stamp that set it
     """
 
     __slots__ = ("touched_ns", "upper_bound")
@@ -67,7 +68,7 @@ class _Level:
         self.touched_ns = touched_ns
 
     def add(self, x_ns: int, height: float, ahead_ns: int, drift_max: float) -> None:
-        """Take in a stamp that is so much ahead of the newest."""
+        """Add a stamp that is ``ahead_ns`` ahead of the newest one."""
         self.upper_bound += drift_max * max(0, ahead_ns)
         as_of_now = height + drift_max * max(0, -ahead_ns)
         if as_of_now <= self.upper_bound:
@@ -75,21 +76,19 @@ class _Level:
 
 
 class Floor:
-    """The floor of one line of stamps. ``add`` takes placed stamps in order of arrival.
+    """Floor of one line of stamps. ``add`` takes placed stamps in order of arrival.
 
     Arguments:
 
-        window_ns   time over which latencies are sampled and a steady drift is looked for
-        drift_max   greatest drift taken for possible, a ratio
+        window_ns   time over which latencies are sampled and a steady drift is detected
+        drift_max   largest drift assumed, a ratio
 
     Attributes:
 
-        newest_ns   newest sender time; 0 without any
-        drift       drift that a steady rise or fall has shown, a ratio; 0 unless it is beyond
-                    ``drift_max``
+        newest_ns   newest sender time; 0 before the first stamp
+        drift       detected steady drift, a ratio; 0 unless it exceeds ``drift_max``
         count       stamps so far
-        rose_ns     by how much the line was begun higher at the newest stamp than the greatest
-                    drift explains; 0 unless it was
+        rose_ns     rise of the line at the newest stamp beyond ``drift_max``; 0 unless it restarted
     """
 
     def __init__(self, window_ns: int, drift_max: float) -> None:
@@ -100,12 +99,12 @@ class Floor:
         self.newest_ns = 0
         self.rose_ns = 0.0
         self._first_arrival_ns = self._newest_arrival_ns = 0
-        self._base = (0, 0)  # x, y: heights below are above base y + drift * (x - base x)
+        self._base = (0, 0)  # x, y: heights are relative to base y + drift * (x - base x)
         self._upper_bound = self._line = 0.0  # heights at newest_ns
-        self._level: _Level | None = None  # the floor, if what looks like a drift is a queue
-        self._touched_ns = 0  # x of the stamp that ``upper_bound`` comes from
-        self._since_ns = 0  # x from which the line is what it is
-        self._risen = -np.inf  # height of the last few frames, where they are suspiciously late
+        self._level: _Level | None = None  # floor if the apparent drift is a queue
+        self._touched_ns = 0  # x of the stamp that set ``upper_bound``
+        self._since_ns = 0  # x of the line's last restart
+        self._risen = -np.inf  # height of the last few frames, if they are suspiciously late
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT)
         self._lateness = SenderLateness(drift_max)
         self._visible = Latencies(window_ns, drift_max)
@@ -114,10 +113,10 @@ class Floor:
     def __bool__(self) -> bool:
         return self.count > 0
 
-    # --- stamps in --------------------------------------------------------------------------
+    # --- input ------------------------------------------------------------------------------
 
     def add(self, x_ns: int, y_ns: int) -> None:
-        """Take in a stamp: its sender time, and its arrival less that time."""
+        """Add a stamp: its sender time, and its arrival less that time."""
         self.rose_ns = 0.0
         self._newest_arrival_ns = x_ns + y_ns
         if not self.count:
@@ -149,17 +148,17 @@ class Floor:
             if late_spell is not None:
                 self._all_late(late_spell)
         if self._line - self._upper_bound > WORST_LATENCY_NS:
-            # No frame is as late as that: the clock did change.
+            # No frame is that late: the clock changed.
             self._upper_bound, self._touched_ns = self._line, x_ns
         level = self._level
         if level is not None and self._tilted(self._line) - level.upper_bound > WORST_LATENCY_NS:
-            self._level = None  # no queue is as long as that: the clock does drift
+            self._level = None  # no queue is that long: the clock drifts
         if self.count < 4 * RECENT or self.count - self._looked >= 64 or gap < -RESOLUTION_NS:
             self._measure()
 
     @property
     def _spread(self) -> float:
-        """What is usual of a frame's height above the line, ns."""
+        """Usual height of a frame above the line, ns."""
         return self._visible.median_ns + RESOLUTION_NS
 
     def _height(self, x_ns: int, y_ns: int) -> float:
@@ -167,7 +166,7 @@ class Floor:
         return y_ns - y0_ns - self.drift * (x_ns - x0_ns)
 
     def _suspicious(self) -> float:
-        """The least height of the last few frames, if that they are all so late is no chance."""
+        """Return the least height of the last few frames if all are improbably late, else -inf."""
         heights = [
             height + self._drift_max * (self.newest_ns - at_ns) for at_ns, height in self._recent
         ]
@@ -181,7 +180,10 @@ class Floor:
         return -np.inf
 
     def _all_late(self, spell: LateSpell) -> None:
-        """Tell that all frames are late, once; begin the line again there in time."""
+        """Report a spell of late frames once.
+
+        Restart the line at their height when it has lasted.
+        """
         if spell.is_news:
             rose_ns = spell.height - max(self._line, self._upper_bound)
             self.rose_ns = rose_ns if rose_ns > LEAST_CHANGE_NS else 0.0
@@ -190,7 +192,7 @@ class Floor:
             self._visible.keep_median()
 
     def _measure(self) -> None:
-        """Measure the visible latencies anew, and follow a steady drift if they show one."""
+        """Measure the visible latencies again, and follow a steady drift if there is one."""
         self._looked = self.count
         self._visible.measure(self.newest_ns, self._since_ns)
         if not self.drift:
@@ -199,7 +201,7 @@ class Floor:
                 self._drifts()
 
     def _drifts(self) -> None:
-        """Lay the floor anew along the drift, on the least heights of the window."""
+        """Restart the floor along the drift, on the least heights of the window."""
         newest_ns, level = self.newest_ns, self._upper_bound
         self._level = _Level(self._touched_ns)
         self._base = (newest_ns, self._base[1] + round(level))
@@ -211,14 +213,14 @@ class Floor:
         self._lateness.clear()
         self._recent.clear()
 
-    # --- what they show ---------------------------------------------------------------------
+    # --- estimates --------------------------------------------------------------------------
 
     def at(self, x_ns: int) -> int:
-        """The most likely height of the floor at a sender time, ns."""
+        """Return the most likely height of the floor at a sender time, ns."""
         return self._base[1] + round(self._line + self.drift * (x_ns - self._base[0]))
 
     def heights(self, x_ns: int) -> Heights:
-        """What the floor says of the offset at a sender time."""
+        """Return the bounds on the offset at a sender time."""
         drift_max, newest_ns = self._drift_max, self.newest_ns
         base_ns = self._base[1]
         sure, line, recent = self._upper_bound, self._line, self._risen
@@ -243,7 +245,7 @@ class Floor:
         )
 
     def _tilted(self, height: float) -> float:
-        """A height at the newest stamp above the level base."""
+        """Convert a height at the newest stamp to one above the level base."""
         return height + self.drift * (self.newest_ns - self._base[0])
 
     @property
@@ -253,11 +255,11 @@ class Floor:
 
     @property
     def late_ns(self) -> float:
-        """By how much all frames are late now, by the clock or by the link; 0 if they are not."""
+        """Present lateness of all frames, by the clock or by the link; 0 if they are on time."""
         return max(0.0, self._lateness.height - self._line)
 
     def residual_ns(self) -> float:
-        """What a short time of listening may have missed of the fastest frame.
+        """Return the possible excess of the fastest frame so far, due to the short observation.
 
         The least of n exponential latencies is above their minimum by up to 7 means / n; and the
         first frames may all have been slow.
@@ -269,13 +271,13 @@ class Floor:
         return float(_RARE * self._visible.mean_ns / n + slow)
 
     def drifted_ns(self, x_ns: int) -> int:
-        """By how much the drift that has shown itself moves the floor from its newest stamp, ns."""
+        """Return the change of the floor from its newest stamp by the detected drift, ns."""
         return round(self.drift * (x_ns - self.newest_ns))
 
     def may_drift_ns(self, x_ns: int) -> tuple[int, int]:
-        """The least and the greatest that the offset may have drifted since the newest stamp, ns.
+        """Return the least and greatest drift of the offset since the newest stamp, ns.
 
-        Beside what ``drift_max`` explains. While a queue may be what looks like a drift, none.
+        Beyond ``drift_max``. It includes 0 while the apparent drift may be a queue.
         """
         drifted_ns = self.drifted_ns(x_ns)
         if self._level is None:
@@ -283,7 +285,7 @@ class Floor:
         return min(0, drifted_ns), max(0, drifted_ns)
 
     def begin_again(self, height_ns: int, x_ns: int) -> None:
-        """Begin again at a height that was measured at a sender time: the clock did change."""
+        """Restart at a height that was measured at a sender time, because the clock changed."""
         measured = self._height(x_ns, height_ns)
         self._upper_bound = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
         self._level = None

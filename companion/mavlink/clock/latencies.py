@@ -1,9 +1,9 @@
-"""The visible part of a sender's latencies: heights above the floor, sampled evenly over a window.
+"""Visible part of a sender's latencies: heights above the floor, sampled evenly over a window.
 
-A sample that leaves stamps out by lot has its share of the slow and of the fast ones, however they
-come in spells. Every n-th would not do: a link that sends eight frames at a time makes each eighth
-of them the slowest. The least height of each piece of the window gives the floor of its own time,
-and shows a drift that goes on for the whole window.
+Random sampling keeps slow and fast stamps in proportion, however they are clustered. Taking every
+n-th stamp would not: if a link sends frames eight at a time, every eighth one is the slowest. The
+least height of each piece of the window gives the floor at its time, and reveals a drift that
+lasts for the whole window.
 """
 
 from collections import deque
@@ -14,18 +14,19 @@ import numpy as np
 
 PIECES: Final = 16  # pieces of the window whose least heights are kept
 SAMPLES: Final = 256
-RESOLUTION_NS: Final = 1e6  # step of the stamps
+RESOLUTION_NS: Final = 1e6  # resolution of the stamps
 _LOTS: Final = 1 << 32
 _STEADY: Final = 0.1
-"""Share of the level line's mean gap below which a sloped line's is a steady drift."""
+"""Ratio of a sloped line's mean gap to the level line's, below which the slope is a steady drift.
+"""
 
 
 class Latencies:
-    """Heights of stamps, of which the median above the floor is measured when asked.
+    """Heights of stamps; ``measure`` computes their median above the floor.
 
     window_ns   time over which stamps are kept
-    drift_max   greatest drift taken for possible, a ratio
-    median_ns   attribute: median of the visible latencies, as measured last
+    drift_max   largest drift assumed, a ratio
+    median_ns   attribute: median of the visible latencies at the last ``measure``
     mean_ns     attribute: their mean
     """
 
@@ -41,7 +42,7 @@ class Latencies:
         self.median_ns = self.mean_ns = 0.0
 
     def add(self, x_ns: int, height: float) -> None:
-        """Take in a stamp: its sender time and its height, ns."""
+        """Add a stamp: its sender time and its height, ns."""
         index = x_ns // self._piece_ns
         pieces, samples = self._pieces, self._samples
         if not pieces or index > pieces[-1][0]:
@@ -50,7 +51,7 @@ class Latencies:
                 pieces.popleft()
         elif height < pieces[-1][2]:
             pieces[-1] = (pieces[-1][0], x_ns, height)
-        # A linear congruential generator (Numerical Recipes): the same stamps, the same lots.
+        # A linear congruential generator (Numerical Recipes): sampling is reproducible.
         self._lot = (1664525 * self._lot + 1013904223) % _LOTS
         if self._lot * self._one_of >= _LOTS:
             return
@@ -64,7 +65,7 @@ class Latencies:
             self._one_of //= 2
 
     def keep_median(self) -> None:
-        """Let the median not fall below the present one until there are enough new samples."""
+        """Hold the median at or above its present value until there are enough new samples."""
         self._kept_median_ns = self.median_ns
 
     def measure(self, newest_ns: int, since_ns: int) -> None:
@@ -82,19 +83,19 @@ class Latencies:
         below = (floors + self._drift_max * np.abs(x - at)).min(axis=0)
         gaps = np.maximum(0.0, heights - below)
         self.mean_ns = float(gaps.mean())
-        gaps.sort()  # np.median takes longer than all the rest
+        gaps.sort()  # np.median would dominate the run time
         n = len(gaps)
         self.median_ns = float(gaps[(n - 1) // 2] + gaps[n // 2]) / 2.0
         if n < SAMPLES // 4:
             self.median_ns = max(self.median_ns, self._kept_median_ns)
 
     def steady_drift(self, newest_ns: int) -> float:
-        """The drift, a ratio, along which the floor moved steadily for a whole window.
+        """Return the steady drift of the floor over a whole window, a ratio; 0 unless above the
+        limit.
 
-        0 if it did not, or by no more than the greatest. The line along the edge of the pieces'
-        lower hull over the mean time (Moon, Skelly and Towsley 1999) must leave all but none of
-        the level line's gaps: a queue that fills for a while, or a clock that stands still for a
-        moment, leaves more.
+        The line is the edge of the pieces' lower hull over the mean time (Moon, Skelly and Towsley
+        1999). It must remove nearly all of the level line's gaps: a queue that fills for a while,
+        or a clock that stalls for a moment, leaves more.
         """
         first_ns, last_ns = self._pieces[0][1], self._pieces[-1][1]
         if last_ns - first_ns < self._window_ns * (PIECES - 2) / PIECES:
@@ -112,7 +113,8 @@ class Latencies:
         return slope if sloped + RESOLUTION_NS <= _STEADY * level else 0.0
 
     def tilt(self, drift: float, newest_ns: int, level: float) -> list[tuple[int, float]]:
-        """Take a drift and a level off all heights. Returns the least ones: sender time, height."""
+        """Subtract a drift and a level from all heights. Return the least ones: sender time,
+        height."""
         self._pieces = deque(
             (index, at_ns, height - drift * (at_ns - newest_ns) - level)
             for index, at_ns, height in self._pieces
@@ -122,7 +124,8 @@ class Latencies:
 
 
 def _slope_over(points: list[tuple[float, float]], x: float) -> float:
-    """Slope of the edge over ``x`` of the lower convex hull of points in order; 0 without one."""
+    """Return the slope of the lower convex hull's edge over ``x``, for ordered points; 0 without
+    one."""
     hull: list[tuple[float, float]] = []
     for point in points:
         while len(hull) > 1:

@@ -1,10 +1,11 @@
-"""Spells in which all frames come late: told soon, and followed when they have lasted.
+"""Spells in which all frames arrive late: reported soon, followed when they have lasted.
 
-A clock that stood still and a link that got slower look alike: every frame lies higher above the
-line. Links do that all day; boot clocks hardly ever do, but those of simulators. So the later the
-frames are, the longer they must be late before the line follows them: a queue that holds frames
-back for half a second lasts for many times that. But where they come again as before one quick
-spell, that spell was the exception: some logs put frames down before they can have come.
+A stalled clock and a slower link look alike: every frame lies higher above the line. Links slow
+down often; boot clocks hardly ever stall, except those of simulators. So the later the frames are,
+the longer they must be late before the line follows them: a queue that delays frames by half a
+second lasts for many times that. One case is followed at once: a single quick block of frames
+lowered the line, and later frames return to its earlier height. Then that block was the exception,
+since some logs stamp frames before they can have arrived.
 """
 
 import math
@@ -12,34 +13,34 @@ from collections import deque
 from typing import Final, NamedTuple
 
 CHANGE: Final = 20.0
-"""Negative logarithm of the probability below which frames that are all late are a change.
+"""Negative logarithm of the probability below which a spell of late frames counts as a change.
 
-By exponential latencies n frames are all later than r with exp(-n r / mean).
+If latencies are exponential, n frames are all later than r with probability exp(-n r / mean).
 """
 CHANGE_NS: Final = 750_000_000
-"""Least time over which all frames must be late to be a change: a busy host is late for less."""
+"""Shortest spell of late frames that counts as a change; a busy host delays frames for less."""
 LEAST_CHANGE_NS: Final = 5e6
-"""Least change that is looked for: some milliseconds are the stamps' own steps."""
-FEWEST: Final = 8  # least number of frames that make a change
+"""Smallest change that is detected: stamps have a resolution of some milliseconds."""
+FEWEST: Final = 8  # fewest frames of a change
 FOLLOWED: Final = 40.0
 """Multiple of their lateness for which all frames must be late before the line follows them."""
-FOLLOWED_NS: Final = 20_000_000_000  # time after which it does so in any case
+FOLLOWED_NS: Final = 20_000_000_000  # time after which the line follows in any case
 _BLOCK_NS: Final = 250_000_000
 _BLOCKS: Final = 240
 _BLOCK_COUNT: Final = 4  # frames of a block that count as independent
 
 
 class LateSpell(NamedTuple):
-    """A spell in which all frames are late."""
+    """Spell in which all frames are late."""
 
     height: float  # least height of the late frames, aged to the newest, ns
     since_ns: int  # sender time of the first of them
-    is_news: bool  # whether it was not told before
-    followed: bool  # whether it has lasted for so long that the line is to begin again there
+    is_news: bool  # whether it is reported for the first time
+    followed: bool  # whether it has lasted so long that the line must restart there
 
 
 class _Block:
-    """Stamps of a quarter of a second: how many, and the least height above the line."""
+    """Stamps of a quarter of a second: their number, and the least height above the line."""
 
     __slots__ = ("count", "first_ns", "gap_ns", "height", "index", "x_ns")
 
@@ -51,32 +52,32 @@ class _Block:
 
 
 class SenderLateness:
-    """How far the frames of one sender lie above its line. ``add`` takes the newest ones.
+    """Heights of one sender's frames above its line. ``add`` takes the newest ones.
 
-    ``height`` is that of the spell that goes on, -inf without one.
+    ``height`` is that of the current spell, -inf without one.
     """
 
     def __init__(self, drift_max: float) -> None:
         self._drift_max = drift_max
         self._blocks: deque[_Block] = deque(maxlen=_BLOCKS)
         self.height = -math.inf
-        self._before = math.inf  # height of the line before one quick spell
-        self._dropped_ns = 0  # sender time of that
+        self._before = math.inf  # height of the line before a single quick block
+        self._dropped_ns = 0  # sender time of that block
 
     def clear(self) -> None:
-        """Begin again, as the line does."""
+        """Restart, as the line does."""
         self._blocks.clear()
         self.height = -math.inf
 
     def add(self, x_ns: int, height: float, gap: float, spread: float) -> LateSpell | None:
-        """Take in the newest frame: its height, and how far it is above the line before it.
+        """Add the newest frame: its height, and its gap above the line before it.
 
-        ``spread`` is what is usual of that. As a block ends, returns the spell that goes on then.
+        ``spread`` is the usual gap. At the end of a block, returns the spell in progress.
         """
         if gap < -LEAST_CHANGE_NS:
             self._before, self._dropped_ns = height - gap, x_ns
         elif gap < LEAST_CHANGE_NS and x_ns - self._dropped_ns > _BLOCK_NS:
-            self._before = math.inf  # more than one
+            self._before = math.inf  # quick frames lasted longer than one block
         if gap <= 0.0:
             self.clear()
             return None

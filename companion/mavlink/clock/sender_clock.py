@@ -1,18 +1,19 @@
 """One sender's boot clock on the node's timeline.
 
-A sender stamps with milliseconds since its own boot. What is known of its offset, node time less
-sender time, is an interval, and every stamp and every answer narrows it:
+A sender stamps with milliseconds since its own boot. Its offset, node time less sender time, is
+known as an interval, which every stamp and every answer narrows:
 
 - no frame arrives before it was sent, so the offset is below every (arrival - stamp), aged by the
-  greatest drift taken for possible (``floor.py``);
-- TIMESYNC round trips hold it on both sides, and so does GNSS time at both ends where the settings
+  largest drift assumed (``floor.py``);
+- TIMESYNC round trips bound it on both sides; so does GNSS time at both ends if the settings
   trust it (``evidence.py``);
-- where neither is there, the lower side is an assumption: that the least latency, which nothing
-  that is only heard can show, is no longer than the median of its visible part; and what another
-  node heard may have arrived earlier by its doubt.
+- without either, the lower side is an assumption: the least latency, which one-way frames cannot
+  show, is at most the median of its visible part. A frame relayed by another node may have arrived
+  earlier by its doubt.
 
-The interval is as of the time asked for, and grows while nothing comes. No report is ever placed
-later than it arrived. See docs/math.md 6. ``epochs.py`` tells which stamps are of one line.
+The interval is valid at the time asked for, and widens while nothing arrives. No report is ever
+placed later than it arrived. See docs/math.md 6. ``epochs.py`` decides which stamps are on one
+line.
 """
 
 import math
@@ -32,26 +33,27 @@ from companion.mavlink.clock.evidence import DriftProven, Interval, OffsetEviden
 _NS: Final = 1_000_000_000
 _NS_PER_MS: Final = 1_000_000
 _DEEPEST_NS: Final = 10 * _NS
-"""Greatest depth of the offset below the floor that evidence may claim."""
+"""Largest depth of the offset below the floor that evidence may claim."""
 _LATENCY_S: Final = (-0.02, 5.0)
 """Least and greatest latency that a trusted GNSS time may imply, seconds."""
 _GNSS_CHECKS: Final = 5  # GNSS times in a row that must be plausible before one is used
 INVISIBLE: Final = 0.1
-"""Share of the median visible latency that is taken for the invisible part of it.
+"""Estimated ratio of the invisible part of the latency to the median of the visible part.
 
-A point estimate, not a bound: of the latency laws tried (docs/math.md 6) most are better with it
-than without, and none is much worse.
+A point estimate, not a bound: it improves most of the latency laws tried (docs/math.md 6), and
+makes none much worse.
 """
 UNSEEN_NS: Final = 25 * _NS_PER_MS
-"""Least latency that is taken for possible where all visible parts are shorter: a serial line's."""
+"""Least upper limit assumed for the invisible latency, even if visible parts are shorter: a serial
+line's.
+"""
 
 
 class SenderClock:
-    """The clock of one sender.
+    """Clock of one sender.
 
     ``observe`` takes the stamps of its reports in order of arrival, ``notice`` those of its other
-    messages. ``change`` is what the newest stamp or answer showed of a change of the clock, None
-    where it showed none.
+    messages. ``change`` is the clock change that the newest stamp or answer revealed, or None.
     """
 
     def __init__(self, settings: ClockAssumptions | None = None) -> None:
@@ -66,18 +68,18 @@ class SenderClock:
         self._gnss = OffsetEvidence(drift_max)
         self._gnss_plausible = 0
         self._latency_s = 0.0
-        self._doubt_ns = 0  # the greatest of all stamps
-        self._known: tuple[ClockKind, int, int, int] | None = None  # as of the newest stamp
+        self._doubt_ns = 0  # largest doubt of all stamps
+        self._known: tuple[ClockKind, int, int, int] | None = None  # at the newest stamp
 
     def observe(self, arrival_ns: int, boot_ms: int, doubt_ns: int = 0) -> Stamp | None:
-        """Place a stamp; ``doubt_ns`` is by how much its frame may have arrived earlier.
+        """Place a stamp whose frame may have arrived up to ``doubt_ns`` earlier.
 
-        Returns None for a frame of the boot before, and for a stamp off the line that others have
-        not confirmed so far: that report has no time and cannot be used.
+        Returns None for a frame of the previous boot, and for a stamp off the line that is not yet
+        confirmed by others: that report has no time and cannot be used.
         """
         placed = self._line.observe(arrival_ns, boot_ms)
         self.change = self._known = None
-        # A stamp that is not placed may begin a line that later ones confirm, and be its floor.
+        # A stamp without a place may start a line that later ones confirm, and be its floor.
         self._doubt_ns = max(self._doubt_ns, doubt_ns)
         if placed is None:
             return None
@@ -91,7 +93,7 @@ class SenderClock:
         return Stamp(placed.x_ns, latency_s, placed.rebooted)
 
     def notice(self, arrival_ns: int, boot_ms: int) -> None:
-        """Take in the stamp of any other message, if it lies on the line that reports have made."""
+        """Add the stamp of any other message, if it lies on the line of the reports."""
         self.change = self._known = None
         if self._line.notice(arrival_ns, boot_ms):
             self._note_change()
@@ -104,36 +106,37 @@ class SenderClock:
             )
 
     def is_shared(self, arrival_ns: int) -> bool:
-        """Whether two clocks go on side by side, which means that two senders share this id."""
+        """Return whether two clocks run side by side: two senders then share this id."""
         return self._line.is_shared(arrival_ns)
 
-    # --- evidence from both sides -----------------------------------------------------------
+    # --- two-way evidence -------------------------------------------------------------------
 
     def timesync(self, sent_ns: int, received_ns: int, remote_ns: int) -> str | None:
-        """Take in one TIMESYNC round trip, of any length.
+        """Add one TIMESYNC round trip, of any length.
 
         Returns None, or the reason why it is not used, as before the first stamp.
 
             sent_ns      when the request was sent, node time
             received_ns  when the answer was received, node time
-            remote_ns    the sender's time since boot when it answered
+            remote_ns    the sender's boot time when it answered
         """
         self.change = self._known = None
         if not self._line.floor:
-            return "no stamp of this sender was seen so far"
+            return "no stamp of this sender received yet"
         if received_ns < sent_ns:
-            return "it was received before it was sent"
+            return "answer was received before its request was sent"
         x_ns = remote_ns + round((self._line.newest_ns - remote_ns) / WRAP_NS) * WRAP_NS
         return self._prove(self._timesync, Interval(x_ns, sent_ns - x_ns, received_ns - x_ns))
 
     def system_time(self, arrival_ns: int, unix_us: int, boot_ms: int) -> str | None:
-        """Take in one SYSTEM_TIME: the sender's Unix time in microseconds beside its boot time.
+        """Add one SYSTEM_TIME: the sender's Unix time in microseconds, with its boot time.
 
-        ``unix_us`` counts on the node's timeline: what that is off UTC is taken off before.
+        ``unix_us`` counts on the node's timeline: the caller has removed the timeline's offset to
+        UTC.
 
-        It is used only if the settings trust it and the node keeps UTC, and only after five in a
-        row have implied latencies between -20 ms and 5 s (each limit widened by the node's own
-        error). Returns None, or the reason why it is not used.
+        It is used only if the settings trust it, the node keeps UTC, and five in a row have implied
+        latencies between -20 ms and 5 s (each limit widened by the node's own error). Returns None,
+        or the reason why it is not used.
         """
         self.change = self._known = None
         refused = self._system_time(arrival_ns, unix_us, boot_ms)
@@ -142,41 +145,40 @@ class SenderClock:
         return refused
 
     def forget_gnss(self) -> None:
-        """Forget what SYSTEM_TIME has shown, as when the node's own clock was set."""
+        """Discard the evidence of SYSTEM_TIME, for example after the node's own clock was set."""
         self._known = None
         self._gnss_plausible = 0
         self._gnss.clear()
 
     def _system_time(self, arrival_ns: int, unix_us: int, boot_ms: int) -> str | None:
-        """Take in a SYSTEM_TIME. Returns None, or the reason for which it was not used."""
         if not self._settings.trust_gnss:
-            return "the settings do not trust it"
+            return "settings do not trust GNSS time"
         if self._settings.node_utc_error_s is None:
-            return "the node's own timeline is not known to be UTC"
+            return "UTC error of the node's own timeline is unknown"
         if unix_us == 0:
-            return "the sender does not know the time"
+            return "sender does not know the time"
         x_ns = self._line.unwrap(boot_ms)
         if not self._line.fits(arrival_ns, x_ns):
-            return "its boot time is not on the line of the sender's stamps"
+            return "boot time does not match the sender's other stamps"
         latency_s = (arrival_ns - unix_us * 1000) * 1e-9
         error_s = self._settings.node_utc_error_s
         if not _LATENCY_S[0] - error_s <= latency_s <= _LATENCY_S[1] + error_s:
-            return f"it implies a latency of {latency_s:.6g} s"
+            return f"implied latency of {latency_s:.6g} s is implausible"
         self._gnss_plausible += 1
         error_ns = round((error_s + self._settings.gnss_error_s) * _NS) + _NS_PER_MS
         offset_ns = unix_us * 1000 - x_ns
         return self._prove(self._gnss, Interval(x_ns, offset_ns - error_ns, offset_ns + error_ns))
 
     def _prove(self, evidence: OffsetEvidence, new: Interval) -> str | None:
-        """Add an interval to the evidence. Returns None, or why it cannot be about this clock."""
+        """Add an interval to the evidence. Return None, or why it cannot be about this clock."""
         floor = self._line.floor
         sure_ns, highest_ns, _, _ = floor.heights(new.x_ns)
         early_ns = new.low_ns - highest_ns - _NS_PER_MS
         if early_ns > 0:
-            return f"frames would have come {early_ns / 1e9:.3f} s before they were sent"
+            return f"frames would have arrived {early_ns / 1e9:.3f} s before they were sent"
         if sure_ns - new.high_ns > _DEEPEST_NS:
             least_s = (sure_ns - new.high_ns) / 1e9
-            return f"the best frame would have taken {least_s:.3f} s: it is another clock"
+            return f"fastest frame would have taken {least_s:.3f} s: answer is from another clock"
         proven = evidence.add(new)
         if new.low_ns > sure_ns + _NS_PER_MS:
             floor.begin_again(round(new.high_ns), new.x_ns)
@@ -200,12 +202,12 @@ class SenderClock:
         """
         newest_ns, floor = self._line.newest_ns, self._line.floor
         if not floor.count:
-            raise ValueError("no stamp of this sender was seen so far")
+            raise ValueError("no stamp of this sender received yet")
         ahead_ns = node_ns - newest_ns - self._now()[3]
         return newest_ns + round(ahead_ns / (1.0 + floor.drift))
 
     def estimate(self, node_ns: int | None = None) -> ClockEstimate | None:
-        """The clock as of a node time, by default that of its newest stamp; None before that."""
+        """Return the clock at a node time (default: its newest stamp); None before that."""
         floor = self._line.floor
         if not floor:
             return None
@@ -224,9 +226,10 @@ class SenderClock:
         )
 
     def time(self, node_ns: int) -> tuple[int, float, float, float] | None:
-        """The clock as of a node time, as ``ClockEstimate`` has it; None before the first stamp.
+        """Return the clock at a node time, as in ``ClockEstimate``; None before the first stamp.
 
-        Node time less sender time, ns; by how much it may be more, and less; and usually is, s.
+        The offset (node time less sender time), ns; then, in seconds, how much larger and how much
+        smaller it may be, and its usual error.
         """
         if not self._line.floor.count:
             return None
@@ -236,7 +239,7 @@ class SenderClock:
         return likely_ns, before_s, after_s, self._usual_s(kind, low_ns, high_ns)
 
     def _at(self, x_ns: int) -> tuple[ClockKind, int, int, int]:
-        """What is known of the offset, aged to a sender time."""
+        """Return the interval of the offset, aged to a sender time."""
         kind, low_ns, high_ns, likely_ns = self._now()
         newest_ns = self._line.newest_ns
         drift = max(self._timesync.drift_at(newest_ns), self._gnss.drift_at(newest_ns))
@@ -250,23 +253,23 @@ class SenderClock:
         )
 
     def _now(self) -> tuple[ClockKind, int, int, int]:
-        """What is known of the offset as of the newest stamp; kept until more is heard."""
+        """Return the interval of the offset at the newest stamp; cached until new input."""
         if self._known is None:
             self._known = self._interval(self._line.newest_ns)
         return self._known
 
     def _usual_s(self, kind: ClockKind, low_ns: int, high_ns: int) -> float:
-        """By how much the most likely offset usually is off: as much as is guessed of it."""
+        """Return the usual error of the most likely offset."""
         if kind is not ClockKind.ENVELOPE:
             return (high_ns - low_ns) / 4 * 1e-9
         floor = self._line.floor
         return math.hypot(INVISIBLE * floor.median_ns + _NS_PER_MS, floor.late_ns) * 1e-9
 
     def _interval(self, x_ns: int) -> tuple[ClockKind, int, int, int]:
-        """What is known of the offset at a sender time: kind, least, greatest and most likely; ns.
+        """Return the offset at a sender time: kind, least, greatest and most likely; ns.
 
-        The kind is the evidence that leaves the least uncertainty; but what was measured stands
-        where it contradicts what is only assumed.
+        The kind is the evidence that leaves the least uncertainty. A measurement takes precedence
+        where it contradicts an assumption.
         """
         floor = self._line.floor
         sure_ns, highest_ns, line_ns, least_ns = floor.heights(x_ns)

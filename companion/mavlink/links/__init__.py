@@ -1,1 +1,1 @@
-"""UDP, TCP and serial endpoints over which MAVLink comes and goes.                       [shell]"""
+"""UDP, TCP, serial, HTTP and Zenoh endpoints that carry MAVLink and related formats.     [shell]"""

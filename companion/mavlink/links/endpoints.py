@@ -1,8 +1,8 @@
-"""The interface of a link's endpoints, and what they share.                              [shell]
+"""Interface of a link's endpoints, and their shared functions.                              [shell]
 
-An endpoint serves one connection after the other. ``serve`` ends, by an exception that says why,
-when a connection is lost, and is called again after a while. The endpoint tells its link what
-happens through ``Upcalls``. A write succeeds at once or not at all.
+An endpoint serves one connection after the other. ``serve`` ends with an exception, the reason,
+when a connection is lost, and is called again after a while. The endpoint reports events to its
+link through ``Upcalls``. A write succeeds at once or not at all.
 """
 
 import asyncio
@@ -19,61 +19,61 @@ Address = tuple[Any, ...]  # a socket address as the system writes it: for IPv6 
 
 
 class Upcalls(NamedTuple):
-    """Functions by which an endpoint tells its link what happens.
+    """Callbacks by which an endpoint reports events to its link.
 
-    take      a peer, named by the endpoint's key for it, sent bytes; the last argument is how long
-              ago they arrived by the system's own stamp, ns, or None where they bear none
-    stale     bytes of a peer that had waited for too long to be believed
+    take      a peer, by the endpoint's key for it, sent bytes; the last argument is their age by
+              the system's time stamp, ns, or None without a stamp
+    stale     bytes of a peer that waited too long to be used
     """
 
-    up: Callable[[], None]  # a connection stands
+    up: Callable[[], None]  # connected
     take: Callable[[Hashable, bytes, int | None], None]
     stale: Callable[[Hashable, bytes], None]
     hang_up: Callable[[Hashable], None]  # that peer is gone
-    overflow: Callable[[int], None]  # the system has dropped this many more datagrams
+    overflow: Callable[[int], None]  # the system dropped this many more datagrams
 
 
 class Endpoint(Protocol):
-    """One end of a link, of whichever kind."""
+    """One end of a link, of any kind."""
 
     def open(self) -> int | None:
-        """Claim what can be had before the loop runs; returns the port that a listening link got.
+        """Claim local resources before the loop runs; return the port of a listening link.
 
-        Raises ``OSError`` where it cannot be had.
+        Raises ``OSError`` if they are not available.
         """
 
     async def serve(self) -> None:
         """Serve until cancelled, or until the connection is lost.
 
-        A lost connection raises ``OSError``; any other exception is a fault of the program.
+        A lost connection raises ``OSError``; any other exception is a defect of the program.
         """
 
     def peers(self) -> Collection[Hashable] | None:
-        """Peers to which a message for everybody goes; None: those heard lately."""
+        """Return the peers that get a broadcast; None: those received recently."""
 
     def write(self, key: Hashable, raw: bytes) -> bool:
-        """Send a frame to a peer. Never waits and never raises; False if it was not taken."""
+        """Send a frame to a peer. Never waits and never raises; False if it was not accepted."""
 
     def fullness(self, key: Hashable) -> float:
-        """The share, 0 to 1, of a peer's buffer that holds what was written and not yet sent.
+        """Return the filled share, 0 to 1, of a peer's send buffer; 0 for a peer that is gone.
 
-        For who would rather wait than lose a frame. 0 for a peer that is gone.
+        For callers that prefer to wait rather than lose a frame.
         """
 
 
 class HungUpError(ConnectionError):
-    """The other end closed the connection in good order."""
+    """The other end closed the connection properly."""
 
 
 def reason(error: OSError) -> str:
-    """The cause of an error in the system's words, without addresses and numbers."""
+    """Return the system's text for an error, without addresses and numbers."""
     if error.errno is not None and error.errno > 0:
         return os.strerror(error.errno)
     return error.strerror or str(error) or "timed out"
 
 
 def address_text(address: Address | None) -> str:
-    """HOST:PORT of a socket address; empty where there is none, as on a local socket."""
+    """Return HOST:PORT of a socket address; empty without one, as on a local socket."""
     if not address:
         return ""
     host, port = address[:2]
@@ -90,17 +90,18 @@ def settle(lost: asyncio.Future[Exception], why: Exception) -> None:
 
 
 def bound(url: LinkUrl, kind: socket.SocketKind) -> socket.socket:
-    """A socket bound to a listening link's address. Raises ``OSError`` where that cannot be had.
+    """Return a socket bound to a listening link's address. Raises ``OSError`` if it is not
+    available.
 
-    A name is looked up synchronously: this is called before the loop runs, and holds nobody up.
-    At a group's address (multicast) others of this machine may listen too, and the group is joined.
+    The name lookup is synchronous: this is called before the loop runs. At a multicast address the
+    group is joined, and other programs of this machine may listen too.
     """
     infos = socket.getaddrinfo(url.host, url.port, type=kind, flags=socket.AI_PASSIVE)
     family, _, _, _, address = infos[0]
     sock = socket.socket(family, kind)
     try:
         sock.setblocking(False)
-        if kind == socket.SOCK_STREAM:  # else the port stays taken a minute after a connection
+        if kind == socket.SOCK_STREAM:  # else the port stays in use a minute after a connection
             sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         group = ipaddress.ip_address(str(address[0]).partition("%")[0])
         if group.is_multicast:
@@ -129,7 +130,7 @@ def _join(
 async def resolved(
     url: LinkUrl, kind: socket.SocketKind
 ) -> list[tuple[socket.AddressFamily, Address]]:
-    """The addresses of a link's host, at least one, looked up without blocking the loop."""
+    """Return the addresses of a link's host, at least one, without blocking the loop."""
     loop = asyncio.get_running_loop()
     infos = await loop.getaddrinfo(url.host, url.port, type=kind)
     return [(family, address) for family, _, _, _, address in infos]

@@ -1,4 +1,4 @@
-"""A document that is asked for over HTTP again and again, for a link.                   [shell]"""
+"""Link that polls a document over HTTP.                                                  [shell]"""
 
 import asyncio
 import ssl
@@ -10,23 +10,23 @@ from companion.mavlink.links.urls import LinkUrl
 
 PERIOD_S: Final = 1.0
 """Seconds from one request to the next; receivers write a document about once a second."""
-ANSWER_S: Final = 5.0  # longest time that a request may take
+ANSWER_S: Final = 5.0  # timeout of a request
 HEAD_MAX: Final = 16 << 10
 BODY_MAX: Final = 16 << 20
 
 
 class HttpPoll:
-    """A link that asks one server for one document; the document is what its one peer sends."""
+    """Link that polls one document of one server, its only peer."""
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
         self._upcalls = upcalls
 
     def open(self) -> None:
-        """Do nothing: the server may come later."""
+        """Do nothing: the server may start later."""
 
     async def serve(self) -> None:
-        """Ask until an answer fails, which raises ``OSError``."""
+        """Poll until an answer fails, which raises ``OSError``."""
         loop = asyncio.get_running_loop()
         is_up = False
         while True:
@@ -35,7 +35,7 @@ class HttpPoll:
                 async with asyncio.timeout(ANSWER_S):
                     body = await _get(self._url)
             except (ValueError, EOFError) as error:
-                raise OSError(f"no HTTP that is understood: {error}") from error
+                raise OSError(f"malformed HTTP answer: {error}") from error
             if not is_up:
                 self._upcalls.up()
                 is_up = True
@@ -43,7 +43,7 @@ class HttpPoll:
             await asyncio.sleep(max(0.0, due_s - loop.time()))
 
     def peers(self) -> Collection[Hashable]:
-        """Nobody can be sent anything."""
+        """Return no peers: the link is receive-only."""
         return ()
 
     def write(self, key: Hashable, raw: bytes) -> bool:
@@ -51,15 +51,14 @@ class HttpPoll:
         return False
 
     def fullness(self, key: Hashable) -> float:
-        """0: there is no buffer."""
+        """Return 0: there is no buffer."""
         return 0.0
 
 
 async def _get(url: LinkUrl) -> bytes:
-    """The body of a document (HTTP/1.0, RFC 1945: it ends where the server hangs up).
+    """Return the body of a document (HTTP/1.0, RFC 1945: it ends where the server hangs up).
 
-    Raises ``OSError`` where it cannot be had, ``ValueError`` or ``EOFError`` where the answer is
-    no HTTP.
+    Raises ``OSError`` if it is not available, ``ValueError`` or ``EOFError`` for malformed HTTP.
     """
     secure = ssl.create_default_context() if url.way == "https" else None
     reader, writer = await asyncio.open_connection(url.host, url.port, ssl=secure, limit=HEAD_MAX)
@@ -72,17 +71,17 @@ async def _get(url: LinkUrl) -> bytes:
         try:
             head = await reader.readuntil(b"\r\n\r\n")
         except asyncio.LimitOverrunError as error:
-            raise ValueError("its head does not end") from error
+            raise ValueError("header is too long") from error
         status = head.split(None, 2)[1:2]
         if not head.startswith(b"HTTP/") or not status:
-            raise ValueError("no status")
+            raise ValueError("status line is missing")
         if status != [b"200"]:
             raise OSError(f"the server answers {status[0][:3].decode('ascii', 'replace')}")
         body = bytearray()
         while piece := await reader.read(1 << 16):
             body += piece
             if len(body) > BODY_MAX:
-                raise ValueError(f"more than {BODY_MAX} bytes")
+                raise ValueError(f"body exceeds {BODY_MAX} bytes")
         return bytes(body)
     finally:
         writer.transport.abort()

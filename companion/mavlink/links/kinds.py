@@ -1,4 +1,4 @@
-"""What a link's scheme stands for: how bytes come, and what makes frames of them.        [shell]"""
+"""Endpoint and splitter of each link scheme.                                             [shell]"""
 
 from collections.abc import Callable
 
@@ -21,7 +21,7 @@ from companion.mavlink.wire.sbs import SbsSplitter
 
 
 def splitter(url: LinkUrl) -> Callable[[str], Splits]:
-    """What makes frames of what comes over a link; each peer has its own."""
+    """Return the factory of a link's splitters; each peer has its own."""
     match url.scheme:
         case "sbs":
             return SbsSplitter
@@ -36,7 +36,7 @@ def splitter(url: LinkUrl) -> Callable[[str], Splits]:
 
 
 def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:
-    """The endpoint of the link's kind, not yet open."""
+    """Return the endpoint of a link's scheme, not yet open."""
     match url.scheme:
         case "udpin":
             return UdpIn(url, status, upcalls)

@@ -1,7 +1,7 @@
-"""How far this machine is behind: from the system's stamp on a datagram to its processing.
+"""Processing lag of this machine: from a datagram's kernel time stamp to its processing.
 
-What is kept is the worst lag of each tenth of a second, so that a burst counts no more than a
-quiet time, and a datagram costs a comparison.
+The worst lag of each tenth of a second is kept, so that a burst counts no more than a quiet time,
+and a datagram costs one comparison.
 """
 
 from collections import deque
@@ -11,13 +11,13 @@ from typing import Annotated, Final
 
 from companion.values.described import Meaning
 
-SLOT_NS: Final = 100_000_000  # time of which the worst lag is kept
-KEPT_NS: Final = 10_000_000_000  # time over which lags are judged
-LIMIT_NS: Final = 500_000_000  # lag above which beams are aimed by news that is too old
+SLOT_NS: Final = 100_000_000  # interval of which the worst lag is kept
+KEPT_NS: Final = 10_000_000_000  # window of lags
+LIMIT_NS: Final = 500_000_000  # lag above which beams are aimed by outdated reports
 LASTS_NS: Final = 1_000_000_000
-"""Time over which every lag must be above the limit for the machine to be behind."""
+"""Time over which every lag must exceed the limit before the machine counts as behind."""
 CLEARS_NS: Final = 2_000_000_000
-"""Time without a lag above the limit after which it is not behind any more."""
+"""Time without a lag above the limit after which the machine has caught up."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -35,14 +35,14 @@ class LagSeen:
 
 
 class ArrivalLag:
-    """Lags of all stamped datagrams, whichever link they came over. Times do not go back."""
+    """Lags of the stamped datagrams of all links. Times do not decrease."""
 
     def __init__(self) -> None:
         self._newest_ns = 0
         self._slots: deque[list[int]] = deque([[0, 0]], KEPT_NS // SLOT_NS + 1)  # when, worst lag
 
     def observe(self, now_ns: int, lag_ns: int) -> None:
-        """Take in the lag of a datagram that is processed now."""
+        """Record the lag of a datagram that is processed now."""
         self._newest_ns = lag_ns
         newest = self._slots[-1]
         if now_ns - newest[0] >= SLOT_NS:
@@ -51,7 +51,7 @@ class ArrivalLag:
             newest[1] = lag_ns
 
     def seen(self, now_ns: int) -> LagSeen:
-        """The lags of the last ten seconds."""
+        """Return the lags of the last ten seconds."""
         recent = [(at, worst) for at, worst in self._slots if at > max(0, now_ns - KEPT_NS)]
         if not recent:
             return LagSeen(newest_s=None, p95_s=None, max_s=None, behind=False)

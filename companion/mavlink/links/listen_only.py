@@ -1,4 +1,4 @@
-"""Endpoints that only hear: what they would be sent is no MAVLink.                       [shell]"""
+"""Receive-only endpoints, for formats other than MAVLink.                                [shell]"""
 
 from collections.abc import Collection, Hashable
 
@@ -7,10 +7,10 @@ from companion.mavlink.links.udp import UdpIn
 
 
 class TcpListen(TcpOut):
-    """A link that connects to one peer, and only hears it."""
+    """Receive-only link that connects to one peer."""
 
     def peers(self) -> Collection[Hashable]:
-        """Nobody can be sent anything."""
+        """Return no peers: the link is receive-only."""
         return ()
 
     def write(self, key: Hashable, raw: bytes) -> bool:
@@ -19,7 +19,7 @@ class TcpListen(TcpOut):
 
 
 class UdpListen(UdpIn):
-    """A link that listens for datagrams, and only hears them."""
+    """Receive-only link that listens for datagrams."""
 
     def write(self, key: Hashable, raw: bytes) -> bool:
         """Send nothing."""

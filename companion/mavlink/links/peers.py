@@ -1,4 +1,4 @@
-"""Peers of a link, each with a splitter and with sequence numbers of its own in both directions.
+"""Peers of a link, each with its own splitter and sequence numbers in both directions.
 
 The 8-bit sequence number (https://mavlink.io/en/guide/serialization.html) is counted by sender and
 path, so it is followed for each peer and source. With d the step from the last frame to this one,
@@ -7,13 +7,12 @@ modulo 256:
     d = 1            in order
     d = 0            a repeat
     1 < d < 128      d - 1 frames are missing
-    d >= 128         late: it steps back by 256 - d; the place reached is kept
+    d >= 128         late by 256 - d; the expected number does not change
 
-A sender that starts again jumps anywhere. A jump forwards cannot be told from a hole: one wrong
-gap. After a jump backwards every frame would look late until the sender has caught up. Where
-``RESTART_RUN`` late frames come in a row, each further on than the one before, the sender is
-therefore taken to have started again, and is followed from there without a gap. Stragglers between
-frames in order never make such a run.
+A sender that restarts jumps anywhere. A jump forwards looks like a gap: one wrong gap is counted.
+After a jump backwards every frame would look late until the sender has caught up. Therefore
+``RESTART_RUN`` late frames in a row, in increasing order, count as a restart, which adds no gap.
+Stragglers between frames in order never form such a run.
 """
 
 from collections import OrderedDict
@@ -26,30 +25,30 @@ from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
 from companion.values import Frame, Rejection, Source
 
-PEERS_MAX: Final = 4096  # peers kept, the last heard: a scan of the port must not fill the memory
+PEERS_MAX: Final = 4096  # most recent peers kept: a port scan must not fill the memory
 SENDERS_MAX: Final = 16_384
-"""Sequences followed over all peers, so that invented senders do not fill the memory either.
+"""Most sequences followed over all peers, so that forged senders do not fill the memory either.
 
-When there are more, all are begun anew, which costs no more than the holes of that moment.
+Beyond it all are reset, which loses only the gaps of that moment.
 """
-RESTART_RUN: Final = 3  # late frames in a row, each further on, that show a restart of the sender
+RESTART_RUN: Final = 3  # late frames in a row, in increasing order, that prove a restart
 
 STAMPS_KEPT_NS: Final = 30_000_000_000
 _HALF_ROUND: Final = 128
 
 
 class Splits(Protocol):
-    """What makes frames of a peer's bytes: MAVLink's splitter, or one of another format."""
+    """Parser of a peer's bytes: MAVLink's splitter, or one of another format."""
 
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
-        """Take in bytes that arrived at ``t_ns``; returns what is whole in them."""
+        """Parse bytes that arrived at ``t_ns``; return the complete frames and the rejections."""
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """End the stream; returns what its unfinished end held."""
+        """End the stream; return the frames and rejections in its unfinished end."""
 
 
 class _Component:
-    """One source over the whole link: its counts, and the peer over which it was last heard."""
+    """One source over the whole link: its counts, and the peer over which it was last received."""
 
     __slots__ = ("peer", "status")
 
@@ -59,7 +58,7 @@ class _Component:
 
 
 class _PeerSender:
-    """One source as one peer delivers it: the sequence number due, and the run of late ones."""
+    """One source over one peer: the expected sequence number, and the run of late frames."""
 
     __slots__ = ("component", "due", "late", "run", "stamped_ns")
 
@@ -68,13 +67,13 @@ class _PeerSender:
         self.due = due
         self.late = 0
         self.run = 0
-        self.stamped_ns: int | None = None  # when the peer last brought a stamp of its clock
+        self.stamped_ns: int | None = None  # when the peer last delivered a stamp of its clock
 
 
 class Peer:
-    """A party that a link hears and sends to; ``key`` is the endpoint's name for it.
+    """Peer of a link; ``key`` is the endpoint's name for it.
 
-    ``address`` is its HOST:PORT; empty where the endpoint knows of one party alone.
+    ``address`` is its HOST:PORT; empty if the endpoint has only one peer.
     """
 
     __slots__ = ("_sequence", "address", "heard_ns", "key", "senders", "splitter", "versions")
@@ -85,32 +84,33 @@ class Peer:
         self.splitter = splitter
         self.senders: dict[Source, _PeerSender] = {}
         self.heard_ns: int | None = None
-        self.versions = 0  # bit 0: MAVLink 1 was heard, bit 1: MAVLink 2
+        self.versions = 0  # bit 0: MAVLink 1 received, bit 1: MAVLink 2 received
         self._sequence = 0
 
     @property
     def speaks_v1_only(self) -> bool:
-        """True if it was heard, and in MAVLink 1 alone."""
+        """True if every frame from it was MAVLink 1, and there was one."""
         return self.versions == 1
 
     def brings_stamps(self, source: Source, now_ns: int) -> bool:
-        """Whether this peer has lately brought what a source says with its boot clock's stamp."""
+        """Return whether this peer recently delivered a source's position or attitude with its boot
+        time."""
         sender = self.senders.get(source)
         stamped_ns = None if sender is None else sender.stamped_ns
         return stamped_ns is not None and now_ns - stamped_ns <= STAMPS_KEPT_NS
 
     def next_sequence(self) -> int:
-        """Take the sequence number of the next frame to this peer."""
+        """Return the sequence number of the next frame to this peer, and advance it."""
         number = self._sequence
         self._sequence = (number + 1) & 0xFF
         return number
 
 
 class Peers:
-    """The peers of one link, bounded in number. What they send is counted into ``status``.
+    """Peers of one link, bounded in number. Their frames are counted in ``status``.
 
-    ``farewell`` is called with each peer that is given up for want of room, before it is removed;
-    ``splitter`` makes a peer's own, for a link of that name.
+    ``farewell`` is called with each peer that is evicted, before its removal; ``splitter`` builds a
+    peer's splitter from the link's name.
     """
 
     def __init__(
@@ -130,7 +130,7 @@ class Peers:
         return len(self._peers)
 
     def at(self, key: Hashable) -> Peer:
-        """The peer of that key, made if it is new. It becomes the last to be given up."""
+        """Return the peer of a key, created if new. It becomes the last candidate for eviction."""
         peer = self._peers.get(key)
         if peer is not None:
             self._peers.move_to_end(key)
@@ -144,27 +144,27 @@ class Peers:
         return peer
 
     def find(self, key: Hashable) -> Peer | None:
-        """The peer of that key; None if it was never met or is gone."""
+        """Return the peer of a key; None if unknown or gone."""
         return self._peers.get(key)
 
     def forget(self, peer: Peer) -> None:
-        """Remove a peer that has hung up or for which there is no room."""
+        """Remove a peer that hung up or is evicted."""
         del self._peers[peer.key]
         self._senders -= len(peer.senders)
 
     def active_since(self, t_ns: int) -> list[Peer]:
-        """Peers from which a frame came at ``t_ns`` or later."""
+        """Return the peers from which a frame arrived at ``t_ns`` or later."""
         return [p for p in self._peers.values() if p.heard_ns is not None and p.heard_ns >= t_ns]
 
     def last_of(self, source: Source) -> Peer | None:
-        """The peer over which that source was last heard; None if it is gone."""
+        """Return the peer over which a source was last received; None if it is gone."""
         component = self._components.get(source)
         if component is None or self._peers.get(component.peer.key) is not component.peer:
             return None
         return component.peer
 
     def count(self, peer: Peer, found: list[Frame | Rejection]) -> None:
-        """Count what a peer sent, in order."""
+        """Count the items that a peer sent, in order."""
         status, senders = self._status, peer.senders
         for item in found:
             if isinstance(item, Rejection):
@@ -184,7 +184,7 @@ class Peers:
             counts.frames += 1
             counts.heard_ns = t_ns
             counts.mavlink = version
-            if msgid in POSE:  # their stamps are of the clock that TIMESYNC is about
+            if msgid in POSE:  # their stamps are of the clock that TIMESYNC measures
                 sender.stamped_ns = t_ns
             peer.versions |= version
             peer.heard_ns = status.heard_ns = t_ns
@@ -214,10 +214,7 @@ class Peers:
         sender.run = 0
 
     def _meet(self, peer: Peer, frame: Frame) -> _PeerSender:
-        """Begin to follow a source of this peer.
-
-        The number of its first frame counts as the one due.
-        """
+        """Start to follow a source of this peer; its first sequence number counts as expected."""
         component = self._components.get(frame.source)
         if component is None:
             counts = ComponentStatus(frames=0, gaps=0, heard_ns=frame.t_ns, mavlink=frame.version)

@@ -1,4 +1,4 @@
-"""A serial port for a link, by pyserial and the loop's own readers.                      [shell]"""
+"""Serial port of a link, by pyserial and the loop's own readers.                         [shell]"""
 
 import asyncio
 import contextlib
@@ -15,15 +15,15 @@ from companion.mavlink.links.stale_bytes import StaleBytes
 from companion.mavlink.links.urls import LinkUrl
 
 WRITE_BUFFER_BYTES: Final = 4096
-"""Bytes held back beside the system's own buffer: 0.7 s at 57 600 baud.
+"""Bytes buffered beyond the system's own buffer: 0.7 s at 57 600 baud.
 
-Older frames are better lost.
+A larger buffer would deliver outdated frames.
 """
 _READ_BYTES: Final = 1 << 16
 
 
 class SerialPort:
-    """A serial device, opened exclusively. It may be unplugged at any time."""
+    """Serial device, opened exclusively. It may be unplugged at any time."""
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
@@ -58,7 +58,7 @@ class SerialPort:
             self._upcalls.hang_up(None)
 
     def peers(self) -> Collection[Hashable]:
-        """The one peer, None, while the device is open."""
+        """Return the one peer, None, while the device is open."""
         return () if self._descriptor is None else (None,)
 
     def write(self, key: Hashable, raw: bytes) -> bool:
@@ -72,7 +72,7 @@ class SerialPort:
         return True
 
     def fullness(self, key: Hashable) -> float:
-        """The share of the buffer that is taken, by what waits here and in the system."""
+        """Return the filled share of the buffer, including the system's."""
         if self._descriptor is None:
             return 0.0
         waiting = len(self._unsent) + _waiting(self._descriptor)
@@ -96,7 +96,7 @@ class SerialPort:
                 self._upcalls.stale(None, data[:stale])
             if len(data) > stale:
                 self._upcalls.take(None, data[stale:], None)
-        except Exception as fault:  # of the program: it is to end the link, not to vanish
+        except Exception as fault:  # a defect must end the link, not disappear
             self._lose(fault)
 
     def _write_on(self, descriptor: int) -> None:
@@ -119,22 +119,22 @@ class SerialPort:
 
 
 def _opened(device: str, baud: int) -> Any:
-    """Open the port: raw, 8N1, exclusive, never waiting.
+    """Open the port: raw, 8N1, exclusive, non-blocking.
 
-    Raises ``OSError`` where that cannot be had.
+    Raises ``OSError`` if it is not available.
     """
     import serial  # only where there is a serial link
 
     try:
         port = serial.Serial(device, baud, exclusive=True, timeout=0)
     except serial.SerialException as error:
-        if error.errno == errno.EAGAIN:  # its lock is taken
+        if error.errno == errno.EAGAIN:  # locked by another process
             raise OSError(errno.EBUSY, os.strerror(errno.EBUSY)) from error
         raise
     except (ValueError, termios.error) as error:
-        raise OSError(f"not at {baud} baud: {error}") from error
-    # pyserial has reads of nothing give nothing, which is also how the end of a device looks.
-    # With at least one byte asked for, nothing there is EAGAIN, and an empty read is the end.
+        raise OSError(f"{baud} baud is not possible: {error}") from error
+    # pyserial sets VMIN 0: an empty read then means either no data or an unplugged device.
+    # With VMIN 1, no data gives EAGAIN, and only an unplugged device an empty read.
     settings = termios.tcgetattr(port.fileno())
     settings[6][termios.VMIN] = 1
     termios.tcsetattr(port.fileno(), termios.TCSANOW, settings)
@@ -142,7 +142,7 @@ def _opened(device: str, baud: int) -> Any:
 
 
 def _waiting(descriptor: int) -> int:
-    """Bytes that the system has taken and the device has not; 0 where the device is gone."""
+    """Return the bytes in the system's send buffer; 0 if the device is gone."""
     try:
         return cast(int, struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))[0])
     except OSError:
@@ -150,8 +150,8 @@ def _waiting(descriptor: int) -> int:
 
 
 def _close(port: Any) -> None:
-    """Close without waiting (up to half a minute) for the device to take what is unsent."""
+    """Close without waiting (up to half a minute) for unsent bytes."""
     if _waiting(port.fileno()):
-        with contextlib.suppress(termios.error):  # the device is gone, and what was unsent with it
+        with contextlib.suppress(termios.error):  # the device is gone, with its unsent bytes
             termios.tcflush(port.fileno(), termios.TCOFLUSH)
     port.close()

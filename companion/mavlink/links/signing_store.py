@@ -1,10 +1,9 @@
-"""Signing keys in files, and signing timestamps that outlive the process.                [shell]
+"""Signing keys in files, and signing timestamps that persist across runs.                   [shell]
 
-Without the timestamps of the last run, whatever was recorded from the air could be played to the
-next one. A process that is killed or loses power leaves a file that lags behind: the file is
-written every second, or every three while nothing is heard or sent, and a write may take two more.
-Together that is ``signing.MARGIN``, by which the next run begins later. A link that was closed in
-order begins where it ended.
+Without the timestamps of the last run, any recorded frame could be replayed to the next one. After
+a kill or a power loss the file lags behind: it is written every second, or every three while no
+frame is received or sent, and a write may take two more. The sum is ``signing.MARGIN``, by which
+the next run starts later. A link that was closed properly resumes where it ended.
 """
 
 import contextlib
@@ -23,26 +22,26 @@ from companion.mavlink.trust.signing import KEY_BYTES, LinkSigning, State, finge
 
 SAVE_NS: Final = 1_000_000_000  # shortest time between two writes
 REFRESH_NS: Final = 3_000_000_000
-"""Longest time between two writes: a silent link still has a clock that goes on."""
+"""Longest time between two writes: the clock of a silent link advances too."""
 _VERSION: Final = 1
-_READ_MAX: Final = 4096  # bytes read of a key file
+_READ_MAX: Final = 4096  # most bytes read of a key file
 
 
 # --- keys ---------------------------------------------------------------------------------------
 
 
 def load_key(path: Path) -> bytes:
-    """Read the 32 bytes of a signing key from a file of just them, or of 64 hex digits.
+    """Read the 32 bytes of a signing key from a file of exactly these bytes, or of 64 hex digits.
 
-    Raises ``LinkError``, which says what is wrong with the file and how one is made. Mission
-    Planner and MAVProxy take SHA-256 of a passphrase (``MAVAuthKeys.AddKey``, UTF-8;
+    Raises ``LinkError``, with the fault of the file and the command that creates a key. Mission
+    Planner and MAVProxy use the SHA-256 of a passphrase (``MAVAuthKeys.AddKey``, UTF-8;
     ``passphrase_to_key`` of the module ``signing``, ASCII).
     """
     try:
         with path.open("rb") as file:
             data = file.read(_READ_MAX)
     except OSError as error:
-        raise LinkError(f"{path}: the signing key cannot be read: {error.strerror}") from None
+        raise LinkError(f"{path}: cannot read the signing key: {error.strerror}") from None
     if len(data) != KEY_BYTES:
         try:
             text = data.decode("ascii").strip()
@@ -52,25 +51,25 @@ def load_key(path: Path) -> bytes:
     if len(data) != KEY_BYTES:
         raise LinkError(f"{path}: not a signing key: {_how_to_make(path)}")
     if not any(data):
-        raise LinkError(f"{path}: a signing key of zeros switches signing off elsewhere")
+        raise LinkError(f"{path}: signing key is all zeros, which disables signing; give another")
     return data
 
 
 def key_warning(path: Path) -> str | None:
-    """One line for the operator if others may read or change a key file; None if not."""
+    """Return a warning if other users may read or change a key file; None if not."""
     try:
         mode = path.stat().st_mode
     except OSError as error:
-        return f"{path}: who may read the signing key cannot be told: {error.strerror}"
+        return f"{path}: cannot check the permissions of the signing key: {error.strerror}"
     if stat.S_IMODE(mode) & (stat.S_IRWXG | stat.S_IRWXO):
-        return f"{path}: others may read or change the signing key: chmod 600 {path}"
+        return f"{path}: other users may read or change the signing key: chmod 600 {path}"
     return None
 
 
 def _how_to_make(path: Path) -> str:
     return (
-        f"it is 32 bytes, or 64 hex digits; from a passphrase, as Mission Planner and MAVProxy "
-        f"have it: printf %s 'PASSPHRASE' | sha256sum | cut -c1-64 > {path}"
+        f"give 32 bytes or 64 hex digits; from a passphrase, as in Mission Planner and MAVProxy: "
+        f"printf %s 'PASSPHRASE' | sha256sum | cut -c1-64 > {path}"
     )
 
 
@@ -78,37 +77,37 @@ def _how_to_make(path: Path) -> str:
 
 
 class _LinkKey(NamedTuple):
-    """The owner of a set of timestamps: a link's URL and the fingerprint of its key."""
+    """Owner of a set of timestamps: a link's URL and the fingerprint of its key."""
 
     url: str
     key: str
 
 
 class _Kept(NamedTuple):
-    """A link's state; ``clean`` if the link was closed in order."""
+    """State of a link; ``clean`` if the link was closed properly."""
 
     state: State
     clean: bool
 
 
 class SigningSnapshot(NamedTuple):
-    """States to be written; ``number`` counts the snapshots."""
+    """States to write; ``number`` counts the snapshots."""
 
     number: int
     links: Mapping[_LinkKey, _Kept]
 
 
 class Timestamps:
-    """The timestamps of all links with a key, in one file.
+    """Timestamps of all links with a key, in one file.
 
-    The event loop asks ``due`` and makes a ``snapshot``; a thread does the ``write``::
+    The event loop checks ``due`` and takes a ``snapshot``; a thread does the ``write``::
 
         if timestamps.due(now_ns):
             await asyncio.to_thread(timestamps.write, timestamps.snapshot(now_ns))
 
-    ``close`` comes at the end, when nothing is received or sent any more. States of links that are
-    not in use stay in the file. Raises ``LinkError`` where the file is damaged, cannot be read or
-    written, or is in use by another process.
+    Call ``close`` at the end, when no frame is received or sent any more. States of unused links
+    stay in the file. Raises ``LinkError`` if the file is damaged, cannot be read or written, or is
+    in use by another process.
     """
 
     def __init__(self, path: Path) -> None:
@@ -123,7 +122,7 @@ class Timestamps:
         try:
             self._kept = _read(path)
             self._number += 1
-            # Written at once, so that a place that cannot be written to is reported at start.
+            # Write now, so that an unwritable path is reported at the start.
             self.write(SigningSnapshot(self._number, self._kept))
         except LinkError:
             os.close(self._lock)
@@ -132,10 +131,10 @@ class Timestamps:
     def guard(
         self, url: str, key: bytes, link_id: int, now_ns: int, *, allow_unsigned: bool = False
     ) -> LinkSigning:
-        """The guard of a link, with the state it had when last in use with this key.
+        """Return the guard of a link, with its last state for this key.
 
-        When this returns, the file says that the link is in use: should the process be killed, the
-        next one begins later. Raises ``LinkError`` also for a link that is there twice.
+        The file is then marked as in use: if the process is killed, the next one starts later.
+        Raises ``LinkError`` also for a link given twice.
         """
         link = _LinkKey(url, fingerprint(key))
         if link in self._guards:
@@ -148,20 +147,21 @@ class Timestamps:
         return guard
 
     def due(self, now_ns: int) -> bool:
-        """Whether it is time for a ``snapshot`` and a ``write``."""
+        """Return whether it is time for a ``snapshot`` and a ``write``."""
         moved = self._moves != sum(guard.moves for guard in self._guards.values())
         return bool(self._guards) and now_ns - self._snapshot_ns >= (
             SAVE_NS if moved else REFRESH_NS
         )
 
     def snapshot(self, now_ns: int) -> SigningSnapshot:
-        """The state of all links; cheap. ``now_ns`` is the own clock, ns since the Unix epoch."""
+        """Return the state of all links; cheap. ``now_ns`` is the own clock, ns since the Unix
+        epoch."""
         return self._snapshot(now_ns, clean=False)
 
     def write(self, snapshot: SigningSnapshot) -> None:
-        """Write a snapshot to disk, from any thread; one older than the file is skipped.
+        """Write a snapshot to disk, from any thread; skip one older than the file.
 
-        When this returns, a loss of power no longer takes it away.
+        On return, the data survive a power loss.
         """
         with self._writing:
             if snapshot.number <= self._written:
@@ -173,7 +173,7 @@ class Timestamps:
             self._written = snapshot.number
 
     def close(self, now_ns: int) -> None:
-        """Write that all links have ended in order. No guard may be used afterwards."""
+        """Record that all links were closed properly. No guard may be used afterwards."""
         try:
             self.write(self._snapshot(now_ns, clean=True))
         finally:
@@ -188,7 +188,7 @@ class Timestamps:
 
 
 def _locked(path: Path) -> int:
-    """A descriptor that keeps other processes away from the file until it is closed."""
+    """Return a descriptor that locks the file against other processes until it is closed."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = os.open(_beside(path, ".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -199,32 +199,30 @@ def _locked(path: Path) -> int:
     except OSError as error:
         os.close(lock)
         if isinstance(error, BlockingIOError):
-            raise LinkError(f"{path}: another process keeps its signing timestamps here") from None
+            raise LinkError(f"{path}: signing timestamps are in use by another process") from None
         raise _unwritable(path, error) from None
     return lock
 
 
 def _read(path: Path) -> dict[_LinkKey, _Kept]:
-    """The content of the file; empty if there is no file yet."""
+    """Return the content of the file; empty if there is no file yet."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
         return {}
     except OSError as error:
-        raise LinkError(
-            f"{path}: the signing timestamps cannot be read: {error.strerror}"
-        ) from None
+        raise LinkError(f"{path}: cannot read the signing timestamps: {error.strerror}") from None
     links = _checked_links(data)
     if links is None:
         raise LinkError(
-            f"{path}: the signing timestamps are damaged: put back a copy, or remove the file to "
-            "begin anew; what was sent in the minute before could then be replayed once"
+            f"{path}: signing timestamps are damaged; restore a copy, or remove the file: frames "
+            "of the minute before could then be replayed once"
         )
     return {_LinkKey(link["url"], link["key"]): _kept(link) for link in links}
 
 
 def _checked_links(data: bytes) -> list[dict[str, Any]] | None:
-    """The list of links as it was written; None if the file's digest does not match."""
+    """Return the list of links as written; None if the file's digest does not match."""
     with contextlib.suppress(ValueError, RecursionError, TypeError, KeyError):
         content = json.loads(data)
         if content["version"] == _VERSION and content["sha256"] == _digest(content["links"]):
@@ -274,7 +272,7 @@ def _dumped(value: object) -> bytes:
 
 
 def _replace(path: Path, data: bytes) -> None:
-    """Write a file so that either the old or the new one is there, whole, at any time."""
+    """Write a file atomically and durably."""
     fresh = _beside(path, ".new")
     with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
         file.write(data)
@@ -293,4 +291,4 @@ def _beside(path: Path, ending: str) -> Path:
 
 
 def _unwritable(path: Path, error: OSError) -> LinkError:
-    return LinkError(f"{path}: the signing timestamps cannot be written: {error.strerror}")
+    return LinkError(f"{path}: cannot write the signing timestamps: {error.strerror}")

@@ -1,7 +1,7 @@
-"""What had waited in a stream while this process was held up, as by SIGSTOP or a sleep.   [shell]
+"""Stale bytes of a stream, which waited while this process was suspended, as by SIGSTOP.    [shell]
 
-A stream's bytes bear no stamps of the system. What was there when the process went on may be as old
-as it was held up, and must not look as if it had just arrived.
+The bytes of a stream have no time stamps. Those that were waiting when the process resumed may be
+as old as the suspension, and must not count as just arrived.
 """
 
 import asyncio
@@ -12,12 +12,12 @@ from typing import Final
 
 from companion.mavlink.links.kernel_time import since_boot_ns
 
-STALE_NS: Final = 2_500_000_000  # time without a look beyond which what waits is stale
-LOOK_S: Final = 0.5  # time between two looks
+STALE_NS: Final = 2_500_000_000  # time between checks beyond which waiting bytes are stale
+LOOK_S: Final = 0.5  # time between two checks
 
 
 class StaleBytes:
-    """Tells which bytes of a stream are stale, from ``watch`` until ``close``; for a descriptor."""
+    """Detector of stale bytes in the stream of a descriptor, from ``watch`` until ``close``."""
 
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
@@ -26,17 +26,17 @@ class StaleBytes:
         self._next: asyncio.TimerHandle | None = None
 
     def watch(self) -> None:
-        """Look, and go on looking on the running loop."""
+        """Check now, and then periodically on the running loop."""
         self.stale(b"")
         self._next = asyncio.get_running_loop().call_later(LOOK_S, self.watch)
 
     def close(self) -> None:
-        """Look no more."""
+        """Stop checking."""
         if self._next is not None:
             self._next.cancel()
 
     def stale(self, data: bytes) -> int:
-        """How many of the bytes that were read just now, from their first, are stale."""
+        """Return how many of the bytes just read, from the first, are stale."""
         before_ns, self._seen_ns = self._seen_ns, since_boot_ns()
         if self._seen_ns - before_ns > STALE_NS:
             self._stale_bytes = len(data) + _unread(self._descriptor)
@@ -46,7 +46,7 @@ class StaleBytes:
 
 
 def _unread(descriptor: int) -> int:
-    """Bytes that wait to be read; 0 where the stream has ended."""
+    """Return the number of unread bytes; 0 if the stream has ended."""
     try:
         (waiting,) = struct.unpack("i", fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)))
     except OSError:

@@ -1,7 +1,7 @@
-"""Counts of what a link has seen, for the operator and for metrics.
+"""Counters of a link, for the operator and for metrics.
 
-Counts only grow. Frames refused by signing are in ``lost`` and nowhere else: a sender that cannot
-prove who it is changes no other number.
+Counters only increase. Frames rejected by signing are counted only in ``lost``: a sender that
+cannot authenticate itself changes no other counter.
 """
 
 from dataclasses import dataclass, field
@@ -16,7 +16,7 @@ Arrival = Literal["kernel", "read"]
 
 @dataclass(slots=True, kw_only=True)
 class ComponentStatus:
-    """One component as heard over one link; ``heard_ns`` is the time of its last frame."""
+    """One component as received over one link; ``heard_ns`` is the time of its last frame."""
 
     frames: Annotated[int, Meaning("frames received")]
     gaps: Annotated[int, Meaning("frames missing by sequence number, at least")]
@@ -26,26 +26,26 @@ class ComponentStatus:
 
 @dataclass(slots=True, kw_only=True)
 class LinkStatus:
-    """The state and the counts of one link.
+    """State and counters of one link.
 
-    A listening link is up while it listens; a link that connects is connecting until its peer or
-    device answers. A hole of n frames shows as n modulo 256 in ``gaps``; a sender that restarts can
-    add one wrong hole (see ``peers``). ``late`` frames were counted in ``gaps`` before, or are
-    copies. ``receive_buffer_bytes`` and ``overflowed`` are None for streams, and where the system
-    does not say. ``heard_ns`` is the time of the last frame.
+    A listening link is up while it listens; a connecting link is "connecting" until its peer or
+    device answers. A gap of n frames counts as n modulo 256 in ``gaps``; a sender that restarts can
+    add one wrong gap (see ``peers``). ``late`` frames were counted in ``gaps`` before, or are
+    copies. ``receive_buffer_bytes`` and ``overflowed`` are None for streams, and if the system does
+    not report them. ``heard_ns`` is the time of the last frame.
     """
 
     url: Annotated[str, Meaning("address of the link", example="udpin:0.0.0.0:14550")]
     state: Annotated[LinkState, Meaning("up, trying to connect, or down")] = "down"
     frames: Annotated[int, Meaning("frames accepted")] = 0
     bytes: Annotated[int, Meaning("bytes received")] = 0
-    peers: Annotated[int, Meaning("peers so far; a new connection counts anew")] = 0
-    lost: Annotated[
-        dict[str, int], Meaning("frames that could not be used, by reason; garbage in bytes")
-    ] = field(default_factory=dict)
+    peers: Annotated[int, Meaning("peers so far; each new connection counts")] = 0
+    lost: Annotated[dict[str, int], Meaning("unusable frames, by reason; garbage in bytes")] = (
+        field(default_factory=dict)
+    )
     gaps: Annotated[int, Meaning("frames missing by sequence number, at least")] = 0
     late: Annotated[int, Meaning("frames with an earlier sequence number: late or copies")] = 0
-    repeats: Annotated[int, Meaning("frames with the sequence number of the frame before")] = 0
+    repeats: Annotated[int, Meaning("frames with the previous frame's sequence number")] = 0
     sent: Annotated[int, Meaning("frames sent")] = 0
     send_dropped: Annotated[int, Meaning("frames that could not be sent")] = 0
     arrival: Annotated[
@@ -58,7 +58,7 @@ class LinkStatus:
         int | None, Meaning("receive buffer that the system granted (Linux doubles the request)")
     ] = None
     overflowed: Annotated[
-        int | None, Meaning("datagrams dropped: receive buffer full, or too old to be of use")
+        int | None, Meaning("datagrams dropped: receive buffer full, or too old to be used")
     ] = None
     heard_ns: int | None = None
     components: dict[Source, ComponentStatus] = field(default_factory=dict)

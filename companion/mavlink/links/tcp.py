@@ -1,4 +1,4 @@
-"""TCP for a link: connecting, or listening for connections.                              [shell]"""
+"""TCP endpoints of a link: a client, and a server.                                       [shell]"""
 
 import asyncio
 import errno
@@ -22,18 +22,16 @@ from companion.mavlink.links.urls import LinkUrl
 WRITE_BUFFER_BYTES: Final = 64 << 10
 """Unsent bytes of a connection beyond which further frames are dropped."""
 CONNECT_S: Final = 5.0
-"""Timeout of a connection attempt.
-
-The system itself would try for two minutes, ever more rarely.
-"""
+"""Timeout of a connection attempt; the system's own is two minutes, with ever longer pauses."""
 CONNECTIONS_MAX: Final = 256
-"""Connections of a listening link. More are closed at once, since each takes a file descriptor."""
+"""Most connections of a listening link, since each takes a file descriptor; more are closed at
+once."""
 SILENCE_S: Final = 12
-"""Seconds without an acknowledgement after which a peer is given up as switched off."""
+"""Seconds without an acknowledgement after which a connection is closed."""
 
 
 class TcpOut:
-    """A link that connects to one peer."""
+    """Link that connects to one peer."""
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
@@ -41,7 +39,7 @@ class TcpOut:
         self._stream: _Stream | None = None
 
     def open(self) -> None:
-        """Do nothing: the peer may come later."""
+        """Do nothing: the peer may start later."""
 
     async def serve(self) -> None:
         """Connect and serve until the connection is lost."""
@@ -59,7 +57,7 @@ class TcpOut:
             stream.abort()
 
     def peers(self) -> Collection[Hashable]:
-        """The one peer, while the connection stands."""
+        """Return the one peer, while connected."""
         return () if self._stream is None else (self._stream,)
 
     def write(self, key: Hashable, raw: bytes) -> bool:
@@ -67,12 +65,12 @@ class TcpOut:
         return cast(_Stream, key).write(raw)
 
     def fullness(self, key: Hashable) -> float:
-        """The share of the connection's buffer that is taken."""
+        """Return the filled share of the connection's buffer."""
         return cast(_Stream, key).fullness()
 
 
 class TcpIn:
-    """A link that listens. Each connection is a peer of its own, which may come and go."""
+    """Link that listens. Each connection is a separate peer."""
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
@@ -81,7 +79,7 @@ class TcpIn:
         self._streams: set[_Stream] = set()
 
     def open(self) -> int:
-        """Listen; returns the port. Raises ``OSError`` where the address cannot be had."""
+        """Listen; return the port. Raises ``OSError`` if the address is not available."""
         self._socket = _listening(self._url)
         port = cast(int, self._socket.getsockname()[1])
         self._url = replace(self._url, port=port)
@@ -92,7 +90,7 @@ class TcpIn:
         loop = asyncio.get_running_loop()
         fault: asyncio.Future[Exception] = loop.create_future()
         sock, self._socket = self._socket or _listening(self._url), None
-        # Not started at once: that takes a turn of the loop, in which a stop would leave it open.
+        # start_serving=True yields to the loop once; a cancellation there would leak the server.
         server = await loop.create_server(lambda: self._met(fault), sock=sock, start_serving=False)
         try:
             await server.start_serving()
@@ -104,7 +102,7 @@ class TcpIn:
                 stream.abort()
 
     def peers(self) -> Collection[Hashable]:
-        """Every connection that can be written to."""
+        """Return every writable connection."""
         return tuple(stream for stream in self._streams if stream.is_open())
 
     def write(self, key: Hashable, raw: bytes) -> bool:
@@ -112,7 +110,7 @@ class TcpIn:
         return cast(_Stream, key).write(raw)
 
     def fullness(self, key: Hashable) -> float:
-        """The share of a connection's buffer that is taken."""
+        """Return the filled share of a connection's buffer."""
         return cast(_Stream, key).fullness()
 
     def _met(self, fault: asyncio.Future[Exception]) -> "_Stream":
@@ -131,8 +129,8 @@ class TcpIn:
 class _Stream(asyncio.Protocol):
     """One connection, which is also the key of its peer.
 
-    ``parted`` is called with the reason when it ends. A connection that is not ``welcome`` is ended
-    at once.
+    ``parted`` is called with the reason when it ends. A connection that is not ``welcome`` is
+    closed at once.
     """
 
     def __init__(
@@ -185,17 +183,20 @@ class _Stream(asyncio.Protocol):
         return True
 
     def is_open(self) -> bool:
-        """Whether it can be written to."""
+        """Return whether it is writable."""
         return self._transport is not None and not self._transport.is_closing()
 
     def fullness(self) -> float:
-        """The share of the buffer that is taken; 0 when it has ended."""
+        """Return the filled share of the buffer; 0 when it has ended."""
         if self._transport is None:
             return 0.0
         return self._transport.get_write_buffer_size() / WRITE_BUFFER_BYTES
 
     def abort(self) -> None:
-        """End the connection without sending what is unsent; at once where it is yet to be made."""
+        """Close the connection and discard unsent bytes.
+
+        At once on connect if it is not yet made.
+        """
         self._welcome = False
         if self._transport is not None:
             self._transport.abort()
@@ -213,10 +214,7 @@ def _listening(url: LinkUrl) -> socket.socket:
 
 
 async def _connected(url: LinkUrl) -> socket.socket:
-    """A connection to the first address of a host that accepts one.
-
-    If none does, the last address's error is raised.
-    """
+    """Connect to the first address of a host that accepts; else raise the last address's error."""
     loop = asyncio.get_running_loop()
     error: OSError | None = None
     for family, address in await resolved(url, socket.SOCK_STREAM):
@@ -228,8 +226,8 @@ async def _connected(url: LinkUrl) -> socket.socket:
                 await loop.sock_connect(sock, address)
             if sock.getsockname() != sock.getpeername():
                 return sock
-            # Nobody listens on this machine, and the system chose that very port for our end:
-            # a connection to itself, which would also keep the peer from listening.
+            # No program listens on this machine, and the system chose that very port for our end:
+            # a connection to itself, which would also prevent the peer from listening.
             error = OSError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
         except OSError as refused:
             error = refused
@@ -237,14 +235,14 @@ async def _connected(url: LinkUrl) -> socket.socket:
             sock.close()
             raise
         sock.close()
-    assert error is not None, "a name that is found has an address"
+    assert error is not None, "a resolved name has an address"
     raise error
 
 
 def _notice_silence(sock: socket.socket) -> None:
-    """Have the system give up a peer that vanished silently (keep-alive, RFC 9293, 3.8.4).
+    """Enable keep-alive, to detect a peer that vanished silently (RFC 9293, 3.8.4).
 
-    Nothing else would ever tell of a connection that is only read from.
+    Without it, a connection that is only read from would never fail.
     """
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
     options = {

@@ -1,4 +1,4 @@
-"""From threads to the event loop: one queue, one wake-up for all that waits in it.       [shell]"""
+"""Calls from threads to the event loop: one queue, with one wake-up for all its entries. [shell]"""
 
 import asyncio
 import threading
@@ -8,12 +8,12 @@ from collections.abc import Callable
 from typing import Final
 
 QUEUE_MAX: Final = 20_000
-"""Calls that may wait for the loop; what comes beyond is dropped and counted."""
+"""Most calls that may wait for the loop; more are dropped and counted."""
 SLICE_S: Final = 0.003  # time slice, after which other work of the event loop runs
 
 
 class ToLoop:
-    """Calls that threads want made on the loop, in order, until ``end`` or until one fails.
+    """Queue of calls from threads, run on the loop in order until ``end`` or until one fails.
 
     handed_over  calls made
     dropped      calls that found ``QUEUE_MAX`` waiting
@@ -30,7 +30,7 @@ class ToLoop:
         self._fault: asyncio.Future[None] = loop.create_future()
 
     def post(self, call: Callable[[], None]) -> None:
-        """Have a call made on the loop; from any thread."""
+        """Queue a call for the loop; from any thread."""
         with self._lock:
             if self._is_over:
                 return
@@ -43,11 +43,11 @@ class ToLoop:
             self._is_woken = True
         try:
             self._loop.call_soon_threadsafe(self._hand_over)
-        except RuntimeError:  # the loop has ended, and with it whoever would listen
+        except RuntimeError:  # the loop is closed
             self.end()
 
     def fail(self, fault: Exception) -> None:
-        """End, on the loop, by a defect of a call, which must not vanish: ``run`` raises it."""
+        """End, on the loop, after a defect of a call; ``run`` raises it."""
         self.end()
         if not self._fault.done():
             self._fault.set_exception(fault)
@@ -59,7 +59,7 @@ class ToLoop:
             self._waiting.clear()
 
     async def run(self) -> None:
-        """Wait until cancelled; raises what a call raised."""
+        """Wait until cancelled; raise the exception of a failed call."""
         await asyncio.shield(self._fault)
 
     def _hand_over(self) -> None:

@@ -1,21 +1,21 @@
-"""Links over which MAVLink comes and goes.                                               [shell]
+"""Links that carry MAVLink and related formats.                                             [shell]
 
     udpin:HOST:PORT      listen for datagrams, from any number of peers
-    udpout:HOST:PORT     send datagrams to one peer, and hear what it answers
-    tcp:HOST:PORT        connect, and connect again when the peer goes away
-    tcpin:HOST:PORT      listen for connections, any number of them
+    udpout:HOST:PORT     send datagrams to one peer, and receive its answers
+    tcp:HOST:PORT        connect, and reconnect when the peer goes away
+    tcpin:HOST:PORT      listen for any number of connections
     serial:DEVICE:BAUD   a serial port, which may be unplugged and plugged in again
-    sbs:HOST:PORT        connect to an ADS-B receiver; its lines become ADSB_VEHICLE, none is sent
-    readsb:HOST:PORT     the same of a receiver that speaks Beast
-    readsb:http://...    the same of a receiver's aircraft.json
+    sbs:HOST:PORT        connect to an ADS-B receiver; its lines become ADSB_VEHICLE
+    readsb:HOST:PORT     connect to a receiver that speaks Beast; messages become ADSB_VEHICLE
+    readsb:http://...    poll a receiver's aircraft.json
     rid:HOST:PORT        connect to a Remote ID receiver; its JSON becomes OPEN_DRONE_ID messages
-    rid:udp:HOST:PORT    listen for such receivers' datagrams
-    cot:tcp:HOST:PORT    connect to who says Cursor on Target; its events become frames
-    cot:udp:HOST:PORT    listen for such datagrams
+    rid:udp:HOST:PORT    listen for datagrams of such receivers
+    cot:tcp:HOST:PORT    connect to a Cursor on Target server; its events become frames
+    cot:udp:HOST:PORT    listen for Cursor on Target datagrams
     zenoh:KEY            raw frames over Zenoh, in both directions
 
-IPv6 hosts stand in brackets. Every peer has its own splitter: a frame truncated by one peer cannot
-damage another's.
+IPv6 hosts are written in brackets. Every peer has its own splitter: a frame truncated by one peer
+cannot damage another's.
 
 Over 300 lines: what a link receives, sends and reports is one class.
 """
@@ -41,12 +41,10 @@ __all__ = ["Link", "LinkStatus", "MessageSigning", "Notify", "Receive", "endpoin
 RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds from one attempt to serve a lost link to the next; the last is repeated."""
 STEADY_S: Final = 1.0
-"""Seconds a connection must hold before it is said to be back.
-
-One that breaks at once is an outage.
-"""
+"""Seconds a connection must hold before it is reported as back; a shorter one is part of the
+outage."""
 PEER_ACTIVE_S: Final = 10.0
-"""A listening UDP link sends to peers from which a frame came within this many seconds."""
+"""A listening UDP link sends to the peers from which a frame arrived within this many seconds."""
 
 Receive = Callable[[list[Frame | Rejection]], None]
 Notify = Callable[[Notice], None]
@@ -56,10 +54,13 @@ class MessageSigning(Protocol):
     """Message signing of one link (https://mavlink.io/en/guide/message_signing.html)."""
 
     def refusal(self, frame: Frame) -> Reason | None:
-        """Why a frame must not be used; None if it may. Asked once for each frame, in order."""
+        """Return why a frame must be rejected; None to accept it.
+
+        Called once per frame, in order.
+        """
 
     def sign(self, raw: bytes, now_ns: int) -> bytes:
-        """A packed MAVLink 2 frame with its signature added."""
+        """Return a packed MAVLink 2 frame with its signature appended."""
 
 
 class Link:
@@ -69,9 +70,9 @@ class Link:
                        read
         now_ns         the node's timeline
         notify         called once when the link is lost, and once when it is back
-        guard          refuses frames and signs what is sent; None: no signing
-        lag            observes how late datagrams are processed
-        duplicate_ids  refuses what peers say that contradict each other; shared by all links
+        guard          rejects received frames and signs sent ones; None: no signing
+        lag            records how late datagrams are processed
+        duplicate_ids  rejects contradictory reports of peers; shared by all links
 
     All methods but ``open`` must be called on the event loop; ``open`` is called before it runs.
     """
@@ -108,9 +109,9 @@ class Link:
         self._steady: asyncio.TimerHandle | None = None
 
     def open(self) -> None:
-        """Claim a listening link's address. Raises ``LinkError`` where it cannot be had.
+        """Claim a listening link's address. Raises ``LinkError`` if it is not available.
 
-        An absent peer or device is no error: ``run`` tries it again and again.
+        An absent peer or device is no error: ``run`` retries.
         """
         try:
             port = self._endpoint.open()
@@ -120,9 +121,9 @@ class Link:
             self.status.url = str(replace(self.url, port=port))
 
     async def run(self) -> None:
-        """Serve until cancelled. A lost link is tried again, ever more rarely until frames come.
+        """Serve until cancelled. Retry a lost link, with growing delays until frames arrive.
 
-        Raises what ``receive`` raises.
+        Raises the exceptions of ``receive``.
         """
         attempt = 0
         try:
@@ -145,10 +146,9 @@ class Link:
     # --- receiving --------------------------------------------------------------------------
 
     def take(self, key: Hashable, data: bytes, age_ns: int | None = None) -> None:
-        """Split the bytes that a peer sent and pass on what they held.
+        """Split the bytes that a peer sent and pass on the frames.
 
-        ``age_ns`` is how long ago they arrived; None where that is not known, and they count as
-        arrived now.
+        ``age_ns`` is the time since their arrival; None if unknown: they count as arrived now.
         """
         peer = self._peers.at(key)
         self.status.bytes += len(data)
@@ -161,7 +161,7 @@ class Link:
             self._hand_on(peer, found)
 
     def _pass_over(self, key: Hashable, data: bytes) -> None:
-        """Count the frames in bytes that are too old, and keep in step with the stream."""
+        """Count the frames in stale bytes, and keep the splitter synchronised with the stream."""
         self.status.bytes += len(data)
         found = self._peers.at(key).splitter.feed(self._now_ns(), data)
         frames = sum(isinstance(item, Frame) for item in found)
@@ -176,7 +176,7 @@ class Link:
         self._receive([self._believed(peer, _answered(peer, item)) for item in found])
 
     def _believed(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
-        """The item itself, or the refusal of what its sender's peers contradict each other in."""
+        """Return the item, or its rejection if the sender's peers contradict each other."""
         if isinstance(item, Rejection) or item.msgid not in POSE:
             return item
         if not self._duplicate_ids.rejects(str(self.url), peer.address or str(self.url), item):
@@ -187,20 +187,19 @@ class Link:
         )
 
     def _hang_up(self, key: Hashable) -> None:
-        """Forget a peer that is gone."""
         peer = self._peers.find(key)
         if peer is not None:
             self._finish(peer)
             self._peers.forget(peer)
 
     def _finish(self, peer: Peer) -> None:
-        """Search what the unfinished frame of a departing peer may have swallowed."""
+        """Search the unfinished frame of a departing peer for other frames."""
         found = peer.splitter.finish(self._now_ns())
         if found:
             self._hand_on(peer, found)
 
     def _overflow(self, count: int) -> None:
-        """Count datagrams or frames that were let go; their senders are not asked for."""
+        """Count dropped datagrams or frames; their senders are unknown."""
         lost = self.status.lost
         lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
         reject = Rejection(
@@ -211,9 +210,9 @@ class Link:
     # --- sending ----------------------------------------------------------------------------
 
     def send(self, message: Outgoing) -> int:
-        """Send to every peer heard lately (udpin), to every connection (tcpin), or to the one peer.
+        """Send to every recent peer (udpin), to every connection (tcpin), or to the one peer.
 
-        "Lately" is within ``PEER_ACTIVE_S``. Returns how many took it. Never waits and never
+        "Recent" is within ``PEER_ACTIVE_S``. Returns how many accepted it. Never waits and never
         raises.
         """
         keys = self._endpoint.peers()
@@ -224,7 +223,7 @@ class Link:
         return sum([self._send(peer, message) for peer in peers])
 
     def send_raw(self, raw: bytes) -> None:
-        """Send bytes as they are to every peer that a message would go to."""
+        """Send raw bytes to every peer that would get a broadcast message."""
         for key in self._endpoint.peers() or ():
             if self._endpoint.write(key, raw):
                 self.status.sent += 1
@@ -232,15 +231,15 @@ class Link:
                 self.status.send_dropped += 1
 
     def send_to(self, target: Source, message: Outgoing) -> bool:
-        """Send to the peer over which ``target`` was last heard on this link.
+        """Send to the peer over which ``target`` was last received on this link.
 
-        Returns False if it was never heard, has hung up, or does not take it.
+        Returns False if there is none, it has hung up, or it does not accept the frame.
         """
         peer = self._peers.last_of(target)
         return peer is not None and self._send(peer, message)
 
     def _send(self, peer: Peer, message: Outgoing) -> bool:
-        """Send to one peer: as MAVLink 1 if it speaks nothing else and the link has no guard.
+        """Send to one peer: as MAVLink 1 if it uses only that and the link has no guard.
 
         MAVLink 1 cannot be signed.
         """
@@ -255,7 +254,7 @@ class Link:
             self.status.send_dropped += 1
         return taken
 
-    # --- coming and going -------------------------------------------------------------------
+    # --- state of the connection ------------------------------------------------------------
 
     def _up(self) -> None:
         self.status.state = "up"
@@ -290,15 +289,15 @@ class Link:
 
 
 def _answered(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
-    """The item itself, or the refusal of a TIMESYNC from who does not bring its sender's stamps.
+    """Return the item, or the rejection of a TIMESYNC from a peer without its sender's stamps.
 
-    Whoever else reaches the socket could move a clock by it. Routers bring both.
+    Any program that reaches the socket could otherwise shift a clock. Routers deliver both.
     """
     if isinstance(item, Rejection) or item.msgid != TIMESYNC:
         return item
     if peer.brings_stamps(item.source, item.t_ns) or item.payload[:8].strip(b"\0") == b"":
         return item  # a request is no evidence
-    detail = "TIMESYNC: not from the peer that brings its positions"
+    detail = "TIMESYNC: not from the peer that delivers the sender's positions"
     who = str(item.source)
     return Rejection(
         t_ns=item.t_ns, source=who, reason=Reason.UNPLACED_STAMP, msgid=TIMESYNC, detail=detail
@@ -306,7 +305,7 @@ def _answered(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
 
 
 def _admitted(guard: MessageSigning, item: Frame | Rejection) -> Frame | Rejection:
-    """The item itself, or the guard's refusal of it."""
+    """Return the item, or its rejection by the guard."""
     refusal = None if isinstance(item, Rejection) else guard.refusal(item)
     if refusal is None or isinstance(item, Rejection):
         return item

@@ -1,6 +1,6 @@
-"""UDP for a link: one socket that serves all senders, or one that is connected.          [shell]
+"""UDP endpoints of a link: one socket that serves all senders, or a connected one.          [shell]
 
-Over 300 lines: both are read alike, and the system's doings with a socket belong together.
+Over 300 lines: both are read alike, and the system calls on a socket belong together.
 """
 
 import asyncio
@@ -22,30 +22,30 @@ from companion.mavlink.links.to_loop import SLICE_S
 from companion.mavlink.links.urls import LinkUrl
 
 RECEIVE_BUFFER_BYTES: Final = 4 << 20
-"""Receive buffer asked for; with stock buffers frames are lost from about 20 000 a second on.
+"""Requested receive buffer; with default buffers, frames are lost above about 20 000 a second.
 
 Measured: docs/field-notes.md 3.
 """
-OVERFLOW_CHECK_S: Final = 1.0  # longest time between two looks at the system's drop counter
+OVERFLOW_CHECK_S: Final = 1.0  # longest time between two reads of the system's drop counter
 OVERFLOW_CHECK_DATAGRAMS: Final = 1024
 """Datagrams after which the drop counter is read even before that time."""
 STALE_NS: Final = 2_000_000_000
-"""Age at which a datagram is let go unread: a busy machine then sees what is new, not a backlog."""
+"""Age at which a datagram is discarded: a busy machine then processes new data, not a backlog."""
 READ_AT_ONCE: Final = 32
-"""Datagrams read at most before other work runs, as in libuv; fewer in ``SLICE_S``."""
+"""Most datagrams read before other work runs, as in libuv; ``SLICE_S`` limits them too."""
 DATAGRAM_BYTES: Final = 1 << 16  # more than any datagram has
 
 _SO_MEMINFO: Final = 55  # Linux, include/uapi/asm-generic/socket.h
 _SK_MEMINFO_BYTES: Final = 36  # nine 32-bit numbers, include/uapi/linux/sock_diag.h
 _NOT_THIS_SOCKET: Final = (errno.EAGAIN, errno.ENOBUFS, errno.ECONNREFUSED)
-"""Errors that leave a socket as good as before: it is full, or nobody listens at the other end."""
+"""Errors that leave a socket usable: it is full, or no program listens at the other end."""
 
 
 def dropped_by_system(sock: socket.socket) -> int | None:
-    """Datagrams that the system has dropped at a socket so far, modulo 2³².
+    """Return the number of datagrams dropped by the system at a socket, modulo 2³².
 
-    The cause is nearly always a full buffer. None where the system does not say (others than
-    Linux).
+    The cause is nearly always a full buffer. None if the system does not report it (only Linux
+    does).
     """
     if sys.platform != "linux":
         return None
@@ -59,15 +59,15 @@ def dropped_by_system(sock: socket.socket) -> int | None:
 
 
 def _prepare(sock: socket.socket, status: LinkStatus) -> None:
-    """Ask for a large buffer and for stamps of arrival, and note what the system grants."""
+    """Request a large buffer and arrival stamps, and record what the system grants."""
     status.arrival = "kernel" if kernel_time.stamped(sock) else "read"
-    with contextlib.suppress(OSError):  # what is granted is said, be it less
+    with contextlib.suppress(OSError):  # the granted size is reported below
         sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
     status.receive_buffer_bytes = sock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
 
 
 def _fullness(sock: socket.socket) -> float:
-    """1 where the system would not take a datagram now, else 0: datagrams are not kept here."""
+    """Return 1 if the system would not accept a datagram now, else 0: there is no buffer here."""
     if sock.fileno() < 0:  # closed by its transport
         return 0.0
     poll = select.poll()
@@ -77,10 +77,10 @@ def _fullness(sock: socket.socket) -> float:
 
 @contextlib.contextmanager
 def _readiness(sock: socket.socket) -> Iterator[int]:
-    """A file descriptor that is readable while a socket is, or has an error.
+    """Yield a file descriptor that is readable while a socket is, or has an error.
 
-    uvloop stops watching a socket that has an error, such as a refusal by ICMP. An epoll instance
-    about that socket has none.
+    uvloop stops watching a socket that has an error, such as an ICMP refusal. An epoll instance on
+    that socket has none.
     """
     if not hasattr(select, "epoll"):
         yield sock.fileno()
@@ -91,7 +91,7 @@ def _readiness(sock: socket.socket) -> Iterator[int]:
 
 
 class UdpIn:
-    """A link that listens for datagrams.
+    """Link that listens for datagrams.
 
     One socket serves all senders; their addresses are the keys.
     """
@@ -103,7 +103,7 @@ class UdpIn:
         self._socket: socket.socket | None = None
 
     def open(self) -> int:
-        """Bind; returns the port. Raises ``OSError`` where the address cannot be had."""
+        """Bind; return the port. Raises ``OSError`` if the address is not available."""
         self._socket = self._bound()
         port = cast(int, self._socket.getsockname()[1])
         self._url = replace(self._url, port=port)
@@ -125,7 +125,7 @@ class UdpIn:
         return sock
 
     def peers(self) -> None:
-        """None: a listening socket has no peers but those heard lately."""
+        """Return None: a broadcast goes to the peers received recently."""
 
     def write(self, key: Hashable, raw: bytes) -> bool:
         """Send a datagram to an address."""
@@ -133,21 +133,23 @@ class UdpIn:
             return False
         try:
             self._socket.sendto(raw, cast(Address, key))
-        except OSError:  # the buffer is full, or no route leads to that peer: others are unaffected
+        except OSError:  # the buffer is full, or there is no route to that peer
             return False
         return True
 
     def fullness(self, key: Hashable) -> float:
-        """1 where the system would not take a datagram now, else 0; the same for all peers."""
+        """Return 1 if the system would not accept a datagram now, else 0.
+
+        The same for all peers.
+        """
         return 0.0 if self._socket is None else _fullness(self._socket)
 
 
 class UdpOut:
-    """A link with one peer: its socket is connected, so that nobody else is heard.
+    """Link with one peer: its socket is connected, so that other senders are ignored.
 
-    That nobody listens at the other end (ICMP) is no error: the peer may come yet. After an error
-    of this end, such as a network that is gone, the socket is made anew, since the old one would
-    keep the address that it had.
+    An ICMP refusal is no error: the peer may start later. After a local error, such as a network
+    that is down, the socket is recreated, since the old one would keep its local address.
     """
 
     def __init__(self, url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> None:
@@ -157,12 +159,12 @@ class UdpOut:
         self._datagrams: _Datagrams | None = None
 
     def open(self) -> None:
-        """Do nothing: nothing can be known yet."""
+        """Do nothing."""
 
     async def serve(self) -> None:
-        """Read what the peer sends.
+        """Read the peer's datagrams.
 
-        Raises ``OSError`` where its name is not found or no route leads there.
+        Raises ``OSError`` if its name is not found or there is no route.
         """
         while True:
             family, address = (await resolved(self._url, socket.SOCK_DGRAM))[0]
@@ -183,7 +185,7 @@ class UdpOut:
                 self._datagrams = None
 
     def peers(self) -> Collection[Hashable]:
-        """The one peer, None, while there is a socket."""
+        """Return the one peer, None, while there is a socket."""
         return () if self._datagrams is None else (None,)
 
     def write(self, key: Hashable, raw: bytes) -> bool:
@@ -191,14 +193,14 @@ class UdpOut:
         return self._datagrams is not None and self._datagrams.send(raw)
 
     def fullness(self, key: Hashable) -> float:
-        """1 where the system would not take a datagram now, else 0."""
+        """Return 1 if the system would not accept a datagram now, else 0."""
         return 0.0 if self._datagrams is None else self._datagrams.fullness()
 
 
 class _Datagrams:
-    """A UDP socket at work: read by the loop's own readers, written to directly.
+    """UDP socket, read by the loop's own readers and written to directly.
 
-    A transport would hand on no stamps of arrival, and keep what the system does not take.
+    An asyncio transport would not deliver arrival stamps, and would buffer what the system rejects.
     """
 
     def __init__(
@@ -216,7 +218,7 @@ class _Datagrams:
         self._unchecked = 0
 
     async def serve(self) -> None:
-        """Read until the socket has to be made anew; raises what a reader of its data raised."""
+        """Read until the socket must be recreated; raise the exceptions of ``take``."""
         loop = asyncio.get_running_loop()
         try:
             with _readiness(self._socket) as descriptor:
@@ -237,7 +239,7 @@ class _Datagrams:
         for _ in range(2):
             try:
                 self._socket.send(raw)
-            except ConnectionRefusedError:  # the answer to a datagram before; this one stayed here
+            except ConnectionRefusedError:  # refers to an earlier datagram; this one was not sent
                 continue
             except OSError as error:
                 self._note_error(error)
@@ -246,11 +248,11 @@ class _Datagrams:
         return False
 
     def fullness(self) -> float:
-        """1 where the system would not take a datagram now, else 0."""
+        """Return 1 if the system would not accept a datagram now, else 0."""
         return _fullness(self._socket)
 
     def _read(self) -> None:
-        """Hand on the datagrams that wait, each with its age."""
+        """Pass on the waiting datagrams, each with its age."""
         was_set = self._wall_clock.was_set()
         until_s = time.monotonic() + SLICE_S
         for _ in range(READ_AT_ONCE):
@@ -272,7 +274,7 @@ class _Datagrams:
                 continue
             try:
                 self._upcalls.take(None if self._connected else address, data, age_ns)
-            except Exception as fault:  # of the program: it is to end the link, not to vanish
+            except Exception as fault:  # a defect must end the link, not disappear
                 settle(self._lost, fault)
                 return
             self._unchecked += 1
@@ -280,7 +282,7 @@ class _Datagrams:
                 self._count_dropped()
 
     def _age_ns(self, ancillary: kernel_time.Ancillary, was_set: bool) -> int | None:
-        """How long a datagram has waited, ns; None where no stamp tells."""
+        """Return how long a datagram has waited, ns; None without a valid stamp."""
         stamp_ns = kernel_time.stamp_ns(ancillary)
         if stamp_ns is None:
             self._status.arrival = "read"
@@ -292,7 +294,7 @@ class _Datagrams:
         return age_ns
 
     def _note_error(self, error: OSError) -> None:
-        # A listening socket is not bound to a route: it stays as it is, whatever comes.
+        # A listening socket is not bound to a route: no error requires a new one.
         if error.errno not in _NOT_THIS_SOCKET and self._connected:
             self._unfit = True
 

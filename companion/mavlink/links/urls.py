@@ -1,23 +1,23 @@
-"""Link addresses, written as users of MAVLink write them.
+"""Link addresses, in the usual form of MAVLink programs.
 
     udpin:HOST:PORT      listen for datagrams, from any number of peers
-    udpout:HOST:PORT     send datagrams to one peer, and hear what it answers
+    udpout:HOST:PORT     send datagrams to one peer, and receive its answers
     tcp:HOST:PORT        connect
     tcpin:HOST:PORT      listen for connections
     serial:DEVICE:BAUD   a serial port, as in serial:/dev/ttyAMA0:921600
-    sbs:HOST:PORT        connect to an ADS-B receiver that says BaseStation lines; nothing is sent
-    readsb:HOST:PORT     connect to an ADS-B receiver that speaks Beast; nothing is sent
+    sbs:HOST:PORT        connect to an ADS-B receiver with BaseStation lines; receive-only
+    readsb:HOST:PORT     connect to an ADS-B receiver that speaks Beast; receive-only
     readsb:http://HOST/PATH/aircraft.json
-                         ask such a receiver's web server once a second; https:// too
-    rid:HOST:PORT        connect to a Remote ID receiver that says JSON; nothing is sent
-    rid:udp:HOST:PORT    listen for the datagrams of such receivers; nothing is sent
-    cot:tcp:HOST:PORT    connect to who says Cursor on Target; nothing is sent
-    cot:udp:HOST:PORT    listen for it, as in cot:udp:239.2.3.1:6969; nothing is sent
-    zenoh:KEY            hear KEY/out and say KEY/in over Zenoh's router on this machine; what else
-                         it may be stands behind a question mark, as in
+                         poll such a receiver's web server once a second; https:// too
+    rid:HOST:PORT        connect to a Remote ID receiver with JSON; receive-only
+    rid:udp:HOST:PORT    listen for the datagrams of such receivers; receive-only
+    cot:tcp:HOST:PORT    connect to a Cursor on Target server; receive-only
+    cot:udp:HOST:PORT    listen for it, as in cot:udp:239.2.3.1:6969; receive-only
+    zenoh:KEY            subscribe to KEY/out and publish KEY/in over Zenoh's router on this
+                         machine; options follow a question mark, as in
                          zenoh:site/raw?connect=tcp/10.0.0.7:7447 (see ``zenoh_link``)
 
-IPv6 hosts stand in brackets.
+IPv6 hosts are written in brackets.
 """
 
 import difflib
@@ -34,9 +34,9 @@ Scheme = Literal[
 ]
 SCHEMES: Final[tuple[Scheme, ...]] = get_args(Scheme)
 Way = Literal["", "tcp", "udp", "http", "https"]
-"""How a link goes whose scheme may go several ways; empty: as its scheme does of itself."""
+"""Transport of a link whose scheme supports several; empty: the default of the scheme."""
 MAVLINK: Final[tuple[Scheme, ...]] = ("udpin", "udpout", "tcp", "tcpin", "serial", "zenoh")
-"""Links over which MAVLink goes, in both directions."""
+"""Schemes that carry MAVLink, in both directions."""
 _FORMS: Final[dict[str, str]] = {
     "serial": "serial:DEVICE:BAUD",
     "zenoh": "zenoh:KEY",
@@ -59,16 +59,15 @@ _NAME: Final = re.compile(r"[A-Za-z0-9._-]+")
 
 
 class LinkError(UserError):
-    """A link that cannot be opened. The message is one line for the user and names the link."""
+    """Link that cannot be opened. The message is one line for the user and names the link."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkUrl:
-    """A parsed link address; ``str`` gives it as the user wrote it.
+    """Parsed link address; ``str`` gives it as the user wrote it.
 
     ``host`` is the device of a serial link, and ``port`` its baud rate; ``host`` is the key of a
-    Zenoh link, whose ``port`` is 0. ``path`` is what is asked for over HTTP, or a Zenoh link's
-    options.
+    Zenoh link, whose ``port`` is 0. ``path`` is the path of an HTTP URL, or a Zenoh link's options.
     """
 
     scheme: Scheme
@@ -88,14 +87,14 @@ class LinkUrl:
 
     @property
     def listens(self) -> bool:
-        """Whether others call here, so that an address of this machine is claimed."""
+        """Whether the link listens at an address of this machine."""
         return self.scheme in ("udpin", "tcpin") or self.way == "udp"
 
 
 def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
-    """Read a link of one of ``schemes``. Raises ``LinkError``, which says what is wrong with it.
+    """Parse a link of one of ``schemes``. Raises ``LinkError``, which names the fault.
 
-    Port 0 is allowed where the link listens: the system then chooses one.
+    Port 0 is allowed if the link listens: the system then chooses one.
     """
     scheme, _, address = text.partition(":")
     if scheme == "zenoh" and scheme in schemes:
@@ -117,9 +116,9 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     bracketed = host.startswith("[") and host.endswith("]")
     host = host[1:-1] if bracketed else host
     if (":" in host) is not bracketed:
-        raise LinkError(f"{text!r}: an IPv6 host stands in brackets, as in udpin:[::]:14550")
+        raise LinkError(f"{text!r}: put the IPv6 host in brackets, as in udpin:[::]:14550")
     if not (_is_ipv6(host) if bracketed else _may_be_a_name(host)):
-        raise LinkError(f"{text!r}: {host!r} cannot be the name or address of a host")
+        raise LinkError(f"{text!r}: {host!r} is not a valid host name or address")
     url = LinkUrl(scheme=cast(Scheme, scheme), host=host, port=int(port), way=way, path=path)
     if int(port) > 65535 or (int(port) == 0 and not url.listens):
         raise LinkError(f"{text!r}: {port} is not a port, 1 to 65535")
@@ -127,7 +126,7 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
 
 
 def _http(text: str, address: str) -> tuple[Way, str, str]:
-    """The way, HOST:PORT and the path of ``http://HOST[:PORT]/PATH``."""
+    """Split ``http://HOST[:PORT]/PATH`` into scheme, HOST:PORT and path."""
     way, slashes, rest = address.partition("://")
     host, slash, path = rest.partition("/")
     if not slashes or not _PATH.fullmatch(slash + path):
@@ -144,20 +143,20 @@ def _zenoh(text: str, address: str) -> LinkUrl:
     wrong = [one for one in options.split("&") if not _OPTION.fullmatch(one)] if mark else []
     if wrong:
         known = "connect=tcp/HOST:PORT, listen=tcp/HOST:PORT and as=hub"
-        raise LinkError(f"{text!r}: {wrong[0]!r} is none of {known}, with & between them")
+        raise LinkError(f"{text!r}: unknown option {wrong[0]!r}; give {known}, joined by &")
     return LinkUrl(scheme="zenoh", host=key, port=0, way="", path=options)
 
 
 def _serial(text: str, device: str, baud: int) -> LinkUrl:
     if not device.isprintable():
-        raise LinkError(f"{text!r}: {device!r} cannot be the name of a device")
+        raise LinkError(f"{text!r}: {device!r} is not a valid device name")
     if not 1 <= baud <= _BAUD_MAX:
         raise LinkError(f"{text!r}: {baud} is not a baud rate, 1 to {_BAUD_MAX}")
     return LinkUrl(scheme="serial", host=device, port=baud)
 
 
 def _meant(text: str) -> str:
-    """What was likely meant, as the end of a message; empty where nobody knows."""
+    """Return a suggestion for the end of a message; empty without one."""
     scheme, _, address = text.partition(":")
     if not text.isprintable():
         return ""
@@ -197,8 +196,8 @@ def _is_ipv6(host: str) -> bool:
 
 
 def _may_be_a_name(host: str) -> bool:
-    """Whether the text can be the name of a host; an IPv4 address counts as one."""
+    """Return whether the text can be a host name; an IPv4 address counts as one."""
     try:
         return _NAME.fullmatch(host) is not None and len(host.encode("idna")) > 0
-    except UnicodeError:  # a label that is empty, or too long
+    except UnicodeError:  # an empty or too long label
         return False

@@ -1,9 +1,9 @@
-"""One Zenoh session: what is published, heard, asked and answered, and who is alive.       [shell]
+"""Zenoh session: publications, subscriptions, queries and liveliness.                       [shell]
 
-Over 300 lines: the only file that knows Zenoh (https://zenoh.io, the extra ``[fleet]``). Its
-callbacks come on threads of its own; what they bring is handed to the event loop. Only answers to
-questions are given on Zenoh's thread, since a clock must not wait for a busy loop. Nothing here
-waits for the network but ``open`` and ``close``, which belong on a thread.
+Over 300 lines: the only file that uses Zenoh (https://zenoh.io, the extra ``[fleet]``). Its
+callbacks run on its own threads; their data are passed to the event loop. Only queries are answered
+on Zenoh's thread, since a clock must not wait for a busy loop. Only ``open`` and ``close`` wait for
+the network; call them on a thread.
 """
 
 import asyncio
@@ -24,27 +24,30 @@ if TYPE_CHECKING:
     import zenoh
 
 PUBLISHERS_MAX: Final = 1024
-"""Keys declared, so that their names go over the wire once; beyond it, all are begun anew."""
+"""Most keys declared, so that their names are sent once; beyond it, all are declared again."""
 NO_ROUTER: Final = "Unable to connect"
-"""What Zenoh says when a client reaches none of its endpoints."""
+"""Zenoh's message when a client reaches none of its endpoints."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusStatus:
-    """Counts, which only grow.
+    """Counters, which only increase.
 
-    sent     samples given to Zenoh. What it then drops at a congested link it does not tell: number
-             what is published, and the other end sees the holes
+    sent     samples given to Zenoh. It does not report drops at a congested link: number the
+             samples, so that the receiver sees the gaps
     """
 
     sent: int
-    refused: int  # samples that Zenoh did not take, or after close
-    heard: int  # samples, answers and signs of life handed over
-    dropped: int  # those for which there was no room while the loop was busy
+    refused: int  # samples that Zenoh did not accept, or after close
+    heard: int  # samples, answers and liveliness changes handed over
+    dropped: int  # those dropped because the queue to the loop was full
 
 
 def open_peer(config: BusConfig) -> "zenoh.Session":
-    """The session of a peer, before there is a loop; blocks. Raises ``UserError`` as ``open``."""
+    """Open the session of a peer before there is a loop; blocks.
+
+    Raises ``UserError`` as ``open``.
+    """
     with needs("zenoh", "fleet", "Zenoh"):
         import zenoh
     try:
@@ -54,11 +57,11 @@ def open_peer(config: BusConfig) -> "zenoh.Session":
 
 
 class Bus:
-    """A Zenoh session. All methods but ``open`` and ``close`` are called on the loop.
+    """Zenoh session. All methods but ``open`` and ``close`` are called on the loop.
 
-    ``session`` is one that is open already (``open_peer``); None: ``open`` opens one.
+    ``session`` is one that is already open (``open_peer``); None: ``open`` opens one.
 
-    ``run`` raises what a callback raised: after that nothing more is handed over.
+    ``run`` raises the exception of a callback: after that nothing more is handed over.
     """
 
     def __init__(
@@ -74,14 +77,14 @@ class Bus:
         self._ended = threading.Event()
         self._session = session
         self._publishers: dict[tuple[str, Priority, bool, bool], zenoh.Publisher] = {}
-        self._declared: list[Any] = []  # what ends when nobody holds it any more
+        self._declared: list[Any] = []  # declarations, which end when unreferenced
 
     def open(self) -> None:
-        """Open the session; blocks. An absent neighbour is no error: it is tried again and again.
+        """Open the session; blocks. An absent neighbour is no error: it is retried.
 
         A client has no session without its router, so this waits for it; ``close`` ends that.
-        Raises ``UserError`` where the package is missing, an endpoint or a file is wrong, or an
-        address cannot be had.
+        Raises ``UserError`` if the package is missing, an endpoint or a file is invalid, or an
+        address is not available.
         """
         with needs("zenoh", "fleet", "Zenoh"):
             import zenoh
@@ -105,17 +108,18 @@ class Bus:
         )
 
     async def run(self) -> None:
-        """Wait until cancelled; raises what a callback raised."""
+        """Wait until cancelled; raise the exception of a callback."""
         await self._to_loop.run()
 
     def close(self) -> None:
-        """End the session; blocks until others were told. Nothing is handed over afterwards."""
+        """Close the session; blocks until the others are notified. Nothing is handed over
+        afterwards."""
         self._to_loop.end()
         self._ended.set()
         if self._session is not None:
             _close(self._session)
 
-    # --- publishing and asking ---------------------------------------------------------------
+    # --- publications and queries ------------------------------------------------------------
 
     def put(
         self,
@@ -126,12 +130,12 @@ class Bus:
         priority: Priority = "data",
         reliable: bool = True,
     ) -> bool:
-        """Publish a sample; False if Zenoh did not take it.
+        """Publish a sample; False if Zenoh did not accept it.
 
-        What a congested link has no room for is dropped, unseen. ``express`` sends it at once
-        rather than with what follows, for single samples: of a burst only ``QUEUED`` find room.
-        Not ``reliable``: over an endpoint ``?rel=0`` where there is one, with no wait for what was
-        lost before.
+        A congested link drops samples silently. ``express`` sends a sample at once, without
+        batching; for single samples only, since at most ``QUEUED`` of a burst fit the queue. Not
+        ``reliable``: over an endpoint with ``?rel=0`` if there is one, without waiting for lost
+        samples.
         """
         import zenoh
 
@@ -144,21 +148,21 @@ class Bus:
         return True
 
     def is_wanted(self, key: str, priority: Priority = "data") -> bool:
-        """Whether somebody listens to what ``put`` publishes under ``key``, with this priority."""
+        """Return whether there is a subscriber to ``put`` under ``key`` with this priority."""
         import zenoh
 
         try:
             status: Any = self._publisher(key, priority, False, True).matching_status
-            return bool(status.matching)  # its annotation says that it is a bool, and it is not
+            return bool(status.matching)  # despite its annotation, it is not a bool
         except zenoh.ZError:
             return False
 
     def ask(
         self, key: str, payload: bytes, timeout_s: float, take: Callable[[bytes, int], None]
     ) -> None:
-        """Ask who serves ``key``; ``take`` is called with each answer, if one comes in time.
+        """Query ``key``; ``take`` is called with each answer that arrives in time.
 
-        Its second argument is the monotonic time, ns, at which Zenoh's thread had the answer.
+        Its second argument is the monotonic time, ns, at which Zenoh's thread received the answer.
         """
         import zenoh
 
@@ -173,19 +177,20 @@ class Bus:
             zenoh.handlers.Callback(answered, indirect=False),
             payload=payload,
             timeout=timeout_s,
-            # Else an answer is held back until nobody can give another.
+            # Otherwise Zenoh holds answers back until all are in.
             consolidation=zenoh.ConsolidationMode.NONE,
             congestion_control=zenoh.CongestionControl.DROP,
             priority=zenoh.Priority.REAL_TIME,
             express=True,
         )
 
-    # --- hearing and answering ---------------------------------------------------------------
+    # --- subscriptions and answers -----------------------------------------------------------
 
     def subscribe(self, key_expr: str, take: Callable[[str, bytes], None]) -> Callable[[], None]:
-        """Have ``take`` called with the key and the payload of every sample from others.
+        """Call ``take`` with the key and the payload of every sample from others.
 
-        Returns what ends that: samples that are on their way to the loop are still handed over.
+        Returns the function that ends the subscription: samples already queued are still handed
+        over.
         """
         import zenoh
 
@@ -210,9 +215,9 @@ class Bus:
         return end
 
     def serve(self, key: str, answer: Callable[[str, bytes], bytes | None]) -> None:
-        """Have questions about ``key`` answered, at once, on Zenoh's own thread.
+        """Answer queries for ``key`` at once, on Zenoh's own thread.
 
-        ``answer`` is given the key that was asked for and the payload; None: no answer.
+        ``answer`` is called with the queried key and the payload; None: no answer.
         """
         import zenoh
 
@@ -222,7 +227,7 @@ class Bus:
                 said = answer(str(query.key_expr), payload)
                 if said is not None:
                     query.reply(key, said, express=True)
-            except zenoh.ZError:  # who asked is gone, or this session
+            except zenoh.ZError:  # the querier or this session is gone
                 return
             except Exception as fault:
                 self._to_loop.post(partial(self._to_loop.fail, fault))
@@ -234,11 +239,11 @@ class Bus:
         )
 
     def alive(self, key: str) -> None:
-        """Say that this node is there, until ``close`` or until others miss its signs of life."""
+        """Declare a liveliness token, until ``close`` or until others miss its keep-alives."""
         self._declared.append(self._opened().liveliness().declare_token(key))
 
     def watch(self, key_expr: str, take: Callable[[str, bool], None]) -> None:
-        """Have ``take`` called with each key that is alive, True, and when it is no more, False."""
+        """Call ``take`` with each live key, True, and with False when it is gone."""
         import zenoh
 
         def seen(sample: "zenoh.Sample") -> None:
@@ -250,9 +255,10 @@ class Bus:
         self._declared.append(liveliness.declare_subscriber(key_expr, callback, history=True))
 
     def neighbours(self, take: Callable[[str, bool], None]) -> None:
-        """Have ``take`` called with the id of each session that this one is, or no more, joined to.
+        """Call ``take`` with the id of each directly connected session, True; False when
+        disconnected.
 
-        Those through a router are none.
+        Sessions behind a router are excluded.
         """
         import zenoh
 
@@ -273,7 +279,6 @@ class Bus:
     def _publisher(
         self, key: str, priority: Priority, express: bool, reliable: bool
     ) -> "zenoh.Publisher":
-        """The publisher for these, declared when it is first asked for."""
         import zenoh
 
         publisher = self._publishers.get((key, priority, express, reliable))
@@ -294,7 +299,7 @@ class Bus:
 
 
 def check(config: BusConfig) -> None:
-    """See that Zenoh is here and can read a configuration. Raises ``UserError`` where not."""
+    """Check that Zenoh is installed and accepts a configuration. Raises ``UserError`` if not."""
     with needs("zenoh", "fleet", "Zenoh"):
         import zenoh  # noqa: F401
     _configured(config)
@@ -303,13 +308,13 @@ def check(config: BusConfig) -> None:
 def _close(session: "zenoh.Session") -> None:
     import zenoh
 
-    # It may find that others do not listen; they then miss its signs of life.
+    # Notification may fail; others then miss the keep-alives.
     with contextlib.suppress(zenoh.ZError):
         session.close()  # type: ignore[no-untyped-call]
 
 
 def _error_text(error: Exception) -> str:
-    """What an error of Zenoh says, in one line without the places in its source."""
+    """Return an error of Zenoh in one line, without source locations."""
     return " ".join(str(error).split(" at ")[0].split())
 
 

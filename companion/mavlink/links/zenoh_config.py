@@ -1,4 +1,4 @@
-"""What a Zenoh session is configured with, and how Zenoh reads it.                       [shell]"""
+"""Configuration of a Zenoh session, and its conversion to Zenoh's own.                   [shell]"""
 
 import json
 from dataclasses import dataclass
@@ -10,7 +10,7 @@ from companion.values import UserError
 QUEUED: Final = 16
 """Batches of each priority that wait for the network, the most that Zenoh allows.
 
-With its own 2, and without waiting for room, of 5 samples in a row sent express 2 arrive.
+With Zenoh's default of 2, and without waiting, only 2 of 5 express samples in a row arrive.
 """
 LINKS_MAX: Final = 4  # links to one neighbour: two of each kind, where both connect to each other
 
@@ -30,28 +30,28 @@ Mode = Literal["peer", "client"]
 class BusTls:
     """Certificates for ``tls/`` and ``quic/`` endpoints, as PEM files.
 
-    certificate  this node's own; None only for one that connects to who does not ask for it
+    certificate  this node's own; None only if no server that it connects to asks for one
     """
 
-    ca: Path  # what signed the certificates of others
+    ca: Path  # certificate authority of the others
     certificate: Path | None = None
     private_key: Path | None = None  # its key
-    mutual: bool = True  # whether who connects must show a certificate too
-    check_name: bool = True  # whether a certificate must be that of the host that was connected to
+    mutual: bool = True  # whether clients must present a certificate too
+    check_name: bool = True  # whether a certificate must match the host name
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusConfig:
-    """How a session reaches others.
+    """How a session connects to others.
 
-    mode            "peer" speaks with every other peer directly, and no router passes on what two
-                    peers say; "client" speaks through one router
+    mode            "peer" connects to every other peer directly, and no router forwards between two
+                    peers; "client" communicates through one router
     listen          endpoints of this node, as in tcp/127.0.0.1:7447; empty: it only connects. A
-                    client has none. Beside one with ?rel=1 one with ?rel=0 may stand, ``udp/`` or
-                    ``quic/`` (datagrams, by TLS), for what need not be reliable
-    access_control  a file with Zenoh's section ``access_control``; None: who connects may do all
-    attempt_s       longest time that an attempt takes: 3 round trips over TCP, 5 with TLS. More
-                    on a slow link; what began in a parting delays its end
+                    client has none. An endpoint with ?rel=1 may have one with ?rel=0 beside it,
+                    ``udp/`` or ``quic/`` (datagrams, by TLS), for unreliable samples
+    access_control  a file with Zenoh's section ``access_control``; None: no restrictions
+    attempt_s       timeout of a connection attempt: 3 round trips over TCP, 5 with TLS. More on a
+                    slow link; an attempt that began during an outage delays its end
     """
 
     mode: Mode = "peer"
@@ -59,17 +59,17 @@ class BusConfig:
     connect: tuple[str, ...] = ()  # endpoints of others or of routers
     tls: BusTls | None = None  # certificates; None: endpoints are not tls/
     access_control: Path | None = None
-    scouting: bool = False  # whether others are looked for by multicast
-    lease_s: float = 1.5  # silence after which a neighbour is given up
-    keep_alive: int = 4  # signs of life in one lease
+    scouting: bool = False  # whether others are discovered by multicast
+    lease_s: float = 1.5  # silence after which a neighbour is disconnected
+    keep_alive: int = 4  # keep-alives in one lease
     retry_s: float = 0.25  # time from one attempt to connect to the next
     attempt_s: float = 1.0
 
 
 def sections(config: BusConfig) -> dict[str, str]:
-    """Places in Zenoh's configuration, and the JSON5 that stands there.
+    """Return Zenoh's configuration as JSON5 by path.
 
-    Raises ``UserError`` where a file cannot be read.
+    Raises ``UserError`` if a file cannot be read.
     """
     retry_ms = round(config.retry_s * 1000)
     is_peer = config.mode == "peer"
@@ -92,9 +92,9 @@ def sections(config: BusConfig) -> dict[str, str]:
             },
         },
         "scouting/multicast/enabled": config.scouting,
-        "scouting/delay": 0,  # a session is open before its neighbours are found
+        "scouting/delay": 0,  # open a session before its neighbours are found
         "transport/unicast/max_links": LINKS_MAX if has_unreliable else 1,
-        # Else an attempt to connect hangs on, ever more rarely heard, after the network is back.
+        # Otherwise an attempt hangs with ever longer TCP retries after the network is back.
         "transport/unicast/open_timeout": round(config.attempt_s * 1000),
         "transport/unicast/accept_timeout": round(config.attempt_s * 1000),
         "transport/link/tx/lease": round(config.lease_s * 1000),

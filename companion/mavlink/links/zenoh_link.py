@@ -1,15 +1,16 @@
-"""Raw MAVLink frames over Zenoh, for a link.                                              [shell]
+"""Link with raw MAVLink frames over Zenoh.                                                  [shell]
 
     zenoh:KEY                        through the router on this machine, tcp/127.0.0.1:7447
-    zenoh:KEY?connect=ENDPOINT       through another router, or to a peer that listens
+    zenoh:KEY?connect=ENDPOINT       through another router, or to a listening peer
     zenoh:KEY?listen=ENDPOINT        as a peer that others connect to
-    zenoh:KEY?as=hub&...             the other way round
+    zenoh:KEY?as=hub&...             with both directions swapped
 
-A link hears ``KEY/out`` and says ``KEY/in``: these are the names of who has the vehicles, as with
-bluerobotics/mavlink-server, whose "zenohraw" driver has mavlink_raw/out and mavlink_raw/in. A hub
-has vehicles: it says ``KEY/out`` and hears ``KEY/in``. A sample is any number of whole frames.
+A link subscribes to ``KEY/out`` and publishes ``KEY/in``. The names are from the viewpoint of the
+hub, which has the vehicles, as in bluerobotics/mavlink-server with its mavlink_raw/out and
+mavlink_raw/in ("zenohraw" driver). A hub publishes ``KEY/out`` and subscribes to ``KEY/in``. A
+sample is any number of whole frames.
 
-Endpoints are Zenoh's own; what they need more stands in them, as the certificates in
+Endpoints are Zenoh's own, with their options, such as the certificates in
 ``tls/HOST:7447#root_ca_certificate_file=/etc/companion/ca.pem``.
 """
 
@@ -23,14 +24,14 @@ from companion.mavlink.links.zenoh_bus import Bus, check
 from companion.mavlink.links.zenoh_config import BusConfig
 from companion.values import UserError
 
-ROUTER: Final = "tcp/127.0.0.1:7447"  # where Zenoh's router listens unless told otherwise
-OPEN_S: Final = 5.0  # how long a router is waited for before it is said to be away
+ROUTER: Final = "tcp/127.0.0.1:7447"  # default endpoint of Zenoh's router
+OPEN_S: Final = 5.0  # how long to wait for a router before the link is reported as down
 
 
 class ZenohLink:
-    """A link over a Zenoh session of its own, with whoever uses the same key as its one peer.
+    """Link over its own Zenoh session; all others under the same key are its one peer.
 
-    It ends when the last neighbour goes that it connected to, and is then opened anew.
+    It ends when its last neighbour disconnects, and is then opened again.
     """
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
@@ -43,14 +44,11 @@ class ZenohLink:
         self._bus: Bus | None = None
 
     def open(self) -> None:
-        """Do nothing but look whether Zenoh is here and can read the endpoints.
-
-        Raises ``UserError`` where not.
-        """
+        """Check that Zenoh is installed and accepts the endpoints. Raises ``UserError`` if not."""
         check(self._config)
 
     async def serve(self) -> None:
-        """Hear and say until there is no neighbour left; raises ``OSError`` then."""
+        """Serve until there is no neighbour left; then raise ``OSError``."""
         bus = Bus(self._config, asyncio.get_running_loop())
         near: set[str] = set()
 
@@ -69,28 +67,29 @@ class ZenohLink:
             await bus.run()
         except TimeoutError as error:
             raise OSError("Zenoh's router does not answer") from error
-        except UserError as error:  # an address that cannot be had now
+        except UserError as error:  # an address that is not available now
             raise OSError(str(error)) from error
         finally:
             self._bus = None
             await asyncio.to_thread(bus.close)
 
     def peers(self) -> Collection[Hashable]:
-        """The one peer, None, while somebody listens to what is said here."""
+        """Return the one peer, None, while there is a subscriber to this link's key."""
         bus = self._bus
         return (None,) if bus is not None and bus.is_wanted(self._said_key) else ()
 
     def write(self, key: Hashable, raw: bytes) -> bool:
-        """Publish a frame; what a congested link drops is not known."""
+        """Publish a frame; drops at a congested link are not reported."""
         return self._bus is not None and self._bus.put(self._said_key, raw)
 
     def fullness(self, key: Hashable) -> float:
-        """0: Zenoh does not tell."""
+        """Return 0: Zenoh does not report it."""
         return 0.0
 
 
 def configuration(url: LinkUrl) -> BusConfig:
-    """A peer where it listens; else a client, since no router passes on what peers say."""
+    """Return the configuration: a peer if it listens, else a client, since no router forwards for
+    peers."""
     options = [option.partition("=") for option in url.path.split("&")]
     listen = tuple(value for name, _, value in options if name == "listen")
     connect = tuple(value for name, _, value in options if name == "connect")

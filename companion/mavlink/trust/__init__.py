@@ -1,1 +1,1 @@
-"""Which frames and reports are used: signatures, allow lists, duplicates, ADS-B relays."""
+"""Acceptance of frames and reports: signatures, allow lists, duplicates, ADS-B relays."""

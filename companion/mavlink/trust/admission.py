@@ -1,4 +1,4 @@
-"""Who may be tracked, by the allow and deny lists of the settings."""
+"""Admission of UAVs by the allow and deny lists of the settings."""
 
 from collections.abc import Callable, Iterable
 from fnmatch import fnmatchcase
@@ -6,16 +6,16 @@ from functools import lru_cache
 from typing import Final
 
 KNOWN_MAX: Final = 8192
-"""Ids whose answer is kept; a cache only, since senders may invent as many as they like."""
+"""Size of the cache of answers; bounded, since senders may invent any number of ids."""
 
 
 def admission(allow: Iterable[str], deny: Iterable[str]) -> Callable[[str], bool]:
-    """The function that says which UAVs may be tracked.
+    """Return the function that decides whether a UAV may be tracked.
 
-        allow  patterns of the UAVs that may be; everyone if empty
-        deny   patterns of those that may not, whatever ``allow`` says
+        allow  patterns of allowed ids; all are allowed if empty
+        deny   patterns of denied ids; they override ``allow``
 
-    Patterns are ids in which ``*`` stands for anything.
+    Patterns are ids in which ``*`` matches anything.
     """
     allowed, denied = tuple(allow), tuple(deny)
 

@@ -1,20 +1,19 @@
-"""Aircraft relayed by ADS-B receivers: one stream of reports for each aircraft, whoever relays it.
+"""Aircraft relayed by ADS-B receivers: one stream of reports for each aircraft over all relays.
 
-ADSB_VEHICLE has no time stamp. ``tslc`` counts whole seconds since the aircraft was last heard, so
-a message was true at its arrival less ``tslc``, or up to a second before. Receivers send it again
-and again, with or without news, and not every message has every field:
+ADSB_VEHICLE has no time stamp. ``tslc`` counts whole seconds since the aircraft's last message, so
+a position was true at its arrival less ``tslc``, or up to a second earlier. Receivers repeat
+messages, with or without changes, and not every message has every field:
 
 - Fields are merged one by one, each with the time at which it was true; the newest counts.
-- A message whose position was reported before, and which differs in nothing else, is no news,
-  whichever relay sends it and whatever age it states. Its other fields are dated like that
-  position.
-- A message without a position cannot be told from one sent again, since a cruising aircraft keeps
-  its altitude: its ``tslc`` is believed.
-- Pressure altitude is off from geometric altitude by the weather, up to hundreds of metres. A
-  track that mixes them jumps, so an aircraft keeps its datum while that is fresh. Where a datum has
-  to be chosen, that of the message itself comes first, then geometric, then pressure.
+- A message that repeats a reported position and contradicts no other field is a duplicate,
+  from any relay and with any stated age. Its other fields are dated like that position.
+- A message without a position cannot be recognised as a repeat, since a cruising aircraft keeps
+  its altitude: its ``tslc`` is trusted.
+- Pressure altitude differs from geometric altitude with the weather, by up to hundreds of metres.
+  A track that mixes them jumps, so an aircraft keeps its datum while that is fresh. Otherwise the
+  datum of the message itself comes first, then geometric, then pressure.
 
-See docs/field-notes.md 1 for what relays really send.
+See docs/field-notes.md 1 for the behaviour of real relays.
 """
 
 from collections import OrderedDict
@@ -26,37 +25,35 @@ from companion.values import AdsbVehicle, AltitudeDatum, Reason, Rejection, Repo
 
 _NS: Final = 1_000_000_000
 SLACK_NS: Final = _NS
-"""Time hidden by whole seconds: of two times closer than this, either may be the earlier."""
+"""Time resolution of whole seconds: two closer times have no certain order."""
 ALTITUDE_KEPT_NS: Final = 10 * _NS
-"""Largest distance in time between a position and the altitude joined to it."""
+"""Largest time between a position and the altitude joined to it."""
 VELOCITY_KEPT_NS: Final = SLACK_NS
-"""Largest distance in time between a position and the velocity joined to it.
+"""Largest time between a position and the velocity joined to it.
 
-The error of an old velocity has no bound that grows with its age: a turn of 30 degrees bank changes
-it by 5.7 m/s every second. Within the slack it may well be of the position's own time. Transponders
-send both twice a second (RTCA DO-260B), so older ones are seldom needed.
+The error of an old velocity is unbounded: at a bank angle of 30 degrees it changes by 5.7 m/s every
+second. Within the slack it may be simultaneous with the position. Transponders send both twice a
+second (RTCA DO-260B), so older ones are seldom needed.
 """
 REPEATED_NS: Final = 30 * _NS
-"""How long the same position counts as a repeat; after that, the aircraft may be hovering."""
+"""How long the same position counts as a repeat; later, the aircraft may be hovering."""
 FORGOTTEN_S: Final = 120
-"""Seconds without news after which an aircraft is forgotten. Older messages are no news."""
+"""Seconds without news after which an aircraft is forgotten; older messages are discarded."""
 AIRCRAFT_MAX: Final = 2000
-"""Aircraft remembered; beyond it the one longest without news is forgotten."""
+"""Most aircraft remembered; beyond it the one longest without news is forgotten."""
 POSITIONS_KEPT: Final = 32
-"""Reported positions remembered of each aircraft.
+"""Reported positions remembered per aircraft.
 
-At two a second, a relay may lag 16 s behind another; 4.8 s have been seen.
+At two a second, a relay may lag 16 s behind another; 4.8 s have been observed.
 """
 RELAYS_KEPT: Final = 16  # relays remembered of each aircraft
 
 _T = TypeVar("_T")
-_Dated = tuple[int, _T]  # when it was true, and what
+_Dated = tuple[int, _T]  # when it was true, and the value
 
 
 @dataclass(slots=True, kw_only=True)
 class _RelayedAircraft:
-    """What is known of one aircraft."""
-
     news_ns: int = 0
     position_ns: int | None = None  # when the newest reported position was true
     datum: AltitudeDatum | None = None
@@ -69,14 +66,14 @@ class _RelayedAircraft:
     relays: OrderedDict[Source, int] = field(default_factory=OrderedDict)  # heard from at
 
     def hear(self, relay: Source, t_ns: int) -> None:
-        """Note that a relay reported the aircraft at ``t_ns``."""
+        """Record that a relay reported the aircraft at ``t_ns``."""
         self.relays[relay] = t_ns
         self.relays.move_to_end(relay)
         while len(self.relays) > RELAYS_KEPT or _is_past(next(iter(self.relays.values())), t_ns):
             self.relays.popitem(last=False)
 
     def learn(self, message: AdsbVehicle, true_ns: int) -> None:
-        """Take in every field that is present and newer than what is known."""
+        """Store every field that is present and newer than the known one."""
         if message.alt_datum is not None:
             altitude = _newest(self.altitudes.get(message.alt_datum), true_ns, message.alt_m)
             if altitude is not None:
@@ -87,7 +84,7 @@ class _RelayedAircraft:
         self.callsign = _newest(self.callsign, true_ns, message.callsign)
 
     def repeated(self, message: AdsbVehicle) -> AdsbVehicle | None:
-        """The reported message that this one repeats; None where it has something new."""
+        """Return the reported message that this one repeats; None if it has new content."""
         assert message.position_deg is not None
         before = self.reported.get(message.position_deg)
         if before is None or _differs(before, message):
@@ -96,7 +93,7 @@ class _RelayedAircraft:
         return None if is_later and message.t_ns - before.t_ns > REPEATED_NS else before
 
     def altitude(self, message: AdsbVehicle) -> tuple[AltitudeDatum, float, int] | None:
-        """Datum, metres and age (ns) of the altitude that is joined to a position just learned."""
+        """Return datum, metres and age (ns) of the altitude that belongs to a new position."""
         true_ns = _true_ns(message)
         choice = (self.datum, message.alt_datum, AltitudeDatum.GEOMETRIC, AltitudeDatum.PRESSURE)
         for datum in choice:
@@ -110,7 +107,7 @@ class _RelayedAircraft:
         return None
 
     def report(self, message: AdsbVehicle, at_deg: tuple[float, float]) -> Report | None:
-        """The report of a position that is news; None where no altitude is known for it."""
+        """Return the report of a new position; None if no altitude is known for it."""
         altitude = self.altitude(message)
         if altitude is None:
             return None
@@ -143,8 +140,8 @@ class _RelayedAircraft:
 class Aircraft:
     """All relayed aircraft. ``merge`` takes the messages about them in order of arrival.
 
-    At most ``AIRCRAFT_MAX`` are known, and none that had no news for ``FORGOTTEN_S``. Their names
-    are those of ``AdsbVehicle.uav``.
+    At most ``AIRCRAFT_MAX`` are remembered, and none longer than ``FORGOTTEN_S`` without news.
+    Their names are those of ``AdsbVehicle.uav``.
     """
 
     def __init__(self) -> None:
@@ -153,14 +150,14 @@ class Aircraft:
         )  # the longest without news first
 
     def merge(self, message: AdsbVehicle) -> Report | Rejection:
-        """Take in a message: a report if its position is news, else the reason why there is none.
+        """Merge a message: return a report if its position is new, else a rejection.
 
         The report is completed from earlier messages. Reasons:
 
             NO_POSITION   no position; its other fields are merged
             NO_ALTITUDE   no altitude is known for the position; its fields are merged
             DUPLICATE     the position was reported before
-            OUT_OF_ORDER  certainly older than a reported one, or not heard for ``FORGOTTEN_S``
+            OUT_OF_ORDER  certainly older than a reported one, or at least ``FORGOTTEN_S`` old
         """
         while self._known and _is_past(next(iter(self._known.values())).news_ns, message.t_ns):
             self._known.popitem(last=False)
@@ -168,7 +165,7 @@ class Aircraft:
         if known is not None:
             known.hear(message.source, message.t_ns)
         if message.tslc_s >= FORGOTTEN_S:
-            return _rejected(message, Reason.OUT_OF_ORDER, f"not heard for {message.tslc_s} s")
+            return _rejected(message, Reason.OUT_OF_ORDER, f"{message.tslc_s} s old")
         if known is None:
             known = self._begin(message)
         if message.position_deg is not None:
@@ -189,17 +186,21 @@ class Aircraft:
         return report if report is not None else _rejected(message, Reason.NO_ALTITUDE)
 
     def relays(self, uav: str) -> tuple[Source, ...]:
-        """Relays that spoke of an aircraft in the last ``FORGOTTEN_S``, the newest first."""
+        """Return the relays that reported an aircraft in the last ``FORGOTTEN_S``, the newest
+        first."""
         known = self._known.get(uav)
         return tuple(reversed(known.relays)) if known is not None else ()
 
     def datum(self, uav: str) -> AltitudeDatum | None:
-        """Datum of the altitudes in an aircraft's reports; None before the first report."""
+        """Return the datum of the altitudes in an aircraft's reports.
+
+        None before the first report.
+        """
         known = self._known.get(uav)
         return known.datum if known is not None else None
 
     def callsign(self, uav: str) -> str | None:
-        """The aircraft's own callsign; None if not known."""
+        """Return the aircraft's own callsign; None if unknown."""
         known = self._known.get(uav)
         return known.callsign[1] if known is not None and known.callsign is not None else None
 
@@ -220,21 +221,21 @@ def _true_ns(message: AdsbVehicle) -> int:
 
 
 def _newest(before: _Dated[_T] | None, true_ns: int, value: _T | None) -> _Dated[_T] | None:
-    """The newer of a value that was just received, with its time, and the known one."""
+    """Return the newer of a received value, with its time, and the known one."""
     if value is None or (before is not None and true_ns < before[0]):
         return before
     return true_ns, value
 
 
 def _fitting(own: _T | None, known: _Dated[_T] | None, true_ns: int) -> _T | None:
-    """The message's own value, or the known one if it is of nearly the same time."""
+    """Return the message's own value, or the known one if it is of nearly the same time."""
     if own is not None or known is None or abs(true_ns - known[0]) > VELOCITY_KEPT_NS:
         return own
     return known[1]
 
 
 def _differs(before: AdsbVehicle, message: AdsbVehicle) -> bool:
-    """Whether two messages with one position disagree in velocity or altitude."""
+    """Return whether two messages with one position disagree in velocity or altitude."""
     pairs = [
         (before.velocity_ne_mps, message.velocity_ne_mps),
         (before.velocity_down_mps, message.velocity_down_mps),
@@ -245,7 +246,7 @@ def _differs(before: AdsbVehicle, message: AdsbVehicle) -> bool:
 
 
 def _rejected(message: AdsbVehicle, reason: Reason, detail: str = "") -> Rejection:
-    # Without a position there is nothing to show of the aircraft: it is its relay's message.
+    # Without a position the aircraft cannot be displayed: attribute the message to its relay.
     source = str(message.source) if reason is Reason.NO_POSITION else message.uav
     return Rejection(
         t_ns=message.t_ns, source=source, reason=reason, msgid=ADSB_VEHICLE, detail=detail

@@ -1,8 +1,8 @@
-"""Duplicate reports: one that comes over several links, or twice over one, counts once.
+"""Detection of duplicate reports, which arrive over several links or twice over one.
 
-A report is known by its content: sender, message and payload. The sequence number is no part of it,
-since every link has its own. GLOBAL_POSITION_INT carries a boot time, so equal content is the same
-report. ADSB_VEHICLE carries none: ``adsb`` decides what is new in it.
+A report is identified by its content: sender, message and payload. The sequence number is not part
+of it, since every link has its own. GLOBAL_POSITION_INT carries a boot time, so equal content is
+the same report. ADSB_VEHICLE carries none: ``adsb`` detects repeats there.
 """
 
 from collections import OrderedDict, deque
@@ -12,26 +12,26 @@ from typing import Final
 from companion.values import Frame
 
 WINDOW_NS: Final = 30_000_000_000
-"""How long a report is remembered: longer than any link has been seen to lag behind another."""
-LINKS_MAX: Final = 4096  # links that are counted: a log may name one for each of its frames
+"""How long a report is remembered: longer than the largest lag observed between links."""
+LINKS_MAX: Final = 4096  # most links counted; a log may name one for each of its frames
 LATENCIES_KEPT: Final = 256  # newest latencies kept per link
 
 
 @dataclass(slots=True)
 class LinkShare:
-    """What one link has contributed.
+    """Contribution of one link.
 
-    latencies_s  how old the newest reports were when they came over this link, repeats included
+    latencies_s  latencies of the newest reports over this link, repeats included
     """
 
-    first: int = 0  # reports that it brought before any other link
-    repeats: int = 0  # reports that had already come
+    first: int = 0  # reports that arrived over this link first
+    repeats: int = 0  # reports that had arrived before
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES_KEPT))
 
 
 @dataclass(slots=True)
 class _First:
-    """The first arrival of a report; its latency is None until it is known."""
+    """First arrival of a report; its latency is None until it is known."""
 
     t_ns: int
     link: str
@@ -39,14 +39,14 @@ class _First:
 
 
 class Dedupe:
-    """Remembers the reports of the last ``WINDOW_NS`` by content, and counts them by link."""
+    """Memory of the reports of the last ``WINDOW_NS`` by content, with counts by link."""
 
     def __init__(self) -> None:
         self.shares: dict[str, LinkShare] = {}
         self._seen: OrderedDict[bytes, _First] = OrderedDict()  # in order of arrival
 
     def is_repeat(self, frame: Frame) -> bool:
-        """Count a frame; True if the same content came before, within the window."""
+        """Count a frame; return True if the same content arrived before, within the window."""
         while self._seen and next(iter(self._seen.values())).t_ns < frame.t_ns - WINDOW_NS:
             self._seen.popitem(last=False)
         share = self._share(frame.link)
@@ -62,7 +62,7 @@ class Dedupe:
         return True
 
     def took(self, latency_s: float) -> None:
-        """Set the latency, in seconds, of the report that was last found to be new."""
+        """Set the latency, in seconds, of the last new report."""
         first = next(reversed(self._seen.values()))
         first.latency_s = latency_s
         self._share(first.link).latencies_s.append(latency_s)
@@ -77,10 +77,10 @@ class Dedupe:
 
 
 def content(raw: bytes) -> bytes:
-    """Sender, message id and payload of a frame, without the zeros at the payload's end.
+    """Return sender, message id and payload of a frame, without trailing zeros of the payload.
 
-    MAVLink 2 cuts those; MAVLink 1 has one byte for the message id, and they are brought alike.
+    MAVLink 2 truncates those; MAVLink 1 has one byte for the message id. Both give the same result.
     """
-    if raw[0] == 0xFD:  # they stand one after the other
+    if raw[0] == 0xFD:  # the fields are contiguous
         return raw[5 : 10 + raw[1]].rstrip(b"\0")
     return (raw[3:6] + b"\0\0" + raw[6 : 6 + raw[1]]).rstrip(b"\0")

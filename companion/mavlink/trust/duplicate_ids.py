@@ -1,20 +1,20 @@
-"""One id from two peers at once: whether they tell of one vehicle, or contradict each other.
+"""Detection of two senders under one id, from peers that contradict each other.
 
-A vehicle may be heard over any number of peers. A router brings the same reports over each, a
-second telemetry port has stamps of its own, and a radio that starts again has another address:
-all of them lie on one path. With two reports of one peer, dt apart, a report of another peer whose
-stamp lies between them is off the straight line between these two by at most
+A vehicle may be received over any number of peers. A router forwards the same reports, a second
+telemetry port has its own stamps, and a restarted radio has another address: all of their reports
+lie on one path. Take two reports of one peer, dt apart, and a report of another peer whose stamp
+lies between them. Its distance from the straight line between the two is at most
 
     a dt^2 / 8    in position, and    a dt / 2    in velocity,
 
-where a is the greatest acceleration, but for what one vehicle may say differently of itself:
-``SLACK_M``, the noise that is taken for possible in any report, and ``STALE_S`` of the way flown.
-A report that is further off contradicts the other peer. One or two do so where an autopilot resets
-its position; ``CONTRADICTIONS`` within ``KEPT_NS`` are two senders, and neither is believed until
-they have agreed for that long. The path is not what boot clocks are judged by (``clock/epochs.py``)
-nor what can be flown (``tracking/gate.py``): this holds one who copies the clock and stays near.
+where a is the largest acceleration, plus an allowance for differences between the reports of one
+vehicle: ``SLACK_M``, the noise of any report, and the distance flown in ``STALE_S``. A report
+further off contradicts the other peer. An autopilot that resets its position causes one or two
+contradictions; ``CONTRADICTIONS`` within ``KEPT_NS`` prove two senders, and both are rejected until
+they have agreed for that long. Unlike boot clocks (``clock/epochs.py``) and flight limits
+(``tracking/gate.py``), the path also exposes a sender that copies the clock and stays near.
 
-Peers that the settings name as routers are believed, whoever else contradicts them.
+Peers that the settings name as routers are trusted, even if others contradict them.
 """
 
 import math
@@ -29,18 +29,18 @@ from companion.values import Frame, Vector
 
 CONTRADICTIONS: Final = 5
 SPACED_NS: Final = 500_000_000
-"""Time within which contradictions count as one: a position that is reset makes a few."""
+"""Time within which contradictions count as one: a position reset causes a few."""
 KEPT_NS: Final = 30_000_000_000  # how long a peer and a contradiction are remembered
 SLACK_M: Final = 3.0
 STALE_S: Final = 0.1
 SLACK_MPS: Final = 1.0
 ACCELERATION_MPS2: Final = 20.0
 STRETCH_MS: Final = 2000
-"""Longest time between two reports of a peer that another one is held against."""
-RESTARTED_MS: Final = 10_000  # a stamp that steps back so far is of another boot
+"""Longest time between two reports of a peer with which another one is compared."""
+RESTARTED_MS: Final = 10_000  # a stamp that steps back further is from another boot
 
-SENDERS_MAX: Final = 4096  # senders followed; who was there before is not given up for who is new
-PEERS_MAX: Final = 4  # peers followed of one sender, the last heard
+SENDERS_MAX: Final = 4096  # senders followed; new ones beyond it are not followed
+PEERS_MAX: Final = 4  # peers followed per sender, the most recent
 REPORTS_KEPT: Final = 32  # newest reports kept of a peer
 
 _METRES: Final = 111_195.0 * 1e-7  # metres in 1e-7 degrees of latitude
@@ -48,7 +48,7 @@ _METRES: Final = 111_195.0 * 1e-7  # metres in 1e-7 degrees of latitude
 
 @dataclass(slots=True)
 class _Path:
-    """What one peer says of a sender; ``is_router``: the settings say that it is believed."""
+    """Reports of a sender over one peer; ``is_router``: the settings trust the peer."""
 
     is_router: bool
     heard_ns: int
@@ -57,7 +57,7 @@ class _Path:
 
 @dataclass(slots=True, kw_only=True)
 class _SenderPaths:
-    """A sender by its peers, and when they contradicted each other."""
+    """Paths of a sender by peer, and the times of their contradictions."""
 
     heard_ns: int
     paths: dict[str, _Path] = field(default_factory=dict)
@@ -66,10 +66,10 @@ class _SenderPaths:
 
 
 class DuplicateIds:
-    """Finds two senders under one id, by the peers that bring their frames.
+    """Detector of two senders under one id, by the peers that deliver their frames.
 
-    ``routers`` names peers that are believed: a link as in the settings, HOST or HOST:PORT.
-    ``found`` holds the ids found since it was last emptied, and the peers that bring them.
+    ``routers`` names trusted peers: a link as in the settings, HOST or HOST:PORT.
+    ``found`` holds the ids found since it was last emptied, with their peers.
     """
 
     def __init__(self, routers: Collection[str] = ()) -> None:
@@ -78,10 +78,10 @@ class DuplicateIds:
         self._senders: dict[tuple[int, int], _SenderPaths] = {}
 
     def rejects(self, link: str, peer: str, frame: Frame) -> bool:
-        """Take in a frame of ``decode.POSE``. Returns whether it is not to be believed.
+        """Process a frame of ``decode.POSE``. Return whether it must be rejected.
 
-        ``link`` is the link as it stands in the settings, ``peer`` the peer's HOST:PORT, or the
-        link again where it has but one peer.
+        ``link`` is the link as in the settings, ``peer`` the peer's HOST:PORT, or the link again if
+        it has only one peer.
         """
         sender = self._senders.get(frame.source)
         if sender is None:
@@ -102,7 +102,7 @@ class DuplicateIds:
         return self._are_two(frame, sender) and not path.is_router
 
     def _follow(self, frame: Frame) -> _SenderPaths | None:
-        """Begin to follow a sender; None where there is no room for one that is new."""
+        """Start to follow a sender; None if ``SENDERS_MAX`` is reached."""
         if len(self._senders) >= SENDERS_MAX:
             before_ns = frame.t_ns - KEPT_NS
             self._senders = {k: v for k, v in self._senders.items() if v.heard_ns >= before_ns}
@@ -111,7 +111,7 @@ class DuplicateIds:
         return self._senders.setdefault(frame.source, _SenderPaths(heard_ns=frame.t_ns))
 
     def _meet(self, sender: _SenderPaths, link: str, peer: str, t_ns: int) -> _Path:
-        """Begin to follow a peer of a sender; those that are silent are forgotten."""
+        """Start to follow a peer of a sender; forget silent peers."""
         paths = sender.paths
         for name in [name for name, path in paths.items() if t_ns - path.heard_ns > KEPT_NS]:
             del paths[name]
@@ -122,10 +122,10 @@ class DuplicateIds:
         return paths.setdefault(peer, _Path(not known.isdisjoint(self._routers), t_ns))
 
     def _contradicts(self, sender: _SenderPaths, path: _Path, said: OwnPosition) -> bool:
-        """Add a report to its path. Returns whether that shows two senders.
+        """Add a report to its path. Return whether it proves two senders.
 
-        It is held against the stretches of other peers, and their reports against the stretch that
-        it ends.
+        It is compared with the stretches of other peers, and their reports with the stretch that it
+        ends.
         """
         before = path.reports[-1] if path.reports else None
         if before is not None and said.boot_ms <= before.boot_ms:
@@ -145,7 +145,7 @@ class DuplicateIds:
         return False
 
     def _are_two(self, frame: Frame, sender: _SenderPaths) -> bool:
-        """Whether the peers of a sender contradict each other, which is told once."""
+        """Return whether the peers of a sender contradict each other; add it to ``found`` once."""
         when = sender.contradicted_ns
         while when and frame.t_ns - when[0] > KEPT_NS:
             when.popleft()
@@ -158,7 +158,7 @@ class DuplicateIds:
 
 
 def _around(reports: deque[OwnPosition], boot_ms: int) -> Iterator[tuple[OwnPosition, OwnPosition]]:
-    """The stretches of a path in which a stamp lies, the newest first: one, or two that meet."""
+    """Yield the stretches of a path that contain a stamp, newest first: one, or two that meet."""
     for last, first in pairwise(reversed(reports)):
         if boot_ms > last.boot_ms:
             return
@@ -169,7 +169,7 @@ def _around(reports: deque[OwnPosition], boot_ms: int) -> Iterator[tuple[OwnPosi
 def _within(
     reports: deque[OwnPosition], first: OwnPosition, last: OwnPosition
 ) -> Iterator[OwnPosition]:
-    """The reports of a path whose stamps lie between those of two others, the newest first."""
+    """Yield the reports of a path with stamps between those of two others, the newest first."""
     for one in reversed(reports):
         if one.boot_ms < first.boot_ms:
             return
@@ -178,7 +178,7 @@ def _within(
 
 
 def _is_off(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> bool:
-    """Whether a report whose stamp is between two others cannot be of who made these."""
+    """Return whether a report between two others contradicts their sender."""
     stretch_ms = last.boot_ms - first.boot_ms
     if stretch_ms > STRETCH_MS:
         return False

@@ -1,9 +1,9 @@
-"""Remote ID's aircraft: which one sends from a radio's address, and its reports.
+"""Aircraft of Remote ID: the id behind each radio address, and its reports.
 
-A broadcast names its sender in a message of its own (Basic ID), at least every three seconds; until
-then a position has no name and is not used. Addresses change, and are used by others later: a name
-holds while the address is heard. A sender that says to stand for several aircraft (System) has no
-position that is one's.
+A broadcast sends the id of its sender in a separate message (Basic ID), at least every three
+seconds; until then a position has no id and is not used. Addresses change and are reused: an id
+holds while its address is received. A sender that represents several aircraft (System) has no
+position of a single one.
 """
 
 from collections import OrderedDict
@@ -12,10 +12,10 @@ from typing import Final
 
 from companion.values import AltitudeDatum, Reason, Rejection, RemoteId, Report, Source, UavKind
 
-NAMED_NS: Final = 60_000_000_000  # how long a name holds after its address was last heard
+NAMED_NS: Final = 60_000_000_000  # how long an id holds after the last message of its address
 ADDRESSES_MAX: Final = 4096
-"""Addresses remembered; beyond it the one not heard for longest is forgotten."""
-DATUM_NS: Final = 10_000_000_000  # how long an aircraft keeps what its heights are measured from
+"""Most addresses remembered; beyond it the one silent for longest is forgotten."""
+DATUM_NS: Final = 10_000_000_000  # how long an aircraft keeps the datum of its heights
 
 
 @dataclass(slots=True, kw_only=True)
@@ -29,19 +29,19 @@ class _AddressRecord:
 
 
 class RemoteIds:
-    """What is known of each address, for each receiver. ``merge`` takes messages as they arrive."""
+    """State of each address, per receiver. ``merge`` takes messages in order of arrival."""
 
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[Source, str], _AddressRecord] = OrderedDict()
 
     def merge(self, message: RemoteId) -> Report | Rejection | None:
-        """The report that a message completes, under its aircraft's name; None if it has none.
+        """Return the report that a message completes, under its aircraft's id; None if it has none.
 
         Rejections and their reasons:
 
             NO_IDENTITY  the address has not sent the id of its aircraft yet
-            NO_ALTITUDE  a position without a height, or with one of another datum than before
-            SHARED_ID    it stands for several aircraft
+            NO_ALTITUDE  a position without a height, or with a height of another datum than before
+            SHARED_ID    the sender represents several aircraft
         """
         known = self._learned(message)
         if message.report is None and not message.is_flat:
@@ -50,14 +50,14 @@ class RemoteIds:
             return _rejected(message, UavKind.REMOTE_ID.uav(message.heard_as), Reason.NO_IDENTITY)
         uav = UavKind.REMOTE_ID.uav(known.uas_id)
         if known.aircraft > 1:
-            detail = f"it stands for {known.aircraft} aircraft"
+            detail = f"sender represents {known.aircraft} aircraft"
             return _rejected(message, uav, Reason.SHARED_ID, detail)
         report = message.report
         if report is None:
             return _rejected(message, uav, Reason.NO_ALTITUDE)
         fresh = message.t_ns - known.placed_ns <= DATUM_NS
         if known.datum not in (None, report.alt_datum) and fresh:
-            return _rejected(message, uav, Reason.NO_ALTITUDE, f"{known.datum} before")
+            return _rejected(message, uav, Reason.NO_ALTITUDE, f"datum was {known.datum} before")
         known.datum, known.placed_ns = report.alt_datum, message.t_ns
         return replace(report, uav=uav)
 

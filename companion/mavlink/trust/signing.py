@@ -1,37 +1,37 @@
-"""MAVLink 2 message signing: which frames a link with a key accepts, and how its own are signed.
+"""MAVLink 2 message signing: the frames that a link with a key accepts, and the signing of its own.
 
 The 13 bytes that follow the checksum of a signed frame
 (https://mavlink.io/en/guide/message_signing.html):
 
-    link id     1 byte    which of the sender's links; with the sender's ids it names a stream
+    link id     1 byte    one of the sender's links; with the sender's ids it identifies a stream
     timestamp   6 bytes   little-endian, units of 10 µs since 2015-01-01T00:00:00Z
     signature   6 bytes   the first of SHA-256(key + frame, magic byte to timestamp)
 
-**What is accepted.** A well signed frame that is newer than the newest accepted of its stream. A
-new stream must not be more than a minute behind the local timestamp, which is the newest of the own
-clock and all timestamps accepted. A datagram that another overtook is refused: without that rule it
-could not be told from a replay. Only accepted frames change any state, so that nobody without the
-key can shut a stream by sending a bad signature with a high timestamp. SETUP_SIGNING is a message
-like any other here: nobody changes a key over the air.
+**Acceptance.** A frame with a valid signature is accepted if it is newer than the newest accepted
+one of its stream. A new stream must be at most a minute behind the local timestamp, which is the
+newest of the own clock and all accepted timestamps. A datagram that was overtaken is rejected,
+since it cannot be distinguished from a replay. Only accepted frames change any state. So a sender
+without the key cannot block a stream by a bad signature with a high timestamp. SETUP_SIGNING is
+handled like any other message: keys cannot be changed over the air.
 
-**Each link is on its own.** Guards share nothing, even with one key. A router delivers the same
-signed frame over two links, and the link id in it is the sender's: shared state would refuse
-whichever copy comes later, and with it all that a slow link brings after a fast one. The price is
-that a frame heard on one link can be played once into another: it is genuine, what it reports is
-dropped as a duplicate, and from then on that link refuses it.
+**Links are independent.** Guards share nothing, even with one key. A router delivers the same
+signed frame over two links, and the link id in it is the sender's: shared state would reject the
+later copy, and everything that a slow link delivers after a fast one. The cost is that a frame
+received on one link can be replayed once into another. It is genuine, its report is dropped as a
+duplicate, and from then on that link rejects it.
 
-**Frames of this node** are a stream of the link as well: with one key for all, such a frame sent
-back to the node would otherwise carry a good signature.
+**Frames of this node** are also a stream of the link. Otherwise, with one key for all, such a frame
+sent back to the node would carry a valid signature.
 
-**A wrong clock.** Whoever has the key may send a timestamp far ahead, and the local one follows, as
-the standard has it. Known streams go on by their own clocks. New streams on this link are refused
-until their sender has heard a frame of this node, which then carries the high timestamp and takes
-it along, or until time has caught up; a replay is never accepted instead. Other links do not
-notice. ``LinkSigning.ahead_ns`` shows it. Timestamps in the last ten years of the 48 bits (to
-2104) are not followed, or one frame could leave no timestamps for anybody else.
+**A wrong clock.** Any holder of the key may send a timestamp far ahead, and the local one follows,
+as the standard requires. Known streams continue by their own clocks. New streams on this link are
+rejected until their sender has received a frame of this node with the high timestamp, or until
+time has caught up; a replay is never accepted instead. Other links are unaffected.
+``LinkSigning.ahead_ns`` shows it. Timestamps in the last ten years of the 48 bits (to 2104) are not
+followed, because one frame could then exhaust all timestamps.
 
-**Memory.** At most ``STREAMS_MAX`` streams are remembered. The one with the oldest timestamp gives
-way to a new one; from then on new streams must be newer than what was forgotten.
+**Memory.** At most ``STREAMS_MAX`` streams are remembered. A new stream replaces the one with the
+oldest timestamp; from then on new streams must be newer than the forgotten one.
 """
 
 from collections.abc import Mapping
@@ -57,9 +57,9 @@ LATEST: Final = (1 << 48) - 1  # largest timestamp of 48 bits
 FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
 """Largest timestamp that the local timestamp follows: ten years before ``LATEST``."""
 MARGIN: Final = 5 * SECOND
-"""How far the state on disk may lag behind in a killed process: see ``State.after_crash``."""
+"""Largest lag of the state on disk in a killed process: see ``State.after_crash``."""
 BURST: Final = SECOND
-"""More than the frames sent in ``MARGIN``: each takes one unit where the clock is behind."""
+"""Upper limit on the frames sent in ``MARGIN``; each takes one unit if the clock is behind."""
 
 Stream = tuple[int, int, int]  # system id and component id of the sender, and its link id
 ReceivedTimestamp = tuple[int, int | None]
@@ -71,28 +71,29 @@ The lead is None for a stream of this node.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
-    """What a guard must not forget; times in units of 10 µs since 2015."""
+    """Persistent state of a guard; times in units of 10 µs since 2015."""
 
-    clock: int = 0  # the own clock when this was made
+    clock: int = 0  # the own clock when this was saved
     local: int = 0  # the local timestamp
     sent: int = 0  # newest timestamp of this node's frames
-    floor: int = -1  # streams not in streams must be newer than this
+    floor: int = -1  # new streams must be newer than this
     streams: Mapping[Stream, ReceivedTimestamp] = field(
         default_factory=dict
     )  # newest timestamp of each stream
 
     def after_crash(self) -> Self:
-        """The state to go on with if the process ended up to ``MARGIN`` after this one was made.
+        """Return the state to resume with if the process ended up to ``MARGIN`` after this was
+        saved.
 
-        Each stream is advanced to where its clock was ``MARGIN`` later: a stream may have been
-        silent for an hour before it was heard in the second that is lost, so its newest timestamp
-        plus a margin would not do. Lost frames of this node were stamped no later than ``MARGIN``
-        ahead of the own clock, or of the clock of a sender ahead of it. Streams first heard in the
-        lost time are not known: new streams must be newer than anything this node could have sent.
-        None of this adds up when the process ends this way again and again.
+        Each stream advances to where its clock was ``MARGIN`` later. Its newest timestamp plus a
+        margin would not do: a stream may have been silent for an hour before a frame in the lost
+        second. Lost frames of this node were stamped at most ``MARGIN`` ahead of the own clock, or
+        of a sender's clock that is ahead of it. Streams that began in the lost time are unknown:
+        new streams must be newer than anything this node could have sent. Repeated crashes do not
+        accumulate margins.
 
-        Not covered: what was accepted, in the lost time, from a sender whose clock leapt ahead just
-        then, or that was new and ahead, or that was ahead and came back after a silence longer than
+        Not covered: frames accepted in the lost time from a sender whose clock jumped ahead just
+        then, that was new and ahead, or that was ahead and returned after a silence longer than
         that.
         """
         sent = max(self.sent + BURST, max(self.local, self.clock) + MARGIN)
@@ -114,22 +115,22 @@ class State:
         )
 
 
-START: Final = State()  # nothing heard and nothing sent
+START: Final = State()  # nothing received and nothing sent
 
 
 def fingerprint(key: bytes) -> str:
-    """Eight hex digits that identify a key and do not reveal it."""
+    """Return eight hex digits that identify a key and do not reveal it."""
     return sha256(sha256(key).digest()).hexdigest()[:8]
 
 
 class LinkSigning:
-    """The signing state of one link: its key, and what was heard and sent with it.
+    """Signing state of one link: its key, and the frames received and sent with it.
 
-        key             32 bytes
-        link_id         0 to 255, carried by this node's frames; different for each link of one key
-        allow_unsigned  accept frames without a signature, MAVLink 1 among them; a signature that is
-                        there must still be right
-        state           the state of an earlier run
+    key             32 bytes
+    link_id         0 to 255, carried by this node's frames; different for each link of one key
+    allow_unsigned  accept frames without a signature, including MAVLink 1; signatures must still
+                    be valid
+    state           the state of an earlier run
 
     Raises ``UserError`` for a key of another length, ``ValueError`` for another link id.
     """
@@ -138,9 +139,9 @@ class LinkSigning:
         self, *, key: bytes, link_id: int, allow_unsigned: bool = False, state: State = START
     ) -> None:
         if len(key) != KEY_BYTES:
-            raise UserError(f"a signing key has {KEY_BYTES} bytes, not {len(key)}")
+            raise UserError(f"signing key has {len(key)} bytes; give {KEY_BYTES}")
         if not 0 <= link_id <= 255:
-            raise ValueError(f"a link id is 0 to 255, not {link_id}")
+            raise ValueError(f"link id is {link_id}, allowed: 0 to 255")
         self.link_id = link_id
         self.allow_unsigned = allow_unsigned
         self.moves = 0  # number of times the remembered state has changed
@@ -151,11 +152,11 @@ class LinkSigning:
         self._streams = dict(state.streams)
 
     def refusal(self, frame: Frame) -> Reason | None:
-        """Why a frame must not be used: UNSIGNED, BAD_SIGNATURE or REPLAYED; None if it may.
+        """Return why a frame must be rejected: UNSIGNED, BAD_SIGNATURE or REPLAYED; None to accept
+        it.
 
-        ``frame.raw`` is a whole frame whose checksum is right; ``frame.t_ns`` is the own clock, ns
-        since the Unix epoch. A frame that may be used is remembered, so each frame is to be asked
-        about once.
+        ``frame.raw`` is a whole frame with a correct checksum; ``frame.t_ns`` is the own clock, ns
+        since the Unix epoch. An accepted frame is remembered, so call this once per frame.
         """
         raw = frame.raw
         if raw[0] != MAGIC_V2 or not raw[2] & SIGNED:
@@ -191,7 +192,7 @@ class LinkSigning:
         return signed + sha256(self._key + signed).digest()[:6]
 
     def state(self, now_ns: int) -> State:
-        """The state to keep; ``now_ns`` is the own clock, ns since the Unix epoch."""
+        """Return the state to save; ``now_ns`` is the own clock, ns since the Unix epoch."""
         clock = (now_ns - EPOCH_NS) // UNIT_NS
         return State(
             clock=clock,
@@ -202,14 +203,14 @@ class LinkSigning:
         )
 
     def ahead_ns(self, now_ns: int) -> int:
-        """How far the local timestamp is ahead of the own clock, ns, at least 0.
+        """Return the lead of the local timestamp over the own clock, ns, at least 0.
 
-        Minutes or more mean that a sender's clock is wrong, or that the own clock is or was.
+        Minutes or more mean that a sender's clock is or was wrong, or the own clock.
         """
         return max(0, self._local * UNIT_NS + EPOCH_NS - now_ns)
 
     def _too_old(self, clock: int) -> int:
-        """The newest timestamp with which no new stream may begin."""
+        """Return the newest timestamp that is too old for a new stream."""
         return max(self._floor, max(self._local, clock) - MINUTE - 1)
 
     def _remember(self, stream: Stream, heard: ReceivedTimestamp) -> None:

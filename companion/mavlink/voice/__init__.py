@@ -1,1 +1,1 @@
-"""What the service itself sends over MAVLink: its presence, and requests for message rates."""
+"""MAVLink messages that the service itself sends: heartbeats, and requests for message rates."""

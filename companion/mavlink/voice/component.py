@@ -1,28 +1,28 @@
-"""The service as a MAVLink component: heartbeat, rate requests, TIMESYNC, and conflicts of ids.
+"""The service as a MAVLink component: heartbeat, rate requests, TIMESYNC, and id conflicts.
 
-Pure: the caller passes in the frames heard and the time, and sends what is due.
+Pure: the caller passes in the received frames and the time, and sends the messages that are due.
 
-Heartbeat (https://mavlink.io/en/services/heartbeat.html): once a second, and only while the service
-is fit to be used. One that goes on regardless would lie to the others.
+Heartbeat (https://mavlink.io/en/services/heartbeat.html): once a second, and only while the
+service works. Otherwise it would report a working service that is not.
 
 TIMESYNC (https://mavlink.io/en/services/timesync.html): a request with the time of sending in
-``ts1`` goes to everybody. Each peer answers with that ``ts1`` and its own time in ``tc1``. Newer
-peers also name whom they answer; older ones do not. An answer to another program is recognised by
-its ``ts1``: other programs send microseconds, or any nanosecond, of Unix time, while the last three
+``ts1`` is broadcast. Each peer answers with that ``ts1`` and its own time in ``tc1``. Newer peers
+also address the answer; older ones do not. An answer to another program is recognised by its
+``ts1``: other programs send microseconds, or any nanosecond, of Unix time, while the last three
 digits of ours are the system id, as in ArduPilot, which makes ``ts1`` up to 1 us earlier than the
-sending. A program that sends the very same nanosecond of Unix time to an autopilot that names
-nobody would still be mistaken for this service, once in a thousand million, and the round trip
-would be false only if that program's clock is ahead of ours.
+sending. Once in a thousand million requests, another program's request to an autopilot that does
+not address its answers has the same nanosecond. Its round trip is then mistaken for ours, and is
+false only if that program's clock is ahead of ours.
 
 ``tc1`` is nanoseconds since boot of ArduPilot (``GCS_MAVLINK::handle_timesync``: ``micros64()``
 times 1000) and of PX4 (mavlink_timesync.cpp: ``hrt_absolute_time()`` times 1000), the clock of the
-milliseconds in their positions. Ground stations and other programs answer with Unix time, which
-says nothing of any boot clock. Answers of senders without a position or attitude are therefore not
-read, and answers far off the sender's boot clock are refused. An answer is used ``HELD_NS`` after
-it came: if a second one to the same question cannot be of the same clock, neither is. See
+milliseconds in their positions. Ground stations and other programs answer with Unix time, which is
+unrelated to any boot clock. Answers of senders without a position or attitude are therefore
+ignored, and answers far off the sender's boot clock are rejected. An answer is used ``HELD_NS``
+after it arrived: if a second answer to the same request contradicts it, neither is used. See
 docs/field-notes.md 1.
 
-Over 300 lines: everything that the service hears and says as a component passes here.
+Over 300 lines: everything that the service receives and sends as a component is here.
 """
 
 import struct
@@ -60,7 +60,7 @@ from companion.values import (
 _NS: Final = 1_000_000_000
 COMMAND_ACK: Final = 77
 ACCEPTED_IDS: Final = POSE | {HEARTBEAT, REQUEST_DATA_STREAM, COMMAND_LONG, COMMAND_ACK, TIMESYNC}
-"""Ids of the messages that ``ServiceComponent.hear`` must be given."""
+"""Ids of the messages that ``ServiceComponent.hear`` requires."""
 
 HEARTBEAT_NS: Final = _NS  # time between two heartbeats
 TIMESYNC_NS: Final = (1 * _NS, 5 * _NS)
@@ -69,18 +69,18 @@ TIMESYNC_FIRST: Final = 10  # requests sent at the shorter interval
 LONGEST_TRIP_NS: Final = 10 * _NS  # longest round trip that is used
 KEPT_NS: Final = 30 * _NS  # how long sent messages and senders' newest stamps are remembered
 HELD_NS: Final = 2 * _NS
-"""How long an answer waits for another one that contradicts it: as long as a slow radio takes."""
+"""How long an answer waits for a contradicting one: the delay of a slow radio."""
 CLOCKS_APART_NS: Final = 60 * _NS
-"""Largest distance of an answer from the sender's boot clock.
+"""Largest difference between an answer and the sender's boot clock.
 
-Beyond it, it is about another clock.
+A larger one means that the answer is from another clock.
 """
 _UPTIME_MAX_NS: Final = 10 * 365 * 86_400 * _NS
-"""Greatest time since boot that is believed. Unix time has exceeded it since 1980."""
+"""Largest plausible time since boot. Unix time has exceeded it since 1980."""
 CONFLICT_NOTICE_NS: Final = 300 * _NS  # time after which a conflict of ids is reported again
 
 _BROADCAST: Final = 0
-_NOT_OURS: Final = frozenset({0, 1, 190})  # everybody, an autopilot, a ground station
+_NOT_OURS: Final = frozenset({0, 1, 190})  # broadcast, an autopilot, a ground station
 _RATES_HZ: Final = (0.1, 100.0)
 _ALL_STREAMS: Final = 0
 
@@ -92,16 +92,16 @@ _TIMESYNC = struct.Struct("<qqBB")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ComponentSpec:
-    """The identity of the service on the network, and the message rates that it wants.
+    """Identity of the service on the network, and the message rates that it requests.
 
-    A rate of None asks for nothing. Raises ``UserError`` for ids that belong to ground stations,
-    autopilots or everybody, for a source that is the carrier, and for rates outside 0.1 to 100 Hz.
+    A rate of None requests nothing. Raises ``UserError`` for ids of ground stations, autopilots or
+    broadcasts, for a source equal to the carrier, and for rates outside 0.1 to 100 Hz.
     """
 
     source: Source  # system and component id of the service
     carrier: Source | None  # the vehicle that carries the array; None for a fixed array
-    position_hz: float | None  # rate of GLOBAL_POSITION_INT wanted of every UAV and of the carrier
-    attitude_hz: float | None  # rate of ATTITUDE wanted of the carrier
+    position_hz: float | None  # rate of GLOBAL_POSITION_INT of every UAV and of the carrier
+    attitude_hz: float | None  # rate of ATTITUDE of the carrier
 
     def __post_init__(self) -> None:
         if not 1 <= self.source.sysid <= 254:
@@ -119,7 +119,7 @@ class ComponentSpec:
 
 
 class ServiceComponent:
-    """The service as a MAVLink component. Times are node times and do not go back."""
+    """The service as a MAVLink component. Times are node times and do not decrease."""
 
     def __init__(self, settings: ComponentSpec) -> None:
         self._source = settings.source
@@ -134,16 +134,16 @@ class ServiceComponent:
         self._timesyncs = 0
         self._answered: dict[int, dict[Source, RoundTrip]] = {}  # by time of sending
         self._held: list[RoundTrip] = []  # answers that others may still contradict, in order
-        self._doubted: dict[Source, int] = {}  # when contradictions of a source were last told
+        self._doubted: dict[Source, int] = {}  # last notice on contradictions of a source
         self._sent: dict[tuple[int, bytes], int] = {}  # own messages by content: when last sent
         self._stamps: dict[Source, tuple[int, int]] = {}  # arrival ns and boot ms of the newest
         self._purge_ns = 0
         self._conflict_ns: int | None = None
 
     def hear(self, frame: Frame) -> list[RoundTrip | Rejection | Notice]:
-        """Take in a frame whose id is in ``ACCEPTED_IDS``.
+        """Process a frame whose id is in ``ACCEPTED_IDS``.
 
-        Returns round trips, rejections and notices that came of it, or since the last call.
+        Returns the round trips, rejections and notices since the last call.
         """
         said: list[RoundTrip | Rejection | Notice] = []
         if frame.source == self._source:
@@ -173,12 +173,12 @@ class ServiceComponent:
     def due(
         self, now_ns: int, fit: bool, uavs: Iterable[Source]
     ) -> list[tuple[Outgoing, Source | None]]:
-        """The messages to be sent now, each with its target; None: to everybody.
+        """Return the messages to send now, each with its target; None: broadcast.
 
-            fit   the service can be relied on
-            uavs  UAVs whose positions matter
+            fit   whether the service works
+            uavs  UAVs whose positions are needed
 
-        Call it about ten times a second. What was missed between calls is not made up for.
+        Call it about ten times a second. Messages missed between calls are not sent later.
         """
         out: list[tuple[Outgoing, Source | None]] = []
         if fit and now_ns >= self._heartbeat_ns:
@@ -199,7 +199,7 @@ class ServiceComponent:
         return out
 
     def rates(self) -> list[MessageRate]:
-        """The state of every message whose rate is watched."""
+        """Return the state of every message whose rate is monitored."""
         return self._rates.state()
 
     def _purge(self, oldest_ns: int) -> None:
@@ -210,13 +210,13 @@ class ServiceComponent:
         self._doubted = told
 
     def _own_name(self, frame: Frame, said: list[RoundTrip | Rejection | Notice]) -> None:
-        """Handle a frame under this service's id: one of its own come back, or a stranger's."""
+        """Handle a frame under this service's id: an echo of its own, or another sender's."""
         sent_ns = self._sent.get(_content(frame.msgid, frame.payload))
         if sent_ns is not None and frame.t_ns - sent_ns <= KEPT_NS:
             return
         if self._conflict_ns is None or frame.t_ns - self._conflict_ns >= CONFLICT_NOTICE_NS:
             self._conflict_ns = frame.t_ns
-            text = f"{frame.link}: someone else sends as {self._source}, which is this service's id"
+            text = f"{frame.link}: another sender uses {self._source}, this service's id"
             said.append(
                 Notice(
                     t_ns=frame.t_ns, severity=Severity.WARNING, subject=str(self._source), text=text
@@ -228,10 +228,10 @@ class ServiceComponent:
         answered = self._answered.get(sent_ns)
         stamp = self._stamps.get(frame.source)
         if remote_ns == 0 or answered is None or stamp is None or not self._is_for_us(*target):
-            return  # a request, or an answer to others, or of no use to us
+            return  # a request, an answer to others, or an answer of a sender without stamps
         if frame.t_ns - sent_ns > LONGEST_TRIP_NS:
             trip_s = (frame.t_ns - sent_ns) * 1e-9
-            refused, detail = Reason.OUT_OF_ORDER, f"TIMESYNC: it took {trip_s:.1f} s"
+            refused, detail = Reason.OUT_OF_ORDER, f"TIMESYNC: round trip took {trip_s:.1f} s"
         elif not _is_boot_time(remote_ns, frame.t_ns, *stamp):
             refused, detail = Reason.UNPLACED_STAMP, "TIMESYNC: not the clock of its positions"
         else:
@@ -251,7 +251,7 @@ class ServiceComponent:
     def _contradicted(
         self, first: RoundTrip, second: RoundTrip, said: list[RoundTrip | Rejection | Notice]
     ) -> None:
-        """Discard both of two answers that cannot be of one clock; one that waits no more stays."""
+        """Discard two answers that cannot be of one clock; the first only if it is still held."""
         discarded = [first, second] if first in self._held else [second]
         self._held = [trip for trip in self._held if trip is not first]
         detail = "TIMESYNC: two answers contradict each other"
@@ -259,7 +259,7 @@ class ServiceComponent:
         t_ns, source = second.t_ns, second.source
         if t_ns - self._doubted.get(source, -CONFLICT_NOTICE_NS) >= CONFLICT_NOTICE_NS:
             self._doubted[source] = t_ns
-            text = f"two answer TIMESYNC as {source}, and their clocks differ: neither is used"
+            text = f"two senders answer TIMESYNC as {source} with different clocks: neither is used"
             said.append(
                 Notice(t_ns=t_ns, severity=Severity.WARNING, subject=str(source), text=text)
             )
@@ -272,7 +272,7 @@ class ServiceComponent:
     def _command_long(self, frame: Frame) -> None:
         msgid, interval_us, *_, command, sysid, compid, _ = unpack(frame, _COMMAND_LONG)
         if command == MAV_CMD_SET_MESSAGE_INTERVAL and msgid in STREAM:
-            hz = 1e6 / interval_us if interval_us > 0 else None  # stopped, or its default
+            hz = 1e6 / interval_us if interval_us > 0 else None  # stopped, or default rate
             target = Source(sysid, compid)
             self._rates.requested(
                 Request(
@@ -290,7 +290,7 @@ class ServiceComponent:
             )
 
     def _is_for_us(self, sysid: int, compid: int) -> bool:
-        """Whether an answer may be for this service: it says so, or names nobody."""
+        """Return whether an answer may be for this service: addressed to it, or broadcast."""
         return sysid in (_BROADCAST, self._source.sysid) and compid in (
             _BROADCAST,
             self._source.compid,
@@ -302,10 +302,10 @@ def _refused(t_ns: int, source: Source, why: Reason, detail: str) -> Rejection:
 
 
 def _agree(one: RoundTrip, other: RoundTrip) -> bool:
-    """Whether two answers to one question can be of one clock, however long each was on its way.
+    """Return whether two answers to one request can be of one clock, whatever their delays.
 
-    A question that goes several ways is answered several times. Each answer holds the offset
-    between two bounds, and of one clock both hold the same, but for a millisecond of rounding.
+    A request that takes several routes is answered several times. Each answer bounds the offset;
+    for one clock the intervals overlap, to a millisecond of rounding.
     """
     high_ns = min(one.t_ns - one.remote_ns, other.t_ns - other.remote_ns)
     low_ns = max(one.sent_ns - one.remote_ns, other.sent_ns - other.remote_ns)
@@ -313,12 +313,13 @@ def _agree(one: RoundTrip, other: RoundTrip) -> bool:
 
 
 def _content(msgid: int, payload: bytes) -> tuple[int, bytes]:
-    """The part of a message that a router leaves as it is, whichever version it forwards in."""
+    """Return the part of a message that a router leaves unchanged in either MAVLink version."""
     return msgid, payload.rstrip(b"\0")
 
 
 def _is_boot_time(remote_ns: int, t_ns: int, stamp_t_ns: int, boot_ms: int) -> bool:
-    """Whether ``remote_ns`` is the clock of the stamp ``boot_ms`` that came at ``stamp_t_ns``.
+    """Return whether ``remote_ns`` is the clock of the stamp ``boot_ms`` that came at
+    ``stamp_t_ns``.
 
     The stamp wraps after 49.7 days; ``remote_ns`` does not.
     """

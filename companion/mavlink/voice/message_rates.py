@@ -1,6 +1,6 @@
-"""Requests to the autopilots for the message rates that are wanted, of all UAVs together.
+"""Requests to the autopilots for message rates, for all UAVs together.
 
-What is asked about one message of one UAV, and when, is decided in ``rate_watch``.
+``rate_watch`` decides about one message of one UAV.
 """
 
 from collections import deque
@@ -15,7 +15,7 @@ from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.values import Notice, Source
 
 _NS: Final = 1_000_000_000
-GONE_NS: Final = 5 * _NS  # silence after which a UAV is not asked for anything
+GONE_NS: Final = 5 * _NS  # silence after which a UAV gets no requests
 FORGET_NS: Final = 30 * _NS  # silence after which a UAV is forgotten
 REQUESTS_PER_S: Final = 5  # most requests sent in any second
 
@@ -27,10 +27,10 @@ class _Uav:
 
 
 class MessageRates:
-    """The watched messages of all UAVs.
+    """Monitored messages of all UAVs.
 
-    ``source`` asks for ``position_hz`` of everyone and for ``attitude_hz`` of the carrier; None:
-    any rate will do. ``notices`` collects messages to the operator; the reader empties it.
+    ``source`` requests ``position_hz`` of every UAV and ``attitude_hz`` of the carrier; None: any
+    rate is accepted. ``notices`` collects messages to the operator; the reader empties it.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class MessageRates:
         self._sent: deque[int] = deque(maxlen=REQUESTS_PER_S)
 
     def message_received(self, t_ns: int, source: Source) -> None:
-        """Note that a message of this sender came, whichever it is."""
+        """Record that any message of this sender arrived."""
         uav = self._uavs.get(source)
         if uav is not None:
             uav.heard_ns = t_ns
@@ -60,7 +60,7 @@ class MessageRates:
             self._uavs[source] = _Uav(t_ns, self._watches(t_ns, source))
 
     def stamped(self, t_ns: int, source: Source, msgid: int, boot_ms: int) -> None:
-        """Note a position or an attitude with its sender's stamp."""
+        """Record a position or an attitude with its sender's stamp."""
         self.message_received(t_ns, source)
         uav = self._uavs.get(source)
         watch = uav.watches.get(msgid) if uav is not None else None
@@ -68,18 +68,19 @@ class MessageRates:
             watch.observed.add(t_ns, boot_ms)
 
     def requested(self, request: Request) -> None:
-        """Note that someone else asked for a rate."""
+        """Record a rate request of another component."""
         self._others.append(request)
 
     def acknowledged(self, t_ns: int, source: Source, result: int) -> None:
-        """Note a COMMAND_ACK of a SET_MESSAGE_INTERVAL, addressed to this service or to nobody."""
+        """Process a COMMAND_ACK of SET_MESSAGE_INTERVAL to this service or to all."""
         uav = self._uavs.get(source)
         asked = [w for w in uav.watches.values() if w.state is RateState.ASKED] if uav else []
         if asked:
             max(asked, key=lambda watch: watch.asked_ns).acknowledged(t_ns, result)
 
     def due(self, now_ns: int, uavs: Iterable[Source]) -> list[tuple[Outgoing, Source]]:
-        """The requests to be sent now, with their targets. ``uavs``: those whose positions matter.
+        """Return the requests to send now, with their targets. ``uavs``: those whose positions are
+        needed.
 
         At most ``REQUESTS_PER_S`` in any second; the one that has waited longest comes first.
         """
@@ -103,7 +104,8 @@ class MessageRates:
         return out
 
     def state(self) -> list[MessageRate]:
-        """The state of every watched message, in the order in which the UAVs were first heard."""
+        """Return the state of every monitored message, in the order in which the UAVs first
+        appeared."""
         return [w.view(uav.heard_ns) for uav in self._watched() for w in uav.watches.values()]
 
     def _watched(self) -> list[_Uav]:

@@ -1,27 +1,27 @@
-"""The watch on one message of one UAV: its rate, and the requests that keep it in order.
+"""Monitor of one message of one UAV: its rate, and the requests that maintain it.
 
 A small state machine (``Watch``):
 
-    watching    nothing was asked, or the rate came without asking
+    watching    nothing was requested, or the rate is sufficient without a request
     asked       SET_MESSAGE_INTERVAL was sent; up to three times, as COMMAND_ACK may be lost
-    accepted    the autopilot said so, or its rate shows it
-    streaming   REQUEST_DATA_STREAM was sent, after a refusal or no answer; nobody acknowledges it
+    accepted    the autopilot acknowledged it, or the rate shows that it complied
+    streaming   REQUEST_DATA_STREAM was sent, after a refusal or no answer; it is not acknowledged
     refused     neither helped
 
-A request is sent only where a rate is lower than wanted: a higher one is wanted by someone else.
-The time between two requests doubles from round to round, and begins anew after the rate was in
-order for long. Programs that want different rates of one UAV then do not fight over it, and a thin
-link is not filled with requests.
+A request is sent only if a rate is lower than wanted: another component wants a higher one. The
+time between two requests doubles from round to round, and is reset after the rate was sufficient
+for long. So programs that want different rates of one UAV do not fight over it, and requests do
+not fill a slow link.
 
-The rate is the sender's, measured between its own stamps. What the link loses (up to half),
-repeats, delays or delivers in bursts therefore changes nothing; asking would not either. A message
-counts as absent only while others of the same sender come.
+The rate is the sender's, measured between its own stamps. Frames that the link loses (up to half),
+repeats, delays or delivers in bursts therefore change nothing; a request would not help either. A
+message counts as absent only while others of the same sender arrive.
 
 Sources: https://mavlink.io/en/services/command.html, https://mavlink.io/en/messages/common.html.
 ArduPilot answers FAILED for a message that it does not stream (``set_message_interval`` in its
 GCS_Common.cpp); PX4 ignores REQUEST_DATA_STREAM (mavlink_receiver.cpp).
 
-Over 300 lines: one state machine, with what it observes and what it reports.
+Over 300 lines: one state machine, with its observations and its reports.
 """
 
 import math
@@ -41,22 +41,22 @@ from companion.values.described import DescribedEnum, Meaning
 _NS: Final = 1_000_000_000
 SLOW_BELOW: Final = 0.8  # fraction of the wanted rate below which a rate is slow
 SETTLE_NS: Final = 5 * _NS
-"""How long a rate must be slow, or in order, to count as such: at least this, and five messages."""
+"""Least time a rate must be slow, or sufficient, to count as such; it also takes five messages."""
 TRIES: Final = 3  # SET_MESSAGE_INTERVAL requests in one round before REQUEST_DATA_STREAM is tried
 BACKOFF_NS: Final = (5 * _NS, 300 * _NS)
 """Shortest and longest time between two requests for one message of one UAV."""
 IN_ORDER_NS: Final = 600 * _NS
-"""How long a rate must be in order before the back-off begins anew and notices may be repeated."""
+"""Time of a sufficient rate after which the back-off is reset and notices may be repeated."""
 BLAME_NS: Final = 30 * _NS
-"""Longest time between a request of someone else and a change that is blamed on it."""
+"""Longest time between another component's request and a rate change attributed to it."""
 _ACK_WAIT_NS: Final = 5 * _NS
-"""How long the answer to a command is waited for before another command goes to that UAV."""
+"""How long the answer to a command blocks the next command to that UAV."""
 _PROGRESS_NS: Final = 60 * _NS
 """How long after a request IN_PROGRESS answers still postpone the next one."""
 _LATE_MS: Final = 30_000
 """Largest step back of a stamp that counts as a late frame; a larger one is a restart."""
 _STAMPS: Final = 12  # newest stamps kept per message
-_ENOUGH: Final = 5  # intervals, for a rate or to settle
+_ENOUGH: Final = 5  # intervals needed to measure a rate or to settle
 _WRAP_MS: Final = 1 << 32
 
 _NAMES: Final = {GLOBAL_POSITION_INT: "GLOBAL_POSITION_INT", ATTITUDE: "ATTITUDE"}
@@ -64,7 +64,7 @@ STREAM: Final = {GLOBAL_POSITION_INT: 6, ATTITUDE: 10}
 """Data stream that carries a message: MAV_DATA_STREAM_POSITION, MAV_DATA_STREAM_EXTRA1."""
 _ACCEPTED, _TEMPORARILY_REJECTED, _IN_PROGRESS = 0, 1, 5  # MAV_RESULT; all others are refusals
 RESTART: Final = "a restart"
-NO_REQUEST_SEEN: Final = "nobody was heard asking"
+NO_REQUEST_SEEN: Final = "no request of another component was received"
 
 
 class RateState(DescribedEnum):
@@ -79,7 +79,7 @@ class RateState(DescribedEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class MessageRate:
-    """A message whose rate is requested of a UAV."""
+    """Message whose rate is requested of a UAV."""
 
     uav: Annotated[Source, Meaning("UAV that sends the message", example="3:1")]
     msgid: Annotated[int, Meaning("MAVLink message id")]
@@ -93,7 +93,7 @@ class MessageRate:
 
 
 class Request(NamedTuple):
-    """A request by someone else for the rate of some messages."""
+    """Another component's request for the rate of some messages."""
 
     t_ns: int
     by: Source
@@ -102,13 +102,13 @@ class Request(NamedTuple):
     hz: float | None
 
     def explains(self, uav: Source, msgid: int, wanted_hz: float) -> bool:
-        """Whether this request may have made a message slower than wanted."""
+        """Return whether this request may have made a message slower than wanted."""
         addressed = all(mine in (0, its) for mine, its in zip(self.target, uav, strict=True))
         return addressed and msgid in self.msgids and (self.hz is None or self.hz < wanted_hz)
 
 
 class ObservedRate:
-    """The rate of a message by its sender's own stamps, and when it last came."""
+    """Rate of a message by its sender's own stamps, and its last arrival."""
 
     __slots__ = ("_newest_ms", "last_ns", "restarted_ns", "stamps_ms")
 
@@ -116,10 +116,10 @@ class ObservedRate:
         self.last_ns = now_ns
         self.restarted_ns: int | None = None
         self._newest_ms: int | None = None
-        self.stamps_ms: list[int] = []  # the newest, in order, past the wrap
+        self.stamps_ms: list[int] = []  # the newest, sorted and unwrapped
 
     def add(self, t_ns: int, boot_ms: int) -> None:
-        """Take in one message. A late stamp is put in its place; a repeated one is ignored."""
+        """Add one message. A late stamp is sorted in; a repeated one is ignored."""
         newest_ms = boot_ms if self._newest_ms is None else self._newest_ms
         step_ms = (boot_ms - newest_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
         if step_ms <= -_LATE_MS:
@@ -134,7 +134,7 @@ class ObservedRate:
         del self.stamps_ms[:-_STAMPS]
 
     def median_ns(self) -> int | None:
-        """Median interval between stamps; None while there are too few."""
+        """Return the median interval between stamps; None while there are too few."""
         if len(self.stamps_ms) <= _ENOUGH:
             return None
         return median_high(b - a for a, b in pairwise(self.stamps_ms)) * 1_000_000
@@ -142,7 +142,7 @@ class ObservedRate:
 
 @dataclass(slots=True, kw_only=True)
 class Watch:
-    """The state machine for one message of one UAV."""
+    """State machine for one message of one UAV."""
 
     uav: Source
     msgid: int
@@ -153,23 +153,23 @@ class Watch:
     changed_by: str | None = None
     next_ns: int = 0  # no request before this time
     asked_ns: int = 0  # when the newest request was sent
-    _backoff_ns: int = 0  # of this round; 0: no round since the rate was last long in order
+    _backoff_ns: int = 0  # of this round; 0: no round since the last reset
     _tries: int = 0  # SET_MESSAGE_INTERVAL requests in this round
     _by_stream: bool = False  # SET_MESSAGE_INTERVAL was refused, or not answered
     _slow_since_ns: int | None = None
     _order_since_ns: int | None = None
-    _was_in_order: bool = False  # settled in order since the newest request
+    _was_in_order: bool = False  # whether the rate settled as sufficient since the newest request
     _notified: set[str] = field(default_factory=set)
 
     def observed_hz(self, heard_ns: int) -> float | None:
-        """The rate as of when the UAV was last heard; None while too little is known."""
+        """Return the rate at the UAV's last message; None while there are too few stamps."""
         median_ns = self.observed.median_ns()
         if median_ns is None:
             return None
         return _NS / max(median_ns, heard_ns - self.observed.last_ns)
 
     def view(self, heard_ns: int) -> MessageRate:
-        """The state as of when the UAV was last heard."""
+        """Return the state at the UAV's last message."""
         observed_hz = self.observed_hz(heard_ns)
         return MessageRate(
             uav=self.uav,
@@ -182,7 +182,7 @@ class Watch:
         )
 
     def review(self, now_ns: int, heard_ns: int, others: Iterable[Request]) -> list[Notice]:
-        """Judge the rate. Returns the notices that follow from it."""
+        """Check the rate. Return the resulting notices."""
         observed_hz = self.observed_hz(heard_ns)
         silence_ns = heard_ns - self.observed.last_ns
         slow_hz = self.wanted_hz * SLOW_BELOW
@@ -199,21 +199,21 @@ class Watch:
         return []
 
     def ready(self, now_ns: int) -> bool:
-        """Whether a request is due: the rate has long been slow, and the back-off is over."""
+        """Return whether a request is due: the rate settled as slow, and the back-off is over."""
         since_ns = self._slow_since_ns
         slow = since_ns is not None and self._is_settled(since_ns, now_ns)
         return slow and now_ns >= self.next_ns
 
     def awaits_ack(self, now_ns: int) -> bool:
-        """Whether an answer to the one command that is under way to the UAV may still come.
+        """Return whether the answer to the pending command to the UAV may still arrive.
 
-        There is only one at a time, since an answer does not say which message it is about.
+        Only one is pending at a time, since an answer does not name its message.
         """
         unanswered = self.state is RateState.ASKED and not self._by_stream
         return unanswered and now_ns < self.asked_ns + _ACK_WAIT_NS
 
     def ask(self, now_ns: int, source: Source) -> Outgoing:
-        """Make the request that is due and record that it was sent."""
+        """Build the request that is due and record that it was sent."""
         if self.state is not RateState.ASKED:  # a new round
             self._backoff_ns = min(max(2 * self._backoff_ns, BACKOFF_NS[0]), BACKOFF_NS[1])
             self._tries = 0
@@ -234,7 +234,8 @@ class Watch:
         )
 
     def acknowledged(self, t_ns: int, result: int) -> None:
-        """Take in a COMMAND_ACK to the newest request; after a refusal it is another's."""
+        """Process a COMMAND_ACK to the newest request; after a refusal it belongs to another
+        request."""
         if self._by_stream:
             return
         if result == _ACCEPTED:
@@ -250,13 +251,13 @@ class Watch:
         return now_ns - since_ns >= max(SETTLE_NS, round(_ENOUGH / self.wanted_hz * _NS))
 
     def _expect_change(self) -> None:
-        """Discard what was observed, because the rate is about to change."""
+        """Discard the observations, because the rate is about to change."""
         self.observed.stamps_ms.clear()
         self._slow_since_ns = self._order_since_ns = None
 
     def _in_order(self, now_ns: int) -> None:
         if self.state is RateState.ASKED and not self._by_stream:
-            self.state = RateState.ACCEPTED  # it was done, though nobody was heard to say so
+            self.state = RateState.ACCEPTED  # it complied, but the acknowledgement was lost
         elif self.state in (RateState.ASKED, RateState.REFUSED):
             self.state = RateState.WATCHING
         if self._order_since_ns is None:
@@ -271,8 +272,8 @@ class Watch:
         self, now_ns: int, since_ns: int, observed_hz: float | None, others: Iterable[Request]
     ) -> list[Notice]:
         """Handle a rate that settled as slow: it was changed, or the last request did not help."""
-        comes = "does not come" if observed_hz is None else f"comes at {observed_hz:.2g} Hz"
-        text = f"{self.uav}: {_NAMES[self.msgid]} {comes}, wanted is {self.wanted_hz:g} Hz: "
+        comes = "is not sent" if observed_hz is None else f"is sent at {observed_hz:.2g} Hz"
+        text = f"{self.uav}: {_NAMES[self.msgid]} {comes}, not at {self.wanted_hz:g} Hz: "
         if self._was_in_order:
             self._was_in_order = False
             self.changed_by = self._who_changed(since_ns, others)
@@ -282,11 +283,11 @@ class Watch:
             self.state = RateState.REFUSED
             self.next_ns = now_ns + self._backoff_ns
             self._by_stream = False
-            return self._tell(now_ns, self.state, text + "asking does not help")
+            return self._tell(now_ns, self.state, text + "requests have no effect")
         return []
 
     def _who_changed(self, since_ns: int, others: Iterable[Request]) -> str:
-        """The latest known cause between our own newest request and the change."""
+        """Return the latest known cause between our own newest request and the change."""
         after_ns = max(since_ns - BLAME_NS, self.asked_ns)
         causes = [
             (request.t_ns, str(request.by))

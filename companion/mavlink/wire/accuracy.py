@@ -1,9 +1,9 @@
-"""Codes by which aircraft say how exact they are, as what a GNSS receiver would say.
+"""Accuracy codes of aircraft, converted to the accuracies that a GNSS receiver states.
 
 NACp, NACv and GVA of ADS-B (RTCA DO-260B, 2.2.3.2.7.2.7, 2.2.3.2.6.1.5, 2.2.3.2.7.2.8) and the
 accuracies of Remote ID (ASTM F3411-22a, ASD-STAN prEN 4709-002; MAV_ODID_HOR_ACC and the others of
-https://mavlink.io/en/messages/common.html) each name a limit below which 95 % of errors are. 0 is
-"unknown, or worse than all of these"; a code without a meaning tells nothing either.
+https://mavlink.io/en/messages/common.html) each denote a limit that holds 95 % of errors. 0 is
+"unknown, or worse than all of these"; undefined codes count as unknown.
 """
 
 import math
@@ -14,7 +14,7 @@ from companion.values import Accuracy
 OF_95: Final = math.sqrt(math.log(1 - 0.68) / math.log(1 - 0.95))
 """Radius that holds 68 % of errors over that which holds 95 %, in a plane (Rayleigh): 0.617.
 
-Along a line it is 0.507: the greater is taken for heights too.
+Along a line it is 0.507; the larger ratio is used for heights too.
 """
 _NM_M: Final = 1852.0
 _NACP_M: Final = (
@@ -29,7 +29,7 @@ _VERTICAL_M: Final = (*_GVA_M, 25.0, 10.0, 3.0, 1.0)
 
 
 def adsb(nac_p: int, nac_v: int, gva: int) -> Accuracy | None:
-    """What NACp, NACv and GVA say; None where all are unknown."""
+    """Convert NACp, NACv and GVA; None if all are unknown."""
     known = Accuracy(
         horizontal_m=_of(_NACP_M, nac_p),
         vertical_m=_of(_GVA_M, gva),
@@ -39,7 +39,7 @@ def adsb(nac_p: int, nac_v: int, gva: int) -> Accuracy | None:
 
 
 def remote_id(horizontal: int, vertical: int, speed: int) -> Accuracy:
-    """What the codes of a Remote ID location say."""
+    """Convert the codes of a Remote ID location."""
     return Accuracy(
         horizontal_m=_of(_HORIZONTAL_M, horizontal),
         vertical_m=_of(_VERTICAL_M, vertical),

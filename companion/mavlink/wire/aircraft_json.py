@@ -1,9 +1,9 @@
-"""``aircraft.json`` of readsb and dump1090 as the ADSB_VEHICLE of each aircraft in it.
+"""``aircraft.json`` of readsb and dump1090, converted to one ADSB_VEHICLE per aircraft.
 
-One document is all that a receiver knows, written about once a second; it is asked for again and
-again (``links/http_poll.py``). Its keys: ``README-json.md`` of https://github.com/wiedehopf/readsb.
-Aircraft that others place (TIS-B, multilateration) are refused, for how exact they are is not
-known, and so are addresses that are none of ICAO's (``~``).
+A document holds the whole state of a receiver, written about once a second; it is polled
+(``links/http_poll.py``). Its keys: ``README-json.md`` of https://github.com/wiedehopf/readsb.
+Rejected are aircraft whose position others computed (TIS-B, multilateration), because its accuracy
+is unknown, and addresses that are not ICAO's (``~``).
 """
 
 import json
@@ -15,14 +15,14 @@ from companion.mavlink.wire.foreign import ForeignSplitter, Items
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState
 from companion.values import Reason
 
-DOCUMENT_MAX: Final = 8 << 20  # bytes of a document at most: some 10 000 aircraft
-AIRCRAFT_MAX: Final = 10_000  # aircraft read of one document, and remembered
+DOCUMENT_MAX: Final = 8 << 20  # largest document, bytes: some 10 000 aircraft
+AIRCRAFT_MAX: Final = 10_000  # most aircraft read from a document, and remembered
 _NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s", "mode_ac")
-"""Types of an aircraft that report no position themselves."""
+"""Types of aircraft that do not report their position themselves."""
 
 
 class AircraftJson(ForeignSplitter):
-    """Turns documents into frames; ``feed`` takes a whole one."""
+    """Converter of documents to frames; ``feed`` takes a whole one."""
 
     def __init__(self, link: str) -> None:
         super().__init__(link)
@@ -30,13 +30,13 @@ class AircraftJson(ForeignSplitter):
         self._true_at: OrderedDict[int, float] = OrderedDict()  # by ICAO address
 
     def feed(self, t_ns: int, data: bytes) -> Items:
-        """Take in a document that came at ``t_ns``; returns what is new in it."""
+        """Parse a document received at ``t_ns``; return what is new in it."""
         try:
             if len(data) > DOCUMENT_MAX:
                 raise ValueError(f"{len(data)} bytes")
             document = json.loads(data)
             if not isinstance(document, dict):
-                raise ValueError("no object")
+                raise ValueError("not a JSON object")
             written = _number(document, "now", 0, 1e11)
             aircraft = document["aircraft"]
             if written is None or not isinstance(aircraft, list):
@@ -65,7 +65,10 @@ class AircraftJson(ForeignSplitter):
         return self._aircraft(t_ns, message)
 
     def _is_news(self, message: AircraftState, true_at: float) -> bool:
-        """Whether a position is newer than what was read before; ages are in tenths of seconds."""
+        """Return whether a position is newer than the last one read.
+
+        Ages are in tenths of seconds.
+        """
         before = self._true_at.pop(message.icao, None)
         self._true_at[message.icao] = true_at
         if len(self._true_at) > AIRCRAFT_MAX:
@@ -74,23 +77,23 @@ class AircraftJson(ForeignSplitter):
 
 
 def _aircraft_state(entry: object) -> AircraftState | str | None:
-    """The state of one aircraft; None: no position. Text: why it is not used.
+    """Return the state of one aircraft; None without a position; a text if it must be rejected.
 
-    Raises ``ValueError`` where its fields cannot be what they say.
+    Raises ``ValueError`` for impossible field values.
     """
     if not isinstance(entry, dict):
-        raise ValueError("an aircraft that is no object")
+        raise ValueError("aircraft entry is not a JSON object")
     name = entry.get("hex")
     if not isinstance(name, str) or not 6 <= len(name) <= 7:
-        raise ValueError("an aircraft without an address")
+        raise ValueError("aircraft has no valid address")
     if name.startswith("~"):
-        return "no address of ICAO's"
+        return "not an ICAO address"
     lat_deg, lon_deg = _number(entry, "lat", -90, 90), _number(entry, "lon", -180, 180)
     if lat_deg is None or lon_deg is None:
         return None
     relayed = [one for key in ("mlat", "tisb") for one in _texts(entry, key)]
     if entry.get("type") in _NOT_SEEN or "lat" in relayed:
-        return "placed by others: how exact it is, is not known"
+        return "position computed by others: its accuracy is not stated"
     if entry.get("alt_baro") == "ground":
         entry = {key: value for key, value in entry.items() if key != "alt_baro"}
     above_ellipsoid = _number(entry, "alt_geom", -2000, 200_000)
@@ -115,18 +118,18 @@ def _aircraft_state(entry: object) -> AircraftState | str | None:
         nac_p=int(_number(entry, "nac_p", 0, 15) or 0),
         nac_v=int(_number(entry, "nac_v", 0, 7) or 0),
         gva=int(_number(entry, "gva", 0, 3) or 0),
-        # The document itself is up to a second old: half of it is meant.
+        # The document itself is up to a second old: add half a second on average.
         age_s=math.floor((age_s or 0.0) + 0.5),
     )
 
 
 def _number(entry: Any, key: str, least: float, most: float) -> float | None:
-    """A number; None where it is not there. Raises ``ValueError`` beyond the limits."""
+    """Return a number; None if the key is absent. Raises ``ValueError`` beyond the limits."""
     value = entry.get(key)
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, int | float) or not least <= value <= most:
-        raise ValueError(f"{key} {value!r:.20} is no number from {least:g} to {most:g}")
+        raise ValueError(f"{key} {value!r:.20} is not a number from {least:g} to {most:g}")
     return float(value)
 
 

@@ -1,13 +1,13 @@
-"""The Beast protocol (port 30005) as the ADSB_VEHICLE that a MAVLink receiver would send.
+"""Beast protocol (port 30005), converted to the ADSB_VEHICLE of a MAVLink receiver.
 
 A message is 0x1a, its kind, six bytes of the receiver's 12 MHz counter, one of signal strength, and
 a Mode S message of two (kind 1), seven (2) or fourteen bytes (3); a 0x1a within is doubled. Source:
 https://wiki.jetvision.de/wiki/Mode-S_Beast:Data_Output_Formats, and ``net_io.c`` of readsb for kind
-4 (status) and 0xe3 (which receiver, of many). What is read of fourteen bytes: ``mode_s``.
+4 (status) and 0xe3 (receiver number, of several). ``mode_s`` decodes the fourteen bytes.
 
-How old a message is, the counter tells: as much as it came later than the least late before it.
-Messages whose counter is that of multilateration (FF 00 4D 4C 41 54) are refused, for how exact
-they are is not known.
+The counter gives the age of a message: its delay beyond the least delayed earlier message.
+Messages with the counter of multilateration (FF 00 4D 4C 41 54) are rejected, because their
+accuracy is unknown.
 """
 
 import re
@@ -18,17 +18,17 @@ from companion.mavlink.wire.mode_s import SIZE, Transponders
 from companion.values import Reason
 
 _ESCAPE: Final = b"\x1a"
-_SIZES: Final = {0x31: 9, 0x32: 14, 0x33: 21, 0x34: 21, 0xE3: 8}  # bytes behind a message's kind
+_SIZES: Final = {0x31: 9, 0x32: 14, 0x33: 21, 0x34: 21, 0xE3: 8}  # bytes after a message's kind
 _START: Final = re.compile(rb"\x1a(?=[\x31-\x34\xe3])")
 _MLAT: Final = b"\xff\x00MLAT"
 _TICK_NS: Final = 1000 / 12
 _OLDEST_NS: Final = 120_000_000_000
 _DRIFT: Final = 100e-6
-"""Greatest drift of the counter against this clock: ten times a good crystal's."""
+"""Largest drift of the counter against this clock: ten times that of a good crystal."""
 
 
 class BeastSplitter(ForeignSplitter):
-    """Turns the messages of one connection into frames."""
+    """Converter of the messages of one connection to frames."""
 
     def __init__(self, link: str) -> None:
         super().__init__(link)
@@ -36,7 +36,10 @@ class BeastSplitter(ForeignSplitter):
         self._lateness = _Lateness()
 
     def feed(self, t_ns: int, data: bytes) -> Items:
-        """Take in bytes that arrived at ``t_ns``; returns what the messages in them say."""
+        """Parse bytes that arrived at ``t_ns``.
+
+        Return the frames and rejections of their messages.
+        """
         data, at, garbage = self._pending + data, 0, 0
         out: Items = []
         while True:
@@ -75,9 +78,9 @@ class BeastSplitter(ForeignSplitter):
 
 
 def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:
-    """As many bytes as asked for from a place on, and the place behind them.
+    """Unescape ``size`` bytes from an index; return them and the index after them.
 
-    None where another message begins there, or where the data end (the place is then their end).
+    None if another message begins there, or if the data end (the index is then their end).
     """
     body = bytearray()
     while len(body) < size:
@@ -93,9 +96,9 @@ def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:
 
 
 class _Lateness:
-    """How much later than the least late message one came, by the receiver's counter.
+    """Delay of messages beyond the least delayed one, by the receiver's counter.
 
-    A counter that leaps by more than what a message may be late has begun anew.
+    A counter jump larger than the greatest delay of a message is a restart.
     """
 
     def __init__(self) -> None:
@@ -103,7 +106,7 @@ class _Lateness:
         self._seen_ns = 0
 
     def observe(self, t_ns: int, ticks: int) -> int:
-        """Nanoseconds by which a message was late; 0 where the counter does not run."""
+        """Return the delay of a message, nanoseconds; 0 if the counter does not run."""
         if ticks == 0:
             return 0
         offset_ns = t_ns - ticks * _TICK_NS

@@ -1,9 +1,9 @@
-"""Cursor on Target: an event's fields, from XML and from TAK's protobuf, and from nothing else.
+"""Parser of Cursor on Target events, from XML and from TAK's protobuf.
 
 Sources: the schema ``Event.xsd`` of MITRE (MP090284) for the fields: ``ce`` and ``le`` are standard
 deviations in metres where they are errors, 9999999 where they are unknown, as is ``hae``; and
 ``takproto`` (https://github.com/snstac/takproto) for the protobuf of TAK's protocol, version 1.
-No document type, and so no entity, is read.
+Document types, and so entities, are rejected.
 """
 
 import math
@@ -14,18 +14,18 @@ from datetime import UTC, datetime
 from typing import Any, Final, NamedTuple
 from xml.parsers import expat
 
-DEPTH_MAX: Final = 32  # elements within one another that are read
+DEPTH_MAX: Final = 32  # deepest nesting of elements
 UNKNOWN: Final = 9_999_999.0
 OWN: Final = "uav-companion-beams."
-"""What the ids begin with of events that this program says of others."""
+"""Prefix of the ids of events that this program sends about others."""
 _TIME_MAX_MS: Final = 1 << 48
 _AIR: Final = re.compile(r"a-[a-zA-Z.]-A(-.*)?")
 
 
 class CotEvent(NamedTuple):
-    """An event: who, of which type, how it is known, when (Unix, ms), where, and how it moves.
+    """Event: id, type, how it was determined, time (Unix, ms), position and motion.
 
-    ``ce_m`` and ``le_m`` are standard deviations; what is unknown is None.
+    ``ce_m`` and ``le_m`` are standard deviations; None: unknown.
     """
 
     uid: str
@@ -43,12 +43,12 @@ class CotEvent(NamedTuple):
 
     @property
     def is_aircraft(self) -> bool:
-        """Whether it is the place of something that flies (type a-?-A)."""
+        """Whether it is the position of something airborne (type a-?-A)."""
         return _AIR.fullmatch(self.kind) is not None
 
 
 def from_xml(text: bytes) -> CotEvent:
-    """Read one event. Raises ``ValueError``."""
+    """Parse one event. Raises ``ValueError``."""
     found: dict[str, dict[str, str]] = {}
     depth = 0
 
@@ -56,7 +56,7 @@ def from_xml(text: bytes) -> CotEvent:
         nonlocal depth
         depth += 1
         if depth > DEPTH_MAX:
-            raise ValueError(f"more than {DEPTH_MAX} elements within one another")
+            raise ValueError(f"XML elements nested deeper than {DEPTH_MAX}")
         if name in ("event", "point", "track"):
             found.setdefault(name, attributes)
 
@@ -65,7 +65,7 @@ def from_xml(text: bytes) -> CotEvent:
         depth -= 1
 
     def refused(*_: Any) -> None:
-        raise ValueError("a document type")
+        raise ValueError("document type (DTD) is not allowed")
 
     parser = expat.ParserCreate("utf-8")
     parser.StartElementHandler, parser.EndElementHandler = begun, ended
@@ -73,7 +73,7 @@ def from_xml(text: bytes) -> CotEvent:
     try:
         parser.Parse(text, True)
     except expat.ExpatError as error:
-        raise ValueError(f"no XML: {error}") from error
+        raise ValueError(f"malformed XML: {error}") from error
     event, point = found.get("event", {}), found.get("point", {})
     track = found.get("track", {})
     try:
@@ -82,7 +82,7 @@ def from_xml(text: bytes) -> CotEvent:
         place = [float(point[key]) for key in ("lat", "lon", "hae", "ce", "le")]
         motion = [float(track.get(key, "nan")) for key in ("course", "speed", "slope")]
     except KeyError as missing:
-        raise ValueError(f"no {missing.args[0]}") from missing
+        raise ValueError(f"{missing.args[0]} is missing") from missing
     return _checked(uid, kind=kind, how=how, time_ms=time_ms, place=place, motion=motion)
 
 
@@ -97,11 +97,11 @@ def _checked(
     lat_deg, lon_deg, hae_m, ce_m, le_m = place
     course_deg, speed_mps, slope_deg = motion
     if not 0 <= time_ms < _TIME_MAX_MS:
-        raise ValueError(f"time {time_ms} ms")
+        raise ValueError(f"time {time_ms} ms is out of range")
     if not uid:
-        raise ValueError("no uid")
+        raise ValueError("uid is missing")
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
-        raise ValueError(f"latitude {lat_deg}, longitude {lon_deg}")
+        raise ValueError(f"latitude {lat_deg}, longitude {lon_deg} out of range")
     return CotEvent(
         uid=uid,
         kind=kind,
@@ -122,7 +122,7 @@ def _checked(
 
 
 def from_protobuf(message: bytes) -> CotEvent | None:
-    """Read a TakMessage; None for one without an event. Raises ``ValueError``."""
+    """Parse a TakMessage; None for one without an event. Raises ``ValueError``."""
     body = dict(_fields(message)).get(2)
     if body is None:
         return None
@@ -130,13 +130,13 @@ def from_protobuf(message: bytes) -> CotEvent | None:
     detail = dict(_fields(_bytes(event.get(15, b""))))
     track = dict(_fields(_bytes(detail.get(7, b""))))
     place = [_double(event.get(number, 0.0)) for number in range(10, 15)]
-    # What is left out of a message is zero: a whole track is left out where there is none.
+    # Absent fields are zero; the whole track is absent if there is none.
     absent = 0.0 if 7 in detail else math.nan
     motion = [_double(track.get(number, absent)) for number in (2, 1)]
     names = [_bytes(event.get(number, b"")).decode("utf-8") for number in (5, 1, 9)]
     time_ms = event.get(6)
     if not isinstance(time_ms, int):
-        raise ValueError("no time")
+        raise ValueError("time is missing")
     uid, kind, how = names
     return _checked(
         uid, kind=kind, how=how, time_ms=time_ms, place=place, motion=[*motion, math.nan]
@@ -144,7 +144,7 @@ def from_protobuf(message: bytes) -> CotEvent | None:
 
 
 def _fields(message: bytes) -> Iterator[tuple[int, int | float | bytes]]:
-    """Fields by number (https://protobuf.dev/programming-guides/encoding/), in their order."""
+    """Yield fields by number, in order (https://protobuf.dev/programming-guides/encoding/)."""
     at = 0
     while at < len(message):
         tag, at = varint(message, at)
@@ -163,28 +163,28 @@ def _fields(message: bytes) -> Iterator[tuple[int, int | float | bytes]]:
                 _span(message, at, 4)
                 at += 4
             case _:
-                raise ValueError("no protobuf")
+                raise ValueError("unknown protobuf wire type")
 
 
 def varint(message: bytes, at: int) -> tuple[int, int]:
-    """A number of variable length, and the place behind it. Raises ``ValueError``."""
+    """Decode a varint; return it and the index after it. Raises ``ValueError``."""
     value = 0
     for number, byte in enumerate(message[at : at + 10]):
         value |= (byte & 0x7F) << 7 * number
         if byte < 0x80:
             return value, at + number + 1
-    raise ValueError("a number without an end")
+    raise ValueError("truncated varint")
 
 
 def _span(message: bytes, at: int, size: int) -> bytes:
     if at + size > len(message):
-        raise ValueError("a field beyond the end")
+        raise ValueError("truncated field")
     return message[at : at + size]
 
 
 def _bytes(value: object) -> bytes:
     if not isinstance(value, bytes):
-        raise ValueError("a number in place of text")
+        raise ValueError("expected a length-delimited field")
     return value
 
 

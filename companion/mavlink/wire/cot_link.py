@@ -1,9 +1,9 @@
-"""Events of Cursor on Target on a link, and the TUNNEL that carries each from there on.
+"""Cursor on Target events on a link, and the TUNNEL frame that carries each inside the program.
 
-MAVLink has no message for what an event says: a name of any length, errors in metres. A TUNNEL
-with a payload of a vendor's kind (https://mavlink.io/en/messages/common.html#TUNNEL) is what it has
-for the like, so events are recorded, replayed and shown as any frame. ``decode`` reads those of
-``SENDER`` alone.
+MAVLink has no message for an event's content: an id of any length, errors in metres. Each event
+is therefore carried in a TUNNEL with a vendor-specific payload type
+(https://mavlink.io/en/messages/common.html#TUNNEL), and is recorded, replayed and displayed like
+any frame. ``decode`` reads only those of ``SENDER``.
 
 Peers send XML, one event after the other, or TAK's protocol, version 1: 0xbf, the length, a message
 (a stream), or 0xbf 0x01 0xbf and a message (a datagram).
@@ -30,8 +30,8 @@ from companion.values import (
 )
 
 TUNNEL: Final = 385
-SENDER: Final = Source(0, 25)  # who says it: no system, MAV_COMP_ID_USER1
-EVENT_MAX: Final = 16 << 10  # bytes of an event at most; a longer one is garbage
+SENDER: Final = Source(0, 25)  # sender of the frames: no system, MAV_COMP_ID_USER1
+EVENT_MAX: Final = 16 << 10  # longest event, bytes; a longer one is garbage
 _KIND: Final = 0xC07A
 _EVENT = struct.Struct("<Qii6f")
 _HEAD = struct.Struct("<HBBB")
@@ -42,10 +42,13 @@ _PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,60}")
 
 
 class CotSplitter(ForeignSplitter):
-    """Turns the events of one peer into frames."""
+    """Converter of the events of one peer to frames."""
 
     def feed(self, t_ns: int, data: bytes) -> Items:
-        """Take in bytes that arrived at ``t_ns``; returns what the events in them say."""
+        """Parse bytes that arrived at ``t_ns``.
+
+        Return the frames and rejections of their events.
+        """
         data, at, garbage = self._pending + data, 0, 0
         out: Items = []
         while True:
@@ -87,21 +90,21 @@ class CotSplitter(ForeignSplitter):
 
 
 def _unfit(event: CotEvent) -> str:
-    """Why an event is not used; empty where it is."""
+    """Return why an event must be rejected; empty to use it."""
     if not event.is_aircraft:
-        return "no aircraft"
+        return "not an aircraft"
     if event.how.startswith("h"):
-        return "placed by hand"
-    return "what a companion made of it" if event.uid.startswith(OWN) else ""
+        return "position entered by hand"
+    return "event of another companion service" if event.uid.startswith(OWN) else ""
 
 
 def _stray(data: bytes) -> int:
-    """Bytes between events that are none of XML's own: its declaration, and blanks."""
+    """Count the bytes between events, except XML declarations and white space."""
     return len(re.sub(rb"<\?xml[^>]*\?>|\s", b"", data))
 
 
 def _beginning(data: bytes, at: int) -> int:
-    """Bytes at the end that may be the beginning of an event or of a declaration."""
+    """Count the bytes at the end that may start an event or a declaration."""
     opened = data.rfind(b"<", max(at, len(data) - 200))
     return 0 if opened < 0 or b">" in data[opened:] else len(data) - opened
 
@@ -112,9 +115,9 @@ def _xml_end(data: bytes, at: int) -> int | None:
 
 
 def _tak_end(data: bytes, at: int) -> int | None:
-    """The place behind a message of TAK's; None where it is not all there.
+    """Return the index after a TAK message; None if it is incomplete.
 
-    A datagram has no length: its message is what there is.
+    A datagram has no length: its message extends to the end.
     """
     if data[at + 1 : at + 3] == b"\x01\xbf":
         return len(data)
@@ -134,7 +137,7 @@ def _tak(raw: bytes) -> CotEvent | None:
 
 
 def _name(uid: str) -> str:
-    """An id that may stand in an address; of another one a part, and what tells it apart."""
+    """Return an event's uid, or a shortened one with a hash if it has other characters."""
     if _PLAIN.fullmatch(uid):
         return uid
     short = re.sub(r"[^A-Za-z0-9._-]", "_", uid)[:40]
@@ -156,7 +159,7 @@ def _outgoing(event: CotEvent) -> Outgoing:
 
 
 def report(frame: Frame) -> Report | None:
-    """The report that a TUNNEL of ``SENDER`` carries; None of any other. Raises ``ValueError``."""
+    """Return the report in a TUNNEL of ``SENDER``; None for any other. Raises ``ValueError``."""
     if frame.source != SENDER:
         return None
     payload = frame.payload.ljust(_HEAD.size + 128, b"\0")
@@ -166,13 +169,13 @@ def report(frame: Frame) -> Report | None:
     body = payload[_HEAD.size : _HEAD.size + size]
     name = body[_EVENT.size :].decode("ascii", "replace")
     if not _PLAIN.fullmatch(name):
-        raise ValueError("no name")
+        raise ValueError("invalid uid")
     time_ms, lat, lon, *numbers = _EVENT.unpack_from(body)
     hae_m, ce_m, le_m, course_deg, speed_mps, slope_deg = (
         None if math.isnan(one) else one for one in numbers
     )
     if hae_m is None or abs(lat) > 900_000_000 or abs(lon) > 1_800_000_000:
-        raise ValueError("no place")
+        raise ValueError("position is missing or out of range")
     velocity = down = None
     if course_deg is not None and speed_mps is not None:
         course = math.radians(course_deg)

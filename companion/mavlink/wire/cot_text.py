@@ -1,8 +1,7 @@
-"""An event of Cursor on Target as XML, for others to read.
+"""Cursor on Target events as XML, for other programs.
 
-``ce`` and ``le`` are what is guaranteed of the error, which is more than the standard deviation
-that the schema means (``cot``): who takes one for the other is on the safe side, and ``remarks``
-say which it is.
+``ce`` and ``le`` are guaranteed bounds, which exceed the standard deviation that the schema means
+(``cot``). A reader that confuses the two errs on the safe side, and ``remarks`` state which it is.
 """
 
 from datetime import UTC, datetime
@@ -11,12 +10,12 @@ from xml.sax.saxutils import escape, quoteattr
 
 from companion.mavlink.wire.cot import OWN, UNKNOWN
 
-KIND: Final = "a-u-A"  # something that flies, and of which nobody said whose it is
-HOW: Final = "m-f"  # by a machine, from several reports
+KIND: Final = "a-u-A"  # airborne, affiliation unknown
+HOW: Final = "m-f"  # machine-generated, fused from several reports
 
 
 class CotPosition(NamedTuple):
-    """Where an aircraft is, how far it may be off, and how it moves; None is unknown.
+    """Position of an aircraft, bounds on its error, and motion; None: unknown.
 
     ``ce_m`` and ``le_m`` bound the error in the plane and in height.
     """
@@ -31,7 +30,7 @@ class CotPosition(NamedTuple):
 
 
 def event(uav: str, at_ns: int, stale_ns: int, place: CotPosition, remarks: str) -> bytes:
-    """One event, valid from one Unix time to another."""
+    """Return one event as XML, valid from one Unix time to another."""
     at, stale = _time(at_ns), _time(stale_ns)
     hae, le = (UNKNOWN if one is None else one for one in (place.hae_m, place.le_m))
     track = ""
@@ -47,7 +46,7 @@ def event(uav: str, at_ns: int, stale_ns: int, place: CotPosition, remarks: str)
 
 
 def uid(uav: str) -> str:
-    """The id of the events of a UAV; companions know them by it, and do not take them in."""
+    """Return the event id of a UAV; companion services recognise and ignore such events."""
     return OWN + uav.replace(":", ".")
 
 

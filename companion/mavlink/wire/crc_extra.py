@@ -1,10 +1,9 @@
 """Checksum seeds (CRC_EXTRA) of the MAVLink messages that can be checked.
 
 A frame whose message id is not in the table cannot be checked and is not trusted. The table is that
-of pymavlink's generated ``all`` dialect. It is written out here because importing the dialect takes
-more than half a second on a small computer, and the service needs nothing else of it.
-``tests/mavlink/wire/test_crc_extra.py`` compares it with the dialect and prints the new table when
-they differ.
+of pymavlink's generated ``all`` dialect, copied because importing the dialect takes more than half
+a second on a small computer. ``tests/mavlink/wire/test_crc_extra.py`` compares it with the dialect
+and prints the new table when they differ.
 """
 
 # fmt: off

@@ -1,8 +1,8 @@
 """Decoders: one function per message, from a frame to a value, each field with its own validity.
 
-Sources: the message definitions of https://mavlink.io/en/messages/common.html. MAVLink 2 cuts
+Sources: the message definitions of https://mavlink.io/en/messages/common.html. MAVLink 2 truncates
 trailing zero bytes of a payload, and a version 1 frame has no extension fields: both are read as
-zeros, as the standard says. Where zero means "not sent" the value is None.
+zeros, as the standard requires. Where zero means "not sent" the value is None.
 """
 
 import math
@@ -39,20 +39,20 @@ POSE: Final = positions.OWN | {ATTITUDE}
 """Messages in which vehicles report their own position or attitude, stamped by their boot clock."""
 
 NULL_ISLAND_RADIUS_M: Final = 5000.0
-"""Distance from 0 N 0 E within which no position is believed.
+"""Distance from 0 N 0 E within which positions are rejected.
 
-Estimators without a fix wander there by some metres (docs/field-notes.md 1).
+Estimators without a fix drift there by some metres (docs/field-notes.md 1).
 """
 _METRES_PER_DEGREE: Final = 111_195.0
 
-# ADSB_FLAGS. Not asked for: 256 is BARO_VALID to some and "retransmitted" to others (PX4).
+# ADSB_FLAGS. Flag 256 is ignored: BARO_VALID in some programs, "retransmitted" in others (PX4).
 _COORDS, _ALTITUDE, _HEADING, _VELOCITY, _CALLSIGN, _VERTICAL = 1, 2, 4, 8, 16, 128
 _DATUM: Final = {0: AltitudeDatum.PRESSURE, 1: AltitudeDatum.GEOMETRIC}  # ADSB_ALTITUDE_TYPE
 _ICAO_MAX: Final = 0xFF_FFFF
 
 
 class _RefusedError(Exception):
-    """Raised inside this module only: the message must be rejected, for this reason."""
+    """Internal error: the message must be rejected, for this reason."""
 
     def __init__(self, reason: Reason, detail: str = "") -> None:
         super().__init__(reason)
@@ -61,9 +61,9 @@ class _RefusedError(Exception):
 
 
 def decode(frame: Frame) -> Message | Rejection | None:
-    """Decode a frame. Returns None for messages that nobody here reads, or that are of no matter.
+    """Decode a frame. Returns None for messages without a decoder or without relevant content.
 
-    A frame whose fields cannot be used gives a ``Rejection`` with its reason.
+    A frame with unusable fields gives a ``Rejection`` with its reason.
     """
     decoder = _DECODERS.get(frame.msgid)
     if decoder is None:
@@ -81,9 +81,9 @@ def decode(frame: Frame) -> Message | Rejection | None:
 
 
 def _position(lat_1e7: int, lon_1e7: int) -> tuple[float, float]:
-    """Latitude and longitude in degrees.
+    """Return latitude and longitude in degrees.
 
-    Refuses coordinates that are no place on Earth, and those that are sent before there is a fix.
+    Rejects coordinates out of range, and those that are sent before there is a fix.
     """
     lat_deg, lon_deg = lat_1e7 * 1e-7, lon_1e7 * 1e-7
     if abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
@@ -94,7 +94,6 @@ def _position(lat_1e7: int, lon_1e7: int) -> tuple[float, float]:
 
 
 def _own_position(frame: Frame) -> Report:
-    """Decode a position that a vehicle sent of itself."""
     said = positions.read(frame)
     lat_deg, lon_deg = _position(said.lat_1e7, said.lon_1e7)
     velocity = said.velocity_ned_mps
@@ -125,7 +124,7 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
 
     ``ver_velocity`` is positive up; ``heading`` is the course over ground. A speed without a course
     gives no velocity, an altitude of an undefined type no altitude. An address of 0 or of more than
-    24 bits (ICAO Annex 10) is refused. Accuracies stand behind it where this program put them
+    24 bits (ICAO Annex 10) is rejected. Accuracies are appended if this program wrote the message
     (``transponder``).
     """
     fields = unpack(frame, _ADSB_VEHICLE)
@@ -158,7 +157,7 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
 
 
 def _callsign(padded: bytes) -> str | None:
-    """The callsign up to the first zero byte, stripped of blanks; None if empty or unprintable."""
+    """Return the callsign up to the first zero byte, stripped; None if empty or unprintable."""
     text = padded.partition(b"\0")[0].decode("latin-1").strip()
     return text if text and text.isascii() and text.isprintable() else None
 
@@ -168,16 +167,16 @@ _ATTITUDE = struct.Struct("<Iffffff")
 
 TURN_RAD: Final = 6.3
 RATE_MAX_RADPS: Final = 75.0
-"""Rates beyond it are no gyroscope's: the widest range of those aboard is 4000 degrees a second."""
+"""Largest rate that a gyroscope can measure: the widest range on board is 4000 degrees a second."""
 
 
 def _attitude(frame: Frame) -> Attitude:
     """Decode body attitude (FRD from NED, radians) and body rates (rad/s)."""
     boot_ms, *angles = unpack(frame, _ATTITUDE)
     if not all(map(math.isfinite, angles)):
-        raise _RefusedError(Reason.MALFORMED, "an angle or rate is not a number")
+        raise _RefusedError(Reason.MALFORMED, "angle or rate is not finite")
     if max(map(abs, angles[:3])) > TURN_RAD or max(map(abs, angles[3:])) > RATE_MAX_RADPS:
-        raise _RefusedError(Reason.MALFORMED, "an angle or rate that nothing can measure")
+        raise _RefusedError(Reason.MALFORMED, "angle or rate is out of range")
     roll_rad, pitch_rad, yaw_rad, rollspeed_radps, pitchspeed_radps, yawspeed_radps = angles
     return Attitude(
         t_ns=frame.t_ns,
@@ -205,12 +204,12 @@ _GPS_RAW_INT = struct.Struct("<QiiiHHHHBBiIIIIH")
 
 
 def _stated(thousandths: int) -> float | None:
-    """An accuracy in m or m/s; None where it was not sent, or is all ones."""
+    """Return an accuracy in m or m/s; None if it was not sent, or is all ones."""
     return None if thousandths in (0, _UNKNOWN) else thousandths * 1e-3
 
 
 def _gps_raw_int(frame: Frame) -> GnssStatus:
-    """Decode fix type and accuracies; the accuracies are extension fields, 0 where not sent."""
+    """Decode fix type and accuracies; the accuracies are extension fields, 0 if not sent."""
     fields = unpack(frame, _GPS_RAW_INT)
     h_acc, v_acc, vel_acc = fields[11:14]
     return GnssStatus(
@@ -231,7 +230,7 @@ _SYSTEM_TIME = struct.Struct("<QI")
 def _system_time(frame: Frame) -> SystemTime:
     """Decode Unix time and boot time; Unix time 0 means that the sender has none.
 
-    Nothing is checked.
+    Neither is checked.
     """
     unix_us, boot_ms = unpack(frame, _SYSTEM_TIME)
     return SystemTime(
@@ -244,7 +243,7 @@ _KNOWS_ATTITUDE, _UNINITIALIZED = 1, 1024
 
 
 def _ekf_status_report(frame: Frame) -> EstimatorStatus:
-    """Decode what ArduPilot's estimator says of its attitude; ``compass_variance`` is a ratio."""
+    """Decode ArduPilot's estimator status; ``compass_variance`` is a ratio."""
     *_, compass_ratio, _, flags = unpack(frame, _EKF_STATUS_REPORT)
     if not math.isfinite(compass_ratio) or compass_ratio < 0.0:
         raise _RefusedError(Reason.MALFORMED, "compass ratio is negative or not finite")

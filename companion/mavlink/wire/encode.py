@@ -1,7 +1,7 @@
-"""Encoders of the few messages that the service sends.
+"""Encoders of the messages that the service sends.
 
-A payload is made once. Its frame is made for each peer, since every peer counts sequence numbers of
-its own. Fields are laid out as on the wire: by size, largest first, then extensions
+A payload is encoded once; its frame is built per peer, since every peer has its own sequence
+numbers. Fields are laid out as on the wire: by size, largest first, then extensions
 (https://mavlink.io/en/guide/serialization.html). ``tests/mavlink/wire/test_encode.py`` compares
 every message with pymavlink's generated dialect.
 """
@@ -33,7 +33,7 @@ _MAVLINK_VERSION: Final = 3
 
 
 class Outgoing(NamedTuple):
-    """A message to be sent: its sender, its id, and its payload at full length."""
+    """Message to send: its sender, its id, and its payload at full length."""
 
     source: Source
     msgid: int
@@ -41,10 +41,10 @@ class Outgoing(NamedTuple):
 
 
 def pack(message: Outgoing, seq: int, version: int = 2) -> bytes:
-    """The frame of a message: MAVLink 2, unsigned, with trailing zeros cut; or MAVLink 1.
+    """Build the frame of a message: MAVLink 2, unsigned, with trailing zeros cut; or MAVLink 1.
 
-    A payload with extension fields cannot be sent as MAVLink 1: a payload that may go out as either
-    version must be made without them.
+    A payload with extension fields cannot be sent as MAVLink 1. Omit them from a payload that may
+    be sent as either version.
     """
     seed = bytes([CRC_EXTRA[message.msgid]])
     if version == 1:
@@ -59,7 +59,7 @@ def pack(message: Outgoing, seq: int, version: int = 2) -> bytes:
 
 
 def heartbeat(source: Source) -> Outgoing:
-    """HEARTBEAT of an active onboard controller without an autopilot."""
+    """Encode the HEARTBEAT of an active onboard controller without an autopilot."""
     payload = struct.pack(
         "<IBBBBB", 0, _ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, _ACTIVE, _MAVLINK_VERSION
     )
@@ -75,9 +75,9 @@ def global_position_int(
     velocity_ned_mps: tuple[float, float, float],
     heading_deg: float | None,
 ) -> Outgoing:
-    """GLOBAL_POSITION_INT: ``place`` is latitude and longitude in degrees, and metres.
+    """Encode GLOBAL_POSITION_INT: ``place`` is latitude and longitude in degrees, and metres.
 
-    Speeds beyond what the message holds are cut to it.
+    Speeds are clipped to the range of the message.
     """
     lat_deg, lon_deg, alt_m = place
     speeds = (max(-32_767, min(32_767, round(speed * 100))) for speed in velocity_ned_mps)
@@ -94,11 +94,11 @@ def global_position_int(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UtmPosition:
-    """What UTM_GLOBAL_POSITION says; None: not known.
+    """Content of UTM_GLOBAL_POSITION; None: unknown.
 
     lat_deg, lon_deg  WGS84
     horizontal_m, vertical_m
-                      said as its uncertainties
+                      sent as its uncertainties
     """
 
     utc_ns: int  # time of the position
@@ -109,13 +109,14 @@ class UtmPosition:
     velocity_ned_mps: tuple[float, float, float]  # over ground
     horizontal_m: float
     vertical_m: float
-    every_s: float  # time between two of them
+    every_s: float  # interval between messages
 
 
 def utm_global_position(source: Source, said: UtmPosition) -> Outgoing:
-    """UTM_GLOBAL_POSITION: its flags (UTM_DATA_AVAIL_FLAGS) say what of it is known.
+    """Encode UTM_GLOBAL_POSITION; its flags (UTM_DATA_AVAIL_FLAGS) state which fields are known.
 
-    The vehicle's own UAS id is not, and stays empty. What is beyond what the message holds is cut.
+    The vehicle's own UAS id is unknown, and stays empty. Values are clipped to the range of the
+    message.
     """
     flags = 1 | 4 | 32 | 64  # time, position, both velocities
     flags |= 0 if said.hae_m is None else 8
@@ -130,7 +131,7 @@ def utm_global_position(source: Source, said: UtmPosition) -> Outgoing:
         *(0, 0, 0),  # of the next waypoint
         *speeds,
         *off,
-        0,  # accuracy of the velocity: not known
+        0,  # accuracy of the velocity: unknown
         min(65_535, round(said.every_s * 100)),
         b"",
         0,  # UTM_FLIGHT_STATE_UNKNOWN
@@ -142,11 +143,11 @@ def utm_global_position(source: Source, said: UtmPosition) -> Outgoing:
 def set_message_interval(
     source: Source, target: Source, msgid: int, interval_us: int, confirmation: int = 0
 ) -> Outgoing:
-    """COMMAND_LONG with MAV_CMD_SET_MESSAGE_INTERVAL; the target answers with COMMAND_ACK.
+    """Encode COMMAND_LONG with MAV_CMD_SET_MESSAGE_INTERVAL; the target answers with COMMAND_ACK.
 
-        msgid         message to be sent
-        interval_us   time between two of them, microseconds
-        confirmation  how often this command was sent before without an answer
+        msgid         requested message
+        interval_us   its interval, microseconds
+        confirmation  number of earlier transmissions of this command without an answer
 
     Source: https://mavlink.io/en/services/command.html.
     """
@@ -159,11 +160,14 @@ def set_message_interval(
 
 
 def request_data_stream(source: Source, target: Source, stream: int, rate_hz: int) -> Outgoing:
-    """REQUEST_DATA_STREAM, the predecessor of SET_MESSAGE_INTERVAL. It is not acknowledged."""
+    """Encode REQUEST_DATA_STREAM, the predecessor of SET_MESSAGE_INTERVAL.
+
+    It is not acknowledged.
+    """
     payload = struct.pack("<HBBBB", rate_hz, target.sysid, target.compid, stream, 1)
     return Outgoing(source, REQUEST_DATA_STREAM, payload)
 
 
 def timesync(source: Source, sent_ns: int) -> Outgoing:
-    """TIMESYNC request: the peer returns ``sent_ns`` beside its own time."""
+    """Encode a TIMESYNC request: the peer returns ``sent_ns`` with its own time."""
     return Outgoing(source, TIMESYNC, struct.pack("<qq", 0, sent_ns))

@@ -1,4 +1,4 @@
-"""What the parsers of other formats than MAVLink share: each makes MAVLink frames of its bytes."""
+"""Base of the parsers of formats other than MAVLink; each converts its bytes to MAVLink frames."""
 
 from collections.abc import Iterable
 from typing import Final
@@ -13,21 +13,21 @@ MLAT: Final = "MLAT position: its accuracy is not stated"
 
 
 class ForeignSplitter:
-    """Base of the splitters of other formats; used as ``framing.Splitter`` is."""
+    """Base of the splitters of other formats, with the interface of ``framing.Splitter``."""
 
     def __init__(self, link: str) -> None:
         self.link = link
-        self._pending = b""  # what has no end yet
-        self._overlong = False  # whether a line that was too long goes on
+        self._pending = b""  # unfinished message
+        self._overlong = False  # whether the rest of a too long line is being skipped
         self._seq = 0
 
     def finish(self, t_ns: int) -> Items:
-        """End the stream: what has no end is garbage."""
+        """End the stream: an unfinished message is garbage."""
         stray, self._pending, self._overlong = len(self._pending), b"", False
         return self._garbage(t_ns, stray)
 
     def _lines(self, lines: Iterable[bytes], most: int) -> tuple[list[bytes], int]:
-        """Lines of at most ``most`` bytes, and the number of bytes of the longer ones."""
+        """Return lines of at most ``most`` bytes, and the number of bytes of the longer ones."""
         kept, garbage = [], 0
         for line in lines:
             if self._overlong or len(line) > most:
@@ -38,7 +38,7 @@ class ForeignSplitter:
         return kept, garbage
 
     def _drop_overlong(self, most: int) -> int:
-        """Drop an unfinished line of more than ``most`` bytes. Returns its length so far."""
+        """Drop an unfinished line of more than ``most`` bytes. Return its length so far."""
         if len(self._pending) <= most:
             return 0
         stray, self._pending, self._overlong = len(self._pending), b"", True
@@ -58,7 +58,7 @@ class ForeignSplitter:
         return Frame(t_ns=t_ns, link=self.link, source=message.source, msgid=message.msgid, raw=raw)
 
     def _aircraft(self, t_ns: int, state: AircraftState) -> Items:
-        """ADSB_VEHICLE with what is known of an aircraft; empty where nothing is."""
+        """Return the ADSB_VEHICLE of an aircraft's state; empty if nothing is known."""
         payload = state.payload()
         return (
             [] if payload is None else [self._frame(t_ns, Outgoing(SENDER, ADSB_VEHICLE, payload))]

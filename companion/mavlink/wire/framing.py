@@ -1,4 +1,4 @@
-"""Bytes to frames of MAVLink 1 and 2: one incremental splitter for each peer.
+"""Parser of MAVLink 1 and 2 frames: one incremental splitter per peer.
 
 A frame on the wire (https://mavlink.io/en/guide/serialization.html):
 
@@ -8,10 +8,9 @@ A frame on the wire (https://mavlink.io/en/guide/serialization.html):
 The checksum is CRC-16/MCRF4XX over all but the magic byte, then over one seed byte per message id
 (CRC_EXTRA), so a frame of an unknown id cannot be checked and is not trusted.
 
-After a failed frame the search goes on at the next magic byte *inside* what that frame claimed,
-never after its claimed length: a damaged length byte would otherwise take good frames with it. The
-claimed length is remembered only so that false starts inside it are not counted as further
-failures.
+After a failed frame the search resumes at the next magic byte *inside* its claimed length, never
+after it: a damaged length byte would otherwise discard good frames. The claimed length is kept only
+so that false starts inside it are not counted as further failures.
 """
 
 import re
@@ -28,7 +27,7 @@ SIGNED: Final = 0x01  # the only incompatibility flag defined; frames with any o
 
 SHORTEST: Final = 8  # bytes of a MAVLink 1 frame without a payload
 KNOWN_MAX: Final = 8192
-"""Distinct pairs of sender and message of which a stream keeps what it knows."""
+"""Most distinct pairs of sender and message that a stream caches."""
 
 INCOMPLETE: Final = 0
 NOT_A_FRAME: Final = -1
@@ -43,12 +42,12 @@ _find_start = re.compile(rb"\xfd(?:.[\x00\x01]|.?\Z)|\xfe", re.DOTALL).search
 
 
 def examine(buffer: bytes, at: int, end: int) -> int:
-    """Length in bytes of the checked frame that starts at ``at``, or a verdict of at most 0.
+    """Return the length in bytes of the valid frame at ``at``, or a verdict of at most 0.
 
-    INCOMPLETE       the bytes so far fit a frame that goes on past ``end``
+    INCOMPLETE       the bytes so far fit a frame that continues past ``end``
     NOT_A_FRAME      no magic byte, or undefined incompatibility flags
     UNKNOWN_MESSAGE  a message id without a checksum seed
-    BAD_CRC          the checksum is wrong
+    BAD_CRC          wrong checksum
     """
     magic = buffer[at]
     if magic == MAGIC_V2:
@@ -74,13 +73,13 @@ def examine(buffer: bytes, at: int, end: int) -> int:
     if stop > end:
         return INCOMPLETE
     if magic == MAGIC_V1 and buffer[at + 1] > LONGEST[msgid]:
-        return BAD_CRC  # MAVLink 1 carries no more, and the sum would cost as much as a frame
+        return BAD_CRC  # longer than any MAVLink 1 payload; saves the cost of the checksum
     crc = buffer[crc_at] | buffer[crc_at + 1] << 8
     return stop - at if _mcrf4xx(buffer[at + 1 : crc_at] + seed) == crc else BAD_CRC
 
 
 def claimed_length(buffer: bytes, at: int, end: int) -> int:
-    """Length in bytes that the frame at ``at`` claims; 1 where the bytes do not say."""
+    """Return the length in bytes that the frame at ``at`` claims; 1 if it is unknown."""
     if end - at < 3 or buffer[at] not in (MAGIC_V1, MAGIC_V2):
         return 1
     if buffer[at] == MAGIC_V1:
@@ -89,22 +88,23 @@ def claimed_length(buffer: bytes, at: int, end: int) -> int:
 
 
 def is_shaped(raw: bytes) -> bool:
-    """Whether bytes begin and are as long as one frame; nothing is said of what is in it."""
+    """Return whether bytes have the start and length of one frame; the content is not checked."""
     return len(raw) >= SHORTEST and claimed_length(raw, 0, len(raw)) == len(raw)
 
 
 def next_magic(buffer: bytes, at: int, end: int) -> int:
-    """Index of the next magic byte at or after ``at``; ``end`` when there is none."""
+    """Return the index of the next magic byte at or after ``at``; ``end`` without one."""
     found = _find_magic(buffer, at, end)
     return found.start() if found else end
 
 
 def _next_start(buffer: bytes, at: int, end: int, claimed_to: int) -> int:
-    """Index of the next byte at or after ``at`` where a frame can begin; ``end`` without one.
+    """Return the index of the next byte at or after ``at`` where a frame can begin; ``end`` without
+    one.
 
-    What cannot be a frame is passed over here, as long as it would be counted no differently: any
-    flags that are undefined, and in what a failed frame laid claim to, lengths that no message of
-    MAVLink 1 has. A flood of magic bytes then costs no more than frames do.
+    It skips bytes that cannot start a frame if that does not change the counts: undefined flags
+    anywhere, and, within the claim of a failed frame, lengths that no MAVLink 1 message has. A
+    flood of magic bytes then costs no more than frames do.
     """
     while found := _find_start(buffer, at, end):
         at = found.start()
@@ -116,14 +116,14 @@ def _next_start(buffer: bytes, at: int, end: int, claimed_to: int) -> int:
 
 
 Checked = tuple[Source, int, bytes]
-"""A frame that is whole and whose checksum is right: sender, message id, and all of its bytes."""
+"""Whole frame with a correct checksum: sender, message id, and all of its bytes."""
 
 
 class Checker:
-    """Finds whole frames of one stream; what it knows of each sender's messages is kept.
+    """Finder of whole frames in one stream, with a cache per sender and message.
 
-    ``at`` does in one step for nearly every frame what ``examine`` does for all of them: the five
-    bytes of sender and message are looked up together.
+    ``at`` handles nearly every MAVLink 2 frame in one step: it looks up the five bytes of sender
+    and message together. ``examine`` handles the others.
     """
 
     def __init__(self) -> None:
@@ -131,7 +131,7 @@ class Checker:
         self._sources: dict[tuple[int, int], Source] = {}
 
     def at(self, buffer: bytes, at: int, end: int) -> Checked | int:
-        """The frame that starts at ``at``, or what ``examine`` says of it, at most 0."""
+        """Return the frame at ``at``, or the verdict of ``examine``, at most 0."""
         if end - at >= 12 and buffer[at] == MAGIC_V2 and not buffer[at + 2]:
             known = self._known.get(buffer[at + 5 : at + 10])
             stop = at + 12 + buffer[at + 1]
@@ -145,13 +145,13 @@ class Checker:
         return self._learn(buffer[at : at + length]) if length > 0 else length
 
     def _learn(self, raw: bytes) -> Checked:
-        """A checked frame; its sender and message are remembered."""
+        """Cache the sender and message of a valid frame, and return it."""
         if raw[0] == MAGIC_V2:
             ids, msgid = (raw[5], raw[6]), raw[7] | raw[8] << 8 | raw[9] << 16
         else:
             ids, msgid = (raw[3], raw[4]), raw[5]
         if len(self._known) >= KNOWN_MAX:
-            self._known.clear()  # a cache only, as is the other
+            self._known.clear()  # both are caches
             self._sources.clear()
         source = self._sources.get(ids)
         if source is None:
@@ -162,7 +162,7 @@ class Checker:
 
 
 class Splitter:
-    """Splits one peer's bytes into frames, in whatever pieces they arrive.
+    """Incremental splitter of one peer's bytes into frames.
 
     ``wanted`` holds the message ids that are returned (None: all); other frames are only counted.
     At most one unfinished frame is held between calls.
@@ -170,16 +170,16 @@ class Splitter:
 
     def __init__(self, link: str, wanted: frozenset[int] | None = None) -> None:
         self.link = link
-        self.frames = 0  # frames whose checksum held, wanted or not
+        self.frames = 0  # frames with a correct checksum, wanted or not
         self._wanted = wanted
         self._pending = b""
-        self._claimed = 0  # bytes ahead that a failed frame laid claim to
+        self._claimed = 0  # following bytes within the claimed length of a failed frame
         self._checker = Checker()
 
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
-        """Take in bytes that arrived at ``t_ns``; returns the frames that end in them.
+        """Parse bytes that arrived at ``t_ns``; return the frames that end in them.
 
-        Bytes that were no frame are returned as rejections, one per reason.
+        Other bytes are returned as rejections, one per reason.
         """
         if not self._pending:
             found = self._checker.at(data, 0, len(data)) if data else INCOMPLETE
@@ -196,7 +196,7 @@ class Splitter:
         return self._split(t_ns, self._pending + data if self._pending else data, last=False)
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """End the stream: an unfinished frame is searched for others and given up."""
+        """End the stream: search an unfinished frame for others and discard it."""
         return self._split(t_ns, self._pending, last=True)
 
     def _split(self, t_ns: int, buffer: bytes, *, last: bool) -> list[Frame | Rejection]:
@@ -243,9 +243,9 @@ class Splitter:
         claimed_to: int,
         buffer: bytes,
     ) -> int:
-        """Count what is skipped from ``at`` to ``resume``.
+        """Count the bytes skipped from ``at`` to ``resume``.
 
-        Returns how far the claims of failed frames reach.
+        Returns the end of the lengths claimed by failed frames.
         """
         reason = REASONS.get(verdict)
         if reason is not None and at >= claimed_to:

@@ -1,10 +1,10 @@
-"""ADS-B messages of Mode S (extended squitter, 14 bytes), as far as positions need them.
+"""Decoder of the ADS-B messages of Mode S (extended squitter, 14 bytes) that positions need.
 
 Format and codes: RTCA DO-260B, 2.2.3 (ICAO Doc 9871 has the same tables); the compact position
-report (CPR) is its appendix A.1.7. Read are identification (type 1-4), airborne positions (9-18
+report (CPR) is its appendix A.1.7. Decoded are identification (type 1-4), airborne positions (9-18
 with pressure altitude, 20-22), velocities over ground (19, subtypes 1 and 2), operational status
-(31), which has the accuracies, and positions on the ground (5-8): these count from a place that the
-aircraft had before, some minutes ago at most, and have no height. Left out are aircraft that ground
+(31), which has the accuracies, and positions on the ground (5-8): these are relative to a position
+of the aircraft some minutes ago at most, and have no height. Not decoded are aircraft that ground
 stations rebroadcast (TIS-B: DF18 with a control field other than 0), and the heights of types
 20-22, which dump1090 reads in steps of 25 feet and pyModeS in metres.
 """
@@ -18,14 +18,15 @@ from companion.mavlink.wire.transponder import AircraftState
 
 SIZE: Final = 14  # bytes of an extended squitter
 PAIR_NS: Final = 10_000_000_000
-"""Greatest time between the even and the odd position that are one place (DO-260B, A.1.7.7)."""
+"""Largest time between the even and the odd half of one position (DO-260B, A.1.7.7)."""
 STATUS_NS: Final = 30_000_000_000
 """How long a stated accuracy holds: it is sent every 2.5 s (DO-260B, 2.2.3.3)."""
 AIRCRAFT_MAX: Final = 2000
-"""Aircraft of which something is kept; beyond it the one not heard for longest is forgotten."""
+"""Most aircraft remembered; beyond it the one silent for longest is forgotten."""
 GROUND_NS: Final = 240_000_000_000
-"""Age of a place from which one on the ground is counted: at 340 m/s it is 45 nautical miles away,
-half of what the position repeats itself by."""
+"""Largest age of the reference of a position on the ground: at 340 m/s it is 45 nautical miles
+away, half the ambiguity of the position.
+"""
 _POLYNOMIAL: Final = 0xFFF409
 _CPR: Final = 1 << 17
 _LETTERS: Final = "?ABCDEFGHIJKLMNOPQRSTUVWXYZ????? ???????????????0123456789??????"
@@ -34,11 +35,11 @@ _MOVEMENT: Final = (
     (1, 0.0, 0.0), (2, 0.125, 0.125), (9, 1.0, 0.25), (13, 2.0, 0.5), (39, 15.0, 1.0),
     (94, 70.0, 2.0), (109, 100.0, 5.0), (124, 175.0, 0.0),
 )  # fmt: skip
-"""First code, its speed and the steps of the codes behind it, knots."""
+"""First code, its speed and the step of the following codes, knots."""
 
 
 def parity(message: bytes) -> int:
-    """The remainder of a message by the parity polynomial; 0 where it came whole."""
+    """Return the remainder of a message by the parity polynomial; 0 if it is intact."""
     bits = int.from_bytes(message, "big")
     for at in range(8 * len(message) - 1, 23, -1):
         if bits >> at & 1:
@@ -48,7 +49,7 @@ def parity(message: bytes) -> int:
 
 @dataclass(slots=True, kw_only=True)
 class _AircraftMemory:
-    """What an aircraft said that later messages need: half positions, accuracies, and when."""
+    """State of an aircraft that later messages need: half positions, accuracies, times."""
 
     halves: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # odd: t_ns, lat, lon
     nac_p: tuple[int, int] = (0, 0)  # value, t_ns
@@ -58,15 +59,15 @@ class _AircraftMemory:
 
 
 class Transponders:
-    """Puts messages of many aircraft together. ``read`` takes them in order of arrival."""
+    """Decoder of the messages of many aircraft. ``read`` takes them in order of arrival."""
 
     def __init__(self) -> None:
         self._heard: OrderedDict[int, _AircraftMemory] = OrderedDict()
 
     def read(self, t_ns: int, message: bytes) -> AircraftState | None:
-        """What a message says that came whole at ``t_ns``; None where that is nothing of use.
+        """Decode a message received at ``t_ns``; None if it has no relevant content.
 
-        Raises ``ValueError`` where its parity is wrong.
+        Raises ``ValueError`` if its parity is wrong.
         """
         kind, control = message[0] >> 3, message[0] & 7
         if len(message) != SIZE or kind not in (17, 18) or (kind == 18 and control != 0):
@@ -103,11 +104,11 @@ def _callsign(me: int) -> str:
 
 
 def _status(heard: _AircraftMemory, t_ns: int, me: int, *, airborne: bool) -> None:
-    """Take in the accuracies of an operational status; version 0 has none, the ground no GVA."""
+    """Store the accuracies of an operational status; version 0 has none, the ground no GVA."""
     version = me >> 13 & 7
     if version in (1, 2):
         heard.nac_p = (me >> 8 & 15, t_ns)
-        known = version == 2 and airborne  # in version 1 another quantity
+        known = version == 2 and airborne  # a different quantity in version 1
         heard.gva = (me >> 6 & 3 if known else 0, t_ns)
 
 
@@ -135,7 +136,7 @@ def _position(
 
 
 def _on_ground(heard: _AircraftMemory, t_ns: int, icao: int, me: int) -> AircraftState:
-    """A position on the ground, near the newest place that is known, and how it moves."""
+    """Decode a position on the ground, nearest to the last known one, and its motion."""
     place = None
     if heard.place is not None and t_ns - heard.place[0] <= GROUND_NS:
         half = me >> 17 & 0x1FFFF, me & 0x1FFFF
@@ -154,20 +155,21 @@ def _on_ground(heard: _AircraftMemory, t_ns: int, icao: int, me: int) -> Aircraf
 
 
 def ground_deg(half: tuple[int, int], near: tuple[float, float], odd: int) -> tuple[float, float]:
-    """The place with such a position on the ground nearest to another (DO-260B, A.1.7.6)."""
+    """Return the ground position nearest to ``near`` (DO-260B, A.1.7.6)."""
     lat_deg = _nearest(half[0] / _CPR, near[0], 90 / (60 - odd))
     lon_deg = _nearest(half[1] / _CPR, near[1], 90 / max(zones(lat_deg) - odd, 1))
     return max(-90.0, min(90.0, lat_deg)), (lon_deg + 180) % 360 - 180
 
 
 def _nearest(part: float, near_deg: float, zone_deg: float) -> float:
-    """The angle at a part of a zone that is nearest to another angle."""
+    """Return the angle at a fraction of a zone that is nearest to another angle."""
     within = near_deg % zone_deg / zone_deg
     return zone_deg * (math.floor(near_deg / zone_deg) + math.floor(0.5 + within - part) + part)
 
 
 def ground_speed_kt(code: int) -> float | None:
-    """Speed on the ground, the low end of its step (DO-260B, 2.2.3.2.4.2); None: not known."""
+    """Return the speed on the ground, the low end of its step (DO-260B, 2.2.3.2.4.2); None:
+    unknown."""
     if not 1 <= code <= 124:
         return None
     first, speed_kt, step_kt = next(row for row in reversed(_MOVEMENT) if code >= row[0])
@@ -179,9 +181,9 @@ def _fresh(stated: tuple[int, int], t_ns: int) -> int:
 
 
 def _altitude_ft(code: int) -> float | None:
-    """Pressure altitude in steps of 25 ft; None where there is none, or in Gillham's code.
+    """Return pressure altitude in steps of 25 ft; None if unknown, or in Gillham code.
 
-    Gillham's is for above 50 175 ft.
+    Gillham code is used above 50 175 ft.
     """
     if not code & 0x10:
         return None
@@ -189,7 +191,7 @@ def _altitude_ft(code: int) -> float | None:
 
 
 def _velocity(icao: int, me: int, knots: int) -> AircraftState:
-    """Speed and course over ground, and climb; a field of 0 is unknown."""
+    """Decode speed and course over ground, and climb; a field of 0 is unknown."""
     east, north = me >> 32 & 0x3FF, me >> 21 & 0x3FF
     speed_kt = track_deg = None
     if east and north:
@@ -204,9 +206,9 @@ def _velocity(icao: int, me: int, knots: int) -> AircraftState:
 def position_deg(
     even: tuple[int, ...], odd: tuple[int, ...], *, newest_is_odd: bool
 ) -> tuple[float, float] | None:
-    """Latitude and longitude of the newer of an even and an odd position (DO-260B, A.1.7.7).
+    """Return latitude and longitude of the newer of an even and an odd position (DO-260B, A.1.7.7).
 
-    None where they lie in zones of different width, or are no place on Earth.
+    None if their zones differ in width, or the latitude is out of range.
     """
     y = [even[0] / _CPR, odd[0] / _CPR]
     x = [even[1] / _CPR, odd[1] / _CPR]
@@ -224,7 +226,7 @@ def position_deg(
 
 
 def zones(lat_deg: float) -> int:
-    """Zones of longitude at a latitude, NL of DO-260B, A.1.7.2."""
+    """Return the number of longitude zones at a latitude, NL of DO-260B, A.1.7.2."""
     if abs(lat_deg) >= _POLE_DEG:
         return 2 if abs(lat_deg) == _POLE_DEG else 1
     if lat_deg == 0:

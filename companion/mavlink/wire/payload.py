@@ -1,4 +1,4 @@
-"""The fields of a payload."""
+"""Fields of a payload."""
 
 import struct
 from typing import Any
@@ -7,10 +7,7 @@ from companion.values import Frame
 
 
 def unpack(frame: Frame, layout: struct.Struct) -> tuple[Any, ...]:
-    """Unpack the fields of a payload.
-
-    Fields cut off, or absent in its MAVLink version, are zeros.
-    """
+    """Unpack the fields of a payload; truncated or absent ones are zeros."""
     raw = frame.raw
     start = 10 if raw[0] == 0xFD else 6
     if raw[1] >= layout.size:

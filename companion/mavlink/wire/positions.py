@@ -1,8 +1,8 @@
-"""The messages that carry positions: one table, from which everything else derives.
+"""Table of the messages that carry positions, from which everything else derives.
 
-A message in which a vehicle reports its own position needs a function that reads it, and a row in
-``POSITIONS``. It is then decoded, compared between peers and nodes, shared within a fleet, timed
-and exported like the others.
+To add a message with a vehicle's own position, write its reader and a row in ``POSITIONS``. The
+message is then decoded, compared between peers and nodes, shared within a fleet, timed and exported
+like the others.
 """
 
 import struct
@@ -20,7 +20,7 @@ HIGH_LATENCY2: Final = 235
 
 
 class OwnPosition(NamedTuple):
-    """A position that a vehicle sent of itself; None stands for what its message does not have.
+    """Position that a vehicle sent of itself; None: not in its message.
 
     lat_1e7, lon_1e7  WGS84, 1e-7 degrees
     """
@@ -33,13 +33,13 @@ class OwnPosition(NamedTuple):
     velocity_ned_mps: Vector | None  # north, east, down
     heading_deg: float | None  # from true north, clockwise
     accuracy: Accuracy | None = None  # accuracy that the message states
-    alt_step_m: float = 0.0  # step in which the message gives heights
+    alt_step_m: float = 0.0  # resolution of heights in the message
 
 
 class PositionMessage(NamedTuple):
-    """A message that carries a position: its MAVLink name, and how a vehicle's own is read.
+    """Message that carries a position: its MAVLink name, and its reader.
 
-    ``read`` is None where the message relays another aircraft's position (see ``decode``).
+    ``read`` is None if the message relays another aircraft's position (see ``decode``).
     """
 
     name: str
@@ -63,16 +63,15 @@ def _global_position_int(frame: Frame) -> OwnPosition:
     )
 
 
-_HIGH_LATENCY2 = struct.Struct("<Iii2xh10xB7x2B")  # up to eph and epv; what follows is not read
+_HIGH_LATENCY2 = struct.Struct("<Iii2xh10xB7x2B")  # up to eph and epv
 
 
 def _high_latency2(frame: Frame) -> OwnPosition:
-    """Read HIGH_LATENCY2, a summary every few seconds over a satellite modem or another thin link.
+    """Read HIGH_LATENCY2, sent every few seconds over a satellite modem or another slow link.
 
-    Its heights are whole metres. It has a ground speed and the direction of the nose, but no
-    velocity: where the wind blows the two disagree. ``eph`` and ``epv`` are the largest errors
-    since the message before, 0.1 m; 0 and 255 are unknown.
-    https://mavlink.io/en/messages/common.html#HIGH_LATENCY2
+    Its heights are whole metres. It has a ground speed and a heading, but no velocity: in wind,
+    heading and course differ. ``eph`` and ``epv`` are the largest errors since the previous
+    message, 0.1 m; 0 and 255 are unknown. https://mavlink.io/en/messages/common.html#HIGH_LATENCY2
     """
     boot_ms, lat, lon, alt_m, heading, eph, epv = unpack(frame, _HIGH_LATENCY2)
     horizontal_m, vertical_m = (None if dm in (0, 255) else dm * 0.1 for dm in (eph, epv))
@@ -103,5 +102,5 @@ OWN: Final = frozenset(_READERS)  # messages in which vehicles report their own 
 
 
 def read(frame: Frame) -> OwnPosition:
-    """Read the position in a frame of a message in ``OWN``. Nothing is checked."""
+    """Read the position in a frame of a message in ``OWN``, without checks."""
     return _READERS[frame.msgid](frame)

@@ -1,11 +1,11 @@
-"""Remote ID: the OPEN_DRONE_ID messages of receivers, and the messages of ASTM F3411 in packs.
+"""Decoder of Remote ID: OPEN_DRONE_ID messages of receivers, and ASTM F3411 messages in packs.
 
 Sources: https://mavlink.io/en/services/opendroneid.html for the former; for the 25 bytes of a
 message in a pack ASTM F3411-22a, 5.4.5 (ASD-STAN prEN 4709-002 has the same), as
 ``libopendroneid/opendroneid.h`` of https://github.com/opendroneid/opendroneid-core-c lays them out.
 
-A receiver names the sender of what it heard by its radio's address (``id_or_mac``). Messages
-without one are a vehicle's own words to its transmitter, and are not read: it reports itself.
+A receiver identifies the sender of a broadcast by its radio's address (``id_or_mac``). Messages
+without one are from a vehicle to its own transmitter, and are ignored: it reports itself.
 """
 
 import math
@@ -22,7 +22,7 @@ BASIC_ID: Final = 12900
 LOCATION: Final = 12901
 SYSTEM: Final = 12904
 MESSAGE_PACK: Final = 12915
-RECEIVERS: Final = range(236, 239)  # components that hear others (MAV_COMP_ID_ODID_TXRX_1 to 3)
+RECEIVERS: Final = range(236, 239)  # components that receive others (MAV_COMP_ID_ODID_TXRX_1 to 3)
 _UNPLACED: Final = (0, 0)
 _NO_ALTITUDE_M: Final = -1000.0
 _MESSAGE_BYTES: Final = 25
@@ -37,7 +37,7 @@ _PACK = struct.Struct("<xx20sBB225s")
 
 
 def remote_id(frame: Frame) -> RemoteId | None:
-    """What a message of a receiver says; None for a vehicle's own. Raises ``ValueError``."""
+    """Decode a message of a receiver; None for a vehicle's own. Raises ``ValueError``."""
     said = _READERS[frame.msgid](frame)
     is_own = frame.source.compid not in RECEIVERS
     if (is_own or said.uas_id is None) and not any(bytes.fromhex(said.heard_as)):
@@ -59,7 +59,7 @@ def _location(frame: Frame) -> RemoteId:
         frame, _LOCATION
     )
     if not all(map(math.isfinite, (baro_m, geo_m, stamp_s))):
-        raise ValueError("a height or a time is not a number")
+        raise ValueError("height or time is not finite")
     horizontal, vertical, at_speed, at_time = codes
     return _located(
         _begun(frame, heard_as),
@@ -85,7 +85,7 @@ def _system(frame: Frame) -> RemoteId:
 def _pack(frame: Frame) -> RemoteId:
     heard_as, size, count, messages = unpack(frame, _PACK)
     if size != _MESSAGE_BYTES or not 0 < count <= _PACK_MAX:
-        raise ValueError(f"a pack of {count} messages of {size} bytes")
+        raise ValueError(f"invalid pack of {count} messages of {size} bytes")
     said = _begun(frame, heard_as)
     for at in range(0, count * size, size):
         said = _added(said, messages[at : at + size])
@@ -93,7 +93,7 @@ def _pack(frame: Frame) -> RemoteId:
 
 
 def _added(said: RemoteId, message: bytes) -> RemoteId:
-    """What was said, and what one message of a pack adds to it."""
+    """Add one message of a pack."""
     match message[0] >> 4:
         case 0:
             return _identified(said, message[1] >> 4, message[2:22])
@@ -132,7 +132,7 @@ READ: Final = frozenset(_READERS)  # message ids that remote_id reads
 
 
 def _identified(said: RemoteId, kind: int, uas_id: bytes) -> RemoteId:
-    """With an id, unless it has one of a better kind: serial number, registration, the flight's."""
+    """Add an id, unless it has one of a better kind: serial number, registration, flight id."""
     name = uas_id.rstrip(b"\0 ")
     if not name or kind == 0 or (said.id_kind is not None and said.id_kind <= kind):
         return said
@@ -143,7 +143,7 @@ def _identified(said: RemoteId, kind: int, uas_id: bytes) -> RemoteId:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Place:
-    """A location, in degrees by 1e7, metres, m/s (climb is positive up), and codes of accuracy."""
+    """Location: 1e-7 degrees, metres, m/s (climb is positive up), and accuracy codes."""
 
     lat_1e7: int
     lon_1e7: int
@@ -160,7 +160,8 @@ def _located(said: RemoteId, at: _Place) -> RemoteId:
     if (at.lat_1e7, at.lon_1e7) == _UNPLACED:
         return said
     if abs(at.lat_1e7) > 900_000_000 or abs(at.lon_1e7) > 1_800_000_000:
-        raise ValueError(f"latitude {at.lat_1e7 * 1e-7}, longitude {at.lon_1e7 * 1e-7}")
+        place = f"latitude {at.lat_1e7 * 1e-7}, longitude {at.lon_1e7 * 1e-7}"
+        raise ValueError(f"{place} out of range")
     datum, alt_m = AltitudeDatum.GEOMETRIC, at.geo_m
     if alt_m <= _NO_ALTITUDE_M:
         datum, alt_m = AltitudeDatum.PRESSURE, at.baro_m
@@ -190,15 +191,16 @@ def _located(said: RemoteId, at: _Place) -> RemoteId:
 
 
 def _accuracy(horizontal: int, vertical: int, speed: int, time: int) -> Accuracy:
-    """What the codes say; the stamp's steps of 0.1 s come to its own accuracy, of as many."""
+    """Decode the accuracy codes; half a step is added to the accuracy of the stamp, in steps of 0.1
+    s."""
     known = accuracy.remote_id(horizontal, vertical, speed)
     return known._replace(time_s=0.1 * time + 0.05 if 0 < time < 16 else None)
 
 
 def _of_hour(t_ns: int, stamp_s: float) -> int:
-    """A stamp of seconds after the full hour as milliseconds of a clock that goes on, of 32 bits.
+    """Convert a stamp of seconds after the full hour to milliseconds of a continuous 32-bit clock.
 
-    The hour is that in which it was nearest to its arrival.
+    The hour is the one that puts the stamp nearest to its arrival.
     """
     stamp_ms = round(stamp_s * 1e3)
     hours = round((t_ns // 1_000_000 - stamp_ms) / _HOUR_MS)

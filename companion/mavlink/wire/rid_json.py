@@ -1,6 +1,6 @@
-"""What Remote ID receivers say in JSON, as the OPEN_DRONE_ID messages that one over MAVLink sends.
+"""JSON of Remote ID receivers, converted to the OPEN_DRONE_ID messages of a MAVLink receiver.
 
-One object is what was heard of one radio. Two forms are read, told by their keys:
+Each object holds what one radio sent. Two formats are read, distinguished by their keys:
 
 - DroneScout's (https://github.com/BluemarkInnovations/RemoteID-MQTT-subscriber, ``mqtt_sub.py``):
   ``UASdata`` is the structure ODID_UAS_Data of ``libopendroneid/opendroneid.h``
@@ -23,8 +23,8 @@ from companion.mavlink.wire.foreign import ForeignSplitter, Items
 from companion.mavlink.wire.remote_id import BASIC_ID, LOCATION, SYSTEM
 from companion.values import Reason, Source
 
-SENDER: Final = Source(0, 236)  # who says it: no system, MAV_COMP_ID_ODID_TXRX_1
-OBJECT_MAX: Final = 16 << 10  # bytes of an object at most; a longer one is garbage
+SENDER: Final = Source(0, 236)  # sender of the frames: no system, MAV_COMP_ID_ODID_TXRX_1
+OBJECT_MAX: Final = 16 << 10  # longest object, bytes; a longer one is garbage
 _UNKNOWN_STAMP_S: Final = 65_535.0
 _BY_SECOND: Final = 10  # MAV_ODID_TIME_ACC of a stamp in whole seconds
 _BASIC_ID = struct.Struct("<2x20sBB20s")
@@ -35,14 +35,17 @@ _AT = {"location": 64, "system": 808, "valid": 892, "end": 914}
 
 
 class RidJson(ForeignSplitter):
-    """Turns the objects of one peer into frames."""
+    """Converter of the objects of one peer to frames."""
 
     def feed(self, t_ns: int, data: bytes) -> Items:
-        """Take in bytes that arrived at ``t_ns``; returns what the objects in them say."""
+        """Parse bytes that arrived at ``t_ns``.
+
+        Return the frames and rejections of their objects.
+        """
         *lines, self._pending = (self._pending + data).replace(b"\0", b"\n").split(b"\n")
         kept, garbage = self._lines(lines, OBJECT_MAX)
         out = [item for line in kept if line.strip() for item in self._object(t_ns, line)]
-        if self._pending.rstrip().endswith(b"}") and not self._overlong:  # a datagram has no end
+        if self._pending.rstrip().endswith(b"}") and not self._overlong:  # no new line in datagrams
             whole = _parsed(self._pending)
             if whole is not None:
                 out += self._object(t_ns, self._pending)
@@ -68,7 +71,7 @@ def _parsed(text: bytes) -> dict[str, Any] | None:
 
 
 def _messages(found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
-    """Message ids and payloads of what an object says; nothing of one that says something else."""
+    """Yield message ids and payloads of an object; nothing if its format is unknown."""
     data = found.get("data")
     if isinstance(data, dict) and isinstance(data.get("UASdata"), str):
         yield from _uas_data(_mac(data.get("MAC address")), base64.b64decode(data["UASdata"]))
@@ -86,9 +89,9 @@ def _mac(text: object) -> bytes:
 
 
 def _uas_data(mac: bytes, uas: bytes) -> Iterator[tuple[int, bytes]]:
-    """What ODID_UAS_Data says: its ids, how many aircraft it stands for, and its position."""
+    """Convert ODID_UAS_Data: its ids, the number of aircraft it represents, and its position."""
     if len(uas) < _AT["end"]:
-        raise ValueError(f"{len(uas)} bytes of UASdata, of {_AT['end']}")
+        raise ValueError(f"UASdata has {len(uas)} bytes, needs {_AT['end']}")
     valid = uas[_AT["valid"] :]
     for number in (0, 1):
         if valid[number]:
@@ -122,7 +125,7 @@ def _uas_data(mac: bytes, uas: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _captured(mac: bytes, found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
-    """What an object of rid_capture says; its kind of id is not told but by its key."""
+    """Convert an object of rid_capture; the key alone gives the kind of id."""
     for key, kind in (("uav id", 1), ("caa registration", 2)):
         name = found.get(key)
         if isinstance(name, str) and name:
@@ -152,7 +155,7 @@ def _captured(mac: bytes, found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
 
 
 def _number(value: object) -> float:
-    """A number; not a number where there is none."""
+    """Return a number; NaN if there is none."""
     return float(value) if isinstance(value, int | float) else math.nan
 
 
@@ -175,12 +178,12 @@ def _location(
     status: int,
     codes: tuple[int, int, int, int, int],
 ) -> bytes:
-    """The payload of an OPEN_DRONE_ID_LOCATION; what is out of range, or no number, is unknown.
+    """Encode an OPEN_DRONE_ID_LOCATION; values that are out of range or NaN become unknown.
 
-    Raises ``ValueError`` for an invalid place.
+    Raises ``ValueError`` for an invalid position.
     """
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
-        raise ValueError(f"latitude {lat_deg}, longitude {lon_deg}")
+        raise ValueError(f"latitude {lat_deg}, longitude {lon_deg} out of range")
     return _LOCATION.pack(
         round(lat_deg * 1e7),
         round(lon_deg * 1e7),

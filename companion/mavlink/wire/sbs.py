@@ -1,14 +1,13 @@
-"""BaseStation lines (SBS-1, port 30003) as the ADSB_VEHICLE that a MAVLink receiver would send.
+"""BaseStation lines (SBS-1, port 30003), converted to the ADSB_VEHICLE of a MAVLink receiver.
 
-One line is one message of one aircraft, with the fields that this one held; they are put together
-where those of all relays are (``mavlink/trust/adsb.py``). The fields, their units and the sample
-that the tests read: http://woodair.net/SBS/Article/Barebones42_Socket_Data.htm. Altitude is that of
-the standard pressure; with an H behind it, as dump1090 writes it when told to (``net_io.c``), it is
-above the ellipsoid.
+One line is one message of one aircraft, with the fields of that message; ``mavlink/trust/adsb.py``
+merges the fields, as for all relays. The fields, their units and the sample that the tests read:
+http://woodair.net/SBS/Article/Barebones42_Socket_Data.htm. Altitude is pressure altitude; with a
+trailing H, which dump1090 writes as an option (``net_io.c``), it is above the ellipsoid.
 
-A line has two times of its writer's clock, when the message came and when it was written. Their
-difference is the age of what it says: some writers hold all back for five minutes. Where it is
-negative or missing, the line counts as new. How exact a position is, no line says.
+A line has two times of its writer's clock: when the message was received and when the line was
+written. Their difference is the age of the message, since some writers delay everything by five
+minutes. If it is negative or missing, the line counts as new. No line states an accuracy.
 """
 
 import re
@@ -19,17 +18,18 @@ from companion.mavlink.wire.foreign import MLAT, ForeignSplitter, Items
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState
 from companion.values import Reason
 
-LINE_MAX: Final = 512  # bytes of a line at most; a longer one is garbage
+LINE_MAX: Final = 512  # longest line, bytes; a longer one is garbage
 _SILENT: Final = frozenset((b"SEL", b"ID", b"AIR", b"STA", b"CLK"))
 """Lines about the writer's own display."""
 _NUMBER: Final = re.compile(r"-?\d{1,9}(?:\.\d{1,9})?")
 
 
 class SbsSplitter(ForeignSplitter):
-    """Turns the lines of one connection into frames."""
+    """Converter of the lines of one connection to frames."""
 
     def feed(self, t_ns: int, data: bytes) -> Items:
-        """Take in bytes that arrived at ``t_ns``; returns what the lines that end in them say."""
+        """Parse bytes that arrived at ``t_ns``; return the frames and rejections of the lines they
+        end."""
         *lines, self._pending = (self._pending + data).split(b"\n")
         kept, garbage = self._lines(lines, LINE_MAX)
         out: Items = []
@@ -42,7 +42,7 @@ class SbsSplitter(ForeignSplitter):
         return out + self._garbage(t_ns, garbage + self._drop_overlong(LINE_MAX))
 
     def _line(self, t_ns: int, line: bytes, kind: bytes) -> Items:
-        if kind == b"MLAT":  # found by other receivers, however well they are placed
+        if kind == b"MLAT":
             return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, MLAT)
         try:
             return self._aircraft(t_ns, aircraft_state(line.decode("ascii")))
@@ -52,10 +52,10 @@ class SbsSplitter(ForeignSplitter):
 
 
 def aircraft_state(line: str) -> AircraftState:
-    """What a MSG line says. Raises ``ValueError`` where its fields cannot be what they say."""
+    """Parse a MSG line. Raises ``ValueError`` for impossible field values."""
     fields = [field.strip() for field in line.split(",")]
     if len(fields) < 10:
-        raise ValueError(f"{len(fields)} fields, of 22")
+        raise ValueError(f"line has {len(fields)} of 22 fields")
     fields += [""] * (22 - len(fields))
     if not re.fullmatch(r"[0-9A-Fa-f]{6}", fields[4]):
         raise ValueError(f"{fields[4]!r:.20} is not an ICAO address")
@@ -74,16 +74,16 @@ def aircraft_state(line: str) -> AircraftState:
 
 
 def _number(text: str, least: float, most: float) -> float | None:
-    """A decimal number; None for an empty field. Raises ``ValueError`` beyond the limits."""
+    """Parse a decimal number; None for an empty field. Raises ``ValueError`` beyond the limits."""
     if not text:
         return None
     if not _NUMBER.fullmatch(text) or not least <= float(text) <= most:
-        raise ValueError(f"{text!r:.20} is no number from {least:g} to {most:g}")
+        raise ValueError(f"{text!r:.20} is not a number from {least:g} to {most:g}")
     return float(text)
 
 
 def _age_s(stamps: list[str]) -> int:
-    """Whole seconds from the message (date, time) to the line (date, time); 0 where not told."""
+    """Return whole seconds from the message (date, time) to the line (date, time); 0 if unknown."""
     try:
         came, written = (
             datetime.strptime(f"{day} {time}", "%Y/%m/%d %H:%M:%S.%f")

@@ -1,8 +1,8 @@
 """Boot stamps of messages that are not decoded otherwise.
 
-Any message with ``time_boot_ms`` says where its sender's boot clock is. The table is that of
-pymavlink's generated ``all`` dialect, without the setpoints that ground stations send (82, 84, 86):
-theirs are no autopilot's time. ``tests/mavlink/wire/test_stamps.py`` compares it with the dialect.
+Any message with ``time_boot_ms`` shows its sender's boot clock. The table is that of pymavlink's
+generated ``all`` dialect, without the setpoints that ground stations send (82, 84, 86): their time
+is not an autopilot's. ``tests/mavlink/wire/test_stamps.py`` compares it with the dialect.
 """
 
 from typing import Final
@@ -20,13 +20,13 @@ STAMPED: Final[dict[int, int]] = {
     264: 24,
     283: 8,
 }
-"""Message id to the place of ``time_boot_ms`` in its payload, bytes."""
+"""Offset of ``time_boot_ms`` in the payload, bytes, by message id."""
 
 
 def boot_ms(frame: Frame) -> int:
-    """The stamp of a message in ``STAMPED``, milliseconds since its sender's boot.
+    """Return the stamp of a message in ``STAMPED``, milliseconds since its sender's boot.
 
-    MAVLink 2 cuts trailing zero bytes of a payload: they are zeros.
+    Bytes that MAVLink 2 truncated are zeros.
     """
     raw = frame.raw
     start = 10 if raw[0] == 0xFD else 6

@@ -1,9 +1,9 @@
-"""What a transponder message, as the ADSB_VEHICLE that a MAVLink receiver would send of it.
+"""State of a transponder message, as the ADSB_VEHICLE of a MAVLink receiver.
 
-Behind the fields that the message has stand three bytes more: NACp, NACv and GVA, each 0 where it
-is unknown. MAVLink 2 lets a message grow so (https://mavlink.io/en/guide/serialization.html):
-who does not know them does not read them. ``decode`` reads them from ``SENDER`` alone, so that what
-another dialect may add one day is not taken for them.
+Three bytes are appended to the message's own fields: NACp, NACv and GVA, each 0 if unknown. MAVLink
+2 allows such extensions (https://mavlink.io/en/guide/serialization.html), and other readers ignore
+them. ``decode`` reads them from ``SENDER`` only, so that it does not confuse them with a future
+extension of another dialect.
 """
 
 import struct
@@ -12,7 +12,7 @@ from typing import Final, NamedTuple
 from companion.values import Source
 
 ADSB_VEHICLE: Final = 246
-SENDER: Final = Source(0, 156)  # who says it: no system, MAV_COMP_ID_ADSB
+SENDER: Final = Source(0, 156)  # sender of the frames: no system, MAV_COMP_ID_ADSB
 _LAYOUT: Final = struct.Struct("<IiiiHHhHHB9sBBBBB")
 _COORDS, _ALTITUDE, _HEADING, _VELOCITY, _CALLSIGN, _VERTICAL = 1, 2, 4, 8, 16, 128  # ADSB_FLAGS
 _PRESSURE, _GEOMETRIC = 0, 1  # ADSB_ALTITUDE_TYPE
@@ -22,9 +22,9 @@ _FPM_CMPS: Final = 30.48 / 60
 
 
 class AircraftState(NamedTuple):
-    """The state of one aircraft in aviation's units; None: unknown.
+    """State of one aircraft in aviation's units; None: unknown.
 
-    geometric   the altitude is above the ellipsoid, not that of the standard pressure
+    geometric   the altitude is above the ellipsoid, not pressure altitude
     age_s       whole seconds since it was true
     """
 
@@ -43,7 +43,7 @@ class AircraftState(NamedTuple):
     age_s: int = 0
 
     def payload(self) -> bytes | None:
-        """The payload of an ADSB_VEHICLE that says as much; None where that is nothing."""
+        """Return the payload of the ADSB_VEHICLE; None if nothing is known."""
         placed = self.lat_deg is not None and self.lon_deg is not None
         told = (
             (_COORDS, placed),
@@ -65,7 +65,7 @@ class AircraftState(NamedTuple):
             round((self.speed_kt or 0.0) * _KNOT_CMPS),
             round((self.climb_fpm or 0.0) * _FPM_CMPS),
             flags,
-            0,  # squawk: nobody here reads it
+            0,  # squawk: not used
             _GEOMETRIC if self.geometric else _PRESSURE,
             self.callsign[:8].encode(),
             0,  # kind of aircraft: unknown

@@ -72,10 +72,10 @@ def test_a_document_becomes_frames(run: Run, status: bytes) -> None:
     ("answer", "why"),
     [
         ((b"HTTP/1.1 302 Found\r\nLocation: http://127.0.0.1/\r\n\r\n",), "answers 302"),
-        ((b"SSH-2.0-OpenSSH_9.2\r\n\r\n",), "no HTTP"), ((b"",), "no HTTP"),
-        ((b"HTTP/1.1 200 OK\r\n",), "no HTTP"), ((b"A" * 100_000,), "no HTTP"),
-        ((b"HTTP/1.1\r\n\r\n",), "no HTTP"),
-        ((b"HTTP/1.1 200 OK\r\n\r\n", *[b" " * (1 << 20)] * 17), "more than"),
+        ((b"SSH-2.0-OpenSSH_9.2\r\n\r\n",), "malformed HTTP"), ((b"",), "malformed HTTP"),
+        ((b"HTTP/1.1 200 OK\r\n",), "malformed HTTP"), ((b"A" * 100_000,), "malformed HTTP"),
+        ((b"HTTP/1.1\r\n\r\n",), "malformed HTTP"),
+        ((b"HTTP/1.1 200 OK\r\n\r\n", *[b" " * (1 << 20)] * 17), "body exceeds"),
     ],
 )  # fmt: skip
 def test_an_answer_that_is_none_takes_the_link_down(

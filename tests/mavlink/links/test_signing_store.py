@@ -109,7 +109,7 @@ def test_what_is_not_a_key(tmp_path: Path, data: bytes) -> None:
 
 @pytest.mark.parametrize("name", ["missing", "."])
 def test_a_key_that_cannot_be_read(tmp_path: Path, name: str) -> None:
-    with pytest.raises(LinkError, match="cannot be read") as error:
+    with pytest.raises(LinkError, match="cannot read") as error:
         load_key(tmp_path / name)
     one_line(error, tmp_path / name)
 
@@ -119,7 +119,7 @@ def test_the_command_that_is_told_makes_the_key_that_mavproxy_has(tmp_path: Path
     file.touch()
     with pytest.raises(LinkError) as error:
         load_key(file)
-    command = str(error.value).partition("have it: ")[2].replace("PASSPHRASE", "correct horse")
+    command = str(error.value).partition("MAVProxy: ")[2].replace("PASSPHRASE", "correct horse")
     subprocess.run(["sh", "-c", command], check=True, timeout=HANG_S)
     ask = (
         "from MAVProxy.modules.mavproxy_signing import SigningModule as module;"
@@ -146,7 +146,7 @@ def test_a_key_that_others_can_read(tmp_path: Path, mode: int) -> None:
         assert f"chmod 600 {file}" in warning
     else:
         assert warning is None
-    assert "cannot be told" in str(key_warning(tmp_path / "missing"))
+    assert "cannot check the permissions" in str(key_warning(tmp_path / "missing"))
 
 
 # --- from run to run ----------------------------------------------------------------------------
@@ -447,11 +447,11 @@ def test_a_file_of_another_version(path: Path) -> None:
 
 def test_places_where_nothing_can_be_kept(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    refuses(tmp_path / "file" / "signing.json", "cannot be written")
+    refuses(tmp_path / "file" / "signing.json", "cannot write the signing timestamps")
     (tmp_path / "folder").mkdir()
-    refuses(tmp_path / "folder", "cannot be read")
+    refuses(tmp_path / "folder", "cannot read")
     (tmp_path / "new.new").mkdir()
-    refuses(tmp_path / "new", "cannot be written")
+    refuses(tmp_path / "new", "cannot write the signing timestamps")
 
 
 def test_one_process_at_a_time(path: Path) -> None:
@@ -467,7 +467,7 @@ def test_a_disk_that_fails_is_told_and_tried_again(path: Path) -> None:
     assert guard.refusal(sent(NOW_NS)) is None
     away = path.parent.with_name("away")
     path.parent.rename(away)
-    with pytest.raises(LinkError, match="cannot be written") as error:
+    with pytest.raises(LinkError, match="cannot write the signing timestamps") as error:
         timestamps.write(timestamps.snapshot(NOW_NS))
     one_line(error, path)
     away.rename(path.parent)

@@ -322,10 +322,10 @@ def test_only_an_unsigned_frame_of_version_2_can_be_signed() -> None:
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"key": KEY[:31]}, "32 bytes, not 31"),
-        ({"key": b""}, "32 bytes, not 0"),
-        ({"link_id": 256}, "0 to 255, not 256"),
-        ({"link_id": -1}, "0 to 255, not -1"),
+        ({"key": KEY[:31]}, "has 31 bytes; give 32"),
+        ({"key": b""}, "has 0 bytes; give 32"),
+        ({"link_id": 256}, "is 256, allowed: 0 to 255"),
+        ({"link_id": -1}, "is -1, allowed: 0 to 255"),
     ],
 )
 def test_what_a_guard_is_made_of(changes: dict[str, object], said: str) -> None:

@@ -350,7 +350,7 @@ def test_one_that_refuses_both_is_asked_ever_less_often_and_told_of_once() -> No
     (notice,) = world.notices
     assert notice.subject == "3:1"
     assert "GLOBAL_POSITION_INT" in notice.text
-    assert "asking does not help" in notice.text
+    assert "requests have no effect" in notice.text
     assert world.rate().asked == len(world.requests)
 
 
@@ -482,8 +482,10 @@ def test_the_innocent_are_not_named(innocent: Any) -> None:
     world.run(1)
     uav.hz[POSITION] = 1.0
     world.run(40)
-    assert [n.text.split(": ")[-1] for n in world.notices] == ["nobody was heard asking"]
-    assert world.rate().changed_by == "nobody was heard asking"
+    assert [n.text.split(": ")[-1] for n in world.notices] == [
+        "no request of another component was received"
+    ]
+    assert world.rate().changed_by == "no request of another component was received"
 
 
 def test_one_who_asked_long_before_is_not_named() -> None:
@@ -496,7 +498,7 @@ def test_one_who_asked_long_before_is_not_named() -> None:
     world.run(40)
     uav.hz[POSITION] = 1.0
     world.run(40)
-    assert world.rate().changed_by == "nobody was heard asking"
+    assert world.rate().changed_by == "no request of another component was received"
 
 
 def test_one_whom_we_have_overruled_is_not_named_for_the_next_change() -> None:
@@ -510,7 +512,7 @@ def test_one_whom_we_have_overruled_is_not_named_for_the_next_change() -> None:
     assert world.rate().changed_by == "255:190"
     uav.hz[POSITION] = 1.0
     world.run(12)
-    assert world.rate().changed_by == "nobody was heard asking"
+    assert world.rate().changed_by == "no request of another component was received"
 
 
 def test_order_that_is_broken_off_is_no_long_order() -> None:
@@ -544,7 +546,7 @@ def test_a_change_that_cannot_be_undone_is_told_of_too() -> None:
     uav.hz[POSITION] = 1.0
     world.run(60)
     texts = [n.text.split(": ")[-1] for n in world.notices]
-    assert texts == ["nobody was heard asking", "asking does not help"]
+    assert texts == ["no request of another component was received", "requests have no effect"]
 
 
 def test_a_restart_is_named() -> None:

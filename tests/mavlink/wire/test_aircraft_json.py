@@ -85,8 +85,8 @@ def test_only_news_is_handed_on() -> None:
 @pytest.mark.parametrize(
     ("changed", "why"),
     [
-        ({"type": "mlat"}, "placed by others"), ({"type": "tisb_icao"}, "placed by others"),
-        ({"mlat": ["lat", "lon"]}, "placed by others"), ({"hex": "~a2fcf2"}, "no address"),
+        ({"type": "mlat"}, "computed by others"), ({"type": "tisb_icao"}, "computed by others"),
+        ({"mlat": ["lat", "lon"]}, "computed by others"), ({"hex": "~a2fcf2"}, "not an ICAO"),
     ],
 )  # fmt: skip
 def test_who_is_placed_by_others_is_not_used(changed: dict[str, Any], why: str) -> None:

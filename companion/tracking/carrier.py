@@ -17,7 +17,7 @@ from companion.values import Attitude, Carrier, EstimatorStatus, Fix, FloatArray
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
     """Rotation (3, 3) from north-east-down to body axes, by roll, pitch and yaw in radians.
 
-    Angles are MAVLink's: yaw turns about z, then pitch about y, then roll about x. Source: the
+    Angles are MAVLink's: yaw rotates about z, then pitch about y, then roll about x. Source: the
     aerospace sequence 3-2-1, e.g. Groves, Principles of GNSS (2013), eq. 2.22.
     """
     cr, sr = math.cos(roll_rad), math.sin(roll_rad)
@@ -36,8 +36,8 @@ def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> Flo
     """Rotation (3, 3) from a body's axes now to its axes ``interval_s`` seconds later.
 
     ``body_rates_radps`` (3,) are constant rates about the body axes. Rodrigues' formula for the
-    rotation vector -rates * interval; the sign is negative because coordinates turn the other way
-    than the body.
+    rotation vector -rates * interval; the sign is negative because coordinates rotate opposite to
+    the body.
     """
     x, y, z = (-rate * interval_s for rate in body_rates_radps.tolist())
     angle = math.sqrt(x * x + y * y + z * z)
@@ -55,16 +55,16 @@ def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> Flo
 
 
 USUAL_ATTITUDE: Final = 0.45
-"""The angle that 95 of 100 attitudes are off by at most, over the bound on reported ones.
+"""Ratio of the 95th percentile of attitude errors to their bound.
 
-Simulated copters' were 1.3 degrees off, most of it a compass that errs steadily, where 3 is bound.
+Simulated copters had 1.3 degrees, mostly a constant compass error, at a bound of 3.
 """
 
 
 def fixed(
     valid_at_ns: int, local: LocalFrame, place: tuple[float, float, float], heading_rad: float
 ) -> Carrier:
-    """The carrier of a fixed, level station.
+    """Return the carrier of a fixed, level station.
 
     ``place`` is latitude and longitude in degrees and height in metres; ``heading_rad`` is
     clockwise from true north.
@@ -87,13 +87,13 @@ def fixed(
 
 @dataclass(frozen=True, slots=True)
 class AttitudeBounds:
-    """Bounds on how far an attitude that is carried on at its rates is off."""
+    """Bounds on the error of an attitude that is extrapolated at its rates."""
 
     attitude_rad: float  # bound on the reported attitude, as an angle
     acceleration_radps2: float  # greatest angular acceleration
 
     def at(self, rate_radps: float, age_s: float, doubt_s: float) -> float:
-        """The bound after a time, known to within ``doubt_s``, from a rate of turn (norm); rad.
+        """Return the bound after ``age_s``, known to ``doubt_s``, at an angular rate (norm); rad.
 
         See docs/math.md 5.3.
         """
@@ -104,29 +104,29 @@ class AttitudeBounds:
 
 @dataclass(frozen=True, slots=True)
 class Contradiction:
-    """Two attitudes of which one at least is wrong: neither follows from the other at its rates."""
+    """Two attitudes of which at least one is wrong: neither follows from the other at its rates."""
 
-    apart_rad: float  # by how much, as an angle
+    apart_rad: float  # unexplained rotation, as an angle
     apart_s: float  # time between them
 
     def at(self, age_s: float) -> float:
-        """The bound on the newer one after a time, whichever is right; rad.
+        """Return the bound on the newer one after a time, whichever is right; rad.
 
-        A rate of turn that is wrong shows by ``apart_rad`` in ``apart_s``.
+        A wrong angular rate causes ``apart_rad`` in ``apart_s``.
         """
         return min(math.pi, self.apart_rad * (1.0 + abs(age_s) / self.apart_s))
 
 
-APART_MAX_S: Final = 1.0  # longest time between attitudes that are held against one another
+APART_MAX_S: Final = 1.0  # longest time between two attitudes that are compared
 
 
 def contradiction(
     before: Attitude, after: Attitude, apart_s: float, bounds: AttitudeBounds
 ) -> Contradiction | None:
-    """Whether an attitude contradicts the one before it, beyond what both may be off.
+    """Check whether an attitude contradicts the previous one beyond the errors of both.
 
-    Each is carried on to the other's time at its own rates: forward shows a wrong angle, back a
-    wrong rate. ``apart_s`` is positive.
+    Each is extrapolated to the other's time at its own rates: forward reveals a wrong angle,
+    backward a wrong rate. ``apart_s`` is positive.
     """
     if apart_s > APART_MAX_S:
         return None
@@ -148,19 +148,19 @@ def _angle(rotation: FloatArray) -> float:
     return math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1.0) / 2.0)))
 
 
-STAMP_S: Final = 1e-3  # what a stamp of whole milliseconds may be off
+STAMP_S: Final = 1e-3  # largest error of a stamp in whole milliseconds
 COMPASS_RAD: Final = 0.6
-"""What compass and attitude contradict one another by at a ratio of 1, as an angle.
+"""Angle between compass and attitude at a compass ratio of 1.
 
-ArduPilot accepts 3 deviations of 0.05 gauss; of the Earth's field 0.25 are level (0.15 to 0.4).
+ArduPilot accepts 3 deviations of 0.05 gauss; the Earth's field is 0.25 horizontally (0.15 to 0.4).
 """
 
 
 def reported_bound_rad(status: EstimatorStatus | None, least_rad: float) -> float:
-    """The bound on reported attitudes, by what the autopilot's estimator says of them.
+    """Return the bound on reported attitudes, given the autopilot's estimator status.
 
-    A ratio shows what compass and gyroscopes disagree by and nothing of what they err by alike, so
-    it never makes the bound less (docs/math.md 5.3).
+    A ratio shows the difference between compass and gyroscopes, not their common error, so it never
+    reduces the bound (docs/math.md 5.3).
     """
     if status is None:
         return least_rad
@@ -170,23 +170,23 @@ def reported_bound_rad(status: EstimatorStatus | None, least_rad: float) -> floa
 
 
 RATES_APART_S: Final = 0.05
-"""Least time between two rates of turn that are compared: stamps are whole milliseconds."""
-RATE_NOISE_DEGPS: Final = 2.0  # bound on the error of a reported rate of turn
+"""Least time between two angular rates that are compared: stamps are whole milliseconds."""
+RATE_NOISE_DEGPS: Final = 2.0  # bound on the error of a reported angular rate
 
 
 class AngularAcceleration:
-    """What a carrier's reported rates of turn prove of its angular acceleration."""
+    """Least angular acceleration of a carrier that its reported angular rates prove."""
 
     def __init__(self) -> None:
         self._raised = RaisedLimit()
         self._newest: tuple[int, float, float, float] | None = None
 
     def limit_degps2(self, base_degps2: float, sender_ns: int) -> float:
-        """The greatest angular acceleration taken for possible at a sender time."""
+        """Return the limit of angular acceleration at a sender time."""
         return self._raised.at(base_degps2, sender_ns)
 
     def look(self, attitude: Attitude, sender_ns: int, base_degps2: float) -> Refuted | None:
-        """Take in an attitude. Returns what it refutes of the limit, which is raised then."""
+        """Check an attitude. Return the refutation of the limit, which is then raised."""
         rates = (attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps)
         before = self._newest
         if before is not None and sender_ns - before[0] < RATES_APART_S * 1e9:
@@ -222,15 +222,15 @@ def moving(
     bounds: AttitudeBounds,
     contradicted: Contradiction | None,
 ) -> Carrier:
-    """The carrier aboard a vehicle, at the time of its track.
+    """Return the carrier aboard a vehicle, at the time of its track.
 
-    track         the vehicle's track, which gives position, velocity and bound
+    track         the vehicle's track: position, velocity and bound
     newest        its newest report; north and down are taken there, a few metres away
-    attitude      its newest attitude, carried on at its body rates
+    attitude      its newest attitude, extrapolated at its body rates
     since_ns      age of that attitude at the track's time
     doubt_s       bound on the error of that age
     bounds        bounds on the attitude and on its acceleration
-    contradicted  how the attitude before contradicts it; None: it does not
+    contradicted  contradiction with the previous attitude, if any
     """
     rates = _rates(attitude)
     age_s = since_ns * 1e-9

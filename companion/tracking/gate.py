@@ -1,10 +1,10 @@
-"""Which reports can be true, and when a track must be begun again because it is itself wrong.
+"""Gate: which reports can be true, and when a track must be restarted because it is itself wrong.
 
-A report is refused when the UAV cannot have got there: it lies outside the bound of what was
-predicted from the last *accepted* report, given the bounds on acceleration, speed and noise, plus
-its own noise. Refused reports never move the gate; they are set aside. Once enough of them agree
-with one another for long enough, with none accepted meanwhile, the track is begun again from them.
-See docs/math.md 5.2.
+A report is rejected if the UAV cannot have reached it: it lies outside the bound of the prediction
+from the last *accepted* report, given the bounds on acceleration, speed and noise, plus its own
+noise. Rejected reports never move the gate; they are kept apart. Once enough of them agree with one
+another for long enough, and none was accepted meanwhile, the track is restarted from them. See
+docs/math.md 5.2.
 """
 
 import math
@@ -20,29 +20,29 @@ FROZEN_TRAVEL_M = 0.3
 """Least distance that this speed must have covered while the position stayed the same."""
 
 ALTERNATIONS: Final = 3
-"""Alternations of refused and possible reports that show two vehicles."""
-SHARED_S: Final = 3.0  # seconds for which they must do so
+"""Alternations of rejected and possible reports that prove two vehicles."""
+SHARED_S: Final = 3.0  # seconds over which they must alternate
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateSettings:
-    """When refused reports become the track.
+    """Conditions under which rejected reports replace the track.
 
-    lead_m             how far a report may be ahead of the position or behind it, beside its
-                       noise (a feedthrough)
+    lead_m             how far a report may be ahead of or behind the position, beyond its noise (a
+                       feedthrough)
     """
 
-    reacquire_reports: int = 3  # refused reports that must agree
+    reacquire_reports: int = 3  # rejected reports that must agree
     reacquire_s: float = 1.0  # seconds over which they must agree
     forget_s: float = 10.0  # seconds without another one after which they are forgotten
     lead_m: float = 0.0
-    drift_max: float = 250e-6  # greatest drift of a sender's clock, a ratio
+    drift_max: float = 250e-6  # largest drift of a sender's clock, a ratio
 
     def slack_m(self, before: Fix, fix: Fix) -> float:
-        """How far apart two reports of one UAV may be because of their times alone.
+        """Return the distance between two reports of one UAV that errors of their times explain.
 
-        Stamps are whole milliseconds, the clock between them may drift, and either position may lag
-        more or less than is taken off. Each error of a time is worth the way flown in it then.
+        Stamps are whole milliseconds, the clock between them may drift, and the lag of either
+        position may differ from the one subtracted. Each time error costs the distance flown in it.
         """
         apart_s = abs(fix.sender_ns - before.sender_ns) * 1e-9
         drifted_s = 1e-3 + self.drift_max * apart_s
@@ -51,7 +51,7 @@ class GateSettings:
 
 
 def _way_m(fix: Fix, within_s: float) -> float:
-    """The most that can be flown within a time about a report, m; 0 where it has no velocity."""
+    """Return the largest distance flown within a time about a report, m; 0 without a velocity."""
     velocity = fix.velocity_ned_mps
     if velocity is None:
         return 0.0
@@ -62,7 +62,7 @@ def _way_m(fix: Fix, within_s: float) -> float:
 
 
 def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reason, str] | None:
-    """Why a report cannot be true, given the prediction for its time; None if it can."""
+    """Return why a report cannot be true, given the prediction for its time; None if it can."""
     (n, e, d), (there_n, there_e, there_d) = predicted.position_ned_m, fix.position_ned_m
     down = there_d - d
     horizontal_m = math.hypot(there_n - n, there_e - e)
@@ -76,7 +76,7 @@ def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reaso
 
 
 def is_frozen(before: Fix, fix: Fix) -> bool:
-    """Whether a position was sent again under a fresh stamp, though its velocity says it moved."""
+    """Return whether a position was resent under a new stamp although the UAV moves."""
     velocity = fix.velocity_ned_mps
     if velocity is None or before.position_ned_m != fix.position_ned_m:
         return False
@@ -86,7 +86,7 @@ def is_frozen(before: Fix, fix: Fix) -> bool:
 
 
 class Suspects(Generic[State]):
-    """Refused reports of one UAV that agree with one another, newest last."""
+    """Rejected reports of one UAV that agree with one another, newest last."""
 
     def __init__(self, observer: Observer[State], settings: GateSettings) -> None:
         self._observer = observer
@@ -97,7 +97,7 @@ class Suspects(Generic[State]):
         self._interrupted = False
 
     def add(self, fix: Fix) -> None:
-        """Set a refused report aside: it continues the run, or begins another."""
+        """Add a rejected report: it continues the run, or starts another."""
         if self._run:
             last = self._run[-1]
             predicted = self._observer.predict(self._observer.begin(last), fix.sender_ns)
@@ -114,11 +114,11 @@ class Suspects(Generic[State]):
         self._run.append(fix)
 
     def interrupt(self) -> None:
-        """Note that a report was possible: the run may be another vehicle's, or is over."""
+        """Record that a report was possible: the run may be another vehicle's, or is over."""
         self._interrupted = True
 
     def agree(self) -> bool:
-        """Whether the run is long enough, in reports and in seconds, to be believed."""
+        """Return whether the run is long enough, in reports and in seconds."""
         if len(self._run) < self._settings.reacquire_reports:
             return False
         lasted_ns = self._run[-1].sender_ns - self._begun_ns
@@ -126,15 +126,16 @@ class Suspects(Generic[State]):
 
     @property
     def silence_s(self) -> float:
-        """Time without a possible report after which the run takes the track's place, seconds.
+        """Time without a possible report after which the run replaces the track, seconds.
 
-        Longer where possible reports came between: it may be another vehicle's.
+        Longer if possible reports came in between: it may be another vehicle's.
         """
         least_s = self._settings.reacquire_s
         return max(least_s, SHARED_S) if self._alternations else least_s
 
     def goes_on(self, sender_ns: int) -> bool:
-        """Whether the run is a second vehicle's: it goes on while possible reports come between."""
+        """Return whether the run is a second vehicle's: it continues while possible reports
+        alternate."""
         if len(self._run) < self._settings.reacquire_reports or self._alternations < ALTERNATIONS:
             return False
         if self._run[-1].sender_ns - self._begun_ns < SHARED_S * 1e9:
@@ -142,7 +143,7 @@ class Suspects(Generic[State]):
         return sender_ns - self._run[-1].sender_ns < self._settings.forget_s * 1e9
 
     def take(self) -> list[Fix]:
-        """Take the run out."""
+        """Remove and return the run."""
         run = list(self._run)
         self._run.clear()
         return run

@@ -1,9 +1,9 @@
 """WGS84 and the local frame.
 
-The local frame is north-east-down at a fixed origin, and Cartesian: a point far away has its exact
+The local frame is north-east-down at a fixed origin, and Cartesian: a far point has its exact
 straight-line coordinates, and only "north" and "down" differ there from the directions at the
-origin. ``local_from_ned`` turns one into the other. Heights are taken as given by the sender (above
-mean sea level for GLOBAL_POSITION_INT); a common error of datum cancels in every difference of
+origin. ``local_from_ned`` rotates one into the other. Heights are used as the sender gives them
+(above mean sea level for GLOBAL_POSITION_INT); a common datum error cancels in every difference of
 positions.
 """
 
@@ -39,7 +39,7 @@ def ned_from_ecef(lat_deg: float, lon_deg: float) -> FloatArray:
 
 
 class Place(NamedTuple):
-    """A point on Earth: WGS84 degrees, metres above the ellipsoid or mean sea level, as given."""
+    """Point on Earth: WGS84 degrees, metres above the ellipsoid or mean sea level, as given."""
 
     lat_deg: Annotated[float, Meaning("latitude, WGS84", example=47.3977)]
     lon_deg: Annotated[float, Meaning("longitude, WGS84", example=8.5456)]
@@ -47,7 +47,7 @@ class Place(NamedTuple):
 
 
 class _Axes:
-    """North, east and down at a place, with the sines and cosines that turning to them takes."""
+    """North, east and down at a place, by sines and cosines."""
 
     __slots__ = ("cos_lat", "cos_lon", "sin_lat", "sin_lon")
 
@@ -65,7 +65,7 @@ class _Axes:
         return across_m * self.cos_lon, across_m * self.sin_lon, z_m
 
     def ned(self, x: float, y: float, z: float) -> Vector:
-        """An earth-centred vector in north, east and down of the place."""
+        """Rotate an earth-centred vector to north, east and down of the place."""
         out = self.cos_lon * x + self.sin_lon * y
         return (
             self.cos_lat * z - self.sin_lat * out,
@@ -74,7 +74,8 @@ class _Axes:
         )
 
     def ecef(self, north: float, east: float, down: float) -> Vector:
-        """The way back: ``ned`` of it is the vector itself."""
+        """Rotate north, east and down of the place to an earth-centred vector, the inverse of
+        ``ned``."""
         out = -self.sin_lat * north - self.cos_lat * down
         return (
             self.cos_lon * out - self.sin_lon * east,
@@ -104,14 +105,14 @@ class LocalFrame:
     def localise(
         self, lat_deg: float, lon_deg: float, alt_m: float, velocity_ned: Vector | None
     ) -> tuple[Vector, Vector | None]:
-        """Local coordinates of a place, and of a velocity that is in north-east-down there."""
+        """Return local coordinates of a place, and of a velocity given in north-east-down there."""
         there, here = _Axes(lat_deg, lon_deg), self._axes
         (x, y, z), (x0, y0, z0) = there.ecef_m(alt_m), self._origin
         position = here.ned(x - x0, y - y0, z - z0)
         return position, None if velocity_ned is None else here.ned(*there.ecef(*velocity_ned))
 
     def position_ned_m(self, lat_deg: float, lon_deg: float, alt_m: float) -> FloatArray:
-        """Local coordinates of a place in metres, (3,)."""
+        """Return local coordinates of a place in metres, (3,)."""
         return np.array(self.localise(lat_deg, lon_deg, alt_m, None)[0])
 
     def local_from_ned(self, lat_deg: float, lon_deg: float) -> FloatArray:
@@ -119,13 +120,13 @@ class LocalFrame:
         return self._local_from_ecef @ ned_from_ecef(lat_deg, lon_deg).T
 
     def place(self, north_m: float, east_m: float, down_m: float) -> Place:
-        """The place of one local point; for single points it is faster than ``geodetic``."""
+        """Return the place of one local point; faster than ``geodetic`` for single points."""
         return _geodetic(
             *(at + x * north_m + y * east_m + z * down_m for at, x, y, z in self._rows)
         )
 
     def geodetic(self, position_ned_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Latitude and longitude in degrees and height in metres of local points, (N, 3)."""
+        """Return latitude and longitude in degrees and height in metres of local points, (N, 3)."""
         ecef_m = np.asarray(position_ned_m, dtype=float) @ self._local_from_ecef + self._origin_m
         places = [_geodetic(*point) for point in ecef_m.tolist()]
         lat, lon, alt = np.array(places).reshape(-1, 3).T
@@ -133,10 +134,10 @@ class LocalFrame:
 
 
 def _geodetic(x_m: float, y_m: float, z_m: float) -> Place:
-    """The place of an earth-centred point.
+    """Return the place of an earth-centred point.
 
-    Bowring's formula (1976), two steps: exact to rounding wherever aircraft fly. pymap3d does the
-    same for arrays; for the few points of an update its overhead would be most of the time.
+    Bowring's formula (1976), two steps: exact to rounding at all flight altitudes. pymap3d does the
+    same for arrays; for the few points of an update its overhead would dominate.
     """
     across_m = math.hypot(x_m, y_m)
     lat = math.atan2(z_m, across_m * (1 - ECCENTRICITY2))

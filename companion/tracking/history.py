@@ -1,8 +1,8 @@
-"""The recent reports of one UAV, in the order in which they were made.
+"""Recent reports of one UAV, in the order of the sender's time.
 
-Links deliver late and out of order. A late report within the window is put where it belongs, and
-what follows it is estimated again, so that the result is that of reports in order. A report older
-than the window is not used. Nearly always a report is the newest, and costs one step.
+Links deliver late and out of order. A late report within the window is inserted in its place, and
+all later states are estimated again, so that the result equals that of reports in order. A report
+older than the window is not used. Nearly always a report is the newest, and costs one step.
 """
 
 from bisect import bisect_left
@@ -19,7 +19,7 @@ ACCELERATION_REPORTS_MAX = 25
 
 @dataclass(slots=True)
 class Entry(Generic[State]):
-    """A report, the observer's state there, and the prediction for it (None for the first)."""
+    """Report, the observer's state there, and the prediction for it (None for the first)."""
 
     fix: Fix
     state: State
@@ -27,7 +27,7 @@ class Entry(Generic[State]):
 
 
 class ReportHistory(Generic[State]):
-    """The reports of one UAV within the window.
+    """Reports of one UAV within the window.
 
     ``entries`` are in order of the sender's time, and never empty.
     """
@@ -39,11 +39,11 @@ class ReportHistory(Generic[State]):
 
     @property
     def newest(self) -> Entry[State]:
-        """The entry that predictions start from."""
+        """Entry from which predictions start."""
         return self.entries[-1]
 
     def index(self, sender_ns: int) -> int | None:
-        """The place of a report with this time; None if it is too old to be used."""
+        """Return the index for a report with this time; None if it is too old to be used."""
         if sender_ns > self.newest.fix.sender_ns:
             return len(self.entries)
         if sender_ns < self.newest.fix.sender_ns - self._window_ns:
@@ -51,9 +51,9 @@ class ReportHistory(Generic[State]):
         return bisect_left(self.entries, sender_ns, key=lambda entry: entry.fix.sender_ns)
 
     def insert(self, index: int, fix: Fix, predicted: Prediction | None = None) -> None:
-        """Put a report in its place and estimate again what follows it.
+        """Insert a report and estimate all later states again.
 
-        ``predicted`` is what the entry before predicts for it, if that was computed already.
+        ``predicted`` is the previous entry's prediction for it, if already computed.
         """
         if predicted is not None and index == len(self.entries):
             state = self._observer.after(self.newest.state, predicted, fix)
@@ -75,10 +75,10 @@ class ReportHistory(Generic[State]):
         return Entry(fix, self._observer.after(before, predicted, fix), predicted)
 
     def accelerations(self, windows: Sequence[tuple[float, int]]) -> list[Vector | None]:
-        """Least-squares slopes of the velocities reported within some times, m/s².
+        """Return least-squares slopes of the reported velocities over several windows, m/s².
 
-        windows  the times, seconds, ascending, each with the least number of velocities: older
-                 ones are taken if need be, and None stands where there are too few
+        windows  lengths in seconds, ascending, each with the least number of velocities: older ones
+                 are added if needed, and the slope is None if there are too few
 
         One pass over the reports, newest first: each window ends where the next report is too old.
         """
@@ -115,7 +115,7 @@ class ReportHistory(Generic[State]):
 
 
 def _slope(n: float, t1: float, t2: float, v: Vector, w: Vector) -> Vector | None:
-    """The slope from the sums of 1, t, t², v and t v; None where all times are one."""
+    """Return the slope from the sums of 1, t, t², v and t v; None if all times are equal."""
     spread = t2 - t1 * t1 / n
     if spread <= 0.0:
         return None

@@ -1,9 +1,9 @@
-"""One aircraft under two names: its own telemetry, and what receivers relay of it.
+"""Identification of one aircraft under two ids: its own telemetry, and relayed reports.
 
-Two beams on one aircraft would be two nearly equal steering vectors, which ruin zero forcing. A
-relayed aircraft is identified with a track by which it would rather be known (telemetry, or Remote
-ID before ADS-B) after several reports in a row that are nearer to it than their errors allow to
-tell apart, and is separated again after as many that are not.
+Two beams on one aircraft have nearly equal steering vectors, which ruin zero forcing. A relayed
+aircraft is identified with a track of a better kind (telemetry, or Remote ID before ADS-B) after
+several reports in a row that agree with it within the errors of both. It is separated again after
+as many that do not.
 """
 
 import math
@@ -12,34 +12,31 @@ from typing import Final
 
 from companion.values import Fix, Track
 
-RELAYED_MAX: Final = 8192  # relayed aircraft remembered; beyond it the one heard first is forgotten
+RELAYED_MAX: Final = 8192  # most relayed aircraft remembered; beyond it the oldest is forgotten
 REPORTS_TO_DECIDE: Final = 5  # reports in a row that identify, or separate, two tracks
-SPEED_APART_MPS: Final = 15.0  # difference in velocity above which two tracks are not one aircraft
+SPEED_APART_MPS: Final = 15.0  # difference in velocity above which two tracks are two aircraft
 
 
 @dataclass(slots=True)
 class _Relayed:
-    """A relayed aircraft: the track near its newest reports, and the track that it is.
+    """State of a relayed aircraft.
 
-    same_as   the better known track that is the same aircraft; None if there is none
+    same_as   the better track of the same aircraft; None if there is none
     """
 
-    near: str  # the nearest better known track; empty if none is near enough
-    in_a_row: int = 0  # newest reports for which that is so
+    near: str  # the nearest better track; empty if none is near enough
+    in_a_row: int = 0  # newest reports for which ``near`` did not change
     same_as: str | None = None
 
 
 class Identities:
-    """Which relayed aircraft is which better known track."""
+    """Assignment of relayed aircraft to better tracks."""
 
     def __init__(self) -> None:
         self._relayed: dict[str, _Relayed] = {}
 
     def same_as(self, uav: str) -> str | None:
-        """The better known track that is the same aircraft as this relayed one.
-
-        None if there is none.
-        """
+        """Return the better track of the same aircraft; None if there is none."""
         known = self._relayed.get(uav)
         return None if known is None else known.same_as
 
@@ -48,7 +45,7 @@ class Identities:
         self._relayed.pop(uav, None)
 
     def observe(self, relayed: Fix, better: list[Track]) -> None:
-        """Compare a relayed report with the better known tracks at its time."""
+        """Compare a relayed report with the better tracks at its time."""
         near = [(_apart_m(relayed, track), track.uav) for track in better]
         nearest = min((pair for pair in near if pair[0] is not None), default=None)
         match = nearest[1] if nearest else ""
@@ -65,7 +62,7 @@ class Identities:
 
 
 def _apart_m(relayed: Fix, track: Track) -> float | None:
-    """Horizontal distance between two tracks that may be one aircraft; None if they cannot be."""
+    """Return the horizontal distance if report and track can be one aircraft, else None."""
     (n, e, d), (to_n, to_e, to_d) = relayed.position_ned_m, track.position_ned_m.tolist()
     apart_m = math.hypot(n - to_n, e - to_e)
     if apart_m > relayed.noise.horizontal_m + track.horizontal_bound_m:

@@ -1,9 +1,9 @@
-"""What an aircraft is taken to be able to do, by its type; and what its reports prove it to do.
+"""Limits of an aircraft: assumed by its type, and raised when its reports refute them.
 
-The bounds rest on a greatest speed and a greatest acceleration. Two reported velocities prove a
-mean acceleration between them of at least (|v2 - v1| - n1 - n2) / T, n their noise. Where that is
-more than what is taken for possible, the assumption is refuted: it is raised for this aircraft at
-once, and fades back over minutes. See docs/math.md 5.6.
+The bounds assume a largest speed and a largest acceleration. Two reported velocities prove a mean
+acceleration between them of at least (|v2 - v1| - n1 - n2) / T, n their noise. If that exceeds the
+limit, the assumption is refuted: the limit of this aircraft is raised at once, and decays over
+minutes. See docs/math.md 5.6.
 """
 
 import math
@@ -14,18 +14,19 @@ from typing import Final
 
 from companion.values import Fix, Limits, LimitSource, Refuted
 
-RAISED: Final = 1.5  # multiple of what was proven that is taken for possible from then on
-FADES_S: Final = 120.0  # time constant with which a raised limit fades
+RAISED: Final = 1.5  # multiple of the proven value that is assumed from then on
+FADES_S: Final = 120.0  # time constant with which a raised limit decays
 MOST: Final = 6.0
-"""Multiple of the limit above which a proof is not believed: the report is wrong, not the limit."""
+"""Multiple of the limit above which a proof is rejected: the report is wrong, not the limit."""
 PAIRS_S: Final = (0.001, 0.2, 0.5, 1.0, 2.0)
-"""Least times between two velocities that are compared: the one before, and others further back."""
+"""Least times between two velocities that are compared: with the previous one, and with older ones.
+"""
 _PAIRS_NS: Final = tuple(round(least_s * 1e9) for least_s in PAIRS_S)
 _KEPT: Final = 64
 
 
 class Airframe(StrEnum):
-    """Kinds of aircraft that differ in what they can do."""
+    """Kind of aircraft, by its limits."""
 
     COPTER = "copter"
     AEROPLANE = "aeroplane"
@@ -36,19 +37,19 @@ class Airframe(StrEnum):
     ADSB = "adsb"
 
 
-ANY_LAG_S: Final = (0.0, 0.06)  # lag of an autopilot of which nothing is known
+ANY_LAG_S: Final = (0.0, 0.06)  # lag of an unknown autopilot
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AirframeLimits:
-    """What is assumed of a kind of aircraft.
+    """Assumed limits of a kind of aircraft.
 
     speed_mps, acceleration_mps2
-                greatest of each, norms of 3-vectors
-    lag_s       least and greatest time by which a reported position is older than its stamp;
-                negative: it is where the aircraft will be
+                largest values, norms of 3-vectors
+    lag_s       least and largest age of a reported position at its stamp; negative: the position is
+                extrapolated
     turn_degps2
-                greatest angular acceleration, norm about the body's axes
+                largest angular acceleration, norm about the body's axes
     """
 
     speed_mps: float
@@ -68,10 +69,10 @@ LIMITS: Final = {
         speed_mps=400.0, acceleration_mps2=16.0, lag_s=(0.0, 0.0), turn_degps2=720.0
     ),
 }
-"""From real and simulated logs: docs/field-notes.md 1."""
+"""Limits from real and simulated logs: docs/field-notes.md 1."""
 ARDUPILOT_LAG_S: Final = {Airframe.COPTER: (0.019, 0.040), Airframe.AEROPLANE: (-0.033, -0.019)}
 ARDUPILOT_ANY_LAG_S: Final = (-0.033, 0.040)
-"""Lag of ArduPilot's positions in simulation: its copters' and its aeroplanes' differ in sign."""
+"""Lag of ArduPilot's positions in simulation; it differs in sign between copters and aeroplanes."""
 
 _ARDUPILOT: Final = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
 _AIRFRAMES: Final = {
@@ -84,12 +85,16 @@ _AIRFRAMES: Final = {
 
 
 def airframe(mav_type: int | None) -> Airframe:
-    """The kind of aircraft by MAV_TYPE (minimal.xml) of its heartbeat; None: none was heard."""
+    """Return the kind of aircraft by MAV_TYPE (minimal.xml) of its heartbeat.
+
+    None: not received.
+    """
     return Airframe.UNKNOWN if mav_type is None else _AIRFRAMES.get(mav_type, Airframe.UNKNOWN)
 
 
 def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
-    """Least and greatest lag of a position by MAV_AUTOPILOT and the kind of aircraft, seconds."""
+    """Return the least and largest lag of a position, by MAV_AUTOPILOT and kind of aircraft,
+    seconds."""
     if autopilot == _ARDUPILOT:
         return ARDUPILOT_LAG_S.get(kind, ARDUPILOT_ANY_LAG_S)
     return LIMITS[kind].lag_s
@@ -97,18 +102,18 @@ def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
 
 @dataclass(slots=True)
 class RaisedLimit:
-    """A limit that was raised: to how much, and when on the sender's timeline."""
+    """Raised limit: its value, and the sender time of the raise."""
 
     to: float = 0.0
     at_ns: int = 0
 
     def to_hold(self, proven: float, sender_ns: int) -> float:
-        """Raise the limit to what holds what was proven, and more; returns it."""
+        """Raise the limit above a proven value; return the new limit."""
         self.to, self.at_ns = RAISED * proven, sender_ns
         return self.to
 
     def at(self, limit: float, sender_ns: int) -> float:
-        """The limit in force at a sender time."""
+        """Return the limit in force at a sender time."""
         if self.to <= limit:
             return limit
         faded = math.exp(-max(0, sender_ns - self.at_ns) * 1e-9 / FADES_S)
@@ -116,7 +121,7 @@ class RaisedLimit:
 
 
 class Refutations:
-    """What the reports of one UAV have proven of its limits. ``look`` takes them in any order."""
+    """Limits of one UAV that its reports refuted. ``look`` takes reports in any order."""
 
     def __init__(self) -> None:
         self.speed = RaisedLimit()
@@ -125,7 +130,7 @@ class Refutations:
         self._velocities: list[tuple[float, float, float, float, float]] = []
 
     def limits(self, base: Limits, sender_ns: int) -> Limits:
-        """The limits in force at a sender time."""
+        """Return the limits in force at a sender time."""
         speed = self.speed.at(base.speed_max_mps, sender_ns)
         acceleration = self.acceleration.at(base.acceleration_max_mps2, sender_ns)
         if speed == base.speed_max_mps and acceleration == base.acceleration_max_mps2:
@@ -133,7 +138,7 @@ class Refutations:
         return Limits(speed, acceleration, LimitSource.RAISED)
 
     def look(self, fix: Fix) -> list[Refuted]:
-        """Take in a report with its base limits. Returns what it refutes, and raises that."""
+        """Check a report against its limits. Return the refutations; the limits are raised."""
         base, velocity = fix.limits, fix.velocity_ned_mps
         if base is None or velocity is None:
             return []
@@ -157,7 +162,7 @@ class Refutations:
         return found
 
     def _proven(self, fix: Fix, north: float, east: float, down: float) -> float:
-        """The greatest mean acceleration that a velocity proves with those before it, m/s²."""
+        """Return the largest mean acceleration that a velocity proves with earlier ones, m/s²."""
         most, noise = 0.0, fix.noise
         times_ns, end = self._times_ns, len(self._times_ns)
         for least_ns in _PAIRS_NS:
@@ -167,7 +172,7 @@ class Refutations:
             n, e, d, noise_mps, time_s = self._velocities[end - 1]
             n, e, d = north - n, east - e, down - d
             changed = math.sqrt(n * n + e * e + d * d)
-            # Stamps are whole milliseconds, so the time between may be one more.
+            # Stamps are whole milliseconds: the interval may be one longer.
             apart_s = (fix.sender_ns - times_ns[end - 1]) * 1e-9 + 1e-3 + time_s + noise.time_s
             most = max(most, (changed - noise_mps - noise.velocity_mps) / apart_s)
         return most

@@ -1,4 +1,4 @@
-"""Bounds on the errors of a report, by the accuracy that is stated or for relayed aircraft."""
+"""Bounds on the errors of a report, from stated accuracies or for relayed aircraft."""
 
 import math
 from dataclasses import dataclass
@@ -12,33 +12,33 @@ QUANTISATION: Final = 0.02
 GLOBAL_POSITION_INT has steps of 1.1 cm and 1 cm/s.
 """
 LEAST_ACCURACY_M: Final = {4: 0.2, 5: 0.1, 6: 0.01, 7: 0.01, 8: 0.01}
-"""Least accuracy that a kind of fix (GPS_FIX_TYPE) is believed to have: differential, RTK floating
-and fixed, static, PPP. Some receivers state a millimetre when they mean that they do not know."""
-PLAIN_ACCURACY_M: Final = 0.3  # the same of any other fix
+"""Best credible accuracy for a type of fix (GPS_FIX_TYPE): differential, RTK float and fixed,
+static, PPP. Some receivers state a millimetre if they do not know their accuracy.
+"""
+PLAIN_ACCURACY_M: Final = 0.3  # best credible accuracy of any other fix
 ADSB_TIME_BOUND_S: Final = 1.0
 """Uncertainty of the time of an ADS-B report: ``tslc`` is in whole seconds."""
 ADSB_NOISE_M: Final = 100.0
 """Bound on the position error of an ADS-B report.
 
-It is above what most transponders vouch for (NACp 8: 93 m) and above the steps of pressure
-altitude.
+It exceeds what most transponders guarantee (NACp 8: 93 m) and the steps of pressure altitude.
 """
 ADSB_VELOCITY_NOISE_MPS: Final = 10.0  # bound on the velocity error of an ADS-B report (NACv 1)
 GEOID_M: Final = 107.0
-"""Greatest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
+"""Largest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 
-Heights above the ellipsoid stand beside telemetry's, which are above mean sea level. Where the
-geoid's height is not known they are left as they are, and may be that far off.
+Heights above the ellipsoid are compared with telemetry's, which are above mean sea level. If the
+geoid height is unknown they are not converted, and may be off by this much.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseSettings:
-    """How noise bounds are found.
+    """How noise bounds are derived.
 
-    default  bounds where nothing better is known
-    factor   multiple of a stated accuracy (a standard deviation or 68 % radius, as receivers
-             have it) that is taken as a bound; None: stated accuracies are ignored
+    default  bounds without better information
+    factor   multiple of a stated accuracy (a standard deviation or 68 % radius, as receivers state
+             it) that is used as a bound; None: stated accuracies are ignored
     """
 
     default: ReportNoise
@@ -46,7 +46,7 @@ class NoiseSettings:
 
 
 def reported(status: GnssStatus, settings: NoiseSettings) -> ReportNoise:
-    """The noise bounds by GPS_RAW_INT, field by field where it is sent."""
+    """Return the noise bounds from GPS_RAW_INT, with defaults for fields that are not sent."""
     default, factor = settings.default, settings.factor
     if factor is None:
         return default
@@ -75,16 +75,16 @@ def relayed(
     factor: float | None = None,
     geoid_error_m: float = 0.0,
 ) -> ReportNoise:
-    """The noise bounds of a relayed aircraft's report.
+    """Return the noise bounds of a relayed aircraft's report.
 
-        accuracy  what it says of itself; what is unknown counts as ADS-B's in general
-        datum     of its height: no accuracy of a height holds for that of the standard pressure
-        factor    multiple of a stated accuracy that is taken as a bound; None: it is ignored
+        accuracy  stated by the aircraft; unknown fields get the defaults of ADS-B
+        datum     of its height: a stated accuracy does not apply to pressure altitude
+        factor    multiple of a stated accuracy that is used as a bound; None: it is ignored
         geoid_error_m
-                  most that a height above mean sea level is off that was brought there
+                  largest error of a height that was converted to mean sea level
 
     The uncertainty of its time adds the distance flown in it, and an altitude that was true
-    ``alt_age_s`` apart adds what can be climbed in that time.
+    ``alt_age_s`` apart adds the distance climbed in that time.
     """
     known = Accuracy() if accuracy is None or factor is None else accuracy
     time_s = ADSB_TIME_BOUND_S if known.time_s is None else known.time_s

@@ -1,8 +1,8 @@
-"""The pace at which a UAV's reports come, and how long a silence is no more than its pace.
+"""Report timing of a UAV, and the silence that is still normal for it.
 
-A link that brings a report each .8 s after up to a second is not losing its UAV every other report:
-a track coasts only when nothing has come for longer than three of its own intervals and the spread
-of its link, and than silences that it has just come back from.
+A link that delivers a report every 0.8 s with a latency up to a second does not lose its UAV
+between reports. A track coasts only after a silence longer than three of its own intervals plus the
+spread of latencies, and longer than recent silences.
 """
 
 from collections import deque
@@ -10,14 +10,15 @@ from typing import Final
 
 from companion.values import Fix
 
-KEPT: Final = 16  # reports from which the pace is taken
+KEPT: Final = 16  # reports from which the timing is measured
 INTERVALS: Final = 3.0
 SILENCES: Final = 1.25
-"""Multiple of the second longest silence of late that is no news: a single one is."""
+"""Multiple of the second longest recent silence that is still normal; the longest may be an
+outlier."""
 
 
 class ReportTiming:
-    """Intervals, latencies and silences of the newest reports. ``add`` takes those accepted."""
+    """Intervals, latencies and silences of the newest reports. ``add`` takes accepted reports."""
 
     def __init__(self) -> None:
         self._intervals_s: deque[float] = deque(maxlen=KEPT)
@@ -27,13 +28,13 @@ class ReportTiming:
         self._silence_s = 0.0
 
     def add(self, fix: Fix) -> None:
-        """Take in an accepted report, in order of arrival."""
+        """Add an accepted report, in order of arrival."""
         latency_s = (fix.arrival_ns - fix.t_ns) * 1e-9
         self._latencies_s.append(latency_s)
         before = self._newest
         if before is not None and fix.sender_ns > before.sender_ns:
             self._intervals_s.append((fix.sender_ns - before.sender_ns) * 1e-9)
-            # How old the report before had become when this one came.
+            # Age of the previous report when this one arrived.
             self._ages_s.append(self._intervals_s[-1] + latency_s)
         if before is None or fix.sender_ns > before.sender_ns:
             self._newest = fix
@@ -50,5 +51,6 @@ class ReportTiming:
         return max(usual_s, SILENCES * sorted(self._ages_s)[-2])
 
     def silence_s(self, least_s: float, most_s: float) -> float:
-        """Age of the newest report beyond which the track coasts, seconds, within two limits."""
+        """Return the age of the newest report beyond which the track coasts, seconds, within two
+        limits."""
         return min(max(least_s, self._silence_s), most_s)

@@ -1,11 +1,11 @@
-"""Errors of past predictions, as later reports show them.
+"""Errors of past predictions, as later reports reveal them.
 
-Every report shows how far earlier predictions for its time were off. That chooses, for each UAV,
-the way of feeding an acceleration forward that would have predicted its own last reports best, or
-none: what helps in a steady turn hurts where velocities are sparse or noisy. Likewise whether its
-positions are taken as reported, or smoothed along the reported velocities. And it says what error
-is usual at a given age, as a quantile of those of the near past: no law of errors is assumed, only
-that the near future resembles the near past.
+Every report reveals the errors of earlier predictions for its time. For each UAV they select the
+acceleration model that would have predicted its own recent reports best, or none: a model that
+helps in a steady turn is harmful with sparse or noisy velocities. They also select whether
+positions are used as reported, or smoothed along the reported velocities. Finally they give the
+usual error at a given age, as a quantile of recent errors: no error distribution is assumed, only
+that the near future resembles the recent past.
 """
 
 import math
@@ -21,15 +21,15 @@ from companion.values import Fix, Vector
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccelerationModel:
-    """A model of the acceleration that is fed forward.
+    """Model of the acceleration that is fed forward.
 
     turns     coordinated turn: the lateral acceleration rotates with the velocity and does not
               decay; the longitudinal part is dropped
     """
 
-    window_s: float  # time over which the slope of the reported velocities is taken; 0: none is fed
+    window_s: float  # time over which the slope of the reported velocities is taken; 0: no model
     fewest: int  # least number of velocities
-    fades_s: float  # time constant with which the acceleration fades
+    fades_s: float  # time constant with which the acceleration decays
     turns: bool = False
 
 
@@ -44,26 +44,27 @@ ACCELERATION_MODELS: Final = (
     AccelerationModel(window_s=2.5, fewest=3, fades_s=3.0, turns=True),
     AccelerationModel(window_s=5.0, fewest=5, fades_s=3.0, turns=True),
 )
-"""None; a quick turn, soon over or not; one that goes on; a slow one, noisy reports; circles."""
+"""None; quick turns of short and long duration; a sustained turn; a slow one with noisy reports;
+circles."""
 WINDOWS: Final = sorted({(way.window_s, way.fewest) for way in ACCELERATION_MODELS if way.window_s})
-"""Windows of the ways and the velocities they need, each once, ascending."""
-TURNING_MPS: Final = 1.0  # speed in the plane below which there is no direction that could turn
+"""Distinct windows of the models with the numbers of velocities they need, ascending."""
+TURNING_MPS: Final = 1.0  # horizontal speed below which the course is undefined
 SMOOTHING_SHARE: Final = 0.35  # share of the newest report in a smoothed position
 SMOOTHING_GAP_S: Final = 5.0  # gap between reports over which positions are not smoothed
 ZERO: Final = (0.0, 0.0, 0.0)
 COMPARED_AGES_S: Final = (1.0, 2.0)
-"""Least ages of the predictions by which ways are judged: soon, and as over a slow radio."""
-MEMORY_S: Final = 20.0  # time constant with which what was seen is forgotten
+"""Least ages of the predictions by which models are compared: short, and as over a slow radio."""
+MEMORY_S: Final = 20.0  # time constant with which squared errors decay
 SWITCH_RATIO: Final = 0.9
-"""Share of the present way's mean square error that another's must be below to take its place."""
-SWITCH_AFTER: Final = 4  # least number of judgements before a way other than the plain one is taken
+"""Ratio to the present model's mean square error that another must be below to replace it."""
+SWITCH_AFTER: Final = 4  # comparisons before a model other than constant velocity is selected
 AGES_S: Final = (0.25, 1.0, 2.5)
 """Least ages of the predictions whose errors are kept for the usual error."""
 ERRORS_KEPT: Final = 200
 QUANTILE: Final = 0.95
-"""Share of the errors that the usual one is not below: of n the ceil((n + 1) QUANTILE)-th."""
+"""Quantile of the errors that is the usual one: of n errors the ceil((n + 1) QUANTILE)-th."""
 ERRORS_LEAST: Final = 20
-SPACING_S: Final = 0.3  # least time between reports that are judged: more often would say no more
+SPACING_S: Final = 0.3  # least time between evaluated reports; more would add no information
 _KEPT: Final = 64
 
 
@@ -78,7 +79,7 @@ class _PastPrediction:
     smoothing_offset: Vector  # of the smoothed position from the reported one
 
     def error_m(self, way: int, there: Vector, ahead_s: float) -> float:
-        """How far the prediction by a way is from a position reported later.
+        """Return the distance of a model's prediction from a position reported later.
 
         Models are numbered as in ``ACCELERATION_MODELS``, then once more over smoothed positions.
         """
@@ -90,7 +91,7 @@ class _PastPrediction:
     def errors_m(
         self, ways: Sequence[int], there: Vector, ahead_s: float
     ) -> tuple[list[float], list[float]]:
-        """The errors of several models: over reported positions, and over smoothed ones."""
+        """Return the errors of several models: over reported positions, and over smoothed ones."""
         (n, e, d), (vn, ve, vd), (tn, te, td) = self.position, self.velocity, there
         n, e, d = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
         aside_n, aside_e, aside_d = self.smoothing_offset
@@ -110,7 +111,7 @@ class _PastPrediction:
 
 @dataclass(slots=True, kw_only=True)
 class _Errors:
-    """The newest errors of predictions of about one age."""
+    """Newest errors of predictions of about one age."""
 
     in_order: deque[float] = field(default_factory=lambda: deque(maxlen=ERRORS_KEPT))
     sorted_m: list[float] = field(default_factory=list)
@@ -130,7 +131,7 @@ class _Errors:
 
 
 class PastPredictions:
-    """The past predictions of one UAV. ``add`` takes its reports in order of the sender's time."""
+    """Past predictions of one UAV. ``add`` takes its reports in order of the sender's time."""
 
     def __init__(self) -> None:
         self._made: deque[_PastPrediction] = deque(maxlen=_KEPT)
@@ -139,12 +140,12 @@ class PastPredictions:
         self._compared_ns = 0
         self._model = 0
         self._errors = tuple(_Errors() for _ in AGES_S)
-        self._smoothed: tuple[int, Vector, Vector] | None = None  # when, the place, the velocity
+        self._smoothed: tuple[int, Vector, Vector] | None = None  # time, position, velocity
         self._smoothing_offset: Vector = ZERO
 
     @property
     def model(self) -> AccelerationModel:
-        """The acceleration model in use."""
+        """Acceleration model in use."""
         return ACCELERATION_MODELS[self._model % len(ACCELERATION_MODELS)]
 
     @property
@@ -153,7 +154,7 @@ class PastPredictions:
         return self._smoothing_offset if self._model >= len(ACCELERATION_MODELS) else ZERO
 
     def smooth(self, fix: Fix) -> None:
-        """Take the newest report into the smoothed position: every one, before ``add``."""
+        """Update the smoothed position by the newest report: by every one, before ``add``."""
         before, velocity = self._smoothed, fix.velocity_ned_mps
         self._smoothed, self._smoothing_offset = None, ZERO
         if velocity is None:
@@ -175,11 +176,11 @@ class PastPredictions:
         self._smoothed = (fix.sender_ns, place, velocity)
 
     def is_due(self, sender_ns: int) -> bool:
-        """Whether a report of this time is to be added."""
+        """Return whether a report of this time must be added."""
         return not self._made or sender_ns - self._made[-1].sender_ns >= SPACING_S * 1e9
 
     def add(self, fix: Fix, accelerations: tuple[Vector | None, ...]) -> None:
-        """Judge earlier predictions by a report; remember what can be predicted from it.
+        """Evaluate earlier predictions by a report; store the state to predict from it.
 
         ``accelerations``: what each model would feed forward from this report, m/s².
         """
@@ -204,7 +205,8 @@ class PastPredictions:
             )
 
     def _older(self, sender_ns: int, least_s: float) -> _PastPrediction | None:
-        """The newest of what is remembered that is at least so old, and not twice as old."""
+        """Return the newest stored state of at least an age; None if it is more than 2 s + twice as
+        old."""
         newest_ns = sender_ns - round(least_s * 1e9)
         for made in reversed(self._made):
             if made.sender_ns <= newest_ns:
@@ -232,10 +234,10 @@ class PastPredictions:
             self._model = best
 
     def error_p95_m(self, age_s: float) -> float | None:
-        """The error that 95 of 100 predictions of this age stay below, as reports have shown.
+        """Return the 95th percentile of recent prediction errors at an age; None before there are
+        enough.
 
-        Between the ages seen it is interpolated, beyond them carried on with the square of the age.
-        None before there are enough.
+        It is interpolated between the observed ages, and extrapolated with the square of the age.
         """
         known = [
             (one.age_s, one.error_p95_m) for one in self._errors if one.error_p95_m is not None
@@ -255,10 +257,10 @@ class PastPredictions:
 def fed_forward(
     way: AccelerationModel, acceleration: Vector, velocity: Vector, ahead_s: float
 ) -> tuple[Vector, Vector]:
-    """Displacement (m) and change of velocity (m/s) that an acceleration causes within a time.
+    """Displacement (m) and change of velocity (m/s) by an acceleration within a time.
 
-    A turn in the plane at the rate w = (v x a) / v^2 turns the velocity by w t, and the way is the
-    integral of that (docs/math.md 5.1).
+    A turn in the plane at the rate w = (v x a) / v^2 rotates the velocity by w t, and the
+    displacement is the integral of that (docs/math.md 5.1).
     """
     way_s2, gain_s = fading_response(ahead_s, way.fades_s)
     (a, b, c), (north, east, _) = acceleration, velocity
@@ -268,7 +270,7 @@ def fed_forward(
     rate = (north * b - east * a) / level
     angle = min(max(rate * ahead_s, -math.pi), math.pi)
     along, across = math.sin(angle), 1.0 - math.cos(angle)
-    # Of angles that vanish the series: (sin x / x - 1) t and (1 - cos x) / x t.
+    # Series for small angles: (sin x / x - 1) t and (1 - cos x) / x t.
     less = ahead_s * (along / angle - 1.0 if abs(angle) > 1e-3 else -angle * angle / 6.0)
     aside = ahead_s * (across / angle if abs(angle) > 1e-3 else angle / 2.0)
     return (
@@ -278,7 +280,7 @@ def fed_forward(
 
 
 def fading_response(ahead_s: float, fades_s: float) -> tuple[float, float]:
-    """Displacement (s²) and gain in speed (s) by a fading acceleration of 1 within a time.
+    """Displacement (s²) and gain in speed (s) by a decaying unit acceleration within a time.
 
     s(τ) of docs/math.md 5.1, and its derivative.
     """

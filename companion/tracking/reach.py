@@ -1,12 +1,12 @@
-"""The places that a UAV can have reached: what its newest report and its limits leave.
+"""Reachable set of a UAV, from its newest report and its limits.
 
 At a time s after a report of position p and velocity v, with noise n_p and n_v and an acceleration
 of at most a, the UAV is within
 
     R(s) = n_p + |s| n_v + a s^2 / 2    of    p + v s
 
-Where s is known to lie between two times only, all of these balls are possible. |q - (p + v s)| and
-R(s) are both convex in s, so their sum is greatest at one of the two ends, for every place q: the
+If s is only known to lie between two times, all of these balls are possible. |q - (p + v s)| and
+R(s) are both convex in s, so for every place q their sum is largest at one of the two ends: the
 bound about a prediction q is the larger of the two, and exact. Older reports add nothing to the
 worst case. See docs/math.md 5.1.
 """
@@ -18,7 +18,7 @@ from companion.values import Fix, Limits, SenderTime, Vector
 
 
 class Reach(NamedTuple):
-    """Bounds about a prediction, and the least ball that holds all that is possible."""
+    """Bounds about a prediction, and the smallest ball that contains the reachable set."""
 
     bound_m: float  # bound on the norm of the prediction's error
     horizontal_m: float  # bound on its part in the plane
@@ -28,10 +28,10 @@ class Reach(NamedTuple):
 
 
 def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> Reach:
-    """What is possible at a time, and how far it is from a prediction for that time.
+    """Return the reachable set at a time, and bounds about a prediction for that time.
 
     fix              the newest report, with a velocity
-    limits           what the aircraft can do
+    limits           the aircraft's limits
     predicted_ned_m  the prediction
     at               the time, on the sender's timeline
     """
@@ -52,11 +52,11 @@ def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> 
         off = math.sqrt(flat + d * d) + noise.position_m + grown
         aside = math.sqrt(flat) + noise.horizontal_m + grown
         above = abs(d) + noise.vertical_m + grown
-        # Conditions, for ``max`` costs more than the arithmetic.
+        # Conditional expressions, because ``max`` costs more than the arithmetic.
         bound = off if off > bound else bound
         horizontal = aside if aside > horizontal else horizontal
         vertical = above if above > vertical else vertical
-    # Over long gaps the greatest speed says more.
+    # Over long gaps the largest speed gives the tighter bound.
     way = max(abs(ends[0]), abs(ends[1])) * limits.speed_max_mps
     flat = north * north + east * east
     bound = min(bound, math.sqrt(flat + down * down) + noise.position_m + way)
@@ -75,7 +75,7 @@ def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> 
 
 
 def _ball(fix: Fix, ends: tuple[float, float], radii: list[float]) -> tuple[Vector, float]:
-    """The least ball that holds the balls at both ends, and with them all between."""
+    """Return the smallest ball that contains the balls at both ends, and so all between them."""
     assert fix.velocity_ned_mps is not None
     (n, e, d), (v_n, v_e, v_d) = fix.position_ned_m, fix.velocity_ned_mps
     apart = math.sqrt(v_n * v_n + v_e * v_e + v_d * v_d) * (ends[1] - ends[0])

@@ -1,12 +1,12 @@
-"""Receivers that are worse than they say: positions that stray from the way of the velocities.
+"""Detection of receivers that are worse than stated: positions that deviate from dead reckoning.
 
-A receiver states the radius within which two of three of its positions lie, and the bound on a
-report's error rests on it. Velocities are measured apart from positions, by Doppler. Within a few
-seconds two positions of a receiver hardly err differently: where they stray from where the reported
-velocities lead by more than two independent errors of the stated size would, the statement is not
-believed. Between two reports the velocity is taken for even, and what an aircraft may have done
-meanwhile is left to it. That is no proof, for velocities may err for long; so nothing is refused by
-it. The bound becomes that of a receiver that states nothing, or more where more was seen.
+A receiver states the radius that holds two of three of its positions, and the bound on a report's
+error rests on it. Velocities are measured independently of positions, by Doppler. Within a few
+seconds two positions of a receiver have nearly the same error. If they deviate from dead reckoning
+by more than two independent errors of the stated size would, the statement is rejected. Between two
+reports the velocity is assumed to change linearly, with an allowance for other manoeuvres. This is
+no proof, for velocities may also be wrong for long; so no report is rejected by it. The bound
+becomes that of a receiver without a stated accuracy, or more if the deviation was larger.
 """
 
 import math
@@ -19,38 +19,39 @@ from companion.values import Fix, Refuted, ReportNoise
 
 WITHIN_NS: Final = 5_000_000_000  # time within which positions are compared
 APART_NS: Final = 500_000_000
-"""Longest time between two reports over which the way is known from their velocities."""
+"""Longest time between two reports over which dead reckoning by their velocities is valid."""
 GOOD_DEVIATION_M: Final = 0.4
-"""What good receivers' positions stray, whatever they state: velocities err, too."""
+"""Deviation of good receivers' positions, whatever they state: velocities have errors, too."""
 UNSEEN: Final = 0.5
-"""Multiple of the root of the sum of squares of what may be flown unseen between the reports.
+"""Multiple of the root sum square of the displacement that is possible unseen between reports.
 
-It is hardly ever the most that the aircraft can do.
+It is hardly ever the largest that the aircraft can cause.
 """
 COMMON_ERROR: Final = 0.07
-"""Share of the noise bound that is usual in all reports alike, which none of them shows."""
+"""Usual share of the noise bound that is common to all reports, so that none reveals it."""
 COMMON_ERROR_REFUTED: Final = 0.82
-"""The same of a receiver that strays: 95 of 100 lie within 2.45 deviations in the plane, of 3."""
-NOTICE_RATIO: Final = 1.25  # multiple of what was seen last from which it is told again
+"""The same for a receiver that deviates: 95 of 100 lie within 2.45 deviations in the plane, of 3.
+"""
+NOTICE_RATIO: Final = 1.25  # increase after which a deviation is reported again
 
 
 class ReceiverCheck:
-    """Compares the positions of one UAV with its velocities. ``look`` takes the newest report.
+    """Comparison of one UAV's positions with its velocities. ``look`` takes the newest report.
 
-    ``settings`` are those by which the bounds on their noise were made.
+    ``settings`` are those from which the bounds on their noise were derived.
     """
 
     def __init__(self, settings: NoiseSettings) -> None:
         self._settings = settings
-        # Sender time, off the way north and east in m, sum of squares of what was unseen till then.
+        # Sender time, deviation north and east in m, sum of squares of the unseen displacements.
         self._seen: deque[tuple[int, float, float, float]] = deque()
         self._newest: Fix | None = None
         self._deviation_m = 0.0
 
     def look(self, fix: Fix, acceleration_mps2: float) -> Refuted | None:
-        """Take in a report. Returns what it says against its receiver, if that is news.
+        """Check a report. Return the refutation of its receiver's accuracy, if it is new.
 
-        ``acceleration_mps2`` is the greatest that the aircraft is taken for able to have.
+        ``acceleration_mps2`` is the aircraft's largest acceleration.
         """
         factor, before = self._settings.factor, self._newest
         velocity = fix.velocity_ned_mps
@@ -67,7 +68,7 @@ class ReceiverCheck:
         lag_m = 2.0 * fix.noise.time_s * math.hypot(*velocity)
         north_m, east_m, unseen_m = _step_deviation(before, fix, acceleration_mps2)
         if math.hypot(north_m, east_m) > 2.0 * fix.noise.horizontal_m + lag_m + unseen_m:
-            self._begin(fix)  # a leap, which the gate judges
+            self._begin(fix)  # a jump, which the gate handles
             return None
         strayed_m, unseen_m = self._deviation(fix.sender_ns, north_m, east_m, unseen_m)
         if (
@@ -96,9 +97,9 @@ class ReceiverCheck:
     def _deviation(
         self, sender_ns: int, north_m: float, east_m: float, unseen_m: float
     ) -> tuple[float, float]:
-        """Deviation over the last seconds, and what may have been flown unseen; metres.
+        """Return the deviation over the last seconds, and the possible unseen displacement; metres.
 
-        The arguments are what ``_step_deviation`` returns for the newest report.
+        The arguments are the results of ``_step_deviation`` for the newest report.
         """
         seen = self._seen
         _, north, east, unseen_m2 = seen[-1]
@@ -109,7 +110,7 @@ class ReceiverCheck:
         return math.hypot(north - north_0, east - east_0), math.sqrt(unseen_m2 - before_m2)
 
     def noise(self, stated: ReportNoise) -> ReportNoise:
-        """The bounds on a report's noise, by what its receiver states and what was seen of it."""
+        """Return the bounds on a report's noise, by its stated accuracy and past deviations."""
         factor = self._settings.factor
         if not self._deviation_m or factor is None:
             return stated
@@ -121,7 +122,7 @@ class ReceiverCheck:
         )
 
     def common_error_m(self, noise: ReportNoise) -> float:
-        """What positions usually err by alike, so that reports do not show it."""
+        """Return the usual common error of positions, which reports do not reveal."""
         if self._deviation_m:
             return COMMON_ERROR_REFUTED * noise.horizontal_m
         return min(noise.apart_m, noise.vertical_m) or COMMON_ERROR * noise.position_m
@@ -130,8 +131,8 @@ class ReceiverCheck:
 def _step_deviation(before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float, float]:
     """Deviation of a position from dead reckoning by the velocities, north and east, metres.
 
-    The third value bounds what may have been flown unseen between the two reports. In the plane
-    alone: heights come from a barometer.
+    The third value bounds the possible unseen displacement between the two reports. Horizontal
+    only: heights come from a barometer.
     """
     assert before.velocity_ned_mps is not None and fix.velocity_ned_mps is not None
     half_s = (fix.sender_ns - before.sender_ns) * 0.5e-9
@@ -140,5 +141,5 @@ def _step_deviation(before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[fl
     return (
         north - from_north - half_s * (v_north + was_north),
         east - from_east - half_s * (v_east + was_east),
-        acceleration_mps2 * half_s**2,  # away, and back again, at full power
+        acceleration_mps2 * half_s**2,  # out and back at full acceleration
     )

@@ -1,8 +1,8 @@
-"""Tracks of all UAVs: which track a report belongs to, whether it can be true, and how tracks age.
+"""Tracks of all UAVs: assignment and gating of reports, and the states of tracks.
 
-A track is live while reports come, coasting when they fail to, stale when too old to point a beam
-at, and lost; the ages at which it changes are settings. Nothing here keeps time: the newest
-accepted report and the time asked for decide.
+A track is live while reports arrive, coasting when they fail to, stale when too old for a beam, and
+lost; the ages at which it changes are settings. Nothing here keeps time: only the newest accepted
+report and the time asked for matter.
 
 Over 300 lines: reports in and tracks out share the state of a track.
 """
@@ -42,14 +42,14 @@ from companion.values import (
 )
 
 ESTABLISHED: Final = 50
-"""Reports of a UAV that make it known: when it comes back, those of fewer make room for it."""
+"""Reports that establish a UAV: when it returns, tracks with fewer reports make room for it."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ages:
-    """Ages of the newest report, in seconds, beyond which a track passes to the next state.
+    """Ages of the newest report, in seconds, beyond which a track changes to the next state.
 
-    ``coasting_s`` is the least: a slow link's is longer (``pace.py``).
+    ``coasting_s`` is a minimum: it is longer on a slow link (``pace.py``).
     """
 
     coasting_s: float = 2.0
@@ -57,7 +57,7 @@ class Ages:
     lost_s: float = 60.0
 
     def state(self, age_s: float, pace: ReportTiming) -> TrackState:
-        """The state of a track whose newest report is this old, by its own pace."""
+        """Return the state of a track whose newest report is this old, given its own timing."""
         coasting_s = pace.silence_s(self.coasting_s, self.stale_s)
         if age_s > self.lost_s:
             return TrackState.LOST
@@ -68,16 +68,16 @@ class Ages:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackerSettings:
-    """How tracks are kept.
+    """Settings of the tracker.
 
-    gate                   when refused reports begin a track again
-    noise                  how the bounds on the reports' noise were made; None: they are believed
+    gate                   when rejected reports restart a track
+    noise                  how the bounds on the reports' noise were derived; None: they are trusted
     """
 
-    limits: Limits  # what aircraft can do whose reports have no limits of their own
-    ages: Ages = field(default_factory=Ages)  # when a track passes from state to state
+    limits: Limits  # limits of aircraft whose reports carry none
+    ages: Ages = field(default_factory=Ages)  # when a track changes its state
     gate: GateSettings = field(default_factory=GateSettings)
-    window_s: float = 5.0  # how late a report may come and still be put in order
+    window_s: float = 5.0  # how late a report may arrive and still be sorted in
     feed_forward: bool = False  # whether an estimated acceleration enters predictions
     most: int = 2000  # largest number of tracks
     noise: NoiseSettings | None = None
@@ -85,7 +85,10 @@ class TrackerSettings:
 
 @dataclass(slots=True)
 class _Past:
-    """What outlasts a restarted track; ``receiver_check`` is None if stated noise is trusted."""
+    """State that survives a restarted track.
+
+    ``receiver_check`` is None if stated noise is trusted.
+    """
 
     refutations: Refutations
     receiver_check: ReceiverCheck | None
@@ -94,7 +97,7 @@ class _Past:
 
 @dataclass(slots=True, kw_only=True)
 class _Tracked:
-    """One track: its newest reports, and what they have shown."""
+    """One track: its newest reports, and the state derived from them."""
 
     past: _Past
     history: ReportHistory[Any]
@@ -112,31 +115,30 @@ class _Tracked:
 class Tracker:
     """All tracks, by UAV id. ``accept`` takes reports; ``track`` predicts to a time.
 
-    Tracks live on each sender's own timeline, so that what a link does to a report's arrival
-    changes neither the intervals nor their order. The caller of ``track`` converts the time to that
-    timeline.
+    Tracks are on each sender's own timeline, so that link delays change neither the intervals nor
+    their order. The caller of ``track`` converts the time to that timeline.
     """
 
     def __init__(self, observer: Observer[Any], settings: TrackerSettings) -> None:
         self._observer = observer
         self._settings = settings
         self._tracked: dict[str, _Tracked] = {}
-        self._established: set[str] = set()  # whose record was dropped, and had many reports
+        self._established: set[str] = set()  # dropped UAVs that had many reports
 
-    # --- reports in -------------------------------------------------------------------------
+    # --- input: reports ---------------------------------------------------------------------
 
     def accept(self, fix: Fix) -> tuple[Estimate | Rejection, list[Refuted]]:
-        """Add a report to its track, or begin a track; or return the reason why it is not used.
+        """Add a report to its track, or start a track; or return the rejection.
 
-        Also returns what the report refutes of its aircraft and receiver. The bounds of the report
-        that is judged are raised by that.
+        Also returns the refutations of its aircraft's limits and its receiver's accuracy. They
+        raise the bounds before the report is checked.
         """
         tracked = self._tracked.get(fix.uav)
         past = self._new_past() if tracked is None else tracked.past
         fix, refuted = self._held_to(past, fix)
         full = tracked is None and len(self._tracked) >= self._settings.most
         if full and not self._make_room(fix.uav):
-            why = f"{self._settings.most} tracks are kept"
+            why = f"limit of {self._settings.most} tracks reached"
             return _rejected(fix, Reason.TOO_MANY, why), refuted
         if tracked is None or self._is_lost(tracked, fix):
             return self._begin(fix, past), refuted
@@ -147,7 +149,7 @@ class Tracker:
         return _Past(Refutations(), None if noise is None else ReceiverCheck(noise), ReportTiming())
 
     def _held_to(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
-        """A report with the bounds that reports have shown, and what it refutes of them."""
+        """Return a report with the bounds as raised by refutations, and its own refutations."""
         given = self._limits(fix)
         found = past.refutations.look(fix if fix.limits else replace(fix, limits=given))
         limits, noise = past.refutations.limits(given, fix.sender_ns), fix.noise
@@ -178,10 +180,8 @@ class Tracker:
         return self._use(tracked, index, fix, predicted)
 
     def _make_room(self, uav: str) -> bool:
-        """Give up the latest track of few reports for a UAV that was here long before.
-
-        Returns False where there is none, or it was not.
-        """
+        """Drop the latest unestablished track to make room for an established UAV; False if
+        impossible."""
         if uav not in self._established:
             return False
         for other in reversed(self._tracked):
@@ -204,24 +204,24 @@ class Tracker:
         return first
 
     def _is_lost(self, tracked: _Tracked, fix: Fix) -> bool:
-        """Whether the gap before a report is so long that the track is no use for judging it."""
+        """Return whether the gap before a report is too long for the track to gate it."""
         gap_s = (fix.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
         return gap_s > self._settings.ages.lost_s
 
     def _wrong(self, tracked: _Tracked, index: int, fix: Fix) -> tuple[Reason, str] | None:
-        """Judge a report without a prediction: a repeated stamp, or a resent position."""
+        """Check a report without a prediction: a repeated stamp, or a resent position."""
         entries = tracked.history.entries
         if index < len(entries) and entries[index].fix.sender_ns == fix.sender_ns:
             return Reason.DUPLICATE, "a second report with the same stamp"
         arrived, tracked.arrived = tracked.arrived, fix
         if index == len(entries) and is_frozen(arrived, fix):
-            return Reason.FROZEN, "a fresh stamp on the position of the report before"
+            return Reason.FROZEN, "new stamp on the previous report's position"
         return None
 
     def _suspect(
         self, tracked: _Tracked, fix: Fix, why: tuple[Reason, str]
     ) -> Estimate | Rejection:
-        """Set a refused report aside, and begin the track again if enough such reports agree."""
+        """Keep a rejected report apart, and restart the track if enough such reports agree."""
         tracked.suspects.add(fix)
         newest_ns = max(tracked.history.newest.fix.sender_ns, tracked.believable_ns)
         silent_s = (fix.sender_ns - newest_ns) * 1e-9
@@ -273,9 +273,9 @@ class Tracker:
         )
 
     def _look_back(self, tracked: _Tracked, fix: Fix) -> None:
-        """Judge earlier predictions by the newest report, and choose what is fed forward from it.
+        """Evaluate earlier predictions by the newest report, and select the model to feed forward.
 
-        Accelerations are cut to the greatest possible size.
+        Accelerations are clipped to the largest possible size.
         """
         predictions = tracked.predictions
         if self._settings.feed_forward:
@@ -294,19 +294,20 @@ class Tracker:
     def forget(self, uav: str) -> None:
         """Forget a track, because its sender was restarted or is gone."""
         tracked = self._tracked.pop(uav, None)
-        room = len(self._established) < self._settings.most  # for whoever was here first
+        room = len(self._established) < self._settings.most  # earlier UAVs take precedence
         if room and tracked is not None and tracked.reports >= ESTABLISHED:
             self._established.add(uav)
 
     def silent(self, now_ns: int, for_s: float) -> list[str]:
-        """UAVs of which no report has arrived for ``for_s`` seconds, node time."""
+        """Return the UAVs without a report for ``for_s`` seconds, node time."""
         before_ns = now_ns - round(for_s * 1e9)
         return [uav for uav, one in self._tracked.items() if one.arrived.arrival_ns < before_ns]
 
-    # --- tracks out -------------------------------------------------------------------------
+    # --- output: tracks ---------------------------------------------------------------------
 
     def track(self, uav: str, now_ns: int, at: SenderTime) -> Track | None:
-        """One UAV at ``at.node_ns``, its state judged at ``now_ns``; None if it was never seen."""
+        """Predict one UAV to ``at.node_ns``; its state is that at ``now_ns``. None if it was never
+        seen."""
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
@@ -339,7 +340,7 @@ class Tracker:
         )
 
     def _predict(self, tracked: _Tracked, at: SenderTime) -> tuple[Vector, Vector | None, Reach]:
-        """Position and velocity, the acceleration fed forward, and what is possible then.
+        """Return position and velocity, including feed-forward, and the reachable set.
 
         See docs/math.md 5.1.
         """
@@ -373,9 +374,10 @@ class Tracker:
     def _error_p95_m(
         self, tracked: _Tracked, velocity: Vector | None, at: SenderTime, bound_m: float
     ) -> float | None:
-        """The error that is usual at a time: what reports have shown, and the clock's share.
+        """Return the usual error at a time, from past errors, the receiver's common error and the
+        clock.
 
-        What reports have shown is of the near past, and may be more than can be now.
+        Past errors may exceed the present bound, which limits the result.
         """
         age_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
         seen_m = tracked.predictions.error_p95_m(age_s)
@@ -398,17 +400,17 @@ class Tracker:
         return uav in self._tracked
 
     def newest(self, uav: str) -> Fix | None:
-        """The newest accepted report of a UAV; None if it was never seen."""
+        """Return the newest accepted report of a UAV; None if it was never seen."""
         tracked = self._tracked.get(uav)
         return tracked.history.newest.fix if tracked else None
 
     @property
     def uavs(self) -> list[str]:
-        """Ids of all tracks, in the order in which they began."""
+        """Ids of all tracks, in the order of their start."""
         return list(self._tracked)
 
     def state(self, uav: str, now: SenderTime) -> TrackState | None:
-        """The state of a track, without a prediction; None if it was never seen."""
+        """Return the state of a track, without a prediction; None if it was never seen."""
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
@@ -416,7 +418,7 @@ class Tracker:
         return self._settings.ages.state(age_s, tracked.past.pace)
 
     def near(self, position_ned_m: Vector, within_m: float) -> list[str]:
-        """UAVs whose newest accepted report lies within a distance of a local place."""
+        """Return the UAVs whose newest accepted report is within a distance of a local position."""
         return [
             uav
             for uav, tracked in self._tracked.items()
@@ -427,7 +429,7 @@ class Tracker:
 def _fastest_mps(
     velocity: Vector | None, bound_mps: float | None, limits: Limits, within_s: float
 ) -> float:
-    """Greatest speed within a time of the instant at which the UAV is predicted."""
+    """Return the largest speed within a time of the instant of a prediction."""
     if velocity is None or bound_mps is None:
         return limits.speed_max_mps
     gained_mps = limits.acceleration_max_mps2 * within_s
@@ -435,7 +437,7 @@ def _fastest_mps(
 
 
 def _first(fix: Fix) -> Estimate:
-    """The estimate at a report that nothing predicted: the report itself."""
+    """Return the estimate at a report without a prediction: the report itself."""
     return Estimate(
         fix=fix,
         position_ned_m=fix.position_ned_m,
@@ -452,7 +454,7 @@ def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
 def _fed(
     tracked: _Tracked, at: SenderTime, position: Vector, velocity: Vector
 ) -> tuple[Vector, Vector]:
-    """A predicted position and velocity with what past predictions have chosen to add."""
+    """Add feed-forward and smoothing to a predicted position and velocity."""
     ahead_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
     position = _sum(position, tracked.predictions.smoothing_offset)
     if tracked.acceleration is None or ahead_s <= 0:
@@ -471,7 +473,7 @@ def _sum(one: Vector, other: Vector) -> Vector:
 
 
 def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:
-    """An acceleration cut to the greatest size."""
+    """Clip an acceleration to the largest size."""
     if acceleration is None:
         return None
     north, east, down = acceleration

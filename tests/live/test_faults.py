@@ -169,7 +169,7 @@ def test_a_frozen_position_is_refused_and_the_track_coasts(flights: dict[str, Ou
     assert [one["reason"] for one in recent] == ["frozen"] * 8
     assert [one["at"] for one in recent] == sorted(one["at"] for one in recent)
     said = done.said("3:1")
-    why = "frozen, a fresh stamp on the position of the report before"
+    why = "frozen, new stamp on the previous report's position"
     unheard = [
         text for text in said if re.fullmatch(rf"no report of 3:1 was used for \S+ s: {why}", text)
     ]

@@ -1,6 +1,6 @@
-"""The answers of ``companion design``: rows by closed form or by LMI, and tables of gains.
+"""Answers of ``companion design``: rows by closed form or by LMI, and tables of gains.
 
-Over 300 lines: the two models' answers have the same keys and are made side by side.
+Over 300 lines: the two models' answers have the same keys and are computed side by side.
 """
 
 from collections.abc import Callable, Sequence
@@ -21,16 +21,15 @@ POSITION: Final = np.array([[1.0, 0.0]])
 """Output matrix H of the kinematic model: mu bounds the position."""
 
 FASTEST_SHARE: Final = 0.98
-"""Largest alpha of a table; with alpha = 1 nothing of the error would persist from step to step."""
+"""Largest alpha of a table; with alpha = 1 no error would persist from step to step."""
 
 
 @dataclass(frozen=True, slots=True)
 class KinematicLimits:
     """Bounds assumed by the kinematic model.
 
-    ``velocity_noise_mps`` is None if no velocity is reported.
-
-    Raises ``UserError`` unless all are positive and finite.
+    ``velocity_noise_mps`` is None if no velocity is reported. Raises ``UserError`` unless all are
+    positive and finite.
     """
 
     acceleration_mps2: float
@@ -40,7 +39,7 @@ class KinematicLimits:
     def __post_init__(self) -> None:
         given = (self.acceleration_mps2, self.position_noise_m, self.velocity_noise_mps or 1.0)
         if not all(0 < value < np.inf for value in given):
-            raise UserError("bounds on acceleration and noise are positive numbers")
+            raise UserError("bounds on acceleration and noise: give positive numbers")
 
 
 def row(
@@ -52,7 +51,7 @@ def row(
     model: str,
     method: str,
 ) -> dict[str, Any]:
-    """The position model's design for one interval, with the keys of ``companion design --json``.
+    """Position model's design for one interval, with the keys of ``companion design --json``.
 
         dt_s           interval between reports, seconds
         feedthrough_s  time by which a report leads the position, seconds
@@ -88,7 +87,7 @@ def row(
 
 
 def _by_lmi(dt_s: float, feedthrough_s: float, alpha: float) -> dict[str, float]:
-    """The same axis solved by CVXPY and Clarabel, which only this function loads."""
+    """Solve the same axis by CVXPY and Clarabel, which only this function loads."""
     from companion.tracking.design import lmi
 
     one = np.eye(1)
@@ -105,7 +104,7 @@ def _by_lmi(dt_s: float, feedthrough_s: float, alpha: float) -> dict[str, float]
 
 
 def as_text(row: dict[str, Any]) -> str:
-    """One row as text."""
+    """Format one row as text."""
     kinematic_model = row["model"] == "kinematic"
     unit = "m" if kinematic_model else "s"
     limit = "" if row["dt_limit_s"] is None else f"  dt limit {row['dt_limit_s']:.4f} s"
@@ -133,7 +132,7 @@ def kinematic_row(
     mu_max: float | None = None,
     dt_limit_s: float | None = None,
 ) -> dict[str, Any]:
-    """The kinematic model's design for one interval alone.
+    """Kinematic model's design for one interval alone.
 
     It has the keys of ``row``, with L and Q nested. ``mu`` is in m². ``gamma`` is the certified and
     ``peak_gain`` the exact largest position error, in metres, under the bounds of ``motion``
@@ -141,7 +140,7 @@ def kinematic_row(
     the solver fails.
     """
     if not 0 < dt_s < np.inf:
-        raise UserError("an interval between reports is a positive number of seconds")
+        raise UserError("interval between reports: give a positive number of seconds")
     solved = _optimum(dt_s, motion, alpha)
     seen = np.eye(2)[: solved.gain.shape[1]]
     return {
@@ -164,7 +163,7 @@ def kinematic_row(
 def kinematic_rows(
     dts_s: Sequence[float], motion: KinematicLimits, alpha: float | None, mu_max: float | None
 ) -> list[dict[str, Any]]:
-    """``kinematic_row`` at each interval; what does not depend on the interval is found once."""
+    """``kinematic_row`` at each interval; values independent of the interval are computed once."""
     limit_s = _dt_limit_s(mu_max, motion, alpha) if dts_s and mu_max is not None else None
     return [kinematic_row(dt_s, motion, alpha, mu_max, limit_s) for dt_s in dts_s]
 
@@ -173,7 +172,7 @@ def peak_error_m(dt_s: float, gain: FloatArray, motion: KinematicLimits) -> floa
     """Exact largest position error in the long run at one interval and gain, metres, on one axis.
 
     The l-infinity gain: the sum over k of the largest |h (A - L C)^k (L n - g)|, where the
-    acceleration may change within each interval. Infinite where the gain does not contract.
+    acceleration may change within each interval. Infinite if the gain does not contract.
     """
     noises = np.array([motion.position_noise_m, motion.velocity_noise_mps or 0.0])
     noises = noises[: gain.shape[1]]
@@ -191,7 +190,7 @@ def peak_error_m(dt_s: float, gain: FloatArray, motion: KinematicLimits) -> floa
 
 
 def _swept(slope: float, start: float, dt_s: float) -> float:
-    """The integral of |slope u + start| over u from 0 to T."""
+    """Integral of |slope u + start| over u from 0 to T."""
     end = start + slope * dt_s
     if start * end >= 0:
         return float(abs(start + end) * dt_s / 2)
@@ -208,7 +207,7 @@ def _sampling(dt_s: float, motion: KinematicLimits) -> "tuple[Sampling, tuple[in
 
 
 def _optimum(dt_s: float, motion: KinematicLimits, alpha: float | None) -> "LmiSolution":
-    """The LMI's solution at one interval; ``alpha=None``: the best of a grid, refined once."""
+    """Solve the LMI at one interval; ``alpha=None``: the best of a grid, refined once."""
     from companion.tracking.design import lmi
 
     sampling, channels = _sampling(dt_s, motion)
@@ -230,10 +229,10 @@ def _optimum(dt_s: float, motion: KinematicLimits, alpha: float | None) -> "LmiS
 
 
 def _least(at: "Callable[[float], LmiSolution]", tried: Sequence[float]) -> "LmiSolution":
-    """The solution with the smallest mu. Raises the last failure if every attempt fails."""
+    """Return the solution with the smallest mu. Raises the last failure if every attempt fails."""
     from companion.tracking.design.lmi import LmiError
 
-    found, failure = [], LmiError("nothing was tried")
+    found, failure = [], LmiError("no candidate was tried")
     for value in tried:
         try:
             found.append(at(value))
@@ -245,9 +244,8 @@ def _least(at: "Callable[[float], LmiSolution]", tried: Sequence[float]) -> "Lmi
 
 
 def _dt_limit_s(mu_max: float, motion: KinematicLimits, alpha: float | None) -> float:
-    """The largest interval, to a part in a thousand, at which mu is within the limit.
-
-    0 if there is none.
+    """Return the largest interval, to a part in a thousand, with mu within the limit; 0 without
+    one.
 
     By bisection: mu grows with the interval, from the noise alone to about (a T^2 / sqrt 3)^2.
     """
@@ -272,21 +270,21 @@ def table(
         dt_range_s  shortest and longest interval, seconds
         motion      bounds on acceleration and noise
         points      number of intervals in the grid, spaced geometrically
-        slack       margin asked of the LMIs, for what lies between the points
+        slack       margin required of the LMIs, for intervals between the points
 
-    The decay is alpha(T) = 1 - exp(-T/tau), so that every interval gives up its share of the error
-    in proportion to its length. A single alpha would ask of the shortest interval what only the
-    longest can do, and make the bound up to twice as large. tau is searched: among those within 1 %
-    of the smallest bound the shortest is taken, which forgets fastest. See docs/math.md 4.
+    The decay is alpha(T) = 1 - exp(-T/tau), so that the error decays in proportion to the interval.
+    A single alpha would require of the shortest interval what only the longest can achieve, and
+    make the bound up to twice as large. tau is searched: among those within 1 % of the smallest
+    bound the shortest is taken, which decays fastest. See docs/math.md 4.
 
-    Raises ``UserError`` for an impossible range, ``LmiError`` where no tau is solved,
-    ``DesignError`` where the result does not hold between the points.
+    Raises ``UserError`` for an impossible range, ``LmiError`` if no tau is solved, ``DesignError``
+    if the result does not hold between the points.
     """
     match dt_range_s:
         case [low_s, high_s] if 0 < low_s < high_s < np.inf:
             pass
         case _:
-            raise UserError("a range of intervals is LOW,HIGH: positive, ascending, in seconds")
+            raise UserError("range of intervals: give LOW,HIGH, positive and ascending, in seconds")
     from companion.tracking.design import lmi
 
     dt_s = np.geomspace(low_s, high_s, points)
@@ -342,7 +340,7 @@ def _flags(motion: KinematicLimits) -> str:
 
 
 def described(found: KinematicDesign) -> str:
-    """One line about a table."""
+    """Return one line about a table."""
     return (
         f"{len(found.dt_s)} intervals from {found.dt_s[0]:g} to {found.dt_s[-1]:g} s, position"
         f" within {gain_table.invariant_bound(found):.3g} m, margin {found.margin:.1e}"

@@ -5,15 +5,15 @@ the unknown input), decay a in (0, 1), output weight 1. The observer is
 
     x+ = q x + l y,  q = 1 - l;      error  e+ = q e + (l d - b) w,  |w| the unknown input
 
-(docs/math.md 2, paper eq. (8)). The smallest mu = gamma^2 for which the LMIs (paper eq. (10)) can
-be met, with the gain that meets it (paper eq. (11)), is
+(docs/math.md 2, paper eq. (8)). The smallest mu = gamma^2 for which the LMIs (paper eq. (10)) are
+feasible, with the gain that attains it (paper eq. (11)), is
 
     mu*(b) = max(0, ((d - b)^2 - (1 - a) d^2) / a)
     q*     = (1 - a) d / (d - b)   where (d - b)^2 > (1 - a) d^2,   else 1 - b/d (and mu* = 0)
 
-Nothing is lost by designing each axis of a network alone (docs/math.md 2.1). A single p = 1 / max
-mu*(b) serves every b at once, so the guarantee |e| <= gamma sup|w| holds with gains scheduled by
-the interval that really occurred, in any order (docs/math.md 2.3).
+Designing each axis of a network alone loses nothing (docs/math.md 2.1). A single p = 1 / max mu*(b)
+serves every b at once, so the guarantee |e| <= gamma sup|w| holds with gains scheduled by the
+actual interval, in any order (docs/math.md 2.3).
 
 The scalar functions run for every report and are plain arithmetic; those in the plural take arrays.
 Source: the optimum over P and Z of the LMIs; derivation in docs/math.md 2.2.
@@ -32,22 +32,25 @@ FASTEST_DECAY: Final = 0.99
 """Largest alpha that ``best_alpha`` returns.
 
 mu* falls towards its limit as alpha tends to 1, where the invariant set degenerates; the last per
-cent is not worth it.
+cent gains almost nothing.
 """
 
 
 def _check(dt_s: ArrayLike, alpha: float) -> FloatArray:
-    """The intervals as an array. Raises ``UserError`` for an interval or alpha out of range."""
+    """Return the intervals as an array.
+
+    Raises ``UserError`` for an interval or alpha out of range.
+    """
     b = np.asarray(dt_s, dtype=float)
     if not np.all(np.isfinite(b) & (b > 0)):
-        raise UserError("an interval between reports is a positive number of seconds")
+        raise UserError("interval between reports: give a positive number of seconds")
     if not 0.0 < alpha < 1.0:
-        raise UserError(f"alpha lies strictly between 0 and 1, not {alpha}")
+        raise UserError(f"alpha is {alpha}, allowed: 0 to 1, both excluded")
     return b
 
 
 def mu_star(dt_s: float, feedthrough_s: float, alpha: float) -> float:
-    """The smallest feasible mu (s²) at one interval; 0 if the error can be cancelled.
+    """Smallest feasible mu (s²) at one interval; 0 if the error can be cancelled.
 
     mu*(b) of docs/math.md 2.2.
     """
@@ -55,11 +58,10 @@ def mu_star(dt_s: float, feedthrough_s: float, alpha: float) -> float:
 
 
 def gain(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> float:
-    """The optimal gain l* on the report at one interval; q* = 1 - l* (docs/math.md 2.2).
+    """Optimal gain l* on the report at one interval; q* = 1 - l* (docs/math.md 2.2).
 
-    ``alpha=None``: ``best_alpha``.
-
-    Plain arithmetic, because it runs for every report and every prediction.
+    ``alpha=None``: ``best_alpha``. Plain arithmetic, because it runs for every report and
+    prediction.
     """
     b, d = dt_s, feedthrough_s
     if alpha is None:
@@ -70,7 +72,7 @@ def gain(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> float
 
 
 def _excess(b: float, d: float, alpha: float) -> float:
-    """(d - b)^2 - (1 - alpha) d^2, rounding errors set to 0: ``best_alpha`` lies on the edge."""
+    """(d - b)^2 - (1 - alpha) d^2, rounding errors set to 0: ``best_alpha`` is on the edge."""
     excess = (d - b) ** 2 - (1 - alpha) * d * d
     return excess if excess > 4 * EPSILON * d * d else min(excess, 0.0)
 
@@ -88,25 +90,23 @@ def gains(dt_s: ArrayLike, feedthrough_s: float, alpha: float) -> FloatArray:
 
 
 def dt_limit_s(mu_max: float, feedthrough_s: float, alpha: float) -> float:
-    """The largest interval (s) at which ``mu <= mu_max`` (s²) is still feasible.
-
-    0 if there is none.
+    """Largest interval (s) at which ``mu <= mu_max`` (s²) is feasible; 0 if there is none.
 
     Raises ``UserError`` for a negative ``mu_max`` or an alpha outside (0, 1).
     """
     _check(1.0, alpha)
     if not mu_max >= 0:
-        raise UserError(f"mu is at least 0, not {mu_max}")
+        raise UserError(f"mu is {mu_max}, allowed: at least 0")
     d = feedthrough_s
     return max(0.0, float(d + np.sqrt(alpha * mu_max + (1 - alpha) * d * d)))
 
 
 def best_alpha(dt_s: float, feedthrough_s: float) -> float:
-    """The alpha with the smallest mu* at one interval.
+    """Alpha with the smallest mu* at one interval.
 
-    Where the feedthrough allows mu* = 0 (b < 2d), the largest alpha that still does is taken, up to
-    ``FASTEST_DECAY``: it has the fastest certified decay. Otherwise mu* falls with alpha all the
-    way, and ``FASTEST_DECAY`` is returned.
+    If the feedthrough allows mu* = 0 (b < 2d), this is the largest alpha that still does, up to
+    ``FASTEST_DECAY``: it has the fastest certified decay. Otherwise mu* decreases with alpha, and
+    ``FASTEST_DECAY`` is returned.
     """
     b, d = dt_s, feedthrough_s
     if 0 < b < 2 * d:
@@ -117,7 +117,7 @@ def best_alpha(dt_s: float, feedthrough_s: float) -> float:
 def peak_gain(dt_s: ArrayLike, feedthrough_s: float, l_gain: ArrayLike) -> FloatArray:
     """Exact largest |e| / sup|w| (s) with a fixed gain: |l d - b| / (1 - |1 - l|).
 
-    This is the sum of the error's absolute impulse response (docs/math.md 2.4). Infinite where the
+    This is the sum of the error's absolute impulse response (docs/math.md 2.4). Infinite if the
     gain does not contract, unless no input enters.
     """
     b, gain = np.asarray(dt_s, dtype=float), np.asarray(l_gain, dtype=float)
@@ -131,7 +131,7 @@ def lmi_margin(
 ) -> float:
     """Smallest eigenvalue of both LMIs at a solution; non-negative proves it.
 
-    The matrices are scaled by congruence (P to 1), so that the margin is a pure number.
+    The matrices are scaled by congruence (P to 1), so that the margin is dimensionless.
     """
     b, d, root = dt_s, feedthrough_s, np.sqrt(p)
     enters = (l_gain * d - b) * root
@@ -143,7 +143,7 @@ def lmi_margin(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClosedFormDesign:
-    """A gain for one interval and its certificate; times in seconds, mu in s²."""
+    """Gain for one interval and its certificate; times in seconds, mu in s²."""
 
     dt_s: float
     alpha: float
@@ -157,17 +157,17 @@ class ClosedFormDesign:
 
 
 def design(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> ClosedFormDesign:
-    """The optimal gain at one interval. ``alpha=None`` chooses it by ``best_alpha``.
+    """Optimal gain at one interval; ``alpha=None``: ``best_alpha``.
 
-    Where mu* = 0 the infimum over P is not attained: the certificate is then given at p = 1, which
-    shows the decay LMI, and mu is the limit. Raises ``UserError`` for an interval, feedthrough or
+    If mu* = 0 the infimum over P is not attained: the certificate is then given at p = 1, which
+    proves the decay LMI, and mu is the limit. Raises ``UserError`` for an interval, feedthrough or
     alpha out of range.
     """
     if alpha is None:
         alpha = best_alpha(dt_s, feedthrough_s)
     _check(dt_s, alpha)
     if not np.isfinite(feedthrough_s):
-        raise UserError(f"the feedthrough is a number of seconds, not {feedthrough_s}")
+        raise UserError(f"feedthrough is {feedthrough_s}, allowed: a finite number of seconds")
     mu = mu_star(dt_s, feedthrough_s, alpha)
     l_gain = gain(dt_s, feedthrough_s, alpha)
     p = 1 / mu if mu > 0 else 1.0

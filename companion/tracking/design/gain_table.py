@@ -13,7 +13,7 @@ half way moves p by a T^2/4 and v not at all. By the Cauchy-Schwarz inequality, 
 
 because B B^T T^-1 is the Gramian of the integral. It covers every a(s), at a cost of 15 % in p.
 With one P for all T (``lmi.solve_common``; one channel each for w, n_p and n_v), the set
-{e : e^T P e <= 1} is invariant, whatever the order of the intervals; ``verify`` proves it again by
+{e : e^T P e <= 1} is invariant for any order of the intervals; ``verify`` proves it again by
 eigenvalues alone. The running bound (``observers.kinematic``) is interval arithmetic with
 the exact |g_p| <= a T^2/2, |g_v| <= a T. See docs/math.md 4.
 
@@ -33,27 +33,27 @@ from numpy.typing import ArrayLike
 from companion.values import FloatArray, UserError
 
 FORMAT: Final = "kinematic-design-1"
-LARGEST: Final = 1 << 20  # most characters of a design: that of the program has 4500
+LARGEST: Final = 1 << 20  # most characters of a design; the program's own has 4500
 NUMBER_MAX: Final = 1e30
-"""Most that a number of a design may be; its intervals are no shorter than one over it."""
-FINER: Final = 5  # intervals that verify checks for each step of the design's grid
+"""Largest number in a design; its shortest interval is one over it."""
+FINER: Final = 5  # intervals that verify checks per step of the design's grid
 
 
 class DesignError(UserError):
-    """A design that cannot be read, or that its own certificate does not confirm."""
+    """Design that cannot be read, or that its own certificate does not confirm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KinematicDesign:
-    """Gains over a grid of intervals, and the proof that they hold.
+    """Gains over a grid of intervals, with their certificate.
 
         velocity_noise_mps  bound on the error of a reported velocity; None: not reported
-        corrections         M at each interval, row by row: m11, m12, m21, m22 where velocity is
+        corrections         M at each interval, row by row: m11, m12, m21, m22 if velocity is
                             reported, else m11, m21
         multipliers         at each interval, of acceleration, position noise and (if reported)
                             velocity noise; they sum to alpha
 
-    The fields are plain numbers, so that a design can be compared, hashed and written down.
+    The fields are plain numbers, so that a design can be compared, hashed and serialised.
     """
 
     acceleration_mps2: float  # bound on the acceleration
@@ -63,8 +63,8 @@ class KinematicDesign:
     corrections: tuple[tuple[float, ...], ...]
     lyapunov: tuple[float, float, float]  # P as p11, p12, p22
     multipliers: tuple[tuple[float, ...], ...]
-    margin: float  # the result of verify when the design was made
-    provenance: str  # how the design was made
+    margin: float  # result of verify when the design was computed
+    provenance: str  # how the design was computed
 
     @property
     def has_velocity(self) -> bool:
@@ -85,7 +85,7 @@ class KinematicDesign:
         return np.asarray(_transitions(np.array(self.dt_s)) @ m)
 
     def to_json(self) -> str:
-        """The design as text, which ``from_json`` reads."""
+        """Serialise the design for ``from_json``."""
         lines = {"format": FORMAT, **asdict(self)}.items()
         return (
             "{\n" + ",\n".join(f' "{key}": {json.dumps(value)}' for key, value in lines) + "\n}\n"
@@ -93,7 +93,7 @@ class KinematicDesign:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Read and verify a design. Raises ``DesignError``, which says what is wrong with it."""
+        """Parse and verify a design. Raises ``DesignError``, which names the fault."""
         if len(text) > LARGEST:
             raise DesignError("not a kinematic design: too large")
         try:
@@ -166,10 +166,7 @@ def correction(design: KinematicDesign, dt_s: float) -> tuple[float, ...]:
 
 
 def gain(design: KinematicDesign, dt_s: float) -> FloatArray:
-    """L(T) = A(T) M(T), (2, 2), or (2, 1) without velocity.
-
-    In the units 1, s and 1/s of its entries.
-    """
+    """L(T) = A(T) M(T), (2, 2), or (2, 1) without velocity; entries in 1, s and 1/s."""
     m = np.array(correction(design, dt_s)).reshape(2, -1)
     found: FloatArray = transition(dt_s) @ m
     return found
@@ -181,8 +178,8 @@ def gain(design: KinematicDesign, dt_s: float) -> FloatArray:
 def verify(design: KinematicDesign) -> float:
     """Smallest eigenvalue of the LMIs over a grid finer than the design's, with P scaled to I.
 
-    Raises ``DesignError`` where it is negative, so that invariance is not shown, or where the
-    design is malformed. Batched: it takes a few milliseconds.
+    Raises ``DesignError`` if it is negative, so that invariance is not proven, or if the design is
+    malformed. Batched: it takes a few milliseconds.
     """
     _check(design)
     nodes = np.arange(len(design.dt_s))
@@ -193,11 +190,11 @@ def verify(design: KinematicDesign) -> float:
         return np.array([np.interp(at, nodes, column) for column in columns]).T
 
     dt_s = np.interp(at, nodes, design.dt_s)
-    # Where grid and table are both linear in the node, M is what ``correction`` gives.
+    # Between nodes, grid and table are both linear, so M equals the result of ``correction``.
     m = between(design.corrections).reshape(len(at), 2, -1)
     margin = float(np.min(_margins(design, dt_s, m, between(design.multipliers))))
     if not margin >= 0:
-        raise DesignError(f"the design fails its certificate: margin {margin:.2e}")
+        raise DesignError(f"design fails its certificate: margin {margin:.2e} is negative")
     return margin
 
 
@@ -205,7 +202,7 @@ def _check(design: KinematicDesign) -> None:
     reports = 2 if design.has_velocity else 1
     grid = np.array(design.dt_s)
     if len(grid) < 2 or not (grid[0] > 0 and np.all(np.diff(grid) > 0) and np.isfinite(grid[-1])):
-        raise DesignError("the intervals of a design are positive and ascend")
+        raise DesignError("intervals of the design are not positive and ascending")
     shapes = (
         len(design.corrections) == len(design.multipliers) == len(grid)
         and {len(row) for row in design.corrections} == {2 * reports}
@@ -213,17 +210,17 @@ def _check(design: KinematicDesign) -> None:
         and len(design.lyapunov) == 3
     )
     if not shapes:
-        raise DesignError("the tables of a design do not fit its grid")
+        raise DesignError("tables of the design do not match its grid of intervals")
     noises = design.position_noise_m, design.velocity_noise_mps or 0.0
     bounds = np.array([design.acceleration_mps2, *noises], dtype=float)
     numbers = np.concatenate([bounds, design.lyapunov, *design.corrections, *design.multipliers])
     if not (np.all(np.isfinite(numbers)) and np.all(bounds >= 0)):
-        raise DesignError("the bounds of a design are finite and at least 0, its gains finite")
+        raise DesignError("design has a negative bound or a number that is not finite")
     if grid[0] < 1 / NUMBER_MAX or max(grid[-1], np.abs(numbers).max()) > NUMBER_MAX:
-        raise DesignError(f"the numbers of a design are within {NUMBER_MAX:.0e}")
+        raise DesignError(f"design has a number beyond {NUMBER_MAX:.0e}, or an interval near 0")
     p11, p12, p22 = design.lyapunov
     if not (p11 > 0 and p11 * p22 > p12 * p12):
-        raise DesignError("the Lyapunov matrix of a design is not positive definite")
+        raise DesignError("Lyapunov matrix of the design is not positive definite")
 
 
 def _margins(

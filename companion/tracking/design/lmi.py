@@ -1,4 +1,4 @@
-"""The observer design as a linear matrix inequality, solved by CVXPY and Clarabel.
+"""Observer design as a linear matrix inequality, solved by CVXPY and Clarabel.
 
 This is the general case, and the independent proof of the closed forms in ``closed_form``. For one
 or more sampling times T, each with its own A, B, C, D,
@@ -12,12 +12,12 @@ such that
     [     0        diag(alpha_i)  (Z D - P B)^T ]  >= 0       [ P  H^T  ]
     [ P A - Z C    Z D - P B           P        ]             [ H  mu I ]  >= 0
 
-Then |H e| <= sqrt(mu) from e = 0, and in the limit from anywhere, in whatever order the sampling
-times occur: {e : e^T P e <= 1} is invariant. The inputs w for which it holds depend on the
-channels. With one channel, diag(alpha_i) = alpha I and |w| <= 1. With several, alpha is the sum of
-the alpha_i, all non-negative and found by the solver (the S-procedure, one multiplier per channel),
-and |w_i| <= 1 for each block w_i of w. The inequalities are docs/math.md 2, paper eq. (10), with
-the sign of the last block corrected (docs/math.md 8.4); L is paper eq. (11), H e paper eq. (9).
+Then |H e| <= sqrt(mu) from e = 0, and in the limit from anywhere, for any order of the sampling
+times: {e : e^T P e <= 1} is invariant. The admissible inputs w depend on the channels. With one
+channel, diag(alpha_i) = alpha I and |w| <= 1. With several, alpha is the sum of the alpha_i, all
+non-negative and found by the solver (the S-procedure, one multiplier per channel), and |w_i| <= 1
+for each block w_i of w. The inequalities are docs/math.md 2, paper eq. (10), with the sign of the
+last block corrected (docs/math.md 8.4); L is paper eq. (11), H e paper eq. (9).
 
 Only this module imports cvxpy, which takes more than a second to load, and only commands that
 design import this module.
@@ -36,7 +36,7 @@ import numpy as np
 from companion.values import FloatArray, UserError
 
 TOLERANCE: Final = 1e-6
-"""How far below 0 an eigenvalue of a scaled LMI may lie: the accuracy of the solver."""
+"""Largest negative eigenvalue of a scaled LMI that is accepted: the accuracy of the solver."""
 
 NEARLY_ZERO: Final = 1e-3
 """A mu below this, in units of the input, may be an infimum of 0 that no P attains."""
@@ -48,7 +48,7 @@ class LmiError(UserError):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sampling:
-    """The plant at one sampling time: A (n, n), B (n, m), C (r, n), D (r, m)."""
+    """Plant at one sampling time: A (n, n), B (n, m), C (r, n), D (r, m)."""
 
     a: FloatArray
     b: FloatArray
@@ -58,9 +58,9 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LmiSolution:
-    """A design and its certificate, checked by eigenvalues in numpy alone.
+    """Design and its certificate, checked by eigenvalues in numpy alone.
 
-    attained     False where mu can be lowered to 0 while P grows without bound: the mu given is
+    attained     False if mu can be lowered to 0 while P grows without bound: the mu given is
                  certified, but is not the smallest
     """
 
@@ -104,28 +104,28 @@ def solve_common(
     slack: float = 0.0,
     scale: FloatArray | None = None,
 ) -> LmiSolution:
-    """The gains with the smallest mu, under one P for all sampling times.
+    """Gains with the smallest mu, under one P for all sampling times.
 
         samplings  the plant at each of K sampling times
         h          H (k, n), the output whose error mu bounds
         alphas     (K,), each in (0, 1)
         channels   widths of the blocks of w that are bounded separately; None: one block
-        mu_max     ask only for some solution with mu at this limit, as the paper does; which one is
-                   the solver's choice
-        slack      margin asked of every decay LMI
+        mu_max     find any solution with mu at this limit, as the paper does; which one depends on
+                   the solver
+        slack      margin required of every decay LMI
         scale      (n,), typical sizes of the states, tried first
 
-    Raises ``UserError`` for an alpha outside (0, 1), ``ValueError`` for widths that do not fit, and
-    ``LmiError`` where, in every scaling tried, the solver fails or its answer does not pass the
-    eigenvalue check.
+    Raises ``UserError`` for an alpha outside (0, 1), ``ValueError`` for widths that do not match,
+    and ``LmiError`` if, in every scaling tried, the solver fails or its answer fails the eigenvalue
+    check.
     """
     for alpha in alphas:
         if not 0.0 < alpha < 1.0:
-            raise UserError(f"alpha lies strictly between 0 and 1, not {alpha}")
+            raise UserError(f"alpha is {alpha}, allowed: 0 to 1, both excluded")
     widths = [samplings[0].b.shape[1]] if channels is None else list(channels)
     if sum(widths) != samplings[0].b.shape[1] or min(widths) < 1 or len(alphas) != len(samplings):
-        raise ValueError("the channels share out the columns of B, and each sampling has an alpha")
-    failure = LmiError("the solver was not asked")
+        raise ValueError("channels must cover the columns of B, and each sampling needs an alpha")
+    failure = LmiError("the solver did not run")
     for states, reports in _scalings(samplings, scale):
         try:
             found = _solve_scaled(
@@ -152,7 +152,7 @@ def solve_common(
 def _scalings(
     samplings: Sequence[Sampling], scale: FloatArray | None
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Sizes of the states (n,) and reports (r,) to try: those given, by the inputs, and ones."""
+    """Yield sizes of states (n,) and reports (r,) to try: given, by the inputs, and ones."""
     inputs = np.max([np.linalg.norm(s.b, axis=1) for s in samplings], axis=0)
     noises = np.max([np.linalg.norm(s.d, axis=1) for s in samplings], axis=0)
     seen = np.max([np.abs(s.c) for s in samplings], axis=0)
@@ -177,7 +177,7 @@ def _solve_scaled(
     states: FloatArray,
     reports: FloatArray,
 ) -> LmiSolution:
-    """Solve with states and reports in the units given, and certify in the original ones."""
+    """Solve with states and reports in the given units, and certify in the original ones."""
     unit = float(np.max(np.abs(h) @ states)) or 1.0
     scaled = [
         Sampling(
@@ -194,7 +194,7 @@ def _solve_scaled(
     )
     gains = [np.linalg.solve(p, z) * states[:, None] / reports for z in zs]
     p = p / np.outer(states, states)
-    mu = float(np.linalg.eigvalsh(h @ np.linalg.solve(p, h.T))[-1])  # what this P really gives
+    mu = float(np.linalg.eigvalsh(h @ np.linalg.solve(p, h.T))[-1])  # the exact value for this P
     return _certified(
         p, gains, mu, samplings=samplings, h=h, multipliers=multipliers, widths=widths
     )
@@ -209,7 +209,7 @@ def _ask(
     mu_max: float | None,
     slack: float,
 ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
-    """P, the Z and the multipliers (K, channels), as the solver gives them."""
+    """Return P, the Z and the multipliers (K, channels) from the solver."""
     n, k = samplings[0].a.shape[0], h.shape[0]
     p = cp.Variable((n, n), symmetric=True)
     mu = cp.Variable(nonneg=True)
@@ -234,13 +234,13 @@ def _ask(
     problem = cp.Problem(cp.Minimize(mu if mu_max is None else 0), constraints)
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # an inaccurate answer is judged by its certificate
+            warnings.simplefilter("ignore")  # the certificate detects an inaccurate answer
             problem.solve(solver=cp.CLARABEL)
     except cp.SolverError as failure:
         raise LmiError(f"the solver failed: {failure}") from failure
     answered = problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
     if not answered or p.value is None or shares.value is None:
-        raise LmiError(f"the solver's answer is {problem.status}")
+        raise LmiError(f"the solver found no solution: {problem.status}")
     multipliers = np.maximum(shares.value, 0.0)
     multipliers *= (np.array(alphas) / multipliers.sum(axis=1))[:, None]
     return p.value, [z.value for z in zs], multipliers

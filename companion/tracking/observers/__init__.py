@@ -1,1 +1,1 @@
-"""The observers: one on the position model, one on the kinematic model."""
+"""Observers on the position model and on the kinematic model."""

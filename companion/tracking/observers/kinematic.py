@@ -1,4 +1,4 @@
-"""The observer on the kinematic model: position and velocity measured, acceleration unknown.
+"""Observer on the kinematic model: position and velocity measured, acceleration unknown.
 
 Per axis, over an interval T from one report to the next,
 
@@ -10,10 +10,10 @@ Per axis, over an interval T from one report to the next,
 The last two lines are the running bound, where A bounds the acceleration and N_p, N_v the report's
 noise. The gain is the same for every axis, so the norms of the horizontal pair, of the height and
 of all three obey it, each with its own noise. Gains come from a design with one Lyapunov function
-over a range of T (``gain_table.KinematicDesign``); the bound holds whatever they are.
+over a range of T (``gain_table.KinematicDesign``); the bound holds for any gains.
 
 The same step predicts, with T the time since the report; backwards too, with |T| in the last terms.
-The greatest speed ``speed_max_mps`` limits the bound over long gaps. See docs/math.md 4; the step
+The largest speed ``speed_max_mps`` limits the bound over long gaps. See docs/math.md 4; the step
 is paper eq. (8) with A(T) - L for Q.
 """
 
@@ -30,16 +30,16 @@ GainSchedule = Callable[[float], Gain]  # function from an interval in seconds t
 
 
 VELOCITY_SHARE = 0.5
-"""Share of the velocity shown by a report that is believed where no velocity is reported.
+"""Weight of a velocity derived from positions, if no velocity is reported.
 
 Over equal intervals the error then has the eigenvalues 0 and 1 - share.
 """
 SHOWN_S = 0.1
-"""Interval below which positions show less of a velocity, as their noise would be one of km/s."""
+"""Least interval for a velocity derived from positions; below it, their noise would mean km/s."""
 
 
 def deadbeat(interval_s: float) -> Gain:
-    """L = A(T): the report alone, carried on at its velocity, as the worst case demands."""
+    """L = A(T): the report alone, extrapolated at its velocity; optimal in the worst case."""
     return 1.0, interval_s, 0.0, 1.0
 
 
@@ -55,9 +55,9 @@ def scheduled(design: KinematicDesign) -> GainSchedule:
 
 @dataclass(frozen=True, slots=True)
 class KinematicModel:
-    """Bounds on speed and acceleration (norms), never exceeded, and the schedule of gains.
+    """Bounds on speed and acceleration (norms), and the schedule of gains.
 
-    The bounds are those of reports that have no ``limits`` of their own.
+    The bounds apply to reports that have no ``limits`` of their own.
     """
 
     speed_max_mps: float
@@ -67,7 +67,7 @@ class KinematicModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KinematicState:
-    """The estimate at a report's time, made before that report, its bounds, and the report.
+    """Estimate at a report's time before that report is used, its bounds, and the report.
 
     position_ned_m, velocity_ned_mps
                   the estimate, local frame
@@ -80,22 +80,22 @@ class KinematicState:
     vertical_m: float  # bound on the error in height
     position_m: float  # bound on the norm of the position error
     velocity_mps: float  # bound on the norm of the velocity error
-    interval_s: float | None  # interval since the report before; None for the first
+    interval_s: float | None  # interval since the previous report; None for the first
 
 
 class KinematicObserver:
-    """The observer on the kinematic model; see ``estimates.Observer``.
+    """Observer on the kinematic model; see ``estimates.Observer``.
 
-    Where reports have no velocity, it is estimated from the positions.
+    If reports have no velocity, it is estimated from the positions.
     """
 
     def __init__(self, model: KinematicModel) -> None:
         self.model = model
 
     def begin(self, fix: Fix) -> KinematicState:
-        """The state of a track with one report, which is the estimate.
+        """Return the state of a track with one report, which is the estimate.
 
-        Without a reported velocity the estimate is at rest, with the greatest speed as its bound.
+        Without a reported velocity the estimate is at rest, with the largest speed as its bound.
         """
         velocity, fastest_mps = fix.velocity_ned_mps, (fix.limits or self.model).speed_max_mps
         return KinematicState(
@@ -110,7 +110,7 @@ class KinematicObserver:
         )
 
     def predict(self, state: KinematicState, sender_ns: int) -> Prediction:
-        """Position and velocity at a time, with their bounds."""
+        """Predict position and velocity to a time, with their bounds."""
         fix = state.fix
         t = (sender_ns - fix.sender_ns) * 1e-9
         gain = self._gain(state, t)
@@ -118,7 +118,7 @@ class KinematicObserver:
         return self._bounded(state, t, gain, position, velocity)
 
     def carry(self, state: KinematicState, sender_ns: int) -> tuple[Vector, Vector] | None:
-        """Position and velocity of ``predict``; None where no velocity is reported."""
+        """Position and velocity of ``predict``; None if no velocity is reported."""
         if state.fix.velocity_ned_mps is None:
             return None
         t = (sender_ns - state.fix.sender_ns) * 1e-9
@@ -127,7 +127,7 @@ class KinematicObserver:
     def _bounded(
         self, state: KinematicState, t: float, gain: Gain, position: Vector, velocity: Vector
     ) -> Prediction:
-        """The prediction with the running bound."""
+        """Return the prediction with the running bound."""
         fix, noise = state.fix, state.fix.noise
         model = fix.limits or self.model
         l11, l12, l21, l22 = gain
@@ -163,11 +163,12 @@ class KinematicObserver:
             and vertical_m <= noise.vertical_m + reach_m
             and bound_m <= noise.position_m + reach_m
         ):
-            return found  # the greatest speed says no more
+            return found  # the largest speed gives no tighter bound
         return self._limited(fix, reach_m, found, model.speed_max_mps)
 
     def _gain(self, state: KinematicState, t: float) -> Gain:
-        """The scheduled gain; without a reported velocity, A(t) [1; share / interval before]."""
+        """Return the scheduled gain; without a reported velocity, A(t) [1; share / previous
+        interval]."""
         if state.fix.velocity_ned_mps is not None:
             return self.model.gain(t)
         if state.interval_s is None:
@@ -176,7 +177,7 @@ class KinematicObserver:
         return 1.0 + rate * t, 0.0, rate, 0.0
 
     def after(self, state: KinematicState, predicted: Prediction, fix: Fix) -> KinematicState:
-        """The state at a report.
+        """Return the state at a report.
 
         The delayed observer's estimate there does not use that report yet.
         """
@@ -195,7 +196,7 @@ class KinematicObserver:
         )
 
     def _limited(self, fix: Fix, reach_m: float, found: Prediction, speed_mps: float) -> Prediction:
-        """The prediction with its bounds reduced to what the greatest speed allows."""
+        """Limit the bounds of a prediction by the largest speed."""
         assert found.velocity_ned_mps is not None
         assert found.velocity_bound_mps is not None
         horizontal_m, vertical_m = found.horizontal_m, found.vertical_m
@@ -218,7 +219,7 @@ class KinematicObserver:
 
 
 def _moved(state: KinematicState, t: float, gain: Gain) -> tuple[Vector, Vector]:
-    """Position and velocity a time after the state's report, by the gain for that time."""
+    """Return position and velocity a time after the state's report, by the gain for that time."""
     fix = state.fix
     l11, l12, l21, l22 = gain
     m11, m12, m22 = 1.0 - l11, t - l12, 1.0 - l22

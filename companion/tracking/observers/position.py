@@ -1,4 +1,4 @@
-"""The unknown input observer on the position model, with gains scheduled by the real interval.
+"""Unknown input observer on the position model, with gains scheduled by the actual interval.
 
 Per axis, over an interval b from one report to the next,
 
@@ -7,17 +7,17 @@ Per axis, over an interval b from one report to the next,
     |e+| <= |1 - l| |e| + |l d - b| W + |l| N       the running bound, exact for given W and N
 
 where W bounds the speed and N the report's noise. The same step predicts, with b the time since the
-report: the estimate at t is what the observer would hold if its next report came at t. The gain is
-the same for all axes, so norms of 3-vectors obey the same bound. The model is docs/math.md 1, paper
-eq. (6), the step docs/math.md 2, paper eq. (8), the bound docs/math.md 2.4.
+report: the estimate at t is the observer's if its next report came at t. The gain is the same for
+all axes, so norms of 3-vectors obey the same bound. The model is docs/math.md 1, paper eq. (6), the
+step docs/math.md 2, paper eq. (8), the bound docs/math.md 2.4.
 
-A sender that itself leads by d has mean velocities over d and over b that differ by at most A |b -
-d| / 2, with A a bound on acceleration; N has d times that added.
+A sender whose reports lead by d has mean velocities over d and over b that differ by at most
+A |b - d| / 2, with A a bound on acceleration; d times that is added to N.
 
-A sender that also reports velocity lets the feedthrough be chosen: y = p + d v leads the position
-by d, with noise  N = N_p + d (N_v + A b / 2), since the mean velocity of the interval differs from
-v by at most A b / 2. With d >= b the unknown velocity is decoupled altogether (l d = b), and what
-is left is noise and acceleration: x^+ = x^ + b v + (b / d)(p - x^). Here d =
+If a sender also reports velocity, the feedthrough can be chosen: y = p + d v leads the position by
+d, with noise  N = N_p + d (N_v + A b / 2), since the mean velocity of the interval differs from
+v by at most A b / 2. With d >= b the unknown velocity is decoupled completely (l d = b), and only
+noise and acceleration remain: x^+ = x^ + b v + (b / d)(p - x^). Here d =
 max(``velocity_lead_s``, b). See docs/math.md 2.6.
 
 Time is an argument, on the sender's own timeline; states are frozen values.
@@ -37,9 +37,9 @@ class PositionModel:
     Speed and acceleration are norms of 3-vectors that are never exceeded.
 
         alpha            decay in (0, 1); None: the best at each interval
-        feedthrough_s    time by which the *sender* makes its reports lead (negative: lag); 0 where
-                         the time of a report is known
-        velocity_lead_s  least lead made from a reported velocity; a longer one smooths more
+        feedthrough_s    lead of the *sender's* reports (negative: lag); 0 if the time of a report
+                         is known
+        velocity_lead_s  least lead computed from a reported velocity; a longer one smooths more
     """
 
     speed_max_mps: float
@@ -51,7 +51,7 @@ class PositionModel:
 
 @dataclass(frozen=True, slots=True)
 class PositionState:
-    """The estimate at a report's time, made before that report; its bound; and the report."""
+    """Estimate at a report's time before that report is used; its bound; and the report."""
 
     fix: Fix
     estimate_ned_m: Vector
@@ -59,18 +59,21 @@ class PositionState:
 
 
 class PositionObserver:
-    """The observer on the position model; see ``estimates.Observer``."""
+    """Observer on the position model; see ``estimates.Observer``."""
 
     def __init__(self, model: PositionModel) -> None:
         self.model = model
 
     def begin(self, fix: Fix) -> PositionState:
-        """The state of a track with one report, which is the estimate."""
+        """Return the state of a track with one report, which is the estimate."""
         lead_m = abs(self.model.feedthrough_s) * (fix.limits or self.model).speed_max_mps
         return PositionState(fix, fix.position_ned_m, fix.noise.position_m + lead_m)
 
     def predict(self, state: PositionState, sender_ns: int) -> Prediction:
-        """Position at a time, with its bound; before the report's own time only the bound grows."""
+        """Predict the position with its bound.
+
+        Before the report's own time only the bound grows.
+        """
         model, fix = self.model, state.fix
         limits = fix.limits or model
         b = (sender_ns - fix.sender_ns) * 1e-9
@@ -78,7 +81,7 @@ class PositionObserver:
             bound_m = state.bound_m - b * limits.speed_max_mps
             return self._made(state, state.estimate_ned_m, bound_m, b, 0.0)
         d, noise_m, lead_s = model.feedthrough_s, fix.noise.position_m, 0.0
-        # The mean velocity of the sender's lead is not quite that of the interval.
+        # The mean velocity over the sender's lead differs from that over the interval.
         noise_m += abs(d) * limits.acceleration_max_mps2 * abs(b - d) / 2
         if fix.velocity_ned_mps is not None:
             lead_s = max(model.velocity_lead_s, b)
@@ -95,11 +98,11 @@ class PositionObserver:
         return self._made(state, estimate, bound_m, b, closed_form.mu_star(b, d, alpha))
 
     def carry(self, _state: PositionState, _sender_ns: int) -> tuple[Vector, Vector] | None:
-        """None: the observer has a bound of its own."""
+        """None: the observer has its own bound."""
         return None
 
     def after(self, _state: PositionState, predicted: Prediction, fix: Fix) -> PositionState:
-        """The state at a report.
+        """Return the state at a report.
 
         The delayed observer's estimate there does not use that report yet.
         """
@@ -108,7 +111,7 @@ class PositionObserver:
     def _made(
         self, state: PositionState, estimate: Vector, bound_m: float, b: float, mu_s2: float
     ) -> Prediction:
-        """A prediction with the reported velocity, whose bound grows with the acceleration."""
+        """Return a prediction with the reported velocity, whose bound grows with time."""
         fix = state.fix
         changed_mps = fix.noise.velocity_mps + (
             fix.limits or self.model
@@ -126,7 +129,7 @@ class PositionObserver:
 
 
 def _drawn(state: PositionState, lead_s: float, gain: float) -> Vector:
-    """The estimate, drawn by the gain towards the report with the lead made from its velocity."""
+    """Return the estimate, corrected by the gain towards the report with its lead."""
     x1, x2, x3 = state.estimate_ned_m
     y1, y2, y3 = state.fix.position_ned_m
     v1, v2, v3 = state.fix.velocity_ned_mps or (0.0, 0.0, 0.0)

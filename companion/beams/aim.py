@@ -1,4 +1,4 @@
-"""Tracks to beams: which UAVs get one, where it points, and the weights of all of them together."""
+"""Beams from tracks: which UAVs get one, its direction, and the weights of all beams together."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -38,14 +38,14 @@ from companion.values import (
 
 AIMABLE: Final = (TrackState.LIVE, TrackState.COASTING)  # states of a track that gets a beam
 NEAREST_M: Final = 1.0
-"""Distance from the array below which a direction means nothing.
+"""Distance from the array below which a direction is meaningless.
 
 The far field is tens of metres away.
 """
 UNKNOWN_SHARE: Final = 0.25
-"""Share of a bound that is taken for the usual error before reports have shown one.
+"""Ratio of the usual error to its bound, before reports have revealed it.
 
-On the logs it is a twentieth for positions, and a tenth to a fifth for attitudes.
+In the logs it is 1/20 for positions, and 1/10 to 1/5 for attitudes.
 """
 DARK: Final = 1e-3
 """Element amplitude below which there is no beam: 60 dB below an isotropic element."""
@@ -62,16 +62,16 @@ def aim(
     coverage: Coverage = EVERYWHERE,
     before: Hysteresis | None = None,
 ) -> BeamSet:
-    """Make one beam on every track that can be aimed at, with nulls on the others.
+    """Compute one beam for every eligible track, with nulls on the others.
 
-        now_ns       when the beams are made, node time
+        now_ns       when the beams are computed, node time
         valid_at_ns  when they are applied, node time
         tracks       UAVs predicted to ``valid_at_ns``
-        carrier      where the array is then; None: not known, and no beams
+        carrier      position and attitude of the array then; None: unknown, and no beams
         array        the array on its mount
-        precoder     how weights are made
+        precoder     how weights are computed
         coverage     directions in which beams may point
-        before       what the last beams were, which these do not leave at once; None: nothing
+        before       state of the last beams, for hysteresis; None: no hysteresis
 
     The columns of the weights are in the order of ``tracks``. UAVs without a beam are listed with
     the reason.
@@ -109,7 +109,7 @@ def aim(
 
 
 def without(beam_set: BeamSet, uavs: Collection[str]) -> BeamSet:
-    """The beam set without the beams of some UAVs; the nulls towards these UAVs stay.
+    """Remove the beams of some UAVs; the nulls towards these UAVs stay.
 
     The other beams of a time slot share its power. A slot without beams is removed.
     """
@@ -126,7 +126,7 @@ def without(beam_set: BeamSet, uavs: Collection[str]) -> BeamSet:
 
 
 def directions(beam_set: BeamSet) -> FloatArray:
-    """Unit directions (N, 3) of the beams in the array frame."""
+    """Return unit directions (N, 3) of the beams in the array frame."""
     azimuths = np.array([beam.azimuth_rad for beam in beam_set.beams])
     elevations = np.array([beam.elevation_rad for beam in beam_set.beams])
     return steering.unit_directions(azimuths, elevations)
@@ -149,7 +149,7 @@ def _beams(
     before: Hysteresis | None,
     valid_at_ns: int,
 ) -> tuple[tuple[Beam, ...], Precoding, dict[str, str]]:
-    """The beams, their weights, and the UAVs that the policy left out with the reason."""
+    """Return the beams, their weights, and the UAVs that the policy left out with the reason."""
     tracks, ranges_m, directions = aimed
     uavs = [track.uav for track in tracks]
     each = list(zip(tracks, ranges_m.tolist(), strict=True))
@@ -220,7 +220,7 @@ def _beams(
 
 
 def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:
-    """Indices of the tracks by descending priority: those named first, then the others."""
+    """Return indices of the tracks by descending priority: those in ``priority`` first."""
     ranks = {uav: rank for rank, uav in enumerate(priority)}
     return sorted(range(len(tracks)), key=lambda i: ranks.get(tracks[i].uav, len(ranks)))
 
@@ -228,17 +228,17 @@ def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:
 def _out_of_reach(
     directions: FloatArray, array: Array, coverage: Coverage
 ) -> list[tuple[Cause, str] | None]:
-    """For each direction the reason why no beam can point there; None if one can."""
+    """Return for each direction why no beam can point there; None if one can."""
     reasons: list[str | None] = [None] * len(directions)
     if coverage != EVERYWHERE:
         reasons = refusals(coverage, directions, directions @ array.array_from_body)
     if array.element.pattern is not ElementPattern.ISOTROPIC:
         amplitudes = steering.amplitudes(array, directions)
-        if array.live is not None:  # those that face there may be those that are dead
+        if array.live is not None:  # dead elements may be the ones that face there
             amplitudes = amplitudes * array.live[:, np.newaxis]
         dark = amplitudes.max(axis=0) < DARK
         reasons = [
-            why or ("its elements radiate nothing there" if none else None)
+            why or ("no element of the array radiates there" if none else None)
             for why, none in zip(reasons, dark.tolist(), strict=True)
         ]
     return [None if why is None else (Cause.COVERAGE, why) for why in reasons]
@@ -247,10 +247,10 @@ def _out_of_reach(
 def _pointing_bound_rad(
     track: Track, carrier: Carrier, lever_m: float, range_m: float
 ) -> float | None:
-    """Bound on the angle between predicted and true direction; None: any direction is possible.
+    """Return the bound on the angle between predicted and true direction; None: unbounded.
 
-    Both positions' errors as seen from the array, the way that its attitude's error moves an array
-    that stands off the carrier's reported point, and that error itself (docs/math.md 5.3).
+    The sum of: the errors of both positions as seen from the array; the displacement of the array
+    by the attitude error, through the lever arm; and the attitude error itself (docs/math.md 5.3).
     """
     swing = 2.0 * math.sin(min(carrier.attitude_bound_rad, math.pi) / 2.0)
     swung_m = swing * lever_m
@@ -261,10 +261,10 @@ def _pointing_bound_rad(
 def _usual_rad(
     track: Track, carrier: Carrier, lever_m: float, range_m: float, bound_rad: float | None
 ) -> float:
-    """Angle that 95 of 100 predicted directions are off by at most, as far as is known.
+    """Return the estimated 95th percentile of the direction error.
 
-    Errors of positions and of the attitude have nothing to do with one another, so they add as
-    squares. What is not known is taken for ``UNKNOWN_SHARE`` of its bound (docs/math.md 5.3).
+    Errors of positions and of the attitude are independent, so they add as squares. Unknown ones
+    are estimated as ``UNKNOWN_SHARE`` of their bounds (docs/math.md 5.3).
     """
 
     def usual(known: float | None, bound: float) -> float:
@@ -282,11 +282,11 @@ def _usual_rad(
 
 
 def _refusal(track: Track, place_ned_m: FloatArray | None) -> tuple[Cause, str] | None:
-    """Why a track gets no beam from an array at this place; None if it gets one."""
+    """Return why a track gets no beam from an array at this place; None if it gets one."""
     if place_ned_m is None:
-        return Cause.CARRIER, "the carrier is not known"
+        return Cause.CARRIER, "the carrier's position or attitude is unknown"
     if track.state not in AIMABLE:
-        return Cause.SILENT, f"its reports are {track.state}"
+        return Cause.SILENT, f"its track is {track.state}"
     offset_m = track.position_ned_m - place_ned_m
     if offset_m @ offset_m < NEAREST_M**2:
         return Cause.COVERAGE, f"it is within {NEAREST_M:g} m of the array"

@@ -1,8 +1,8 @@
-"""Hysteresis of beams: shapes, method and time slots follow what is known, but not at once.
+"""Hysteresis of beams: shapes, method and time slots follow the estimates with a delay.
 
-A report changes what is known of a UAV from one moment to the next, by a factor over a slow radio.
-A beam's shape follows at a limited pace. A method and a set of slots are kept for ``KEPT_NS`` after
-they were chosen, unless they exceed the limits. The state is that of the last tick of the pipeline.
+A report changes the estimates of a UAV abruptly, over a slow radio by a factor. A beam's shape
+follows at a limited rate. A method and a set of slots are kept for ``KEPT_NS`` after they were
+selected, unless they exceed the limits. The state is that of the pipeline's last tick.
 """
 
 from collections.abc import Mapping
@@ -18,7 +18,7 @@ MAX_RATIO_PER_S: Final = 3.0  # largest factor by which the angles of a shape ch
 MAX_ELAPSED_S: Final = 60.0
 """Longest time between two ticks that counts: after days ``MAX_RATIO_PER_S ** s`` overflows."""
 MAX_WIDENING: Final = 3.5
-"""Largest growth in a second, in natural widths: as fast change phases at the aperture's ends."""
+"""Largest growth in a second, in natural widths: phases at the aperture's ends change as fast."""
 MAX_NARROWING: Final = 3.0  # largest shrinkage in a second, in natural widths
 MAX_HELD_NARROWING: Final = 1.0
 """The same for a bound that filled its shape within the last ``HELD_NS``.
@@ -27,9 +27,9 @@ Over a slow radio a bound grows until the next report; a shape that followed wou
 """
 HELD_NS: Final = 3_000_000_000
 GUARANTEE_PLANE_SHARE: Final = 1 / 3
-"""Share of these rates for a plane's beams under ``widen = "guarantee"``.
+"""Factor of these rates for planar arrays with ``widen = "guarantee"``.
 
-They change most from one width to the next.
+Their beams change most with the width.
 """
 LEAST_WIDTHS: Final = 0.25
 """Angle in natural widths below which a shape is unaffected; growth by factors starts here."""
@@ -43,20 +43,20 @@ class Hysteresis:
     """State after the beams of the last tick.
 
     shaped       the likely angle and the bound of each UAV's shape, radians
-    filled_ns    when last the bound of each UAV was no less than that of its shape
+    filled_ns    when the bound of each UAV was last at least that of its shape
     """
 
-    valid_at_ns: int  # for when they were made
+    valid_at_ns: int  # when they are applied
     shaped: Mapping[str, tuple[float, float]]
     filled_ns: Mapping[str, int]
     slots: Mapping[str, int]  # the slot of each UAV; those left out are missing
     known: frozenset[str]  # the UAVs that could have a beam
-    slots_since_ns: int  # since when these UAVs have had these slots
+    slots_since_ns: int  # when these slots were assigned
     inexact_ns: int | None  # when zero forcing last was not exact; None: never
 
 
 def updated(before: Hysteresis | None, made: BeamSet) -> Hysteresis:
-    """The state once these beams were made."""
+    """Return the state after new beams."""
     slots = {beam.uav: beam.group for beam in made.beams}
     same = before is not None and before.slots == slots
     inexact_ns = None if before is None else before.inexact_ns
@@ -72,7 +72,7 @@ def updated(before: Hysteresis | None, made: BeamSet) -> Hysteresis:
 
 
 def _filled_ns(before: Hysteresis | None, beam: Beam, valid_at_ns: int) -> int:
-    """When last the bound of a UAV was no less than that of its shape; at first, now."""
+    """Return when the bound of a UAV was last at least that of its shape; at first, now."""
     bound_rad = 0.0 if beam.pointing_bound_rad is None else beam.pointing_bound_rad
     if before is None or bound_rad >= beam.shaped_bound_rad:
         return valid_at_ns
@@ -90,12 +90,12 @@ def rate_limited_rad(
 ) -> FloatArray:
     """Angles (N, 2) for which beams are shaped, limited in their rate of change.
 
-    before       the last beams; None: none
-    valid_at_ns  for when beams are made
+    before       state of the last beams; None: no limit
+    valid_at_ns  when the new beams are applied
     uavs         names of the N UAVs
     wanted_rad   (N, 2), their likely angles and their bounds
     natural_rad  the natural width of the array
-    pace         share of the usual rates
+    pace         factor of the usual rates
     """
     wanted_rad = np.minimum(wanted_rad, MOST_WIDTHS * natural_rad)
     if before is None:
@@ -121,7 +121,7 @@ def rate_limited_rad(
 def previous_slots(
     before: Hysteresis | None, valid_at_ns: int, uavs: list[str]
 ) -> PreviousSlots | None:
-    """The previous slots of these UAVs; -1 for one that was left out.
+    """Return the previous slots of these UAVs, -1 for one left out.
 
     None if the UAVs have changed.
     """
@@ -134,7 +134,7 @@ def previous_slots(
 def reported_method(
     before: Hysteresis | None, valid_at_ns: int, method: Method, exact: bool
 ) -> Method:
-    """The method to report: zero forcing only where it has been exact for a while."""
+    """Return the method to report: zero forcing only after it has been exact for ``KEPT_NS``."""
     if method is not Method.ZERO_FORCING or before is None or before.inexact_ns is None:
         return method
     since_ns = valid_at_ns - before.inexact_ns

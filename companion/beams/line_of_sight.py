@@ -1,4 +1,4 @@
-"""UAVs as seen from the array: ranges, directions, and their rates of change.
+"""Ranges, directions, and their rates of change, from the array to the UAVs.
 
 Directions are unit vectors in the array frame.
 """
@@ -83,9 +83,9 @@ def directions_ahead(
 ) -> FloatArray | None:
     """Unit directions (T, 3) of a UAV at times after the track's own; None without its velocity.
 
-    Track and carrier go on at their velocities, the track with its acceleration, and the carrier
-    turns at its body rates; the result is good for as long as that is so. Where the UAV would be at
-    the array itself, boresight stands for its direction.
+    Track and carrier are extrapolated at their velocities, the track also with its acceleration,
+    and the carrier at its body rates. Boresight is returned where the UAV would be at the array
+    itself.
     """
     velocity, own = track.velocity_ned_mps, carrier.velocity_ned_mps
     if velocity is None or own is None:
@@ -97,7 +97,7 @@ def directions_ahead(
     seen_m = ahead_m @ carrier.body_from_local.T
     turn = math.sqrt(carrier.body_rates_radps @ carrier.body_rates_radps)
     if turn > 0:
-        # Rodrigues' formula; coordinates turn the other way than the body.
+        # Rodrigues' formula; coordinates rotate opposite to the body.
         axis, angle = carrier.body_rates_radps / turn, -turn * t
         along = (seen_m @ axis)[:, np.newaxis] * axis
         seen_m = along + (seen_m - along) * np.cos(angle) + np.cross(axis, seen_m) * np.sin(angle)

@@ -208,8 +208,8 @@ def test_who_is_left_out_and_why() -> None:
     assert found.uavs == ("live", "coasting", "beside")
     assert found.weights.shape == (16, 3)
     assert {left.uav: left.reason for left in found.left_out} == {
-        "stale": "its reports are stale",
-        "lost": "its reports are lost",
+        "stale": "its track is stale",
+        "lost": "its track is lost",
         "here": "it is within 1 m of the array",
     }
 
@@ -218,7 +218,9 @@ def test_without_a_carrier_there_are_no_beams() -> None:
     found = pointed([track("a", (100, 0, 0)), track("b", (0, 100, 0), "stale")], None)
     assert (found.beams, found.weights.shape, found.condition_number) == ((), (16, 0), None)
     assert [left.uav for left in found.left_out] == ["a", "b"]
-    assert {left.reason for left in found.left_out} == {"the carrier is not known"}
+    assert {left.reason for left in found.left_out} == {
+        "the carrier's position or attitude is unknown"
+    }
 
 
 @pytest.mark.parametrize("tracks", [[], [track("a", (5, 0, 0), "stale")]])
@@ -357,7 +359,7 @@ def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
     assert found.uavs == ("ahead",)
     assert found.method is Method.ZERO_FORCING
     (out,) = found.left_out
-    assert (out.uav, out.reason) == ("behind", "its elements radiate nothing there")
+    assert (out.uav, out.reason) == ("behind", "no element of the array radiates there")
 
 
 def test_where_all_elements_that_face_a_uav_are_dead_there_is_no_beam() -> None:
@@ -377,7 +379,7 @@ def test_where_all_elements_that_face_a_uav_are_dead_there_is_no_beam() -> None:
         )
         assert found.uavs == ("behind",)
         (out,) = found.left_out
-        assert (out.uav, out.reason) == ("ahead", "its elements radiate nothing there")
+        assert (out.uav, out.reason) == ("ahead", "no element of the array radiates there")
 
 
 @pytest.mark.parametrize("policy", Policy)
@@ -406,7 +408,7 @@ def test_two_uavs_at_one_point_are_defined_under_every_policy(policy: Policy) ->
             assert found.uavs == ("b", "c")
             (out,) = found.left_out
             assert out.uav == "a"
-            assert out.reason.startswith("too close to one of higher priority")
+            assert out.reason.startswith("too close to a UAV of higher priority")
 
 
 def test_straight_above_is_a_direction_like_any_other() -> None:
@@ -543,7 +545,7 @@ def test_what_is_not_covered_is_left_out_in_the_frames_that_its_limits_are_in() 
     }
     assert reasons.keys() == {"ahead", "behind"}
     assert reasons["ahead"].startswith("hidden by the airframe")
-    assert reasons["behind"] == "its elements radiate nothing there"
+    assert reasons["behind"] == "no element of the array radiates there"
     limits = Coverage(azimuth_limits_rad=(-0.5, 0.5))
     found = aim(
         7,

@@ -1,1 +1,1 @@
-"""The antenna array: its geometry, its elements, steering vectors, and where it may point."""
+"""Antenna array: geometry, elements, steering vectors and coverage."""

@@ -1,9 +1,9 @@
 """Coverage: the directions in which beams may point.
 
-The field of view is a cone about boresight, and the steering limits are a range of azimuths and of
-elevations; both are in the array frame. What the carrier hides is in its body frame, in which the
-airframe stands still. Azimuth is atan2(y, x), to the right; elevation is asin(-z), up. Edges belong
-to what is allowed, and to what is hidden.
+The field of view is a cone about boresight; the steering limits are ranges of azimuth and
+elevation; both are in the array frame. Sectors hidden by the airframe are in the carrier's body
+frame, in which the airframe is fixed. Azimuth is atan2(y, x), to the right; elevation is asin(-z),
+up. Edges belong to the allowed range, and to a hidden sector.
 """
 
 import math
@@ -21,12 +21,11 @@ QUARTER: Final = math.pi / 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sector:
-    """A range of azimuths to the right and of elevations upwards, radians.
+    """Range of azimuths to the right and of elevations upwards, radians.
 
-    Azimuths are -pi to pi and may run across the tail: from 170 to -170 degrees is 20 degrees wide,
-    from -180 to 180 all around; straight up and down the azimuth is 0. A sector that hides
-    something is in the carrier's body frame. ``azimuths`` and ``elevations`` are the two ranges as
-    text, degrees.
+    Azimuths are -pi to pi and may cross the tail: from 170 to -170 degrees is 20 degrees wide, from
+    -180 to 180 all around; straight up and down the azimuth is 0. A hidden sector is in the
+    carrier's body frame. ``azimuths`` and ``elevations`` are the two ranges as text, degrees.
 
     Raises ``UserError`` for angles out of range, elevations out of order, and a sector without
     width.
@@ -39,11 +38,13 @@ class Sector:
 
     def __post_init__(self) -> None:
         if not all(abs(a) <= math.pi for a in (self.azimuth_from_rad, self.azimuth_to_rad)):
-            raise UserError(f"azimuth {self.azimuths} degrees: both within -180 to 180")
+            raise UserError(f"azimuth {self.azimuths} degrees: give angles from -180 to 180")
         if self.width_rad == 0:
-            raise UserError(f"azimuth {self.azimuths} degrees: it has no width")
+            raise UserError(f"azimuth {self.azimuths} degrees: give a range above 0 degrees")
         if not -QUARTER <= self.elevation_from_rad < self.elevation_to_rad <= QUARTER:
-            raise UserError(f"elevation {self.elevations} degrees: upward, within -90 to 90")
+            raise UserError(
+                f"elevation {self.elevations} degrees: give ascending angles from -90 to 90"
+            )
 
     @property
     def width_rad(self) -> float:
@@ -52,12 +53,13 @@ class Sector:
         return width if width >= 0 else max(width + 2 * math.pi, 0.0)
 
     def holds(self, directions: FloatArray) -> BoolArray:
-        """Whether unit directions (..., 3) are inside or on the edge: (...)."""
+        """Return whether unit directions (..., 3) are inside or on the edge: (...)."""
         azimuth, elevation = _angles(directions)
         return self.spans(azimuth) & self.reaches(elevation)
 
     def to_edge_rad(self, directions: FloatArray) -> FloatArray:
-        """Angle from unit directions (..., 3), inside or outside, to the nearest edge: (...).
+        """Return the angle from unit directions (..., 3), inside or outside, to the nearest edge:
+        (...).
 
         Exact: the sides are arcs of great circles, and the nearest point of a parallel has the same
         azimuth or is a corner. A sector all around has no sides; a pole is no edge. Infinite for
@@ -75,21 +77,21 @@ class Sector:
         return nearest
 
     def spans(self, azimuth: FloatArray) -> BoolArray:
-        """Whether azimuths lie within the sector's range."""
+        """Return whether azimuths lie within the sector's range."""
         beyond = np.mod(azimuth - self.azimuth_from_rad, 2 * math.pi)
         spanned: BoolArray = beyond <= self.width_rad
         return spanned
 
     def reaches(self, elevation: FloatArray) -> BoolArray:
-        """Whether elevations lie within the sector's range."""
+        """Return whether elevations lie within the sector's range."""
         return (self.elevation_from_rad <= elevation) & (elevation <= self.elevation_to_rad)
 
     def _to_side_rad(self, directions: FloatArray, side_rad: float) -> FloatArray:
-        """Angle to the arc of a meridian between the two elevations."""
+        """Return the angle to the arc of a meridian between the two elevations."""
         x, y, up = directions[..., 0], directions[..., 1], -directions[..., 2]
         ahead = x * math.cos(side_rad) + y * math.sin(side_rad)
         aside = y * math.cos(side_rad) - x * math.sin(side_rad)
-        foot = np.arctan2(up, ahead)  # elevation of the nearest place of the great circle
+        foot = np.arctan2(up, ahead)  # elevation of the nearest point of the great circle
         on_arc = (self.elevation_from_rad <= foot) & (foot <= self.elevation_to_rad)
         nearest = np.where(on_arc, np.arctan2(np.abs(aside), np.hypot(ahead, up)), math.inf)
         for edge in (self.elevation_from_rad, self.elevation_to_rad):
@@ -112,10 +114,9 @@ class Sector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Coverage:
-    """Where the array may point. A limit that is not given (None, nothing hidden) does not limit.
+    """Directions in which the array may point. None, or no hidden sector: no limit.
 
-        field_of_view_rad     full angle of a cone about boresight, at most 2 pi, which is
-                              everything
+        field_of_view_rad     full angle of a cone about boresight, at most 2 pi, the whole sphere
         azimuth_limits_rad    steering range (from, to) in the array frame, as in a ``Sector``
         elevation_limits_rad  steering range (from, to) in the array frame
         hidden                sectors that the airframe hides, in the body frame
@@ -131,17 +132,17 @@ class Coverage:
     def __post_init__(self) -> None:
         view = self.field_of_view_rad
         if view is not None and not 0 < view <= 2 * math.pi:
-            raise UserError(f"field of view {_degrees(view)} degrees: above 0, at most 360")
+            raise UserError(
+                f"field of view {_degrees(view)} degrees: give more than 0, at most 360"
+            )
         try:
             self.limits()
         except ValueError as error:
             raise UserError(f"steering limits: {error}") from None
 
     def limits(self) -> Sector:
-        """The steering range as a sector of the array frame.
-
-        The whole sphere if nothing limits it.
-        """
+        """Return the steering range as a sector of the array frame; the whole sphere without
+        limits."""
         azimuth_from_rad, azimuth_to_rad = self.azimuth_limits_rad or (-math.pi, math.pi)
         elevation_from_rad, elevation_to_rad = self.elevation_limits_rad or (-QUARTER, QUARTER)
         return Sector(
@@ -152,13 +153,13 @@ class Coverage:
         )
 
 
-EVERYWHERE: Final = Coverage()  # no limits at all
+EVERYWHERE: Final = Coverage()  # no limits
 
 
 def refusals(
     coverage: Coverage, directions_array: FloatArray, directions_body: FloatArray
 ) -> list[str | None]:
-    """For each of N directions the reason why no beam may point there; None if one may.
+    """Return for each of N directions why no beam may point there; None if one may.
 
     Both arguments are the same unit directions (N, 3): in the array frame and in the carrier's body
     frame.
@@ -190,9 +191,9 @@ def margin_rad(
     """Angle from directions to the nearest edge of the coverage.
 
     Both arguments are the same unit directions (..., 3): in the array frame and in the carrier's
-    body frame. The result has shape (...) and is exact on the sphere: 0 where the direction itself
-    is refused, infinite where nothing limits. Every direction nearer than the margin is covered; a
-    pointing bound that reaches past it may leave the coverage, and then no gain is guaranteed.
+    body frame. The result has shape (...) and is exact on the sphere: 0 outside the coverage,
+    infinite without limits. Every direction nearer than the margin is covered; a pointing bound
+    beyond it may leave the coverage, and then no gain is guaranteed.
     """
     view, limits = coverage.field_of_view_rad, coverage.limits()
     edge = limits.to_edge_rad(directions_array)
@@ -220,5 +221,5 @@ def _angles(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
 
 
 def _degrees(angle_rad: float) -> str:
-    """Text of an angle to a tenth of a degree, without trailing zeros or "-0"."""
+    """Format an angle to a tenth of a degree, without trailing zeros or "-0"."""
     return f"{round(math.degrees(angle_rad), 1) + 0.0:g}"

@@ -22,7 +22,7 @@ class ElementPattern(StrEnum):
     TR38901 = "3gpp"
 
 
-# 3GPP TR 38.901 table 7.3-1: 65 degrees between half powers, 30 dB at most, 8 dBi at best.
+# 3GPP TR 38.901 table 7.3-1: 65 degrees beamwidth, at most 30 dB below the peak of 8 dBi.
 WIDTH_DEG: Final = 65.0
 FLOOR_DB: Final = 30.0
 BEST_DBI: Final = 8.0
@@ -30,11 +30,11 @@ BEST_DBI: Final = 8.0
 
 @dataclass(frozen=True, slots=True)
 class Element:
-    """The pattern of an element; ``exponent`` q belongs to the cosine alone.
+    """Pattern of an element; ``exponent`` q applies to the cosine only.
 
         ISOTROPIC  gain 1 everywhere
-        COSINE     power gain 2(q + 1) cos^q of the angle from outward, nothing behind; the factor
-                   makes the radiated power that of an isotropic element
+        COSINE     power gain 2(q + 1) cos^q of the angle from outward, 0 behind; the factor makes
+                   the radiated power that of an isotropic element
         TR38901    the antenna element of 3GPP TR 38.901, table 7.3-1
 
     Raises ``UserError`` for an exponent below 0.
@@ -45,10 +45,13 @@ class Element:
 
     def __post_init__(self) -> None:
         if not 0 <= self.exponent < math.inf:
-            raise UserError(f"the exponent {self.exponent:g} of a cosine pattern is not 0 or more")
+            raise UserError(f"exponent of the cosine pattern is {self.exponent:g}; give 0 or more")
 
     def amplitude(self, directions: FloatArray) -> FloatArray:
-        """Amplitude towards unit directions (..., 3) in the element frame; shape (...)."""
+        """Return the amplitude towards unit directions (..., 3) in the element frame.
+
+        Shape (...).
+        """
         match self.pattern:
             case ElementPattern.ISOTROPIC:
                 return np.ones(directions.shape[:-1])
@@ -60,7 +63,7 @@ class Element:
     def amplitude_range(
         self, directions: FloatArray, radius_rad: float | FloatArray
     ) -> tuple[FloatArray, FloatArray]:
-        """Bounds (...) on the amplitude within ``radius_rad`` of unit directions (..., 3).
+        """Return bounds (...) on the amplitude within ``radius_rad`` of unit directions (..., 3).
 
         Both are attained, except at the corners of TR 38.901, where the product of the two cuts is
         bounded by the extremes of each.
@@ -71,7 +74,7 @@ class Element:
                 return both, both
             case ElementPattern.COSINE:
                 aside = np.hypot(directions[..., 1], directions[..., 2])
-                off = np.arctan2(aside, directions[..., 0])  # arccos is 1e-8 off near 0
+                off = np.arctan2(aside, directions[..., 0])  # arccos has an error of 1e-8 near 0
                 least = np.cos(np.minimum(off + radius_rad, np.pi))
                 return self._cosine(least), self._cosine(np.cos(np.maximum(off - radius_rad, 0.0)))
             case ElementPattern.TR38901:

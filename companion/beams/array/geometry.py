@@ -1,4 +1,4 @@
-"""Array geometry: positions of the elements, how they face, and the mounting on the carrier.
+"""Array geometry: positions and orientations of the elements, and the mount on the carrier.
 
 Array frame: x boresight, y right, z down; metres. A uniform linear array (ULA) lies along y, a
 uniform rectangular one (URA) in the yz plane, a uniform circular one (UCA) in the xy plane; any
@@ -16,34 +16,34 @@ from companion.values import ArrayKind, BoolArray, ComplexArray, FloatArray, Use
 
 SPEED_OF_LIGHT_MPS: Final = 299_792_458.0
 SAME_PLACE_WAVELENGTHS: Final = 1e-9
-"""Distance below which two positions are one: 1e-8 rad of phase."""
+"""Distance below which two positions are identical: 1e-8 rad of phase."""
 LINE_WAVELENGTHS: Final = 1e-6
 """Root mean square distance from a line below which all elements count as on it."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Array:
-    """Element positions at a wavelength, and the mounting of the array.
+    """Element positions at a wavelength, and the mount of the array.
 
         elements_m          (M, 3), array frame
         wavelength_m        wavelength
-        array_from_body     (3, 3), the mounting
-        lever_arm_m         (3,), place of the array in the body frame, from the point whose
+        array_from_body     (3, 3), the mount
+        lever_arm_m         (3,), position of the array in the body frame, from the point whose
                             position the carrier reports
         element             pattern of all elements
-        element_from_array  (M, 3, 3), turns the array frame to where each element faces; None: all
-                            along boresight
+        element_from_array  (M, 3, 3), rotation from the array frame to each element's frame; None:
+                            all face boresight
         grid                rows and columns of a ULA or URA, elements row by row; else None
         live                (M,), whether an element works; None: all do
         coupling            C (M, M): fed with f, the elements carry C f; None: they carry f
-        channel_error       (M,), most that a channel's factor is off, |actual / wanted - 1|; None:
-                            nothing
+        channel_error       (M,), largest error of a channel's factor, |actual / wanted - 1|; None:
+                            0
 
     Computed from these:
 
         centred_m           (M, 3), positions relative to their centroid
         variance_m2         (3, 3), mean of their outer products
-        axis                (3,), the line on which they stand; None where they do not
+        axis                (3,), the line through all elements; None if they are not on a line
     """
 
     kind: ArrayKind
@@ -76,11 +76,11 @@ class Array:
         return len(self.elements_m)
 
     def fed(self, weights: ComplexArray) -> ComplexArray:
-        """Weights (M, K) without those of dead elements, which are fed in vain."""
+        """Return weights (M, K) with those of dead elements set to 0."""
         return weights if self.live is None else weights * self.live[:, np.newaxis]
 
     def carried(self, weights: ComplexArray) -> ComplexArray:
-        """What the elements carry, (M, K), when they are fed with weights (M, K)."""
+        """Return the excitation of the elements, (M, K), when fed with weights (M, K)."""
         live = self.fed(weights)
         return live if self.coupling is None else self.coupling @ live
 
@@ -99,9 +99,9 @@ def uniform_linear(
     element: Element = ISOTROPIC,
     lever_arm_m: FloatArray | None = None,
 ) -> Array:
-    """A uniform linear array along y, its first element at the origin.
+    """Uniform linear array along y, its first element at the origin.
 
-    Raises ``UserError`` for numbers that make no array, as do the functions below.
+    Raises ``UserError`` for invalid numbers, as do the functions below.
     """
     return uniform_rectangular(
         1,
@@ -124,7 +124,7 @@ def uniform_rectangular(
     element: Element = ISOTROPIC,
     lever_arm_m: FloatArray | None = None,
 ) -> Array:
-    """A uniform rectangular array: rows downward (z) of elements to the right (y), row by row.
+    """Uniform rectangular array: rows downward (z) of elements to the right (y), row by row.
 
     The first element is at the origin. One row is the uniform linear array.
     """
@@ -155,7 +155,7 @@ def uniform_circular(
     element: Element = ISOTROPIC,
     lever_arm_m: FloatArray | None = None,
 ) -> Array:
-    """A circle around the origin; the spacing is the chord between neighbours.
+    """Circle around the origin; the spacing is the chord between neighbours.
 
     The first element is on x, the next ones follow towards y. Elements that are not isotropic face
     outward.
@@ -188,7 +188,7 @@ def hexagonal(
     """Rings of hexagons about a middle element, on a triangular lattice in the yz plane.
 
     1 + 3 R (R + 1) elements for R rings, row by row from the top; neighbours are
-    ``spacing_wavelengths`` apart. For the same grating lobes it takes 13 % fewer elements an area
+    ``spacing_wavelengths`` apart. For the same grating lobes it needs 13 % fewer elements per area
     than a square lattice (Van Trees, Optimum Array Processing, 4.1.7).
     """
     wavelength_m = _wavelength_m(rings, frequency_hz, spacing_wavelengths)
@@ -218,16 +218,16 @@ def listed(
     outward: FloatArray | None = None,
     kind: ArrayKind = ArrayKind.LIST,
 ) -> Array:
-    """Elements at any positions (M, 3); ``outward`` (M, 3) is where each faces (None: boresight).
+    """Elements at any positions (M, 3), facing ``outward`` (M, 3) (None: boresight).
 
     Raises ``UserError`` for two elements at one place: they would be one element wired twice.
     """
     wavelength_m = _wavelength_m(len(elements_m), frequency_hz, 1.0)
     if elements_m.ndim != 2 or elements_m.shape[1] != 3 or not np.isfinite(elements_m).all():
-        raise UserError("element positions are rows of three finite numbers, metres")
+        raise UserError("element positions: give rows of three finite numbers, metres")
     places = np.round(elements_m / (SAME_PLACE_WAVELENGTHS * wavelength_m))
     if len(np.unique(places, axis=0)) < len(places):
-        raise UserError("two elements stand at one place")
+        raise UserError("two elements have the same position")
     turned = None
     if outward is not None and element.pattern is not ElementPattern.ISOTROPIC:
         turned = _facing(outward, len(elements_m))
@@ -245,20 +245,20 @@ def listed(
 
 def _wavelength_m(elements: int, frequency_hz: float, spacing: float) -> float:
     if elements < 1 or not (0 < frequency_hz < math.inf and 0 < spacing < math.inf):
-        raise UserError("an array has at least one element, a frequency and a spacing above 0")
+        raise UserError("array: give at least one element, a frequency and a spacing above 0")
     return SPEED_OF_LIGHT_MPS / frequency_hz
 
 
 def _facing(outward: FloatArray, count: int) -> FloatArray:
-    """element_from_array (M, 3, 3): x outward, y level (to the right of outward) where it can be.
+    """element_from_array (M, 3, 3): x outward, y level (to the right of outward) where possible.
 
     An element that faces straight up or down keeps the array's y.
     """
     if outward.shape != (count, 3) or not np.isfinite(outward).all():
-        raise UserError("each element faces one direction of three finite numbers")
+        raise UserError("element directions: give three finite numbers for each element")
     lengths = np.linalg.norm(outward, axis=1)
     if not (lengths > 0).all():
-        raise UserError("the direction in which an element faces has a length above 0")
+        raise UserError("element directions: give vectors with a length above 0")
     x = outward / lengths[:, np.newaxis]
     y = np.stack([-x[:, 1], x[:, 0], np.zeros(count)], axis=1)  # down cross outward
     level = np.linalg.norm(y, axis=1)

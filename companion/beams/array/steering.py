@@ -6,9 +6,9 @@ Angles of a unit direction u in the array frame: azimuth = atan2(u_y, u_x), to t
     a(u)_m = g_m(u) exp(+j 2 pi / wavelength  p_m . u)
 
 with p_m the position of element m and g_m its amplitude (docs/math.md 7). For isotropic elements
-along y this is exp(j 2 pi / wavelength d m sin theta), paper eq. (2). Where elements couple, and
-carry C f when they are fed with f, the vector is C^T a(u): what each channel does. It is 0 where an
-element is dead.
+along y this is exp(j 2 pi / wavelength d m sin theta), paper eq. (2). If elements couple, and
+carry C f when fed with f, the vector is C^T a(u), the response of each channel. It is 0 for a dead
+element.
 """
 
 import math
@@ -21,7 +21,7 @@ from companion.beams.array.geometry import Array
 from companion.values import ComplexArray, FloatArray
 
 POWERS_PAY: Final = 1000
-"""Entries of a steering matrix from which on powers are cheaper than exponentials."""
+"""Entries of a steering matrix from which powers are cheaper than exponentials."""
 
 
 def angles_rad(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -59,9 +59,9 @@ def phase_factors(array: Array, directions: FloatArray) -> ComplexArray:
 
 
 def _on_grid(array: Array, directions: FloatArray, rows: int, columns: int) -> ComplexArray:
-    """Phase factors (M, N) of elements that stand row by row on a grid from the origin.
+    """Phase factors (M, N) of elements row by row on a grid from the origin.
 
-    Powers of the factor from one element to the next are cheaper than so many exponentials.
+    Powers of the factor between neighbours are cheaper than exponentials.
     """
     across = _powers(array, array.elements_m[1 % columns], directions, columns)
     if rows == 1:
@@ -74,7 +74,7 @@ def _on_grid(array: Array, directions: FloatArray, rows: int, columns: int) -> C
 def _powers(array: Array, step_m: FloatArray, directions: FloatArray, count: int) -> ComplexArray:
     """exp(j k step . u) to the powers 0 to ``count`` - 1, (count, N).
 
-    By doubling, so that rounding does not add up along the line.
+    By doubling, so that rounding does not accumulate along the line.
     """
     found: ComplexArray = np.empty((count, len(directions)), dtype=complex)
     found[0] = 1.0
@@ -106,7 +106,7 @@ def pointing_bound_rad(bound_m: float, range_m: float) -> float | None:
     """Largest angle to the true direction, for a position error of at most ``bound_m``.
 
     The angle of the tangent to the ball of the error, asin(bound / range), with the range to the
-    *predicted* position; None where the array lies inside the ball and every direction is possible
+    *predicted* position; None if the array lies inside the ball and every direction is possible
     (docs/math.md 5.3).
     """
     return math.asin(bound_m / range_m) if bound_m < range_m else None

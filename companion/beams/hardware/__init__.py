@@ -1,1 +1,1 @@
-"""Weights for phased-array devices: quantised, calibrated, and written as their files."""
+"""Weights for phased-array devices: quantisation, calibration, and the devices' file formats."""

@@ -1,4 +1,4 @@
-"""Calibration of an array: which element each channel drives, and its errors of phase and gain."""
+"""Calibration of an array: the element of each channel, and its errors of phase and gain."""
 
 import math
 from collections.abc import Iterator, Sequence
@@ -11,20 +11,20 @@ from companion.values import ComplexArray, FloatArray, UserError, shown
 
 CALIBRATION_HEADER: Final = "channel,element,phase_deg,gain_db"
 BOUNDED_HEADER: Final = f"{CALIBRATION_HEADER},phase_error_deg,gain_error_db"
-"""The header of a table that says how far its numbers may be off."""
+"""Header of a table that also states bounds on its errors."""
 GAIN_MAX_DB: Final = 1000.0
-"""Most that a gain may be, either way: beyond it factors are no numbers any more."""
+"""Largest magnitude of a gain: beyond it factors overflow."""
 DIGITS_MAX: Final = 18
-"""Most digits of a whole number: Python reads thousands, and then raises another error."""
-PHASE_MAX_DEG: Final = 1e6  # most that a phase may be, either way, for it to be one still
+"""Most digits of a whole number: for thousands of them, ``int`` raises another error."""
+PHASE_MAX_DEG: Final = 1e6  # largest magnitude of a phase
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:
-    """A measured calibration of an array of M elements.
+    """Measured calibration of an array of M elements.
 
         phase_error_rad, gain_error_db
-                   by element: most that the two are off; empty: not said
+                   by element: bounds on the errors of the two; empty: unknown
 
     A setting is therefore the wanted value less these. Raises ``UserError`` for lengths that
     differ, values that are not finite, or an order that is no permutation.
@@ -41,25 +41,25 @@ class Calibration:
         if not size or len(self.phase_rad) != size or len(self.gain_db) != size:
             raise UserError(
                 f"{len(self.phase_rad)} phases, {len(self.gain_db)} gains and an order of {size}: "
-                "a calibration has one of each for every element"
+                "give one of each for every element"
             )
         if sorted(self.order) != list(range(size)):
-            raise UserError(f"order {self.order} is not each of 0 to {size - 1} once")
+            raise UserError(f"order {self.order} does not contain each of 0 to {size - 1} once")
         errors = (self.phase_error_rad, self.gain_error_db)
         if errors != ((), ()) and [len(found) for found in errors] != [size, size]:
-            raise UserError(f"bounds on errors go with each of {size} elements, or with none")
+            raise UserError(f"bounds on errors: give both for all {size} elements, or none")
         if any(not 0 <= most < math.inf for found in errors for most in found):
-            raise UserError("bounds on errors are finite numbers, 0 or more")
+            raise UserError("bounds on errors: give finite numbers, 0 or more")
         for name, values in (("phase", self.phase_rad), ("gain", self.gain_db)):
             for element, value in enumerate(values):
                 if not math.isfinite(value):
                     raise UserError(f"{name} {value} of element {element} is not finite")
                 if name == "gain" and abs(value) > GAIN_MAX_DB:
-                    raise UserError(f"gain {value:.4g} dB of element {element}: at most 1000")
+                    raise UserError(f"gain {value:.4g} dB of element {element} exceeds 1000 dB")
 
     @classmethod
     def ideal(cls, order: Sequence[int]) -> Self:
-        """A calibration of channels that add nothing, in this order."""
+        """Return a calibration of ideal channels, in this order."""
         return cls(phase_rad=(0.0,) * len(order), gain_db=(0.0,) * len(order), order=tuple(order))
 
     @property
@@ -71,9 +71,9 @@ class Calibration:
 
 
 def channel_error(phase_error_rad: FloatArray, gain_error_db: FloatArray) -> FloatArray:
-    """Most that a channel's factor is off, |actual / wanted - 1|, for bounds on both its errors.
+    """Largest error of a channel's factor, |actual / wanted - 1|, for bounds on phase and gain.
 
-    It is greatest at a corner: the phase at its end, the gain at one of its two.
+    It is largest at a corner: the phase at its end, the gain at one of its two.
     """
     turned = np.exp(1j * np.minimum(phase_error_rad, np.pi))
     ends = [np.abs(10 ** (sign * gain_error_db / 20) * turned - 1) for sign in (1.0, -1.0)]
@@ -82,11 +82,11 @@ def channel_error(phase_error_rad: FloatArray, gain_error_db: FloatArray) -> Flo
 
 
 def parse_calibration(text: str) -> Calibration:
-    """Read CSV with the header ``channel,element,phase_deg,gain_db`` and a line for each channel.
+    """Parse CSV with the header ``channel,element,phase_deg,gain_db`` and a line for each channel.
 
-    ``,phase_error_deg,gain_error_db`` may follow: most that the two are off. Channels and elements
-    count from 0; lines may come in any order. Raises ``UserError`` that names the line and the
-    value.
+    ``,phase_error_deg,gain_error_db`` may follow: bounds on the errors of the two. Channels and
+    elements count from 0; lines may be in any order. Raises ``UserError`` that names the line and
+    the value.
     """
     order: dict[int, int] = {}
     measured: dict[int, tuple[float, ...]] = {}
@@ -95,9 +95,9 @@ def parse_calibration(text: str) -> Calibration:
         channel = whole(number, "channel", found[0], 0, 99_999)
         element = whole(number, "element", found[1], 0, 99_999)
         if channel in order:
-            raise UserError(f"line {number}: channel {channel} stands twice")
+            raise UserError(f"line {number}: channel {channel} appears twice")
         if element in measured:
-            raise UserError(f"line {number}: element {element} stands twice")
+            raise UserError(f"line {number}: element {element} appears twice")
         phase_deg = real(number, "phase_deg", found[2], PHASE_MAX_DEG)
         measured[element] = math.radians(phase_deg), real(number, "gain_db", found[3], GAIN_MAX_DB)
         if bounded:
@@ -108,7 +108,7 @@ def parse_calibration(text: str) -> Calibration:
     for name, seen in (("channel", order), ("element", measured)):
         missing = set(range(len(order))) - set(seen)
         if missing:
-            raise UserError(f"{name} {min(missing)} of {len(order)} has no line")
+            raise UserError(f"{name} {min(missing)} of {len(order)} is missing")
     elements = range(len(order))
     return Calibration(
         phase_rad=tuple(measured[m][0] for m in elements),
@@ -120,7 +120,7 @@ def parse_calibration(text: str) -> Calibration:
 
 
 def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
-    """Line number and fields of each line below ``header``; empty lines are skipped."""
+    """Yield line number and fields of each line below ``header``; skip empty lines."""
     lines = text.splitlines()
     if not lines or lines[0].strip() != header:
         raise UserError(f"line 1: {lines[0] if lines else ''!r} is not the header {header!r}")
@@ -135,7 +135,7 @@ def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def whole(number: int, name: str, field: str, least: int, most: int) -> int:
-    """A whole number of a line. Raises ``UserError`` outside ``least`` to ``most``."""
+    """Parse a whole number of a line. Raises ``UserError`` outside ``least`` to ``most``."""
     digits = field.removeprefix("-")
     is_one = digits.isascii() and digits.isdecimal() and len(digits) <= DIGITS_MAX
     if not is_one or not least <= int(field) <= most:
@@ -145,7 +145,8 @@ def whole(number: int, name: str, field: str, least: int, most: int) -> int:
 
 
 def real(number: int, name: str, field: str, most: float = math.inf) -> float:
-    """A number of a line, within ``most`` either way. Raises ``UserError`` for anything else."""
+    """Parse a number of a line, of magnitude up to ``most``. Raises ``UserError`` for anything
+    else."""
     try:
         value = float(field)
     except ValueError:
@@ -158,5 +159,5 @@ def real(number: int, name: str, field: str, most: float = math.inf) -> float:
 
 
 def is_number(given: object, most: float) -> TypeGuard[float]:
-    """Whether something that was read is a number, within ``most`` either way."""
+    """Return whether a value is a number of magnitude up to ``most``."""
     return type(given) in (int, float) and -most <= given <= most  # type: ignore[operator]

@@ -1,4 +1,4 @@
-"""Calibration as a file has it: one table as CSV, or tables of several frequencies as TOML.
+"""Calibration files: one table as CSV, or tables of several frequencies as TOML.
 
     order = [6, 7, 4, 5, 2, 3, 0, 1]          # element of each channel, from 0
 
@@ -6,12 +6,12 @@
     frequency_hz = 10.0e9
     phase_deg = [0.0, 3.1, ...]               # by channel, as in the CSV
     gain_db = [0.0, -0.4, ...]
-    phase_error_deg = [1.0, 1.2, ...]         # if known, in all tables: most that they are off
+    phase_error_deg = [1.0, 1.2, ...]         # if known, in all tables: bounds on their errors
     gain_error_db = [0.1, 0.1, ...]
 
-Between two frequencies phases are interpolated the shorter way about, and gains in dB; bounds are
-the larger of the two, so what a channel does between them that no table shows is not in them.
-Outside of the tables nothing is known.
+Between two frequencies phases are interpolated the shorter way, and gains in dB; bounds are the
+larger of the two, and do not include deviations between the tables. Frequencies outside of the
+tables are rejected.
 """
 
 import itertools
@@ -32,17 +32,17 @@ from companion.beams.hardware.calibration import (
 from companion.values import FloatArray, UserError, read_toml, shown
 
 FARTHEST_DEG: Final = 90.0
-"""Most that a channel's phase may differ from one frequency to the next, over channel 0's."""
-SAME: Final = 1e-9  # share of a frequency by which it may miss a table's and still be the same
+"""Largest change of a channel's phase, relative to channel 0's, from one frequency to the next."""
+SAME: Final = 1e-9  # relative difference at which a frequency still equals a table's
 FREQUENCY_MAX_HZ: Final = 1e15
-LARGEST: Final = 1 << 22  # most characters of tables: those of 4096 channels at 30 frequencies
+LARGEST: Final = 1 << 22  # most characters of a file: 4096 channels at 30 frequencies
 REQUIRED: Final = ("phase_deg", "gain_db")
 BOUNDS: Final = ("phase_error_deg", "gain_error_db")
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Table:
-    """One table: columns (M,) by channel, bounds None where they are not said."""
+    """One table: columns (M,) by channel, bounds None if unknown."""
 
     frequency_hz: float
     phase_deg: FloatArray
@@ -52,7 +52,7 @@ class _Table:
 
 
 def calibration_at(text: str, frequency_hz: float) -> Calibration:
-    """The calibration for a frequency; that of CSV is for any. Raises ``UserError``."""
+    """Return the calibration for a frequency; CSV applies to any. Raises ``UserError``."""
     if text.lstrip().startswith(CALIBRATION_HEADER):
         return parse_calibration(text)
     order, tables = _read(text)
@@ -60,11 +60,11 @@ def calibration_at(text: str, frequency_hz: float) -> Calibration:
 
 
 def _read(text: str) -> tuple[list[int], list[_Table]]:
-    """Order and tables, by rising frequency."""
+    """Return order and tables, by ascending frequency."""
     try:
         told = read_toml(text, LARGEST)
     except UserError as error:
-        header = f"a CSV file begins with {CALIBRATION_HEADER}"
+        header = f"CSV must begin with {CALIBRATION_HEADER}"
         raise UserError(f"neither calibration as CSV nor as TOML: {error}; {header}") from error
     order, given = told.get("order"), told.get("table")
     if (
@@ -72,18 +72,19 @@ def _read(text: str) -> tuple[list[int], list[_Table]]:
         or not isinstance(order, list)
         or not isinstance(given, list)
     ):
-        raise UserError("TOML of a calibration has an order and a [[table]] for each frequency")
+        raise UserError("calibration in TOML: give an order and a [[table]] for each frequency")
     if not all(type(element) is int for element in order):
-        raise UserError(f"order {shown(order)} is not of whole numbers")
+        raise UserError(f"order {shown(order)} is not a list of whole numbers")
     if sorted(order) != list(range(len(order))) or not order:
-        raise UserError(f"order {shown(order)} is not each of 0 to {max(len(order) - 1, 0)} once")
+        last = max(len(order) - 1, 0)
+        raise UserError(f"order {shown(order)} does not contain each of 0 to {last} once")
     tables = sorted((_table(one, len(order)) for one in given), key=lambda one: one.frequency_hz)
     for low, high in itertools.pairwise(tables):
         where = f"{low.frequency_hz:.9g} Hz and {high.frequency_hz:.9g} Hz"
         if low.frequency_hz == high.frequency_hz:
             raise UserError(f"{low.frequency_hz:.9g} Hz has two tables")
         if (low.phase_error_deg is None) != (high.phase_error_deg is None):
-            raise UserError(f"tables for {where}: bounds are said in all of them, or in none")
+            raise UserError(f"tables for {where}: give bounds in all tables, or in none")
     return order, tables
 
 
@@ -93,10 +94,10 @@ def _table(given: Any, size: int) -> _Table:
     bounded = bool(set(given) & set(BOUNDS))
     names = (*REQUIRED, *(BOUNDS if bounded else ()))
     if set(given) != {"frequency_hz", *names}:
-        raise UserError(f"a table has frequency_hz, {', '.join(names)}, not {', '.join(given)}")
+        raise UserError(f"table has {', '.join(given)}; give frequency_hz, {', '.join(names)}")
     frequency = given["frequency_hz"]
     if not is_number(frequency, FREQUENCY_MAX_HZ) or frequency <= 0:
-        raise UserError(f"frequency_hz = {shown(frequency)} is not above 0, up to 1e15")
+        raise UserError(f"frequency_hz = {shown(frequency)} is not a number from 0 to 1e15")
     columns: dict[str, FloatArray] = {}
     for name in names:
         column = given[name]
@@ -118,11 +119,11 @@ def _table(given: Any, size: int) -> _Table:
 
 def _interpolated(order: list[int], tables: list[_Table], frequency_hz: float) -> Calibration:
     if not tables:
-        raise UserError("there is no [[table]]")
+        raise UserError("[[table]] is missing")
     low = tables[0].frequency_hz * (1 - SAME)
     if not low <= frequency_hz <= tables[-1].frequency_hz * (1 + SAME):
         known = f"{tables[0].frequency_hz:.9g} to {tables[-1].frequency_hz:.9g} Hz"
-        raise UserError(f"{frequency_hz:.9g} Hz is outside of the tables, {known}")
+        raise UserError(f"{frequency_hz:.9g} Hz is outside the range of the tables, {known}")
     for one in tables:
         if abs(one.frequency_hz - frequency_hz) <= SAME * frequency_hz:
             return _calibration(order, one)
@@ -137,8 +138,8 @@ def _between(low: _Table, high: _Table, frequency_hz: float) -> _Table:
     if np.abs(apart_deg).max() > FARTHEST_DEG:
         worst = int(np.abs(apart_deg).argmax())
         raise UserError(
-            f"channel {worst} turns by {apart_deg[worst]:.0f} degrees over channel 0 from"
-            f" {low.frequency_hz:.9g} to {high.frequency_hz:.9g} Hz: too far to interpolate"
+            f"phase of channel {worst} over channel 0 changes by {apart_deg[worst]:.0f} degrees"
+            f" from {low.frequency_hz:.9g} to {high.frequency_hz:.9g} Hz; add a table in between"
         )
     phase_error, gain_error = None, None
     if low.phase_error_deg is not None and high.phase_error_deg is not None:
@@ -155,7 +156,7 @@ def _between(low: _Table, high: _Table, frequency_hz: float) -> _Table:
 
 
 def _calibration(order: list[int], table: _Table) -> Calibration:
-    """The table by element."""
+    """Convert a table to elements."""
 
     def by_element(column: FloatArray | None) -> tuple[float, ...]:
         if column is None:

@@ -1,9 +1,9 @@
-"""Codebooks: which fixed beam serves a direction best, which must be swept, which comes next.
+"""Codebooks: the best fixed beam for a direction, the beams to sweep, and the next best one.
 
-A radio that cannot set its own weights chooses one beam of a codebook by its index. The received
-response is a(u)^T c_k (docs/math.md 7), with c_k of unit power. Where all elements face alike,
-their pattern is a common factor of all beams and does not change which is best; the choice is then
-made without it, also behind the elements.
+A radio that cannot set its own weights selects one beam of a codebook by its index. The received
+response is a(u)^T c_k (docs/math.md 7), with c_k of unit power. If all elements face alike, their
+pattern is a common factor of all beams and does not change the selection, which then ignores it,
+also behind the elements.
 """
 
 import math
@@ -22,13 +22,13 @@ from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, User
 
 LEVELS: Final = 12  # most rounds of splitting cells
 MOST_RESPONSES: Final = 2**18
-"""Beams times cells examined for one question; a round that has begun is finished."""
+"""Limit on beams times cells examined per query; a started round is finished."""
 MOST_TERMS: Final = 2**26
-"""Beams times cells times elements examined for one question: as many responses up to 256
-elements, and fewer of larger arrays."""
+"""Limit on beams times cells times elements per query: it matters for arrays above 256 elements."""
 MOST_TERMS_AT_FIRST: Final = 2**30
-"""The same in the first round, which is finished once begun: half a second. All beams must be swept
-where it would be more."""
+"""The same for the first round, which is finished once started: half a second. Beyond it, all beams
+must be swept.
+"""
 MOST_ENTRIES: Final = 2**22  # elements times beams of a codebook: 64 MB
 BLOCK: Final = 2**19
 """Beams times cells, or beams times directions, computed at once: some tens of megabytes."""
@@ -37,7 +37,7 @@ SAMPLES_PER_BEAM: Final = 4  # samples while a direction crosses one beam
 
 
 WEIGHT_MAX: Final = 1e300
-"""Most that a weight of a list may be; the greatest of a beam is at least one over it."""
+"""Largest weight of a list; the largest weight of each beam is at least one over it."""
 
 
 class CodebookKind(StrEnum):
@@ -62,9 +62,9 @@ class Codebook:
 
 @dataclass(frozen=True, slots=True)
 class NextBest:
-    """The index that is best now, the one that becomes best next, and in how many seconds.
+    """Index that is best now, the one that becomes best next, and in how many seconds.
 
-    ``next_index`` and ``after_s`` are None where no other becomes best within the horizon.
+    ``next_index`` and ``after_s`` are None if no other becomes best within the horizon.
     """
 
     index: int
@@ -73,7 +73,7 @@ class NextBest:
 
 
 def dft(array: Array, oversampling: int = 1) -> Codebook:
-    """The beams of a discrete Fourier transform over a line or a grid of elements.
+    """Beams of a discrete Fourier transform over a line or a grid of elements.
 
     A line of n elements along y has K = n oversampling beams. The k-th steps by -2 pi k / K from
     element to element, and so points where spacing / wavelength times u_y is k/K, or that less a
@@ -84,10 +84,10 @@ def dft(array: Array, oversampling: int = 1) -> Codebook:
     if array.grid is None:
         raise UserError(f"a DFT codebook needs a ULA or a URA, not elements of kind {array.kind}")
     if oversampling < 1:
-        raise UserError(f"oversampling is 1 or more, not {oversampling}")
+        raise UserError(f"oversampling is {oversampling}, allowed: 1 or more")
     entries = array.size * math.prod(_beams(count, oversampling) for count in array.grid)
     if entries > MOST_ENTRIES:
-        raise UserError(f"a codebook of {entries} weights is larger than {MOST_ENTRIES}")
+        raise UserError(f"codebook has {entries} weights, allowed: at most {MOST_ENTRIES}")
     down, across = (_line(count, oversampling) for count in array.grid)
     return Codebook(CodebookKind.DFT, np.kron(down, across).astype(np.complex128))
 
@@ -98,34 +98,34 @@ def _beams(count: int, oversampling: int) -> int:
 
 def _line(count: int, oversampling: int) -> ComplexArray:
     beams = _beams(count, oversampling)
-    # Whole turns are taken out before the sine: exact for any number of elements.
+    # The modulus removes whole turns before the sine: exact for any number of elements.
     steps = np.outer(np.arange(count), np.arange(beams)) % beams
     line: ComplexArray = np.exp(-2j * np.pi * steps / beams) / np.sqrt(count)
     return line
 
 
 def listed(weights: ComplexArray, array: Array) -> Codebook:
-    """A codebook from a list of weights (M, K), each column scaled to unit power.
+    """Codebook from a list of weights (M, K), each column scaled to unit power.
 
-    Raises ``UserError`` where they do not fit the array, are not finite, or a beam is zero.
+    Raises ``UserError`` if they do not match the array, are not finite, or a beam is zero.
     """
     if weights.ndim != 2 or weights.shape[0] != array.size:
-        raise UserError(f"weights of shape {weights.shape} are not for {array.size} elements")
+        raise UserError(f"weights of shape {weights.shape} do not match {array.size} elements")
     if weights.shape[1] == 0:
-        raise UserError("a codebook has at least one beam")
+        raise UserError("codebook has no beam; give at least one")
     if not np.isfinite(weights).all():
-        raise UserError("weights are finite numbers")
+        raise UserError("weights must be finite")
     silent = np.flatnonzero(~weights.any(axis=0))
     if silent.size:
         raise UserError(f"column {silent[0]} of the weights is zero")
     most = np.maximum(np.abs(weights.real), np.abs(weights.imag)).max(axis=0)
     if most.max() > WEIGHT_MAX or most.min() < 1 / WEIGHT_MAX:
-        raise UserError(f"the greatest weight of each beam is within {WEIGHT_MAX:.0e}")
+        raise UserError(f"largest weight of a beam is not between 1e-300 and {WEIGHT_MAX:.0e}")
     return Codebook(CodebookKind.LISTED, cone.unit_power(array, weights))
 
 
 def best(codebook: Codebook, array: Array, directions: FloatArray) -> tuple[IntArray, FloatArray]:
-    """The best beam for each unit direction (N, 3), and its gain.
+    """Best beam for each unit direction (N, 3), and its gain.
 
     Returns indices (N,), the lowest of equal ones, and array gains |a^T c|^2 (N,), linear, element
     pattern included.
@@ -146,7 +146,7 @@ def _best(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[IntArray,
 
 
 def _gains(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gains (K, N) of all beams towards unit directions, and the factor (N,) that they share."""
+    """Gains (K, N) of all beams towards unit directions, and their common factor (N,)."""
     if cone.faces_apart(array) or array.live is not None or array.coupling is not None:
         power = np.abs(codebook.weights.T @ steering.steering_matrix(array, unit)) ** 2
         return power, np.ones(len(unit))
@@ -158,7 +158,8 @@ def _gains(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[FloatArr
 def strongest_first(
     codebook: Codebook, array: Array, direction: FloatArray, indices: IntArray
 ) -> IntArray:
-    """Indices by their gain towards a unit direction (3,), the greatest first, lower of equals."""
+    """Sort indices by their gain towards a unit direction (3,), descending; the lower of equals
+    first."""
     unit = cone.unit_directions(direction[np.newaxis], np.zeros(1))
     power = _gains(codebook, array, unit)[0][indices, 0]
     ordered: IntArray = indices[np.argsort(-power, kind="stable")]
@@ -175,10 +176,10 @@ def candidates(
     """Indices, ascending, of the beams that must be swept to find the best one.
 
     They include the best beam for every true direction within the bound of the unit direction (3,);
-    all beams where there is no bound (None). This is proven: a beam is left out of a cell only if
-    its largest response there is less than the least of another. Cells are split while they hold a
-    beam that has not been seen to be best somewhere, until the work is spent: ``share`` of the most
-    that one question may take.
+    all beams without a bound (None). This is proven: a beam is excluded from a cell only if its
+    largest response there is less than the least of another. Cells are split while they contain a
+    beam that is not known to be best somewhere, until the work limit is reached: ``share`` of that
+    of one query.
     """
     if pointing_bound_rad is None:
         return np.arange(codebook.size)
@@ -238,18 +239,18 @@ def next_best(
     horizon_s: float,
     step_s: float,
 ) -> NextBest:
-    """The best beam now, and the one that becomes best next, to a millisecond.
+    """Best beam now, and the one that becomes best next, to a millisecond.
 
         directions_at  unit directions (T, 3) for seconds from now (T,)
-        horizon_s      how far ahead to look
+        horizon_s      how far ahead to search
         step_s         sampling step; the first change between two samples is bisected
 
-    A beam that is best for less than a step can be missed; where several changes fall into one
-    step, one of them is found. ``sampling_step_s`` is a step at which neither happens in practice.
-    Raises ``UserError`` for a horizon or a step not above 0.
+    A beam that is best for less than a step can be missed; if several changes fall into one step,
+    one of them is found. With ``sampling_step_s`` neither happens in practice. Raises ``UserError``
+    for a horizon or a step not above 0.
     """
     if not (0 < horizon_s < math.inf and step_s > 0):
-        raise UserError(f"horizon and step are above 0 s, not {horizon_s:g} s and {step_s:g} s")
+        raise UserError(f"horizon {horizon_s:g} s and step {step_s:g} s: give values above 0 s")
 
     def best_at(times_s: FloatArray) -> IntArray:
         return best(codebook, array, directions_at(times_s))[0]
@@ -273,11 +274,11 @@ def next_best(
 
 
 def sampling_step_s(codebook: Codebook, array: Array, rate_radps: float) -> float | None:
-    """A step for ``next_best``: a quarter of the time in which a direction crosses one beam.
+    """Step for ``next_best``: a quarter of the time in which a direction crosses one beam.
 
-    ``rate_radps`` is the direction's angular rate. A beam is taken to be as wide as wavelength /
-    extent, or less where there are more beams than elements. None where the direction does not turn
-    or the array has no extent.
+    ``rate_radps`` is the direction's angular rate. A beam is assumed as wide as wavelength /
+    extent, or less if there are more beams than elements. None if the direction is constant or the
+    array has no extent.
     """
     centred = array.centred_m
     extent_m = 2 * float(np.sqrt(np.einsum("mk,mk->m", centred, centred).max()))

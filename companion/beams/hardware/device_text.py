@@ -1,7 +1,7 @@
-"""Tables of settings as the text that each device's own tools read.
+"""Tables of settings in the text formats of the devices' own tools.
 
-Settings come as codes (K, M, 2) of K beams and M channels, in the order of the channels, as
-``companion.beams.hardware.devices`` has them.
+Settings come as codes (K, M, 2) of K beams and M channels, in the order of the channels, as in
+``companion.beams.hardware.devices``.
 """
 
 from collections.abc import Sequence
@@ -29,9 +29,9 @@ TMYTEK_HEADER: Final = "Mode,BeamID,BeamType,beam_db,beam_theta,beam_phi,ch,ch_s
 
 
 def check_name(uav: str) -> str:
-    """The name, if it can stand in a line of fields. Raises ``UserError`` if not."""
+    """Return the name if it is valid in a line of fields. Raises ``UserError`` if not."""
     if not uav or uav != uav.strip() or not uav.isprintable() or set(uav) & set(',"'):
-        raise UserError(f"UAV {uav!r}: a name has no comma, quote, line break or outer blank")
+        raise UserError(f"UAV {uav!r}: name has a comma, quote, line break or outer blank")
     return uav
 
 
@@ -59,8 +59,8 @@ def write_adar1000(uavs: Sequence[str], codes: IntArray, order: Sequence[int]) -
 def write_tmytek(codes: IntArray, gains: UnitGains) -> str:
     """CSV for TLKCore with a line for each beam and channel (BeamType 1); beams count from 1.
 
-    A channel that is off keeps a gain of the unit, the lowest: its board's others are judged by it.
-    The format has no room for names.
+    A channel that is off gets the lowest gain of the unit, because TLKCore checks the differences
+    within its board. The format has no field for names.
     """
     lowest = round(gains.range_db / TMYTEK_STEP_DB)
     lines = [TMYTEK_HEADER]
@@ -73,11 +73,11 @@ def write_tmytek(codes: IntArray, gains: UnitGains) -> str:
 
 
 def write_sivers(uavs: Sequence[str], codes: IntArray, frequency_hz: float) -> str:
-    """An Eder beam book of one table: 64 rows of Q and I bytes, antenna 15 first.
+    """Eder beam book of one table: 64 rows of Q and I bytes, antenna 15 first.
 
-    The maker's loader packs each pair to Q << 6 | I. It looks for ``START_TABLE FREQ:`` (GHz) and
-    skips what comes before, where the names of the rows are written. Rows without a beam are
-    silent.
+    The manufacturer's loader packs each pair to Q << 6 | I. It searches for ``START_TABLE FREQ:``
+    (GHz) and skips the text before, where the names of the rows are written. Rows without a beam
+    are silent.
     """
     if not np.isfinite(frequency_hz) or frequency_hz <= 0:
         raise UserError(f"frequency {frequency_hz} Hz is not above 0")

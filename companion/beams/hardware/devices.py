@@ -1,9 +1,8 @@
-"""Phased-array devices: what they can be set to, and what they cannot do.
+"""Phased-array devices: their settings and limits.
 
-Each device's comment says what was found in public, and what was not. Conventions: channels and
-elements are numbered from 0 in values; a positive phase is a factor exp(+j phase), as in a steering
-vector; full gain is 0 dB, and every beam has its strongest element there. See docs/field-notes.md
-5.
+Each device's comment states what is public, and what is not. Conventions: channels and elements are
+numbered from 0 in values; a positive phase is a factor exp(+j phase), as in a steering vector; full
+gain is 0 dB, and every beam has its strongest element there. See docs/field-notes.md 5.
 """
 
 import math
@@ -25,9 +24,9 @@ class Beamformer(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceLimits:
-    """What a device can hold and do.
+    """Limits of a device.
 
-    off_boresight_rad  largest angle off boresight to which it steers; None: not stated
+    off_boresight_rad  largest steering angle off boresight; None: not stated
     """
 
     elements: int | None  # number of elements; None: any
@@ -41,7 +40,7 @@ class DeviceLimits:
 # Data sheet: four channels a chip, 360 degrees of phase at 2.8 degrees, at least 31 dB of gain at
 # 0.5 dB or finer, memory for 121 beam positions. Linux driver (iio/beamformer/adar1000): 128 phases
 # of 2.8125 degrees, RAM positions 0 to 120, gain register bits 6-0 the VGA and bit 7 set to bypass
-# the attenuator. The law from gain code to dB is in neither. Taken here: amplitude proportional to
+# the attenuator. Neither gives the law from gain code to dB. Assumed: amplitude proportional to
 # the code (pyadi-iio scales codes by amplitude ratios when it calibrates a CN0566), an attenuator
 # of 15 dB (other public firmware for the chip), and codes down to 20: 16 dB and 15 dB make
 # the 31 dB of the data sheet, and the coarsest step is 0.43 dB, below its 0.5 dB. Code 0 with the
@@ -75,7 +74,7 @@ _VM_Q: Final = bytes.fromhex(
 
 
 def vector_modulator(phase_code: int) -> tuple[int, int]:
-    """I and Q register bytes of the ADAR1000 for a phase code of 0 to 127."""
+    """Return I and Q register bytes of the ADAR1000 for a phase code of 0 to 127."""
     half_turn, code = divmod(phase_code, 64)
     i, q = _VM_I[code], _VM_Q[code]
     return (i ^ 0x20, q ^ 0x20 if q & 0x1F else q) if half_turn else (i, q)
@@ -83,21 +82,21 @@ def vector_modulator(phase_code: int) -> tuple[int, int]:
 
 # --- TMYTEK BBox ------------------------------------------------------------------------------
 #
-# TLKCore examples of the maker: the columns and their meaning, 64 beams, theta 0 to 45 and phi 0 to
-# 359 whole degrees, channels from 1 (16 of them in the 4 x 4 antenna kits, which state -45 to 45
-# degrees), ch_sw 0 on and 1 off, ch_deg whole degrees, ch_db in half decibels. What gains a unit
-# can have lies in its own calibration tables: ``unit_gains`` reads what it says of them. Theta is
-# the angle off boresight and phi the angle about it, counted here from the array's right (y)
-# towards up (-z); only theta matters to tables of channels.
+# TLKCore examples of the manufacturer: the columns and their meaning, 64 beams, theta 0 to 45 and
+# phi 0 to 359 whole degrees, channels from 1 (16 of them in the 4 x 4 antenna kits, which state -45
+# to 45 degrees), ch_sw 0 on and 1 off, ch_deg whole degrees, ch_db in half decibels. The possible
+# gains of a unit are in its own calibration tables, which ``unit_gains`` reads. Theta is the angle
+# off boresight and phi the angle about it, counted here from the array's right (y) towards up (-z);
+# only theta matters to tables of channels.
 
 TMYTEK_CHANNELS: Final = 16
 TMYTEK_STEP_DB: Final = 0.5
-TMYTEK_RANGE_DB: Final = 7.5  # what the channels of the maker's example span
+TMYTEK_RANGE_DB: Final = 7.5  # gain range of the channels in the manufacturer's example
 TMYTEK_SETTINGS: Final = stepped(360, TMYTEK_STEP_DB, TMYTEK_RANGE_DB, off=True)
 
 
 class Mode(StrEnum):
-    """Use of a TMYTEK beam: transmission and reception have tables of their own."""
+    """Use of a TMYTEK beam: transmission and reception have separate tables."""
 
     TX = "TX"
     RX = "RX"
@@ -105,10 +104,10 @@ class Mode(StrEnum):
 
 # --- Sivers EVK (Eder) ------------------------------------------------------------------------
 #
-# The maker's control scripts for the EVK: a table of 64 rows by 16 antennas, each word 6 bits of Q
-# above 6 bits of I, antenna 15 at the lowest address and first in the file. In the same scripts a
-# path is silenced by 31 in both, and a circle is driven by 31 times cosine and sine plus 31: the
-# codes are offset by 31 (0 is -31, 62 is +31, 63 is not used). A limit of steering is not stated.
+# The manufacturer's control scripts for the EVK: a table of 64 rows by 16 antennas, each word 6
+# bits of Q above 6 bits of I, antenna 15 at the lowest address and first in the file. In the same
+# scripts a path is silenced by 31 in both, and a circle is driven by 31 times cosine and sine plus
+# 31: the codes are offset by 31 (0 is -31, 62 is +31, 63 is not used). No steering limit is stated.
 
 SIVERS_ANTENNAS: Final = 16
 SIVERS_ROWS: Final = 64

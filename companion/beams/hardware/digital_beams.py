@@ -1,10 +1,11 @@
-"""Stored beams as a digital beam table: what a base station with a port for each element loads.
+"""Stored beams as a digital beam table, for a base station with a port per element.
 
 OpenAirInterface reads them from CSV (``dbt_file``, with ``bf_method = "predefined"``): a header,
-then a line a beam with its id and a complex weight for each port. It multiplies real and imaginary
-parts by 32767 and rounds, as the PHY API's table holds them (5G FAPI, SCF 222, digital beam table:
-16 bits each, Q15). What is written here are those integers over 32767, so that its rounding changes
-nothing. A port's samples are multiplied by its weight: no conjugate, as everywhere here.
+then a line per beam with its id and a complex weight for each port. It multiplies real and
+imaginary parts by 32767 and rounds, as in the PHY API's table (5G FAPI, SCF 222, digital beam
+table: 16 bits each, Q15). The values written here are those integers over 32767, so that its
+rounding changes nothing. A port's samples are multiplied by its weight: no conjugate, as everywhere
+here.
 """
 
 from typing import Final
@@ -22,12 +23,12 @@ MOST_BEAMS: Final = 1 << 16  # ids of beams have 16 bits
 def q15(codebook: Codebook, calibration: Calibration) -> IntArray:
     """Real and imaginary parts (K, M, 2) by beam and port, as 16-bit integers.
 
-    Ports are the calibration's channels, and what they add is taken off. Beams are of unit power,
-    unless a channel is so weak that all must be turned down to stay within the range. Raises
-    ``UserError`` for more beams than ids.
+    Ports are the calibration's channels, and their errors are compensated. Beams have unit power,
+    unless a weak channel requires a reduction of all to stay within the range. Raises ``UserError``
+    for more beams than ids.
     """
     if codebook.size > MOST_BEAMS:
-        raise UserError(f"{codebook.size} beams: a digital beam table has at most {MOST_BEAMS}")
+        raise UserError(f"{codebook.size} beams exceed a digital beam table's {MOST_BEAMS}")
     ports = (codebook.weights / calibration.factors[:, np.newaxis])[list(calibration.order)]
     parts = np.stack([ports.real, ports.imag], axis=-1).transpose(1, 0, 2)
     parts /= max(1.0, float(np.abs(parts).max()))
@@ -36,7 +37,7 @@ def q15(codebook: Codebook, calibration: Calibration) -> IntArray:
 
 
 def write_oai_dbt(codebook: Codebook, calibration: Calibration) -> str:
-    """The CSV: ids are the indices of the codebook, as in the API."""
+    """CSV: ids are the indices of the codebook, as in the API."""
     table = q15(codebook, calibration)
     lines = [",".join(["beam_id", *(f"txru{port}" for port in range(table.shape[1]))])]
     for beam, row in enumerate((table / FULL_SCALE).tolist()):

@@ -1,13 +1,12 @@
-"""Calibration from measured responses: one source at known directions, each channel by itself.
+"""Calibration from measured responses: one source at known directions, each channel alone.
 
-In direction k channel c, which drives element m, answers
+In direction k channel c, which drives element m, responds with
 
     y_kc = s_k h_m a_m(u_k) + noise
 
-with a the steering vector, h_m what the channel adds, and s_k the source, known neither in phase
-nor in level. With z = y / a the best s and h in the sense of least squares are the first singular
-vectors of z (Eckart and Young). Only ratios of h can be told: phases are over that of element 0,
-gains over the mean in dB.
+with a the steering vector, h_m the channel's factor, and s_k the source, of unknown phase and
+level. With z = y / a the least-squares s and h are the first singular vectors of z (Eckart and
+Young). Only ratios of h can be measured: phases are relative to element 0, gains to the mean in dB.
 """
 
 from collections.abc import Sequence
@@ -35,7 +34,7 @@ MEASURED_HEADER: Final = "azimuth_deg,elevation_deg,channel,phase_deg,gain_db"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelResponses:
-    """Responses (K, M) of channels by themselves to a source at unit directions (K, 3)."""
+    """Responses (K, M) of single channels to a source at unit directions (K, 3)."""
 
     directions: FloatArray
     responses: ComplexArray
@@ -43,7 +42,7 @@ class ChannelResponses:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FittedCalibration:
-    """A calibration with bounds, and what it leaves.
+    """Calibration with bounds, and its residual errors.
 
     phase_deg, gain_db  largest errors that remain, of all channels and directions
     """
@@ -51,13 +50,13 @@ class FittedCalibration:
     calibration: Calibration
     phase_deg: float
     gain_db: float
-    cost_db: float  # most that a matched beam's guarantee loses to them
+    cost_db: float  # largest loss of a matched beam's guaranteed gain by them
 
 
 def parse_responses(text: str) -> ChannelResponses:
-    """Read CSV with the header ``MEASURED_HEADER``: a line for each direction and channel.
+    """Parse CSV with the header ``MEASURED_HEADER``: a line for each direction and channel.
 
-    Raises ``UserError`` that names the line, or what is missing.
+    Raises ``UserError`` that names the line, or the missing channel.
     """
     found: dict[tuple[float, float], dict[int, complex]] = {}
     for number, row in fields(text, MEASURED_HEADER):
@@ -68,7 +67,7 @@ def parse_responses(text: str) -> ChannelResponses:
         gain_db = real(number, "gain_db", row[4], GAIN_MAX_DB)
         channels = found.setdefault(towards, {})
         if channel in channels:
-            raise UserError(f"line {number}: channel {channel} stands twice at {towards}")
+            raise UserError(f"line {number}: channel {channel} appears twice at {towards}")
         channels[channel] = 10 ** (gain_db / 20) * np.exp(1j * np.radians(phase_deg))
     size = max((len(channels) for channels in found.values()), default=0)
     for towards, channels in found.items():
@@ -76,31 +75,31 @@ def parse_responses(text: str) -> ChannelResponses:
         if missing:
             raise UserError(f"channel {min(missing)} of {size} has no response at {towards}")
     if not found:
-        raise UserError("there is no response at all")
+        raise UserError("file has no responses")
     angles = np.radians(np.array(list(found)))
     responses = np.array([[one[c] for c in range(size)] for one in found.values()])
     return ChannelResponses(unit_directions(angles[:, 0], angles[:, 1]), responses)
 
 
 def fitted(measured: ChannelResponses, array: Array, order: Sequence[int]) -> FittedCalibration:
-    """The calibration nearest to the responses; ``order`` is the element of each channel.
+    """Fit a calibration to the responses; ``order`` is the element of each channel.
 
-    Its bounds are the largest errors that remain for each channel: of what was measured, no more.
-    Raises ``UserError`` where responses do not fit the array.
+    Its bounds are the largest residual errors of each channel: they cover only what was measured.
+    Raises ``UserError`` if the responses do not match the array.
     """
     responses, places = measured.responses, list(order)
     if responses.shape[1] != array.size:
         raise UserError(f"{responses.shape[1]} channels for {array.size} elements")
     if len(responses) < 2:
-        raise UserError("one direction shows no error: measure two or more")
+        raise UserError("one direction cannot reveal errors; measure two or more")
     steering = steering_matrix(array, measured.directions).T[:, places]
     if not steering.all():
-        raise UserError("an element answers nothing in one of these directions, or is dead")
+        raise UserError("an element is dead, or does not radiate in one of these directions")
     seen = responses / steering
     u, s, vh = np.linalg.svd(seen, full_matrices=False)
     source, channel = u[:, 0] * s[0], vh[0]
     if not channel.all() or not source.all():
-        raise UserError("a channel, or the source in one direction, answered nothing")
+        raise UserError("no response from a channel, or from the source in one direction")
     off = seen / np.outer(source, channel)
     factors = np.empty(array.size, dtype=complex)
     factors[places] = channel
@@ -125,7 +124,7 @@ def fitted(measured: ChannelResponses, array: Array, order: Sequence[int]) -> Fi
 
 
 def as_text(calibration: Calibration) -> str:
-    """The CSV that ``parse_calibration`` reads, with bounds."""
+    """CSV that ``parse_calibration`` reads, with bounds."""
     errors = calibration.phase_error_rad, calibration.gain_error_db
     phase_off, gain_off = (found or (0.0,) * len(calibration.order) for found in errors)
     lines = [BOUNDED_HEADER]

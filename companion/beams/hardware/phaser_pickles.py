@@ -1,9 +1,9 @@
-"""The calibration that a CN0566 Phaser keeps: pickles of numbers, read without trusting them.
+"""Calibration of a CN0566 Phaser: untrusted pickles of numbers, read safely.
 
 ``adi.CN0566`` (pyadi-iio) adds ``phase_cal_val.pkl``, degrees, to each element's wanted phase, and
-multiplies its gain code by ``gain_cal_val.pkl``; both are lists of eight. What its channels add is
-therefore the opposite. A pickle may name any function to be called: here only numbers, lists and
-numpy's scalars are let through.
+multiplies its gain code by ``gain_cal_val.pkl``; both are lists of eight. The channel errors are
+therefore the opposite. A pickle may call any function: here only numbers, lists and numpy's scalars
+are allowed.
 """
 
 import io
@@ -23,7 +23,8 @@ _SCALARS: Final = {"f8": "d", "f4": "f", "i8": "q", "i4": "i"}
 
 
 def calibration(phases: bytes, gains: bytes) -> Calibration:
-    """The calibration in the two pickles. Raises ``UserError`` for what is not eight numbers."""
+    """Return the calibration in the two pickles. Raises ``UserError`` unless each has eight
+    numbers."""
     added_deg = numbers("phase calibration", phases)
     factors = numbers("gain calibration", gains)
     if not all(factor > 0 for factor in factors):
@@ -36,14 +37,14 @@ def calibration(phases: bytes, gains: bytes) -> Calibration:
 
 
 def numbers(what: str, data: bytes) -> list[float]:
-    """The eight numbers in a pickle. Raises ``UserError`` for anything else."""
+    """Return the eight numbers in a pickle. Raises ``UserError`` for anything else."""
     if len(data) > LARGEST_BYTES:
         raise UserError(f"{what}: more than a list of {ELEMENTS} numbers")
     try:
         found = _Numbers(io.BytesIO(data)).load()
     except UserError:
         raise
-    except Exception as error:  # a damaged pickle raises whatever it likes
+    except Exception as error:  # a damaged pickle can raise anything
         raise UserError(f"{what}: not a pickle of numbers: {error}") from error
     good = isinstance(found, list) and len(found) == ELEMENTS
     if not good or not all(is_number(one, PHASE_MAX_DEG) for one in found):
@@ -54,10 +55,10 @@ def numbers(what: str, data: bytes) -> list[float]:
 
 
 class _Numbers(pickle.Unpickler):
-    """Lets numbers through, and numpy's scalars by functions of our own."""
+    """Unpickler that allows only numbers, and numpy's scalars by its own functions."""
 
     def find_class(self, module: str, name: str) -> Any:
-        """Stand-ins for what numpy's scalars need; nothing else."""
+        """Return stand-ins for the names that numpy's scalars need; reject all others."""
         if module in ("numpy.core.multiarray", "numpy._core.multiarray") and name == "scalar":
             return _scalar
         if (module, name) == ("numpy", "dtype"):
@@ -66,13 +67,13 @@ class _Numbers(pickle.Unpickler):
 
 
 class _Kind:
-    """A kind of number by its name; the state that numpy gives it says only its byte order."""
+    """Type of number by its name; numpy's state for it only gives the byte order."""
 
     def __init__(self, name: object, *_: object) -> None:
         self.name = name
 
     def __setstate__(self, state: object) -> None:
-        """Refuse numbers that are not little-endian."""
+        """Reject numbers that are not little-endian."""
         if not (isinstance(state, tuple) and len(state) > 1 and state[1] == "<"):
             raise UserError("numbers of an unknown byte order")
 
@@ -80,6 +81,6 @@ class _Kind:
 def _scalar(kind: object, data: object) -> float:
     letter = _SCALARS.get(str(kind.name)) if isinstance(kind, _Kind) else None
     if letter is None or not isinstance(data, bytes):
-        raise UserError("the pickle holds what is not a number")
+        raise UserError("the pickle contains a value that is not a number")
     (value,) = struct.unpack("<" + letter, data)
     return float(value)

@@ -1,28 +1,28 @@
-"""Complex weights to the settings that phase shifters and attenuators have.
+"""Quantisation of complex weights to the settings of phase shifters and attenuators.
 
-The cost of settings that radiate g (M,) where f (M,) is wanted is
+The cost of settings that radiate g (M,) if f (M,) is wanted is
 
     J = min over complex beta of |f - beta g|^2 + sum_j w_j |a_j^T (f - beta g)|^2
 
 For a half-wave line the first term is the mean square error of the pattern over one period of
-sin(angle) (Parseval). The second counts the response in given directions again, where a null is to
-stay deep or a gain to stay. beta is free because the level and the phase of a whole beam are set
-elsewhere. With K = I + sum_j w_j a_j* a_j^T (Hermitian, positive definite),
+sin(angle) (Parseval). The second weights the response in given directions, to preserve a deep null
+or a gain. beta is free because the level and the phase of a whole beam are set elsewhere. With
+K = I + sum_j w_j a_j* a_j^T (Hermitian, positive definite),
 
     J = f^H K f - |g^H K f|^2 / (g^H K g)
 
-so the best settings have the largest second term, which is what the search compares. The phases of
-all elements may turn together, so the first step rounds at several common rotations. From the best
-few of them, coordinate descent takes one element after the other to its best neighbouring setting
+so the best settings have the largest second term, which the search compares. The phases of all
+elements may rotate together, so the first step rounds at several common rotations. From the best
+few of them, coordinate descent moves one element after the other to its best neighbouring setting
 until a whole sweep changes nothing. Every step lowers J, and rounding without a rotation is among
-those tried: the result is never worse than plain rounding. Nothing is random: equal input gives
+the candidates: the result is never worse than plain rounding. Nothing is random: equal input gives
 equal codes.
 
 The cost of plain rounding for a matched beam: phase errors uniform over a step of 2 pi / n leave
 the amplitude sinc(1/n) in the mean, a loss of -20 log10(sinc(1/n)) dB with sinc(x) = sin(pi x)/(pi
 x) (docs/math.md 7; R. J. Mailloux, Phased Array Antenna Handbook, quantisation of phase). Hardware
 without gain control radiates every element at full gain: a taper, or the unequal amplitudes of
-nulls, are then lost except for what the phases can give back.
+nulls, are then lost, except for what the phases can recover.
 
 Over 300 lines: one search: its steps, its metric, its descent.
 """
@@ -37,12 +37,12 @@ from companion.values import ComplexArray, FloatArray, IntArray
 ROTATIONS: Final = 16  # common rotations that are tried, over one step of phase
 STARTS: Final = 4  # best rotations from which the descent starts
 SWEEPS: Final = 100
-"""Most sweeps of the coordinate descent; it ends by itself, mostly after three to eight."""
+"""Most sweeps of the coordinate descent; it mostly ends after three to eight."""
 REACH: Final = 2  # steps of phase, gain, I or Q that one move may take
 NEAR: Final = np.array([(i, j) for i in range(-REACH, REACH + 1) for j in range(-REACH, REACH + 1)])
 """All moves within ``REACH``, as pairs of steps."""
 EMPHASIS: Final = 1.0
-"""Weight w_j where the elements of a_j have amplitude 1.
+"""Weight w_j if the elements of a_j have amplitude 1.
 
 At 1 a direction counts as much as the whole pattern. More deepens nulls by less than a decibel and
 costs gain.
@@ -50,9 +50,9 @@ costs gain.
 
 
 class SettableStates(Protocol):
-    """The settings one element can take: codes of two integers each, full gain at amplitude 1.
+    """Settings of one element: codes of two integers each, full gain at amplitude 1.
 
-    period_rad  the turn that maps the settings onto themselves
+    period_rad  the rotation that maps the settings onto themselves
     values      complex factors (...) of codes (..., 2)
     nearest     codes (..., 2) nearest to wanted factors (...) of amplitude at most 1
     around      codes (S, n, 2) that are tried from each code (S, 2)
@@ -67,11 +67,12 @@ class SettableStates(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Resolution:
-    """A phase shifter and a gain control: codes are (phase, gain).
+    """Phase shifter and gain control: codes are (phase, gain).
 
-    Phase code k turns by exp(+j 2 pi k / ``phase_steps``); b bits are 2**b steps. Gain code i has
-    amplitude ``levels[i]``, falling from 1, full gain; a last level of 0 is an element switched
-    off; (1.0,) is hardware without gain control. Raises ``ValueError`` for other steps or levels.
+    Phase code k is a factor exp(+j 2 pi k / ``phase_steps``); b bits are 2**b steps. Gain code i
+    has amplitude ``levels[i]``, decreasing from 1, full gain; a last level of 0 is an element
+    switched off; (1.0,) is hardware without gain control. Raises ``ValueError`` for other steps or
+    levels.
     """
 
     phase_steps: int
@@ -79,10 +80,10 @@ class Resolution:
 
     def __post_init__(self) -> None:
         if self.phase_steps < 2:
-            raise ValueError(f"{self.phase_steps} steps of phase: at least 2")
+            raise ValueError(f"{self.phase_steps} phase steps; give at least 2")
         falling = all(a > b for a, b in zip(self.levels, self.levels[1:], strict=False))
         if not self.levels or self.levels[0] != 1.0 or not falling or self.levels[-1] < 0:
-            raise ValueError(f"levels {self.levels} do not fall from 1 and stay at 0 or more")
+            raise ValueError(f"levels {self.levels} must decrease from 1 and be 0 or more")
 
     @property
     def period_rad(self) -> float:
@@ -95,10 +96,10 @@ class Resolution:
         return factors
 
     def nearest(self, wanted: ComplexArray) -> IntArray:
-        """Codes (..., 2): phase and gain, each rounded by itself.
+        """Codes (..., 2): phase and gain, each rounded separately.
 
-        An amplitude below the range goes to the lowest level or off, whichever is nearer. An
-        amplitude of 1 stays at full gain, however far off its phase is.
+        An amplitude below the range becomes the lowest level or off, whichever is nearer. An
+        amplitude of 1 stays at full gain, whatever its phase error.
         """
         phase = np.rint(np.angle(wanted) / self.period_rad).astype(np.int64)
         rising = np.asarray(self.levels)[::-1]
@@ -122,7 +123,7 @@ def stepped(
 ) -> Resolution:
     """Equal steps of gain in dB from 0 down to ``-gain_range_db`` (None: no gain control).
 
-    ``off``: an element can be switched off. Raises ``ValueError`` for a step or range out of order.
+    ``off``: an element can be switched off. Raises ``ValueError`` for an invalid step or range.
     """
     levels = [1.0]
     if gain_step_db is not None:
@@ -138,10 +139,10 @@ def stepped(
 
 @dataclass(frozen=True, slots=True)
 class Quadrature:
-    """A vector modulator: codes are (I, Q), integers from -``peak`` to ``peak``.
+    """Vector modulator: codes are (I, Q), integers from -``peak`` to ``peak``.
 
-    The factor is (I + jQ) / ``peak``, so that full gain is possible at every phase; no code is
-    louder than half a step above that. I = Q = 0 is off.
+    The factor is (I + jQ) / ``peak``, so that full gain is possible at every phase; no code is more
+    than half a step above that. I = Q = 0 is off.
     """
 
     peak: int
@@ -156,7 +157,7 @@ class Quadrature:
         return factors
 
     def nearest(self, wanted: ComplexArray) -> IntArray:
-        """Codes (..., 2): I and Q, each rounded by itself."""
+        """Codes (..., 2): I and Q, each rounded separately."""
         both = np.stack([wanted.real, wanted.imag], axis=-1) * self.peak
         return np.clip(np.rint(both), -self.peak, self.peak).astype(np.int64)
 
@@ -170,7 +171,7 @@ class Quadrature:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantised:
-    """The settings of one beam.
+    """Settings of one beam.
 
     weights  (M,) that they radiate, channel factors included; the strongest element is at full
              gain
@@ -178,7 +179,7 @@ class Quantised:
 
     codes: IntArray  # (M, 2), as the settings define them
     weights: ComplexArray
-    cost: float  # J over its value for weights that radiate nothing: 0 is exact, 1 worthless
+    cost: float  # J over its value for zero weights: 0 is exact, 1 useless
 
 
 def quantise(
@@ -188,17 +189,18 @@ def quantise(
     channel: ComplexArray | None = None,
     emphasis: float = EMPHASIS,
 ) -> Quantised:
-    """The settings whose pattern is nearest to that of ``weights`` (M,).
+    """Return the settings whose pattern is nearest to that of ``weights`` (M,).
 
-        settings  what one element can be set to
-        towards   (M, J), steering vectors of the directions that count again, such as the beam's
-                  own UAV and the nulled ones
-        channel   (M,), factor that each channel adds to its setting; None: 1
-        emphasis  w_j where the elements of a_j have amplitude 1; in general w_j = emphasis M /
+        settings  possible settings of one element
+        towards   (M, J), steering vectors of emphasised directions, such as the beam's own UAV and
+                  the nulled ones
+        channel   (M,), factor that each channel applies to its setting; None: 1
+        emphasis  w_j if the elements of a_j have amplitude 1; in general w_j = emphasis M /
                   |a_j|^2
 
-    The element that needs the most gets full gain and keeps it. Raises ``ValueError`` for weights
-    that are all zero, for channels that are zero, and for shapes that do not fit.
+    The element with the largest required amplitude gets full gain and keeps it. Raises
+    ``ValueError`` for weights that are all zero, for channels that are zero, and for shapes that do
+    not match.
     """
     factors = np.ones(len(weights), dtype=complex) if channel is None else channel
     metric = _metric(len(weights), towards, emphasis)
@@ -216,7 +218,7 @@ def quantise(
 
 
 def _wanted(weights: ComplexArray, factors: ComplexArray) -> ComplexArray:
-    """Factors wanted of the settings: weights less the channels, the strongest of amplitude 1."""
+    """Factors wanted of the settings: weights over channels, the strongest of amplitude 1."""
     if weights.ndim != 1 or factors.shape != weights.shape:
         raise ValueError(f"weights {weights.shape} and channels {factors.shape}: both must be (M,)")
     if not (np.isfinite(weights).all() and np.isfinite(factors).all() and factors.all()):
@@ -224,20 +226,20 @@ def _wanted(weights: ComplexArray, factors: ComplexArray) -> ComplexArray:
     wanted = weights / factors
     strongest = np.abs(wanted).max(initial=0.0)
     if strongest == 0:
-        raise ValueError("all weights are 0: there is nothing to radiate")
+        raise ValueError("all weights are 0")
     scaled: ComplexArray = wanted / strongest
     return scaled
 
 
 def _metric(size: int, towards: ComplexArray | None, emphasis: float) -> ComplexArray:
-    """K (M, M): the identity for the pattern, plus a term for each direction that counts."""
+    """K (M, M): the identity for the pattern, plus a term for each emphasised direction."""
     metric = np.eye(size, dtype=complex)
     if towards is None:
         return metric
     if towards.ndim != 2 or len(towards) != size or not np.isfinite(towards).all():
         raise ValueError(f"directions {towards.shape} must be ({size}, J) and finite")
     power = np.sum(np.abs(towards) ** 2, axis=0)
-    seen = towards[:, power > 0]  # an element pattern may be 0 there: no response, no error
+    seen = towards[:, power > 0]  # element patterns may be 0 there
     scaled = seen * np.sqrt(emphasis * size / power[power > 0])
     metric += scaled.conj() @ scaled.T
     return metric
@@ -258,10 +260,7 @@ def _best_rotations(
     weights: ComplexArray,
     factors: ComplexArray,
 ) -> IntArray:
-    """Codes (``STARTS``, M, 2) rounded at the best of the common rotations.
-
-    0 is among those tried.
-    """
+    """Codes (``STARTS``, M, 2) rounded at the best of the common rotations, 0 among them."""
     turns = np.exp(1j * settings.period_rad * np.arange(ROTATIONS) / ROTATIONS)
     codes = np.unique(settings.nearest(turns[:, np.newaxis] * wanted), axis=0)
     best = np.argsort(-_score(factors * settings.values(codes), metric, weights), kind="stable")
@@ -280,10 +279,10 @@ def _descend(
 ) -> IntArray:
     """Coordinate descent from each of ``starts`` (S, M, 2), all at once.
 
-    A change of element m by d moves p = g^H K f by d* (K f)_m and q = g^H K g by 2 Re(d* (K g)_m) +
-    |d|^2 K_mm, so all settings of one element are compared at once, and K g follows by one column
-    of K. It is sequential, and meant for exports, not for every update. The strongest element may
-    turn but not become weaker.
+    A change of element m by d changes p = g^H K f by d* (K f)_m and q = g^H K g by 2 Re(d* (K g)_m)
+    + |d|^2 K_mm, so all settings of one element are compared at once, and K g is updated by one
+    column of K. It is sequential, and meant for exports, not for every update. The strongest
+    element may rotate but not become weaker.
     """
     codes, set_to = starts.copy(), settings.values(starts)
     least = np.zeros(set_to.shape)
@@ -291,7 +290,7 @@ def _descend(
     aim, each = metric @ weights, np.arange(len(codes))
     for _ in range(SWEEPS):
         radiated = factors * set_to
-        pull = radiated @ metric.T  # anew at each sweep, so that rounding does not gather
+        pull = radiated @ metric.T  # recomputed, so that rounding does not accumulate
         p = radiated.conj() @ aim
         q = np.einsum("sm,sm->s", radiated.conj(), pull).real
         moved = False

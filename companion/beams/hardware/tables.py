@@ -1,6 +1,6 @@
-"""From beams to a device's table: calibration, limits, the nearest settings, and what they cost.
+"""Device tables from beams: calibration, limits, the nearest settings, and their cost.
 
-``fit`` finds the settings, ``encode`` writes them as the device's tools read them.
+``fit`` finds the settings, ``encode`` writes them in the format of the device's tools.
 """
 
 import math
@@ -20,12 +20,12 @@ from companion.values import ComplexArray, IntArray, UserError
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class WantedBeam:
-    """A beam to be written for a device.
+    """Beam to write for a device.
 
     weights                     (M,)
     azimuth_rad, elevation_rad  its direction in the array frame
-    steering                    (M, J), steering vectors that count when it is quantised: its
-                                own first, then those of its nulls
+    steering                    (M, J), steering vectors that the quantisation emphasises: its own
+                                first, then those of its nulls
     """
 
     uav: str
@@ -37,21 +37,21 @@ class WantedBeam:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DeviceTable:
-    """The settings of a device.
+    """Settings of a device.
 
     weights  (M, K), by element, as radiated; each beam has its strongest element at full gain,
-             and what feeds the array divides the power among beams
-    loss_db  array gain that each beam lost towards its own direction by the settings; None
-             where the wanted weights are not known
+             and the feed of the array divides the power among beams
+    loss_db  loss of each beam's array gain towards its own direction by the settings; None if the
+             wanted weights are unknown
     """
 
     device: Beamformer
-    uavs: tuple[str, ...]  # names of the beams; their numbers where the text had no room for names
+    uavs: tuple[str, ...]  # names of the beams; their numbers if the format has no names
     codes: IntArray  # (K, M, 2), by beam and channel
     order: tuple[int, ...]  # the element of each channel
     weights: ComplexArray
     loss_db: tuple[float, ...] | None
-    gains: UnitGains = RELATIVE  # what the channels of a TMYTEK unit can have
+    gains: UnitGains = RELATIVE  # possible gains of the channels of a TMYTEK unit
 
 
 def fit(
@@ -60,9 +60,9 @@ def fit(
     calibration: Calibration,
     gains: UnitGains = RELATIVE,
 ) -> DeviceTable:
-    """The settings nearest to the wanted beams; ``gains`` are those of a TMYTEK unit.
+    """Return the settings nearest to the wanted beams; ``gains`` are those of a TMYTEK unit.
 
-    Raises ``UserError``, with the reason, for what the device cannot do.
+    Raises ``UserError``, with the reason, for beams outside the device's limits.
     """
     _check(device, beams, calibration, gains)
     factors = calibration.factors
@@ -90,9 +90,9 @@ def fit(
 
 
 def encode(table: DeviceTable, frequency_hz: float | None = None) -> str:
-    """The table as the text of its device (``companion.beams.hardware.device_text``).
+    """Return the table in the format of its device (``companion.beams.hardware.device_text``).
 
-    ``frequency_hz`` is needed by Sivers alone. Raises ``UserError`` for a value that the text
+    ``frequency_hz`` is needed by Sivers only. Raises ``UserError`` for a value that the format
     cannot hold.
     """
     match table.device:
@@ -102,14 +102,14 @@ def encode(table: DeviceTable, frequency_hz: float | None = None) -> str:
             return device_text.write_tmytek(table.codes, table.gains)
         case Beamformer.SIVERS:
             if frequency_hz is None:
-                raise UserError("a Sivers beam book needs the frequency that it is for")
+                raise UserError("Sivers beam book: give its frequency")
             return device_text.write_sivers(table.uavs, table.codes, frequency_hz)
 
 
 def _check(
     device: Beamformer, beams: Sequence[WantedBeam], calibration: Calibration, gains: UnitGains
 ) -> None:
-    """Raise ``UserError`` for what the device cannot do."""
+    """Raise ``UserError`` for beams outside the device's limits."""
     limits, size = LIMITS[device], len(calibration.order)
     range_db = gains.range_db if device is Beamformer.TMYTEK else limits.gain_range_db
     if limits.elements is not None and size != limits.elements:
@@ -119,7 +119,7 @@ def _check(
     spread_db = max(calibration.gain_db) - min(calibration.gain_db)
     if spread_db > range_db:
         raise UserError(
-            f"the channels differ by {spread_db:.1f} dB, {device} can level {range_db:.1f} dB"
+            f"channel gains differ by {spread_db:.1f} dB, {device} can equalise {range_db:.1f} dB"
         )
     for beam in beams:
         if beam.weights.shape != (size,) or beam.steering.ndim != 2 or not beam.steering.size:

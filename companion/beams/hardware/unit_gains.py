@@ -1,16 +1,16 @@
-"""Gains that a TMYTEK unit can have: its own limits, from a described file for each unit.
+"""Possible gains of a TMYTEK unit: its own limits, from a file for each unit.
 
-A channel's gain is the common gain of its board, four channels, and an element gain of its own,
-from 0 to the board's limit. TLKCore says both at the operating frequency (``getCOMDR``,
-``getELEDR``), and checks each beam by them: the elements of a board differ by no more than the
-element limit, and its common gain is within its range. The file is TOML:
+A channel's gain is the common gain of its board, four channels, plus an element gain from 0 to the
+board's limit. TLKCore gives both at the operating frequency (``getCOMDR``, ``getELEDR``), and
+checks each beam against them: the elements of a board differ by at most the element limit, and its
+common gain is within its range. The file is TOML:
 
     mode = "TX"                                 # or "RX"
     common_db = [[-1.0, 9.5], [-1.0, 9.5], [-1.0, 9.5], [-1.0, 9.5]]
     element_db = [4.0, 4.0, 4.0, 4.0]
 
-All boards are driven within one span, that of the weakest: its top is what every board reaches, and
-each beam has its strongest element there.
+All boards use one range, that of the weakest: every board reaches its top, and each beam has its
+strongest element there.
 """
 
 import math
@@ -25,50 +25,50 @@ from companion.values import UserError, read_toml, shown
 BOARD_CHANNELS: Final = 4
 BOARDS: Final = TMYTEK_CHANNELS // BOARD_CHANNELS
 UNIT_MAX_DB: Final = 200.0
-"""Most that a gain of a unit may be, either way: each step of its range takes memory."""
+"""Largest magnitude of a gain of a unit: each step of its range takes memory."""
 KEYS: Final = {"mode", "common_db", "element_db"}
 
 
 @dataclass(frozen=True, slots=True)
 class UnitGains:
-    """The gains of all channels of a unit."""
+    """Gains of all channels of a unit."""
 
-    mode: Mode  # transmission or reception: each has limits of its own
+    mode: Mode  # transmission or reception, which have different limits
     full_gain_db: float  # gain of an element at full gain, in steps of TMYTEK_STEP_DB
-    range_db: float  # how far below that an element can be, in such steps
+    range_db: float  # range of an element below that, in such steps
 
     @property
     def settings(self) -> Resolution:
-        """What one channel can be set to."""
+        """Possible settings of one channel."""
         step_db = TMYTEK_STEP_DB if self.range_db else None
         return stepped(360, step_db, self.range_db, off=True)
 
 
 RELATIVE: Final = UnitGains(Mode.TX, 0.0, TMYTEK_RANGE_DB)
-"""Gains over the loudest element, for a unit of which nothing is known: it may refuse them."""
+"""Gains relative to the strongest element, for an unknown unit: it may reject them."""
 
 
 def parse_unit_gains(text: str) -> UnitGains:
-    """Read the file described above. Raises ``UserError`` that names the key."""
+    """Parse the file described above. Raises ``UserError`` that names the key."""
     told = read_toml(text)
     if set(told) != KEYS:
-        raise UserError(f"the keys are {', '.join(sorted(KEYS))}, not {', '.join(sorted(told))}")
+        raise UserError(f"keys are {', '.join(sorted(told))}; give {', '.join(sorted(KEYS))}")
     if told["mode"] not in tuple(Mode):
         raise UserError(f'mode = {shown(told["mode"])} is not "TX" or "RX"')
     common = [_numbers("common_db", pair, 2) for pair in _by_board("common_db", told["common_db"])]
     element = _numbers("element_db", _by_board("element_db", told["element_db"]), BOARDS)
     if any(low > high for low, high in common) or min(element) < 0:
-        raise UserError("common_db is the least and the greatest of a board, element_db 0 or more")
+        raise UserError("common_db: give least and largest per board; element_db: give 0 or more")
     full_db = _floor(min(high + more for (_, high), more in zip(common, element, strict=True)))
     range_db = _floor(min(*element, full_db - max(low for low, _ in common)))
     if range_db < 0:
-        raise UserError("the boards have no gain in common")
+        raise UserError("boards have no common gain range")
     return UnitGains(Mode(told["mode"]), full_db, range_db)
 
 
 def _by_board(key: str, given: Any) -> list[Any]:
     if not isinstance(given, list) or len(given) != BOARDS:
-        raise UserError(f"{key} has one entry for each of {BOARDS} boards")
+        raise UserError(f"{key}: give one entry for each of {BOARDS} boards")
     return given
 
 
@@ -83,5 +83,5 @@ def _numbers(key: str, given: Any, count: int) -> list[float]:
 
 
 def _floor(gain_db: float) -> float:
-    """The step at or below a gain."""
+    """Round a gain down to a step."""
     return math.floor(gain_db / TMYTEK_STEP_DB + 1e-9) * TMYTEK_STEP_DB

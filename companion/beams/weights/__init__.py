@@ -1,1 +1,1 @@
-"""Array weights: zero forcing and its relatives, wide beams and nulls, grouping of users."""
+"""Array weights: zero forcing and related methods, wide beams and nulls, grouping of users."""

@@ -1,11 +1,10 @@
-"""Cones of directions as an array sees them, and the least gain of beams over them, sampled.
+"""Cones of directions as an array resolves them, and the sampled least gain of beams over them.
 
-An array sees a direction by its cosines on the axes of its aperture. Those of a cone about a
-direction are an interval on each axis: a line sees no more of it, and a plane an ellipse. Elements
-on a grid are asked at places that lie alike about each predicted direction: turned to look there,
-what all weights radiate to them is one product of matrices on each axis. Others are asked in a few
-directions. What is sampled here steers how much nulls may cost; what is promised is proven in
-``worth.guarantee``.
+An array resolves a direction by its cosines to the axes of its aperture. A cone about a direction
+gives an interval on each axis; a plane sees it as an ellipse. For elements on a grid, the samples
+lie alike about each predicted direction: with all beams steered to one direction, their responses
+are one matrix product per axis. Other arrays are sampled in a few directions. These samples only
+decide how much nulls may cost; ``worth.guarantee`` proves the guaranteed gain.
 """
 
 import functools
@@ -21,12 +20,12 @@ from companion.beams.weights.shapes import Aperture
 from companion.beams.worth.cone import faces_apart
 from companion.values import ComplexArray, FloatArray, IntArray
 
-FINER: Final = 6  # places in each natural width of a line
+FINER: Final = 6  # samples per natural width of a line
 FINER_IN_PLANE: Final = 8  # the same on each axis of a plane
-EDGE: Final = 0.25  # by how many places a place may be beyond a cone and count half
+EDGE: Final = 0.25  # distance beyond a cone, in sample steps, at which a sample counts half
 MOST_INCLINED: Final = 0.95
-"""Inclination beyond which ellipses are no narrower: cones there reach behind the plane."""
-RINGS: Final = 4  # rings of directions in which other arrays are asked
+"""Inclination at which ellipses are clipped: more inclined cones reach behind the plane."""
+RINGS: Final = 4  # rings of directions in which other arrays are sampled
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,9 +49,9 @@ class ApertureCones:
 
     @property
     def inclined(self) -> FloatArray:
-        """How inclined the ellipses are as which a plane sees cones, (N,), -1 to 1.
+        """Inclination of the ellipses that a plane sees, (N,), -1 to 1.
 
-        A cone about u is seen as an ellipse like 1 - u u^T, u cut to the two axes: this is that
+        A cone about u is seen as an ellipse like 1 - u u^T, u reduced to the two axes: this is that
         matrix's coefficient of correlation. 0: parallel to the axes.
         """
         y, z = self.seen.T
@@ -62,14 +61,14 @@ class ApertureCones:
 
     @property
     def furthest(self) -> FloatArray:
-        """To the further end, from the predicted direction."""
+        """Distance from the predicted direction to the further end."""
         return np.maximum(self.highest - self.seen, self.seen - self.lowest)
 
 
 def cones_on_aperture(
     across: Aperture, directions: FloatArray, angles_rad: FloatArray
 ) -> ApertureCones:
-    """The cones within angles (K, N) of unit directions (N, 3)."""
+    """Return the cones within angles (K, N) of unit directions (N, 3)."""
     cosines = np.minimum(np.maximum(directions @ across.axes.T, -1.0), 1.0)
     angle, wide = np.arccos(cosines), angles_rad[:, :, np.newaxis]
     lowest = np.cos(np.minimum(angle + wide, np.pi))
@@ -79,13 +78,13 @@ def cones_on_aperture(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConeSamples:
-    """Where N beams are looked at, at P places each.
+    """Samples of N beams, at P places each.
 
-    turns    (M, N), phase factors that turn all beams to one direction, on a grid
-    waves    what elements on each axis (n, P_d) radiate to places about it; empty elsewhere
+    turns    (M, N), phase factors that steer all beams to one direction, on a grid
+    waves    responses of the elements on each axis (n, P_d) to places about it; empty elsewhere
     vectors  (N, P, M), steering vectors of the places; empty on a grid
-    counts   (2, N, P), how much of a least gain is asked at a place: 1 within the cone over which
-             it counts, and within that of the likely angle; about the edge it falls to 0
+    counts   (2, N, P), weight of a sample in a least gain: 1 within the bound's cone, and within
+             the likely cone; it falls to 0 about the edge
     """
 
     turns: ComplexArray
@@ -94,7 +93,7 @@ class ConeSamples:
     counts: FloatArray
 
     def fields(self, weights: ComplexArray) -> ComplexArray:
-        """What each column (M, N) radiates to its user's places, (N, P)."""
+        """Return the field of each column (M, N) at its user's places, (N, P)."""
         if not self.waves:
             found: ComplexArray = np.einsum("npm,mn->np", self.vectors, weights)
             return found
@@ -108,7 +107,7 @@ class ConeSamples:
         return plane
 
     def of(self, users: IntArray) -> "ConeSamples":
-        """The cones of some of the users."""
+        """Return the samples of some of the users."""
         vectors = self.vectors if self.waves else self.vectors[users]
         return ConeSamples(
             turns=self.turns[:, users],
@@ -125,7 +124,7 @@ def cones(
     seen: ApertureCones,
     centres: ComplexArray,
 ) -> ConeSamples:
-    """Where the beams towards unit directions (N, 3) are looked at.
+    """Return the samples of beams towards unit directions (N, 3).
 
     ``seen`` has the cones of the bound and of the likely angle; ``centres`` (M, N) are the steering
     vectors of the directions.
@@ -141,7 +140,7 @@ def cones(
 def _about(
     across: Aperture, seen: ApertureCones, grid: tuple[int, int], wavelength_m: float
 ) -> tuple[list[ComplexArray], FloatArray]:
-    """The places about each predicted direction: their waves on each axis, and how they count."""
+    """Return the samples about each predicted direction: waves on each axis, and weights."""
     wide = across.lengths_m / wavelength_m
     furthest = (seen.furthest * wide).max(axis=(0, 1))
     middles, halves = (seen.middles - seen.seen) * wide, seen.halves * wide
@@ -153,12 +152,12 @@ def _about(
         reach = min(math.ceil(furthest[d] * finer), most)
         waves.append(_waves(count, finer, reach))
         aside = np.arange(-reach, reach + 1) / finer - middles[:, :, d, np.newaxis]
-        if reach == most:  # round the end, as the field goes
+        if reach == most:  # wrap around, as the field is periodic
             aside -= count * np.rint(aside / count)
         aside /= (halves[:, :, d] + EDGE / finer)[:, :, np.newaxis]
         sides.append(aside)
     off = np.abs(sides[0]) if len(sides) == 1 else _off_ellipses(sides[0], sides[1], seen.inclined)
-    # Over one place about the edge: no place comes or goes at once.
+    # A ramp one sample wide at the edge, so that weights change continuously.
     steps = np.maximum(halves.min(axis=2) * finer + EDGE, 0.5)[:, :, np.newaxis]
     counts = np.minimum(np.maximum(0.5 + steps * (1.0 - off), 0.0), 1.0)
     counts /= np.maximum(counts.max(axis=2, keepdims=True), 1e-9)
@@ -166,9 +165,9 @@ def _about(
 
 
 def _off_ellipses(along: FloatArray, down: FloatArray, inclined: FloatArray) -> FloatArray:
-    """How far places are off ellipses: 1 on the rim, (K, N, P_1 P_0).
+    """Return the distance of places from ellipses: 1 on the rim, (K, N, P_1 P_0).
 
-    By the places on the first axis (K, N, P_0) and on the second (K, N, P_1), in half intervals.
+    Given places on the first axis (K, N, P_0) and on the second (K, N, P_1), in half intervals.
     """
     y, z = along[:, :, np.newaxis], down[:, :, :, np.newaxis]
     mixed = inclined[:, np.newaxis, np.newaxis]
@@ -177,7 +176,7 @@ def _off_ellipses(along: FloatArray, down: FloatArray, inclined: FloatArray) -> 
 
 
 def _waves(count: int, finer: int, reach: int) -> ComplexArray:
-    """What elements radiate, (count, 2 reach + 1), to places ``finer`` to a natural width."""
+    """Return responses of elements, (count, 2 reach + 1), to places ``finer`` per natural width."""
     longest = 1 << max(reach - 1, 0).bit_length()
     return _all_waves(count, finer, longest)[:, longest - reach : longest + reach + 1]
 
@@ -193,7 +192,7 @@ def _all_waves(count: int, finer: int, reach: int) -> ComplexArray:
 def _asked(
     array: Array, across: Aperture, directions: FloatArray, seen: ApertureCones
 ) -> ConeSamples:
-    """Steering vectors of directions in rings about each predicted one, out to either cone."""
+    """Return steering vectors of directions in rings about each predicted one, out to the cones."""
     users = len(directions)
     held, likely = seen.halves
     wide = np.arccos(np.clip(seen.seen - held, -1, 1)) - np.arccos(seen.seen)
@@ -223,7 +222,7 @@ def _asked(
 def outside(
     across: Aperture, seen: ApertureCones, around: FloatArray, wavelength_m: float
 ) -> FloatArray:
-    """How far directions (P, 3) are outside of the first of K cones, in natural widths, (P, N).
+    """Distance of directions (P, 3) outside the first of K cones, natural widths, (P, N).
 
     0 within.
     """

@@ -1,4 +1,4 @@
-"""Grouping: which users are served together, given what zero forcing may cost."""
+"""Grouping: which users are served together, given the allowed cost of zero forcing."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from companion.values import ComplexArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class CostLimits:
-    """What zero forcing may cost: the loss of any user, dB, and the condition number."""
+    """Allowed cost of zero forcing: the loss of any user, dB, and the condition number."""
 
     loss_db: float
     condition: float
@@ -32,7 +32,7 @@ YOUNG_MARGIN_DB: Final = 1.5  # loss accepted beyond the limit while slots are y
 def kept_groups(
     steering: ComplexArray, before: PreviousSlots, limits: CostLimits
 ) -> list[IntArray] | None:
-    """The previous groups if they are still within the limits; else None."""
+    """Return the previous groups if they are still within the limits; else None."""
     groups = [np.flatnonzero(before.numbers == n) for n in range(int(before.numbers.max()) + 1)]
     most_db = limits.loss_db + (YOUNG_MARGIN_DB if before.young else 0.0)
     if not groups or any(not len(g) or lost_db(steering[:, g], limits) > most_db for g in groups):
@@ -41,10 +41,10 @@ def kept_groups(
 
 
 def lost_db(steering: ComplexArray, limits: CostLimits) -> float:
-    """What zero forcing costs the worst of the users, dB; infinite past the condition limit.
+    """Return the loss of the worst user by zero forcing, dB; infinite past the condition limit.
 
-    Judged with columns of one length: that elements radiate less towards a user brings him no
-    closer to another.
+    Computed with columns of equal length: a weak element pattern towards a user does not make the
+    user harder to separate.
     """
     unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
     return _lost_db(unit.T @ unit.conj(), len(steering), limits)
@@ -61,7 +61,7 @@ def _lost_db(gram: ComplexArray, elements: int, limits: CostLimits) -> float:
 
 
 class _Group:
-    """A group that grows: the inverse of its Gram matrix, bordered with each user it takes in."""
+    """Growing group: the inverse of its Gram matrix, bordered with each added user."""
 
     def __init__(
         self, *, gram: ComplexArray, first: int, elements: int, limits: CostLimits
@@ -71,7 +71,7 @@ class _Group:
         self._inverse: ComplexArray = np.array([[1.0 / gram[first, first]]])
 
     def take(self, user: int) -> bool:
-        """Take a user in if all fit."""
+        """Add a user if the group stays within the limits; return whether it does."""
         if len(self.members) >= self._elements:
             return False
         beside = self._gram[self.members, user]
@@ -95,9 +95,9 @@ class _Group:
         return True
 
     def _is_well_conditioned(self, user: int, losses: FloatArray) -> bool:
-        """Whether the condition number is within its limit.
+        """Return whether the condition number is within its limit.
 
-        Its square is at most the product of the traces, which mostly settles it.
+        Its square is at most the product of the traces, which mostly decides.
         """
         square = self._limits.condition**2
         if len(losses) * float(losses.sum()) <= square:
@@ -114,12 +114,13 @@ def semi_orthogonal(
 
         steering  A, (M, N)
         order     users in descending priority
-        limits    what zero forcing may cost
+        limits    allowed cost of zero forcing
 
-    Each group begins with the highest priority that is left. It then takes in, again and again, the
-    user with the largest part outside the span of the group, while all of it fits (semi-orthogonal
-    user selection: Yoo and Goldsmith 2006, with the cost of zero forcing itself as the threshold;
-    docs/math.md 7). The parts outside are kept up by pivoted Cholesky of the Gram matrix.
+    Each group starts with the remaining user of highest priority. It then repeatedly adds the user
+    with the largest component outside the span of the group, while the group stays within the
+    limits (semi-orthogonal user selection: Yoo and Goldsmith 2006, with the cost of zero forcing
+    itself as the threshold; docs/math.md 7). The components are updated by pivoted Cholesky of the
+    Gram matrix.
     """
     unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
     gram = unit.conj().T @ unit
@@ -155,7 +156,7 @@ def semi_orthogonal(
 def without_the_lowest(
     steering: ComplexArray, order: Sequence[int], limits: CostLimits
 ) -> IntArray:
-    """The users kept: by descending priority, each that fits with those kept before."""
+    """Return the users kept: by descending priority, each that fits with those kept before."""
     unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
     kept = _Group(gram=unit.conj().T @ unit, first=order[0], elements=len(steering), limits=limits)
     for user in order[1:]:

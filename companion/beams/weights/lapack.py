@@ -1,8 +1,8 @@
-"""The routines of BLAS and LAPACK that beams take, without all else that is scipy.linalg.
+"""BLAS and LAPACK routines for beams, without the rest of scipy.linalg.
 
-``scipy.linalg`` asks numpy for everything it has, down to its tests and its Fortran wrappers: 27 MB
-and a quarter of a second for what nobody uses in flight. What it hands on are compiled modules,
-which stand for themselves. They are loaded alone; by the package where it keeps them otherwise.
+``scipy.linalg`` imports all of numpy, including its tests and Fortran wrappers: 27 MB and a quarter
+of a second that are not needed in flight. Its compiled modules are independent, and are loaded
+alone here; from the public package if they are not found.
 """
 
 from importlib import import_module
@@ -13,7 +13,7 @@ from typing import Any
 
 
 def _routines(package: str, compiled: str) -> Any:
-    """The module ``compiled`` below scipy.linalg, or the public one that hands it on."""
+    """Load the module ``compiled`` below scipy.linalg, or the public one that exports it."""
     scipy = find_spec("scipy")
     places = (scipy.submodule_search_locations if scipy else None) or ()
     folders = [str(PurePath(place, "linalg")) for place in places]

@@ -1,17 +1,17 @@
-"""How the beams of one time slot share the transmitter's power, and what that means for the beams.
+"""Power allocation between the beams of one time slot, and the beams that suit it.
 
 With the coupling c_ij = SNR of user i from beam j alone if that had all the power,
 
     SINR_i = p_i c_ii / (1 + sum_{j != i} p_j c_ij),     sum p = 1.
 
-``max_min`` makes the least SINR the greatest: all are then equal, and p is the fixed point of
-p_i = t (1 + sum p_j c_ij) / c_ii (M. Schubert and H. Boche 2004). ``weighted_sum`` climbs the
+``max_min`` maximises the least SINR: all are then equal, and p is the fixed point of
+p_i = t (1 + sum p_j c_ij) / c_ii (M. Schubert and H. Boche 2004). ``weighted_sum`` maximises the
 weighted sum of log2(1 + SINR) by weighted least squares (WMMSE, Q. Shi et al. 2011), here over
 powers alone.
 
-The best beams for either are those of the least mean square error in the other direction, with
-powers q that users would send with (uplink-downlink duality): F = A* (A^T A* + X)^-1 with x_i =
-1/(q_i SNR_i), up to the lengths of the columns. ``dual_of_*`` find q. See docs/math.md 7.
+The best beams for either are those of the least mean square error in the uplink, with uplink powers
+q (uplink-downlink duality): F = A* (A^T A* + X)^-1 with x_i = 1/(q_i SNR_i), up to the lengths of
+the columns. ``dual_of_*`` find q. See docs/math.md 7.
 """
 
 from typing import Final
@@ -20,17 +20,17 @@ import numpy as np
 
 from companion.values import ComplexArray, FloatArray
 
-ROUNDS: Final = 60  # most rounds of a fixed point
-DUAL_ROUNDS: Final = 24  # most rounds in which beams are made anew
+ROUNDS: Final = 60  # most iterations of a fixed point
+DUAL_ROUNDS: Final = 24  # most iterations that recompute beams
 ENOUGH: Final = 1e-4  # relative change of powers at which a search ends
 ROUNDING: Final = 1e-13
-"""Least loading, over the greatest power: what rounding leaves of vectors that are alike."""
+"""Least loading, relative to the largest power: the rounding error for identical vectors."""
 LEAST_SHARE: Final = 1e-4
-"""Least share of the equal power that a user keeps, so that each beam is one."""
+"""Least share of the equal power that a user keeps, so that every beam exists."""
 
 
 def max_min(coupling: FloatArray) -> FloatArray:
-    """Shares (N,) with which the least SINR is the greatest, for a coupling (N, N)."""
+    """Return shares (N,) that maximise the least SINR, for a coupling (N, N)."""
     own = np.maximum(coupling.diagonal(), 1e-300)
     cross = coupling - np.diag(coupling.diagonal())
     share = np.full(len(own), 1.0 / len(own))
@@ -45,7 +45,7 @@ def max_min(coupling: FloatArray) -> FloatArray:
 
 
 def weighted_sum(coupling: FloatArray, worths: FloatArray) -> FloatArray:
-    """Shares (N,) with which the sum of ``worths`` (N,) times rates is great; a local optimum."""
+    """Return shares (N,) that maximise the sum of ``worths`` (N,) times rates; a local optimum."""
     direct = np.sqrt(coupling.diagonal())
     sent = np.full(len(direct), (1.0 / len(direct)) ** 0.5)
     for _ in range(2 * ROUNDS):
@@ -63,7 +63,7 @@ def weighted_sum(coupling: FloatArray, worths: FloatArray) -> FloatArray:
 
 
 def dual_of_max_min(gram: ComplexArray, snr: FloatArray) -> FloatArray:
-    """Powers (N,) of sum 1 in the other direction with which the least SINR is the greatest.
+    """Return uplink powers (N,) of sum 1 that maximise the least SINR.
 
     gram  A^T A*, (N, N)
     snr   (N,), of an isotropic antenna with the whole power
@@ -81,7 +81,7 @@ def dual_of_max_min(gram: ComplexArray, snr: FloatArray) -> FloatArray:
 
 
 def _alone(gram: ComplexArray, snr: FloatArray, share: FloatArray) -> FloatArray:
-    """SINR (N,) of each user for a power of 1 while the others keep their shares."""
+    """Return the SINR (N,) of each user for a power of 1 while the others keep their shares."""
     # x [(K + X)^-1]_ii is the mean square error, 1 / (1 + SINR).
     error = _inverse(gram, 1.0 / (snr * share)).diagonal().real / (snr * share)
     found: FloatArray = np.maximum(1.0 / np.maximum(error, 1e-15) - 1.0, 1e-15) / share
@@ -89,7 +89,7 @@ def _alone(gram: ComplexArray, snr: FloatArray, share: FloatArray) -> FloatArray
 
 
 def dual_of_weighted_sum(gram: ComplexArray, snr: FloatArray, worths: FloatArray) -> FloatArray:
-    """Powers (N,) of sum 1 in the other direction for a great weighted sum of rates.
+    """Return uplink powers (N,) of sum 1 for a large weighted sum of rates.
 
     Found by WMMSE with beams A* Z: their directions are those of the least mean square error, with
     powers as the receivers' weights.
@@ -111,7 +111,7 @@ def dual_of_weighted_sum(gram: ComplexArray, snr: FloatArray, worths: FloatArray
         power = float(np.einsum("in,ij,jn->", made.conj(), channel.T, made).real)  # of beams H* Z
         done = np.abs(found - share).max() <= ENOUGH * found.max()
         share = found
-        if done or not power > 0.0:  # rounding alone tells them apart: no beams to go on from
+        if done or not power > 0.0:  # vectors identical to rounding: no beams to continue from
             break
         made /= np.sqrt(power)
     return share

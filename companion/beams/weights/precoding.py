@@ -1,4 +1,4 @@
-"""Weights from steering vectors: zero forcing, and what is done where it costs too much.
+"""Weights from steering vectors: zero forcing, and the fallbacks where it costs too much.
 
 UAV i receives y_i = h_i a(u_i)^T F s + noise (docs/math.md 7, paper eq. (1)). With A = [a(u_1) ...
 a(u_N)], (M, N),
@@ -10,14 +10,15 @@ a(u_N)], (M, N),
 RZF is ZF at x = 0 and tends to MRT as x grows. (The published channel has a^H beside this F, which
 points elsewhere: one of the two must be conjugated; docs/math.md 8.4.)
 
-The inverse alone says what zero forcing costs user i: its gain falls from |a_i|^2 to 1 / [(A^T
-A*)^-1]_ii. Past ``loss_limit_db`` for any user, or past a condition number of A, the policy
+The inverse alone gives the cost of zero forcing for user i: its gain falls from |a_i|^2 to 1 /
+[(A^T A*)^-1]_ii. Past ``loss_limit_db`` for any user, or past a condition number of A, the policy
 decides: load the matrix by the least x at which no user loses more (each loss falls with x, see
-``_least_loading``), serve groups in time slots, or leave out the lowest priorities. This is judged
-with the columns of A scaled to one length, since a weak element pattern is not closeness. It
-happens at mirror images about a line array, or with two UAVs behind one another (docs/math.md 7).
+``_least_loading``), serve groups in time slots, or leave out the lowest priorities. The cost is
+computed with the columns of A scaled to equal length, since a weak element pattern is not
+closeness. High cost occurs at mirror images about a line array, or with two UAVs in line
+(docs/math.md 7).
 
-Over 300 lines: the ways of making weights fall back on one another.
+Over 300 lines: the methods are fallbacks of one another.
 """
 
 import math
@@ -46,22 +47,22 @@ from companion.values import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precoder:
-    """How weights are made.
+    """How weights are computed.
 
     method           zero forcing, regularised or maximum ratio
-    policy           what is done where zero forcing costs too much
-    loss_limit_db    most that it may cost any user
-    condition_limit  largest condition number of A, with columns of one length
-    regularisation   x / M where RZF itself is the method
-    normalisation    how the columns are scaled
-    priority         names of UAVs in descending order; those not named follow as they come
-    widen            how wide main lobes and nulls are
-    floor_db         least gain that a likely beam keeps within the bound, where it can
-    power            how beams share the power; None: as the normalisation makes them
-    rate_weights     worth of each UAV's rate where their weighted sum counts, by name; else 1
+    policy           fallback where zero forcing costs too much
+    loss_limit_db    largest loss of any user
+    condition_limit  largest condition number of A, with columns of equal length
+    regularisation   x / M if RZF itself is the method
+    normalisation    scale of the columns
+    priority         names of UAVs in descending order; unnamed ones follow in their order
+    widen            widths of main lobes and nulls
+    floor_db         least gain of a likely beam within the bound, where possible
+    power            power allocation between beams; None: by the normalisation
+    rate_weights     weight of each UAV's rate in their weighted sum, by name; else 1
     budget           power and noise of the radio
     uav_antennas     antennas that each UAV combines
-    worth_db         gain from which on a guarantee is worth something
+    worth_db         least guaranteed gain that is useful
     """
 
     method: Method = Method.ZERO_FORCING
@@ -86,14 +87,14 @@ class Precoder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precoding:
-    """Weights for the K users that are served, and what they cost.
+    """Weights for the K users that are served, and their cost.
 
-    ``condition_number`` is that of A with columns of one length, the largest over the groups; None
-    without users.
+    ``condition_number`` is that of A with columns of equal length, the largest over the groups;
+    None without users.
     """
 
     weights: ComplexArray  # F, (M, K)
-    method: Method  # the least exact one of the groups
+    method: Method  # the least exact method over the groups
     normalisation: Normalisation
     condition_number: float | None
     served: IntArray  # (K,), indices of the users served
@@ -104,20 +105,20 @@ class Precoding:
 
 @dataclass(frozen=True, slots=True)
 class Radio:
-    """What the radio makes of N users."""
+    """Radio parameters of N users."""
 
     snr: FloatArray  # (N,), of an isotropic antenna that has the whole power, as a power ratio
-    worths: FloatArray  # (N,), what each one's rate is worth
+    worths: FloatArray  # (N,), weights of the rates
 
     def of(self, users: IntArray) -> "Radio":
-        """The part that concerns some of the users."""
+        """Return the parameters of some of the users."""
         return Radio(self.snr[users], self.worths[users])
 
 
 LEAST_LOADING: Final = 1e-12
-"""Least loading where RZF itself is the method, as a share of the trace of the Gram matrix."""
+"""Least loading if RZF itself is the method, relative to the trace of the Gram matrix."""
 ROUNDING: Final = 1e-11
-"""Response to another user, over that to the own user, above which it is removed."""
+"""Response to another user, relative to the own one, above which it is removed."""
 LOADINGS: Final = np.logspace(-6, 6, 49)
 """Loadings tried by ``_least_loading``, in mean eigenvalues; beyond the last it is MRT to 1e-6."""
 
@@ -131,14 +132,14 @@ def precode(
     radio: Radio | None = None,
     before: PreviousSlots | None = None,
 ) -> Precoding:
-    """Weights for a steering matrix (M, N).
+    """Compute the weights for a steering matrix (M, N).
 
         steering    A, one steering vector per column
-        settings    how weights are made
-        spread      how main lobes and nulls are widened; None: not at all
-        priorities  users in descending priority; None: as they come
-        radio       needed where the method is MMSE or power is shared by rates
-        before      who was served when; None: nobody was
+        settings    how weights are computed
+        spread      widening of main lobes and nulls; None: none
+        priorities  users in descending priority; None: in their order
+        radio       needed if the method is MMSE or power is allocated by rates
+        before      previous time slots; None: there are none
 
     Raises ``ValueError`` for a steering vector that is not finite or is 0, and without a radio
     where one is needed.
@@ -147,7 +148,7 @@ def precode(
     power = np.einsum("mn,mn->n", steering.real, steering.real)
     power += np.einsum("mn,mn->n", steering.imag, steering.imag)
     if not (np.isfinite(power).all() and (power > 0).all()):
-        raise ValueError("a steering vector is 0, or holds what is not a number")
+        raise ValueError("a steering vector is 0 or not finite")
     everyone = np.arange(users)
     if users == 0:
         nothing: ComplexArray = np.empty((size, 0), dtype=complex)
@@ -193,10 +194,10 @@ def _slots(
     priorities: Sequence[int] | None,
     before: PreviousSlots | None,
 ) -> tuple[list[IntArray], dict[int, str]]:
-    """Who is served together, and who is not served and why.
+    """Return the groups of users, and the users left out with the reason.
 
-    What was before stays while it does, for a while at least, and until there are fewer slots or
-    more are served.
+    Previous slots are kept while they are within the limits and young, and until there are fewer
+    slots or more users are served.
     """
     everyone = np.arange(steering.shape[1])
     if settings.policy is Policy.REGULARISE or settings.method is not Method.ZERO_FORCING:
@@ -218,8 +219,8 @@ def _slots(
     else:
         kept = grouping.without_the_lowest(steering, order, limits)
         kept = stays[0] if stays is not None and len(stays[0]) >= len(kept) else kept
-    cost = f"cost {lost_db:.0f} dB" if np.isfinite(lost_db) else "pass the limits"
-    why = f"too close to one of higher priority: to tell all apart would {cost}"
+    cost = f"cost {lost_db:.0f} dB" if np.isfinite(lost_db) else "exceed the limits"
+    why = f"too close to a UAV of higher priority: separating all would {cost}"
     return [kept], dict.fromkeys(set(order).difference(kept.tolist()), why)
 
 
@@ -268,13 +269,12 @@ def _columns(
 def _mmse_loading(
     gram: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
 ) -> FloatArray:
-    """Loading of each user for the least mean square error at his share of the power.
+    """Return the loading of each user for the least mean square error at its share of the power.
 
-    The share is equal, or the one that the same power has in the other direction where the worst
-    rate or the weighted sum is greatest.
+    The share is equal, or the uplink share that maximises the worst rate or the weighted sum.
     """
     if radio is None:
-        raise ValueError("MMSE needs to know the radio")
+        raise ValueError("MMSE needs the radio parameters")
     snr = radio.snr[users]
     match settings.power:
         case Power.MAX_MIN:
@@ -288,14 +288,14 @@ def _mmse_loading(
 def _shared(
     a: ComplexArray, weights: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
 ) -> ComplexArray:
-    """Columns (M, K) of a slot with the power shared as the settings say; else as they are."""
+    """Return columns (M, K) of a slot with the power allocated by the settings; else unchanged."""
     if settings.power is None:
         return weights
     unit: ComplexArray = weights / np.linalg.norm(weights, axis=0)
     if settings.power is Power.EQUAL:
         return unit
     if radio is None:
-        raise ValueError("to share power by rates the radio has to be known")
+        raise ValueError("power allocation by rates needs the radio parameters")
     coupling = radio.snr[users, np.newaxis] * np.abs(a.T @ unit) ** 2
     if settings.power is Power.MAX_MIN:
         share = powers.max_min(coupling)
@@ -308,7 +308,7 @@ def _shared(
 def _zero_forcing(
     a: ComplexArray, gram: ComplexArray, condition: float, settings: Precoder
 ) -> _Columns:
-    """Zero forcing where its cost is within the limits, else the least loading that is.
+    """Zero forcing if its cost is within the limits, else with the least loading that is.
 
     The columns of ``a`` (M, N) have unit length.
     """
@@ -334,7 +334,7 @@ def _wide_zero_forcing(
 
 
 def _exactly(a: ComplexArray, found: ComplexArray) -> ComplexArray:
-    """Beams without the residual that nulled points beside the others may have left by rounding."""
+    """Remove the residual at the predicted directions that rounding or nearby points left."""
     stray = a.T @ found
     own = np.abs(stray.diagonal())
     np.fill_diagonal(stray, 0.0)
@@ -348,7 +348,7 @@ def _exactly(a: ComplexArray, found: ComplexArray) -> ComplexArray:
 
 
 def _unit_response(a: ComplexArray, weights: ComplexArray) -> ComplexArray:
-    """Columns scaled so that each UAV receives 1 from its own."""
+    """Scale columns so that each UAV receives 1 from its own."""
     scaled: ComplexArray = weights / np.einsum("mn,mn->n", a, weights)
     return scaled
 
@@ -358,7 +358,7 @@ def _db(power_ratio: float) -> float:
 
 
 def _loaded(a: ComplexArray, gram: ComplexArray, loading: FloatArray) -> ComplexArray:
-    """A* (A^T A* + X)^-1, X (N,), by the smaller of the two matrices that will do."""
+    """A* (A^T A* + X)^-1, X (N,), by the smaller of the two equivalent matrices."""
     if len(gram) <= len(a):
         loaded: ComplexArray = gram.copy()
         loaded.flat[:: len(loaded) + 1] += loading
@@ -371,8 +371,7 @@ def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:
     """cond(A) in the 2-norm, from the eigenvalues of A^T A*.
 
     Always finite: past about 1e7 rounding hides the smallest eigenvalue, and the result stays
-    there. With more users than elements the smallest is 0, and the result is that of rounding
-    alone.
+    there. With more users than elements the smallest is 0, and only rounding determines the result.
     """
     rounding = len(gram) * float(np.finfo(float).eps)
     if len(gram) > len(a):
@@ -386,7 +385,7 @@ def _spectrum(a: ComplexArray, gram: ComplexArray) -> tuple[FloatArray, FloatArr
     """Eigenvalues l of A^T A*, ascending, and their shares in each user's column, |v_ik|^2 l_k.
 
     Computed from the smaller of A^T A* and A* A^T, whose eigenvalues are the same but for zeros,
-    which have no part in any column: v_k sqrt(l_k) = A^T u_k.
+    which do not contribute to any column: v_k sqrt(l_k) = A^T u_k.
     """
     if len(gram) <= len(a):
         values, vectors = np.linalg.eigh(gram)
@@ -397,12 +396,12 @@ def _spectrum(a: ComplexArray, gram: ComplexArray) -> tuple[FloatArray, FloatArr
 
 
 def _least_loading(a: ComplexArray, gram: ComplexArray, settings: Precoder) -> float:
-    """The least x at which no user's loss and no condition number is beyond its limit.
+    """Return the least x at which every user's loss and the condition number are within the limits.
 
     With A^T A* = V diag(l) V^H and w_k = |v_ik|^2 l_k, the gain of user i over that of its own beam
     is (sum w y)^2 / (sum w . sum w y^2), y_k = 1/(l_k + x). Its derivative in x has the sign of
     (sum w y^3)(sum w y) - (sum w y^2)^2, which is never negative (Cauchy-Schwarz): the loss falls
-    with x, towards none. The least x is therefore found on a grid, and then on a finer one.
+    with x, to 0. The least x is therefore found on a grid, and then on a finer one.
     """
     values, shares = _spectrum(a, gram)
     scale = float(values.sum()) / len(gram)
@@ -430,7 +429,7 @@ def _least_loading(a: ComplexArray, gram: ComplexArray, settings: Precoder) -> f
 def normalise(weights: ComplexArray, how: Normalisation, slots: IntArray) -> None:
     """Scale columns in place; the columns of one slot share one factor.
 
-    Those of unit response stay as they are.
+    Those of unit response stay unchanged.
     """
     if how is Normalisation.UNIT_RESPONSE:
         return

@@ -1,10 +1,10 @@
-"""Phases over the aperture that make a beam as wide as is wanted, interpolated from tables.
+"""Phases over the aperture for a beam of a given width, interpolated from tables.
 
-One amplifier feeds each element, so all radiate alike and their phases alone shape the beam. Widths
-are in natural beams: an angle e across an aperture D is w = e D / wavelength. The tables were
-searched for offline (``docs/make_beam_shapes.py``) for 64 elements on a line and 16 x 16 in a
-square; in apertures from the middle, their phases serve any number. A square of 16 x 16 places has
-no more to say of wide beams: there a plane has the sum of two lines. See docs/math.md 5.5.
+Each element has its own amplifier, so all radiate equal power and only their phases shape the beam.
+Widths are in natural beams: an angle e across an aperture D is w = e D / wavelength. The tables
+were optimised offline (``docs/make_beam_shapes.py``) for 64 elements on a line and 16 x 16 in a
+square; with positions in apertures from the middle, they apply to any number. The square's 16 x 16
+grid is too coarse for wide beams: there a plane uses the sum of two lines. See docs/math.md 5.5.
 """
 
 import functools
@@ -24,38 +24,39 @@ CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T  # the corners (8, 3) of 
 MOST: Final = 0.375
 """Widest beam in natural widths for each element: beyond it they are too far apart to shape one."""
 GIVEN_UP: Final = 2.0
-"""Loss in dB that is accepted for each dB by which a floor is too low to be worth something."""
+"""Additional loss in dB, accepted for each dB by which a floor is too low to be useful."""
 SPARE_DB: Final = 2.5
-"""How far above what is worth something a floor has to be: nulls and places between take some."""
+"""Margin of a floor over the useful gain: nulls and places between samples reduce it."""
 FAR: Final = (3.8, 4.8)
-"""Widths of a plane's beams, in natural widths, from which and up to which lines take over."""
+"""Start and end of the transition from square to line tables, in natural widths of a plane's beam.
+"""
 LEAST_SHARE: Final = 1 / 16
 """Least ratio of the widths on the two axes of a plane that its shapes follow."""
 
 
 class Shapes(NamedTuple):
-    """The tables of one kind of aperture; phases are psi over it, times 2 pi w in radians.
+    """Tables of one kind of aperture; phases are psi over it, times 2 pi w in radians.
 
-    places    (n,), where the phases are, in apertures from the middle; on each axis of a square
+    places    (n,), positions of the phases, in apertures from the middle; on each axis of a square
     least_db  (W,), that gain over the number of elements, at the least: losses count from there
-    losses    (L,), by how many dB the floor over the cone is below the greatest least gain
+    losses    (L,), loss of the floor over the cone from the largest least gain, dB
 
     Widths, losses, cones and ratios are natural logarithms.
     """
 
     places: FloatArray
     widths: FloatArray  # (W,), ascending
-    guaranteed: FloatArray  # (W, K), the greatest least gain within the width
+    guaranteed: FloatArray  # (W, K), phases of the largest least gain within the width
     least_db: FloatArray
     losses: FloatArray
     cones: FloatArray  # (C,), ascending
     ratios: FloatArray  # (R,), the cone's width over the likely one, ascending from 1
-    likely: FloatArray  # (L C R, K), the greatest mean gain over the likely error, above that floor
+    likely: FloatArray  # (L C R, K), phases of the largest mean likely gain above that floor
 
 
 @functools.cache
 def _table(name: str) -> Shapes:
-    """The tables of a ``line`` or of a ``square``."""
+    """Load the tables of a ``line`` or of a ``square``."""
     count, axes = (64, 1) if name == "line" else (16, 2)
     even = _even(count) if axes == 1 else np.kron(_even(count), _even(count))
     file = resources.files(__package__) / TABLES
@@ -74,13 +75,13 @@ def _table(name: str) -> Shapes:
 
 
 def _even(count: int) -> FloatArray:
-    """What is even over an aperture (count, count / 2), from its half, the middle first."""
+    """Matrix (count, count / 2) from half of an even function, the middle first, to the whole."""
     half = count // 2
     return np.concatenate([np.eye(half)[::-1], np.eye(half)])
 
 
 class Aperture(NamedTuple):
-    """An array as its shapes see it: a line, or a plane with two axes.
+    """Array as its shapes see it: a line, or a plane with two axes.
 
     knots      (K, M), interpolation from a line's table to its elements; empty for a plane
     """
@@ -88,14 +89,14 @@ class Aperture(NamedTuple):
     shapes: Shapes  # the tables
     axes: FloatArray  # (D, 3), the line, or the two axes of the plane, array frame
     lengths_m: FloatArray  # (D,), those of uniform apertures with the same variance
-    most: FloatArray  # (D,), the widest beam in natural widths that elements so far apart can make
+    most: FloatArray  # (D,), the widest possible beam in natural widths, by the element spacing
     placed: FloatArray  # (M, D), the elements in apertures from the middle
     knots: FloatArray
 
 
 @functools.lru_cache(maxsize=8)
 def aperture(array: Array) -> Aperture:
-    """The aperture of an array; cached by array."""
+    """Return the aperture of an array; cached by array."""
     counts = np.array([array.size]) if array.axis is not None else np.full(2, array.size**0.5)
     if array.grid is not None:
         axes = np.eye(3)[[place for place in (1, 2) if array.grid[2 - place] > 1] or [1]]
@@ -105,7 +106,7 @@ def aperture(array: Array) -> Aperture:
     else:
         axes = np.linalg.eigh(array.variance_m2)[1].T[:0:-1]
     variances = np.einsum("dk,kl,dl->d", axes, array.variance_m2, axes)
-    # So many points a step apart have the variance of a line of sqrt(n^2 - 1) steps.
+    # n points one step apart have the variance of a continuous line of sqrt(n^2 - 1) steps.
     longer = counts / np.sqrt(np.maximum(counts**2 - 1.0, 1e-9))
     lengths_m = np.sqrt(12 * np.maximum(variances, 0.0)) * np.where(counts > 1, longer, 0.0)
     placed = array.centred_m @ axes.T / np.maximum(lengths_m, 1e-300)
@@ -132,17 +133,16 @@ def phases_rad(
     floor_db: float = 0.0,
     worth_db: float = 0.0,
 ) -> FloatArray:
-    """Phases (N, M) of N beams.
+    """Return phases (N, M) of N beams.
 
         across    the aperture
-        cones     (N, D), widths that a UAV may be off on each axis
-        likely    (N, D), widths that it likely is off; None: only the cone counts
-        floor_db  least gain over the cone that is wanted beside a likely width, over an isotropic
-                  element; it is kept where it leaves the least of ``losses`` to the best that there
-                  is
-        worth_db  least gain that is worth a floor: what is not above it is given up
+        cones     (N, D), widths of the bound on each axis
+        likely    (N, D), widths of the likely error; None: only the bound counts
+        floor_db  least gain wanted over the cone, over an isotropic element; it limits the loss,
+                  which is at least the least of ``losses``
+        worth_db  least useful gain: a floor below it is given up
 
-    They follow all of it without a step, to 0 where the widths are 0.
+    They are continuous in all arguments, and 0 where the widths are 0.
     """
     cones = np.minimum(cones, across.most)
     width = cones.max(axis=1)
@@ -171,7 +171,7 @@ def phases_rad(
         found += (1 - far) * width[:, np.newaxis] * square
     if far.any():
         line = _table("line")
-        # What a product of lines pays for a floor, it pays on both axes: more than it is worth.
+        # A product of lines would pay for a floor on both axes, which is more than it is worth.
         each = _psi(
             line, cones, within, elements=len(across.placed), floor_db=-math.inf, worth_db=worth_db
         )
@@ -189,7 +189,8 @@ def _psi(
     floor_db: float,
     worth_db: float,
 ) -> list[FloatArray]:
-    """Phases psi (N, K) of the table for each column of widths (N, D): their sum is one shape."""
+    """Return phases psi (N, K) of the table for each column of widths (N, D); their sum is one
+    shape."""
     columns = range(cones.shape[1])
     if likely is None:
         return [_guaranteed_phases(shapes, cones[:, d]) for d in columns]
@@ -203,16 +204,14 @@ def _psi(
 
 
 def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
-    """The knot (ascending) before each place, and what share the next one has; onward beyond."""
+    """Return the knot (ascending) before each place, and the next one's weight; extrapolated
+    beyond."""
     before = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
     return before, (at - knots[before]) / (knots[before + 1] - knots[before])
 
 
 def _on_axes(axes: Sequence[FloatArray], at: Sequence[FloatArray]) -> tuple[IntArray, FloatArray]:
-    """The knots (A, N) before N places on A axes, and what share the next ones have.
-
-    No further than the ends.
-    """
+    """Return the knots (A, N) before N places on A axes, and the next ones' weights; clipped."""
     places = np.stack(
         [
             np.interp(where, knots, np.arange(len(knots)))
@@ -240,7 +239,7 @@ def _likely_phases(
     axes = shapes.losses, shapes.cones, shapes.ratios
     before, share = _on_axes(axes, (loss, cone, cone - wide))
     strides = np.array([len(axes[1]) * len(axes[2]), len(axes[2]), 1])
-    # The eight corners of each one's cell.
+    # The eight corners of each cell.
     corners = (strides @ before)[:, np.newaxis] + CORNERS @ strides
     parts = np.stack([1 - share, share])
     shares = parts[CORNERS[:, 0], 0] * parts[CORNERS[:, 1], 1] * parts[CORNERS[:, 2], 2]
@@ -248,14 +247,14 @@ def _likely_phases(
 
 
 def _on_line(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:
-    """Phases psi (N, n) of a line at places (M,), linear."""
+    """Interpolate phases psi (N, n) of a line at places (M,), linear."""
     before, share = _between(shapes.places, placed)
     found: FloatArray = (1 - share) * psi[:, before] + share * psi[:, before + 1]
     return found
 
 
 def _on_square(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:
-    """Phases psi (N, n n) of a square at places (N, M, 2), bilinear."""
+    """Interpolate phases psi (N, n n) of a square at places (N, M, 2), bilinear."""
     users, count = np.arange(len(psi))[:, np.newaxis], len(shapes.places)
     grid = psi.reshape(-1, count, count)
     (i, j), (a, b) = zip(*(_between(shapes.places, placed[:, :, d]) for d in (0, 1)), strict=True)

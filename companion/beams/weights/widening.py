@@ -1,9 +1,9 @@
-"""Beams as wide as it is likely that they must be, or as wide as it is sure that they need be.
+"""Beams widened to cover the likely error, or the guaranteed bound.
 
-A UAV is likely within one angle of where it is predicted, and surely within another one, its
-pointing bound. A beam is shaped by the phases of ``shapes``: for the likely angle over a floor
-within the bound, or for the bound alone. Around each UAV stand points that others' beams are to
-leave dark as well (``nulls``). See docs/math.md 5.5.
+A UAV is likely within one angle of its predicted direction, and certainly within another one, its
+pointing bound. The phases of ``shapes`` shape a beam for the likely angle with a floor within the
+bound, or for the bound alone. Points around each UAV are also nulled by the others' beams
+(``nulls``). See docs/math.md 5.5.
 """
 
 from dataclasses import dataclass
@@ -19,39 +19,39 @@ from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, Wide
 
 WIDEST_RAD: Final = np.pi / 2  # angle beyond which beams are not widened further
 NULLED_AT: Final = 0.7
-"""Place of the points around a UAV, in likely angles from where it is predicted."""
-LEAST_RAD: Final = 1e-6  # likely angle below which nobody is nulled beside his place
+"""Distance of the points around a UAV from its predicted direction, in likely angles."""
+LEAST_RAD: Final = 1e-6  # likely angle below which no points around a UAV are nulled
 BROADENED: Final = 0.9
-"""Share of the sharp beam's gain at its middle below which a beam counts as broadened."""
+"""Ratio to the sharp beam's gain in the middle, below which a beam counts as broadened."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DirectionErrors:
-    """How far N directions are off."""
+    """Errors of N directions."""
 
     likely_rad: FloatArray  # (N,), the angle within which the UAV usually is
-    bounds_rad: FloatArray  # (N,), that within which it surely is; 0: no such angle counts
-    floor_db: float = 2.9  # least gain that a likely beam keeps within the bound, where it can
-    worth_db: float = 0.0  # least gain that is worth keeping
+    bounds_rad: FloatArray  # (N,), the bound on the angle; 0: unbounded, ignored
+    floor_db: float = 2.9  # least gain of a likely beam within the bound, where possible
+    worth_db: float = 0.0  # least useful gain
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """How to widen the beams and nulls of N users.
+    """Widened beams and nulls of N users.
 
     points     (M, N K), steering vectors, K per user in the order of the users: the predicted
-               direction, then those around it that are to be nulled as well
-    outside    (N K, N), how far each point is outside each user's cone, in natural widths; 0 within
+               direction, then those around it that are nulled as well
+    outside    (N K, N), distance of each point outside each user's cone, natural widths; 0 within
     """
 
     beams: ComplexArray  # (M, N), the shaped beams by themselves
     broadened: BoolArray  # (N,), which of them are broadened
     points: ComplexArray
     gram: ComplexArray  # (N K, N K), S^T S* of the points S
-    reached: ComplexArray  # (N K, N), what the beams radiate to the points
+    reached: ComplexArray  # (N K, N), fields of the beams at the points
     outside: FloatArray
-    cones: ConeSamples  # where the least gain of each beam is looked for
-    worth: float  # least gain that is worth keeping
+    cones: ConeSamples  # samples for the least gain of each beam
+    worth: float  # least useful gain
 
     @property
     def each(self) -> int:
@@ -64,7 +64,7 @@ class Spread:
         return self.points[:, :: self.each]
 
     def of(self, users: IntArray) -> "Spread":
-        """The part that concerns some of the users, in their order."""
+        """Return the part for some of the users, in their order."""
         if len(users) == self.beams.shape[1]:
             return self
         rows = (users[:, np.newaxis] * self.each + np.arange(self.each)).ravel()
@@ -83,7 +83,7 @@ class Spread:
 def spread(
     array: Array, directions: FloatArray, known: DirectionErrors, widen: Widen
 ) -> Spread | None:
-    """How to widen for unit directions (N, 3) in the array frame; None: not at all."""
+    """Widen beams for unit directions (N, 3) in the array frame; None without widening."""
     if widen is Widen.NO:
         return None
     across = shapes.aperture(array)
@@ -113,7 +113,7 @@ def spread(
 
 
 def _for_the_bound_rad(array: Array, across: shapes.Aperture, seen: ApertureCones) -> FloatArray:
-    """Phases (N, M) for the bound alone: each beam looks at the middle of what is seen of it."""
+    """Phases (N, M) for the bound alone: each beam points at the middle of its interval."""
     shaped = shapes.phases_rad(across, seen.halves[0] * across.lengths_m / array.wavelength_m, None)
     aside = (seen.middles[0] - seen.seen) @ (array.centred_m @ across.axes.T).T
     found: FloatArray = shaped - array.wavenumber_radpm * aside
@@ -134,9 +134,9 @@ def power_gains(steering: ComplexArray, weights: ComplexArray) -> FloatArray:
 def _around(
     array: Array, across: shapes.Aperture, directions: FloatArray, likely_rad: FloatArray
 ) -> FloatArray:
-    """Directions (N, K, 3): each user's own, then those about it on each axis that the array has.
+    """Directions (N, K, 3): each user's own, then those about it on each axis of the array.
 
-    Each point is a null, so there are none where the array has no degrees of freedom to spare.
+    Each point is a null, so there are none if the array lacks the degrees of freedom.
     """
     users, axes = len(directions), across.axes
     spare = (array.size - users) // users if users > 1 else 0

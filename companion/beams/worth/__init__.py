@@ -1,1 +1,1 @@
-"""What beams are worth: guaranteed gain, patterns, channels, link budget."""
+"""Performance of beams: guaranteed gain, patterns, channels, link budget."""

@@ -1,4 +1,4 @@
-"""The channel between the array and a UAV: free-space loss, scattering, blockage.
+"""Channel between the array and a UAV: free-space loss, scattering, blockage.
 
 A UAV with N_U antennas of its own receives, from M elements with weights F and symbols s,
 
@@ -43,8 +43,8 @@ def free_space_gain(ranges_m: float | FloatArray, wavelength_m: float) -> FloatA
 class SalehValenzuela:
     """Parameters of the scattered channel.
 
-        rician_k_db         power of the line of sight over that of all scattered rays together; inf
-                            is the line of sight alone, -inf none of it. 9 to 15 dB were measured at
+        rician_k_db         power of the line of sight over that of all scattered rays together;
+                            inf: only the line of sight, -inf: none. 9 to 15 dB were measured at
                             28 GHz with line of sight (M. Samimi et al. 2016)
         clusters            number of clusters, in uniformly random directions, independent at the
                             node and at the UAV
@@ -53,7 +53,7 @@ class SalehValenzuela:
                             along each of two axes across
 
     The defaults of clusters, rays and spread are those of El Ayach et al. Raises ``ValueError`` for
-    numbers that describe no channel.
+    invalid numbers.
     """
 
     rician_k_db: float = 10.0
@@ -63,7 +63,7 @@ class SalehValenzuela:
 
     def __post_init__(self) -> None:
         if math.isnan(self.rician_k_db):
-            raise ValueError("rician_k_db must be a number; inf is the line of sight alone")
+            raise ValueError("rician_k_db is not a number; inf means only the line of sight")
         if self.clusters < 1 or self.rays_per_cluster < 1:
             raise ValueError(
                 f"clusters {self.clusters} and rays_per_cluster {self.rays_per_cluster} "
@@ -91,7 +91,7 @@ def draw(
     directions_at_uav: FloatArray,
     rng: "np.random.Generator",
 ) -> ComplexArray:
-    """Draw H for N UAVs, independent of one another: shape (N, N_U, M).
+    """Draw H for N independent UAVs: shape (N, N_U, M).
 
         directions_at_node  (N, 3), unit directions of the line of sight to the UAVs, array frame
         directions_at_uav   (N, 3), unit directions to the node, in the frame of each UAV's
@@ -100,8 +100,7 @@ def draw(
 
     The mean of |H|^2 (Frobenius) is N_U M times the element gains at both ends: towards the line of
     sight in its share of the power, averaged over all directions in the rest. It is N_U M for
-    isotropic elements. Raises ``ValueError`` unless there are as many directions at one end as at
-    the other.
+    isotropic elements. Raises ``ValueError`` if the numbers of directions differ.
     """
     users = len(directions_at_node)
     if directions_at_node.shape != (users, 3) or directions_at_uav.shape != (users, 3):
@@ -131,15 +130,15 @@ def _ray_directions(
 ) -> FloatArray:
     """Unit directions (N * rays, 3), user by user and cluster by cluster.
 
-    The axes across a cluster are turned at random about it, so that no direction of space is
-    special: a single ray is uniform on the sphere.
+    The axes across a cluster are rotated at random about it, so that no direction is preferred: a
+    single ray is uniform on the sphere.
     """
     centres = _unit(rng.standard_normal((users, settings.clusters, 1, 3)))
     across = rng.standard_normal(centres.shape)
     across = _unit(across - np.sum(across * centres, axis=-1, keepdims=True) * centres)
     other = np.cross(centres, across)
     offsets = rng.laplace(
-        scale=settings.angular_spread_rad / math.sqrt(2),  # of that standard deviation
+        scale=settings.angular_spread_rad / math.sqrt(2),  # for that standard deviation
         size=(users, settings.clusters, settings.rays_per_cluster, 2),
     )
     away = offsets[..., :1] * across + offsets[..., 1:] * other
@@ -159,9 +158,9 @@ def combined_rows(channels: ComplexArray, uav_steering: ComplexArray) -> Complex
         channels      (N, N_U, M)
         uav_steering  (N_U, N), b_i, one column per UAV
 
-    The combiner is matched to the UAV's own steering of the line of sight, w = b / |b|, of unit
-    norm: the noise stays that of one antenna, and the line of sight gains |b|^2 in power (N_U if
-    isotropic). Raises ``ValueError`` where the shapes disagree or a UAV's antennas hear nothing
+    The combiner is matched to the UAV's own steering vector of the line of sight, w = b / |b|, of
+    unit norm: the noise stays that of one antenna, and the line of sight gains |b|^2 in power (N_U
+    if isotropic). Raises ``ValueError`` if the shapes disagree or a UAV's antennas receive nothing
     from there.
     """
     users, antennas, _ = channels.shape
@@ -178,11 +177,11 @@ def combined_rows(channels: ComplexArray, uav_steering: ComplexArray) -> Complex
 
 @dataclass(frozen=True, slots=True)
 class Blockages:
-    """When the link to one UAV is blocked, and how deeply.
+    """Blockages of the link to one UAV.
 
         intervals_s  starts and ends, seconds from the start of the study, start included and end
-                     excluded; kept in order and merged where they meet
-        depth_db     0 or more; weakens every path alike, in each direction of the link
+                     excluded; sorted, and merged where they touch
+        depth_db     0 or more; attenuates every path equally, in each direction of the link
 
     Raises ``ValueError`` for an interval that ends before it starts, or a negative depth.
     """
@@ -210,7 +209,7 @@ class Blockages:
         return np.asarray(begun > np.searchsorted(edges[:, 1], t_s, side="right"))
 
     def attenuation_db(self, t_s: float | FloatArray) -> FloatArray:
-        """Loss one way at times ``t_s``: the depth or 0 dB; shape as ``t_s``."""
+        """One-way loss at times ``t_s``: the depth or 0 dB; shape as ``t_s``."""
         return np.where(self.blocked(t_s), self.depth_db, 0.0)
 
 
@@ -221,11 +220,11 @@ def draw_blockages(
     mean_s: float,
     depth_db: float = 25.0,
 ) -> Blockages:
-    """Draw blockages that begin at random (Poisson, ``rate_hz``) and last an exponential time.
+    """Draw blockages with random starts (Poisson, ``rate_hz``) and exponential durations.
 
-    None is under way at time 0; the last may outlast ``duration_s``. Long after the start the link
-    is blocked for 1 - exp(-rate mean) of the time. Raises ``ValueError`` unless all are finite,
-    ``mean_s`` above 0 and the others at least 0.
+    None is in progress at time 0; the last may outlast ``duration_s``. Long after the start the
+    link is blocked for 1 - exp(-rate mean) of the time. Raises ``ValueError`` unless all are
+    finite, ``mean_s`` above 0 and the others at least 0.
     """
     if not (0 <= duration_s < math.inf and 0 <= rate_hz < math.inf and 0 < mean_s < math.inf):
         raise ValueError(

@@ -3,20 +3,19 @@
 A cone holds every direction within an angle of a predicted one. Directions are written in polar
 form about a pole, u = cos r p + sin r (cos t e1 + sin t e2), and a cell is a box in r and t. For
 most arrays the pole is the predicted direction: rings and sectors tile the cone exactly, and no
-cell reaches over its rim. The elements of a line, if they all face alike, see a direction only by
-its angle r to the line. There the pole is the line and a cell is an interval of r; the intervals
-cover the predicted angle plus and minus the bound.
+cell crosses its rim. If the elements are on a line and all face alike, they resolve only the angle
+r to the line. Then the pole is the line and a cell is an interval of r; the intervals cover the
+predicted angle plus and minus the bound.
 
 The response of weights f to u is r(u) = sum f_m g_m(u) exp(jk p_m . u). Let u = u_s + d with u_s
-the middle of a cell, q_m the positions about any point c (which only turns r by exp(-jk c . u)),
-c_m = f_m g_m exp(jk q_m . u_s) with g_m held. From |exp(jx) - 1 - jx| <= x^2/2, for any real x,
+the middle of a cell, q_m the positions about any point c (which only rotates r by exp(-jk c . u)),
+c_m = f_m g_m exp(jk q_m . u_s) with g_m constant. From |exp(jx) - 1 - jx| <= x^2/2, for any real x,
 
     |r(u) - r_s - G.d| <= k^2/2 sum w_m (q_m . d)^2,   r_s = sum c_m,   G = jk sum c_m q_m
 
 for any w_m >= |c_m|. With d in a frame of three axes and each coordinate bounded over the cell,
 this bounds |r| from below, by its part in phase with r_s, and from above. The variation of g_m over
-the cell is added as an interval, or taken out as a factor where all elements face alike. See
-docs/math.md 5.4.
+the cell is added as an interval, or factored out if all elements face alike. See docs/math.md 5.4.
 
 Over 300 lines: one proof: the cells of a cone, the bound over a cell, and the search over cells.
 """
@@ -32,22 +31,22 @@ from companion.beams.array.geometry import SAME_PLACE_WAVELENGTHS, Array
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 MOST_INTERVALS: Final = 512
-"""Most first cells of one cone on a line; those still in doubt are split further."""
+"""Most initial cells of one cone on a line; undecided ones are split further."""
 MOST_RINGS: Final = 16
-"""Most rings of first cells of one cone elsewhere; those still in doubt are split further."""
+"""Most rings of initial cells of one cone elsewhere; undecided ones are split further."""
 LINE_PHASE_RAD: Final = 0.12  # on a line
 DISC_PHASE_RAD: Final = 0.25  # elsewhere
-"""RMS phase of the elements from the middle of a first cell to its end.
+"""RMS phase of the elements from the middle of an initial cell to its end.
 
-Half of its square is the bounds' error, as a share of the largest response possible.
+Half of its square is the error of the bounds, relative to the largest possible response.
 """
 ROUNDING_RAD: Final = 1e-12
-"""Angle added wherever a pattern is bounded within an angle, for rounding."""
+"""Rounding margin, added to the angle wherever a pattern is bounded within an angle."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DirectionCones:
-    """N cones of directions, and what bounds the responses of one array over them.
+    """N cones of directions, with the data that bound the responses of one array over them.
 
     w are the largest magnitudes of the weights, patterns included if they differ.
     """
@@ -67,9 +66,9 @@ class DirectionCones:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Boxes:
-    """C cells as boxes in angle from the pole and turn about it, in the order of their cones.
+    """C cells as boxes in angle from the pole and rotation about it, in the order of their cones.
 
-    On a line the turn is whatever the cone leaves, and the second column is unused.
+    On a line the cone limits the rotation, and the second column is unused.
     """
 
     cone: IntArray  # (C,), the cone of each
@@ -77,7 +76,7 @@ class Boxes:
     high: FloatArray  # (C, 2), upper ends
 
     def take(self, chosen: BoolArray | slice) -> "Boxes":
-        """The boxes chosen by a mask or by a slice."""
+        """Return the boxes selected by a mask or by a slice."""
         return Boxes(self.cone[chosen], self.low[chosen], self.high[chosen])
 
 
@@ -86,7 +85,7 @@ class Cells:
     """C cells in space, each in the union of its K caps.
 
     Any direction of a cell differs from its middle by a sum of axes, each times at most its reach.
-    A line has one axis, as it does not see the others.
+    A line has one axis, as it does not resolve the others.
     """
 
     cone: IntArray  # (C,), the cone of each
@@ -99,31 +98,31 @@ class Cells:
 
 
 def unit_directions(directions: FloatArray, bounds_rad: FloatArray) -> FloatArray:
-    """Unit directions (N, 3), scaled to length 1 exactly.
+    """Return unit directions (N, 3), scaled to length 1 exactly.
 
     Raises ``ValueError`` if a length is off by more than 1e-6, or if a bound of ``bounds_rad`` (N,)
     is missing or negative.
     """
     if directions.ndim != 2 or directions.shape[1] != 3:
-        raise ValueError(f"directions are rows of three, not of shape {directions.shape}")
+        raise ValueError(f"directions have shape {directions.shape}; give rows of three")
     lengths = np.sqrt(np.einsum("nk,nk->n", directions, directions))
     if not (np.abs(lengths - 1) < 1e-6).all():
-        raise ValueError("directions are unit vectors")
+        raise ValueError("directions must be unit vectors")
     if bounds_rad.shape != lengths.shape or not (bounds_rad >= 0).all():
-        raise ValueError("each direction has one pointing bound, 0 or more radians")
+        raise ValueError("give one pointing bound, 0 or more radians, for each direction")
     unit: FloatArray = directions / lengths[:, np.newaxis]
     return unit
 
 
 def unit_power(array: Array, weights: ComplexArray) -> ComplexArray:
-    """Weights (M, K) with each column scaled to unit power.
+    """Return weights (M, K) with each column scaled to unit power.
 
-    Raises ``ValueError`` where they do not fit the array, are not finite, or a column is zero.
+    Raises ``ValueError`` if they do not match the array, are not finite, or a column is zero.
     """
     if weights.ndim != 2 or len(weights) != array.size:
-        raise ValueError(f"weights of shape {weights.shape} are not for {array.size} elements")
+        raise ValueError(f"weights of shape {weights.shape} do not match {array.size} elements")
     if not np.isfinite(weights).all():
-        raise ValueError("weights are finite numbers")
+        raise ValueError("weights must be finite")
     largest = np.abs(weights).max(axis=0)
     if not largest.all():
         raise ValueError(f"column {int(np.argmin(largest))} of the weights is zero")
@@ -133,7 +132,7 @@ def unit_power(array: Array, weights: ComplexArray) -> ComplexArray:
 
 
 def faces_apart(array: Array) -> bool:
-    """Whether the elements radiate differently, so that their pattern is no common factor."""
+    """Return whether element patterns differ, so that they are no common factor."""
     return (
         array.element_from_array is not None
         and array.element.pattern is not ElementPattern.ISOTROPIC
@@ -143,9 +142,9 @@ def faces_apart(array: Array) -> bool:
 def cones_around(
     array: Array, directions: FloatArray, bounds_rad: FloatArray, magnitudes: FloatArray
 ) -> DirectionCones:
-    """Cones within ``bounds_rad`` (N,) of unit directions (N, 3).
+    """Return cones within ``bounds_rad`` (N,) of unit directions (N, 3).
 
-    They are for the responses of weights that are at most ``magnitudes`` (M, N).
+    They apply to responses of weights that are at most ``magnitudes`` (M, N).
     """
     centred = array.centred_m
     far = centred[np.argmax(np.einsum("mk,mk->m", centred, centred))]
@@ -159,7 +158,7 @@ def cones_around(
         magnitudes = magnitudes * array.element.amplitude_range(towards, bounds_rad)[1]
     columns = np.flatnonzero(np.abs(centred).max(axis=0) > 0)
     positions = centred[:, columns]
-    ceilings = np.maximum(magnitudes.sum(axis=0), 1e-300)  # 0: nothing radiates there
+    ceilings = np.maximum(magnitudes.sum(axis=0), 1e-300)  # 0: no element radiates there
     centres = magnitudes.T @ positions / ceilings[:, np.newaxis]
     moments = np.einsum("mn,mi,mj->nij", magnitudes, positions, positions)
     moments -= ceilings[:, np.newaxis, np.newaxis] * np.einsum("ni,nj->nij", centres, centres)
@@ -187,14 +186,14 @@ def cones_around(
 def _frames(poles: FloatArray, towards: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Pole, e1 and e2 as rows (N, 3, 3), and the angle (N,) from the pole to ``towards``.
 
-    e1 is on the side of ``towards`` where that differs from the pole.
+    e1 is on the side of ``towards`` if that differs from the pole.
     """
     cosines = np.einsum("nk,nk->n", poles, towards)
     aside = towards - cosines[:, np.newaxis] * poles
     sines = np.sqrt(np.einsum("nk,nk->n", aside, aside))
     least = np.eye(3)[np.argmin(np.abs(poles), axis=1)]
     e1 = np.where((sines > 1e-15)[:, np.newaxis], aside, least)
-    for _ in range(2):  # twice: what rounding leaves along the pole of a short vector is not small
+    for _ in range(2):  # twice: for a short vector the residual along the pole is not small
         e1 /= np.sqrt(np.einsum("nk,nk->n", e1, e1))[:, np.newaxis]
         e1 -= np.einsum("nk,nk->n", e1, poles)[:, np.newaxis] * poles
     e1 /= np.sqrt(np.einsum("nk,nk->n", e1, e1))[:, np.newaxis]
@@ -202,14 +201,14 @@ def _frames(poles: FloatArray, towards: FloatArray) -> tuple[FloatArray, FloatAr
 
 
 def first_boxes(cones: DirectionCones) -> Boxes:
-    """Boxes that cover every cone, finer where the phases of the elements turn faster."""
+    """Return boxes that cover every cone, finer where the phases of the elements change faster."""
     spread = np.einsum("nii->ni", cones.curvatures).max(axis=1, initial=0.0) / cones.ceilings
     turned_rad = np.sqrt(np.maximum(spread, 0.0)) * cones.bounds_rad
     if cones.line:
         wanted = np.clip(turned_rad / LINE_PHASE_RAD, 1, MOST_INTERVALS)
     else:
         wanted = np.clip(turned_rad / (2 * DISC_PHASE_RAD), 1, MOST_RINGS)
-    counts = 2 ** np.ceil(np.log2(wanted)).astype(np.int64)  # few different ones: built at once
+    counts = 2 ** np.ceil(np.log2(wanted)).astype(np.int64)  # few different counts
     found = []
     for count in np.unique(counts):
         low, high = _intervals(count) if cones.line else _sectors(count)
@@ -228,13 +227,13 @@ def first_boxes(cones: DirectionCones) -> Boxes:
 
 
 def _intervals(count: int) -> tuple[FloatArray, FloatArray]:
-    """Ends of ``count`` equal parts of -1 to 1; the turn is unused."""
+    """Ends of ``count`` equal parts of -1 to 1; the rotation is unused."""
     ends = np.stack([np.linspace(-1.0, 1.0, count + 1), np.zeros(count + 1)], axis=1)
     return ends[:-1], ends[1:]
 
 
 def _sectors(rings: int) -> tuple[FloatArray, FloatArray]:
-    """Rings of the unit disc, the n-th cut into 6n sectors about as long as they are wide."""
+    """Rings of the unit disc, the n-th divided into 6n sectors about as long as they are wide."""
     parts = 6 * np.arange(1, rings + 1)
     ring = np.repeat(np.arange(rings), parts)
     sector = np.arange(len(ring)) - np.repeat(np.cumsum(parts) - parts, parts)
@@ -244,7 +243,7 @@ def _sectors(rings: int) -> tuple[FloatArray, FloatArray]:
 
 
 def split(cones: DirectionCones, boxes: Boxes) -> Boxes:
-    """Each box in four: quarters of the angle on a line, else halves both ways."""
+    """Split each box in four: quarters of the angle on a line, else halves both ways."""
     angles, turns = (4, 1) if cones.line else (2, 2)
     quarter = np.stack(np.divmod(np.arange(angles * turns), turns), axis=1)
     size = ((boxes.high - boxes.low) / [angles, turns])[:, np.newaxis]
@@ -255,7 +254,7 @@ def split(cones: DirectionCones, boxes: Boxes) -> Boxes:
 
 
 def cells(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
-    """The boxes in space.
+    """Return the boxes in space.
 
     ``caps`` is the number of caps that cover the arc of a cell on a line, an odd number; 1 does not
     cover it, for callers that need no pattern.
@@ -264,7 +263,7 @@ def cells(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
 
 
 def _strips(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
-    """Cells of a line: arcs of the cone about it, of which it sees the angle alone."""
+    """Cells of a line: arcs of the cone about it, of which only the angle matters."""
     low, high = boxes.low[:, 0], boxes.high[:, 0]
     angle, half = (low + high) / 2, (high - low) / 2
     frames = cones.frames[boxes.cone]
@@ -291,7 +290,7 @@ def _strips(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
 
 
 def _turn_rad(cones: DirectionCones, boxes: Boxes) -> FloatArray:
-    """The largest turn about the line at which a direction is both in the cell and in its cone.
+    """Largest rotation about the line at which a direction is both in the cell and in its cone.
 
     sin^2(t / 2) = sin((bound + r - tilt) / 2) sin((bound - r + tilt) / 2) / (sin r sin tilt); its
     only extreme between the ends of r is where cos r = cos tilt / cos bound.
@@ -338,7 +337,7 @@ def _patches(cones: DirectionCones, boxes: Boxes) -> Cells:
 
 
 def _polar(frames: FloatArray, angle: FloatArray, turn: FloatArray) -> FloatArray:
-    """Unit directions (C, K, 3) at angles (C, 1 or K) from the poles, turns (C, K) about them."""
+    """Unit directions (C, K, 3) at angles (C, 1 or K) from, rotations (C, K) about the poles."""
     sine = np.sin(angle)
     parts = np.stack(
         np.broadcast_arrays(np.cos(angle), sine * np.cos(turn), sine * np.sin(turn)), axis=2
@@ -348,14 +347,14 @@ def _polar(frames: FloatArray, angle: FloatArray, turn: FloatArray) -> FloatArra
 
 
 def _highest_sine(boxes: Boxes) -> FloatArray:
-    """The largest sin r in each box."""
+    """Largest sin r in each box."""
     low, high = boxes.low[:, 0], boxes.high[:, 0]
     sines: FloatArray = np.sin(np.clip(np.pi / 2, low, high))
     return sines
 
 
 def _inward(boxes: Boxes, width: FloatArray) -> FloatArray:
-    """Upper bound on 1 - u . u_s for turns within ``width`` (C, 1) of the middle's.
+    """Upper bound on 1 - u . u_s for rotations within ``width`` (C, 1) of the middle's.
 
     u . u_s = cos(r - r_s) - sin r sin r_s (1 - cos(t - t_s)).
     """
@@ -366,7 +365,7 @@ def _inward(boxes: Boxes, width: FloatArray) -> FloatArray:
 
 
 def _angle_rad(inward: FloatArray) -> FloatArray:
-    """The angle whose cosine is 1 - ``inward``, with a margin for rounding."""
+    """Angle whose cosine is 1 - ``inward``, with a margin for rounding."""
     angle: FloatArray = 2 * np.arcsin(np.sqrt(np.minimum(inward / 2, 1.0))) + ROUNDING_RAD
     return angle
 
@@ -374,8 +373,8 @@ def _angle_rad(inward: FloatArray) -> FloatArray:
 def phasors(cones: DirectionCones, pieces: Cells) -> tuple[ComplexArray, FloatArray | None]:
     """Response of each element to the middle of each cell, (M, C), and its largest change in it.
 
-    The change is None where all elements face alike; their pattern is then left out. Phases are
-    from the origin of the array frame, which is as good a point as any other.
+    The change is None if all elements face alike; their pattern is then left out. Phases are from
+    the origin of the array frame; any other point would do.
     """
     received = steering.phase_factors(cones.array, pieces.middles)
     if not faces_apart(cones.array):
@@ -404,7 +403,7 @@ def response_range(
     balanced = [(m - about[b] * responses) * turned for b, m in enumerate(moments)]
     for d in range(pieces.reach.shape[1]):
         slope = sum(part * pieces.axes[:, d, b] for b, part in enumerate(balanced))
-        # jk turns the parts: what is in phase with the response is the imaginary part.
+        # jk swaps the parts: the imaginary part is in phase with the response.
         slopes[0] += np.abs(np.imag(slope)) * pieces.reach[:, d]
         slopes[1] += np.abs(np.real(slope)) * pieces.reach[:, d]
     slopes *= cones.array.wavenumber_radpm

@@ -1,10 +1,10 @@
-"""Guaranteed gain: the least array gain over all directions in which the UAV can truly be.
+"""Guaranteed gain: the least array gain over all possible directions of the UAV.
 
 The array gain of weights f towards u is |a(u)^T f|^2 / |f|^2. Its least over the cone of the
 pointing bound is found by branch and bound: cells whose bound could still be the least are split
-until bound and attained gain agree (``TOLERANCE_DB``) or the work is spent. The result is a bound
-over every cell, whenever the search ends: never above the true least gain, never below the true
-largest. See docs/math.md 5.4 and 7.
+until bound and attained gain agree (``TOLERANCE_DB``) or the work limit is reached. The result is a
+bound over every cell, whenever the search ends: never above the true least gain, never below the
+true largest. See docs/math.md 5.4 and 7.
 """
 
 import math
@@ -28,7 +28,7 @@ NOTHING_DB: Final = 40.0
 """Depth below the weights' greatest possible gain beyond which a gain is not refined."""
 LEVELS: Final = 12  # most rounds of splitting cells
 CAPS: Final = 8
-"""Caps, plus one, that cover the arc of a first cell on a line; each split doubles them."""
+"""Caps, plus one, that cover the arc of an initial cell on a line; each split doubles them."""
 MOST_SPLIT: Final = 4096  # most cells split for one cone; those with many caps count as more
 BLOCK: Final = 2**18  # elements or caps, times cells, computed at once: some megabytes
 
@@ -39,18 +39,18 @@ def guaranteed_gains_db(
     pointing_bounds_rad: Sequence[float | None],
     weights: ComplexArray,
 ) -> tuple[float | None, ...]:
-    """Least array gain that each beam is proven to have within its pointing bound, dB.
+    """Least array gain of each beam within its pointing bound, proven, dB.
 
         directions           (N, 3), unit directions, array frame
         pointing_bounds_rad  (N,), half angles of the cones; None: any direction
         weights              (M, N), column n for row n of the directions
 
-    Element patterns and coupling are included, and what the channels may be off; the power is that
-    of the weights, dead elements left out. A result is None where nothing is proven: the cone holds
-    a null, or has no bound. The true minimum is at most ``TOLERANCE_DB`` above the result, unless
-    it lies ``NOTHING_DB`` down or the work is spent: over cones many beams wide, or where directive
+    Element patterns, coupling and channel errors are included; the power is that of the weights of
+    live elements. A result is None if nothing is proven: the cone contains a null, or has no bound.
+    The true minimum is at most ``TOLERANCE_DB`` above the result. Exceptions: it is more than
+    ``NOTHING_DB`` down, or the work limit is reached: over cones many beams wide, or if directive
     elements face apart and the weights set them against one another (tenths of a dB). Raises
-    ``ValueError`` for weights that are zero or do not fit.
+    ``ValueError`` for weights that are zero or do not match.
     """
     unit, bounds = _cones(directions, pointing_bounds_rad)
     powered = cone.unit_power(array, array.fed(weights))
@@ -79,8 +79,8 @@ def leakage_bounds(
         pointing_bounds_rad  (N,), half angles of the cones; None: any direction
         weights              (M, J)
 
-    Powers apart, this is the most that UAV i can receive of UAV j's stream. The true maximum is at
-    most ``TOLERANCE_DB`` below, with the exceptions of ``guaranteed_gains_db``.
+    Up to the powers, this bounds what UAV i receives of UAV j's stream. The true maximum is at most
+    ``TOLERANCE_DB`` below, with the exceptions of ``guaranteed_gains_db``.
     """
     unit, bounds = _cones(directions, pointing_bounds_rad)
     powered = cone.unit_power(array, array.fed(weights))
@@ -92,7 +92,7 @@ def leakage_bounds(
 
 
 def _cones(directions: FloatArray, given: Sequence[float | None]) -> tuple[FloatArray, FloatArray]:
-    """Unit directions and their bounds, checked; no bound becomes half a turn."""
+    """Return checked unit directions and their bounds; no bound becomes pi."""
     bounds = np.array([np.pi if bound is None else bound for bound in given], dtype=float)
     return cone.unit_directions(directions, bounds), bounds
 
@@ -100,9 +100,9 @@ def _cones(directions: FloatArray, given: Sequence[float | None]) -> tuple[Float
 def _off(
     array: Array, unit: FloatArray, bounds: FloatArray, weights: ComplexArray
 ) -> FloatArray | float:
-    """Most (N,) that errors of the channels change the response of column n over cone n.
+    """Return the largest change (N,) of the response of column n over cone n by channel errors.
 
-    The sum of what each may do to its element's part, as if all errors added up.
+    The sum over elements, as if all errors added up.
     """
     if array.channel_error is None:
         return 0.0
@@ -118,7 +118,7 @@ def _off(
 def _extremes(
     array: Array, unit: FloatArray, bounds: FloatArray, weights: ComplexArray, most: bool
 ) -> FloatArray:
-    """The least response (N,) of column n over cone n.
+    """Return the least response (N,) of column n over cone n.
 
     With ``most``, the largest, negated: everything is then negated, so that it is a least as well.
     """
@@ -151,7 +151,7 @@ def _extremes(
 def _over_boxes(
     cones: DirectionCones, boxes: Boxes, weights: ComplexArray, caps: int, most: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """For each box a proven lower bound (C,) of the least response, and a value attained in it."""
+    """Return for each box a lower bound (C,) of the least response, and an attained value."""
     step = max(1, BLOCK // max(cones.array.size, caps))
     starts = range(0, len(boxes.cone), step)
     parts = [
@@ -186,7 +186,7 @@ def _by_cone(
 ) -> ComplexArray:
     """For each cell the response of its cone's weights, and its moments by position, (1 + B, C).
 
-    Cells are in the order of their cones, so that each cone's are one product of matrices.
+    Cells are in the order of their cones, so that each cone needs one matrix product.
     """
     parts = np.vstack([np.ones(len(weights)), cones.positions_m.T])
     first = int(cone_of[0])
@@ -204,9 +204,8 @@ def covered_bounds(
     directions: FloatArray,
     pointing_bounds_rad: Sequence[float | None],
 ) -> list[float | None]:
-    """The bounds of unit directions (N, 3) in the array frame.
-
-    None where a cone leaves the coverage.
+    """Return the bounds of unit directions (N, 3) in the array frame, None if a cone leaves the
+    coverage.
 
     A UAV may then be outside the coverage, and nothing is guaranteed.
     """

@@ -73,9 +73,8 @@ def share_power(
     """Weights (M, N) with the total power shared equally by the streams of each group.
 
     Column j becomes f_j / |f_j| sqrt(power / streams of its group), in square roots of watts;
-    ``groups`` (N,) numbers each UAV's slot (None: all at once). A column of zeros is a stream that
-    is not sent: it stays, and the others share its power. Raises ``ValueError`` for a power not
-    above 0.
+    ``groups`` (N,) numbers each UAV's slot (None: all at once). A column of zeros is an inactive
+    stream: it stays, and the others share its power. Raises ``ValueError`` for a power not above 0.
     """
     if not 0 < power_w < math.inf:
         raise ValueError(f"power_w {power_w} must be finite and above 0")
@@ -101,7 +100,7 @@ def sinr(
         noise_power_w  after combining with unit norm
         groups         (N,), the slot of each UAV; None: all at once
 
-    Raises ``ValueError`` where shapes disagree or the noise is not above 0.
+    Raises ``ValueError`` if shapes disagree or the noise is not above 0.
     """
     users = responses.shape[-1]
     if responses.shape[-2] != users or path_gains.shape[-1:] != (users,):
@@ -114,14 +113,14 @@ def sinr(
     received = path_gains[..., np.newaxis] * np.abs(responses) ** 2
     others = _together(groups, users) - np.eye(users)
     wanted = np.einsum("...ii->...i", received)
-    # Masked, not total less wanted: interference is often far below the rounding of the signal.
+    # A mask avoids cancellation: interference is often far below the rounding of the signal.
     interference = np.einsum("...ij,ij->...i", received, others)
     ratio: FloatArray = wanted / (interference + noise_power_w)
     return ratio
 
 
 def _together(groups: IntArray | None, users: int) -> FloatArray:
-    """(N, N): 1 where two UAVs are served at the same time, else 0."""
+    """(N, N): 1 if two UAVs are served at the same time, else 0."""
     if groups is None:
         return np.ones((users, users))
     if groups.shape != (users,):
@@ -152,9 +151,9 @@ def transmitted(
     groups: IntArray | None = None,
     normalisation: Normalisation = Normalisation.TOTAL,
 ) -> ComplexArray:
-    """Weights (M, N) as they are sent, in square roots of watts: one factor for all of a group.
+    """Weights (M, N) as transmitted, in square roots of watts: one factor for all of a group.
 
-        weights        as they are delivered
+        weights        as published
         power_w        power of all streams of a group together
         groups         (N,), the slot of each UAV; None: all at once
         normalisation  ``ANTENNA``: no element sends more than ``power_w`` / M; else the group sends
@@ -180,17 +179,17 @@ def predicted_sinr_db(
     budget: LinkBudget,
     uav_antennas: int = 1,
 ) -> FloatArray:
-    """SINR that each UAV will have on the line of sight, dB, (N,).
+    """Predicted SINR of each UAV on the line of sight, dB, (N,).
 
         directions    (N, 3), predicted unit directions, array frame
         ranges_m      (N,), predicted ranges
-        sent          (M, N), weights as they are sent (``transmitted``)
+        sent          (M, N), weights as transmitted (``transmitted``)
         groups        (N,), the slot of each UAV; None: all at once
         budget        noise
         uav_antennas  isotropic antennas of each UAV, combined towards the node
 
-    Free space, no scattering, no blockage; -inf where no element faces the UAV. Time slots
-    reduce the rate, not the SINR. Raises ``ValueError`` as its parts do.
+    Free space, no scattering, no blockage; -inf if no element faces the UAV. Time slots reduce the
+    rate, not the SINR. Raises ``ValueError`` as its parts do.
     """
     if uav_antennas < 1:
         raise ValueError(f"uav_antennas {uav_antennas} must be at least 1")
@@ -203,7 +202,7 @@ def predicted_sinr_db(
 
 
 def sent_weights(beam_set: BeamSet, budget: LinkBudget) -> ComplexArray:
-    """The weights (M, N) of an update as they are sent, in square roots of watts."""
+    """Weights (M, N) of an update as transmitted, in square roots of watts."""
     slots, normalisation = beam_set.slots, beam_set.normalisation
     return transmitted(beam_set.weights, budget.tx_power_w, slots, normalisation)
 
@@ -215,7 +214,7 @@ def sinr_of_beams_db(
     budget: LinkBudget,
     uav_antennas: int = 1,
 ) -> FloatArray:
-    """SINR (N,) that the UAVs of an update have in these unit directions (N, 3), dB."""
+    """SINR (N,) of the UAVs of an update in given unit directions (N, 3), dB."""
     sent = sent_weights(beam_set, budget)
     ranges_m, slots = beam_set.ranges_m, beam_set.slots
     return predicted_sinr_db(
@@ -241,14 +240,14 @@ def least_sinr_db(
     wavelength_m: float,
     uav_antennas: int = 1,
 ) -> FloatArray:
-    """Least SINR that some of N UAVs have on the line of sight, dB, (K,).
+    """Least SINR of some of N UAVs on the line of sight, dB, (K,).
 
         least_gains  (K,), least array gain of each one's own beam, linear
         leaks        (K, N), largest array gain of each beam towards it, linear
-        users        (K,), indices below N of the UAVs asked about
+        users        (K,), indices below N of these UAVs
         farthest_m   (K,), largest possible ranges
         groups       (N,), the slot of each UAV
-        powers_w     (N,), power that each beam is sent with
+        powers_w     (N,), transmitted power of each beam
         budget       noise
 
     The SINR falls with range, with leakage and with less gain, so the three worst together give the

@@ -3,11 +3,10 @@
 The response of weights f towards u is the array gain |a(u)^T f|^2 / |f|^2, in dB, element gain
 included: 0 dB is one isotropic element at the same power (docs/math.md 7).
 
-An *azimuth cut* runs along a parallel: azimuth varies, elevation is fixed. An *elevation cut* runs
-along a meridian: elevation varies, azimuth is fixed. Lobes are measured on whole circles, so that a
-lobe may lie across azimuth 180 degrees or over a pole. Everything is found on the exact pattern: by
-a scan of at least eight points to the narrowest lobe that the array can make, then by narrowing
-down.
+An *azimuth cut* follows a parallel: azimuth varies, elevation is fixed. An *elevation cut* follows
+a meridian: elevation varies, azimuth is fixed. Lobes are measured on whole circles, so that a lobe
+may lie across azimuth 180 degrees or over a pole. All measures are those of the exact pattern: by a
+scan of at least eight points per narrowest possible lobe, then by refinement.
 
 Over 300 lines: the cut, its lobes and their measures share one refinement of angles.
 """
@@ -25,18 +24,18 @@ from companion.values import ComplexArray, FloatArray
 FLOOR_DB: Final = -200.0
 """Lowest value returned, also for an exact null: JSON has no minus infinity."""
 BLOCK: Final = 8192  # entries of a steering matrix computed at once, so that they stay in the cache
-POINTS_PER_SIDE_LOBE: Final = 8  # points of a scan over the narrowest lobe that the array can make
+POINTS_PER_SIDE_LOBE: Final = 8  # points of a scan per narrowest possible lobe
 LEAST_POINTS: Final = 360  # least number of points of a scan around a circle
-NEAR: Final = 64  # points examined first to either side of a peak; nearly always they suffice
+NEAR: Final = 64  # points examined first to either side of a peak; they nearly always suffice
 SECTIONS: Final = np.linspace(0.0, 1.0, 17)
-"""Places examined to narrow an interval: 16 times for a crossing, 8 times for an extreme."""
+"""Relative positions examined to narrow an interval: 16 times for a crossing, 8 for an extreme."""
 HALVING_ROUNDS: Final = 10
 EXTREME_ROUNDS: Final = 12
 RIVALS_DB: Final = 0.5
 """Difference to the highest side lobe of the scan within which another may be the highest."""
-ABREAST: Final = 1e-4  # boresight component below which a direction counts as square to boresight
+ABREAST: Final = 1e-4  # boresight component below which a direction counts as perpendicular to it
 RIPPLE_DB: Final = 1.0
-"""How far the gain may rise above the peak within a lobe, as it does on a broadened one."""
+"""Largest rise of the gain above the peak within a lobe, as in a broadened one."""
 CLIMB_MOVES: Final = 400
 SINGULAR: Final = 1e-9  # slope and curvature, relative to the gain, below which they are rounding
 
@@ -49,8 +48,8 @@ _QUADRATIC = np.linalg.pinv(np.stack([_X**0, _X, _Y, _X**2 / 2, _X * _Y, _Y**2 /
 def response_db(array: Array, weights: ComplexArray, directions: FloatArray) -> FloatArray:
     """Array gain of weights (M,) towards unit directions (..., 3) in the array frame; dB, (...).
 
-    Never less than ``FLOOR_DB``. Raises ``ValueError`` for weights that are not M finite numbers,
-    or all zero, as do the functions below.
+    At least ``FLOOR_DB``. Raises ``ValueError`` for weights that are not M finite numbers, or all
+    zero, as do the functions below.
     """
     return _db(_gains(array, _unit_power(array, weights), directions))
 
@@ -83,7 +82,7 @@ def elevation_cut(
 def sphere(
     array: Array, weights: ComplexArray, azimuths_rad: FloatArray, elevations_rad: FloatArray
 ) -> FloatArray:
-    """The response in dB on a grid: one row for each elevation, one column for each azimuth."""
+    """Response in dB on a grid: one row for each elevation, one column for each azimuth."""
     azimuth, elevation = np.meshgrid(azimuths_rad, elevations_rad)
     level = np.cos(elevation)
     directions = np.stack(
@@ -101,17 +100,17 @@ def null_depths_db(
 
 @dataclass(frozen=True, slots=True)
 class CutLobe:
-    """A lobe in one cut through its peak; angles of the cut, radians.
+    """Lobe in one cut through its peak; angles of the cut, radians.
 
-        half_power_width_rad  between the nearest places on either side where the gain falls to half
+        half_power_width_rad  between the nearest points on either side where the gain falls to half
         first_nulls_rad       the first minimum beyond them on either side, as angles from the peak,
                               (below 0, above 0)
         side_lobe_db          the highest maximum outside of those, less the peak
 
-    The first two are None where the gain never falls to half, or first rises a decibel above the
-    peak (the flank of a stronger lobe); the third also where there is no other maximum. An array
-    whose elements all stand in one plane across boresight and face alike cannot tell front from
-    back: the mirror lobe behind is not counted as a side lobe.
+    The first two are None if the gain never falls to half, or first rises a decibel above the peak
+    (the flank of a stronger lobe); the third also if there is no other maximum. If all elements are
+    in one plane across boresight and face alike, front and back look the same: the mirror lobe
+    behind is not counted as a side lobe.
     """
 
     half_power_width_rad: float | None
@@ -121,7 +120,7 @@ class CutLobe:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lobe:
-    """The lobe that holds a direction: its peak (array frame, gain in dB), and its two cuts."""
+    """Lobe that contains a direction: its peak (array frame, gain in dB), and its two cuts."""
 
     peak_azimuth_rad: float
     peak_elevation_rad: float
@@ -131,9 +130,9 @@ class Lobe:
 
 
 def lobe(array: Array, weights: ComplexArray, direction: FloatArray) -> Lobe:
-    """Measures of the lobe of weights (M,) that holds a unit direction (3,) in the array frame.
+    """Return the lobe of weights (M,) that contains a unit direction (3,) in the array frame.
 
-    The peak is the top of the hill on which the direction stands.
+    Its peak is found by ascent from the direction.
     """
     unit = _unit_power(array, weights)
     peak = _summit(array, unit, direction)
@@ -152,8 +151,8 @@ def half_power_beamwidths_rad(
 ) -> tuple[float | None, float | None]:
     """Full widths at half power, in azimuth and in elevation, of the beam matched to a direction.
 
-    ``direction`` (3,) is a unit vector in the array frame. None where the gain never falls to half
-    along that cut; both are None where the elements radiate nothing towards the direction.
+    ``direction`` (3,) is a unit vector in the array frame. None if the gain never falls to half
+    along that cut; both are None if no element radiates towards the direction.
     """
     matched = steering.steering_matrix(array, direction[np.newaxis])[:, 0].conj()
     if not matched.any():
@@ -177,14 +176,14 @@ class _Circle:
 
     @classmethod
     def parallel(cls, elevation_rad: float) -> Self:
-        """The circle along azimuth, at one elevation."""
+        """Circle along azimuth, at one elevation."""
         level = math.cos(elevation_rad)
         middle = np.array([0.0, 0.0, -math.sin(elevation_rad)])
         return cls(middle, np.array([level, 0.0, 0.0]), np.array([0.0, level, 0.0]))
 
     @classmethod
     def meridian(cls, azimuth_rad: float) -> Self:
-        """The circle along elevation, at one azimuth, continued over the poles."""
+        """Circle along elevation, at one azimuth, continued over the poles."""
         ahead = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
         return cls(np.zeros(3), ahead, np.array([0.0, 0.0, -1.0]))
 
@@ -197,7 +196,7 @@ class _Circle:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Cut:
-    """The pattern of weights of unit power around a circle."""
+    """Pattern of weights of unit power around a circle."""
 
     array: Array
     weights: ComplexArray
@@ -210,7 +209,7 @@ class _Cut:
     def points(self) -> int:
         """Number of points of a scan around the whole circle.
 
-        Between elements 2 r apart in the plane of the circle the phase turns by at most 2 k r a
+        Between elements 2 r apart in the plane of the circle the phase changes by at most 2 k r per
         radian, and no fringe of the pattern is finer.
         """
         centred = self.array.centred_m
@@ -221,7 +220,7 @@ class _Cut:
 
 def _span(half_rad: float, points: int) -> FloatArray:
     if points < 2:
-        raise ValueError(f"a cut of {points} points: it has at least 2")
+        raise ValueError(f"cut has {points} points; give at least 2")
     return np.linspace(-half_rad, half_rad, points)
 
 
@@ -231,12 +230,12 @@ def _db(gains: FloatArray) -> FloatArray:
 
 
 def _unit_power(array: Array, weights: ComplexArray) -> ComplexArray:
-    """Weights scaled to |f| = 1, in two steps, since squares of very small numbers are 0."""
+    """Scale weights to |f| = 1, in two steps, since squares of very small numbers are 0."""
     if weights.shape != (array.size,) or not np.isfinite(weights).all():
-        raise ValueError(f"the weights are not {array.size} finite numbers, one for each element")
+        raise ValueError(f"weights must be {array.size} finite numbers, one for each element")
     most = np.abs(weights).max()
     if most == 0:
-        raise ValueError("the weights are all zero: they have no pattern")
+        raise ValueError("weights are all zero")
     scaled = weights / most
     unit: ComplexArray = scaled / np.linalg.norm(scaled)
     return unit
@@ -255,11 +254,12 @@ def _gains(array: Array, weights: ComplexArray, directions: FloatArray) -> Float
 
 
 def _summit(array: Array, weights: ComplexArray, direction: FloatArray) -> FloatArray:
-    """The unit direction (3,) at the top of the hill on which ``direction`` stands.
+    """Return the unit direction (3,) of the local maximum that an ascent from ``direction``
+    reaches.
 
     Newton's method on a quadratic through 3 x 3 directions, in steps too short to leave a lobe.
-    They lie along the axes of the array as seen from there, which are mostly those of the hill: on
-    a ridge (a line of elements has its peak on a cone) it goes straight up.
+    They lie along the axes of the array as seen from there, which mostly are those of the maximum:
+    on a ridge (a line of elements has its peak on a cone) it ascends straight.
     """
     centred = array.centred_m
     aperture_m = 2 * float(np.linalg.norm(centred, axis=1).max())
@@ -277,7 +277,7 @@ def _summit(array: Array, weights: ComplexArray, direction: FloatArray) -> Float
         higher = gains[4] >= best
         if higher:
             best, top, onward = gains[4], here, here + reach * (step @ across)
-        else:  # the step before went too far
+        else:  # the previous step was too long
             onward = top
         if higher and np.linalg.norm(step) >= 1:
             reach = min(2 * reach, widest)
@@ -290,10 +290,10 @@ def _summit(array: Array, weights: ComplexArray, direction: FloatArray) -> Float
 
 
 def _uphill(slope: FloatArray, curvature: FloatArray, bend: float) -> FloatArray:
-    """The step (2,) to the top of a quadratic, at most 2 along each of its axes.
+    """Return the step (2,) to the maximum of a quadratic, at most 2 along each of its axes.
 
-    Out of a hollow or off a saddle it goes along the axis that rises most. On a ridge, an apparent
-    rise is that of the sphere itself: it is at most ``bend`` of the other axis' curvature.
+    From a minimum or a saddle it follows the axis that rises most. On a ridge, an apparent rise is
+    that of the sphere itself: it is at most ``bend`` of the other axis' curvature.
     """
     values, axes = np.linalg.eigh(curvature)
     along = slope @ axes
@@ -340,20 +340,20 @@ def _crossings(
     """Distance from the peak at which the gain falls to ``half``: (2,), below and above, both
     positive.
 
-    ``inner`` (2, 1) are angles from the peak, one step short of where it has fallen.
+    ``inner`` (2, 1) are angles from the peak, one step before the crossing.
     """
     ways, near = np.array([[-1.0], [1.0]]), np.abs(inner)
     for _ in range(HALVING_ROUNDS):
         offsets = near + step * SECTIONS
         low = cut.gains(peak_rad + ways * offsets) < half
-        low[:, -1] = True  # known; rounding must not deny it
+        low[:, -1] = True  # known, despite rounding
         near = np.take_along_axis(offsets, np.maximum(low.argmax(axis=1) - 1, 0)[:, np.newaxis], 1)
         step *= float(SECTIONS[1])
     return near[:, 0] + step / 2
 
 
 def _extremes(cut: _Cut, brackets: FloatArray, sign: float) -> tuple[FloatArray, FloatArray]:
-    """The highest (sign 1) or lowest (-1) place within each of (K, 2) brackets: angles, gains."""
+    """Find the highest (sign 1) or lowest (-1) point in each of (K, 2) brackets: angles, gains."""
     low, high = brackets[:, :1], brackets[:, 1:]
     for _ in range(EXTREME_ROUNDS):
         angles = low + (high - low) * SECTIONS
@@ -365,7 +365,7 @@ def _extremes(cut: _Cut, brackets: FloatArray, sign: float) -> tuple[FloatArray,
 
 
 def _side_lobe_db(cut: _Cut, peak_rad: float, nulls: tuple[float, float]) -> float | None:
-    """The highest maximum outside the first nulls, less the peak, dB."""
+    """Highest maximum outside the first nulls, less the peak, dB."""
     points = cut.points()
     step = 2 * math.pi / points
     offsets: FloatArray = step * np.arange(points, dtype=np.float64)
@@ -390,6 +390,6 @@ def _side_lobe_db(cut: _Cut, peak_rad: float, nulls: tuple[float, float]) -> flo
 
 
 def _mirrored(array: Array) -> bool:
-    """Whether a direction and its image in the yz plane look alike, element patterns apart."""
+    """Return whether a direction and its image in the yz plane look alike, patterns apart."""
     depths = np.ptp(array.elements_m[:, 0]) / array.wavelength_m
     return array.element_from_array is None and bool(depths < SAME_PLACE_WAVELENGTHS)

@@ -268,16 +268,16 @@ def test_margins_come_in_any_shape() -> None:
 @pytest.mark.parametrize(
     ("degrees", "reason"),
     [
-        ((-181, 10, 0, 10), "azimuth -181 to 10 degrees: both within -180 to 180"),
-        ((0, 180.1, 0, 10), "azimuth 0 to 180.1 degrees: both within"),
-        ((math.nan, 10, 0, 10), "azimuth nan to 10 degrees: both within"),
-        ((30, 30, 0, 10), "azimuth 30 to 30 degrees: it has no width"),
-        ((180, -180, 0, 10), "azimuth 180 to -180 degrees: it has no width"),
-        ((0, 10, 20, 10), "elevation 20 to 10 degrees: upward, within -90 to 90"),
-        ((0, 10, 10, 10), "elevation 10 to 10 degrees: upward"),
-        ((0, 10, -91, 10), "elevation -91 to 10 degrees: upward"),
-        ((0, 10, 0, 90.1), "elevation 0 to 90.1 degrees: upward"),
-        ((0, 10, 0, math.nan), "elevation 0 to nan degrees: upward"),
+        ((-181, 10, 0, 10), "azimuth -181 to 10 degrees: give angles from -180 to 180"),
+        ((0, 180.1, 0, 10), "azimuth 0 to 180.1 degrees: give angles from -180 to 180"),
+        ((math.nan, 10, 0, 10), "azimuth nan to 10 degrees: give angles from -180 to 180"),
+        ((30, 30, 0, 10), "azimuth 30 to 30 degrees: give a range above 0 degrees"),
+        ((180, -180, 0, 10), "azimuth 180 to -180 degrees: give a range above 0 degrees"),
+        ((0, 10, 20, 10), "elevation 20 to 10 degrees: give ascending angles from -90 to 90"),
+        ((0, 10, 10, 10), "elevation 10 to 10 degrees: give ascending angles from -90 to 90"),
+        ((0, 10, -91, 10), "elevation -91 to 10 degrees: give ascending angles from -90 to 90"),
+        ((0, 10, 0, 90.1), "elevation 0 to 90.1 degrees: give ascending angles from -90 to 90"),
+        ((0, 10, 0, math.nan), "elevation 0 to nan degrees: give ascending angles from -90 to 90"),
     ],
 )
 def test_a_sector_that_is_none_is_refused(degrees: tuple[float, ...], reason: str) -> None:
@@ -287,12 +287,17 @@ def test_a_sector_that_is_none_is_refused(degrees: tuple[float, ...], reason: st
 
 @pytest.mark.parametrize("degrees", [0.0, -10.0, 360.1, math.nan, math.inf])
 def test_a_field_of_view_that_is_none_is_refused(degrees: float) -> None:
-    with pytest.raises(ValueError, match=r"field of view .* degrees: above 0, at most 360"):
+    with pytest.raises(
+        ValueError, match=r"field of view .* degrees: give more than 0, at most 360"
+    ):
         Coverage(field_of_view_rad=math.radians(degrees))
 
 
 def test_steering_limits_that_are_none_are_refused() -> None:
-    with pytest.raises(ValueError, match="steering limits: azimuth 10 to 10 degrees: it has no"):
+    with pytest.raises(ValueError, match="steering limits: azimuth 10 to 10 degrees: give a range"):
         limited((10, 10), (-90, 90))
-    with pytest.raises(ValueError, match="steering limits: elevation 10 to -10 degrees: upward"):
+    with pytest.raises(
+        ValueError,
+        match="steering limits: elevation 10 to -10 degrees: give ascending angles from -90 to 90",
+    ):
         limited((-180, 180), (10, -10))

@@ -179,5 +179,5 @@ def test_the_range_of_the_standards_element_is_tight_in_its_main_cuts(degrees: f
 
 @pytest.mark.parametrize("exponent", [-0.1, -3.0, math.nan, math.inf])
 def test_an_exponent_below_zero_is_refused(exponent: float) -> None:
-    with pytest.raises(ValueError, match=r"the exponent .* of a cosine pattern is not 0 or more"):
+    with pytest.raises(ValueError, match=r"exponent of the cosine pattern is .*; give 0 or more"):
         Element(ElementPattern.COSINE, exponent)

@@ -171,10 +171,10 @@ TWICE = np.concatenate([PLACES, PLACES[2:3] + 1e-12])
         (np.zeros((2, 2)), None, "rows of three finite numbers"),
         (np.array([[0, 0, math.nan]]), None, "rows of three finite numbers"),
         (np.array([[0, math.inf, 0]]), None, "rows of three finite numbers"),
-        (TWICE, None, "two elements stand at one place"),
-        (PLACES, np.ones((4, 3)), "each element faces one direction"),
-        (PLACES, np.full((5, 3), math.nan), "each element faces one direction"),
-        (PLACES, np.zeros((5, 3)), "has a length above 0"),
+        (TWICE, None, "two elements have the same position"),
+        (PLACES, np.ones((4, 3)), "three finite numbers for each element"),
+        (PLACES, np.full((5, 3), math.nan), "three finite numbers for each element"),
+        (PLACES, np.zeros((5, 3)), "with a length above 0"),
     ],
 )
 def test_a_list_that_is_no_array_is_refused(

@@ -74,7 +74,7 @@ def test_a_calibrated_panel_radiates_the_codebook() -> None:
 
 def test_ids_have_sixteen_bits() -> None:
     many = Codebook(CodebookKind.LISTED, np.ones((1, 65_537), complex))
-    with pytest.raises(UserError, match="65537 beams: a digital beam table has at most 65536"):
+    with pytest.raises(UserError, match="65537 beams exceed a digital beam table's 65536"):
         write_oai_dbt(many, Calibration.ideal([0]))
 
 

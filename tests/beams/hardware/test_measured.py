@@ -93,8 +93,8 @@ def test_what_remains_is_bounded_and_said() -> None:
     ("text", "said"),
     [
         ("nothing", "is not the header"),
-        (MEASURED_HEADER, "no response at all"),
-        (f"{MEASURED_HEADER}\n0,0,0,0,0\n0,0,0,0,0\n", "line 3: channel 0 stands twice"),
+        (MEASURED_HEADER, "file has no responses"),
+        (f"{MEASURED_HEADER}\n0,0,0,0,0\n0,0,0,0,0\n", "line 3: channel 0 appears twice"),
         (f"{MEASURED_HEADER}\n0,0,0,0,0\n0,0,2,0,0\n", "channel 1 of 2 has no response"),
         (f"{MEASURED_HEADER}\n0,0,0,nan,0\n", "not a finite number"),
         (f"{MEASURED_HEADER}\n0,0,0,0,1e6\n", "line 2: gain_db '1e6' is not within 1000"),

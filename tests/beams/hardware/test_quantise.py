@@ -142,7 +142,7 @@ def test_steps_of_gain_are_counted_from_full() -> None:
 @pytest.mark.parametrize(
     ("phases", "step_db", "range_db", "said"),
     [
-        (1, None, 0.0, "1 steps of phase"),
+        (1, None, 0.0, "1 phase steps"),
         (8, 0.0, 6.0, "gain steps of 0.0 dB"),
         (8, 7.0, 6.0, "over 6.0 dB"),
         (8, 1.0, np.inf, "over inf dB"),
@@ -158,7 +158,7 @@ def test_a_resolution_that_is_none_is_refused(
 
 @pytest.mark.parametrize("levels", [(), (0.5,), (1.0, 1.0), (1.0, 0.5, 0.7), (1.0, -0.1)])
 def test_levels_fall_from_full(levels: tuple[float, ...]) -> None:
-    with pytest.raises(ValueError, match="do not fall"):
+    with pytest.raises(ValueError, match="must decrease"):
         Resolution(8, levels)
 
 

@@ -281,7 +281,7 @@ def test_the_lowest_priority_is_dropped_and_it_is_said_why() -> None:
     found = precode(a, Precoder(policy=Policy.DROP))
     assert list(found.served) == [0, 1, 3]
     assert found.dropped.keys() == {2}
-    assert found.dropped[2].startswith("too close to one of higher priority")
+    assert found.dropped[2].startswith("too close to a UAV of higher priority")
     plain_db = loss_db(a, np.linalg.pinv(a.T)).max()
     assert f"{plain_db:.0f} dB" in found.dropped[2]
     other = precode(a, Precoder(policy=Policy.DROP), priorities=[2, 1, 0, 3])
@@ -367,7 +367,7 @@ def test_however_little_is_loaded_weights_are_finite(
 def test_who_cannot_be_told_apart_at_all_is_not_said_to_cost_inf_db() -> None:
     found = precode(matrix([0.3, 0.3]), Precoder(policy=Policy.DROP))
     assert found.dropped == {
-        1: "too close to one of higher priority: to tell all apart would pass the limits"
+        1: "too close to a UAV of higher priority: separating all would exceed the limits"
     }
 
 
@@ -447,7 +447,7 @@ def test_no_users_no_weights() -> None:
 @pytest.mark.parametrize("users", [1, 2])
 def test_what_is_not_a_number_is_refused(users: int) -> None:
     """Never weights that are not numbers."""
-    with pytest.raises(ValueError, match="not a number"):
+    with pytest.raises(ValueError, match="0 or not finite"):
         precode(np.full((4, users), np.nan + 0j), Precoder())
 
 

@@ -185,10 +185,10 @@ def test_many_directions_are_worked_on_in_blocks_that_leave_no_seam() -> None:
 @pytest.mark.parametrize(
     ("weights", "reason"),
     [
-        (np.ones(3, complex), "not 4 finite numbers"),
-        (np.ones((4, 1), complex), "not 4 finite numbers"),
-        (np.array([1, 1, math.nan, 1], complex), "not 4 finite numbers"),
-        (np.array([1, 1, math.inf, 1], complex), "not 4 finite numbers"),
+        (np.ones(3, complex), "must be 4 finite numbers"),
+        (np.ones((4, 1), complex), "must be 4 finite numbers"),
+        (np.array([1, 1, math.nan, 1], complex), "must be 4 finite numbers"),
+        (np.array([1, 1, math.inf, 1], complex), "must be 4 finite numbers"),
         (np.zeros(4, complex), "all zero"),
     ],
 )
@@ -228,7 +228,7 @@ def test_cuts_go_through_the_directions_that_they_say() -> None:
 @pytest.mark.parametrize("points", [1, 0, -3])
 def test_a_cut_of_too_few_points_is_refused(points: int) -> None:
     for cut in (patterns.azimuth_cut, patterns.elevation_cut):
-        with pytest.raises(ValueError, match=f"a cut of {points} points: it has at least 2"):
+        with pytest.raises(ValueError, match=f"cut has {points} points; give at least 2"):
             cut(line(4), np.ones(4, complex), 0.0, points)
 
 

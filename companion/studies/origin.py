@@ -1,4 +1,4 @@
-"""What an answer says of its own origin: the command line and the versions of the programs."""
+"""Provenance of an answer: the command line and the versions of the programs."""
 
 import platform
 import shlex
@@ -8,14 +8,14 @@ from typing import Any, Final
 
 import companion
 
-PACKAGES: Final = ("numpy",)  # packages that every study computes with
+PACKAGES: Final = ("numpy",)  # packages that every study uses
 
 
 def command_line(study: str, *arguments: object, **options: Any) -> str:
-    """The command line that asks for a study, in the order given.
+    """Return the command line of a study, with options in the order given.
 
     An option without a value (None, False or empty) is left out, True is a flag, and the parts of a
-    sequence stand with commas between them.
+    sequence are joined by commas.
     """
     words = ["companion", "study", study, *map(str, arguments)]
     for name, value in options.items():
@@ -33,7 +33,7 @@ def _written(value: Any) -> str:
 
 
 def versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
-    """Versions of this program, of packages that computed the numbers, and of Python."""
+    """Return the versions of this program, of packages that computed the numbers, and of Python."""
     return {
         "companion": companion.__version__,
         **{name: version(name) for name in packages},

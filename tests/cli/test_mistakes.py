@@ -153,7 +153,7 @@ SAYS: list[tuple[str, int, str]] = [
     ("study fleet --nodes 3..2 --out report", 2, "the smaller is not first"),
     ("study fleet --steps 0 --out report", 2, "0 is not in the range 1<=x<=20"),
     ("study fleet --out good.tlog", 1, "good.tlog: File exists"),
-    ("study beams good.tlog --center 5:1 --out a/report", 1, "no UAV gets a beam in it"),
+    ("study beams good.tlog --center 5:1 --out a/report", 1, "no UAV gets a beam while"),
     ("study link good.tlog --out report --snr loud", 2, "is not FROM:TO:STEP in dB"),
     ("study nosuch", 2, "No such command 'nosuch'. See companion study --help"),
     ("export beams", 1, '[codebook]: no stored beams; set kind = "dft"'),

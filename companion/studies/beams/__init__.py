@@ -1,1 +1,1 @@
-"""The worth of an array's beams over a recorded flight."""
+"""Performance of an array's beams over a recorded flight."""

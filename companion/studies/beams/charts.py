@@ -1,4 +1,4 @@
-"""Figures of the beam study: gains over time, share to be swept, distribution of gains."""
+"""Figures of the beam study: gains over time, share to sweep, distribution of gains."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -24,12 +24,12 @@ RANGE_DB: Final = 35.0  # range of gains drawn below the largest; lower ones are
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GainCurve:
-    """A gain that is drawn."""
+    """Gain to draw."""
 
     name: str  # its name in the legend
     line: int  # number of its line style
-    value: Callable[[Worth], float | None]  # reads it from a Worth
-    unknown: bool = False  # whether None means "not known" rather than "nothing is guaranteed
+    value: Callable[[Worth], float | None]  # getter
+    unknown: bool = False  # whether None means "unknown" rather than "not guaranteed"
 
 
 KINDS: Final = (
@@ -40,7 +40,7 @@ KINDS: Final = (
 
 
 def charts(watched: Watched) -> dict[str, plotting.Draw]:
-    """The figures of one log by name; without a codebook there is no share to be swept."""
+    """Return the figures of one log by name; without a codebook there is no share to sweep."""
     found: dict[str, plotting.Draw]
     found = {"gain": partial(_gain, watched), "gain_had": partial(_gain_had, watched)}
     if watched.codebook_beams is not None:
@@ -49,7 +49,7 @@ def charts(watched: Watched) -> dict[str, plotting.Draw]:
 
 
 def _gain(watched: Watched) -> "Figure":
-    """A panel for each UAV: predicted, guaranteed and true gain over time."""
+    """Panel per UAV: predicted, guaranteed and true gain over time."""
     by_uav, edges, (low, high) = watched.by_uav, _edges(watched), _range_db(watched)
     size_in = (WIDTH_IN, 0.9 + 1.25 * len(by_uav))
     figure, panels = plotting.new(len(by_uav), 1, size_in, sharex=True, sharey=True)
@@ -66,7 +66,7 @@ def _gain(watched: Watched) -> "Figure":
 
 
 def _sweep(watched: Watched) -> "Figure":
-    """A line for each UAV: the share of the codebook that must be swept."""
+    """Line per UAV: the share of the codebook that must be swept."""
     edges = _edges(watched)
     figure, (axes,) = plotting.new(1, 1, (WIDTH_IN, 3.6))
     for number, (uav, samples) in enumerate(watched.by_uav.items()):
@@ -82,7 +82,7 @@ def _sweep(watched: Watched) -> "Figure":
 
 
 def _gain_had(watched: Watched) -> "Figure":
-    """The share of looks at which a gain is at least a given value: as set, and sharp beside it."""
+    """Share of looks with at least a given gain: as set, and sharp beside it."""
     sets = {"as set": [sample.as_set for sample in watched.samples]}
     if watched.widen:
         sets["sharp"] = [sample.sharp for sample in watched.samples]
@@ -96,7 +96,7 @@ def _gain_had(watched: Watched) -> "Figure":
             share = 100 * (1 - np.arange(len(gains)) / max(len(gains), 1))
             shown = np.flatnonzero(gains >= low)
             few = shown[np.linspace(0, len(shown) - 1, min(len(shown), BINS)).astype(int)]
-            first = few[:1]  # from the left edge on: the share of all that is shown
+            first = few[:1]  # extend the curve to the left edge
             x = np.append(np.full(len(first), low), gains[few])
             y = np.append(share[first], share[few])
             axes.plot(x, y, label=kind.name, **plotting.line(kind.line))
@@ -110,7 +110,7 @@ def _gain_had(watched: Watched) -> "Figure":
 def _over_time(
     axes: "Axes", edges: FloatArray, values: FloatArray, label: str, how: dict[str, Any]
 ) -> None:
-    """A line through the middles of the bins, with a gap wherever there is no number.
+    """Draw a line through the middles of the bins, with a gap at each NaN.
 
     A value alone between two gaps is a dot.
     """
@@ -122,7 +122,7 @@ def _over_time(
 
 
 def _gains(worths: Sequence[Worth | None], kind: GainCurve) -> FloatArray:
-    """Gains of one kind, ascending; -inf where nothing is guaranteed."""
+    """Return gains of one kind, ascending; -inf if not guaranteed."""
     found = np.array([_of(worth, kind.value) for worth in worths if worth is not None])
     if kind.unknown:
         found = found[np.isfinite(found)]
@@ -134,9 +134,9 @@ def _kinds(watched: Watched) -> list[GainCurve]:
 
 
 def _edges(watched: Watched) -> FloatArray:
-    """Edges of the time bins, (B + 1,).
+    """Return edges of the time bins, (B + 1,).
 
-    There are at most half as many bins as looks, so that none is empty by itself.
+    There are at most half as many bins as looks, so that no bin is empty by chance.
     """
     times = np.unique([sample.t_s for sample in watched.samples])
     bins = int(np.clip(len(times) // 2, 1, BINS))
@@ -149,14 +149,14 @@ def _bin(edges: FloatArray) -> str:
 
 
 def _least(samples: Sequence[Sample], edges: FloatArray, kind: GainCurve) -> FloatArray:
-    """The least gain of a kind in each bin (B,)."""
+    """Return the least gain of a kind in each bin (B,)."""
     return _worst(samples, edges, lambda sample: _of(sample.as_set, kind.value), np.fmin)
 
 
 def _worst(
     samples: Sequence[Sample], edges: FloatArray, value: Callable[[Sample], float], worse: np.ufunc
 ) -> FloatArray:
-    """The worst value in each bin (B,); NaN for an empty bin, and for infinite values."""
+    """Return the worst value in each bin (B,); NaN for an empty bin, and for infinite values."""
     found = np.full(len(edges) - 1, np.nan)
     where = np.clip(
         np.searchsorted(edges, [s.t_s for s in samples], "right") - 1, 0, len(found) - 1
@@ -167,7 +167,7 @@ def _worst(
 
 
 def _of(worth: Worth | None, value: Callable[[Worth], float | None]) -> float:
-    """A gain of a beam: NaN without a beam, -inf for a beam without that gain."""
+    """Return a gain of a beam: NaN without a beam, -inf for a beam without that gain."""
     if worth is None:
         return math.nan
     found = value(worth)
@@ -175,7 +175,7 @@ def _of(worth: Worth | None, value: Callable[[Worth], float | None]) -> float:
 
 
 def _range_db(watched: Watched) -> tuple[float, float]:
-    """Lower and upper limit of the gain axis, whole multiples of 5."""
+    """Return the lower and upper limit of the gain axis, multiples of 5."""
     worths = [w for s in watched.samples for w in (s.as_set, s.sharp) if w is not None]
     values = [v for worth in worths for kind in KINDS if (v := kind.value(worth)) is not None]
     high = 5 * math.ceil(max(values) / 5 + 1e-9)

@@ -1,12 +1,11 @@
-"""The beam study, ``companion study beams``: what an array would have done over a flight.
+"""Beam study, ``companion study beams``: the beams of an array over a recorded flight.
 
-A log goes through the pipeline as in a replay, and some times a second the newest update is
-examined: what each beam gives by the prediction, what it is guaranteed to give wherever the UAV may
-be within its pointing bound, and, where the log has the simulator's truth, what it truly gave. The
-beams as the settings make them are compared with those of ``[beams] widen = false`` for the same
-tracks, which shows what widening costs and gives. A codebook (that of the settings, else a DFT's
-where the elements are on a grid) tells which share of it must be swept to be sure of the best
-stored beam.
+A log is replayed through the pipeline, and the newest update is examined several times a second.
+For each beam the study computes the gain by the prediction, the guaranteed gain within the pointing
+bound, and, if the log has the simulator's truth, the true gain. The beams of the settings are
+compared with those of ``[beams] widen = false`` for the same tracks, which shows the cost and the
+benefit of widening. With a codebook (that of the settings, else a DFT's if the elements are on a
+grid) it also computes the share that must be swept to include the best stored beam.
 
 Over 300 lines: one study: its settings, its looks, its answer.
 """
@@ -38,14 +37,14 @@ from companion.studies.truth.array_truth import ArrayTruth
 from companion.studies.truth.vehicles import named
 from companion.values import BeamSet, Carrier, FloatArray, Update, UserError, Widen, kind_of
 
-PROGRESS_EVERY: Final = 20  # looks between two reports of progress
+PROGRESS_EVERY: Final = 20  # looks between two progress messages
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamStudy:
-    """What is asked of the study.
+    """Parameters of the study.
 
-        links     names of the links over which ways of making beams are compared; none: not at all
+        links     names of the links over which widths and predictors are compared; may be empty
 
     Raises ``UserError`` for a rate out of range.
     """
@@ -60,13 +59,13 @@ class BeamStudy:
     def __post_init__(self) -> None:
         known = [link.name for link in LINKS]
         if not set(self.links) <= set(known):
-            raise UserError(f"links are some of {', '.join(known)}, not {','.join(self.links)}")
+            raise UserError(f"--links {','.join(self.links)}: give some of {', '.join(known)}")
         if not 0 < self.hz <= 1000:
-            raise UserError(f"--hz {self.hz:g}: looks a second, above 0 and at most 1000")
+            raise UserError(f"--hz {self.hz:g}: give looks per second, above 0 and at most 1000")
 
     @property
     def command(self) -> str:
-        """The command line that asks for this study."""
+        """Command line of this study."""
         logs = chain.from_iterable(self.flights)
         given = {"center": self.center, "config": self.config, "links": self.links, "hz": self.hz}
         return command_line("beams", *logs, **given)
@@ -87,7 +86,7 @@ class Watched:
 
     @property
     def by_uav(self) -> dict[str, list[Sample]]:
-        """The samples of each UAV, in the order in which they were first seen."""
+        """Samples of each UAV, in the order of first appearance."""
         found: dict[str, list[Sample]] = {}
         for sample in self.samples:
             found.setdefault(sample.uav, []).append(sample)
@@ -99,7 +98,7 @@ class Watched:
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """What all looks at one log share."""
+    """Data shared by all looks at one log."""
 
     pipeline: Pipeline
     equipment: Equipment
@@ -108,7 +107,7 @@ class Sight:
     def worths(
         self, beam_set: BeamSet, carrier: Carrier, truly: dict[str, FloatArray]
     ) -> dict[str, Worth]:
-        """The worth of each beam of a set, by UAV.
+        """Return the performance of each beam of a set, by UAV.
 
         ``truly`` holds the true directions, (3,) each.
         """
@@ -138,9 +137,10 @@ class Sight:
     def swept(
         self, towards: FloatArray, bound_rad: float | None, truly: FloatArray | None
     ) -> tuple[int | None, float | None, bool | None]:
-        """The best stored beam of a direction (3,), the share to be swept, and whether it misses.
+        """Return the best stored beam of a direction (3,), the share to sweep, and whether it
+        misses.
 
-        A share misses if the truly best beam is not in it. None stands for what cannot be told.
+        A share misses if it lacks the truly best beam. None: unknown.
         """
         if self.codebook is None:
             return None, None, None
@@ -155,9 +155,8 @@ class Sight:
 
 
 def sight(pipeline: Pipeline) -> Sight:
-    """The radio and the codebook that the settings describe.
-
-    Raises ``ConfigError`` where they cannot be.
+    """Return the radio and the codebook of the settings. Raises ``ConfigError`` if they are
+    impossible.
 
     Without a codebook in the settings it is that of a DFT over the array's own grid, if it has one.
     """
@@ -169,7 +168,7 @@ def sight(pipeline: Pipeline) -> Sight:
 
 
 def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> list[Sample]:
-    """Samples of every tracked UAV at one update, ``t_s`` seconds into the log."""
+    """Return samples of every tracked UAV at one update, ``t_s`` seconds into the log."""
     pipeline, carrier = seen.pipeline, update.carrier
     if carrier is None:
         return [Sample(t_s=t_s, uav=track.uav) for track in update.tracks]
@@ -219,7 +218,7 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
 
 
 def _angle_rad(towards: FloatArray, truly: FloatArray) -> float:
-    """Angle between two unit directions (3,); exact for small ones."""
+    """Return the angle between two unit directions (3,); exact for small ones."""
     return math.atan2(float(np.linalg.norm(np.cross(towards, truly))), float(towards @ truly))
 
 
@@ -227,16 +226,17 @@ def _angle_rad(towards: FloatArray, truly: FloatArray) -> float:
 
 
 def updates(logs: Sequence[Path], pipeline: Pipeline, hz: float) -> Iterator[tuple[float, Update]]:
-    """Seconds into a flight, ``hz`` per second, each with the update of the last tick by then.
+    """Yield seconds into a flight, ``hz`` per second, each with the update of the last tick by
+    then.
 
-    Each update comes once. Steps the pipeline through the whole flight.
+    Each update is yielded once. Steps the pipeline through the whole flight.
     """
     period_ns = round(1e9 / hz)
     begins_ns, due_ns, seen = None, 0, None
     for event in log_events(logs, pipeline.settings):
         if begins_ns is None:
             begins_ns, due_ns = event.t_ns, event.t_ns + period_ns
-        while due_ns < event.t_ns:  # all that happened by then has been taken in
+        while due_ns < event.t_ns:  # all earlier events are processed
             update = pipeline.last_update
             if update is not None and update is not seen:
                 seen = update
@@ -253,7 +253,7 @@ def watch(
 ) -> Watched:
     """Study the logs of one flight.
 
-    Raises ``UserError``, ``LogError`` or ``ConfigError`` where there is nothing to see.
+    Raises ``UserError``, ``LogError`` or ``ConfigError`` if no UAV gets a beam.
     """
     pipeline = Pipeline(settings)
     seen, truth, sought = sight(pipeline), None, False
@@ -268,7 +268,7 @@ def watch(
         if looks % PROGRESS_EVERY == 0:
             progress(f"{name}: {t_s:.0f} s of log")
     if not any(sample.as_set or sample.sharp for sample in samples):
-        raise UserError(f"{name}: no UAV gets a beam in it, as far as its carrier is known")
+        raise UserError(f"{name}: no UAV gets a beam while the carrier's pose is known")
     array = pipeline.array
     return Watched(
         log=name,
@@ -285,10 +285,9 @@ def watch(
 def study(
     setting: BeamStudy, progress: Callable[[str], None] = lambda _text: None
 ) -> tuple[dict[str, Any], list[Watched]]:
-    """The answer as it is written to ``beams.json``, and what the report shows.
+    """Return the answer as written to ``beams.json``, and the data of the report.
 
-    Raises ``UserError``, ``LogError`` or ``ConfigError`` for a log in which there is nothing to
-    study.
+    Raises ``UserError``, ``LogError`` or ``ConfigError`` for a log without any beam.
     """
     found = [
         watch(logs, settings, setting.hz, progress)

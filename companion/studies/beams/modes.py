@@ -1,10 +1,11 @@
-"""Ways of making beams compared over links: gains, guarantees and rates, against the truth.
+"""Comparison of beam widths and predictors over links: gains, guarantees and rates, against the
+truth.
 
 Each UAV's own frames pass through a link, the log's own or one of ``studies.prediction``; the
-array's carrier is heard as it was. At every tick beams are made in each of the three widths for the
-tracks of the product, and, sharp, for where others would look: at the last report (``hold``), where
-a Kalman filter of known noise has it (``kalman-peng``), and where AntennaTracker would
-(``dead-reckoning-arrival``). What they give is taken towards the true directions.
+carrier's frames stay as logged. At every tick beams are computed in each of the three widths for
+the product's tracks. Sharp beams are also computed for the positions of other predictors: the last
+report (``hold``), a Kalman filter of known noise (``kalman-peng``), and AntennaTracker's method
+(``dead-reckoning-arrival``). Their gains are evaluated towards the true directions.
 """
 
 import heapq
@@ -50,15 +51,15 @@ from companion.values import (
 )
 
 RIVALS: Final = ("hold", "kalman-peng", "dead-reckoning-arrival")
-"""Predictors whose beams are sharp and stand beside the product's."""
-LOOK_EVERY: Final = 4  # ticks from one look to the next; beams are made at each
+"""Predictors whose beams are sharp and compared with the product's."""
+LOOK_EVERY: Final = 4  # ticks from one look to the next; beams are computed at each tick
 ALIKE: Final = 0.9  # correlation of two shapes of one beam below which it has changed
 JUMP_DB: Final = 1.0  # change of a predicted gain from tick to tick that is a jump
 
 
 @dataclass(slots=True, kw_only=True)
 class _Way:
-    """One way of making beams, with what has been seen of it."""
+    """One width or predictor, with its results."""
 
     name: str
     widen: Widen
@@ -73,7 +74,7 @@ class _Way:
     violations: int = 0
 
     def row(self) -> Row:
-        """The figures; shares are of beams, and None where there is nothing to tell."""
+        """Return the figures; shares are of beams, and None without data."""
         return {
             "beams": self.name,
             "n": len(self.predicted_db),
@@ -95,7 +96,8 @@ class _Way:
 def events(
     logs: Sequence[Path], link: RadioLink, settings: Settings, seed: int = 1
 ) -> tuple[Iterator[Event], dict[str, list[ObservedReport]], LocalFrame]:
-    """What a node hears over a link, with ticks; each UAV's reports, and the frame they are in."""
+    """Return the events of a node over a link, with ticks; each UAV's reports, and their local
+    frame."""
     center = settings.center.source or "home"
     flown = vehicles.load(logs, center)
     streams = {
@@ -119,7 +121,7 @@ def events(
 
 
 class _Rival:
-    """A predictor of each UAV, in the pipeline's frame."""
+    """Another predictor of each UAV, in the pipeline's frame."""
 
     def __init__(
         self, name: str, observed: dict[str, list[ObservedReport]], settings: Settings
@@ -130,7 +132,7 @@ class _Rival:
         self._predictors = {uav: self._make() for uav in observed}
 
     def tracks(self, update: Update, local: LocalFrame, pipeline: Pipeline) -> tuple[Track, ...]:
-        """The tracks of an update, placed where this predictor has them."""
+        """Return the tracks of an update, at this predictor's positions."""
         found = []
         for track in update.tracks:
             waiting, predictor = self._waiting.get(track.uav, []), self._predictors.get(track.uav)
@@ -154,7 +156,7 @@ def compare(
     link: RadioLink,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> list[Row]:
-    """A row for each way of making beams, over one link."""
+    """Return a row for each width and predictor, over one link."""
     pipeline = Pipeline(settings)
     heard, observed, local = events(logs, link, settings)
     ways = [_Way(name=str(widen), widen=widen) for widen in Widen]
@@ -194,7 +196,7 @@ def _make(
     truth: ArrayTruth | None,
     looks: bool,
 ) -> None:
-    """Make beams one way, and note what they are worth."""
+    """Compute the beams of one width or predictor, and record their performance."""
     assert update.carrier is not None
     made = aim(
         update.t_ns,
@@ -244,15 +246,15 @@ def _judge(pipeline: Pipeline, made: BeamSet, true: dict[str, FloatArray], way: 
 COLUMNS: Final = (
     ("link", "link"), ("beams", "beams"), ("true 5 %", "true_gain_p5_db"),
     ("true 50 %", "true_gain_median_db"), ("predicted", "predicted_gain_median_db"),
-    ("sure > 0 dB", "guaranteed_above_0_db_share"), ("sure 50 %", "guaranteed_gain_median_db"),
-    ("broken", "violations"), ("bit/s/Hz", "spectral_efficiency_mean"),
+    ("guar. > 0 dB", "guaranteed_above_0_db_share"), ("guar. 50 %", "guaranteed_gain_median_db"),
+    ("violated", "violations"), ("bit/s/Hz", "spectral_efficiency_mean"),
     ("changed", "changed_shape_share"), ("jumps", "jump_share"),
 )  # fmt: skip
-"""Words and keys of the table."""
+"""Headings and keys of the table."""
 
 
 def cells(row: Row) -> list[str]:
-    """A row as it is shown."""
+    """Format a row."""
     found = []
     for _, key in COLUMNS:
         value = row[key]
@@ -266,5 +268,5 @@ def cells(row: Row) -> list[str]:
 
 
 def text(rows: Sequence[Row]) -> str:
-    """The table as text."""
+    """Return the table as text."""
     return text_table([[words for words, _ in COLUMNS], *map(cells, rows)])

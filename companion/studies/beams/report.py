@@ -15,7 +15,7 @@ COMPARED: Final = (
     ("true gain, dB: 5 % / median", ("true_gain_p5_db", "true_gain_median_db")),
     ("looks with a guarantee", ("guaranteed_share",)),
     ("guaranteed gain, dB: 5 % / median", ("guaranteed_gain_p5_db", "guaranteed_gain_median_db")),
-    ("truly less than guaranteed / within the bound", ("violations", "violations_within_bound")),
+    ("true gain below guaranteed / within the bound", ("violations", "violations_within_bound")),
     ("loss, dB: median / 95 %", ("loss_median_db", "loss_p95_db")),
     ("predicted SINR, dB: median", ("sinr_median_db",)),
     ("spectral efficiency, bit/s/Hz: mean", ("spectral_efficiency_mean",)),
@@ -33,30 +33,30 @@ AS_FOUND: Final = (
         ("pointing_bound_median_deg", "pointing_bound_p95_deg"),
     ),
     ("pointing error, degrees: 95 %", ("pointing_error_p95_deg",)),
-    ("truly beyond the bound", ("bound_violations",)),
-    ("share of the codebook to be swept: mean / 95 %", ("sweep_share_mean", "sweep_share_p95")),
+    ("true direction beyond the bound", ("bound_violations",)),
+    ("share of the codebook to sweep: mean / 95 %", ("sweep_share_mean", "sweep_share_p95")),
     (
         "best stored beam not in that share / within the bound",
         ("codebook_misses", "codebook_misses_within_bound"),
     ),
 )
-"""Figures that do not depend on how the beams are made."""
+"""Figures that are independent of the beam width."""
 
 _CAPTIONS: Final = {
-    "gain": "Array gain over time, at its least in each interval. Where the line of the guaranteed"
-    " gain is missing nothing is guaranteed: the cone of possible directions holds a null.",
-    "gain_had": "The share of looks at which a gain is at least so much: towards the predicted"
-    " direction, towards the true one, and wherever the UAV may be within its bound. Sharp:"
+    "gain": "Array gain over time, the least in each interval. A gap in the line of the guaranteed"
+    " gain means that no gain is guaranteed: the cone of possible directions contains a null.",
+    "gain_had": "Share of looks with at least a given gain: towards the predicted direction,"
+    " towards the true one, and guaranteed within the pointing bound. Sharp:"
     ' [beams] widen = "no".',
-    "sweep": "The share of the stored beams that must be swept to be sure of the best, at its"
-    " largest in each interval.",
+    "sweep": "Share of the stored beams that must be swept to include the best one, the largest in"
+    " each interval.",
 }
 
 
 def files(
     answer: dict[str, Any], found: Sequence[Watched], progress: Callable[[str], None]
 ) -> dict[str, bytes]:
-    """The page and every figure as SVG and PNG, by file name.
+    """Return the page and every figure as SVG and PNG, by file name.
 
     Figures of the second and later logs are numbered.
     """
@@ -76,7 +76,7 @@ def files(
 
 
 def text(found: Sequence[Watched], compared: Sequence[Row] = ()) -> str:
-    """The tables as text, all UAVs of a log together."""
+    """Return the tables as text, all UAVs of a log together."""
     parts = [_text(watched) for watched in found]
     for log in dict.fromkeys(row["log"] for row in compared):
         of_log = [row for row in compared if row["log"] == log]
@@ -93,7 +93,7 @@ def _text(watched: Watched) -> str:
 
 
 def _section(watched: Watched, figures: Iterable[str]) -> dict[str, Any]:
-    """What the page shows of one log: ``figures`` are the names of its figures."""
+    """Return the page's data for one log: ``figures`` are the names of its figures."""
     row = summed_up(watched.samples)
     by_uav = {uav: summed_up(samples) for uav, samples in watched.by_uav.items()}
     return {

@@ -1,4 +1,4 @@
-"""The worth of beams, look by look, and the figures that sum it up."""
+"""Performance of beams at each look, and its summary."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +14,7 @@ from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet, FloatArray, Method
 
 Row = dict[str, Any]
-ROUNDING_DB: Final = 1e-9  # difference up to which a true gain below the guaranteed one is rounding
+ROUNDING_DB: Final = 1e-9  # rounding tolerance between true and guaranteed gain
 SHARP: Final = "sharp_"
 """Prefix of the keys for beams with ``[beams] widen = false``; others are for those as set."""
 
@@ -23,18 +23,18 @@ SHARP: Final = "sharp_"
 class Worth:
     """One beam at one time; gains are of the array in dB, element pattern included.
 
-    guaranteed_gain_db   least gain within the pointing bound; None: nothing is guaranteed
+    guaranteed_gain_db   least gain within the pointing bound; None: not guaranteed
     """
 
     gain_db: float  # towards the predicted direction
-    loss_db: float  # what it lacks against a beam for the UAV alone
+    loss_db: float  # loss against a beam for the UAV alone
     guaranteed_gain_db: float | None
-    true_gain_db: float | None  # towards the true direction; None: it is not known
+    true_gain_db: float | None  # towards the true direction; None: unknown
     sinr_db: float  # as predicted; -inf where no element faces the UAV
     spectral_efficiency: float  # bit/s/Hz, time slots counted
     group: int  # number of its time slot
     widened: bool  # its main lobe was broadened
-    method: Method  # how the weights were made
+    method: Method  # how the weights were computed
     condition_number: float  # of the steering matrix
 
     @property
@@ -49,8 +49,8 @@ class Sample:
     """One tracked UAV at one look. Without a beam all but the first two fields are None.
 
     pointing_bound_rad  bound on the angle between predicted and true direction
-    codebook_best       index of the stored beam that serves the predicted direction best
-    sweep_share         share of the codebook that must be swept to be sure of the best
+    codebook_best       index of the best stored beam for the predicted direction
+    sweep_share         share of the codebook that must be swept to include the best
     """
 
     t_s: float  # seconds into the log
@@ -59,25 +59,25 @@ class Sample:
     off_rad: float | None = None  # that angle
     codebook_best: int | None = None
     sweep_share: float | None = None
-    missed: bool | None = None  # the truly best stored beam is not in that share
-    as_set: Worth | None = None  # the beam that the settings make
+    missed: bool | None = None  # whether the truly best stored beam is not in that share
+    as_set: Worth | None = None  # the beam with the settings' width
     sharp: Worth | None = None  # the same beam not widened
 
     @property
     def beyond(self) -> bool:
-        """Whether the true direction lies outside the pointing bound."""
+        """Whether the true direction is outside the pointing bound."""
         off, bound = self.off_rad, self.pointing_bound_rad
         return off is not None and bound is not None and bool(off > bound)
 
 
 def summed_up(samples: Sequence[Sample]) -> Row:
-    """The figures over samples.
+    """Return the figures over samples.
 
-    Counts and shares are of looks at which the UAV had a beam, except ``without_beam``. None where
-    there is nothing to tell. Percentiles are values that occurred. Percentiles of what may be
-    missing count it: a guaranteed gain of p5 is had in 95 % of all looks, and is None where fewer
-    have any. Violations and misses are promises not kept: those within the bound are faults of this
-    program, the others follow from settings whose bounds did not hold.
+    Counts and shares are of looks at which the UAV had a beam, except ``without_beam``. None
+    without data. Percentiles are values that occurred, and count missing values: 95 % of all looks
+    have at least the guaranteed gain p5, which is None if fewer have any. Violations and misses are
+    broken guarantees: those within the bound are faults of this program, the others follow from
+    settings whose bounds did not hold.
     """
     served = [sample for sample in samples if sample.as_set is not None]
     bounds = [_or(sample.pointing_bound_rad, math.inf) for sample in served]
@@ -103,7 +103,8 @@ def summed_up(samples: Sequence[Sample]) -> Row:
 
 
 def _of_beams(beams: Sequence[tuple[Worth, bool]], prefix: str) -> Row:
-    """Figures of one set of beams, each paired with whether the UAV was truly beyond its bound."""
+    """Return the figures of one set of beams, each paired with whether the UAV was beyond its
+    bound."""
     worths = [worth for worth, _ in beams]
     gains = [worth.gain_db for worth in worths]
     sure = [_or(worth.guaranteed_gain_db, -math.inf) for worth in worths]
@@ -137,7 +138,7 @@ def _of_beams(beams: Sequence[tuple[Worth, bool]], prefix: str) -> Row:
 def given(
     pipeline: Pipeline, made: BeamSet, truly: Mapping[str, FloatArray]
 ) -> tuple[Sequence[float | None], FloatArray]:
-    """Guaranteed gains of beams, dB, and their power gains (N,) towards the true directions.
+    """Return guaranteed gains of beams, dB, and their power gains (N,) towards the true directions.
 
     ``truly`` holds the true directions, (3,) each, by UAV; without one the gain is NaN.
     """
@@ -153,7 +154,7 @@ def given(
 
 
 def percentile(values: Sequence[float], percent: float) -> float | None:
-    """The least value that occurred and is not below ``percent`` of all.
+    """Return the least value that occurred and is not below ``percent`` of all.
 
     None if it is not finite, or if there are no values.
     """
@@ -164,12 +165,12 @@ def percentile(values: Sequence[float], percent: float) -> float | None:
 
 
 def mean(values: Sequence[float]) -> float | None:
-    """The mean; None without values."""
+    """Return the mean; None without values."""
     return float(np.mean(values)) if values else None
 
 
 def share(marks: Iterable[bool]) -> float | None:
-    """The share of marks that are true; None without marks."""
+    """Return the share of marks that are true; None without marks."""
     return mean([float(mark) for mark in marks])
 
 

@@ -1,1 +1,1 @@
-"""Measured beams of the DeepSense 6G scenarios, and how well a position tells them."""
+"""Measured beams of the DeepSense 6G scenarios, predicted from positions."""

@@ -1,12 +1,12 @@
-"""Where the array stands, of few parameters: which beam is expected at a position.
+"""Geometry of the array with few parameters: the expected beam at a position.
 
-Positions are normalised, so that the two axes have scales of their own; the array's place, the way
-that it looks and how far above it is flown are not known. Fitted are the array's place (2), the
-ratio of the scales, the way that it looks, the height, the beam in the middle and beams by sine;
-and how many samples the measured beam lags behind the reported position.
+Positions are normalised, so that each axis has its own scale; the array's position, orientation and
+the flight height above it are unknown. Fitted are the array's position (2), the ratio of the
+scales, the orientation, the height, the middle beam and beams per sine; and the lag, in samples, of
+the measured beam behind the reported position.
 
-The beams of a line of elements are even in the sine of the angle from its middle, which counts the
-height: far above the array all is in the middle, however it bears.
+The beams of a line of elements are even in the sine of the angle from its middle, which includes
+the height: far above the array every direction is in the middle, at any bearing.
 """
 
 from dataclasses import dataclass, replace
@@ -22,12 +22,12 @@ _STARTS: Final = ((0.5, -0.3), (0.5, 1.3), (-0.3, 0.5), (1.3, 0.5))
 _HEIGHT: Final = 0.3
 _HIGHEST: Final = 3.0
 _SLOPE: Final = 0.4
-_WIDEST_SLOPE: Final = 1.0  # beams by sine, in codebooks: where the search begins, and at most
+_WIDEST_SLOPE: Final = 1.0  # beams per sine, in codebooks: start of the search, and limit
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Geometry:
-    """The array's place in normalised coordinates, and what else few numbers say.
+    """Array's position in normalised coordinates, and the other fitted parameters.
 
     height   of the flight above the array, in the scale of the second axis; one for all samples
     """
@@ -35,18 +35,18 @@ class Geometry:
     x: float
     y: float
     stretch: float  # log of the scale of the first axis to that of the second
-    yaw: float  # the way that the array looks, rad
-    middle: float  # the beam that looks there
-    slope: float  # beams by sine of the angle from there
+    yaw: float  # orientation of the array, rad
+    middle: float  # the beam in that direction
+    slope: float  # beams per sine of the angle from it
     height: float
-    lag: float  # samples by which the beam is older than the position beside it
+    lag: float  # samples by which the beam lags behind the position
 
     def beams(self, place: FloatArray) -> FloatArray:
-        """The beams that are expected at positions (N, 2) in order of time, with fractions."""
+        """Return the expected beams at positions (N, 2) in order of time, with fractions."""
         return self._at(delayed(place, self.lag))
 
     def _at(self, place: FloatArray) -> FloatArray:
-        """The same at positions that have their lag already."""
+        """Return the same for positions that are already delayed."""
         east = (place[:, 0] - self.x) * np.exp(self.stretch)
         north = place[:, 1] - self.y
         across = north * np.cos(self.yaw) - east * np.sin(self.yaw)
@@ -56,7 +56,7 @@ class Geometry:
 
 
 def delayed(place: FloatArray, lag: float) -> FloatArray:
-    """Positions (N, 2) as they were ``lag`` samples ago, between two of them linearly."""
+    """Return positions (N, 2) as they were ``lag`` samples ago, by linear interpolation."""
     at = np.clip(np.arange(len(place)) - lag, 0, None)
     before = np.floor(at).astype(np.int64)
     after = np.minimum(before + 1, len(place) - 1)
@@ -68,7 +68,7 @@ def delayed(place: FloatArray, lag: float) -> FloatArray:
 def fit(
     place: FloatArray, beam: IntArray, learned: BoolArray, beams: int, *, simple: bool = False
 ) -> Geometry:
-    """The geometry by the samples that may be learned from; a simple one has no height or lag."""
+    """Fit the geometry to the training samples; a simple one has no height or lag."""
     height = 0.0 if simple else _HEIGHT
     begin = [
         Geometry(
@@ -97,7 +97,7 @@ def fit(
 def refit(
     begin: Geometry, place: FloatArray, beam: IntArray, learned: BoolArray, beams: int
 ) -> Geometry:
-    """The same by fewer samples, its lag being known."""
+    """Fit to fewer samples, with a known lag."""
     _, found = _fitted(begin, place, beam, learned, beams)
     return found
 
@@ -105,9 +105,9 @@ def refit(
 def _fitted(
     begin: Geometry, place: FloatArray, beam: IntArray, learned: BoolArray, beams: int
 ) -> tuple[float, Geometry]:
-    """The least cost, with few far-off beams counting little, and where it is.
+    """Return the least cost, robust against outliers, and its geometry.
 
-    Where the height is 0 to begin with it stays so.
+    A height of 0 is not fitted.
     """
     there = delayed(place, begin.lag)[learned]
     first = [begin.x, begin.y, begin.stretch, begin.yaw, begin.middle, begin.slope, begin.height]

@@ -1,9 +1,9 @@
-"""Predictors of the best beam from a position: each learns from some samples and ranks all beams.
+"""Predictors of the best beam from a position: each is trained on samples and ranks all beams.
 
-``nearest`` and ``geometry`` are what others do, to compare with. ``kernel`` is the product's
-way: the density of beams over the beam that a geometry with a height expects, by a Gaussian kernel
-(Nadaraya 1964, Watson 1964), and by the distance from that beam where there are few samples. All
-make their choices by what is learned from alone.
+``nearest`` and ``geometry`` are published methods, for comparison. ``kernel`` is the product's
+method: the density of beams over the beam that a geometry with a height expects, by a Gaussian
+kernel (Nadaraya 1964, Watson 1964), and by the distance from that beam where there are few samples.
+All make their choices from the training samples only.
 """
 
 from collections.abc import Callable
@@ -20,11 +20,11 @@ from companion.studies.deepsense.samples import Samples, inner
 from companion.values import BoolArray, FloatArray, IntArray
 
 Fitted = Callable[[BoolArray], FloatArray]
-"""Probabilities (N, beams) by samples that are learned from, all choices being made."""
+"""Function from training samples to probabilities (N, beams), with all choices made."""
 Predictor = Callable[[Samples, BoolArray], Fitted]
 NEIGHBOURS: Final = 20
 KERNELS: Final = tuple((width, weight) for width in (0.25, 0.5) for weight in (5.0, 15.0))
-"""Widths of the kernel, in beams, and weights of the prior, in samples, that are tried."""
+"""Candidate widths of the kernel, in beams, and weights of the prior, in samples."""
 _INNER: Final = (16, 4)
 _CELL: Final = 0.05
 _FAR: Final = 1.3  # beams within which the prior falls to 1/e
@@ -32,7 +32,7 @@ _REFLECTED: Final = 0.01
 
 
 def nearest(samples: Samples, _: BoolArray) -> Fitted:
-    """Votes of the nearest samples; of equal ones the beam of the nearer counts a little more."""
+    """Votes of the nearest samples; ties favour the beam of the nearer one."""
     return partial(_votes, samples)
 
 
@@ -47,7 +47,7 @@ def _votes(samples: Samples, learned: BoolArray) -> FloatArray:
 
 
 def plain(samples: Samples, learned: BoolArray) -> Fitted:
-    """Beams by their distance from the one that the sine of the bearing says."""
+    """Beams by their distance from the one for the sine of the bearing."""
     at = geometry.fit(samples.place, samples.beam, learned, samples.beams, simple=True)
     likely = _beside(samples, at.beams(samples.place), 1.0)
     likely /= likely.sum(axis=1, keepdims=True)
@@ -55,13 +55,13 @@ def plain(samples: Samples, learned: BoolArray) -> Fitted:
 
 
 def kernel(samples: Samples, learned: BoolArray) -> Fitted:
-    """The density of beams over the expected one, its kernel chosen within what is learned."""
+    """Density of beams over the expected one, with a kernel chosen on the training samples."""
     at, (width, weight) = chosen(samples, learned)
     return lambda mask: averaged(samples, mask, _leave_one_out(samples, mask, at), width, weight)
 
 
 def chosen(samples: Samples, learned: BoolArray) -> tuple[Geometry, tuple[float, float]]:
-    """The geometry, and the kernel that does best in blocks within what is learned."""
+    """Return the geometry, and the kernel that performs best in blocks of the training samples."""
     counted = learned & samples.apart()
     at = geometry.fit(samples.place, samples.beam, counted, samples.beams)
     worth = dict.fromkeys(KERNELS, 0.0)
@@ -75,7 +75,8 @@ def chosen(samples: Samples, learned: BoolArray) -> tuple[Geometry, tuple[float,
 
 
 def _leave_one_out(samples: Samples, learned: BoolArray, at: Geometry) -> list[Geometry]:
-    """Geometries that leave out each a part of what is learned: how far they differ is doubt."""
+    """Return geometries that each leave out a part of the training samples; their spread is the
+    doubt."""
     counted = learned & samples.apart()
     return [
         geometry.refit(at, samples.place, samples.beam, counted & ~part, samples.beams)
@@ -86,7 +87,7 @@ def _leave_one_out(samples: Samples, learned: BoolArray, at: Geometry) -> list[G
 def averaged(
     samples: Samples, learned: BoolArray, geometries: list[Geometry], width: float, weight: float
 ) -> FloatArray:
-    """Probabilities (N, beams), the mean over geometries."""
+    """Return probabilities (N, beams), the mean over geometries."""
     found: FloatArray = np.mean(
         [density(samples, learned, at, width, weight) for at in geometries], axis=0
     )
@@ -94,15 +95,15 @@ def averaged(
 
 
 def own(likely: FloatArray, beam: IntArray) -> FloatArray:
-    """The probability of each beam (N,) among those of all (N, beams)."""
+    """Return the probability of each beam (N,) among those of all (N, beams)."""
     found: FloatArray = likely[np.arange(len(beam)), beam % likely.shape[1]]
     return found
 
 
 def rank_of(likely: FloatArray, beam: IntArray) -> IntArray:
-    """The place of each beam (N,) among all by their probabilities (N, beams), from 0.
+    """Return the rank of each beam (N,) by its probabilities (N, beams), from 0.
 
-    Of equal ones it is the last: a predictor that cannot tell has not told.
+    Ties give the last rank: a predictor that cannot distinguish beams gets no credit.
     """
     found: IntArray = (likely >= own(likely, beam)[:, None]).sum(axis=1) - 1
     return found
@@ -111,9 +112,9 @@ def rank_of(likely: FloatArray, beam: IntArray) -> IntArray:
 def density(
     samples: Samples, learned: BoolArray, at: Geometry, width: float, weight: float
 ) -> FloatArray:
-    """Probabilities (N, beams) by the learned samples of about the same expected beam.
+    """Return probabilities (N, beams) from training samples with about the same expected beam.
 
-    They are counted in small cells; one that is just there counts 1, and the prior ``weight``.
+    They are counted in small cells; a sample in the same cell counts 1, and the prior ``weight``.
     """
     counted = learned & samples.apart()
     expected = at.beams(samples.place)
@@ -124,11 +125,11 @@ def density(
     sigma = width / _CELL
     near = gaussian_filter1d(counts, sigma, axis=0, mode="constant", truncate=5.0)
     near *= np.sqrt(2 * np.pi) * sigma
-    # Where nothing is near, the beams beside the expected one; popular ones first.
+    # Without near samples, prefer beams close to the expected one, frequent ones first.
     popular = np.bincount(beam[learned], minlength=samples.beams) + 1.0
     prior = _beside(samples, expected, _FAR) * np.sqrt(popular)
     prior /= prior.sum(axis=1, keepdims=True)
-    # A reflection makes any beam the best one, whatever the position is.
+    # A reflection can make any beam the best one at any position.
     prior = (1 - _REFLECTED) * prior + _REFLECTED / samples.beams
     mixed: FloatArray = near[cell] + weight * prior
     mixed /= mixed.sum(axis=1, keepdims=True)
@@ -136,7 +137,7 @@ def density(
 
 
 def _beside(samples: Samples, expected: FloatArray, scale: float) -> FloatArray:
-    """Falls with the distance (N, beams) of beams from the expected one, in ``scale`` beams."""
+    """Decay with the distance (N, beams) of beams from the expected one, in ``scale`` beams."""
     off = np.abs(np.arange(samples.beams) - expected[:, None])
     found: FloatArray = np.exp(-off / scale)
     return found

@@ -1,4 +1,4 @@
-"""The report of measured beams: one self-contained HTML page, and its figure."""
+"""Report of measured beams: one self-contained HTML page, and its figure."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -12,11 +12,11 @@ if TYPE_CHECKING:
 
 
 def files(answer: dict[str, Any], progress: Callable[[str], None]) -> dict[str, bytes]:
-    """The page and its figure as PNG and SVG, by file name."""
+    """Return the page and its figure as PNG and SVG, by file name."""
     drawings = {
         "deepsense_tops": (
-            "Share of samples whose best beam is among the likeliest; lines are what is meant to be"
-            " reached on blocks.",
+            "Share of samples whose best beam is among the likeliest; lines are the targets on"
+            " blocks.",
             lambda: _tops(answer),
         )
     }

@@ -1,4 +1,4 @@
-"""How well a position tells the best beam, on contiguous blocks and on a random split."""
+"""Prediction of the best beam from a position, on contiguous blocks and on a random split."""
 
 from collections.abc import Callable
 from typing import Any, Final
@@ -21,16 +21,16 @@ PREDICTORS: Final[dict[str, Predictor]] = {
     "plain geometry": predictors.plain,
     "geometry and kernel": predictors.kernel,
 }
-TARGETS: Final = {1: 45.0, 3: 82.0, 5: 95.0}  # percent on blocks that the product means to reach
+TARGETS: Final = {1: 45.0, 3: 82.0, 5: 95.0}  # the product's targets on blocks, percent
 _CALIBRATION: Final = (16, 4)
 _AIMED: Final = 1 - 0.75 * (1 - COVERAGE)
-"""A quarter of what sets may miss is held in reserve: other blocks are missed more often."""
+"""Aimed coverage: a quarter of the allowed misses is in reserve, for blocks that are harder."""
 
 
 def study(
     samples: Samples, seed: int, progress: Callable[[str], None] = lambda _text: None
 ) -> dict[str, Any]:
-    """The answer as it is written to ``deepsense.json``."""
+    """Return the answer as written to ``deepsense.json``."""
     count = len(samples.beam)
     splits = {"blocks": blocks(count, BLOCKS, FOLDS), "shuffled": shuffled(count, FOLDS, seed)}
     rows = []
@@ -59,7 +59,7 @@ def study(
 
 
 def _scores(samples: Samples, predictor: Predictor, folds: list[BoolArray]) -> dict[str, Any]:
-    """What a predictor reaches over all folds, each sample tested once."""
+    """Return a predictor's scores over all folds, each sample tested once."""
     count = len(samples.beam)
     rank, size, lost_db = np.zeros(count, int), np.zeros(count, int), np.full(count, np.nan)
     for tested in folds:
@@ -80,10 +80,11 @@ def _scores(samples: Samples, predictor: Predictor, folds: list[BoolArray]) -> d
 
 
 def _threshold(samples: Samples, fitted: Fitted, learned: BoolArray) -> float:
-    """What a beam's probability must reach for sets to cover, in blocks within what is learned.
+    """Return the probability threshold at which sets cover enough, in blocks of the training
+    samples.
 
-    Of all sets that cover as much in the mean, those by one such threshold are the smallest
-    (Sadinle, Lei and Wasserman 2019).
+    Of all sets with the same mean coverage, those by one such threshold are the smallest (Sadinle,
+    Lei and Wasserman 2019).
     """
     reached = []
     for part in inner(learned, *_CALIBRATION):
@@ -92,13 +93,13 @@ def _threshold(samples: Samples, fitted: Fitted, learned: BoolArray) -> float:
 
 
 def _sizes(likely: FloatArray, threshold: float) -> IntArray:
-    """How many beams reach a probability, at least one, (N,)."""
+    """Return the number of beams that reach a probability, at least one, (N,)."""
     sizes: IntArray = np.maximum((likely >= threshold).sum(axis=1), 1)
     return sizes
 
 
 def _lost_db(power: FloatArray, likely: FloatArray) -> FloatArray:
-    """What the likeliest beam receives less than the best one, dB, (N,)."""
+    """Return the loss of received power by the likeliest beam against the best one, dB, (N,)."""
     columns = np.argmax(likely, axis=1) % power.shape[1]
     got = power[np.arange(len(power)), columns]
     found: FloatArray = 10.0 * np.log10(power.max(axis=1) / np.maximum(got, 1e-12))
@@ -106,7 +107,7 @@ def _lost_db(power: FloatArray, likely: FloatArray) -> FloatArray:
 
 
 def text(answer: dict[str, Any]) -> str:
-    """The table as text."""
+    """Return the table as text."""
     lines = [
         f"{answer['table']}: {answer['samples']} samples, {answer['beams']} beams;"
         f" {answer['neighbours_alike']:.0%} of neighbours share a beam",

@@ -1,1 +1,1 @@
-"""Predictors compared on logs."""
+"""Comparison of predictors on logs."""

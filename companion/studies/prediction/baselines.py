@@ -1,12 +1,12 @@
 """Baselines for the observer: hold and dead reckoning. The Kalman filters are in ``kalman``.
 
-All are asked alike: at ``now_ns``, knowing only what has arrived by then, where is the UAV at
-``at_ns``? They differ in what they make of a report's time:
+All answer the same question: at ``now_ns``, from what has arrived by then, where is the UAV at
+``at_ns``? They differ in their use of a report's time:
 
-* ``Hold`` and ``DeadReckoningOnArrival`` know only when it arrived, and trust the last to arrive;
-* ``DeadReckoning`` and the Kalman filters know when it was made (the sender's clock), so that a
-  late or overtaken report is worth what it is worth. They keep to the sender's own timeline, and
-  convert the time they are asked for by what the last report to arrive says of the clock.
+* ``Hold`` and ``DeadReckoningOnArrival`` use only its arrival, and trust the last to arrive;
+* ``DeadReckoning`` and the Kalman filters use the time when it was made (the sender's clock), so
+  that they handle late and overtaken reports correctly. They stay on the sender's own timeline, and
+  convert the requested time by the clock offset of the last report to arrive.
 """
 
 from dataclasses import dataclass
@@ -15,33 +15,31 @@ from typing import Final, NamedTuple, Protocol
 from companion.values import FloatArray, GnssStatus
 
 TRACKER_TIMEOUT_NS: Final = 5_000_000_000
-"""Silence after which AntennaTracker takes a vehicle for lost."""
+"""Silence after which AntennaTracker considers a vehicle lost."""
 _S_PER_NS: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ObservedReport:
-    """A report as it reaches a predictor.
+    """Report as it reaches a predictor.
 
     The baselines do not use ``clock_bound_s`` and ``gnss``.
     """
 
     arrival_ns: int  # when it arrived, node time
-    sent_ns: int  # when it was made, node time, by the best clock known on arrival
+    sent_ns: int  # when it was made, node time, by the best clock estimate on arrival
     sender_ns: int  # when it was made, on the sender's timeline
     position_ned_m: FloatArray  # (3,), local frame
     velocity_ned_mps: FloatArray | None  # (3,), local frame; None if not reported
     clock_bound_s: float = 0.0  # bound on the error of sent_ns
-    gnss: GnssStatus | None = None  # what the sender last said of its receiver
+    gnss: GnssStatus | None = None  # the sender's last receiver status
 
 
 class Predicted(NamedTuple):
-    """A predicted position and velocity, (3,), local frame.
+    """Predicted position and velocity, (3,), local frame.
 
-    ``bound_m`` and ``usual_m``, the bound on its error and the error that 95 of 100 stay below, are
-    None where none is given.
-
-    A tuple rather than a dataclass, because a study makes millions.
+    ``bound_m`` and ``usual_m``, the bound on its error and its 95th percentile, are None if the
+    predictor has none. A tuple rather than a dataclass, because a study creates millions.
     """
 
     position_ned_m: FloatArray
@@ -51,27 +49,30 @@ class Predicted(NamedTuple):
 
 
 class Predictor(Protocol):
-    """One UAV's predictor. Reports come in the order in which they arrive."""
+    """Predictor of one UAV. Reports come in the order of arrival."""
 
     def report(self, report: ObservedReport) -> None:
-        """Take in a report that has just arrived."""
+        """Add a report that has just arrived."""
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """The state at ``at_ns`` from what has arrived by ``now_ns``; None if nothing has."""
+        """Return the state at ``at_ns`` from reports that arrived by ``now_ns``.
+
+        None without any.
+        """
 
 
 class Hold:
-    """Holds the last report to arrive."""
+    """Predictor that holds the last report to arrive."""
 
     def __init__(self) -> None:
         self._last: ObservedReport | None = None
 
     def report(self, report: ObservedReport) -> None:
-        """Replace the report that is held."""
+        """Replace the held report."""
         self._last = report
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """The position of the report that is held, whatever the time."""
+        """Return the position of the held report, at any time."""
         if self._last is None:
             return None
         return Predicted(
@@ -80,23 +81,23 @@ class Hold:
 
 
 class DeadReckoningOnArrival:
-    """Straight on from the last report, as if made on arrival: as ArduPilot's AntennaTracker does.
+    """Dead reckoning from the last report, as if made on arrival: ArduPilot's AntennaTracker.
 
-    If nothing arrived for 5 s the estimate is no longer moved, and stays where it was then. One
-    thing is kinder than the original: that adds vz, which is positive down, to the altitude; here
-    the vertical has its sign. A lead, which the original has not, is extrapolated as well. Source:
-    ArduPilot, AntennaTracker/tracking.cpp, ``update_vehicle_pos_estimate``.
+    If nothing arrived for 5 s the estimate stops moving. One fault of the original is corrected: it
+    adds vz, which is positive down, to the altitude. A lead, which the original does not have, is
+    extrapolated as well. Source: ArduPilot, AntennaTracker/tracking.cpp,
+    ``update_vehicle_pos_estimate``.
     """
 
     def __init__(self) -> None:
         self._last: ObservedReport | None = None
 
     def report(self, report: ObservedReport) -> None:
-        """Keep the newest report by arrival, however old it was when it came."""
+        """Keep the last report to arrive, at any age."""
         self._last = report
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """Position plus velocity times the time since arrival, and the lead."""
+        """Return position plus velocity times the time since arrival, and the lead."""
         last = self._last
         if last is None:
             return None
@@ -105,20 +106,20 @@ class DeadReckoningOnArrival:
 
 
 class DeadReckoning:
-    """Straight on from the report that was made last, by the sender's clock."""
+    """Dead reckoning from the newest report by the sender's clock."""
 
     def __init__(self) -> None:
         self._newest: ObservedReport | None = None
         self._offset_ns = 0
 
     def report(self, report: ObservedReport) -> None:
-        """Keep the newest report; one that was overtaken on its way only updates the clock."""
+        """Keep the newest report; an overtaken one only updates the clock."""
         self._offset_ns = report.sent_ns - report.sender_ns
         if self._newest is None or report.sender_ns > self._newest.sender_ns:
             self._newest = report
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """Position plus velocity times the time since the report was made."""
+        """Return position plus velocity times the time since the report was made."""
         newest = self._newest
         if newest is None:
             return None

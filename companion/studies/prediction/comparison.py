@@ -1,17 +1,17 @@
-"""Predictors compared on logs: ``companion study prediction``.
+"""Comparison of predictors on logs: ``companion study prediction``.
 
 For every vehicle of a log but the carrier, over each link (the log's own, a slow radio, a hostile
-one), a pointer is asked 20 times a second where the UAV will be at now + lead. It uses only what
-has arrived by then. Errors are those of position and of the direction from the array's true
-position, while the UAV flies. The product answers through its pipeline, which hears the vehicle's
-own frames; whether its bounds held, and whether it had said that they might not, is counted in
-``violations``.
+one), a pointer asks 20 times a second where the UAV will be at now + lead. Predictors use only data
+that have arrived by then. Errors are those of position and of the direction from the array's true
+position, while the UAV flies. The product answers through its pipeline, which receives the
+vehicle's own frames; ``violations`` counts whether its bounds held, and whether a violation was
+announced.
 
 The Kalman filters are tuned in hindsight, once for each log and link: their process and measurement
-noise are the best of a grid over all UAVs and leads, which is kinder to them than any user could
-be. ``kalman-peng`` has the noise that the settings state, and is never tuned.
+noise are the best of a grid over all UAVs and leads, an advantage that no user has. ``kalman-peng``
+has the noise of the settings, and is never tuned.
 
-Each log over each link is a piece of work of its own: see ``companion.studies.running.fan_out``.
+Each log over each link is a separate piece of work: see ``companion.studies.running.fan_out``.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -55,16 +55,17 @@ from companion.studies.truth.vehicles import Flown
 from companion.values import UserError
 
 LEADS_S: Final = (0.0, 0.1, 0.3, 1.0)
-LINKS: Final = ("clean", "radio", "hostile")  # links over which is compared unless others are named
+LINKS: Final = ("clean", "radio", "hostile")  # default links
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionStudy:
-    """What is asked of the study.
+    """Parameters of the study.
 
-        links     names of the links over which is compared, of those in ``radio_link``
+        links     names of links, of those in ``radio_link``
 
-    Who works does not change the rows. Raises ``UserError`` for values out of range.
+    The choice of processes or cluster does not change the rows. Raises ``UserError`` for values out
+    of range.
     """
 
     logs: tuple[Path, ...]  # the logs
@@ -78,28 +79,28 @@ class PredictionStudy:
     learned: Path | None = None  # a file of companion study train
     snr_db: float = SNR_DB  # SNR for the loss in spectral efficiency
     jobs: int | None = 1  # processes; None: as many as cores
-    cluster: str | None = None  # address of a cluster that works instead
+    cluster: str | None = None  # address of a cluster to use instead
 
     def __post_init__(self) -> None:
         if not -100 <= self.snr_db <= 100:
-            raise UserError(f"--snr is in dB, between -100 and 100, not {self.snr_db:g}")
+            raise UserError(f"--snr {self.snr_db:g}: give dB from -100 to 100")
         if not self.leads_s or not all(0 <= lead_s <= 60 for lead_s in self.leads_s):
-            raise UserError("leads are seconds, between 0 and 60")
+            raise UserError("--lead: give seconds from 0 to 60")
         known = [link.name for link in radio_link.LINKS]
         if not self.links or not set(self.links) <= set(known):
-            raise UserError(f"links are some of {', '.join(known)}, not {','.join(self.links)}")
+            raise UserError(f"--links {','.join(self.links)}: give some of {', '.join(known)}")
         if self.seed < 0:
-            raise UserError(f"a seed is at least 0, not {self.seed}")
+            raise UserError(f"--seed {self.seed}: give 0 or more")
 
     @property
     def over(self) -> tuple[RadioLink, ...]:
-        """The links, each once, in the order in which they were named."""
+        """Links, each once, in the order named."""
         links = {link.name: link for link in radio_link.LINKS} | {RADIO.name: self.radio}
         return tuple(links[name] for name in dict.fromkeys(self.links))
 
     @property
     def command(self) -> str:
-        """The command line that asks for this study."""
+        """Command line of this study."""
         radio = self.radio
         return command_line(
             "prediction",
@@ -120,7 +121,7 @@ class PredictionStudy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LogComparison:
-    """A log, by its name, over one link: its rows, and the tuning that each filter was given."""
+    """One log over one link: its rows, and the tuning of each filter."""
 
     log: str
     center: str
@@ -135,7 +136,7 @@ def compare(
     setting: PredictionStudy,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> LogComparison:
-    """Every predictor on every UAV of a log, over one link. No rows where none flies."""
+    """Run every predictor on every UAV of a log, over one link. No rows if none flies."""
     cases: list[Case] = []
 
     def clock() -> SenderClock:
@@ -177,15 +178,15 @@ def compare(
 
 
 def as_true(settings: Settings, kind: Kind) -> Settings:
-    """The settings under which the product is judged by a kind of truth.
+    """Return the settings with which the product is evaluated against a kind of truth.
 
-    Where the truth is made of the reports themselves, they do not lag behind it.
+    If the truth is computed from the reports themselves, they do not lag behind it.
     """
     return settings.override(observer={"lag_s": (0.0, 0.0)}) if kind == "reports" else settings
 
 
 def rivals(setting: PredictionStudy, tuned: Mapping[str, Tuning]) -> dict[str, Make]:
-    """The predictors that the product is compared with, by name, in the order of the tables."""
+    """Return the predictors to compare the product with, by name, in the order of the tables."""
     known = known_tuning(setting.settings)
     makes = dict(SIMPLE)
     makes |= {name: kalman(name, tuning) for name, tuning in tuned.items()}
@@ -197,7 +198,7 @@ def rivals(setting: PredictionStudy, tuned: Mapping[str, Tuning]) -> dict[str, M
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """A piece of work: the logs of one flight over one link."""
+    """Piece of work: the logs of one flight over one link."""
 
     setting: PredictionStudy
     logs: tuple[Path, ...]
@@ -205,10 +206,7 @@ class Piece:
 
 
 def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> LogComparison:
-    """Read a log and compare.
-
-    Raises ``UserError`` or ``LogError`` where it has nothing to study.
-    """
+    """Read a log and compare. Raises ``UserError`` or ``LogError`` if it has nothing to study."""
     progress(f"reading {vehicles.named(piece.logs)}")
     flown = vehicles.load(piece.logs, center_of(piece.logs, piece.setting.center))
     return compare(flown, piece.link, piece.setting, progress)
@@ -217,12 +215,12 @@ def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> 
 def study(
     setting: PredictionStudy, progress: Callable[[str], None] = lambda _text: None
 ) -> tuple[dict[str, Any], list[LogComparison]]:
-    """The answer as it is written to ``prediction.json``, and what the report shows.
+    """Return the answer as written to ``prediction.json``, and the data of the report.
 
-    Raises ``UserError`` or ``LogError`` for a log in which there is nothing to study.
+    Raises ``UserError`` or ``LogError`` for a log with nothing to study.
     """
     if setting.learned is not None:
-        learned(setting.learned)  # what cannot be used is said before the work
+        learned(setting.learned)  # report an unusable file before the work starts
     flown = flights(setting.logs)
     pieces = [Piece(setting, logs, link) for logs in flown for link in setting.over]
     found = _compared(setting, pieces, progress)
@@ -230,7 +228,7 @@ def study(
         among = len(setting.over)
         if not any(each.rows for each in found[number * among : (number + 1) * among]):
             names = " ".join(map(str, logs))
-            raise UserError(f"{names}: no UAV flies in it, as far as its carrier is known")
+            raise UserError(f"{names}: no UAV flies while the carrier's position is known")
     known = known_tuning(setting.settings)
     rows = [row for compared in found for row in compared.rows]
     return {
@@ -252,7 +250,7 @@ def study(
 def _compared(
     setting: PredictionStudy, pieces: Sequence[Piece], progress: Callable[[str], None]
 ) -> list[LogComparison]:
-    """The results of the pieces, in their order."""
+    """Return the results of the pieces, in their order."""
 
     def progressed(done: int) -> None:
         progress(f"{done} of {len(pieces)} done (a log over a link each)")

@@ -1,8 +1,8 @@
-"""Messages delivered by a link: when each arrives, and what a predictor makes of it.
+"""Delivery of messages by a link: arrival times, and the reports for predictors.
 
-The product is handed the frames themselves; the baselines get observed reports, whose times are by
-the product's clock, which hears the stamps of all messages. Everything is drawn from
-a seed and the vehicle's id.
+The product receives the frames themselves; the baselines get observed reports, whose times are by
+the product's clock, which uses the stamps of all messages. All random values derive from a seed and
+the vehicle's id.
 """
 
 import math
@@ -26,40 +26,40 @@ from companion.values import BoolArray, FloatArray, Frame, IntArray, RoundTrip, 
 
 P95: Final = 1.6448536269514722  # the 95th percentile of the standard normal distribution
 ROUND_TRIP_NS: Final = 10_000_000
-"""Length of the round trips, one a second, of which a clock that is known is known."""
+"""Duration of the round trips, one a second, that measure a known clock."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Delivery:
-    """What a link delivers of one vehicle, in order of arrival.
+    """Messages of one vehicle that a link delivers, in order of arrival.
 
-    events     the frames with the times of their arrival, and round trips; none for a flight
-               without frames
+    events     the frames with their arrival times, and round trips; empty for a flight without
+               frames
     """
 
     observed: tuple[ObservedReport, ...]  # the reports
     events: tuple[Frame | RoundTrip, ...]
     rate_hz: float  # nominal rate of reports, or that of the log
-    latency_s: float  # nominal median latency, or that seen by the clock
+    latency_s: float  # nominal median latency, or that estimated by the clock
     begins_ns: int | None = None  # when a hostile link was switched on; None for others
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Sends:
-    """What a vehicle sent, (M,): first its reports (N,), then its other frames, if any."""
+    """Messages that a vehicle sent, (M,): first its reports (N,), then its other frames, if any."""
 
     sent_ns: Times  # when it arrived over the log's own link
-    boot_ms: Times  # its boot stamp; -1 where it has none
+    boot_ms: Times  # its boot stamp; -1 without one
     kind: IntArray  # its message id
-    frame: IntArray  # its place among the flight's frames; -1 without
+    frame: IntArray  # its index among the flight's frames; -1 without one
 
 
 def deliver(
     flight: Flight, link: RadioLink, seed: int, clock: Callable[[], SenderClock] = SenderClock
 ) -> Delivery:
-    """Send what a flight sent through a link; ``clock`` makes the sender's clock.
+    """Send the messages of a flight through a link; ``clock`` creates the sender's clock.
 
-    The same seed gives the same result, whatever else is flown.
+    The same seed gives the same result, independent of other flights.
     """
     rng = np.random.default_rng([seed, zlib.crc32(flight.uav.encode())])
     sends, reports = _sends(flight), len(flight.arrival_ns)
@@ -69,7 +69,7 @@ def deliver(
     rows, arrival_ns = rows[order], arrival_ns[order]
     noise = noisy_frames.noise(rng, reports, link)
     trips = flight.round_trips if link.as_logged else ()
-    # The radio's delays do not reach a clock that is known by other means.
+    # The radio's delays do not affect a clock that is known by other means.
     heard_ns = sends.sent_ns[rows] if link.known_delay else arrival_ns
     placed = on_sender_clock(clock(), heard_ns, sends.boot_ms[rows], rows < reports, trips)
     observed = tuple(
@@ -138,7 +138,7 @@ def _sends(flight: Flight) -> _Sends:
 
 
 def _begins_ns(flight: Flight) -> int:
-    """When the UAV is first seen to fly; when its first report came, if it never is."""
+    """Return when the UAV is first seen to fly; if never, when its first report arrived."""
     (flies,) = np.nonzero(flight.flying(flight.arrival_ns))
     return int(flight.arrival_ns[flies[0] if len(flies) else 0])
 
@@ -146,7 +146,7 @@ def _begins_ns(flight: Flight) -> int:
 def _passed(
     rng: np.random.Generator, sends: _Sends, reports: int, link: RadioLink, begins_ns: int | None
 ) -> tuple[IntArray, Times]:
-    """The rows of what arrives, and when."""
+    """Return the rows that arrive, and their arrival times."""
     if begins_ns is not None:
         order = np.argsort(sends.sent_ns, kind="stable")
         came_ns, arrives = hostile_link.arrivals_ns(rng, sends.sent_ns[order], begins_ns)
@@ -173,18 +173,18 @@ def _over_radio(
 
 
 def _thinned(sends: _Sends, reports: int, rate_hz: float | None) -> IntArray:
-    """Rows of the first report in each period of the sender's clock, in order of arrival."""
+    """Return rows of the first report in each period of the sender's clock, in order of arrival."""
     rows = np.arange(reports)
     if rate_hz is None:
         return rows
-    # A new period, or a clock that was restarted.
+    # A new period, or a restarted clock.
     period = np.floor(sends.boot_ms[:reports] * (rate_hz * 1e-3)).astype(np.int64)
     kept: IntArray = rows[np.diff(period, prepend=period[0] - 1) != 0]
     return kept
 
 
 def _thinned_each(sends: _Sends, rows: IntArray, rate_hz: float) -> IntArray:
-    """The rows of the first message of each kind in each period of the log."""
+    """Return the rows of the first message of each kind in each period of the log."""
     period = np.floor((sends.sent_ns[rows] - sends.sent_ns.min()) * (rate_hz * 1e-9))
     kinds = np.stack([sends.kind[rows].astype(float), period], axis=1)
     _, first = np.unique(kinds, axis=0, return_index=True)
@@ -193,7 +193,7 @@ def _thinned_each(sends: _Sends, rows: IntArray, rate_hz: float) -> IntArray:
 
 
 def _known(flight: Flight) -> tuple[RoundTrip, ...]:
-    """Round trips as the service would have made with a vehicle over the log's own link."""
+    """Return round trips as the service would have measured over the log's own link."""
     found: list[RoundTrip] = []
     source = Source.parse(flight.uav)
     each = zip(flight.arrival_ns.tolist(), flight.made_ns.tolist(), flight.boot_ms, strict=True)
@@ -213,16 +213,16 @@ def _known(flight: Flight) -> tuple[RoundTrip, ...]:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PlacedMessages:
-    """Messages put in time by the product's clock, (n,) each.
+    """Messages placed in time by the product's clock, (n,) each.
 
-    sender_ns  on the sender's timeline, which begins where its clock is first placed, and again
+    sender_ns  on the sender's timeline, which starts when its clock is first placed, and again
                after a restart
     """
 
     sender_ns: Times
-    sent_ns: Times  # on the node's timeline, as known on arrival
+    sent_ns: Times  # on the node's timeline, as estimated on arrival
     bound_s: FloatArray  # bound on the error of that
-    known: BoolArray  # whether it is a report whose stamp could be placed at all
+    known: BoolArray  # whether it is a report with a placed stamp
 
 
 def on_sender_clock(
@@ -232,9 +232,9 @@ def on_sender_clock(
     is_report: BoolArray,
     trips: tuple[RoundTrip, ...] = (),
 ) -> PlacedMessages:
-    """When reports among messages (n,) were made, by the product's clock; a stamp of -1 is none.
+    """Place reports among messages (n,) in time by the product's clock; stamp -1: none.
 
-    The clock hears the others, and ``trips``, as in the pipeline. Only here does the study use it.
+    The clock also receives the other messages, and ``trips``, as in the pipeline.
     """
     start_ns: int | None = None
     waiting = list(reversed(trips))

@@ -1,9 +1,9 @@
-"""A hostile link: regimes of latency one after the other, drawn from a seed.
+"""Hostile link: a sequence of latency regimes, drawn from a seed.
 
-The node is switched on when the UAV flies: what was sent before never arrives, so that the link's
-very first frame is heard in flight. From then on the regimes follow one another, and begin again
-when all were there. Frames keep their order, as in a queue, but for the regime in which they
-overtake one another. Nothing is thinned or lost.
+The node is switched on when the UAV flies: earlier messages never arrive, so that the link's first
+frame arrives in flight. From then on the regimes follow one another, and repeat. Frames keep their
+order, as in a queue, except in the regime in which they overtake one another. Nothing is thinned or
+lost.
 """
 
 from collections.abc import Callable
@@ -19,12 +19,12 @@ FAST_S: Final = 0.02
 SLOW_S: Final = 0.5
 
 Latency = Callable[[np.random.Generator, FloatArray], FloatArray]
-"""Latencies (n,) of frames sent at times (n,) in the regime, seconds both."""
+"""Function from send times (n,) within the regime to latencies (n,), seconds both."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Regime:
-    """A regime: its name in reports, how long it lasts, its latency, whether frames overtake."""
+    """Regime: its name in reports, duration, latency, and whether frames overtake."""
 
     name: str
     lasts_s: float
@@ -42,17 +42,17 @@ def _steady(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
 
 
 def _step(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """0.02 s, and from the fifth second on 0.5 s."""
+    """0.02 s, from the fifth second 0.5 s."""
     return np.where(at_s < 5, FAST_S, SLOW_S)
 
 
 def _ramp(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """From 0.02 to 1 s within 20 s, 5 s there, and back within 20 s."""
+    """From 0.02 to 1 s within 20 s, constant for 5 s, and back within 20 s."""
     return np.interp(at_s, [0.0, 20.0, 25.0, 45.0], [FAST_S, 1.0, 1.0, FAST_S])
 
 
 def _sawtooth(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """From 0 to 0.8 s within 6 s, again and again."""
+    """From 0 to 0.8 s within 6 s, repeatedly."""
     return 0.8 * (at_s % 6.0) / 6.0
 
 
@@ -68,7 +68,7 @@ def _wandering(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
 
 
 def _bursts(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """Open for 0.5 to 2 s, then everything is held for 1 to 4 s and comes at once."""
+    """Open for 0.5 to 2 s, then everything is held for 1 to 4 s and delivered at once."""
     found = np.full(len(at_s), FAST_S)
     opens_s = 0.0
     while len(at_s) and opens_s < at_s[-1]:
@@ -87,7 +87,7 @@ def _changes(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
 
 
 def _overtaking(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """Each frame by a way of its own: anything up to 0.8 s."""
+    """Each frame independently: anything up to 0.8 s."""
     return rng.uniform(0.0, 0.8, len(at_s))
 
 
@@ -107,7 +107,7 @@ ROUND_NS: Final = int(_STARTS_NS[-1])
 
 
 def regimes_at(t_ns: Times, begins_ns: int) -> IntArray:
-    """The number of the regime, in ``REGIMES``, at each time (n,)."""
+    """Return the index of the regime, in ``REGIMES``, at each time (n,)."""
     into_ns = (t_ns - begins_ns) % ROUND_NS
     found: IntArray = np.searchsorted(_STARTS_NS, into_ns, side="right") - 1
     return found
@@ -116,7 +116,7 @@ def regimes_at(t_ns: Times, begins_ns: int) -> IntArray:
 def arrivals_ns(
     rng: np.random.Generator, sent_ns: Times, begins_ns: int
 ) -> tuple[Times, BoolArray]:
-    """When frames sent at ascending times (n,) arrive, and whether they do."""
+    """Return arrival times of frames sent at ascending times (n,), and whether they arrive."""
     arrives = np.asarray(sent_ns >= begins_ns)
     arrival_ns = sent_ns.copy()
     rounds = (sent_ns - begins_ns) // ROUND_NS

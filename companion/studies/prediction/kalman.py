@@ -1,4 +1,4 @@
-"""Kalman filters on the sender's clock: two states an axis, or three.
+"""Kalman filters on the sender's clock, with two or three states per axis.
 
 The model, per axis, all axes alike: x = [p v] or [p v a], driven by white noise of spectral
 density q in the derivative after the last. With k the number of derivatives,
@@ -22,7 +22,7 @@ from companion.studies.prediction.baselines import ObservedReport, Predicted
 from companion.values import FloatArray
 
 HISTORY: Final = 64
-"""Reports that a Kalman filter keeps, so that a late one can be put in its place."""
+"""Reports that a Kalman filter keeps, so that a late one can be sorted in."""
 _S_PER_NS: Final = 1e-9
 
 
@@ -32,7 +32,7 @@ class Tuning:
 
     ``process_density`` is the spectral density of the white noise in the last derivative's rate,
     m²/s³ for two states (acceleration), m²/s⁵ for three (jerk). The others are standard deviations;
-    ``start_*`` are those of what the first report does not say.
+    ``start_*`` are those of states that the first report does not contain.
     """
 
     process_density: float
@@ -43,7 +43,7 @@ class Tuning:
 
 
 class _Filtered(NamedTuple):
-    """A report and the state after it: mean (n, 3), covariance (n, n) common to the axes."""
+    """Report and the state after it: mean (n, 3), covariance (n, n) common to the axes."""
 
     report: ObservedReport
     mean: FloatArray
@@ -53,15 +53,15 @@ class _Filtered(NamedTuple):
 class Kalman:
     """Kalman filter on the sender's clock: 2 states per axis (``cv``) or 3 (``ca``).
 
-    A report that was overtaken is put in its place and what came after it is filtered again, as
-    long as it is among the last ``HISTORY``; an older one is dropped.
+    An overtaken report is sorted in and later ones are filtered again, if it is among the last
+    ``HISTORY``; an older one is dropped.
 
-    With several tunings it is as many filters at once, and all it gives has a first axis for them.
+    With several tunings it is as many filters at once, and all results have a first axis for them.
     """
 
     def __init__(self, states: int, tuning: Tuning, *others: Tuning) -> None:
         if states not in (2, 3):
-            raise ValueError(f"a filter has 2 or 3 states an axis, not {states}")
+            raise ValueError(f"filter has {states} states per axis, allowed: 2 or 3")
         self._states = states
         rows = np.array([_numbers(each) for each in (tuning, *others)])
         numbers = rows.T if others else rows[0]
@@ -85,7 +85,7 @@ class Kalman:
             del history[0]
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """The mean, carried on from the newest report."""
+        """Return the mean, extrapolated from the newest report."""
         if not self._history:
             return None
         newest = self._history[-1]
@@ -120,7 +120,7 @@ class Kalman:
         return _Filtered(report, mean, covariance)
 
     def _start(self, report: ObservedReport) -> tuple[FloatArray, FloatArray]:
-        """The first position as reported; unknown states are 0 with large deviations."""
+        """Return the first position as reported; unknown states are 0 with large deviations."""
         deviations = self._deviations
         mean = np.zeros((*deviations.shape, 3))
         mean[..., 0, :] = report.position_ned_m
@@ -140,7 +140,8 @@ def _numbers(tuning: Tuning) -> tuple[float, ...]:
 def _conditioned(
     mean: FloatArray, covariance: FloatArray, state: int, measured: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Mean (..., n, 3) and covariance (..., n, n) given a measurement (3,) of one state, each axis.
+    """Condition mean (..., n, 3) and covariance (..., n, n) on a measurement (3,) of one state per
+    axis.
 
     The noise of the measurement is (...).
     """

@@ -1,17 +1,17 @@
-"""A learned predictor: an LSTM over the last reports. Only this module loads PyTorch.
+"""Learned predictor: an LSTM over the last reports. Only this module loads PyTorch.
 
 In the manner of LRNet (C. Liu, W. Yuan, Z. Wei, X. Liu, D. W. K. Ng, "Location-aware predictive
 beamforming for UAV communications: a deep learning approach", IEEE Wireless Communications Letters
-10(3), 668-672): the last locations go through a recurrent network, whose state a dense layer turns
-into the location to come. Only the citation and a reader's sketch of the network were at hand, not
-the paper, and this differs on purpose: reports come at any intervals (so their times are an input),
-they bear velocities, any lead may be asked for (it is an input of the dense layers), and what is
-learned is the departure from straight flight, as an acceleration:
+10(3), 668-672): the last locations enter a recurrent network, whose state a dense layer maps to the
+future location. Only the citation and a reader's sketch of the network were available, not the
+paper, and this differs on purpose: reports come at any intervals (so their times are an input),
+they contain velocities, any lead is possible (it is an input of the dense layers), and the network
+learns the deviation from straight flight, as an acceleration:
 
     p(t + h) = p(t) + v(t) h + R a(window, h) h^2 / 2          h up to ``LEAD_MAX_S``
 
-Beyond that the acceleration is over and the flight straight. Trained on flights made up at random,
-heard through links made up at random; the same seed gives the same network on the same machine.
+Beyond that the acceleration ends and the flight is straight. Trained on random flights over random
+links; the same seed gives the same network on the same machine.
 """
 
 from collections.abc import Callable
@@ -38,11 +38,11 @@ FLIGHTS: Final = 240
 LEADS_A_WINDOW: Final = 4
 
 Network: TypeAlias = Any
-"""A ``torch.nn.ModuleDict``; PyTorch's own types exist only where it is installed."""
+"""``torch.nn.ModuleDict``; PyTorch's own types exist only if it is installed."""
 
 
 def network() -> Network:
-    """An untrained network, its weights drawn from torch's generator."""
+    """Return an untrained network, its weights drawn from torch's generator."""
     head = nn.Sequential(nn.Linear(HIDDEN + 1, HIDDEN), nn.Tanh(), nn.Linear(HIDDEN, 3))
     return nn.ModuleDict({"lstm": nn.LSTM(FEATURES, HIDDEN, batch_first=True), "head": head})
 
@@ -56,7 +56,7 @@ def _accelerations(net: Network, state: Any, lead_s: Any) -> Any:
 
 
 class Learned:
-    """One UAV's predictor by a trained network."""
+    """Predictor of one UAV by a trained network."""
 
     def __init__(self, net: Network) -> None:
         self._net = net
@@ -65,7 +65,7 @@ class Learned:
         self._state: Any = None
 
     def report(self, report: ObservedReport) -> None:
-        """Take in a report; the recurrent part runs once for each."""
+        """Add a report; the recurrent part runs once for each."""
         if self._recent.add(report):
             self._window = self._recent.window()
             seen = torch.tensor(self._window.seen[None], dtype=torch.float32)
@@ -73,7 +73,7 @@ class Learned:
                 self._state = self._net["lstm"](seen)[1][0][0]
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """Straight on from the newest report, plus the network's correction."""
+        """Dead reckoning from the newest report, plus the network's correction."""
         window = self._window
         if window is None:
             return None
@@ -82,7 +82,7 @@ class Learned:
         with torch.no_grad():
             seen = _accelerations(self._net, self._state, torch.tensor([[lead_s]]))[0].numpy()
         acceleration = window.local_from_seen @ seen.astype(float)
-        # Past the last lead: straight on with the velocity reached there.
+        # Past the largest lead: straight flight at the velocity reached there.
         bend = acceleration * (lead_s * lead_s / 2 + lead_s * (max(since_s, lead_s) - lead_s))
         position = window.position_ned_m + window.velocity_ned_mps * since_s + bend
         return Predicted(
@@ -93,20 +93,20 @@ class Learned:
 
 
 def load(path: Path) -> Callable[[], Predictor]:
-    """A function that makes predictors by a trained network.
+    """Return a factory of predictors with a trained network.
 
-    Raises ``UserError`` for a file that holds none, ``OSError`` where it cannot be read.
+    Raises ``UserError`` for a file without one, ``OSError`` if it cannot be read.
     """
     torch.set_num_threads(1)
     net = network()
     try:
         held = torch.load(path, weights_only=True, map_location="cpu")
         if not isinstance(held, dict) or held.get("format") != FORMAT:
-            raise UserError("of another kind")
+            raise UserError("wrong format")
         net.load_state_dict(held["weights"])
     except OSError:
         raise
-    except Exception as error:  # a pickle that is none fails in any way it likes
+    except Exception as error:  # an invalid pickle can raise anything
         raise UserError(f"{path}: not a network of `companion study train`") from error
     net.eval()
     return lambda: Learned(net)
@@ -118,10 +118,10 @@ def load(path: Path) -> Callable[[], Predictor]:
 def examples(
     seed: int, flights: int, progress: Callable[[str], None]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Examples to learn from; only windows of K reports whose future is known.
+    """Return training examples; only windows of K reports with a known future.
 
-    Returns windows (N, K, 7), leads (N, L) in s, and departures (N, L, 3) of the UAV from straight
-    flight, frame of the window, m.
+    Windows (N, K, 7), leads (N, L) in s, and deviations (N, L, 3) of the UAV from straight flight,
+    frame of the window, m.
     """
     rng = np.random.default_rng(seed)
     windows: list[FloatArray] = []
@@ -161,9 +161,9 @@ def train(
     flights: int = FLIGHTS,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> tuple[dict[str, Any], float]:
-    """Train a network: returns what ``save`` writes, and the loss of the last epoch (Huber, m).
+    """Train a network: return the input of ``save``, and the loss of the last epoch (Huber, m).
 
-    Raises ``UserError`` where the flights give no example. Sets torch to one thread and to
+    Raises ``UserError`` if the flights give no example. Sets torch to one thread and to
     deterministic algorithms.
     """
     torch.set_num_threads(1)
@@ -173,7 +173,7 @@ def train(
         torch.tensor(each, dtype=torch.float32) for each in examples(seed, flights, progress)
     )
     if len(seen) == 0:
-        raise UserError("no example to learn from: more flights are needed")
+        raise UserError("no training examples; give more flights")
     net = network()
     steps = epochs * -(-len(seen) // BATCH)
     optimiser = torch.optim.Adam(net.parameters(), lr=RATE)
@@ -184,7 +184,7 @@ def train(
         order = torch.tensor(rng.permutation(len(seen)))
         total = 0.0
         for rows in torch.split(order, BATCH):
-            # Fewer reports at times, as at the beginning of a flight.
+            # Sometimes fewer reports, as at the start of a flight.
             known = REPORTS if rng.random() < 0.7 else int(rng.integers(1, REPORTS))
             loss = _loss(net, seen[rows, REPORTS - known :], leads[rows], ways[rows])
             optimiser.zero_grad()
@@ -200,7 +200,7 @@ def train(
 
 
 def _loss(net: Network, seen: Any, leads: Any, ways: Any) -> Any:
-    """Huber's loss of the departures, metres; squares would be dominated by the long leads."""
+    """Huber's loss of the deviations, metres; squares would be dominated by the long leads."""
     state = net["lstm"](seen)[1][0][0]
     state = state.repeat_interleave(LEADS_A_WINDOW, dim=0)
     lead_s = leads.reshape(-1, 1)

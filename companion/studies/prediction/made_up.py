@@ -1,8 +1,8 @@
-"""Flights made up at random for training, and radios as bad as real ones to hear them through.
+"""Random flights for training, and random radio links for their reports.
 
-A flight turns, speeds up and climbs by Ornstein-Uhlenbeck processes about values of its own: some
+A flight turns, accelerates and climbs by Ornstein-Uhlenbeck processes about its own values: some
 circle, some fly straight, some wander. Velocity is the integral of acceleration and position of
-velocity, so that the three agree. Frame: local NED, metres; nothing here is any place on Earth.
+velocity, so that the three are consistent. Frame: local NED, metres; not at any place on Earth.
 """
 
 from typing import Final
@@ -15,7 +15,7 @@ from companion.studies.truth.vehicles import Flight
 from companion.values import FloatArray
 
 STEP_S: Final = 0.05
-REPORT_STEPS: Final = 2  # steps between reports: one each 0.1 s, which a link then thins
+REPORT_STEPS: Final = 2  # steps between reports: one every 0.1 s, which a link then thins
 EPOCH_NS: Final = 1_700_000_000_000_000_000
 BOOT_MS: Final = 5000
 DELAY_NS: Final = 5_000_000
@@ -24,7 +24,7 @@ VELOCITY_NOISE_MPS: Final = 0.1
 
 
 def flight(rng: np.random.Generator, uav: str, seconds: float = 60.0) -> Flight:
-    """One flight, its reports 10 a second with noise, each 5 ms on its way."""
+    """Return one flight with noisy reports, 10 a second, each with a latency of 5 ms."""
     n = round(seconds / STEP_S)
     position, velocity = _motion(rng, n)
     t_ns = EPOCH_NS + np.arange(n, dtype=np.int64) * round(STEP_S * 1e9)
@@ -47,9 +47,9 @@ def flight(rng: np.random.Generator, uav: str, seconds: float = 60.0) -> Flight:
 
 
 def made_ns(made: Flight, sender_ns: Times, first: FloatArray) -> Times:
-    """True times of reports (N,) by their sender's clock.
+    """Return the true times of reports (N,) by their sender's clock.
 
-    ``first`` is the position (3,) in the first of them, by which it is found.
+    ``first`` is the position (3,) in the first of them, which identifies it.
     """
     (row,) = np.flatnonzero((made.position_ned_m == first).all(axis=1))
     times: Times = made.arrival_ns[row] - DELAY_NS + sender_ns - sender_ns[0]
@@ -57,7 +57,7 @@ def made_ns(made: Flight, sender_ns: Times, first: FloatArray) -> Times:
 
 
 def link(rng: np.random.Generator) -> RadioLink:
-    """A link between a clean one at 10 Hz and a slow radio.
+    """Return a link between a clean one at 10 Hz and a slow radio.
 
     Its sender's clock is known, as by TIMESYNC: the network should not learn a clock's errors.
     """
@@ -74,7 +74,7 @@ def link(rng: np.random.Generator) -> RadioLink:
 
 
 def _motion(rng: np.random.Generator, n: int) -> tuple[FloatArray, FloatArray]:
-    """Positions and velocities (n, 3)."""
+    """Return positions and velocities (n, 3)."""
     turn = _wander(rng, n, rng.choice([0.0, rng.uniform(-0.5, 0.5)]), rng.uniform(0, 0.2), 5.0)
     speed = np.abs(_wander(rng, n, rng.uniform(1.0, 20.0), rng.uniform(0, 2.0), 8.0))
     climb = _wander(rng, n, 0.0, rng.uniform(0, 1.5), 5.0)
@@ -90,9 +90,9 @@ def _motion(rng: np.random.Generator, n: int) -> tuple[FloatArray, FloatArray]:
 def _wander(
     rng: np.random.Generator, n: int, about: float, deviation: float, memory_s: float
 ) -> FloatArray:
-    """An Ornstein-Uhlenbeck process (n,) from its stationary state, smoothed over half a second.
+    """Ornstein-Uhlenbeck process (n,) from its stationary state, smoothed over half a second.
 
-    The smoothing stands for a vehicle's inertia.
+    The smoothing models a vehicle's inertia.
     """
     keep = np.exp(-STEP_S / memory_s)
     drawn = rng.standard_normal(n) * deviation

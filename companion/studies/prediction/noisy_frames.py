@@ -1,4 +1,4 @@
-"""Reports made worse: noise added to GLOBAL_POSITION_INT, and GPS_RAW_INT that says so."""
+"""Degraded reports: noise added to GLOBAL_POSITION_INT, and to the accuracies in GPS_RAW_INT."""
 
 import math
 import struct
@@ -23,14 +23,14 @@ _METRES_PER_DEGREE: Final = 111_195.0
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Noise:
-    """What is added to each report: position (N, 3), velocity (N, 3), north-east-down."""
+    """Noise of each report: position (N, 3), velocity (N, 3), north-east-down."""
 
     position_ned_m: FloatArray
     velocity_ned_mps: FloatArray
 
 
 def noise(rng: np.random.Generator, reports: int, link: RadioLink) -> Noise:
-    """The noise of a link for so many reports."""
+    """Draw the noise of a link for a number of reports."""
     if not (link.noise_m or link.noise_mps):
         return Noise(np.zeros((reports, 3)), np.zeros((reports, 3)))
     drawn = np.clip(rng.standard_normal((2, reports, 3)), -NOISE_MOST, NOISE_MOST)
@@ -38,7 +38,7 @@ def noise(rng: np.random.Generator, reports: int, link: RadioLink) -> Noise:
 
 
 def changed(flight: Flight, added: Noise, link: RadioLink) -> list[Frame]:
-    """The frames of a flight with this noise in its reports."""
+    """Return the frames of a flight with this noise in its reports."""
     frames = list(flight.frames)
     if not (frames and (link.noise_m or link.noise_mps)):
         return frames
@@ -68,7 +68,7 @@ def _less_accurate(frame: Frame, link: RadioLink) -> Frame:
     payload = bytearray(frame.payload.ljust(_GPS_RAW_INT_SIZE, b"\0"))
     told = _ACCURACY.unpack_from(payload, _ACCURACY_AT)
     more = (link.noise_m, link.noise_m, link.noise_mps)
-    # What a receiver calls its accuracy is a deviation in all directions together.
+    # A receiver's accuracy is a deviation over all directions together.
     sums = (
         round(math.hypot(before, one * math.sqrt(3) * 1e3))
         for before, one in zip(told, more, strict=True)

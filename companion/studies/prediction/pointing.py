@@ -1,4 +1,4 @@
-"""Questions to a pointer on a log, a predictor's answers, and their scores."""
+"""Questions of a pointer on a log, a predictor's answers, and their scores."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -25,10 +25,10 @@ Row = dict[str, Any]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Questions:
-    """Questions to one UAV's pointer: at times ``now_ns`` (K,), for each lead (L,).
+    """Questions about one UAV: at times ``now_ns`` (K,), for each lead (L,).
 
     counts       (L, K), whether the answer is scored: the UAV flies then, and both are known
-    regime       (K,), the regime of a hostile link, by its number; None over other links
+    regime       (K,), index of the regime of a hostile link; None over other links
     """
 
     now_ns: Times
@@ -36,11 +36,11 @@ class Questions:
     truth_ned_m: FloatArray  # (L, K, 3), the UAV's true position at now + lead
     array_ned_m: FloatArray  # (L, K, 3), the array's true position at now + lead
     counts: NDArray[np.bool_]
-    in_fault: NDArray[np.bool_]  # (L, K), whether a declared fault lies between now and then
+    in_fault: NDArray[np.bool_]  # (L, K), whether a declared fault is between now and then
     regime: IntArray | None = None
 
     def every(self, step: int) -> "Questions":
-        """Each ``step``-th question."""
+        """Return every ``step``-th question."""
         return Questions(
             now_ns=self.now_ns[::step],
             leads_ns=self.leads_ns,
@@ -54,9 +54,9 @@ class Questions:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Answers:
-    """Positions (L, K, 3), bounds and usual errors (L, K); NaN where there is none.
+    """Positions (L, K, 3), bounds and usual errors (L, K); NaN without one.
 
-    ``refuted_ns`` are the times at which the product said that an assumption was refuted.
+    ``refuted_ns`` are the times at which the product reported that an assumption was refuted.
     """
 
     position_ned_m: FloatArray
@@ -72,7 +72,7 @@ def questions(
     from_ns: int,
     begins_ns: int | None = None,
 ) -> Questions:
-    """Questions, ``ASK_HZ`` a second from ``from_ns``, while any of their answers counts.
+    """Return questions, ``ASK_HZ`` a second from ``from_ns``, while any of their answers counts.
 
     ``begins_ns`` is when a hostile link was switched on.
     """
@@ -103,7 +103,7 @@ def questions(
 
 
 def answers(predictor: Predictor, observed: Sequence[ObservedReport], asked: Questions) -> Answers:
-    """Play the reports to a predictor, and ask it in between."""
+    """Play the reports to a predictor, with the questions in between."""
     came_ns = [each.arrival_ns for each in observed]
     return _played(predictor.report, observed, came_ns, predictor.predict, asked)
 
@@ -111,7 +111,7 @@ def answers(predictor: Predictor, observed: Sequence[ObservedReport], asked: Que
 def product_answers(
     product: Product, events: Sequence[Frame | RoundTrip], asked: Questions
 ) -> Answers:
-    """Play events to the product, and ask it in between."""
+    """Play events to the product, with the questions in between."""
     came_ns = [event.t_ns for event in events]
     given = _played(product.hear, events, came_ns, product.predict, asked)
     return replace(given, refuted_ns=tuple(product.refuted_ns))
@@ -146,7 +146,7 @@ def _played(
 
 
 def angles_deg(towards: FloatArray, truly: FloatArray) -> FloatArray:
-    """Angle between two directions, (..., 3) each, in degrees; exact for small ones."""
+    """Return the angle between two directions, (..., 3) each, in degrees; exact for small ones."""
     across = np.linalg.norm(np.cross(towards, truly), axis=-1)
     found: FloatArray = np.degrees(np.arctan2(across, np.sum(towards * truly, axis=-1)))
     return found
@@ -154,7 +154,7 @@ def angles_deg(towards: FloatArray, truly: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """The array that points, and the SNR in dB that it gives with its beam on the UAV."""
+    """Array that points, and the SNR in dB at a UAV with the beam on it."""
 
     array: Array
     snr_db: float = SNR_DB
@@ -163,11 +163,11 @@ class Receiver:
 def score(
     asked: Questions, given: Answers, lead: int, receiver: Receiver | None = None
 ) -> Row | None:
-    """The figures of one lead; None where nothing counts. Without bounds theirs are None.
+    """Return the figures of one lead; None if no answer counts. Without bounds theirs are None.
 
     ``bound_tightness`` is the median bound over the 95th percentile of the error: 1 would be a
     bound as small as the error. ``usual_covers`` is the share of answers with a usual error whose
-    error was no more. ``se_loss_bps_hz`` is that of ``receiver``, None without one.
+    error was no larger. ``se_loss_bps_hz`` is that of ``receiver``, None without one.
     """
     counts = asked.counts[lead] & ~np.isnan(given.position_ned_m[lead, :, 0])
     if not counts.any():

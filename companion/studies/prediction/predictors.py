@@ -1,9 +1,9 @@
-"""The predictors that a study compares, all with one interface.
+"""Predictors that a study compares, all with one interface.
 
 ``kalman-peng`` is named after Peng et al. (2018), who are said to predict a UAV's position and
-velocity by a Kalman filter whose statistics are known. Neither the paper nor an account of it was
-found: no number and no equation here is theirs. The model over time is the constant-velocity one of
-``companion.studies.prediction.kalman``, and the statistics are those of ``known_tuning``, which
+velocity by a Kalman filter with known statistics. Neither the paper nor an account of it was
+available: no number and no equation here is theirs. The motion model is the constant-velocity one
+of ``companion.studies.prediction.kalman``, and the statistics are those of ``known_tuning``, which
 uses the settings and never a log.
 """
 
@@ -28,16 +28,17 @@ from companion.values.extras import needs
 
 Make = Callable[[], Predictor]
 KALMAN_STATES: Final = {"kalman-cv": 2, "kalman-ca": 3}
-MANOEUVRE_S: Final = 1.0  # time for which an acceleration lasts, as kalman-peng assumes
+MANOEUVRE_S: Final = 1.0  # duration of an acceleration, as kalman-peng assumes
 
 
 class Product:
-    """The product as a predictor of one UAV: its pipeline, fed frames and asked for tracks.
+    """The product as a predictor of one UAV: its pipeline, with frames as input and tracks as
+    output.
 
-    The array stands at the origin of the study's local frame, so that its frame is the study's.
+    The array is at the origin of the study's local frame, so that its frame is the study's.
 
     uav        the UAV
-    refuted_ns  node times at which the product said that an assumption about it was refuted
+    refuted_ns  node times at which the product reported that an assumption about it was refuted
     """
 
     def __init__(self, settings: Settings, uav: str, origin: tuple[float, float, float]) -> None:
@@ -47,13 +48,13 @@ class Product:
         self._pipeline = Pipeline(settings.override(center={"source": str(stands)}))
 
     def hear(self, event: Event) -> None:
-        """Take in an event, in order of arrival."""
+        """Process an event, in order of arrival."""
         for output in self._pipeline.step(event):
             if isinstance(output, Refuted) and output.uav == self.uav:
                 self.refuted_ns.append(output.t_ns)
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """The track at that time, with its bound."""
+        """Return the track at that time, with its bound."""
         for track in self._pipeline.tracks(now_ns, at_ns):
             if track.uav == self.uav:
                 return Predicted(
@@ -70,7 +71,7 @@ MODELS: Final = {f"uio-{model}": model for model in ("position", "kinematic")}
 
 
 def product(settings: Settings, name: str, uav: str, origin: tuple[float, float, float]) -> Product:
-    """The product with the observer of a name in ``MODELS``."""
+    """Return the product with the observer of a name in ``MODELS``."""
     return Product(settings.override(observer={"model": MODELS[name]}), uav, origin)
 
 
@@ -82,14 +83,14 @@ SIMPLE: Final[Mapping[str, Make]] = {
 
 
 def kalman(name: str, tuning: Tuning) -> Make:
-    """A maker of one of the ``KALMAN_STATES`` filters with its noise."""
+    """Return a factory of one of the ``KALMAN_STATES`` filters with its noise."""
     return lambda: Kalman(KALMAN_STATES[name], tuning)
 
 
 def learned(path: Path) -> Make:
-    """A maker of predictors by the network in a file.
+    """Return a factory of predictors with the network in a file.
 
-    Raises ``UserError`` where it holds none or PyTorch is missing.
+    Raises ``UserError`` if it contains none or PyTorch is missing.
     """
     with needs("torch", "learned", "--learned"):
         from companion.studies.prediction.learned import load
@@ -97,11 +98,10 @@ def learned(path: Path) -> Make:
 
 
 def known_tuning(settings: Settings) -> Tuning:
-    """The noise that the settings' bounds stand for, the same for every log and link.
+    """Return the noise that corresponds to the settings' bounds, the same for every log and link.
 
-    A bound is taken for ``accuracy_factor`` standard deviations, as the settings have it of
-    receivers. The process noise is white acceleration whose density is its variance times
-    ``MANOEUVRE_S``.
+    A bound counts as ``accuracy_factor`` standard deviations, as the settings assume for receivers.
+    The process noise is white acceleration whose density is its variance times ``MANOEUVRE_S``.
     """
     given = settings.observer
     deviation_mps2 = assembly.anyone(settings).acceleration_max_mps2 / given.accuracy_factor

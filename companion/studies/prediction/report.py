@@ -1,4 +1,4 @@
-"""The page of the prediction study, which needs nothing else, and its figures."""
+"""Self-contained page of the prediction study, and its figures."""
 
 import math
 from collections import Counter
@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 def files(
     answer: dict[str, Any], found: Sequence[LogComparison], progress: Callable[[str], None]
 ) -> dict[str, bytes]:
-    """The page and every figure as SVG and PNG, by file name: ``angle_`` and the link's name.
+    """Return the page and every figure as SVG and PNG, by file name: ``angle_`` and the link's
+    name.
 
     Figures of the second and later logs are numbered.
     """
@@ -34,7 +35,7 @@ def files(
 
 
 def drawings(found: Sequence[LogComparison]) -> dict[str, tuple[str, plotting.Draw]]:
-    """Caption and drawing of each figure by its name."""
+    """Return caption and drawing of each figure by its name."""
     return {
         name: (f"{ANGLE.caption}, over lead: {summary.title(compared)}", partial(_curves, compared))
         for name, compared in _named(found).items()
@@ -42,7 +43,7 @@ def drawings(found: Sequence[LogComparison]) -> dict[str, tuple[str, plotting.Dr
 
 
 def _named(found: Sequence[LogComparison]) -> dict[str, LogComparison]:
-    """The comparisons that have rows, by the name of their figure."""
+    """Return the comparisons that have rows, by the name of their figure."""
     named = {}
     seen = Counter[str]()
     for compared in found:
@@ -55,7 +56,7 @@ def _named(found: Sequence[LogComparison]) -> dict[str, LogComparison]:
 
 
 def _section(name: str, compared: LogComparison) -> dict[str, Any]:
-    """What the page shows of one log over one link."""
+    """Return the page's data for one log over one link."""
     leads, predictors = summary.axes_of(compared)
     rows = compared.rows
     keys = (
@@ -83,7 +84,7 @@ def _section(name: str, compared: LogComparison) -> dict[str, Any]:
 
 
 def _table(compared: LogComparison, measure: Measure) -> dict[str, Any]:
-    """The caption, and of each predictor its figure at each lead and whether it is the best."""
+    """Return the caption, and each predictor's figure at each lead and whether it is the best."""
     leads, predictors = summary.axes_of(compared)
     cells = {
         name: [pooled(compared.rows, name, lead_s, measure) for lead_s in leads]
@@ -108,10 +109,7 @@ def _table(compared: LogComparison, measure: Measure) -> dict[str, Any]:
 
 
 def _curves(compared: LogComparison) -> "Figure":
-    """RMS angle (logarithmic) over lead, one line per predictor.
-
-    Zero has no place on the axis and is left out.
-    """
+    """RMS angle (logarithmic) over lead, one line per predictor. Zeros are left out."""
     from matplotlib.ticker import LogLocator
 
     leads, predictors = summary.axes_of(compared)

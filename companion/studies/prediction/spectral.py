@@ -1,18 +1,18 @@
-"""The cost of a wrong direction: spectral efficiency lost against perfect knowledge.
+"""Cost of a wrong direction: spectral efficiency lost against perfect knowledge.
 
-The array of the settings stands square to the UAV: its boresight in the UAV's true direction, its y
-axis level. There its beam is narrowest. The matched beam f = a(v)* / |a(v)| for a predicted
-direction v gives, for the UAV in the true direction u, the share
+The array of the settings faces the UAV: its boresight in the UAV's true direction, its y axis
+level. There its beam is narrowest. The matched beam f = a(v)* / |a(v)| for a predicted direction v
+gives, for the UAV in the true direction u, the share
 
     g = |a(u)^T f|^2 / |a(u)|^2                        (1 with perfect knowledge)
 
-of the signal-to-noise ratio S that perfect knowledge gives, and loses
+of the signal-to-noise ratio S with perfect knowledge, and loses
 
     log2(1 + S) - log2(1 + g S)                        bit/s/Hz
 
-``SNR_DB`` is S: at the UAV, with the beam on it, whatever the range. The array is that of
-``[array]`` without its mounting. A line of elements does not see errors across it: those cost it
-nothing. (C. Shannon 1949; steering vectors as in ``companion.beams.array.steering``.)
+``SNR_DB`` is S: at the UAV, with the beam on it, at any range. The array is that of ``[array]``
+without its mount. A line of elements does not resolve errors across it: those cost nothing.
+(C. Shannon 1949; steering vectors as in ``companion.beams.array.steering``.)
 """
 
 from typing import Final
@@ -24,7 +24,7 @@ from companion.beams.array.steering import steering_matrix
 from companion.values import FloatArray
 
 SNR_DB: Final = 20.0
-AT_ONCE: Final = 1_000_000  # entries of a steering matrix that are held at a time
+AT_ONCE: Final = 1_000_000  # entries of a steering matrix in memory at a time
 
 
 def array_from_local(truly: FloatArray) -> FloatArray:
@@ -48,7 +48,7 @@ def gains(array: Array, towards: FloatArray, truly: FloatArray) -> FloatArray:
         beams = steering_matrix(array, seen[first : first + step])
         power = np.sum(np.abs(beams) ** 2, axis=0)
         met = np.abs(at @ beams.conj()) ** 2
-        # A direction into which no element radiates has no beam, and gives nothing.
+        # A direction into which no element radiates has no beam, and a gain of 0.
         found[first : first + step] = np.divide(
             met, power * np.sum(np.abs(at) ** 2), out=np.zeros_like(met), where=power > 0
         )

@@ -1,4 +1,4 @@
-"""What the rows of a comparison amount to: measures over UAVs, and bounds that were broken."""
+"""Summary of the rows of a comparison: measures over UAVs, and violated bounds."""
 
 import math
 from collections import Counter
@@ -12,7 +12,7 @@ from companion.studies.prediction.pointing import HALF_BEAMWIDTH_DEG, Row
 
 
 class Pool(StrEnum):
-    """How the figures of several UAVs become one, each weighted by its answers."""
+    """How the figures of several UAVs are combined, each weighted by its answers."""
 
     RMS = "all UAVs together"
     MEAN = "mean over all UAVs"
@@ -21,12 +21,12 @@ class Pool(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measure:
-    """A figure of the rows and how it is shown."""
+    """Figure of the rows and its presentation."""
 
     key: str  # its key in a row
     caption: str  # caption of its table
     short: str  # its heading in the text
-    pool: Pool = Pool.RMS  # how the UAVs' figures become one
+    pool: Pool = Pool.RMS  # how the UAVs' figures are combined
     more_is_better: bool = False  # whether a larger one is better
 
 
@@ -73,8 +73,7 @@ MEASURES: Final = (
     ),
     Measure(
         key="usual_covers",
-        caption="share of errors no larger than the usual one that was stated (95 of 100 are"
-        " meant)",
+        caption="share of errors no larger than the stated usual error (95 % expected)",
         short="covered",
         pool=Pool.MEAN,
         more_is_better=True,
@@ -85,7 +84,7 @@ MEASURES: Final = (
 def pooled(
     rows: Sequence[Row], predictor: str, lead_s: float, measure: Measure = ANGLE
 ) -> float | None:
-    """One figure of all UAVs; None without rows, or where one of them has none."""
+    """Return one figure over all UAVs; None without rows, or if a UAV has no figure."""
     chosen = [row for row in rows if row["predictor"] == predictor and row["lead_s"] == lead_s]
     values = [(row["n"], row[measure.key]) for row in chosen]
     if not values or any(value is None for _, value in values):
@@ -101,7 +100,7 @@ def pooled(
 
 
 def regimes(compared: LogComparison) -> list[tuple[str, dict[str, str]]]:
-    """How many bounds were broken in each regime of a hostile link, by predictor."""
+    """Return the number of violated bounds in each regime of a hostile link, by predictor."""
     sums: dict[str, dict[str, Counter[str]]] = {}
     for row in compared.rows:
         for regime, counts in (row["regimes"] or {}).items():
@@ -119,7 +118,7 @@ def _beyond(counts: Mapping[str, int]) -> str:
 
 
 def left_out(compared: LogComparison) -> list[str]:
-    """A line on answers in the windows of declared faults, if there are any."""
+    """Return a line on answers in the windows of declared faults, if there are any."""
     left = {row["predictor"]: 0 for row in compared.rows if row["in_faults"]}
     for row in compared.rows:
         left[row["predictor"]] = left.get(row["predictor"], 0) + (row["in_faults"] or 0)
@@ -128,18 +127,18 @@ def left_out(compared: LogComparison) -> list[str]:
 
 
 def axes_of(compared: LogComparison) -> tuple[list[float], list[str]]:
-    """The leads and the predictors, in the order in which they come."""
+    """Return the leads and the predictors, in the order of the rows."""
     leads = dict.fromkeys(row["lead_s"] for row in compared.rows)
     return list(leads), list(dict.fromkeys(row["predictor"] for row in compared.rows))
 
 
 def title(compared: LogComparison) -> str:
-    """The log and the link, as headings name them."""
+    """Return the log and the link, for headings."""
     return f"{compared.log}, {compared.link.name} link"
 
 
 def broken(compared: LogComparison, predictor: str) -> str:
-    """How many of a predictor's errors went beyond its own bound, over all rows."""
+    """Return how many of a predictor's errors exceeded its own bound, over all rows."""
     rows = [row for row in compared.rows if row["predictor"] == predictor]
     if any(row["violations"] is None for row in rows):
         return "no bound"
@@ -148,5 +147,5 @@ def broken(compared: LogComparison, predictor: str) -> str:
 
 
 def number(value: float | None) -> str:
-    """A figure to three decimals; a dash where there is none."""
+    """Format a figure to three decimals; a dash without one."""
     return "-" if value is None else f"{value:.3f}"

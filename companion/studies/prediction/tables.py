@@ -1,4 +1,4 @@
-"""The tables of the prediction study as text."""
+"""Tables of the prediction study as text."""
 
 from collections.abc import Sequence
 
@@ -9,7 +9,7 @@ from companion.studies.prediction.summary import MEASURES, pooled
 
 
 def text(found: Sequence[LogComparison]) -> str:
-    """The tables as text: RMS angle at each lead, every measure at the longest, and the regimes."""
+    """Return the tables: RMS angle at each lead, every measure at the longest, and the regimes."""
     shown = [compared for compared in found if compared.rows]
     tables = [
         table(each) for each in shown for table in (_text_table, _text_measures, _text_regimes)
@@ -41,7 +41,7 @@ def _text_measures(compared: LogComparison) -> str:
 
 
 def _text_regimes(compared: LogComparison) -> str:
-    """Where bounds were broken over a hostile link; empty over others."""
+    """Return the violated bounds over a hostile link; empty over others."""
     regimes = summary.regimes(compared)
     if not regimes:
         return ""

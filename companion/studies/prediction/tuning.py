@@ -1,4 +1,4 @@
-"""The Kalman filters' noise, tuned in hindsight: the best of a grid over all UAVs and leads."""
+"""Tuning of the Kalman filters' noise in hindsight: the best of a grid over all UAVs and leads."""
 
 from collections.abc import Sequence
 from itertools import product as product_of
@@ -16,7 +16,7 @@ from companion.values import FloatArray
 TUNE_EVERY: Final = 5
 """Step between the questions on which the grid is searched.
 
-The grid is smooth, and there are many settings.
+The cost is smooth over the grid, and there are many candidates.
 """
 
 DENSITIES: Final = {
@@ -24,19 +24,20 @@ DENSITIES: Final = {
     "kalman-ca": (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0),
 }
 NOISES: Final = tuple(product_of((0.03, 0.3), (0.1, 0.3)))
-"""Noise of position (m) and velocity (m/s) of the grid on which the filters are tuned.
+"""Noise of position (m) and velocity (m/s) on the grid for tuning the filters.
 
-``DENSITIES`` holds its process noises.
+``DENSITIES`` has its process noises.
 """
 
 Case = tuple[Flight, Delivery, Questions]
-"""A flight, what a link delivered of it, and what is asked."""
+"""A flight, its delivery by a link, and the questions."""
 
 
 def tune(name: str, cases: Sequence[Case]) -> Tuning:
-    """The noise of the grid with the least mean square position error over all UAVs and leads.
+    """Return the noise of the grid with the least mean square position error over all UAVs and
+    leads.
 
-    All tunings are played at once.
+    All tunings are evaluated at once.
     """
     tunings = [
         Tuning(
@@ -54,7 +55,7 @@ def tune(name: str, cases: Sequence[Case]) -> Tuning:
 def _squares(
     name: str, tunings: Sequence[Tuning], delivery: Delivery, asked: Questions
 ) -> FloatArray:
-    """Squares (n, T) of the errors of answers that count, m², of each tuning; NaN without one."""
+    """Return squared errors (n, T) of answers that count, m², of each tuning; NaN without one."""
     few = asked.every(TUNE_EVERY)
     filters = Kalman(KALMAN_STATES[name], *tunings)
     found = np.full((*few.counts.shape, len(tunings)), np.nan)

@@ -1,8 +1,8 @@
-"""Whether the product's bounds held, and whether it had said that they might not.
+"""Violations of the product's bounds, and whether they were announced.
 
-An answer whose truth lies outside its bound is a violation. It was announced if the product had
-said by then, or said within the same second, that an assumption about this UAV was refuted. Answers
-in the windows of declared faults do not count: what is assumed does not hold there.
+An answer whose truth is outside its bound is a violation. It was announced if the product had
+reported by then, or within the same second, that an assumption about this UAV was refuted. Answers
+in the windows of declared faults do not count: the assumptions do not hold there.
 """
 
 from collections.abc import Iterable, Sequence
@@ -19,10 +19,10 @@ KEYS: Final = ("answers", "violations", "announced", "in_faults", "worst_of_boun
 
 
 def counted(asked: Questions, given: Answers, lead: int) -> Row:
-    """The counts of one lead; None for predictors without a bound.
+    """Return the counts of one lead; None for predictors without a bound.
 
     answers         answers outside the windows of declared faults
-    violations      those whose truth lies outside the bound
+    violations      those whose truth is outside the bound
     announced       violations that were announced
     in_faults       answers inside such a window
     worst_of_bound  the largest error over its bound, outside the windows
@@ -47,7 +47,7 @@ def counted(asked: Questions, given: Answers, lead: int) -> Row:
 
 
 def announced(asked: Questions, given: Answers) -> BoolArray:
-    """Whether an assumption about the UAV had been refuted at each question, (K,)."""
+    """Return whether an assumption about the UAV had been refuted at each question, (K,)."""
     if not given.refuted_ns:
         return np.zeros(len(asked.now_ns), dtype=bool)
     found: BoolArray = asked.now_ns + SAME_SECOND_NS >= min(given.refuted_ns)
@@ -70,14 +70,14 @@ def _by_regime(
 
 
 def unannounced(rows: Iterable[Row]) -> int:
-    """How many bounds were broken without a word."""
+    """Return the number of unannounced violations."""
     return sum(
         row["violations"] - row["announced"] for row in rows if row["violations"] is not None
     )
 
 
 def notice(rows: Sequence[Row]) -> str | None:
-    """One line on bounds that were broken without a word, by the worst row; None if none was."""
+    """Return one line on unannounced violations, by the worst row; None without any."""
     total = unannounced(rows)
     if not total:
         return None
@@ -87,7 +87,7 @@ def notice(rows: Sequence[Row]) -> str | None:
     )
     number = worst["violations"] - worst["announced"]
     return (
-        f"{total} bounds were broken under assumptions that were not refuted; most of them, "
+        f"{total} bounds were violated, but no assumption was refuted; most of them, "
         f"{number} of {worst['answers']}, by {worst['predictor']} on {worst['uav']} of "
         f"{worst['log']} over the {worst['link']} link at a lead of {worst['lead_s']:g} s"
     )

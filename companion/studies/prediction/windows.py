@@ -1,9 +1,9 @@
-"""The input of a learned predictor: the last reports, scaled and without absolute place.
+"""Input of a learned predictor: the last reports, scaled and relative to the newest position.
 
-Each report gives seven numbers: how long before the newest it was made; where it was from there;
-its velocity. All are turned about the vertical so that the newest velocity points along x: north is
-like any other direction. Reports go by the sender's clock, at whatever intervals; one that was
-overtaken is put in its place.
+Each report gives seven numbers: its time before the newest; its position relative to it; its
+velocity. All are rotated about the vertical so that the newest velocity points along x: no
+direction is preferred. Reports are ordered by the sender's clock, at any intervals; an overtaken
+one is sorted in.
 """
 
 import math
@@ -15,7 +15,7 @@ import numpy as np
 from companion.studies.prediction.baselines import ObservedReport
 from companion.values import FloatArray
 
-REPORTS: Final = 10  # K: how many of the last reports are used
+REPORTS: Final = 10  # K: number of last reports used
 FORGOTTEN_NS: Final = 20_000_000_000
 """Age relative to the newest report beyond which a report is not used."""
 FEATURES: Final = 7
@@ -25,7 +25,7 @@ SPEED_UNIT_MPS: Final = 10.0
 
 
 class Window(NamedTuple):
-    """The newest report and the network's input."""
+    """Newest report and the network's input."""
 
     sender_ns: int  # when it was made, sender's timeline
     position_ned_m: FloatArray  # (3,), its position
@@ -35,17 +35,15 @@ class Window(NamedTuple):
 
 
 class RecentReports:
-    """The last reports of one UAV, in the order in which they were made."""
+    """Last reports of one UAV, in the order of the sender's clock."""
 
     def __init__(self) -> None:
         self._reports: list[ObservedReport] = []
         self.offset_ns = 0
 
     def add(self, report: ObservedReport) -> bool:
-        """Add a report; returns whether the window has changed.
-
-        A report too old only updates the clock.
-        """
+        """Add a report; return whether the window has changed. One that is too old only updates the
+        clock."""
         self.offset_ns = report.sent_ns - report.sender_ns
         reports = self._reports
         at = bisect_right(reports, report.sender_ns, key=lambda each: each.sender_ns)
@@ -59,7 +57,7 @@ class RecentReports:
         return True
 
     def window(self) -> Window:
-        """The present window; needs at least one report."""
+        """Return the present window; needs at least one report."""
         reports = self._reports
         newest = reports[-1]
         ago_s = np.array([each.sender_ns - newest.sender_ns for each in reports]) * 1e-9
@@ -83,7 +81,7 @@ class RecentReports:
 
 
 def _velocities(reports: list[ObservedReport], ago_s: FloatArray, places: FloatArray) -> FloatArray:
-    """Reported velocities; where there is none, that since the report before.
+    """Return reported velocities; if missing, the mean velocity since the previous report.
 
     The first report takes that to the next; a single report is at rest.
     """

@@ -1,13 +1,12 @@
-"""The same work on many things at once: on this machine's cores, or on a Dask cluster.
+"""Parallel execution of one function over many items: on local cores, or on a Dask cluster.
 
-Answers come in the order of the questions, whoever was done first, so that a parallel run gives the
-same as a serial one. The first error in that order is raised, and what has not begun by then is
-given up. Processes are started anew ("spawn"), with one BLAS thread each: with as many as there are
-cores they would be in one another's way.
+Answers are in the order of the questions, so that a parallel run gives the same result as a serial
+one. The first error in that order is raised, and pending items are cancelled. Processes are started
+fresh ("spawn"), with one BLAS thread each: more threads than cores would slow each other down.
 
-Dask: ``distributed.Client``, its documentation; the extra ``[cluster]``. Its workers keep to one
-BLAS thread themselves (``distributed.nanny.pre-spawn-environ``), and must have this package and the
-files that are named to them.
+Dask: ``distributed.Client``, its documentation; the extra ``[cluster]``. Its workers limit
+themselves to one BLAS thread (``distributed.nanny.pre-spawn-environ``), and must have this package
+and access to the named files.
 """
 
 import multiprocessing
@@ -24,7 +23,7 @@ from companion.values.extras import needs
 
 Asked = TypeVar("Asked")
 Answer = TypeVar("Answer")
-Progress = Callable[[int], None]  # function that is given the number of finished pieces
+Progress = Callable[[int], None]  # called with the number of finished pieces
 
 CLUSTER_ANSWERS_S: Final = 10
 ADDRESS: Final = re.compile(r"(tcp|tls)://([\w.-]+|\[[0-9a-fA-F:.]+\]):\d{1,5}")
@@ -32,14 +31,14 @@ BLAS_THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREA
 
 
 def cores() -> int:
-    """Number of cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def on_cores(
     work: Callable[[Asked], Answer], asked: Sequence[Asked], jobs: int, told: Progress
 ) -> list[Answer]:
-    """The answers, by ``jobs`` processes; ``work`` must be a function of a module."""
+    """Return the answers, computed by ``jobs`` processes; ``work`` must be a module's function."""
     count = min(jobs, len(asked))
     context = multiprocessing.get_context("spawn")
     with (
@@ -50,16 +49,13 @@ def on_cores(
         try:
             return _gathered(futures, told)
         except BaseException:
-            # Waiting: a second call, that of ``with``, would take the cancellation back.
+            # Wait here: the second call, by ``with``, would revoke the cancellation.
             pool.shutdown(cancel_futures=True)
             raise
 
 
 def _gathered(futures: "Sequence[Future[Answer]]", told: Progress) -> list[Answer]:
-    """The answers in order.
-
-    The first error in order is raised as soon as it is known to be the first.
-    """
+    """Return the answers in order; raise the first error in order as soon as it is determined."""
     first = 0
     for done, _ in enumerate(as_completed(futures), start=1):
         told(done)
@@ -76,7 +72,7 @@ def _left_to_parent() -> None:
 
 @contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    """Context in which new processes inherit a limit of one BLAS thread."""
+    """Limit new processes to one BLAS thread, through the environment."""
     before = {name: os.environ.get(name) for name in BLAS_THREADS}
     os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
     try:
@@ -96,12 +92,12 @@ def on_cluster(
     told: Progress,
     answers_s: float = CLUSTER_ANSWERS_S,
 ) -> list[Answer]:
-    """The answers, by the workers of the Dask scheduler at an address.
+    """Return the answers, computed by the workers of the Dask scheduler at an address.
 
-    Raises ``UserError`` where the address is malformed, ``distributed`` is not installed, or no
-    worker is there within ``answers_s``.
+    Raises ``UserError`` if the address is malformed, ``distributed`` is not installed, or no worker
+    appears within ``answers_s``.
     """
-    # Given an address that it cannot parse, the client would leave a thread that does not end.
+    # With an address that it cannot parse, the client would leave a thread running.
     if not ADDRESS.fullmatch(address):
         raise UserError(f"--cluster {address}: not an address such as tcp://HOST:8786")
     with needs("distributed", "cluster", "--cluster"):
@@ -116,7 +112,7 @@ def on_cluster(
             client.wait_for_workers(1, timeout=answers_s)
         except TimeoutError as error:
             raise UserError(f"--cluster {address}: the scheduler has no workers") from error
-        # Not pure: the same files may hold something else another time.
+        # Not pure: the files may change between calls.
         futures = client.map(work, asked, pure=False, retries=0)
         try:
             for done, _ in enumerate(dask.as_completed(futures, loop=client.loop), start=1):

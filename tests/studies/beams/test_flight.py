@@ -642,10 +642,10 @@ def test_two_logs_and_the_table(short: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--hz", "0"], "--hz 0: looks a second, above 0"),
-        (["--hz", "nan"], "--hz nan: looks a second"),
+        (["--hz", "0"], "--hz 0: give looks per second, above 0"),
+        (["--hz", "nan"], "--hz nan: give looks per second"),
         (["--hz", "x"], "'x'"),
-        (["--center", "9:1"], "no UAV gets a beam in it"),
+        (["--center", "9:1"], "no UAV gets a beam while"),
         (["--center", "nowhere"], "'nowhere' is not SYSID:COMPID"),
         (["--config", "no-such.toml"], "no-such.toml"),
     ],

@@ -109,9 +109,7 @@ def test_the_command_compares_over_the_links_that_are_named(
     assert "Three widths" in (report / "beams.html").read_text(encoding="utf-8")
     wrong = CliRunner().invoke(main, [*WORDS, "best", "--out", str(tmp_path), str(CUT)])
     assert wrong.exit_code != 0
-    assert "links are some of clean, radio, hostile, noisy" in str(wrong.output) + str(
-        wrong.exception
-    )
+    assert "give some of clean, radio, hostile, noisy" in str(wrong.output) + str(wrong.exception)
 
 
 def test_logs_of_the_vehicles_themselves_are_one_flight(tmp_path: Path) -> None:

@@ -220,12 +220,12 @@ def test_the_command_and_its_page(files: bool, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "why"),
     [
-        ("a,b\n1,2\n", "no columns unit2_pos and unit1_beam"),
+        ("a,b\n1,2\n", "columns unit2_pos and unit1_beam are missing"),
         ('unit2_pos,unit1_beam\n"[1,2]",x\n', "row 2"),
         ('unit2_pos,unit1_beam\n"[1,2]",3\n', "at least 200 rows"),
-        ("unit2_pos,unit1_beam\n" + '"[1,2]",3\n' * 300, "nothing moves"),
-        ("unit2_pos,unit1_beam\n" + "gone.txt,3\n" * 300, "cannot be read"),
-        ("unit2_pos,unit1_beam\n" + '"[1,2]",99999\n' * 300, "beams are counted"),
+        ("unit2_pos,unit1_beam\n" + '"[1,2]",3\n' * 300, "positions do not change"),
+        ("unit2_pos,unit1_beam\n" + "gone.txt,3\n" * 300, "cannot read"),
+        ("unit2_pos,unit1_beam\n" + '"[1,2]",99999\n' * 300, "beam index out of range"),
     ],
 )
 def test_what_is_no_scenario_is_said(text: str, why: str, tmp_path: Path) -> None:

@@ -280,5 +280,5 @@ def test_a_report_older_than_the_history_is_dropped() -> None:
 
 
 def test_a_filter_has_two_or_three_states() -> None:
-    with pytest.raises(ValueError, match="2 or 3 states"):
+    with pytest.raises(ValueError, match="allowed: 2 or 3"):
         Kalman(4, TUNING)

@@ -252,7 +252,7 @@ def test_a_broken_bound_is_an_exit_status(
     assert done.exit_code == (0 if announces else 3), done.output
     assert (out / "prediction.json").exists()
     assert (out / "prediction.html").exists()
-    lines = [line for line in done.stderr.splitlines() if "were broken" in line]
+    lines = [line for line in done.stderr.splitlines() if "bounds were violated" in line]
     assert len(lines) == (0 if announces else 1)
     assert ("announced" in done.stdout) == announces
 
@@ -261,7 +261,7 @@ def test_links_that_there_are_not(tmp_path: Path) -> None:
     asked = ["study", "prediction", str(CUT), "--links", "clean,bad", "--out", str(tmp_path)]
     done = CliRunner().invoke(main, asked)
     assert done.exit_code == 1
-    assert "links are some of clean, radio, hostile, noisy" in done.stderr
+    assert "give some of clean, radio, hostile, noisy" in done.stderr
 
 
 def test_a_hostile_link_begins_in_flight(circling: Flown) -> None:

@@ -101,12 +101,12 @@ def test_the_senders_timeline_goes_on_after_a_restart(straight_flight: MakeFligh
 @pytest.mark.parametrize(
     ("values", "says"),
     [
-        ({"rate_hz": 0.0}, "a rate is a positive number"),
-        ({"rate_hz": float("nan")}, "a rate is a positive number"),
+        ({"rate_hz": 0.0}, "give a positive number of Hz"),
+        ({"rate_hz": float("nan")}, "give a positive number of Hz"),
         ({"latency_s": (2.0, 1.0)}, "MEDIAN,P95"),
         ({"latency_s": (0.0, 1.0)}, "MEDIAN,P95"),
-        ({"loss": 1.0}, "a loss is at least 0"),
-        ({"loss": -0.1}, "a loss is at least 0"),
+        ({"loss": 1.0}, "give a share from 0 to below 1"),
+        ({"loss": -0.1}, "give a share from 0 to below 1"),
     ],
 )
 def test_what_no_link_can_be(values: dict[str, float], says: str) -> None:

@@ -19,7 +19,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Tests of pure rooms on two workers; those that start services share one, one after the other.
 WORKERS = -n 2 --dist loadgroup
 
-.PHONY: demo test test-all check site bench soak fuzz format lock clean FORCE
+.PHONY: demo test test-all check site bench soak fuzz messages format lock clean FORCE
 
 demo: .venv/.runtime
 	$(BIN)/companion demo
@@ -65,6 +65,12 @@ FUZZ_SECONDS = 600
 fuzz: .venv/.dev
 	@for target in framing fold recovery settings http; do \
 	    $(BIN)/python tests/fuzzing/run.py $$target $(FUZZ_SECONDS) --keep || exit 1; done
+
+# Every error and notice that the tests cause, in docs/messages.md.
+messages: .venv/.dev
+	rm -f build/texts.jsonl && mkdir -p build
+	COLLECT_TEXTS=build/texts.jsonl $(PYTEST) -q $(WORKERS) -m "not full and not benchmark and not soak"
+	$(BIN)/python docs/list_texts.py --collected build/texts.jsonl
 
 format: .venv/.dev
 	$(BIN)/ruff format .

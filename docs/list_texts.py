@@ -1,8 +1,8 @@
 """List every text that a person can read, for translators and reviewers.
 
-    python docs/list_texts.py [KIND...]             the texts as tab-separated lines; then the counts
-    python docs/list_texts.py --draw SEED           the sample of 60 that a fresh reader restates
-    python docs/list_texts.py --collected FILE      rewrite docs/messages.md from a test run
+    python docs/list_texts.py [KIND...]          print the texts, tab-separated; then the counts
+    python docs/list_texts.py --draw SEED        print a sample of 60 for a fresh reader
+    python docs/list_texts.py --collected FILE   rewrite docs/messages.md from a test run
 
 Errors, notices and rejection details are listed as users see them, with realistic values: `make
 messages` runs the tests with COLLECT_TEXTS=FILE, which keeps each of these texts (see
@@ -26,12 +26,12 @@ from make_api import answer, document
 ROOT: Final = Path(__file__).resolve().parents[1]
 MESSAGES: Final = ROOT / "docs" / "messages.md"
 EXAMPLES_MAX: Final = 4  # of one place in the code
+LENGTH_MAX: Final = 250  # of an example; random texts of tests are longer
 SAMPLE: Final = {"error": 15, "notice": 10, "detail": 5, "api": 15, "docstring": 15}
 HEAD: Final = """# Errors and notices
 
-Every error, notice and rejection detail, as users see it. Search this page for the words that you
-have; [troubleshooting](troubleshooting.md) says what to do about the common ones. Values are examples
-from the tests. Written by `make messages`.
+Every error, notice and rejection detail, as users see it, with example values from the tests.
+[Troubleshooting](troubleshooting.md) explains the common ones. Written by `make messages`.
 """
 TITLES: Final = {
     "error": "Errors: a command or a setting that cannot be used",
@@ -48,18 +48,18 @@ class Text(NamedTuple):
     text: str
 
 
-# --- errors, notices and details -------------------------------------------------------------------
+# --- errors, notices and details ----------------------------------------------------------------
 
 
 def _example(text: str) -> str:
-    """A collected text without what only the test machine has: folders and ports of the moment."""
+    """Return a collected text without folders and ports of the test machine."""
     text = re.sub(r"/[^ '\":]*/(?:test_|pytest|tmp)[^ '\":/]*/", "", text)
     text = re.sub(r"(127\.0\.0\.1|\[::1\]|localhost):\d{5}", r"\1:14550", text)
     return text.replace("|", "\\|").replace("`", "'")
 
 
 def _form(text: str) -> str:
-    """A text without its values: two texts of one form differ in numbers, names and quotes alone."""
+    """Return a text without its values: numbers, names, quotes."""
     text = re.sub(r"'[^']*'|\"[^\"]*\"|\[[^]]*\]|\([^)]*\)", "'", text)
     text = re.sub(r"^[^:]*: ", ": ", text)
     return re.sub(r"[-+\d.][\w.:+-]*|\b\w+:\w+\b", "0", text)
@@ -71,8 +71,7 @@ def _chosen(texts: list[str]) -> Iterator[str]:
     for text in texts:
         by_form[_form(text)].append(text)
     for form in sorted(by_form, key=lambda one: (-len(by_form[one]), one))[:EXAMPLES_MAX]:
-        readable = [one for one in by_form[form] if one.isascii() and one.isprintable()]
-        yield min(readable or by_form[form], key=lambda one: (abs(len(one) - 80), one))
+        yield min(by_form[form], key=lambda one: (abs(len(one) - 80), one))
 
 
 def write_messages(collected: Path) -> None:
@@ -80,7 +79,9 @@ def write_messages(collected: Path) -> None:
     places: dict[tuple[str, str], list[str]] = defaultdict(list)
     for line in sorted(set(collected.read_text(encoding="utf-8").splitlines())):
         found = json.loads(line)
-        places[found["kind"], found["place"]].append(_example(found["text"]))
+        text = _example(found["text"])
+        if text.isascii() and text.isprintable() and len(text) <= LENGTH_MAX:
+            places[found["kind"], found["place"]].append(text)
     parts = [HEAD]
     for kind, title in TITLES.items():
         parts.append(f"\n## {title}\n")
@@ -106,7 +107,7 @@ def messages() -> Iterator[Text]:
             yield Text(kind, room, line[3:-1])
 
 
-# --- commands, API and metrics ---------------------------------------------------------------------
+# --- commands, API and metrics ------------------------------------------------------------------
 
 
 def _commands(command: click.Command, name: str) -> Iterator[Text]:
@@ -157,7 +158,7 @@ def metrics() -> Iterator[Text]:
             yield Text("metrics", name, text)
 
 
-# --- the page --------------------------------------------------------------------------------------
+# --- the page -----------------------------------------------------------------------------------
 
 
 class _Html(HTMLParser):
@@ -191,7 +192,7 @@ def page() -> Iterator[Text]:
             yield Text("page", path.name, " ".join((text[0] or text[1]).split()))
 
 
-# --- what stands in files --------------------------------------------------------------------------
+# --- texts in files -----------------------------------------------------------------------------
 
 
 def documents() -> Iterator[Text]:
@@ -224,11 +225,11 @@ def docstrings() -> Iterator[Text]:
         for node in ast.walk(tree):
             owner = getattr(node, "name", "")
             for before, one in zip([None, *_body(node)], _body(node), strict=False):
-                if isinstance(one, ast.Expr) and isinstance(one.value, ast.Constant):
-                    if isinstance(one.value.value, str):
+                match one:
+                    case ast.Expr(value=ast.Constant(value=str(text))):
                         name = ast.unparse(before).partition(" =")[0] if before else ""
                         where = f"{place}::{'.'.join(filter(None, (owner, name[:60])))}"
-                        yield Text("docstring", where, " ".join(one.value.value.split()))
+                        yield Text("docstring", where, " ".join(text.split()))
 
 
 def _body(node: ast.AST) -> list[ast.stmt]:
@@ -249,7 +250,7 @@ KINDS: Final[dict[str, Callable[[], Iterator[Text]]]] = {
 
 
 def draw(seed: int) -> list[Text]:
-    """The sample of a seed, by kind."""
+    """Return the sample of a seed, by kind."""
     of_kind: dict[str, list[Text]] = defaultdict(list)
     for one in (*messages(), *api(), *docstrings()):
         of_kind[one.kind].append(one)
@@ -258,7 +259,7 @@ def draw(seed: int) -> list[Text]:
 
 
 def main(words: list[str]) -> None:
-    """Run one of the three ways."""
+    """Do what the words of the command line ask for."""
     match words:
         case ["--collected", file]:
             write_messages(Path(file))

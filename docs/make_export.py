@@ -30,7 +30,8 @@ def table_section(table: Table) -> str:
 def fields_section() -> str:
     """The section of the fields of all recorded messages in Markdown."""
     parts = [
-        "## Fields\n\nFields of this program's own messages, by number. An unknown vector is empty.\n"
+        "## Fields\n\nFields of this program's own messages, by number."
+        " An unknown vector is empty.\n"
     ]
     for name in fields.CLASSES:
         if name in NOT_RECORDED:

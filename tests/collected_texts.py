@@ -6,6 +6,7 @@ With COLLECT_TEXTS=FILE in the environment each of them is appended to that file
 
 import json
 import os
+import re
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +16,9 @@ from companion.values import Notice, Rejection, UserError
 
 CHARACTERS_MAX: Final = 200
 ROOT: Final = str(Path(__file__).resolve().parents[1])
-CODE: Final = (f"{ROOT}/companion/", f"{ROOT}/sitl_replay/")
+READ_BACK: Final = ("companion/recording/fields.py", "companion/recording/entries.py")
+"""Files that read the texts of recordings."""
+_FOLDERS: Final = re.compile(r"/[^ '\":,]*/")  # of the test machine
 
 
 class CollectedTexts:
@@ -28,7 +31,7 @@ class CollectedTexts:
     def add(self, holder: object, kind: str, text: str, subject: str) -> None:
         """Collect one text. An error raised while another is handled replaces that one."""
         place = _place()
-        if place is None:  # made by a test
+        if place is None or place.startswith(READ_BACK):
             return
         self._texts.pop(id(sys.exc_info()[1]), None)
         self._texts[id(holder)] = {
@@ -36,7 +39,7 @@ class CollectedTexts:
         }  # fmt: skip
 
     def faults(self) -> list[str]:
-        """Break down what is wrong with the texts of the test that ends; then forget them."""
+        """Return the broken rules of the texts of the test that ends, and drop these texts."""
         found = [
             f"{one['place']}: {one['kind']} {wrong}: {one['text']!r}"
             for one in self._texts.values()
@@ -58,17 +61,18 @@ def broken_rules(*, kind: str, text: str, subject: str, place: str) -> Iterator[
     """The rules that a text breaks. ``subject``: the class of an error, the object of a notice."""
     if "\n" in text:
         yield "has a line break"
-    if len(text) > CHARACTERS_MAX:
-        yield f"has {len(text)} characters"
+    if (length := len(_FOLDERS.sub("", text))) > CHARACTERS_MAX:
+        yield f"has {length} characters, without folders"
 
 
 def _place() -> str | None:
-    """Return the file and line of the code that made the text."""
+    """Return the file and line of the code that made the text; None if a test made it."""
     frame = sys._getframe(3)
     while frame.f_code.co_filename == "<string>" and frame.f_back is not None:  # of a dataclass
         frame = frame.f_back
     file = frame.f_code.co_filename
-    return f"{file[len(ROOT) + 1 :]}:{frame.f_lineno}" if file.startswith(CODE) else None
+    in_code = file.startswith((f"{ROOT}/companion/", f"{ROOT}/sitl_replay/"))
+    return f"{file[len(ROOT) + 1 :]}:{frame.f_lineno}" if in_code else None
 
 
 def collect() -> CollectedTexts:

@@ -90,7 +90,9 @@ def _text_file(key: str, name: str) -> NDArray[Any]:
         )
         return np.array([[float(word) for word in line] for line in lines if line])
     except ValueError as error:
-        raise ConfigError(f"{key} = {name!r}: not a table of numbers: {error}") from error
+        raise ConfigError(
+            f"{key} = {name!r}: not a table of numbers; give rows of numbers"
+        ) from error
 
 
 def _npy_file(key: str, name: str, kinds: str) -> NDArray[Any]:

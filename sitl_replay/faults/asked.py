@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 from companion.values import Source, UserError
+from companion.values.errors import shown
 
 Sender = tuple[int, int]  # system and component id
 
@@ -192,7 +193,7 @@ class Fault:
         name, at, system = left.partition("@")
         kind = KINDS.get(name)
         if kind is None:
-            raise FaultError(f"{text!r}: {name!r} is none of {', '.join(KINDS)}")
+            raise FaultError(f"{shown(name)} is not a fault; give one of {', '.join(KINDS)}")
         numbers = value.split(":")
         required = sum(bound.default is None for bound in kind.bounds)
         if not required <= len(numbers) <= len(kind.bounds):

@@ -35,11 +35,11 @@ def test_help_has_an_example(command: str) -> None:
         (["design", "--dt", "x"], "'x' is not a list of numbers"),
         (["design", "--dt", "-1"], "positive number of seconds"),
         (["design", "--dt", "nan"], "positive number of seconds"),
-        (["design", "--dt", "0.1", "--alpha", "2"], "alpha lies strictly between 0 and 1"),
+        (["design", "--dt", "0.1", "--alpha", "2"], "alpha is 2.0, allowed: 0 to 1, both excluded"),
         (["run"], "center.source is not set; give --center"),
         (["run", "--center", "5:1"], "links.urls is empty; give --link"),
         (["run", "--center", "5"], "'5' is not SYSID:COMPID"),
-        (["run", "--center", "5:1", "--link", "foo"], "'foo' is not udpin:HOST:PORT"),
+        (["run", "--center", "5:1", "--link", "foo"], "'foo' is not a link; give one of udpin:"),
         (
             ["run", "--center", "5:1", "--link", "udpin:127.0.0.1:0", "--listen", "0.0.0.0:0"],
             "--insecure",

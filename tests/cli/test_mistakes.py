@@ -168,7 +168,11 @@ SAYS: list[tuple[str, int, str]] = [
     ("sitl-replay fly paper", 2, "Missing option '--to'. See sitl-replay fly --help"),
     ("sitl-replay fly paper --to udp:127.0.0.1:1", 2, "did you mean udpin:127.0.0.1:1"),
     ("sitl-replay fly paper --to udpout:127.0.0.1:1 --uavs 0", 2, "in the range 1<=x<=1000"),
-    ("sitl-replay fly paper --to udpout:127.0.0.1:1 --fault los=1", 2, "'los' is none of drift"),
+    (
+        "sitl-replay fly paper --to udpout:127.0.0.1:1 --fault los=1",
+        2,
+        "'los' is not a fault; give one of drift",
+    ),
     ("sitl-replay fly paper --to udpout:127.0.0.1:1 --fault loss=2", 2, "allowed: 0 to 1, as in"),
     (
         "sitl-replay fly paper --to udpout:127.0.0.1:1 --record gone/x.tlog",

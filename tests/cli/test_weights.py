@@ -137,7 +137,7 @@ def test_a_unit_s_gains_are_those_of_its_file(cut_log: Path, tmp_path: Path) -> 
     assert min(gains) >= 9.5
     unit.write_text("mode = 'TX'\n")
     said = mistake(cut_log, "--config", str(config), "--format", "tmytek")
-    assert said.startswith("hardware.unit: the keys are common_db, element_db, mode")
+    assert said.startswith("hardware.unit: keys are mode; give common_db, element_db, mode")
 
 
 def test_a_file_holds_what_stdout_would(cut_log: Path, tmp_path: Path) -> None:
@@ -207,7 +207,7 @@ def test_a_log_that_is_not_there() -> None:
         ("words.npy", np.array([["a", "b"]]), "unsupported dtype"),
         ("fields.npy", np.zeros((64, 1), dtype=[("a", "f8")]), "unsupported dtype"),
         ("line.npy", np.ones(64), "not a matrix"),
-        ("small.npy", np.ones((5, 3)), "not for 64 elements"),
+        ("small.npy", np.ones((5, 3)), "do not match 64 elements"),
         ("zero.npy", np.zeros((64, 2)), "column 0 of the weights is zero"),
         ("nan.npy", np.full((64, 2), np.nan), "finite"),
     ],

@@ -184,7 +184,7 @@ def test_no_record_is_torn_by_a_writer_that_laps_its_reader(follower: Path, tmp_
 def test_a_file_that_is_no_ring_is_left_alone(tmp_path: Path) -> None:
     mine = tmp_path / "thesis.txt"
     mine.write_text("years of work")
-    with pytest.raises(UserError, match="is no ring"):
+    with pytest.raises(UserError, match="is not a ring of records"):
         Ring(mine)
     assert mine.read_text() == "years of work"
     with pytest.raises(UserError, match="No such file"):

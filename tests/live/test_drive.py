@@ -102,7 +102,7 @@ def test_how_it_goes_is_said_each_second(start_node: Any, tmp_path: Path) -> Non
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        (["laser:1"], "is unknown; give rotctld:HOST:PORT"),
+        (["laser:1"], "is not a device; give one of rotctld:"),
         (
             ["rotctld:127.0.0.1:1", "--on-stale", "mute"],
             "does not support mute; choose hold or boresight",

@@ -47,14 +47,14 @@ WRONG = [
     ("presence", "enabled", '"always"', "always", "boolean"),
     ("presence", "system_id", "255", "255", "less than or equal to 254"),
     ("presence", "position_hz", "0", "0", "greater than or equal to 0.1"),
-    ("out", "urls", '["udpin:0.0.0.0:1"]', "udpin:0.0.0.0:1", "udpout:HOST:PORT"),
+    ("out", "urls", '["udpin:0.0.0.0:1"]', "udpin:0.0.0.0:1", "udpout:, tcp:"),
     ("out", "urls", '["cot:udp:10.0.0.1:0"]', "cot:udp:10.0.0.1:0", "port 0"),
-    ("out", "urls", '["sbs:radar:30003"]', "sbs:radar:30003", "cot:udp:HOST:PORT"),
+    ("out", "urls", '["sbs:radar:30003"]', "sbs:radar:30003", "cot:"),
     ("records", "udp", '["radio:9000"]', "radio:9000", "IP:PORT"),
     ("records", "udp", '["127.0.0.1:0"]', "127.0.0.1:0", "IP:PORT"),
     ("out", "rate_hz", "51", "51", "less than or equal to 50"),
     ("out", "uavs", '["me"]', "me", "SYSID:COMPID"),
-    ("signing", "keys", '{"radio" = "key"}', "radio", "serial:DEVICE:BAUD"),
+    ("signing", "keys", '{"radio" = "key"}', "radio", "serial:"),
     ("signing", "allow_unsigned", '["tcp:a:1"]', "tcp:a:1", "has no key"),
     ("tracks", "allow", '["one"]', "one", "SYSID:COMPID, icao:HEX, rid:ID or cot:UID"),
     (
@@ -417,7 +417,10 @@ def test_a_file_of_positions_that_will_not_do_is_named(
 @pytest.mark.parametrize(
     ("array", "said"),
     [
-        ({"kind": "list", "positions_m": [[0, 0, 0], [0, 0, 0]]}, "two elements stand at one"),
+        (
+            {"kind": "list", "positions_m": [[0, 0, 0], [0, 0, 0]]},
+            "two elements have the same position",
+        ),
         ({"kind": "list", "positions_m": [[0, 0], [0, 1]]}, "rows of 3 numbers"),
         ({"kind": "list", "positions_m": [[0, 0, 0], [0, 0, 1, 1, 0, 0]]}, "rows of 3 numbers"),
     ],

@@ -50,11 +50,14 @@ def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
     [
         (["fly", "papr", "--to", SOMEWHERE], "'papr' is not one of 'paper', 'hover'"),
         (["fly", "paper"], "Missing option '--to'"),
-        (["fly", "paper", "--to", "udp:127.0.0.1:9"], "is not udpin:HOST:PORT, udpout:HOST:PORT"),
+        (["fly", "paper", "--to", "udp:127.0.0.1:9"], "is not a link; give one of udpin:, udpout:"),
         (["fly", "paper", "--to", "serial:nowhere:57600"], "serial:nowhere:57600: No such file"),
         (["fly", "paper", "--to", "serial:/dev/null:57600"], "serial:/dev/null:57600: "),
         (["fly", "paper", "--to", "tcpin:192.0.2.1:9"], "tcpin:192.0.2.1:9: Cannot assign"),
-        (["fly", "paper", "--to", SOMEWHERE, "--fault", "los=1"], "'los' is none of drift, reboot"),
+        (
+            ["fly", "paper", "--to", SOMEWHERE, "--fault", "los=1"],
+            "'los' is not a fault; give one of drift, reboot",
+        ),
         (
             ["play", "empty.tlog", "--to", SOMEWHERE, "--fault", "loss=2"],
             "'loss=2': P is '2', allowed: 0 to 1, as in loss=0.1",
@@ -74,7 +77,10 @@ def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
         (["play", ".", "--to", SOMEWHERE], "is a directory"),
         (["play", "nowhere.tlog", "--to", SOMEWHERE], "does not exist"),
         (["play", "empty.tlog", "--to", SOMEWHERE, "--speed", "fast"], "above 0, or 'max'"),
-        (["record", "--from", "127.0.0.1:9", "--out", "a.tlog"], "is not udpin:HOST:PORT"),
+        (
+            ["record", "--from", "127.0.0.1:9", "--out", "a.tlog"],
+            "is not a link; give one of udpin:",
+        ),
         (["record", "--from", "udpin:127.0.0.1:9"], "Missing option '--out'"),
         (["record", "--from", "udpin:192.0.2.1:9999", "--out", "a.tlog"], "udpin:192.0.2.1"),
         (["land"], "No such command 'land'"),

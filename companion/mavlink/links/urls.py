@@ -28,6 +28,7 @@ from dataclasses import dataclass
 from typing import Final, Literal, cast, get_args
 
 from companion.values import UserError
+from companion.values.errors import shown
 
 Scheme = Literal[
     "udpin", "udpout", "tcp", "tcpin", "serial", "zenoh", "sbs", "readsb", "rid", "cot"
@@ -107,21 +108,21 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
         name, _, address = address.partition(":")
         way = cast(Way, name)
     elif scheme == "cot":
-        raise LinkError(f"{text!r} is not {_FORMS['cot']}{_meant(text)}")
+        raise LinkError(f"{shown(text)} is not {_FORMS['cot']}{_meant(text)}")
     host, _, port = address.rpartition(":")
     if scheme not in schemes or not host or not _NUMBER.fullmatch(port):
-        raise LinkError(f"{text!r} is not {_forms(schemes)}{_meant(text)}")
+        raise LinkError(f"{shown(text)} is not {_form(scheme, schemes)}{_meant(text)}")
     if scheme == "serial":
         return _serial(text, host, int(port))
     bracketed = host.startswith("[") and host.endswith("]")
     host = host[1:-1] if bracketed else host
     if (":" in host) is not bracketed:
-        raise LinkError(f"{text!r}: put the IPv6 host in brackets, as in udpin:[::]:14550")
+        raise LinkError(f"{shown(text)}: put the IPv6 host in brackets, as in udpin:[::]:14550")
     if not (_is_ipv6(host) if bracketed else _may_be_a_name(host)):
-        raise LinkError(f"{text!r}: {host!r} is not a valid host name or address")
+        raise LinkError(f"{shown(text)}: {shown(host)} is not a valid host name or address")
     url = LinkUrl(scheme=cast(Scheme, scheme), host=host, port=int(port), way=way, path=path)
     if int(port) > 65535 or (int(port) == 0 and not url.listens):
-        raise LinkError(f"{text!r}: {port} is not a port, 1 to 65535")
+        raise LinkError(f"{shown(text)}: {port} is not a port, 1 to 65535")
     return url
 
 
@@ -130,7 +131,7 @@ def _http(text: str, address: str) -> tuple[Way, str, str]:
     way, slashes, rest = address.partition("://")
     host, slash, path = rest.partition("/")
     if not slashes or not _PATH.fullmatch(slash + path):
-        raise LinkError(f"{text!r} is not readsb:http://HOST/PATH, as in {_AIRCRAFT_JSON}")
+        raise LinkError(f"{shown(text)} is not readsb:http://HOST/PATH, as in {_AIRCRAFT_JSON}")
     if ":" not in host.rpartition("]")[2]:
         host = f"{host}:{_HTTP_PORTS[way]}"
     return cast(Way, way), host, slash + path
@@ -139,19 +140,20 @@ def _http(text: str, address: str) -> tuple[Way, str, str]:
 def _zenoh(text: str, address: str) -> LinkUrl:
     key, mark, options = address.partition("?")
     if not _KEY.fullmatch(key):
-        raise LinkError(f"{text!r} is not zenoh:KEY, a key without wildcards such as mavlink_raw")
-    wrong = [one for one in options.split("&") if not _OPTION.fullmatch(one)] if mark else []
-    if wrong:
+        raise LinkError(
+            f"{shown(text)} is not zenoh:KEY, a key without wildcards such as mavlink_raw"
+        )
+    if mark and not all(map(_OPTION.fullmatch, options.split("&"))):
         known = "connect=tcp/HOST:PORT, listen=tcp/HOST:PORT and as=hub"
-        raise LinkError(f"{text!r}: unknown option {wrong[0]!r}; give {known}, joined by &")
+        raise LinkError(f"{shown(text)}: unknown option; give {known}, joined by &")
     return LinkUrl(scheme="zenoh", host=key, port=0, way="", path=options)
 
 
 def _serial(text: str, device: str, baud: int) -> LinkUrl:
     if not device.isprintable():
-        raise LinkError(f"{text!r}: {device!r} is not a valid device name")
+        raise LinkError(f"{shown(text)}: {device!r} is not a valid device name")
     if not 1 <= baud <= _BAUD_MAX:
-        raise LinkError(f"{text!r}: {baud} is not a baud rate, 1 to {_BAUD_MAX}")
+        raise LinkError(f"{shown(text)}: {baud} is not a baud rate, 1 to {_BAUD_MAX}")
     return LinkUrl(scheme="serial", host=device, port=baud)
 
 
@@ -182,9 +184,11 @@ def _meant(text: str) -> str:
     return ""
 
 
-def _forms(schemes: Collection[Scheme]) -> str:
-    forms = [_FORMS.get(one, f"{one}:HOST:PORT") for one in schemes]
-    return forms[0] if len(forms) == 1 else f"{', '.join(forms[:-1])} or {forms[-1]}"
+def _form(scheme: str, schemes: Collection[Scheme]) -> str:
+    """Return what a link of a scheme looks like; of an unknown scheme, which ones there are."""
+    if scheme in schemes:
+        return _FORMS.get(scheme, f"{scheme}:HOST:PORT")
+    return f"a link; give one of {', '.join(f'{one}:' for one in schemes)}"
 
 
 def _is_ipv6(host: str) -> bool:

@@ -23,6 +23,7 @@ from companion.values.extras import needs
 if TYPE_CHECKING:
     import zenoh
 
+ERROR_MAX: Final = 150  # largest number of characters of an error of Zenoh
 PUBLISHERS_MAX: Final = 1024
 """Most keys declared, so that their names are sent once; beyond it, all are declared again."""
 NO_ROUTER: Final = "Unable to connect"
@@ -314,8 +315,9 @@ def _close(session: "zenoh.Session") -> None:
 
 
 def _error_text(error: Exception) -> str:
-    """Return an error of Zenoh in one line, without source locations."""
-    return " ".join(str(error).split(" at ")[0].split())
+    """Return an error of Zenoh in one line, without source locations, and cut if it is long."""
+    text = " ".join(str(error).split(" at ")[0].replace("\\n", " ").split())
+    return text if len(text) <= ERROR_MAX else f"{text[:ERROR_MAX]}…"
 
 
 def _configured(config: BusConfig) -> "zenoh.Config":

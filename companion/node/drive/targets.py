@@ -22,6 +22,7 @@ from typing import Final
 
 from companion.node.drive.loop import Device, DeviceCommand, DeviceInput, SafeState
 from companion.values import IntArray, Source, UserError
+from companion.values.errors import shown
 
 FORMS: Final = {
     "rotctld": "rotctld:HOST:PORT",
@@ -78,7 +79,8 @@ def device(
         raise UserError(f"{target!r} is not {FORMS[kind]}")
     near = difflib.get_close_matches(kind, FORMS, 1)
     meant = f"; did you mean {FORMS[near[0]]}?" if near else ""
-    raise UserError(f"{target!r} is unknown; give {', '.join(FORMS.values())}{meant}")
+    known = ", ".join(f"{one}:" for one in FORMS)
+    raise UserError(f"{shown(target)} is not a device; give one of {known}{meant}")
 
 
 class DryRun:

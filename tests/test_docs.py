@@ -82,7 +82,7 @@ def rows(heading: str) -> list[list[str]]:
 
 
 def test_reasons_of_refusals_are_those_that_there_are() -> None:
-    named = [word for row in rows("Reports are refused") for word in row[0].split(", ")]
+    named = [word for row in rows("Reports are rejected") for word in row[0].split(", ")]
     assert sorted(named) == sorted(f"`{reason}`" for reason in Reason)
 
 
@@ -93,7 +93,7 @@ def test_every_cause_of_a_weak_link_is_told() -> None:
 
 def test_every_source_of_events_is_told_in_its_own_words() -> None:
     text = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
-    said = {one for row in rows("What the events say") for one in re.findall(r'"(.+?)"', row[0])}
+    said = {one for row in rows("Notices") for one in re.findall(r'"(.+?)"', row[0])}
     said |= set(re.findall(r'"([^"]+)"', text.split("## A fleet\n")[1].split("\n## ")[0]))
     sources = {
         path: path.read_text(encoding="utf-8") for path in (ROOT / "companion").rglob("*.py")

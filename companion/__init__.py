@@ -1,6 +1,6 @@
 """Location-aware beamforming from MAVLink: bytes in, array weights out.
 
-The library's face, for notebooks and programs; everything else is inside and may change::
+The library interface for notebooks and programs; everything else is internal and may change::
 
     from companion import Pipeline, Settings, Tick, read_log
 
@@ -13,17 +13,17 @@ The library's face, for notebooks and programs; everything else is inside and ma
     update = pipeline.look(now_ns, lead_s=0.02)
     print(update.beams.uavs, update.beams.weights.shape)
 
-``Settings``: all settings; ``override(section={...})`` gives them with some replaced.
-``Pipeline``: ``step(event)`` takes events in order of time; ``look(now_ns, lead_s)`` gives targets
-and beams, ``tracks(now_ns, valid_at_ns)`` every UAV heard of, ``clock_estimate(uav)`` what is
-known of its clock, ``local`` the local frame. ``Frame``, ``Tick``, ``RoundTrip``: the events, of a
-``Source``. ``read_log(path)``: the events of any kind of log. ``UserError``: what all of it raises
-for what a user can do wrong.
+``Settings``: all settings; ``override(section={...})`` returns a copy with some replaced.
+``Pipeline``: ``step(event)`` processes events in order of time; ``look(now_ns, lead_s)`` returns
+targets and beams, ``tracks(now_ns, valid_at_ns)`` every tracked UAV, ``clock_estimate(uav)`` the
+state of its clock, ``local`` the local frame. ``Frame``, ``Tick``, ``RoundTrip``: events, from a
+``Source``. ``read_log(path)``: the events of any kind of log. ``UserError``: raised for a user's
+mistakes.
 
-Names are loaded when they are first asked for: to import this package costs next to nothing.
+Names are loaded on first use, so that importing this package is fast.
 """
 
-TYPE_CHECKING = False  # for type checkers alone: to import `typing` takes longer than all of this
+TYPE_CHECKING = False  # for type checkers only: importing `typing` would take longer than all this
 if TYPE_CHECKING:
     from companion.pipeline.fold import Pipeline
     from companion.recording.reader import read_log

@@ -4,7 +4,7 @@ from companion.cli.interrupts import interrupts_end
 
 
 def main() -> None:
-    """Load the command and run it; Ctrl-C ends it with one line, even while it is still loading."""
+    """Load and run the command; Ctrl-C ends it with one line, even while it loads."""
     with interrupts_end("companion"):
         from companion.cli.main import main as command
 

@@ -1,11 +1,11 @@
-"""A client for a notebook or a radio's controller: the service's answers as plain values.
+"""Client of the service for a notebook or a radio's controller, with answers as plain values.
 
     node = Client("http://127.0.0.1:8080")
     weights = node.weights(lead_ms=20)      # M×N complex, one column a UAV
     for message in node.stream(topics=["beams"], rate_hz=20):
         ...
 
-Synchronous, with no more than the standard library, numpy and websockets. For use by one thread.
+Synchronous; needs only the standard library, numpy and websockets. For use by one thread.
 """
 
 import base64
@@ -32,10 +32,10 @@ SUBPROTOCOL: Final = "companion.v1"
 
 
 class ServiceError(Exception):
-    """The service refused, failed, or could not be reached.
+    """The service rejected the request, failed, or could not be reached.
 
-    ``status`` is the HTTP status, or the code with which a stream was closed; None where there was
-    no answer. ``title`` says why.
+    ``status`` is the HTTP status, or the close code of a stream; None without an answer. ``title``
+    is the reason.
     """
 
     def __init__(self, status: int | None, title: str) -> None:
@@ -50,7 +50,7 @@ class Weights:
 
     uavs         names of the N UAVs
     matrix       (M, N) complex, columns in the order of ``uavs``
-    valid_at_ns  when they are to be applied, ns since the Unix epoch on the service's clock
+    valid_at_ns  time of application, ns since the Unix epoch on the service's clock
     groups       the time slot of each UAV
     """
 
@@ -64,8 +64,8 @@ class Client:
     """A connection to one service.
 
         url        ``http://HOST:PORT``; raises ``UserError`` for any other form
-        token      bearer token, where the service asks for one
-        timeout_s  for connecting and for each answer
+        token      bearer token, if the service requires one
+        timeout_s  timeout for connecting and for each answer
 
     Every method raises ``ServiceError``.
     """
@@ -78,24 +78,24 @@ class Client:
         self._timeout_s = timeout_s
 
     def fleet(self) -> Json:
-        """The nodes of the fleet and who serves whom: ``/v1/fleet``."""
+        """Return ``/v1/fleet``: the nodes of the fleet and the UAVs that each serves."""
         return self.get("/v1/fleet")
 
     def status(self) -> Json:
-        """``/v1/status``: version, uptime, links, center, recording, rates."""
+        """Return ``/v1/status``: version, uptime, links, center, recording, rates."""
         return self.get("/v1/status")
 
     def uavs(self) -> list[Json]:
-        """Every UAV as it is now."""
+        """Return every UAV as it is now."""
         found: list[Json] = self.get("/v1/uavs")["uavs"]
         return found
 
     def beams(self, lead_ms: float = 0.0) -> Json:
-        """``/v1/beams``: the beams that are applied in ``lead_ms`` milliseconds."""
+        """Return ``/v1/beams``: the beams that are applied in ``lead_ms`` milliseconds."""
         return self.get("/v1/beams", lead_ms=lead_ms)
 
     def weights(self, lead_ms: float = 0.0) -> Weights:
-        """The weights that are to be applied in ``lead_ms`` milliseconds."""
+        """Return the weights to apply in ``lead_ms`` milliseconds."""
         query = urlencode({"lead_ms": lead_ms})
         with self._open(f"/v1/beams/weights?{query}", "application/x-npy") as answer:
             body, headers = _read(answer), answer.headers
@@ -107,13 +107,13 @@ class Client:
         )
 
     def table(self, media_type: str, lead_ms: float = 0.0) -> str:
-        """The weights applied in ``lead_ms`` milliseconds as the text that a device reads."""
+        """Return the weights to apply in ``lead_ms`` milliseconds, as text for a device."""
         query = urlencode({"lead_ms": lead_ms})
         with self._open(f"/v1/beams/weights?{query}", media_type) as answer:
             return _read(answer).decode()
 
     def get(self, path: str, **query: object) -> Json:
-        """The answer of any path of the API that returns a JSON object."""
+        """Return the answer of any path of the API that returns a JSON object."""
         address = quote(path) + ("?" + urlencode(query, doseq=True) if query else "")
         with self._open(address, "application/json") as answer:
             body = _read(answer)
@@ -122,28 +122,28 @@ class Client:
         except ValueError as error:
             raise ServiceError(None, f"{self._url}: the answer is not JSON") from error
         if not isinstance(found, dict):
-            raise ServiceError(None, f"{self._url}: the answer is no JSON object")
+            raise ServiceError(None, f"{self._url}: the answer is not a JSON object")
         return found
 
     def stream(
         self, uavs: Iterable[str] = (), topics: Iterable[str] = (), rate_hz: float = 10.0
     ) -> Iterator[Json]:
-        """Messages of the state as it changes; ``companion.server.stream`` describes them.
+        """Yield messages of the state as it changes; ``companion.server.stream`` describes them.
 
-        A consumer that is slow between two messages misses some. Close the iterator to end the
-        stream. If the service ends, ``ServiceError`` is raised with the status 1012.
+        A slow consumer misses some. Close the iterator to end the stream. If the service ends,
+        ``ServiceError`` is raised with the status 1012.
         """
         topics = tuple(topics)
         if "records" in topics:
-            raise UserError("records are binary: Client.records has them")
+            raise UserError("topic 'records' is binary; use Client.records")
         with closing(self._messages(uavs, topics, rate_hz)) as messages:
             for message in messages:
                 yield json.loads(message)
 
     def records(self, uavs: Iterable[str] = (), rate_hz: float = 100.0) -> Iterator[bytes]:
-        """Updates as they are made, each as one record (``companion.views.records``).
+        """Yield updates as they are computed, each as one record (``companion.views.records``).
 
-        As ``stream`` in all else.
+        Otherwise as ``stream``.
         """
         with closing(self._messages(uavs, ["records"], rate_hz)) as messages:
             for message in messages:
@@ -202,11 +202,11 @@ def _read(answer: HTTPResponse) -> bytes:
     try:
         return answer.read()
     except (OSError, HTTPException) as error:
-        raise ServiceError(None, f"the answer broke off: {_reason(error)}") from error
+        raise ServiceError(None, f"the answer is incomplete: {_reason(error)}") from error
 
 
 def _title(error: urllib.error.HTTPError) -> str:
-    """The problem's title; the status's own words where there is none."""
+    """Return the problem's title, or the text of the status without one."""
     try:
         return str(json.loads(error.read())["title"])
     except (ValueError, KeyError, TypeError, OSError, HTTPException):

@@ -1,5 +1,5 @@
-// An alarm for whoever does not look at the page: off unless switched on, which this browser
-// remembers. It sounds, and a bar stays, until somebody has seen it.
+// An alarm for an operator who does not watch the page. It is off by default, and the browser
+// stores the choice. It sounds, and shows a bar, until it is acknowledged.
 
 import { $, setText } from "./dom.js";
 import { rankOf } from "./health.js";
@@ -13,7 +13,7 @@ function remembered() {
   try {
     return localStorage.getItem(KEY) === "on";
   } catch {
-    return false; // storage is refused to this page: it is off until it is switched on again
+    return false; // storage is blocked: off until it is switched on again
   }
 }
 
@@ -21,18 +21,18 @@ function remember(isOn) {
   try {
     localStorage.setItem(KEY, isOn ? "on" : "off");
   } catch {
-    // storage is refused to this page: it holds until the page is closed
+    // storage is blocked: the choice holds until the page is closed
   }
 }
 
 export class Alarm {
   constructor() {
     Object.assign(this, { isOn: remembered(), ranks: new Map(), wasLost: false, soundedAt: 0 });
-    this.unseen = ""; // what nobody has seen yet
+    this.unseen = ""; // text of the alarm that is not acknowledged yet
     this.sound = null;
     $("alarm").addEventListener("click", () => this.switch(!this.isOn));
     $("alarm-seen").addEventListener("click", () => this.see());
-    // Browsers let a page sound only once somebody has touched it.
+    // Browsers allow sound only after an interaction with the page.
     document.addEventListener("pointerdown", () => this.isOn && this.wakeSound());
     this.draw();
   }
@@ -49,14 +49,14 @@ export class Alarm {
     this.draw();
   }
 
-  /** Look at what is true now; `isLost`: nothing is known of it any more. */
+  /** Check the present UAVs; `isLost`: the connection to the service is lost. */
   watch(uavs, isLost, now) {
-    // One that is good is no alarm, though it had no verdict before, as while another node served it.
+    // A good link is no alarm, even without a verdict before, as while another node served it.
     const worse = uavs.filter((uav) => uav.verdict !== "good"
       && rankOf(uav) < (this.ranks.get(uav.id) ?? -1));
     if (!isLost) this.ranks = new Map(uavs.map((uav) => [uav.id, rankOf(uav)]));
     if (!this.isOn) return;
-    if (isLost && !this.wasLost) this.unseen = "the connection to the service is lost";
+    if (isLost && !this.wasLost) this.unseen = "connection to the service lost";
     else if (worse.length) {
       this.unseen = worse.map((uav) => `link to ${uav.id}: ${uav.verdict}`).join(", ");
     }

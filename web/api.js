@@ -1,31 +1,31 @@
-// Polling. Each feed has one request in flight at most, keeps the newest answer only, backs off
-// while it fails, and knows how far its answer may be trusted. Local time is performance.now():
-// the clock of the browser's machine and that of the service need not agree.
+// Polling. Each feed has at most one request in flight, keeps only the newest answer, backs off
+// after failures, and knows whether its answer may be trusted. Local time is performance.now():
+// the clocks of the browser's machine and of the service need not agree.
 //
-// All feeds beat in time, on multiples of BEAT_MS: what is drawn together (UAVs, beams, pattern)
-// is asked at the same moment, or a fast UAV would seem to be beside its own beam. In all they are
-// five requests a second, six in a fleet.
+// All feeds poll on multiples of BEAT_MS. Values that are drawn together (UAVs, beams, pattern) are
+// requested at the same moment; otherwise a fast UAV would appear beside its own beam. In total
+// this is five requests a second, six in a fleet.
 
 import { authorised, setUpToken } from "./token.js";
 
 const BEAT_MS = 850;
 const TIMEOUT_MS = 2000;
 const BACKOFF_MAX_MS = 2000;
-/** A value that is older than so much beyond its own period looks stale. */
+/** Age beyond its own period from which on a value is shown as late. */
 const LATE_MS = 1150;
-/** Without an answer for so long beyond its period, a value is no longer true. */
+/** Time without an answer, beyond its period, after which a value is outdated. */
 const MISSED_MS = 2150;
-/** Without any answer at all for so long, the service is lost. */
+/** Time without any answer after which the connection counts as lost. */
 export const LOST_MS = 3000;
-const NO_TOKEN = "the service asks for a token";
+const NO_TOKEN = "the service needs a token";
 const BAD_ANSWERS = ["lost", "frozen", "waiting"];
 
 const isListOf = (list, key) =>
   Array.isArray(list) && list.every((entry) => typeof entry?.[key] === "string");
 
 /**
- * What is polled, every so many beats. `stamp` is the field by which the service shows that it
- * moves on; `offset`, in beats, spreads the slow ones out.
+ * The feeds, each with its period in beats. `stamp` is a field that changes while the service is
+ * running; `offset`, in beats, spreads the slow feeds out.
  */
 const FEEDS = {
   uavs: {
@@ -74,7 +74,7 @@ const FEEDS = {
 };
 
 export class Feed {
-  /** `context()` says what an address may depend on; an address of null is not asked now. */
+  /** `context()` returns what a path may depend on; a path of null is not requested now. */
   constructor(name, settings, context, onAnswer) {
     Object.assign(this, { name, offset: 0, ...settings, context, onAnswer });
     this.periodMs = this.beats * BEAT_MS;
@@ -96,14 +96,14 @@ export class Feed {
     }
   }
 
-  /** Milliseconds until this feed's next beat; who has nothing to ask looks again at each beat. */
+  /** Milliseconds until this feed's next beat; a feed without an answer tries at each beat. */
   untilBeatMs() {
     const everyMs = this.answeredAt === null ? BEAT_MS : this.periodMs;
     const phaseMs = performance.now() - this.offset * BEAT_MS;
     return everyMs - (((phaseMs % everyMs) + everyMs) % everyMs);
   }
 
-  /** Wait, or be woken: when the page is shown again or the network comes back. */
+  /** Wait, or until woken: when the page is shown again or the network is back. */
   pause(waitMs) {
     return new Promise((resolve) => {
       const timer = setTimeout(resolve, waitMs);
@@ -117,7 +117,7 @@ export class Feed {
   async poll() {
     const path = typeof this.path === "function" ? this.path(this.context()) : this.path;
     if (!path) {
-      // There is nothing to ask about: nor is there an answer, nor one that failed to come.
+      // There is nothing to request: neither an answer nor a failure.
       Object.assign(this, { data: null, answeredAt: null, failures: 0, problem: "" });
       this.startedAt = performance.now();
       return;
@@ -134,7 +134,7 @@ export class Feed {
           : `the service answered ${response.status}`);
       }
       const data = await response.json();
-      if (!this.accepts(data)) throw new Error("the answer is not what was asked for");
+      if (!this.accepts(data)) throw new Error("unexpected answer");
       answer = data;
     } catch (error) {
       this.failures += 1;
@@ -155,7 +155,7 @@ export class Feed {
     this.onAnswer();
   }
 
-  /** Seconds since the newest answer; since the start where there has been none. */
+  /** Seconds since the newest answer, or since the start without one. */
   silenceS(now = performance.now()) {
     return (now - (this.answeredAt ?? this.startedAt)) / 1000;
   }
@@ -169,7 +169,7 @@ export class Feed {
     if (isIdle) return "idle";
     if (silentMs > missedMs) return "lost";
     if (this.answeredAt === null) return "waiting";
-    // A stamp of null is a service that has nothing to tell yet, not one that has stopped.
+    // A stamp of null means that the service has no data yet, not that it has stopped.
     if (this.stamp && this.lastStamp && now - this.movedAt > missedMs) return "frozen";
     return silentMs > this.periodMs + LATE_MS ? "late" : "live";
   }
@@ -187,7 +187,7 @@ function describe(error) {
 }
 
 /**
- * Start polling. `context()` gives `{beamed}`, the UAV whose beam is looked at, and `{inFleet}`,
+ * Start polling. `context()` returns `{beamed}`, the UAV whose beam is shown, and `{inFleet}`,
  * whether this node is part of a fleet; `onAnswer(name)` is called after each answer. Returns the feeds by name.
  */
 export function startPolling(context, onAnswer) {
@@ -199,22 +199,22 @@ export function startPolling(context, onAnswer) {
   setUpToken(wakeAll);
   window.addEventListener("online", wakeAll);
   document.addEventListener("visibilitychange", () => document.hidden || wakeAll());
-  // Once the caller has the feeds: what its context says depends on them.
+  // Only after the caller has the feeds, as its context depends on them.
   queueMicrotask(() => Object.values(feeds).forEach((feed) => feed.run()));
   return feeds;
 }
 
-/** What need not be known: the answer, or null where there is none. */
+/** Return an optional answer; null without one. */
 export async function askOnce(path) {
   try {
     const response = await authorised(path);
     return response.ok ? await response.json() : null;
   } catch {
-    return null; // who asks does without
+    return null; // the caller does without
   }
 }
 
-/** The connection as one word and, where it is bad, what to tell the operator. */
+/** The state of the connection as one word and, if it is bad, details for the operator. */
 export function connection(feeds, now = performance.now()) {
   const all = Object.values(feeds).filter((feed) => feed.health(now) !== "idle");
   const having = (...states) => all.filter((feed) => states.includes(feed.health(now)));

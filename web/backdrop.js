@@ -1,4 +1,4 @@
-// Behind everything: range rings and compass.
+// Background of the plan view: range rings and compass.
 
 import { units } from "./units.js";
 
@@ -25,12 +25,12 @@ export function drawRings(view) {
   context.globalAlpha = 1;
 }
 
-/** Returns the boxes that the labels take, for others to keep away from. */
+/** Returns the boxes of the labels, which other labels must avoid. */
 export function drawRingLabels(view) {
   const boxes = [];
   for (const { m, px, outer } of rings(view)) {
     if (px < 26) continue;
-    // Below the middle and to the left: seldom in the way of the boresight or of the compass.
+    // Below the centre and to the left, where boresight and compass seldom are.
     const [x, y] = view.atBearing(225, px);
     if (y > view.height - 8 || x < 16) continue;
     view.write(ringLabel(m), x, y, { colour: "gridtext", size: 11, align: "center",
@@ -40,7 +40,7 @@ export function drawRingLabels(view) {
   return boxes;
 }
 
-/** Returns the boxes that the bearings take, likewise. */
+/** Returns the boxes of the bearings, likewise. */
 export function drawCompass(view) {
   const boxes = [];
   const { context } = view;

@@ -1,4 +1,4 @@
-// Time series of the last minutes, a line a UAV: one picture for each thing that must stay small
+// Time series of the last minutes, one line per UAV: one chart for each value that must stay small
 // (or, for gain, large). Drawn by uPlot, which is loaded as a plain script (vendor/README.md).
 
 import { $, make, setChildren, setText } from "./dom.js";
@@ -6,12 +6,12 @@ import { known } from "./format.js";
 import { fontOf, readColours } from "./surface.js";
 import { lengthOf, units } from "./units.js";
 
-const SPANS_S = [30, 60, 180]; // the shortest that holds what there is
-const GAP_MS = 2500; // no line through a hole in what was received
-const MOST_LINES = 7; // as many hues as can be told apart
-const REDRAW_MS = 2000; // of minutes: a second is not a pixel
+const SPANS_S = [30, 60, 180]; // the shortest that contains all samples is used
+const GAP_MS = 2500; // no line across a longer gap
+const MOST_LINES = 7; // number of hues that are easy to distinguish
+const REDRAW_MS = 2000; // a second is less than a pixel
 const LASTING_MS = 10_000;
-/** Besides its hue every line has its own dash: no UAV is told by colour alone. */
+/** Every line also has its own dash, so that no UAV is identified by colour alone. */
 const DASHES = [[], [7, 3], [2, 3], [10, 3, 2, 3], [4, 2], [14, 4], [2, 6]];
 const HUES = DASHES.map((_, i) => `line${i}`);
 
@@ -24,7 +24,7 @@ const CHARTS = [
 
 const COLLATOR = new Intl.Collator("en", { numeric: true });
 
-/** `uavs` to draw: the chosen one always, then those whose links are worst; in a lasting order. */
+/** UAVs to draw: the selected one, then those with the worst links; in a stable order. */
 function chosenFew(uavs, selected) {
   const ids = uavs.map((uav) => uav.id);
   const few = ids.slice(0, MOST_LINES);
@@ -52,7 +52,7 @@ function columns(moments, ids, of, now) {
 export class Charts {
   constructor(onPick) {
     Object.assign(this, { onPick, plots: [], ids: null, selected: null, drawnAt: -Infinity, pastAt: null });
-    this.past = []; // moments of before this page was opened
+    this.past = []; // moments before this page was opened
     [this.spanS] = SPANS_S;
     for (const { id } of CHARTS) {
       new ResizeObserver(() => this.fit()).observe($(`chart-${id}`));
@@ -63,7 +63,7 @@ export class Charts {
   recolour() {
     this.colour = readColours([...HUES, "grid", "muted", "mark"]);
     this.font = `11px ${fontOf()}`;
-    this.ids = null; // made anew with the new colours
+    this.ids = null; // rebuilt with the new colours
   }
 
   changeUnits() {
@@ -71,7 +71,7 @@ export class Charts {
     this.drawnAt = -Infinity;
   }
 
-  /** Take in what the service kept of the time before; `now`: when its answer came. */
+  /** Add the service's samples from before; `now`: arrival of its answer. */
   fill(answer, now) {
     const uavs = Object.entries(answer.uavs);
     this.past = answer.at.map((stamp, i) => ({
@@ -90,7 +90,7 @@ export class Charts {
     }
   }
 
-  /** `pastAt`: the moment that the page shows, null while it is live. */
+  /** `pastAt`: the moment shown by the page, null while it is live. */
   show(history, uavs, { selected, pastAt, now }) {
     const ids = this.lasting(chosenFew(uavs, selected), uavs, selected, now);
     const changed = this.ids === null || ids.join() !== this.ids.join()
@@ -108,7 +108,7 @@ export class Charts {
     CHARTS.forEach(({ of }, i) => this.plots[i].plot.setData(columns(moments, ids, of, now)));
   }
 
-  /** The lines stay for a while though others have become the worst: to change them is much work. */
+  /** Keep the lines for a while although other links are now worse: changing them is expensive. */
   lasting(wanted, uavs, selected, now) {
     const present = new Set(uavs.map(({ id }) => id));
     const stay = this.ids?.length === wanted.length && this.ids.every((id) => present.has(id))
@@ -118,7 +118,7 @@ export class Charts {
 
   build(ids, total) {
     Object.assign(this, { ids, builtAt: this.now });
-    // Their sizes all at once: to ask after each change would lay the page out each time.
+    // All sizes are read at once: reading after each change would cause a layout each time.
     const sizes = CHARTS.map(({ id }) => $(`chart-${id}`))
       .map(({ clientWidth, clientHeight }) => [clientWidth, clientHeight]);
     this.plots.forEach(({ plot }) => plot.destroy());
@@ -157,7 +157,7 @@ export class Charts {
     };
   }
 
-  /** Where in the pictures the moment is that the rest of the page shows. */
+  /** Mark the moment that the rest of the page shows. */
   markPast(plot) {
     if (this.pastAt === null) return;
     const { left, top, width, height } = plot.bbox;
@@ -177,7 +177,7 @@ function agoLabel(seconds) {
   return seconds % 60 ? `−${-seconds} s` : `−${-seconds / 60} min`;
 }
 
-/** Which line is whose. */
+/** The legend: the line of each UAV. */
 function showKey(ids, total) {
   setChildren($("series-key"), [ids, total], () => {
     const names = ids.map((id, i) => {

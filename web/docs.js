@@ -1,4 +1,4 @@
-// The API's document, drawn by Swagger UI. Requests that are tried on it bring the tab's token.
+// The API's document in Swagger UI. Requests from it use the tab's token.
 
 import { tokenOfTab } from "./token.js";
 
@@ -9,7 +9,7 @@ SwaggerUIBundle({
   displayRequestDuration: true,
   docExpansion: "list",
   defaultModelsExpandDepth: 0,
-  validatorUrl: null, // nothing is asked of anybody else
+  validatorUrl: null, // no request to another server
   requestInterceptor: (request) => {
     const token = tokenOfTab();
     if (token && !request.headers.Authorization) request.headers.Authorization = `Bearer ${token}`;

@@ -1,13 +1,13 @@
-// The few things that every panel does to the page.
+// Functions for changing the page that all panels share.
 
 export const $ = (id) => document.getElementById(id);
 const TEXT_NODE = 3;
 
-/** Nothing is written that stands there already: each write costs a layout. */
+/** Set a text, unless it is unchanged: each write costs a layout. */
 export function setText(element, text) {
   const only = element.firstChild;
   if (only?.nodeType === TEXT_NODE && only === element.lastChild) {
-    if (only.data !== text) only.data = text; // the box of the text stays
+    if (only.data !== text) only.data = text; // the text node stays
   } else if (element.textContent !== text) element.textContent = text;
 }
 
@@ -27,15 +27,15 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
-/** Put these children into a list, unless it shows the same already: `key` says what it shows. */
+/** Set the children of a list, unless `key`, which identifies its contents, is unchanged. */
 export function setChildren(list, key, build) {
   const wanted = JSON.stringify(key);
   if (list.dataset.shown === wanted) return; // leave focus and selection alone
   list.replaceChildren(...build());
-  list.dataset.shown = wanted; // not before: what cannot be built is not shown
+  list.dataset.shown = wanted; // only after `build` has succeeded
 }
 
-/** Fill a list with `[left, right, level?, title?]` lines; says `none` where there are none. */
+/** Fill a list with `[left, right, level?, title?]` lines; shows `none` without any. */
 export function setPairs(list, pairs, none) {
   setChildren(list, [pairs, none], () => {
     if (!pairs.length) return [make("li", { class: "muted" }, none)];

@@ -1,4 +1,4 @@
-// All that is known of one UAV, beside the page: for whoever has to tell it to somebody else.
+// Details of one UAV, beside the page.
 
 import { askOnce } from "./api.js";
 import { $, make, setChildren, setText } from "./dom.js";
@@ -38,11 +38,11 @@ export class Drawer {
       await navigator.clipboard.writeText(text);
       setText($("copy"), "Copied");
     } catch {
-      getSelection()?.selectAllChildren($("coordinates")); // to be copied by hand
+      getSelection()?.selectAllChildren($("coordinates")); // for copying by hand
     }
   }
 
-  /** Its last messages, for battery and mode; a relayed aircraft sends none. */
+  /** Request its last messages, for battery and mode; a relayed aircraft has none. */
   async ask(now) {
     const [system, component] = this.id.split(":");
     if (!/^\d+$/.test(system) || now - this.askedAt < ASK_MS) return;
@@ -85,10 +85,10 @@ function showVerdict(uav) {
 
 function verdictOf(uav) {
   if (uav.verdict) return `link ${uav.verdict}`;
-  return elsewhere(uav) ? `served by ${elsewhere(uav)}` : "no link to judge";
+  return elsewhere(uav) ? `served by ${elsewhere(uav)}` : "no link";
 }
 
-/** As maps and other programs take them: decimal degrees, and metres. */
+/** The form that maps and other programs accept: decimal degrees, and metres. */
 function coordinatesOf({ lat_deg: lat, lon_deg: lon, alt_m: alt }) {
   if (![lat, lon].every(format.known)) return format.UNKNOWN;
   const up = format.known(alt) ? `, ${alt.toFixed(1)}` : "";
@@ -105,7 +105,7 @@ function batteryOf(status) {
   ].filter(Boolean).join(" · ") || format.UNKNOWN;
 }
 
-/** A fact under the name that the service gives its value, with its meaning for the pointer. */
+/** A fact with the service's label, and its meaning as a tooltip. */
 const of = (kind, name, text) => [labelOf(kind, name), text, meaningOf(kind, name)];
 
 function factsOf(uav, messages) {
@@ -134,7 +134,7 @@ function factsOf(uav, messages) {
 const rejectionsOf = (uav) => (uav.recent_rejections ?? []).slice(-EVENTS_SHOWN).reverse()
   .map(({ at, reason, detail }) => [at, [reason, detail].filter(Boolean).join(": ")]);
 
-/** What was said of this one: its id stands there as a word. */
+/** Notices about this UAV: those whose text contains its id as a word. */
 const eventsOf = (uav, answer) => (answer?.events ?? [])
   .filter(({ subject, text }) => subject === uav.id || text.match(/\w+:\w+/g)?.includes(uav.id))
   .slice(-EVENTS_SHOWN).reverse().map(({ at, text }) => [at, text]);

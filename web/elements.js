@@ -50,7 +50,7 @@ function drawAmplitudes(view, elements, top, height, colour) {
     [1, `${format.fixed(FLOOR_DB)}`]]);
   view.context.fillStyle = colour;
   elements.forEach(({ db }, i) => {
-    const share = Math.max(0, 1 - db / FLOOR_DB); // 1: as strong as the strongest
+    const share = Math.max(0, 1 - db / FLOOR_DB); // 1: the strongest element
     const px = height * share;
     const widthPx = Math.max(0.5, view.stepPx * 0.7);
     view.context.fillRect(view.xOf(i + 0.15), top + height - px, widthPx, px);

@@ -1,4 +1,4 @@
-// What is shown, to be taken along: the table as CSV, the plan view as PNG.
+// Export of the displayed data: the table as CSV, the plan view as PNG.
 
 import { make } from "./dom.js";
 import { known } from "./format.js";
@@ -9,7 +9,7 @@ const FIELDS = ["id", "verdict", "state", "lat_deg", "lon_deg", "alt_m", "north_
 const OF_BEAM = ["azimuth_deg", "elevation_deg", "range_m", "pointing_bound_deg", "gain_db",
   "guaranteed_gain_db"];
 
-/** Name and value in the units that are chosen; to a millimetre, or as the service said it. */
+/** Name and value in the selected units, rounded to a thousandth; SI values unchanged. */
 function inUnits(name, value) {
   const [, stem, unit] = /^(.*)_(m|mps)$/.exec(name) ?? [];
   if (stem === undefined) return [name, value];
@@ -21,7 +21,7 @@ function inUnits(name, value) {
 const quoted = (value) => (/[",\n]/.test(value) ? `"${value.replaceAll('"', '""')}"` : value);
 const cell = (value) => quoted(value === null || value === undefined ? "" : String(value));
 
-/** Comma-separated values, a line a UAV; what is not known is empty, never 0. */
+/** Comma-separated values, one line per UAV; unknown values are empty, never 0. */
 export function csvOf({ stamp, uavs, beams }) {
   const byId = new Map(beams.filter(({ oldS }) => oldS === undefined)
     .map((beam) => [beam.uav, beam]));

@@ -1,5 +1,5 @@
-// The fleet, where this node is part of one: which nodes are there, who serves whom, what each node
-// offers each UAV, and the newest handovers.
+// The fleet, if this node is in one: its nodes, the UAVs that each serves, the offers of each node,
+// and the newest handovers.
 
 import { $, make, setAttribute, setChildren, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
@@ -8,16 +8,16 @@ import { labelOf, meaningOf } from "./meanings.js";
 import { placedBy } from "./last_known.js";
 
 const HANDOVERS_KEPT = 30;
-/** How bad it is that a node is so. */
+/** Severity of each state of a node. */
 export const NODE_LEVELS = {
   here: "good", there: "good", silent: "warn", aside: "bad", gone: "bad",
 };
 
-/** What is kept of an answer for looking back: of the handovers the newest. */
+/** The part of an answer kept in the history: with the newest handovers only. */
 export const slimFleet = (answer) => answer
   && { ...answer, handovers: answer.handovers.slice(-HANDOVERS_KEPT) };
 
-/** The other nodes whose place is known, seen from the middle of the plan view. */
+/** The other nodes with a known position, relative to the centre of the plan view. */
 export function nodesAround(answer, middle) {
   return (answer?.nodes ?? []).filter((one) => !one.is_self && one.place)
     .map(({ node, state, place }) => placedBy({ node, state, ...place }, middle))
@@ -51,22 +51,22 @@ function nodeItem(one) {
     make("dt", {}, labelOf("FleetNode", name)), make("dd", {}, show(one)),
   ));
   const item = make("li", {}, head, make("dl", { class: "link-facts" }, ...facts));
-  if (one.reason) item.append(make("p", { class: "muted" }, `not believed: it ${one.reason}`));
+  if (one.reason) item.append(make("p", { class: "muted" }, `not trusted: it ${one.reason}`));
   return item;
 }
 
 function trafficOf({ sent_bps: sent, heard_bps: heard, damaged, untold }) {
-  const parts = [`tells ${format.bitsPerSecond(sent)}`, `hears ${format.bitsPerSecond(heard)}`];
-  if (damaged) parts.push(`▲ ${format.count(damaged)} damaged`);
-  if (untold) parts.push(`▲ ${format.count(untold)} untold`);
+  const parts = [`sent ${format.bitsPerSecond(sent)}`, `received ${format.bitsPerSecond(heard)}`];
+  if (damaged) parts.push(`▲ ${format.count(damaged)} malformed`);
+  if (untold) parts.push(`▲ ${format.count(untold)} not shared`);
   return parts.join(" · ");
 }
 
-// --- who serves whom ----------------------------------------------------------------------------
+// --- served UAVs --------------------------------------------------------------------------------
 
-/** Who serves a UAV, in words, and how bad that is; `rank`: the worst has the least. */
+/** The nodes that serve a UAV as text, and the severity; `rank`: the worst has the lowest. */
 export function servingOf({ served_by: by, handing_to: to, unconfirmed }) {
-  const parts = [by.join(" and ") || "nobody"];
+  const parts = [by.join(" and ") || "no node"];
   if (by.length > 1) parts[0] = `twice: ${parts[0]}`;
   if (to && !by.includes(to)) parts[0] += ` → ${to}`;
   if (unconfirmed) parts.push("unconfirmed");
@@ -74,23 +74,24 @@ export function servingOf({ served_by: by, handing_to: to, unconfirmed }) {
   const warn = by.length > 1 || unconfirmed;
   const title = [
     bad ? "No node serves it" : "",
-    by.length > 1 ? "During a handover, or while the fleet is parted" : "",
-    to ? `To be taken over by ${to}` : "",
-    unconfirmed ? "One node alone tells of it, where others ought to hear it" : "",
+    by.length > 1 ? "During a handover, or while the fleet is partitioned" : "",
+    to ? `Being handed over to ${to}` : "",
+    unconfirmed ? "Only one node receives it, though others should" : "",
   ].filter(Boolean).join(". ");
   return { text: parts.join(" · "), title, level: bad ? "bad" : warn ? "warn" : "",
     rank: bad ? 0 : warn ? 1 : to ? 2 : 3 };
 }
 
-/** An offer: the gain that is sure, the likely one, the SINR with it. */
+/** An offer: guaranteed gain, likely gain, SINR. */
 function offerOf(offer) {
   if (!offer) return { text: format.UNKNOWN, title: "no offer" };
   const { sure_db: sure, likely_db: likely, sinr_db: sinr, heard_s: heardS } = offer;
-  const heard = format.known(heardS) ? `heard ${format.seconds(heardS)} ago` : "never heard there";
+  const heard = format.known(heardS) ? `received ${format.seconds(heardS)} ago`
+    : "never received there";
   if (!format.known(sinr)) return { text: format.UNKNOWN, title: `cannot serve it; ${heard}` };
   return {
     text: `${format.fixed(sure, 1)} / ${format.fixed(likely, 1)} · ${format.fixed(sinr)}`,
-    title: `sure ${format.decibels(sure)}, likely ${format.decibels(likely)}, SINR ${
+    title: `guaranteed ${format.decibels(sure)}, likely ${format.decibels(likely)}, SINR ${
       format.decibels(sinr)}; ${heard}`,
   };
 }
@@ -113,7 +114,7 @@ export class FleetView {
     });
   }
 
-  /** Show an answer of /v1/fleet; nothing of it is there where this node is part of none. */
+  /** Show an answer of /v1/fleet; all of it is hidden if this node is not in a fleet. */
   show(answer, selected) {
     this.last = [answer, selected];
     const has = Boolean(answer?.node);
@@ -147,7 +148,7 @@ export class FleetView {
     $("fleet-empty").hidden = uavs.length > 0;
   }
 
-  /** A column for each node; the rows are made anew where the nodes are others. */
+  /** A column for each node; the rows are rebuilt if the nodes have changed. */
   makeColumns(names) {
     setAttribute(this.head.children[0], "aria-sort", this.order === "id" ? "ascending" : "none");
     setAttribute(this.head.children[1], "aria-sort",
@@ -197,6 +198,6 @@ function showHandovers(handovers) {
   setChildren($("fleet-handovers"), shown, () => (shown.length
     ? shown.map(({ time, uav, before, after }) => make("li", {},
       make("time", { datetime: time }, format.timeOfDay(time)),
-      make("span", {}, `${uav}: ${before ?? "nobody"} → ${after ?? "nobody"}`)))
+      make("span", {}, `${uav}: ${before ?? "none"} → ${after ?? "none"}`)))
     : [make("li", { class: "muted" }, "none")]));
 }

@@ -1,4 +1,4 @@
-// One beam looked at closely: its pattern, and what every element does for it.
+// Details of one beam: its pattern, and phase and amplitude of every element.
 
 import { $, make, setChildren, setText } from "./dom.js";
 import { elementsOf, makeElements } from "./elements.js";
@@ -9,7 +9,7 @@ export class Focus {
   constructor() {
     this.pattern = makePattern($("pattern"));
     this.elements = makeElements($("elements"));
-    this.shown = {}; // what the elements were last worked out from
+    this.shown = {}; // input of the last computation of the elements
   }
 
   recolour() {
@@ -17,14 +17,14 @@ export class Focus {
     this.elements.recolour();
   }
 
-  /** `oldS`: how old it is, where it is the last that was known; else null. */
+  /** `oldS`: age of the last known beam, if it is shown; else null. */
   show({ pattern, weights, patternBeams }, uav, { isLive, oldS, patternTrusted, weightsTrusted }) {
     const label = oldS === null ? uav ?? "" : `${uav}, as ${format.duration(oldS)} ago`;
     const entry = pattern?.patterns.find((one) => one.uav === uav) ?? null;
     const beam = entry && patternBeams?.beams.find((one) => one.uav === uav);
     for (const name of document.querySelectorAll(".focus-uav")) setText(name, label);
-    // Only the pattern of the UAV that was looked at then has been asked for.
-    const none = uav === null ? "no beam" : isLive ? "waiting…" : "not asked for at that time";
+    // Only the pattern of the UAV that was shown at that time was requested.
+    const none = uav === null ? "no beam" : isLive ? "waiting…" : "not stored for that time";
     this.pattern.show({ answer: pattern, entry, beam, trusted: patternTrusted, none });
     const facts = directionFacts(entry, beam);
     setChildren($("pattern-facts"), facts, () => facts.map(([label, text]) => make(

@@ -1,4 +1,4 @@
-// Numbers to text. Unknown (null, undefined, NaN, infinite) is a dash everywhere, never 0.
+// Conversion of numbers to text. Unknown (null, undefined, NaN, infinite) is a dash, never 0.
 
 import { lengthOf, speedOf, units } from "./units.js";
 
@@ -18,12 +18,12 @@ export function fixed(value, decimals = 0, { signed = false } = {}) {
   return signed ? `+${text}` : text;
 }
 
-/** The same with its unit; the unit of an unknown value is left away. */
+/** The same with its unit; an unknown value has none. */
 function withUnit(value, decimals, unit, options) {
   return known(value) ? fixed(value, decimals, options) + unit : UNKNOWN;
 }
 
-/** Metres in the unit that is chosen; from ten thousand of it on in the unit of what is long. */
+/** Metres in the selected unit; from ten thousand of it on in the unit for long distances. */
 export function length(metres) {
   if (!known(metres)) return UNKNOWN;
   const { name, far } = units.length;
@@ -34,7 +34,7 @@ export function length(metres) {
 
 export const degrees = (value, decimals = 1) => withUnit(value, decimals, "°");
 export const signedDegrees = (value) => withUnit(value, 1, "°", { signed: true });
-/** Metres per second in the unit that is chosen. */
+/** Metres per second in the selected unit. */
 export const speed = (mps) =>
   withUnit(known(mps) ? speedOf(mps) : null, 1, NBSP + units.speed.name);
 export const decibels = (value) => withUnit(value, 1, `${NBSP}dB`);
@@ -47,14 +47,14 @@ export function bearing(value) {
   return `${String(whole).padStart(3, "0")}°`;
 }
 
-/** Seconds with the decimals that matter at that size. */
+/** Seconds, with fewer decimals for larger values. */
 export function seconds(value) {
   if (!known(value)) return UNKNOWN;
   const size = Math.abs(value);
   return withUnit(value, size < 9.995 ? 2 : size < 99.95 ? 1 : 0, `${NBSP}s`);
 }
 
-/** From here on a time is written in seconds, not in milliseconds. */
+/** Least time written in seconds instead of milliseconds. */
 const LONG_S = 9.9995;
 
 export function milliseconds(valueS) {
@@ -64,7 +64,7 @@ export function milliseconds(valueS) {
     : withUnit(valueS * 1000, 0, `${NBSP}ms`);
 }
 
-/** Two times in milliseconds: 2 / 5 ms. Each has its unit where that is not the same. */
+/** Two times in milliseconds: 2 / 5 ms. Each has its own unit if they differ. */
 export function millisecondsRange(fromS, toS) {
   if (!known(fromS) || !known(toS)) return UNKNOWN;
   const from = Math.abs(toS) >= LONG_S ? milliseconds(fromS) : fixed(fromS * 1000);
@@ -74,7 +74,7 @@ export function millisecondsRange(fromS, toS) {
 /** A share of one as a percentage. */
 export const share = (value) => withUnit(known(value) ? value * 100 : null, 0, `${NBSP}%`);
 
-/** A span of time for a person: 42 s, 3 min 05 s, 2 h 07 min, 3 d 04 h. */
+/** A readable duration: 42 s, 3 min 05 s, 2 h 07 min, 3 d 04 h. */
 export function duration(valueS) {
   if (!known(valueS)) return UNKNOWN;
   const whole = Math.max(0, Math.floor(valueS));
@@ -103,7 +103,7 @@ export function bitsPerSecond(value) {
     : withUnit(value, 0, `${NBSP}bit/s`);
 }
 
-/** A whole count, thousands apart by a narrow space: 12 345. */
+/** A count, with thousands separated by a narrow space: 12 345. */
 export function count(value) {
   if (!known(value)) return UNKNOWN;
   return fixed(value, 0).replace(/\B(?=(\d{3})+(?!\d))/g, "\u202f");

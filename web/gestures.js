@@ -1,8 +1,8 @@
-// Moving the plan view by hand: drag, wheel, two fingers; a press that does not move chooses.
+// Gestures of the plan view: drag, wheel, two fingers; a press without movement selects.
 
 const STILL_PX = 5; // a press that moves less is a click
-const NOTCH_PX = 60; // touch pads send many small steps: about one notch of a wheel
-const PINCH = 1.25; // how far fingers spread for one step of scale
+const NOTCH_PX = 60; // sum of the small steps of a touch pad that counts as a notch of a wheel
+const PINCH = 1.25; // ratio of finger distances for one zoom step
 
 /** `actions`: `{pan(dxPx, dyPx), zoom(steps), choose(event)}`. */
 export function setUpGestures(canvas, actions) {

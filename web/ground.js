@@ -1,14 +1,14 @@
-// The ground under the plan view: a PMTiles file of the user's, drawn by MapLibre. Neither is
-// loaded unless the settings name such a file; then the plan's own background becomes clear.
+// The map under the plan view: a PMTiles file of the user, drawn by MapLibre. Neither is loaded
+// unless the settings name such a file; then the plan's own background becomes transparent.
 
 import { authorised } from "./token.js";
 
 const EARTH_ROUND_M = 40075016.686;
-const TILE_PX = 512; // MapLibre's own measure: the world at zoom 0
+const TILE_PX = 512; // size of the world at zoom 0 in MapLibre
 const M_PER_DEG = EARTH_ROUND_M / 360;
 const SHADE = { raster: 0.55, fill: 0.35, line: 0.5 };
 
-/** Whether there is a map here; a service of an earlier version has none. */
+/** Whether the service has a map; earlier versions have none. */
 async function named() {
   const answer = await authorised("v1/map");
   return answer.ok && (await answer.json()).name !== null;
@@ -19,7 +19,7 @@ export class Ground {
     Object.assign(this, { holder, colourOf, map: null, place: null });
   }
 
-  /** Load what draws it, if there is a file; resolves to whether there is one. */
+  /** Load MapLibre and the file, if there is one; resolves to whether there is. */
   async begin() {
     if (!(await named())) return false;
     const [maplibre] = await Promise.all([
@@ -35,7 +35,7 @@ export class Ground {
     this.style = () => styleOf(header, said ?? {}, this.colourOf());
     this.map = new maplibre.Map({
       container: this.holder, style: this.style(), interactive: false, fadeDuration: 0,
-      attributionControl: false, // its button is a picture that the page's policy forbids
+      attributionControl: false, // the page's policy blocks the image of its button
     });
     this.holder.dataset.credit = plainOf(said?.attribution ?? "");
     return true;
@@ -45,7 +45,7 @@ export class Ground {
     this.map?.setStyle(this.style());
   }
 
-  /** Put the carrier's place where the plan has it; `view` is the plan, north up. */
+  /** Move the map so that the carrier is where the plan shows it; `view` is the plan, north up. */
   follow(view) {
     if (!this.map || !this.place) return;
     const camera = cameraOf(this.place, view);
@@ -56,7 +56,7 @@ export class Ground {
   }
 }
 
-/** Where MapLibre has to look for the plan's middle and scale: longitude, latitude, zoom. */
+/** MapLibre's camera for the plan's centre and scale: longitude, latitude, zoom. */
 export function cameraOf(place, view) {
   const round = Math.cos(place.lat_deg * Math.PI / 180);
   const eastM = (view.width / 2 - view.centre[0]) / view.pxPerM;
@@ -77,7 +77,7 @@ const RANGES = {
   },
 };
 
-/** A style without words: pictures as they are, or plain shapes of whatever layers there are. */
+/** A style without labels: raster tiles, or plain shapes of all vector layers. */
 export function styleOf(header, said, colour) {
   const area = {
     type: header.tileType === 1 ? "vector" : "raster", tiles: ["pmtiles://area/{z}/{x}/{y}"],
@@ -104,7 +104,7 @@ function shapesOf(id, colour) {
   ];
 }
 
-/** Text without its marks: attributions come with links. */
+/** Text without markup, as attributions contain links. */
 const plainOf = (html) => new DOMParser().parseFromString(html, "text/html").body.textContent;
 
 function script(src) {

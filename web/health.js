@@ -1,11 +1,11 @@
-// Which links to UAVs are good, worst first: the headline, and what to do about those that are not.
+// Verdicts on the links to UAVs, worst first: the headline, and remedies for weak links.
 
 import { $, make, setChildren, setText } from "./dom.js";
 import { known } from "./format.js";
 
-/** From the worst to the best; a UAV without a verdict is no target, and comes last. */
+/** From worst to best; a UAV without a verdict is not a target, and comes last. */
 export const LEVELS = ["none", "weak", "good"];
-/** Colours and marks of the page for each level. */
+/** Colour and mark of each level. */
 export const LEVEL_OF = { none: "bad", weak: "warn", good: "good" };
 export const MARKS = { none: "✕", weak: "▲", good: "●" };
 const MOST_SHOWN = 8;
@@ -15,11 +15,11 @@ export const rankOf = (uav) => (LEVELS.includes(uav.verdict)
   ? LEVELS.indexOf(uav.verdict) : LEVELS.length);
 
 const COLLATOR = new Intl.Collator("en", { numeric: true });
-const STEP_DB = 6; // links that differ by less are alike: rows must not change places all the time
+const STEP_DB = 6; // links that differ by less rank equal, so that rows seldom change places
 
 export const byId = (a, b) => COLLATOR.compare(a.id, b.id);
 
-/** How much gain a link has beyond what it needs, in steps; what is not known is the least. */
+/** Gain of a link beyond what it needs, in steps; unknown is the lowest. */
 function spareOf({ health }, gain) {
   const spareDb = (health?.[gain] ?? NaN) - (health?.needed_gain_db ?? NaN);
   return Number.isFinite(spareDb) ? Math.floor(spareDb / STEP_DB) : -Infinity;
@@ -30,22 +30,22 @@ const bySpare = (a, b, gain) => {
   return one === other ? 0 : one - other;
 };
 
-/** Who else serves a UAV, where this node does not: its link is judged there. */
+/** The other nodes that serve a UAV, if this node does not; they assess its link. */
 export const elsewhere = (uav) => (!uav.verdict && uav.served_by?.length
   ? uav.served_by.join(", ") : null);
 
-/** The worst link first: by verdict, then by the gain that is sure, then by the likely one. */
+/** The worst link first: by verdict, then by guaranteed gain, then by likely gain. */
 export const worstFirst = (a, b) => rankOf(a) - rankOf(b)
   || bySpare(a, b, "guaranteed_gain_db") || bySpare(a, b, "likely_gain_db") || byId(a, b);
 
 const of = (uavs, level) => uavs.filter((uav) => uav.verdict === level);
 
-/** The one line that says it all, and how bad it is. */
+/** The headline, and its severity. */
 export function headlineOf(uavs) {
   const judged = uavs.filter((uav) => rankOf(uav) < LEVELS.length);
   const others = uavs.filter(elsewhere).length;
   const besides = others ? `${others} with other nodes` : "";
-  if (!judged.length) return { text: besides || "no link to judge yet", level: "wait" };
+  if (!judged.length) return { text: besides || "no link assessed yet", level: "wait" };
   const good = of(judged, "good").length;
   const text = [`${good} of ${judged.length} links good`, besides].filter(Boolean).join(" · ");
   const worst = LEVELS.find((level) => of(judged, level).length);
@@ -58,7 +58,7 @@ export function showHeadline(uavs) {
   setText($("headline"), text);
 }
 
-/** Links that are not good, those with one cause together, the worst first. */
+/** Links that are not good, grouped by cause, the worst first. */
 export function troublesOf(uavs) {
   const alike = new Map();
   for (const uav of [...uavs].sort(worstFirst)) {
@@ -87,7 +87,7 @@ function troubleItem({ level, reason, remedy, ids, differ }, onSelect) {
     make("p", { class: "muted" }, remedy ? `→ ${remedy}` : ""));
 }
 
-/** What holds links back and what to do; nothing is listed where all are good. */
+/** Causes and remedies of weak links; empty if all are good. */
 export function showTroubles(uavs, onSelect) {
   const all = troublesOf(uavs);
   const shown = all.slice(0, MOST_SHOWN);
@@ -95,13 +95,13 @@ export function showTroubles(uavs, onSelect) {
   setChildren($("troubles"), shown, () => shown.map((one) => troubleItem(one, onSelect)));
 }
 
-/** The gains behind a verdict, in words: for the pointer, and for the reader of a screen. */
+/** The reason of a verdict as text: for the tooltip, and for screen readers. */
 export function explain(uav) {
   const others = elsewhere(uav);
-  if (others) return `Served by ${others}, which judges its link`;
+  if (others) return `Served by ${others}, which assesses its link`;
   const { reason, remedy, needed_gain_db: needed } = uav.health ?? {};
   if (uav.verdict === "good") {
-    return known(needed) ? `It surely has the ${needed.toFixed(1)} dB that it needs` : "";
+    return known(needed) ? `Guaranteed gain is at least the ${needed.toFixed(1)} dB that it needs` : "";
   }
   return [reason, remedy].filter(Boolean).join(". To do: ");
 }

@@ -1,11 +1,11 @@
-// What was polled over the last minutes, so that the operator can look back. It is bounded in time
-// and in size: with many UAVs it reaches back less far.
+// Answers of the last minutes, so that the operator can look back. Limited in time and in size:
+// with many UAVs it covers less time.
 
-/** How far back one can look, at most. */
+/** Longest time that is kept. */
 export const KEEP_MS = 300_000;
 const KEEP_UAV_ENTRIES = 24_000; // some 25 MB: 300 s of 60 UAVs
 
-/** Without what the page never shows: a moment is kept for minutes. */
+/** Without values that the page does not show, as moments are kept for minutes. */
 function slim({ recent_rejections: _, rejected: __, clock: ___, ...uav }) {
   return uav;
 }
@@ -34,7 +34,7 @@ export class History {
     return this.moments.at(-1) ?? null;
   }
 
-  /** Index of the first moment after `at`; as many as there are where none is. */
+  /** Index of the first moment after `at`; the number of moments if there is none. */
   indexAfter(at) {
     let [low, high] = [0, this.moments.length];
     while (low < high) {
@@ -45,12 +45,12 @@ export class History {
     return low;
   }
 
-  /** The newest moment that is not after `at`, or else the oldest; null where there is none. */
+  /** The newest moment that is not after `at`, or else the oldest; null without any. */
   at(at) {
     return this.moments[Math.max(0, this.indexAfter(at) - 1)] ?? null;
   }
 
-  /** The moment so many steps from this one. Where it has been dropped: from the oldest. */
+  /** The moment this many steps from the given one, or from the oldest if that was dropped. */
   stepFrom(moment, steps) {
     const here = this.indexAfter(moment.at) - 1;
     const index = Math.max(0, Math.min(this.moments.length - 1, here + steps));

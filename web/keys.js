@@ -1,6 +1,6 @@
-// The keyboard, for a page that is worked with gloves on.
+// Keyboard control of the page.
 
-/** Native controls keep their own keys while the keyboard is on them. */
+/** Whether a focused native control uses this key itself. */
 function isTaken(event, clicked) {
   const element = event.target;
   if (event.ctrlKey || event.altKey || event.metaKey || event.isComposing) return true;
@@ -9,15 +9,15 @@ function isTaken(event, clicked) {
     return ["ArrowLeft", "ArrowRight", "ArrowUp", "ArrowDown", "Home", "End"]
       .includes(event.key);
   }
-  // Space presses a button that was reached by the keyboard, not one that was clicked before.
+  // Space presses a button focused by the keyboard, not one that was clicked before.
   const pressable = element.closest("button, a, summary");
   return event.key === " " && pressable !== null && pressable !== clicked
     && pressable.matches(":focus-visible");
 }
 
-/** `actions`: what each key does; `selectNth(n)`: 1 is the first row of the table. */
+/** `actions`: the function of each key; `selectNth(n)`: 1 is the first row of the table. */
 export function setUpKeys(actions, selectNth) {
-  let clicked = null; // the control that was pressed last, until the keyboard goes elsewhere
+  let clicked = null; // the control that was clicked last, until the focus moves
   document.addEventListener("pointerdown", ({ target }) => {
     clicked = target.closest("button, a, summary");
   });
@@ -30,7 +30,7 @@ export function setUpKeys(actions, selectNth) {
       : () => selectNth(digit);
     if (!action) return;
     event.preventDefault();
-    // A clicked button would be pressed by the key's release: it gives the keyboard back.
+    // The key's release would press a clicked button, so its focus is removed.
     if (event.key === " " && event.target.matches("button")) event.target.blur();
     action();
   });

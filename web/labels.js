@@ -1,14 +1,14 @@
-// The names beside the symbols of the plan view.
+// Labels beside the symbols of the plan view.
 
 import * as format from "./format.js";
 import { MARKS, worstFirst } from "./health.js";
 
-const CROWD = 8; // with more UAVs than this, a label without room is left away
+const CROWD = 8; // with more UAVs than this, a label without space is omitted
 
 /**
- * Labels go where they cover nothing; in a crowd the second line goes, then the label. The chosen
- * UAV has its own first, then the worst links. The names of other nodes are always there. What is
- * `written` already, boxes of rings and bearings, stays legible.
+ * Labels are placed where they cover nothing. With many UAVs, first the second line is omitted, then
+ * the label. The selected UAV has priority, then the worst links. Names of other nodes are always
+ * shown. The boxes in `written`, of rings and bearings, are kept free.
  */
 export function drawLabels(view, written, nodes = []) {
   const [x, y] = view.centre;
@@ -35,7 +35,7 @@ export function drawLabels(view, written, nodes = []) {
   }
 }
 
-/** The first place beside a symbol that is inside the picture and not taken, or null. */
+/** The first free position beside a symbol inside the picture, or null. */
 function findPlace(view, { x, y }, lines, taken) {
   const widthPx = Math.max(
     view.measure(lines[0], 13, 700), lines[1] ? view.measure(lines[1], 11.5, 400) : 0,

@@ -1,5 +1,5 @@
-// What was known last of the carrier and of each beam: it stays on the page, grey and with its age,
-// for nothing tells an operator less than an empty picture.
+// The last known state of the carrier and of each beam. It stays on the page, grey and with its age,
+// since an empty picture would tell an operator less.
 
 import { known } from "./format.js";
 import { elsewhere } from "./health.js";
@@ -8,24 +8,24 @@ import { metresPerDegree, wrapDegrees } from "./trails.js";
 export class LastKnown {
   constructor() {
     this.beams = new Map(); // by UAV: {beam, at}
-    this.picture = null; // {uav, pattern, weights, patternBeams, at} of the beam that was looked at
-    this.first = null; // where a UAV was first seen
+    this.picture = null; // {uav, pattern, weights, patternBeams, at} of the beam that was shown
+    this.first = null; // first known position of a UAV
   }
 
-  /** The place that UAVs are seen from: the carrier's; where a UAV was first, while none is known. */
+  /** Centre of the view: the carrier; a UAV's first position while the carrier's is unknown. */
   middle(carrier, uavs) {
     this.first ??= uavs.find(({ lat_deg: lat }) => known(lat)) ?? null;
     return carrier?.unseen ? this.first : carrier;
   }
 
-  /** Take in what is true at `at`. */
+  /** Store the state at `at`. */
   note({ uavs, beams, answer, pattern, weights, patternBeams }, uav, at) {
     const present = new Set(uavs.map(({ id }) => id));
     for (const id of this.beams.keys()) if (!present.has(id)) this.beams.delete(id);
     for (const beam of beams) this.beams.set(beam.uav, { beam, at });
     if (answer?.array) this.array = answer.array;
     if (uav !== null && pattern?.patterns.some((one) => one.uav === uav)) {
-      // Weights are asked for less often: those of the same beam stay until there are others.
+      // Weights are requested less often: those of the same beam are kept until new ones arrive.
       const before = this.picture?.uav === uav ? this.picture.weights : null;
       const has = weights?.uavs?.includes(uav);
       this.picture = { uav, pattern, weights: has ? weights : before, patternBeams, at };
@@ -33,8 +33,8 @@ export class LastKnown {
   }
 
   /**
-   * The present beams, and after them the last ones of UAVs that have none, with their age; of one
-   * that another node serves now there is none to be missed.
+   * The present beams, then the last beams of UAVs without one, with their age; except of UAVs that
+   * another node serves now.
    */
   beamsOf(uavs, beams, now) {
     const fresh = new Set(beams.map(({ uav }) => uav));
@@ -48,14 +48,14 @@ export class LastKnown {
 }
 
 /**
- * Where the carrier is, or was: `{lat_deg, lon_deg, heading_deg, ageS, unfit}`; null without news.
- * `ageS` is null while that is true; `unfit` says what is wrong with it; `unseen`: it never was
- * known.
+ * Position of the carrier, present or last: `{lat_deg, lon_deg, heading_deg, ageS, unfit}`; null
+ * without a status. `ageS` is null for the present one; `unfit` is the reason why it is unknown;
+ * `unseen`: it was never known.
  */
 export function carrierOf(status) {
   const center = status?.center;
   if (!center) return null;
-  // Where this machine does not keep up, that is why its news of the carrier is old.
+  // If this machine is overloaded, that is why its data of the carrier are old.
   const unfit = status.health?.behind ?? center.unfit;
   const last = known(center.lat_deg) ? center : center.last_known;
   if (!last) return { unfit, unseen: true };
@@ -63,7 +63,7 @@ export function carrierOf(status) {
   return { ...last, ageS, unfit };
 }
 
-/** A UAV with its offset from where the carrier was last, where it has none from where it is. */
+/** A UAV with its offset from the carrier's last position, if the present one is unknown. */
 export function placedBy(uav, carrier) {
   if (known(uav.north_m) || !known(uav.lat_deg) || !known(carrier?.lat_deg)) return uav;
   const scale = metresPerDegree(carrier.lat_deg);

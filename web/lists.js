@@ -24,7 +24,7 @@ function linkLevel(link) {
   return format.known(link.age_s) && link.age_s > 3.5 ? "warn" : "good";
 }
 
-/** A link and its counts; `level` shows by a mark as well as by colour. */
+/** A link and its counts; `level` has a mark as well as a colour. */
 function linkItem(link) {
   const quiet = link.state === "up" && linkLevel(link) === "warn"
     ? ` · silent ${format.duration(link.age_s)}` : "";
@@ -35,7 +35,7 @@ function linkItem(link) {
   ));
   const heard = (link.components ?? []).map((one) => one.id).join(" ");
   const item = make("li", {}, head, make("dl", { class: "link-facts" }, ...facts));
-  if (heard) item.append(make("p", { class: "muted" }, `hears ${heard}`));
+  if (heard) item.append(make("p", { class: "muted" }, `receives ${heard}`));
   return item;
 }
 
@@ -50,7 +50,7 @@ function eventItem({ at, severity, text }) {
     make("time", { datetime: at }, format.timeOfDay(at)), make("span", {}, text));
 }
 
-/** The newest first. */
+/** Newest first. */
 export function showEvents(answer) {
   const events = (answer?.events ?? []).slice(-EVENTS_SHOWN).reverse();
   setChildren($("events"), events.length ? events : answer !== null, () => (events.length
@@ -68,14 +68,14 @@ function recordingItem({ name, bytes, state }) {
   return make("li", {}, link, make("span", {}, [format.bytes(bytes), state].join(" · ")));
 }
 
-/** A link brings no token, so what needs one is fetched first and then handed over. */
+/** A plain link sends no token, so a file that needs one is fetched first and then saved. */
 async function download(href, name) {
   const response = await authorised(href);
   if (!response.ok) return;
   save(await response.blob(), name);
 }
 
-/** Nothing at all where the service does not offer them. */
+/** Hidden if the service has none. */
 export function showRecordings(answer) {
   const recordings = answer?.recordings ?? null;
   $("recordings-panel").hidden = !recordings?.length;

@@ -1,5 +1,5 @@
-// Wires the page: what is polled goes into the history, and from there, or from minutes ago, to
-// the plan view, the table, the pictures and the lists.
+// Main module of the page: stores answers in the history, and shows the present or a past moment in
+// the plan view, the table, the charts and the lists.
 
 import { askOnce, connection, startPolling } from "./api.js";
 import { Charts } from "./charts.js";
@@ -27,9 +27,9 @@ import { setUpTheme } from "./theme.js";
 import { TimeBar } from "./timebar.js";
 import { setUpUnits } from "./units.js";
 
-const LOOK_MS = 250; // how often the connection is looked at, answers or not
-const AGES_MS = 900; // without an answer for so long, ages are counted on all the same
-const GATHER_MS = 120; // answers of one beat come together: they are shown together
+const LOOK_MS = 250; // interval of checks of the connection
+const AGES_MS = 900; // time without an answer after which displayed ages are updated anyway
+const GATHER_MS = 120; // answers of one beat are collected and shown together
 const SAME_BEAT_MS = 400;
 const STATE_ORDER = ["live", "coasting", "stale", "lost"];
 const COLLATOR = new Intl.Collator("en", { numeric: true });
@@ -37,9 +37,9 @@ const KEPT = ["beams", "pattern", "weights", "links", "events", "status", "fleet
 
 let selected = null;
 let faulted = false;
-let isFilled = false; // whether the charts have what was before
-let gathering = null; // the timer of a refresh that is about to come
-let shown = { at: -Infinity, healths: "" }; // when all was last shown, and what was known then
+let isFilled = false; // whether the charts have the samples from before
+let gathering = null; // timer of the next refresh
+let shown = { at: -Infinity, healths: "" }; // time of the last refresh, and the feeds' state then
 
 const history = new History();
 const last = new LastKnown();
@@ -57,15 +57,15 @@ const feeds = startPolling(() => ({
   beamed: beamedUav(feeds.beams.data), inFleet: Boolean(feeds.status.data?.node),
 }), take);
 
-// --- what is shown -----------------------------------------------------------------------------
+// --- display -----------------------------------------------------------------------------------
 
-/** The UAV whose beam is looked at closely: the chosen one, or else the first that has a beam. */
+/** The UAV whose beam is shown in detail: the selected one, or else the first with a beam. */
 function beamedUav(answer) {
   const ids = (answer?.beams ?? []).map((beam) => beam.uav).sort(COLLATOR.compare);
   return ids.includes(selected) ? selected : ids[0] ?? null;
 }
 
-/** What is known now, as the history keeps it; what is no longer true is left out. */
+/** The present moment for the history, without outdated answers. */
 function presentMoment(now) {
   const answers = Object.fromEntries(
     KEPT.map((name) => [name, feeds[name].isTrusted(now) ? feeds[name].data : null]),
@@ -82,7 +82,7 @@ function presentMoment(now) {
   };
 }
 
-/** The beams at the time of the pattern: of two answers the nearer one. */
+/** The answer with beams that is nearest to the time of the pattern. */
 function beamsAt(stamp) {
   const time = Date.parse(stamp);
   const answers = [feeds.beams.data, ...history.moments.slice(-3).map((moment) => moment.answer)];
@@ -91,7 +91,7 @@ function beamsAt(stamp) {
     .reduce((best, one) => (best && distance(best) <= distance(one) ? best : one), null);
 }
 
-/** The charts begin with what the service kept of the minutes before this page was opened. */
+/** Fill the charts with the service's samples from before this page was opened. */
 async function fillCharts() {
   isFilled = true;
   loadMeanings().then(() => {
@@ -102,7 +102,7 @@ async function fillCharts() {
   if (Array.isArray(answer?.at)) charts.fill(answer, performance.now());
 }
 
-/** An answer came. UAVs and beams of one beat make a moment of the history. */
+/** Process an answer. UAVs and beams of one beat are a moment of the history. */
 function take(name) {
   if (name === "uavs" && !isFilled) fillCharts();
   const now = performance.now();
@@ -117,7 +117,7 @@ function take(name) {
   gathering ??= setTimeout(refresh, GATHER_MS);
 }
 
-/** Mark what stands on an answer that is late, or no longer true. The past was true in its time. */
+/** Mark values of late or outdated answers. A past moment is never outdated. */
 function markAges(now, all = false) {
   const root = document.documentElement;
   for (const feed of Object.values(feeds)) {
@@ -128,7 +128,7 @@ function markAges(now, all = false) {
   }
 }
 
-/** How it stands with every feed: what has changed is shown at once, though nothing came. */
+/** States of all feeds: a change is shown at once, even without an answer. */
 const healthsAt = (now) => Object.values(feeds).map((feed) => feed.health(now)).join()
   + connection(feeds, now).state;
 
@@ -137,7 +137,7 @@ function look() {
   if (now - shown.at > AGES_MS || healthsAt(now) !== shown.healths) refresh();
 }
 
-/** Show everything anew. Should that fail, say so: a page that stood still would look live. */
+/** Refresh everything. A failure is displayed, as a frozen page would look live. */
 function refresh() {
   clearTimeout(gathering);
   gathering = null;
@@ -151,7 +151,7 @@ function refresh() {
   } catch (error) {
     showFault(error);
     markAges(now, true);
-    if (!faulted) console.error(error); // once, not ten times a second
+    if (!faulted) console.error(error); // once, not at every refresh
     faulted = true;
   }
 }
@@ -177,14 +177,14 @@ function showAll(link, now) {
   nameThePage(view, link);
 }
 
-/** The newest answers, true or not: what is not true any more is marked, not hidden. */
+/** The newest answers; outdated ones are marked, not hidden. */
 function liveView(now) {
   const answers = Object.fromEntries(KEPT.map((name) => [name, feeds[name].data]));
   const view = { ...presentMoment(now), ...answers, answer: answers.beams };
   return { ...view, beams: last.beamsOf(view.uavs, answers.beams?.beams ?? [], now) };
 }
 
-/** Whether what stands on a feed may look true: what is past was true in its time. */
+/** Whether the values of a feed are shown as valid; those of a past moment always are. */
 function believed(feed, link, now) {
   return !timebar.isLive || (link.state !== "lost" && feed.isTrusted(now));
 }
@@ -210,7 +210,7 @@ function showMoment(view, link, now) {
   drawer.show(view, timebar.isLive, now);
 }
 
-/** One beam closely; while there is none, the last one, grey. */
+/** Details of one beam; without one, the last beam in grey. */
 function showFocus(view, link, now) {
   const uav = beamedUav(view.answer);
   const isOld = uav === null && timebar.isLive && last.picture !== null;
@@ -233,19 +233,19 @@ function showCount(uavs) {
     : "Nothing received yet.");
 }
 
-/** What the plan view says of itself when it must not be believed; nothing while it is live. */
+/** Message in the plan view while it is not live; empty while it is. */
 function planMessage(view, link, now) {
   if (!timebar.isLive) {
     return `NOT LIVE – ${format.duration((now - timebar.shown.at) / 1000)} ago`;
   }
   if (link.never) return "NOT LIVE – no connection";
   if (link.state === "lost") return "NOT LIVE – connection lost";
-  if (link.state === "token") return "NOT LIVE – token asked for";
+  if (link.state === "token") return "NOT LIVE – token needed";
   if (feeds.uavs.health(now) === "frozen") return "NOT LIVE – estimates stopped";
-  if (feeds.uavs.health(now) === "lost") return "NOT LIVE – no answer about UAVs";
+  if (feeds.uavs.health(now) === "lost") return "NOT LIVE – no answer for UAVs";
   const { unfit, ageS } = view.carrier ?? {};
   if (!unfit) return "";
-  return format.known(ageS) ? `${unfit}: carrier and beams as ${format.duration(ageS)} ago` : unfit;
+  return format.known(ageS) ? `${unfit}: carrier and beams from ${format.duration(ageS)} ago` : unfit;
 }
 
 function showPlan(view, link, now) {
@@ -268,7 +268,7 @@ function showPlan(view, link, now) {
   }, now);
 }
 
-/** The tab's title and the picture's name tell the state to whoever does not see the page. */
+/** Set the tab's title and the picture's name to the state, also for screen readers. */
 function nameThePage({ uavs, beams, status }, link) {
   const trouble = { lost: "CONNECTION LOST", partial: "CONNECTION FAILING", token: "TOKEN", frozen: "STOPPED" };
   const state = trouble[link.state] ?? (timebar.isLive ? "" : "PAUSED");
@@ -276,14 +276,14 @@ function nameThePage({ uavs, beams, status }, link) {
   const title = [state || headlineOf(uavs).text, status?.node, "companion"].filter(Boolean)
     .join(" · ");
   if (document.title !== title) document.title = title;
-  const name = `${plan.space ? "View in space" : "Plan view"}: ${uavs.length} UAVs, ${beams.length} beams`
+  const name = `${plan.space ? "3D view" : "Plan view"}: ${uavs.length} UAVs, ${beams.length} beams`
     + (state ? `, not live: ${state.toLowerCase()}` : "");
   if ($("plan").getAttribute("aria-label") !== name) $("plan").setAttribute("aria-label", name);
 }
 
 // --- controls -----------------------------------------------------------------------------------
 
-/** Choose a UAV, or none by choosing it again. */
+/** Select a UAV; selecting it again deselects it. */
 function choose(id) {
   selected = id === selected ? null : id;
   feeds.pattern.wake();
@@ -291,7 +291,7 @@ function choose(id) {
   refresh();
 }
 
-/** Choose with the pointer: the UAV's drawer opens, or closes where it is chosen no more. */
+/** Select with the pointer: opens the UAV's drawer, or closes it if it is deselected. */
 function pick(id) {
   choose(id);
   if (selected === null) drawer.close();
@@ -328,10 +328,10 @@ function control(action) {
 const zoomIn = () => control(() => plan.zoom(1));
 const zoomOut = () => control(() => plan.zoom(-1));
 const fitAll = () => control(() => plan.fitAll());
-const TURN_PX = 40; // of the view in space, by a key
+const TURN_PX = 40; // rotation of the 3D view by a key, as pixels of a drag
 const turn = (dx, dy) => control(() => plan.turn(dx * TURN_PX, dy * TURN_PX));
 
-/** From above, or in space; what draws the latter is loaded when it is first asked for. */
+/** Switch between plan and 3D view; the 3D code is loaded on first use. */
 async function toggleSpace() {
   if (plan.space) {
     plan.lookFrom(null);
@@ -363,7 +363,7 @@ $("save-png").addEventListener("click", () => {
   $("plan").toBlob((blob) => blob && save(blob, fileName(view, "png")));
 });
 
-// Where there is little room, the symbols are folded until they are asked for.
+// On small screens the legend is folded.
 if (window.matchMedia("(max-width: 1180px)").matches) $("legend").removeAttribute("open");
 
 const toggleTheme = setUpTheme($("theme"), () => {

@@ -1,10 +1,10 @@
-// What the service calls its values and what they mean (/v1/labels): this page keeps no copy.
+// Labels and meanings of values, from the service (/v1/labels); this page has no copy.
 
 import { askOnce } from "./api.js";
 
 let known = { values: {}, enumerations: {} };
 
-/** Ask the service once; until it has answered, and if it does not, a value's name is its label. */
+/** Request them once; without an answer a value's name is its label. */
 export async function loadMeanings() {
   const answer = await askOnce("/v1/labels");
   if (!answer?.values || !answer.enumerations) return;
@@ -24,8 +24,8 @@ export function learn(answer) {
 /** Short name of a value of a class, such as ("UavState", "age_s"). */
 export const labelOf = (of, name) => known.values[of]?.[name]?.label ?? name.replaceAll("_", " ");
 
-/** What it means, for the pointer. */
+/** Its meaning, for the tooltip. */
 export const meaningOf = (of, name) => known.values[of]?.[name]?.meaning ?? "";
 
-/** What one value of an enumeration means, such as ("Reason", "frozen"). */
+/** Meaning of one value of an enumeration, such as ("Reason", "frozen"). */
 export const meaningOfWord = (enumeration, word) => known.enumerations[enumeration]?.[word] ?? "";

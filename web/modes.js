@@ -1,4 +1,4 @@
-// Flight modes by name, of the autopilots that number them: ArduPilot by kind of vehicle, and PX4.
+// Names of flight modes: ArduPilot by kind of vehicle, and PX4.
 
 const COPTER = { 0: "Stabilize", 1: "Acro", 2: "AltHold", 3: "Auto", 4: "Guided", 5: "Loiter",
   6: "RTL", 7: "Circle", 9: "Land", 11: "Drift", 13: "Sport", 16: "PosHold", 17: "Brake",
@@ -20,7 +20,7 @@ function nameOf({ autopilot, mavtype, custom_mode: mode }) {
   return (mavtype?.type === "MAV_TYPE_FIXED_WING" ? PLANE : COPTER)[mode];
 }
 
-/** The mode in words, and whether it is armed; null where no HEARTBEAT was heard. */
+/** The name of the mode, and whether it is armed; null without a HEARTBEAT. */
 export function modeOf(heartbeat) {
   if (!heartbeat) return null;
   const mode = nameOf(heartbeat) ?? `mode ${heartbeat.custom_mode}`;

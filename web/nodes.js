@@ -6,7 +6,7 @@ const SIZE_PX = 6;
 const EDGE_PX = 16;
 const COLOURS = { there: "text", silent: "stale", aside: "bad" };
 
-/** A thin line from each node to each UAV that it serves: no beam of this array. */
+/** A thin line from each other node to each UAV that it serves. */
 export function drawServing(view, uavs) {
   const { context, scene } = view;
   const places = new Map((scene.nodes ?? []).map((one) => [one.node, one]));
@@ -24,7 +24,7 @@ export function drawServing(view, uavs) {
   context.setLineDash([]);
 }
 
-/** A diamond for each node. Returns where each is, and what is to be written beside it. */
+/** A diamond for each node. Returns the position of each, and its label. */
 export function drawNodes(view) {
   return (view.scene.nodes ?? []).map((node) => drawNode(view, node));
 }
@@ -50,7 +50,7 @@ function drawNode(view, node) {
   return { x, y, text, colour: colour === "text" ? "muted" : colour };
 }
 
-/** Where its mark is: of one outside the picture at the edge, in its direction. */
+/** Position of its mark; for a node outside the picture at the edge, in its direction. */
 function placeOf(view, node) {
   const [x, y] = view.at(node.north_m, node.east_m);
   const [middleX, middleY] = [view.width / 2, view.height / 2];

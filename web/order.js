@@ -1,10 +1,10 @@
-// Which UAVs the table shows, and in which order: the worst link first unless a column is chosen.
+// Filter and order of the table: the worst link first, unless a column is selected.
 
 import { $ } from "./dom.js";
 import { known } from "./format.js";
 import { byId, worstFirst } from "./health.js";
 
-const FEW = 6; // up to so many are seen at once: there is nothing to search
+const FEW = 6; // number of UAVs up to which no search is needed
 
 export class Order {
   constructor(head, columns, onChange) {
@@ -12,7 +12,7 @@ export class Order {
     head.addEventListener("click", (event) => {
       const key = event.target.closest("button")?.closest("th")?.dataset.key;
       if (!key) return;
-      // Up, down, and back to the worst first.
+      // Ascending, descending, then back to the worst first.
       if (this.key !== key) [this.key, this.falls] = [key, false];
       else if (!this.falls) this.falls = true;
       else this.key = null;
@@ -29,7 +29,7 @@ export class Order {
     }
   }
 
-  /** The UAVs to show; `beams` by UAV. What is not known comes last, whichever way it is sorted. */
+  /** The UAVs to show; `beams` by UAV. Unknown values come last in either order. */
   arrange(uavs, beams) {
     $("find").hidden = uavs.length <= FEW;
     const wanted = $("search").value.trim().toLowerCase();

@@ -1,4 +1,4 @@
-// Everything that is words: the header, the banner, the side panels.
+// The header, the banner and the side panels.
 
 import { $, setAttribute, setPairs, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
@@ -17,14 +17,14 @@ function setNotice(element, text) {
 // --- connection ---------------------------------------------------------------------------------
 
 const CHIPS = {
-  waiting: ["wait", "reaching the service…"],
-  live: ["good", "service answers"],
-  late: ["warn", "service answers late"],
-  partial: ["bad", "service fails in part"],
+  waiting: ["wait", "connecting…"],
+  live: ["good", "connected"],
+  late: ["warn", "answers are late"],
+  partial: ["bad", "some requests fail"],
   frozen: ["bad", "estimates stopped"],
-  token: ["warn", "asks for a token"],
-  lost: ["bad", "connection to the service lost"],
-  never: ["bad", "service not reached"],
+  token: ["warn", "token needed"],
+  lost: ["bad", "connection lost"],
+  never: ["bad", "not connected"],
 };
 
 function bannerText(link, lastStamp, behind) {
@@ -32,16 +32,15 @@ function bannerText(link, lastStamp, behind) {
   switch (link.state) {
     case "lost":
       return link.never
-        ? ["No connection", `Nothing received from the service yet (${link.problem}). `
-          + "Still trying."]
-        : ["CONNECTION LOST", `Nothing received for ${since} (${link.problem}). What is shown is `
-          + `from ${lastStamp} and is no longer true. Still trying.`];
+        ? ["No connection", `No answer from the service yet (${link.problem}). Retrying.`]
+        : ["CONNECTION LOST", `No answer for ${since} (${link.problem}). All values are from `
+          + `${lastStamp} and outdated. Retrying.`];
     case "partial":
-      return ["CONNECTION FAILING", `No answer about ${link.what} (${behind ?? link.problem}): struck values `
-        + "are no longer true. Still trying."];
+      return ["CONNECTION FAILING", `No answer for ${link.what} (${behind ?? link.problem}). `
+        + "Struck-through values are outdated. Retrying."];
     case "frozen":
-      return ["ESTIMATES STOPPED", `The service answers, but its time stands still at ${lastStamp} `
-        + `(${link.what}): struck values are no longer true.`];
+      return ["ESTIMATES STOPPED", `The service answers, but its time has stopped at ${lastStamp} `
+        + `(${link.what}). Struck-through values are outdated.`];
     default:
       return null;
   }
@@ -53,13 +52,13 @@ function showBanner(title, detail) {
   setText($("banner-detail"), detail);
 }
 
-/** This page itself has failed: what it shows cannot be relied on. */
+/** Report a defect of this page, whose values are then unreliable. */
 export function showFault(error) {
-  showBanner("DISPLAY FAULT", `This page could not show what the service sent (${error.message}). `
-    + "Struck values are no longer true; reload the page.");
+  showBanner("DISPLAY FAULT", `This page could not display an answer (${error.message}). `
+    + "Struck-through values are outdated; reload the page.");
 }
 
-/** `behind`: that this machine does not keep up, in words, where that is so: then it is the cause. */
+/** `behind`: text if this machine is overloaded, which is then the cause; else null. */
 export function showConnection(link, lastStamp, behind = null) {
   setChip($("connection"), ...CHIPS[link.never ? "never" : link.state]);
   const text = bannerText(link, format.clock(lastStamp), behind);
@@ -110,9 +109,9 @@ function showRecording(recording) {
   setText(element, parts.join(" · "));
 }
 
-const LAG_WARN_S = 0.5; // as the service has it for being behind
+const LAG_WARN_S = 0.5; // the service's limit for being overloaded
 
-/** How far behind the machine is: of no interest until beams are aimed by news that is too old. */
+/** Delay of frames; marked only if beams would use data that are too old. */
 function showLag(lag) {
   const element = $("lag");
   const late = format.known(lag?.max_s) && lag.max_s > LAG_WARN_S;
@@ -120,7 +119,7 @@ function showLag(lag) {
   setText(element, format.milliseconds(lag?.max_s));
 }
 
-/** Whose past this is, where it is one: nobody may take a replay for the air. */
+/** Show that this is a replay, so that it is not mistaken for a live flight. */
 function showReplay(replay) {
   const element = $("replay");
   element.hidden = !replay;
@@ -131,14 +130,14 @@ function showReplay(replay) {
   setChip(element, "warn", `replay ${replay.log} · ${Math.round(replay.at_s)}${of} s · ${how}`);
 }
 
-/** Counts by reason, and when this page last saw each of them rise. */
+/** Counts by reason, and the time at which each last rose. */
 export class Rejections {
   constructor() {
     this.seen = new Map();
     this.isFirst = true;
   }
 
-  /** The newest counts; what was there when the page was opened has no known time. */
+  /** Store the newest counts; those from before the page was opened have no time. */
   note(rejected, now) {
     for (const [reason, total] of Object.entries(rejected)) {
       if (this.seen.get(reason)?.total === total) continue;
@@ -147,7 +146,7 @@ export class Rejections {
     this.isFirst = false;
   }
 
-  /** The counts of the moment `at`, which may be past: what rose after it is not told of. */
+  /** Show the counts at the moment `at`, which may be past; later rises are omitted. */
   show(rejected, at) {
     const pairs = Object.entries(rejected ?? {})
       .sort(([, a], [, b]) => b - a)
@@ -167,7 +166,7 @@ function ago(seconds) {
   return `${format.duration(seconds < 60 ? Math.floor(seconds / 5) * 5 : seconds)} ago`;
 }
 
-/** `status` is null where it is not known: nothing of another moment may stand there then. */
+/** `status` is null if unknown; then no values of another moment may remain. */
 export function showStatus(status) {
   setText($("version"), status ? `v${status.version}` : "");
   setText($("uptime"), format.duration(status?.uptime_s));
@@ -204,8 +203,8 @@ export function showBeams(answer) {
     `lead ${format.milliseconds(format.known(answer.lead_ms) ? answer.lead_ms / 1000 : null)}`,
   ].join(" · ") : format.UNKNOWN);
   setNotice($("beams-warning"), regularised
-    ? "Nulls are not exact: each is held back where it would cost another beam more of the gain "
-      + "that is sure than [beams] loss_limit_db." : "");
+    ? "Nulls are not exact: exact ones would reduce a beam's guaranteed gain by more than "
+      + "[beams] loss_limit_db." : "");
 }
 
 function conditionNumber(value) {

@@ -1,5 +1,5 @@
-// The polar pattern of one beam, in dB over the azimuth from boresight: where its UAV is, where
-// the beam was sent, and where it truly points.
+// The polar pattern of one beam, in dB over the azimuth from boresight, with three directions: its
+// UAV, the commanded direction, and the actual peak.
 
 import * as format from "./format.js";
 import { Surface } from "./surface.js";
@@ -11,7 +11,7 @@ const RING_DB = 10;
 const COLOURS = ["plan", "grid", "gridtext", "text", "muted", "stale", "beam", "live", "coast",
   "bore"];
 
-/** Pixels from the middle for a response; below the floor is the middle. */
+/** Distance from the centre for a response, in pixels; 0 below the floor. */
 const radius = (view, valueDb, topDb) =>
   view.outerPx * Math.max(0, Math.min(1, 1 - (topDb - valueDb) / SPAN_DB));
 
@@ -51,7 +51,7 @@ function drawRingNames(view, topDb) {
   }
 }
 
-/** The half-power width as a wedge about the true peak. */
+/** The half-power width as a wedge around the actual peak. */
 function drawWidth(view, entry, colour) {
   const widthDeg = entry.half_power_beamwidth_deg;
   if (!format.known(widthDeg)) return;
@@ -83,7 +83,7 @@ function drawResponse(view, { angles_deg: angles }, entry, topDb, colour) {
   context.stroke();
 }
 
-/** Three directions that lie close together where all is well: each has its own shape. */
+/** Three directions, normally close together, so each has its own shape. */
 function drawDirections(view, entry, beam) {
   const { context, outerPx } = view;
   context.lineWidth = 2;
@@ -128,7 +128,7 @@ function draw(view, { answer, entry, beam, trusted, none }) {
 
 export const makePattern = (canvas) => new Surface(canvas, COLOURS, draw);
 
-/** The directions in words, for who cannot see them apart, or at all. */
+/** The directions as text. */
 export function directionFacts(entry, beam) {
   return [
     ["target", format.signedDegrees(beam?.azimuth_deg)],

@@ -1,4 +1,4 @@
-// The plan view: the carrier in the middle, north up, metres to scale.
+// The plan view: the carrier at the centre, north up, to scale.
 
 import { drawCompass, drawRingLabels, drawRings } from "./backdrop.js";
 import * as format from "./format.js";
@@ -12,10 +12,10 @@ import { fixesOf, trailOf } from "./trails.js";
 import { drawBeams, withAlpha } from "./wedges.js";
 
 const RADIANS = Math.PI / 180;
-const MARGIN_PX = 30; // room for the compass outside the outermost ring
-const GAP_MS = 2500; // a trail is not drawn through a hole in what was received
+const MARGIN_PX = 30; // space for the compass outside the outermost ring
+const GAP_MS = 2500; // no trail across a longer gap
 
-/** What tells one scene from another, beside its answers' contents. */
+/** Parts of a scene that identify it, in addition to its answers. */
 const KEYS = ["answers", "uavsLive", "beamsLive", "message", "isPast", "selected", "at"];
 
 const COLOURS = [
@@ -29,13 +29,13 @@ export class PlanView {
     this.scene = { uavs: [], beams: [], array: null, selected: null, uavsLive: false };
     this.scale = new Scale();
     this.queued = false;
-    this.fault = null; // why it could not be drawn last time
+    this.fault = null; // error of the last drawing
     this.hits = [];
     new ResizeObserver(() => this.resize()).observe(canvas);
-    this.pan = [0, 0]; // where the carrier is, pixels off the middle
-    this.ground = null; // a map beneath, which is moved along
-    this.followed = null; // the UAV that is kept in the middle
-    this.space = null; // the onlooker, where all is drawn in space instead
+    this.pan = [0, 0]; // offset of the carrier from the centre, pixels
+    this.ground = null; // the map underneath, which moves along
+    this.followed = null; // the UAV that is kept at the centre
+    this.space = null; // the 3D view, if active
     setUpGestures(canvas, {
       pan: (dx, dy) => this.drag(dx, dy),
       zoom: (steps) => this.zoom(steps),
@@ -66,21 +66,21 @@ export class PlanView {
     this.redraw();
   }
 
-  /** `scene.answers` tells one answer from the next: what is the same is not drawn again. */
+  /** `scene.answers` identifies the answers: an unchanged scene is not drawn again. */
   show(scene, now) {
     const key = JSON.stringify(KEYS.map((name) => scene[name]));
     const isSame = scene.answers !== undefined && key === this.shown;
     Object.assign(this, { scene, shown: key });
-    // Neither one that flew off long ago nor passing traffic may make those with a beam small.
+    // Neither lost UAVs nor other traffic may shrink the view of those with a beam.
     const shown = scene.uavs.filter((uav) => placed(uav) && uav.state !== "lost");
     const targets = shown.filter((uav) => uav.target !== false);
     this.scale.follow((targets.length ? targets : shown)
       .map((uav) => Math.hypot(uav.north_m, uav.east_m)), now);
     if (!isSame || this.scale.isMoving || this.fault) this.redraw();
-    if (this.fault) throw this.fault; // to whom shows it: a frame's own errors are heard by nobody
+    if (this.fault) throw this.fault; // so that the page reports it: errors in a frame are not caught
   }
 
-  /** About the middle of the picture. */
+  /** Zoom around the centre of the picture. */
   zoom(steps) {
     const [beforeM] = this.scale.rings;
     this.scale.zoom(steps);
@@ -101,7 +101,7 @@ export class PlanView {
     this.onMove();
   }
 
-  /** Draw in space, as an onlooker sees it; null: from above. */
+  /** Switch to a 3D view; null: plan view. */
   lookFrom(space) {
     this.space = space;
     this.pan = [0, 0];
@@ -109,13 +109,13 @@ export class PlanView {
     this.onMove();
   }
 
-  /** Go round the scene as by a drag of so many pixels; nothing where it is seen from above. */
+  /** Rotate the 3D view as by a drag of this many pixels; no effect in the plan view. */
   turn(dx, dy) {
     this.space?.turn(dx, dy);
     this.redraw();
   }
 
-  /** Keep a UAV in the middle; null: the carrier. */
+  /** Keep a UAV at the centre; null: the carrier. */
   follow(id) {
     this.followed = id;
     this.pan = [0, 0];
@@ -203,7 +203,7 @@ export class PlanView {
     return ofState === stale ? stale : { weak: warn, none: bad }[uav.verdict] ?? ofState;
   }
 
-  /** Thick where reports held it up, thin where it is an estimate alone. */
+  /** Thick where based on reports, thin where only predicted. */
   drawTrail(uav) {
     if (!format.known(uav.lat_deg)) return;
     const { context } = this;
@@ -224,7 +224,7 @@ export class PlanView {
     context.globalAlpha = 1;
   }
 
-  /** What was reported, beside what is taken to be so now. */
+  /** Reported positions, in addition to the estimate. */
   drawFixes(uav) {
     if (!format.known(uav.lat_deg)) return;
     const { context } = this;
@@ -243,7 +243,7 @@ export class PlanView {
     context.globalAlpha = 1;
   }
 
-  /** From point to point as it was flown: the curve has the velocities at both ends (Hermite). */
+  /** Curve between two points with the velocities at both ends (Hermite). */
   curveTo(older, newer) {
     const to = this.at(newer.north, newer.east);
     if (!older.velocity || !newer.velocity) {
@@ -267,7 +267,7 @@ export class PlanView {
     context.ellipse(
       ...this.at(uav.north_m, uav.east_m), radiusPx, radiusPx, 0, 0, 2 * Math.PI,
     );
-    // One as large as the picture says it by its rim: several would cover all else.
+    // A bound as large as the picture is not filled, as several would cover everything else.
     if (radiusPx < this.outerPx) {
       context.fillStyle = withAlpha(this.colourOf(uav), 0.1);
       context.fill();
@@ -302,17 +302,17 @@ export class PlanView {
     context.fillRect(align === "center" ? x - widthPx / 2 : x, y, widthPx, 1.4);
   }
 
-  /** What must not be overlooked, across the middle of the picture. */
+  /** A prominent message across the picture. */
   drawMessage() {
     const { message: text, uavsLive, isPast } = this.scene;
     if (!text) return;
-    const isQuiet = uavsLive && !isPast; // the UAVs are true: no more than a word about the carrier
+    const isQuiet = uavsLive && !isPast; // the UAVs are valid: only a small message on the carrier
     const { context } = this;
     const size = this.width < 500 ? 16 : isQuiet ? 17 : 22;
     const x = this.width / 2;
     const y = this.height / 2 + this.outerPx * 0.42;
     const fits = this.measure(text, size, 700) + 36 <= this.width;
-    const lines = fits ? [text] : text.split(/(?<=:) /); // the cause, and how old that is
+    const lines = fits ? [text] : text.split(/(?<=:) /); // the cause, and the age
     const widthPx = Math.max(...lines.map((line) => this.measure(line, size, 700))) + 36;
     const heightPx = size * (0.8 + 1.2 * lines.length);
     const top = isQuiet ? this.height - heightPx : y - heightPx / 2;

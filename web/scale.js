@@ -1,4 +1,4 @@
-// The scale of the plan view: how many metres the outermost ring stands for, and when that changes.
+// The scale of the plan view: the radius of the outermost ring in metres, and when it changes.
 
 import { units } from "./units.js";
 
@@ -7,7 +7,7 @@ const ROUND = [0, 1, 2, 3, 4, 5, 6].flatMap((power) => [
   [1, 0.25], [1.5, 0.5], [2, 0.5], [3, 1], [4, 1], [5, 1], [6, 2], [8, 2],
 ].map(([radius, step]) => [radius * 10 ** power, step * 10 ** power]));
 
-/** Both in metres, round in the units that are used: 50 m … 800 km, 200 ft … 400 nmi. */
+/** Both in metres, round in the selected units: 50 m … 800 km, 200 ft … 400 nmi. */
 function scalesIn({ metres, far }) {
   const near = ROUND.map((pair) => pair.map((value) => value * metres))
     .filter(([radiusM]) => radiusM >= 50 && radiusM < far.metres);
@@ -16,14 +16,14 @@ function scalesIn({ metres, far }) {
   return [...near, ...long];
 }
 
-const SHRINK_AFTER_MS = 4000; // do not zoom in again at once: the picture would breathe
+const SHRINK_AFTER_MS = 4000; // delay before zooming in again, so that the scale does not oscillate
 
 export class Scale {
   constructor() {
     this.scales = scalesIn(units.length);
-    this.fit = true; // follow the UAVs; false once the operator has chosen
+    this.fit = true; // fit the UAVs; false after the operator has zoomed
     this.level = this.scales.findIndex(([radius]) => radius >= 200);
-    [this.radiusM] = this.scales[this.level]; // what is drawn: follows the level, eased
+    [this.radiusM] = this.scales[this.level]; // the drawn radius, which approaches that of the level
     this.roomyAt = null;
     this.everFitted = false;
     this.stillness = window.matchMedia("(prefers-reduced-motion: reduce)");
@@ -34,7 +34,7 @@ export class Scale {
     return this.scales[this.level];
   }
 
-  /** Rings that are round in the units that are used now, hardly another picture. */
+  /** Select rings that are round in the new units, at nearly the same scale. */
   changeUnits() {
     const [radiusM] = this.rings;
     this.scales = scalesIn(units.length);
@@ -42,7 +42,7 @@ export class Scale {
     this.level = level < 0 ? this.scales.length - 1 : level;
   }
 
-  /** Hold these ranges, metres: wider at once, narrower only after a while. */
+  /** Fit these ranges, metres: zoom out at once, zoom in only after a while. */
   follow(rangesM, now) {
     if (!this.fit || !rangesM.length) return;
     const needM = Math.max(...rangesM) * 1.06;
@@ -63,7 +63,7 @@ export class Scale {
     this.level = Math.max(0, Math.min(this.scales.length - 1, this.level - steps));
   }
 
-  /** Follow the UAVs again; asked for, so it narrows at once. */
+  /** Fit the UAVs again; on request, so zoom in at once. */
   fitAll() {
     this.fit = true;
     this.roomyAt = -Infinity;
@@ -73,7 +73,7 @@ export class Scale {
     return this.radiusM !== this.scales[this.level][0];
   }
 
-  /** Move what is drawn towards what is wanted. True while it is on its way. */
+  /** Move the drawn radius towards its goal. Returns whether it is still moving. */
   ease() {
     const [goalM] = this.scales[this.level];
     const ratio = goalM / this.radiusM;

@@ -1,5 +1,4 @@
-// The settings that are in effect, to be read: what was set first and by whom, then what is at its
-// default.
+// The effective settings, read only: those that were set, with their origin, then the defaults.
 
 import { askOnce } from "./api.js";
 import { $, make, setText } from "./dom.js";
@@ -19,11 +18,11 @@ function sectionOf([name, keys], isSet) {
   ))];
 }
 
-/** Ask for the settings and show them. */
+/** Request the settings and show them. */
 export async function showSettings() {
   const answer = await askOnce("/v1/settings");
   const sections = Object.entries(answer?.sections ?? {});
-  setText($("settings-problem"), answer ? "" : "The service does not tell.");
+  setText($("settings-problem"), answer ? "" : "The service did not send its settings.");
   const all = (isSet) => sections.flatMap((section) => sectionOf(section, isSet));
   $("settings-set").replaceChildren(...all(true));
   $("settings-default").replaceChildren(...all(false));

@@ -1,6 +1,6 @@
-// The scene in space, on the plan view's own canvas and with its gestures: the carrier and its
-// array, beams as cones, UAVs with their bounds, rings at the carrier's height. Loaded when it is
-// first asked for. Lengths are to scale in every direction: nothing gets smaller with distance.
+// The 3D view, on the plan view's own canvas and with its gestures: the carrier and its array, beams
+// as cones, UAVs with their bounds, rings at the carrier's height. Loaded on first use. The
+// projection is orthographic: lengths are to scale at every distance.
 
 import * as format from "./format.js";
 import { drawLabels } from "./labels.js";
@@ -11,9 +11,9 @@ const TURN_DEG_PER_PX = 0.4;
 const STEPS = 36; // of a circle
 const ARRAY_PX = 26; // a line of elements, not to scale
 const [LOWEST_DEG, HIGHEST_DEG] = [5, 90];
-const WIDEST_DEG = 60; // half of a cone: beyond, it would be a hemisphere and hide all else
+const WIDEST_DEG = 60; // limit on half a cone's angle: a wider one would hide everything else
 
-/** Where the onlooker is: the bearing in which he looks, and how far above the horizon he is. */
+/** The viewpoint: bearing of the view, and elevation above the horizon. */
 export class Space {
   constructor() {
     Object.assign(this, { bearingDeg: 20, aboveDeg: 30 });
@@ -25,7 +25,7 @@ export class Space {
     this.aboveDeg = Math.max(LOWEST_DEG, Math.min(HIGHEST_DEG, above));
   }
 
-  /** Pixels of an offset from the carrier in metres, right and down of it. */
+  /** Projection of an offset from the carrier: right and down in pixels, depth in metres. */
   offset([northM, eastM, downM], pxPerM) {
     const [sin, cos] = [Math.sin(this.bearingDeg * RADIANS), Math.cos(this.bearingDeg * RADIANS)];
     const above = this.aboveDeg * RADIANS;
@@ -34,7 +34,7 @@ export class Space {
       (downM * Math.cos(above) - aheadM * Math.sin(above)) * pxPerM, aheadM];
   }
 
-  /** Draw all of `view`, a plan view, which then knows where its UAVs can be chosen. */
+  /** Draw `view`, a plan view, and set the positions at which its UAVs can be selected. */
   draw(view) {
     const uavs = view.scene.uavs.filter(placed);
     this.middle(view, uavs);
@@ -55,7 +55,7 @@ export class Space {
     drawLabels(view, []);
   }
 
-  /** The carrier is in the middle, or else the UAV that is followed. */
+  /** Centre on the followed UAV, or else on the carrier. */
   middle(view, uavs) {
     const followed = uavs.find(({ id }) => id === view.followed);
     const [right, down] = followed ? this.offset(placeOf(followed), view.pxPerM) : [0, 0];
@@ -124,7 +124,7 @@ export class Space {
 
   // --- beams ------------------------------------------------------------------------------------
 
-  /** A cone to its UAV, as wide as 95 of 100 true directions are from where it points. */
+  /** A cone to its UAV with the 95th percentile of the pointing error as its half angle. */
   drawBeam(view, beam, uav) {
     if (!uav && !format.known(beam.bearing_deg)) return;
     const end = uav ? placeOf(uav)
@@ -144,7 +144,7 @@ export class Space {
     context.globalAlpha = 1;
   }
 
-  /** The rim of a cone from the carrier about a place, half as wide as the angle. */
+  /** The rim of a cone from the carrier around a position, with this half angle. */
   rimOf(end, halfDeg) {
     const lengthM = Math.hypot(...end) || 1;
     const axis = end.map((part) => part / lengthM);
@@ -160,7 +160,7 @@ export class Space {
 
   // --- UAVs -------------------------------------------------------------------------------------
 
-  /** The cylinder in which it surely is. */
+  /** The cylinder that contains the UAV. */
   drawBound(view, uav) {
     const { horizontal_bound_m: radiusM, vertical_bound_m: heightM } = uav;
     if (!format.known(radiusM) || !format.known(heightM)) return;
@@ -178,7 +178,7 @@ export class Space {
     for (const rim of ends) stroke(context, rim, colour, 1, true);
   }
 
-  /** Its mark, and a line down to the height of the carrier. */
+  /** Its mark, and a vertical line to the height of the carrier. */
   drawUav(view, uav) {
     const { context } = view;
     const ned = placeOf(uav);
@@ -208,7 +208,7 @@ export class Space {
 const placed = (uav) => format.known(uav.north_m) && format.known(uav.east_m);
 const placeOf = (uav) => [uav.north_m, uav.east_m, uav.down_m ?? 0];
 
-/** Half of a cone's opening: the likely angle, or the bound where no likely one is known. */
+/** Half angle of a cone: the likely error, or the bound if that is unknown. */
 function likelyDeg({ pointing_p95_deg: likely, pointing_bound_deg: bound }) {
   const deg = [likely, bound].find(format.known) ?? WIDEST_DEG;
   return Math.max(0.5, Math.min(WIDEST_DEG, deg));

@@ -1,4 +1,4 @@
-// A canvas that keeps its size, its sharpness and the colours of the theme.
+// A canvas that adapts to its size, the pixel ratio and the theme's colours.
 
 /** Colours by name, read from the style sheet. */
 export function readColours(names) {
@@ -15,7 +15,7 @@ export class Surface {
   constructor(canvas, colourNames, draw) {
     Object.assign(this, { canvas, colourNames, draw, context: canvas.getContext("2d") });
     this.shown = undefined;
-    this.isDrawn = false; // whether what is to be shown could be drawn
+    this.isDrawn = false; // whether the last drawing succeeded
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.recolour();
   }
@@ -26,13 +26,13 @@ export class Surface {
     this.redraw();
   }
 
-  /** Asked here alone: in the middle of a refresh the answer would cost a layout. */
+  /** The size is read only here: during a refresh, reading it would cost a layout. */
   resize() {
     [this.width, this.height] = [this.canvas.clientWidth, this.canvas.clientHeight];
     this.redraw();
   }
 
-  /** Draw `data`; nothing is done where the same parts were drawn last. */
+  /** Draw `data`, unless it is unchanged. */
   show(data) {
     const before = this.shown ?? {};
     this.shown = data;
@@ -44,7 +44,7 @@ export class Surface {
     const ratio = window.devicePixelRatio || 1;
     if (!this.shown || !this.width || !this.height) return;
     const [wide, high] = [this.width, this.height].map((px) => Math.round(px * ratio));
-    // To be given a size, even the one that it has, costs a canvas all of its memory anew.
+    // Setting a canvas's size, even to the same value, reallocates its memory.
     if (canvas.width !== wide || canvas.height !== high) Object.assign(canvas, { width: wide, height: high });
     context.setTransform(ratio, 0, 0, ratio, 0, 0);
     this.isDrawn = false;
@@ -60,7 +60,7 @@ export class Surface {
     context.textBaseline = "middle";
     context.lineJoin = "round";
     context.lineWidth = 3.5;
-    context.strokeStyle = this.colour.plan; // a rim, for what is written over a picture
+    context.strokeStyle = this.colour.plan; // an outline, for text over a picture
     context.strokeText(text, x, y);
     context.fillStyle = this.colour[colour];
     context.fillText(text, x, y);

@@ -1,15 +1,15 @@
-// The symbols of the plan view: the carrier, UAVs, and who is outside the picture.
+// The symbols of the plan view: the carrier, UAVs, and UAVs outside the picture.
 
 import * as format from "./format.js";
 
 const RADIANS = Math.PI / 180;
-const LEADER_S = 2; // the line ahead of a UAV: where it is in so many seconds
+const LEADER_S = 2; // the line ahead of a UAV ends at its position after this time
 
-/** The carrier in the middle, and how it heads. */
+/** The carrier at the centre, with its heading. */
 export function drawCarrier(view) {
   const { context } = view;
   const { carrier } = view.scene;
-  if (carrier?.unseen) return; // a UAV's first place is in the middle
+  if (carrier?.unseen) return; // then a UAV's first position is at the centre
   const headingDeg = carrier?.heading_deg;
   context.save();
   context.translate(...view.centre);
@@ -30,7 +30,7 @@ export function drawCarrier(view) {
   context.restore();
 }
 
-/** Draw the symbol of a UAV; returns where it is, for labels and for the pointer. */
+/** Draw the symbol of a UAV; returns its position, for labels and for the pointer. */
 export function drawUav(view, uav) {
   const [x, y] = view.at(uav.north_m, uav.east_m);
   const inside = x > 8 && y > 8 && x < view.width - 8 && y < view.height - 8;

@@ -1,4 +1,4 @@
-// The table of UAVs: one row a UAV, kept between updates so that focus and selection stay.
+// The table of UAVs: one row per UAV, kept between updates so that focus and selection stay.
 
 import { $, make, setAttribute, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
@@ -9,23 +9,23 @@ import { Order } from "./order.js";
 const halfWidthDeg = (array) =>
   format.known(array?.half_power_beamwidth_deg) ? array.half_power_beamwidth_deg / 2 : null;
 
-/** The pointing bound, and what it means. Whether the link suffers by it is in the verdict. */
+/** The pointing bound with an explanation. Its effect on the link is in the verdict. */
 function pointingBound({ beam, array }) {
   const bound = beam?.pointing_bound_deg;
   const text = format.degrees(bound, 2);
   const limit = halfWidthDeg(array);
   if (beam && !format.known(bound)) return { text, title: "No bound: the UAV can be anywhere" };
   if (!format.known(bound) || limit === null || bound <= limit) return { text };
-  return { text, title: beam.widened ? "More than half the beamwidth: the beam is broadened"
+  return { text, title: beam.widened ? "More than half the beamwidth: the beam is widened"
     : `More than half the beamwidth (${format.degrees(limit, 2)}): the beam may miss` };
 }
 
-/** The guaranteed gain, or what it means that there is none. */
+/** The guaranteed gain, or why there is none. */
 function guaranteedGain({ beam }) {
   const text = format.decibels(beam?.guaranteed_gain_db);
   if (!beam || format.known(beam.guaranteed_gain_db)) return { text };
-  return { text, title: "Nothing is guaranteed: within its bound the UAV may be in a null, or out"
-    + " of coverage" };
+  return { text, title: "No guarantee: within its bound the UAV may be in a null, or out of"
+    + " coverage" };
 }
 
 function range(uav) {
@@ -38,11 +38,11 @@ function bound({ uav }) {
   if (uav.assumptions?.limits_source !== "raised") return { text };
   return {
     text: `▲ ${text}`, level: "warn",
-    title: "Its reports refuted what was assumed of this aircraft: it was raised",
+    title: "Reports refuted an assumption about this aircraft, which was raised",
   };
 }
 
-/** Older than this, a UAV's values are drawn as old. */
+/** Age from which on a UAV's values are shown as old. */
 const OLD_S = 2;
 
 const ageOf = ({ uav, sinceS }) => (format.known(uav.age_s) ? uav.age_s + sinceS : null);
@@ -51,17 +51,17 @@ function age(context) {
   const ageS = ageOf(context);
   const text = format.seconds(ageS);
   if (!(ageS > OLD_S)) return { text };
-  return { text: `▲ ${text}`, level: "warn", title: "No report lately" };
+  return { text: `▲ ${text}`, level: "warn", title: "No recent report" };
 }
 
-/** Whom no beam of this array is for, for another node serves it. */
+/** The other nodes that serve a UAV, if this array has no beam for it. */
 const servedBy = (uav) => (elsewhere(uav) ? `by ${elsewhere(uav)}` : null);
 
 const STATES = ["live", "coasting", "stale", "lost"];
 
 /**
- * Columns in their order. `value`: what it shows, by class and name, which the service labels;
- * `short`: for narrow screens; `feed`: which answer it stands on; `by`: what it is sorted by.
+ * Columns in order. `value`: class and name of the value, labelled by the service; `short`: label
+ * for narrow screens; `feed`: answer with the value; `by`: sort key.
  */
 const COLUMNS = [
   { key: "verdict", value: ["UavState", "verdict"], feed: "uavs",
@@ -123,16 +123,16 @@ export class UavTable {
     this.showLabels();
     this.order = new Order(head, COLUMNS, onOrder);
     this.order.mark();
-    // Where there is little room, some columns are folded until they are asked for.
+    // On small screens some columns are hidden until requested.
     $("all-columns").addEventListener("click", () => {
       const isAll = !table.hasAttribute("data-all");
       table.toggleAttribute("data-all", isAll);
       $("all-columns").setAttribute("aria-pressed", String(isAll));
     });
-    this.ids = []; // as they stand in the table
+    this.ids = []; // in the order of the table
   }
 
-  /** Name the columns as the service does, as far as it has said so yet. */
+  /** Label the columns with the service's labels, as far as they are loaded. */
   showLabels() {
     HEADS.forEach(({ value, short }, index) => {
       const { cell, button } = this.heads[index];
@@ -164,7 +164,7 @@ export class UavTable {
     });
   }
 
-  /** Bring a UAV's row into sight. */
+  /** Scroll to a UAV's row. */
   reveal(id) {
     this.rows.get(id)?.line.scrollIntoView({ block: "nearest" });
   }
@@ -204,7 +204,7 @@ export class UavTable {
       setText(value, text);
       toggleAttribute(cell, "data-old", oldS !== undefined);
       setAttribute(cell, "data-level", level);
-      setAttribute(cell, "title", oldS === undefined ? title : `As ${format.duration(oldS)} ago`);
+      setAttribute(cell, "title", oldS === undefined ? title : `Value from ${format.duration(oldS)} ago`);
     });
   }
 }

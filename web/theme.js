@@ -1,4 +1,4 @@
-// As the browser prefers, until the operator chooses; the choice is remembered in this browser.
+// The browser's preferred theme, until the operator selects one, which the browser stores.
 
 const KEY = "companion.theme";
 
@@ -6,7 +6,7 @@ function remembered() {
   try {
     return localStorage.getItem(KEY);
   } catch {
-    return null; // storage is refused to this page: the default will do
+    return null; // storage is blocked: use the default
   }
 }
 
@@ -14,11 +14,11 @@ function remember(theme) {
   try {
     localStorage.setItem(KEY, theme);
   } catch {
-    // storage is refused to this page: the choice holds until it is closed
+    // storage is blocked: the choice holds until the page is closed
   }
 }
 
-/** Returns what changes the theme. */
+/** Returns a function that changes the theme. */
 export function setUpTheme(button, onChange) {
   const apply = (theme) => {
     document.documentElement.dataset.theme = theme;

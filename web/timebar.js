@@ -1,4 +1,4 @@
-// Pause and look back. While the page shows the past it says so where nobody can overlook it.
+// Pause and look back. A past moment is marked prominently.
 
 import { $, setText } from "./dom.js";
 import * as format from "./format.js";
@@ -8,7 +8,7 @@ const JUMP_MS = 10_000;
 export class TimeBar {
   constructor(history, onChange) {
     Object.assign(this, { history, onChange });
-    this.shown = null; // the moment that is shown; null while the page is live
+    this.shown = null; // the displayed moment; null while the page is live
     $("pause").addEventListener("click", () => this.toggle());
     $("scrub").addEventListener("input", () => {
       const agoMs = -Number($("scrub").value) * 1000;
@@ -30,9 +30,9 @@ export class TimeBar {
     this.onChange();
   }
 
-  /** The page stays at this moment until it is sent elsewhere, even when it is long past. */
+  /** Show this moment until another one is selected. */
   show(moment) {
-    if (moment === null) return; // nothing has been received: there is nothing to look back at
+    if (moment === null) return; // nothing has been received yet
     this.shown = moment;
     this.onChange();
   }
@@ -41,13 +41,13 @@ export class TimeBar {
     this.show(this.history.at(at));
   }
 
-  /** One answer back or on. */
+  /** One answer back or forward. */
   step(steps) {
     const from = this.shown ?? this.history.newest;
     if (from) this.show(this.history.stepFrom(from, steps));
   }
 
-  /** Ten seconds back or on. */
+  /** Ten seconds back or forward. */
   jump(direction) {
     const from = this.shown ?? this.history.newest;
     if (from) this.showAt(from.at + direction * JUMP_MS);
@@ -64,7 +64,7 @@ export class TimeBar {
     document.documentElement.toggleAttribute("data-past", !isLive);
     const scrub = $("scrub");
     scrub.min = String(-Math.ceil(reachS));
-    // While it is dragged it is the operator's; else it follows the moment into the past.
+    // While it is dragged the operator sets it; otherwise it follows the displayed moment.
     if (!scrub.matches(":active")) scrub.value = String(-agoS);
     scrub.setAttribute("aria-valuetext", isLive ? "live" : `${format.duration(agoS)} ago`);
     setText($("pause"), isLive ? "❚❚ Pause" : "▶ Live");
@@ -73,7 +73,7 @@ export class TimeBar {
     setText($("time-mode"), isLive ? "now" : `−${format.duration(agoS)}`);
     $("past").hidden = isLive;
     if (isLive) return;
-    setText($("past-detail"), `All but connection and readiness is of `
+    setText($("past-detail"), `Everything except connection and readiness is from `
       + `${format.clock(this.shown.stamp)}, ${format.duration(agoS)} ago. Space: back to live.`);
   }
 }

@@ -1,5 +1,5 @@
-// The bearer token of a service that asks for one. It is asked for when it is missing or wrong, and
-// kept for this tab; it is never part of an address, which logs and histories would keep.
+// The bearer token of a service that needs one. The user is asked for it if it is missing or wrong.
+// It is stored for this tab, and never part of a URL, which logs and histories would keep.
 
 import { $, setText } from "./dom.js";
 
@@ -7,7 +7,7 @@ const KEY = "companion-token";
 let token = stored();
 let awake = () => {};
 
-/** Set up the dialog; `wake` is called once there is a token to try. */
+/** Set up the dialog; `wake` is called when a token was entered. */
 export function setUpToken(wake) {
   awake = wake;
   $("token-form").addEventListener("submit", (event) => {
@@ -22,7 +22,7 @@ export function setUpToken(wake) {
   });
 }
 
-/** `fetch` with the token, if there is one. A 401 opens the dialog, which says what was wrong. */
+/** `fetch` with the token, if there is one. A 401 opens the dialog with the problem. */
 export async function authorised(path, options = {}) {
   const tried = token;
   const headers = { ...options.headers };
@@ -32,10 +32,10 @@ export async function authorised(path, options = {}) {
   return response;
 }
 
-/** The token that this tab keeps; null without one. */
+/** The stored token of this tab; null without one. */
 export const tokenOfTab = () => token;
 
-/** Whether a token is needed for what links lead to: a browser sends none with them. */
+/** Whether downloads need a token, which a browser does not send with plain links. */
 export const hasToken = () => token !== null;
 
 function demand(wrong) {
@@ -48,7 +48,7 @@ function stored() {
   try {
     return sessionStorage.getItem(KEY);
   } catch {
-    return null; // without storage it is kept as long as the page is
+    return null; // storage is blocked: it is kept until the page is closed
   }
 }
 
@@ -56,7 +56,7 @@ function keep(given) {
   try {
     sessionStorage.setItem(KEY, given);
   } catch {
-    // it is kept as long as the page is
+    // storage is blocked: it is kept until the page is closed
   }
 }
 
@@ -65,6 +65,6 @@ function forget() {
   try {
     sessionStorage.removeItem(KEY);
   } catch {
-    // there was nothing to forget
+    // storage is blocked: nothing is stored
   }
 }

@@ -1,5 +1,5 @@
-// Where each UAV has been. Points are kept on the earth, not relative to the carrier, so that a
-// trail stays where it was flown when the carrier moves.
+// Trails of the UAVs. Points are stored as Earth coordinates, not relative to the carrier, so that a
+// trail stays in place when the carrier moves.
 
 import { known } from "./format.js";
 
@@ -21,7 +21,7 @@ export function metresPerDegree(latDeg) {
 
 /**
  * The trail of a UAV in metres relative to the carrier, oldest first, ending at the UAV:
- * `{north, east, velocity, age: 0 new … 1 old, measured, at}`. `at` is the time that is shown.
+ * `{north, east, velocity, age: 0 new … 1 old, measured, at}`. `at` is the displayed time.
  */
 export function trailOf(uav, history, at) {
   const scale = metresPerDegree(uav.lat_deg);
@@ -41,8 +41,8 @@ export function trailOf(uav, history, at) {
 }
 
 /**
- * Where a UAV said that it was, in metres relative to the carrier: `{north, east, age: 0 … 1}`, the
- * newest reports that were seen, each once.
+ * Reported positions of a UAV in metres relative to the carrier: `{north, east, age: 0 … 1}`, the
+ * newest reports, each once.
  */
 export function fixesOf(uav, history, at) {
   const scale = metresPerDegree(uav.lat_deg);

@@ -1,29 +1,29 @@
-// Lengths and speeds in the units that the reader has chosen; the service knows metres and seconds
-// alone. The choice is remembered in this browser.
+// Lengths and speeds in the units that the user has selected; the service uses only metres and
+// seconds. The browser stores the choice.
 
 import { $ } from "./dom.js";
 
 const KEY = "companion.units";
 
-/** `metres` in one; `far`: the unit of what is long, its `metres` too. `field`: as headers name it. */
+/** `metres` per unit; `far`: the unit for long distances; `field`: suffix in CSV headers. */
 export const LENGTHS = {
   m: { name: "m", field: "m", metres: 1, far: { name: "km", metres: 1000 } },
   ft: { name: "ft", field: "ft", metres: 0.3048, far: { name: "nmi", metres: 1852 } },
 };
-/** `mps`: metres per second in one. */
+/** `mps`: metres per second per unit. */
 export const SPEEDS = {
   "m/s": { name: "m/s", field: "mps", mps: 1 },
   "kn": { name: "kn", field: "kn", mps: 1852 / 3600 },
   "km/h": { name: "km/h", field: "kmh", mps: 1 / 3.6 },
 };
 
-/** The units that are used now. */
+/** The selected units. */
 export const units = { length: LENGTHS.m, speed: SPEEDS["m/s"] };
 
 export const lengthOf = (metres) => metres / units.length.metres;
 export const speedOf = (mps) => mps / units.speed.mps;
 
-/** Use these; one that is not known is left as it is. */
+/** Select these; an unknown one is ignored. */
 export function use({ length, speed }) {
   if (Object.hasOwn(LENGTHS, length)) units.length = LENGTHS[length];
   if (Object.hasOwn(SPEEDS, speed)) units.speed = SPEEDS[speed];
@@ -33,7 +33,7 @@ function remembered() {
   try {
     return JSON.parse(localStorage.getItem(KEY)) ?? {};
   } catch {
-    return {}; // storage is refused to this page, or holds what is none of ours
+    return {}; // storage is blocked, or its content is invalid
   }
 }
 
@@ -42,11 +42,11 @@ function remember() {
     localStorage.setItem(KEY, JSON.stringify({ length: units.length.name,
       speed: units.speed.name }));
   } catch {
-    // storage is refused to this page: the choice holds until it is closed
+    // storage is blocked: the choice holds until the page is closed
   }
 }
 
-/** The two lists to choose from. */
+/** Set up the two lists of units. */
 export function setUpUnits(onChange) {
   use(remembered());
   const [length, speed] = [$("unit-length"), $("unit-speed")];

@@ -32,12 +32,12 @@ function drawBeam(view, beam, array, uav) {
   const widthDeg = wedgeWidthDeg(beam, array);
   const flatM = uav ? Math.hypot(uav.north_m, uav.east_m)
     : (beam.range_m ?? 0) * Math.cos((beam.elevation_deg ?? 0) * RADIANS);
-  // A beam does not end at its target: it is drawn on beyond, fading.
+  // A beam does not end at its target: it is drawn beyond it, fading.
   const targetPx = flatM * view.pxPerM;
   const reachPx = Math.max(targetPx + 60, view.outerPx);
   const fade = context.createRadialGradient(...view.centre, 0, ...view.centre, reachPx);
   const stop = Math.min(0.98, targetPx / reachPx);
-  // Many wide ones lie over one another: together they are to look no stronger than one.
+  // Many wide beams overlap: together they should look no stronger than one.
   const strength = Math.max(0.1, Math.min(1, 360 / (widthDeg * view.scene.beams.length)));
   fade.addColorStop(0, withAlpha(colour, 0.7 * strength));
   fade.addColorStop(stop, withAlpha(colour, 0.45 * strength));
@@ -52,7 +52,7 @@ function drawBeam(view, beam, array, uav) {
   context.arc(...view.centre, reachPx, from, to);
   context.closePath();
   context.fill();
-  // A thread in the middle keeps a beam of one degree visible near the carrier.
+  // A centre line keeps a narrow beam visible near the carrier.
   context.strokeStyle = fade;
   context.lineWidth = chosen ? 2 : 1.1;
   context.beginPath();
@@ -62,7 +62,7 @@ function drawBeam(view, beam, array, uav) {
   context.globalAlpha = 1;
 }
 
-/** Width of a beam in bearing, degrees: as wide as what is known of its target where widened. */
+/** Width of a beam in bearing, degrees; of a widened one at least twice the pointing bound. */
 function wedgeWidthDeg(beam, array) {
   const naturalDeg = naturalWidthDeg(beam, array);
   if (!beam.widened || !format.known(beam.pointing_bound_deg)) return naturalDeg;
@@ -70,8 +70,8 @@ function wedgeWidthDeg(beam, array) {
 }
 
 /**
- * Half-power width in bearing, degrees. A line of elements has its beamwidth in the sine of the
- * angle off boresight, so the beam widens as it is steered away; other arrays as they are said.
+ * Half-power width in bearing, degrees. A line of elements has a constant beamwidth in the sine of
+ * the angle off boresight, so its beam widens with steering; other arrays: as the service states.
  */
 function naturalWidthDeg(beam, array) {
   const widthDeg = array.half_power_beamwidth_deg;

@@ -115,7 +115,7 @@ def test_for_programs_a_line_is_the_answer(service: Service) -> None:
     [
         (200, json.dumps(FLEET | {"node": None}), ": node is not in a fleet; set its [fleet] node"),
         (200, "{}", ": not a companion: no node in /v1/fleet; check the address"),
-        (200, "[1]", "the answer is no JSON object"),
+        (200, "[1]", "the answer is not a JSON object"),
         (200, "<html>", "the answer is not JSON"),
         (404, "", "404: Not Found"),
         (

@@ -249,7 +249,7 @@ def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: An
     assert page.evaluate(style.format("textDecorationLine")) == "line-through"
     start_mine(port=int(node.url.rpartition(":")[2]))
     page.locator("#banner").wait_for(state="hidden", timeout=HANG_MS)
-    page.get_by_text("service answers", exact=True).wait_for(timeout=HANG_MS)
+    page.get_by_text("connected", exact=True).wait_for(timeout=HANG_MS)
     wait_for_value(page, style.format("textDecorationLine"), "none")
 
 
@@ -268,7 +268,7 @@ def test_a_page_with_a_token_asks_for_it_and_keeps_it(
         field.wait_for()
         assert not page.locator("#token-problem").is_visible()
         field.fill("wrong")
-        page.get_by_role("button", name="Use it").click()
+        page.get_by_role("button", name="Connect").click()
         page.get_by_text("That token is wrong.").wait_for()
         picture(page, "token")
         field.fill("s3cret/ü")

@@ -21,11 +21,11 @@ def test_it_is_seen_from_all_sides(demo: Node, open_page: Any, size: str) -> Non
     wait_for_uavs(page)
     assert not page.evaluate(LOADED)
     page.locator("#pause").click()  # what moves from now on is moved by a key
-    button = page.get_by_role("button", name="3-D")
+    button = page.get_by_role("button", name="3D")
     button.click()
     page.locator("#space[aria-pressed=true]").wait_for(timeout=HANG_MS)
     assert page.evaluate(LOADED)
-    assert page.locator("#plan").get_attribute("aria-label").startswith("View in space: ")
+    assert page.locator("#plan").get_attribute("aria-label").startswith("3D view: ")
     for key in ("]", "."):
         before = page.evaluate(PICTURE)
         page.keyboard.press(key)

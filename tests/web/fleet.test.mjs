@@ -59,8 +59,8 @@ test("the nodes stand with their state, their clock and their way; an unknown is
   assert.deepEqual(items.map(({ facts }) => facts), ["1 of 8",
     "1 of 8 | +1.5 ± 0.4 ms | 12 ms | 7", "1 of 8 | – | – | 7",
     "1 of 8 | +3.000 ± 0.000 s | 12 ms | 7", "1 of 8 | – | – | 7"]);
-  assert.match(items[3].item.textContent, /not believed: it has an inconsistent clock$/);
-  assert.match(plain(page.text("fleet-traffic")), /^tells 14\.0 kbit\/s · hears 900 bit\/s$/);
+  assert.match(items[3].item.textContent, /not trusted: it has an inconsistent clock$/);
+  assert.match(plain(page.text("fleet-traffic")), /^sent 14\.0 kbit\/s · received 900 bit\/s$/);
 });
 
 test("who serves a UAV: one, two, nobody, to be handed over, unconfirmed", () => {
@@ -72,14 +72,14 @@ test("who serves a UAV: one, two, nobody, to be handed over, unconfirmed", () =>
   assert.deepEqual(said({ handing_to: "south" }), ["north → south", ""]);
   assert.deepEqual(said({ served_by: ["north", "south"], handing_to: "south" }),
     ["twice: north and south", "warn"]);
-  assert.deepEqual(said({ served_by: [] }), ["nobody", "bad"]);
+  assert.deepEqual(said({ served_by: [] }), ["no node", "bad"]);
   assert.deepEqual(said({ unconfirmed: true }), ["north · unconfirmed", "warn"]);
 });
 
 test("the worst stands first, or the UAVs by their numbers; each node's offer in its column", async () => {
   const page = await openFleet();
   assert.deepEqual(page.rows().map(([id, by]) => `${id} ${by}`),
-    ["10:1 nobody", "1:1 north", "2:1 south"]);
+    ["10:1 no node", "1:1 north", "2:1 south"]);
   assert.deepEqual(page.rows()[1].slice(2), ["11.0 / 12.0 · 30", "– / 9.5 · 20"]);
   assert.deepEqual(page.rows()[0].slice(2), ["–", "–"]);
   const serves = page.element("fleet-uavs").tBodies[0].querySelectorAll("[data-serves]");
@@ -117,7 +117,7 @@ test("handovers stand with the newest first", async () => {
   const page = await openFleet();
   const items = page.element("fleet-handovers").children.map(({ children }) =>
     children.map(({ textContent }) => textContent).join(" "));
-  assert.deepEqual(items, ["13:00:02 2:1: north → south", "13:00:01 1:1: nobody → north"]);
+  assert.deepEqual(items, ["13:00:02 2:1: north → south", "13:00:01 1:1: none → north"]);
 });
 
 test("whom another node serves is neither bad nor missed here, and is named", async () => {

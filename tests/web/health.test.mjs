@@ -14,7 +14,7 @@ test("the headline says how many links are good, and how bad the worst is", () =
   assert.deepEqual(said("good", "good"), { text: "2 of 2 links good", level: "good" });
   assert.deepEqual(said("good", "weak"), { text: "1 of 2 links good", level: "warn" });
   assert.deepEqual(said("weak", "none", "good", null), { text: "1 of 3 links good", level: "bad" });
-  assert.deepEqual(said(null), { text: "no link to judge yet", level: "wait" });
+  assert.deepEqual(said(null), { text: "no link assessed yet", level: "wait" });
 });
 
 test("links of one cause stand together, the worst first, and the good are not listed", () => {
@@ -84,7 +84,7 @@ test("the alarm is off unless switched on, stays until it is seen, and is rememb
   assert.equal(bar.hidden, true);
   page.service.mode = "gone";
   await page.time.advance(6000);
-  assert.equal(page.text("alarm-text"), "ALARM – the connection to the service is lost");
+  assert.equal(page.text("alarm-text"), "ALARM – connection to the service lost");
   button.click();
   assert.deepEqual([bar.hidden, page.text("alarm")], [true, "Alarm off"]);
 });

@@ -60,12 +60,12 @@ test("without the carrier the picture stays, with its age, and the cause is in t
   const plan = await page.drawn();
   plan.text("1:1".replace("1", "✕ 1"));
   plan.text(`${CAUSE}:`);
-  assert.ok(plan.texts.some((text) => text.startsWith("carrier and beams as ")), plan.texts.join());
+  assert.ok(plan.texts.some((text) => text.startsWith("carrier and beams from ")), plan.texts.join());
   assert.deepEqual(page.cells("range"), [range, range]);
   assert.deepEqual(page.cells("gain"), ["17.5 dB", "17.5 dB"]);
   const cell = page.document.querySelector("td[data-key=gain]");
   assert.ok(cell.hasAttribute("data-old"));
-  assert.match(cell.title, /^As \d+.s ago$/);
+  assert.match(cell.title, /^Value from \d+.s ago$/);
   assert.match(page.text("troubles"), new RegExp(CAUSE));
   assert.match(page.text("center"), new RegExp(CAUSE));
   assert.match(page.document.querySelector(".focus-uav").textContent, /^1:1, as \d+.s ago$/);

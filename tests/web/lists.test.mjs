@@ -31,7 +31,7 @@ test("a link says its address, its counts and who is heard over it", () => {
   assert.deepEqual([head, level], ["udpin:0.0.0.0:14550 | up", "good"]);
   assert.deepEqual(facts, { "Frames": "12,345", "Bad CRC": "0", "Gaps": "3", "First": "50 %",
     "Latency": "2 / 5 ms" });
-  assert.equal(item.children.at(-1).textContent, "hears 1:1");
+  assert.equal(item.children.at(-1).textContent, "receives 1:1");
 });
 
 test("a link that is silent is warned of, one that is not up is bad", () => {

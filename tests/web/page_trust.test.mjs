@@ -17,7 +17,7 @@ test("while the service answers, nothing is marked and nothing is in the way", a
     assert.ok(page.element("banner").hidden);
     await page.time.advance(230);
   }
-  assert.equal(page.text("connection"), "service answers");
+  assert.equal(page.text("connection"), "connected");
   assert.equal(page.document.title, "2 of 2 links good · companion");
   assert.equal(page.element("plan").getAttribute("aria-label"), "Plan view: 2 UAVs, 2 beams");
   assert.ok(!(await page.drawn()).texts.some((text) => text.startsWith("NOT LIVE")));
@@ -31,7 +31,7 @@ test("answers that are late make what stands on them look late", async () => {
   await page.time.advance(900);
   assert.deepEqual(page.marked("late"), ["beams", "pattern", "uavs"]);
   assert.deepEqual(page.marked("lost"), []);
-  assert.equal(page.text("connection"), "service answers late");
+  assert.equal(page.text("connection"), "answers are late");
 });
 
 for (const mode of ["silent", "gone"]) {
@@ -90,11 +90,11 @@ test("an age grows while no answer comes", async () => {
 
 test("where nothing has ever answered there is no connection", async () => {
   const page = await openPage({ mode: "gone" });
-  assert.equal(page.text("connection"), "reaching the service…");
+  assert.equal(page.text("connection"), "connecting…");
   assert.equal(page.text("uavs-empty"), "Nothing received yet.");
   await page.time.advance(4000);
   assert.deepEqual([page.text("connection"), page.text("banner-title")],
-    ["service not reached", "No connection"]);
+    ["not connected", "No connection"]);
   (await page.drawn()).text("NOT LIVE – no connection");
 });
 
@@ -127,11 +127,11 @@ test("a token that is asked for is no connection that fails, and nothing looks l
   page.service.answer = (path) => (path.startsWith("/v1/") ? { status: 401, body: "{}" }
     : answer.call(page.service, path));
   await page.time.advance(20 * BEAT_MS);
-  assert.equal(page.text("connection"), "asks for a token");
+  assert.equal(page.text("connection"), "token needed");
   assert.ok(page.element("banner").hidden);
   assert.ok(page.marked("lost").includes("uavs"));
   assert.match(page.document.title, /^TOKEN/);
-  (await page.drawn()).text("NOT LIVE – token asked for");
+  (await page.drawn()).text("NOT LIVE – token needed");
 });
 
 test("what keeps the service from answering is said in its words where it is known", async () => {
@@ -140,7 +140,7 @@ test("what keeps the service from answering is said in its words where it is kno
   page.service.status.health.behind = cause;
   page.service.answers["/v1/beams"] = { status: 503, body: "{}" };
   await page.time.advance(8 * BEAT_MS);
-  assert.ok(page.text("banner-detail").startsWith(`No answer about beams (${cause})`));
+  assert.ok(page.text("banner-detail").startsWith(`No answer for beams (${cause})`));
 });
 
 test("where UAVs alone are not answered, the plan is not live", async () => {
@@ -148,7 +148,7 @@ test("where UAVs alone are not answered, the plan is not live", async () => {
   page.service.answers["/v1/uavs"] = { status: 500, body: "{}" };
   await page.time.advance(3200);
   assert.deepEqual(page.marked("lost"), ["uavs"]);
-  (await page.drawn()).text("NOT LIVE – no answer about UAVs");
+  (await page.drawn()).text("NOT LIVE – no answer for UAVs");
 });
 
 const IMPOSSIBLE = {

@@ -25,8 +25,8 @@ function openPanels() {
 
 test("a good connection needs no banner, and one chip says how good it is", () => {
   const { text, level } = openPanels();
-  for (const [state, chip, wanted] of [["waiting", "reaching the service…", "wait"],
-    ["live", "service answers", "good"], ["late", "service answers late", "warn"]]) {
+  for (const [state, chip, wanted] of [["waiting", "connecting…", "wait"],
+    ["live", "connected", "good"], ["late", "answers are late", "warn"]]) {
     panels.showConnection({ state }, stampAt(0));
     assert.deepEqual([text("banner"), text("connection"), level("connection")],
       [null, chip, wanted]);
@@ -36,15 +36,15 @@ test("a good connection needs no banner, and one chip says how good it is", () =
 test("a bad connection cannot be overlooked, and it is said since when and why", () => {
   const { text, level } = openPanels();
   for (const [link, chip, title, detail] of [
-    [{ state: "lost", silentS: 65.2, problem: "no answer within 2 s" }, "connection to the service lost",
-      "CONNECTION LOST", /for 1 min 05 s \(no answer within 2 s\).*from 13:00:07 UTC/],
+    [{ state: "lost", silentS: 65.2, problem: "no answer within 2 s" }, "connection lost",
+      "CONNECTION LOST", /for 1 min 05 s \(no answer within 2 s\)\. All values are from 13:00:07 UTC/],
     [{ state: "lost", never: true, silentS: 3, problem: "the service cannot be reached" },
-      "service not reached", "No connection", /Nothing received.*\(the service cannot be reached\)/],
+      "not connected", "No connection", /No answer from the service yet \(the service cannot be reached\)/],
     [{ state: "partial", what: "beams, pattern", problem: "the service answered 500" },
-      "service fails in part", "CONNECTION FAILING",
-      /about beams, pattern \(the service answered 500\)/],
+      "some requests fail", "CONNECTION FAILING",
+      /No answer for beams, pattern \(the service answered 500\)/],
     [{ state: "frozen", what: "UAVs" }, "estimates stopped", "ESTIMATES STOPPED",
-      /stands still at 13:00:07 UTC \(UAVs\)/],
+      /has stopped at 13:00:07 UTC \(UAVs\)/],
   ]) {
     panels.showConnection(link, stampAt(7));
     assert.deepEqual([text("connection"), level("connection"), text("banner-title")],
@@ -59,7 +59,7 @@ test("a bad connection cannot be overlooked, and it is said since when and why",
     panels.showConnection({ state }, stampAt(8));
     assert.equal(text("banner"), null);
   }
-  assert.deepEqual([text("connection"), level("connection")], ["asks for a token", "warn"]);
+  assert.deepEqual([text("connection"), level("connection")], ["token needed", "warn"]);
 });
 
 test("a fault of the page itself is said", () => {

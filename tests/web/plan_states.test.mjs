@@ -96,8 +96,8 @@ test("what must not be overlooked stands across the picture, the past in its col
 test("a message that is wider than the picture takes two lines, after its colon", async () => {
   const view = await openPlan();
   const cause = "the attitude of the carrier 5:1 is too old:";
-  const picture = view.show({ message: `${cause} carrier and beams as 19 s ago`, uavs: [] });
-  const [above, below] = [picture.text(cause), picture.text("carrier and beams as 19 s ago")];
+  const picture = view.show({ message: `${cause} carrier and beams from 19 s ago`, uavs: [] });
+  const [above, below] = [picture.text(cause), picture.text("carrier and beams from 19 s ago")];
   const found = picture.of("rect").at(-1);
   assert.ok(found.y < above.y && above.y < below.y && below.y < found.y + found.height);
   assert.ok(found.x >= 0 && found.y + found.height <= view.plan.height);

@@ -83,7 +83,7 @@ const WRONG = {
   "the service answered 503": { status: 503, body: "{}" },
   "the service answered 404": { status: 404, body: "{}" },
   "the answer is not JSON": { body: "<html>" },
-  "the answer is not what was asked for": { uavs: [{ name: "1:1" }] },
+  "unexpected answer": { uavs: [{ name: "1:1" }] },
 };
 
 for (const [problem, answer] of Object.entries(WRONG)) {

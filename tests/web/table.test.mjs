@@ -99,7 +99,7 @@ test("a pointing bound above half the beamwidth is explained", () => {
   };
   assert.deepEqual(shown({ pointing_bound_deg: 5 }), ["5.00°", ""]);
   assert.match(shown({ pointing_bound_deg: 5.01 })[1], /may miss/);
-  assert.match(shown({ pointing_bound_deg: 5.01, widened: true })[1], /is broadened/);
+  assert.match(shown({ pointing_bound_deg: 5.01, widened: true })[1], /is widened/);
   assert.deepEqual(shown({ pointing_bound_deg: 50 }, null), ["50.00°", ""]);
   assert.match(shown({ pointing_bound_deg: null })[1], /anywhere/);
 });
@@ -108,7 +108,7 @@ test("a beam without any guaranteed gain is explained", () => {
   const { show, cell } = openTable();
   show([uav("1:1")], { beams: [beam("1:1", { guaranteed_gain_db: null })] });
   assert.equal(cell("guaranteed").textContent, "–");
-  assert.match(cell("guaranteed").title, /Nothing is guaranteed/);
+  assert.match(cell("guaranteed").title, /No guarantee/);
   show([uav("1:1")]);
   assert.deepEqual([cell("guaranteed").textContent, cell("guaranteed").title], ["–", ""]);
 });
@@ -118,7 +118,7 @@ test("a verdict is in the row, with its reason and what to do", () => {
   show([uav("1:1", weak()), uav("2:1")]);
   assert.deepEqual([cell("verdict").textContent, cell("verdict").title, rows()[0].dataset.verdict],
     ["weak", "reports 1.1 s apart. To do: ask for 10 Hz", "weak"]);
-  assert.match(cell("verdict", 1).title, /surely has the 6.0 dB/);
+  assert.match(cell("verdict", 1).title, /at least the 6.0 dB/);
   show([uav("3:1", { verdict: null, health: null })]);
   assert.deepEqual([cell("verdict").textContent, cell("verdict").title], ["–", ""]);
 });

@@ -103,7 +103,7 @@ test("the past says that it is past, of when, and for how long", async () => {
   await browser.time.advance(65_000);
   draw();
   assert.ok(!browser.element("past").hidden && root.hasAttribute("data-past"));
-  assert.match(browser.text("past-detail"), /of 12:59:50 UTC, 1.min 15.s ago/);
+  assert.match(browser.text("past-detail"), /from 12:59:50 UTC, 1.min 15.s ago/);
   assert.equal(browser.text("time-mode"), `−1${NBSP}min 15${NBSP}s`);
   assert.equal(browser.text("reach"), `−1${NBSP}min 35${NBSP}s`);
   assert.match(browser.text("pause"), /Live/);

@@ -4,7 +4,7 @@ from companion.cli.interrupts import interrupts_end
 
 
 def main() -> None:
-    """Load the command and run it; Ctrl-C ends it with one line, even while it is still loading."""
+    """Load and run the command; Ctrl-C ends it with one line, even during loading."""
     with interrupts_end("sitl-replay"):
         from sitl_replay.cli import main as command
 

@@ -1,6 +1,6 @@
 """The command ``sitl-replay`` and its subcommands.
 
-Over 300 lines: it is a list, the commands and their options.
+Over 300 lines: a list of the commands and their options.
 """
 
 import asyncio
@@ -29,17 +29,17 @@ PROGRESS_EVERY_S = 0.5
 
 
 def as_links(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> tuple[LinkUrl, ...]:
-    """Parse the URLs of links to send over; a usage error says what is allowed."""
+    """Parse the URLs of links to send to. Usage error if one is invalid."""
     return tuple(_url(value) for value in values)
 
 
 def as_source(_: click.Context, __: click.Parameter, value: str) -> LinkUrl:
-    """Parse the URL of a link to listen to."""
+    """Parse the URL of a link to receive from. Usage error if it is invalid."""
     return _url(value)
 
 
 def as_faults(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> list[Fault]:
-    """Parse the faults; a usage error says what is allowed."""
+    """Parse the faults. Usage error if one is invalid."""
     try:
         return in_order([Fault.parse(value) for value in values])
     except UserError as error:
@@ -47,13 +47,13 @@ def as_faults(_: click.Context, __: click.Parameter, values: tuple[str, ...]) ->
 
 
 def as_duration(_: click.Context, __: click.Parameter, value: str | None) -> float | None:
-    """Parse seconds; None stays None."""
-    return None if value is None else _positive(value, "seconds, a number above 0")
+    """Parse a duration in seconds. None if it is not given."""
+    return None if value is None else _positive(value, "a positive number of seconds")
 
 
 def as_speed(_: click.Context, __: click.Parameter, value: str) -> float | None:
-    """Parse a factor; "max" gives None, which is as fast as it goes."""
-    return None if value == "max" else _positive(value, "a number above 0, or 'max'")
+    """Parse a speed factor. None for "max", which means without waiting."""
+    return None if value == "max" else _positive(value, "a positive number or 'max'")
 
 
 def _url(text: str) -> LinkUrl:
@@ -83,15 +83,15 @@ def sending_options(command: Callable[..., None]) -> Callable[..., None]:
         multiple=True,
         required=True,
         callback=as_links,
-        help="Where to send: udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD, tcpin:HOST:PORT"
-        " (serves those who connect), udpin:HOST:PORT (answers those who send it anything) or"
-        " zenoh:KEY?as=hub. The last three wait for their first peer before it begins. May be"
-        " given several times.",
+        help="Destination: udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD, tcpin:HOST:PORT"
+        " (sends to every client that connects), udpin:HOST:PORT (sends to every peer that has"
+        " sent a datagram) or zenoh:KEY?as=hub. Sending starts when each of the last three has a"
+        " peer. Can be repeated.",
     )(command)
 
 
 json_option = click.option(
-    "--json", "as_json", is_flag=True, help="The summary as one JSON object."
+    "--json", "as_json", is_flag=True, help="Print the summary as one JSON object."
 )
 fault_option = click.option(
     "--fault",
@@ -99,31 +99,31 @@ fault_option = click.option(
     metavar="NAME[@SYSID[:COMPID]]=VALUE",
     multiple=True,
     callback=as_faults,
-    help="Make the traffic faulty (see below), for all or for one system or component alone."
-    " May be given several times.",
+    help="Inject a fault (see below), for all systems or for one system or component. Can be"
+    " repeated.",
 )
 duration_option = click.option(
     "--duration",
     "duration_s",
     metavar="SECONDS",
     callback=as_duration,
-    help="Stop after so many seconds.",
+    help="Stop after this many seconds.",
 )
-FAULTS = f"""Faults, in the order in which they are applied, whatever the order of the options.
-The first four are the senders' own and the same on every link: their frames are rewritten with a
-checksum that holds, and lose a signature. The others strike each link by itself.
-The same --seed and input give the same bytes at the same times; seconds count from the start
+FAULTS = f"""Faults, in the order in which they are applied (the order of the options has no
+effect). The first four belong to the sender and are the same on every link: frames are rewritten
+with a valid checksum, and signatures are removed. The others are drawn for each link separately.
+The same --seed and input give the same bytes at the same times. Times are seconds since the start
 (of the log: at --speed 2 they pass twice as fast).
 
 {described()}
 
-No more than {HELD_MAX} frames are held back; beyond, they are lost and counted as {OVERFLOW}."""
+At most {HELD_MAX} frames are delayed at a time; further ones are lost and counted as {OVERFLOW}."""
 
 
 @click.group(name="sitl-replay", cls=OneLineErrors)
 @click.version_option(__version__, prog_name="sitl-replay")
 def main() -> None:
-    """MAVLink traffic to test against: synthetic vehicles and logs, live.
+    """Send MAVLink test traffic: synthetic vehicles, or logs.
 
     Example: sitl-replay fly paper --to udpout:127.0.0.1:14550
     """
@@ -137,16 +137,20 @@ def main() -> None:
     type=click.IntRange(1, scenario.MAX_UAVS),
     default=4,
     show_default=True,
-    help="How many UAVs fly about the carrier.",
+    help="Number of UAVs around the carrier.",
 )
 @duration_option
 @click.option(
-    "--seed", type=int, default=0, show_default=True, help="Of what is left to chance, and faults."
+    "--seed",
+    type=int,
+    default=0,
+    show_default=True,
+    help="Seed of all random numbers, including faults.",
 )
 @click.option(
     "--record",
     type=click.Path(dir_okay=False, writable=True, path_type=Path),
-    help="Also write the frames to this tlog (replaced if it exists).",
+    help="Also write the frames to this tlog (overwritten if it exists).",
 )
 def fly(
     *,
@@ -159,9 +163,9 @@ def fly(
     faults: list[Fault],
     as_json: bool,
 ) -> None:
-    """Fly SCENARIO (see `sitl-replay list`): synthetic vehicles as MAVLink 2.
+    """Send a scenario (see `sitl-replay list`): synthetic vehicles as MAVLink 2.
 
-    Flies until --duration, SIGINT or SIGTERM.
+    Ends after --duration, or on SIGINT or SIGTERM.
 
     Example: sitl-replay fly paper --to udpout:127.0.0.1:14550 --duration 60 --record paper.tlog
     """
@@ -190,9 +194,9 @@ def fly(
     callback=as_speed,
     default="1",
     show_default=True,
-    help="Times as fast as it was; max: without waiting (over UDP a slow receiver loses frames).",
+    help="Speed factor; max: no waiting (over UDP a slow receiver loses frames).",
 )
-@click.option("--seed", type=int, default=0, show_default=True, help="Of the faults.")
+@click.option("--seed", type=int, default=0, show_default=True, help="Seed of the faults.")
 def play(
     *,
     logs: tuple[Path, ...],
@@ -202,10 +206,10 @@ def play(
     faults: list[Fault],
     as_json: bool,
 ) -> None:
-    """Play a LOG as live traffic: .tlog, raw MAVLink, .mcap, .bin, .ulg, CSV. Several are merged.
+    """Play logs as live traffic: .tlog, raw MAVLink, .mcap, .bin, .ulg or CSV.
 
-    Paced by the log's stamps; where they step back or leap by more than 5 s, the step is played
-    as 0 or 5 s, and the end says how many were.
+    Several logs are merged by time. The pace follows the time stamps; a step back is played as
+    0 s, a jump of more than 5 s as 5 s, and the number of such steps is printed at the end.
 
     Example: sitl-replay play flight.tlog --to udpout:127.0.0.1:14550 --speed 2
 
@@ -218,8 +222,8 @@ def play(
     run(player.play(frames, urls, speed, faults=faults, seed=seed, tally=tally), tally)
     if tally.clamped:
         click.echo(
-            f"{', '.join(map(str, logs))}: {tally.clamped} time stamps step back, or leap by more"
-            " than 5 s; those steps were played as 0 or 5 s",
+            f"{', '.join(map(str, logs))}: {tally.clamped} time stamps step back, or jump by more"
+            " than 5 s; these steps were played as 0 or 5 s",
             err=True,
         )
     conclude(tally, "sent", as_json)
@@ -232,23 +236,23 @@ def play(
     metavar="URL",
     callback=as_source,
     required=True,
-    help="What to listen to: udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT, serial:DEVICE:BAUD,"
-    " zenoh:KEY or udpout:HOST:PORT. Nothing is sent there; only over udpout an empty datagram each"
-    " second, until something is heard, since the peer cannot know of us otherwise.",
+    help="Link to receive from: udpin:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT,"
+    " serial:DEVICE:BAUD, zenoh:KEY or udpout:HOST:PORT. Nothing is sent, except over udpout: an"
+    " empty datagram each second until the first reply, to make this end known to the peer.",
 )
 @click.option(
     "--out",
     type=click.Path(dir_okay=False, writable=True, path_type=Path),
     required=True,
-    help="The tlog to write (replaced if it exists).",
+    help="The tlog to write (overwritten if it exists).",
 )
 @duration_option
 @json_option
 def record(url: LinkUrl, out: Path, duration_s: float | None, as_json: bool) -> None:
-    """Write MAVLink traffic to a tlog, until --duration, SIGINT or SIGTERM.
+    """Record MAVLink traffic to a tlog, until --duration, SIGINT or SIGTERM.
 
-    Stamps are Unix time at the start and never step back. Frames whose checksum is wrong, or
-    whose message is unknown, are counted and not written.
+    Time stamps are Unix time and never step back. Frames with a wrong checksum or an unknown
+    message id are counted, but not written.
 
     Example: sitl-replay record --from udpin:0.0.0.0:14550 --out flight.tlog
     """
@@ -260,7 +264,7 @@ def record(url: LinkUrl, out: Path, duration_s: float | None, as_json: bool) -> 
 @main.command("list")
 @json_option
 def list_scenarios(as_json: bool) -> None:
-    """List the scenarios that `fly` knows.
+    """List the scenarios of `sitl-replay fly`.
 
     Example: sitl-replay list
     """
@@ -275,9 +279,9 @@ def list_scenarios(as_json: bool) -> None:
 
 
 def frames_of(logs: Sequence[Path], tally: player.Tally) -> Iterator[Frame]:
-    """The frames of logs, merged by time; what is not usable in it is counted.
+    """The frames of the logs, merged by time; unusable data is counted.
 
-    Reads as far as the first one, so that a bad log is reported at once.
+    Reads up to the first frame, so that an unreadable log is reported at once.
     """
     from companion.recording.reader import LogError, read_flight
 
@@ -303,7 +307,7 @@ def _frames_among(events: Iterable[Event], tally: player.Tally) -> Iterator[Fram
 
 
 def run(work: Coroutine[Any, Any, object], count: player.Tally | recorder.Heard) -> None:
-    """Run to the end, or to SIGINT or SIGTERM; an error is one line and a non-zero exit code."""
+    """Run until the end, SIGINT or SIGTERM. An error prints one line and exits non-zero."""
     asyncio.run(_until_signal(work, count))
 
 
@@ -316,7 +320,7 @@ async def _until_signal(
         loop.add_signal_handler(known, task.cancel)
     progress = asyncio.ensure_future(_progress(count)) if sys.stderr.isatty() else None
     try:
-        # Only the handlers above cancel the task, and then it did what was asked.
+        # Only the handlers above cancel the task: a requested end.
         with contextlib.suppress(asyncio.CancelledError):
             await task
     finally:
@@ -332,7 +336,7 @@ async def _progress(count: player.Tally | recorder.Heard) -> None:
 
 
 def conclude(count: player.Tally | recorder.Heard, done: str, as_json: bool) -> None:
-    """Print the summary; exit with 1 when a link was lost on the way."""
+    """Print the summary. Exits with 1 if a link was lost during the run."""
     if as_json:
         click.echo(json.dumps(summary_of(count)))
     else:

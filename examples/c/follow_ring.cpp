@@ -1,5 +1,5 @@
-// Follows the ring in shared memory and says at its end how many records came, how many were lost,
-// and the time from the making of weights to their arrival here.
+// Follows the ring in shared memory. At its end, prints the number of records, the number of lost
+// records, and the time from the computation of the weights to their arrival here.
 //
 //     g++ -O2 -std=c++11 -o follow_ring follow_ring.cpp && ./follow_ring /dev/shm/uav-beams
 #include <algorithm>

@@ -1,4 +1,4 @@
-/* Reads the records of weights that companion pushes ([records] in its settings): datagrams, and a
+/* Reads the records of weights that companion sends ([records] in its settings): datagrams, and a
  * ring in shared memory. C99 and C++11, one header, no library. Little-endian machines only.
  *
  * A record is a header, an entry for each beam, and the weights (complex64: float real, float
@@ -24,12 +24,12 @@ extern "C" {
 
 enum uavb_error {
     UAVB_OK = 0,
-    UAVB_SHORT = -1,    /* fewer bytes than the record says */
-    UAVB_FOREIGN = -2,  /* no record */
-    UAVB_NEWER = -3,    /* a version or weights that this header does not know */
-    UAVB_DAMAGED = -4,  /* its checksum or its offsets are wrong */
+    UAVB_SHORT = -1,    /* fewer bytes than the record has */
+    UAVB_FOREIGN = -2,  /* not a record */
+    UAVB_NEWER = -3,    /* unknown version, or unknown type of weights */
+    UAVB_DAMAGED = -4,  /* wrong checksum or offsets */
     UAVB_NOTHING = -5,  /* the ring has no newer record */
-    UAVB_ENDED = -6     /* nothing newer, and its writer has ended: open it anew */
+    UAVB_ENDED = -6     /* no newer record, and its writer has ended: open it again */
 };
 
 struct uavb_header {
@@ -50,7 +50,7 @@ struct uavb_beam {
     double range_m, pointing_bound_rad, gain_db, guaranteed_gain_db;
 };
 
-/* A record that was checked: pointers into the caller's bytes, which must be aligned to 8. */
+/* A valid record: pointers into the caller's bytes, which must be aligned to 8. */
 struct uavb_record {
     const struct uavb_header *header;
     const unsigned char *bytes;
@@ -72,7 +72,7 @@ static inline uint32_t uavb_crc32(const unsigned char *bytes, size_t size)
     return ~crc;
 }
 
-/* Check the `size` bytes at `bytes`, and make `record` point into them. */
+/* Check `size` bytes at `bytes`, and make `record` point into them. */
 static inline int uavb_parse(const void *bytes, size_t size, struct uavb_record *record)
 {
     const struct uavb_header *h = (const struct uavb_header *)bytes;
@@ -104,7 +104,7 @@ static inline const struct uavb_beam *uavb_beam_of(const struct uavb_record *rec
     return (const struct uavb_beam *)(record->bytes + h->beams_at + (size_t)n * h->beam_bytes);
 }
 
-/* Weights of beam n: 2 * elements floats, real and imaginary by turns. */
+/* Weights of beam n: 2 * elements floats, real and imaginary parts alternating. */
 static inline const float *uavb_weights_of(const struct uavb_record *record, uint32_t n)
 {
     const struct uavb_header *h = record->header;
@@ -117,8 +117,8 @@ struct uavb_ring {
     const unsigned char *map;
     size_t size;
     uint32_t slots, slot_bytes;
-    uint64_t next; /* number of the record to be read next */
-    uint64_t lost; /* records that were overwritten before they were read */
+    uint64_t next; /* number of the next record to read */
+    uint64_t lost; /* records overwritten before they were read */
 };
 
 static inline uint64_t uavb_load(const unsigned char *at)
@@ -126,7 +126,7 @@ static inline uint64_t uavb_load(const unsigned char *at)
     return __atomic_load_n((const uint64_t *)(const void *)at, __ATOMIC_ACQUIRE);
 }
 
-/* Open a ring, to follow it from its newest record on. */
+/* Open a ring, starting at its newest record. */
 static inline int uavb_ring_open(struct uavb_ring *ring, const char *path)
 {
     struct stat found;
@@ -182,19 +182,19 @@ static inline int uavb_ring_next(struct uavb_ring *ring, void *to, struct uavb_r
                 }
             }
         }
-        if (uavb_load(slot) > wanted) { /* overwritten: go on where the writer will not be soon */
+        if (uavb_load(slot) > wanted) { /* overwritten: skip to half a ring behind the writer */
             written = uavb_load(ring->map + 24);
             wanted = written - ring->slots / 2;
             ring->lost += wanted - ring->next;
             ring->next = wanted;
         }
     }
-    ring->next++; /* it stays as it is: nobody writes it any more */
+    ring->next++; /* it does not change any more: no writer */
     ring->lost++;
     return UAVB_DAMAGED;
 }
 
-/* Go to the newest record, leaving out those between. */
+/* Skip to the newest record. */
 static inline void uavb_ring_newest(struct uavb_ring *ring)
 {
     uint64_t written = uavb_load(ring->map + 24);

@@ -1,11 +1,11 @@
 #!/bin/sh
-# Certificates to test with: an authority of one's own, and one certificate for each name.
+# Test certificates: a certificate authority, and one certificate per name.
 #
 #     sh make_certificates.sh DIR NAME...
 #
-# makes DIR/ca.pem, DIR/NAME.pem and DIR/NAME.key. A NAME is that of a node, its common name, by
-# which access-control.json5 knows it. ADDRESSES are where it may be reached under its certificate,
-# as openssl writes them. For the field: keep ca.key on no node.
+# makes DIR/ca.pem, DIR/NAME.pem and DIR/NAME.key. NAME is the name of a node, the common name of
+# its certificate, as used in access-control.json5. ADDRESSES are the addresses that the certificate
+# is valid for, in the syntax of openssl. In the field, do not store ca.key on any node.
 set -eu
 DIR=$1
 shift

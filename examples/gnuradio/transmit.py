@@ -1,9 +1,9 @@
-"""Samples of UAVs in, samples of elements out: a flowgraph about the block of ``uav_beams``.
+"""A flowgraph with the block of ``uav_beams``: samples of UAVs in, samples of elements out.
 
     python3 transmit.py 9000 8 1:1 2:1 < streams.c64 > elements.c64
 
-Both are complex64 by turns, of UAVs in their order and of elements. Where a radio takes the
-samples, its sink stands in the place of the last two blocks.
+Both files are interleaved complex64: one sample per UAV in the given order, and one per element. To
+transmit by a radio, replace the last two blocks by its sink.
 """
 
 import os
@@ -18,7 +18,7 @@ class Transmit(gr.top_block):
 
     def __init__(self, port, elements, uavs, source, sink):
         gr.top_block.__init__(self, "transmit")
-        self.beams = Beams(uavs, elements, port)  # a block in Python goes with its last reference
+        self.beams = Beams(uavs, elements, port)  # keeps the Python block alive
         read = blocks.file_descriptor_source(gr.sizeof_gr_complex, source)
         write = blocks.file_descriptor_sink(gr.sizeof_gr_complex, sink)
         apart = blocks.deinterleave(gr.sizeof_gr_complex)
@@ -34,7 +34,7 @@ class Transmit(gr.top_block):
 if __name__ == "__main__":
     port, elements, *uavs = sys.argv[1:]
     samples = os.dup(1)
-    os.dup2(2, 1)  # what is said beside goes where errors go
+    os.dup2(2, 1)  # other output goes to standard error
     top = Transmit(int(port), int(elements), uavs, 0, samples)
     print("open", file=sys.stderr, flush=True)
     top.run()

@@ -1,11 +1,11 @@
-"""A GNU Radio block that sends each UAV's stream by its newest beam.
+"""A GNU Radio block that sends the stream of each UAV with its newest beam.
 
     beams = Beams(["1:1", "2:1"], elements=8, port=9000)      # [records] udp = ["127.0.0.1:9000"]
 
-Stream n in is for UAV n; stream m out is for element m: y_m = sum_n w_nm x_n, as the service has
-its weights (no conjugate). Each call of its work takes the records that have come, and uses the
-newest for all of its samples. A UAV without a beam is silent, and so are all once no record has
-come for ``stale_s``. For GNU Radio 3.10; needs numpy, and nothing of the service.
+Input n is for UAV n, output m for element m: y_m = sum_n w_nm x_n, with the weights of the service
+(no conjugate). Each call of ``work`` reads the records that have arrived, and uses the newest for
+all its samples. Nothing is sent for a UAV without a beam, and nothing at all if no record has
+arrived for ``stale_s``. For GNU Radio 3.10; needs numpy, and nothing from the service.
 """
 
 import socket
@@ -21,7 +21,7 @@ NAME_BYTES = 72
 
 
 class Beams(gr.sync_block):
-    """As many streams of samples in as UAVs, as many out as elements."""
+    """One input per UAV, one output per element."""
 
     def __init__(self, uavs, elements, port, host="127.0.0.1", stale_s=1.0):
         gr.sync_block.__init__(
@@ -37,7 +37,7 @@ class Beams(gr.sync_block):
         self._socket.setblocking(False)
 
     def work(self, input_items, output_items):
-        """Multiply what has come."""
+        """Multiply the samples by the weights."""
         self._hear()
         if time.monotonic() - self._heard_s > self._stale_s:
             self._weights[:] = 0
@@ -47,7 +47,7 @@ class Beams(gr.sync_block):
         return len(output_items[0])
 
     def stop(self):
-        """Let go of the port."""
+        """Close the socket."""
         self._socket.close()
         return True
 
@@ -60,7 +60,7 @@ class Beams(gr.sync_block):
             self._take(record)
 
     def _take(self, record):
-        """Use a record; what is none, or is for another array, is left alone."""
+        """Use a record; ignore invalid ones, and those of another array."""
         if len(record) < HEADER.size:
             return
         magic, version, size, crc, _, sequence, _, _, *rest = HEADER.unpack_from(record)

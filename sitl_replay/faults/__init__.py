@@ -1,1 +1,1 @@
-"""Faults that traffic is given on demand, seeded: pure functions of a stream of frames."""
+"""Faults to inject into traffic, with a seed: pure functions of a stream of frames."""

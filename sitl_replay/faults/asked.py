@@ -1,8 +1,8 @@
 """Requested faults: the values of ``--fault``. Pure.
 
-A fault is written ``NAME=VALUE``, or ``NAME@SYSID=VALUE`` and ``NAME@SYSID:COMPID=VALUE`` for the
-frames of one system or component alone. ``KINDS`` holds all of them, in the order in which they are
-applied, whatever the order in which they are given. ``traffic`` applies them.
+Syntax: ``NAME=VALUE``, or for one system or component ``NAME@SYSID=VALUE`` or
+``NAME@SYSID:COMPID=VALUE``. ``KINDS`` lists all kinds in the order of application, which does not
+depend on the order of the options. ``traffic`` applies them.
 """
 
 import math
@@ -18,26 +18,23 @@ Sender = tuple[int, int]  # system and component id
 
 
 class FaultError(UserError):
-    """A request for a fault that is not possible.
-
-    The message is one line: what was written, what is allowed.
-    """
+    """An invalid fault request. The message is one line, with what is allowed."""
 
 
 class Bound(NamedTuple):
     """One number of a fault's value.
 
-    low, high  its limits, both allowed
+    low, high  limits, inclusive
     """
 
-    letter: str  # its letter in the help
+    letter: str  # placeholder in the help
     low: float
     high: float
-    default: float | None = None  # its value where it is left out; None: it is required
-    whole: bool = False  # it must be a whole number
+    default: float | None = None  # value if it is omitted; None: required
+    whole: bool = False  # only whole numbers
 
     def read(self, text: str) -> float:
-        """The number in ``text``. Raises ``FaultError`` where it is not within the limits."""
+        """Parse ``text``. Raises ``FaultError`` if it is not a number within the limits."""
         try:
             number = float(text)
         except ValueError:
@@ -49,7 +46,7 @@ class Bound(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """A kind of fault. ``is_event``: it may be given several times."""
+    """A kind of fault. ``is_event``: can be given several times for the same frames."""
 
     name: str
     bounds: tuple[Bound, ...]
@@ -59,7 +56,7 @@ class Kind(NamedTuple):
 
     @property
     def form(self) -> str:
-        """Its written form, such as ``glitch=T:M[:N]``."""
+        """The syntax, such as ``glitch=T:M[:N]``."""
         letters = [bound.letter for bound in self.bounds if bound.default is None]
         optional = [f"[:{bound.letter}]" for bound in self.bounds if bound.default is not None]
         return f"{self.name}={':'.join(letters)}{''.join(optional)}"
@@ -74,20 +71,20 @@ KINDS: Final = {
         Kind(
             name="drift",
             bounds=(Bound(letter="PPM", low=-500_000.0, high=500_000.0),),
-            meaning="boot clocks run fast by PPM millionths, or slow if negative: time_boot_ms",
+            meaning="boot clocks (time_boot_ms) gain PPM parts per million (negative: lose)",
             example="drift=-24000",
         ),
         Kind(
             name="reboot",
             bounds=(_FROM,),
-            meaning="at T s boot clocks (time_boot_ms) and sequence numbers start again at 0",
+            meaning="at T s boot clocks (time_boot_ms) and sequence numbers restart at 0",
             example="reboot=20",
             is_event=True,
         ),
         Kind(
             name="frozen",
             bounds=(_FROM, Bound(letter="S", low=0.0, high=1e6)),
-            meaning="from T s on, for S s, GLOBAL_POSITION_INT repeats the position before",
+            meaning="from T s on, for S s, GLOBAL_POSITION_INT repeats the last position",
             example="frozen@3:1=20:5",
             is_event=True,
         ),
@@ -98,8 +95,7 @@ KINDS: Final = {
                 Bound(letter="M", low=0.0, high=100_000.0),
                 Bound(letter="N", low=1.0, high=1e6, default=1.0, whole=True),
             ),
-            meaning="from T s on, N reports (1) of GLOBAL_POSITION_INT are M metres beside the"
-            " place",
+            meaning="from T s on, the next N GLOBAL_POSITION_INT (default 1) are M metres off",
             example="glitch=30:25:4",
             is_event=True,
         ),
@@ -112,20 +108,20 @@ KINDS: Final = {
         Kind(
             name="duplication",
             bounds=(_SHARE,),
-            meaning="with probability P it comes again, 0 to 0.2 s later",
+            meaning="with probability P a frame arrives again, 0 to 0.2 s later",
             example="duplication=0.5",
         ),
         Kind(
             name="delay",
             bounds=(Bound(letter="S", low=0.0, high=600.0),),
-            meaning="every frame is late by S s",
+            meaning="every frame is delayed by S s",
             example="delay=0.3",
         ),
         Kind(
             name="jitter",
             bounds=(Bound(letter="S", low=0.0, high=60.0),),
-            meaning="and by a random time, exponential with mean S s; a sender's frames keep"
-            " their order, so those behind a later one wait",
+            meaning="every frame is delayed by a random time, exponential with mean S s; the frames"
+            " of one sender stay in order",
             example="jitter=0.05",
         ),
         Kind(
@@ -134,20 +130,20 @@ KINDS: Final = {
                 Bound(letter="P", low=0.0, high=0.95),
                 Bound(letter="S", low=0.001, high=600.0),
             ),
-            meaning="the link is shut for S s at a time, on average a share P of all time; what"
-            " would come meanwhile comes at once when it opens",
+            meaning="the link is blocked for S s at a time, on average for a share P of the time;"
+            " frames of that time arrive together at its end",
             example="burst=0.3:2",
         ),
         Kind(
             name="reordering",
             bounds=(_SHARE,),
-            meaning="with probability P a frame is overtaken by those 0 to 0.2 s behind",
+            meaning="with probability P a frame is held 0 to 0.2 s and overtaken by later ones",
             example="reordering=0.1",
         ),
         Kind(
             name="bit-errors",
             bounds=(Bound(letter="P", low=0.0, high=0.5),),
-            meaning="every bit is inverted with probability P",
+            meaning="every bit flips with probability P",
             example="bit-errors=1e-5",
         ),
         Kind(
@@ -159,19 +155,19 @@ KINDS: Final = {
         Kind(
             name="garbage",
             bounds=(_SHARE,),
-            meaning="with probability P, 1 to 64 random bytes come before a frame",
+            meaning="with probability P, 1 to 64 random bytes precede a frame",
             example="garbage=0.01",
         ),
     )
 }
-"""All kinds of faults by name, in the order in which they are applied."""
+"""All kinds of faults by name, in the order of application."""
 
 _ORDER: Final = {name: place for place, name in enumerate(KINDS)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """One fault: its name, its numbers, and whose frames it concerns (None: everybody's)."""
+    """One fault: name, numbers, and the system and component it applies to (None: all)."""
 
     name: str
     values: tuple[float, ...]
@@ -179,15 +175,15 @@ class Fault:
     compid: int | None = None
 
     def __str__(self) -> str:
-        """The name and whose frames, as they were written: ``frozen@3:1``."""
+        """The name and the system, as in ``frozen@3:1``."""
         system = "" if self.sysid is None else f"@{self.sysid}"
         return f"{self.name}{system}" + ("" if self.compid is None else f":{self.compid}")
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Read a fault.
+        """Parse a fault.
 
-        Raises ``FaultError``, which says what is wrong with it and what is allowed.
+        Raises ``FaultError`` with the cause and what is allowed.
         """
         left, _, value = text.partition("=")
         name, at, system = left.partition("@")
@@ -197,40 +193,40 @@ class Fault:
         numbers = value.split(":")
         required = sum(bound.default is None for bound in kind.bounds)
         if not required <= len(numbers) <= len(kind.bounds):
-            raise FaultError(f"{text!r} is not {kind.form}, as in {kind.example}")
+            raise FaultError(f"{text!r} is not {kind.form}, for example {kind.example}")
         try:
             sysid, compid = _system(system) if at else (None, None)
             given = [
                 bound.read(number) for bound, number in zip(kind.bounds, numbers, strict=False)
             ]
         except FaultError as error:
-            raise FaultError(f"{text!r}: {error}, as in {kind.example}") from None
+            raise FaultError(f"{text!r}: {error}; for example {kind.example}") from None
         defaults = [b.default for b in kind.bounds[len(given) :] if b.default is not None]
         return cls(name=name, values=(*given, *defaults), sysid=sysid, compid=compid)
 
     def concerns(self, sender: Sender) -> bool:
-        """Whether the fault concerns the frames of this system and component."""
+        """Whether the fault applies to the frames of this system and component."""
         if self.sysid is None:
             return True
         return self.sysid == sender[0] and self.compid in (None, sender[1])
 
 
 def in_order(faults: Sequence[Fault]) -> list[Fault]:
-    """The faults in the order in which they are applied.
+    """The faults in the order of application.
 
-    Raises ``FaultError`` where one that is no event is given twice for the same frames.
+    Raises ``FaultError`` if a fault that is not an event is given twice for the same frames.
     """
     given = Counter(str(fault) for fault in faults if not KINDS[fault.name].is_event)
     for label, times in given.items():
         if times > 1:
-            raise FaultError(f"{label} is given {times} times, allowed: once for the same system")
+            raise FaultError(f"{label} is given {times} times; allowed: once per system")
     whose = ((_ORDER[f.name], f.sysid or 0, f.compid or 0, f.values) for f in faults)
     return [fault for _, fault in sorted(zip(whose, faults, strict=True), key=lambda pair: pair[0])]
 
 
 def described() -> str:
-    """All faults for a help text, one paragraph each, in the order of application."""
-    return "\n\n".join(f"{k.form}: {k.meaning}. As in {k.example}" for k in KINDS.values())
+    """Help text of all faults, a paragraph each, in the order of application."""
+    return "\n\n".join(f"{k.form}: {k.meaning}. Example: {k.example}" for k in KINDS.values())
 
 
 def _system(text: str) -> tuple[int, int | None]:

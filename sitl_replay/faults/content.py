@@ -1,9 +1,9 @@
-"""Faults of the senders themselves: frames are rewritten, with a right checksum. Pure.
+"""Faults of senders: frames are rewritten, with a valid checksum. Pure.
 
-Field offsets are those of https://mavlink.io/en/messages/common.html in the order of the wire
-(https://mavlink.io/en/guide/serialization.html: by size, the largest first; trailing zeros of a
-MAVLink 2 payload are cut). A frame that a fault leaves as it is keeps its very bytes. A signed
-frame that is rewritten loses its signature: whoever changes a frame on the way has no key.
+Field offsets follow https://mavlink.io/en/messages/common.html in wire order
+(https://mavlink.io/en/guide/serialization.html: largest first; trailing zeros of a MAVLink 2
+payload are truncated). A frame that a fault does not change keeps its bytes. A rewritten frame
+loses its signature, since there is no key to sign it again.
 """
 
 import random
@@ -28,7 +28,7 @@ TIME_BOOT_MS_AT: Final[dict[int, int]] = {
     60051: 0, 60052: 0, 60053: 0,
 }
 # fmt: on
-"""Offset in a message's payload of ``time_boot_ms``, milliseconds since boot, 32 bits."""
+"""Offset of ``time_boot_ms`` (milliseconds since boot, 32 bits) in the payload, by message id."""
 
 _POSITION_AT: Final = 4
 _POSITION: Final = struct.Struct("<iiii")  # lat, lon (degE7), alt, relative_alt (mm)
@@ -51,9 +51,9 @@ def seq_of(raw: bytes) -> int:
 
 
 def payload_of(raw: bytes, size: int) -> bytes:
-    """The first ``size`` bytes of the payload; zeros that MAVLink 2 has cut are put back.
+    """The first ``size`` bytes of the payload, with the zeros that MAVLink 2 truncates.
 
-    Shorter where a MAVLink 1 frame, which cuts nothing, is shorter.
+    Shorter if the payload of a MAVLink 1 frame is shorter.
     """
     if raw[0] != MAGIC_V2:
         return raw[6 : 6 + min(raw[1], size)]
@@ -61,11 +61,11 @@ def payload_of(raw: bytes, size: int) -> bytes:
 
 
 def rewritten(raw: bytes, at: int = 0, field: bytes = b"", seq: int | None = None) -> bytes:
-    """The frame with ``field`` at offset ``at`` of its payload, and ``seq`` (None: as it is).
+    """The frame with ``field`` at offset ``at`` of its payload, and with ``seq`` (None: unchanged).
 
-    Its checksum is computed anew and a signature removed. The frame is returned as it is where that
-    changes nothing, where the message is not known (there is no checksum for it), and where a
-    MAVLink 1 payload does not reach that far.
+    The checksum is recomputed and the signature removed. Returns the same frame if nothing changes,
+    if the message is unknown (so that there is no checksum), or if a MAVLink 1 payload is too
+    short.
     """
     stop = at + len(field)
     before, msgid = payload_of(raw, stop), msgid_of(raw)
@@ -75,7 +75,7 @@ def rewritten(raw: bytes, at: int = 0, field: bytes = b"", seq: int | None = Non
         return raw
     if raw[0] == MAGIC_V2:
         payload = before[:at] + field + raw[10 + stop : 10 + raw[1]]
-        payload = payload[:1] + payload[1:].rstrip(b"\0")  # the first byte is never cut
+        payload = payload[:1] + payload[1:].rstrip(b"\0")  # the first byte is never truncated
         head = bytes([len(payload), raw[2] & ~SIGNED, raw[3], seq]) + raw[5:10]
     else:
         payload = before[:at] + field + raw[6 + stop : 6 + raw[1]]
@@ -85,7 +85,7 @@ def rewritten(raw: bytes, at: int = 0, field: bytes = b"", seq: int | None = Non
 
 
 def boot_ms_of(raw: bytes) -> int | None:
-    """``time_boot_ms`` of a frame; None where its message has none."""
+    """``time_boot_ms`` of a frame; None if its message has none."""
     at = TIME_BOOT_MS_AT.get(msgid_of(raw))
     if at is None:
         return None
@@ -94,20 +94,20 @@ def boot_ms_of(raw: bytes) -> int | None:
 
 
 def with_boot_ms(raw: bytes, boot_ms: int) -> bytes:
-    """The frame with another ``time_boot_ms``, modulo 2³². Only for a message that has one."""
+    """The frame with another ``time_boot_ms``, modulo 2³². Only for messages with that field."""
     return rewritten(
         raw, TIME_BOOT_MS_AT[msgid_of(raw)], (boot_ms % _WRAP_MS).to_bytes(4, "little")
     )
 
 
 class Drift:
-    """Makes the boot clock run fast by ``ppm`` millionths since its boot (negative: slow)."""
+    """Makes the boot clock fast by ``ppm`` parts per million since boot (negative: slow)."""
 
     def __init__(self, ppm: float) -> None:
         self._ppm = ppm
 
     def __call__(self, t_s: float, raw: bytes) -> bytes:
-        """The frame as its sender sends it at ``t_s``."""
+        """The frame as sent at ``t_s``."""
         boot_ms = boot_ms_of(raw)
         return (
             raw
@@ -117,11 +117,11 @@ class Drift:
 
 
 class Reboot:
-    """Sets every sender's boot clock to 0 at ``at_s``; its next frame has sequence number 0.
+    """Restarts every sender's boot clock at 0 at ``at_s``; its next frame has sequence number 0.
 
-    The time of the reboot on a sender's own clock is told by its first stamp from then on, as if
-    that had arrived at once. A frame with an older stamp is late, of the boot before: its stamp
-    stays.
+    The time of the reboot on a sender's clock is computed from its first time stamp after ``at_s``,
+    assuming no delay. A frame with an older time stamp belongs to the previous boot: its time stamp
+    is kept.
     """
 
     def __init__(self, at_s: float) -> None:
@@ -130,7 +130,7 @@ class Reboot:
         self._booted_ms: dict[Sender, int] = {}
 
     def __call__(self, t_s: float, raw: bytes) -> bytes:
-        """The frame as its sender sends it at ``t_s``."""
+        """The frame as sent at ``t_s``."""
         if t_s < self._at_s:
             return raw
         sender, boot_ms = sender_of(raw), boot_ms_of(raw)
@@ -146,9 +146,8 @@ class Reboot:
 class Frozen:
     """Makes GLOBAL_POSITION_INT repeat a sender's last position, from ``at_s`` for ``lasts_s``.
 
-    Latitude, longitude and both altitudes are repeated; stamps go on, and velocity and heading are
-    as they are. Where a sender has reported none before ``at_s``, its first one from then on is
-    repeated.
+    Latitude, longitude and both altitudes are repeated; time stamps, velocity and heading are
+    unchanged. If a sender has no report before ``at_s``, its first one after that is repeated.
     """
 
     def __init__(self, at_s: float, lasts_s: float) -> None:
@@ -157,7 +156,7 @@ class Frozen:
         self._positions: dict[Sender, bytes] = {}
 
     def __call__(self, t_s: float, raw: bytes) -> bytes:
-        """The frame as its sender sends it at ``t_s``."""
+        """The frame as sent at ``t_s``."""
         if t_s >= self._end_s or (position := _position_of(raw)) is None:
             return raw
         if t_s < self._at_s:
@@ -167,10 +166,10 @@ class Frozen:
 
 
 class Glitch:
-    """Puts ``reports`` GLOBAL_POSITION_INT of each sender ``metres`` off, from ``at_s`` on.
+    """Displaces ``reports`` GLOBAL_POSITION_INT of each sender by ``metres``, from ``at_s`` on.
 
-    The offset is along the ground, in a direction that ``seed`` and the sender's ids decide, the
-    same for all of them; the altitudes are as they are.
+    The offset is horizontal, in one direction per sender that depends on ``seed`` and the sender's
+    ids; altitudes are unchanged.
     """
 
     def __init__(self, *, at_s: float, metres: float, reports: int, seed: str) -> None:
@@ -181,7 +180,7 @@ class Glitch:
         self._done: dict[Sender, int] = {}
 
     def __call__(self, t_s: float, raw: bytes) -> bytes:
-        """The frame as its sender sends it at ``t_s``."""
+        """The frame as sent at ``t_s``."""
         if t_s < self._at_s or (position := _position_of(raw)) is None:
             return raw
         sender = sender_of(raw)
@@ -203,7 +202,7 @@ ContentFault = Drift | Reboot | Frozen | Glitch
 
 
 def _position_of(raw: bytes) -> bytes | None:
-    """The position fields of a GLOBAL_POSITION_INT as on the wire; None for other messages."""
+    """The encoded position fields of a GLOBAL_POSITION_INT; None for other messages."""
     if msgid_of(raw) != GLOBAL_POSITION_INT:
         return None
     field = payload_of(raw, _POSITION_AT + _POSITION.size)[_POSITION_AT:]

@@ -1,7 +1,7 @@
-"""Faults of one link: frames lost, late, doubled, reordered, damaged. Pure.
+"""Faults of one link: frames lost, delayed, duplicated, reordered, corrupted. Pure.
 
-Each fault has a random stream of its own: what is lost does not depend on what else is given. A
-fault with a larger share also hits all the frames that it hits with a smaller one.
+Each fault has its own random stream: its effect does not depend on other faults. With a larger
+share, a fault affects the same frames as with a smaller one, and more.
 """
 
 import math
@@ -12,9 +12,9 @@ from typing import Final
 from sitl_replay.faults.asked import Sender
 
 WITHIN_S: Final = 0.2
-"""Longest time by which a duplicate, or a frame that others overtake, comes later."""
+"""Maximum delay of a duplicate or of a reordered frame."""
 LONGEST_JITTER: Final = 10.0
-"""Multiple of the mean at which exponential draws are cut (1 in 22 000 is)."""
+"""Limit of exponential draws, as a multiple of the mean (1 in 22 000 is limited)."""
 MOST_GARBAGE_BYTES: Final = 64
 _NEVER: Final = 1 << 60
 
@@ -32,14 +32,14 @@ class Loss:
 
 
 class Duplication:
-    """Doubles a frame with probability ``share``: it comes again 0 to 0.2 s later."""
+    """Duplicates a frame with probability ``share``: the copy arrives 0 to 0.2 s later."""
 
     def __init__(self, rng: random.Random, share: float) -> None:
         self._rng = rng
         self._share = share
 
     def lag_s(self) -> float | None:
-        """How long after the next frame its copy comes; None where there is none."""
+        """Delay of the copy of the next frame; None: no copy."""
         chance, lag_s = self._rng.random(), self._rng.uniform(0.0, WITHIN_S)
         return lag_s if chance < self._share else None
 
@@ -51,16 +51,16 @@ class Delay:
         self._delay_s = delay_s
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
-        """When a frame goes on that came to the link at ``now_s`` and to this stage at ``t_s``."""
+        """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
         return t_s + self._delay_s
 
 
 class Jitter:
     """Delays every frame by a random time, exponential with mean ``mean_s``.
 
-    The frames of one sender keep their order: one behind a later one waits for it. Where a sender's
-    frames are closer than ``mean_s``, most are therefore later than that: at r frames a second
-    about mean_s·ln(r·mean_s / ln 2) in the median, spread as before.
+    The frames of one sender stay in order: a frame waits for a delayed one before it. If a sender's
+    frames are closer than ``mean_s``, most are therefore delayed by more than that: at r frames per
+    second the median is about mean_s·ln(r·mean_s / ln 2), with the same spread.
     """
 
     def __init__(self, rng: random.Random, mean_s: float) -> None:
@@ -69,7 +69,7 @@ class Jitter:
         self._last_s: dict[Sender, float] = {}
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
-        """When a frame goes on that came to the link at ``now_s`` and to this stage at ``t_s``."""
+        """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
         late_s = self._mean_s * min(self._rng.expovariate(1.0), LONGEST_JITTER)
         released_s = max(t_s + late_s, self._last_s.get(sender, t_s))
         self._last_s[sender] = released_s
@@ -77,10 +77,10 @@ class Jitter:
 
 
 class Burst:
-    """Shuts the link for ``shut_s`` at a time, on average a share ``share`` of all time.
+    """Blocks the link for ``shut_s`` at a time, on average for a share ``share`` of the time.
 
-    It starts open; how long it is open is exponential. What would come while it is shut comes all
-    at once when it opens, in order. Times asked for may step back, not behind ``now_s``.
+    It starts open, and is open for exponentially distributed times. Frames of a blocked time arrive
+    together at its end, in order. ``t_s`` may decrease, but not below ``now_s``.
     """
 
     def __init__(self, rng: random.Random, share: float, shut_s: float) -> None:
@@ -91,7 +91,7 @@ class Burst:
         self._next_s = self._opening_s()
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
-        """When a frame goes on that came to the link at ``now_s`` and to this stage at ``t_s``."""
+        """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
         while self._shuts_s and self._shuts_s[0] + self._shut_s <= now_s:
             del self._shuts_s[0]
         while self._next_s <= t_s:
@@ -105,14 +105,14 @@ class Burst:
 
 
 class Reordering:
-    """Holds a frame 0 to 0.2 s with probability ``share``, while what follows overtakes it."""
+    """Holds a frame for 0 to 0.2 s with probability ``share``, so that later ones overtake it."""
 
     def __init__(self, rng: random.Random, share: float) -> None:
         self._rng = rng
         self._share = share
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
-        """When a frame goes on that came to the link at ``now_s`` and to this stage at ``t_s``."""
+        """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
         chance, held_s = self._rng.random(), self._rng.uniform(0.0, WITHIN_S)
         return t_s + held_s if chance < self._share else t_s
 
@@ -126,7 +126,7 @@ class BitErrors:
         self._good_bits = self._run()
 
     def damaged(self, raw: bytes) -> bytes:
-        """The bytes as they arrive."""
+        """The bytes that arrive."""
         bits = 8 * len(raw)
         if self._good_bits >= bits:
             self._good_bits -= bits
@@ -147,27 +147,27 @@ class BitErrors:
 
 
 class Truncation:
-    """Cuts a frame short with probability ``share``: 1 byte to all but one are left of it."""
+    """Truncates a frame with probability ``share``: at least 1 byte is kept, at least 1 removed."""
 
     def __init__(self, rng: random.Random, share: float) -> None:
         self._rng = rng
         self._share = share
 
     def damaged(self, raw: bytes) -> bytes:
-        """The bytes as they arrive."""
+        """The bytes that arrive."""
         chance, place = self._rng.random(), self._rng.random()
         return raw[: 1 + int(place * (len(raw) - 1))] if chance < self._share else raw
 
 
 class Garbage:
-    """Puts 1 to 64 random bytes just before a frame with probability ``share``."""
+    """Inserts 1 to 64 random bytes before a frame with probability ``share``."""
 
     def __init__(self, rng: random.Random, share: float) -> None:
         self._rng = rng
         self._share = share
 
     def noise(self) -> bytes:
-        """The bytes that come before the next frame; often none."""
+        """The bytes to insert before the next frame; may be empty."""
         chance, key = self._rng.random(), self._rng.random()
         if chance >= self._share:
             return b""

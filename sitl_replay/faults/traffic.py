@@ -1,10 +1,9 @@
 """Applies the requested faults to a stream of frames. Pure.
 
-Time is seconds since the start of the stream. First come the faults of the senders themselves
-(``Senders``), the same on every link, since a UAV cannot be frozen on one link only. Then, on every
-link by itself with random streams of its own (``Network``): what is lost and what comes twice, then
-when it comes, then what is damaged. The same faults, seed and frames give the same bytes at the
-same times.
+Time is seconds since the start of the stream. The faults of senders (``Senders``) come first and
+are the same on every link. Then each link applies its faults with its own random streams
+(``Network``): loss and duplication, then delays, then corruption. The same faults, seed and frames
+give the same bytes at the same times.
 """
 
 import heapq
@@ -29,16 +28,16 @@ from sitl_replay.faults.link import (
     Truncation,
 )
 
-HELD_MAX: Final = 100_000  # frames on their way at most, over all links; further ones are lost
-OVERFLOW: Final = "overflow"  # name under which those lost frames are counted
+HELD_MAX: Final = 100_000  # maximum of delayed frames over all links; further ones are lost
+OVERFLOW: Final = "overflow"  # name under which these are counted
 CONTENT: Final = frozenset(("drift", "reboot", "frozen", "glitch"))
-"""Faults of the senders themselves."""
+"""Names of the faults of senders."""
 
 
 class Senders:
-    """Applies the senders' faults to all frames, in the order of sending.
+    """Applies the faults of senders to all frames, in the order of sending.
 
-    ``touched`` counts the frames that each fault has changed.
+    ``touched`` counts the frames changed by each fault.
     """
 
     def __init__(self, faults: Sequence[Fault], seed: int, touched: Counter[str]) -> None:
@@ -57,7 +56,7 @@ class Senders:
 
 
 class Delivery(NamedTuple):
-    """Bytes that come out of a link at a time. ``place`` orders those of equal times."""
+    """Bytes that leave a link at a time. ``place`` is the order among equal times."""
 
     t_s: float
     place: int
@@ -66,10 +65,10 @@ class Delivery(NamedTuple):
 
 
 class Network:
-    """Applies the links' faults to all frames, in the order of sending; each link has its own luck.
+    """Applies the faults of links to all frames, in the order of sending; each link separately.
 
-    ``touched`` counts, over all links, the frames that each fault has lost, doubled, made late or
-    damaged. Times must not step back.
+    ``touched`` counts, over all links, the frames that each fault has lost, duplicated, delayed or
+    corrupted. Times must not decrease.
     """
 
     def __init__(
@@ -96,13 +95,13 @@ class Network:
                 )
 
     def due(self, until_s: float = math.inf) -> Iterator[Delivery]:
-        """Take out what arrives up to and at ``until_s``, in order of time."""
+        """Remove and yield what arrives up to and including ``until_s``, by time."""
         while self._held and self._held[0].t_s <= until_s:
             yield heapq.heappop(self._held)
 
 
 class _Link:
-    """One link's faults by their stages, each with the frames that it concerns."""
+    """The faults of one link, by stage."""
 
     def __init__(self, faults: Sequence[Fault], seed: str, touched: Counter[str]) -> None:
         effects = [(fault, _on_link(fault, random.Random(f"{seed} {fault}"))) for fault in faults]
@@ -116,7 +115,7 @@ class _Link:
         self._garbage = [(f, e) for f, e in effects if isinstance(e, Garbage)]
 
     def carry(self, now_s: float, raw: bytes) -> Iterator[tuple[float, bytes]]:
-        """What arrives of a frame sent at ``now_s``, and when."""
+        """What arrives of a frame sent at ``now_s``, with its time."""
         sender = sender_of(raw)
         for fault, loss in self._loss:
             if fault.concerns(sender) and loss.loses():
@@ -162,7 +161,7 @@ def _content(fault: Fault, seed: int) -> ContentFault:
             return Glitch(
                 at_s=at_s, metres=metres, reports=int(reports), seed=f"{seed} {fault} {at_s}"
             )
-    raise FaultError(f"{fault} with {len(fault.values)} numbers is none of a sender's")
+    raise FaultError(f"{fault} with {len(fault.values)} numbers is not a fault of senders")
 
 
 _WITH_LUCK: Final[dict[str, Callable[..., LinkFault]]] = {

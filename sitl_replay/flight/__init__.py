@@ -1,1 +1,1 @@
-"""Scenarios: who flies where and sends what, as pure functions of time."""
+"""Scenarios: paths and messages of vehicles, as pure functions of time."""

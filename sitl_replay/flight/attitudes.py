@@ -1,4 +1,4 @@
-"""Attitudes that fit a path: how a multirotor leans, how a fixed wing banks."""
+"""Attitudes along a path: the tilt of a multirotor, the bank of a fixed wing."""
 
 import math
 from dataclasses import dataclass
@@ -8,23 +8,22 @@ from sitl_replay.flight.motion import GRAVITY_MPS2, Path, Pose, body_rates
 
 @dataclass(frozen=True, slots=True)
 class Leaning:
-    """Attitude of a multirotor: its thrust, along its vertical axis, makes the acceleration.
+    """Attitude of a multirotor, whose acceleration comes from thrust along its vertical axis.
 
-    Thrust per mass is a − g. Source: R. Mahony, V. Kumar, P. Corke, "Multirotor aerial vehicles",
-    IEEE Robotics & Automation Magazine 19(3), 2012 (there: differential flatness). Drag is left
-    out.
+    Thrust per mass is a − g; drag is neglected. Source: R. Mahony, V. Kumar, P. Corke, "Multirotor
+    aerial vehicles", IEEE Robotics & Automation Magazine 19(3), 2012 (differential flatness).
     """
 
     path: Path
 
     def __call__(self, t_s: float) -> Pose:
-        """Roll and pitch by the thrust, yaw by the path's heading."""
+        """Roll and pitch from the thrust, yaw from the heading of the path."""
         now = self.path(t_s)
         north, east, down = now.acceleration_ned_mps2
         north_rate, east_rate, down_rate = now.jerk_ned_mps3
         yaw, yaw_rate = now.heading_rad, now.heading_rate_radps
         cosine, sine = math.cos(yaw), math.sin(yaw)
-        # Thrust in the level frame that turns with the nose, and its rate there.
+        # Thrust and its derivative in the level frame that rotates with the heading.
         ahead, right, below = (
             north * cosine + east * sine, east * cosine - north * sine, down - GRAVITY_MPS2
         )  # fmt: skip
@@ -50,8 +49,8 @@ class Leaning:
 class Banked:
     """Attitude of a fixed wing in level, coordinated flight: tan(bank) = airspeed · turn rate / g.
 
-    The nose points along the velocity through the air, the path's less the mean wind (m/s north and
-    east, the direction to which it blows), so it crabs; the turn rate is the nose's. ``pitch_rad``
+    Yaw is the direction of the velocity through the air: that of the path minus the mean wind (m/s
+    north and east, the direction the wind blows to). The turn rate is the yaw rate. ``pitch_rad``
     is the angle of attack. Source: the coordinated turn, e.g. R. Beard, T. McLain, Small Unmanned
     Aircraft, section 5.2.
     """
@@ -61,7 +60,7 @@ class Banked:
     pitch_rad: float
 
     def __call__(self, t_s: float) -> Pose:
-        """Roll by the turn, yaw by the nose."""
+        """Roll from the turn rate, yaw from the velocity through the air."""
         now = self.path(t_s)
         north = now.velocity_ned_mps[0] - self.wind_ne_mps[0]
         east = now.velocity_ned_mps[1] - self.wind_ne_mps[1]

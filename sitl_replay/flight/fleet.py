@@ -1,4 +1,4 @@
-"""Vehicles: who they are, how often they send, and the scenarios that they make up."""
+"""Vehicles, their message intervals, and scenarios of vehicles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -15,15 +15,15 @@ MAX_UAVS = 1000
 ORIGIN = Place(47.3977419, 8.5455938, 513.0)
 HOME_ALT_M = ORIGIN.alt_m - 25.0
 
-# System ids are 1 to 250 without the carrier's; those above are left to ground stations (255) and
-# to what else people number from the top. Once they are used up, component ids count on.
+# System ids are 1 to 250 without the carrier's; higher ones are for ground stations (255) and the
+# like. Further UAVs have the next component id.
 CARRIER_SYSID: Final = 5
 HIGHEST_SYSID: Final = 250
 UAV_SYSIDS: Final = tuple(n for n in range(1, HIGHEST_SYSID + 1) if n != CARRIER_SYSID)
 
 
 class Airframe(Enum):
-    """HEARTBEAT's account of a vehicle: its MAV_TYPE, and ArduPilot's guided mode for it."""
+    """Contents of HEARTBEAT: MAV_TYPE, and the number of ArduPilot's guided mode."""
 
     COPTER = (2, 4)
     PLANE = (1, 15)
@@ -39,20 +39,20 @@ class Airframe(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
-    """One vehicle: who it is, how it moves, and how often it sends what."""
+    """One vehicle: id, motion, and message intervals."""
 
-    source: Source  # its system and component id
+    source: Source  # system and component id
     trajectory: Callable[[float], Motion]  # position and velocity at a time
     attitude: Callable[[float], Pose]  # attitude and body rates at a time
     report_interval_s: float  # of GLOBAL_POSITION_INT
     attitude_interval_s: float  # of ATTITUDE
-    uptime_ms: int  # its boot clock when the scenario starts
+    uptime_ms: int  # boot clock at the start of the scenario
     heartbeat_interval_s: float = 1.0  # of HEARTBEAT
     gnss_interval_s: float = 0.5  # of GPS_RAW_INT
     clock_interval_s: float = 1.0  # of SYSTEM_TIME
     airframe: Airframe = Airframe.COPTER  # copter or plane
-    hears: tuple[Aircraft, ...] = ()  # the aircraft that its ADS-B receiver relays
-    twin: int = 0  # tells vehicles apart that send under one source; 0 where there is no other
+    hears: tuple[Aircraft, ...] = ()  # aircraft that its ADS-B receiver relays
+    twin: int = 0  # number among vehicles with the same source; 0: the only one
 
     @property
     def name(self) -> str:
@@ -61,9 +61,9 @@ class Vehicle:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """A carrier at ``origin`` and the UAVs about it.
+    """A carrier at ``origin`` and the UAVs around it.
 
-    ``home_alt_m`` is the height from which relative heights are measured.
+    ``home_alt_m`` is the reference of relative altitudes.
     """
 
     name: str
@@ -79,10 +79,9 @@ class Scenario:
         return (self.carrier, *self.uavs)
 
     def truth(self, uav: Source | str, t_s: float) -> tuple[Motion, ...]:
-        """True motions of everything under an id, ``3:1`` or ``icao:F00001``, at a time.
+        """True motions at a time of all vehicles with an id, ``3:1`` or ``icao:F00001``.
 
-        One motion, NED from the carrier; several where vehicles share the id; none where nobody has
-        it.
+        NED from the carrier. Several if vehicles share the id; empty if none has it.
         """
         wanted = str(uav)
         aircraft = {craft.icao: craft for one in self.vehicles for craft in one.hears}
@@ -105,18 +104,18 @@ CARRIER = Vehicle(
 
 
 def uav_source(index: int) -> Source:
-    """The id of a UAV, counted from 0: 1:1, 2:1 and so on to 250:1, then 1:2."""
+    """The id of UAV ``index`` (from 0): 1:1, 2:1 and so on to 250:1, then 1:2."""
     component, system = divmod(index, len(UAV_SYSIDS))
     return Source(UAV_SYSIDS[system], component + 1)
 
 
 def uptime_ms(index: int) -> int:
-    """The boot clock of a UAV when the scenario starts: no two booted at the same time."""
+    """The boot clock of a UAV at the start of the scenario; different for every UAV."""
     return 61_007 + 37_219 * index
 
 
 def around_carrier(name: str, description: str, uavs: tuple[Vehicle, ...]) -> Scenario:
-    """A scenario at the usual place with the usual carrier."""
+    """A scenario at the default place with the default carrier."""
     return Scenario(
         name=name,
         description=description,
@@ -128,7 +127,7 @@ def around_carrier(name: str, description: str, uavs: tuple[Vehicle, ...]) -> Sc
 
 
 def checked(uavs: int, fewest: int = 1) -> int:
-    """``uavs`` as it is. Raises ``UserError`` where it is not ``fewest`` to ``MAX_UAVS``."""
+    """Return ``uavs``. Raises ``UserError`` if it is not ``fewest`` to ``MAX_UAVS``."""
     if not fewest <= uavs <= MAX_UAVS:
-        raise UserError(f"{uavs} UAVs: {fewest} to {MAX_UAVS} can fly")
+        raise UserError(f"{uavs} UAVs; allowed: {fewest} to {MAX_UAVS}")
     return uavs

@@ -1,8 +1,8 @@
-"""One UAV of each scenario: its path, its attitude, the wind's effect on it, and what it sends.
+"""One UAV of each scenario: path, attitude, effect of the wind, and message intervals.
 
-UAVs are counted from 0; what is left to chance depends on the seed and that number alone.
+UAVs are counted from 0; random numbers depend on the seed and that number only.
 
-Over 300 lines: a function for each flight, and nothing else.
+Over 300 lines: a function for each flight.
 """
 
 import math
@@ -21,7 +21,7 @@ from sitl_replay.flight.wind import Displacement, Hold, displaced, gusts, low_al
 REPORT_INTERVALS_S: Final = (0.10, 0.15, 0.20, 0.25)
 ATTITUDE_INTERVAL_S: Final = 0.2
 
-# A copter of some kilograms and a small fixed wing, and how they hold against gusts.
+# A copter of some kilograms and a small fixed wing, and their position control in gusts.
 COPTER_LIMITS: Final = Limits(speed_mps=12.0, climb_mps=3.0, acceleration_mps2=3.0)
 COPTER_HOLD: Final = Hold(natural_radps=0.8, damping=0.8, drag_s=3.0)
 COPTER_AIRSPEED_MPS: Final = 8.0
@@ -55,7 +55,7 @@ def uav(
     attitude: Callable[[float], Pose],
     airframe: Airframe = Airframe.COPTER,
 ) -> Vehicle:
-    """A UAV that reports at one of four rates, 4 to 10 Hz."""
+    """A UAV with one of four report rates, 4 to 10 Hz."""
     return Vehicle(
         source=uav_source(index),
         trajectory=trajectory,
@@ -68,12 +68,12 @@ def uav(
 
 
 def calm(index: int, path: Path) -> Vehicle:
-    """A copter that flies a path in still air."""
+    """A copter on a path in still air."""
     return uav(index, Flight(path), Leaning(path))
 
 
 def circling(index: int, centre_m: float = 250.0) -> Vehicle:
-    """A copter in still air on a circle of 40 m, away from those of other numbers."""
+    """A copter in still air on a circle of 40 m radius, away from the others."""
     north_m, east_m = on_spiral(index, centre_m)
     return calm(
         index,
@@ -121,10 +121,10 @@ def racing(index: int, seed: int) -> Vehicle:
 
 
 def paired(index: int, *, mirrored: bool) -> Vehicle:
-    """One of a pair that swings about one azimuth, in opposite senses and at one elevation.
+    """One of a pair that swings about the same azimuth and elevation in opposite directions.
 
     Even numbers are the nearer ones. ``mirrored``: the farther one swings behind the carrier, about
-    the mirror image of that azimuth in the east-west line.
+    the azimuth mirrored in the east-west line.
     """
     pair, second = divmod(index, 2)
     shell, slot = divmod(pair, len(PAIR_AZIMUTHS_DEG))
@@ -152,10 +152,10 @@ def paired(index: int, *, mirrored: bool) -> Vehicle:
 
 
 def swarming(index: int, seed: int) -> Vehicle:
-    """One of a thousand copters, which circles in a cell of its own and sends seldom.
+    """One of a thousand copters, which circles in its own cell and sends at low rates.
 
-    Cells are 300 m wide and circles at most 90 m in radius; of the ten that share one each has a
-    layer of its own, 40 m from the next. Neighbours fill the layers evenly.
+    Cells are 300 m wide, circles at most 90 m in radius. Ten copters share a cell, in layers 40 m
+    apart. Neighbouring cells fill the layers evenly.
     """
     rng = random.Random(f"{seed} swarm {index}")
     turn, cell = divmod(index, CELLS)
@@ -257,9 +257,9 @@ def aircraft(uav_trajectory: Callable[[float], Motion]) -> tuple[Aircraft, ...]:
 
 
 def on_spiral(index: int, spacing_m: float) -> tuple[float, float]:
-    """North and east of a point on a sunflower spiral, evenly far from others of its kind.
+    """North and east of a point on a sunflower spiral, on which points are evenly spaced.
 
-    None is nearer to the carrier than 1.4 of the spacing. Source: H. Vogel, "A better way to
+    None is nearer to the carrier than 1.4 times the spacing. Source: H. Vogel, "A better way to
     construct the sunflower head", Mathematical Biosciences 44, 1979.
     """
     range_m, azimuth_rad = spacing_m * math.sqrt(index + 2.0), index * GOLDEN_ANGLE_RAD
@@ -267,7 +267,7 @@ def on_spiral(index: int, spacing_m: float) -> tuple[float, float]:
 
 
 def wind_course_rad(seed: int) -> float:
-    """Direction to which the mean wind blows: one wind for all."""
+    """Direction the mean wind blows to, the same for all UAVs."""
     return random.Random(f"{seed} wind").uniform(0.0, math.tau)
 
 
@@ -280,7 +280,7 @@ def _displacement(
 
 
 def _waypoints(rng: random.Random, centre_ned_m: Vector) -> tuple[Vector, ...]:
-    """Five or six points about a centre, none close to the next one on the map."""
+    """Five or six points around a centre, successive ones horizontally apart."""
     wanted = rng.choice((5, 6))
     north_m, east_m, down_m = centre_ned_m
     found: list[Vector] = []
@@ -298,7 +298,7 @@ def _waypoints(rng: random.Random, centre_ned_m: Vector) -> tuple[Vector, ...]:
 
 
 def _cell_centres_m() -> tuple[tuple[float, float], ...]:
-    """The cells of a grid about the carrier, without its own, from the inside out."""
+    """The cells of a grid around the carrier without its own cell, nearest first."""
     numbers = range(-5, 6)
     cells = sorted(
         ((n, e) for n in numbers for e in numbers if (n, e) != (0, 0)),

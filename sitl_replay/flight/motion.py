@@ -1,9 +1,9 @@
-"""How vehicles move: positions, velocities and attitudes as functions of time.
+"""Motion of vehicles: positions, velocities and attitudes as functions of time.
 
 Time ``t_s`` is seconds since the start of the scenario. Positions are north-east-down metres from
-the carrier, the hovering vehicle that has the antenna array. Attitudes are roll, pitch, yaw of the
-body (forward-right-down) from NED, rotated in the order yaw, pitch, roll, as MAVLink has them. A
-trajectory's velocity is the exact derivative of its position, as GLOBAL_POSITION_INT promises.
+the carrier, the hovering vehicle with the antenna array. Attitudes are roll, pitch, yaw from NED to
+body (forward-right-down), rotated in the order yaw, pitch, roll, as in MAVLink. The velocity of a
+trajectory is the exact derivative of its position, as GLOBAL_POSITION_INT requires.
 """
 
 import math
@@ -27,7 +27,7 @@ class Motion(NamedTuple):
 
 
 class Kinematics(NamedTuple):
-    """A point of a path with its derivatives, and where the nose is meant to point.
+    """A point of a path with its derivatives, and the heading.
 
     NED from the carrier: metres, m/s, m/s², m/s³; heading clockwise from north, radians.
     """
@@ -44,7 +44,7 @@ Path = Callable[[float], Kinematics]
 
 
 class Pose(NamedTuple):
-    """Attitude in radians and body rates (about forward, right, down) in rad/s."""
+    """Attitude in rad and body rates (about forward, right, down) in rad/s."""
 
     roll_rad: float
     pitch_rad: float
@@ -56,7 +56,7 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Circle:
-    """The paper's flight (docs/math.md 8.2): a clockwise circle about the carrier, with gusts.
+    """The paper's flight (docs/math.md 8.2): a clockwise circle around the carrier, with gusts.
 
     Velocity is v + d, v = Rω[cos(ωt+φ), −sin(ωt+φ)] and d = gust·Rω[cos(10ωt+φ), −sin(10ωt+φ)]
     (north, east); the position is its exact integral, centred on the carrier. ``height_m`` is above
@@ -83,7 +83,7 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class Hover:
-    """Standing still at a point, NED metres from the carrier."""
+    """A fixed point, NED metres from the carrier."""
 
     position_ned_m: Vector
 
@@ -93,10 +93,10 @@ class Hover:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sway:
-    """A level attitude with a slow sway, about a heading that is constant or turns steadily.
+    """A level attitude with slow oscillations, at a heading that is constant or turns steadily.
 
-    Roll and pitch sway by ``amplitude_rad``, yaw by half of it, with three frequencies without a
-    common period, so that no attitude repeats soon. ``phase_rad`` keeps vehicles out of step.
+    Roll and pitch oscillate by ``amplitude_rad``, yaw by half of it, at three frequencies whose
+    common period is long. ``phase_rad`` makes vehicles differ.
     """
 
     heading_rad: float = 0.0
@@ -132,13 +132,13 @@ class Sway:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """A path as it is flown: with the displacement by gusts where there are some."""
+    """A path as flown: with the displacement by gusts, if any."""
 
     path: Path
     displacement: Callable[[float], Motion] | None = None
 
     def __call__(self, t_s: float) -> Motion:
-        """Position and velocity; the one is the integral of the other."""
+        """Position, and velocity as its derivative."""
         on_path = self.path(t_s)
         position_ned_m, velocity_ned_mps = on_path.position_ned_m, on_path.velocity_ned_mps
         if self.displacement is None:

@@ -1,9 +1,9 @@
-"""Paths: tours of waypoints, racetracks, orbits, and swings in bearing about the carrier.
+"""Paths: tours of waypoints, racetracks, orbits, and swings in bearing around the carrier.
 
-Each gives position, velocity, acceleration and jerk in closed form (the roll into a racetrack's
-turn by a quadrature that is exact to rounding), so that attitudes and their rates follow exactly.
+Each gives position, velocity, acceleration and jerk in closed form (the start of a racetrack's turn
+by a quadrature exact to rounding), from which attitudes and their rates follow exactly.
 
-Over 300 lines: it is a list, a path a class, in closed form.
+Over 300 lines: a list of paths, a class each.
 """
 
 import math
@@ -20,7 +20,7 @@ STEEPEST_RAMP: Final = 1.875
 """Largest slope of ``Ramp.value``: a ramp to v in T takes an acceleration of 1.875 v / T."""
 
 _nodes, _weights = np.polynomial.legendre.leggauss(8)
-# Gauss–Legendre on 0 to 1, of order 15: a roll turns through half a radian or so.
+# Gauss–Legendre on 0 to 1, exact to degree 15; the course changes by about half a radian.
 _QUADRATURE: Final = tuple(
     (float(node + 1.0) / 2.0, float(weight) / 2.0)
     for node, weight in zip(_nodes, _weights, strict=True)
@@ -30,8 +30,8 @@ _QUADRATURE: Final = tuple(
 class Ramp(NamedTuple):
     """A smooth step from 0 to 1 over x from 0 to 1, with its integral and two derivatives.
 
-    The minimum-jerk polynomial 10x³ − 15x⁴ + 6x⁵ (T. Flash, N. Hogan, J. Neurosci. 5, 1985), here
-    for a speed or a turn rate.
+    The minimum-jerk polynomial 10x³ − 15x⁴ + 6x⁵ (T. Flash, N. Hogan, J. Neurosci. 5, 1985), used
+    here for a speed or a turn rate.
     """
 
     integral: float
@@ -53,9 +53,9 @@ class Ramp(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Leg:
-    """A straight line from stop to stop, then a stand in which the nose turns to the next one.
+    """A straight line from stop to stop, then a stop in which the heading turns to the next leg.
 
-    Speed ramps up to ``speed_mps`` within ``ramp_s``, stays and ramps down.
+    Speed ramps up to ``speed_mps`` within ``ramp_s``, is constant, and ramps down.
     """
 
     start_ned_m: Vector
@@ -95,7 +95,7 @@ class Leg:
         )
 
     def _progress(self, t_s: float) -> tuple[float, float, float, float]:
-        """Metres along the leg, and three derivatives. The end is the start played backwards."""
+        """Metres along the leg and three derivatives. The end mirrors the start in time."""
         if t_s > self.moving_s / 2.0:
             left, speed, acceleration, jerk = self._progress(self.moving_s - t_s)
             return self.length_m - left, speed, -acceleration, jerk
@@ -121,7 +121,7 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Tour:
-    """A closed round of waypoints, with a stop at each. ``ends_s``: when each leg is over."""
+    """A closed tour of waypoints, with a stop at each. ``ends_s``: end time of each leg."""
 
     legs: tuple[Leg, ...]
     ends_s: tuple[float, ...]
@@ -131,9 +131,9 @@ class Tour:
     def over(
         cls, waypoints: tuple[Vector, ...], limits: Limits, stand_s: float, offset_s: float
     ) -> Self:
-        """A tour through ``waypoints`` (NED metres, none straight above the next) and back.
+        """A tour of ``waypoints`` (NED metres, none vertically above the next) and back.
 
-        ``offset_s`` is how long it has been flying at time 0.
+        ``offset_s`` is the time into the tour at time 0.
         """
         after = (*waypoints[1:], waypoints[0])
         hops = [
@@ -147,7 +147,7 @@ class Tour:
             speed_mps = min(
                 limits.speed_mps,
                 limits.climb_mps * length_m / max(abs(down), 1e-9),
-                # So fast that the two ramps fill the leg.
+                # The speed at which the two ramps fill the leg.
                 math.sqrt(length_m * limits.acceleration_mps2 / STEEPEST_RAMP),
             )
             next_rad = headings_rad[(index + 1) % len(hops)]
@@ -166,7 +166,7 @@ class Tour:
         return cls(tuple(legs), tuple(accumulate(leg.duration_s for leg in legs)), offset_s)
 
     def __call__(self, t_s: float) -> Kinematics:
-        """The point at a time of the scenario; the tour goes on for ever."""
+        """The point at a time of the scenario; the tour repeats."""
         into_s = (t_s + self.offset_s) % self.ends_s[-1]
         index = min(bisect_right(self.ends_s, into_s), len(self.legs) - 1)
         leg = self.legs[index]
@@ -175,10 +175,10 @@ class Tour:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Racetrack:
-    """A stadium at one height and one ground speed: two straights, two half turns clockwise.
+    """A stadium at constant height and ground speed: two straights, two half turns clockwise.
 
-    The turn rate ramps up to speed / radius within ``roll_s`` and back, as an aircraft rolls in and
-    out.
+    The turn rate ramps up to speed / radius within ``roll_s``, and down again, as an aircraft
+    rolls.
     """
 
     centre_ned_m: Vector
@@ -187,18 +187,18 @@ class Racetrack:
     speed_mps: float
     radius_m: float
     roll_s: float
-    offset_s: float  # how long it has been flying at time 0
-    across_m: float = field(init=False)  # computed: how far apart the straights are
+    offset_s: float  # time into the lap at time 0
+    across_m: float = field(init=False)  # computed: distance between the straights
 
     def __post_init__(self) -> None:
-        # Twice as far as half a turn leads across.
+        # Twice the distance across of half a turn.
         _, across = self._rolled_in(self.roll_s)
         course = self.speed_mps / self.radius_m * self.roll_s / 2.0
         object.__setattr__(self, "across_m", 2.0 * (across + self.radius_m * math.cos(course)))
 
     @property
     def turn_s(self) -> float:
-        """Time of a half turn, rolling in and out included."""
+        """Duration of a half turn, including rolling in and out."""
         return math.pi * self.radius_m / self.speed_mps + self.roll_s
 
     @property
@@ -208,7 +208,7 @@ class Racetrack:
     def __call__(self, t_s: float) -> Kinematics:
         """The point at a time of the scenario.
 
-        The second half of a lap mirrors the first in the centre.
+        The second half of a lap is the first mirrored in the centre.
         """
         into_s = (t_s + self.offset_s) % self.lap_s
         back = into_s >= self.lap_s / 2.0
@@ -231,9 +231,9 @@ class Racetrack:
         return _steered(position, self.speed_mps, axis + course, rate, growth)
 
     def _turn(self, t_s: float) -> tuple[float, float, float, float, float]:
-        """Metres along and across since the start of the turn; course, its rate, and the rate's.
+        """Metres along and across since the start of the turn; course and two derivatives.
 
-        The second half of a turn is the first one backwards, seen from the other side.
+        The second half of a turn is the first one mirrored and in reverse.
         """
         if t_s > self.turn_s / 2.0:
             along, across, course, rate, growth = self._turn(max(0.0, self.turn_s - t_s))
@@ -263,10 +263,10 @@ class Racetrack:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orbit:
-    """A circle about a point at one height, the nose along the course.
+    """A circle around a point at constant height, with the heading along the course.
 
-    Positive rates turn clockwise, negative ones turn left. ``phase_rad`` is the bearing from the
-    centre at time 0.
+    Positive rates turn clockwise, negative ones counter-clockwise. ``phase_rad`` is the bearing
+    from the centre at time 0.
     """
 
     centre_ned_m: Vector
@@ -291,9 +291,9 @@ class Orbit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Swing:
-    """A swing on an arc about the carrier: azimuth + amplitude sin(ωt + φ), radians from north.
+    """A swing on an arc around the carrier: azimuth + amplitude sin(ωt + φ), radians from north.
 
-    Range is horizontal. The nose points away from the carrier at the middle of the arc.
+    The range is horizontal. The heading points away from the carrier at the middle of the arc.
     """
 
     range_m: float
@@ -333,7 +333,7 @@ class Swing:
 def _steered(
     position: Vector, speed: float, course: float, rate: float, growth: float
 ) -> Kinematics:
-    """Level flight at one speed along ``course``; ``growth`` is the derivative of its rate."""
+    """Level flight at constant speed along ``course``; ``growth`` is the derivative of ``rate``."""
     cosine, sine = speed * math.cos(course), speed * math.sin(course)
     return Kinematics(
         position_ned_m=position,

@@ -1,8 +1,8 @@
-"""Payloads of vehicles' messages: one function per message, from a moment to its bytes.
+"""Payloads of vehicles' messages: one function per message.
 
-Layouts are those of https://mavlink.io/en/messages/common.html on the wire: by size, largest first,
-then extensions. Written with ``struct``, because a thousand vehicles send thousands of frames a
-second; ``tests/sitl_replay`` reads them with pymavlink's generated dialect.
+Layouts follow https://mavlink.io/en/messages/common.html in wire order: largest first, then
+extensions. Encoded with ``struct`` for speed, since a thousand vehicles send thousands of frames a
+second; ``tests/sitl_replay`` decodes them with pymavlink.
 """
 
 import math
@@ -20,7 +20,7 @@ from sitl_replay.flight.fleet import Vehicle
 from sitl_replay.flight.motion import Motion
 from sitl_replay.flight.relay import Relayed, Valid
 
-# ArduPilot's own words for "armed, in guided mode, flying": MAV_MODE_FLAG custom mode, stabilised,
+# As ArduPilot sends it when armed, in guided mode, flying: MAV_MODE_FLAG custom mode, stabilised,
 # guided, manual input, armed.
 BASE_MODE: Final = 1 | 16 | 8 | 64 | 128
 ARDUPILOT: Final = 3  # MAV_AUTOPILOT
@@ -28,11 +28,11 @@ ACTIVE: Final = 4  # MAV_STATE
 MAVLINK_VERSION: Final = 3
 RTK_FIXED: Final = 6  # GPS_FIX_TYPE
 
-# The geoid's height above the ellipsoid at the origin. Positions are computed as if it were 0:
-# at these ranges that moves them by micrometres.
+# Height of the geoid above the ellipsoid at the origin. Positions are computed with 0 instead, an
+# error of micrometres at these ranges.
 GEOID_HEIGHT_M: Final = 47.4
 PRESSURE_OFFSET_M: Final = -64.0
-"""Error of pressure altitude on the day of the scenario: 1021 hPa at sea level."""
+"""Error of pressure altitude in the scenarios: 1021 hPa at sea level."""
 
 UNKNOWN_U16: Final = 0xFFFF
 SLOWEST_COURSE_MPS: Final = 0.1
@@ -46,10 +46,10 @@ _ADSB_VEHICLE: Final = struct.Struct("<IiiiHHhHHB9sBB")
 
 
 class Sample(NamedTuple):
-    """A moment of one vehicle at which a message is made."""
+    """One vehicle at the time of a message."""
 
     local: LocalFrame  # the carrier's local frame
-    home_alt_m: float  # height from which relative heights are measured
+    home_alt_m: float  # reference of relative altitudes
     vehicle: Vehicle  # the sender
     t_s: float  # since the start of the scenario
     boot_ms: int  # on the vehicle's clock
@@ -94,7 +94,7 @@ def attitude(sample: Sample) -> Outgoing:
 
 
 def gps_raw_int(sample: Sample) -> Outgoing:
-    """GPS_RAW_INT of a receiver with an RTK fix, with accuracies that the reports keep."""
+    """GPS_RAW_INT of a receiver with an RTK fix; the reports are within its accuracies."""
     motion = sample.vehicle.trajectory(sample.t_s)
     lat_deg, lon_deg, alt_m = sample.local.place(*motion.position_ned_m)
     speed_mps, course_cdeg = _over_ground(motion)
@@ -119,7 +119,7 @@ def gps_raw_int(sample: Sample) -> Outgoing:
 
 
 def system_time(sample: Sample) -> Outgoing:
-    """SYSTEM_TIME: the same instant on the GNSS clock and on the boot clock."""
+    """SYSTEM_TIME: the same time on the GNSS clock and on the boot clock."""
     payload = _SYSTEM_TIME.pack(sample.unix_us, sample.boot_ms)
     return Outgoing(sample.vehicle.source, SYSTEM_TIME, payload)
 
@@ -127,7 +127,7 @@ def system_time(sample: Sample) -> Outgoing:
 def adsb_vehicle(sample: Sample, told: Relayed) -> Outgoing:
     """ADSB_VEHICLE of a contact: mm above its datum, course over ground, vertical speed **up**.
 
-    A field whose flag is not set holds the contact's garbage. At a stand there is no course.
+    A field without its flag contains the garbage of the contact. A stationary one has no course.
     """
     _, contact, tslc_s = told
     aircraft, valid = contact.aircraft, contact.valid
@@ -163,7 +163,7 @@ def adsb_vehicle(sample: Sample, told: Relayed) -> Outgoing:
 
 
 def _over_ground(motion: Motion) -> tuple[float, int]:
-    """Speed in m/s and course in centidegrees, ``UNKNOWN_U16`` at a stand."""
+    """Speed in m/s and course in centidegrees, ``UNKNOWN_U16`` if stationary."""
     north_mps, east_mps, _ = motion.velocity_ned_mps
     speed_mps = math.hypot(north_mps, east_mps)
     moving = speed_mps > SLOWEST_COURSE_MPS

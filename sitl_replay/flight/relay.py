@@ -1,9 +1,9 @@
-"""Aircraft with transponders, and the ADS-B receivers that relay them: who is heard when.
+"""Aircraft with transponders, and the ADS-B receivers that relay them.
 
-An aircraft squitters about once a second. A receiver misses some squitters, and sometimes all for
-several seconds. It sends what it heard last again and again, with unchanged content but for the
-whole seconds since (``tslc``), until that is too old. The figures come from docs/field-notes.md 1,
-"ADSB_VEHICLE". Pure: the chances come from the seed, the aircraft and the receiver.
+An aircraft sends a squitter about once a second. A receiver misses single squitters, and at times
+all of several seconds. It sends the last one repeatedly, with only the whole seconds since
+(``tslc``) changed, until it is too old. The numbers come from docs/field-notes.md 1,
+"ADSB_VEHICLE". Pure: random numbers depend on the seed, the aircraft and the receiver.
 """
 
 import random
@@ -17,20 +17,17 @@ from sitl_replay.flight.motion import Motion
 
 SQUITTER_INTERVAL_S: Final = 1.0
 SQUITTER_JITTER_S: Final = 0.05
-MISSED_SHARE: Final = 0.15  # share of squitters that are missed one at a time
-DEAF_SHARE: Final = 0.02  # share of squitters that begin a time in which none is heard
-DEAF_S: Final = (3.0, 5.0)  # shortest and longest such time
-RELAY_INTERVAL_S: Final = (0.2, 2.6)  # shortest and longest time between two relayed messages
+MISSED_SHARE: Final = 0.15  # share of squitters that are missed singly
+DEAF_SHARE: Final = 0.02  # share of squitters that start a time without reception
+DEAF_S: Final = (3.0, 5.0)  # minimum and maximum of that time
+RELAY_INTERVAL_S: Final = (0.2, 2.6)  # minimum and maximum between two relayed messages
 OLDEST_S: Final = 3.0
-"""Age beyond which content is not sent again.
-
-With the rest, a receiver is never silent for 10 s.
-"""
+"""Age beyond which content is not sent again. A receiver is then never silent for 10 s."""
 GARBAGE_OCTETS: Final = 38  # length of the payload of ADSB_VEHICLE
 
 
 class Valid(IntFlag):
-    """ADSB_FLAGS: which fields of ADSB_VEHICLE count."""
+    """ADSB_FLAGS: which fields of ADSB_VEHICLE are valid."""
 
     COORDS = 1
     ALTITUDE = 2
@@ -46,29 +43,29 @@ EVERYTHING: Final = Valid(0b1011_1111)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Aircraft:
-    """An aircraft: how it flies (NED from the carrier) and what its transponder says of that.
+    """An aircraft: its motion (NED from the carrier) and what its transponder reports.
 
-        placeless_share  share of squitters without a position (only altitude and squawk), as Mode S
-                         replies are
+        placeless_share  share of squitters without a position (only altitude and squawk), like
+                         Mode S replies
 
     ``str`` gives the UAV id.
     """
 
     icao: int  # 24-bit address
-    callsign: str  # its callsign
+    callsign: str  # callsign
     emitter_type: int  # ADSB_EMITTER_TYPE
     trajectory: Callable[[float], Motion]  # position and velocity at a time
     datum: AltitudeDatum  # pressure or geometric altitude
-    says: Valid = EVERYTHING  # flags of the fields that it fills
+    says: Valid = EVERYTHING  # flags of the fields that it sets
     placeless_share: float = 0.0
-    squawk: int = 7000  # its squawk
+    squawk: int = 7000  # squawk
 
     def __str__(self) -> str:
         return UavKind.ADSB.uav(f"{self.icao:06X}")
 
 
 class Contact(NamedTuple):
-    """A squitter that was heard: when, which fields count, and what stands in the others."""
+    """A received squitter: time, valid fields, and the content of the other fields."""
 
     aircraft: Aircraft
     t_s: float
@@ -77,7 +74,7 @@ class Contact(NamedTuple):
 
 
 class Relayed(NamedTuple):
-    """A contact that is relayed at ``t_s``, ``tslc_s`` whole seconds after it was heard."""
+    """A contact relayed at ``t_s``, ``tslc_s`` whole seconds after its reception."""
 
     t_s: float
     contact: Contact
@@ -85,7 +82,7 @@ class Relayed(NamedTuple):
 
 
 def squitters(aircraft: Aircraft, seed: int) -> Iterator[Contact]:
-    """The squitters of an aircraft, without end: the same for every receiver."""
+    """The squitters of an aircraft (endless), the same for every receiver."""
     rng = random.Random(f"{seed} {aircraft} squitters")
     t_s = rng.uniform(0.0, SQUITTER_INTERVAL_S)
     while True:
@@ -103,9 +100,9 @@ def squitters(aircraft: Aircraft, seed: int) -> Iterator[Contact]:
 
 
 def heard(aircraft: Aircraft, receiver: str, seed: int) -> Iterator[Contact]:
-    """The squitters of an aircraft that a receiver hears, without end.
+    """The squitters of an aircraft that a receiver receives (endless).
 
-    After a miss, and after a deaf time, the next squitter is heard.
+    After a missed one, and after a time without reception, the next one is received.
     """
     rng = random.Random(f"{seed} {receiver} hears {aircraft}")
     deaf_until_s = 0.0
@@ -124,7 +121,7 @@ def heard(aircraft: Aircraft, receiver: str, seed: int) -> Iterator[Contact]:
 
 
 def relayed(aircraft: Aircraft, receiver: str, seed: int) -> Iterator[Relayed]:
-    """The messages that a receiver relays of an aircraft, without end, in order of time."""
+    """The messages that a receiver relays of an aircraft (endless), by time."""
     rng = random.Random(f"{seed} {receiver} relays {aircraft}")
     contacts = heard(aircraft, receiver, seed)
     last, after = next(contacts), next(contacts)

@@ -1,9 +1,9 @@
-"""Scenarios: who flies where, as pure functions of time.
+"""Scenarios, as pure functions of time.
 
-Each builder takes the number of UAVs (and a seed, where something is left to chance) and returns a
-``Scenario``, whose vehicles move as functions of seconds since its start; ``motion`` has the
-conventions. One UAV more changes nothing for the others, except that ``hover`` spreads them anew.
-Raises ``UserError`` where so many cannot fly.
+Each builder takes the number of UAVs (and a seed, if it uses random numbers) and returns a
+``Scenario``, whose vehicles move as functions of the seconds since its start (conventions: see
+``motion``). An additional UAV does not change the others, except in ``hover``, which spreads them
+evenly. Raises ``UserError`` for a number of UAVs that is not possible.
 """
 
 import math
@@ -55,9 +55,9 @@ __all__ = [
     "waypoints",
 ]
 
-# The paper's angular rate, and the speed of its fastest UAV. Rings beyond the paper's four turn
-# slower, at that speed: at 0.5 rad/s the tenth would leave the range of GLOBAL_POSITION_INT's
-# velocity (327 m/s).
+# The paper's angular rate, and the speed of its fastest UAV. Circles beyond the paper's four are
+# flown at that speed: at 0.5 rad/s the tenth would exceed the velocity range of
+# GLOBAL_POSITION_INT (327 m/s).
 PAPER_RATE_RADPS = 0.5
 PAPER_TOP_SPEED_MPS = 125.0
 
@@ -65,16 +65,16 @@ HEIGHTS_M = (0.0, 10.0, 20.0, 30.0)
 
 
 class Builder(Protocol):
-    """Makes a scenario of so many UAVs; the seed decides what is left to chance."""
+    """Makes a scenario of ``uavs`` UAVs; ``seed`` is that of the random numbers."""
 
     def __call__(self, uavs: int = 4, seed: int = 0) -> Scenario:
-        """The scenario. Raises ``UserError`` where so many cannot fly."""
+        """The scenario. Raises ``UserError`` for a number of UAVs that is not possible."""
 
 
 def paper(uavs: int = 4, gust: float = PAPER_GUST) -> Scenario:
-    """The paper's UAVs on circles of 100, 150, 200, 250 m and so on about the carrier.
+    """The paper's UAVs on circles of 100, 150, 200, 250 m and so on around the carrier.
 
-    Each is a quarter turn from the one before, at 0.5 rad/s (more than four: see
+    Each is a quarter turn from the previous one, at 0.5 rad/s (beyond four: see
     ``PAPER_TOP_SPEED_MPS``).
     """
     return around_carrier(
@@ -85,7 +85,7 @@ def paper(uavs: int = 4, gust: float = PAPER_GUST) -> Scenario:
 
 
 def hover(uavs: int = 4) -> Scenario:
-    """UAVs standing still within 60° of north, where a broadside array tells them apart."""
+    """UAVs hovering within 60° of north, where a broadside array can separate them."""
     step_deg = 120.0 / max(1, uavs - 1)
     first_deg = -60.0 if uavs > 1 else 0.0
     return around_carrier(
@@ -101,8 +101,8 @@ def hover(uavs: int = 4) -> Scenario:
 def waypoints(uavs: int = 4, seed: int = 0) -> Scenario:
     """Copters on tours of five or six waypoints each, some 200 m and more from the carrier.
 
-    At most 12 m/s and 3 m/s², 3 m/s up and down, a stop of 4 s and a turn at each. A mean wind of 6
-    m/s brings Dryden turbulence, which moves them by some decimetres and dm/s more.
+    At most 12 m/s and 3 m/s², 3 m/s up and down; a stop of 4 s and a turn at each waypoint. Dryden
+    turbulence at a mean wind of 6 m/s displaces them by some decimetres, at some dm/s.
     """
     return around_carrier(
         "waypoints",
@@ -114,8 +114,8 @@ def waypoints(uavs: int = 4, seed: int = 0) -> Scenario:
 def racetrack(uavs: int = 4, seed: int = 0) -> Scenario:
     """Fixed wings on stadiums at 20 to 30 m/s over ground, in coordinated turns of up to 30°.
 
-    They fly in a mean wind of 6 m/s with Dryden turbulence: they crab, and airspeed varies by the
-    wind.
+    In a mean wind of 6 m/s with Dryden turbulence: yaw differs from the course, and airspeed varies
+    with the wind.
     """
     return around_carrier(
         "racetrack",
@@ -125,10 +125,10 @@ def racetrack(uavs: int = 4, seed: int = 0) -> Scenario:
 
 
 def crossing(uavs: int = 4) -> Scenario:
-    """Pairs that swing to and fro in opposite senses, one behind the other, as the carrier sees it.
+    """Pairs, one behind the other from the carrier, that swing in opposite directions.
 
-    In still air, at one elevation: when their azimuths meet, every half swing (15.7 s), so do their
-    directions, exactly. An odd one swings alone.
+    In still air, at the same elevation: when their azimuths cross, every half swing (15.7 s), their
+    directions are exactly equal. An odd one swings alone.
     """
     return around_carrier(
         "crossing",
@@ -140,8 +140,8 @@ def crossing(uavs: int = 4) -> Scenario:
 def mirror(uavs: int = 4) -> Scenario:
     """Pairs as in ``crossing``, but with the second behind the carrier, mirrored in its array.
 
-    The array looks north and its elements stand from west to east. When a pair passes its mirror
-    directions, every half swing (15.7 s), a linear array cannot tell the two apart.
+    The array faces north, with elements from west to east. When a pair passes mirrored directions,
+    every half swing (15.7 s), a linear array cannot separate the two.
     """
     return around_carrier(
         "mirror",
@@ -151,12 +151,11 @@ def mirror(uavs: int = 4) -> Scenario:
 
 
 def swarm(uavs: int = 4, seed: int = 0) -> Scenario:
-    """Up to 1000 copters, each on a circle of its own, in ten layers over 3 km by 3 km.
+    """Up to 1000 copters, each on its own circle, in ten layers over 3 km by 3 km.
 
-    No two come closer than 40 m. Each sends 6.3 frames a second (4 reports, a heartbeat, an
+    The minimum distance of two is 40 m. Each sends 6.3 frames a second (4 reports, a heartbeat, an
     attitude, a fifth of a GPS_RAW_INT, a tenth of a SYSTEM_TIME), the carrier 34: 100 UAVs give 664
-    frames a second, 1000 give 6334. Ids: 1:1 to 250:1 without the carrier's system, then 1:2 and so
-    on.
+    frames a second, 1000 give 6334. Ids: 1:1 to 250:1 without the carrier's, then 1:2 and so on.
     """
     return around_carrier(
         "swarm",
@@ -168,22 +167,22 @@ def swarm(uavs: int = 4, seed: int = 0) -> Scenario:
 def adsb(uavs: int = 4, seed: int = 0) -> Scenario:
     """Copters as in ``waypoints``; 1:1 and 2:1 have ADS-B receivers and relay the same aircraft.
 
-    3:1 carries a transponder: it comes under two ids, 3:1 and icao:F00006. Needs three UAVs.
+    3:1 has a transponder, so it has two ids, 3:1 and icao:F00006. Needs three UAVs.
     """
     fleet = [touring(index, seed) for index in range(checked(uavs, fewest=3))]
     hears = aircraft_about(fleet[2].trajectory)
     relays = [replace(one, hears=hears) for one in fleet[:2]]
     return around_carrier(
         "adsb",
-        "copters, two of which relay the aircraft that they hear; one of these is a UAV too",
+        "copters, two of which relay aircraft by ADS-B; one of these aircraft is also a UAV",
         (*relays, *fleet[2:]),
     )
 
 
 def shared_id(uavs: int = 4) -> Scenario:
-    """Two copters some 600 m apart that both send as 1:1, with clocks and sequences of their own.
+    """Two copters about 600 m apart that both send as 1:1, with separate clocks and sequences.
 
-    The others, from 2:1 on, are honest. Needs two UAVs.
+    The others, from 2:1 on, have their own ids. Needs two UAVs.
     """
     west = calm(
         0, Orbit(centre_ned_m=(200.0, -300.0, -30.0), radius_m=30.0, rate_radps=0.2, phase_rad=0.0)
@@ -194,13 +193,13 @@ def shared_id(uavs: int = 4) -> Scenario:
     honest = (circling(index) for index in range(1, checked(uavs, fewest=2) - 1))
     return around_carrier(
         "shared-id",
-        "two copters 600 m apart that both send as 1:1, beside honest ones",
+        "two copters 600 m apart that both send as 1:1, and others with their own ids",
         (replace(west, twin=1), replace(east, twin=2, uptime_ms=uptime_ms(MAX_UAVS)), *honest),
     )
 
 
 def _unseeded(build: Callable[[int], Scenario]) -> Builder:
-    """The builder of a scenario that leaves nothing to chance: every seed gives the same."""
+    """The builder of a scenario without random numbers: the seed has no effect."""
 
     def built(uavs: int = 4, seed: int = 0) -> Scenario:
         return build(uavs)
@@ -232,7 +231,7 @@ def _on_paper(index: int, gust: float) -> Vehicle:
         height_m=HEIGHTS_M[index % len(HEIGHTS_M)],
         gust=gust,
     )
-    # The nose follows the nominal velocity, whose course is −(ωt+φ).
+    # The heading follows the nominal velocity, whose course is −(ωt+φ).
     return uav(
         index,
         circle,

@@ -1,8 +1,8 @@
-"""A scenario as MAVLink 2: what each vehicle sends, and when.
+"""A scenario as MAVLink 2: the frames of each vehicle, with their times.
 
 Pure: the schedule is a function of the scenario, a seed and the Unix time of its start. A message
-is sampled at a whole millisecond, so that its stamp is exactly when its contents are true, and sent
-up to ``JITTER_S`` later, as by an autopilot's scheduler.
+is sampled at a whole millisecond, so that its time stamp is exact, and sent up to ``JITTER_S``
+later, as by the scheduler of an autopilot.
 """
 
 import heapq
@@ -32,7 +32,7 @@ JITTER_S = 0.005
 
 
 class Transmission(NamedTuple):
-    """One frame: when it is sent (seconds since the start), by whom, and its bytes."""
+    """One frame: time of sending (seconds since the start), sender, and bytes."""
 
     t_s: float
     vehicle: Vehicle
@@ -42,18 +42,18 @@ class Transmission(NamedTuple):
 def schedule(
     scenario: Scenario, seed: int = 0, epoch_ns: int = 0, duration_s: float | None = None
 ) -> Iterator[Transmission]:
-    """Every frame of the scenario in the order of sending; without end if ``duration_s`` is None.
+    """Every frame of the scenario in the order of sending; endless if ``duration_s`` is None.
 
     ``epoch_ns`` is the Unix time at the start. The same arguments give the same bytes; another seed
-    starts the timers in other phases and with other jitter. Each vehicle counts its own sequence
-    numbers, also where several send under one id.
+    gives other phases and jitter of the timers. Each vehicle has its own sequence numbers, even if
+    several share an id.
     """
     local = LocalFrame(*scenario.origin)
     vehicles = scenario.vehicles
     sequence = [0] * len(vehicles)
     timers = list(_timers(vehicles, seed))
     due = [next(timer) for _, timer in timers]
-    # Of two at one time the timer that was made first comes first.
+    # At equal times, the timer with the lower number comes first.
     waiting = [(first.send_s, number) for number, first in enumerate(due)]
     heapq.heapify(waiting)
     while True:
@@ -100,7 +100,7 @@ def _timers(vehicles: tuple[Vehicle, ...], seed: int) -> Iterator[tuple[int, Ite
 
 
 def _timer(vehicle: Vehicle, build: Builder, interval_s: float, seed: int) -> Iterator[_Due]:
-    # A generator for each timer: one vehicle more does not change what the others send.
+    # A generator for each timer: an additional vehicle does not change the others.
     rng = random.Random(f"{seed} {vehicle.name} {build.__name__}")
     phase_s = rng.uniform(0.0, interval_s)
     for count in itertools.count():

@@ -1,4 +1,4 @@
-"""Turbulence, and its effect on a vehicle that holds its place: closed forms in time.
+"""Turbulence, and its effect on a vehicle that holds its position: closed forms in time.
 
 The Dryden spectra of MIL-F-8785C (also MIL-HDBK-1797), one-sided over ω > 0 in rad/s, with σ the
 intensity, L the scale length and V the airspeed; along the mean wind, and across it and vertical:
@@ -6,8 +6,8 @@ intensity, L the scale length and V the airspeed; along the mean wind, and acros
     Φ_u(ω) = 2σ²L/(πV) · 1 / (1 + x²)                       x = Lω/V
     Φ_v(ω) =  σ²L/(πV) · (1 + 3x²) / (1 + x²)²              Φ_w the same
 
-A sum of sines has such a spectrum when each sine carries the power of its band; with seeded phases
-it is a pure function of time, whose derivatives are exact.
+A sum of sines approximates such a spectrum if each sine has the power of its band; with phases from
+a seed it is a pure function of time, with exact derivatives.
 """
 
 import cmath
@@ -23,12 +23,11 @@ from companion.values import FloatArray
 from sitl_replay.flight.motion import Motion, Vector
 
 METRES_PER_FOOT: Final = 0.3048
-# The low-altitude forms hold from 10 to 1000 feet above the ground.
+# The low-altitude model is valid from 10 to 1000 feet above the ground.
 LOWEST_FT: Final = 10.0
 HIGHEST_FT: Final = 1000.0
 
-# One sine in each of the bands between these x = Lω/V. What is below and above is less than 3 %
-# of the power.
+# One sine in each band between these x = Lω/V. Less than 3 % of the power is outside.
 BANDS: Final = 16
 LOWEST_X: Final = 0.03
 HIGHEST_X: Final = 100.0
@@ -43,10 +42,10 @@ class Turbulence(NamedTuple):
 
 
 class Hold(NamedTuple):
-    """How a vehicle keeps its place: d̈ = (w − ḋ)/drag_s − 2ζω ḋ − ω² d.
+    """Position control of a vehicle: d̈ = (w − ḋ)/drag_s − 2ζω ḋ − ω² d.
 
-    d is its displacement and w the gust, both along one axis; ``drag_s`` is the time in which the
-    air takes it along, ω = ``natural_radps`` and ζ = ``damping`` those of its position control.
+    d is the displacement and w the gust, both along one axis; ``drag_s`` is the time constant of
+    the drag, ω = ``natural_radps`` and ζ = ``damping`` those of the control loop.
     """
 
     natural_radps: float
@@ -63,14 +62,14 @@ class Hold(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sines:
-    """A sum of sines for each of three axes, arrays of (3, ``BANDS``); Σ a sin(ωt + φ)."""
+    """A sum of sines for each of three axes, Σ a sin(ωt + φ); arrays of (3, ``BANDS``)."""
 
     amplitude: FloatArray
     omega_radps: FloatArray
     phase_rad: FloatArray
 
     def __call__(self, t_s: float) -> tuple[FloatArray, FloatArray]:
-        """The three sums and their derivatives by time."""
+        """The three sums and their time derivatives."""
         angle_rad = self.omega_radps * t_s + self.phase_rad
         slope = self.amplitude * self.omega_radps
         return (
@@ -81,9 +80,9 @@ class Sines:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Displacement:
-    """Displacement of a vehicle off its path by gusts.
+    """Displacement of a vehicle from its path by gusts.
 
-    ``wind_rad``: direction to which the wind blows.
+    ``wind_rad``: direction the wind blows to.
     """
 
     sines: Sines
@@ -104,7 +103,7 @@ def low_altitude(height_m: float, wind_mps: float, airspeed_mps: float) -> Turbu
     """Turbulence at a height above the ground, for a mean wind at 20 feet (6 m).
 
     MIL-F-8785C, with h in feet: L_w = h, L_u = L_v = h / (0.177 + 0.000823 h)^1.2, σ_w = 0.1 of the
-    wind, σ_u = σ_v = σ_w / (0.177 + 0.000823 h)^0.4. Heights beyond 10 to 1000 feet count as these.
+    wind, σ_u = σ_v = σ_w / (0.177 + 0.000823 h)^0.4. Heights are limited to 10 to 1000 feet.
     """
     height_ft = min(max(height_m / METRES_PER_FOOT, LOWEST_FT), HIGHEST_FT)
     shape = 0.177 + 0.000823 * height_ft
@@ -130,8 +129,8 @@ def power_across(x: float) -> float:
 def gusts(turbulence: Turbulence, rng: Random) -> Sines:
     """Gust velocities in m/s, along the mean wind, across it, down: one sine per band.
 
-    Each carries the power of its band, at a frequency drawn from the spectrum within it: over many
-    winds the spectrum is Dryden's, and no two winds are alike.
+    Each has the power of its band, at a frequency drawn from the spectrum within it: the average
+    over many draws is the Dryden spectrum.
     """
     ratio = HIGHEST_X / LOWEST_X
     amplitude, omega_radps, phase_rad = np.zeros((3, 3, BANDS))
@@ -149,7 +148,7 @@ def gusts(turbulence: Turbulence, rng: Random) -> Sines:
 
 
 def _where(share: Callable[[float], float], wanted: float, low_x: float, high_x: float) -> float:
-    """The x between two at which a rising ``share`` is ``wanted``: bisection, to a millionth."""
+    """The x at which an increasing ``share`` is ``wanted``, by bisection to 1e-6."""
     for _ in range(20):
         middle_x = (low_x + high_x) / 2.0
         if share(middle_x) < wanted:
@@ -160,7 +159,7 @@ def _where(share: Callable[[float], float], wanted: float, low_x: float, high_x:
 
 
 def displaced(wind: Sines, hold: Hold) -> Sines:
-    """The displacement in metres of a vehicle that holds its place in ``wind``, settled."""
+    """Steady-state displacement in metres of a vehicle with control ``hold`` in ``wind``."""
     responses = [[hold.response(float(omega)) for omega in axis] for axis in wind.omega_radps]
     polar = np.array([[cmath.polar(response) for response in axis] for axis in responses])
     return Sines(wind.amplitude * polar[:, :, 0], wind.omega_radps, wind.phase_rad + polar[:, :, 1])

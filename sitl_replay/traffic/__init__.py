@@ -1,1 +1,1 @@
-"""Sends scenarios and logs as live traffic, and records what is heard.                   [shell]"""
+"""Sends scenarios and logs as live traffic, and records traffic."""

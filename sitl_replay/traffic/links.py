@@ -1,14 +1,14 @@
-"""Links of the generator: one end of ``companion.mavlink.links`` each, held open for one run.
+"""Links of the generator, one endpoint of ``companion.mavlink.links`` each, open for one run.
 
 udpout:HOST:PORT      one datagram per frame, to one peer
-udpin:HOST:PORT       to everybody who has sent something here, as to a vehicle's own port
+udpin:HOST:PORT       to every peer that has sent a datagram to this port
 tcp:HOST:PORT         connect, once
-tcpin:HOST:PORT       serve everybody who connects, from then on, as SITL does
+tcpin:HOST:PORT       to every client from its connection on, as SITL does
 serial:DEVICE:BAUD    a serial port
-zenoh:KEY             to whoever listens over Zenoh; ?as=hub is the end that vehicles are at
+zenoh:KEY             to every listener over Zenoh; ?as=hub is the vehicles' end
 
-A peer that is lost is not tried again. Sending never waits for a peer that is behind: a frame that
-it does not take is dropped and counted. Who would rather wait asks ``writable`` before.
+There is no reconnection to a lost peer. Sending never waits for a slow peer: a frame that it does
+not accept is dropped and counted. To wait instead, await ``writable`` first.
 """
 
 import asyncio
@@ -21,30 +21,32 @@ from companion.mavlink.links.endpoints import HungUpError, Upcalls, reason
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
 
-PEERS_MAX: Final = 256  # peers of a listening UDP link; the one unheard for longest is forgotten
-LINGER_S: Final = 1.0  # how long closing waits for what is buffered to be sent
-FULL: Final = 0.5  # share of a peer's buffer from which on writable waits
+PEERS_MAX: Final = (
+    256  # maximum peers of a listening UDP link; the one silent for longest is removed
+)
+LINGER_S: Final = 1.0  # maximum wait for buffered data when closing
+FULL: Final = 0.5  # share of a peer's buffer above which writable waits
 RETRY_S: Final = 1.0
-"""Time from the loss of a route to the next attempt; datagrams until then are dropped."""
+"""Time from the loss of a route to the next attempt; datagrams are dropped meanwhile."""
 _ROOM_POLL_S: Final = 0.001
 _FIRST_PEER_POLL_S: Final = 0.01
 
 Receive = Callable[[Hashable, bytes], None]
-"""Function called with the sender (one key per peer) and its bytes; ``b""`` when it has left."""
+"""Function called with the sender (one key per peer) and its bytes; ``b""`` if it has closed."""
 
 
 def ignore(_peer: Hashable, _data: bytes) -> None:
-    """Discard what a peer sends."""
+    """Discard received bytes."""
 
 
 class TrafficLink:
-    """A link that frames are sent to and heard from; made by ``open_link``.
+    """A link to send and receive frames; made by ``open_link``.
 
-    url      the link, with the port that the system chose where it was asked to choose one
-    lost     why the peer is gone for good; empty while it is there, or while another may come
-    broken   whether it is gone by a failure, rather than because it closed the link in good order
-    dropped  frames not sent, because a peer does not take them fast enough or there is none
-    serving  done when nothing more can come
+    url      the link, with the port that the system chose for port 0
+    lost     why the link has ended; empty while it is open
+    broken   whether it ended by an error, rather than closed by the peer
+    dropped  frames not sent, because a peer is too slow or there is none
+    serving  done when the link has ended
     """
 
     def __init__(self, url: LinkUrl, receive: Receive) -> None:
@@ -55,7 +57,7 @@ class TrafficLink:
         self.serving: asyncio.Task[None]
         self._receive = receive
         self._up = asyncio.Event()
-        self._heard: dict[Hashable, None] = {}  # the one heard last comes last
+        self._heard: dict[Hashable, None] = {}  # the most recent one last
         upcalls = Upcalls(
             up=self._up.set,
             take=self._take,
@@ -66,7 +68,7 @@ class TrafficLink:
         self._endpoint = transport.endpoint(url, LinkStatus(url=str(url)), upcalls)
 
     async def open(self) -> None:
-        """Claim the address, connect or open. Raises ``LinkError`` where that is not possible."""
+        """Bind the address, connect or open. Raises ``LinkError`` if that is not possible."""
         try:
             port = self._endpoint.open()
         except OSError as error:
@@ -91,7 +93,7 @@ class TrafficLink:
             try:
                 await self._endpoint.serve()
             except OSError as error:
-                # A datagram may find its way again; a stream that has ended has ended.
+                # A UDP route may recover; a stream that has ended does not.
                 if self.url.scheme != "udpout" or not self._up.is_set():
                     self.lost = reason(error)
                     self.broken = not isinstance(error, HungUpError)
@@ -99,17 +101,17 @@ class TrafficLink:
             await asyncio.sleep(RETRY_S)
 
     def peers(self) -> Collection[Hashable]:
-        """Everybody to whom a frame goes."""
+        """All peers that a frame is sent to."""
         peers = self._endpoint.peers()
         return tuple(self._heard) if peers is None else peers
 
     async def somebody(self) -> None:
-        """Wait until there is somebody to send to, or the peer is lost."""
+        """Wait until there is a peer, or the link has ended."""
         while not self.peers() and not self.serving.done():
             await asyncio.sleep(_FIRST_PEER_POLL_S)
 
     def send(self, raw: bytes) -> None:
-        """Send one frame to everybody, or drop it. Never waits, never raises."""
+        """Send one frame to all peers, or drop it. Never waits, never raises."""
         if self.serving.done():
             return
         peers = self.peers()
@@ -118,24 +120,24 @@ class TrafficLink:
             self.dropped += not self._endpoint.write(key, raw)
 
     def knock(self) -> None:
-        """Send an empty datagram, so that a peer that answers only to senders knows of this one.
+        """Send an empty datagram, for peers that answer only to senders they know.
 
-        Does nothing on other links than ``udpout``.
+        No effect on links other than ``udpout``.
         """
         if self.url.scheme == "udpout":
             self._endpoint.write(None, b"")
 
     async def writable(self) -> None:
-        """Wait until somebody is there and all who are take a frame, or the peer is lost."""
+        """Wait until there is a peer and all peers accept a frame, or the link has ended."""
         await self.somebody()
         while self._fullest() > FULL:
             await asyncio.sleep(_ROOM_POLL_S)
             await self.somebody()
 
     async def close(self) -> None:
-        """Send what is buffered, within a second, and close.
+        """Send the buffered data, within a second, and close.
 
-        Raises what a fault of the program has ended it with.
+        Raises the exception of a defect that has ended the link.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LINGER_S):
@@ -163,7 +165,7 @@ class TrafficLink:
 
 
 async def open_link(url: LinkUrl, receive: Receive = ignore) -> TrafficLink:
-    """Open a link. Raises ``LinkError`` where that is not possible."""
+    """Open a link. Raises ``LinkError`` if that is not possible."""
     link = TrafficLink(url, receive)
     await link.open()
     return link

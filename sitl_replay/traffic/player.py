@@ -1,4 +1,4 @@
-"""Sends a schedule or a log over links, in real time or as fast as it goes."""
+"""Sends a schedule or a log over links, in real time or without waiting."""
 
 import asyncio
 import contextlib
@@ -25,25 +25,23 @@ from sitl_replay.traffic.recorder import TlogWriter
 log = logging.getLogger(__name__)
 
 MAX_STEP_NS = 5_000_000_000
-# Frames sent without a pause when behind, or at full speed, before others get their turn.
+# Frames sent in a row, when late or at full speed, before other tasks run.
 BATCH = 32
 
 
 @dataclass(slots=True, kw_only=True)
 class Tally:
-    """What has been sent so far; kept up to date while it runs.
+    """Counts of what has been sent so far, updated while it runs.
 
-    frames      frames, each counted once, however many links it goes to and whatever becomes of
-                it
+    frames      frames, each counted once for all links, whether delivered or not
     octets      their bytes
-    dropped     over all links: frames that a slow peer did not take, or that came to a link
-                with nobody there
-    clamped     time stamps of a log that step back or leap
-    duration_s  how long it ran
+    dropped     over all links: frames that a slow peer did not accept, or without a peer
+    clamped     time stamps of a log that step back or jump
+    duration_s  duration of the run
     messages    frames by message id
-    rejected    what else of a log was not usable, by reason
-    faults      over all links: frames touched by each requested fault
-    lost        links whose peer went away, with the reason
+    rejected    unusable data of a log, by reason
+    faults      over all links: frames affected by each requested fault
+    lost        links that have ended, with the reason
     """
 
     frames: int = 0
@@ -64,7 +62,7 @@ class Tally:
 
 
 def message_name(known: int) -> str:
-    """The name of a message id; ``UNKNOWN_`` and the id where the dialect has none."""
+    """The name of a message id; ``UNKNOWN_`` and the id if the dialect has none."""
     message = dialect.mavlink_map.get(known)
     return str(message.msgname) if message else f"UNKNOWN_{known}"
 
@@ -79,21 +77,20 @@ async def fly(
     faults: Sequence[Fault] = (),
     tally: Tally | None = None,
 ) -> Tally:
-    """Fly a scenario over ``links`` (see ``links``), until ``duration_s`` or cancelled.
+    """Send a scenario over ``links`` (see module ``links``), until ``duration_s`` or cancelled.
 
         scenario    the scenario
         links       URLs of the links
-        duration_s  how long; None: until cancelled
-        seed        of what is left to chance
-        record      a tlog that gets every frame as its sender sends it, with the time at which it
-                    was due: with the faults of senders, not with those of links
-        faults      faults of the traffic
-        tally       may be given to watch the count, or to have it after a cancellation
+        duration_s  duration; None: until cancelled
+        seed        seed of the random numbers
+        record      tlog of every frame at its scheduled time, with the faults of senders, but not
+                    those of links
+        faults      faults to inject
+        tally       counts to update, so that they can be read meanwhile and after a cancellation
 
-    It begins when every link that listens has its first peer. Links and tlog are closed in any
-    case. Raises ``LinkError`` for a bad URL, for a link that cannot be opened, or when every peer
-    is gone; ``FaultError`` for faults that do not go together; ``OSError`` where the tlog cannot be
-    written.
+    Sending starts when every listening link has a peer. Links and tlog are always closed. Raises
+    ``LinkError`` for an invalid URL, if a link cannot be opened, or when all links have ended;
+    ``FaultError`` for faults that cannot be combined; ``OSError`` if the tlog cannot be written.
     """
     tally = Tally() if tally is None else tally
     senders = Senders(faults, seed, tally.faults)
@@ -107,7 +104,7 @@ async def fly(
                 for t_s, _, made in schedule(scenario, seed, epoch_ns, duration_s):
                     raw = senders.altered(t_s, made)
                     yield t_s, raw
-                    if writer is not None:  # asked for the next one: this one is sent
+                    if writer is not None:  # resumed for the next one, so this one is sent
                         writer.write(epoch_ns + round(t_s * 1e9), raw)
 
             await _Sending(endpoints=endpoints, network=network, speed=1.0, tally=tally).send_all(
@@ -127,17 +124,17 @@ async def play(
 ) -> Tally:
     """Send the frames of a log over ``links``, paced by their stamps.
 
-        frames  only ``t_ns`` and ``raw`` are used. A stamp that steps back counts as no step, one
-                that leaps as 5 s (``Tally.clamped``)
+        frames  only ``t_ns`` and ``raw`` are used. A time stamp that steps back is played as 0 s,
+                a jump of more than 5 s as 5 s (``Tally.clamped``)
         links   URLs of the links
-        speed   multiplies the pace, of faults as well; None: as fast as the links take it (UDP
-                takes anything, and a slow receiver loses what it cannot hold)
-        faults  faults of the traffic
-        seed    of the faults
+        speed   speed factor, also of faults; None: as fast as the links accept frames (over UDP a
+                slow receiver loses frames)
+        faults  faults to inject
+        seed    seed of the faults
         tally   as for ``fly``
 
-    It begins when every link that listens has its first peer. Raises as ``fly`` does, and what
-    iterating over ``frames`` raises.
+    Sending starts when every listening link has a peer. Raises as ``fly`` does, and what iterating
+    over ``frames`` raises.
     """
     tally = Tally() if tally is None else tally
     senders = Senders(faults, seed, tally.faults)
@@ -153,7 +150,7 @@ async def play(
 
 
 def on_timeline(frames: Iterable[Frame], tally: Tally) -> Iterator[tuple[float, bytes]]:
-    """Seconds since the first frame, without steps back or beyond 5 s, and the raw frame."""
+    """Seconds since the first frame, in steps of 0 to 5 s, and the raw frame."""
     elapsed_ns = 0
     before_ns: int | None = None
     for frame in frames:
@@ -167,7 +164,7 @@ def on_timeline(frames: Iterable[Frame], tally: Tally) -> Iterator[tuple[float, 
 
 @contextlib.asynccontextmanager
 async def _opened(urls: Sequence[LinkUrl], tally: Tally) -> AsyncIterator[list[TrafficLink]]:
-    """The links, each with somebody there; closed at the end, their dropped frames counted."""
+    """The open links, each with a peer; closed at the end, with dropped frames counted."""
     loop = asyncio.get_running_loop()
     opened: list[TrafficLink] = []
     start_s = loop.time()
@@ -176,7 +173,7 @@ async def _opened(urls: Sequence[LinkUrl], tally: Tally) -> AsyncIterator[list[T
             opened.append(await open_link(url))
         for endpoint in opened:
             if not endpoint.peers():
-                log.warning("%s: waiting for a first peer", endpoint.url)
+                log.warning("%s: waiting for the first peer", endpoint.url)
         for endpoint in opened:
             await endpoint.somebody()
         start_s = loop.time()
@@ -189,7 +186,7 @@ async def _opened(urls: Sequence[LinkUrl], tally: Tally) -> AsyncIterator[list[T
 
 
 class _Sending:
-    """One run over open links, timed against one start instant so that no drift adds up."""
+    """One run over open links, timed from one start time, so that errors do not accumulate."""
 
     def __init__(
         self, *, endpoints: list[TrafficLink], network: Network, speed: float | None, tally: Tally
@@ -204,7 +201,7 @@ class _Sending:
         self._steps = 0
 
     async def send_all(self, items: Iterable[tuple[float, bytes]]) -> None:
-        """Send every frame when it arrives by the faults of its link, and late ones at the end."""
+        """Send every frame at its time after the faults of its link, delayed ones at the end."""
         for t_s, raw in items:
             await self._send_held(t_s)
             await self._until(t_s)
@@ -222,7 +219,7 @@ class _Sending:
             self._drop_the_lost()
 
     async def _until(self, t_s: float) -> None:
-        """Wait until a time; other tasks get their turn even where there is nothing to wait for."""
+        """Wait until a time; let other tasks run even if there is no need to wait."""
         speed = self._speed
         wait_s = 0.0 if speed is None else self._start_s + t_s / speed - self._loop.time()
         if wait_s > 0.0 or self._steps % BATCH == 0:
@@ -236,7 +233,7 @@ class _Sending:
         endpoint.send(delivery.raw)
 
     def _drop_the_lost(self) -> None:
-        """Go on with the links that are left. Raises ``LinkError`` when there is none."""
+        """Continue with the remaining links. Raises ``LinkError`` if there are none."""
         gone = [f"{one.url}: {one.lost}" for one in self._there if one.lost]
         if not gone:
             return
@@ -245,4 +242,4 @@ class _Sending:
         if not self._there:
             raise LinkError("; ".join(gone))
         for text in gone:
-            log.warning("%s; going on without it", text)
+            log.warning("%s; continuing without this link", text)

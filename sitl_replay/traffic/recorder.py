@@ -22,10 +22,10 @@ FLUSH_EVERY_NS: Final = 1_000_000_000
 
 
 class TlogWriter:
-    """A tlog being written; an existing file is replaced. Use it as a context manager.
+    """A tlog being written, as a context manager; an existing file is overwritten.
 
-    Flushed whenever the stamps have moved on by a second, which is what a killed process loses.
-    Raises ``OSError`` where the file cannot be opened or written.
+    Flushed every second of time stamps, so a killed process loses at most a second. Raises
+    ``OSError`` if the file cannot be opened or written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -33,14 +33,14 @@ class TlogWriter:
         self._flushed_ns = 0
 
     def write(self, t_ns: int, raw: bytes) -> None:
-        """Append one whole frame, received or sent at ``t_ns`` (Unix time)."""
+        """Append one frame, received or sent at ``t_ns`` (Unix time)."""
         self._file.write(struct.pack(">Q", t_ns // 1000) + raw)
         if abs(t_ns - self._flushed_ns) >= FLUSH_EVERY_NS:
             self.flush()
             self._flushed_ns = t_ns
 
     def flush(self) -> None:
-        """Hand what was written so far to the system."""
+        """Flush the buffer to the operating system."""
         self._file.flush()
 
     def __enter__(self) -> Self:
@@ -57,7 +57,7 @@ class TlogWriter:
 
 @dataclass(slots=True, kw_only=True)
 class Heard:
-    """Counts of a recording so far: whole frames, their bytes, and what was not usable."""
+    """Counts of a recording so far: frames, their bytes, and unusable data."""
 
     frames: int = 0
     octets: int = 0
@@ -69,19 +69,18 @@ class Heard:
 async def record(
     url: LinkUrl, out: Path, duration_s: float | None = None, *, heard: Heard | None = None
 ) -> Heard:
-    """Write what arrives over ``url`` to the tlog ``out``, and send nothing.
+    """Record what arrives over ``url`` to the tlog ``out``.
 
-    The one exception: over ``udpout`` an empty datagram goes out each second until something is
-    heard, since the peer cannot know otherwise that somebody listens.
+    Nothing is sent, except over ``udpout``: an empty datagram each second until the first reply, to
+    make this end known to the peer.
 
-    It ends when ``duration_s`` has passed, a TCP peer closes, a serial port vanishes, or it is
-    cancelled. Stamps are Unix time at the start and go on with the monotonic clock: they never step
-    back. What was heard is in the file a second later at the latest. Frames whose checksum is
-    wrong, or cannot be checked because their id is unknown, are counted in ``Heard.rejected`` and
-    not written.
+    Ends after ``duration_s``, when a TCP peer closes, when a serial port disappears, or on
+    cancellation. Time stamps are Unix time at the start, continued with the monotonic clock, and
+    never step back. Data is in the file after at most a second. Frames with a wrong checksum or an
+    unknown message id are counted in ``Heard.rejected`` and not written.
 
-    Raises ``OSError`` where ``out`` cannot be written, and ``LinkError`` where the link cannot be
-    opened, breaks, or closes before ``duration_s``.
+    Raises ``OSError`` if ``out`` cannot be written, and ``LinkError`` if the link cannot be opened,
+    fails, or closes before ``duration_s``.
     """
     heard = Heard() if heard is None else heard
     loop = asyncio.get_running_loop()
@@ -105,7 +104,7 @@ async def record(
 
 
 async def _listen(endpoint: TrafficLink, ear: "_Ear", duration_s: float | None) -> bool:
-    """Listen until the duration is over (False) or the link has ended (True)."""
+    """Receive until the duration is over (False) or the link has ended (True)."""
     loop = asyncio.get_running_loop()
     end_s = math.inf if duration_s is None else loop.time() + duration_s
     while (left_s := end_s - loop.time()) > 0.0:
@@ -123,21 +122,21 @@ async def _listen(endpoint: TrafficLink, ear: "_Ear", duration_s: float | None) 
 
 
 class _Ear:
-    """Bytes from peers, split into frames and written."""
+    """Splits the bytes of peers into frames and writes them."""
 
     def __init__(self, url: LinkUrl, writer: TlogWriter, heard: Heard) -> None:
         self.writer = writer
         self.failed: asyncio.Future[OSError] = asyncio.get_running_loop().create_future()
-        """Done where the file cannot be written, with the reason."""
+        """Done if the file cannot be written, with the error."""
         self.has_heard = False
         self._url = url
         self._heard = heard
-        # One splitter a peer: a truncated datagram must not damage the next peer's frame.
+        # A splitter per peer: a truncated datagram must not affect frames of other peers.
         self._splitters: dict[object, Splitter] = {}
         self._unix_less_monotonic_ns = time.time_ns() - time.monotonic_ns()
 
     def take(self, peer: object, data: bytes) -> None:
-        """Take in what a peer sent; ``b""`` when it has left."""
+        """Process bytes of a peer; ``b""`` if it has closed."""
         if self.failed.done():
             return
         self.has_heard = True
@@ -146,11 +145,11 @@ class _Ear:
                 self._keep(self._splitter(peer).feed(self._now_ns(), data))
             else:
                 self._give_up(peer)
-        except OSError as error:  # a full disk: it ends the recording, not the link
+        except OSError as error:  # such as a full disk; ends the recording
             self.failed.set_result(error)
 
     def finish(self) -> None:
-        """Keep what an unfinished frame of each peer still hides."""
+        """Process the rest of each peer's unfinished frame."""
         for peer in tuple(self._splitters):
             self._give_up(peer)
 

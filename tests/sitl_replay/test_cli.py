@@ -60,7 +60,7 @@ def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
         ),
         (
             ["play", "empty.tlog", "--to", SOMEWHERE, "--fault", "loss=2"],
-            "'loss=2': P is '2', allowed: 0 to 1, as in loss=0.1",
+            "'loss=2': P is '2', allowed: 0 to 1; for example loss=0.1",
         ),
         (
             ["fly", "paper", "--to", SOMEWHERE, "--fault", "loss=0", "--fault", "loss=1"],
@@ -69,9 +69,9 @@ def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
         (["fly", "paper", "--to", "udpout:127.0.0.1:99999"], "is not a port"),
         (["fly", "paper", "--to", "udpout:no-such-host.invalid:9"], "no-such-host.invalid"),
         (["fly", "paper", "--to", SOMEWHERE, "--uavs", "1001"], "1<=x<=1000"),
-        (["fly", "adsb", "--to", SOMEWHERE, "--uavs", "2"], "adsb: 2 UAVs: 3 to 1000 can fly"),
-        (["fly", "paper", "--to", SOMEWHERE, "--duration", "nan"], "a number above 0"),
-        (["fly", "paper", "--to", SOMEWHERE, "--duration", "-1"], "a number above 0"),
+        (["fly", "adsb", "--to", SOMEWHERE, "--uavs", "2"], "adsb: 2 UAVs; allowed: 3 to 1000"),
+        (["fly", "paper", "--to", SOMEWHERE, "--duration", "nan"], "a positive number of seconds"),
+        (["fly", "paper", "--to", SOMEWHERE, "--duration", "-1"], "a positive number of seconds"),
         (["fly", "paper", "--to", SOMEWHERE, "--record", "."], "is a directory"),
         (["fly", "paper", "--to", SOMEWHERE, "--record", "no/such/a.tlog"], "no/such/a.tlog"),
         (["play", ".", "--to", SOMEWHERE], "is a directory"),
@@ -306,7 +306,7 @@ def test_a_link_lost_on_the_way_is_a_failure(receiver: socket.socket) -> None:
 def test_the_help_has_every_fault(command: str) -> None:
     text = " ".join(CliRunner().invoke(main, [command, "--help"]).stdout.split())
     for kind in KINDS.values():
-        assert f"{kind.form}: {kind.meaning}. As in {kind.example}" in text
+        assert f"{kind.form}: {kind.meaning}. Example: {kind.example}" in text
 
 
 def written_as(kind: str, folder: Path, stamps_s: list[float]) -> tuple[Path, list[bytes]]:
@@ -346,7 +346,7 @@ def test_every_kind_of_log_is_played_with_its_broken_stamps_clamped(
     assert (summary["frames"], summary["clamped"], summary["faults"]) == (5, 2, {})
     assert 0.2 <= summary["duration_s"] < 0.6
     (line,) = result.stderr.splitlines()
-    assert "2 time stamps step back, or leap by more than 5 s" in line
+    assert "2 time stamps step back, or jump by more than 5 s" in line
 
 
 def test_faults_are_summed_up(receiver: socket.socket, tmp_path: Path) -> None:
@@ -376,7 +376,7 @@ def test_a_flight_for_those_who_connect(tmp_path: Path) -> None:
         [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     ) as flight:
         line = line_of(flight, flight.stderr)
-        found = re.fullmatch(r"tcpin:127\.0\.0\.1:(\d+): waiting for a first peer\n", line)
+        found = re.fullmatch(r"tcpin:127\.0\.0\.1:(\d+): waiting for the first peer\n", line)
         assert found, line
         with socket.create_connection(("127.0.0.1", int(found[1])), timeout=HANG_S) as peer:
             received = 0

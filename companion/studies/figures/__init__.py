@@ -1,1 +1,1 @@
-"""The style of figures, drawings as SVG, pages from templates, and how all are written."""
+"""Figure style, SVG drawings, page templates and their output."""

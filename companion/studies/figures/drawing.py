@@ -1,4 +1,4 @@
-"""Drawings of lines and words as SVG: x to the right and y down from the upper left corner."""
+"""SVG drawings of lines and labels: x to the right and y down from the upper left corner."""
 
 from dataclasses import dataclass
 from html import escape
@@ -12,9 +12,9 @@ INK: Final = "#111111"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Line:
-    """Points (N, 2) joined in order.
+    """Polyline through points (N, 2).
 
-    ``colour`` is #rrggbb; ``dash`` are lengths drawn and left out in turn, empty for a solid line.
+    ``colour`` is #rrggbb; ``dash`` alternates drawn and blank lengths, empty for a solid line.
     """
 
     points: FloatArray
@@ -25,7 +25,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TextLabel:
-    """Text whose baseline begins, has its middle or ends at x, y, by ``anchor``."""
+    """Text whose baseline starts, is centred or ends at x, y, by ``anchor``."""
 
     x: float
     y: float
@@ -37,7 +37,7 @@ class TextLabel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Drawing:
-    """Lines, and words over them, on white; ``title`` is read out to those who cannot see it."""
+    """Lines with labels on top, on white; ``title`` is for screen readers."""
 
     width: int
     height: int
@@ -47,7 +47,7 @@ class Drawing:
 
 
 def svg(drawing: Drawing) -> str:
-    """The drawing as an SVG document, which may also stand within HTML."""
+    """Return the drawing as an SVG document, which HTML may embed."""
     size = f'viewBox="0 0 {drawing.width} {drawing.height}" width="{drawing.width}"'
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img"'

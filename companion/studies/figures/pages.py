@@ -1,7 +1,7 @@
-"""Pages of studies: templates (``*.html.j2``) beside the code that hands them their values.
+"""Pages of studies from templates (``*.html.j2``), which lie beside the code that uses them.
 
-``figures/page.html.j2`` is what all pages have, ``figures/parts.html.j2`` how they show figures and
-tables. What is handed in is text: markup in it is escaped, and a value that is missing is an error.
+``figures/page.html.j2`` is the common base, ``figures/parts.html.j2`` renders figures and tables.
+Values are text: markup in them is escaped, and a missing value is an error.
 """
 
 from functools import cache
@@ -11,7 +11,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 
 def page(template: str, **values: Any) -> str:
-    """The page of a template, named by its path in ``companion/studies``."""
+    """Render a template, named by its path in ``companion/studies``."""
     return _environment().get_template(template).render(values)
 
 

@@ -1,8 +1,8 @@
-"""The style of figures, and how they are written: PNG and SVG by matplotlib, without a screen.
+"""Figure style and output as PNG and SVG by matplotlib, without a screen.
 
-Made for print: lines differ in colour and in dash; the colours are those of Okabe and Ito (2008),
-which the colour-blind can tell apart. SVG has no dates and no random ids: the same numbers give the
-same file.
+The style suits print: lines differ in colour and in dash. Colours are those of Okabe and Ito
+(2008), which colour-blind readers can distinguish. SVG has no dates and no random ids: equal
+numbers give equal files.
 """
 
 import base64
@@ -50,7 +50,7 @@ Draw = Callable[[], "Figure"]
 
 @contextmanager
 def style() -> Iterator[None]:
-    """Context in which figures have this style; the previous settings are restored after it."""
+    """Return a context with this figure style; the previous settings are restored after it."""
     import matplotlib
 
     with matplotlib.rc_context(_STYLE):
@@ -60,7 +60,7 @@ def style() -> Iterator[None]:
 def new(
     rows: int, columns: int, size_in: tuple[float, float], **options: Any
 ) -> "tuple[Figure, list[Axes]]":
-    """A figure of panels, row by row; sizes in inches."""
+    """Return a figure and its panels in row order; sizes in inches."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size_in)
@@ -69,18 +69,18 @@ def new(
 
 
 def line(number: int) -> dict[str, Any]:
-    """Colour and dash of line ``number``; no two of the first 36 share both."""
+    """Return colour and dash of line ``number``; no two of the first 36 share both."""
     turns, at = divmod(number, len(COLOURS))
     return {"color": COLOURS[at], "linestyle": DASHES[(at + turns) % len(DASHES)]}
 
 
 def marked(number: int) -> dict[str, Any]:
-    """Line ``number`` with its mark: for curves through a few points, or many curves."""
+    """Return ``line`` with a marker: for curves through few points, or many curves."""
     return line(number) | {"marker": MARKS[number % len(MARKS)]}
 
 
 def below(figure: "Figure", axes: "Axes", columns: int) -> None:
-    """Put one legend for all panels under them, with the entries of one."""
+    """Place one legend for all panels below them, with the entries of one."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
@@ -92,7 +92,7 @@ def lettered(panels: "Sequence[Axes]", titles: Sequence[str]) -> None:
 
 
 def rendered(draw: Draw) -> tuple[bytes, bytes]:
-    """A figure as SVG and as PNG."""
+    """Return a figure as SVG and as PNG."""
     with style():
         figure = draw()
         svg, png = BytesIO(), BytesIO()
@@ -108,11 +108,11 @@ def files(
     values: Mapping[str, Any],
     progress: Callable[[str], None],
 ) -> dict[str, bytes]:
-    """Every figure as SVG and PNG, and the page ``name``.html, by file name.
+    """Return every figure as SVG and PNG, and the page ``name``.html, by file name.
 
-    template  of the page, as ``pages.page`` names it
-    drawings  caption and drawing of each figure by its name
-    values    what the template is given; beside it name, caption and PNG of each of ``figures``
+    template  of the page, as in ``pages.page``
+    drawings  caption and drawing of each figure by name
+    values    template variables, besides ``figures`` (name, caption and PNG of each)
     progress  called with the name of each figure
     """
     made, shown = {}, {}

@@ -1,10 +1,10 @@
-"""Tables of studies as text, for a terminal."""
+"""Plain-text tables of studies, for a terminal."""
 
 from collections.abc import Sequence
 
 
 def text_table(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of as many cells each: the first column flush left, the others flush right."""
+    """Format rows of equal length: the first column flush left, the others flush right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for first, *rest in rows:

@@ -1,1 +1,1 @@
-"""Many nodes and UAVs in one process and virtual time: what a fleet costs, how it hands over."""
+"""Simulation of many nodes and UAVs in one process: cost and handovers of a fleet."""

@@ -1,4 +1,4 @@
-"""Reports of the fleet study: a table as text, one HTML page, and figures."""
+"""Reports of the fleet study: a plain-text table, one HTML page, and figures."""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -15,16 +15,16 @@ if TYPE_CHECKING:
 
 COLUMNS: Final = (
     "nodes", "UAVs", "served by one", "by several", "by none", "handovers/min",
-    "tells, kbit/s", "is told, kbit/s", "CPU of a node", "takeover, s", "parted: none", "heals, s",
+    "sends, kbit/s", "receives, kbit/s", "CPU of a node", "takeover, s", "split: none", "heals, s",
 )  # fmt: skip
 CAPTIONS: Final = {
-    "traffic": "What a node tells and what it is told, by size of the fleet.",
-    "time": "Processor time of a node beside its pipeline, and time to take over from a dead one.",
+    "traffic": "Traffic that a node sends and receives, by size of the fleet.",
+    "time": "Processor time of a node without its pipeline, and takeover time after a node dies.",
 }
 
 
 def cells(one: FleetSize) -> list[str]:
-    """One size as a row of the table."""
+    """Return one size as a row of the table."""
     return [
         str(one.nodes),
         str(one.uavs),
@@ -42,7 +42,7 @@ def cells(one: FleetSize) -> list[str]:
 
 
 def text(found: Sequence[FleetSize]) -> str:
-    """The table as text."""
+    """Return the table as text."""
     return text_table([COLUMNS, *map(cells, found)])
 
 
@@ -52,7 +52,7 @@ def files(
     answer: dict[str, Any],
     progress: Callable[[str], None],
 ) -> dict[str, bytes]:
-    """The page and every figure as SVG and PNG, by file name."""
+    """Return the page and every figure as SVG and PNG, by file name."""
     drawings = {
         "traffic": (CAPTIONS["traffic"], partial(_traffic, found)),
         "time": (CAPTIONS["time"], partial(_time, found)),
@@ -73,7 +73,7 @@ def _traffic(found: Sequence[FleetSize]) -> "Figure":
         values = [one.told_kbps[what] for one in found]
         left.plot(nodes, values, label=what, **plotting.marked(number))
     right.plot(nodes, [one.link_kbps for one in found], **plotting.marked(0))
-    for axes, title in ((left, "a node tells"), (right, "a node is told")):
+    for axes, title in ((left, "a node sends"), (right, "a node receives")):
         _sized(axes, nodes)
         axes.set(yscale="log", ylabel="kbit/s", title=title)
         _plain(axes)
@@ -96,13 +96,13 @@ def _time(found: Sequence[FleetSize]) -> "Figure":
 
 
 def _sized(axes: "Axes", nodes: Sequence[int]) -> None:
-    """Nodes along the axis, each size by its number."""
+    """Label the axis of nodes with the sizes."""
     axes.set(xscale="log", xlabel="nodes")
     axes.set_xticks(nodes, labels=map(str, nodes))
     axes.set_xticks([], minor=True)
 
 
 def _plain(axes: "Axes") -> None:
-    """Plain numbers along the logarithmic axis of values."""
+    """Use plain numbers on the logarithmic axis of values."""
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")

@@ -1,4 +1,4 @@
-"""UAVs on circles over a grid of nodes: where they are, what they report, what each node offers."""
+"""UAVs on circles over a grid of nodes: positions, reports and the nodes' offers."""
 
 import math
 from dataclasses import dataclass
@@ -17,26 +17,23 @@ NEAREST_M: Final = 50.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sky:
-    """What is flown around which nodes, and over which network.
-
-    nodes, uavs   how many
-    """
+    """Scenario of UAVs, nodes and their network."""
 
     nodes: int
     uavs: int
     spacing_m: float = 1500.0  # between neighbouring nodes, on a square grid
-    reach_m: float = 2500.0  # distance at which a node hears a UAV, and can serve it
-    report_hz: float = 10.0  # reports of a UAV
-    sampled: int = 50  # UAVs whose reports are told; the others are counted as alike
-    delay_s: float = 0.02  # one way between two nodes
-    loss: float = 0.0  # share of messages lost, 0 to 1
+    reach_m: float = 2500.0  # range within which a node receives and can serve a UAV
+    report_hz: float = 10.0  # report rate of a UAV
+    sampled: int = 50  # UAVs with simulated reports; traffic is scaled to all UAVs
+    delay_s: float = 0.02  # one-way latency between two nodes
+    loss: float = 0.0  # share of lost messages, 0 to 1
     seed: int = 1
 
 
 class SkySimulation:
-    """The sky in time; times are seconds since its start.
+    """The sky over time; times are seconds since its start.
 
-    ``names`` are the nodes, ``uavs`` the UAVs, ``places_m`` (nodes, 2) where the nodes stand.
+    ``names`` are the nodes, ``uavs`` the UAVs, ``places_m`` (nodes, 2) the positions of the nodes.
     """
 
     def __init__(self, sky: Sky, random: np.random.Generator) -> None:
@@ -54,7 +51,7 @@ class SkySimulation:
         self._mavs: dict[str, Any] = {}
 
     def ranges_m(self, t_s: float) -> FloatArray:
-        """Distances (nodes, UAVs)."""
+        """Return distances (nodes, UAVs)."""
         angles = self._phases + self._speeds_mps / self._radii_m * t_s
         around = np.column_stack([np.cos(angles), np.sin(angles)])
         positions_m = self._centres_m + self._radii_m[:, np.newaxis] * around
@@ -63,7 +60,7 @@ class SkySimulation:
         return found
 
     def offers(self, ranges_m: FloatArray) -> dict[str, Offer]:
-        """What a node at these distances (UAVs,) offers those within its reach."""
+        """Return the offers of a node at these distances (UAVs,), for the UAVs within its reach."""
         found = {}
         for i in np.flatnonzero(ranges_m < self._reach_m).tolist():
             loss_db = 20 * math.log10(max(float(ranges_m[i]), NEAREST_M) / 1000)
@@ -74,7 +71,7 @@ class SkySimulation:
         return found
 
     def report(self, uav: str, boot_ms: int) -> bytes:
-        """A report of a UAV; its fields say nothing, its stamp makes it one of its own."""
+        """Encode a report of a UAV; only its stamp varies."""
         sysid, compid = Source.parse(uav)
         mav = self._mavs.setdefault(uav, common.MAVLink(None, sysid, compid))
         message = common.MAVLink_global_position_int_message(

@@ -1,4 +1,4 @@
-"""How a fleet does as it grows: bandwidth, processor time, time served, times to take over."""
+"""Scaling of a fleet: bandwidth, processor time, time served, takeover times."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
@@ -9,39 +9,38 @@ from companion.studies.fleet.sky import Sky
 from companion.studies.fleet.world import FleetCounts, World
 from companion.studies.origin import versions
 
-SETTLE_S = 8.0  # virtual time that a fleet has to find who serves whom
-AFTER_S = 4.0  # virtual time for which a fleet is watched after a node has died
+SETTLE_S = 8.0  # virtual time for a fleet to settle its assignment
+AFTER_S = 4.0  # observed virtual time after a node has died
 HALF = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetSize:
-    """A fleet of one size.
+    """Results of a fleet of one size.
 
-    nodes, uavs         how many
-    twice, none         in which it had several, or none
-    told_kbps           kilobits per second that a node tells, heads left out, by what it is
-    takeover_s          time to the last of a dead node's UAVs being served, where any node can
+    twice, none         share of the time in which a UAV within reach had several nodes, or none
+    told_kbps           kilobits per second that a node sends, without headers, by kind of message
+    takeover_s          time until all of a dead node's UAVs in reach of another are served again
     """
 
     nodes: int
     uavs: int
-    served: float  # share of the time in which a UAV within reach had one node
+    served: float  # share of the time in which a UAV within reach had exactly one node
     twice: float
     none: float
     handovers_per_min: float  # of all UAVs
     told_kbps: dict[str, float]
-    link_kbps: float  # kilobits per second to a node, of all others together, heads included
-    cpu_share: float  # processor time of a node over time, beside its pipeline
+    link_kbps: float  # kilobits per second that a node receives, headers included
+    cpu_share: float  # processor time of a node over time, without its pipeline
     takeover_s: float | None
     orphans: int  # UAVs that the dead node served
-    parted_none: float  # share of the time unserved while the fleet is in two parts
-    heal_s: float  # time from the end of that until no UAV has two nodes
+    parted_none: float  # unserved share of the time while the network is split in two
+    heal_s: float  # time after the split until no UAV has two nodes
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetStudy:
-    """What is to be studied: sizes as (nodes, UAVs), over how much virtual time, on which links.
+    """Parameters of the study: sizes as (nodes, UAVs), virtual time and network.
 
     ``spacing_m`` is between neighbouring nodes.
     """
@@ -60,7 +59,7 @@ def run(
     cpu_s: Callable[[], float],
     progress: Callable[[str], None] = lambda text: None,
 ) -> Iterator[FleetSize]:
-    """Fly the fleet at each size; ``cpu_s`` reads the processor time used."""
+    """Simulate the fleet at each size; ``cpu_s`` returns the processor time used."""
     for nodes, uavs in asked.sizes:
         progress(f"{nodes} nodes, {uavs} UAVs")
         sampled = min(asked.sampled, uavs)
@@ -80,7 +79,7 @@ def _grown(world: World, seconds: float) -> FleetSize:
     sky = world.sky
     world.run(SETTLE_S)
     steady = _counted(world, seconds)
-    # Frames of the sample alone were told: all UAVs' are as many times as much.
+    # Only the sampled UAVs sent frames; scale their traffic to all UAVs.
     scale = {"heard": sky.uavs / sky.sampled if sky.sampled else 1.0}
     told = {
         what: 8e-3 * size * scale.get(what, 1.0) / seconds / sky.nodes
@@ -114,15 +113,15 @@ def _grown(world: World, seconds: float) -> FleetSize:
 
 
 def _counted(world: World, seconds: float) -> FleetCounts:
-    """What is counted over so long."""
+    """Run for the given time and return its counts."""
     world.counted = counted = FleetCounts()
     world.run(seconds)
-    world.counted = FleetCounts()  # what comes later is counted elsewhere
+    world.counted = FleetCounts()  # later events go to another object
     return counted
 
 
 def _death(world: World) -> tuple[float | None, int]:
-    """How long the UAVs of the busiest node are unserved when it dies, and how many it served."""
+    """Kill the busiest node; return the time until its UAVs are served again, and their number."""
     victim = max(world.members, key=lambda name: len(world.members[name].duties.serves))
     orphans = set(world.members[victim].duties.serves)
     began_ns, taken = world.now_ns, dict[str, float]()
@@ -140,7 +139,7 @@ def _death(world: World) -> tuple[float | None, int]:
 
 
 def _healed_s(world: World) -> float:
-    """Time until every UAV has one node, handovers apart."""
+    """Return the time until no UAV has several nodes, handovers aside."""
     began_ns, last_ns = world.now_ns, world.now_ns
 
     def watch() -> None:
@@ -154,6 +153,6 @@ def _healed_s(world: World) -> float:
 
 
 def answer(asked: FleetStudy, found: Sequence[FleetSize], command: str) -> dict[str, Any]:
-    """What was asked and found, as JSON has it."""
+    """Return parameters and results as JSON."""
     sizes = [asdict(one) for one in found]
     return {"sizes": sizes, "asked": asdict(asked), "command": command, "versions": versions()}

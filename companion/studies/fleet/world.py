@@ -1,8 +1,8 @@
 """Nodes, UAVs and the network between the nodes, in virtual time.
 
-The nodes are the real ones (``pipeline/fleet``) without their pipelines: what they offer is worked
-out from where the UAVs are, and what they tell one another is encoded as it is live, so that it can
-be counted. Reports of a sample of the UAVs are told, and counted for all.
+The nodes are the real ones (``pipeline/fleet``) without their pipelines. Their offers are computed
+from the positions of the UAVs, and their messages are encoded as in live operation, so that bytes
+can be counted. Only a sample of the UAVs sends reports; the counts are scaled to all.
 """
 
 import heapq
@@ -29,25 +29,26 @@ STANDING_TICKS: Final = 2
 OFFER_TICKS: Final = 10
 ASK_TICKS: Final = 5
 DEGREE_M: Final = 111_195.0
-ENTRY_S: Final = 2.0  # time from a UAV's coming within reach until it counts as served or not
-STAGGER_NS: Final = 7_919_000  # time by which the reports of two UAVs are apart
+ENTRY_S: Final = 2.0  # time within reach before a UAV counts as served or unserved
+STAGGER_NS: Final = 7_919_000  # time between the reports of consecutive UAVs
 HEADER_BYTES: Final = 110
-"""Ethernet, IP and TCP heads, and Zenoh's own, of a sample on its way: measured on loopback."""
+"""Ethernet, IP, TCP and Zenoh headers of a message, measured on loopback."""
 
 
 @dataclass(slots=True, kw_only=True)
 class FleetCounts:
-    """What was counted; the UAVs' counts are of UAVs that some node could serve, at ticks.
+    """Counts of a period; those of UAVs are of UAVs within reach of some node, summed over ticks.
 
-    A UAV counts once it has been within reach for ``ENTRY_S``: so long a new one may wait.
+    A UAV counts once it has been within reach for ``ENTRY_S``, the time allowed for a first
+    assignment.
 
     served, twice, unserved   by one node, by several, by none
     handovers                 changes from one node to another
-    sent                      bytes by what was told, without heads
-    samples                   messages by what was told
-    received                  bytes that reached a node, heads included
+    sent                      bytes by kind of message, without headers
+    samples                   messages by kind
+    received                  bytes that reached a node, headers included
     cpu_s                     processor time of each node
-    frames_cpu_s              that part of it which reports take
+    frames_cpu_s              part of ``cpu_s`` used for reports
     """
 
     served: int = 0
@@ -62,7 +63,7 @@ class FleetCounts:
 
 
 class World:
-    """A fleet in virtual time; ``run`` takes it on, ``cpu_s`` reads the processor time used."""
+    """Fleet in virtual time; ``cpu_s`` returns the processor time used."""
 
     def __init__(
         self, sky: Sky, settings: FleetSettings, cpu_s: Callable[[], float] = lambda: 0.0
@@ -97,7 +98,7 @@ class World:
     # --- time -------------------------------------------------------------------------------
 
     def run(self, seconds: float, watch: Callable[[], None] = lambda: None) -> None:
-        """Take the world on by so long; ``watch`` is called at every tick."""
+        """Advance the world by ``seconds``; ``watch`` is called at every tick."""
         for _ in range(round(seconds * SECOND_NS / TICK_NS)):
             end_ns = self.now_ns + TICK_NS
             self._report(end_ns)
@@ -113,7 +114,7 @@ class World:
             watch()
 
     def kill(self, name: str, seen_s: float = 0.05) -> None:
-        """End a node's process; the others see its liveliness go after so long."""
+        """End a node's process; the others lose its liveliness after ``seen_s``."""
         self.dead.add(name)
         at_ns = self.now_ns + round(seen_s * SECOND_NS)
         for other in self._names:
@@ -125,7 +126,7 @@ class World:
         member.node_left(self._local_ns(member.name), node)
 
     def clock_ns(self, name: str) -> int:
-        """By how much a node's timeline is ahead of the world's."""
+        """Return the offset of a node's timeline from the world's."""
         return int(self._clock_ns[self._names.index(name)])
 
     def _local_ns(self, name: str) -> int:
@@ -142,7 +143,7 @@ class World:
         if of_frames:
             self.counted.frames_cpu_s[name] += spent_s
 
-    # --- what nodes do ----------------------------------------------------------------------
+    # --- nodes ------------------------------------------------------------------------------
 
     def _act(self, name: str, number: int) -> None:
         member, now_ns = self.members[name], self._local_ns(name)
@@ -164,8 +165,8 @@ class World:
                 self._ask(name, other)
 
     def _flush(self, name: str) -> None:
-        """Tell what is due of what was heard, as the live node does."""
-        if self._flushing.get(name) == self.now_ns and name not in self.dead:  # else it is put off
+        """Publish received frames that are due, as a live node does."""
+        if self._flushing.get(name) == self.now_ns and name not in self.dead:  # else postponed
             del self._flushing[name]
             self._publish_received(name)
 
@@ -227,11 +228,11 @@ class World:
     # --- UAVs -------------------------------------------------------------------------------
 
     def _ranges_m(self) -> FloatArray:
-        """Distances (nodes, UAVs) now."""
+        """Return the current distances (nodes, UAVs)."""
         return self._flight.ranges_m((self.now_ns - START_NS) / SECOND_NS)
 
     def _report(self, end_ns: int) -> None:
-        """Have the sampled UAVs heard by the nodes in whose reach they are."""
+        """Deliver reports of the sampled UAVs to the nodes within reach."""
         period_ns = round(SECOND_NS / self.sky.report_hz)
         ranges_m = self._ranges_m()
         for i, uav in enumerate(self._flight.uavs[: self.sky.sampled]):
@@ -261,7 +262,7 @@ class World:
     # --- counting ---------------------------------------------------------------------------
 
     def served_by(self) -> dict[str, list[str]]:
-        """The living nodes that serve each UAV now."""
+        """Return the living nodes that serve each UAV now."""
         found: dict[str, list[str]] = {}
         for name, member in self.members.items():
             if name not in self.dead:
@@ -270,7 +271,7 @@ class World:
         return found
 
     def servable(self) -> set[str]:
-        """UAVs within reach of a living node."""
+        """Return the UAVs within reach of a living node."""
         alive = [number for number, name in enumerate(self._names) if name not in self.dead]
         if not alive:
             return set()

@@ -1,1 +1,1 @@
-"""How often a UAV must report."""
+"""Report rate that a UAV needs."""

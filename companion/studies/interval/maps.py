@@ -1,8 +1,8 @@
-"""How often a UAV must report: feasible intervals, gamma and peak gain over alpha and feedthrough.
+"""Required report rate: feasible intervals, gamma and peak gain over alpha and feedthrough.
 
-Everything is by the closed forms of ``tracking.design.closed_form`` (docs/math.md 2.2 and 2.6). A
-bound of gamma seconds is gamma metres of error for each m/s of unknown input, which in ordinary
-words is speed that the reports do not foretell.
+All values follow from the closed forms of ``tracking.design.closed_form`` (docs/math.md 2.2 and
+2.6). A bound of gamma seconds is gamma metres of error per m/s of unknown input, which here is
+speed that the reports do not predict.
 """
 
 from dataclasses import dataclass
@@ -30,18 +30,18 @@ FEEDTHROUGHS_S: Final = (-0.2, 0.0, 0.2, 0.5)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Maps:
-    """The maps of the study."""
+    """Maps of the study."""
 
-    alpha: FloatArray  # (A,), axis of the decay
-    feedthrough_s: FloatArray  # (D,), axis of the feedthrough
-    dt_s: FloatArray  # (T,), axis of the interval
-    limit_s: dict[float, FloatArray]  # by mu: the largest feasible interval, (D, A)
+    alpha: FloatArray  # (A,), decay axis
+    feedthrough_s: FloatArray  # (D,), feedthrough axis
+    dt_s: FloatArray  # (T,), interval axis
+    limit_s: dict[float, FloatArray]  # by mu: largest feasible interval, (D, A)
     gamma_s: dict[float, FloatArray]  # by alpha: gamma of the optimal gain, (D, T)
     peak_gain_s: dict[float, FloatArray]  # by alpha: peak gain of the optimal gain, (D, T)
 
 
 def maps() -> Maps:
-    """Compute the maps; feedthroughs run from a lag of half a second to a lead of one."""
+    """Compute the maps, from a lag of half a second to a lead of one second."""
     alpha = np.linspace(0.02, 0.98, 49)
     feedthrough_s = np.linspace(-0.5, 1.0, 61)
     dt_s = np.linspace(0.025, 2.0, 80)
@@ -61,7 +61,7 @@ def maps() -> Maps:
 
 
 def study(progress: Progress) -> tuple[dict[str, Any], Maps]:
-    """The answer of ``companion study dt``, as JSON has it, and its maps."""
+    """Return the answer of ``companion study dt`` as JSON, and its maps."""
     progress("maps")
     found = maps()
     answer = {
@@ -79,10 +79,11 @@ def study(progress: Progress) -> tuple[dict[str, Any], Maps]:
 
 
 def rates() -> list[dict[str, float]]:
-    """Longest intervals that keep an error, by error, speed and feedthrough, at the best alpha.
+    """Return the longest intervals for an error bound, by error, speed and feedthrough, at the best
+    alpha.
 
     With alpha free the largest interval is the larger of 2 d, below which the input can be
-    cancelled, and d + error / speed, which alpha near 1 reaches for what is not cancelled.
+    cancelled, and d + error / speed, which alpha near 1 approaches without cancellation.
     """
     found = []
     for error_m in ERRORS_M:
@@ -108,7 +109,7 @@ def rates() -> list[dict[str, float]]:
 
 
 def files(answer: dict[str, Any], found: Maps, progress: Progress) -> dict[str, bytes]:
-    """The page ``dt.html`` and its figures, by file name."""
+    """Return the page ``dt.html`` and its figures, by file name."""
     drawings = {
         "dt_limit": (
             "Largest feasible interval between reports over the decay α and the feedthrough δ"
@@ -116,12 +117,12 @@ def files(answer: dict[str, Any], found: Maps, progress: Progress) -> dict[str, 
             lambda: _limit_maps(found),
         ),
         "dt_gamma": (
-            "Least γ over the interval and the feedthrough; in the hatched region it is 0: the"
-            " unknown input is cancelled.",
+            "Least γ over the interval and the feedthrough. It is 0 in the hatched region, where"
+            " the unknown input is cancelled.",
             lambda: _gain_maps(found, found.gamma_s, "γ, s"),
         ),
         "dt_peak": (
-            "Exact peak gain of the same optimal gains: the worst error for each m/s.",
+            "Exact peak gain of the same optimal gains: the worst error per m/s.",
             lambda: _gain_maps(found, found.peak_gain_s, "peak gain, s"),
         ),
     }
@@ -163,7 +164,7 @@ def _gain_maps(found: Maps, values: dict[float, FloatArray], label: str) -> "Fig
 
 
 def _map(axes: "Axes", x: FloatArray, y: FloatArray, values: FloatArray, levels: FloatArray) -> Any:
-    """Filled contours with labelled lines; values beyond the last level have its colour."""
+    """Draw filled contours with labelled lines; values beyond the last level have its colour."""
     drawn = axes.contourf(x, y, values, levels=levels, cmap=plotting.MAP, extend="max")
     lines = axes.contour(x, y, values, levels=levels[1::2], colors="#ffffff", linewidths=0.8)
     axes.clabel(lines, fmt="%.2f", fontsize=7.5)
@@ -172,7 +173,7 @@ def _map(axes: "Axes", x: FloatArray, y: FloatArray, values: FloatArray, levels:
 
 
 def _rates(answer: dict[str, Any]) -> list[tuple[str, ...]]:
-    """The fewest reports a second: a row an error and speed, a column a feedthrough."""
+    """Least report rates: one row per error and speed, one column per feedthrough."""
     by_case: dict[tuple[float, float], list[float]] = {}
     for row in answer["rates"]:
         by_case.setdefault((row["error_m"], row["speed_mps"]), []).append(row["dt_max_s"])
@@ -183,8 +184,8 @@ def _rates(answer: dict[str, Any]) -> list[tuple[str, ...]]:
 
 
 def text(answer: dict[str, Any]) -> str:
-    """The longest intervals as a table for a terminal."""
-    rows = [["error m", "speed m/s", "feedthrough s", "longest interval s", "with alpha"]]
+    """Return the longest intervals as a table for a terminal."""
+    rows = [["error m", "speed m/s", "feedthrough s", "longest interval s", "at alpha"]]
     for one in answer["rates"]:
         longest = f"{one['dt_max_s']:.3f}" if one["dt_max_s"] > 0 else "none"
         given = (f"{one[key]:g}" for key in ("error_m", "speed_mps", "feedthrough_s"))

@@ -1,1 +1,1 @@
-"""The radio link bit by bit: code, modulation, OFDM, and beams that point as predicted."""
+"""Bit-level simulation of the radio link: code, modulation, OFDM and pointing errors of beams."""

@@ -1,4 +1,4 @@
-"""Blocks of bits through the link: coded, modulated, sent, received, decoded and counted.
+"""Blocks of bits: encoding, transmission, reception, decoding and error counts.
 
 A block is one OFDM symbol: 306 bits and the tail of the code make 936 coded bits, which fill the
 234 data carriers exactly. There is no interleaver: after beamforming the line of sight is so much
@@ -20,7 +20,7 @@ BLOCK_BITS: Final = CODED_BITS // len(coding.GENERATORS) - coding.TAIL
 
 
 class Estimation(StrEnum):
-    """How a receiver knows its channel: from its pilots, as if it were flat; or exactly."""
+    """Channel knowledge of a receiver: flat estimate from its pilots, or exact."""
 
     PILOTS = "pilots"
     IDEAL = "ideal"
@@ -40,10 +40,12 @@ class Sent:
 def send(users: int, blocks: int, rng: np.random.Generator) -> Sent:
     """Draw random bits and encode them.
 
-    Raises ``ValueError`` for more streams than there are pilots.
+    Raises ``ValueError`` for more streams than pilots.
     """
     if users > ofdm.STREAMS:
-        raise ValueError(f"{users} UAVs at once: the pilots tell {ofdm.STREAMS} streams apart")
+        raise ValueError(
+            f"{users} UAVs at once: the pilots separate at most {ofdm.STREAMS} streams"
+        )
     bits = rng.random((users, blocks, BLOCK_BITS)) < 0.5
     coded = coding.encode(bits)
     symbols = modulation.modulate(coded)
@@ -58,9 +60,9 @@ def send(users: int, blocks: int, rng: np.random.Generator) -> Sent:
 
 
 def through(taps: ComplexArray, samples: ComplexArray) -> ComplexArray:
-    """Samples (N, B, 320) as received without noise.
+    """Return samples (N, B, 320) as received without noise.
 
-    One block follows the other; every stream passes every delay of ``taps`` (T, N, N).
+    Blocks are consecutive; every stream passes every delay of ``taps`` (T, N, N).
     """
     stream = samples.reshape(len(samples), -1)
     heard = taps[0] @ stream
@@ -71,7 +73,7 @@ def through(taps: ComplexArray, samples: ComplexArray) -> ComplexArray:
 
 
 def noise(users: int, blocks: int, rng: np.random.Generator) -> ComplexArray:
-    """White noise of power 1, samples (N, B, 320)."""
+    """Draw white noise of power 1, samples (N, B, 320)."""
     drawn = rng.standard_normal((2, users, blocks, ofdm.SAMPLES)) * np.sqrt(0.5)
     white: ComplexArray = drawn[0] + 1j * drawn[1]
     return white
@@ -81,9 +83,9 @@ def noise(users: int, blocks: int, rng: np.random.Generator) -> ComplexArray:
 class BlockErrors:
     """Errors by UAV and block, (N, B) each."""
 
-    raw_errors: IntArray  # coded bits decided wrongly one by one
-    decoded_errors: IntArray  # bits wrong after decoding
-    square_error: FloatArray  # mean square error of a symbol over the energy of one
+    raw_errors: IntArray  # wrong hard decisions on coded bits
+    decoded_errors: IntArray  # wrong bits after decoding
+    square_error: FloatArray  # mean square error of a symbol, over its energy
 
 
 def receive(
@@ -91,15 +93,12 @@ def receive(
 ) -> BlockErrors:
     """Decode received carriers (N, B, 256), noise included.
 
-        sent         what was sent
-        heard        the received carriers
         noise_power  per carrier, over the energy of a symbol
         taps         (T, N, N), used for the exact channel only
-        estimation   how the receiver knows its channel
+        estimation   channel knowledge of the receiver
 
-    The receiver does not know the interference: it takes the noise for all there is. Where the
-    channel is taken for flat, the noise power does not matter: it scales all soft bits of a block
-    alike.
+    The receiver ignores interference. Where it assumes a flat channel, the noise power does not
+    matter, because it scales all soft bits of a block equally.
     """
     if estimation is Estimation.PILOTS:
         gain = ofdm.flat_estimate(heard, sent.pilots)
@@ -110,7 +109,7 @@ def receive(
     soft = modulation.soft_bits(equalised, noise_power / np.abs(gain) ** 2)
     raw_errors = np.count_nonzero((soft < 0) != sent.coded, axis=-1)
     decoded_errors = np.zeros_like(raw_errors)
-    # A code word on which all soft bits agree is the most likely one: decoding would not change it.
+    # A code word without a wrong soft bit is the most likely one: decoding would not change it.
     doubtful = raw_errors > 0
     if doubtful.any():
         wrong = coding.decode(soft[doubtful]) != sent.bits[doubtful]

@@ -1,10 +1,10 @@
-"""The channel between the link study's streams and its UAVs, as taps one sample apart.
+"""Channel between the link study's streams and its UAVs, as taps one sample apart.
 
-The line of sight comes first and alone; scattered rays (Saleh and Valenzuela, ``channel.draw``)
-follow with delays, their mean power falling exponentially, each delay with rays of its own. Then
-come the two ends: the weights, and the UAV's antennas combined towards the node.
+The line of sight is first. Scattered rays (Saleh and Valenzuela, ``channel.draw``) follow with
+delays; their mean power decays exponentially, and each delay has its own rays. The response then
+includes both ends: the weights, and the UAV's antennas combined towards the node.
 
-Simplifications: delays are whole samples; nothing moves within an OFDM symbol; the receiver follows
+Simplifications: delays are whole samples; nothing moves within an OFDM symbol; the receiver tracks
 time and frequency (Doppler included) exactly.
 """
 
@@ -25,14 +25,14 @@ from companion.studies.link.scenario import Instant, PositionSource
 from companion.values import ComplexArray, FloatArray, UserError
 
 SAMPLE_RATE_HZ: Final = 50e6
-SPREADS: Final = 5.0  # delay spreads beyond which delays are left out
+SPREADS: Final = 5.0  # longest delay in delay spreads
 
 
 @dataclass(frozen=True, slots=True)
 class Scattering:
     """Power and delay of the scattered rays.
 
-    Raises ``UserError`` for a channel without line of sight, or with delays that pass the prefix.
+    Raises ``UserError`` for a channel without line of sight, or with delays beyond the prefix.
     """
 
     rician_k_db: float = 10.0  # power of the line of sight over that of all scattered rays
@@ -40,12 +40,14 @@ class Scattering:
 
     def __post_init__(self) -> None:
         if not self.rician_k_db >= 0:
-            raise UserError(f"--rician-k {self.rician_k_db:g}: dB, at least 0 (inf: no scattering)")
+            raise UserError(
+                f"--rician-k {self.rician_k_db:g}: give dB of at least 0 (inf: no scattering)"
+            )
         most_s = PREFIX / SAMPLE_RATE_HZ / SPREADS
         if not 0 <= self.delay_spread_s <= most_s:
             raise UserError(
-                f"--delay-spread {self.delay_spread_s * 1e9:g}: ns, 0 to {most_s * 1e9:g}, so that"
-                " all delays are within the cyclic prefix"
+                f"--delay-spread {self.delay_spread_s * 1e9:g}: give ns from 0 to"
+                f" {most_s * 1e9:g}, so that the cyclic prefix covers all delays"
             )
 
     @property
@@ -66,10 +68,10 @@ def draw(
     truly: FloatArray,
     rng: np.random.Generator,
 ) -> ComplexArray:
-    """Response of each UAV to each element after combining, at each delay: (T, N, M).
+    """Draw the response of each UAV to each element after combining, at each delay: (T, N, M).
 
-    ``truly`` are the true directions (N, 3) in the array frame. UAVs are turned as the array is. In
-    units in which the line of sight alone has gain 1 from an element to an antenna.
+    ``truly`` are the true directions (N, 3) in the array frame. UAVs have the array's attitude.
+    Units: the line of sight alone has gain 1 from an element to an antenna.
     """
     settings = SalehValenzuela(rician_k_db=math.inf)
     opposite = -truly
@@ -98,33 +100,34 @@ def draw(
 
 
 def weights(array: Array, instant: Instant, by: PositionSource, precoder: Precoder) -> ComplexArray:
-    """Weights (M, N) with columns of unit norm, not widened, for the directions known by ``by``.
+    """Return weights (M, N) with columns of unit norm, not widened, for the directions known by
+    ``by``.
 
-    Raises ``UserError`` where the precoder serves some UAVs only, or in time slots.
+    Raises ``UserError`` if the precoder omits UAVs or uses time slots.
     """
     made = precode(steering_matrix(array, instant.towards[by]), precoder)
     users = len(instant.towards[by])
     if len(made.served) < users or made.groups.any():
         raise UserError(
-            f"[beams] policy = {precoder.policy.value!r}: this study serves all UAVs at once,"
-            " by 'regularise'"
+            f"[beams] policy = {precoder.policy.value!r}: this study serves all UAVs at once;"
+            " give 'regularise'"
         )
     return share_power(made.weights, users)
 
 
 def responses(rows: ComplexArray, sent: ComplexArray, alone: FloatArray) -> ComplexArray:
-    """Response of each UAV to each stream at each delay: (T, N, N), row i the UAV.
+    """Return the response of each UAV to each stream at each delay: (T, N, N), row i the UAV.
 
     rows   (T, N, M), from ``draw``
     sent   (M, N), the weights
-    alone  (N,), amplitude of a beam exactly on a UAV, which becomes 1
+    alone  (N,), amplitude of an exact beam on a UAV, scaled to 1
     """
     heard: ComplexArray = (rows @ sent) / alone[:, np.newaxis]
     return heard
 
 
 def alone(array: Array, uav_array: Array, truly: FloatArray) -> FloatArray:
-    """Amplitude (N,) at each UAV of a beam of unit norm exactly on it, by the line of sight.
+    """Return the line-of-sight amplitude (N,) at each UAV of an exact beam of unit norm.
 
     The UAV's antennas are combined: |a| |b|, which is sqrt(M N_U) for isotropic elements.
     """

@@ -1,13 +1,13 @@
-"""The link's convolutional code, rate 1/3, constraint length 7, and its Viterbi decoder.
+"""Convolutional code of the link, rate 1/3, constraint length 7, and its Viterbi decoder.
 
-Generators 133, 171, 165 (octal), the newest bit at the most significant place; each block ends with
-six zeros, which bring the encoder back to state 0. A state is the last six bits, the newest at the
-most significant place.
+Generators 133, 171, 165 (octal), newest bit in the most significant place; each block ends with
+six zeros, which return the encoder to state 0. A state is the last six bits, newest in the most
+significant place.
 
-All three generators have their first and their last tap. The outputs of the two branches that leave
-a state, and of the two that enter one, are therefore complements of one another, and states go in
-butterflies: 2j and 2j + 1 lead to j (after a 0) and j + 32 (after a 1), with branch metrics +g and
--g. (G. D. Forney, "The Viterbi algorithm", Proceedings of the IEEE 61(3), 1973.)
+All three generators have their first and their last tap. Therefore the outputs of the two branches
+that leave a state, and of the two that enter one, are complements, and states form butterflies: 2j
+and 2j + 1 lead to j (after a 0) and j + 32 (after a 1), with branch metrics +g and -g.
+(G. D. Forney, "The Viterbi algorithm", Proceedings of the IEEE 61(3), 1973.)
 """
 
 from typing import Final
@@ -21,16 +21,16 @@ GENERATORS: Final = (0o133, 0o171, 0o165)
 CONSTRAINT: Final = 7
 TAIL: Final = CONSTRAINT - 1  # zeros after each block
 STATES: Final = 1 << TAIL
-TOGETHER: Final = 128  # blocks decoded at once: their path metrics stay in the processor's cache
+TOGETHER: Final = 128  # blocks decoded at once: their path metrics fit the processor's cache
 
 _TAPS: Final = np.array(
     [[bool(g >> (TAIL - i) & 1) for i in range(CONSTRAINT)] for g in GENERATORS], dtype=np.bool_
 )
-"""(3, 7): whether a generator uses the bit that came i bits ago."""
+"""(3, 7): whether a generator uses the bit of i bits ago."""
 
 
 def _butterfly_signs() -> NDArray[np.float32]:
-    """(32, 3): the output of state 2j after a 0, with +1 for a 0 and -1 for a 1."""
+    """Return (32, 3): the output of state 2j after a 0, with +1 for a 0 and -1 for a 1."""
     states = 2 * np.arange(STATES // 2)
     held = np.array([states >> (CONSTRAINT - 1 - i) & 1 for i in range(1, CONSTRAINT)])
     sent = _TAPS[:, 1:].astype(int) @ held % 2
@@ -42,7 +42,8 @@ _SIGNS: Final = _butterfly_signs()
 
 
 def encode(bits: BoolArray) -> BoolArray:
-    """Code words (..., 3 (k + 6)) of blocks of bits (..., k): three bits each, tail included."""
+    """Encode blocks of bits (..., k) to code words (..., 3 (k + 6)): three bits each, tail
+    included."""
     steps = bits.shape[-1] + TAIL
     ends = [(0, 0)] * (bits.ndim - 1)
     padded = np.pad(bits, [*ends, (TAIL, TAIL)])
@@ -54,15 +55,17 @@ def encode(bits: BoolArray) -> BoolArray:
 
 
 def decode(soft: FloatArray) -> BoolArray:
-    """The most likely blocks of bits (B, k) of soft code words (B, 3 (k + 6)).
+    """Return the most likely blocks of bits (B, k) of soft code words (B, 3 (k + 6)).
 
-    ``soft`` is log P(bit 0) / P(bit 1), or anything proportional to it within a block. Single
-    precision. Raises ``ValueError`` for a length that is no code word's.
+    ``soft`` is log P(bit 0) / P(bit 1), up to a positive factor per block. Single precision. Raises
+    ``ValueError`` for a length that no code word has.
     """
     blocks, length = soft.shape
     steps = length // len(GENERATORS)
     if length % len(GENERATORS) or steps <= TAIL:
-        raise ValueError(f"{length} soft bits are no code word: 3 for each bit and 18 for the tail")
+        raise ValueError(
+            f"{length} soft bits do not make a code word; give 3 per bit and 18 for the tail"
+        )
     bits = np.empty((blocks, steps), dtype=np.bool_)
     for start in range(0, blocks, TOGETHER):
         some = soft[start : start + TOGETHER].astype(np.float32)
@@ -72,7 +75,7 @@ def decode(soft: FloatArray) -> BoolArray:
 
 
 def _decisions(soft: NDArray[np.float32]) -> BoolArray:
-    """(steps, 64, B): whether the best way into a state is from its odd predecessor."""
+    """Return (steps, 64, B): whether the best path into a state is from its odd predecessor."""
     steps, _, blocks = soft.shape
     half = STATES // 2
     odd_wins = np.empty((steps, STATES, blocks), dtype=np.bool_)
@@ -91,7 +94,7 @@ def _decisions(soft: NDArray[np.float32]) -> BoolArray:
 
 
 def _traced_back(odd_wins: BoolArray) -> BoolArray:
-    """The bits (steps, B) that led to state 0 at the end."""
+    """Return the bits (steps, B) that led to state 0 at the end."""
     steps, _, blocks = odd_wins.shape
     bits = np.empty((steps, blocks), dtype=np.bool_)
     every, state = np.arange(blocks), np.zeros(blocks, dtype=np.int64)

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-LEAST: Final = {"ber": 1e-6, "bler": 1e-4}  # least error rate that is drawn
+LEAST: Final = {"ber": 1e-6, "bler": 1e-4}  # least error rate drawn
 LABELS: Final = {
     "perfect": "perfect positions",
     "held": "held positions",
@@ -21,11 +21,11 @@ LABELS: Final = {
 
 
 def drawings(answer: dict[str, Any]) -> dict[str, tuple[str, plotting.Draw]]:
-    """Caption and drawing of each figure by its name."""
+    """Return caption and drawing of each figure by name."""
     return {
         "link_ber": (
-            "Bit error rate. Bands: 95 % confidence, from the differences between instants."
-            " Curves end where no error was seen.",
+            "Bit error rate. Bands: 95 % confidence, from the variance between instants."
+            " Curves end where no error occurred.",
             lambda: _errors(answer, "ber", "bit error rate"),
         ),
         "link_bler": (
@@ -33,11 +33,11 @@ def drawings(answer: dict[str, Any]) -> dict[str, tuple[str, plotting.Draw]]:
             lambda: _errors(answer, "bler", "block error rate"),
         ),
         "link_rate": (
-            "Bits of blocks without error over time, for one UAV.",
+            "Throughput of one UAV: bits of error-free blocks per second.",
             lambda: _rates(answer),
         ),
         "link_evm": (
-            "Error vector magnitude after equalisation, against the symbols that were sent.",
+            "Error vector magnitude after equalisation, relative to the transmitted symbols.",
             lambda: _evm(answer),
         ),
     }
@@ -59,7 +59,7 @@ def _curve(answer: dict[str, Any], positions: str, coded: bool) -> list[Row]:
 
 
 def _errors(answer: dict[str, Any], key: str, label: str) -> "Figure":
-    """Error rates, uncoded beside coded, with confidence bands."""
+    """Draw error rates, uncoded beside coded, with confidence bands."""
     figure, axes = _new(2, (7.2, 3.8))
     for panel, coded in zip(axes, (False, True), strict=True):
         panel.set_title("coded: rate 1/3, K = 7" if coded else "uncoded")

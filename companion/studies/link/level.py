@@ -1,18 +1,17 @@
-"""The link bit by bit: ``companion study link``.
+"""Bit-level study of the link: ``companion study link``.
 
-At many instants of a flight the array zero-forces towards where it believes the UAVs to be; coded
-16-QAM on OFDM goes through the channel to where they are. Error rates, EVM and throughput are found
-against the signal-to-noise ratio, for beams by perfect, predicted and held positions. Bits,
-channels and noise are the same for all three, so that they differ by the positions alone. They are
-compared with the same link without array or channel (``awgn``), and with the exact curve of uncoded
-16-QAM.
+At many instants of a flight the array zero-forces towards the believed directions of the UAVs;
+coded 16-QAM on OFDM passes the channel of the true directions. The study measures error rates, EVM
+and throughput over the signal-to-noise ratio, for beams by perfect, predicted and held positions.
+All three use the same bits, channels and noise, so they differ by the positions alone. References
+are the same link without array or channel (``awgn``) and the exact curve of uncoded 16-QAM.
 
-The ratio (SNR) is that of a data carrier at a UAV with a beam exactly on it, for it alone, on the
-line of sight: the energy of a symbol over the noise (Es/N0). It is the same for every UAV, whatever
-its range: ranges enter by the directions alone. Each UAV has an equal share of the power.
+The ratio (SNR) is that of a data carrier at a UAV served alone by an exact beam over the line of
+sight: the energy of a symbol over the noise (Es/N0). It is the same for every UAV: ranges enter
+only through the directions. Each UAV has an equal share of the power.
 
-Uncoded and coded figures come from the same transmissions: the coded bits decided one by one are
-what the link would do without a code, in blocks of 936 bits of payload.
+Uncoded and coded results come from the same transmissions: hard decisions on the coded bits give
+the performance without a code, in blocks of 936 payload bits.
 """
 
 from collections.abc import Callable, Iterable
@@ -38,18 +37,20 @@ from companion.values import ComplexArray, UserError
 SYMBOL_S: Final = ofdm.SAMPLES / SAMPLE_RATE_HZ  # duration of an OFDM symbol
 AWGN: Final = "awgn"
 KINDS: Final = (AWGN, *(kind.value for kind in PositionSource))
-MOST_POINTS: Final = 100  # most points of a curve
+MOST_POINTS: Final = 100  # per curve
 TARGET: Final = 1e-3  # bit error rate at which curves are compared
 
 
 def snrs(first_db: float, last_db: float, step_db: float) -> tuple[float, ...]:
-    """First, last and what lies between in steps, dB.
+    """Return the SNRs from first to last in steps, dB.
 
     Raises ``UserError`` for a range out of order.
     """
     said = f"--snr {first_db:g}:{last_db:g}:{step_db:g}"
     if not (-40 <= first_db <= last_db <= 80 and step_db > 0):
-        raise UserError(f"{said}: FROM:TO:STEP in dB, -40 <= FROM <= TO <= 80 and STEP above 0")
+        raise UserError(
+            f"{said}: give FROM:TO:STEP in dB, -40 <= FROM <= TO <= 80 and STEP above 0"
+        )
     count = int((last_db - first_db) / step_db + 1e-9) + 1
     if count > MOST_POINTS:
         raise UserError(f"{said}: {count} points, at most {MOST_POINTS} are allowed")
@@ -58,7 +59,7 @@ def snrs(first_db: float, last_db: float, step_db: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStudy:
-    """What is asked of the study.
+    """Parameters of the study.
 
         logs        of one flight with the simulator's truth; none: the paper's circles
 
@@ -68,13 +69,13 @@ class LinkStudy:
     logs: tuple[Path, ...] = ()
     center: str | None = None  # as on the command line
     config: str | None = None  # as on the command line
-    settings: Settings = field(default_factory=Settings)  # those of the array and the tracking
+    settings: Settings = field(default_factory=Settings)  # of the array and the tracking
     snr_db: tuple[float, float, float] = (-2.0, 30.0, 1.0)  # first, last and step
     instants: int = 96  # times of the flight
-    blocks: int = 16  # sent to each UAV at each instant, for each SNR
-    estimation: Estimation = Estimation.PILOTS  # how receivers know their channel
-    reports: Reports = field(default_factory=Reports)  # when the circling UAVs report
-    scattering: Scattering = field(default_factory=Scattering)  # the scattered rays
+    blocks: int = 16  # to each UAV at each instant, for each SNR
+    estimation: Estimation = Estimation.PILOTS  # channel knowledge of the receivers
+    reports: Reports = field(default_factory=Reports)  # timing of the circling UAVs' reports
+    scattering: Scattering = field(default_factory=Scattering)
     seed: int = 1  # of all random numbers
 
     def __post_init__(self) -> None:
@@ -84,13 +85,13 @@ class LinkStudy:
             ("blocks", self.blocks, 1000),
         ):
             if not 1 <= value <= most:
-                raise UserError(f"--{name} {value}: 1 to {most}")
+                raise UserError(f"--{name} {value}: give 1 to {most}")
         if self.seed < 0:
-            raise UserError(f"--seed {self.seed}: at least 0")
+            raise UserError(f"--seed {self.seed}: give a number of at least 0")
 
     @property
     def command(self) -> str:
-        """The command line that asks for this study."""
+        """Command line of this study."""
         return command_line(
             "link",
             *self.logs,
@@ -109,11 +110,11 @@ class LinkStudy:
 
 
 Counts = dict[tuple[str, float], list[BlockErrors]]
-"""Counts by kind of positions and SNR in dB: one entry for each instant."""
+"""Errors by kind of positions and SNR in dB, one entry per instant."""
 
 
 def uav_array(settings: Settings) -> Array:
-    """The UAVs' own antennas: a line, half a wavelength apart, at the array's frequency."""
+    """Return the UAVs' own antennas: a line, half a wavelength apart, at the array's frequency."""
     radio, frequency_hz = settings.radio, settings.array.frequency_hz
     return geometry.uniform_linear(
         radio.uav_antennas, frequency_hz, spacing_wavelengths=0.5, array_from_body=np.eye(3)
@@ -123,7 +124,7 @@ def uav_array(settings: Settings) -> Array:
 def simulate(
     setting: LinkStudy, scenario: Scenario, progress: Callable[[str], None] = lambda _text: None
 ) -> Counts:
-    """Send every block of every instant. Each instant draws from a generator of its own."""
+    """Send every block of every instant; each instant has its own random generator."""
     counts: Counts = {}
     array, own = scenario.array, uav_array(setting.settings)
     precoder = assembly.precoder(setting.settings)
@@ -147,7 +148,7 @@ def exchange(
 ) -> Iterable[tuple[tuple[str, float], BlockErrors]]:
     """Send the same blocks with the same noise over every channel (T, N, N), at every SNR.
 
-    Over ``awgn`` the receiver knows its channel.
+    Over ``awgn`` the receiver has exact channel knowledge.
     """
     users = channels[AWGN].shape[-1]
     sent = blocks.send(users, setting.blocks, rng)
@@ -164,9 +165,9 @@ def exchange(
 def study(
     setting: LinkStudy, progress: Callable[[str], None] = lambda _text: None
 ) -> dict[str, Any]:
-    """The answer as it is written to ``link.json``.
+    """Return the content of ``link.json``.
 
-    Raises ``UserError``, ``LogError`` or ``ConfigError`` where there is nothing to study.
+    Raises ``UserError``, ``LogError`` or ``ConfigError`` if there is nothing to study.
     """
     rng = np.random.default_rng([setting.seed, 0])
     if not setting.logs:
@@ -217,13 +218,13 @@ def study(
 
 
 def _floor(rows: list[Row], kind: str, coded: bool) -> Row:
-    """Error rate and throughput at the highest SNR."""
+    """Return error rate and throughput at the highest SNR."""
     last = [found for found in rows if (found["positions"], found["coded"]) == (kind, coded)][-1]
     return {"ber_at_highest_snr": last["ber"], "rate_at_highest_snr_bps": last["rate_bps"]}
 
 
 def _pointing(scenario: Scenario, kind: PositionSource) -> Row:
-    """Pointing error of the beams, degrees."""
+    """Return the pointing error of the beams, degrees."""
     off_deg = np.concatenate(
         [
             angles_deg(instant.towards[kind], instant.towards[PositionSource.PERFECT])

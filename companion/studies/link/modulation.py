@@ -15,17 +15,17 @@ from scipy.special import erfc
 
 from companion.values import BoolArray, ComplexArray, FloatArray
 
-BITS: Final = 4  # bits in a symbol
+BITS: Final = 4  # bits per symbol
 SCALE: Final = 1 / np.sqrt(10.0)  # factor from the levels -3, -1, 1, 3 to symbols of mean energy 1
 
 
 def modulate(bits: BoolArray) -> ComplexArray:
-    """Symbols (..., n) of bits (..., 4 n).
+    """Map bits (..., 4 n) to symbols (..., n).
 
-    Raises ``ValueError`` unless the bits fill their symbols.
+    Raises ``ValueError`` unless the number of bits is a multiple of 4.
     """
     if bits.shape[-1] % BITS:
-        raise ValueError(f"{bits.shape[-1]} bits do not fill symbols of {BITS}")
+        raise ValueError(f"{bits.shape[-1]} bits do not fill symbols of {BITS}; give a multiple")
     signs = 1.0 - 2.0 * bits.reshape(*bits.shape[:-1], -1, BITS)
     levels = signs[..., :2] * (2.0 - signs[..., 2:]) * SCALE
     symbols: ComplexArray = levels[..., 0] + 1j * levels[..., 1]
@@ -33,12 +33,12 @@ def modulate(bits: BoolArray) -> ComplexArray:
 
 
 def soft_bits(received: ComplexArray, noise_power: ArrayLike) -> FloatArray:
-    """Max-log ratios log P(bit 0) / P(bit 1) of equalised symbols (..., n): (..., 4 n).
+    """Return max-log ratios log P(bit 0) / P(bit 1), (..., 4 n), of equalised symbols (..., n).
 
     ``noise_power`` is that of both axes together, per symbol energy; it broadcasts to the symbols.
     Max-log keeps only the largest term of each sum over symbols: (min over symbols with bit 1 of |y
-    - s|^2 - min over those with bit 0) / noise power. With y in levels of an axis that is, for the
-    sign, 4 y, plus 4 for each level by which |y| exceeds 2; and for the amplitude, 8 - 4 |y|.
+    - s|^2 - min over those with bit 0) / noise power. With y in levels of an axis, the ratio of the
+    sign is 4 y plus 4 for each level by which |y| exceeds 2; that of the amplitude is 8 - 4 |y|.
     """
     levels = np.stack([received.real, received.imag], axis=-1) / SCALE
     size = np.abs(levels)
@@ -50,10 +50,11 @@ def soft_bits(received: ComplexArray, noise_power: ArrayLike) -> FloatArray:
 
 
 def bit_error_rate(snr: ArrayLike) -> FloatArray:
-    """Exact bit error rate of hard decisions in white Gaussian noise; ``snr`` is Es/N0 as a ratio.
+    """Return the exact bit error rate of hard decisions in white Gaussian noise; ``snr`` is Es/N0.
 
-    The mean over the two kinds of bits. Source: K. Cho and D. Yoon, "On the general BER expression
-    of one- and two-dimensional amplitude modulations", IEEE Trans. Communications 50(7), 2002.
+    The mean over the two kinds of bits; ``snr`` is a power ratio. Source: K. Cho and D. Yoon, "On
+    the general BER expression of one- and two-dimensional amplitude modulations", IEEE Trans.
+    Communications 50(7), 2002.
     """
     step = np.sqrt(np.asarray(snr, dtype=float) / 10)
     rate: FloatArray = 3 / 8 * erfc(step) + 1 / 4 * erfc(3 * step) - 1 / 8 * erfc(5 * step)

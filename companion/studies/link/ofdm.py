@@ -1,9 +1,9 @@
-"""The link's OFDM: which carriers hold what, and carriers to samples and back.
+"""OFDM of the link: carrier plan, and conversion between carriers and samples.
 
-256 carriers, of which 234 hold data, 8 pilots and 14 nothing; a cyclic prefix of 64 samples.
-Carriers are numbered from 0 here, in order of frequency with 0 Hz in the middle, at 128; the plan
-in docs/math.md 8.3 counts from 1 (nulls [1:7 129 251:256], pilots [26 54 90 118 140 168 204 232]).
-Transforms are unitary: white noise has the same power per sample as per carrier.
+Of 256 carriers 234 are data, 8 pilots and 14 null; a cyclic prefix has 64 samples. Carriers are
+numbered from 0 in order of frequency, with 0 Hz in the middle, at 128; the plan in docs/math.md 8.3
+counts from 1 (nulls [1:7 129 251:256], pilots [26 54 90 118 140 168 204 232]). Transforms are
+unitary: white noise has the same power per sample as per carrier.
 """
 
 from typing import Final
@@ -19,16 +19,16 @@ SAMPLES: Final = CARRIERS + PREFIX  # samples of one OFDM symbol
 NULLS: Final = np.array([*range(7), 128, *range(250, 256)], dtype=np.int64)
 PILOTS: Final = np.array([26, 54, 90, 118, 140, 168, 204, 232], dtype=np.int64) - 1
 DATA: Final[IntArray] = np.setdiff1d(np.arange(CARRIERS), np.concatenate([NULLS, PILOTS]))
-STREAMS: Final = len(PILOTS)  # number of streams that pilots can tell apart
+STREAMS: Final = len(PILOTS)  # number of streams that pilots can separate
 PILOT_SIGNS: Final[FloatArray] = hadamard(STREAMS).astype(float)
 """(8, 8): one row of pilots per stream, by Sylvester's construction.
 
-The rows are orthogonal: over a flat channel no stream disturbs another's estimate.
+The rows are orthogonal: over a flat channel no stream disturbs the estimate of another.
 """
 
 
 def carriers(data: ComplexArray, pilots: FloatArray) -> ComplexArray:
-    """Carriers (..., 256) with data (..., 234) and pilots (broadcast to (..., 8)) in place."""
+    """Assemble carriers (..., 256) from data (..., 234) and pilots (broadcast to (..., 8))."""
     placed: ComplexArray = np.zeros((*data.shape[:-1], CARRIERS), dtype=complex)
     placed[..., DATA] = data
     placed[..., PILOTS] = pilots
@@ -36,26 +36,27 @@ def carriers(data: ComplexArray, pilots: FloatArray) -> ComplexArray:
 
 
 def samples(placed: ComplexArray) -> ComplexArray:
-    """Samples (..., 320) of carriers (..., 256): the prefix first."""
+    """Return samples (..., 320) of carriers (..., 256), prefix first."""
     body = np.fft.ifft(np.fft.ifftshift(placed, axes=-1), norm="ortho")
     sent: ComplexArray = np.concatenate([body[..., -PREFIX:], body], axis=-1)
     return sent
 
 
 def received_carriers(heard: ComplexArray) -> ComplexArray:
-    """Carriers (..., 256) of samples (..., 320), the prefix left out."""
+    """Return carriers (..., 256) of samples (..., 320), prefix removed."""
     found: ComplexArray = np.fft.fftshift(np.fft.fft(heard[..., PREFIX:], norm="ortho"), axes=-1)
     return found
 
 
 def frequency_response(taps: ComplexArray) -> ComplexArray:
-    """Response of a channel of taps (T, ...), one sample apart, at each carrier: (256, ...)."""
+    """Return the response of a channel of taps (T, ...), one sample apart, at each carrier: (256,
+    ...)."""
     found: ComplexArray = np.fft.fftshift(np.fft.fft(taps, CARRIERS, axis=0), axes=0)
     return found
 
 
 def flat_estimate(heard: ComplexArray, pilots: FloatArray) -> ComplexArray:
-    """Phase and amplitude of a channel that is taken for flat, (..., 1), from carriers (..., 256).
+    """Estimate phase and amplitude of a flat channel, (..., 1), from carriers (..., 256).
 
     The mean over the pilots: its noise is an eighth of a carrier's, which costs 0.5 dB.
     """

@@ -1,4 +1,4 @@
-"""Reports of the link study: a table as text, one self-contained HTML page, and figures."""
+"""Reports of the link study: a plain-text table, one self-contained HTML page, and figures."""
 
 from collections.abc import Callable
 from typing import Any
@@ -10,14 +10,14 @@ from companion.studies.link.rows import Row
 
 
 def files(answer: dict[str, Any], progress: Callable[[str], None]) -> dict[str, bytes]:
-    """The page and every figure as PNG and SVG, by file name."""
+    """Return the page and every figure as PNG and SVG, by file name."""
     values = {"answer": answer, "rows": [_cells(row) for row in answer["summary"]]}
     return plotting.files("link", "link/report.html.j2", figures.drawings(answer), values, progress)
 
 
 def text(answer: dict[str, Any]) -> str:
-    """A table of the SNR that each kind of positions needs, and its figures at the highest SNR."""
-    head = ["positions", "code", "dB at 1e-3", "BER at best", "Mbit/s", "degrees off"]
+    """Return a table of required SNRs by kind of positions, and results at the highest SNR."""
+    head = ["positions", "code", "dB at 1e-3", "BER at best", "Mbit/s", "error, degrees"]
     rows = text_table([head, *map(_cells, answer["summary"])])
     return f"{answer['scenario']['description']}\n{rows}"
 

@@ -1,4 +1,4 @@
-"""Counts of the link study to rates and their confidence intervals."""
+"""Error rates and confidence intervals from the counts of the link study."""
 
 import math
 from collections.abc import Sequence
@@ -10,18 +10,19 @@ from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, BlockErrors
 from companion.values import FloatArray
 
 Row = dict[str, Any]
-Z95: Final = 1.959963984540054  # half the width of a 95 per cent interval, in standard deviations
+Z95: Final = 1.959963984540054  # half-width of a 95 per cent interval, in standard deviations
 
 
 def row(
     positions: str, snr_db: float, coded: bool, counted: Sequence[BlockErrors], symbol_s: float
 ) -> Row:
-    """One point of a curve, all UAVs and instants together; ``counted`` has one entry per instant.
+    """Return one point of a curve over all UAVs and instants; ``counted`` has one entry per
+    instant.
 
-    ber, bler     shares of bits and of blocks that are wrong
-    evm_percent   median over blocks of the RMS error of equalised symbols, over that of a
-                  symbol (a mean would be that of the few blocks whose beam missed altogether)
-    rate_bps      bits of blocks without error over time, for one UAV
+    ber, bler     shares of wrong bits and of wrong blocks
+    evm_percent   median over blocks of the RMS error of equalised symbols, over the RMS of a symbol
+                  (a few blocks with missed beams would dominate a mean)
+    rate_bps      bits of error-free blocks over time, for one UAV
     confidence    95 per cent intervals of ``ber`` and ``bler``
     """
     bits = BLOCK_BITS if coded else CODED_BITS
@@ -32,7 +33,7 @@ def row(
     ber = float(wrong_bits.sum() / (bits * blocks.sum()))
     bler = float(wrong_blocks.sum() / blocks.sum())
     square_error = np.concatenate([each.square_error.ravel() for each in counted])
-    # Errors of a decoder come many at once: without any, blocks are the independent trials.
+    # Errors of a decoder come in bursts: blocks, not bits, are the independent trials.
     tried = blocks.sum() * (1 if coded else bits)
     return {
         "snr_db": snr_db,
@@ -52,14 +53,14 @@ def row(
 
 
 def interval(wrong: FloatArray, tried: FloatArray, independent: float) -> tuple[float, float]:
-    """95 per cent confidence interval of an error share, from clusters (instants).
+    """Return the 95 per cent confidence interval of an error share, from clusters (instants).
 
         wrong        errors by cluster
         tried        trials by cluster
         independent  independent trials, used without errors or with one cluster
 
-    Wilson's score interval, with as many independent trials as would have the variance that is seen
-    between the clusters (E. Korn and B. Graubard, 1998).
+    Wilson's score interval, with the number of independent trials that would have the observed
+    variance between clusters (E. Korn and B. Graubard, 1998).
     """
     total, clusters = float(tried.sum()), len(tried)
     share = float(wrong.sum() / total)
@@ -75,10 +76,10 @@ def interval(wrong: FloatArray, tried: FloatArray, independent: float) -> tuple[
 
 
 def crossing_db(rows: Sequence[Row], positions: str, coded: bool, target: float) -> float | None:
-    """The SNR at which a curve falls to a bit error rate for good, dB; None if it does not.
+    """Return the SNR from which on a curve stays below a bit error rate, dB; None without one.
 
-    Interpolated linearly on the logarithm of the rate; where the lower point saw no error, one
-    wrong bit stands in for it.
+    Interpolated linearly on the logarithm of the rate; a lower point without errors counts as one
+    wrong bit.
     """
     curve = [row for row in rows if (row["positions"], row["coded"]) == (positions, coded)]
     above = [i for i, row in enumerate(curve) if row["ber"] > target]

@@ -1,8 +1,7 @@
-"""Positions for the link study: where its UAVs are, and where their beams point, at many instants.
+"""Scenarios of the link study: true and assumed directions of its UAVs at many instants.
 
-``perfect`` is the truth at the time of use, ``predicted`` what the product's tracking makes of the
-reports that have arrived, ``held`` the last report as it stands. The scenario is the paper's
-circles, or a log that holds the simulator's truth, which goes through the pipeline.
+``perfect`` is the truth at the time of use, ``predicted`` the product's prediction from received
+reports, ``held`` the last report. A scenario is the paper's circles, or a log with SIM_STATE.
 """
 
 import math
@@ -30,18 +29,18 @@ from companion.values import FloatArray, Method, Update, UserError, kind_of
 
 RADII_M: Final = (100.0, 150.0, 200.0, 250.0)
 RATE_RADPS: Final = 0.5
-GUST: Final = 0.2  # share of the gusts in the speed; they turn ten times as fast
+GUST: Final = 0.2  # gust over nominal speed; gusts turn ten times as fast
 GUST_RATIO: Final = 10.0
 REPORTED_M: Final = 0.01
-"""Steps of a reported position, and (0.01 m/s) of a velocity, in GLOBAL_POSITION_INT."""
+"""Resolution of a position (and, in m/s, of a velocity) in GLOBAL_POSITION_INT."""
 WARM_UP_S: Final = 5.0
 DURATION_S: Final = 60.0
 LOOKS_HZ: Final = 10.0
-MOST_DRAWN: Final = 100  # times drawn for each one found before the array is given up
+MOST_DRAWN: Final = 100  # largest number of draws per instant
 
 
 class PositionSource(StrEnum):
-    """Positions by which the beams are pointed."""
+    """Positions that point the beams."""
 
     PERFECT = "perfect"
     PREDICTED = "predicted"
@@ -50,7 +49,8 @@ class PositionSource(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instant:
-    """Unit directions (N, 3) in the array frame by kind of positions, UAVs in the same order."""
+    """Unit directions (N, 3) in the array frame by kind of positions; all kinds have equal UAV
+    order."""
 
     t_s: float
     towards: dict[PositionSource, FloatArray]
@@ -58,10 +58,10 @@ class Instant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """The instants that are studied, and the array.
+    """Instants of the study, and the array.
 
-    ``unresolved_share`` is the share of all instants that were left out because not even the true
-    directions let the array tell all UAVs apart within the settings' limits of zero forcing.
+    ``unresolved_share`` is the share of excluded instants: even with the true directions, zero
+    forcing within the limits of the settings cannot separate all UAVs.
     """
 
     description: str
@@ -72,7 +72,7 @@ class Scenario:
 
 @dataclass(frozen=True, slots=True)
 class Reports:
-    """How often the circling UAVs report, and how late each report arrives, seconds.
+    """Interval and latency of the circling UAVs' reports, seconds.
 
     Raises ``UserError`` for values out of range.
     """
@@ -82,9 +82,9 @@ class Reports:
 
     def __post_init__(self) -> None:
         if not 0 < self.interval_s <= 2:
-            raise UserError(f"--interval {self.interval_s:g}: seconds, above 0 and at most 2")
+            raise UserError(f"--interval {self.interval_s:g}: give seconds above 0 and at most 2")
         if not 0 <= self.latency_s <= 2:
-            raise UserError(f"--latency {self.latency_s:g}: seconds, 0 to 2")
+            raise UserError(f"--latency {self.latency_s:g}: give seconds from 0 to 2")
 
 
 # --- the paper's circles ------------------------------------------------------------------------
@@ -92,7 +92,7 @@ class Reports:
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """A circle about the array, flown clockwise, with gusts: the paper's flight in continuous time.
+    """Circle around the array, flown clockwise, with gusts: the paper's flight in continuous time.
 
     Velocity R w [cos, -sin](w t + phase), plus a fifth of that at ten times the rate (docs/math.md
     8.2).
@@ -102,7 +102,7 @@ class Circle:
     phase_rad: float
 
     def at(self, t_s: float) -> tuple[FloatArray, FloatArray]:
-        """Position and velocity (3,), local frame; the one is the integral of the other."""
+        """Return position and velocity (3,), local frame; position is the integral of velocity."""
         turn = RATE_RADPS * t_s + self.phase_rad
         gust = GUST_RATIO * RATE_RADPS * t_s + self.phase_rad
         reach = GUST / GUST_RATIO
@@ -123,17 +123,17 @@ PAPER: Final = tuple(Circle(radius_m, i * math.pi / 2) for i, radius_m in enumer
 def circles(
     settings: Settings, reports: Reports, instants: int, rng: np.random.Generator
 ) -> Scenario:
-    """The paper's four UAVs at ``instants`` random times of a minute.
+    """Return the paper's four UAVs at ``instants`` random times of a minute.
 
-    The array stands level and faces north. A time at which it cannot tell the UAVs apart is drawn
-    again. The observer is given the bounds that the circles keep.
+    The array is level and faces north. Times at which it cannot separate the UAVs are drawn again.
+    The observer has the true bounds of the circles.
     """
     array = assembly.array(settings)
     times_s, tried = _resolved_times(settings, array, instants, rng)
     bounded = _bounded(settings)
     towards: dict[PositionSource, list[FloatArray]] = {kind: [] for kind in PositionSource}
     for number, circle in enumerate(PAPER):
-        starts_s = number / len(PAPER) * reports.interval_s  # out of step with one another
+        starts_s = number / len(PAPER) * reports.interval_s  # staggered
         answers = _flown(circle, starts_s, times_s, reports, bounded)
         for kind, positions in answers.items():
             towards[kind].append(positions @ array.array_from_body.T)
@@ -144,8 +144,8 @@ def circles(
     )
     description = (
         f"four UAVs on circles of {', '.join(f'{r:g}' for r in RADII_M)} m,"
-        f" {RATE_RADPS:g} rad/s, a report each {reports.interval_s:g} s,"
-        f" {reports.latency_s:g} s late, beams for {settings.beams.actuation_delay_s:g} s ahead"
+        f" {RATE_RADPS:g} rad/s, a report every {reports.interval_s:g} s with a latency of"
+        f" {reports.latency_s:g} s, beams for {settings.beams.actuation_delay_s:g} s ahead"
     )
     return Scenario(
         description=description, array=array, instants=found, unresolved_share=1 - instants / tried
@@ -155,7 +155,7 @@ def circles(
 def _resolved_times(
     settings: Settings, array: Array, instants: int, rng: np.random.Generator
 ) -> tuple[FloatArray, int]:
-    """Times of use, ascending, and how many were drawn to find them."""
+    """Return times of use, ascending, and the number of draws."""
     times_s = list[float]()
     for tried in range(1, MOST_DRAWN * instants + 1):
         t_s = WARM_UP_S + DURATION_S * float(rng.random())
@@ -164,7 +164,7 @@ def _resolved_times(
             times_s.append(t_s)
         if len(times_s) == instants:
             return np.sort(np.array(times_s)), tried
-    raise UserError("this array can hardly ever tell the circling UAVs apart")
+    raise UserError("the array can rarely separate the circling UAVs; give more elements")
 
 
 def _resolved(settings: Settings, array: Array, truly: FloatArray) -> bool:
@@ -175,7 +175,7 @@ def _resolved(settings: Settings, array: Array, truly: FloatArray) -> bool:
 
 
 def _bounded(settings: Settings) -> Settings:
-    """Settings with the bounds on speed, acceleration and noise that the circles keep."""
+    """Return settings with the bounds on speed, acceleration and noise that hold on the circles."""
     speed = max(RADII_M) * RATE_RADPS
     bounds = {
         "speed_max_mps": speed * (1 + GUST),
@@ -189,7 +189,7 @@ def _bounded(settings: Settings) -> Settings:
 def _flown(
     circle: Circle, starts_s: float, times_s: FloatArray, reports: Reports, settings: Settings
 ) -> dict[PositionSource, FloatArray]:
-    """Positions (K, 3) of one UAV at the times of use (K,), by kind."""
+    """Return positions (K, 3) of one UAV at the times of use (K,), by kind."""
     rivals: dict[PositionSource, Predictor] = {
         PositionSource.PREDICTED: TrackPredictor(settings),
         PositionSource.HELD: Hold(),
@@ -206,13 +206,13 @@ def _flown(
         for kind, rival in rivals.items():
             predicted = rival.predict(round(now_s * 1e9), round(t_s * 1e9))
             if predicted is None:
-                raise UserError(f"there is no {kind} position {t_s:.1f} s into the flight")
+                raise UserError(f"no {kind} position {t_s:.1f} s into the flight")
             found[kind].append(predicted.position_ned_m)
     return {kind: np.array(positions) for kind, positions in found.items()}
 
 
 def _report(circle: Circle, made_s: float, latency_s: float) -> ObservedReport:
-    """A report as it arrives; the sender's clock is known."""
+    """Return a report as received; the sender's clock is known."""
     position_m, velocity_mps = (
         np.round(one / REPORTED_M) * REPORTED_M for one in circle.at(made_s)
     )
@@ -241,7 +241,7 @@ def from_logs(
     rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> Scenario:
-    """Instants of a flight, drawn from ``LOOKS_HZ`` looks a second at the running pipeline.
+    """Draw instants of a flight, from ``LOOKS_HZ`` samples per second of the running pipeline.
 
     Raises ``UserError``, ``LogError`` or ``ConfigError`` for logs without the simulator's truth.
     """
@@ -251,7 +251,7 @@ def from_logs(
         if truth is None and any(kind_of(track.uav).reports_itself for track in update.tracks):
             truth = array_truth.load(logs, pipeline)
             if truth is None:
-                raise UserError(f"{name}: there is no simulator's truth of its UAVs in it")
+                raise UserError(f"{name}: no simulator truth; give a log with SIM_STATE")
         if truth is not None and (seen := _seen(t_s, update, pipeline, truth)) is not None:
             looks.append(seen)
         progress(f"{name}: {t_s:.0f} s of log")
@@ -260,7 +260,7 @@ def from_logs(
         one for one in looks if _resolved(settings, array, one.towards[PositionSource.PERFECT])
     ]
     if not resolved:
-        raise UserError(f"{name}: at no time is there a UAV to serve whose true place is known")
+        raise UserError(f"{name}: never serves a UAV whose true position is known; check --center")
     chosen = np.sort(rng.choice(len(resolved), min(instants, len(resolved)), replace=False))
     return Scenario(
         description=f"{name}: array on {pipeline.center.place}",
@@ -273,7 +273,7 @@ def from_logs(
 def _seen(
     t_s: float, update: Update, pipeline: Pipeline, truth: array_truth.ArrayTruth
 ) -> Instant | None:
-    """Directions of the UAVs that have a beam and whose truth is known; None without any."""
+    """Return the directions of UAVs with a beam and a known truth; None without any."""
     carrier = update.carrier
     if carrier is None or not update.beams.beams:
         return None

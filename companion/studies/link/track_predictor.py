@@ -1,4 +1,4 @@
-"""The product's tracking without a link or a clock, for scenarios that have no frames."""
+"""The product's tracking without link or clock, for scenarios without frames."""
 
 from typing import Final
 
@@ -10,7 +10,7 @@ from companion.values import AltitudeDatum, Fix, Report, SenderTime, Source, vec
 
 
 class TrackPredictor:
-    """The product's own tracking as a predictor."""
+    """Predictor by the product's own tracking."""
 
     def __init__(self, settings: Settings) -> None:
         self._tracker = assembly.tracker(settings)
@@ -19,7 +19,7 @@ class TrackPredictor:
         self._clock_bound_s = 0.0
 
     def report(self, report: ObservedReport) -> None:
-        """Take in a fix; the tracker decides whether it is used."""
+        """Pass a fix to the tracker, which may reject it."""
         self._offset_ns = report.sent_ns - report.sender_ns
         self._clock_bound_s = report.clock_bound_s
         errors = self._noise.default if report.gnss is None else reported(report.gnss, self._noise)
@@ -38,7 +38,7 @@ class TrackPredictor:
         )
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """The track at that time, with its bound."""
+        """Return the track at that time, with its bound."""
         at = SenderTime(
             node_ns=at_ns,
             sender_ns=at_ns - self._offset_ns,
@@ -71,4 +71,4 @@ _REPORT: Final = Report(
     boot_ms=None,
     tslc_s=None,
 )
-"""Placeholder for the message of a fix, which tracking does not read."""
+"""Placeholder for the message of a fix, which tracking ignores."""

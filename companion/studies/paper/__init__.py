@@ -1,1 +1,1 @@
-"""The published experiments repeated, and the method's claims judged."""
+"""Reproduction of the published experiments and verdicts on the method's claims."""

@@ -1,13 +1,13 @@
-"""The published scenario: four UAVs on circles, their reports, and the observer on them.
+"""Published scenario: four UAVs on circles, their reports and the observer.
 
-North and east from the array, metres; time step k lasts from report k to report k + 1:
+Coordinates are north and east of the array, metres; step k lasts from report k to report k + 1:
 
     v_k = R w [cos(w T k + f), -sin(w T k + f)]      the nominal velocity, T the interval
     d_k = (R w / 5) [cos(10 w T k + f), -sin(10 w T k + f)]
     x_k+1 = x_k + T W_k,   y_k = x_k + D W_k,   W_k = v_k + d_k / T
 
-The last line is the scenario as it is printed. Read so, d is a step in metres and the gust d / T is
-faster than the flight itself; ``literal=False`` takes d for the gust's velocity, W = v + d. See
+The last line is the scenario as printed. In this reading d is a step in metres and the gust d / T
+is faster than the flight. ``literal=False`` reads d as the gust's velocity, W = v + d. See
 docs/math.md 8.2. Source: Mohammadi, Rahmati and Malik.
 """
 
@@ -25,24 +25,21 @@ GUST_RATE_RATIO: Final = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperScenario:
-    """The scenario's numbers.
+    """Parameters of the scenario; initial phases are a quarter turn apart."""
 
-    UAVs begin a quarter turn from one another.
-    """
-
-    radii_m: tuple[float, ...] = (100.0, 150.0, 200.0, 250.0)  # one for each UAV
-    rate_radps: float = 0.5  # angular rate of all
+    radii_m: tuple[float, ...] = (100.0, 150.0, 200.0, 250.0)  # one per UAV
+    rate_radps: float = 0.5  # angular rate of every UAV
     dt_s: float = 0.15  # interval between reports
-    feedthrough_s: float = 0.5  # time by which a report leads the position
+    feedthrough_s: float = 0.5  # lead of a report over the position
     alpha: float = 0.5  # decay of the certificate
     gust: float = 0.2  # |d| over |v|
-    literal: bool = True  # take the gust as printed
+    literal: bool = True  # read the gust as printed
     steps: int = 170  # reports of each UAV
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class PaperFlight:
-    """K steps of N UAVs; coordinates are north and east."""
+    """Flight of N UAVs over K steps; coordinates are north and east."""
 
     scenario: PaperScenario
     position_m: FloatArray  # (K + 1, N, 2)
@@ -63,22 +60,22 @@ class PaperFlight:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Tracked:
-    """The observer's answers with one gain."""
+    """Estimates of the observer with one gain."""
 
     gain: float  # l
-    estimate_m: FloatArray  # (K + 1, N, 2), made one report ahead
+    estimate_m: FloatArray  # (K + 1, N, 2), predicted one report ahead
     input_b0_mps: FloatArray  # (K, N, 2), the unknown input with G = [b; 0] (as published)
     input_bd_mps: FloatArray  # (K, N, 2), the unknown input with G = [b; d]
 
 
 def stacked(vectors: FloatArray) -> FloatArray:
-    """Norm over all UAVs and axes of (K, N, 2), at each step (K,)."""
+    """Return the norm over all UAVs and axes of (K, N, 2), at each step (K,)."""
     norms: FloatArray = np.linalg.norm(vectors.reshape(len(vectors), -1), axis=1)
     return norms
 
 
 def fly(scenario: PaperScenario) -> PaperFlight:
-    """The flight, which starts on the circles."""
+    """Return the flight, which starts on the circles."""
     radii = np.array(scenario.radii_m)
     phases = np.arange(len(radii)) * np.pi / 2
     turns = scenario.rate_radps * scenario.dt_s * np.arange(scenario.steps)[:, np.newaxis]
@@ -98,16 +95,14 @@ def fly(scenario: PaperScenario) -> PaperFlight:
 
 
 def _heading(angle_rad: FloatArray) -> FloatArray:
-    """[cos, -sin] of angles (...), (..., 2)."""
+    """Return [cos, -sin] of angles (...), (..., 2)."""
     heading: FloatArray = np.stack([np.cos(angle_rad), -np.sin(angle_rad)], axis=-1)
     return heading
 
 
 def track(flight: PaperFlight, gain: float, start_m: FloatArray | None = None) -> Tracked:
-    """The published observer over the flight, from ``start_m`` (N, 2).
-
-    None: without initial error.
-    """
+    """Run the published observer over the flight from ``start_m`` (N, 2); None starts without
+    error."""
     scenario = flight.scenario
     estimate = flight.position_m[0] if start_m is None else start_m
     estimates, plain, full = [estimate], [], []
@@ -132,7 +127,8 @@ def track(flight: PaperFlight, gain: float, start_m: FloatArray | None = None) -
 
 
 def running_bounds(flight: PaperFlight, gain: float) -> FloatArray:
-    """The running bound on ||E_k||, (K + 1,), from the actual ||W_k||: |q| e + |l d - b| ||W||."""
+    """Return the running bound on ||E_k||, (K + 1,), from the true ||W_k||: |q| e + |l d - b|
+    ||W||."""
     scenario, bounds = flight.scenario, [0.0]
     enters = abs(gain * scenario.feedthrough_s - scenario.dt_s)
     for size in stacked(flight.input_mps).tolist():
@@ -141,7 +137,7 @@ def running_bounds(flight: PaperFlight, gain: float) -> FloatArray:
 
 
 def angle_errors_rad(flight: PaperFlight, estimate_m: FloatArray) -> FloatArray:
-    """Angle between the true and the estimated direction from the array, (K + 1, N)."""
+    """Return the angle between the true and the estimated direction from the array, (K + 1, N)."""
     true, seen = flight.position_m, estimate_m
     cross = true[..., 0] * seen[..., 1] - true[..., 1] * seen[..., 0]
     angles: FloatArray = np.abs(np.arctan2(cross, np.sum(true * seen, axis=-1)))
@@ -149,7 +145,7 @@ def angle_errors_rad(flight: PaperFlight, estimate_m: FloatArray) -> FloatArray:
 
 
 def gain_mu(dt_s: float, feedthrough_s: float, alpha: float, gain: float) -> float:
-    """The smallest mu (s²) that the LMIs certify for a given gain; infinite if there is none.
+    """Return the least mu (s²) that the LMIs certify for a given gain; inf if infeasible.
 
     With q = 1 - l and c = l d - b the decay LMI is p c^2 / alpha <= 1 - q^2 / (1 - alpha), and mu =
     1 / p (Schur complements; docs/math.md 2.2).
@@ -163,19 +159,19 @@ def gain_mu(dt_s: float, feedthrough_s: float, alpha: float, gain: float) -> flo
 
 @dataclass(frozen=True, slots=True)
 class Irregular:
-    """Largest |e| / sup|w| over random intervals with an adversary's input."""
+    """Largest |e| / sup|w| over random intervals with an adversarial input."""
 
     fixed_s: float  # with a fixed gain
-    scheduled_s: float  # with a gain that follows the interval
+    scheduled_s: float  # with a gain scheduled by the interval
     gamma_s: float  # gamma over the same intervals
 
 
 def irregular(
     scenario: PaperScenario, gain: float, longest_s: float, steps: int, rng: np.random.Generator
 ) -> Irregular:
-    """Errors over random intervals of 0.05 s to ``longest_s``.
+    """Return the errors over random intervals of 0.05 s to ``longest_s``.
 
-    The input has size 1 and always pushes the error outward.
+    The input has size 1 and its sign always increases the error.
     """
     intervals = rng.uniform(0.05, longest_s, steps)
     d, alpha = scenario.feedthrough_s, scenario.alpha
@@ -191,9 +187,9 @@ def irregular(
 
 
 def adversarial_input_error(scenario: PaperScenario, gain: float, steps: int = 400) -> float:
-    """|W^ - W| / sup|W| reached by the worst input for G = [b; 0], by flying it.
+    """Return |W^ - W| / sup|W| under the worst input for G = [b; 0], by simulation.
 
-    A constant input builds the error up, and turns round at the end.
+    A constant input builds up the error, then reverses at the end.
     """
     b, d = scenario.dt_s, scenario.feedthrough_s
     place, estimate, miss = np.zeros(1), np.zeros(1), 0.0

@@ -1,7 +1,7 @@
-"""The claims of the published method, each judged by a number of the study.
+"""Claims of the published method, each decided by one number of the study.
 
-A claim names the number that decides it by its path in the study's answer. Its verdict and the text
-of what was found are made from that number, so that they cannot disagree with it.
+A claim names that number by its path in the study's answer. Verdict and text are computed from
+the number and cannot disagree with it.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from typing import Any, Final
 
 
 class ClaimVerdict(StrEnum):
-    """The verdict on a claim."""
+    """Verdict on a claim."""
 
     HOLDS = "holds"
     CORRECTED = "holds with a correction"
@@ -20,19 +20,19 @@ class ClaimVerdict(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """A statement of the paper and how it is judged."""
+    """Statement of the paper and the criterion for its verdict."""
 
     statement: str  # what the paper says
-    key: str  # path of the number that decides
-    found: str  # text with {value} for the number
-    verdict: Callable[[float], ClaimVerdict]  # what the number makes of it
-    correction: str = ""  # what a reader of the paper must change
+    key: str  # path of the deciding number
+    found: str  # result, with {value} in place of the number
+    verdict: Callable[[float], ClaimVerdict]  # verdict for a number
+    correction: str = ""  # correction for a reader of the paper
 
 
 def lookup(answer: dict[str, Any], key: str) -> float:
-    """The number at a path such as ``levels/L = 0.39/gamma_s``.
+    """Return the number at a path such as ``levels/L = 0.39/gamma_s``.
 
-    Raises ``KeyError`` if there is none.
+    Raises ``KeyError`` if the path does not lead to a number.
     """
     place: Any = answer
     for part in key.split("/"):
@@ -46,7 +46,7 @@ def lookup(answer: dict[str, Any], key: str) -> float:
 
 
 def judge(answer: dict[str, Any]) -> list[dict[str, Any]]:
-    """Every claim with its number, what was found and the verdict."""
+    """Return every claim with its number, result and verdict."""
     return [
         {
             "statement": claim.statement,
@@ -72,7 +72,7 @@ def _limit(mu: str, infeasible: str) -> Claim:
         found="the first infeasible interval on the paper's grid of 0.01 s differs by {value:.2f}"
         " s",
         verdict=lambda off: _HOLDS if off < _NEVER_OFF_S else _FAILS,
-        correction="The limit need not be searched for: ΔT_max = δ + √(αμ + (1−α)δ²).",
+        correction="No search is needed: ΔT_max = δ + √(αμ + (1−α)δ²).",
     )
 
 
@@ -80,19 +80,19 @@ def _bounded(name: str) -> Claim:
     return Claim(
         statement=f"The error stays below γ sup‖W‖ ({name}).",
         key=f"levels/{name}/error_over_gamma_bound",
-        found="the largest error over many turns is {value:.3f} of the bound, γ the least for this"
-        " gain",
+        found="the largest error over many turns is {value:.3f} of the bound with the least γ of"
+        " this gain",
         verdict=lambda share: _HOLDS if share <= 1 else _FAILS,
     )
 
 
 CLAIMS: Final = (
     Claim(
-        statement="The design is the linear matrix inequality as printed, its last diagonal block"
+        statement="The design is the linear matrix inequality as printed, with last diagonal block"
         " +P.",
         key="designs/0/printed_sign_eigenvalue",
-        found="in the “⪯ 0” form the printed matrix has an eigenvalue of {value:+.2f}, and with P"
-        " ≻ 0 in its diagonal no choice makes it negative",
+        found="in the “⪯ 0” form the printed matrix has an eigenvalue of {value:+.2f}; with P ≻ 0"
+        " on its diagonal it is never negative semidefinite",
         verdict=lambda eigenvalue: _CORRECTED if eigenvalue > 0 else _HOLDS,
         correction="The last block must be −P. The inequality is then feasible and the guarantee"
         " follows.",
@@ -100,10 +100,9 @@ CLAIMS: Final = (
     Claim(
         statement="D is an N × 2N matrix.",
         key="scenario/feedthrough_matrix_rows",
-        found="the reports of the four UAVs in the plane have {value:d} rows, and so must D",
+        found="the reports of the four UAVs in the plane have {value:d} rows; D needs as many",
         verdict=lambda rows: _CORRECTED if rows != 4 else _HOLDS,
-        correction="D is 2N × 2N: with Y = X + D W it has a row for each coordinate that is"
-        " reported.",
+        correction="D is 2N × 2N: with Y = X + D W it has one row per reported coordinate.",
     ),
     _bounded("L = 0.39"),
     _bounded("L = 0.60"),
@@ -111,45 +110,41 @@ CLAIMS: Final = (
     Claim(
         statement="L = 0.39, 0.60 and 0.76 are the gains for the three performance levels.",
         key="designs/0/feasible_gain",
-        found="a solver asked for feasibility at μ ≤ 0.05 returns {value:.3f}: near, and its own"
-        " choice",
+        found="a feasibility solver at μ ≤ 0.05 returns {value:.3f}: close, but its own choice",
         verdict=lambda gain: _HOLDS if abs(gain - 0.39) < 0.005 else _CORRECTED,
-        correction="Any gain of a whole interval is feasible at each level. Which one comes out is"
-        " the solver's business; do not expect these digits from another solver.",
+        correction="At each level a whole interval of gains is feasible, and the solver picks one."
+        " Another solver returns other digits.",
     ),
     Claim(
-        statement="The gains of the three levels are what the method has to offer at ΔT = 0.15 s.",
+        statement="The gains of the three levels are the best of the method at ΔT = 0.15 s.",
         key="levels/L = 0.39/angle_error_deg",
-        found="with L = 0.39 the direction is still off by up to {value:.2f}°, with L = ΔT/δ ="
-        " 0.30 by 0",
+        found="with L = 0.39 the direction error reaches {value:.2f}°, with L = ΔT/δ = 0.30 it is"
+        " 0",
         verdict=lambda degrees: _FAILS if degrees > 0.01 else _HOLDS,
-        correction="They are feasible, not optimal. Where |ΔT − δ| < δ√(1−α) the least μ is 0,"
-        " attained in the limit with L = ΔT/δ, which cancels the unknown input altogether.",
+        correction="They are feasible, not optimal. For |ΔT − δ| < δ√(1−α) the infimum of μ is 0,"
+        " approached at L = ΔT/δ, which cancels the unknown input.",
     ),
     Claim(
-        statement="The performance levels that come with the three gains are γ = 0.21, 0.47 and"
-        " 0.96 s.",
+        statement="The three gains have performance levels γ = 0.21, 0.47 and 0.96 s.",
         key="levels/L = 0.39/gamma_s",
-        found="they are what that solution certified; the least that the first gain has is"
+        found="these are certified by that solution; the least γ of the first gain is"
         " {value:.3f} s",
         verdict=lambda gamma: _CORRECTED if gamma < 0.205 else _HOLDS,
-        correction="γ is a bound of the solution found, not a property of the gain: the guarantee"
-        " of the same gains is up to three times tighter.",
+        correction="γ depends on the solution, not only on the gain: the same gains have"
+        " guarantees up to three times tighter.",
     ),
     Claim(
-        statement="At one level (μ ≤ 0.25 s²) the errors become smaller as α does (0.5, 0.1,"
-        " 0.01).",
+        statement="At one level (μ ≤ 0.25 s²) the errors decrease with α (0.5, 0.1, 0.01).",
         key="alphas/least_step_down",
-        found="each step makes the largest error of the positions {value:.1f} times smaller or"
-        " more",
+        found="each step divides the largest position error by at least {value:.1f}",
         verdict=lambda ratio: _HOLDS if ratio > 1 else _FAILS,
-        correction="By the gain that a feasible solution then has, nearer to ΔT/δ; with that gain"
-        " there is no error at any α.",
+        correction="The cause is the gain of the feasible solution, which approaches ΔT/δ. At"
+        " L = ΔT/δ the error is 0 for every α.",
     ),
     Claim(
         statement="The UAVs stay within 500 m.",
         key="scenario/farthest_m",
-        found="the farthest is {value:.0f} m away",
+        found="the largest distance is {value:.0f} m",
         verdict=lambda farthest: _HOLDS if farthest < 500 else _FAILS,
     ),
     _limit("0.05", "0.89"),
@@ -159,103 +154,101 @@ CLAIMS: Final = (
         statement="The error of the estimated unknown input stays below 3γ sup‖W‖ in the"
         " simulation.",
         key="unknown_input/L = 0.76/b0_in_scenario",
-        found="in the published scenario it reaches {value:.2f} sup‖W‖ at L = 0.76; 3γ is 3.00"
-        " there",
+        found="in the published scenario it reaches {value:.2f} sup‖W‖ at L = 0.76, where 3γ is"
+        " 3.00",
         verdict=lambda share: _HOLDS if share <= 3 else _FAILS,
-        correction="It held because this input is mild, not because it is a bound; see the next"
-        " row.",
+        correction="It holds because this input is mild; 3γ is not a bound (next row).",
     ),
     Claim(
         statement="3γ sup‖W‖ bounds the error of the estimated unknown input in general.",
         key="unknown_input/L = 0.76/b0_adversary",
-        found="an input that turns round at the worst moment makes it {value:.3f} sup‖W‖ at L ="
-        " 0.76, against 3γ = 3.00 with γ = √μ = 1",
+        found="an input that reverses at the worst moment reaches {value:.3f} sup‖W‖ at L = 0.76,"
+        " against 3γ = 3.00 with γ = √μ = 1",
         verdict=lambda reached: _FAILS if reached > 3 else _HOLDS,
-        correction="With Ŵ = (X̂⁺ − X̂)/ΔT the exact peak is 2|Lδ − ΔT|/ΔT for 0 ≤ 1 − L < 1: it"
-        " grows without limit as ΔT falls. 2γ sup‖W‖/ΔT is safe. G = [B; D] has √5‖G†‖γ sup‖W‖.",
+        correction="With Ŵ = (X̂⁺ − X̂)/ΔT the exact peak is 2|Lδ − ΔT|/ΔT for 0 ≤ 1 − L < 1, and"
+        " is unbounded as ΔT falls. 2γ sup‖W‖/ΔT is a bound. G = [B; D] has √5‖G†‖γ sup‖W‖.",
     ),
     Claim(
-        statement="A gain designed for one ΔT carries the guarantee.",
+        statement="A gain designed for one ΔT keeps the guarantee.",
         key="irregular/fixed_over_gamma",
-        found="on intervals between 0.05 and 1.2 s a gain that stays reaches {value:.2f} times the"
-        " γ that a scheduled gain keeps",
+        found="on intervals of 0.05 to 1.2 s a fixed gain reaches {value:.2f} times the γ of a"
+        " scheduled gain",
         verdict=lambda share: _CORRECTED if share > 1 else _HOLDS,
-        correction="Real reports come irregularly. Schedule L by the ΔT that occurred: one P ="
-        " 1/max μ*(ΔT) serves all intervals, in any order.",
+        correction="Real intervals are irregular. Schedule L by the actual ΔT: one P ="
+        " 1/max μ*(ΔT) certifies all intervals, in any order.",
     ),
     Claim(
         statement="The angle of a UAV is θ = arccos(x/r).",
         key="array/arccos_error_deg",
-        found="half of the time y < 0, and then it points to the mirror image: up to {value:.0f}°"
-        " off",
+        found="for y < 0, half of the time, it points to the mirror image: an error of up to"
+        " {value:.0f}°",
         verdict=lambda degrees: _CORRECTED if degrees > 0.01 else _HOLDS,
-        correction="arccos loses the sign of y. Use the unit vector, or atan2(y, x).",
+        correction="arccos loses the sign of y. Use the unit vector or atan2(y, x).",
     ),
     Claim(
-        statement="That angle goes into steering vectors of sin θ.",
+        statement="The steering vectors use sin θ of that angle.",
         key="array/opposite_sines_apart",
-        found="sin(arccos(x/r)) is |y|/r: of UAVs that face each other these differ by {value:.0e}"
-        " at most, two columns of A are one, and AᵀA* has no inverse",
+        found="sin(arccos(x/r)) is |y|/r, which differs by at most {value:.0e} for opposite UAVs:"
+        " two columns of A are equal, and AᵀA* is singular",
         verdict=lambda apart: _HOLDS if apart > 1e-6 else _CORRECTED,
-        correction="Measure θ from broadside: sin θ = x/r for elements along x. (That two and two"
-        " UAVs face each other is our guess of where they begin.)",
+        correction="Measure θ from broadside: sin θ = x/r for elements along x. (Opposite pairs of"
+        " UAVs are our assumption about the initial phases.)",
     ),
     Claim(
         statement="UAV i receives aᴴ F s, with F = A*(AᵀA*)⁻¹.",
         key="array/conjugated_response_max",
-        found="for four UAVs at general places |aᴴf| of the own beam is {value:.3f} at most, not 1",
+        found="for four UAVs at generic positions |aᴴf| of the own beam is at most {value:.3f},"
+        " not 1",
         verdict=lambda response: _CORRECTED if response < 0.5 else _HOLDS,
-        correction="Channel and precoder must agree: aᵀ with F = A*(AᵀA*)⁻¹, for which |aᵀf| = 1.",
+        correction="Channel and precoder must agree: aᵀ with F = A*(AᵀA*)⁻¹ gives |aᵀf| = 1.",
     ),
     Claim(
         statement="Zero forcing separates the four UAVs at all times.",
         key="array/zero_forcing_over_3_db_share",
-        found="for {value:.0%} of the reports it costs a UAV more than 3 dB, and at a mirror image"
-        " there is no answer",
+        found="for {value:.0%} of the reports it costs a UAV more than 3 dB; at a mirror image no"
+        " solution exists",
         verdict=lambda share: _CORRECTED if share > 0 else _HOLDS,
-        correction="A line array cannot tell a direction from its mirror image about its axis,"
-        " where the circling UAVs meet. Regularise or serve in time slots there.",
+        correction="A line array cannot separate a direction from its mirror image about its axis,"
+        " and the circling UAVs pass through such pairs. Regularise or use time slots there.",
     ),
     Claim(
         statement="The gust enters as d/ΔT.",
         key="scenario/input_sup_mps",
-        found="read so, sup‖W‖ is {value:.2f} m/s: the gust is a third faster than the flight"
-        " itself",
+        found="in this reading sup‖W‖ is {value:.2f} m/s: the gust is a third faster than the"
+        " flight",
         verdict=lambda largest: _CORRECTED if largest > 400 else _HOLDS,
-        correction="d is then a step in metres for each report, whatever ΔT. Taken for a velocity,"
-        " W = v + d. The reading changes every error that is drawn; this study takes it as it is"
-        " written.",
+        correction="d is then a step in metres per report, independent of ΔT. As a velocity,"
+        " W = v + d. The reading changes every plotted error; this study uses the printed form.",
     ),
     Claim(
-        statement="64 elements have a beam narrow enough to separate users (half-power angle).",
+        statement="The beam of 64 elements is narrow enough to separate users (half-power angle).",
         key="array/sizes/64/half_power_deg",
-        found="the gain falls by half at ±{value:.2f}°; with 128 elements at half that angle",
+        found="the gain halves at ±{value:.2f}°; with 128 elements at half that angle",
         verdict=lambda degrees: _HOLDS if degrees < 1 else _FAILS,
     ),
     Claim(
-        statement="16-QAM with a code of rate 1/3 on 234 subcarriers with a prefix of 64 is the"
-        " waveform.",
+        statement="The waveform is 16-QAM with a code of rate 1/3 on 234 subcarriers with a prefix"
+        " of 64.",
         key="waveform/most_bit_s_hz",
-        found="it carries {value:.2f} bit/s/Hz at most, whatever the SINR",
+        found="it carries at most {value:.2f} bit/s/Hz at any SINR",
         verdict=lambda most: _CORRECTED if most < 2 else _HOLDS,
-        correction="Spectral efficiencies above that are capacities, log2(1 + SINR), not rates of"
-        " this waveform; so are those here.",
+        correction="Higher spectral efficiencies, including ours, are capacities, log2(1 + SINR),"
+        " not rates of this waveform.",
     ),
     Claim(
         statement="Location-aware beams exceed echo probing in average spectral efficiency under"
         " blockage.",
         key="blockage/gain_over_echo_bit_s_hz/optimum",
-        found="with L = 0.30: {value:+.2f} bit/s/Hz a UAV at 15 blockages a minute of 0.5 s",
+        found="with L = 0.30: {value:+.2f} bit/s/Hz per UAV at 15 blockages of 0.5 s per minute",
         verdict=lambda gain: _HOLDS if gain > 0 else _FAILS,
     ),
     Claim(
         statement="They do so with the paper's own gain.",
         key="blockage/gain_over_echo_bit_s_hz/L = 0.39",
-        found="with L = 0.39: {value:+.2f} bit/s/Hz a UAV, for the beam of 64 elements misses the"
-        " UAV",
+        found="with L = 0.39: {value:+.2f} bit/s/Hz per UAV, because the beam of 64 elements"
+        " misses the UAV",
         verdict=lambda gain: _HOLDS if gain > 0 else _FAILS,
-        correction="An error of 6° is eight half-power angles. The advantage is the optimal"
-        " gain's. The baseline here is one at its best, not the paper's, whose settings are not"
-        " given.",
+        correction="An error of 6° is eight half-power angles. Only the optimal gain has the"
+        " advantage. Our baseline is a favourable one; the paper does not give its settings.",
     ),
 )

@@ -1,7 +1,7 @@
-"""The published experiments repeated: every number by which the claims are judged.
+"""Reproduction of the published experiments: every number that decides a claim.
 
-Only what the paper states is typed in (its scenario, gains and limits, named ``PAPER_``); all else
-is computed. Blockages, echoes and irregular intervals are random, from one seed.
+Only values stated in the paper (its scenario, gains and limits, named ``PAPER_``) are typed in;
+everything else is computed. Blockages, echoes and irregular intervals are random, from one seed.
 
 Over 300 lines: it is a list, an experiment a function.
 """
@@ -26,20 +26,20 @@ from companion.tracking.design import closed_form
 from companion.values import FloatArray
 
 PAPER_LEVELS: Final = ((0.05, 0.39), (0.25, 0.60), (1.0, 0.76))
-"""Bounds on mu, s², and the gain L that the paper found for each."""
+"""Bounds on mu, s², and the paper's gain L for each."""
 PAPER_INFEASIBLE_S: Final = {0.05: 0.89, 0.25: 1.01, 1.0: 1.3}
-"""First interval on a grid of 0.01 s that the paper found infeasible, by mu."""
+"""First infeasible interval of the paper on a grid of 0.01 s, by mu."""
 GRID_S: Final = 0.01
 ALPHAS: Final = (0.5, 0.1, 0.01)
 PAPER_ALPHA: Final = 0.5
 PAPER_SUBCARRIERS: Final = 234
 PAPER_CYCLIC_PREFIX: Final = 64
-PAPER_BITS: Final = 4  # bits of a symbol, by 16-QAM
+PAPER_BITS: Final = 4  # bits per symbol of 16-QAM
 PAPER_CODE_RATE: Final = 1 / 3
 SIZES: Final = (64, 128)
 INSTANTS: Final = (14, 58)
-"""Steps at which the patterns are drawn: no UAV is near another's mirror image there."""
-LONG: Final = 2000  # steps over which a steady error is sought
+"""Steps at which the patterns are drawn: no UAV is near the mirror image of another."""
+LONG: Final = 2000  # steps to measure a steady error
 BLOCKAGES_PER_MINUTE: Final = (0.0, 6.0, 15.0, 30.0, 60.0)
 DRAWS: Final = 2
 OPTIMUM: Final = "optimum"
@@ -48,23 +48,23 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Material:
-    """Material of the figures."""
+    """Data for the figures."""
 
-    flight: PaperFlight  # the flight
-    tracked: dict[str, Tracked]  # the observer by the gain's name
-    alphas: dict[float, Tracked]  # the observer by alpha, with a solver's gain
-    efficiency: dict[str, FloatArray]  # (K + 1, N), by the gain's name
-    arrays: dict[int, Array]  # the array by its number of elements
-    compared: BlockageComparison  # the schemes under blockage
+    flight: PaperFlight
+    tracked: dict[str, Tracked]  # by name of the gain
+    alphas: dict[float, Tracked]  # by alpha, with a solver's gain
+    efficiency: dict[str, FloatArray]  # (K + 1, N), by name of the gain
+    arrays: dict[int, Array]  # by number of elements
+    compared: BlockageComparison  # schemes under blockage
 
 
 def level_name(gain: float) -> str:
-    """Name of a published gain in tables and legends."""
+    """Return the name of a published gain in tables and legends."""
     return f"L = {gain:.2f}"
 
 
 def study(seed: int, progress: Progress) -> tuple[dict[str, Any], Material]:
-    """The answer of ``companion study paper``, as JSON has it, and the material of its figures."""
+    """Return the answer of ``companion study paper`` as JSON, and the data of its figures."""
     rng = np.random.default_rng(seed)
     flight = published_scenario.fly(PaperScenario())
     progress("observer designs by LMI")
@@ -110,7 +110,7 @@ def study(seed: int, progress: Progress) -> tuple[dict[str, Any], Material]:
 
 
 def _tracked(flight: PaperFlight) -> dict[str, Tracked]:
-    """The observer with the three published gains and the optimum, each begun without error."""
+    """Run the observer with the three published gains and the optimum, without initial error."""
     scenario = flight.scenario
     best = closed_form.gain(scenario.dt_s, scenario.feedthrough_s, scenario.alpha)
     gains = {level_name(gain): gain for _, gain in PAPER_LEVELS} | {OPTIMUM: best}
@@ -133,7 +133,7 @@ def _scenario(flight: PaperFlight) -> dict[str, Any]:
 
 
 def _levels(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[str, float]]:
-    """Errors and bounds of each gain: over many steps where steady, and from a wrong start."""
+    """Return errors and bounds of each gain: steady over many steps, and from a wrong start."""
     scenario, found = flight.scenario, {}
     long_flight = published_scenario.fly(replace(scenario, steps=LONG))
     for name, one in tracked.items():
@@ -166,7 +166,7 @@ def _levels(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[
 
 
 def _designs(flight: PaperFlight) -> tuple[list[dict[str, Any]], dict[float, Tracked]]:
-    """Gains by a solver asked for feasibility, and for the least mu, beside the closed form.
+    """Compute gains by a solver, for feasibility and for the least mu, and by the closed form.
 
     Also returns the observer at each alpha with the gain that the solver found feasible at mu <=
     0.25, as in the paper's figure 4.
@@ -206,7 +206,7 @@ def _designs(flight: PaperFlight) -> tuple[list[dict[str, Any]], dict[float, Tra
 
 
 def _alphas(flight: PaperFlight, alphas: dict[float, Tracked]) -> dict[str, Any]:
-    """Largest errors at each alpha over many steps, with the gain of the figure."""
+    """Return the largest errors at each alpha over many steps, with the gain of the figure."""
     long_flight = published_scenario.fly(replace(flight.scenario, steps=LONG))
     found = {}
     for alpha, one in alphas.items():
@@ -223,7 +223,7 @@ def _alphas(flight: PaperFlight, alphas: dict[float, Tracked]) -> dict[str, Any]
 
 
 def _waveform() -> dict[str, float]:
-    """What the stated waveform carries at most: bits of a symbol over its time and bandwidth.
+    """Return the largest rate of the stated waveform: bits of a symbol over its time and bandwidth.
 
     The transform has at least as many points as there are subcarriers.
     """
@@ -233,7 +233,7 @@ def _waveform() -> dict[str, float]:
 
 
 def _decay_eigenvalue(b: float, d: float, alpha: float, solution: Any, sign: float) -> float:
-    """Largest eigenvalue of the decay LMI in its "<= 0" form, with ``sign`` P as its last block."""
+    """Return the largest eigenvalue of the decay LMI in "<= 0" form with last block ``sign`` P."""
     gain, p = float(solution.gain[0, 0]), float(solution.lyapunov[0, 0])
     keep, enters = (1 - gain) * p, (gain * d - b) * p
     matrix = np.array([[(alpha - 1) * p, 0, keep], [0, -alpha, enters], [keep, enters, sign * p]])
@@ -255,7 +255,7 @@ def _limits() -> dict[str, dict[str, float]]:
 
 
 def _unknown_input(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[str, float]]:
-    """Errors of W^ over sup||W||: in the scenario, at the exact worst, and as published."""
+    """Return errors of W^ over sup||W||: in the scenario, at the exact worst, and as published."""
     scenario, found = flight.scenario, {}
     levels = {level_name(gain): mu for mu, gain in PAPER_LEVELS}
     for name, one in tracked.items():
@@ -298,7 +298,8 @@ def _irregular(scenario: PaperScenario, rng: np.random.Generator) -> dict[str, f
 
 
 def _array(flight: PaperFlight) -> dict[str, Any]:
-    """Beams of the published array: widths, nulls, phase steps, and where its formulas point."""
+    """Return widths, nulls and phase-step losses of the published array, and errors of its
+    formulas."""
     sizes = {}
     for size in SIZES:
         array = link.line(size)
@@ -313,7 +314,7 @@ def _array(flight: PaperFlight) -> dict[str, Any]:
             "phase_step_loss_db": {str(bits): _phase_loss_db(array, bits) for bits in (2, 3, 4, 5)},
         }
     array = link.line(SIZES[0])
-    # A general place for each UAV: in the paper's own each one's mirror image is in another's null.
+    # Generic positions: in the paper's, the mirror image of each UAV is in a null of another.
     azimuths = np.radians([10.0, 35.0, -20.0, 60.0])
     apart = 100.0 * np.stack([np.cos(azimuths), np.sin(azimuths)], axis=1)
     right, printed = link.conjugate_responses(array, apart)
@@ -333,7 +334,7 @@ def _array(flight: PaperFlight) -> dict[str, Any]:
 
 
 def _arccos_error_deg(position_m: FloatArray) -> float:
-    """Largest error of arccos(x / r), which always answers with y >= 0."""
+    """Return the largest error of arccos(x / r), which always assumes y >= 0."""
     ranges_m = np.linalg.norm(position_m, axis=-1)
     angle = np.arccos(np.clip(position_m[..., 0] / ranges_m, -1, 1))
     true = np.arctan2(position_m[..., 1], position_m[..., 0])
@@ -342,9 +343,9 @@ def _arccos_error_deg(position_m: FloatArray) -> float:
 
 
 def _opposite_sines_apart(position_m: FloatArray) -> float:
-    """Largest difference of sin(arccos(x / r)) between UAVs that face each other.
+    """Return the largest difference of sin(arccos(x / r)) between opposite UAVs.
 
-    This is what the printed steering vectors are made of: |y| / r.
+    The printed steering vectors use this value, |y| / r.
     """
     sines = np.abs(position_m[..., 1]) / np.linalg.norm(position_m, axis=-1)
     half = sines.shape[1] // 2
@@ -352,7 +353,7 @@ def _opposite_sines_apart(position_m: FloatArray) -> float:
 
 
 def _phase_loss_db(array: Array, bits: int) -> float:
-    """Mean loss of a matched beam by plain rounding of phases, over many directions."""
+    """Return the mean loss of a matched beam by plain rounding of phases, over many directions."""
     azimuths = np.arcsin(np.linspace(-0.95, 0.95, 1001))
     level = np.stack([np.cos(azimuths), np.sin(azimuths)], axis=-1)
     matched = steering_matrix(array, link.directions(level)).conj()
@@ -380,7 +381,7 @@ def _rate_numbers(found: FloatArray) -> dict[str, float]:
 
 
 def _blockage(compared: BlockageComparison) -> dict[str, Any]:
-    """Means by scheme, and the gain of each over echo probing at the middle rate of blockages."""
+    """Return means by scheme, and their gain over echo probing at the middle blockage rate."""
     echo, middle = compared.schemes["echo probing"], len(compared.blockages_per_minute) // 2
     return {
         "tx_power_dbm": link.BUDGET.tx_power_dbm,

@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 Answer = dict[str, Any]
 LEVELS = tuple(level_name(gain) for _, gain in PAPER_LEVELS)
 TITLES = tuple(f"{level_name(gain)}, μ ≤ {mu:g} s²" for mu, gain in PAPER_LEVELS)
-SHOWN_S = 13.0  # time shown in figures: a little over one turn
+SHOWN_S = 13.0  # time span of figures: slightly over one turn
 
 
 def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callable[[], "Figure"]]]:
-    """Caption and drawing of each figure by name, in the order of the paper's experiments."""
+    """Return caption and drawing of each figure by name, in the order of the paper."""
     return {
         "paths": (
-            "Paths of the four UAVs and the places predicted one report ahead, one turn.",
+            "Paths of the four UAVs and positions predicted one report ahead, over one turn.",
             lambda: _paths(material),
         ),
         "coordinates": (
@@ -36,29 +36,29 @@ def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callabl
             lambda: _coordinates(material),
         ),
         "errors": (
-            "Norm of the error of all UAVs together against its bounds. The least γ for each gain"
-            " is used; the exact peak is the smallest bound from sup‖W‖ alone; the running bound"
-            " knows ‖W‖ at each report.",
+            "Norm of the error of all UAVs together, and its bounds. γ is the least of each gain;"
+            " the exact peak is the smallest bound from sup‖W‖ alone; the running bound uses ‖W‖"
+            " at each report.",
             lambda: _errors(answer, material),
         ),
         "unknown_input": (
             "North component of the unknown input of the innermost UAV, as published (G = [B; 0]),"
-            " and the norm of its error over all UAVs.",
+            " and the norm of the error over all UAVs.",
             lambda: _unknown_input(answer, material),
         ),
         "alphas": (
-            "The same at α = 0.5, 0.1 and 0.01, with the gain that the solver finds feasible for"
-            " μ ≤ 0.25 s². The optimum is L = 0.30 at every α, without error.",
+            "The same at α = 0.5, 0.1 and 0.01, with the solver's feasible gain for μ ≤ 0.25 s²."
+            " The optimum is L = 0.30 at every α, without error.",
             lambda: _alphas(material),
         ),
         "limits": (
-            "The least μ over the interval ΔT, α = δ = 0.5: the largest feasible interval is where"
-            " it meets the bound. Dots: the first interval that the paper found infeasible.",
+            "Least μ over the interval ΔT, α = δ = 0.5. It meets the bound at the largest feasible"
+            " interval. Dots: first infeasible interval in the paper.",
             lambda: _limits(answer),
         ),
         "rates": (
-            "Spectral efficiency, mean of the UAVs, 64 elements: over time, and by azimuth. The"
-            " dips common to all are mirror images, which a line array cannot tell apart.",
+            "Spectral efficiency, mean of the UAVs, 64 elements: over time, and by azimuth."
+            " Common dips are mirror images, which a line array cannot separate.",
             lambda: _rates(material),
         ),
         "surfaces": (
@@ -70,12 +70,12 @@ def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callabl
             lambda: cuts(material),
         ),
         "polar": (
-            "Polar patterns (dB) of the beams for UAVs 1 and 2; numbers: where each UAV is.",
+            "Polar patterns (dB) of the beams for UAVs 1 and 2; numbers mark the UAVs.",
             lambda: polar(material),
         ),
         "blockage": (
-            "Mean spectral efficiency a UAV over the rate of blockages, each 0.5 s in the mean and"
-            " 25 dB deep, against echo probing.",
+            "Mean spectral efficiency per UAV over the blockage rate, compared with echo probing."
+            " Blockages last 0.5 s on average and are 25 dB deep.",
             lambda: _blockage(material),
         ),
     }
@@ -169,7 +169,7 @@ def _unknown_input(answer: Answer, material: Material) -> "Figure":
 
 
 def _misses(axes: Any, one: Any, material: Material, numbers: dict[str, float]) -> None:
-    """Norms of the error of both estimates, the exact peak and the published bound."""
+    """Draw the norm of the error of both estimates, the exact peak and the published bound."""
     flight = material.flight
     shown = flight.time_s[:-1] <= SHOWN_S
     time_s, largest = flight.time_s[:-1][shown], flight.largest_input_mps
@@ -275,7 +275,7 @@ def _rates(material: Material) -> "Figure":
 
 
 def _binned(azimuth_deg: FloatArray, values: FloatArray, edges: FloatArray) -> FloatArray:
-    """Means of values in bins of azimuth; NaN in an empty one."""
+    """Return means of values in bins of azimuth; NaN in an empty bin."""
     where = np.clip(np.digitize(azimuth_deg.ravel(), edges) - 1, 0, len(edges) - 2)
     counts = np.bincount(where, minlength=len(edges) - 1)
     sums = np.bincount(where, weights=values.ravel(), minlength=len(edges) - 1)
@@ -299,7 +299,7 @@ def _blockage(material: Material) -> "Figure":
         )  # fmt: skip
     axes.set_ylim(0, None)
     axes.set_xlim(0, None)
-    axes.set_xlabel("blockages a minute for each UAV")
+    axes.set_xlabel("blockages per minute and UAV")
     axes.set_ylabel("mean spectral efficiency, bit/s/Hz")
     plotting.below(figure, axes, 2)
     return figure

@@ -1,8 +1,8 @@
-"""The published scenario as a link: rates over time, and under blockage.
+"""Published scenario as a link: rates over time, and under blockage.
 
-Between reports the UAV moves evenly, as the model has it, and the beam goes evenly from one
-estimate to the next. Weights are zero forcing, regularised where that would cost a UAV more than 3
-dB (a line array cannot tell a direction from its mirror image). Free space; no scattering.
+UAV and beam move uniformly between reports. Weights are zero forcing, regularised where that would
+cost a UAV more than 3 dB (a line array cannot separate a direction from its mirror image). Free
+space; no scattering.
 """
 
 from collections.abc import Callable
@@ -27,28 +27,28 @@ UAV_ANTENNAS: Final = 4
 BUDGET: Final = LinkBudget(tx_power_dbm=30.0, bandwidth_hz=50e6, noise_figure_db=7.0)
 PRECODER: Final = Precoder(widen=Widen.NO)
 PROBING: Final = EchoProbing(dwell_s=0.005, position_gain=0.9, rate_gain=0.5)
-"""Baseline at its best: it listens half of all time, and a tracker of rates follows the turn."""
+"""Baseline in its favour: it integrates half of all time, and its rate tracker follows the turn."""
 MEAN_BLOCKAGE_S: Final = 0.5
-EVERY: Final = 5  # probing intervals from one computed rate to the next
+EVERY: Final = 5  # probing intervals per computed rate
 
 
 def line(elements: int) -> Array:
-    """The published array: half a wavelength apart, from west to east, boresight north."""
+    """Return the published array: half a wavelength apart, from west to east, boresight north."""
     return uniform_linear(
         elements, FREQUENCY_HZ, spacing_wavelengths=0.5, array_from_body=np.eye(3)
     )
 
 
 def directions(position_m: FloatArray) -> FloatArray:
-    """Unit directions (..., 3) in the array frame of places (..., 2), north and east."""
+    """Return unit directions (..., 3) in the array frame of positions (..., 2), north and east."""
     level = position_m / np.linalg.norm(position_m, axis=-1, keepdims=True)
     return np.concatenate([level, np.zeros((*level.shape[:-1], 1))], axis=-1)
 
 
 def responses(array: Array, true_m: FloatArray, aimed_m: FloatArray) -> ComplexArray:
-    """Response of UAV i at its true place to beam j aimed at its estimated place: (T, N, N).
+    """Return the response of UAV i at its true position to beam j: (T, N, N).
 
-    In square roots of watts: the power of the budget is included.
+    Beams aim at the estimated positions. In square roots of watts: the budget's power is included.
     """
     heard = []
     for true, aimed in zip(directions(true_m), directions(aimed_m), strict=True):
@@ -61,7 +61,10 @@ def responses(array: Array, true_m: FloatArray, aimed_m: FloatArray) -> ComplexA
 def efficiency(
     array: Array, heard: ComplexArray, true_m: FloatArray, attenuation_db: float | FloatArray = 0.0
 ) -> FloatArray:
-    """Spectral efficiency, bit/s/Hz, (T, N); ``attenuation_db`` (T, N) is that of blockages."""
+    """Return spectral efficiency, bit/s/Hz, (T, N).
+
+    ``attenuation_db`` (T, N) is that of blockages.
+    """
     ranges_m = np.linalg.norm(true_m, axis=-1)
     gains = UAV_ANTENNAS * channel.free_space_gain(ranges_m, array.wavelength_m)
     blocked = 10 ** (-np.asarray(attenuation_db) / 10)
@@ -71,9 +74,9 @@ def efficiency(
 
 
 def zero_forcing_loss_db(array: Array, position_m: FloatArray) -> FloatArray:
-    """Loss of the worst UAV by plain zero forcing at each time, (T,).
+    """Return the loss of the worst UAV by plain zero forcing at each time, (T,).
 
-    Infinite without an answer.
+    inf where zero forcing has no solution.
     """
     found = []
     for there in directions(position_m):
@@ -83,7 +86,7 @@ def zero_forcing_loss_db(array: Array, position_m: FloatArray) -> FloatArray:
 
 
 def conjugate_responses(array: Array, position_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """|a^T f| and |a^H f| of zero-forcing beams at their own UAVs (N,): corrected and printed."""
+    """Return |a^T f| and |a^H f| (N,) of zero-forcing beams at their UAVs: corrected, printed."""
     steering = steering_matrix(array, directions(position_m))
     weights = precode(steering, PRECODER).weights
     right = np.abs(np.einsum("mn,mn->n", steering, weights))
@@ -91,7 +94,7 @@ def conjugate_responses(array: Array, position_m: FloatArray) -> tuple[FloatArra
 
 
 def between(flight: PaperFlight, place_m: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Places (T, N, 2) at times between the steps, from places (K + 1, N, 2) at the steps."""
+    """Interpolate positions (K + 1, N, 2) of the steps at times (T,): (T, N, 2)."""
     at = time_s / flight.scenario.dt_s
     step = np.minimum(np.floor(at + 1e-9).astype(int), len(place_m) - 2)
     share = (at - step)[:, np.newaxis, np.newaxis]
@@ -119,9 +122,9 @@ def under_blockage(
     rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> BlockageComparison:
-    """Location-aware beams aimed at estimates (K + 1, N, 2), compared with echo probing.
+    """Compare location-aware beams, aimed at estimates (K + 1, N, 2), with echo probing.
 
-    Every scheme has the same blockages, in as many ``draws`` for each rate, and the same precoder.
+    Every scheme has the same precoder and the same blockages, ``draws`` times per rate.
     """
     array = line(64)
     time_s = np.arange(0.0, float(flight.time_s[-1]), PROBING.interval_s)
@@ -152,7 +155,7 @@ def under_blockage(
 def _attenuation_db(
     users: int, time_s: FloatArray, rate_hz: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Attenuation by each UAV's own blockages, (T, N)."""
+    """Attenuation by blockages, drawn independently per UAV, (T, N)."""
     last_s = float(time_s[-1])
     drawn = [channel.draw_blockages(rng, last_s, rate_hz, MEAN_BLOCKAGE_S) for _ in range(users)]
     return np.stack([one.attenuation_db(time_s) for one in drawn], axis=1)
@@ -161,7 +164,7 @@ def _attenuation_db(
 def _echo_efficiency(
     array: Array, true_m: FloatArray, lost_db: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Spectral efficiency of the baseline (T / EVERY, N): 0 for a UAV that is being sought."""
+    """Return spectral efficiency of the baseline (T / EVERY, N): 0 for a UAV during its sweep."""
     state = probing.started(directions(true_m[0]))
     pointed, served = [], []
     for at, (there, places) in enumerate(zip(directions(true_m), true_m, strict=True)):

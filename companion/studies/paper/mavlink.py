@@ -1,10 +1,10 @@
-"""The published scenario through the whole service: MAVLink frames in, predictions and beams out.
+"""Published scenario through the whole service, from MAVLink frames to predictions and beams.
 
-Each UAV sends GLOBAL_POSITION_INT at every step: its leading position y = x + D W and, as its
+Each UAV sends GLOBAL_POSITION_INT at every step with its leading position y = x + D W and, as its
 velocity, W. Positions are in 1e-7 degree and millimetres, velocities in cm/s, times in ms. The
-service's position observer makes a lead of the velocity as well, so that its feedthrough is D plus
-that lead, and follows the scenario without error except for the rounding of the message. The
-observer's correct answer is computed beside it from the numbers before rounding.
+service's position observer also forms a lead from the velocity, so its feedthrough is D plus that
+lead. It follows the scenario without error except for the rounding of the message. The expected
+answer is computed in parallel from the numbers before rounding.
 """
 
 import struct
@@ -38,20 +38,20 @@ Source: https://mavlink.io/en/messages/common.html#GLOBAL_POSITION_INT.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
-    """Largest difference between the answers of service and library, over all UAVs and steps."""
+    """Largest difference between service and library over all UAVs and steps."""
 
     reports: int  # reports accepted
     rejections: int  # reports rejected
-    estimate_m: float  # of predictions of the next report's place
+    estimate_m: float  # of predictions of the next report's position
     direction_deg: float  # of beams aimed at it
-    settled_m: float  # largest error against the truth in the last quarter
+    settled_m: float  # largest true error in the last quarter
 
 
 def settings(flight: PaperFlight) -> Settings:
-    """The service's settings for the scenario.
+    """Return the service's settings for the scenario.
 
-    A level array that faces north, and the limits of this motion. Stamps are exact and frames
-    arrive as they are made.
+    The array is level and faces north; limits are those of this motion. Stamps are exact and frames
+    arrive without delay.
     """
     scenario = flight.scenario
     fastest_mps = 1.01 * float(np.linalg.norm(flight.input_mps, axis=-1).max())
@@ -73,7 +73,7 @@ def settings(flight: PaperFlight) -> Settings:
 
 
 def frames(flight: PaperFlight) -> list[bytes]:
-    """The frames of each step, joined: what the UAVs send, 1:1 first."""
+    """Return the concatenated frames of each step in order of UAVs, 1:1 first."""
     local = LocalFrame(*ORIGIN)
     sent = []
     for step, (places, inputs) in enumerate(zip(flight.report_m, flight.input_mps, strict=True)):
@@ -97,7 +97,7 @@ def frames(flight: PaperFlight) -> list[bytes]:
 
 
 def compare(flight: PaperFlight) -> Agreement:
-    """Fly the scenario through splitter, pipeline and beams, and through the library."""
+    """Run the scenario through splitter, pipeline and beams, and through the library."""
     pipeline, splitter = Pipeline(settings(flight)), Splitter("paper")
     names = [f"{number + 1}:1" for number in range(len(flight.scenario.radii_m))]
     expected = _expected(flight)
@@ -135,10 +135,9 @@ def compare(flight: PaperFlight) -> Agreement:
 
 
 def _expected(flight: PaperFlight) -> FloatArray:
-    """The library's estimates (K + 1, N, 2).
+    """Return the library's estimates (K + 1, N, 2).
 
-    The published step with the service's use of a velocity, begun like a track of the service from
-    the first report.
+    The published step uses the velocity as the service does, and starts at the first report.
     """
     scenario = flight.scenario
     lead_s = max(VELOCITY_LEAD_S, scenario.dt_s)

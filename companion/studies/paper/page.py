@@ -1,4 +1,4 @@
-"""Reports of the repeated experiments: one self-contained HTML page, figures, claims as text."""
+"""Reports of the reproduction: one self-contained HTML page, figures, and claims as text."""
 
 from collections.abc import Callable
 from typing import Any
@@ -13,7 +13,7 @@ Rows = list[tuple[str, ...]]
 def paper_files(
     answer: dict[str, Any], material: Material, progress: Callable[[str], None]
 ) -> dict[str, bytes]:
-    """The page ``paper.html`` and its figures."""
+    """Return the page ``paper.html`` and its figures."""
     values = {
         "answer": answer,
         "inputs": _inputs(answer),
@@ -26,7 +26,7 @@ def paper_files(
 
 
 def text(answer: dict[str, Any]) -> str:
-    """The claims and their verdicts, one line each."""
+    """Return the claims and their verdicts, one line each."""
     return "\n".join(f"{row['verdict']:24} {row['statement']}" for row in answer["claims"])
 
 

@@ -16,25 +16,25 @@ from companion.values import ComplexArray, FloatArray
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-FLOOR_DB: Final = -30.0  # lowest gain drawn; lower ones are drawn at this value
+FLOOR_DB: Final = -30.0  # lower gains are drawn at this value
 POLAR_FLOOR_DB: Final = -15.0
 TOP_DB: Final = 24.0
 
 
 def weights(array: Array, position_m: FloatArray) -> ComplexArray:
-    """Zero-forcing weights (M, N) for UAVs at places (N, 2)."""
+    """Return zero-forcing weights (M, N) for UAVs at positions (N, 2)."""
     steering = steering_matrix(array, link.directions(position_m))
     return precode(steering, link.PRECODER).weights
 
 
 def azimuths_rad(position_m: FloatArray) -> FloatArray:
-    """Azimuths (N,) of places (N, 2) seen from the array."""
+    """Return azimuths (N,) of positions (N, 2) seen from the array."""
     angles: FloatArray = np.arctan2(position_m[:, 1], position_m[:, 0])
     return angles
 
 
 def _cases(material: Material) -> list[tuple[Array, FloatArray, str]]:
-    """Array, places and title for each size at each instant."""
+    """Return array, positions and title for each size at each instant."""
     return [
         (
             material.arrays[size],
@@ -47,7 +47,7 @@ def _cases(material: Material) -> list[tuple[Array, FloatArray, str]]:
 
 
 def surfaces(material: Material) -> "Figure":
-    """Gain over azimuth and elevation about the beam for UAV 1."""
+    """Draw gain over azimuth and elevation around the beam for UAV 1."""
     figure, panels = plotting.new(2, 2, (9.2, 6.9), subplot_kw={"projection": "3d"})
     cases = _cases(material)
     for axes, (array, places, _) in zip(panels, cases, strict=True):
@@ -71,12 +71,12 @@ def surfaces(material: Material) -> "Figure":
 
 
 def _front(azimuth_rad: float) -> float:
-    """The azimuth in front of a line of isotropic elements that has the same response."""
+    """Return the azimuth in front of a line of isotropic elements with the same response."""
     return float(np.arcsin(np.sin(azimuth_rad)))
 
 
 def cuts(material: Material) -> "Figure":
-    """Azimuth cuts about the beam for UAV 1 (above) and elevation cuts through it (below)."""
+    """Draw azimuth cuts around the beam for UAV 1 (above) and elevation cuts through it (below)."""
     figure, panels = plotting.new(2, 2, (9.2, 5.8), sharey=True)
     for column, step in enumerate(INSTANTS):
         places = material.flight.position_m[step]
@@ -112,7 +112,7 @@ def cuts(material: Material) -> "Figure":
 
 
 def polar(material: Material) -> "Figure":
-    """Whole azimuth cuts of the beams for the first two UAVs, dB outward."""
+    """Draw full azimuth cuts of the beams for the first two UAVs, radius in dB."""
     figure, panels = plotting.new(2, 2, (8.0, 8.6), subplot_kw={"projection": "polar"})
     cases = _cases(material)
     for axes, (array, places, _) in zip(panels, cases, strict=True):

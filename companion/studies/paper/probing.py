@@ -1,19 +1,19 @@
-"""The baseline of echo probing: it finds UAVs by the echoes of its own beams.
+"""Baseline of echo probing, which finds UAVs by the echoes of its own beams.
 
-Location-aware beams are compared with it. Nothing is known of the UAVs but what their skin sends
-back (the idea of radar-assisted beams: F. Liu et al. 2020). In each probing interval
+Location-aware beams are compared with it. It receives only radar echoes of the UAVs (the idea of
+radar-assisted beams: F. Liu et al. 2020). In each probing interval
 
-1. the beam of a UAV points where its tracker predicts it to be;
-2. the echo returns, with the two-way loss of the radar equation, less what the beam misses by
-   pointing off, less twice any blockage;
-3. an echo that is strong enough, from within the beam's lobe, gives the direction with an error of
-   the Cramer-Rao bound at that strength. Without an echo the tracker goes on as it was, which
-   without a rate means that the beam is held still;
-4. after too many intervals without an echo the UAV is lost. The node sweeps its codebook, does
-   not serve the UAV meanwhile, and begins again until a sweep ends with an echo.
+1. the beam of a UAV points at the direction predicted by its tracker;
+2. the echo returns with the two-way loss of the radar equation, less the pointing loss, less twice
+   any blockage;
+3. an echo that is strong enough, from within the beam's lobe, measures the direction with an error
+   at the Cramer-Rao bound of that SNR. Without an echo the tracker extrapolates; without a rate
+   the beam stays;
+4. after too many intervals without an echo the UAV is lost. The node sweeps its codebook without
+   serving the UAV, and repeats until a sweep ends with an echo.
 
-Assumed in the baseline's favour: sending and receiving at once without leakage, a receiver at every
-element, no clutter, no mistaken identity, no pilots, sweeps that disturb no other stream.
+Assumptions in the baseline's favour: full duplex without leakage, a receiver at every element, no
+clutter, no mistaken identity, no pilots, sweeps that disturb no other stream.
 """
 
 import math
@@ -31,7 +31,7 @@ from companion.values import FloatArray, IntArray
 BLIND: Final = 1e-4
 """Ratio of squared extents below which the array is blind along an axis.
 
-It measures nothing there, as a line does across its length, and none of its beams needs to know.
+A line, for example, cannot measure angles across its length, and its beams do not depend on them.
 """
 
 
@@ -39,13 +39,13 @@ It measures nothing there, as a line does across its length, and none of its bea
 class EchoProbing:
     """Settings of the baseline.
 
-        dwell_s             how long an echo is integrated coherently, and the time that each beam
-                            of a sweep takes; at most ``interval_s``
-        detection_snr_db    least SNR of an echo after integration, at the output of the array
-        lobe_db             how far the beam's gain towards the UAV may be below its peak for the
-                            echo to count; inf: side lobes count as well
-        sweep_loss_db       what the best of them lacks towards the UAV; 3.9 dB is halfway between
-                            two orthogonal beams of a line
+    dwell_s            coherent integration time of an echo, and time of each beam of a sweep; at
+                       most ``interval_s``
+    detection_snr_db   least SNR of an echo after integration, at the output of the array
+    lobe_db            largest loss of the beam towards the UAV, relative to its peak, for which an
+                       echo counts; inf: side lobes count as well
+    sweep_loss_db      loss of the best sweep beam towards the UAV; 3.9 dB is halfway between two
+                       orthogonal beams of a line
 
     Raises ``ValueError`` for values out of range.
     """
@@ -55,11 +55,11 @@ class EchoProbing:
     cross_section_m2: float = 0.05  # radar cross section of a UAV
     detection_snr_db: float = 13.0
     lobe_db: float = 10.0
-    patience_intervals: int = 10  # how many intervals in a row may bring no echo before the sweep
+    patience_intervals: int = 10  # largest run of intervals without an echo before a sweep
     sweep_beams: int = 64  # beams of the codebook
     sweep_loss_db: float = 3.9
     position_gain: float = 1.0  # gain alpha of an alpha-beta tracker of the direction
-    rate_gain: float = 0.0  # gain beta; 1 and 0 point each beam where the last echo came from
+    rate_gain: float = 0.0  # gain beta; (1, 0) points each beam at the last echo
 
     def __post_init__(self) -> None:
         if not 0 < self.dwell_s <= self.interval_s < math.inf:
@@ -89,25 +89,25 @@ class EchoProbing:
 
     @property
     def sweep_intervals(self) -> int:
-        """Intervals that a sweep takes, rounded up."""
+        """Duration of a sweep in intervals, rounded up."""
         return math.ceil(self.sweep_beams * self.dwell_s / self.interval_s - 1e-9)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EchoState:
-    """The baseline after one interval, N UAVs."""
+    """State of the baseline after one interval, N UAVs."""
 
-    pointed: FloatArray  # (N, 3), where the beams pointed in it: unit vectors, array frame
-    served: NDArray[np.bool_]  # (N,), whether the UAV had its beam in it; False during a sweep
+    pointed: FloatArray  # (N, 3), beam directions: unit vectors, array frame
+    served: NDArray[np.bool_]  # (N,), whether the UAV had its beam; False during a sweep
     heard: NDArray[np.bool_]  # (N,), whether an echo was used
-    estimate: FloatArray  # (N, 3), where the UAV is thought to be in the next interval
-    turn_radps: FloatArray  # (N, 3), how that turns: a rotation vector across it
-    silent: IntArray  # (N,), intervals in a row without an echo
-    sweep_left: IntArray  # (N,), intervals that a sweep still takes; 0 without one
+    estimate: FloatArray  # (N, 3), estimated direction for the next interval
+    turn_radps: FloatArray  # (N, 3), its rotation rate, perpendicular to it
+    silent: IntArray  # (N,), consecutive intervals without an echo
+    sweep_left: IntArray  # (N,), remaining intervals of a sweep; 0 without one
 
 
 def started(directions: FloatArray) -> EchoState:
-    """The state of beams that have just found their UAVs at unit directions (N, 3)."""
+    """Return the state of beams that have just found their UAVs at unit directions (N, 3)."""
     users = len(directions)
     yes, none = np.ones(users, dtype=bool), np.zeros(users, dtype=np.int64)
     return EchoState(
@@ -130,17 +130,17 @@ def echo_snr(
     ranges_m: FloatArray,
     attenuation_db: float | FloatArray = 0.0,
 ) -> FloatArray:
-    """SNR of each echo after integration, at the output of the array, for a beam pointed right.
+    """Return the SNR of each echo of a matched beam after integration, at the output of the array.
 
         budget          its power is shared equally by the UAVs
         directions      (N, 3), unit directions
         ranges_m        (N,)
         attenuation_db  scalar or (N,), one way; it counts twice
 
-    Returns a power ratio, (N,). The radar equation: P G^2 wavelength^2 sigma / ((4 pi)^3 r^4
-    noise), times bandwidth times dwell (a whole block of samples adds up in phase); G is the gain
-    of the matched beam, elements included. Raises ``ValueError`` for ranges that are not finite and
-    above 0.
+    A power ratio, (N,), by the radar equation: P G^2 wavelength^2 sigma / ((4 pi)^3 r^4 noise),
+    times bandwidth times dwell (a whole block of samples adds coherently); G is the gain of the
+    matched beam, elements included. Raises ``ValueError`` for ranges that are not finite and above
+    0.
     """
     if not (np.isfinite(ranges_m).all() and (ranges_m > 0).all()):
         raise ValueError(f"ranges_m {ranges_m} must be finite and above 0")
@@ -162,13 +162,13 @@ def step(
     snr: FloatArray,
     rng: np.random.Generator,
 ) -> EchoState:
-    """One probing interval.
+    """Advance by one probing interval.
 
         directions  (N, 3), unit directions of the UAVs in it
         snr         (N,), ``echo_snr`` now, blockage included
 
-    The same number of random values is drawn whatever happens, so that runs with one seed differ
-    only by what is changed. A sweep that finds a UAV serves it from the next interval on.
+    Every step draws the same number of random values, so that runs with one seed differ only by the
+    changed parameter. A sweep that finds a UAV serves it from the next interval on.
     """
     sweeping = state.sweep_left > 0
     pointed = _turned(state.estimate, state.turn_radps * settings.interval_s)
@@ -192,7 +192,7 @@ def step(
         served=~sweeping,
         heard=heard,
         estimate=estimate,
-        # A sweep begins with no rate and ends with none.
+        # The rate is zero at the start and at the end of a sweep.
         turn_radps=np.where((lost | sweeping)[:, np.newaxis], 0.0, turn),
         silent=silent,
         sweep_left=np.where(lost, settings.sweep_intervals, left),
@@ -200,7 +200,7 @@ def step(
 
 
 def alignment(array: Array, pointed: FloatArray, directions: FloatArray) -> FloatArray:
-    """Gain of matched beams towards other directions over that of beams pointed there, 0 to 1.
+    """Return the gain of matched beams towards other directions, relative to their peak, 0 to 1.
 
     |a(u)^T a(p)*|^2 / (|a(u)|^2 |a(p)|^2), (N,), for beams at unit directions p and UAVs at u,
     both (N, 3); 0 where no element faces either.
@@ -216,13 +216,13 @@ def alignment(array: Array, pointed: FloatArray, directions: FloatArray) -> Floa
 def direction_error_rad(
     array: Array, directions: FloatArray, snr: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Rotation vectors (N, 3) from a true to a measured direction, at the Cramer-Rao bound.
+    """Draw rotation vectors (N, 3) from a true to a measured direction, at the Cramer-Rao bound.
 
     One plane wave of unknown amplitude and phase, SNR ``snr`` (N,) at the output of the array: the
     Fisher information of an angle along a unit axis t across u is 2 snr (2 pi/wavelength)^2 t^T C
-    t, C the covariance of the element positions, weighted by the power each receives (P. Stoica and
+    t, C the covariance of the element positions, weighted by received power (P. Stoica and
     A. Nehorai 1989; 6 / (SNR M (M^2 - 1)) for a line, in electrical angle and SNR at one element).
-    No error along an axis to which the array is blind, or without an echo.
+    The error is zero along an axis to which the array is blind, and without an echo.
     """
     across = np.eye(3) - directions[:, :, np.newaxis] * directions[:, np.newaxis, :]
     spread = _spread_m2(array, directions)
@@ -236,7 +236,7 @@ def direction_error_rad(
 
 
 def _spread_m2(array: Array, directions: FloatArray) -> FloatArray:
-    """Covariance (N, 3, 3) of the element positions, weighted by the power each receives."""
+    """Return the covariance (N, 3, 3) of the element positions, weighted by received power."""
     powers = np.broadcast_to(amplitudes(array, directions) ** 2, (array.size, len(directions)))
     total = powers.sum(axis=0)
     shares = (powers / np.where(total > 0, total, 1.0)).T
@@ -248,7 +248,7 @@ def _spread_m2(array: Array, directions: FloatArray) -> FloatArray:
 def _tracked(
     settings: EchoProbing, pointed: FloatArray, turn_radps: FloatArray, measured: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Alpha-beta update on the sphere: the new estimate and its rotation vector, across it."""
+    """Apply an alpha-beta update on the sphere; return the estimate and its rotation rate."""
     normal = np.cross(pointed, measured)
     sine = np.linalg.norm(normal, axis=1, keepdims=True)
     cosine = np.sum(pointed * measured, axis=1, keepdims=True)
@@ -259,7 +259,7 @@ def _tracked(
 
 
 def _turned(directions: FloatArray, rotations_rad: FloatArray) -> FloatArray:
-    """Unit vectors (N, 3) turned by rotation vectors (N, 3) across them."""
+    """Rotate unit vectors (N, 3) by rotation vectors (N, 3) perpendicular to them."""
     angle = np.linalg.norm(rotations_rad, axis=1, keepdims=True)
     aside = np.sinc(angle / np.pi) * np.cross(rotations_rad, directions)
     turned: FloatArray = np.cos(angle) * directions + aside

@@ -1,12 +1,11 @@
-"""The position-model observer exactly as published, for studies and comparison.
+"""Position-model observer exactly as published, for studies and comparison.
 
-Reports come at the ends of intervals; the estimate is that of the next report's time, made from
-this one:
+Reports arrive at the ends of intervals. Each report gives an estimate for the time of the next:
 
     x+ = x + b w,   y = x + d w          b the interval (s), d the feedthrough (s)
     x^+ = (1 - l) x^ + l y,              e = x^ - x:   e+ = (1 - l) e + (l d - b) w
 
-and the unknown input is estimated by one of two left inverses (docs/math.md 3),
+One of two left inverses estimates the unknown input (docs/math.md 3),
 
     G = [b; d]:   W^ = (b (x^+ - x^) + d (y - x^)) / (b^2 + d^2)       (Chakrabarty et al.)
     G = [b; 0]:   W^ = (x^+ - x^) / b                                  (Mohammadi et al.)
@@ -18,8 +17,8 @@ w independent at each step,
     G = [b; 0]:   |W^ - w| <= |l| / b peak + |l d - b| / b
 
 times sup|w|, where peak is the exact gain to the error (``closed_form.peak_gain``). For 0 <= 1 - l
-< 1 the second is 2 |l d - b| / b: the published "3 gamma" fails where b is small. Every axis is
-alike, so estimates are arrays of any shape, in metres.
+< 1 the second is 2 |l d - b| / b: the published "3 gamma" fails for small b. All axes are equal,
+so estimates are arrays of any shape, in metres.
 """
 
 from dataclasses import dataclass
@@ -32,7 +31,7 @@ from companion.values import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """The outcome of one report: the estimate for the next report's time, and both W^ (m/s)."""
+    """Result of one report: the estimate for the time of the next, and both W^ (m/s)."""
 
     estimate_m: FloatArray
     unknown_input_bd_mps: FloatArray
@@ -48,13 +47,13 @@ def step(
     gain: float | None = None,
     alpha: float | None = None,
 ) -> Step:
-    """One step over the interval that follows the report.
+    """Apply one step over the interval that follows the report.
 
-    ``gain`` is fixed, or None: scheduled by the interval, with ``alpha`` (None: the best there).
+    ``gain`` None schedules it by the interval with ``alpha`` (None: the best for the interval).
     Raises ``ValueError`` for an interval that is not positive.
     """
     if not dt_s > 0:
-        raise ValueError(f"an interval between reports is positive, not {dt_s}")
+        raise ValueError(f"interval between reports is {dt_s}; give a positive number of seconds")
     b, d = dt_s, feedthrough_s
     kept = closed_form.gain(b, d, alpha) if gain is None else gain
     residual = report_m - estimate_m
@@ -64,7 +63,7 @@ def step(
 
 
 def unknown_input_peak(dt_s: float, feedthrough_s: float, gain: float) -> tuple[float, float]:
-    """Exact largest |W^ - w| / sup|w| of both, [b; d] first; infinite where nothing contracts."""
+    """Return the exact largest |W^ - w| / sup|w| of both, [b; d] first; inf without contraction."""
     b, d = dt_s, feedthrough_s
     peak_s = float(closed_form.peak_gain(b, d, gain))
     enters = abs(gain * d - b)
@@ -75,6 +74,6 @@ def unknown_input_peak(dt_s: float, feedthrough_s: float, gain: float) -> tuple[
 
 
 def unknown_input_bound(dt_s: float, feedthrough_s: float, gamma_s: float) -> tuple[float, float]:
-    """Bounds on the same from gamma alone: sqrt(5) |G+| gamma, and 2 gamma / b."""
+    """Return bounds on the same from gamma alone: sqrt(5) |G+| gamma, and 2 gamma / b."""
     pseudo_inverse = 1 / float(np.hypot(dt_s, feedthrough_s))
     return float(np.sqrt(5)) * pseudo_inverse * gamma_s, 2 * gamma_s / dt_s

@@ -1,1 +1,1 @@
-"""True positions of vehicles, from what logs hold of them."""
+"""True positions of vehicles, recovered from logs."""

@@ -1,8 +1,8 @@
-"""True directions of UAVs from the array, for logs that hold the simulator's truth.
+"""True directions of UAVs from the array, for logs with the simulator's truth.
 
-SIM_STATE of a UAV gives its place; that of the vehicle that carries the array its place and its
-attitude. Only then is the whole of a pointing bound tested: both positions and the attitude.
-Without a SIM_STATE of the carrier its predicted pose is taken for true, and reports say so.
+SIM_STATE of a UAV gives its position; that of the vehicle that carries the array gives position and
+attitude. Only then is a whole pointing bound tested: both positions and the attitude. Without a
+SIM_STATE of the carrier its predicted pose counts as true, and reports state this.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ CARRIER_PREDICTED: Final = "SIM_STATE, carrier as predicted"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarrierTruth:
-    """The carrier's own trajectory, and its attitude: ned from body, seconds after ``from_ns``."""
+    """Trajectory of the carrier and its attitude, ned from body, in seconds after ``from_ns``."""
 
     flight: Flight
     from_ns: int
@@ -38,22 +38,20 @@ class CarrierTruth:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ArrayTruth:
-    """The truth that a log holds, for the array of a pipeline.
+    """Truth in a log, for the array of a pipeline.
 
-    carrier  the carrier's truth; None: its pose is as predicted, which for a fixed station is
-             exact
+    carrier  the carrier's truth; None: its pose is the predicted one, which is exact for a fixed
+             station
     """
 
-    kind: str  # its name in reports
-    local: LocalFrame  # the pipeline's local frame
+    kind: str  # name in reports
+    local: LocalFrame  # of the pipeline
     flights: Mapping[str, Flight]  # flights with truth, by UAV
     carrier: CarrierTruth | None
 
     def directions(self, tracks: Sequence[Track], predicted: Carrier, array: Array) -> FloatArray:
-        """True unit directions (N, 3) in the array frame at the tracks' time.
-
-        NaN where not known.
-        """
+        """Return true unit directions (N, 3) in the array frame at the tracks' time; NaN if
+        unknown."""
         found = np.full((len(tracks), 3), np.nan)
         at_ns = np.array([predicted.valid_at_ns])
         carrier = self._carrier(predicted, at_ns)
@@ -65,10 +63,7 @@ class ArrayTruth:
         return found
 
     def _carrier(self, predicted: Carrier, at_ns: Times) -> Carrier:
-        """The carrier with the true pose in place of the predicted one.
-
-        NaN where it is not known.
-        """
+        """Return the carrier with its true pose; NaN where unknown."""
         if self.carrier is None:
             return predicted
         position = self.carrier.flight.truth.at(at_ns)[0][0]
@@ -82,7 +77,7 @@ class ArrayTruth:
 def known_directions(
     truth: ArrayTruth | None, tracks: Sequence[Track], predicted: Carrier, array: Array
 ) -> dict[str, FloatArray]:
-    """True unit directions (3,) by UAV, of those for which they are known."""
+    """Return the known true unit directions (3,) by UAV."""
     if truth is None:
         return {}
     found = truth.directions(tracks, predicted, array)
@@ -94,9 +89,9 @@ def known_directions(
 
 
 def load(logs: Sequence[Path], pipeline: Pipeline) -> ArrayTruth | None:
-    """The truth in the logs of a flight, for the array of a pipeline; None if they hold none.
+    """Return the truth in the logs of a flight, for the array of a pipeline; None without truth.
 
-    The pipeline must have had a report of a vehicle, so that its local frame exists.
+    The pipeline's local frame must exist, which needs at least one report of a vehicle.
     """
     local = pipeline.local
     assert local is not None
@@ -118,7 +113,8 @@ def load(logs: Sequence[Path], pipeline: Pipeline) -> ArrayTruth | None:
 
 
 def _carrier_truth(flight: Flight) -> CarrierTruth | None:
-    """The attitudes of the carrier's SIM_STATE. None for too few."""
+    """Return the truth by the attitudes of the carrier's SIM_STATE; None if there are fewer than
+    two."""
     truth = flight.truth
     if truth.ned_from_body is None:
         return None

@@ -1,13 +1,12 @@
-"""A sender's boot clock on the log's timeline, in hindsight: what no live clock could know.
+"""Boot clock of a sender on the log's timeline, estimated from the whole log.
 
-The offset, arrival less boot time, is the offset of the clocks plus a latency. At each stamp the
-least offset of the ``WINDOW_NS`` before it is taken, and that of the ``WINDOW_NS`` after it, and of
-the two the greater (at the ends of a log the only one). A frame that was late has faster ones on
-both sides of it; where the boot clock stood still or was set, all frames on one side differ, and
-the other side says where the clock was. What is left is the latency of the fastest frame.
+The offset, arrival less boot time, is the offset of the clocks plus a latency. The estimate takes
+the least offset within ``WINDOW_NS`` before a stamp and within ``WINDOW_NS`` after it, and returns
+the greater of the two (at the ends of a log the only one). A late frame has faster ones on both
+sides. If the boot clock paused or was set, the frames on one side of the change all differ, and the
+other side gives the clock. The remaining error is the latency of the fastest frame.
 
-A boot clock that steps back by more than ``REBOOT_STEP_NS`` was restarted, and begins a life of its
-own.
+A boot clock that steps back by more than ``REBOOT_STEP_NS`` has restarted, which starts a new life.
 """
 
 from dataclasses import dataclass
@@ -21,20 +20,21 @@ from companion.values import IntArray
 REBOOT_STEP_NS: Final = 10_000_000_000
 WINDOW_NS: Final = 10_000_000_000
 EDGE_NS: Final = 3_000_000_000
-"""Least time on one side of a stamp for which that side is asked; else a late frame is alone."""
+"""Least time span on one side of a stamp for that side to count; a shorter one may hold only late
+frames."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BootClock:
-    """What a log shows of one boot clock: a stamp each, in order of arrival, (N,)."""
+    """Samples of one boot clock, one per stamp in order of arrival, (N,)."""
 
-    arrival_ns: Times  # when it arrived
-    boot_ns: Times  # what it said
-    life: IntArray  # how often the clock had been restarted
-    made_ns: Times  # when it was made, the log's timeline
+    arrival_ns: Times
+    boot_ns: Times  # value of the stamp
+    life: IntArray  # number of restarts before it
+    made_ns: Times  # time of creation on the log's timeline
 
     def node_ns(self, boot_ns: Times, life: IntArray) -> Times:
-        """Boot times (K,) of given lives on the log's timeline, (K,)."""
+        """Convert boot times (K,) of given lives to the log's timeline, (K,)."""
         found = np.empty(len(boot_ns), dtype=np.int64)
         for number in np.unique(life).tolist():
             wanted, (known,) = life == number, np.nonzero(self.life == number)
@@ -49,7 +49,7 @@ class BootClock:
 
 
 def boot_clock(arrival_ns: Times, boot_ns: Times) -> BootClock:
-    """The clock that made these stamps, (N,), in order of arrival."""
+    """Estimate the clock behind these stamps, (N,), in order of arrival."""
     life = lives(boot_ns)
     made_ns = np.empty_like(boot_ns)
     for number in range(int(life[-1]) + 1 if len(life) else 0):
@@ -58,7 +58,7 @@ def boot_clock(arrival_ns: Times, boot_ns: Times) -> BootClock:
         row = np.arange(len(rows))
         starts = np.searchsorted(here, here - WINDOW_NS, side="left")
         stops = np.searchsorted(here, here + WINDOW_NS, side="right")
-        # Frames that arrived together are one sight of the clock, on both sides.
+        # Frames with equal arrival times are one sample of the clock and count on both sides.
         first, last = np.searchsorted(here, here, "left"), np.searchsorted(here, here, "right")
         before = least(offset_ns, np.minimum(starts, row), last)
         after = least(offset_ns, first, np.maximum(stops, row + 1))
@@ -70,7 +70,7 @@ def boot_clock(arrival_ns: Times, boot_ns: Times) -> BootClock:
 
 
 def lives(boot_ns: Times) -> IntArray:
-    """How often the clock had been restarted at each stamp, (N,), by its steps back."""
+    """Return the number of restarts before each stamp, (N,), found by backward steps."""
     if len(boot_ns) == 0:
         return np.zeros(0, dtype=np.int64)
     found: IntArray = np.cumsum(np.diff(boot_ns, prepend=boot_ns[0]) < -REBOOT_STEP_NS)
@@ -78,9 +78,9 @@ def lives(boot_ns: Times) -> IntArray:
 
 
 def least(values: Times, starts: IntArray, stops: IntArray) -> Times:
-    """The least of ``values[start:stop]`` for each pair, (K,); no range may be empty.
+    """Return the minimum of ``values[start:stop]`` for each pair, (K,); no range may be empty.
 
-    By minima over powers of two, of which two cover any range.
+    Uses minima over powers of two, two of which cover any range.
     """
     levels = [values]
     while 2 ** len(levels) <= len(values):

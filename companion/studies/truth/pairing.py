@@ -1,13 +1,17 @@
-"""When the simulator's words were made, which carry no time: by their order in the stream.
+"""Creation times of the simulator's truth messages, which carry no time, by their order in the
+stream.
 
-An autopilot sends its messages in order: a truth message was made between the stamps of the stamped
-messages before and after it in its vehicle's stream, however late and however bunched they arrive.
-Often the two stamps are equal or 2 ms apart. Else the track itself decides: the way between two
-truth messages over the speed is the time between them, to a millisecond or two, so that all of a
-stretch of flight move together, and what is known of some holds for the others: a narrow bracket; a
-stamped message that arrived in the same moment, where the arrivals keep the sender's pace; else the
-shares of these arrivals. Where nothing of that is near, the earliest time that all brackets near by
-allow is taken: a truth message is now and then sent in one go with the message before it.
+An autopilot sends messages in order: a truth message was created between the stamps of the stamped
+messages before and after it in its vehicle's stream, whatever their delays. These two stamps are
+often equal or 2 ms apart. Otherwise the track constrains the times: distance over speed gives the
+time between two truth messages, to a millisecond or two. All messages of a stretch of flight
+therefore share one time shift, which the best evidence nearby sets:
+
+1. a narrow bracket, or a stamped message that arrived at the same moment while arrivals keep the
+   sender's pace;
+2. the relative positions between these arrivals;
+3. without either, the earliest shift that satisfies all brackets nearby, because an autopilot
+   sometimes sends a truth message together with the message before it.
 """
 
 from dataclasses import dataclass
@@ -21,34 +25,34 @@ from companion.studies.truth.trajectory import GAP_NS, Times
 from companion.values import FloatArray, IntArray
 
 NEAR_NS: Final = (1_000_000_000, 10_000_000_000)
-"""How far off, in the track's own time, a known moment counts; where there is none, farther.
+"""Ranges, on the track's own time, within which a known time counts; the second is the fallback.
 
-The farther, the more do velocities that are a little wrong add up.
+Errors of velocity accumulate with distance.
 """
-NARROW_NS: Final = 5_000_000  # width of a bracket within which its middle is as good as any
+NARROW_NS: Final = 5_000_000  # a narrower bracket determines the time: its middle
 TOGETHER_NS: Final = 7_000_000
-"""Messages of one go have been seen to arrive this far apart, where the link holds nothing back."""
+"""Largest observed spread of arrivals of messages sent together, on a link without queues."""
 ROUNDED_NS: Final = 2_000_000
-"""How far stamps of whole milliseconds and turns of a loop may put a message beyond its bracket."""
+"""Largest error of a bracket, by stamps in whole milliseconds and by the period of a loop."""
 SLOWEST_MPS: Final = 0.5
-"""Speed below which the way between two points does not tell the time between them."""
+"""Speed below which distance does not determine the time between two points."""
 PACE: Final = (0.5, 2.0)
 """Arrivals keep the sender's pace if the gap between two is that of their stamps times 0.5 to 2."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Brackets:
-    """Truth messages (N,) in the order of their stream, and the stamped messages around each."""
+    """Truth messages (N,) in stream order, with the stamped messages around each."""
 
-    arrival_ns: Times  # when the truth message arrived
+    arrival_ns: Times  # arrival of the truth message
     before_ns: Times  # boot time of the stamped message before it
-    after_ns: Times  # that of the one after it
-    before_arrival_ns: Times  # when the one before arrived
-    after_arrival_ns: Times  # when the one after arrived
-    life: IntArray  # how often the boot clock had been restarted
+    after_ns: Times  # boot time of the stamped message after it
+    before_arrival_ns: Times  # arrival of the message before
+    after_arrival_ns: Times  # arrival of the message after
+    life: IntArray  # number of restarts of the boot clock
 
     def rows(self, chosen: NDArray[np.bool_]) -> "Brackets":
-        """Some of the messages."""
+        """Return the selected messages."""
         return Brackets(
             arrival_ns=self.arrival_ns[chosen],
             before_ns=self.before_ns[chosen],
@@ -62,9 +66,9 @@ class Brackets:
 def boot_times_ns(
     brackets: Brackets, position_ned_m: FloatArray, velocity_ned_mps: FloatArray
 ) -> Times:
-    """When truth messages with these positions and velocities, (N, 3), were made, boot time (N,).
+    """Return the creation times, boot time (N,), of truth messages.
 
-    NaN is allowed where a velocity is not known.
+    Their positions and velocities are (N, 3); NaN for an unknown velocity.
     """
     paced, pins = _by_pace(brackets), _pins(brackets)
     alone = np.where(np.isnan(pins), np.where(np.isnan(paced), brackets.before_ns, paced), pins)
@@ -85,7 +89,7 @@ def boot_times_ns(
 
 
 def _keeps_pace(brackets: Brackets) -> NDArray[np.bool_]:
-    """Whether the messages around each came as far apart as they were sent."""
+    """Whether the messages around each arrived as far apart as they were sent."""
     gap_ns = brackets.after_arrival_ns - brackets.before_arrival_ns
     span_ns = brackets.after_ns - brackets.before_ns
     kept: NDArray[np.bool_] = (gap_ns >= PACE[0] * span_ns) & (gap_ns <= PACE[1] * span_ns)
@@ -93,7 +97,7 @@ def _keeps_pace(brackets: Brackets) -> NDArray[np.bool_]:
 
 
 def _by_pace(brackets: Brackets) -> FloatArray:
-    """Times (N,) by the share of the arrivals' gap; NaN where those do not keep the pace."""
+    """Interpolate times (N,) by arrival; NaN where arrivals do not keep the pace."""
     gap_ns = np.maximum(brackets.after_arrival_ns - brackets.before_arrival_ns, 1)
     share = np.clip((brackets.arrival_ns - brackets.before_arrival_ns) / gap_ns, 0.0, 1.0)
     by_share = brackets.before_ns + share * (brackets.after_ns - brackets.before_ns)
@@ -119,7 +123,7 @@ def _times_between_s(position_ned_m: FloatArray, velocity_ned_mps: FloatArray) -
 
 
 def _pins(brackets: Brackets) -> FloatArray:
-    """Times (N,) of those that their bracket or their arrival pins to a moment; NaN for others."""
+    """Times (N,) that a bracket or an arrival determines; NaN for others."""
     narrow = brackets.after_ns - brackets.before_ns <= NARROW_NS
     steady = _keeps_pace(brackets)
     with_before = steady & (brackets.arrival_ns - brackets.before_arrival_ns <= TOGETHER_NS)
@@ -132,7 +136,7 @@ def _pins(brackets: Brackets) -> FloatArray:
 def _moved_together(
     own_ns: Times, brackets: Brackets, paced: FloatArray, pins: FloatArray
 ) -> Times:
-    """Boot times (N,) of points whose times on the track are ``own_ns`` but for a shift."""
+    """Return boot times (N,) of points whose times on the track are ``own_ns`` up to a shift."""
     ordered = np.maximum.accumulate(own_ns)
     nearest, (starts, stops) = (
         (
@@ -153,7 +157,7 @@ def _moved_together(
 
 
 def _typical(values: FloatArray, starts: IntArray, stops: IntArray) -> FloatArray:
-    """The median of what is known of ``values[start:stop]``, (K,); NaN where nothing is."""
+    """Return the median of the known values in ``values[start:stop]``, (K,); NaN without any."""
     at = np.flatnonzero(~np.isnan(values))
     first, last = np.searchsorted(at, starts), np.searchsorted(at, stops)
     known = values[at]

@@ -1,6 +1,6 @@
-"""Boot stamps that are set when a message is sent; only the stamp is read.
+"""Boot stamps that are set when a message is sent.
 
-Left out are stamps of a measurement or a fix (GPS_RAW_INT), which are older than the message, and
+Excluded are stamps of a measurement or a fix (GPS_RAW_INT), which are older than the message, and
 64-bit microseconds, which may be Unix time.
 """
 
@@ -31,5 +31,5 @@ _SENT: Final = frozenset(
 
 
 def boot_ms(frame: Frame) -> int | None:
-    """When a message was sent, milliseconds since boot; None where it does not say."""
+    """Return the sending time of a message, milliseconds since boot; None for other messages."""
     return wire.boot_ms(frame) if frame.msgid in _SENT else None

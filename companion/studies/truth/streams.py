@@ -1,7 +1,7 @@
-"""What a log holds of each vehicle, in order of arrival: reports, stamps, the simulator's words.
+"""Reports, stamps and truth messages of each vehicle in a log, in order of arrival.
 
-The simulator's words are SIM_STATE, and ArduPilot's older SIMSTATE (ardupilotmega.xml, 164), which
-says where but not how high.
+Truth messages come from the simulator: SIM_STATE, and ArduPilot's older SIMSTATE
+(ardupilotmega.xml, 164), which has no altitude.
 """
 
 import struct
@@ -29,17 +29,17 @@ _SIMSTATE = struct.Struct("<9fii")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TruthMessage:
-    """A truth message."""
+    """Truth message of the simulator."""
 
-    arrival_ns: int  # when it arrived
-    before: int  # the number of the stamp before it on its link, among the stamps of its vehicle
-    after: int  # the number of the stamp after it
-    payload: bytes  # its payload
+    arrival_ns: int
+    before: int  # index of the stamp before it on its link, among the stamps of its vehicle
+    after: int  # index of the stamp after it
+    payload: bytes
 
 
 @dataclass(slots=True)
 class _Order:
-    """The order of one vehicle's messages on one link: the last stamp, and what came since."""
+    """Order of one vehicle's messages on one link: the last stamp, and truth messages since."""
 
     last: int | None = None
     waiting: list[tuple[int, int, bytes]] = field(default_factory=list)  # msgid, arrival, payload
@@ -47,15 +47,15 @@ class _Order:
 
 @dataclass(slots=True, kw_only=True)
 class VehicleStream:
-    """What a log holds of one vehicle, in order of arrival.
+    """Messages of one vehicle in order of arrival.
 
-    reports      its reports, each once
-    report_at    the place of each among the frames
-    gnss         what it had last said of its receiver when each report came
-    frames       its frames, but for the simulator's words
-    round_trips  TIMESYNC round trips with it
+    reports      its reports, without repeats
+    report_at    index of each report among the frames
+    gnss         last receiver status before each report
+    frames       its frames, except truth messages
+    round_trips  its TIMESYNC round trips
     stamps       arrival and boot time of its stamped messages, ns
-    said         the simulator's words, by message id
+    said         truth messages, by message id
     """
 
     reports: list[Report] = field(default_factory=list)
@@ -71,12 +71,12 @@ class VehicleStream:
     _links: dict[str, _Order] = field(default_factory=dict)
 
     def clock(self) -> BootClock:
-        """Its boot clock, in hindsight."""
+        """Estimate its boot clock from all stamps."""
         rows = np.array(self.stamps, dtype=np.int64).reshape(-1, 2)
         return boot_clock(rows[:, 0], rows[:, 1])
 
     def take(self, frame: Frame, dedupe: Dedupe) -> None:
-        """Take in a frame of this vehicle; ``dedupe`` knows the reports of all."""
+        """Add a frame of this vehicle; ``dedupe`` holds the reports of all vehicles."""
         order = self._links.get(frame.link)
         if order is None:
             order = self._links.setdefault(frame.link, _Order())
@@ -114,14 +114,14 @@ class VehicleStream:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthMessages:
-    """Truth messages in the order of their stream: their brackets and their payloads."""
+    """Brackets and payloads of truth messages in stream order."""
 
     brackets: Brackets
     payloads: tuple[bytes, ...]
 
 
 def words(stream: VehicleStream, msgid: int, clock: BootClock) -> TruthMessages:
-    """The truth messages of one kind that lie between two stamps of one life."""
+    """Return the truth messages of one kind that lie between two stamps of one life."""
     said = stream.said[msgid]
     before = np.array([each.before for each in said], dtype=np.int64)
     after = np.array([each.after for each in said], dtype=np.int64)
@@ -139,17 +139,17 @@ def words(stream: VehicleStream, msgid: int, clock: BootClock) -> TruthMessages:
 
 
 def sim_state(payload: bytes) -> tuple[float, ...]:
-    """The fields of a SIM_STATE: quaternion (4), …, latitude, longitude (1e-7 degrees) last."""
+    """Decode a SIM_STATE: quaternion (4), …, latitude, longitude (1e-7 degrees) last."""
     return _SIM_STATE.unpack(payload.ljust(_SIM_STATE.size, b"\0")[: _SIM_STATE.size])
 
 
 def simstate(payload: bytes) -> tuple[float, ...]:
-    """The fields of a SIMSTATE; latitude and longitude in 1e-7 degrees come last."""
+    """Decode a SIMSTATE; latitude and longitude in 1e-7 degrees come last."""
     return _SIMSTATE.unpack(payload.ljust(_SIMSTATE.size, b"\0")[: _SIMSTATE.size])
 
 
 def gather(logs: Sequence[Path]) -> dict[str, VehicleStream]:
-    """The streams of a flight's logs by vehicle: of those that report a position."""
+    """Return the streams of a flight's logs, by vehicle that reports a position."""
     found: dict[str, VehicleStream] = {}
     dedupe = Dedupe()
     for event in _events(logs):

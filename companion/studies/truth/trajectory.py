@@ -1,4 +1,4 @@
-"""A trajectory: positions and velocities at ascending times, interpolated between them."""
+"""Trajectory: positions and velocities at ascending times, with interpolation."""
 
 from dataclasses import dataclass
 from typing import Final, Literal
@@ -12,15 +12,15 @@ Times = NDArray[np.int64]
 Kind = Literal["SIM_STATE", "SIMSTATE", "reports"]
 
 GAP_NS: Final = 2_500_000_000
-"""Longest gap between two points of a trajectory across which it is interpolated."""
+"""Longest gap between two points that is interpolated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Trajectory:
     """Positions and velocities, (N, 3), local frame, at ascending times (N,).
 
-    ``ned_from_body`` are attitudes (N, 4), quaternions w, x, y, z; zeros where one is not known,
-    None where none is.
+    ``ned_from_body`` are attitudes (N, 4), quaternions w, x, y, z; zeros for an unknown one, None
+    if all are unknown.
     """
 
     kind: Kind
@@ -30,7 +30,7 @@ class Trajectory:
     ned_from_body: FloatArray | None = None
 
     def at(self, t_ns: Times) -> tuple[FloatArray, FloatArray]:
-        """Position and velocity (K, 3) at times (K,), by cubic Hermite; NaN where not known."""
+        """Return position and velocity (K, 3) at times (K,), by cubic Hermite; NaN if unknown."""
         if len(self.t_ns) < 2:
             return np.full((len(t_ns), 3), np.nan), np.full((len(t_ns), 3), np.nan)
         after = np.clip(np.searchsorted(self.t_ns, t_ns, side="right"), 1, len(self.t_ns) - 1)
@@ -55,9 +55,9 @@ def ascending(
     velocity_ned_mps: FloatArray,
     ned_from_body: FloatArray | None = None,
 ) -> Trajectory:
-    """A trajectory in order of time, each time once.
+    """Return a trajectory sorted by time without repeated times.
 
-    Velocities that are NaN become those between neighbours.
+    A NaN velocity is replaced by the one between neighbours.
     """
     times, rows = np.unique(t_ns, return_index=True)
     position, velocity = position_ned_m[rows], velocity_ned_mps[rows]

@@ -1,10 +1,9 @@
-"""The vehicles of a log: their reports, and where they truly were.
+"""Vehicles of a log: their reports and their true trajectories.
 
-The truth is the simulator's where a log has it: SIM_STATE, or the older SIMSTATE, whose heights are
-those of the reports and whose velocities are those between neighbours. Otherwise the truth is the
-reports seen afterwards: all of them, in the order of the sender's clock, interpolated. When the
-simulator's words were made is found in ``pairing``, what the sender's clock showed in
-``hindsight``.
+The truth is the simulator's if a log has it: SIM_STATE, or the older SIMSTATE with the heights of
+the reports and velocities between neighbours. Otherwise the truth is all reports, in order of the
+sender's clock, interpolated. ``pairing`` finds the times of truth messages, ``hindsight`` estimates
+the sender's clock.
 """
 
 from collections.abc import Sequence
@@ -52,33 +51,33 @@ AFTER_FAULT_NS: Final = 5_000_000_000
 class Flight:
     """One vehicle of a log: its reports in order of arrival, and the truth.
 
-    gnss              what the vehicle had last said of its receiver when each report came
-    report_at         (N,), the place of each report among the frames; empty without frames
+    gnss              last receiver status of the vehicle at each report
+    report_at         (N,), index of each report among the frames; empty without frames
     """
 
-    uav: str  # its name
-    arrival_ns: Times  # (N,), when each report arrived
-    boot_ms: Times  # (N,), its boot time
+    uav: str
+    arrival_ns: Times  # (N,), arrivals of the reports
+    boot_ms: Times  # (N,), their boot times
     position_ned_m: FloatArray  # (N, 3), local frame
     velocity_ned_mps: FloatArray  # (N, 3), local frame; NaN: not reported
     height_m: FloatArray  # (N,), height above the vehicle's home; NaN: not reported
     gnss: tuple[GnssStatus | None, ...]
-    truth: Trajectory  # where it truly was
-    made_ns: Times  # (N,), when each report was made, in hindsight
-    frames: tuple[Frame, ...] = ()  # its frames in order of arrival, but for the simulator's words
+    truth: Trajectory
+    made_ns: Times  # (N,), creation times of the reports, estimated from the whole log
+    frames: tuple[Frame, ...] = ()  # its frames in order of arrival, without truth messages
     report_at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     round_trips: tuple[RoundTrip, ...] = ()  # TIMESYNC round trips with it
-    faults: tuple[tuple[int, int], ...] = ()  # windows of faults that were declared of it: from, to
+    faults: tuple[tuple[int, int], ...] = ()  # windows of its declared faults: from, to
 
     def in_fault(self, from_ns: Times, to_ns: Times) -> BoolArray:
-        """Whether the window of a declared fault meets each of these intervals, (...)."""
+        """Return whether the window of a declared fault overlaps each interval, (...)."""
         found = np.zeros(np.shape(from_ns), dtype=bool)
         for begins_ns, ends_ns in self.faults:
             found |= (from_ns <= ends_ns) & (to_ns >= begins_ns)
         return found
 
     def flying(self, t_ns: Times) -> NDArray[np.bool_]:
-        """Whether it flies: faster than 1 m/s and, by its last report, more than 2 m up."""
+        """Return whether it flies: faster than 1 m/s and, by its last report, higher than 2 m."""
         _, velocity = self.truth.at(t_ns)
         last = np.searchsorted(self.arrival_ns, t_ns, side="right") - 1
         height = np.where(last < 0, 0.0, self.height_m[np.maximum(last, 0)])
@@ -89,7 +88,7 @@ class Flight:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Flown:
-    """A log: its flights, and the array's position (fixed (3,), or a trajectory).
+    """Flights of a log and position of the array: fixed (3,), or a trajectory.
 
     ``origin`` is that of the local frame: latitude and longitude in degrees, altitude in metres.
     """
@@ -102,34 +101,34 @@ class Flown:
     origin: tuple[float, float, float]
 
     def carrier_at(self, t_ns: Times) -> FloatArray:
-        """The array's true position (K, 3) at times (K,); NaN where not known."""
+        """Return the array's true position (K, 3) at times (K,); NaN if unknown."""
         if isinstance(self.carrier, Trajectory):
             return self.carrier.at(t_ns)[0]
         return np.broadcast_to(self.carrier, (len(t_ns), 3))
 
 
 def named(logs: Sequence[Path]) -> str:
-    """The name of a flight: those of its logs."""
+    """Return the name of a flight: the names of its logs."""
     return " + ".join(log.name for log in logs)
 
 
 def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
     """Read a log, or the logs of a flight.
 
-    Raises ``UserError`` or ``LogError`` where there is nothing to study in it.
+    Raises ``UserError`` or ``LogError`` if they contain nothing to study.
     """
     logs = [logs] if isinstance(logs, Path) else logs
     path = " ".join(map(str, logs))
     center: CenterPlace = parse_center(center_text or "home")
     streams = gather(logs)
     if not streams:
-        raise UserError(f"{path}: no vehicle reports a position in it")
+        raise UserError(f"{path}: no position reports; give a log with a flying vehicle")
     first = min((each.reports[0] for each in streams.values()), key=lambda report: report.t_ns)
     home = FixedCenter(lat_deg=first.lat_deg, lon_deg=first.lon_deg, alt_m=first.alt_m or 0.0)
     stands = center if isinstance(center, FixedCenter) else home
     local = LocalFrame(stands.lat_deg, stands.lon_deg, stands.alt_m)
     faults = tuple(fault for log in logs for fault in declared_faults(log))
-    # A vehicle with a single report has no path, and does not fly.
+    # A single report is not a path.
     flights = {
         uav: _flight(uav, stream, local, _windows(faults, stream))
         for uav, stream in streams.items()
@@ -138,7 +137,7 @@ def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
     carrier: FloatArray | Trajectory = np.zeros(3)
     if isinstance(center, VehicleCenter):
         if str(center) not in flights:
-            raise UserError(f"{path}: the carrier {center} reports no position in it")
+            raise UserError(f"{path}: the carrier {center} reports no position; check --center")
         carrier = flights.pop(str(center)).truth
     arrivals = [report.t_ns for stream in streams.values() for report in stream.reports]
     return Flown(
@@ -154,7 +153,7 @@ def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
 def _windows(
     faults: tuple[DeclaredFault, ...], stream: VehicleStream
 ) -> tuple[tuple[int, int], ...]:
-    """The windows of a vehicle's faults, before which and after which its assumptions hold."""
+    """Return the windows of a vehicle's faults, outside of which its assumptions hold."""
     sysid = stream.reports[0].source.sysid
     return tuple(
         (fault.from_ns - BEFORE_FAULT_NS, fault.to_ns + AFTER_FAULT_NS)
@@ -173,7 +172,7 @@ def _flight(
     velocity = np.array([_velocity(local, report) for report in reports])
     height = np.array([np.nan if r.relative_alt_m is None else r.relative_alt_m for r in reports])
     clock = stream.clock()
-    # Every report is a stamp; of equal stamps any will do.
+    # Every report has a stamp; equal stamps are interchangeable.
     rows = {stamp: row for row, stamp in enumerate(stream.stamps)}
     numbers = [rows[r.t_ns, (r.boot_ms or 0) * 1_000_000] for r in reports]
     made_ns = clock.made_ns[numbers]
@@ -219,14 +218,14 @@ def _velocity(local: LocalFrame, report: Report) -> FloatArray:
 
 
 def _simulated(stream: VehicleStream, clock: BootClock, local: LocalFrame) -> Trajectory | None:
-    """The trajectory by SIM_STATE; None where it has no place on Earth or cannot be put in time."""
+    """Return the trajectory by SIM_STATE; None if it has no valid position or time."""
     said = words(stream, SIM_STATE, clock)
     points, attitudes, kept = [], [], []
     for payload in said.payloads:
         fields = sim_state(payload)
         lat_deg, lon_deg, alt_m = fields[13:16]
         lat_1e7, lon_1e7 = fields[21:23]
-        if lat_1e7 or lon_1e7:  # single precision is good to half a metre only
+        if lat_1e7 or lon_1e7:  # single precision resolves only half a metre
             lat_deg, lon_deg = lat_1e7 * 1e-7, lon_1e7 * 1e-7
         kept.append(bool(lat_deg or lon_deg))
         if kept[-1]:
@@ -252,9 +251,9 @@ def _placed(
     position_ned_m: FloatArray,
     velocity_ned_mps: FloatArray,
 ) -> Trajectory | None:
-    """The trajectory by SIMSTATE, at the heights of the reports that were made at ``made_ns``.
+    """Return the trajectory by SIMSTATE, at the heights of the reports created at ``made_ns``.
 
-    Their velocities tell the times between its points. None as for ``_simulated``.
+    The reported velocities give the times between its points. None as for ``_simulated``.
     """
     said = words(stream, SIMSTATE, clock)
     places = np.array([simstate(payload)[9:11] for payload in said.payloads]).reshape(-1, 2)
@@ -278,6 +277,6 @@ def _placed(
     roughly_ns = clock.node_ns(brackets.before_ns, brackets.life)
     level = track(roughly_ns)
     velocity = np.stack([reported(axis, roughly_ns) for axis in velocity_ned_mps.T], axis=1)
-    velocity[:, 2], level[:, 2] = 0.0, 0.0  # its heights say nothing of time
+    velocity[:, 2], level[:, 2] = 0.0, 0.0  # heights carry no information on time
     t_ns = clock.node_ns(pairing.boot_times_ns(brackets, level, velocity), brackets.life)
     return ascending("SIMSTATE", t_ns, track(t_ns), np.full_like(level, np.nan))

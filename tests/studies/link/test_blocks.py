@@ -30,7 +30,7 @@ def test_a_block_fills_its_symbol() -> None:
 
 
 def test_streams_that_pilots_cannot_tell_apart_are_refused() -> None:
-    with pytest.raises(ValueError, match="9 UAVs at once: the pilots tell 8 streams apart"):
+    with pytest.raises(ValueError, match="9 UAVs at once: the pilots separate at most 8 streams"):
         send(9, 1, np.random.default_rng(1))
 
 

@@ -100,7 +100,7 @@ def test_the_scale_of_a_block_does_not_matter() -> None:
 
 @pytest.mark.parametrize("length", [0, 18, 20])
 def test_what_is_no_code_word_is_refused(length: int) -> None:
-    with pytest.raises(ValueError, match=f"{length} soft bits are no code word"):
+    with pytest.raises(ValueError, match=f"{length} soft bits do not make a code word"):
         decode(np.zeros((1, length)))
 
 

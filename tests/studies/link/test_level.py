@@ -141,7 +141,7 @@ def test_a_log_goes_through_the_pipeline(tmp_path: Path) -> None:
     ("arguments", "said"),
     [
         (("--snr", "1:2"), "'1:2' is not FROM:TO:STEP in dB"),
-        (("--snr", "5:2:1"), "--snr 5:2:1: FROM:TO:STEP in dB"),
+        (("--snr", "5:2:1"), "--snr 5:2:1: give FROM:TO:STEP in dB"),
         (("--snr", "0:2:0"), "STEP above 0"),
         (("--snr", "0:nan:1"), "--snr 0:nan:1"),
         (("--snr", "0:20:0.1"), "201 points, at most 100 are allowed"),

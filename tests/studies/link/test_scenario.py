@@ -60,6 +60,6 @@ def test_what_the_array_cannot_tell_apart_is_left_out(scenario: Scenario) -> Non
         solved = solve(steering_matrix(array, seen.towards[PositionSource.PERFECT]))
         assert solved is not None and solved.loss_factors.max() <= 10**0.3
     assert 0.02 < scenario.unresolved_share < 0.4
-    with pytest.raises(ValueError, match="can hardly ever tell the circling UAVs apart"):
+    with pytest.raises(ValueError, match="can rarely separate the circling UAVs"):
         few = Settings().override(array={"elements": 2})
         circles(few, Reports(), 5, np.random.default_rng(1))

@@ -105,18 +105,18 @@ def test_every_figure_of_the_paper_is_held_against_ours(answer: dict[str, Any], 
     for one in answer["paper"]["guesses"]:
         assert one["setting"] in page and one["taken"] in page
     assert {one["setting"]: one["bears_on"] for one in answer["paper"]["guesses"]} == {
-        "where each UAV begins (φ)": "all that is drawn; opposite UAVs",
+        "initial phase of each UAV (φ)": "all figures; opposite UAVs",
         "duration": "means of rates",
-        "the observer's beginning": "the first seconds of figures 2 to 4",
+        "initial state of the observer": "first seconds of figures 2 to 4",
         "transmit power": "figures 5, 6 and 10",
         "noise figure": "figures 5, 6 and 10",
         "path loss": "figures 5, 6 and 10",
         "spectral efficiency": "figures 5, 6 and 10",
-        "rays beside the direct one": "figures 5, 6 and 10",
-        "size of the transform of the OFDM": "the waveform",
+        "scattered rays": "figures 5, 6 and 10",
+        "size of the OFDM transform": "the waveform",
         "blockages": "figure 10",
         "echo probing": "figure 10",
-        "elements' pattern": "figures 7 to 9",
+        "element pattern": "figures 7 to 9",
     }
 
 

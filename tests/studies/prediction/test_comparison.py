@@ -521,8 +521,8 @@ def test_a_mistake_is_one_line(
 @pytest.mark.parametrize(
     ("name", "says"),
     [
-        ("real_bluerobotics_server.tlog", "no vehicle reports a position"),
-        ("adsb_pymodes_real.tlog", "no vehicle reports a position"),
+        ("real_bluerobotics_server.tlog", "no position reports"),
+        ("adsb_pymodes_real.tlog", "no position reports"),
         ("real_eagle_c2_gui.tlog", "no UAV flies while"),
     ],
 )

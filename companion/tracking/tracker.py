@@ -437,7 +437,6 @@ def _fastest_mps(
 
 
 def _first(fix: Fix) -> Estimate:
-    """Return the estimate at a report without a prediction: the report itself."""
     return Estimate(
         fix=fix,
         position_ned_m=fix.position_ned_m,

@@ -60,7 +60,6 @@ def calibration_at(text: str, frequency_hz: float) -> Calibration:
 
 
 def _read(text: str) -> tuple[list[int], list[_Table]]:
-    """Return order and tables, by ascending frequency."""
     try:
         told = read_toml(text, LARGEST)
     except UserError as error:
@@ -156,8 +155,6 @@ def _between(low: _Table, high: _Table, frequency_hz: float) -> _Table:
 
 
 def _calibration(order: list[int], table: _Table) -> Calibration:
-    """Convert a table to elements."""
-
     def by_element(column: FloatArray | None) -> tuple[float, ...]:
         if column is None:
             return ()

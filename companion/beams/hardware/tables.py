@@ -109,7 +109,6 @@ def encode(table: DeviceTable, frequency_hz: float | None = None) -> str:
 def _check(
     device: Beamformer, beams: Sequence[WantedBeam], calibration: Calibration, gains: UnitGains
 ) -> None:
-    """Raise ``UserError`` for beams outside the device's limits."""
     limits, size = LIMITS[device], len(calibration.order)
     range_db = gains.range_db if device is Beamformer.TMYTEK else limits.gain_range_db
     if limits.elements is not None and size != limits.elements:

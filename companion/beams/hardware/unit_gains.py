@@ -83,5 +83,4 @@ def _numbers(key: str, given: Any, count: int) -> list[float]:
 
 
 def _floor(gain_db: float) -> float:
-    """Round a gain down to a step."""
     return math.floor(gain_db / TMYTEK_STEP_DB + 1e-9) * TMYTEK_STEP_DB

@@ -96,7 +96,6 @@ def _squared(values: ComplexArray) -> FloatArray:
 
 
 def _power(columns: ComplexArray) -> FloatArray:
-    """Return the squared length (N,) of each column (M, N)."""
     power: FloatArray = _squared(columns).sum(axis=0)
     return power
 

@@ -56,7 +56,6 @@ class Shapes(NamedTuple):
 
 @functools.cache
 def _table(name: str) -> Shapes:
-    """Load the tables of a ``line`` or of a ``square``."""
     count, axes = (64, 1) if name == "line" else (16, 2)
     even = _even(count) if axes == 1 else np.kron(_even(count), _even(count))
     file = resources.files(__package__) / TABLES

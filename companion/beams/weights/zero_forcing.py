@@ -65,7 +65,6 @@ def _identity(users: int) -> ComplexArray:
 
 
 def _unsolved(steering: ComplexArray) -> ZeroForcingSolution | None:
-    """Return the result if Cholesky fails, or if there are no users."""
     if not np.isfinite(steering).all():
         raise ValueError("a steering vector is not finite")
     return None if steering.shape[1] else ZeroForcingSolution(np.empty_like(steering), np.empty(0))

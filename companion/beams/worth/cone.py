@@ -347,7 +347,6 @@ def _polar(frames: FloatArray, angle: FloatArray, turn: FloatArray) -> FloatArra
 
 
 def _highest_sine(boxes: Boxes) -> FloatArray:
-    """Largest sin r in each box."""
     low, high = boxes.low[:, 0], boxes.high[:, 0]
     sines: FloatArray = np.sin(np.clip(np.pi / 2, low, high))
     return sines

@@ -242,7 +242,6 @@ def _unit_power(array: Array, weights: ComplexArray) -> ComplexArray:
 
 
 def _gains(array: Array, weights: ComplexArray, directions: FloatArray) -> FloatArray:
-    """|a(u)^T f|^2 towards unit directions (..., 3): (...)."""
     rows = directions.reshape(-1, 3)
     gains: FloatArray = np.empty(len(rows))
     block = max(1, BLOCK // array.size)

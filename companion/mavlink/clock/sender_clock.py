@@ -259,7 +259,6 @@ class SenderClock:
         return self._known
 
     def _usual_s(self, kind: ClockKind, low_ns: int, high_ns: int) -> float:
-        """Return the usual error of the most likely offset."""
         if kind is not ClockKind.ENVELOPE:
             return (high_ns - low_ns) / 4 * 1e-9
         floor = self._line.floor

@@ -305,7 +305,6 @@ def _answered(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
 
 
 def _admitted(guard: MessageSigning, item: Frame | Rejection) -> Frame | Rejection:
-    """Return the item, or its rejection by the guard."""
     refusal = None if isinstance(item, Rejection) else guard.refusal(item)
     if refusal is None or isinstance(item, Rejection):
         return item

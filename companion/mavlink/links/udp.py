@@ -252,7 +252,6 @@ class _Datagrams:
         return _fullness(self._socket)
 
     def _read(self) -> None:
-        """Pass on the waiting datagrams, each with its age."""
         was_set = self._wall_clock.was_set()
         until_s = time.monotonic() + SLICE_S
         for _ in range(READ_AT_ONCE):

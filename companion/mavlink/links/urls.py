@@ -127,7 +127,6 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
 
 
 def _http(text: str, address: str) -> tuple[Way, str, str]:
-    """Split ``http://HOST[:PORT]/PATH`` into scheme, HOST:PORT and path."""
     way, slashes, rest = address.partition("://")
     host, slash, path = rest.partition("/")
     if not slashes or not _PATH.fullmatch(slash + path):

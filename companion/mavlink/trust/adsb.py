@@ -235,7 +235,6 @@ def _fitting(own: _T | None, known: _Dated[_T] | None, true_ns: int) -> _T | Non
 
 
 def _differs(before: AdsbVehicle, message: AdsbVehicle) -> bool:
-    """Return whether two messages with one position disagree in velocity or altitude."""
     pairs = [
         (before.velocity_ne_mps, message.velocity_ne_mps),
         (before.velocity_down_mps, message.velocity_down_mps),

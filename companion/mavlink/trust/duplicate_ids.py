@@ -178,7 +178,6 @@ def _within(
 
 
 def _is_off(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> bool:
-    """Return whether a report between two others contradicts their sender."""
     stretch_ms = last.boot_ms - first.boot_ms
     if stretch_ms > STRETCH_MS:
         return False

@@ -251,7 +251,6 @@ class Watch:
         return now_ns - since_ns >= max(SETTLE_NS, round(_ENOUGH / self.wanted_hz * _NS))
 
     def _expect_change(self) -> None:
-        """Discard the observations, because the rate is about to change."""
         self.observed.stamps_ms.clear()
         self._slow_since_ns = self._order_since_ns = None
 

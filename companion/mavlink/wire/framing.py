@@ -145,7 +145,6 @@ class Checker:
         return self._learn(buffer[at : at + length]) if length > 0 else length
 
     def _learn(self, raw: bytes) -> Checked:
-        """Cache the sender and message of a valid frame, and return it."""
         if raw[0] == MAGIC_V2:
             ids, msgid = (raw[5], raw[6]), raw[7] | raw[8] << 8 | raw[9] << 16
         else:

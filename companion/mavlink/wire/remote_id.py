@@ -93,7 +93,6 @@ def _pack(frame: Frame) -> RemoteId:
 
 
 def _added(said: RemoteId, message: bytes) -> RemoteId:
-    """Add one message of a pack."""
     match message[0] >> 4:
         case 0:
             return _identified(said, message[1] >> 4, message[2:22])

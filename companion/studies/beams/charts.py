@@ -49,7 +49,6 @@ def charts(watched: Watched) -> dict[str, plotting.Draw]:
 
 
 def _gain(watched: Watched) -> "Figure":
-    """Panel per UAV: predicted, guaranteed and true gain over time."""
     by_uav, edges, (low, high) = watched.by_uav, _edges(watched), _range_db(watched)
     size_in = (WIDTH_IN, 0.9 + 1.25 * len(by_uav))
     figure, panels = plotting.new(len(by_uav), 1, size_in, sharex=True, sharey=True)
@@ -66,7 +65,6 @@ def _gain(watched: Watched) -> "Figure":
 
 
 def _sweep(watched: Watched) -> "Figure":
-    """Line per UAV: the share of the codebook that must be swept."""
     edges = _edges(watched)
     figure, (axes,) = plotting.new(1, 1, (WIDTH_IN, 3.6))
     for number, (uav, samples) in enumerate(watched.by_uav.items()):
@@ -149,7 +147,6 @@ def _bin(edges: FloatArray) -> str:
 
 
 def _least(samples: Sequence[Sample], edges: FloatArray, kind: GainCurve) -> FloatArray:
-    """Return the least gain of a kind in each bin (B,)."""
     return _worst(samples, edges, lambda sample: _of(sample.as_set, kind.value), np.fmin)
 
 

@@ -93,7 +93,6 @@ def _text(watched: Watched) -> str:
 
 
 def _section(watched: Watched, figures: Iterable[str]) -> dict[str, Any]:
-    """Return the page's data for one log: ``figures`` are the names of its figures."""
     row = summed_up(watched.samples)
     by_uav = {uav: summed_up(samples) for uav, samples in watched.by_uav.items()}
     return {

@@ -96,13 +96,11 @@ def _time(found: Sequence[FleetSize]) -> "Figure":
 
 
 def _sized(axes: "Axes", nodes: Sequence[int]) -> None:
-    """Label the axis of nodes with the sizes."""
     axes.set(xscale="log", xlabel="nodes")
     axes.set_xticks(nodes, labels=map(str, nodes))
     axes.set_xticks([], minor=True)
 
 
 def _plain(axes: "Axes") -> None:
-    """Use plain numbers on the logarithmic axis of values."""
     axes.yaxis.set_major_formatter("{x:g}")
     axes.yaxis.set_minor_formatter("{x:g}")

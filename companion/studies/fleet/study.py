@@ -113,7 +113,6 @@ def _grown(world: World, seconds: float) -> FleetSize:
 
 
 def _counted(world: World, seconds: float) -> FleetCounts:
-    """Run for the given time and return its counts."""
     world.counted = counted = FleetCounts()
     world.run(seconds)
     world.counted = FleetCounts()  # later events go to another object

@@ -165,7 +165,6 @@ class World:
                 self._ask(name, other)
 
     def _flush(self, name: str) -> None:
-        """Publish received frames that are due, as a live node does."""
         if self._flushing.get(name) == self.now_ns and name not in self.dead:  # else postponed
             del self._flushing[name]
             self._publish_received(name)
@@ -228,11 +227,9 @@ class World:
     # --- UAVs -------------------------------------------------------------------------------
 
     def _ranges_m(self) -> FloatArray:
-        """Return the current distances (nodes, UAVs)."""
         return self._flight.ranges_m((self.now_ns - START_NS) / SECOND_NS)
 
     def _report(self, end_ns: int) -> None:
-        """Deliver reports of the sampled UAVs to the nodes within reach."""
         period_ns = round(SECOND_NS / self.sky.report_hz)
         ranges_m = self._ranges_m()
         for i, uav in enumerate(self._flight.uavs[: self.sky.sampled]):

@@ -164,7 +164,6 @@ def _gain_maps(found: Maps, values: dict[float, FloatArray], label: str) -> "Fig
 
 
 def _map(axes: "Axes", x: FloatArray, y: FloatArray, values: FloatArray, levels: FloatArray) -> Any:
-    """Draw filled contours with labelled lines; values beyond the last level have its colour."""
     drawn = axes.contourf(x, y, values, levels=levels, cmap=plotting.MAP, extend="max")
     lines = axes.contour(x, y, values, levels=levels[1::2], colors="#ffffff", linewidths=0.8)
     axes.clabel(lines, fmt="%.2f", fontsize=7.5)
@@ -173,7 +172,6 @@ def _map(axes: "Axes", x: FloatArray, y: FloatArray, values: FloatArray, levels:
 
 
 def _rates(answer: dict[str, Any]) -> list[tuple[str, ...]]:
-    """Least report rates: one row per error and speed, one column per feedthrough."""
     by_case: dict[tuple[float, float], list[float]] = {}
     for row in answer["rates"]:
         by_case.setdefault((row["error_m"], row["speed_mps"]), []).append(row["dt_max_s"])

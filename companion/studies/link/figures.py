@@ -59,7 +59,6 @@ def _curve(answer: dict[str, Any], positions: str, coded: bool) -> list[Row]:
 
 
 def _errors(answer: dict[str, Any], key: str, label: str) -> "Figure":
-    """Draw error rates, uncoded beside coded, with confidence bands."""
     figure, axes = _new(2, (7.2, 3.8))
     for panel, coded in zip(axes, (False, True), strict=True):
         panel.set_title("coded: rate 1/3, K = 7" if coded else "uncoded")

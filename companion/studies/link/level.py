@@ -218,13 +218,11 @@ def study(
 
 
 def _floor(rows: list[Row], kind: str, coded: bool) -> Row:
-    """Return error rate and throughput at the highest SNR."""
     last = [found for found in rows if (found["positions"], found["coded"]) == (kind, coded)][-1]
     return {"ber_at_highest_snr": last["ber"], "rate_at_highest_snr_bps": last["rate_bps"]}
 
 
 def _pointing(scenario: Scenario, kind: PositionSource) -> Row:
-    """Return the pointing error of the beams, degrees."""
     off_deg = np.concatenate(
         [
             angles_deg(instant.towards[kind], instant.towards[PositionSource.PERFECT])

@@ -175,7 +175,6 @@ def _resolved(settings: Settings, array: Array, truly: FloatArray) -> bool:
 
 
 def _bounded(settings: Settings) -> Settings:
-    """Return settings with the bounds on speed, acceleration and noise that hold on the circles."""
     speed = max(RADII_M) * RATE_RADPS
     bounds = {
         "speed_max_mps": speed * (1 + GUST),

@@ -255,7 +255,6 @@ def _limits() -> dict[str, dict[str, float]]:
 
 
 def _unknown_input(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[str, float]]:
-    """Return errors of W^ over sup||W||: in the scenario, at the exact worst, and as published."""
     scenario, found = flight.scenario, {}
     levels = {level_name(gain): mu for mu, gain in PAPER_LEVELS}
     for name, one in tracked.items():
@@ -381,7 +380,6 @@ def _rate_numbers(found: FloatArray) -> dict[str, float]:
 
 
 def _blockage(compared: BlockageComparison) -> dict[str, Any]:
-    """Return means by scheme, and their gain over echo probing at the middle blockage rate."""
     echo, middle = compared.schemes["echo probing"], len(compared.blockages_per_minute) // 2
     return {
         "tx_power_dbm": link.BUDGET.tx_power_dbm,

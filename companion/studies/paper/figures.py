@@ -169,7 +169,6 @@ def _unknown_input(answer: Answer, material: Material) -> "Figure":
 
 
 def _misses(axes: Any, one: Any, material: Material, numbers: dict[str, float]) -> None:
-    """Draw the norm of the error of both estimates, the exact peak and the published bound."""
     flight = material.flight
     shown = flight.time_s[:-1] <= SHOWN_S
     time_s, largest = flight.time_s[:-1][shown], flight.largest_input_mps

@@ -34,7 +34,6 @@ def azimuths_rad(position_m: FloatArray) -> FloatArray:
 
 
 def _cases(material: Material) -> list[tuple[Array, FloatArray, str]]:
-    """Return array, positions and title for each size at each instant."""
     return [
         (
             material.arrays[size],

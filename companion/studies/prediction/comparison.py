@@ -250,8 +250,6 @@ def study(
 def _compared(
     setting: PredictionStudy, pieces: Sequence[Piece], progress: Callable[[str], None]
 ) -> list[LogComparison]:
-    """Return the results of the pieces, in their order."""
-
     def progressed(done: int) -> None:
         progress(f"{done} of {len(pieces)} done (a log over a link each)")
 

@@ -56,7 +56,6 @@ def _named(found: Sequence[LogComparison]) -> dict[str, LogComparison]:
 
 
 def _section(name: str, compared: LogComparison) -> dict[str, Any]:
-    """Return the page's data for one log over one link."""
     leads, predictors = summary.axes_of(compared)
     rows = compared.rows
     keys = (

@@ -72,7 +72,6 @@ def _left_to_parent() -> None:
 
 @contextmanager
 def _one_blas_thread() -> Iterator[None]:
-    """Limit new processes to one BLAS thread, through the environment."""
     before = {name: os.environ.get(name) for name in BLAS_THREADS}
     os.environ.update(dict.fromkeys(BLAS_THREADS, "1"))
     try:

@@ -63,7 +63,6 @@ class ArrayTruth:
         return found
 
     def _carrier(self, predicted: Carrier, at_ns: Times) -> Carrier:
-        """Return the carrier with its true pose; NaN where unknown."""
         if self.carrier is None:
             return predicted
         position = self.carrier.flight.truth.at(at_ns)[0][0]

@@ -89,7 +89,6 @@ def boot_times_ns(
 
 
 def _keeps_pace(brackets: Brackets) -> NDArray[np.bool_]:
-    """Whether the messages around each arrived as far apart as they were sent."""
     gap_ns = brackets.after_arrival_ns - brackets.before_arrival_ns
     span_ns = brackets.after_ns - brackets.before_ns
     kept: NDArray[np.bool_] = (gap_ns >= PACE[0] * span_ns) & (gap_ns <= PACE[1] * span_ns)
@@ -105,10 +104,9 @@ def _by_pace(brackets: Brackets) -> FloatArray:
 
 
 def _times_between_s(position_ned_m: FloatArray, velocity_ned_mps: FloatArray) -> FloatArray:
-    """Times (N - 1,) from each point to the next, by the way along the mean velocity.
+    """Return times (N - 1,) from each point to the next, by distance along the mean velocity.
 
-    NaN where it is too slow for that. In a turn by an angle x the chord over the mean velocity is
-    too long by x²/12.
+    NaN at low speed. In a turn by x rad the chord over the mean velocity is too long by x²/12.
     """
     mean = (velocity_ned_mps[1:] + velocity_ned_mps[:-1]) / 2
     speed2 = np.sum(mean * mean, axis=1)

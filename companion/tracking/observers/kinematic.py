@@ -127,7 +127,6 @@ class KinematicObserver:
     def _bounded(
         self, state: KinematicState, t: float, gain: Gain, position: Vector, velocity: Vector
     ) -> Prediction:
-        """Return the prediction with the running bound."""
         fix, noise = state.fix, state.fix.noise
         model = fix.limits or self.model
         l11, l12, l21, l22 = gain

@@ -187,9 +187,25 @@ def page() -> Iterator[Text]:
         parser.feed(path.read_text(encoding="utf-8"))
         yield from parser.found
     for path in sorted((ROOT / "web").glob("*.js")):
-        code = re.sub(r"^\s*(//|\*|/\*).*$", "", path.read_text(encoding="utf-8"), flags=re.M)
-        for text in re.findall(r'"((?:[^"\\\n]|\\.)* (?:[^"\\\n]|\\.)*)"|`([^`]* [^`]*)`', code):
-            yield Text("page", path.name, " ".join((text[0] or text[1]).split()))
+        for text in _script_texts(path.read_text(encoding="utf-8")):
+            yield Text("page", path.name, text)
+
+
+_SCRIPT: Final = re.compile(
+    r"""//[^\n]* | /\*.*?\*/ | "((?:[^"\\\n]|\\.)*)" | '((?:[^'\\\n]|\\.)*)'
+    | `((?:[^`\\$] | \\. | \$(?!\{) | \$\{(?:[^{}`]|\{[^{}]*\}|`[^`]*`)*\})*)`""",
+    re.VERBOSE | re.DOTALL,
+)
+_CODE: Final = re.compile(r"[#.][a-z]|\[[a-z-]+|=>|^\(|^v1/|^[a-z]+, [a-z]+$|px |^[\d. ]+$|var\(--")
+
+
+def _script_texts(code: str) -> Iterator[str]:
+    """The string literals of a script that read like words."""
+    for found in _SCRIPT.finditer(code):
+        text = " ".join((found[1] or found[2] or found[3] or "").split())
+        words = re.sub(r"\$\{[^}]*\}", "", text)
+        if re.search(r"[A-Za-z]{3}", words) and " " in text and not _CODE.search(words):
+            yield text
 
 
 # --- texts in files -----------------------------------------------------------------------------

@@ -8,8 +8,8 @@ leaves (1 - s_p) r_p there and its own points unchanged: exactly where X is 0, a
 directions, and in the least-squares sense at the points around them. Each s_p is limited by
 
 * the price: with c_p the correlation of a_p with the user's own a and q_p that with g, removing
-  this one alone costs the gain 1 + s^2 q^2 / (1 - c^2), of which each may cost at most ``PRICE``,
-  and towards c = 1 nothing (``APART``);
+  this one alone costs the gain 1 + s^2 q^2 / (1 - c^2). Each may cost at most ``PRICE``, and
+  towards c = 1 nothing (``APART``);
 * the floor: within a user's own cone at least the least gain must be left, and outside a part of it
   that decreases with the distance of the null from the cone.
 

@@ -45,7 +45,7 @@ def max_min(coupling: FloatArray) -> FloatArray:
 
 
 def weighted_sum(coupling: FloatArray, worths: FloatArray) -> FloatArray:
-    """Return shares (N,) that maximise the sum of ``worths`` (N,) times rates; a local optimum."""
+    """Return shares (N,) at a local maximum of the sum of ``worths`` (N,) times rates."""
     direct = np.sqrt(coupling.diagonal())
     sent = np.full(len(direct), (1.0 / len(direct)) ** 0.5)
     for _ in range(2 * ROUNDS):

@@ -164,7 +164,7 @@ def _attenuation_db(
 def _echo_efficiency(
     array: Array, true_m: FloatArray, lost_db: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return spectral efficiency of the baseline (T / EVERY, N): 0 for a UAV during its sweep."""
+    """Return spectral efficiency (T / EVERY, N) of the baseline; 0 during a sweep."""
     state = probing.started(directions(true_m[0]))
     pointed, served = [], []
     for at, (there, places) in enumerate(zip(directions(true_m), true_m, strict=True)):

@@ -256,7 +256,7 @@ def record(url: LinkUrl, out: Path, duration_s: float | None, as_json: bool) -> 
 
     Example: sitl-replay record --from udpin:0.0.0.0:14550 --out flight.tlog
     """
-    heard = recorder.Heard()
+    heard = recorder.RecordingTally()
     run(recorder.record(url, out, duration_s, heard=heard), heard)
     conclude(heard, "recorded", as_json)
 
@@ -306,13 +306,13 @@ def _frames_among(events: Iterable[Event], tally: player.Tally) -> Iterator[Fram
                 tally.rejected[event.reason.value] += event.count
 
 
-def run(work: Coroutine[Any, Any, object], count: player.Tally | recorder.Heard) -> None:
+def run(work: Coroutine[Any, Any, object], count: player.Tally | recorder.RecordingTally) -> None:
     """Run until the end, SIGINT or SIGTERM. An error prints one line and exits non-zero."""
     asyncio.run(_until_signal(work, count))
 
 
 async def _until_signal(
-    work: Coroutine[Any, Any, object], count: player.Tally | recorder.Heard
+    work: Coroutine[Any, Any, object], count: player.Tally | recorder.RecordingTally
 ) -> None:
     loop = asyncio.get_running_loop()
     task = asyncio.ensure_future(work)
@@ -329,13 +329,13 @@ async def _until_signal(
             click.echo("\r\033[K", nl=False, err=True)
 
 
-async def _progress(count: player.Tally | recorder.Heard) -> None:
+async def _progress(count: player.Tally | recorder.RecordingTally) -> None:
     while True:
         await asyncio.sleep(PROGRESS_EVERY_S)
         click.echo(f"\r{count.frames} frames, {count.octets} bytes", nl=False, err=True)
 
 
-def conclude(count: player.Tally | recorder.Heard, done: str, as_json: bool) -> None:
+def conclude(count: player.Tally | recorder.RecordingTally, done: str, as_json: bool) -> None:
     """Print the summary. Exits with 1 if a link was lost during the run."""
     if as_json:
         click.echo(json.dumps(summary_of(count)))
@@ -351,7 +351,7 @@ def conclude(count: player.Tally | recorder.Heard, done: str, as_json: bool) -> 
         sys.exit(1)
 
 
-def summary_of(count: player.Tally | recorder.Heard) -> dict[str, Any]:
+def summary_of(count: player.Tally | recorder.RecordingTally) -> dict[str, Any]:
     """The object that ``--json`` prints."""
     common = {
         "frames": count.frames,
@@ -360,7 +360,7 @@ def summary_of(count: player.Tally | recorder.Heard) -> dict[str, Any]:
         "by_message": {player.message_name(kind): n for kind, n in count.messages.most_common()},
     }
     common["rejected"] = dict(count.rejected)
-    if isinstance(count, recorder.Heard):
+    if isinstance(count, recorder.RecordingTally):
         return common
     return common | {
         "dropped": count.dropped,

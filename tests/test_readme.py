@@ -108,6 +108,7 @@ def curl(words: list[str], where: Path, node: Node) -> None:
 
 def to_its_end(words: list[str], where: Path, start_node: Started) -> None:
     """Replays, designs and studies end by themselves."""
+    words = [str(one) for word in words for one in (sorted(where.glob(word)) or [word])]
     done = run(words, where)
     assert done.stdout or (where / "weights.npy").exists()
     if "--out" in words:
@@ -274,6 +275,9 @@ def test_the_command_does_what_it_should(
     shutil.copy(carrier, tmp_path / "carrier.bin")
     if "recording.mcap" in command:
         shutil.copy(request.getfixturevalue("recording"), tmp_path)
+    if "flights/*.mcap" in command:
+        (tmp_path / "flights").mkdir()
+        shutil.copy(request.getfixturevalue("recording"), tmp_path / "flights")
     monkeypatch.chdir(tmp_path)  # `recordings` and the like are made here
     words = ["3" if word == "120" else word for word in words_of(command)]  # it is 5 s long
     way = runner_of(command)

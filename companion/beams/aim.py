@@ -47,7 +47,7 @@ UNKNOWN_SHARE: Final = 0.25
 
 In the logs it is 1/20 for positions, and 1/10 to 1/5 for attitudes.
 """
-DARK: Final = 1e-3
+MIN_AMPLITUDE: Final = 1e-3
 """Element amplitude below which there is no beam: 60 dB below an isotropic element."""
 
 
@@ -236,7 +236,7 @@ def _out_of_reach(
         amplitudes = steering.amplitudes(array, directions)
         if array.live is not None:  # dead elements may be the ones that face there
             amplitudes = amplitudes * array.live[:, np.newaxis]
-        dark = amplitudes.max(axis=0) < DARK
+        dark = amplitudes.max(axis=0) < MIN_AMPLITUDE
         reasons = [
             why or ("no element of the array radiates there" if none else None)
             for why, none in zip(reasons, dark.tolist(), strict=True)

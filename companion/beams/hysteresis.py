@@ -31,9 +31,9 @@ GUARANTEE_PLANE_SHARE: Final = 1 / 3
 
 Their beams change most with the width.
 """
-LEAST_WIDTHS: Final = 0.25
+MIN_WIDTHS: Final = 0.25
 """Angle in natural widths below which a shape is unaffected; growth by factors starts here."""
-MOST_WIDTHS: Final = 16.0
+MAX_WIDTHS: Final = 16.0
 """Angle in natural widths beyond which a wider bound no longer changes the shape."""
 KEPT_NS: Final = 500_000_000  # time for which a method and slots are kept
 
@@ -97,12 +97,12 @@ def rate_limited_rad(
     natural_rad  the natural width of the array
     pace         factor of the usual rates
     """
-    wanted_rad = np.minimum(wanted_rad, MOST_WIDTHS * natural_rad)
+    wanted_rad = np.minimum(wanted_rad, MAX_WIDTHS * natural_rad)
     if before is None:
         return wanted_rad
     passed_s = pace * min(abs(valid_at_ns - before.valid_at_ns) * 1e-9, MAX_ELAPSED_S)
     last = np.array([before.shaped.get(uav, (np.nan, np.nan)) for uav in uavs])
-    begin = np.maximum(last, LEAST_WIDTHS * natural_rad)
+    begin = np.maximum(last, MIN_WIDTHS * natural_rad)
     widths_rad = natural_rad * passed_s
     further = (
         begin

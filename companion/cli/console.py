@@ -56,7 +56,7 @@ def say(text: str, err: bool = False) -> None:
     click.echo(printable(text), err=err)
 
 
-def tell_vehicles(logs: Sequence[Path]) -> None:
+def print_vehicles(logs: Sequence[Path]) -> None:
     """Print on stderr, for each onboard log among ``logs``, its vehicle and the accuracy of its
     time."""
     from companion.recording.reader import vehicles
@@ -79,12 +79,12 @@ def make_folder(out: Path) -> None:
     made = [each for each in (out, *out.parents) if not each.exists()]
     out.mkdir(parents=True, exist_ok=True)
 
-    def tidy() -> None:
+    def single_line() -> None:
         for each in made:
             with suppress(OSError):  # the folder is not empty
                 each.rmdir()
 
-    click.get_current_context().call_on_close(tidy)
+    click.get_current_context().call_on_close(single_line)
 
 
 class InterruptedByUser(Exception):  # noqa: N818 - not an error
@@ -161,16 +161,16 @@ class Progress:
         self.show("")
 
 
-def of_log(progress: Progress, ends_s: float | None) -> Callable[[int, float, float], None]:
+def log_progress(progress: Progress, ends_s: float | None) -> Callable[[int, float, float], None]:
     """Return a callback that shows the progress through a log of length ``ends_s`` (None: unknown).
 
     Its arguments are frames, seconds of log, and wall-clock seconds since the start.
     """
 
     def show(frames: int, at_s: float, wall_s: float) -> None:
-        to_go = ""
+        remaining = ""
         if ends_s and at_s > 0:
-            to_go = f" of {ends_s:.0f} s, {max(0.0, ends_s / at_s - 1) * wall_s:.0f} s to go"
-        progress.show(f"{frames} frames, {at_s:.0f} s of log{to_go}")
+            remaining = f" of {ends_s:.0f} s, {max(0.0, ends_s / at_s - 1) * wall_s:.0f} s to go"
+        progress.show(f"{frames} frames, {at_s:.0f} s of log{remaining}")
 
     return show

@@ -79,7 +79,7 @@ def drive(
     from companion.client import Client
     from companion.node.drive import running, targets
     from companion.node.drive.loop import Drive, SafeState
-    from companion.node.drive.sources import BeamRequest, OverHttp, stored_registers
+    from companion.node.drive.sources import BeamRequest, HttpSource, stored_registers
     from companion.pipeline import assembly
     from companion.settings.files import load
 
@@ -96,7 +96,7 @@ def drive(
         device = targets.device(f"none:{device.takes}", click.echo, codebook)
     client = Client(service, os.environ.get("COMPANION_TOKEN"))
     driven = Drive(
-        source=OverHttp(
+        source=HttpSource(
             client,
             BeamRequest(
                 uavs=uavs,
@@ -113,23 +113,24 @@ def drive(
         say=lambda text: click.echo(text, err=True),
     )
 
-    def show(told: "DriveStatus") -> None:
+    def show(final_status: "DriveStatus") -> None:
         if as_json:
-            click.echo(json.dumps(asdict(told)))
+            click.echo(json.dumps(asdict(final_status)))
 
     running.run_until_stopped(driven, show, seconds)
-    told = driven.status()
-    click.echo(_text(told), err=as_json)
-    if not told.applied:
+    final_status = driven.status()
+    click.echo(_text(final_status), err=as_json)
+    if not final_status.applied:
         raise UserError("nothing was applied: no beams, or the device rejected them all")
 
 
-def _text(told: "DriveStatus") -> str:
+def _text(final_status: "DriveStatus") -> str:
     times = ""
-    if told.p50_ms is not None:
-        times = f", to apply p50 {told.p50_ms:.1f} ms p99 {told.p99_ms:.1f} ms"
-    rate = "" if told.rate_hz is None else f" at {told.rate_hz:.1f} Hz"
+    if final_status.p50_ms is not None:
+        times = f", to apply p50 {final_status.p50_ms:.1f} ms p99 {final_status.p99_ms:.1f} ms"
+    rate = "" if final_status.rate_hz is None else f" at {final_status.rate_hz:.1f} Hz"
     return (
-        f"{told.applied} updates{rate}{times}, lead {told.lead_ms:.0f} ms;"
-        f" {told.late} late, {told.skipped} skipped, {told.failures} failures"
+        f"{final_status.applied} updates{rate}{times}, lead {final_status.lead_ms:.0f} ms;"
+        f" {final_status.late} late, {final_status.skipped} skipped,"
+        f" {final_status.failures} failures"
     )

@@ -15,15 +15,15 @@ from companion.cli.console import (
     LOGS,
     InterruptedByUser,
     Progress,
-    of_log,
+    log_progress,
+    print_vehicles,
     say,
-    tell_vehicles,
 )
 from companion.cli.export_beams import beams
 from companion.cli.replay_text import center_text
 
 
-class _OrBeams(click.Command):
+class _ExportGroup(click.Command):
     """Command on logs that hands over to ``beams`` if its first argument is that word."""
 
     def make_context(
@@ -39,7 +39,7 @@ class _OrBeams(click.Command):
         return super().make_context(info_name, args, parent, **extra)
 
 
-@click.command(cls=_OrBeams)
+@click.command(cls=_ExportGroup)
 @LOGS
 @click.option(
     "--format",
@@ -85,8 +85,8 @@ def export(
     settings = replaying.settings_for(logs, config, center)
     if settings.center.source is None:
         click.echo("no --center: array placed at the position of the first report", err=True)
-    tell_vehicles(logs)
-    show = of_log(progress, replaying.length_s(logs))
+    print_vehicles(logs)
+    show = log_progress(progress, replaying.length_s(logs))
     try:
         if form == "rerun":
             summary = exporting.export_space(logs, settings, out, show, latency_s)

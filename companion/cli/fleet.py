@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from companion.cli.console import JSON_LINES, SECONDS, Progress, of_log, say
+from companion.cli.console import JSON_LINES, SECONDS, Progress, log_progress, say
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -47,19 +47,19 @@ def watch(url: str, seconds: float | None, as_json: bool) -> None:
     answer = None
     while True:
         try:
-            answer = _asked(node.fleet(), url)
+            answer = _fleet_answer(node.fleet(), url)
             say(json.dumps(answer) if as_json else _text(answer))
         except ServiceError as error:
             if answer is None:
-                raise UserError(_refused(url, error)) from error
-            say(f"no answer: {_refused(url, error)}", err=True)
+                raise UserError(_error_text(url, error)) from error
+            say(f"no answer: {_error_text(url, error)}", err=True)
         left_s = math.inf if ends_s is None else ends_s - time.monotonic()
         if left_s <= 0:
             return
         time.sleep(min(EVERY_S, left_s))
 
 
-def _asked(answer: dict[str, Any], url: str) -> dict[str, Any]:
+def _fleet_answer(answer: dict[str, Any], url: str) -> dict[str, Any]:
     """Return the answer if it comes from a node of a fleet; raise ``UserError`` otherwise."""
     if "node" not in answer:
         raise UserError(f"{url}: not a companion: no node in /v1/fleet; check the address")
@@ -68,7 +68,7 @@ def _asked(answer: dict[str, Any], url: str) -> dict[str, Any]:
     return answer
 
 
-def _refused(url: str, error: "ServiceError") -> str:
+def _error_text(url: str, error: "ServiceError") -> str:
     if error.status is None:
         return error.title  # contains the URL
     hint = " (COMPANION_TOKEN)" if error.status == HTTPStatus.UNAUTHORIZED else ""
@@ -88,12 +88,12 @@ def _text(answer: dict[str, Any]) -> str:
         way = "" if node["way_p99_ms"] is None else f"  way p99 {node['way_p99_ms']:.0f} ms"
         lines.append(
             f"  {node['node']:{width}} {node['state']:7} serves {len(served):3} of at most"
-            f" {_or_dash(node['most'])}: {names or '-'}{_clock(node)}{way}"
+            f" {_text_or_dash(node['most'])}: {names or '-'}{_clock(node)}{way}"
         )
         if node["reason"] is not None:
             lines.append(f"    not trusted: it {node['reason']}")
     for uav in answer["uavs"]:
-        lines += [f"  {uav['uav']} {said}" for said in _about(uav)]
+        lines += [f"  {uav['uav']} {said}" for said in _offset_text(uav)]
     kbps = answer["sent_bps"] / 1e3, answer["heard_bps"] / 1e3
     damaged = f", {answer['damaged']} damaged" if answer["damaged"] else ""
     return "\n".join(
@@ -101,7 +101,7 @@ def _text(answer: dict[str, Any]) -> str:
     )
 
 
-def _about(uav: dict[str, Any]) -> list[str]:
+def _offset_text(uav: dict[str, Any]) -> list[str]:
     """Return what needs attention for a UAV; empty if one node serves it and keeps it."""
     by, to = uav["served_by"], uav["handing_to"]
     said = []
@@ -125,7 +125,7 @@ def _clock(node: dict[str, Any]) -> str:
     return f"  clock {offset} {unit}"
 
 
-def _or_dash(value: int | None) -> str:
+def _text_or_dash(value: int | None) -> str:
     return "-" if value is None else str(value)
 
 
@@ -137,7 +137,7 @@ def replay(logs: Sequence[Path], as_json: bool) -> None:
     from companion.node.fleet import replaying
 
     progress = Progress()
-    found = replaying.replay(logs, of_log(progress, None))
+    found = replaying.replay(logs, log_progress(progress, None))
     progress.clear()
     say(json.dumps(found) if as_json else _replayed(found))
     other = [node["logs"][0] for node in found["nodes"] if node["same"] is False]

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
 
-IMPORTED_BY_S = 0.02  # delay before an interrupt that met an import is tried again
+IMPORT_TIMEOUT_S = 0.02  # delay before an interrupt that met an import is tried again
 
 
 @contextmanager
@@ -51,7 +51,7 @@ def interrupts_raised() -> Iterator[None]:
 def _interrupt(_number: int, at: FrameType | None) -> None:
     if _imports(at):
         signal.signal(signal.SIGALRM, _interrupt)
-        signal.setitimer(signal.ITIMER_REAL, IMPORTED_BY_S)
+        signal.setitimer(signal.ITIMER_REAL, IMPORT_TIMEOUT_S)
         return
     raise KeyboardInterrupt
 

@@ -31,9 +31,9 @@ from companion.cli.console import (
     InterruptedByUser,
     OneLineErrors,
     Progress,
-    of_log,
+    log_progress,
+    print_vehicles,
     say,
-    tell_vehicles,
 )
 from companion.cli.design import design
 from companion.cli.drive import drive
@@ -105,12 +105,12 @@ def run(
         "server": {"listen": listen, "foxglove": foxglove},
         "recording": {"directory": record},
     }
-    voice, token = _voice(as_json), os.environ.get("COMPANION_TOKEN")
+    voice, token = _output(as_json), os.environ.get("COMPANION_TOKEN")
     settings, origins = layered(config, options)
     start.run(settings, voice, origins=origins, token=token, insecure=insecure)
 
 
-def _voice(as_json: bool) -> "Console":
+def _output(as_json: bool) -> "Console":
     from companion.cli.voice import JsonLines, Lines
 
     return JsonLines() if as_json else Lines()
@@ -132,7 +132,7 @@ def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> No
 
     options = {"server": {"listen": f"127.0.0.1:{port}"}}
     settings = scenario.settings("recordings").override(**options)
-    voice, way = _voice(as_json), scenario.traffic
+    voice, way = _output(as_json), scenario.traffic
     start.run(
         settings,
         voice,
@@ -213,7 +213,7 @@ def replay(
     settings, origins = replaying.layers_for(logs, config, center)
     if settings.center.source is None:
         click.echo("no --center: array placed at the position of the first report", err=True)
-    tell_vehicles(logs)
+    print_vehicles(logs)
     begun: list[Writer] = []
 
     def record() -> "Writer":
@@ -237,25 +237,25 @@ def replay(
                 area_map=own.page.map,
             ),
             own.server.listen,
-            partial(_show_replay, as_json),
+            partial(_print_replay, as_json),
             token=os.environ.get("COMPANION_TOKEN"),
             insecure=insecure,
         )
         return
-    show = of_log(progress, replaying.length_s(logs))
+    show = log_progress(progress, replaying.length_s(logs))
     try:
         summary = replaying.replay(
             logs, settings, recorder, speed=pace, progress=show, latency_s=latency_s
         )
     except KeyboardInterrupt:
-        raise InterruptedByUser(_left_behind(begun)) from None
+        raise InterruptedByUser(_recovery_hint(begun)) from None
     progress.clear()
-    _show_replay(as_json, summary)
+    _print_replay(as_json, summary)
     if summary["unaimed"]:
         raise UserError(f"no beam was computed: {summary['unaimed']}")
 
 
-def _left_behind(begun: "list[Writer]") -> str:
+def _recovery_hint(begun: "list[Writer]") -> str:
     """Return how to complete the recording that Ctrl-C interrupted; empty if none was begun."""
     for writer in begun:
         writer.abandon()
@@ -263,7 +263,7 @@ def _left_behind(begun: "list[Writer]") -> str:
     return ""
 
 
-def _show_replay(as_json: bool, summary: dict[str, Any]) -> None:
+def _print_replay(as_json: bool, summary: dict[str, Any]) -> None:
     say(json.dumps(summary) if as_json else replay_text.text(summary))
 
 

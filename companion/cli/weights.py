@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, LATENCY, LOGS, Progress, tell_vehicles
+from companion.cli.console import CENTER, CONFIG, LATENCY, LOGS, Progress, print_vehicles
 from companion.values import WeightFormat
 
 
@@ -70,7 +70,7 @@ def weights(
         raise click.UsageError(f"--out {out}: folder {out.parent} does not exist; create it")
     progress = Progress()
     settings = settings_for(logs, config, center)
-    tell_vehicles(logs)
+    print_vehicles(logs)
     equipment = assembly.equipment(settings, assembly.array(settings))
     pipeline, update = moment.look(
         logs,
@@ -84,9 +84,10 @@ def weights(
     if update.unfit is not None:
         raise click.ClickException(f"no beams at {at}: {update.unfit}")
     if form == "json":
-        told = beam_state.beams(pipeline, equipment, update, 0.0, lead_ms)
+        summary = beam_state.beams(pipeline, equipment, update, 0.0, lead_ms)
         body = (
-            json.dumps(told | beam_state.weights(pipeline, update.beams, lead_ms)).encode() + b"\n"
+            json.dumps(summary | beam_state.weights(pipeline, update.beams, lead_ms)).encode()
+            + b"\n"
         )
     else:
         body = weight_formats.encode(WeightFormat(form), update.beams, pipeline, equipment, lead_ms)

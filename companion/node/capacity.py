@@ -46,7 +46,7 @@ def measure(
     ``processor`` is the fraction of one processor that this process may use.
     """
     update_hz = settings.beams.update_hz
-    few, more = (_flown(settings, number, clock_s) for number in (FEW, MORE))
+    few, more = (_simulate(settings, number, clock_s) for number in (FEW, MORE))
     report_s = (few.report_s + more.report_s) / 2
     each_s = max(0.0, (more.update_s - few.update_s) / (MORE - FEW))
     alone_s = max(0.0, more.update_s - MORE * each_s)
@@ -56,26 +56,26 @@ def measure(
 
 
 @dataclass(frozen=True, slots=True)
-class _Took:
+class _Times:
     report_s: float
     update_s: float
 
 
-def _flown(settings: Settings, number: int, clock_s: Callable[[], float]) -> _Took:
+def _simulate(settings: Settings, number: int, clock_s: Callable[[], float]) -> _Times:
     """Return the mean times of a report and of an update with this number of UAVs."""
     center = {"source": ",".join(map(str, HOME))}
     pipeline = Pipeline(settings.override(center=center, beams={"targets": "all"}))
     took_s, counts = {Frame: 0.0, Tick: 0.0}, {Frame: 0, Tick: 0}
-    for event in _sky(number, settings.beams.update_hz):
+    for event in _traffic(number, settings.beams.update_hz):
         began_s = clock_s()
         pipeline.step(event)
         if event.t_ns >= _BEGIN_NS + SETTLED_S * _S:
             took_s[type(event)] += clock_s() - began_s
             counts[type(event)] += 1
-    return _Took(took_s[Frame] / counts[Frame], took_s[Tick] / counts[Tick])
+    return _Times(took_s[Frame] / counts[Frame], took_s[Tick] / counts[Tick])
 
 
-def _sky(number: int, update_hz: float) -> Iterator[Event]:
+def _traffic(number: int, update_hz: float) -> Iterator[Event]:
     """Yield reports and ticks in order of time; the UAVs fly outwards on different courses."""
     frame = LocalFrame(*HOME)
     update_ns, due_ns = round(_S / update_hz), _BEGIN_NS

@@ -66,7 +66,7 @@ def check(
         )
     if urls and seconds > 0:
         show(f"listening for {seconds:g} s")
-        service = _listen(_to_listen(settings, urls), seconds)
+        service = _listen(_links_to_open(settings, urls), seconds)
         yield from _reception(service, settings)
 
 
@@ -96,7 +96,7 @@ def _capacity(settings: Settings) -> Finding:
     return Finding(subject="capacity", grade=Grade.OK, text=text)
 
 
-def _to_listen(settings: Settings, urls: list[str]) -> Settings:
+def _links_to_open(settings: Settings, urls: list[str]) -> Settings:
     """Return the settings of a run over these links that records and sends nothing else."""
     source = settings.center.source or "home"
     kept = settings.override(links={"urls": urls}, center={"source": source})
@@ -228,10 +228,10 @@ def _uavs(service: Service) -> Iterator[Finding]:
         name, dt_s = track.uav, track.dt_s
         pace = "one report" if dt_s is None else f"a report every {dt_s:.2f} s"
         text = f"{track.state}, {pace}, bound {track.bound_m:.1f} m"
-        yield _judged(name, text, verdicts.get(name))
+        yield _assessed(name, text, verdicts.get(name))
 
 
-def _judged(name: str, text: str, verdict: Verdict | None) -> Finding:
+def _assessed(name: str, text: str, verdict: Verdict | None) -> Finding:
     found = Finding(subject=f"UAV {name}", grade=Grade.OK, text=text)
     if verdict is None:
         return replace(found, grade=Grade.DOUBT, text=f"not assessed: {text}")
@@ -243,9 +243,9 @@ def _judged(name: str, text: str, verdict: Verdict | None) -> Finding:
 
 
 def _speed(service: Service, update_hz: float) -> Iterator[Finding]:
-    took_s = sorted(_look_s(service.pipeline, service.now_ns()) for _ in range(TIMED_UPDATES))[
-        TIMED_UPDATES // 2
-    ]
+    took_s = sorted(
+        _update_time_s(service.pipeline, service.now_ns()) for _ in range(TIMED_UPDATES)
+    )[TIMED_UPDATES // 2]
     share = took_s * update_hz
     text = f"beams take {took_s * 1e3:.1f} ms, {share:.0%} of the update interval"
     if share > BUSY:
@@ -256,7 +256,7 @@ def _speed(service: Service, update_hz: float) -> Iterator[Finding]:
         yield Finding(subject="this machine", grade=Grade.OK, text=text)
 
 
-def _look_s(pipeline: Pipeline, now_ns: int) -> float:
+def _update_time_s(pipeline: Pipeline, now_ns: int) -> float:
     began_s = time.perf_counter()
     pipeline.look(now_ns, 0.0)
     return time.perf_counter() - began_s

@@ -21,11 +21,11 @@ from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.values import UserError
 
-SCARCE_BYTES: Final = 2_000_000_000
+LOW_DISK_BYTES: Final = 2_000_000_000
 """Free disk space below which recordings are at risk: some hours of four UAVs."""
 BUFFER_BYTES: Final = 1_000_000
 """Receive buffer below which bursts of UDP may be lost (docs/links.md)."""
-UNSYNCHRONISED: Final = 5  # TIME_ERROR of adjtimex(2): the clock is not synchronised
+UNSYNCHRONISED_STATE: Final = 5  # TIME_ERROR of adjtimex(2): the clock is not synchronised
 
 
 class Grade(StrEnum):
@@ -145,7 +145,7 @@ def _disk(folder: Path) -> Finding:
             remedy="choose a writable folder in `[recording] directory`",
         )
     text = f"{free / 1e9:.1f} GB free"
-    if free < SCARCE_BYTES:
+    if free < LOW_DISK_BYTES:
         return Finding(
             subject=subject,
             grade=Grade.DOUBT,
@@ -197,7 +197,7 @@ def _clock() -> Iterator[Finding]:
         state = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(512))
     except (OSError, AttributeError):
         return  # not Linux
-    if state == UNSYNCHRONISED:
+    if state == UNSYNCHRONISED_STATE:
         text = "the clock is not synchronised: times in recordings may be wrong"
         yield Finding(
             subject="wall clock",

@@ -69,19 +69,19 @@ class Outlet:
             for link in (*self._frames, *self._events):
                 group.create_task(link.run(), name=f"out {link.url}")
             if self._frames or self._events:
-                group.create_task(self._speak(), name="out")
+                group.create_task(self._send_all(), name="out")
 
-    async def _speak(self) -> None:
+    async def _send_all(self) -> None:
         """Send at the rate; times missed while the loop was blocked are skipped."""
         loop = asyncio.get_running_loop()
         period_s = 1 / self._settings.rate_hz
         due_s = loop.time()
         while True:
-            self._say()
+            self._send_text()
             due_s = max(due_s + period_s, loop.time())
             await asyncio.sleep(due_s - loop.time())
 
-    def _say(self) -> None:
+    def _send_text(self) -> None:
         now_ns = self._now_ns()
         named = self._pipeline.tracks(now_ns, now_ns)
         tracks = [track for track in named if self._admits(track.uav)]

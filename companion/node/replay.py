@@ -11,7 +11,7 @@ from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.recording import ends, parts
-from companion.recording.parts import Story
+from companion.recording.parts import RecordingInfo
 from companion.recording.reader import (
     LogError,
     center_of,
@@ -205,7 +205,7 @@ def in_order(logs: Sequence[Path]) -> list[Path] | None:
 
     Raises ``LogError`` if one is unreadable or given twice.
     """
-    return _in_order(_stories(logs))
+    return _in_order(_recording_infos(logs))
 
 
 def missing(logs: Sequence[Path]) -> list[str]:
@@ -214,20 +214,20 @@ def missing(logs: Sequence[Path]) -> list[str]:
     A replay of such recordings cannot reproduce the live run's digest. Raises ``LogError`` as for a
     replay.
     """
-    stories = _stories(logs)
-    return parts.missing(stories, _in_order(stories) or logs)
+    infos = _recording_infos(logs)
+    return parts.missing(infos, _in_order(infos) or logs)
 
 
-def _stories(logs: Sequence[Path]) -> dict[Path, Story]:
+def _recording_infos(logs: Sequence[Path]) -> dict[Path, RecordingInfo]:
     try:
-        return {log: parts.read_story(log) for log in logs}
+        return {log: parts.read_recording_info(log) for log in logs}
     except (OSError, ValueError) as error:
         raise LogError(f"{logs[0]}: cannot be read: {error}") from None
 
 
-def _in_order(stories: dict[Path, Story]) -> list[Path] | None:
+def _in_order(infos: dict[Path, RecordingInfo]) -> list[Path] | None:
     try:
-        return parts.in_order(stories)
+        return parts.in_order(infos)
     except ValueError as error:
         raise LogError(str(error)) from None
 

@@ -20,7 +20,7 @@ from companion.node.clock import NodeClock
 from companion.node.drive import targets
 from companion.node.drive.loop import Drive, SafeState
 from companion.node.drive.running import run_in_thread
-from companion.node.drive.sources import BeamRequest, OfThisProcess, stored_registers
+from companion.node.drive.sources import BeamRequest, LocalSource, stored_registers
 from companion.node.fleet.live import LiveFleetNode
 from companion.node.gateway import Gateway
 from companion.node.outlet import Outlet
@@ -88,7 +88,10 @@ class Service:
         self._recorder: BackgroundRecorder | None = None
         self._live = self._open_live()
         self._traffic = Gateway(
-            settings=settings, step=self._hear, notify=self._notify, now_ns=self._timeline.now_ns
+            settings=settings,
+            step=self._process_frame,
+            notify=self._notify,
+            now_ns=self._timeline.now_ns,
         )
         self.arrival_lag = self._traffic.lag
         self._outlet = Outlet(
@@ -139,7 +142,7 @@ class Service:
                 tasks.append(group.create_task(self._traffic.run(), name="links"))
                 tasks.append(group.create_task(self._outlet.run(), name="out"))
                 tasks.append(group.create_task(self._push.run(), name="records"))
-                tasks.append(group.create_task(self._driven(), name="drive"))
+                tasks.append(group.create_task(self._drive_input(), name="drive"))
                 if self.fleet is not None:
                     tasks.append(group.create_task(self.fleet.run(), name="fleet"))
                 tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
@@ -165,7 +168,7 @@ class Service:
         if self._recorder:
             metadata = {"digest": self.pipeline.digest.hexdigest()}
             await asyncio.to_thread(self._recorder.stop, metadata)
-            self._tell_of_recorder(self._recorder)
+            self._notify_recorder_state(self._recorder)
 
     def _fleet_node(self, settings: Settings) -> LiveFleetNode | None:
         if settings.fleet.node is None:
@@ -181,7 +184,7 @@ class Service:
 
     # --- input of the pipeline --------------------------------------------------------------
 
-    def _hear(self, event: Event) -> None:
+    def _process_frame(self, event: Event) -> None:
         """Process an event of this node's own links."""
         if self.fleet is not None:
             self.fleet.on_event(event)  # first: other nodes wait for it
@@ -206,7 +209,7 @@ class Service:
         if offset_ns is not None:
             self._step(ClockSet(self._timeline.now_ns(), offset_ns))
 
-    async def _driven(self) -> None:
+    async def _drive_input(self) -> None:
         """Drive the device of ``[drive]``; a user's error ends the drive, not the service."""
         if self._device is None:
             return
@@ -222,7 +225,7 @@ class Service:
             wanted = BeamRequest(
                 uavs=uavs, anybody=not kept.drive.uavs, takes=self._device.takes, centre=centre
             )
-            source = OfThisProcess(
+            source = LocalSource(
                 loop=loop,
                 pipeline=self.pipeline,
                 equipment=self.equipment,
@@ -264,13 +267,13 @@ class Service:
         self._hand_over(None, [notice])
         self._show(notice)
 
-    def _tell_of_recorder(self, recorder: BackgroundRecorder) -> None:
+    def _notify_recorder_state(self, recorder: BackgroundRecorder) -> None:
         for severity, text in recorder.news():
             self._notify(
                 Notice(t_ns=self.now_ns(), severity=severity, subject="recording", text=text)
             )
 
-    def _tell_of_machine(self) -> None:
+    def _notify_overload(self) -> None:
         """Publish a notice when this machine becomes overloaded, and when it recovers."""
         machine = behind(self.arrival_lag.seen(self.now_ns()))
         if (machine is not None) is self._is_behind:
@@ -306,10 +309,10 @@ class Service:
                 self._push.newest(self.pipeline.last_update, self.pipeline.updates - 1)
             self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
             if self._recorder:
-                self._tell_of_recorder(self._recorder)
+                self._notify_recorder_state(self._recorder)
             if self._traffic.has_component:
                 self._traffic.speak(not self.unfit(), self.pipeline.reporters())
-            self._tell_of_machine()
+            self._notify_overload()
             self.series.add(self.pipeline)
             self._ticked.set()  # wakes all current waiters;
             self._ticked.clear()  # later ones wait for the next tick

@@ -24,7 +24,7 @@ T = TypeVar("T")
 RATE_WINDOW_S: Final = 2.0  # time over which frames and updates per second are averaged
 NOTICES_KEPT: Final = 200
 STREAM_TAKES_BYTES: Final = 1024  # largest message accepted from a WebSocket client
-FAREWELL_S: Final = 2
+CLOSE_TIMEOUT_S: Final = 2
 """Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
 
 
@@ -48,7 +48,7 @@ class Server(uvicorn.Server):
                 access_log=False,
                 ws_max_size=STREAM_TAKES_BYTES,
                 ws_per_message_deflate=False,  # a message is encoded once for all clients
-                timeout_graceful_shutdown=FAREWELL_S,
+                timeout_graceful_shutdown=CLOSE_TIMEOUT_S,
             )
         )
         self._answering = answering
@@ -128,7 +128,7 @@ def run_until_stopped(
     ``main`` gets an event that is set by SIGINT, SIGTERM, or after ``seconds``; it must then
     finish.
     """
-    _tame_interpreter()
+    _configure_interpreter()
     with asyncio.Runner(loop_factory=_loop_factory()) as runner:
         runner.run(_stopped_by_signal(main, seconds))
 
@@ -144,7 +144,7 @@ async def _stopped_by_signal(
     await main(until)
 
 
-def _tame_interpreter() -> None:
+def _configure_interpreter() -> None:
     """Keep garbage collection and threads from blocking the event loop.
 
     The time of a collection is proportional to the objects that it examines. Objects loaded by now

@@ -33,11 +33,11 @@ from companion.tracking.observers.position import PositionModel, PositionObserve
 from companion.tracking.tracker import Ages, Tracker, TrackerSettings
 from companion.values import FloatArray, Limits, LimitSource, ReportNoise, UserError, kind_of
 
-FLOOR_SPARE_DB: Final = 2.9
+FLOOR_MARGIN_DB: Final = 2.9
 """Default margin of the floor of a likely beam above the gain that the link needs."""
 COUPLING_MAX: Final = 1e6
 """Limit of the largest entry of a coupling matrix; its inverse is the lower limit."""
-WORST_COUPLING: Final = 1e6
+COUPLING_CONDITION_MAX: Final = 1e6
 """Limit of the condition number of a coupling matrix."""
 
 
@@ -69,8 +69,8 @@ def array(settings: Settings) -> geometry.Array:
             allowed = f"{1 / COUPLING_MAX:g} .. {COUPLING_MAX:g}"
             raise ConfigError(f"array.coupling: largest entry {most:.3g} is outside {allowed}")
         condition = np.linalg.cond(coupling)
-        if condition > WORST_COUPLING:
-            why = f"condition number {condition:.3g}, limit {WORST_COUPLING:g}"
+        if condition > COUPLING_CONDITION_MAX:
+            why = f"condition number {condition:.3g}, limit {COUPLING_CONDITION_MAX:g}"
             raise ConfigError(
                 f"array.coupling: matrix is nearly singular ({why});"
                 " give measured values or leave it out"
@@ -87,9 +87,9 @@ def _channel_error(settings: Settings, size: int) -> FloatArray | None:
         return channel_error(np.array(table.phase_error_rad), np.array(table.gain_error_db))
     if not given.phase_error_deg and not given.gain_error_db:
         return None
-    all_of_them = np.ones(size)
+    all_elements = np.ones(size)
     return channel_error(
-        np.radians(given.phase_error_deg) * all_of_them, given.gain_error_db * all_of_them
+        np.radians(given.phase_error_deg) * all_elements, given.gain_error_db * all_elements
     )
 
 
@@ -196,7 +196,7 @@ def precoder(settings: Settings) -> Precoder:
         normalisation=given.normalisation,
         priority=given.priority,
         widen=given.widen,
-        floor_db=worth_db + FLOOR_SPARE_DB if given.floor_db is None else given.floor_db,
+        floor_db=worth_db + FLOOR_MARGIN_DB if given.floor_db is None else given.floor_db,
         power=given.power,
         rate_weights=given.rate_weights,
         budget=budget,
@@ -277,14 +277,14 @@ def assumed(
     )
 
 
-def anyone(settings: Settings) -> Limits:
+def default_limits(settings: Settings) -> Limits:
     """Return the limits of an aircraft of unknown type."""
     return assumed(settings, "0:0", None, None).limits
 
 
 def observer(settings: Settings) -> PositionObserver | KinematicObserver:
     """Return the observer that every track uses."""
-    given, limits = settings.observer, anyone(settings)
+    given, limits = settings.observer, default_limits(settings)
     if given.model == "position":
         return PositionObserver(
             PositionModel(
@@ -317,7 +317,7 @@ def clock(settings: Settings) -> SenderClock:
 
 def tracker(settings: Settings) -> Tracker:
     """Return a tracker without tracks."""
-    given, kept, limits = settings.observer, settings.tracks, anyone(settings)
+    given, kept, limits = settings.observer, settings.tracks, default_limits(settings)
     leads = given.model == "position"
     lead_m = abs(given.feedthrough_s) * limits.speed_max_mps if leads else 0.0
     feeds = given.model == "kinematic" and given.feed_forward

@@ -15,7 +15,9 @@ _UNITS: Final = {
     "center.turn_acceleration_max_degps2": "°/s²",
     "center.attitude_bound_deg": "°",
 }
-SILENT_NS: Final = 60_000_000_000  # least time between two notices of a change of a clock or link
+NOTICE_INTERVAL_NS: Final = (
+    60_000_000_000  # least time between two notices of a change of a clock or link
+)
 
 
 def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:
@@ -54,8 +56,8 @@ def clock_changed(
             raised_to=drift,
         )
     ]
-    told_ns = record.clock_notice_ns
-    if change.leapt or told_ns is None or t_ns - told_ns >= SILENT_NS:
+    notified_ns = record.clock_notice_ns
+    if change.leapt or notified_ns is None or t_ns - notified_ns >= NOTICE_INTERVAL_NS:
         record.clock_notice_ns = t_ns
         out.append(
             Notice(

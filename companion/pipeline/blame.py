@@ -10,7 +10,7 @@ from typing import Final
 
 from companion.values import Beam, Blame, Carrier, Cause, LeftOut, Reason, Track, TrackState
 
-CROWDED_DB: Final = 3.0
+CLOSE_UAVS_DB: Final = 3.0
 """Loss, compared with a beam for one UAV alone, from which on the other UAVs are the cause."""
 SPARSE_S: Final = 0.25  # interval between reports from which on a higher rate helps
 LATE_S: Final = 0.15  # latency from which on a faster link helps
@@ -20,7 +20,7 @@ SILENT_INTERVALS: Final = 3.0
 
 TIMESYNC: Final = "allow TIMESYNC: set `[presence] enabled = true`, over a two-way link"
 APART: Final = 'fly them apart, or set `[beams] policy = "group"`'
-STEADIER: Final = "use a MAVLink link with a steadier delay"
+BETTER_CLOCK_RATIO: Final = "use a MAVLink link with a steadier delay"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -51,7 +51,7 @@ def of_left_out(out: LeftOut, track: Track | None, unfit: str | None) -> Blame:
         case Cause.CROWDED:
             remedy = APART
         case Cause.SILENT if track is not None:
-            return _silent(track)
+            return _silence_cause(track)
         case Cause.MACHINE:
             remedy = "add it to `[beams] priority`, or raise `[beams] most`"
         case _:
@@ -66,7 +66,7 @@ def of_unserved(track: Track, *, reached: bool, full: bool) -> Blame:
     full     each of those serves as many UAVs as it may
     """
     if track.state in (TrackState.STALE, TrackState.LOST):
-        return _silent(track)
+        return _silence_cause(track)
     if not reached:
         remedy = "turn an array, or fly elsewhere"
         return Blame(Cause.COVERAGE, "no node of the fleet reaches it", remedy)
@@ -85,15 +85,15 @@ def of_beam(
     if silence is not None:
         return silence
     # A widened beam has less gain because of its bound, not because of other UAVs.
-    if not beam.widened and (beam.gain_db < needed_db or beam.loss_db > CROWDED_DB):
+    if not beam.widened and (beam.gain_db < needed_db or beam.loss_db > CLOSE_UAVS_DB):
         return _short_of_gain(beam, needed_db)
     seen_rad = math.asin(min(1.0, (track.bound_m + carrier.bound_m) / max(beam.range_m, 1e-9)))
     if carrier.attitude_bound_rad > seen_rad:
-        return _turned(carrier, evidence)
-    return _far_off(beam, track, carrier, evidence)
+        return _attitude_cause(carrier, evidence)
+    return _bound_cause(beam, track, carrier, evidence)
 
 
-def _turned(carrier: Carrier, evidence: LinkEvidence) -> Blame:
+def _attitude_cause(carrier: Carrier, evidence: LinkEvidence) -> Blame:
     """Return why the carrier's attitude is uncertain: its error, its age, or its clock."""
     if carrier.attitude_bound_rad < 1.5 * evidence.attitude_bound_rad:
         remedy = (
@@ -105,13 +105,13 @@ def _turned(carrier: Carrier, evidence: LinkEvidence) -> Blame:
     elif evidence.carrier_assumed:
         remedy = f"improve the carrier's clock: {TIMESYNC}"
     else:
-        remedy = f"improve the carrier's clock: {STEADIER}"
+        remedy = f"improve the carrier's clock: {BETTER_CLOCK_RATIO}"
     known = f"{math.degrees(carrier.attitude_bound_rad):.0f}°"
     return Blame(Cause.CARRIER, f"the carrier's attitude is uncertain by {known}", remedy)
 
 
 def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
-    if beam.loss_db > CROWDED_DB:
+    if beam.loss_db > CLOSE_UAVS_DB:
         return Blame(
             Cause.CROWDED, f"other UAVs in its direction cost it {beam.loss_db:.0f} dB", APART
         )
@@ -123,22 +123,22 @@ def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
     )
 
 
-def _far_off(beam: Beam, track: Track, carrier: Carrier, evidence: LinkEvidence) -> Blame:
+def _bound_cause(beam: Beam, track: Track, carrier: Carrier, evidence: LinkEvidence) -> Blame:
     """Return why the position is uncertain, as seen from the array."""
     aged_s = max(track.age_s, track.dt_s or 0.0)
-    grown_m = _grown_m(track, aged_s)
-    doubted_m = _grown_m(track, aged_s + track.clock_bound_s) - grown_m
+    growth_m = _growth_m(track, aged_s)
+    doubted_m = _growth_m(track, aged_s + track.clock_bound_s) - growth_m
     if track.velocity_ned_mps is not None:
         doubted_m += math.hypot(*track.velocity_ned_mps) * track.clock_bound_s
     parts = {
-        Cause.RATE: grown_m,
+        Cause.RATE: growth_m,
         Cause.CLOCK: doubted_m,
         Cause.CARRIER: carrier.bound_m,
-        Cause.POSITION: track.bound_m - grown_m - doubted_m,
+        Cause.POSITION: track.bound_m - growth_m - doubted_m,
     }
     match max(parts, key=lambda cause: parts[cause]):
         case Cause.RATE:
-            return _aged(track)
+            return _age_cause(track)
         case Cause.CLOCK:
             return _clock(track, evidence)
         case Cause.CARRIER:
@@ -153,7 +153,7 @@ def _far_off(beam: Beam, track: Track, carrier: Carrier, evidence: LinkEvidence)
             )
 
 
-def _grown_m(track: Track, seconds: float) -> float:
+def _growth_m(track: Track, seconds: float) -> float:
     """Return how far a UAV can deviate in this time from what its last report predicts."""
     way_m = track.limits.speed_max_mps * seconds
     if track.velocity_ned_mps is None:
@@ -169,16 +169,16 @@ def _silence(track: Track, evidence: LinkEvidence) -> Blame | None:
             "open the UAV's details and read its rejections",
         )
     if track.age_s > max(SILENT_S, SILENT_INTERVALS * (track.dt_s or 0.0)):
-        return _silent(track)
+        return _silence_cause(track)
     return None
 
 
-def _silent(track: Track) -> Blame:
+def _silence_cause(track: Track) -> Blame:
     remedy = "check its MAVLink link: power, range, antenna"
     return Blame(Cause.SILENT, f"no report for {track.age_s:.1f} s", remedy)
 
 
-def _aged(track: Track) -> Blame:
+def _age_cause(track: Track) -> Blame:
     """Return why a prediction spans a long time: sparse reports, late reports, or an agile UAV."""
     if track.dt_s is not None and track.dt_s >= SPARSE_S:
         remedy = "request reports at 10 Hz: set `[presence] position_hz = 10`"
@@ -199,4 +199,4 @@ def _clock(track: Track, evidence: LinkEvidence) -> Blame:
     known = f"{doubt_s * 1e3:.0f} ms" if doubt_s < 1.0 else f"{doubt_s:.1f} s"
     if evidence.clock_assumed:
         return Blame(Cause.CLOCK, f"its clock is unmeasured, uncertain by {known}", TIMESYNC)
-    return Blame(Cause.CLOCK, f"its clock is uncertain by {known}", STEADIER)
+    return Blame(Cause.CLOCK, f"its clock is uncertain by {known}", BETTER_CLOCK_RATIO)

@@ -36,16 +36,18 @@ from companion.values import (
     Track,
 )
 
-HOME_SETTLES_S: Final = 120.0
+HOME_SETTLING_S: Final = 120.0
 """Time after its first report in which a restarted track may move ``home``."""
 HOME_HEIGHT_M: Final = 20.0  # least error of the first height for which ``home`` moves
 
 NOTICE_RATIO: Final = 1.25
 """Multiple of the attitude bound last reported above which it is reported again."""
-PASSED_LEAST: Final = 4  # older-stamped attitudes in a row that replace the newest
-PASSED_NS: Final = 500_000_000
+MIN_CONSISTENT_SAMPLES: Final = 4  # older-stamped attitudes in a row that replace the newest
+CONSISTENT_TIME_NS: Final = 500_000_000
 """Least duration of that run; attitudes that are resent arrive all at once."""
-PACE_NS: Final = 250_000_000  # largest difference between the steps of arrivals and of stamps
+MEAN_INTERVAL_NS: Final = (
+    250_000_000  # largest difference between the steps of arrivals and of stamps
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +77,7 @@ class CarrierTracker:
             None  # between the newest attitude and the previous one
         )
         self._angular_acceleration = carrier.AngularAcceleration()
-        self._passed: _AttitudeRun | None = None  # attitudes stamped earlier than the newest
+        self._consistency: _AttitudeRun | None = None  # attitudes stamped earlier than the newest
         self._least_bound_rad = math.radians(settings.center.attitude_bound_deg)
         self._estimator: EstimatorStatus | None = None
         self._doubted_rad = self._least_bound_rad  # largest bound reported so far
@@ -87,7 +89,7 @@ class CarrierTracker:
             self._begin(self.place)
 
     @property
-    def seeks_home(self) -> bool:
+    def needs_home(self) -> bool:
         """Whether the next report sets ``home``."""
         return self.local is None and isinstance(self.place, HomeCenter)
 
@@ -98,8 +100,8 @@ class CarrierTracker:
 
         The first report sets its origin; a notice says where.
         """
-        report = self._levelled(placed.report)
-        said = (self._first(report),) if self.local is None else ()
+        report = self._above_sea_level(placed.report)
+        said = (self._set_origin(report),) if self.local is None else ()
         assert self.local is not None
         there = None
         if report.velocity_ne_mps is not None and report.velocity_down_mps is not None:
@@ -131,7 +133,7 @@ class CarrierTracker:
         )
         return made, said
 
-    def _levelled(self, report: Report) -> Report:
+    def _above_sea_level(self, report: Report) -> Report:
         """Return the report with its height above mean sea level, if the undulation is known."""
         if self._geoid_m is None or report.alt_datum is not AltitudeDatum.GEOMETRIC:
             return report
@@ -144,11 +146,11 @@ class CarrierTracker:
         Returns the refutation of ``turn_degps2``, the largest assumed angular acceleration, if any.
         """
         if self._attitude is not None and placed.sender_ns <= self._attitude[0]:
-            if not self._goes_on_before(placed):
+            if not self._is_newest_stamp_wrong(placed):
                 return None
             self._angular_acceleration = carrier.AngularAcceleration()
             self._attitude = None
-        self._passed = None
+        self._consistency = None
         self._contradicted = self._contradicts(placed, turn_degps2)
         self._attitude = placed.sender_ns, placed.attitude
         return self._angular_acceleration.look(placed.attitude, placed.sender_ns, turn_degps2)
@@ -189,21 +191,21 @@ class CarrierTracker:
             raised_to=doubted_deg,
         )
 
-    def _goes_on_before(self, placed: PlacedAttitude) -> bool:
+    def _is_newest_stamp_wrong(self, placed: PlacedAttitude) -> bool:
         """Return whether a run of older-stamped attitudes shows that the newest has a wrong stamp.
 
         A newest attitude stamped in the future must not block all later ones. Attitudes from a
         slower link are also older, but then the newest keeps advancing meanwhile.
         """
         at = (placed.attitude.t_ns, placed.sender_ns)
-        run = self._passed
+        run = self._consistency
         if run is not None:
             step_ns, sender_step_ns = at[0] - run.last[0], at[1] - run.last[1]
-            if sender_step_ns <= 0 or abs(step_ns - sender_step_ns) > PACE_NS:
+            if sender_step_ns <= 0 or abs(step_ns - sender_step_ns) > MEAN_INTERVAL_NS:
                 run = None
         began_ns, count = (at[0], 0) if run is None else (run.began_ns, run.count)
-        self._passed = _AttitudeRun(began_ns, at, count + 1)
-        return at[0] - began_ns >= PASSED_NS and count + 1 >= PASSED_LEAST
+        self._consistency = _AttitudeRun(began_ns, at, count + 1)
+        return at[0] - began_ns >= CONSISTENT_TIME_NS and count + 1 >= MIN_CONSISTENT_SAMPLES
 
     def restarted(self, uav: str) -> None:
         """Drop the carrier's attitude if the carrier rebooted, since its stamps start again."""
@@ -211,10 +213,10 @@ class CarrierTracker:
             self._attitude = None
             self._contradicted = None
             self._estimator = None
-            self._passed = None
+            self._consistency = None
             self._angular_acceleration = carrier.AngularAcceleration()
 
-    def _first(self, report: Report) -> Notice:
+    def _set_origin(self, report: Report) -> Notice:
         """Make the first position the origin of the local frame, and ``home``."""
         home = FixedCenter(lat_deg=report.lat_deg, lon_deg=report.lon_deg, alt_m=report.alt_m)
         self._begin(home)
@@ -233,12 +235,12 @@ class CarrierTracker:
         """
         if self._home_from is None or anew.fix.uav != self._home_from[0]:
             return None
-        if anew.fix.arrival_ns - self._home_from[1] > HOME_SETTLES_S * 1e9:
+        if anew.fix.arrival_ns - self._home_from[1] > HOME_SETTLING_S * 1e9:
             self._home_from = None
             return None
         if abs(anew.fix.position_ned_m[2]) < HOME_HEIGHT_M:
             return None
-        said = self._first(placed.report)
+        said = self._set_origin(placed.report)
         text = f"home moved, because the first height was wrong: {said.text}"
         return Notice(t_ns=said.t_ns, severity=Severity.WARNING, subject="home", text=text)
 
@@ -255,7 +257,7 @@ class CarrierTracker:
         place = (at.lat_deg, at.lon_deg, at.alt_m)
         return carrier.fixed(valid_at_ns, self.local, place, math.radians(at.heading_deg))
 
-    def aboard(
+    def on_vehicle(
         self,
         track: Track | None,
         newest: Fix | None,

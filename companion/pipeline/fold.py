@@ -35,7 +35,7 @@ from companion.pipeline.digest import Digest
 from companion.pipeline.health import HealthMonitor, LinkBatch, Site
 from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import Refusals
-from companion.pipeline.senders import NOTHING, PlacedAttitude, PlacedReport, Senders
+from companion.pipeline.senders import NO_OUTCOME, PlacedAttitude, PlacedReport, Senders
 from companion.pipeline.targets import Targets
 from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
@@ -132,7 +132,7 @@ class Pipeline:
         elif isinstance(event, Tick):
             outputs = self._tick(event)
         elif isinstance(event, Tock):
-            outputs = self._tock(event.t_ns)
+            outputs = self._finish_update(event.t_ns)
         elif isinstance(event, Rejection):
             outputs = [event]
         elif isinstance(event, Duty):
@@ -169,7 +169,7 @@ class Pipeline:
             change = self.senders.notice(frame) if frame.msgid in STAMPED else None
             return [] if change is None else self._changed(frame.t_ns, str(frame.source), change)
         heard = self.senders.hear(frame)
-        if heard is NOTHING:
+        if heard is NO_OUTCOME:
             return []
         if heard.restarted is not None:
             self.restarts[heard.restarted] += 1
@@ -197,8 +197,8 @@ class Pipeline:
 
     def _report(self, placed: PlacedReport) -> list[Output]:
         report = placed.report
-        begins = self.center.seeks_home or report.uav not in self.tracker
-        if begins and not self.senders.may_begin(report, self.center.seeks_home):
+        begins = self.center.needs_home or report.uav not in self.tracker
+        if begins and not self.senders.may_begin(report, self.center.needs_home):
             return [Rejection(t_ns=report.t_ns, source=report.uav, reason=Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         accepted, refuted = self.tracker.accept(fix)
@@ -238,10 +238,10 @@ class Pipeline:
 
     def _tick(self, tick: Tick) -> list[Output]:
         dropped = self._drop_silent(tick.t_ns) if (self.updates + 1) % DROP_EVERY == 0 else []
-        self.aiming = Aiming(cache(self._aimed_of(self.sighted(tick.t_ns))), self.local)
-        return [*dropped] if tick.in_two else [*dropped, *self._tock(tick.t_ns)]
+        self.aiming = Aiming(cache(self._aimed_of(self.prepare_update(tick.t_ns))), self.local)
+        return [*dropped] if tick.in_two else [*dropped, *self._finish_update(tick.t_ns)]
 
-    def _tock(self, now_ns: int) -> list[Output]:
+    def _finish_update(self, now_ns: int) -> list[Output]:
         """Take the beams of the last tick, and assess links.
 
         Recompute the beams if the local frame was re-anchored meanwhile.
@@ -251,7 +251,7 @@ class Pipeline:
             return []
         self.updates += 1
         is_old = aiming.local is not self.local
-        made = self._aimed_of(self.sighted(now_ns)) if is_old else aiming.made
+        made = self._aimed_of(self.prepare_update(now_ns)) if is_old else aiming.made
         self.last_update, weighed = made()
         self.last_carrier = self.last_update.carrier or self.last_carrier
         self._hysteresis = hysteresis.updated(self._hysteresis, self.last_update.beams)
@@ -305,9 +305,9 @@ class Pipeline:
     def look(self, now_ns: int, lead_s: float = 0.0) -> Update:
         """Return targets and beams at the actuation delay plus ``lead_s`` from now. Changes
         nothing."""
-        return self.sighted(now_ns, lead_s)()
+        return self.prepare_update(now_ns, lead_s)()
 
-    def sighted(self, now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
+    def prepare_update(self, now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
         """Predict the tracks now, and return a function that computes the beams of ``look``.
 
         That function may be called at any later time, on any thread.
@@ -396,7 +396,7 @@ class Pipeline:
         track = self.tracker.track(vehicle, now_ns, at)
         now = self.senders.time(vehicle, now_ns)
         turn_degps2 = self.senders.assumed(vehicle).turn_degps2
-        return self.center.aboard(track, self.tracker.newest(vehicle), now, at, turn_degps2)
+        return self.center.on_vehicle(track, self.tracker.newest(vehicle), now, at, turn_degps2)
 
     def utc_ns(self, t_ns: int) -> UtcNs:
         """Convert a time of the node's timeline to UTC, by the current wall clock."""

@@ -37,9 +37,9 @@ EVERY_NS: Final = 1_000_000_000
 """Interval between two assessments of a link; one round through all links takes as long."""
 AT_ONCE: Final = 16
 """Least number of links assessed per update; more if a round would take too long."""
-WORSE_NS: Final = 1_000_000_000  # hold time before a verdict gets worse
-BETTER_NS: Final = 3_000_000_000  # hold time before a verdict gets better
-SLACK_DB: Final = 1.0
+HOLD_WORSE_NS: Final = 1_000_000_000  # hold time before a verdict gets worse
+HOLD_BETTER_NS: Final = 3_000_000_000  # hold time before a verdict gets better
+HYSTERESIS_DB: Final = 1.0
 """Gain margin: a link keeps its level until the gain falls this far below what it needs."""
 NAMED: Final = 6  # largest number of UAVs named in one notice
 RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}  # levels from the worst to the best
@@ -80,11 +80,11 @@ class HealthMonitor:
         self.verdicts: dict[str, Verdict] = {}
         self._need = need
         self._site = site
-        self._begun_ns: int | None = None  # start of the current round
+        self._round_start_ns: int | None = None  # start of the current round
         self._last_ns: int | None = None  # time of the previous update
         self._waiting: list[str] = []  # UAVs still queued in this round
         self._noticed: dict[str, Verdict] = {}  # verdicts at the last notice
-        self._unsettled: dict[str, tuple[bool, int]] = {}  # pending change: better?, since when
+        self._pending: dict[str, tuple[bool, int]] = {}  # pending change: better?, since when
         self._unfit: str | None = None
 
     def next_batch(self, update: Update) -> LinkBatch | None:
@@ -92,7 +92,7 @@ class HealthMonitor:
 
         Changes nothing. Takes milliseconds, and may run on any thread.
         """
-        begun_ns, last_ns = self._begun_ns, self._last_ns
+        begun_ns, last_ns = self._round_start_ns, self._last_ns
         begins = begun_ns is None or not 0 <= update.t_ns - begun_ns < EVERY_NS
         waiting = [beam.uav for beam in update.beams.beams] if begins else self._waiting
         if not begins and not waiting:
@@ -134,17 +134,19 @@ class HealthMonitor:
         tracks = {track.uav: track for track in update.tracks}
         fresh = dict[str, Verdict]()
         if weighed.begins:
-            self._begun_ns = update.t_ns
+            self._round_start_ns = update.t_ns
             fresh = _of_left_out(update, tracks)
         for link in weighed.links:
-            fresh[link.beam.uav] = self._of_link(update, link, tracks, evidence)
-        held = self.verdicts | {uav: self._settled(verdict) for uav, verdict in fresh.items()}
+            fresh[link.beam.uav] = self._judge_link(update, link, tracks, evidence)
+        held = self.verdicts | {
+            uav: self._with_hold_time(verdict) for uav, verdict in fresh.items()
+        }
         names = dict.fromkeys((*tracks, *(out.uav for out in update.beams.left_out)))
         self.verdicts = {uav: held[uav] for uav in names if uav in held}
-        self._unsettled = {uav: kept for uav, kept in self._unsettled.items() if uav in tracks}
+        self._pending = {uav: kept for uav, kept in self._pending.items() if uav in tracks}
         return [] if self._waiting else self._notices(update)
 
-    def _of_link(
+    def _judge_link(
         self,
         update: Update,
         link: _Link,
@@ -184,36 +186,38 @@ class HealthMonitor:
     def _level(
         self, uav: str, needed_db: float, sure_db: float | None, likely_db: float | None
     ) -> Level:
-        """Return the level by the gains; the current level is kept within ``SLACK_DB``."""
+        """Return the level by the gains; the current level is kept within ``HYSTERESIS_DB``."""
         held = self.verdicts.get(uav)
         rank = RANK[held.level] if held else RANK[Level.NONE]
 
         def enough(gain_db: float | None, level: Level) -> bool:
-            slack_db = SLACK_DB if rank >= RANK[level] else 0.0
-            return gain_db is not None and gain_db >= needed_db - slack_db
+            hysteresis_db = HYSTERESIS_DB if rank >= RANK[level] else 0.0
+            return gain_db is not None and gain_db >= needed_db - hysteresis_db
 
         if enough(sure_db, Level.GOOD):
             return Level.GOOD
         return Level.WEAK if enough(likely_db, Level.WEAK) else Level.NONE
 
-    def _settled(self, fresh: Verdict) -> Verdict:
+    def _with_hold_time(self, fresh: Verdict) -> Verdict:
         """Return the new verdict, or the current level with the new values until the hold time
         ends."""
         uav, held = fresh.uav, self.verdicts.get(fresh.uav)
         if held is None:
             return fresh
         if fresh.level is held.level:
-            self._unsettled.pop(uav, None)
+            self._pending.pop(uav, None)
             return replace(fresh, since_ns=held.since_ns)
         better = RANK[fresh.level] > RANK[held.level]
-        was_better, since_ns = self._unsettled.get(uav, (better, fresh.since_ns))
+        was_better, since_ns = self._pending.get(uav, (better, fresh.since_ns))
         if was_better is not better:
             since_ns = fresh.since_ns
-        self._unsettled[uav] = (better, since_ns)
+        self._pending[uav] = (better, since_ns)
         # Without a beam no gain can fluctuate, so the verdict changes at once.
-        wait_ns = BETTER_NS if better else WORSE_NS if fresh.needed_gain_db is not None else 0
+        wait_ns = (
+            HOLD_BETTER_NS if better else HOLD_WORSE_NS if fresh.needed_gain_db is not None else 0
+        )
         if fresh.since_ns - since_ns >= wait_ns:
-            del self._unsettled[uav]
+            del self._pending[uav]
             return fresh
         why = None if held.level is Level.GOOD else fresh.blame or held.blame
         return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)

@@ -9,7 +9,7 @@ from companion.values import Reason
 
 RECORDS_MAX: Final = 4096
 """Limit on records. Beyond it, the oldest unprotected ones are dropped."""
-DROPPED_AT_ONCE: Final = 256  # records dropped at once: forged ids may come in any number
+DROPPED_TOGETHER: Final = 256  # records dropped at once: forged ids may come in any number
 
 _T = TypeVar("_T")
 
@@ -19,7 +19,7 @@ class Records(dict[str, _T]):
 
     ``make`` creates a record, ``is_kept`` says which ids are never dropped to make room. There may
     be more of those than ``RECORDS_MAX``, so the table is searched again only after
-    ``DROPPED_AT_ONCE`` additions.
+    ``DROPPED_TOGETHER`` additions.
     """
 
     def __init__(self, make: Callable[[], _T], is_kept: Callable[[str], bool]) -> None:
@@ -31,9 +31,9 @@ class Records(dict[str, _T]):
     def __missing__(self, uav: str) -> _T:
         if len(self) >= self._most:
             unwanted = (one for one in self if not self._is_kept(one))
-            for one in list(islice(unwanted, DROPPED_AT_ONCE)):
+            for one in list(islice(unwanted, DROPPED_TOGETHER)):
                 del self[one]
-            self._most = max(RECORDS_MAX, len(self) + DROPPED_AT_ONCE)
+            self._most = max(RECORDS_MAX, len(self) + DROPPED_TOGETHER)
         return self.setdefault(uav, self._make())
 
 

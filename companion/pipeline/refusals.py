@@ -7,10 +7,10 @@ from typing import Final
 from companion.pipeline.records import UavRecords, UnusedRun
 from companion.values import Notice, Reason, Rejection, Severity, kind_of
 
-UNHEARD_NS: Final = 1_000_000_000
+SILENT_AFTER_NS: Final = 1_000_000_000
 """Time without an accepted report of a sender after which a notice is published."""
 NOTICE_INTERVAL_NS: Final = 10_000_000_000  # least time between two such notices about one sender
-OF_REPORTS: Final = frozenset(
+REPORT_REASONS: Final = frozenset(
     {
         Reason.UNREACHABLE,
         Reason.ALTITUDE_JUMP,
@@ -32,7 +32,7 @@ Beyond it the least recently rejected one is forgotten.
 
 
 @dataclass(slots=True)
-class OfSender:
+class SenderRejections:
     """Rejections of one sender (a UAV, component or link): counts by reason, and the newest."""
 
     counts: Counter[Reason] = field(default_factory=Counter)
@@ -45,7 +45,7 @@ class Refusals:
     def __init__(self, records: UavRecords) -> None:
         self.total: Counter[Reason] = Counter()
         self._records = records
-        self._senders: OrderedDict[str, OfSender] = OrderedDict()
+        self._senders: OrderedDict[str, SenderRejections] = OrderedDict()
 
     def add(self, refused: Rejection) -> Notice | None:
         """Count one rejection.
@@ -54,7 +54,7 @@ class Refusals:
         """
         self._count(refused)
         uav = refused.source
-        if refused.reason not in OF_REPORTS or not kind_of(uav).reports_itself:
+        if refused.reason not in REPORT_REASONS or not kind_of(uav).reports_itself:
             return None
         record = self._records[uav]
         if record.unused is None:
@@ -63,13 +63,13 @@ class Refusals:
         run.reports += 1
         run.reason = refused.reason
         lasted_ns = refused.t_ns - run.since_ns
-        if run.is_reported or run.reports < 2 or lasted_ns < UNHEARD_NS:
+        if run.is_reported or run.reports < 2 or lasted_ns < SILENT_AFTER_NS:
             return None
         if refused.reason is Reason.SHARED_ID:
             return None  # a shared id has its own notice
         run.is_reported = True
-        told_ns = record.unused_notice_ns
-        if told_ns is not None and refused.t_ns - told_ns < NOTICE_INTERVAL_NS:
+        notified_ns = record.unused_notice_ns
+        if notified_ns is not None and refused.t_ns - notified_ns < NOTICE_INTERVAL_NS:
             return None
         record.unused_notice_ns = refused.t_ns
         why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)
@@ -92,7 +92,7 @@ class Refusals:
         self.total[refused.reason] += refused.count
         sender = self._senders.get(refused.source)
         if sender is None:
-            sender = self._senders.setdefault(refused.source, OfSender())
+            sender = self._senders.setdefault(refused.source, SenderRejections())
             if len(self._senders) > SENDERS_MAX:
                 self._senders.popitem(last=False)
         else:
@@ -100,6 +100,6 @@ class Refusals:
         sender.counts[refused.reason] += refused.count
         sender.recent.append(refused)
 
-    def of(self, sender: str) -> OfSender:
+    def of(self, sender: str) -> SenderRejections:
         """Return the rejections of one sender; empty for an unknown one."""
-        return self._senders.get(sender) or OfSender()
+        return self._senders.get(sender) or SenderRejections()

@@ -50,8 +50,8 @@ from companion.values import (
     kind_of,
 )
 
-WAITS_NS: Final = 10_000_000_000  # time for which a new track waits for its GNSS receiver
-STATED_LATE_US: Final = 30_000_000
+RECEIVER_WAIT_NS: Final = 10_000_000_000  # time for which a new track waits for its GNSS receiver
+ACCURACY_AGE_MAX_US: Final = 30_000_000
 """Largest delay of a receiver status that is out of order; a larger step back means a reboot.
 
 As long as reports are remembered (``dedupe``).
@@ -66,7 +66,9 @@ Before an autopilot's height is valid it may be off by hundreds of metres (docs/
 """
 
 
-APART_SHARE: Final = 0.1  # weight of the newest report in the mean square height difference
+HEIGHT_FILTER_WEIGHT: Final = (
+    0.1  # weight of the newest report in the mean square height difference
+)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -108,7 +110,7 @@ class FrameOutcome:
     change: ClockChange | None = None
 
 
-NOTHING: Final = FrameOutcome()  # outcome of a frame without further effect
+NO_OUTCOME: Final = FrameOutcome()  # outcome of a frame without further effect
 
 
 @dataclass(slots=True)
@@ -176,7 +178,7 @@ class Senders:
         """Process one frame of a message that is decoded (``decode.DECODED``)."""
         if frame.msgid == ATTITUDE and frame.source != self._carrier_source:
             change = self.notice(frame)
-            return NOTHING if change is None else FrameOutcome(change=change)
+            return NO_OUTCOME if change is None else FrameOutcome(change=change)
         message = decode(frame)
         match message:
             case Rejection():
@@ -197,9 +199,9 @@ class Senders:
                 return self._attitude(message)
             case EstimatorStatus():
                 carries = message.source == self._carrier_source
-                return FrameOutcome(message=message) if carries else NOTHING
+                return FrameOutcome(message=message) if carries else NO_OUTCOME
             case None:
-                return NOTHING
+                return NO_OUTCOME
             case _:
                 return self._take_other(frame, message)
 
@@ -212,7 +214,7 @@ class Senders:
                 component = self._component(message)
                 stated_us, newest_us = message.time_us, component.stated_us
                 # An older status comes over a second, slower link.
-                if not 0 < stated_us < newest_us <= stated_us + STATED_LATE_US:
+                if not 0 < stated_us < newest_us <= stated_us + ACCURACY_AGE_MAX_US:
                     component.stated_us = stated_us
                     component.noise = noise.reported(message, self._noise_settings)
                     component.receiver = message
@@ -222,10 +224,10 @@ class Senders:
                     clock = self._senders[str(message.source)].clock
                     on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
                     clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
-                return NOTHING if change is None else FrameOutcome(change=change)
+                return NO_OUTCOME if change is None else FrameOutcome(change=change)
             case Presence():
                 self._component(message).presence = message
-        return NOTHING
+        return NO_OUTCOME
 
     def _component(self, message: GnssStatus | Presence) -> ComponentState:
         component = self._components[message.source]
@@ -281,7 +283,7 @@ class Senders:
                 outputs=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
                 restarted=restarted,
             )
-        self._dedupe.took(stamp.latency_s)
+        self._dedupe.set_latency(stamp.latency_s)
         assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
         errors = self._errors(report, assumed.lag_rest_s) if is_own else None
@@ -305,16 +307,20 @@ class Senders:
         """
         component = self._components.get(report.source)
         if component is None or component.noise is None or component.receiver is None:
-            return self._stated(report, replace(self._noise_settings.default, time_s=time_s))
+            return self._stated_accuracy(
+                report, replace(self._noise_settings.default, time_s=time_s)
+            )
         apart_m = 0.0
         if component.receiver.fix_type >= FIX_3D:
             apart_m2, before = (report.alt_m - component.receiver.alt_m) ** 2, component.apart_m2
             if before is not None:
-                apart_m2 = before + APART_SHARE * (apart_m2 - before)
+                apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
             component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
-        return self._stated(report, replace(component.noise, time_s=time_s, apart_m=apart_m))
+        return self._stated_accuracy(
+            report, replace(component.noise, time_s=time_s, apart_m=apart_m)
+        )
 
-    def _stated(self, report: Report, noise: ReportNoise) -> ReportNoise:
+    def _stated_accuracy(self, report: Report, noise: ReportNoise) -> ReportNoise:
         """Widen bounds by what the message itself states: accuracy, and steps of height."""
         if report.accuracy is None and not report.alt_step_m:
             return noise
@@ -356,7 +362,7 @@ class Senders:
         """Place a broadcast position by its stamp."""
         named = self.remote_ids.merge(said)
         if named is None:
-            return NOTHING
+            return NO_OUTCOME
         if isinstance(named, Rejection):
             return FrameOutcome(outputs=(named,))
         if not self._admits(named.uav):
@@ -383,7 +389,7 @@ class Senders:
         """Return whether a track may begin with this report.
 
         Its sender's receiver, if one was received, must have a 3D fix near the report's height.
-        After ``WAITS_NS`` the track begins anyway, as heights may permanently have different
+        After ``RECEIVER_WAIT_NS`` the track begins anyway, as heights may have different
         datums; home waits ``always``.
         """
         component = self._components.get(report.source)
@@ -396,7 +402,7 @@ class Senders:
             return True
         if record.waits_ns is None:
             record.waits_ns = report.t_ns
-        return not always and report.t_ns - record.waits_ns >= WAITS_NS
+        return not always and report.t_ns - record.waits_ns >= RECEIVER_WAIT_NS
 
     # --- times ------------------------------------------------------------------------------
 

@@ -5,10 +5,10 @@ from typing import Final
 
 from companion.values import Event, Tick
 
-LONGEST_PAUSE_NS: Final = 3_600_000_000_000
+PAUSE_MAX_NS: Final = 3_600_000_000_000
 """Longest single pause with ticks; a single log has no longer one."""
 PAUSE_NS: Final = 60_000_000_000  # least duration of a pause: after it every track is lost
-PAUSES_NS: Final = 4 * LONGEST_PAUSE_NS
+TOTAL_PAUSE_NS: Final = 4 * PAUSE_MAX_NS
 """Limit on the total of a log's pauses with ticks.
 
 A forged log of a few bytes can claim hours without events, and each hour is 36 000 ticks.
@@ -25,8 +25,8 @@ def with_ticks(events: Iterable[Event], update_hz: float) -> Iterator[Event]:
             due_ns = event.t_ns + period_ns
         pause_ns = event.t_ns - due_ns
         if pause_ns > PAUSE_NS:
-            paused_ns += min(pause_ns, LONGEST_PAUSE_NS)
-            if pause_ns > LONGEST_PAUSE_NS or paused_ns > PAUSES_NS:
+            paused_ns += min(pause_ns, PAUSE_MAX_NS)
+            if pause_ns > PAUSE_MAX_NS or paused_ns > TOTAL_PAUSE_NS:
                 due_ns = event.t_ns
         while due_ns <= event.t_ns:
             yield Tick(due_ns)

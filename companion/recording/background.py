@@ -40,9 +40,9 @@ Free space on a full disk is checked without writing, at the interval of the fir
 """
 RETRY_MAX_S: Final = 30.0  # longest time between two retries
 STOP_MAX_S: Final = 30.0  # longest wait for an unresponsive disk at the end of the service
-GO_ON_WITH: Final = 2000
+RESUME_BATCH: Final = 2000
 """Events written at once when a recording continues: some hundred kilobytes."""
-ROOM_BYTES: Final = 8 << 20
+MIN_FREE_BYTES: Final = 8 << 20
 """Free space needed to continue a recording; with less it would soon stop again."""
 
 _TOO_SLOW: Final = "the disk was too slow"
@@ -108,7 +108,7 @@ class BackgroundRecorder:
         self._queue_max = queue_max
         self._missed = 0
         self._overrun = False
-        self._unsafe: list[_Item] = []  # written, but not yet flushed to the disk
+        self._unflushed: list[_Item] = []  # written, but not yet flushed to the disk
         self._clock_set: ClockSet | None = None
         self._lost = 0  # events that may or may not be on the disk
         self._why = _TOO_SLOW
@@ -197,7 +197,7 @@ class BackgroundRecorder:
     def _record(self) -> bool:
         """Write until stopped; return False after an error."""
         try:
-            self._go_on()
+            self._resume()
             self._write_until_stopped()
             self._finish()
         except OSError as error:
@@ -205,17 +205,17 @@ class BackgroundRecorder:
             return False
         return True
 
-    def _go_on(self) -> None:
+    def _resume(self) -> None:
         """Begin a file with the events that the previous file did not get."""
         if self._lost:
-            t_ns = next((item.t_ns for item in self._unsafe if item.t_ns), self.written_ns or 0)
+            t_ns = next((item.t_ns for item in self._unflushed if item.t_ns), self.written_ns or 0)
             self._writer.hole(Hole(t_ns, self._lost, self._why))
-        waiting = self._unsafe
-        for begin in range(0, len(waiting), GO_ON_WITH):  # as much as fits on the disk is kept
-            for item in waiting[begin : begin + GO_ON_WITH]:
+        waiting = self._unflushed
+        for begin in range(0, len(waiting), RESUME_BATCH):  # as much as fits on the disk is kept
+            for item in waiting[begin : begin + RESUME_BATCH]:
                 self._write(item)
             self._writer.flush()
-            self._unsafe, self._lost = waiting[begin + GO_ON_WITH :], 0
+            self._unflushed, self._lost = waiting[begin + RESUME_BATCH :], 0
         self._flush()
         self._lost = 0
         if self.failure is not None:
@@ -228,9 +228,9 @@ class BackgroundRecorder:
         while self._queue or not self._stopping.wait(GATHER_S) or self._queue:
             for _ in range(min(AT_ONCE, len(self._queue))):
                 item = self._queue.popleft()
-                self._unsafe.append(item)
+                self._unflushed.append(item)
                 self._write(item)
-            if time.monotonic() >= flush_due_s or len(self._unsafe) >= self._queue_max:
+            if time.monotonic() >= flush_due_s or len(self._unflushed) >= self._queue_max:
                 self._flush()
                 self._rotate_if_due()
                 every_s = min(2 * every_s, FLUSH_S)
@@ -240,13 +240,13 @@ class BackgroundRecorder:
         if item.missed:
             self._writer.hole(Hole(item.t_ns, item.missed, self._why))
         if item.event is not None:
-            self._say_utc(item.event)
+            self._write_utc(item.event)
             self._writer.event(item.event)
             self.written_ns = item.event.t_ns
         for output in item.outputs:
             self._writer.output(output, self._geodetic)
 
-    def _say_utc(self, event: Event) -> None:
+    def _write_utc(self, event: Event) -> None:
         """Begin each file with the offset to UTC, so that it can be read alone."""
         known = self._clock_set
         if isinstance(event, ClockSet):
@@ -256,7 +256,7 @@ class BackgroundRecorder:
 
     def _flush(self) -> None:
         self._writer.flush()
-        self._unsafe.clear()
+        self._unflushed.clear()
         self._retry_s = RETRY_FIRST_S
         self.bytes = self._writer.size_bytes
 
@@ -293,9 +293,9 @@ class BackgroundRecorder:
             self._tell(Severity.ERROR, text)
         self.failure = f"{self._writer.path}: {self._why}"
         if not self._writer.salvage():
-            self._lost += sum(item.event is not None for item in self._unsafe)
-            self.dropped += len(self._unsafe)
-            self._unsafe.clear()
+            self._lost += sum(item.event is not None for item in self._unflushed)
+            self.dropped += len(self._unflushed)
+            self._unflushed.clear()
 
     def _reopen(self) -> bool:
         """Retry until it works; return False if the service ends before."""
@@ -317,11 +317,11 @@ class BackgroundRecorder:
             found = os.statvfs(self._writer.path.parent)
         except FileNotFoundError:
             return  # the folder will be created
-        if found.f_bavail * found.f_frsize < ROOM_BYTES:
+        if found.f_bavail * found.f_frsize < MIN_FREE_BYTES:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _give_up(self) -> None:
-        self.dropped += len(self._unsafe)
+        self.dropped += len(self._unflushed)
         self.dropped += len(self._queue)
         self._queue.clear()
 

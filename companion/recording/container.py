@@ -52,7 +52,7 @@ Their names and values become objects of many more bytes; those of this program 
 """
 _PAIR: Final = 256  # overhead of a name and its value in memory, bytes
 _MOST: Final = 10_000  # limit each on attachments and on metadata records of a file
-_PACKED: Final = 50
+_RATIO_MAX: Final = 50
 """Limit on unpacked bytes per byte of a file, in addition to one largest chunk.
 
 Ten times the ratio found in recordings; a decompression bomb has thousands.
@@ -131,7 +131,7 @@ class Walk:
     def _records(self, file: IO[bytes]) -> Iterator[tuple[int, int]]:
         """Yield (opcode, length) of the records, with the file positioned at the body."""
         size = self.path.stat().st_size
-        self._room = LARGEST + _PACKED * size
+        self._room = LARGEST + _RATIO_MAX * size
         at = len(file.read(len(MAGIC)))
         while len(header := file.read(_HEADER.size)) == _HEADER.size:
             opcode, length = _HEADER.unpack(header)

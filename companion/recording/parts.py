@@ -89,21 +89,21 @@ def _whole(text: str) -> int:
     return int(text)
 
 
-class Story(NamedTuple):
+class RecordingInfo(NamedTuple):
     """A log's statement about itself: its part, if any, and the events missing from it."""
 
     part: Part | None
     holes: tuple[Hole, ...]
 
 
-def read_story(path: Path) -> Story:
+def read_recording_info(path: Path) -> RecordingInfo:
     """Read the story of a file; empty for a log that is not a recording.
 
     Raises ``OSError`` if it cannot be read.
     """
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
-            return Story(None, ())
+            return RecordingInfo(None, ())
     part: Part | None = None
     holes: list[Hole] = []
     for record in Walk(path, frozenset()):
@@ -115,10 +115,10 @@ def read_story(path: Path) -> Story:
                 events = min(holes.pop().events + hole.events, EVENTS_MAX)
                 hole = hole._replace(events=events)
             holes.append(hole)
-    return Story(part, tuple(holes))
+    return RecordingInfo(part, tuple(holes))
 
 
-def in_order(stories: Mapping[Path, Story]) -> list[Path] | None:
+def in_order(stories: Mapping[Path, RecordingInfo]) -> list[Path] | None:
     """Return the parts of one run in the order in which they were written; None for other logs.
 
     Raises ``UserError`` if two files are the same part.
@@ -135,7 +135,7 @@ def in_order(stories: Mapping[Path, Story]) -> list[Path] | None:
     return ordered
 
 
-def missing(stories: Mapping[Path, Story], ordered: Sequence[Path]) -> list[str]:
+def missing(stories: Mapping[Path, RecordingInfo], ordered: Sequence[Path]) -> list[str]:
     """Return what a replay of these logs lacks, one line each; empty for a complete run."""
     lines = []
     before = 0

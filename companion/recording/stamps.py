@@ -13,7 +13,7 @@ from typing import Final
 
 LARGEST_LEAP_NS: Final = 3_600_000_000_000
 """Longest plausible gap in a recording; a stamp beyond it is wrong."""
-LINGERS_NS: Final = 1_000_000_000
+STEP_HOLD_NS: Final = 1_000_000_000
 """Time for which stamps must continue behind the time line before a step back counts as a set
 clock.
 
@@ -26,7 +26,7 @@ Times then fit into 63 bits however long the log is.
 """
 
 
-def _goes_on(step_ns: int) -> bool:
+def _is_plausible(step_ns: int) -> bool:
     return 0 <= step_ns <= LARGEST_LEAP_NS
 
 
@@ -39,10 +39,14 @@ class RepairedStamps:
 
     def __init__(self, first: Sequence[int]) -> None:
         start_ns = first[0] if first else 0
-        if len(first) >= 3 and not _goes_on(first[1] - first[0]) and _goes_on(first[2] - first[1]):
+        if (
+            len(first) >= 3
+            and not _is_plausible(first[1] - first[0])
+            and _is_plausible(first[2] - first[1])
+        ):
             start_ns = first[1]
-        self._absurd_start = not 0 <= start_ns < _LATEST_START_NS
-        self.t_ns = 0 if self._absurd_start else start_ns
+        self._implausible_start = not 0 <= start_ns < _LATEST_START_NS
+        self.t_ns = 0 if self._implausible_start else start_ns
         self._shift_ns = self.t_ns - start_ns
         self._resumed: tuple[int, int] | None = None  # first and last stamp since clamping began
 
@@ -52,18 +56,18 @@ class RepairedStamps:
         Returns None for a good stamp, else its error in nanoseconds (not 0).
         """
         step_ns = stamp_ns + self._shift_ns - self.t_ns
-        if 0 <= step_ns <= LARGEST_LEAP_NS:  # inlined ``_goes_on``, for speed
+        if 0 <= step_ns <= LARGEST_LEAP_NS:  # inlined ``_is_plausible``, for speed
             self._resumed = None
             self.t_ns += step_ns
-            if not self._absurd_start:
+            if not self._implausible_start:
                 return None
-            self._absurd_start = False
+            self._implausible_start = False
             return -self._shift_ns
         began_ns, last_ns = self._resumed or (stamp_ns, stamp_ns)
-        if self._resumed is None or stamp_ns < last_ns or not _goes_on(stamp_ns - began_ns):
+        if self._resumed is None or stamp_ns < last_ns or not _is_plausible(stamp_ns - began_ns):
             self._resumed = (stamp_ns, stamp_ns)
             return step_ns
-        if abs(step_ns) <= LARGEST_LEAP_NS and stamp_ns - began_ns < LINGERS_NS:
+        if abs(step_ns) <= LARGEST_LEAP_NS and stamp_ns - began_ns < STEP_HOLD_NS:
             self._resumed = (began_ns, stamp_ns)
             return step_ns
         self._shift_ns = self.t_ns - began_ns

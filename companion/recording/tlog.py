@@ -20,12 +20,12 @@ from companion.mavlink.wire.framing import (
     next_magic,
 )
 from companion.mavlink.wire.stamps import boot_ms
-from companion.recording.stamps import LINGERS_NS, RepairedStamps
+from companion.recording.stamps import STEP_HOLD_NS, RepairedStamps
 from companion.values import Event, Frame, Reason, Rejection, Source
 
 STAMP: Final = 8  # bytes of the stamp before each frame of a telemetry log
 _PIECE: Final = 1 << 16
-_MANY_PAIRS: Final = 50
+_PAIRS_MIN: Final = 50
 _SEARCHED_BYTES: Final = 1 << 26  # bytes of a file that are searched for MAVLink
 _TIMED: Final = frozenset((33, 30, 2))
 """GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME, whose boot stamps date raw MAVLink."""
@@ -43,7 +43,7 @@ def sniff(data: bytes) -> Literal["tlog", "mavlink"] | None:
     """
     stamped = bare = 0
     at, end = 0, min(len(data), _SEARCHED_BYTES)
-    while at < end and max(stamped, bare) < _MANY_PAIRS:
+    while at < end and max(stamped, bare) < _PAIRS_MIN:
         at, length = _next_frame(data, at, end)
         after = at + length
         if not length:
@@ -72,7 +72,7 @@ def _next_frame(data: bytes, at: int, end: int) -> tuple[int, int]:
 # --- telemetry logs -----------------------------------------------------------------------------
 
 
-_Stretch = tuple[int | None, Checked | None, dict[Reason, int]]
+_StampedFrame = tuple[int | None, Checked | None, dict[Reason, int]]
 """Stamp of a frame of a telemetry log, ns; the frame; bytes skipped before it.
 
 The stamp is None if it does not fit before the frame, the frame is None at the end.
@@ -88,7 +88,7 @@ def read_tlog(data: bytes, link: str) -> Iterator[Event]:
     A rejection has the time of the following frame. A frame with a bad stamp is still returned,
     after a rejection for the stamp.
     """
-    ahead = _stretches(data)
+    ahead = _stamped_frames(data)
     first = list(islice(ahead, 3))
     timeline = RepairedStamps([one[0] for one in first if one[0] is not None])
     for group in (first, ahead):
@@ -119,7 +119,7 @@ def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
     )
 
 
-def _stretches(data: bytes) -> Iterator[_Stretch]:
+def _stamped_frames(data: bytes) -> Iterator[_StampedFrame]:
     at, end = 0, len(data)
     frame_at = Checker().at
     while at < end:
@@ -175,7 +175,7 @@ def read_raw(data: bytes, link: str) -> Iterator[Event]:
         stamp_ns = _boot_ns(event, clock) if isinstance(event, Frame) else None
         off_ns = None if stamp_ns is None else timeline.place(stamp_ns)
         # Messages of one sender may be slightly out of order: only more is a bad stamp.
-        if off_ns is not None and abs(off_ns) > LINGERS_NS:
+        if off_ns is not None and abs(off_ns) > STEP_HOLD_NS:
             yield _bad_stamp(timeline.t_ns, link, off_ns)
         yield _at(event, timeline.t_ns)
 

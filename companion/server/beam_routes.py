@@ -15,7 +15,7 @@ from companion.views import beam_state, weight_formats
 from companion.views import pattern as pattern_view
 from companion.views.state import Node
 
-MOST_ANGLES: Final = 20_000
+ANGLES_MAX: Final = 20_000
 """Limit on beams times angles in one answer; at the limit, an answer takes half a second."""
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 Cut = Annotated[
@@ -80,7 +80,7 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
             if uav is not None and uav not in served:
                 raise HTTPException(404, f"no beam for {uav!r}")
             shown = 1 if uav is not None else len(served)
-            if shown * points > MOST_ANGLES:
+            if shown * points > ANGLES_MAX:
                 wanted = f"{shown} beams at {points} angles"
                 raise HTTPException(422, f"too large: {wanted}; give uav, or fewer points")
             return encode(

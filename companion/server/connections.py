@@ -15,7 +15,7 @@ HEAD_BYTES: Final = 16_384
 BODY_BYTES: Final = 65_536  # limit on a request's body; no route uses one
 HEAD_S: Final = 10.0
 """Time limit from connecting, or from the last answer, to a complete head."""
-STALLED_S: Final = 60.0  # time limit for a client that reads nothing of an answer
+STALL_TIMEOUT_S: Final = 60.0  # time limit for a client that reads nothing of an answer
 _MOST: Final = 512
 _OWN: Final = 96  # descriptors reserved for links, recordings and files
 
@@ -130,7 +130,7 @@ class BoundedProtocol(HttpToolsProtocol):
     def pause_writing(self) -> None:
         """Start the time limit: the client does not read."""
         super().pause_writing()
-        self._stalled = self.loop.call_later(STALLED_S, self.transport.abort)
+        self._stalled = self.loop.call_later(STALL_TIMEOUT_S, self.transport.abort)
 
     def resume_writing(self) -> None:
         """Cancel the time limit: the client reads again."""

@@ -26,7 +26,7 @@ class Moments:
         self._node = node
         self._work_slots = work_slots
         self._moment = 0
-        self._looks: dict[float, Callable[[], Update]] = {}
+        self._reads: dict[float, Callable[[], Update]] = {}
         self._answers: dict[tuple[float, Hashable], asyncio.Task[Any]] = {}
 
     async def made(self, lead_ms: float, what: Hashable, make: Callable[[Update], T]) -> T:
@@ -40,28 +40,30 @@ class Moments:
         moment = -(-now_ns // EVERY_NS)
         if moment != self._moment:
             self._moment = moment
-            self._looks.clear()
+            self._reads.clear()
             self._answers.clear()
         task = self._answers.get((lead_ms, what))
         if task is None:
             self._work_slots.refuse_if_full()  # before predicting
-            look = self._look(now_ns, moment * EVERY_NS - now_ns, lead_ms)
+            look = self._read(now_ns, moment * EVERY_NS - now_ns, lead_ms)
             task = asyncio.create_task(self._work_slots.run(lambda: make(look())))
             task.add_done_callback(_seen)
             self._answers[lead_ms, what] = task
         found: T = await asyncio.shield(task)  # a client that leaves must not cancel it for others
         return found
 
-    def _look(self, now_ns: int, until_ns: int, lead_ms: float) -> Callable[[], Update]:
+    def _read(self, now_ns: int, until_ns: int, lead_ms: float) -> Callable[[], Update]:
         """Return the function that computes the beams for ``lead_ms``, shared by all answers."""
-        found = self._looks.get(lead_ms)
+        found = self._reads.get(lead_ms)
         if found is None:
             lead_s = until_ns * 1e-9 + lead_ms * 1e-3
-            found = self._looks[lead_ms] = _once(self._node.pipeline.sighted(now_ns, lead_s))
+            found = self._reads[lead_ms] = _memoised(
+                self._node.pipeline.prepare_update(now_ns, lead_s)
+            )
         return found
 
 
-def _once(make: Callable[[], T]) -> Callable[[], T]:
+def _memoised(make: Callable[[], T]) -> Callable[[], T]:
     """Return a function that calls ``make`` on the first calling thread; others wait for its
     result."""
     lock, made = threading.Lock(), list[T]()

@@ -33,7 +33,7 @@ from companion.views.state import Node
 
 Json = dict[str, Any]
 
-TAKES_NOTHING: Final = 1003
+SLOW_CLIENT: Final = 1003
 TOO_MANY: Final = 1013
 ELSEWHERE: Final = 4403
 BAD_ARGUMENTS: Final = 4422
@@ -41,7 +41,7 @@ BAD_ARGUMENTS: Final = 4422
 RATE_HZ: Final = 10.0
 LEAST_HZ, MOST_HZ = 0.1, 100.0
 _UAV: Final = re.compile("|".join(kind.pattern for kind in UavKind), re.ASCII)
-MOST_CLIENTS: Final = 256
+CLIENTS_MAX: Final = 256
 """Limit on streams: half of the connections; the others are left for requests."""
 SLOTS: Final = 32
 """Number of slots that spread the clients' messages after an update.
@@ -112,7 +112,7 @@ class Stream:
         if not _is_from_here(websocket):
             await websocket.close(ELSEWHERE, "pages of other sites may not connect")
             return
-        if self.clients >= MOST_CLIENTS:
+        if self.clients >= CLIENTS_MAX:
             await websocket.close(TOO_MANY, "too many streams are open")
             return
         try:
@@ -138,7 +138,7 @@ class Stream:
             await asyncio.wait({sending, hearing}, return_when=asyncio.FIRST_COMPLETED)
             if hearing.done() and hearing.result()["type"] == "websocket.receive":
                 sending.cancel()
-                await websocket.close(TAKES_NOTHING, "the stream accepts no messages")
+                await websocket.close(SLOW_CLIENT, "the stream accepts no messages")
             elif sending.done():
                 sending.result()
         finally:

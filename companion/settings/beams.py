@@ -14,7 +14,7 @@ Interval = tuple[Degrees, Degrees]
 HiddenSector = tuple[Degrees, Degrees, Degrees, Degrees]
 
 
-def _rising(interval: Interval) -> Interval:
+def _ascending(interval: Interval) -> Interval:
     if not interval[0] < interval[1]:
         raise UserError("give [from, to] with from < to")
     return interval
@@ -27,7 +27,7 @@ def _named_width(given: object) -> object:
     return given
 
 
-def _once(names: tuple[str, ...]) -> tuple[str, ...]:
+def _unique(names: tuple[str, ...]) -> tuple[str, ...]:
     if len(set(names)) < len(names):
         raise UserError("a UAV is listed twice; list each UAV once, highest priority first")
     return names
@@ -78,14 +78,14 @@ class ArraySettings(Section):
     mount_yaw_deg: Degrees = 0.0
     lever_arm_m: Position = (0.0, 0.0, 0.0)
     field_of_view_deg: Annotated[float, Field(gt=0, le=360)] | None = None
-    azimuth_limits_deg: Annotated[Interval, AfterValidator(_rising)] | None = None
-    elevation_limits_deg: Annotated[Interval, AfterValidator(_rising)] | None = None
+    azimuth_limits_deg: Annotated[Interval, AfterValidator(_ascending)] | None = None
+    elevation_limits_deg: Annotated[Interval, AfterValidator(_ascending)] | None = None
     hidden_deg: tuple[HiddenSector, ...] = ()
     dead: Annotated[tuple[Annotated[int, Field(ge=0, le=4095)], ...], Field(max_length=4095)] = ()
     coupling: str | None = None
 
     @model_validator(mode="after")
-    def _listed(self) -> Self:
+    def _as_list(self) -> Self:
         listed = self.positions is not None or self.positions_m is not None
         if (self.kind is ArrayKind.LIST) != listed:
             raise UserError(
@@ -140,7 +140,7 @@ class BeamSettings(Section):
     condition_limit: Annotated[float, Field(gt=1, le=1e3)] = 100.0
     regularisation: Annotated[float, Field(gt=0, le=1e6)] = 0.01
     normalisation: Normalisation = Normalisation.UNIT_RESPONSE
-    priority: Annotated[tuple[str, ...], AfterValidator(_once)] = ()
+    priority: Annotated[tuple[str, ...], AfterValidator(_unique)] = ()
     widen: Annotated[Widen, BeforeValidator(_named_width)] = Widen.LIKELY
     floor_db: Annotated[float, Field(ge=-60, le=60)] | None = None
     power: Power | None = None

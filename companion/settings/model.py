@@ -40,10 +40,10 @@ from companion.settings.section import ConfigError, Section
 from companion.settings.tracking import ClockSettings, ObserverSettings
 from companion.values import UserError, read_toml, shown
 
-NEAR: Final = 0.7
+MIN_SIMILARITY: Final = 0.7
 """Similarity (difflib's ratio) from which on a name is suggested for an unknown setting."""
 
-MODELLED: Final = frozenset(
+REPLAYED_SECTIONS: Final = frozenset(
     (
         "center", "clocks", "observer", "tracks", "array", "beams", "codebook", "hardware", "radio",
         "link",
@@ -114,23 +114,25 @@ class Settings(Section):
 
     @classmethod
     def from_recording(cls, text: str, where: str, attached: Mapping[str, bytes]) -> Self:
-        """Parse the settings of a recording, only the sections in ``MODELLED``.
+        """Parse the settings of a recording, only the sections in ``REPLAYED_SECTIONS``.
 
         The recording is untrusted: addresses, outgoing links, directories and paths in it are
         ignored. Files that the settings name are taken from ``attached``, by their names there.
         Raises ``ConfigError`` as ``from_toml``, and if a file is missing.
         """
-        found = {name: kept for name, kept in sections(text, where).items() if name in MODELLED}
+        found = {
+            name: kept for name, kept in sections(text, where).items() if name in REPLAYED_SECTIONS
+        }
         attached = {**attached, **_former_files(found, where)}
         files = {}
         for file in NAMED_FILES:
             if file.key in (keys := _table(found, file.section)):
                 if file.attachment not in attached:
-                    raise _missing(where, file.setting)
+                    raise _missing_files(where, file.setting)
                 keys[file.key] = file.attachment
                 files[file.attachment] = attached[file.attachment]
         if "positions" in _table(found, "array"):  # recordings have ``positions_m`` instead
-            raise _missing(where, "array.positions")
+            raise _missing_files(where, "array.positions")
         return cls._from_sections(found, where).with_files(files)
 
     @classmethod
@@ -207,7 +209,7 @@ def _table(found: dict[str, Any], section: str) -> dict[str, Any]:
     return keys if isinstance(keys, dict) else {}
 
 
-def _missing(where: str, setting: str) -> ConfigError:
+def _missing_files(where: str, setting: str) -> ConfigError:
     return ConfigError(
         f"{where}: file of {setting} is not in the recording; give the settings with --config"
     )
@@ -221,11 +223,11 @@ def sections(text: str, where: str) -> dict[str, Any]:
         raise ConfigError(f"{where}: {error}") from error
 
 
-def _meant(place: tuple[int | str, ...]) -> str:
+def _suggestion(place: tuple[int | str, ...]) -> str:
     """Return a suggestion of the most similar setting; empty if none is similar."""
     section, *keys = map(str, place)
     if not keys:
-        near = difflib.get_close_matches(section, Settings.model_fields, 1, NEAR)
+        near = difflib.get_close_matches(section, Settings.model_fields, 1, MIN_SIMILARITY)
         owners = [
             name for name, field in Settings.model_fields.items() if section in _keys(field.default)
         ]
@@ -233,7 +235,7 @@ def _meant(place: tuple[int | str, ...]) -> str:
             return f"; did you mean {owners[0]}.{section}?"
         return f"; did you mean {near[0]}?" if near else ""
     near = difflib.get_close_matches(
-        keys[0], _keys(Settings.model_fields[section].default), 1, NEAR
+        keys[0], _keys(Settings.model_fields[section].default), 1, MIN_SIMILARITY
     )
     return f"; did you mean {section}.{near[0]}?" if near else ""
 
@@ -251,7 +253,7 @@ def _first(error: ValidationError) -> str:
     place = errors[0]["loc"][:2]
     key = ".".join(map(str, place))
     if errors[0]["type"] == "extra_forbidden":
-        return f"{key} is not a setting{_meant(place)}"
+        return f"{key} is not a setting{_suggestion(place)}"
     said = [wrong["msg"] for wrong in errors if wrong["loc"][:2] == place]
     allowed = dict.fromkeys(text.removeprefix("Value error, ") for text in said)
     return f"{key} = {shown(errors[0]['input'])}: {', or '.join(allowed)}"

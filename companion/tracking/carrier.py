@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from companion.tracking.geodesy import LocalFrame
-from companion.tracking.limits import MOST, RaisedLimit
+from companion.tracking.limits import MAX_PLAUSIBLE_RATIO, RaisedLimit
 from companion.values import Attitude, Carrier, EstimatorStatus, Fix, FloatArray, Refuted, Track
 
 
@@ -198,9 +198,9 @@ class AngularAcceleration:
         changed_degps = math.degrees(math.dist(rates, before[1:]))
         proven = (changed_degps - 2 * RATE_NOISE_DEGPS) / apart_s
         limit = self._raised.at(base_degps2, sender_ns)
-        if not limit < proven < MOST * base_degps2:
+        if not limit < proven < MAX_PLAUSIBLE_RATIO * base_degps2:
             return None
-        to = self._raised.to_hold(proven, sender_ns)
+        to = self._raised.raised_value(proven, sender_ns)
         return Refuted(
             t_ns=attitude.t_ns,
             uav=str(attitude.source),

@@ -46,11 +46,11 @@ class GateSettings:
         """
         apart_s = abs(fix.sender_ns - before.sender_ns) * 1e-9
         drifted_s = 1e-3 + self.drift_max * apart_s
-        lagged_m = _way_m(before, before.noise.time_s)
-        return self.lead_m + lagged_m + _way_m(fix, fix.noise.time_s + drifted_s)
+        lagged_m = _flown_distance_m(before, before.noise.time_s)
+        return self.lead_m + lagged_m + _flown_distance_m(fix, fix.noise.time_s + drifted_s)
 
 
-def _way_m(fix: Fix, within_s: float) -> float:
+def _flown_distance_m(fix: Fix, within_s: float) -> float:
     """Return the largest distance flown within a time about a report, m; 0 without a velocity."""
     velocity = fix.velocity_ned_mps
     if velocity is None:
@@ -133,7 +133,7 @@ class Suspects(Generic[State]):
         least_s = self._settings.reacquire_s
         return max(least_s, SHARED_S) if self._alternations else least_s
 
-    def goes_on(self, sender_ns: int) -> bool:
+    def is_consistent(self, sender_ns: int) -> bool:
         """Return whether the run is a second vehicle's: it continues while possible reports
         alternate."""
         if len(self._run) < self._settings.reacquire_reports or self._alternations < ALTERNATIONS:

@@ -15,13 +15,13 @@ from typing import Final
 from companion.values import Fix, Limits, LimitSource, Refuted
 
 RAISED: Final = 1.5  # multiple of the proven value that is assumed from then on
-FADES_S: Final = 120.0  # time constant with which a raised limit decays
-MOST: Final = 6.0
+DECAY_S: Final = 120.0  # time constant with which a raised limit decays
+MAX_PLAUSIBLE_RATIO: Final = 6.0
 """Multiple of the limit above which a proof is rejected: the report is wrong, not the limit."""
-PAIRS_S: Final = (0.001, 0.2, 0.5, 1.0, 2.0)
+PAIR_SPANS_S: Final = (0.001, 0.2, 0.5, 1.0, 2.0)
 """Least times between two velocities that are compared: with the previous one, and with older ones.
 """
-_PAIRS_NS: Final = tuple(round(least_s * 1e9) for least_s in PAIRS_S)
+_PAIRS_NS: Final = tuple(round(least_s * 1e9) for least_s in PAIR_SPANS_S)
 _KEPT: Final = 64
 
 
@@ -107,7 +107,7 @@ class RaisedLimit:
     to: float = 0.0
     at_ns: int = 0
 
-    def to_hold(self, proven: float, sender_ns: int) -> float:
+    def raised_value(self, proven: float, sender_ns: int) -> float:
         """Raise the limit above a proven value; return the new limit."""
         self.to, self.at_ns = RAISED * proven, sender_ns
         return self.to
@@ -116,7 +116,7 @@ class RaisedLimit:
         """Return the limit in force at a sender time."""
         if self.to <= limit:
             return limit
-        faded = math.exp(-max(0, sender_ns - self.at_ns) * 1e-9 / FADES_S)
+        faded = math.exp(-max(0, sender_ns - self.at_ns) * 1e-9 / DECAY_S)
         return limit + (self.to - limit) * faded
 
 
@@ -147,11 +147,11 @@ class Refutations:
         noise_mps = fix.noise.velocity_mps
         speed = math.sqrt(north * north + east * east + down * down) - noise_mps
         limit = self.speed.at(base.speed_max_mps, fix.sender_ns)
-        if limit < speed < MOST * base.speed_max_mps:
+        if limit < speed < MAX_PLAUSIBLE_RATIO * base.speed_max_mps:
             found.append(self._raise(self.speed, fix, "observer.speed_max_mps", limit, speed))
         proven = self._proven(fix, north, east, down)
         limit = self.acceleration.at(base.acceleration_max_mps2, fix.sender_ns)
-        if limit < proven < MOST * base.acceleration_max_mps2:
+        if limit < proven < MAX_PLAUSIBLE_RATIO * base.acceleration_max_mps2:
             name = "observer.acceleration_max_mps2"
             found.append(self._raise(self.acceleration, fix, name, limit, proven))
         if not self._times_ns or fix.sender_ns > self._times_ns[-1]:
@@ -180,7 +180,7 @@ class Refutations:
     def _raise(
         self, raised: RaisedLimit, fix: Fix, setting: str, limit: float, proven: float
     ) -> Refuted:
-        to = raised.to_hold(proven, fix.sender_ns)
+        to = raised.raised_value(proven, fix.sender_ns)
         return Refuted(
             t_ns=fix.arrival_ns,
             uav=fix.uav,

@@ -28,25 +28,27 @@ class AccelerationModel:
     """
 
     window_s: float  # time over which the slope of the reported velocities is taken; 0: no model
-    fewest: int  # least number of velocities
-    fades_s: float  # time constant with which the acceleration decays
+    min_velocities: int  # least number of velocities
+    decay_s: float  # time constant with which the acceleration decays
     turns: bool = False
 
 
-CONSTANT_VELOCITY: Final = AccelerationModel(window_s=0.0, fewest=0, fades_s=1.0)
+CONSTANT_VELOCITY: Final = AccelerationModel(window_s=0.0, min_velocities=0, decay_s=1.0)
 ACCELERATION_MODELS: Final = (
     CONSTANT_VELOCITY,
-    AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0),
-    AccelerationModel(window_s=1.0, fewest=3, fades_s=10.0),
-    AccelerationModel(window_s=2.5, fewest=3, fades_s=10.0),
-    AccelerationModel(window_s=5.0, fewest=5, fades_s=3.0),
-    AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0, turns=True),
-    AccelerationModel(window_s=2.5, fewest=3, fades_s=3.0, turns=True),
-    AccelerationModel(window_s=5.0, fewest=5, fades_s=3.0, turns=True),
+    AccelerationModel(window_s=1.0, min_velocities=3, decay_s=3.0),
+    AccelerationModel(window_s=1.0, min_velocities=3, decay_s=10.0),
+    AccelerationModel(window_s=2.5, min_velocities=3, decay_s=10.0),
+    AccelerationModel(window_s=5.0, min_velocities=5, decay_s=3.0),
+    AccelerationModel(window_s=1.0, min_velocities=3, decay_s=3.0, turns=True),
+    AccelerationModel(window_s=2.5, min_velocities=3, decay_s=3.0, turns=True),
+    AccelerationModel(window_s=5.0, min_velocities=5, decay_s=3.0, turns=True),
 )
 """None; quick turns of short and long duration; a sustained turn; a slow one with noisy reports;
 circles."""
-WINDOWS: Final = sorted({(way.window_s, way.fewest) for way in ACCELERATION_MODELS if way.window_s})
+WINDOWS: Final = sorted(
+    {(way.window_s, way.min_velocities) for way in ACCELERATION_MODELS if way.window_s}
+)
 """Distinct windows of the models with the numbers of velocities they need, ascending."""
 TURNING_MPS: Final = 1.0  # horizontal speed below which the course is undefined
 SMOOTHING_SHARE: Final = 0.35  # share of the newest report in a smoothed position
@@ -134,7 +136,7 @@ class PastPredictions:
     """Past predictions of one UAV. ``add`` takes its reports in order of the sender's time."""
 
     def __init__(self) -> None:
-        self._made: deque[_PastPrediction] = deque(maxlen=_KEPT)
+        self._states: deque[_PastPrediction] = deque(maxlen=_KEPT)
         self._costs = [0.0] * (2 * len(ACCELERATION_MODELS))
         self._comparisons = 0
         self._compared_ns = 0
@@ -177,7 +179,7 @@ class PastPredictions:
 
     def is_due(self, sender_ns: int) -> bool:
         """Return whether a report of this time must be added."""
-        return not self._made or sender_ns - self._made[-1].sender_ns >= SPACING_S * 1e9
+        return not self._states or sender_ns - self._states[-1].sender_ns >= SPACING_S * 1e9
 
     def add(self, fix: Fix, accelerations: tuple[Vector | None, ...]) -> None:
         """Evaluate earlier predictions by a report; store the state to predict from it.
@@ -194,7 +196,7 @@ class PastPredictions:
                 errors.add(made.error_m(self._model, there, age_s), age_s)
         if fix.velocity_ned_mps is not None:
             velocity, aside = fix.velocity_ned_mps, self._smoothing_offset
-            self._made.append(
+            self._states.append(
                 _PastPrediction(
                     sender_ns=fix.sender_ns,
                     position=there,
@@ -208,7 +210,7 @@ class PastPredictions:
         """Return the newest stored state of at least an age; None if it is more than 2 s + twice as
         old."""
         newest_ns = sender_ns - round(least_s * 1e9)
-        for made in reversed(self._made):
+        for made in reversed(self._states):
             if made.sender_ns <= newest_ns:
                 age_s = (sender_ns - made.sender_ns) * 1e-9
                 return made if age_s < 2.0 * least_s + 2.0 else None
@@ -262,7 +264,7 @@ def fed_forward(
     A turn in the plane at the rate w = (v x a) / v^2 rotates the velocity by w t, and the
     displacement is the integral of that (docs/math.md 5.1).
     """
-    way_s2, gain_s = fading_response(ahead_s, way.fades_s)
+    way_s2, gain_s = fading_response(ahead_s, way.decay_s)
     (a, b, c), (north, east, _) = acceleration, velocity
     level = north * north + east * east
     if not way.turns or level < TURNING_MPS**2:
@@ -279,10 +281,10 @@ def fed_forward(
     )
 
 
-def fading_response(ahead_s: float, fades_s: float) -> tuple[float, float]:
+def fading_response(ahead_s: float, decay_s: float) -> tuple[float, float]:
     """Displacement (s²) and gain in speed (s) by a decaying unit acceleration within a time.
 
     s(τ) of docs/math.md 5.1, and its derivative.
     """
-    shrink = math.exp(-ahead_s / fades_s)
-    return fades_s * fades_s * (shrink - 1.0 + ahead_s / fades_s), fades_s * (1.0 - shrink)
+    shrink = math.exp(-ahead_s / decay_s)
+    return decay_s * decay_s * (shrink - 1.0 + ahead_s / decay_s), decay_s * (1.0 - shrink)

@@ -22,7 +22,7 @@ APART_NS: Final = 500_000_000
 """Longest time between two reports over which dead reckoning by their velocities is valid."""
 GOOD_DEVIATION_M: Final = 0.4
 """Deviation of good receivers' positions, whatever they state: velocities have errors, too."""
-UNSEEN: Final = 0.5
+UNSEEN_FACTOR: Final = 0.5
 """Multiple of the root sum square of the displacement that is possible unseen between reports.
 
 It is hardly ever the largest that the aircraft can cause.
@@ -73,7 +73,7 @@ class ReceiverCheck:
         strayed_m, unseen_m = self._deviation(fix.sender_ns, north_m, east_m, unseen_m)
         if (
             strayed_m
-            <= max(GOOD_DEVIATION_M, math.sqrt(2.0) * stated_m) + lag_m + UNSEEN * unseen_m
+            <= max(GOOD_DEVIATION_M, math.sqrt(2.0) * stated_m) + lag_m + UNSEEN_FACTOR * unseen_m
         ):
             return None
         if strayed_m <= NOTICE_RATIO * self._deviation_m:

@@ -135,7 +135,7 @@ class Tracker:
         """
         tracked = self._tracked.get(fix.uav)
         past = self._new_past() if tracked is None else tracked.past
-        fix, refuted = self._held_to(past, fix)
+        fix, refuted = self._with_refuted_limits(past, fix)
         full = tracked is None and len(self._tracked) >= self._settings.most
         if full and not self._make_room(fix.uav):
             why = f"limit of {self._settings.most} tracks reached"
@@ -148,7 +148,7 @@ class Tracker:
         noise = self._settings.noise
         return _Past(Refutations(), None if noise is None else ReceiverCheck(noise), ReportTiming())
 
-    def _held_to(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
+    def _with_refuted_limits(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
         """Return a report with the bounds as raised by refutations, and its own refutations."""
         given = self._limits(fix)
         found = past.refutations.look(fix if fix.limits else replace(fix, limits=given))
@@ -166,7 +166,7 @@ class Tracker:
         if index is None:
             return _rejected(fix, Reason.OUT_OF_ORDER, "older than the window for late reports")
         before = tracked.history.entries[max(index - 1, 0)]
-        wrong = self._wrong(tracked, index, fix)
+        wrong = self._basic_rejection(tracked, index, fix)
         if wrong is not None:
             return _rejected(fix, *wrong)
         predicted = self._observer.predict(before.state, fix.sender_ns)
@@ -175,7 +175,7 @@ class Tracker:
             return self._suspect(tracked, fix, impossible)
         tracked.believable_ns = max(tracked.believable_ns, fix.sender_ns)
         tracked.suspects.interrupt()
-        if tracked.suspects.goes_on(fix.sender_ns):
+        if tracked.suspects.is_consistent(fix.sender_ns):
             return _rejected(fix, Reason.SHARED_ID, "a second vehicle reports under this id")
         return self._use(tracked, index, fix, predicted)
 
@@ -191,7 +191,7 @@ class Tracker:
         return False
 
     def _begin(self, fix: Fix, past: _Past, reports: int = 0) -> Estimate:
-        first = _first(fix)
+        first = _initial_estimate(fix)
         past.pace.add(fix)
         self._tracked[fix.uav] = _Tracked(
             past=past,
@@ -208,7 +208,9 @@ class Tracker:
         gap_s = (fix.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
         return gap_s > self._settings.ages.lost_s
 
-    def _wrong(self, tracked: _Tracked, index: int, fix: Fix) -> tuple[Reason, str] | None:
+    def _basic_rejection(
+        self, tracked: _Tracked, index: int, fix: Fix
+    ) -> tuple[Reason, str] | None:
         """Check a report without a prediction: a repeated stamp, or a resent position."""
         entries = tracked.history.entries
         if index < len(entries) and entries[index].fix.sender_ns == fix.sender_ns:
@@ -246,7 +248,7 @@ class Tracker:
         tracked.past.pace.add(fix)
         tracked.reports += 1
         if history.newest.fix is fix:
-            self._look_back(tracked, fix)
+            self._evaluate_past(tracked, fix)
         tracked.newest = self._estimate(tracked, len(history.entries) - 1)
         tracked.unknown_input = _unknown_input(history)
         if tracked.newest.fix is fix:
@@ -258,7 +260,7 @@ class Tracker:
         entry = tracked.history.entries[at]
         predicted = entry.predicted
         if predicted is None:
-            return _first(entry.fix)
+            return _initial_estimate(entry.fix)
         if predicted.mu_s2 is not None:
             tracked.mu_max_s2 = max(predicted.mu_s2, tracked.mu_max_s2 or 0.0)
         before_ns = tracked.history.entries[at - 1].fix.sender_ns if at else None
@@ -272,7 +274,7 @@ class Tracker:
             dt_s=dt_s,
         )
 
-    def _look_back(self, tracked: _Tracked, fix: Fix) -> None:
+    def _evaluate_past(self, tracked: _Tracked, fix: Fix) -> None:
         """Evaluate earlier predictions by the newest report, and select the model to feed forward.
 
         Accelerations are clipped to the largest possible size.
@@ -349,12 +351,12 @@ class Tracker:
         velocity: Vector | None
         carried = self._observer.carry(newest.state, at.sender_ns)
         if carried is not None:
-            position, velocity = _fed(tracked, at, *carried)
+            position, velocity = _with_feed_forward(tracked, at, *carried)
             return position, velocity, reach(newest.fix, limits, position, at)
         found = self._observer.predict(newest.state, at.sender_ns)
         position, velocity = found.position_ned_m, found.velocity_ned_mps
         if velocity is not None:
-            position, velocity = _fed(tracked, at, position, velocity)
+            position, velocity = _with_feed_forward(tracked, at, position, velocity)
         fastest_mps = _fastest_mps(velocity, found.velocity_bound_mps, limits, at.bound_s)
         widened_m = at.bound_s * fastest_mps
         bound_m = found.bound_m + widened_m
@@ -436,7 +438,7 @@ def _fastest_mps(
     return min(limits.speed_max_mps, math.hypot(*velocity) + bound_mps + gained_mps)
 
 
-def _first(fix: Fix) -> Estimate:
+def _initial_estimate(fix: Fix) -> Estimate:
     return Estimate(
         fix=fix,
         position_ned_m=fix.position_ned_m,
@@ -450,7 +452,7 @@ def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
     return Rejection(t_ns=fix.arrival_ns, source=fix.uav, reason=reason, detail=detail)
 
 
-def _fed(
+def _with_feed_forward(
     tracked: _Tracked, at: SenderTime, position: Vector, velocity: Vector
 ) -> tuple[Vector, Vector]:
     """Add feed-forward and smoothing to a predicted position and velocity."""

@@ -24,12 +24,14 @@ from companion.values.described import Inline, Meaning
 from companion.views import guaranteed_gain
 from companion.views.as_json import Json, as_json, degrees
 
-AHEAD_S: Final = 30.0  # horizon of the search for the next beam of a codebook
-MOST_SAMPLES: Final = 2000  # largest number of sampled directions over that time
-FEWEST_SAMPLES: Final = 32  # smallest number, however large the codebook
-MOST_RESPONSES: Final = 2**28
+HORIZON_S: Final = 30.0  # horizon of the search for the next beam of a codebook
+RESPONSE_SAMPLES_MAX: Final = 2000  # largest number of sampled directions over that time
+RESPONSE_SAMPLES_MIN: Final = 32  # smallest number, however large the codebook
+RESPONSES_MAX: Final = 2**28
 """Limit on samples times codebook beams times elements, over all UAVs of one answer."""
-FULL_SHARE: Final = 8  # number of UAVs up to which each gets the full work limit of a request
+MIN_AMPLITUDE_SHARE: Final = (
+    8  # number of UAVs up to which each gets the full work limit of a request
+)
 LEAD: Final = "requested time from the request to valid_at; valid_at is up to 10 ms later"
 
 
@@ -200,11 +202,11 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> Iterat
             cost_db=beam.loss_db + 10 * math.log10(beam_set.groups),
             guaranteed_sinr_db=sinrs_db[i],
             sinr_db=float(sinr_db[i]) if np.isfinite(sinr_db[i]) else None,
-            codebook=_stored(pipeline, equipment, update, beam, towards[i]),
+            codebook=_stored_beams(pipeline, equipment, update, beam, towards[i]),
         )
 
 
-def _stored(
+def _stored_beams(
     pipeline: Pipeline, equipment: Equipment, update: Update, beam: Beam, towards: FloatArray
 ) -> StoredBeam | None:
     """Return the best stored beam for a UAV, the next one with its time, and those to sweep."""
@@ -212,7 +214,7 @@ def _stored(
     if codebook is None:
         return None
     (best,), gains = codebooks.best(codebook, array, towards[np.newaxis])
-    share = min(1.0, FULL_SHARE / len(update.beams.beams))
+    share = min(1.0, MIN_AMPLITUDE_SHARE / len(update.beams.beams))
     swept = codebooks.candidates(codebook, array, towards, beam.pointing_bound_rad, share)
     following = _next_best(pipeline, equipment, update, beam)
     return StoredBeam(
@@ -240,17 +242,17 @@ def _next_best(
         assert found is not None
         return found
 
-    coarse_s = np.linspace(0.0, AHEAD_S, 121)
+    coarse_s = np.linspace(0.0, HORIZON_S, 121)
     path = line_of_sight.directions_ahead(track, carrier, array, coarse_s)
     if path is None:
         return None
     turned = np.linalg.norm(np.diff(path, axis=0), axis=1)
     fastest_radps = float(turned.max()) / coarse_s[1]
-    step_s = codebooks.sampling_step_s(codebook, array, fastest_radps) or AHEAD_S
+    step_s = codebooks.sampling_step_s(codebook, array, fastest_radps) or HORIZON_S
     answers = codebook.weights.size * len(update.beams.beams)
-    samples = min(MOST_SAMPLES, max(FEWEST_SAMPLES, MOST_RESPONSES // answers))
-    step_s = min(max(step_s, AHEAD_S / samples), AHEAD_S)
-    return codebooks.next_best(codebook, array, directions_at, AHEAD_S, step_s)
+    samples = min(RESPONSE_SAMPLES_MAX, max(RESPONSE_SAMPLES_MIN, RESPONSES_MAX // answers))
+    step_s = min(max(step_s, HORIZON_S / samples), HORIZON_S)
+    return codebooks.next_best(codebook, array, directions_at, HORIZON_S, step_s)
 
 
 def weights(pipeline: Pipeline, beam_set: BeamSet, lead_ms: float) -> Json:

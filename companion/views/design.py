@@ -100,7 +100,7 @@ class DesignView:
 
     def __init__(self, settings: Settings) -> None:
         self._observer = settings.observer
-        self._anyone = _bounds(settings.observer, assembly.anyone(settings))
+        self._default_airframe = _bounds(settings.observer, assembly.default_limits(settings))
         self._table = None if self._observer.model == "position" else kinematic_design(settings)
 
     def show(self, pipeline: Pipeline, now_ns: int) -> Json:
@@ -113,8 +113,10 @@ class DesignView:
         shown = Design(
             valid_at_ns=now_ns,
             model=self._observer.model,
-            assumed=self._anyone,
-            certificate=None if self._table is None else _certificate(self._table, self._anyone),
+            assumed=self._default_airframe,
+            certificate=None
+            if self._table is None
+            else _certificate(self._table, self._default_airframe),
             designs=[
                 UavDesign(uav=track.uav, **self._row(pipeline, track, track.dt_s))
                 for track in pipeline.tracks(now_ns, now_ns)

@@ -22,7 +22,7 @@ class NodeState(DescribedEnum):
     HERE = "here", "the node that answers"
     THERE = "there", "its messages are current"
     SILENT = "silent", "no message for longer than `[fleet] lease_s`"
-    ASIDE = "aside", "excluded, because its messages contradict those of others"
+    EXCLUDED = "aside", "excluded, because its messages contradict those of others"
     GONE = "gone", "it left"
 
 
@@ -169,12 +169,12 @@ def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
     known: Neighbour = member.neighbours[name]
     said, ahead = known.standing, known.clock.newest_offset()
     reason = member.trust.excluded.get(name)
-    is_there = name in member.duties.others(now_ns)
+    is_connected = name in member.duties.others(now_ns)
     median_ms, p99_ms = _ways_ms(known, now_ns)
-    state = NodeState.THERE if is_there else NodeState.SILENT
+    state = NodeState.THERE if is_connected else NodeState.SILENT
     return FleetNode(
         node=name,
-        state=state if reason is None else NodeState.ASIDE,
+        state=state if reason is None else NodeState.EXCLUDED,
         near=name in member.near,
         reason=reason,
         place=None if said is None else _place(said.place),

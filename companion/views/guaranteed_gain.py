@@ -12,7 +12,7 @@ from companion.pipeline.fold import Pipeline
 from companion.values import ComplexArray, FloatArray, Update, UserError
 from companion.views.quantised import device_table
 
-MOST_AT_WORST: Final = 16
+CANDIDATES_MAX: Final = 16
 """Largest number of beams with guaranteed SINRs; the work grows with its square."""
 
 
@@ -23,7 +23,7 @@ def gains_db(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[f
     weights = _radiated(pipeline, equipment, update)
     if weights is None:
         return [None] * len(update.beams.beams)
-    return list(_least(pipeline, update, directions(update.beams), weights)[1])
+    return list(_minimum_db(pipeline, update, directions(update.beams), weights)[1])
 
 
 def of_beams(
@@ -36,16 +36,16 @@ def of_beams(
     """Return least gain and least SINR of each beam within its UAV's bound.
 
     A gain is None if the UAV may be out of coverage, in a null, or anywhere. All SINRs are None if
-    there are more than ``MOST_AT_WORST`` beams.
+    there are more than ``CANDIDATES_MAX`` beams.
     """
     array, beam_set = pipeline.array, update.beams
     weights = _radiated(pipeline, equipment, update)
     if weights is None:
         return [None] * len(beam_set.beams), [None] * len(beam_set.beams)
-    bounds, gains_db = _least(pipeline, update, towards, weights)
+    bounds, gains_db = _minimum_db(pipeline, update, towards, weights)
     known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
     unknown: list[float | None] = [None] * len(bounds)
-    if not known or len(bounds) > MOST_AT_WORST or update.carrier is None:
+    if not known or len(bounds) > CANDIDATES_MAX or update.carrier is None:
         return gains_db, unknown
     farthest_m = {track.uav: track.bound_m + update.carrier.bound_m for track in update.tracks}
     ranges_m = np.array([beam.range_m + farthest_m[beam.uav] for beam in beam_set.beams])
@@ -66,7 +66,7 @@ def of_beams(
     return gains_db, unknown
 
 
-def _least(
+def _minimum_db(
     pipeline: Pipeline, update: Update, towards: FloatArray, weights: ComplexArray
 ) -> tuple[Sequence[float | None], Sequence[float | None]]:
     """Return each pointing bound, None if it leaves the coverage, and the least gain within."""

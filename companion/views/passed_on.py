@@ -19,7 +19,7 @@ from companion.pipeline.fold import Pipeline
 from companion.tracking.noise import GEOID_M
 from companion.values import AltitudeDatum, Source, Track, TrackState, kind_of
 
-KNOWN: Final = (TrackState.LIVE, TrackState.COASTING)
+KNOWN_DATUMS: Final = (TrackState.LIVE, TrackState.COASTING)
 _REBOOT_MS: Final = 60_000  # a larger backward step of a boot clock means a reboot
 
 
@@ -40,7 +40,7 @@ class Positions:
             message
             for track in tracks
             if kind_of(track.uav).reports_itself
-            and track.state in KNOWN
+            and track.state in KNOWN_DATUMS
             and (message := self._one(pipeline, track)) is not None
         ]
         for uav in self._boot_ms.keys() - set(pipeline.tracker.uavs):
@@ -104,7 +104,7 @@ def events(pipeline: Pipeline, tracks: Iterable[Track], stale_s: float) -> list[
     return [
         _event(pipeline, track, stale_s)
         for track in tracks
-        if track.state in KNOWN and pipeline.targets.identities.same_as(track.uav) is None
+        if track.state in KNOWN_DATUMS and pipeline.targets.identities.same_as(track.uav) is None
     ]
 
 
@@ -132,7 +132,7 @@ def _event(pipeline: Pipeline, track: Track, stale_s: float) -> bytes:
     )
     at_ns = pipeline.utc_ns(track.valid_at_ns)
     stale_ns = at_ns + round(stale_s * 1e9)
-    return cot_text.event(track.uav, at_ns, stale_ns, where, _remarks(track, datum, geoid_m))
+    return cot_text.event(track.uav, at_ns, stale_ns, where, _remarks_text(track, datum, geoid_m))
 
 
 def _geoid(pipeline: Pipeline) -> tuple[float, float]:
@@ -141,7 +141,7 @@ def _geoid(pipeline: Pipeline) -> tuple[float, float]:
     return (0.0, GEOID_M) if given.geoid_m is None else (given.geoid_m, given.geoid_error_m)
 
 
-def _remarks(track: Track, datum: AltitudeDatum, geoid_m: float) -> str:
+def _remarks_text(track: Track, datum: AltitudeDatum, geoid_m: float) -> str:
     """Return text that explains the numbers of an event."""
     words = [
         f"ce {track.horizontal_bound_m:.1f} m and le are guaranteed bounds, not standard deviations"

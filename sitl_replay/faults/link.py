@@ -13,9 +13,9 @@ from sitl_replay.faults.asked import Sender
 
 WITHIN_S: Final = 0.2
 """Maximum delay of a duplicate or of a reordered frame."""
-LONGEST_JITTER: Final = 10.0
+JITTER_MAX: Final = 10.0
 """Limit of exponential draws, as a multiple of the mean (1 in 22 000 is limited)."""
-MOST_GARBAGE_BYTES: Final = 64
+GARBAGE_MAX_BYTES: Final = 64
 _NEVER: Final = 1 << 60
 
 
@@ -70,7 +70,7 @@ class Jitter:
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
         """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
-        late_s = self._mean_s * min(self._rng.expovariate(1.0), LONGEST_JITTER)
+        late_s = self._mean_s * min(self._rng.expovariate(1.0), JITTER_MAX)
         released_s = max(t_s + late_s, self._last_s.get(sender, t_s))
         self._last_s[sender] = released_s
         return released_s
@@ -85,20 +85,20 @@ class Burst:
 
     def __init__(self, rng: random.Random, share: float, shut_s: float) -> None:
         self._rng = rng
-        self._shut_s = shut_s
+        self._blocked_s = shut_s
         self._open_s = shut_s * (1.0 - share) / share if share else math.inf
-        self._shuts_s: list[float] = []
+        self._block_starts_s: list[float] = []
         self._next_s = self._opening_s()
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
         """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
-        while self._shuts_s and self._shuts_s[0] + self._shut_s <= now_s:
-            del self._shuts_s[0]
+        while self._block_starts_s and self._block_starts_s[0] + self._blocked_s <= now_s:
+            del self._block_starts_s[0]
         while self._next_s <= t_s:
-            self._shuts_s.append(self._next_s)
-            self._next_s += self._shut_s + self._opening_s()
-        at = bisect_right(self._shuts_s, t_s) - 1
-        return t_s if at < 0 else max(t_s, self._shuts_s[at] + self._shut_s)
+            self._block_starts_s.append(self._next_s)
+            self._next_s += self._blocked_s + self._opening_s()
+        at = bisect_right(self._block_starts_s, t_s) - 1
+        return t_s if at < 0 else max(t_s, self._block_starts_s[at] + self._blocked_s)
 
     def _opening_s(self) -> float:
         return self._open_s * self._rng.expovariate(1.0) if self._open_s < math.inf else math.inf
@@ -172,7 +172,7 @@ class Garbage:
         if chance >= self._share:
             return b""
         noise = random.Random(key)
-        return noise.randbytes(noise.randint(1, MOST_GARBAGE_BYTES))
+        return noise.randbytes(noise.randint(1, GARBAGE_MAX_BYTES))
 
 
 Timing = Delay | Jitter | Burst | Reordering

@@ -164,7 +164,7 @@ def _content(fault: Fault, seed: int) -> ContentFault:
     raise FaultError(f"{fault} with {len(fault.values)} numbers is not a fault of senders")
 
 
-_WITH_LUCK: Final[dict[str, Callable[..., LinkFault]]] = {
+_RANDOM_FAULTS: Final[dict[str, Callable[..., LinkFault]]] = {
     "loss": Loss,
     "duplication": Duplication,
     "jitter": Jitter,
@@ -179,4 +179,4 @@ _WITH_LUCK: Final[dict[str, Callable[..., LinkFault]]] = {
 def _on_link(fault: Fault, rng: random.Random) -> LinkFault:
     if fault.name == "delay":
         return Delay(*fault.values)
-    return _WITH_LUCK[fault.name](rng, *fault.values)
+    return _RANDOM_FAULTS[fault.name](rng, *fault.values)

@@ -30,10 +30,10 @@ WIND_MPS: Final = 6.0
 
 STAND_S: Final = 4.0
 TOUR_REACH_M: Final = 110.0
-SHORTEST_HOP_M: Final = 50.0
+LEG_MIN_M: Final = 50.0
 
 ROLL_S: Final = 2.0
-STEEPEST_BANK_RAD: Final = math.radians(30.0)
+BANK_MAX_RAD: Final = math.radians(30.0)
 ANGLE_OF_ATTACK_RAD: Final = math.radians(3.0)
 
 PAIR_AZIMUTHS_DEG: Final = (-50.0, -25.0, 0.0, 25.0, 50.0)
@@ -108,7 +108,7 @@ def racing(index: int, seed: int) -> Vehicle:
         axis_rad=rng.uniform(0.0, math.tau),
         straight_m=rng.uniform(200.0, 400.0),
         speed_mps=speed_mps,
-        radius_m=speed_mps**2 / (GRAVITY_MPS2 * math.tan(STEEPEST_BANK_RAD)),
+        radius_m=speed_mps**2 / (GRAVITY_MPS2 * math.tan(BANK_MAX_RAD)),
         roll_s=ROLL_S,
         offset_s=rng.uniform(0.0, 60.0),
     )
@@ -190,7 +190,7 @@ def aircraft(uav_trajectory: Callable[[float], Motion]) -> tuple[Aircraft, ...]:
 
     def holding(north_m: float, east_m: float, height_m: float, speed_mps: float) -> Flight:
         centre_ned_m = (north_m, east_m, -height_m)
-        radius_m = speed_mps**2 / (GRAVITY_MPS2 * math.tan(STEEPEST_BANK_RAD))
+        radius_m = speed_mps**2 / (GRAVITY_MPS2 * math.tan(BANK_MAX_RAD))
         # Each place gives an axis and an offset that no other aircraft has.
         return Flight(
             Racetrack(
@@ -292,7 +292,7 @@ def _waypoints(rng: random.Random, centre_ned_m: Vector) -> tuple[Vector, ...]:
         )
         neighbours = [found[-1]] if found else []
         neighbours += found[:1] if len(found) == wanted - 1 else []
-        if all(math.dist(point[:2], other[:2]) >= SHORTEST_HOP_M for other in neighbours):
+        if all(math.dist(point[:2], other[:2]) >= LEG_MIN_M for other in neighbours):
             found.append(point)
     return tuple(found)
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from sitl_replay.flight.motion import Kinematics, Vector
 
-STEEPEST_RAMP: Final = 1.875
+MAX_RAMP_SLOPE: Final = 1.875
 """Largest slope of ``Ramp.value``: a ramp to v in T takes an acceleration of 1.875 v / T."""
 
 _nodes, _weights = np.polynomial.legendre.leggauss(8)
@@ -148,7 +148,7 @@ class Tour:
                 limits.speed_mps,
                 limits.climb_mps * length_m / max(abs(down), 1e-9),
                 # The speed at which the two ramps fill the leg.
-                math.sqrt(length_m * limits.acceleration_mps2 / STEEPEST_RAMP),
+                math.sqrt(length_m * limits.acceleration_mps2 / MAX_RAMP_SLOPE),
             )
             next_rad = headings_rad[(index + 1) % len(hops)]
             legs.append(
@@ -157,7 +157,7 @@ class Tour:
                     direction=(north / length_m, east / length_m, down / length_m),
                     length_m=length_m,
                     speed_mps=speed_mps,
-                    ramp_s=STEEPEST_RAMP * speed_mps / limits.acceleration_mps2,
+                    ramp_s=MAX_RAMP_SLOPE * speed_mps / limits.acceleration_mps2,
                     heading_rad=headings_rad[index],
                     turn_rad=math.remainder(next_rad - headings_rad[index], math.tau),
                     stand_s=stand_s,

@@ -35,7 +35,7 @@ PRESSURE_OFFSET_M: Final = -64.0
 """Error of pressure altitude in the scenarios: 1021 hPa at sea level."""
 
 UNKNOWN_U16: Final = 0xFFFF
-SLOWEST_COURSE_MPS: Final = 0.1
+COURSE_SPEED_MIN_MPS: Final = 0.1
 
 _HEARTBEAT: Final = struct.Struct("<IBBBBB")
 _GLOBAL_POSITION_INT: Final = struct.Struct("<IiiiihhhH")
@@ -141,21 +141,21 @@ def adsb_vehicle(sample: Sample, told: Relayed) -> Outgoing:
     climb_mps = -motion.velocity_ned_mps[2]
     garbage = _ADSB_VEHICLE.unpack(contact.garbage)
 
-    def told_or_garbage(flag: Valid, at: int, value: int | bytes) -> int | bytes:
+    def field_or_garbage(flag: Valid, at: int, value: int | bytes) -> int | bytes:
         return value if flag in valid else garbage[at]
 
     payload = _ADSB_VEHICLE.pack(
         aircraft.icao,
-        told_or_garbage(Valid.COORDS, 1, round(lat_deg * 1e7)),
-        told_or_garbage(Valid.COORDS, 2, round(lon_deg * 1e7)),
-        told_or_garbage(Valid.ALTITUDE, 3, round(alt_m * 1e3)),
-        told_or_garbage(Valid.HEADING, 4, course_cdeg),
-        told_or_garbage(Valid.VELOCITY, 5, round(100 * speed_mps)),
-        told_or_garbage(Valid.VERTICAL_VELOCITY, 6, round(100 * climb_mps)),
+        field_or_garbage(Valid.COORDS, 1, round(lat_deg * 1e7)),
+        field_or_garbage(Valid.COORDS, 2, round(lon_deg * 1e7)),
+        field_or_garbage(Valid.ALTITUDE, 3, round(alt_m * 1e3)),
+        field_or_garbage(Valid.HEADING, 4, course_cdeg),
+        field_or_garbage(Valid.VELOCITY, 5, round(100 * speed_mps)),
+        field_or_garbage(Valid.VERTICAL_VELOCITY, 6, round(100 * climb_mps)),
         valid,
-        told_or_garbage(Valid.SQUAWK, 8, aircraft.squawk),
-        told_or_garbage(Valid.ALTITUDE, 9, int(geometric)),
-        told_or_garbage(Valid.CALLSIGN, 10, aircraft.callsign.encode("ascii")),
+        field_or_garbage(Valid.SQUAWK, 8, aircraft.squawk),
+        field_or_garbage(Valid.ALTITUDE, 9, int(geometric)),
+        field_or_garbage(Valid.CALLSIGN, 10, aircraft.callsign.encode("ascii")),
         aircraft.emitter_type,
         tslc_s,
     )
@@ -166,7 +166,7 @@ def _over_ground(motion: Motion) -> tuple[float, int]:
     """Speed in m/s and course in centidegrees, ``UNKNOWN_U16`` if stationary."""
     north_mps, east_mps, _ = motion.velocity_ned_mps
     speed_mps = math.hypot(north_mps, east_mps)
-    moving = speed_mps > SLOWEST_COURSE_MPS
+    moving = speed_mps > COURSE_SPEED_MIN_MPS
     return speed_mps, _bearing_cdeg(math.atan2(east_mps, north_mps)) if moving else UNKNOWN_U16
 
 

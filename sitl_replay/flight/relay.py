@@ -18,10 +18,10 @@ from sitl_replay.flight.motion import Motion
 SQUITTER_INTERVAL_S: Final = 1.0
 SQUITTER_JITTER_S: Final = 0.05
 MISSED_SHARE: Final = 0.15  # share of squitters that are missed singly
-DEAF_SHARE: Final = 0.02  # share of squitters that start a time without reception
-DEAF_S: Final = (3.0, 5.0)  # minimum and maximum of that time
+OUTAGE_SHARE: Final = 0.02  # share of squitters that start a time without reception
+OUTAGE_S: Final = (3.0, 5.0)  # minimum and maximum of that time
 RELAY_INTERVAL_S: Final = (0.2, 2.6)  # minimum and maximum between two relayed messages
-OLDEST_S: Final = 3.0
+CONTENT_AGE_MAX_S: Final = 3.0
 """Age beyond which content is not sent again. A receiver is then never silent for 10 s."""
 GARBAGE_OCTETS: Final = 38  # length of the payload of ADSB_VEHICLE
 
@@ -105,19 +105,19 @@ def heard(aircraft: Aircraft, receiver: str, seed: int) -> Iterator[Contact]:
     After a missed one, and after a time without reception, the next one is received.
     """
     rng = random.Random(f"{seed} {receiver} hears {aircraft}")
-    deaf_until_s = 0.0
+    outage_end_s = 0.0
     certain = True
     for contact in squitters(aircraft, seed):
-        if contact.t_s < deaf_until_s:
+        if contact.t_s < outage_end_s:
             continue
         chance = rng.random()
-        if certain or chance >= MISSED_SHARE + DEAF_SHARE:
+        if certain or chance >= MISSED_SHARE + OUTAGE_SHARE:
             certain = False
             yield contact
             continue
         certain = True
-        if chance < DEAF_SHARE:
-            deaf_until_s = contact.t_s + rng.uniform(*DEAF_S)
+        if chance < OUTAGE_SHARE:
+            outage_end_s = contact.t_s + rng.uniform(*OUTAGE_S)
 
 
 def relayed(aircraft: Aircraft, receiver: str, seed: int) -> Iterator[Relayed]:
@@ -131,5 +131,5 @@ def relayed(aircraft: Aircraft, receiver: str, seed: int) -> Iterator[Relayed]:
         while after.t_s <= t_s:
             last, after = after, next(contacts)
         age_s = t_s - last.t_s
-        if age_s <= OLDEST_S:
+        if age_s <= CONTENT_AGE_MAX_S:
             yield Relayed(t_s, last, int(age_s))

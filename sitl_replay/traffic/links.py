@@ -62,7 +62,7 @@ class TrafficLink:
             up=self._up.set,
             take=self._take,
             stale=lambda *_: None,
-            hang_up=self._hang_up,
+            on_peer_gone=self._hang_up,
             overflow=lambda _: None,
         )
         self._endpoint = transport.endpoint(url, LinkStatus(url=str(url)), upcalls)
@@ -105,7 +105,7 @@ class TrafficLink:
         peers = self._endpoint.peers()
         return tuple(self._heard) if peers is None else peers
 
-    async def somebody(self) -> None:
+    async def first_peer(self) -> None:
         """Wait until there is a peer, or the link has ended."""
         while not self.peers() and not self.serving.done():
             await asyncio.sleep(_FIRST_PEER_POLL_S)
@@ -119,7 +119,7 @@ class TrafficLink:
         for key in peers:
             self.dropped += not self._endpoint.write(key, raw)
 
-    def knock(self) -> None:
+    def send_empty(self) -> None:
         """Send an empty datagram, for peers that answer only to senders they know.
 
         No effect on links other than ``udpout``.
@@ -129,10 +129,10 @@ class TrafficLink:
 
     async def writable(self) -> None:
         """Wait until there is a peer and all peers accept a frame, or the link has ended."""
-        await self.somebody()
-        while self._fullest() > FULL:
+        await self.first_peer()
+        while self._max_fullness() > FULL:
             await asyncio.sleep(_ROOM_POLL_S)
-            await self.somebody()
+            await self.first_peer()
 
     async def close(self) -> None:
         """Send the buffered data, within a second, and close.
@@ -141,14 +141,14 @@ class TrafficLink:
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LINGER_S):
-                while self._fullest() > 0.0:
+                while self._max_fullness() > 0.0:
                     await asyncio.sleep(_ROOM_POLL_S)
         self.serving.cancel()
         await asyncio.wait({self.serving})
         if not self.serving.cancelled():
             self.serving.result()
 
-    def _fullest(self) -> float:
+    def _max_fullness(self) -> float:
         return max((self._endpoint.fullness(key) for key in self.peers()), default=0.0)
 
     def _take(self, key: Hashable, data: bytes, _age_ns: int | None) -> None:

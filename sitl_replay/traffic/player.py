@@ -175,7 +175,7 @@ async def _opened(urls: Sequence[LinkUrl], tally: Tally) -> AsyncIterator[list[T
             if not endpoint.peers():
                 log.warning("%s: waiting for the first peer", endpoint.url)
         for endpoint in opened:
-            await endpoint.somebody()
+            await endpoint.first_peer()
         start_s = loop.time()
         yield opened
     finally:
@@ -192,7 +192,7 @@ class _Sending:
         self, *, endpoints: list[TrafficLink], network: Network, speed: float | None, tally: Tally
     ) -> None:
         self._endpoints = endpoints
-        self._there = list(endpoints)
+        self._open_links = list(endpoints)
         self._network = network
         self._speed = speed
         self._tally = tally
@@ -209,14 +209,14 @@ class _Sending:
             self._network.take(t_s, raw)
             for delivery in self._network.due(t_s):
                 await self._send(delivery)
-            self._drop_the_lost()
+            self._remove_ended_links()
         await self._send_held(math.inf)
 
     async def _send_held(self, until_s: float) -> None:
         for delivery in self._network.due(until_s):
             await self._until(delivery.t_s)
             await self._send(delivery)
-            self._drop_the_lost()
+            self._remove_ended_links()
 
     async def _until(self, t_s: float) -> None:
         """Wait until a time; let other tasks run even if there is no need to wait."""
@@ -232,14 +232,14 @@ class _Sending:
             await endpoint.writable()
         endpoint.send(delivery.raw)
 
-    def _drop_the_lost(self) -> None:
+    def _remove_ended_links(self) -> None:
         """Continue with the remaining links. Raises ``LinkError`` if there are none."""
-        gone = [f"{one.url}: {one.lost}" for one in self._there if one.lost]
+        gone = [f"{one.url}: {one.lost}" for one in self._open_links if one.lost]
         if not gone:
             return
         self._tally.lost += gone
-        self._there = [one for one in self._there if not one.lost]
-        if not self._there:
+        self._open_links = [one for one in self._open_links if not one.lost]
+        if not self._open_links:
             raise LinkError("; ".join(gone))
         for text in gone:
             log.warning("%s; continuing without this link", text)

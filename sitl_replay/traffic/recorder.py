@@ -56,7 +56,7 @@ class TlogWriter:
 
 
 @dataclass(slots=True, kw_only=True)
-class Heard:
+class RecordingTally:
     """Counts of a recording so far: frames, their bytes, and unusable data."""
 
     frames: int = 0
@@ -67,8 +67,8 @@ class Heard:
 
 
 async def record(
-    url: LinkUrl, out: Path, duration_s: float | None = None, *, heard: Heard | None = None
-) -> Heard:
+    url: LinkUrl, out: Path, duration_s: float | None = None, *, heard: RecordingTally | None = None
+) -> RecordingTally:
     """Record what arrives over ``url`` to the tlog ``out``.
 
     Nothing is sent, except over ``udpout``: an empty datagram each second until the first reply, to
@@ -77,25 +77,25 @@ async def record(
     Ends after ``duration_s``, when a TCP peer closes, when a serial port disappears, or on
     cancellation. Time stamps are Unix time at the start, continued with the monotonic clock, and
     never step back. Data is in the file after at most a second. Frames with a wrong checksum or an
-    unknown message id are counted in ``Heard.rejected`` and not written.
+    unknown message id are counted in ``RecordingTally.rejected`` and not written.
 
     Raises ``OSError`` if ``out`` cannot be written, and ``LinkError`` if the link cannot be opened,
     fails, or closes before ``duration_s``.
     """
-    heard = Heard() if heard is None else heard
+    heard = RecordingTally() if heard is None else heard
     loop = asyncio.get_running_loop()
     with TlogWriter(out) as writer:
-        ear = _Ear(url, writer, heard)
-        endpoint = await open_link(url, ear.take)
+        frame_writer = _FrameWriter(url, writer, heard)
+        endpoint = await open_link(url, frame_writer.take)
         if endpoint.url != url:
             log.warning("listening on %s", endpoint.url)
         start_s = loop.time()
         try:
-            ended = await _listen(endpoint, ear, duration_s)
+            ended = await _listen(endpoint, frame_writer, duration_s)
         finally:
             heard.duration_s = loop.time() - start_s
             await endpoint.close()
-            ear.finish()
+            frame_writer.finish()
     if ended and endpoint.broken:
         raise LinkError(f"{url}: {endpoint.lost}")
     if ended and duration_s is not None:
@@ -103,28 +103,30 @@ async def record(
     return heard
 
 
-async def _listen(endpoint: TrafficLink, ear: "_Ear", duration_s: float | None) -> bool:
+async def _listen(
+    endpoint: TrafficLink, frame_writer: "_FrameWriter", duration_s: float | None
+) -> bool:
     """Receive until the duration is over (False) or the link has ended (True)."""
     loop = asyncio.get_running_loop()
     end_s = math.inf if duration_s is None else loop.time() + duration_s
     while (left_s := end_s - loop.time()) > 0.0:
-        if not ear.has_heard:
-            endpoint.knock()
+        if not frame_writer.has_heard:
+            endpoint.send_empty()
         waited_s = min(FLUSH_EVERY_NS * 1e-9, left_s)
-        ends: set[asyncio.Future[Any]] = {ear.failed, endpoint.serving}
+        ends: set[asyncio.Future[Any]] = {frame_writer.failed, endpoint.serving}
         await asyncio.wait(ends, timeout=waited_s, return_when=asyncio.FIRST_COMPLETED)
-        if ear.failed.done():
-            raise ear.failed.result()
+        if frame_writer.failed.done():
+            raise frame_writer.failed.result()
         if endpoint.serving.done():
             return True
-        ear.writer.flush()
+        frame_writer.writer.flush()
     return False
 
 
-class _Ear:
+class _FrameWriter:
     """Splits the bytes of peers into frames and writes them."""
 
-    def __init__(self, url: LinkUrl, writer: TlogWriter, heard: Heard) -> None:
+    def __init__(self, url: LinkUrl, writer: TlogWriter, heard: RecordingTally) -> None:
         self.writer = writer
         self.failed: asyncio.Future[OSError] = asyncio.get_running_loop().create_future()
         """Done if the file cannot be written, with the error."""

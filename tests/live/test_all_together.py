@@ -20,7 +20,7 @@ from websockets.asyncio.client import connect
 
 from companion.mavlink.wire.encode import heartbeat, pack
 from companion.node.replay import replay, settings_for
-from companion.recording.parts import read_story
+from companion.recording.parts import read_recording_info
 from companion.recording.recover import recover_leftovers
 from companion.values import Source
 
@@ -234,7 +234,9 @@ def test_whatever_goes_wrong_at_once_it_goes_on_and_all_is_recorded(
     assert code == 0, err
     shutil.copytree(small_disk, kept, dirs_exist_ok=True)
     recover_leftovers(kept)  # as the next start does, of what the full disk cut short
-    parts = sorted(kept.iterdir(), key=lambda path: getattr(read_story(path).part, "number", 0))
+    parts = sorted(
+        kept.iterdir(), key=lambda path: getattr(read_recording_info(path).part, "number", 0)
+    )
     settings = settings_for(parts, None, None)
     summary = replay(parts, settings)
     tell(table, seconds, Seen(healthy_s, memory, page.ages_s))

@@ -15,7 +15,7 @@ import pytest
 from support import BIN, HANG_S, ROOT, Node, end, read_metadata
 
 from companion.node.replay import replay, settings_for
-from companion.recording.parts import read_story
+from companion.recording.parts import read_recording_info
 from companion.recording.reader import read_parts
 from companion.recording.recover import Recovered, recover_leftovers
 from companion.values import Frame
@@ -104,7 +104,8 @@ def test_the_parts_of_a_run_replay_to_its_digest(start_node: Any, tmp_path: Path
     code, out, err = node.stop()
     assert code == 0, err
     logs = sorted(
-        (tmp_path / "kept").iterdir(), key=lambda path: getattr(read_story(path).part, "number", 0)
+        (tmp_path / "kept").iterdir(),
+        key=lambda path: getattr(read_recording_info(path).part, "number", 0),
     )
     assert len(logs) >= 4
     assert all(log.suffix == ".mcap" for log in logs)

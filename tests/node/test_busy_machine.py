@@ -171,11 +171,11 @@ def test_what_comes_while_beams_are_made_is_taken_in_and_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However long it takes to make them; a replay takes all in the same order."""
-    held, sighted = threading.Event(), Pipeline.sighted
+    held, prepare_update = threading.Event(), Pipeline.prepare_update
     held.set()
 
     def slow(pipeline: Pipeline, now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
-        make = sighted(pipeline, now_ns, lead_s)
+        make = prepare_update(pipeline, now_ns, lead_s)
 
         def made() -> Update:
             if threading.current_thread().name.startswith("beams"):
@@ -184,7 +184,7 @@ def test_what_comes_while_beams_are_made_is_taken_in_and_answered(
 
         return made
 
-    monkeypatch.setattr(Pipeline, "sighted", slow)
+    monkeypatch.setattr(Pipeline, "prepare_update", slow)
 
     async def course(flight: Flight) -> None:
         service = flight.service

@@ -58,9 +58,9 @@ def test_the_sky_is_one_that_the_pipeline_believes() -> None:
         Settings().override(center={"source": "47.0,8.0,500.0"}, beams={"targets": "all"})
     )
     refused = []
-    sources = {one.source for one in capacity._sky(3, 10.0) if isinstance(one, Frame)}
+    sources = {one.source for one in capacity._traffic(3, 10.0) if isinstance(one, Frame)}
     assert sources == {Source(sysid=number, compid=1) for number in (1, 2, 3)}
-    for event in capacity._sky(capacity.MORE, 10.0):
+    for event in capacity._traffic(capacity.MORE, 10.0):
         refused += [x for x in pipeline.step(event) if isinstance(x, Rejection)]
     assert refused == []
     assert pipeline.last_update is not None

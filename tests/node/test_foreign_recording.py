@@ -23,7 +23,7 @@ from companion.recording.container import Walk
 from companion.recording.reader import read_log, read_settings
 from companion.recording.writer import Writer
 from companion.settings.files import load
-from companion.settings.model import MODELLED, NAMED_FILES, Settings
+from companion.settings.model import NAMED_FILES, REPLAYED_SECTIONS, Settings
 from companion.settings.section import ConfigError
 from companion.values import Frame
 
@@ -240,14 +240,14 @@ def test_each_key_that_names_a_file_is_known() -> None:
     """A new one must say what takes its place in a recording, or stay out of what is taken."""
     paths = {
         (section, key)
-        for section in MODELLED
+        for section in REPLAYED_SECTIONS
         for key, field in type(getattr(Settings(), section)).model_fields.items()
         if field.annotation == str | None and field.metadata == []
     }
     named = {(file.section, file.key) for file in NAMED_FILES}
     assert paths - {("center", "source"), ("array", "positions")} == named
     assert Settings().model_fields_set == set()
-    assert set(Settings.model_fields) - MODELLED == set(PATHS)
+    assert set(Settings.model_fields) - REPLAYED_SECTIONS == set(PATHS)
 
 
 @pytest.mark.parametrize(

@@ -6,7 +6,7 @@ import socket
 from support import ROOT, free_port, run_async
 
 from companion.node import moment
-from companion.node.push import WELL, Push
+from companion.node.push import RECOVERED_AFTER, Push
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.settings.outlets import RecordSettings
@@ -37,13 +37,13 @@ def test_who_does_not_listen_is_said_once_and_that_it_does_after_a_while() -> No
                 await asyncio.sleep(0)
                 await asyncio.sleep(0)
 
-        await pushed(WELL)  # every second one is told that the one before was refused
+        await pushed(RECOVERED_AFTER)  # every second one is told that the one before was refused
         assert [one.text.partition(":")[2] for one in notices] == [
             f"{to[1]} fail: Connection refused"
         ]
         with socket.socket(type=socket.SOCK_DGRAM) as listener:
             listener.bind(to)
-            await pushed(WELL + 1)
+            await pushed(RECOVERED_AFTER + 1)
         assert [one.text for one in notices[1:]] == [f"records to {to[0]}:{to[1]} are sent again"]
         task.cancel()
 

@@ -46,7 +46,9 @@ def test_each_figure_of_a_running_recording_is_its_own() -> None:
 
 def test_news_of_a_recorder_are_notices_about_the_recording() -> None:
     service: Any = Service(settings=SETTINGS, say=lambda _: None)
-    service._tell_of_recorder(SimpleNamespace(news=lambda: [(Severity.ERROR, "the disk is full")]))
+    service._notify_recorder_state(
+        SimpleNamespace(news=lambda: [(Severity.ERROR, "the disk is full")])
+    )
     newest = service.notices[-1]
     assert (newest.severity, newest.subject, newest.text) == (
         Severity.ERROR,

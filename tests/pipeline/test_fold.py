@@ -954,7 +954,7 @@ def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyP
     """Invented senders do not fill the memory; who has a track, and the carrier, keep theirs."""
     monkeypatch.setattr("companion.pipeline.records.RECORDS_MAX", 10)
     monkeypatch.setattr("companion.pipeline.senders.RECORDS_MAX", 10)
-    monkeypatch.setattr("companion.pipeline.records.DROPPED_AT_ONCE", 2)
+    monkeypatch.setattr("companion.pipeline.records.DROPPED_TOGETHER", 2)
     pipeline = Pipeline(settings(tracks={"most": 2}))
     pipeline.step(attitude(0, "5:1"))  # the carrier has no position, and so no track
     for sysid in range(11, 61):

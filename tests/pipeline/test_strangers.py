@@ -11,7 +11,7 @@ from pymavlink.dialects.v20 import common
 from companion.mavlink.trust.admission import KNOWN_MAX, admission
 from companion.pipeline.center import CarrierTracker
 from companion.pipeline.fold import Pipeline
-from companion.pipeline.records import DROPPED_AT_ONCE, RECORDS_MAX, Records, UavRecord
+from companion.pipeline.records import DROPPED_TOGETHER, RECORDS_MAX, Records, UavRecord
 from companion.pipeline.senders import PlacedAttitude, Senders
 from companion.settings.model import Settings
 from companion.tracking.observers.position import PositionModel, PositionObserver
@@ -140,7 +140,7 @@ def made_senders(carrier: str | None, tracked: Container[str]) -> Senders:
 def test_clocks_are_forgotten_between_ticks_and_those_of_tracks_are_kept() -> None:
     tracked = {str(Source(number, 1)) for number in range(0, 200, 10)}
     senders = made_senders("255:1", tracked)
-    for number in range(RECORDS_MAX + 2 * DROPPED_AT_ONCE):
+    for number in range(RECORDS_MAX + 2 * DROPPED_TOGETHER):
         source = Source(255 - number % 256, 1 + number // 256)
         senders.round_trip(RoundTrip(t_ns=2 * S, source=source, sent_ns=S, remote_ns=1))
         assert len(senders._senders) <= RECORDS_MAX
@@ -158,7 +158,7 @@ def test_more_tracks_than_clocks_leave_all_of_them_their_own() -> None:
 
     everyone = Everyone()
     senders = made_senders(None, everyone)
-    many = RECORDS_MAX + 3 * DROPPED_AT_ONCE
+    many = RECORDS_MAX + 3 * DROPPED_TOGETHER
     for number in range(many):
         senders.round_trip(
             RoundTrip(

@@ -19,7 +19,7 @@ from support import BALLAST, HANG_S, ROOT, fill, read_metadata
 from companion.node.replay import log_events, missing
 from companion.recording import background
 from companion.recording.background import BackgroundRecorder, Rotation
-from companion.recording.parts import Hole, Part, read_story
+from companion.recording.parts import Hole, Part, read_recording_info
 from companion.recording.reader import read_log, utc_offset_ns
 from companion.recording.writer import Writer
 from companion.settings.model import Settings
@@ -111,7 +111,7 @@ def hand_over(made: BackgroundRecorder, events: list[Event]) -> list[Event]:
 
 def parts_of(folder: Path) -> list[Path]:
     found = [path for path in folder.iterdir() if ".mcap" in path.name]
-    return sorted(found, key=lambda path: read_story(path).part or Part("", 0, ""))
+    return sorted(found, key=lambda path: read_recording_info(path).part or Part("", 0, ""))
 
 
 def test_who_lives_for_a_moment_leaves_what_it_heard(tmp_path: Path) -> None:
@@ -214,8 +214,8 @@ def test_what_fits_into_little_room_is_kept_of_what_waits(
     """All that waited had to fit at once, and was written anew by each attempt."""
     monkeypatch.setattr(background, "RETRY_FIRST_S", 0.05)
     monkeypatch.setattr(background, "RETRY_MAX_S", 0.05)
-    monkeypatch.setattr(background, "ROOM_BYTES", 0)
-    monkeypatch.setattr(background, "GO_ON_WITH", 100)
+    monkeypatch.setattr(background, "MIN_FREE_BYTES", 0)
+    monkeypatch.setattr(background, "RESUME_BATCH", 100)
     made = recorder(small_disk)
     made.start()
     events = hand_over(made, ticks(1, 100))
@@ -256,7 +256,7 @@ def test_an_outage_longer_than_the_queue_is_a_hole_that_is_told(small_disk: Path
     assert events[:99] == head and events[-100:] == tail
     assert len(events) + dropped == 5099
     hole = Hole(START_NS + 5000, dropped, "No space left on device")
-    assert [hole] == [hole for log in logs for hole in read_story(log).holes]
+    assert [hole] == [hole for log in logs for hole in read_recording_info(log).holes]
     assert len(missing(logs)) == 1 and f"{dropped} events" in missing(logs)[0]
     assert [severity for severity, _ in made.news()] == ["error", "info", "info"]
 
@@ -370,7 +370,7 @@ def test_a_slow_disk_drops_counts_and_tells(
     os.close(writing)
     (path,) = tmp_path.iterdir()
     assert list(read_log(path)) == [Tick(START_NS), *head, *tail]
-    assert read_story(path).holes == (Hole(START_NS + 1501, 500, "the disk was too slow"),)
+    assert read_recording_info(path).holes == (Hole(START_NS + 1501, 500, "the disk was too slow"),)
     assert [text for _, text in made.news()] == [
         "some events are not recorded: the disk is too slow",
         "recording again: 500 events are missing",
@@ -398,7 +398,7 @@ def test_a_hole_in_the_queue_counts_events_alone(tmp_path: Path) -> None:
     made.stop({})
     (path,) = tmp_path.iterdir()
     assert list(read_log(path)) == [*ticks(1, 3), *ticks(5, 6)]
-    assert read_story(path).holes == (Hole(START_NS + 5, 2, "the disk was too slow"),)
+    assert read_recording_info(path).holes == (Hole(START_NS + 5, 2, "the disk was too slow"),)
 
 
 class _Broken(Writer):
@@ -442,7 +442,7 @@ def test_a_hole_in_a_broken_file_counts_events_alone(
     assert made.dropped == 5
     (path,) = sound.iterdir()
     assert list(read_log(path)) == ticks(3, 4)
-    (hole,) = read_story(path).holes
+    (hole,) = read_recording_info(path).holes
     assert (hole.events, hole.why) == (2, os.strerror(errno.EIO))
 
 
@@ -471,7 +471,7 @@ def test_a_new_part_goes_on_where_the_one_before_ends(tmp_path: Path, rotation: 
     made.stop({"digest": "last"})
     logs = parts_of(tmp_path)
     assert len(logs) == 3 and all(log.suffix == ".mcap" for log in logs)
-    stories = [read_story(log).part for log in logs]
+    stories = [read_recording_info(log).part for log in logs]
     assert [part and part.number for part in stories] == [1, 2, 3]
     assert [part and part.continues for part in stories] == ["", logs[0].name, logs[1].name]
     assert len({part and part.run for part in stories}) == 1

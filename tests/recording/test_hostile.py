@@ -17,7 +17,7 @@ from support import HANG_S
 from companion.recording import schemas
 from companion.recording.container import LARGEST, MAGIC, Damage, Message, Walk
 from companion.recording.mcap_file import McapFile
-from companion.recording.parts import EVENTS_MAX, HOLE, HOLES_MAX, Hole, Part, read_story
+from companion.recording.parts import EVENTS_MAX, HOLE, HOLES_MAX, Hole, Part, read_recording_info
 from companion.recording.reader import LogError, read_log, read_settings, utc_offset_ns
 from companion.recording.recover import Recovered, recover, recover_leftovers
 from companion.recording.writer import Writer
@@ -158,13 +158,13 @@ def _damaged_at_random(tmp_path: Path, events: Callable[[int], list[Event]], see
     folder.mkdir()
     for seed in seeds:
         (folder / "x.mcap.active").write_bytes(damaged(whole, random.Random(seed)))
-        for read in (read_log, read_settings, read_story):
+        for read in (read_log, read_settings, read_recording_info):
             try:
                 found = read(folder / "x.mcap.active")
                 if read is read_log:
                     assert all(event.t_ns >= 0 for event in found)
             except (LogError, ValueError) as error:
-                assert isinstance(error, LogError) or read is read_story, (seed, error)
+                assert isinstance(error, LogError) or read is read_recording_info, (seed, error)
         (told,) = recover_leftovers(folder)
         assert not isinstance(told, LogError), (seed, told)
         told.path.unlink()
@@ -262,11 +262,11 @@ PAIRS = frozenset(("channel-pairs", "metadata-pairs", "metadata", "attachments")
 _READ_ALL = r"""
 import re, sys
 from pathlib import Path
-from companion.recording.parts import read_story
+from companion.recording.parts import read_recording_info
 from companion.recording.reader import LogError, read_log, read_settings
 from companion.recording.recover import recover
 for path in map(Path, sys.argv[1:]):
-    for work in (read_settings, read_story, lambda p: sum(1 for _ in read_log(p)), recover):
+    for work in (read_settings, read_recording_info, lambda p: len(list(read_log(p))), recover):
         try:
             work(path)
         except LogError as error:
@@ -420,7 +420,7 @@ def test_settings_that_are_no_text_are_said(tmp_path: Path) -> None:
 def test_holes_without_number_are_counted_together(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(MAGIC + record(METADATA, _hole()) * (HOLES_MAX + 5))
-    holes = read_story(path).holes
+    holes = read_recording_info(path).holes
     assert len(holes) == HOLES_MAX
     assert holes[-1].events == 2 * 6
 
@@ -437,7 +437,7 @@ def test_a_hole_says_nothing_that_a_terminal_obeys_and_no_number_beyond_all(tmp_
     pairs = {b"t_ns": b"5", b"events": most, b"why": b"x"}
     body = text(b"".join(text(key) + text(value) for key, value in pairs.items()))
     path.write_bytes(MAGIC + record(METADATA, text(HOLE.encode()) + body) * (HOLES_MAX + 5))
-    assert read_story(path).holes[-1].events == EVENTS_MAX
+    assert read_recording_info(path).holes[-1].events == EVENTS_MAX
 
 
 @pytest.mark.parametrize("number", ["9" * 10, "9" * 5000])

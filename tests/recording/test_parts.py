@@ -12,7 +12,7 @@ from companion.node.replay import log_events, replay, settings_for
 from companion.node.replay import missing as missing_of
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
-from companion.recording.parts import Hole, Part, in_order, missing, read_story
+from companion.recording.parts import Hole, Part, in_order, missing, read_recording_info
 from companion.recording.reader import LogError, read_log
 from companion.recording.recover import recover
 from companion.recording.writer import Writer
@@ -74,7 +74,7 @@ def test_a_recovered_part_keeps_its_place(
     logs, events, _ = run_in_three
     cut = tmp_path / "d.mcap.active"
     cut.write_bytes(logs[1].read_bytes()[:-400])
-    assert read_story(recover(cut).path) == read_story(logs[1])
+    assert read_recording_info(recover(cut).path) == read_recording_info(logs[1])
     assert list(log_events([logs[0], tmp_path / "d.mcap", logs[2]], Settings())) == events
 
 
@@ -89,7 +89,7 @@ def test_what_is_not_there_is_said(run_in_three: tuple[list[Path], list[Event], 
 def test_a_hole_is_said_where_it_is(tmp_path: Path) -> None:
     part = Part.first()
     path = write(tmp_path / "a.mcap", part, [Tick(7)], Hole(START_NS, 12, "no room"))
-    assert read_story(path).holes == (Hole(START_NS, 12, "no room"),)
+    assert read_recording_info(path).holes == (Hole(START_NS, 12, "no room"),)
     assert missing_of([path]) == [
         f"{path}: 12 events before 2023-11-14T22:13:20+00:00 are missing: no room"
     ]
@@ -110,7 +110,7 @@ def test_a_part_twice_is_refused(tmp_path: Path) -> None:
 def test_different_runs_are_merged_by_time_as_before(tmp_path: Path, alone: bool) -> None:
     one = write(tmp_path / "a.mcap", None if alone else Part.first(), [Tick(1), Tick(3)])
     other = write(tmp_path / "b.mcap", Part.first(), [Tick(2)])
-    assert in_order({log: read_story(log) for log in (one, other)}) is None
+    assert in_order({log: read_recording_info(log) for log in (one, other)}) is None
     assert list(log_events([one, other], Settings())) == []  # ticks of their own are made
 
 

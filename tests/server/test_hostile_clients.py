@@ -189,7 +189,7 @@ def test_a_stream_is_not_opened_under_another_name(make_node: Any) -> None:
 def test_streams_leave_connections_for_questions(
     make_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("companion.server.stream.MOST_CLIENTS", 1)
+    monkeypatch.setattr("companion.server.stream.CLIENTS_MAX", 1)
 
     async def streamed() -> None:
         async with served(make_node()) as port:
@@ -259,7 +259,7 @@ def test_a_pattern_of_everything_is_not_drawn(
     node.tick(0.0)
     with TestClient(create_app(node), "http://localhost") as client:
         assert client.get("/v1/pattern?points=3601").status_code == 200
-        monkeypatch.setattr("companion.server.beam_routes.MOST_ANGLES", 14_000)
+        monkeypatch.setattr("companion.server.beam_routes.ANGLES_MAX", 14_000)
         told = client.get("/v1/pattern?points=3600")
         assert told.status_code == 422
         assert (
@@ -275,7 +275,7 @@ def test_a_codebook_is_asked_no_more_than_can_be_answered(
     node = make_node(array={"kind": "ura", "rows": 16, "columns": 16}, codebook={"kind": "dft"})
     node.tick(0.0)
     work = list[int]()
-    best, contest = codebooks._best, codebooks._contest
+    best, contest = codebooks._best, codebooks._possible_beams
 
     def counted_best(codebook: Any, array: Any, unit: Any) -> Any:
         work.append(codebook.weights.size * len(unit))
@@ -286,12 +286,12 @@ def test_a_codebook_is_asked_no_more_than_can_be_answered(
         return contest(cones, boxes, weights)
 
     monkeypatch.setattr(codebooks, "_best", counted_best)
-    monkeypatch.setattr(codebooks, "_contest", counted_contest)
+    monkeypatch.setattr(codebooks, "_possible_beams", counted_contest)
     told = _codebook_answers(node)
     spent = sum(work)
     monkeypatch.setattr(codebooks, "MOST_TERMS", 2**20)
     monkeypatch.setattr(codebooks, "MOST_TERMS_AT_FIRST", 2**22)
-    monkeypatch.setattr(beam_state, "MOST_RESPONSES", 2**20)
+    monkeypatch.setattr(beam_state, "RESPONSES_MAX", 2**20)
     work.clear()
     less = _codebook_answers(node)
     assert sum(work) < spent / 4

@@ -18,10 +18,10 @@ pytestmark = pytest.mark.anyio
 @pytest.fixture
 def moments(shared_node: Any, monkeypatch: pytest.MonkeyPatch) -> Moments:
     shared_node.looks = []
-    sighted = shared_node.pipeline.sighted
+    prepare_update = shared_node.pipeline.prepare_update
 
     def counted(now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
-        made = sighted(now_ns, lead_s)
+        made = prepare_update(now_ns, lead_s)
 
         def counted_too() -> Update:
             shared_node.looks.append(threading.current_thread())
@@ -30,7 +30,7 @@ def moments(shared_node: Any, monkeypatch: pytest.MonkeyPatch) -> Moments:
 
         return counted_too
 
-    monkeypatch.setattr(shared_node.pipeline, "sighted", counted)
+    monkeypatch.setattr(shared_node.pipeline, "prepare_update", counted)
     return Moments(shared_node, WorkSlots())
 
 
@@ -73,7 +73,7 @@ async def test_beams_are_made_off_the_event_loop(moments: Moments, shared_node: 
 async def test_who_finds_no_room_costs_no_prediction(
     shared_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(shared_node.pipeline, "sighted", lambda *_: pytest.fail("predicted"))
+    monkeypatch.setattr(shared_node.pipeline, "prepare_update", lambda *_: pytest.fail("predicted"))
     with pytest.raises(HTTPException) as refused:
         await Moments(shared_node, WorkSlots(0, 0)).made(0.0, "npy", lambda update: update)
     assert refused.value.status_code == 503

@@ -11,7 +11,7 @@ from companion.node.replay import Run
 from companion.pipeline.ticks import with_ticks
 from companion.recording.reader import read_log
 from companion.recording.writer import Writer
-from companion.settings.model import MODELLED, Settings
+from companion.settings.model import REPLAYED_SECTIONS, Settings
 from companion.values import Event, UserError
 
 FLOWN_NS: Final = 4_000_000_000
@@ -143,7 +143,7 @@ def test_the_flight_has_beams(flight: list[Event], tmp_path: Path) -> None:
     assert flown(settings, flight, tmp_path / "x.mcap") > 0
 
 
-@pytest.mark.parametrize("key", [key for key in keys() if key.split(".")[0] in MODELLED])
+@pytest.mark.parametrize("key", [key for key in keys() if key.split(".")[0] in REPLAYED_SECTIONS])
 def test_at_its_limits_a_number_flies_or_is_a_line(
     flight: list[Event], tmp_path: Path, key: str
 ) -> None:

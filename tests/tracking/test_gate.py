@@ -139,9 +139,9 @@ def test_a_suspect_that_is_late_or_came_twice_counts_for_nothing(fix: MakeFix) -
 
 def test_a_run_goes_on_for_as_long_as_it_is_not_forgotten(fix: MakeFix) -> None:
     run = taking_turns(fix, [0, 1, 2, 3])
-    assert run.goes_on(3 * S)
-    assert run.goes_on(13 * S - 1)
-    assert not run.goes_on(13 * S)
+    assert run.is_consistent(3 * S)
+    assert run.is_consistent(13 * S - 1)
+    assert not run.is_consistent(13 * S)
 
 
 def test_a_run_that_did_not_take_turns_is_no_second_vehicle(fix: MakeFix) -> None:
@@ -149,10 +149,10 @@ def test_a_run_that_did_not_take_turns_is_no_second_vehicle(fix: MakeFix) -> Non
     run = suspects(fix, [0, 1, 2, 3])
     run.interrupt()
     run.interrupt()
-    assert not run.goes_on(4 * S)
+    assert not run.is_consistent(4 * S)
     run.add(fix(5 * S, [50, 0, 0], [10, 0, 0]))
-    assert not run.goes_on(5 * S)
-    assert not taking_turns(fix, [0, 1, 2]).goes_on(2 * S)
+    assert not run.is_consistent(5 * S)
+    assert not taking_turns(fix, [0, 1, 2]).is_consistent(2 * S)
 
 
 def taking_turns(fix: MakeFix, times_s: list[float]) -> Suspects:

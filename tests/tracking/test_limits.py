@@ -13,7 +13,7 @@ from support import examples
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.tracking.limits import (
-    FADES_S,
+    DECAY_S,
     RAISED,
     Airframe,
     RaisedLimit,
@@ -114,7 +114,7 @@ def test_a_turn_beyond_the_limit_is_proven_raised_and_fades(fix: Callable[..., F
     raised = known.limits(COPTER, 3 * S)
     assert raised.limits_source is LimitSource.RAISED
     assert 4.0 < raised.acceleration_max_mps2 <= RAISED * 8.0
-    later = known.limits(COPTER, round((3 + 3 * FADES_S) * S))
+    later = known.limits(COPTER, round((3 + 3 * DECAY_S) * S))
     assert 4.0 < later.acceleration_max_mps2 < 4.7
     assert later.speed_max_mps == 60.0
 

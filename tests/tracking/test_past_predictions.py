@@ -124,7 +124,7 @@ def test_in_a_turn_the_velocity_turns(
     speed_mps: float, heading: float, across_mps2: float, along_mps2: float, ahead_s: float
 ) -> None:
     """Against small steps; and no further from straight flight than what is across could go."""
-    way = AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0, turns=True)
+    way = AccelerationModel(window_s=1.0, min_velocities=3, decay_s=3.0, turns=True)
     direction = np.array([math.cos(heading), math.sin(heading)])
     aside = np.array([-direction[1], direction[0]])
     given = along_mps2 * direction + across_mps2 * aside
@@ -145,8 +145,8 @@ def test_in_a_turn_the_velocity_turns(
 
 def test_who_stands_has_no_direction_to_turn() -> None:
     turning, straight = (
-        AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0, turns=True),
-        AccelerationModel(window_s=1.0, fewest=3, fades_s=3.0),
+        AccelerationModel(window_s=1.0, min_velocities=3, decay_s=3.0, turns=True),
+        AccelerationModel(window_s=1.0, min_velocities=3, decay_s=3.0),
     )
     stands = (0.5, -0.5, 1.0)
     for ahead_s in (0.1, 2.0):
@@ -190,11 +190,11 @@ def test_over_a_gap_nothing_is_smoothed(fix: Callable[..., Fix]) -> None:
         assert hindsight.smoothing_offset == (0.0, 0.0, 0.0)
 
 
-@pytest.mark.parametrize("fades_s", [3.0, 10.0])
-def test_a_fading_acceleration(fades_s: float) -> None:
+@pytest.mark.parametrize("decay_s", [3.0, 10.0])
+def test_a_fading_acceleration(decay_s: float) -> None:
     """Against the integral, twice."""
     times = np.linspace(0, 2.0, 20001)
-    speeds = np.concatenate([[0], np.cumsum(np.exp(-(times[:-1] + 5e-5) / fades_s) * 1e-4)])
-    way, gain = fading_response(2.0, fades_s)
+    speeds = np.concatenate([[0], np.cumsum(np.exp(-(times[:-1] + 5e-5) / decay_s) * 1e-4)])
+    way, gain = fading_response(2.0, decay_s)
     assert gain == pytest.approx(speeds[-1], rel=1e-6)
     assert way == pytest.approx(float(np.trapezoid(speeds, times)), rel=1e-6)

@@ -20,7 +20,7 @@ from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import Array
 from companion.values import ComplexArray, FloatArray
 
-POWERS_PAY: Final = 1000
+MIN_ENTRIES_FOR_POWERS: Final = 1000
 """Entries of a steering matrix from which powers are cheaper than exponentials."""
 
 
@@ -50,7 +50,7 @@ def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
 
 def phase_factors(array: Array, directions: FloatArray) -> ComplexArray:
     """Steering vectors (M, N) without the elements' pattern, for unit directions (N, 3)."""
-    if array.grid is not None and array.size * len(directions) >= POWERS_PAY:
+    if array.grid is not None and array.size * len(directions) >= MIN_ENTRIES_FOR_POWERS:
         return _on_grid(array, directions, *array.grid)
     phase = array.wavenumber_radpm * (array.elements_m @ directions.T)
     factors: ComplexArray = np.empty(phase.shape, dtype=complex)

@@ -21,7 +21,7 @@ from companion.beams.worth.cone import Boxes, DirectionCones
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, UserError
 
 LEVELS: Final = 12  # most rounds of splitting cells
-MOST_RESPONSES: Final = 2**18
+RESPONSES_MAX: Final = 2**18
 """Limit on beams times cells examined per query; a started round is finished."""
 MOST_TERMS: Final = 2**26
 """Limit on beams times cells times elements per query: it matters for arrays above 256 elements."""
@@ -147,7 +147,7 @@ def _best(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[IntArray,
 
 def _gains(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Gains (K, N) of all beams towards unit directions, and their common factor (N,)."""
-    if cone.faces_apart(array) or array.live is not None or array.coupling is not None:
+    if cone.has_distinct_patterns(array) or array.live is not None or array.coupling is not None:
         power = np.abs(codebook.weights.T @ steering.steering_matrix(array, unit)) ** 2
         return power, np.ones(len(unit))
     phase = array.wavenumber_radpm * (array.elements_m @ unit.T)
@@ -193,9 +193,9 @@ def candidates(
     boxes = cone.first_boxes(cones)
     if len(boxes.cone) * codebook.weights.size > share * MOST_TERMS_AT_FIRST:
         return np.arange(codebook.size)
-    spent, most = 0, share * min(MOST_RESPONSES, MOST_TERMS // array.size)
+    spent, most = 0, share * min(RESPONSES_MAX, MOST_TERMS // array.size)
     for level in range(LEVELS):
-        possible, seen = _contest(cones, boxes, carried[:, alive])
+        possible, seen = _possible_beams(cones, boxes, carried[:, alive])
         found[alive[seen]] = True
         in_doubt: BoolArray = np.any(possible & ~found[alive, np.newaxis], axis=0)
         alive = alive[possible[:, in_doubt].any(axis=1)]
@@ -207,7 +207,7 @@ def candidates(
     return np.flatnonzero(found)
 
 
-def _contest(
+def _possible_beams(
     cones: DirectionCones, boxes: Boxes, weights: ComplexArray
 ) -> tuple[BoolArray, BoolArray]:
     """Beams that can be best somewhere in each box, (K, C), and those best at any middle, (K,)."""

@@ -204,7 +204,7 @@ def quantise(
     """
     factors = np.ones(len(weights), dtype=complex) if channel is None else channel
     metric = _metric(len(weights), towards, emphasis)
-    wanted = _wanted(weights, factors)
+    wanted = _target_factors(weights, factors)
     strongest = int(np.argmax(np.abs(wanted)))
     starts = _best_rotations(wanted, settings, metric, weights, factors)
     codes = _descend(
@@ -217,7 +217,7 @@ def quantise(
     return Quantised(codes[best], radiated[best], max(1 - float(score[best]) / whole, 0.0))
 
 
-def _wanted(weights: ComplexArray, factors: ComplexArray) -> ComplexArray:
+def _target_factors(weights: ComplexArray, factors: ComplexArray) -> ComplexArray:
     """Factors wanted of the settings: weights over channels, the strongest of amplitude 1."""
     if weights.ndim != 1 or factors.shape != weights.shape:
         raise ValueError(f"weights {weights.shape} and channels {factors.shape}: both must be (M,)")

@@ -17,11 +17,11 @@ import numpy as np
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights.shapes import Aperture
-from companion.beams.worth.cone import faces_apart
+from companion.beams.worth.cone import has_distinct_patterns
 from companion.values import ComplexArray, FloatArray, IntArray
 
-FINER: Final = 6  # samples per natural width of a line
-FINER_IN_PLANE: Final = 8  # the same on each axis of a plane
+SAMPLES_PER_WIDTH: Final = 6  # samples per natural width of a line
+SAMPLES_PER_WIDTH_IN_PLANE: Final = 8  # the same on each axis of a plane
 EDGE: Final = 0.25  # distance beyond a cone, in sample steps, at which a sample counts half
 MOST_INCLINED: Final = 0.95
 """Inclination at which ellipses are clipped: more inclined cones reach behind the plane."""
@@ -129,22 +129,22 @@ def cones(
     ``seen`` has the cones of the bound and of the likely angle; ``centres`` (M, N) are the steering
     vectors of the directions.
     """
-    if array.grid is None or faces_apart(array) or array.coupling is not None:
-        return _asked(array, across, directions, seen)
-    waves, counts = _about(across, seen, array.grid, array.wavelength_m)
+    if array.grid is None or has_distinct_patterns(array) or array.coupling is not None:
+        return _ring_samples(array, across, directions, seen)
+    waves, counts = _grid_samples(across, seen, array.grid, array.wavelength_m)
     turns = centres / np.maximum(np.abs(centres).max(axis=0), 1e-300)
     nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
     return ConeSamples(turns=turns, waves=tuple(waves), vectors=nothing, counts=counts)
 
 
-def _about(
+def _grid_samples(
     across: Aperture, seen: ApertureCones, grid: tuple[int, int], wavelength_m: float
 ) -> tuple[list[ComplexArray], FloatArray]:
     """Return the samples about each predicted direction: waves on each axis, and weights."""
     wide = across.lengths_m / wavelength_m
     furthest = (seen.furthest * wide).max(axis=(0, 1))
     middles, halves = (seen.middles - seen.seen) * wide, seen.halves * wide
-    finer = FINER if len(across.axes) == 1 else FINER_IN_PLANE
+    finer = SAMPLES_PER_WIDTH if len(across.axes) == 1 else SAMPLES_PER_WIDTH_IN_PLANE
     waves, sides = list[ComplexArray](), list[FloatArray]()
     for d, axis in enumerate(across.axes):
         count = grid[1 if axis[1] else 0]
@@ -189,7 +189,7 @@ def _all_waves(count: int, finer: int, reach: int) -> ComplexArray:
     return waves
 
 
-def _asked(
+def _ring_samples(
     array: Array, across: Aperture, directions: FloatArray, seen: ApertureCones
 ) -> ConeSamples:
     """Return steering vectors of directions in rings about each predicted one, out to the cones."""

@@ -8,8 +8,8 @@ leaves (1 - s_p) r_p there and its own points unchanged: exactly where X is 0, a
 directions, and in the least-squares sense at the points around them. Each s_p is limited by
 
 * the price: with c_p the correlation of a_p with the user's own a and q_p that with g, removing
-  this one alone costs the gain 1 + s^2 q^2 / (1 - c^2). Each may cost at most ``PRICE``, and
-  towards c = 1 nothing (``APART``);
+  this one alone costs the gain 1 + s^2 q^2 / (1 - c^2). Each may cost ``MAX_NULL_COST``, and
+  towards c = 1 nothing (``FULL_PRICE_DISTANCE``);
 * the floor: within a user's own cone at least the least gain must be left, and outside a part of it
   that decreases with the distance of the null from the cone.
 
@@ -26,8 +26,8 @@ import numpy as np
 from companion.beams.weights.widening import Spread
 from companion.values import BoolArray, ComplexArray, FloatArray
 
-PRICE: Final = 0.2  # gain that one null may cost, over the remaining gain: 0.8 dB
-APART: Final = 0.3
+MAX_NULL_COST: Final = 0.2  # gain that one null may cost, over the remaining gain: 0.8 dB
+FULL_PRICE_DISTANCE: Final = 0.3
 """Distance from the user's own direction, as 1 - c^2, from which a null is worth its price: some
 .33 natural widths. A nearer null would be ineffective, and change sign where the two directions
 cross.
@@ -37,16 +37,18 @@ FLOOR_PRICE_DB: Final = 2.5
 
 Between samples it may be half a decibel more, and rarely more than that.
 """
-ABOVE: Final = 1.15
+PROTECTION_MARGIN: Final = 1.15
 """Margin of the protected least gain over the one worth keeping, because samples are finite."""
-GIVEN_UP: Final = 6.0
-"""Exponent of the ratio to ``ABOVE`` by which a smaller least gain may be reduced."""
-SHALLOW: Final = 0.05
+REDUCTION_EXPONENT: Final = 6.0
+"""Exponent of the ratio to ``PROTECTION_MARGIN`` by which a smaller least gain may be reduced."""
+TOLERATED_DIP: Final = 0.05
 """Relative depth of a dip below the protected gain that is tolerated: some .15 dB."""
-NOTHING: Final = 1e-9  # gain that counts as 0
+NEGLIGIBLE_GAIN: Final = 1e-9  # gain that counts as 0
 NULL_WIDTHS: Final = 1.0
 """Natural widths from a cone's edge at which a null no longer reaches into it."""
-SOFT: Final = 0.02  # loading of the points around a predicted direction, relative to their power
+NULL_LOADING: Final = (
+    0.02  # loading of the points around a predicted direction, relative to their power
+)
 ROUNDING: Final = 1e-10
 """Loading of the predicted directions against rounding, relative to their power."""
 
@@ -71,22 +73,22 @@ def with_nulls(spread: Spread, noise: FloatArray | None = None, exact: bool = Fa
     fields, counts = spread.cones.fields(spread.beams), spread.cones.counts
     power = _power(spread.beams)
     gains = _squared(fields) / power[:, np.newaxis]
-    asked = np.where(counts > 0, gains / np.maximum(counts, NOTHING), np.inf)
-    kept = _kept(asked.min(axis=2), spread.worth)
+    asked = np.where(counts > 0, gains / np.maximum(counts, NEGLIGIBLE_GAIN), np.inf)
+    kept = _protected_gains(asked.min(axis=2), spread.worth)
     shares = _shares(spread, kept[0], power)
     if exact:
         shares[::each] = 1.0
     own = np.arange(users)
     wanted = (spread.reached * shares).reshape(users, each, users)
     wanted[own, :, own] = 0.0
-    taken = _taken(spread, wanted.reshape(-1, users), noise)
+    taken = _correction(spread, wanted.reshape(-1, users), noise)
     dark = shares[::each] >= 1.0
     dark[own, own] = True
     whole = np.asarray(dark.all(axis=0))
     if exact:
         return NulledBeams(spread.beams - taken, whole)
     least = (counts * kept[:, :, np.newaxis]).max(axis=0)
-    back = _back(spread, taken, (fields, power), least)
+    back = _step_back(spread, taken, (fields, power), least)
     return NulledBeams(spread.beams - back * taken, whole & (back >= 1.0))
 
 
@@ -100,12 +102,12 @@ def _power(columns: ComplexArray) -> FloatArray:
     return power
 
 
-def _kept(least: FloatArray, worth: float) -> FloatArray:
+def _protected_gains(least: FloatArray, worth: float) -> FloatArray:
     """Return the least gains that nulls must leave."""
-    wanted = ABOVE * worth
+    wanted = PROTECTION_MARGIN * worth
     lowered = np.maximum(least * 10 ** (-FLOOR_PRICE_DB / 10), wanted)
-    lowered *= np.minimum(least / wanted, 1.0) ** GIVEN_UP
-    kept: FloatArray = np.maximum(lowered, NOTHING)
+    lowered *= np.minimum(least / wanted, 1.0) ** REDUCTION_EXPONENT
+    kept: FloatArray = np.maximum(lowered, NEGLIGIBLE_GAIN)
     return kept
 
 
@@ -117,8 +119,8 @@ def _shares(spread: Spread, kept: FloatArray, power: FloatArray) -> FloatArray:
     centres = lengths[:: spread.each]
     alike = np.abs(spread.gram[:, :: spread.each]) ** 2 / np.outer(lengths, centres)
     cost = reached**2 / np.outer(lengths, power) / np.maximum(1.0 - alike, 1e-12)
-    priced = np.sqrt(PRICE / np.maximum(cost, PRICE))
-    priced *= np.minimum((1.0 - alike) / APART, 1.0)
+    priced = np.sqrt(MAX_NULL_COST / np.maximum(cost, MAX_NULL_COST))
+    priced *= np.minimum((1.0 - alike) / FULL_PRICE_DISTANCE, 1.0)
     near = np.clip(1.0 - spread.outside / NULL_WIDTHS, 0.0, 1.0) ** 2
     left = np.sqrt(kept * power) * near
     floored = 1.0 - np.minimum(left / np.maximum(reached, 1e-300), 1.0)
@@ -126,11 +128,11 @@ def _shares(spread: Spread, kept: FloatArray, power: FloatArray) -> FloatArray:
     return shares
 
 
-def _taken(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) -> ComplexArray:
+def _correction(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) -> ComplexArray:
     """Return the least change (M, N) of beams that removes ``wanted`` (N K, N) at the points."""
     points, gram, each = spread.points, spread.gram, spread.each
     power = gram.diagonal().real
-    loads = np.maximum(SOFT * power, ROUNDING * power.max())
+    loads = np.maximum(NULL_LOADING * power, ROUNDING * power.max())
     loads[::each] = ROUNDING * power.max()
     if noise is not None:
         loads[::each] += noise
@@ -148,7 +150,7 @@ def _taken(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) -> Co
     return taken
 
 
-def _back(
+def _step_back(
     spread: Spread, taken: ComplexArray, known: tuple[ComplexArray, FloatArray], least: FloatArray
 ) -> FloatArray:
     """Return the share (N,) of the nulls up to which every place has its least gain (N, P); 0: any.
@@ -172,7 +174,7 @@ def _back(
     short = (depth > 0) & ((b > 0) | (a < 0)) & (least > 0)
     first = np.where(b > 0, c, inside - b) / np.where(short, np.where(b > 0, b + inside, -a), 1.0)
     # A shallow dip is faded in, so that the result is continuous in the directions.
-    reached = np.minimum(depth / np.maximum(SHALLOW * b * b, 1e-300), 1.0)
+    reached = np.minimum(depth / np.maximum(TOLERATED_DIP * b * b, 1e-300), 1.0)
     first = 1.0 - (1.0 - np.minimum(first, 1.0)) * reached
     back: FloatArray = np.where(short, first, 1.0).min(axis=1)
     return back

@@ -44,14 +44,14 @@ def max_min(coupling: FloatArray) -> FloatArray:
     return _kept(share)
 
 
-def weighted_sum(coupling: FloatArray, worths: FloatArray) -> FloatArray:
-    """Return shares (N,) at a local maximum of the sum of ``worths`` (N,) times rates."""
+def weighted_sum(coupling: FloatArray, rate_weights: FloatArray) -> FloatArray:
+    """Return shares (N,) at a local maximum of the sum of ``rate_weights`` (N,) times rates."""
     direct = np.sqrt(coupling.diagonal())
     sent = np.full(len(direct), (1.0 / len(direct)) ** 0.5)
     for _ in range(2 * ROUNDS):
         heard = 1.0 + coupling @ sent**2
         receiver = direct * sent / heard
-        weight = worths / np.maximum(1.0 - receiver * direct * sent, 1e-12)
+        weight = rate_weights / np.maximum(1.0 - receiver * direct * sent, 1e-12)
         pull = weight * receiver**2
         found = weight * receiver * direct / (coupling.T @ pull + pull.sum())
         found *= 1.0 / np.sqrt(found @ found)
@@ -70,7 +70,7 @@ def dual_of_max_min(gram: ComplexArray, snr: FloatArray) -> FloatArray:
     """
     share = np.full(len(snr), 1.0 / len(snr))
     for _ in range(DUAL_ROUNDS):
-        alone = _alone(gram, snr, share)
+        alone = _sinr_per_power(gram, snr, share)
         found = 1.0 / alone
         found /= found.sum()
         done = np.abs(found - share).max() <= ENOUGH * found.min()
@@ -80,7 +80,7 @@ def dual_of_max_min(gram: ComplexArray, snr: FloatArray) -> FloatArray:
     return share
 
 
-def _alone(gram: ComplexArray, snr: FloatArray, share: FloatArray) -> FloatArray:
+def _sinr_per_power(gram: ComplexArray, snr: FloatArray, share: FloatArray) -> FloatArray:
     """Return the SINR (N,) of each user for a power of 1 while the others keep their shares."""
     # x [(K + X)^-1]_ii is the mean square error, 1 / (1 + SINR).
     error = _inverse(gram, 1.0 / (snr * share)).diagonal().real / (snr * share)
@@ -88,7 +88,9 @@ def _alone(gram: ComplexArray, snr: FloatArray, share: FloatArray) -> FloatArray
     return found
 
 
-def dual_of_weighted_sum(gram: ComplexArray, snr: FloatArray, worths: FloatArray) -> FloatArray:
+def dual_of_weighted_sum(
+    gram: ComplexArray, snr: FloatArray, rate_weights: FloatArray
+) -> FloatArray:
     """Return uplink powers (N,) of sum 1 for a large weighted sum of rates.
 
     Found by WMMSE with beams A* Z: their directions are those of the least mean square error, with
@@ -103,7 +105,7 @@ def dual_of_weighted_sum(gram: ComplexArray, snr: FloatArray, worths: FloatArray
         heard = 1.0 + np.sum(np.abs(field) ** 2, axis=1)
         own = field.diagonal()
         receiver = own.conj() / heard
-        weight = worths / np.maximum(1.0 - (receiver * own).real, 1e-12)
+        weight = rate_weights / np.maximum(1.0 - (receiver * own).real, 1e-12)
         pull = weight * np.abs(receiver) ** 2
         found = np.maximum(pull / pull.sum(), LEAST_SHARE / len(snr))
         scale = weight * receiver.conj() / np.maximum(pull, 1e-300)

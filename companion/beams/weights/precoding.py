@@ -168,7 +168,7 @@ def precode(
     slots = np.zeros(users, dtype=np.int64)
     for slot, (group, one) in enumerate(zip(groups, made, strict=True)):
         slots[group] = slot
-        shared = _shared(steering[:, group], one.weights, settings, radio, group)
+        shared = _with_power_allocation(steering[:, group], one.weights, settings, radio, group)
         weights[:, np.searchsorted(served, group)] = shared
     method = max((one.method for one in made), key=_METHODS.index)
     condition = max(one.condition_number for one in made)
@@ -285,7 +285,7 @@ def _mmse_loading(
             return len(users) / snr
 
 
-def _shared(
+def _with_power_allocation(
     a: ComplexArray, weights: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
 ) -> ComplexArray:
     """Return columns (M, K) of a slot with the power allocated by the settings; else unchanged."""

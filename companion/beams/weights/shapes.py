@@ -21,13 +21,13 @@ from companion.values import FloatArray, IntArray
 
 TABLES: Final = "shapes.npz"
 CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T  # the corners (8, 3) of a cell of three axes
-MOST: Final = 0.375
+WIDEST_PER_ELEMENT: Final = 0.375
 """Widest beam in natural widths for each element: beyond it they are too far apart to shape one."""
-GIVEN_UP: Final = 2.0
+USEFUL_LOSS_DB: Final = 2.0
 """Additional loss in dB, accepted for each dB by which a floor is too low to be useful."""
 SPARE_DB: Final = 2.5
 """Margin of a floor over the useful gain: nulls and places between samples reduce it."""
-FAR: Final = (3.8, 4.8)
+LINE_TRANSITION_WIDTHS: Final = (3.8, 4.8)
 """Start and end of the transition from square to line tables, in natural widths of a plane's beam.
 """
 LEAST_SHARE: Final = 1 / 16
@@ -119,7 +119,7 @@ def aperture(array: Array) -> Aperture:
         shapes=shapes,
         axes=axes,
         lengths_m=lengths_m,
-        most=MOST * counts,
+        most=WIDEST_PER_ELEMENT * counts,
         placed=placed,
         knots=knots,
     )
@@ -152,7 +152,9 @@ def phases_rad(
             shapes, cones, within, elements=len(across.placed), floor_db=floor_db, worth_db=worth_db
         )
         return np.asarray(2 * np.pi * cones * (psi @ across.knots))
-    far = np.interp(np.log(np.maximum(width, 1e-9)), np.log(FAR), (0.0, 1.0))[:, np.newaxis]
+    far = np.interp(np.log(np.maximum(width, 1e-9)), np.log(LINE_TRANSITION_WIDTHS), (0.0, 1.0))[
+        :, np.newaxis
+    ]
     found = np.zeros((len(cones), len(across.placed)))
     if (far < 1).any():
         usual = None if within is None else within.max(axis=1, keepdims=True)
@@ -197,7 +199,7 @@ def _psi(
     best_db += 10 * math.log10(elements)
     least_db = len(columns) * math.exp(shapes.losses[0])
     lacking_db = np.maximum(worth_db + SPARE_DB + least_db - best_db, 0.0)
-    loss_db = np.maximum(best_db - floor_db, least_db) + GIVEN_UP * lacking_db
+    loss_db = np.maximum(best_db - floor_db, least_db) + USEFUL_LOSS_DB * lacking_db
     loss_db /= len(columns)
     return [_likely_phases(shapes, cones[:, d], likely[:, d], loss_db) for d in columns]
 

@@ -131,7 +131,7 @@ def unit_power(array: Array, weights: ComplexArray) -> ComplexArray:
     return powered
 
 
-def faces_apart(array: Array) -> bool:
+def has_distinct_patterns(array: Array) -> bool:
     """Return whether element patterns differ, so that they are no common factor."""
     return (
         array.element_from_array is not None
@@ -152,8 +152,8 @@ def cones_around(
     along = far / max(extent_m, 1e-300)
     aside_m = float(np.abs(centred - np.outer(centred @ along, along)).max())
     aligned = extent_m > 0 and aside_m <= SAME_PLACE_WAVELENGTHS * array.wavelength_m
-    line = aligned and not faces_apart(array)
-    if faces_apart(array):
+    line = aligned and not has_distinct_patterns(array)
+    if has_distinct_patterns(array):
         towards = steering.element_directions(array, directions)
         magnitudes = magnitudes * array.element.amplitude_range(towards, bounds_rad)[1]
     columns = np.flatnonzero(np.abs(centred).max(axis=0) > 0)
@@ -376,7 +376,7 @@ def phasors(cones: DirectionCones, pieces: Cells) -> tuple[ComplexArray, FloatAr
     the origin of the array frame; any other point would do.
     """
     received = steering.phase_factors(cones.array, pieces.middles)
-    if not faces_apart(cones.array):
+    if not has_distinct_patterns(cones.array):
         return received, None
     towards = steering.element_directions(cones.array, pieces.middles)
     least, most = cones.array.element.amplitude_range(towards, pieces.caps_rad[:, 0])

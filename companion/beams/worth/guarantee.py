@@ -126,7 +126,9 @@ def _extremes(
         return np.empty(0)
     cones = cone.cones_around(array, unit, bounds, np.abs(weights))
     patterned = array.element.pattern is not ElementPattern.ISOTROPIC
-    scales = 1.0 if cone.faces_apart(array) else array.element.amplitude_range(unit, bounds)[1]
+    scales = (
+        1.0 if cone.has_distinct_patterns(array) else array.element.amplitude_range(unit, bounds)[1]
+    )
     nothing = 10 ** (-NOTHING_DB / 20) * scales * cones.ceilings
     proven, attained = np.full((2, len(unit)), np.inf)
     spent = np.zeros(len(unit), dtype=np.int64)

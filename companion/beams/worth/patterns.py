@@ -33,7 +33,9 @@ HALVING_ROUNDS: Final = 10
 EXTREME_ROUNDS: Final = 12
 RIVALS_DB: Final = 0.5
 """Difference to the highest side lobe of the scan within which another may be the highest."""
-ABREAST: Final = 1e-4  # boresight component below which a direction counts as perpendicular to it
+PERPENDICULAR_COSINE: Final = (
+    1e-4  # boresight component below which a direction counts as perpendicular to it
+)
 RIPPLE_DB: Final = 1.0
 """Largest rise of the gain above the peak within a lobe, as in a broadened one."""
 CLIMB_MOVES: Final = 400
@@ -135,7 +137,7 @@ def lobe(array: Array, weights: ComplexArray, direction: FloatArray) -> Lobe:
     Its peak is found by ascent from the direction.
     """
     unit = _unit_power(array, weights)
-    peak = _summit(array, unit, direction)
+    peak = _peak_direction(array, unit, direction)
     azimuth, elevation = (float(angle[0]) for angle in steering.angles_rad(peak[np.newaxis]))
     return Lobe(
         peak_azimuth_rad=azimuth,
@@ -158,7 +160,7 @@ def half_power_beamwidths_rad(
     if not matched.any():
         return None, None
     unit = _unit_power(array, matched)
-    peak = _summit(array, unit, direction)
+    peak = _peak_direction(array, unit, direction)
     azimuth, elevation = (float(angle[0]) for angle in steering.angles_rad(peak[np.newaxis]))
     return (
         _half_power(_Cut(array, unit, _Circle.parallel(elevation)), azimuth)[0],
@@ -252,7 +254,7 @@ def _gains(array: Array, weights: ComplexArray, directions: FloatArray) -> Float
     return gains.reshape(directions.shape[:-1])
 
 
-def _summit(array: Array, weights: ComplexArray, direction: FloatArray) -> FloatArray:
+def _peak_direction(array: Array, weights: ComplexArray, direction: FloatArray) -> FloatArray:
     """Return the unit direction (3,) of the local maximum that an ascent from ``direction``
     reaches.
 
@@ -374,14 +376,14 @@ def _side_lobe_db(cut: _Cut, peak_rad: float, nulls: tuple[float, float]) -> flo
     tops = (gains >= np.roll(gains, 1)) & (gains > np.roll(gains, -1))
     tops &= (offsets > nulls[1]) & (offsets < 2 * math.pi + nulls[0])
     side = math.copysign(1.0, directions[0, 0])
-    mirrored = _mirrored(cut.array) and abs(directions[0, 0]) > ABREAST
+    mirrored = _mirrored(cut.array) and abs(directions[0, 0]) > PERPENDICULAR_COSINE
     if mirrored:
         tops &= directions[:, 0] * side >= -step
     while tops.any():
         rivals = np.flatnonzero(tops & (gains >= gains[tops].max() * 10 ** (-RIVALS_DB / 10)))
         brackets = angles[rivals][:, np.newaxis] + step * np.array([-1.0, 1.0])
         found, highest = _extremes(cut, brackets, 1.0)
-        behind = mirrored & (cut.circle.directions(found)[:, 0] * side < -ABREAST)
+        behind = mirrored & (cut.circle.directions(found)[:, 0] * side < -PERPENDICULAR_COSINE)
         if not behind.any():
             return float(_db(highest.max()) - _db(gains[0]))
         tops[rivals[behind]] = False

@@ -49,7 +49,7 @@ class PlacedStamp(NamedTuple):
     x_ns: int  # the sender's time since boot, unwrapped
     new_line: bool = False  # True for the first stamp on a new line
     rebooted: bool = False  # True if the new line was begun by a reboot
-    leapt_ns: int = 0  # height of a new line without reboot above the previous one; else 0
+    jump_ns: int = 0  # height of a new line without reboot above the previous one; else 0
 
 
 @dataclass(slots=True, kw_only=True)
@@ -123,16 +123,16 @@ class BootLine:
         if self._previous is not None and self._is_straggler(arrival_ns, boot_ms, late_ns):
             return None
         if abs(late_ns) <= self._late_max_ns:
-            return self._near(arrival_ns, boot_ms, x_ns)
+            return self._place_near(arrival_ns, boot_ms, x_ns)
         if late_ns > 0 and x_ns > self.newest_ns:
-            return self._stalled(arrival_ns, boot_ms, x_ns)
+            return self._place_delayed(arrival_ns, boot_ms, x_ns)
         advances = self._run.add(arrival_ns, boot_ms, self._late_max_ns)
         self._rival.forget(arrival_ns)
         self._rival.add(arrival_ns, boot_ms, self._late_max_ns)
         if not (advances and self._run.lasts(3, _NS // 2)):
             return None
         stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % _WRAP_MS
-        return self._begin_again(rebooted=stepped_back)
+        return self._begin_new_line(rebooted=stepped_back)
 
     def notice(self, arrival_ns: int, boot_ms: int) -> bool:
         """Add a stamp that cannot start a line. Return whether it lies on the current one."""
@@ -168,12 +168,12 @@ class BootLine:
         self.newest_ns = max(self.newest_ns, x_ns)
         return PlacedStamp(x_ns=x_ns)
 
-    def _near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp | None:
+    def _place_near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp | None:
         """Place a stamp near the line: in order, late, or early in a second boot."""
         if x_ns > self.newest_ns:
             early = self.late_ns(arrival_ns, x_ns) < _EARLY_NS
             if early and self.floor.count >= _ESTABLISHED:
-                return self._ahead(arrival_ns, boot_ms)
+                return self._place_ahead(arrival_ns, boot_ms)
             self._run.stamps.clear()
         elif (
             x_ns < self.newest_ns
@@ -181,10 +181,10 @@ class BootLine:
             and self._run.add(arrival_ns, boot_ms, _NS)
             and self._run.lasts(5, _NS)
         ):
-            return self._begin_again(rebooted=True)
+            return self._begin_new_line(rebooted=True)
         return self._accept(arrival_ns, x_ns)
 
-    def _ahead(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
+    def _place_ahead(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
         """Place a stamp that implies that all earlier ones were late, once others confirm it.
 
         A single forged stamp could otherwise move the clock by any amount.
@@ -197,10 +197,10 @@ class BootLine:
         self._run.stamps.clear()
         return self._accept(arrival_ns, _unwrap(boot_ms, self.newest_ns))
 
-    def _stalled(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp:
+    def _place_delayed(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp:
         """Place a stamp in order but too late: the link stalled, or the clock stood still."""
         if self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(5, 2 * _NS):
-            return self._begin_again(rebooted=False)
+            return self._begin_new_line(rebooted=False)
         self.newest_ns = x_ns
         return PlacedStamp(x_ns=x_ns)
 
@@ -217,7 +217,7 @@ class BootLine:
         fits_before = _EARLY_NS <= was_late_ns <= self._late_max_ns
         return fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
 
-    def _begin_again(self, *, rebooted: bool) -> PlacedStamp:
+    def _begin_new_line(self, *, rebooted: bool) -> PlacedStamp:
         """Make the run the line. After a reboot the sender's timeline restarts."""
         stamps = list(self._run.stamps)
         self._run.stamps.clear()
@@ -230,8 +230,8 @@ class BootLine:
             x_ns = _unwrap(boot_ms, x_ns)
             self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = x_ns
-        leapt_ns = 0 if rebooted else self.floor.at(x_ns) - before.at(x_ns)
-        return PlacedStamp(x_ns=x_ns, new_line=True, rebooted=rebooted, leapt_ns=leapt_ns)
+        jump_ns = 0 if rebooted else self.floor.at(x_ns) - before.at(x_ns)
+        return PlacedStamp(x_ns=x_ns, new_line=True, rebooted=rebooted, jump_ns=jump_ns)
 
 
 def _unwrap(boot_ms: int, newest_ns: int) -> int:

@@ -21,8 +21,8 @@ from typing import Final, NamedTuple
 AGREE: Final = 3  # pieces of evidence in a row after a contradiction that end the doubt
 STEP: Final = 0.02
 """Least drift, a ratio, that counts as a step: no clock sustains such a rate error."""
-RAISED: Final = 1.5  # multiple of the proven drift that is assumed from then on
-FADES_NS: Final = 60e9  # time constant with which a raised drift decays
+RAISE_FACTOR: Final = 1.5  # multiple of the proven drift that is assumed from then on
+DECAY_NS: Final = 60e9  # time constant with which a raised drift decays
 
 
 class Interval(NamedTuple):
@@ -66,7 +66,7 @@ class OffsetEvidence:
         """Return the largest drift assumed at a sender time, a ratio."""
         if not self._raised:
             return self._drift_max
-        faded = self._raised * math.exp(-max(0, x_ns - self._raised_ns) / FADES_NS)
+        faded = self._raised * math.exp(-max(0, x_ns - self._raised_ns) / DECAY_NS)
         return max(self._drift_max, faded)
 
     def add(self, new: Interval) -> DriftProven | None:
@@ -95,7 +95,7 @@ class OffsetEvidence:
         moved_ns = apart_ns + self.drift_at(before.x_ns) * since_ns
         drift = moved_ns / since_ns if since_ns else math.inf
         if drift < STEP:
-            self._raised, self._raised_ns = RAISED * drift, new.x_ns
+            self._raised, self._raised_ns = RAISE_FACTOR * drift, new.x_ns
         doubt = known if self._doubt is None else _hull(known, self._aged(self._doubt, new.x_ns))
         self._known, self._doubt, self._agreed = new, doubt, 0
         return DriftProven(drift if drift < STEP else math.inf, apart_ns)

@@ -88,7 +88,7 @@ class Floor:
         newest_ns   newest sender time; 0 before the first stamp
         drift       detected steady drift, a ratio; 0 unless it exceeds ``drift_max``
         count       stamps so far
-        rose_ns     rise of the line at the newest stamp beyond ``drift_max``; 0 unless it restarted
+        rise_ns     rise of the line at the newest stamp beyond ``drift_max``; 0 unless it restarted
     """
 
     def __init__(self, window_ns: int, drift_max: float) -> None:
@@ -97,18 +97,18 @@ class Floor:
         self.drift = 0.0
         self.count = 0
         self.newest_ns = 0
-        self.rose_ns = 0.0
+        self.rise_ns = 0.0
         self._first_arrival_ns = self._newest_arrival_ns = 0
         self._base = (0, 0)  # x, y: heights are relative to base y + drift * (x - base x)
         self._upper_bound = self._line = 0.0  # heights at newest_ns
         self._level: _Level | None = None  # floor if the apparent drift is a queue
-        self._touched_ns = 0  # x of the stamp that set ``upper_bound``
+        self._last_change_ns = 0  # x of the stamp that set ``upper_bound``
         self._since_ns = 0  # x of the line's last restart
         self._risen = -np.inf  # height of the last few frames, if they are suspiciously late
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT)
         self._lateness = SenderLateness(drift_max)
         self._visible = Latencies(window_ns, drift_max)
-        self._looked = 0
+        self._measured_count = 0
 
     def __bool__(self) -> bool:
         return self.count > 0
@@ -117,11 +117,11 @@ class Floor:
 
     def add(self, x_ns: int, y_ns: int) -> None:
         """Add a stamp: its sender time, and its arrival less that time."""
-        self.rose_ns = 0.0
+        self.rise_ns = 0.0
         self._newest_arrival_ns = x_ns + y_ns
         if not self.count:
             self._base = (x_ns, y_ns)
-            self._since_ns = self._touched_ns = x_ns
+            self._since_ns = self._last_change_ns = x_ns
             self.newest_ns, self._first_arrival_ns = x_ns, x_ns + y_ns
         self.count += 1
         height = self._height(x_ns, y_ns)
@@ -136,12 +136,12 @@ class Floor:
         else:
             as_of_now = height - self._drift_max * ahead_ns
         if as_of_now <= self._upper_bound:
-            self._upper_bound, self._touched_ns = as_of_now, x_ns
+            self._upper_bound, self._last_change_ns = as_of_now, x_ns
         gap = as_of_now - self._line
         self._line = min(self._line, as_of_now)
         self._recent.append((x_ns, height))
         late = gap > LEAST_CHANGE_NS and gap > CHANGE / RECENT * self._spread
-        self._risen = self._suspicious() if late else -np.inf
+        self._risen = self._late_height() if late else -np.inf
         self._visible.add(x_ns, height)
         if ahead_ns > 0:
             late_spell = self._lateness.add(x_ns, height, gap, self._spread)
@@ -149,11 +149,15 @@ class Floor:
                 self._all_late(late_spell)
         if self._line - self._upper_bound > WORST_LATENCY_NS:
             # No frame is that late: the clock changed.
-            self._upper_bound, self._touched_ns = self._line, x_ns
+            self._upper_bound, self._last_change_ns = self._line, x_ns
         level = self._level
         if level is not None and self._tilted(self._line) - level.upper_bound > WORST_LATENCY_NS:
             self._level = None  # no queue is that long: the clock drifts
-        if self.count < 4 * RECENT or self.count - self._looked >= 64 or gap < -RESOLUTION_NS:
+        if (
+            self.count < 4 * RECENT
+            or self.count - self._measured_count >= 64
+            or gap < -RESOLUTION_NS
+        ):
             self._measure()
 
     @property
@@ -165,7 +169,7 @@ class Floor:
         x0_ns, y0_ns = self._base
         return y_ns - y0_ns - self.drift * (x_ns - x0_ns)
 
-    def _suspicious(self) -> float:
+    def _late_height(self) -> float:
         """Return the least height of the last few frames if all are improbably late, else -inf."""
         heights = [
             height + self._drift_max * (self.newest_ns - at_ns) for at_ns, height in self._recent
@@ -185,15 +189,15 @@ class Floor:
         Restart the line at their height when it has lasted.
         """
         if spell.is_news:
-            rose_ns = spell.height - max(self._line, self._upper_bound)
-            self.rose_ns = rose_ns if rose_ns > LEAST_CHANGE_NS else 0.0
+            rise_ns = spell.height - max(self._line, self._upper_bound)
+            self.rise_ns = rise_ns if rise_ns > LEAST_CHANGE_NS else 0.0
         if spell.followed:
             self._line, self._since_ns = spell.height, spell.since_ns
             self._visible.keep_median()
 
     def _measure(self) -> None:
         """Measure the visible latencies again, and follow a steady drift if there is one."""
-        self._looked = self.count
+        self._measured_count = self.count
         self._visible.measure(self.newest_ns, self._since_ns)
         if not self.drift:
             self.drift = self._visible.steady_drift(self.newest_ns)
@@ -203,13 +207,13 @@ class Floor:
     def _drifts(self) -> None:
         """Restart the floor along the drift, on the least heights of the window."""
         newest_ns, level = self.newest_ns, self._upper_bound
-        self._level = _Level(self._touched_ns)
+        self._level = _Level(self._last_change_ns)
         self._base = (newest_ns, self._base[1] + round(level))
         points = self._visible.tilt(self.drift, newest_ns, level)
         self._upper_bound = self._line = min(
             height + self._drift_max * (newest_ns - at_ns) for at_ns, height in points
         )
-        self._since_ns = self._touched_ns = points[0][0]
+        self._since_ns = self._last_change_ns = points[0][0]
         self._lateness.clear()
         self._recent.clear()
 
@@ -229,7 +233,7 @@ class Floor:
         if len(self._recent) == RECENT:
             least = min([h + drift_max * (newest_ns - at_ns) for at_ns, h in self._recent])
             recent = max(recent, least)
-        aged = 2.0 * drift_max * (newest_ns - self._touched_ns)
+        aged = 2.0 * drift_max * (newest_ns - self._last_change_ns)
         highest, least = max(sure, line, recent) + moved, sure - aged + moved
         sure += moved
         if self._level is not None:
@@ -284,12 +288,12 @@ class Floor:
             return drifted_ns, drifted_ns
         return min(0, drifted_ns), max(0, drifted_ns)
 
-    def begin_again(self, height_ns: int, x_ns: int) -> None:
+    def restart_at(self, height_ns: int, x_ns: int) -> None:
         """Restart at a height that was measured at a sender time, because the clock changed."""
         measured = self._height(x_ns, height_ns)
         self._upper_bound = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
         self._level = None
-        self._since_ns = self._touched_ns = x_ns
+        self._since_ns = self._last_change_ns = x_ns
         self._risen = -np.inf
         self._lateness.clear()
         self._recent.clear()

@@ -32,18 +32,18 @@ from companion.mavlink.clock.evidence import DriftProven, Interval, OffsetEviden
 
 _NS: Final = 1_000_000_000
 _NS_PER_MS: Final = 1_000_000
-_DEEPEST_NS: Final = 10 * _NS
+_MAX_DEPTH_NS: Final = 10 * _NS
 """Largest depth of the offset below the floor that evidence may claim."""
 _LATENCY_S: Final = (-0.02, 5.0)
 """Least and greatest latency that a trusted GNSS time may imply, seconds."""
 _GNSS_CHECKS: Final = 5  # GNSS times in a row that must be plausible before one is used
-INVISIBLE: Final = 0.1
+INVISIBLE_RATIO: Final = 0.1
 """Estimated ratio of the invisible part of the latency to the median of the visible part.
 
 A point estimate, not a bound: it improves most of the latency laws tried (docs/math.md 6), and
 makes none much worse.
 """
-UNSEEN_NS: Final = 25 * _NS_PER_MS
+MIN_INVISIBLE_NS: Final = 25 * _NS_PER_MS
 """Least upper limit assumed for the invisible latency, even if visible parts are shorter: a serial
 line's.
 """
@@ -86,7 +86,7 @@ class SenderClock:
         if placed.new_line:
             self._timesync.clear()
             self.forget_gnss()
-        self._note_change(placed.leapt_ns)
+        self._note_change(placed.jump_ns)
         latency_s = max(0.0, (arrival_ns - self.node_ns(placed.x_ns)) * 1e-9)
         if placed.x_ns == self._line.newest_ns:
             self._latency_s = latency_s
@@ -98,11 +98,11 @@ class SenderClock:
         if self._line.notice(arrival_ns, boot_ms):
             self._note_change()
 
-    def _note_change(self, leapt_ns: int = 0) -> None:
-        rose_ns = leapt_ns or self._line.floor.rose_ns
-        if rose_ns:
+    def _note_change(self, jump_ns: int = 0) -> None:
+        rise_ns = jump_ns or self._line.floor.rise_ns
+        if rise_ns:
             self.change = ClockChange(
-                proven=False, step_s=rose_ns * 1e-9, drift_ppm=math.inf, leapt=leapt_ns != 0
+                proven=False, step_s=rise_ns * 1e-9, drift_ppm=math.inf, leapt=jump_ns != 0
             )
 
     def is_shared(self, arrival_ns: int) -> bool:
@@ -126,7 +126,7 @@ class SenderClock:
         if received_ns < sent_ns:
             return "answer was received before its request was sent"
         x_ns = remote_ns + round((self._line.newest_ns - remote_ns) / WRAP_NS) * WRAP_NS
-        return self._prove(self._timesync, Interval(x_ns, sent_ns - x_ns, received_ns - x_ns))
+        return self._add(self._timesync, Interval(x_ns, sent_ns - x_ns, received_ns - x_ns))
 
     def system_time(self, arrival_ns: int, unix_us: int, boot_ms: int) -> str | None:
         """Add one SYSTEM_TIME: the sender's Unix time in microseconds, with its boot time.
@@ -167,21 +167,21 @@ class SenderClock:
         self._gnss_plausible += 1
         error_ns = round((error_s + self._settings.gnss_error_s) * _NS) + _NS_PER_MS
         offset_ns = unix_us * 1000 - x_ns
-        return self._prove(self._gnss, Interval(x_ns, offset_ns - error_ns, offset_ns + error_ns))
+        return self._add(self._gnss, Interval(x_ns, offset_ns - error_ns, offset_ns + error_ns))
 
-    def _prove(self, evidence: OffsetEvidence, new: Interval) -> str | None:
+    def _add(self, evidence: OffsetEvidence, new: Interval) -> str | None:
         """Add an interval to the evidence. Return None, or why it cannot be about this clock."""
         floor = self._line.floor
         sure_ns, highest_ns, _, _ = floor.heights(new.x_ns)
         early_ns = new.low_ns - highest_ns - _NS_PER_MS
         if early_ns > 0:
             return f"frames would have arrived {early_ns / 1e9:.3f} s before they were sent"
-        if sure_ns - new.high_ns > _DEEPEST_NS:
+        if sure_ns - new.high_ns > _MAX_DEPTH_NS:
             least_s = (sure_ns - new.high_ns) / 1e9
             return f"fastest frame would have taken {least_s:.3f} s: answer is from another clock"
         proven = evidence.add(new)
         if new.low_ns > sure_ns + _NS_PER_MS:
-            floor.begin_again(round(new.high_ns), new.x_ns)
+            floor.restart_at(round(new.high_ns), new.x_ns)
             proven = proven or DriftProven(math.inf, new.low_ns - sure_ns)
         if proven is not None:
             self.change = ClockChange(
@@ -262,7 +262,7 @@ class SenderClock:
         if kind is not ClockKind.ENVELOPE:
             return (high_ns - low_ns) / 4 * 1e-9
         floor = self._line.floor
-        return math.hypot(INVISIBLE * floor.median_ns + _NS_PER_MS, floor.late_ns) * 1e-9
+        return math.hypot(INVISIBLE_RATIO * floor.median_ns + _NS_PER_MS, floor.late_ns) * 1e-9
 
     def _interval(self, x_ns: int) -> tuple[ClockKind, int, int, int]:
         """Return the offset at a sender time: kind, least, greatest and most likely; ns.
@@ -275,12 +275,12 @@ class SenderClock:
         median_ns = floor.median_ns
         delay_ns = self._constant_delay_ns
         best = ClockKind.ENVELOPE
-        low_ns = least_ns - max(delay_ns, median_ns, UNSEEN_NS) - floor.residual_ns()
+        low_ns = least_ns - max(delay_ns, median_ns, MIN_INVISIBLE_NS) - floor.residual_ns()
         low_ns -= self._doubt_ns
-        low_ns = max(low_ns, sure_ns - _DEEPEST_NS)
+        low_ns = max(low_ns, sure_ns - _MAX_DEPTH_NS)
         high_ns: float = sure_ns - delay_ns
-        likely_ns = line_ns - delay_ns - INVISIBLE * max(0.0, median_ns - delay_ns)
-        rose_ns = highest_ns - sure_ns
+        likely_ns = line_ns - delay_ns - INVISIBLE_RATIO * max(0.0, median_ns - delay_ns)
+        rise_ns = highest_ns - sure_ns
         for kind, evidence in ((ClockKind.TIMESYNC, self._timesync), (ClockKind.GNSS, self._gnss)):
             known = evidence.at(x_ns)
             if known is None or (kind is ClockKind.GNSS and self._gnss_plausible < _GNSS_CHECKS):
@@ -292,6 +292,6 @@ class SenderClock:
             best, low_ns, high_ns = kind, known.low_ns, upper_ns
             likely_ns = (newest.low_ns + min(newest.high_ns, sure_ns)) / 2
             likely_ns += max(0, line_ns - sure_ns)
-        high_ns = max(high_ns + rose_ns, low_ns)
+        high_ns = max(high_ns + rise_ns, low_ns)
         likely_ns = min(max(likely_ns, low_ns), high_ns)
         return best, math.floor(low_ns), math.ceil(high_ns), round(likely_ns)

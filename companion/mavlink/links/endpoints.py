@@ -29,7 +29,7 @@ class Upcalls(NamedTuple):
     up: Callable[[], None]  # connected
     take: Callable[[Hashable, bytes, int | None], None]
     stale: Callable[[Hashable, bytes], None]
-    hang_up: Callable[[Hashable], None]  # that peer is gone
+    on_peer_gone: Callable[[Hashable], None]  # that peer is gone
     overflow: Callable[[int], None]  # the system dropped this many more datagrams
 
 

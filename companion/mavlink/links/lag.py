@@ -14,9 +14,9 @@ from companion.values.described import Meaning
 SLOT_NS: Final = 100_000_000  # interval of which the worst lag is kept
 KEPT_NS: Final = 10_000_000_000  # window of lags
 LIMIT_NS: Final = 500_000_000  # lag above which beams are aimed by outdated reports
-LASTS_NS: Final = 1_000_000_000
+BEHIND_AFTER_NS: Final = 1_000_000_000
 """Time over which every lag must exceed the limit before the machine counts as behind."""
-CLEARS_NS: Final = 2_000_000_000
+CAUGHT_UP_AFTER_NS: Final = 2_000_000_000
 """Time without a lag above the limit after which the machine has caught up."""
 
 
@@ -70,8 +70,8 @@ def _is_behind(slots: list[tuple[int, int]], now_ns: int) -> bool:
     for at_ns, worst_ns in slots:
         if worst_ns > LIMIT_NS:
             since_ns = at_ns if since_ns is None else since_ns
-            behind = behind or at_ns - since_ns >= LASTS_NS
+            behind = behind or at_ns - since_ns >= BEHIND_AFTER_NS
             last_ns = at_ns
-        elif not behind or at_ns - last_ns > CLEARS_NS:
+        elif not behind or at_ns - last_ns > CAUGHT_UP_AFTER_NS:
             behind, since_ns = False, None
-    return behind and now_ns - last_ns <= CLEARS_NS
+    return behind and now_ns - last_ns <= CAUGHT_UP_AFTER_NS

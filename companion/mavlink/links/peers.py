@@ -109,19 +109,19 @@ class Peer:
 class Peers:
     """Peers of one link, bounded in number. Their frames are counted in ``status``.
 
-    ``farewell`` is called with each peer that is evicted, before its removal; ``splitter`` builds a
+    ``on_evict`` is called with each peer that is evicted, before its removal; ``splitter`` builds a
     peer's splitter from the link's name.
     """
 
     def __init__(
         self,
         status: LinkStatus,
-        farewell: Callable[[Peer], None],
+        on_evict: Callable[[Peer], None],
         splitter: Callable[[str], Splits] = Splitter,
     ) -> None:
         self._status = status
         self._splitter = splitter
-        self._farewell = farewell
+        self._on_evict = on_evict
         self._peers: OrderedDict[Hashable, Peer] = OrderedDict()
         self._components: dict[Source, _Component] = {}
         self._senders = 0
@@ -137,7 +137,7 @@ class Peers:
             return peer
         if len(self._peers) >= PEERS_MAX:
             oldest = next(iter(self._peers.values()))
-            self._farewell(oldest)
+            self._on_evict(oldest)
             self.forget(oldest)
         peer = self._peers[key] = Peer(key, self._splitter(self._status.url))
         self._status.peers += 1
@@ -177,7 +177,7 @@ class Peers:
                 version, number = 1, raw[2]
             sender = senders.get(source)
             if sender is None:
-                sender = self._meet(peer, item)
+                sender = self._add_source(peer, item)
             component = sender.component
             component.peer = peer
             counts = component.status
@@ -205,15 +205,15 @@ class Peers:
             sender.component.status.gaps += step - 1
         else:
             self._status.late += 1
-            goes_on = sender.run > 0 and 0 < (number - sender.late) & 0xFF < _HALF_ROUND
-            sender.run = sender.run + 1 if goes_on else 1
+            continues = sender.run > 0 and 0 < (number - sender.late) & 0xFF < _HALF_ROUND
+            sender.run = sender.run + 1 if continues else 1
             sender.late = number
             if sender.run < RESTART_RUN:
                 return
         sender.due = (number + 1) & 0xFF
         sender.run = 0
 
-    def _meet(self, peer: Peer, frame: Frame) -> _PeerSender:
+    def _add_source(self, peer: Peer, frame: Frame) -> _PeerSender:
         """Start to follow a source of this peer; its first sequence number counts as expected."""
         component = self._components.get(frame.source)
         if component is None:

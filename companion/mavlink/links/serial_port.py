@@ -55,7 +55,7 @@ class SerialPort:
             loop.remove_reader(descriptor)
             loop.remove_writer(descriptor)
             _close(port)
-            self._upcalls.hang_up(None)
+            self._upcalls.on_peer_gone(None)
 
     def peers(self) -> Collection[Hashable]:
         """Return the one peer, None, while the device is open."""

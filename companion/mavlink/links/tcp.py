@@ -114,14 +114,14 @@ class TcpIn:
         return cast(_Stream, key).fullness()
 
     def _met(self, fault: asyncio.Future[Exception]) -> "_Stream":
-        def parted(stream: _Stream, why: Exception) -> None:
+        def on_close(stream: _Stream, why: Exception) -> None:
             self._streams.discard(stream)
             if not isinstance(why, OSError):
                 settle(fault, why)
 
         if len(self._streams) >= CONNECTIONS_MAX:
-            return _Stream(self._upcalls, parted, welcome=False)
-        stream = _Stream(self._upcalls, parted)
+            return _Stream(self._upcalls, on_close, is_accepted=False)
+        stream = _Stream(self._upcalls, on_close)
         self._streams.add(stream)
         return stream
 
@@ -129,21 +129,21 @@ class TcpIn:
 class _Stream(asyncio.Protocol):
     """One connection, which is also the key of its peer.
 
-    ``parted`` is called with the reason when it ends. A connection that is not ``welcome`` is
+    ``on_close`` is called with the reason when it ends. A connection that is not ``is_accepted`` is
     closed at once.
     """
 
     def __init__(
         self,
         upcalls: Upcalls,
-        parted: Callable[["_Stream", Exception], None],
+        on_close: Callable[["_Stream", Exception], None],
         *,
-        welcome: bool = True,
+        is_accepted: bool = True,
     ) -> None:
         self._upcalls = upcalls
-        self._parted = parted
+        self._on_close = on_close
         self._transport: asyncio.Transport | None = None
-        self._welcome = welcome
+        self._is_accepted = is_accepted
         self._address = ""
         self._held_up: StaleBytes | None = None
 
@@ -155,7 +155,7 @@ class _Stream(asyncio.Protocol):
         self._address = address_text(transport.get_extra_info("peername"))
         self._held_up = StaleBytes(transport.get_extra_info("socket").fileno())
         self._held_up.watch()
-        if not self._welcome:
+        if not self._is_accepted:
             self._transport.abort()
 
     def data_received(self, data: bytes) -> None:
@@ -169,8 +169,8 @@ class _Stream(asyncio.Protocol):
         self._transport = None
         if self._held_up:
             self._held_up.close()
-        self._parted(self, exc or HungUpError("the peer hung up"))
-        self._upcalls.hang_up(self)
+        self._on_close(self, exc or HungUpError("the peer hung up"))
+        self._upcalls.on_peer_gone(self)
 
     def write(self, raw: bytes) -> bool:
         """Send a frame, or buffer it while there is room; False if there is none."""
@@ -197,7 +197,7 @@ class _Stream(asyncio.Protocol):
 
         At once on connect if it is not yet made.
         """
-        self._welcome = False
+        self._is_accepted = False
         if self._transport is not None:
             self._transport.abort()
 

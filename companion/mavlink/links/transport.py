@@ -100,8 +100,8 @@ class Link:
         upcalls = Upcalls(
             up=self._up,
             take=self.take,
-            stale=self._pass_over,
-            hang_up=self._hang_up,
+            stale=self._count_stale,
+            on_peer_gone=self._peer_gone,
             overflow=self._overflow,
         )
         self._endpoint = endpoint(url, self.status, upcalls)
@@ -133,7 +133,7 @@ class Link:
                 try:
                     await self._endpoint.serve()
                 except OSError as error:
-                    self._say_it_is_down(reason(error))
+                    self._notify_down(reason(error))
                 if self.status.frames > frames:
                     attempt = 0
                 self.status.state = "connecting"
@@ -158,9 +158,9 @@ class Link:
             t_ns -= age_ns
         found = peer.splitter.feed(t_ns, data)
         if found:
-            self._hand_on(peer, found)
+            self._pass_on(peer, found)
 
-    def _pass_over(self, key: Hashable, data: bytes) -> None:
+    def _count_stale(self, key: Hashable, data: bytes) -> None:
         """Count the frames in stale bytes, and keep the splitter synchronised with the stream."""
         self.status.bytes += len(data)
         found = self._peers.at(key).splitter.feed(self._now_ns(), data)
@@ -169,13 +169,15 @@ class Link:
             self.status.overflowed = (self.status.overflowed or 0) + frames
             self._overflow(frames)
 
-    def _hand_on(self, peer: Peer, found: list[Frame | Rejection]) -> None:
+    def _pass_on(self, peer: Peer, found: list[Frame | Rejection]) -> None:
         if self._guard is not None:
-            found = [_admitted(self._guard, item) for item in found]
+            found = [_checked_by_guard(self._guard, item) for item in found]
         self._peers.count(peer, found)
-        self._receive([self._believed(peer, _answered(peer, item)) for item in found])
+        self._receive(
+            [self._checked_for_duplicates(peer, _checked_timesync(peer, item)) for item in found]
+        )
 
-    def _believed(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
+    def _checked_for_duplicates(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
         """Return the item, or its rejection if the sender's peers contradict each other."""
         if isinstance(item, Rejection) or item.msgid not in POSE:
             return item
@@ -186,7 +188,7 @@ class Link:
             t_ns=item.t_ns, source=who, reason=Reason.SHARED_ID, msgid=item.msgid, detail=detail
         )
 
-    def _hang_up(self, key: Hashable) -> None:
+    def _peer_gone(self, key: Hashable) -> None:
         peer = self._peers.find(key)
         if peer is not None:
             self._finish(peer)
@@ -196,7 +198,7 @@ class Link:
         """Search the unfinished frame of a departing peer for other frames."""
         found = peer.splitter.finish(self._now_ns())
         if found:
-            self._hand_on(peer, found)
+            self._pass_on(peer, found)
 
     def _overflow(self, count: int) -> None:
         """Count dropped datagrams or frames; their senders are unknown."""
@@ -261,13 +263,13 @@ class Link:
         self._cancel_steady()
         if self._is_out:
             loop = asyncio.get_running_loop()
-            self._steady = loop.call_later(STEADY_S, self._say_it_is_back)
+            self._steady = loop.call_later(STEADY_S, self._notify_up)
 
-    def _say_it_is_back(self) -> None:
+    def _notify_up(self) -> None:
         self._is_out = False
         self._say(Severity.INFO, "is back")
 
-    def _say_it_is_down(self, why: str) -> None:
+    def _notify_down(self, why: str) -> None:
         self._cancel_steady()
         if not self._is_out:
             self._is_out = True
@@ -288,7 +290,7 @@ class Link:
             self._steady = None
 
 
-def _answered(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
+def _checked_timesync(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
     """Return the item, or the rejection of a TIMESYNC from a peer without its sender's stamps.
 
     Any program that reaches the socket could otherwise shift a clock. Routers deliver both.
@@ -304,7 +306,7 @@ def _answered(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
     )
 
 
-def _admitted(guard: MessageSigning, item: Frame | Rejection) -> Frame | Rejection:
+def _checked_by_guard(guard: MessageSigning, item: Frame | Rejection) -> Frame | Rejection:
     refusal = None if isinstance(item, Rejection) else guard.refusal(item)
     if refusal is None or isinstance(item, Rejection):
         return item

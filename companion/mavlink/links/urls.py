@@ -34,7 +34,7 @@ Scheme = Literal[
     "udpin", "udpout", "tcp", "tcpin", "serial", "zenoh", "sbs", "readsb", "rid", "cot"
 ]
 SCHEMES: Final[tuple[Scheme, ...]] = get_args(Scheme)
-Way = Literal["", "tcp", "udp", "http", "https"]
+TransportKind = Literal["", "tcp", "udp", "http", "https"]
 """Transport of a link whose scheme supports several; empty: the default of the scheme."""
 MAVLINK: Final[tuple[Scheme, ...]] = ("udpin", "udpout", "tcp", "tcpin", "serial", "zenoh")
 """Schemes that carry MAVLink, in both directions."""
@@ -74,7 +74,7 @@ class LinkUrl:
     scheme: Scheme
     host: str
     port: int
-    way: Way = ""
+    way: TransportKind = ""
     path: str = ""
 
     def __str__(self) -> str:
@@ -100,18 +100,18 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     scheme, _, address = text.partition(":")
     if scheme == "zenoh" and scheme in schemes:
         return _zenoh(text, address)
-    way: Way = ""
+    way: TransportKind = ""
     path = ""
     if scheme == "readsb" and address.startswith(("http:", "https:")):
         way, address, path = _http(text, address)
     elif address.startswith(_WAYS.get(scheme, ())):
         name, _, address = address.partition(":")
-        way = cast(Way, name)
+        way = cast(TransportKind, name)
     elif scheme == "cot":
-        raise LinkError(f"{shown(text)} is not {_FORMS['cot']}{_meant(text)}")
+        raise LinkError(f"{shown(text)} is not {_FORMS['cot']}{_suggestion(text)}")
     host, _, port = address.rpartition(":")
     if scheme not in schemes or not host or not _NUMBER.fullmatch(port):
-        raise LinkError(f"{shown(text)} is not {_form(scheme, schemes)}{_meant(text)}")
+        raise LinkError(f"{shown(text)} is not {_form(scheme, schemes)}{_suggestion(text)}")
     if scheme == "serial":
         return _serial(text, host, int(port))
     bracketed = host.startswith("[") and host.endswith("]")
@@ -126,14 +126,14 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     return url
 
 
-def _http(text: str, address: str) -> tuple[Way, str, str]:
+def _http(text: str, address: str) -> tuple[TransportKind, str, str]:
     way, slashes, rest = address.partition("://")
     host, slash, path = rest.partition("/")
     if not slashes or not _PATH.fullmatch(slash + path):
         raise LinkError(f"{shown(text)} is not readsb:http://HOST/PATH, as in {_AIRCRAFT_JSON}")
     if ":" not in host.rpartition("]")[2]:
         host = f"{host}:{_HTTP_PORTS[way]}"
-    return cast(Way, way), host, slash + path
+    return cast(TransportKind, way), host, slash + path
 
 
 def _zenoh(text: str, address: str) -> LinkUrl:
@@ -156,7 +156,7 @@ def _serial(text: str, device: str, baud: int) -> LinkUrl:
     return LinkUrl(scheme="serial", host=device, port=baud)
 
 
-def _meant(text: str) -> str:
+def _suggestion(text: str) -> str:
     """Return a suggestion for the end of a message; empty without one."""
     scheme, _, address = text.partition(":")
     if not text.isprintable():

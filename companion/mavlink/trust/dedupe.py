@@ -61,7 +61,7 @@ class Dedupe:
             share.latencies_s.append(first.latency_s + (frame.t_ns - first.t_ns) * 1e-9)
         return True
 
-    def took(self, latency_s: float) -> None:
+    def set_latency(self, latency_s: float) -> None:
         """Set the latency, in seconds, of the last new report."""
         first = next(reversed(self._seen.values()))
         first.latency_s = latency_s

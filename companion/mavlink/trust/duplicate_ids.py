@@ -91,7 +91,7 @@ class DuplicateIds:
         sender.heard_ns = frame.t_ns
         path = sender.paths.get(peer)
         if path is None:
-            path = self._meet(sender, link, peer, frame.t_ns)
+            path = self._add_peer(sender, link, peer, frame.t_ns)
         path.heard_ns = frame.t_ns
         if len(sender.paths) == 1:
             return False
@@ -99,7 +99,7 @@ class DuplicateIds:
             when = sender.contradicted_ns
             if not when or frame.t_ns - when[-1] >= SPACED_NS:
                 when.append(frame.t_ns)
-        return self._are_two(frame, sender) and not path.is_router
+        return self._is_duplicate(frame, sender) and not path.is_router
 
     def _follow(self, frame: Frame) -> _SenderPaths | None:
         """Start to follow a sender; None if ``SENDERS_MAX`` is reached."""
@@ -110,7 +110,7 @@ class DuplicateIds:
                 return None
         return self._senders.setdefault(frame.source, _SenderPaths(heard_ns=frame.t_ns))
 
-    def _meet(self, sender: _SenderPaths, link: str, peer: str, t_ns: int) -> _Path:
+    def _add_peer(self, sender: _SenderPaths, link: str, peer: str, t_ns: int) -> _Path:
         """Start to follow a peer of a sender; forget silent peers."""
         paths = sender.paths
         for name in [name for name, path in paths.items() if t_ns - path.heard_ns > KEPT_NS]:
@@ -136,15 +136,18 @@ class DuplicateIds:
         for other in sender.paths.values():
             if other is path or (other.is_router and path.is_router):
                 continue
-            if any(_is_off(said, *stretch) for stretch in _around(other.reports, said.boot_ms)):
+            if any(
+                _contradicts_stretch(said, *stretch)
+                for stretch in _around(other.reports, said.boot_ms)
+            ):
                 return True
             if before is not None and any(
-                _is_off(q, before, said) for q in _within(other.reports, before, said)
+                _contradicts_stretch(q, before, said) for q in _within(other.reports, before, said)
             ):
                 return True
         return False
 
-    def _are_two(self, frame: Frame, sender: _SenderPaths) -> bool:
+    def _is_duplicate(self, frame: Frame, sender: _SenderPaths) -> bool:
         """Return whether the peers of a sender contradict each other; add it to ``found`` once."""
         when = sender.contradicted_ns
         while when and frame.t_ns - when[0] > KEPT_NS:
@@ -177,7 +180,7 @@ def _within(
             yield one
 
 
-def _is_off(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> bool:
+def _contradicts_stretch(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> bool:
     stretch_ms = last.boot_ms - first.boot_ms
     if stretch_ms > STRETCH_MS:
         return False

@@ -145,9 +145,9 @@ class ServiceComponent:
 
         Returns the round trips, rejections and notices since the last call.
         """
-        said: list[RoundTrip | Rejection | Notice] = []
+        outputs: list[RoundTrip | Rejection | Notice] = []
         if frame.source == self._source:
-            self._own_name(frame, said)
+            self._own_id_received(frame, outputs)
         elif frame.msgid in POSE:
             is_stamped = frame.msgid in stamps.STAMPED
             boot_ms = stamps.boot_ms(frame) if is_stamped else positions.read(frame).boot_ms
@@ -156,7 +156,7 @@ class ServiceComponent:
         else:
             self._rates.message_received(frame.t_ns, frame.source)
             if frame.msgid == TIMESYNC:
-                self._timesync_answer(frame, said)
+                self._timesync_answer(frame, outputs)
             elif frame.msgid == COMMAND_ACK:
                 self._command_ack(frame)
             elif frame.msgid == COMMAND_LONG:
@@ -164,11 +164,11 @@ class ServiceComponent:
             elif frame.msgid == REQUEST_DATA_STREAM:
                 self._request_data_stream(frame)
         while self._held and frame.t_ns - self._held[0].t_ns >= HELD_NS:
-            said.append(self._held.pop(0))
+            outputs.append(self._held.pop(0))
         if self._rates.notices:
-            said += self._rates.notices
+            outputs += self._rates.notices
             self._rates.notices.clear()
-        return said
+        return outputs
 
     def due(
         self, now_ns: int, fit: bool, uavs: Iterable[Source]
@@ -209,7 +209,7 @@ class ServiceComponent:
         told = {who: at for who, at in self._doubted.items() if oldest_ns - at < CONFLICT_NOTICE_NS}
         self._doubted = told
 
-    def _own_name(self, frame: Frame, said: list[RoundTrip | Rejection | Notice]) -> None:
+    def _own_id_received(self, frame: Frame, outputs: list[RoundTrip | Rejection | Notice]) -> None:
         """Handle a frame under this service's id: an echo of its own, or another sender's."""
         sent_ns = self._sent.get(_content(frame.msgid, frame.payload))
         if sent_ns is not None and frame.t_ns - sent_ns <= KEPT_NS:
@@ -217,17 +217,22 @@ class ServiceComponent:
         if self._conflict_ns is None or frame.t_ns - self._conflict_ns >= CONFLICT_NOTICE_NS:
             self._conflict_ns = frame.t_ns
             text = f"{frame.link}: another sender uses {self._source}, this service's id"
-            said.append(
+            outputs.append(
                 Notice(
                     t_ns=frame.t_ns, severity=Severity.WARNING, subject=str(self._source), text=text
                 )
             )
 
-    def _timesync_answer(self, frame: Frame, said: list[RoundTrip | Rejection | Notice]) -> None:
+    def _timesync_answer(self, frame: Frame, outputs: list[RoundTrip | Rejection | Notice]) -> None:
         remote_ns, sent_ns, *target = unpack(frame, _TIMESYNC)
         answered = self._answered.get(sent_ns)
         stamp = self._stamps.get(frame.source)
-        if remote_ns == 0 or answered is None or stamp is None or not self._is_for_us(*target):
+        if (
+            remote_ns == 0
+            or answered is None
+            or stamp is None
+            or not self._is_addressed_to_us(*target)
+        ):
             return  # a request, an answer to others, or an answer of a sender without stamps
         if frame.t_ns - sent_ns > LONGEST_TRIP_NS:
             trip_s = (frame.t_ns - sent_ns) * 1e-9
@@ -243,30 +248,30 @@ class ServiceComponent:
                 self._held.append(trip)
                 return
             if not _agree(first, trip):
-                self._contradicted(first, trip, said)
+                self._discard_contradicting(first, trip, outputs)
                 return
             refused, detail = Reason.DUPLICATE, "TIMESYNC: answered before"
-        said.append(_refused(frame.t_ns, frame.source, refused, detail))
+        outputs.append(_refused(frame.t_ns, frame.source, refused, detail))
 
-    def _contradicted(
-        self, first: RoundTrip, second: RoundTrip, said: list[RoundTrip | Rejection | Notice]
+    def _discard_contradicting(
+        self, first: RoundTrip, second: RoundTrip, outputs: list[RoundTrip | Rejection | Notice]
     ) -> None:
         """Discard two answers that cannot be of one clock; the first only if it is still held."""
         discarded = [first, second] if first in self._held else [second]
         self._held = [trip for trip in self._held if trip is not first]
         detail = "TIMESYNC: two answers contradict each other"
-        said += [_refused(one.t_ns, one.source, Reason.SHARED_ID, detail) for one in discarded]
+        outputs += [_refused(one.t_ns, one.source, Reason.SHARED_ID, detail) for one in discarded]
         t_ns, source = second.t_ns, second.source
         if t_ns - self._doubted.get(source, -CONFLICT_NOTICE_NS) >= CONFLICT_NOTICE_NS:
             self._doubted[source] = t_ns
             text = f"two senders answer TIMESYNC as {source} with different clocks: neither is used"
-            said.append(
+            outputs.append(
                 Notice(t_ns=t_ns, severity=Severity.WARNING, subject=str(source), text=text)
             )
 
     def _command_ack(self, frame: Frame) -> None:
         command, result, _, _, *target = unpack(frame, _COMMAND_ACK)
-        if command == MAV_CMD_SET_MESSAGE_INTERVAL and self._is_for_us(*target):
+        if command == MAV_CMD_SET_MESSAGE_INTERVAL and self._is_addressed_to_us(*target):
             self._rates.acknowledged(frame.t_ns, frame.source, result)
 
     def _command_long(self, frame: Frame) -> None:
@@ -289,7 +294,7 @@ class ServiceComponent:
                 Request(t_ns=frame.t_ns, by=frame.source, target=target, msgids=msgids, hz=hz)
             )
 
-    def _is_for_us(self, sysid: int, compid: int) -> bool:
+    def _is_addressed_to_us(self, sysid: int, compid: int) -> bool:
         """Return whether an answer may be for this service: addressed to it, or broadcast."""
         return sysid in (_BROADCAST, self._source.sysid) and compid in (
             _BROADCAST,

@@ -15,7 +15,7 @@ from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.values import Notice, Source
 
 _NS: Final = 1_000_000_000
-GONE_NS: Final = 5 * _NS  # silence after which a UAV gets no requests
+SILENCE_NS: Final = 5 * _NS  # silence after which a UAV gets no requests
 FORGET_NS: Final = 30 * _NS  # silence after which a UAV is forgotten
 REQUESTS_PER_S: Final = 5  # most requests sent in any second
 
@@ -91,7 +91,7 @@ class MessageRates:
         for uav in self._watched():
             for watch in uav.watches.values():
                 self.notices += watch.review(now_ns, uav.heard_ns, self._others)
-                if watch.ready(now_ns) and now_ns - uav.heard_ns < GONE_NS:
+                if watch.ready(now_ns) and now_ns - uav.heard_ns < SILENCE_NS:
                     ready.append(watch)
         out = []
         for watch in sorted(ready, key=lambda watch: watch.next_ns):

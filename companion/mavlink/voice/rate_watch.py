@@ -47,7 +47,7 @@ BACKOFF_NS: Final = (5 * _NS, 300 * _NS)
 """Shortest and longest time between two requests for one message of one UAV."""
 IN_ORDER_NS: Final = 600 * _NS
 """Time of a sufficient rate after which the back-off is reset and notices may be repeated."""
-BLAME_NS: Final = 30 * _NS
+ATTRIBUTION_NS: Final = 30 * _NS
 """Longest time between another component's request and a rate change attributed to it."""
 _ACK_WAIT_NS: Final = 5 * _NS
 """How long the answer to a command blocks the next command to that UAV."""
@@ -191,7 +191,7 @@ class Watch:
                 self._slow_since_ns = now_ns
             if self._is_settled(self._slow_since_ns, now_ns):
                 self._order_since_ns = None
-                return self._slow(now_ns, self._slow_since_ns, observed_hz, others)
+                return self._handle_slow(now_ns, self._slow_since_ns, observed_hz, others)
         else:
             self._slow_since_ns = None
             if observed_hz is not None:
@@ -267,7 +267,7 @@ class Watch:
             self._notified.clear()
             self.changed_by = None
 
-    def _slow(
+    def _handle_slow(
         self, now_ns: int, since_ns: int, observed_hz: float | None, others: Iterable[Request]
     ) -> list[Notice]:
         """Handle a rate that settled as slow: it was changed, or the last request did not help."""
@@ -275,19 +275,19 @@ class Watch:
         text = f"{self.uav}: {_NAMES[self.msgid]} {comes}, not at {self.wanted_hz:g} Hz: "
         if self._was_in_order:
             self._was_in_order = False
-            self.changed_by = self._who_changed(since_ns, others)
+            self.changed_by = self._cause_of_change(since_ns, others)
             by = "" if self.changed_by == NO_REQUEST_SEEN else "changed by "
-            return self._tell(now_ns, self.changed_by, text + by + self.changed_by)
+            return self._notice_once(now_ns, self.changed_by, text + by + self.changed_by)
         if self.state is RateState.STREAMING and now_ns >= self.next_ns:
             self.state = RateState.REFUSED
             self.next_ns = now_ns + self._backoff_ns
             self._by_stream = False
-            return self._tell(now_ns, self.state, text + "requests have no effect")
+            return self._notice_once(now_ns, self.state, text + "requests have no effect")
         return []
 
-    def _who_changed(self, since_ns: int, others: Iterable[Request]) -> str:
+    def _cause_of_change(self, since_ns: int, others: Iterable[Request]) -> str:
         """Return the latest known cause between our own newest request and the change."""
-        after_ns = max(since_ns - BLAME_NS, self.asked_ns)
+        after_ns = max(since_ns - ATTRIBUTION_NS, self.asked_ns)
         causes = [
             (request.t_ns, str(request.by))
             for request in others
@@ -299,7 +299,7 @@ class Watch:
             (c for c in causes if after_ns <= c[0] <= since_ns), default=(0, NO_REQUEST_SEEN)
         )[1]
 
-    def _tell(self, now_ns: int, what: str, text: str) -> list[Notice]:
+    def _notice_once(self, now_ns: int, what: str, text: str) -> list[Notice]:
         if what in self._notified:
             return []
         self._notified.add(what)

@@ -54,11 +54,11 @@ class CotSplitter(ForeignSplitter):
         while True:
             begun = _BEGIN.search(data, at)
             if begun is None:
-                keep = _beginning(data, at)
-                garbage += _stray(data[at : len(data) - keep])
+                keep = _partial_start_bytes(data, at)
+                garbage += _count_stray_bytes(data[at : len(data) - keep])
                 at = len(data) - keep
                 break
-            garbage += _stray(data[at : begun.start()])
+            garbage += _count_stray_bytes(data[at : begun.start()])
             at = begun.start()
             end = _tak_end(data, at) if data[at] == _MAGIC else _xml_end(data, at)
             if end is None and len(data) - at <= EVENT_MAX:
@@ -80,7 +80,7 @@ class CotSplitter(ForeignSplitter):
             return self._refused(t_ns, Reason.MALFORMED, str(why)[:80])
         if event is None:
             return []
-        unfit = _unfit(event)
+        unfit = _rejection_reason(event)
         if unfit:
             return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, unfit)
         if event.hae_m is None:
@@ -89,7 +89,7 @@ class CotSplitter(ForeignSplitter):
         return [self._frame(t_ns, _outgoing(event))]
 
 
-def _unfit(event: CotEvent) -> str:
+def _rejection_reason(event: CotEvent) -> str:
     """Return why an event must be rejected; empty to use it."""
     if not event.is_aircraft:
         return "not an aircraft"
@@ -98,12 +98,12 @@ def _unfit(event: CotEvent) -> str:
     return "event of another companion service" if event.uid.startswith(OWN) else ""
 
 
-def _stray(data: bytes) -> int:
+def _count_stray_bytes(data: bytes) -> int:
     """Count the bytes between events, except XML declarations and white space."""
     return len(re.sub(rb"<\?xml[^>]*\?>|\s", b"", data))
 
 
-def _beginning(data: bytes, at: int) -> int:
+def _partial_start_bytes(data: bytes, at: int) -> int:
     """Count the bytes at the end that may start an event or a declaration."""
     opened = data.rfind(b"<", max(at, len(data) - 200))
     return 0 if opened < 0 or b">" in data[opened:] else len(data) - opened

@@ -203,7 +203,7 @@ _UNKNOWN: Final = 0xFFFF_FFFF
 _GPS_RAW_INT = struct.Struct("<QiiiHHHHBBiIIIIH")
 
 
-def _stated(thousandths: int) -> float | None:
+def _accuracy(thousandths: int) -> float | None:
     """Return an accuracy in m or m/s; None if it was not sent, or is all ones."""
     return None if thousandths in (0, _UNKNOWN) else thousandths * 1e-3
 
@@ -217,9 +217,9 @@ def _gps_raw_int(frame: Frame) -> GnssStatus:
         source=frame.source,
         fix_type=fields[8],
         alt_m=fields[3] * 1e-3,
-        h_acc_m=_stated(h_acc),
-        v_acc_m=_stated(v_acc),
-        vel_acc_mps=_stated(vel_acc),
+        h_acc_m=_accuracy(h_acc),
+        v_acc_m=_accuracy(v_acc),
+        vel_acc_mps=_accuracy(vel_acc),
         time_us=fields[0],
     )
 

@@ -142,9 +142,9 @@ class Checker:
                     return source, msgid, raw
                 return BAD_CRC
         length = examine(buffer, at, end)
-        return self._learn(buffer[at : at + length]) if length > 0 else length
+        return self._cache_sender(buffer[at : at + length]) if length > 0 else length
 
-    def _learn(self, raw: bytes) -> Checked:
+    def _cache_sender(self, raw: bytes) -> Checked:
         if raw[0] == MAGIC_V2:
             ids, msgid = (raw[5], raw[6]), raw[7] | raw[8] << 8 | raw[9] << 16
         else:

@@ -45,13 +45,13 @@ def remote_id(frame: Frame) -> RemoteId | None:
     return said
 
 
-def _begun(frame: Frame, heard_as: bytes) -> RemoteId:
+def _message(frame: Frame, heard_as: bytes) -> RemoteId:
     return RemoteId(t_ns=frame.t_ns, source=frame.source, heard_as=heard_as.rstrip(b"\0").hex())
 
 
 def _basic_id(frame: Frame) -> RemoteId:
     heard_as, kind, uas_id = unpack(frame, _BASIC_ID)
-    return _identified(_begun(frame, heard_as), kind, uas_id)
+    return _add_id(_message(frame, heard_as), kind, uas_id)
 
 
 def _location(frame: Frame) -> RemoteId:
@@ -62,7 +62,7 @@ def _location(frame: Frame) -> RemoteId:
         raise ValueError("height or time is not finite")
     horizontal, vertical, at_speed, at_time = codes
     return _located(
-        _begun(frame, heard_as),
+        _message(frame, heard_as),
         _Place(
             lat_1e7=lat,
             lon_1e7=lon,
@@ -79,23 +79,23 @@ def _location(frame: Frame) -> RemoteId:
 
 def _system(frame: Frame) -> RemoteId:
     count, heard_as = unpack(frame, _SYSTEM)
-    return replace(_begun(frame, heard_as), aircraft=count)
+    return replace(_message(frame, heard_as), aircraft=count)
 
 
 def _pack(frame: Frame) -> RemoteId:
     heard_as, size, count, messages = unpack(frame, _PACK)
     if size != _MESSAGE_BYTES or not 0 < count <= _PACK_MAX:
         raise ValueError(f"invalid pack of {count} messages of {size} bytes")
-    said = _begun(frame, heard_as)
+    said = _message(frame, heard_as)
     for at in range(0, count * size, size):
-        said = _added(said, messages[at : at + size])
+        said = _add_message(said, messages[at : at + size])
     return said
 
 
-def _added(said: RemoteId, message: bytes) -> RemoteId:
+def _add_message(said: RemoteId, message: bytes) -> RemoteId:
     match message[0] >> 4:
         case 0:
-            return _identified(said, message[1] >> 4, message[2:22])
+            return _add_id(said, message[1] >> 4, message[2:22])
         case 1:
             return _located(said, _packed_place(message))
         case 4:
@@ -130,7 +130,7 @@ _READERS: Final = {BASIC_ID: _basic_id, LOCATION: _location, SYSTEM: _system, ME
 READ: Final = frozenset(_READERS)  # message ids that remote_id reads
 
 
-def _identified(said: RemoteId, kind: int, uas_id: bytes) -> RemoteId:
+def _add_id(said: RemoteId, kind: int, uas_id: bytes) -> RemoteId:
     """Add an id, unless it has one of a better kind: serial number, registration, flight id."""
     name = uas_id.rstrip(b"\0 ")
     if not name or kind == 0 or (said.id_kind is not None and said.id_kind <= kind):

@@ -73,7 +73,7 @@ class Gimbal:
 
     def apply(self, command: DeviceCommand) -> None:
         """Read the reported attitudes, and point."""
-        self._hear()
+        self._receive()
         yaw_rad = _near(command.bearing_rad, self._last_rad)
         self._last_rad = yaw_rad
         self._point(command)
@@ -94,9 +94,9 @@ class Gimbal:
         """Send the direction; without one it is boresight."""
         yaw_rad = math.remainder(command.bearing_rad, 2 * math.pi)
         rates = math.nan, math.nan  # pitch and yaw rates are not commanded
-        whom = *self.target, 0  # every gimbal of that manager
+        recipient = *self.target, 0  # every gimbal of that manager
         angles = command.above_rad, yaw_rad
-        self.say(SET_PITCHYAW, struct.pack("<I4f3B", IN_EARTH_FRAME, *angles, *rates, *whom))
+        self.say(SET_PITCHYAW, struct.pack("<I4f3B", IN_EARTH_FRAME, *angles, *rates, *recipient))
 
     def say(self, msgid: int, payload: bytes) -> None:
         """Send a message to the gimbal."""
@@ -110,7 +110,7 @@ class Gimbal:
         except OSError as error:
             raise DeviceError(f"gimbal: {error.strerror or error}") from error
 
-    def _hear(self) -> None:
+    def _receive(self) -> None:
         """Read the attitudes received so far."""
         while self._socket is not None:
             try:
@@ -141,8 +141,10 @@ class RoiGimbal(Gimbal):
         lat_deg, lon_deg, alt_m = command.place or (0.0, 0.0, 0.0)
         number = DO_SET_ROI_NONE if command.place is None else DO_SET_ROI_LOCATION
         where = round(lat_deg * 1e7), round(lon_deg * 1e7), alt_m
-        whom = *self.target, 0, 0, 0  # MAV_FRAME_GLOBAL: above mean sea level; no mission
-        self.say(COMMAND_INT, struct.pack("<4f2ifH5B", 0.0, 0.0, 0.0, 0.0, *where, number, *whom))
+        recipient = *self.target, 0, 0, 0  # MAV_FRAME_GLOBAL: above mean sea level; no mission
+        self.say(
+            COMMAND_INT, struct.pack("<4f2ifH5B", 0.0, 0.0, 0.0, 0.0, *where, number, *recipient)
+        )
 
 
 def _near(angle_rad: float, other_rad: float) -> float:

@@ -9,10 +9,10 @@ from companion.values import FloatArray
 
 MOST_S: Final = 2.0  # largest lag considered
 STEP_S: Final = 0.01
-FEWEST: Final = 20  # least number of reports for an estimate
+SAMPLES_MIN: Final = 20  # least number of reports for an estimate
 LEAST_RAD: Final = np.radians(2.0)
 """Movement within the stored reports below which the estimate is kept."""
-MOST_LEFT: Final = 0.2
+RESIDUAL_MAX: Final = 0.2
 """Largest fraction of the movement that the lag may leave unexplained, as by a mount at its limit.
 """
 KEPT: Final = 100
@@ -33,13 +33,13 @@ class MountLag:
     def note_report(self, at_ns: int, azimuth_rad: float) -> None:
         """Note a reported direction, and update the estimate."""
         self._reports.append((at_ns * 1e-9, azimuth_rad))
-        if len(self._reports) >= FEWEST:
+        if len(self._reports) >= SAMPLES_MIN:
             self._estimate(np.array(self._commands).T, np.array(self._reports).T)
 
     def _estimate(self, told: FloatArray, seen: FloatArray) -> None:
         """Find the lag at which commands and reports differ least."""
         late = seen[:, seen[0] >= told[0, 0] + MOST_S]
-        if late.shape[1] < FEWEST // 2 or np.ptp(late[1]) < LEAST_RAD:
+        if late.shape[1] < SAMPLES_MIN // 2 or np.ptp(late[1]) < LEAST_RAD:
             return
         lags = np.arange(0.0, MOST_S, STEP_S)
         then = np.interp(late[0] - lags[:, np.newaxis], *told)
@@ -47,5 +47,5 @@ class MountLag:
         off -= 2 * np.pi * np.round(np.median(off, axis=1, keepdims=True) / (2 * np.pi))
         left = np.sqrt(np.mean(off**2, axis=1))
         best = int(np.argmin(left))
-        if left[best] <= MOST_LEFT * np.std(late[1]):
+        if left[best] <= RESIDUAL_MAX * np.std(late[1]):
             self.lag_s = float(lags[best])

@@ -18,7 +18,7 @@ import numpy as np
 from companion.values import IntArray, UserError
 
 REMEMBERED: Final = 1000  # updates whose times are kept
-LEADING: Final = 51  # updates whose median time is the next lead
+LEAD_QUANTILE: Final = 51  # updates whose median time is the next lead
 RETRY_NS: Final = 1_000_000_000  # time between two attempts to open a device
 LATE_SHARE: Final = 0.1
 """Fraction of the update interval by which an update may be late."""
@@ -176,7 +176,7 @@ class Drive:
                 return
             self._device.apply(command)
         except DeviceError as error:
-            self._failed(error)
+            self._handle_failure(error)
             return
         ended_ns = self._now_ns()
         self._took_ns.append(ended_ns - began_ns)
@@ -204,7 +204,9 @@ class Drive:
         own_s = self._device.lead_s
         if own_s is not None:
             return own_s
-        return statistics.median(list(self._took_ns)[-LEADING:]) * 1e-9 if self._took_ns else 0.0
+        return (
+            statistics.median(list(self._took_ns)[-LEAD_QUANTILE:]) * 1e-9 if self._took_ns else 0.0
+        )
 
     def status(self) -> DriveStatus:
         """Return the state of the drive."""
@@ -230,7 +232,7 @@ class Drive:
             self._say("the device is connected")
         return self._open
 
-    def _failed(self, error: DeviceError) -> None:
+    def _handle_failure(self, error: DeviceError) -> None:
         if self._open or not self._failures:
             self._say(f"the device failed: {error}")
         self._failures += 1

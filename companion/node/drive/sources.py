@@ -25,7 +25,7 @@ from companion.views.as_json import as_json
 from companion.views.quantised import device_table
 
 ADAR1000: Final = WeightFormat.ADAR1000.media_type
-LEAST_MEAN: Final = 0.1  # length of the mean of unit directions below which it is undefined
+MIN_MEAN_VECTOR: Final = 0.1  # length of the mean of unit directions below which it is undefined
 ANSWERS_S: Final = 5.0  # timeout for an answer of the event loop
 
 
@@ -50,7 +50,7 @@ class BeamRequest:
             raise UserError('aim = "centre" works only for a mount; set aim = "first"')
 
 
-class OverHttp:
+class HttpSource:
     """Beams of a service over HTTP."""
 
     def __init__(self, client: Client, wanted: BeamRequest) -> None:
@@ -75,7 +75,7 @@ class OverHttp:
         return command_for(told, text, self._wanted, valid_at_ns)
 
 
-class OfThisProcess:
+class LocalSource:
     """Beams of the pipeline of this process, which runs on an event loop."""
 
     def __init__(
@@ -100,13 +100,13 @@ class OfThisProcess:
             update = asked.result(ANSWERS_S)
         except (TimeoutError, asyncio.CancelledError) as error:
             raise SourceLostError("timeout") from error
-        return shot_of(self._pipeline, self._equipment, update, self._wanted)
+        return command_of(self._pipeline, self._equipment, update, self._wanted)
 
     async def _look(self, lead_s: float) -> Update:
         return self._pipeline.look(self._now_ns(), lead_s)
 
 
-def shot_of(
+def command_of(
     pipeline: Pipeline, equipment: Equipment, update: Update, wanted: BeamRequest
 ) -> DeviceCommand:
     """Return the command from one update. Only the requested beam is fitted to the device."""
@@ -209,7 +209,7 @@ def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> DeviceCommand:
         float(part.sum())
         for part in (level * np.cos(bearing), level * np.sin(bearing), np.sin(above))
     )
-    if math.hypot(north, east, up) < LEAST_MEAN * len(beams):
+    if math.hypot(north, east, up) < MIN_MEAN_VECTOR * len(beams):
         return DeviceCommand(
             valid_at_ns=valid_at_ns,
             unfit="mean direction of the UAVs is undefined, as they surround the array; follow"

@@ -9,14 +9,14 @@ requests detect this. Only a new session fixes it.
 from collections.abc import Mapping
 from typing import Final
 
-MOST_NS: Final = 60_000_000_000
+PATIENCE_MAX_NS: Final = 60_000_000_000
 """Limit on the time between two sessions.
 
 A node that never answers, or forged names, must not cost the others their sessions.
 """
-CALM_NS: Final = 600_000_000_000
+RESET_NS: Final = 600_000_000_000
 """Time after a new session after which the interval to the next one is reset."""
-HELD_UP_NS: Final = 3_000_000_000
+BLOCKED_NS: Final = 3_000_000_000
 """Time without a check after which this process was suspended, and answers may still be queued."""
 
 
@@ -48,12 +48,12 @@ class Unanswered:
         before_ns = now_ns - self._patience_ns
         return [n for n, at_ns in heard_ns.items() if n not in self.alive and at_ns < before_ns]
 
-    def mute(self, now_ns: int, heard_ns: Mapping[str, int]) -> list[str]:
+    def unresponsive(self, now_ns: int, heard_ns: Mapping[str, int]) -> list[str]:
         """Return nodes that are present but have not answered for too long; then restart all waits.
 
         A node is present if it has a liveliness token, or sent a message within half the patience.
         """
-        if self._looked_ns is not None and now_ns - self._looked_ns > HELD_UP_NS:
+        if self._looked_ns is not None and now_ns - self._looked_ns > BLOCKED_NS:
             self._since.clear()
         self._looked_ns = now_ns
         lately_ns = now_ns - self._patience_ns // 2
@@ -67,11 +67,11 @@ class Unanswered:
         return found
 
     def _may_find(self, now_ns: int) -> bool:
-        passed_ns = CALM_NS if self._found_ns is None else now_ns - self._found_ns
-        if passed_ns >= CALM_NS:
+        passed_ns = RESET_NS if self._found_ns is None else now_ns - self._found_ns
+        if passed_ns >= RESET_NS:
             self._gap_ns = self._patience_ns
         if passed_ns < self._gap_ns:
             return False
         self._found_ns = now_ns
-        self._gap_ns = min(2 * self._gap_ns, MOST_NS)
+        self._gap_ns = min(2 * self._gap_ns, PATIENCE_MAX_NS)
         return True

@@ -85,7 +85,7 @@ class LiveFleetNode:
         self._bus: Bus | None = None  # set after all declarations
         self._flushing: asyncio.TimerHandle | None = None
         self._flush_ns = 0  # due time of the flush
-        self._has_twin = False
+        self._has_duplicate = False
         self._listening: Listening | None = None
         patience_s = max(PATIENCE_S, PATIENCE_LEASES * settings.lease_s)
         self._unanswered = Unanswered(round(patience_s * 1e9))
@@ -132,9 +132,11 @@ class LiveFleetNode:
             async with asyncio.TaskGroup() as group:
                 tasks = [
                     group.create_task(bus.run(), name="zenoh"),
-                    group.create_task(self._repeat(STANDING_S, self._stand), name="standing"),
+                    group.create_task(
+                        self._repeat(STANDING_S, self._publish_standing), name="standing"
+                    ),
                     group.create_task(self._repeat(ASKED_S, self._ask), name="clocks"),
-                    group.create_task(self._repeat(OFFERED_S, self._offer), name="offers"),
+                    group.create_task(self._repeat(OFFERED_S, self._publish_offers), name="offers"),
                     group.create_task(self._make_offers(), name="looks"),
                 ]
                 while not self._is_link_one_way(self._now_ns()):
@@ -153,12 +155,12 @@ class LiveFleetNode:
         """Return whether a present node does not answer; removes nodes that left."""
         heard_ns = {node: known.heard_ns for node, known in self.member.neighbours.items()}
         for node in self._unanswered.gone(now_ns, heard_ns):
-            self._tell(self.member.node_left(now_ns, node))
-        mute = self._unanswered.mute(now_ns, heard_ns)
-        if mute:
-            text = f"no answer from {', '.join(mute)}; reconnecting to all nodes"
+            self._publish(self.member.node_left(now_ns, node))
+        unresponsive = self._unanswered.unresponsive(now_ns, heard_ns)
+        if unresponsive:
+            text = f"no answer from {', '.join(unresponsive)}; reconnecting to all nodes"
             self._notify(Notice(t_ns=now_ns, severity=Severity.WARNING, subject="fleet", text=text))
-        return bool(mute)
+        return bool(unresponsive)
 
     async def _repeat(self, period_s: float, what: Callable[[int], None]) -> None:
         while True:
@@ -177,8 +179,8 @@ class LiveFleetNode:
         base = f"{PREFIX}/{self.settings.site}"
         bus.serve(self._key("time"), self._time)
         bus.serve(self._key("schema"), lambda key, payload: schemas.SHARED.descriptor_set)
-        bus.subscribe(f"{base}/*/standing", self._taking(self._stands))
-        heard, offered = self._taking(self._shared), self._taking(self._offered)
+        bus.subscribe(f"{base}/*/standing", self._receive_loop(self._stands))
+        heard, offered = self._receive_loop(self._shared), self._receive_loop(self._offered)
         self._listening = Listening(bus=bus, base=base, heard=heard, offered=offered)
         bus.watch(f"{base}/*/alive", self._seen)
         bus.alive(self._key("alive"))
@@ -208,8 +210,10 @@ class LiveFleetNode:
         duty, notices = self.member.decide(now_ns)
         if duty is not None:
             self._step(duty)
-            self._stand(now_ns)  # at once: until then two nodes serve a UAV that was handed over
-        self._tell(notices)
+            self._publish_standing(
+                now_ns
+            )  # at once: until then two nodes serve a UAV that was handed over
+        self._publish(notices)
 
     def _publish_received(self, now_ns: int) -> None:
         said = self.member.sharing.next_message(now_ns)
@@ -245,13 +249,13 @@ class LiveFleetNode:
                 self._key(what), payload, express=express, priority=PRIORITY, reliable=reliable
             )
 
-    def _stand(self, now_ns: int) -> None:
+    def _publish_standing(self, now_ns: int) -> None:
         said = self.member.own_standing(now_ns, self._around.place(), self._around.reach_m(now_ns))
         self._put("standing", messages.standing(said))
         if self._listening is not None:
             self._listening.to(self.member.near)
 
-    def _offer(self, now_ns: int) -> None:
+    def _publish_offers(self, now_ns: int) -> None:
         """Publish this node's offers and the tracks that it serves, and check for phantoms."""
         offers = dict(self._offers.made)
         self.member.set_offers(offers)
@@ -269,7 +273,7 @@ class LiveFleetNode:
                 ]
             )
             self._put("tracks", said.SerializeToString())
-        self._tell(self._around.phantoms(now_ns))
+        self._publish(self._around.phantoms(now_ns))
         self._sent.look(now_ns)
         self._heard.look(now_ns)
 
@@ -279,9 +283,9 @@ class LiveFleetNode:
         for node in self.member.near:
             key = self._key("time", node)
             self._unanswered.asked(now_ns, node)
-            self._bus.ask(key, b"", ANSWERED_S, self._reading(node, self._now_ns()))
+            self._bus.ask(key, b"", ANSWERED_S, self._clock_answer(node, self._now_ns()))
 
-    def _reading(self, node: str, sent_ns: int) -> Callable[[bytes, int], None]:
+    def _clock_answer(self, node: str, sent_ns: int) -> Callable[[bytes, int], None]:
         """Return the callback for the answer to a request sent now."""
 
         def take(answer: bytes, arrived_ns: int) -> None:
@@ -291,7 +295,7 @@ class LiveFleetNode:
                 return
             started_ns, remote_ns = messages.CLOCK.unpack(answer)
             received_ns = self._now_ns() - (time.monotonic_ns() - arrived_ns)
-            self._tell(self.member.read_clock(node, started_ns, sent_ns, received_ns, remote_ns))
+            self._publish(self.member.read_clock(node, started_ns, sent_ns, received_ns, remote_ns))
 
         return take
 
@@ -305,7 +309,7 @@ class LiveFleetNode:
         self.damaged += 1
         return None
 
-    def _taking(self, take: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
+    def _receive_loop(self, take: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
         """Return a callback that passes valid samples of other nodes on, and counts the others."""
 
         def taken(key: str, payload: bytes) -> None:
@@ -324,7 +328,7 @@ class LiveFleetNode:
         events, notices = self.member.take_shared(now_ns, node, messages.to_shared(payload))
         for event in events:
             self._step(event)
-        self._tell(notices)
+        self._publish(notices)
 
     def _stands(self, node: str, payload: bytes) -> None:
         said = messages.to_standing(payload, node)
@@ -346,7 +350,7 @@ class LiveFleetNode:
             return
         if not is_alive:
             self._unanswered.alive.discard(node)
-            self._tell(self.member.node_left(self._now_ns(), node))
+            self._publish(self.member.node_left(self._now_ns(), node))
             return
         self._unanswered.alive.add(node)
         if node not in self.member.neighbours:
@@ -358,15 +362,15 @@ class LiveFleetNode:
             )
 
     def _notify_duplicate(self) -> None:
-        if self._has_twin:
+        if self._has_duplicate:
             return
-        self._has_twin = True
+        self._has_duplicate = True
         text = f"another node is also named {self.name}; set a unique `[fleet] node` on each"
         self._notify(
             Notice(t_ns=self._now_ns(), severity=Severity.ERROR, subject="fleet", text=text)
         )
 
-    def _tell(self, notices: list[Notice]) -> None:
+    def _publish(self, notices: list[Notice]) -> None:
         for notice in notices:
             self._notify(notice)
 

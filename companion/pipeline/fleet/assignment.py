@@ -25,7 +25,7 @@ LIKELY_PENALTY_DB: Final = 10.0
 STEP_DB: Final = 0.1  # offers are rounded to steps, so that all nodes have the same numbers
 UNSERVED_DB: Final = -1e6
 """Value of not being served: so low that every UAV is served if possible."""
-MOVES: Final = 1000  # largest number of rings of moves per decision
+CYCLES_MAX: Final = 1000  # largest number of rings of moves per decision
 ROUNDING_DB: Final = 1e-7  # a smaller gain is a rounding error
 
 
@@ -61,20 +61,20 @@ def assign(
     uavs = sorted({uav for given in offers.values() for uav in given})
     if not nodes or not uavs:
         return {}
-    nobody = len(nodes)
+    unassigned = len(nodes)
     given = [[offers[node].get(uav, -np.inf) for node in nodes] for uav in uavs]
     worth = np.column_stack([np.array(given), np.full(len(uavs), UNSERVED_DB)])
     rank = {node: number for number, node in enumerate(nodes)}
-    at = np.array([rank.get(holders.get(uav, ""), nobody) for uav in uavs])
+    at = np.array([rank.get(holders.get(uav, ""), unassigned) for uav in uavs])
     each = np.arange(len(uavs))
-    at[~np.isfinite(worth[each, at])] = nobody
-    worth[each, at] += np.where(at == nobody, 0.0, hysteresis_db)
+    at[~np.isfinite(worth[each, at])] = unassigned
+    worth[each, at] += np.where(at == unassigned, 0.0, hysteresis_db)
     room = np.array([*(most[node] for node in nodes), len(uavs)])
     others = np.array([*((beside or {}).get(node, 0) for node in nodes), 0])
-    load = others + np.bincount(at, minlength=nobody + 1)
+    load = others + np.bincount(at, minlength=unassigned + 1)
     _place(worth, room, at, load)
     _improve(worth, room, at, load)
-    return {uav: nodes[at[i]] for i, uav in enumerate(uavs) if at[i] != nobody}
+    return {uav: nodes[at[i]] for i, uav in enumerate(uavs) if at[i] != unassigned}
 
 
 def _price_db(load: IntArray) -> FloatArray:
@@ -87,21 +87,21 @@ def _price_db(load: IntArray) -> FloatArray:
 
 def _place(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> None:
     """Assign each UAV without a node to the best node with room, as a start for the moves."""
-    nobody = len(room) - 1
-    for i in np.flatnonzero(at == nobody):
-        load[nobody] -= 1
+    unassigned = len(room) - 1
+    for i in np.flatnonzero(at == unassigned):
+        load[unassigned] -= 1
         at[i] = np.argmax(np.where(load < room, worth[i] - _price_db(load), -np.inf))
         load[at[i]] += 1
 
 
 def _improve(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> None:
     """Move UAVs in rings, each into the place that the next one leaves, while that gains."""
-    for _ in range(MOVES):
+    for _ in range(CYCLES_MAX):
         gain, who = _gains_db(worth, at)
         left = _price_db(np.maximum(load - 1, 0))
         taken = np.where(load < room, _price_db(load), np.inf)
         outside = len(load)
-        moves = _ring(np.block([[gain, -taken[:, None]], [left, -np.inf]]))
+        moves = _positive_cycle(np.block([[gain, -taken[:, None]], [left, -np.inf]]))
         if not moves:
             return
         for a, b in moves:
@@ -126,7 +126,7 @@ def _gains_db(worth: FloatArray, at: IntArray) -> tuple[FloatArray, IntArray]:
     return gain, who
 
 
-def _ring(edges: FloatArray) -> list[tuple[int, int]]:
+def _positive_cycle(edges: FloatArray) -> list[tuple[int, int]]:
     """Return a ring of edges with a positive sum; empty if none exists (Bellman, Ford).
 
     ``edges`` lead from row to column.

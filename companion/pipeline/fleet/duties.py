@@ -5,7 +5,7 @@ for one lease. A node without a message for that time, or whose liveliness token
 nothing.
 
 - A UAV without a node is claimed by the assigned node: at once if its holder left, otherwise after
-  ``GRACE_NS``. If the assigned node does not claim it within a lease, the next one does.
+  ``NEW_NODE_DELAY_NS``. If the assigned node does not claim it within a lease, the next one does.
 - A UAV that belongs elsewhere is handed over: its holder announces the new node, and serves until
   that node announces that it serves. Two nodes then serve it for the delay of one message, and
   never none.
@@ -22,7 +22,7 @@ from companion.pipeline.fleet.assignment import assign
 from companion.values import Standing
 from companion.values.described import Meaning
 
-GRACE_NS: Final = 500_000_000
+NEW_NODE_DELAY_NS: Final = 500_000_000
 """Time without a holder after which a UAV is claimed; longer than the delay of a message."""
 ASSIGNED_NS: Final = 500_000_000  # time between two assignments while the nodes are the same
 SETTLED_NS: Final = 2_000_000_000
@@ -75,7 +75,7 @@ class Duties:
         """Remove a node that left: the UAVs that it served may be claimed at once."""
         _, said = self._others.pop(node, (0, None))
         for uav, _ in said.serves if said else ():
-            self._free_since[uav] = now_ns - GRACE_NS
+            self._free_since[uav] = now_ns - NEW_NODE_DELAY_NS
 
     def others(self, now_ns: int) -> dict[str, Standing]:
         """Return the newest standing of each other node whose lease has not expired."""
@@ -104,7 +104,7 @@ class Duties:
             self._assigned = now_ns, frozenset(standing)
             self._wanted = self._assign(claims, standing, known)
         wanted = self._wanted
-        self._let_go(claims, standing, known)
+        self._drop_lost_claims(claims, standing, known)
         self._hand_over(now_ns, wanted, known)
         self._take(now_ns, wanted, claims, standing, known)
         changed = [
@@ -128,7 +128,7 @@ class Duties:
             for node, one in offers.items()
         }
         given = {node: one for node, one in given.items() if one or node == self._name}
-        holders = {uav: _keeper(claims[uav]) for uav in matters if uav in claims}
+        holders = {uav: _best_claim(claims[uav]) for uav in matters if uav in claims}
         holders |= dict.fromkeys(self.serves, self._name)
         most = {node: said.most for node, said in standing.items()} | {self._name: self._most}
         beside = {
@@ -138,11 +138,11 @@ class Duties:
         return assign(given, holders, most, self._hysteresis_db, beside)
 
     def _change(self, now_ns: int, uav: str, claims: Mapping[str, Mapping[str, float]]) -> Handover:
-        other = _keeper(claims[uav]) if uav in claims else None
+        other = _best_claim(claims[uav]) if uav in claims else None
         before, after = (other, self._name) if uav in self.serves else (self._name, other)
         return Handover(t_ns=now_ns, uav=uav, before=before, after=after)
 
-    def _let_go(
+    def _drop_lost_claims(
         self,
         claims: Mapping[str, Mapping[str, float]],
         standing: Mapping[str, Standing],
@@ -156,7 +156,7 @@ class Duties:
                 if (uav, self._name) not in standing[node].handing
             }
             mine = {self._name: self.serves[uav]}
-            if self.handing.get(uav) in rivals or _keeper(rivals | mine) != self._name:
+            if self.handing.get(uav) in rivals or _best_claim(rivals | mine) != self._name:
                 self._drop(uav)
         for uav in [uav for uav in self.serves if all(uav not in one for one in offers.values())]:
             self._drop(uav)  # no node can serve it
@@ -206,7 +206,7 @@ class Duties:
                 continue
             free_ns = now_ns - self._free_since.setdefault(uav, now_ns)
             late_ns = 0 if wanted.get(uav) == self._name else self._lease_ns
-            if has_listened and free_ns >= GRACE_NS + late_ns:
+            if has_listened and free_ns >= NEW_NODE_DELAY_NS + late_ns:
                 self.serves[uav] = mine[uav]
         for uav in [uav for uav in self._free_since if uav not in mine or uav in self.serves]:
             del self._free_since[uav]
@@ -221,6 +221,6 @@ def _claims(standing: Mapping[str, Standing]) -> dict[str, dict[str, float]]:
     return claims
 
 
-def _keeper(claims: Mapping[str, float]) -> str:
+def _best_claim(claims: Mapping[str, float]) -> str:
     """Return the node that keeps a UAV: the one with the highest value, by name between equals."""
     return max(sorted(claims), key=lambda node: claims[node])

@@ -257,24 +257,24 @@ class FleetMember:
         ``positions`` are those of all vehicles known here, ``own`` is what this node receives.
         """
         witnesses = {self.name: own}
-        hearers = dict[str, list[str]]()
-        heard_by = dict[str, frozenset[str]]()
+        receiving_nodes = dict[str, list[str]]()
+        received_by = dict[str, frozenset[str]]()
         for node, known in self.neighbours.items():
             said = known.standing
             if not self.trust.is_trusted(node) or known.offers is None or said is None:
                 continue
             heard = frozenset(u for u, offer in known.offers.items() if offer.heard_s is not None)
-            heard_by[node] = heard
+            received_by[node] = heard
             for uav in heard:
-                hearers.setdefault(uav, []).append(node)
+                receiving_nodes.setdefault(uav, []).append(node)
             if said.place is not None and said.reach_m is not None:
                 witnesses[node] = Witness(local(said.place), said.reach_m, heard)
         told = [
             UnconfirmedVehicle(uav, nodes[0], positions[uav])
-            for uav, nodes in hearers.items()
+            for uav, nodes in receiving_nodes.items()
             if len(nodes) == 1 and uav not in own.heard and uav in positions
         ]
-        counts = {node: len(heard) for node, heard in heard_by.items()}
+        counts = {node: len(heard) for node, heard in received_by.items()}
         return self.trust.check_vehicles(now_ns, told, witnesses, counts)
 
     def own_standing(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:

@@ -13,13 +13,13 @@ from companion.tracking.geodesy import LocalFrame
 from companion.values import Standing
 
 Place = tuple[float, float, float]
-COMES: Final = 1.1
+ENTER_FACTOR: Final = 1.1
 """Factor on the overlap of both ranges within which a node becomes near.
 
 More than 1, as a range is only the distance of the farthest vehicle received so far.
 """
-GOES: Final = 1.3  # factor beyond which a near node ceases to be near
-ALWAYS_M: Final = 10_000.0
+LEAVE_FACTOR: Final = 1.3  # factor beyond which a near node ceases to be near
+ALWAYS_NEAR_M: Final = 10_000.0
 """Distance within which a node is always near: a range is not the limit of an array."""
 
 
@@ -47,7 +47,7 @@ def near(
         reaches_m = [reach for reach in (reach_m, said.reach_m) if reach is not None]
         both_m = 2.0 * sum(reaches_m) / len(reaches_m) if reaches_m else 0.0
         north, east, _ = frame.localise(*said.place, None)[0]
-        limit_m = (GOES if node in before else COMES) * max(both_m, ALWAYS_M)
+        limit_m = (LEAVE_FACTOR if node in before else ENTER_FACTOR) * max(both_m, ALWAYS_NEAR_M)
         if north * north + east * east <= limit_m * limit_m:
             found.add(node)
     return frozenset(found)

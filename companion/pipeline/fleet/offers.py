@@ -18,7 +18,7 @@ from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet, Method, Offer, Policy, Power
 
 ROUND_NS: Final = 2_000_000_000  # time in which all offers are renewed
-LEAST: Final = 2  # least number of UAVs per batch
+MIN_BATCH: Final = 2  # least number of UAVs per batch
 
 
 class Offers:
@@ -49,7 +49,7 @@ class Offers:
             self._waiting = new + [uav for uav in self._waiting or wanted if uav in self.made]
         share = 0.0 if self._last_ns is None else (now_ns - self._last_ns) / ROUND_NS
         self._last_ns = now_ns
-        many = max(LEAST, math.ceil(share * len(self.made)))
+        many = max(MIN_BATCH, math.ceil(share * len(self.made)))
         chosen, self._waiting = self._waiting[:many], self._waiting[many:]
         return self._made_of(now_ns, chosen) if chosen else None
 

@@ -29,7 +29,7 @@ VEHICLES_MAX: Final = 4096
 """Limit on vehicles with a record; shared reports of others are used as they come."""
 FUTURE_NS: Final = 1_000_000
 """Tolerance for frames received in the future, by the bounds on the clocks."""
-HERE: Final = "here"
+OWN_NODE: Final = "here"
 
 
 class RecentFrames:
@@ -82,7 +82,7 @@ class Reception:
         self._heard = RecentFrames()
         self._shared = RecentFrames()
         self._vehicles: dict[Source, _VehicleReception] = {}
-        self._duplicate_ids = DuplicateIds({HERE})
+        self._duplicate_ids = DuplicateIds({OWN_NODE})
 
     def take_received(self, frame: Frame) -> bytes:
         """Take in a frame received here, of a message in ``SHARED``. Returns its content."""
@@ -90,7 +90,7 @@ class Reception:
         if frame.msgid not in OWN:
             return key
         self._heard.note(frame.t_ns, key)
-        self._duplicate_ids.rejects(HERE, HERE, frame)
+        self._duplicate_ids.rejects(OWN_NODE, OWN_NODE, frame)
         self._duplicate_ids.found.clear()  # reported per node, in ``contradicted``
         vehicle = self._vehicles.get(frame.source)
         if vehicle is None:

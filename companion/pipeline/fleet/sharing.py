@@ -19,7 +19,7 @@ HOLD_NS: Final = (60_000_000, 2_000_000_000)
 """Least and largest time for which a report is held; longer than a message takes."""
 HOLD: Final = 1.5  # hold time as a multiple of the longest message delay
 HOLD_DECAY: Final = 0.999  # factor on the hold time after each report shared by another in time
-SPEAKER_AFTER: Final = 2
+SPEAKER_FRAMES: Final = 2
 """Reports in a row that no other node shared, after which this node becomes the speaker."""
 HELD_MAX: Final = 20_000
 """Limit each on held frames, queued frames and queued round trips."""
@@ -58,13 +58,13 @@ class Sharing:
     def __init__(self, name: str, every_ns: int = 0) -> None:
         self.dropped = 0
         self._every_ns = every_ns
-        self._said_ns = -every_ns
+        self._sent_ns = -every_ns
         self._name = name
         self._speakers: dict[Source, _SpeakerState] = {}
         self._hold_ns: float = HOLD_NS[0]
         self._held: deque[_Held] = deque()
         self._by_others = RecentFrames()
-        self._by_me = RecentFrames()
+        self._shared_by_self = RecentFrames()
         self._frames: deque[SharedFrame] = deque()
         self._trips: deque[RoundTrip] = deque()
 
@@ -87,18 +87,18 @@ class Sharing:
         elif key in self._by_others:
             speaker.late = 0
         elif frame.msgid in OWN:
-            self._wait(self._held, _Held(now_ns + round(self._hold_ns), key, frame))
+            self._enqueue(self._held, _Held(now_ns + round(self._hold_ns), key, frame))
 
     def round_trip_measured(self, trip: RoundTrip) -> None:
         """Take in a round trip; it is shared if this node is the vehicle's speaker."""
         speaker = self._speakers.get(trip.source)
         if speaker is not None and speaker.is_own:
-            self._wait(self._trips, trip)
+            self._enqueue(self._trips, trip)
 
     def note_shared(self, now_ns: int, node: str, source: Source, key: bytes, way_ns: int) -> None:
         """Note that another node shared a report, with the largest delay of its message."""
         self._by_others.note(now_ns, key)
-        if key in self._by_me:
+        if key in self._shared_by_self:
             speaker = self._speakers.get(source)
             if speaker is not None and node < self._name:
                 speaker.is_own, speaker.late = False, 0
@@ -109,12 +109,12 @@ class Sharing:
     def next_message(self, now_ns: int) -> Shared | None:
         """Return the message to publish now; None if there is none, or the last is too recent."""
         self._release_held(now_ns)
-        if 0 <= now_ns - self._said_ns < self._every_ns:
+        if 0 <= now_ns - self._sent_ns < self._every_ns:
             return None
         frames, trips = _first(self._frames), _first(self._trips)
         if not frames and not trips:
             return None
-        self._said_ns = now_ns
+        self._sent_ns = now_ns
         return Shared(now_ns, frames, trips)
 
     def _release_held(self, now_ns: int) -> None:
@@ -132,13 +132,13 @@ class Sharing:
                 speaker.late = 0
                 continue
             speaker.late += 1
-            speaker.is_own = speaker.is_own or speaker.late >= SPEAKER_AFTER
+            speaker.is_own = speaker.is_own or speaker.late >= SPEAKER_FRAMES
             self._queue_frame(now_ns, key, frame)
 
     def wait_ns(self, now_ns: int) -> int | None:
         """Return the time until the next message; None if nothing is queued or held."""
         if self._frames or self._trips:
-            due_ns = self._said_ns + self._every_ns
+            due_ns = self._sent_ns + self._every_ns
         elif self._held:
             due_ns = self._held[0].due_ns
         else:
@@ -158,10 +158,10 @@ class Sharing:
         self._hold_ns = HOLD_NS[0]
 
     def _queue_frame(self, now_ns: int, key: bytes, frame: Frame) -> None:
-        self._by_me.note(now_ns, key)
-        self._wait(self._frames, SharedFrame(frame.t_ns, frame.raw))
+        self._shared_by_self.note(now_ns, key)
+        self._enqueue(self._frames, SharedFrame(frame.t_ns, frame.raw))
 
-    def _wait(self, waiting: deque[_T], one: _T) -> None:
+    def _enqueue(self, waiting: deque[_T], one: _T) -> None:
         """Add to a queue; drop its oldest entry if it is full."""
         if len(waiting) >= HELD_MAX:
             waiting.popleft()

@@ -6,8 +6,8 @@ A node is excluded if it
 - has an inconsistent clock: repeated round trips that no drift explains;
 - shares reports that contradict those received here or by other nodes;
 - shares vehicles that only it receives, at positions where others receive everything: at least
-  ``PHANTOMS`` of them for ``UNHEARD_NS``, and most of what it receives. A few such vehicles may be
-  hidden by an obstacle: they cause a notice and stay unconfirmed.
+  ``PHANTOMS_MIN`` of them for ``SILENT_AFTER_NS``, and most of what it receives. A few such
+  vehicles may be hidden by an obstacle: they cause a notice and stay unconfirmed.
 """
 
 import math
@@ -17,11 +17,13 @@ from typing import Final, NamedTuple
 
 from companion.values import Notice, Severity
 
-CONTRADICTIONS: Final = 3  # contradictions within WITHIN_NS after which a node is excluded
-WITHIN_NS: Final = 30_000_000_000
+CONTRADICTIONS: Final = (
+    3  # contradictions within CONTRADICTION_WINDOW_NS after which a node is excluded
+)
+CONTRADICTION_WINDOW_NS: Final = 30_000_000_000
 EXCLUDED_NS: Final = 300_000_000_000  # duration of an exclusion
-PHANTOMS: Final = 2  # number of phantom vehicles from which on their node is excluded
-UNHEARD_NS: Final = 8_000_000_000
+PHANTOMS_MIN: Final = 2  # number of phantom vehicles from which on their node is excluded
+SILENT_AFTER_NS: Final = 8_000_000_000
 """Time after which a vehicle that others should receive, but do not, counts as a phantom."""
 REACH_SHARE: Final = 0.7
 """Fraction of a node's range within which it receives every vehicle."""
@@ -50,7 +52,7 @@ class Trust:
         self.excluded: dict[str, str] = {}
         self._until_ns: dict[str, int] = {}
         self._times: dict[tuple[str, str], deque[int]] = {}
-        self._unheard: dict[str, tuple[str, int]] = {}
+        self._silent_since: dict[str, tuple[str, int]] = {}
         self._notified: set[str] = set()
 
     def is_trusted(self, node: str) -> bool:
@@ -61,7 +63,7 @@ class Trust:
         """Note a contradiction; ``what`` is a predicate, to follow "it"."""
         times = self._times.setdefault((node, what), deque(maxlen=CONTRADICTIONS))
         times.append(now_ns)
-        if len(times) < CONTRADICTIONS or now_ns - times[0] > WITHIN_NS:
+        if len(times) < CONTRADICTIONS or now_ns - times[0] > CONTRADICTION_WINDOW_NS:
             return []
         return self._exclude(now_ns, node, what)
 
@@ -77,21 +79,21 @@ class Trust:
 
         ``heard`` is the number of vehicles that each node claims to receive.
         """
-        before, self._unheard = self._unheard, {}
+        before, self._silent_since = self._silent_since, {}
         for one in told:
             others = [w for name, w in witnesses.items() if name != one.node]
             has_been_heard = any(one.uav in w.heard for w in others)
             if not has_been_heard and any(_should_receive(w, one) for w in others):
                 node, since_ns = before.get(one.uav, (one.node, now_ns))
-                self._unheard[one.uav] = (one.node, since_ns if node == one.node else now_ns)
+                self._silent_since[one.uav] = (one.node, since_ns if node == one.node else now_ns)
         phantoms = dict[str, list[str]]()
-        for uav, (node, since_ns) in self._unheard.items():
-            if now_ns - since_ns >= UNHEARD_NS:
+        for uav, (node, since_ns) in self._silent_since.items():
+            if now_ns - since_ns >= SILENT_AFTER_NS:
                 phantoms.setdefault(node, []).append(uav)
         said = []
         for node, uavs in phantoms.items():
             names = ", ".join(sorted(uavs)[:6])
-            if len(uavs) >= PHANTOMS and 2 * len(uavs) > heard.get(node, 0):
+            if len(uavs) >= PHANTOMS_MIN and 2 * len(uavs) > heard.get(node, 0):
                 what = f"shares vehicles that other nodes should receive, but do not: {names}"
                 said += self._exclude(now_ns, node, what)
             elif not self._notified.issuperset(uavs):
@@ -101,17 +103,17 @@ class Trust:
                 )
                 said.append(_notice(now_ns, node, text, Severity.WARNING))
             self._notified.update(uavs)
-        self._notified &= self._unheard.keys()
+        self._notified &= self._silent_since.keys()
         return said
 
     @property
     def unconfirmed(self) -> frozenset[str]:
         """Vehicles that only one node shares, though others should receive them."""
-        return frozenset(self._unheard)
+        return frozenset(self._silent_since)
 
     def forget(self, now_ns: int) -> None:
         """Forget contradictions that have expired."""
-        before_ns = now_ns - WITHIN_NS
+        before_ns = now_ns - CONTRADICTION_WINDOW_NS
         self._times = {what: times for what, times in self._times.items() if times[-1] > before_ns}
 
     def readmit(self, now_ns: int) -> list[Notice]:

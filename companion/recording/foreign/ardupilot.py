@@ -17,13 +17,13 @@ from companion.recording.foreign.onboard import (
     Onboard,
     OnboardPositions,
     Truth,
+    body_rates_of,
     headings_between,
-    in_time,
-    moved,
     on_earth,
     sound_rows,
-    turned,
+    time_ordered,
     vectors_between,
+    velocities_of,
 )
 from companion.recording.foreign.receiver import count, fixes_of, times
 from companion.values import BoolArray, FloatArray, IntArray, Reason
@@ -79,13 +79,13 @@ def _timed(of: DataflashTable, lost: dict[Reason, int]) -> DataflashTable:
     which = next((name for name in ("C", "I") if of.integers(name) is not None), None)
     number = None if which is None else of.integers(which)
     if number is None:
-        rows, wild = in_time(boot_us)
+        rows, wild = time_ordered(boot_us)
         count(lost, Reason.BAD_STAMP, wild)
         return of.rows(rows)
     parts = []
     for each in np.unique(number).tolist():
         (mine,) = np.nonzero(number == each)
-        rows, wild = in_time(boot_us[mine])
+        rows, wild = time_ordered(boot_us[mine])
         count(lost, Reason.BAD_STAMP, wild)
         parts.append(mine[rows])
     return of.rows(np.concatenate(parts) if parts else np.zeros(0, dtype=np.int64))
@@ -150,7 +150,7 @@ def _positions(
     lat_1e7, lon_1e7, alt_m = lat_1e7[sound], lon_1e7[sound], alt_m[sound]
     velocity = _velocities(boot_us, tables)
     if np.isnan(velocity).any():
-        between_m = moved(boot_us, lat_1e7, lon_1e7, alt_m)
+        between_m = velocities_of(boot_us, lat_1e7, lon_1e7, alt_m)
         velocity = _filled(velocity, boot_us, fixes, between_m, notes)
     heading = _headings(boot_us, attitude)
     if not len(boot_us):
@@ -174,7 +174,7 @@ def _received(
     if fixed is None:
         return None
     notes.append("no POS: positions are those of the GNSS receiver")
-    way = moved(fixed.boot_us, fixed.lat_1e7, fixed.lon_1e7, fixed.alt_m)
+    way = velocities_of(fixed.boot_us, fixed.lat_1e7, fixed.lon_1e7, fixed.alt_m)
     velocity = _filled(np.full_like(way, np.nan), fixed.boot_us, fixes, way, notes)
     return fixed.positions(velocity, _headings(fixed.boot_us, tables["ATT"]))
 
@@ -226,7 +226,7 @@ def _attitudes(
     if not sound.any():
         return None
     boot_us, euler = times(of)[sound], np.radians(angles[sound])
-    rates = turned(boot_us, euler)
+    rates = body_rates_of(boot_us, euler)
     measured = np.radians(np.stack([gyro.numbers(name) for name in ("R", "P", "Y")], axis=1))
     there = vectors_between(boot_us, times(gyro), measured, NEAR_US // 5, 1e3)
     return Attitudes(boot_us, euler, np.where(np.isnan(there), rates, there))
@@ -246,7 +246,7 @@ def _truth(sim: DataflashTable, motion: DataflashTable, lost: dict[Reason, int])
         return None
     velocity = np.stack([motion.numbers(name) for name in ("VN", "VE", "VD")], axis=1)
     there = vectors_between(boot_us, times(motion), velocity, NEAR_US // 5)
-    there = np.where(np.isnan(there), moved(boot_us, lat_1e7, lon_1e7, alt_m), there)
+    there = np.where(np.isnan(there), velocities_of(boot_us, lat_1e7, lon_1e7, alt_m), there)
     return Truth(
         boot_us=boot_us,
         lat_1e7=lat_1e7,

@@ -13,7 +13,7 @@ from typing import Final
 from companion.mavlink.wire.framing import Splitter
 from companion.recording.container import Message, Walk
 from companion.recording.foreign.packets import Segment, Skipped, packets, segment
-from companion.recording.stamps import LINGERS_NS, RepairedStamps
+from companion.recording.stamps import STEP_HOLD_NS, RepairedStamps
 from companion.values import Event, Frame, Reason, Rejection
 
 _FLOWS_MAX: Final = 512
@@ -53,7 +53,7 @@ def read_capture(path: Path) -> Iterator[Event]:
                     yield from oldest.finish(timeline.t_ns)
             flows.move_to_end(found.flow)
             events = flow.take(timeline.t_ns, found)
-            if events and off_ns is not None and abs(off_ns) > LINGERS_NS:
+            if events and off_ns is not None and abs(off_ns) > STEP_HOLD_NS:
                 way = "back" if off_ns < 0 else "ahead"
                 detail = f"{abs(off_ns) / 1e9:.6g} s {way}, clamped"
                 yield Rejection(

@@ -28,10 +28,10 @@ from companion.recording.foreign.onboard import (
     Fixes,
     Onboard,
     OnboardPositions,
-    in_time,
-    moved,
+    body_rates_of,
     on_earth,
-    turned,
+    time_ordered,
+    velocities_of,
 )
 from companion.recording.foreign.thinned import Thinned
 from companion.values import FloatArray, IntArray, Reason
@@ -167,7 +167,7 @@ def _onboard(
     notes: list[str],
 ) -> Onboard:
     boot_us, clock = _times(table[timed], timed)
-    rows, wild = in_time(boot_us)
+    rows, wild = time_ordered(boot_us)
     if wild:
         lost[Reason.BAD_STAMP] = wild
     lat, lon, alt_m = (table[name][rows] for name in PLACE)
@@ -216,7 +216,7 @@ def _positions(
     boot_us: IntArray, place: Place, table: dict[str, FloatArray], notes: list[str]
 ) -> OnboardPositions:
     lat_1e7, lon_1e7, alt_m = place
-    velocity = moved(boot_us, lat_1e7, lon_1e7, alt_m)
+    velocity = velocities_of(boot_us, lat_1e7, lon_1e7, alt_m)
     nothing = np.full(len(boot_us), np.nan)
     given = np.stack([table.get(name, nothing) for name in _VELOCITY], axis=1)
     given = np.where(np.abs(given) < 1e4, given, np.nan)
@@ -241,7 +241,7 @@ def _attitudes(boot_us: IntArray, table: dict[str, FloatArray]) -> Attitudes | N
     sound = (np.abs(euler) < 1e3).all(axis=1)
     if not sound.any():
         return None
-    return Attitudes(boot_us[sound], euler[sound], turned(boot_us[sound], euler[sound]))
+    return Attitudes(boot_us[sound], euler[sound], body_rates_of(boot_us[sound], euler[sound]))
 
 
 def _fixes(boot_us: IntArray, place: Place, table: dict[str, FloatArray]) -> Fixes | None:

@@ -203,16 +203,18 @@ def _chains(data: Bytes, lengths: IntArray) -> Iterator[tuple[IntArray, IntArray
     """Yield the offsets of messages, and their types, by block of the file."""
     resume = 0
     for begin in range(0, data.size, _BLOCK):
-        at, types = _heads(data, begin, min(begin + _BLOCK, data.size), lengths)
+        at, types = _candidate_headers(data, begin, min(begin + _BLOCK, data.size), lengths)
         inside = at >= resume
         at, types = at[inside], types[inside]
-        chosen = _followed(at, at + lengths[types])
+        chosen = _chained(at, at + lengths[types])
         if len(chosen):
             resume = int(at[chosen[-1]] + lengths[types[chosen[-1]]])
         yield at[chosen], types[chosen]
 
 
-def _heads(data: Bytes, begin: int, end: int, lengths: IntArray) -> tuple[IntArray, IntArray]:
+def _candidate_headers(
+    data: Bytes, begin: int, end: int, lengths: IntArray
+) -> tuple[IntArray, IntArray]:
     """Return the offsets in [begin, end) of candidates: a message followed by another, or by the
     end."""
     ahead = data[begin : end + 2 * _LONGEST + _HEAD]
@@ -231,7 +233,7 @@ def _heads(data: Bytes, begin: int, end: int, lengths: IntArray) -> tuple[IntArr
     return at[goes_on] + begin, types[goes_on]
 
 
-def _followed(at: IntArray, behind: IntArray) -> IntArray:
+def _chained(at: IntArray, behind: IntArray) -> IntArray:
     """Return the rows reached from the first by following each message to the next.
 
     The next row is nearly always the next message; it is searched only if not.

@@ -17,7 +17,7 @@ REBOOT_US: Final = 10_000_000  # a larger step back of a boot clock is a reboot,
 NEAR_US: Final = 500_000
 """Largest time between a position and the velocity or heading assigned to it."""
 _NEAR: Final = 4
-_WILD_US: Final = 120_000_000
+_STAMP_JUMP_US: Final = 120_000_000
 """Largest deviation of a stamp from the median of its neighbours in the file."""
 METRES_PER_DEGREE: Final = 111_195.0
 
@@ -124,7 +124,7 @@ class Onboard:
 # --- usable samples -------------------------------------------------------------------------------
 
 
-def in_time(boot_us: IntArray) -> tuple[IntArray, int]:
+def time_ordered(boot_us: IntArray) -> tuple[IntArray, int]:
     """Return the rows of samples in order of time, and the number of rows with an outlier stamp.
 
     ``boot_us`` (N,) is in the order of the file. A stamp is an outlier, and dropped, if it is
@@ -139,7 +139,7 @@ def in_time(boot_us: IntArray) -> tuple[IntArray, int]:
     apart = np.maximum(boot_us, middle).astype(np.uint64) - np.minimum(boot_us, middle).astype(
         np.uint64
     )
-    sound = (apart <= np.uint64(_WILD_US)) & (boot_us >= 0)
+    sound = (apart <= np.uint64(_STAMP_JUMP_US)) & (boot_us >= 0)
     rows: IntArray = np.flatnonzero(sound)
     life = np.cumsum(np.diff(middle[rows], prepend=middle[rows][:1]) < -REBOOT_US)
     order = np.lexsort((boot_us[rows], life))
@@ -198,7 +198,9 @@ def between(at_us: IntArray, boot_us: IntArray, values: FloatArray, gap_us: int)
     return found.reshape(len(at_us), *values.shape[1:])
 
 
-def moved(boot_us: IntArray, lat_1e7: IntArray, lon_1e7: IntArray, alt_m: FloatArray) -> FloatArray:
+def velocities_of(
+    boot_us: IntArray, lat_1e7: IntArray, lon_1e7: IntArray, alt_m: FloatArray
+) -> FloatArray:
     """Return velocities (N, 3), north-east-down, m/s, from adjacent positions; 0 for one."""
     if len(boot_us) < 2:
         return np.zeros((len(boot_us), 3))
@@ -218,7 +220,7 @@ def _ascending_s(boot_us: IntArray) -> FloatArray:
     return ascending_s
 
 
-def turned(boot_us: IntArray, euler_rad: FloatArray) -> FloatArray:
+def body_rates_of(boot_us: IntArray, euler_rad: FloatArray) -> FloatArray:
     """Return body rates (N, 3), rad/s, from adjacent attitudes; 0 for a single one.
 
     The rates of roll, pitch and yaw give those of the body by the kinematics of Euler angles.

@@ -19,13 +19,13 @@ from companion.recording.foreign.onboard import (
     Onboard,
     OnboardPositions,
     Truth,
+    body_rates_of,
     euler_of,
     headings_between,
-    in_time,
-    moved,
     on_earth,
-    turned,
+    time_ordered,
     vectors_between,
+    velocities_of,
 )
 from companion.recording.foreign.receiver import count
 from companion.recording.foreign.ulog import UlogTable, table, walk
@@ -95,7 +95,7 @@ def _timed(of: UlogTable, lost: Lost) -> UlogTable:
     if len(times) != len(of):
         count(lost, Reason.MALFORMED, len(of))
         return of.rows(np.zeros(0, dtype=np.int64))
-    rows, wild = in_time(times)
+    rows, wild = time_ordered(times)
     count(lost, Reason.BAD_STAMP, wild)
     return of.rows(rows)
 
@@ -177,7 +177,7 @@ def _positions(
     missing: BoolArray = np.array(np.isnan(velocity).any(axis=1))
     if missing.any():
         notes.append(f"no estimated velocity at {missing.sum()} of {len(boot_us)} positions")
-        way = moved(boot_us, lat_1e7, lon_1e7, alt_m)
+        way = velocities_of(boot_us, lat_1e7, lon_1e7, alt_m)
         velocity = np.where(missing[:, None], way, velocity)
     home_m = tables["home_position"].numbers("alt")
     home_m = home_m[np.isfinite(home_m)]
@@ -205,7 +205,7 @@ def _received(fixes: Fixes, local: UlogTable, notes: list[str]) -> OnboardPositi
     if fixed is None:
         return None
     notes.append("no vehicle_global_position: positions are those of the GNSS receiver")
-    velocity = moved(fixed.boot_us, fixed.lat_1e7, fixed.lon_1e7, fixed.alt_m)
+    velocity = velocities_of(fixed.boot_us, fixed.lat_1e7, fixed.lon_1e7, fixed.alt_m)
     level = fixed.velocity_mps
     velocity[:, :2] = np.where(np.isfinite(level), level, velocity[:, :2])
     return fixed.positions(velocity, _headings(fixed.boot_us, local))
@@ -237,7 +237,9 @@ def _attitudes(tables: dict[str, UlogTable], lost: Lost) -> Attitudes | None:
     euler = euler_of(quaternions)
     gyro = tables[_RATES]
     rates = vectors_between(boot_us, _times(gyro), gyro.numbers("xyz", 3), NEAR_US // 5, 1e3)
-    return Attitudes(boot_us, euler, np.where(np.isnan(rates), turned(boot_us, euler), rates))
+    return Attitudes(
+        boot_us, euler, np.where(np.isnan(rates), body_rates_of(boot_us, euler), rates)
+    )
 
 
 def _truth(tables: dict[str, UlogTable], lost: Lost) -> Truth | None:
@@ -250,7 +252,7 @@ def _truth(tables: dict[str, UlogTable], lost: Lost) -> Truth | None:
     if not len(boot_us):
         return None
     velocity = _velocities(boot_us, tables[f"{_LOCAL}_groundtruth"])
-    made = moved(boot_us, lat_1e7, lon_1e7, alt_m)
+    made = velocities_of(boot_us, lat_1e7, lon_1e7, alt_m)
     velocity = np.where(np.isnan(velocity), made, velocity)
     turned_at, quaternions = _turns(tables[f"{_ATTITUDE}_groundtruth"], lost)
     near = np.zeros((len(boot_us), 4))

@@ -10,7 +10,7 @@ import numpy as np
 from companion.recording.foreign import gps_time
 from companion.recording.foreign.dataflash import DataflashTable
 from companion.recording.foreign.gps_time import GpsTime
-from companion.recording.foreign.onboard import Fixes, in_time, on_earth
+from companion.recording.foreign.onboard import Fixes, on_earth, time_ordered
 from companion.values import FloatArray, IntArray, Reason
 
 _BESIDE_US: Final = 5_000  # GPA is written with its GPS
@@ -56,8 +56,8 @@ def fixes_of(
     fixed_us = gps_time.unix_us(
         np.where(known, week, 0).astype(np.int64), np.where(known, week_ms, -1).astype(np.int64)
     )
-    beside = _beside(boot_us, gps, accuracy)
-    had_us = np.where(np.isfinite(beside[:, 3]), beside[:, 3] * 1e3, boot_us).astype(np.int64)
+    beside = _nearest(boot_us, gps, accuracy)
+    previous_us = np.where(np.isfinite(beside[:, 3]), beside[:, 3] * 1e3, boot_us).astype(np.int64)
     satellites = gps.numbers("NSats")
     places = gps.integers("Lat"), gps.integers("Lng")
     assert places[0] is not None and places[1] is not None
@@ -73,15 +73,15 @@ def fixes_of(
         speed_mps=gps.numbers("Spd"),
         course_deg=gps.numbers("GCrs"),
     )
-    return fixes, gps_time.fit(had_us, fixed_us)
+    return fixes, gps_time.fit(previous_us, fixed_us)
 
 
 def _by_time(boot_us: IntArray) -> IntArray:
-    rows, _ = in_time(boot_us)
+    rows, _ = time_ordered(boot_us)
     return rows
 
 
-def _beside(boot_us: IntArray, gps: DataflashTable, accuracy: DataflashTable) -> FloatArray:
+def _nearest(boot_us: IntArray, gps: DataflashTable, accuracy: DataflashTable) -> FloatArray:
     """Return accuracies and the boot time of the fix, ms, (N, 4), from GPA; NaN: unknown."""
     found = np.full((len(boot_us), 4), np.nan)
     mine, other = gps.integers("I"), accuracy.integers("I")

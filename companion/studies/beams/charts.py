@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from companion.studies.beams.flight import Watched
+from companion.studies.beams.flight import StudiedFlight
 from companion.studies.beams.worth import Sample, Worth
 from companion.studies.figures import plotting
 from companion.values import FloatArray
@@ -39,16 +39,16 @@ KINDS: Final = (
 )
 
 
-def charts(watched: Watched) -> dict[str, plotting.Draw]:
+def charts(watched: StudiedFlight) -> dict[str, plotting.Draw]:
     """Return the figures of one log by name; without a codebook there is no share to sweep."""
     found: dict[str, plotting.Draw]
-    found = {"gain": partial(_gain, watched), "gain_had": partial(_gain_had, watched)}
+    found = {"gain": partial(_gain, watched), "gain_had": partial(_gain_distribution, watched)}
     if watched.codebook_beams is not None:
         found["sweep"] = partial(_sweep, watched)
     return found
 
 
-def _gain(watched: Watched) -> "Figure":
+def _gain(watched: StudiedFlight) -> "Figure":
     by_uav, edges, (low, high) = watched.by_uav, _edges(watched), _range_db(watched)
     size_in = (WIDTH_IN, 0.9 + 1.25 * len(by_uav))
     figure, panels = plotting.new(len(by_uav), 1, size_in, sharex=True, sharey=True)
@@ -64,7 +64,7 @@ def _gain(watched: Watched) -> "Figure":
     return figure
 
 
-def _sweep(watched: Watched) -> "Figure":
+def _sweep(watched: StudiedFlight) -> "Figure":
     edges = _edges(watched)
     figure, (axes,) = plotting.new(1, 1, (WIDTH_IN, 3.6))
     for number, (uav, samples) in enumerate(watched.by_uav.items()):
@@ -79,7 +79,7 @@ def _sweep(watched: Watched) -> "Figure":
     return figure
 
 
-def _gain_had(watched: Watched) -> "Figure":
+def _gain_distribution(watched: StudiedFlight) -> "Figure":
     """Share of looks with at least a given gain: as set, and sharp beside it."""
     sets = {"as set": [sample.as_set for sample in watched.samples]}
     if watched.widen:
@@ -127,11 +127,11 @@ def _gains(worths: Sequence[Worth | None], kind: GainCurve) -> FloatArray:
     return np.sort(found)
 
 
-def _kinds(watched: Watched) -> list[GainCurve]:
+def _kinds(watched: StudiedFlight) -> list[GainCurve]:
     return [kind for kind in KINDS if watched.truth or not kind.unknown]
 
 
-def _edges(watched: Watched) -> FloatArray:
+def _edges(watched: StudiedFlight) -> FloatArray:
     """Return edges of the time bins, (B + 1,).
 
     There are at most half as many bins as looks, so that no bin is empty by chance.
@@ -171,7 +171,7 @@ def _of(worth: Worth | None, value: Callable[[Worth], float | None]) -> float:
     return -math.inf if found is None else found
 
 
-def _range_db(watched: Watched) -> tuple[float, float]:
+def _range_db(watched: StudiedFlight) -> tuple[float, float]:
     """Return the lower and upper limit of the gain axis, multiples of 5."""
     worths = [w for s in watched.samples for w in (s.as_set, s.sharp) if w is not None]
     values = [v for worth in worths for kind in KINDS if (v := kind.value(worth)) is not None]

@@ -72,7 +72,7 @@ class BeamStudy:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Watched:
+class StudiedFlight:
     """One flight: every UAV at every look, in order of time; the array and the kind of truth."""
 
     log: str
@@ -250,7 +250,7 @@ def watch(
     settings: Settings,
     hz: float,
     progress: Callable[[str], None] = lambda _text: None,
-) -> Watched:
+) -> StudiedFlight:
     """Study the logs of one flight.
 
     Raises ``UserError``, ``LogError`` or ``ConfigError`` if no UAV gets a beam.
@@ -270,7 +270,7 @@ def watch(
     if not any(sample.as_set or sample.sharp for sample in samples):
         raise UserError(f"{name}: no UAV gets a beam while the carrier's pose is known")
     array = pipeline.array
-    return Watched(
+    return StudiedFlight(
         log=name,
         center=str(pipeline.center.place),
         array=f"{array.size} elements ({array.kind}) at {settings.array.frequency_hz * 1e-9:g} GHz",
@@ -284,7 +284,7 @@ def watch(
 
 def study(
     setting: BeamStudy, progress: Callable[[str], None] = lambda _text: None
-) -> tuple[dict[str, Any], list[Watched]]:
+) -> tuple[dict[str, Any], list[StudiedFlight]]:
     """Return the answer as written to ``beams.json``, and the data of the report.
 
     Raises ``UserError``, ``LogError`` or ``ConfigError`` for a log without any beam.
@@ -310,7 +310,7 @@ def study(
         "modes": modes_found,
         "summary": summed_up([sample for watched in found for sample in watched.samples]),
         "logs": [
-            {field.name: getattr(watched, field.name) for field in fields(Watched)[:-1]}
+            {field.name: getattr(watched, field.name) for field in fields(StudiedFlight)[:-1]}
             for watched in found  # without its samples
         ],
         "command": setting.command,

@@ -50,7 +50,7 @@ from companion.values import (
     kind_of,
 )
 
-RIVALS: Final = ("hold", "kalman-peng", "dead-reckoning-arrival")
+OTHER_PREDICTORS: Final = ("hold", "kalman-peng", "dead-reckoning-arrival")
 """Predictors whose beams are sharp and compared with the product's."""
 LOOK_EVERY: Final = 4  # ticks from one look to the next; beams are computed at each tick
 ALIKE: Final = 0.9  # correlation of two shapes of one beam below which it has changed
@@ -58,7 +58,7 @@ JUMP_DB: Final = 1.0  # change of a predicted gain from tick to tick that is a j
 
 
 @dataclass(slots=True, kw_only=True)
-class _Way:
+class _Variant:
     """One width or predictor, with its results."""
 
     name: str
@@ -120,7 +120,7 @@ def events(
     return with_ticks(heard, settings.beams.update_hz), observed, local
 
 
-class _Rival:
+class _OtherPredictor:
     """Another predictor of each UAV, in the pipeline's frame."""
 
     def __init__(
@@ -159,9 +159,9 @@ def compare(
     """Return a row for each width and predictor, over one link."""
     pipeline = Pipeline(settings)
     heard, observed, local = events(logs, link, settings)
-    ways = [_Way(name=str(widen), widen=widen) for widen in Widen]
-    rivals = {name: _Rival(name, observed, settings) for name in RIVALS}
-    theirs = {name: _Way(name=f"{name}, sharp", widen=Widen.NO) for name in RIVALS}
+    ways = [_Variant(name=str(widen), widen=widen) for widen in Widen]
+    rivals = {name: _OtherPredictor(name, observed, settings) for name in OTHER_PREDICTORS}
+    theirs = {name: _Variant(name=f"{name}, sharp", widen=Widen.NO) for name in OTHER_PREDICTORS}
     truth: ArrayTruth | None = None
     flight, sought, ticks = vehicles.named(logs), False, 0
     for event in heard:
@@ -192,7 +192,7 @@ def _make(
     update: Update,
     tracks: tuple[Track, ...],
     *,
-    way: _Way,
+    way: _Variant,
     truth: ArrayTruth | None,
     looks: bool,
 ) -> None:
@@ -222,10 +222,12 @@ def _make(
     way.last = seen
     if looks and made.beams:
         true = array_truth.known_directions(truth, tracks, update.carrier, pipeline.array)
-        _judge(pipeline, made, true, way)
+        _evaluate(pipeline, made, true, way)
 
 
-def _judge(pipeline: Pipeline, made: BeamSet, true: dict[str, FloatArray], way: _Way) -> None:
+def _evaluate(
+    pipeline: Pipeline, made: BeamSet, true: dict[str, FloatArray], way: _Variant
+) -> None:
     array, how = pipeline.array, pipeline.precoder
     sure, gains = given(pipeline, made, true)
     gains_db = 10 * np.log10(gains)

@@ -5,7 +5,7 @@ from typing import Any, Final
 
 from companion.studies.beams import modes
 from companion.studies.beams.charts import charts
-from companion.studies.beams.flight import Watched
+from companion.studies.beams.flight import StudiedFlight
 from companion.studies.beams.worth import SHARP, Row, summed_up
 from companion.studies.figures import plotting
 from companion.studies.figures.text_tables import text_table
@@ -54,7 +54,7 @@ _CAPTIONS: Final = {
 
 
 def files(
-    answer: dict[str, Any], found: Sequence[Watched], progress: Callable[[str], None]
+    answer: dict[str, Any], found: Sequence[StudiedFlight], progress: Callable[[str], None]
 ) -> dict[str, bytes]:
     """Return the page and every figure as SVG and PNG, by file name.
 
@@ -75,16 +75,18 @@ def files(
     return plotting.files("beams", "beams/report.html.j2", drawings, values, progress)
 
 
-def text(found: Sequence[Watched], compared: Sequence[Row] = ()) -> str:
+def text(found: Sequence[StudiedFlight], compared: Sequence[Row] = ()) -> str:
     """Return the tables as text, all UAVs of a log together."""
     parts = [_text(watched) for watched in found]
     for log in dict.fromkeys(row["log"] for row in compared):
-        of_log = [row for row in compared if row["log"] == log]
-        parts.append(f"{log}, three widths and three rivals, gains in dB:\n{modes.text(of_log)}")
+        log_progress = [row for row in compared if row["log"] == log]
+        parts.append(
+            f"{log}, three widths and three rivals, gains in dB:\n{modes.text(log_progress)}"
+        )
     return "\n\n".join(parts)
 
 
-def _text(watched: Watched) -> str:
+def _text(watched: StudiedFlight) -> str:
     row = summed_up(watched.samples)
     rows = [(label, _cells(row, keys, ""), "") for label, keys in AS_FOUND]
     rows.append(("", "as set", "sharp"))
@@ -92,7 +94,7 @@ def _text(watched: Watched) -> str:
     return f"{_describe(watched)}\n{text_table(rows)}"
 
 
-def _section(watched: Watched, figures: Iterable[str]) -> dict[str, Any]:
+def _section(watched: StudiedFlight, figures: Iterable[str]) -> dict[str, Any]:
     row = summed_up(watched.samples)
     by_uav = {uav: summed_up(samples) for uav, samples in watched.by_uav.items()}
     return {
@@ -111,7 +113,7 @@ def _section(watched: Watched, figures: Iterable[str]) -> dict[str, Any]:
     }
 
 
-def _describe(watched: Watched) -> str:
+def _describe(watched: StudiedFlight) -> str:
     stored = watched.codebook_beams
     return (
         f"{watched.log}: {watched.array}, on {watched.center};"

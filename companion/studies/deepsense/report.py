@@ -50,6 +50,6 @@ def _tops(answer: dict[str, Any]) -> "Figure":
             axes.hlines(wanted, place - 0.45, place + 0.45, plotting.INK, linestyles="--")
         axes.set_xticks(range(3), ["top-1", "top-3", "top-5"])
     panels[0].set_ylabel("%")
-    plotting.lettered(panels, ("contiguous blocks", "random split, which leaks"))
+    plotting.title_panels(panels, ("contiguous blocks", "random split, which leaks"))
     plotting.below(figure, panels[0], 3)
     return figure

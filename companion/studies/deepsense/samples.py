@@ -7,7 +7,7 @@ import numpy as np
 
 from companion.values import BoolArray, FloatArray, IntArray
 
-_STAYED: Final = 0.1
+_STATIONARY_SHARE: Final = 0.1
 """Weight of a sample at the previous position, relative to one a mean step farther."""
 
 
@@ -34,7 +34,7 @@ class Samples:
         Repeated measurements of a hovering UAV add little information.
         """
         step = np.hypot(*np.diff(self.place, axis=0, prepend=self.place[:1]).T)
-        way = np.cumsum(step / max(float(step.mean()), 1e-12) + _STAYED)
+        way = np.cumsum(step / max(float(step.mean()), 1e-12) + _STATIONARY_SHARE)
         begun: BoolArray = np.diff(np.floor(way), prepend=-1.0) > 0
         return begun
 

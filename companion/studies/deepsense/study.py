@@ -23,7 +23,7 @@ PREDICTORS: Final[dict[str, Predictor]] = {
 }
 TARGETS: Final = {1: 45.0, 3: 82.0, 5: 95.0}  # the product's targets on blocks, percent
 _CALIBRATION: Final = (16, 4)
-_AIMED: Final = 1 - 0.75 * (1 - COVERAGE)
+_TARGET_COVERAGE: Final = 1 - 0.75 * (1 - COVERAGE)
 """Aimed coverage: a quarter of the allowed misses is in reserve, for blocks that are harder."""
 
 
@@ -89,7 +89,7 @@ def _threshold(samples: Samples, fitted: Fitted, learned: BoolArray) -> float:
     reached = []
     for part in inner(learned, *_CALIBRATION):
         reached.append(own(fitted(learned & ~part), samples.beam)[part])
-    return float(np.quantile(np.concatenate(reached), 1 - _AIMED))
+    return float(np.quantile(np.concatenate(reached), 1 - _TARGET_COVERAGE))
 
 
 def _sizes(likely: FloatArray, threshold: float) -> IntArray:

@@ -85,13 +85,13 @@ def below(figure: "Figure", axes: "Axes", columns: int) -> None:
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
-def lettered(panels: "Sequence[Axes]", titles: Sequence[str]) -> None:
+def title_panels(panels: "Sequence[Axes]", titles: Sequence[str]) -> None:
     """Title the panels (a), (b) and so on."""
     for number, (axes, title) in enumerate(zip(panels, titles, strict=True)):
         axes.set_title(f"({chr(ord('a') + number)}) {title}")
 
 
-def rendered(draw: Draw) -> tuple[bytes, bytes]:
+def render_figure(draw: Draw) -> tuple[bytes, bytes]:
     """Return a figure as SVG and as PNG."""
     with style():
         figure = draw()
@@ -118,7 +118,7 @@ def files(
     made, shown = {}, {}
     for figure, (caption, draw) in drawings.items():
         progress(f"drawing {figure}")
-        svg, png = rendered(draw)
+        svg, png = render_figure(draw)
         made[f"{figure}.svg"], made[f"{figure}.png"] = svg, png
         data = base64.b64encode(png).decode()
         shown[figure] = {"name": figure, "caption": caption, "png_base64": data}

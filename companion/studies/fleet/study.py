@@ -72,10 +72,10 @@ def run(
             loss=asked.loss,
             seed=asked.seed,
         )
-        yield _grown(World(sky, FleetSettings(node="any"), cpu_s), asked.seconds)
+        yield _simulate_size(World(sky, FleetSettings(node="any"), cpu_s), asked.seconds)
 
 
-def _grown(world: World, seconds: float) -> FleetSize:
+def _simulate_size(world: World, seconds: float) -> FleetSize:
     sky = world.sky
     world.run(SETTLE_S)
     steady = _counted(world, seconds)
@@ -87,7 +87,7 @@ def _grown(world: World, seconds: float) -> FleetSize:
     }
     received = sum(size * scale.get(what, 1.0) for what, size in steady.received.items())
     cpu_s = sum(steady.cpu_s.values()) + sum(steady.frames_cpu_s.values()) * (scale["heard"] - 1)
-    takeover_s, orphans = _death(world)
+    takeover_s, orphans = _measure_takeover(world)
     names = list(world.members)
     left = set(names[: round(HALF * len(names))])
     world.parted = lambda one, other: (one in left) != (other in left)
@@ -108,7 +108,7 @@ def _grown(world: World, seconds: float) -> FleetSize:
         takeover_s=takeover_s,
         orphans=orphans,
         parted_none=parted.unserved / unserved,
-        heal_s=_healed_s(world),
+        heal_s=_measure_healing_s(world),
     )
 
 
@@ -119,7 +119,7 @@ def _counted(world: World, seconds: float) -> FleetCounts:
     return counted
 
 
-def _death(world: World) -> tuple[float | None, int]:
+def _measure_takeover(world: World) -> tuple[float | None, int]:
     """Kill the busiest node; return the time until its UAVs are served again, and their number."""
     victim = max(world.members, key=lambda name: len(world.members[name].duties.serves))
     orphans = set(world.members[victim].duties.serves)
@@ -137,7 +137,7 @@ def _death(world: World) -> tuple[float | None, int]:
     return (None if left or not times else max(times)), len(orphans)
 
 
-def _healed_s(world: World) -> float:
+def _measure_healing_s(world: World) -> float:
     """Return the time until no UAV has several nodes, handovers aside."""
     began_ns, last_ns = world.now_ns, world.now_ns
 

@@ -108,7 +108,7 @@ class World:
             self.now_ns = end_ns
             for number, name in enumerate(self._names):
                 if name not in self.dead:
-                    self._timed(name, partial(self._act, name, number))
+                    self._timed(name, partial(self._run_node, name, number))
             self._count()
             self._tick += 1
             watch()
@@ -145,12 +145,12 @@ class World:
 
     # --- nodes ------------------------------------------------------------------------------
 
-    def _act(self, name: str, number: int) -> None:
+    def _run_node(self, name: str, number: int) -> None:
         member, now_ns = self.members[name], self._local_ns(name)
         tick = self._tick + number
         if tick % OFFER_TICKS == 0:
             member.set_offers(self._flight.offers(self._ranges_m()[number]))
-            self._tell(name, "offers", messages.offers(member.offers))
+            self._broadcast(name, "offers", messages.offers(member.offers))
         member.decide(now_ns)
         for one in member.handovers:
             self.handovers.append((self.now_ns, one.uav, one.before, one.after))
@@ -159,10 +159,10 @@ class World:
         if tick % STANDING_TICKS == 0:
             lat_deg, lon_deg = (self._flight.places_m[number] / DEGREE_M).tolist()
             said = member.own_standing(now_ns, (lat_deg, lon_deg, 0.0), self.sky.reach_m)
-            self._tell(name, "standing", messages.standing(said))
+            self._broadcast(name, "standing", messages.standing(said))
         if tick % ASK_TICKS == 0:
             for other in sorted(member.near):
-                self._ask(name, other)
+                self._query_clock(name, other)
 
     def _flush(self, name: str) -> None:
         if self._flushing.get(name) == self.now_ns and name not in self.dead:  # else postponed
@@ -173,7 +173,7 @@ class World:
         sharing = self.members[name].sharing
         said = sharing.next_message(self._local_ns(name))
         if said is not None:
-            self._tell(name, "heard", messages.shared(said))
+            self._broadcast(name, "heard", messages.shared(said))
         wait_ns = sharing.wait_ns(self._local_ns(name))
         if wait_ns is None or self.now_ns <= self._flushing.get(name, 0) <= self.now_ns + wait_ns:
             return
@@ -181,7 +181,7 @@ class World:
         flush = partial(self._timed, name, partial(self._flush, name), of_frames=True)
         self._at(self.now_ns + wait_ns, flush)
 
-    def _tell(self, name: str, what: str, payload: bytes) -> None:
+    def _broadcast(self, name: str, what: str, payload: bytes) -> None:
         self.counted.sent[what] += len(payload)
         self.counted.samples[what] += 1
         for other in self._names:
@@ -191,7 +191,7 @@ class World:
                 continue
             if self._arrives(name, other):
                 self.counted.received[what] += len(payload) + HEADER_BYTES
-                self._at(self._arrival_ns(), partial(self._take, other, name, what, payload))
+                self._at(self._arrival_ns(), partial(self._deliver, other, name, what, payload))
 
     def _arrives(self, name: str, other: str) -> bool:
         return not self.parted(name, other) and self._random.random() >= self.sky.loss
@@ -199,12 +199,12 @@ class World:
     def _arrival_ns(self) -> int:
         return self.now_ns + round(self.sky.delay_s * SECOND_NS * self._random.uniform(1.0, 1.5))
 
-    def _take(self, name: str, node: str, what: str, payload: bytes) -> None:
+    def _deliver(self, name: str, node: str, what: str, payload: bytes) -> None:
         if name not in self.dead:
-            taken = partial(self._taken, name, node, what, payload)
+            taken = partial(self._handle_message, name, node, what, payload)
             self._timed(name, taken, of_frames=what == "heard")
 
-    def _taken(self, name: str, node: str, what: str, payload: bytes) -> None:
+    def _handle_message(self, name: str, node: str, what: str, payload: bytes) -> None:
         member, now_ns = self.members[name], self._local_ns(name)
         match what:
             case "heard":
@@ -214,7 +214,7 @@ class World:
             case "offers":
                 member.take_offers(now_ns, node, messages.to_offers(payload))
 
-    def _ask(self, name: str, other: str) -> None:
+    def _query_clock(self, name: str, other: str) -> None:
         if other in self.dead or not (self._arrives(name, other) and self._arrives(other, name)):
             return
         sent_ns, there_ns = self.now_ns, self._arrival_ns()
@@ -238,10 +238,10 @@ class World:
             while at_ns < end_ns:
                 raw = self._flight.report(uav, (at_ns - START_NS) // 1_000_000 + 60_000)
                 for number in hearers:
-                    self._at(at_ns, partial(self._hear, self._names[number], raw, uav))
+                    self._at(at_ns, partial(self._deliver_frame, self._names[number], raw, uav))
                 at_ns += period_ns
 
-    def _hear(self, name: str, raw: bytes, uav: str) -> None:
+    def _deliver_frame(self, name: str, raw: bytes, uav: str) -> None:
         if name not in self.dead:
             frame = Frame(
                 t_ns=self._local_ns(name),
@@ -250,9 +250,9 @@ class World:
                 msgid=REPORT,
                 raw=raw,
             )
-            self._timed(name, partial(self._was_received, name, frame), of_frames=True)
+            self._timed(name, partial(self._handle_frame, name, frame), of_frames=True)
 
-    def _was_received(self, name: str, frame: Frame) -> None:
+    def _handle_frame(self, name: str, frame: Frame) -> None:
         self.members[name].frame_received(self._local_ns(name), frame)
         self._publish_received(name)
 

@@ -141,7 +141,7 @@ def _limit_maps(found: Maps) -> "Figure":
         drawn = _map(axes, found.alpha, found.feedthrough_s, found.limit_s[mu], levels)
         axes.set_xlabel("decay α")
     panels[0].set_ylabel("feedthrough δ, s")
-    plotting.lettered(panels, [f"μ ≤ {mu:g} s²" for mu in MUS_S2])
+    plotting.title_panels(panels, [f"μ ≤ {mu:g} s²" for mu in MUS_S2])
     figure.colorbar(drawn, ax=panels, label="largest ΔT, s", shrink=0.95)
     return figure
 
@@ -158,7 +158,7 @@ def _gain_maps(found: Maps, values: dict[float, FloatArray], label: str) -> "Fig
         )  # fmt: skip
         axes.set_xlabel("interval ΔT, s")
     panels[0].set_ylabel("feedthrough δ, s")
-    plotting.lettered(panels, [f"α = {alpha:g}" for alpha in ALPHAS])
+    plotting.title_panels(panels, [f"α = {alpha:g}" for alpha in ALPHAS])
     figure.colorbar(drawn, ax=panels, label=label, shrink=0.95)
     return figure
 

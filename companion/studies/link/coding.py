@@ -21,7 +21,7 @@ GENERATORS: Final = (0o133, 0o171, 0o165)
 CONSTRAINT: Final = 7
 TAIL: Final = CONSTRAINT - 1  # zeros after each block
 STATES: Final = 1 << TAIL
-TOGETHER: Final = 128  # blocks decoded at once: their path metrics fit the processor's cache
+BATCH: Final = 128  # blocks decoded at once: their path metrics fit the processor's cache
 
 _TAPS: Final = np.array(
     [[bool(g >> (TAIL - i) & 1) for i in range(CONSTRAINT)] for g in GENERATORS], dtype=np.bool_
@@ -67,10 +67,10 @@ def decode(soft: FloatArray) -> BoolArray:
             f"{length} soft bits do not make a code word; give 3 per bit and 18 for the tail"
         )
     bits = np.empty((blocks, steps), dtype=np.bool_)
-    for start in range(0, blocks, TOGETHER):
-        some = soft[start : start + TOGETHER].astype(np.float32)
+    for start in range(0, blocks, BATCH):
+        some = soft[start : start + BATCH].astype(np.float32)
         by_step = np.ascontiguousarray(some.reshape(len(some), steps, -1).transpose(1, 2, 0))
-        bits[start : start + TOGETHER] = _traced_back(_decisions(by_step)).T
+        bits[start : start + BATCH] = _trace_back(_decisions(by_step)).T
     return bits[:, :-TAIL]
 
 
@@ -93,7 +93,7 @@ def _decisions(soft: NDArray[np.float32]) -> BoolArray:
     return odd_wins
 
 
-def _traced_back(odd_wins: BoolArray) -> BoolArray:
+def _trace_back(odd_wins: BoolArray) -> BoolArray:
     """Return the bits (steps, B) that led to state 0 at the end."""
     steps, _, blocks = odd_wins.shape
     bits = np.empty((steps, blocks), dtype=np.bool_)

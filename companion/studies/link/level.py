@@ -37,7 +37,7 @@ from companion.values import ComplexArray, UserError
 SYMBOL_S: Final = ofdm.SAMPLES / SAMPLE_RATE_HZ  # duration of an OFDM symbol
 AWGN: Final = "awgn"
 KINDS: Final = (AWGN, *(kind.value for kind in PositionSource))
-MOST_POINTS: Final = 100  # per curve
+MAX_POINTS: Final = 100  # per curve
 TARGET: Final = 1e-3  # bit error rate at which curves are compared
 
 
@@ -52,8 +52,8 @@ def snrs(first_db: float, last_db: float, step_db: float) -> tuple[float, ...]:
             f"{said}: give FROM:TO:STEP in dB, -40 <= FROM <= TO <= 80 and STEP above 0"
         )
     count = int((last_db - first_db) / step_db + 1e-9) + 1
-    if count > MOST_POINTS:
-        raise UserError(f"{said}: {count} points, at most {MOST_POINTS} are allowed")
+    if count > MAX_POINTS:
+        raise UserError(f"{said}: {count} points, at most {MAX_POINTS} are allowed")
     return tuple(round(first_db + i * step_db, 9) for i in range(count))
 
 
@@ -196,7 +196,7 @@ def study(
                 "positions": kind,
                 "coded": coded,
                 "snr_at_ber_1e-3_db": crossing_db(rows, kind, coded, TARGET),
-                **_floor(rows, kind, coded),
+                **_best_rates(rows, kind, coded),
                 **({} if kind == AWGN else _pointing(scenario, PositionSource(kind))),
             }
             for kind in KINDS
@@ -217,7 +217,7 @@ def study(
     }
 
 
-def _floor(rows: list[Row], kind: str, coded: bool) -> Row:
+def _best_rates(rows: list[Row], kind: str, coded: bool) -> Row:
     last = [found for found in rows if (found["positions"], found["coded"]) == (kind, coded)][-1]
     return {"ber_at_highest_snr": last["ber"], "rate_at_highest_snr_bps": last["rate_bps"]}
 

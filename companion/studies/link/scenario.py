@@ -36,7 +36,7 @@ REPORTED_M: Final = 0.01
 WARM_UP_S: Final = 5.0
 DURATION_S: Final = 60.0
 LOOKS_HZ: Final = 10.0
-MOST_DRAWN: Final = 100  # largest number of draws per instant
+MAX_DRAWS: Final = 100  # largest number of draws per instant
 
 
 class PositionSource(StrEnum):
@@ -134,7 +134,7 @@ def circles(
     towards: dict[PositionSource, list[FloatArray]] = {kind: [] for kind in PositionSource}
     for number, circle in enumerate(PAPER):
         starts_s = number / len(PAPER) * reports.interval_s  # staggered
-        answers = _flown(circle, starts_s, times_s, reports, bounded)
+        answers = _positions_by_source(circle, starts_s, times_s, reports, bounded)
         for kind, positions in answers.items():
             towards[kind].append(positions @ array.array_from_body.T)
     seen = {kind: _unit(np.stack(found, axis=1)) for kind, found in towards.items()}
@@ -157,7 +157,7 @@ def _resolved_times(
 ) -> tuple[FloatArray, int]:
     """Return times of use, ascending, and the number of draws."""
     times_s = list[float]()
-    for tried in range(1, MOST_DRAWN * instants + 1):
+    for tried in range(1, MAX_DRAWS * instants + 1):
         t_s = WARM_UP_S + DURATION_S * float(rng.random())
         offsets = np.array([circle.at(t_s)[0] for circle in PAPER])
         if _resolved(settings, array, _unit(offsets @ array.array_from_body.T)):
@@ -185,11 +185,11 @@ def _bounded(settings: Settings) -> Settings:
     return settings.override(observer=bounds)
 
 
-def _flown(
+def _positions_by_source(
     circle: Circle, starts_s: float, times_s: FloatArray, reports: Reports, settings: Settings
 ) -> dict[PositionSource, FloatArray]:
     """Return positions (K, 3) of one UAV at the times of use (K,), by kind."""
-    rivals: dict[PositionSource, Predictor] = {
+    predictors: dict[PositionSource, Predictor] = {
         PositionSource.PREDICTED: TrackPredictor(settings),
         PositionSource.HELD: Hold(),
     }
@@ -198,12 +198,12 @@ def _flown(
     for t_s in times_s.tolist():
         now_s = t_s - settings.beams.actuation_delay_s
         while (made_s := starts_s + sent * reports.interval_s) + reports.latency_s <= now_s:
-            for rival in rivals.values():
-                rival.report(_report(circle, made_s, reports.latency_s))
+            for predictor in predictors.values():
+                predictor.report(_report(circle, made_s, reports.latency_s))
             sent += 1
         found[PositionSource.PERFECT].append(circle.at(t_s)[0])
-        for kind, rival in rivals.items():
-            predicted = rival.predict(round(now_s * 1e9), round(t_s * 1e9))
+        for kind, predictor in predictors.items():
+            predicted = predictor.predict(round(now_s * 1e9), round(t_s * 1e9))
             if predicted is None:
                 raise UserError(f"no {kind} position {t_s:.1f} s into the flight")
             found[kind].append(predicted.position_ned_m)

@@ -39,7 +39,7 @@ PAPER_CODE_RATE: Final = 1 / 3
 SIZES: Final = (64, 128)
 INSTANTS: Final = (14, 58)
 """Steps at which the patterns are drawn: no UAV is near the mirror image of another."""
-LONG: Final = 2000  # steps to measure a steady error
+STEADY_STEPS: Final = 2000  # steps to measure a steady error
 BLOCKAGES_PER_MINUTE: Final = (0.0, 6.0, 15.0, 30.0, 60.0)
 DRAWS: Final = 2
 OPTIMUM: Final = "optimum"
@@ -135,7 +135,7 @@ def _scenario(flight: PaperFlight) -> dict[str, Any]:
 def _levels(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[str, float]]:
     """Return errors and bounds of each gain: steady over many steps, and from a wrong start."""
     scenario, found = flight.scenario, {}
-    long_flight = published_scenario.fly(replace(scenario, steps=LONG))
+    long_flight = published_scenario.fly(replace(scenario, steps=STEADY_STEPS))
     for name, one in tracked.items():
         steady = published_scenario.track(long_flight, one.gain)
         lost = published_scenario.track(long_flight, one.gain, 0 * flight.position_m[0])
@@ -144,7 +144,9 @@ def _levels(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[
         )
         peak_s = closed_form.peak_gain(scenario.dt_s, scenario.feedthrough_s, one.gain)
         errors = published_scenario.stacked(steady.estimate_m - long_flight.position_m)
-        late = published_scenario.stacked(lost.estimate_m - long_flight.position_m)[LONG // 2 :]
+        late = published_scenario.stacked(lost.estimate_m - long_flight.position_m)[
+            STEADY_STEPS // 2 :
+        ]
         angles = np.degrees(published_scenario.angle_errors_rad(long_flight, steady.estimate_m))
         running = published_scenario.running_bounds(long_flight, one.gain)
         gamma_m = float(np.sqrt(mu)) * long_flight.largest_input_mps
@@ -158,7 +160,7 @@ def _levels(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[
             "gamma_bound_m": gamma_m,
             "peak_bound_m": float(peak_s) * long_flight.largest_input_mps,
             "running_bound_excess_m": float((errors - running).max()),
-            "angle_error_deg": float(angles[LONG // 2 :].max()),
+            "angle_error_deg": float(angles[STEADY_STEPS // 2 :].max()),
         }
         if gamma_m > 0:
             found[name]["error_over_gamma_bound"] = found[name]["error_sup_m"] / gamma_m
@@ -207,7 +209,7 @@ def _designs(flight: PaperFlight) -> tuple[list[dict[str, Any]], dict[float, Tra
 
 def _alphas(flight: PaperFlight, alphas: dict[float, Tracked]) -> dict[str, Any]:
     """Return the largest errors at each alpha over many steps, with the gain of the figure."""
-    long_flight = published_scenario.fly(replace(flight.scenario, steps=LONG))
+    long_flight = published_scenario.fly(replace(flight.scenario, steps=STEADY_STEPS))
     found = {}
     for alpha, one in alphas.items():
         steady = published_scenario.track(long_flight, one.gain)

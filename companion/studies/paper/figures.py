@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Answer = dict[str, Any]
 LEVELS = tuple(level_name(gain) for _, gain in PAPER_LEVELS)
 TITLES = tuple(f"{level_name(gain)}, μ ≤ {mu:g} s²" for mu, gain in PAPER_LEVELS)
-SHOWN_S = 13.0  # time span of figures: slightly over one turn
+FIGURE_SPAN_S = 13.0  # time span of figures: slightly over one turn
 
 
 def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callable[[], "Figure"]]]:
@@ -83,7 +83,7 @@ def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callabl
 
 def _paths(material: Material) -> "Figure":
     figure, panels = plotting.new(1, 3, (9.6, 3.9), sharex=True, sharey=True)
-    shown = material.flight.time_s <= SHOWN_S
+    shown = material.flight.time_s <= FIGURE_SPAN_S
     true = material.flight.position_m[shown]
     for axes, name in zip(panels, LEVELS, strict=True):
         seen = material.tracked[name].estimate_m[shown]
@@ -98,7 +98,7 @@ def _paths(material: Material) -> "Figure":
         axes.set_aspect("equal")
         axes.set_xlabel("east, m")
     panels[0].set_ylabel("north, m")
-    plotting.lettered(panels, TITLES)
+    plotting.title_panels(panels, TITLES)
     plotting.below(figure, panels[0], 6)
     return figure
 
@@ -106,7 +106,7 @@ def _paths(material: Material) -> "Figure":
 def _coordinates(material: Material) -> "Figure":
     figure, panels = plotting.new(2, 1, (7.2, 4.6), sharex=True)
     time_s = material.flight.time_s
-    shown = time_s <= SHOWN_S
+    shown = time_s <= FIGURE_SPAN_S
     for axis, (axes, word) in enumerate(zip(panels, ("north", "east"), strict=True)):
         true = material.flight.position_m[shown, -1, axis]
         axes.plot(time_s[shown], true, color=plotting.INK, lw=2.0, label="actual")
@@ -115,7 +115,7 @@ def _coordinates(material: Material) -> "Figure":
             axes.plot(time_s[shown], seen, label=name, **plotting.line(number + 1))
         axes.set_ylabel(f"{word}, m")
     panels[1].set_xlabel("time, s")
-    panels[1].set_xlim(0, SHOWN_S)
+    panels[1].set_xlim(0, FIGURE_SPAN_S)
     plotting.below(figure, panels[0], 4)
     return figure
 
@@ -135,7 +135,7 @@ def _errors(answer: Answer, material: Material) -> "Figure":
         axes.set_xlim(0, flight.time_s[-1])
     panels[0].set_ylabel("norm of the error, m")
     panels[0].set_ylim(0, None)
-    plotting.lettered(panels, TITLES)
+    plotting.title_panels(panels, TITLES)
     plotting.below(figure, panels[0], 4)
     return figure
 
@@ -143,7 +143,7 @@ def _errors(answer: Answer, material: Material) -> "Figure":
 def _unknown_input(answer: Answer, material: Material) -> "Figure":
     figure, panels = plotting.new(2, 3, (9.6, 5.2), sharex=True, sharey="row")
     flight = material.flight
-    shown = flight.time_s[:-1] <= SHOWN_S
+    shown = flight.time_s[:-1] <= FIGURE_SPAN_S
     time_s = flight.time_s[:-1][shown]
     for column, name in enumerate(LEVELS):
         one, above, under = material.tracked[name], panels[column], panels[3 + column]
@@ -151,13 +151,13 @@ def _unknown_input(answer: Answer, material: Material) -> "Figure":
             time_s, flight.input_mps[shown, 0, 0], color=plotting.INK, lw=1.8, label="W, actual"
         )
         above.plot(time_s, one.input_b0_mps[shown, 0, 0], label="Ŵ, G = [B; 0]", **plotting.line(1))
-        _misses(under, one, material, answer["unknown_input"][name])
+        _draw_input_errors(under, one, material, answer["unknown_input"][name])
         under.set_xlabel("time, s")
-        under.set_xlim(0, SHOWN_S)
+        under.set_xlim(0, FIGURE_SPAN_S)
     panels[0].set_ylabel("north, UAV 1, m/s")
     panels[3].set_ylabel("norm of the error, m/s")
     panels[3].set_ylim(0, None)
-    plotting.lettered(panels[:3], TITLES)
+    plotting.title_panels(panels[:3], TITLES)
     handles = [axes.get_legend_handles_labels() for axes in (panels[0], panels[3])]
     figure.legend(
         handles[0][0] + handles[1][0],
@@ -168,9 +168,9 @@ def _unknown_input(answer: Answer, material: Material) -> "Figure":
     return figure
 
 
-def _misses(axes: Any, one: Any, material: Material, numbers: dict[str, float]) -> None:
+def _draw_input_errors(axes: Any, one: Any, material: Material, numbers: dict[str, float]) -> None:
     flight = material.flight
-    shown = flight.time_s[:-1] <= SHOWN_S
+    shown = flight.time_s[:-1] <= FIGURE_SPAN_S
     time_s, largest = flight.time_s[:-1][shown], flight.largest_input_mps
     for number, (kept, label) in enumerate(
         ((one.input_b0_mps, "error, [B; 0]"), (one.input_bd_mps, "error, [B; D]"))
@@ -186,7 +186,7 @@ def _misses(axes: Any, one: Any, material: Material, numbers: dict[str, float]) 
 def _alphas(material: Material) -> "Figure":
     figure, panels = plotting.new(2, 3, (9.6, 5.0), sharex=True, sharey="row")
     flight = material.flight
-    shown = flight.time_s[:-1] <= SHOWN_S
+    shown = flight.time_s[:-1] <= FIGURE_SPAN_S
     time_s = flight.time_s[:-1][shown]
     titles = []
     for column, (alpha, one) in enumerate(material.alphas.items()):
@@ -203,12 +203,12 @@ def _alphas(material: Material) -> "Figure":
             peak * flight.largest_input_mps, label="exact peak, [B; 0]", **plotting.line(3)
         )
         under.set_xlabel("time, s")
-        under.set_xlim(0, SHOWN_S)
+        under.set_xlim(0, FIGURE_SPAN_S)
         titles.append(f"α = {alpha:g}, L = {one.gain:.3f}")
     panels[0].set_ylabel("north, UAV 1, m/s")
     panels[3].set_ylabel("norm of the error, m/s")
     panels[3].set_ylim(0, None)
-    plotting.lettered(panels[:3], titles)
+    plotting.title_panels(panels[:3], titles)
     handles = [axes.get_legend_handles_labels() for axes in (panels[0], panels[3])]
     figure.legend(
         handles[0][0] + handles[1][0],
@@ -245,7 +245,7 @@ def _limits(answer: Answer) -> "Figure":
 def _rates(material: Material) -> "Figure":
     figure, panels = plotting.new(1, 2, (9.6, 3.6), sharey=True)
     time_s = material.flight.time_s
-    shown = time_s <= SHOWN_S
+    shown = time_s <= FIGURE_SPAN_S
     place = material.flight.position_m
     azimuth_deg = np.degrees(np.arctan2(place[..., 1], place[..., 0]))
     edges = np.linspace(-180, 180, 37)
@@ -262,13 +262,13 @@ def _rates(material: Material) -> "Figure":
             **plotting.line(number),
         )
     panels[0].set_xlabel("time, s")
-    panels[0].set_xlim(0, SHOWN_S)
+    panels[0].set_xlim(0, FIGURE_SPAN_S)
     panels[0].set_ylabel("spectral efficiency, bit/s/Hz")
     panels[0].set_ylim(0, None)
     panels[1].set_xlabel("azimuth of the UAV, degrees (0: boresight)")
     panels[1].set_xlim(-180, 180)
     panels[1].set_xticks(np.arange(-180, 181, 60))
-    plotting.lettered(panels, ("mean of the UAVs over time", "mean over reports by azimuth"))
+    plotting.title_panels(panels, ("mean of the UAVs over time", "mean over reports by azimuth"))
     plotting.below(figure, panels[0], 4)
     return figure
 

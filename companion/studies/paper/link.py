@@ -29,7 +29,7 @@ PRECODER: Final = Precoder(widen=Widen.NO)
 PROBING: Final = EchoProbing(dwell_s=0.005, position_gain=0.9, rate_gain=0.5)
 """Baseline in its favour: it integrates half of all time, and its rate tracker follows the turn."""
 MEAN_BLOCKAGE_S: Final = 0.5
-EVERY: Final = 5  # probing intervals per computed rate
+RATE_DECIMATION: Final = 5  # probing intervals per computed rate
 
 
 def line(elements: int) -> Array:
@@ -129,9 +129,9 @@ def under_blockage(
     array = line(64)
     time_s = np.arange(0.0, float(flight.time_s[-1]), PROBING.interval_s)
     true_m = between(flight, flight.position_m, time_s)
-    some = true_m[::EVERY]
+    some = true_m[::RATE_DECIMATION]
     heard = {
-        name: responses(array, some, between(flight, places, time_s[::EVERY]))
+        name: responses(array, some, between(flight, places, time_s[::RATE_DECIMATION]))
         for name, places in aimed_m.items()
     }
     found: dict[str, list[float]] = {name: [] for name in (*aimed_m, "echo probing")}
@@ -141,7 +141,7 @@ def under_blockage(
             progress(f"echo probing under blockage: {number + 1} of {len(blockages_per_minute)}")
             lost_db = _attenuation_db(true_m.shape[1], time_s, rate / 60, rng)
             for name, responded in heard.items():
-                rate_now = efficiency(array, responded, some, lost_db[::EVERY])
+                rate_now = efficiency(array, responded, some, lost_db[::RATE_DECIMATION])
                 totals[name] += float(rate_now.mean()) / draws
             echoed = _echo_efficiency(array, true_m, lost_db, rng)
             totals["echo probing"] += float(echoed.mean()) / draws
@@ -164,7 +164,7 @@ def _attenuation_db(
 def _echo_efficiency(
     array: Array, true_m: FloatArray, lost_db: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return spectral efficiency (T / EVERY, N) of the baseline; 0 during a sweep."""
+    """Return spectral efficiency (T / RATE_DECIMATION, N) of the baseline; 0 during a sweep."""
     state = probing.started(directions(true_m[0]))
     pointed, served = [], []
     for at, (there, places) in enumerate(zip(directions(true_m), true_m, strict=True)):
@@ -173,15 +173,17 @@ def _echo_efficiency(
             PROBING, BUDGET, array, directions=there, ranges_m=ranges_m, attenuation_db=lost_db[at]
         )
         state = probing.step(PROBING, array, state, directions=there, snr=snr, rng=rng)
-        if at % EVERY == 0:
+        if at % RATE_DECIMATION == 0:
             pointed.append(state.pointed)
             served.append(state.served)
     heard = []
-    for beams, there, on in zip(pointed, directions(true_m[::EVERY]), served, strict=True):
+    for beams, there, on in zip(
+        pointed, directions(true_m[::RATE_DECIMATION]), served, strict=True
+    ):
         sent = np.zeros((array.size, len(on)), dtype=complex)
         if on.any():
             sent[:, on] = precode(steering_matrix(array, beams[on]), PRECODER).weights
         heard.append(
             steering_matrix(array, there).T @ link_budget.share_power(sent, BUDGET.tx_power_w)
         )
-    return efficiency(array, np.array(heard), true_m[::EVERY], lost_db[::EVERY])
+    return efficiency(array, np.array(heard), true_m[::RATE_DECIMATION], lost_db[::RATE_DECIMATION])

@@ -50,7 +50,7 @@ def surfaces(material: Material) -> "Figure":
     figure, panels = plotting.new(2, 2, (9.2, 6.9), subplot_kw={"projection": "3d"})
     cases = _cases(material)
     for axes, (array, places, _) in zip(panels, cases, strict=True):
-        middle = _front(float(azimuths_rad(places)[0]))
+        middle = _front_azimuth(float(azimuths_rad(places)[0]))
         azimuth = middle + np.radians(np.linspace(-12, 12, 193))
         elevation = np.radians(np.linspace(-40, 40, 81))
         gain = patterns.sphere(array, weights(array, places)[:, 0], azimuth, elevation)
@@ -65,11 +65,11 @@ def surfaces(material: Material) -> "Figure":
         axes.set_zlim(-20, TOP_DB)  # type: ignore[attr-defined]
         axes.view_init(elev=38, azim=-62)  # type: ignore[attr-defined]
         axes.set_box_aspect(None, zoom=0.95)  # type: ignore[call-arg]
-    plotting.lettered(panels, [title for *_, title in cases])
+    plotting.title_panels(panels, [title for *_, title in cases])
     return figure
 
 
-def _front(azimuth_rad: float) -> float:
+def _front_azimuth(azimuth_rad: float) -> float:
     """Return the azimuth in front of a line of isotropic elements with the same response."""
     return float(np.arcsin(np.sin(azimuth_rad)))
 
@@ -79,7 +79,7 @@ def cuts(material: Material) -> "Figure":
     figure, panels = plotting.new(2, 2, (9.2, 5.8), sharey=True)
     for column, step in enumerate(INSTANTS):
         places = material.flight.position_m[step]
-        middle = _front(float(azimuths_rad(places)[0]))
+        middle = _front_azimuth(float(azimuths_rad(places)[0]))
         for number, size in enumerate(SIZES):
             array = material.arrays[size]
             beam = weights(array, places)[:, 0]
@@ -103,7 +103,7 @@ def cuts(material: Material) -> "Figure":
         axes.set_ylabel("array gain, dB")
         axes.set_ylim(FLOOR_DB, TOP_DB)
     times = [f"t = {material.flight.time_s[step]:.1f} s" for step in INSTANTS]
-    plotting.lettered(
+    plotting.title_panels(
         panels, [f"{cut} cut, {t}" for cut in ("azimuth", "elevation") for t in times]
     )
     plotting.below(figure, panels[0], 2)
@@ -136,6 +136,6 @@ def polar(material: Material) -> "Figure":
         axes.set_rlim(POLAR_FLOOR_DB, TOP_DB)  # type: ignore[attr-defined]
         axes.set_rticks([-10, 0, 10, 20])  # type: ignore[attr-defined]
         axes.set_rlabel_position(45)  # type: ignore[attr-defined]
-    plotting.lettered(panels, [title for *_, title in cases])
+    plotting.title_panels(panels, [title for *_, title in cases])
     plotting.below(figure, panels[0], 2)
     return figure

@@ -28,7 +28,7 @@ from companion.beams.array.steering import amplitudes, steering_matrix
 from companion.beams.worth.link_budget import LinkBudget
 from companion.values import FloatArray, IntArray
 
-BLIND: Final = 1e-4
+BLIND_RATIO: Final = 1e-4
 """Ratio of squared extents below which the array is blind along an axis.
 
 A line, for example, cannot measure angles across its length, and its beams do not depend on them.
@@ -228,7 +228,7 @@ def direction_error_rad(
     spread = _spread_m2(array, directions)
     seen, axes = np.linalg.eigh(across @ spread @ across)
     size = np.trace(spread, axis1=1, axis2=2)[:, np.newaxis]
-    known = (seen > BLIND * size) & (snr[:, np.newaxis] > 0)
+    known = (seen > BLIND_RATIO * size) & (snr[:, np.newaxis] > 0)
     information = 2 * snr[:, np.newaxis] * array.wavenumber_radpm**2 * seen
     deviations = np.where(known, 1 / np.sqrt(np.where(known, information, 1.0)), 0.0)
     drawn = rng.standard_normal(deviations.shape) * deviations

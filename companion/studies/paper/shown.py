@@ -29,7 +29,7 @@ class Figure:
 
 
 @dataclass(frozen=True, slots=True)
-class Guess:
+class AssumedSetting:
     """Setting that the paper does not give: the value assumed here and what it affects."""
 
     setting: str
@@ -111,18 +111,22 @@ FIGURES: Final = (
 )
 
 GUESSES: Final = (
-    Guess("initial phase of each UAV (φ)", "a quarter turn apart", "all figures; opposite UAVs"),
-    Guess("duration", "170 reports, two turns", "means of rates"),
-    Guess("initial state of the observer", "without error", "first seconds of figures 2 to 4"),
-    Guess("transmit power", "30 dBm, shared", "figures 5, 6 and 10"),
-    Guess("noise figure", "7 dB over 50 MHz", "figures 5, 6 and 10"),
-    Guess("path loss", "free space", "figures 5, 6 and 10"),
-    Guess("spectral efficiency", "log2(1 + SINR)", "figures 5, 6 and 10"),
-    Guess("scattered rays", "none", "figures 5, 6 and 10"),
-    Guess("size of the OFDM transform", "only its minimum, 234, is used", "the waveform"),
-    Guess("blockages", "random, 0.5 s long on average", "figure 10"),
-    Guess("echo probing", "a favourable baseline", "figure 10"),
-    Guess("element pattern", "isotropic", "figures 7 to 9"),
+    AssumedSetting(
+        "initial phase of each UAV (φ)", "a quarter turn apart", "all figures; opposite UAVs"
+    ),
+    AssumedSetting("duration", "170 reports, two turns", "means of rates"),
+    AssumedSetting(
+        "initial state of the observer", "without error", "first seconds of figures 2 to 4"
+    ),
+    AssumedSetting("transmit power", "30 dBm, shared", "figures 5, 6 and 10"),
+    AssumedSetting("noise figure", "7 dB over 50 MHz", "figures 5, 6 and 10"),
+    AssumedSetting("path loss", "free space", "figures 5, 6 and 10"),
+    AssumedSetting("spectral efficiency", "log2(1 + SINR)", "figures 5, 6 and 10"),
+    AssumedSetting("scattered rays", "none", "figures 5, 6 and 10"),
+    AssumedSetting("size of the OFDM transform", "only its minimum, 234, is used", "the waveform"),
+    AssumedSetting("blockages", "random, 0.5 s long on average", "figure 10"),
+    AssumedSetting("echo probing", "a favourable baseline", "figure 10"),
+    AssumedSetting("element pattern", "isotropic", "figures 7 to 9"),
 )
 
 

@@ -104,7 +104,7 @@ def known_tuning(settings: Settings) -> Tuning:
     The process noise is white acceleration whose density is its variance times ``MANOEUVRE_S``.
     """
     given = settings.observer
-    deviation_mps2 = assembly.anyone(settings).acceleration_max_mps2 / given.accuracy_factor
+    deviation_mps2 = assembly.default_limits(settings).acceleration_max_mps2 / given.accuracy_factor
     return Tuning(
         process_density=deviation_mps2**2 * MANOEUVRE_S,
         position_noise_m=given.position_noise_m / given.accuracy_factor,

@@ -24,19 +24,19 @@ from companion.studies.truth.hindsight import least
 from companion.studies.truth.trajectory import GAP_NS, Times
 from companion.values import FloatArray, IntArray
 
-NEAR_NS: Final = (1_000_000_000, 10_000_000_000)
+NEIGHBOURHOODS_NS: Final = (1_000_000_000, 10_000_000_000)
 """Ranges, on the track's own time, within which a known time counts; the second is the fallback.
 
 Errors of velocity accumulate with distance.
 """
-NARROW_NS: Final = 5_000_000  # a narrower bracket determines the time: its middle
-TOGETHER_NS: Final = 7_000_000
+NARROW_BRACKET_NS: Final = 5_000_000  # a narrower bracket determines the time: its middle
+SIMULTANEOUS_NS: Final = 7_000_000
 """Largest observed spread of arrivals of messages sent together, on a link without queues."""
-ROUNDED_NS: Final = 2_000_000
+BRACKET_ERROR_NS: Final = 2_000_000
 """Largest error of a bracket, by stamps in whole milliseconds and by the period of a loop."""
-SLOWEST_MPS: Final = 0.5
+MIN_SPEED_MPS: Final = 0.5
 """Speed below which distance does not determine the time between two points."""
-PACE: Final = (0.5, 2.0)
+PACE_RATIOS: Final = (0.5, 2.0)
 """Arrivals keep the sender's pace if the gap between two is that of their stamps times 0.5 to 2."""
 
 
@@ -70,7 +70,7 @@ def boot_times_ns(
 
     Their positions and velocities are (N, 3); NaN for an unknown velocity.
     """
-    paced, pins = _by_pace(brackets), _pins(brackets)
+    paced, pins = _interpolated_by_arrival(brackets), _determined_ns(brackets)
     alone = np.where(np.isnan(pins), np.where(np.isnan(paced), brackets.before_ns, paced), pins)
     found = np.round(alone).astype(np.int64)
     way_s = _times_between_s(position_ned_m, velocity_ned_mps)
@@ -84,18 +84,20 @@ def boot_times_ns(
         rows[start:stop] = True
         own_s = np.concatenate([[0.0], np.cumsum(way_s[start : stop - 1])])
         own_ns = found[start] + np.round(own_s * 1e9).astype(np.int64)
-        found[rows] = _moved_together(own_ns, brackets.rows(rows), paced[rows], pins[rows])
+        found[rows] = _with_common_shift(own_ns, brackets.rows(rows), paced[rows], pins[rows])
     return found
 
 
 def _keeps_pace(brackets: Brackets) -> NDArray[np.bool_]:
     gap_ns = brackets.after_arrival_ns - brackets.before_arrival_ns
     span_ns = brackets.after_ns - brackets.before_ns
-    kept: NDArray[np.bool_] = (gap_ns >= PACE[0] * span_ns) & (gap_ns <= PACE[1] * span_ns)
+    kept: NDArray[np.bool_] = (gap_ns >= PACE_RATIOS[0] * span_ns) & (
+        gap_ns <= PACE_RATIOS[1] * span_ns
+    )
     return kept & (gap_ns > 0)
 
 
-def _by_pace(brackets: Brackets) -> FloatArray:
+def _interpolated_by_arrival(brackets: Brackets) -> FloatArray:
     """Interpolate times (N,) by arrival; NaN where arrivals do not keep the pace."""
     gap_ns = np.maximum(brackets.after_arrival_ns - brackets.before_arrival_ns, 1)
     share = np.clip((brackets.arrival_ns - brackets.before_arrival_ns) / gap_ns, 0.0, 1.0)
@@ -110,7 +112,7 @@ def _times_between_s(position_ned_m: FloatArray, velocity_ned_mps: FloatArray) -
     """
     mean = (velocity_ned_mps[1:] + velocity_ned_mps[:-1]) / 2
     speed2 = np.sum(mean * mean, axis=1)
-    fast = np.nan_to_num(speed2) >= SLOWEST_MPS**2
+    fast = np.nan_to_num(speed2) >= MIN_SPEED_MPS**2
     speed2 = np.where(fast, speed2, 1.0)
     gained = np.diff(velocity_ned_mps, axis=0)
     along2 = np.sum(gained * mean, axis=1) ** 2 / speed2
@@ -120,18 +122,18 @@ def _times_between_s(position_ned_m: FloatArray, velocity_ned_mps: FloatArray) -
     return found
 
 
-def _pins(brackets: Brackets) -> FloatArray:
+def _determined_ns(brackets: Brackets) -> FloatArray:
     """Times (N,) that a bracket or an arrival determines; NaN for others."""
-    narrow = brackets.after_ns - brackets.before_ns <= NARROW_NS
+    narrow = brackets.after_ns - brackets.before_ns <= NARROW_BRACKET_NS
     steady = _keeps_pace(brackets)
-    with_before = steady & (brackets.arrival_ns - brackets.before_arrival_ns <= TOGETHER_NS)
-    with_after = steady & (brackets.after_arrival_ns - brackets.arrival_ns <= TOGETHER_NS)
+    with_before = steady & (brackets.arrival_ns - brackets.before_arrival_ns <= SIMULTANEOUS_NS)
+    with_after = steady & (brackets.after_arrival_ns - brackets.arrival_ns <= SIMULTANEOUS_NS)
     middle = (brackets.before_ns + brackets.after_ns) / 2
     neither = np.where(with_after, brackets.after_ns, np.nan)
     return np.where(narrow, middle, np.where(with_before, brackets.before_ns, neither))
 
 
-def _moved_together(
+def _with_common_shift(
     own_ns: Times, brackets: Brackets, paced: FloatArray, pins: FloatArray
 ) -> Times:
     """Return boot times (N,) of points whose times on the track are ``own_ns`` up to a shift."""
@@ -141,20 +143,22 @@ def _moved_together(
             np.searchsorted(ordered, ordered - within_ns, side="left"),
             np.searchsorted(ordered, ordered + within_ns, side="right"),
         )
-        for within_ns in NEAR_NS
+        for within_ns in NEIGHBOURHOODS_NS
     )
     lowest = -least(own_ns - brackets.before_ns, starts, stops)
     highest = np.maximum(least(brackets.after_ns - own_ns, starts, stops), lowest)
-    shift = np.clip(_typical(paced - own_ns, starts, stops), lowest, highest)
+    shift = np.clip(_median_of_known(paced - own_ns, starts, stops), lowest, highest)
     shift = np.where(np.isnan(shift), lowest, shift)
     for among in ((starts, stops), nearest):
-        pinned = _typical(pins - own_ns, *among)
+        pinned = _median_of_known(pins - own_ns, *among)
         shift = np.where(np.isnan(pinned), shift, pinned)
     found: Times = own_ns + np.round(shift).astype(np.int64)
-    return np.clip(found, brackets.before_ns - ROUNDED_NS, brackets.after_ns + ROUNDED_NS)
+    return np.clip(
+        found, brackets.before_ns - BRACKET_ERROR_NS, brackets.after_ns + BRACKET_ERROR_NS
+    )
 
 
-def _typical(values: FloatArray, starts: IntArray, stops: IntArray) -> FloatArray:
+def _median_of_known(values: FloatArray, starts: IntArray, stops: IntArray) -> FloatArray:
     """Return the median of the known values in ``values[start:stop]``, (K,); NaN without any."""
     at = np.flatnonzero(~np.isnan(values))
     first, last = np.searchsorted(at, starts), np.searchsorted(at, stops)

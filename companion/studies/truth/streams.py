@@ -120,7 +120,7 @@ class TruthMessages:
     payloads: tuple[bytes, ...]
 
 
-def words(stream: VehicleStream, msgid: int, clock: BootClock) -> TruthMessages:
+def truth_messages(stream: VehicleStream, msgid: int, clock: BootClock) -> TruthMessages:
     """Return the truth messages of one kind that lie between two stamps of one life."""
     said = stream.said[msgid]
     before = np.array([each.before for each in said], dtype=np.int64)

@@ -25,7 +25,7 @@ from companion.studies.truth.streams import (
     gather,
     sim_state,
     simstate,
-    words,
+    truth_messages,
 )
 from companion.studies.truth.trajectory import Times, Trajectory, ascending
 from companion.tracking.geodesy import LocalFrame
@@ -219,7 +219,7 @@ def _velocity(local: LocalFrame, report: Report) -> FloatArray:
 
 def _simulated(stream: VehicleStream, clock: BootClock, local: LocalFrame) -> Trajectory | None:
     """Return the trajectory by SIM_STATE; None if it has no valid position or time."""
-    said = words(stream, SIM_STATE, clock)
+    said = truth_messages(stream, SIM_STATE, clock)
     points, attitudes, kept = [], [], []
     for payload in said.payloads:
         fields = sim_state(payload)
@@ -255,7 +255,7 @@ def _placed(
 
     The reported velocities give the times between its points. None as for ``_simulated``.
     """
-    said = words(stream, SIMSTATE, clock)
+    said = truth_messages(stream, SIMSTATE, clock)
     places = np.array([simstate(payload)[9:11] for payload in said.payloads]).reshape(-1, 2)
     kept: BoolArray = np.array(places.any(axis=1))
     if kept.sum() < 2:

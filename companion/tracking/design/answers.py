@@ -181,7 +181,7 @@ def peak_error_m(dt_s: float, gain: FloatArray, motion: KinematicLimits) -> floa
         return float("inf")
     at, total = POSITION[0], 0.0
     while True:
-        swept = motion.acceleration_mps2 * _swept(at[0], at[1], dt_s)
+        swept = motion.acceleration_mps2 * _absolute_integral(at[0], at[1], dt_s)
         step = swept + float(np.abs(at @ gain) @ noises)
         total += step
         at = at @ closed
@@ -189,7 +189,7 @@ def peak_error_m(dt_s: float, gain: FloatArray, motion: KinematicLimits) -> floa
             return total
 
 
-def _swept(slope: float, start: float, dt_s: float) -> float:
+def _absolute_integral(slope: float, start: float, dt_s: float) -> float:
     """Integral of |slope u + start| over u from 0 to T."""
     end = start + slope * dt_s
     if start * end >= 0:

@@ -36,7 +36,7 @@ FORMAT: Final = "kinematic-design-1"
 LARGEST: Final = 1 << 20  # most characters of a design; the program's own has 4500
 NUMBER_MAX: Final = 1e30
 """Largest number in a design; its shortest interval is one over it."""
-FINER: Final = 5  # intervals that verify checks per step of the design's grid
+CHECKS_PER_STEP: Final = 5  # intervals that verify checks per step of the design's grid
 
 
 class DesignError(UserError):
@@ -183,7 +183,7 @@ def verify(design: KinematicDesign) -> float:
     """
     _check(design)
     nodes = np.arange(len(design.dt_s))
-    at = np.linspace(0, nodes[-1], FINER * nodes[-1] + 1)
+    at = np.linspace(0, nodes[-1], CHECKS_PER_STEP * nodes[-1] + 1)
 
     def between(rows: ArrayLike) -> FloatArray:
         columns = np.asarray(rows, dtype=float).T

@@ -189,7 +189,7 @@ def _solve_scaled(
         for s in samplings
     ]
     top = None if mu_max is None else mu_max / unit**2
-    p, zs, multipliers = _ask(
+    p, zs, multipliers = _solve_sdp(
         scaled, h * states / unit, alphas, widths=widths, mu_max=top, slack=slack
     )
     gains = [np.linalg.solve(p, z) * states[:, None] / reports for z in zs]
@@ -200,7 +200,7 @@ def _solve_scaled(
     )
 
 
-def _ask(
+def _solve_sdp(
     samplings: Sequence[Sampling],
     h: FloatArray,
     alphas: Sequence[float],

@@ -34,7 +34,7 @@ VELOCITY_SHARE = 0.5
 
 Over equal intervals the error then has the eigenvalues 0 and 1 - share.
 """
-SHOWN_S = 0.1
+MIN_DIFFERENCE_S = 0.1
 """Least interval for a velocity derived from positions; below it, their noise would mean km/s."""
 
 
@@ -114,7 +114,7 @@ class KinematicObserver:
         fix = state.fix
         t = (sender_ns - fix.sender_ns) * 1e-9
         gain = self._gain(state, t)
-        position, velocity = _moved(state, t, gain)
+        position, velocity = _propagated(state, t, gain)
         return self._bounded(state, t, gain, position, velocity)
 
     def carry(self, state: KinematicState, sender_ns: int) -> tuple[Vector, Vector] | None:
@@ -122,7 +122,7 @@ class KinematicObserver:
         if state.fix.velocity_ned_mps is None:
             return None
         t = (sender_ns - state.fix.sender_ns) * 1e-9
-        return _moved(state, t, self.model.gain(t))
+        return _propagated(state, t, self.model.gain(t))
 
     def _bounded(
         self, state: KinematicState, t: float, gain: Gain, position: Vector, velocity: Vector
@@ -172,7 +172,7 @@ class KinematicObserver:
             return self.model.gain(t)
         if state.interval_s is None:
             return 1.0, 0.0, 0.0, 0.0
-        rate = VELOCITY_SHARE / max(state.interval_s, SHOWN_S)
+        rate = VELOCITY_SHARE / max(state.interval_s, MIN_DIFFERENCE_S)
         return 1.0 + rate * t, 0.0, rate, 0.0
 
     def after(self, state: KinematicState, predicted: Prediction, fix: Fix) -> KinematicState:
@@ -217,7 +217,7 @@ class KinematicObserver:
         )
 
 
-def _moved(state: KinematicState, t: float, gain: Gain) -> tuple[Vector, Vector]:
+def _propagated(state: KinematicState, t: float, gain: Gain) -> tuple[Vector, Vector]:
     """Return position and velocity a time after the state's report, by the gain for that time."""
     fix = state.fix
     l11, l12, l21, l22 = gain

@@ -79,7 +79,7 @@ class PositionObserver:
         b = (sender_ns - fix.sender_ns) * 1e-9
         if b <= 0:
             bound_m = state.bound_m - b * limits.speed_max_mps
-            return self._made(state, state.estimate_ned_m, bound_m, b, 0.0)
+            return self._prediction(state, state.estimate_ned_m, bound_m, b, 0.0)
         d, noise_m, lead_s = model.feedthrough_s, fix.noise.position_m, 0.0
         # The mean velocity over the sender's lead differs from that over the interval.
         noise_m += abs(d) * limits.acceleration_max_mps2 * abs(b - d) / 2
@@ -94,8 +94,8 @@ class PositionObserver:
             + abs(gain * d - b) * limits.speed_max_mps
             + abs(gain) * noise_m
         )
-        estimate = _drawn(state, lead_s, gain)
-        return self._made(state, estimate, bound_m, b, closed_form.mu_star(b, d, alpha))
+        estimate = _corrected(state, lead_s, gain)
+        return self._prediction(state, estimate, bound_m, b, closed_form.mu_star(b, d, alpha))
 
     def carry(self, _state: PositionState, _sender_ns: int) -> tuple[Vector, Vector] | None:
         """None: the observer has its own bound."""
@@ -108,7 +108,7 @@ class PositionObserver:
         """
         return PositionState(fix, predicted.position_ned_m, predicted.bound_m)
 
-    def _made(
+    def _prediction(
         self, state: PositionState, estimate: Vector, bound_m: float, b: float, mu_s2: float
     ) -> Prediction:
         """Return a prediction with the reported velocity, whose bound grows with time."""
@@ -128,7 +128,7 @@ class PositionObserver:
         )
 
 
-def _drawn(state: PositionState, lead_s: float, gain: float) -> Vector:
+def _corrected(state: PositionState, lead_s: float, gain: float) -> Vector:
     """Return the estimate, corrected by the gain towards the report with its lead."""
     x1, x2, x3 = state.estimate_ned_m
     y1, y2, y3 = state.fix.position_ned_m

@@ -326,7 +326,7 @@ def test_equal_beams_are_all_candidates_without_endless_work() -> None:
 
 def test_it_is_a_superset_however_early_the_work_ends(monkeypatch: pytest.MonkeyPatch) -> None:
     full = {name: candidates(book, a, in_plane(0.4), 0.2) for name, (a, book) in BOOKS.items()}
-    monkeypatch.setattr(codebooks, "MOST_RESPONSES", 1)
+    monkeypatch.setattr(codebooks, "RESPONSES_MAX", 1)
     monkeypatch.setattr(codebooks, "BLOCK", 64)
     for name, (array, book) in BOOKS.items():
         assert set(full[name]) <= set(candidates(book, array, in_plane(0.4), 0.2))

@@ -10,8 +10,8 @@ from companion.beams.array.geometry import Array, uniform_linear, uniform_rectan
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights import shapes
 from companion.beams.weights.cones import (
-    FINER,
-    FINER_IN_PLANE,
+    SAMPLES_PER_WIDTH,
+    SAMPLES_PER_WIDTH_IN_PLANE,
     ConeSamples,
     cones,
     cones_on_aperture,
@@ -47,7 +47,7 @@ def looked_at(array: Array, angles_deg: list[list[float]]) -> ConeSamples:
 
 def offsets(array: Array, found: ConeSamples) -> list[FloatArray]:
     """The places of each axis, as cosines beside the predicted direction's."""
-    finer = FINER if len(found.waves) == 1 else FINER_IN_PLANE
+    finer = SAMPLES_PER_WIDTH if len(found.waves) == 1 else SAMPLES_PER_WIDTH_IN_PLANE
     across = shapes.aperture(array)
     reaches = [wave.shape[1] // 2 for wave in found.waves]
     return [

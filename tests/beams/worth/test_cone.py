@@ -159,7 +159,7 @@ def test_responses_stay_within_the_bounds_of_their_cell(
     assert (low <= high).all()
     for direction in within(predicted_of(cones), bound_rad, rng, 8):
         amplitudes = np.ones(array.size)
-        if cone.faces_apart(array):
+        if cone.has_distinct_patterns(array):
             amplitudes = steering.amplitudes(array, direction[np.newaxis])[:, 0]
         response = sum(
             weights[m] * amplitudes[m] * cmath.exp(1j * array.wavenumber_radpm * p @ direction)

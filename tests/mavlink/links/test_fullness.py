@@ -30,7 +30,7 @@ async def serving(url: str) -> AsyncIterator[Endpoint]:
         up=lambda: None,
         take=lambda *_: None,
         stale=lambda *_: None,
-        hang_up=lambda _: None,
+        on_peer_gone=lambda _: None,
         overflow=lambda _: None,
     )
     made = endpoint(parse_link(url), LinkStatus(url=url), upcalls)

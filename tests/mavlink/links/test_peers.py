@@ -29,7 +29,7 @@ def numbered(number: int, source: Source = UAV, t_ns: int = 0) -> Frame:
 
 
 class Heard:
-    """Peers of a link, and who was bidden farewell."""
+    """Peers of a link, and who was bidden on_evict."""
 
     def __init__(self) -> None:
         self.status = LinkStatus(url=LINK)

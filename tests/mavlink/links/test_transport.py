@@ -262,7 +262,7 @@ async def serving() -> AsyncIterator[Server]:
         await server.stop()
 
 
-async def hang_up(writer: asyncio.StreamWriter) -> None:
+async def on_peer_gone(writer: asyncio.StreamWriter) -> None:
     writer.close()
     await writer.wait_closed()
 
@@ -280,7 +280,7 @@ def test_a_stream_in_pieces(run: Run) -> None:
             assert inbox.raws == made
             status = link.status
             assert (status.state, status.frames, status.lost) == ("up", 50, {})
-            await hang_up(writer)
+            await on_peer_gone(writer)
 
     run(test())
 
@@ -295,14 +295,14 @@ def test_it_connects_again_when_the_server_goes_away(run: Run) -> None:
                 writer.write(frame(n) + frame(100 + n)[:20])
                 await inbox.until(n + 1)
                 await server.stop()
-                await hang_up(writer)
+                await on_peer_gone(writer)
                 await server.start()
             writer = await server.connections.get()
             writer.write(frame(7))
             await inbox.until(4)
             assert inbox.raws == [frame(0), frame(1), frame(2), frame(7)]
             assert link.status.state == "up"
-            await hang_up(writer)
+            await on_peer_gone(writer)
 
     run(test())
 
@@ -321,7 +321,7 @@ def test_a_link_may_be_there_before_its_server(run: Run) -> None:
             writer.write(frame(1))
             await inbox.until(1)
             assert link.status.state == "up"
-            await hang_up(writer)
+            await on_peer_gone(writer)
             await server.stop()
 
     run(test())
@@ -338,8 +338,8 @@ def test_after_a_connection_the_first_retry_is_quick_again(
                 writer = await server.connections.get()
                 writer.write(frame(n))
                 await inbox.until(n + 1)
-                await hang_up(writer)
-            await hang_up(await server.connections.get())
+                await on_peer_gone(writer)
+            await on_peer_gone(await server.connections.get())
 
     run(test())
 
@@ -356,11 +356,11 @@ def test_good_frames_in_an_unfinished_claim_are_found_when_the_peer_hangs_up(run
         async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
             writer = await server.connections.get()
             writer.write(damaged_length(frame(1)) + frame(2) + frame(3))
-            await hang_up(writer)
+            await on_peer_gone(writer)
             writer = await server.connections.get()  # it noticed, and is here again
             writer.write(frame(4))
             await inbox.until_there_is(frame(4))
-            await hang_up(writer)
+            await on_peer_gone(writer)
             assert inbox.raws == [frame(2), frame(3), frame(4)]
             assert link.status.lost
 
@@ -379,7 +379,7 @@ def test_a_peer_that_hangs_up_at_once_is_not_tried_at_full_speed(
             for _ in range(3):
                 writer = await server.connections.get()
                 writer.write(greeting)
-                await hang_up(writer)
+                await on_peer_gone(writer)
             with pytest.raises(TimeoutError):
                 async with asyncio.timeout(0.2):
                     await server.connections.get()
@@ -403,14 +403,14 @@ def test_it_says_once_that_it_is_down_and_once_that_it_is_back(
             for outage in range(2):
                 await until_true(lambda: link.status.state == "up")
                 await server.stop()
-                await hang_up(writer)
+                await on_peer_gone(writer)
                 await inbox.until_said(1 + 2 * outage)
                 assert link.status.state == "connecting"
                 await asyncio.sleep(0.05)  # several attempts, and all are refused
                 await server.start()
                 writer = await server.connections.get()
                 await inbox.until_said(2 + 2 * outage)
-            await hang_up(writer)
+            await on_peer_gone(writer)
             down = (Severity.WARNING, f"link {link.url} is down: the peer hung up; trying again")
             back = (Severity.INFO, f"link {link.url} is back")
             said = [(notice.severity, notice.text) for notice in inbox.notices[:4]]
@@ -428,7 +428,7 @@ def test_a_name_is_looked_up(run: Run) -> None:
             writer = await server.connections.get()
             writer.write(frame(1))
             await inbox.until(1)
-            await hang_up(writer)
+            await on_peer_gone(writer)
 
     run(test())
 
@@ -855,7 +855,7 @@ def test_an_unfinished_frame_is_given_up_before_the_link_has_stopped(run: Run, s
                     assert inbox.items == []
                 assert [item.count for item in inbox.rejections] == [20]
             if scheme == "tcp":
-                await hang_up(writer)
+                await on_peer_gone(writer)
 
     run(test())
 

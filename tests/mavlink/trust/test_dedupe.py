@@ -114,7 +114,7 @@ def test_links_without_end_are_not_all_counted() -> None:
     dedupe = Dedupe()
     for number in range(LINKS_MAX + 100):
         assert not dedupe.is_repeat(sent(link=f"udp:{number}", boot_ms=number))
-        dedupe.took(0.1)
+        dedupe.set_latency(0.1)
     assert len(dedupe.shares) == LINKS_MAX
     assert dedupe.is_repeat(sent(link="udp:0", boot_ms=LINKS_MAX + 50))
     assert dedupe.shares["udp:0"].repeats == 1
@@ -129,7 +129,7 @@ def test_which_link_was_first_and_how_late_each_is() -> None:
             if link == "a" and n % 10 == 0:
                 continue
             if not dedupe.is_repeat(sent(t_ns + late_ns, link, boot_ms=n * 100)):
-                dedupe.took(0.1 + late_ns / S)
+                dedupe.set_latency(0.1 + late_ns / S)
     a, b = dedupe.shares["a"], dedupe.shares["b"]
     assert (a.first, a.repeats, b.first, b.repeats) == (90, 0, 10, 90)
     assert list(a.latencies_s) == pytest.approx([0.1] * 90)

@@ -27,7 +27,7 @@ from companion.node.drive.loop import (
     SafeState,
     SourceLostError,
 )
-from companion.node.drive.sources import BeamRequest, command_for, shot_of, stored_registers
+from companion.node.drive.sources import BeamRequest, command_for, command_of, stored_registers
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.values import UserError, WeightFormat
@@ -43,7 +43,7 @@ def flown() -> tuple[DeviceCommand, Any, str]:
     pipeline, update = moment.look([log], EIGHT, "3")
     equipment = assembly.equipment(EIGHT, pipeline.array)
     wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=DeviceInput.REGISTERS)
-    shot = shot_of(pipeline, equipment, update, wanted)
+    shot = command_of(pipeline, equipment, update, wanted)
     text = weight_formats.encode(
         WeightFormat.ADAR1000, update.beams, pipeline, equipment, 0
     ).decode()
@@ -269,7 +269,7 @@ def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
     equipment = assembly.equipment(settings, pipeline.array)
     stored = stored_registers(pipeline.array, equipment)
     wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=DeviceInput.STORED, stored_beams=32)
-    shot = shot_of(pipeline, equipment, update, wanted)
+    shot = command_of(pipeline, equipment, update, wanted)
     told = beam_state.beams(pipeline, equipment, update, 0.0, 0.0)
     (beam,) = [one for one in told["beams"] if one["uav"] == "3:1"]
     assert shot.stored == beam["codebook"]["best"]
@@ -348,7 +348,10 @@ def test_a_mount_looks_at_the_middle_of_several(flown: tuple[DeviceCommand, Any,
     wanted = BeamRequest(
         uavs=("9:9", "2:1", "1:1"), anybody=False, takes=DeviceInput.POINTING, centre=True
     )
-    for shot in (shot_of(pipeline, equipment, update, wanted), command_for(told, None, wanted, 0)):
+    for shot in (
+        command_of(pipeline, equipment, update, wanted),
+        command_for(told, None, wanted, 0),
+    ):
         assert shot.uav == "2:1+1:1"
         assert shot.bearing_rad == pytest.approx(np.arctan2(mean[1], mean[0]))
         assert shot.above_rad == pytest.approx(np.arcsin(mean[2] / np.linalg.norm(mean)))
@@ -357,7 +360,7 @@ def test_a_mount_looks_at_the_middle_of_several(flown: tuple[DeviceCommand, Any,
         mid = np.mean([t.position_ned_m for t in update.tracks if t.uav in ("1:1", "2:1")], axis=0)
         np.testing.assert_allclose(seen, mid, atol=0.01)
     everybody = BeamRequest(uavs=("1:1",), anybody=True, takes=DeviceInput.POINTING, centre=True)
-    around = shot_of(pipeline, equipment, update, everybody)
+    around = command_of(pipeline, equipment, update, everybody)
     assert "as they surround the array" in (around.unfit or "")  # four on one circle
     with pytest.raises(UserError, match="works only for a mount"):
         BeamRequest(uavs=(), anybody=True, takes=DeviceInput.REGISTERS, centre=True)

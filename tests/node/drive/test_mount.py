@@ -17,7 +17,7 @@ from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.node.drive.lag import MountLag
 from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, Drive, SafeState
 from companion.node.drive.rotctld import Rotator
-from companion.node.drive.sources import BeamRequest, shot_of
+from companion.node.drive.sources import BeamRequest, command_of
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
@@ -139,7 +139,7 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
 
     class Here:
         def ask(self, lead_s: float) -> DeviceCommand:
-            return shot_of(pipeline, equipment, pipeline.look(clock.t_ns, lead_s), wanted)
+            return command_of(pipeline, equipment, pipeline.look(clock.t_ns, lead_s), wanted)
 
     rotator = Rotator("127.0.0.1", serving(ours, clock), clock.now_ns)
     drive = Drive(

@@ -2,18 +2,18 @@
 
 from itertools import pairwise
 
-from companion.node.fleet.answering import HELD_UP_NS, MOST_NS, Unanswered
+from companion.node.fleet.answering import BLOCKED_NS, PATIENCE_MAX_NS, Unanswered
 
 S = 1_000_000_000
 PATIENCE_NS = 6 * S
 
 
 def looks(kept: Unanswered, begin_s: int, end_s: int, heard_ns: dict[str, int]) -> list[int]:
-    """The seconds at which a node is mute, where ``south`` is asked and looked at in each."""
+    """The seconds at which a node is unresponsive, ``south`` being asked and checked in each."""
     found = []
     for second in range(begin_s, end_s):
         kept.asked(second * S, "south")
-        if kept.mute(second * S, heard_ns):
+        if kept.unresponsive(second * S, heard_ns):
             found.append(second)
     return found
 
@@ -25,7 +25,7 @@ def test_who_is_there_and_never_answers_is_mute_ever_more_rarely() -> None:
     waits = [after - before for before, after in pairwise(found)]
     assert found[0] == 6
     assert waits[:3] == [12, 24, 48]
-    assert set(waits[3:]) == {MOST_NS // S}
+    assert set(waits[3:]) == {PATIENCE_MAX_NS // S}
 
 
 def test_who_answers_is_not_mute() -> None:
@@ -53,7 +53,7 @@ def test_names_that_somebody_makes_up_cost_one_session_a_minute() -> None:
         name = f"made-up-{second // 10}"
         kept.alive = {name}
         kept.asked(second * S, name)
-        found += bool(kept.mute(second * S, {}))
+        found += bool(kept.unresponsive(second * S, {}))
     assert found <= 13
 
 
@@ -74,7 +74,7 @@ def test_answers_that_wait_for_this_process_are_waited_for() -> None:
     kept = Unanswered(PATIENCE_NS)
     kept.alive.add("south")
     assert looks(kept, 0, 3, {}) == []
-    stopped_ns = 2 * S + 10 * HELD_UP_NS
-    assert kept.mute(stopped_ns, {}) == []
+    stopped_ns = 2 * S + 10 * BLOCKED_NS
+    assert kept.unresponsive(stopped_ns, {}) == []
     kept.asked(stopped_ns, "south")
-    assert kept.mute(stopped_ns + S, {}) == []
+    assert kept.unresponsive(stopped_ns + S, {}) == []

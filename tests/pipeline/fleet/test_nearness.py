@@ -5,7 +5,7 @@ import math
 from hypothesis import given
 from hypothesis import strategies as st
 
-from companion.pipeline.fleet.nearness import ALWAYS_M, COMES, GOES, near
+from companion.pipeline.fleet.nearness import ALWAYS_NEAR_M, ENTER_FACTOR, LEAVE_FACTOR, near
 from companion.values import Standing
 
 HERE = (47.0, 8.0, 400.0)
@@ -23,14 +23,14 @@ def test_whose_reach_can_meet_this_one_s_is_near(
     apart_m: float, own_m: float, its_m: float
 ) -> None:
     found = near(HERE, own_m, {"b": standing(apart_m, its_m)}, NOBODY)
-    if apart_m <= max(own_m + its_m, ALWAYS_M):
+    if apart_m <= max(own_m + its_m, ALWAYS_NEAR_M):
         assert found == {"b"}
-    elif apart_m > 1.02 * COMES * max(own_m + its_m, ALWAYS_M):
+    elif apart_m > 1.02 * ENTER_FACTOR * max(own_m + its_m, ALWAYS_NEAR_M):
         assert found == NOBODY
 
 
 def test_who_was_near_stays_so_a_little_farther() -> None:
-    others = {"b": standing(0.5 * (COMES + GOES) * 16_000, 8000.0)}
+    others = {"b": standing(0.5 * (ENTER_FACTOR + LEAVE_FACTOR) * 16_000, 8000.0)}
     assert near(HERE, 8000.0, others, NOBODY) == NOBODY
     assert near(HERE, 8000.0, others, frozenset(others)) == {"b"}
 

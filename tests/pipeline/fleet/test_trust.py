@@ -5,7 +5,7 @@ from collections import Counter
 from companion.pipeline.fleet.trust import (
     CONTRADICTIONS,
     EXCLUDED_NS,
-    UNHEARD_NS,
+    SILENT_AFTER_NS,
     Trust,
     UnconfirmedVehicle,
     Witness,
@@ -56,7 +56,7 @@ def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
         UnconfirmedVehicle("67:1", "b", (0.0, 400.0, 0.0)),
     ]
     far = Witness((5000.0, 0.0, 0.0), 1000.0, frozenset())  # it can say nothing
-    said = look(trust, phantoms, {"a": HERE, "c": far}, UNHEARD_NS // S + 2)
+    said = look(trust, phantoms, {"a": HERE, "c": far}, SILENT_AFTER_NS // S + 2)
     assert len(said) == 1
     assert "node b is excluded for 5 minutes" in said[0]
     assert "66:1, 67:1" in said[0]

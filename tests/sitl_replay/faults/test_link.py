@@ -126,7 +126,7 @@ def test_a_burst_shuts_the_link_for_that_share_of_the_time(share: float, shut_s:
     assert all(b - a >= shut_s for a, b in pairwise(openings_s))
     # What comes while it is shut comes at once.
     assert max(sum(r == opening for _, r in held) for opening in openings_s[:20]) >= 20
-    assert len(burst._shuts_s) <= 2
+    assert len(burst._block_starts_s) <= 2
 
 
 def test_a_burst_may_be_asked_for_earlier_times_again() -> None:

@@ -86,7 +86,7 @@ def test_udpout_sends_hears_and_knocks(run: Run, host: str) -> None:
     async def scene(other: socket.socket) -> list[bytes]:
         peer = await open_link(parse_link(f"udpout:{host}:{other.getsockname()[1]}"), heard)
         assert peer.peers()
-        peer.knock()
+        peer.send_empty()
         peer.send(FRAME)
         got = []
         for _ in range(2):
@@ -113,7 +113,7 @@ def test_udpin_sends_to_everybody_it_has_heard(run: Run, host: str) -> None:
         endpoint.send(b"nobody there")
         assert (endpoint.dropped, bool(endpoint.peers())) == (1, False)
         first.sendto(b"", address)  # an opener
-        await endpoint.somebody()
+        await endpoint.first_peer()
         await endpoint.writable()
         endpoint.send(b"one")
         assert (await received(first))[0] == b"one"
@@ -255,7 +255,7 @@ def test_tcpin_serves_everybody_from_then_on(run: Run, host: str) -> None:
         assert (server.dropped, bool(server.peers())) == (1, False)
         first, first_out = await asyncio.open_connection(*address)
         first_out.write(b"hello")
-        await server.somebody()
+        await server.first_peer()
         server.send(b"one")
         assert await first.readexactly(3) == b"one"
         second, second_out = await asyncio.open_connection(*address)
@@ -272,7 +272,7 @@ def test_tcpin_serves_everybody_from_then_on(run: Run, host: str) -> None:
         server.send(b"nobody there")
         assert (server.dropped, server.lost, server.broken) == (2, "", False)
         third, third_out = await asyncio.open_connection(*address)
-        await server.writable()  # waits for somebody
+        await server.writable()  # waits for first_peer
         server.send(b"four")
         await server.close()
         rest.append(await third.read())

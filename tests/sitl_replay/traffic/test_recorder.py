@@ -84,7 +84,7 @@ def test_a_flight_is_recorded_as_it_was_sent(tmp_path: Path) -> None:
 KNOCK = dialect.MAVLink_ping_message(1, 2, 3, 4).pack(dialect.MAVLink(None, 9, 9))
 
 
-async def until(heard: recorder.Heard, count: int) -> None:
+async def until(heard: recorder.RecordingTally, count: int) -> None:
     """Wait for so many frames, knocks aside."""
     async with asyncio.timeout(5.0):
         while heard.frames - heard.messages[dialect.MAVLINK_MSG_ID_PING] < count:
@@ -95,7 +95,7 @@ def test_udp_is_recorded_peer_by_peer(tmp_path: Path, frames: list[bytes]) -> No
     # One peer sends half a frame, then another peer whole ones: those must not suffer.
     tlog = tmp_path / "heard.tlog"
     port = free_port(socket.SOCK_DGRAM)
-    heard = recorder.Heard()
+    heard = recorder.RecordingTally()
 
     async def scene() -> None:
         listening = parse_link(f"udpin:127.0.0.1:{port}")
@@ -140,7 +140,7 @@ def test_tcp_is_recorded_to_its_end(tmp_path: Path, frames: list[bytes]) -> None
     damaged = bytearray(frames[3])
     damaged[12] ^= 0x40
 
-    async def scene() -> recorder.Heard:
+    async def scene() -> recorder.RecordingTally:
         stream = b"".join(frames[:3]) + damaged + b"".join(frames[4:])
         server, url = await serve(stream)
         async with server:
@@ -214,7 +214,9 @@ def test_a_full_disk_is_an_error(frames: list[bytes]) -> None:
 # --- every kind of link, and what others read ---------------------------------------------------
 
 
-async def waited_for(heard: recorder.Heard, frames: int, task: "asyncio.Task[object]") -> None:
+async def waited_for(
+    heard: recorder.RecordingTally, frames: int, task: "asyncio.Task[object]"
+) -> None:
     """Wait for so many frames, then end the recording as a signal does."""
     async with asyncio.timeout(5.0):
         while heard.frames < frames:
@@ -232,7 +234,7 @@ def test_what_is_played_over_any_link_is_recorded(
 ) -> None:
     """The recorder at one end, the player at the other, whoever of them listens."""
     tlog = tmp_path / "heard.tlog"
-    heard, listening = recorder.Heard(), pair.split()
+    heard, listening = recorder.RecordingTally(), pair.split()
     log = [
         Frame(t_ns=10**18, link="", source=Source(1, 1), msgid=0, raw=raw)
         for raw in frames[:ENOUGH]
@@ -270,7 +272,7 @@ def test_what_is_played_over_any_link_is_recorded(
 
 def test_what_is_played_over_zenoh_is_recorded(tmp_path: Path, frames: list[bytes]) -> None:
     pytest.importorskip("zenoh")
-    tlog, heard = tmp_path / "heard.tlog", recorder.Heard()
+    tlog, heard = tmp_path / "heard.tlog", recorder.RecordingTally()
     log = [
         Frame(t_ns=10**18, link="", source=Source(1, 1), msgid=0, raw=raw)
         for raw in frames[:ENOUGH]
@@ -303,7 +305,7 @@ def test_serial_is_recorded_until_it_is_unplugged(tmp_path: Path, frames: list[b
     tlog = tmp_path / "heard.tlog"
     far, near = pty.openpty()
     url = parse_link(f"serial:{os.ttyname(near)}:57600")
-    heard = recorder.Heard()
+    heard = recorder.RecordingTally()
 
     async def scene() -> None:
         task = asyncio.create_task(recorder.record(url, tlog, heard=heard))
@@ -327,7 +329,7 @@ def test_serial_is_recorded_until_it_is_unplugged(tmp_path: Path, frames: list[b
 
 
 def test_a_recorder_is_silent_but_for_its_opener(tmp_path: Path, frames: list[bytes]) -> None:
-    heard = recorder.Heard()
+    heard = recorder.RecordingTally()
 
     async def scene(vehicle: socket.socket) -> list[bytes]:
         url = parse_link(f"udpout:127.0.0.1:{vehicle.getsockname()[1]}")
@@ -357,7 +359,7 @@ def test_what_was_heard_is_on_disk_when_it_falls_silent(
 ) -> None:
     """So that a killed process loses a second, not what came since the last flush."""
     tlog, port = tmp_path / "a.tlog", free_port(socket.SOCK_DGRAM)
-    heard = recorder.Heard()
+    heard = recorder.RecordingTally()
 
     async def scene() -> None:
         url = LinkUrl(scheme="udpin", host="127.0.0.1", port=port)
@@ -378,7 +380,7 @@ def test_a_visitor_who_leaves_does_not_end_the_recording_of_a_server(
     tmp_path: Path, frames: list[bytes], caplog: pytest.LogCaptureFixture
 ) -> None:
     tlog = tmp_path / "a.tlog"
-    heard = recorder.Heard()
+    heard = recorder.RecordingTally()
     claim = bytes([0xFD, 255, 0, 0, 0, 9, 1, 33, 0, 0])  # swallows what comes behind it
 
     async def scene() -> None:

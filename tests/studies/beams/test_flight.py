@@ -24,7 +24,15 @@ from companion.pipeline.fold import Pipeline
 from companion.recording.reader import read_log
 from companion.settings.model import Settings
 from companion.studies.beams.charts import charts
-from companion.studies.beams.flight import BeamStudy, Sight, Watched, look, sight, updates, watch
+from companion.studies.beams.flight import (
+    BeamStudy,
+    Sight,
+    StudiedFlight,
+    look,
+    sight,
+    updates,
+    watch,
+)
 from companion.studies.beams.worth import SHARP, Sample, Worth, summed_up
 from companion.studies.truth import array_truth
 from companion.studies.truth.vehicles import Trajectory
@@ -65,7 +73,7 @@ def short(cut: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def watched(cut: Path) -> Watched:
+def watched(cut: Path) -> StudiedFlight:
     return watch([cut], on_carrier(), 0.5)
 
 
@@ -200,7 +208,7 @@ def test_looks_are_at_the_last_tick(short: Path, hz: float) -> None:
 
 
 def test_sharp_beams_are_those_of_a_pipeline_that_does_not_widen(
-    cut: Path, watched: Watched
+    cut: Path, watched: StudiedFlight
 ) -> None:
     sharp = watch([cut], on_carrier(beams={"widen": False}), 0.5)
     assert (watched.widen, sharp.widen) == (True, False)
@@ -215,7 +223,7 @@ def test_sharp_beams_are_those_of_a_pipeline_that_does_not_widen(
     assert any(s.as_set.widened for s in watched.samples if s.as_set)
 
 
-def test_what_is_promised_is_kept(watched: Watched) -> None:
+def test_what_is_promised_is_kept(watched: StudiedFlight) -> None:
     row = summed_up(watched.samples)
     assert watched.truth == "SIM_STATE"
     assert set(watched.by_uav) == UAVS
@@ -503,7 +511,7 @@ def test_figures_show_the_worst_and_leave_gaps() -> None:
         )
         for t in range(40)
     )
-    watched = Watched(
+    watched = StudiedFlight(
         log="log",
         center="home",
         array="array",
@@ -547,7 +555,7 @@ def test_a_value_between_two_gaps_is_a_dot() -> None:
         for t in range(20)
     )
     axes = charts(
-        Watched(
+        StudiedFlight(
             log="log",
             center="home",
             array="array",

@@ -59,7 +59,12 @@ def test_each_width_gives_what_it_is_for(rows: dict[str, modes.Row]) -> None:
         assert row["changed_shape_share"] < 0.1
         assert row["jump_share"] < 0.1
     assert rows["hold, sharp"]["true_gain_median_db"] < sharp["true_gain_median_db"] - 3
-    assert set(rows) == {"likely", "guarantee", "no", *(f"{name}, sharp" for name in modes.RIVALS)}
+    assert set(rows) == {
+        "likely",
+        "guarantee",
+        "no",
+        *(f"{name}, sharp" for name in modes.OTHER_PREDICTORS),
+    }
 
 
 def test_the_likely_row_is_of_the_pipeline_s_own_beams(

@@ -27,8 +27,8 @@ def test_36_lines_differ_in_colour_or_dash_and_neighbours_in_both() -> None:
 
 def test_a_figure_is_the_same_again_and_leaves_the_style_as_it_was() -> None:
     before = dict(matplotlib.rcParams)
-    svg, png = plotting.rendered(drawn)
-    assert (svg, png) == plotting.rendered(drawn)
+    svg, png = plotting.render_figure(drawn)
+    assert (svg, png) == plotting.render_figure(drawn)
     assert b"<svg" in svg and png.startswith(b"\x89PNG")
     assert dict(matplotlib.rcParams) == before
 

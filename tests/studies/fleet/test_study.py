@@ -83,10 +83,10 @@ def test_shares_are_of_uavs_served_once_twice_and_not_at_all(
         FleetCounts(served=4, twice=0, unserved=4),
     ]
     monkeypatch.setattr(study, "_counted", lambda *_: counted.pop(0))
-    monkeypatch.setattr(study, "_death", lambda _: (1.5, 2))
-    monkeypatch.setattr(study, "_healed_s", lambda _: 2.5)
+    monkeypatch.setattr(study, "_measure_takeover", lambda _: (1.5, 2))
+    monkeypatch.setattr(study, "_measure_healing_s", lambda _: 2.5)
     world: Any = SimpleNamespace(sky=Sky(nodes=2, uavs=8), run=lambda _: None, members={})
-    found = study._grown(world, 10.0)
+    found = study._simulate_size(world, 10.0)
     assert (found.served, found.twice, found.none, found.parted_none) == (0.6, 0.1, 0.3, 0.5)
     assert (found.nodes, found.uavs, found.handovers_per_min) == (2, 8, 24.0)
     assert (found.takeover_s, found.orphans, found.heal_s) == (1.5, 2, 2.5)

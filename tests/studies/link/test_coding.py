@@ -9,7 +9,7 @@ from commpy.channelcoding import Trellis, conv_encode, viterbi_decode  # the ora
 from scipy.stats import norm
 from support import rounds
 
-from companion.studies.link.coding import GENERATORS, TOGETHER, decode, encode
+from companion.studies.link.coding import BATCH, GENERATORS, decode, encode
 from companion.studies.link.modulation import modulate, soft_bits
 from companion.values import BoolArray, FloatArray
 
@@ -56,7 +56,7 @@ def test_blocks_of_any_shape() -> None:
 
 def test_without_noise_every_block_comes_back() -> None:
     """More blocks than are decoded at once."""
-    bits = drawn(TOGETHER + 3, 50, 3)
+    bits = drawn(BATCH + 3, 50, 3)
     assert (decode(1.0 - 2.0 * encode(bits)) == bits).all()
 
 

@@ -161,7 +161,7 @@ def test_between_the_points_the_certificate_looks_as_well(monkeypatch: pytest.Mo
     )
     with pytest.raises(DesignError, match="fails its certificate"):
         gain_table.verify(ends)
-    monkeypatch.setattr(gain_table, "FINER", 1)
+    monkeypatch.setattr(gain_table, "CHECKS_PER_STEP", 1)
     assert gain_table.verify(ends) > 0
 
 

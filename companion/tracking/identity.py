@@ -36,7 +36,7 @@ class Identities:
         self._relayed: dict[str, _Relayed] = {}
 
     def same_as(self, uav: str) -> str | None:
-        """Return the better track of the same aircraft; None if there is none."""
+        """Return the better track of the same aircraft; None without one."""
         known = self._relayed.get(uav)
         return None if known is None else known.same_as
 

@@ -93,8 +93,7 @@ def airframe(mav_type: int | None) -> Airframe:
 
 
 def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
-    """Return the least and largest lag of a position, by MAV_AUTOPILOT and kind of aircraft,
-    seconds."""
+    """Return least and largest lag of a position, s, by MAV_AUTOPILOT and kind of aircraft."""
     if autopilot == _ARDUPILOT:
         return ARDUPILOT_LAG_S.get(kind, ARDUPILOT_ANY_LAG_S)
     return LIMITS[kind].lag_s

@@ -51,6 +51,5 @@ class ReportTiming:
         return max(usual_s, SILENCES * sorted(self._ages_s)[-2])
 
     def silence_s(self, least_s: float, most_s: float) -> float:
-        """Return the age of the newest report beyond which the track coasts, seconds, within two
-        limits."""
+        """Return the age of the newest report, s, beyond which the track coasts; limited."""
         return min(max(least_s, self._silence_s), most_s)

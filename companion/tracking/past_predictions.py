@@ -207,8 +207,7 @@ class PastPredictions:
             )
 
     def _older(self, sender_ns: int, least_s: float) -> _PastPrediction | None:
-        """Return the newest stored state of at least an age; None if it is more than 2 s + twice as
-        old."""
+        """Return the newest stored state at least this old; None if older than 2 s + twice that."""
         newest_ns = sender_ns - round(least_s * 1e9)
         for made in reversed(self._states):
             if made.sender_ns <= newest_ns:
@@ -236,8 +235,7 @@ class PastPredictions:
             self._model = best
 
     def error_p95_m(self, age_s: float) -> float | None:
-        """Return the 95th percentile of recent prediction errors at an age; None before there are
-        enough.
+        """Return the 95th percentile of recent errors at an age; None with too few.
 
         It is interpolated between the observed ages, and extrapolated with the square of the age.
         """

@@ -180,8 +180,7 @@ class Tracker:
         return self._use(tracked, index, fix, predicted)
 
     def _make_room(self, uav: str) -> bool:
-        """Drop the latest unestablished track to make room for an established UAV; False if
-        impossible."""
+        """Drop the latest unestablished track to admit an established UAV; False if impossible."""
         if uav not in self._established:
             return False
         for other in reversed(self._tracked):
@@ -308,8 +307,7 @@ class Tracker:
     # --- output: tracks ---------------------------------------------------------------------
 
     def track(self, uav: str, now_ns: int, at: SenderTime) -> Track | None:
-        """Predict one UAV to ``at.node_ns``; its state is that at ``now_ns``. None if it was never
-        seen."""
+        """Predict one UAV to ``at.node_ns``, with its state at ``now_ns``; None if unknown."""
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
@@ -376,8 +374,7 @@ class Tracker:
     def _error_p95_m(
         self, tracked: _Tracked, velocity: Vector | None, at: SenderTime, bound_m: float
     ) -> float | None:
-        """Return the usual error at a time, from past errors, the receiver's common error and the
-        clock.
+        """Return the usual error, from past errors, the receiver's common error and the clock.
 
         Past errors may exceed the present bound, which limits the result.
         """

@@ -121,8 +121,7 @@ class SenderTime:
 
 
 class TrackState(DescribedEnum):
-    """State of a track, by the age of its newest report; the age limits are settings
-    (``[tracks]``)."""
+    """State of a track by the age of its newest report; ``[tracks]`` sets the limits."""
 
     LIVE = "live", "reports arrive"
     COASTING = "coasting", "predicted without new reports"

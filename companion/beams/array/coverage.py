@@ -58,8 +58,7 @@ class Sector:
         return self.spans(azimuth) & self.reaches(elevation)
 
     def to_edge_rad(self, directions: FloatArray) -> FloatArray:
-        """Return the angle from unit directions (..., 3), inside or outside, to the nearest edge:
-        (...).
+        """Return the angle from unit directions (..., 3), in or out, to the nearest edge: (...).
 
         Exact: the sides are arcs of great circles, and the nearest point of a parallel has the same
         azimuth or is a corner. A sector all around has no sides; a pole is no edge. Infinite for
@@ -141,8 +140,7 @@ class Coverage:
             raise UserError(f"steering limits: {error}") from None
 
     def limits(self) -> Sector:
-        """Return the steering range as a sector of the array frame; the whole sphere without
-        limits."""
+        """Return the steering range as a sector of the array frame; default: the whole sphere."""
         azimuth_from_rad, azimuth_to_rad = self.azimuth_limits_rad or (-math.pi, math.pi)
         elevation_from_rad, elevation_to_rad = self.elevation_limits_rad or (-QUARTER, QUARTER)
         return Sector(

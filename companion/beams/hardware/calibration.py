@@ -145,8 +145,7 @@ def whole(number: int, name: str, field: str, least: int, most: int) -> int:
 
 
 def real(number: int, name: str, field: str, most: float = math.inf) -> float:
-    """Parse a number of a line, of magnitude up to ``most``. Raises ``UserError`` for anything
-    else."""
+    """Parse a number of a line, of magnitude up to ``most``; else raise ``UserError``."""
     try:
         value = float(field)
     except ValueError:

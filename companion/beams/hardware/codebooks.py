@@ -158,8 +158,7 @@ def _gains(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[FloatArr
 def strongest_first(
     codebook: Codebook, array: Array, direction: FloatArray, indices: IntArray
 ) -> IntArray:
-    """Sort indices by their gain towards a unit direction (3,), descending; the lower of equals
-    first."""
+    """Sort indices by descending gain towards a direction (3,); ties by ascending index."""
     unit = cone.unit_directions(direction[np.newaxis], np.zeros(1))
     power = _gains(codebook, array, unit)[0][indices, 0]
     ordered: IntArray = indices[np.argsort(-power, kind="stable")]

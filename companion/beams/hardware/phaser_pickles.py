@@ -23,8 +23,7 @@ _SCALARS: Final = {"f8": "d", "f4": "f", "i8": "q", "i4": "i"}
 
 
 def calibration(phases: bytes, gains: bytes) -> Calibration:
-    """Return the calibration in the two pickles. Raises ``UserError`` unless each has eight
-    numbers."""
+    """Return the calibration in two pickles; raises ``UserError`` unless each has 8 numbers."""
     added_deg = numbers("phase calibration", phases)
     factors = numbers("gain calibration", gains)
     if not all(factor > 0 for factor in factors):

@@ -190,8 +190,7 @@ def _psi(
     floor_db: float,
     worth_db: float,
 ) -> list[FloatArray]:
-    """Return phases psi (N, K) of the table for each column of widths (N, D); their sum is one
-    shape."""
+    """Return phases psi (N, K) of the table per column of widths (N, D); their sum is a shape."""
     columns = range(cones.shape[1])
     if likely is None:
         return [_guaranteed_phases(shapes, cones[:, d]) for d in columns]
@@ -205,8 +204,7 @@ def _psi(
 
 
 def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the knot (ascending) before each place, and the next one's weight; extrapolated
-    beyond."""
+    """Return the (ascending) knot before each place, and the next one's weight; extrapolated."""
     before = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
     return before, (at - knots[before]) / (knots[before + 1] - knots[before])
 

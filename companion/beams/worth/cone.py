@@ -388,12 +388,11 @@ def phasors(cones: DirectionCones, pieces: Cells) -> tuple[ComplexArray, FloatAr
 def response_range(
     cones: DirectionCones, pieces: Cells, responses: ComplexArray, moments: ComplexArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Lower and upper bounds of |response| over each cell, (..., C) both; the lower may be
-    negative.
+    """Bounds of |response| over each cell, (..., C), lower (may be negative) and upper.
 
-        responses  (..., C), responses to the middles
-        moments    (B, ..., C), the same sums with every term times its element's position: sum p_m
-                   c_m
+    responses  (..., C), responses to the middles
+    moments    (B, ..., C), the same sums with every term times its element's position: sum p_m
+               c_m
     """
     size = np.abs(responses)
     turned = np.where(size > 0, responses.conj() / np.where(size > 0, size, 1.0), 1.0)

@@ -206,8 +206,7 @@ def covered_bounds(
     directions: FloatArray,
     pointing_bounds_rad: Sequence[float | None],
 ) -> list[float | None]:
-    """Return the bounds of unit directions (N, 3) in the array frame, None if a cone leaves the
-    coverage.
+    """Return the bounds of unit directions (N, 3), array frame; None outside the coverage.
 
     A UAV may then be outside the coverage, and nothing is guaranteed.
     """

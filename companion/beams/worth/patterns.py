@@ -338,8 +338,7 @@ def _half_power(cut: _Cut, peak_rad: float) -> tuple[float | None, tuple[float, 
 def _crossings(
     cut: _Cut, peak_rad: float, half: float, inner: FloatArray, step: float
 ) -> FloatArray:
-    """Distance from the peak at which the gain falls to ``half``: (2,), below and above, both
-    positive.
+    """Distances (2,) below and above the peak, both positive, where the gain is ``half``.
 
     ``inner`` (2, 1) are angles from the peak, one step before the crossing.
     """

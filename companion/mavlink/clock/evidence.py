@@ -113,8 +113,7 @@ class OffsetEvidence:
         return self._aged(self._known, x_ns)
 
     def at(self, x_ns: int) -> Interval | None:
-        """Return the interval at a sender time, including the doubt interval; None without
-        evidence."""
+        """Return the interval at a sender time, with the doubt interval; None without evidence."""
         if self._known is None:
             return None
         known = self._aged(self._known, x_ns)

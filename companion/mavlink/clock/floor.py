@@ -18,7 +18,7 @@ cannot be distinguished, so both are kept. ``upper_bound`` holds if the clock di
 (``lateness.py``). The same holds if frames arrive steadily later for a whole window: the clock is
 slow, or a queue fills. The line follows the slope, and a level floor is kept beside it until no
 queue can be that long. Before that, the least height of the last few frames is assumed possible:
-the offset is below it whatever the clock did earlier.
+the offset is below it regardless of earlier clock changes.
 """
 
 from collections import deque
@@ -32,7 +32,7 @@ from companion.mavlink.clock.lateness import CHANGE, LEAST_CHANGE_NS, LateSpell,
 LIKELY_DRIFT: Final = 50e-6
 """Drift of an ordinary crystal, by which the most likely line rises while no frame touches it."""
 FEWEST, RECENT = 3, 8
-"""Number of last frames whose least height bounds the offset, whatever the clock did before.
+"""Number of last frames whose least height bounds the offset, regardless of earlier clock changes.
 
 ``RECENT`` always; ``FEWEST`` if their lateness exceeds the spread.
 """
@@ -54,8 +54,7 @@ class Heights(NamedTuple):
 
 
 class _Level:
-    """Level floor under stamps with a steady slope: it holds if a queue, not drift, caused the
-    slope.
+    """Level floor under steadily rising stamps: valid if a queue, not drift, caused the rise.
 
     upper_bound bound on the offset in that case, at the newest stamp, relative to the level base
     touched_ns  sender time of the stamp that set it

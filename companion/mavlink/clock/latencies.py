@@ -90,8 +90,7 @@ class Latencies:
             self.median_ns = max(self.median_ns, self._kept_median_ns)
 
     def steady_drift(self, newest_ns: int) -> float:
-        """Return the steady drift of the floor over a whole window, a ratio; 0 unless above the
-        limit.
+        """Return the steady drift of the floor over a window, a ratio; 0 unless above the limit.
 
         The line is the edge of the pieces' lower hull over the mean time (Moon, Skelly and Towsley
         1999). It must remove nearly all of the level line's gaps: a queue that fills for a while,
@@ -113,8 +112,7 @@ class Latencies:
         return slope if sloped + RESOLUTION_NS <= _STEADY * level else 0.0
 
     def tilt(self, drift: float, newest_ns: int, level: float) -> list[tuple[int, float]]:
-        """Subtract a drift and a level from all heights. Return the least ones: sender time,
-        height."""
+        """Subtract drift and level from all heights; return the least ones: sender time, height."""
         self._pieces = deque(
             (index, at_ns, height - drift * (at_ns - newest_ns) - level)
             for index, at_ns, height in self._pieces
@@ -124,8 +122,7 @@ class Latencies:
 
 
 def _slope_over(points: list[tuple[float, float]], x: float) -> float:
-    """Return the slope of the lower convex hull's edge over ``x``, for ordered points; 0 without
-    one."""
+    """Return the slope of the lower hull's edge over ``x``, for ordered points; 0 without one."""
     hull: list[tuple[float, float]] = []
     for point in points:
         while len(hull) > 1:

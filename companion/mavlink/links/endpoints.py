@@ -90,8 +90,7 @@ def settle(lost: asyncio.Future[Exception], why: Exception) -> None:
 
 
 def bound(url: LinkUrl, kind: socket.SocketKind) -> socket.socket:
-    """Return a socket bound to a listening link's address. Raises ``OSError`` if it is not
-    available.
+    """Return a socket bound to a link's address. Raises ``OSError`` if it is unavailable.
 
     The name lookup is synchronous: this is called before the loop runs. At a multicast address the
     group is joined, and other programs of this machine may listen too.

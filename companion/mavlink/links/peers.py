@@ -93,8 +93,7 @@ class Peer:
         return self.versions == 1
 
     def brings_stamps(self, source: Source, now_ns: int) -> bool:
-        """Return whether this peer recently delivered a source's position or attitude with its boot
-        time."""
+        """Return whether this peer recently delivered a source's stamped position or attitude."""
         sender = self.senders.get(source)
         stamped_ns = None if sender is None else sender.stamped_ns
         return stamped_ns is not None and now_ns - stamped_ns <= STAMPS_KEPT_NS

@@ -154,8 +154,7 @@ class Timestamps:
         )
 
     def snapshot(self, now_ns: int) -> SigningSnapshot:
-        """Return the state of all links; cheap. ``now_ns`` is the own clock, ns since the Unix
-        epoch."""
+        """Return the state of all links; ``now_ns`` is the own clock, ns since the Unix epoch."""
         return self._snapshot(now_ns, clean=False)
 
     def write(self, snapshot: SigningSnapshot) -> None:

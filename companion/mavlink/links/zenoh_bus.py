@@ -113,8 +113,7 @@ class Bus:
         await self._to_loop.run()
 
     def close(self) -> None:
-        """Close the session; blocks until the others are notified. Nothing is handed over
-        afterwards."""
+        """Close the session; blocks until the others are notified, then delivers nothing."""
         self._to_loop.end()
         self._ended.set()
         if self._session is not None:
@@ -256,8 +255,7 @@ class Bus:
         self._declared.append(liveliness.declare_subscriber(key_expr, callback, history=True))
 
     def neighbours(self, take: Callable[[str, bool], None]) -> None:
-        """Call ``take`` with the id of each directly connected session, True; False when
-        disconnected.
+        """Call ``take`` with each directly connected session's id: True; False on disconnection.
 
         Sessions behind a router are excluded.
         """

@@ -63,7 +63,7 @@ class _RelayedAircraft:
     velocity_down: _Dated[float] | None = None
     callsign: _Dated[str] | None = None
     reported: OrderedDict[tuple[float, float], AdsbVehicle] = field(default_factory=OrderedDict)
-    relays: OrderedDict[Source, int] = field(default_factory=OrderedDict)  # heard from at
+    relays: OrderedDict[Source, int] = field(default_factory=OrderedDict)  # last message, ns
 
     def hear(self, relay: Source, t_ns: int) -> None:
         """Record that a relay reported the aircraft at ``t_ns``."""
@@ -186,8 +186,7 @@ class Aircraft:
         return report if report is not None else _rejected(message, Reason.NO_ALTITUDE)
 
     def relays(self, uav: str) -> tuple[Source, ...]:
-        """Return the relays that reported an aircraft in the last ``FORGOTTEN_S``, the newest
-        first."""
+        """Return the relays that reported an aircraft in the last ``FORGOTTEN_S``, newest first."""
         known = self._known.get(uav)
         return tuple(reversed(known.relays)) if known is not None else ()
 

@@ -82,8 +82,7 @@ class State:
     )  # newest timestamp of each stream
 
     def after_crash(self) -> Self:
-        """Return the state to resume with if the process ended up to ``MARGIN`` after this was
-        saved.
+        """Return the state to resume with if the process ended up to ``MARGIN`` after saving.
 
         Each stream advances to where its clock was ``MARGIN`` later. Its newest timestamp plus a
         margin would not do: a stream may have been silent for an hour before a frame in the lost
@@ -152,8 +151,7 @@ class LinkSigning:
         self._streams = dict(state.streams)
 
     def refusal(self, frame: Frame) -> Reason | None:
-        """Return why a frame must be rejected: UNSIGNED, BAD_SIGNATURE or REPLAYED; None to accept
-        it.
+        """Return the rejection of a frame: UNSIGNED, BAD_SIGNATURE, REPLAYED; None to accept it.
 
         ``frame.raw`` is a whole frame with a correct checksum; ``frame.t_ns`` is the own clock, ns
         since the Unix epoch. An accepted frame is remembered, so call this once per frame.

@@ -323,8 +323,7 @@ def _content(msgid: int, payload: bytes) -> tuple[int, bytes]:
 
 
 def _is_boot_time(remote_ns: int, t_ns: int, stamp_t_ns: int, boot_ms: int) -> bool:
-    """Return whether ``remote_ns`` is the clock of the stamp ``boot_ms`` that came at
-    ``stamp_t_ns``.
+    """Return whether ``remote_ns`` is the clock of the stamp ``boot_ms`` at ``stamp_t_ns``.
 
     The stamp wraps after 49.7 days; ``remote_ns`` does not.
     """

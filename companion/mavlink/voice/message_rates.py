@@ -79,8 +79,7 @@ class MessageRates:
             max(asked, key=lambda watch: watch.asked_ns).acknowledged(t_ns, result)
 
     def due(self, now_ns: int, uavs: Iterable[Source]) -> list[tuple[Outgoing, Source]]:
-        """Return the requests to send now, with their targets. ``uavs``: those whose positions are
-        needed.
+        """Return the due requests with their targets; ``uavs`` are those whose positions count.
 
         At most ``REQUESTS_PER_S`` in any second; the one that has waited longest comes first.
         """
@@ -104,8 +103,7 @@ class MessageRates:
         return out
 
     def state(self) -> list[MessageRate]:
-        """Return the state of every monitored message, in the order in which the UAVs first
-        appeared."""
+        """Return the state of every monitored message, in the UAVs' order of first appearance."""
         return [w.view(uav.heard_ns) for uav in self._watched() for w in uav.watches.values()]
 
     def _watched(self) -> list[_Uav]:

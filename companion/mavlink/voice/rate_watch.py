@@ -234,8 +234,7 @@ class Watch:
         )
 
     def acknowledged(self, t_ns: int, result: int) -> None:
-        """Process a COMMAND_ACK to the newest request; after a refusal it belongs to another
-        request."""
+        """Process a COMMAND_ACK to the newest request; after a refusal it answers another."""
         if self._by_stream:
             return
         if result == _ACCEPTED:

@@ -99,8 +99,7 @@ def next_magic(buffer: bytes, at: int, end: int) -> int:
 
 
 def _next_start(buffer: bytes, at: int, end: int, claimed_to: int) -> int:
-    """Return the index of the next byte at or after ``at`` where a frame can begin; ``end`` without
-    one.
+    """Return the index from ``at`` on where a frame can begin; ``end`` without one.
 
     It skips bytes that cannot start a frame if that does not change the counts: undefined flags
     anywhere, and, within the claim of a failed frame, lengths that no MAVLink 1 message has. A

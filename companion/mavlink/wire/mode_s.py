@@ -168,8 +168,7 @@ def _nearest(part: float, near_deg: float, zone_deg: float) -> float:
 
 
 def ground_speed_kt(code: int) -> float | None:
-    """Return the speed on the ground, the low end of its step (DO-260B, 2.2.3.2.4.2); None:
-    unknown."""
+    """Return the ground speed, low end of its step (DO-260B, 2.2.3.2.4.2); None: unknown."""
     if not 1 <= code <= 124:
         return None
     first, speed_kt, step_kt = next(row for row in reversed(_MOVEMENT) if code >= row[0])

@@ -190,8 +190,7 @@ def _located(said: RemoteId, at: _Place) -> RemoteId:
 
 
 def _accuracy(horizontal: int, vertical: int, speed: int, time: int) -> Accuracy:
-    """Decode the accuracy codes; half a step is added to the accuracy of the stamp, in steps of 0.1
-    s."""
+    """Decode the accuracy codes; the stamp's, in steps of 0.1 s, gains half a step."""
     known = accuracy.remote_id(horizontal, vertical, speed)
     return known._replace(time_s=0.1 * time + 0.05 if 0 < time < 16 else None)
 

@@ -155,7 +155,7 @@ def _captured(mac: bytes, found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
 
 
 def _number(value: object) -> float:
-    """Return a number; NaN if there is none."""
+    """Return a number, or NaN."""
     return float(value) if isinstance(value, int | float) else math.nan
 
 

@@ -28,8 +28,7 @@ class SbsSplitter(ForeignSplitter):
     """Converter of the lines of one connection to frames."""
 
     def feed(self, t_ns: int, data: bytes) -> Items:
-        """Parse bytes that arrived at ``t_ns``; return the frames and rejections of the lines they
-        end."""
+        """Parse bytes that arrived at ``t_ns``; return frames and rejections of complete lines."""
         *lines, self._pending = (self._pending + data).split(b"\n")
         kept, garbage = self._lines(lines, LINE_MAX)
         out: Items = []

@@ -137,8 +137,7 @@ class Sight:
     def swept(
         self, towards: FloatArray, bound_rad: float | None, truly: FloatArray | None
     ) -> tuple[int | None, float | None, bool | None]:
-        """Return the best stored beam of a direction (3,), the share to sweep, and whether it
-        misses.
+        """Return the best stored beam of a direction (3,), the share to sweep, whether it misses.
 
         A share misses if it lacks the truly best beam. None: unknown.
         """
@@ -155,8 +154,7 @@ class Sight:
 
 
 def sight(pipeline: Pipeline) -> Sight:
-    """Return the radio and the codebook of the settings. Raises ``ConfigError`` if they are
-    impossible.
+    """Return radio and codebook of the settings; raises ``ConfigError`` if impossible.
 
     Without a codebook in the settings it is that of a DFT over the array's own grid, if it has one.
     """
@@ -226,8 +224,7 @@ def _angle_rad(towards: FloatArray, truly: FloatArray) -> float:
 
 
 def updates(logs: Sequence[Path], pipeline: Pipeline, hz: float) -> Iterator[tuple[float, Update]]:
-    """Yield seconds into a flight, ``hz`` per second, each with the update of the last tick by
-    then.
+    """Yield seconds into a flight, at ``hz``, each with the update of the latest tick.
 
     Each update is yielded once. Steps the pipeline through the whole flight.
     """

@@ -1,5 +1,4 @@
-"""Comparison of beam widths and predictors over links: gains, guarantees and rates, against the
-truth.
+"""Beam widths and predictors compared over links: gains, guarantees and rates, with truth.
 
 Each UAV's own frames pass through a link, the log's own or one of ``studies.prediction``; the
 carrier's frames stay as logged. At every tick beams are computed in each of the three widths for
@@ -96,8 +95,7 @@ class _Variant:
 def events(
     logs: Sequence[Path], link: RadioLink, settings: Settings, seed: int = 1
 ) -> tuple[Iterator[Event], dict[str, list[ObservedReport]], LocalFrame]:
-    """Return the events of a node over a link, with ticks; each UAV's reports, and their local
-    frame."""
+    """Return a node's events over a link, with ticks; each UAV's reports; their local frame."""
     center = settings.center.source or "home"
     flown = vehicles.load(logs, center)
     streams = {

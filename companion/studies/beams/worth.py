@@ -103,8 +103,7 @@ def summed_up(samples: Sequence[Sample]) -> Row:
 
 
 def _of_beams(beams: Sequence[tuple[Worth, bool]], prefix: str) -> Row:
-    """Return the figures of one set of beams, each paired with whether the UAV was beyond its
-    bound."""
+    """Return each figure of the beams, paired with whether the UAV was beyond its bound."""
     worths = [worth for worth, _ in beams]
     gains = [worth.gain_db for worth in worths]
     sure = [_or(worth.guaranteed_gain_db, -math.inf) for worth in worths]

@@ -75,8 +75,7 @@ def chosen(samples: Samples, learned: BoolArray) -> tuple[Geometry, tuple[float,
 
 
 def _leave_one_out(samples: Samples, learned: BoolArray, at: Geometry) -> list[Geometry]:
-    """Return geometries that each leave out a part of the training samples; their spread is the
-    doubt."""
+    """Return geometries from parts of the training samples; their spread is the doubt."""
     counted = learned & samples.apart()
     return [
         geometry.refit(at, samples.place, samples.beam, counted & ~part, samples.beams)

@@ -80,8 +80,7 @@ def _scores(samples: Samples, predictor: Predictor, folds: list[BoolArray]) -> d
 
 
 def _threshold(samples: Samples, fitted: Fitted, learned: BoolArray) -> float:
-    """Return the probability threshold at which sets cover enough, in blocks of the training
-    samples.
+    """Return the probability threshold for enough coverage, in blocks of training samples.
 
     Of all sets with the same mean coverage, those by one such threshold are the smallest (Sadinle,
     Lei and Wasserman 2019).

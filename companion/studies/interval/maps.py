@@ -79,8 +79,7 @@ def study(progress: Progress) -> tuple[dict[str, Any], Maps]:
 
 
 def rates() -> list[dict[str, float]]:
-    """Return the longest intervals for an error bound, by error, speed and feedthrough, at the best
-    alpha.
+    """Return the longest intervals by error, speed and feedthrough, at the best alpha.
 
     With alpha free the largest interval is the larger of 2 d, below which the input can be
     cancelled, and d + error / speed, which alpha near 1 approaches without cancellation.

@@ -100,8 +100,7 @@ def draw(
 
 
 def weights(array: Array, instant: Instant, by: PositionSource, precoder: Precoder) -> ComplexArray:
-    """Return weights (M, N) with columns of unit norm, not widened, for the directions known by
-    ``by``.
+    """Return weights (M, N), columns of unit norm, not widened, for the directions by ``by``.
 
     Raises ``UserError`` if the precoder omits UAVs or uses time slots.
     """

@@ -42,8 +42,7 @@ _SIGNS: Final = _butterfly_signs()
 
 
 def encode(bits: BoolArray) -> BoolArray:
-    """Encode blocks of bits (..., k) to code words (..., 3 (k + 6)): three bits each, tail
-    included."""
+    """Encode bits (..., k) to code words (..., 3 (k + 6)): three per bit, tail included."""
     steps = bits.shape[-1] + TAIL
     ends = [(0, 0)] * (bits.ndim - 1)
     padded = np.pad(bits, [*ends, (TAIL, TAIL)])

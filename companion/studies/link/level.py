@@ -1,6 +1,6 @@
 """Bit-level study of the link: ``companion study link``.
 
-At many instants of a flight the array zero-forces towards the believed directions of the UAVs;
+At many instants of a flight the array zero-forces towards the assumed directions of the UAVs;
 coded 16-QAM on OFDM passes the channel of the true directions. The study measures error rates, EVM
 and throughput over the signal-to-noise ratio, for beams by perfect, predicted and held positions.
 All three use the same bits, channels and noise, so they differ by the positions alone. References

@@ -49,8 +49,7 @@ def received_carriers(heard: ComplexArray) -> ComplexArray:
 
 
 def frequency_response(taps: ComplexArray) -> ComplexArray:
-    """Return the response of a channel of taps (T, ...), one sample apart, at each carrier: (256,
-    ...)."""
+    """Return the response (256, ...) at each carrier of taps (T, ...), one sample apart."""
     found: ComplexArray = np.fft.fftshift(np.fft.fft(taps, CARRIERS, axis=0), axes=0)
     return found
 

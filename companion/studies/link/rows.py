@@ -16,8 +16,7 @@ Z95: Final = 1.959963984540054  # half-width of a 95 per cent interval, in stand
 def row(
     positions: str, snr_db: float, coded: bool, counted: Sequence[BlockErrors], symbol_s: float
 ) -> Row:
-    """Return one point of a curve over all UAVs and instants; ``counted`` has one entry per
-    instant.
+    """Return one point of a curve over all UAVs; ``counted`` has one entry per instant.
 
     ber, bler     shares of wrong bits and of wrong blocks
     evm_percent   median over blocks of the RMS error of equalised symbols, over the RMS of a symbol

@@ -49,8 +49,7 @@ class PositionSource(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instant:
-    """Unit directions (N, 3) in the array frame by kind of positions; all kinds have equal UAV
-    order."""
+    """Unit directions (N, 3) by kind of positions, array frame, in equal order of UAVs."""
 
     t_s: float
     towards: dict[PositionSource, FloatArray]

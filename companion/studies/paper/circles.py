@@ -101,8 +101,7 @@ def _heading(angle_rad: FloatArray) -> FloatArray:
 
 
 def track(flight: PaperFlight, gain: float, start_m: FloatArray | None = None) -> Tracked:
-    """Run the published observer over the flight from ``start_m`` (N, 2); None starts without
-    error."""
+    """Run the published observer from ``start_m`` (N, 2); None starts without error."""
     scenario = flight.scenario
     estimate = flight.position_m[0] if start_m is None else start_m
     estimates, plain, full = [estimate], [], []
@@ -127,8 +126,7 @@ def track(flight: PaperFlight, gain: float, start_m: FloatArray | None = None) -
 
 
 def running_bounds(flight: PaperFlight, gain: float) -> FloatArray:
-    """Return the running bound on ||E_k||, (K + 1,), from the true ||W_k||: |q| e + |l d - b|
-    ||W||."""
+    """Return the running bound on ||E_k||, (K + 1,): |q| e + |l d - b| ||W||, true ||W_k||."""
     scenario, bounds = flight.scenario, [0.0]
     enters = abs(gain * scenario.feedthrough_s - scenario.dt_s)
     for size in stacked(flight.input_mps).tolist():

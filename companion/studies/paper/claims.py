@@ -22,7 +22,7 @@ class ClaimVerdict(StrEnum):
 class Claim:
     """Statement of the paper and the criterion for its verdict."""
 
-    statement: str  # what the paper says
+    statement: str  # text of the claim
     key: str  # path of the deciding number
     found: str  # result, with {value} in place of the number
     verdict: Callable[[float], ClaimVerdict]  # verdict for a number

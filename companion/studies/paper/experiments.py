@@ -299,8 +299,7 @@ def _irregular(scenario: PaperScenario, rng: np.random.Generator) -> dict[str, f
 
 
 def _array(flight: PaperFlight) -> dict[str, Any]:
-    """Return widths, nulls and phase-step losses of the published array, and errors of its
-    formulas."""
+    """Return widths, nulls and phase-step losses of the array, and errors of its formulas."""
     sizes = {}
     for size in SIZES:
         array = link.line(size)

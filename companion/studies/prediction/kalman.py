@@ -140,8 +140,7 @@ def _numbers(tuning: Tuning) -> tuple[float, ...]:
 def _conditioned(
     mean: FloatArray, covariance: FloatArray, state: int, measured: FloatArray, noise: FloatArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Condition mean (..., n, 3) and covariance (..., n, n) on a measurement (3,) of one state per
-    axis.
+    """Condition mean (..., n, 3), covariance (..., n, n) on a state measured per axis (3,).
 
     The noise of the measurement is (...).
     """

@@ -1,10 +1,9 @@
 """Predictors that a study compares, all with one interface.
 
-``kalman-peng`` is named after Peng et al. (2018), who are said to predict a UAV's position and
-velocity by a Kalman filter with known statistics. Neither the paper nor an account of it was
-available: no number and no equation here is theirs. The motion model is the constant-velocity one
-of ``companion.studies.prediction.kalman``, and the statistics are those of ``known_tuning``, which
-uses the settings and never a log.
+``kalman-peng`` is named after Peng et al. (2018), cited elsewhere for a Kalman filter of position
+and velocity with known statistics. The paper was not available: no number and no equation here is
+theirs. The motion model is the constant-velocity one of ``companion.studies.prediction.kalman``,
+and the statistics are those of ``known_tuning``, which uses the settings and never a log.
 """
 
 from collections.abc import Callable, Mapping
@@ -32,8 +31,7 @@ MANOEUVRE_S: Final = 1.0  # duration of an acceleration, as kalman-peng assumes
 
 
 class Product:
-    """The product as a predictor of one UAV: its pipeline, with frames as input and tracks as
-    output.
+    """The product as a predictor of one UAV: pipeline from frames to tracks.
 
     The array is at the origin of the study's local frame, so that its frame is the study's.
 

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 def files(
     answer: dict[str, Any], found: Sequence[LogComparison], progress: Callable[[str], None]
 ) -> dict[str, bytes]:
-    """Return the page and every figure as SVG and PNG, by file name: ``angle_`` and the link's
-    name.
+    """Return the page, and figures ``angle_`` and link name as SVG and PNG, by file name.
 
     Figures of the second and later logs are numbered.
     """

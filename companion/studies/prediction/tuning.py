@@ -34,8 +34,7 @@ Case = tuple[Flight, Delivery, Questions]
 
 
 def tune(name: str, cases: Sequence[Case]) -> Tuning:
-    """Return the noise of the grid with the least mean square position error over all UAVs and
-    leads.
+    """Return the grid's noise of least mean square position error, over all UAVs and leads.
 
     All tunings are evaluated at once.
     """

@@ -42,8 +42,7 @@ class RecentReports:
         self.offset_ns = 0
 
     def add(self, report: ObservedReport) -> bool:
-        """Add a report; return whether the window has changed. One that is too old only updates the
-        clock."""
+        """Add a report; return whether the window changed. A late one only updates the clock."""
         self.offset_ns = report.sent_ns - report.sender_ns
         reports = self._reports
         at = bisect_right(reports, report.sender_ns, key=lambda each: each.sender_ns)

@@ -50,8 +50,7 @@ class ArrayTruth:
     carrier: CarrierTruth | None
 
     def directions(self, tracks: Sequence[Track], predicted: Carrier, array: Array) -> FloatArray:
-        """Return true unit directions (N, 3) in the array frame at the tracks' time; NaN if
-        unknown."""
+        """Return true unit directions (N, 3), array frame, at the tracks' time; NaN if unknown."""
         found = np.full((len(tracks), 3), np.nan)
         at_ns = np.array([predicted.valid_at_ns])
         carrier = self._carrier(predicted, at_ns)
@@ -112,8 +111,7 @@ def load(logs: Sequence[Path], pipeline: Pipeline) -> ArrayTruth | None:
 
 
 def _carrier_truth(flight: Flight) -> CarrierTruth | None:
-    """Return the truth by the attitudes of the carrier's SIM_STATE; None if there are fewer than
-    two."""
+    """Return the carrier's truth by attitudes of SIM_STATE; None with fewer than two."""
     truth = flight.truth
     if truth.ned_from_body is None:
         return None

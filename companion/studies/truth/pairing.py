@@ -1,5 +1,4 @@
-"""Creation times of the simulator's truth messages, which carry no time, by their order in the
-stream.
+"""Creation times of the simulator's unstamped truth messages, by their stream order.
 
 An autopilot sends messages in order: a truth message was created between the stamps of the stamped
 messages before and after it in its vehicle's stream, whatever their delays. These two stamps are

@@ -244,8 +244,7 @@ def _least(at: "Callable[[float], LmiSolution]", tried: Sequence[float]) -> "Lmi
 
 
 def _dt_limit_s(mu_max: float, motion: KinematicLimits, alpha: float | None) -> float:
-    """Return the largest interval, to a part in a thousand, with mu within the limit; 0 without
-    one.
+    """Return the largest interval with mu within the limit, to 0.1 %; 0 without one.
 
     By bisection: mu grows with the interval, from the noise alone to about (a T^2 / sqrt 3)^2.
     """

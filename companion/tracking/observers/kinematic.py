@@ -166,8 +166,7 @@ class KinematicObserver:
         return self._limited(fix, reach_m, found, model.speed_max_mps)
 
     def _gain(self, state: KinematicState, t: float) -> Gain:
-        """Return the scheduled gain; without a reported velocity, A(t) [1; share / previous
-        interval]."""
+        """Return the scheduled gain; without a velocity, A(t) [1; share / previous interval]."""
         if state.fix.velocity_ned_mps is not None:
             return self.model.gain(t)
         if state.interval_s is None:

@@ -1,7 +1,4 @@
-"""The carrier of the array, and the origin of the local frame.
-
-The origin is the fixed station, or the position of the first report.
-"""
+"""The carrier of the array, and the local frame, whose origin is fixed or the first report."""
 
 import math
 from dataclasses import dataclass, replace

@@ -2,7 +2,7 @@
 
 from typing import Final
 
-SHOWN_MAX: Final = 60  # longest value that an error message shows, characters
+SHOWN_MAX: Final = 50  # longest value that an error message shows, characters
 
 
 class UserError(ValueError):

@@ -189,7 +189,7 @@ class Fault:
         name, at, system = left.partition("@")
         kind = KINDS.get(name)
         if kind is None:
-            raise FaultError(f"{shown(name)} is not a fault; give one of {', '.join(KINDS)}")
+            raise FaultError(f"{shown(name)} is not a fault; give {', '.join(KINDS)}")
         numbers = value.split(":")
         required = sum(bound.default is None for bound in kind.bounds)
         if not required <= len(numbers) <= len(kind.bounds):

@@ -171,9 +171,13 @@ SAYS: list[tuple[str, int, str]] = [
     (
         "sitl-replay fly paper --to udpout:127.0.0.1:1 --fault los=1",
         2,
-        "'los' is not a fault; give one of drift",
+        "'los' is not a fault; give drift",
     ),
-    ("sitl-replay fly paper --to udpout:127.0.0.1:1 --fault loss=2", 2, "allowed: 0 to 1, as in"),
+    (
+        "sitl-replay fly paper --to udpout:127.0.0.1:1 --fault loss=2",
+        2,
+        "allowed: 0 to 1; for example",
+    ),
     (
         "sitl-replay fly paper --to udpout:127.0.0.1:1 --record gone/x.tlog",
         1,

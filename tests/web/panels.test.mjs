@@ -54,7 +54,7 @@ test("a bad connection cannot be overlooked, and it is said since when and why",
   }
   const late = { state: "partial", what: "beams", problem: "no answer within 2 s" };
   panels.showConnection(late, stampAt(7), "this machine is overloaded: frames wait up to 2.0 s");
-  assert.match(text("banner-detail"), /about beams \(this machine is overloaded: frames wait up to 2\.0 s/);
+  assert.match(text("banner-detail"), /for beams \(this machine is overloaded: frames wait up to 2\.0 s/);
   for (const state of ["live", "token"]) { // the dialog says the latter
     panels.showConnection({ state }, stampAt(8));
     assert.equal(text("banner"), null);

@@ -37,10 +37,10 @@ def test_every_example_is_one_and_every_fault_is_described(kind: object) -> None
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("", "'' is not a fault; give one of drift, reboot, frozen, glitch, loss, duplication,"),
-        ("los=0.1", "'los' is not a fault; give one of "),
-        ("loss", "'loss': P is '', allowed: 0 to 1, as in loss=0.1"),
-        ("loss=1.1", "'loss=1.1': P is '1.1', allowed: 0 to 1, as in loss=0.1"),
+        ("", "'' is not a fault; give drift, reboot, frozen, glitch, loss, duplication,"),
+        ("los=0.1", "'los' is not a fault; give "),
+        ("loss", "'loss': P is '', allowed: 0 to 1; for example loss=0.1"),
+        ("loss=1.1", "'loss=1.1': P is '1.1', allowed: 0 to 1; for example loss=0.1"),
         ("loss=-0.1", "P is '-0.1', allowed: 0 to 1"),
         ("loss=nan", "P is 'nan', allowed: 0 to 1"),
         ("delay=inf", "S is 'inf', allowed: 0 to 600"),

@@ -210,9 +210,7 @@ class LiveFleetNode:
         duty, notices = self.member.decide(now_ns)
         if duty is not None:
             self._step(duty)
-            self._publish_standing(
-                now_ns
-            )  # at once: until then two nodes serve a UAV that was handed over
+            self._publish_standing(now_ns)  # at once, not with the next one
         self._publish(notices)
 
     def _publish_received(self, now_ns: int) -> None:

@@ -76,7 +76,6 @@ def _error_text(url: str, error: "ServiceError") -> str:
 
 
 def _text(answer: dict[str, Any]) -> str:
-    """Return lines for nodes, for UAVs that need attention, and for the traffic."""
     lines = [f"{answer['valid_at']}  fleet {answer['site']}, seen from {answer['node']}"]
     width = max(len(node["node"]) for node in answer["nodes"])
     for node in answer["nodes"]:

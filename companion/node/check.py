@@ -114,7 +114,6 @@ def _links_to_open(settings: Settings, urls: list[str]) -> Settings:
 
 
 def _listen(settings: Settings, seconds: float) -> Service:
-    """Run a service for this time, reachable only from this process."""
     with bind("127.0.0.1:0", token=None, insecure=False) as http:
         service = Service(settings=settings, say=lambda _: None)
         run_until_stopped(lambda until: service.run(http, None, until), seconds)

@@ -161,7 +161,6 @@ class ServedReplay:
             raise failed
 
     async def _replay(self, until: asyncio.Event) -> None:
-        """Process every event at its time, until stopped."""
         loop = asyncio.get_running_loop()
         began_s, first_ns = loop.time(), self._now_ns
         slice_s = flush_s = began_s
@@ -213,7 +212,6 @@ class ServedReplay:
         self._ticked.clear()  # later ones wait for the next tick
 
     async def _measure(self) -> None:
-        """Measure the length of the log by reading all of it, during the replay."""
         events, first_ns = self._measured
         last_ns: int | None = first_ns
         while last_ns is not None:

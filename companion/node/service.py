@@ -204,7 +204,6 @@ class Service:
                 self._show(output)
 
     def _follow_wall_clock(self) -> None:
-        """Adjust the offset to UTC if this machine's clock was set."""
         offset_ns = self._timeline.set_to_ns()
         if offset_ns is not None:
             self._step(ClockSet(self._timeline.now_ns(), offset_ns))
@@ -263,7 +262,6 @@ class Service:
             self._live.put(event, outputs)
 
     def _notify(self, notice: Notice) -> None:
-        """Record and show a notice that did not come from the pipeline."""
         self._hand_over(None, [notice])
         self._show(notice)
 
@@ -416,7 +414,6 @@ class Service:
         return None if self.fleet is None else self.fleet.status()
 
     async def _recover_leftovers(self) -> None:
-        """Recover recordings that an earlier, killed run left open, off the event loop."""
         directory = self._settings.recording.directory
         if directory is None:
             return

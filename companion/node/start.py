@@ -78,7 +78,6 @@ def run(
 
 
 async def _keep_shown(service: Service, voice: Console) -> None:
-    """Print the status periodically."""
     while True:
         await asyncio.sleep(STATUS_EVERY_S)
         voice.show(service)

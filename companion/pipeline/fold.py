@@ -188,7 +188,6 @@ class Pipeline:
         return said
 
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
-        """Report a change of the clock or link of a sender that is tracked."""
         if sender not in self.tracker:
             return []
         drift_max_ppm = self.settings.clocks.drift_max_ppm
@@ -231,7 +230,6 @@ class Pipeline:
         return [moved]
 
     def _restart(self, uav: str) -> None:
-        """Forget the past of a sender."""
         self.records.pop(uav, None)
         self.tracker.forget(uav)
         self.center.restarted(uav)
@@ -291,7 +289,6 @@ class Pipeline:
         return clock is not None and clock.guarantee is Guarantee.ASSUMED
 
     def _drop_silent(self, now_ns: int) -> list[Notice]:
-        """Drop tracks without recent reports, to save memory and time."""
         silent = self.tracker.silent(now_ns, self.settings.tracks.dropped_s)
         dropped = self.targets.dropped(now_ns, silent)
         for uav in silent:

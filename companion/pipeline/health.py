@@ -223,7 +223,6 @@ class HealthMonitor:
         return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
 
     def _notices(self, update: Update) -> list[Notice]:
-        """Return notices of changes; a single one if the carrier is the cause for all."""
         before, self._noticed = self._noticed, self.verdicts
         was, self._unfit = self._unfit, update.unfit
         if update.unfit is not None:

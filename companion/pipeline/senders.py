@@ -359,7 +359,6 @@ class Senders:
         )
 
     def _remote_id(self, frame: Frame, said: RemoteId) -> FrameOutcome:
-        """Place a broadcast position by its stamp."""
         named = self.remote_ids.merge(said)
         if named is None:
             return NO_OUTCOME

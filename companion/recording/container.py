@@ -153,7 +153,6 @@ class Walk:
         return opcode in _READ
 
     def _is_beyond(self, opcode: int) -> bool:
-        """Return whether this attachment or metadata record exceeds the limit."""
         if opcode not in (Opcode.ATTACHMENT, Opcode.METADATA):
             return False
         self._counts[opcode] += 1
@@ -175,7 +174,6 @@ class Walk:
             yield from self._in_chunk(_HEADER.pack(opcode, len(body)) + body)
 
     def _in_chunk(self, data: bytes) -> Iterator[Content]:
-        """Yield the wanted messages of a chunk; store the schemas and channels in it."""
         channels, topics = self.channels, self._topics
         orphaned = 0
         for opcode, body in _split(data):
@@ -199,7 +197,6 @@ class Walk:
             yield Damage(orphaned)
 
     def _describe(self, opcode: int, body: bytes) -> None:
-        """Store a schema or a channel. Raises ``ValueError`` if it is too large."""
         if opcode == Opcode.SCHEMA:
             schema = Schema.read(ReadDataStream(BytesIO(body)))
             if schema != self.schemas.get(schema.id):
@@ -218,7 +215,6 @@ class Walk:
             self._channel_bodies[body[:2]] = body
 
     def _take(self, size: int) -> None:
-        """Count bytes of descriptions. Raises ``ValueError`` beyond the limit."""
         self._described_bytes += size
         if self._described_bytes > _DESCRIPTIONS:
             raise ValueError("descriptions exceed the size limit")

@@ -150,7 +150,6 @@ class McapFile:
         self._stream.flush()
 
     def _end_chunk(self) -> None:
-        """Write the chunk and the indexes of its messages; without messages there is no chunk."""
         if not self._entries:
             return
         contents = b"".join(self._parts)

@@ -86,7 +86,6 @@ def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
 
 
 def _keep_damaged(path: Path, why: str) -> LogError:
-    """Rename a leftover to ``x.mcap.damaged``; return the message about it."""
     aside = free_name(path.with_suffix(DAMAGED))
     try:
         path.rename(aside)

@@ -89,7 +89,6 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
 
 
 def _own_names() -> frozenset[str]:
-    """Return this machine's names in the local network, none of which is a public name."""
     name = socket.gethostname().lower().partition(".")[0]
     return frozenset(("localhost", name, f"{name}.local"))
 
@@ -173,7 +172,6 @@ class BearerToken:
 
 
 def _decoded(text: str) -> bytes:
-    """Decode base64url without padding; empty for anything else."""
     try:
         return base64.urlsafe_b64decode(text + "=" * (-len(text) % 4))
     except (binascii.Error, ValueError):

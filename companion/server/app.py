@@ -93,7 +93,6 @@ def web_directory() -> Path:
 
 
 def _page_paths() -> frozenset[str]:
-    """Return the paths of the dashboard's files, which contain no secrets."""
     root = web_directory()
     files = {f"/{file.relative_to(root).as_posix()}" for file in root.rglob("*") if file.is_file()}
     return frozenset({"/"} | files)

@@ -31,7 +31,6 @@ GAINS: Final = ("needed", "guaranteed", "likely")
 
 
 def _help(described: Any, name: str) -> str:
-    """Return the meaning of a value, as in the API."""
     text = meaning(described, name).text
     return text[0].upper() + text[1:]
 

@@ -66,7 +66,6 @@ def listed(where: str | None, current: Current) -> list[Json]:
 
 
 def _entries(where: str | None) -> Iterator[os.DirEntry[str]]:
-    """Yield the entries that are recordings; none if the folder is missing or unreadable."""
     if where is None:
         return
     path = Path(where)

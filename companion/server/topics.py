@@ -38,7 +38,6 @@ def message(topic: Topic, body: Json, uavs: frozenset[str]) -> str | bytes:
 
 
 def _record(body: Json, uavs: frozenset[str]) -> bytes:
-    """Return the record of one update, limited to these UAVs if any are given."""
     made: BeamSet = body["beams"]
     kept = [i for i, uav in enumerate(made.uavs) if not uavs or uav in uavs]
     shown = replace(made, beams=tuple(made.beams[i] for i in kept), weights=made.weights[:, kept])
@@ -85,7 +84,6 @@ def _weights(node: Node) -> Json:
 
 
 async def _records(node: Node) -> Json:
-    """Return the input of ``_record`` for the newest update."""
     pipeline = node.pipeline
     update, number = pipeline.last_update, max(pipeline.updates - 1, 0)
     update = update or pipeline.look(node.now_ns())

@@ -60,7 +60,6 @@ def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[S
 
 
 def _with_positions(settings: Settings) -> Settings:
-    """Return the settings with the element positions read from their file."""
     named = settings.array.positions
     if named is None:
         return settings
@@ -101,7 +100,6 @@ def _npy_file(key: str, name: str, kinds: str) -> NDArray[Any]:
 
 
 def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
-    """Parse the bytes of a .npy file; as ``_npy_file``."""
     try:
         found = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
     except (ValueError, MemoryError, TokenError) as error:  # the header is read as Python text
@@ -159,7 +157,6 @@ def _where(settings: Settings, file: NamedFile) -> str:
 
 
 def _bytes(key: str, name: str) -> bytes:
-    """Return the bytes of a named file. Raises ``ConfigError`` that names ``key``."""
     try:
         return _read(Path(name))
     except OSError as error:
@@ -167,7 +164,6 @@ def _bytes(key: str, name: str) -> bytes:
 
 
 def _read(path: Path) -> bytes:
-    """Return the bytes of a file. Raises ``OSError`` if it cannot be read or is too large."""
     with path.open("rb") as file:
         data = file.read(LARGEST_BYTES + 1)
     if len(data) > LARGEST_BYTES:

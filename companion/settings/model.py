@@ -204,7 +204,6 @@ def _former_files(found: dict[str, Any], where: str) -> dict[str, bytes]:
 
 
 def _table(found: dict[str, Any], section: str) -> dict[str, Any]:
-    """Return a section of unvalidated settings; empty if it is missing or not a table."""
     keys = found.get(section)
     return keys if isinstance(keys, dict) else {}
 

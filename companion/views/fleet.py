@@ -205,7 +205,6 @@ def _place(place: tuple[float, float, float] | None) -> Place | None:
 
 
 def _uavs(member: FleetMember, now_ns: int) -> list[FleetUav]:
-    """Return every UAV that a node serves or offers to serve."""
     offers, by = offers_of(member), served_by(member, now_ns)
     handing = dict(member.duties.handing)
     for said in standing(member, now_ns).values():

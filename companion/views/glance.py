@@ -88,7 +88,6 @@ def _verdict(pipeline: Pipeline, found: Verdict | None, machine: Blame | None) -
 
 
 def _worst_first(verdicts: list[Verdict]) -> list[Verdict]:
-    """Return the verdicts that are not good, worst first."""
     ranks = {Level.NONE: 0, Level.WEAK: 1}
     poor = [verdict for verdict in verdicts if verdict.level in ranks]
     return sorted(poor, key=lambda verdict: ranks[verdict.level])

@@ -167,7 +167,6 @@ def _place(pipeline: Pipeline, track: Track) -> tuple[float, float, float]:
 def _velocity_ned_mps(
     pipeline: Pipeline, track: Track, place: tuple[float, float, float]
 ) -> tuple[float, float, float] | None:
-    """Return the velocity in north, east and down at the aircraft's position."""
     if track.velocity_ned_mps is None or pipeline.local is None:
         return None
     there_from_local = pipeline.local.local_from_ned(place[0], place[1]).T

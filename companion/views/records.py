@@ -102,7 +102,6 @@ def encode(
 
 
 def _entries(beam_set: BeamSet, guaranteed_db: Sequence[float | None] | None) -> NDArray[Any]:
-    """The entries (N,) of all beams."""
     known = guaranteed_db or [None] * len(beam_set.beams)
     rows = [
         (

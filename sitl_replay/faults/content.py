@@ -202,7 +202,6 @@ ContentFault = Drift | Reboot | Frozen | Glitch
 
 
 def _position_of(raw: bytes) -> bytes | None:
-    """The encoded position fields of a GLOBAL_POSITION_INT; None for other messages."""
     if msgid_of(raw) != GLOBAL_POSITION_INT:
         return None
     field = payload_of(raw, _POSITION_AT + _POSITION.size)[_POSITION_AT:]

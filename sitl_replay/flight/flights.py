@@ -280,7 +280,6 @@ def _displacement(
 
 
 def _waypoints(rng: random.Random, centre_ned_m: Vector) -> tuple[Vector, ...]:
-    """Five or six points around a centre, successive ones horizontally apart."""
     wanted = rng.choice((5, 6))
     north_m, east_m, down_m = centre_ned_m
     found: list[Vector] = []

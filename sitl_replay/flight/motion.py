@@ -121,7 +121,6 @@ class Sway:
         )
 
     def _swing(self, t_s: float, amplitude_rad: float, frequency_hz: float) -> tuple[float, float]:
-        """Angle and its derivative."""
         omega_radps = math.tau * frequency_hz
         angle_rad = omega_radps * t_s + self.phase_rad
         return (

@@ -251,7 +251,6 @@ class Racetrack:
         return along, across, turned, full_radps, 0.0
 
     def _rolled_in(self, t_s: float) -> tuple[float, float]:
-        """Metres along and across after ``t_s`` of rolling in."""
         reach_rad = self.speed_mps / self.radius_m * self.roll_s
         along = across = 0.0
         for node, weight in _QUADRATURE:

@@ -85,7 +85,6 @@ class _Due(NamedTuple):
 
 
 def _timers(vehicles: tuple[Vehicle, ...], seed: int) -> Iterator[tuple[int, Iterator[_Due]]]:
-    """Every timer, and the index in ``vehicles`` of its vehicle."""
     for who, vehicle in enumerate(vehicles):
         for build, interval_s in (
             (heartbeat, vehicle.heartbeat_interval_s),

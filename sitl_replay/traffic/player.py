@@ -164,7 +164,6 @@ def on_timeline(frames: Iterable[Frame], tally: Tally) -> Iterator[tuple[float, 
 
 @contextlib.asynccontextmanager
 async def _opened(urls: Sequence[LinkUrl], tally: Tally) -> AsyncIterator[list[TrafficLink]]:
-    """The open links, each with a peer; closed at the end, with dropped frames counted."""
     loop = asyncio.get_running_loop()
     opened: list[TrafficLink] = []
     start_s = loop.time()

@@ -91,7 +91,6 @@ class Gimbal:
             self._socket = None
 
     def _point(self, command: DeviceCommand) -> None:
-        """Send the direction; without one it is boresight."""
         yaw_rad = math.remainder(command.bearing_rad, 2 * math.pi)
         rates = math.nan, math.nan  # pitch and yaw rates are not commanded
         recipient = *self.target, 0  # every gimbal of that manager
@@ -137,7 +136,6 @@ class RoiGimbal(Gimbal):
     """A gimbal that gets positions instead of directions; boresight cancels the position."""
 
     def _point(self, command: DeviceCommand) -> None:
-        """Send the position to point at, or cancel it."""
         lat_deg, lon_deg, alt_m = command.place or (0.0, 0.0, 0.0)
         number = DO_SET_ROI_NONE if command.place is None else DO_SET_ROI_LOCATION
         where = round(lat_deg * 1e7), round(lon_deg * 1e7), alt_m

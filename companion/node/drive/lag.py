@@ -37,7 +37,6 @@ class MountLag:
             self._estimate(np.array(self._commands).T, np.array(self._reports).T)
 
     def _estimate(self, told: FloatArray, seen: FloatArray) -> None:
-        """Find the lag at which commands and reports differ least."""
         late = seen[:, seen[0] >= told[0, 0] + MOST_S]
         if late.shape[1] < SAMPLES_MIN // 2 or np.ptp(late[1]) < LEAST_RAD:
             return

@@ -242,7 +242,6 @@ class Drive:
         self._again_ns = self._now_ns() + RETRY_NS
 
     def _rest(self, why: str) -> None:
-        """Go to the safe state, once per reason."""
         if self._resting != why:
             if self._resting is None:
                 self._device.rest(self._safe)

@@ -168,7 +168,6 @@ class LiveFleetNode:
             await asyncio.sleep(period_s)
 
     async def _make_offers(self) -> None:
-        """Compute offers, some UAVs at a time, off the loop."""
         while True:
             make = self._offers.look(self._now_ns())
             if make is not None:

@@ -148,7 +148,6 @@ class Duties:
         standing: Mapping[str, Standing],
         offers: Mapping[str, Mapping[str, float]],
     ) -> None:
-        """Drop UAVs that another node has taken over, or has a better claim to."""
         for uav in [uav for uav in self.serves if uav in claims]:
             rivals = {
                 node: worth
@@ -169,7 +168,6 @@ class Duties:
     def _hand_over(
         self, now_ns: int, wanted: Mapping[str, str], offers: Mapping[str, Mapping[str, float]]
     ) -> None:
-        """Announce the new node of UAVs that have belonged elsewhere for some time."""
         for uav in self.serves:
             to = wanted.get(uav, self._name)
             if to == self._name:
@@ -192,7 +190,6 @@ class Duties:
         standing: Mapping[str, Standing],
         offers: Mapping[str, Mapping[str, float]],
     ) -> None:
-        """Take the UAVs handed to this node, and unserved ones that it should serve."""
         mine = offers.get(self._name, {})
         handed = {uav for said in standing.values() for uav, to in said.handing if to == self._name}
         has_listened = self._begun_ns is not None and now_ns - self._begun_ns >= self._lease_ns

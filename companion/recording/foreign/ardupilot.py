@@ -95,7 +95,6 @@ def _timed(of: DataflashTable, lost: dict[Reason, int]) -> DataflashTable:
 
 
 def _identity(parameters: DataflashTable, versions: DataflashTable) -> tuple[int | None, int]:
-    """Return system id, if the log has it, and MAV_TYPE; 0 (generic) if unknown."""
     values: dict[bytes, float] = {}
     if "Name" in parameters and "Value" in parameters:
         names = np.char.rstrip(parameters.raw("Name").astype("S16"), b"\0")
@@ -169,7 +168,6 @@ def _positions(
 def _received(
     fixes: Fixes, tables: dict[str, DataflashTable], notes: list[str]
 ) -> OnboardPositions | None:
-    """Return the receiver's positions, if the log has no estimated ones."""
     fixed = fixes.fixed()
     if fixed is None:
         return None

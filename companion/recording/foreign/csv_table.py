@@ -96,14 +96,12 @@ class _Reading(io.RawIOBase):
 
 
 def _lines(data: bytes | Bytes) -> Iterator[str]:
-    """Return the lines of a text; over-long lines in pieces."""
     raw = io.BufferedReader(_Reading(data))
     text = io.TextIOWrapper(raw, encoding="utf-8-sig", errors="replace")
     return iter(partial(text.readline, _LINE_MAX), "")
 
 
 def _header(lines: Iterator[str]) -> tuple[dict[str, int], str]:
-    """Return the values set before the header, and the header."""
     said: dict[str, int] = {}
     for number, line in enumerate(lines):
         if number > _NOTICES_MAX:
@@ -196,7 +194,6 @@ def _onboard(
 
 
 def _times(seconds: FloatArray, timed: str) -> tuple[IntArray, GpsTime | None]:
-    """Return microseconds since the first line, and their Unix time if known."""
     sound = np.abs(seconds) < LAST_UNIX_US * 1e-6
     whole_us = np.round(np.where(sound, seconds, -1.0) * 1e6).astype(np.int64)
     begin_us = int(np.median(whole_us[:9])) if len(whole_us) else 0

@@ -175,7 +175,6 @@ def segment(packet: Packet) -> Segment | None:
 
 
 def _network(packet: Packet) -> int | None:
-    """Return the offset of the IP packet, by the link type."""
     data, kind = packet.data, packet.link_type
     match kind:
         case 1:  # Ethernet

@@ -101,8 +101,6 @@ def _timed(of: UlogTable, lost: Lost) -> UlogTable:
 
 
 def _identity(walked: ulog.UlogIndex, status: UlogTable) -> tuple[int | None, int, int]:
-    """Return system id, component id and MAV_TYPE: from parameters, else from the status."""
-
     def stated(parameter: str, column: str) -> int | None:
         value = walked.parameters.get(parameter)
         values = status.integers(column)
@@ -200,7 +198,6 @@ def _place(of: UlogTable) -> tuple[IntArray, IntArray, FloatArray]:
 
 
 def _received(fixes: Fixes, local: UlogTable, notes: list[str]) -> OnboardPositions | None:
-    """Return the receiver's positions, if the estimator had none."""
     fixed = fixes.fixed()
     if fixed is None:
         return None

@@ -135,7 +135,6 @@ class Heard:
         return None if self.estimate is None else self.estimate.fix.noise
 
     def _number(self, name: str) -> float | None:
-        """Return a number of the message; None if it has no such field."""
         found: float | None = getattr(self.said, name, None)
         return found
 

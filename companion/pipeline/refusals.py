@@ -73,7 +73,7 @@ class Refusals:
             return None
         record.unused_notice_ns = refused.t_ns
         why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)
-        text = f"no report of {uav} was used for {lasted_ns * 1e-9:.1f} s: {why}"
+        text = f"no report of {uav} was used in the last {lasted_ns * 1e-9:.1f} s: {why}"
         return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
 
     def used(self, uav: str) -> None:

@@ -110,12 +110,12 @@ def read_tlog(data: bytes, link: str) -> Iterator[Event]:
 
 
 def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
-    way = "back" if off_ns < 0 else "ahead"
+    way = "before" if off_ns < 0 else "after"
     return Rejection(
         t_ns=t_ns,
         source=link,
         reason=Reason.BAD_STAMP,
-        detail=f"{abs(off_ns) / 1e9:.6g} s {way}, clamped",
+        detail=f"{abs(off_ns) / 1e9:.6g} s {way} the previous stamp; set to that one",
     )
 
 

@@ -111,7 +111,12 @@ def _health_routes(app: FastAPI, node: Node, stream: Stream) -> None:
         "/readyz",
         summary="Whether the service is ready, or why not (503)",
         responses=answers(models.Readiness)
-        | {503: {"model": models.model(models.Readiness), "description": "Not ready"}},
+        | {
+            503: {
+                "model": models.model(models.Readiness),
+                "description": "The service is not ready, for the given reasons",
+            }
+        },
     )
     async def readyz() -> Response:
         reasons = node.unfit()

@@ -47,7 +47,7 @@ class Recording:
     bytes: Annotated[int | None, Meaning("size of the file")]
     state: Annotated[
         Literal["recording", "finished", "unfinished"],
-        Meaning("being written; finished; unfinished: cut short"),
+        Meaning("state of the recording: recording, finished, or unfinished if it was cut short"),
     ]
     started: Annotated[str | None, Meaning("when it was started")]
 

@@ -102,7 +102,9 @@ def _npy_file(key: str, name: str, kinds: str) -> NDArray[Any]:
 def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
     try:
         found = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
-    except (ValueError, MemoryError, TokenError) as error:  # the header is read as Python text
+    except MemoryError as error:
+        raise ConfigError(f"{where}: array is too large for the memory: {error}") from error
+    except (ValueError, TokenError) as error:  # the header is read as Python text
         first = str(error).splitlines()[0]
         raise ConfigError(f"{where}: not a .npy file of numbers: {first}") from error
     if found.dtype.kind not in kinds:

@@ -32,7 +32,7 @@ RESPONSES_MAX: Final = 2**28
 MIN_AMPLITUDE_SHARE: Final = (
     8  # number of UAVs up to which each gets the full work limit of a request
 )
-LEAD: Final = "requested time from the request to valid_at; valid_at is up to 10 ms later"
+LEAD: Final = "requested lead: valid_at is this long after the request, or up to 10 ms more"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -125,8 +125,14 @@ class Weights:
     lead_ms: Annotated[float, Meaning(LEAD)]
     uavs: Annotated[list[str], Meaning("the UAV of each column")]
     groups: Annotated[list[int], Meaning("the time slot of each column, from 0")]
-    re: Annotated[list[list[float]], Meaning("real parts, a row per element")]
-    im: Annotated[list[list[float]], Meaning("imaginary parts, a row per element")]
+    re: Annotated[
+        list[list[float]],
+        Meaning("real parts of the weights: one row per element, one column per UAV"),
+    ]
+    im: Annotated[
+        list[list[float]],
+        Meaning("imaginary parts of the weights: one row per element, one column per UAV"),
+    ]
 
 
 def beams(

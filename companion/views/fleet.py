@@ -78,7 +78,7 @@ class FleetNode:
 
 @dataclass(frozen=True, slots=True)
 class FleetOffer:
-    """The gain and SINR that a node's array would give a UAV, if it served that UAV alone."""
+    """Gain and SINR that a node offers for a UAV, computed as if it served no other UAV."""
 
     node: Annotated[str, Meaning("node that offers")]
     offer: Annotated[Offer, Inline(omit=("uav",))]

@@ -26,9 +26,11 @@ class LinkHealth:
 class Headline:
     """Number of good, weak and missing links to UAVs; and as text."""
 
-    good: Annotated[int, Meaning("links with the guaranteed gain they need")]
-    weak: Annotated[int, Meaning("links that usually have the gain they need")]
-    none: Annotated[int, Meaning("links without the gain they need, or without a beam")]
+    good: Annotated[int, Meaning("number of UAVs whose link has the guaranteed gain that it needs")]
+    weak: Annotated[int, Meaning("number of UAVs whose link usually has the gain that it needs")]
+    none: Annotated[
+        int, Meaning("number of UAVs whose link lacks the gain that it needs, or has no beam")
+    ]
     headline: Annotated[str, Meaning("number of good links, as text", example="3 of 4 links good")]
     behind: Annotated[
         str | None, Meaning("that this machine is overloaded, as text; null: it is not")

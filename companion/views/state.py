@@ -76,7 +76,9 @@ class Status:
     health: Annotated[Headline, Meaning("number of good, weak and missing links")]
     links: Annotated[list[LinkState], Meaning("the links, in the order of the settings")]
     recording: Annotated[RecordingStatus, Meaning("the recording that is being written")]
-    arrival_lag: Annotated[LagSeen, Meaning("how long frames waited to be read")]
+    arrival_lag: Annotated[
+        LagSeen, Meaning("time from the arrival of frames at this computer until they were read")
+    ]
     rates: Annotated[Throughput, Meaning("rates over the last seconds")]
     frames: Annotated[int, Meaning("MAVLink frames processed since the start")]
     updates: Annotated[int, Meaning("beam updates so far")]

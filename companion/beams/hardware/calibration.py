@@ -139,7 +139,7 @@ def whole(number: int, name: str, field: str, least: int, most: int) -> int:
     digits = field.removeprefix("-")
     is_one = digits.isascii() and digits.isdecimal() and len(digits) <= DIGITS_MAX
     if not is_one or not least <= int(field) <= most:
-        said = f"{shown(field)} is not a whole number, {least} to {most}"
+        said = f"{shown(field)} is not a whole number from {least} to {most}"
         raise UserError(f"line {number}: {name} {said}")
     return int(field)
 
@@ -153,7 +153,9 @@ def real(number: int, name: str, field: str, most: float = math.inf) -> float:
     if not np.isfinite(value):
         raise UserError(f"line {number}: {name} {shown(field)} is not a finite number")
     if abs(value) > most:
-        raise UserError(f"line {number}: {name} {shown(field)} is not within {most:.0f}")
+        raise UserError(
+            f"line {number}: {name} {shown(field)} is not between -{most:.0f} and {most:.0f}"
+        )
     return value
 
 

@@ -249,7 +249,9 @@ def next_best(
     for a horizon or a step not above 0.
     """
     if not (0 < horizon_s < math.inf and step_s > 0):
-        raise UserError(f"horizon {horizon_s:g} s and step {step_s:g} s: give values above 0 s")
+        raise UserError(
+            f"horizon {horizon_s:g} s and step {step_s:g} s: give finite values above 0 s"
+        )
 
     def best_at(times_s: FloatArray) -> IntArray:
         return best(codebook, array, directions_at(times_s))[0]

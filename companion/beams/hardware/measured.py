@@ -73,7 +73,10 @@ def parse_responses(text: str) -> ChannelResponses:
     for towards, channels in found.items():
         missing = set(range(size)) - set(channels)
         if missing:
-            raise UserError(f"channel {min(missing)} of {size} has no response at {towards}")
+            raise UserError(
+                f"channel {min(missing)}: no measured response at azimuth, elevation {towards};"
+                f" measure channels 0 to {size - 1} there"
+            )
     if not found:
         raise UserError("file has no responses")
     angles = np.radians(np.array(list(found)))

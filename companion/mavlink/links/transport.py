@@ -299,7 +299,7 @@ def _checked_timesync(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
         return item
     if peer.brings_stamps(item.source, item.t_ns) or item.payload[:8].strip(b"\0") == b"":
         return item  # a request is no evidence
-    detail = "TIMESYNC: not from the peer that delivers the sender's positions"
+    detail = "TIMESYNC: answer came from another peer than this sender's positions"
     who = str(item.source)
     return Rejection(
         t_ns=item.t_ns, source=who, reason=Reason.UNPLACED_STAMP, msgid=TIMESYNC, detail=detail

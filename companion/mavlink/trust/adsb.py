@@ -181,7 +181,11 @@ class Aircraft:
             return _rejected(message, Reason.NO_POSITION)
         if known.position_ns is not None and true_ns <= known.position_ns - SLACK_NS:
             late_s = (known.position_ns - true_ns) * 1e-9
-            return _rejected(message, Reason.OUT_OF_ORDER, f"{late_s:.1f} s before the newest")
+            return _rejected(
+                message,
+                Reason.OUT_OF_ORDER,
+                f"{late_s:.1f} s older than the newest message of this aircraft",
+            )
         report = known.report(message, message.position_deg)
         return report if report is not None else _rejected(message, Reason.NO_ALTITUDE)
 

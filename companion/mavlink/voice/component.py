@@ -238,7 +238,10 @@ class ServiceComponent:
             trip_s = (frame.t_ns - sent_ns) * 1e-9
             refused, detail = Reason.OUT_OF_ORDER, f"TIMESYNC: round trip took {trip_s:.1f} s"
         elif not _is_boot_time(remote_ns, frame.t_ns, *stamp):
-            refused, detail = Reason.UNPLACED_STAMP, "TIMESYNC: not the clock of its positions"
+            refused, detail = (
+                Reason.UNPLACED_STAMP,
+                "TIMESYNC: answer is from another clock than the positions",
+            )
         else:
             trip = RoundTrip(
                 t_ns=frame.t_ns, source=frame.source, sent_ns=sent_ns, remote_ns=remote_ns
@@ -250,7 +253,7 @@ class ServiceComponent:
             if not _agree(first, trip):
                 self._discard_contradicting(first, trip, outputs)
                 return
-            refused, detail = Reason.DUPLICATE, "TIMESYNC: answered before"
+            refused, detail = Reason.DUPLICATE, "TIMESYNC: request was already answered"
         outputs.append(_refused(frame.t_ns, frame.source, refused, detail))
 
     def _discard_contradicting(

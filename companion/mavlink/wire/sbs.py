@@ -77,7 +77,7 @@ def _number(text: str, least: float, most: float) -> float | None:
     if not text:
         return None
     if not _NUMBER.fullmatch(text) or not least <= float(text) <= most:
-        raise ValueError(f"{text!r:.20} is not a number from {least:g} to {most:g}")
+        raise ValueError(f"field {text!r:.20} is not a number from {least:g} to {most:g}")
     return float(text)
 
 

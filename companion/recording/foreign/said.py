@@ -84,7 +84,8 @@ def frames(log: Onboard, link: str, source: Source, latency_s: float) -> Iterato
     for (kind, row), t_ns in _rows(order, times_ns):
         off_ns = timeline.place(t_ns)
         if off_ns is not None:
-            detail = f"{abs(off_ns) / 1e9:.6g} s {'back' if off_ns < 0 else 'ahead'}, clamped"
+            side = "before" if off_ns < 0 else "after"
+            detail = f"{abs(off_ns) / 1e9:.6g} s {side} the previous stamp; set to that one"
             yield Rejection(
                 t_ns=timeline.t_ns + latency_ns, source=link, reason=Reason.BAD_STAMP, detail=detail
             )

@@ -113,8 +113,13 @@ class KinematicDesign:
             raise
         except RecursionError as error:
             raise DesignError("not a kinematic design: nested too deeply") from error
-        except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-            raise DesignError(f"not a kinematic design: {error}") from error
+        except KeyError as error:
+            raise DesignError(f"not a kinematic design: {error.args[0]} is missing") from error
+        except (TypeError, AttributeError, ValueError, OverflowError) as error:
+            raise DesignError(
+                "not a kinematic design: a value has the wrong type or size;"
+                " give a file written by `companion design --out`"
+            ) from error
         verify(design)
         return design
 

@@ -95,11 +95,17 @@ def test_what_remains_is_bounded_and_said() -> None:
         ("nothing", "is not the header"),
         (MEASURED_HEADER, "file has no responses"),
         (f"{MEASURED_HEADER}\n0,0,0,0,0\n0,0,0,0,0\n", "line 3: channel 0 appears twice"),
-        (f"{MEASURED_HEADER}\n0,0,0,0,0\n0,0,2,0,0\n", "channel 1 of 2 has no response"),
+        (f"{MEASURED_HEADER}\n0,0,0,0,0\n0,0,2,0,0\n", "channel 1: no measured response"),
         (f"{MEASURED_HEADER}\n0,0,0,nan,0\n", "not a finite number"),
-        (f"{MEASURED_HEADER}\n0,0,0,0,1e6\n", "line 2: gain_db '1e6' is not within 1000"),
-        (f"{MEASURED_HEADER}\n0,0,0,0,-1e6\n", "line 2: gain_db '-1e6' is not within 1000"),
-        (f"{MEASURED_HEADER}\n1e300,0,0,0,0\n", "azimuth_deg '1e300' is not within"),
+        (
+            f"{MEASURED_HEADER}\n0,0,0,0,1e6\n",
+            "line 2: gain_db '1e6' is not between -1000 and 1000",
+        ),
+        (
+            f"{MEASURED_HEADER}\n0,0,0,0,-1e6\n",
+            "line 2: gain_db '-1e6' is not between -1000 and 1000",
+        ),
+        (f"{MEASURED_HEADER}\n1e300,0,0,0,0\n", "azimuth_deg '1e300' is not between"),
     ],
 )
 def test_responses_that_are_none_are_refused(text: str, said: str) -> None:

@@ -314,7 +314,10 @@ def test_what_is_older_for_certain_is_out_of_order() -> None:
     report(aircraft.merge(said(10, HERE, alt=500, tslc=2)))
     older = aircraft.merge(said(11, THERE, alt=480, tslc=4, relay=6))
     assert refused(older) is Reason.OUT_OF_ORDER
-    assert isinstance(older, Rejection) and older.detail == "1.0 s before the newest"
+    assert (
+        isinstance(older, Rejection)
+        and older.detail == "1.0 s older than the newest message of this aircraft"
+    )
     report(aircraft.merge(said(11.001, YONDER, alt=490, tslc=4, relay=6)))  # may be the newer
     assert refused(aircraft.merge(said(11.002, THERE, alt=480, tslc=5))) is Reason.OUT_OF_ORDER
 

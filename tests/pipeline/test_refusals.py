@@ -54,7 +54,8 @@ def test_a_second_without_a_report_that_is_used_is_told_once() -> None:
     said = refusals.add(refused(8.5, "4:1"))
     assert said is not None
     assert said.text == (
-        "no report of 4:1 was used in the last 1.5 s: unreachable, 45.0 m off, at most 4.0 m possible"
+        "no report of 4:1 was used in the last 1.5 s: unreachable,"
+        " 45.0 m off, at most 4.0 m possible"
     )
 
 

@@ -20,7 +20,7 @@ SILENT_INTERVALS: Final = 3.0
 
 TIMESYNC: Final = "allow TIMESYNC: set `[presence] enabled = true`, over a two-way link"
 APART: Final = 'fly them apart, or set `[beams] policy = "group"`'
-BETTER_CLOCK_RATIO: Final = "use a MAVLink link with a steadier delay"
+STEADIER_LINK: Final = "use a MAVLink link with a steadier delay"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -105,7 +105,7 @@ def _attitude_cause(carrier: Carrier, evidence: LinkEvidence) -> Blame:
     elif evidence.carrier_assumed:
         remedy = f"improve the carrier's clock: {TIMESYNC}"
     else:
-        remedy = f"improve the carrier's clock: {BETTER_CLOCK_RATIO}"
+        remedy = f"improve the carrier's clock: {STEADIER_LINK}"
     known = f"{math.degrees(carrier.attitude_bound_rad):.0f}°"
     return Blame(Cause.CARRIER, f"the carrier's attitude is uncertain by {known}", remedy)
 
@@ -199,4 +199,4 @@ def _clock(track: Track, evidence: LinkEvidence) -> Blame:
     known = f"{doubt_s * 1e3:.0f} ms" if doubt_s < 1.0 else f"{doubt_s:.1f} s"
     if evidence.clock_assumed:
         return Blame(Cause.CLOCK, f"its clock is unmeasured, uncertain by {known}", TIMESYNC)
-    return Blame(Cause.CLOCK, f"its clock is uncertain by {known}", BETTER_CLOCK_RATIO)
+    return Blame(Cause.CLOCK, f"its clock is uncertain by {known}", STEADIER_LINK)

@@ -79,9 +79,9 @@ def text(found: Sequence[StudiedFlight], compared: Sequence[Row] = ()) -> str:
     """Return the tables as text, all UAVs of a log together."""
     parts = [_text(watched) for watched in found]
     for log in dict.fromkeys(row["log"] for row in compared):
-        log_progress = [row for row in compared if row["log"] == log]
+        of_this_log = [row for row in compared if row["log"] == log]
         parts.append(
-            f"{log}, three widths and three rivals, gains in dB:\n{modes.text(log_progress)}"
+            f"{log}, three widths and three other predictors, gains in dB:\n{modes.text(of_this_log)}"
         )
     return "\n\n".join(parts)
 

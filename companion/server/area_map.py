@@ -23,7 +23,7 @@ MEDIA_TYPE: Final = "application/vnd.pmtiles"
 class AreaMap:
     """The map under the plan view."""
 
-    name: Annotated[str | None, Meaning("name of its file; null without one")]
+    name: Annotated[str | None, Meaning("name of the map's file; null without one")]
 
 
 def find(named: str | None) -> Path | None:

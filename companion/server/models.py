@@ -46,7 +46,9 @@ class Readiness:
     """Whether the service is ready; ``reasons`` say why not."""
 
     ready: Annotated[bool, Meaning("whether the service is ready")]
-    reasons: Annotated[list[str], Meaning("why it is not ready", example=["no link is up"])]
+    reasons: Annotated[
+        list[str], Meaning("why the service is not ready", example=["no link is up"])
+    ]
 
 
 @functools.cache

@@ -49,7 +49,7 @@ class Recording:
         Literal["recording", "finished", "unfinished"],
         Meaning("state of the recording: recording, finished, or unfinished if it was cut short"),
     ]
-    started: Annotated[str | None, Meaning("when it was started")]
+    started: Annotated[str | None, Meaning("start time of the recording")]
 
 
 @dataclass(frozen=True, slots=True)

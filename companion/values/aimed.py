@@ -136,7 +136,7 @@ class LeftOut:
 
     uav: Annotated[str, Meaning("UAV without a beam", 1)]
     cause: Cause
-    reason: Annotated[str, Meaning("why it has no beam", 2)]
+    reason: Annotated[str, Meaning("why the UAV has no beam", 2)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -36,9 +36,15 @@ class Cause(DescribedEnum):
 class Blame:
     """Cause of a weak link, with a reason in words and a remedy."""
 
-    cause: Annotated[Cause, Meaning("what limits the link most; null where it is good")]
+    cause: Annotated[Cause, Meaning("main limit of the link; null for a good link")]
     reason: Annotated[str, Meaning("the cause in words", example="reports 1.1 s apart")]
-    remedy: Annotated[str, Meaning("what to do", example="ask for 10 Hz ([presence] position_hz)")]
+    remedy: Annotated[
+        str,
+        Meaning(
+            "remedy: an action that a person can take now",
+            example="ask for 10 Hz ([presence] position_hz)",
+        ),
+    ]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -21,8 +21,8 @@ class Severity(DescribedEnum):
 class Notice:
     """Message to the operator, emitted once when the state that it describes changes."""
 
-    t_ns: Annotated[int, Meaning("when it was issued")]
-    severity: Annotated[Severity, Meaning("how important it is")]
+    t_ns: Annotated[int, Meaning("time of the notice")]
+    severity: Annotated[Severity, Meaning("severity of the notice")]
     subject: Annotated[str, Meaning("UAV, link or part of the service that it is about")]
     text: Annotated[str, Meaning("the message", example="3:1 is coasting")]
 

@@ -39,9 +39,9 @@ class Reason(DescribedEnum):
 class Rejection:
     """Received data that was not used, with the reason."""
 
-    t_ns: Annotated[int, Meaning("when it was received", 1)]
+    t_ns: Annotated[int, Meaning("arrival time of the message", 1)]
     source: Annotated[str, Meaning("UAV, sender, link or log that it came from", 2)]
-    reason: Annotated[Reason, Meaning("why it was not used", 3, example="unreachable")]
+    reason: Annotated[Reason, Meaning("why the data was not used", 3, example="unreachable")]
     count: Annotated[int, Meaning("number of frames; for garbage, bytes", 4, wire="uint64")] = 1
     msgid: Annotated[int | None, Meaning("MAVLink message id", 5)] = None
-    detail: Annotated[str, Meaning("the reason with its numbers", 6)] = ""
+    detail: Annotated[str, Meaning("explanation of the rejection, with its numbers", 6)] = ""

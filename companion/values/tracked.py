@@ -41,7 +41,7 @@ class Limits:
     acceleration_max_mps2: Annotated[
         float, Meaning("largest acceleration that the bounds assume", 22)
     ]
-    limits_source: Annotated[LimitSource, Meaning("where both limits come from", 23)] = (
+    limits_source: Annotated[LimitSource, Meaning("origin of both limits", 23)] = (
         LimitSource.SETTINGS
     )
 
@@ -141,7 +141,7 @@ class Track:
     """
 
     uav: Annotated[str, Meaning("id of the UAV", 1, label="UAV", example="3:1")]
-    state: Annotated[TrackState, Meaning("how old the newest report is", 2)]
+    state: Annotated[TrackState, Meaning("age of the newest report", 2)]
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold", 3)]
     age_s: Annotated[float, Meaning("age of the newest accepted report", 4)]
     position_ned_m: Annotated[

@@ -40,7 +40,9 @@ class StoredBeam:
     """The codebook's beam that serves a UAV, and the next one."""
 
     best: Annotated[int, Meaning("number of the codebook's beam that serves this UAV now")]
-    gain_db: Annotated[float, Meaning("its gain towards the predicted direction")]
+    gain_db: Annotated[
+        float, Meaning("gain of the codebook's beam towards the predicted direction")
+    ]
     next: Annotated[int | None, Meaning("number of the beam that will serve this UAV next")]
     next_in_s: Annotated[float | None, Meaning("time until the next beam")]
     candidates: Annotated[

@@ -43,7 +43,7 @@ class Pose:
 class LastPose:
     """The last known position and attitude."""
 
-    t_ns: Annotated[int, Meaning("when the array was there")]
+    t_ns: Annotated[int, Meaning("time of the position")]
     pose: Annotated[Pose, Inline()]
 
 
@@ -54,9 +54,11 @@ class Center:
     source: Annotated[
         str, Meaning("the vehicle SYSID:COMPID, the coordinates, or home", example="5:1")
     ]
-    fixed: Annotated[bool, Meaning("whether it is a fixed station")]
+    fixed: Annotated[bool, Meaning("whether the carrier is a fixed station")]
     pose: Annotated[Pose | None, Inline()] = None
-    unfit: Annotated[str | None, Meaning("why its position is unknown; null: it is known")] = None
+    unfit: Annotated[
+        str | None, Meaning("why the carrier's position is unknown; null: it is known")
+    ] = None
     last_known: Annotated[
         LastPose | None, Meaning("last known position, while the present one is unknown")
     ] = None

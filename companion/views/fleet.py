@@ -31,7 +31,7 @@ class FleetNode:
     """A node of the fleet: this one, then the others by name, and then those that left."""
 
     node: Annotated[str, Meaning("name of the node", example="north")]
-    is_self: Annotated[bool, Meaning("whether it is the node that answers")] = False
+    is_self: Annotated[bool, Meaning("whether this is the node that answers the request")] = False
     state: Annotated[
         NodeState,
         Meaning(
@@ -41,22 +41,24 @@ class FleetNode:
     near: Annotated[
         bool,
         Meaning(
-            "whether its range overlaps this node's; only such nodes exchange reports and offers"
+            "whether the ranges of the node and of this node overlap; only then they exchange reports"
         ),
     ] = False
-    reason: Annotated[str | None, Meaning("why it is excluded")] = None
-    place: Annotated[Place | None, Meaning("position of its array")] = None
-    reach_m: Annotated[float | None, Meaning("distance of the farthest UAV that it receives")] = (
-        None
-    )
-    serves: Annotated[int, Meaning("UAVs that it serves")] = 0
-    most: Annotated[int | None, Meaning("largest number of UAVs that it serves")] = None
-    heard_s: Annotated[float | None, Meaning("time since its last message, or since it left")] = (
-        None
-    )
+    reason: Annotated[str | None, Meaning("why the node is excluded")] = None
+    place: Annotated[Place | None, Meaning("position of the node's array")] = None
+    reach_m: Annotated[
+        float | None, Meaning("distance of the farthest UAV that the node receives")
+    ] = None
+    serves: Annotated[int, Meaning("UAVs that the node serves")] = 0
+    most: Annotated[int | None, Meaning("largest number of UAVs that the node serves")] = None
+    heard_s: Annotated[
+        float | None, Meaning("time since the node's last message, or since it left")
+    ] = None
     clock_offset_s: Annotated[
         float | None,
-        Meaning("its clock minus this node's, middle of the possible interval", label="Clock"),
+        Meaning(
+            "the node's clock minus this node's, middle of the possible interval", label="Clock"
+        ),
     ] = None
     clock_doubt_s: Annotated[float | None, Meaning("width of the possible interval")] = None
     frames: Annotated[int | None, Meaning("frames of vehicles that it shared")] = None
@@ -90,13 +92,13 @@ class FleetUav:
 
     uav: Annotated[str, Meaning("id of the UAV", example="3:1")]
     served_by: Annotated[
-        list[str], Meaning("nodes that serve it; two during a handover or in a split fleet")
+        list[str], Meaning("nodes that serve the UAV; two during a handover or in a split fleet")
     ]
     handing_to: Annotated[str | None, Meaning("node to which it is being handed over")]
     unconfirmed: Annotated[
-        bool, Meaning("whether only one node reports it, though others should receive it")
+        bool, Meaning("whether only one node reports the UAV, though others should receive it")
     ]
-    offers: Annotated[list[FleetOffer], Meaning("what each node offers it")]
+    offers: Annotated[list[FleetOffer], Meaning("what each node offers the UAV")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -32,9 +32,7 @@ class Headline:
         int, Meaning("number of UAVs whose link lacks the gain that it needs, or has no beam")
     ]
     headline: Annotated[str, Meaning("number of good links, as text", example="3 of 4 links good")]
-    behind: Annotated[
-        str | None, Meaning("that this machine is overloaded, as text; null: it is not")
-    ]
+    behind: Annotated[str | None, Meaning("text that this machine is overloaded; null: it is not")]
 
 
 def behind(seen: LagSeen) -> Blame | None:

@@ -30,7 +30,7 @@ ENUMERATIONS: Final[tuple[type[DescribedEnum], ...]] = (
 class Label:
     """Name, unit and meaning of one value."""
 
-    label: Annotated[str, Meaning("short name", example="Innovation")]
+    label: Annotated[str, Meaning("label of the value on the page", example="Innovation")]
     unit: Annotated[str, Meaning("unit; empty without one", example="m")]
     meaning: Annotated[str, Meaning("what the value means")]
 

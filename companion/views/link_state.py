@@ -43,7 +43,7 @@ class Component:
 
     id: Annotated[Source, Meaning("SYSID:COMPID", example="3:1")]
     status: Annotated[ComponentStatus, Inline()]
-    age_s: Annotated[float, Meaning("time since its last frame")]
+    age_s: Annotated[float, Meaning("time since the component's last frame")]
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +73,7 @@ class Links:
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     links: Annotated[list[HeardLink], Meaning("the links, in the order of the settings")]
-    out: Annotated[list[OutLink], Meaning("links of [out], which only send")]
+    out: Annotated[list[OutLink], Meaning("links of `[out]`, which only send")]
     message_rates: Annotated[list[MessageRate], Meaning("rates requested of UAVs")]
 
 

@@ -68,7 +68,7 @@ class MavlinkVehicle:
     """One system: its components by id."""
 
     id: Annotated[int, Meaning("system id")]
-    components: Annotated[dict[str, MavlinkComponent], Meaning("its components, by id")]
+    components: Annotated[dict[str, MavlinkComponent], Meaning("components of the system, by id")]
 
 
 class Dialect:

@@ -20,7 +20,7 @@ class Setting:
     default: Annotated[Any, Meaning("the default value")]
     source: Annotated[
         Literal["default", "file", "recording", "option", "program"],
-        Meaning("what set it; the program sets some in its demo"),
+        Meaning("origin of the value: default, file, option, environment, or the demo"),
     ]
     file: Annotated[str | None, Meaning("the file or recording that set it")]
 

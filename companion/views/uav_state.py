@@ -21,7 +21,7 @@ from companion.views.state import Node
 class ReportedFix:
     """The newest reported position of a UAV, and its time."""
 
-    t_ns: Annotated[int, Meaning("when the UAV was there")]
+    t_ns: Annotated[int, Meaning("time of the position")]
     place: Annotated[Place, Inline()]
 
 
@@ -45,10 +45,11 @@ class UavState:
 
     id: Annotated[str, Meaning("SYSID:COMPID, icao:HEX, rid:ID or cot:UID", example="3:1")]
     verdict: Annotated[
-        Level | None, Meaning("whether its beam has the gain that the link needs", label="Link")
+        Level | None,
+        Meaning("whether the UAV's beam has the gain that the link needs", label="Link"),
     ]
     health: Annotated[LinkHealth | None, Meaning("cause and gains of the verdict")]
-    target: Annotated[bool, Meaning("whether a beam is wanted for it, from any node")]
+    target: Annotated[bool, Meaning("whether a beam is wanted for the UAV, from any node")]
     served_by: Annotated[
         list[str] | None,
         Meaning("nodes of the fleet that serve it; null: no fleet, or no beam is wanted"),

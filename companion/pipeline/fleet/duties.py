@@ -35,8 +35,8 @@ class Handover:
 
     t_ns: Annotated[int, Meaning("when this node changed it")]
     uav: Annotated[str, Meaning("UAV that changed its node", example="3:1")]
-    before: Annotated[str | None, Meaning("node that served it before; null: none")]
-    after: Annotated[str | None, Meaning("node that serves it from then on; null: none")]
+    before: Annotated[str | None, Meaning("node that served the UAV before; null: none")]
+    after: Annotated[str | None, Meaning("node that serves the UAV from then on; null: none")]
 
 
 class Duties:

@@ -81,7 +81,8 @@ def text(found: Sequence[StudiedFlight], compared: Sequence[Row] = ()) -> str:
     for log in dict.fromkeys(row["log"] for row in compared):
         of_this_log = [row for row in compared if row["log"] == log]
         parts.append(
-            f"{log}, three widths and three other predictors, gains in dB:\n{modes.text(of_this_log)}"
+            f"{log}, three widths and three other predictors, gains in dB:\n"
+            f"{modes.text(of_this_log)}"
         )
     return "\n\n".join(parts)
 

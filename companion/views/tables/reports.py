@@ -39,7 +39,7 @@ class Heard:
     said: Report | AdsbVehicle | None
 
     @property
-    def arrival_ns(self) -> Annotated[int, Meaning("when it was received")]:
+    def arrival_ns(self) -> Annotated[int, Meaning("arrival time of the message")]:
         return self.frame.t_ns
 
     @property
@@ -65,11 +65,13 @@ class Heard:
         return self.estimate is not None
 
     @property
-    def reason(self) -> Annotated[str | None, Meaning("why it was not used")]:
+    def reason(self) -> Annotated[str | None, Meaning("why the data was not used")]:
         return None if self.refused is None else self.refused.reason
 
     @property
-    def detail(self) -> Annotated[str | None, Meaning("the reason with its numbers")]:
+    def detail(
+        self,
+    ) -> Annotated[str | None, Meaning("explanation of the rejection, with its numbers")]:
         return None if self.refused is None else self.refused.detail
 
     @property

@@ -61,7 +61,7 @@ class EventRow:
     refuted: Annotated[Refuted | None, Inline(omit=("t_ns",))]
 
     @property
-    def t_ns(self) -> Annotated[int, Meaning("when it was issued")]:
+    def t_ns(self) -> Annotated[int, Meaning("time of the notice")]:
         return self._said.t_ns
 
     @property

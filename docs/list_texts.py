@@ -27,6 +27,7 @@ ROOT: Final = Path(__file__).resolve().parents[1]
 MESSAGES: Final = ROOT / "docs" / "messages.md"
 EXAMPLES_MAX: Final = 4  # of one place in the code
 LENGTH_MAX: Final = 250  # of an example; random texts of tests are longer
+FIXED_MIN: Final = 6  # characters of a template that tell it from others
 SAMPLE: Final = {"error": 15, "notice": 10, "detail": 5, "api": 15, "docstring": 15}
 HEAD: Final = """# Errors and notices
 
@@ -37,6 +38,7 @@ TITLES: Final = {
     "error": "Errors: a command or a setting that cannot be used",
     "notice": "Notices: events of a running service",
     "detail": "Details of rejections: why a received message was discarded",
+    "rest": "Errors that no test causes, without example values",
 }
 
 
@@ -55,7 +57,7 @@ def _example(text: str) -> str:
     """Return a collected text without folders and ports of the test machine."""
     text = re.sub(r"/[^ '\":]*/(?:test_|pytest|tmp)[^ '\":/]*/", "", text)
     text = re.sub(r"(127\.0\.0\.1|\[::1\]|localhost):\d{5}", r"\1:14550", text)
-    return text.replace("|", "\\|").replace("`", "'")
+    return listed(text)
 
 
 def _form(text: str) -> str:
@@ -74,6 +76,54 @@ def _chosen(texts: list[str]) -> Iterator[str]:
         yield min(by_form[form], key=lambda one: (abs(len(one) - 80), one))
 
 
+class Raised(NamedTuple):
+    """An error in the code: its template, and the longest part of it without placeholders."""
+
+    place: str
+    template: str
+    fixed: str
+
+
+def raised() -> Iterator[Raised]:
+    """The errors of users that the code raises, each with a message of its own."""
+    modules = list(_modules())
+    classes = {"UserError"}
+    for _ in range(3):  # subclasses of subclasses
+        classes |= {
+            node.name
+            for _, tree in modules
+            for node in ast.walk(tree)
+            if isinstance(node, ast.ClassDef)
+            and any(isinstance(base, ast.Name) and base.id in classes for base in node.bases)
+        }
+    for place, tree in modules:
+        for node in ast.walk(tree):
+            match node:
+                case ast.Raise(exc=ast.Call(func=ast.Name(id=name), args=[text])) if (
+                    name in classes
+                ):
+                    template, parts = _template(text)
+                    fixed = max(parts, key=len, default="")
+                    if len(fixed) >= FIXED_MIN:
+                        yield Raised(place, template, fixed)
+
+
+def _template(text: ast.expr) -> tuple[str, list[str]]:
+    match text:
+        case ast.Constant(value=str(words)):
+            return words, [words]
+        case ast.JoinedStr(values=values):
+            parts = [one.value for one in values if isinstance(one, ast.Constant)]
+            shown = [str(one.value) if isinstance(one, ast.Constant) else "…" for one in values]
+            return "".join(shown), [str(one) for one in parts]
+    return "", []
+
+
+def listed(text: str) -> str:
+    """A text as docs/messages.md writes it."""
+    return text.replace("|", "\\|").replace("`", "'")
+
+
 def write_messages(collected: Path) -> None:
     """Write docs/messages.md from what a run of the tests collected."""
     places: dict[tuple[str, str], list[str]] = defaultdict(list)
@@ -83,7 +133,7 @@ def write_messages(collected: Path) -> None:
         if text.isascii() and text.isprintable() and len(text) <= LENGTH_MAX:
             places[found["kind"], found["place"]].append(text)
     parts = [HEAD]
-    for kind, title in TITLES.items():
+    for kind, title in list(TITLES.items())[:-1]:
         parts.append(f"\n## {title}\n")
         rooms: dict[str, set[str]] = defaultdict(set)
         for (of, place), texts in places.items():
@@ -92,6 +142,10 @@ def write_messages(collected: Path) -> None:
         for room in sorted(rooms):
             parts.append(f"\n### {room}\n\n")
             parts.extend(f"- `{text}`\n" for text in sorted(rooms[room]))
+    written = "".join(parts)
+    rest = {listed(one.template) for one in raised() if listed(one.fixed) not in written}
+    parts.append(f"\n## {TITLES['rest']}\n\n### all\n\n")
+    parts.extend(f"- `{text}`\n" for text in sorted(rest))
     MESSAGES.write_text("".join(parts), encoding="utf-8")
 
 

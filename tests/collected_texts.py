@@ -57,8 +57,17 @@ class CollectedTexts:
                 out.write("".join(f"{line}\n" for line in sorted(lines)))
 
 
+_OBJECT: Final = re.compile(
+    r"""'|"|--\w|\[\w|\w\.\w|/|\w:\S|^\S*: |\w: """  # a value, option, key, file, URL, place
+    r"|^[^:;]+? (=|is|are|has|have|needs?|cannot|can|does|do|stores?|drives|exceed|differ|must|"
+    r"failed|found|fails|changes)\b"  # or a sentence about it
+)
+
+
 def broken_rules(*, kind: str, text: str, subject: str, place: str) -> Iterator[str]:
     """The rules that a text breaks. ``subject``: the class of an error, the object of a notice."""
+    if not subject or (kind == "error" and not _OBJECT.search(text)):
+        yield "names no object"
     if "\n" in text:
         yield "has a line break"
     if (length := len(_FOLDERS.sub("", text))) > CHARACTERS_MAX:

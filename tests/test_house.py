@@ -17,6 +17,7 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 
 import pytest
+from collected_texts import broken_rules
 from support import HANG_S
 
 ROOT = Path(__file__).resolve().parent.parent
@@ -815,3 +816,40 @@ def test_the_wheel_and_the_locks_agree() -> None:
         pinned = set(re.findall(r"^([\w.-]+)==", (ROOT / lock).read_text("utf-8"), re.MULTILINE))
         names = {re.split(r"[^\w.-]", requirement)[0] for requirement in requirements}
         assert names <= pinned, f"{lock} lacks {names - pinned}: run `make lock`"
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "subject"),
+    [
+        ("error", "not a good thing", "UserError"),
+        ("error", "array: " + "x" * 200, "UserError"),
+        ("error", "array: two\nlines", "UserError"),
+        ("notice", "clock moved by 30 ms", ""),
+    ],
+)
+def test_a_text_that_breaks_a_rule_is_found(kind: str, text: str, subject: str) -> None:
+    assert list(broken_rules(kind=kind, text=text, subject=subject, place=""))
+
+
+def test_an_error_in_three_parts_keeps_the_rules() -> None:
+    text = "array.coupling: matrix is nearly singular (condition number 2e7); give measured values"
+    assert not list(broken_rules(kind="error", text=text, subject="UserError", place=""))
+
+
+def test_the_list_of_texts_has_every_kind() -> None:
+    """docs/messages.md, from which errors and notices are listed, is what the tests collect."""
+    command = [sys.executable, ROOT / "docs" / "list_texts.py", "messages", "help", "page"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=HANG_S)
+    counted = {kind: int(count) for count, kind in map(str.split, done.stderr.splitlines())}
+    assert set(counted) == {"error", "notice", "detail", "rest", "help", "page"}
+    assert counted["error"] > 300 and counted["rest"] < 80
+
+
+def test_every_error_of_the_code_is_in_the_list_of_texts() -> None:
+    """An error that was reworded or added is not listed until `make messages` is run."""
+    sys.path.insert(0, str(ROOT / "docs"))
+    import list_texts
+
+    written = list_texts.MESSAGES.read_text(encoding="utf-8")
+    missing = [one for one in list_texts.raised() if list_texts.listed(one.fixed) not in written]
+    assert not missing, f"run `make messages`: {missing[:3]}"

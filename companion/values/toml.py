@@ -45,7 +45,7 @@ def read_toml(text: str, largest: int = LARGEST) -> dict[str, Any]:
     except RecursionError as error:
         raise UserError("TOML is too large or nested too deeply") from error
     except ValueError as error:  # Python's limit on the digits of an integer
-        raise UserError("TOML with a number of thousands of digits") from error
+        raise UserError("TOML has a number of thousands of digits") from error
 
 
 def _is_readable(text: str, largest: int) -> bool:

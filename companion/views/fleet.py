@@ -41,7 +41,7 @@ class FleetNode:
     near: Annotated[
         bool,
         Meaning(
-            "whether the ranges of the node and of this node overlap; only then they exchange reports"
+            "whether the ranges of the node and this node overlap; only then they share reports"
         ),
     ] = False
     reason: Annotated[str | None, Meaning("why the node is excluded")] = None

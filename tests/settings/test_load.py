@@ -167,8 +167,8 @@ HEX = "0x" + "f" * 5000
 @pytest.mark.parametrize(
     ("text", "said"),
     [
-        (f"[beams]\nupdate_hz = {DIGITS}", "TOML with a number of thousands of digits"),
-        (f"[array]\nnone = {'1_' * 5000}1", "TOML with a number of thousands of digits"),
+        (f"[beams]\nupdate_hz = {DIGITS}", "TOML has a number of thousands of digits"),
+        (f"[array]\nnone = {'1_' * 5000}1", "TOML has a number of thousands of digits"),
         (f"[beams]\nupdate_hz = {HEX}", "beams.update_hz = a number of thousands of digits: "),
         (f"[array]\nlever_arm_m = [{HEX}, 0, 0]", "a number of thousands of digits: "),
         (f"[array]\nkind = {HEX}", "array.kind = a number of thousands of digits: "),

@@ -232,7 +232,7 @@ def _least(at: "Callable[[float], LmiSolution]", tried: Sequence[float]) -> "Lmi
     """Return the solution with the smallest mu. Raises the last failure if every attempt fails."""
     from companion.tracking.design.lmi import LmiError
 
-    found, failure = [], LmiError("no candidate was tried")
+    found, failure = [], LmiError("the search for alpha has no candidate")
     for value in tried:
         try:
             found.append(at(value))

@@ -99,7 +99,7 @@ class KinematicDesign:
         try:
             given: dict[str, Any] = json.loads(text)
             if given.pop("format", None) != FORMAT:
-                raise DesignError(f"not a design of the format {FORMAT}")
+                raise DesignError(f"format of the design is not {FORMAT!r}")
             for table in ("corrections", "multipliers"):
                 given[table] = tuple(tuple(map(float, row)) for row in given[table])
             for row in ("dt_s", "lyapunov"):

@@ -125,7 +125,7 @@ def solve_common(
     widths = [samplings[0].b.shape[1]] if channels is None else list(channels)
     if sum(widths) != samplings[0].b.shape[1] or min(widths) < 1 or len(alphas) != len(samplings):
         raise ValueError("channels must cover the columns of B, and each sampling needs an alpha")
-    failure = LmiError("the solver did not run")
+    failure = LmiError("the solver has no scaling to try")
     for states, reports in _scalings(samplings, scale):
         try:
             found = _solve_scaled(

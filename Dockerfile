@@ -1,26 +1,25 @@
-# The service in a container, for amd64 and arm64: as an unprivileged user, on a root file system
-# that may be read only, with nothing in it but what it runs. docs/deployment.md
+# The service in a container, for amd64 and arm64. It runs as an unprivileged user on a root file
+# system that may be read-only. See docs/deployment.md.
 ARG BASE=python:3.11-slim-bookworm
-# The same Python with more beside it, of which `strip` is used.
+# The full image of the same Python; only `strip` is used of its additions.
 ARG BUILD=python:3.11-bookworm
 
 FROM ${BUILD} AS build
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1
 RUN python -m venv /opt/venv
 WORKDIR /src
-# The packages first: they change seldom, so this layer is made seldom. Wheels alone: a package
-# without a wheel for this machine is to fail at once.
+# Packages first: they change rarely, so this layer is cached. Wheels only: a package without a
+# wheel for this machine fails at once.
 COPY requirements.lock ./
 RUN /opt/venv/bin/pip install --require-hashes --only-binary :all: -r requirements.lock
 COPY . ./
-# What only builds is taken away again, pip last.
+# Remove the build tools, pip last.
 RUN /opt/venv/bin/pip install --no-deps --no-build-isolation . \
     && /opt/venv/bin/pip uninstall --yes editables hatchling pathspec pluggy trove-classifiers \
     && /opt/venv/bin/pip check
-# What packages ask for and nothing here uses: solvers beside Clarabel, what generates MAVLink; then
-# their own tests, dialects that nobody speaks here, and symbols for debuggers. It is over half of
-# all. Not of packages that bring libraries: what was patched to find these need not load once
-# stripped.
+# Remove what is not used: solvers other than Clarabel, the MAVLink generator, the packages' tests,
+# unused dialects and debug symbols. This is more than half of the size. Wheels that bundle shared
+# libraries are not stripped, because their patched modules may not load afterwards.
 RUN /opt/venv/bin/pip uninstall --yes highspy lxml scs setuptools sparsediffpy pip \
     && find /opt/venv/lib -type d -name tests -prune -exec rm -r {} + \
     && find /opt/venv/lib -path '*/pymavlink/dialects/v*' -type f \
@@ -35,15 +34,15 @@ ENV PATH=/opt/venv/bin:$PATH \
     PYTHONUNBUFFERED=1 \
     PYTHONDONTWRITEBYTECODE=1 \
     OPENBLAS_NUM_THREADS=1
-# A numeric id, so that an orchestrator can see that it is not root without reading /etc/passwd.
+# A numeric id: an orchestrator can check that it is not root without reading /etc/passwd.
 USER 10001:10001
 WORKDIR /tmp
 VOLUME /recordings
 EXPOSE 8080/tcp 14550/udp
-# Fit to be used, not merely alive: unhealthy without a carrier or while beam updates are late.
+# Readiness, not liveness: unhealthy without a carrier, or while beam updates are late.
 HEALTHCHECK --interval=10s --timeout=5s --start-period=15s --retries=3 \
     CMD ["python", "-c", "import os; from urllib.request import Request, urlopen; urlopen(Request('http://127.0.0.1:8080/readyz', headers={'Authorization': 'Bearer ' + os.environ.get('COMPANION_TOKEN', '')}), timeout=4)"]
 ENTRYPOINT ["companion"]
-# In a container the service must listen on every address to be reached at all, hence
-# --insecure: publish the port on 127.0.0.1, as docker-compose.yml does, or set a token instead.
+# In a container the service must listen on every address, hence --insecure. Publish the port on
+# 127.0.0.1, as docker-compose.yml does, or set a token instead.
 CMD ["run", "--link", "udpin:0.0.0.0:14550", "--center", "5:1", "--listen", "0.0.0.0:8080", "--insecure", "--record", "/recordings"]

@@ -1,6 +1,6 @@
-# Two commands on a fresh machine: `make demo`, `make test`. Each makes .venv by itself, and
-# again when a lock, pyproject.toml or the place of this directory has changed.
-# For GNU make 3.81 or later and any POSIX shell. PYTHON=... chooses the interpreter.
+# Two commands on a fresh machine: `make demo`, `make test`. Both create .venv, and create it again
+# when a lock file, pyproject.toml or the path of this directory has changed.
+# Requires GNU make 3.81 or later and any POSIX shell. PYTHON=... chooses the interpreter.
 
 SHELL = /bin/sh
 BIN = .venv/bin
@@ -8,15 +8,15 @@ PIP = $(BIN)/python -m pip --disable-pip-version-check install --quiet --require
 PYTEST = $(BIN)/python -m pytest
 UV = uv
 
-# The matrices are small: threads in BLAS cost more than they give, and make timings vary.
+# The matrices are small: BLAS threads slow them down and make timings vary.
 OPENBLAS_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS
 
-# Where this is set, each worker and each of some hundred processes that tests start compiles all
-# that it imports anew: together as long as the tests themselves.
+# If this is set, every process that the tests start compiles all its imports again, which takes as
+# long as the tests themselves.
 unexport PYTHONDONTWRITEBYTECODE
 
-# Tests of pure rooms on two workers; those that start services share one, one after the other.
+# Two workers. Tests that start services run on one of them, one after the other.
 WORKERS = -n 2 --dist loadgroup
 
 .PHONY: demo test test-all check site bench soak fuzz messages format lock clean FORCE
@@ -24,17 +24,17 @@ WORKERS = -n 2 --dist loadgroup
 demo: .venv/.runtime
 	$(BIN)/companion demo
 
-# What must be green before anything lands: at most five minutes on two quiet cores. Tests marked
-# `full` are left out. Warnings are errors: pyproject.toml says so to pytest, for every run.
+# The tests that every change must pass, at most five minutes on two quiet cores. Tests marked `full`
+# are left out. Warnings are errors (pyproject.toml).
 test: .venv/.dev
 	$(PYTEST) -q $(WORKERS) -m "not full and not benchmark and not soak"
 
-# Every test, and more examples of each property.
+# All tests, with more examples of each property.
 test-all: .venv/.dev
 	HYPOTHESIS_PROFILE=full $(PYTEST) -q $(WORKERS)
 
-# The formatter, the linter, the types, the rules of the house and the container's files. The
-# site of the documents is built, and any warning ends it. The rest of the tests is not run a second time here: `make test` has warnings as errors already.
+# Formatter, linter, type checker, architecture rules, container files, and the documents, which are
+# built as a site with warnings as errors.
 check: .venv/.dev
 	$(BIN)/ruff format --check .
 	$(BIN)/ruff check .
@@ -48,25 +48,25 @@ check: .venv/.dev
 	$(BIN)/python docs/make_site.py
 	$(PYTEST) -q tests/test_house.py tests/test_docs.py
 
-# The documents as pages that are read without internet: build/site/index.html.
+# The documents as a site for reading offline: build/site/index.html.
 site: .venv/.dev
 	$(BIN)/python docs/make_site.py
 
-# Tests marked `benchmark` and `soak`, which `make test` leaves out. No such test: status 5.
-# The figures are kept in build/bench.json (or BENCH_JSON), and compared with those there before.
+# Tests marked `benchmark` and `soak`, which `make test` leaves out. The figures are written to
+# build/bench.json (or BENCH_JSON), and compared with the previous ones there.
 bench: .venv/.dev
 	$(PYTEST) -q -s -m benchmark
 
 soak: .venv/.dev
 	$(PYTEST) -q -s -m soak --timeout=0
 
-# What fails is left in build/fuzz/TARGET/crash-…; what reaches new code goes into the corpus.
+# Failing inputs are in build/fuzz/TARGET/crash-…; inputs that reach new code join the corpus.
 FUZZ_SECONDS = 600
 fuzz: .venv/.dev
 	@for target in framing fold recovery settings http; do \
 	    $(BIN)/python tests/fuzzing/run.py $$target $(FUZZ_SECONDS) --keep || exit 1; done
 
-# Every error and notice that the tests cause, in docs/messages.md.
+# Collects every error and notice that the tests cause in docs/messages.md.
 messages: .venv/.dev
 	rm -f build/texts.jsonl && mkdir -p build
 	COLLECT_TEXTS=build/texts.jsonl $(PYTEST) -q $(WORKERS) -m "not full and not benchmark and not soak"
@@ -76,7 +76,7 @@ format: .venv/.dev
 	$(BIN)/ruff format .
 	$(BIN)/ruff check --fix .
 
-# Recordings are left alone.
+# Keeps recordings.
 clean:
 	rm -rf .venv build dist .pytest_cache .mypy_cache .ruff_cache .hypothesis \
 	    .import_linter_cache .coverage htmlcov *.egg-info
@@ -84,14 +84,14 @@ clean:
 
 # --- the environment ----------------------------------------------------------------------------
 
-# The stamp holds the directory that .venv was made in: a moved or copied one is made again.
+# The stamp contains the directory of .venv: a moved or copied .venv is created again.
 ifneq ($(shell test -x $(BIN)/python && cat .venv/.runtime 2>/dev/null),$(CURDIR))
 .venv/.runtime: FORCE
 endif
 
 .venv/.runtime: requirements.lock pyproject.toml
 	@$(find_python); \
-	echo "making .venv with $$($$python -V) (once; one to four minutes)"; \
+	echo "creating .venv with $$($$python -V) (once; one to four minutes)"; \
 	"$$python" -m venv --clear .venv
 	@$(PIP) -r requirements.lock
 	@$(PIP:--require-hashes=) --no-deps --no-build-isolation --editable .
@@ -102,7 +102,7 @@ endif
 	@$(PIP) -r requirements-dev.lock
 	@touch $@
 
-# Sets $$python to the first interpreter that will do, or says in one line what is missing.
+# Sets $$python to the first suitable interpreter, or prints in one line what is missing.
 define find_python
 python=; old=; bare=; \
 for p in $(if $(PYTHON),'$(PYTHON)',python3.13 python3.12 python3.11 python3); do \
@@ -124,11 +124,11 @@ if [ -z "$$python" ]; then \
 fi
 endef
 
-# Every version and hash, without the address of any registry.
+# Versions and hashes, without registry addresses.
 COMPILE = $(UV) pip compile pyproject.toml --universal --python-version 3.11 \
     --fork-strategy fewest --generate-hashes --no-header --no-annotate --quiet $(UPGRADE)
 
-# Keeps the versions that still fit; `make lock UPGRADE=--upgrade` takes the newest.
+# Keeps versions that still satisfy pyproject.toml; `make lock UPGRADE=--upgrade` takes the newest.
 lock:
 	@command -v $(UV) >/dev/null || { echo "make lock needs uv; name it with UV=..." >&2; exit 1; }
 	$(COMPILE) --group build --output-file requirements.lock

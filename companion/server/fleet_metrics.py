@@ -35,7 +35,7 @@ def fleet_metrics(node: Node) -> Iterator[Metric]:
         "companion_fleet_elsewhere", "UAVs that only other nodes serve", value=served.elsewhere
     )
     yield GaugeMetricFamily(
-        "companion_fleet_unserved", "UAVs that no node serves", value=len(served.nobody)
+        "companion_fleet_unserved", "UAVs that no node serves", value=len(served.unserved)
     )
     yield CounterMetricFamily(
         "companion_fleet_handovers", "UAVs that this node took or gave up", value=member.handed_over

@@ -27,7 +27,7 @@ class Served:
 
     node: str  # this node
     by: Mapping[str, list[str]]  # nodes that serve each UAV, without excluded nodes
-    nobody: Mapping[str, Blame]  # UAVs that no node serves, with the reason
+    unserved: Mapping[str, Blame]  # UAVs that no node serves, with the reason
     elsewhere: int  # number of UAVs that only other nodes serve
 
     def is_here(self, uav: str) -> bool:
@@ -46,15 +46,15 @@ def served_uavs(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> 
     tracks = pipeline.tracks(now_ns, now_ns, alone) if alone else []
     full = _full(member, now_ns) if tracks else {}
     offers = offers_of(member) if tracks else {}
-    nobody = dict[str, Blame]()
+    unserved = dict[str, Blame]()
     for track in tracks:
         given = offers.get(track.uav, {})
         able = [
             full.get(node, False) for node, one in given.items() if offer_value_db(one) is not None
         ]
-        nobody[track.uav] = blame.of_unserved(track, reached=bool(able), full=all(able))
+        unserved[track.uav] = blame.of_unserved(track, reached=bool(able), full=all(able))
     elsewhere = sum(uav in by and member.name not in by[uav] for uav in wanted)
-    return Served(node=member.name, by=by, nobody=nobody, elsewhere=elsewhere)
+    return Served(node=member.name, by=by, unserved=unserved, elsewhere=elsewhere)
 
 
 def offers_of(member: FleetMember) -> dict[str, dict[str, Offer]]:

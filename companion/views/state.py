@@ -167,5 +167,5 @@ def summary(node: Node, now_ns: int) -> Headline:
     if served is None:
         return health.summary(verdicts.values(), machine)
     here = [one for uav, one in verdicts.items() if served.is_here(uav)]
-    nobody, elsewhere = len(served.nobody), served.elsewhere
-    return health.summary(here, machine, unserved=nobody, elsewhere=elsewhere)
+    unserved, elsewhere = len(served.unserved), served.elsewhere
+    return health.summary(here, machine, unserved=unserved, elsewhere=elsewhere)

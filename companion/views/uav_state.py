@@ -143,7 +143,7 @@ def _state(
     is_target = pipeline.targets.wants(uav)
     is_here = served is None or served.is_here(uav)
     judged = pipeline.health.verdicts.get(uav) if is_here else None
-    unserved = None if served is None else served.nobody.get(uav)
+    unserved = None if served is None else served.unserved.get(uav)
     level, why = health.verdict(judged, machine, unserved)
     newest, aircraft = pipeline.tracker.newest(uav), pipeline.senders.aircraft
     report = newest.report if newest else None

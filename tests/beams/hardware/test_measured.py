@@ -2,6 +2,7 @@
 
 import os
 import pickle
+import tracemalloc
 from pathlib import Path
 from typing import Any
 
@@ -174,12 +175,27 @@ class Evil:
         (b"", "not a pickle"),
         (pickle.dumps([0.0] * 8)[:-3], "not a pickle"),
         (b"0" * 20_000, "more than a list"),
+        (b"\x80\x02]r\xff\xff\xff\x7f.", "list of 8"),  # a memo index of 2^31
+        (b"\x80\x02}.", "opcode EMPTY_DICT"),
+        (b"\x80\x04\x95" + b"\xff" * 7 + b"\x7f].", "not a"),  # a frame of 2^63 bytes
+        (b"(" * 9_000 + b"l.", "list of 8"),
+        (b"a.", "not a pickle"),
+        (b"h\x00.", "not a pickle"),
     ],
 )
 def test_a_pickle_of_anything_else_is_refused(data: bytes, said: str) -> None:
     with pytest.raises(UserError, match=said):
         phaser_pickles.numbers("phase calibration", data)
     assert not Path("/tmp/pickled").exists()
+
+
+def test_a_pickle_takes_no_more_memory_than_its_size() -> None:
+    data = b"\x80\x02]" + b"r\xff\xff\xff\x7f" * 1_900 + b"."
+    tracemalloc.start()
+    with pytest.raises(UserError):
+        phaser_pickles.numbers("phase calibration", data)
+    assert tracemalloc.get_traced_memory()[1] < 10_000_000
+    tracemalloc.stop()
 
 
 def test_the_command_reads_a_phaser_s_folder(tmp_path: Path) -> None:

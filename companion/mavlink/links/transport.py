@@ -32,8 +32,10 @@ from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
 from companion.mavlink.trust.duplicate_ids import DuplicateIds
+from companion.mavlink.wire.cot_link import SENDER, TUNNEL
 from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
+from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
 
 __all__ = ["Link", "LinkStatus", "MessageSigning", "Notify", "Receive", "endpoint"]
@@ -170,6 +172,8 @@ class Link:
             self._overflow(frames)
 
     def _pass_on(self, peer: Peer, found: list[Frame | Rejection]) -> None:
+        if not isinstance(peer.splitter, ForeignSplitter):
+            found = [_checked_origin(item) for item in found]
         if self._guard is not None:
             found = [_checked_by_guard(self._guard, item) for item in found]
         self._peers.count(peer, found)
@@ -303,6 +307,19 @@ def _checked_timesync(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
     who = str(item.source)
     return Rejection(
         t_ns=item.t_ns, source=who, reason=Reason.UNPLACED_STAMP, msgid=TIMESYNC, detail=detail
+    )
+
+
+def _checked_origin(item: Frame | Rejection) -> Frame | Rejection:
+    """Return the item, or its rejection if only a Cursor on Target link makes such messages.
+
+    Any MAVLink peer could otherwise make tracks of aircraft, as if a receiver had reported them.
+    """
+    if isinstance(item, Rejection) or item.msgid != TUNNEL or item.source != SENDER:
+        return item
+    who, detail = str(item.source), "TUNNEL: this sender is a Cursor on Target link of the service"
+    return Rejection(
+        t_ns=item.t_ns, source=who, reason=Reason.NOT_ALLOWED, msgid=TUNNEL, detail=detail
     )
 
 

@@ -1,4 +1,4 @@
-"""Aiming: who gets a beam, where it points, and what turning the world changes."""
+"""Aiming: selection of UAVs, pointing, and invariance under rotations of the world."""
 
 import math
 from dataclasses import replace
@@ -118,11 +118,12 @@ def test_the_attitude_s_bound_turns_every_direction() -> None:
     assert near.pointing_bound_rad == pytest.approx(math.asin(0.07) + 0.05)
     assert anywhere.pointing_bound_rad is None
     (beam,) = pointed(tracks[:1], carrier(attitude_bound_rad=math.pi)).beams
-    assert beam.pointing_bound_rad == math.pi  # no direction lies farther away
+    assert beam.pointing_bound_rad == math.pi  # the largest possible angle
 
 
 def test_a_true_direction_lies_within_the_pointing_bound() -> None:
-    """The worst of both errors at once: positions apart across, the attitude turned further."""
+    """Worst case of both errors: a lateral position error plus an attitude error in the same
+    sense."""
     tracks = [track("a", (100, 0, 0), bound_m=6.0)]
     (beam,) = pointed(tracks, carrier(bound_m=2.0, attitude_bound_rad=0.1)).beams
     assert beam.pointing_bound_rad is not None
@@ -136,7 +137,7 @@ def test_a_true_direction_lies_within_the_pointing_bound() -> None:
 
 
 def test_a_wrong_attitude_swings_an_array_that_stands_off() -> None:
-    """Ten metres off the point that is reported, a UAV two metres away, two degrees."""
+    """Lever arm of 10 m, a UAV 2 m from the array, attitude error of 2 degrees."""
     array = uniform_linear(
         8,
         30e9,
@@ -167,7 +168,7 @@ def test_a_wrong_attitude_swings_an_array_that_stands_off() -> None:
 
 
 def test_weights_respond_to_their_own_direction_alone() -> None:
-    """By the phases written out for elements along y, half a wave apart."""
+    """Compared with explicit phases for elements along y, half a wavelength apart."""
     found = pointed([track(uav, place) for uav, place in PLACES.items()], carrier())
     assert (found.method, found.regularised) == (Method.ZERO_FORCING, False)
     assert found.weights.shape == (16, 3)
@@ -256,33 +257,33 @@ def test_turning_the_carrier_is_turning_the_world_the_other_way(seed: int) -> No
     array = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=mount)
     tracks = [track(uav, np.array(p)) for uav, p in PLACES.items()]
     plain = pointed(tracks, carrier(tuple(place), pose), array)
-    # The world, carrier included, turned and moved.
+    # The world, carrier included, rotated and translated.
     moved = [track(uav, turn @ np.array(p) + shift) for uav, p in PLACES.items()]
     turned = carrier(tuple(turn @ place + shift), pose @ turn.T)
     assert_same_beams(plain, pointed(moved, turned, array))
-    # The mount turned one way and the carrier the other.
+    # The mount rotated one way and the carrier the other.
     other = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=mount @ turn)
     assert_same_beams(plain, pointed(tracks, carrier(tuple(place), turn.T @ pose), other))
-    # The mount alone, or the carrier alone: the same, for they follow one another.
+    # The mount alone or the carrier alone: equal, since the rotations are composed.
     straight = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     assert_same_beams(plain, pointed(tracks, carrier(tuple(place), mount @ pose), straight))
 
 
 def test_a_mount_that_looks_right_sees_the_right_ahead() -> None:
-    """Array yawed by 90 degrees: body's right is its boresight."""
+    """Array yawed by 90 degrees: its boresight is the body's right."""
     right = Rotation.from_euler("ZYX", [math.pi / 2, 0, 0]).as_matrix().T
     array = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=right)
     (beam,) = pointed([track("a", (0, 100, 0))], carrier(), array).beams
     assert beam.azimuth_rad == pytest.approx(0.0, abs=1e-12)
 
 
-# --- the array on its carrier -------------------------------------------------------------------
+# --- array on its carrier -----------------------------------------------------------------------
 
 
 @settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1))
 def test_the_lever_arm_turns_with_the_carrier(seed: int) -> None:
-    """An array beside the navigation point is an array at that place."""
+    """An array with a lever arm equals an array at the resulting position."""
     rng = np.random.default_rng(seed)
     pose = Rotation.random(rng=rng).as_matrix()
     lever = rng.uniform(-3, 3, 3)
@@ -297,8 +298,8 @@ def test_the_lever_arm_turns_with_the_carrier(seed: int) -> None:
 
 
 def test_the_lever_arm_is_in_the_body_frame() -> None:
-    """Two metres below the belly of a carrier that lies on its right side: two metres to its west,
-    when it looks north."""
+    """The array is two metres below a carrier that lies on its right side and faces north: two
+    metres to its west."""
     array = uniform_linear(
         16,
         30e9,
@@ -316,7 +317,7 @@ def test_the_lever_arm_is_in_the_body_frame() -> None:
 @settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1))
 def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: int) -> None:
-    """Weights and all: any geometry, elements that face somewhere, a lever arm."""
+    """Weights included: any geometry, directional elements, a lever arm."""
     rng = np.random.default_rng(seed)
     turn, mount, pose = (m.as_matrix() for m in Rotation.random(3, rng=rng))
     elements = rng.uniform(-0.02, 0.02, (12, 3))
@@ -331,7 +332,7 @@ def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: in
     moved = [track(uav, turn @ np.array(p) + shift) for uav, p in PLACES.items()]
     world = carrier(turn @ place + shift, pose @ turn.T)
     assert_same_beams(plain, pointed(moved, world, array))
-    # The body's axes named otherwise: the mount and the lever arm turn with them.
+    # Renamed body axes: mount and lever arm rotate with them.
     other = listed(
         elements,
         30e9,
@@ -343,7 +344,7 @@ def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: in
     assert_same_beams(plain, pointed(tracks, carrier(place, turn.T @ pose), other))
 
 
-# --- what cannot be pointed at ------------------------------------------------------------------
+# --- UAVs without a beam ------------------------------------------------------------------------
 
 
 def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
@@ -412,7 +413,7 @@ def test_two_uavs_at_one_point_are_defined_under_every_policy(policy: Policy) ->
 
 
 def test_straight_above_is_a_direction_like_any_other() -> None:
-    """A line along y sees it at right angles; its azimuth says nothing."""
+    """A line along y sees it broadside; its azimuth is meaningless."""
     tracks = [track("up", (0, 0, -100)), track("right", (0, 100, 0))]
     found = pointed(tracks, carrier())
     assert found.uavs == ("up", "right")
@@ -456,7 +457,7 @@ def test_a_beam_says_that_it_was_widened() -> None:
 
 
 def test_a_uav_that_can_be_anywhere_has_a_sharp_beam() -> None:
-    """No floor could be kept, so none is paid for."""
+    """No floor gain could be guaranteed, so the beam is not widened."""
     tracks = [track("a", (100, 20, 0), bound_m=0.1), track("b", (100, -60, 0), bound_m=500.0)]
     near, anywhere = pointed(tracks, carrier()).beams
     assert (near.widened, anywhere.widened) == (False, False)
@@ -465,7 +466,8 @@ def test_a_uav_that_can_be_anywhere_has_a_sharp_beam() -> None:
 
 
 def test_the_usual_angle_is_that_of_both_positions_and_of_the_attitude() -> None:
-    """As squares; what is not known is a quarter of its bound, and nothing is beyond the bound."""
+    """Root sum of squares; an unknown term counts as a quarter of its bound; the sum is at most the
+    bound."""
     known = replace(track("a", (100, 0, 0), bound_m=8.0), error_p95_m=3.0)
     at = carrier(bound_m=6.0, attitude_bound_rad=0.2)
     at = replace(at, error_p95_m=4.0, attitude_p95_rad=0.04)
@@ -478,7 +480,7 @@ def test_the_usual_angle_is_that_of_both_positions_and_of_the_attitude() -> None
 
 
 def test_what_is_said_of_a_beam_is_of_its_own_uav_when_others_are_dropped() -> None:
-    """The first is left out: bounds, widths and gains are not those of one place before."""
+    """The first UAV is dropped: bounds, widths and gains must not shift by one position."""
     tracks = [
         track("twin", (80, 60, 0), bound_m=3.0),
         track("kept", (80, 60, 0), bound_m=0.2),
@@ -509,8 +511,8 @@ def test_what_is_said_of_a_beam_is_of_its_own_uav_when_others_are_dropped() -> N
 
 
 def test_what_is_not_covered_is_left_out_in_the_frames_that_its_limits_are_in() -> None:
-    """Array yawed to the right on a carrier that heads east: steering limits turn with the array,
-    what the airframe hides with the carrier."""
+    """Array yawed right on a carrier heading east: steering limits rotate with the array, airframe
+    shadows with the carrier."""
     right = Rotation.from_euler("z", math.pi / 2).as_matrix().T
     array = uniform_linear(
         16,
@@ -527,7 +529,7 @@ def test_what_is_not_covered_is_left_out_in_the_frames_that_its_limits_are_in() 
         elevation_to_rad=math.pi / 2,
     )
     tracks = [
-        track("ahead", (-100, 0, 0)),  # south: right of the nose, the array's boresight
+        track("ahead", (-100, 0, 0)),  # south: to the right of the nose, on the array's boresight
         track("aside", (-60, 80, 0)),
         track("behind", (100, 0, 0)),
     ]
@@ -561,11 +563,11 @@ def test_what_is_not_covered_is_left_out_in_the_frames_that_its_limits_are_in() 
     assert all("outside the steering limits" in out.reason for out in found.left_out)
 
 
-# --- how fast the angles change -----------------------------------------------------------------
+# --- angle rates --------------------------------------------------------------------------------
 
 
 def integrated(rates: FloatArray, seconds: float) -> FloatArray:
-    """Axes that turn at constant rates about themselves, seen from where they were."""
+    """Integrate axes that rotate at constant body rates, seen from their initial frame."""
     turned: FloatArray = Rotation.from_rotvec(rates * seconds).as_matrix().T
     return turned
 
@@ -573,7 +575,7 @@ def integrated(rates: FloatArray, seconds: float) -> FloatArray:
 @settings(max_examples=examples(200))
 @given(st.integers(0, 2**32 - 1))
 def test_rates_are_those_of_positions_and_of_the_turning_carrier(seed: int) -> None:
-    """Central differences of what is aimed at a moment earlier and later."""
+    """Central differences of the angles a moment earlier and later."""
     rng = np.random.default_rng(seed)
     pose, mount = (m.as_matrix() for m in Rotation.random(2, rng=rng))
     array = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=mount)
@@ -590,7 +592,7 @@ def test_rates_are_those_of_positions_and_of_the_turning_carrier(seed: int) -> N
     h_s = 1e-5
     before, beam, after = at(-h_s), at(0.0), at(h_s)
     if beam is None or abs(beam.elevation_rad) > 1.5 or beam.range_m < 10.0:
-        return  # where a finite difference says little
+        return  # a finite difference is inaccurate there
     assert before is not None
     assert after is not None
     turned = (after.azimuth_rad - before.azimuth_rad + math.pi) % (2 * math.pi) - math.pi
@@ -602,19 +604,21 @@ def test_rates_are_those_of_positions_and_of_the_turning_carrier(seed: int) -> N
 
 
 def test_a_turning_carrier_alone_moves_the_beam_the_other_way() -> None:
-    """Yaw to the right sends what is ahead to the left, roll to the right lifts the right."""
+    """Yaw to the right moves the UAV ahead to the left; roll to the right raises the UAV on the
+    right."""
     ahead, right = track("a", (100, 0, 0), velocity=STILL), track("b", (0, 100, 0), velocity=STILL)
     at = carrier(velocity=STILL, rates=np.array([0.2, 0.0, 0.3]))
     one, other = pointed([ahead, right], at).beams
     assert one.azimuth_rate_radps == pytest.approx(-0.3)
     assert one.elevation_rate_radps == pytest.approx(0.0)
     assert other.azimuth_rate_radps == pytest.approx(-0.3)
-    assert other.elevation_rate_radps == pytest.approx(0.2)  # the right wing sinks below it
+    assert other.elevation_rate_radps == pytest.approx(0.2)  # the right wing drops below it
     assert (one.range_rate_mps, other.range_rate_mps) == (0.0, 0.0)
 
 
 def test_an_array_on_a_boom_swings_with_the_turning_carrier() -> None:
-    """10 m ahead of the centre at 0.3 rad/s to the right: 3 m/s sideways, towards what is right."""
+    """10 m ahead of the centre at 0.3 rad/s to the right: the array moves sideways at 3 m/s, to the
+    right."""
     array = uniform_linear(
         16,
         30e9,
@@ -650,7 +654,7 @@ def test_a_rate_that_is_not_known_is_none() -> None:
 
 
 def test_behind_the_field_of_view_there_is_no_beam_and_no_null() -> None:
-    """Who is in view gets the beam that it would have alone: nothing is spent on the other."""
+    """UAVs in view get the beam that they would have alone: no gain is spent on the others."""
     view = Coverage(field_of_view_rad=math.radians(120))
     ahead = track("ahead", (80, 60, 0))
     tracks = [ahead, track("aside", (10, 99, 0)), track("behind", (-80, 60, 0))]
@@ -693,11 +697,11 @@ def test_who_is_spared_has_a_null_on_him_and_none_of_the_power(normalisation: st
     power = np.abs(spared.weights) ** 2
     used = power.sum() if normalisation == "total" else power.sum(axis=1).max() * ARRAY.size
     assert used == pytest.approx(1.0)
-    np.testing.assert_allclose(  # the shares of those who stay are as they were
+    np.testing.assert_allclose(  # the power shares of the remaining UAVs are unchanged
         np.linalg.norm(spared.weights, axis=0)[0] / np.linalg.norm(spared.weights, axis=0)[1],
         np.linalg.norm(full.weights, axis=0)[0] / np.linalg.norm(full.weights, axis=0)[2],
     )
-    assert full.uavs == ("1:1", "2:1", "3:1")  # and what was made stays as it was
+    assert full.uavs == ("1:1", "2:1", "3:1")  # the original beams are unchanged
 
 
 def test_a_turn_that_was_of_the_spared_alone_is_none() -> None:
@@ -746,4 +750,4 @@ def test_precoding_gets_the_snr_and_the_worth_of_each_uav(monkeypatch: pytest.Mo
     )
     (radio,) = given
     assert radio.worths.tolist() == [1.0, 4.0]
-    assert radio.snr[0] == pytest.approx(4 * radio.snr[1])  # at half the distance
+    assert radio.snr[0] == pytest.approx(4 * radio.snr[1])  # half the distance

@@ -1,4 +1,4 @@
-"""Beams follow the directions without a step: the largest change of a sweep, down to rounding."""
+"""Beams are continuous in direction: the largest change of a sweep, refined down to rounding."""
 
 import itertools
 
@@ -40,11 +40,11 @@ ARRAYS = {
     "circle": uniform_circular(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE),
 }
 STEPS, HALVINGS = 24, 18
-"""Steps of a sweep, and how often the one of the largest change is halved: to .06 microdegrees."""
+"""Steps of a sweep, and halvings of its largest step: down to 0.06 microdegrees."""
 
 
 class Scene:
-    """UAVs about one another, of which the first moves by .4 degrees."""
+    """Close UAVs, the first of which moves by 0.4 degrees."""
 
     def __init__(self, array: Array, widen: Widen, seed: int) -> None:
         rng = np.random.default_rng(seed)
@@ -55,7 +55,7 @@ class Scene:
         self._bounds_m = 100.0 * np.radians(rng.uniform(1.0, 14.0, users))
 
     def beams(self, share: float) -> ComplexArray:
-        """Unit columns towards where the first one is after a share of its way."""
+        """Return normalised columns when the first UAV has covered a share of its path."""
         angles = self._angles.copy()
         angles[0] += share * self._way
         places = 100.0 * steering.unit_directions(*angles.T)

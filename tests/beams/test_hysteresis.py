@@ -1,4 +1,4 @@
-"""Beams that stay: shapes change at their pace, names and slots not at every update."""
+"""Hysteresis: shapes change at a limited rate; method and time slots change only after a delay."""
 
 import itertools
 import math
@@ -39,7 +39,7 @@ def track(uav: str, aside_m: float, bound_m: float) -> Track:
 def flown(
     bounds_m: list[float], how: Precoder, apart_m: list[float] | None = None, array: Array = ARRAY
 ) -> list[BeamSet]:
-    """A UAV whose bound changes from tick to tick, and one beside it."""
+    """Return beams for a UAV whose bound changes from tick to tick, with a second UAV beside it."""
     state: Hysteresis | None = None
     found = []
     for tick, bound_m in enumerate(bounds_m):
@@ -87,7 +87,7 @@ def test_in_the_end_the_shape_is_the_one_that_is_wanted() -> None:
 
 @pytest.mark.parametrize("widen", [Widen.LIKELY, Widen.GUARANTEE])
 def test_a_uav_that_is_known_exactly_keeps_its_narrow_shape(widen: Widen) -> None:
-    """Narrower than what shapes anything: a width is 1/32 rad."""
+    """Narrower than any shape; one natural width is 1/32 rad."""
     made = flown([0.3] * 5 + [0.5] * 20 + [0.3] * 20, Precoder(widen=widen))
     for tick, bound_m in ((4, 0.3), (24, 0.5), (44, 0.3)):
         wanted = math.asin(bound_m / 100)
@@ -97,7 +97,7 @@ def test_a_uav_that_is_known_exactly_keeps_its_narrow_shape(widen: Widen) -> Non
 
 
 def test_once_a_uav_is_known_well_its_beam_soon_promises() -> None:
-    """After it was known nowhere near, and after it was not known at all: within eight seconds."""
+    """After a large or missing bound, the shape reaches the new bound within eight seconds."""
     for before_m in (99.0, 1000.0):
         made = flown([before_m] * 20 + [4.0] * 80, Precoder())
         wanted = math.asin(0.04)
@@ -106,7 +106,7 @@ def test_once_a_uav_is_known_well_its_beam_soon_promises() -> None:
 
 
 def test_a_bound_that_rises_and_falls_with_reports_hardly_moves_its_shape() -> None:
-    """Twelve ticks from report to report; a width is 1/32 rad."""
+    """Twelve ticks between reports; one natural width is 1/32 rad."""
     made = flown([6.0 + 14.0 * (tick % 12) / 12 for tick in range(96)], Precoder())
     shaped = np.array([each.beams[0].shaped_bound_rad for each in made[24:]])
     assert np.diff(shaped).min() > -1.1 * 0.1 / 32
@@ -114,7 +114,7 @@ def test_a_bound_that_rises_and_falls_with_reports_hardly_moves_its_shape() -> N
 
 
 def test_zero_forcing_is_named_only_once_it_lasts() -> None:
-    """Through a place in which two cannot be told apart, and out of it again and again."""
+    """Two UAVs repeatedly become inseparable and separate again."""
     near, far = 0.05, 60.0
     apart = [far] * 3 + [near] + [far] * 3 + [near] + [far] * 9
     names = [each.method for each in flown([0.1] * len(apart), Precoder(), apart)]
@@ -125,7 +125,7 @@ def test_zero_forcing_is_named_only_once_it_lasts() -> None:
 
 @pytest.mark.parametrize("policy", [Policy.GROUP, Policy.DROP])
 def test_turns_do_not_change_to_and_fro(policy: Policy) -> None:
-    """About the distance at which zero forcing costs as much as it may."""
+    """Near the distance at which zero forcing reaches its loss limit."""
     apart = [1.38 + 0.06 * math.sin(2.1 * tick) for tick in range(40)]
     how = Precoder(policy=policy, widen=Widen.NO, priority=("b", "a"))
     sizes = [len(set(each.uavs)) + 10 * each.groups for each in flown([0.1] * 40, how, apart)]
@@ -140,7 +140,7 @@ def test_turns_do_not_change_to_and_fro(policy: Policy) -> None:
 
 @pytest.mark.parametrize("stopped_s", [100.0, 1000.0, 86_400.0, 2.0**31])
 def test_beams_go_on_after_any_pause(stopped_s: float) -> None:
-    """A process that was stopped (SIGSTOP) or a machine that was suspended ticks on much later."""
+    """The next tick comes much later after SIGSTOP or a suspended machine."""
     before = Hysteresis(
         valid_at_ns=0,
         shaped={"1:1": (0.01, 0.2)},

@@ -1,4 +1,4 @@
-"""Directions ahead, against the same thing done with positions and rotations."""
+"""Predicted directions against explicit positions and rotations."""
 
 import numpy as np
 import pytest
@@ -28,7 +28,8 @@ def flying(rng: np.random.Generator, acceleration: FloatArray | None) -> Track:
 @settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_directions_ahead_are_those_of_positions_ahead(seed: int, accelerates: bool) -> None:
-    """Velocities, acceleration, turning body, lever arm and mount, one time after the other."""
+    """Velocities, acceleration, rotating body, lever arm and mount, computed for one time at a
+    time."""
     rng = np.random.default_rng(seed)
     pose, mount = (m.as_matrix() for m in Rotation.random(2, rng=rng))
     lever, rates = rng.uniform(-3, 3, 3), rng.normal(0, 1, 3)
@@ -62,7 +63,7 @@ def test_directions_ahead_are_those_of_positions_ahead(seed: int, accelerates: b
 
 
 def test_through_the_array_itself_directions_stay_unit_vectors() -> None:
-    """A UAV that flies through it is at no direction for one instant."""
+    """A UAV that passes through the array has no direction for one instant."""
     array = uniform_linear(4, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     at = Carrier(
         valid_at_ns=9,

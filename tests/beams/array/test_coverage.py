@@ -1,4 +1,4 @@
-"""Where a beam may point: reasons by hand, and the margin against caps drawn at random."""
+"""Coverage of the array: rejection reasons by hand, and margins against randomly drawn caps."""
 
 import math
 
@@ -94,7 +94,7 @@ def limited(azimuths_deg: tuple[float, float], elevations_deg: tuple[float, floa
         (
             Coverage(hidden=(sector(-180, -170, -10, 10),)),
             FRONT,
-            towards(180, 0),  # 180 is -180
+            towards(180, 0),  # 180 and -180 degrees are equal
             "hidden by the airframe (azimuth -180 to -170, elevation -10 to 10)",
         ),
     ],
@@ -133,13 +133,23 @@ def test_of_several_reasons_the_first_counts_and_each_direction_has_its_own() ->
         (Coverage(field_of_view_rad=math.radians(300)), towards(0, 90), FRONT, 60.0),
         (limited((-180, 180), (-90, 90)), FRONT, FRONT, math.inf),
         (limited((-180, 180), (-90, 60)), towards(77, 20), FRONT, 40.0),
-        (limited((-180, 180), (-90, 60)), towards(77, -90), FRONT, 150.0),  # a pole is no edge
+        (
+            limited((-180, 180), (-90, 60)),
+            towards(77, -90),
+            FRONT,
+            150.0,
+        ),  # a pole does not count as an edge
         (limited((-60, 30), (-90, 90)), FRONT, FRONT, 30.0),
-        (limited((-60, 30), (-90, 90)), towards(0, 90), FRONT, 0.0),  # but a corner is
+        (limited((-60, 30), (-90, 90)), towards(0, 90), FRONT, 0.0),  # a corner does
         (limited((150, -150), (-90, 90)), towards(-170, 0), FRONT, 20.0),
         (Coverage(hidden=(BOX,)), FRONT, towards(45, 7), 7.0),
         (Coverage(hidden=(BOX,)), FRONT, towards(10, 0), 20.0),
-        (Coverage(hidden=(BOX,)), FRONT, towards(-135, 0), 90.0),  # behind: the pole is nearest
+        (
+            Coverage(hidden=(BOX,)),
+            FRONT,
+            towards(-135, 0),
+            90.0,
+        ),  # behind: the pole is the nearest edge
         (Coverage(hidden=(sector(-180, 180, 30, 90),)), FRONT, towards(10, -90), 120.0),
         (Coverage(hidden=(sector(170, -170, -10, 10),)), FRONT, towards(180, 15), 5.0),
         (Coverage(hidden=(sector(170, -170, -10, 10),)), FRONT, towards(180, 10), 0.0),
@@ -154,7 +164,7 @@ def test_margins_known_by_geometry(
 
 
 def drawn(rng: np.random.Generator) -> Sector:
-    """Any sector: thin ones, ones around the pole, across the tail, all around."""
+    """Draw any sector: thin ones, around a pole, across 180 degrees, over all azimuths."""
     low, high = np.sort(rng.choice([-90.0, 90.0, *rng.uniform(-90, 90, 3)], 2, replace=False))
     if rng.random() < 0.2:
         return sector(-180, 180, low, high)
@@ -164,7 +174,7 @@ def drawn(rng: np.random.Generator) -> Sector:
 
 
 def edge(of: Sector, points: int) -> FloatArray:
-    """Directions all along the edge of a sector."""
+    """Return directions along the whole edge of a sector."""
     share = np.linspace(0, 1, points)
     azimuths = of.azimuth_from_rad + share * of.width_rad
     low, high = of.elevation_from_rad, of.elevation_to_rad
@@ -179,7 +189,7 @@ def edge(of: Sector, points: int) -> FloatArray:
 
 
 def about(direction: FloatArray, radius: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Directions at angles ``radius`` (N,) from one, around it at random."""
+    """Return random directions at angles ``radius`` (N,) from a given one."""
     aside = rng.standard_normal((len(radius), 3))
     aside -= (aside @ direction)[:, np.newaxis] * direction
     aside /= np.linalg.norm(aside, axis=1)[:, np.newaxis]
@@ -187,7 +197,7 @@ def about(direction: FloatArray, radius: FloatArray, rng: np.random.Generator) -
 
 
 def random_direction(rng: np.random.Generator, near: FloatArray) -> FloatArray:
-    """Anywhere, straight up or behind, or close to one of those given."""
+    """Return a direction anywhere, straight up, straight behind, or close to a given one."""
     if rng.random() < 0.2:
         poles = np.array([[0, 0, 1], [0, 0, -1], [-1, 0, 0], [-1, -0.0, 0], [0, 1, 0.0]])
         return poles[rng.integers(5)]
@@ -210,7 +220,7 @@ def cone_edge(half_rad: float, points: int) -> FloatArray:
 @given(SEEDS)
 @settings(max_examples=examples(300), deadline=None)
 def test_the_margin_is_the_nearest_edge_and_nothing_nearer_is_refused(seed: int) -> None:
-    """All limits together, the array mounted at random on the body."""
+    """All limits combined, with the array mounted at random on the body."""
     rng = np.random.default_rng(seed)
     view = float(rng.uniform(0.5, 2 * math.pi)) if rng.random() < 0.3 else None
     steered = drawn(rng)

@@ -1,4 +1,4 @@
-"""Element patterns: the standard's table, total power by integration, adversaries for the range."""
+"""Element patterns against the 3GPP table, integrated power, and adversarial amplitude ranges."""
 
 import math
 
@@ -35,7 +35,7 @@ def gain_dbi(element: Element, azimuth_deg: float, elevation_deg: float) -> floa
     ("azimuth_deg", "elevation_deg", "dbi"),
     [
         (0, 0, 8.0),
-        (32.5, 0, 5.0),  # 65 degrees between half powers
+        (32.5, 0, 5.0),  # half-power width of 65 degrees
         (0, -32.5, 5.0),
         (-65, 0, -4.0),
         (65, 32.5, -7.0),
@@ -54,11 +54,11 @@ def test_known_gains_of_the_standards_element(
 
 @given(st.floats(0, 180), st.floats(-180, 180))
 def test_the_standards_element_is_the_table_written_out(zenith_deg: float, phi_deg: float) -> None:
-    """3GPP TR 38.901 table 7.3-1 has theta from the zenith: 90 degrees is level."""
+    """3GPP TR 38.901 table 7.3-1 measures theta from the zenith: 90 degrees is level."""
     vertical_db = -min(12 * ((zenith_deg - 90) / 65) ** 2, 30)
     horizontal_db = -min(12 * (phi_deg / 65) ** 2, 30)
     dbi = 8 - min(-(vertical_db + horizontal_db), 30)
-    if 0.001 < zenith_deg < 179.999:  # at a pole no azimuth is left in the vector
+    if 0.001 < zenith_deg < 179.999:  # at a pole the vector has no azimuth
         assert gain_dbi(TR38901, phi_deg, 90 - zenith_deg) == pytest.approx(dbi, abs=1e-6)
 
 
@@ -66,7 +66,7 @@ def test_the_standards_element_is_the_table_written_out(zenith_deg: float, phi_d
 def test_a_cosine_element_radiates_all_of_its_power(exponent: float) -> None:
     """The integral of the power gain over the sphere is 4 pi."""
     nodes, shares = np.polynomial.legendre.leggauss(400)
-    cosine, weight = (nodes + 1) / 2, shares / 2  # ahead; nothing is behind
+    cosine, weight = (nodes + 1) / 2, shares / 2  # ahead; nothing is radiated behind
     across = np.sqrt(1 - cosine**2)
     element = Element(ElementPattern.COSINE, exponent)
     total = 0.0
@@ -102,7 +102,8 @@ def test_amplitudes_and_ranges_keep_the_shape_of_the_directions(element: Element
 
 
 def about(direction: FloatArray, radius: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Directions at angles ``radius`` (N,) from one: at random, and at four right angles."""
+    """Return directions at angles ``radius`` (N,) from one: random ones and four at right
+    angles."""
     aside = rng.standard_normal((len(radius), 3))
     up = np.array([0, 0, 1.0]) if abs(direction[2]) < 0.9 else np.array([1.0, 0, 0])
     aside[:2], aside[2:4] = [up, -up], [np.cross(direction, up), -np.cross(direction, up)]
@@ -112,7 +113,8 @@ def about(direction: FloatArray, radius: FloatArray, rng: np.random.Generator) -
 
 
 def random_direction(rng: np.random.Generator) -> FloatArray:
-    """Anywhere; outward, behind, level aside, at a pole, or hard by one of these."""
+    """Return a direction anywhere, outward, behind, level, at a pole, or very close to one of
+    these."""
     drawn = rng.standard_normal(3)
     if rng.random() < 0.6:
         places = np.array([[1, 0, 0], [-1, 0, 0], [0, 1, 0], [0, 0, 1], [0, 0, -1.0]])
@@ -131,7 +133,7 @@ def test_no_direction_within_the_radius_is_out_of_the_range(element: Element, se
     least, most = element.amplitude_range(direction, radius)
     share = np.append(np.ones(150), np.sqrt(rng.random(250)))
     found = element.amplitude(about(direction, radius * share, rng))
-    # A direction is rounded to 1e-16; level aside, where a root of the cosine is steep, that shows.
+    # Rounding of 1e-16 in a direction is visible sideways, where a root of the cosine is steep.
     slack = 1e-12
     if element.pattern is ElementPattern.COSINE:
         slack += 3 * (1e-15) ** (element.exponent / 2)
@@ -145,7 +147,7 @@ def test_no_direction_within_the_radius_is_out_of_the_range(element: Element, se
 @given(seed=SEEDS)
 @settings(max_examples=examples(60), deadline=None)
 def test_the_range_is_attained_by_the_cosine(seed: int) -> None:
-    """Straight towards outward and straight away from it."""
+    """The extremes lie straight along the outward direction and straight opposite to it."""
     rng = np.random.default_rng(seed)
     element = Element(ElementPattern.COSINE, float(rng.uniform(1, 4)))
     off, radius, turn = rng.uniform(0, math.pi), rng.uniform(0, math.pi), rng.uniform(0, 6.3)
@@ -163,7 +165,7 @@ def test_the_range_is_attained_by_the_cosine(seed: int) -> None:
 
 @pytest.mark.parametrize("degrees", [-70, -20, 0, 10, 35, 70])
 def test_the_range_of_the_standards_element_is_tight_in_its_main_cuts(degrees: float) -> None:
-    """The most is attained; the least is, but for the corner that the two cuts make together."""
+    """The maximum is attained; so is the minimum, except in the corner where both cuts combine."""
     radius = math.radians(15)
     far, near = abs(degrees) + 15, max(abs(degrees) - 15, 0)
     least, most = TR38901.amplitude_range(towards(degrees, 0), radius)

@@ -1,4 +1,4 @@
-"""Element positions, where elements face, and which mirror one another."""
+"""Element positions, outward directions, and mirror symmetry."""
 
 import math
 
@@ -11,7 +11,7 @@ from companion.values import FloatArray, UserError
 
 EYE = np.eye(3)
 LIGHT = geometry.SPEED_OF_LIGHT_MPS
-"""The frequency at which a metre is a wavelength."""
+"""Frequency at which the wavelength is one metre."""
 
 
 def test_elements_stand_along_y() -> None:
@@ -86,7 +86,7 @@ def test_a_circle_has_its_spacing_between_neighbours_and_starts_at_boresight(ele
     assert array.elements_m[0] == pytest.approx([radii[0], 0, 0])
     assert not array.elements_m[:, 2].any()
     turn = math.atan2(array.elements_m[1, 1], array.elements_m[1, 0])
-    assert turn == pytest.approx(2 * math.pi / elements)  # from x towards y
+    assert turn == pytest.approx(2 * math.pi / elements)  # from x to y
 
 
 def test_a_circle_of_one_stands_at_the_origin() -> None:
@@ -149,7 +149,7 @@ def test_what_is_listed_is_kept() -> None:
     assert array.elements_m is places
     assert array.lever_arm_m is lever
     assert array.element is COSINE
-    assert array.element_from_array is None  # all along boresight
+    assert array.element_from_array is None  # all on the boresight axis
     assert not geometry.listed(places, 2e9, array_from_body=EYE).lever_arm_m.any()
     for made in (geometry.uniform_linear, geometry.uniform_circular):
         array = made(

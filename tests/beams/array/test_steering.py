@@ -1,4 +1,4 @@
-"""Steering vectors by brute force; the pointing bound against an adversary."""
+"""Steering vectors against direct sums; the pointing bound against an adversary."""
 
 import cmath
 import math
@@ -27,13 +27,13 @@ DIRECTIONS = st.lists(st.tuples(AZIMUTHS, ELEVATIONS), min_size=1, max_size=6)
 
 
 def unit(azimuth_rad: float, elevation_rad: float) -> tuple[float, float, float]:
-    """x boresight, y right, z down."""
+    """Return a unit vector; x is boresight, y right, z down."""
     level = math.cos(elevation_rad)
     return (level * math.cos(azimuth_rad), level * math.sin(azimuth_rad), -math.sin(elevation_rad))
 
 
 def test_the_known_steering_vector() -> None:
-    """Five elements at 0, .1, ..., .4 m, 1 GHz, 45 degrees."""
+    """Five elements at 0, 0.1, ..., 0.4 m, 1 GHz, 45 degrees."""
     elements = np.array([[0.0, 0.1 * m, 0.0] for m in range(5)])
     array = Array(
         kind="list", elements_m=elements, wavelength_m=299_792_458 / 1e9, array_from_body=np.eye(3)
@@ -46,7 +46,7 @@ def test_the_known_steering_vector() -> None:
 
 @given(DIRECTIONS, st.integers(0, 2**32 - 1))
 def test_steering_is_the_sum_written_out(angles: list[tuple[float, float]], seed: int) -> None:
-    """Elements anywhere in space."""
+    """Elements at arbitrary positions in space."""
     elements = np.random.default_rng(seed).uniform(-0.05, 0.05, (7, 3))
     array = Array(kind="list", elements_m=elements, wavelength_m=0.01, array_from_body=np.eye(3))
     directions = np.array([unit(*pair) for pair in angles])
@@ -60,7 +60,7 @@ def test_steering_is_the_sum_written_out(angles: list[tuple[float, float]], seed
 
 @given(st.floats(-1.5, 1.5))
 def test_in_the_plane_it_is_the_published_vector(theta_rad: float) -> None:
-    """exp(j 2 pi / wavelength d m sin theta)."""
+    """The formula is exp(j 2 pi / wavelength d m sin theta)."""
     array = uniform_linear(8, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     found = steering.steering_matrix(array, np.array([unit(theta_rad, 0.0)]))[:, 0]
     wavelength_m = SPEED_OF_LIGHT_MPS / 30e9
@@ -69,7 +69,7 @@ def test_in_the_plane_it_is_the_published_vector(theta_rad: float) -> None:
 
 
 def written_out(array: Array, direction: FloatArray) -> list[complex]:
-    """g_m(u) exp(j k p_m . u), for a cosine of exponent 2 about where each element faces."""
+    """Return g_m(u) exp(j k p_m . u) for cosine elements of exponent 2 in their own directions."""
     found = []
     for m, place in enumerate(array.elements_m.tolist()):
         ahead = [1.0, 0.0, 0.0]
@@ -126,7 +126,7 @@ def test_steering_has_each_elements_gain(name: str, angles: list[tuple[float, fl
 
 
 def test_a_direction_seen_by_an_element_that_faces_right() -> None:
-    """Ahead of the array is to the element's left; to the right of the array is ahead of it."""
+    """Array boresight is to the element's left; the array's right is the element's boresight."""
     right = np.array([[0.0, 1.0, 0.0]])
     array = listed(
         np.zeros((1, 3)),
@@ -161,7 +161,7 @@ def angle_rad(a: FloatArray, b: FloatArray) -> float:
 def test_no_position_within_the_ball_is_farther_off(
     range_m: float, share: float, seed: int
 ) -> None:
-    """And the tangent attains it."""
+    """The tangent attains the bound."""
     rng = np.random.default_rng(seed)
     bound_m = share * range_m
     bound_rad = steering.pointing_bound_rad(bound_m, range_m)
@@ -174,7 +174,7 @@ def test_no_position_within_the_ball_is_farther_off(
     ]
     for offset in offsets:
         assert angle_rad(predicted + offset, predicted) <= bound_rad + 1e-9
-    # The worst: where a line through the array touches the ball, at a right angle to its radius.
+    # The worst case is the tangent from the array to the ball, at a right angle to its radius.
     tangent = bound_m * (-share * towards + math.sqrt(1 - share**2) * aside)
     assert np.linalg.norm(tangent) == pytest.approx(bound_m)
     assert angle_rad(predicted + tangent, predicted) >= 0.999 * bound_rad
@@ -190,7 +190,7 @@ def test_inside_the_ball_every_direction_is_possible(bound_m: float) -> None:
 )
 @pytest.mark.parametrize("users", [1, 7, 300])
 def test_powers_on_a_grid_are_the_exponentials(rows: int, columns: int, users: int) -> None:
-    """However many: few are taken one way and many the other."""
+    """Any number of users; small and large numbers take different code paths."""
     array = uniform_rectangular(
         rows, columns=columns, frequency_hz=30e9, spacing_wavelengths=0.7, array_from_body=np.eye(3)
     )

@@ -1,4 +1,4 @@
-"""Calibrations of several frequencies: what stands in a file, and what is between."""
+"""Calibration tables for several frequencies: listed values and interpolation."""
 
 import math
 from pathlib import Path
@@ -55,7 +55,7 @@ def test_between_tables_phases_go_the_shorter_way_and_bounds_are_the_larger() ->
 
 @given(SEEDS, st.floats(0, 1))
 def test_cables_are_interpolated_whatever_their_length(seed: int, share: float) -> None:
-    """Delays common to all channels turn them by any angle; what tells them apart stays small."""
+    """A delay common to all channels rotates them by any angle; their differences stay small."""
     rng = np.random.default_rng(seed)
     common_s, own_s = rng.uniform(-1e-8, 1e-8), rng.uniform(-2e-11, 2e-11, 4)
     order, ends = rng.permutation(4).tolist(), (10e9, 10.5e9)
@@ -72,7 +72,7 @@ def test_cables_are_interpolated_whatever_their_length(seed: int, share: float) 
     at_hz = ends[0] + share * (ends[1] - ends[0])
     found = calibration_at(text, at_hz).factors[order]
     wanted = np.exp(1j * np.radians(phases_deg(at_hz)))
-    assert abs(np.vdot(found, wanted)) == pytest.approx(4.0)  # but for what all have in common
+    assert abs(np.vdot(found, wanted)) == pytest.approx(4.0)  # up to a common phase
 
 
 def test_csv_is_for_any_frequency() -> None:

@@ -1,4 +1,5 @@
-"""Codebooks: sums written out, exact sets for lines, and draws that try to beat what is swept."""
+"""Codebooks against direct sums, exact sets for lines, and random draws against the
+candidate sets."""
 
 import cmath
 import math
@@ -43,7 +44,7 @@ def drawn(array: Array, beams: int, seed: int = 1) -> Codebook:
 
 
 def around(array: Array, beams: int) -> Codebook:
-    """Matched to directions all around the horizon."""
+    """Return beams matched to directions all around the horizon."""
     angles = 2 * np.pi * np.arange(beams) / beams
     directions = np.stack([np.cos(angles), np.sin(angles), np.zeros(beams)], axis=1)
     return codebooks.listed(steering.steering_matrix(array, directions).conj(), array)
@@ -71,7 +72,7 @@ def unit(rng: np.random.Generator) -> FloatArray:
 def within(
     direction: FloatArray, bound_rad: float, rng: np.random.Generator, count: int
 ) -> FloatArray:
-    """Unit directions within an angle of one, every other on the rim."""
+    """Return unit directions within an angle of one; every second one lies on the rim."""
     aside = np.cross(direction, rng.standard_normal((count, 3)))
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     off = bound_rad * np.where(np.arange(count) % 2, np.sqrt(rng.uniform(size=count)), 1.0)
@@ -79,16 +80,16 @@ def within(
 
 
 def in_plane(sine: float) -> FloatArray:
-    """The direction at a sine off boresight, to the right."""
+    """Return the horizontal direction whose sine off boresight, to the right, is given."""
     return np.array([math.sqrt(1 - sine * sine), sine, 0.0])
 
 
-# --- what is in a codebook -----------------------------------------------------------------------
+# --- contents of a codebook ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("oversampling", [1, 3])
 def test_the_beams_of_a_line_point_where_their_index_says(oversampling: int) -> None:
-    """Full gain M at sine 2k/K, wrapped; without oversampling a null at every other such place."""
+    """Full gain M at sine 2k/K, wrapped; without oversampling a null at every other grid sine."""
     array = line(8, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     book = dft(array, oversampling)
     beams = 8 * oversampling
@@ -157,12 +158,12 @@ def test_what_is_no_codebook_is_refused() -> None:
             codebooks.listed(weights.astype(complex), LINE)
 
 
-# --- the best ------------------------------------------------------------------------------------
+# --- best beam -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", sorted(BOOKS))
 def test_the_best_beam_is_the_one_received_most(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each beam's sum written out; also when done in blocks."""
+    """Compared with direct sums, also when computed in blocks."""
     array, book = BOOKS[name]
     rng = np.random.default_rng(3)
     directions = np.array([unit(rng) for _ in range(9)])
@@ -188,7 +189,7 @@ def test_behind_the_elements_the_order_of_beams_is_that_without_their_pattern() 
     assert gains[0] == 0 < gains[1]
 
 
-# --- what must be swept --------------------------------------------------------------------------
+# --- candidates ----------------------------------------------------------------------------------
 
 
 @settings(max_examples=examples(180), deadline=None)
@@ -203,7 +204,7 @@ def test_behind_the_elements_the_order_of_beams_is_that_without_their_pattern() 
 def test_the_best_beam_is_always_among_the_candidates(
     name: str, bound_deg: float, seed: int
 ) -> None:
-    """Bounds up to 60 degrees and beyond; 80 directions for each, half of them on the rim."""
+    """Bounds up to 60 degrees and beyond; 80 directions each, half of them on the rim."""
     array, book = BOOKS[name]
     rng = np.random.default_rng(seed)
     direction, bound_rad = unit(rng), math.radians(bound_deg)
@@ -218,7 +219,7 @@ def test_the_best_beam_is_always_among_the_candidates(
 def test_a_beam_that_is_best_just_inside_the_rim_is_a_candidate(
     name: str, exponent: float, seed: int
 ) -> None:
-    """The rim is laid just past the border between two beams, found by bisection."""
+    """The rim lies just past the border between two beams, found by bisection."""
     array, book = BOOKS[name]
     rng = np.random.default_rng(seed)
     start, end = unit(rng), unit(rng)
@@ -245,8 +246,8 @@ def test_a_beam_that_is_best_just_inside_the_rim_is_a_candidate(
 @pytest.mark.parametrize("oversampling", [1, 2, 4])
 @pytest.mark.parametrize("bound_deg", [0.01, 0.5, 3.0, 12.0, 50.0])
 def test_a_line_sweeps_hardly_more_than_it_must(oversampling: int, bound_deg: float) -> None:
-    """The beams that a line needs are those nearest to some sine in the cone; at most one more at
-    each end is swept, and for most directions none."""
+    """A line needs the beams nearest to some sine in the cone. At most one extra beam at each end
+    is swept; for most directions none is."""
     book = dft(LINE, oversampling)
     more = []
     rng = np.random.default_rng(7)
@@ -289,13 +290,13 @@ def test_the_pattern_of_the_elements_does_not_matter_where_all_face_alike() -> N
 
 
 def test_a_sharp_beam_beside_a_broad_one_is_not_missed() -> None:
-    """All elements, and one in the middle. At the predicted direction the sharp beam is below
-    the other and flat, on top of a side lobe: nothing but its curvature says that it is best
-    elsewhere in the cone."""
+    """One beam uses all elements, the other only the middle one. At the predicted direction the
+    sharp beam is weaker and flat, on top of a side lobe: only its curvature shows that it is
+    best elsewhere in the cone."""
     sharp = steering.steering_matrix(LINE, in_plane(0.37)[np.newaxis]).conj()
     broad = np.eye(16)[:, 7:8]
     book = codebooks.listed(np.concatenate([broad, sharp], axis=1), LINE)
-    for lobe in (1.4303, 2.459, 3.4709):  # off the peak, in widths to its null
+    for lobe in (1.4303, 2.459, 3.4709):  # distance from the peak, in peak-to-null widths
         sine = 0.37 - 2 * lobe / 16
         bound_rad = math.asin(0.37) - math.asin(sine)
         assert list(candidates(book, LINE, in_plane(sine), bound_rad)) == [0, 1]
@@ -303,7 +304,7 @@ def test_a_sharp_beam_beside_a_broad_one_is_not_missed() -> None:
 
 @pytest.mark.parametrize("name", BOOKS)
 def test_a_sweep_begins_with_the_strongest(name: str) -> None:
-    """Also behind the elements, where their pattern is as good as nothing."""
+    """Also behind the elements, where their pattern is practically zero."""
     array, book = BOOKS[name]
     rng = np.random.default_rng(4)
     for _ in range(20):
@@ -342,11 +343,11 @@ def test_what_is_no_cone_is_refused() -> None:
             candidates(dft(LINE), LINE, direction, bound_rad)
 
 
-# --- what comes next -----------------------------------------------------------------------------
+# --- next beam -----------------------------------------------------------------------------------
 
 
 def turning(from_rad: float, rate_radps: float) -> Callable[[FloatArray], FloatArray]:
-    """Directions in the plane at an azimuth that grows with time."""
+    """Return horizontal directions whose azimuth grows with time."""
 
     def directions_at(times_s: FloatArray) -> FloatArray:
         azimuth = from_rad + rate_radps * times_s
@@ -358,7 +359,7 @@ def turning(from_rad: float, rate_radps: float) -> Callable[[FloatArray], FloatA
 @pytest.mark.parametrize("oversampling", [1, 4])
 @pytest.mark.parametrize("rate_radps", [0.05, -0.05, 0.7])
 def test_the_next_beam_comes_where_the_line_says(oversampling: int, rate_radps: float) -> None:
-    """Beams of a half-wave line change at sines (2k + 1) / K: the time is known in closed form."""
+    """Beams of a half-wave line change at sines (2k + 1) / K, so the time has a closed form."""
     book = dft(LINE, oversampling)
     start_rad = 0.3
     k = round(math.sin(start_rad) * book.size / 2)
@@ -376,7 +377,7 @@ def test_the_next_beam_comes_where_the_line_says(oversampling: int, rate_radps: 
 def test_nothing_comes_within_the_horizon() -> None:
     book = dft(LINE)
     assert next_best(book, LINE, turning(0.0, 0.01), 1.0, 0.1) == NextBest(0, None, None)
-    # The border at sine 1/16 is crossed 0.06254 s from now: the horizon itself is looked at.
+    # The border at sine 1/16 is crossed after 0.06254 s: the horizon itself is included.
     assert next_best(book, LINE, turning(0.0, 1.0), 0.0620, 1.0) == NextBest(0, None, None)
     found = next_best(book, LINE, turning(0.0, 1.0), 0.0630, 1.0)
     assert found.next_index == 1
@@ -384,7 +385,7 @@ def test_nothing_comes_within_the_horizon() -> None:
 
 
 def test_a_step_that_is_too_long_passes_over_beams() -> None:
-    """What the limits say: with the step for its rate, it does not."""
+    """The documented limit: with the sampling step for its rate, no beam is skipped."""
     book, path = dft(LINE, 2), turning(-1.0, 0.5)
     step_s = codebooks.sampling_step_s(book, LINE, 0.5)
     assert step_s is not None
@@ -400,7 +401,7 @@ def test_a_step_that_is_too_long_passes_over_beams() -> None:
 
 
 def test_the_step_is_a_quarter_of_a_beam() -> None:
-    """Sixteen half-wave elements extend 7.5 wavelengths."""
+    """Sixteen half-wave elements span 7.5 wavelengths."""
     assert codebooks.sampling_step_s(dft(LINE), LINE, -0.5) == pytest.approx(1 / 7.5 / 0.5 / 4)
     assert codebooks.sampling_step_s(dft(LINE, 4), LINE, 0.5) == pytest.approx(1 / 30 / 0.5 / 4)
     assert codebooks.sampling_step_s(dft(LINE), LINE, 0.0) is None

@@ -1,4 +1,4 @@
-"""The digital beam table, read as OpenAirInterface's documents say that it is read."""
+"""The digital beam table, read as OpenAirInterface's documentation describes."""
 
 import re
 from pathlib import Path
@@ -24,7 +24,7 @@ COMPLEX = re.compile(r"([+-]?[\d.]+)([+-][\d.]+)[ij]")
 
 
 def loaded(text: str) -> dict[int, ComplexArray]:
-    """Weights by id, in units of their 16 bits: as the base station has them."""
+    """Return weights by id in 16-bit units, as the base station loads them."""
     header, *lines = text.splitlines()
     width = header.count(",")
     table = {}
@@ -52,11 +52,11 @@ def test_what_is_loaded_is_the_codebook_to_the_last_bit(seed: int) -> None:
     off = np.stack(list(found.values()), axis=1) - book.weights * 32767
     assert max(np.abs(off.real).max(), np.abs(off.imag).max()) <= 0.5 + 1e-9
     written = [float(part) * 32767 for part in re.findall(r"-?\d\.\d+", text)]
-    assert np.abs(written - np.rint(written)).max() < 0.02  # integers: nothing is left to rounding
+    assert np.abs(written - np.rint(written)).max() < 0.02  # integers: no further rounding
 
 
 def test_a_calibrated_panel_radiates_the_codebook() -> None:
-    """The base station's ports are the channels, and the strongest part is in range."""
+    """The base station's ports are the channels, and the largest component is in range."""
     rng, book = np.random.default_rng(2), codebooks.dft(PANEL)
     calibration = Calibration(
         phase_rad=tuple(rng.uniform(-3, 3, 16).tolist()),

@@ -1,4 +1,4 @@
-"""Calibrations found from responses of arrays whose channels are known, and a Phaser's pickles."""
+"""Calibration from responses of arrays with known channels, and from a Phaser's pickles."""
 
 import os
 import pickle
@@ -37,7 +37,8 @@ ARRAYS = {
 
 
 def measured(array: Array, phase: FloatArray, gain_db: FloatArray, noise: float) -> str:
-    """What a source would show, by the geometry alone; its own phase and level are anything."""
+    """Return responses to a source by geometry alone, with an arbitrary phase and level per
+    direction."""
     rng = np.random.default_rng(5)
     lines = [MEASURED_HEADER]
     for azimuth, elevation in AT_DEG:
@@ -137,7 +138,7 @@ def test_the_command_writes_what_the_settings_read(tmp_path: Path) -> None:
     assert parse_calibration(out.read_text()).order == ORDER
 
 
-# --- the Phaser's pickles -----------------------------------------------------------------------
+# --- Phaser pickles -----------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
@@ -146,7 +147,7 @@ def test_pickles_of_numbers_are_read(protocol: int, kind: Any) -> None:
     phases = [kind(10.0 * n) for n in range(8)]
     gains = [kind(1.0 - n / 32) for n in range(8)]
     if protocol < 3 and kind is not float:
-        return  # numpy's bytes are then made by a function that is not let through
+        return  # numpy's bytes would then be built by a forbidden function
     found = phaser_pickles.calibration(
         pickle.dumps(phases, protocol), pickle.dumps(gains, protocol)
     )

@@ -1,4 +1,4 @@
-"""Settings instead of weights: exhaustive search, direct sums and closed forms as oracles."""
+"""Device settings for weights, against exhaustive search, direct sums and closed forms."""
 
 import itertools
 
@@ -32,25 +32,26 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 
 def line(sines: list[float], elements: int = 64) -> ComplexArray:
-    """Steering of a half-wave line for directions in the plane, by their sines."""
+    """Return the steering matrix of a half-wave line for directions given by their sines."""
     made: ComplexArray = np.exp(1j * np.pi * np.outer(np.arange(elements), sines))
     return made
 
 
 def drawn(rng: np.random.Generator, elements: int) -> ComplexArray:
-    """Weights of any phase and of amplitudes that differ by tens of decibels."""
+    """Return random weights with any phase and amplitudes that differ by tens of decibels."""
     amplitude = 10 ** rng.uniform(-1.5, 0.5, elements)
     made: ComplexArray = amplitude * np.exp(1j * rng.uniform(0, 2 * np.pi, elements))
     return made
 
 
 def rounded(weights: ComplexArray, kind: SettableStates) -> ComplexArray:
-    """What plain rounding radiates: the strongest element at full gain, no search."""
+    """Return the weights of plain rounding: strongest element at full gain, no search."""
     return kind.values(kind.nearest(weights / np.abs(weights).max()))
 
 
 def cost(radiated: ComplexArray, weights: ComplexArray, towards: ComplexArray) -> float:
-    """J over |f|^2 + sum of w_j |a_j^T f|^2, by least squares over beta on stacked residuals."""
+    """Return J over |f|^2 + sum of w_j |a_j^T f|^2, by least squares over beta on stacked
+    residuals."""
     power = np.sum(np.abs(towards) ** 2, axis=0)
     rows = np.sqrt(EMPHASIS * len(weights) / power)[:, np.newaxis] * towards.T
     stack = np.vstack([np.eye(len(weights)), rows])
@@ -61,17 +62,17 @@ def cost(radiated: ComplexArray, weights: ComplexArray, towards: ComplexArray) -
 
 
 def loss_db(own: ComplexArray, wanted: ComplexArray, sent: ComplexArray) -> float:
-    """Array gain lost towards ``own``."""
+    """Return the loss of array gain towards ``own``."""
     both = np.stack([wanted, sent], axis=1)
     gains = gain_db(np.stack([own, own], axis=1), both)
     return float(gains[0] - gains[1])
 
 
-# --- the settings -------------------------------------------------------------------------------
+# --- settings -----------------------------------------------------------------------------------
 
 
 def every_code(kind: SettableStates) -> IntArray:
-    """All codes of a kind, (n, 2)."""
+    """Return all codes of a device, (n, 2)."""
     if isinstance(kind, Resolution):
         pairs = itertools.product(range(kind.phase_steps), range(len(kind.levels)))
     else:
@@ -83,7 +84,7 @@ def every_code(kind: SettableStates) -> IntArray:
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_nearest_is_the_nearest_of_all(kind: SettableStates) -> None:
-    """In I and Q, or in phase and in gain each for itself."""
+    """In I and Q, or in phase and gain separately."""
     rng = np.random.default_rng(3)
     wanted = np.sqrt(rng.uniform(0, 1, 300)) * np.exp(1j * rng.uniform(-4, 4, 300))
     everything = kind.values(every_code(kind))
@@ -116,7 +117,7 @@ def test_what_is_tried_around_a_code_are_codes_and_it_is_among_them(kind: Settab
 
 
 def test_below_the_range_it_is_lowest_or_off_whichever_is_nearer() -> None:
-    """6 dB down is 0.501: half of that is where off comes nearer."""
+    """6 dB down is 0.501; below half of that, off is nearer."""
     phase_only, clipped, with_off = (
         Resolution(4),
         stepped(4, 3.0, 6.0),
@@ -136,7 +137,7 @@ def test_steps_of_gain_are_counted_from_full() -> None:
     assert levels[-1] == 0
     assert 20 * np.log10(levels[:-1]) == pytest.approx(-0.5 * np.arange(63))
     assert len(stepped(8, 0.1, 0.3).levels) == 4  # though 0.3 / 0.1 is below 3 in binary
-    assert len(stepped(8, 2.0, 5.0).levels) == 3  # not beyond the range
+    assert len(stepped(8, 2.0, 5.0).levels) == 3  # not beyond its range
 
 
 @pytest.mark.parametrize(
@@ -162,7 +163,7 @@ def test_levels_fall_from_full(levels: tuple[float, ...]) -> None:
         Resolution(8, levels)
 
 
-# --- the search ---------------------------------------------------------------------------------
+# --- search -------------------------------------------------------------------------------------
 
 
 @settings(max_examples=examples(60), deadline=None)
@@ -185,7 +186,7 @@ def test_it_is_never_worse_than_rounding_and_says_what_it_costs(
 def test_the_result_cannot_be_bettered_by_one_element(
     seed: int, kind: SettableStates, elements: int
 ) -> None:
-    """No neighbouring setting of any one element costs less, but for what full gain forbids."""
+    """No neighbouring setting of a single element costs less, except those that lower full gain."""
     rng = np.random.default_rng(seed)
     towards = line(list(rng.uniform(-1, 1, 2)), elements)
     weights = drawn(rng, elements)
@@ -202,7 +203,7 @@ def test_the_result_cannot_be_bettered_by_one_element(
 
 
 def test_it_comes_near_the_best_of_all_settings() -> None:
-    """Six elements of two bits: 4**5 settings that differ. Most often it is the very best."""
+    """Six elements of two bits: 4**5 distinct settings. Usually the result is the optimum."""
     rng = np.random.default_rng(11)
     kind = Resolution(4)
     every = np.array([(0, *rest) for rest in itertools.product(range(4), repeat=5)])
@@ -220,7 +221,7 @@ def test_it_comes_near_the_best_of_all_settings() -> None:
 
 @pytest.mark.parametrize(("bits", "table_db"), [(2, 0.89), (3, 0.22), (4, 0.054), (5, 0.014)])
 def test_a_matched_beam_loses_what_the_theory_says(bits: int, table_db: float) -> None:
-    """64 elements, MATH: golden values; and not more than sinc of a step."""
+    """64 elements, docs/math.md golden values; at most the sinc of one step."""
     rng = np.random.default_rng(bits)
     losses = []
     for sine in rng.uniform(-1, 1, rounds(15, 60)):
@@ -254,7 +255,7 @@ def test_six_bits_lose_almost_nothing() -> None:
     ],
 )
 def test_nulls_are_deeper_than_by_rounding(kind: SettableStates, deeper_db: float) -> None:
-    """Zero forcing of two users; the response at the other over that at the own, mean of dB."""
+    """Zero forcing of two users; response at the other over that at the own, mean in dB."""
     rng = np.random.default_rng(5)
     plain, searched, lost = [], [], []
     for _ in range(rounds(8, 25)):
@@ -276,7 +277,7 @@ def test_nulls_are_deeper_than_by_rounding(kind: SettableStates, deeper_db: floa
 @settings(max_examples=examples(40), deadline=None)
 @given(SEEDS, st.sampled_from(KINDS))
 def test_a_common_factor_changes_no_code(seed: int, kind: SettableStates) -> None:
-    """Any level; any turn by a whole period of the settings turns the codes alone."""
+    """Any level; a rotation by a whole phase step shifts only the codes."""
     rng = np.random.default_rng(seed)
     weights, towards = drawn(rng, 9), line([0.1, 0.4], 9)
     found = quantise(weights, kind, towards)
@@ -288,7 +289,7 @@ def test_a_common_factor_changes_no_code(seed: int, kind: SettableStates) -> Non
 @settings(max_examples=examples(40), deadline=None)
 @given(SEEDS)
 def test_channels_are_taken_out(seed: int) -> None:
-    """Fine settings behind any channels radiate what was wanted."""
+    """Fine settings behind any channels radiate the wanted weights."""
     rng = np.random.default_rng(seed)
     weights = np.exp(1j * rng.uniform(0, 7, 12))
     channel = 10 ** rng.uniform(-0.2, 0.2, 12) * np.exp(1j * rng.uniform(0, 7, 12))
@@ -305,7 +306,7 @@ def test_channels_are_taken_out(seed: int) -> None:
 def test_the_strongest_element_has_full_gain(
     seed: int, kind: SettableStates, elements: int
 ) -> None:
-    """The strongest is the one whose setting must be the largest, behind its channel."""
+    """The strongest element is the one whose setting must be largest behind its channel."""
     rng = np.random.default_rng(seed)
     weights = drawn(rng, elements)
     channel = 10 ** rng.uniform(-0.3, 0.3, elements)

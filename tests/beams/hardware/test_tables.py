@@ -1,4 +1,4 @@
-"""Calibration, limits and the files of devices: what is written is what is radiated."""
+"""Calibration, limits and device files: the written table radiates the wanted beams."""
 
 import itertools
 import math
@@ -19,18 +19,18 @@ from companion.values import ComplexArray
 
 SIZES = {Beamformer.ADAR1000: 8, Beamformer.TMYTEK: 16, Beamformer.SIVERS: 16}
 CN0566_ORDER = (6, 7, 4, 5, 2, 3, 0, 1)
-"""Which element each channel of the ADALM-PHASER drives, from pyadi-iio's CN0566."""
+"""Element that each channel of the ADALM-PHASER drives, from pyadi-iio's CN0566."""
 SEEDS = st.integers(0, 2**32 - 1)
 
 
 def line(sines: list[float], elements: int) -> ComplexArray:
-    """Steering of a half-wave line for directions in the plane, by their sines."""
+    """Return the steering matrix of a half-wave line for directions given by their sines."""
     made: ComplexArray = np.exp(1j * np.pi * np.outer(np.arange(elements), sines))
     return made
 
 
 def wanted(sines: list[float], elements: int) -> list[WantedBeam]:
-    """Zero-forcing beams, each with nulls at the others."""
+    """Return zero-forcing beams, each with nulls at the others."""
     steering = line(sines, elements)
     weights = np.linalg.pinv(steering.T)
     return [
@@ -46,7 +46,7 @@ def wanted(sines: list[float], elements: int) -> list[WantedBeam]:
 
 
 def measured(seed: int, elements: int) -> Calibration:
-    """A scrambled array whose channels differ by up to 4 dB and any phase."""
+    """Return a permuted array whose channels differ by up to 4 dB and any phase."""
     rng = np.random.default_rng(seed)
     return Calibration(
         phase_rad=tuple(rng.uniform(-4, 4, elements).tolist()),
@@ -56,7 +56,7 @@ def measured(seed: int, elements: int) -> Calibration:
 
 
 def written(device: Beamformer, table: DeviceTable) -> str:
-    """The text of a table, with what the device needs beside."""
+    """Return the text of a table, with the additional arguments that the device needs."""
     return encode(table, frequency_hz=60.48e9 if device is Beamformer.SIVERS else None)
 
 
@@ -113,12 +113,12 @@ def test_a_calibration_is_checked(
         Calibration(phase_rad=phase, gain_db=gain, order=order)
 
 
-# --- what is fitted -----------------------------------------------------------------------------
+# --- fitting ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("device", list(Beamformer))
 def test_the_channels_radiate_the_wanted_beams(device: Beamformer) -> None:
-    """Element by element from the codes: setting of its channel times what the channel adds."""
+    """Element by element: channel setting times channel response."""
     size = SIZES[device]
     calibration = measured(4, size)
     beams = wanted([-0.5, 0.1, 0.6], size)
@@ -146,7 +146,7 @@ def test_the_loss_is_that_of_the_array_gain() -> None:
 
 
 def test_phases_are_taken_out_not_put_in() -> None:
-    """A channel that adds 90 degrees is set 90 degrees back."""
+    """A channel that adds 90 degrees is set back by 90 degrees."""
     ideal = Calibration.ideal(range(16))
     turned = Calibration(
         phase_rad=(math.pi / 2, *ideal.phase_rad[1:]), gain_db=ideal.gain_db, order=ideal.order
@@ -164,7 +164,7 @@ def test_phases_are_taken_out_not_put_in() -> None:
 
 
 def test_gains_are_levelled_to_the_weakest() -> None:
-    """The strongest setting is full gain; a channel 3 dB too strong is set 3 dB down."""
+    """The strongest setting is full gain; a channel 3 dB too strong is attenuated by 3 dB."""
     ideal = Calibration.ideal(range(16))
     uneven = Calibration(
         phase_rad=ideal.phase_rad, gain_db=(3.0, *ideal.gain_db[1:]), order=ideal.order
@@ -245,7 +245,7 @@ def test_channels_that_differ_too_much_or_do_not_match_are_refused() -> None:
         fit(Beamformer.ADAR1000, [nowhere], ideal)
 
 
-# --- the texts ----------------------------------------------------------------------------------
+# --- file formats -------------------------------------------------------------------------------
 
 
 @settings(max_examples=examples(25), deadline=None)
@@ -269,7 +269,7 @@ def test_what_is_written_is_read_back(seed: int, device: Beamformer, count: int)
 @settings(max_examples=examples(40), deadline=None)
 @given(SEEDS, st.sampled_from(list(Beamformer)))
 def test_every_code_survives(seed: int, device: Beamformer) -> None:
-    """Any codes at all, off and lowest among them; full gain somewhere, as every beam has it."""
+    """Arbitrary codes, off and lowest among them; one has full gain, as in every beam."""
     rng = np.random.default_rng(seed)
     size, kind = SIZES[device], SETTINGS[device]
     spread = rng.uniform(0, 1, (3, size)) ** 4 * np.exp(1j * rng.uniform(0, 7, (3, size)))
@@ -290,7 +290,7 @@ def test_every_code_survives(seed: int, device: Beamformer) -> None:
 
 
 def test_the_adar1000_table_of_a_phaser() -> None:
-    """Channel 2 of the first chip is element 8 of the CN0566, in pyadi-iio's counting."""
+    """Channel 2 of the first chip is element 8 of the CN0566 in pyadi-iio's numbering."""
     calibration = Calibration.ideal(CN0566_ORDER)
     ramp = np.exp(2j * np.pi * 16 / 128 * np.arange(8))  # 45 degrees from element to element
     beam = WantedBeam(
@@ -380,7 +380,7 @@ def test_the_tmytek_table() -> None:
 
 
 def test_blank_lines_of_a_tmytek_table_are_skipped() -> None:
-    """As the maker's own examples have them."""
+    """The manufacturer's own examples contain blank lines."""
     ideal = Calibration.ideal(range(16))
     table = fit(Beamformer.TMYTEK, wanted([0.1], 16), ideal)
     text = encode(table).replace("\n", "\n,,,,,,,,,\n", 1)
@@ -388,7 +388,7 @@ def test_blank_lines_of_a_tmytek_table_are_skipped() -> None:
 
 
 def test_what_is_off_does_not_count_for_full_gain() -> None:
-    """A table may say any gain for a channel that is switched off."""
+    """A table may give any gain for a channel that is switched off."""
     ideal = Calibration.ideal(range(16))
     beam = WantedBeam(
         uav="1:1",
@@ -405,7 +405,7 @@ def test_what_is_off_does_not_count_for_full_gain() -> None:
 
 
 def test_the_sivers_book_loads_as_the_makers_scripts_load_it() -> None:
-    """Their way: bytes from the line after the tag, two to a word, antenna 15 first."""
+    """The scripts read bytes from the line after the tag, two per word, antenna 15 first."""
     table = fit(Beamformer.SIVERS, wanted([-0.3, 0.4], 16), measured(1, 16))
     lines = encode(table, frequency_hz=60.48e9).splitlines()
     start = next(i for i, line in enumerate(lines) if line.startswith("START_TABLE FREQ:"))

@@ -1,4 +1,4 @@
-"""Gains of a TMYTEK unit: every beam passes the checks that the maker's package makes of it."""
+"""Gains of a TMYTEK unit: every beam passes the checks of the manufacturer's package."""
 
 import csv
 import importlib
@@ -23,12 +23,12 @@ UNIT = (
 )
 SEEDS = st.integers(0, 2**32 - 1)
 Board = tuple[tuple[float, float], float]
-"""Least and greatest common gain, and most of an element."""
+"""Lowest and highest common gain, and highest element gain, of a board."""
 SLACK = 1e-9
 
 
 def table(gains: UnitGains, seed: int, beams: int) -> DeviceTable:
-    """Beams of weights as far apart as can be, some of them 0, on channels that differ."""
+    """Fit beams of extreme weights, some of them 0, to unequal channels."""
     rng = np.random.default_rng(seed)
     array: ComplexArray = rng.normal(size=(16, beams)) + 1j * rng.normal(size=(16, beams))
     array *= 10 ** rng.uniform(-2, 0, (16, beams)) * (rng.random((16, beams)) > 0.1)
@@ -50,7 +50,8 @@ def table(gains: UnitGains, seed: int, beams: int) -> DeviceTable:
 
 
 def refused(text: str, boards: list[Board]) -> list[str]:
-    """What the unit refuses, by its published limits: an element's gain over that of its board."""
+    """Return what the unit rejects by its published limits: element gains relative to their
+    board."""
     found: dict[str, list[list[float]]] = {}
     for row in csv.reader(text.splitlines()[1:]):
         found.setdefault(row[1], [[] for _ in boards])[(int(row[6]) - 1) // 4].append(float(row[8]))
@@ -69,7 +70,7 @@ def refused(text: str, boards: list[Board]) -> list[str]:
 
 @st.composite
 def units(draw: st.DrawFn) -> list[Board]:
-    """Boards that have some gain in common."""
+    """Draw boards that have some common gain."""
     tenths = st.integers(-10, 10).map(lambda tenth: tenth / 10)
     low = draw(st.integers(-20, 20)) / 2
     width, element = draw(st.integers(2, 20)), draw(st.integers(1, 8))
@@ -80,7 +81,7 @@ def units(draw: st.DrawFn) -> list[Board]:
 
 
 def described(boards: list[Board], mode: str = "TX") -> str:
-    """The file of a unit."""
+    """Write the file of a unit."""
     common = [list(pair) for pair, _ in boards]
     return f'mode = "{mode}"\ncommon_db = {common}\nelement_db = {[e for _, e in boards]}\n'
 
@@ -103,14 +104,14 @@ def test_the_strongest_element_is_as_loud_as_every_board_can_be() -> None:
 
 
 def test_relative_gains_leave_the_limits_of_a_unit() -> None:
-    """Why a unit's own are asked for."""
+    """This is why the unit's own gain limits are required."""
     boards: list[Board] = [((5.0, 9.5), 4.0)] * 4
     relative = fit(Beamformer.TMYTEK, [zero_beam()], Calibration.ideal(range(16)))
     assert refused(encode(relative), boards)
 
 
 def zero_beam() -> WantedBeam:
-    """A beam of which one element is off."""
+    """Return a beam with one element off."""
     weights = np.ones(16, complex)
     weights[3] = 0
     return WantedBeam(
@@ -163,7 +164,7 @@ def test_a_file_that_is_none_says_what_is_wrong(text: str, said: str) -> None:
 
 
 class Unit:
-    """What ``TMYBeamConfig`` asks a unit for, and what it sets."""
+    """Stand-in unit with the calls that ``TMYBeamConfig`` makes."""
 
     def __init__(self, boards: list[Board], ok: Any) -> None:
         self._ok = ok
@@ -197,9 +198,11 @@ class Unit:
         return self._said()
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")  # files it leaves
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # files that it leaves behind
 def test_the_maker_s_own_package_applies_every_beam(tmp_path: Path) -> None:
-    """Its own checks, on a unit that keeps what was applied before."""
+    """Its own checks, on a unit that keeps the previously applied settings."""
     batch = pytest.importorskip("tlkcore.TMYBeamConfig")
     codes = importlib.import_module("tlkcore.TMYPublic").RetCode
     boards: list[Board] = [((-1.0, 9.5), 4.0), ((-1.5, 9.0), 4.5), ((0.0, 10.0), 4.0)]

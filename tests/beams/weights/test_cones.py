@@ -1,4 +1,4 @@
-"""Where beams are looked at: against steering vectors of directions worked out one by one."""
+"""Sample points of a cone, against steering vectors of directions computed one by one."""
 
 import math
 
@@ -46,7 +46,7 @@ def looked_at(array: Array, angles_deg: list[list[float]]) -> ConeSamples:
 
 
 def offsets(array: Array, found: ConeSamples) -> list[FloatArray]:
-    """The places of each axis, as cosines beside the predicted direction's."""
+    """Return the sample points of each axis, as cosines relative to the predicted direction's."""
     finer = SAMPLES_PER_WIDTH if len(found.waves) == 1 else SAMPLES_PER_WIDTH_IN_PLANE
     across = shapes.aperture(array)
     reaches = [wave.shape[1] // 2 for wave in found.waves]
@@ -95,7 +95,7 @@ def test_places_are_all_over_the_cone_and_hardly_beyond(array: Array, wide_deg: 
             apart = crowd[:, np.newaxis] - inside
             apart -= period * np.rint(apart / period)
             nearest = (np.abs(apart) / step).max(axis=2).min(axis=1)
-            # A plane sees less of what reaches behind it.
+            # A planar array resolves less of a cone that reaches behind it.
             behind = angles[user] > math.acos(min(float(np.linalg.norm(axes @ direction)), 1.0))
             assert nearest.max() < (1.0 if len(axes) == 1 or not behind else 8.0)
             reach = 2 * math.sin(angles[user] / 2) + np.array(step)

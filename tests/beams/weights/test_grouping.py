@@ -1,4 +1,4 @@
-"""Who is served together: greedy choices, against the same thing done by pseudo-inverses."""
+"""Time slots: greedy grouping against the same computation by pseudo-inverses."""
 
 import numpy as np
 import pytest
@@ -21,15 +21,15 @@ LIMITS = CostLimits(3.0, 100.0)
 
 
 def drawn(seed: int, elements: int, users: int) -> ComplexArray:
-    """Directions of a half-wave line, some hardly apart, elements that radiate unlike each."""
+    """Draw directions of a half-wave line, some nearly equal, with unequal element gains."""
     rng = np.random.default_rng(seed)
     sines = rng.uniform(-0.6, 0.6, users)
     made: ComplexArray = np.exp(1j * np.pi * np.outer(np.arange(elements), sines))
-    return made * rng.uniform(0.01, 100, users)  # length says nothing
+    return made * rng.uniform(0.01, 100, users)  # the length is irrelevant
 
 
 def fit(steering: ComplexArray, some: list[int]) -> bool:
-    """Whether zero forcing is within the limits, by numpy's own pseudo-inverse and cond."""
+    """Return whether zero forcing is within the limits, by numpy's pseudo-inverse and cond."""
     unit = steering[:, some] / np.linalg.norm(steering[:, some], axis=0)
     if len(some) > len(unit) or np.linalg.cond(unit) > LIMITS.condition:
         return False
@@ -38,7 +38,7 @@ def fit(steering: ComplexArray, some: list[int]) -> bool:
 
 
 def outside(candidate: ComplexArray, group: ComplexArray) -> float:
-    """The share of a vector's power that a group does not span, by least squares."""
+    """Return the share of a vector's power outside the span of a group, by least squares."""
     held, *_ = np.linalg.lstsq(group, candidate, rcond=None)
     rest = candidate - group @ held
     return float(np.sum(np.abs(rest) ** 2) / np.sum(np.abs(candidate) ** 2))
@@ -49,7 +49,7 @@ def outside(candidate: ComplexArray, group: ComplexArray) -> float:
 def test_each_takes_in_who_is_most_apart_while_all_fit(
     seed: int, users: int, elements: int
 ) -> None:
-    """Everybody in one group, every group fits, and each choice is that of the oracle."""
+    """Every UAV is in one group, every group fits, and each choice is that of the oracle."""
     steering = drawn(seed, elements, users)
     order = np.random.default_rng(seed).permutation(users).tolist()
     groups = semi_orthogonal(steering, order, LIMITS)

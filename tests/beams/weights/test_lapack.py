@@ -1,4 +1,4 @@
-"""The routines that are loaded alone are those of scipy, wherever it keeps them."""
+"""Separately loaded BLAS and LAPACK routines are those of scipy, wherever scipy keeps them."""
 
 import numpy as np
 import scipy.linalg.blas

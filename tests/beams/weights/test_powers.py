@@ -1,4 +1,4 @@
-"""Power: against optima of independent methods, and against equal shares."""
+"""Power allocation against independent optimisers and against equal shares."""
 
 import numpy as np
 import pytest
@@ -69,7 +69,7 @@ def test_the_weighted_sum_is_no_less_than_a_search_finds(seed: int) -> None:
 @pytest.mark.parametrize("snr_db", [-10.0, 5.0, 20.0])
 @pytest.mark.parametrize("users", [2, 8, 16])
 def test_mmse_with_max_min_is_the_optimum(users: int, snr_db: float) -> None:
-    """Uplink-downlink duality: the balanced SINR there is the greatest that any beams have."""
+    """Uplink-downlink duality: the balanced SINR there is the largest of all beams."""
     a = steering(users, 64, users)
     ranges = np.random.default_rng(users).uniform(0.3, 3.0, users)
     radio = Radio(10 ** (snr_db / 10) / 64 * users * ranges, np.ones(users))
@@ -121,7 +121,7 @@ def test_without_a_radio_there_is_no_mmse() -> None:
 @pytest.mark.parametrize("power", Power)
 @pytest.mark.parametrize("snr_db", [0.0, 60.0, 120.0, 200.0])
 def test_channels_that_are_alike_are_shared_at_any_power(power: Power, snr_db: float) -> None:
-    """Two in one direction and two behind one another's mirror, and more than elements."""
+    """Two UAVs in one direction, two at mirror directions, and more UAVs than elements."""
     rng = np.random.default_rng(3)
     for users in (4, 12):
         sines = rng.uniform(-0.9, 0.9, users)

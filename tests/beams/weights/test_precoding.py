@@ -1,4 +1,4 @@
-"""Weights: numpy's pseudo-inverse and condition number as oracles; what is ill-conditioned."""
+"""Weights against numpy's pseudo-inverse and condition number, including ill-conditioned cases."""
 
 import math
 
@@ -28,13 +28,13 @@ SINES = st.floats(-0.999, 0.999)
 
 
 def matrix(sines: list[float], elements: int = 16) -> ComplexArray:
-    """Steering of a half-wave line for directions in the plane, by their sines."""
+    """Return the steering matrix of a half-wave line for directions given by their sines."""
     made: ComplexArray = np.exp(1j * np.pi * np.outer(np.arange(elements), sines))
     return made
 
 
 def apart(seed: int, users: int, elements: int = 16) -> ComplexArray:
-    """Directions at random, no two within half a beam of each other."""
+    """Draw directions, no two within half a beam of each other."""
     rng = np.random.default_rng(seed)
     while True:
         sines = np.sort(rng.uniform(-0.99, 0.99, users))
@@ -43,14 +43,14 @@ def apart(seed: int, users: int, elements: int = 16) -> ComplexArray:
 
 
 def loss_db(a: ComplexArray, weights: ComplexArray) -> FloatArray:
-    """What each user lacks against a beam for it alone, by the sums written out."""
+    """Return each user's loss against a beam for it alone, by direct sums."""
     towards = np.array([abs(np.dot(a[:, n], weights[:, n])) ** 2 for n in range(a.shape[1])])
     own = np.sum(np.abs(a) ** 2, axis=0)
     return 10 * np.log10(own * np.sum(np.abs(weights) ** 2, axis=0) / towards)
 
 
 def somewhere(data: st.DataObject, users: int) -> FloatArray:
-    """Unit directions (N, 3), anywhere in space."""
+    """Return random unit directions (N, 3)."""
     angles = st.tuples(st.floats(-math.pi, math.pi), st.floats(-1.5, 1.5))
     drawn = np.array(data.draw(st.lists(angles, min_size=users, max_size=users)))
     azimuth, elevation = drawn.T
@@ -59,7 +59,7 @@ def somewhere(data: st.DataObject, users: int) -> FloatArray:
 
 
 def any_array(seed: int) -> Array:
-    """A line, a rectangle, a circle or elements scattered in space: 16 of them."""
+    """Draw a line, a rectangle, a circle or elements scattered in space, of 16 elements."""
     rng = np.random.default_rng(seed)
     element = Element([ElementPattern.ISOTROPIC, ElementPattern.TR38901][seed // 4 % 2])
     match seed % 4:
@@ -91,7 +91,7 @@ def any_array(seed: int) -> Array:
 def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
     users: int, seed: int, widen: bool, data: st.DataObject
 ) -> None:
-    """Any array, any directions, any number up to the elements, wherever it is not marked."""
+    """Any array, any directions, up to as many users as elements, unless marked as regularised."""
     array = any_array(seed)
     directions = somewhere(data, users)
     a = steering.steering_matrix(array, directions)
@@ -116,7 +116,7 @@ def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
 def test_no_user_loses_more_than_the_limit(
     users: int, seed: int, limit_db: float, data: st.DataObject
 ) -> None:
-    """The default policy, on any array, wherever the UAVs are."""
+    """Default policy, any array, any UAV positions."""
     a = steering.steering_matrix(any_array(seed), somewhere(data, users))
     found = precode(a, Precoder(loss_limit_db=limit_db))
     assert loss_db(a, found.weights).max() <= limit_db + 1e-6
@@ -124,7 +124,7 @@ def test_no_user_loses_more_than_the_limit(
 
 @pytest.mark.parametrize("seed", range(20))
 def test_loading_is_the_least_that_keeps_to_the_limit(seed: int) -> None:
-    """Half as much would cost somebody more than the limit, or pass the condition."""
+    """Half the loading would exceed a user's loss limit or the condition limit."""
     a = matrix(list(np.random.default_rng(seed).uniform(-0.9, 0.9, 8)))
     found = precode(a, Precoder(condition_limit=1000.0))
     if found.method is Method.ZERO_FORCING:
@@ -135,7 +135,7 @@ def test_loading_is_the_least_that_keeps_to_the_limit(seed: int) -> None:
         loss_db(a, a.conj() @ np.linalg.inv(gram + x * np.eye(8))).max()
         for x in np.logspace(-9, 3, 2000)
     ]
-    assert np.all(np.diff(losses) < 1e-6)  # more loading, less loss: the bisection is right
+    assert np.all(np.diff(losses) < 1e-6)  # loss decreases with loading, so the bisection is valid
     assert loss_db(a, found.weights).max() == pytest.approx(3.0, abs=0.1)
 
 
@@ -172,7 +172,7 @@ def test_regularised_tends_to_zero_forcing_and_to_maximum_ratio(
     assert np.abs(between - made(Method.ZERO_FORCING)).max() > 1e-3
     assert np.abs(between - made(Method.MATCHED)).max() > 1e-3
     loaded = a.conj() @ np.linalg.inv(a.T @ a.conj() + 16.0 * np.eye(4))
-    ratio = between / loaded  # column by column the same direction
+    ratio = between / loaded  # each column has the same direction
     assert ratio == pytest.approx(np.broadcast_to(ratio[0], ratio.shape))
 
 
@@ -190,7 +190,7 @@ def test_past_the_condition_limit_it_is_regularised_and_says_so(
 
 @pytest.mark.parametrize("limit", [10.0, 1e2, 1e3, 1e4, 1e5, 1e6])
 def test_zero_forcing_is_exact_at_every_limit_that_settings_allow(limit: float) -> None:
-    """A^T F = I to 1e-9 wherever it is not marked as a fallback."""
+    """A^T F = I to 1e-9 unless it is marked as a fallback."""
     try:
         BeamSettings(condition_limit=limit, loss_limit_db=60.0)
     except ValidationError:
@@ -229,7 +229,8 @@ def test_identical_directions_are_finite_under_every_policy(
 
 
 def mirrored(offset: float) -> ComplexArray:
-    """Two UAVs that a line of 64 sees ``offset`` (of the sine) apart, one in front, one behind."""
+    """Return two UAVs that a line of 64 sees ``offset`` (of the sine) apart, one ahead, one
+    behind."""
     sine = 0.5 + offset
     ahead = [math.sqrt(0.75), 0.5, 0.0]
     behind = [-math.sqrt(1 - sine**2), sine, 0.0]
@@ -239,7 +240,7 @@ def mirrored(offset: float) -> ComplexArray:
 
 @pytest.mark.parametrize("policy", Policy)
 def test_through_the_mirror_direction_no_user_loses_more_than_3_db(policy: Policy) -> None:
-    """Where plain zero forcing loses 40 dB."""
+    """Plain zero forcing loses 40 dB there."""
     worst_db, plain_db = 0.0, 0.0
     for offset in [0.0, *np.logspace(-6, -0.7, 120)]:
         for signed in (offset, -offset):
@@ -292,7 +293,7 @@ def test_the_lowest_priority_is_dropped_and_it_is_said_why() -> None:
 
 @pytest.mark.parametrize("policy", Policy)
 def test_what_elements_radiate_there_is_no_closeness(policy: Policy) -> None:
-    """Two UAVs 70 degrees apart, one of them where narrow elements hardly radiate."""
+    """Two UAVs 70 degrees apart, one where narrow elements hardly radiate."""
     line = uniform_linear(
         64,
         30e9,
@@ -310,7 +311,7 @@ def test_what_elements_radiate_there_is_no_closeness(policy: Policy) -> None:
         np.linalg.cond(a / np.linalg.norm(a, axis=0)), rel=1e-9
     )
     assert np.abs(a.T @ found.weights - np.eye(2)).max() < 1e-9
-    # Beside its own mirror image it is the image that counts, however weak both are.
+    # Beside its mirror image, only the image counts, however weak both are.
     twice = precode(a[:, [0, 1, 1]], Precoder(policy=policy))
     assert twice.method is (Method.REGULARISED if policy is Policy.REGULARISE else found.method)
     assert loss_db(a[:, [0, 1, 1]][:, twice.served], twice.weights).max() <= 3 + 1e-6
@@ -325,7 +326,7 @@ def test_what_elements_radiate_there_is_no_closeness(policy: Policy) -> None:
 
 @pytest.mark.parametrize("limit", [2.0, 10.0, 1000.0])
 def test_the_loaded_matrix_is_within_the_condition_limit(limit: float) -> None:
-    """Where the loss alone would let it pass: by the weights of the least loading, written out."""
+    """The loss limit alone would accept it; compared with the weights of the smallest loading."""
     a = matrix([0.3, 0.3 + 1e-5, -0.4])
     found = precode(a, Precoder(condition_limit=limit, loss_limit_db=60.0))
     assert found.method is Method.REGULARISED
@@ -415,7 +416,7 @@ def test_power_is_what_its_name_says(
 
 
 def test_mirror_images_about_the_line_cannot_be_told_apart() -> None:
-    """Ahead and behind, above and below: the same to a line along y."""
+    """Ahead and behind, above and below: equal for a line along y."""
     array = uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     for image in ([-0.6, 0.8, 0.0], [0.0, 0.8, 0.6], [0.0, 0.8, -0.6]):
         a = steering.steering_matrix(array, np.array([[0.6, 0.8, 0.0], image]))
@@ -446,7 +447,7 @@ def test_no_users_no_weights() -> None:
 
 @pytest.mark.parametrize("users", [1, 2])
 def test_what_is_not_a_number_is_refused(users: int) -> None:
-    """Never weights that are not numbers."""
+    """Weights are always finite."""
     with pytest.raises(ValueError, match="0 or not finite"):
         precode(np.full((4, users), np.nan + 0j), Precoder())
 

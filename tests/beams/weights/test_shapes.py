@@ -1,4 +1,4 @@
-"""Shapes: against least gains by the sums written out, and against bounds that need no search."""
+"""Beam shapes against least gains by direct sums and against analytic bounds."""
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ def line(elements: int) -> Array:
 
 
 def gains_db(phases_rad: FloatArray, width: float) -> FloatArray:
-    """Gains of a half-wave line over +-width natural beams, by the sum over elements."""
+    """Return gains of a half-wave line over +-width natural beams, by the sum over elements."""
     elements = len(phases_rad)
     places = np.arange(elements) / elements
     field = np.exp(
@@ -35,8 +35,8 @@ def sure(elements: int, width: float) -> FloatArray:
     return phases
 
 
-# The greatest least gain of 64 elements with any amplitudes, by the linear programme of
-# docs/make_beam_shapes.py, dB; phases alone come near it.
+# Largest least gain of 64 elements with free amplitudes, by the linear programme of
+# docs/make_beam_shapes.py, in dB; phases alone come close to it.
 ALL_DB = {0.25: 17.20, 0.5: 15.05, 1.0: 13.29, 2.0: 11.07, 4.0: 8.52, 8.0: 5.76, 10.0: 4.84}
 
 
@@ -61,7 +61,8 @@ def test_one_table_serves_other_numbers_of_elements(elements: int, most: float) 
 def test_a_likely_shape_has_its_floor_and_gains_by_it(
     cone: float, likely: float, floor_db: float
 ) -> None:
-    """No lower than asked (or 3 dB below the best), and in the middle above the sure shape."""
+    """At least the wanted floor (or 3 dB below the best), and above the guarantee shape in the
+    middle."""
     across = shapes.aperture(line(64))
     cones, usual = np.array([[cone]]), np.array([[likely]])
     (phases,) = shapes.phases_rad(across, cones, usual, floor_db)
@@ -73,7 +74,8 @@ def test_a_likely_shape_has_its_floor_and_gains_by_it(
 
 
 def test_a_floor_that_is_out_of_reach_is_not_paid_for() -> None:
-    """At most 3.5 dB is had within 12 widths: .5 dB, 3 below it, would cost the middle 2 more."""
+    """At most 3.5 dB is reachable within 12 widths; a floor of 0.5 dB, 3 dB below, would cost the
+    middle 2 dB more."""
     across, usual = shapes.aperture(line(64)), np.array([[0.8]])
     middles = []
     for cone in (5.0, 8.0, 12.0, 20.0):
@@ -114,7 +116,7 @@ def test_a_floor_that_is_out_of_reach_is_not_paid_for() -> None:
 def test_a_bound_that_grows_changes_the_gain_little_by_little(
     array: Array, widest: float, likely: float
 ) -> None:
-    """Between the entries of a table as well: phases of two kinds have no mean."""
+    """Also between table entries: phases of two kinds have no mean."""
     across = shapes.aperture(array)
     widths = np.exp(np.arange(np.log(max(0.3, likely)), np.log(widest), 0.02))
     one = np.ones((1, len(across.axes)))
@@ -124,7 +126,7 @@ def test_a_bound_that_grows_changes_the_gain_little_by_little(
 
 
 def disc(width: float) -> FloatArray:
-    """Places (P, 2) all over a disc, and along its rim."""
+    """Return points (P, 2) over a disc and along its rim."""
     side = np.linspace(-width, width, 81)
     inner = np.stack(np.meshgrid(side, side), axis=-1).reshape(-1, 2)
     turns = np.linspace(0, 2 * np.pi, 300)
@@ -135,15 +137,15 @@ def disc(width: float) -> FloatArray:
 @pytest.mark.parametrize(
     ("elements", "width", "least_db"),
     [
-        # At most 1.1 dB below what a search from random and from these phases finds, but for
-        # 16 x 16 beyond 4.
+        # At most 1.1 dB below the result of a search from random and from these phases, except
+        # for 16 x 16 beyond 4 widths.
         (8, 0.5, 14.0), (8, 0.85, 8.7), (8, 1.0, 8.3), (8, 1.5, 5.2), (8, 3.0, -1.2),
         (16, 1.0, 14.3), (16, 2.0, 9.6), (16, 4.0, 4.2), (16, 5.0, 0.1), (16, 6.0, -1.9),
         (32, 4.0, 9.8), (32, 4.15, 9.6), (32, 6.0, 5.2), (32, 8.0, 2.0), (32, 12.0, -1.4),
     ],
 )  # fmt: skip
 def test_the_least_gain_of_a_plane(elements: int, width: float, least_db: float) -> None:
-    """Beyond four natural widths it was down to -30 dB, where one element alone has 0."""
+    """Beyond four natural widths it was once -30 dB, where a single element has 0 dB."""
     across = shapes.aperture(
         uniform_rectangular(
             elements,

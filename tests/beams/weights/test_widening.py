@@ -1,4 +1,4 @@
-"""Beams no narrower than what is known: by what reaches a crowd of directions within the bound."""
+"""Widened beams, by their power towards many directions within the bound."""
 
 import itertools
 import math
@@ -41,7 +41,7 @@ FOUR = towards((-40, 5), (-10, 2), (15, -3), (50, 0))
 
 
 def within(direction: FloatArray, bound_rad: float, seed: int = 1, count: int = 3000) -> FloatArray:
-    """Directions all over the cone, its rim among them."""
+    """Return directions all over the cone, its rim included."""
     rng = np.random.default_rng(seed)
     aside = np.cross(direction, rng.standard_normal((count, 3)))
     aside /= np.linalg.norm(aside, axis=1)[:, np.newaxis]
@@ -51,7 +51,7 @@ def within(direction: FloatArray, bound_rad: float, seed: int = 1, count: int = 
 
 
 def power_db(array: Array, weights: ComplexArray, directions: FloatArray) -> FloatArray:
-    """What columns radiate (D, N), under unit power each."""
+    """Return the power of each column in each direction (D, N), at unit transmit power."""
     response = np.abs(steering_matrix(array, directions).T @ weights) ** 2
     return 10 * np.log10(response / np.sum(np.abs(weights) ** 2, axis=0) + 1e-30)
 
@@ -79,7 +79,7 @@ def spread(
 @pytest.mark.parametrize("bound_deg", [0.9, 1.6, 2.7, 4.0, 6.0, 9.0, 14.0])
 @pytest.mark.parametrize("azimuth_deg", [0.0, -35.0, 60.0])
 def test_a_beam_for_its_bound_reaches_all_of_it(bound_deg: float, azimuth_deg: float) -> None:
-    """Spread evenly there would be 1 / 2w of 64; within 4.5 dB of that everywhere."""
+    """An even spread would have 1 / 2w of 64; within 4.5 dB of that everywhere."""
     directions = towards((azimuth_deg, 3.0))
     beams = spread(LINE, directions, bound_deg).beams
     reached = power_db(LINE, beams, within(directions[0], math.radians(bound_deg)))
@@ -123,7 +123,7 @@ def test_points_are_beside_each_user_where_the_array_has_room() -> None:
         (LINE, FOUR, 2),
         (RECTANGLE, FOUR, 4),
         (uniform_linear(8, 30e9, spacing_wavelengths=0.5, array_from_body=EYE), FOUR, 0),
-        (RECTANGLE, FOUR[:1], 0),  # nobody to be kept from
+        (RECTANGLE, FOUR[:1], 0),  # no other UAV needs a null
     ):
         wide = spread(array, directions, 5.0, 2.0)
         assert wide.each == 1 + beside
@@ -145,7 +145,7 @@ def test_what_concerns_some_users_is_theirs_in_their_order() -> None:
 
 @pytest.mark.parametrize("array", [LINE, RECTANGLE, CIRCLE], ids=["line", "rectangle", "circle"])
 def test_nulls_are_as_wide_as_is_likely(array: Array) -> None:
-    """What reaches the others falls by 6 dB at least against nulls at their places alone."""
+    """The interference falls by at least 6 dB compared with nulls at single points."""
     likely = math.radians(1.5)
     a = steering_matrix(array, FOUR)
     wide = precode(a, Precoder(), spread(array, FOUR, 1.5, 1.5, Widen.LIKELY)).weights
@@ -161,7 +161,7 @@ def test_nulls_are_as_wide_as_is_likely(array: Array) -> None:
 def crowded(
     users: int, seed: int, most_deg: float, widen: Widen
 ) -> tuple[Spread, list[FloatArray]]:
-    """Any lines and planes, bounds that overlap, users that coincide; and a crowd in each cone."""
+    """Draw lines and planes with overlapping bounds and coincident users; sample each cone."""
     rng = np.random.default_rng(seed)
     array = [
         LINE,
@@ -189,7 +189,7 @@ def crowded(
 def test_nulls_cost_no_least_gain_more_than_their_price(
     users: int, seed: int, most_deg: float, widen: Widen
 ) -> None:
-    """Where it is looked at, over the cone and over its likely part."""
+    """At the sample points, over the cone and over its likely part."""
     wide, _ = crowded(users, seed, most_deg, widen)
     found = nulls.with_nulls(wide).weights
     assert np.isfinite(found).all()
@@ -202,14 +202,14 @@ def test_nulls_cost_no_least_gain_more_than_their_price(
         before, after = ((gain / asked).min(axis=1) for gain in gains)
         worth = before > 1.15
         least = np.maximum(before[worth] * 10**-0.25, 1.15)
-        assert (after[worth] > 0.9 * least - 1e-8).all()  # dips that are shallow count for less
-        # A beam without a floor: of 1500 random pairs the deepest lost 10.1 times in dB what it
-        # lacked before. It is no law, so the limit leaves room.
+        assert (after[worth] > 0.9 * least - 1e-8).all()  # shallow dips count for less
+        # A beam without a floor: in 1500 random pairs the deepest loss was 10.1 times in dB what it
+        # lacked before. This is empirical, so the limit leaves room.
         assert (after[~worth] > 1.15 * (before[~worth] / 1.15) ** 14 - 1e-8).all()
 
 
 def test_nulls_seldom_cost_more_between_the_places_that_are_looked_at() -> None:
-    """Beside a steep flank a cone's edge may lose more; what is promised is proven elsewhere."""
+    """Beside a steep flank the edge of a cone may lose more; guarantees are proven elsewhere."""
     lost: list[float] = []
     for seed in range(60):
         wide, crowds = crowded(2 + seed % 9, seed, 0.5 * (1 + seed % 40), list(Widen)[seed % 2])
@@ -228,7 +228,7 @@ def test_nulls_seldom_cost_more_between_the_places_that_are_looked_at() -> None:
 
 
 def test_two_uavs_close_together_keep_their_floors() -> None:
-    """Bounds of 4.7 degrees, 5 degrees apart: exact nulls would leave nothing of the floors."""
+    """Bounds of 4.7 degrees, 5 degrees apart: exact nulls would leave no floor gain."""
     directions = towards((0.0, 0.0), (5.0, 0.0))
     wide = spread(LINE, directions, 4.7, 1.2)
     found = nulls.with_nulls(wide)
@@ -255,19 +255,20 @@ def test_where_nothing_stands_in_the_way_nulls_are_exact() -> None:
 @settings(max_examples=examples(40), deadline=None)
 @given(st.integers(0, 2**16), st.sampled_from(list(Widen)[:2]))
 def test_beams_follow_directions_without_a_step(seed: int, widen: Widen) -> None:
-    """Through bounds that overlap: no loading begins or ends suddenly."""
+    """Through overlapping bounds: no loading starts or stops abruptly."""
     assert least_alike(seed, widen) > 0.75
 
 
 @pytest.mark.parametrize("seed", [178, 994, 13797, 22582, 26960, 28655, 38418, 49021])
 def test_beams_of_two_that_pass_one_another_do_not_turn_round(seed: int) -> None:
-    """Two of four have the same direction at some time: a null beside a beam changes its side."""
+    """Two of four UAVs coincide at some time: a null beside a beam changes its side."""
     for widen in (Widen.LIKELY, Widen.GUARANTEE):
         assert least_alike(seed, widen) > 0.75
 
 
 def least_alike(seed: int, widen: Widen) -> float:
-    """Least overlap of a beam's shape with that of the step before, of four that move slowly."""
+    """Return the smallest overlap of a beam's shape with that of the step before; four UAVs move
+    slowly."""
     rng = np.random.default_rng(seed)
     angles = np.stack([rng.uniform(-60, 60, 4), np.zeros(4)], axis=1)
     bounds, likely = rng.uniform(1, 15, 4).tolist(), rng.uniform(0.2, 2, 4).tolist()
@@ -304,7 +305,7 @@ def test_turns_are_exact(policy: Policy, seed: int) -> None:
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 6, 11])
 def test_points_nulled_beside_the_others_leave_nothing_at_them(seed: int) -> None:
-    """On arrays so dense that rounding costs ten digits of the nulls, if it is not taken away."""
+    """On dense arrays rounding would cost ten digits of the nulls unless it is corrected."""
     for spacing in (0.05, 0.1):
         rng = np.random.default_rng(seed)
         array = uniform_linear(32, 30e9, spacing_wavelengths=spacing, array_from_body=EYE)
@@ -378,7 +379,7 @@ EVERY = {
 def test_weights_are_finite_whatever_the_array_and_the_uavs(
     array: Array, data: st.DataObject
 ) -> None:
-    """From one user to twice as many as elements; coincident, opposite, anywhere at all."""
+    """From one user to twice as many as elements; coincident, opposite, random directions."""
     users = data.draw(st.integers(1, 2 * array.size))
     rng = np.random.default_rng(data.draw(st.integers(0, 2**16)))
     directions = rng.standard_normal((users, 3))
@@ -408,7 +409,8 @@ def test_weights_are_finite_whatever_the_array_and_the_uavs(
 
 
 def test_a_least_gain_that_the_link_needs_is_what_nulls_leave() -> None:
-    """Another UAV within the bound: with 6 dB needed the floor stays above them, else above 0."""
+    """Another UAV within the bound: with 6 dB required the floor stays above 6 dB, otherwise above
+    0 dB."""
     directions = towards((0.0, 0.0), (2.0, 0.0))
     likely, bounds = np.radians([0.6, 0.6]), np.radians([2.5, 2.5])
     crowd = within(directions[0], math.radians(2.5))

@@ -1,4 +1,4 @@
-"""Zero forcing: numpy's pseudo-inverse as oracle, and what has no answer."""
+"""Zero forcing against numpy's pseudo-inverse, and inputs without a solution."""
 
 import numpy as np
 import pytest
@@ -15,24 +15,24 @@ from companion.values import ComplexArray, FloatArray
 EYE = np.eye(3)
 COSINE = Element(ElementPattern.COSINE, 1.5)
 SIZES = [(64, 32), (64, 8)]
-"""Elements and users."""
+"""Numbers of elements and users."""
 
 
 def line(sines: FloatArray, size: int) -> ComplexArray:
-    """Steering of a half-wave line for directions in the plane, by their sines."""
+    """Return the steering matrix of a half-wave line for directions given by their sines."""
     made: ComplexArray = np.exp(1j * np.pi * np.outer(np.arange(size), sines))
     return made
 
 
 def spread(users: int, rng: np.random.Generator, jitter: float = 0.3) -> FloatArray:
-    """Sines that are about equally far apart."""
+    """Return sines with roughly equal spacing."""
     grid = np.linspace(-1, 1, users, endpoint=False) + 1 / users
     sines: FloatArray = grid + rng.uniform(-jitter, jitter, users) / users
     return sines
 
 
 def anywhere(users: int, rng: np.random.Generator) -> FloatArray:
-    """Unit directions in front of the array, (N, 3)."""
+    """Return unit directions in front of the array, (N, 3)."""
     drawn = rng.standard_normal((users, 3))
     drawn[:, 0] = np.abs(drawn[:, 0]) + 0.1
     directions: FloatArray = drawn / np.linalg.norm(drawn, axis=1, keepdims=True)
@@ -40,7 +40,8 @@ def anywhere(users: int, rng: np.random.Generator) -> FloatArray:
 
 
 def mirrored_list(size: int, rng: np.random.Generator) -> Array:
-    """Elements anywhere in space, in any order, with their mirror images through some point."""
+    """Return elements at random positions and in random order, with their mirror images about some
+    point."""
     half = rng.uniform(-0.2, 0.2, (size // 2, 3))
     centre = np.zeros((size % 2, 3))
     placed = np.concatenate([half, centre, -half]) + rng.uniform(-1, 1, 3)
@@ -48,7 +49,7 @@ def mirrored_list(size: int, rng: np.random.Generator) -> Array:
 
 
 def any_array(kind: str, rng: np.random.Generator) -> Array:
-    """With 63 to 66 elements."""
+    """Return an array of 63 to 66 elements."""
     match kind:
         case "ula":
             return geometry.uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
@@ -87,7 +88,7 @@ KINDS = ["ula", "odd ula", "ura", "odd ura", "uca", "odd uca", "outward uca", "l
 
 
 def check(found: ZeroForcingSolution | None, a: ComplexArray, tolerance: float = 1e-12) -> None:
-    """Against the pseudo-inverse; gains and loss factors by their definitions."""
+    """Compare with the pseudo-inverse; gains and loss factors by their definitions."""
     assert found is not None
     condition = np.linalg.cond(a)
     tolerance *= condition**2
@@ -116,7 +117,7 @@ def test_any_memory_order(size: int, users: int) -> None:
         found = solve(given_as)
         check(found, a)
         assert found is not None
-        assert found.weights.strides[0] == 16  # one user's weights lie together
+        assert found.weights.strides[0] == 16  # the weights of one user are contiguous
         assert np.array_equal(given_as, before)
 
 
@@ -138,7 +139,7 @@ def test_loss_factors_do_not_depend_on_how_columns_are_scaled(
     )
 
 
-# --- where there is no answer -------------------------------------------------------------------
+# --- no solution --------------------------------------------------------------------------------
 
 
 def test_no_users() -> None:
@@ -181,9 +182,9 @@ def test_more_users_than_elements_have_no_answer(users: int) -> None:
 def test_what_is_nearly_singular_shows_in_the_loss_factors(
     separation: float, numbers: tuple[int, int]
 ) -> None:
-    """Two users that come together: the closed form of their loss, and A^T F = I as far as it says.
+    """Two users that approach each other: closed form of the loss, and A^T F = I.
 
-    Alone with another user whose normalised inner product with it is c, a user loses 1/(1 - |c|^2).
+    A user whose normalised inner product with the only other user is c loses 1/(1 - |c|^2).
     """
     size, users = numbers
     sines = spread(users, np.random.default_rng(6))
@@ -194,7 +195,7 @@ def test_what_is_nearly_singular_shows_in_the_loss_factors(
         assert separation < -5
         return
     pair = solve(a[:, :2])
-    # 1 - |c|^2, as the mean of 1 - cos((m - m') phase) over pairs of elements: nothing cancels.
+    # 1 - |c|^2 as the mean of 1 - cos((m - m') phase) over element pairs: no cancellation.
     phase = np.pi * (sines[1] - sines[0]) / 2
     apart = np.subtract.outer(np.arange(size), np.arange(size))
     loss = size**2 / (2 * np.sum(np.sin(apart * phase) ** 2))

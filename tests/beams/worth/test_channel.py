@@ -1,4 +1,4 @@
-"""Propagation: Friis by hand, moments of many draws, blockage against a list walked through."""
+"""Propagation: Friis by hand, moments of random draws, blockage against a linear scan."""
 
 import math
 
@@ -67,7 +67,7 @@ def test_a_wavelength_that_is_none_is_refused(wavelength_m: float) -> None:
 
 
 def test_sight_alone_is_the_outer_product_written_out() -> None:
-    """Not conjugated at either end, of unit magnitude, one random phase a UAV."""
+    """Unconjugated at both ends, unit magnitude, one random phase per UAV."""
     at_node, at_uav = directions(1, 3), directions(2, 3)
     channels = draw(
         SIGHT_ONLY,
@@ -99,7 +99,7 @@ def test_sight_alone_is_the_outer_product_written_out() -> None:
     ("node", "uav"),
     [
         (NODE, UAV),
-        # A cosine sends all its power, so its mean over all directions is 1.
+        # A cosine element radiates all its power, so its mean gain over all directions is 1.
         (
             uniform_circular(
                 6,
@@ -152,7 +152,7 @@ def test_the_mean_energy_is_that_of_antennas_and_elements(
 @pytest.mark.parametrize("k_db", [-5.0, 3.0, 12.0])
 def test_one_pair_of_antennas_fades_as_rice_does(k_db: float) -> None:
     """Moments of a Rician amplitude: E x^2 = 1, E x^4 = 1 + (1 + 2 K) / (1 + K)^2. Exact for any
-    number of rays, for their amplitudes are Gaussian."""
+    number of rays, because ray amplitudes are Gaussian."""
     single = listed(np.zeros((1, 3)), 30e9, array_from_body=np.eye(3))
     many = 40_000
     ahead = np.tile([1.0, 0.0, 0.0], (many, 1))
@@ -191,7 +191,8 @@ def test_the_phase_of_the_sight_is_uniform() -> None:
 
 
 def test_rays_of_one_cluster_lie_about_it() -> None:
-    """Without spread the rays of a cluster are one, and the channel of rank 1; with it not."""
+    """Without spread the rays of a cluster coincide and the channel has rank 1; with spread it has
+    not."""
     ahead = np.array([[1.0, 0.0, 0.0]])
     rank_one = SalehValenzuela(
         rician_k_db=-math.inf, clusters=1, rays_per_cluster=20, angular_spread_rad=0.0
@@ -222,10 +223,10 @@ def test_rays_of_one_cluster_lie_about_it() -> None:
 
 
 def test_the_spread_is_the_standard_deviation_across_a_cluster() -> None:
-    """By the correlation of two elements 2 wavelengths apart. A Laplacian angle of deviation s
-    has the characteristic function 1 / (1 + (x s)^2 / 2); two of them, across a cluster that is
-    turned by psi and lies at cosine c from the pair, give rho below. The amplitudes of rays are
-    Gaussian, so E |h0 h1|^2 = 1 + |correlation|^2, and L rays have 1/L of it by chance."""
+    """Correlation of two elements 2 wavelengths apart. A Laplacian angle of deviation s has the
+    characteristic function 1 / (1 + (x s)^2 / 2). Two of them, across a cluster rotated by psi
+    at cosine c from the pair, give rho below. Ray amplitudes are Gaussian, so E |h0 h1|^2 = 1 +
+    |correlation|^2, of which L rays contribute 1/L by chance."""
     rays, spread, apart = 30, 0.05, 2.0
     pair = listed(
         np.array([[0, 0, 0], [apart * 0.01, 0, 0]]),
@@ -249,7 +250,7 @@ def test_the_spread_is_the_standard_deviation_across_a_cluster() -> None:
     x = 2 * np.pi * apart * spread * np.sqrt(1 - cosine**2)
     rho = 1 / ((1 + (x * np.cos(psi)) ** 2 / 2) * (1 + (x * np.sin(psi)) ** 2 / 2))
     wanted = 1 + 1 / rays + (1 - 1 / rays) * np.mean(rho**2)
-    assert 1.5 < wanted < 1.9  # far enough from 1 and 2 to tell a wrong spread
+    assert 1.5 < wanted < 1.9  # far enough from 1 and 2 to reveal a wrong spread
     assert np.mean(np.abs(h[:, 0] * h[:, 1]) ** 2) == pytest.approx(wanted, abs=0.08)
 
 
@@ -323,7 +324,7 @@ def test_directions_come_in_pairs(nodes: int, uavs: int) -> None:
 
 
 def test_the_combiner_is_matched_and_of_unit_norm() -> None:
-    """N_U times the power of one antenna; noise as at one; no other unit combiner does better."""
+    """N_U times the power of one antenna, noise as at one; no other unit combiner is better."""
     at_node, at_uav = directions(1, 5), directions(2, 5)
     rng = np.random.default_rng(4)
     channels = draw(
@@ -340,14 +341,14 @@ def test_the_combiner_is_matched_and_of_unit_norm() -> None:
     best = np.linalg.svd(channels, compute_uv=False)[:, 0]
     assert np.linalg.norm(rows, axis=1) == pytest.approx(best)
     assert np.abs(rows) ** 2 == pytest.approx(4 * np.abs(channels[:, 0, :]) ** 2)
-    # Noise put through as a channel would be: unit variance stays unit variance.
+    # Noise passed through the combiner keeps unit variance.
     noise = rng.standard_normal((5, 4, 20_000)) + 1j * rng.standard_normal((5, 4, 20_000))
     through = combined_rows(noise / math.sqrt(2), b)
     assert np.mean(np.abs(through) ** 2, axis=1) == pytest.approx(np.ones(5), abs=0.04)
 
 
 def test_a_conjugate_beam_meets_the_combined_row() -> None:
-    """F = a* and w^H H = |b| a^T add up in phase: M^2 N_U."""
+    """F = a* and w^H H = |b| a^T add in phase: M^2 N_U."""
     at_node, at_uav = directions(3, 4), directions(4, 4)
     channels = draw(
         SIGHT_ONLY,
@@ -420,7 +421,8 @@ def test_a_blockage_that_is_none_is_refused(
 
 
 def test_drawn_blockages_block_as_a_queue_of_many_servers_is_busy() -> None:
-    """P(blocked at t) = 1 - exp(-rate mean (1 - exp(-t/mean))): M/M/infinity, empty at first."""
+    """P(blocked at t) = 1 - exp(-rate mean (1 - exp(-t/mean))): M/M/infinity, empty at the
+    start."""
     rng = np.random.default_rng(8)
     rate_hz, mean_s = 0.8, 0.5
     times = np.array([0.0, 0.25, 0.5, 1.0, 3.0, 9.9])

@@ -1,4 +1,4 @@
-"""Cells cover their cones, and bounds hold over each: by directions drawn at random and at rims."""
+"""Cells cover their cones, and their bounds hold for random directions and on rims."""
 
 import cmath
 import dataclasses
@@ -61,7 +61,7 @@ def anywhere(rng: np.random.Generator, count: int) -> FloatArray:
 def within(
     direction: FloatArray, bound_rad: float, rng: np.random.Generator, count: int
 ) -> FloatArray:
-    """Unit directions within an angle of one, every third on the rim."""
+    """Return unit directions within an angle of one; every third lies on the rim."""
     aside = np.cross(direction, anywhere(rng, count))
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     off = bound_rad * np.where(np.arange(count) % 3, np.sqrt(rng.uniform(size=count)), 1.0)
@@ -76,7 +76,7 @@ def angle_rad(a: FloatArray, b: FloatArray) -> FloatArray:
 def drawn_cones(
     array: Array, bound_rad: float, seed: int, endfire: bool
 ) -> tuple[DirectionCones, Boxes]:
-    """One cone, in any direction or along the line of the elements, and its boxes, split or not."""
+    """Draw one cone, in any direction or along the element line, and its cells, split or not."""
     rng = np.random.default_rng(seed)
     direction = anywhere(rng, 1)
     if endfire and array.size > 1:
@@ -95,12 +95,12 @@ def predicted_of(cones: DirectionCones) -> FloatArray:
 
 
 def whole(cones: DirectionCones) -> DirectionCones:
-    """With all columns, in which a direction can be compared."""
+    """Return cones with all columns, so that a direction can be compared."""
     return dataclasses.replace(cones, columns=np.arange(3))
 
 
 def holders(cells: Cells, direction: FloatArray) -> FloatArray:
-    """Which cells say that they hold the direction, by their reaches and by their caps."""
+    """Return which cells contain the direction, by their reaches and by their caps."""
     off = np.einsum("cdb,cb->cd", cells.axes, direction - cells.middles)
     reached = np.abs(off) <= cells.reach + 1e-12
     capped = angle_rad(cells.caps, direction) <= cells.caps_rad + 1e-7
@@ -123,7 +123,7 @@ def test_every_direction_of_a_cone_is_in_a_cell(
 
 @pytest.mark.parametrize("kind", sorted(ARRAYS))
 def test_the_frame_is_right_handed_and_holds_the_predicted_direction(kind: str) -> None:
-    """Also a millionth of a millionth off the line of the elements, where a cross product fails."""
+    """Also 1e-12 off the element line, where a cross product fails."""
     array = ARRAYS[kind]
     rng = np.random.default_rng(2)
     directions = anywhere(rng, 12)
@@ -143,12 +143,12 @@ def test_the_frame_is_right_handed_and_holds_the_predicted_direction(kind: str) 
 def test_responses_stay_within_the_bounds_of_their_cell(
     kind: str, bound_rad: float, seed: int
 ) -> None:
-    """The sum is written out, with the pattern where it is no common factor."""
+    """Compared with direct sums, including the element pattern where it is not a common factor."""
     array = ARRAYS[kind]
     cones, boxes = drawn_cones(array, bound_rad, seed, endfire=False)
     cells = cone.cells(cones, boxes, caps=5)
     rng = np.random.default_rng(seed)
-    # No more than the magnitudes that the cones were made for: the first draws of that seed.
+    # At most the magnitudes for which the cones were built: the first draws of that seed.
     anywhere(rng, 1)
     magnitudes = np.abs(rng.standard_normal((array.size, 1)))[:, 0]
     weights = magnitudes * np.exp(1j * rng.uniform(0, 2 * math.pi, array.size))
@@ -170,15 +170,15 @@ def test_responses_stay_within_the_bounds_of_their_cell(
         if off is not None:
             changed = np.abs(amplitudes[:, np.newaxis] - np.abs(received))
             assert (changed <= off + 1e-9)[:, held].all()
-        unsure = 1e-9 * magnitudes.sum()  # a direction may be that little outside
+        unsure = 1e-9 * magnitudes.sum()  # rounding
         assert (abs(response) >= (low - slack)[held] - unsure).all()
         assert (abs(response) <= (high + slack)[held] + unsure).all()
 
 
 @pytest.mark.parametrize("phases_rad", [0.0, 1.0])
 def test_smaller_cells_say_more_by_the_square(phases_rad: float) -> None:
-    """What is unsure falls to about a sixteenth when cells are quartered, with weights far from
-    even, too: and it is never less than nothing."""
+    """Quartering the cells cuts the slack to about a sixteenth, also for uneven weights; it is
+    never negative."""
     array = ARRAYS["line"]
     rng = np.random.default_rng(3)
     weights = np.exp(-np.arange(16) / 3 + 1j * phases_rad * rng.standard_normal(16))[:, np.newaxis]
@@ -192,14 +192,16 @@ def test_smaller_cells_say_more_by_the_square(phases_rad: float) -> None:
         terms = weights * received
         responses, moments = terms.sum(axis=0), cones.positions_m.T @ terms
         low, high = cone.response_range(cones, cells, responses, moments)
-        angles = np.linspace(boxes.low[:, 0], boxes.high[:, 0], 50)  # from the pole: the line
+        angles = np.linspace(
+            boxes.low[:, 0], boxes.high[:, 0], 50
+        )  # from the pole: the element line
         sines = cones.frames[0, 0, 1] * np.cos(angles)
         phase = np.pi * np.arange(16)[:, np.newaxis, np.newaxis] * sines
         true = np.abs(np.sum(weights[:, np.newaxis] * np.exp(1j * phase), axis=0))
         below, above = true.min(axis=0) - low, high - true.max(axis=0)
         assert min(below.min(), above.min()) > 0
         losses.append([below.max(), above.max()])
-        # Of the order of the remainder: its phase turns as well, which the lower bound leaves out.
+        # Of the order of the remainder: its phase changes too, which the lower bound ignores.
         half = (boxes.high - boxes.low)[0, 0] / 2
         remainder = cones.curvatures.max() * half**2
         assert (np.array(losses[-1]) <= [5 * remainder, 1.1 * remainder]).all()
@@ -208,7 +210,7 @@ def test_smaller_cells_say_more_by_the_square(phases_rad: float) -> None:
 
 
 def test_a_response_of_exactly_nothing_has_a_slope_all_the_same() -> None:
-    """Its phase is anything."""
+    """The phase of a zero response is arbitrary."""
     array = uniform_linear(2, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     cones = cone.cones_around(array, np.array([[1.0, 0, 0]]), np.array([0.1]), np.ones((2, 1)))
     cells = cone.cells(cones, cone.first_boxes(cones), caps=1)

@@ -1,4 +1,4 @@
-"""Guaranteed gains and leakage: never beaten by any direction drawn, close to a search's best."""
+"""Guaranteed gains and leakage: valid for every drawn direction, and close to search results."""
 
 import cmath
 import itertools
@@ -61,7 +61,7 @@ BOUNDS_DEG = (1e-5, 0.01, 0.3, 1.5, 8.0, 45.0, 180.0)
 
 
 def weights_for(array: Array, rng: np.random.Generator) -> dict[str, ComplexArray]:
-    """Towards ``AHEAD``: matched, zero forcing, with phases of two bits, and at random."""
+    """Return weights towards ``AHEAD``: matched, zero forcing, two-bit phases, or random."""
     a = steering.steering_matrix(array, AHEAD)
     random = rng.standard_normal((2, array.size, 3)).T @ [1, 1j]
     steps = np.exp(1j * np.pi / 2 * np.round(np.angle(a.conj()) * 2 / np.pi))
@@ -77,13 +77,13 @@ CASES = [
     for kind in weights_for(array, np.random.default_rng(1))
 ]
 QUICK = {"circle": "zero forcing", "cloud of patterns": "two bits", "line of patterns": "random"}
-"""Of arrays with which a case takes most of a second, the kind of weights in `make test`."""
+"""Kind of weights used in `make test` for arrays whose case takes most of a second."""
 
 
 def within(
     direction: FloatArray, bound_rad: float, rng: np.random.Generator, count: int
 ) -> FloatArray:
-    """Unit directions within an angle of one, every third on the rim."""
+    """Return unit directions within an angle of one; every third lies on the rim."""
     aside = np.cross(direction, rng.standard_normal((count, 3)))
     aside /= np.linalg.norm(aside, axis=1, keepdims=True)
     off = bound_rad * np.where(np.arange(count) % 3, np.sqrt(rng.uniform(size=count)), 1.0)
@@ -91,7 +91,7 @@ def within(
 
 
 def gains(array: Array, directions: FloatArray, weights: ComplexArray) -> FloatArray:
-    """Array gain, linear, (directions, columns)."""
+    """Return the linear array gain, (directions, columns)."""
     received = steering.steering_matrix(array, directions).T @ weights
     return np.abs(received) ** 2 / np.sum(np.abs(weights) ** 2, axis=0)
 
@@ -99,8 +99,8 @@ def gains(array: Array, directions: FloatArray, weights: ComplexArray) -> FloatA
 def searched(
     array: Array, direction: FloatArray, bound_rad: float, weights: ComplexArray, sign: int
 ) -> float:
-    """The least gain (``sign`` 1) or the largest (-1) that many draws and, from the best few of
-    them, ever closer ones attain."""
+    """Return the least (``sign`` 1) or largest (-1) gain found by many draws and by ever closer
+    draws around the best few."""
     rng = np.random.default_rng(4)
     tried = within(direction, bound_rad, rng, rounds(600, 2000))
     for scale in 0.2 * 0.4 ** np.arange(6):
@@ -121,7 +121,7 @@ def searched(
     ],
 )
 def test_no_direction_within_the_bound_has_less_or_leaks_more(name: str, kind: str) -> None:
-    """Thousands of directions for each array and each kind of weights, over all bounds."""
+    """Thousands of directions for each array, kind of weights and bound."""
     array, rng = ARRAYS[name], np.random.default_rng(CASES.index((name, kind)))
     weights = weights_for(array, np.random.default_rng(1))[kind]
     bounds = np.repeat(np.radians(BOUNDS_DEG), 3)
@@ -139,8 +139,8 @@ def test_no_direction_within_the_bound_has_less_or_leaks_more(name: str, kind: s
 @pytest.mark.parametrize("name", sorted(ARRAYS))
 @pytest.mark.parametrize("kind", ["matched", "random"])
 def test_the_bounds_are_close_to_what_a_search_finds(name: str, kind: str) -> None:
-    """Within 0.1 dB for a gain within 15 dB of the predicted one and a cone of a few beams; a dB
-    where patterns that differ are set against one another, and all work goes into that."""
+    """Within 0.1 dB for a gain within 15 dB of the predicted one and a cone of a few beams; within
+    1 dB for unequal element patterns, where all work is used up."""
     array = ARRAYS[name]
     weights = weights_for(array, np.random.default_rng(1))[kind]
     width_rad = 1.0 / (array.wavenumber_radpm * max(np.ptp(array.elements_m, axis=0).max(), 1e-3))
@@ -188,7 +188,7 @@ def test_the_gain_is_the_sum_written_out() -> None:
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
 def test_without_error_it_is_the_nominal_gain(name: str) -> None:
-    """To eight digits, and not above it in the last."""
+    """To eight digits, and never above it."""
     array = ARRAYS[name]
     aims = within(AHEAD[0], 1.0, np.random.default_rng(2), 40)
     for weights in weights_for(array, np.random.default_rng(1)).values():
@@ -202,7 +202,7 @@ def test_without_error_it_is_the_nominal_gain(name: str) -> None:
 
 
 def test_a_gain_far_down_is_a_gain() -> None:
-    """Two elements that all but cancel."""
+    """Two elements that almost cancel."""
     weights = np.array([[1.0], [-0.9999]], dtype=complex)
     (found,) = guaranteed_gains_db(
         line(2, 1e9, spacing_wavelengths=0.5, array_from_body=EYE),
@@ -214,7 +214,7 @@ def test_a_gain_far_down_is_a_gain() -> None:
 
 
 def test_a_null_at_the_predicted_direction_leaks_beside_it() -> None:
-    """Exactly zero there: its phase is anything, and the slope counts all the same."""
+    """The response is exactly zero there: its phase is arbitrary, and the slope still counts."""
     weights = np.array([[1.0], [-1.0]], dtype=complex)
     array = line(2, 1e9, spacing_wavelengths=0.5, array_from_body=EYE)
     ahead = np.array([[1.0, 0, 0]])
@@ -226,7 +226,8 @@ def test_a_null_at_the_predicted_direction_leaks_beside_it() -> None:
 
 @pytest.mark.parametrize(("elements", "bound_deg"), [(64, 0.79), (128, 0.40)])
 def test_the_known_beams_lose_three_decibels(elements: int, bound_deg: float) -> None:
-    """MATH: golden values. On the exact half-power angle it is a half to the tolerance."""
+    """docs/math.md golden values. At the exact half-power angle the gain is half, within the
+    tolerance."""
     array = line(elements, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     ahead = np.array([[1.0, 0, 0]])
     weights = np.ones((elements, 1), dtype=complex)
@@ -242,7 +243,7 @@ def test_the_known_beams_lose_three_decibels(elements: int, bound_deg: float) ->
 
 
 def test_nothing_is_sure_past_a_null() -> None:
-    """The first null of 64 elements at half a wavelength lies at 1.79 degrees."""
+    """The first null of 64 half-wave elements is at 1.79 degrees."""
     array = line(64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     weights = np.ones((64, 1), dtype=complex)
     ahead = np.array([[1.0, 0, 0]])
@@ -252,7 +253,7 @@ def test_nothing_is_sure_past_a_null() -> None:
 
 
 def test_nothing_is_sure_of_any_direction() -> None:
-    """Without a bound: also of a single element that radiates the same everywhere."""
+    """Also for a single element that radiates equally everywhere."""
     weights = np.ones((1, 1), dtype=complex)
     array = line(1, 1e9, spacing_wavelengths=0.5, array_from_body=EYE)
     assert guaranteed_gains_db(array, AHEAD[:1], [None], weights) == (None,)
@@ -291,7 +292,7 @@ def test_behind_elements_that_radiate_nothing_there_nothing_arrives() -> None:
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
 def test_a_larger_bound_promises_no_more(name: str) -> None:
-    """But for the tolerance, by which either may be off."""
+    """Except for the tolerance, by which either may be off."""
     array = ARRAYS[name]
     weights = weights_for(array, np.random.default_rng(1))["matched"]
     before_db, before = [math.inf] * 3, np.zeros((3, 3))
@@ -299,7 +300,7 @@ def test_a_larger_bound_promises_no_more(name: str) -> None:
         least = guaranteed_gains_db(array, AHEAD, [bound_rad] * 3, weights)
         most = leakage_bounds(array, AHEAD, [bound_rad] * 3, weights)
         after_db = [-math.inf if found is None else found for found in least]
-        # Past 20 dB down, what cannot be pinned down within the work may be off by more.
+        # Below -20 dB the limited work may leave a larger error.
         for i in range(3):
             assert after_db[i] <= max(before_db[i] + 0.06, -20.0)
         assert (most >= before * 10**-0.006).all()

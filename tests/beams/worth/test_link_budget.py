@@ -1,4 +1,4 @@
-"""Link budget by hand; SINR against symbols sent and measured, and against closed forms."""
+"""Link budget by hand; SINR against simulated symbols and closed forms."""
 
 import math
 
@@ -97,7 +97,7 @@ def test_each_group_sends_the_whole_power_in_equal_streams(seed: int, slots: lis
     for slot in set(slots):
         mine = powers[groups == slot]
         assert mine == pytest.approx(np.full(len(mine), 3.0 / len(mine)))
-    # The directions of the columns are as they were.
+    # Column directions are unchanged.
     assert shared / np.sqrt(powers) == pytest.approx(weights / np.linalg.norm(weights, axis=0))
 
 
@@ -119,8 +119,8 @@ def test_power_that_is_none_is_refused(power_w: float) -> None:
 
 
 def test_it_is_what_a_receiver_measures_on_random_symbols() -> None:
-    """Symbols through the whole chain: weights, scattered channel, noise at each antenna of the
-    UAV, combining; the wanted part found by correlation, the rest is interference and noise."""
+    """Symbols through the whole chain: weights, scattered channel, noise at each UAV antenna,
+    combining. The wanted part is found by correlation; the rest is interference and noise."""
     rng = np.random.default_rng(12)
     users, antennas, symbols = 3, 4, 200_000
     uav = uniform_linear(antennas, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
@@ -214,7 +214,7 @@ def test_matched_antennas_at_the_uav_gain_their_number_exactly() -> None:
 
 @pytest.mark.parametrize("depth_db", [3.0, 25.0])
 def test_a_blockage_takes_its_decibels_from_the_sinr(depth_db: float) -> None:
-    """Exactly, where there is no interference; where there is nothing else, nothing."""
+    """Exactly so without interference; with interference alone the SINR does not change."""
     lost_db = Blockages(((1.0, 2.0),), depth_db).attenuation_db(np.array([0.5, 1.5]))
     gains = 10 ** (-lost_db / 10)[:, np.newaxis] * np.ones(2)
     clear, blocked = sinr(np.broadcast_to(np.eye(2, dtype=complex), (2, 2, 2)), gains, 0.1)
@@ -269,7 +269,7 @@ def test_a_rate_that_is_none_is_refused() -> None:
         spectral_efficiency(1.0, slots=0)
 
 
-# --- what is shown ------------------------------------------------------------------------------
+# --- displayed values ---------------------------------------------------------------------------
 
 
 def sent(weights: ComplexArray, groups: IntArray | None = None) -> ComplexArray:
@@ -281,7 +281,7 @@ def sent(weights: ComplexArray, groups: IntArray | None = None) -> ComplexArray:
 def test_what_is_sent_is_the_matrix_that_is_delivered(
     normalisation: Normalisation, groups: IntArray | None
 ) -> None:
-    """Up to one factor for each slot; all of the power, or its share at the busiest element."""
+    """Up to one factor per time slot; full power, or its share at the busiest element."""
     rng = np.random.default_rng(1)
     weights = random_complex(rng, 8, 4) * np.array([1.0, 2.0, 0.1, 5.0])
     if normalisation is Normalisation.ANTENNA:
@@ -397,7 +397,7 @@ def test_no_uavs_and_no_antennas() -> None:
 @settings(max_examples=examples(40))
 @given(st.integers(0, 2**32 - 1), st.booleans())
 def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, slots: bool) -> None:
-    """True directions and ranges anywhere in their bounds, against the worst of each together."""
+    """True directions and ranges anywhere in their bounds, against the combined worst case."""
     rng = np.random.default_rng(seed)
     bounds = rng.uniform(0.001, 0.03, 4)
     made = precode(steering.steering_matrix(ARRAY, APART), Precoder())
@@ -407,7 +407,7 @@ def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, slots: boo
     leaks = leakage_bounds(ARRAY, APART[known], list(bounds[known]), made.weights)
     linear = 10 ** (np.array([gains_db[i] for i in known], dtype=float) / 10)
     far_m = RANGES_M[known] + 5.0
-    shared = sent(made.weights * rng.uniform(0.3, 3.0, 4), groups)  # columns of unlike powers
+    shared = sent(made.weights * rng.uniform(0.3, 3.0, 4), groups)  # columns of unequal powers
     powers_w = np.sum(np.abs(shared) ** 2, axis=0)
     least = least_sinr_db(
         linear,
@@ -463,7 +463,7 @@ def test_the_least_is_attained_where_nothing_is_uncertain() -> None:
 
 
 def test_at_the_least_only_those_of_the_same_turn_are_heard_and_share_the_power() -> None:
-    """Three UAVs, the last in a slot of its own: the sums written out."""
+    """Three UAVs, the last in its own time slot, against direct sums."""
     gains, leaks = np.array([40.0, 50.0]), np.array([[9.0, 3.0, 8.0], [7.0, 6.0, 9.0]])
     groups, users, at = np.array([0, 0, 1]), np.array([1, 2]), np.array([900.0, 500.0])
     powers_w = np.array([0.3, 0.7, 0.9])

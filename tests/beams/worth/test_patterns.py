@@ -1,4 +1,4 @@
-"""Patterns and lobes: sums written out, closed forms, Bessel functions, and known beamwidths."""
+"""Patterns and lobes against direct sums, closed forms, Bessel functions and known beamwidths."""
 
 import cmath
 import math
@@ -54,14 +54,14 @@ def matched(array: Array, direction: FloatArray) -> ComplexArray:
 
 
 def dirichlet(count: int, half_phase: FloatArray) -> FloatArray:
-    """|sin(M x) / sin x|^2 / M, the gain of M equal weights."""
+    """Return |sin(M x) / sin x|^2 / M, the gain of M equal weights."""
     sine = np.sin(half_phase)
     small = np.abs(sine) < 1e-9
     ratio = np.where(small, count, np.sin(count * half_phase) / np.where(small, 1.0, sine))
     return np.asarray(ratio**2 / count)
 
 
-# --- the response -------------------------------------------------------------------------------
+# --- response -----------------------------------------------------------------------------------
 
 
 @given(SEEDS)
@@ -108,7 +108,7 @@ def test_the_response_of_a_rectangle_is_the_product_of_two_lines() -> None:
 
 
 def test_the_response_of_a_full_circle_is_bessels() -> None:
-    """Phased towards boresight: M J0^2(k r |u - x|) in its plane, with many elements."""
+    """Phased to boresight: M J0^2(k r |u - x|) in its plane, with many elements."""
     array = uniform_circular(96, 30e9, spacing_wavelengths=0.25, array_from_body=EYE)
     radius_m = float(np.linalg.norm(array.elements_m[0]))
     azimuths, found = patterns.azimuth_cut(array, matched(array, BORESIGHT), 0.0, 361)
@@ -118,7 +118,7 @@ def test_the_response_of_a_full_circle_is_bessels() -> None:
 
 
 def test_the_golden_steering_vector_gives_the_full_gain_and_no_more_anywhere() -> None:
-    """Five elements at 0, .1, ..., .4 m, 1 GHz, 45 degrees."""
+    """Five elements at 0, 0.1, ..., 0.4 m, 1 GHz, 45 degrees."""
     places = np.array([[0.0, 0.1 * m, 0.0] for m in range(5)])
     array = listed(places, 1e9, array_from_body=EYE)
     golden = np.array([1, 0.0887 + 0.9961j, -0.9843 + 0.1767j, -0.2633 - 0.9647j, 0.9376 - 0.3478j])
@@ -177,7 +177,7 @@ def test_many_directions_are_worked_on_in_blocks_that_leave_no_seam() -> None:
     assert patterns.response_db(array, weights, directions[:0]).shape == (0,)
     large = uniform_rectangular(
         100, columns=100, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
-    )  # more elements than a block
+    )  # more elements than one block
     full = patterns.response_db(large, np.ones(10_000, complex), np.stack([BORESIGHT] * 3))
     assert full == pytest.approx([40.0] * 3)
 
@@ -259,14 +259,14 @@ def test_the_half_power_beamwidth_is_where_the_power_is_half(elements: int, spac
 
 def test_no_beamwidth_where_there_is_no_beam() -> None:
     assert patterns.half_power_beamwidths_rad(line(1), BORESIGHT) == (None, None)
-    # So close together that the power never falls to a half.
+    # So close that the power never falls to half.
     assert patterns.half_power_beamwidths_rad(line(2, 0.1), BORESIGHT) == (None, None)
-    # A line has no width upward; what faces ahead has no beam behind.
+    # A line has no elevation width; elements facing ahead have no beam behind.
     assert patterns.half_power_beamwidths_rad(line(8), BORESIGHT)[1] is None
     assert patterns.half_power_beamwidths_rad(
         line(8, element=Element(ElementPattern.COSINE)), -BORESIGHT
     ) == (None, None)
-    # Straight up every azimuth is the same place.
+    # Straight up, every azimuth is the same direction.
     ring = uniform_circular(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     azimuth, elevation = patterns.half_power_beamwidths_rad(ring, towards(0, 90))
     assert azimuth is None
@@ -274,7 +274,7 @@ def test_no_beamwidth_where_there_is_no_beam() -> None:
 
 
 def test_one_element_has_the_width_of_its_pattern() -> None:
-    """12 (angle / 65)^2 dB is 3.01 dB; cos^3 is a half at 37.5 degrees; also over a pole."""
+    """12 (angle / 65)^2 dB is 3.01 dB; cos^3 is a half at 37.5 degrees; also across a pole."""
     expected = 65 * math.sqrt(10 * math.log10(2) / 3)
     for mast in (line(1, element=TR38901), line(1, element=Element(ElementPattern.COSINE, 3.0))):
         if mast.element.pattern is ElementPattern.COSINE:
@@ -295,7 +295,7 @@ def test_one_element_has_the_width_of_its_pattern() -> None:
 
 @pytest.mark.parametrize("azimuth_deg", [0, 30, -50, 150])
 def test_the_width_of_a_steered_line_is_that_of_sines(azimuth_deg: float) -> None:
-    """Where sine less sine of the peak is the same as at broadside."""
+    """The sine relative to the peak's sine is the same as at broadside."""
     array = line(32)
     off = math.sin(math.radians(width_deg(array)) / 2)
     sine = math.sin(math.radians(azimuth_deg))
@@ -325,7 +325,7 @@ def test_a_full_circle_has_bessels_width_in_every_direction() -> None:
 
 
 def test_the_lobe_of_a_uniform_line() -> None:
-    """Half-wave, 64 elements: first nulls at 1.79 degrees, first side lobe -13.26 dB."""
+    """Half-wave line of 64 elements: first nulls at 1.79 degrees, first side lobe -13.26 dB."""
     found = patterns.lobe(line(64), np.ones(64, complex), towards(0.5, 0))
     assert found.peak_azimuth_rad == pytest.approx(0, abs=1e-8)
     assert found.peak_elevation_rad == pytest.approx(0, abs=1e-8)
@@ -337,7 +337,7 @@ def test_the_lobe_of_a_uniform_line() -> None:
     assert np.degrees(nulls) == pytest.approx([-exact, exact], abs=1e-6)
     assert found.azimuth.half_power_width_rad == pytest.approx(math.radians(width_deg(line(64))))
     assert found.elevation == patterns.CutLobe(None, None, None)
-    # Of Dirichlet's kernel itself, and of the sinc that it tends to.
+    # Of Dirichlet's kernel itself, and of its sinc limit.
     side = minimize_scalar(
         lambda x: -float(dirichlet(64, np.array(x))), bounds=(0.02 * math.pi, 0.025 * math.pi)
     )
@@ -349,7 +349,7 @@ def test_the_lobe_of_a_uniform_line() -> None:
 
 @pytest.mark.parametrize("azimuth_deg", [0, 40, 160])
 def test_side_lobes_of_chebyshev_weights_are_as_designed(azimuth_deg: float) -> None:
-    """All side lobes alike: none but the highest may be taken for it. Also steered, also behind."""
+    """All side lobes are equal; only the highest may be reported. Also steered, also behind."""
     direction = towards(azimuth_deg, 0)
     array = line(24)
     weights = chebwin(24, at=50) * matched(array, direction)
@@ -358,7 +358,7 @@ def test_side_lobes_of_chebyshev_weights_are_as_designed(azimuth_deg: float) -> 
 
 
 def test_a_bump_on_the_flank_of_a_stronger_lobe_has_no_width_of_its_own() -> None:
-    """A weaker beam beside a strong one: between them the gain dips by less than to half."""
+    """A weaker beam beside a strong one: the gain between them dips by less than half."""
     array, n = line(32), np.arange(32) - 15.5
     weights = np.ones(32) + 0.5 * np.exp(-1j * (math.pi * 2.4 / 32 * n - 1.6))
     bump = patterns.lobe(array, weights, towards(math.degrees(math.asin(2.5 / 32)), 0))
@@ -373,7 +373,7 @@ def test_a_bump_on_the_flank_of_a_stronger_lobe_has_no_width_of_its_own() -> Non
 
 
 def test_of_side_lobes_almost_alike_the_higher_counts() -> None:
-    """Whichever the scan sees higher: its points fall beside the tops."""
+    """Independent of which one the scan samples higher: its points miss the peaks."""
     array = line(24)
     for degrees in np.linspace(25, 40, 9):
         weights = matched(array, BORESIGHT) + 0.5 * matched(array, towards(degrees, 0))
@@ -386,27 +386,30 @@ def test_of_side_lobes_almost_alike_the_higher_counts() -> None:
 
 
 def test_grating_lobes_are_side_lobes_and_the_mirror_behind_is_not() -> None:
-    """Spacing of a wavelength: as strong at endfire. A circle sees all around, and has none."""
+    """Spacing of one wavelength: equally strong at endfire. A circle covers all around and has
+    none."""
     assert patterns.lobe(
         line(8, 1.0), np.ones(8, complex), BORESIGHT
     ).azimuth.side_lobe_db == pytest.approx(0, abs=1e-9)
     pair = patterns.lobe(line(2), np.ones(2, complex), BORESIGHT)
     assert pair.azimuth.side_lobe_db is None
     assert np.degrees(pair.azimuth.first_nulls_rad or ()) == pytest.approx([-90, 90])
-    ahead = np.array([[0, 0, 0], [SPEED_OF_LIGHT_MPS / 30e9 / 4, 0, 0]])  # in line with boresight
+    ahead = np.array([[0, 0, 0], [SPEED_OF_LIGHT_MPS / 30e9 / 4, 0, 0]])  # aligned with boresight
     cardioid = listed(ahead, 30e9, array_from_body=EYE)
     found = patterns.lobe(cardioid, matched(cardioid, BORESIGHT), towards(20, 10))
-    # Its top is as flat as a fourth power: a thousandth of a radian is lost in rounding.
+    # Its top is flat to fourth order: rounding costs a milliradian.
     assert found.azimuth.first_nulls_rad == pytest.approx((-math.pi, math.pi), abs=0.01)
     assert found.azimuth.half_power_width_rad == pytest.approx(math.pi, abs=0.01)
     assert found.azimuth.side_lobe_db is None
     half_wave = listed(2 * ahead, 30e9, array_from_body=EYE)
     found = patterns.lobe(half_wave, matched(half_wave, BORESIGHT), BORESIGHT)
-    assert found.azimuth.side_lobe_db == pytest.approx(0, abs=1e-9)  # behind, no mirror
+    assert found.azimuth.side_lobe_db == pytest.approx(
+        0, abs=1e-9
+    )  # behind, without a mirror image
 
 
 def test_ripple_on_a_flat_top_is_no_end_of_the_lobe() -> None:
-    """Two beams side by side: between them the power dips by 1 dB, and that is no null."""
+    """Two adjacent beams: the power between them dips by 1 dB, which is not a null."""
     array = line(32)
     phase = math.pi / 32 * (np.arange(32) - 15.5)
     weights = np.exp(-1j * phase) + np.exp(1j * phase + 1.7j)
@@ -443,13 +446,13 @@ ARRAYS = {
 
 
 def falls(scan: FloatArray, threshold: float) -> tuple[int, int]:
-    """How many points to the left and to the right of the first it falls below."""
+    """Return how many points to the left and right of the first it falls below."""
     low = scan < threshold
     return int(low[::-1].argmax()), int(low.argmax())
 
 
 def check_null(scan: FloatArray, fallen: int, null: float) -> int:
-    """A null at index ``null`` is the first minimum that a dense scan has, but for mere ripples."""
+    """Check that index ``null`` is the first minimum of a dense scan, apart from ripple."""
     at = fallen
     while True:
         while scan[at + 1] < scan[at]:
@@ -495,7 +498,7 @@ def test_a_lobe_is_what_a_dense_scan_shows(name: str, seed: int) -> None:
         left, right = falls(scan, half_db)
         assert max(scan[: right + 1].max(), scan[len(scan) - left - 1 :].max()) < 1.01
         if sum(falls(scan, half_db - 0.5)) > 1.3 * (left + right):
-            continue  # it hardly falls to half and rises again: that may be overlooked
+            continue  # it barely reaches half and rises again: this may be missed
         assert lobe.half_power_width_rad == pytest.approx((right + left) * step, abs=2.1 * step)
         assert lobe.first_nulls_rad is not None
         left = check_null(scan[::-1], left, -lobe.first_nulls_rad[0] / step)
@@ -526,14 +529,14 @@ def test_the_peak_of_a_matched_beam_is_found_from_anywhere_on_its_hill(seed: int
         8, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
     )
     at = towards(rng.uniform(-50, 50), rng.uniform(-50, 50))
-    aside = rng.uniform(-0.2, 0.2, 2)  # sines; the first nulls are at 0.25
+    aside = rng.uniform(-0.2, 0.2, 2)  # in sines; the first nulls are at 0.25
     right, down = at[1] + aside[0], at[2] + aside[1]
     if right**2 + down**2 > 0.99:
         return
     start = np.array([math.sqrt(1 - right**2 - down**2), right, down])
     found = patterns.lobe(array, matched(array, at), start)
     peak = towards(math.degrees(found.peak_azimuth_rad), math.degrees(found.peak_elevation_rad))
-    assert peak == pytest.approx(at, abs=3e-4)  # a lobe is 0.25 wide, and flat at its top
+    assert peak == pytest.approx(at, abs=3e-4)  # a lobe is 0.25 wide and flat at its top
     assert found.peak_db == pytest.approx(10 * math.log10(64), abs=1e-6)
 
 
@@ -544,14 +547,14 @@ def test_from_the_bottom_of_a_null_it_climbs_out() -> None:
     null = np.array([math.sqrt(1 - 0.25**2), 0.25, 0.0])
     found = patterns.lobe(array, np.ones(32, complex), null)
     assert found.peak_db > 0
-    # Abreast of the array, where the hill ahead meets its mirror image behind.
+    # Broadside, where the lobe ahead meets its mirror image behind.
     at, saddle = towards(50, 50), towards(90, 50)
     found = patterns.lobe(array, matched(array, at), saddle)
     assert found.peak_db > patterns.response_db(array, matched(array, at), saddle) + 1
 
 
 def test_on_a_ridge_the_peak_stays_abreast_of_the_direction() -> None:
-    """A line has its peak on a cone: the nearest place of it is meant, not any."""
+    """The peak of a line is a cone: the nearest point of it is meant."""
     array = line(64)
     at = towards(20, 35)
     for start in (at, towards(20.3, 35)):
@@ -562,7 +565,7 @@ def test_on_a_ridge_the_peak_stays_abreast_of_the_direction() -> None:
 
 
 def test_nulls_are_as_deep_as_they_are() -> None:
-    """Zero forcing: -13.26 dB becomes what rounding leaves."""
+    """Zero forcing turns -13.26 dB into rounding noise."""
     array = line(32)
     others = np.stack([towards(20, 0), towards(-33, 10)])
     steer = steering.steering_matrix(array, np.concatenate([BORESIGHT[np.newaxis], others]))

@@ -1,4 +1,4 @@
-"""Guarantees of what is radiated: dead elements, coupling and channels that are off, drawn."""
+"""Guarantees for radiated beams: dead elements, coupling and channel errors, drawn at random."""
 
 import math
 from dataclasses import replace
@@ -39,7 +39,7 @@ FAULTS = ("dead", "coupling", "off", "all")
 
 
 def faulty(array: Array, fault: str) -> Array:
-    """An array with elements that are dead, that couple, or whose channels are off."""
+    """Return an array with dead elements, coupling, or channel errors."""
     rng, size = np.random.default_rng(3), array.size
     live = np.ones(size, dtype=bool)
     live[[2, 5]] = False
@@ -56,16 +56,16 @@ def faulty(array: Array, fault: str) -> Array:
 def drawn(
     array: Array, weights: ComplexArray, directions: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Array gains (directions, columns) of one array of those that the bounds allow.
+    """Return array gains (directions, columns) of one array within the error bounds.
 
-    By the physics alone: what is fed, less the dead, off as drawn, coupled, radiated by elements.
+    From the physics alone: feed, remove dead elements, apply channel errors, couple, radiate.
     """
     pristine = replace(array, live=None, coupling=None, channel_error=None)
     live = np.ones(array.size) if array.live is None else array.live
     fed = weights * live[:, np.newaxis]
     power = np.sum(np.abs(fed) ** 2, axis=0)
     if array.channel_error is not None:
-        ends = rng.integers(0, 2) == 0  # errors at their bounds, or anywhere within
+        ends = rng.integers(0, 2) == 0  # errors at their bounds or anywhere within them
         draw = (
             rng.choice([-1.0, 1.0], (2, array.size))
             if ends
@@ -106,7 +106,7 @@ def test_no_array_that_the_bounds_allow_has_less_or_leaks_more(name: str, fault:
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
 def test_a_guarantee_at_a_point_is_close_to_the_worst_of_all_errors(name: str) -> None:
-    """The worst errors are known there: each channel's part turned against the sum, or lessened."""
+    """The worst errors are known there: each channel's part opposes the sum or is reduced."""
     array = faulty(ARRAYS[name], "off")
     own = AHEAD[:1]
     weights = steering_matrix(array, own).conj()
@@ -143,7 +143,7 @@ def test_an_error_of_a_channel_is_bounded_by_its_corners() -> None:
 def test_a_steering_vector_is_what_each_channel_does_by_itself(name: str) -> None:
     array = faulty(ARRAYS[name], "all")
     fed = np.eye(array.size, dtype=complex)
-    carried = array.carried(fed)  # the currents that a unit in each channel makes
+    carried = array.carried(fed)  # currents for a unit input in each channel
     pristine = replace(array, live=None, coupling=None, channel_error=None)
     heard = steering_matrix(pristine, AHEAD).T @ carried
     np.testing.assert_allclose(steering_matrix(array, AHEAD), heard.T, atol=1e-12)

@@ -1,4 +1,4 @@
-"""Reports, accepted, as the observer and the tracker take them."""
+"""Accepted reports, as the observer and the tracker receive them."""
 
 import math
 from collections.abc import Callable
@@ -13,14 +13,15 @@ MakeFix = Callable[..., Fix]
 NOISE = ReportNoise(
     horizontal_m=1.2, vertical_m=0.9, position_m=math.hypot(1.2, 0.9), velocity_mps=0.4
 )
-"""1.5 m in space."""
+"""1.5 m in three dimensions."""
 
 
 @pytest.fixture(scope="session")
 def fix() -> MakeFix:
-    """``fix(t_ns, position, velocity=None)``: arrived ``late_ns`` after it was true.
+    """Return ``fix(t_ns, position, velocity=None)``, which arrives ``late_ns`` after its time.
 
-    The sender's timeline is the node's; the report's degrees tell positions apart, no more.
+    The sender timeline equals the node timeline; the report's degrees only distinguish
+    positions.
     """
 
     def make(

@@ -1,4 +1,4 @@
-"""Attitudes and their prediction: against scipy's rotations and integrated kinematics."""
+"""Attitudes and their prediction, against scipy rotations and integrated kinematics."""
 
 import math
 from collections.abc import Callable
@@ -23,7 +23,7 @@ S = 1_000_000_000
 
 
 def oracle(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
-    """scipy's matrix takes body coordinates to NED: intrinsic yaw, pitch, roll."""
+    """Return scipy's matrix from body to NED coordinates: intrinsic yaw, pitch, roll."""
     return Rotation.from_euler("ZYX", [yaw_rad, pitch_rad, roll_rad]).as_matrix().T
 
 
@@ -42,8 +42,8 @@ def test_attitudes_are_mavlink_s(roll: float, pitch: float, yaw: float) -> None:
 @pytest.mark.parametrize(
     ("angles_rad", "ned", "body"),
     [
-        ((0, 0, math.pi / 2), (0, 1, 0), (1, 0, 0)),  # heading east, east is ahead
-        ((0, math.pi / 6, 0), (0, 0, 1), (-0.5, 0, math.sqrt(0.75))),  # nose up, down is behind
+        ((0, 0, math.pi / 2), (0, 1, 0), (1, 0, 0)),  # heading east: east is ahead
+        ((0, math.pi / 6, 0), (0, 0, 1), (-0.5, 0, math.sqrt(0.75))),  # nose up: down is behind
         ((math.pi / 6, 0, 0), (0, 0, 1), (0, 0.5, math.sqrt(0.75))),  # right wing low
     ],
 )
@@ -54,7 +54,7 @@ def test_signs(
 
 
 def integrated(rates: FloatArray, interval_s: float) -> FloatArray:
-    """dC/dt = -[rates]x C from C = 1, by Runge and Kutta."""
+    """Integrate dC/dt = -[rates]x C from C = 1 by Runge-Kutta."""
     x, y, z = rates
     slope = -np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     turned, steps = np.eye(3), 400
@@ -77,7 +77,7 @@ def test_constant_rates_turn_as_the_kinematics_say(
 
 
 def test_turning_right_is_turning_right() -> None:
-    """Yaw rate is positive to the right: heading 0 becomes heading 0.3 rad."""
+    """Positive yaw rate is to the right: heading 0 becomes heading 0.3 rad."""
     later = carrier.later_body_from_body(np.array([0, 0, 0.6]), 0.5)
     assert later @ oracle(0, 0, 0) == pytest.approx(oracle(0, 0, 0.3), abs=1e-12)
     assert carrier.later_body_from_body(np.zeros(3), 5.0).tolist() == np.eye(3).tolist()
@@ -92,7 +92,7 @@ def test_a_fixed_station_is_level_and_faces_its_heading() -> None:
     assert station.velocity_ned_mps.tolist() == [0, 0, 0]
     assert station.body_rates_radps.tolist() == [0, 0, 0]
     assert station.position_ned_m == pytest.approx(local.position_ned_m(48.0, 9.5, 100.0))
-    # Up, north and east there: below, to the left, ahead.
+    # Up, north and east of it: below, left, ahead.
     for place, body in (
         ((48.0, 9.5, 110.0), (0, 0, -10)),
         ((48.0001, 9.5, 100.0), (0, -11.12, 0)),
@@ -186,7 +186,7 @@ def test_no_turn_leaves_the_bound_of_the_attitude(
     late: float,
     off_rad: float,
 ) -> None:
-    """A body that turns ever faster about any axis, a clock that is off, a wrong report."""
+    """A body with growing rates about any axis, a clock error, and a wrong report."""
     most = 4.0
     push = np.array(way)
     push = push * most / max(1e-9, float(np.linalg.norm(push)))
@@ -203,7 +203,7 @@ def test_no_turn_leaves_the_bound_of_the_attitude(
 
 
 def test_an_attitude_that_was_lost_says_nothing_soon() -> None:
-    """A turn of 60 degrees a second that ended just after the newest attitude, 1.4 s ago."""
+    """A rotation at 60 degrees/s that ended just after the newest attitude, 1.4 s ago."""
     bounds = carrier.AttitudeBounds(math.radians(3.0), math.radians(270.0))
     assert math.degrees(bounds.at(math.radians(60.0), 1.4, 0.0)) > 84.0
     assert bounds.at(1.0, 100.0, 0.0) == math.pi
@@ -225,7 +225,7 @@ def turning(rate_degps: float) -> Attitude:
 
 
 def test_rates_prove_an_angular_acceleration_and_raise_the_limit() -> None:
-    """From 0 to 54 degrees a second in .25 s, less 2 degrees a second of noise at each end."""
+    """From 0 to 54 degrees/s in 0.25 s, less 2 degrees/s of noise at each end."""
     turns = carrier.AngularAcceleration()
     assert turns.look(turning(0.0), 0, 180.0) is None
     refuted = turns.look(turning(54.0), 250_000_000, 180.0)
@@ -235,20 +235,20 @@ def test_rates_prove_an_angular_acceleration_and_raise_the_limit() -> None:
     assert refuted.raised_to == turns.limit_degps2(180.0, 250_000_000)
     assert refuted.raised_to == pytest.approx(1.5 * 50 / 0.251)
     later = turns.limit_degps2(180.0, 120_250_000_000)
-    assert 180.0 < later < refuted.raised_to  # it fades
+    assert 180.0 < later < refuted.raised_to  # it decays
 
 
 def test_what_is_possible_or_beyond_belief_raises_nothing() -> None:
     turns = carrier.AngularAcceleration()
-    rates = [0.0, 40.0, 0.0, 3000.0, 0.0]  # the third step is 16 times what is possible
+    rates = [0.0, 40.0, 0.0, 3000.0, 0.0]  # the third step is 16 times the possible one
     for at, rate in enumerate(rates):
         assert turns.look(turning(rate), at * 250_000_000, 180.0) is None
     assert turns.limit_degps2(180.0, 0) == 180.0
-    assert turns.look(turning(90.0), 1_010_000_000, 180.0) is None  # 10 ms after the last
+    assert turns.look(turning(90.0), 1_010_000_000, 180.0) is None  # 10 ms after the previous one
 
 
 def test_a_contradiction_is_an_angle_in_a_time() -> None:
-    """Two level attitudes without rates, a quarter turn apart within half a second."""
+    """Two level attitudes without rates, 90 degrees apart within half a second."""
     before, after = (
         replace(turning(0.0), t_ns=at_ns, yaw_rad=yaw_rad)
         for at_ns, yaw_rad in ((0, 0.0), (S // 2, math.pi / 2))

@@ -1,4 +1,4 @@
-"""Which reports cannot be true, and when those that were refused are believed after all."""
+"""The gate: rejection of impossible reports, and reacquisition from rejected ones."""
 
 import dataclasses
 import math
@@ -35,18 +35,18 @@ NOISE = ReportNoise(
         ((100, 0, -50), None),
         ((100 + 7.7, 10.3, -50), None),  # 12.86 m
         ((100 + 13.01, 0, -50), Reason.UNREACHABLE),
-        ((100 - 9.5, 9.5, -50), Reason.UNREACHABLE),  # 13.4 m, though no axis is off by as much
+        ((100 - 9.5, 9.5, -50), Reason.UNREACHABLE),  # 13.4 m, though each axis is off by less
         ((100, 0, -44.01), None),
         ((100, 0, -43.99), Reason.ALTITUDE_JUMP),
         ((100, 0, -56.01), Reason.ALTITUDE_JUMP),
-        ((100, 12.9, -55.9), None),  # at the edge of the cylinder
+        ((100, 12.9, -55.9), None),  # on the edge of the cylinder
         ((100, 13.1, -90), Reason.UNREACHABLE),
     ],
 )
 def test_a_report_outside_the_cylinder_cannot_be_true(
     fix: MakeFix, place: tuple[float, ...], reason: Reason | None
 ) -> None:
-    """Its own noise counts besides: 10 + 3 m in the plane, 4 + 2 m in height."""
+    """The report's own noise is added: 10 + 3 m horizontally, 4 + 2 m vertically."""
     found = refusal(PREDICTED, fix(0, place, noise=NOISE))
     assert (None if found is None else found[0]) is reason
 
@@ -64,7 +64,7 @@ def test_a_report_outside_the_cylinder_cannot_be_true(
 def test_a_report_may_lead_by_what_a_feedthrough_makes_of_its_speed(
     fix: MakeFix, place: tuple[float, ...], reason: Reason | None
 ) -> None:
-    """In the plane and in height: 3 m more than its noise, which is all it may be off else."""
+    """Horizontally and vertically: 3 m more than the noise bound."""
     found = refusal(PREDICTED, fix(0, place, noise=NOISE), lead_m=3.0)
     assert (None if found is None else found[0]) is reason
 
@@ -81,8 +81,8 @@ def test_it_is_said_how_far_and_how_far_is_possible(fix: MakeFix) -> None:
     [
         ((0, 0, 0), (5, 0, 0), 1.0, True),
         ((0, 0, 0), (0, 0, -2), 1.0, True),
-        ((0, 0, 0), (5, 0, 0), 0.05, False),  # 0.25 m may be less than a digit
-        ((0, 0, 0), (0.9, 0, 0), 10.0, False),  # it hovers
+        ((0, 0, 0), (5, 0, 0), 0.05, False),  # 0.25 m may be below the resolution
+        ((0, 0, 0), (0.9, 0, 0), 10.0, False),  # hovering
         ((0, 0, 0), None, 10.0, False),
         ((0.01, 0, 0), (5, 0, 0), 1.0, False),
         ((0, 0.01, 0), (5, 0, 0), 1.0, False),
@@ -100,7 +100,7 @@ def test_frozen_positions(
 
 
 def suspects(fix: MakeFix, times_s: list[float], **changed: float) -> Suspects:
-    """Reports of a UAV that flies north at 10 m/s."""
+    """Return rejected reports of a UAV that flies north at 10 m/s."""
     run = Suspects(OBSERVER, GateSettings(**changed))
     for t_s in times_s:
         run.add(fix(round(t_s * S), [10 * t_s, 0, 0], [10, 0, 0]))
@@ -145,7 +145,7 @@ def test_a_run_goes_on_for_as_long_as_it_is_not_forgotten(fix: MakeFix) -> None:
 
 
 def test_a_run_that_did_not_take_turns_is_no_second_vehicle(fix: MakeFix) -> None:
-    """A step of some seconds, after which the reports are possible again."""
+    """A step of a few seconds, after which reports are possible again."""
     run = suspects(fix, [0, 1, 2, 3])
     run.interrupt()
     run.interrupt()
@@ -156,7 +156,7 @@ def test_a_run_that_did_not_take_turns_is_no_second_vehicle(fix: MakeFix) -> Non
 
 
 def taking_turns(fix: MakeFix, times_s: list[float]) -> Suspects:
-    """A run between whose reports others were possible."""
+    """Return a run whose reports alternate with possible ones."""
     run = Suspects(OBSERVER, GateSettings())
     for t_s in times_s:
         run.add(fix(round(t_s * S), [10 * t_s, 0, 0], [10, 0, 0]))
@@ -178,7 +178,7 @@ def test_fast_reports_are_believed_as_soon_as_slow_ones(fix: MakeFix, rate_hz: i
 
 
 def test_times_that_are_off_are_worth_the_way_flown_in_them(fix: MakeFix) -> None:
-    """At 40 m/s, 2 s apart: a millisecond, the drift over 2 s, and what the velocity may be off."""
+    """At 40 m/s, 2 s apart: one millisecond, the drift over 2 s, and the velocity error."""
     noise = dataclasses.replace(NOISE, velocity_mps=0.5, time_s=0.0)
     before, after = (fix(at * S, (80 * at, 0, -50), (40.0, 0, 0), noise=noise) for at in (0, 2))
     settings = GateSettings(drift_max=1e-3)

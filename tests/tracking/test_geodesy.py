@@ -1,4 +1,4 @@
-"""The local frame: against pymap3d and against the ellipsoid's equations written out here."""
+"""The local frame against pymap3d and against explicit ellipsoid equations."""
 
 import math
 
@@ -20,7 +20,7 @@ HEIGHTS = st.floats(-100.0, 12_000.0)
 
 
 def ecef_m(lat_deg: float, lon_deg: float, alt_m: float) -> FloatArray:
-    """WGS84, by the radius of curvature in the prime vertical."""
+    """Return WGS84 ECEF coordinates, by the radius of curvature in the prime vertical."""
     lat, lon = math.radians(lat_deg), math.radians(lon_deg)
     squared = FLATTENING * (2 - FLATTENING)
     prime_m = SEMI_MAJOR_M / math.sqrt(1 - squared * math.sin(lat) ** 2)
@@ -30,7 +30,9 @@ def ecef_m(lat_deg: float, lon_deg: float, alt_m: float) -> FloatArray:
 
 
 def axes(lat_deg: float, lon_deg: float) -> FloatArray:
-    """North, east and down as rows, from how the place moves with latitude and longitude."""
+    """Return north, east and down as rows, from derivatives with respect to latitude and
+    longitude.
+    """
     step_deg = 1e-4
     north = ecef_m(lat_deg + step_deg, lon_deg, 0) - ecef_m(lat_deg - step_deg, lon_deg, 0)
     east = ecef_m(lat_deg, lon_deg + step_deg, 0) - ecef_m(lat_deg, lon_deg - step_deg, 0)
@@ -69,7 +71,7 @@ def test_places_to_local_points(
     assert found == pytest.approx(ned_from_ecef(lat_deg, lon_deg) @ straight, abs=1e-6)
     assert found == pytest.approx(axes(lat_deg, lon_deg) @ straight, abs=0.2)
     oracle = pymap3d.geodetic2ned(*there, lat_deg, lon_deg, alt_m)
-    assert found == pytest.approx(np.array(oracle), abs=1e-8)  # roundings of 6.4e6 m
+    assert found == pytest.approx(np.array(oracle), abs=1e-8)  # rounding of 6.4e6 m
 
 
 @given(LATITUDES, LONGITUDES, HEIGHTS, st.lists(st.tuples(*[st.floats(-5e4, 5e4)] * 3), min_size=1))
@@ -105,7 +107,7 @@ def test_local_from_ned_is_a_rotation(lat: float, lon: float, lat2: float, lon2:
 def test_a_far_velocity_is_that_of_the_local_coordinates(
     lat_deg: float, lon_deg: float, azimuth_deg: float
 ) -> None:
-    """Along a great circle, by Vincenty's formulae: 10 m on, in 1 s."""
+    """Along a great circle by Vincenty's formulae: 10 m in 1 s."""
     local = LocalFrame(47.4, 8.5, 0.0)
     before, after = (
         local.position_ned_m(*_reached(lat_deg, lon_deg, distance_m, azimuth_deg), 0.0)
@@ -122,7 +124,7 @@ def _reached(lat: float, lon: float, distance_m: float, azimuth: float) -> tuple
     return float(lat2), float(lon2)
 
 
-# --- one place at a time, against pymap3d, which goes another way (You, 2000) -------------------
+# --- single positions, against pymap3d's different algorithm (You, 2000) ------------------------
 
 METRES = st.floats(-60_000.0, 60_000.0)
 
@@ -138,6 +140,7 @@ METRES = st.floats(-60_000.0, 60_000.0)
 def test_places_are_those_of_pymap3d(
     *, lat_deg: float, lon_deg: float, alt_m: float, north_m: float, east_m: float, down_m: float
 ) -> None:
+    """pymap3d converts back to the local plane: metres, anywhere on Earth and across 180° E."""
     origin = Place(lat_deg, lon_deg, alt_m)
     place = LocalFrame(*origin).place(north_m, east_m, down_m)
     # Back into the plane by the other program: metres, wherever on Earth and across 180° E.

@@ -1,4 +1,4 @@
-"""Reports in any order of arrival are the same reports: what was in the window is put in place."""
+"""Report history: reports within the window give the same state in any order of arrival."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -27,7 +27,7 @@ KINEMATIC = OBSERVERS["kinematic"]
 
 
 def reports(fix: MakeFix, seed: int, gaps_ms: list[int], told: float = 0.8) -> list[Fix]:
-    """In order, at random places; the velocity comes with some."""
+    """Return ordered reports at random positions; some have a velocity."""
     rng, t_ns, made = np.random.default_rng(seed), 17 * S, []
     for gap_ms in gaps_ms:
         t_ns += gap_ms * 1_000_000
@@ -65,7 +65,7 @@ def same_state(one: object, other: object) -> bool:
 def test_any_order_of_arrival_gives_what_the_right_order_gives(
     fix: MakeFix, seed: int, gaps_ms: list[int], late: list[int], name: str
 ) -> None:
-    """Each report late by up to four others: less than the window, whatever the intervals."""
+    """Each report may be overtaken by up to four others, always within the window."""
     in_order = reports(fix, seed, gaps_ms)
     by_arrival = sorted(range(len(in_order)), key=lambda n: n + late[n])
     shuffled = [in_order[n] for n in by_arrival]
@@ -85,7 +85,7 @@ def test_any_order_of_arrival_gives_what_the_right_order_gives(
 
 
 def test_a_late_report_is_estimated_from_the_one_before_it(fix: MakeFix) -> None:
-    """And those after it from it."""
+    """Later reports are then estimated from it."""
     first, late, last = (
         fix(0, [0, 0, 0], [1, 0, 0]),
         fix(S, [9, 0, 0], [2, 0, 0]),
@@ -123,13 +123,13 @@ def test_a_report_from_before_the_first_becomes_the_first(fix: MakeFix) -> None:
 def test_where_a_report_belongs_and_when_it_is_too_old(
     fix: MakeFix, sender_ns: int, index: int | None
 ) -> None:
-    """A report of a time that is held already would take that one's place: its index says so."""
+    """A report with the time of a stored one would replace it: its index shows that."""
     history = told(KINEMATIC, [fix(n * S // 2, [n, 0, 0]) for n in range(30, 41)])
     assert history.index(sender_ns) == index
 
 
 def test_the_window_does_not_grow(fix: MakeFix) -> None:
-    """In order or not, no more is kept than the window holds, however long the flight."""
+    """In order or not, the history never exceeds the window, however long the flight."""
     rng = np.random.default_rng(1)
     history = ReportHistory(KINEMATIC, fix(0, [0, 0, 0]), WINDOW_NS)
     order = sorted(range(1, 1000), key=lambda n: n + rng.uniform(0, 8))
@@ -145,7 +145,7 @@ def test_the_window_does_not_grow(fix: MakeFix) -> None:
 
 
 def test_after_a_hole_longer_than_the_window_a_late_report_is_still_used(fix: MakeFix) -> None:
-    """It is half a second late: the window is what counts, not what was heard before."""
+    """It is half a second late: the window is measured in time, not in reports."""
     before, after, late = fix(0, [0, 0, 0]), fix(7 * S, [7, 0, 0]), fix(6 * S + S // 2, [6, 0, 0])
     history = told(KINEMATIC, [before, after])
     index = history.index(late.sender_ns)
@@ -155,7 +155,7 @@ def test_after_a_hole_longer_than_the_window_a_late_report_is_still_used(fix: Ma
     assert same_state(history.newest.state, right.newest.state)
 
 
-# --- the acceleration ---------------------------------------------------------------------------
+# --- acceleration -------------------------------------------------------------------------------
 
 
 @given(
@@ -164,7 +164,7 @@ def test_after_a_hole_longer_than_the_window_a_late_report_is_still_used(fix: Ma
 def test_the_acceleration_is_the_slope_of_the_velocities(
     fix: MakeFix, seed: int, gaps_ms: list[int]
 ) -> None:
-    """numpy.polyfit of those of the last five seconds, or of the last five."""
+    """numpy.polyfit over the last five seconds, or over the last five velocities."""
     made = reports(fix, seed, gaps_ms, told=1.0)
     newest_ns = made[-1].sender_ns
     used = max(5, sum(newest_ns - one.sender_ns <= 5 * S for one in made))

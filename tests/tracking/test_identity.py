@@ -1,4 +1,4 @@
-"""Own telemetry and ADS-B of one aircraft are one; two aircraft that meet are two."""
+"""Telemetry and ADS-B of one aircraft are merged; two aircraft that pass each other are not."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -37,7 +37,7 @@ def relayed(fix: MakeFix, n: int, position: ArrayLike, velocity: ArrayLike = VEL
 
 
 def after(fix: MakeFix, offsets: list[float], *others: Track) -> str | None:
-    """Who it is taken for, after reports that far to the east of the first track."""
+    """Return the merged UAV id after reports at those distances east of the first track."""
     identities = Identities()
     for n, east in enumerate(offsets):
         here = [20.0 * n, 0, -300]
@@ -57,7 +57,7 @@ def test_far_apart_it_is_itself(fix: MakeFix) -> None:
 
 @pytest.mark.parametrize(("above_m", "same"), [(120.0, "1:1"), (-120.0, "1:1"), (130.0, None)])
 def test_far_above_or_below_it_is_itself(fix: MakeFix, above_m: float, same: str | None) -> None:
-    """100 m of noise, 20 for the second to which its time is known, and 5 of the track."""
+    """100 m of noise, 20 m for one second of time uncertainty, and 5 m of the track."""
     identities = Identities()
     for n in range(REPORTS_TO_DECIDE):
         here = [20.0 * n, 0, -300]
@@ -71,7 +71,7 @@ def test_the_nearest_is_taken(fix: MakeFix) -> None:
 
 
 def test_a_short_meeting_is_no_match(fix: MakeFix) -> None:
-    """Passing within the errors for fewer reports than it takes."""
+    """They are within their errors for too few reports."""
     assert after(fix, [400, 300, 100, 0, -100, -300, -400, -500]) is None
 
 
@@ -104,7 +104,7 @@ def status(h: float | None, v: float | None, vel: float | None) -> GnssStatus:
     [
         ((0.5, 1.0, 0.1), (1.5, 3.0, 3.354, 0.3)),
         ((None, 1.0, None), (3.0, 3.0, 4.243, 0.5)),
-        ((0.001, 0.001, 0.001), (0.9, 0.9, 1.273, 0.02)),  # what no fix of the kind can have
+        ((0.001, 0.001, 0.001), (0.9, 0.9, 1.273, 0.02)),  # below the best accuracy of the fix type
     ],
 )
 def test_reported_accuracies_are_bounds_times_a_factor(
@@ -124,7 +124,7 @@ def test_reported_accuracies_can_be_ignored() -> None:
     ("fix_type", "least_m"), [(2, 0.9), (3, 0.9), (4, 0.6), (5, 0.3), (6, 0.03), (8, 0.03)]
 )
 def test_no_fix_is_believed_to_be_better_than_its_kind(fix_type: int, least_m: float) -> None:
-    """Some receivers state a millimetre where they do not know; 30 cm of an RTK fix stands."""
+    """Some receivers state 1 mm when they do not know; 30 cm of an RTK fix is accepted."""
     claimed = replace(status(0.001, 0.001, None), fix_type=fix_type)
     found = noise.reported(claimed, noise.NoiseSettings(DEFAULT, 3.0))
     assert (found.horizontal_m, found.vertical_m) == pytest.approx((least_m, least_m))
@@ -146,7 +146,7 @@ def test_an_aircraft_that_is_forgotten_is_compared_anew(fix: MakeFix) -> None:
 
 
 def test_made_up_names_take_no_memory(fix: MakeFix) -> None:
-    """The one heard first is forgotten, and decided upon again when it is heard."""
+    """The oldest entry is evicted, and decided again when it is received again."""
     identities = Identities()
     here = [20.0, 0, -300]
     for n in range(REPORTS_TO_DECIDE):

@@ -1,4 +1,4 @@
-"""What aircraft are taken to be able to do, and what their reports prove."""
+"""Limits of aircraft, and reports that refute them."""
 
 import math
 from collections.abc import Callable
@@ -55,7 +55,7 @@ def test_lags_differ_in_sign_and_what_is_not_known_has_both() -> None:
 
 
 def test_the_nearest_setting_wins() -> None:
-    """A UAV's own, its type's, everybody's, and what is known of its type."""
+    """Order: the UAV's setting, its type's, the general one, the built-in value of its type."""
     given = Settings().override(
         observer={
             "acceleration_max_mps2": 7.0,
@@ -84,7 +84,7 @@ def test_the_nearest_setting_wins() -> None:
 def test_what_keeps_within_its_limits_is_never_refuted(
     fix: Callable[..., Fix], steps: list[tuple[float, ...]]
 ) -> None:
-    """Whatever the noise says, and on stamps in whole milliseconds."""
+    """At any noise within its bound, and with stamps in whole milliseconds."""
     known, velocity, t_s = Refutations(), np.zeros(3), 0.0
     for length_s, *rest in steps:
         push, wrong = np.array(rest[:3]), np.array(rest[3:])
@@ -101,7 +101,7 @@ def test_what_keeps_within_its_limits_is_never_refuted(
 
 
 def test_a_turn_beyond_the_limit_is_proven_raised_and_fades(fix: Callable[..., Fix]) -> None:
-    """8 m/s² for two seconds, of a type that is taken to do 4."""
+    """8 m/s² for two seconds by a type with a limit of 4 m/s²."""
     known, found = Refutations(), []
     for n in range(40):
         t_s = n / 10
@@ -110,7 +110,7 @@ def test_a_turn_beyond_the_limit_is_proven_raised_and_fades(fix: Callable[..., F
     assert {one.setting for one in found} == {"observer.acceleration_max_mps2"}
     assert found[0].limit == 4.0
     assert all(4.0 < one.proven <= 8.0 for one in found)
-    assert found[0].t_ns <= 2 * S  # within a second of its beginning
+    assert found[0].t_ns <= 2 * S  # within one second of its start
     raised = known.limits(COPTER, 3 * S)
     assert raised.limits_source is LimitSource.RAISED
     assert 4.0 < raised.acceleration_max_mps2 <= RAISED * 8.0
@@ -127,7 +127,7 @@ def test_a_speed_beyond_the_limit_is_proven(fix: Callable[..., Fix]) -> None:
 
 
 def test_what_nothing_can_fly_is_no_proof(fix: Callable[..., Fix]) -> None:
-    """A report that lies: 500 m/s, or from rest to 30 m/s in a tenth of a second."""
+    """A false report: 500 m/s, or from rest to 30 m/s in a tenth of a second."""
     known = Refutations()
     assert known.look(told(fix, 0, [500, 0, 0])) == []
     known = Refutations()

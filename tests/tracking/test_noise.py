@@ -1,4 +1,4 @@
-"""Bounds on what a relayed aircraft's report may be off."""
+"""Error bounds on the reports of relayed aircraft."""
 
 import math
 
@@ -21,7 +21,7 @@ from companion.values import Accuracy, AltitudeDatum
 def test_a_time_in_whole_seconds_is_worth_the_way_flown_in_one(
     velocity: tuple[float, ...] | None, way_m: float
 ) -> None:
-    """At the speed that is reported, or at the greatest there is."""
+    """At the reported speed, or at the speed limit if none is reported."""
     told = None if velocity is None else np.array(velocity)
     found = relayed(told, 0.0, speed_max_mps=90.0)
     assert found.horizontal_m == pytest.approx(ADSB_NOISE_M + way_m)
@@ -32,7 +32,7 @@ def test_a_time_in_whole_seconds_is_worth_the_way_flown_in_one(
 
 @pytest.mark.parametrize("age_s", [1.5, 10.0])
 def test_an_altitude_of_another_time_is_worth_what_can_be_climbed_between(age_s: float) -> None:
-    """In height, and in space; where it is on the map has nothing to do with it."""
+    """Affects the vertical and the 3-D bound, not the horizontal one."""
     velocity = np.array([30.0, 40.0, 0.0])
     fresh, old = (
         relayed(velocity, 0.0, speed_max_mps=90.0),
@@ -44,7 +44,7 @@ def test_an_altitude_of_another_time_is_worth_what_can_be_climbed_between(age_s:
 
 
 def test_a_stated_accuracy_takes_the_place_of_what_is_taken_for_granted() -> None:
-    """Field by field, with the factor of the settings; the geoid is no matter of accuracy."""
+    """Field by field, times the configured factor; the geoid error is added unscaled."""
     still = np.zeros(3)
     told = Accuracy(horizontal_m=6.0, vertical_m=20.0, velocity_mps=0.5)
     found = relayed(

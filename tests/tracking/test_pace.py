@@ -1,4 +1,4 @@
-"""How long a silence is no more than a UAV's own pace."""
+"""Silence timeout relative to a UAV's own report interval."""
 
 import random
 from collections.abc import Callable
@@ -34,7 +34,7 @@ def test_before_there_is_a_pace_the_least_counts(fix: Callable[..., Fix]) -> Non
 
 @pytest.mark.parametrize("seed", range(5))
 def test_a_slow_radio_does_not_flap(fix: Callable[..., Fix], seed: int) -> None:
-    """1.2 reports a second, a tenth of them lost, up to some seconds late: over an hour."""
+    """1.2 reports per second, a tenth of them lost, up to some seconds late, over one hour."""
     rng, pace, changes, coasts = random.Random(seed), ReportTiming(), 0, False
     arrivals = sorted(
         (n / 1.2 + min(6.0, rng.lognormvariate(-0.5, 0.79)), n / 1.2)

@@ -1,4 +1,4 @@
-"""Ways of feeding acceleration forward, chosen by what they would have been worth."""
+"""Acceleration models, selected by the errors of past predictions."""
 
 import math
 from collections.abc import Callable
@@ -74,7 +74,7 @@ def test_in_straight_flight_with_noise_nothing_is_fed(fix: Callable[..., Fix]) -
 
 
 def test_in_a_quick_turn_a_short_window_is_taken(fix: Callable[..., Fix]) -> None:
-    """An aeroplane's: over five seconds the acceleration turns by a radian."""
+    """An aeroplane's: over five seconds the acceleration rotates by one radian."""
     way = flown(fix, circling(110.0, 22.0), 0.1, seconds=60, noise_mps=0.05, noise_m=0.05).model
     assert 0 < way.window_s <= 2.5
 
@@ -92,7 +92,7 @@ def test_before_there_is_any_judgement_nothing_is_fed(fix: Callable[..., Fix]) -
 
 
 def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
-    """Over noisy reports, at the ages that were judged: 19 of 20, and not much more."""
+    """Over noisy reports at the evaluated ages: 19 of 20 errors, and not many more."""
     place = circling(60.0, 8.0)
     hindsight = flown(fix, place, 0.2, seconds=120, noise_mps=0.2, noise_m=0.5)
     rng, covered, count = np.random.default_rng(2), 0, 2000
@@ -123,7 +123,8 @@ def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
 def test_in_a_turn_the_velocity_turns(
     speed_mps: float, heading: float, across_mps2: float, along_mps2: float, ahead_s: float
 ) -> None:
-    """Against small steps; and no further from straight flight than what is across could go."""
+    """Against small integration steps; at most as far from straight flight as the lateral
+    acceleration allows."""
     way = AccelerationModel(window_s=1.0, min_velocities=3, decay_s=3.0, turns=True)
     direction = np.array([math.cos(heading), math.sin(heading)])
     aside = np.array([-direction[1], direction[0]])
@@ -161,7 +162,7 @@ def test_in_a_steady_circle_the_turn_is_fed(fix: Callable[..., Fix]) -> None:
 
 
 def test_positions_of_a_poor_receiver_are_smoothed(fix: Callable[..., Fix]) -> None:
-    """Half of the noise is gone, in a turn as well; and a good receiver is believed."""
+    """Half of the noise is removed, also in a turn; a good receiver is hardly smoothed."""
     straight: Place = lambda t_s: ([10 * t_s, 0, 0], [10, 0, 0])  # noqa: E731
     for place in (straight, circling(60.0, 8.0)):
         rng, history, hindsight, off = np.random.default_rng(3), None, PastPredictions(), []
@@ -192,7 +193,7 @@ def test_over_a_gap_nothing_is_smoothed(fix: Callable[..., Fix]) -> None:
 
 @pytest.mark.parametrize("decay_s", [3.0, 10.0])
 def test_a_fading_acceleration(decay_s: float) -> None:
-    """Against the integral, twice."""
+    """Against the integral, for velocity and position."""
     times = np.linspace(0, 2.0, 20001)
     speeds = np.concatenate([[0], np.cumsum(np.exp(-(times[:-1] + 5e-5) / decay_s) * 1e-4)])
     way, gain = fading_response(2.0, decay_s)

@@ -1,4 +1,4 @@
-"""What is possible at a time that is not known exactly, against motions and an exact search."""
+"""Reachable sets at uncertain times, against simulated motions and an exact search."""
 
 import math
 from collections.abc import Callable
@@ -53,7 +53,7 @@ def test_no_motion_leaves_what_is_possible(
     aside: tuple[float, ...],
     off_m: float,
 ) -> None:
-    """Full noise and full acceleration, any time between the ends, any place predicted."""
+    """Full noise and acceleration, any time between the ends, any predicted position."""
     velocity = speed * unit(way)
     made = fix(0, [0, 0, 0], velocity, noise=NOISE)
     at_s = age_s - before_s + when * (before_s + after_s)
@@ -79,7 +79,7 @@ def test_no_motion_leaves_what_is_possible(
 def test_the_bound_and_the_ball_are_the_least(
     fix: Callable[..., Fix], age_s: float, before_s: float, after_s: float
 ) -> None:
-    """Against the worst of all places that are possible, and the least ball over them."""
+    """Against the farthest possible position and the smallest ball around all of them."""
     noise = replace(NOISE, horizontal_m=1.5, vertical_m=1.5)
     velocity = np.array([8.0, 3.0, 0.0])
     made = fix(0, [0, 0, 0], velocity, noise=noise)

@@ -1,4 +1,4 @@
-"""A receiver that is worse than it says: when it is not believed, and what is assumed then."""
+"""Receivers worse than their stated accuracy: detection, and the noise assumed afterwards."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -22,7 +22,7 @@ Wander = Callable[[float], tuple[float, float]]
 def flown(
     fix: MakeFix, wander: Wander, noise: ReportNoise = STATED, step_s: float = 0.1
 ) -> Iterator[Fix]:
-    """A minute on a circle, 60 m wide at 6 m/s, as a receiver sees it that wanders."""
+    """Return one minute on a circle 60 m wide at 6 m/s, as a wandering receiver reports it."""
     for n in range(round(60 / step_s)):
         t_s = n * step_s
         turn = 0.1 * t_s
@@ -56,7 +56,7 @@ def test_one_that_is_off_for_good_cannot_be_seen(fix: MakeFix) -> None:
 
 @pytest.mark.parametrize("size_m", [0.8, 1.6, 3.2])
 def test_one_that_wanders_is_found_while_the_bound_still_holds(fix: MakeFix, size_m: float) -> None:
-    """It is told soon, in few words, and what is assumed then holds what it is off by."""
+    """It is reported early and a few times only, and the raised bound covers the error."""
     straying, wander = ReceiverCheck(SETTINGS), wave(size_m, 15)
     found = told(straying, flown(fix, wander))
     assert 1 <= len(found) <= 12
@@ -90,7 +90,9 @@ def test_what_is_left_of_the_lag_is_no_fault_of_the_receiver(fix: MakeFix) -> No
 
 
 def test_what_is_flown_between_two_reports_is_no_fault_of_the_receiver(fix: MakeFix) -> None:
-    """Gusts at 5 rad/s, 25 m/s strong, reported half a second apart: no velocity tells of them."""
+    """Gusts at 5 rad/s, 25 m/s strong, reported every half second: the velocities do not
+    show them.
+    """
 
     def gusty() -> Iterator[Fix]:
         for n in range(120):
@@ -106,7 +108,7 @@ def test_what_is_flown_between_two_reports_is_no_fault_of_the_receiver(fix: Make
 
 
 def test_a_leap_is_left_to_the_gate(fix: MakeFix) -> None:
-    """It says nothing against the receiver, there nor back again."""
+    """Neither the jump nor the return counts against the receiver."""
     assert (
         told(ReceiverCheck(SETTINGS), flown(fix, lambda t_s: (25.0 * (20 < t_s < 22), 0.0))) == []
     )

@@ -1,4 +1,4 @@
-"""Tracks: how they begin, age, refuse and are forgotten."""
+"""Tracks: start, ageing, rejection and removal."""
 
 import math
 from collections import Counter
@@ -34,7 +34,7 @@ SETTINGS = TrackerSettings(limits=Limits(30.0, 8.0), ages=AGES)
 
 
 def same_time(node_ns: int, bound_s: float = 0.0) -> SenderTime:
-    """A time of a sender whose timeline is the node's, as is known to within ``bound_s``."""
+    """Return a sender time on the node timeline, known within ``bound_s``."""
     return SenderTime(node_ns=node_ns, sender_ns=node_ns, before_s=bound_s, after_s=bound_s)
 
 
@@ -58,7 +58,7 @@ def test_tracks_age(tracker: Tracker, fix: MakeFix, age_s: float, state: str) ->
     assert track.state == state
     assert tracker.state("1:1", same_time(now_ns)) is TrackState(state)
     assert tracker.state("2:1", same_time(now_ns)) is None
-    # The time asked for is another matter.
+    # The prediction time may differ.
     assert track.age_s == pytest.approx(age_s + 1.0)
 
 
@@ -134,7 +134,7 @@ def test_a_report_that_is_too_old_or_came_twice_is_rejected_and_changes_nothing(
 
 
 def test_a_late_report_is_put_in_its_place(fix: MakeFix) -> None:
-    """And leaves what a report in time would have left."""
+    """The resulting state equals that of a timely report."""
     made = [fix(n * S, [10 * n, n * n, 0], [10, 2 * n, 0], late_ns=S // 8) for n in range(100, 106)]
     one, other = Tracker(OBSERVER, SETTINGS), Tracker(OBSERVER, SETTINGS)
     for n in range(6):
@@ -163,7 +163,7 @@ def test_a_restart_begins_anew(tracker: Tracker, fix: MakeFix) -> None:
     tracker.accept(fix(100 * S, [0, 0, 0], uav="2:1"))
     assert tracker.uavs == ["1:1", "2:1"]
     tracker.forget("1:1")
-    tracker.forget("9:1")  # never seen
+    tracker.forget("9:1")  # unknown
     assert tracker.uavs == ["2:1"]
     assert tracker.track("1:1", 0, same_time(0)) is None
     assert tracker.newest("1:1") is None
@@ -190,7 +190,7 @@ def test_tracks_do_not_touch_one_another(fix: MakeFix) -> None:
     assert a.bound_m == b.bound_m
 
 
-# --- what cannot be true ------------------------------------------------------------------------
+# --- impossible reports -------------------------------------------------------------------------
 
 KINEMATIC = KinematicObserver(KinematicModel(30.0, 5.0))
 NOISE = ReportNoise(
@@ -208,7 +208,7 @@ def tracking(feed_mps2: float | None = None, ages: Ages = AGES, **gate: float) -
 
 
 def circling(t_s: float, radius_m: float = 60.0) -> tuple[FloatArray, FloatArray]:
-    """Position and velocity of level flight in a circle at 12 m/s: 2.4 m/s^2."""
+    """Return position and velocity of level flight in a circle at 12 m/s: 2.4 m/s^2."""
     turned = CRUISE_MPS / radius_m * t_s
     ahead = np.array([-math.sin(turned), math.cos(turned), 0.0])
     side = np.array([math.cos(turned), math.sin(turned), 0.0])
@@ -221,7 +221,7 @@ Shift = Callable[[float], tuple[float, float, float]]
 def flight(
     fix: MakeFix, times_s: Iterable[float], shift: Shift = lambda _: (0, 0, 0), seed: int = 0
 ) -> list[Fix]:
-    """Reports of the circle, with noise within its bounds, and wrong by ``shift``."""
+    """Return reports of the circle, with noise within its bounds, displaced by ``shift``."""
     rng, made = np.random.default_rng(seed), []
     for t_s in times_s:
         position, velocity = circling(t_s)
@@ -240,7 +240,7 @@ def seen(tracker: Tracker, t_s: float, doubt_s: float = 0.0) -> Track:
 
 
 def holds(track: Track, truth: FloatArray) -> float:
-    """The truth is in the cylinder; how far off the position is."""
+    """Check that the truth is in the cylinder, and return the position error."""
     off = track.position_ned_m - truth
     assert math.hypot(off[0], off[1]) <= track.horizontal_bound_m + 1e-6
     assert abs(off[2]) <= track.vertical_bound_m + 1e-6
@@ -257,7 +257,7 @@ def every(interval_s: float, start_s: float, end_s: float) -> list[float]:
 
 
 def test_one_bad_report_is_refused_and_nothing_is_gated_on_it(fix: MakeFix) -> None:
-    """The good ones that follow lie far from the bad one, and near what was accepted before it."""
+    """The following good reports are far from the outlier and near the last accepted report."""
     tracker = tracking()
     made = flight(
         fix, every(0.2, 0, 30), lambda t_s: (500, 0, 0) if abs(t_s - 10) < 0.05 else (0, 0, 0)
@@ -271,7 +271,7 @@ def test_one_bad_report_is_refused_and_nothing_is_gated_on_it(fix: MakeFix) -> N
 
 
 def test_a_glitch_is_sat_out(fix: MakeFix) -> None:
-    """25 m to the north for .8 s: none of it enters, and the bounds go on to hold."""
+    """25 m to the north for 0.8 s: none of it is used, and the bounds hold."""
     tracker = tracking()
     for one in flight(
         fix, every(0.2, 0, 40), lambda t_s: (25, 0, 0) if 9.9 < t_s < 10.7 else (0, 0, 0)
@@ -288,7 +288,7 @@ def test_a_glitch_is_sat_out(fix: MakeFix) -> None:
 
 
 def test_a_jump_that_lasts_is_followed_once(fix: MakeFix) -> None:
-    """Refused for as long as it takes to be believed; then the track begins anew from it."""
+    """Rejected until it is confirmed; then the track restarts from it."""
     tracker = tracking()
     jumped = flight(fix, every(0.2, 0, 40), lambda t_s: (25, 0, 0) if t_s > 9.9 else (0, 0, 0))
     outcomes = [tracker.accept(one)[0] for one in jumped]
@@ -302,7 +302,7 @@ def test_a_jump_that_lasts_is_followed_once(fix: MakeFix) -> None:
     assert outcomes[again[0]].fix is jumped[again[0]]
     assert tracker.newest("1:1") is jumped[-1]
     track = seen(tracker, 40)
-    assert track.reports == 200  # those that were refused count: the track begins with them
+    assert track.reports == 200  # the rejected reports count: the track starts with them
     holds(track, circling(40)[0] + np.array([25, 0, 0]))
 
 
@@ -325,7 +325,7 @@ def test_a_change_of_the_height_s_datum_has_its_own_reason(fix: MakeFix) -> None
 
 
 def test_positions_that_are_sent_again_are_not_used(fix: MakeFix) -> None:
-    """Fresh stamps and velocities, old positions: for three seconds, then it flies on."""
+    """Fresh stamps and velocities with old positions for three seconds, then normal flight."""
     tracker, outcomes = tracking(), []
     made = flight(fix, every(0.2, 0, 20))
     for number, one in enumerate(made):
@@ -350,14 +350,15 @@ def test_a_position_sent_again_just_after_a_jump_was_believed_is_not_used(fix: M
 
 
 def two_under_one_id(fix: MakeFix, end_s: float) -> list[Fix]:
-    """Five reports a second of each, 2 km apart: farther than can be forgotten in a while."""
+    """Return five reports per second of each of two vehicles, 2 km apart: too far to be forgotten
+    soon."""
     here = flight(fix, every(0.2, 0, end_s))
     there = flight(fix, every(0.2, 0.1, end_s + 0.1), lambda _: (0, 2000, 0), seed=1)
     return sorted(here + there, key=lambda one: one.sender_ns)
 
 
 def test_two_vehicles_under_one_id_are_said(fix: MakeFix) -> None:
-    """At first the second one's reports are refused, then, while both go on, everyone's."""
+    """First the second vehicle's reports are rejected, then, while both continue, those of both."""
     tracker = tracking()
     outcomes = [tracker.accept(one)[0] for one in two_under_one_id(fix, 5.9)]
     early = reasons(outcomes[:30])
@@ -368,14 +369,14 @@ def test_two_vehicles_under_one_id_are_said(fix: MakeFix) -> None:
 
 
 def test_of_two_vehicles_under_one_id_neither_becomes_the_track(fix: MakeFix) -> None:
-    """As long as both go on, the track does not leap from the one to the other."""
+    """While both continue, the track does not jump from one to the other."""
     tracker = tracking()
     outcomes = [tracker.accept(one)[0] for one in two_under_one_id(fix, 20)]
     assert not any(isinstance(one, Estimate) and one.reacquired for one in outcomes)
 
 
 def test_a_hole_is_coasted_over(fix: MakeFix) -> None:
-    """12 s without a report: the bound grows, and holds; the first report after it is taken."""
+    """12 s without a report: the bound grows and holds; the first report after it is accepted."""
     tracker = tracking()
     for one in flight(fix, every(0.2, 0, 10)):
         assert isinstance(tracker.accept(one)[0], Estimate)
@@ -397,7 +398,7 @@ def test_a_hole_is_coasted_over(fix: MakeFix) -> None:
 
 @pytest.mark.parametrize(("gap_s", "anew"), [(59.9, False), (60.1, True)])
 def test_a_lost_track_begins_anew(fix: MakeFix, gap_s: float, anew: bool) -> None:
-    """Wherever it comes back: there is nothing left to compare it with."""
+    """Wherever it reappears: the old track is no longer compared."""
     tracker = tracking()
     tracker.accept(fix(0, [0, 0, 0], [0, 0, 0]))
     found = tracker.accept(fix(round(gap_s * S), [20_000, 0, 0], [0, 0, 0]))[0]
@@ -407,11 +408,11 @@ def test_a_lost_track_begins_anew(fix: MakeFix, gap_s: float, anew: bool) -> Non
         assert seen(tracker, gap_s).reports == 1
 
 
-# --- what is added to the observer --------------------------------------------------------------
+# --- additions to the observer ------------------------------------------------------------------
 
 
 def errors_m(fix: MakeFix, feed_mps2: float | None, ahead_s: float) -> float:
-    """The mean error over a circle, ``ahead_s`` past the newest report."""
+    """Return the mean error over a circle, ``ahead_s`` past the newest report."""
     tracker, off = tracking(feed_mps2), []
     for one in flight(fix, every(0.2, 0, 60)):
         assert isinstance(tracker.accept(one)[0], Estimate)
@@ -422,13 +423,13 @@ def errors_m(fix: MakeFix, feed_mps2: float | None, ahead_s: float) -> float:
 
 
 def test_an_acceleration_fed_forward_helps_in_a_turn(fix: MakeFix) -> None:
-    """Two seconds ahead: 2.4 m/s^2 are 4.8 m that would be missed. Noise is smoothed besides."""
+    """Two seconds ahead, 2.4 m/s^2 are 4.8 m. Noise is smoothed as well."""
     assert errors_m(fix, 5.0, 2.0) < 0.6 * errors_m(fix, None, 2.0)
     assert errors_m(fix, 5.0, 0.0) < 0.6 * errors_m(fix, None, 0.0)
 
 
 def test_what_is_fed_forward_is_within_the_bound(fix: MakeFix) -> None:
-    """It moves the estimate, and the bound grows by its whole size where it points."""
+    """It moves the estimate, and the bound grows by the full displacement in that direction."""
     plain, fed = tracking(), tracking(5.0)
     for n in range(31):
         t_s = n / 5
@@ -449,7 +450,7 @@ def test_what_is_fed_forward_is_within_the_bound(fix: MakeFix) -> None:
 
 
 def test_no_more_is_fed_forward_than_is_possible(fix: MakeFix) -> None:
-    """Velocities of such a noise prove nothing, and raise no limit."""
+    """Such noisy velocities refute nothing and raise no limit."""
     tracker, noise = tracking(3.0), replace(NOISE, velocity_mps=20.0)
     for n in range(31):  # 5 m/s^2
         t_s = n / 5
@@ -460,8 +461,8 @@ def test_no_more_is_fed_forward_than_is_possible(fix: MakeFix) -> None:
 
 @pytest.mark.parametrize("doubt_s", [0.0, 0.4])
 def test_no_adversary_leaves_what_the_fleet_says(fix: MakeFix, doubt_s: float) -> None:
-    """Accelerations to and fro, all the noise there may be, a clock that is off: none is refused,
-    and the truth stays in the bounds."""
+    """Alternating accelerations, full noise, a clock error: no report is rejected, and the truth
+    stays within the bounds."""
     for seed in range(rounds(40, 150)):
         rng = np.random.default_rng(seed)
         tracker = tracking(5.0)
@@ -493,18 +494,20 @@ def test_doubt_of_the_clock_is_worth_the_way_flown_in_it(fix: MakeFix) -> None:
     tracker.accept(fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE))
     a, b = seen(tracker, 1), seen(tracker, 1, doubt_s=0.5)
     assert (a.clock_bound_s, b.clock_bound_s) == (0.0, 0.5)
-    # At the later end: 10 m/s by the report, 0.4 by its noise, and its acceleration since.
+    # At the later end: 10 m/s reported, 0.4 m/s of noise, and the acceleration since.
     widened_m = 0.5 * (10 + 0.4) + 5.0 * (1.5**2 - 1) / 2
     assert b.bound_m - a.bound_m == pytest.approx(widened_m)
     assert b.horizontal_bound_m - a.horizontal_bound_m == pytest.approx(widened_m)
-    # The way flown is level: only what is not known of it may be up or down.
+    # The path is level: only its unknown part may be vertical.
     assert b.vertical_bound_m - a.vertical_bound_m == pytest.approx(widened_m - 0.5 * 10)
     a, b = seen(tracker, 40), seen(tracker, 40, doubt_s=0.5)
     assert b.horizontal_bound_m - a.horizontal_bound_m == pytest.approx(0.5 * 30.0)
 
 
 def test_doubt_of_the_clock_covers_an_acceleration_in_it(fix: MakeFix) -> None:
-    """At full acceleration, asked a second too early: 2.5 m beyond the way at its speed."""
+    """At full acceleration and a clock one second early: 2.5 m beyond the path at constant
+    speed.
+    """
     tracker = tracking()
     tracker.accept(
         fix(0, [0, 0, 0], [0, 0, 0], noise=replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6))
@@ -515,8 +518,8 @@ def test_doubt_of_the_clock_covers_an_acceleration_in_it(fix: MakeFix) -> None:
 
 
 def test_doubt_of_the_clock_covers_a_turn_that_ends_in_it(fix: MakeFix) -> None:
-    """It brakes at 4 m/s^2, which is fed forward, and from the last report on it speeds up at 5;
-    3.4 s after that, where it was asked for 0.4 s earlier, it is still in the bounds."""
+    """It brakes at 4 m/s^2, which is fed forward, and accelerates at 5 m/s^2 after the last report.
+    The prediction for 3.0 s must still hold at 3.4 s."""
     tracker, exact = tracking(5.0), replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6)
     for n in range(11):
         t_s = 0.2 * n
@@ -529,7 +532,7 @@ def test_doubt_of_the_clock_covers_a_turn_that_ends_in_it(fix: MakeFix) -> None:
 
 
 def test_who_is_near_is_told_by_the_newest_reports(fix: MakeFix) -> None:
-    """In space, and nearer than the distance: 100 m off by 60 m east and 80 m up."""
+    """Distance in three dimensions: 60 m east and 80 m up are 100 m."""
     tracker = tracking()
     tracker.accept(fix(0, [900, 0, 0], uav="1:1"))
     tracker.accept(fix(0, [1000, 60, -80], uav="2:1"))
@@ -550,7 +553,7 @@ def test_without_a_velocity_doubt_is_worth_the_greatest_speed(fix: MakeFix) -> N
 
 
 def test_what_is_usual_is_within_what_is_possible(fix: MakeFix) -> None:
-    """Of a clock that was usually off by more than it can be off now."""
+    """The usual clock error was larger than its present bound."""
     tracker = Tracker(KinematicObserver(KinematicModel(30.0, 8.0)), SETTINGS)
     for t_s in range(100, 130):
         tracker.accept(fix(t_s * S, [20 * t_s, 0, 0], [20, 0, 0]))

@@ -1,4 +1,4 @@
-"""The closed form: against the LMI by CVXPY and Clarabel, simulation and dense scans."""
+"""The closed form against the LMI by CVXPY and Clarabel, simulation and dense scans."""
 
 import math
 
@@ -16,7 +16,7 @@ ALPHAS = st.floats(0.01, 0.99)
 
 
 def grid() -> list[tuple[float, float, float]]:
-    """Interval, feedthrough and alpha about a grid, not on it."""
+    """Return interval, feedthrough and alpha near, but not on, a grid."""
     rng = np.random.default_rng(2)
     return [
         (b * rng.uniform(0.9, 1.1), d + rng.uniform(-0.05, 0.05), a * rng.uniform(0.9, 1.05))
@@ -30,7 +30,7 @@ def grid() -> list[tuple[float, float, float]]:
 def test_the_closed_form_is_the_optimum_of_the_lmi(b: float, d: float, alpha: float) -> None:
     solved = lmi.solve(ONE, b=b * ONE, c=ONE, d=d * ONE, h=ONE, alpha=alpha)
     mu = closed_form.mu_star(b, d, alpha)
-    # Where mu* = 0 no P attains it, and the solver stops a little above.
+    # For mu* = 0 no P attains it; the solver stops slightly above.
     assert solved.mu == pytest.approx(mu, abs=1e-5 if mu > 0 else 1e-4)
     if mu > 1e-3:
         assert solved.gain[0, 0] == pytest.approx(closed_form.gain(b, d, alpha), abs=1e-3)
@@ -46,7 +46,7 @@ def test_the_closed_form_is_the_optimum_of_the_lmi(b: float, d: float, alpha: fl
 
 @pytest.mark.parametrize(("mu", "limit_s"), [(0.05, 0.8873), (0.25, 1.0000), (1.0, 1.2906)])
 def test_the_published_limits(mu: float, limit_s: float) -> None:
-    """The paper, on a grid of 0.01 s, found infeasibility at 0.89, 1.01 and 1.3."""
+    """The paper used a grid of 0.01 s and found infeasibility at 0.89, 1.01 and 1.3 s."""
     assert round(closed_form.dt_limit_s(mu, 0.5, 0.5), 4) == limit_s
 
 
@@ -106,7 +106,7 @@ def test_no_alpha_up_to_the_fastest_is_better_than_the_best(b: float, d: float) 
     scan = np.linspace(1e-4, closed_form.FASTEST_DECAY, 500)
     mus = np.array([((d - b) ** 2 - (1 - a) * d * d) / a for a in scan]).clip(min=0.0)
     assert attained <= mus.min() + 1e-9
-    # Of those that null the error it is the largest.
+    # It is the largest of those that null the error.
     if attained == 0.0 and best < closed_form.FASTEST_DECAY:
         assert mus[scan > best + 1e-3].min(initial=1.0) > 0
     assert closed_form.gain(b, d) == closed_form.gain(b, d, best)
@@ -122,14 +122,14 @@ def test_the_limit_is_where_mu_passes_the_bound(mu: float, d: float, alpha: floa
 
 
 def test_no_interval_below_zero_is_feasible() -> None:
-    """With a lag no interval meets a small mu: the largest that does is not a negative one."""
+    """With a lag no interval meets a small mu; the limit is then 0, not negative."""
     assert closed_form.mu_stars([1e-6], -1.0, 0.5)[0] > 0.9
     assert closed_form.dt_limit_s(0.0, -1.0, 0.5) >= 0.0
 
 
 @given(INTERVALS, FEEDTHROUGHS, st.floats(0.05, 1.95))
 def test_the_peak_gain_is_that_of_the_worst_input(b: float, d: float, l_gain: float) -> None:
-    """e+ = (1-l) e + (l d - b) w, with w = -1 or 1 as it hurts most, until it settles."""
+    """e+ = (1-l) e + (l d - b) w, with w = -1 or 1 in the worst sense, until it settles."""
     error, q, enters = 0.0, 1 - l_gain, l_gain * d - b
     steps = math.ceil(math.log(1e-12) / math.log(max(abs(q), 1e-3))) + 1
     for _ in range(steps):
@@ -142,7 +142,7 @@ def test_the_peak_gain_is_that_of_the_worst_input(b: float, d: float, l_gain: fl
 
 def test_a_gain_that_does_not_contract_has_no_peak() -> None:
     assert closed_form.peak_gain([0.1, 0.1, 0.5], 0.0, [0.0, 2.0, -1.0]).tolist() == [math.inf] * 3
-    assert closed_form.peak_gain(0.5, 0.25, 2.0) == 0.0  # nothing enters
+    assert closed_form.peak_gain(0.5, 0.25, 2.0) == 0.0  # no input
 
 
 @given(INTERVALS, FEEDTHROUGHS, ALPHAS)

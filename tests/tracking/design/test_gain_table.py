@@ -1,4 +1,4 @@
-"""The kinematic design: its certificate, its bounds against adversaries, its text form."""
+"""The kinematic design: its certificate, its bounds against adversaries, and its JSON form."""
 
 import json
 import math
@@ -25,7 +25,7 @@ SPEED_MPS = 60.0
 
 
 def designed(folder: Path, name: str) -> KinematicDesign:
-    """The table that comes with the program, and one for senders without velocity."""
+    """Return the shipped table, and one for senders without velocity."""
     return KinematicDesign.from_json((folder / f"{name}.json").read_text(encoding="utf-8"))
 
 
@@ -34,7 +34,7 @@ WITH_VELOCITY, WITHOUT = DESIGNS
 EACH = pytest.mark.parametrize("design", DESIGNS, ids=NAMES)
 
 
-# --- the model ----------------------------------------------------------------------------------
+# --- model --------------------------------------------------------------------------------------
 
 
 @given(st.floats(0.05, 3.0), st.integers(0, 2**32 - 1))
@@ -47,7 +47,7 @@ def test_the_input_covers_every_acceleration(dt_s: float, seed: int) -> None:
         a[: seed % 40] *= -1
         a[:, 1:] = 0.0
     edges = np.linspace(0.0, dt_s, 41)
-    lever = (edges[1:] ** 2 - edges[:-1] ** 2)[:, None] / 2  # of T - s, in pieces
+    lever = (edges[1:] ** 2 - edges[:-1] ** 2)[:, None] / 2  # integral of T - s, piecewise
     g = np.array([(lever * a).sum(axis=0), (np.diff(edges)[:, None] * a).sum(axis=0)])
     b, _, channels = gain_table.inputs(dt_s, 5.0, 0.5, 0.2)
     assert channels == (2, 1, 1)
@@ -58,7 +58,8 @@ def test_the_input_covers_every_acceleration(dt_s: float, seed: int) -> None:
 
 
 def worst_level(p: FloatArray, gain: FloatArray, dt_s: float) -> float:
-    """sup sqrt(e+^T P e+) from the invariant set, acceleration free to switch; by support."""
+    """Return sup sqrt(e+^T P e+) from the invariant set with freely switching acceleration, by
+    support functions."""
     root = np.linalg.cholesky(p).T
     r = gain.shape[1]
     closed = gain_table.transition(dt_s) - gain @ np.eye(2)[:r]
@@ -76,7 +77,8 @@ def worst_level(p: FloatArray, gain: FloatArray, dt_s: float) -> float:
 def test_acceleration_held_over_the_interval_would_prove_too_little(
     noise: float | None, alpha: float
 ) -> None:
-    """With B = [T^2/2; T] alone the set is left when the acceleration switches; with ours never."""
+    """With B = [T^2/2; T] alone the error leaves the set when the acceleration switches; with this
+    B never."""
     b, d, channels = gain_table.inputs(1.0, 5.0, 0.5, noise)
     c, position = np.eye(2)[: len(d)], np.array([[1.0, 0.0]])
     a = gain_table.transition(1.0)
@@ -114,7 +116,7 @@ def test_the_shipped_tables_verify_and_quickly(design: KinematicDesign) -> None:
 
 @EACH
 def test_the_margin_is_that_of_the_lmi(design: KinematicDesign) -> None:
-    """At the grid's points, against the general certificate in ``lmi``, one by one."""
+    """At each grid point, against the general certificate in ``lmi``."""
     margins = []
     position = np.array([[1.0, 0.0]])
     sizes = (design.acceleration_mps2, design.position_noise_m, design.velocity_noise_mps)
@@ -152,7 +154,7 @@ def test_the_certificate_notices(design: KinematicDesign) -> None:
 
 
 def test_between_the_points_the_certificate_looks_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A grid of its ends alone passes there, and is refused for what lies between."""
+    """A grid of two end points passes at them and is rejected for the intervals between."""
     ends = replace(
         WITHOUT,
         dt_s=WITHOUT.dt_s[::23],
@@ -189,7 +191,8 @@ def test_the_invariant_bound_is_the_largest_on_the_ellipse() -> None:
 
 
 def swept(c: FloatArray, dt_s: FloatArray, acceleration: float) -> FloatArray:
-    """g (2, S) that is largest along c (2, S): bang-bang, switching once at T - s = -c_v / c_p."""
+    """Return g (2, S) that is largest along c (2, S): bang-bang, switching once at T - s = -c_v /
+    c_p."""
     with np.errstate(divide="ignore", invalid="ignore"):
         at = -c[1] / c[0]
     switches = (at > 0) & (at < dt_s)
@@ -200,7 +203,7 @@ def swept(c: FloatArray, dt_s: FloatArray, acceleration: float) -> FloatArray:
 
 
 def step(design: KinematicDesign, e: FloatArray, dt_s: FloatArray, c: FloatArray) -> FloatArray:
-    """e+ (2, S) at its largest along c (2, S)."""
+    """Return the largest e+ (2, S) along c (2, S)."""
     r = 2 if design.has_velocity else 1
     noise = np.array([design.position_noise_m, design.velocity_noise_mps or 0.0])[:r]
     gains = np.array([gain_table.gain(design, float(x)) for x in dt_s])
@@ -215,7 +218,8 @@ def step(design: KinematicDesign, e: FloatArray, dt_s: FloatArray, c: FloatArray
 
 
 def closed_along(design: KinematicDesign, c: FloatArray, dt_s: FloatArray) -> FloatArray:
-    """(A - L C)^T c: where the error must lie now to lie along c after the interval."""
+    """Return (A - L C)^T c: the direction of the present error that lies along c after the
+    interval."""
     r = 2 if design.has_velocity else 1
     closed = [
         gain_table.transition(float(x)) - gain_table.gain(design, float(x)) @ np.eye(2)[:r]
@@ -226,11 +230,11 @@ def closed_along(design: KinematicDesign, c: FloatArray, dt_s: FloatArray) -> Fl
 
 @EACH
 def test_no_adversary_leaves_the_invariant_set(design: KinematicDesign) -> None:
-    """Hundreds of sequences of 40 intervals in the range, each planned back from a goal."""
+    """Hundreds of sequences of 40 intervals in the range, each planned backwards from a goal."""
     rng = np.random.default_rng(7)
     sequences, steps = rounds(400, 2000), 40
     dt_s = np.exp(rng.uniform(np.log(0.05), np.log(2.0), (steps, sequences)))
-    dt_s[:, ::4] = dt_s[:1, ::4]  # a quarter keeps its interval
+    dt_s[:, ::4] = dt_s[:1, ::4]  # a quarter of them keep their interval
     dt_s[:, 1::4] = np.where(rng.random(dt_s[:, 1::4].shape) < 0.5, 0.05, 2.0)
     goal = np.zeros((steps + 1, 2, sequences))
     goal[-1] = [np.ones(sequences), rng.choice([0.0, 0.0, 1.0, -1.0], sequences)]
@@ -249,7 +253,7 @@ def test_no_adversary_leaves_the_invariant_set(design: KinematicDesign) -> None:
 @EACH
 @pytest.mark.parametrize("dt_s", [0.05, 0.1, 0.25, 1.0, 2.0])
 def test_the_peak_of_one_interval_is_reached(design: KinematicDesign, dt_s: float) -> None:
-    """The exact peak of ``companion design``: reached by the adversary, and never passed."""
+    """The exact peak of ``companion design`` is attained by the adversary and never exceeded."""
     limits = KinematicLimits(
         design.acceleration_mps2, design.position_noise_m, design.velocity_noise_mps
     )
@@ -260,13 +264,13 @@ def test_the_peak_of_one_interval_is_reached(design: KinematicDesign, dt_s: floa
         goals.append(closed_along(design, goals[-1], interval))
     e = np.zeros((2, 1))
     for goal in reversed(goals[:-1]):
-        # Signs by the goal alone: the error so far lies along it already.
+        # Signs depend on the goal alone: the error so far already lies along it.
         e = step(design, e, interval, goal)
     assert abs(e[0, 0]) == pytest.approx(peak_m, rel=1e-6)
     assert peak_m < gain_table.invariant_bound(design)
 
 
-# --- text ---------------------------------------------------------------------------------------
+# --- JSON ---------------------------------------------------------------------------------------
 
 
 @EACH
@@ -316,7 +320,7 @@ def test_what_is_no_design_is_refused(text: str) -> None:
         KinematicDesign.from_json(text)
 
 
-# --- the command --------------------------------------------------------------------------------
+# --- command ------------------------------------------------------------------------------------
 
 
 def run(*arguments: str) -> Result:
@@ -375,7 +379,7 @@ def test_the_command_writes_a_table(tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_a_table_without_velocity_costs_little_more_than_its_longest_interval() -> None:
-    """An alpha for each interval: one for all comes to 6.1 m here, the longest alone to 3.3 m."""
+    """One alpha per interval; a common alpha gives 6.1 m here, the longest interval alone 3.3 m."""
     motion = answers.KinematicLimits(5.0, 0.5, None)
     design = answers.table((0.05, 0.5), motion, points=12)
     alone_m = answers.kinematic_row(0.5, motion)["gamma"]

@@ -1,4 +1,4 @@
-"""The LMI: its certificate, networks, and what it does not solve."""
+"""The LMI: its certificate, networks, and unsolvable cases."""
 
 from collections.abc import Sequence
 
@@ -13,13 +13,13 @@ Plant = tuple[FloatArray, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 def solve(plant: Plant, alpha: float, channels: Sequence[int] | None = None) -> lmi.LmiSolution:
-    """``lmi.solve`` of a plant that is given as one tuple."""
+    """Call ``lmi.solve`` with a plant given as one tuple."""
     a, b, c, d, h = plant
     return lmi.solve(a, b=b, c=c, d=d, h=h, alpha=alpha, channels=channels)
 
 
 def network(intervals_s: list[float], feedthrough_s: float) -> Plant:
-    """The paper's stacked model: two axes for each UAV."""
+    """Return the paper's stacked model with two axes per UAV."""
     stacked = np.repeat(intervals_s, 2)
     eye = np.eye(len(stacked))
     return eye, np.diag(stacked), eye, feedthrough_s * eye, eye
@@ -32,20 +32,22 @@ def network(intervals_s: list[float], feedthrough_s: float) -> Plant:
 def test_a_network_is_no_worse_than_its_worst_axis(
     intervals_s: list[float], feedthrough_s: float, alpha: float
 ) -> None:
-    """Unequal intervals, 2N x 2N, nothing assumed diagonal: mu is the largest of the axes'."""
+    """Unequal intervals, 2N x 2N, no diagonal structure assumed: mu is the largest of the
+    axes' mu.
+    """
     plant = network(intervals_s, feedthrough_s)
     solved = solve(plant, alpha)
     worst = max(closed_form.mu_star(b, feedthrough_s, alpha) for b in intervals_s)
     assert worst > 0.01
     assert solved.mu == pytest.approx(worst, abs=1e-5)
-    # And the gains of the single axes, with one common P, meet the network's LMIs.
+    # The gains of the single axes with a common P also meet the network's LMIs.
     gains = np.diag(np.repeat(closed_form.gains(intervals_s, feedthrough_s, alpha), 2))
     common = np.eye(len(gains)) / worst
     assert lmi.lmi_margin(common, gain=gains, mu=worst, plant=plant, alpha=alpha) >= -1e-9
 
 
 def test_the_margin_is_the_least_eigenvalue_of_what_is_written() -> None:
-    """Positive exactly where the LMIs, unscaled, are positive definite."""
+    """Positive exactly where the unscaled LMIs are positive definite."""
     rng = np.random.default_rng(5)
     signs = set()
     for _ in range(200):
@@ -92,7 +94,7 @@ def test_a_tampered_solution_fails_its_certificate() -> None:
 
 
 def certify(p: FloatArray, gain: FloatArray, mu: float, plant: Plant) -> None:
-    """What ``solve`` does with the solver's answer, at alpha = 0.5."""
+    """Certify a solver's answer as ``solve`` does, at alpha = 0.5."""
     a, b, c, d, h = plant
     lmi._certified(
         p,
@@ -106,7 +108,7 @@ def certify(p: FloatArray, gain: FloatArray, mu: float, plant: Plant) -> None:
 
 
 def test_a_p_that_is_not_positive_is_no_certificate() -> None:
-    """An ``LmiError`` like every other answer that cannot be confirmed."""
+    """It raises an ``LmiError``, as for every other answer that cannot be confirmed."""
     with pytest.raises(lmi.LmiError, match="not positive"):
         certify(-ONE, ONE, 1.0, (ONE, ONE, ONE, 0 * ONE, ONE))
 
@@ -118,7 +120,7 @@ def test_alpha_lies_between_0_and_1(alpha: float) -> None:
 
 
 def test_what_cannot_be_met_is_an_error() -> None:
-    """A growing state that is not measured: no gain, no P."""
+    """An unstable, unmeasured state: no gain and no P exist."""
     unmeasured = 0 * ONE
     with pytest.raises(lmi.LmiError, match=r"^the solver"):
         lmi.solve(2 * ONE, b=ONE, c=unmeasured, d=unmeasured, h=ONE, alpha=0.5)
@@ -126,13 +128,13 @@ def test_what_cannot_be_met_is_an_error() -> None:
 
 @pytest.mark.parametrize("dt_s", [1e-4, 1e-3, 100.0, 1000.0])
 def test_the_unit_of_time_does_not_matter(dt_s: float) -> None:
-    """mu scales with the square of the interval: what is solved at 1 s is solved at any."""
+    """mu scales with the square of the interval: a plant solvable at 1 s is solvable at any."""
     solved = lmi.solve(ONE, b=dt_s * ONE, c=ONE, d=-0.3 * dt_s * ONE, h=ONE, alpha=0.5)
     assert solved.mu == pytest.approx(closed_form.mu_star(dt_s, -0.3 * dt_s, 0.5), rel=1e-3)
 
 
 def test_a_network_with_weighted_outputs_on_random_plants() -> None:
-    """mu = max h_i^2 mu*_i, and the axis that decides has the closed form's gain."""
+    """mu = max h_i^2 mu*_i, and the deciding axis has the closed form's gain."""
     rng = np.random.default_rng(11)
     decided = 0
     for _ in range(12):
@@ -154,7 +156,9 @@ def test_a_network_with_weighted_outputs_on_random_plants() -> None:
 
 @pytest.mark.parametrize(("l_gain", "mu"), [(0.39, 0.05), (0.60, 0.25), (0.76, 1.0)])
 def test_the_published_gains_are_feasible(l_gain: float, mu: float) -> None:
-    """delta = 0.5 s, dt = 0.15 s, alpha = 0.5; a P exists for each, and none for a worse mu."""
+    """delta = 0.5 s, dt = 0.15 s, alpha = 0.5; a P exists for each mu, and none for a
+    smaller one.
+    """
     plant = (ONE, 0.15 * ONE, ONE, 0.5 * ONE, ONE)
     margins = [
         lmi.lmi_margin(p * ONE, gain=l_gain * ONE, mu=mu, plant=plant, alpha=0.5)
@@ -184,7 +188,7 @@ def test_what_is_infeasible_under_a_limit() -> None:
 
 
 def test_an_infimum_that_is_not_attained_is_flagged() -> None:
-    """b < 2 d: mu can be made as small as one likes, by a P as large as it takes."""
+    """b < 2 d: mu can be made arbitrarily small by an arbitrarily large P."""
     for b, d, alpha in ((0.15, 0.5, 0.5), (0.4, 0.5, 0.5), (0.65, 0.5, 0.5)):
         assert closed_form.mu_star(b, d, alpha) == 0
         assert not lmi.solve(ONE, b=b * ONE, c=ONE, d=d * ONE, h=ONE, alpha=alpha).attained
@@ -195,7 +199,7 @@ def test_an_infimum_that_is_not_attained_is_flagged() -> None:
 
 
 def test_several_intervals_under_one_p_cost_no_more_than_the_worst() -> None:
-    """One axis: MATH's statement that p = 1 / max mu*(b) serves every b."""
+    """One axis: docs/math.md states that p = 1 / max mu*(b) serves every b."""
     intervals, d, alpha = [0.1, 0.4, 0.9, 1.2], -0.1, 0.6
     samplings = [lmi.Sampling(a=ONE, b=b * ONE, c=ONE, d=d * ONE) for b in intervals]
     solved = lmi.solve_common(samplings, ONE, [alpha] * 4)
@@ -215,7 +219,7 @@ POSITION = np.array([[1.0, 0.0]])
 
 
 def held(dt_s: float, velocity: bool) -> lmi.Sampling:
-    """Acceleration of 5 m/s^2, *constant within the interval*; 0.5 m and 0.2 m/s of noise."""
+    """Return a plant for 5 m/s^2, *constant within the interval*; noise of 0.5 m and 0.2 m/s."""
     r = 2 if velocity else 1
     b = np.hstack([[[5 * dt_s**2 / 2], [5 * dt_s]], np.zeros((2, r))])
     d = np.hstack([np.zeros((r, 1)), np.diag([0.5, 0.2])[:r, :r]])
@@ -261,7 +265,7 @@ def test_one_p_for_a_range_of_intervals() -> None:
 
 
 def test_multipliers_a_channel_are_no_worse_than_one() -> None:
-    """|w_i| <= 1 for each of three channels is |w| <= sqrt 3 for one: the bound must gain."""
+    """|w_i| <= 1 for each of three channels is |w| <= sqrt 3 for one: the bound must tighten."""
     sampling = held(0.25, velocity=True)
     plant = (sampling.a, sampling.b, sampling.c, sampling.d, POSITION)
     apart = solve(plant, 0.9, channels=[1, 1, 1])
@@ -278,7 +282,7 @@ def test_channels_share_out_the_inputs(channels: list[int]) -> None:
 
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
 def test_the_units_of_the_states_do_not_matter(size: float) -> None:
-    """Position in other units than velocity: scaled inside, certified outside."""
+    """Position in a different unit than velocity: scaled internally, certified externally."""
     s, change = held(0.25, velocity=True), np.diag([size, 1.0])
     back = np.diag([1 / size, 1.0])
     changed = (change @ s.a @ back, change @ s.b, s.c @ back, s.d, POSITION @ back)
@@ -292,7 +296,7 @@ def test_slack_is_left_in_the_decay_lmi() -> None:
     plant = (s.a, s.b, s.c, s.d, POSITION)
     for slack in (0.0, 1e-3):
         found = lmi.solve_common([s], POSITION, [0.9], channels=[1, 1, 1], slack=slack)
-        roomy = 2 * found.mu + 1  # so that the other LMI does not decide
+        roomy = 2 * found.mu + 1  # so that the other LMI is not active
         margin = lmi.lmi_margin(
             found.lyapunov,
             gain=found.gain,

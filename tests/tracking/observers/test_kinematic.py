@@ -1,4 +1,4 @@
-"""The kinematic observer against adversaries: flights that use all that the bounds allow."""
+"""The kinematic observer against adversaries: flights that use the full bounds."""
 
 import math
 from bisect import bisect_right
@@ -61,13 +61,13 @@ def unit(rng: np.random.Generator, size: int = 3) -> FloatArray:
 
 @dataclass
 class Flight:
-    """Accelerations that last a while each; slower than the greatest speed throughout."""
+    """Piecewise constant accelerations; always below the speed limit."""
 
     starts_ns: list[int]
     motions: list[tuple[FloatArray, FloatArray, FloatArray]]
 
     def at(self, t_ns: int) -> tuple[FloatArray, FloatArray]:
-        """Position and velocity."""
+        """Return position and velocity."""
         number = bisect_right(self.starts_ns, t_ns) - 1
         position, velocity, acceleration = self.motions[number]
         t_s = (t_ns - self.starts_ns[number]) * 1e-9
@@ -78,7 +78,8 @@ class Flight:
 
 
 def flown(rng: np.random.Generator, kind: str, start_ns: int, end_ns: int) -> Flight:
-    """``kind``: anywhere in the ball, on its surface, or to and fro along one direction."""
+    """Draw a flight; ``kind``: accelerations in the ball, on its surface, or alternating along one
+    direction."""
     along, flight = unit(rng), Flight([], [])
     position, velocity = rng.normal(0, 1000, 3), unit(rng) * SPEED_MPS * rng.uniform()
     while start_ns < end_ns:
@@ -87,7 +88,7 @@ def flown(rng: np.random.Generator, kind: str, start_ns: int, end_ns: int) -> Fl
         acceleration = along * rng.choice([-1, 1]) if kind == "bang" else unit(rng)
         acceleration = acceleration * size
         after = velocity + acceleration * (step_ns * 1e-9)
-        after *= min(1.0, SPEED_MPS / math.sqrt(after @ after))  # no more than was wanted
+        after *= min(1.0, SPEED_MPS / math.sqrt(after @ after))  # at most the wanted acceleration
         flight.starts_ns.append(start_ns)
         flight.motions.append((position, velocity, (after - velocity) / (step_ns * 1e-9)))
         start_ns += step_ns
@@ -96,7 +97,7 @@ def flown(rng: np.random.Generator, kind: str, start_ns: int, end_ns: int) -> Fl
 
 
 def noise(rng: np.random.Generator, kind: str) -> tuple[FloatArray, FloatArray]:
-    """Of position, within an upright cylinder, and of velocity, within a ball."""
+    """Draw noise of position within an upright cylinder and of velocity within a ball."""
     share = rng.uniform(size=3) if kind == "ball" else np.ones(3)
     plane = unit(rng, 2) * NOISE.horizontal_m * share[0]
     height = rng.choice([-1, 1]) * NOISE.vertical_m * share[1]
@@ -104,7 +105,7 @@ def noise(rng: np.random.Generator, kind: str) -> tuple[FloatArray, FloatArray]:
 
 
 def check(found: Prediction, truth: tuple[FloatArray, FloatArray]) -> float:
-    """Every bound holds; how much of the position's is used."""
+    """Check every bound and return the used share of the position bound."""
     off, off_mps = found.position_ned_m - truth[0], found.velocity_ned_mps - truth[1]
     assert math.hypot(off[0], off[1]) <= found.horizontal_m + ROUNDING
     assert abs(off[2]) <= found.vertical_m + ROUNDING
@@ -123,7 +124,7 @@ def sequences(count: int) -> Iterator[tuple[np.random.Generator, str]]:
 @pytest.mark.parametrize("told", [1.0, 0.8, 0.0], ids=["told", "sometimes", "never"])
 @pytest.mark.parametrize("name", GAINS)
 def test_no_adversary_leaves_the_bounds(fix: MakeFix, name: str, told: float) -> None:
-    """Irregular reports, some without a velocity; asked before, at and after each of them."""
+    """Irregular reports, some without a velocity; predicted before, at and after each of them."""
     observer = observing(name)
     for rng, kind in sequences(rounds(60, 240)):
         times = np.cumsum(10 ** rng.uniform(7.3, rng.uniform(8.5, 10.3), size=9)).astype(int)
@@ -147,7 +148,7 @@ def test_no_adversary_leaves_the_bounds(fix: MakeFix, name: str, told: float) ->
 def test_a_greedy_adversary_reaches_the_bounds(
     fix: MakeFix, name: str, interval_s: float, along: tuple[float, float, float]
 ) -> None:
-    """Noise that lags, as much as it may, of a UAV that gains speed for as long as it flies."""
+    """Noise lags as far as allowed behind a UAV that accelerates throughout."""
     observer, ahead = observing(name, speed_max_mps=1e6), np.array(along)
     acceleration, state, step_ns = ACCELERATION_MPS2 * ahead, None, round(interval_s * S)
     size = NOISE.vertical_m if along[2] else NOISE.horizontal_m
@@ -170,8 +171,8 @@ def test_a_greedy_adversary_reaches_the_bounds(
 def planned(
     rng: np.random.Generator, observer: KinematicObserver, steps: int, most_s: float
 ) -> tuple[list[float], list[FloatArray]]:
-    """Intervals, and for each the direction in (position, velocity) along which an error has to
-    grow there to be at its largest along the position in the end: planned back from it."""
+    """Return intervals and, for each, the direction in (position, velocity) along which the error
+    must grow to be largest along the position at the end; planned backwards."""
     intervals = np.exp(rng.uniform(np.log(0.05), np.log(most_s), steps)).round(9).tolist()
     goals = [np.array([1.0, 0.0])]
     for dt_s in reversed(intervals):
@@ -181,8 +182,8 @@ def planned(
 
 
 def bang_bang(goal: FloatArray, dt_s: float) -> FloatArray:
-    """What the acceleration adds to (position, velocity) where it does most along the goal: it
-    switches once, where the goal's position and velocity outweigh each other."""
+    """Return the largest effect of the acceleration on (position, velocity) along the goal: it
+    switches once, where the goal's position and velocity terms balance."""
     switch_s = -goal[1] / goal[0] if goal[0] else -1.0
     if 0 < switch_s < dt_s:
         way, gained = dt_s**2 / 2 - switch_s**2, dt_s - 2 * switch_s
@@ -200,8 +201,8 @@ def bang_bang(goal: FloatArray, dt_s: float) -> FloatArray:
 def test_no_plan_over_many_intervals_leaves_the_bounds(
     fix: MakeFix, name: str, axis: tuple[float, float, float], noise_m: float
 ) -> None:
-    """Noise and acceleration along one axis, each step as the plan wants it: never outside, and
-    in the best of the plans all but at the bound. The speed limit is out of reach."""
+    """Noise and acceleration along one axis, each step as planned: never outside, and nearly at the
+    bound in the best plan. The speed limit is not reached."""
     rng, along, closest = np.random.default_rng(7), np.array(axis), 0.0
     observer = observing(name, speed_max_mps=1e6)
     for number in range(60):
@@ -233,7 +234,7 @@ def test_no_plan_over_many_intervals_leaves_the_bounds(
 
 
 def test_the_gains_are_those_of_the_interval(fix: MakeFix) -> None:
-    """By the matrices written out: x + L (y - x), carried on by A."""
+    """By explicit matrices: x + L (y - x), propagated by A."""
     observer, t = observing("of both"), 0.7
     state = KinematicState(
         fix=fix(0, [3, 1, 0], [1, 0, 2], noise=NOISE),
@@ -268,7 +269,7 @@ def test_a_constant_velocity_is_followed_exactly(
     asked_ms: int,
     name: str,
 ) -> None:
-    """Whatever the gains: forwards and backwards."""
+    """With any gains, forwards and backwards."""
     observer, speeds, t_ns, state = observing(name), np.array(velocity), 17 * S, None
     for after_ms in intervals_ms:
         state = advance(state, fix(t_ns, speeds * (t_ns * 1e-9), speeds), observer)
@@ -294,7 +295,7 @@ def test_a_constant_acceleration_is_missed_by_just_its_own_way(fix: MakeFix, t_s
 
 
 def test_without_reported_velocity_it_is_learned_from_positions(fix: MakeFix) -> None:
-    """By half of what is missing a report, over equal intervals; at first it is at rest."""
+    """The error halves with each report at equal intervals; the initial velocity is zero."""
     observer, velocity, state = observing(), np.array([10.0, -5.0, 2.0]), None
     missing = []
     for number in range(8):
@@ -308,7 +309,7 @@ def test_without_reported_velocity_it_is_learned_from_positions(fix: MakeFix) ->
 
 
 def test_two_positions_at_nearly_the_same_time_show_no_great_velocity(fix: MakeFix) -> None:
-    """Two receivers that differ by 3 m, 1 ms apart: that is not 1500 m/s."""
+    """Two receivers that differ by 3 m, 1 ms apart, are not 1500 m/s."""
     observer, state = observing(), None
     for at_ns, north in ((0, 0.0), (S, 10.0), (S + S // 1000, 13.0)):
         state = advance(state, fix(at_ns, [north, 0.0, 0.0]), observer)
@@ -318,7 +319,8 @@ def test_two_positions_at_nearly_the_same_time_show_no_great_velocity(fix: MakeF
 
 @pytest.mark.parametrize("gap_s", [20.0, 60.0])
 def test_over_a_long_gap_the_greatest_speed_says_more(fix: MakeFix, gap_s: float) -> None:
-    """Its own way and that of the prediction, however much it might have gained speed."""
+    """The speed limit bounds the UAV's path and that of the prediction, whatever the acceleration
+    allows."""
     made = fix(0, [5, 5, 5], [20.0, 0, 0], noise=NOISE)
     observer, free = observing(), observing(speed_max_mps=1e6)
     limited = observer.predict(observer.begin(made), round(gap_s * S))
@@ -329,7 +331,7 @@ def test_over_a_long_gap_the_greatest_speed_says_more(fix: MakeFix, gap_s: float
     assert unlimited.horizontal_m == pytest.approx(1.5 + 0.4 * gap_s + 4.0 * gap_s**2)
     assert limited.horizontal_m < unlimited.horizontal_m
     assert limited.velocity_bound_mps == pytest.approx(50.0)
-    # What the speed says is what a UAV can do: back at once, at full speed.
+    # The speed bound assumes that the UAV turns back at once at full speed.
     check(limited, (np.array([5 - 30 * gap_s, 5, 5]), np.array([-30.0, 0, 0])))
 
 

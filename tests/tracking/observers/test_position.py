@@ -1,4 +1,4 @@
-"""The observer against adversaries: simulated UAVs that use all that the bounds allow."""
+"""The position observer against adversaries: simulated UAVs that use the full bounds."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -20,14 +20,14 @@ NOISE = ReportNoise(
     horizontal_m=1.2, vertical_m=0.9, position_m=math.hypot(1.2, 0.9), velocity_mps=0.4
 )  # 1.5 m in space
 NOISE_M = 1.5
-# For adversaries of the stacked model, in which one velocity holds from report to report.
+# For adversaries of the stacked model, whose velocity is constant between reports.
 STILL_MPS2 = 1e-9
 S = 1_000_000_000
 ROUNDING_M = 1e-6
 
 
 def inside(vector: FloatArray, norm: float) -> FloatArray:
-    """The nearest vector that is no longer than ``norm``."""
+    """Return the nearest vector that is no longer than ``norm``."""
     length = float(np.sqrt(vector @ vector))
     return vector if length <= norm else vector * (norm / length)
 
@@ -51,7 +51,7 @@ class Adversary:
 
 
 def adversaries(count: int) -> Iterator[Adversary]:
-    """Seeded, of each kind in turn."""
+    """Yield seeded adversaries of each kind in turn."""
     for seed in range(count):
         rng = np.random.default_rng(seed)
         along = rng.standard_normal(3)
@@ -60,7 +60,7 @@ def adversaries(count: int) -> Iterator[Adversary]:
 
 
 def interval_ns(rng: np.random.Generator) -> int:
-    """From 20 ms to 3 s, short ones more often."""
+    """Draw an interval from 20 ms to 3 s, short ones more often."""
     return int(10 ** rng.uniform(7.3, 9.5))
 
 
@@ -96,7 +96,7 @@ def norm_m(vector: FloatArray) -> float:
 def test_positions_alone_never_leave_the_bound(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
-    """Speed and noise bounded, nothing else; the sender's lead is by the same mean velocity."""
+    """Only speed and noise are bounded; the sender's lead uses the same mean velocity."""
     observer = observing(alpha, feedthrough_s, acceleration_max_mps2=STILL_MPS2)
     worst = 0.0
     for adversary in adversaries(400):
@@ -144,7 +144,7 @@ def test_positions_and_velocities_never_leave_the_bound(
             step_ns = min(due_ns, int(rng.uniform(0.01, 1.0) * S))
             step_s = step_ns * 1e-9
             wanted = velocity + adversary(ACCELERATION_MPS2) * step_s
-            after = inside(wanted, SPEED_MPS)  # no more acceleration than was wanted
+            after = inside(wanted, SPEED_MPS)  # at most the wanted acceleration
             position = position + (velocity + after) / 2 * step_s
             velocity, t_ns, due_ns = after, t_ns + step_ns, due_ns - step_ns
     assert worst > 0.5
@@ -154,7 +154,8 @@ def test_positions_and_velocities_never_leave_the_bound(
 def test_a_lead_of_the_sender_and_velocities_keep_the_bound(
     fix: MakeFix, alpha: float | None
 ) -> None:
-    """At the next report's time, up to which the lead's mean velocity is that of the interval."""
+    """Checked at the next report's time, up to which the lead's mean velocity is that of the
+    interval."""
     observer = observing(alpha, 0.4)
     for adversary in adversaries(400):
         position, velocity = np.zeros(3), adversary(SPEED_MPS)
@@ -177,7 +178,8 @@ def test_a_lead_of_the_sender_and_velocities_keep_the_bound(
 @pytest.mark.parametrize("told", [True, False])
 @pytest.mark.parametrize("feedthrough_s", [0.5, -0.3])
 def test_a_lead_in_time_keeps_the_bound(fix: MakeFix, feedthrough_s: float, told: bool) -> None:
-    """The sender tells where it will be, or was: its mean velocity there is another than here."""
+    """The sender reports a future or past position, where its mean velocity differs from the
+    present one."""
     observer = observing(None, feedthrough_s)
     for start_mps, acceleration in ((0.0, 8.0), (-10.0, 8.0), (10.0, -8.0)):
 
@@ -190,7 +192,7 @@ def test_a_lead_in_time_keeps_the_bound(fix: MakeFix, feedthrough_s: float, told
             known = PositionState(fix(0, report, velocity), place(0.0), 0.0)
             found = observer.predict(known, b_ns)
             error_m = norm_m(found.position_ned_m - place(b_ns * 1e-9))
-            # The report may have its noise besides.
+            # The report may also have noise.
             gain = abs(_gain(fix, observer, b_ns)) if not told else 0.0
             assert error_m + gain * NOISE_M <= found.bound_m + ROUNDING_M
 
@@ -200,7 +202,8 @@ def test_a_lead_in_time_keeps_the_bound(fix: MakeFix, feedthrough_s: float, told
 def test_a_greedy_adversary_reaches_the_bound(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
-    """Knowing the gains to come, it takes noise and velocity as they hurt most: all of it."""
+    """It anticipates the gains and chooses noise and velocity in the worst sense: all of the bound
+    is used."""
     observer = observing(alpha, feedthrough_s, acceleration_max_mps2=STILL_MPS2)
     along = np.array([0.6, 0.0, -0.8])
     reached = []
@@ -210,7 +213,7 @@ def test_a_greedy_adversary_reaches_the_bound(
         for _ in range(60):
             b_ns = int(rng.uniform(0.05, 1.2) * S)
             b_s = b_ns * 1e-9
-            # How the error depends on the noise and the velocity of this interval, by experiment.
+            # Sensitivity of the error to this interval's noise and velocity, measured numerically.
             gain = _gain(fix, observer, b_ns)
             push = math.copysign(1.0, (1 - gain) * error)
             noise = push * math.copysign(NOISE_M, gain)
@@ -227,7 +230,7 @@ def test_a_greedy_adversary_reaches_the_bound(
 
 
 def _gain(fix: MakeFix, observer: PositionObserver, b_ns: int) -> float:
-    """What share of a report goes into the estimate: at 0 m, with a report of 1 m."""
+    """Return the weight of a report in the estimate: estimate at 0 m, report at 1 m."""
     estimate = PositionState(fix(0, [1.0, 0.0, 0.0]), np.zeros(3), 0.0)
     return float(observer.predict(estimate, b_ns).position_ned_m[0])
 
@@ -258,7 +261,7 @@ def test_a_constant_velocity_is_followed_exactly(
         report = position + feedthrough_s * speeds
         made = fix(t_ns, report, speeds if told else None)
         if state is None and not told:
-            # Its first estimate is right, so that only what follows is judged.
+            # The first estimate is exact, so that only the following ones are tested.
             state = PositionState(made, position, 0.0)
         else:
             state = advance(state, made, observer)
@@ -284,7 +287,7 @@ def test_the_velocity_is_the_reported_one_and_may_have_changed_since(fix: MakeFi
 
 
 def test_before_the_report_nothing_is_extrapolated(fix: MakeFix) -> None:
-    """The estimate stands, and its bound grows by what can have been flown."""
+    """The estimate stays, and its bound grows by the possible path."""
     observer = observing()
     state = observer.begin(fix(10 * S, [1, 2, 3], [20.0, 0, 0]))
     state = advance(state, fix(11 * S, [21, 2, 3], [20.0, 0, 0]), observer)

@@ -1,8 +1,8 @@
-"""Flights made to break the bounds, within everything that the bounds assume.
+"""Flights built to break the bounds within all of their assumptions.
 
-A search turns the latencies, accelerations, errors, lags, drifts and gaps of a flight towards what
-does most harm. ``python tests/adversary_search.py`` is the large one (docs/math.md 5.6); these are
-some hundred thousand answers, or with the quick tests some thousands.
+A search steers the latencies, accelerations, errors, lags, drifts and gaps of a flight towards
+the largest violation. ``python tests/adversary_search.py`` is the long run (docs/math.md 5.6);
+these tests evaluate some hundred thousand predictions, or some thousands in quick mode.
 """
 
 from itertools import islice
@@ -39,7 +39,7 @@ def test_a_search_finds_no_flight_that_breaks_a_bound(family: str) -> None:
 
 
 def test_the_search_goes_where_more_harm_is() -> None:
-    """On a bowl: what it tries gets better and better, and the edges are within reach."""
+    """On a bowl-shaped function the samples improve steadily and the edges are reachable."""
 
     def harm(genes: np.ndarray, _number: int) -> Tried:
         return Tried(1.0 - float(np.sum((genes - best) ** 2)), "", 1)
@@ -52,7 +52,7 @@ def test_the_search_goes_where_more_harm_is() -> None:
 
 
 def test_the_adversary_reaches_what_it_may() -> None:
-    """A flight that came nowhere near the bound would prove nothing."""
+    """A flight far inside the bound would prove nothing."""
     flight = adversary.Flight(default_rng(3).random(adversary.GENES))
     accelerations = np.diff(flight.velocities, axis=0) / adversary.STEP_S
     sizes = np.linalg.norm(accelerations, axis=1)

@@ -1,4 +1,4 @@
-"""What is assumed of aircraft, and what is told when their reports refute it, through the fold."""
+"""Assumptions about aircraft, and the notices when reports refute them, in the whole pipeline."""
 
 import math
 from collections.abc import Iterable
@@ -35,7 +35,7 @@ def position(
     velocity: Iterable[float] = (0, 0, 0),
     late_s: float = 0.0,
 ) -> Frame:
-    """A report made at a time, by a boot clock that began 100 s before, and late."""
+    """Return a report made at a time, by a boot clock that started 100 s before, with a latency."""
     north, east, down = ned_m
     message = dialect.MAVLink_global_position_int_message(
         round((100 + t_s) * 1000),
@@ -69,7 +69,7 @@ def run(into: Pipeline, events: Iterable[Frame | Tick]) -> list[Output]:
 def turning(
     uav: str, seconds: float, speed: float = 22.0, radius: float = 60.0, rate_hz: int = 10
 ) -> list[Frame]:
-    """Circles of 8 m/s²."""
+    """Return circles of 8 m/s²."""
     frames = []
     for n in range(int(seconds * rate_hz)):
         t_s, a = n / rate_hz, speed / radius * n / rate_hz
@@ -107,7 +107,7 @@ def test_what_an_aeroplane_can_do_is_no_news() -> None:
 
 @pytest.mark.parametrize(("mav_type", "lag_s"), [(2, 0.0295), (1, -0.026)])
 def test_a_lag_is_taken_off(mav_type: int, lag_s: float) -> None:
-    """ArduPilot's copters' positions are old, its aeroplanes' ahead of their stamps."""
+    """Positions of ArduPilot copters lag their stamps, those of aeroplanes lead them."""
     into = pipeline()
     out = run(into, [heartbeat(0, "1:1", mav_type), position(1, "1:1", (100, 0, 0), (10, 0, 0))])
     (estimate,) = (one for one in out if isinstance(one, Estimate))
@@ -116,7 +116,7 @@ def test_a_lag_is_taken_off(mav_type: int, lag_s: float) -> None:
 
 
 def test_a_step_of_some_seconds_is_no_second_vehicle() -> None:
-    """Six metres aside for four seconds: followed after one, and so is the way back."""
+    """Six metres aside for four seconds: reacquired after one second, and again on return."""
     into, rejected = pipeline(), []
     for n in range(200):
         t_s = n / 10
@@ -129,7 +129,7 @@ def test_a_step_of_some_seconds_is_no_second_vehicle() -> None:
 
 
 def test_reports_of_a_fast_aircraft_with_a_good_receiver_are_all_used() -> None:
-    """150 m/s at 20 Hz and a centimetre of accuracy: a millisecond is worth more than that."""
+    """150 m/s at 20 Hz with 1 cm accuracy: one millisecond is more than that."""
     into = pipeline(observer={"speed_max_mps": 160.0})
     good = dialect.MAVLink_gps_raw_int_message(
         0, 6, 0, 0, round((ALT_M + 100) * 1e3), 100, 100, 0, 0, 12, 0, 10, 10, 10
@@ -179,10 +179,10 @@ def test_a_round_trip_that_contradicts_is_told_as_proven() -> None:
 
 
 def test_other_messages_keep_the_clock() -> None:
-    """Stamps of messages that nobody decodes: between two reports of a slow link they count."""
+    """Stamps of messages that are not decoded count between two reports of a slow link."""
     alone, helped = pipeline(), pipeline()
     for n in range(40):
-        late_s = 0.8 if n % 4 else 0.05  # reports are the slow ones
+        late_s = 0.8 if n % 4 else 0.05  # the reports are the slow messages
         frame = position(float(n), "1:1", (100, 0, 0), late_s=0.8)
         alone.step(frame)
         helped.step(frame)
@@ -197,7 +197,7 @@ def test_other_messages_keep_the_clock() -> None:
 
 
 def test_home_waits_for_a_receiver_that_vouches() -> None:
-    """No fix, then a height that is hundreds of metres off, then both right."""
+    """No fix, then a height that is hundreds of metres off, then both valid."""
     into = pipeline("home")
     out = run(into, [receiver(0.5, "1:1", 1, ALT_M), position(1, "1:1", (0, 0, 0))])
     assert [one.reason for one in out if isinstance(one, Rejection)] == [Reason.NO_FIX]
@@ -211,7 +211,7 @@ def test_home_waits_for_a_receiver_that_vouches() -> None:
 
 
 def test_a_track_waits_for_a_receiver_that_vouches_but_not_for_ever() -> None:
-    """Its height is 500 m off for three seconds; another's is so for good."""
+    """One height is 500 m off for three seconds; another permanently."""
     into = pipeline("9:1")
     for uav, wrong_s in (("1:1", 3.0), ("2:1", 99.0)):
         out: list[Output] = []
@@ -228,7 +228,7 @@ def test_a_track_waits_for_a_receiver_that_vouches_but_not_for_ever() -> None:
 
 
 def test_home_moves_where_its_first_height_was_wrong() -> None:
-    """Nothing was heard of a receiver: the first height counts, until the track leaps from it."""
+    """No receiver status arrived: the first height is used until the track jumps away from it."""
     into = pipeline("home")
     out = run(into, [position(n / 5, "1:1", (0, 0, 500.2 if n < 20 else 0)) for n in range(60)])
     moved = [one for one in out if isinstance(one, Notice) and one.subject == "home"]
@@ -240,7 +240,7 @@ def test_home_moves_where_its_first_height_was_wrong() -> None:
 
 
 def test_a_line_that_leaps_beyond_what_frames_are_late_is_told() -> None:
-    """A link that held all frames back for a quarter of a minute looks like that: both are said."""
+    """A link that delayed all frames by 15 s looks the same: the notice names both causes."""
     there = pipeline()
     said = run(there, (position(0.1 * n, "7:1", (n, 0, 0), (10, 0, 0)) for n in range(300)))
     said += run(

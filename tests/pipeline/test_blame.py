@@ -1,4 +1,4 @@
-"""What is blamed for a link that is not good: the part of the bound that is the largest."""
+"""Cause of a weak link: the largest part of its bound."""
 
 from dataclasses import replace
 
@@ -76,7 +76,7 @@ def test_the_largest_part_of_a_track_s_bound_is_to_blame(
 
 
 def test_a_clock_in_doubt_is_to_blame_for_the_turns_that_are_possible_meanwhile() -> None:
-    """4.8 s at 4 m/s^2 make 46 m by themselves, and more with the report's own age."""
+    """4.8 s at 4 m/s^2 alone are 46 m, and more with the report's age."""
     doubted = replace(
         TRACK, velocity_ned_mps=np.array([11.5, 0.0, 0.0]), limits=Limits(60.0, 4.0), age_s=2.8,
         dt_s=3.5, clock_bound_s=4.8, bound_m=173.0,
@@ -91,7 +91,7 @@ def test_without_a_velocity_an_old_report_says_little() -> None:
 
 
 def test_slow_reports_are_not_silence() -> None:
-    """At 2 s between reports, one that is 4 s old is one that is missing, not a lost link."""
+    """With 2 s between reports, an age of 4 s is one missing report, not a lost link."""
     assert blamed(replace(TRACK, age_s=4.0, dt_s=2.0, bound_m=60.0))[0] is Cause.RATE
 
 

@@ -1,4 +1,4 @@
-"""A day of a changing sky in virtual time: what was known of who is gone takes no memory."""
+"""One day of changing traffic in virtual time: departed aircraft use no memory."""
 
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
@@ -8,15 +8,15 @@ import pytest
 from changing_sky import flown
 
 GROWS_MB = 4.0
-"""Most that the second half of a day, or of a shorter time, may add: 500 aircraft were there."""
+"""Largest growth in the second half of a day, or of a shorter time, with 500 aircraft seen."""
 CLOCKS_MAX = 100
-"""Most clocks that are kept of them."""
+"""Largest number of clocks kept for them."""
 
 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
 def test_a_day_takes_no_more_memory_than_its_morning(table: Any) -> None:
-    """In a process of its own: in this one the room that other tests left would be filled first."""
+    """Runs in its own process; here, memory freed by other tests would be filled first."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
         found, clocks = alone.submit(flown, 24).result()
     print("MB by the hour:", *(f"{mb:.1f}" for mb in found))

@@ -1,4 +1,4 @@
-"""The whole program as a fold: real MAVLink frames in, beams out."""
+"""The whole pipeline as a fold: real MAVLink frames in, beams out."""
 
 import math
 from collections.abc import Iterable
@@ -64,7 +64,7 @@ def position(
     seq: int = 0,
     link: str = "udp",
 ) -> Frame:
-    """GLOBAL_POSITION_INT of a place told from PLACE, without latency."""
+    """Return a GLOBAL_POSITION_INT at an offset from PLACE, without latency."""
     lat, lon, alt = pymap3d.ned2geodetic(*ned_m, *PLACE)
     message = dialect.MAVLink_global_position_int_message(
         round(1000 * (100 + t_s if boot_s is None else boot_s)),
@@ -97,7 +97,7 @@ EXACT: dict[str, Any] = {"lag_s": (0.0, 0.0), "acceleration_max_mps2": 5.0, "spe
 
 
 def settings(center: str | None = "5:1", **sections: dict[str, Any]) -> Settings:
-    """Made-up senders' stamps are exact, and arrive at once."""
+    """Return settings for simulated senders, whose stamps are exact and arrive at once."""
     sections["observer"] = EXACT | sections.get("observer", {})
     return Settings().override(center={"source": center}, **sections)
 
@@ -113,7 +113,7 @@ def updated(pipeline: Pipeline, t_s: float) -> Update:
 
 
 def flown(flight: Scenario, seconds: float, seed: int = 1) -> list[Event]:
-    """A scenario's traffic with ticks among it."""
+    """Return a scenario's traffic, interleaved with ticks."""
     frames = (
         frame(START_NS + round(t_s * 1e9), raw)
         for t_s, _, raw in schedule(flight, seed, START_NS, seconds)
@@ -128,7 +128,7 @@ def paper() -> list[Event]:
 
 @pytest.fixture(scope="module")
 def begun(paper: list[Event]) -> list[Event]:
-    """Its first three seconds."""
+    """Return its first three seconds."""
     return [event for event in paper if event.t_ns < paper[0].t_ns + 3 * S]
 
 
@@ -151,7 +151,7 @@ def test_two_uavs_and_a_carrier_that_is_turned() -> None:
     assert update.unfit is None
     assert update.beams.uavs == ("1:1", "2:1")
     ahead, left = update.beams.beams
-    # East is ahead and, seen from a nose that points up, below; north is to the left.
+    # East is ahead and, with the nose up, below; north is to the left.
     assert math.degrees(ahead.azimuth_rad) == pytest.approx(0, abs=0.02)
     assert math.degrees(ahead.elevation_rad) == pytest.approx(-10, abs=0.02)
     assert ahead.range_m == pytest.approx(200, abs=0.05)
@@ -166,7 +166,7 @@ def test_two_uavs_and_a_carrier_that_is_turned() -> None:
 def test_beams_on_hovering_uavs_are_where_the_scenario_has_them(
     mount_deg: tuple[float, float, float],
 ) -> None:
-    """The carrier sways; scipy turns the directions, at the time at which the beams apply."""
+    """The carrier sways; scipy rotates the directions at the time at which the beams apply."""
     flight = scenario.hover(4)
     keys = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
     mount = dict(zip(keys, mount_deg, strict=True))
@@ -192,7 +192,7 @@ def test_beams_on_hovering_uavs_are_where_the_scenario_has_them(
 
 
 def test_the_truth_is_within_the_bounds_of_the_paper_s_flight(paper: list[Event]) -> None:
-    """Up to 125 m/s with gusts: positions and directions within what the update vouches for."""
+    """Up to 125 m/s with gusts: positions and directions within the bounds of the update."""
     flight = scenario.paper(4)
     bounds = {
         "speed_max_mps": 151.0, "acceleration_max_mps2": 190.0, "position_noise_m": 1.0,
@@ -201,7 +201,7 @@ def test_the_truth_is_within_the_bounds_of_the_paper_s_flight(paper: list[Event]
     pipeline = Pipeline(settings(observer=bounds))
     updates = [o for o in run(pipeline, paper) if isinstance(o, Update)]
     checked = 0
-    for update in updates[60:]:  # the first frames may all have been slow
+    for update in updates[60:]:  # the first frames may all have been late
         assert update.carrier is not None
         t_s = (update.beams.valid_at_ns - START_NS) * 1e-9
         pose = flight.carrier.attitude(t_s)
@@ -210,7 +210,7 @@ def test_the_truth_is_within_the_bounds_of_the_paper_s_flight(paper: list[Event]
         for track, beam in zip(update.tracks, update.beams.beams, strict=True):
             (vehicle,) = (v for v in flight.uavs if str(v.source) == beam.uav)
             ned = np.array(vehicle.trajectory(t_s).position_ned_m)
-            # The local frame begins elsewhere, and the carrier has noise of its own.
+            # The local frame has another origin, and the carrier has noise.
             slack_m = update.carrier.bound_m
             away = np.linalg.norm(track.position_ned_m - here - ned)
             assert away <= track.bound_m + slack_m
@@ -247,7 +247,7 @@ def test_a_lead_asks_for_a_later_time() -> None:
     assert led.tracks[0].bound_m > plain.tracks[0].bound_m
 
 
-# --- what carries the array ---------------------------------------------------------------------
+# --- carrier ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("center", ["home", None])
@@ -255,7 +255,7 @@ def test_home_is_where_the_first_report_was_made(center: str | None) -> None:
     pipeline = Pipeline(settings(center))
     assert pipeline.step(tick(0))[0].unfit == "no report yet"  # type: ignore[union-attr]
     zero = dialect.MAVLink_global_position_int_message(1, 0, 0, 0, 0, 0, 0, 0, 0)
-    pipeline.step(sent(0.1, "9:1", zero))  # not accepted
+    pipeline.step(sent(0.1, "9:1", zero))  # rejected
     home, first = pipeline.step(position(0.2, "1:1", (10, 20, -30)))
     assert isinstance(home, Notice)
     assert (home.subject, home.severity) == ("home", Severity.INFO)
@@ -297,7 +297,7 @@ def test_without_a_carrier_there_are_no_beams_and_it_says_why() -> None:
     assert [track.uav for track in update.tracks] == ["1:1"]
     pipeline.step(position(0.3, "5:1"))
     assert updated(pipeline, 0.4).unfit == "no attitude from the carrier 5:1"
-    pipeline.step(attitude(0.5, "1:1"))  # another's does not do
+    pipeline.step(attitude(0.5, "1:1"))  # another vehicle's attitude does not count
     assert updated(pipeline, 0.5).unfit == "no attitude from the carrier 5:1"
     pipeline.step(attitude(0.5, "5:1"))
     assert updated(pipeline, 0.6).unfit is None
@@ -308,14 +308,14 @@ def test_without_a_carrier_there_are_no_beams_and_it_says_why() -> None:
 
 
 def bearing_deg(update: Update) -> float:
-    """Of the one beam, from the carrier's nose."""
+    """Return the bearing of the single beam from the carrier's nose."""
     assert update.unfit is None
     (beam,) = update.beams.beams
     return math.degrees(beam.azimuth_rad)
 
 
 def test_an_attitude_that_was_overtaken_changes_nothing() -> None:
-    """It heads north, and then east; what tells of north comes once more, half a second late."""
+    """The carrier heads north, then east; the first attitude arrives again half a second late."""
     pipeline = Pipeline(settings())
     run(pipeline, [position(1.0, "5:1"), position(1.0, "1:1", (200, 0, 0))])
     pipeline.step(attitude(0.6, "5:1", 0.0, 0.0, 0.0))
@@ -327,7 +327,7 @@ def test_an_attitude_that_was_overtaken_changes_nothing() -> None:
 
 
 def test_a_carrier_that_restarts_has_no_attitude_until_it_sends_one() -> None:
-    """The old one was made at a time that its new clock has not reached."""
+    """The old attitude has a stamp that the new clock has not reached."""
     pipeline = Pipeline(settings())
     for t_s in np.arange(0, 5, 0.5):
         run(pipeline, [position(t_s, "5:1"), attitude(t_s, "5:1", 0.0, 0.0, 0.0)])
@@ -346,7 +346,7 @@ def estimator(t_s: float, ratio: float, flags: int = 831, source: str = "5:1") -
 
 
 def test_the_attitude_is_as_sure_as_its_estimator_is() -> None:
-    """A ratio makes the bound wider, never narrower; without an attitude every one is possible."""
+    """A ratio can only widen the bound; without an attitude estimate any attitude is possible."""
     held = {"source": "5:1", "turn_acceleration_max_degps2": 0.0}
     pipeline, at_s = Pipeline(settings().override(center=held)), 0.1
 
@@ -386,7 +386,7 @@ def test_the_carrier_is_never_its_own_target() -> None:
     assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["1:1"]
 
 
-# --- what is a target, and what is not accepted -------------------------------------------------
+# --- targets and rejections ---------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(("targets", "aimed"), [("telemetry", ()), ("all", ("icao:4CA7B3",))])
@@ -414,7 +414,9 @@ def test_adsb_without_what_it_takes_is_counted(flags: int, reason: Reason, who: 
 
 
 def relayed(t_s: float, north_m: float, alt_m: float, datum: int, relay: str = "5:1") -> Frame:
-    """ADSB_VEHICLE of what flies north at 50 m/s, level; ``datum`` is ADSB_ALTITUDE_TYPE."""
+    """Return an ADSB_VEHICLE flying level to the north at 50 m/s; ``datum`` is
+    ADSB_ALTITUDE_TYPE.
+    """
     lat, lon, _ = pymap3d.ned2geodetic(north_m, 500, 0, *PLACE)
     message = dialect.MAVLink_adsb_vehicle_message(
         0x4CA7B3, round(float(lat) * 1e7), round(float(lon) * 1e7), datum, round(alt_m * 1e3),
@@ -424,14 +426,16 @@ def relayed(t_s: float, north_m: float, alt_m: float, datum: int, relay: str = "
 
 
 def test_an_aircraft_of_two_relays_is_one_track_at_one_datum() -> None:
-    """One relay has its altitude by pressure, 300 m off; when the other falls silent, so be it."""
+    """One relay reports pressure altitude, 300 m off; it is used only when the other falls
+    silent.
+    """
     pipeline = Pipeline(settings("47.4,8.55,500"))
     heard = [relayed(t_s, 50 * t_s, 1300, 1) for t_s in range(10)]
     heard += [relayed(t_s + 0.5, 50 * t_s + 25, 1000, 0, "6:1") for t_s in range(30)]
     heard += [relayed(t_s + 0.6, 50 * t_s, 1300, 1, "7:1") for t_s in range(10)]
     outputs = run(pipeline, sorted(heard, key=lambda each: each.t_ns))
     heights = [o.fix.report.alt_m for o in outputs if isinstance(o, Estimate)]
-    assert heights == [1300] * 29 + [1000] * 11  # 1300 was said at 9 s for the last time
+    assert heights == [1300] * 29 + [1000] * 11  # 1300 m was last reported at 9 s
     assert pipeline.refusals.total == {Reason.DUPLICATE: 10}
     (notice,) = (output for output in outputs if isinstance(output, Notice))
     assert (notice.subject, notice.severity) == ("icao:4CA7B3", Severity.INFO)
@@ -439,7 +443,7 @@ def test_an_aircraft_of_two_relays_is_one_track_at_one_datum() -> None:
     now_ns = tick(30).t_ns
     (track,) = pipeline.tracks(now_ns, now_ns)
     assert track.position_ned_m[2] == pytest.approx(-500, abs=1)
-    assert track.reports == 11  # of the new datum alone
+    assert track.reports == 11  # the new datum only
 
 
 def test_the_same_report_over_two_links_counts_once() -> None:
@@ -456,7 +460,7 @@ def test_the_same_report_over_two_links_counts_once() -> None:
 
 
 def test_a_late_report_is_put_in_its_place() -> None:
-    """Half a second late: the track is what it would be had it come in time."""
+    """Half a second late: the track equals that of a timely report."""
     made = [position(t_s, "1:1", (t_s, t_s**2, 0), (1, 2 * t_s, 0)) for t_s in (0.0, 0.5, 1.0)]
     in_order, late = Pipeline(settings("home")), Pipeline(settings("home"))
     run(in_order, made)
@@ -480,7 +484,7 @@ def test_a_report_later_than_the_window_is_out_of_order() -> None:
 
 
 def test_reports_that_waited_together_are_not_out_of_order() -> None:
-    """Read at once, made one after the other: the newest is what the track goes on from."""
+    """Read together but made one after the other: the track continues from the newest."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
     for number in range(5):
         made = position(2.0, "1:1", (100, number, 0), boot_s=100 + 0.1 * number)
@@ -492,7 +496,7 @@ def test_reports_that_waited_together_are_not_out_of_order() -> None:
 
 
 def accuracy(t_s: float, source: str, h_acc_m: float, v_acc_m: float, vel_mps: float) -> Frame:
-    """GPS_RAW_INT; an accuracy of 0 is one that is not sent."""
+    """Return a GPS_RAW_INT; an accuracy of 0 means that it is not sent."""
     message = dialect.MAVLink_gps_raw_int_message(
         round(1e6 * t_s), 3, 0, 0, 0, 100, 100, 0, 0, 12, 0,
         *(round(1000 * value) for value in (h_acc_m, v_acc_m, vel_mps)), 0, 0,
@@ -518,7 +522,7 @@ def noise_of(pipeline: Pipeline, uav: str) -> tuple[float, float, float]:
 def test_the_autopilot_s_own_accuracy_is_followed_if_asked(
     follow: bool, accuracies: tuple[float, float, float], expected: tuple[float, float, float]
 ) -> None:
-    """From the next report of that sender on, times the factor; what is not sent is the default."""
+    """From the next report of that sender on, times the factor; missing values use the default."""
     given = {
         "position_noise_m": 6.0, "velocity_noise_mps": 0.7,
         "accuracy_factor": 2.5, "follow_accuracy": follow,
@@ -530,13 +534,13 @@ def test_the_autopilot_s_own_accuracy_is_followed_if_asked(
     run(pipeline, [position(0.2, "1:1"), position(0.2, "2:1", (50, 0, 0))])
     assert noise_of(pipeline, "1:1") == pytest.approx(expected)
     assert noise_of(pipeline, "2:1") == (6.0, 6.0, 0.7)
-    pipeline.step(accuracy(0.3, "1:1", 0, 0, 0))  # it is sent no longer
+    pipeline.step(accuracy(0.3, "1:1", 0, 0, 0))  # no longer sent
     pipeline.step(position(0.4, "1:1"))
     assert noise_of(pipeline, "1:1") == (6.0, 6.0, 0.7)
 
 
 def test_what_a_receiver_said_before_does_not_take_the_place_of_what_it_says_now() -> None:
-    """A second link that lags brings it again; a time long before is another boot's."""
+    """A slower second link repeats it; a much earlier time belongs to another boot."""
     pipeline = Pipeline(settings("home"))
     run(pipeline, [position(49.9, "1:1"), accuracy(50.0, "1:1", 0.5, 0.5, 0.1)])
     run(pipeline, [accuracy(51.0, "1:1", 5.0, 5.0, 0.2), position(51.1, "1:1")])
@@ -550,7 +554,9 @@ def test_what_a_receiver_said_before_does_not_take_the_place_of_what_it_says_now
 
 
 def test_after_a_reboot_a_receiver_is_believed_whose_time_is_a_little_before() -> None:
-    """Less than a second link may lag, so that only the reboot tells it from an old status."""
+    """Within the lag of a second link, so that only the reboot distinguishes it from an old
+    status.
+    """
     pipeline = Pipeline(settings("home"))
     run(pipeline, [position(n / 5, "1:1") for n in range(100)])
     run(pipeline, [accuracy(15.0, "1:1", 5.0, 5.0, 0.2)])
@@ -563,7 +569,7 @@ def test_after_a_reboot_a_receiver_is_believed_whose_time_is_a_little_before() -
 
 
 def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
-    """100 m, and the way flown in the second to which its time is known."""
+    """100 m plus the distance flown in the second to which its time is known."""
     pipeline = Pipeline(settings("home", observer={"speed_max_mps": 90.0}))
     run(pipeline, [accuracy(0.0, "5:1", 0.5, 0.5, 0.1), adsb(0.1, (3000, 500, -800))])
     assert noise_of(pipeline, "icao:4CA7B3") == pytest.approx((190.0, 190.0 + GEOID_M, 10.0))
@@ -582,7 +588,7 @@ def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
 
 
 def test_a_relayed_report_was_true_when_its_aircraft_was_heard() -> None:
-    """A second before, by ``tslc``; it came when it came."""
+    """One second earlier by ``tslc``; the arrival time is unchanged."""
     (seen,) = Pipeline(settings("47.4,8.55,500")).step(adsb(5.0, (3000, 500, -800)))
     assert isinstance(seen, Estimate)
     assert (seen.fix.t_ns, seen.fix.sender_ns) == (START_NS + 4 * S, START_NS + 4 * S)
@@ -590,7 +596,7 @@ def test_a_relayed_report_was_true_when_its_aircraft_was_heard() -> None:
 
 
 def test_a_track_that_is_begun_again_is_said_once() -> None:
-    """A jump of 200 m that lasts."""
+    """A lasting jump of 200 m."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
     outputs: list[Output] = []
     for number in range(100):
@@ -640,7 +646,7 @@ def test_frames_that_nobody_reads_are_counted_and_no_more() -> None:
 
 
 def test_after_a_reboot_a_track_waits_for_its_receiver_anew() -> None:
-    """The receiver's height is always another, so that the first track began after ten seconds."""
+    """The receiver's height always differs, so the first track started after ten seconds."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
 
     def reasons(from_s: float, to_s: float, boot_s: float) -> list[Reason]:
@@ -661,7 +667,7 @@ def test_a_reboot_is_said_and_begins_a_fresh_track() -> None:
     for t_s in range(5):
         pipeline.step(position(t_s, "1:1", (100 + t_s, 0, 0)))
     pipeline.step(position(4, "2:1", (0, 90, 0)))
-    for t_s in (5.0, 5.5):  # a stamp far back is not believed before others agree
+    for t_s in (5.0, 5.5):  # a stamp far in the past needs confirmation by others
         (refused,) = pipeline.step(position(t_s, "1:1", (200, 0, 0), boot_s=t_s - 3))
         assert isinstance(refused, Rejection)
         assert refused.reason is Reason.UNPLACED_STAMP
@@ -691,7 +697,7 @@ def test_states_are_said_when_they_change() -> None:
         assert isinstance(update, Update)
         said[t_s] = [(n.severity, n.text) for n in notices if isinstance(n, Notice)]
         assert len(update.beams.beams) == (t_s < 15)
-        assert len(update.tracks) == 1  # lost is something to show, too
+        assert len(update.tracks) == 1  # the lost state is shown, too
     assert {t_s: notices for t_s, notices in said.items() if notices} == {
         0.1: [(Severity.INFO, "1:1 is live")],
         2.5: [(Severity.INFO, "1:1 is coasting")],
@@ -734,8 +740,8 @@ def test_other_events_give_another_digest(begun: list[Event]) -> None:
 
 
 def held_up(events: list[Event], begin_s: float, end_s: float) -> list[Event]:
-    """The same in the order of a node that was held up for a while: its first tick comes before
-    the frames that waited, and the ticks of meanwhile are left out."""
+    """Return the events in the order of a stalled node: its first tick precedes the queued frames,
+    and the ticks in between are missing."""
     begin_ns, end_ns = START_NS + round(begin_s * S), START_NS + round(end_s * S)
 
     def waits(event: Event) -> bool:
@@ -754,7 +760,7 @@ def digest_of(*outputs: Estimate | Update) -> str:
 
 
 def test_a_node_that_was_held_up_knows_the_same_afterwards(paper: list[Event]) -> None:
-    """Frames are taken in after a later tick, with the time at which they arrived."""
+    """Frames are processed after a later tick, with their true arrival times."""
     smooth, busy = Pipeline(settings("5:1")), Pipeline(settings("5:1"))
     late = held_up(paper, 2.0, 2.5)
     assert any(a.t_ns > b.t_ns + S // 4 for a, b in pairwise(late))
@@ -787,7 +793,7 @@ def test_an_estimate_is_in_the_digest_with_all_that_matters() -> None:
 
 
 def test_looking_changes_nothing(begun: list[Event]) -> None:
-    """Neither the digest nor what comes out later."""
+    """Neither the digest nor later outputs change."""
     quiet, watched = Pipeline(settings()), Pipeline(settings())
     for number, event in enumerate(begun):
         plain, seen = quiet.step(event), watched.step(event)
@@ -813,7 +819,7 @@ def test_geodetic_is_the_way_back() -> None:
         Pipeline(settings()).geodetic(np.zeros((1, 3)))
 
 
-# --- the timer of a log -------------------------------------------------------------------------
+# --- ticks of a log -----------------------------------------------------------------------------
 
 
 def test_ticks_come_at_the_rate_asked_for() -> None:
@@ -824,7 +830,7 @@ def test_ticks_come_at_the_rate_asked_for() -> None:
     assert [event for event in events if isinstance(event, Frame)] == frames
     assert events[0] is frames[0]
     assert all(a.t_ns <= b.t_ns for a, b in pairwise(events))
-    # What a timer would have made by the time of a frame comes before it.
+    # Ticks due by the time of a frame precede it.
     assert events.index(frames[4]) == len(events) - 1
 
 
@@ -865,7 +871,7 @@ def test_who_is_denied_is_not_tracked_and_that_is_counted() -> None:
         run(pipeline, [adsb(t_s, (500.0, 0.0, -50.0))])
     now_ns = START_NS + 2 * S
     assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["1:1"]
-    assert pipeline.tracker.newest("5:1") is not None  # the carrier always is
+    assert pipeline.tracker.newest("5:1") is not None  # the carrier is always tracked
     refused = {
         uav: pipeline.refusals.of(uav).counts[Reason.NOT_ALLOWED]
         for uav in ("2:1", "3:7", "icao:4CA7B3", "5:1")
@@ -876,7 +882,7 @@ def test_who_is_denied_is_not_tracked_and_that_is_counted() -> None:
 
 
 def test_the_link_that_is_first_is_known_and_both_latencies_are() -> None:
-    """``fast`` brings a report at once and ``slow`` brings it 50 ms later; one was lost on fast."""
+    """``fast`` delivers a report at once and ``slow`` 50 ms later; one report was lost on fast."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
     for n in range(50):
         both = [position(n / 10, "1:1", link="fast"), position(n / 10, "1:1", link="slow")]
@@ -893,7 +899,7 @@ def test_the_link_that_is_first_is_known_and_both_latencies_are() -> None:
 
 
 def test_a_round_trip_tells_what_one_way_cannot() -> None:
-    """Every report takes 300 ms at least; the answers of TIMESYNC show it."""
+    """Every report takes at least 300 ms; the TIMESYNC answers show it."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
     for n in range(40):
         made_s = n / 4
@@ -902,7 +908,7 @@ def test_a_round_trip_tells_what_one_way_cannot() -> None:
         sent_ns = late.t_ns + S // 50
         remote_ns = (
             sent_ns + S // 100 - START_NS + 100 * S
-        )  # halfway; the boot clock began at 100 s
+        )  # halfway; the boot clock started at 100 s
         assert (
             pipeline.step(
                 RoundTrip(
@@ -951,23 +957,25 @@ def test_no_more_are_tracked_than_the_settings_allow() -> None:
 
 
 def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Invented senders do not fill the memory; who has a track, and the carrier, keep theirs."""
+    """Invented senders use bounded memory; senders with a track and the carrier keep their
+    clocks.
+    """
     monkeypatch.setattr("companion.pipeline.records.RECORDS_MAX", 10)
     monkeypatch.setattr("companion.pipeline.senders.RECORDS_MAX", 10)
     monkeypatch.setattr("companion.pipeline.records.DROPPED_TOGETHER", 2)
     pipeline = Pipeline(settings(tracks={"most": 2}))
-    pipeline.step(attitude(0, "5:1"))  # the carrier has no position, and so no track
+    pipeline.step(attitude(0, "5:1"))  # the carrier has no position and thus no track
     for sysid in range(11, 61):
         pipeline.step(position(0, f"{sysid}:1", (10.0 * sysid, 0.0, 0.0)))
     kept = ["5:1", "11:1", "12:1", *(f"{sysid}:1" for sysid in range(55, 61))]
-    for _ in range(2):  # before any tick, and after some
+    for _ in range(2):  # before and after ticks
         known = [f"{sysid}:1" for sysid in range(1, 61) if pipeline.clock_estimate(f"{sysid}:1")]
         assert known == kept
         run(pipeline, [tick(n / 100) for n in range(100)])
 
 
 def test_pauses_without_end_are_not_ticked_through() -> None:
-    """A thousand of an hour each: 36 million ticks, were they all made."""
+    """A thousand pauses of one hour each would be 36 million ticks."""
     hour_ns = 3_590 * S
     garbage = [
         Rejection(t_ns=n * hour_ns, source="log", reason=Reason.GARBAGE) for n in range(1_000)
@@ -977,7 +985,7 @@ def test_pauses_without_end_are_not_ticked_through() -> None:
 
 
 def test_pauses_of_a_flight_are_ticked_through_however_many() -> None:
-    """Each is less than a minute, and all together are a day."""
+    """Each is shorter than a minute; together they last a day."""
     garbage = [
         Rejection(t_ns=n * 50 * S, source="log", reason=Reason.GARBAGE) for n in range(1_728)
     ]
@@ -986,7 +994,7 @@ def test_pauses_of_a_flight_are_ticked_through_however_many() -> None:
 
 
 def test_the_clock_of_who_is_long_gone_is_forgotten() -> None:
-    """But for the carrier's, and not while it may come back within the hour."""
+    """Except for the carrier's, and not within the hour in which it may return."""
     pipeline = Pipeline(settings())
     run(pipeline, [position(0.0, "5:1"), position(0.0, "7:1")])
     run(pipeline, [tick(3_500.0 + n * 0.05) for n in range(DROP_EVERY)])

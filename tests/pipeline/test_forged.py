@@ -1,7 +1,8 @@
-"""One forged frame of each message that the fold reads, from the vehicle's own peer.
+"""One forged frame of each message that the pipeline reads, sent from the vehicle's own peer.
 
-Whoever can send as the vehicle itself is believed in the end; a single frame may not make a bound a
-lie. Bounds may grow, tracks may be lost, and frames may be refused: that is announced.
+A sender that fully impersonates the vehicle is trusted in the end; a single frame must not break
+a bound silently. Bounds may grow, tracks may be lost and frames may be rejected: that is
+announced.
 """
 
 import math
@@ -27,7 +28,7 @@ CARRIER, UAV = (5, 1), (1, 1)
 
 
 def place_ne_m(ids: tuple[int, int], t_s: float) -> tuple[float, float, float, float]:
-    """North, east and their rates: the carrier hovers, the UAV circles."""
+    """Return north, east and their rates: the carrier hovers, the UAV circles."""
     if ids == CARRIER:
         return 0.0, 0.0, 0.0, 0.0
     angle, v = RATE_RADPS * t_s, RADIUS_M * RATE_RADPS
@@ -40,7 +41,7 @@ def yaw_rad(t_s: float) -> float:
 
 
 def said(ids: tuple[int, int], msgid: int, t_s: float) -> bytes:
-    """The payload of an honest frame at a time."""
+    """Return the payload of a genuine frame at a time."""
     north, east, v_north, v_east = place_ne_m(ids, t_s)
     boot_ms = 60_000 + round(t_s * 1e3)
     lat = round((LAT + north / M_PER_DEG) * 1e7)
@@ -61,7 +62,7 @@ def said(ids: tuple[int, int], msgid: int, t_s: float) -> bytes:
 
 
 def flight(seconds: float) -> Iterator[Frame | Tick]:
-    """Both vehicles' frames, and ticks, at 10 Hz; the rest once a second."""
+    """Return both vehicles' frames and ticks at 10 Hz; other messages once per second."""
     for n in range(round(seconds * 10)):
         t_s = n / 10
         at_ns = BEGINS_NS + round(t_s * S)
@@ -76,7 +77,7 @@ def flight(seconds: float) -> Iterator[Frame | Tick]:
 
 
 def lies(pipeline: Pipeline, update: Update) -> list[str]:
-    """The bounds that do not hold."""
+    """Return the bounds that do not hold."""
     found = []
     t_s = (update.beams.valid_at_ns - BEGINS_NS) * 1e-9
     assert pipeline.local is not None
@@ -99,10 +100,11 @@ def lies(pipeline: Pipeline, update: Update) -> list[str]:
 
 
 def flown(forged: tuple[int, Frame] | None, seconds: float = 5.0) -> list[str]:
-    """The lies of a flight in which a frame is put in after so many events, until one is told.
+    """Return the broken bounds of a flight with a frame inserted after so many events, until a
+    notice.
 
-    Told is that an assumption is refuted, or a warning. Before the frame the flight is the honest
-    one, and nothing is asked: ticks are most of the time.
+    A notice is a refuted assumption or a warning. Before the frame the flight is the genuine one
+    and is not checked: ticks take most of the time.
     """
     pipeline, found = Pipeline(Settings().override(center={"source": "5:1"})), list[str]()
     for number, event in enumerate(flight(seconds)):
@@ -123,7 +125,7 @@ def flown(forged: tuple[int, Frame] | None, seconds: float = 5.0) -> list[str]:
 def forged(
     ids: tuple[int, int], msgid: int, at: int, offset: int, form: str, *values: float
 ) -> tuple[int, Frame]:
-    """An honest frame after so many events but for some of its bytes."""
+    """Return a genuine frame after so many events with some of its bytes changed."""
     payload = bytearray(said(ids, msgid, at // 5 / 10))
     struct.pack_into(form, payload, offset, *values)
     return at, Frame(

@@ -1,4 +1,4 @@
-"""Verdicts on links: by the gains, settled before they are told, one notice for one cause."""
+"""Verdicts on links: by their gains, with hysteresis before a notice, one notice per cause."""
 
 import math
 from dataclasses import replace
@@ -62,7 +62,7 @@ def update(t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -
 
 
 class Watch:
-    """A health of 10 dB that is asked, and what it said."""
+    """Link assessment that requires 10 dB, with its notices."""
 
     def __init__(self, **need: float) -> None:
         self.health = HealthMonitor(NeedSettings(**(need or {"needed_db": 10.0})), SITE)
@@ -103,7 +103,9 @@ def test_it_is_judged_once_a_second() -> None:
 
 
 def test_many_links_are_judged_in_turn_and_told_together(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Each has its turn once a second; those that became worse for one cause are one notice."""
+    """Each link is assessed once per second; links that became worse for one cause share a
+    notice.
+    """
     many = {f"{n}:1": (200.0, 4.0 * n - 120.0, -10.0) for n in range(1, 61)}
     monkeypatch.setattr(f"{__name__}.PLACES", many)
     watch, judged = Watch(needed_db=6.0), []
@@ -145,7 +147,7 @@ def test_a_level_that_is_held_says_why_it_is_so_now() -> None:
     assert why is not None
     assert why.reason == "no report for 3.0 s"
     assert watch.see(2, [track("1:1", *SURE)]) == "none"
-    assert watch.health.verdicts["1:1"].blame == why  # what is good has no other reason
+    assert watch.health.verdicts["1:1"].blame == why  # a good link has no other reason
 
 
 def test_what_is_held_for_good_has_no_reason() -> None:
@@ -170,7 +172,7 @@ def test_what_is_worse_one_way_or_the_other_is_worse() -> None:
 
 
 def test_better_must_last_whole() -> None:
-    """From weak it is worse in between: the three seconds begin anew."""
+    """It gets worse in between: the three seconds start again."""
     watch = Watch()
     watch.see(0, [track("1:1", *USUAL)])
     errors = [SURE, SURE, WILD, SURE, SURE, SURE, SURE]
@@ -179,7 +181,7 @@ def test_better_must_last_whole() -> None:
 
 
 def test_a_hair_s_breadth_changes_nothing() -> None:
-    """Up to a decibel less than needed keeps the level, and does not reach it."""
+    """Up to 1 dB below the required gain keeps the level but does not reach it."""
     watch = Watch()
     watch.see(0, [track("1:1", *SURE)])
     sure_db = watch.health.verdicts["1:1"].guaranteed_gain_db
@@ -224,7 +226,7 @@ def test_a_uav_that_is_gone_is_forgotten() -> None:
 
 
 def test_an_sinr_that_is_needed_is_turned_into_a_gain() -> None:
-    """Twice as far takes 6 dB more; without others in its turn there is noise alone."""
+    """Twice the range takes 6 dB more; alone in its time slot there is only noise."""
     found = []
     for factor in (1.0, 2.0):
         watch = Watch(needed_sinr_db=5.0)

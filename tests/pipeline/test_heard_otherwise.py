@@ -1,4 +1,4 @@
-"""Aircraft heard otherwise than by telemetry, in the fold: one stays one, and late is late."""
+"""Aircraft received by other means than telemetry: merged into one track, with correct times."""
 
 import math
 from collections import Counter
@@ -35,7 +35,7 @@ def pipeline(**sections: dict[str, Any]) -> Pipeline:
 
 
 def there(t_s: float, aside_m: float = 0.0) -> tuple[float, float, float]:
-    """Where the aircraft is: northwards at 5 m/s, 120 m up."""
+    """Return the aircraft's position: north at 5 m/s, 120 m up."""
     lat, lon, alt = pymap3d.ned2geodetic(300 + 5 * t_s, 40 + aside_m, -120, *PLACE)
     return float(lat), float(lon), float(alt)
 
@@ -121,7 +121,7 @@ def estimates(fold: Pipeline, frame: Frame) -> list[Estimate]:
 
 
 def test_one_aircraft_that_is_heard_three_ways_gets_one_beam() -> None:
-    """Its own telemetry before Remote ID before ADS-B, whichever of them there are."""
+    """Telemetry takes precedence over Remote ID, and Remote ID over ADS-B."""
     fold = pipeline()
     fold.step(naming(0))
     for n in range(12):
@@ -152,7 +152,7 @@ def test_an_event_of_an_aircraft_that_is_known_better_is_that_one() -> None:
 
 
 def test_an_events_errors_are_its_bounds_and_late_is_late() -> None:
-    """Three standard deviations, and the way in a second."""
+    """Three standard deviations plus the distance flown in one second."""
     fold = pipeline(tracks={"window_s": 20.0})
     for n in range(20):
         (heard,) = estimates(fold, event(n))
@@ -167,7 +167,7 @@ def test_an_aircraft_elsewhere_is_another_one() -> None:
     fold.step(naming(0))
     for n in range(12):
         fold.step(telemetry(n))
-        fold.step(broadcast(n + 0.05, aside_m=80.0))  # far more than either may be off
+        fold.step(broadcast(n + 0.05, aside_m=80.0))  # far beyond the error of either
     assert set(updated(fold, 12).beams.uavs) == {"1:1", RID}
 
 
@@ -183,7 +183,7 @@ def test_a_broadcast_that_two_receivers_hear_counts_once() -> None:
 
 
 def test_a_position_that_comes_ten_seconds_late_is_of_ten_seconds_ago() -> None:
-    """By its stamp, as with telemetry: what it says is no news of the present."""
+    """By its stamp, as with telemetry."""
     fold = pipeline(tracks={"window_s": 20.0})
     fold.step(naming(0))
     for n in range(20):
@@ -196,7 +196,8 @@ def test_a_position_that_comes_ten_seconds_late_is_of_ten_seconds_ago() -> None:
 
 @pytest.mark.parametrize(("code", "horizontal_m"), [(10, 18.5), (9, 55.5), (8, 171.3), (0, 100.0)])
 def test_stated_accuracies_are_the_bounds(code: int, horizontal_m: float) -> None:
-    """Three times the radius of 68 %, and the way in 0.15 s, or in the second of ADS-B's ages."""
+    """Three times the 68 % radius, plus the distance flown in 0.15 s or, for ADS-B ages, in one
+    second."""
     fold = pipeline()
     fold.step(naming(0))
     (heard,) = estimates(fold, broadcast(0, horizontal=code))
@@ -206,7 +207,8 @@ def test_stated_accuracies_are_the_bounds(code: int, horizontal_m: float) -> Non
 
 
 def test_what_a_mavlink_relay_puts_behind_its_message_is_no_accuracy() -> None:
-    """Another dialect may have its own fields there; only this program's receivers' are read."""
+    """Another dialect may have its own fields there; only those of this program's receivers are
+    read."""
     theirs = transponder(0, nac_p=11)
     raw = bytearray(theirs.raw)
     raw[5] = 9
@@ -259,7 +261,7 @@ def test_an_export_has_a_row_of_each_report_whatever_its_message() -> None:
 
 
 def test_made_up_names_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Of events, whose names are anybody's: what is kept of them has an end."""
+    """Event ids can be invented freely; the state kept for them is bounded."""
     monkeypatch.setattr(records, "RECORDS_MAX", RECORDS_MAX)
     monkeypatch.setattr(senders, "RECORDS_MAX", RECORDS_MAX)
     fold = pipeline(tracks={"most": TRACKS_MAX})
@@ -278,7 +280,7 @@ def test_made_up_names_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def summary(t_s: float, **given: int) -> Frame:
-    """HIGH_LATENCY2 of the same aircraft, as an autopilot packs it."""
+    """Return a HIGH_LATENCY2 of the same aircraft, as an autopilot packs it."""
     lat, lon, alt = there(t_s)
     fields = dict.fromkeys(dialect.MAVLink_high_latency2_message.fieldnames, 0)
     fields |= {
@@ -289,7 +291,7 @@ def summary(t_s: float, **given: int) -> Frame:
 
 
 def test_a_uav_that_sends_high_latency2_alone_is_tracked_within_its_bound() -> None:
-    """One report each 5 s, in whole metres of height and without a velocity."""
+    """One report every 5 s, with height in whole metres and no velocity."""
     into, estimates, t_s = pipeline(), list[Estimate](), 0.0
     for step in range(60):
         t_s = 5.0 * step
@@ -307,7 +309,7 @@ def test_a_uav_that_sends_high_latency2_alone_is_tracked_within_its_bound() -> N
 
 @pytest.mark.parametrize(("eph", "least_m"), [(0, 3.0), (255, 3.0), (80, 24.0)])
 def test_the_bound_on_a_summary_holds_what_it_states(eph: int, least_m: float) -> None:
-    """Its accuracy, three times over, and a metre for the step of its heights."""
+    """Three times its stated accuracy, plus one metre for the resolution of its heights."""
     (estimate,) = (
         one for one in pipeline().step(summary(0.0, eph=eph)) if isinstance(one, Estimate)
     )
@@ -318,6 +320,6 @@ def test_the_bound_on_a_summary_holds_what_it_states(eph: int, least_m: float) -
 
 
 def pipeline_noise_m() -> float:
-    """The bound on a height without any accuracy that is stated."""
+    """Return the bound on a height without stated accuracy."""
     (estimate,) = (one for one in pipeline().step(telemetry(0.0)) if isinstance(one, Estimate))
     return estimate.fix.noise.vertical_m

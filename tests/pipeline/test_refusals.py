@@ -1,4 +1,4 @@
-"""What was refused is counted, by whom, and a flood of names is bounded."""
+"""Rejections: counted by sender, with bounded memory under a flood of ids."""
 
 from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import RECENT, SENDERS_MAX, Refusals

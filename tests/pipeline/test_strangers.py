@@ -1,4 +1,4 @@
-"""Strangers who send what they like: others are not locked out, and nothing grows without end."""
+"""Unknown senders with arbitrary traffic: they evict no tracked UAV, and all state is bounded."""
 
 import math
 import random
@@ -38,7 +38,7 @@ S = 1_000_000_000
 MS = 1_000_000
 
 
-# --- the table of tracks ------------------------------------------------------------------------
+# --- table of tracks ----------------------------------------------------------------------------
 
 
 def fix(uav: str, t_s: float) -> Fix:
@@ -87,7 +87,7 @@ def flown(tracker: Tracker, uav: str, reports: int, from_s: float) -> None:
 
 def test_who_was_here_before_is_not_shut_out_by_strangers(tracker: Tracker) -> None:
     flown(tracker, "1:1", ESTABLISHED, 0.0)
-    tracker.forget("1:1")  # behind a hill for ten minutes
+    tracker.forget("1:1")  # silent behind a hill for ten minutes
     for number in range(10):
         flown(tracker, f"200:{number}", 3, 700.0)
     refused = tracker.accept(fix("201:1", 701.0))[0]
@@ -117,7 +117,7 @@ def test_only_as_many_are_remembered_as_are_tracked(tracker: Tracker) -> None:
     for number in range(30):
         flown(tracker, f"3:{number}", ESTABLISHED, 100.0 * number)
         tracker.forget(f"3:{number}")
-    assert tracker._established == {f"3:{number}" for number in range(10)}  # whoever was first
+    assert tracker._established == {f"3:{number}" for number in range(10)}  # the first ones
 
 
 def test_ids_without_end_do_not_fill_the_lists() -> None:
@@ -166,7 +166,7 @@ def test_more_tracks_than_clocks_leave_all_of_them_their_own() -> None:
             )
         )
     assert len(senders._senders) == many
-    assert everyone.asked < 4 * many  # they are not looked through for each that comes
+    assert everyone.asked < 4 * many  # the table is not scanned for each new sender
 
 
 def test_what_is_said_beside_positions_is_forgotten() -> None:
@@ -187,7 +187,9 @@ def test_what_is_said_beside_positions_is_forgotten() -> None:
         heard(number)
     assert len(senders._components) == RECORDS_MAX + 100
     senders.forget_silent(2 * S)
-    assert len(senders._components) == RECORDS_MAX + 2  # the oldest went, but for who is kept
+    assert (
+        len(senders._components) == RECORDS_MAX + 2
+    )  # the oldest are evicted, except those that are kept
     assert {str(source) for source in list(senders._components)[:3]} == {"1:1", "5:1", "101:1"}
     senders.forget_silent(4000 * S)
     assert set(map(str, senders._components)) == {"1:1", "5:1"}
@@ -222,7 +224,7 @@ def attitude(arrival_ms: int, stamp_ms: int, yaw_rad: float) -> PlacedAttitude:
 
 @pytest.fixture
 def turning() -> Callable[[list[PlacedAttitude]], list[float]]:
-    """``turning(attitudes)``: the yaw that is known after each, degrees."""
+    """Return ``turning(attitudes)``: the known yaw after each attitude, in degrees."""
 
     def run(attitudes: list[PlacedAttitude]) -> list[float]:
         center = CarrierTracker(Settings().override(center={"source": "5:1"}))
@@ -258,7 +260,7 @@ def test_an_attitude_from_the_future_does_not_keep_others_out(
 def test_a_slower_link_never_turns_the_carrier_back(
     turning: Callable[[list[PlacedAttitude]], list[float]],
 ) -> None:
-    """Attitudes that come again two seconds late, at their own pace, beside the fresh ones."""
+    """Attitudes arrive again two seconds late at their own rate, beside the fresh ones."""
     rng = random.Random(5)
     fast = [attitude(t, t, yaw_rad(t)) for t in range(0, 20_000, 100)]
     slow = [attitude(t + 2000 + rng.randrange(90), t, yaw_rad(t)) for t in range(0, 18_000, 40)]
@@ -274,11 +276,11 @@ def test_attitudes_that_are_resent_at_once_turn_nothing_back(
     assert set(turning([*fresh, *burst])[-len(burst) :]) == {29.0}
 
 
-# --- seats among the beams ------------------------------------------------------------------------
+# --- limit on beams -------------------------------------------------------------------------------
 
 
 def report(sysid: int, t_s: float) -> Frame:
-    """A UAV that hovers in its own direction from the array."""
+    """Return a report of a UAV that hovers in its own direction from the array."""
     mav = common.MAVLink(None, srcSystem=sysid, srcComponent=1)
     angle, t_ms = sysid / 10, round(t_s * 1000)
     lat, lon = 47.0 + 0.002 * math.cos(angle), 8.0 + 0.003 * math.sin(angle)
@@ -295,7 +297,7 @@ def report(sysid: int, t_s: float) -> Frame:
 
 
 def test_beams_are_for_the_first_and_for_those_of_priority() -> None:
-    """However many come; who is lost gives up the seat, and everybody else is told why."""
+    """However many arrive; a lost UAV frees its place, and all others get a reason."""
     given = {"center": {"source": "47,8,480,0"}, "beams": {"most": 3, "priority": ["90:1"]}}
     pipeline = Pipeline(Settings().override(**given))
 
@@ -316,5 +318,5 @@ def test_beams_are_for_the_first_and_for_those_of_priority() -> None:
     }
     assert {out.cause for out in update.beams.left_out} == {Cause.MACHINE}
     assert pipeline.health.verdicts["7:1"].blame is not None
-    update = flies(5, 70, [*range(2, 41), 90])  # 1:1 has gone
+    update = flies(5, 70, [*range(2, 41), 90])  # 1:1 has left
     assert update.beams.uavs == ("2:1", "3:1", "90:1")

@@ -1,4 +1,4 @@
-"""Ticks in two: beams are those of the tick, whenever and on whichever thread they are made."""
+"""Split ticks: beams are those of the tick, at any later time and on any thread."""
 
 import threading
 from collections.abc import Iterable, Iterator
@@ -19,12 +19,12 @@ from companion.values import Event, Frame, Output, Tick, Tock, Update
 
 SETTINGS = Settings().override(center={"source": "5:1"})
 LATER = 7
-"""Events that come while beams are made."""
+"""Events that arrive while beams are computed."""
 
 
 @pytest.fixture(scope="module")
 def flown() -> list[Event]:
-    """Eight seconds of a flight."""
+    """Return eight seconds of a flight."""
     events = []
     for event in log_events([ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"], SETTINGS):
         if events and event.t_ns > events[0].t_ns + 8_000_000_000:
@@ -34,7 +34,7 @@ def flown() -> list[Event]:
 
 
 def in_two(events: Iterable[Event], later: int = LATER) -> Iterator[Event]:
-    """The same flight where the beams of every tick take so many events to be made."""
+    """Run the same flight with the beams of every tick finished so many events later."""
     due = -1
     for event in events:
         if isinstance(event, Tick):
@@ -78,7 +78,7 @@ def test_beams_are_those_of_the_tick_though_reports_came_since(flown: list[Event
             differ += not same(update, pipeline.look(update.t_ns))
     assert len(expected) - 1 <= pipeline.updates <= len(expected)
     assert pipeline.updates > 70
-    assert differ > 30  # else nothing that mattered came in between
+    assert differ > 30  # otherwise no relevant event came in between
 
 
 def test_with_nothing_in_between_it_is_one_tick(flown: list[Event]) -> None:
@@ -114,7 +114,7 @@ def test_it_does_not_matter_who_makes_them_and_when(flown: list[Event]) -> None:
 
 
 def test_where_the_local_frame_began_meanwhile_they_are_made_anew(flown: list[Event]) -> None:
-    """The places of the tick are of no frame, or of another."""
+    """The tick's coordinates belong to no frame or to another one."""
     pipeline = Pipeline(SETTINGS)
     pipeline.step(Tick(flown[0].t_ns, in_two=True))
     for event in flown:
@@ -164,7 +164,7 @@ def test_a_recording_replays_to_the_same(tmp_path: Path, flown: list[Event]) -> 
 
 
 def test_a_reader_that_knows_of_no_tocks_sees_ticks() -> None:
-    """As of before there were any: a field more, and a topic that it does not ask for."""
+    """It meets one additional field, and a topic that it does not subscribe to."""
     data = schemas.encode_tick(5, in_two=True)
     assert data.startswith(schemas.encode_tick(5))
     assert schemas.TickMessage.FromString(data).t_ns == 5

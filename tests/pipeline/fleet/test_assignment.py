@@ -1,4 +1,5 @@
-"""Who serves whom: against every assignment there is, and the same from whichever order."""
+"""Assignment of UAVs to nodes: optimal by exhaustive search, and independent of the order of
+offers."""
 
 import itertools
 import math
@@ -26,14 +27,14 @@ ROOM = dict.fromkeys(NODES, 10)
 
 
 def total_db(found: dict[str, str], offers: dict[str, dict[str, float]]) -> float:
-    """What all UAVs have together: their worth, less what shared power costs."""
+    """Return the total value of an assignment: offer values less the cost of shared power."""
     load = {node: list(found.values()).count(node) for node in offers}
     shared = sum(10 * n * math.log10(n) for n in load.values() if n)
     return sum(offers[node][uav] for uav, node in found.items()) - shared
 
 
 def best(offers: dict[str, dict[str, float]], room: dict[str, int]) -> tuple[int, float]:
-    """The most UAVs that can be served, and the greatest total of those assignments that do so."""
+    """Return the largest number of UAVs that can be served, and the best total with that number."""
     uavs = sorted({uav for one in offers.values() for uav in one})
     choices = [[None, *(node for node in offers if uav in offers[node])] for uav in uavs]
     found = []
@@ -54,7 +55,7 @@ def best(offers: dict[str, dict[str, float]], room: dict[str, int]) -> tuple[int
         "c": {"0:1": 0.0},
     },
     ROOM,
-)  # two have to move on for one
+)  # two UAVs must move for one
 @example(
     {
         "a": {"0:1": 0.0, "1:1": 0.0, "2:1": 10.0, "3:1": 20.0},
@@ -62,7 +63,7 @@ def best(offers: dict[str, dict[str, float]], room: dict[str, int]) -> tuple[int
         "c": {"0:1": 0.0, "1:1": 0.0, "3:1": 10.0},
     },
     ROOM,
-)  # three change places
+)  # three UAVs swap nodes
 def test_it_is_the_best_of_all(offers: dict[str, dict[str, float]], room: dict[str, int]) -> None:
     found = assign(offers, {}, room, 0.0)
     assert all(uav in offers[node] for uav, node in found.items())
@@ -116,7 +117,7 @@ def test_load_is_shared() -> None:
     offers = {node: dict.fromkeys(uavs, 18.0) for node in NODES}
     found = assign(offers, {}, ROOM, 0.0)
     assert [list(found.values()).count(node) for node in NODES] == [4, 4, 4]
-    # What a node serves beside those of the offers counts as much.
+    # UAVs that a node serves besides the offered ones count as well.
     beside = assign(offers, {}, ROOM | {"a": 50}, 0.0, {"a": 8})
     assert list(beside.values()).count("a") == 0
 

@@ -1,4 +1,4 @@
-"""Claims, leases and handovers of two nodes that hear each other's word when the test says so."""
+"""Claims, leases and handovers of two nodes whose messages the test passes or drops."""
 
 from dataclasses import dataclass
 
@@ -13,7 +13,7 @@ NODES = frozenset("ab")
 
 @dataclass
 class Pair:
-    """Nodes a and b, 18 dB and what the test gives to each UAV; ``talk`` passes their words."""
+    """Nodes a and b with 18 dB plus a test value per UAV; ``talk`` passes their messages."""
 
     offers: dict[str, dict[str, float]]
     now_ns: int = 1000 * S
@@ -33,7 +33,7 @@ class Pair:
         )
 
     def step(self, talk: bool = True, alive: str = "ab") -> list[list[str]]:
-        """One tick of 100 ms. Returns who serves what after each node's decision."""
+        """Run one tick of 100 ms; return the serving nodes after each node's decision."""
         self.now_ns += 100 * MS
         seen = []
         words = {name: self.says(name) for name in alive}
@@ -47,7 +47,7 @@ class Pair:
         return seen
 
     def run(self, seconds: float, talk: bool = True, alive: str = "ab") -> list[list[str]]:
-        """Some seconds of ticks."""
+        """Run for some seconds."""
         return [one for _ in range(round(10 * seconds)) for one in self.step(talk, alive)]
 
 
@@ -63,7 +63,7 @@ def test_a_handover_is_made_before_the_old_beam_is_given_up() -> None:
     pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
     pair.run(5)
     assert list(pair.nodes["a"].serves) == ["1:1"]
-    pair.offers["b"]["1:1"] = 22.0  # better, and not by enough
+    pair.offers["b"]["1:1"] = 22.0  # better, but by less than the margin
     assert set(map(tuple, pair.run(5))) == {("a",)}
     pair.offers["b"]["1:1"] = 25.0
     began_ns = pair.now_ns
@@ -97,10 +97,10 @@ def test_a_node_that_falls_silent_is_followed_after_its_lease() -> None:
 
 
 def test_parted_both_serve_and_healed_one_does_and_never_none() -> None:
-    for worth in (8.0, 20.0, 26.0):  # less, as much, more than the other's
+    for worth in (8.0, 20.0, 26.0):  # less than, equal to and more than the other's
         pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": worth}})
         pair.run(5)
-        pair.offers["a"]["1:1"] = 5.0  # it flies while they are parted
+        pair.offers["a"]["1:1"] = 5.0  # it appears during the partition
         seen = pair.run(5, talk=False)
         assert [] not in seen
         assert seen[-1] == ["a", "b"]
@@ -129,7 +129,7 @@ def test_a_full_node_takes_nobody_more() -> None:
 
 
 def test_the_second_takes_what_the_first_does_not() -> None:
-    """The node that the assignment names may not see it: nobody waits for it for ever."""
+    """The assigned node may not receive the UAV: the other does not wait for it forever."""
     pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
     for _ in range(60):
         pair.now_ns += 100 * MS
@@ -144,7 +144,7 @@ def said(node: str, *serves: tuple[str, float]) -> Standing:
 
 
 class Alone:
-    """Node a of several, the words of the others as the test says."""
+    """Node a of several; the test gives the other nodes' messages."""
 
     def __init__(self, **offers: float) -> None:
         self.duties = Duties(name="a", most=50, lease_ns=LEASE_NS, hysteresis_db=3.0)
@@ -152,7 +152,7 @@ class Alone:
         self.worth = offers
 
     def run(self, seconds: float, *words: Standing, trusted: str = "bc") -> None:
-        """Some seconds of ticks in which the others go on to say so."""
+        """Run for some seconds in which the others repeat their messages."""
         for _ in range(round(10 * seconds)):
             self.now_ns += 100 * MS
             for word in words:
@@ -175,7 +175,9 @@ def test_it_is_handed_to_one_and_not_given_up_for_another() -> None:
     node.worth["b"] = 30.0
     node.run(3, said("b"), said("c"))
     assert node.duties.handing == {"1:1": "b"}
-    node.run(0.5, said("b"), said("c", ("1:1", 10.0)))  # it was parted, and served it as well
+    node.run(
+        0.5, said("b"), said("c", ("1:1", 10.0))
+    )  # after a partition in which it also served the UAV
     assert list(node.duties.serves) == ["1:1"]
     node.run(0.1, said("b", ("1:1", 30.0)), said("c"))
     assert not node.duties.serves

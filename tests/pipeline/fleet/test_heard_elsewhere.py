@@ -1,4 +1,4 @@
-"""Reports that another node heard: the bound holds whatever its clock and the links between do."""
+"""Reports received by another node: the bound holds for any clock and link between the nodes."""
 
 import math
 import random
@@ -22,7 +22,7 @@ S = 1_000_000_000
 START_NS = 1_800_000_000 * S
 UAV = "1:1"
 SHADOW_S = 6.0
-"""When the vehicle flies behind the building."""
+"""Time at which the vehicle flies behind the building."""
 END_S = 12.0
 
 
@@ -52,7 +52,7 @@ def ns(seconds: float) -> int:
 
 
 def flown(links: Links) -> tuple[list[tuple[float, float, float]], Pipeline]:
-    """Errors and bounds at each tick as (time, error, bound), and the pipeline at the end."""
+    """Return (time, error, bound) of each tick, and the final pipeline."""
     chance, sky = random.Random(links.seed), FleetSky(ports=[], uavs=1)
     pipeline = Pipeline(Settings().override(center={"source": "47.3977,8.5456,480"}))
     hearing, clock = Reception(), NeighbourClock()
@@ -147,7 +147,7 @@ def test_it_stays_small_and_would_grow_alone() -> None:
 
 
 def test_a_doubt_that_were_forgotten_would_be_seen() -> None:
-    """The clock's doubt is in the vehicle's: a wide one widens it by as much."""
+    """The node clock's uncertainty is part of the vehicle's and widens it equally."""
     narrow, wide = (
         flown(
             Links(

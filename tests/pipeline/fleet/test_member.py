@@ -1,4 +1,4 @@
-"""One node of a fleet by itself: what it keeps of others, and what it forgets."""
+"""One node of a fleet: the state that it keeps of other nodes, and what it forgets."""
 
 import struct
 
@@ -29,7 +29,7 @@ def standing(node: str, serves: tuple[str, ...] = ()) -> Standing:
 
 
 def word(now_ns: int, number: int) -> Shared:
-    """What a node on the same clock heard 2 ms ago."""
+    """Return what a node on the same clock received 2 ms ago."""
     mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
     message = common.MAVLink_global_position_int_message(
         1000 + number, 473977000, 85456000, 0, 0, 0, 0, 0, 0
@@ -70,7 +70,7 @@ def test_who_went_is_remembered_for_a_while_and_in_bounded_number() -> None:
 
 
 def test_an_answer_of_who_went_makes_nobody_known_and_is_no_word() -> None:
-    """Zenoh's threads answer for the clock though the node's own loop stands still."""
+    """Zenoh's threads answer for the clock while the node's own loop is stalled."""
     node = member()
     node.read_clock("b", START_NS, START_NS, START_NS + MS, START_NS)
     assert not node.neighbours
@@ -92,7 +92,7 @@ def test_invented_nodes_take_no_room_for_ever() -> None:
 
 
 def test_the_first_answers_of_a_clock_are_not_enough() -> None:
-    """The doubt with which a frame was placed stays with its sender's clock."""
+    """The uncertainty with which a frame was placed stays with its sender's clock."""
     node, now_ns = member(), START_NS
     node.node_joined(now_ns, "b")
     for number, wide_ms in enumerate((900, 4, 4)):
@@ -156,7 +156,7 @@ def test_who_is_far_away_is_not_near_and_its_offers_are_not_kept() -> None:
 def answered(
     node: FleetMember, now_ns: int, ahead_s: float, started_ns: int, times: int = 3
 ) -> list[str]:
-    """Answers of a node whose clock is so much behind, 4 ms apart; what was said of them."""
+    """Feed answers of a node whose clock lags by that much, 4 ms apart; return the notices."""
     notices = []
     node.node_joined(now_ns, "b")
     for number in range(times):

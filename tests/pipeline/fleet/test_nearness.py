@@ -1,4 +1,4 @@
-"""Who is near: whose reach meets this node's, and who may."""
+"""Near nodes: those whose reach overlaps this node's, or may."""
 
 import math
 
@@ -43,7 +43,7 @@ def test_who_hears_nobody_has_the_reach_of_the_other() -> None:
 
 
 def test_neighbours_on_a_site_are_near_though_they_hear_little() -> None:
-    """One UAV circles a mast at 100 m; behind a building another mast is all that hears it."""
+    """One UAV circles a mast at 100 m; another mast behind a building receives only that UAV."""
     for own_m, its_m in ((100.0, None), (None, 400.0), (100.0, 200.0), (None, None)):
         assert near(HERE, own_m, {"b": standing(1500, its_m)}, NOBODY) == {"b"}
 

@@ -1,4 +1,4 @@
-"""Clocks of other nodes: the truth is always within what is told, whatever link and drift do."""
+"""Clocks of other nodes: the interval contains the truth for any link and drift."""
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -41,7 +41,7 @@ def test_the_truth_is_within(
     ahead = clock.offset(remote(then_ns))
     assert ahead is not None
     assert ahead.low_ns - 2 <= then_ns - remote(then_ns) <= ahead.high_ns + 2
-    # No wider than the best round trip and what drift can have added since.
+    # No wider than the best round trip plus the drift since.
     best_ns = min(there + back for there, back in ways) * MS
     aged_ns = 2 * DRIFT_MAX * (abs(then_ns - START_NS) + 25_000 * MS)
     assert ahead.width_ns <= best_ns + aged_ns
@@ -51,7 +51,7 @@ def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
     clock = NeighbourClock()
     trip = RoundTrip(t_ns=500 * MS, source=Source(1, 1), sent_ns=400 * MS, remote_ns=77)
     assert here(trip, clock) is None
-    # The other clock is 1 s behind; the question took 4 ms, the answer 6 ms.
+    # The other clock lags by 1 s; the request took 4 ms, the answer 6 ms.
     clock.note_answer(1000 * MS, 1010 * MS, 4 * MS)
     placed = here(trip, clock)
     assert placed is not None
@@ -62,7 +62,7 @@ def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
 
 
 def test_ways_of_long_ago_say_nothing_of_now() -> None:
-    """A node that speaks for nobody any more has no ways, however slow its last words were."""
+    """A node that shares no vehicle any more has no delays, however slow its last messages were."""
     node = Neighbour(clock=NeighbourClock())
     node.note_delay(START_NS, 900 * MS)
     node.note_delay(START_NS + DELAYS_WINDOW_NS // 2, 5 * MS)

@@ -1,4 +1,4 @@
-"""What a node offers of a flight, and how far it hears, against its own beams and distances."""
+"""A node's offers and reach, against its own beams and ranges."""
 
 import math
 
@@ -22,7 +22,7 @@ SETTINGS = Settings().override(center={"source": "5:1"})
 
 @pytest.fixture(scope="module")
 def flown() -> tuple[Pipeline, FleetMember, int]:
-    """A pipeline after some seconds of flight, what its node heard, and the time."""
+    """Return a pipeline after some seconds of flight, its node's surroundings, and the time."""
     pipeline = Pipeline(SETTINGS)
     begun_ns, member = None, None
     for event in log_events([ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"], SETTINGS):

@@ -1,4 +1,4 @@
-"""Own ears first: what others tell is used of those who are silent here, and held against them."""
+"""Shared frames: used for vehicles that are silent here, and checked against own reception."""
 
 from pymavlink.dialects.v20 import common
 
@@ -24,7 +24,7 @@ def raw(boot_ms: int, north_m: float = 0.0, msg: str = "position") -> bytes:
 
 
 def clock(behind_ns: int = 3 * S, width_ns: int = 2 * MS) -> NeighbourClock:
-    """A node whose clock is so much behind this one's, known within ``width_ns``."""
+    """Return the clock of a node that lags by that much, known within ``width_ns``."""
     made = NeighbourClock()
     made.note_answer(10 * S, 10 * S + width_ns, 10 * S + width_ns // 2 - behind_ns)
     return made
@@ -33,7 +33,7 @@ def clock(behind_ns: int = 3 * S, width_ns: int = 2 * MS) -> NeighbourClock:
 def tell(
     hearing: Reception, now_ns: int, data: bytes, heard_ns: int, node: str = "b"
 ) -> list[Frame]:
-    """Frames that the pipeline is to have, when a node 3 s behind tells one that it heard."""
+    """Return the frames for the pipeline when a node 3 s behind shares a received one."""
     frame = hearing.to_own_timeline(now_ns, node, clock(), SharedFrame(heard_ns - 3 * S, data))
     return [] if frame is None else hearing.take_shared(now_ns, node, frame, content(frame.raw))
 
@@ -63,7 +63,7 @@ def test_of_a_vehicle_that_is_heard_here_nothing_else_is_used() -> None:
     for number in range(20):
         hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
     now_ns = 11 * S + 1910 * MS
-    assert tell(hearing, now_ns, raw(2900), now_ns - 5 * MS) == []  # heard here too
+    assert tell(hearing, now_ns, raw(2900), now_ns - 5 * MS) == []  # received here too
     assert tell(hearing, now_ns, raw(2850, 1.0), now_ns - 5 * MS) == []
     assert tell(hearing, now_ns, raw(0, msg="heartbeat"), now_ns - 5 * MS) == []
 
@@ -80,18 +80,18 @@ def test_of_one_that_falls_silent_what_was_missed_is_taken_up() -> None:
     first = taken[2][0]
     assert first.link == "fleet:b"
     assert first.source == UAV
-    # It was heard 3 s behind, within the clock's width: at most so late, and never too early.
+    # Received 3 s behind, within the clock's width: late by at most that, and never early.
     at_ns = 11 * S + 2000 * MS
     assert at_ns <= first.t_ns <= at_ns + 3 * MS
     assert first.t_ns - first.doubt_ns <= at_ns
     assert tell(hearing, 15 * S, raw(0, msg="heartbeat"), 15 * S - 5 * MS)
-    # Heard again, it is its own ears that count.
+    # Received here again, own reception counts.
     hear(hearing, 16 * S, 6000)
     assert tell(hearing, 16 * S + 50 * MS, raw(6040), 16 * S + 40 * MS) == []
 
 
 def test_nobody_is_silent_whose_reports_wait_here() -> None:
-    """A node that is short of time would else take in everybody's reports twice."""
+    """An overloaded node would otherwise process every report twice."""
     hearing = Reception()
     for number in range(20):
         hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
@@ -115,7 +115,7 @@ def test_what_comes_before_it_can_be_heard_is_a_contradiction() -> None:
     hearing = Reception()
     assert tell(hearing, 12 * S, raw(1000), 12 * S + 50 * MS) == []
     assert hearing.early == ["b"]
-    # Without a clock nothing is placed, and nothing is wrong.
+    # Without a clock no frame is placed, and none contradicts.
     shared = SharedFrame(12 * S, raw(1000))
     assert hearing.to_own_timeline(12 * S, "c", NeighbourClock(), shared) is None
     assert hearing.early == ["b"]

@@ -1,4 +1,5 @@
-"""What is told: each report once where all hear it, at once where one alone does."""
+"""Sharing of frames: once for a vehicle that all receive, at once for one that a single node
+receives."""
 
 import struct
 from dataclasses import dataclass, field
@@ -26,12 +27,12 @@ def report(at_ns: int, boot_ms: int, source: Source = UAV) -> Frame:
 
 @dataclass
 class Nodes:
-    """Nodes on one clock, with a way between them; each report is told to all that hear it."""
+    """Nodes on one clock with a link between them; each report reaches all that receive it."""
 
     names: tuple[str, ...]
     way_ns: int = 2 * MS
     told: list[tuple[str, int, int]] = field(default_factory=list)
-    """Who told a report, its number, and how long after it was heard."""
+    """The sharing node, the report's number, and the delay since its reception."""
 
     def __post_init__(self) -> None:
         self.sharing = {name: Sharing(name) for name in self.names}
@@ -79,7 +80,7 @@ def test_who_alone_hears_a_vehicle_speaks_for_it_at_once() -> None:
     nodes = Nodes(("a", "b", "c"))
     nodes.fly(20, ("a", "b", "c"))
     nodes.told.clear()
-    nodes.fly(20, ("b",), first=20)  # behind a building for the others
+    nodes.fly(20, ("b",), first=20)  # hidden from the others by a building
     assert sorted(number for _, number, _ in nodes.told) == list(range(20, 40))
     first = [late for _, number, late in nodes.told if number < 22]
     assert max(first) <= HOLD_NS[0] + 5 * MS
@@ -111,7 +112,7 @@ def test_round_trips_are_told_by_the_speaker() -> None:
 
 
 def spoken_for() -> Sharing:
-    """A node that speaks for a vehicle."""
+    """Return a node that shares a vehicle."""
     nodes = Nodes(("a",))
     nodes.fly(5, ("a",))
     return nodes.sharing["a"]
@@ -160,7 +161,7 @@ def test_vehicles_of_yesterday_make_room_for_those_of_today() -> None:
     for number in range(2):
         frame = report(3600 * S + number * S, 1000 * number, late)
         sharing.frame_received(frame.t_ns, frame, content(frame.raw))
-    assert sharing.next_message(3610 * S) is None  # no room
+    assert sharing.next_message(3610 * S) is None  # no capacity left
     assert sharing.dropped == 2
     sharing.forget(3620 * S, 600 * S)
     frame = report(3620 * S, 9000, late)
@@ -179,7 +180,7 @@ def test_what_is_held_of_a_forgotten_vehicle_is_not_told() -> None:
 
 
 def test_it_says_how_long_to_wait_and_nobody_looks_before() -> None:
-    """A node that does not speak holds everything for a moment: it is not woken for all of it."""
+    """A node that does not share holds every frame briefly; it is not woken for each one."""
     sharing = Sharing("b", every_ns=2 * MS)
     assert sharing.wait_ns(S) is None
     frames = [report(S + number * MS, number) for number in range(3)]
@@ -188,7 +189,7 @@ def test_it_says_how_long_to_wait_and_nobody_looks_before() -> None:
     assert sharing.wait_ns(S + 10 * MS) == 50 * MS
     sharing.note_shared(S + 11 * MS, "a", frames[0].source, content(frames[0].raw), MS)
     assert sharing.next_message(S + 12 * MS) is None
-    assert sharing.wait_ns(S + 12 * MS) == 49 * MS  # the next one's
+    assert sharing.wait_ns(S + 12 * MS) == 49 * MS  # of the next frame
     assert sharing.next_message(S + 60 * MS) is None
     assert sharing.next_message(S + 61 * MS) is not None
     assert sharing.next_message(S + 62 * MS) is None
@@ -198,7 +199,7 @@ def test_it_says_how_long_to_wait_and_nobody_looks_before() -> None:
 
 
 def test_what_others_tell_waits_too_where_this_node_is_behind() -> None:
-    """What it reads late is not late by the others' fault."""
+    """Frames that this node reads late are not late through the others' fault."""
     sharing = Sharing("b")
     frames = [report(S + number * 100 * MS, number) for number in range(3)]
     now_ns = S + 900 * MS

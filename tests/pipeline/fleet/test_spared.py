@@ -1,4 +1,4 @@
-"""UAVs that another node serves: nulls on them where they are spared, and nothing said of them."""
+"""UAVs served by another node: protected by nulls, and without notices."""
 
 import numpy as np
 from fleet_sky import FleetSky
@@ -15,7 +15,7 @@ START_NS = 1_800_000_000 * S
 
 
 def flown(pipeline: Pipeline, seconds: float, begins_ns: int = START_NS) -> list[str]:
-    """What is said while two vehicles fly."""
+    """Return the notices of a flight of two vehicles."""
     sky, said = FleetSky(ports=[], uavs=2), []
     for step in range(round(10 * seconds)):
         now_ns = begins_ns + step * S // 10

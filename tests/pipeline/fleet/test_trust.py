@@ -1,4 +1,4 @@
-"""Who is believed: contradictions put a node aside, a hidden vehicle does not."""
+"""Trust in nodes: contradictions exclude a node, a single hidden vehicle does not."""
 
 from collections import Counter
 
@@ -34,7 +34,7 @@ def test_one_contradiction_is_none_and_several_are() -> None:
     for number in range(CONTRADICTIONS - 1):
         assert trust.note_contradiction(number * S, "b", "lies") == []
     assert trust.is_trusted("b")
-    assert trust.note_contradiction(100 * S, "b", "lies") == []  # the others are long ago
+    assert trust.note_contradiction(100 * S, "b", "lies") == []  # the others are too old
     (notice, *_) = [
         n
         for t in range(CONTRADICTIONS)
@@ -55,7 +55,7 @@ def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
         UnconfirmedVehicle("66:1", "b", (300.0, 0.0, 0.0)),
         UnconfirmedVehicle("67:1", "b", (0.0, 400.0, 0.0)),
     ]
-    far = Witness((5000.0, 0.0, 0.0), 1000.0, frozenset())  # it can say nothing
+    far = Witness((5000.0, 0.0, 0.0), 1000.0, frozenset())  # it receives nothing and cannot confirm
     said = look(trust, phantoms, {"a": HERE, "c": far}, SILENT_AFTER_NS // S + 2)
     assert len(said) == 1
     assert "node b is excluded for 5 minutes" in said[0]
@@ -75,7 +75,7 @@ def test_one_hidden_vehicle_is_unconfirmed_and_no_lie() -> None:
 
 
 def test_a_few_among_many_are_said_and_their_node_is_believed() -> None:
-    """A team behind a building is heard by the node beside it alone."""
+    """Only the node beside a team behind a building receives it."""
     trust = Trust()
     hidden = [UnconfirmedVehicle(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(4)]
     (said,) = look(trust, hidden, {"a": HERE}, 60, others=6)
@@ -90,7 +90,7 @@ def test_who_is_far_away_or_was_heard_before_is_no_phantom() -> None:
     near = [UnconfirmedVehicle(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(5)]
     heard = Witness((0.0, 0.0, 0.0), 1000.0, frozenset(one.uav for one in near))
     assert look(trust, near, {"a": HERE, "c": heard}, 60) == []
-    assert look(trust, near, {"b": HERE}, 60) == []  # nobody is its own witness
+    assert look(trust, near, {"b": HERE}, 60) == []  # a node does not confirm its own reports
     deaf = Witness((0.0, 0.0, 0.0), 10.0, frozenset())
     assert look(trust, near, {"a": deaf}, 60) == []
     assert trust.unconfirmed == frozenset()

@@ -1,6 +1,7 @@
-"""A service whose event loop is held up, over real datagrams: late is the machine, not the radio.
+"""A service whose event loop is blocked, over real datagrams: the delay is the machine's, not the
+radio's.
 
-What holds it up is ``time.sleep`` in the loop's own thread: that is the subject.
+``time.sleep`` in the loop's own thread blocks it on purpose.
 """
 
 import asyncio
@@ -33,7 +34,7 @@ from companion.values import Frame, Tick, Tock, Update
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="only Linux stamps datagrams")
 
 SOON_S = 0.25
-"""Sending takes less, also on a busy machine."""
+"""Sending takes less than this, also on a busy machine."""
 
 WAITING = READ_AT_ONCE + 8
 
@@ -45,7 +46,7 @@ def _stamped() -> Iterator[None]:
 
 
 class Flight:
-    """A service that is sent frames by who runs beside it, in its own thread."""
+    """A service that receives frames from a concurrent course in its own thread."""
 
     def __init__(self, service: Service, page: str) -> None:
         self.service = service
@@ -55,12 +56,12 @@ class Flight:
         self._socket = socket.socket(type=socket.SOCK_DGRAM)
 
     async def until_heard(self) -> None:
-        """Until the service has taken in all that was sent."""
+        """Wait until the service has processed all sent frames."""
         while self.service.pipeline.frames < len(self.sent_ns):
             await self.service.ticked()
 
     def hold_up(self, seconds: float) -> None:
-        """Send frames while nobody reads: more than are read at once."""
+        """Send frames while the loop is blocked: more than one read takes."""
         for _ in range(WAITING):
             self.sent_ns.append(self.service.now_ns())
             boot_ms = 1000 + (self.sent_ns[-1] - self.sent_ns[0]) // 1_000_000
@@ -68,7 +69,7 @@ class Flight:
             time.sleep(seconds / WAITING)
 
     async def ask(self, path: str) -> Any:
-        """The service's answer, whatever its status."""
+        """Return the service's response, whatever its status."""
 
         def answer() -> str:
             try:
@@ -86,7 +87,7 @@ class Flight:
 
 
 def fly(folder: Path, course: Callable[[Flight], Coroutine[Any, Any, None]]) -> Flight:
-    """Run a service, and a course beside it; the recording is in the folder afterwards."""
+    """Run a service with a concurrent course; the recording is in the folder afterwards."""
     settings = Settings().override(
         links={"urls": ["udpin:127.0.0.1:0"]},
         center={"source": "47.3977,8.5456,480"},
@@ -116,7 +117,7 @@ def fly(folder: Path, course: Callable[[Flight], Coroutine[Any, Any, None]]) -> 
 
 def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_path: Path) -> None:
     async def course(flight: Flight) -> None:
-        flight.hold_up(0.5)  # once: several in a row would be a machine that stays behind
+        flight.hold_up(0.5)  # once: several in a row would count as an overloaded machine
         await flight.until_heard()
         status = await flight.ask("/v1/status")
         assert 0.45 < status["arrival_lag"]["max_s"] < 5.0
@@ -135,7 +136,7 @@ def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_pa
     arrived_ns = [event.t_ns for event in events if isinstance(event, Frame)]
     late_s = [(a - b) * 1e-9 for a, b in zip(arrived_ns, flight.sent_ns, strict=True)]
     assert min(late_s) > -0.001 and max(late_s) < SOON_S
-    # The fold was given frames after a tick of a later time, and makes the same of them again.
+    # The pipeline received frames after a later tick, and a replay gives the same result.
     assert any(
         isinstance(a, Tick) and isinstance(b, Frame) and b.t_ns < a.t_ns
         for a, b in pairwise(events)
@@ -146,7 +147,7 @@ def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_pa
 
 def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> None:
     async def course(flight: Flight) -> None:
-        for _ in range(50):  # four are enough where it is asked at once
+        for _ in range(50):  # four suffice when queried at once
             flight.hold_up(0.7)
             await flight.until_heard()
             status, readiness = await flight.ask("/v1/status"), await flight.ask("/readyz")
@@ -156,12 +157,12 @@ def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> 
         assert not readiness["ready"]
         (reason,) = [one for one in readiness["reasons"] if "this machine is overloaded" in one]
         assert reason.startswith("this machine is overloaded: frames wait up to ")
-        assert readiness["reasons"] == [reason]  # what is late then is late for that
+        assert readiness["reasons"] == [reason]  # later frames are late for this reason
         said = [one["text"] for one in (await flight.ask("/v1/events"))["events"]]
         told = [text.startswith("this machine is overloaded") for text in said if "machine" in text]
         assert any(told) and all(
             a != b for a, b in pairwise(told)
-        )  # once, and once that it is over
+        )  # one notice, and one when it is over
         assert "\ncompanion_ready 0.0" in await flight.ask("/metrics")
 
     fly(tmp_path, course)
@@ -170,7 +171,7 @@ def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> 
 def test_what_comes_while_beams_are_made_is_taken_in_and_answered(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However long it takes to make them; a replay takes all in the same order."""
+    """However long the computation takes; a replay processes everything in the same order."""
     held, prepare_update = threading.Event(), Pipeline.prepare_update
     held.set()
 

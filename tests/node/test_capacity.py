@@ -1,4 +1,4 @@
-"""What a machine carries, by a clock that is the test's own."""
+"""Capacity of a machine, measured with the test's own clock."""
 
 from pathlib import Path
 
@@ -13,24 +13,24 @@ from companion.values import Event, Frame, Rejection, Source, Tick
 
 @pytest.fixture(autouse=True)
 def few(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small sky: what is flown longer, by more, is nothing else."""
+    """Use little traffic: more and longer traffic would be equivalent."""
     for name, value in {"FEW": 2, "MORE": 5, "SETTLED_S": 1, "MEASURED_S": 1}.items():
         monkeypatch.setattr(capacity, name, value)
 
 
 class Slow:
-    """A processor that needs a given time for each event, whatever it is."""
+    """A processor that needs a given time for each event of any kind."""
 
     def __init__(self, each_s: float) -> None:
         self.each_s, self.reads = each_s, 0
 
     def __call__(self) -> float:
         self.reads += 1
-        return self.reads // 2 * self.each_s  # read before an event and after it
+        return self.reads // 2 * self.each_s  # read before and after an event
 
 
 def test_what_is_carried_follows_from_what_events_take() -> None:
-    """Each report takes so long, and each update too, however many beams it has."""
+    """Each report and each update takes a fixed time, for any number of beams."""
     found = capacity.measure(Settings(), Slow(0.0011))
     assert [found.report_s, found.update_s] == pytest.approx([0.0011, 0.0011])
     spare = capacity.SHARE - 10 * 0.0011  # ten updates a second

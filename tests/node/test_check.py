@@ -1,4 +1,4 @@
-"""``companion check``: faults are named before a run, and what would hold a site back."""
+"""``companion check``: reports faults before a run, and whatever limits a site."""
 
 import json
 import os

@@ -1,4 +1,4 @@
-"""The node's clock: a timeline that never steps, and times that follow the wall clock."""
+"""The node's clock: a timeline without steps, and UTC times that follow the wall clock."""
 
 import asyncio
 import csv
@@ -23,7 +23,7 @@ S = 1_000_000_000
 
 
 class Machine:
-    """A wall clock that can be set, and the time since boot, which cannot."""
+    """A wall clock that can be set, and a boot time that cannot."""
 
     def __init__(self) -> None:
         self.set_ns = 0
@@ -54,7 +54,7 @@ def test_the_timeline_goes_on_when_the_clock_is_set_and_that_is_told_once() -> N
 
 
 def test_a_machine_that_sleeps_has_its_clock_not_set() -> None:
-    """Both clocks count the time asleep, so all that was heard before is that much older."""
+    """Both clocks count the suspended time, so everything received before is older by it."""
     machine = Machine()
     clock = machine.clock()
     before_ns = clock.now_ns()
@@ -77,11 +77,11 @@ def test_a_pause_between_two_clocks_is_no_step() -> None:
 SETTINGS = Settings().override(center={"source": "5:1"}, links={"urls": ["udpin:127.0.0.1:0"]})
 NTP_NS = 1_700_000_000 * S
 FRAMES = 350
-"""Heard of a log: the first second of four UAVs and the carrier."""
+"""Frames of a log: the first second of four UAVs and the carrier."""
 
 
 def flown(log: Path, machine: Machine, recordings: Path, said: list[str]) -> Service:
-    """A service that heard a log, and whose clock was set in the middle of it."""
+    """Return a service that replayed a log while its clock was set halfway."""
     settings = SETTINGS.override(recording={"directory": str(recordings)})
     node = Service(settings=settings, say=said.append, clock=machine.clock())
     assert node._recorder is not None
@@ -119,7 +119,7 @@ def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
     uavs = uav_state.uavs(node)["uavs"]
     assert uavs
     assert {one["valid_at"][:14] for one in uavs} == {"2023-11-14T22:"}
-    assert {one["fix"]["at"][:14] for one in uavs} == {"2023-11-14T22:"}  # also of before
+    assert {one["fix"]["at"][:14] for one in uavs} == {"2023-11-14T22:"}  # also for earlier times
     assert min(one["age_s"] for one in uavs) < 1  # the timeline has not moved
 
     (log,) = (tmp_path / "recordings").iterdir()
@@ -138,11 +138,11 @@ def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
         assert {row["t_utc"][:14] for row in csv.DictReader(file)} == {"2023-11-14T22:"}
     pipeline, update = look([log], SETTINGS, shown["time"])
     apart_ns = pipeline.utc_ns(update.t_ns) - node.pipeline.utc_ns(node.now_ns())
-    assert abs(apart_ns) < 2_000_000  # what is shown has milliseconds
+    assert abs(apart_ns) < 2_000_000  # displayed times have milliseconds
 
 
 def test_a_clock_that_is_set_changes_no_estimate(short_log: Path) -> None:
-    """The fold's own axis goes on as it does under a clock that is left alone."""
+    """The pipeline's timeline continues as with an untouched clock."""
     events = list(with_ticks(read_log(short_log), 10.0))[:FRAMES]
     middle = len(events) // 2
     alone, followed = Pipeline(SETTINGS), Pipeline(SETTINGS)

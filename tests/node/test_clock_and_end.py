@@ -1,4 +1,4 @@
-"""A port is taken, the end comes at a bad time: said, and nothing is lost."""
+"""Ports in use and shutdown at a bad time: reported, and no data is lost."""
 
 import signal
 import struct
@@ -18,7 +18,7 @@ RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--cente
 
 
 def started_in_the_background(*arguments: str) -> "subprocess.Popen[str]":
-    """As by ``companion run … &`` in a script: the shell has it ignore SIGINT."""
+    """Start as by ``companion run … &`` in a script, where the shell ignores SIGINT."""
     ignoring = "import os, signal, sys; signal.signal(signal.SIGINT, signal.SIG_IGN);"
     code = f"{ignoring} os.execv(sys.argv[1], sys.argv[1:])"
     return subprocess.Popen(
@@ -40,22 +40,22 @@ def test_a_start_in_the_background_ends_on_sigterm(tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_the_end_does_not_wait_for_a_leftover(tmp_path: Path, start_node: Any) -> None:
-    """Half a minute's work of recovery: its leftover is there for the next start."""
+    """Recovery takes half a minute; the leftover file remains for the next start."""
     leftover = tmp_path / "companion-1.mcap.active"
     leftover.write_bytes(MAGIC + _many_messages() * 10)
     node = start_node(*RUN, "--record", str(tmp_path))
     partial = tmp_path / "companion-1.mcap.recovering"
     until = time.monotonic() + HANG_S
     while not partial.exists() and time.monotonic() < until:
-        time.sleep(0.01)  # between two looks at what another process does
+        time.sleep(0.01)  # polling interval for another process
     assert partial.exists()
     returncode, _, err = node.stop()
     assert returncode == 0, err
-    assert leftover.exists()  # recovery was not waited for
+    assert leftover.exists()  # it did not wait for recovery
 
 
 def _many_messages() -> bytes:
-    """A chunk of half a million messages, not packed."""
+    """Return an uncompressed chunk of half a million messages."""
     name, protobuf = schemas.FRAMES_TOPIC.encode(), b"protobuf"
     schema = struct.pack("<H", 1) + _text(b"companion.Frame") + _text(protobuf) + _text(b"")
     channel = struct.pack("<HH", 1, 1) + _text(name) + _text(protobuf) + _text(b"")

@@ -1,4 +1,4 @@
-"""A mistake of ours: the service ends, with a traceback and a finished recording."""
+"""A program defect: the service ends with a traceback and a finished recording."""
 
 import subprocess
 import sys

@@ -1,4 +1,4 @@
-"""A recording's settings are data: replaying what others made touches no file that they name."""
+"""Recorded settings are data: a replay of a foreign recording touches no file that it names."""
 
 import base64
 import json
@@ -41,12 +41,12 @@ PATHS = {
     "fleet": {"node": "north", "ca": "{}/fifo", "certificate": "{}/fifo", "key": "{}/fifo"},
     "records": {"udp": ["192.0.2.1:1"], "shared_memory": "{}/written/ring"},
 }  # fmt: skip
-"""What a recording may say that a replay has no business with."""
+"""Recorded settings that a replay must not use."""
 SHORT = "companion: no beam was computed: the log is shorter than one update\n"
 
 
 def foreign(cut_log: Path, path: Path, sections: dict[str, Any]) -> Path:
-    """A recording of a real flight, with settings of somebody else's making."""
+    """Return a recording of a real flight with foreign settings."""
     text = tomli_w.dumps({"center": {"source": "5:1"}, **sections}).replace("{}", str(path.parent))
     with Writer(
         where=path, settings_toml=text, versions={}, weights_hz=None, started_ns=0
@@ -59,7 +59,7 @@ def foreign(cut_log: Path, path: Path, sections: dict[str, Any]) -> Path:
 
 
 def replayed(folder: Path, *arguments: object) -> "subprocess.CompletedProcess[str]":
-    """``companion replay`` in a folder, which ends within ``HANG_S`` or fails."""
+    """Run ``companion replay`` in a folder; it ends within ``HANG_S`` or fails."""
     command = [BIN / "companion", "replay", *map(str, arguments), "--json"]
     return subprocess.run(
         command, capture_output=True, text=True, check=False, timeout=HANG_S, cwd=folder
@@ -69,7 +69,7 @@ def replayed(folder: Path, *arguments: object) -> "subprocess.CompletedProcess[s
 def test_a_replay_writes_and_opens_nothing_that_a_recording_names(
     cut_log: Path, tmp_path: Path
 ) -> None:
-    os.mkfifo(tmp_path / "fifo")  # whoever opens it waits for ever
+    os.mkfifo(tmp_path / "fifo")  # opening it blocks forever
     (tmp_path / "written").mkdir()
     log = foreign(cut_log, tmp_path / "theirs.mcap", PATHS)
     here = tmp_path / "here"
@@ -117,7 +117,7 @@ def test_equipment_that_a_recording_only_names_is_refused(
 
 
 def equipped(folder: Path) -> Settings:
-    """Settings that name a file of every kind; the files are gone once they are read."""
+    """Return settings that name a file of every kind; the files are deleted after loading."""
     np.save(folder / "beams.npy", np.exp(1j * np.arange(12.0)).reshape(4, 3))
     np.save(folder / "mixed.npy", np.eye(4) + 0.1j)
     lines = [f"{c},{3 - c},{10 * c},0" for c in range(4)]
@@ -140,7 +140,7 @@ def equipped(folder: Path) -> Settings:
 
 
 def same_equipment(one: Settings, other: Settings) -> bool:
-    """Whether all files of both say the same."""
+    """Return whether all files have the same contents in both settings."""
     array, again = assembly.array(one), assembly.array(other)
     kept, found = assembly.equipment(one, array), assembly.equipment(other, again)
     assert kept.codebook is not None
@@ -181,7 +181,7 @@ def test_files_that_settings_name_are_attached_to_the_recording(
 def test_files_within_the_settings_of_an_older_recording_are_used(
     cut_log: Path, tmp_path: Path, paths: bool
 ) -> None:
-    """The first recording had the paths as well; one of its replay had none."""
+    """The first recording also had the paths; the recording of its replay had none."""
     given, log = equipped(tmp_path), tmp_path / "older.mcap"
     sections = given.model_dump(mode="json", exclude_none=True)
     for file in NAMED_FILES:
@@ -237,7 +237,7 @@ def test_attachments_that_settings_do_not_name_are_not_kept(cut_log: Path, tmp_p
 
 
 def test_each_key_that_names_a_file_is_known() -> None:
-    """A new one must say what takes its place in a recording, or stay out of what is taken."""
+    """A new key must name its attachment or be excluded from a replay."""
     paths = {
         (section, key)
         for section in REPLAYED_SECTIONS
@@ -270,7 +270,7 @@ def test_nested_settings_are_refused_in_a_line(text: str) -> None:
 
 
 def test_the_largest_array_is_not_too_large() -> None:
-    """On one line, as somebody may write it, and as a recording has it."""
+    """On one line, as a user may write it, and as recorded."""
     rows = np.random.default_rng(1).uniform(-1e4, 1e4, (4096, 6)).tolist()
     text = f"[array]\nkind = 'list'\npositions_m = {rows}\n"
     found = Settings.from_toml(text, "x")

@@ -1,4 +1,4 @@
-"""What goes from the links to the fold and its recording, and what does not."""
+"""Events that the links pass to the pipeline and its recording, and those that are dropped."""
 
 import asyncio
 import socket
@@ -19,14 +19,14 @@ SECRET = bytes(range(100, 132))
 
 
 def setup_signing() -> bytes:
-    """The message by which a ground station hands out a signing key, from 255:190."""
+    """Return the SETUP_SIGNING message by which 255:190 distributes a signing key."""
     sender = dialect.MAVLink(None, srcSystem=255, srcComponent=190)
     message = dialect.MAVLink_setup_signing_message(1, 1, list(SECRET), 7)
     return bytes(message.pack(sender))
 
 
 def test_a_signing_key_goes_no_further_and_that_is_counted() -> None:
-    """Neither to the fold nor, with it, into a recording; what comes before and after it does."""
+    """It reaches neither the pipeline nor a recording; the frames before and after it do."""
     stepped: list[Event] = []
     sent = [frame(1), setup_signing(), frame(2)]
 
@@ -78,13 +78,13 @@ def test_timestamps_that_cannot_be_saved_are_reported_once(monkeypatch: pytest.M
 
 
 def beat() -> bytes:
-    """A heartbeat of 1:1."""
+    """Return a heartbeat of 1:1."""
     message = dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
     return bytes(message.pack(dialect.MAVLink(None, srcSystem=1, srcComponent=1)))
 
 
 def test_a_uav_is_asked_over_the_link_on_which_it_was_heard_last() -> None:
-    """Its positions come too seldom. It came over the first link, and is now on the second."""
+    """Its position rate is too low. It was received on the first link and is now on the second."""
     stepped: list[Event] = []
     now_s = [1]
 
@@ -138,7 +138,7 @@ def test_a_uav_is_asked_over_the_link_on_which_it_was_heard_last() -> None:
 
 
 def where(north_m: float, boot_ms: int) -> bytes:
-    """1:1 says that it stands so far north of a place."""
+    """Return a position of 1:1 at a distance north of the origin."""
     mav = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
     lat = 473977419 + round(north_m * 1e7 / 111_195.0)
     return bytes(
@@ -152,7 +152,7 @@ def where(north_m: float, boot_ms: int) -> bytes:
 def test_two_peers_that_contradict_each_other_are_said_once_and_not_believed(
     routers: list[str],
 ) -> None:
-    """The second copies the clock, and says to be 20 m beside: less than the gate can tell."""
+    """The second one copies the clock and claims to be 20 m away: too little for the gate."""
     stepped: list[Event] = []
     said: list[Notice] = []
     now_ms = 100_000

@@ -1,4 +1,4 @@
-"""A log up to one time, to the nanosecond."""
+"""A log up to a given time, to the nanosecond."""
 
 from itertools import pairwise
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""What goes on to others over a link, as pymavlink hears it."""
+"""Tracks forwarded over an output link, as pymavlink receives them."""
 
 import asyncio
 import socket

@@ -1,4 +1,4 @@
-"""Weights pushed over UDP to somebody who does not listen yet."""
+"""Weights pushed over UDP to a receiver that does not listen yet."""
 
 import asyncio
 import socket
@@ -37,7 +37,9 @@ def test_who_does_not_listen_is_said_once_and_that_it_does_after_a_while() -> No
                 await asyncio.sleep(0)
                 await asyncio.sleep(0)
 
-        await pushed(RECOVERED_AFTER)  # every second one is told that the one before was refused
+        await pushed(
+            RECOVERED_AFTER
+        )  # every second datagram reports that the previous one was refused
         assert [one.text.partition(":")[2] for one in notices] == [
             f"{to[1]} fail: Connection refused"
         ]

@@ -1,4 +1,4 @@
-"""What the API says of a recording while a service runs and while a replay is served."""
+"""Recording status in the API, of a running service and of a served replay."""
 
 from pathlib import Path
 from types import SimpleNamespace

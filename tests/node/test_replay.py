@@ -1,4 +1,4 @@
-"""``companion replay``: logs of other people's software through the whole program."""
+"""``companion replay``: third-party logs through the whole program."""
 
 import json
 import subprocess
@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from pymavlink import mavutil  # the oracle: tests alone may import it
+from pymavlink import mavutil  # the oracle: only tests may import it
 from support import BIN, HANG_S, shared_log
 
 from companion.beams.array.steering import steering_matrix
@@ -28,7 +28,8 @@ def replay(*arguments: str | Path, check: bool = True) -> "subprocess.CompletedP
 
 
 def counted(log: Path) -> tuple[int, Counter[str], Counter[str]]:
-    """Frames, and by source GLOBAL_POSITION_INT with and without a position, by pymavlink."""
+    """Return pymavlink's frame count, and per source the GLOBAL_POSITION_INT with and without
+    position."""
     reader = mavutil.mavlogfile(str(log))
     frames, placed, zero = 0, Counter[str](), Counter[str]()
     while (message := reader.recv_match()) is not None:
@@ -49,7 +50,7 @@ def test_counts_are_those_of_pymavlink(tmp_path: Path) -> None:
     assert summary["frames"] == frames == 116_764
     assert placed.pop("5:1") > 0
     telemetry = {uav: n for uav, n in summary["reports"].items() if not uav.startswith("icao:")}
-    waited = {uav: placed[uav] - n for uav, n in telemetry.items()}  # for a receiver that vouches
+    waited = {uav: placed[uav] - n for uav, n in telemetry.items()}  # waiting for a receiver status
     assert all(0 <= n <= 5 for n in waited.values())
     assert sum(waited.values()) <= summary["rejected"].get("no-fix", 0)
     assert set(telemetry) == {"1:1", "2:1", "3:1", "4:1"}
@@ -66,7 +67,7 @@ def test_counts_are_those_of_pymavlink(tmp_path: Path) -> None:
 def test_a_short_flight_replays_to_the_same_digest(short_log: Path, tmp_path: Path) -> None:
     recording = tmp_path / "cut.mcap"
     first = json.loads(replay(short_log, "--center", "5:1", "--out", recording, "--json").stdout)
-    # By another process, or by this one: it is the same.
+    # Another process and this one give the same.
     done = CliRunner().invoke(main, ["replay", str(recording), "--no-record", "--json"])
     second = json.loads(done.stdout)
     assert second["digest"] == first["digest"]
@@ -113,7 +114,7 @@ def test_every_log_survives(name: str, uavs: int | None) -> None:
 
 
 def test_zero_forcing_holds_at_every_update(cut_log: Path) -> None:
-    """With sharp beams; wide ones give nulls up that would cost too much of what is sure."""
+    """With narrow beams; widened ones give up nulls that would cost too much guaranteed gain."""
     settings = Settings().override(center={"source": "5:1"}, beams={"widen": "no"})
     pipeline, checked = Pipeline(settings), 0
     for event in with_ticks(read_log(cut_log), settings.beams.update_hz):

@@ -1,4 +1,4 @@
-"""The live service as its users have it: real processes, real UDP, real HTTP."""
+"""The live service as users run it: real processes, real UDP, real HTTP."""
 
 import io
 import json
@@ -33,19 +33,19 @@ position_noise_m = 1.0
 velocity_noise_mps = 0.1
 """
 STAMPS_OFF_DEG = 0.5
-"""What the flown log's own stamps, those of sending, are worth at 29 degrees a second."""
+"""Error of the flown log's own (sending) stamps at 29 degrees/s."""
 
 
 def fly(port: int, record: Path, seconds: float = 5.0) -> Any:
-    """The paper's four UAVs and the carrier, as real traffic."""
+    """Send the paper's four UAVs and the carrier as real traffic."""
     to = f"udpout:127.0.0.1:{port}"
     command = [BIN / "sitl-replay", "fly", "paper", "--to", to, "--duration", str(seconds)]
     return started([*command, "--record", str(record)], stdout=subprocess.PIPE, text=True)
 
 
 def true_bearings_deg(tlog: Path) -> dict[str, Any]:
-    """By UAV, a function of Unix seconds: the bearing from the carrier, from what was flown;
-    not a number before and after."""
+    """Return, per UAV, a function from Unix seconds to the true bearing from the carrier; NaN
+    outside the flight."""
     seen: dict[str, list[tuple[float, float, float, float]]] = {}
     for event in read_log(tlog):
         message = decode(event) if isinstance(event, Frame) else None
@@ -96,16 +96,18 @@ def test_follows_flying_vehicles_and_stops_cleanly(
         at = datetime.fromisoformat(answer["valid_at"]).timestamp()
         for beam in answer["beams"]:
             true_deg = bearing_at[beam["uav"]](at)
-            if math.isnan(true_deg):  # past the last thing flown
+            if math.isnan(true_deg):  # after the end of the flight
                 continue
             off_deg = abs((beam["bearing_deg"] - true_deg + 180) % 360 - 180)
-            bound_deg = beam["pointing_bound_deg"]  # null: any direction, before the clock settles
+            bound_deg = beam[
+                "pointing_bound_deg"
+            ]  # null means any direction, before the clock settles
             assert off_deg <= (180 if bound_deg is None else bound_deg) + STAMPS_OFF_DEG, beam
             bounded += bound_deg is not None and bound_deg < 10
             errors_deg.append(off_deg)
             travelled[beam["uav"]].append(true_deg)
-    assert len(errors_deg) > 4  # a very busy machine answers once or twice meanwhile
-    assert bounded > len(errors_deg) / 20  # not in the first seconds, nor where the machine lags
+    assert len(errors_deg) > 4  # a very busy machine answers only once or twice
+    assert bounded > len(errors_deg) / 20  # not in the first seconds or while the machine lags
     assert np.median(errors_deg) < 0.5
     assert all(max(angles) - min(angles) > 30 for angles in travelled.values())
 
@@ -144,7 +146,7 @@ def test_weights_point_where_the_beams_say(start_node: Any, tmp_path: Path) -> N
 
 @pytest.mark.full
 def test_beams_say_what_they_are_worth(start_node: Any, tmp_path: Path) -> None:
-    """Gain, what is guaranteed of it, signal to noise, and the stored beams to be swept."""
+    """Gain, guaranteed gain, SINR, and the codebook beams to sweep."""
     config = tmp_path / "settings.toml"
     config.write_text(PAPER_BOUNDS + '[codebook]\nkind = "dft"\n', encoding="utf-8")
     node = start_node(*RUN, "--config", str(config))
@@ -178,7 +180,7 @@ def test_beams_say_what_they_are_worth(start_node: Any, tmp_path: Path) -> None:
     for entry in pattern["patterns"]:
         assert len(entry["response_db"]) == 721
         at = np.interp(entry["target_deg"], pattern["angles_deg"], entry["response_db"])
-        # The lobe that holds the target; a broadened one beside a null need not peak there.
+        # The lobe that contains the target; a widened one beside a null may peak elsewhere.
         assert entry["peak_db"] - 15 < at <= entry["peak_db"] + 0.5
         assert len(entry["null_depths_db"]) == 3
         if pattern["method"] == "zf":

@@ -1,4 +1,4 @@
-"""``companion replay --serve``: the page and the API over a replay, as its users have them."""
+"""``companion replay --serve``: page and API over a replay, as users run it."""
 
 import asyncio
 import json
@@ -28,7 +28,7 @@ RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--cente
 
 
 class Replaying(Node):
-    """A ``companion replay --serve`` process, and its address; said on stderr."""
+    """A ``companion replay --serve`` process and its address, read from stderr."""
 
     def __init__(self, *arguments: str | Path) -> None:
         self.process = subprocess.Popen(
@@ -45,7 +45,7 @@ class Replaying(Node):
         self.url, self.log = found[1], found[2]
 
     def stop(self, number: signal.Signals = signal.SIGTERM) -> tuple[int, str, str]:
-        """Exit status, stdout and stderr after a signal."""
+        """Return exit status, stdout and stderr after a signal."""
         self.process.send_signal(number)
         out, err = self.process.communicate(timeout=HANG_S)
         return self.process.returncode, out, err
@@ -53,7 +53,7 @@ class Replaying(Node):
 
 @pytest.fixture
 def start_replay() -> Iterator[Any]:
-    """Starts replays, and ends those that a test left."""
+    """Start replays, and stop those that a test leaves running."""
     started: list[Replaying] = []
 
     def start(*arguments: str | Path) -> Replaying:
@@ -67,7 +67,7 @@ def start_replay() -> Iterator[Any]:
 
 @pytest.fixture
 def unserved(cut_log: Path) -> dict[str, Any]:
-    """What a replay that nobody looks at comes to."""
+    """Return the summary of a replay that is not served."""
     return replay([cut_log], Settings().override(center={"source": "5:1"}))
 
 
@@ -82,11 +82,11 @@ def test_it_is_served_while_it_goes_and_at_its_end(
     while not seen or seen[-1]["replay"]["state"] == "running":
         seen.append(node.json("/v1/status"))
         ahead_s = seen[-1]["replay"]["at_s"] - 10 * (time.monotonic() - began_s)
-        assert ahead_s < 0.5  # it says that it serves before it begins
+        assert ahead_s < 0.5  # it announces its address before it starts
         assert time.monotonic() - began_s < 30
     at_s = [answer["replay"]["at_s"] for answer in seen]
     assert at_s == sorted(at_s)
-    assert len({round(at) for at in at_s}) > 12  # in steps that a person can follow
+    assert len({round(at) for at in at_s}) > 12  # in small steps
     last = seen[-1]
     assert last["replay"] == {
         "log": cut_log.name,
@@ -129,7 +129,7 @@ def test_a_replay_that_is_stopped_sums_up_what_there_was(
     out = tmp_path / "part.mcap"
     node = start_replay(cut_log, "--center", "5:1", "--out", out, "--json")
     status = node.wait_until("/v1/status", lambda answer: answer["replay"]["at_s"] > 0.5)
-    assert status["replay"]["speed"] == 1.0  # what it is unless said
+    assert status["replay"]["speed"] == 1.0  # the default
     assert node.json("/readyz")["ready"]
     returncode, stdout, err = node.stop(signal.SIGTERM)
     assert returncode == 0, err
@@ -169,7 +169,7 @@ def test_on_plain_asyncio_as_fast_as_it_goes(cut_log: Path, unserved: dict[str, 
 
 
 def test_now_does_not_go_back_for_a_frame_that_waited(tmp_path: Path) -> None:
-    """It is taken in after a tick of a later time, with the time at which it arrived."""
+    """The frame is processed after a later tick, with its true arrival time."""
     settings, begun_ns = Settings().override(center={"source": "5:1"}), 1_760_000_000 * 10**9
     late = Frame(
         t_ns=begun_ns + 500_000_000, link="udp", source=Source(1, 1), msgid=33, raw=frame(1)
@@ -235,13 +235,13 @@ def test_a_mistake_is_one_line_and_leaves_nothing(
 
 @pytest.mark.full
 def test_the_address_of_the_recorded_run_is_not_taken(tmp_path: Path, cut_log: Path) -> None:
-    """A recording holds the settings of its run: its port is another program's by now."""
+    """A recording holds the settings of its run, whose port may now be in use."""
     recorded = tmp_path / "x.mcap"
     settings = tmp_path / "settings.toml"
     settings.write_text('[server]\nlisten = "192.0.2.1:1"\n[center]\nsource = "5:1"\n')
     command = ["replay", cut_log, "--config", settings, "--out", recorded]
     subprocess.run([BIN / "companion", *command], check=True, capture_output=True, timeout=HANG_S)
-    with socket.socket() as taken:  # the default port is taken, if not by others then by us
+    with socket.socket() as taken:  # the default port is in use, by others or by this test
         taken.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             taken.bind(("127.0.0.1", 8080))

@@ -1,4 +1,4 @@
-"""What systemd is told: by a real service, over real Unix sockets."""
+"""Messages to systemd by a real service over real Unix sockets."""
 
 import asyncio
 import os
@@ -33,7 +33,7 @@ class Listener:
         self.socket.bind("\0" + address[1:] if address.startswith("@") else address)
 
     def next(self, seconds: float) -> list[str] | None:
-        """The lines of the next message; None where none comes in time."""
+        """Return the lines of the next message; None after a timeout."""
         self.socket.settimeout(seconds)
         try:
             return self.socket.recv(4096).decode().split("\n")
@@ -41,7 +41,7 @@ class Listener:
             return None
 
     def wait_for(self, line: str, seconds: float = HANG_S) -> list[str]:
-        """The first message with that line."""
+        """Return the first message with that line."""
         end = time.monotonic() + seconds
         while (left_s := end - time.monotonic()) > 0:
             lines = self.next(left_s)
@@ -50,7 +50,7 @@ class Listener:
         pytest.fail(f"no {line}")
 
     def drain(self) -> None:
-        """Forget what has come."""
+        """Discard pending messages."""
         self.socket.setblocking(False)
         with pytest.raises(BlockingIOError):
             while True:
@@ -61,7 +61,7 @@ class Listener:
 def listener(
     request: pytest.FixtureRequest, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> Iterator[Listener]:
-    """Named in the environment, as systemd does for what it starts."""
+    """Return a listener named in the environment, as systemd does."""
     names = {"path": str(tmp_path / "notify"), "abstract": f"@companion-test-{os.getpid()}"}
     monkeypatch.setenv("NOTIFY_SOCKET", names[request.param])
     heard = Listener(names[request.param])
@@ -76,17 +76,17 @@ def test_ready_alive_and_stopping(
     monkeypatch.setenv("WATCHDOG_USEC", str(round(WATCHDOG_S * 1e6)))
     node = start_node(*RUN)
     first = listener.wait_for("READY=1")
-    assert node.get("/healthz")[0] == 200  # at once: ready means ready
+    assert node.get("/healthz")[0] == 200  # at once after READY
     assert "STATUS=UAVs: none; links up: 1 of 1; recording: off" in first
     gaps_s, last_s = [], time.monotonic()
     for _ in range(5):
-        lines = listener.wait_for("WATCHDOG=1", WATCHDOG_S)  # in time, each of them
+        lines = listener.wait_for("WATCHDOG=1", WATCHDOG_S)  # each one in time
         assert "READY=1" not in lines
         gaps_s.append(time.monotonic() - last_s)
         last_s += gaps_s[-1]
     assert sorted(gaps_s)[2] == pytest.approx(WATCHDOG_S / 2, abs=WATCHDOG_S / 8)
 
-    node.process.send_signal(signal.SIGSTOP)  # as good as an event loop that is blocked
+    node.process.send_signal(signal.SIGSTOP)  # equivalent to a blocked event loop
     listener.drain()
     assert listener.next(2 * WATCHDOG_S) is None
     node.process.send_signal(signal.SIGCONT)
@@ -103,7 +103,7 @@ def test_ready_alive_and_stopping(
 def test_no_signs_of_life_where_none_are_asked_for(
     listener: Listener, start_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """``WATCHDOG_PID`` is another process's: the variables were inherited."""
+    """``WATCHDOG_PID`` belongs to another process: the variables were inherited."""
     monkeypatch.setenv("WATCHDOG_USEC", "100000")
     monkeypatch.setenv("WATCHDOG_PID", "1")
     node = start_node(*RUN)
@@ -114,7 +114,7 @@ def test_no_signs_of_life_where_none_are_asked_for(
 
 
 def test_late_beams_are_no_sign_of_life(tmp_path: Path) -> None:
-    """The event loop turns, but nobody makes beam updates."""
+    """The event loop runs, but no beam updates are made."""
     settings = Settings().override(center={"source": "5:1"}, links={"urls": ["udpin:127.0.0.1:0"]})
     heard = Listener(str(tmp_path / "notify"))
     said: list[str] = []
@@ -138,7 +138,7 @@ def test_late_beams_are_no_sign_of_life(tmp_path: Path) -> None:
         done.result(HANG_S)
     assert "READY=1" in messages[0]
     assert "beam updates are late" in messages[0][-1]
-    assert len(messages) > 10  # it looks again often: a hold-up must not cost a restart
+    assert len(messages) > 10  # it checks often: a short delay must not cause a restart
     assert not any("WATCHDOG=1" in lines for lines in messages)
 
 
@@ -214,7 +214,7 @@ def test_a_socket_that_cannot_be_had_is_a_reason() -> None:
 
 
 def test_a_full_socket_does_not_hold_the_service_up(tmp_path: Path) -> None:
-    """Nobody reads: the kernel takes some, then refuses at once."""
+    """Nothing reads the socket: the kernel accepts some messages, then refuses at once."""
     heard = Listener(str(tmp_path / "notify"))
     with closing(heard.socket):
         manager = systemd.Manager(str(tmp_path / "notify"))
@@ -252,4 +252,4 @@ def test_the_documented_unit_is_good(tmp_path: Path) -> None:
         check=False,
         timeout=HANG_S,
     )
-    assert "WatchDogSec" in done.stderr  # it does look
+    assert "WatchDogSec" in done.stderr  # the check is effective

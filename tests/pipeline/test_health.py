@@ -78,7 +78,7 @@ class Watch:
 
 
 SURE, USUAL, WILD = (0.5, 0.1), (12.0, 0.5), (60.0, 50.0)
-"""Bound and usual error with which 10 dB are guaranteed, likely, and neither, at 100 m."""
+"""Bound and p95 error at 100 m with which 10 dB are guaranteed, likely, and neither."""
 
 
 @pytest.mark.parametrize(("errors", "level"), [(SURE, "good"), (USUAL, "weak"), (WILD, "none")])

@@ -1,4 +1,4 @@
-"""A node that stands still: a pipeline that has seen a flight, and a server in this process."""
+"""A stand-in node: a pipeline that has processed a flight, and a server in this process."""
 
 import asyncio
 import contextlib
@@ -30,7 +30,7 @@ FLOWN_S = 6.0
 
 
 class StandIn:
-    """What the server looks at, without links and clocks: time moves with ``tick`` alone."""
+    """The node interface of the server, without links and clocks: only ``tick`` advances time."""
 
     def __init__(self, settings: Settings, *, flown: bool = True) -> None:
         self.pipeline = Pipeline(settings)
@@ -63,14 +63,14 @@ class StandIn:
             self.notices += [output for output in outputs if isinstance(output, Notice)]
 
     def tick(self, after_s: float = 0.1) -> None:
-        """Time passes, and the beams are updated."""
+        """Advance time and update the beams."""
         self._now_ns += round(after_s * 1e9)
         self.pipeline.step(Tick(self._now_ns))
         self._ticked.set()
         self._ticked.clear()
 
     def say(self, text: str) -> None:
-        """A notice to the operator."""
+        """Publish a notice to the operator."""
         self.notices.append(
             Notice(t_ns=self._now_ns, severity=Severity.INFO, subject="test", text=text)
         )
@@ -80,15 +80,15 @@ class StandIn:
         await self._ticked.wait()
 
     def now_ns(self) -> int:
-        """The time of the last event."""
+        """Return the time of the last event."""
         return self._now_ns
 
     def uptime_s(self) -> float:
-        """Some time."""
+        """Return a fixed uptime."""
         return 12.5
 
     def links(self) -> list[LinkStatus]:
-        """One link that hears one vehicle, and one that hears nobody."""
+        """Return one link that receives one vehicle, and one that receives nothing."""
         heard = {Source(1, 1): ComponentStatus(frames=7, gaps=1, heard_ns=self._now_ns, mavlink=2)}
         lost = {"garbage": 12}
         one = LinkStatus(
@@ -104,25 +104,25 @@ class StandIn:
         return [one, LinkStatus(url="serial:/dev/ttyS0:57600", state="connecting")]
 
     def out_links(self) -> list[LinkStatus]:
-        """One that has said something."""
+        """Return one output link that has sent something."""
         return [
             LinkStatus(url="cot:udp:127.0.0.1:6969", state="up", peers=1, sent=12, send_dropped=3)
         ]
 
     def recording(self) -> RecordingStatus:
-        """As the test says."""
+        """Return the recording status set by the test."""
         return self.current
 
     def rates(self) -> dict[str, float | None]:
-        """One that is known and one that is not."""
+        """Return one known and one unknown rate."""
         return {"frames_hz": 70.0, "updates_hz": None}
 
     def unfit(self) -> list[str]:
-        """Nothing is wrong."""
+        """Return no reason: the node is fit."""
         return []
 
     def message_rates(self) -> list[MessageRate]:
-        """One that is asked for."""
+        """Return one requested message rate."""
         return [
             MessageRate(
                 uav=Source(1, 1),
@@ -136,27 +136,29 @@ class StandIn:
         ]
 
     def events(self) -> list[Notice]:
-        """What was said."""
+        """Return the published notices."""
         return list(self.notices)
 
     def fleet_status(self) -> FleetStatus | None:
-        """As the test says."""
+        """Return the fleet status set by the test."""
         return self.fleet
 
     def replay(self) -> ReplayStatus | None:
-        """As the test says."""
+        """Return the replay status set by the test."""
         return self.replayed
 
 
 def settings(**sections: dict[str, object]) -> Settings:
-    """Those of the log, with what is asked for besides; test clients call it ``testserver``."""
+    """Return the log's settings plus those of the test; test clients use the host
+    ``testserver``.
+    """
     made = Settings().override(center={"source": "5:1"}, server={"hosts": ["testserver"]})
     return made.override(**sections)
 
 
 @pytest.fixture
 def make_node() -> Callable[..., StandIn]:
-    """A node after some seconds of flight, or before (``flown=False``), with settings."""
+    """Return a node after some seconds of flight, or before it (``flown=False``), with settings."""
 
     def make(*, flown: bool = True, **sections: dict[str, object]) -> StandIn:
         return StandIn(settings(**sections), flown=flown)
@@ -166,7 +168,7 @@ def make_node() -> Callable[..., StandIn]:
 
 @pytest.fixture(scope="module")
 def shared_node() -> StandIn:
-    """One that no test changes: a beam has been made, and there is a codebook."""
+    """Return a node that no test modifies: it has beams and a codebook."""
     node = StandIn(settings(codebook={"kind": "dft"}))
     node.tick(0.0)
     return node
@@ -174,7 +176,7 @@ def shared_node() -> StandIn:
 
 @pytest.fixture
 def serving() -> Callable[..., contextlib.AbstractAsyncContextManager[str]]:
-    """Serve a node on this event loop, over a real socket: gives HOST:PORT."""
+    """Serve a node on this event loop over a real socket; yields HOST:PORT."""
 
     @contextlib.asynccontextmanager
     async def serve(node: StandIn, token: str | None = None) -> AsyncIterator[str]:

@@ -1,4 +1,4 @@
-"""Who may listen where, and what it takes."""
+"""Addresses on which the server may listen, and the token that they require."""
 
 import pytest
 
@@ -7,7 +7,7 @@ from companion.server.access import ListenError, bind
 
 @pytest.mark.parametrize("token", [None, ""])
 def test_an_address_that_others_reach_wants_a_token_or_a_word(token: str | None) -> None:
-    """An empty token is none; a good one, or saying that it may lie open, will do."""
+    """An empty token does not count; a valid one or the insecure flag does."""
     with pytest.raises(ListenError, match=r"0\.0\.0\.0:0: other machines can reach this address"):
         bind("0.0.0.0:0", token=token, insecure=False)
     bind("0.0.0.0:0", token="secret", insecure=False).close()

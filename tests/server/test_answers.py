@@ -1,4 +1,4 @@
-"""Every answer is what its model says, no more and no less; every error is a problem."""
+"""Every response matches its model exactly; every error is problem+json."""
 
 import asyncio
 import io
@@ -67,14 +67,14 @@ def client(shared_node: Any) -> Iterator[TestClient]:
 
 
 def holds(model: Any, answer: Any) -> None:
-    """The answer has the fields of the model, all of them, none besides, of its types."""
+    """Check that the response has exactly the fields of the model, with its types."""
     adapter = TypeAdapter(models.outward(model))
     read = adapter.validate_json(orjson.dumps(answer), strict=True)
     assert adapter.dump_python(read, mode="json") == answer
 
 
 def test_messages_are_found_by_system_and_component(make_node: Any) -> None:
-    """In this order, where the two numbers differ."""
+    """In this order, with two different numbers."""
     node = make_node(flown=False)
     raw = pack(heartbeat(Source(sysid=7, compid=9)), 0)
     node.last_messages.add(
@@ -96,7 +96,7 @@ def test_an_answer_is_what_its_model_says(client: TestClient, path: str) -> None
 
 
 def test_what_is_compared_is_not_empty(client: TestClient) -> None:
-    """Lists with nothing in them would hold whatever the model says."""
+    """Empty lists would match any model."""
     uavs = client.get("/v1/uavs").json()["uavs"]
     assert {uav["id"].startswith("icao:") for uav in uavs} == {True, False}
     beams = client.get("/v1/beams").json()["beams"]
@@ -129,7 +129,7 @@ def test_every_path_of_the_document_is_held_against_its_model(client: TestClient
 def test_the_document_is_made_beside_the_event_loop(
     make_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """It takes a fifth of a second, and everybody else would wait for whoever asks first."""
+    """It takes 0.2 s, in which all other requests would wait."""
     beside = []
 
     def on_loop(**asked: Any) -> Any:
@@ -158,7 +158,7 @@ def test_the_document_shows_problems_as_problems(client: TestClient) -> None:
 
 
 def test_the_document_says_what_every_field_and_parameter_means(client: TestClient) -> None:
-    """With the unit that its name ends in."""
+    """With the unit in which its name ends."""
     document = client.get("/openapi.json").json()
     lacking: list[str] = []
     for model, schema in document["components"]["schemas"].items():
@@ -205,7 +205,7 @@ def test_every_error_is_a_problem(client: TestClient, method: str, path: str, st
 
 def test_a_mistake_of_ours_is_a_problem_too(make_node: Any) -> None:
     node = make_node(flown=False)
-    del node.notices  # so that `events` fails
+    del node.notices  # makes `events` fail
     with TestClient(create_app(node), raise_server_exceptions=False) as client:
         answer = client.get("/v1/events")
     assert answer.status_code == 500
@@ -237,7 +237,7 @@ def test_what_is_accepted_is_given(accept: str, form: str | None) -> None:
 
 
 def test_raw_weights_are_told_by_their_headers_and_npy_is_in_c_order(client: TestClient) -> None:
-    """All that is needed to read them, and the same numbers in each form."""
+    """The headers suffice to read them, and every format holds the same numbers."""
     forms = ("application/octet-stream", "application/x-npy", "application/json")
     raw, npy, told = (client.get("/v1/beams/weights", headers={"accept": form}) for form in forms)
     given = raw.headers
@@ -263,11 +263,11 @@ def test_numbers_that_are_none_are_null(make_node: Any) -> None:
 
 
 def test_the_design_is_that_of_the_observer_in_use(client: TestClient, shared_node: Any) -> None:
-    """L by its definition, A(T) M(T); the worst error within the guarantee, at each interval."""
+    """L by its definition, A(T) M(T); the largest error within the guarantee, at each interval."""
     shown = client.get("/v1/design").json()
     pipeline, certificate = shared_node.pipeline, shown["certificate"]
     assert shown["assumed"]["acceleration_max_mps2"] == 16.0
-    assert certificate["scale"] == pytest.approx(6.0)  # 3 m of noise for the table's 0.5 m
+    assert certificate["scale"] == pytest.approx(6.0)  # 3 m of noise instead of the table's 0.5 m
     p = np.array(certificate["P"])
     assert certificate["bound_m"] == pytest.approx(6 * np.sqrt(np.linalg.inv(p)[0, 0]))
     for row in shown["designs"]:
@@ -304,7 +304,9 @@ def test_the_position_model_shows_what_companion_design_prints(make_node: Any) -
 
 
 def test_a_beam_costs_what_nulls_take_and_what_its_turn_does(make_node: Any) -> None:
-    """With so low a limit everybody has a turn alone: nothing is lost, but for three others."""
+    """At so low a limit every UAV has its own time slot: no null loss, but a quarter of the
+    time.
+    """
     node = make_node(beams={"policy": "group", "condition_limit": 1.0001, "widen": False})
     node.tick(0.0)
     with TestClient(create_app(node)) as client:
@@ -318,7 +320,7 @@ def test_a_beam_costs_what_nulls_take_and_what_its_turn_does(make_node: Any) -> 
 def test_a_bearing_is_from_true_north_however_the_carrier_is_turned(
     client: TestClient, shared_node: Any
 ) -> None:
-    """By where track and carrier are; angles in the array turn with it."""
+    """From the positions of track and carrier; angles in the array rotate with it."""
     now_ns, delay_ns = shared_node.now_ns(), 10_000_000
     headers = client.get("/v1/beams/weights", headers={"accept": "application/x-npy"}).headers
     later_s = (int(headers["x-valid-at-ns"]) - now_ns - delay_ns) * 1e-9
@@ -330,7 +332,7 @@ def test_a_bearing_is_from_true_north_however_the_carrier_is_turned(
         north, east, _ = positions[beam["uav"]] - update.carrier.position_ned_m
         off_deg = beam["bearing_deg"] - np.degrees(np.arctan2(east, north))
         assert (off_deg + 180) % 360 - 180 == pytest.approx(0.0, abs=0.01)
-    assert abs(shown["array"]["boresight_bearing_deg"]) > 5  # it is turned
+    assert abs(shown["array"]["boresight_bearing_deg"]) > 5  # the carrier is rotated
 
 
 def test_how_far_the_machine_is_behind(make_node: Any) -> None:

@@ -1,4 +1,4 @@
-"""The map under the plan view: ranges of the user's file, or none; never one that a log names."""
+"""The map under the plan view: byte ranges of the user's file, never of a file named in a log."""
 
 from pathlib import Path
 from typing import Any

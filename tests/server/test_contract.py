@@ -1,6 +1,6 @@
-"""Requests of every kind, made from the OpenAPI document: none is answered against it, or by 500.
+"""Requests generated from the OpenAPI document: every response conforms, and none is a 500.
 
-Schemathesis makes them: what the document allows, and what it does not. Seeded, and bounded.
+Schemathesis generates allowed and disallowed requests, seeded and bounded.
 """
 
 from typing import Any
@@ -25,7 +25,7 @@ EXAMPLES_SOAK = 1500
 
 
 def check_every_operation(node: Any, examples: int) -> tuple[int, set[str]]:
-    """Returns how many operations there are, and of which the rules could be broken."""
+    """Return how many operations there are, and for how many invalid requests can be generated."""
     schema = schemathesis.openapi.from_asgi("/openapi.json", create_app(node))
     found, broken = 0, set()
     for result in schema.get_all_operations():
@@ -47,7 +47,7 @@ def check_every_operation(node: Any, examples: int) -> tuple[int, set[str]]:
 
             try:
                 check()
-            except Unsatisfiable:  # without parameters nothing can be said that is not allowed
+            except Unsatisfiable:  # without parameters no invalid request exists
                 assert mode is schemathesis.GenerationMode.NEGATIVE
             else:
                 if mode is schemathesis.GenerationMode.NEGATIVE:

@@ -1,7 +1,7 @@
-"""Every answer holds against the OpenAPI document, whatever enumerated settings say.
+"""Every response matches the OpenAPI document for every value of an enumerated setting.
 
-The settings are found in their model, so a new one, or a new value of one, is tried as well. The
-header of each binary form of the weights is held against its bytes.
+The settings are found in their model, so new settings and values are covered. The headers of
+each binary weight format are checked against its bytes.
 """
 
 import enum
@@ -37,7 +37,7 @@ PATHS = {
 
 
 def words(annotation: Any) -> Iterator[Any]:
-    """The values that an annotation enumerates."""
+    """Return the values that an annotation enumerates."""
     if typing.get_origin(annotation) is typing.Literal:
         yield from typing.get_args(annotation)
     elif typing.get_origin(annotation) in (typing.Union, types.UnionType, typing.Annotated):
@@ -50,7 +50,7 @@ def words(annotation: Any) -> Iterator[Any]:
 
 
 def enumerated() -> list[tuple[str, str, Any]]:
-    """Section, key and value of each enumerated setting."""
+    """Return section, key and value of each enumerated setting."""
     return [
         (section, key, value)
         for section, field in Settings.model_fields.items()
@@ -60,7 +60,7 @@ def enumerated() -> list[tuple[str, str, Any]]:
 
 
 def beside(section: str, key: str, value: Any, *, folder: Path) -> dict[str, dict[str, object]]:
-    """What a value needs beside it."""
+    """Return other settings that a value requires."""
     match section, key, value:
         case "array", "kind", "list":
             return {"array": {"positions_m": [[0, 0, 0], [0, 0.005, 0], [0, 0.01, 0]]}}
@@ -71,7 +71,7 @@ def beside(section: str, key: str, value: Any, *, folder: Path) -> dict[str, dic
 
 
 def strict(document: dict[str, Any]) -> dict[str, Any]:
-    """The document, in which no object has fields besides those that it names."""
+    """Return the document with additional properties disallowed in every object."""
     for schema in document["components"]["schemas"].values():
         if "properties" in schema:
             schema["additionalProperties"] = False
@@ -85,7 +85,7 @@ def faults(document: dict[str, Any], schema: dict[str, Any], answer: Any) -> lis
 
 
 def check_every_answer(client: TestClient) -> int:
-    """Hold each JSON answer of a service against its document; returns how many there were."""
+    """Check each JSON response of a service against its document; return their number."""
     document, checked = strict(client.get("/openapi.json").json()), 0
     for path, operations in document["paths"].items():
         asked = PATHS.get(path, path)
@@ -112,7 +112,7 @@ def test_every_answer_is_as_the_document_says(
 
 
 def test_an_answer_that_breaks_the_document_is_found(make_node: Any) -> None:
-    """The methods of the document were once copied by hand, and one was missing."""
+    """The document's methods were once copied by hand, and one was missing."""
     node = make_node(beams={"method": "mmse"})
     node.tick()
     with TestClient(create_app(node)) as client:
@@ -139,7 +139,7 @@ def test_every_binary_form_is_what_its_headers_say(make_node: Any, method: Metho
         matrix = np.array(told["re"]) + 1j * np.array(told["im"])
         for form in WeightFormat:
             answer = weights(form)
-            if answer.status_code == 409:  # the device cannot do it, and says why
+            if answer.status_code == 409:  # unsupported by the device, with a reason
                 assert form in (WeightFormat.TMYTEK, WeightFormat.SIVERS)
                 continue
             assert answer.headers["content-type"].partition(";")[0] == form.media_type

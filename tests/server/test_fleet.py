@@ -1,4 +1,4 @@
-"""A node of a fleet over HTTP: who serves whom, and what that makes of the verdicts and metrics."""
+"""A fleet node over HTTP: serving nodes, and their effect on verdicts and metrics."""
 
 from collections.abc import Iterator
 from typing import Any
@@ -25,13 +25,15 @@ def offer(uav: str, sinr_db: float | None = 30.0) -> Offer:
 
 @pytest.fixture(scope="module")
 def flown() -> StandIn:
-    """A node that has heard some UAVs."""
+    """Return a node that has received some UAVs."""
     return StandIn(settings())
 
 
 @pytest.fixture
 def north(flown: StandIn) -> Iterator[StandIn]:
-    """It serves 1:1 in a fleet; another, south, serves 2:1, and nobody serves the rest."""
+    """Return a node that serves 1:1; another node, south, serves 2:1, and no node serves the
+    rest.
+    """
     now_ns = flown.now_ns()
     member = FleetMember(
         name="north", settings=FleetSettings(node="north"), elements=16, started_ns=now_ns

@@ -1,4 +1,4 @@
-"""Clients that mean harm: no head, connection, name or question of theirs holds up the others."""
+"""Hostile clients: no request head, connection, host name or request delays the others."""
 
 import asyncio
 import contextlib
@@ -34,7 +34,7 @@ OPEN: list[asyncio.StreamWriter] = []
 
 @contextlib.asynccontextmanager
 async def served(node: Any, token: str | None = None) -> AsyncIterator[int]:
-    """The service's own server around a node: gives its port."""
+    """Run the service's own server around a node; yields its port."""
     answering = asyncio.Event()
     with bind("127.0.0.1:0", token=token, insecure=False) as listening:
         server = Server(node=node, token=token, answering=answering)
@@ -53,14 +53,14 @@ async def served(node: Any, token: str | None = None) -> AsyncIterator[int]:
 
 
 async def connected(port: int) -> Client:
-    """A connection, which ``served`` closes."""
+    """Return a connection, which ``served`` closes."""
     client = await asyncio.wait_for(asyncio.open_connection("127.0.0.1", port), HANG_S)
     OPEN.append(client[1])
     return client
 
 
 async def asked(client: Client, request: bytes = REQUEST) -> bytes:
-    """The first line of the answer; empty where the connection was ended."""
+    """Return the first line of the response; empty if the connection was closed."""
     reader, writer = client
     with contextlib.suppress(ConnectionError):
         writer.write(request)
@@ -69,17 +69,17 @@ async def asked(client: Client, request: bytes = REQUEST) -> bytes:
 
 
 async def ends(client: Client) -> bool:
-    """Wait until the server has ended a connection."""
+    """Wait until the server has closed a connection."""
     with contextlib.suppress(ConnectionError):
         await asyncio.wait_for(client[0].read(), HANG_S)
     return True
 
 
-# --- heads, bodies and waiting --------------------------------------------------------------------
+# --- heads, bodies and timeouts -------------------------------------------------------------------
 
 
 def test_a_head_without_end_is_cut_off_before_anything_is_asked(make_node: Any) -> None:
-    """Whoever has no token has no more of the loop than this."""
+    """A client without a token uses no more of the event loop than this."""
     floods = (
         b"GET /" + b"a" * (1 << 25),
         b"GET / HTTP/1.1\r\n" + b"x: y\r\n" * (1 << 22),
@@ -95,7 +95,7 @@ def test_a_head_without_end_is_cut_off_before_anything_is_asked(make_node: Any) 
                 client = await connected(port)
                 client[1].write(flood)
                 assert await ends(client)
-                # What the system still held when it was cut off: far from all that was sent.
+                # Bytes still in the kernel at the cut: far fewer than were sent.
                 left = client[1].transport.get_write_buffer_size()
                 assert left > len(flood) / 2 or client[1].transport.is_closing()
             assert await asked(await connected(port)) == b"HTTP/1.1 200 OK\r\n"
@@ -109,7 +109,7 @@ def test_a_head_without_end_is_cut_off_before_anything_is_asked(make_node: Any) 
 def test_who_does_not_finish_a_head_is_let_go(
     make_node: Any, monkeypatch: pytest.MonkeyPatch, half: bytes
 ) -> None:
-    """Bytes that trickle do not put it off."""
+    """Slowly trickling bytes do not extend the timeout."""
     monkeypatch.setattr(connections, "HEAD_S", 0.3)
 
     async def half_sent() -> None:
@@ -126,7 +126,7 @@ def test_who_does_not_finish_a_head_is_let_go(
 
 
 def test_idle_connections_shut_nobody_out(make_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The one that has waited longest makes room."""
+    """The longest idle connection is closed."""
     monkeypatch.setattr(connections, "most_connections", lambda: 20)
 
     async def crowded() -> None:
@@ -149,7 +149,7 @@ def test_connections_leave_descriptors_for_all_else(monkeypatch: pytest.MonkeyPa
         assert connections.most_connections() == most
 
 
-# --- names ----------------------------------------------------------------------------------------
+# --- host names -----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -163,7 +163,7 @@ def test_connections_leave_descriptors_for_all_else(monkeypatch: pytest.MonkeyPa
     ],
 )  # fmt: skip
 def test_only_names_of_this_machine_are_answered(make_node: Any, host: str, status: int) -> None:
-    """A page whose name was made to resolve to this machine (DNS rebinding) has its own in Host."""
+    """A page whose name resolves to this machine (DNS rebinding) sends its own name in Host."""
     node = make_node(flown=False, server={"hosts": ["Mast.example"]})
     with TestClient(create_app(node)) as client:
         assert client.get("/v1/uavs", headers={"host": host}).status_code == status
@@ -217,7 +217,7 @@ def test_a_name_is_asked_for_before_a_token(make_node: Any) -> None:
     assert isinstance(create_app(make_node(flown=False), "secret"), KnownHosts)
 
 
-# --- questions ------------------------------------------------------------------------------------
+# --- requests -------------------------------------------------------------------------------------
 
 
 def test_work_is_done_in_turns_and_the_rest_is_told_to_come_again(make_node: Any) -> None:
@@ -271,7 +271,7 @@ def test_a_pattern_of_everything_is_not_drawn(
 def test_a_codebook_is_asked_no_more_than_can_be_answered(
     make_node: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """However many elements and stored beams there are: counted in products, not in seconds."""
+    """For any number of elements and stored beams; counted in products, not in seconds."""
     node = make_node(array={"kind": "ura", "rows": 16, "columns": 16}, codebook={"kind": "dft"})
     node.tick(0.0)
     work = list[int]()
@@ -297,7 +297,7 @@ def test_a_codebook_is_asked_no_more_than_can_be_answered(
     assert sum(work) < spent / 4
     for wide, narrow in zip(less, told, strict=True):
         assert wide["best"] == narrow["best"]
-        assert set(wide["candidates"]) >= set(narrow["candidates"])  # proven still
+        assert set(wide["candidates"]) >= set(narrow["candidates"])  # still proven
 
 
 def _codebook_answers(node: Any) -> list[dict[str, Any]]:
@@ -330,7 +330,7 @@ def test_the_history_is_five_minutes_and_no_more(make_node: Any) -> None:
     ]
     shown = series.show(samples, newest_ns, UtcNs)
     node.tick(1.0)
-    kept.add(node.pipeline)  # what was taken for another thread stays as it was
+    kept.add(node.pipeline)  # the snapshot for another thread is unchanged
     assert shown == series.show(samples, newest_ns, UtcNs)
     assert len(shown["at"]) == SAMPLES == 300
     columns = [column for uav in shown["uavs"].values() for column in uav.values()]

@@ -1,4 +1,4 @@
-"""What is asked twice for the same moment is made once; nobody is answered for the past."""
+"""Requests for the same moment share one computation; no response is outdated."""
 
 import asyncio
 import threading
@@ -47,7 +47,7 @@ async def test_many_who_ask_at_once_share_one_answer(moments: Moments, shared_no
     assert set(found) == set(made)
     assert 0 <= made[0] - delay_ns - now_ns - 20_000_000 < EVERY_NS
     await moments.made(20.0, "json", make)
-    assert (len(made), len(shared_node.looks)) == (2, 1)  # other things of the same beams
+    assert (len(made), len(shared_node.looks)) == (2, 1)  # other values of the same beams
     await moments.made(30.0, "npy", make)
     assert (len(made), len(shared_node.looks)) == (3, 2)
 
@@ -64,7 +64,7 @@ async def test_the_next_moment_is_made_anew(
 
 
 async def test_beams_are_made_off_the_event_loop(moments: Moments, shared_node: Any) -> None:
-    """For any number of leads: what they cost is paid in turns."""
+    """For any number of leads: the computations are queued."""
     await asyncio.gather(*(moments.made(lead, "npy", lambda update: update) for lead in range(20)))
     assert len(shared_node.looks) == 20
     assert threading.current_thread() not in shared_node.looks

@@ -1,4 +1,4 @@
-"""Recordings over HTTP: listed, whole, in part, while they are written, and nothing else."""
+"""Recordings over HTTP: listed, complete, by range, and while being written; no other files."""
 
 import dataclasses
 import os
@@ -19,7 +19,7 @@ BYTES = bytes(range(256)) * 4000
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Two recordings, one of them being written, and what is none of anybody's business."""
+    """Return two recordings, one being written, and files that must not be served."""
     folder = tmp_path / "recordings"
     (folder / "below").mkdir(parents=True)
     (folder / FINISHED).write_bytes(BYTES)

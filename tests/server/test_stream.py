@@ -1,4 +1,4 @@
-"""``WS /v1/stream`` over a real socket: what is asked for comes, and the newest of it."""
+"""``WS /v1/stream`` over a real socket: the requested topics, always the newest."""
 
 import asyncio
 import base64
@@ -31,7 +31,7 @@ async def said(websocket: ClientConnection) -> Any:
 
 
 async def closed(address: str, **options: Any) -> tuple[int, str]:
-    """Code and reason with which a stream is closed."""
+    """Return the code and reason with which a stream is closed."""
     async with connect(address, **options) as websocket:
         with pytest.raises(ConnectionClosed) as raised:
             await asyncio.wait_for(websocket.recv(), SOON_S)
@@ -152,7 +152,7 @@ def test_no_more_messages_than_asked_for(make_node: Any, serving: Any) -> None:
 
 
 def test_a_message_is_made_once_for_all_who_ask_for_the_same(make_node: Any, serving: Any) -> None:
-    """All get the very same bytes of a look at a time at which the clock has gone on."""
+    """All receive the same bytes, although the clock has advanced."""
 
     async def check() -> None:
         node = make_node()
@@ -296,7 +296,8 @@ def test_who_goes_leaves_nothing_behind(make_node: Any, serving: Any) -> None:
 def test_a_client_that_does_not_read_misses_messages_and_holds_nobody_up(
     make_node: Any, serving: Any
 ) -> None:
-    """The reader gets every update, the other what was under way, and then the newest."""
+    """The reader receives every update; the other one receives messages in transit and then the
+    newest."""
 
     async def check() -> None:
         node = make_node()
@@ -321,6 +322,6 @@ def test_a_client_that_does_not_read_misses_messages_and_holds_nobody_up(
             await slow.close()
             await reader.close()
         assert valid_at == sorted(valid_at)
-        assert len(valid_at) < 250  # of 302: the system's buffers hold a few
+        assert len(valid_at) < 250  # of 302: the kernel's buffers hold a few
 
     run_async(check())

@@ -1,4 +1,4 @@
-"""Many clients of the stream, some of whom never read: nobody else notices."""
+"""Many stream clients, some of which never read: others are not affected."""
 
 import asyncio
 import re
@@ -17,7 +17,7 @@ RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--cente
 QUERY = "/v1/stream?topic=uavs&topic=beams&rate_hz=10"
 FRESH_S = 0.2
 MEMORY_BYTES = 60e6
-"""Room for 200 connections and their buffers, not for a queue of messages."""
+"""Memory for 200 connections and their buffers, without a queue of messages."""
 
 MEMORY = "process_resident_memory_bytes"
 CPU = "process_cpu_seconds_total"
@@ -25,14 +25,14 @@ SENT = "companion_stream_messages_total"
 
 
 def lag(node: Node) -> list[tuple[float, float]]:
-    """Upper ends in seconds of the histogram of the event loop's lag, and its counts."""
+    """Return the bucket bounds in seconds of the event loop's lag histogram, and its counts."""
     text = node.get("/metrics")[1].decode()
     found = re.findall(r'companion_event_loop_lag_seconds_bucket{le="(.*?)"} (\S+)', text)
     return [(float(end), float(count)) for end, count in found]
 
 
 def p99_s(before: list[tuple[float, float]], after: list[tuple[float, float]]) -> float:
-    """The upper end of the bucket that holds the 99th percentile."""
+    """Return the upper bound of the bucket that holds the 99th percentile."""
     counts = [b - a for (_, a), (_, b) in zip(before, after, strict=True)]
     return next(
         end for (end, _), count in zip(after, counts, strict=True) if count >= 0.99 * counts[-1]
@@ -40,14 +40,14 @@ def p99_s(before: list[tuple[float, float]], after: list[tuple[float, float]]) -
 
 
 def metric(node: Node, name: str) -> float:
-    """The value of a metric without labels."""
+    """Return the value of a metric without labels."""
     found = re.search(rf"^{name} (\S+)$", node.get("/metrics")[1].decode(), re.MULTILINE)
     assert found is not None
     return float(found[1])
 
 
 async def read(address: str, until_s: float, ages_s: list[float], quiet_s: float) -> int:
-    """Read to the end; keep how old each message was on arrival, after a first while."""
+    """Read to the end; record the age of each message on arrival, after an initial period."""
     heard = 0
     async with connect(address, max_queue=4, compression=None) as websocket:
         while time.time() < until_s:
@@ -62,7 +62,7 @@ async def read(address: str, until_s: float, ages_s: list[float], quiet_s: float
 
 
 async def crowd(node: Node, readers: int, deaf: int, seconds: float) -> tuple[list[int], Any]:
-    """How many messages each reader heard, and how old they were."""
+    """Return how many messages each reader received, and their ages."""
     address = node.url.replace("http", "ws", 1) + QUERY
     ages_s: list[float] = []
     silent = [
@@ -80,7 +80,7 @@ async def crowd(node: Node, readers: int, deaf: int, seconds: float) -> tuple[li
 def measure(
     node: Node, directory: Path, readers: int, deaf: int, seconds: float
 ) -> dict[str, float]:
-    """A flight watched by nobody, then by the crowd."""
+    """Measure a flight without clients, then with the crowd."""
     to = f"udpout:127.0.0.1:{node.udp_port}"
     command = [BIN / "sitl-replay", "fly", "paper", "--to", to, "--duration", str(3 * seconds + 9)]
     with started(command, stdout=subprocess.DEVNULL, cwd=directory) as flight:

@@ -1,5 +1,5 @@
-"""Devices as they are driven: a chip that decodes its registers, the Phaser's own class over a
-libiio that records, and codes as the device's text has them."""
+"""Device drivers: a chip stand-in that decodes its registers, the Phaser's own class over a
+recording libiio, and codes equal to those of the device's table."""
 
 import sys
 import threading
@@ -38,7 +38,8 @@ EIGHT = Settings().override(center={"source": "5:1"}, array={"elements": 8, "fre
 
 @pytest.fixture(scope="module")
 def flown() -> tuple[DeviceCommand, Any, str]:
-    """A shot of a real flight, its UAV's beam as the device's text reads back, and that text."""
+    """Return a shot of a real flight, its UAV's beam as read back from the device's table, and that
+    table."""
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
     equipment = assembly.equipment(EIGHT, pipeline.array)
@@ -52,7 +53,7 @@ def flown() -> tuple[DeviceCommand, Any, str]:
 
 
 class Always:
-    """A source that has always the same; None is a service that is lost."""
+    """A source that always gives the same; None is a lost service."""
 
     def __init__(self, *shots: DeviceCommand | None) -> None:
         self._shots = list(shots)
@@ -67,7 +68,7 @@ class Always:
 
 
 class Ticking:
-    """A clock that is told how time passes."""
+    """A clock advanced by the test."""
 
     def __init__(self) -> None:
         self.t_ns = 0
@@ -87,7 +88,7 @@ def spidev(monkeypatch: pytest.MonkeyPatch) -> Iterator[dict[tuple[int, int], Ch
 
 
 def factor(gain: int, i: int, q: int) -> complex:
-    """What a channel's registers radiate, by the data sheet's tables alone: sign and magnitude."""
+    """Return what a channel's registers radiate by the data sheet's tables: sign and magnitude."""
     signed = [(value & 0x1F) * (1 if value & 0x20 else -1) for value in (i, q)]
     amplitude = (gain & 0x7F) / 127 * (1.0 if gain & 0x80 else 10 ** (-15 / 20))
     turned = complex(*signed)
@@ -110,12 +111,12 @@ def test_registers_of_chips_radiate_what_the_text_says(
     )
     for n in range(1, 4):
         drive.step()
-        assert [chip.loads for chip in spidev.values()] == [n, n]  # one pulse an update
+        assert [chip.loads for chip in spidev.values()] == [n, n]  # one pulse per update
     got = [factor(*one) for key in ((0, 0), (0, 1)) for one in spidev[key].radiates]
     wanted = read.weights[:, list(read.uavs).index("3:1")]
     turn = np.vdot(got, wanted)
     assert abs(turn) / (np.linalg.norm(got) * np.linalg.norm(wanted)) > 0.9995
-    steps = np.angle(np.array(got) * turn / wanted)  # a modulator's magnitudes are of 5 bits
+    steps = np.angle(np.array(got) * turn / wanted)  # a modulator's magnitudes have 5 bits
     assert np.abs(steps).max() < np.radians(2.8)
     np.testing.assert_allclose(np.abs(got), np.abs(wanted), rtol=1e-9)
     assert [spidev[0, n].address for n in (0, 1)] == [0, 1]
@@ -181,12 +182,12 @@ def test_a_line_that_is_not_there_is_tried_again_each_second(
     assert said == ["the device failed: SPI 9.0: No such file or directory"]
 
 
-# --- the Phaser ---------------------------------------------------------------------------------
+# --- Phaser -------------------------------------------------------------------------------------
 
 
 @pytest.fixture
 def iio(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, str]]:
-    """What is written to libiio: device, or channel of one, attribute, value."""
+    """Record what is written to libiio: device or channel, attribute, value."""
     log: list[tuple[str, str, str]] = []
     monkeypatch.setitem(sys.modules, "iio", iio_module(log))
     adi = pytest.importorskip("adi")
@@ -197,7 +198,7 @@ def iio(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, str, str]]:
 
 
 MAP = {"BEAM0": [7, 8, 5, 6], "BEAM1": [3, 4, 1, 2]}
-"""Elements of the channels of both chips, as Analog Devices' class has them."""
+"""Element of each channel of both chips, as in Analog Devices' class."""
 
 
 def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
@@ -221,7 +222,7 @@ def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
         for row in (line.split(",") for line in text.splitlines()[1:])
         if row[1] == "3:1"
     }
-    assert len(before) == 2 * 2  # configuring latches each chip once; the update once
+    assert len(before) == 2 * 2  # configuration latches each chip once, the update once
     last = {(where, name): value for where, name, value in iio}
     for chip, elements in MAP.items():
         for channel, element in enumerate(elements):
@@ -232,7 +233,7 @@ def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
             assert int(last[where, "attenuation"]) == 1 - attenuated
     drive.step()
     latched = Counter(name for _, name, _ in iio[configured:])
-    assert latched == {"rx_load_spi": 2}  # of what has not changed nothing is written again
+    assert latched == {"rx_load_spi": 2}  # unchanged values are not written again
     drive.end()
     last = {(where, name): value for where, name, value in iio}
     assert {value for (_, name), value in last.items() if name == "phase"} == {"0.0"}
@@ -310,7 +311,7 @@ def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
         positions = {value for _, name, value in iio[begun:] if name == "beam_pos_load"}
         return positions, Counter(name for _, name, _ in iio[begun:])
 
-    assert said() == (set(), {"rx_load_spi": 2})  # as it was: one latch of each chip
+    assert said() == (set(), {"rx_load_spi": 2})  # as before: one latch per chip
     assert said() == ({str(other.stored)}, {"beam_pos_load": 8, "rx_load_spi": 2})
     assert said() == ({"120"}, {"beam_pos_load": 8, "rx_load_spi": 2})
     assert {value for key, value in saved.items() if key.endswith("/120")} == {"120, 0, 0, 0.0"}
@@ -335,7 +336,7 @@ def test_beams_of_another_codebook_are_not_pointed_to() -> None:
 
 
 def test_a_mount_looks_at_the_middle_of_several(flown: tuple[DeviceCommand, Any, str]) -> None:
-    """Against their own directions and places; who is not wanted does not count."""
+    """Against their own directions and positions; unwanted UAVs do not count."""
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
     equipment = assembly.equipment(EIGHT, pipeline.array)
@@ -400,11 +401,11 @@ def test_what_a_phaser_cannot_store_is_said() -> None:
         targets.device("phaser-memory:ip:x", print, lambda: held)
 
 
-# --- the loop -----------------------------------------------------------------------------------
+# --- loop ---------------------------------------------------------------------------------------
 
 
 class Recorder:
-    """A device that notes what is asked of it, and takes its time."""
+    """A device that records its calls and takes a given time."""
 
     takes = DeviceInput.POINTING
     lead_s = None
@@ -479,7 +480,7 @@ def test_the_lead_is_the_device_s_own_time_and_late_ones_are_counted() -> None:
     assert source.leads_s == pytest.approx([0.0, 0.03, 0.03, 0.03, 0.03])
     told = drive.status()
     assert (told.p50_ms, told.p99_ms) == pytest.approx((30.0, 30.0))
-    assert told.late == 5  # they were all right at 0
+    assert told.late == 5  # the first lead is 0
 
 
 def test_a_device_that_fails_is_opened_again_and_rests_again() -> None:

@@ -1,4 +1,4 @@
-"""A gimbal as pymavlink has it: what it is told, and what is made of its own attitude."""
+"""Gimbals over pymavlink: commands sent, and evaluation of the gimbal's own attitude."""
 
 import math
 import socket
@@ -90,8 +90,8 @@ def test_it_is_told_places_where_it_is_asked_to(heard: socket.socket) -> None:
 def test_its_lag_is_found_from_its_attitude(
     heard: socket.socket, from_north: bool, sysid: int
 ) -> None:
-    """Over north, where angles leap; an attitude relative to the vehicle says nothing, nor does
-    one of another vehicle's gimbal."""
+    """Across north, where angles wrap; attitudes relative to the vehicle or of another vehicle's
+    gimbal are ignored."""
     clock = [0]
     gimbal = Gimbal(
         host="127.0.0.1",

@@ -1,5 +1,5 @@
-"""Mounts: hamlib's own dummy rotator, and one of 30 degrees a second and a lag of .2 s that
-follows UAVs over a slow radio, against a mount that points to the newest report."""
+"""Mounts: hamlib's dummy rotator, and one of 30 degrees/s with a lag of 0.2 s that follows UAVs
+over a slow radio, compared with pointing at the newest report."""
 
 import math
 import socket
@@ -38,7 +38,7 @@ class Clock:
 
 
 class Mount:
-    """30 degrees a second at most, behind its commands by .2 s: of dead time, or of smoothing."""
+    """At most 30 degrees/s, with a lag of 0.2 s as dead time or smoothing."""
 
     def __init__(self, smooth: bool) -> None:
         self.azimuth_deg = self.elevation_deg = 0.0
@@ -64,7 +64,7 @@ class Mount:
 
 @pytest.fixture
 def serving() -> Iterator[Any]:
-    """Serves a mount as rotctld does, in the time of a clock."""
+    """Serve a mount as rotctld does, in the time of a clock."""
     servers = []
 
     def serve(mount: Mount, clock: Clock) -> int:
@@ -99,8 +99,8 @@ def serving() -> Iterator[Any]:
 def over_radio(
     flown: Any, seconds: float, rng: np.random.Generator
 ) -> list[tuple[float, Any, bytes]]:
-    """Time of arrival, sender and frame: 1.2 Hz of each kind, .6 s late (2.2 at the 95th
-    percentile), a tenth lost; the carrier's own are on a wire."""
+    """Return arrival time, sender and frame: 1.2 Hz of each kind, 0.6 s late (2.2 s at the 95th
+    percentile), a tenth lost; the carrier's own frames arrive by wire."""
     last: dict[tuple[str, int], float] = {}
     sigma = math.log(2.2 / 0.6) / 1.645
     arrivals = []
@@ -193,7 +193,7 @@ def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
 
 
 def opened(port: int) -> Rotator:
-    """A rotator, once rotctld listens."""
+    """Return a rotator once rotctld listens."""
     rotator = Rotator("127.0.0.1", port)
     waiting = threading.Event()
     for _ in range(round(HANG_S / 0.05)):

@@ -1,4 +1,4 @@
-"""Nodes that are there and do not answer."""
+"""Nodes that are present but do not answer."""
 
 from itertools import pairwise
 
@@ -9,7 +9,8 @@ PATIENCE_NS = 6 * S
 
 
 def looks(kept: Unanswered, begin_s: int, end_s: int, heard_ns: dict[str, int]) -> list[int]:
-    """The seconds at which a node is unresponsive, ``south`` being asked and checked in each."""
+    """Return the seconds at which a node is unresponsive; ``south`` is queried and checked each
+    second."""
     found = []
     for second in range(begin_s, end_s):
         kept.asked(second * S, "south")

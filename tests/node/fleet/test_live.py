@@ -1,4 +1,4 @@
-"""What a node of a fleet refuses to begin with, in one line, and what it takes of others."""
+"""Settings that a fleet node rejects in one line, and messages that it accepts from others."""
 
 import asyncio
 import socket
@@ -88,7 +88,7 @@ def test_a_status_tells_what_is_sent_from_what_is_heard() -> None:
 
 
 class Wire:
-    """What a node says and asks, in place of a bus; ``takes`` has who takes what of others."""
+    """Stand-in bus that records messages and queries; ``takes`` holds the subscriptions."""
 
     def __init__(self, *_: object) -> None:
         self.takes: dict[str, Callable[..., None]] = {}
@@ -138,7 +138,7 @@ def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
 
 
 def test_an_answer_came_when_zenoh_had_it(wire: Wire) -> None:
-    """However long the loop was busy then."""
+    """However long the event loop was busy afterwards."""
     now_ns = [1000 * S]
 
     async def test() -> None:
@@ -184,7 +184,7 @@ def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
 
 @pytest.mark.parametrize("loop", LOOPS)
 def test_what_is_heard_is_told_at_once_but_not_too_often(wire: Wire, loop: str) -> None:
-    """The second report is held back until its time; nobody waits for a tick or for the fold."""
+    """The second report is held back until it is due, independent of ticks and of the pipeline."""
     now_ns = [1000 * S]
 
     async def test() -> None:
@@ -199,7 +199,8 @@ def test_what_is_heard_is_told_at_once_but_not_too_often(wire: Wire, loop: str) 
             member.on_event(report(now_ns[0] - 70 * MS, number))
             counts.append([len(said.frames) for said in told(wire)])
         assert member.member.reception.behind_ns == 70 * MS
-        # The first is held for 60 ms, in which another might tell it. Who has told two speaks.
+        # The first is held for 60 ms, in which another node may share it. After two, this node
+        # shares.
         assert counts == [[], [1], [1], [1], [1, 4], [1, 4], [1, 4, 2]]
         task.cancel()
         with pytest.raises(asyncio.CancelledError):
@@ -218,12 +219,12 @@ def report(t_ns: int, number: int) -> Frame:
 
 
 def told(wire: Wire) -> list[Shared]:
-    """What was told of what was heard."""
+    """Return the shared frames of the received ones."""
     return [messages.to_shared(payload) for what, payload in wire.said if what == "heard"]
 
 
 def test_a_change_of_duty_is_said_at_once_and_a_rival_is_answered(wire: Wire) -> None:
-    """A UAV is served by two for the way of a word, not until the next word is due."""
+    """Two nodes serve a UAV only for one message delay, not until the next periodic message."""
     now_ns, steps = [1000 * S], list[Event]()
 
     async def test() -> None:
@@ -256,7 +257,7 @@ def test_a_change_of_duty_is_said_at_once_and_a_rival_is_answered(wire: Wire) ->
 
 
 def test_who_is_there_and_does_not_answer_makes_it_connect_anew() -> None:
-    """A real neighbour that shows signs of life, and to whom no question comes."""
+    """A real neighbour that is alive but receives no query."""
     import zenoh
 
     notices: list[str] = []

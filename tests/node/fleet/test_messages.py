@@ -1,4 +1,4 @@
-"""What nodes tell one another: said and read back alike; anything else is refused by its reason."""
+"""Fleet messages: encoded and decoded unchanged; others are rejected with a reason."""
 
 from pathlib import Path
 
@@ -48,7 +48,7 @@ def test_what_was_heard_comes_back(said: Shared) -> None:
 )
 @settings(max_examples=examples(100))
 def test_what_a_node_says_of_itself_comes_back_exactly(said: Standing) -> None:
-    """To the last bit: two nodes that compare a worth must have the same number."""
+    """Bit-exact: nodes that compare values must have the same number."""
     assert messages.to_standing(messages.standing(said), "north") == said
 
 
@@ -86,7 +86,7 @@ def test_what_cannot_be_is_refused() -> None:
 
     assert messages.to_standing(standing(), "north").serves == ()
     for wrong, node in (
-        (standing(), "south"),  # it speaks for another
+        (standing(), "south"),  # it names another node
         (standing(place=[1.0]), "north"),
         (standing(place=[1.0, float("nan"), 0.0]), "north"),
         (standing(serves=[{"uav": "1:1", "worth_db": float("inf")}]), "north"),
@@ -108,7 +108,7 @@ def test_times_that_older_nodes_sent_of_themselves_are_skipped() -> None:
 
 
 def test_the_contract_is_described() -> None:
-    """Every message that is told is in the schema that a node hands out, and in the docs."""
+    """Every message is in the published schema and in the documentation."""
     page = (Path(__file__).parents[3] / "docs" / "fleet.md").read_text(encoding="utf-8")
     for name in ("Shared", "Standing", "Offers", "Tracks"):
         assert f"companion.{name}" in page

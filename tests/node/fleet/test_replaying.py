@@ -1,4 +1,4 @@
-"""Recordings of a fleet's nodes, replayed together."""
+"""Recordings of several fleet nodes, replayed together."""
 
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,7 @@ START_NS = 1_800_000_000 * S
 
 
 def events(shift_ns: int, duties: list[tuple[float, tuple[str, ...]]]) -> list[Event]:
-    """Six seconds of two vehicles, on a clock of the node's own, and its duties."""
+    """Return six seconds of two vehicles on the node's own clock, with its duties."""
     sky = FleetSky(ports=[], uavs=2)
     found: list[Event] = []
     for step in range(60):
@@ -41,7 +41,7 @@ def fleet_settings(node: str | None) -> Settings:
 
 
 def record(path: Path, node: str | None, made: list[Event]) -> Path:
-    """A node's recording, with the digest to which it came."""
+    """Write a node's recording, with its digest."""
     settings = fleet_settings(node)
     pipeline = Pipeline(settings)
     with Writer(
@@ -76,7 +76,7 @@ def test_each_comes_to_its_digest_and_together_they_say_who_served_whom(
     served = found["served"]
     assert served["none"] == 0
     assert served["once"] + served["twice"] == pytest.approx(1.0)
-    assert 0.05 < served["twice"] < 0.2  # 1:1 by both over the last of 5.5 seconds
+    assert 0.05 < served["twice"] < 0.2  # both nodes serve 1:1 in the last of 5.5 seconds
 
 
 def test_a_duty_and_a_doubt_come_back_from_a_recording(recorded: list[Path]) -> None:

@@ -28,13 +28,13 @@ END_S = 12.0
 
 @dataclass(kw_only=True)
 class Links:
-    """What the links do: latencies of the vehicle's and the nodes' links, and the other's clock.
+    """Latencies of the vehicle's and the nodes' links, and the other node's clock.
 
     uplink_s      least latency of the vehicle's reports at either node
-    jitter_s      how much more it may be
-    way_s         one way between the nodes, and by how much the two ways may differ
-    uneven_s
-    offset_s      the other node's clock less this one's
+    jitter_s      largest additional latency
+    way_s         one-way latency between the nodes
+    uneven_s      largest difference between the two directions
+    offset_s      the other node's clock minus this one's
     drift         of the other node's clock
     """
 

@@ -1,4 +1,4 @@
-"""What is promised of predictions, on flights whose truth is known."""
+"""Promised prediction accuracy, on flights with known truth."""
 
 import json
 import random
@@ -31,7 +31,7 @@ from companion.studies.truth.vehicles import Flown
 from companion.values import Estimate, Event, Frame, Notice, Rejection, Track
 
 EVERY = 2
-"""Ten times a second is asked: half of what the study asks."""
+"""Ten predictions per second: half of what the study makes."""
 
 
 OURS = "uio-kinematic"
@@ -40,7 +40,7 @@ OURS = "uio-kinematic"
 def asked(
     flown: Flown, name: str, link: RadioLink, settings: Settings
 ) -> list[tuple[str, Questions, Answers]]:
-    """One predictor on every UAV of a log."""
+    """Run one predictor on every UAV of a log."""
     found = []
     for flight in flown.flights:
         sent = deliver(flight, link, 1, lambda: assembly.clock(settings))
@@ -54,7 +54,7 @@ def asked(
 
 
 def rms_deg(flown: Flown, name: str, link: RadioLink, settings: Settings) -> np.ndarray:
-    """RMS angle error, (UAV, lead)."""
+    """Return the RMS angle error, (UAV, lead)."""
     rows = []
     for _, plan, given in asked(flown, name, link, settings):
         scores = [score(plan, given, lead) for lead in range(len(LEADS_S))]
@@ -64,7 +64,7 @@ def rms_deg(flown: Flown, name: str, link: RadioLink, settings: Settings) -> np.
 
 @pytest.fixture(scope="module")
 def circling() -> Flown:
-    """Four UAVs on circles about the carrier."""
+    """Return four UAVs on circles around the carrier."""
     return vehicles.load(shared_log("sitl_4circle.tlog"), "5:1")
 
 
@@ -102,7 +102,9 @@ def test_no_bound_is_violated(circling: Flown, link: RadioLink, suited: bool) ->
     error_m, bound_m = np.concatenate(errors), np.concatenate(bounds)
     assert np.all(error_m <= bound_m)
     if suited and link is CLEAN:
-        assert np.median(bound_m) <= 6 * np.percentile(error_m, 95)  # the clock is only heard
+        assert np.median(bound_m) <= 6 * np.percentile(
+            error_m, 95
+        )  # the clock is known from arrivals only
 
 
 @pytest.mark.full
@@ -122,7 +124,7 @@ def test_where_gps_wanders_violations_are_in_the_faults() -> None:
 
 @pytest.mark.full
 def test_where_gps_wanders_it_is_told_before_a_bound_is_broken() -> None:
-    """By default the receiver is believed to 0.9 m, until its positions stray."""
+    """By default the receiver's accuracy is trusted down to 0.9 m, until its positions wander."""
     flown = vehicles.load(shared_log("sitl_4circle_wander.tlog"), "5:1")
     answers = broken = 0
     for _, plan, given in asked(flown, OURS, CLEAN, Settings()):
@@ -135,7 +137,7 @@ def test_where_gps_wanders_it_is_told_before_a_bound_is_broken() -> None:
 
 
 def late(events: list[Event], seed: int) -> list[Event]:
-    """The frames of a log, each held back by up to 3 s; its stamp is that of its arrival."""
+    """Return the frames of a log, each delayed by up to 3 s; its stamp is that of its arrival."""
     rng = random.Random(seed)
     held = [
         event._replace(t_ns=event.t_ns + rng.randrange(3_000_000_000))
@@ -146,7 +148,7 @@ def late(events: list[Event], seed: int) -> list[Event]:
 
 
 def final_tracks(events: list[Event], at_ns: int) -> dict[str, Track]:
-    """What is known of every vehicle when all has arrived."""
+    """Return the track of every vehicle after all frames."""
     pipeline = Pipeline(Settings().override(center={"source": "47.3977419,8.5455938,488"}))
     for event in events:
         pipeline.step(event)
@@ -157,9 +159,8 @@ def final_tracks(events: list[Event], at_ns: int) -> dict[str, Track]:
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.full) for n in (2, 3))])
 def test_shuffled_within_the_window_the_end_is_the_same(cut_log: Path, seed: int) -> None:
-    """What is made on the sender's own timeline is equal. The node's clock has then seen other
-    arrivals, and hindsight other predictions: that moves a prediction by no more than the clock
-    says that it may be off."""
+    """Values on the sender timeline are equal. The node's clock has seen other arrivals, and model
+    selection other predictions: a prediction moves by at most the clock uncertainty."""
     events = list(read_log(cut_log))
     held_back = late(events, seed)
     in_order, shuffled = (final_tracks(each, held_back[-1].t_ns) for each in (events, held_back))
@@ -199,7 +200,7 @@ def test_one_reboot_and_tracking_goes_on() -> None:
     ],
 )
 def test_real_flights_are_not_gated(name: str) -> None:
-    """Real vehicles stay within the default bounds on what a vehicle can do."""
+    """Real vehicles stay within the default limits."""
     pipeline = Pipeline(Settings())
     for event in read_log(shared_log(name)):
         pipeline.step(event)
@@ -208,7 +209,7 @@ def test_real_flights_are_not_gated(name: str) -> None:
 
 
 def with_glitch(events: list[Event], sysid: int, from_s: float, to_s: float) -> list[Event]:
-    """The same log, one UAV's positions 25 m off to the north for a while."""
+    """Return the same log with one UAV's positions displaced 25 m to the north for a while."""
     begin = events[0].t_ns
     changed: list[Event] = []
     for event in events:

@@ -1,4 +1,4 @@
-"""``companion.client`` against a live node, and against what is no node at all."""
+"""``companion.client`` against a live node, and against other services."""
 
 import contextlib
 import itertools
@@ -23,7 +23,7 @@ TOKEN = "s3cret/ü"
 
 
 def demo(folder: Path) -> Node:
-    """The demo, once its four beams are up; it records to a folder of its own."""
+    """Run the demo with its own recording folder, and wait for its four beams."""
     with contextlib.chdir(folder):
         node = Node("demo", "--port", "0", "--seconds", "36000")
     node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
@@ -32,7 +32,7 @@ def demo(folder: Path) -> Node:
 
 @pytest.fixture(scope="module")
 def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
-    """One for all tests that do not end it."""
+    """Run one demo for all tests that do not stop it."""
     node = demo(tmp_path_factory.mktemp("demo"))
     yield node
     end(node.process)
@@ -40,7 +40,7 @@ def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
 
 @pytest.fixture(scope="module")
 def guarded() -> Iterator[Node]:
-    """One that asks for a token."""
+    """Run a demo that requires a token."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COMPANION_TOKEN", TOKEN)
         node = Node(*RUN)
@@ -81,7 +81,7 @@ def test_a_stream_goes_on_until_it_is_closed(flying: Node) -> None:
 
 @pytest.mark.full
 def test_that_the_service_ends_is_said(tmp_path: Path) -> None:
-    """A reader is told so, and one that never reads does not keep the service from ending."""
+    """A reader is notified, and a client that never reads does not delay the shutdown."""
     flying = demo(tmp_path)
     host, _, port = flying.url.removeprefix("http://").partition(":")
     with socket.socket() as deaf:
@@ -148,7 +148,7 @@ def test_where_nobody_answers() -> None:
 
 
 class _Stranger(BaseHTTPRequestHandler):
-    """Something else that speaks HTTP: an error in HTML, and an answer that breaks off."""
+    """Another HTTP service: an error in HTML, and a truncated response."""
 
     def do_GET(self) -> None:
         if self.path == "/v1/status":

@@ -1,4 +1,4 @@
-"""The container's files, and as much of what they promise as can be had without a container."""
+"""The container's files, as far as they can be tested without a container."""
 
 import fnmatch
 import json
@@ -21,7 +21,7 @@ COMPOSE = (ROOT / "docker-compose.yml").read_text(encoding="utf-8")
 
 
 def lint(text: str, tmp_path: Path) -> "subprocess.CompletedProcess[str]":
-    """hadolint over a Dockerfile."""
+    """Run hadolint on a Dockerfile."""
     path = tmp_path / "Dockerfile"
     path.write_text(text, encoding="utf-8")
     command = [BIN / "hadolint", path]
@@ -29,7 +29,7 @@ def lint(text: str, tmp_path: Path) -> "subprocess.CompletedProcess[str]":
 
 
 def against_schema(text: str, tmp_path: Path) -> int:
-    """The exit status of the check against the Compose specification."""
+    """Return the exit status of the check against the Compose specification."""
     path = tmp_path / "docker-compose.yml"
     path.write_text(text, encoding="utf-8")
     command = [BIN / "check-jsonschema", "--builtin-schema", "vendor.compose-spec", path]
@@ -37,7 +37,7 @@ def against_schema(text: str, tmp_path: Path) -> int:
 
 
 def instruction(name: str) -> list[str]:
-    """The exec form of the Dockerfile's last instruction of that name."""
+    """Return the exec form of the Dockerfile's last instruction of that name."""
     text = DOCKERFILE.replace("\\\n", " ")
     found: list[str] = re.findall(rf"^{name} .*?(\[.*\])$", text, re.MULTILINE)
     return list(json.loads(found[-1]))
@@ -74,7 +74,7 @@ def test_a_service_has_no_rights(name: str) -> None:
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
     assert service["security_opt"] == ["no-new-privileges:true"]
-    assert "user" not in service  # that of the image
+    assert "user" not in service  # the image's user
     assert re.findall(r"^USER (\S+)$", DOCKERFILE, re.MULTILINE) == ["10001:10001"]
 
 
@@ -88,7 +88,9 @@ def test_only_this_machine_reaches_the_page() -> None:
 
 @pytest.mark.full
 def test_the_commands_are_understood(start_node: Any) -> None:
-    """What image and compose file run, with addresses of this machine, starts and is fed."""
+    """The commands of image and compose file start with addresses of this machine and
+    receive data.
+    """
     services = yaml.safe_load(COMPOSE)["services"]
     assert services["companion"]["command"] == instruction("CMD")
     assert instruction("ENTRYPOINT") == ["companion"]
@@ -135,7 +137,7 @@ def test_health_is_that_of_readyz(
 
 
 def context(target: Path) -> None:
-    """What ``docker build`` is given: the tree as .dockerignore leaves it."""
+    """Return the ``docker build`` context: the tree without what .dockerignore excludes."""
     lines = (ROOT / ".dockerignore").read_text(encoding="utf-8").splitlines()
     rules = [line for line in lines if line and not line.startswith("#")]
     assert rules[0] == "*"
@@ -150,7 +152,9 @@ def context(target: Path) -> None:
 
 
 def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> None:
-    """Installed apart, read only, without HOME and in another directory; the page is in it."""
+    """Installed separately, read-only, without HOME and in another directory; the page is
+    included.
+    """
     source, installed, record = (tmp_path / name for name in ("src", "installed", "recordings"))
     source.mkdir()
     context(source)
@@ -190,14 +194,14 @@ def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> No
     )
     for path in [installed, *installed.rglob("*")]:
         if path.is_dir():
-            path.chmod(0o755)  # so that pytest can take it away
+            path.chmod(0o755)  # so that pytest can remove it
     assert done.returncode == 0, done.stderr
     assert len(list(record.glob("*.mcap"))) == 1
 
 
 @pytest.mark.full
 def test_what_the_image_leaves_out_is_not_missed(tmp_path: Path) -> None:
-    """A design by the LMI, a study with its figures and a replay, without those packages."""
+    """An LMI design, a study with figures and a replay, without the omitted packages."""
     (line,) = re.findall(r"pip uninstall --yes (highspy .*) pip ", DOCKERFILE)
     gone = [name for name in line.split() if name != "setuptools"]
     code = (
@@ -225,12 +229,12 @@ def test_what_the_image_leaves_out_is_not_missed(tmp_path: Path) -> None:
 
 
 PACKAGES_MB = 330
-"""Most that the packages may take: beside a base of some 125 MB the image has less than 450."""
+"""Largest size of the packages: with a base of some 125 MB the image stays below 450 MB."""
 
 
 @pytest.mark.full
 def test_what_the_image_keeps_is_small_and_works(tmp_path: Path) -> None:
-    """The packages of the lock, as they are here, made smaller as the image has them."""
+    """The locked packages as installed here, reduced as in the image."""
     if shutil.which("strip") is None:
         pytest.skip("no strip: install binutils")
     packages = tmp_path / "venv" / "lib"
@@ -265,7 +269,7 @@ def test_what_the_image_keeps_is_small_and_works(tmp_path: Path) -> None:
         "        importlib.import_module(name)\n"
         "print(len(known))\n"
     )
-    python = Path(sys.executable).resolve()  # without the packages of its environment
+    python = Path(sys.executable).resolve()  # without the packages of this environment
     environment = {**os.environ, "PYTHONPATH": f"{packages}{os.pathsep}{ROOT}"}
     log = str(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog")
     for words in (
@@ -282,11 +286,11 @@ def test_what_the_image_keeps_is_small_and_works(tmp_path: Path) -> None:
 
 
 def taken_mb(folder: Path) -> float:
-    """What the files in a folder take."""
+    """Return the size of the files in a folder."""
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 2**20
 
 
 def test_services_are_tested_one_at_a_time(request: pytest.FixtureRequest) -> None:
-    """The group of ``conftest.ALONE`` reaches xdist, which reads it from the test's id."""
+    """The ``conftest.ALONE`` group reaches xdist, which reads it from the test's id."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         assert request.node.nodeid.endswith("@alone")

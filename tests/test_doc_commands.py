@@ -1,8 +1,8 @@
 """Every command line of the documents that tests/test_readme.py does not run.
 
-A command on a log is run to its end, with the short flight of the tests in the place of the
-reader's. A command that needs a device, a peer or a network is parsed by the program itself, so a
-wrong option or argument is found. ``NOT_RUN`` gives the reason for those that are neither.
+A command on a log runs to its end on the tests' short flight. A command that needs a device, a
+peer or a network is only parsed by the program itself, so a wrong option or argument is found.
+``NOT_RUN`` gives the reason for the remaining ones.
 """
 
 import re
@@ -20,7 +20,7 @@ from test_readme import PAGES as GUIDES
 from companion.cli.main import main as companion
 from sitl_replay.cli import main as sitl_replay
 
-WRITTEN = ("api.md", "export.md", "messages.md")  # by programs
+WRITTEN = ("api.md", "export.md", "messages.md")  # read by programs
 PAGES = [
     page
     for page in sorted([*(ROOT / "docs").rglob("*.md"), ROOT / "CONTRIBUTING.md"])
@@ -41,7 +41,7 @@ ELLIPSIS = "…"
 
 
 def commands(page: Path) -> list[str]:
-    """The command lines of a page, without placeholders for the reader's own arguments."""
+    """Return the command lines of a page, without placeholders for the reader's own arguments."""
     text = page.read_text(encoding="utf-8")
     blocks = re.findall(r"(?:^    .*\n?|^\n(?=    ))+", text, re.M)
     lines = [line.strip() for block in blocks for line in block.replace("\\\n", " ").split("\n")]
@@ -54,7 +54,7 @@ ALL = sorted({one for page in PAGES for one in commands(page)})
 
 
 def parsed(words: list[str]) -> None:
-    """Let the program parse a command, without carrying it out."""
+    """Parse a command with the program itself, without running it."""
     command: click.Command = PROGRAMS[words[0]]
     context = click.Context(command)
     rest = words[1:]
@@ -89,7 +89,9 @@ def ended(words: list[str], where: Path, studied: Callable[..., Path]) -> None:
 
 
 def is_run(words: list[str]) -> bool:
-    """Whether a command is run to its end: it reads the reader's flight, and writes a report."""
+    """Return whether a command is run to its end: it reads the reader's flight and writes a
+    report.
+    """
     return words[0] == "companion" and (
         (words[1] == "study" and "--out" in words and "fleet" not in words)
         or (words[1] in TO_THE_END and "flight.tlog" in words and "--config" not in words)
@@ -98,7 +100,7 @@ def is_run(words: list[str]) -> bool:
 
 
 def marked(line: str) -> object:
-    """A command as a parameter; studies are left to `make test-all`."""
+    """Return a command as a parameter; studies are left to `make test-all`."""
     long = line.startswith("companion study")
     return pytest.param(line, marks=pytest.mark.full if long else ())
 

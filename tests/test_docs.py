@@ -1,4 +1,4 @@
-"""The documents are true: what they link to, name, draw and cite is there."""
+"""The documents are correct: every link, name, figure and citation exists."""
 
 import re
 import subprocess
@@ -55,7 +55,8 @@ def test_the_picture_of_the_rooms_is_up_to_date() -> None:
     ],
 )
 def test_a_page_that_is_written_by_a_program_is_up_to_date(drawn: str) -> None:
-    """The API's reference, what is redistributed, and the notebook, whose cells are run."""
+    """The API reference, the list of redistributed software, and the notebook with its executed
+    cells."""
     making = [sys.executable, DOCS / drawn, "--check"]
     done = subprocess.run(making, capture_output=True, text=True, check=False, timeout=HANG_S)
     assert done.returncode == 0, done.stderr
@@ -71,11 +72,11 @@ def test_every_threat_has_a_test_that_is_there() -> None:
 
 
 READ_BACK = {"companion/views/tables/said.py", "companion/recording/entries.py"}
-"""What makes notices of those that others made."""
+"""Code that recreates notices published by others."""
 
 
 def rows(heading: str) -> list[list[str]]:
-    """The cells of the first table under a heading of the page on troubleshooting."""
+    """Return the cells of the first table under a heading of the troubleshooting page."""
     text = (DOCS / "troubleshooting.md").read_text(encoding="utf-8").split(f"## {heading}\n")[1]
     table = [line for line in text.split("\n## ")[0].splitlines() if line.startswith("|")]
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table[2:]]
@@ -127,7 +128,7 @@ def test_every_decision_is_listed() -> None:
 
 
 def headings(page: str) -> set[str]:
-    """The numbers of a page's sections."""
+    """Return the numbers of a page's sections."""
     text = (DOCS / page).read_text(encoding="utf-8")
     return {found.rstrip(".") for found in re.findall(r"^#+ ([\d.]+) ", text, re.MULTILINE)}
 
@@ -164,12 +165,12 @@ def test_the_code_of_the_method_cites_its_equations(path: str) -> None:
 
 
 def equations(path: Path) -> set[str]:
-    """The numbers of the paper's equations that a file cites."""
+    """Return the numbers of the paper equations that a file cites."""
     return set(re.findall(r"paper eq\. \((\d+)\)", unwrapped(path)))
 
 
 def unwrapped(path: Path) -> str:
-    """The text of a file, its comments and paragraphs on one line."""
+    """Return the text of a file with comments and paragraphs on one line."""
     return re.sub(r"\s*\n\s*#?\s*", " ", path.read_text(encoding="utf-8"))
 
 
@@ -193,7 +194,7 @@ def test_every_class_that_the_glossary_names_is_there() -> None:
     ],
 )
 def test_where_to_add_names_every_file_that_a_neighbour_is_in(what: str, neighbour: str) -> None:
-    """What was added last stands in the files that the table names, and in four at most."""
+    """The most recent addition appears in the files of the table, and in at most four."""
     text = (DOCS / "architecture.md").read_text(encoding="utf-8")
     (row,) = (line for line in text.splitlines() if line.startswith(f"| {what} |"))
     named = set(re.findall(r"`([\w/]+\.\w+)`", row))

@@ -1,4 +1,4 @@
-"""The library's face: what notebooks and programs outside import, and its example as it stands."""
+"""The public interface: names for notebooks and external programs, and the docstring example."""
 
 import ast
 import subprocess
@@ -12,7 +12,7 @@ import companion
 
 
 def loaded_by(code: str) -> set[str]:
-    """The modules that a fresh interpreter has loaded after some code."""
+    """Return the modules that a fresh interpreter has loaded after running some code."""
     run = f"{code}\nimport sys\nprint(*sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", run], capture_output=True, text=True, check=True, timeout=HANG_S
@@ -30,7 +30,7 @@ def test_every_name_is_there_and_documented() -> None:
 
 
 def test_the_type_checker_and_the_loader_mean_the_same_things() -> None:
-    """What stands under TYPE_CHECKING is what a name gives when it is asked for."""
+    """The imports under TYPE_CHECKING are the objects that lazy loading returns."""
     tree = ast.parse(Path(companion.__file__).read_text(encoding="utf-8"))
     under = next(node for node in tree.body if isinstance(node, ast.If))
     found = {

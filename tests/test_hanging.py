@@ -1,4 +1,4 @@
-"""A test that hangs is ended and named, whatever it hangs in, and the others are run."""
+"""A hanging test is terminated and named, wherever it hangs, and the others run."""
 
 import os
 import re

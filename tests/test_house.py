@@ -1,8 +1,8 @@
-"""The rules of the house, as tests: what may live in which room, and what must not be committed.
+"""Rules of the code base as tests: contents of each package, and files that must not be committed.
 
-Each rule is a function from source text to a list of faults, run over the tree and, below, over
-small pieces of bad code that it must refuse: a rule that finds nothing there has gone blind.
-Which room may import which is import-linter's part (``pyproject.toml``); it is run here as well.
+Each rule is a function from source text to a list of faults. It runs over the tree and, below,
+over small pieces of bad code that it must reject: a rule that finds nothing there is broken.
+Imports between packages are import-linter's task (``pyproject.toml``); it runs here as well.
 """
 
 import ast
@@ -26,11 +26,11 @@ LOCKS = ("requirements.lock", "requirements-dev.lock")
 LONGEST_MODULE_LINES = 300
 REASON = "Over 300 lines: "
 FIELDS_TO_NAME = 4
-"""Number of fields from which on each is given by name."""
+"""Number of fields from which each must be passed by name."""
 MOST_POSITIONAL = 5
 TAKE_ANY_NUMBER = frozenset({"max", "min", "pack", "pack_into", "zip"})
 
-# Rooms that may know sockets, files, clocks and `await`; all others are pure. Folders, not files.
+# Packages that may use sockets, files, clocks and `await`; all others are pure.
 SHELL = (
     "companion/__main__.py",
     "companion/client.py",
@@ -53,7 +53,7 @@ IMPURE_MODULES = frozenset({
     "tempfile", "threading", "time",
 })
 # fmt: on
-# A path is a value, and `io` holds bytes in memory: what counts is the call that reaches a file.
+# A path is a value, and `io` holds bytes in memory: only a call that reaches a file counts.
 FILE_CALLS = frozenset(
     {
         "exists",
@@ -73,12 +73,12 @@ FILE_CALLS = frozenset(
     }
 )
 CLOCK_CALLS = frozenset({"now", "today", "utcnow"})
-# Words that carry on from something said before, with which no docstring may begin.
+# Words that refer to something before; no docstring may begin with one.
 RIDDLE = re.compile(
     r"\s*(Of|So|And|But|Or|Nor|Also|Then|Thus|Hence|For\s+(?:so|that|which))\b", re.IGNORECASE
 )
 
-# Words that name nothing which a textbook, an RFC or the MAVLink documentation knows.
+# Words that no textbook, RFC or MAVLink documentation uses.
 OBSCURE = frozenset(
     {"anew", "aside", "ears", "lent", "nobody", "said", "seated", "spared", "sure", "told", "twins",
      "unsure", "untold", "vouch"}
@@ -92,7 +92,7 @@ REPEATED_CLASSES = {
     "Weights": "the client's class holds the answer that the view's class describes"
 }
 
-# In parts, so that this file does not hold what it looks for.
+# In parts, so that this file does not contain the searched text.
 # fmt: off
 REGISTRY_HOSTS = tuple(".".join(parts) for parts in (
     ("pypi", "org"), ("pythonhosted", "org"), ("anaconda", "org"), ("npmjs", "org"),
@@ -104,13 +104,15 @@ REGISTRY_HOSTS = tuple(".".join(parts) for parts in (
 
 
 def sources() -> list[str]:
-    """Every module of both packages, as a path from the root."""
+    """Return every module of both packages, as a path from the root."""
     found = (p for package in PACKAGES for p in (ROOT / package).rglob("*.py"))
     return sorted(p.relative_to(ROOT).as_posix() for p in found)
 
 
 def committed() -> list[str]:
-    """Every file that is or would be committed; without git, every file not made by a tool."""
+    """Return every file that is or would be committed; without git, every file not made by a
+    tool.
+    """
     git = ("git", "ls-files", "-z", "--cached", "--others", "--exclude-standard")
     if shutil.which("git") and (ROOT / ".git").exists():
         done = subprocess.run(git, cwd=ROOT, capture_output=True, check=True, timeout=HANG_S)
@@ -122,24 +124,24 @@ def committed() -> list[str]:
 
 
 def is_pure(path: str) -> bool:
-    """Whether the module at ``path`` is in a room without clock, socket, file and await."""
+    """Return whether the module at ``path`` may use no clock, socket, file or await."""
     return not path.startswith(SHELL)
 
 
 @functools.cache
 def parsed(text: str) -> ast.Module:
-    """A module's tree, which several rules look at."""
+    """Return a module's tree, cached for several rules."""
     return ast.parse(text)
 
 
 @functools.cache
 def nodes_of(text: str) -> list[ast.AST]:
-    """All nodes of a module's tree, which several rules look at."""
+    """Return all nodes of a module's tree, cached for several rules."""
     return list(ast.walk(parsed(text)))
 
 
 def imports(text: str) -> Iterator[tuple[int, str]]:
-    """Line and full dotted name of everything imported; ``from a import b`` gives ``a.b``."""
+    """Return line and full dotted name of every import; ``from a import b`` gives ``a.b``."""
     for node in nodes_of(text):
         if isinstance(node, ast.Import):
             yield from ((node.lineno, name.name) for name in node.names)
@@ -148,11 +150,11 @@ def imports(text: str) -> Iterator[tuple[int, str]]:
             yield from ((node.lineno, f"{module}.{name.name}") for name in node.names)
 
 
-# --- the rules: path and source text to faults --------------------------------------------------
+# --- rules: path and source text to faults ------------------------------------------------------
 
 
 def impurities(path: str, text: str) -> list[str]:
-    """Await, clocks, sockets and files in a pure room."""
+    """Await, clocks, sockets and files in a pure package."""
     if not is_pure(path):
         return []
     may_read = path.startswith(READS_FILES)
@@ -199,7 +201,7 @@ def foreign_imports(path: str, text: str) -> list[str]:
 
 
 def strangers(path: str, text: str) -> list[str]:
-    """``sitl_replay`` knows the values, the wire, geodesy, the reader and the console, no more."""
+    """``sitl_replay`` imports only the values, the wire, geodesy, the reader and the console."""
     if not path.startswith("sitl_replay/"):
         return []
     allowed = re.compile(
@@ -215,8 +217,8 @@ def strangers(path: str, text: str) -> list[str]:
 def undocumented(path: str, text: str) -> list[str]:
     """Modules, public classes, functions and methods without a docstring.
 
-    Properties are attributes: the docstring of their class speaks of them. Methods of a class
-    with a base may be what the base has documented.
+    Properties are attributes, described in the docstring of their class. Methods of a class with
+    a base may be documented in the base.
     """
     tree = parsed(text)
     faults = [] if ast.get_docstring(tree) or not tree.body else [f"{path}:1: no docstring"]
@@ -238,7 +240,7 @@ def undocumented(path: str, text: str) -> list[str]:
 
 
 def documentation(text: str) -> Iterator[tuple[int, str]]:
-    """Line and text of every docstring, and of every string that follows an assignment."""
+    """Return line and text of every docstring, and of every string after an assignment."""
     documented = (
         ast.Module,
         ast.ClassDef,
@@ -259,7 +261,7 @@ def documentation(text: str) -> Iterator[tuple[int, str]]:
 
 
 def riddles(path: str, text: str) -> list[str]:
-    """Docstrings that begin in mid-sentence: the first words say what the thing is or does."""
+    """Docstrings that start mid-sentence: the first words must say what the thing is or does."""
     faults = []
     for line, said in documentation(text):
         found = RIDDLE.match(said)
@@ -269,7 +271,7 @@ def riddles(path: str, text: str) -> list[str]:
 
 
 def overlong(path: str, text: str) -> list[str]:
-    """Modules that one can no longer hold in the head, and do not say why they are so long."""
+    """Modules that are too long and do not give a reason."""
     lines = text.count("\n")
     if lines <= LONGEST_MODULE_LINES:
         return []
@@ -278,20 +280,20 @@ def overlong(path: str, text: str) -> list[str]:
 
 
 def nameless(path: str, _text: str) -> list[str]:
-    """Modules named after nothing."""
+    """Modules with meaningless names."""
     bad = Path(path).stem in {"utils", "util", "helpers", "helper", "common", "misc"}
     return [f"{path}: says nothing of what is in it"] if bad else []
 
 
 def called(node: ast.AST) -> str:
-    """The last part of the name of a class, a decorator or what a call calls."""
+    """Return the last part of the name of a class, a decorator or a called function."""
     if isinstance(node, ast.Call | ast.Subscript):
         node = node.func if isinstance(node, ast.Call) else node.value
     return ast.unparse(node).rpartition(".")[2]
 
 
 def init_fields(node: ast.ClassDef) -> list[str]:
-    """Fields of a dataclass or NamedTuple that its constructor takes."""
+    """Return the fields of a dataclass or NamedTuple that its constructor takes."""
     found = []
     for item in node.body:
         match item:
@@ -301,14 +303,14 @@ def init_fields(node: ast.ClassDef) -> list[str]:
                     for given in value.keywords
                 )
                 if called(kind) == "KW_ONLY":
-                    return found  # those that follow are given by name
+                    return found  # later fields are keyword-only
                 if called(kind) != "ClassVar" and not is_made:
                     found.append(name)
     return found
 
 
 def positional_fields(path: str, text: str) -> list[str]:
-    """Classes that take four or more values, some of them by position: two can be swapped."""
+    """Classes with four or more positional values, two of which could be swapped."""
     faults = []
     for node in nodes_of(text):
         if not isinstance(node, ast.ClassDef):
@@ -352,10 +354,10 @@ def module_of(path: str) -> str:
 
 
 def positional_tuples(path: str, text: str) -> list[str]:
-    """Calls that give a NamedTuple with four or more fields any of them by position.
+    """Calls that pass a field of a NamedTuple with four or more fields by position.
 
-    Such a class cannot be keyword-only. It is found under the name by which it was imported, also
-    from the package that passes it on.
+    Such a class cannot be keyword-only. It is found under the name by which it was imported,
+    also from a package that re-exports it.
     """
     names = {name: f"{module_of(path)}.{name}" for name in long_tuples_in(text)}
     own = frozenset(names.values())
@@ -380,7 +382,7 @@ def positional_tuples(path: str, text: str) -> list[str]:
 
 
 def crowded_calls(path: str, text: str) -> list[str]:
-    """Calls with more than five positional arguments, except of functions that take any number."""
+    """Calls with more than five positional arguments, except to variadic functions."""
     return [
         f"{path}:{node.lineno}: {called(node)} is given {len(node.args)} arguments by position"
         for node in nodes_of(text)
@@ -402,7 +404,7 @@ def defined_names(text: str) -> Iterator[tuple[int, str]]:
 
 
 def obscure_names(path: str, text: str) -> list[str]:
-    """Names of modules, classes, functions and constants that a reader must look up."""
+    """Names of modules, classes, functions and constants that a reader would have to look up."""
     if not path.startswith("companion/"):
         return []
     faults = []
@@ -595,11 +597,11 @@ def test_the_rule_allows(rule: Rule, path: str, text: str) -> None:
     assert rule(path, text) == []
 
 
-# --- what imports what: import-linter -----------------------------------------------------------
+# --- imports: import-linter ---------------------------------------------------------------------
 
 
 def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
-    """Run import-linter over the packages at ``root``, with the contracts found there."""
+    """Run import-linter over the packages at ``root`` with the contracts found there."""
     run = "from importlinter.cli import lint_imports_command; lint_imports_command()"
     command = (sys.executable, "-c", run, "--no-cache")
     return subprocess.run(
@@ -636,7 +638,7 @@ REFUSED = [
 
 @pytest.fixture(scope="module")
 def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The rooms without what is in them, and the contracts."""
+    """Return the empty packages and the contracts."""
     root = tmp_path_factory.mktemp("bare")
     shutil.copy(ROOT / "pyproject.toml", root)
     for package in PACKAGES:
@@ -651,7 +653,7 @@ def bare(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def refused(bare: Path) -> str:
-    """What import-linter says where there is one of each."""
+    """Return import-linter's output for one violation of each contract."""
     for path, text, _ in REFUSED:
         (bare / path).write_text(text, encoding="utf-8")
     done = lint_imports(bare)
@@ -667,7 +669,7 @@ def test_import_linter_refuses(refused: str, path: str, text: str, imported: str
 
 
 def test_the_service_starts_without_the_solver_and_what_only_studies_need() -> None:
-    """What ``companion run`` imports loads neither CVXPY nor what makes figures and pages."""
+    """``companion run`` imports neither CVXPY nor the packages for figures and pages."""
     if not (ROOT / "companion/node/service.py").exists():
         pytest.skip("there is no companion/node/service.py yet")
     run = (
@@ -680,14 +682,14 @@ def test_the_service_starts_without_the_solver_and_what_only_studies_need() -> N
     assert (done.returncode, done.stdout.decode().split()) == (0, []), done.stderr.decode()
 
 
-# --- the tests --------------------------------------------------------------------------------
+# --- tests ------------------------------------------------------------------------------------
 
 
 WAITS = frozenset(("run", "communicate"))
 
 
 def endless_waits(text: str) -> list[str]:
-    """Calls in a test that may wait for ever, each with what is used instead."""
+    """Calls in a test that may wait forever, each with its replacement."""
     faults: list[str] = []
     if not any(word in text for word in ("Popen", ".run(", ".communicate")):
         return faults
@@ -711,11 +713,11 @@ def endless_waits(text: str) -> list[str]:
 
 
 def test_no_test_waits_for_ever() -> None:
-    """Neither for a process nor for a coroutine: nothing else may notice that it hangs."""
+    """Neither for a process nor for a coroutine: nothing else would notice the hang."""
     faults = [
         f"{path.relative_to(ROOT)}:{fault}"
         for path in sorted((ROOT / "tests").rglob("*.py"))
-        if path.name != "mutations.py"  # no test: it runs them
+        if path.name != "mutations.py"  # not a test: it runs them
         for fault in endless_waits(path.read_text(encoding="utf-8"))
     ]
     assert faults == []
@@ -742,7 +744,7 @@ def test_a_repeated_class_and_an_obscure_name_are_found() -> None:
     assert obscure_names("sitl_replay/aside.py", text) == []
 
 
-# --- what is committed --------------------------------------------------------------------------
+# --- committed files ----------------------------------------------------------------------------
 
 
 def registries(data: bytes) -> list[str]:
@@ -752,7 +754,7 @@ def registries(data: bytes) -> list[str]:
 
 
 def lock_faults(text: str) -> list[str]:
-    """Requirements of a lock without an exact version or a hash, and anything with an address."""
+    """Requirements of a lock without an exact version or hash, and addresses."""
     faults = [line for line in text.splitlines() if "://" in line or line.startswith("-")]
     for entry in text.replace("\\\n", " ").splitlines():
         if entry.strip() and not re.match(r"[\w.-]+==\S+ .*--hash=sha256:[0-9a-f]{64}", entry):
@@ -802,7 +804,7 @@ def test_a_bad_lock_is_refused(text: str) -> None:
 
 
 def test_the_wheel_and_the_locks_agree() -> None:
-    """Every dependency that ``pyproject.toml`` names is pinned."""
+    """Every dependency in ``pyproject.toml`` is pinned."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     wanted = {
         "requirements.lock": [

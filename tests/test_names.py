@@ -1,4 +1,4 @@
-"""What a UAV's id names."""
+"""Kinds of UAV ids."""
 
 import re
 

@@ -1,9 +1,9 @@
-"""The README and the guides are run: every command in them, and every snippet.
+"""Every command and snippet of the README and the guides is run.
 
-Its blocks are cut into commands and settings. A command is run by what its first words say; one
-that nobody here knows how to run fails, and so does a way of running that no command asks for.
-What differs from the README: the flight is the short one that comes with the tests, addresses are
-those of this run, and what runs for ever is stopped once it has shown what it promises.
+Code blocks are split into commands and settings. A command's first words select how it is run; a
+command without a runner fails, and so does a runner without a command. Differences from the
+README: the flight is the tests' short one, addresses are those of this run, and a command that
+runs forever is stopped once it has shown its result.
 """
 
 import json
@@ -43,13 +43,13 @@ Started = Callable[..., Any]
 
 
 def words_of(command: str) -> list[str]:
-    """The words of a command, its comment left out; a program of .venv by its name."""
+    """Return the words of a command without its comment; a program of .venv by its name."""
     words = shlex.split(command, comments=True)
     return [words[0].removeprefix(".venv/bin/"), *words[1:]]
 
 
 def run(words: list[str], where: Path) -> "subprocess.CompletedProcess[str]":
-    """Run one of our programs to its end, which must be good."""
+    """Run one of this project's programs to its successful end."""
     done = subprocess.run(
         [BIN / words[0], *words[1:]],
         cwd=where,
@@ -63,7 +63,7 @@ def run(words: list[str], where: Path) -> "subprocess.CompletedProcess[str]":
 
 
 def study(words: list[str], where: Path, studied: Callable[..., Path]) -> None:
-    """The README's own words but for the place of the report; run once a session."""
+    """Run a study as in the README except for the report's path; once per session."""
     *asked, out, place = words[2:]
     assert (out, place) == ("--out", "report")
     log = str(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog")
@@ -72,7 +72,7 @@ def study(words: list[str], where: Path, studied: Callable[..., Path]) -> None:
 
 
 def make(words: list[str], _: Path, start_node: Started) -> None:
-    """What make would do; not done, for it makes an environment first."""
+    """Parse what make would run; not executed, because it would create an environment."""
     command = ["make", "--dry-run", "--always-make", *words[1:]]
     done = subprocess.run(
         command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=HANG_S
@@ -90,7 +90,7 @@ def make(words: list[str], _: Path, start_node: Started) -> None:
 
 
 def curl(words: list[str], where: Path, node: Node) -> None:
-    """Asked of a demo that runs, by Python."""
+    """Send the request to a running demo from Python."""
     (url,) = [word for word in words if word.startswith("http://127.0.0.1:8080/")]
     headers = dict(words[i + 1].split(": ") for i, word in enumerate(words) if word == "-H")
     request = urllib.request.Request(url.replace("http://127.0.0.1:8080", node.url), None, headers)
@@ -107,7 +107,7 @@ def curl(words: list[str], where: Path, node: Node) -> None:
 
 
 def to_its_end(words: list[str], where: Path, start_node: Started) -> None:
-    """Replays, designs and studies end by themselves."""
+    """Run a replay, design or study to its end."""
     words = [str(one) for word in words for one in (sorted(where.glob(word)) or [word])]
     done = run(words, where)
     assert done.stdout or (where / "weights.npy").exists()
@@ -116,7 +116,7 @@ def to_its_end(words: list[str], where: Path, start_node: Started) -> None:
 
 
 def served(words: list[str], where: Path, start_node: Started) -> None:
-    """The replay of a recording that answers until it is stopped."""
+    """Serve a replay of a recording, which answers until stopped."""
     words[words.index("--listen") + 1] = "127.0.0.1:0"
     with started(
         [BIN / words[0], *words[1:]], cwd=where, stderr=subprocess.PIPE, text=True,
@@ -134,7 +134,7 @@ def served(words: list[str], where: Path, start_node: Started) -> None:
 
 
 def live(words: list[str], where: Path, start_node: Started) -> None:
-    """It serves, and what settings it names are those of the README."""
+    """Run a live service with the README's settings."""
     if words[1:] == ["--config", "settings.toml"] or "settings.toml" in words:
         (block,) = SETTINGS
         with socket.create_server(("127.0.0.1", 0)) as nobody:
@@ -151,7 +151,7 @@ def live(words: list[str], where: Path, start_node: Started) -> None:
 
 
 def traffic(words: list[str], where: Path, start_node: Started) -> None:
-    """Sent to a service, which comes to see it."""
+    """Send traffic to a service, which receives it."""
     node = start_node(
         *("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
     )
@@ -163,7 +163,7 @@ def traffic(words: list[str], where: Path, start_node: Started) -> None:
 
 
 def compose(words: list[str], where: Path, start_node: Started) -> None:
-    """The services and profiles that it names are there; and what compose says, where it is."""
+    """Check that the named services and profiles exist, and run compose if it is installed."""
     known = yaml.safe_load((ROOT / "docker-compose.yml").read_text(encoding="utf-8"))["services"]
     rest = words[2:]
     if rest[0] == "--profile":
@@ -183,7 +183,7 @@ def compose(words: list[str], where: Path, start_node: Started) -> None:
 
 
 def checked(words: list[str], where: Path, start_node: Started) -> None:
-    """What is in order is said line by line; nobody sends here, and that is said too."""
+    """Check that good results are listed line by line, and that the missing traffic is reported."""
     words = [word.replace("0.0.0.0:14550", "127.0.0.1:0") for word in words]
     done = subprocess.run(
         [BIN / words[0], *words[1:], "--seconds", "0.2", "--listen", "127.0.0.1:0"],
@@ -194,7 +194,7 @@ def checked(words: list[str], where: Path, start_node: Started) -> None:
 
 
 def forwarded(words: list[str], where: Path, start_node: Started) -> None:
-    """MAVProxy itself is run in tests/live; here its options are those that it knows."""
+    """Check MAVProxy's options; MAVProxy itself runs in tests/live."""
     done = run([words[0], "--help"], where)
     for option in words[1:]:
         assert option.split("=")[0] in done.stdout, option
@@ -218,13 +218,13 @@ RUNNERS: dict[str, Callable[[list[str], Path, Any], None]] = {
     "docker compose": compose,
 }
 WITH = {"companion study": "studied", "curl": "demo"}
-"""The fixture that a way of running is given; the others start nodes of their own."""
+"""Fixture of each runner; the others start their own nodes."""
 FULL = {"companion study prediction", "companion check"}
-"""Said in the text as a name, without its arguments."""
+"""Commands mentioned in the text by name, without arguments."""
 
 
 def runner_of(command: str) -> str:
-    """The key of ``RUNNERS`` for a command; ``LookupError`` where nobody knows how to run it."""
+    """Return the key of ``RUNNERS`` for a command; raise ``LookupError`` if there is none."""
     words = words_of(command)
     if "--serve" in words:
         return "companion replay --serve"
@@ -235,14 +235,14 @@ def runner_of(command: str) -> str:
 
 
 def marked(command: str) -> Any:
-    """A command as a parameter: those that take long are left to `make test-all`."""
+    """Return a command as a parameter; slow ones are left to `make test-all`."""
     long = RUNNERS[runner_of(command)] in (study, live, served, traffic)
     return pytest.param(command, marks=pytest.mark.full if long else ())
 
 
 @pytest.fixture(scope="module")
 def demo() -> Iterator[Node]:
-    """The demo, once all its UAVs have beams."""
+    """Run the demo until all its UAVs have beams."""
     node = Node("demo", "--port", "0", "--seconds", "36000")
     try:
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
@@ -253,7 +253,7 @@ def demo() -> Iterator[Node]:
 
 @pytest.fixture(scope="module")
 def recording(short_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the replay of the short flight recorded."""
+    """Return the recording of a replay of the short flight."""
     made = tmp_path_factory.mktemp("readme") / "recording.mcap"
     run(["companion", "replay", str(short_log), "--out", str(made)], made.parent)
     return made
@@ -278,8 +278,8 @@ def test_the_command_does_what_it_should(
     if "flights/*.mcap" in command:
         (tmp_path / "flights").mkdir()
         shutil.copy(request.getfixturevalue("recording"), tmp_path / "flights")
-    monkeypatch.chdir(tmp_path)  # `recordings` and the like are made here
-    words = ["3" if word == "120" else word for word in words_of(command)]  # it is 5 s long
+    monkeypatch.chdir(tmp_path)  # `recordings` and similar folders are created here
+    words = ["3" if word == "120" else word for word in words_of(command)]  # the flight is 5 s long
     way = runner_of(command)
     RUNNERS[way](words, tmp_path, request.getfixturevalue(WITH.get(way, "start_node")))
 

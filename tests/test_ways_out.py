@@ -1,8 +1,7 @@
-"""One name for each value on every way out: the API, recordings and exports.
+"""One name for each value in every output: the API, recordings and exports.
 
-What the ways hold of one subject is compared on a flight. Two names with the same values are one
-value under two names; a value that one way lacks needs a reason, which stands with its
-description, or here.
+The outputs are compared on a flight. Two names with the same values are one value under two
+names. A value missing from one output needs a reason, given with its description or here.
 """
 
 import math
@@ -75,7 +74,7 @@ UNITS = ("_degps", "_radps", "_mps2", "_mps", "_dbm", "_deg", "_rad", "_utc", "_
 
 
 def stem(name: str) -> str:
-    """A name without its unit, and a vector without its axis: the same on every way."""
+    """Return a name without its unit and axis: equal in every output."""
     for unit in UNITS:
         if name.endswith(unit):
             name = name.removesuffix(unit)
@@ -87,7 +86,7 @@ def stem(name: str) -> str:
 
 
 def names(subject: dict[str, Any]) -> dict[str, set[str]]:
-    """The stems that each way has of a subject; names of the version before are left out."""
+    """Return the stems of a subject in each output; deprecated names are left out."""
     api = {
         stem(name_in_json(one.name)) for one in members(subject["api"])
         if "api" not in one.meaning.absent
@@ -110,7 +109,7 @@ def test_what_one_way_lacks_has_a_reason(subject: str) -> None:
 
 @pytest.fixture(scope="module")
 def flown(cut_log: Path) -> tuple[Pipeline, Any, list[Update]]:
-    """A pipeline after a flight, with updates of which each UAV has moved on."""
+    """Return a pipeline after a flight, with updates in which each UAV has moved."""
     settings = Settings().override(center={"source": "5:1"})
     pipeline, updates = Pipeline(settings), list[Update]()
     for event in log_events([cut_log], settings):
@@ -130,7 +129,8 @@ def radians_as_degrees(name: str, value: Any) -> Any:
 
 
 def columns(flown: tuple[Pipeline, Any, list[Update]]) -> dict[str, dict[str, list[Any]]]:
-    """The values of all beams and tracks of a flight by name, on all ways, angles in degrees."""
+    """Return the values of all beams and tracks of a flight by name, in every output, angles in
+    degrees."""
     pipeline, equipment, updates = flown
     found: dict[str, dict[str, list[Any]]] = {"track": defaultdict(list), "beam": defaultdict(list)}
 
@@ -188,7 +188,7 @@ def test_two_names_never_hold_the_same_values(
 def test_one_name_holds_the_same_values_on_every_way(
     flown: tuple[Pipeline, Any, list[Update]], subject: str
 ) -> None:
-    """Angles in degrees: the recording has them in radians."""
+    """Angles in degrees; the recording has radians."""
     found = {
         name: values for name, values in columns(flown)[subject].items()
         if isinstance(values[0], float) and not re.search("_(north|east|down)_", name)
@@ -212,7 +212,7 @@ def test_no_table_names_a_column_twice_and_old_names_say_what_is_new() -> None:
 
 
 def test_a_value_means_the_same_on_every_way() -> None:
-    """It is described once: the same object says what it means."""
+    """It is described once: every output refers to the same object."""
     for name in ("innovation_m", "bound_m", "age_s"):
         said = meaning(TrackRow, name)
         assert isinstance(said, Meaning)

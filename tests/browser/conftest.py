@@ -1,4 +1,4 @@
-"""The browser and the running demo that the tests of pages share."""
+"""The browser and the running demo shared by the page tests."""
 
 import os
 from collections.abc import Iterator
@@ -17,7 +17,9 @@ QUIET = (
 
 @pytest.fixture(scope="module")
 def chromium() -> Iterator[Any]:
-    """A headless browser. Of a module: while it is open its loop runs in this thread."""
+    """Open a headless browser for one module: its event loop runs in this thread while it is
+    open.
+    """
     if not CHROMIUM.exists():
         pytest.skip(f"no {CHROMIUM}: install chromium to test the page")
     from playwright.sync_api import sync_playwright
@@ -29,9 +31,9 @@ def chromium() -> Iterator[Any]:
 
 
 def start_demo(directory: Path, port: int = 0) -> Node:
-    """The demo, recording to ``directory``, once its four beams are up."""
+    """Start the demo, recording to ``directory``, and wait for its four beams."""
     before = Path.cwd()
-    os.chdir(directory)  # it records to ./recordings
+    os.chdir(directory)  # recordings go to ./recordings
     try:
         node = Node("demo", "--port", str(port), "--seconds", "36000")
     finally:
@@ -42,21 +44,21 @@ def start_demo(directory: Path, port: int = 0) -> Node:
 
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
-    """One demo for all tests of a module that do not end it."""
+    """Run one demo for all tests of a module that do not stop it."""
     node = start_demo(tmp_path_factory.mktemp("demo"))
     yield node
     node.stop()
 
 
 def is_complaint(said: Any) -> bool:
-    """Whether the console says that something is wrong. Chromium reports each answer that is no
-    success, and 503 is what a service that is late, on a busy machine, rightly answers."""
+    """Return whether a console message reports an error. Chromium reports each unsuccessful
+    response, and 503 is the correct response of an overloaded service."""
     return said.type == "error" and "status of 503" not in said.text
 
 
 @pytest.fixture
 def open_page(chromium: Any) -> Iterator[Any]:
-    """Opens pages; at the end none of them may have complained, but of what was announced."""
+    """Open pages; at the end none may have logged errors other than the expected ones."""
     pages: list[tuple[Any, list[str], bool]] = []
 
     def start(
@@ -74,14 +76,14 @@ def open_page(chromium: Any) -> Iterator[Any]:
     yield start
     for page, complaints, loses_service in pages:
         page.close()
-        # Chromium complains of every answer that is none or no success, and there are such then.
+        # Chromium logs every missing or unsuccessful response, which are expected then.
         unheard = [text for text in complaints if not text.startswith("Failed to load resource")]
         assert (unheard if loses_service else complaints) == []
 
 
 @pytest.fixture
 def start_mine(tmp_path: Path) -> Iterator[Any]:
-    """Starts demos for one test alone, and ends those that it left."""
+    """Start demos for one test, and stop those left running."""
     nodes: list[Node] = []
 
     def start(port: int = 0) -> Node:

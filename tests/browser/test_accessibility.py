@@ -1,4 +1,4 @@
-"""The page by the rules of axe-core: no violation at any size, in any theme, with anything open."""
+"""The page under axe-core's rules: no violation at any size, in any theme, with any dialog open."""
 
 from pathlib import Path
 from typing import Any
@@ -21,14 +21,14 @@ OPENED = {
     "settings": "() => document.getElementById('settings-open').click()",
     "drawer": "() => document.querySelector('.pick').click()",
 }
-"""How each is opened, and the page alone."""
+"""How each dialog is opened, and the page alone."""
 VIOLATIONS = """async () => (await axe.run()).violations.flatMap(({ id, nodes }) =>
     nodes.map(({ target, failureSummary }) => `${id}: ${target} ${failureSummary}`))"""
 
 
 def violations(page: Any) -> list[str]:
-    """What axe finds wrong, an element a line. (Evaluated, for the page's policy lets no other
-    script in.)"""
+    """Return axe's violations, one element per line. (Evaluated, because the page's policy allows
+    no other script.)"""
     page.evaluate(AXE.read_text(encoding="utf-8") + ";0")
     found: list[str] = page.evaluate(VIOLATIONS)
     return found

@@ -1,4 +1,4 @@
-"""The API's document in a browser: drawn without internet, and tried with the tab's token."""
+"""The API documentation page in a browser: rendered without internet, with the tab's token."""
 
 import json
 from typing import Any
@@ -33,5 +33,5 @@ def test_the_document_is_drawn_and_tried(
     answered.wait_for()
     assert answered.inner_text().split()[0] == "200"
     assert {address for address in elsewhere if not address.startswith((url, "data:"))} == set()
-    assert said == []  # a policy that is broken is said on the console
+    assert said == []  # a policy violation is logged on the console
     page.close()

@@ -1,4 +1,4 @@
-"""The page of a node of a fleet: it is all there at every size, and axe finds nothing."""
+"""The page of a fleet node: complete at every size, and without axe violations."""
 
 from typing import Any
 
@@ -15,7 +15,7 @@ STATES = {"north": "here", "harbour-east": "there", "a-node-with-a-long-name": "
 
 
 def fleet(answer: dict[str, Any], uavs: list[str]) -> dict[str, Any]:
-    """A fleet of four nodes in each state, and UAVs served in every way."""
+    """Return a fleet of four nodes, one in each state, with UAVs in every serving state."""
     names = [name for name, state in STATES.items() if state != "aside"]
     nodes = [
         {
@@ -47,7 +47,7 @@ def fleet(answer: dict[str, Any], uavs: list[str]) -> dict[str, Any]:
 
 
 def join(node: Node, page: Any) -> None:
-    """Let the page see the node as part of a fleet."""
+    """Show the node to the page as part of a fleet."""
 
     def uavs(route: Any) -> None:
         answer = node.json("/v1/uavs")

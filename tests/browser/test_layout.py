@@ -1,4 +1,4 @@
-"""The page at every size, for few UAVs and for many: nothing overlaps, nothing is cut off."""
+"""The page at every size, with few and many UAVs: nothing overlaps or is cut off."""
 
 import functools
 from typing import Any
@@ -44,7 +44,7 @@ OVERLAPS = """() => {
     }
     return found;
 }"""
-"""Pairs of elements of one group whose boxes, as far as they can be seen, overlap."""
+"""Pairs of elements of one group whose visible boxes overlap."""
 CUT = """() => [...document.querySelectorAll("header *, .side h2, .side p, h2, .chip, .button")]
     .filter(one => one.checkVisibility() && !one.closest(".hidden"))
     .filter(one => one.getBoundingClientRect().right > innerWidth + 0.5
@@ -53,7 +53,7 @@ CUT = """() => [...document.querySelectorAll("header *, .side h2, .side p, h2, .
 
 
 def crowd(answer: dict[str, Any], key: str, name: str, number: int) -> dict[str, Any]:
-    """The answer with its UAVs over and over, as many as are wanted."""
+    """Return the response with its UAVs repeated up to the wanted number."""
     several = answer[key]
     levels = ("good", "good", "weak", "none")
     copies = []
@@ -68,7 +68,7 @@ def crowd(answer: dict[str, Any], key: str, name: str, number: int) -> dict[str,
 
 
 def many(node: Node, page: Any, number: int) -> None:
-    """Let the page see as many UAVs as are wanted, whatever the demo flies."""
+    """Show the page the wanted number of UAVs, independent of the demo."""
 
     def fulfil(path: str, key: str, name: str, route: Any) -> None:
         route.fulfill(json=crowd(node.json(path), key, name, number))
@@ -118,7 +118,7 @@ def test_what_is_acted_on_is_seen_on_a_tablet_without_scrolling(demo: Node, open
 
 
 def test_every_column_is_seen_at_a_desk_whatever_the_states(demo: Node, open_page: Any) -> None:
-    """Signs and bold letters of what is old take more room than what is well."""
+    """Signs and bold letters of stale values need more room than good ones."""
 
     def fulfil(route: Any) -> None:
         answer = crowd(demo.json("/v1/uavs"), "uavs", "id", 4)

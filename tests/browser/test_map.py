@@ -1,4 +1,4 @@
-"""A map of the user's under the plan view: drawn where it belongs, and loaded from here alone."""
+"""A user's map under the plan view: at the right position, loaded from this server only."""
 
 import io
 import math
@@ -21,7 +21,7 @@ GROUND, MARK = (40, 160, 60), (250, 30, 30)
 
 
 def picture(marked: tuple[float, float] | None) -> bytes:
-    """A tile as PNG: plain, with a square around the marked pixel."""
+    """Return a plain PNG tile with a square around the marked pixel."""
     rows = bytearray()
     for y in range(256):
         rows.append(0)  # no filter
@@ -41,7 +41,7 @@ def picture(marked: tuple[float, float] | None) -> bytes:
 
 @pytest.fixture
 def area(tmp_path: Path) -> Path:
-    """One zoom level about the carrier, whose place is marked. Tiles of web Mercator."""
+    """Return one zoom level around the carrier, whose position is marked. Web Mercator tiles."""
     path, zoom = tmp_path / "area.pmtiles", 16
     world = 2**zoom
     x = (CARRIER[1] + 180) / 360 * world
@@ -64,9 +64,9 @@ def area(tmp_path: Path) -> Path:
 
 
 def reddish(page: Any, right: int, down: int) -> bool:
-    """Whether the map has the mark's colour at an offset from its middle, where the carrier is.
+    """Return whether the map has the mark's colour at an offset from its centre, the carrier.
 
-    Tiles are drawn at about half their strength over the page's own ground.
+    Tiles are drawn at about half opacity over the page's background.
     """
     box = page.locator("#ground").bounding_box()
     at = {"x": box["x"] + box["width"] / 2 + right, "y": box["y"] + box["height"] / 2 + down}
@@ -95,7 +95,7 @@ def test_the_ground_lies_under_the_carrier(
         page.locator("#uavs tbody tr").first.wait_for()
         page.evaluate("document.getElementById('plan').style.visibility = 'hidden'")
         while not (reddish(page, 0, 0) and not reddish(page, 150, 60)):
-            pass  # the ground is loaded and drawn tile by tile; a test that hangs is ended
+            pass  # the map is drawn tile by tile; a hanging test is terminated
         credit = page.locator("#ground").get_attribute("data-credit")
         page.close()
         process.terminate()

@@ -1,6 +1,6 @@
 """The dashboard in a real browser, on the running demo.
 
-Pictures go to ``out/screens``; with ``KEEP_SCREENS`` set, to ``docs`` as well.
+Screenshots go to ``out/screens``; with ``KEEP_SCREENS`` set, to ``docs`` as well.
 """
 
 import functools
@@ -31,14 +31,14 @@ AZIMUTHS = (
 
 
 def wait_for_uavs(page: Any) -> None:
-    """Until every UAV of the demo is in the table."""
+    """Wait until every UAV of the demo is in the table."""
     for uav in UAVS:
         page.locator("#uavs").get_by_text(uav, exact=True).wait_for(timeout=HANG_MS)
 
 
 def wait_for_value(page: Any, expression: str, wanted: str) -> None:
-    """Until an expression has a value. (Playwright's own way to wait for
-    one evaluates text in the page, which the content policy forbids.)"""
+    """Wait until an expression has a value. (Playwright's own method evaluates text in the page,
+    which the content policy forbids.)"""
     end = time.monotonic() + HANG_S
     while (found := page.evaluate(expression)) != wanted:
         assert time.monotonic() < end, found
@@ -46,7 +46,7 @@ def wait_for_value(page: Any, expression: str, wanted: str) -> None:
 
 
 def picture(page: Any, name: str) -> None:
-    """Keep what the page looks like, in 256 colours."""
+    """Save a screenshot in 256 colours."""
     SCREENS.mkdir(parents=True, exist_ok=True)
     shot = Image.open(io.BytesIO(page.screenshot())).convert("RGB")
     shot.quantize(256, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
@@ -55,7 +55,7 @@ def picture(page: Any, name: str) -> None:
 
 
 def drawn_colours(page: Any, canvas: str) -> int:
-    """How many colours a picture has: one, where nothing was drawn."""
+    """Return the number of colours in a picture: one if nothing was drawn."""
     return int(
         page.evaluate(
             """id => {
@@ -78,7 +78,7 @@ def test_everything_is_shown_and_moves_without_flooding(demo: Node, open_page: A
     page.locator("#pattern-facts [data-fact=peak]").get_by_text("dB").wait_for(timeout=HANG_MS)
     page.locator("#links").get_by_text("udpin:").wait_for(timeout=HANG_MS)
     page.locator("#events").get_by_text("4:1 is live").first.wait_for(timeout=HANG_MS)
-    page.wait_for_timeout(6000)  # so that the series and the rate of requests say something
+    page.wait_for_timeout(6000)  # so that the series and the request rate are meaningful
     times = page.evaluate("performance.getEntriesByType('resource')"
                           ".filter(one => one.initiatorType === 'fetch')"
                           ".map(one => one.startTime)")  # fmt: skip
@@ -97,7 +97,7 @@ def test_everything_is_shown_and_moves_without_flooding(demo: Node, open_page: A
 def test_the_keyboard_chooses_pauses_and_looks_back(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, DESKTOP)
     wait_for_uavs(page)
-    page.locator("#uavs th[data-key=id] button").click()  # by name: the worst first changes
+    page.locator("#uavs th[data-key=id] button").click()  # by name: the worst-first order changes
     page.keyboard.press("2")
     assert page.locator(".pick[aria-pressed=true]").inner_text() == "2:1"
     page.keyboard.press("ArrowDown")
@@ -110,7 +110,7 @@ def test_the_keyboard_chooses_pauses_and_looks_back(demo: Node, open_page: Any) 
     assert page.locator("#past").is_visible()
     assert "NOT LIVE" in page.locator("#past").inner_text()
     assert page.title().startswith("PAUSED")
-    page.wait_for_timeout(1200)  # more than a beat: the page must stand still
+    page.wait_for_timeout(1200)  # more than one polling period: the page must not change
     assert page.evaluate(AZIMUTHS) == paused
     page.keyboard.press("ArrowLeft")
     page.keyboard.press("ArrowLeft")
@@ -131,7 +131,7 @@ def test_the_keyboard_chooses_pauses_and_looks_back(demo: Node, open_page: Any) 
 
 
 def remember_azimuths(page: Any, seconds: float) -> list[str]:
-    """Every state of the table's azimuths over some seconds."""
+    """Return every state of the table's azimuths over some seconds."""
     seen: list[str] = page.evaluate(
         f"""async milliseconds => {{
             const seen = new Set();
@@ -161,7 +161,7 @@ def test_the_slider_looks_back(demo: Node, open_page: Any) -> None:
 
 
 def fulfil(answer: Any, route: Any) -> None:
-    """Answer in the place of a service that has recordings to offer."""
+    """Respond in place of a service that has recordings."""
     route.fulfill(json=answer)
 
 
@@ -191,7 +191,7 @@ def test_a_phone_shows_it_all_in_its_width(demo: Node, open_page: Any) -> None:
         .filter(one => one.getBoundingClientRect().right > innerWidth + 0.5)
         .map(one => one.tagName + "." + one.className)""")
     assert cut == []
-    assert page.locator("#pause").bounding_box()["height"] >= 40  # for cold fingers
+    assert page.locator("#pause").bounding_box()["height"] >= 40  # large enough for gloves
 
 
 @pytest.mark.full
@@ -208,7 +208,7 @@ def test_themes_are_remembered_and_legible(demo: Node, open_page: Any) -> None:
     page.reload()
     wait_for_uavs(page)
     assert page.locator("html").get_attribute("data-theme") == "light"
-    page.wait_for_timeout(4000)  # for the picture alone
+    page.wait_for_timeout(4000)  # for the screenshot only
     picture(page, "dashboard-light")
 
 
@@ -226,7 +226,7 @@ CONTRASTS = """(() => {
         return [name, (a + 0.05) / (b + 0.05)];
     }));
 })()"""
-"""Contrast with the panels as WCAG 2 has it: 4.5 for text, 7 where it must be read in the sun."""
+"""Contrast with the panels by WCAG 2: 4.5 for text, 7 where it must be readable in sunlight."""
 
 
 @pytest.mark.full
@@ -235,7 +235,7 @@ def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: An
     page = open_page(node.url, DESKTOP, loses_service=True)
     wait_for_uavs(page)
     style = "getComputedStyle(document.querySelector('td[data-key=range] span')).{}"
-    node.process.send_signal(signal.SIGSTOP)  # silent, but not gone
+    node.process.send_signal(signal.SIGSTOP)  # silent, but still running
     page.locator("html[data-uavs-late]").wait_for(state="attached", timeout=HANG_MS)
     assert page.evaluate(style.format("fontStyle")) == "italic"
     node.process.send_signal(signal.SIGCONT)

@@ -1,4 +1,4 @@
-"""The pages of all studies in a real browser, from the file system and without a network."""
+"""The report pages of all studies in a real browser, from the file system, without a network."""
 
 import json
 from collections.abc import Callable
@@ -24,12 +24,12 @@ FIGURES = """[...document.querySelectorAll("img, svg")].map(one => {
     const right = one.getBoundingClientRect().right <= document.documentElement.clientWidth;
     return { width, height, pixels: one.naturalWidth ?? width, right };
 })"""
-"""What each figure takes up, and whether its image could be read: 0 pixels where it could not."""
+"""Size of each figure, and of its image: 0 pixels if it could not be loaded."""
 
 
 @pytest.fixture(scope="module")
 def report(studied: Callable[..., Path]) -> Callable[[str], Path]:
-    """``report("paper")``: the directory of a study's report."""
+    """``report("paper")`` returns the directory of a study's report."""
     return lambda name: studied(name, *map(str, STUDIES[name]))
 
 

@@ -1,4 +1,4 @@
-"""The scene in space: asked for by a button or a key, turned by both, and as accessible."""
+"""The 3D view: opened by button or key, rotated by both, and equally accessible."""
 
 from typing import Any
 
@@ -20,7 +20,7 @@ def test_it_is_seen_from_all_sides(demo: Node, open_page: Any, size: str) -> Non
     page = open_page(demo.url, SIZES[size])
     wait_for_uavs(page)
     assert not page.evaluate(LOADED)
-    page.locator("#pause").click()  # what moves from now on is moved by a key
+    page.locator("#pause").click()  # from now on the view moves by key only
     button = page.get_by_role("button", name="3D")
     button.click()
     page.locator("#space[aria-pressed=true]").wait_for(timeout=HANG_MS)
@@ -30,7 +30,7 @@ def test_it_is_seen_from_all_sides(demo: Node, open_page: Any, size: str) -> Non
         before = page.evaluate(PICTURE)
         page.keyboard.press(key)
         while page.evaluate(PICTURE) == before:
-            page.wait_for_timeout(50)  # until the next frame; a test that hangs is ended
+            page.wait_for_timeout(50)  # until the next frame; a hanging test is terminated
     assert page.evaluate(OVERLAPS) == []
     assert page.evaluate(CUT) == []
     assert violations(page) == []

@@ -1,4 +1,4 @@
-"""What the page and its tests take from others is what was published: files by their checksums."""
+"""Vendored files of the page and its tests match their published checksums."""
 
 import hashlib
 import re
@@ -13,7 +13,7 @@ ROW = re.compile(r"^\| `(?P<file>[^`]+)` \|.*\| (?P<version>[\d.]+) \| (?P<licen
 
 
 def faults(folder: Path) -> list[str]:
-    """Files that differ from the folder's table, or are missing on either side."""
+    """Return files that differ from the folder's table or are missing on either side."""
     told = {row["file"]: row["sha256"] for row in ROW.finditer((folder / "README.md").read_text())}
     found = {
         path.name: hashlib.sha256(path.read_bytes()).hexdigest()

@@ -1,4 +1,4 @@
-"""One line for what a user does wrong, a traceback for what we do, one line for Ctrl-C."""
+"""One line for user errors, a traceback for program defects, one line for Ctrl-C."""
 
 import os
 import random
@@ -27,7 +27,7 @@ def prog() -> None:
 @prog.command()
 @click.argument("what")
 def fail(what: str) -> None:
-    """Fails as it is told."""
+    """Fail in the given way."""
     match what:
         case "user":
             raise UserError("the file holds\n  no log")
@@ -64,9 +64,9 @@ def test_one_line(what: str, status: int, said: str) -> None:
 
 
 def test_nothing_that_a_terminal_obeys_is_said(capsys: pytest.CaptureFixture[str]) -> None:
-    """Lines are kept, and what is written in whatever letters."""
+    """Line breaks and letters of any script are kept."""
     for say in (console.say, voice.Lines().say, voice.JsonLines().say, served_replay._say):
-        say("ü 王\n\x1b[2J\x1b]0;pwned\x07\r\b\x9b")  # as a hole's reason, or a name
+        say("ü 王\n\x1b[2J\x1b]0;pwned\x07\r\b\x9b")  # as a reason or a name
     said = capsys.readouterr()
     assert said.out + said.err == 4 * "ü 王\n[2J]0;pwned\n"
 
@@ -75,7 +75,7 @@ def test_nothing_that_a_terminal_obeys_is_said(capsys: pytest.CaptureFixture[str
 def test_an_interrupt_in_an_import_waits_for_its_end(
     made_of_it: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Whatever a package would make of it: nothing, another error, or half a package."""
+    """Otherwise a package might ignore it, raise another error, or be left half imported."""
     (tmp_path / "interrupted_import.py").write_text(
         "import signal\n"
         "try:\n    signal.raise_signal(signal.SIGINT)\n"
@@ -96,20 +96,20 @@ def test_a_defect_is_not_taken_for_a_mistake_of_the_user(what: str) -> None:
 
 
 def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
-    """Whatever class of ours ends in Error and can leave a command is one, or says here why not."""
+    """Every error class that can leave a command is a UserError, or has its reason here."""
     inside = {
         "_RefusedError",  # becomes a Rejection where it is raised
         "UnsatisfiableRangeError",  # becomes a 416
-        "ServiceError",  # of the client: what the service answered
+        "ServiceError",  # client side: the service's error response
         "InterruptedByUser",  # Ctrl-C
-        "HungUpError",  # a connection that ended in good order: a link tries again, or is done
+        "HungUpError",  # an orderly end of a connection: the link retries or ends
         "TooLongError",  # the parser refuses the request with a 400
         "DamagedChunkError",  # the chunk is passed over and counted
         "NoTableError",  # becomes the UserError of a file that is no log
         "UnknownFlagsError",  # the same
-        "DeviceError",  # becomes "safe" and a try again, said once
+        "DeviceError",  # leads to the safe state and a retry, announced once
         "SourceLostError",  # the same
-        "FleetMessageError",  # becomes a counted sample that was refused
+        "FleetMessageError",  # becomes a counted rejected sample
     }
     run = (
         "import pkgutil, importlib, companion\n"
@@ -146,8 +146,8 @@ def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
 def test_an_interrupt_while_the_command_loads_is_one_line(
     package: str, asked: list[str], ended: str, seed: int, tmp_path: Path
 ) -> None:
-    """From the moment on that it listens for it; before that the interpreter itself is starting,
-    and on a busy machine that can take longer than any wait."""
+    """From the moment at which the handler is installed; interpreter start can take longer than any
+    timeout on a busy machine."""
     began = tmp_path / "began"
     code = (
         f"import signal, sys\nfrom {package}.__main__ import main\n"
@@ -164,7 +164,7 @@ def test_an_interrupt_while_the_command_loads_is_one_line(
         while not began.exists():
             assert process.poll() is None
             os.sched_yield()
-        time.sleep(random.Random(seed).uniform(0.0, 0.5))  # anywhere while it loads, or after it
+        time.sleep(random.Random(seed).uniform(0.0, 0.5))  # anywhere during loading, or after it
         process.send_signal(signal.SIGINT)
         _, said = process.communicate(timeout=HANG_S)
     lines = said.splitlines()

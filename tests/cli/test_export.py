@@ -1,4 +1,4 @@
-"""``companion export``: the tables as other programs read them, against the pipeline's numbers."""
+"""``companion export``: tables as other programs read them, against the pipeline's numbers."""
 
 import errno
 import json
@@ -14,7 +14,7 @@ import pytest
 from click.testing import CliRunner, Result
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from mcap.reader import make_reader
-from pymavlink import mavutil  # the oracle: tests alone may import it
+from pymavlink import mavutil  # the oracle: only tests may import it
 from pymavlink.dialects.v20 import all as dialect
 from support import ROOT
 
@@ -74,14 +74,14 @@ def as_parquet(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def outputs() -> list[Output]:
-    """Everything that the pipeline says of the log, stepped by hand."""
+    """Return every output of the pipeline for the log, stepped by hand."""
     settings = Settings().override(center={"source": "5:1"})
     pipeline = Pipeline(settings)
     return [out for event in log_events([LOG], settings) for out in pipeline.step(event)]
 
 
 def duck(file: Path) -> list[tuple[Any, ...]]:
-    """All rows of a file, as DuckDB reads it by itself."""
+    """Return all rows of a file with the types that DuckDB infers."""
     found: list[tuple[Any, ...]] = duckdb.sql(f"select * from '{file}'").fetchall()
     return found
 
@@ -91,7 +91,7 @@ def arrow(file: Path) -> list[dict[str, Any]]:
     return found
 
 
-# --- the schema ---------------------------------------------------------------------------------
+# --- schema -------------------------------------------------------------------------------------
 
 
 def test_the_document_says_what_the_tables_are() -> None:
@@ -123,7 +123,7 @@ def test_names_end_in_their_units(table: Table) -> None:
             assert not column.name.endswith(tuple(endings.values())), column.name
 
 
-# --- how others read it -------------------------------------------------------------------------
+# --- other readers ------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
@@ -171,11 +171,11 @@ def test_parquet_says_the_types_and_holds_the_same(
     assert json.loads((as_parquet / folder.CONTENTS).read_text())["rows"][file.name] == len(rows)
 
 
-# --- the numbers --------------------------------------------------------------------------------
+# --- values -------------------------------------------------------------------------------------
 
 
 def test_reports_are_those_that_pymavlink_reads(as_parquet: Path) -> None:
-    """Every one has a row, in the order of the log, used or not."""
+    """Every report has a row, in log order, accepted or not."""
     reader = mavutil.mavlogfile(str(LOG))
     wanted = []
     while (message := reader.recv_match(type=["GLOBAL_POSITION_INT", "ADSB_VEHICLE"])) is not None:
@@ -245,7 +245,7 @@ def test_what_was_refused_and_said_is_there(as_parquet: Path, outputs: list[Outp
 
 
 def test_space_holds_each_track_and_beam_as_points(tmp_path: Path, outputs: list[Output]) -> None:
-    """Read by mcap and Foxglove's own class: a beam's last point is where its UAV is."""
+    """Read by mcap and Foxglove's own class: the last point of a beam is at its UAV."""
     where = exported(tmp_path / "space", LOG, "--format", "rerun", *CENTER)
     updates = {one.t_ns: one for one in outputs if isinstance(one, Update)}
     seen: Counter[str] = Counter()
@@ -294,7 +294,7 @@ def test_a_recording_gives_the_same_tables(tmp_path: Path, short_log: Path) -> N
 
 
 def tlog(*messages: tuple[int, Any]) -> bytes:
-    """Messages of vehicle 7:1, each with its time in microseconds, as a telemetry log."""
+    """Return messages of vehicle 7:1, each with its time in microseconds, as a telemetry log."""
     sender = dialect.MAVLink(None, srcSystem=7, srcComponent=1)
     return b"".join(us.to_bytes(8, "big") + message.pack(sender) for us, message in messages)
 
@@ -311,12 +311,12 @@ def test_unknown_is_null_and_never_0(tmp_path: Path) -> None:
     log.write_bytes(
         tlog(
             *((begun_us + i * 100_000, position(i * 100, 470_000_000, 65_535)) for i in range(20)),
-            (begun_us + 2_000_000, position(2000, 0, 0)),  # far from where it was
+            (begun_us + 2_000_000, position(2000, 0, 0)),  # far from its previous position
             (begun_us + 2_100_000, position(2100, 950_000_000, 0)),
         )
     )
     tables = exported(tmp_path / "out", log)
-    exported(tmp_path / "out", log, "--format", "parquet")  # beside the other
+    exported(tmp_path / "out", log, "--format", "parquet")  # beside the other vehicle
     rows = arrow(tmp_path / "out" / "reports.parquet")
     assert rows == [dict(zip(rows[0], row, strict=True)) for row in duck(tables / "reports.csv")]
     assert {row["link"] for row in rows} == {'a, "b"\nc\\udcff.tlog'}
@@ -330,7 +330,7 @@ def test_unknown_is_null_and_never_0(tmp_path: Path) -> None:
     )
     assert of_place is not None
     after = of_place[0].partition("longitude")[2].split(",")[1:]
-    assert set(after) == {"", "false"}  # nothing is known of it, and it began no track anew
+    assert set(after) == {"", "false"}  # no estimate, and it restarted no track
 
 
 def test_a_log_without_positions_gives_tables_without_rows(tmp_path: Path) -> None:
@@ -364,7 +364,7 @@ def test_garbage_and_torn_frames_are_counted(tmp_path: Path) -> None:
     assert found["garbage"] > 0
 
 
-# --- what is left behind ------------------------------------------------------------------------
+# --- files left behind --------------------------------------------------------------------------
 
 
 def left(where: Path) -> dict[str, bytes]:

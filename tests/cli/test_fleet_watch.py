@@ -1,4 +1,4 @@
-"""``companion fleet watch`` on a node, on what is none, with a token, and over a restart."""
+"""``companion fleet watch`` on a node, on other services, with a token, and across a restart."""
 
 import json
 import threading
@@ -39,7 +39,7 @@ FLEET = {
 
 
 class Service(ThreadingHTTPServer):
-    """Answers one request after the other as it is told; the last answer stands."""
+    """Gives the prepared responses one after the other; the last one repeats."""
 
     answers: list[tuple[int, str]]
     tokens: list[str | None]
@@ -158,7 +158,7 @@ def test_a_node_that_is_restarted_is_waited_for(
     monkeypatch.setattr(watching, "EVERY_S", 0.001)
     good, gone = (200, json.dumps(FLEET)), (503, "")
     service.answers = [good, gone, good, (200, json.dumps(FLEET | {"node": None}))]
-    done = watch(service.url)  # which ends where the node is part of no fleet any more
+    done = watch(service.url)  # it ends once the node is no longer in a fleet
     assert done.stdout.count("seen from north") == 2
     assert done.stderr.splitlines() == [
         f"no answer: {service.url}: 503: Service Unavailable",

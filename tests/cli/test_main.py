@@ -1,4 +1,4 @@
-"""Commands: help with an example, mistakes in one line, ``design`` with its fields."""
+"""Commands: help with an example, errors in one line, ``design`` with its fields."""
 
 import json
 import socket
@@ -13,7 +13,7 @@ COMMANDS = sorted(main.commands)
 
 
 def run(*arguments: str) -> Any:
-    """Run a command as the console script does."""
+    """Run a command like the console script."""
     return CliRunner().invoke(main, arguments, standalone_mode=True)
 
 
@@ -100,7 +100,7 @@ def test_design_by_lmi_agrees() -> None:
 
 
 def test_a_drive_that_applied_nothing_did_not_do_what_was_asked() -> None:
-    """Nobody listens at that port."""
+    """No service listens at that port."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     service = f"http://127.0.0.1:{port}"

@@ -1,4 +1,4 @@
-"""Mistakes at the command line: one line with a hint, the right status, and nothing left behind."""
+"""Command-line errors: one line with a hint, the correct exit status, and no files left behind."""
 
 import struct
 from pathlib import Path
@@ -40,7 +40,7 @@ FILES = {
     "latin.toml": "[beams]\n# \xe9\n".encode("latin-1"),
 }
 SAYS: list[tuple[str, int, str]] = [
-    # what is given, the exit status, a part of the one line
+    # arguments, exit status, part of the error line
     ("replay", 2, "Missing argument 'LOG...'. See companion replay --help"),
     ("replay nothere.tlog", 1, "nothere.tlog: no such file"),
     ("replay .", 1, ".: is a folder; name the logs in it"),
@@ -217,7 +217,7 @@ def test_a_mistake_is_one_line(folder: Path, given: str, status: int, says: str)
         *before_it, line = done.stderr.splitlines()
         assert says in line
         assert line.startswith(f"{name}: ")
-        assert len(before_it) <= 1  # what was taken for granted, such as no --center
+        assert len(before_it) <= 1  # notes on defaults, such as no --center
     assert sorted(folder.rglob("*")) == before
 
 
@@ -227,7 +227,7 @@ def test_every_reason_has_plain_words() -> None:
 
 
 def test_text_is_told_from_noise() -> None:
-    assert kinds.looks_like_text("Höhe,m\n".encode()[:3])  # cut within a character
+    assert kinds.looks_like_text("Höhe,m\n".encode()[:3])  # truncated within a character
     assert kinds.looks_like_text(b"a\tb\r\n")
     assert not kinds.looks_like_text(b"")
     assert not kinds.looks_like_text(bytes(range(256)))

@@ -1,4 +1,4 @@
-"""Guaranteed gains of what a device radiates: its own table, read back, and all errors drawn."""
+"""Guaranteed gains of a device's radiated beams: its table read back, with all errors drawn."""
 
 import json
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""How a run speaks: a line that is alive on a terminal, plain lines elsewhere, JSON on request."""
+"""Output of a run: a live status line on a terminal, plain lines in a pipe, JSON on request."""
 
 import json
 import os

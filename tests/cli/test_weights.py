@@ -1,4 +1,4 @@
-"""``companion weights``: the same beams in every form, every way to say when, and mistakes."""
+"""``companion weights``: the same beams in every format, every form of time, and errors."""
 
 import io
 import json
@@ -27,7 +27,7 @@ CENTER = ("--center", "5:1")
 HUGE = b"\x93NUMPY\x01\x00v\x00" + (
     b"{'descr': '<c16', 'fortran_order': False, 'shape': (64, 10000000000000), }".ljust(117) + b"\n"
 )
-"""A header that promises 10 petabytes."""
+"""A header that claims 10 petabytes."""
 SMALL = '[array]\nkind = "ura"\nrows = 4\ncolumns = 4\n'
 
 
@@ -38,7 +38,7 @@ def weights(log: Path, *arguments: str, at: str = str(AT_S)) -> bytes:
 
 
 def mistake(log: Path, *arguments: str, at: str = "1") -> str:
-    """What is said on stderr: one line, and nothing on stdout."""
+    """Return the single stderr line; stdout must be empty."""
     command = ["weights", str(log), "--at", at, *CENTER, *arguments]
     answer = CliRunner().invoke(main, command)
     assert answer.exit_code not in (0, None)
@@ -50,7 +50,7 @@ def mistake(log: Path, *arguments: str, at: str = "1") -> str:
 
 @pytest.fixture(scope="module")
 def looked() -> tuple[Pipeline, Update]:
-    """The pipeline stepped by hand to the time, and what it sees with a lead of 100 ms."""
+    """Return the pipeline stepped by hand to the time, and its update with a lead of 100 ms."""
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     settings = Settings().override(center={"source": "5:1"})
     pipeline, at_ns = Pipeline(settings), None
@@ -107,7 +107,7 @@ def test_a_device_s_table_reads_back_as_what_was_fitted(
 
 
 def test_a_calibration_turns_a_device_s_settings(cut_log: Path, tmp_path: Path) -> None:
-    """What the channels add is taken off: the same is radiated, by other codes."""
+    """The channel responses are compensated: equal radiation with different codes."""
     config = tmp_path / "settings.toml"
     table = tmp_path / "measured.csv"
     lines = [f"{c},{15 - c},{20 * c},{-0.1 * c}" for c in range(16)]
@@ -147,7 +147,7 @@ def test_a_file_holds_what_stdout_would(cut_log: Path, tmp_path: Path) -> None:
 
 
 def test_a_time_of_day_is_the_same_as_seconds(cut_log: Path) -> None:
-    """The same instant, whatever the zone it is said in."""
+    """The same instant, in any time zone."""
     begins = next(iter(log_events([cut_log], Settings()))).t_ns
     at = np.datetime64(begins // 1000, "us") + np.timedelta64(2_000_000, "us")
     told = json.loads(weights(cut_log, at=f"{at}Z"))
@@ -215,7 +215,7 @@ def test_a_log_that_is_not_there() -> None:
 def test_stored_beams_that_will_not_do(
     cut_log: Path, tmp_path: Path, name: str, content: Any, said: str
 ) -> None:
-    """Said before the log is read, and once."""
+    """Reported once, before the log is read."""
     file = tmp_path / name
     if isinstance(content, bytes):
         file.write_bytes(content)

@@ -52,7 +52,7 @@ def test_the_state_comes_at_once_and_with_every_update(
                 assert message.keys() >= {"valid_at", "topic"}
             models.model(uav_state.Uavs).model_validate(first[0])
             models.model(beam_state.Beams).model_validate(first[1])
-            await asyncio.sleep(0.02)  # more than the period that was asked for
+            await asyncio.sleep(0.02)  # more than the requested period
             node.tick()
             second = [await said(websocket) for _ in range(2)]
             assert second[0]["valid_at"] > first[0]["valid_at"]
@@ -88,7 +88,7 @@ def test_records_are_binary_and_those_of_each_update(make_node: Any, serving: An
                 wanted = update.beams.weights[:, columns].T.astype(np.complex64)
                 np.testing.assert_array_equal(weights, wanted)
                 assert (await said(other))["topic"] == "uavs"
-                await asyncio.sleep(0.02)  # more than the period that was asked for
+                await asyncio.sleep(0.02)  # more than the requested period
                 node.tick()
 
     run_async(check())

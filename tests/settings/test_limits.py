@@ -1,4 +1,4 @@
-"""Every number of the settings has limits, and at them a flight raises nothing but a line."""
+"""Every numeric setting has limits; at its limits a flight runs or fails with one line."""
 
 import math
 from collections.abc import Iterator
@@ -33,7 +33,7 @@ GOES_WITH: Final[dict[str, dict[str, object]]] = {
     "observer.velocity_lead_s": {"model": "position"},
     "observer.geoid_error_m": {"geoid_m": 40.0},
 }
-"""What a key needs for its number to be used at all."""
+"""Other settings that a key requires to take effect."""
 BESIDE: Final[dict[str, dict[str, dict[str, object]]]] = {
     "radio": {"beams": {"method": "mmse", "power": "max-min"}, "link": {"needed_sinr_db": 10.0}},
     "link": {"beams": {"method": "mmse", "widen": "guarantee"}},
@@ -49,7 +49,7 @@ def referred(schema: dict[str, Any]) -> dict[str, Any]:
 
 
 def numbers(schema: dict[str, Any]) -> Iterator[dict[str, Any]]:
-    """The schemas of all numbers in a value."""
+    """Return the schemas of all numbers in a value."""
     schema = referred(schema)
     if schema.get("type") in ("number", "integer"):
         yield schema
@@ -63,7 +63,7 @@ def numbers(schema: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 
 def ends(schema: dict[str, Any]) -> tuple[float, float]:
-    """The least and the greatest number that a schema allows."""
+    """Return the smallest and largest number that a schema allows."""
     least, greatest = schema.get("minimum"), schema.get("maximum")
     if least is None:
         least = math.nextafter(schema["exclusiveMinimum"], math.inf)
@@ -73,7 +73,7 @@ def ends(schema: dict[str, Any]) -> tuple[float, float]:
 
 
 def extremes(schema: dict[str, Any]) -> Iterator[object]:
-    """Values at their limits: one number, or all numbers that belong together."""
+    """Return values at their limits: one number, or all numbers of a list."""
     schema = referred(schema)
     if schema.get("type") in ("number", "integer"):
         yield from ends(schema)
@@ -96,7 +96,7 @@ def extremes(schema: dict[str, Any]) -> Iterator[object]:
 
 
 def keys() -> dict[str, dict[str, Any]]:
-    """The schemas of all keys that have numbers, by section and name."""
+    """Return the schemas of all numeric keys, by section and name."""
     found = {}
     for section, each in SCHEMA["properties"].items():
         for name, schema in referred(each)["properties"].items():
@@ -114,14 +114,14 @@ def test_every_number_has_a_least_and_a_greatest(key: str) -> None:
 
 @pytest.fixture(scope="module")
 def flight() -> list[Event]:
-    """Some seconds of five vehicles and of aircraft, with ticks."""
+    """Return some seconds of five vehicles and relayed aircraft, with ticks."""
     log = Path(__file__).parents[1] / "data" / "sitl_4circle_cut.tlog"
     events = list(with_ticks(read_log(log), 2.5))
     return [event for event in events if event.t_ns - events[0].t_ns < FLOWN_NS]
 
 
 def flown(settings: Settings, flight: list[Event], path: Path) -> int:
-    """Fly and record; the number of updates with beams."""
+    """Process and record a flight; return the number of updates with beams."""
     run, beams = Run(settings, None), 0
     run.writer = Writer(
         where=path,
@@ -162,7 +162,7 @@ def test_at_its_limits_a_number_flies_or_is_a_line(
 def test_all_numbers_of_a_section_fly_at_their_limits_together(
     flight: list[Event], tmp_path: Path, section: str, end: int
 ) -> None:
-    given = {"window_s": 60.0} if section == "tracks" else {}  # of a log there is no more anyway
+    given = {"window_s": 60.0} if section == "tracks" else {}  # a log holds no more anyway
     for key, schema in keys().items():
         if key.startswith(f"{section}.") and key not in ("observer.alpha", "tracks.window_s"):
             given[key.split(".")[1]] = list(extremes(schema))[end]

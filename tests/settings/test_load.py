@@ -1,4 +1,4 @@
-"""Settings: what is read, what is refused, and how that is said."""
+"""Settings: accepted values, rejected values, and their error messages."""
 
 import re
 import time
@@ -35,7 +35,7 @@ def refusal(text: str) -> str:
 
 # --- errors -------------------------------------------------------------------------------------
 
-# Section, key, value as TOML, the value as it is said, and what is allowed.
+# Section, key, value as TOML, value as printed, and allowed values.
 WRONG = [
     ("center", "source", '"there"', "there", "SYSID:COMPID"),
     ("center", "source", '"300:1"', "300:1", "at most 255"),
@@ -133,7 +133,7 @@ def test_an_error_names_key_value_and_what_is_allowed(
 
 @pytest.mark.parametrize("value", ["2", "0", "1.0", '"fast"', "-0.5"])
 def test_alpha_is_auto_or_between_0_and_1(value: str) -> None:
-    """A key of two kinds is named as it is written, and both kinds are said."""
+    """A key with two kinds of value is named as written, and both kinds are listed."""
     message = refusal(f"[observer]\nalpha = {value}\n")
     assert message.startswith("observer.alpha = "), message
     assert "auto" in message
@@ -186,13 +186,13 @@ HEX = "0x" + "f" * 5000
 def test_text_that_costs_too_much_is_refused_in_a_line(text: str, said: str) -> None:
     began_s = time.process_time()
     assert said in refusal(text)
-    assert time.process_time() - began_s < HANG_S  # the square of it takes hours
+    assert time.process_time() - began_s < HANG_S  # quadratic time would take hours
 
 
 @given(st.lists(st.sampled_from(['"', "'", "\\", "a", "#", "\n", "=", "."]), max_size=40))
 @example(['"', "a", '"', "#", "a"])
 def test_strings_of_toml_are_found_where_its_reader_finds_them(parts: list[str]) -> None:
-    """What is left without them has the keys and values that the reader sees."""
+    """The text without its strings has the same keys and types for the parser."""
     text = "x = " + "".join(parts)
     try:
         read = tomllib.loads(text)
@@ -214,7 +214,7 @@ def test_what_is_not_toml_is_said_to_be_not_toml(text: str) -> None:
 
 @pytest.mark.parametrize("text", ["[tracks]\ncoasting_s = 100\n", "[tracks]\nlost_s = 10\n"])
 def test_a_track_passes_its_states_in_order(text: str) -> None:
-    """coasting_s <= stale_s <= lost_s, or a state would never be seen."""
+    """coasting_s <= stale_s <= lost_s; otherwise a state would be unreachable."""
     assert "tracks" in refusal(text)
 
 
@@ -249,7 +249,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
         load(tmp_path / "bad.toml")
 
 
-# --- to TOML and back ---------------------------------------------------------------------------
+# --- TOML round trip ----------------------------------------------------------------------------
 
 LINKS = ["udpin:[::]:14550", "tcp:ground.example:5760", 'serial:/dev/"tty" = 1:57600']
 SCALAR = st.characters(exclude_categories=["Cs"])
@@ -314,7 +314,7 @@ def test_what_is_written_holds_every_default() -> None:
         assert written[name].keys() == known
 
 
-# --- flags --------------------------------------------------------------------------------------
+# --- options ------------------------------------------------------------------------------------
 
 
 def test_flags_override_and_none_leaves_a_key() -> None:
@@ -337,7 +337,7 @@ def test_a_bad_flag_is_an_error_of_settings() -> None:
         Settings().override(array={"shape": 3})
 
 
-# --- the array ----------------------------------------------------------------------------------
+# --- array --------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
@@ -372,7 +372,7 @@ def test_a_rectangle_is_not_larger_than_a_line_may_be() -> None:
 def test_element_positions_are_read_into_the_settings(
     tmp_path: Path, name: str, text: str | None
 ) -> None:
-    """So a recording holds them, whatever becomes of the file."""
+    """A recording thus holds them independently of the file."""
     rows = [[0.0, 0.0, 0.0], [0.0, 0.005, 0.0], [0.0, 0.0, 0.005]]
     file = tmp_path / name
     if text is None:
@@ -536,7 +536,7 @@ def test_the_array_is_the_one_that_is_described() -> None:
     assert listed.element_from_array[1, 0] == pytest.approx(np.array([0, 1, 0]))
 
 
-# --- what carries the array ---------------------------------------------------------------------
+# --- carrier ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

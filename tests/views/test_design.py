@@ -1,4 +1,4 @@
-"""The design as the API shows it."""
+"""The observer design in the API."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from companion.views.design import Assumed, _row
 
 
 def test_the_peak_error_is_that_of_the_bounds_assumed() -> None:
-    """Acceleration and noise of position weigh differently: neither stands for the other."""
+    """Acceleration and position noise have different weights and are not interchangeable."""
     gain = np.array([[1.2], [0.8]])
     assumed = Assumed(
         limits=Limits(speed_max_mps=40.0, acceleration_max_mps2=8.0),

@@ -1,4 +1,4 @@
-"""Verdicts as the API shows them."""
+"""Verdicts in the API."""
 
 from companion.mavlink.links.lag import LagSeen
 from companion.values import Blame, Cause, Level, UtcNs, Verdict

@@ -1,4 +1,4 @@
-"""Last messages as users of mavlink2rest know them, against pymavlink's own decoding."""
+"""Last messages in the mavlink2rest format, against pymavlink's decoding."""
 
 import json
 import math
@@ -33,7 +33,7 @@ def kept(message: Any) -> LastMessages:
 
 
 def shown(message: Any) -> Any:
-    """As it comes over HTTP."""
+    """Return a message as sent over HTTP."""
     found = kept(message).find(SENDER, message.get_msgId())
     assert found is not None
     return json.loads(encode(mavlink_messages.dialect().message(found, UtcNs)))
@@ -71,7 +71,7 @@ def test_text_comes_as_characters() -> None:
     param = generated.MAVLink_param_value_message(b"SYSID_THISMAV", 0.1, 9, 3, 1)
     message = shown(param)["message"]
     assert message["param_id"] == [*"SYSID_THISMAV", "\0", "\0", "\0"]
-    assert message["param_value"] == 0.1  # single precision, written with the digits it has
+    assert message["param_value"] == 0.1  # single precision, with its significant digits
     assert message["param_type"] == {"type": "MAV_PARAM_TYPE_REAL32"}
 
 
@@ -98,7 +98,7 @@ def test_every_message_decodes_as_pymavlink_decodes_it(data: st.DataObject) -> N
     assert one is not None
     message = json.loads(encode(mavlink_messages.dialect().message(one, UtcNs)))["message"]
     assert message.pop("type") == kind.msgname
-    # its own order, from the same bytes with the zeros that MAVLink 2 cuts off
+    # its own order, from the same bytes with the zeros that MAVLink 2 truncates
     values = kind.unpacker.unpack(payload.ljust(size, b"\0"))
     assert len(message) == len(kind.fieldnames)
     flat = []
@@ -142,7 +142,7 @@ def test_a_flood_of_senders_does_not_fill_the_memory() -> None:
     store.add(frame(0, Source(1, 1)))
     for number in range(10_000):
         store.add(frame(number, Source(number % 256, number // 256), msgid=5))
-        store.add(frame(number, Source(1, 1)))  # heard all the time: it stays
+        store.add(frame(number, Source(1, 1)))  # received throughout: it is kept
     assert sum(map(len, store.by_sender().values())) == 100
     stayed = store.find(Source(1, 1), 0)
     assert stayed is not None

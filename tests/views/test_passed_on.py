@@ -1,4 +1,4 @@
-"""What goes on to others: each aircraft at this moment, and times that only go forward."""
+"""Forwarded tracks: the present position of each aircraft, with increasing times."""
 
 import math
 from typing import Any
@@ -30,7 +30,7 @@ def pipeline(observer: dict[str, Any] | None = None) -> Pipeline:
 
 
 def there(t_s: float) -> tuple[float, float, float]:
-    """Northwards at 20 m/s and eastwards at 15, 120 m up, of 30 km away: north is another there."""
+    """Return a position moving north at 20 m/s and east at 15 m/s, 120 m up, 30 km away."""
     lat, lon, alt = pymap3d.ned2geodetic(20 * t_s, 30_000 + 15 * t_s, -120, *PLACE)
     return float(lat), float(lon), float(alt)
 
@@ -69,14 +69,14 @@ def tracks(fold: Pipeline, t_s: float) -> list[Track]:
 
 
 def said(fold: Pipeline, t_s: float, out: passed_on.Positions | None = None) -> list[Any]:
-    """What is said at a time, as pymavlink reads it."""
+    """Return the forwarded messages at a time, as pymavlink reads them."""
     mav: Any = dialect.MAVLink(None)
     messages = (out or passed_on.Positions()).outgoing(fold, tracks(fold, t_s))
     return [mav.decode(bytearray(pack(message, 0))) for message in messages]
 
 
 def test_a_vehicle_is_said_where_it_is_now_by_its_own_clock() -> None:
-    """0.7 s after its newest report; under its own name, with its own north."""
+    """0.7 s after its newest report, under its own id and in its own north direction."""
     fold = pipeline()
     for n in range(6):
         fold.step(telemetry(n / 2))
@@ -95,7 +95,7 @@ def test_a_vehicle_is_said_where_it_is_now_by_its_own_clock() -> None:
 
 @pytest.mark.parametrize("geoid_m", [None, -30.0])
 def test_a_vehicle_is_said_to_traffic_management(geoid_m: float | None) -> None:
-    """By pymavlink's eyes; a height above the ellipsoid only where the geoid's is known."""
+    """Decoded by pymavlink; a height above the ellipsoid only where the geoid is known."""
     fold = pipeline({"geoid_m": geoid_m, "geoid_error_m": 2.0} if geoid_m else None)
     for n in range(6):
         fold.step(telemetry(n / 2))
@@ -128,7 +128,7 @@ def test_a_vehicle_is_said_to_traffic_management(geoid_m: float | None) -> None:
 
 
 def test_what_is_not_known_any_more_is_not_said() -> None:
-    """Stale after 15 s by default."""
+    """A track is stale after 15 s by default."""
     fold = pipeline()
     fold.step(telemetry(0))
     assert len(said(fold, 14)) == len(passed_on.events(fold, tracks(fold, 14), 10)) == 1
@@ -150,7 +150,7 @@ def test_times_only_go_forward_but_for_a_reboot() -> None:
 
 
 def test_reports_that_come_ten_seconds_late_take_nothing_back() -> None:
-    """Every other one comes late; what is said goes on where it was, at every fifth of a second."""
+    """Every second report is late; the forwarded track continues every 0.2 s."""
     fold, out = pipeline(), passed_on.Positions()
     frames = sorted(
         [telemetry(n / 4, late_s=10.0 if n % 2 else 0.0) for n in range(120)],
@@ -172,7 +172,7 @@ def test_reports_that_come_ten_seconds_late_take_nothing_back() -> None:
 
 
 def test_an_event_says_what_its_numbers_are() -> None:
-    """The bound that is guaranteed, not a standard deviation; the geoid, where it is in the way."""
+    """The guaranteed bound, not a standard deviation; plus the geoid error where it applies."""
     fold = pipeline()
     for n in range(6):
         fold.step(telemetry(n / 2))
@@ -197,7 +197,8 @@ def test_an_event_says_what_its_numbers_are() -> None:
 
 @pytest.mark.parametrize("datum", ["telemetry", "geometric"])
 def test_where_the_geoid_is_known_heights_are_brought_from_one_to_the_other(datum: str) -> None:
-    """Within: above mean sea level. Without: above the ellipsoid, with what that may be off."""
+    """With the geoid: above mean sea level. Without: above the ellipsoid, with the conversion error
+    in the bound."""
     fold = pipeline({"geoid_m": 48.0, "geoid_error_m": 3.0})
     for n in range(6):
         fold.step(telemetry(n / 2) if datum == "telemetry" else adsb(n / 2, 1))
@@ -231,7 +232,7 @@ def test_a_companion_does_not_take_in_what_a_companion_said() -> None:
 def test_heights_by_pressure_are_none_above_the_ellipsoid(datum: int, told: bool) -> None:
     fold = pipeline()
     fold.step(adsb(0, datum))
-    assert said(fold, 0.5) == []  # it does not report itself
+    assert said(fold, 0.5) == []  # it sends no own reports
     (text,) = passed_on.events(fold, tracks(fold, 0.5), 10.0)
     event = from_xml(text)
     assert (event.hae_m is not None, event.le_m is not None) == (told, told)

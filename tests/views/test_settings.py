@@ -1,4 +1,4 @@
-"""The effective settings as the API shows them, each with where it comes from."""
+"""Effective settings in the API, each with its source."""
 
 from importlib import resources
 from pathlib import Path
@@ -15,7 +15,7 @@ from companion.views import settings
 
 
 def told(shown: Settings, origins: Origins) -> dict[str, tuple[str, str | None]]:
-    """Source and file of every setting that is not at its default."""
+    """Return source and file of every setting that differs from its default."""
     sections = settings.show(shown, origins)["sections"]
     assert set(sections) == set(Settings.model_fields)
     return {
@@ -38,7 +38,7 @@ def test_every_setting_is_shown_with_its_default() -> None:
 
 def test_a_file_and_the_options_over_it_are_told_apart(tmp_path: Path) -> None:
     path = tmp_path / "mast.toml"
-    # A key that is given with its default is the file's all the same.
+    # A key that the file sets to its default still has the file as source.
     path.write_text(
         "[center]\nsource = '1:1'\n[link]\nneeded_db = 6.0\n[beams]\nupdate_hz = 10.0\n"
     )

@@ -1,7 +1,7 @@
-"""The page's modules under node, without a browser: ``node:test``, and nothing installed.
+"""The page's modules under node without a browser: ``node:test`` only.
 
-Each ``*.test.mjs`` here runs the modules themselves on a canvas that records and in time that
-passes when a test says so. ``WEB_ROOT=DIR`` takes them from another directory than ``web``.
+Each ``*.test.mjs`` runs the modules on a recording canvas and in virtual time. ``WEB_ROOT=DIR``
+takes the modules from another directory than ``web``.
 """
 
 import json
@@ -23,11 +23,11 @@ from companion.views.uav_state import UavState
 
 HERE = Path(__file__).parent
 OLDEST = (20, 6)
-"""The first version of node whose loader can be told that the page's files are modules."""
+"""First version of node whose loader can treat the page's files as modules."""
 
 
 def node() -> str:
-    """A node that will do; skips where there is none."""
+    """Return a suitable node; skip if there is none."""
     found = shutil.which("node")
     if found is None:
         pytest.skip("no node: install Node.js to test the page's modules")
@@ -41,7 +41,7 @@ def node() -> str:
 
 
 def test_every_module_is_asked_for_at_once() -> None:
-    """Else the browser learns of each only once it has read who imports it, in several turns."""
+    """Otherwise the browser discovers each module only after reading its importer."""
     needed, asked = set[str](), ["main.js"]
     while asked:
         if (module := asked.pop()) not in needed:
@@ -53,11 +53,11 @@ def test_every_module_is_asked_for_at_once() -> None:
     assert sorted(told) == sorted(needed - {"main.js"})
 
 
-@pytest.mark.timeout(600)  # for one that hangs
+@pytest.mark.timeout(600)  # for a hanging test
 def test_the_modules_of_the_page_do_what_their_tests_say(tmp_path: Path) -> None:
     tests = sorted(HERE.glob("*.test.mjs"))
     assert tests
-    # In one process: `node --test` starts one for each file, which takes longer than they do.
+    # In one process: `node --test` starts one per file, which takes longer than the tests.
     everything = tmp_path / "all.mjs"
     everything.write_text("".join(f"await import({json.dumps(one.as_uri())});\n" for one in tests))
     labels = tmp_path / "labels.json"
@@ -75,7 +75,7 @@ def test_the_modules_of_the_page_do_what_their_tests_say(tmp_path: Path) -> None
 
 
 def test_the_page_uses_no_deprecated_name() -> None:
-    """They go with the next version."""
+    """They are removed in the next version."""
     old = {name for names in FORMER_NAMES.values() for name in names} - {"source"}
     old |= {member.name for member in members(UavState) if member.meaning.deprecated}
     used = " ".join(file.read_text("utf-8") for file in (ROOT / "web").glob("*.js"))

@@ -1,4 +1,4 @@
-// Range rings and compass of the plan view: what distances and directions are read against.
+// Range rings and compass of the plan view.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -16,7 +16,7 @@ function metresOf(text) {
 const labelsOf = (picture) => picture.of("text").map((one) => ({ ...one, m: metresOf(one.text) }))
   .filter(({ m }) => m !== null);
 
-test("the compass has N at the top, E at the right, and three digits between", async () => {
+test("compass has N at the top, E at the right, and three-digit bearings between", async () => {
   const picture = (await openPlan()).show({});
   const [n, e, s, w] = ["N", "E", "S", "W"].map((text) => picture.text(text));
   const px = OUTER_PX + 18;

@@ -17,7 +17,7 @@ export const WEB_ROOT = resolve(process.env.WEB_ROOT ?? join(ROOT, "web"));
 
 export const readPage = (name) => readFileSync(join(WEB_ROOT, name), "utf8");
 
-/** A module of the page; with `anew` one that nobody has loaded before, for it to start again. */
+/** A module of the page; with `anew` a fresh instance, so that it starts again. */
 export const load = (name, anew = "") => import(pathToFileURL(join(WEB_ROOT, name)).href + anew);
 
 /** The answer of /v1/labels, which the service made for these tests. */
@@ -46,7 +46,7 @@ class Storage {
   }
 }
 
-/** Put a new browser in place; returns what a test turns of it. */
+/** Install a new browser; returns the controls for a test. */
 export function openBrowser({ ratio = 1, still = false, storage = new Storage() } = {}) {
   const time = new VirtualTime();
   const document = new PageDocument(readPage("index.html"));
@@ -71,7 +71,7 @@ export function openBrowser({ ratio = 1, still = false, storage = new Storage() 
 
     observe(element) {
       observers.push({ element, callback: this.callback });
-      time.add(this.callback, 0, { isFrame: true }); // it tells the first size as well
+      time.add(this.callback, 0, { isFrame: true }); // reports the initial size as well
     }
   };
   return {
@@ -79,7 +79,7 @@ export function openBrowser({ ratio = 1, still = false, storage = new Storage() 
     element: (id) => document.getElementById(id),
     text: (id) => document.getElementById(id).textContent,
     colour: (name) => themeColours(document.documentElement.dataset.theme)[name],
-    /** Lay an element out at a size; whoever watches it is told. */
+    /** Lay an element out at a size, and notify its observers. */
     resize(id, width, height) {
       const element = document.getElementById(id);
       [element.clientWidth, element.clientHeight] = [width, height];

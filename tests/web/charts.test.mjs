@@ -1,4 +1,4 @@
-// The time series: which values go to the drawing library, in which order and over which time.
+// The time series: values passed to the chart library, their order and time span.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -29,7 +29,7 @@ function openCharts() {
   };
 }
 
-test("each picture has its own value, the latency in milliseconds", () => {
+test("each chart has its own value; latency is in milliseconds", () => {
   const { add, show, plots } = openCharts();
   add(9000, [uav("1:1", { innovation_m: 0.4, latency_s: 0.03 })],
     [beam("1:1", { pointing_bound_deg: 1.5, guaranteed_gain_db: 15.2 })]);
@@ -40,7 +40,7 @@ test("each picture has its own value, the latency in milliseconds", () => {
   assert.deepEqual(values.map(([, [value]]) => value), [1.5, 0.4, 30, 15.2]);
 });
 
-test("each UAV has its own line, and what is not known is a gap, not 0", () => {
+test("each UAV has its own line, and unknown values are gaps, not 0", () => {
   const { add, show, plots } = openCharts();
   add(8000, [uav("1:1", { innovation_m: 1 })]);
   add(9000, [uav("1:1", { innovation_m: null }), uav("2:1", { innovation_m: 2 })]);
@@ -49,7 +49,7 @@ test("each UAV has its own line, and what is not known is a gap, not 0", () => {
   assert.deepEqual(plots().gain.data, [[-2, -1], [null, null], [null, null]]);
 });
 
-test("what the service kept fills the time before this page was opened, and no more", () => {
+test("service history fills the time before the page was opened only", () => {
   const { add, show, plots, charts } = openCharts();
   add(9000, [uav("1:1", { innovation_m: 3 })]);
   const [nothing, at] = [[null, null, null], [stampAt(0), stampAt(1), stampAt(3)]];
@@ -60,7 +60,7 @@ test("what the service kept fills the time before this page was opened, and no m
   assert.deepEqual(plots().gain.data[1], [5, null, null]);
 });
 
-test("the innovation is in the unit that is chosen, from the next drawing on", async () => {
+test("innovation uses the selected unit from the next redraw on", async () => {
   const { use } = await load("units.js");
   const { add, show, plots, charts } = openCharts();
   add(9000, [uav("1:1", { innovation_m: 3.048, latency_s: 0.03 })]);
@@ -72,7 +72,7 @@ test("the innovation is in the unit that is chosen, from the next drawing on", a
   assert.deepEqual([plots().innovation.data[1], plots().latency.data[1]], [[10], [30]]);
 });
 
-test("no line goes through a hole in what was received", () => {
+test("no line is drawn across a gap in the received data", () => {
   const { add, show, plots } = openCharts();
   for (const at of [5000, 7500, 10_001]) add(at, [uav("1:1", { innovation_m: 1 })]);
   show({ now: 10_001 });
@@ -81,17 +81,17 @@ test("no line goes through a hole in what was received", () => {
   near(times[2], -2.5);
 });
 
-test("time runs to now at the right, over the shortest span that holds what there is", () => {
+test("time axis ends now and uses the shortest span that holds the data", () => {
   for (const [ago, span] of [[5, 30], [30, 30], [30.1, 60], [61, 180], [290, 180]]) {
     const { add, show, plots } = openCharts();
     add(1000, [uav("1:1")]);
     show({ now: 1000 + ago * 1000 });
     assert.deepEqual(plots().latency.range, [-span, 0], `${ago} s`);
-    if (ago > span) assert.deepEqual(plots().latency.data[0], []); // older than what is shown
+    if (ago > span) assert.deepEqual(plots().latency.data[0], []); // older than the shown span
   }
 });
 
-test("seven lines at most, the chosen one always, and it is said of how many", () => {
+test("at most seven lines, always with the selected UAV, and the total is stated", () => {
   const { browser, add, show, plots } = openCharts();
   add(9000, Array.from({ length: 9 }, (_, i) => uav(`${i}:1`, { innovation_m: i })));
   show({ selected: "8:1" });
@@ -103,7 +103,7 @@ test("seven lines at most, the chosen one always, and it is said of how many", (
   assert.equal(plots().innovation.data.at(-1)[0], 6);
 });
 
-test("lines stay for ten seconds though others become the worst, and go with their UAV", () => {
+test("lines stay for ten seconds when others become worst, and vanish with their UAV", () => {
   const { browser, add, show } = openCharts();
   const key = () => browser.element("series-key").children.map(({ textContent }) => textContent);
   const ids = (...order) => order.map((n) => uav(`${n}:1`));
@@ -119,7 +119,7 @@ test("lines stay for ten seconds though others become the worst, and go with the
   assert.deepEqual(key().slice(0, 7), few);
 });
 
-test("a line is told by its hue and its dash, as in the key, the chosen one by its width", () => {
+test("lines differ by hue and dash as in the legend, and the selected one by width", () => {
   const { browser, add, show, plots } = openCharts();
   add(9000, [uav("1:1"), uav("2:1"), uav("3:1")]);
   show({ selected: "2:1" });
@@ -134,18 +134,18 @@ test("a line is told by its hue and its dash, as in the key, the chosen one by i
   assert.ok(lines[1].width > lines[0].width && lines[0].width === lines[2].width);
 });
 
-test("a click picks the moment under it, as far back as the picture says", async () => {
+test("a click selects the time under it within the shown span", async () => {
   const { browser, add, show, plots, picked } = openCharts();
   add(9000, [uav("1:1")]);
   show({ now: 10_000 });
-  browser.time.now = 10_500; // the picture is as it was drawn
+  browser.time.now = 10_500; // the chart is unchanged since it was drawn
   const plot = plots().pointing;
   plot.cursor.left = WIDTH * 0.9;
   plot.over.click();
   near(picked, [10_000 - 3000]);
 });
 
-test("the moment that the page shows is marked, where it is in the picture", () => {
+test("the displayed time is marked on the chart", () => {
   const { browser, add, show, plots } = openCharts();
   add(9000, [uav("1:1")]);
   const marks = () => {
@@ -164,7 +164,7 @@ test("the moment that the page shows is marked, where it is in the picture", () 
   assert.deepEqual(marks(), []);
 });
 
-test("pictures are drawn for another moment, and every other second", () => {
+test("charts are redrawn for a new time, and every two seconds", () => {
   const { add, show, plots, history } = openCharts();
   add(9000, [uav("1:1")]);
   show();
@@ -180,7 +180,7 @@ test("pictures are drawn for another moment, and every other second", () => {
   assert.equal(history.moments.length, 1);
 });
 
-test("another theme makes the pictures anew, in its colours; another size fits them", () => {
+test("a new theme redraws the charts in its colours; a new size resizes them", () => {
   const { browser, add, show, plots, charts } = openCharts();
   add(9000, [uav("1:1")]);
   show();
@@ -194,7 +194,7 @@ test("another theme makes the pictures anew, in its colours; another size fits t
   assert.deepEqual(plots().gain.size, { width: 320, height: 90 });
 });
 
-test("the axes say how long ago, and values with a real minus", () => {
+test("axes show the age, and values with a true minus sign", () => {
   const { add, show, plots } = openCharts();
   add(9000, [uav("1:1")]);
   show();

@@ -10,7 +10,7 @@ import { Service } from "./service.mjs";
 const { LOST_MS, connection, startPolling } = await load("api.js");
 const BEAT_MS = 850;
 
-/** Polling that has run for ten seconds, and whose feeds have all been asked just now. */
+/** Polling that has run for ten seconds, with every feed just requested. */
 async function startPage({ mode = "answers", beamed = "1:1" } = {}) {
   const { time } = openBrowser();
   const service = new Service(time);
@@ -22,7 +22,7 @@ async function startPage({ mode = "answers", beamed = "1:1" } = {}) {
   return { time, service, feeds, context, state: () => connection(feeds).state };
 }
 
-/** When, in milliseconds, the health of a feed becomes each of these. */
+/** Times in milliseconds at which the health of a feed becomes each of these. */
 async function changes(time, feed, untilMs) {
   const found = [];
   for (const start = time.now; time.now - start <= untilMs; await time.advance(10)) {
@@ -32,16 +32,16 @@ async function changes(time, feed, untilMs) {
   return found;
 }
 
-test("an answer is late after two seconds without another, and lost after three", async () => {
+test("a feed is late two seconds after its last response, and lost after three", async () => {
   const { time, service, feeds } = await startPage();
   service.mode = "silent";
   assert.deepEqual(await changes(time, feeds.uavs, 5000), [[0, "live"], [2010, "late"],
     [3010, "lost"]]);
   assert.equal(feeds.uavs.isTrusted(), false);
-  assert.notEqual(feeds.uavs.data, null); // what was known last is kept, to be struck
+  assert.notEqual(feeds.uavs.data, null); // the last data is kept, to be struck out
 });
 
-test("a slow answer is given its own period more", async () => {
+test("a slow feed is allowed one more period", async () => {
   const { time, service, feeds } = await startPage();
   service.mode = "silent";
   const periodMs = 4 * BEAT_MS;
@@ -49,14 +49,14 @@ test("a slow answer is given its own period more", async () => {
     [[0, "live"], [periodMs + 1160, "late"], [periodMs + 2160, "lost"]]);
 });
 
-test("an answer that is late is still trusted", async () => {
+test("a late response is still trusted", async () => {
   const { time, service, feeds } = await startPage();
   service.mode = "silent";
   await time.advance(2500);
   assert.deepEqual([feeds.uavs.health(), feeds.uavs.isTrusted()], ["late", true]);
 });
 
-test("a service whose time stands still is frozen, though it answers", async () => {
+test("a responding service whose time does not advance is frozen", async () => {
   const { time, service, feeds, state } = await startPage();
   service.mode = "frozen";
   await time.advance(BEAT_MS + 3000);
@@ -68,14 +68,14 @@ test("a service whose time stands still is frozen, though it answers", async () 
   assert.deepEqual([feeds.uavs.health(), state()], ["live", "live"]);
 });
 
-test("a service that has nothing to tell yet has not stopped", async () => {
+test("a service without data yet does not count as stopped", async () => {
   const { time, service, feeds } = await startPage();
   service.answers["/v1/uavs"] = { valid_at: null, uavs: [] };
   await time.advance(10_000);
   assert.equal(feeds.uavs.health(), "live");
 });
 
-test("while all is well the connection is live", async () => {
+test("the connection is live while all responses are timely", async () => {
   const { time, feeds, state } = await startPage();
   for (let i = 0; i < 60; i += 1) {
     assert.equal(state(), "live", JSON.stringify(connection(feeds)));
@@ -83,7 +83,7 @@ test("while all is well the connection is live", async () => {
   }
 });
 
-test("until the first answers it waits, and then says that there is no connection", async () => {
+test("it waits for the first responses, then reports no connection", async () => {
   const { time, feeds, state } = await startPage({ mode: "silent" });
   assert.equal(state(), "waiting");
   await time.advance(LOST_MS);
@@ -95,7 +95,7 @@ test("until the first answers it waits, and then says that there is no connectio
 });
 
 for (const mode of ["silent", "gone"]) {
-  test(`a service that is ${mode} is late after 2 s, lost after 3 s, and heals`, async () => {
+  test(`a service that is ${mode} is late after 2 s, lost after 3 s, and recovers`, async () => {
     const { time, service, feeds, state } = await startPage();
     service.mode = mode;
     await time.advance(2010);
@@ -112,7 +112,7 @@ for (const mode of ["silent", "gone"]) {
   });
 }
 
-test("where one answer alone fails, it is named", async () => {
+test("a single failing feed is named", async () => {
   const { time, service, feeds } = await startPage();
   service.answers["/v1/beams"] = { status: 500, body: "{}" };
   await time.advance(3100);
@@ -121,16 +121,16 @@ test("where one answer alone fails, it is named", async () => {
   assert.equal(feeds.uavs.health(), "live");
 });
 
-test("what there is nothing to ask about is no part of the connection", async () => {
+test("feeds that are not requested do not affect the connection", async () => {
   const { time, feeds, context, state } = await startPage();
   context.beamed = null;
   await time.advance(10_000);
   assert.deepEqual([feeds.pattern.health(), feeds.pattern.data, state()], ["idle", null, "live"]);
 });
 
-test("a question that failed and is no longer asked hides no lost connection", async () => {
+test("a failed feed that is no longer requested does not hide a lost connection", async () => {
   const { time, service, feeds, context } = await startPage();
-  service.beams = []; // the beam is gone, and its pattern was just asked for
+  service.beams = []; // the beam has vanished, and its pattern was just requested
   await time.advance(BEAT_MS);
   assert.equal(feeds.pattern.problem, "the service answered 404");
   context.beamed = null;

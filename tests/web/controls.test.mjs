@@ -20,7 +20,7 @@ function openKeys() {
   return { browser, done, press };
 }
 
-test("a key does what it stands for, letters in either case, and does nothing else", () => {
+test("each key has only its own action, in upper or lower case", () => {
   const { done, press } = openKeys();
   assert.ok([" ", "ArrowLeft", "t", "T", "?", "7"].map((key) => press(key)).every(Boolean));
   assert.deepEqual(done, [" ", "ArrowLeft", "t", "t", "?", 7]);
@@ -28,14 +28,14 @@ test("a key does what it stands for, letters in either case, and does nothing el
   assert.equal(done.length, 6);
 });
 
-test("with Shift an arrow jumps", () => {
+test("Shift with an arrow key jumps", () => {
   const { done, press } = openKeys();
   press("ArrowLeft", { shiftKey: true });
   press("?", { shiftKey: true });
   assert.deepEqual(done, ["Shift+ArrowLeft", "?"]);
 });
 
-test("the browser's own keys stay its own", () => {
+test("browser shortcuts are not intercepted", () => {
   const { done, press } = openKeys();
   for (const held of ["ctrlKey", "altKey", "metaKey", "isComposing"]) {
     assert.equal(press("t", { [held]: true }), false);
@@ -43,14 +43,14 @@ test("the browser's own keys stay its own", () => {
   assert.deepEqual(done, []);
 });
 
-test("while help is open keys are its own", () => {
+test("the help dialog receives all keys while open", () => {
   const { browser, done, press } = openKeys();
   browser.element("help").showModal();
   assert.ok(!press("t") && !press(" "));
   assert.deepEqual(done, []);
 });
 
-test("on the slider arrows are its own, other keys are the page's", () => {
+test("the slider receives arrow keys; other keys go to the page", () => {
   const { browser, done, press } = openKeys();
   const on = browser.element("scrub");
   for (const key of ["ArrowLeft", "ArrowUp", "Home", "End"]) assert.ok(!press(key, { on }), key);
@@ -58,7 +58,7 @@ test("on the slider arrows are its own, other keys are the page's", () => {
   assert.deepEqual(done, [" "]);
 });
 
-test("Space presses a button that was reached by the keyboard, not one that was clicked", () => {
+test("Space presses a button focused by keyboard, not one that was clicked", () => {
   const { browser, done, press } = openKeys();
   const on = browser.element("theme");
   on.pseudo.add("focus-visible");
@@ -66,7 +66,7 @@ test("Space presses a button that was reached by the keyboard, not one that was 
   on.pseudo.clear();
   assert.ok(press(" ", { on }));
   assert.deepEqual(done, [" "]);
-  assert.ok(on.isBlurred); // or the key's release would press it
+  assert.ok(on.isBlurred); // otherwise releasing the key would press it
 });
 
 function openTheme(storage) {
@@ -78,7 +78,7 @@ function openTheme(storage) {
     theme: () => browser.document.documentElement.dataset.theme };
 }
 
-test("the page is dark until light is chosen; the button names what it changes to", () => {
+test("the page is dark until light is selected; the button names the other theme", () => {
   const { button, theme, toggle, changes } = openTheme();
   assert.deepEqual([theme(), button.textContent, changes()], ["dark", "Light", 1]);
   button.click();
@@ -87,7 +87,7 @@ test("the page is dark until light is chosen; the button names what it changes t
   assert.deepEqual([theme(), button.textContent, changes()], ["dark", "Light", 3]);
 });
 
-test("the choice is remembered", () => {
+test("the selected theme is stored", () => {
   const { button, browser: { storage } } = openTheme();
   button.click();
   const again = openTheme(storage);
@@ -96,7 +96,7 @@ test("the choice is remembered", () => {
   assert.equal(openTheme(storage).theme(), "dark");
 });
 
-test("where the browser refuses to remember, the choice holds until the page is closed", () => {
+test("without browser storage the theme holds until the page is closed", () => {
   const refuse = () => { throw new Error("SecurityError"); };
   const { button, theme } = openTheme({ getItem: refuse, setItem: refuse });
   assert.equal(theme(), "dark");
@@ -104,7 +104,7 @@ test("where the browser refuses to remember, the choice holds until the page is 
   assert.equal(theme(), "light");
 });
 
-test("the light theme changes every colour but those that warn in both", () => {
+test("the light theme changes every colour except the shared warning colours", () => {
   const [dark, light] = [themeColours("dark"), themeColours("light")];
   const same = Object.keys(dark).filter((name) => dark[name] === light[name]);
   assert.deepEqual(same.sort(), ["bad-bg", "font", "on-past", "past"]);

@@ -1,4 +1,4 @@
-// One UAV's drawer: what it shows, when it asks, and that it opens and closes as one expects.
+// One UAV's drawer: its values, its requests, and opening and closing.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -21,7 +21,7 @@ async function openDrawer(page, nth = 1) {
   return Object.fromEntries(facts);
 }
 
-test("modes are named as their autopilot names them; else by number", () => {
+test("modes have their autopilot's names, or a number", () => {
   assert.equal(modeOf(HEARTBEAT), "Guided, armed");
   const plane = { ...HEARTBEAT, mavtype: { type: "MAV_TYPE_FIXED_WING" }, custom_mode: 10 };
   assert.equal(modeOf({ ...plane, base_mode: { bits: 0 } }), "Auto, disarmed");
@@ -32,7 +32,7 @@ test("modes are named as their autopilot names them; else by number", () => {
   assert.equal(modeOf(undefined), null);
 });
 
-test("a click opens the drawer with all that is known of that UAV, and asks for its messages", async () => {
+test("a click opens the drawer with all values of the UAV and requests its messages", async () => {
   const page = await openPage();
   const sysStatus = { voltage_battery: 15100, battery_remaining: 76 };
   page.service.answers[MESSAGES] = {
@@ -49,7 +49,7 @@ test("a click opens the drawer with all that is known of that UAV, and asks for 
   page.service.uavs = [uav("1:1"), uav("2:1", { ...weak(), ...fields, climb_rate_mps: -1.25 })];
   assert.equal(page.element("drawer").hidden, true);
   await page.time.advance(6 * BEAT_MS);
-  const facts = await openDrawer(page, 0); // the weak one is the first
+  const facts = await openDrawer(page, 0); // the weak UAV is first
   assert.equal(page.element("drawer").hidden, false);
   assert.deepEqual([page.text("drawer-title"), page.text("drawer-verdict")], ["2:1", "link weak"]);
   assert.equal(page.text("coordinates"), "47.0009000, 8.0000000, 500.0");
@@ -60,7 +60,7 @@ test("a click opens the drawer with all that is known of that UAV, and asks for 
   assert.equal(page.text("drawer-events"), "13:00:02links to 12:1, 2:1: good13:00:012:1 is live");
 });
 
-test("what was not heard is a dash: no battery of 0", async () => {
+test("values not received are dashes: no battery of 0", async () => {
   const page = await openPage();
   page.service.answers[MESSAGES] = {
     SYS_STATUS: { message: { voltage_battery: 65535, battery_remaining: -1 } },
@@ -69,7 +69,7 @@ test("what was not heard is a dash: no battery of 0", async () => {
   assert.deepEqual([Mode, Battery, Clock, Assumed], ["–", "–", "–", "–"]);
 });
 
-test("Escape closes the drawer, then chooses nothing; messages are asked for while it is open", async () => {
+test("Escape closes the drawer, then clears the selection; then no messages are requested", async () => {
   const page = await openPage();
   await openDrawer(page);
   page.press("Escape");
@@ -85,7 +85,7 @@ test("Escape closes the drawer, then chooses nothing; messages are asked for whi
   assert.deepEqual(page.chosen(), []);
 });
 
-test("a relayed aircraft sends no messages, whatever relays it: none are asked for", async () => {
+test("no messages are requested for relayed aircraft", async () => {
   for (const id of ["icao:4CA7B3", "rid:1581F5", "cot:HAWK"]) {
     const page = await openPage({ ids: [id] });
     await openDrawer(page, 0);

@@ -11,14 +11,14 @@ const { elementsOf, makeElements } = await load("elements.js");
 const WEIGHTS = { uavs: ["1:1", "2:1"], re: [[9, 1], [9, 0], [9, -0.5], [9, 0]],
   im: [[9, 0], [9, 2], [9, 0], [9, -0.2]] };
 
-test("of a UAV's column the phase is in degrees, the amplitude below the strongest in dB", () => {
+test("phase is in degrees, amplitude in dB relative to the strongest element", () => {
   const found = elementsOf(WEIGHTS, "2:1");
   near(found.map(({ deg }) => deg), [0, 90, 180, -90]);
   near(found.map(({ db }) => db), [-6.0206, 0, -12.0412, -20], 1e-4);
   near(elementsOf(WEIGHTS, "1:1").map(({ deg }) => deg), [45, 45, 45, 45]);
 });
 
-test("who has no column has no elements", () => {
+test("a UAV without a weight column has no elements", () => {
   assert.equal(elementsOf(WEIGHTS, "3:1"), null);
   assert.equal(elementsOf(null, "1:1"), null);
   assert.equal(elementsOf(WEIGHTS, null), null);
@@ -33,13 +33,13 @@ function draw(elements, trusted = true) {
   const picture = canvas.getContext("2d");
   const dots = picture.of("fill", ({ path }) => path[0].op === "arc")
     .map(({ path, fillStyle }) => ({ ...path[0], fillStyle }));
-  const bars = picture.of("rect").slice(1); // after the sheet itself
+  const bars = picture.of("rect").slice(1); // after the background
   return { browser, picture, dots, bars };
 }
 
 const eight = (values) => Array.from({ length: 8 }, (_, i) => values[i] ?? { db: 0, deg: 0 });
 
-test("phases are dots, a positive one above the middle line and a negative one below", () => {
+test("phases are dots, positive above the middle line and negative below", () => {
   const { picture, dots } = draw(eight([
     { db: 0, deg: 0 }, { db: 0, deg: 90 }, { db: 0, deg: -90 }, { db: 0, deg: 180 },
   ]));
@@ -49,7 +49,7 @@ test("phases are dots, a positive one above the middle line and a negative one b
   near(dots.map(({ x }) => x), eight([]).map((_, i) => 40 + 30 * (i + 0.5)));
 });
 
-test("amplitudes are bars on a scale of dB: full for the strongest, none at −30 and below", () => {
+test("amplitudes are bars in dB: full for the strongest, empty at −30 and below", () => {
   const { picture, bars } = draw(eight([
     { db: 0, deg: 0 }, { db: -15, deg: 0 }, { db: -30, deg: 0 }, { db: -45, deg: 0 },
   ]));
@@ -60,12 +60,12 @@ test("amplitudes are bars on a scale of dB: full for the strongest, none at −3
   near(bars.map(({ x, width }) => x + width / 2), eight([]).map((_, i) => 40 + 30 * (i + 0.5)));
 });
 
-test("the first and the last element are named", () => {
+test("first and last element are labelled", () => {
   const { picture } = draw(eight([]));
   assert.ok(picture.text("element 0").x < picture.text("7").x);
 });
 
-test("what is no longer true has the colour of the stale", () => {
+test("outdated values have the stale colour", () => {
   for (const [trusted, dot, bar] of [[true, "beam", "coast"], [false, "stale", "stale"]]) {
     const { browser, dots, bars } = draw(eight([]), trusted);
     assert.equal(dots[0].fillStyle, browser.colour(dot));

@@ -1,4 +1,4 @@
-// What is exported: the values of the table, in units that their names have.
+// Exports: the values of the table, with units in their names.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -9,7 +9,7 @@ import { openPage } from "./whole_page.mjs";
 
 const { csvOf } = await load("export.js");
 
-test("a line a UAV, what is not known is empty, and commas are quoted", () => {
+test("one line per UAV, unknown values are empty, and commas are quoted", () => {
   const text = csvOf({ stamp: stampAt(0), beams: [beam("1:1"), beam("2:1", { oldS: 3 })],
     uavs: [uav("1:1", weak("weak", { reason: "late, so to say" })), uav("2:1", { alt_m: null })] });
   const [head, one, two, end] = text.split("\n");
@@ -22,7 +22,7 @@ test("a line a UAV, what is not known is empty, and commas are quoted", () => {
     ["2:1", "", "", "47.0009"]);
 });
 
-test("the settings are shown, what was set before what is as it comes", async () => {
+test("settings are shown, changed ones before defaults", async () => {
   const page = await openPage();
   page.service.answers["/v1/settings"] = { sections: { link: {
     needed_db: { value: 6, default: 0, source: "file", file: "mast.toml" },

@@ -29,7 +29,7 @@ async function openFleet(answer = fleetAnswer()) {
   return { ...page, rows };
 }
 
-test("without a fleet nothing is asked of it, and nothing of it is there", async () => {
+test("without a fleet nothing of it is requested or shown", async () => {
   const page = await openPage();
   await page.time.advance(8 * BEAT_MS);
   assert.equal(page.service.count("/v1/fleet"), 0);
@@ -37,7 +37,7 @@ test("without a fleet nothing is asked of it, and nothing of it is there", async
   assert.ok(page.element("legend").querySelectorAll("[data-fleet]").every((one) => one.hidden));
 });
 
-test("the nodes stand with their state, their clock and their way; an unknown is a dash", async () => {
+test("nodes are listed with state, clock and latency; unknown values are dashes", async () => {
   const page = await openFleet(fleetAnswer({ nodes: [
     otherNode("north", { is_self: true, state: "here", serves: 1 }),
     otherNode("south"),
@@ -63,7 +63,7 @@ test("the nodes stand with their state, their clock and their way; an unknown is
   assert.match(plain(page.text("fleet-traffic")), /^sent 14\.0 kbit\/s · received 900 bit\/s$/);
 });
 
-test("who serves a UAV: one, two, nobody, to be handed over, unconfirmed", () => {
+test("serving nodes of a UAV: one, two, none, handover, unconfirmed", () => {
   const said = (fields) => {
     const { text, level } = servingOf(fleetUav("1:1", fields));
     return [text, level];
@@ -76,7 +76,7 @@ test("who serves a UAV: one, two, nobody, to be handed over, unconfirmed", () =>
   assert.deepEqual(said({ unconfirmed: true }), ["north · unconfirmed", "warn"]);
 });
 
-test("the worst stands first, or the UAVs by their numbers; each node's offer in its column", async () => {
+test("sorted by worst or by number; each node's offer is in its column", async () => {
   const page = await openFleet();
   assert.deepEqual(page.rows().map(([id, by]) => `${id} ${by}`),
     ["10:1 no node", "1:1 north", "2:1 south"]);
@@ -90,7 +90,7 @@ test("the worst stands first, or the UAVs by their numbers; each node's offer in
   assert.equal(byUav.parent.getAttribute("aria-sort"), "ascending");
 });
 
-test("a row stays the same one while its offers change, and its UAV can be chosen", async () => {
+test("a row stays the same element while its offers change, and is selectable", async () => {
   const answer = fleetAnswer();
   const page = await openFleet(answer);
   const first = () => page.element("fleet-uavs").tBodies[0].rows[1];
@@ -103,7 +103,7 @@ test("a row stays the same one while its offers change, and its UAV can be chose
   assert.deepEqual(new Set(page.chosen()), new Set(["1:1"]));
 });
 
-test("a node more is a column more", async () => {
+test("each additional node adds a column", async () => {
   const answer = fleetAnswer();
   const page = await openFleet(answer);
   answer.nodes.push(otherNode("west"));
@@ -113,27 +113,27 @@ test("a node more is a column more", async () => {
   assert.ok(page.rows().every((row) => row.length === 5));
 });
 
-test("handovers stand with the newest first", async () => {
+test("handovers are listed newest first", async () => {
   const page = await openFleet();
   const items = page.element("fleet-handovers").children.map(({ children }) =>
     children.map(({ textContent }) => textContent).join(" "));
   assert.deepEqual(items, ["13:00:02 2:1: north → south", "13:00:01 1:1: none → north"]);
 });
 
-test("whom another node serves is neither bad nor missed here, and is named", async () => {
+test("a UAV of another node is neither bad nor missing here, and its node is named", async () => {
   const page = await openFleet();
   assert.equal(page.text("headline"), "1 of 1 links good · 1 with other nodes");
   assert.equal(page.element("headline").dataset.level, "good");
   assert.equal(page.document.title, "1 of 1 links good · 1 with other nodes · north · companion");
   assert.equal(page.text("node-name"), "north");
   assert.deepEqual(page.cells("verdict"), ["good", "by south"]);
-  assert.deepEqual(page.cells("azimuth")[1], "–"); // its last beam of ours is not kept as if missed
+  assert.deepEqual(page.cells("azimuth")[1], "–"); // our last beam for it is not kept as missing
   assert.ok(page.element("troubles-panel").hidden);
   assert.deepEqual(headlineOf([uav("1:1", ELSEWHERE)]),
     { text: "1 with other nodes", level: "wait" });
 });
 
-test("whom no node serves is bad, and what to do is said", async () => {
+test("a UAV that no node serves is bad, with a remedy", async () => {
   const page = await openFleet();
   page.service.uavs = [uav("1:1"), uav("2:1", { verdict: "none", served_by: [],
     health: health({ cause: "unserved", reason: "every node that reaches it is full",
@@ -144,7 +144,7 @@ test("whom no node serves is bad, and what to do is said", async () => {
   assert.match(page.text("troubles"), /2:1 noneevery node that reaches it is full→ add a node/);
 });
 
-test("a UAV that is taken over from another node is no alarm while it is good", async () => {
+test("a UAV taken over from another node raises no alarm while good", async () => {
   const page = await openFleet();
   page.element("alarm").click();
   page.service.uavs = [uav("1:1", ELSEWHERE), uav("2:1", { served_by: ["north"] })];
@@ -155,7 +155,7 @@ test("a UAV that is taken over from another node is no alarm while it is good", 
   assert.equal(page.text("alarm-text"), "ALARM – link to 1:1: none");
 });
 
-test("a paused page has the fleet of its time, and goes on with the present one", async () => {
+test("a paused page shows the fleet of its time, then the present one", async () => {
   const answer = fleetAnswer();
   const page = await openFleet(answer);
   page.press(" ");
@@ -170,7 +170,7 @@ test("a paused page has the fleet of its time, and goes on with the present one"
   assert.deepEqual([of(), page.cells("verdict").join()], ["south", "by south,by south"]);
 });
 
-test("in the plan each node has its mark and name, and a thin line to whom it serves", async () => {
+test("in the plan each node has a mark, a name and thin lines to its UAVs", async () => {
   const view = await openPlan();
   const nodes = [{ node: "south", state: "there", north_m: -100, east_m: 0 }];
   const shown = { nodes, uavs: [uav("1:1", { north_m: 0, east_m: 100, ...ELSEWHERE }),
@@ -189,7 +189,7 @@ test("in the plan each node has its mark and name, and a thin line to whom it se
   silent.text("south silent");
 });
 
-test("a node's place is seen from the carrier; one without a place is not drawn", () => {
+test("nodes are drawn relative to the carrier; nodes without a position are not", () => {
   const carrier = { lat_deg: LAT, lon_deg: LON, alt_m: 450 };
   const answer = fleetAnswer({ nodes: [otherNode("north", { is_self: true }), otherNode("south"),
     otherNode("west", { place: null })] });
@@ -199,7 +199,7 @@ test("a node's place is seen from the carrier; one without a place is not drawn"
   assert.deepEqual([nodesAround(answer, null), nodesAround(null, carrier)], [[], []]);
 });
 
-test("of the handovers the newest are kept for looking back", () => {
+test("the newest handovers are kept for looking back", () => {
   const handovers = Array.from({ length: 100 }, (_, i) => ({ uav: `${i}:1` }));
   const kept = slimFleet(fleetAnswer({ handovers })).handovers;
   assert.deepEqual([kept.length, kept.at(-1).uav], [30, "99:1"]);

@@ -1,11 +1,11 @@
-// Numbers as the page writes them: the unit, the decimals, and a dash for what is not known.
+// Numbers as the page writes them: the unit, the decimals, and a dash for unknown values.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import { load } from "./browser.mjs";
 
-process.env.TZ = "America/Lima"; // five hours off, so that a local time would show
+process.env.TZ = "America/Lima"; // five hours off, so that local time would be noticed
 const format = await load("format.js");
 
 /** `_` stands for the space that does not break, `,` in counts for the narrow one. */
@@ -41,7 +41,7 @@ for (const [name, pairs] of Object.entries(WRITTEN)) {
     for (const [value, text] of pairs) assert.equal(plain(format[name](value)), text);
   });
 
-  test(`${name}: what is not known is a dash, never 0`, () => {
+  test(`${name}: an unknown value is a dash, never 0`, () => {
     for (const value of [null, undefined, NaN, Infinity, -Infinity, "5"]) {
       assert.equal(format[name](value), "–", `${value}`);
     }
@@ -55,7 +55,7 @@ test("a number alone: its decimals, its sign, and a dash for none", () => {
   for (const value of [null, undefined, NaN, Infinity, "5"]) assert.equal(fixed(value, 1), "–");
 });
 
-test("two times have one unit, or each its own", () => {
+test("two durations share a unit or have one each", () => {
   const range = (from, to) => plain(format.millisecondsRange(from, to));
   assert.equal(range(0.002, 0.005), "2 / 5_ms");
   assert.equal(range(0.5, 9.9), "500 / 9900_ms");
@@ -71,7 +71,7 @@ test("a position has five decimals, north and east positive", () => {
   assert.equal(format.position(47, null), "–");
 });
 
-test("the time of day is that of the stamp, in UTC, wherever the browser is", () => {
+test("time of day is the stamp's in UTC, in any browser time zone", () => {
   assert.equal(format.timeOfDay("2026-11-20T13:00:05.9Z"), "13:00:05");
   assert.equal(format.timeOfDay("2026-11-20T13:00:05+02:00"), "11:00:05");
   assert.equal(format.clock("2026-11-20T13:00:05Z"), "13:00:05 UTC");

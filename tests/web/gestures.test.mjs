@@ -22,7 +22,7 @@ function openCanvas() {
   return { canvas, done, point };
 }
 
-test("a press that stays chooses, a drag moves and chooses nothing", () => {
+test("a press without movement selects; a drag pans without selecting", () => {
   const { canvas, done, point } = openCanvas();
   point("pointerdown", 1, 100);
   point("pointermove", 1, 103);
@@ -34,11 +34,11 @@ test("a press that stays chooses, a drag moves and chooses nothing", () => {
   point("pointerup", 1, 140, 20);
   canvas.click();
   assert.deepEqual(done.slice(1), [["pan", 40, 20]]);
-  point("pointermove", 1, 300); // nothing is pressed any more
+  point("pointermove", 1, 300); // no pointer is pressed any more
   assert.equal(done.length, 2);
 });
 
-test("two fingers zoom by how far they spread, and do not drag", () => {
+test("two fingers zoom by their spread and do not pan", () => {
   const { done, point } = openCanvas();
   point("pointerdown", 1, 100);
   point("pointerdown", 2, 200);
@@ -49,7 +49,7 @@ test("two fingers zoom by how far they spread, and do not drag", () => {
   assert.deepEqual(done, [["zoom", 1], ["zoom", -1]]);
 });
 
-test("dragging moves the carrier, following keeps a UAV in the middle, and Fit takes both back", async () => {
+test("dragging pans, following centres a UAV, and Fit resets both", async () => {
   const page = await openPage();
   page.service.uavs = [uav("1:1", { north_m: 0, east_m: 50 }), uav("2:1")];
   const carrier = async () => {
@@ -68,7 +68,7 @@ test("dragging moves the carrier, following keeps a UAV in the middle, and Fit t
   page.press("f");
   assert.equal(page.element("follow").getAttribute("aria-pressed"), "true");
   const [x, y] = await carrier();
-  assert.ok(x < 190 && y === 200, `${x} ${y}`); // the UAV, east of it, is in the middle
+  assert.ok(x < 190 && y === 200, `${x} ${y}`); // the UAV, east of the carrier, is centred
   page.press("0");
   assert.deepEqual(await carrier(), [200, 200]);
   assert.equal(page.element("zoom-fit").getAttribute("aria-pressed"), "true");

@@ -1,4 +1,4 @@
-// Where the map has to look, so that its ground lies under the plan; and how it is drawn.
+// Camera of the map, so that it lies under the plan, and its style.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -9,7 +9,7 @@ const PLACE = { lat_deg: 47.4, lon_deg: 8.5 };
 const COLOUR = { plan: "#000", beam: "#00f", gridtext: "#888" };
 const HEADER = { tileType: 1, minZoom: 3, maxZoom: 14, minLon: 8, minLat: 47, maxLon: 9, maxLat: 48 };
 
-/** Where web Mercator puts a place on a picture with this camera: what MapLibre does, on paper. */
+/** Pixel of a position in web Mercator with this camera, computed as MapLibre does. */
 function pixelOf({ lat_deg: lat, lon_deg: lon }, camera, view) {
   const world = 512 * 2 ** camera.zoom;
   const at = (lonDeg, latDeg) => [
@@ -22,7 +22,7 @@ function pixelOf({ lat_deg: lat, lon_deg: lon }, camera, view) {
 }
 
 for (const centre of [[400, 300], [120, 555], [790, 20]]) {
-  test(`the carrier is under its own sign at ${centre}`, () => {
+  test(`the map has the carrier under its symbol at ${centre}`, () => {
     const view = { width: 800, height: 600, centre, pxPerM: 0.7 };
     const camera = cameraOf(PLACE, view);
     const [x, y] = pixelOf(PLACE, camera, view);
@@ -34,7 +34,7 @@ for (const centre of [[400, 300], [120, 555], [790, 20]]) {
   });
 }
 
-test("pictures are shown as they are, shapes without words, and nothing from elsewhere", () => {
+test("raster tiles are shown unchanged, vector tiles without text, nothing external", () => {
   const layers = [{ id: "water" }, { id: "roads" }];
   const vector = styleOf(HEADER, { vector_layers: layers }, COLOUR);
   assert.equal(vector.sources.area.type, "vector");

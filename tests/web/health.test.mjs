@@ -9,7 +9,7 @@ import { BEAT_MS, openPage } from "./whole_page.mjs";
 
 const { headlineOf, troublesOf, showTroubles, worstFirst } = await load("health.js");
 
-test("the headline says how many links are good, and how bad the worst is", () => {
+test("the headline counts good links and shows the worst level", () => {
   const said = (...verdicts) => headlineOf(verdicts.map((verdict) => ({ verdict })));
   assert.deepEqual(said("good", "good"), { text: "2 of 2 links good", level: "good" });
   assert.deepEqual(said("good", "weak"), { text: "1 of 2 links good", level: "warn" });
@@ -17,14 +17,14 @@ test("the headline says how many links are good, and how bad the worst is", () =
   assert.deepEqual(said(null), { text: "no link assessed yet", level: "wait" });
 });
 
-test("links of one cause stand together, the worst first, and the good are not listed", () => {
+test("links are grouped by cause, worst first, without the good ones", () => {
   const uavs = [uav("1:1", weak()), uav("2:1"), uav("3:1", weak("none", { cause: "silent" })),
     uav("4:1", weak("weak", { reason: "reports 2.0 s apart" }))];
   assert.deepEqual(troublesOf(uavs).map(({ level, ids }) => [level, ids]),
     [["none", ["3:1"]], ["weak", ["1:1", "4:1"]]]);
 });
 
-test("among links of one verdict the least sure stands first, and a decibel moves nobody", () => {
+test("links of one verdict are sorted by guaranteed gain with 1 dB of hysteresis", () => {
   const gains = (guaranteed, likely = 12) => ({ ...weak("weak"),
     health: { needed_gain_db: 3, guaranteed_gain_db: guaranteed, likely_gain_db: likely } });
   const order = (...given) => given.map((one, i) => uav(`${i + 1}:1`, one)).sort(worstFirst)
@@ -35,7 +35,7 @@ test("among links of one verdict the least sure stands first, and a decibel move
   assert.equal(order(gains(-40), weak("none")), "21");
 });
 
-test("what to do is shown, and its UAVs can be chosen; without trouble the panel goes", () => {
+test("remedies are shown with selectable UAVs; the panel hides when all links are good", () => {
   const browser = openBrowser();
   const chosen = [];
   showTroubles([uav("1:1", weak()), uav("2:1")], (id) => chosen.push(id));
@@ -48,7 +48,7 @@ test("what to do is shown, and its UAVs can be chosen; without trouble the panel
   assert.equal(panel.hidden, true);
 });
 
-test("the worst link is the first row, and the page's title has the headline", async () => {
+test("the worst link is the first row, and the page title has the headline", async () => {
   const page = await openPage({ ids: ["1:1", "2:1", "3:1"] });
   assert.deepEqual(page.rows(), ["1:1", "2:1", "3:1"]);
   page.service.uavs = [uav("1:1"), uav("2:1", weak()), uav("3:1", weak("none"))];
@@ -61,7 +61,7 @@ test("the worst link is the first row, and the page's title has the headline", a
   plan.text("✕ 3:1");
 });
 
-test("the alarm is off unless switched on, stays until it is seen, and is remembered", async () => {
+test("the alarm is off by default, stays until acknowledged, and is stored", async () => {
   const page = await openPage();
   const [bar, button] = [page.element("alarm-bar"), page.element("alarm")];
   const worsen = async (id) => {
@@ -74,12 +74,12 @@ test("the alarm is off unless switched on, stays until it is seen, and is rememb
   button.click();
   assert.deepEqual([page.text("alarm"), page.storage.getItem("companion.alarm")],
     ["Alarm on", "on"]);
-  assert.equal(bar.hidden, true); // what was bad before is known
+  assert.equal(bar.hidden, true); // what was bad at the start raises no alarm
   await worsen("2:1");
   assert.deepEqual([bar.hidden, page.text("alarm-text")], [false, "ALARM – link to 2:1: weak"]);
   page.service.uavs = page.service.uavs.map(({ id }) => uav(id));
   await page.time.advance(2 * BEAT_MS);
-  assert.equal(bar.hidden, false); // better again, and still nobody has seen it
+  assert.equal(bar.hidden, false); // good again, but not yet acknowledged
   page.element("alarm-seen").click();
   assert.equal(bar.hidden, true);
   page.service.mode = "gone";
@@ -89,7 +89,7 @@ test("the alarm is off unless switched on, stays until it is seen, and is rememb
   assert.deepEqual([bar.hidden, page.text("alarm")], [true, "Alarm off"]);
 });
 
-test("the alarm sounds every two seconds until it is seen; what appears bad is no change", async () => {
+test("the alarm sounds every two seconds until acknowledged; a bad start is no change", async () => {
   const page = await openPage();
   let tones = 0;
   const node = { connect: () => {}, frequency: {}, start: () => { tones += 1; }, stop: () => {} };
@@ -111,7 +111,7 @@ test("the alarm sounds every two seconds until it is seen; what appears bad is n
     assert.deepEqual([tones, page.element("alarm-bar").hidden], [0, true]);
     page.service.uavs = page.service.uavs.map(({ id }) => uav(id, weak()));
     await page.time.advance(10_000);
-    assert.ok(tones >= 6 && tones <= 10, `${tones}`); // two tones each time
+    assert.ok(tones >= 6 && tones <= 10, `${tones}`); // two tones per alarm
     page.element("alarm-seen").click();
     const before = tones;
     await page.time.advance(5000);

@@ -1,4 +1,4 @@
-// What the page keeps to look back at: five minutes at most, bounded in size, found by its time.
+// History of the page: at most five minutes, bounded in size, found by time.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -16,14 +16,14 @@ function historyAt(...times) {
 
 const timesOf = (moments) => moments.map(({ at }) => at);
 
-test("a moment is kept for five minutes", () => {
+test("entries are kept for five minutes", () => {
   assert.equal(KEEP_MS, 5 * 60 * 1000);
   assert.deepEqual(timesOf(historyAt(0, 1000, KEEP_MS).moments), [0, 1000, KEEP_MS]);
   assert.deepEqual(timesOf(historyAt(0, 1000, KEEP_MS + 1).moments), [1000, KEEP_MS + 1]);
   assert.deepEqual(timesOf(historyAt(0, 5 * KEEP_MS).moments), [5 * KEEP_MS]);
 });
 
-test("with many UAVs it reaches back less far, but always holds the newest", () => {
+test("with many UAVs the history is shorter but always holds the newest", () => {
   const history = new History();
   const many = Array.from({ length: 10_000 }, (_, i) => uav(`${i}:1`));
   for (const at of [1, 2, 3]) history.add({ at, uavs: many });
@@ -35,7 +35,7 @@ test("with many UAVs it reaches back less far, but always holds the newest", () 
   assert.deepEqual(timesOf(history.moments), [5, 6]);
 });
 
-test("the moment of a time is the newest that is not after it, or else the oldest", () => {
+test("a time selects the newest entry not after it, or the oldest", () => {
   const history = historyAt(100, 200, 300);
   const found = (at) => history.at(at).at;
   assert.deepEqual([0, 100, 199, 200, 299, 300, 999].map(found),
@@ -43,14 +43,14 @@ test("the moment of a time is the newest that is not after it, or else the oldes
   assert.equal(history.newest.at, 300);
 });
 
-test("while it is empty there is no moment", () => {
+test("an empty history has no entry", () => {
   const history = new History();
   assert.deepEqual([history.newest, history.at(5), history.stepFrom({ at: 5 }, -1)],
     [null, null, null]);
   assert.deepEqual(history.between(0, 10), []);
 });
 
-test("steps go from one moment to the next, and stop at the ends", () => {
+test("steps go to the adjacent entry and stop at the ends", () => {
   const history = historyAt(100, 200, 300);
   const [oldest, middle, newest] = history.moments;
   assert.equal(history.stepFrom(middle, -1), oldest);
@@ -59,19 +59,19 @@ test("steps go from one moment to the next, and stop at the ends", () => {
   assert.equal(history.stepFrom(oldest, -1), oldest);
 });
 
-test("from a moment that was dropped steps go on from the oldest", () => {
+test("steps from a dropped entry continue from the oldest", () => {
   const history = historyAt(100, 200, 300);
   assert.equal(history.stepFrom({ at: 5 }, 1).at, 100);
   assert.equal(history.stepFrom({ at: 5 }, -1).at, 100);
 });
 
-test("between two times are those after the first, up to the second", () => {
+test("a time range excludes its start and includes its end", () => {
   const history = historyAt(100, 200, 300);
   assert.deepEqual(timesOf(history.between(100, 300)), [200, 300]);
   assert.deepEqual(timesOf(history.between(99, 299)), [100, 200]);
 });
 
-test("a moment knows its UAVs by their ids, without what the page never shows", () => {
+test("an entry holds its UAVs by id, without values that are never shown", () => {
   const history = new History();
   history.add({ at: 1, uavs: [uav("1:1", { rejected: { frozen: 1 } }), uav("2:1")], beams: "b" });
   const { byId, uavs, beams } = history.newest;

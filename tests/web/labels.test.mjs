@@ -12,7 +12,7 @@ const NBSP = "\u00a0";
 
 const show = async (uavs, scene = {}) => (await openPlan()).show({ uavs, ...scene });
 
-test("a UAV has its name beside it, and below that how high above the carrier it is", async () => {
+test("a UAV is labelled with its name and its height above the carrier", async () => {
   const picture = await show([uav("1:1", { down_m: -50 })]);
   const [symbol] = circles(picture, 6);
   const [name, height] = [picture.text("1:1"), picture.text(`↑50.0${NBSP}m`)];
@@ -21,17 +21,17 @@ test("a UAV has its name beside it, and below that how high above the carrier it
   near(height.x, name.x);
 });
 
-test("one that is below the carrier has an arrow down", async () => {
+test("a UAV below the carrier has a down arrow", async () => {
   (await show([uav("1:1", { down_m: 30 })])).text(`↓30.0${NBSP}m`);
   (await show([uav("1:1", { down_m: 0 })])).text(`↑0.0${NBSP}m`);
 });
 
-test("one that is not live says what it is", async () => {
+test("a UAV that is not live is labelled with its state", async () => {
   (await show([uav("1:1", { state: "coasting" })])).text(`↑50.0${NBSP}m coasting`);
   (await show([uav("1:1", { state: "lost", down_m: null })])).text("lost");
 });
 
-test("one outside the picture says how far away it is", async () => {
+test("a UAV outside the view is labelled with its range", async () => {
   const view = await openPlan();
   view.plan.zoom(20);
   const picture = view.show({ uavs: [uav("1:1", { north_m: 300, east_m: -400, down_m: -9 })] });
@@ -50,7 +50,7 @@ const boxesOf = (picture, names) => names.map((text) => {
 const overlap = (a, b) =>
   a.left < b.right && b.left < a.right && a.top < b.bottom && b.top < a.bottom;
 
-test("names of UAVs close together cover neither each other nor a symbol", async () => {
+test("labels of close UAVs overlap neither each other nor a symbol", async () => {
   const uavs = [0, 1, 2, 3, 4].map((i) => uav(`${i}:1`, { north_m: 100, east_m: 22 * (i - 2) }));
   const picture = await show(uavs);
   const boxes = boxesOf(picture, uavs.map(({ id }) => id));
@@ -63,7 +63,7 @@ test("names of UAVs close together cover neither each other nor a symbol", async
   });
 });
 
-test("a name leaves the bearings round the picture legible", async () => {
+test("labels leave the bearing scale legible", async () => {
   const view = await openPlan();
   view.show({ uavs: [uav("1:1", { north_m: 0, east_m: 140 })] }); // the scale stays
   const bearings = ["N", "E", "S", "W", "030", "060", "120", "240", "300"];
@@ -79,7 +79,7 @@ test("a name leaves the bearings round the picture legible", async () => {
   }
 });
 
-test("a name stays in the picture", async () => {
+test("labels stay inside the view", async () => {
   const view = await openPlan();
   view.show({ uavs: [uav("1:1", { north_m: 0, east_m: 140 })] });
   for (const uavs of [[uav("9999:100", { north_m: 0, east_m: 140 })],
@@ -89,7 +89,7 @@ test("a name stays in the picture", async () => {
   }
 });
 
-test("a name keeps away from the carrier", async () => {
+test("labels keep clear of the carrier", async () => {
   const picture = await show([
     uav("1:1", { north_m: 0, east_m: -24 }), uav("2:1", { north_m: 140 }),
   ]);
@@ -99,22 +99,22 @@ test("a name keeps away from the carrier", async () => {
   assert.ok(Math.abs(box.left - CENTRE.x) < 100);
 });
 
-/** So many UAVs on one spot, where there is room for few names. */
+/** Many coincident UAVs, with room for few labels. */
 const crowd = (number) => Array.from({ length: number }, (_, i) => uav(`${i + 1}:1`));
 
-test("of a few UAVs on one spot every name is written", async () => {
+test("a few coincident UAVs all have labels", async () => {
   const picture = await show(crowd(8));
   assert.equal(picture.texts.filter((text) => text.endsWith(":1")).length, 8);
 });
 
-test("in a crowd names without room are left away, but never that of the chosen one", async () => {
+test("labels without room are omitted, except that of the selected UAV", async () => {
   const picture = await show(crowd(30), { selected: "30:1" });
   const names = picture.texts.filter((text) => text.endsWith(":1"));
   assert.ok(names.length < 12, `${names.length} names`);
-  assert.equal(names[0], "30:1"); // it had the first choice of place
+  assert.equal(names[0], "30:1"); // it was placed first
 });
 
-test("in a crowd the worst link has its name after the chosen one", async () => {
+test("the worst link is labelled right after the selected UAV", async () => {
   const uavs = crowd(30).map((one) => (one.id === "29:1" ? { ...one, verdict: "none" } : one));
   const picture = await show(uavs, { selected: "30:1" });
   assert.deepEqual(picture.texts.filter((text) => text.endsWith(":1")).slice(0, 2),

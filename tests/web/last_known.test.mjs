@@ -15,7 +15,7 @@ const lastPose = (fields = {}) => ({
   at: stampAt(0), lat_deg: LAT, lon_deg: LON, alt_m: 450, heading_deg: 90, ...fields,
 });
 
-/** The service's answers while the carrier is not known. */
+/** The service's responses while the carrier is unknown. */
 function loseCarrier(service, behind = null) {
   const { answer } = service;
   service.beams = [];
@@ -31,7 +31,7 @@ function loseCarrier(service, behind = null) {
   };
 }
 
-test("the carrier is where it is, or where it was last, and why no better", () => {
+test("the carrier is at its present or last known position, with the reason", () => {
   const center = { ...statusAnswer().center, lat_deg: null, unfit: CAUSE, last_known: lastPose() };
   const status = statusAnswer({ center, time: stampAt(12) });
   assert.deepEqual(carrierOf(statusAnswer()).ageS, null);
@@ -44,7 +44,7 @@ test("the carrier is where it is, or where it was last, and why no better", () =
   assert.equal(carrierOf(late).unfit, "this machine is overloaded");
 });
 
-test("a UAV without an offset is placed from where the carrier was", () => {
+test("a UAV without an offset is placed from the carrier's last position", () => {
   const placed = placedBy(uav("1:1", { north_m: null, east_m: null, down_m: null }), lastPose());
   assert.ok(Math.abs(placed.north_m - 100) < 0.2, placed.north_m);
   assert.deepEqual([placed.east_m, placed.down_m], [0, -50]);
@@ -52,7 +52,7 @@ test("a UAV without an offset is placed from where the carrier was", () => {
   assert.equal(placedBy(known, lastPose()), known);
 });
 
-test("without the carrier the picture stays, with its age, and the cause is in the same words", async () => {
+test("without the carrier the last view stays, with its age and the same cause", async () => {
   const page = await openPage();
   const range = page.cells("range")[0];
   loseCarrier(page.service);
@@ -71,7 +71,7 @@ test("without the carrier the picture stays, with its age, and the cause is in t
   assert.match(page.document.querySelector(".focus-uav").textContent, /^1:1, as \d+.s ago$/);
 });
 
-test("weights of a beam stay with it while there are none, and are no other beam's", () => {
+test("the last weights of a beam are kept, and never used for another beam", () => {
   const last = new LastKnown();
   const [pattern, weights] = [{ patterns: [{ uav: "1:1" }, { uav: "2:1" }] }, { uavs: ["1:1"] }];
   const note = (uav, found) => last.note({ uavs: [], beams: [], pattern, ...found }, uav, 0);
@@ -85,7 +85,7 @@ test("weights of a beam stay with it while there are none, and are no other beam
   assert.equal(last.picture.weights, null);
 });
 
-test("where this machine is overloaded, that is the cause, and no old attitude", async () => {
+test("on an overloaded machine the overload is the cause, not an old attitude", async () => {
   const page = await openPage();
   loseCarrier(page.service, "this machine is overloaded: frames wait up to 7.0 s");
   await page.time.advance(8 * BEAT_MS);
@@ -95,7 +95,7 @@ test("where this machine is overloaded, that is the cause, and no old attitude",
   assert.doesNotMatch(page.text("center"), new RegExp(CAUSE));
 });
 
-test("before the carrier was ever known, UAVs are drawn about where one was first", async () => {
+test("before the carrier is known, UAVs are drawn around the first position", async () => {
   const page = await openPage();
   loseCarrier(page.service);
   const { center } = page.service.status;

@@ -1,4 +1,4 @@
-// Links, events and recordings: what each line says, in which order, and how bad it is.
+// Links, events and recordings: content, order and severity of each line.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -14,7 +14,7 @@ function openLists() {
   return { element, items: (id) => element(id).children };
 }
 
-/** What the one link looks like. */
+/** Appearance of the single link. */
 function shownLink(fields) {
   const { items } = openLists();
   showLinks({ links: [linkAnswer(fields)] });
@@ -26,7 +26,7 @@ function shownLink(fields) {
     level: head.dataset.level, facts: Object.fromEntries(facts), item };
 }
 
-test("a link says its address, its counts and who is heard over it", () => {
+test("a link shows its address, counts and received senders", () => {
   const { head, level, facts, item } = shownLink();
   assert.deepEqual([head, level], ["udpin:0.0.0.0:14550 | up", "good"]);
   assert.deepEqual(facts, { "Frames": "12,345", "Bad CRC": "0", "Gaps": "3", "First": "50 %",
@@ -34,7 +34,7 @@ test("a link says its address, its counts and who is heard over it", () => {
   assert.equal(item.children.at(-1).textContent, "receives 1:1");
 });
 
-test("a link that is silent is warned of, one that is not up is bad", () => {
+test("a silent link is a warning, a link that is down is bad", () => {
   assert.equal(shownLink({ age_s: 3.5 }).level, "good");
   const { head, level } = shownLink({ age_s: 65 });
   assert.deepEqual([head, level], ["udpin:0.0.0.0:14550 | up · silent 1 min 05 s", "warn"]);
@@ -44,7 +44,7 @@ test("a link that is silent is warned of, one that is not up is bad", () => {
   }
 });
 
-test("events stand with the newest first, each with its time and how bad it is", () => {
+test("events are listed newest first, with time and severity", () => {
   const { items } = openLists();
   showEvents({ events: [
     { at: stampAt(1), severity: "info", text: "1:1 is live" },
@@ -59,7 +59,7 @@ test("events stand with the newest first, each with its time and how bad it is",
   ]);
 });
 
-test("of many events the newest sixty are shown", () => {
+test("only the newest sixty events are shown", () => {
   const { items } = openLists();
   showEvents({ events: Array.from({ length: 100 }, (_, i) =>
     ({ at: stampAt(i), severity: "info", text: `${i}` })) });
@@ -67,7 +67,7 @@ test("of many events the newest sixty are shown", () => {
   assert.deepEqual([texts.length, texts[0], texts.at(-1)], [60, "99", "40"]);
 });
 
-test("no links or events is one thing, not to know of them another", () => {
+test("an empty list differs from an unknown one", () => {
   const { element } = openLists();
   showLinks(null);
   showEvents(null);
@@ -78,7 +78,7 @@ test("no links or events is one thing, not to know of them another", () => {
     ["none", "none"]);
 });
 
-test("what has not changed is left as it is, so that a selection stays", () => {
+test("unchanged elements are kept, so that a selection stays", () => {
   const { items } = openLists();
   showLinks({ links: [linkAnswer()] });
   const [before] = items("links");
@@ -88,7 +88,7 @@ test("what has not changed is left as it is, so that a selection stays", () => {
   assert.notEqual(items("links")[0], before);
 });
 
-test("a recording can be had by its name, whatever is in that", () => {
+test("recordings are linked by name, with any characters", () => {
   const { element, items } = openLists();
   showRecordings({ recordings: [{ name: "a b/c.mcap", bytes: 1500, state: "finished" }] });
   assert.equal(element("recordings-panel").hidden, false);

@@ -1,4 +1,4 @@
-// Numbers that are equal but for rounding.
+// Comparison of numbers up to rounding.
 
 import assert from "node:assert/strict";
 

@@ -10,7 +10,7 @@ import { BEAT_MS, openPage } from "./whole_page.mjs";
 
 const FEEDS = ["beams", "events", "fleet", "links", "pattern", "readyz", "status", "uavs", "weights"];
 
-test("while the service answers, nothing is marked and nothing is in the way", async () => {
+test("while the service responds, nothing is marked and no banner is shown", async () => {
   const page = await openPage();
   for (let i = 0; i < 40; i += 1) {
     assert.deepEqual([page.marked("late"), page.marked("lost")], [[], []]);
@@ -23,7 +23,7 @@ test("while the service answers, nothing is marked and nothing is in the way", a
   assert.ok(!(await page.drawn()).texts.some((text) => text.startsWith("NOT LIVE")));
 });
 
-test("answers that are late make what stands on them look late", async () => {
+test("late responses mark the values that depend on them", async () => {
   const page = await openPage();
   page.service.mode = "silent";
   await page.time.advance(1700);
@@ -35,7 +35,7 @@ test("answers that are late make what stands on them look late", async () => {
 });
 
 for (const mode of ["silent", "gone"]) {
-  test(`a service that is ${mode} strikes everything within four seconds, and heals`, async () => {
+  test(`a service that is ${mode} strikes out everything within four seconds, and recovers`, async () => {
     const page = await openPage();
     page.service.mode = mode;
     await page.time.advance(4000);
@@ -59,7 +59,7 @@ for (const mode of ["silent", "gone"]) {
   });
 }
 
-test("every feed that can be marked has its rules in the style sheet, late and lost", async () => {
+test("every feed has style rules for late and lost", async () => {
   const page = await openPage();
   page.service.mode = "gone";
   await page.time.advance(4000);
@@ -77,10 +77,10 @@ test("every feed that can be marked has its rules in the style sheet, late and l
     assert.ok(struck.some((one) => one.startsWith(`:root[data-${feed}-lost] `)), feed);
   }
   const standing = page.document.querySelectorAll("[data-feed]").map(({ dataset }) => dataset.feed);
-  assert.deepEqual([...new Set(standing)].sort(), feeds); // each marks something, all are marked
+  assert.deepEqual([...new Set(standing)].sort(), feeds); // every feed marks something
 });
 
-test("an age grows while no answer comes", async () => {
+test("ages grow while no response arrives", async () => {
   const page = await openPage();
   page.service.mode = "silent";
   await page.time.advance(2500);
@@ -88,7 +88,7 @@ test("an age grows while no answer comes", async () => {
   assert.ok(page.document.querySelector("tbody tr").hasAttribute("data-old"));
 });
 
-test("where nothing has ever answered there is no connection", async () => {
+test("without any response there is no connection", async () => {
   const page = await openPage({ mode: "gone" });
   assert.equal(page.text("connection"), "connecting…");
   assert.equal(page.text("uavs-empty"), "Nothing received yet.");
@@ -98,18 +98,18 @@ test("where nothing has ever answered there is no connection", async () => {
   (await page.drawn()).text("NOT LIVE – no connection");
 });
 
-test("a service whose time stands still has stopped", async () => {
+test("a service whose time does not advance has stopped", async () => {
   const page = await openPage();
   page.service.mode = "frozen";
   await page.time.advance(BEAT_MS + 3200);
   assert.equal(page.text("banner-title"), "ESTIMATES STOPPED");
   assert.equal(page.document.title, "STOPPED · companion");
   assert.ok(["uavs", "beams"].every((name) => page.marked("lost").includes(name)));
-  assert.ok(!page.marked("lost").includes("links")); // no time stands in those
+  assert.ok(!page.marked("lost").includes("links")); // they show no time
   (await page.drawn()).text("NOT LIVE – estimates stopped");
 });
 
-test("where beams alone are not answered, UAVs stay live", async () => {
+test("if only beams fail, UAVs stay live", async () => {
   const page = await openPage();
   page.service.answers["/v1/beams"] = { status: 500, body: "{}" };
   await page.time.advance(3200);
@@ -121,7 +121,7 @@ test("where beams alone are not answered, UAVs stay live", async () => {
   assert.equal(page.document.title, "CONNECTION FAILING · companion");
 });
 
-test("a token that is asked for is no connection that fails, and nothing looks live meanwhile", async () => {
+test("a token request is not a failed connection, and nothing looks live meanwhile", async () => {
   const page = await openPage();
   const { answer } = page.service;
   page.service.answer = (path) => (path.startsWith("/v1/") ? { status: 401, body: "{}" }
@@ -134,7 +134,7 @@ test("a token that is asked for is no connection that fails, and nothing looks l
   (await page.drawn()).text("NOT LIVE – token needed");
 });
 
-test("what keeps the service from answering is said in its words where it is known", async () => {
+test("the service's own reason for not responding is shown if known", async () => {
   const page = await openPage();
   const cause = "this machine is overloaded: frames wait up to 2.0 s";
   page.service.status.health.behind = cause;
@@ -143,7 +143,7 @@ test("what keeps the service from answering is said in its words where it is kno
   assert.ok(page.text("banner-detail").startsWith(`No answer for beams (${cause})`));
 });
 
-test("where UAVs alone are not answered, the plan is not live", async () => {
+test("if only UAVs fail, the plan is not live", async () => {
   const page = await openPage();
   page.service.answers["/v1/uavs"] = { status: 500, body: "{}" };
   await page.time.advance(3200);
@@ -159,12 +159,12 @@ const IMPOSSIBLE = {
 };
 
 for (const [place, answer] of Object.entries(IMPOSSIBLE)) {
-  test(`what cannot be shown of ${place} is said, and the page goes on once it can`, async (t) => {
+  test(`a drawing error of ${place} is reported, and the page recovers`, async (t) => {
     const complaints = t.mock.method(console, "error", () => {});
     const page = await openPage();
     page.service.answers[place] = answer;
     await page.time.advance(8 * BEAT_MS);
-    for (let i = 0; i < 5; i += 1) { // it stands there, and does not flicker
+    for (let i = 0; i < 5; i += 1) { // it stays without flicker
       assert.equal(page.text("banner-title"), "DISPLAY FAULT");
       assert.equal(page.element("banner").hidden, false);
       assert.deepEqual(page.marked("lost").filter((name) => name !== "recordings"), FEEDS);

@@ -9,12 +9,12 @@ import { circles } from "./plan_picture.mjs";
 import { beam, patternAnswer, stampAt, uav } from "./service.mjs";
 import { BEAT_MS, openPage, turnBeams } from "./whole_page.mjs";
 
-test("UAVs stand in the order of their numbers, not of their letters", async () => {
+test("UAVs are sorted numerically, not alphabetically", async () => {
   const page = await openPage({ ids: ["10:1", "icao:4CA7B3", "2:1", "1:1", "2:10", "2:9"] });
   assert.deepEqual(page.rows(), ["1:1", "2:1", "2:9", "2:10", "10:1", "icao:4CA7B3"]);
 });
 
-test("UAVs are counted by their state, the best first", async () => {
+test("UAVs are counted by state, best first", async () => {
   const page = await openPage();
   page.service.uavs = ["lost", "live", "stale", "coasting", "live"]
     .map((state, i) => uav(`${i}:1`, { state }));
@@ -28,7 +28,7 @@ test("UAVs are counted by their state, the best first", async () => {
   assert.equal(page.element("uavs-empty").hidden, false);
 });
 
-test("keys choose: a number the row, arrows the next, Escape nobody", async () => {
+test("number keys select a row, arrows the next, Escape clears the selection", async () => {
   const page = await openPage({ ids: ["1:1", "2:1", "10:1"] });
   const after = (key) => {
     page.press(key);
@@ -41,7 +41,7 @@ test("keys choose: a number the row, arrows the next, Escape nobody", async () =
   assert.equal(after("ArrowDown"), "1:1");
 });
 
-test("a click on the row or on the symbol chooses, a second one lets go", async () => {
+test("a click on row or symbol selects, a second one clears", async () => {
   const page = await openPage();
   page.document.querySelectorAll(".pick")[1].click();
   assert.deepEqual(page.chosen(), ["2:1"]);
@@ -56,7 +56,7 @@ test("a click on the row or on the symbol chooses, a second one lets go", async 
   assert.deepEqual(page.chosen(), []);
 });
 
-test("who is chosen and vanishes is let go", async () => {
+test("a selected UAV that vanishes is deselected", async () => {
   const page = await openPage();
   page.press("2");
   page.service.uavs = [uav("1:1")];
@@ -67,7 +67,7 @@ test("who is chosen and vanishes is let go", async () => {
   assert.deepEqual(page.chosen(), []);
 });
 
-test("the pattern is that of the chosen UAV at once, else of the first with a beam", async () => {
+test("the pattern is that of the selected UAV at once, or of the first with a beam", async () => {
   const page = await openPage({ ids: ["1:1", "2:1", "10:1"] });
   page.service.beams = [beam("10:1"), beam("2:1")];
   await page.time.advance(5 * BEAT_MS);
@@ -79,7 +79,7 @@ test("the pattern is that of the chosen UAV at once, else of the first with a be
   assert.equal(decodeURIComponent(asked()), "10:1");
   const names = page.document.querySelectorAll(".focus-uav").map(({ textContent }) => textContent);
   assert.deepEqual(names, ["10:1", "10:1"]);
-  page.press("1"); // chosen, but without a beam
+  page.press("1"); // selected, but without a beam
   await page.time.advance(10);
   assert.equal(decodeURIComponent(asked()), "2:1");
 });
@@ -98,7 +98,7 @@ test("the target in the pattern is where the beam was at the time of the pattern
   assert.equal(target(), then);
 });
 
-test("a paused page stands still and says so, while what comes is kept", async () => {
+test("a paused page stops and is labelled, while new data is kept", async () => {
   const page = await openPage({ ids: ["1:1"] });
   turnBeams(page.service);
   await page.time.advance(4 * BEAT_MS);
@@ -110,7 +110,7 @@ test("a paused page stands still and says so, while what comes is kept", async (
   assert.equal(page.element("past").hidden, false);
   const plan = await page.drawn();
   assert.ok(plan.texts.some((text) => /^NOT LIVE – \d.s ago$/.test(text)));
-  page.press("ArrowRight"); // into what came meanwhile
+  page.press("ArrowRight"); // into data received meanwhile
   const [next] = page.cells("azimuth");
   assert.notEqual(next, paused);
   page.press("ArrowLeft");
@@ -121,14 +121,14 @@ test("a paused page stands still and says so, while what comes is kept", async (
   near(Number.parseFloat(page.cells("azimuth")[0]), page.service.seconds * 10, 10);
 });
 
-test("the past was true in its time: it is not struck when the service is lost", async () => {
+test("past values are not struck out when the service is lost", async () => {
   const page = await openPage();
   await page.time.advance(3 * BEAT_MS);
   page.press(" ");
   page.service.mode = "gone";
   await page.time.advance(5000);
   assert.deepEqual(page.marked("lost").filter((name) => name !== "recordings"), ["readyz"]);
-  assert.equal(page.text("banner-title"), "CONNECTION LOST"); // of now, and not to be overlooked
+  assert.equal(page.text("banner-title"), "CONNECTION LOST"); // the present state
   assert.ok((await page.drawn()).drawn.some(({ strokeStyle }) =>
     strokeStyle === page.colour("live")));
   page.press(" ");
@@ -136,7 +136,7 @@ test("the past was true in its time: it is not struck when the service is lost",
   assert.ok(page.marked("lost").includes("uavs"));
 });
 
-test("what was not known then is not known when one looks back", async () => {
+test("values unknown at the displayed time are shown as unknown", async () => {
   const page = await openPage({ answers: { "/v1/status": { status: 500, body: "{}" } } });
   await page.time.advance(2 * BEAT_MS);
   delete page.service.answers["/v1/status"];
@@ -151,7 +151,7 @@ test("what was not known then is not known when one looks back", async () => {
   assert.equal(page.text("uptime"), "1\u00a0min 05\u00a0s");
 });
 
-test("beams that were not known then are not shown when one looks back", async () => {
+test("beams unknown at the displayed time are not shown", async () => {
   const page = await openPage({ answers: { "/v1/beams": { status: 500, body: "{}" } } });
   await page.time.advance(2 * BEAT_MS);
   delete page.service.answers["/v1/beams"];
@@ -162,7 +162,7 @@ test("beams that were not known then are not shown when one looks back", async (
   assert.deepEqual(page.cells("azimuth"), ["–", "–"]);
 });
 
-test("the scale is the operator's by button, key and wheel, until it is to fit again", async () => {
+test("the scale stays as set by button, key or wheel until Fit", async () => {
   const page = await openPage();
   const fits = () => page.element("zoom-fit").getAttribute("aria-pressed");
   const px = async () => 200 - circles(await page.drawn(), 6)[0].y;
@@ -187,7 +187,7 @@ test("the scale is the operator's by button, key and wheel, until it is to fit a
   assert.equal(fits(), "true");
 });
 
-test("the theme changes every picture", async () => {
+test("the theme changes every canvas", async () => {
   const page = await openPage();
   page.press("t");
   const plan = await page.drawn();

@@ -23,7 +23,7 @@ function openPanels() {
   };
 }
 
-test("a good connection needs no banner, and one chip says how good it is", () => {
+test("a good connection shows no banner and one status chip", () => {
   const { text, level } = openPanels();
   for (const [state, chip, wanted] of [["waiting", "connecting…", "wait"],
     ["live", "connected", "good"], ["late", "answers are late", "warn"]]) {
@@ -33,7 +33,7 @@ test("a good connection needs no banner, and one chip says how good it is", () =
   }
 });
 
-test("a bad connection cannot be overlooked, and it is said since when and why", () => {
+test("a bad connection shows a banner with its start and reason", () => {
   const { text, level } = openPanels();
   for (const [link, chip, title, detail] of [
     [{ state: "lost", silentS: 65.2, problem: "no answer within 2 s" }, "connection lost",
@@ -62,14 +62,14 @@ test("a bad connection cannot be overlooked, and it is said since when and why",
   assert.deepEqual([text("connection"), level("connection")], ["token needed", "warn"]);
 });
 
-test("a fault of the page itself is said", () => {
+test("a fault of the page itself is reported", () => {
   const { text } = openPanels();
   panels.showFault(new Error("no such thing"));
   assert.equal(text("banner-title"), "DISPLAY FAULT");
   assert.match(text("banner-detail"), /no such thing.*reload/);
 });
 
-test("whether the service is ready, and if not why", () => {
+test("readiness is shown, with the reason if not ready", () => {
   const { text, level } = openPanels();
   for (const [answer, chip, wanted, reasons] of [
     [null, "readiness –", "wait", null], [{ ready: true, reasons: [] }, "ready", "good", null],
@@ -83,14 +83,14 @@ test("whether the service is ready, and if not why", () => {
   }
 });
 
-test("the service at a glance: version, uptime, rates", () => {
+test("service summary: version, uptime, rates", () => {
   const { text } = openPanels();
   panels.showStatus(statusAnswer());
   assert.deepEqual(["version", "uptime", "frames", "updates"].map(text),
     ["v1.2.3", "1 min 05 s", "120 /s", "20 /s"]);
 });
 
-test("the center says where it is and how it heads; old or nowhere, it is warned of", () => {
+test("the center shows position and heading, with a warning if old or unknown", () => {
   const { text, level } = openPanels();
   const show = (fields) => {
     panels.showStatus(statusAnswer({ center: { ...statusAnswer().center, ...fields } }));
@@ -105,7 +105,7 @@ test("the center says where it is and how it heads; old or nowhere, it is warned
     ["5:1 · its attitude is too old", "warn"]);
 });
 
-test("a recording that is degraded is bad, and its size is said while there is one", () => {
+test("a degraded recording is bad, and its size is shown while it exists", () => {
   const { text, level, element } = openPanels();
   const show = (recording) => {
     panels.showStatus(statusAnswer({ recording }));
@@ -118,7 +118,7 @@ test("a recording that is degraded is bad, and its size is said while there is o
   assert.deepEqual(show({ state: "degraded", bytes: 1, file: null }), ["degraded · 1 B", "bad"]);
 });
 
-test("how far behind the machine is: of interest only when frames wait too long", () => {
+test("machine lag is highlighted only when frames wait too long", () => {
   const { text, level } = openPanels();
   const show = (lag) => {
     panels.showStatus(statusAnswer({ arrival_lag: lag }));
@@ -134,7 +134,7 @@ test("how far behind the machine is: of interest only when frames wait too long"
   assert.deepEqual(show(undefined), ["–", ""]);
 });
 
-test("a replay says that it is one, of what, how far and how fast", () => {
+test("a replay shows its log, progress and speed", () => {
   const { text, level } = openPanels();
   const show = (replay) => {
     panels.showStatus(statusAnswer({ replay }));
@@ -149,7 +149,7 @@ test("a replay says that it is one, of what, how far and how fast", () => {
   assert.equal(show(null), null);
 });
 
-test("rejections stand with the most frequent first, each with what it means", () => {
+test("rejections are listed most frequent first, each with its meaning", () => {
   const { lines, element } = openPanels();
   const rejections = new panels.Rejections();
   const counts = { "frozen": 2, "garbage": 12345, "out-of-order": 30, "not-known-here": 1 };
@@ -164,7 +164,7 @@ test("rejections stand with the most frequent first, each with what it means", (
   assert.equal(element("rejections-panel").hidden, true);
 });
 
-test("what rises while the page is open says when; what was there before does not", () => {
+test("counts that rise while the page is open show when; earlier ones do not", () => {
   const { lines } = openPanels();
   const rejections = new panels.Rejections();
   const at = (counts, now) => {
@@ -180,7 +180,7 @@ test("what rises while the page is open says when; what was there before does no
     ["frozen | 3 · 1 min 01 s ago", "secret | 1 · 1 min 09 s ago"]);
 });
 
-test("the first rejection of all is as new as any other", () => {
+test("the very first rejection counts as new", () => {
   const { lines } = openPanels();
   const rejections = new panels.Rejections();
   rejections.note({}, 0);
@@ -189,7 +189,7 @@ test("the first rejection of all is as new as any other", () => {
   assert.deepEqual(lines("rejections"), ["frozen | 1 · now"]);
 });
 
-test("looking back makes no rejection new", () => {
+test("looking back marks no rejection as new", () => {
   const { lines } = openPanels();
   const rejections = new panels.Rejections();
   rejections.note({ frozen: 1 }, 0);
@@ -200,7 +200,7 @@ test("looking back makes no rejection new", () => {
   assert.deepEqual(lines("rejections"), ["frozen | 5 · 30 s ago"]);
 });
 
-test("the beams in a line: method, number, condition; the array and the lead in another", () => {
+test("one line shows method, number and condition of the beams; another the array and lead", () => {
   const { text } = openPanels();
   panels.showBeams(beamsAnswer([beam("1:1"), beam("2:1")], { condition_number: 2.345 }));
   assert.equal(text("beams-line"), "Zero forcing · 2 beams · condition number 2.35");
@@ -216,7 +216,7 @@ test("the beams in a line: method, number, condition; the array and the lead in 
     ["Zero forcing · no beams", "–"]);
 });
 
-test("what is not known is said to be so, and nothing of before stays", () => {
+test("unknown values are labelled, and no earlier value stays", () => {
   const { text, level, lines } = openPanels();
   const center = { ...statusAnswer().center, age_s: 9 };
   panels.showStatus(statusAnswer({ center, replay: { log: "a", at_s: 1, state: "running" } }));
@@ -229,7 +229,7 @@ test("what is not known is said to be so, and nothing of before stays", () => {
   assert.equal(level("center"), "");
 });
 
-test("that nulls are held back is said", () => {
+test("held-back nulls are reported", () => {
   const { text } = openPanels();
   for (const beams of [[], [beam("1:1")]]) {
     panels.showBeams(beamsAnswer(beams));
@@ -237,6 +237,6 @@ test("that nulls are held back is said", () => {
   }
   panels.showBeams(beamsAnswer([beam("1:1")], { regularised: true }));
   assert.match(text("beams-warning"), /^Nulls are not exact/);
-  panels.showBeams(beamsAnswer([], { regularised: true })); // where there are none, of none
+  panels.showBeams(beamsAnswer([], { regularised: true })); // without beams, no nulls
   assert.equal(text("beams-warning"), null);
 });

@@ -44,7 +44,7 @@ test("the response is drawn clockwise from boresight at the top", () => {
   near(left, MIDDLE); // below the floor
 });
 
-test("the edge is the peak rounded up to 5 dB, and a ring stands for 10 dB", () => {
+test("the edge is the peak rounded up to 5 dB, with a ring every 10 dB", () => {
   const { show } = openPattern();
   const picture = show({ answer: patternAnswer("1:1", { peak_db: 17.2 }) });
   for (const [i, label] of ["20 dB", "10", "0", "−10"].entries()) {
@@ -55,7 +55,7 @@ test("the edge is the peak rounded up to 5 dB, and a ring stands for 10 dB", () 
   }
 });
 
-test("angles are written around it: to the right positive, to the left negative", () => {
+test("angles are labelled around it, positive to the right", () => {
   const picture = openPattern().show();
   const px = EDGE_PX + 15;
   for (const [text, deg] of [["0°", 0], ["90°", 90], ["180°", 180], ["−90°", 270], ["−30°", 330]]) {
@@ -80,7 +80,7 @@ test("the commanded direction is dashed, the peak a bar on the edge, the target 
   assert.equal(ring.strokeStyle, browser.colour("live"));
 });
 
-test("the half-power width is a wedge about where the beam truly points", () => {
+test("the half-power width is a wedge around the true beam direction", () => {
   const { show } = openPattern();
   const answer = patternAnswer("1:1", { peak_azimuth_deg: 30, half_power_beamwidth_deg: 12 });
   const [wedge] = wedges(show({ answer }));
@@ -89,25 +89,25 @@ test("the half-power width is a wedge about where the beam truly points", () => 
   assert.deepEqual(wedges(show({ answer: unknown })), []);
 });
 
-test("where there is no pattern the page says why", () => {
+test("a missing pattern shows its reason", () => {
   const { show } = openPattern();
   const picture = show({ answer: null, none: "no beam" });
   near(picture.text("no beam"), MIDDLE);
   assert.equal(outlineOf(picture), undefined);
 });
 
-test("a response that is not known is drawn in the middle", () => {
+test("an unknown response is drawn at the centre", () => {
   const answer = patternAnswer("1:1", { response_db: [null, -10, 18, -10] });
   near(outlineOf(openPattern().show({ answer })).path[0], MIDDLE);
 });
 
-test("what is no longer true has the colour of the stale", () => {
+test("outdated values have the stale colour", () => {
   const { show, browser } = openPattern();
   assert.equal(outlineOf(show()).strokeStyle, browser.colour("beam"));
   assert.equal(outlineOf(show({ trusted: false })).strokeStyle, browser.colour("stale"));
 });
 
-test("the same is not drawn twice; another theme or size draws it again", () => {
+test("an unchanged pattern is not redrawn; a new theme or size redraws it", () => {
   const { show, browser, picture, surface } = openPattern();
   const answer = patternAnswer("1:1");
   const same = { answer, beam: beam("1:1") };
@@ -121,14 +121,14 @@ test("the same is not drawn twice; another theme or size draws it again", () => 
   near(circles(picture, 300 / 2 - 34)[0], { x: 150, y: 150 });
 });
 
-test("on a sharp screen all is drawn at twice the pixels", () => {
+test("a high-density screen is drawn at twice the pixels", () => {
   const { show, browser } = openPattern({ ratio: 2 });
   near(circles(show(), 2 * EDGE_PX)[0], { x: 2 * MIDDLE.x, y: 2 * MIDDLE.y });
   const { width, height } = browser.element("pattern");
   assert.deepEqual([width, height], [800, 600]);
 });
 
-test("the directions are said in words as well, each under its own name", () => {
+test("directions are also given as text, each with its name", () => {
   const [entry] = patternAnswer("1:1", { target_deg: 1, peak_azimuth_deg: -2.04, peak_db: 17.5,
     half_power_beamwidth_deg: 12, side_lobe_db: -13.2 }).patterns;
   assert.deepEqual(Object.fromEntries(directionFacts(entry, beam("1:1", { azimuth_deg: 1.5 }))), {

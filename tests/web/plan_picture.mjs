@@ -19,7 +19,7 @@ export async function openPlan({ width = 400, height = 400, ...settings } = {}) 
   const picture = canvas.getContext("2d");
   return {
     browser, plan, history, chosen, canvas, picture,
-    /** Show a scene, and draw until the picture stands still. */
+    /** Show a scene, and draw until it no longer changes. */
     show(scene, now = 1000) {
       plan.show({
         uavs: [], beams: [], array: null, carrier: null, uavsLive: true, beamsLive: true,
@@ -32,7 +32,7 @@ export async function openPlan({ width = 400, height = 400, ...settings } = {}) 
       plan.redraw();
       let last = 0;
       while (browser.time.paint(1)) {
-        picture.drawn.splice(0, last); // of an eased change of scale its last frame
+        picture.drawn.splice(0, last); // keep only the last frame of a scale transition
         last = picture.drawn.length;
       }
       return picture;
@@ -54,7 +54,7 @@ export const arrows = (picture, colour) =>
     && one.fillStyle === colour)
     .map((one) => ({ ...one, tip: one.path[0], tail: one.path[2] }));
 
-/** Triangles at the edge, for who is outside the picture. */
+/** Triangles at the edge, for UAVs outside the view. */
 export const edgeArrows = (picture) =>
   picture.of("fill", (one) => shape(one) === "move line line close")
     .map((one) => ({ ...one, tip: one.path[0],

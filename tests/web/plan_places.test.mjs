@@ -10,7 +10,7 @@ import {
 } from "./plan_picture.mjs";
 import { uav } from "./service.mjs";
 
-/** A UAV that stands still is a circle of 6 px. */
+/** A hovering UAV is a circle of 6 px. */
 const stillAt = (picture) => circles(picture, 6)[0];
 
 const COMPASS = [
@@ -30,7 +30,7 @@ for (const { name, north_m, east_m, x, y } of COMPASS) {
     near(stillAt(picture), { x: CENTRE.x + x * PX, y: CENTRE.y + y * PX });
   });
 
-  test(`a UAV that flies ${name} points there, with a line to where it is in 2 s`, async () => {
+  test(`a UAV that flies ${name} points there, with a line to its position in 2 s`, async () => {
     const view = await openPlan();
     const velocity = [north_m / 10, east_m / 10, 0];
     const picture = view.show({
@@ -43,7 +43,7 @@ for (const { name, north_m, east_m, x, y } of COMPASS) {
     near(leader.to, { x: place.x + 20 * x * OUTER_PX / 100, y: place.y + 20 * y * OUTER_PX / 100 });
   });
 
-  test(`a carrier that heads ${name} shows it`, async () => {
+  test(`a carrier that heads ${name} points there`, async () => {
     const view = await openPlan();
     const headingDeg = { north: 0, east: 90, south: 180, west: 270 }[name];
     const picture = view.show({ carrier: { heading_deg: headingDeg } });
@@ -51,7 +51,7 @@ for (const { name, north_m, east_m, x, y } of COMPASS) {
     near(symbol.tip, { x: CENTRE.x + 7 * x, y: CENTRE.y + 7 * y });
   });
 
-  test(`a UAV outside the picture in the ${name} is an arrow at that edge`, async () => {
+  test(`a UAV outside the view in the ${name} is an arrow at that edge`, async () => {
     const view = await openPlan();
     view.plan.zoom(20);
     const picture = view.show({ uavs: [uav("1:1", { north_m, east_m })] });
@@ -62,7 +62,7 @@ for (const { name, north_m, east_m, x, y } of COMPASS) {
   });
 }
 
-test("a UAV in the northeast is above and to the right, twice as far east as north", async () => {
+test("a UAV to the northeast is above and to the right, twice as far east as north", async () => {
   const view = await openPlan();
   const picture = view.show({ uavs: [uav("1:1", { north_m: 60, east_m: 120 })] });
   near(stillAt(picture), { x: CENTRE.x + 1.2 * PX, y: CENTRE.y - 0.6 * PX });
@@ -93,7 +93,7 @@ test("a bound larger than the picture, or unknown, is not drawn", async () => {
   }
 });
 
-test("one that hovers has no line ahead, one that is lost neither", async () => {
+test("neither a hovering nor a lost UAV has a line ahead", async () => {
   const view = await openPlan();
   const place = { x: CENTRE.x, y: CENTRE.y - PX };
   const hovering = uav("1:1", { velocity_ned_mps: [0.2, 0.2, 3] });
@@ -103,14 +103,14 @@ test("one that hovers has no line ahead, one that is lost neither", async () => 
   assert.deepEqual(linesFrom(view.show({ uavs: [lost, near100] }), place), []);
 });
 
-test("nobody without a place is drawn", async () => {
+test("a UAV without a position is not drawn", async () => {
   const view = await openPlan();
   const nowhere = uav("1:1", { north_m: null, east_m: null });
   assert.deepEqual(circles(view.show({ uavs: [nowhere] }), 6), []);
   assert.equal(circles(view.show({ uavs: [nowhere, uav("2:1")] }), 6).length, 1);
 });
 
-test("on a sharp screen all is drawn at twice the pixels", async () => {
+test("a high-density screen is drawn at twice the pixels", async () => {
   const view = await openPlan({ ratio: 2 });
   assert.deepEqual([view.canvas.width, view.canvas.height], [800, 800]);
   const picture = view.show({ uavs: [uav("1:1")] });

@@ -13,7 +13,7 @@ import { array, beam, uav } from "./service.mjs";
 const COLOUR_OF = { live: "live", coasting: "coast", stale: "stale" };
 
 for (const [state, name] of Object.entries(COLOUR_OF)) {
-  test(`a UAV that is ${state} has the colour for it, filled only while live`, async () => {
+  test(`a UAV that is ${state} has the colour of that state, filled only while live`, async () => {
     const view = await openPlan();
     const picture = view.show({ uavs: [uav("1:1", { state })] });
     assert.equal(circles(picture, 6)[0].strokeStyle, view.browser.colour(name));
@@ -35,7 +35,7 @@ test("a UAV that is lost is a cross", async () => {
   assert.equal(cross[0].strokeStyle, view.browser.colour("stale"));
 });
 
-test("nothing looks live while the answers are not", async () => {
+test("nothing looks live while the responses are not", async () => {
   const view = await openPlan();
   const flying = uav("1:1", { velocity_ned_mps: [10, 0, 0] });
   const scene = { uavs: [flying], beams: [beam("1:1")], array: array(), carrier: { heading_deg: 0 } };
@@ -55,7 +55,7 @@ test("nothing looks live while the answers are not", async () => {
   assert.ok(wedges(picture)[0].fillStyle.stops[0][1].startsWith(view.browser.colour("beam")));
 });
 
-test("a carrier that is not known any more, and old beams, are grey; UAVs keep their colour", async () => {
+test("a lost carrier and old beams are grey; UAVs keep their colour", async () => {
   const view = await openPlan();
   const carrier = { heading_deg: 0, unfit: "the attitude is too old" };
   const scene = { uavs: [uav("1:1")], beams: [beam("1:1", { oldS: 9 })], array: array(), carrier };
@@ -66,7 +66,7 @@ test("a carrier that is not known any more, and old beams, are grey; UAVs keep t
   assert.equal(circles(picture, 6)[0].strokeStyle, view.browser.colour("live"));
 });
 
-test("names are struck out while the answers are not live", async () => {
+test("labels are struck out while the responses are not live", async () => {
   const view = await openPlan();
   const strokes = (picture) => picture.of("rect", ({ height }) => height < 2);
   assert.deepEqual(strokes(view.show({ uavs: [uav("1:1")] })), []);
@@ -76,7 +76,7 @@ test("names are struck out while the answers are not live", async () => {
   near(strokes(picture)[0].width, "1:1".length * 6.5);
 });
 
-test("what must not be overlooked stands across the picture, the past in its colour", async () => {
+test("warnings are written across the view, the past in its own colour", async () => {
   const view = await openPlan();
   const plate = (picture) => {
     const { x } = picture.text("NOT LIVE");
@@ -89,11 +89,11 @@ test("what must not be overlooked stands across the picture, the past in its col
   found = plate(view.show({ message: "NOT LIVE", isPast: true }));
   assert.equal(found.fillStyle, view.browser.colour("past"));
   assert.ok(!view.show({ uavs: [uav("1:1")] }).texts.includes("NOT LIVE"));
-  const said = view.show({ message: "NOT LIVE" }); // of the carrier alone, say
+  const said = view.show({ message: "NOT LIVE" }); // for example, of the carrier alone
   assert.equal(plate(said).fillStyle, view.browser.colour("plan"));
 });
 
-test("a message that is wider than the picture takes two lines, after its colon", async () => {
+test("a message wider than the view wraps after its colon", async () => {
   const view = await openPlan();
   const cause = "the attitude of the carrier 5:1 is too old:";
   const picture = view.show({ message: `${cause} carrier and beams from 19 s ago`, uavs: [] });
@@ -103,7 +103,7 @@ test("a message that is wider than the picture takes two lines, after its colon"
   assert.ok(found.x >= 0 && found.y + found.height <= view.plan.height);
 });
 
-test("a bound as large as the picture is a rim: several would cover all else", async () => {
+test("a bound as large as the view is drawn as an outline only", async () => {
   const view = await openPlan();
   const drawn = (boundM) => {
     const picture = view.show({
@@ -124,10 +124,10 @@ test("the colours are those of the theme", async () => {
   assert.deepEqual([dark, light], ["#27c498", "#00634a"]);
 });
 
-/** How far from the middle the first UAV is, which is 100 m to the north. */
+/** Distance from the centre to the first UAV, which is 100 m north. */
 const pxOf100 = (picture) => CENTRE.y - circles(picture, 6)[0].y;
 
-test("neither who is lost nor passing traffic makes those with a beam small", async () => {
+test("neither lost UAVs nor passing traffic shrink the view of UAVs with beams", async () => {
   const view = await openPlan();
   const mine = uav("1:1");
   near(pxOf100(view.show({ uavs: [mine] })), (100 * OUTER_PX) / 150);
@@ -139,7 +139,7 @@ test("neither who is lost nor passing traffic makes those with a beam small", as
   near(pxOf100(view.show({ uavs: [mine, uav("3:1", far)] })), (100 * OUTER_PX) / 10_000);
 });
 
-test("zooming in draws larger, out smaller; to fit asks for all again", async () => {
+test("zooming in enlarges, zooming out shrinks; Fit shows all again", async () => {
   const view = await openPlan();
   const before = pxOf100(view.show({ uavs: [uav("1:1")] }));
   view.plan.zoom(1);
@@ -150,7 +150,7 @@ test("zooming in draws larger, out smaller; to fit asks for all again", async ()
   near(pxOf100(view.drawAnew()), before);
 });
 
-test("a click chooses the nearest UAV within reach, and nobody in the open", async () => {
+test("a click selects the nearest UAV within reach, or none", async () => {
   const view = await openPlan();
   const picture = view.show({ uavs: [uav("1:1"), uav("2:1", { north_m: 80 })] });
   const [one, other] = circles(picture, 6);
@@ -162,7 +162,7 @@ test("a click chooses the nearest UAV within reach, and nobody in the open", asy
   assert.deepEqual(view.chosen, ["1:1", "2:1", "1:1", null]);
 });
 
-test("the chosen one has a ring about it, and its beam is not dimmed", async () => {
+test("the selected UAV has a ring, and its beam is not dimmed", async () => {
   const view = await openPlan();
   const uavs = [uav("1:1"), uav("2:1", { north_m: 0, east_m: 100 })];
   const beams = [beam("1:1"), beam("2:1", { bearing_deg: 90 })];
@@ -177,7 +177,7 @@ test("the chosen one has a ring about it, and its beam is not dimmed", async () 
   assert.deepEqual(wedges(view.show(scene)).map(({ globalAlpha }) => globalAlpha), [1, 1]);
 });
 
-test("a carrier whose heading is not known has none", async () => {
+test("a carrier without a known heading shows none", async () => {
   const view = await openPlan();
   for (const headingDeg of [null, undefined]) {
     assert.deepEqual(arrows(view.show({ carrier: { heading_deg: headingDeg } }), view.browser.colour("text")), []);
@@ -185,7 +185,7 @@ test("a carrier whose heading is not known has none", async () => {
   assert.equal(circles(view.show({}), 9).length, 1);
 });
 
-test("while nothing is laid out, nothing is drawn", async () => {
+test("nothing is drawn before layout", async () => {
   const view = await openPlan({ width: 0, height: 0 });
   assert.deepEqual(view.show({ uavs: [uav("1:1")] }).drawn, []);
   view.browser.resize("plan", 400, 400);
@@ -194,7 +194,7 @@ test("while nothing is laid out, nothing is drawn", async () => {
   assert.equal(linesFrom(view.picture, CENTRE).length, 0);
 });
 
-test("the same scene is not drawn again, and another answer is", async () => {
+test("an unchanged scene is not redrawn; a new response is", async () => {
   const view = await openPlan();
   const scene = { uavs: [uav("1:1")], beams: [], array: null, carrier: null, uavsLive: true,
     beamsLive: true, message: "", isPast: false, selected: null, at: 1000, answers: "1" };

@@ -10,7 +10,7 @@ import { Service, beam, uav } from "./service.mjs";
 const { startPolling } = await load("api.js");
 const BEAT_MS = 850;
 
-/** Polling, with the first answers there. */
+/** Polling after the first responses. */
 async function startPage({ beamed = "1:1", mode = "answers", answers = {} } = {}) {
   const browser = openBrowser();
   const { time } = browser;
@@ -26,11 +26,11 @@ async function startPage({ beamed = "1:1", mode = "answers", answers = {} } = {}
 const timesOf = (service, place) =>
   service.asked.filter(({ path }) => path.split("?")[0] === place).map(({ at }) => at);
 
-test("everything is asked for at once, then each at its rate, five a second in all", async () => {
+test("all feeds are requested at once, then each at its rate, five per second in all", async () => {
   const { time, service, answered } = await startPage();
   assert.deepEqual(answered.sort(), ["beams", "events", "links", "pattern", "readyz",
     "recordings", "status", "uavs", "weights"]);
-  await time.advance(60 * BEAT_MS); // until everything is in its beat
+  await time.advance(60 * BEAT_MS); // until every feed is at its own rate
   const since = time.now;
   await time.advance(60 * BEAT_MS);
   const counts = ["/v1/uavs", "/v1/beams", "/v1/pattern", "/v1/beams/weights", "/v1/status",
@@ -40,7 +40,7 @@ test("everything is asked for at once, then each at its rate, five a second in a
   assert.ok(all / (60 * BEAT_MS / 1000) <= 5);
 });
 
-test("what is drawn together is asked for at the same moment", async () => {
+test("feeds drawn together are requested together", async () => {
   const { time, service } = await startPage();
   await time.advance(10_000);
   const uavs = timesOf(service, "/v1/uavs");
@@ -49,7 +49,7 @@ test("what is drawn together is asked for at the same moment", async () => {
   assert.ok(uavs.slice(1).every((at) => at % BEAT_MS === 0));
 });
 
-test("slow answers are spread: of links, events and weights one at a time", async () => {
+test("slow feeds are spread: links, events and weights one at a time", async () => {
   const { time, service } = await startPage();
   await time.advance(60_000);
   const [links, events, weights] = ["/v1/links", "/v1/events", "/v1/beams/weights"]
@@ -59,16 +59,16 @@ test("slow answers are spread: of links, events and weights one at a time", asyn
   assert.ok(links.length && events.length && weights.length);
 });
 
-test("nothing is taken from the browser's store: old answers would look new", async () => {
+test("the browser cache is not used: old responses would look new", async () => {
   const { service } = await startPage();
   const asked = service.asked.filter(({ path }) => path.startsWith("/v1/"));
   assert.deepEqual([...new Set(asked.map(({ cache }) => cache))], ["no-store"]);
 });
 
-test("a service that says nothing is given up after 2 s, and asked once at a time", async () => {
+test("a silent service times out after 2 s, with one request at a time", async () => {
   const { time, service, feeds } = await startPage();
   service.mode = "silent";
-  await time.advance(BEAT_MS - (time.now % BEAT_MS)); // until it is asked
+  await time.advance(BEAT_MS - (time.now % BEAT_MS)); // until it is requested
   await time.advance(1999);
   assert.equal(feeds.uavs.failures, 0);
   await time.advance(1);
@@ -87,7 +87,7 @@ const WRONG = {
 };
 
 for (const [problem, answer] of Object.entries(WRONG)) {
-  test(`a wrong answer is none: ${problem}`, async () => {
+  test(`a malformed response is ignored: ${problem}`, async () => {
     const { time, service, feeds } = await startPage();
     const before = feeds.uavs.data;
     service.answers["/v1/uavs"] = answer;
@@ -101,7 +101,7 @@ for (const [problem, answer] of Object.entries(WRONG)) {
   });
 }
 
-test("an empty list is an answer, a missing one is none", async () => {
+test("an empty list is a valid response, a missing one is not", async () => {
   const { time, service, feeds } = await startPage();
   service.uavs = [];
   await time.advance(BEAT_MS);
@@ -111,14 +111,14 @@ test("an empty list is an answer, a missing one is none", async () => {
   assert.equal(feeds.uavs.failures, 1);
 });
 
-test("not to be ready is an answer", async () => {
+test("not being ready is a valid response", async () => {
   const { feeds } = await startPage({
     answers: { "/readyz": { status: 503, body: '{"ready": false, "reasons": ["no link"]}' } },
   });
   assert.deepEqual(feeds.readyz.data, { ready: false, reasons: ["no link"] });
 });
 
-test("while the service is gone it is asked less often, every two seconds", async () => {
+test("an absent service is polled every two seconds only", async () => {
   const { time, service, feeds } = await startPage();
   service.mode = "gone";
   await time.advance(BEAT_MS);
@@ -129,7 +129,7 @@ test("while the service is gone it is asked less often, every two seconds", asyn
   assert.deepEqual(after.map((at) => at - failedAt), [1700, 3700, 5700, 7700, 9700]);
 });
 
-test("once it is back the beat is taken up again", async () => {
+test("normal polling resumes when the service returns", async () => {
   const { time, service } = await startPage();
   service.mode = "gone";
   await time.advance(10_000);
@@ -142,7 +142,7 @@ test("once it is back the beat is taken up again", async () => {
   assert.equal(asked[2] - asked[1], BEAT_MS);
 });
 
-test("when the network comes back, or the page is looked at again, it asks at once", async () => {
+test("it polls at once when the network or the page's visibility returns", async () => {
   const { browser, time, service } = await startPage();
   service.mode = "gone";
   await time.advance(10_050);
@@ -162,7 +162,7 @@ test("when the network comes back, or the page is looked at again, it asks at on
   assert.equal(service.count("/v1/uavs"), before);
 });
 
-test("the pattern is asked for the UAV that is looked at, whatever is in its name", async () => {
+test("the pattern is requested for the selected UAV, with any characters in its id", async () => {
   const { time, service, context } = await startPage({ beamed: null });
   await time.advance(5000);
   assert.equal(service.count("/v1/pattern") + service.count("/v1/beams/weights"), 0);

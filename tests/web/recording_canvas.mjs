@@ -22,7 +22,7 @@ export class RecordingContext {
   constructor() {
     Object.assign(this, PEN, { dash: [], matrix: [1, 0, 0, 1, 0, 0], saved: [] });
     this.path = [];
-    this.drawn = []; // what can be seen, oldest first
+    this.drawn = []; // visible items, oldest first
   }
 
   // --- the pen and the sheet --------------------------------------------------------------------
@@ -33,7 +33,7 @@ export class RecordingContext {
   }
 
   restore() {
-    Object.assign(this, this.saved.pop()); // the path is no part of it
+    Object.assign(this, this.saved.pop()); // the path is not part of the saved state
   }
 
   setLineDash(dash) {
@@ -163,7 +163,7 @@ export class RecordingContext {
     return this.drawn.filter((one) => one.kind === kind && wanted(one));
   }
 
-  /** Where a text stands; an error where it does not, or more than once. */
+  /** Position of a text; an error if it is missing or repeated. */
   text(text) {
     const found = this.of("text", (one) => one.text === text);
     if (found.length !== 1) throw new Error(`${found.length} times "${text}" among ${this.texts}`);

@@ -15,7 +15,7 @@ async function newScale({ still = false } = {}) {
 
 const radiusOf = (scale) => scale.rings[0];
 
-test("the first UAVs are fitted at once, with a little room beyond the farthest", async () => {
+test("the first UAVs are fitted at once, with a small margin", async () => {
   for (const [farthestM, radiusM] of [[10, 50], [47, 50], [48, 60], [140, 150], [142, 200],
     [7000, 8000], [90_000, 100_000]]) {
     const scale = await newScale();
@@ -25,26 +25,26 @@ test("the first UAVs are fitted at once, with a little room beyond the farthest"
   }
 });
 
-test("beyond the largest scale it stays there", async () => {
+test("the scale stops at its maximum", async () => {
   const scale = await newScale();
   scale.follow([1e9], 0);
   assert.equal(radiusOf(scale), 800_000);
 });
 
-test("one that flies out is followed at once", async () => {
+test("the view widens at once for a departing UAV", async () => {
   const scale = await newScale();
   scale.follow([100], 0);
   scale.follow([190], 1);
   assert.equal(radiusOf(scale), 300);
 });
 
-test("one that comes in is followed only after four seconds without a break", async () => {
+test("the view narrows only after four uninterrupted seconds", async () => {
   const scale = await newScale();
   scale.follow([190], 0);
   scale.follow([50], 1000);
   scale.follow([50], 4900);
   assert.equal(radiusOf(scale), 300);
-  scale.follow([220], 4950); // out again: the wait starts anew
+  scale.follow([220], 4950); // out again: the wait restarts
   scale.follow([50], 5000);
   scale.follow([50], 9000);
   assert.equal(radiusOf(scale), 300);
@@ -52,14 +52,14 @@ test("one that comes in is followed only after four seconds without a break", as
   assert.equal(radiusOf(scale), 60);
 });
 
-test("without any UAV nothing changes", async () => {
+test("the scale does not change without UAVs", async () => {
   const scale = await newScale();
   scale.follow([100], 0);
   scale.follow([], 10_000);
   assert.equal(radiusOf(scale), 150);
 });
 
-test("who has zoomed keeps that scale until it is to fit, which narrows at once", async () => {
+test("a zoomed scale is kept until Fit, which narrows at once", async () => {
   const scale = await newScale();
   scale.follow([100], 0);
   scale.zoom(-2);
@@ -72,7 +72,7 @@ test("who has zoomed keeps that scale until it is to fit, which narrows at once"
   assert.equal(radiusOf(scale), 150);
 });
 
-test("zooming ends at the smallest and at the largest scale", async () => {
+test("zooming stops at the smallest and largest scale", async () => {
   const scale = await newScale();
   scale.zoom(100);
   assert.equal(radiusOf(scale), 50);
@@ -80,7 +80,7 @@ test("zooming ends at the smallest and at the largest scale", async () => {
   assert.equal(radiusOf(scale), 800_000);
 });
 
-test("every ring's distance divides its radius", async () => {
+test("ring distances divide the radius", async () => {
   const scale = await newScale();
   scale.zoom(100);
   for (let before = 0; radiusOf(scale) !== before; scale.zoom(-1)) {
@@ -91,7 +91,7 @@ test("every ring's distance divides its radius", async () => {
   }
 });
 
-test("the picture glides to a new scale, from one side and without end effects", async () => {
+test("the scale eases monotonically to its new value", async () => {
   const scale = await newScale();
   scale.follow([100], 0);
   scale.follow([900], 1);
@@ -106,7 +106,7 @@ test("the picture glides to a new scale, from one side and without end effects",
   assert.ok(frames > 5 && frames < 60, `${frames}`);
 });
 
-test("who asked for no motion gets the new scale in one step", async () => {
+test("with reduced motion the scale changes in one step", async () => {
   const scale = await newScale({ still: true });
   scale.follow([100], 0);
   scale.follow([900], 1);

@@ -1,6 +1,6 @@
 // Selectors of style sheets, as far as the page and its tests use them.
 
-/** What an element must be, for one part of a selector. */
+/** Conditions on an element for one part of a selector. */
 function testOf(part) {
   const name = part.slice(1);
   if (part[0] === ".") {
@@ -37,7 +37,7 @@ function questionOf(selectors) {
 
 const QUESTIONS = new Map();
 
-/** The same, worked out once. */
+/** The same, cached. */
 export function question(selectors) {
   if (!QUESTIONS.has(selectors)) QUESTIONS.set(selectors, questionOf(selectors));
   return QUESTIONS.get(selectors);

@@ -6,11 +6,11 @@ import { LABELS } from "./browser.mjs";
 export const START = Date.parse("2026-11-20T13:00:00.000Z");
 export const stampAt = (seconds) => new Date(START + seconds * 1000).toISOString();
 
-/** Where the carrier of these answers is. */
+/** The carrier's position in these responses. */
 export const LAT = 47.0;
 export const LON = 8.0;
 
-/** What is behind a verdict; all is well by default. */
+/** Health of a verdict; good by default. */
 export const health = (fields = {}) => ({
   cause: null, reason: null, remedy: null, since: stampAt(0), needed_gain_db: 6,
   guaranteed_gain_db: 15.2, likely_gain_db: 17, ...fields,
@@ -86,7 +86,7 @@ export const otherNode = (node, fields = {}) => ({
   way_p50_ms: 5, way_p99_ms: 12, ...fields,
 });
 
-/** A UAV of it, which north serves. */
+/** A UAV of the fleet, served by north. */
 export const fleetUav = (id, fields = {}) => ({
   uav: id, served_by: ["north"], handing_to: null, unconfirmed: false,
   offers: [
@@ -95,7 +95,7 @@ export const fleetUav = (id, fields = {}) => ({
   ], ...fields,
 });
 
-/** North and south; nobody serves 10:1. */
+/** North and south; no node serves 10:1. */
 export const fleetAnswer = (fields = {}) => ({
   valid_at: null, node: "north", site: "harbour",
   nodes: [otherNode("north", { is_self: true, state: "here" }), otherNode("south")],
@@ -113,13 +113,13 @@ export class Service {
     this.time = time;
     this.startedAt = time.now;
     this.mode = "answers"; // or "silent", "gone", "frozen"
-    this.asked = []; // {path, at, …}, and what else the request said
+    this.asked = []; // {path, at, …} and other properties of the request
     this.open = []; // paths that are being answered
     this.mostOpen = 0; // requests at the same time for the same thing
     this.uavs = [uav("1:1")];
     this.beams = [beam("1:1")];
     this.status = statusAnswer();
-    this.answers = {}; // what is answered at a path instead: data, or {status, body}
+    this.answers = {}; // response to a path instead: data, or {status, body}
     globalThis.fetch = (path, options) => this.fetch(path, options);
   }
 
@@ -178,7 +178,7 @@ export class Service {
     return { status, ok: status >= 200 && status < 300, json: async () => JSON.parse(text) };
   }
 
-  /** How often a path was asked for since a time. */
+  /** Number of requests for a path since a time. */
   count(path, since = 0) {
     return this.asked.filter((one) => one.path.split("?")[0] === path && one.at >= since).length;
   }

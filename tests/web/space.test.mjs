@@ -20,18 +20,18 @@ async function openSpace(fields = {}) {
 const HIGH = uav("1:1", { north_m: 30, east_m: 40, down_m: -50 });
 const points = ({ path }) => path.filter(({ op }) => op === "move" || op === "line");
 
-test("from above it is the plan; from the side heights are to scale", () => {
+test("from above it equals the plan; from the side heights are to scale", () => {
   const space = Object.assign(new Space(), { bearingDeg: 0, aboveDeg: 90 });
   const [right, down] = space.offset([30, 40, -50], 2);
   near(right, 80);
   near(down, -60);
   space.aboveDeg = 0;
   near(space.offset([30, 40, -50], 2)[1], -100);
-  space.bearingDeg = 90; // who looks east has the south on the right
+  space.bearingDeg = 90; // looking east, south is on the right
   near(space.offset([-30, 0, 0], 1)[0], 30);
 });
 
-test("a drag goes round it, never below the ground, and on the plan it pans", async () => {
+test("a drag orbits the view, never below ground; on the plan it pans", async () => {
   const { plan, space } = await openSpace();
   const before = space.bearingDeg;
   plan.drag(50, 10_000);
@@ -45,7 +45,7 @@ test("a drag goes round it, never below the ground, and on the plan it pans", as
   assert.deepEqual(plan.pan, [5, 6]);
 });
 
-test("a UAV stands over its foot, can be chosen, and has its name", async () => {
+test("a UAV is drawn above its ground point, selectable and labelled", async () => {
   const view = await openSpace({ bearingDeg: 0, aboveDeg: 30 });
   const picture = view.show({ uavs: [HIGH] });
   const { pxPerM } = view.plan;
@@ -59,7 +59,7 @@ test("a UAV stands over its foot, can be chosen, and has its name", async () => 
   assert.equal(view.plan.nearest({ offsetX: hit.x + 3, offsetY: hit.y }), "1:1");
 });
 
-test("a beam is a cone of the likely angle, of the bound where there is none", async () => {
+test("a beam is a cone of the p95 angle, or of the bound without one", async () => {
   const view = await openSpace({ bearingDeg: 0, aboveDeg: 90 });
   const flat = uav("1:1", { north_m: 100, east_m: 0, down_m: 0, horizontal_bound_m: null });
   const halfWidthM = (fields) => {
@@ -72,7 +72,7 @@ test("a beam is a cone of the likely angle, of the bound where there is none", a
   near(halfWidthM({ pointing_p95_deg: null, pointing_bound_deg: 20 }), 100 * Math.tan(Math.PI / 9));
 });
 
-test("what is not true any more is grey, and what is not known does no harm", async () => {
+test("outdated values are grey, and unknown ones cause no error", async () => {
   const view = await openSpace();
   const picture = view.show({ uavs: [HIGH], beams: [beam("1:1", { oldS: 3 })], array: array(),
     uavsLive: false, message: "NOT LIVE – connection lost" });
@@ -90,7 +90,7 @@ test("what is not true any more is grey, and what is not known does no harm", as
   assert.deepEqual(view.plan.hits.map(({ uav: { id } }) => id), ["2:1"]);
 });
 
-test("who is followed is in the middle", async () => {
+test("a followed UAV is centred", async () => {
   const view = await openSpace();
   view.plan.follow("1:1");
   view.show({ uavs: [HIGH] });
@@ -98,13 +98,13 @@ test("who is followed is in the middle", async () => {
   near(view.plan.hits[0].y, CENTRE.y);
 });
 
-test("the hull of points holds them all, and has no other corners", () => {
+test("the convex hull contains all points and has no other corners", () => {
   const corners = [[0, 0], [4, 0], [4, 3], [0, 3]];
   assert.deepEqual(new Set(hull([[2, 1], ...corners, [1, 2], [2, 0]]).map(String)),
     new Set(corners.map(String)));
 });
 
-test("it is loaded when it is asked for, and is light", () => {
+test("the 3D view is loaded on request and is small", () => {
   assert.doesNotMatch(readPage("main.js"), /^import .*space\.js/m);
   assert.match(readPage("main.js"), /await import\("\.\/space\.js"\)/);
   assert.ok(readPage("space.js").length < 20_000);

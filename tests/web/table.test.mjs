@@ -49,7 +49,7 @@ test("every value is in its own column, with its unit", () => {
   });
 });
 
-test("every column has a head of its key, and cells say on which answer they stand", () => {
+test("every column has a header, and cells name their feed", () => {
   const { element, show, rows } = openTable();
   show([uav("1:1")]);
   const heads = element.querySelectorAll("thead th").map((cell) => cell.dataset.key);
@@ -60,7 +60,7 @@ test("every column has a head of its key, and cells say on which answer they sta
   assert.equal(rows()[0].querySelectorAll("[data-feed=uavs]").length, cells.length - 5);
 });
 
-test("what is not known is a dash: without a beam, without a place", () => {
+test("unknown values are dashes: without a beam, without a position", () => {
   const { show, texts } = openTable();
   show([uav("1:1", { north_m: null, speed_mps: null, age_s: null, dt_s: null, latency_s: null })]);
   assert.deepEqual(texts(), {
@@ -69,7 +69,7 @@ test("what is not known is a dash: without a beam, without a place", () => {
   });
 });
 
-test("an age grows while no answer comes, and above two seconds it is warned of", () => {
+test("ages grow without responses, with a warning above two seconds", () => {
   const { show, cell, rows } = openTable();
   show([uav("1:1", { age_s: 0.5 })], { sinceS: 1.5 });
   assert.equal(plain(cell("age").textContent), "2.00 s");
@@ -113,7 +113,7 @@ test("a beam without any guaranteed gain is explained", () => {
   assert.deepEqual([cell("guaranteed").textContent, cell("guaranteed").title], ["–", ""]);
 });
 
-test("a verdict is in the row, with its reason and what to do", () => {
+test("a row shows its verdict, reason and remedy", () => {
   const { show, cell, rows } = openTable();
   show([uav("1:1", weak()), uav("2:1")]);
   assert.deepEqual([cell("verdict").textContent, cell("verdict").title, rows()[0].dataset.verdict],
@@ -130,7 +130,7 @@ test("each UAV has its own beam", () => {
   assert.deepEqual([texts(0).azimuth, texts(1).azimuth], ["+10.0°", "+20.0°"]);
 });
 
-test("rows stay the same elements, in the order that is asked for", () => {
+test("rows stay the same elements in the selected order", () => {
   const { show, rows, ids } = openTable();
   show([uav("2:1"), uav("10:1")]);
   const [two, ten] = rows();
@@ -144,7 +144,7 @@ test("rows stay the same elements, in the order that is asked for", () => {
   assert.deepEqual(ids(), []);
 });
 
-test("a row says its UAV's state, and whether it is the chosen one", () => {
+test("a row shows its UAV's state and whether it is selected", () => {
   const { show, rows } = openTable();
   show([uav("1:1", { state: "lost" }), uav("2:1")], { selected: "2:1" });
   const shown = () => rows().map((row) => [row.dataset.state, row.hasAttribute("data-selected"),
@@ -154,7 +154,7 @@ test("a row says its UAV's state, and whether it is the chosen one", () => {
   assert.deepEqual(shown(), [["live", true, "true"], ["live", false, "false"]]);
 });
 
-test("a click on a name chooses that UAV; a chosen one can be brought into sight", () => {
+test("a click on a name selects that UAV, and a selected row can be scrolled into view", () => {
   const { show, rows, chosen, table } = openTable();
   show([uav("1:1"), uav("2:1")]);
   rows()[1].querySelector(".pick").click();
@@ -164,7 +164,7 @@ test("a click on a name chooses that UAV; a chosen one can be brought into sight
   assert.deepEqual(rows().map(({ isRevealed = false }) => isRevealed), [false, true]);
 });
 
-test("a head sorts up, down, and then the worst stand first again; unknown comes last", () => {
+test("a header sorts ascending, descending, then worst first; unknown values come last", () => {
   const { show, ids, element } = openTable();
   const uavs = [uav("1:1", { speed_mps: 5 }), uav("2:1", { speed_mps: null }),
     uav("3:1", { speed_mps: 1, ...weak() }), uav("10:1", { speed_mps: 9 })];
@@ -183,7 +183,7 @@ test("a head sorts up, down, and then the worst stand first again; unknown comes
   assert.deepEqual(sorted("id"), ["1:1 2:1 3:1 10:1", "ascending"]);
 });
 
-test("many UAVs can be searched, and those that are good left away", () => {
+test("UAVs can be searched, and good ones hidden", () => {
   const { show, ids, browser } = openTable();
   const uavs = ["1:1", "2:1", "3:1", "4:1", "5:1", "6:1"].map((id) => uav(id));
   show(uavs);

@@ -30,7 +30,7 @@ function openBar({ seconds = 30 } = {}) {
   };
 }
 
-test("the button pauses at the newest moment, and goes back to live", () => {
+test("the button pauses at the newest time and returns to live", () => {
   const { browser, bar, agoS, changes } = openBar();
   assert.ok(bar.isLive);
   browser.element("pause").click();
@@ -41,7 +41,7 @@ test("the button pauses at the newest moment, and goes back to live", () => {
   assert.equal(changes(), 2);
 });
 
-test("a paused page stays at its moment while time passes", async () => {
+test("a paused page keeps its time", async () => {
   const { browser, history, bar, agoS } = openBar();
   bar.toggle();
   await browser.time.advance(5000);
@@ -49,7 +49,7 @@ test("a paused page stays at its moment while time passes", async () => {
   assert.equal(agoS(), 5);
 });
 
-test("steps go to the answer before and after, jumps ten seconds, Home to the oldest", () => {
+test("steps go to the adjacent response, jumps by ten seconds, Home to the oldest", () => {
   const { bar, agoS } = openBar();
   bar.step(-1);
   assert.equal(agoS(), 1);
@@ -69,14 +69,14 @@ test("steps go to the answer before and after, jumps ten seconds, Home to the ol
   assert.equal(agoS(), null);
 });
 
-test("the slider shows the moment as many seconds ago as it says", () => {
+test("the slider shows the time that its age states", () => {
   const { browser, agoS } = openBar();
   browser.element("scrub").value = "-12.3";
   browser.element("scrub").dispatch("input");
   assert.equal(agoS(), 13); // the newest moment that is not after that
 });
 
-test("the slider reaches as far back as there is anything, and follows the moment", async () => {
+test("the slider spans the history and follows the displayed time", async () => {
   const { browser, bar, draw } = openBar();
   const scrub = browser.element("scrub");
   draw();
@@ -85,13 +85,13 @@ test("the slider reaches as far back as there is anything, and follows the momen
   await browser.time.advance(1500);
   draw();
   assert.deepEqual([scrub.min, scrub.value], ["-32", "-11.5"]);
-  scrub.pseudo.add("active"); // while it is dragged it is the operator's
+  scrub.pseudo.add("active"); // while dragged, the operator controls it
   scrub.value = "-20";
   draw();
   assert.equal(scrub.value, "-20");
 });
 
-test("the past says that it is past, of when, and for how long", async () => {
+test("the past is labelled with its time and age", async () => {
   const { browser, bar, draw } = openBar();
   const root = browser.document.documentElement;
   draw();
@@ -116,7 +116,7 @@ test("the past says that it is past, of when, and for how long", async () => {
   assert.equal(browser.element("scrub").getAttribute("aria-valuetext"), "live");
 });
 
-test("while nothing has been received there is nothing to look back at", () => {
+test("looking back is disabled before any data", () => {
   const { bar, draw, browser } = openBar({ seconds: -1 });
   bar.toggle();
   bar.step(-1);

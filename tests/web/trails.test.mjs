@@ -21,12 +21,12 @@ function historyOf(...moments) {
   return history;
 }
 
-/** What was drawn of the trail, oldest first: round ends are its mark. */
+/** Segments of the trail, oldest first, recognised by their round ends. */
 const trailIn = (picture) => picture.of("stroke", (one) => one.lineCap === "round"
   && one.strokeStyle === "#27c498" && /^move (line|curve)$/.test(one.path.map(({ op }) => op)
     .join(" ")));
 
-test("a degree is as long as the tables of the ellipsoid say", () => {
+test("a degree has the length given by ellipsoid tables", () => {
   // Length of a degree of latitude and of longitude on WGS84, metres.
   for (const [latDeg, north, east] of [
     [0, 110_574, 111_320], [30, 110_852, 96_486], [45, 111_132, 78_847], [60, 111_412, 55_800],
@@ -37,7 +37,7 @@ test("a degree is as long as the tables of the ellipsoid say", () => {
   }
 });
 
-test("who was farther south and west has its trail below to the left, ending at it", async () => {
+test("a trail from the southwest runs from below left to its UAV", async () => {
   const view = await openPlan();
   const { north, east } = metresPerDegree(LAT + 0.0009);
   const here = { lat_deg: LAT + 0.0009, lon_deg: LON };
@@ -52,7 +52,7 @@ test("who was farther south and west has its trail below to the left, ending at 
   near(from, { x: place.x - 30 * PX_PER_M, y: place.y + 40 * PX_PER_M }, 0.01);
 });
 
-test("a trail is that of its own UAV, up to the moment that is shown", () => {
+test("a trail belongs to its UAV and ends at the displayed time", () => {
   const history = historyOf([1000], [2000], [3000]);
   const at = (moment) => trailOf(uav("1:1"), history, moment).map((point) => point.at);
   assert.deepEqual(at(3000), [1000, 2000, 3000]);
@@ -60,7 +60,7 @@ test("a trail is that of its own UAV, up to the moment that is shown", () => {
   assert.deepEqual(trailOf(uav("2:1"), history, 3000), []);
 });
 
-test("a trail is forgotten after 45 s, reported positions after 12 s", () => {
+test("trails last 45 s, reported positions 12 s", () => {
   const fix = { at: "a", lat_deg: LAT, lon_deg: LON };
   const history = historyOf([0, { fix }], [22_500], [45_000]);
   near(trailOf(uav("1:1"), history, 45_000).map(({ age }) => age), [0.5, 0]);
@@ -70,14 +70,14 @@ test("a trail is forgotten after 45 s, reported positions after 12 s", () => {
   assert.deepEqual(fixesOf(uav("1:1"), history, 12_000), []);
 });
 
-test("a trail goes across the date line, not around the earth", () => {
+test("a trail crosses the date line, not the whole earth", () => {
   const history = historyOf([1000, { lat_deg: 0, lon_deg: 179.9999 }],
     [2000, { lat_deg: 0, lon_deg: -179.9999 }]);
   const now = uav("1:1", { lat_deg: 0, lon_deg: -179.9999, north_m: 0, east_m: 50 });
   near(trailOf(now, history, 2000).map(({ east }) => east), [50 - 22.26, 50], 0.01);
 });
 
-test("a trail bends as it was flown: between two points of a circle it stays on it", async () => {
+test("a trail follows the flown curve between points of a circle", async () => {
   const view = await openPlan();
   const { north, east } = metresPerDegree(LAT);
   const radiusM = 100;
@@ -97,7 +97,7 @@ test("a trail bends as it was flown: between two points of a circle it stays on 
   assert.ok(c1.x > from.x && c2.y < to.y);
 });
 
-test("a trail is thick where reports held it up, thin where it is an estimate", async () => {
+test("a trail is thick where reports support it, thin where predicted", async () => {
   const view = await openPlan();
   for (const [at, state] of [[1000, "live"], [2000, "live"], [3000, "coasting"]]) {
     view.history.add({ at, uavs: [uav("1:1", { state })] });
@@ -115,13 +115,13 @@ test("a trail fades with its age", async () => {
   assert.ok(alphas[0] < alphas[1] && alphas[1] < alphas[2] && alphas[2] < 0.3);
 });
 
-test("no trail is drawn through a hole in what was received", async () => {
+test("no trail is drawn across a gap in the received data", async () => {
   const view = await openPlan();
   for (const at of [1000, 2000, 4501, 5000]) view.history.add({ at, uavs: [uav("1:1")] });
   assert.equal(trailIn(view.show({ uavs: [uav("1:1")], at: 5000 })).length, 2);
 });
 
-test("each report is one cross, where the UAV said that it was", async () => {
+test("each report is one cross at its reported position", async () => {
   const view = await openPlan();
   const { north, east } = metresPerDegree(LAT + 0.0009);
   const fixes = [-20, -10].map((m, i) => ({ // to the southeast
@@ -138,7 +138,7 @@ test("each report is one cross, where the UAV said that it was", async () => {
   assert.ok(crosses[0].globalAlpha < crosses[1].globalAlpha);
 });
 
-test("who has no position on the earth has no trail", async () => {
+test("a UAV without a geodetic position has no trail", async () => {
   const view = await openPlan();
   for (const at of [1000, 2000]) view.history.add({ at, uavs: [uav("1:1")] });
   const picture = view.show({ uavs: [uav("1:1", { lat_deg: null })], at: 2000 });

@@ -16,7 +16,7 @@ const plain = (text) => text.replaceAll("\u00a0", " ");
 
 beforeEach(() => use({ length: "m", speed: "m/s" }));
 
-test("the units are those of the international agreements", () => {
+test("units have their international definitions", () => {
   assert.deepEqual([LENGTHS.ft.metres, LENGTHS.ft.far.metres], [0.3048, 1852]);
   use({ length: "ft", speed: "kn" });
   assert.equal(lengthOf(304.8), 1000);
@@ -27,7 +27,7 @@ test("the units are those of the international agreements", () => {
   assert.deepEqual([units.length, units.speed], [LENGTHS.ft, SPEEDS["km/h"]]);
 });
 
-test("feet, and nautical miles for what is far; knots and kilometres an hour", () => {
+test("feet, nautical miles for long distances, knots and kilometres per hour", () => {
   use({ length: "ft", speed: "kn" });
   const lengths = [[0, "0.0 ft"], [1, "3.3 ft"], [30.46, "99.9 ft"], [304.8, "1000 ft"],
     [-100, "−328 ft"], [3047.8, "9999 ft"], [3048, "1.6 nmi"], [185_200, "100.0 nmi"]];
@@ -40,7 +40,7 @@ test("feet, and nautical miles for what is far; knots and kilometres an hour", (
   }
 });
 
-test("what is exported says its units, and stays empty where it is not known", () => {
+test("exports name their units, and unknown values are empty", () => {
   const view = { stamp: stampAt(0), beams: [beam("1:1", { range_m: 304.8 })],
     uavs: [uav("1:1", { alt_m: 30.48, speed_mps: 10, bound_m: null })] };
   const row = () => {
@@ -56,7 +56,7 @@ test("what is exported says its units, and stays empty where it is not known", (
   assert.equal(row().speed_kmh, "36");
 });
 
-test("rings are round in the units that are used", async () => {
+test("ring distances are round numbers in the selected units", async () => {
   const view = await openPlan();
   const labels = (picture) => picture.texts.filter((text) => / (m|km|ft|nmi)$/.test(text));
   const uavs = [uav("1:1", { north_m: 180, east_m: 0 })];
@@ -64,12 +64,12 @@ test("rings are round in the units that are used", async () => {
   use({ length: "ft" });
   view.plan.changeUnits();
   assert.deepEqual(labels(view.drawAnew()).slice(0, 3), ["200 ft", "400 ft", "600 ft"]);
-  assert.equal(circles(view.drawAnew(), 170).length, 1); // the outermost ring is where it was
+  assert.equal(circles(view.drawAnew(), 170).length, 1); // the outermost ring has not moved
   uavs[0].north_m = 30_000;
   assert.match(labels(view.show({ uavs }, 20_000))[0], /^\d+ nmi$/);
 });
 
-test("the choice holds for the whole page, and for the next one", async () => {
+test("selected units apply to the whole page and are stored", async () => {
   const page = await openPage();
   const [length, speed] = [page.element("unit-length"), page.element("unit-speed")];
   assert.deepEqual([length.value, speed.value], ["m", "m/s"]);
@@ -91,7 +91,7 @@ test("the choice holds for the whole page, and for the next one", async () => {
   assert.deepEqual([next.element("unit-length").value, units.speed.name], ["ft", "kn"]);
 });
 
-test("what a browser remembers wrongly, or not at all, is metres", () => {
+test("invalid or missing stored units default to metres", () => {
   for (const kept of ["{", "null", '{"length":"ell"}']) {
     const storage = { getItem: () => kept, setItem: () => {} };
     openBrowser({ storage });

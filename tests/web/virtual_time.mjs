@@ -10,7 +10,7 @@ export class VirtualTime {
     this.now = 1000;
     this.timers = new Map();
     this.made = 0;
-    this.waits = []; // every delay that setTimeout was asked for
+    this.waits = []; // every delay passed to setTimeout
   }
 
   add(callback, delayMs, { everyMs = null, isFrame = false } = {}) {
@@ -19,7 +19,7 @@ export class VirtualTime {
     return this.made;
   }
 
-  /** Put itself in the place of the browser's. */
+  /** Replace the browser's timers. */
   install() {
     globalThis.performance = { now: () => this.now };
     globalThis.setTimeout = (callback, delayMs = 0) => {
@@ -40,7 +40,7 @@ export class VirtualTime {
     timer.callback(this.now);
   }
 
-  /** Let the time pass; what is due happens in its order, promises included. */
+  /** Advance time; due callbacks run in order, promises included. */
   async advance(ms) {
     const end = this.now + ms;
     await turn();
@@ -55,7 +55,7 @@ export class VirtualTime {
     this.now = end;
   }
 
-  /** Draw what waits to be drawn, without letting time pass; the number of frames. */
+  /** Run pending animation frames without advancing time; returns their number. */
   paint(atMost = 1000) {
     for (let frames = 0; frames < atMost; frames += 1) {
       const due = [...this.timers].find(([, timer]) => timer.isFrame);

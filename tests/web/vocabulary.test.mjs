@@ -21,7 +21,7 @@ test("every state of a UAV has its mark in the table and in the legend", () => {
   }
 });
 
-test("every verdict has its mark in the table and its colour, and no other", async () => {
+test("every verdict has exactly one mark and colour in the table", async () => {
   const { LEVELS, LEVEL_OF, MARKS } = await load("health.js");
   const style = readPage("style.css");
   for (const list of [LEVELS, Object.keys(LEVEL_OF), Object.keys(MARKS)]) {
@@ -33,18 +33,18 @@ test("every verdict has its mark in the table and its colour, and no other", asy
   }
 });
 
-test("no sign of a state is one of a verdict", () => {
+test("signs of states and verdicts are distinct", () => {
   const style = readPage("style.css");
   const signs = (what) => [...style.matchAll(
     new RegExp(`tr\\[data-${what}="\\w+"\\] td\\[data-key="\\w+"\\]::before { content: "(.)"`, "g"),
   )].map((found) => found[1]);
   const [states, verdicts] = [signs("state"), signs("verdict")];
   assert.deepEqual([states.length, verdicts.length], [4, 3]);
-  // A cross is the same in both: there is nothing.
+  // A cross is shared by both: it means nothing is there.
   assert.deepEqual(states.filter((sign) => verdicts.includes(sign)), ["✕"]);
 });
 
-test("every severity of an event has its mark, and no other", async () => {
+test("every event severity has exactly one mark", async () => {
   const { SEVERITY_LEVEL } = await load("lists.js");
   assert.deepEqual(Object.keys(SEVERITY_LEVEL).sort(), wordsOf("Severity"));
 });

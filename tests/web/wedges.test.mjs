@@ -20,7 +20,7 @@ async function wedgesOf(beams, { array: fields = {}, ...scene } = {}) {
 for (const [name, bearing, x, y] of [
   ["north", 0, 0, -1], ["east", 90, 1, 0], ["south", 180, 0, 1], ["west", 270, -1, 0],
 ]) {
-  test(`a beam to the ${name} is a wedge that points there, a thread in its middle`, async () => {
+  test(`a beam to the ${name} is a wedge that points there, with a centre line`, async () => {
     const view = await openPlan();
     const picture = view.show({ beams: [beam("1:1", { bearing_deg: bearing })], array: array() });
     const [wedge] = wedges(picture);
@@ -55,7 +55,7 @@ test("a line's beam widens as it is steered off boresight, a panel's does not", 
   near((await wedgesOf([endfire]))[0].widthDeg, 60);
 });
 
-test("a widened beam is as wide as what is known of its target, up to 120°", async () => {
+test("a widened beam is as wide as its target's uncertainty, up to 120°", async () => {
   const width = async (fields) => (await wedgesOf([beam("1:1", fields)]))[0].widthDeg;
   near(await width({ widened: true, pointing_bound_deg: 20 }), 40);
   near(await width({ widened: true, pointing_bound_deg: 2 }), 10);
@@ -64,12 +64,12 @@ test("a widened beam is as wide as what is known of its target, up to 120°", as
   near(await width({ widened: false, pointing_bound_deg: 20 }), 10);
 });
 
-test("a beam whose width is not known is a thread alone", async () => {
+test("a beam of unknown width is a centre line only", async () => {
   const [wedge] = await wedgesOf([beam("1:1")], { array: { half_power_beamwidth_deg: null } });
   near(wedge.widthDeg, 0);
 });
 
-test("a beam goes on beyond its target, and fades from there", async () => {
+test("a beam extends beyond its target and fades from there", async () => {
   const [wedge] = await wedgesOf([beam("1:1")]);
   assert.equal(wedge.reachPx, Math.max(OUTER_PX, (100 * OUTER_PX) / 150 + 60));
   const { stops, radius } = wedge.fillStyle;
@@ -79,13 +79,13 @@ test("a beam goes on beyond its target, and fades from there", async () => {
   assert.ok(opacities[0] > opacities[1] && opacities[1] > opacities[2] && opacities[2] === 0);
 });
 
-test("where its UAV is not placed a beam fades from its range in the plane", async () => {
+test("a beam without a placed UAV fades from its horizontal range", async () => {
   const far = beam("9:9", { range_m: 200, elevation_deg: 60 }); // 100 m in the plane
   const [wedge] = await wedgesOf([far]);
   near(wedge.fillStyle.stops[1][0] * wedge.reachPx, (100 * OUTER_PX) / 150, 1e-6);
 });
 
-test("a beam without a bearing is not drawn, nor is any without an array", async () => {
+test("beams without a bearing or without an array are not drawn", async () => {
   assert.deepEqual(await wedgesOf([beam("1:1", { bearing_deg: null })]), []);
   assert.deepEqual(await wedgesOf([beam("1:1")], { array: {} }).then((list) => list.length), 1);
   const view = await openPlan();
@@ -114,7 +114,7 @@ test("every colour that gets an opacity is written #rrggbb in both themes", () =
   }
 });
 
-test("many wide beams together are no stronger than one", async () => {
+test("many wide beams together are no more opaque than one", async () => {
   const view = await openPlan();
   const opacity = (number, width) => {
     const ids = Array.from({ length: number }, (_, i) => `${i + 1}:1`);

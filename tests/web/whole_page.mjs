@@ -7,7 +7,7 @@ import { Service, beam, uav } from "./service.mjs";
 export const BEAT_MS = 850;
 let opened = 0;
 
-/** The page once everything has answered; UAVs are of the given ids, each with a beam. */
+/** The page after the first responses; UAVs have the given ids and a beam each. */
 export async function openPage({ ids = ["1:1", "2:1"], mode = "answers", answers = {} } = {}) {
   const browser = openBrowser();
   const { time, document } = browser;
@@ -32,7 +32,7 @@ export async function openPage({ ids = ["1:1", "2:1"], mode = "answers", answers
     /** The names of the feeds that the page marks as `late` or `lost`. */
     marked: (how) => [...document.documentElement.attributes.keys()]
       .map((name) => new RegExp(`^data-(\\w+)-${how}$`).exec(name)?.[1]).filter(Boolean).sort(),
-    /** The plan view as it is drawn now. */
+    /** The plan view as currently drawn. */
     async drawn() {
       await time.advance(200);
       const picture = browser.element("plan").getContext();
@@ -44,7 +44,7 @@ export async function openPage({ ids = ["1:1", "2:1"], mode = "answers", answers
   };
 }
 
-/** An azimuth for each second: a paused page is told from one that moves. */
+/** An azimuth per second, which distinguishes a paused page from a live one. */
 export function turnBeams(service) {
   const { answer } = service;
   service.answer = (path) => {

@@ -163,7 +163,8 @@ def traffic(words: list[str], where: Path, start_node: Started) -> None:
 
 
 def compose(words: list[str], where: Path, start_node: Started) -> None:
-    """Check that the named services and profiles exist, and validate the file if compose is installed."""
+    """Check that the named services and profiles exist, and validate the file if compose is
+    installed."""
     known = yaml.safe_load((ROOT / "docker-compose.yml").read_text(encoding="utf-8"))["services"]
     rest = words[2:]
     if rest[0] == "--profile":

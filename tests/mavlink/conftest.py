@@ -1,4 +1,4 @@
-"""pymavlink's generated dialect as the oracle, and the recordings to hold against it."""
+"""pymavlink's generated dialect as the oracle, and recordings to compare with it."""
 
 import re
 from collections.abc import Callable
@@ -14,19 +14,19 @@ _magics = re.compile(b"[\xfd\xfe]").finditer
 
 @pytest.fixture(scope="session")
 def cut_log() -> bytes:
-    """25 s of five vehicles in flight: what ``tests/data/make_cut.py`` made."""
+    """Return 25 s of five flying vehicles, made by ``tests/data/make_cut.py``."""
     return CUT.read_bytes()
 
 
 @pytest.fixture(scope="session")
 def cut_frames(cut_log: bytes, scan: Callable[[bytes], list[bytes]]) -> list[bytes]:
-    """The frames of the cut, without their stamps."""
+    """Return the frames of the cut, without their stamps."""
     return scan(cut_log)
 
 
 @pytest.fixture(scope="session")
 def shared_log() -> Callable[[str], bytes]:
-    """``shared_log(name)``: a log of other programs; skips where it is missing."""
+    """Return ``shared_log(name)``: a log of other programs; skips if it is missing."""
 
     def read(name: str) -> bytes:
         path = SHARED / name
@@ -39,10 +39,10 @@ def shared_log() -> Callable[[str], bytes]:
 
 @pytest.fixture(scope="session")
 def scan() -> Callable[[bytes], list[bytes]]:
-    """``scan(data)``: the frames that pymavlink decodes, searched from left to right.
+    """Return ``scan(data)``: the frames that pymavlink decodes, scanned from left to right.
 
-    A frame is tried at every magic byte that no frame before it has taken. pymavlink hands on
-    unknown ids without checking them; those are left out.
+    A frame is tried at every magic byte outside previous frames. pymavlink passes on unknown ids
+    without checking them; those are left out.
     """
     mav = dialect.MAVLink(None)
 

@@ -69,7 +69,7 @@ test("values not received are dashes: no battery of 0", async () => {
   assert.deepEqual([Mode, Battery, Clock, Assumed], ["–", "–", "–", "–"]);
 });
 
-test("Escape closes the drawer, then clears the selection; then no messages are requested", async () => {
+test("Escape closes the drawer and ends its requests, then clears the selection", async () => {
   const page = await openPage();
   await openDrawer(page);
   page.press("Escape");

@@ -89,7 +89,7 @@ test("the alarm is off by default, stays until acknowledged, and is stored", asy
   assert.deepEqual([bar.hidden, page.text("alarm")], [true, "Alarm off"]);
 });
 
-test("the alarm sounds every two seconds until acknowledged; a bad start is no change", async () => {
+test("the alarm sounds every two seconds until acknowledged; a bad start does not count", async () => {
   const page = await openPage();
   let tones = 0;
   const node = { connect: () => {}, frequency: {}, start: () => { tones += 1; }, stop: () => {} };

@@ -35,7 +35,7 @@ test("late responses mark the values that depend on them", async () => {
 });
 
 for (const mode of ["silent", "gone"]) {
-  test(`a service that is ${mode} strikes out everything within four seconds, and recovers`, async () => {
+  test(`a service that is ${mode} strikes out all within four seconds, and recovers`, async () => {
     const page = await openPage();
     page.service.mode = mode;
     await page.time.advance(4000);

@@ -1,4 +1,4 @@
-"""Late frames, reboots, leaps and the wrap: which line a stamp lies on."""
+"""Late frames, reboots, jumps and the wrap: assignment of a stamp to an epoch."""
 
 from itertools import pairwise
 
@@ -43,7 +43,7 @@ def test_a_late_frame_is_no_reboot(back_ms: int) -> None:
 
 
 def test_a_link_that_lags_by_seconds_is_no_reboot() -> None:
-    """Beside a fast one, or alone: the sender's first seconds are over."""
+    """Beside a fast link or alone, after the sender's first seconds."""
     fast, slow = run(0, 300_000, 100), run(4_001, 300_001, 100)
     assert not reboots(observe_all(sorted([*fast, *slow])))
     assert None not in observe_all(sorted([*fast, *slow]))
@@ -53,7 +53,8 @@ def test_a_link_that_lags_by_seconds_is_no_reboot() -> None:
 @pytest.mark.parametrize("ahead_ms", [1_100, 4_900])
 @pytest.mark.parametrize("again_ms", [0, 10, 1_000])
 def test_stamps_from_the_future_do_not_move_the_clock(ahead_ms: int, again_ms: int) -> None:
-    """A single forged one, two of a moment, and one a second: the vehicle's own go on as before."""
+    """One forged stamp, two at one time, or one per second: the vehicle's own stamps are
+    unaffected."""
     honest = run(0, 300_000, 50)
     times = [10_050] if not again_ms else [10_050 + n * again_ms for n in range(2)]
     forged = [(at, 300_000 + at + ahead_ms) for at in times]
@@ -70,13 +71,13 @@ def test_stamps_from_the_future_do_not_move_the_clock(ahead_ms: int, again_ms: i
 
 
 def test_a_link_that_was_late_is_followed_when_it_is_not() -> None:
-    """All of half a minute came 3 s late: half a second later the clock knows."""
+    """All frames of half a minute were 3 s late; the clock follows after half a second."""
     late, prompt = run(3_000, 300_000, 150), run(33_000, 333_000, 20)
     stamps = observe_all([*late, *prompt])
     assert [n for n, stamp in enumerate(stamps) if stamp is None] == [150, 151, 152]
     assert not reboots(stamps)
     latencies = [stamp.latency_s for stamp in stamps[153:] if stamp is not None]
-    assert max(latencies) < 0.31  # a tenth of what was seen is taken for what is not
+    assert max(latencies) < 0.31  # a tenth of the visible latency is assumed as invisible
 
 
 @pytest.mark.parametrize("boot_ms", [0, 12_000])
@@ -84,18 +85,18 @@ def test_a_link_that_was_late_is_followed_when_it_is_not() -> None:
 def test_a_reboot_is_one_event_and_begins_anew(back_ms: int, boot_ms: int) -> None:
     before = run(0, boot_ms + back_ms - 9_800, 50)
     stamps = observe_all([*before, *run(10_000, boot_ms, 100)])
-    assert reboots(stamps) == [53]  # half a second after its first stamp
+    assert reboots(stamps) == [53]  # half a second after the first stamp
     assert [n for n, stamp in enumerate(stamps) if stamp is None] == [50, 51, 52]
     for n, stamp in enumerate(stamps[53:], start=3):
         assert stamp is not None
         assert stamp.sender_ns == (boot_ms + n * 200) * MS
-        assert stamp.latency_s == 0.0  # nothing is left of the old offset
+        assert stamp.latency_s == 0.0  # the old offset is gone
 
 
 @pytest.mark.parametrize("uptime_ms", [4_000, 9_000])
 @pytest.mark.parametrize("late_ms", [0, 400])
 def test_a_reboot_shortly_after_a_boot(uptime_ms: int, late_ms: int) -> None:
-    """It steps back by no more than a late frame, and does not catch up."""
+    """It steps back by no more than a late frame would, and does not catch up."""
     again = [(t + (late_ms if n % 2 else 0), b) for n, (t, b) in enumerate(run(0, 500, 40, 250))]
     seen = run(0, 0, uptime_ms // 100, 100) + [(uptime_ms + 500 + t, b) for t, b in again]
     stamps = observe_all(seen)
@@ -107,7 +108,7 @@ def test_a_reboot_shortly_after_a_boot(uptime_ms: int, late_ms: int) -> None:
 
 @pytest.mark.parametrize(("late_ms", "placed"), [(9_900, True), (10_100, False), (60_000, False)])
 def test_no_frame_is_later_than_ten_seconds(late_ms: int, placed: bool) -> None:
-    """A single stamp that lags by more is of another clock, and has no time."""
+    """A single stamp that lags by more belongs to another clock and has no time."""
     *_, late, after = observe_all(
         [*run(0, 300_000, 100), (19_810, 319_810 - late_ms), (20_000, 320_000)]
     )
@@ -117,7 +118,7 @@ def test_no_frame_is_later_than_ten_seconds(late_ms: int, placed: bool) -> None:
 
 
 def test_a_queue_that_is_flushed_in_the_first_seconds_is_no_reboot() -> None:
-    """Late frames in a burst catch up with the line."""
+    """Late frames in a burst catch up with the current stamps."""
     queued = [(8_000 + n * 10, 3_000 + n * 100) for n in range(45)]
     stamps = observe_all([*run(0, 0, 80, 100), *queued, *run(8_500, 8_500, 20, 100)])
     assert not reboots(stamps)
@@ -125,7 +126,7 @@ def test_a_queue_that_is_flushed_in_the_first_seconds_is_no_reboot() -> None:
 
 
 def test_stragglers_of_the_boot_before_have_no_time() -> None:
-    """Single or in a burst, up to seconds after the reboot; the new boot goes on."""
+    """Single or in a burst, up to seconds after the reboot; the new boot continues."""
     again = run(10_000, 1_000, 100)
     late = [(13_105, 108_000), *((14_110 + n, 108_500 + n * 100) for n in range(10))]
     seen = sorted([*run(0, 100_000, 50), *again, *late])
@@ -137,7 +138,7 @@ def test_stragglers_of_the_boot_before_have_no_time() -> None:
 
 
 def test_a_leap_soon_after_a_reboot_is_none_of_the_boot_before() -> None:
-    """Ahead of all that either boot has sent: three stamps later it is the line."""
+    """Ahead of every stamp of either boot: accepted after three stamps."""
     seen = [*run(0, 100_000, 50), *run(10_000, 1_000, 20), *run(14_000, 500_000, 20)]
     stamps = observe_all(seen)
     assert len(reboots(stamps)) == 1
@@ -146,7 +147,7 @@ def test_a_leap_soon_after_a_reboot_is_none_of_the_boot_before() -> None:
 
 
 def test_a_stray_stamp_changes_nothing() -> None:
-    """One message of the sender with another clock in it, ahead or behind, again and again."""
+    """One message of the sender carries another clock, ahead or behind, repeatedly."""
     steady = run(0, 100_000, 200, 100)
     for boot in (7, 660_000, 4_000_000_000):
         strays = [(150 + n * 1_000, boot) for n in range(18)]
@@ -186,7 +187,7 @@ def test_the_wrap_is_neither_a_reboot_nor_a_leap() -> None:
 
 
 def test_a_link_that_lags_by_seconds_is_no_reboot_after_the_wrap() -> None:
-    """The stamps are those of the first seconds of a boot, but the boot was 49.7 days ago."""
+    """The stamps equal those shortly after boot, but the boot was 49.7 days ago."""
     fast = [(at, boot % WRAP_MS) for at, boot in run(0, WRAP_MS - 10_000, 75)]
     slow = [(at, boot % WRAP_MS) for at, boot in run(4_001, WRAP_MS - 9_999, 100)]
     stamps = observe_all(sorted([*fast, *slow]))
@@ -220,7 +221,7 @@ def test_a_reboot_after_any_uptime(uptime_ms: int, wrapped: bool) -> None:
     )
 )
 def test_whatever_comes(steps: Seen) -> None:
-    """Leaps, reboots, wraps and nonsense: never later than the arrival."""
+    """Jumps, reboots, wraps and invalid stamps: never later than the arrival."""
     clock, arrival_ns = SenderClock(), EPOCH_NS
     for gap_ms, boot_ms in steps:
         arrival_ns += gap_ms * MS
@@ -232,7 +233,7 @@ def test_whatever_comes(steps: Seen) -> None:
 
 
 def shared_at(seen: Seen) -> list[int]:
-    """The arrivals, ms, at which two clocks are known to run."""
+    """Return the arrivals, in ms, at which two clocks are detected."""
     clock, found = SenderClock(), []
     for arrival, boot in seen:
         clock.observe(EPOCH_NS + arrival * MS, boot)
@@ -256,7 +257,7 @@ def test_once_the_second_is_silent_the_first_is_believed_again() -> None:
 
 
 def test_what_one_sender_alone_does_is_never_taken_for_two() -> None:
-    """Reboots, late frames, another link that lags, a leap, bursts."""
+    """Reboots, late frames, another lagging link, a jump, bursts."""
     alone = run(0, 300_000, 100)
     late = [(12_000 + n, 310_000 - 180 * n) for n in range(20)]
     assert not shared_at([*alone, *run(20_000, 1_000, 100)])
@@ -264,6 +265,6 @@ def test_what_one_sender_alone_does_is_never_taken_for_two() -> None:
     assert not shared_at(sorted([*alone, *run(4_001, 300_001, 100)]))
     assert not shared_at([*alone, *run(20_000, 900_000, 100)])
     assert not shared_at([(10_000 * (n // 50 + 1), 300_000 + 200 * n) for n in range(300)])
-    # What a slow link still brings of the boot before, beside the fast one.
+    # Frames of the previous boot that a slow link still delivers beside the fast one.
     again, left = run(10_000, 1_000, 100), run(12_050, 105_000, 30)
     assert not shared_at(sorted([*run(0, 100_000, 50), *again, *left]))

@@ -1,8 +1,8 @@
-"""The interval of a sender's offset against links and clocks that mean harm.
+"""The interval of a sender's clock offset under adversarial links and clocks.
 
-Every case says what the clock and the link do; the truth must lie in the interval at every moment,
-within what is declared: a drift of 250 ppm, and a least latency that is no longer than the median
-of its visible part (or 25 ms).
+Every case gives the behaviour of clock and link. The truth must always lie in the interval,
+within the declared limits: a drift of 250 ppm, and a least latency no longer than the median of
+its visible part (or 25 ms).
 """
 
 import math
@@ -26,7 +26,7 @@ S = 1_000_000_000
 EPOCH_NS = 1_700_000_000 * S
 BOOT_S = 7_000.0
 Latency = Callable[[float, random.Random], float]
-"""Latency in seconds of what is sent a time after the epoch."""
+"""Latency in seconds of a frame sent a time after the epoch."""
 
 
 def answers(
@@ -38,10 +38,10 @@ def answers(
     trips_s: float | None = None,
     seed: int = 0,
 ) -> list[tuple[float, float, ClockEstimate, ClockChange | None]]:
-    """When, by how much the estimate is off (s), the estimate, and the change that was told.
+    """Return time, estimate error (s), estimate, and reported change.
 
-    ``moved`` is by how much the sender's clock has fallen behind; ``trips_s`` the time between
-    round trips, whose ways both take the link's latency.
+    ``moved`` is the lag that the sender's clock has accumulated; ``trips_s`` the time between
+    round trips, whose ways both have the link's latency.
     """
     rng = random.Random(seed)
     made: list[tuple[float, float, float | None]] = []
@@ -106,7 +106,7 @@ def test_no_link_leads_the_interval_away(name: str, rate_hz: float) -> None:
 
 def test_there_is_no_cliff_where_the_last_fast_frame_leaves_the_window() -> None:
     found = answers(LINKS["the last fast frame long ago"], seconds=200)
-    doubts = [one.uncertainty_s for at, _, one, _ in found if at > 30]  # the late are followed
+    doubts = [one.uncertainty_s for at, _, one, _ in found if at > 30]  # late frames are followed
     assert min(doubts) > 0.45
     assert max(abs(b - a) for a, b in pairwise(doubts)) < 0.05
 
@@ -122,9 +122,9 @@ def test_there_is_no_cliff_where_the_last_fast_frame_leaves_the_window() -> None
 def test_no_latency_that_follows_another_leads_the_interval_away(
     spells: list[tuple[float, float, float]], drift: float, rate_hz: float, seed: int
 ) -> None:
-    """Spells of some latency and some jitter, in any order, on any clock within its drift.
+    """Periods of varying latency and jitter, in any order, on any clock within its drift.
 
-    Each tenth frame is quick, so that the least latency is no secret: the assumption holds.
+    Every tenth frame is fast, so that the assumption on the least latency holds.
     """
     ends = np.cumsum([length for length, _, _ in spells])
 
@@ -142,7 +142,7 @@ def test_no_latency_that_follows_another_leads_the_interval_away(
     "batch", [4, 7, *(pytest.param(n, marks=pytest.mark.full) for n in (8, 13)), 16]
 )
 def test_a_link_that_sends_in_batches_hides_no_latency_behind_their_rhythm(batch: int) -> None:
-    """The median of what is seen is half a batch; of each n-th frame it may be none of it."""
+    """The median of the visible latency is half a batch; every n-th frame may have none of it."""
     for phase in range(0, batch, rounds(1 + batch // 5, 1)):
 
         def latency(t: float, _rng: random.Random, phase: int = phase) -> float:
@@ -158,7 +158,9 @@ def test_a_link_that_sends_in_batches_hides_no_latency_behind_their_rhythm(batch
 @pytest.mark.parametrize("rate_hz", [10.0, 50.0])
 @pytest.mark.parametrize("stood_s", [0.13, 0.18, 1.5])
 def test_a_clock_that_stood_still_is_told_within_a_second(rate_hz: float, stood_s: float) -> None:
-    """Three frames show it; the interval holds what it was before, too: it may be the link."""
+    """Three frames reveal it; the interval keeps the old offset too, as the link may be the
+    cause.
+    """
     found = answers(
         jitter(0.003, 0.007),
         seconds=30 + 20 * stood_s,
@@ -177,7 +179,7 @@ def test_a_clock_that_stood_still_is_told_within_a_second(rate_hz: float, stood_
 
 @pytest.mark.parametrize("slower_s", [0.1, 0.3, 1.0])
 def test_a_link_that_is_slow_for_a_while_is_not_followed(slower_s: float) -> None:
-    """It is told as a change that may be, and the most likely offset stays."""
+    """It is reported as a possible change, and the most likely offset stays."""
     lasts_s = 0.6 * min(FOLLOWED * slower_s, FOLLOWED_NS / S)
 
     def latency(t: float, rng: random.Random) -> float:
@@ -189,7 +191,7 @@ def test_a_link_that_is_slow_for_a_while_is_not_followed(slower_s: float) -> Non
 
 
 def test_after_a_quick_spell_the_line_is_where_it_was() -> None:
-    """Frames that were put down before they can have come are an exception, not the rule."""
+    """Frames placed before their possible arrival are rare exceptions."""
 
     def latency(t: float, rng: random.Random) -> float:
         return rng.uniform(0.303, 0.307) - 0.25 * (round(20 * t) in (500, 501, 900))
@@ -210,11 +212,11 @@ def test_a_steady_link_tells_of_no_change() -> None:
         assert not any(change for *_, change in found)
 
 
-# --- with round trips ---------------------------------------------------------------------------
+# --- round trips --------------------------------------------------------------------------------
 
 
 def slow(t: float) -> float:
-    """5000 ppm slow for 5 s, twice, and as much quick in between."""
+    """5000 ppm slow for 5 s, twice, and equally fast in between."""
     return 0.005 * (min(5.0, max(0.0, t - 30)) - min(5.0, max(0.0, t - 50)))
 
 
@@ -229,7 +231,7 @@ def test_a_clock_that_runs_slow_for_seconds_is_followed_by_round_trips(trips_s: 
         found = answers(busy, seconds=90, rate_hz=50, moved=slow, trips_s=trips_s, seed=seed)
         late = [(off, one) for at, off, one, _ in found if at > 2 * trips_s]
         assert np.percentile([one.uncertainty_s for _, one in late], 99) < 0.05
-        # Between two trips the clock may run further than is known of it.
+        # Between two round trips the clock may drift beyond the known interval.
         assert max(outside_s(off, one) for off, one in late) <= 0.01
 
 
@@ -242,7 +244,7 @@ def test_poor_trips_do_not_beat_good_stamps() -> None:
     assert poor[-1][2].uncertainty_s < 0.05
 
 
-# --- the floor itself ---------------------------------------------------------------------------
+# --- floor --------------------------------------------------------------------------------------
 
 
 @settings(max_examples=examples(200))
@@ -253,7 +255,7 @@ def test_poor_trips_do_not_beat_good_stamps() -> None:
 def test_the_sure_side_is_above_the_offset_and_below_every_stamp(
     steps: list[tuple[int, int]], drift: float
 ) -> None:
-    """Whatever comes, for whatever latency: the truth is under it, and no stamp is, aged."""
+    """For any latency the truth is below the bound, and no aged stamp is."""
     floor, x_ns = Floor(60 * S, 250e-6), 10 * S
     for step_ns, latency_ns in steps:
         x_ns += step_ns

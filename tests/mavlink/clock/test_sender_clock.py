@@ -1,4 +1,6 @@
-"""A sender's clock on the node's timeline: against the truth, a peer, and real logs."""
+"""A sender's clock on the node timeline, against the truth, another implementation, and real
+logs.
+"""
 
 import math
 import random
@@ -28,14 +30,14 @@ MS = 1_000_000
 S = 1_000_000_000
 EPOCH_NS = 1_700_000_000 * S
 BOOT_NS = 7_000 * S
-"""The sender's clock at ``EPOCH_NS`` in the simulations below."""
+"""Sender clock at ``EPOCH_NS`` in the simulations below."""
 
 
 # --- simulated links ----------------------------------------------------------------------------
 
 
 def sent(drift: float, true_ns: int) -> int:
-    """The sender's clock, ns, ``true_ns`` after the epoch; its offset grows by ``drift`` of it."""
+    """Return the sender clock in ns, ``true_ns`` after the epoch, with that drift."""
     return BOOT_NS + round(true_ns / (1.0 + drift))
 
 
@@ -46,8 +48,8 @@ def truth(drift: float, sender_ns: int) -> float:
 def link(
     seed: int, drift: float, *, rate_hz: float, median_s: float, spread: float, seconds: int
 ) -> list[tuple[int, int]]:
-    """(arrival ns, boot ms) in order of arrival: lognormal latencies, none over 6 s,
-    and a tenth of it lost."""
+    """Return (arrival ns, boot ms) in order of arrival: lognormal latencies up to 6 s, a tenth
+    lost."""
     rng, out = random.Random(seed), []
     for n in range(int(seconds * rate_hz)):
         if rng.random() < 0.1:
@@ -59,7 +61,7 @@ def link(
 
 
 def radio(seed: int, drift: float, seconds: int = 300) -> list[tuple[int, int]]:
-    """Median .6 s, 95th percentile 2.2 s, 1.2 Hz."""
+    """Median 0.6 s, 95th percentile 2.2 s, 1.2 Hz."""
     return link(seed, drift, rate_hz=1.2, median_s=0.6, spread=0.79, seconds=seconds)
 
 
@@ -82,10 +84,10 @@ def known(clock: SenderClock) -> ClockEstimate:
 
 
 class JitterCorrection:
-    """The peer: what ArduPilot's AP_RTC/JitterCorrection does, of its behaviour as described there.
+    """Reference: ArduPilot's AP_RTC/JitterCorrection, by its documented behaviour.
 
-    The least (arrival - boot) is the offset; a frame that would be later than half a second is
-    taken to be just that late; every hundred frames the least of them is taken anew.
+    The least (arrival - boot) is the offset. A frame that would be later than half a second is
+    taken to be exactly that late. Every hundred frames their least value replaces the offset.
     """
 
     lag_ns = 500 * MS
@@ -113,7 +115,7 @@ Link = Callable[[int, float], list[tuple[int, int]]]
 
 
 def errors_s(seen: list[tuple[int, int]], drift: float) -> tuple[list[float], list[float]]:
-    """Of ours and of the peer, at each stamp on its arrival."""
+    """Return the errors of this clock and of the reference, at each stamp on its arrival."""
     clock, peer = SenderClock(), JitterCorrection()
     ours, theirs = [], []
     for arrival_ns, boot_ms in seen:
@@ -132,10 +134,10 @@ def rms(values: list[float], around: float = 0.0) -> float:
 @pytest.mark.parametrize("drift", [0.0, 1e-4, -1e-4])
 @pytest.mark.parametrize(("sky", "best_s"), [(radio, 0.2), (wifi, 0.010)])
 def test_at_least_as_good_as_the_peer(sky: Link, best_s: float, drift: float) -> None:
-    """In error, and in its variation about the constant part that nobody can see."""
+    """In error, and in its variation around the unobservable constant part."""
     runs = [errors_s(sky(seed, drift), drift) for seed in range(rounds(3, 6))]
     ours, theirs = [e for run, _ in runs for e in run], [e for _, run in runs for e in run]
-    # To a millisecond: where it lags behind a drift, the peer's error happens to be against the
+    # To a millisecond: where the reference lags behind a drift, its error happens to offset the
     # constant part and hides some of it.
     assert rms(ours) <= rms(theirs) + 1e-3
     assert rms(ours) <= best_s
@@ -146,7 +148,7 @@ def test_at_least_as_good_as_the_peer(sky: Link, best_s: float, drift: float) ->
 @pytest.mark.parametrize("drift", [0.0, 1e-4, 2.4e-4, -2.4e-4])
 @pytest.mark.parametrize("sky", [radio, pytest.param(wifi, marks=pytest.mark.full)])
 def test_the_uncertainty_holds(sky: Link, drift: float) -> None:
-    """At every moment, within the drift assumed; later it is no more than the link's own scale."""
+    """At every time, within the assumed drift; later it shrinks to the link's own scale."""
     for seed in range(rounds(4, 12)):
         clock = SenderClock()
         for arrival_ns, boot_ms in sky(seed + 10, drift):
@@ -154,14 +156,14 @@ def test_the_uncertainty_holds(sky: Link, drift: float) -> None:
             assert stamp is not None
             estimate = known(clock)
             off_s = (clock.node_ns(stamp.sender_ns) - truth(drift, stamp.sender_ns)) / S
-            if stamp.latency_s == estimate.latency_s:  # it is the newest
+            if stamp.latency_s == estimate.latency_s:  # the newest one
                 assert abs(off_s) <= estimate.uncertainty_s
         assert known(clock).uncertainty_s < (1.5 if sky is radio else 0.08)
 
 
 @pytest.mark.parametrize("drift", [0.0246, pytest.param(-0.0234, marks=pytest.mark.full)])
 def test_a_steady_drift_beyond_the_greatest_is_followed_after_a_minute(drift: float) -> None:
-    """And believed as soon as no queue can be what makes the frames come later and later."""
+    """And trusted as soon as no queue can explain the growing delay."""
     clock = SenderClock()
     for arrival_ns, boot_ms in wifi(1, drift):
         stamp = clock.observe(arrival_ns, boot_ms)
@@ -178,7 +180,7 @@ def test_a_steady_drift_beyond_the_greatest_is_followed_after_a_minute(drift: fl
 @pytest.mark.parametrize("stays", [False, True])
 @pytest.mark.parametrize("rate", [0.003, 0.03])
 def test_a_queue_that_fills_for_a_minute_is_no_drift(rate: float, stays: bool) -> None:
-    """It looks like one: both are allowed for, whether it empties at once or stays as long."""
+    """It looks like drift; both are covered, whether the queue empties at once or stays."""
     rng, seen = random.Random(1), []
     for n in range(1600):
         t_s = n / 10
@@ -201,7 +203,9 @@ def test_a_known_delay_is_taken_off_and_no_longer_uncertain() -> None:
     for arrival_ns, boot_ms in seen:
         a, b = plain.observe(arrival_ns, boot_ms), told.observe(arrival_ns, boot_ms)
         assert a is not None and b is not None
-    assert 0.18 * S < plain.node_ns(5 * S) - told.node_ns(5 * S) < 0.25 * S  # it guesses some of it
+    assert (
+        0.18 * S < plain.node_ns(5 * S) - told.node_ns(5 * S) < 0.25 * S
+    )  # part of it is already assumed
     assert known(told).constant_delay_s == pytest.approx(0.25, abs=0.05)
     assert known(told).after_s < known(plain).after_s - 0.15
 
@@ -242,7 +246,7 @@ def test_the_mapping_is_monotone_and_has_an_inverse(
 def test_no_stamp_of_the_window_is_later_than_its_arrival(
     sky: tuple[list[tuple[int, int]], float],
 ) -> None:
-    """Not only when it came: by what is known at the end, too, but for the drift since."""
+    """Also by the clock known at the end, except for the drift since."""
     clock = fed(sky[0])
     for arrival_ns, boot_ms in sky[0]:
         assert clock.node_ns(boot_ms * MS) <= arrival_ns + (20 * MS if abs(sky[1]) <= 2.5e-4 else S)
@@ -259,7 +263,7 @@ def test_a_time_does_not_depend_on_how_late_the_report_came() -> None:
 
 @pytest.mark.parametrize("sky", [radio, wifi])
 def test_who_asks_when_changes_nothing(sky: Link) -> None:
-    """A clock that was asked now and then, and one that is asked at every stamp, say the same."""
+    """A clock queried rarely and one queried at every stamp agree."""
     seen = sky(5, 50e-6, 60)
     seldom, often = SenderClock(), SenderClock()
     for n, (arrival_ns, boot_ms) in enumerate(seen):
@@ -281,7 +285,7 @@ def test_before_the_first_stamp_nothing_is_known() -> None:
 
 
 def test_that_the_first_frames_were_slow_is_soon_ruled_out() -> None:
-    """One may be nearly 5 s late; that all of five seconds are is not thought possible."""
+    """One frame may be nearly 5 s late, but not all frames of five seconds."""
     clock, doubts = SenderClock(ClockAssumptions(drift_max_ppm=0.0)), []
     for n in range(50):
         clock.observe(EPOCH_NS + n * 100 * MS, 5_000 + n * 100)
@@ -293,12 +297,13 @@ def test_that_the_first_frames_were_slow_is_soon_ruled_out() -> None:
 
 
 def test_a_line_keeps_the_doubt_of_the_stamps_that_began_it() -> None:
-    """A new boot is believed after some stamps: those before, told by another node, are its floor
-    too, and may have arrived earlier than they are placed.
-    """
+    """A new boot is accepted after some stamps. The earlier ones, shared by another node, are in
+    its floor too and may have arrived earlier than placed."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 500_000 + n * 100) for n in range(100)])
     again_ns = EPOCH_NS + 20 * S
-    for n in range(40):  # three that came at once, and were told with 300 ms; others took 310
+    for n in range(
+        40
+    ):  # three that arrived together with an uncertainty of 300 ms; others took 310 ms
         late_ms, doubt_ms = (300, 400) if n < 3 else (310, 0)
         clock.observe(again_ns + (n * 100 + late_ms) * MS, 1_000 + n * 100, doubt_ms * MS)
     offset_ns = again_ns - 1_000 * MS
@@ -318,7 +323,7 @@ def exchange(
     there_s: float,
     back_s: float,
 ) -> str | None:
-    """A round trip that sets out ``true_ns`` after the epoch, its ways of random length."""
+    """Run a round trip that starts ``true_ns`` after the epoch, with random latencies."""
     out_ns = round(rng.expovariate(1.0 / there_s) * S) + 20 * MS
     home_ns = round(rng.expovariate(1.0 / back_s) * S) + 120 * MS
     reply_ns = sent(drift, true_ns + out_ns)
@@ -329,7 +334,7 @@ def exchange(
 @pytest.mark.parametrize("drift", [0.0, 5e-5, 2.4e-4, -2.4e-4])
 @pytest.mark.parametrize(("there_s", "back_s"), [(0.3, 0.3), (0.05, 1.0), (1.5, 0.1)])
 def test_timesync_stays_within_its_uncertainty(drift: float, there_s: float, back_s: float) -> None:
-    """Over a radio, by round trips of seconds, however unequal their ways."""
+    """Over a radio with round trips of seconds and asymmetric latencies."""
     beyond = []
     for seed in range(3):
         rng, clock, next_ns = random.Random(seed), SenderClock(), 5 * S
@@ -352,7 +357,7 @@ def test_timesync_stays_within_its_uncertainty(drift: float, there_s: float, bac
 
 
 def test_timesync_sees_the_constant_delay() -> None:
-    """What no one-way observation can: every frame takes 300 ms."""
+    """One-way observation cannot: every frame takes 300 ms."""
     clock = fed([(EPOCH_NS + n * 100 * MS + 300 * MS, 5_000 + n * 100) for n in range(100)])
     assert known(clock).kind is ClockKind.ENVELOPE
     assert clock.node_ns(10 * S) == pytest.approx(EPOCH_NS + 5 * S + 300 * MS, abs=500_000)
@@ -368,10 +373,10 @@ def test_timesync_sees_the_constant_delay() -> None:
 
 
 def test_round_trips_are_intersected_and_held_below_the_envelope() -> None:
-    """Two slow trips, one late on the way out and one on the way back, make a good one."""
+    """Two slow trips, one delayed on the way out and one on the way back, make a good one."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
     clock.timesync(EPOCH_NS + 9_000 * MS, EPOCH_NS + 10_010 * MS, 15_000 * MS)
-    assert known(clock).kind is ClockKind.ENVELOPE  # which says more than half of a second does
+    assert known(clock).kind is ClockKind.ENVELOPE  # which is tighter than half a second
     clock.timesync(EPOCH_NS + 9_990 * MS, EPOCH_NS + 11_000 * MS, 15_000 * MS)
     assert known(clock).kind is ClockKind.TIMESYNC
     assert known(clock).uncertainty_s < 0.012
@@ -397,7 +402,7 @@ def test_round_trips_that_cannot_be(trip: tuple[int, int, int], why: str) -> Non
 
 @pytest.mark.parametrize(("first_ms", "then_ms"), [(400, 900), (900, 400)])
 def test_what_contradicts_is_believed_and_the_doubt_holds_both(first_ms: int, then_ms: int) -> None:
-    """Whichever way the clock leapt; until three agree, both may be true."""
+    """In either direction of the jump; until three trips agree, both offsets may be true."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
 
     def trip(delay_ms: int) -> ClockChange | None:
@@ -445,7 +450,7 @@ def test_a_reboot_ends_what_was_known() -> None:
 
 
 def test_timesync_past_the_wrap() -> None:
-    """The remote clock does not wrap; a node that starts later knows only the 32 bits."""
+    """The remote clock does not wrap; a node that starts later knows only its 32 bits."""
     wrap_ns = (1 << 32) * MS
     clock = fed([(EPOCH_NS + n * 100 * MS + 300 * MS, 5_000 + n * 100) for n in range(100)])
     remote_ns = 15 * S + 2 * wrap_ns
@@ -461,7 +466,7 @@ TRUSTED = ClockAssumptions(trust_gnss=True, node_utc_error_s=0.005)
 def told_the_time(
     settings: ClockAssumptions, ahead_us: int = 0, exactly: int | None = None
 ) -> SenderClock:
-    """Each second a SYSTEM_TIME, every frame 300 ms on its way."""
+    """Feed a SYSTEM_TIME every second, each frame 300 ms late."""
     clock = SenderClock(settings)
     for n in range(100):
         arrival_ns = EPOCH_NS + n * 100 * MS + 300 * MS
@@ -518,7 +523,7 @@ def test_what_was_shown_before_the_nodes_own_clock_was_set_is_forgotten() -> Non
 
 
 def test_a_sender_that_sets_its_clock_is_believed_once_its_times_agree() -> None:
-    """Until then the doubt holds both."""
+    """Until then the uncertainty covers both."""
     clock, doubts = told_the_time(TRUSTED), []
     for n in range(100, 106):
         arrival_ns = EPOCH_NS + n * 100 * MS + 300 * MS
@@ -569,9 +574,9 @@ def stamps_of(data: bytes, name: str, ids: set[int]) -> dict[str, list[tuple[int
 def test_reboots_of_real_logs(
     shared_log: Callable[[str], bytes], name: str, reboots: int, leaps: int, ids: set[int]
 ) -> None:
-    """A second later at most every stamp has its time, and the doubt is no more than the link's.
+    """After at most one second every stamp has a time, with an uncertainty of the link's scale.
 
-    One leaps ahead of its line by more than a second, once.
+    One log jumps ahead by more than a second, once.
     """
     for seen in stamps_of(shared_log(name), name, ids).values():
         clock = SenderClock()
@@ -590,13 +595,13 @@ def test_what_a_stamp_costs(capsys: pytest.CaptureFixture[str]) -> None:
         each_us = (time.perf_counter_ns() - begun_ns) / len(seen) / 1e3
         with capsys.disabled():
             print(f"\n{name}: {each_us:.1f} us a stamp", end="")
-        assert each_us < 1_000.0  # not a benchmark: a bound against a change of complexity
+        assert each_us < 1_000.0  # not a benchmark: a guard against a change of complexity
 
 
 def test_evidence_above_the_floor_is_a_step_of_unknown_drift(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Where the floor leaves 200 ms, a round trip says that it is 120 ms above the lowest."""
+    """The floor leaves 200 ms; a round trip places the offset 120 ms above its lower end."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
     low_ns, high_ns = EPOCH_NS - 5_100 * MS, EPOCH_NS - 4_900 * MS
     wide = Heights(upper_bound=low_ns, highest=high_ns, line=low_ns, least=low_ns)

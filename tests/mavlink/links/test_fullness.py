@@ -1,4 +1,4 @@
-"""How full an endpoint's buffer is: what tells a sender that would rather wait than lose."""
+"""Fullness of an endpoint's buffer, for senders that wait rather than lose messages."""
 
 import asyncio
 import contextlib
@@ -19,13 +19,13 @@ from companion.mavlink.links.urls import parse_link
 
 @pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest) -> Run:
-    """``run(test())`` on one loop and on the other."""
+    """Return ``run(test())``, on each of the two event loops."""
     return runner(request.param)
 
 
 @contextlib.asynccontextmanager
 async def serving(url: str) -> AsyncIterator[Endpoint]:
-    """An endpoint at work; nobody hears what comes."""
+    """Run an endpoint whose received data is dropped."""
     upcalls = Upcalls(
         up=lambda: None,
         take=lambda *_: None,
@@ -45,7 +45,7 @@ async def serving(url: str) -> AsyncIterator[Endpoint]:
 
 
 def fill(made: Endpoint) -> int:
-    """Write until nothing is taken; returns how many bytes were."""
+    """Write until nothing is accepted; return the number of bytes."""
     (key,) = made.peers() or ()
     assert made.fullness(key) == 0.0
     taken = 0
@@ -71,7 +71,7 @@ def test_a_connection_is_full_until_it_is_read(run: Run) -> None:
 
                 await until_true(read_all)
                 assert made.fullness(key) == 0.0
-        assert made.fullness(key) == 0.0  # it is gone
+        assert made.fullness(key) == 0.0  # it has disconnected
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         run(test(server))

@@ -1,6 +1,6 @@
-"""When a datagram arrived, by the system's own stamp, over real sockets on loopback.
+"""Kernel arrival time of a datagram, over real sockets on loopback.
 
-What makes this process late is ``time.sleep`` in the loop's own thread: that is the subject.
+``time.sleep`` in the loop's own thread delays this process on purpose.
 """
 
 import asyncio
@@ -21,7 +21,7 @@ from companion.values import Reason, Source
 
 BLOCKED_S = 0.5
 SOON_S = 0.25
-"""Sending and reading clocks takes less, also on a busy machine."""
+"""Sending and reading clocks takes less than this, also on a busy machine."""
 DAY_NS = 86_400_000_000_000
 HOUR_NS = DAY_NS // 24
 
@@ -30,7 +30,7 @@ linux = pytest.mark.skipif(sys.platform != "linux", reason="only Linux stamps da
 
 @pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest) -> Run:
-    """``run(test())`` on one loop and on the other."""
+    """Return ``run(test())``, on each of the two event loops."""
     return runner(request.param)
 
 
@@ -48,7 +48,7 @@ def peer() -> Iterator[socket.socket]:
 
 
 async def sent_while_blocked(link: Link, sender: socket.socket, to: object) -> list[int]:
-    """Send ten frames and hold the loop up; returns when each was sent, on the link's time."""
+    """Send ten frames and block the loop; return when each was sent, on the link's time."""
     await until_true(lambda: link.status.state == "up")
     sent_ns = []
     for number in range(10):
@@ -82,7 +82,7 @@ def test_a_frame_that_waited_arrived_when_the_system_had_it(run: Run) -> None:
 def test_a_backlog_is_let_go_from_its_old_end_and_counted(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is read is then what is new, not what has waited for seconds."""
+    """The frames read are then new ones, not seconds old."""
     monkeypatch.setattr(udp, "STALE_NS", round(BLOCKED_S * 0.55e9))
     monkeypatch.setattr(udp, "OVERFLOW_CHECK_S", 0.1)
 
@@ -162,7 +162,7 @@ def test_stamps_of_before_the_wall_clock_was_set_are_not_believed(
                 assert min(one.t_ns for one in inbox.frames) >= read_ns
                 assert link.status.misstamped == 10
                 step[0] = 0
-                sender.sendto(b"nothing waits any more", to)  # by which the step is noted
+                sender.sendto(b"nothing waits any more", to)  # by which the step is noticed
                 await until_true(lambda: link.status.misstamped == 11)
                 await asyncio.sleep(0)
                 sent_ns = await sent_while_blocked(link, sender, to)
@@ -178,7 +178,7 @@ def test_stamps_of_before_the_wall_clock_was_set_are_not_believed(
 def test_what_was_received_before_a_sleep_is_let_go(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A datagram waits, the machine sleeps for an hour, and both clocks count that."""
+    """A datagram waits while the machine is suspended for an hour, which both clocks count."""
 
     async def test() -> None:
         with peer() as sender:
@@ -215,7 +215,7 @@ def test_a_stream_has_no_stamps(run: Run) -> None:
 def test_what_waited_in_a_stream_while_nobody_read_is_let_go(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """As long as by SIGSTOP or a sleep of the machine: frames of then must not look like now."""
+    """After SIGSTOP or a suspend, old frames must not look current."""
     away_ns = [0]
     monkeypatch.setattr(stale_bytes, "since_boot_ns", lambda: away_ns[0])
 
@@ -253,7 +253,7 @@ def test_a_look_knows_how_much_waits_before_it_is_read(monkeypatch: pytest.Monke
 
 @linux
 def test_a_reader_that_fails_ends_the_link(run: Run) -> None:
-    """What the node's own code raises must not be lost in the loop."""
+    """An exception of the node's own code must not be lost in the loop."""
 
     async def test() -> None:
         def broken(_: object) -> None:
@@ -285,7 +285,7 @@ def test_the_watch_tells_when_the_wall_clock_was_set(monkeypatch: pytest.MonkeyP
 
 
 def test_a_pause_between_two_clocks_is_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A busy machine may take this process away while it reads the clocks."""
+    """A busy machine may preempt this process between the clock readings."""
     now_ns, pause_ns = [0], [0]
 
     def read() -> int:

@@ -1,4 +1,4 @@
-"""How far behind the machine is, as it is summed up and judged."""
+"""The machine's arrival lag: its statistics and the behind state."""
 
 import pytest
 from hypothesis import given
@@ -12,7 +12,7 @@ BEGIN = 1_800_000_000 * S
 
 
 def fed(*lags: tuple[float, float]) -> tuple[ArrivalLag, int]:
-    """Lags in seconds, at seconds; and the time of the last."""
+    """Feed lags in seconds at given seconds; return the lag and the last time."""
     lag = ArrivalLag()
     for at_s, lag_s in lags:
         lag.observe(BEGIN + round(at_s * S), round(lag_s * S))
@@ -20,7 +20,7 @@ def fed(*lags: tuple[float, float]) -> tuple[ArrivalLag, int]:
 
 
 def steady(lag_s: float, from_s: float, to_s: float) -> list[tuple[float, float]]:
-    """A datagram every 50 ms."""
+    """One datagram every 50 ms."""
     return [(from_s + n * 0.05, lag_s) for n in range(round((to_s - from_s) / 0.05))]
 
 
@@ -76,14 +76,14 @@ def test_one_long_pause_is_over_when_it_is_seen() -> None:
 
 
 def test_pauses_one_after_the_other_are_a_machine_that_is_behind() -> None:
-    """After each the queue is empty again: the last datagram of each is not late at all."""
+    """After each pause the queue empties: its last datagram is not late at all."""
     waited = [(k * 0.8 + n * 1e-4, 0.8 - n * 0.1) for k in range(1, 5) for n in range(8)]
     lag, now_ns = fed(*waited)
     assert lag.seen(now_ns).behind
 
 
 def test_it_does_not_flap() -> None:
-    """Once behind, two seconds without a lag above the limit clear it, and nothing less."""
+    """Once behind, only two seconds without a lag above the limit clear it."""
     late = [*steady(0.01, 0, 1), *steady(0.6, 1, 3)]
     for gap_s in (0.3, 1.0, 1.9):
         lag, now_ns = fed(*late, *steady(0.01, 3, 3 + gap_s))

@@ -1,4 +1,4 @@
-"""Links that only hear, over real sockets: a web server's answers, groups, and peers left in peace.
+"""Receive-only links over real sockets: web server responses, multicast groups, silent peers.
 
 Every test runs on both loops.
 """
@@ -26,13 +26,13 @@ EVENT = (
 
 @pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest) -> Run:
-    """``run(test())`` on one loop and on the other."""
+    """Return ``run(test())``, on each of the two event loops."""
     return runner(request.param)
 
 
 @contextlib.asynccontextmanager
 async def answering(*pieces: bytes, hangs: bool = False) -> AsyncIterator[tuple[str, list[bytes]]]:
-    """A server that gives every request the same answer; its URL, and what it was asked."""
+    """Run a server with a fixed response; yields its URL and the received requests."""
     asked: list[bytes] = []
     stop = asyncio.Event()
 
@@ -130,7 +130,7 @@ def test_who_is_only_heard_is_sent_nothing(run: Run, url: str) -> None:
 
 
 def test_a_group_is_joined_and_shared_with_other_programs(run: Run) -> None:
-    """As ATAK says it: to everybody who listens to the group."""
+    """As ATAK sends it: to every listener of the group."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)
         sender.settimeout(LIMIT_S)

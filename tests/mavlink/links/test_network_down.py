@@ -1,7 +1,7 @@
-"""Links over a network that goes down, and peers that vanish without a word.
+"""Links over a network that goes down, and peers that vanish silently.
 
-A network namespace of its own has a loopback that a test may switch off. Where the system does
-not give one, these tests are skipped.
+A separate network namespace has a loopback that a test may switch off. Without support by the
+system these tests are skipped.
 """
 
 import os
@@ -31,7 +31,7 @@ def loopback(up):
 
 
 def alone(loop: str, test: str) -> None:
-    """Run ``async def test()`` in a network namespace of its own, on that loop."""
+    """Run ``async def test()`` in its own network namespace, on that loop."""
     try:
         subprocess.run(
             ("unshare", "--net", "true"), check=True, capture_output=True, timeout=HANG_S
@@ -88,7 +88,7 @@ async def test():
 
 
 def test_a_peer_that_vanishes_is_noticed_by_its_silence() -> None:
-    """Neither end says a word: only the system can tell, and is asked to."""
+    """Neither end sends: only the kernel's keepalive can detect it."""
     alone(
         "uvloop",
         """
@@ -107,7 +107,7 @@ async def test():
 
 
 def test_a_link_does_not_connect_to_itself() -> None:
-    """While nobody listens, the system may choose the very port called for as the caller's."""
+    """Without a listener the kernel may choose the called port as the caller's own."""
     alone(
         "uvloop",
         """

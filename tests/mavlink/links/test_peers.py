@@ -1,4 +1,4 @@
-"""Sequence numbers, by peer and source: what is missing, late, repeated, or begun again."""
+"""Sequence numbers by peer and source: gaps, late frames, repeats and restarts."""
 
 import random
 from collections.abc import Iterable
@@ -22,14 +22,14 @@ assert isinstance(MADE, Frame)
 
 
 def numbered(number: int, source: Source = UAV, t_ns: int = 0) -> Frame:
-    """A frame as far as counting goes: its checksum has been looked at before."""
+    """Return a frame for counting: its checksum is assumed valid."""
     raw = bytearray(MADE.raw)
     raw[4:7] = number & 0xFF, *source
     return Frame(t_ns=t_ns, link=LINK, source=source, msgid=MADE.msgid, raw=bytes(raw))
 
 
 class Heard:
-    """Peers of a link, and who was bidden on_evict."""
+    """Peers of a link, and the evicted ones."""
 
     def __init__(self) -> None:
         self.status = LinkStatus(url=LINK)
@@ -49,7 +49,7 @@ class Heard:
 
 @given(st.integers(0, 255), st.lists(st.integers(1, 127), max_size=200))
 def test_every_hole_shorter_than_half_a_round_is_counted(first: int, steps: list[int]) -> None:
-    """Frames that are sent one after the other, of which some are lost."""
+    """Consecutive frames, of which some are lost."""
     number, numbers = first, [first]
     for step in steps:
         numbers.append(number := number + step)
@@ -77,19 +77,19 @@ def test_a_swapped_pair_is_one_late_frame_that_was_missing(first: int, swaps: li
 
 @pytest.mark.parametrize("behind", [2, 10, 126])
 def test_stragglers_among_frames_in_order_are_no_restart(behind: int) -> None:
-    """Two ways to here, one of them longer: nothing is missing, each frame comes twice."""
+    """Two routes, one of them slower: nothing is missing, each frame arrives twice."""
     numbers = [n for at in range(1000) for n in ((at, at - behind) if at > behind else (at,))]
     assert Heard().hear(numbers).counts == (0, 999 - behind, 0)
 
 
 def test_frames_in_reverse_are_no_restart() -> None:
-    """A new beginning counts upwards."""
+    """A restart counts upwards."""
     assert Heard().hear([1, 10, 9, 8, 7, 6, 5, 11]).counts == (8, 5, 0)
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
 def test_a_restart_is_at_most_one_wrong_gap(lost: float) -> None:
-    """From any place to any other; also over a link that loses frames, whose own holes count."""
+    """From any number to any other; also over a lossy link, whose own gaps count."""
     chance = random.Random(1)
     for last in range(0, 256, rounds(25, 5)):
         for first in range(256):
@@ -99,11 +99,11 @@ def test_a_restart_is_at_most_one_wrong_gap(lost: float) -> None:
             holes = arrived[-1] - first + 1 - len(arrived)
             gaps, late, repeats = heard.counts
             step = (first - last) & 0xFF
-            if 0 < step < 128:  # forwards: it cannot be told from a hole
+            if 0 < step < 128:  # forwards: indistinguishable from a gap
                 assert (gaps, late, repeats) == (step - 1 + holes, 0, 0)
-            elif step == 0:  # the place where it was: as if nothing had been
+            elif step == 0:  # the same number: not noticeable
                 assert (gaps, late, repeats) == (holes, 0, 1)
-            else:  # backwards: it is followed as soon as it is sure, or has caught up
+            else:  # backwards: followed once certain, or once caught up
                 assert gaps <= holes and late + repeats <= RESTART_RUN and repeats <= 1
 
 
@@ -115,7 +115,7 @@ def test_after_a_restart_holes_are_counted_again() -> None:
 
 
 def test_a_hole_of_a_whole_round_is_not_seen() -> None:
-    """The number has 8 bits: that is all that it can say."""
+    """An 8-bit number cannot show it."""
     assert Heard().hear([0, 1, 256 + 2]).counts == (0, 0, 0)
     assert Heard().hear([0, 1, 256 + 5]).counts == (3, 0, 0)
 
@@ -176,7 +176,7 @@ def test_a_source_is_where_it_was_heard_last() -> None:
     assert peers.last_of(Source(3, 1)) is None
     peers.forget(peers.at("a"))
     assert peers.last_of(UAV) is None
-    peers.at("a")  # somebody new at the old address has not been heard yet
+    peers.at("a")  # a new peer at the old address has not been received yet
     assert peers.last_of(UAV) is None
 
 
@@ -197,14 +197,14 @@ def test_the_peers_heard_last_are_kept() -> None:
     heard = Heard()
     for n in range(PEERS_MAX + 10):
         heard.peers.at(n)
-        heard.peers.at(0)  # who keeps sending is not given up
+        heard.peers.at(0)  # a peer that keeps sending is kept
     assert len(heard.peers) == PEERS_MAX
     assert [peer.key for peer in heard.farewells] == list(range(1, 11))
     assert heard.peers.find(0) is not None and heard.peers.find(1) is None
 
 
 def test_invented_senders_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whoever keeps sending loses at most the hole of that moment."""
+    """A steady sender loses at most the gap count of that moment."""
     assert SENDERS_MAX <= 1 << 16
     monkeypatch.setattr(peers_module, "SENDERS_MAX", 100)
     heard = Heard()
@@ -220,7 +220,7 @@ def test_invented_senders_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch
 
 
 def test_peers_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
-    """However many there were: those that stay are followed on, and every hole is seen."""
+    """However many there were: remaining peers are tracked, and every gap is counted."""
     monkeypatch.setattr(peers_module, "SENDERS_MAX", 10)
     heard = Heard()
     for n in range(100):

@@ -1,4 +1,4 @@
-"""Serial links over real pseudo-terminals: a device that comes, goes, and is somebody else's."""
+"""Serial links over real pseudo-terminals: devices that appear, vanish, or are in use."""
 
 import asyncio
 import contextlib
@@ -26,17 +26,17 @@ from companion.mavlink.wire.framing import Splitter
 from companion.values import Frame, Rejection, Source
 
 OURS = Source(5, 191)
-TIOCVHANGUP = 0x5437  # what the system does to a terminal whose device is unplugged
+TIOCVHANGUP = 0x5437  # what the kernel does to the terminal of an unplugged device
 
 
 @pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest) -> Run:
-    """``run(test())`` on one loop and on the other."""
+    """Return ``run(test())``, on each of the two event loops."""
     return runner(request.param)
 
 
 class Cable:
-    """A pseudo-terminal: ``path`` is the device, and this is what sits at its other end."""
+    """A pseudo-terminal: ``path`` is the device, and this object its other end."""
 
     def __init__(self) -> None:
         self.end, device = pty.openpty()
@@ -45,13 +45,13 @@ class Cable:
         os.close(device)
 
     def read(self) -> bytes:
-        """What has come so far."""
+        """Return everything received so far."""
         with contextlib.suppress(BlockingIOError):
             return os.read(self.end, 1 << 16)
         return b""
 
     def unplug(self) -> None:
-        """The device is gone."""
+        """Remove the device."""
         if self.end >= 0:
             os.close(self.end)
             self.end = -1
@@ -59,7 +59,7 @@ class Cable:
 
 @contextlib.contextmanager
 def cable() -> Iterator[Cable]:
-    """A cable that is unplugged at the end, if it was not before."""
+    """Provide a cable, which is unplugged at the end."""
     made = Cable()
     try:
         yield made
@@ -68,7 +68,7 @@ def cable() -> Iterator[Cable]:
 
 
 def hard_bytes(number: int) -> bytes:
-    """A frame full of what terminals have their own ways with: ^C, ^D, CR, LF, ^Q, ^S, DEL, 0xFF"""
+    """Return a frame full of terminal control bytes: ^C, ^D, CR, LF, ^Q, ^S, DEL, 0xFF."""
     mav = dialect.MAVLink(None, 1, 1)
     mav.seq = number % 256
     awkward = b"\x03\x04\r\n\x11\x13\x7f\xff\x1a\x1c\x00"
@@ -82,7 +82,7 @@ def test_frames_pass_both_ways_whatever_bytes_they_hold(run: Run) -> None:
     async def test() -> None:
         with cable() as wire:
             async with running(f"serial:{wire.path}:921600") as (link, inbox):
-                assert link.send(heartbeat(OURS)) == 0  # it is not open yet
+                assert link.send(heartbeat(OURS)) == 0  # not open yet
                 await until_true(lambda: link.status.state == "up")
                 made = [hard_bytes(n) for n in range(10)]
                 for raw in made:
@@ -111,7 +111,7 @@ def test_frames_pass_both_ways_whatever_bytes_they_hold(run: Run) -> None:
 def test_a_device_that_is_unplugged_and_plugged_in_again(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """At first it is not there. Half a frame of before spoils nothing."""
+    """The device is absent at first. Half a frame from before does no harm."""
     monkeypatch.setattr(transport, "RETRY_S", (0.01,))
     monkeypatch.setattr(transport, "STEADY_S", 0.02)
     device = tmp_path / "ttyUSB0"
@@ -158,7 +158,7 @@ def test_a_hang_up_by_the_system_is_noticed(run: Run) -> None:
                 await inbox.until_said(1)
                 why = os.strerror(errno.ENODEV)
                 assert inbox.texts == [f"link {link.url} is down: {why}; trying again"]
-                await until_true(lambda: link.status.state == "up")  # the other end is still there
+                await until_true(lambda: link.status.state == "up")  # the other end still exists
                 os.write(wire.end, frame(1))
                 await inbox.until(1)
 
@@ -179,7 +179,7 @@ def test_a_device_of_another_program_is_waited_for(
                 assert inbox.texts == [f"link {link.url} is down: {busy}; trying again"]
                 os.write(wire.end, frame(9))
                 await asyncio.sleep(0.05)
-                assert other.read(len(frame(9))) == frame(9)  # nothing was taken from it
+                assert other.read(len(frame(9))) == frame(9)  # no byte was taken from it
                 other.close()
                 await until_true(lambda: link.status.state == "up")
                 with pytest.raises(serial.SerialException):
@@ -201,7 +201,7 @@ def test_what_is_no_terminal_is_waited_for(run: Run) -> None:
 
 
 def test_a_device_that_does_not_take_loses_messages_and_no_time(run: Run) -> None:
-    """What it does get, in the end, are whole frames; what it did not take is counted."""
+    """It eventually receives whole frames only; dropped ones are counted."""
 
     async def test() -> None:
         with cable() as wire:
@@ -219,7 +219,7 @@ def test_a_device_that_does_not_take_loses_messages_and_no_time(run: Run) -> Non
                         numbers.append(item.seq)
                     await asyncio.sleep(0)
                 assert numbers == [n % 256 for n in range(taken)]
-                assert link.send(heartbeat(OURS)) == 1  # there is room again
+                assert link.send(heartbeat(OURS)) == 1  # there is space again
                 while not any(splitter.feed(0, wire.read())):
                     await asyncio.sleep(0)
 
@@ -235,14 +235,14 @@ def test_its_settings_are_those_of_a_raw_line(run: Run) -> None:
                 assert speed_in == speed_out == termios.B115200
                 assert cflag & termios.CSIZE == termios.CS8
                 assert not lflag & (termios.ECHO | termios.ICANON | termios.ISIG)
-                # With 0, to read when there is nothing looks like the end of the device.
+                # With 0, an empty read looks like the end of the device.
                 assert control[termios.VMIN] in (1, b"\x01")
 
     run(test())
 
 
 class FaultError(Exception):
-    """A fault of the program."""
+    """A program defect."""
 
 
 def test_a_fault_of_the_program_does_not_vanish(run: Run) -> None:

@@ -1,4 +1,4 @@
-"""Key files and kept timestamps, on a real disk, with a process that is really killed."""
+"""Key files and stored timestamps, on a real disk, with a process that is really killed."""
 
 import hashlib
 import json
@@ -29,7 +29,7 @@ NOW_NS = 1_790_000_000 * S
 
 
 def sent(t_ns: int, key: bytes = KEY, sysid: int = 1) -> Frame:
-    """A signed heartbeat of that time."""
+    """Return a signed heartbeat with that timestamp."""
     raw = LinkSigning(key=key, link_id=0).sign(
         encode.pack(encode.heartbeat(Source(sysid, 1)), 0), t_ns
     )
@@ -43,7 +43,7 @@ def framed(raw: bytes, t_ns: int) -> Frame:
 
 
 def one_line(error: pytest.ExceptionInfo[LinkError], path: Path) -> str:
-    """What the operator is told: one line that names the file."""
+    """Check that the operator's message is one line that names the file."""
     text = str(error.value)
     assert str(path) in text
     assert "\n" not in text
@@ -56,7 +56,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def as_left(path: Path, name: str) -> Path:
-    """The file as a process that is killed now would leave it."""
+    """Return the file as a process killed now would leave it."""
     return shutil.copy(path, path.with_name(name))
 
 
@@ -149,7 +149,7 @@ def test_a_key_that_others_can_read(tmp_path: Path, mode: int) -> None:
     assert "cannot check the permissions" in str(key_warning(tmp_path / "missing"))
 
 
-# --- from run to run ----------------------------------------------------------------------------
+# --- across runs --------------------------------------------------------------------------------
 
 
 def test_the_file_is_there_at_once_and_holds_no_key(path: Path) -> None:
@@ -208,7 +208,7 @@ def test_the_settings_of_a_guard_are_handed_on(path: Path) -> None:
 
 
 def test_from_the_first_moment_a_run_counts_as_not_ended(path: Path) -> None:
-    """Killed before anything was saved, whatever the run before has left."""
+    """Killed before the first save, whatever the previous run has left."""
     first = Timestamps(path)
     guard = first.guard(URL, KEY, 0, NOW_NS)
     assert guard.refusal(sent(NOW_NS)) is None
@@ -261,7 +261,7 @@ while True:
 
 
 def live(path: Path, now_ns: int, lines: int) -> Iterator[tuple[str, int, bytes]]:
-    """What a process heard and sent until it was killed in the midst of it; its time runs fast."""
+    """Return what a process received and sent until it was killed; its time runs fast."""
     command = [sys.executable, "-c", CHILD, path, str(now_ns), KEY.hex()]
     with started(command, stdout=subprocess.PIPE, text=True) as process:
         out = [line_of(process, process.stdout) for _ in range(lines)]
@@ -277,7 +277,8 @@ def live(path: Path, now_ns: int, lines: int) -> Iterator[tuple[str, int, bytes]
 
 
 def test_killed_again_and_again(path: Path) -> None:
-    """Nothing heard is taken again, no timestamp is sent again, and within seconds all go on."""
+    """No received frame is accepted again, no timestamp is reused, and all streams continue within
+    seconds."""
     now_ns, heard, stamps = NOW_NS, [], [0]
     for lines in (40, 333, 2, 517):
         before = len(heard)
@@ -302,7 +303,9 @@ def test_killed_again_and_again(path: Path) -> None:
 
 
 def test_time_to_save(path: Path) -> None:
-    """Every second while anything moves; every three in silence, for clocks go on."""
+    """Every second while timestamps change; every three seconds in silence, because clocks
+    advance.
+    """
     timestamps = Timestamps(path)
     assert not timestamps.due(NOW_NS + 100 * S)  # no link has a key
     guard = timestamps.guard(URL, KEY, 0, NOW_NS)
@@ -331,14 +334,14 @@ def test_a_snapshot_is_of_its_moment_and_never_replaces_a_newer_one(path: Path) 
         assert link["clock"] == (clock_ns - EPOCH_NS) // UNIT_NS
         assert len(link["streams"]) == streams
     newest = path.read_bytes()
-    for snapshot in (first, second):  # as a thread that was held up would
+    for snapshot in (first, second):  # as a delayed thread would
         timestamps.write(snapshot)
         assert path.read_bytes() == newest
     timestamps.close(NOW_NS + 3 * S)
 
 
 def test_a_file_is_replaced_and_never_written_over(path: Path) -> None:
-    """What was whole stays whole until the next one is."""
+    """The old file stays whole until the new one is complete."""
     timestamps = Timestamps(path)
     timestamps.guard(URL, KEY, 0, NOW_NS)
     before = path.read_bytes()
@@ -352,7 +355,7 @@ def test_a_file_is_replaced_and_never_written_over(path: Path) -> None:
 def test_a_new_file_is_on_the_disk_and_its_name_in_the_folder_too(
     path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """That the power may fail cannot be had in a test: what was asked of the system can."""
+    """A power failure cannot be tested, but the system calls can."""
     timestamps = Timestamps(path)
     timestamps.guard(URL, KEY, 0, NOW_NS)
     before, synced = path.read_bytes(), []
@@ -366,13 +369,13 @@ def test_a_new_file_is_on_the_disk_and_its_name_in_the_folder_too(
     (file, size, then), (folder, _, later) = synced
     assert (file, size) == (path.stat().st_ino, path.stat().st_size)
     assert folder == path.parent.stat().st_ino
-    assert then == before  # the old one is in its place until the new one is whole
+    assert then == before  # the old file stays until the new one is complete
     assert later == path.read_bytes() != before
     timestamps.close(NOW_NS + 60 * S)
 
 
 def test_threads_write_while_frames_come(path: Path) -> None:
-    """At every moment the file is whole."""
+    """The file is whole at every moment."""
     timestamps = Timestamps(path)
     guard = timestamps.guard(URL, KEY, 0, NOW_NS)
     failures: list[BaseException] = []
@@ -404,7 +407,7 @@ def test_threads_write_while_frames_come(path: Path) -> None:
     again.close(frames[-1].t_ns)
 
 
-# --- what cannot be used ------------------------------------------------------------------------
+# --- unusable files -----------------------------------------------------------------------------
 
 
 def refuses(path: Path, said: str) -> None:

@@ -1,4 +1,4 @@
-"""Calls of threads made on the loop: in order, and not all at once."""
+"""Calls from threads executed on the event loop: in order, and in limited batches."""
 
 import asyncio
 import time
@@ -13,7 +13,7 @@ EACH_S = to_loop.SLICE_S / 2
 
 
 def test_other_work_has_its_turn_among_many_calls() -> None:
-    """By time, since what a call takes is the caller's matter."""
+    """Limited by time, because the cost of a call is unknown."""
     made: list[int] = []
     seen: list[int] = []
 

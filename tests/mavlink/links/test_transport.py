@@ -1,6 +1,6 @@
-"""Links over real sockets on loopback; what is waited for is an event, never a time.
+"""Links over real sockets on loopback; tests wait for events, never for a time.
 
-Every test runs on both loops: the one that comes with Python, and the one in flight.
+Every test runs on both loops: Python's own and the one used in flight.
 """
 
 import asyncio
@@ -29,13 +29,13 @@ OURS = Source(5, 191)
 
 @pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest) -> Run:
-    """``run(test())`` on one loop and on the other."""
+    """Return ``run(test())``, on each of the two event loops."""
     return runner(request.param)
 
 
 @pytest.fixture
 def unstamped(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Frames arrive when they are read, for tests that have a time of their own."""
+    """Use read times as arrival times, for tests with their own time."""
     monkeypatch.setattr(kernel_time, "stamped", lambda _: False)
 
 
@@ -85,8 +85,8 @@ def test_datagrams_become_frames(run: Run) -> None:
             frames = [item for item in inbox.items if isinstance(item, Frame)]
             assert {item.link for item in frames} == {url}
             times = [item.t_ns for item in frames]
-            assert len(set(times[:5])) == 1  # a datagram's frames came together
-            # Not in order to the millisecond: until the system stamps, it is when they were read.
+            assert len(set(times[:5])) == 1  # frames of one datagram arrived together
+            # Not ordered to the millisecond: before kernel stamps start, read times are used.
             assert begun_ns < min(times) and max(times) < time.monotonic_ns()
             status = link.status
             assert (status.state, status.frames, status.peers) == ("up", 40, 1)
@@ -111,7 +111,7 @@ def test_datagrams_over_ipv6(run: Run) -> None:
 
 
 def test_each_peer_has_its_own_splitter(run: Run) -> None:
-    """Every frame in halves, those of 100 peers by turns: all are found, and nothing is lost."""
+    """Every frame in halves, interleaved over 100 peers: all are found, and none is lost."""
 
     async def test() -> None:
         async with running("udpin:127.0.0.1:0") as (link, inbox):
@@ -164,7 +164,7 @@ def test_what_is_lost_is_handed_on_and_counted(run: Run) -> None:
 
 
 def test_a_port_scan_does_not_fill_the_memory() -> None:
-    """The peers heard last are kept: one that keeps sending is never forgotten."""
+    """The most recent peers are kept: a peer that keeps sending is never evicted."""
     inbox: list[Frame | Rejection] = []
     link = Link(url=parse_link("udpin:127.0.0.1:0"), receive=inbox.extend, now_ns=lambda: 0)
     link.take("old", frame(0)[:20])
@@ -179,7 +179,7 @@ def test_a_port_scan_does_not_fill_the_memory() -> None:
     assert [item.raw for item in inbox if isinstance(item, Frame)] == [frame(1)]
     assert len(link._peers) == PEERS_MAX
     assert link.status.peers == 2 * PEERS_MAX + 3
-    assert link.status.lost["garbage"] > 2 * PEERS_MAX  # of those given up: it is not silent
+    assert link.status.lost["garbage"] > 2 * PEERS_MAX  # of evicted peers: their bytes still count
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
@@ -197,7 +197,7 @@ def test_a_port_in_use_is_one_line(scheme: str) -> None:
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
 def test_an_address_of_another_machine_is_one_line(scheme: str) -> None:
-    url = f"{scheme}:192.0.2.1:0"  # TEST-NET-1: nobody's address
+    url = f"{scheme}:192.0.2.1:0"  # TEST-NET-1: an unassigned address
     with pytest.raises(LinkError) as caught:
         Link(url=parse_link(url), receive=lambda _: None, now_ns=lambda: 0).open()
     assert str(caught.value) == f"{url}: Cannot assign requested address"
@@ -212,7 +212,7 @@ def test_a_peer_or_a_device_that_is_away_is_no_error_at_the_start(url: str) -> N
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
 def test_the_port_is_free_again_after_a_link(run: Run, scheme: str) -> None:
-    """Also when it is the link that ends a connection: the system remembers those for a minute."""
+    """Also when the link closes a connection: the kernel remembers those for a minute."""
 
     async def test() -> None:
         url = f"{scheme}:127.0.0.1:0"
@@ -232,7 +232,7 @@ def test_the_port_is_free_again_after_a_link(run: Run, scheme: str) -> None:
 
 
 class Server:
-    """A server on loopback that hands over its connections as they come."""
+    """A server on loopback that passes on its connections as they arrive."""
 
     def __init__(self) -> None:
         self.port = 0
@@ -286,7 +286,7 @@ def test_a_stream_in_pieces(run: Run) -> None:
 
 
 def test_it_connects_again_when_the_server_goes_away(run: Run) -> None:
-    """The server stops listening and comes back; half a frame of before spoils nothing."""
+    """The server stops listening and returns; half a frame from before does no harm."""
 
     async def test() -> None:
         async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
@@ -311,7 +311,7 @@ def test_a_link_may_be_there_before_its_server(run: Run) -> None:
     async def test() -> None:
         server = Server()
         await server.start()
-        await server.stop()  # its port is known now, and nobody listens there
+        await server.stop()  # its port is known, and nothing listens there
         async with running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
             await inbox.until_said(1)
             assert inbox.texts == [f"link {link.url} is down: Connection refused; trying again"]
@@ -350,14 +350,15 @@ def test_retries_become_rare() -> None:
 
 
 def test_good_frames_in_an_unfinished_claim_are_found_when_the_peer_hangs_up(run: Run) -> None:
-    """A damaged length claims what follows; no more bytes will come, so it is looked through."""
+    """A damaged length covers the following frames; they are searched because no more bytes will
+    arrive."""
 
     async def test() -> None:
         async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
             writer = await server.connections.get()
             writer.write(damaged_length(frame(1)) + frame(2) + frame(3))
             await on_peer_gone(writer)
-            writer = await server.connections.get()  # it noticed, and is here again
+            writer = await server.connections.get()  # it noticed, and has reconnected
             writer.write(frame(4))
             await inbox.until_there_is(frame(4))
             await on_peer_gone(writer)
@@ -371,7 +372,7 @@ def test_good_frames_in_an_unfinished_claim_are_found_when_the_peer_hangs_up(run
 def test_a_peer_that_hangs_up_at_once_is_not_tried_at_full_speed(
     run: Run, monkeypatch: pytest.MonkeyPatch, greeting: bytes
 ) -> None:
-    """Only frames begin the waiting anew; and however often it answers, it is one outage."""
+    """Only frames reset the retry delay; however often it accepts, it is one outage."""
     monkeypatch.setattr(transport, "RETRY_S", (0.0, 0.0, 2 * LIMIT_S))
 
     async def test() -> None:
@@ -398,7 +399,7 @@ def test_it_says_once_that_it_is_down_and_once_that_it_is_back(
     async def test() -> None:
         async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
             writer = await server.connections.get()
-            await asyncio.sleep(0.1)  # longer than it takes to be called back, if it were
+            await asyncio.sleep(0.1)  # longer than a callback would take
             assert inbox.notices == []
             for outage in range(2):
                 await until_true(lambda: link.status.state == "up")
@@ -406,7 +407,7 @@ def test_it_says_once_that_it_is_down_and_once_that_it_is_back(
                 await on_peer_gone(writer)
                 await inbox.until_said(1 + 2 * outage)
                 assert link.status.state == "connecting"
-                await asyncio.sleep(0.05)  # several attempts, and all are refused
+                await asyncio.sleep(0.05)  # several attempts, all refused
                 await server.start()
                 writer = await server.connections.get()
                 await inbox.until_said(2 + 2 * outage)
@@ -421,7 +422,7 @@ def test_it_says_once_that_it_is_down_and_once_that_it_is_back(
 
 
 def test_a_name_is_looked_up(run: Run) -> None:
-    """Whichever of its addresses answers: here the first may be ::1, where nobody listens."""
+    """Any of its addresses may answer: here the first may be ::1, without a listener."""
 
     async def test() -> None:
         async with serving() as server, running(f"tcp:localhost:{server.port}") as (_, inbox):
@@ -438,7 +439,7 @@ def test_a_name_is_looked_up(run: Run) -> None:
 
 @contextlib.asynccontextmanager
 async def connected(link: Link, family: int = socket.AF_INET) -> AsyncIterator[socket.socket]:
-    """A connection to a link that listens."""
+    """Connect to a listening link."""
     host = "127.0.0.1" if family == socket.AF_INET else "::1"
     with socket.socket(family, socket.SOCK_STREAM) as stream:
         stream.setblocking(False)
@@ -448,7 +449,7 @@ async def connected(link: Link, family: int = socket.AF_INET) -> AsyncIterator[s
 
 @pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("[::1]", marks=needs_ipv6)])
 def test_connections_are_served_side_by_side(run: Run, host: str) -> None:
-    """Frames in halves by turns; one connection breaks off in the middle of a frame."""
+    """Interleaved half frames; one connection breaks off in the middle of a frame."""
     family = socket.AF_INET6 if host == "[::1]" else socket.AF_INET
 
     async def test() -> None:
@@ -486,7 +487,7 @@ def test_connections_are_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
                     with contextlib.suppress(ConnectionResetError):
                         assert await loop.sock_recv(third, 1) == b""
                 assert link.send(heartbeat(OURS)) == 2 and link.status.send_dropped == 0
-            await until_true(lambda: link.send(heartbeat(OURS)) == 1)  # it has seen that end
+            await until_true(lambda: link.send(heartbeat(OURS)) == 1)  # it has noticed the end
             async with connected(link) as fourth:
                 fourth.send(frame(3))
                 await inbox.until(3)
@@ -507,7 +508,7 @@ def test_the_one_peer_is_spoken_to_and_heard(run: Run, host: str) -> None:
         with senders(2, family) as (peer, stranger):
             peer.bind(address)
             async with running(f"udpout:{host}:{peer.getsockname()[1]}") as (link, inbox):
-                assert link.send(heartbeat(OURS)) == 0  # there is no socket yet: it does not wait
+                assert link.send(heartbeat(OURS)) == 0  # no socket yet: it does not wait
                 await until_true(lambda: link.status.state == "up")
                 assert link.send(heartbeat(OURS)) == 1
                 raw, ours = peer.recvfrom(1000)
@@ -528,8 +529,8 @@ def test_the_one_peer_is_spoken_to_and_heard(run: Run, host: str) -> None:
 def test_that_nobody_listens_there_is_no_lost_link(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The system answers a refusal to every datagram; none of ours is given up for it, and the
-    peer finds us, when it is back, at the port that it knows."""
+    """The kernel reports a refusal for every datagram; no message of ours is dropped for it, and a
+    returning peer finds us at the known port."""
     monkeypatch.setattr(udp, "OVERFLOW_CHECK_S", 0.01)
 
     async def test() -> None:
@@ -543,7 +544,7 @@ def test_that_nobody_listens_there_is_no_lost_link(
                 for _ in range(20):
                     assert link.send(heartbeat(OURS)) == 1
                     assert link.send(heartbeat(OURS)) == 1
-                    await asyncio.sleep(0.002)  # the loop hears the refusal as well
+                    await asyncio.sleep(0.002)  # the loop receives the refusal as well
                 link.send(heartbeat(OURS))
                 after.bind(address)
                 assert link.send(heartbeat(OURS)) == 1
@@ -559,12 +560,12 @@ def test_that_nobody_listens_there_is_no_lost_link(
     run(test())
 
 
-# --- what the system loses ----------------------------------------------------------------------
+# --- losses in the kernel -----------------------------------------------------------------------
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what a socket lost")
 def test_what_overflows_is_counted_to_the_last_datagram(run: Run) -> None:
-    """Sent while nobody reads, until far more than the buffer holds: none vanishes unseen."""
+    """Sent while nothing is read, far beyond the buffer: every lost datagram is counted."""
 
     async def test() -> None:
         made = [frame(n) for n in range(256)]
@@ -591,7 +592,9 @@ def test_the_buffer_is_sized_and_what_was_granted_is_said(run: Run) -> None:
         with senders(1) as (stock,):
             usual = stock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
         async with running("udpin:127.0.0.1:0") as (link, _):
-            granted = link.status.receive_buffer_bytes  # before it runs: a burst may wait there
+            granted = (
+                link.status.receive_buffer_bytes
+            )  # before it runs: a burst may be queued there
             await until_true(lambda: link.status.state == "up")
             assert granted is not None and usual < granted <= 2 * udp.RECEIVE_BUFFER_BYTES
         async with running("tcpin:127.0.0.1:0") as (link, _):
@@ -603,7 +606,7 @@ def test_the_buffer_is_sized_and_what_was_granted_is_said(run: Run) -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that knows")
 def test_where_the_system_does_not_say_it_is_unknown_and_not_none_lost() -> None:
-    """Of a socket that is closed, nobody can say how many datagrams it lost."""
+    """For a closed socket the number of lost datagrams is unknown."""
     with socket.socket(type=socket.SOCK_DGRAM) as sock:
         assert udp.dropped_by_system(sock) == 0
     assert udp.dropped_by_system(sock) is None
@@ -638,7 +641,7 @@ def test_what_is_heard_is_counted_by_component(run: Run) -> None:
 
 
 class Mailbox:
-    """A real peer over UDP: its own socket, and pymavlink's parser for what it is sent."""
+    """A real UDP peer: its own socket, and pymavlink's parser for received data."""
 
     def __init__(self, stack: contextlib.ExitStack) -> None:
         self.socket = stack.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
@@ -646,7 +649,7 @@ class Mailbox:
         self.socket.setblocking(False)
 
     def got(self) -> list[tuple[int, int, str]]:
-        """Version, sequence number and type of all that has come."""
+        """Return version, sequence number and type of everything received."""
         parser, found = dialect.MAVLink(None), []
         with contextlib.suppress(BlockingIOError):
             while data := self.socket.recv(1000):
@@ -658,7 +661,7 @@ class Mailbox:
 
 @pytest.mark.usefixtures("unstamped")
 def test_everybody_heard_lately_is_sent_to(run: Run) -> None:
-    """Each with sequence numbers of its own, in the version that it speaks."""
+    """Each with its own sequence numbers and in its own MAVLink version."""
 
     async def test() -> None:
         now = [0]
@@ -724,7 +727,7 @@ def test_every_connection_is_sent_to_and_a_source_over_its_own(run: Run) -> None
 
 
 def test_a_connection_that_does_not_read_loses_messages_and_no_time(run: Run) -> None:
-    """Its buffer is bounded; what it does get, when it reads again, are whole frames."""
+    """Its buffer is bounded; when it reads again, it receives whole frames only."""
 
     async def test() -> None:
         loop = asyncio.get_running_loop()
@@ -760,7 +763,7 @@ def test_a_peer_that_cannot_be_sent_to_harms_no_other(run: Run) -> None:
         with contextlib.ExitStack() as stack:
             peer = Mailbox(stack)
             async with running("udpin:127.0.0.1:0") as (link, inbox):
-                link.take(("127.0.0.1", 0), frame(1, sysid=2))  # nobody can be sent to at port 0
+                link.take(("127.0.0.1", 0), frame(1, sysid=2))  # port 0 is not a valid destination
                 peer.socket.sendto(frame(1), ("127.0.0.1", port_of(link)))
                 await inbox.until(2)
                 assert link.send(heartbeat(OURS)) == 1
@@ -771,11 +774,11 @@ def test_a_peer_that_cannot_be_sent_to_harms_no_other(run: Run) -> None:
     run(test())
 
 
-# --- the guard ----------------------------------------------------------------------------------
+# --- guard --------------------------------------------------------------------------------------
 
 
 class OddOnly:
-    """Refuses every system with an even id, and signs with a tail of its own."""
+    """Rejects every even system id, and signs with its own tail."""
 
     def __init__(self) -> None:
         self.asked: list[Frame] = []
@@ -810,7 +813,7 @@ def test_what_the_guard_refuses_is_a_rejection_and_moves_nothing(run: Run) -> No
                 assert status.lost == {"bad-signature": 2, "garbage": 1}
                 assert (status.frames, status.gaps) == (2, 0)
                 assert set(status.components) == {Source(1, 1)}
-                assert link.send(heartbeat(OURS)) == 1  # who proved nothing is not an active peer
+                assert link.send(heartbeat(OURS)) == 1  # an unauthenticated peer is not active
                 assert not link.send_to(Source(4, 1), heartbeat(OURS))
                 assert peer.socket.recv(1000).endswith(b"signed at 1234")
                 assert forger.got() == []
@@ -831,12 +834,12 @@ def test_a_link_with_a_guard_speaks_what_can_be_signed(run: Run) -> None:
     run(test())
 
 
-# --- the end, several links, and faults ---------------------------------------------------------
+# --- shutdown, several links, and defects -------------------------------------------------------
 
 
 @pytest.mark.parametrize("scheme", ["tcp", "tcpin"])
 def test_an_unfinished_frame_is_given_up_before_the_link_has_stopped(run: Run, scheme: str) -> None:
-    """Afterwards it has nothing more to say (``running`` sees to that): nobody would listen."""
+    """Afterwards it must report nothing more (``running`` checks that)."""
 
     async def test() -> None:
         async with serving() as server:
@@ -865,8 +868,8 @@ def test_an_unfinished_frame_is_given_up_before_the_link_has_stopped(run: Run, s
 def test_a_link_that_is_stopped_while_it_opens_leaves_nothing_open(
     run: Run, scheme: str, turns: int
 ) -> None:
-    """After so many turns of the loop. What is left open is a warning of Python or of uvloop;
-    as an error it would have uvloop wait for ever when it is closed, so it is only looked at."""
+    """Cancelled after so many loop iterations. Python or uvloop warns of anything left open; as an
+    error it would block uvloop's close, so warnings are only collected."""
 
     async def test() -> None:
         with socket.create_server(("127.0.0.1", 0)) as server:
@@ -902,7 +905,7 @@ def test_who_connects_while_a_link_stops_is_not_left_waiting(run: Run, turns: in
             visitor = socket.create_connection(("127.0.0.1", port_of(link)))
             for _ in range(turns):
                 await asyncio.sleep(0)
-        gc.collect()  # asyncio leaves to it what it accepts while its server closes
+        gc.collect()  # asyncio hands over connections accepted while its server closes
         with visitor:
             visitor.setblocking(False)
             with contextlib.suppress(ConnectionResetError):
@@ -932,12 +935,12 @@ def test_several_links_at_once(run: Run) -> None:
 
 
 class FaultError(Exception):
-    """A fault of the program."""
+    """A program defect."""
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin", "udpout", "tcp"])
 def test_a_fault_of_the_program_does_not_vanish(run: Run, scheme: str) -> None:
-    """What ``receive`` raises, ``run`` raises, whatever the loop would do with it."""
+    """``run`` raises what ``receive`` raises, whatever the loop would do with it."""
 
     def receive(_: list[Frame | Rejection]) -> None:
         raise FaultError

@@ -1,4 +1,4 @@
-"""Addresses of links: read and written alike, and one line about what is wrong with one."""
+"""Link URLs: parsed and formatted consistently, with one-line errors."""
 
 import pytest
 from hypothesis import example, given
@@ -147,7 +147,7 @@ def test_only_the_schemes_that_are_asked_for() -> None:
 @example("serial", "\x1e", "")
 @example("udp", "\x85", "1")
 def test_any_text_is_an_address_or_a_link_error(scheme: str, host: str, port: str) -> None:
-    """What is read is written so that it reads alike."""
+    """A parsed URL is formatted so that it parses to the same value."""
     try:
         url = parse_link(f"{scheme}:{host}:{port}")
     except LinkError as error:

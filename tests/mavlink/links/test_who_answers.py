@@ -1,4 +1,4 @@
-"""TIMESYNC answers are taken from the peer that brings a sender's positions, and from no other."""
+"""TIMESYNC answers are accepted only from the peer that delivers the sender's positions."""
 
 import pytest
 from link_support import frame
@@ -15,7 +15,7 @@ HOME, ELSEWHERE = ("10.0.0.1", 14550), ("10.0.0.66", 4000)
 
 
 class Taken:
-    """A link that is fed by hand, and what it handed on last."""
+    """A link fed by hand, and its last output."""
 
     def __init__(self) -> None:
         self.found: list[Frame | Rejection] = []
@@ -24,7 +24,7 @@ class Taken:
         self.link = Link(url=link, receive=self.found.extend, now_ns=lambda: self.now_ns)
 
     def take(self, peer: object, raw: bytes) -> Frame | Rejection:
-        """What becomes of a frame."""
+        """Return the result for a frame."""
         self.found.clear()
         self.link.take(peer, raw)
         (one,) = self.found
@@ -32,7 +32,7 @@ class Taken:
 
 
 def answer(remote_ns: int = 77_000_000_000) -> bytes:
-    """An answer of the vehicle: it takes its id from whoever packs it."""
+    """Return an answer of the vehicle, with the id of its packer."""
     message = timesync(VEHICLE, 5_000_191)
     payload = remote_ns.to_bytes(8, "little") + message.payload[8:]
     return pack(message._replace(payload=payload), 0, 2)

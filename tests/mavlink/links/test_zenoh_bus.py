@@ -1,4 +1,4 @@
-"""Zenoh sessions on loopback: what one says, the other hears; what goes wrong is said."""
+"""Zenoh sessions on loopback: samples, queries, liveliness and errors."""
 
 import asyncio
 import contextlib
@@ -25,7 +25,7 @@ pytest.importorskip("zenoh")
 
 @pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest) -> Run:
-    """``run(test())`` on one loop and on the other."""
+    """Return ``run(test())``, on each of the two event loops."""
     return runner(request.param)
 
 
@@ -41,7 +41,7 @@ async def opened(config: BusConfig) -> AsyncIterator[Bus]:
 
 @contextlib.asynccontextmanager
 async def pair() -> AsyncIterator[tuple[Bus, Bus]]:
-    """Two peers; the second connects to the first."""
+    """Open two peers; the second connects to the first."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     async with (
         opened(BusConfig(listen=(endpoint,))) as one,
@@ -51,7 +51,7 @@ async def pair() -> AsyncIterator[tuple[Bus, Bus]]:
 
 
 class Heard(list[Any]):
-    """What callbacks were called with."""
+    """Arguments of the callbacks."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -68,7 +68,7 @@ class Heard(list[Any]):
 
 
 async def joined(speaker: Bus, listener: Bus) -> None:
-    """Both know of each other: what is declared is declared, and what is put arrives."""
+    """Wait until both know each other: declarations are exchanged, and samples arrive."""
     heard = Heard()
     listener.watch("joined/*", heard.take)
     speaker.alive("joined/speaker")
@@ -80,7 +80,7 @@ def test_samples_arrive_whole_and_in_order(run: Run) -> None:
         async with pair() as (one, other):
             heard = Heard()
             one.subscribe("site/*/frames", heard.take)
-            await joined(one, other)  # the subscription went before
+            await joined(one, other)  # the subscription was sent before
             sent = [bytes([n % 256]) * (n % 50) for n in range(800)]
             for payload in sent:
                 other.put("site/b/frames", payload)
@@ -289,13 +289,15 @@ def test_whether_somebody_listens_and_who_is_near_is_known(run: Run) -> None:
             near = Heard()
             stays.neighbours(near.take)
             leaves.subscribe("site/a", lambda key, payload: None)
-            stays.subscribe("site/*", lambda key, payload: None)  # of his own nobody is asked
+            stays.subscribe(
+                "site/*", lambda key, payload: None
+            )  # a session's own subscription does not count
             await joined(leaves, stays)
             await near.until(1)
             assert stays.is_wanted("site/a") and not stays.is_wanted("site/b")
             assert stays.is_wanted("site/a", "data_high")
             await asyncio.to_thread(leaves.close)
-            while near[-1][1]:  # a busy machine may hear twice that it joined
+            while near[-1][1]:  # on a busy machine the join may be reported twice
                 await near.until(len(near) + 1)
             assert {is_joined for _, is_joined in near[:-1]} == {True}
             assert len({who for who, _ in near}) == 1
@@ -323,7 +325,7 @@ def test_who_listens_no_more_hears_nothing_and_nothing_is_sent_to_him(run: Run) 
             await others.until(1)
             assert [payload for _, payload in some] == [b"1"]
             await asyncio.to_thread(listens.close)
-            end()  # once more, after the session: nothing
+            end()  # once more, after the session: nothing is sent
 
     run(test())
 
@@ -350,10 +352,10 @@ def test_a_neighbour_that_comes_later_is_found(run: Run) -> None:
 
 
 def listening() -> dict[str, str]:
-    """Sockets of this process that take what comes: by inode, the table and the address."""
+    """Return this process's receiving sockets: by inode, the table and the address."""
     mine = set()
     for descriptor in Path("/proc/self/fd").iterdir():
-        with contextlib.suppress(OSError):  # the one that the folder was read by
+        with contextlib.suppress(OSError):  # the descriptor by which the folder was read
             mine.add(str(descriptor.readlink()))
     found = {}
     for table, state in (("tcp", "0A"), ("tcp6", "0A"), ("udp", "07"), ("udp6", "07")):
@@ -376,7 +378,7 @@ def test_unless_told_otherwise_it_listens_on_this_machine_alone(run: Run) -> Non
 
 
 def wrong_configurations(nowhere: Path) -> Iterator[tuple[BusConfig, str]]:
-    """Mistakes, and a word of what is said of each."""
+    """Return invalid configurations, and a word of each error message."""
     yield BusConfig(listen=("tpc/127.0.0.1:0",)), "tpc"
     yield BusConfig(listen=("tcp/192.0.2.1:7447",)), "192.0.2.1"
     yield BusConfig(connect=("nonsense",)), "nonsense"

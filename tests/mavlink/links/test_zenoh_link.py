@@ -1,4 +1,4 @@
-"""Raw frames over Zenoh on loopback: to and from a hub, which may go and come."""
+"""Raw frames over Zenoh on loopback: to and from a hub that may restart."""
 
 import asyncio
 import sys
@@ -18,13 +18,13 @@ pytest.importorskip("zenoh")
 
 @pytest.fixture(params=LOOPS)
 def run(request: pytest.FixtureRequest) -> Run:
-    """``run(test())`` on one loop and on the other."""
+    """Return ``run(test())``, on each of the two event loops."""
     return runner(request.param)
 
 
 @pytest.fixture
 def links() -> tuple[str, str]:
-    """A hub that listens, and a link that connects to it."""
+    """Open a listening hub and a link that connects to it."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     return f"zenoh:site/raw?as=hub&listen={endpoint}", f"zenoh:site/raw?connect={endpoint}"
 
@@ -51,7 +51,7 @@ def test_frames_go_both_ways(run: Run, links: tuple[str, str]) -> None:
 
 
 def test_nobody_listens_to_the_same_end(run: Run, links: tuple[str, str]) -> None:
-    """Two that are no hub say what neither hears; a frame then counts as not sent."""
+    """Two links without a hub do not receive each other; a frame then counts as not sent."""
 
     async def test() -> None:
         peer = links[0].replace("as=hub&", "")

@@ -1,4 +1,4 @@
-"""The lists of who may be tracked."""
+"""Allow and deny lists of UAVs."""
 
 import pytest
 

@@ -1,7 +1,7 @@
-"""One stream of reports for each aircraft, whoever relays it and in however many pieces.
+"""One stream of reports per aircraft, for any relay and any split into messages.
 
-Messages are packed by pymavlink's generated dialect. The model (``Model``) keeps every message and
-works out the answer to each from all of them.
+Messages are packed by pymavlink's generated dialect. The model (``Model``) keeps every message
+and derives each result from all of them.
 """
 
 import tracemalloc
@@ -41,7 +41,7 @@ def said(
     relay: int = 5,
     icao: int = 0x4CA7B3,
 ) -> AdsbVehicle:
-    """What a relay says at a time: ``velocity`` is course (degrees) and speed."""
+    """Return a relay's message at a time; ``velocity`` is course (degrees) and speed."""
     flags = sum(
         flag
         for flag, value in (
@@ -53,7 +53,7 @@ def said(
         )
         if value is not None
     )
-    lat, lon = at or (12.0, 34.0)  # what no flag vouches for is garbage
+    lat, lon = at or (12.0, 34.0)  # fields without their flag are garbage
     course, speed = velocity or (123.0, 45.0)
     message = dialect.MAVLink_adsb_vehicle_message(
         icao, round(lat * 1e7), round(lon * 1e7), int(datum is GEOMETRIC),
@@ -103,7 +103,7 @@ def test_what_is_not_vouched_for_stays_unknown() -> None:
 
 
 def test_who_a_rejection_is_of() -> None:
-    """A message without a position is its relay's; all others are the aircraft's."""
+    """A message without a position is attributed to its relay, all others to the aircraft."""
     aircraft = Aircraft()
     assert aircraft.merge(said(1, None, alt=9)) == Rejection(
         t_ns=EPOCH_NS + S, source="5:1", reason=Reason.NO_POSITION, msgid=ADSB_VEHICLE
@@ -156,7 +156,7 @@ def test_a_position_that_wanted_an_altitude_is_used_once_there_is_one() -> None:
 
 
 def test_a_velocity_goes_with_a_position_of_its_own_second_only() -> None:
-    """Later, the aircraft may have turned, and nothing would widen the velocity's bound."""
+    """Later the aircraft may have turned, and the velocity's bound would not include that."""
     aircraft = Aircraft()
     aircraft.merge(said(0, None, alt=500, velocity=(180, 60), climb=3))
     found = report(aircraft.merge(said(1)))
@@ -176,14 +176,14 @@ def test_horizontal_and_vertical_velocity_are_merged_apart() -> None:
 
 
 def test_a_message_s_own_fields_come_first() -> None:
-    """Even where what is known was true later."""
+    """Even where a known value is more recent."""
     aircraft = Aircraft()
     aircraft.merge(said(0.9, None, alt=500, velocity=(0, 60), climb=3))
     found = report(aircraft.merge(said(1, alt=400, velocity=(90, 50), climb=-1, tslc=1)))
     assert (found.alt_m, found.alt_age_s) == (400.0, 0.0)
     assert found.velocity_ne_mps == pytest.approx((0, 50))
     assert (found.velocity_down_mps, found.heading_deg) == pytest.approx((1.0, 90.0))
-    assert report(aircraft.merge(said(1.1, THERE))).alt_m == 500.0  # and the newer is remembered
+    assert report(aircraft.merge(said(1.1, THERE))).alt_m == 500.0  # and the newer one is kept
 
 
 def test_a_callsign_is_the_newest_one() -> None:
@@ -200,7 +200,7 @@ def test_a_callsign_is_the_newest_one() -> None:
 
 
 def test_an_aircraft_keeps_its_datum_while_that_is_fresh() -> None:
-    """Two relays, one for each datum: no altitude of the other's gets into the track."""
+    """Two relays, one per datum: no altitude of the other datum enters the track."""
     aircraft = Aircraft()
     for n in range(20):
         place = (47.4 + n / 1000, 8.5)
@@ -220,7 +220,7 @@ def test_a_datum_that_is_no_longer_said_gives_way_to_the_other() -> None:
     found = report(aircraft.merge(said(10.1, YONDER, alt=700)))
     assert (found.alt_m, found.alt_datum, found.alt_age_s) == (700.0, GEOMETRIC, 0.0)
     assert aircraft.datum(UAV) is GEOMETRIC
-    aircraft.merge(said(11, None, alt=505, datum=PRESSURE))  # it comes back: too late
+    aircraft.merge(said(11, None, alt=505, datum=PRESSURE))  # it returns too late
     assert report(aircraft.merge(said(12, (47.5, 8.5)))).alt_m == 700.0
 
 
@@ -232,7 +232,7 @@ def test_geometric_altitude_is_preferred_where_there_is_a_choice() -> None:
     assert (found.alt_m, found.alt_datum, found.alt_age_s) == (700.0, GEOMETRIC, 6.0)
     aircraft = Aircraft()
     aircraft.merge(said(0, None, alt=700))
-    found = report(aircraft.merge(said(5, alt=500, datum=PRESSURE)))  # its own is newer
+    found = report(aircraft.merge(said(5, alt=500, datum=PRESSURE)))  # its own altitude is newer
     assert (found.alt_m, found.alt_datum) == (500.0, PRESSURE)
 
 
@@ -241,7 +241,7 @@ def test_geometric_altitude_is_preferred_where_there_is_a_choice() -> None:
 
 @pytest.mark.parametrize("relay", [5, 6])
 def test_the_same_again_is_no_news_however_old_it_says_it_is(relay: int) -> None:
-    """And it makes nothing newer than it is; but the relay lives."""
+    """It does not refresh the position, but the relay counts as alive."""
     aircraft = Aircraft()
     aircraft.merge(said(0, alt=500, velocity=(0, 60)))
     for n in range(1, 100):
@@ -251,13 +251,13 @@ def test_the_same_again_is_no_news_however_old_it_says_it_is(relay: int) -> None
     aircraft = Aircraft()
     aircraft.merge(said(0, alt=500, velocity=(0, 60)))
     for n in range(1, 30):
-        again = said(n, alt=500, velocity=(0, 60), relay=relay)  # tslc does not grow
+        again = said(n, alt=500, velocity=(0, 60), relay=relay)  # tslc does not increase
         assert refused(aircraft.merge(again)) is Reason.DUPLICATE
     assert refused(aircraft.merge(said(30, THERE))) is Reason.NO_ALTITUDE
 
 
 def test_a_repeated_position_may_bring_what_was_not_said_before() -> None:
-    """True when the position was."""
+    """The new field is dated like the position."""
     aircraft = Aircraft()
     report(aircraft.merge(said(0, alt=500, datum=PRESSURE)))
     more = said(3, alt=700, velocity=(0, 60), callsign="EIN123", relay=6)
@@ -293,7 +293,7 @@ def test_a_lagging_relay_repeats_what_was_reported_long_before() -> None:
     places = [(47.4 + n / 1000, 8.5) for n in range(POSITIONS_KEPT)]
     for n, place in enumerate(places):
         report(aircraft.merge(said(n / 2, place, alt=500)))
-    for n, place in enumerate(places):  # its messages claim to be fresh
+    for n, place in enumerate(places):  # its messages claim to be new
         late = said(16 + n / 2, place, alt=500, relay=6)
         assert refused(aircraft.merge(late)) is Reason.DUPLICATE
 
@@ -323,7 +323,7 @@ def test_what_is_older_for_certain_is_out_of_order() -> None:
 
 
 def test_reports_within_the_slack_do_not_walk_back() -> None:
-    """Each half a second before the one before: the newest stays what they are measured by."""
+    """Each is half a second older than the previous one; all are compared with the newest."""
     aircraft = Aircraft()
     report(aircraft.merge(said(10, (47.4, 8.5), alt=500)))
     report(aircraft.merge(said(10.5, (47.5, 8.5), alt=500, tslc=1)))
@@ -336,7 +336,7 @@ def test_relays_newest_first() -> None:
     aircraft.merge(said(0, relay=1, alt=500))
     aircraft.merge(said(1, None, relay=2))
     aircraft.merge(said(2, relay=3, tslc=2))  # a duplicate
-    aircraft.merge(said(3, relay=4, tslc=255))  # of no use
+    aircraft.merge(said(3, relay=4, tslc=255))  # unusable
     aircraft.merge(said(4, relay=1, tslc=4))
     assert [relay.sysid for relay in aircraft.relays(UAV)] == [1, 4, 3, 2]
     aircraft.merge(said(90, THERE, relay=3, alt=500))
@@ -344,7 +344,7 @@ def test_relays_newest_first() -> None:
     assert [relay.sysid for relay in aircraft.relays(UAV)] == [3, 1, 4]
 
 
-# --- what is forgotten --------------------------------------------------------------------------
+# --- expiry -------------------------------------------------------------------------------------
 
 
 def test_without_news_for_two_minutes_it_is_forgotten() -> None:
@@ -371,7 +371,7 @@ def test_what_was_last_heard_so_long_ago_is_no_news(tslc: int) -> None:
 
 
 def test_any_number_of_aircraft_takes_so_much_memory() -> None:
-    """The longest without news goes first; one that has news stays."""
+    """The least recently updated is evicted; one with updates stays."""
     aircraft = Aircraft()
     first = said(0, alt=500, icao=1)
     template = said(0, alt=500)
@@ -415,14 +415,14 @@ def test_one_aircraft_takes_so_much_memory() -> None:
     assert kept == list(range(200 - POSITIONS_KEPT, 200))
 
 
-# --- against all that was ever said -------------------------------------------------------------
+# --- against the brute-force model --------------------------------------------------------------
 
 
 class Model:
-    """One aircraft by brute force: every message is kept, every answer worked out from all."""
+    """One aircraft by brute force: every message is kept, and each result derived from all."""
 
     def __init__(self) -> None:
-        self.learned: list[tuple[int, AdsbVehicle]] = []  # when what it says was true
+        self.learned: list[tuple[int, AdsbVehicle]] = []  # time of validity
         self.reports: list[AdsbVehicle] = []
         self.heard: list[AdsbVehicle] = []
         self.datum: AltitudeDatum | None = None
@@ -550,7 +550,7 @@ def test_every_answer_is_what_all_messages_together_say(
 
 
 def merged(log: bytes) -> tuple[list[Report], Counter[Reason], int]:
-    """Reports, rejections, and how many messages there were."""
+    """Return reports, rejections, and the number of messages."""
     aircraft, reports, lost = Aircraft(), [], Counter[Reason]()
     count = 0
     for event in read_tlog(log, "x"):
@@ -567,7 +567,7 @@ def merged(log: bytes) -> tuple[list[Report], Counter[Reason], int]:
 
 
 def test_an_airliner(shared_log: Callable[[str], bytes]) -> None:
-    """Everything of it is news, at the speed of an airliner."""
+    """Every message is new at airliner speed."""
     reports, lost, count = merged(shared_log("adsb_pymodes_real.tlog"))
     assert (len(reports) + lost.total(), count) == (933, 933)
     assert lost.total() < 10

@@ -1,4 +1,4 @@
-"""The same report counts once, whatever link it came over; two reports are two."""
+"""Duplicates: the same report counts once over any links; different reports are kept."""
 
 import tracemalloc
 
@@ -33,7 +33,7 @@ def sent(
 
 
 def test_the_same_report_over_two_links_counts_once() -> None:
-    """Every link has a sequence of its own."""
+    """Each link has its own sequence numbers."""
     dedupe = Dedupe()
     answers = []
     for n in range(50):
@@ -76,14 +76,14 @@ def test_two_reports_are_two(other: Frame) -> None:
 
 @pytest.mark.parametrize("hdg", [35_999, 255, 0])
 def test_the_same_report_in_both_versions_counts_once(hdg: int) -> None:
-    """Version 2 cuts the trailing zeros that version 1 sends: the content is the same."""
+    """MAVLink 2 truncates the trailing zeros that MAVLink 1 sends: the content is equal."""
     dedupe = Dedupe()
     assert not dedupe.is_repeat(sent(link="a", hdg=hdg))
     assert dedupe.is_repeat(sent(link="b", hdg=hdg, v1=True))
 
 
 def test_the_window() -> None:
-    """Counted from the report that was new, so that what is repeated for ever comes through."""
+    """Counted from the first copy, so that a report repeated forever is accepted again."""
     dedupe = Dedupe()
     assert not dedupe.is_repeat(sent(EPOCH_NS))
     assert dedupe.is_repeat(sent(EPOCH_NS + WINDOW_NS // 2))
@@ -106,7 +106,7 @@ def test_memory_is_that_of_one_window() -> None:
                 sizes.append(tracemalloc.get_traced_memory()[0])
     finally:
         tracemalloc.stop()
-    assert sizes[0] > per_window * 30  # it does remember the window
+    assert sizes[0] > per_window * 30  # the window is remembered
     assert sizes[1] < 1.2 * sizes[0]
 
 
@@ -121,7 +121,7 @@ def test_links_without_end_are_not_all_counted() -> None:
 
 
 def test_which_link_was_first_and_how_late_each_is() -> None:
-    """Link b brings all that a brings 40 ms later, and every tenth that a lost."""
+    """Link b delivers everything of a 40 ms later, and every tenth frame that a lost."""
     dedupe = Dedupe()
     for n in range(100):
         t_ns = EPOCH_NS + n * S // 10

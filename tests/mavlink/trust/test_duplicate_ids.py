@@ -1,4 +1,4 @@
-"""One id from two peers: whether they tell of one vehicle. The adversary copies clock and path."""
+"""One id from two peers: one vehicle or two. The adversary copies clock and path."""
 
 import math
 import random
@@ -24,7 +24,7 @@ HOME, OTHER = "10.0.0.1:14550", "10.0.0.66:4000"
 
 
 class Place(NamedTuple):
-    """Where a vehicle is, m north and east of a place, and its velocity."""
+    """Position of a vehicle, in m north and east of an origin, and its velocity."""
 
     north_m: float
     east_m: float
@@ -33,7 +33,7 @@ class Place(NamedTuple):
 
 
 def circle(t_s: float) -> Place:
-    """20 m/s, 60 m wide: 13 m/s² to its middle, more than most can."""
+    """20 m/s, 60 m wide: 13 m/s² of centripetal acceleration, more than most can fly."""
     angle, speed = t_s / 3, 20.0
     return Place(
         north_m=60 * math.cos(angle),
@@ -58,11 +58,11 @@ def report(t_ns: int, boot_s: float, place: Place, sysid: int = 1) -> Frame:
 
 
 Stream = Iterable[tuple[float, float, str, Place]]
-"""When it arrives, what its clock says, who brings it, where it says to be."""
+"""Arrival time, clock, delivering peer and claimed position."""
 
 
 def refused(judge: DuplicateIds, *streams: Stream) -> dict[str, list[float]]:
-    """When something of each peer was refused, of streams that come together."""
+    """Return the times of rejections per peer, for interleaved streams."""
     found: dict[str, list[float]] = {HOME: [], OTHER: []}
     for arrives_s, boot_s, peer, place in sorted(one for stream in streams for one in stream):
         if judge.rejects(LINK, peer, report(round(arrives_s * S), boot_s, place)):
@@ -216,7 +216,9 @@ def test_ids_and_addresses_without_end_take_no_memory(monkeypatch: pytest.Monkey
 def test_what_is_held_against_what_is_found_from_the_newest_on(
     stamps: set[int], boot_ms: int, later_ms: int
 ) -> None:
-    """A report is near the end of a path: that all of it need not be looked at changes nothing."""
+    """A report lies near the end of a path; searching backwards from there gives the same
+    result.
+    """
 
     def said(stamp_ms: int) -> OwnPosition:
         return OwnPosition(

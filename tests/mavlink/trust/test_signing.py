@@ -1,5 +1,5 @@
-"""Signatures against pymavlink's generated dialect and hashlib written out; the rules of timestamps
-against brute force; crashes against all that was ever taken or sent."""
+"""Signatures against pymavlink's dialect and hashlib; timestamp rules against brute force; crashes
+against the full history of accepted and sent frames."""
 
 import hashlib
 import struct
@@ -26,7 +26,7 @@ from companion.values import Frame, Reason, Source
 KEY = hashlib.sha256(b"correct horse").digest()
 OTHER_KEY = hashlib.sha256(b"battery staple").digest()
 S = 1_000_000_000
-UNITS = 100_000  # of a timestamp in a second
+UNITS = 100_000  # timestamp units per second
 NOW_NS = 1_790_000_000 * S
 NOW = (1_790_000_000 - 1_420_070_400) * UNITS
 OURS = Source(5, 191)
@@ -43,7 +43,7 @@ def position(boot_ms: int = 0) -> object:
 
 
 def vehicle(key: bytes | None, stamp: int, link_id: int = 0, sysid: int = 1) -> dialect.MAVLink:
-    """pymavlink's end of a link: it signs what it sends and takes only what is signed."""
+    """Return pymavlink's end of a link: it signs its frames and accepts only signed ones."""
     mav = dialect.MAVLink(None, sysid, 1)
     mav.signing.secret_key = key
     mav.signing.timestamp = stamp
@@ -53,7 +53,7 @@ def vehicle(key: bytes | None, stamp: int, link_id: int = 0, sysid: int = 1) -> 
 
 
 def framed(raw: bytes, t_ns: int = NOW_NS) -> Frame:
-    """What a link makes of these bytes."""
+    """Return the frame that a link makes of these bytes."""
     (item,) = Splitter("a").feed(t_ns, raw)
     assert isinstance(item, Frame)
     return item
@@ -67,7 +67,7 @@ def sent(
     t_ns: int = NOW_NS,
     payload: bytes = bytes(27) + b"\1",
 ) -> Frame:
-    """A signed GLOBAL_POSITION_INT, made by hand."""
+    """Return a hand-made signed GLOBAL_POSITION_INT."""
     sysid, compid, link_id = stream
     raw = b"\xfd" + bytes([len(payload), 1, 0, 7, sysid, compid, 33, 0, 0]) + payload
     crc = dialect.x25crc(raw[1:] + bytes([104])).crc
@@ -102,7 +102,7 @@ def test_what_pymavlink_signs_is_taken(link_id: int) -> None:
 
 
 def test_what_we_sign_is_what_pymavlink_signs() -> None:
-    """Byte for byte, with each message that the service sends; and its parser takes it."""
+    """Byte-identical for each message of the service, and accepted by pymavlink's parser."""
     listener = vehicle(KEY, NOW)
     ours = guard(link_id=3)
     messages = (
@@ -142,7 +142,7 @@ def test_a_flipped_bit_anywhere(allow_unsigned: bool) -> None:
     for bit in range(8 * len(good)):
         raw = bytearray(good)
         raw[bit // 8] ^= 1 << bit % 8
-        if not allow_unsigned:  # whether or not the checksum was looked at
+        if not allow_unsigned:  # with or without a checksum test
             assert (
                 ours.refusal(
                     Frame(t_ns=NOW_NS, link="a", source=Source(1, 1), msgid=33, raw=bytes(raw))
@@ -162,13 +162,13 @@ def test_a_flipped_bit_anywhere(allow_unsigned: bool) -> None:
 
 def unsigned(*, v1: bool, seq: int = 0) -> Frame:
     mav = vehicle(None, 0)
-    mav.seq = seq  # where version 1 has it, version 2 has the flag of a signature
+    mav.seq = seq  # at this position of a version 1 frame, version 2 has the signature flag
     return framed(bytes(position().pack(mav, force_mavlink1=v1)))  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("v1", [False, True])
 def test_unsigned_frames_are_refused_whatever_came_before(v1: bool) -> None:
-    """pymavlink's mavutil makes a new parser on the first MAVLink 2 byte after MAVLink 1, and
+    """pymavlink's mavutil creates a new parser on the first MAVLink 2 byte after MAVLink 1, and
     that one has no key."""
     ours = guard()
     for n in range(3):
@@ -203,8 +203,8 @@ def test_nobody_changes_the_key_over_the_air() -> None:
 
 
 def test_a_refused_frame_moves_nothing() -> None:
-    """Whoever has no key must not shut a stream: pymavlink notes the timestamp of a frame before
-    it looks at the signature, and from then on takes no frame of that sender."""
+    """A sender without the key must not block a stream. pymavlink stores the timestamp before it
+    checks the signature, and then rejects every frame of that sender."""
     ours = guard()
     assert ours.refusal(sent(NOW)) is None
     before, moves = ours.state(NOW_NS), ours.moves
@@ -229,7 +229,7 @@ def test_a_newcomer_is_at_most_a_minute_behind_the_own_clock() -> None:
 def test_a_newcomer_is_at_most_a_minute_behind_what_was_taken() -> None:
     ours = guard()
     assert ours.refusal(sent(NOW + 100 * UNITS)) is None
-    newcomer = (1, 1, 1)  # the same sender over another of its links
+    newcomer = (1, 1, 1)  # the same sender over another link id
     assert ours.refusal(sent(NOW + 40 * UNITS - 1, stream=newcomer)) is Reason.REPLAYED
     assert ours.refusal(sent(NOW + 40 * UNITS, stream=newcomer)) is None
 
@@ -256,7 +256,7 @@ def test_a_wrong_clock_shuts_out_newcomers_until_they_hear_us() -> None:
         return framed(bytes(position().pack(newcomer)))  # type: ignore[attr-defined]
 
     assert ours.refusal(report()) is Reason.REPLAYED
-    assert guard().refusal(report()) is None  # another link does not notice
+    assert guard().refusal(report()) is None  # another link is unaffected
     newcomer.parse_buffer(ours.sign(encode.pack(encode.heartbeat(OURS), 0), NOW_NS))
     assert ours.refusal(report()) is None
 
@@ -403,13 +403,13 @@ def test_sequences_by_brute_force(sequence: list[tuple]) -> None:  # type: ignor
 
 # --- crashes ------------------------------------------------------------------------------------
 
-KNOWN = {(1, 1, 0): 0, (2, 1, 0): -3600, (3, 1, 0): 7200}  # s by which their clocks are ahead
+KNOWN = {(1, 1, 0): 0, (2, 1, 0): -3600, (3, 1, 0): 7200}  # seconds by which their clocks are ahead
 KNOWN_AT = {stream: (NOW + (ahead - 1) * UNITS, ahead * UNITS) for stream, ahead in KNOWN.items()}
 NEW = {(4, 1, 0): 0, (5, 1, 0): -50}
 
 
 class Run:
-    """A guard with its disk: saved every second, on the disk ``write_s`` later."""
+    """A guard with its disk: saved every second, written ``write_s`` later."""
 
     def __init__(self, write_s: int) -> None:
         self.now_ns = NOW_NS
@@ -498,7 +498,7 @@ def test_a_stream_that_was_silent_and_is_heard_in_the_last_second(silent_s: int)
     run = Run(0)
     run.wait(silent_s * 1000 + 500)
     assert run.hear((1, 1, 0), 0) is None
-    run.crash(0)  # replays all that was taken
+    run.crash(0)  # replays every accepted frame
     run.wait(6000)
     assert run.hear((1, 1, 0), 0) is None
 
@@ -506,14 +506,14 @@ def test_a_stream_that_was_silent_and_is_heard_in_the_last_second(silent_s: int)
 def test_our_frames_of_the_last_second_that_followed_a_clock_ahead() -> None:
     run = Run(0)
     run.wait(60_500)
-    assert run.hear((3, 1, 0), 0) is None  # ahead, and silent for a minute before
+    assert run.hear((3, 1, 0), 0) is None  # ahead, after a minute of silence
     run.send()
     run.crash(0)
     run.send()
 
 
 def test_a_burst_of_our_own_in_the_last_second() -> None:
-    """After a crash we are ahead of the clock, and each frame takes one unit."""
+    """After a crash own timestamps are ahead of the clock, and each frame takes one unit."""
     run = Run(0)
     for _ in range(3):
         run.wait(100)
@@ -524,7 +524,7 @@ def test_a_burst_of_our_own_in_the_last_second() -> None:
 
 @pytest.mark.parametrize("crashed", [False, True])
 def test_a_clock_that_stands_a_day_back_at_the_next_start(crashed: bool) -> None:
-    """A small computer without a battery for its clock: the stored timestamp holds."""
+    """A small computer without a clock battery: the stored timestamp is used."""
     first = guard()
     assert first.refusal(sent(NOW + 1)) is None
     state = first.state(NOW_NS)
@@ -541,7 +541,7 @@ def test_a_clock_that_stands_a_day_back_at_the_next_start(crashed: bool) -> None
 
 
 def test_the_own_clock_counts_for_the_next_run() -> None:
-    """Where nothing was heard and nothing sent."""
+    """Without any received or sent frame."""
     ours = guard(state=guard().state(NOW_NS))
     back_ns = NOW_NS - 86_400 * S
     assert ours.refusal(sent(NOW - 60 * UNITS - 1, t_ns=back_ns)) is Reason.REPLAYED
@@ -550,7 +550,7 @@ def test_the_own_clock_counts_for_the_next_run() -> None:
 
 @pytest.mark.parametrize("ahead_s", [0, 7200])
 def test_crash_after_crash_does_not_add_up(ahead_s: int) -> None:
-    """Neither for ourselves, who may follow a clock that is ahead, nor for others."""
+    """Neither for own timestamps, which may follow a clock ahead, nor for others."""
     run = Run(0)
     if not ahead_s:
         streams = {stream: KNOWN_AT[stream] for stream in KNOWN if KNOWN[stream] <= 0}
@@ -563,4 +563,4 @@ def test_crash_after_crash_does_not_add_up(ahead_s: int) -> None:
     assert run.stamps[-1] < units(run.now_ns) + (ahead_s + 6) * UNITS
     run.wait(6000)
     assert [run.hear(stream, 0) for stream in KNOWN if KNOWN[stream] <= 0] == [None] * 2
-    assert run.hear((4, 1, 0), 0) is (Reason.REPLAYED if ahead_s else None)  # a newcomer
+    assert run.hear((4, 1, 0), 0) is (Reason.REPLAYED if ahead_s else None)  # a new stream

@@ -1,4 +1,4 @@
-"""A component that says that it is there, measures clocks, and notices another of its name."""
+"""The service's own component: heartbeats, TIMESYNC, and detection of a duplicate id."""
 
 import random
 import struct
@@ -24,7 +24,7 @@ S = 1_000_000_000
 EPOCH_NS = 1_790_000_000 * S
 OURS, CARRIER, UAV, GCS = Source(5, 191), Source(5, 1), Source(3, 1), Source(255, 190)
 BOOT_NS = EPOCH_NS - 1000 * S
-"""When the UAV was started, on the node's timeline."""
+"""Boot time of the UAV on the node timeline."""
 TIMESYNC, HEARTBEAT = 111, 0
 
 Said = list[RoundTrip | Rejection | Notice]
@@ -61,13 +61,13 @@ def answer(t_ns: int, sent_ns: int, remote_ns: int, source: Source = UAV) -> Fra
 
 
 def addressed(t_ns: int, sent_ns: int, remote_ns: int, target: Source) -> Frame:
-    """As newer programs answer: the dialect at hand has no target fields yet."""
+    """Answer as newer programs do: the present dialect has no target fields yet."""
     payload = struct.pack("<qqBB", remote_ns, sent_ns, *target)
     return echo(t_ns, Outgoing(UAV, TIMESYNC, payload))
 
 
 def heard(node: ServiceComponent, one: Frame) -> Said:
-    """What comes of a frame once nothing can contradict it any more."""
+    """Return the outputs for a frame once nothing can contradict it any more."""
     settled = dialect.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
     return node.hear(one) + node.hear(frame(one.t_ns + HELD_NS, GCS, settled))
 
@@ -77,7 +77,7 @@ def ticks(start_ns: int, seconds: float, every_ms: int = 100) -> Iterator[int]:
 
 
 def request(node: ServiceComponent, now_ns: int) -> int:
-    """``ts1`` of the TIMESYNC request that is due now."""
+    """Return ``ts1`` of the TIMESYNC request that is due now."""
     (sent,) = (m for m, _ in node.due(now_ns, False, []) if m.msgid == TIMESYNC)
     (message,) = dialect.MAVLink(None).parse_buffer(pack(sent, 0))
     assert message.tc1 == 0
@@ -154,7 +154,7 @@ def test_a_stall_is_not_caught_up_with() -> None:
 @settings(max_examples=examples(100), deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3000), st.booleans()), max_size=60))
 def test_never_while_unfit_and_never_closer_than_a_second(steps: list[tuple[int, bool]]) -> None:
-    """And always with the id that it was given; at once, where a second has passed."""
+    """Always with its own id, and at once if a second has passed."""
     node, now_ns, last_ns = component(), EPOCH_NS, 0
     for gap_ms, fit in steps:
         now_ns += gap_ms * MS
@@ -244,7 +244,7 @@ def test_the_first_of_two_answers_counts_and_each_source_has_its_own() -> None:
 def test_of_two_answers_that_contradict_each_other_neither_is_used(
     forged_first: bool, off_ms: int
 ) -> None:
-    """The true one took 50 ms; the other comes from its own address, and none is early."""
+    """The true answer took 50 ms; the other comes from its own address, and neither is early."""
     node, said = component(), []
     for number in range(3):
         now_ns = EPOCH_NS + number * 5 * S
@@ -284,8 +284,8 @@ def test_one_that_contradicts_long_after_is_refused_alone() -> None:
         (939 * S, False),
         (-1000 * S, False),
         (EPOCH_NS, False),
-        (1000 * S + (1 << 32) * MS, True),  # the milliseconds of its positions wrap
-        (1000 * S + (1 << 32) * MS * 100, False),  # no uptime
+        (1000 * S + (1 << 32) * MS, True),  # the position stamps in ms wrap
+        (1000 * S + (1 << 32) * MS * 100, False),  # not an uptime
     ],
 )
 def test_only_the_clock_of_its_positions_counts(remote_ns: int, good: bool) -> None:
@@ -297,7 +297,7 @@ def test_only_the_clock_of_its_positions_counts(remote_ns: int, good: bool) -> N
     if isinstance(said, Rejection):
         assert (said.reason, said.source) == (Reason.UNPLACED_STAMP, "3:1")
         good_one = answer(EPOCH_NS + MS, sent_ns, 1000 * S)
-        assert isinstance(heard(node, good_one)[0], RoundTrip)  # that one did not count
+        assert isinstance(heard(node, good_one)[0], RoundTrip)  # that one was not used
 
 
 def test_the_stamp_is_taken_on_to_the_answer() -> None:
@@ -310,7 +310,7 @@ def test_the_stamp_is_taken_on_to_the_answer() -> None:
 
 
 def test_who_sends_no_position_has_no_clock_here() -> None:
-    """A ground station answers too, with its Unix time."""
+    """A ground station answers too, with Unix time."""
     node = component()
     sent_ns = request(node, EPOCH_NS)
     assert heard(node, answer(EPOCH_NS + MS, sent_ns, EPOCH_NS, GCS)) == []
@@ -341,7 +341,7 @@ def test_an_attitude_gives_the_clock_as_well() -> None:
 def test_the_true_offset_is_in_every_round_trip(
     sub_ns: int, ways: list[tuple[int, int, int]]
 ) -> None:
-    """However long the ways, over one link or two, and whenever it is really sent."""
+    """For any latencies, over one link or two, and any actual sending time."""
     node, trips = component(), []
     for n, (out_ms, home_ms, links) in enumerate(ways):
         now_ns = EPOCH_NS + sub_ns + n * 10 * S
@@ -361,7 +361,7 @@ def test_the_true_offset_is_in_every_round_trip(
 
 
 def test_round_trips_are_what_a_clock_needs() -> None:
-    """Together with ``SenderClock``: the constant part of the latency is found."""
+    """Combined with ``SenderClock``: the constant part of the latency is measured."""
     node, clock, rng = component(), SenderClock(), random.Random(3)
     for t_ns in ticks(EPOCH_NS, 30):
         seen = position(t_ns)
@@ -381,7 +381,7 @@ def test_round_trips_are_what_a_clock_needs() -> None:
     assert known.uncertainty_s < 0.03
 
 
-# --- another one of our name --------------------------------------------------------------------
+# --- duplicate own id ---------------------------------------------------------------------------
 
 
 def test_someone_else_with_our_id_is_told_of_once_and_again_later() -> None:
@@ -415,7 +415,7 @@ def test_anything_that_we_did_not_send(message: Any) -> None:
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_our_own_frames_may_come_back(version: int) -> None:
-    """A router sends them on, under other sequence numbers, perhaps in the other version."""
+    """A router forwards them with other sequence numbers, perhaps in the other version."""
     node = component(position_hz=5.0)
     node.due(EPOCH_NS, True, [UAV])
     kinds = set()
@@ -440,7 +440,7 @@ def test_a_heartbeat_like_ours_long_after_our_last_is_another_s() -> None:
     pytest.fail("nothing was said")
 
 
-# --- whatever comes -----------------------------------------------------------------------------
+# --- arbitrary input ----------------------------------------------------------------------------
 
 
 @settings(max_examples=examples(300), deadline=None)
@@ -451,7 +451,7 @@ def test_a_heartbeat_like_ours_long_after_our_last_is_another_s() -> None:
     st.booleans(),
 )
 def test_any_content_is_survived(msgid: int, payload: bytes, sysid: int, ours: bool) -> None:
-    """Infinities, numbers that are none, fields cut off or beyond the end."""
+    """Infinities, NaN, truncated fields and fields beyond the end."""
     node = component(position_hz=5.0, carrier=CARRIER, attitude_hz=5.0)
     node.due(EPOCH_NS, True, [UAV])
     source = OURS if ours else Source(sysid, 1)

@@ -1,4 +1,5 @@
-"""Rates are asked for, watched and not fought over: against autopilots played by pymavlink."""
+"""Message rates: requested, monitored and not fought over, against autopilots simulated with
+pymavlink."""
 
 import math
 import random
@@ -31,10 +32,10 @@ STEP_MS = 50
 
 
 class Autopilot:
-    """pymavlink's generated dialect as a vehicle: it sends, obeys and answers.
+    """A vehicle in pymavlink's generated dialect: it sends, obeys and acknowledges.
 
-    ``results``: what it answers SET_MESSAGE_INTERVAL with, one after the other, the last for ever;
-    None loses the request. ``streams``: whether it does REQUEST_DATA_STREAM.
+    ``results``: acknowledgements of SET_MESSAGE_INTERVAL in order, the last one repeating; None
+    loses the request. ``streams``: whether it supports REQUEST_DATA_STREAM.
     """
 
     def __init__(
@@ -56,7 +57,7 @@ class Autopilot:
         self._next_ns = {POSITION: 0, ATTITUDE: 0, 0: 0}
 
     def send(self, now_ns: int) -> list[bytes]:
-        """What is due: a heartbeat a second, and the messages at their rates."""
+        """Return due messages: a heartbeat per second, and the messages at their rates."""
         boot_ms = (now_ns - self.boot_ns) // MS
         made = {
             0: dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3),
@@ -75,7 +76,7 @@ class Autopilot:
         return out
 
     def obey(self, raw: bytes) -> list[bytes]:
-        """A request of anyone, if it is for this one, and the answer to it."""
+        """Handle a request addressed to this vehicle, and return the acknowledgement."""
         (message,) = dialect.MAVLink(None).parse_buffer(raw)
         kind = message.get_type()
         if kind not in ("COMMAND_LONG", "REQUEST_DATA_STREAM"):
@@ -108,7 +109,7 @@ class Autopilot:
 
 
 Link = Callable[[int, bytes], list[tuple[int, bytes]]]
-"""A frame sent at a time, to when its copies arrive."""
+"""Maps a frame sent at a time to the arrivals of its copies."""
 
 
 class World:
@@ -151,7 +152,7 @@ class World:
                     self._to_all(pack(message, 0))
 
     def say(self, message: Any, by: Source = GCS) -> None:
-        """Someone else sends, and all hear it."""
+        """Another component sends, and all receive it."""
         raw = bytes(message.pack(dialect.MAVLink(None, *by)))
         self._to_us([raw])
         self._to_all(raw)
@@ -161,7 +162,7 @@ class World:
         return found
 
     def gaps_s(self) -> list[float]:
-        """Times between requests, in seconds."""
+        """Return the times between requests, in seconds."""
         return [(b - a) / S for (a, *_), (b, *_) in pairwise(self.requests)]
 
     def _to_all(self, raw: bytes) -> None:
@@ -187,7 +188,7 @@ def set_interval(hz: float, msgid: int = POSITION, target: Source = UAV) -> Any:
     )
 
 
-# --- asking -------------------------------------------------------------------------------------
+# --- requests -----------------------------------------------------------------------------------
 
 
 def test_a_slow_uav_is_asked_once_and_obeys() -> None:
@@ -259,7 +260,7 @@ def test_a_message_that_never_came_is_asked_for() -> None:
     assert carrier.hz[POSITION] == 0.0
 
 
-# --- answers ------------------------------------------------------------------------------------
+# --- acknowledgements ---------------------------------------------------------------------------
 
 
 def test_what_is_lost_is_sent_again_and_says_so() -> None:
@@ -377,7 +378,8 @@ def test_one_that_agrees_and_does_nothing_is_not_flooded() -> None:
 
 
 def test_answers_to_others_are_not_ours() -> None:
-    """An answer says whose it is; what it says of another command, or from another, is nothing."""
+    """An acknowledgement to another component, of another command or from another sender is
+    ignored."""
     uav = Autopilot(results=(None,))
     world = World(uav)
     while not world.requests:
@@ -389,7 +391,7 @@ def test_answers_to_others_are_not_ours() -> None:
     world.say(dialect.MAVLink_command_ack_message(511, denied, 0, 0, *OURS), Source(3, 154))
     world.run(12)
     assert [m.get_type() for m in uav.received] == ["COMMAND_LONG"] * 3
-    world.say(dialect.MAVLink_command_ack_message(511, denied), UAV)  # as version 1 has it
+    world.say(dialect.MAVLink_command_ack_message(511, denied), UAV)  # in version 1 form
     world.run(0.5)
     world.say(dialect.MAVLink_command_ack_message(511, dialect.MAV_RESULT_ACCEPTED), UAV)
     world.run(6)
@@ -397,7 +399,7 @@ def test_answers_to_others_are_not_ours() -> None:
 
 
 def test_one_command_at_a_time_for_a_uav() -> None:
-    """An answer does not say which message it is about."""
+    """An acknowledgement does not name the message that it concerns."""
     carrier = Autopilot(source=CARRIER, results=(None,))
     world = World(carrier, carrier=CARRIER, attitude_hz=5.0)
     world.run(40)
@@ -516,7 +518,7 @@ def test_one_whom_we_have_overruled_is_not_named_for_the_next_change() -> None:
 
 
 def test_order_that_is_broken_off_is_no_long_order() -> None:
-    """A rate that goes up and down by itself is not asked for any more often."""
+    """A rate that fluctuates by itself does not cause more requests."""
     uav = Autopilot(results=(None,), streams=False)
     world = World(uav)
     for _ in range(12):
@@ -591,7 +593,7 @@ def test_after_long_order_the_backoff_begins_anew_and_it_is_said_again() -> None
 
 
 def radio(seed: int, loss: float, burst_s: float, jitter_s: float, copies: int = 1) -> Link:
-    """A link that loses, delivers in bursts, reorders and repeats."""
+    """Return a link that loses, bursts, reorders and repeats frames."""
     rng = random.Random(seed)
 
     def carry(t_ns: int, raw: bytes) -> list[tuple[int, bytes]]:
@@ -612,7 +614,7 @@ def test_what_the_link_does_is_no_reason_to_ask(
 ) -> None:
     world = World(Autopilot(hz=5.0), link=radio(1, loss, burst_s, jitter_s, copies=2))
     world.run(120)
-    assert len(world.requests) <= (2 if loss else 0)  # once in a while most of a dozen is lost
+    assert len(world.requests) <= (2 if loss else 0)  # occasionally most of a dozen are lost
     assert world.rate().observed_hz is not None
 
 
@@ -639,7 +641,7 @@ def test_a_uav_that_is_gone_is_not_asked_and_then_forgotten() -> None:
 
 
 def test_a_fleet_is_asked_in_turn_and_not_all_at_once() -> None:
-    """Whoever waits longest comes first, and there are five a second at most."""
+    """The longest waiting UAV comes first, with at most five requests per second."""
     fleet = [
         Autopilot(source=Source(n, 1), results=(None,), streams=False) for n in range(100, 160)
     ]
@@ -652,7 +654,7 @@ def test_a_fleet_is_asked_in_turn_and_not_all_at_once() -> None:
     assert len({to for *_, to in world.requests[60:120]}) == 60
 
 
-# --- whatever is heard --------------------------------------------------------------------------
+# --- arbitrary input ----------------------------------------------------------------------------
 
 NUMBERS = st.integers(0, 3)
 EVENTS = st.one_of(
@@ -668,8 +670,8 @@ EVENTS = st.one_of(
 @settings(max_examples=examples(25), deadline=None)
 @given(st.lists(EVENTS, max_size=40))
 def test_whatever_is_heard_there_are_never_more_requests_than_allowed(events: list[Any]) -> None:
-    """Per message never within 5 s, in total at most 5 a second, and hundreds of seconds of
-    nothing but slow rates bring no more than the back-off lets through."""
+    """Per message at least 5 s apart, in total at most 5 per second; hundreds of seconds of slow
+    rates cause no more than the back-off allows."""
     uavs = [CARRIER, UAV, Source(4, 1), Source(6, 1)]
     rates, now_ns = (
         MessageRates(source=OURS, carrier=CARRIER, position_hz=1.0, attitude_hz=20.0),

@@ -1,4 +1,4 @@
-"""``aircraft.json``: what is in it, what is new in it, and what is no such document."""
+"""``aircraft.json``: its content, new positions in it, and invalid documents."""
 
 import json
 from typing import Any
@@ -12,7 +12,7 @@ from companion.mavlink.wire.aircraft_json import AIRCRAFT_MAX, DOCUMENT_MAX, Air
 from companion.mavlink.wire.decode import decode
 from companion.values import AdsbVehicle, AltitudeDatum, Frame, Reason, Rejection
 
-# An aircraft as ADS-B Exchange, which runs readsb, gives it.
+# An aircraft as published by ADS-B Exchange, which runs readsb.
 ONE: dict[str, Any] = {
     "hex": "a2fcf2", "type": "adsb_icao", "flight": "ASA541  ", "alt_baro": 5400, "alt_geom": 5650,
     "gs": 250, "track": 0.69, "baro_rate": -960, "squawk": "3766", "category": "A3",
@@ -79,7 +79,7 @@ def test_only_news_is_handed_on() -> None:
     assert poll.feed(2, document(ONE | {"seen_pos": 0.2}, now=100.0)) == []  # the same document
     assert poll.feed(3, document(ONE | {"seen_pos": 1.5}, now=101.0)) == []  # the same position
     assert len(poll.feed(4, document(ONE | {"seen_pos": 0.1}, now=102.0))) == 1
-    assert len(poll.feed(5, document(ONE, now=5.0))) == 1  # the server's clock was set
+    assert len(poll.feed(5, document(ONE, now=5.0))) == 1  # the server's clock was changed
 
 
 @pytest.mark.parametrize(

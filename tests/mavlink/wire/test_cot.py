@@ -1,4 +1,4 @@
-"""Cursor on Target: XML and TAK's protobuf as takproto has them, on a link, and what is neither."""
+"""Cursor on Target: XML and TAK protobuf as takproto encodes them, on a link, and invalid input."""
 
 import math
 import time
@@ -197,7 +197,7 @@ def test_events_without_an_end_take_no_memory_and_no_time(piece: bytes) -> None:
     for _ in range(100):
         splitter.feed(7, piece * 500)
         assert len(splitter._pending) <= EVENT_MAX + len(piece) * 500
-    assert time.process_time() - began_s < 10  # it is linear: tenths of a second
+    assert time.process_time() - began_s < 10  # linear: tenths of a second
     found = splitter.feed(7, b"</event>" * 2 + XML)
     assert isinstance(found[0], Frame | Rejection)
 

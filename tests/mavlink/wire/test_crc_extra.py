@@ -1,4 +1,4 @@
-"""The table of checksum seeds is that of pymavlink's dialect."""
+"""The checksum seeds are those of pymavlink's dialect."""
 
 from pymavlink.dialects.v20 import all as dialect
 
@@ -6,7 +6,7 @@ from companion.mavlink.wire.crc_extra import CRC_EXTRA, LONGEST
 
 
 def as_source(table: dict[int, int], width: int = 100) -> str:
-    """The table as it stands in ``messages.py``."""
+    """Return the table as written in ``messages.py``."""
     lines, line = ["CRC_EXTRA: dict[int, int] = {"], "   "
     for msgid, seed in sorted(table.items()):
         entry = f" {msgid}: {seed},"

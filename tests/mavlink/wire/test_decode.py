@@ -1,4 +1,4 @@
-"""Field values equal pymavlink's; every field is None exactly when nobody vouches for it."""
+"""Decoded fields equal pymavlink's; a field is None exactly if it is not marked as valid."""
 
 import math
 import struct
@@ -43,12 +43,12 @@ def as_frame(raw: bytes) -> Frame:
 
 
 def sent(message: dialect.MAVLink_message) -> Frame:
-    """The message as pymavlink sends it over MAVLink 2, trailing zeros cut."""
+    """Return the message as pymavlink sends it over MAVLink 2, with trailing zeros truncated."""
     return as_frame(bytes(message.pack(dialect.MAVLink(None, 7, 3))))
 
 
 def sent_v1(message: dialect.MAVLink_message, size: int) -> Frame:
-    """The message over MAVLink 1: its first ``size`` bytes, without the extension fields.
+    """Return the message over MAVLink 1: its first ``size`` bytes, without extension fields.
 
     (pymavlink packs the extensions into version 1 as well.)
     """
@@ -125,7 +125,7 @@ def traffic(frame: Frame) -> AdsbVehicle:
 
 
 def rejected(frame: Frame) -> Reason:
-    """Why, after checking that the rejection says of whom and of what it is."""
+    """Return the reason, after checking the rejection's source and message id."""
     found = decode(frame)
     assert isinstance(found, Rejection), found
     assert (found.t_ns, found.source, found.count) == (T_NS, "7:3", 1)
@@ -133,11 +133,11 @@ def rejected(frame: Frame) -> Reason:
     return found.reason
 
 
-# --- the whole cut against pymavlink ------------------------------------------------------------
+# --- whole log against pymavlink ----------------------------------------------------------------
 
 
 def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None:
-    """The value in exact decimal units of pymavlink's fields."""
+    """Return pymavlink's field value in exact decimal units."""
     source = Source(m.get_srcSystem(), m.get_srcComponent())
     match m.get_type():
         case "HEARTBEAT":
@@ -217,7 +217,7 @@ def assert_same(found: object, wanted: object) -> None:
     for name in getattr(wanted, "__dataclass_fields__", {}):
         have, want = getattr(found, name), getattr(wanted, name)
         if isinstance(want, float) or (isinstance(want, tuple) and not isinstance(want, Source)):
-            # Exact up to the last bits of 1e-7, 1e-3 or 1e-2 as a factor.
+            # Exact up to the last bits of the factors 1e-7, 1e-3 and 1e-2.
             assert have == pytest.approx(want, rel=1e-14, abs=1e-13), name
         else:
             assert have == want and type(have) is type(want), name
@@ -245,7 +245,7 @@ def test_the_whole_cut_equals_pymavlink(cut_frames: list[bytes]) -> None:
 
 
 def test_the_cut_moves_in_every_direction(cut_frames: list[bytes]) -> None:
-    """Its signs and units mean something: what is said of the motion is what the position does."""
+    """Checks signs and units: reported velocities match the changes of position."""
     track = [
         report(as_frame(raw)) for raw in cut_frames if raw[7:10] == b"\x21\0\0" and raw[5] == 1
     ]
@@ -336,7 +336,7 @@ def test_what_is_no_place_on_earth_is_malformed(make: Make, lat: int, lon: int) 
 
 
 def test_the_flags_are_those_of_the_dialect() -> None:
-    """One at a time, no other field is there."""
+    """One flag at a time; no other field is set."""
     names = {
         dialect.ADSB_FLAGS_VALID_COORDS: "position_deg",
         dialect.ADSB_FLAGS_VALID_ALTITUDE: "alt_m",
@@ -438,7 +438,7 @@ def test_an_address_is_24_bits_and_not_0(flags: int) -> None:
         (b"EZY85MH", "EZY85MH"),
         (b"N12345  ", "N12345"),
         (b"SIM 5590\0", "SIM 5590"),
-        (b"123456789", "123456789"),  # not ended by a zero
+        (b"123456789", "123456789"),  # not terminated by a zero
         (b"        ", None),
         (b"AB\0garb", "AB"),
         (b"\xe9\xfe\xff", None),
@@ -449,7 +449,7 @@ def test_a_callsign_is_what_can_be_read(padded: bytes, callsign: str | None) -> 
     assert traffic(adsb(callsign=padded)).callsign == callsign
 
 
-# --- what is cut off, and what is missing -------------------------------------------------------
+# --- truncated and missing fields ---------------------------------------------------------------
 
 
 @settings(max_examples=examples(200))
@@ -498,7 +498,7 @@ def test_a_payload_of_one_byte() -> None:
 
 
 def test_an_adsb_payload_cut_within_its_flags() -> None:
-    """Flags of one byte only, and everything after them zero."""
+    """One byte of the flags remains, and everything after it is zero."""
     frame = sent(dialect.MAVLink_adsb_vehicle_message(
         1, *HERE, 0, 0, 0, 0, 0, b"", 0, 0, dialect.ADSB_FLAGS_VALID_COORDS, 0
     ))  # fmt: skip
@@ -588,7 +588,7 @@ def test_an_attitude_that_is_no_number_is_malformed(field: int, bad: float) -> N
 
 @pytest.mark.parametrize("field", range(6))
 def test_an_attitude_that_nothing_can_measure_is_malformed(field: int) -> None:
-    """A rate of turn of 10⁶ rad/s would be carried on to any attitude at all."""
+    """A rate of 10⁶ rad/s would be extrapolated to any attitude."""
     for most in (6.29, -6.29) if field < 3 else (70.0, -70.0):
         angles = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
         angles[field] = most

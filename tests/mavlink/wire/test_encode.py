@@ -1,4 +1,4 @@
-"""What the service sends is what pymavlink's generated dialect would send."""
+"""Sent messages equal those of pymavlink's generated dialect."""
 
 import itertools
 

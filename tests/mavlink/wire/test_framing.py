@@ -1,4 +1,4 @@
-"""Frames are found whatever the pieces they come in and whatever is broken around them.
+"""Frames are found in any fragments and amid any damage.
 
 The oracle is pymavlink's generated dialect, as a packer and (``scan`` in conftest.py) a parser.
 """
@@ -31,7 +31,7 @@ LOGS = (
     "sitl_4circle_wander.tlog",
 )
 FALSE_STARTS = [0xFD, 0xFE, 0x03] * 84 + [0xFD]
-"""253 bytes that start a frame at two of three places."""
+"""253 bytes, two of three of which start a frame."""
 
 
 def pack(
@@ -42,7 +42,7 @@ def pack(
     seq: int = 0,
     source: tuple[int, int] = (1, 1),
 ) -> bytes:
-    """The frame as pymavlink sends it."""
+    """Return the frame as pymavlink sends it."""
     mav = dialect.MAVLink(None, *source)
     mav.seq = seq % 256
     if signed:
@@ -54,14 +54,14 @@ def pack(
 
 
 def checked(head: bytes, payload: bytes, seed: int) -> bytes:
-    """A frame made by hand, ``head`` from the magic byte on, with the checksum it should have."""
+    """Return a hand-made frame, ``head`` from the magic byte on, with its correct checksum."""
     body = head[1:] + payload
     crc = dialect.x25crc(body + bytes([seed])).crc
     return head[:1] + body + int(crc).to_bytes(2, "little")
 
 
 def traffic(count: int) -> list[bytes]:
-    """Frames all different: both versions, signed and not, short and long, three senders."""
+    """Return distinct frames: both versions, signed and unsigned, short and long, three senders."""
     made = []
     for n in range(count):
         message = (
@@ -82,7 +82,7 @@ def traffic(count: int) -> list[bytes]:
 
 
 def unknown(v1: bool, payload: bytes = b"\xfe\x01\x02\xfd\x09") -> bytes:
-    """A frame of an id that nobody knows, with false starts in its payload."""
+    """Return a frame with an unknown id and false starts in its payload."""
     size = len(payload)
     if v1:
         return checked(bytes([0xFE, size, 0, 1, 1, 255]), payload, 0)
@@ -90,7 +90,7 @@ def unknown(v1: bool, payload: bytes = b"\xfe\x01\x02\xfd\x09") -> bytes:
 
 
 def split(pieces: Iterable[bytes], wanted: frozenset[int] | None = None) -> Found:
-    """What one splitter finds in the pieces, the end of the stream included."""
+    """Return what one splitter finds in the pieces, including the end of the stream."""
     splitter = Splitter("x", wanted)
     found = [item for n, piece in enumerate(pieces) for item in splitter.feed(n, piece)]
     return sort_out([*found, *splitter.finish(-1)])
@@ -117,7 +117,7 @@ def bytewise(data: bytes) -> list[bytes]:
 
 
 def damaged(frame: bytes) -> bytes:
-    """The frame with the last byte under its checksum changed: header and length stay."""
+    """Return the frame with the last byte before its checksum changed: header and length stay."""
     signature = 13 if frame[0] == 0xFD and frame[2] & 1 else 0
     at = len(frame) - signature - 3
     return frame[:at] + bytes([frame[at] ^ 0x10]) + frame[at + 1 :]
@@ -157,7 +157,7 @@ def test_many_frames_in_one_datagram() -> None:
 
 @pytest.mark.parametrize("tail", [b"", b"\xfd\x09\x00", b"\xfe", b"\x55\x55"])
 def test_one_frame_over_many_reads(tail: bytes) -> None:
-    """It is handed on with its last byte, once, at that byte's time."""
+    """It is delivered once, with its last byte, at that byte's time."""
     for made in traffic(14):
         splitter = Splitter("x")
         for n, byte in enumerate(bytewise(made[:-1])):
@@ -179,7 +179,7 @@ def test_only_what_is_wanted_is_handed_on_and_all_is_counted() -> None:
     assert lost == {}
 
 
-# --- cuts ---------------------------------------------------------------------------------------
+# --- fragments ----------------------------------------------------------------------------------
 
 TRAFFIC = traffic(35)
 PIECES = st.lists(
@@ -199,7 +199,7 @@ PIECES = st.lists(
 def test_frames_and_counts_do_not_depend_on_the_cuts(
     scan: Scan, pieces: list[bytes], cuts: list[int]
 ) -> None:
-    """Whole, byte by byte and in any pieces: what pymavlink finds, and the same losses."""
+    """Whole, byte by byte and in random pieces: pymavlink's frames, and equal losses."""
     data = b"".join(pieces)
     edges = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
     frames, lost = split([data])
@@ -231,7 +231,7 @@ def test_random_bytes_full_of_magic_never_raise() -> None:
 
 
 def test_no_more_is_kept_than_a_frame_can_be_long() -> None:
-    """Looks inside: that the memory is bounded cannot be seen from outside."""
+    """Inspects internals: bounded memory is not visible from outside."""
     rng = random.Random(2)
     data = b"".join(traffic(50)) + bytes(rng.choices([0xFD, 0xFE, 0, 1, 33, 255], k=20_000))
     longest = pack(dialect.MAVLink_encapsulated_data_message(1, [255] * 253), signed=True)
@@ -303,7 +303,7 @@ def test_a_damaged_length_takes_no_good_frame_with_it() -> None:
 
 
 def test_a_claim_ends_with_the_next_good_frame() -> None:
-    """What is damaged behind it counts for itself, even within the length first claimed."""
+    """Damage behind that frame counts separately, even within the length first claimed."""
     made = [frame for frame in traffic(40) if len(frame) < 40][:12]
     first = made[0][:1] + b"\xff" + made[0][2:]
     stream = [first, made[1], b"0123456789", damaged(made[2]), *made[3:]]
@@ -360,7 +360,7 @@ def test_an_unknown_id_counts_once_and_is_not_handed_on(v1: bool) -> None:
 
 @pytest.mark.parametrize("flags", [2, 3, 4, 0x80, 0x81, 0xFF])
 def test_flags_that_nobody_has_defined_are_refused(flags: int) -> None:
-    """Its checksum holds, but what the flag changes about the frame is not known."""
+    """Its checksum is correct, but the flag's effect on the frame is unknown."""
     good = traffic(4)
     payload = bytes([1, 2, 3, 4, 5, 6, 7, 8, 9])
     frame = checked(bytes([0xFD, 9, 0, 0, 0, 1, 1, 0, 0, 0]), payload, CRC_EXTRA[0])
@@ -402,7 +402,7 @@ def test_a_truncated_datagram_harms_no_other_peer() -> None:
 
 
 def test_the_cut_against_a_parser_run_over_the_stream(cut_frames: list[bytes]) -> None:
-    """pymavlink's own ``parse_buffer``, over the frames as they came in."""
+    """pymavlink's own ``parse_buffer`` over the frames in order."""
     assert len(cut_frames) == 7698
     stream = b"".join(cut_frames)
     messages = dialect.MAVLink(None).parse_buffer(stream)
@@ -440,7 +440,7 @@ def test_whole_logs(scan: Scan, shared_log: Callable[[str], bytes], name: str) -
 
 
 def test_more_senders_than_are_kept_are_all_heard() -> None:
-    """What is known of a sender's messages is a cache: it is begun again when it is full."""
+    """The state per sender is a cache, cleared when full."""
     sent = [Source(n % 255 + 1, n // 255) for n in range(KNOWN_MAX + 300)]
     splitter = Splitter("x")
     for _ in range(2):

@@ -50,17 +50,19 @@ _MIRRORED = bytes(int(f"{byte:08b}"[::-1], 2) for byte in range(256))
 _magics = re.compile(b"[\xfd\xfe]").finditer
 
 
-# --- the oracle ---------------------------------------------------------------------------------
+# --- oracle -------------------------------------------------------------------------------------
 
 
 def checksum(body: bytes, seed: int) -> bytes:
-    """CRC-16/MCRF4XX as it stands on the wire: CCITT with the bits of every byte mirrored."""
+    """Return CRC-16/MCRF4XX as transmitted: CCITT with the bits of every byte mirrored."""
     mirrored = (body + bytes([seed])).translate(_MIRRORED)
     return binascii.crc_hqx(mirrored, 0xFFFF).to_bytes(2, "big").translate(_MIRRORED)
 
 
 def judge(data: bytes, at: int) -> tuple[Reason | str, int]:
-    """Of a magic byte: "good", "no frame", or why it is refused; and the length it claims."""
+    """Classify a magic byte: "good", "no frame", or a rejection reason; and the length it
+    claims.
+    """
     v2 = data[at] == 0xFD
     head = data[at : at + (10 if v2 else 6)]
     if len(head) < (10 if v2 else 6) or (v2 and head[2] & ~1):
@@ -71,22 +73,24 @@ def judge(data: bytes, at: int) -> tuple[Reason | str, int]:
     if msgid not in SEEDS:
         return Reason.UNKNOWN_MESSAGE, size
     if at + size > len(data):
-        return "no frame", 0  # cut short by the end of the stream
+        return "no frame", 0  # truncated by the end of the stream
     holds = (
         checksum(data[at + 1 : at + checked], SEEDS[msgid]) == data[at + checked : at + checked + 2]
     )
-    fits = v2 or head[1] <= dialect.mavlink_map[msgid].unpacker.size  # MAVLink 1 has no more
+    fits = (
+        v2 or head[1] <= dialect.mavlink_map[msgid].unpacker.size
+    )  # a MAVLink 1 frame is no longer
     return ("good" if holds and fits else Reason.BAD_CRC), size
 
 
 @dataclass
 class Account:
-    """Where the frames of a stream are, and what the rest of it is."""
+    """Frames of a stream, and classification of the remaining bytes."""
 
     frames: list[Span] = field(default_factory=list)
     lost: Counter[Reason] = field(default_factory=Counter)
     claimed: int = 0
-    """Bytes of failed frames that are in no good one."""
+    """Bytes of failed frames that belong to no good frame."""
 
 
 def account(data: bytes) -> Account:
@@ -114,7 +118,7 @@ def account(data: bytes) -> Account:
 
 
 def split(pieces: Iterator[bytes] | list[bytes]) -> tuple[list[bytes], Counter[Reason]]:
-    """What the splitter makes of the pieces, the end of the stream included."""
+    """Return what the splitter makes of the pieces, including the end of the stream."""
     splitter = Splitter("x")
     found = [item for n, piece in enumerate(pieces) for item in splitter.feed(n, piece)]
     found += splitter.finish(-1)
@@ -133,10 +137,10 @@ def losses(found: list[Event] | list[Frame | Rejection]) -> Counter[Reason]:
 
 
 def check_accounts(data: bytes, frames: list[bytes], lost: Counter[Reason]) -> None:
-    """The accounting law, exactly."""
+    """Check the accounting law exactly."""
     expected = account(data)
     assert frames == [data[start:stop] for start, stop in expected.frames]
-    assert lost == expected.lost  # a count of 0 is one that is missing
+    assert lost == expected.lost  # a count of 0 is left out
     in_frames = sum(map(len, frames))
     assert in_frames + expected.claimed + lost[Reason.GARBAGE] == len(data)
     claims = lost[Reason.BAD_CRC] + lost[Reason.UNKNOWN_MESSAGE]
@@ -144,7 +148,7 @@ def check_accounts(data: bytes, frames: list[bytes], lost: Counter[Reason]) -> N
 
 
 def reads(rng: random.Random, data: bytes) -> Iterator[bytes]:
-    """The stream in pieces of 1 to 64 KiB, short ones as often as long ones."""
+    """Split the stream into pieces of 1 to 64 KiB, short and long ones equally often."""
     at = 0
     while at < len(data):
         size = round(LARGEST_READ ** rng.random())
@@ -161,7 +165,7 @@ HEADERS = (HEADER, SIGNED_HEADER, HEADER_V1, HEADER[:7] + b"\x56\x34\x12", HEADE
 
 
 def heads(rng: random.Random, size: int) -> bytes:
-    """Headers with a length of their own, some good frames, and noise between them."""
+    """Return headers with random lengths, some good frames, and noise between them."""
     mav = dialect.MAVLink(None)
     good = bytes(dialect.MAVLink_heartbeat_message(2, 3, 81, 5, 4, 3).pack(mav))
     pieces, made = [], 0
@@ -214,7 +218,7 @@ def test_the_work_grows_as_the_bytes_do(kind: str) -> None:
 @pytest.mark.full
 @pytest.mark.parametrize("kind", FLOODS)
 def test_no_more_is_kept_than_one_unfinished_frame(kind: str) -> None:
-    """While a flood lasts, and after it: measured from outside, by the allocator."""
+    """During a flood and after it, measured with the allocator."""
     rng = random.Random(f"memory {kind}")
     data = FLOODS[kind](rng, 100_000)
     pieces = list(reads(rng, data))
@@ -244,16 +248,16 @@ def test_a_long_flood_is_accounted_for(kind: str) -> None:
 
 @dataclass
 class Damaged:
-    """A stream after damage, and where its untouched frames now are."""
+    """A stream after damage, and the new positions of its undamaged frames."""
 
     data: bytes
     untouched: list[Span]
 
 
 def spoil(rng: random.Random, clean: bytes, frames: list[Span], hits: int, other: bytes) -> Damaged:
-    """Flip bits, cut bytes out, insert noise or a piece of another log: ``hits`` times in all.
+    """Flip bits, remove bytes, insert noise or a piece of another log: ``hits`` times in all.
 
-    One hit in five is at a length byte, which tells a lie about all that follows.
+    One hit in five is at a length byte, which misleads about everything after it.
     """
     blows = []
     for _ in range(hits):
@@ -277,7 +281,7 @@ def spoil(rng: random.Random, clean: bytes, frames: list[Span], hits: int, other
 
 
 def struck(clean: bytes, frames: list[Span], blows: list[tuple[int, int, bytes]]) -> Damaged:
-    """The stream with the blows (start, stop, bytes in their place) applied in order."""
+    """Return the stream with the changes (start, stop, replacement) applied in order."""
     pieces: list[bytes] = []
     untouched: list[Span] = []
     ahead = iter([*frames, (len(clean) + 1, len(clean) + 1)])
@@ -285,7 +289,7 @@ def struck(clean: bytes, frames: list[Span], blows: list[tuple[int, int, bytes]]
     kept_from = made = 0
     for start, stop, instead in [*blows, (len(clean), len(clean), b"")]:
         if start < kept_from:
-            continue  # inside a cut
+            continue  # inside a removed part
         while frame[1] <= start:
             if frame[0] >= kept_from:
                 untouched.append((frame[0] - kept_from + made, frame[1] - kept_from + made))
@@ -297,9 +301,9 @@ def struck(clean: bytes, frames: list[Span], blows: list[tuple[int, int, bytes]]
 
 
 def check_found(damaged: Damaged, frames: list[bytes]) -> int:
-    """Every untouched frame is found, unless what is found in front of it reaches into it.
+    """Check that every undamaged frame is found unless an earlier found frame overlaps it.
 
-    Returns how many of those found, all with checksums that hold, do so.
+    Returns how many of the found frames, all with valid checksums, do so.
     """
     at, spans = 0, []
     for raw in frames:
@@ -318,16 +322,16 @@ def check_found(damaged: Damaged, frames: list[bytes]) -> int:
 
 
 def false_alarms(checked: int) -> float:
-    """How many of so many false starts may have a checksum that holds; more is no coincidence.
+    """Return how many of so many false starts may have a valid checksum by coincidence.
 
-    One such was met while these tests were made: of 721, with a length byte that made it swallow
-    seven good frames.
+    One such case occurred while these tests were written: of 721, with a length byte that made
+    it swallow seven good frames.
     """
     return 2 + 4 * checked / 65_536
 
 
 def stream_of(data: bytes) -> tuple[bytes, list[Span]]:
-    """The frames of a telemetry log without their stamps, and where they are."""
+    """Return the frames of a telemetry log without their stamps, and their positions."""
     frames = [data[start:stop] for start, stop in account(data).frames]
     edges = list(accumulate(map(len, frames), initial=0))
     return b"".join(frames), list(pairwise(edges))
@@ -338,7 +342,7 @@ def starts(data: bytes) -> int:
 
 
 def batter(rng: random.Random, log: bytes, other: bytes, rounds: int) -> None:
-    """Spoil the wire of a log again and again: both laws hold every time."""
+    """Damage the stream of a log repeatedly: both laws hold every time."""
     clean, frames = stream_of(log)
     false = checked = 0
     for _ in range(rounds):
@@ -358,7 +362,7 @@ def cut(rng: random.Random, data: bytes, size: int) -> bytes:
 def test_what_the_oracle_calls_untouched_is_what_pymavlink_finds(
     cut_log: bytes, scan: Callable[[bytes], list[bytes]]
 ) -> None:
-    """The oracle is worth something: frames as pymavlink has them; no damage, nothing touched."""
+    """Validates the oracle: its frames are pymavlink's, and without damage all are undamaged."""
     data = cut_log[:60_000]
     clean, frames = stream_of(data)
     assert [clean[start:stop] for start, stop in frames] == scan(data)
@@ -408,16 +412,18 @@ def test_frames_of_a_whole_log_outside_the_damage_are_found(
         batter(rng, cut(rng, data, 20_000), cut_log, rounds=10)
 
 
-# --- any frames, anything between them ----------------------------------------------------------
+# --- any frames between any bytes ---------------------------------------------------------------
 
 _mav = dialect.MAVLink(None)
 PACKED = sorted(n for n in SEEDS if "c" not in dialect.mavlink_map[n].unpacker.format)
-"""Messages that pymavlink can pack again: it cannot a single ``char``, which it reads as text."""
+"""Messages that pymavlink can pack again; it cannot pack a single ``char``, which it reads
+as text.
+"""
 
 
 @st.composite
 def frames_of_the_dialect(draw: st.DrawFn) -> bytes:
-    """Any message with any payload, as pymavlink packs it: version 1, 2, or 2 signed."""
+    """Draw any message with any payload, packed by pymavlink: version 1, 2, or 2 signed."""
     msgid = draw(st.sampled_from(PACKED))
     size = dialect.mavlink_map[msgid].unpacker.size
     payload = draw(st.binary(min_size=size, max_size=size))
@@ -467,7 +473,7 @@ def test_frames_between_any_bytes_are_found_however_they_are_cut(
         assert split(way) == (found, lost)
 
 
-# --- through the readers of logs ----------------------------------------------------------------
+# --- log readers --------------------------------------------------------------------------------
 
 
 def spoil_log(rng: random.Random, log: bytes, other: bytes) -> Damaged:
@@ -476,19 +482,22 @@ def spoil_log(rng: random.Random, log: bytes, other: bytes) -> Damaged:
 
 
 def check_events(damaged: Damaged, events: list[Event]) -> int:
-    """Time goes on and does not leap, no byte is counted twice, and what is untouched is found."""
+    """Check that time advances without jumps, no byte counts twice, and undamaged frames are
+    found.
+    """
     times = [event.t_ns for event in events]
     assert all(0 <= b - a <= LARGEST_LEAP_NS for a, b in pairwise(times))
     frames = [event.raw for event in events if isinstance(event, Frame)]
     lost = losses(events)
     assert sum(map(len, frames)) + lost[Reason.GARBAGE] <= len(damaged.data)
     assert lost[Reason.BAD_STAMP] <= len(frames)
-    assert len(events) <= 4 + 5 * len(frames)  # one for each reason before a frame
+    assert len(events) <= 4 + 5 * len(frames)  # one per reason before a frame
     return check_found(damaged, frames)
 
 
 def check_stamps(data: bytes, events: list[Event]) -> None:
-    """The eight bytes before a frame are its stamp, no garbage, unless it is said to lack one."""
+    """Check that the eight bytes before a frame are its stamp and not garbage, unless marked
+    missing."""
     frames = [event.raw for event in events if isinstance(event, Frame)]
     bare = sum(isinstance(event, Rejection) and event.detail == "no stamp" for event in events)
     stamps = 8 * (len(frames) - bare)
@@ -496,12 +505,12 @@ def check_stamps(data: bytes, events: list[Event]) -> None:
 
 
 def has_a_pair(untouched: list[Span]) -> bool:
-    """Two untouched frames with just a stamp between them."""
+    """Return whether two undamaged frames have only a stamp between them."""
     return any(b - a == 8 for (_, a), (b, _) in pairwise(untouched))
 
 
 def read_spoilt(rng: random.Random, log: bytes, other: bytes, path: Path, rounds: int) -> int:
-    """Spoil a telemetry log again and again and read it; how often nothing was left."""
+    """Damage and read a telemetry log repeatedly; return how often nothing was left."""
     false = checked = refused = 0
     for _ in range(rounds):
         damaged = spoil_log(rng, log, other)
@@ -553,7 +562,7 @@ def test_a_damaged_whole_log_gives_what_is_untouched(
         read_spoilt(rng, piece, cut_log, tmp_path / "x.tlog", rounds=10)
 
 
-# --- what a flood costs -------------------------------------------------------------------------
+# --- cost of a flood ----------------------------------------------------------------------------
 
 DATAGRAM = 1400
 MAGIC_FLOODS = {
@@ -569,7 +578,7 @@ MAGIC_FLOODS = {
 def test_a_flood_of_magic_bytes_costs_no_more_sums_than_frames(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Sums of up to 255 bytes at each byte would be a hundred times what frames take."""
+    """Checksums over up to 255 bytes at each byte would cost a hundred times as much as frames."""
     from companion.mavlink.wire import framing
 
     summed, mcrf4xx = [0], framing._mcrf4xx
@@ -583,7 +592,7 @@ def test_a_flood_of_magic_bytes_costs_no_more_sums_than_frames(
     for _ in range(50):
         splitter.feed(0, (MAGIC_FLOODS[name] * DATAGRAM)[:DATAGRAM])
     assert summed[0] <= 2 * 50 * DATAGRAM
-    # And a frame among all that is found.
+    # A frame within the flood is found.
     raw = bytes(dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3).pack(dialect.MAVLink(None, 1)))
     found = splitter.feed(0, MAGIC_FLOODS[name] * 40 + raw + bytes(600))
     assert raw in [item.raw for item in found if isinstance(item, Frame)]

@@ -1,4 +1,6 @@
-"""Mode S: messages made here, read as pyModeS reads them; and the Beast stream that brings them."""
+"""Mode S: messages encoded here and decoded like pyModeS, and the Beast stream that carries
+them.
+"""
 
 import json
 import math
@@ -25,7 +27,7 @@ from companion.mavlink.wire.mode_s import (
 from companion.values import AdsbVehicle, Frame, Reason, Rejection
 
 S = 1_000_000_000
-# Of https://mode-s.org/1090mhz: an even and an odd position, a name, a velocity.
+# From https://mode-s.org/1090mhz: an even and an odd position, a callsign, a velocity.
 EVEN = bytes.fromhex("8D40621D58C382D690C8AC2863A7")
 ODD = bytes.fromhex("8D40621D58C386435CC412692AD6")
 NAMED = bytes.fromhex("8D4840D6202CC371C32CE0576098")
@@ -33,13 +35,13 @@ MOVING = bytes.fromhex("8D485020994409940838175B284F")
 
 
 def message(me: int, icao: int = 0x40621D, head: int = 0x8D) -> bytes:
-    """An extended squitter with its parity."""
+    """Return an extended squitter with its parity."""
     body = bytes([head]) + icao.to_bytes(3, "big") + me.to_bytes(7, "big")
     return body + parity(body + b"\0\0\0").to_bytes(3, "big")
 
 
 def placed(lat_deg: float, lon_deg: float, odd: int, altitude: int = 0xC38) -> bytes:
-    """An airborne position by the encoding side of DO-260B, A.1.7.3."""
+    """Return an airborne position, encoded as in DO-260B, A.1.7.3."""
     lat_zone = 360 / (60 - odd)
     y = math.floor(2**17 * (lat_deg % lat_zone) / lat_zone + 0.5)
     at = lat_zone * (y / 2**17 + math.floor(lat_deg / lat_zone))
@@ -70,7 +72,7 @@ def said(item: Frame | Rejection) -> AdsbVehicle:
 
 
 def test_random_messages_are_read_as_pymodes_reads_them() -> None:
-    """Every field that both have, and the same messages thrown away."""
+    """Every common field is equal, and the same messages are rejected."""
     rng = random.Random(3)
     read = 0
     for _ in range(3000):
@@ -81,7 +83,7 @@ def test_random_messages_are_read_as_pymodes_reads_them() -> None:
         assert theirs["crc_valid"]
         ours = Transponders().read(0, raw)
         if ours is None:
-            assert kind == 31  # which tells by the next position
+            assert kind == 31  # decided by the next position
             continue
         read += 1
         assert f"{ours.icao:06X}" == theirs["icao"]
@@ -119,7 +121,7 @@ def test_two_halves_are_the_place_that_pymodes_finds_and_that_was_flown(seed: in
 
 
 def test_published_messages() -> None:
-    """Positions and the rest as https://mode-s.org/1090mhz works them out."""
+    """Positions and other fields as worked out at https://mode-s.org/1090mhz."""
     first, second, named, moving = fed(b"".join(map(beast, (EVEN, ODD, NAMED, MOVING))))
     assert said(first).position_deg is None
     place = said(second)
@@ -135,7 +137,7 @@ def test_published_messages() -> None:
 
 
 def on_ground(lat_deg: float, lon_deg: float, odd: int, movement: int = 42) -> bytes:
-    """A position on the ground by the encoding side of DO-260B, A.1.7.3: zones of a quarter."""
+    """Return a surface position, encoded as in DO-260B, A.1.7.3: zones of a quarter of the size."""
     lat_zone = 90 / (60 - odd)
     y = math.floor(2**17 * (lat_deg % lat_zone) / lat_zone + 0.5)
     at = lat_zone * (y / 2**17 + math.floor(lat_deg / lat_zone))
@@ -147,14 +149,14 @@ def on_ground(lat_deg: float, lon_deg: float, odd: int, movement: int = 42) -> b
 
 @pytest.mark.parametrize("seed", range(20))
 def test_a_position_on_the_ground_counts_from_the_one_in_the_air(seed: int) -> None:
-    """Up to 40 nautical miles on, as pyModeS has it with the place to begin from."""
+    """Up to 40 nautical miles away, as pyModeS does with a reference position."""
     rng = random.Random(seed)
     lat, lon = rng.uniform(-80, 80), rng.uniform(-180, 180)
     there = lat + rng.uniform(-0.66, 0.66), lon
     heard = Transponders()
     raw = on_ground(*there, odd=seed % 2)
     lost = heard.read(0, raw)
-    assert lost is not None and lost.lat_deg is None  # nowhere to count from
+    assert lost is not None and lost.lat_deg is None  # no reference position
     for odd in (0, 1):
         heard.read(0, placed(lat, lon, odd))
     ours = heard.read(239 * S, raw)
@@ -165,14 +167,14 @@ def test_a_position_on_the_ground_counts_from_the_one_in_the_air(seed: int) -> N
     assert ours.lat_deg == pytest.approx(there[0], abs=1e-5)
     assert (ours.speed_kt, ours.track_deg) == (theirs["groundspeed"], theirs["track"])
     assert ours.altitude_ft is None
-    again = heard.read(478 * S, raw)  # from the place on the ground
+    again = heard.read(478 * S, raw)  # relative to the surface position
     assert again is not None and again.lat_deg == pytest.approx(ours.lat_deg)
     late = heard.read(800 * S, raw)
     assert late is not None and late.lat_deg is None
 
 
 def test_a_published_position_on_the_ground() -> None:
-    """Of https://mode-s.org/1090mhz: 52.32061 north, 4.73473 east, near 51.990, 4.375."""
+    """From https://mode-s.org/1090mhz: 52.32061 north, 4.73473 east, near 51.990, 4.375."""
     me = int.from_bytes(bytes.fromhex("8C4841753A8A35323FAEBDAC702D")[4:11], "big")
     half = me >> 17 & 0x1FFFF, me & 0x1FFFF
     assert ground_deg(half, (51.990, 4.375), me >> 34 & 1) == pytest.approx(
@@ -205,7 +207,7 @@ def test_halves_that_are_too_far_apart_in_time_are_no_place() -> None:
 def test_stated_accuracies_come_with_the_position(
     nac_p: int, gva: int, version: int, horizontal_m: float | None, vertical_m: float | None
 ) -> None:
-    """Limits of 95 %, brought to 68 % (Rayleigh: 0.617 of them); unknown codes say nothing."""
+    """95 % limits converted to 68 % (Rayleigh: factor 0.617); unknown codes give no accuracy."""
     *_, last = fed(b"".join(map(beast, (status(nac_p, gva, version), EVEN, ODD))))
     told = said(last).accuracy
     if horizontal_m is None and vertical_m is None:
@@ -226,13 +228,13 @@ def test_an_accuracy_that_was_stated_long_ago_holds_no_more() -> None:
 
 
 def test_a_message_that_is_held_back_is_old() -> None:
-    """By the receiver's counter of 12 MHz, against the least late message so far."""
+    """By the receiver's 12 MHz counter, relative to the least delayed message so far."""
     splitter = BeastSplitter("x")
     (soon,) = splitter.feed(10 * S, beast(EVEN, 600 * 12_000_000))
     (late,) = splitter.feed(25 * S, beast(ODD, 600 * 12_000_000 + 12_000_000 // 2))
     assert (said(soon).tslc_s, said(late).tslc_s) == (0, 14)
-    assert said(late).position_deg is not None  # half a second apart when they were sent
-    (again,) = splitter.feed(26 * S, beast(ODD, 5))  # the receiver was started again
+    assert said(late).position_deg is not None  # sent half a second apart
+    (again,) = splitter.feed(26 * S, beast(ODD, 5))  # the receiver was restarted
     assert said(again).tslc_s == 0
 
 
@@ -248,7 +250,7 @@ def test_what_is_not_used_is_counted() -> None:
     )
     rebroadcast = message(int.from_bytes(EVEN[4:11], "big"), head=18 << 3 | 2)
     assert fed(beast(rebroadcast)) == fed(beast(b"\0\0", kind=0x31)) == []
-    garbage, frame = fed(b"\x1a3\x00\x1b" + beast(EVEN))[::-1]  # one that ends within
+    garbage, frame = fed(b"\x1a3\x00\x1b" + beast(EVEN))[::-1]  # a truncated one
     assert isinstance(frame, Frame)
     assert isinstance(garbage, Rejection) and garbage.count == 4
 
@@ -275,5 +277,5 @@ def test_no_bytes_are_a_defect_or_kept_for_long(pieces: list[bytes]) -> None:
     for piece in pieces:
         for found in splitter.feed(7, piece):
             assert isinstance(found, Rejection) or isinstance(decode(found), AdsbVehicle)
-        assert len(splitter._pending) <= 2 + 2 * 21  # a whole message, each byte of it doubled
+        assert len(splitter._pending) <= 2 + 2 * 21  # a whole message with every byte doubled
     json.dumps([one.count for one in splitter.finish(8) if isinstance(one, Rejection)])

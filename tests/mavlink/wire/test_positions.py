@@ -1,4 +1,4 @@
-"""The table of position messages, held against the dialect and against those who use it."""
+"""The table of position messages, against the dialect and against its users."""
 
 import pytest
 from hypothesis import given

@@ -1,4 +1,4 @@
-"""Remote ID: messages that pymavlink makes, packs as others work them out, and what is none."""
+"""Remote ID: messages made by pymavlink, published message packs, and invalid input."""
 
 import struct
 from typing import Any
@@ -17,7 +17,7 @@ from companion.values import AltitudeDatum, Frame, Reason, Rejection, RemoteId, 
 S = 1_000_000_000
 RECEIVER = Source(9, 236)
 MAC = bytes.fromhex("ac67b20950d4")
-# A location as the example of https://github.com/tuupola/librid has it, and works it out.
+# A location from the worked example of https://github.com/tuupola/librid.
 PACKED = bytes.fromhex("12202d3e0420bd5c25401c190d0000c10834084a0339300100")
 NAMED = b"\x02\x12" + b"1588E0123456789ABCDE" + bytes(3)  # protocol 2, basic id: serial number
 GROUP = b"\x42" + bytes(9) + b"\x03\0" + bytes(13)  # system: three aircraft
@@ -69,7 +69,7 @@ def reported(message: Any, t_ns: int = 7) -> Report:
 
 
 def test_a_location_is_read_field_by_field() -> None:
-    """From what pymavlink packed; speeds are 15.5 m/s to the north-east and 2 m/s up."""
+    """Packed by pymavlink; 15.5 m/s to the north-east and 2 m/s up."""
     report = reported(location())
     assert (report.lat_deg, report.lon_deg) == pytest.approx((62.683472, 21.974944))
     assert (report.alt_m, report.alt_datum) == (120.5, AltitudeDatum.GEOMETRIC)
@@ -79,7 +79,7 @@ def test_a_location_is_read_field_by_field() -> None:
 
 
 def test_a_pack_says_what_its_messages_say() -> None:
-    """The published example, beside the same fields in a message of MAVLink's own."""
+    """The published example, against the same fields in a single MAVLink message."""
     found = said(packed(NAMED, PACKED))
     assert (found.uas_id, found.aircraft) == ("1588E0123456789ABCDE", None)
     assert found.report is not None
@@ -144,7 +144,7 @@ def test_heights_by_pressure_are_taken_where_there_is_no_other() -> None:
 
 
 def test_a_stamp_of_the_hour_goes_on_over_the_hour() -> None:
-    """Milliseconds between stamps are those between their times, whichever hour they lie in."""
+    """Differences between stamps equal differences between times, across the hour."""
     hour_ns = 1_700_000_000 * S // (3600 * S) * 3600 * S
     before = reported(location(timestamp=3599.0), hour_ns - S // 2).boot_ms
     after = reported(location(timestamp=0.5), hour_ns + S).boot_ms
@@ -170,7 +170,9 @@ def test_what_cannot_be_is_refused(message: Any) -> None:
 
 def test_a_vehicles_own_words_to_its_transmitter_are_not_read() -> None:
     assert decode(framed(location(mac=b""), source=Source(1, 1))) is None
-    assert decode(framed(location(mac=b""))) is None  # a receiver that does not say of whom
+    assert (
+        decode(framed(location(mac=b""))) is None
+    )  # a receiver that does not give the transmitter
     assert isinstance(decode(framed(packed(NAMED, PACKED, mac=b""))), RemoteId)
     assert decode(framed(packed(NAMED, PACKED, mac=b""), source=Source(1, 1))) is None
 
@@ -183,7 +185,7 @@ def test_ids_that_are_no_text_are_hexadecimal() -> None:
     assert said(basic_id(b"abc", 0)).uas_id is said(basic_id(b"")).uas_id is None
 
 
-# --- who is who -----------------------------------------------------------------------------
+# --- identities -----------------------------------------------------------------------------
 
 
 def named(ids: RemoteIds, message: Any, t_ns: int = 7, source: Source = RECEIVER) -> Any:

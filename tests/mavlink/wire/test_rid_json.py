@@ -1,4 +1,4 @@
-"""Remote ID receivers' JSON: two forms of it, in pieces and in datagrams, and what is none."""
+"""JSON of Remote ID receivers: two formats, in fragments and datagrams, and invalid input."""
 
 import base64
 import json
@@ -17,7 +17,7 @@ from companion.mavlink.wire.rid_json import OBJECT_MAX, SENDER, RidJson
 from companion.values import Frame, Reason, Rejection, RemoteId, Source
 
 MAC = "ac:67:b2:09:50:d4"
-# As https://github.com/sxjack/unix_rid_capture prints one, with a place.
+# As printed by https://github.com/sxjack/unix_rid_capture, with a location.
 CAPTURED = (
     b'{ "mac" : "ac:67:b2:09:50:d4", "operator" : "GBR-OP-ZZZZZZZZZZZZ", "uav id" : "SERIAL.1", '
     b'"uav latitude" :    51.500000, "uav longitude" :    -0.100000, "uav altitude" : 120, '
@@ -27,7 +27,9 @@ CAPTURED = (
 
 
 def uas_data(**changed: Any) -> bytes:
-    """ODID_UAS_Data as a C compiler lays it out on a 64-bit machine: ids, place, system."""
+    """Return ODID_UAS_Data as a C compiler lays it out on a 64-bit machine: ids, location,
+    system.
+    """
     at: dict[str, Any] = {
         "course": 45.0, "speed": 15.5, "climb": 2.0, "lat": 62.683472, "lon": 21.974944,
         "baro": -1000.0, "geo": 120.5, "stamp": 1234.5, "horizontal": 10, "vertical": 4,
@@ -57,7 +59,7 @@ def fed(data: bytes) -> list[Frame | Rejection]:
 
 
 def said(data: bytes) -> RemoteId:
-    """The location that is said, the last of the frames."""
+    """Return the reported location, the last of the frames."""
     *_, last = fed(data)
     found = decode(last) if isinstance(last, Frame) else last
     assert isinstance(found, RemoteId), found
@@ -155,7 +157,7 @@ def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
     splitter = RidJson("x")
     pieces = [STREAM[a:b] for a, b in pairwise(at)]
     whole = RidJson("x").feed(7, STREAM)
-    assert len(whole) == 7  # two of each of rid_capture's, three of DroneScout's
+    assert len(whole) == 7  # two per rid_capture object, three per DroneScout object
     assert [one for piece in pieces for one in splitter.feed(7, piece)] == whole
     assert splitter.finish(8) == []
 

@@ -1,4 +1,4 @@
-"""BaseStation lines: a published stream, whole and in pieces, and what is no such stream."""
+"""BaseStation lines: a published stream, whole and in fragments, and invalid input."""
 
 import math
 from itertools import pairwise
@@ -36,7 +36,7 @@ CALLED = (
 
 
 def line(**fields: str) -> str:
-    """A line with a position, and other fields by their number: ``f11="37000"``."""
+    """Return a line with a position, and other fields by number: ``f11="37000"``."""
     cells = LATE.split(",")
     for name, text in fields.items():
         cells[int(name[1:])] = text
@@ -63,7 +63,9 @@ def refused(text: str | bytes) -> Rejection:
 
 
 def test_a_published_stream_is_read_as_it_is_described() -> None:
-    """By pymavlink; feet, knots and feet a minute are 0.3048 m, 1852 m/h and 0.00508 m/s."""
+    """Decoded by pymavlink; feet, knots and feet per minute are 0.3048 m, 1852 m/h and
+    0.00508 m/s.
+    """
     mav: Any = dialect.MAVLink(None)
     frames = fed(PUBLISHED.rstrip())
     assert all(isinstance(one, Frame) and one.source == (0, 156) for one in frames)
@@ -86,7 +88,7 @@ def test_a_published_stream_is_read_as_it_is_described() -> None:
 
 
 def test_a_line_that_was_held_back_is_old() -> None:
-    assert said(LATE).tslc_s == 255  # 300 s; more does not fit
+    assert said(LATE).tslc_s == 255  # 300 s, limited to the field's maximum
     assert said(CALLED).tslc_s == 2
     assert said(line(f7="14:59:00.000")).tslc_s == 0  # from the future
     assert said(line(f6="", f7="")).tslc_s == 0
@@ -135,14 +137,14 @@ def test_a_line_without_an_end_takes_no_memory() -> None:
     splitter = SbsSplitter("x")
     found = [one for _ in range(1000) for one in splitter.feed(7, b"M" * 100)]
     counted = sum(one.count for one in found if isinstance(one, Rejection))
-    assert 100_000 - LINE_MAX <= counted <= 100_000  # what is not counted is what is kept
+    assert 100_000 - LINE_MAX <= counted <= 100_000  # bytes not counted are kept
     end_of_it = LATE.encode() + b"\n"
     found += splitter.feed(7, end_of_it + PUBLISHED)
     lost = sum(one.count for one in found if isinstance(one, Rejection))
     assert lost == 100_000 + len(end_of_it)
     assert sum(isinstance(one, Frame) for one in found) == 4
-    assert splitter.feed(7, b"M" * (LINE_MAX + 1))  # all of it is counted, and none kept
-    assert isinstance(splitter.feed(7, end_of_it)[0], Rejection)  # still the end of that line
+    assert splitter.feed(7, b"M" * (LINE_MAX + 1))  # all of it is counted, and none is kept
+    assert isinstance(splitter.feed(7, end_of_it)[0], Rejection)  # still the rest of that line
 
 
 @given(st.lists(st.integers(1, len(PUBLISHED) - 1), max_size=20))

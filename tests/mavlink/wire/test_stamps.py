@@ -1,4 +1,4 @@
-"""Boot stamps against pymavlink: where they are, and how they are read."""
+"""Boot stamps against pymavlink: their position in the payload and their decoding."""
 
 import struct
 
@@ -9,7 +9,7 @@ from companion.mavlink.wire.stamps import STAMPED, boot_ms
 from companion.values import Frame, Source
 
 SETPOINTS = {82, 84, 86}
-"""What ground stations send to a vehicle: their time is not the vehicle's."""
+"""Messages that ground stations send to a vehicle: their stamp is not the vehicle's."""
 SIZES = {
     "uint64_t": 8, "int64_t": 8, "double": 8, "uint32_t": 4, "int32_t": 4, "float": 4,
     "uint16_t": 2, "int16_t": 2, "uint8_t": 1, "int8_t": 1, "char": 1,
@@ -17,7 +17,7 @@ SIZES = {
 
 
 def place(message: type[dialect.MAVLink_message]) -> int | None:
-    """Where ``time_boot_ms`` begins in the payload; None where there is none."""
+    """Return where ``time_boot_ms`` starts in the payload; None if there is none."""
     at = 0
     for name, length in zip(message.ordered_fieldnames, message.array_lengths, strict=True):
         if name == "time_boot_ms":
@@ -34,7 +34,7 @@ def test_the_table_is_the_dialects() -> None:
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_a_stamp_is_read_as_pymavlink_packs_it(version: int) -> None:
-    """Zeros at the end of a payload are cut by version 2."""
+    """MAVLink 2 truncates trailing zeros of a payload."""
     sender = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
     message = dialect.MAVLink_system_time_message(1_700_000_000_000_000, 70_000)
     raw = message.pack(sender, force_mavlink1=version == 1)

@@ -121,7 +121,7 @@ def sequences(count: int) -> Iterator[tuple[np.random.Generator, str]]:
         yield np.random.default_rng(seed), ("ball", "surface", "bang")[seed % 3]
 
 
-@pytest.mark.parametrize("told", [1.0, 0.8, 0.0], ids=["told", "sometimes", "never"])
+@pytest.mark.parametrize("told", [1.0, 0.8, 0.0], ids=["reported", "sometimes", "never"])
 @pytest.mark.parametrize("name", GAINS)
 def test_no_adversary_leaves_the_bounds(fix: MakeFix, name: str, told: float) -> None:
     """Irregular reports, some without a velocity; predicted before, at and after each of them."""

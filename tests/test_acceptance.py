@@ -69,14 +69,14 @@ def circling() -> Flown:
 
 
 @pytest.mark.full
-def test_clean_link(circling: Flown) -> None:
+def test_prediction_error_over_a_clean_link(circling: Flown) -> None:
     settings = Settings()
     found = rms_deg(circling, OURS, CLEAN, settings)
     assert np.all(found <= [0.13, 0.13, 0.14, 0.20]), found
 
 
 @pytest.mark.full
-def test_radio_link(circling: Flown) -> None:
+def test_prediction_error_over_a_radio_link(circling: Flown) -> None:
     settings = Settings()
     ours = rms_deg(circling, OURS, RADIO, settings)
     over_all = np.sqrt(np.mean(ours**2, axis=0))
@@ -108,7 +108,7 @@ def test_no_bound_is_violated(circling: Flown, link: RadioLink, suited: bool) ->
 
 
 @pytest.mark.full
-def test_where_gps_wanders_violations_are_in_the_faults() -> None:
+def test_bound_violations_occur_only_during_gps_faults() -> None:
     """A walk of 3.8 m under a noise bound of 4 m."""
     flown = vehicles.load(shared_log("sitl_4circle_wander.tlog"), "5:1")
     events = json.loads((SHARED / "sitl_4circle_wander.tlog.events.json").read_text())
@@ -123,7 +123,7 @@ def test_where_gps_wanders_violations_are_in_the_faults() -> None:
 
 
 @pytest.mark.full
-def test_where_gps_wanders_it_is_told_before_a_bound_is_broken() -> None:
+def test_gps_wander_is_announced_before_a_bound_violation() -> None:
     """By default the receiver's accuracy is trusted down to 0.9 m, until its positions wander."""
     flown = vehicles.load(shared_log("sitl_4circle_wander.tlog"), "5:1")
     answers = broken = 0
@@ -158,7 +158,7 @@ def final_tracks(events: list[Event], at_ns: int) -> dict[str, Track]:
 
 
 @pytest.mark.parametrize("seed", [1, *(pytest.param(n, marks=pytest.mark.full) for n in (2, 3))])
-def test_shuffled_within_the_window_the_end_is_the_same(cut_log: Path, seed: int) -> None:
+def test_shuffled_reports_within_the_window_give_the_same_tracks(cut_log: Path, seed: int) -> None:
     """Values on the sender timeline are equal. The node's clock has seen other arrivals, and model
     selection other predictions: a prediction moves by at most the clock uncertainty."""
     events = list(read_log(cut_log))
@@ -175,7 +175,7 @@ def test_shuffled_within_the_window_the_end_is_the_same(cut_log: Path, seed: int
         assert apart_m <= other.clock_bound_s * 8.0 + 0.01
 
 
-def test_one_reboot_and_tracking_goes_on() -> None:
+def test_tracking_continues_after_a_reboot() -> None:
     pipeline = Pipeline(Settings())
     reboots, since, refused = 0, 99, []
     for event in read_log(shared_log("real_dronekit_flight2015.tlog")):
@@ -199,7 +199,7 @@ def test_one_reboot_and_tracking_goes_on() -> None:
         "real_eagle_c2_gui.tlog",
     ],
 )
-def test_real_flights_are_not_gated(name: str) -> None:
+def test_reports_of_real_flights_pass_the_gate(name: str) -> None:
     """Real vehicles stay within the default limits."""
     pipeline = Pipeline(Settings())
     for event in read_log(shared_log(name)):
@@ -227,7 +227,7 @@ def _moved(frame: Frame) -> bytes:
     return frame.raw[:14] + struct.pack("<i", lat_1e7) + frame.raw[18:]
 
 
-def test_a_glitch_is_gated_and_the_rest_of_the_flight_is_not(cut_log: Path) -> None:
+def test_only_the_glitch_is_rejected(cut_log: Path) -> None:
     events = list(read_log(cut_log))
     pipeline = Pipeline(Settings().override(center={"source": "5:1"}))
     for event in with_glitch(events, 2, 8.0, 10.0):

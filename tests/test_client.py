@@ -48,7 +48,7 @@ def guarded() -> Iterator[Node]:
     end(node.process)
 
 
-def test_it_shows_what_the_service_says(flying: Node) -> None:
+def test_client_returns_the_service_responses(flying: Node) -> None:
     client = Client(flying.url + "/")
     assert client.status()["version"]
     assert {uav["id"] for uav in client.uavs()} == {"1:1", "2:1", "3:1", "4:1"}
@@ -63,7 +63,7 @@ def test_it_shows_what_the_service_says(flying: Node) -> None:
     assert not np.allclose(now.matrix, later.matrix)
 
 
-def test_a_stream_goes_on_until_it_is_closed(flying: Node) -> None:
+def test_stream_continues_until_closed(flying: Node) -> None:
     client = Client(flying.url)
     with closing(client.stream(["1:1"], ["uavs", "weights"], rate_hz=50)) as stream:
         heard = list(itertools.islice(stream, 12))
@@ -80,7 +80,7 @@ def test_a_stream_goes_on_until_it_is_closed(flying: Node) -> None:
 
 
 @pytest.mark.full
-def test_that_the_service_ends_is_said(tmp_path: Path) -> None:
+def test_service_shutdown_is_reported_to_stream_readers(tmp_path: Path) -> None:
     """A reader is notified, and a client that never reads does not delay the shutdown."""
     flying = demo(tmp_path)
     host, _, port = flying.url.removeprefix("http://").partition(":")
@@ -104,7 +104,7 @@ def test_that_the_service_ends_is_said(tmp_path: Path) -> None:
     assert raised.value.status == 1012
 
 
-def test_refusals_have_a_status_and_a_title(guarded: Node) -> None:
+def test_error_responses_have_status_and_title(guarded: Node) -> None:
     client = Client(guarded.url, TOKEN)
     with pytest.raises(ServiceError, match=r"422: query\.lead_ms: ") as raised:
         client.beams(lead_ms=-1)
@@ -119,7 +119,7 @@ def test_refusals_have_a_status_and_a_title(guarded: Node) -> None:
     assert empty.matrix.shape == (64, 0)
 
 
-def test_a_token_is_sent(guarded: Node) -> None:
+def test_missing_or_wrong_token_is_rejected(guarded: Node) -> None:
     for wrong in (Client(guarded.url), Client(guarded.url, "wrong")):
         with pytest.raises(ServiceError, match="401: a bearer token is needed"):
             wrong.status()
@@ -127,14 +127,14 @@ def test_a_token_is_sent(guarded: Node) -> None:
             next(wrong.stream())
 
 
-def test_the_right_token_opens(guarded: Node) -> None:
+def test_correct_token_is_accepted(guarded: Node) -> None:
     client = Client(guarded.url, TOKEN)
     assert client.status()["version"]
     with closing(client.stream(topics=["status"])) as stream:
         assert next(stream)["topic"] == "status"
 
 
-def test_where_nobody_answers() -> None:
+def test_unreachable_service_raises_service_error() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     client = Client(f"http://127.0.0.1:{port}")
@@ -163,7 +163,7 @@ class _Stranger(BaseHTTPRequestHandler):
         pass
 
 
-def test_what_is_no_service_of_ours() -> None:
+def test_foreign_http_service_raises_service_error() -> None:
     with HTTPServer(("127.0.0.1", 0), _Stranger) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)
         thread.start()

@@ -43,7 +43,7 @@ def instruction(name: str) -> list[str]:
     return list(json.loads(found[-1]))
 
 
-def test_the_dockerfile_is_clean(tmp_path: Path) -> None:
+def test_dockerfile_passes_hadolint(tmp_path: Path) -> None:
     assert lint(DOCKERFILE, tmp_path).stdout == ""
     careless = DOCKERFILE.replace("USER 10001:10001", "USER root").replace(
         "WORKDIR /tmp", "RUN cd /tmp && pip install numpy"
@@ -51,25 +51,25 @@ def test_the_dockerfile_is_clean(tmp_path: Path) -> None:
     assert lint(careless, tmp_path).returncode != 0
 
 
-def test_the_compose_file_fits_its_schema(tmp_path: Path) -> None:
+def test_compose_file_matches_its_schema(tmp_path: Path) -> None:
     assert against_schema(COMPOSE, tmp_path) == 0
     assert against_schema(COMPOSE.replace("read_only:", "readonly:"), tmp_path) != 0
 
 
-def test_make_check_holds_both() -> None:
+def test_make_check_covers_dockerfile_and_compose_file() -> None:
     recipe = (ROOT / "Makefile").read_text(encoding="utf-8").split("\ncheck:")[1].split("\n\n")[0]
     assert "hadolint Dockerfile" in recipe
     assert "vendor.compose-spec docker-compose.yml" in recipe
 
 
-def test_packages_come_as_wheels_with_hashes() -> None:
+def test_packages_are_installed_as_hashed_wheels() -> None:
     (install,) = [line for line in DOCKERFILE.splitlines() if "requirements.lock" in line][-1:]
     assert "--require-hashes" in install
     assert "--only-binary :all:" in install
 
 
 @pytest.mark.parametrize("name", ["companion", "sim"])
-def test_a_service_has_no_rights(name: str) -> None:
+def test_containers_run_without_privileges(name: str) -> None:
     service = yaml.safe_load(COMPOSE)["services"][name]
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
@@ -78,7 +78,7 @@ def test_a_service_has_no_rights(name: str) -> None:
     assert re.findall(r"^USER (\S+)$", DOCKERFILE, re.MULTILINE) == ["10001:10001"]
 
 
-def test_only_this_machine_reaches_the_page() -> None:
+def test_page_is_published_on_loopback_only() -> None:
     services = yaml.safe_load(COMPOSE)["services"]
     published = [port for one in services.values() for port in one.get("ports", [])]
     assert [port for port in published if port.endswith(":8080")] == ["127.0.0.1:8080:8080"]
@@ -87,7 +87,7 @@ def test_only_this_machine_reaches_the_page() -> None:
 
 
 @pytest.mark.full
-def test_the_commands_are_understood(start_node: Any) -> None:
+def test_container_commands_run(start_node: Any) -> None:
     """The commands of image and compose file start with addresses of this machine and
     receive data.
     """
@@ -112,7 +112,7 @@ def test_the_commands_are_understood(start_node: Any) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("token", [None, "s3cret"])
-def test_health_is_that_of_readyz(
+def test_container_health_check_uses_readyz(
     start_node: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, token: str | None
 ) -> None:
     if token:
@@ -151,7 +151,7 @@ def context(target: Path) -> None:
     assert not any(fnmatch.fnmatch(path.name, "*.pyc") for path in target.rglob("*"))
 
 
-def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> None:
+def test_image_installs_and_runs_from_its_build_context(tmp_path: Path) -> None:
     """Installed separately, read-only, without HOME and in another directory; the page is
     included.
     """
@@ -200,7 +200,7 @@ def test_the_image_installs_and_runs_from_what_it_is_given(tmp_path: Path) -> No
 
 
 @pytest.mark.full
-def test_what_the_image_leaves_out_is_not_missed(tmp_path: Path) -> None:
+def test_commands_run_without_packages_left_out_of_the_image(tmp_path: Path) -> None:
     """An LMI design, a study with figures and a replay, without the omitted packages."""
     (line,) = re.findall(r"pip uninstall --yes (highspy .*) pip ", DOCKERFILE)
     gone = [name for name in line.split() if name != "setuptools"]
@@ -233,7 +233,7 @@ PACKAGES_MB = 330
 
 
 @pytest.mark.full
-def test_what_the_image_keeps_is_small_and_works(tmp_path: Path) -> None:
+def test_reduced_packages_are_small_and_work(tmp_path: Path) -> None:
     """The locked packages as installed here, reduced as in the image."""
     if shutil.which("strip") is None:
         pytest.skip("no strip: install binutils")
@@ -290,7 +290,7 @@ def taken_mb(folder: Path) -> float:
     return sum(path.stat().st_size for path in folder.rglob("*") if path.is_file()) / 2**20
 
 
-def test_services_are_tested_one_at_a_time(request: pytest.FixtureRequest) -> None:
+def test_service_tests_run_one_at_a_time(request: pytest.FixtureRequest) -> None:
     """The ``conftest.ALONE`` group reaches xdist, which reads it from the test's id."""
     if "PYTEST_XDIST_WORKER" in os.environ:
         assert request.node.nodeid.endswith("@alone")

@@ -106,7 +106,7 @@ def marked(line: str) -> object:
 
 
 @pytest.mark.parametrize("line", [marked(line) for line in ALL])
-def test_a_command_of_the_documents_works(
+def test_documented_command_works(
     *,
     line: str,
     tmp_path: Path,
@@ -144,14 +144,14 @@ def test_a_command_of_the_documents_works(
         parsed(words)
 
 
-def test_a_wrong_option_is_found() -> None:
+def test_wrong_option_is_detected() -> None:
     with pytest.raises(click.UsageError):
         parsed(["companion", "run", "--lnik", "udpin:0.0.0.0:14550"])
     with pytest.raises(click.UsageError):
         parsed(["companion", "dirve", "rotctld:127.0.0.1:4533"])
 
 
-def test_every_reason_for_not_running_is_used() -> None:
+def test_every_exception_from_running_is_used() -> None:
     words = {line.split()[0] for line in ALL}
     assert len(ALL) > 50
     assert set(NOT_RUN) - words <= {"mosquitto_sub"}

@@ -18,13 +18,13 @@ CODE = [
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_every_link_leads_somewhere(page: Path) -> None:
+def test_every_link_target_exists(page: Path) -> None:
     for target in re.findall(r"\]\(([^)#\s]+)", page.read_text(encoding="utf-8")):
         if "://" not in target:
             assert (page.parent / target).exists(), target
 
 
-def test_every_file_and_folder_that_the_architecture_names_is_there() -> None:
+def test_every_path_named_in_the_architecture_exists() -> None:
     """``a/b.py`` is below companion/; a bare ``b.py`` is in a folder named before it."""
     text = (DOCS / "architecture.md").read_text(encoding="utf-8")
     named = re.findall(r"`([\w./-]+)`", text)
@@ -39,7 +39,7 @@ def test_every_file_and_folder_that_the_architecture_names_is_there() -> None:
 
 
 @pytest.mark.full
-def test_the_picture_of_the_rooms_is_up_to_date() -> None:
+def test_package_diagram_is_up_to_date() -> None:
     drawing = [sys.executable, DOCS / "draw_architecture.py", "--check"]
     done = subprocess.run(drawing, capture_output=True, text=True, check=False, timeout=HANG_S)
     assert done.returncode == 0, done.stderr
@@ -54,7 +54,7 @@ def test_the_picture_of_the_rooms_is_up_to_date() -> None:
         pytest.param("make_researcher.py", marks=pytest.mark.full),
     ],
 )
-def test_a_page_that_is_written_by_a_program_is_up_to_date(drawn: str) -> None:
+def test_generated_page_is_up_to_date(drawn: str) -> None:
     """The API reference, the list of redistributed software, and the notebook with its executed
     cells."""
     making = [sys.executable, DOCS / drawn, "--check"]
@@ -62,7 +62,7 @@ def test_a_page_that_is_written_by_a_program_is_up_to_date(drawn: str) -> None:
     assert done.returncode == 0, done.stderr
 
 
-def test_every_threat_has_a_test_that_is_there() -> None:
+def test_every_threat_cites_an_existing_test() -> None:
     rows = re.findall(r"^\|.*\| `?([^|`]*)`? \|$", (DOCS / "security.md").read_text("utf-8"), re.M)
     cited = [one for one in rows if one not in ("test", "---") and not one.startswith("---")]
     assert len(cited) > 20
@@ -82,17 +82,17 @@ def rows(heading: str) -> list[list[str]]:
     return [[cell.strip() for cell in line.strip("|").split("|")] for line in table[2:]]
 
 
-def test_reasons_of_refusals_are_those_that_there_are() -> None:
+def test_documented_rejection_reasons_are_complete() -> None:
     named = [word for row in rows("Reports are rejected") for word in row[0].split(", ")]
     assert sorted(named) == sorted(f"`{reason}`" for reason in Reason)
 
 
-def test_every_cause_of_a_weak_link_is_told() -> None:
+def test_every_cause_of_a_weak_link_is_documented() -> None:
     told = [cause for row in rows("A link is weak, or none") for cause in row[0].split(", ")]
     assert sorted(told) == sorted(f"`{cause}`" for cause in Cause)
 
 
-def test_every_source_of_events_is_told_in_its_own_words() -> None:
+def test_every_notice_subject_is_documented() -> None:
     text = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
     said = {one for row in rows("Notices") for one in re.findall(r'"(.+?)"', row[0])}
     said |= set(re.findall(r'"([^"]+)"', text.split("## A fleet\n")[1].split("\n## ")[0]))
@@ -113,7 +113,7 @@ def test_every_source_of_events_is_told_in_its_own_words() -> None:
     assert untold == READ_BACK
 
 
-def test_there_are_at_most_twelve_rooms_and_nothing_loose() -> None:
+def test_package_has_at_most_twelve_subpackages() -> None:
     inside = (ROOT / "companion").iterdir()
     there = {path.name for path in inside if path.name not in ("__pycache__", "_web")}
     files = {name for name in there if name.endswith(".py")}
@@ -134,7 +134,7 @@ def headings(page: str) -> set[str]:
 
 
 @pytest.mark.parametrize("page", ["math.md", "field-notes.md"])
-def test_every_section_that_is_cited_exists(page: str) -> None:
+def test_every_cited_section_exists(page: str) -> None:
     there, cited = headings(page), set()
     one = r"\d+(?:\.\d+)?"
     for path in CODE:
@@ -146,7 +146,7 @@ def test_every_section_that_is_cited_exists(page: str) -> None:
     assert cited <= there, cited - there
 
 
-def test_every_equation_of_the_paper_that_is_cited_is_in_the_mathematics() -> None:
+def test_every_cited_paper_equation_is_in_the_mathematics_page() -> None:
     there = equations(DOCS / "math.md")
     for path in CODE:
         assert equations(path) <= there, path
@@ -174,7 +174,7 @@ def unwrapped(path: Path) -> str:
     return re.sub(r"\s*\n\s*#?\s*", " ", path.read_text(encoding="utf-8"))
 
 
-def test_every_class_that_the_glossary_names_is_there() -> None:
+def test_every_class_in_the_glossary_exists() -> None:
     text = (DOCS / "glossary.md").read_text(encoding="utf-8")
     named = set(re.findall(r"`([A-Z][a-z]+[A-Za-z]*)(?:\.\w+)*`", text))
     sources = "".join(
@@ -193,7 +193,7 @@ def test_every_class_that_the_glossary_names_is_there() -> None:
         ("a field of the API, recordings and exports", "climb_rate_mps"),
     ],
 )
-def test_where_to_add_names_every_file_that_a_neighbour_is_in(what: str, neighbour: str) -> None:
+def test_extension_table_names_every_affected_file(what: str, neighbour: str) -> None:
     """The most recent addition appears in the files of the table, and in at most four."""
     text = (DOCS / "architecture.md").read_text(encoding="utf-8")
     (row,) = (line for line in text.splitlines() if line.startswith(f"| {what} |"))

@@ -20,7 +20,7 @@ def loaded_by(code: str) -> set[str]:
     return set(done.stdout.splitlines()[-1].split())
 
 
-def test_every_name_is_there_and_documented() -> None:
+def test_every_public_name_exists_and_is_documented() -> None:
     assert companion.__doc__ is not None
     for name in companion.__all__:
         assert getattr(companion, name) is not None
@@ -29,7 +29,7 @@ def test_every_name_is_there_and_documented() -> None:
         _ = companion.Beams
 
 
-def test_the_type_checker_and_the_loader_mean_the_same_things() -> None:
+def test_type_checking_imports_match_lazy_imports() -> None:
     """The imports under TYPE_CHECKING are the objects that lazy loading returns."""
     tree = ast.parse(Path(companion.__file__).read_text(encoding="utf-8"))
     under = next(node for node in tree.body if isinstance(node, ast.If))
@@ -44,14 +44,14 @@ def test_the_type_checker_and_the_loader_mean_the_same_things() -> None:
         assert getattr(companion, name) is getattr(__import__(module, fromlist=[name]), name)
 
 
-def test_importing_it_loads_nothing_of_weight() -> None:
+def test_importing_the_package_loads_no_heavy_modules() -> None:
     bare = loaded_by("pass")
     loaded = loaded_by("import companion")
     assert {name for name in loaded - bare if name.startswith("companion")} == {"companion"}
     assert not (loaded - bare) & {"numpy", "scipy", "pydantic", "pymavlink", "asyncio", "typing"}
 
 
-def test_the_example_runs(cut_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_package_docstring_example_runs(cut_log: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert companion.__doc__ is not None
     example = companion.__doc__.split("::\n\n")[1].split("\n\n``Settings``")[0]
     lines = [line.removeprefix("    ") for line in example.splitlines()]

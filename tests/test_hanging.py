@@ -34,7 +34,7 @@ def test_that_does_not():
 
 
 @pytest.mark.full
-def test_a_test_that_hangs_is_ended_and_named(tmp_path: Path) -> None:
+def test_hanging_test_is_terminated_and_named(tmp_path: Path) -> None:
     text = (ROOT / "tests" / "conftest.py").read_text(encoding="utf-8")
     assert PATIENT in text
     (tmp_path / "conftest.py").write_text(text.replace(PATIENT, HASTY), encoding="utf-8")

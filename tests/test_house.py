@@ -444,14 +444,14 @@ RULES: tuple[Rule, ...] = (
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
-def test_the_tree_keeps_the_rule(rule: Rule) -> None:
+def test_source_tree_satisfies_the_rule(rule: Rule) -> None:
     paths = sources()
     assert "companion/values/received.py" in paths
     faults = [fault for p in paths for fault in rule(p, (ROOT / p).read_text(encoding="utf-8"))]
     assert not faults, "\n" + "\n".join(faults)
 
 
-def test_tests_and_examples_name_the_fields_of_tuples() -> None:
+def test_tests_and_examples_pass_tuple_fields_by_name() -> None:
     paths = sorted(
         path for room in ("docs", "examples", "tests") for path in (ROOT / room).rglob("*.py")
     )
@@ -544,7 +544,7 @@ BAD = [
 
 
 @pytest.mark.parametrize(("rule", "path", "text"), BAD)
-def test_the_rule_refuses(rule: Rule, path: str, text: str) -> None:
+def test_rule_rejects_bad_code(rule: Rule, path: str, text: str) -> None:
     assert rule(path, text)
 
 
@@ -593,7 +593,7 @@ GOOD = [
 
 
 @pytest.mark.parametrize(("rule", "path", "text"), GOOD)
-def test_the_rule_allows(rule: Rule, path: str, text: str) -> None:
+def test_rule_accepts_good_code(rule: Rule, path: str, text: str) -> None:
     assert rule(path, text) == []
 
 
@@ -609,7 +609,7 @@ def lint_imports(root: Path) -> subprocess.CompletedProcess[str]:
     )
 
 
-def test_the_rooms_import_in_the_order_of_the_flow() -> None:
+def test_packages_satisfy_the_import_contracts() -> None:
     done = lint_imports(ROOT)
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -663,12 +663,14 @@ def refused(bare: Path) -> str:
 
 
 @pytest.mark.parametrize(("path", "text", "imported"), REFUSED)
-def test_import_linter_refuses(refused: str, path: str, text: str, imported: str) -> None:
+def test_import_linter_rejects_forbidden_imports(
+    refused: str, path: str, text: str, imported: str
+) -> None:
     module = path.removesuffix(".py").replace("/", ".")
     assert f"- {module} -> {imported} (l.{text.count(chr(10)) + 1})" in refused
 
 
-def test_the_service_starts_without_the_solver_and_what_only_studies_need() -> None:
+def test_service_loads_neither_solver_nor_study_packages() -> None:
     """``companion run`` imports neither CVXPY nor the packages for figures and pages."""
     if not (ROOT / "companion/node/service.py").exists():
         pytest.skip("there is no companion/node/service.py yet")
@@ -712,7 +714,7 @@ def endless_waits(text: str) -> list[str]:
     return faults
 
 
-def test_no_test_waits_for_ever() -> None:
+def test_tests_have_no_endless_waits() -> None:
     """Neither for a process nor for a coroutine: nothing else would notice the hang."""
     faults = [
         f"{path.relative_to(ROOT)}:{fault}"
@@ -723,7 +725,7 @@ def test_no_test_waits_for_ever() -> None:
     assert faults == []
 
 
-def test_an_endless_wait_is_found() -> None:
+def test_endless_wait_is_detected() -> None:
     text = (
         "with subprocess.Popen(a) as b:\n    b.communicate()\n    subprocess.run(c)\nasyncio.run(d)"
     )
@@ -736,7 +738,7 @@ def test_class_names_are_unique() -> None:
     assert repeated_classes(texts) == sorted(REPEATED_CLASSES)
 
 
-def test_a_repeated_class_and_an_obscure_name_are_found() -> None:
+def test_repeated_classes_and_obscure_names_are_detected() -> None:
     assert repeated_classes(["class A:\n    class B: ...", "class B: ..."]) == ["B"]
     text = "TOLD_S: Final = 1\ndef sure_db(): ...\nclass Twins:\n    def is_insured(self): ..."
     found = obscure_names("companion/pipeline/aside.py", text)
@@ -762,7 +764,7 @@ def lock_faults(text: str) -> list[str]:
     return faults
 
 
-def test_every_fault_of_the_mutation_table_can_still_be_put_in() -> None:
+def test_every_mutation_applies_once() -> None:
     for fault in tomllib.loads((ROOT / "tests" / "mutations.toml").read_text())["mutation"]:
         times = (ROOT / fault["file"]).read_text().count(fault["old"])
         assert times == 1, f"{fault['what']}: its text is in {fault['file']} {times} times"
@@ -770,7 +772,7 @@ def test_every_fault_of_the_mutation_table_can_still_be_put_in() -> None:
             assert (ROOT / tests).exists(), f"{fault['what']}: no {tests}"
 
 
-def test_no_committed_file_names_a_registry() -> None:
+def test_committed_files_name_no_registry() -> None:
     paths = committed()
     assert {"LICENSE", "pyproject.toml", *LOCKS} <= set(paths)
     found = {path: registries((ROOT / path).read_bytes()) for path in paths}
@@ -778,12 +780,12 @@ def test_no_committed_file_names_a_registry() -> None:
 
 
 @pytest.mark.parametrize("host", REGISTRY_HOSTS)
-def test_a_registry_is_found(host: str) -> None:
+def test_registry_name_is_detected(host: str) -> None:
     assert registries(f"see HTTPS://files.{host.upper()}/simple".encode())
 
 
 @pytest.mark.parametrize("lock", LOCKS)
-def test_a_lock_has_versions_and_hashes_and_no_address(lock: str) -> None:
+def test_locks_have_versions_and_hashes_and_no_addresses(lock: str) -> None:
     text = (ROOT / lock).read_text(encoding="utf-8")
     assert "numpy==" in text
     assert lock_faults(text) == []
@@ -799,11 +801,11 @@ def test_a_lock_has_versions_and_hashes_and_no_address(lock: str) -> None:
         "numpy==2.0.0 \\\n    --hash=md5:" + "0" * 32 + "\n",
     ],
 )
-def test_a_bad_lock_is_refused(text: str) -> None:
+def test_invalid_lock_is_detected(text: str) -> None:
     assert lock_faults(text)
 
 
-def test_the_wheel_and_the_locks_agree() -> None:
+def test_locks_pin_every_dependency() -> None:
     """Every dependency in ``pyproject.toml`` is pinned."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     wanted = {

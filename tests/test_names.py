@@ -15,12 +15,12 @@ IDS = {
 
 
 @pytest.mark.parametrize(("kind", "uav"), IDS.items())
-def test_each_id_is_of_one_kind(kind: UavKind, uav: str) -> None:
+def test_each_uav_id_has_one_kind(kind: UavKind, uav: str) -> None:
     assert kind_of(uav) is kind
     assert [one for one in UavKind if re.fullmatch(one.pattern, uav)] == [kind]
     assert kind.reports_itself == (kind is UavKind.VEHICLE)
     assert kind.prefix in UAV_FORMS
 
 
-def test_telemetry_is_known_best_and_the_word_of_others_least() -> None:
+def test_uav_kinds_are_ranked_from_telemetry_to_cot() -> None:
     assert sorted(UavKind, key=lambda kind: kind.rank) == list(IDS)

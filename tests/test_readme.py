@@ -261,7 +261,7 @@ def recording(short_log: Path, tmp_path_factory: pytest.TempPathFactory) -> Path
 
 
 @pytest.mark.parametrize("command", [marked(command) for command in sorted(set(COMMANDS) - FULL)])
-def test_the_command_does_what_it_should(
+def test_readme_command_works(
     *,
     command: str,
     tmp_path: Path,
@@ -285,7 +285,7 @@ def test_the_command_does_what_it_should(
     RUNNERS[way](words, tmp_path, request.getfixturevalue(WITH.get(way, "start_node")))
 
 
-def test_python_does_what_it_should(demo: Node, capsys: pytest.CaptureFixture[str]) -> None:
+def test_readme_client_snippet_works(demo: Node, capsys: pytest.CaptureFixture[str]) -> None:
     (block,) = (block for block in PYTHON if "companion.client" in block)
     exec(block.replace("http://127.0.0.1:8080", demo.url), {})
     weights, beams = capsys.readouterr().out.splitlines()
@@ -293,7 +293,7 @@ def test_python_does_what_it_should(demo: Node, capsys: pytest.CaptureFixture[st
     assert beams.startswith("beams 20")
 
 
-def test_the_library_does_what_it_should(cut_log: Path) -> None:
+def test_readme_library_snippet_works(cut_log: Path) -> None:
     (block,) = (block for block in PYTHON if "companion.client" not in block)
     names: dict[str, Any] = {}
     exec(block.replace('"flight.tlog"', repr(str(cut_log))), names)
@@ -301,24 +301,24 @@ def test_the_library_does_what_it_should(cut_log: Path) -> None:
     assert {track.uav for track in tracks} >= {"1:1", "2:1", "3:1", "4:1"}
 
 
-def test_names_of_commands_are_run_in_full() -> None:
+def test_abbreviated_commands_are_run_in_full() -> None:
     for name in FULL:
         assert any(
             " ".join(words_of(command)).startswith(name + " ") for command in set(COMMANDS) - FULL
         )
 
 
-def test_every_way_of_running_is_asked_for() -> None:
+def test_every_runner_is_used() -> None:
     assert {runner_of(command) for command in COMMANDS} == set(RUNNERS)
     assert len(SETTINGS) == 1
 
 
-def test_a_command_that_nobody_knows_is_found() -> None:
+def test_command_without_runner_is_detected() -> None:
     with pytest.raises(LookupError, match="companion fnord"):
         runner_of(".venv/bin/companion fnord --now")
 
 
-def test_the_settings_are_good() -> None:
+def test_readme_settings_are_valid() -> None:
     (block,) = SETTINGS
     settings = Settings.from_toml(block, "README.md")
     assert settings.array.elements == 64

@@ -97,7 +97,7 @@ def names(subject: dict[str, Any]) -> dict[str, set[str]]:
 
 
 @pytest.mark.parametrize("subject", SUBJECTS)
-def test_what_one_way_lacks_has_a_reason(subject: str) -> None:
+def test_values_missing_from_one_output_have_a_reason(subject: str) -> None:
     found, reasons = names(SUBJECTS[subject]), REASONS[subject]
     everything = set.union(*found.values())
     described = {stem(one.name): one.meaning.absent for one in members(SUBJECTS[subject]["export"])}
@@ -166,7 +166,7 @@ def same(one: Any, other: Any) -> bool:
 
 
 @pytest.mark.parametrize("subject", SUBJECTS)
-def test_two_names_never_hold_the_same_values(
+def test_no_two_names_hold_the_same_values(
     flown: tuple[Pipeline, Any, list[Update]], subject: str
 ) -> None:
     found = columns(flown)[subject]
@@ -185,7 +185,7 @@ def test_two_names_never_hold_the_same_values(
 
 
 @pytest.mark.parametrize("subject", SUBJECTS)
-def test_one_name_holds_the_same_values_on_every_way(
+def test_each_name_holds_the_same_values_in_every_output(
     flown: tuple[Pipeline, Any, list[Update]], subject: str
 ) -> None:
     """Angles in degrees; the recording has radians."""
@@ -202,7 +202,7 @@ def test_one_name_holds_the_same_values_on_every_way(
     assert compared > 15
 
 
-def test_no_table_names_a_column_twice_and_old_names_say_what_is_new() -> None:
+def test_column_names_are_unique_and_old_names_point_to_new_ones() -> None:
     for table in TABLES:
         named = [column.name for column in table.columns]
         assert len(named) == len(set(named))
@@ -211,7 +211,7 @@ def test_no_table_names_a_column_twice_and_old_names_say_what_is_new() -> None:
             assert new in named and column.meaning == f"deprecated: use `{new}`"
 
 
-def test_a_value_means_the_same_on_every_way() -> None:
+def test_each_value_has_one_description_for_every_output() -> None:
     """It is described once: every output refers to the same object."""
     for name in ("innovation_m", "bound_m", "age_s"):
         said = meaning(TrackRow, name)

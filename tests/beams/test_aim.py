@@ -105,14 +105,14 @@ def test_beams_point_where_the_tracks_are() -> None:
         assert beam.pointing_bound_rad == pytest.approx(math.asin(2.0 / beam.range_m))
 
 
-def test_the_carrier_s_bound_adds_to_the_track_s() -> None:
+def test_pointing_bound_adds_carrier_and_track_bounds() -> None:
     (beam,) = pointed([track("a", (100, 0, 0), bound_m=3.0)], carrier(bound_m=4.0)).beams
     assert beam.pointing_bound_rad == pytest.approx(math.asin(0.07))
     (beam,) = pointed([track("a", (100, 0, 0), bound_m=60.0)], carrier(bound_m=40.0)).beams
     assert beam.pointing_bound_rad is None
 
 
-def test_the_attitude_s_bound_turns_every_direction() -> None:
+def test_attitude_bound_adds_to_every_pointing_bound() -> None:
     tracks = [track("a", (100, 0, 0), bound_m=3.0), track("b", (0, 50, 0), bound_m=60.0)]
     near, anywhere = pointed(tracks, carrier(bound_m=4.0, attitude_bound_rad=0.05)).beams
     assert near.pointing_bound_rad == pytest.approx(math.asin(0.07) + 0.05)
@@ -136,7 +136,7 @@ def test_a_true_direction_lies_within_the_pointing_bound() -> None:
     assert worst == pytest.approx(beam.pointing_bound_rad, abs=1e-5)
 
 
-def test_a_wrong_attitude_swings_an_array_that_stands_off() -> None:
+def test_pointing_bound_covers_attitude_error_with_a_lever_arm() -> None:
     """Lever arm of 10 m, a UAV 2 m from the array, attitude error of 2 degrees."""
     array = uniform_linear(
         8,
@@ -167,7 +167,7 @@ def test_a_wrong_attitude_swings_an_array_that_stands_off() -> None:
     assert turned < worst <= beam.pointing_bound_rad
 
 
-def test_weights_respond_to_their_own_direction_alone() -> None:
+def test_zero_forcing_weights_respond_only_to_their_own_direction() -> None:
     """Compared with explicit phases for elements along y, half a wavelength apart."""
     found = pointed([track(uav, place) for uav, place in PLACES.items()], carrier())
     assert (found.method, found.regularised) == (Method.ZERO_FORCING, False)
@@ -187,7 +187,7 @@ def test_weights_respond_to_their_own_direction_alone() -> None:
 
 
 @pytest.mark.parametrize("order", [("1:1", "2:1", "3:1"), ("3:1", "1:1", "2:1")])
-def test_columns_come_in_the_order_of_the_tracks(order: tuple[str, ...]) -> None:
+def test_weight_columns_follow_the_track_order(order: tuple[str, ...]) -> None:
     plain = pointed([track(uav, PLACES[uav]) for uav in PLACES], carrier())
     found = pointed([track(uav, PLACES[uav]) for uav in order], carrier())
     assert found.uavs == order
@@ -196,7 +196,7 @@ def test_columns_come_in_the_order_of_the_tracks(order: tuple[str, ...]) -> None
         assert found.weights[:, column] == pytest.approx(same, abs=1e-12)
 
 
-def test_who_is_left_out_and_why() -> None:
+def test_tracks_without_a_beam_have_a_reason() -> None:
     tracks = [
         track("live", (100, 0, 0)),
         track("stale", (90, 40, 0), "stale"),
@@ -225,13 +225,13 @@ def test_without_a_carrier_there_are_no_beams() -> None:
 
 
 @pytest.mark.parametrize("tracks", [[], [track("a", (5, 0, 0), "stale")]])
-def test_without_anyone_to_aim_at_there_are_no_beams(tracks: list[Track]) -> None:
+def test_no_live_tracks_give_no_beams(tracks: list[Track]) -> None:
     found = pointed(tracks, carrier())
     assert (found.beams, found.weights.shape) == ((), (16, 0))
     assert len(found.left_out) == len(tracks)
 
 
-def test_mirror_images_are_regularised() -> None:
+def test_mirror_directions_are_regularised() -> None:
     found = pointed([track("ahead", (80, 60, 0)), track("behind", (-80, 60, 0))], carrier())
     assert found.regularised
     assert np.all(np.isfinite(found.weights))
@@ -249,7 +249,7 @@ def assert_same_beams(a: BeamSet, b: BeamSet) -> None:
 
 @settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1))
-def test_turning_the_carrier_is_turning_the_world_the_other_way(seed: int) -> None:
+def test_carrier_rotation_equals_inverse_world_rotation(seed: int) -> None:
     rng = np.random.default_rng(seed)
     turn, mount, pose = (m.as_matrix() for m in Rotation.random(3, rng=rng))
     shift = rng.uniform(-500, 500, 3)
@@ -269,7 +269,7 @@ def test_turning_the_carrier_is_turning_the_world_the_other_way(seed: int) -> No
     assert_same_beams(plain, pointed(tracks, carrier(tuple(place), mount @ pose), straight))
 
 
-def test_a_mount_that_looks_right_sees_the_right_ahead() -> None:
+def test_array_mounted_to_the_right_has_boresight_at_the_right() -> None:
     """Array yawed by 90 degrees: its boresight is the body's right."""
     right = Rotation.from_euler("ZYX", [math.pi / 2, 0, 0]).as_matrix().T
     array = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=right)
@@ -282,7 +282,7 @@ def test_a_mount_that_looks_right_sees_the_right_ahead() -> None:
 
 @settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1))
-def test_the_lever_arm_turns_with_the_carrier(seed: int) -> None:
+def test_lever_arm_rotates_with_the_carrier(seed: int) -> None:
     """An array with a lever arm equals an array at the resulting position."""
     rng = np.random.default_rng(seed)
     pose = Rotation.random(rng=rng).as_matrix()
@@ -316,7 +316,7 @@ def test_the_lever_arm_is_in_the_body_frame() -> None:
 
 @settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1))
-def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: int) -> None:
+def test_rotation_invariance_holds_for_every_array(seed: int) -> None:
     """Weights included: any geometry, directional elements, a lever arm."""
     rng = np.random.default_rng(seed)
     turn, mount, pose = (m.as_matrix() for m in Rotation.random(3, rng=rng))
@@ -347,7 +347,7 @@ def test_turning_array_and_carrier_is_turning_the_world_for_every_array(seed: in
 # --- UAVs without a beam ------------------------------------------------------------------------
 
 
-def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
+def test_uav_behind_forward_elements_gets_no_beam() -> None:
     array = uniform_linear(
         16,
         30e9,
@@ -363,7 +363,7 @@ def test_behind_an_element_that_radiates_forward_there_is_no_beam() -> None:
     assert (out.uav, out.reason) == ("behind", "no element of the array radiates there")
 
 
-def test_where_all_elements_that_face_a_uav_are_dead_there_is_no_beam() -> None:
+def test_uav_faced_only_by_dead_elements_gets_no_beam() -> None:
     ring = uniform_circular(
         8, 5e9, spacing_wavelengths=0.5, array_from_body=EYE, element=Element(ElementPattern.COSINE)
     )
@@ -384,7 +384,7 @@ def test_where_all_elements_that_face_a_uav_are_dead_there_is_no_beam() -> None:
 
 
 @pytest.mark.parametrize("policy", Policy)
-def test_two_uavs_at_one_point_are_defined_under_every_policy(policy: Policy) -> None:
+def test_coincident_uavs_give_finite_weights_under_every_policy(policy: Policy) -> None:
     tracks = [track("a", (80, 60, 0)), track("b", (80, 60, 0)), track("c", (80, -60, 0))]
     found = aim(
         7,
@@ -412,7 +412,7 @@ def test_two_uavs_at_one_point_are_defined_under_every_policy(policy: Policy) ->
             assert out.reason.startswith("too close to a UAV of higher priority")
 
 
-def test_straight_above_is_a_direction_like_any_other() -> None:
+def test_uav_straight_above_gets_a_beam() -> None:
     """A line along y sees it broadside; its azimuth is meaningless."""
     tracks = [track("up", (0, 0, -100)), track("right", (0, 100, 0))]
     found = pointed(tracks, carrier())
@@ -422,13 +422,13 @@ def test_straight_above_is_a_direction_like_any_other() -> None:
     assert np.abs(a.T @ found.weights - np.eye(2)).max() < 1e-9
 
 
-def test_at_zero_range_nothing_is_aimed() -> None:
+def test_uav_at_zero_range_gets_no_beam() -> None:
     found = pointed([track("here", (0, 0, 0))], carrier())
     assert (found.beams, found.weights.shape) == ((), (16, 0))
     assert [out.reason for out in found.left_out] == ["it is within 1 m of the array"]
 
 
-def test_what_a_beam_lacks_against_one_for_its_uav_alone() -> None:
+def test_beam_loss_is_relative_to_a_single_uav_beam() -> None:
     found = pointed(
         [track("a", (80, 60, 0), bound_m=0), track("b", (80, 67, 0), bound_m=0)], carrier()
     )
@@ -440,7 +440,7 @@ def test_what_a_beam_lacks_against_one_for_its_uav_alone() -> None:
     assert alone.loss_db == pytest.approx(0.0, abs=1e-9)
 
 
-def test_a_beam_says_that_it_was_widened() -> None:
+def test_widened_beams_are_marked() -> None:
     tracks = [track("sure", (100, 0, 0), bound_m=0.5), track("vague", (0, 100, 0), bound_m=30.0)]
     sure, vague = pointed(tracks, carrier(turn=Rotation.from_euler("z", 0.7).as_matrix())).beams
     assert (sure.widened, vague.widened) == (False, True)
@@ -456,7 +456,7 @@ def test_a_beam_says_that_it_was_widened() -> None:
     assert [beam.widened for beam in sharp.beams] == [False, False]
 
 
-def test_a_uav_that_can_be_anywhere_has_a_sharp_beam() -> None:
+def test_unbounded_uav_gets_a_narrow_beam() -> None:
     """No floor gain could be guaranteed, so the beam is not widened."""
     tracks = [track("a", (100, 20, 0), bound_m=0.1), track("b", (100, -60, 0), bound_m=500.0)]
     near, anywhere = pointed(tracks, carrier()).beams
@@ -465,7 +465,7 @@ def test_a_uav_that_can_be_anywhere_has_a_sharp_beam() -> None:
     assert anywhere.loss_db < 1.0
 
 
-def test_the_usual_angle_is_that_of_both_positions_and_of_the_attitude() -> None:
+def test_pointing_p95_combines_position_and_attitude_errors() -> None:
     """Root sum of squares; an unknown term counts as a quarter of its bound; the sum is at most the
     bound."""
     known = replace(track("a", (100, 0, 0), bound_m=8.0), error_p95_m=3.0)
@@ -479,7 +479,7 @@ def test_the_usual_angle_is_that_of_both_positions_and_of_the_attitude() -> None
     assert beam.pointing_p95_rad == beam.pointing_bound_rad == pytest.approx(math.asin(0.005))
 
 
-def test_what_is_said_of_a_beam_is_of_its_own_uav_when_others_are_dropped() -> None:
+def test_beam_values_stay_with_their_uav_when_others_are_dropped() -> None:
     """The first UAV is dropped: bounds, widths and gains must not shift by one position."""
     tracks = [
         track("twin", (80, 60, 0), bound_m=3.0),
@@ -510,7 +510,7 @@ def test_what_is_said_of_a_beam_is_of_its_own_uav_when_others_are_dropped() -> N
     assert found.beams[0].gain_db + found.beams[0].loss_db == pytest.approx(most_db)
 
 
-def test_what_is_not_covered_is_left_out_in_the_frames_that_its_limits_are_in() -> None:
+def test_coverage_limits_apply_in_their_own_frames() -> None:
     """Array yawed right on a carrier heading east: steering limits rotate with the array, airframe
     shadows with the carrier."""
     right = Rotation.from_euler("z", math.pi / 2).as_matrix().T
@@ -574,7 +574,7 @@ def integrated(rates: FloatArray, seconds: float) -> FloatArray:
 
 @settings(max_examples=examples(200))
 @given(st.integers(0, 2**32 - 1))
-def test_rates_are_those_of_positions_and_of_the_turning_carrier(seed: int) -> None:
+def test_angle_rates_match_central_differences(seed: int) -> None:
     """Central differences of the angles a moment earlier and later."""
     rng = np.random.default_rng(seed)
     pose, mount = (m.as_matrix() for m in Rotation.random(2, rng=rng))
@@ -603,7 +603,7 @@ def test_rates_are_those_of_positions_and_of_the_turning_carrier(seed: int) -> N
     assert beam.range_rate_mps == pytest.approx(farther, rel=1e-4, abs=1e-4)
 
 
-def test_a_turning_carrier_alone_moves_the_beam_the_other_way() -> None:
+def test_carrier_rotation_alone_gives_opposite_beam_rates() -> None:
     """Yaw to the right moves the UAV ahead to the left; roll to the right raises the UAV on the
     right."""
     ahead, right = track("a", (100, 0, 0), velocity=STILL), track("b", (0, 100, 0), velocity=STILL)
@@ -616,7 +616,7 @@ def test_a_turning_carrier_alone_moves_the_beam_the_other_way() -> None:
     assert (one.range_rate_mps, other.range_rate_mps) == (0.0, 0.0)
 
 
-def test_an_array_on_a_boom_swings_with_the_turning_carrier() -> None:
+def test_lever_arm_adds_to_rates_of_a_turning_carrier() -> None:
     """10 m ahead of the centre at 0.3 rad/s to the right: the array moves sideways at 3 m/s, to the
     right."""
     array = uniform_linear(
@@ -634,7 +634,7 @@ def test_an_array_on_a_boom_swings_with_the_turning_carrier() -> None:
     assert beam.azimuth_rate_radps == pytest.approx(-0.3 - 3.0 / 50.0)
 
 
-def test_a_hair_off_straight_up_the_azimuth_has_no_rate() -> None:
+def test_angle_rates_are_undefined_near_the_zenith() -> None:
     at = carrier(velocity=STILL)
     up = track("a", (1e-6, 0, -50), velocity=np.array([0.0, 1.0, 0.0]))
     (beam,) = pointed([up], at).beams
@@ -642,7 +642,7 @@ def test_a_hair_off_straight_up_the_azimuth_has_no_rate() -> None:
     assert beam.range_rate_mps == pytest.approx(0.0)
 
 
-def test_a_rate_that_is_not_known_is_none() -> None:
+def test_rates_are_none_without_velocity_or_body_rates() -> None:
     velocity = np.array([0.0, 0.0, 7.0])
     for moving, own in ((None, STILL), (velocity, None)):
         (beam,) = pointed([track("a", (99, 0, 0), velocity=moving)], carrier(velocity=own)).beams
@@ -653,7 +653,7 @@ def test_a_rate_that_is_not_known_is_none() -> None:
     assert beam.range_rate_mps == pytest.approx(7.0)
 
 
-def test_behind_the_field_of_view_there_is_no_beam_and_no_null() -> None:
+def test_uav_outside_field_of_view_gets_neither_beam_nor_null() -> None:
     """UAVs in view get the beam that they would have alone: no gain is spent on the others."""
     view = Coverage(field_of_view_rad=math.radians(120))
     ahead = track("ahead", (80, 60, 0))
@@ -685,7 +685,7 @@ def test_behind_the_field_of_view_there_is_no_beam_and_no_null() -> None:
 
 
 @pytest.mark.parametrize("normalisation", ["total", "antenna"])
-def test_who_is_spared_has_a_null_on_him_and_none_of_the_power(normalisation: str) -> None:
+def test_protected_uav_gets_a_null_and_no_power(normalisation: str) -> None:
     tracks = [track(uav, place) for uav, place in PLACES.items()]
     precoder = Precoder(widen=Widen.NO, normalisation=Normalisation(normalisation))
     full = aim(1, valid_at_ns=2, tracks=tracks, carrier=carrier(), array=ARRAY, precoder=precoder)
@@ -704,7 +704,7 @@ def test_who_is_spared_has_a_null_on_him_and_none_of_the_power(normalisation: st
     assert full.uavs == ("1:1", "2:1", "3:1")  # the original beams are unchanged
 
 
-def test_a_turn_that_was_of_the_spared_alone_is_none() -> None:
+def test_time_slot_of_only_protected_uavs_is_removed() -> None:
     twins = [track("1:1", (100, 0, 0)), track("2:1", (101, 0, 0)), track("3:1", (102, 0, 0))]
     precoder = Precoder(policy=Policy.GROUP, widen=Widen.NO, normalisation=Normalisation.TOTAL)
     full = aim(1, valid_at_ns=2, tracks=twins, carrier=carrier(), array=ARRAY, precoder=precoder)
@@ -715,7 +715,7 @@ def test_a_turn_that_was_of_the_spared_alone_is_none() -> None:
     np.testing.assert_allclose(np.linalg.norm(spared.weights, axis=0), 1.0)
 
 
-def test_sparing_all_leaves_nothing() -> None:
+def test_protecting_all_uavs_leaves_no_beams() -> None:
     full = aim(
         1,
         valid_at_ns=2,
@@ -728,7 +728,9 @@ def test_sparing_all_leaves_nothing() -> None:
     assert (spared.uavs, spared.groups, spared.weights.shape) == ((), 0, (16, 0))
 
 
-def test_precoding_gets_the_snr_and_the_worth_of_each_uav(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_precoding_receives_snr_and_rate_weight_of_each_uav(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     given: list[Radio] = []
 
     def precoded(*arguments: Any, radio: Radio, **more: Any) -> Any:

@@ -77,7 +77,7 @@ def least_alike(one: ComplexArray, other: ComplexArray) -> float:
 
 @pytest.mark.parametrize("widen", [Widen.LIKELY, Widen.GUARANTEE])
 @pytest.mark.parametrize("array", ARRAYS.values(), ids=ARRAYS.keys())
-def test_no_beam_changes_at_once(array: Array, widen: Widen) -> None:
+def test_beams_change_continuously_with_direction(array: Array, widen: Widen) -> None:
     for seed in range(rounds(8, 40)):
         scene = Scene(array, widen, seed)
         shares = np.linspace(0, 1, STEPS + 1).tolist()

@@ -64,7 +64,7 @@ def flown(
 @pytest.mark.parametrize("widen", [Widen.LIKELY, Widen.GUARANTEE])
 @pytest.mark.parametrize("bounds_m", [[2.0] + [30.0] * 40, [30.0] + [2.0] * 60, [90.0, 300.0] * 9])
 @pytest.mark.parametrize("array", [ARRAY, PLANE], ids=["line", "plane"])
-def test_no_shape_jumps_when_a_report_comes(
+def test_beam_shape_does_not_jump_at_a_report(
     array: Array, widen: Widen, bounds_m: list[float]
 ) -> None:
     made = flown(bounds_m, Precoder(widen=widen), array=array)
@@ -76,7 +76,7 @@ def test_no_shape_jumps_when_a_report_comes(
         )
 
 
-def test_in_the_end_the_shape_is_the_one_that_is_wanted() -> None:
+def test_beam_shape_converges_to_the_wanted_shape() -> None:
     made = flown([2.0] + [30.0] * 60, Precoder())
     (alone, _) = flown([30.0], Precoder())[0].beams
     assert made[-1].beams[0].shaped_bound_rad == pytest.approx(alone.shaped_bound_rad)
@@ -86,7 +86,7 @@ def test_in_the_end_the_shape_is_the_one_that_is_wanted() -> None:
 
 
 @pytest.mark.parametrize("widen", [Widen.LIKELY, Widen.GUARANTEE])
-def test_a_uav_that_is_known_exactly_keeps_its_narrow_shape(widen: Widen) -> None:
+def test_uav_with_small_bound_keeps_a_narrow_beam(widen: Widen) -> None:
     """Narrower than any shape; one natural width is 1/32 rad."""
     made = flown([0.3] * 5 + [0.5] * 20 + [0.3] * 20, Precoder(widen=widen))
     for tick, bound_m in ((4, 0.3), (24, 0.5), (44, 0.3)):
@@ -96,7 +96,7 @@ def test_a_uav_that_is_known_exactly_keeps_its_narrow_shape(widen: Widen) -> Non
     assert np.abs(np.diff(gains)).max() < 0.1
 
 
-def test_once_a_uav_is_known_well_its_beam_soon_promises() -> None:
+def test_shape_bound_shrinks_within_eight_seconds() -> None:
     """After a large or missing bound, the shape reaches the new bound within eight seconds."""
     for before_m in (99.0, 1000.0):
         made = flown([before_m] * 20 + [4.0] * 80, Precoder())
@@ -105,7 +105,7 @@ def test_once_a_uav_is_known_well_its_beam_soon_promises() -> None:
         assert made[-1].beams[0].shaped_bound_rad == pytest.approx(wanted)
 
 
-def test_a_bound_that_rises_and_falls_with_reports_hardly_moves_its_shape() -> None:
+def test_sawtooth_bound_hardly_changes_the_shape() -> None:
     """Twelve ticks between reports; one natural width is 1/32 rad."""
     made = flown([6.0 + 14.0 * (tick % 12) / 12 for tick in range(96)], Precoder())
     shaped = np.array([each.beams[0].shaped_bound_rad for each in made[24:]])
@@ -113,7 +113,7 @@ def test_a_bound_that_rises_and_falls_with_reports_hardly_moves_its_shape() -> N
     assert shaped.min() > 0.75 * math.asin(0.2 - 0.14 / 12)
 
 
-def test_zero_forcing_is_named_only_once_it_lasts() -> None:
+def test_method_returns_to_zero_forcing_only_after_a_delay() -> None:
     """Two UAVs repeatedly become inseparable and separate again."""
     near, far = 0.05, 60.0
     apart = [far] * 3 + [near] + [far] * 3 + [near] + [far] * 9
@@ -124,7 +124,7 @@ def test_zero_forcing_is_named_only_once_it_lasts() -> None:
 
 
 @pytest.mark.parametrize("policy", [Policy.GROUP, Policy.DROP])
-def test_turns_do_not_change_to_and_fro(policy: Policy) -> None:
+def test_time_slots_do_not_alternate(policy: Policy) -> None:
     """Near the distance at which zero forcing reaches its loss limit."""
     apart = [1.38 + 0.06 * math.sin(2.1 * tick) for tick in range(40)]
     how = Precoder(policy=policy, widen=Widen.NO, priority=("b", "a"))
@@ -139,7 +139,7 @@ def test_turns_do_not_change_to_and_fro(policy: Policy) -> None:
 
 
 @pytest.mark.parametrize("stopped_s", [100.0, 1000.0, 86_400.0, 2.0**31])
-def test_beams_go_on_after_any_pause(stopped_s: float) -> None:
+def test_rate_limit_survives_any_pause(stopped_s: float) -> None:
     """The next tick comes much later after SIGSTOP or a suspended machine."""
     before = Hysteresis(
         valid_at_ns=0,

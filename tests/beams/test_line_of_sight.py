@@ -27,7 +27,7 @@ def flying(rng: np.random.Generator, acceleration: FloatArray | None) -> Track:
 
 @settings(max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1), st.booleans())
-def test_directions_ahead_are_those_of_positions_ahead(seed: int, accelerates: bool) -> None:
+def test_predicted_directions_match_predicted_positions(seed: int, accelerates: bool) -> None:
     """Velocities, acceleration, rotating body, lever arm and mount, computed for one time at a
     time."""
     rng = np.random.default_rng(seed)
@@ -62,7 +62,7 @@ def test_directions_ahead_are_those_of_positions_ahead(seed: int, accelerates: b
         assert direction == pytest.approx(seen / np.linalg.norm(seen), abs=1e-9)
 
 
-def test_through_the_array_itself_directions_stay_unit_vectors() -> None:
+def test_directions_through_the_array_stay_unit_vectors() -> None:
     """A UAV that passes through the array has no direction for one instant."""
     array = uniform_linear(4, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     at = Carrier(
@@ -84,7 +84,7 @@ def test_through_the_array_itself_directions_stay_unit_vectors() -> None:
     assert found == pytest.approx(np.array([[0, 1, 0], [1, 0, 0], [0, -1, 0]]))
 
 
-def test_without_a_velocity_nothing_is_known_ahead() -> None:
+def test_no_directions_are_predicted_without_carrier_velocity() -> None:
     rng = np.random.default_rng(1)
     array = uniform_linear(4, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     unknown = Carrier(

@@ -50,7 +50,7 @@ def demo(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
     node.stop()
 
 
-def is_complaint(said: Any) -> bool:
+def is_console_error(said: Any) -> bool:
     """Return whether a console message reports an error. Chromium reports each unsuccessful
     response, and 503 is the correct response of an overloaded service."""
     return said.type == "error" and "status of 503" not in said.text
@@ -67,7 +67,7 @@ def open_page(chromium: Any) -> Iterator[Any]:
         page = chromium.new_page(viewport=viewport, color_scheme=theme)
         page.set_default_timeout(HANG_MS)
         complaints: list[str] = []
-        page.on("console", lambda said: is_complaint(said) and complaints.append(said.text))
+        page.on("console", lambda said: is_console_error(said) and complaints.append(said.text))
         page.on("pageerror", lambda error: complaints.append(str(error)))
         pages.append((page, complaints, loses_service))
         page.goto(url)
@@ -82,7 +82,7 @@ def open_page(chromium: Any) -> Iterator[Any]:
 
 
 @pytest.fixture
-def start_mine(tmp_path: Path) -> Iterator[Any]:
+def start_own_demo(tmp_path: Path) -> Iterator[Any]:
     """Start demos for one test, and stop those left running."""
     nodes: list[Node] = []
 

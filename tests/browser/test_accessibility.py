@@ -36,7 +36,7 @@ def violations(page: Any) -> list[str]:
 
 @pytest.mark.parametrize("theme", ["dark", "light"])
 @pytest.mark.parametrize("size", SIZES)
-def test_axe_finds_nothing(demo: Node, open_page: Any, size: str, theme: str) -> None:
+def test_axe_finds_no_violation(demo: Node, open_page: Any, size: str, theme: str) -> None:
     page = open_page(demo.url, SIZES[size], theme=theme)
     found = {}
     for name, opened in OPENED.items():
@@ -53,7 +53,7 @@ def test_axe_finds_nothing(demo: Node, open_page: Any, size: str, theme: str) ->
     assert found == {name: [] for name in OPENED}
 
 
-def test_axe_sees(demo: Node, open_page: Any) -> None:
+def test_axe_detects_a_violation(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, SIZES["desktop"])
     page.locator(".pick").first.wait_for(timeout=HANG_MS)
     page.evaluate("document.getElementById('readiness').style.color = '#223'")

@@ -9,7 +9,7 @@ pytestmark = pytest.mark.full
 LISTENING = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "1:1")
 
 
-def test_the_document_is_drawn_and_tried(
+def test_api_document_renders_and_sends_requests(
     chromium: Any, start_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COMPANION_TOKEN", "s3cret")

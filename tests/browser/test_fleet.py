@@ -63,7 +63,9 @@ def join(node: Node, page: Any) -> None:
 
 
 @pytest.mark.parametrize(("size", "theme"), [(s, t) for s in SIZES for t in ("dark", "light")])
-def test_the_fleet_is_all_there(demo: Node, open_page: Any, size: str, theme: str) -> None:
+def test_fleet_page_is_complete_and_accessible(
+    demo: Node, open_page: Any, size: str, theme: str
+) -> None:
     page = open_page("about:blank", SIZES[size], theme=theme, loses_service=True)
     join(demo, page)
     page.goto(demo.url)

@@ -81,7 +81,7 @@ def many(node: Node, page: Any, number: int) -> None:
     "number", [*(pytest.param(n, marks=pytest.mark.full) for n in (1, 4, 20)), 100]
 )
 @pytest.mark.parametrize("size", SIZES)
-def test_nothing_overlaps_and_nothing_is_cut(
+def test_no_element_overlaps_or_is_cut_off(
     demo: Node, open_page: Any, size: str, number: int
 ) -> None:
     page = open_page("about:blank", SIZES[size], loses_service=True)
@@ -103,7 +103,7 @@ COLUMNS_IN_SIGHT = """() => {
 }"""
 
 
-def test_what_is_acted_on_is_seen_on_a_tablet_without_scrolling(demo: Node, open_page: Any) -> None:
+def test_actionable_columns_are_visible_on_a_tablet(demo: Node, open_page: Any) -> None:
     page = open_page("about:blank", SIZES["tablet"], loses_service=True)
     many(demo, page, 20)
     page.goto(demo.url)
@@ -117,7 +117,7 @@ def test_what_is_acted_on_is_seen_on_a_tablet_without_scrolling(demo: Node, open
     assert page.evaluate(COLUMNS_IN_SIGHT) == wanted
 
 
-def test_every_column_is_seen_at_a_desk_whatever_the_states(demo: Node, open_page: Any) -> None:
+def test_every_column_is_visible_on_a_desktop_in_any_state(demo: Node, open_page: Any) -> None:
     """Signs and bold letters of stale values need more room than good ones."""
 
     def fulfil(route: Any) -> None:
@@ -138,7 +138,7 @@ def test_every_column_is_seen_at_a_desk_whatever_the_states(demo: Node, open_pag
     assert page.evaluate(COLUMNS_IN_SIGHT) == columns
 
 
-def test_what_overlaps_and_what_is_cut_is_found(demo: Node, open_page: Any) -> None:
+def test_overlapping_and_cut_off_elements_are_detected(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, SIZES["desktop"])
     page.locator("#events time").first.wait_for(timeout=HANG_MS)
     styled = (
@@ -151,8 +151,6 @@ def test_what_overlaps_and_what_is_cut_is_found(demo: Node, open_page: Any) -> N
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_the_theme_is_the_one_that_the_browser_prefers(
-    demo: Node, open_page: Any, theme: str
-) -> None:
+def test_theme_follows_the_browser_preference(demo: Node, open_page: Any, theme: str) -> None:
     page = open_page(demo.url, SIZES["desktop"], theme=theme)
     assert page.locator("html").get_attribute("data-theme") == theme

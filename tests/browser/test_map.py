@@ -75,7 +75,7 @@ def reddish(page: Any, right: int, down: int) -> bool:
     return bool(red > green + 0.1)
 
 
-def test_the_ground_lies_under_the_carrier(
+def test_map_is_drawn_at_the_carrier_position(
     chromium: Any, cut_log: Path, area: Path, tmp_path: Path
 ) -> None:
     (tmp_path / "settings.toml").write_text(f'[page]\nmap = "{area}"\n', encoding="utf-8")

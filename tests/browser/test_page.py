@@ -69,7 +69,7 @@ def drawn_colours(page: Any, canvas: str) -> int:
     )
 
 
-def test_everything_is_shown_and_moves_without_flooding(demo: Node, open_page: Any) -> None:
+def test_page_updates_within_the_request_limit(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, DESKTOP)
     wait_for_uavs(page)
     page.get_by_text("ready", exact=True).wait_for(timeout=HANG_MS)
@@ -94,7 +94,7 @@ def test_everything_is_shown_and_moves_without_flooding(demo: Node, open_page: A
 
 
 @pytest.mark.full
-def test_the_keyboard_chooses_pauses_and_looks_back(demo: Node, open_page: Any) -> None:
+def test_keyboard_selects_pauses_and_steps_back(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, DESKTOP)
     wait_for_uavs(page)
     page.locator("#uavs th[data-key=id] button").click()  # by name: the worst-first order changes
@@ -148,7 +148,7 @@ def remember_azimuths(page: Any, seconds: float) -> list[str]:
 
 
 @pytest.mark.full
-def test_the_slider_looks_back(demo: Node, open_page: Any) -> None:
+def test_slider_steps_back_in_time(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, PHONE)
     wait_for_uavs(page)
     seen = remember_azimuths(page, seconds=2.5)
@@ -165,7 +165,7 @@ def fulfil(answer: Any, route: Any) -> None:
     route.fulfill(json=answer)
 
 
-def test_recordings_are_listed_with_a_link_where_there_are_any(demo: Node, open_page: Any) -> None:
+def test_recordings_are_listed_with_links(demo: Node, open_page: Any) -> None:
     page = open_page("about:blank", DESKTOP)
     answers: dict[str, Any] = {
         "/v1/recordings": {"recordings": [{"name": "a b.mcap", "bytes": 1500, "state": "closed"}]}
@@ -181,7 +181,7 @@ def test_recordings_are_listed_with_a_link_where_there_are_any(demo: Node, open_
 
 
 @pytest.mark.full
-def test_a_phone_shows_it_all_in_its_width(demo: Node, open_page: Any) -> None:
+def test_page_fits_the_width_of_a_phone(demo: Node, open_page: Any) -> None:
     page = open_page(demo.url, PHONE)
     wait_for_uavs(page)
     page.locator("#links").get_by_text("udpin:").wait_for(timeout=HANG_MS)
@@ -230,8 +230,8 @@ CONTRASTS = """(() => {
 
 
 @pytest.mark.full
-def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: Any) -> None:
-    node = start_mine()
+def test_lost_service_is_marked_and_recovers(open_page: Any, start_own_demo: Any) -> None:
+    node = start_own_demo()
     page = open_page(node.url, DESKTOP, loses_service=True)
     wait_for_uavs(page)
     style = "getComputedStyle(document.querySelector('td[data-key=range] span')).{}"
@@ -247,13 +247,13 @@ def test_a_lost_service_is_unmistakable_and_heals(open_page: Any, start_mine: An
     page.get_by_text("CONNECTION LOST", exact=True).wait_for(timeout=HANG_MS)
     assert time.monotonic() - killed < 4
     assert page.evaluate(style.format("textDecorationLine")) == "line-through"
-    start_mine(port=int(node.url.rpartition(":")[2]))
+    start_own_demo(port=int(node.url.rpartition(":")[2]))
     page.locator("#banner").wait_for(state="hidden", timeout=HANG_MS)
     page.get_by_text("connected", exact=True).wait_for(timeout=HANG_MS)
     wait_for_value(page, style.format("textDecorationLine"), "none")
 
 
-def test_a_page_with_a_token_asks_for_it_and_keeps_it(
+def test_page_asks_for_the_token_and_stores_it(
     open_page: Any, cut_log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COMPANION_TOKEN", "s3cret/ü")
@@ -282,7 +282,7 @@ def test_a_page_with_a_token_asks_for_it_and_keeps_it(
 
 
 @pytest.mark.full
-def test_a_replay_says_that_it_is_one(open_page: Any, cut_log: Path) -> None:
+def test_replay_is_labelled_on_the_page(open_page: Any, cut_log: Path) -> None:
     command = [BIN / "companion", "replay", cut_log, "--center", "5:1", "--no-record", "--serve"]
     with started(
         [*command, "--listen", "127.0.0.1:0"],

@@ -34,7 +34,7 @@ def report(studied: Callable[..., Path]) -> Callable[[str], Path]:
 
 
 @pytest.mark.parametrize("name", STUDIES)
-def test_a_report_needs_nothing_else(
+def test_report_page_is_self_contained(
     name: str, report: Callable[[str], Path], chromium: Any
 ) -> None:
     made = report(name)

@@ -16,7 +16,7 @@ LOADED = "performance.getEntriesByType('resource').some(one => one.name.endsWith
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_it_is_seen_from_all_sides(demo: Node, open_page: Any, size: str) -> None:
+def test_3d_view_loads_on_request_and_rotates(demo: Node, open_page: Any, size: str) -> None:
     page = open_page(demo.url, SIZES[size])
     wait_for_uavs(page)
     assert not page.evaluate(LOADED)

@@ -58,12 +58,12 @@ def fail(what: str) -> None:
         ("interrupted", 130, "prog: interrupted\n"),
     ],
 )
-def test_one_line(what: str, status: int, said: str) -> None:
+def test_user_error_is_one_line(what: str, status: int, said: str) -> None:
     done = CliRunner().invoke(prog, ["fail", what])
     assert (done.exit_code, done.stderr) == (status, said)
 
 
-def test_nothing_that_a_terminal_obeys_is_said(capsys: pytest.CaptureFixture[str]) -> None:
+def test_terminal_control_characters_are_stripped(capsys: pytest.CaptureFixture[str]) -> None:
     """Line breaks and letters of any script are kept."""
     for say in (console.say, voice.Lines().say, voice.JsonLines().say, served_replay._say):
         say("ü 王\n\x1b[2J\x1b]0;pwned\x07\r\b\x9b")  # as a reason or a name
@@ -72,7 +72,7 @@ def test_nothing_that_a_terminal_obeys_is_said(capsys: pytest.CaptureFixture[str
 
 
 @pytest.mark.parametrize("made_of_it", ["pass", "raise RuntimeError('no class')", "raise"])
-def test_an_interrupt_in_an_import_waits_for_its_end(
+def test_interrupt_during_an_import_waits_for_its_end(
     made_of_it: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Otherwise a package might ignore it, raise another error, or be left half imported."""
@@ -89,13 +89,13 @@ def test_an_interrupt_in_an_import_waits_for_its_end(
 
 
 @pytest.mark.parametrize("what", ["value", "unpacking"])
-def test_a_defect_is_not_taken_for_a_mistake_of_the_user(what: str) -> None:
+def test_defect_is_not_reported_as_a_user_error(what: str) -> None:
     done = CliRunner().invoke(prog, ["fail", what])
     assert type(done.exception) is ValueError
     assert done.stderr == ""
 
 
-def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
+def test_every_user_facing_error_is_a_user_error() -> None:
     """Every error class that can leave a command is a UserError, or has its reason here."""
     inside = {
         "_RefusedError",  # becomes a Rejection where it is raised
@@ -143,7 +143,7 @@ def test_every_error_that_is_raised_for_users_is_a_user_error() -> None:
         ),
     ],
 )
-def test_an_interrupt_while_the_command_loads_is_one_line(
+def test_interrupt_while_loading_is_one_line(
     package: str, asked: list[str], ended: str, seed: int, tmp_path: Path
 ) -> None:
     """From the moment at which the handler is installed; interpreter start can take longer than any
@@ -172,7 +172,7 @@ def test_an_interrupt_while_the_command_loads_is_one_line(
     assert lines[0] in (f"{package.replace('_', '-')}: interrupted", ended)
 
 
-def test_both_doors_are_the_same_command() -> None:
+def test_script_and_module_entry_points_are_equal() -> None:
     by_name = subprocess.run(
         [BIN / "companion", "--version"], capture_output=True, check=True, timeout=HANG_S
     )

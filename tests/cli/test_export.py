@@ -94,7 +94,7 @@ def arrow(file: Path) -> list[dict[str, Any]]:
 # --- schema -------------------------------------------------------------------------------------
 
 
-def test_the_document_says_what_the_tables_are() -> None:
+def test_export_document_matches_the_tables() -> None:
     text = (ROOT / "docs" / "export.md").read_text(encoding="utf-8")
     told = {}
     for section in text.split("\n## ")[1:]:
@@ -110,7 +110,7 @@ def test_the_document_says_what_the_tables_are() -> None:
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
-def test_names_end_in_their_units(table: Table) -> None:
+def test_column_names_end_in_their_units(table: Table) -> None:
     endings = {
         "ns": "_ns", "UTC": "_utc", "s": "_s", "m": "_m", "deg": "_deg", "m/s": "_mps",
         "m/s²": "_mps2", "deg/s": "_degps", "dB": "_db",
@@ -127,7 +127,7 @@ def test_names_end_in_their_units(table: Table) -> None:
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
-def test_pandas_tells_the_types(table: Table, as_csv: Path) -> None:
+def test_pandas_infers_the_column_types(table: Table, as_csv: Path) -> None:
     times = [column.name for column in table.columns if column.kind is ColumnKind.TIME]
     frame = pandas.read_csv(as_csv / f"{table.name}.csv", parse_dates=times)
     assert list(frame.columns) == [column.name for column in table.columns]
@@ -146,7 +146,7 @@ def test_pandas_tells_the_types(table: Table, as_csv: Path) -> None:
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
-def test_duckdb_tells_the_types(table: Table, as_csv: Path) -> None:
+def test_duckdb_infers_the_column_types(table: Table, as_csv: Path) -> None:
     file = as_csv / f"{table.name}.csv"
     types = {row[0]: row[1] for row in duckdb.sql(f"describe select * from '{file}'").fetchall()}
     rows = duck(file)
@@ -156,7 +156,7 @@ def test_duckdb_tells_the_types(table: Table, as_csv: Path) -> None:
 
 
 @pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
-def test_parquet_says_the_types_and_holds_the_same(
+def test_parquet_declares_types_and_holds_the_same_rows(
     table: Table, as_csv: Path, as_parquet: Path
 ) -> None:
     file = as_parquet / f"{table.name}.parquet"
@@ -174,7 +174,7 @@ def test_parquet_says_the_types_and_holds_the_same(
 # --- values -------------------------------------------------------------------------------------
 
 
-def test_reports_are_those_that_pymavlink_reads(as_parquet: Path) -> None:
+def test_report_rows_match_pymavlink(as_parquet: Path) -> None:
     """Every report has a row, in log order, accepted or not."""
     reader = mavutil.mavlogfile(str(LOG))
     wanted = []
@@ -194,7 +194,7 @@ def test_reports_are_those_that_pymavlink_reads(as_parquet: Path) -> None:
             assert row["boot_s"] == message.time_boot_ms / 1000
 
 
-def test_numbers_are_those_of_the_pipeline(as_parquet: Path, outputs: list[Output]) -> None:
+def test_exported_numbers_match_the_pipeline(as_parquet: Path, outputs: list[Output]) -> None:
     estimates = [out for out in outputs if isinstance(out, Estimate)]
     used = [row for row in arrow(as_parquet / "reports.parquet") if row["accepted"]]
     assert [(row["uav"], row["innovation_m"], row["bound_m"], row["dt_s"]) for row in used] == [
@@ -225,7 +225,7 @@ def test_numbers_are_those_of_the_pipeline(as_parquet: Path, outputs: list[Outpu
         assert row["range_m"] == beam.range_m
 
 
-def test_what_was_refused_and_said_is_there(as_parquet: Path, outputs: list[Output]) -> None:
+def test_rejections_and_notices_are_exported(as_parquet: Path, outputs: list[Output]) -> None:
     refused = [out for out in outputs if isinstance(out, Rejection)]
     rejections = arrow(as_parquet / "rejections.parquet")
     assert [(row["t_ns"], row["source"], row["reason"], row["count"]) for row in rejections] == [
@@ -244,7 +244,9 @@ def test_what_was_refused_and_said_is_there(as_parquet: Path, outputs: list[Outp
     ]
 
 
-def test_space_holds_each_track_and_beam_as_points(tmp_path: Path, outputs: list[Output]) -> None:
+def test_space_export_holds_tracks_and_beams_as_points(
+    tmp_path: Path, outputs: list[Output]
+) -> None:
     """Read by mcap and Foxglove's own class: the last point of a beam is at its UAV."""
     where = exported(tmp_path / "space", LOG, "--format", "rerun", *CENTER)
     updates = {one.t_ns: one for one in outputs if isinstance(one, Update)}
@@ -270,14 +272,14 @@ def test_space_holds_each_track_and_beam_as_points(tmp_path: Path, outputs: list
     assert sorted(path.name for path in where.iterdir()) == ["space.mcap"]
 
 
-def test_space_leaves_nothing_of_a_log_that_cannot_be_read(tmp_path: Path) -> None:
+def test_space_export_of_an_unreadable_log_leaves_no_files(tmp_path: Path) -> None:
     (tmp_path / "x.tlog").write_bytes(b"")
     done = export(tmp_path / "x.tlog", "--out", tmp_path / "space", "--format", "rerun")
     assert done.exit_code != 0
     assert not list(tmp_path.glob("space/*"))
 
 
-def test_a_recording_gives_the_same_tables(tmp_path: Path, short_log: Path) -> None:
+def test_recording_exports_the_same_tables(tmp_path: Path, short_log: Path) -> None:
     recording, as_csv = tmp_path / "flight.mcap", exported(tmp_path / "csv", short_log, *CENTER)
     done = CliRunner().invoke(main, ["replay", str(short_log), *CENTER, "--out", str(recording)])
     assert done.exit_code == 0
@@ -305,7 +307,7 @@ def position(boot_ms: int, lat: int, heading: int) -> Any:
     )
 
 
-def test_unknown_is_null_and_never_0(tmp_path: Path) -> None:
+def test_unknown_values_are_null_not_zero(tmp_path: Path) -> None:
     begun_us = 1_795_314_424_300_000
     log = tmp_path / 'a, "b"\nc\udcff.tlog'
     log.write_bytes(
@@ -333,7 +335,7 @@ def test_unknown_is_null_and_never_0(tmp_path: Path) -> None:
     assert set(after) == {"", "false"}  # no estimate, and it restarted no track
 
 
-def test_a_log_without_positions_gives_tables_without_rows(tmp_path: Path) -> None:
+def test_log_without_positions_gives_empty_tables(tmp_path: Path) -> None:
     log = tmp_path / "quiet.tlog"
     heartbeat = dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3)
     log.write_bytes(tlog((1_795_314_424_300_000, heartbeat), (1_795_314_424_400_000, heartbeat)))
@@ -348,7 +350,7 @@ def test_a_log_without_positions_gives_tables_without_rows(tmp_path: Path) -> No
     assert duck(tmp_path / "out" / "reports.csv") == []
 
 
-def test_garbage_and_torn_frames_are_counted(tmp_path: Path) -> None:
+def test_garbage_and_truncated_frames_are_counted(tmp_path: Path) -> None:
     data = bytearray(LOG.read_bytes()[: 1 << 17])
     for at in range(1000, len(data), 5000):
         data[at : at + 40] = bytes(40)
@@ -378,7 +380,7 @@ def left(where: Path) -> dict[str, bytes]:
         ("parquet", OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)), 1, "No space left"),
     ],
 )
-def test_an_export_cut_short_leaves_what_was_there(
+def test_interrupted_export_keeps_existing_files(
     *, form: str, failure: BaseException, status: int, says: str, short_log: Path,
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip
@@ -408,7 +410,7 @@ def test_an_export_cut_short_leaves_what_was_there(
     assert cut_short() == before
 
 
-def test_a_disk_that_fills_at_the_end_leaves_no_new_names(
+def test_full_disk_leaves_no_new_files(
     short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_descriptor: int) -> None:
@@ -420,7 +422,7 @@ def test_a_disk_that_fills_at_the_end_leaves_no_new_names(
     assert "No space left" in done.stderr
 
 
-def test_two_exports_do_not_share_a_folder(short_log: Path, tmp_path: Path) -> None:
+def test_concurrent_exports_to_one_folder_are_rejected(short_log: Path, tmp_path: Path) -> None:
     with folder.TableFolder(tmp_path, "csv", TABLES):
         done = export(short_log, "--out", tmp_path, *CENTER)
         assert done.exit_code == 1
@@ -429,7 +431,7 @@ def test_two_exports_do_not_share_a_folder(short_log: Path, tmp_path: Path) -> N
     assert left(tmp_path) == {}
 
 
-def test_without_pyarrow_it_says_what_to_install(
+def test_missing_pyarrow_is_reported_with_the_package_to_install(
     short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
@@ -440,7 +442,7 @@ def test_without_pyarrow_it_says_what_to_install(
     assert left(tmp_path / "out") == {}
 
 
-def test_parquet_is_written_group_by_group(
+def test_parquet_is_written_in_row_groups(
     short_log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(parquet_file, "BATCH", 50)

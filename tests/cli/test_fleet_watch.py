@@ -79,7 +79,7 @@ def watch(*arguments: str) -> Result:
     return CliRunner().invoke(main, ["fleet", "watch", *arguments])
 
 
-def test_a_look_says_who_serves_whom_and_what_needs_a_look(service: Service) -> None:
+def test_fleet_watch_lists_serving_nodes_and_warnings(service: Service) -> None:
     done = watch(service.url, "--seconds", "0.001")
     assert done.exit_code == 0, done.stderr
     lines = done.stdout.splitlines()[:9]
@@ -103,7 +103,7 @@ def test_a_look_says_who_serves_whom_and_what_needs_a_look(service: Service) -> 
     assert "1:1 is" not in said
 
 
-def test_for_programs_a_line_is_the_answer(service: Service) -> None:
+def test_fleet_watch_json_prints_one_line_per_response(service: Service) -> None:
     done = watch(service.url, "--seconds", "0.001", "--json")
     for line in done.stdout.splitlines():
         assert json.loads(line)["node"] == "north"
@@ -125,7 +125,7 @@ def test_for_programs_a_line_is_the_answer(service: Service) -> None:
         ),
     ],
 )
-def test_what_is_no_node_of_a_fleet_is_one_line(
+def test_service_outside_a_fleet_is_reported_in_one_line(
     service: Service, status: int, body: str, says: str
 ) -> None:
     service.answers = [(status, body)]
@@ -138,13 +138,13 @@ def test_what_is_no_node_of_a_fleet_is_one_line(
 
 
 @pytest.mark.parametrize("url", ["nonsense", "ftp://127.0.0.1", "http://", "http://127.0.0.1:x"])
-def test_what_is_no_address_is_one_line(url: str) -> None:
+def test_invalid_address_is_reported_in_one_line(url: str) -> None:
     done = watch(url)
     assert (done.exit_code, done.stdout) == (1, "")
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_the_token_is_that_of_the_environment(
+def test_token_comes_from_the_environment(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COMPANION_TOKEN", "s3cret")
@@ -152,7 +152,7 @@ def test_the_token_is_that_of_the_environment(
     assert set(service.tokens) == {"Bearer s3cret"}
 
 
-def test_a_node_that_is_restarted_is_waited_for(
+def test_fleet_watch_waits_for_a_restarted_node(
     service: Service, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(watching, "EVERY_S", 0.001)

@@ -17,7 +17,7 @@ def run(*arguments: str) -> Any:
     return CliRunner().invoke(main, arguments, standalone_mode=True)
 
 
-def test_the_commands_are_the_documented_ones() -> None:
+def test_commands_match_the_documentation() -> None:
     documented = "calibrate demo drive fleet run replay check design export recover study weights"
     assert set(COMMANDS) == set(documented.split())
 
@@ -49,7 +49,7 @@ def test_help_has_an_example(command: str) -> None:
         (["demo", "--port", "99999"], "99999"),
     ],
 )
-def test_a_mistake_is_one_line(arguments: list[str], says: str) -> None:
+def test_command_error_is_one_line(arguments: list[str], says: str) -> None:
     answer = run(*arguments)
     assert answer.exit_code not in (0, None)
     assert answer.stdout == ""
@@ -58,7 +58,7 @@ def test_a_mistake_is_one_line(arguments: list[str], says: str) -> None:
     assert says in answer.stderr
 
 
-def test_design_as_published() -> None:
+def test_design_matches_the_paper() -> None:
     common = ["design", "--dt", "0.15", "--alpha", "0.5", "--feedthrough", "0.5", "--json"]
     (row,) = json.loads(run(*common).stdout)
     assert row["L"] == pytest.approx(0.30)
@@ -90,7 +90,7 @@ def test_design_as_published() -> None:
     assert [row["feasible"] for row in rows] == [True, False]
 
 
-def test_design_by_lmi_agrees() -> None:
+def test_lmi_design_agrees_with_the_closed_form() -> None:
     arguments = ["design", "--dt", "0.9", "--alpha", "0.5", "--feedthrough", "0.3", "--json"]
     (closed,) = json.loads(run(*arguments).stdout)
     (solved,) = json.loads(run(*arguments, "--method", "lmi").stdout)
@@ -99,7 +99,7 @@ def test_design_by_lmi_agrees() -> None:
     assert solved["residual"] > -1e-6
 
 
-def test_a_drive_that_applied_nothing_did_not_do_what_was_asked() -> None:
+def test_drive_that_applied_nothing_exits_with_an_error() -> None:
     """No service listens at that port."""
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]

@@ -206,7 +206,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize(("given", "status", "says"), SAYS)
-def test_a_mistake_is_one_line(folder: Path, given: str, status: int, says: str) -> None:
+def test_command_error_is_one_line(folder: Path, given: str, status: int, says: str) -> None:
     before = sorted(folder.rglob("*"))
     words = given.split()
     program, words = (sitl, words[1:]) if words[0] == "sitl-replay" else (main, words)
@@ -221,12 +221,12 @@ def test_a_mistake_is_one_line(folder: Path, given: str, status: int, says: str)
     assert sorted(folder.rglob("*")) == before
 
 
-def test_every_reason_has_plain_words() -> None:
+def test_every_rejection_reason_has_a_distinct_text() -> None:
     meanings = [reason.meaning for reason in Reason]
     assert all(meanings) and len(set(meanings)) == len(meanings)
 
 
-def test_text_is_told_from_noise() -> None:
+def test_text_is_distinguished_from_binary() -> None:
     assert kinds.looks_like_text("Höhe,m\n".encode()[:3])  # truncated within a character
     assert kinds.looks_like_text(b"a\tb\r\n")
     assert not kinds.looks_like_text(b"")

@@ -31,7 +31,7 @@ def told(log: Path, config: Path, form: str) -> bytes:
     return answer.stdout_bytes
 
 
-def test_no_device_within_its_calibration_s_bounds_has_less(cut_log: Path, tmp_path: Path) -> None:
+def test_guaranteed_gain_holds_within_calibration_bounds(cut_log: Path, tmp_path: Path) -> None:
     rng = np.random.default_rng(9)
     lines = [f"{c},{15 - c},{20 * c},{-0.1 * c},{3 + c % 3},{0.4}" for c in range(16)]
     measured = tmp_path / "measured.csv"
@@ -87,7 +87,7 @@ def test_no_device_within_its_calibration_s_bounds_has_less(cut_log: Path, tmp_p
         (f"dead = {list(range(16))}", "or no element is left; list some of 0..15, not all"),
     ],
 )
-def test_dead_elements_are_some_of_those_there_are(tmp_path: Path, keys: str, said: str) -> None:
+def test_invalid_dead_elements_are_rejected(tmp_path: Path, keys: str, said: str) -> None:
     (tmp_path / "there.toml").write_text(f"{ARRAY}{keys}\n")
     with pytest.raises(ConfigError, match=said):
         assembly.array(load(tmp_path / "there.toml"))
@@ -104,14 +104,14 @@ def test_dead_elements_are_some_of_those_there_are(tmp_path: Path, keys: str, sa
         (np.ones(16), "not a matrix"),
     ],
 )
-def test_a_coupling_that_is_none_is_refused(tmp_path: Path, matrix: Any, said: str) -> None:
+def test_invalid_coupling_is_rejected(tmp_path: Path, matrix: Any, said: str) -> None:
     np.save(tmp_path / "c.npy", matrix)
     settings = Settings.from_toml(f'{ARRAY}coupling = "{tmp_path / "c.npy"}"\n', "there")
     with pytest.raises(ConfigError, match=said):
         assembly.array(settings)
 
 
-def test_a_recording_holds_the_coupling(tmp_path: Path) -> None:
+def test_recording_includes_the_coupling(tmp_path: Path) -> None:
     np.save(tmp_path / "c.npy", np.eye(16) * 0.5j)
     settings = embedded(Settings.from_toml(f'{ARRAY}coupling = "{tmp_path / "c.npy"}"\n', "there"))
     (tmp_path / "c.npy").unlink()

@@ -14,7 +14,7 @@ from support import BIN, HANG_S, line_of, started
 DEMO = [BIN / "companion", "demo", "--port", "0"]
 
 
-def test_json_is_an_object_a_second_with_the_events_since_the_last(tmp_path: Path) -> None:
+def test_json_output_is_one_object_per_second_with_new_events(tmp_path: Path) -> None:
     pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.DEVNULL, "text": True}
     found: list[dict[str, Any]] = []
     with started([*DEMO, "--json"], cwd=tmp_path, **pipes) as process:
@@ -32,7 +32,7 @@ def test_json_is_an_object_a_second_with_the_events_since_the_last(tmp_path: Pat
 
 
 @pytest.mark.full
-def test_into_a_pipe_there_are_plain_lines(tmp_path: Path) -> None:
+def test_piped_output_is_plain_lines(tmp_path: Path) -> None:
     done = subprocess.run(
         [*DEMO, "--seconds", "3"],
         cwd=tmp_path, capture_output=True, text=True, timeout=HANG_S, check=True,
@@ -44,7 +44,7 @@ def test_into_a_pipe_there_are_plain_lines(tmp_path: Path) -> None:
     assert "links up" not in done.stderr
 
 
-def test_on_a_terminal_the_last_line_says_how_it_goes(tmp_path: Path) -> None:
+def test_terminal_status_line_fits_80_columns(tmp_path: Path) -> None:
     ours, theirs = pty.openpty()
     with started([*DEMO], cwd=tmp_path, stdout=theirs, stderr=theirs) as process:
         os.close(theirs)

@@ -63,7 +63,7 @@ def looked() -> tuple[Pipeline, Update]:
     return pipeline, pipeline.look(at_ns, 0.1)
 
 
-def test_every_form_holds_the_weights_of_the_pipeline(
+def test_every_format_holds_the_pipeline_weights(
     cut_log: Path, looked: tuple[Pipeline, Update]
 ) -> None:
     _, update = looked
@@ -82,16 +82,14 @@ def test_every_form_holds_the_weights_of_the_pipeline(
     assert np.array_equal(raw.reshape(64, 4), expected.astype(np.complex64))
 
 
-def test_a_lead_is_a_later_look(cut_log: Path, looked: tuple[Pipeline, Update]) -> None:
+def test_lead_gives_later_weights(cut_log: Path, looked: tuple[Pipeline, Update]) -> None:
     _, update = looked
     now = np.load(io.BytesIO(weights(cut_log, "--format", "npy")))
     assert now.shape == update.beams.weights.shape
     assert not np.allclose(now, update.beams.weights)
 
 
-def test_a_device_s_table_reads_back_as_what_was_fitted(
-    cut_log: Path, looked: tuple[Pipeline, Update]
-) -> None:
+def test_device_table_round_trips(cut_log: Path, looked: tuple[Pipeline, Update]) -> None:
     pipeline, update = looked
     text = weights(cut_log, "--lead-ms", "100", "--format", "adar1000").decode()
     ideal = Calibration.ideal(range(64))
@@ -106,7 +104,7 @@ def test_a_device_s_table_reads_back_as_what_was_fitted(
         assert alike > 0.99
 
 
-def test_a_calibration_turns_a_device_s_settings(cut_log: Path, tmp_path: Path) -> None:
+def test_calibration_changes_codes_but_not_radiation(cut_log: Path, tmp_path: Path) -> None:
     """The channel responses are compensated: equal radiation with different codes."""
     config = tmp_path / "settings.toml"
     table = tmp_path / "measured.csv"
@@ -124,7 +122,7 @@ def test_a_calibration_turns_a_device_s_settings(cut_log: Path, tmp_path: Path) 
         assert abs(np.vdot(a, b)) > 0.99 * np.linalg.norm(a) * np.linalg.norm(b)
 
 
-def test_a_unit_s_gains_are_those_of_its_file(cut_log: Path, tmp_path: Path) -> None:
+def test_unit_gains_come_from_its_file(cut_log: Path, tmp_path: Path) -> None:
     config, unit = tmp_path / "settings.toml", tmp_path / "unit.toml"
     unit.write_text(
         'mode = "TX"\ncommon_db = [[-1, 9.5], [-1, 9.5], [-1, 9.5], [-1, 9.5]]\n'
@@ -140,13 +138,13 @@ def test_a_unit_s_gains_are_those_of_its_file(cut_log: Path, tmp_path: Path) -> 
     assert said.startswith("hardware.unit: keys are mode; give common_db, element_db, mode")
 
 
-def test_a_file_holds_what_stdout_would(cut_log: Path, tmp_path: Path) -> None:
+def test_output_file_equals_stdout(cut_log: Path, tmp_path: Path) -> None:
     out = tmp_path / "w.npy"
     assert weights(cut_log, "--format", "npy", "--out", str(out)) == b""
     assert out.read_bytes() == weights(cut_log, "--format", "npy")
 
 
-def test_a_time_of_day_is_the_same_as_seconds(cut_log: Path) -> None:
+def test_time_of_day_equals_seconds_into_the_log(cut_log: Path) -> None:
     """The same instant, in any time zone."""
     begins = next(iter(log_events([cut_log], Settings()))).t_ns
     at = np.datetime64(begins // 1000, "us") + np.timedelta64(2_000_000, "us")
@@ -171,7 +169,7 @@ def test_a_time_of_day_is_the_same_as_seconds(cut_log: Path) -> None:
         ("0", "no beams at 0: no report yet"),
     ],
 )
-def test_a_time_that_the_log_does_not_hold(cut_log: Path, at: str, said: str) -> None:
+def test_time_outside_the_log_is_rejected(cut_log: Path, at: str, said: str) -> None:
     assert said in mistake(cut_log, at=at)
 
 
@@ -187,11 +185,11 @@ def test_a_time_that_the_log_does_not_hold(cut_log: Path, at: str, said: str) ->
         (["--center", "99:1"], "no position from the carrier 99:1"),
     ],
 )
-def test_what_cannot_be_done_is_said(cut_log: Path, arguments: list[str], said: str) -> None:
+def test_unsupported_arguments_are_reported(cut_log: Path, arguments: list[str], said: str) -> None:
     assert said in mistake(cut_log, *arguments)
 
 
-def test_a_log_that_is_not_there() -> None:
+def test_missing_log_is_reported() -> None:
     assert mistake(Path("missing.tlog")) == "missing.tlog: no such file"
 
 
@@ -212,7 +210,7 @@ def test_a_log_that_is_not_there() -> None:
         ("nan.npy", np.full((64, 2), np.nan), "finite"),
     ],
 )
-def test_stored_beams_that_will_not_do(
+def test_invalid_codebook_is_reported_once(
     cut_log: Path, tmp_path: Path, name: str, content: Any, said: str
 ) -> None:
     """Reported once, before the log is read."""
@@ -228,7 +226,7 @@ def test_stored_beams_that_will_not_do(
     assert message.count("codebook") == 1
 
 
-def test_whole_numbers_are_a_codebook(cut_log: Path, tmp_path: Path) -> None:
+def test_integer_codebook_is_accepted(cut_log: Path, tmp_path: Path) -> None:
     file, config = tmp_path / "beams.npy", tmp_path / "settings.toml"
     np.save(file, np.eye(64, dtype=np.int8)[:, :5])
     config.write_text(f'[codebook]\nkind = "file"\nfile = "{file}"\n', encoding="utf-8")
@@ -237,7 +235,7 @@ def test_whole_numbers_are_a_codebook(cut_log: Path, tmp_path: Path) -> None:
     assert {beam["codebook"]["best"] for beam in told["beams"]} <= set(range(5))
 
 
-def test_progress_is_told_and_the_look_is_the_same(
+def test_progress_reporting_does_not_change_the_result(
     cut_log: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(moment, "PROGRESS_EVERY", 200)

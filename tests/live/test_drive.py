@@ -109,7 +109,7 @@ def test_how_it_goes_is_said_each_second(start_node: Any, tmp_path: Path) -> Non
         ),
     ],
 )
-def test_a_mistake_is_one_line(words: list[str], said: str) -> None:
+def test_command_error_is_one_line(words: list[str], said: str) -> None:
     done = subprocess.run(
         [BIN / "companion", "drive", *words],
         capture_output=True,

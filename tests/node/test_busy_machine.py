@@ -115,7 +115,7 @@ def fly(folder: Path, course: Callable[[Flight], Coroutine[Any, Any, None]]) -> 
     return run_async(run())
 
 
-def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_path: Path) -> None:
+def test_queued_frames_keep_arrival_times_and_replay_matches(tmp_path: Path) -> None:
     async def course(flight: Flight) -> None:
         flight.hold_up(0.5)  # once: several in a row would count as an overloaded machine
         await flight.until_heard()
@@ -145,7 +145,7 @@ def test_frames_that_waited_arrived_when_they_came_and_replay_says_so_too(tmp_pa
     assert summary["digest"] == read_metadata(log)["summary"]["digest"]
 
 
-def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> None:
+def test_overloaded_machine_is_not_ready_and_says_why(tmp_path: Path) -> None:
     async def course(flight: Flight) -> None:
         for _ in range(50):  # four suffice when queried at once
             flight.hold_up(0.7)
@@ -168,7 +168,7 @@ def test_a_machine_that_stays_behind_is_not_fit_and_says_why(tmp_path: Path) -> 
     fly(tmp_path, course)
 
 
-def test_what_comes_while_beams_are_made_is_taken_in_and_answered(
+def test_frames_and_requests_are_handled_while_beams_are_computed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """However long the computation takes; a replay processes everything in the same order."""

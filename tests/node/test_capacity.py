@@ -29,7 +29,7 @@ class Slow:
         return self.reads // 2 * self.each_s  # read before and after an event
 
 
-def test_what_is_carried_follows_from_what_events_take() -> None:
+def test_capacity_follows_from_event_times() -> None:
     """Each report and each update takes a fixed time, for any number of beams."""
     found = capacity.measure(Settings(), Slow(0.0011))
     assert [found.report_s, found.update_s] == pytest.approx([0.0011, 0.0011])
@@ -38,7 +38,7 @@ def test_what_is_carried_follows_from_what_events_take() -> None:
     assert capacity.measure(Settings(), Slow(1e-6)).uavs is None
 
 
-def test_reports_and_updates_are_timed_apart(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reports_and_updates_are_timed_separately(monkeypatch: pytest.MonkeyPatch) -> None:
     """A pipeline that needs 1 ms for a report and 20 ms for an update."""
     now_s = [0.0]
 
@@ -53,7 +53,7 @@ def test_reports_and_updates_are_timed_apart(monkeypatch: pytest.MonkeyPatch) ->
     assert (found.report_s, found.update_s) == pytest.approx((0.001, 0.02))
 
 
-def test_the_sky_is_one_that_the_pipeline_believes() -> None:
+def test_capacity_traffic_is_accepted_by_the_pipeline() -> None:
     pipeline = Pipeline(
         Settings().override(center={"source": "47.0,8.0,500.0"}, beams={"targets": "all"})
     )
@@ -79,7 +79,7 @@ def test_the_sky_is_one_that_the_pipeline_believes() -> None:
         ("0::/gone\n", {}, 1.0),
     ],
 )  # fmt: skip
-def test_a_quota_of_the_processor_is_known(
+def test_cgroup_cpu_quota_is_read(
     tmp_path: Path, groups: str, files: dict[str, str], share: float
 ) -> None:
     made = {f"sys/fs/cgroup/{name}": text for name, text in files.items()}
@@ -89,7 +89,7 @@ def test_a_quota_of_the_processor_is_known(
     assert processor_share(tmp_path) == share
 
 
-def test_half_a_processor_carries_about_half() -> None:
+def test_half_a_processor_has_half_the_capacity() -> None:
     found = capacity.measure(Settings(), Slow(0.0011), processor=0.5)
     spare = 0.5 * capacity.SHARE - 10 * 0.0011
     assert found.uavs == int(spare / (capacity.RATE_HZ * 0.0011))

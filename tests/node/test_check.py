@@ -22,7 +22,7 @@ def looked(**sections: Any) -> dict[str, Finding]:
     return {each.subject: each for each in machine.look(settings, token=None, insecure=False)}
 
 
-def test_ports_that_are_taken_are_faults() -> None:
+def test_ports_in_use_are_faults() -> None:
     with (
         socket.create_server(("127.0.0.1", 0)) as web,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as mavlink,
@@ -40,19 +40,19 @@ def test_ports_that_are_taken_are_faults() -> None:
     assert found[f"link {url}"].grade is Grade.OK
 
 
-def test_serving_beyond_this_machine_without_a_token_is_a_fault() -> None:
+def test_public_server_without_token_is_a_fault() -> None:
     found = looked(server={"listen": "0.0.0.0:0"})["http 0.0.0.0:0"]
     assert found.grade is Grade.FAULT
     assert "COMPANION_TOKEN" in found.text
 
 
-def test_a_device_that_is_not_there_is_a_fault() -> None:
+def test_missing_serial_device_is_a_fault() -> None:
     found = looked(links={"urls": ["serial:/dev/nothere:57600"]})
     assert found["link serial:/dev/nothere:57600"].grade is Grade.FAULT
     assert "plugged in" in found["link serial:/dev/nothere:57600"].remedy
 
 
-def test_a_device_that_is_there_is_in_order() -> None:
+def test_present_serial_device_is_ok() -> None:
     master, slave = os.openpty()
     device = os.ttyname(slave)
     found = looked(links={"urls": [f"serial:{device}:57600"]})
@@ -61,7 +61,7 @@ def test_a_device_that_is_there_is_in_order() -> None:
     os.close(slave)
 
 
-def test_the_folder_of_recordings_is_tried(tmp_path: Path) -> None:
+def test_recording_folder_is_checked(tmp_path: Path) -> None:
     folder = tmp_path / "to" / "be" / "made"
     assert looked(recording={"directory": str(folder)})[f"recordings {folder}"].grade is Grade.OK
     assert not folder.exists()
@@ -70,7 +70,7 @@ def test_the_folder_of_recordings_is_tried(tmp_path: Path) -> None:
     assert looked(recording={"directory": str(inside)})[f"recordings {inside}"].grade is Grade.FAULT
 
 
-def test_silence_and_a_missing_carrier_are_told(tmp_path: Path) -> None:
+def test_silent_link_and_missing_carrier_are_reported(tmp_path: Path) -> None:
     settings = Settings().override(
         links={"urls": ["udpin:127.0.0.1:0"]}, server={"listen": "127.0.0.1:0"}
     )
@@ -90,7 +90,7 @@ def test_silence_and_a_missing_carrier_are_told(tmp_path: Path) -> None:
         (b"MSG,8,5,211,4CA2D6,10057,,,,,,,,,,,,,,,,0\r\n", Grade.DOUBT, "no aircraft yet"),
     ],
 )
-def test_a_receiver_that_says_something_else_is_told(said: bytes, grade: Grade, text: str) -> None:
+def test_unexpected_receiver_data_is_reported(said: bytes, grade: Grade, text: str) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         url = f"sbs:127.0.0.1:{server.getsockname()[1]}"
         accepted: list[socket.socket] = []
@@ -114,7 +114,7 @@ def test_a_receiver_that_says_something_else_is_told(said: bytes, grade: Grade, 
 
 
 @pytest.mark.full
-def test_a_flight_is_judged(tmp_path: Path) -> None:
+def test_flight_is_assessed(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

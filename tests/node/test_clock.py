@@ -39,7 +39,7 @@ class Machine:
         return NodeClock(self.wall_ns, self.since_boot_ns)
 
 
-def test_the_timeline_goes_on_when_the_clock_is_set_and_that_is_told_once() -> None:
+def test_timeline_continues_across_a_clock_set_with_one_notice() -> None:
     machine = Machine()
     clock = machine.clock()
     told = []
@@ -53,7 +53,7 @@ def test_the_timeline_goes_on_when_the_clock_is_set_and_that_is_told_once() -> N
     ]  # fmt: skip
 
 
-def test_a_machine_that_sleeps_has_its_clock_not_set() -> None:
+def test_suspended_machine_does_not_count_as_clock_set() -> None:
     """Both clocks count the suspended time, so everything received before is older by it."""
     machine = Machine()
     clock = machine.clock()
@@ -63,7 +63,7 @@ def test_a_machine_that_sleeps_has_its_clock_not_set() -> None:
     assert clock.set_to_ns() is None
 
 
-def test_a_pause_between_two_clocks_is_no_step() -> None:
+def test_pause_between_clock_readings_is_not_a_step() -> None:
     machine = Machine()
 
     def slowly_ns() -> int:
@@ -105,9 +105,7 @@ def flown(log: Path, machine: Machine, recordings: Path, said: list[str]) -> Ser
     return node
 
 
-def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
-    short_log: Path, tmp_path: Path
-) -> None:
+def test_utc_times_follow_a_clock_set_live_and_in_replay(short_log: Path, tmp_path: Path) -> None:
     machine, said = Machine(), list[str]()
     node = flown(short_log, machine, tmp_path / "recordings", said)
     told = [text for text in said if "clock" in text]
@@ -141,7 +139,7 @@ def test_times_follow_the_clock_that_was_set_live_and_in_a_replay(
     assert abs(apart_ns) < 2_000_000  # displayed times have milliseconds
 
 
-def test_a_clock_that_is_set_changes_no_estimate(short_log: Path) -> None:
+def test_clock_set_does_not_change_estimates(short_log: Path) -> None:
     """The pipeline's timeline continues as with an untouched clock."""
     events = list(with_ticks(read_log(short_log), 10.0))[:FRAMES]
     middle = len(events) // 2

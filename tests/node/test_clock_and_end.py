@@ -29,7 +29,7 @@ def started_in_the_background(*arguments: str) -> "subprocess.Popen[str]":
     )
 
 
-def test_a_start_in_the_background_ends_on_sigterm(tmp_path: Path) -> None:
+def test_background_process_ends_on_sigterm(tmp_path: Path) -> None:
     with started_in_the_background(*RUN, "--record", str(tmp_path)) as process:
         assert process.stdout is not None
         assert "serves" in process.stdout.readline()
@@ -39,7 +39,7 @@ def test_a_start_in_the_background_ends_on_sigterm(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_the_end_does_not_wait_for_a_leftover(tmp_path: Path, start_node: Any) -> None:
+def test_shutdown_does_not_wait_for_recovery(tmp_path: Path, start_node: Any) -> None:
     """Recovery takes half a minute; the leftover file remains for the next start."""
     leftover = tmp_path / "companion-1.mcap.active"
     leftover.write_bytes(MAGIC + _many_messages() * 10)
@@ -74,7 +74,7 @@ def _record(opcode: int, body: bytes) -> bytes:
 
 
 @pytest.mark.parametrize("way", ["link", pytest.param("listen", marks=pytest.mark.full)])
-def test_a_second_service_on_the_same_ports_is_refused_in_a_line(start_node: Any, way: str) -> None:
+def test_second_service_on_the_same_ports_fails_with_one_line(start_node: Any, way: str) -> None:
     node = start_node(*RUN)
     taken = {
         "link": f"udpin:127.0.0.1:{node.udp_port}",

@@ -33,7 +33,7 @@ main()
         pytest.param("Tick", "KeyError('1:1')", id="in the timer's task", marks=pytest.mark.full),
     ],
 )
-def test_a_defect_of_the_fold_ends_the_service_and_is_shown_whole(
+def test_pipeline_defect_ends_the_service_with_a_traceback(
     tmp_path: Path, kind: str, error: str
 ) -> None:
     done = subprocess.run(

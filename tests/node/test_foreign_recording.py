@@ -66,9 +66,7 @@ def replayed(folder: Path, *arguments: object) -> "subprocess.CompletedProcess[s
     )
 
 
-def test_a_replay_writes_and_opens_nothing_that_a_recording_names(
-    cut_log: Path, tmp_path: Path
-) -> None:
+def test_replay_opens_no_file_that_a_recording_names(cut_log: Path, tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "fifo")  # opening it blocks forever
     (tmp_path / "written").mkdir()
     log = foreign(cut_log, tmp_path / "theirs.mcap", PATHS)
@@ -82,7 +80,7 @@ def test_a_replay_writes_and_opens_nothing_that_a_recording_names(
 
 
 @pytest.mark.full
-def test_a_file_is_not_replaced_because_a_recording_says_so(cut_log: Path, tmp_path: Path) -> None:
+def test_recorded_paths_do_not_overwrite_files(cut_log: Path, tmp_path: Path) -> None:
     mine = tmp_path / "mine.mcap"
     mine.write_bytes(b"years of work")
     theirs = {"recording": {"directory": str(mine)}}
@@ -102,7 +100,7 @@ def test_a_file_is_not_replaced_because_a_recording_says_so(cut_log: Path, tmp_p
     ],
     ids=["design", "positions", "codebook", "calibration"],
 )
-def test_equipment_that_a_recording_only_names_is_refused(
+def test_equipment_file_missing_from_recording_is_rejected(
     cut_log: Path, tmp_path: Path, named: dict[str, Any], file: str
 ) -> None:
     os.mkfifo(tmp_path / "fifo")
@@ -154,7 +152,7 @@ def same_equipment(one: Settings, other: Settings) -> bool:
     )
 
 
-def test_files_that_settings_name_are_attached_to_the_recording(
+def test_files_named_in_settings_are_attached_to_the_recording(
     cut_log: Path, tmp_path: Path
 ) -> None:
     given, log = equipped(tmp_path), tmp_path / "kept.mcap"
@@ -178,7 +176,7 @@ def test_files_that_settings_name_are_attached_to_the_recording(
 
 
 @pytest.mark.parametrize("paths", [True, False])
-def test_files_within_the_settings_of_an_older_recording_are_used(
+def test_files_embedded_in_older_recorded_settings_are_used(
     cut_log: Path, tmp_path: Path, paths: bool
 ) -> None:
     """The first recording also had the paths; the recording of its replay had none."""
@@ -210,13 +208,13 @@ def test_files_within_the_settings_of_an_older_recording_are_used(
 
 
 @pytest.mark.parametrize("content", ["'%'", "7"])
-def test_contents_of_files_that_are_invalid_are_refused(content: str) -> None:
+def test_invalid_embedded_file_contents_are_rejected(content: str) -> None:
     for section, key in (("codebook", "stored"), ("array", "coupling_stored")):
         with pytest.raises(ConfigError, match=rf"^x: {section}\.{key} = .*: not base64$"):
             Settings.from_recording(f"[{section}]\n{key} = {content}\n", "x", {})
 
 
-def test_attachments_that_settings_do_not_name_are_not_kept(cut_log: Path, tmp_path: Path) -> None:
+def test_attachments_not_named_in_settings_are_discarded(cut_log: Path, tmp_path: Path) -> None:
     given, log = equipped(tmp_path), tmp_path / "x.mcap"
     files = {"codebook.npy": b"1", "other.csv": b"2"}
     with Writer(
@@ -236,7 +234,7 @@ def test_attachments_that_settings_do_not_name_are_not_kept(cut_log: Path, tmp_p
     assert given.override(codebook={"file": "new.npy"}).files.keys() == given.files.keys() - files
 
 
-def test_each_key_that_names_a_file_is_known() -> None:
+def test_every_file_setting_is_registered() -> None:
     """A new key must name its attachment or be excluded from a replay."""
     paths = {
         (section, key)
@@ -262,14 +260,14 @@ def test_each_key_that_names_a_file_is_known() -> None:
     ],
     ids=["arrays", "tables", "key", "header", "quotes", "many"],
 )
-def test_nested_settings_are_refused_in_a_line(text: str) -> None:
+def test_deeply_nested_settings_are_rejected_in_one_line(text: str) -> None:
     for read in (Settings.from_toml, partial(Settings.from_recording, attached={})):
         with pytest.raises(ConfigError, match=r"^there: ") as caught:
             read(text, "there")
         assert len(str(caught.value).splitlines()) == 1
 
 
-def test_the_largest_array_is_not_too_large() -> None:
+def test_largest_array_is_accepted_in_recorded_settings() -> None:
     """On one line, as a user may write it, and as recorded."""
     rows = np.random.default_rng(1).uniform(-1e4, 1e4, (4096, 6)).tolist()
     text = f"[array]\nkind = 'list'\npositions_m = {rows}\n"
@@ -277,7 +275,7 @@ def test_the_largest_array_is_not_too_large() -> None:
     assert Settings.from_recording(found.to_toml(), "x", {}) == found
 
 
-def test_a_file_without_end_is_refused(tmp_path: Path) -> None:
+def test_unbounded_file_is_rejected(tmp_path: Path) -> None:
     config = tmp_path / "settings.toml"
     config.write_text("[observer]\ndesign = '/dev/zero'\n")
     with pytest.raises(ConfigError, match=r"/dev/zero.*larger than 16 MiB"):

@@ -25,7 +25,7 @@ def setup_signing() -> bytes:
     return bytes(message.pack(sender))
 
 
-def test_a_signing_key_goes_no_further_and_that_is_counted() -> None:
+def test_signing_key_is_dropped_and_counted() -> None:
     """It reaches neither the pipeline nor a recording; the frames before and after it do."""
     stepped: list[Event] = []
     sent = [frame(1), setup_signing(), frame(2)]
@@ -83,7 +83,7 @@ def beat() -> bytes:
     return bytes(message.pack(dialect.MAVLink(None, srcSystem=1, srcComponent=1)))
 
 
-def test_a_uav_is_asked_over_the_link_on_which_it_was_heard_last() -> None:
+def test_request_goes_over_the_link_last_received_on() -> None:
     """Its position rate is too low. It was received on the first link and is now on the second."""
     stepped: list[Event] = []
     now_s = [1]
@@ -149,9 +149,7 @@ def where(north_m: float, boot_ms: int) -> bytes:
 
 
 @pytest.mark.parametrize("routers", [[], ["127.0.0.1:5"]])
-def test_two_peers_that_contradict_each_other_are_said_once_and_not_believed(
-    routers: list[str],
-) -> None:
+def test_contradicting_peers_are_announced_once_and_rejected(routers: list[str]) -> None:
     """The second one copies the clock and claims to be 20 m away: too little for the gate."""
     stepped: list[Event] = []
     said: list[Notice] = []

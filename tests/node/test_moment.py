@@ -13,7 +13,7 @@ from companion.values import Frame
 SETTINGS = Settings().override(center={"source": "5:1"})
 
 
-def test_what_came_at_that_very_time_is_known_then_and_nothing_later(cut_log: Path) -> None:
+def test_log_position_includes_events_up_to_that_time(cut_log: Path) -> None:
     events = list(log_events([cut_log], SETTINGS))
     begins_ns = events[0].t_ns
     times_ns = [a.t_ns for a, b in pairwise(events) if isinstance(a, Frame) and a.t_ns < b.t_ns]
@@ -25,6 +25,6 @@ def test_what_came_at_that_very_time_is_known_then_and_nothing_later(cut_log: Pa
         assert update.t_ns == t_ns
 
 
-def test_a_time_after_the_last_event_is_refused(cut_log: Path) -> None:
+def test_time_after_the_last_event_is_rejected(cut_log: Path) -> None:
     with pytest.raises(MomentError, match="s long"):
         look([cut_log], SETTINGS, "3600")

@@ -12,7 +12,7 @@ from companion.node.outlet import Outlet
 from companion.settings.model import Settings
 
 
-def test_each_vehicle_counts_its_messages() -> None:
+def test_each_forwarded_vehicle_has_its_own_sequence_numbers() -> None:
     settings = Settings().override(center={"source": "5:1"})
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], settings, "3")

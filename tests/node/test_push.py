@@ -13,7 +13,7 @@ from companion.settings.outlets import RecordSettings
 from companion.values import Notice
 
 
-def test_who_does_not_listen_is_said_once_and_that_it_does_after_a_while() -> None:
+def test_refused_udp_push_and_recovery_are_announced_once() -> None:
     settings = Settings().override(center={"source": "5:1"})
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], settings, "3")

@@ -16,7 +16,7 @@ from companion.views.state import RecordingStatus
 SETTINGS = Settings().override(center={"source": "5:1"})
 
 
-def test_each_figure_of_a_running_recording_is_its_own() -> None:
+def test_running_recording_status_has_its_own_values() -> None:
     service: Any = Service(settings=SETTINGS, say=lambda _: None)
     assert service.recording().state == "off"
     recorder = SimpleNamespace(
@@ -44,7 +44,7 @@ def test_each_figure_of_a_running_recording_is_its_own() -> None:
     assert (service.recording().state, service.recording().lag_s) == ("degraded", None)
 
 
-def test_news_of_a_recorder_are_notices_about_the_recording() -> None:
+def test_recorder_messages_become_recording_notices() -> None:
     service: Any = Service(settings=SETTINGS, say=lambda _: None)
     service._notify_recorder_state(
         SimpleNamespace(news=lambda: [(Severity.ERROR, "the disk is full")])
@@ -57,7 +57,7 @@ def test_news_of_a_recorder_are_notices_about_the_recording() -> None:
     )
 
 
-def test_each_figure_of_a_replays_recording_is_its_own(short_log: Path, tmp_path: Path) -> None:
+def test_replay_recording_status_has_its_own_values(short_log: Path, tmp_path: Path) -> None:
     out = tmp_path / "replayed.mcap"
     asked = ReplayRequest(
         logs=[short_log],

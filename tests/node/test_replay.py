@@ -42,7 +42,7 @@ def counted(log: Path) -> tuple[int, Counter[str], Counter[str]]:
 
 
 @pytest.mark.full
-def test_counts_are_those_of_pymavlink(tmp_path: Path) -> None:
+def test_frame_counts_match_pymavlink(tmp_path: Path) -> None:
     log = shared_log("sitl_4circle.tlog")
     first = tmp_path / "first.mcap"
     summary = json.loads(replay(log, "--center", "5:1", "--out", first, "--json").stdout)
@@ -97,7 +97,7 @@ def test_a_short_flight_replays_to_the_same_digest(short_log: Path, tmp_path: Pa
         ("sitl_4circle_wander.tlog", None),
     ],
 )
-def test_every_log_survives(name: str, uavs: int | None) -> None:
+def test_every_log_replays_without_a_traceback(name: str, uavs: int | None) -> None:
     done = replay(shared_log(name), "--no-record", "--json", check=False)
     summary = json.loads(done.stdout)
     assert "Traceback" not in done.stderr
@@ -142,7 +142,7 @@ def test_zero_forcing_holds_at_every_update(cut_log: Path) -> None:
     ],
 )
 @pytest.mark.parametrize("command", ["replay", "recover"])
-def test_what_is_no_log_is_one_line(make: Any, command: str, tmp_path: Path) -> None:
+def test_invalid_log_is_reported_in_one_line(make: Any, command: str, tmp_path: Path) -> None:
     path = tmp_path / "x"
     make(path)
     done = subprocess.run(

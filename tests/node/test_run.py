@@ -124,7 +124,7 @@ def test_follows_flying_vehicles_and_stops_cleanly(
 
 
 @pytest.mark.full
-def test_weights_point_where_the_beams_say(start_node: Any, tmp_path: Path) -> None:
+def test_weights_point_along_their_beams(start_node: Any, tmp_path: Path) -> None:
     node = start_node(*RUN)
     with fly(node.udp_port, tmp_path / "flown.tlog", seconds=4) as flight:
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
@@ -145,7 +145,7 @@ def test_weights_point_where_the_beams_say(start_node: Any, tmp_path: Path) -> N
 
 
 @pytest.mark.full
-def test_beams_say_what_they_are_worth(start_node: Any, tmp_path: Path) -> None:
+def test_beams_report_gain_guarantee_sinr_and_codebook(start_node: Any, tmp_path: Path) -> None:
     """Gain, guaranteed gain, SINR, and the codebook beams to sweep."""
     config = tmp_path / "settings.toml"
     config.write_text(PAPER_BOUNDS + '[codebook]\nkind = "dft"\n', encoding="utf-8")
@@ -191,7 +191,7 @@ def test_beams_say_what_they_are_worth(start_node: Any, tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_weights_for_a_device_or_the_reason_why_not(start_node: Any, tmp_path: Path) -> None:
+def test_device_weights_or_the_reason_are_returned(start_node: Any, tmp_path: Path) -> None:
     node = start_node(*RUN)
     with fly(node.udp_port, tmp_path / "flown.tlog", seconds=4) as flight:
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
@@ -207,7 +207,7 @@ def test_weights_for_a_device_or_the_reason_why_not(start_node: Any, tmp_path: P
 
 
 @pytest.mark.full
-def test_without_a_carrier_it_says_so(start_node: Any) -> None:
+def test_missing_carrier_is_reported(start_node: Any) -> None:
     node = start_node(*RUN)
     node.wait_until("/readyz", lambda answer: answer["reasons"] == ["no report yet"])
     assert node.get("/readyz")[0] == 503
@@ -252,7 +252,7 @@ def test_the_page_is_served(start_node: Any) -> None:
 
 
 @pytest.mark.full
-def test_a_token_is_asked_for(start_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_token_is_required(start_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COMPANION_TOKEN", "s3cret")
     node = start_node(*RUN)
     asked = ("/v1/status", "/readyz", "/metrics", "/v1/../v1/uavs")
@@ -269,7 +269,7 @@ def test_a_token_is_asked_for(start_node: Any, monkeypatch: pytest.MonkeyPatch) 
     assert [node.get(path, "*/*")[0] for path in open_to_all] == [200] * len(open_to_all)
 
 
-def test_the_demo_runs_by_itself_and_loads_nothing_that_it_does_not_use(tmp_path: Path) -> None:
+def test_demo_runs_without_loading_unused_modules(tmp_path: Path) -> None:
     code = (
         "import sys\n"
         "from companion.cli.main import main\n"

@@ -72,7 +72,7 @@ def unserved(cut_log: Path) -> dict[str, Any]:
 
 
 @pytest.mark.full
-def test_it_is_served_while_it_goes_and_at_its_end(
+def test_replay_is_served_during_and_after_the_run(
     start_replay: Any, cut_log: Path, unserved: dict[str, Any], tmp_path: Path
 ) -> None:
     out = tmp_path / "served.mcap"
@@ -123,9 +123,7 @@ def test_it_is_served_while_it_goes_and_at_its_end(
 
 
 @pytest.mark.full
-def test_a_replay_that_is_stopped_sums_up_what_there_was(
-    start_replay: Any, cut_log: Path, tmp_path: Path
-) -> None:
+def test_stopped_replay_prints_a_summary(start_replay: Any, cut_log: Path, tmp_path: Path) -> None:
     out = tmp_path / "part.mcap"
     node = start_replay(cut_log, "--center", "5:1", "--out", out, "--json")
     status = node.wait_until("/v1/status", lambda answer: answer["replay"]["at_s"] > 0.5)
@@ -141,7 +139,7 @@ def test_a_replay_that_is_stopped_sums_up_what_there_was(
 
 
 @pytest.mark.full
-def test_on_plain_asyncio_as_fast_as_it_goes(cut_log: Path, unserved: dict[str, Any]) -> None:
+def test_full_speed_replay_runs_on_plain_asyncio(cut_log: Path, unserved: dict[str, Any]) -> None:
     said: list[str] = []
     shown: list[dict[str, Any]] = []
 
@@ -168,7 +166,7 @@ def test_on_plain_asyncio_as_fast_as_it_goes(cut_log: Path, unserved: dict[str, 
     assert "5:1 is live" in said
 
 
-def test_now_does_not_go_back_for_a_frame_that_waited(tmp_path: Path) -> None:
+def test_current_time_does_not_go_back_for_a_queued_frame(tmp_path: Path) -> None:
     """The frame is processed after a later tick, with its true arrival time."""
     settings, begun_ns = Settings().override(center={"source": "5:1"}), 1_760_000_000 * 10**9
     late = Frame(
@@ -202,7 +200,7 @@ def test_now_does_not_go_back_for_a_frame_that_waited(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_live_service_is_no_replay(start_node: Any) -> None:
+def test_live_service_has_no_replay_status(start_node: Any) -> None:
     assert start_node(*RUN).json("/v1/status")["replay"] is None
 
 
@@ -215,7 +213,7 @@ def test_a_live_service_is_no_replay(start_node: Any) -> None:
         (("--serve", "--speed", "0"), "'0' is neither max nor a positive number"),
     ],
 )
-def test_a_mistake_is_one_line_and_leaves_nothing(
+def test_command_error_is_one_line_and_leaves_no_files(
     arguments: tuple[str, ...], says: str, cut_log: Path, tmp_path: Path
 ) -> None:
     done = subprocess.run(
@@ -234,7 +232,7 @@ def test_a_mistake_is_one_line_and_leaves_nothing(
 
 
 @pytest.mark.full
-def test_the_address_of_the_recorded_run_is_not_taken(tmp_path: Path, cut_log: Path) -> None:
+def test_recorded_listen_address_is_not_used(tmp_path: Path, cut_log: Path) -> None:
     """A recording holds the settings of its run, whose port may now be in use."""
     recorded = tmp_path / "x.mcap"
     settings = tmp_path / "settings.toml"

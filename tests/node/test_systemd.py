@@ -70,7 +70,7 @@ def listener(
 
 
 @pytest.mark.full
-def test_ready_alive_and_stopping(
+def test_systemd_receives_ready_watchdog_and_stopping(
     listener: Listener, start_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("WATCHDOG_USEC", str(round(WATCHDOG_S * 1e6)))
@@ -100,7 +100,7 @@ def test_ready_alive_and_stopping(
 
 
 @pytest.mark.full
-def test_no_signs_of_life_where_none_are_asked_for(
+def test_no_watchdog_messages_unless_requested(
     listener: Listener, start_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """``WATCHDOG_PID`` belongs to another process: the variables were inherited."""
@@ -113,7 +113,7 @@ def test_no_signs_of_life_where_none_are_asked_for(
     listener.wait_for("STOPPING=1", HANG_S)
 
 
-def test_late_beams_are_no_sign_of_life(tmp_path: Path) -> None:
+def test_late_beams_suppress_watchdog_messages(tmp_path: Path) -> None:
     """The event loop runs, but no beam updates are made."""
     settings = Settings().override(center={"source": "5:1"}, links={"urls": ["udpin:127.0.0.1:0"]})
     heard = Listener(str(tmp_path / "notify"))
@@ -142,7 +142,7 @@ def test_late_beams_are_no_sign_of_life(tmp_path: Path) -> None:
     assert not any("WATCHDOG=1" in lines for lines in messages)
 
 
-def test_a_manager_that_is_away_is_said_once_and_tried_again(
+def test_absent_service_manager_is_announced_once_and_retried(
     start_node: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
@@ -157,7 +157,7 @@ def test_a_manager_that_is_away_is_said_once_and_tried_again(
     assert complaints == ["systemd cannot be notified: No such file or directory"]
 
 
-def test_without_a_manager_there_is_none() -> None:
+def test_no_manager_without_notify_socket() -> None:
     assert systemd.manager({}) is None
     assert systemd.manager({"WATCHDOG_USEC": "1000000"}) is None
 
@@ -171,7 +171,7 @@ def test_without_a_manager_there_is_none() -> None:
         ({"WATCHDOG_USEC": "30000000", "WATCHDOG_PID": "1"}, None),
     ],
 )
-def test_how_much_silence_it_bears(watchdog: dict[str, str], expected_s: float | None) -> None:
+def test_watchdog_interval_is_parsed(watchdog: dict[str, str], expected_s: float | None) -> None:
     found = systemd.manager({"NOTIFY_SOCKET": "/run/notify", **watchdog})
     assert found is not None
     assert found.watchdog_s == expected_s
@@ -188,13 +188,13 @@ def test_how_much_silence_it_bears(watchdog: dict[str, str], expected_s: float |
         {"NOTIFY_SOCKET": "/run/notify", "WATCHDOG_USEC": "-1"},
     ],
 )
-def test_an_environment_that_makes_no_sense_is_a_mistake(environ: dict[str, str]) -> None:
+def test_invalid_systemd_environment_is_rejected(environ: dict[str, str]) -> None:
     name, value = list(environ.items())[-1]
     with pytest.raises(UserError, match=f"^{name}: '{value}' is "):
         systemd.manager(environ)
 
 
-def test_a_mistake_in_the_environment_is_one_line() -> None:
+def test_invalid_environment_is_reported_in_one_line() -> None:
     done = subprocess.run(
         [BIN / "companion", *RUN],
         env=os.environ | {"NOTIFY_SOCKET": "run/notify"},
@@ -208,12 +208,12 @@ def test_a_mistake_in_the_environment_is_one_line() -> None:
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_a_socket_that_cannot_be_had_is_a_reason() -> None:
+def test_unreachable_notify_socket_returns_a_reason() -> None:
     assert systemd.Manager("/" + "x" * 200).tell("READY=1") == "AF_UNIX path too long"
     assert systemd.Manager("@nobody-listens-here").tell("READY=1") == "Connection refused"
 
 
-def test_a_full_socket_does_not_hold_the_service_up(tmp_path: Path) -> None:
+def test_full_notify_socket_does_not_block_the_service(tmp_path: Path) -> None:
     """Nothing reads the socket: the kernel accepts some messages, then refuses at once."""
     heard = Listener(str(tmp_path / "notify"))
     with closing(heard.socket):
@@ -225,7 +225,7 @@ def test_a_full_socket_does_not_hold_the_service_up(tmp_path: Path) -> None:
         assert answers[-1] == "Resource temporarily unavailable"
 
 
-def test_the_documented_unit_is_good(tmp_path: Path) -> None:
+def test_documented_systemd_unit_is_valid(tmp_path: Path) -> None:
     analyze = shutil.which("systemd-analyze")
     if analyze is None:
         pytest.skip("no systemd-analyze here")

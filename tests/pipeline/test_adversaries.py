@@ -16,7 +16,7 @@ from numpy.random import default_rng
 QUICK, FULL = 4, 40
 
 
-def nothing_is_found(family: str, seed: int, flights: int) -> None:
+def assert_no_violation_found(family: str, seed: int, flights: int) -> None:
     tried = list(islice(search(FAMILIES[family], default_rng(seed)), flights))
     for number, one in enumerate(tried):
         assert one.wrong == "", number
@@ -24,21 +24,21 @@ def nothing_is_found(family: str, seed: int, flights: int) -> None:
     assert sum(one.queries for one in tried) > 100 * flights
 
 
-def test_nothing_that_is_assumed_possible_breaks_a_bound_or_is_refused() -> None:
-    nothing_is_found("everything", 1, QUICK)
+def test_flights_within_the_assumptions_keep_bounds_and_are_accepted() -> None:
+    assert_no_violation_found("everything", 1, QUICK)
 
 
-def test_a_carrier_that_turns_away_is_within_its_bounds_and_so_are_its_beams() -> None:
-    nothing_is_found("turns and gaps of attitudes", 1, 1)
+def test_turning_carrier_keeps_attitude_and_beam_bounds() -> None:
+    assert_no_violation_found("turns and gaps of attitudes", 1, 1)
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("family", FAMILIES)
-def test_a_search_finds_no_flight_that_breaks_a_bound(family: str) -> None:
-    nothing_is_found(family, 2, FULL)
+def test_search_finds_no_bound_violation(family: str) -> None:
+    assert_no_violation_found(family, 2, FULL)
 
 
-def test_the_search_goes_where_more_harm_is() -> None:
+def test_search_converges_on_the_worst_case() -> None:
     """On a bowl-shaped function the samples improve steadily and the edges are reachable."""
 
     def harm(genes: np.ndarray, _number: int) -> Tried:
@@ -51,7 +51,7 @@ def test_the_search_goes_where_more_harm_is() -> None:
     assert np.mean(ratios[:50]) < 0.0
 
 
-def test_the_adversary_reaches_what_it_may() -> None:
+def test_adversary_uses_its_full_limits() -> None:
     """A flight far inside the bound would prove nothing."""
     flight = adversary.Flight(default_rng(3).random(adversary.GENES))
     accelerations = np.diff(flight.velocities, axis=0) / adversary.STEP_S

@@ -78,7 +78,7 @@ def turning(
     return frames
 
 
-def test_a_turn_that_the_type_cannot_do_is_told_once_and_the_bound_widens() -> None:
+def test_turn_beyond_type_limit_is_announced_once_and_widens_the_bound() -> None:
     into = pipeline()
     out = run(into, [heartbeat(0, "1:1", 2), *turning("1:1", 10)])
     refuted = [one for one in out if isinstance(one, Refuted)]
@@ -97,7 +97,7 @@ def test_a_turn_that_the_type_cannot_do_is_told_once_and_the_bound_widens() -> N
     assert not any(isinstance(one, Rejection) for one in out)
 
 
-def test_what_an_aeroplane_can_do_is_no_news() -> None:
+def test_aeroplane_turn_refutes_nothing() -> None:
     into = pipeline()
     out = run(into, [heartbeat(0, "1:1", 1), *turning("1:1", 10)])
     assert not any(isinstance(one, Refuted) for one in out)
@@ -106,7 +106,7 @@ def test_what_an_aeroplane_can_do_is_no_news() -> None:
 
 
 @pytest.mark.parametrize(("mav_type", "lag_s"), [(2, 0.0295), (1, -0.026)])
-def test_a_lag_is_taken_off(mav_type: int, lag_s: float) -> None:
+def test_position_lag_is_corrected(mav_type: int, lag_s: float) -> None:
     """Positions of ArduPilot copters lag their stamps, those of aeroplanes lead them."""
     into = pipeline()
     out = run(into, [heartbeat(0, "1:1", mav_type), position(1, "1:1", (100, 0, 0), (10, 0, 0))])
@@ -115,7 +115,7 @@ def test_a_lag_is_taken_off(mav_type: int, lag_s: float) -> None:
     assert (101 * S - estimate.fix.sender_ns) / S == pytest.approx(lag_s, abs=1e-9)
 
 
-def test_a_step_of_some_seconds_is_no_second_vehicle() -> None:
+def test_temporary_step_is_not_a_duplicate_id() -> None:
     """Six metres aside for four seconds: reacquired after one second, and again on return."""
     into, rejected = pipeline(), []
     for n in range(200):
@@ -128,7 +128,7 @@ def test_a_step_of_some_seconds_is_no_second_vehicle() -> None:
     assert [one for one in rejected if one.t_ns > START_NS + 13.2 * S] == []
 
 
-def test_reports_of_a_fast_aircraft_with_a_good_receiver_are_all_used() -> None:
+def test_reports_of_a_fast_accurate_aircraft_are_all_accepted() -> None:
     """150 m/s at 20 Hz with 1 cm accuracy: one millisecond is more than that."""
     into = pipeline(observer={"speed_max_mps": 160.0})
     good = dialect.MAVLink_gps_raw_int_message(
@@ -146,7 +146,7 @@ def test_reports_of_a_fast_aircraft_with_a_good_receiver_are_all_used() -> None:
 # --- clocks -------------------------------------------------------------------------------------
 
 
-def test_a_clock_that_stood_still_is_told_and_recorded_as_refuted() -> None:
+def test_stalled_clock_is_announced_and_refutes_the_drift_limit() -> None:
     into, out = pipeline(), []
     for n in range(600):
         t_s = n / 20
@@ -160,7 +160,7 @@ def test_a_clock_that_stood_still_is_told_and_recorded_as_refuted() -> None:
     assert told.subject == "1:1" and "150 ms" in told.text
 
 
-def test_a_round_trip_that_contradicts_is_told_as_proven() -> None:
+def test_contradicting_round_trip_is_announced_at_most_once() -> None:
     into = pipeline()
     out = run(into, [position(n / 10, "1:1", (100, 0, 0)) for n in range(100)])
     for t_s, late_s in ((9.0, 0.0), (9.5, 0.4)):
@@ -178,7 +178,7 @@ def test_a_round_trip_that_contradicts_is_told_as_proven() -> None:
     assert len(changed) <= 1
 
 
-def test_other_messages_keep_the_clock() -> None:
+def test_undecoded_messages_update_the_clock() -> None:
     """Stamps of messages that are not decoded count between two reports of a slow link."""
     alone, helped = pipeline(), pipeline()
     for n in range(40):
@@ -196,7 +196,7 @@ def test_other_messages_keep_the_clock() -> None:
 # --- home ---------------------------------------------------------------------------------------
 
 
-def test_home_waits_for_a_receiver_that_vouches() -> None:
+def test_home_waits_for_a_valid_receiver_status() -> None:
     """No fix, then a height that is hundreds of metres off, then both valid."""
     into = pipeline("home")
     out = run(into, [receiver(0.5, "1:1", 1, ALT_M), position(1, "1:1", (0, 0, 0))])
@@ -210,7 +210,7 @@ def test_home_waits_for_a_receiver_that_vouches() -> None:
     assert update.carrier is not None
 
 
-def test_a_track_waits_for_a_receiver_that_vouches_but_not_for_ever() -> None:
+def test_track_waits_for_receiver_status_at_most_ten_seconds() -> None:
     """One height is 500 m off for three seconds; another permanently."""
     into = pipeline("9:1")
     for uav, wrong_s in (("1:1", 3.0), ("2:1", 99.0)):
@@ -227,7 +227,7 @@ def test_a_track_waits_for_a_receiver_that_vouches_but_not_for_ever() -> None:
         assert {one.reason for one in refused} == {Reason.NO_FIX}
 
 
-def test_home_moves_where_its_first_height_was_wrong() -> None:
+def test_home_moves_after_a_wrong_first_height() -> None:
     """No receiver status arrived: the first height is used until the track jumps away from it."""
     into = pipeline("home")
     out = run(into, [position(n / 5, "1:1", (0, 0, 500.2 if n < 20 else 0)) for n in range(60)])
@@ -239,7 +239,7 @@ def test_home_moves_where_its_first_height_was_wrong() -> None:
     assert abs(track.position_ned_m[2]) < 1.0
 
 
-def test_a_line_that_leaps_beyond_what_frames_are_late_is_told() -> None:
+def test_clock_jump_beyond_possible_latency_is_announced() -> None:
     """A link that delayed all frames by 15 s looks the same: the notice names both causes."""
     there = pipeline()
     said = run(there, (position(0.1 * n, "7:1", (n, 0, 0), (10, 0, 0)) for n in range(300)))

@@ -69,13 +69,13 @@ def blamed(
         ({"age_s": 1.2}, Cause.SILENT, "no report for 1.2 s"),
     ],
 )  # fmt: skip
-def test_the_largest_part_of_a_track_s_bound_is_to_blame(
+def test_cause_is_the_largest_part_of_the_track_bound(
     changed: dict[str, object], cause: Cause, reason: str
 ) -> None:
     assert blamed(replace(TRACK, **changed))[:2] == (cause, reason)  # type: ignore[arg-type]
 
 
-def test_a_clock_in_doubt_is_to_blame_for_the_turns_that_are_possible_meanwhile() -> None:
+def test_clock_is_blamed_for_acceleration_within_its_uncertainty() -> None:
     """4.8 s at 4 m/s^2 alone are 46 m, and more with the report's age."""
     doubted = replace(
         TRACK, velocity_ned_mps=np.array([11.5, 0.0, 0.0]), limits=Limits(60.0, 4.0), age_s=2.8,
@@ -84,25 +84,25 @@ def test_a_clock_in_doubt_is_to_blame_for_the_turns_that_are_possible_meanwhile(
     assert blamed(doubted)[:2] == (Cause.CLOCK, "its clock is uncertain by 4.8 s")
 
 
-def test_without_a_velocity_an_old_report_says_little() -> None:
+def test_old_report_without_velocity_blames_the_report_rate() -> None:
     mute = replace(TRACK, velocity_ned_mps=None, dt_s=0.9, age_s=0.9, bound_m=58.0)
     assert blamed(mute)[0] is Cause.RATE
     assert blamed(replace(mute, bound_m=200.0))[0] is Cause.POSITION
 
 
-def test_slow_reports_are_not_silence() -> None:
+def test_slow_reports_blame_the_rate_not_silence() -> None:
     """With 2 s between reports, an age of 4 s is one missing report, not a lost link."""
     assert blamed(replace(TRACK, age_s=4.0, dt_s=2.0, bound_m=60.0))[0] is Cause.RATE
 
 
-def test_an_assumed_clock_is_helped_by_timesync() -> None:
+def test_unmeasured_clock_remedy_is_timesync() -> None:
     assumed = LinkEvidence(clock_assumed=True, refused=None)
     cause, reason, remedy = blamed(replace(TRACK, clock_bound_s=0.1), evidence=assumed)
     assert (cause, reason) == (Cause.CLOCK, "its clock is unmeasured, uncertain by 100 ms")
     assert "TIMESYNC" in remedy
 
 
-def test_the_carrier_is_to_blame_for_its_attitude_and_its_position() -> None:
+def test_carrier_is_blamed_for_its_attitude_and_position() -> None:
     turned = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2))
     assert turned[:2] == (Cause.CARRIER, "the carrier's attitude is uncertain by 11°")
     assert "10 Hz" in turned[2]
@@ -122,14 +122,14 @@ def test_the_carrier_is_to_blame_for_its_attitude_and_its_position() -> None:
     assert placed[:2] == (Cause.CARRIER, "the carrier's position is uncertain by 8 m")
 
 
-def test_reports_that_come_and_are_not_used_are_told_before_all_else() -> None:
+def test_rejected_reports_are_the_first_cause() -> None:
     refused = LinkEvidence(clock_assumed=False, refused=Reason.UNREACHABLE)
     far = replace(CARRIER, attitude_bound_rad=0.5)
     found = blamed(replace(TRACK, age_s=9.0), far, evidence=refused)
     assert found[:2] == (Cause.REFUSED, "its reports are rejected: unreachable")
 
 
-def test_a_sharp_beam_without_gain_is_crowded_or_too_far() -> None:
+def test_narrow_beam_without_gain_is_crowded_or_out_of_range() -> None:
     crowded = replace(BEAM, gain_db=4.0, loss_db=14.0, widened=False)
     assert blamed(beam=crowded)[:2] == (Cause.CROWDED, "other UAVs in its direction cost it 14 dB")
     weak = replace(BEAM, gain_db=4.0, widened=False)
@@ -140,7 +140,7 @@ def test_a_sharp_beam_without_gain_is_crowded_or_too_far() -> None:
     assert blamed(beam=replace(crowded, widened=True))[0] is Cause.POSITION
 
 
-def test_without_a_beam_the_reason_of_the_beams_is_told() -> None:
+def test_uav_without_beam_gets_the_left_out_reason() -> None:
     outside, crowded = (
         LeftOut("3:1", cause, "so it is") for cause in (Cause.COVERAGE, Cause.CROWDED)
     )
@@ -153,7 +153,7 @@ def test_without_a_beam_the_reason_of_the_beams_is_told() -> None:
     assert (found.cause, found.reason) == (Cause.SILENT, "no report for 12.0 s")
 
 
-def test_who_is_silent_everywhere_is_not_missed_for_want_of_a_node() -> None:
+def test_globally_silent_uav_is_not_blamed_on_missing_nodes() -> None:
     stale = replace(TRACK, state=TrackState.STALE, age_s=12.0)
     for track, reached, full, cause in (
         (stale, True, True, Cause.SILENT),
@@ -166,7 +166,7 @@ def test_who_is_silent_everywhere_is_not_missed_for_want_of_a_node() -> None:
         assert ("full" in found.reason) is (cause is Cause.UNSERVED and full)
 
 
-def test_a_reason_says_what_is_wrong_and_a_remedy_what_to_do() -> None:
+def test_every_cause_has_a_reason_and_a_remedy() -> None:
     out = LeftOut(uav="3:1", cause=Cause.COVERAGE, reason="behind the array")
     found = [
         blame.of_left_out(out, TRACK, "no attitude from the carrier"),

@@ -15,7 +15,7 @@ CLOCKS_MAX = 100
 
 @pytest.mark.soak
 @pytest.mark.timeout(1800)
-def test_a_day_takes_no_more_memory_than_its_morning(table: Any) -> None:
+def test_memory_does_not_grow_over_a_day(table: Any) -> None:
     """Runs in its own process; here, memory freed by other tests would be filled first."""
     with ProcessPoolExecutor(1, mp_context=get_context("spawn")) as alone:
         found, clocks = alone.submit(flown, 24).result()

@@ -135,7 +135,7 @@ def begun(paper: list[Event]) -> list[Event]:
 # --- beams that point where the UAVs are --------------------------------------------------------
 
 
-def test_two_uavs_and_a_carrier_that_is_turned() -> None:
+def test_beam_angles_with_a_rotated_carrier() -> None:
     """Heading east, nose up by 10 degrees: the angles by plane geometry."""
     pipeline = Pipeline(settings())
     nose_rad = math.radians(10)
@@ -163,9 +163,7 @@ def test_two_uavs_and_a_carrier_that_is_turned() -> None:
 
 
 @pytest.mark.parametrize("mount_deg", [(0, 0, 0), (20.0, -30.0, 140.0)])
-def test_beams_on_hovering_uavs_are_where_the_scenario_has_them(
-    mount_deg: tuple[float, float, float],
-) -> None:
+def test_beams_on_hovering_uavs_match_the_scenario(mount_deg: tuple[float, float, float]) -> None:
     """The carrier sways; scipy rotates the directions at the time at which the beams apply."""
     flight = scenario.hover(4)
     keys = ("mount_roll_deg", "mount_pitch_deg", "mount_yaw_deg")
@@ -191,7 +189,7 @@ def test_beams_on_hovering_uavs_are_where_the_scenario_has_them(
             assert beam.elevation_rad == pytest.approx(math.asin(-z), abs=2e-3)
 
 
-def test_the_truth_is_within_the_bounds_of_the_paper_s_flight(paper: list[Event]) -> None:
+def test_bounds_hold_over_the_paper_flight(paper: list[Event]) -> None:
     """Up to 125 m/s with gusts: positions and directions within the bounds of the update."""
     flight = scenario.paper(4)
     bounds = {
@@ -234,7 +232,7 @@ def test_the_truth_is_within_the_bounds_of_the_paper_s_flight(paper: list[Event]
     assert checked > 60
 
 
-def test_a_lead_asks_for_a_later_time() -> None:
+def test_lead_predicts_to_a_later_time() -> None:
     pipeline = Pipeline(settings(center="47.4,8.55,500"))
     for t_s in (0.0, 0.1, 0.2):
         east_m = 10 * t_s
@@ -251,7 +249,7 @@ def test_a_lead_asks_for_a_later_time() -> None:
 
 
 @pytest.mark.parametrize("center", ["home", None])
-def test_home_is_where_the_first_report_was_made(center: str | None) -> None:
+def test_home_is_the_first_accepted_report(center: str | None) -> None:
     pipeline = Pipeline(settings(center))
     assert pipeline.step(tick(0))[0].unfit == "no report yet"  # type: ignore[union-attr]
     zero = dialect.MAVLink_global_position_int_message(1, 0, 0, 0, 0, 0, 0, 0, 0)
@@ -286,7 +284,7 @@ def test_a_fixed_station_faces_its_heading() -> None:
     assert (update.carrier.bound_m, update.carrier.age_s) == (0.0, None)
 
 
-def test_without_a_carrier_there_are_no_beams_and_it_says_why() -> None:
+def test_update_without_carrier_has_a_reason_and_no_beams() -> None:
     pipeline = Pipeline(settings())
     assert updated(pipeline, 0).unfit == "no report yet"
     pipeline.step(position(0.1, "1:1", (100, 0, 0)))
@@ -314,7 +312,7 @@ def bearing_deg(update: Update) -> float:
     return math.degrees(beam.azimuth_rad)
 
 
-def test_an_attitude_that_was_overtaken_changes_nothing() -> None:
+def test_outdated_attitude_is_ignored() -> None:
     """The carrier heads north, then east; the first attitude arrives again half a second late."""
     pipeline = Pipeline(settings())
     run(pipeline, [position(1.0, "5:1"), position(1.0, "1:1", (200, 0, 0))])
@@ -326,7 +324,7 @@ def test_an_attitude_that_was_overtaken_changes_nothing() -> None:
     assert bearing_deg(updated(pipeline, 1.2)) == pytest.approx(-90, abs=0.02)
 
 
-def test_a_carrier_that_restarts_has_no_attitude_until_it_sends_one() -> None:
+def test_restarted_carrier_has_no_attitude_until_a_new_one() -> None:
     """The old attitude has a stamp that the new clock has not reached."""
     pipeline = Pipeline(settings())
     for t_s in np.arange(0, 5, 0.5):
@@ -345,7 +343,7 @@ def estimator(t_s: float, ratio: float, flags: int = 831, source: str = "5:1") -
     return sent(t_s, source, message)
 
 
-def test_the_attitude_is_as_sure_as_its_estimator_is() -> None:
+def test_attitude_bound_follows_the_estimator_status() -> None:
     """A ratio can only widen the bound; without an attitude estimate any attitude is possible."""
     held = {"source": "5:1", "turn_acceleration_max_degps2": 0.0}
     pipeline, at_s = Pipeline(settings().override(center=held)), 0.1
@@ -390,7 +388,7 @@ def test_the_carrier_is_never_its_own_target() -> None:
 
 
 @pytest.mark.parametrize(("targets", "aimed"), [("telemetry", ()), ("all", ("icao:4CA7B3",))])
-def test_adsb_traffic_is_a_target_only_if_asked(targets: str, aimed: tuple[str, ...]) -> None:
+def test_adsb_traffic_is_a_target_only_if_enabled(targets: str, aimed: tuple[str, ...]) -> None:
     pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": targets}))
     (seen,) = pipeline.step(adsb(0, (3000, 500, -800)))
     assert isinstance(seen, Estimate)
@@ -403,7 +401,9 @@ def test_adsb_traffic_is_a_target_only_if_asked(targets: str, aimed: tuple[str, 
     ("flags", "reason", "who"),
     [(2, Reason.NO_POSITION, "5:1"), (1, Reason.NO_ALTITUDE, "icao:4CA7B3")],
 )
-def test_adsb_without_what_it_takes_is_counted(flags: int, reason: Reason, who: str) -> None:
+def test_incomplete_adsb_reports_are_rejected_and_counted(
+    flags: int, reason: Reason, who: str
+) -> None:
     pipeline = Pipeline(settings())
     (refused,) = pipeline.step(adsb(0, (3000, 500, -800), flags))
     assert isinstance(refused, Rejection)
@@ -425,7 +425,7 @@ def relayed(t_s: float, north_m: float, alt_m: float, datum: int, relay: str = "
     return sent(t_s, relay, message)
 
 
-def test_an_aircraft_of_two_relays_is_one_track_at_one_datum() -> None:
+def test_aircraft_from_two_relays_is_one_track_with_one_datum() -> None:
     """One relay reports pressure altitude, 300 m off; it is used only when the other falls
     silent.
     """
@@ -459,7 +459,7 @@ def test_the_same_report_over_two_links_counts_once() -> None:
     assert track.reports == 1
 
 
-def test_a_late_report_is_put_in_its_place() -> None:
+def test_late_report_is_inserted_in_order() -> None:
     """Half a second late: the track equals that of a timely report."""
     made = [position(t_s, "1:1", (t_s, t_s**2, 0), (1, 2 * t_s, 0)) for t_s in (0.0, 0.5, 1.0)]
     in_order, late = Pipeline(settings("home")), Pipeline(settings("home"))
@@ -472,7 +472,7 @@ def test_a_late_report_is_put_in_its_place() -> None:
     assert (one.reports, other.reports) == (3, 3)
 
 
-def test_a_report_later_than_the_window_is_out_of_order() -> None:
+def test_report_older_than_the_window_is_out_of_order() -> None:
     pipeline = Pipeline(settings("home"))
     run(pipeline, [position(0, "1:1"), position(1, "1:1", (1, 0, 0))])
     late = position(7.5, "1:1", (0.5, 0, 0), boot_s=100.5)
@@ -483,7 +483,7 @@ def test_a_report_later_than_the_window_is_out_of_order() -> None:
     assert pipeline.refusals.total == {Reason.OUT_OF_ORDER: 1}
 
 
-def test_reports_that_waited_together_are_not_out_of_order() -> None:
+def test_queued_reports_are_not_out_of_order() -> None:
     """Read together but made one after the other: the track continues from the newest."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
     for number in range(5):
@@ -519,7 +519,7 @@ def noise_of(pipeline: Pipeline, uav: str) -> tuple[float, float, float]:
         (False, (0.8, 1.5, 0.1), (6.0, 6.0, 0.7)),
     ],
 )
-def test_the_autopilot_s_own_accuracy_is_followed_if_asked(
+def test_reported_accuracy_is_used_when_enabled(
     follow: bool, accuracies: tuple[float, float, float], expected: tuple[float, float, float]
 ) -> None:
     """From the next report of that sender on, times the factor; missing values use the default."""
@@ -539,7 +539,7 @@ def test_the_autopilot_s_own_accuracy_is_followed_if_asked(
     assert noise_of(pipeline, "1:1") == (6.0, 6.0, 0.7)
 
 
-def test_what_a_receiver_said_before_does_not_take_the_place_of_what_it_says_now() -> None:
+def test_outdated_receiver_status_is_ignored() -> None:
     """A slower second link repeats it; a much earlier time belongs to another boot."""
     pipeline = Pipeline(settings("home"))
     run(pipeline, [position(49.9, "1:1"), accuracy(50.0, "1:1", 0.5, 0.5, 0.1)])
@@ -553,7 +553,7 @@ def test_what_a_receiver_said_before_does_not_take_the_place_of_what_it_says_now
     assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
 
 
-def test_after_a_reboot_a_receiver_is_believed_whose_time_is_a_little_before() -> None:
+def test_receiver_status_after_a_reboot_replaces_the_old_one() -> None:
     """Within the lag of a second link, so that only the reboot distinguishes it from an old
     status.
     """
@@ -568,7 +568,7 @@ def test_after_a_reboot_a_receiver_is_believed_whose_time_is_a_little_before() -
     assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
 
 
-def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
+def test_relayed_report_has_transponder_noise_bounds() -> None:
     """100 m plus the distance flown in the second to which its time is known."""
     pipeline = Pipeline(settings("home", observer={"speed_max_mps": 90.0}))
     run(pipeline, [accuracy(0.0, "5:1", 0.5, 0.5, 0.1), adsb(0.1, (3000, 500, -800))])
@@ -587,7 +587,7 @@ def test_a_relayed_report_is_as_good_as_transponders_are() -> None:
     assert track.clock_bound_s == 1.0
 
 
-def test_a_relayed_report_was_true_when_its_aircraft_was_heard() -> None:
+def test_relayed_report_is_dated_by_its_age_field() -> None:
     """One second earlier by ``tslc``; the arrival time is unchanged."""
     (seen,) = Pipeline(settings("47.4,8.55,500")).step(adsb(5.0, (3000, 500, -800)))
     assert isinstance(seen, Estimate)
@@ -595,7 +595,7 @@ def test_a_relayed_report_was_true_when_its_aircraft_was_heard() -> None:
     assert seen.fix.arrival_ns == START_NS + 5 * S
 
 
-def test_a_track_that_is_begun_again_is_said_once() -> None:
+def test_track_restart_is_announced_once() -> None:
     """A lasting jump of 200 m."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
     outputs: list[Output] = []
@@ -613,7 +613,7 @@ def test_a_track_that_is_begun_again_is_said_once() -> None:
     assert updated(pipeline, 10.0).beams.uavs == ("1:1",)
 
 
-def test_a_position_at_0_0_is_counted_and_makes_no_track() -> None:
+def test_zero_position_is_rejected_and_counted() -> None:
     pipeline = Pipeline(settings())
     zero = dialect.MAVLink_global_position_int_message(1, 200, -300, 0, 0, 0, 0, 0, 0)
     for t_s in (0.0, 0.1):
@@ -635,7 +635,7 @@ def test_rejections_pass_through_and_are_counted() -> None:
     assert pipeline.frames == 0
 
 
-def test_frames_that_nobody_reads_are_counted_and_no_more() -> None:
+def test_unused_frames_are_only_counted() -> None:
     pipeline = Pipeline(settings())
     before = pipeline.digest.hexdigest()
     assert pipeline.step(sent(0, "1:1", dialect.MAVLink_ping_message(1, 2, 3, 4))) == []
@@ -645,7 +645,7 @@ def test_frames_that_nobody_reads_are_counted_and_no_more() -> None:
     assert pipeline.digest.hexdigest() == before
 
 
-def test_after_a_reboot_a_track_waits_for_its_receiver_anew() -> None:
+def test_track_waits_for_receiver_status_again_after_a_reboot() -> None:
     """The receiver's height always differs, so the first track started after ten seconds."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
 
@@ -662,7 +662,7 @@ def test_after_a_reboot_a_track_waits_for_its_receiver_anew() -> None:
     assert after.count(Reason.NO_FIX) == 20
 
 
-def test_a_reboot_is_said_and_begins_a_fresh_track() -> None:
+def test_reboot_is_announced_and_starts_a_new_track() -> None:
     pipeline = Pipeline(settings("47.4,8.55,500"))
     for t_s in range(5):
         pipeline.step(position(t_s, "1:1", (100 + t_s, 0, 0)))
@@ -688,7 +688,7 @@ def test_a_reboot_is_said_and_begins_a_fresh_track() -> None:
     assert second.dt_s == pytest.approx(1.0)
 
 
-def test_states_are_said_when_they_change() -> None:
+def test_state_changes_are_announced() -> None:
     pipeline = Pipeline(settings("47.4,8.55,500"))
     pipeline.step(position(0, "1:1", (100, 0, 0)))
     said = {}
@@ -739,7 +739,7 @@ def test_other_events_give_another_digest(begun: list[Event]) -> None:
     assert len(set(digests)) == len(digests)
 
 
-def held_up(events: list[Event], begin_s: float, end_s: float) -> list[Event]:
+def stalled_order(events: list[Event], begin_s: float, end_s: float) -> list[Event]:
     """Return the events in the order of a stalled node: its first tick precedes the queued frames,
     and the ticks in between are missing."""
     begin_ns, end_ns = START_NS + round(begin_s * S), START_NS + round(end_s * S)
@@ -759,10 +759,10 @@ def digest_of(*outputs: Estimate | Update) -> str:
     return digest.hexdigest()
 
 
-def test_a_node_that_was_held_up_knows_the_same_afterwards(paper: list[Event]) -> None:
+def test_stalled_node_reaches_the_same_state(paper: list[Event]) -> None:
     """Frames are processed after a later tick, with their true arrival times."""
     smooth, busy = Pipeline(settings("5:1")), Pipeline(settings("5:1"))
-    late = held_up(paper, 2.0, 2.5)
+    late = stalled_order(paper, 2.0, 2.5)
     assert any(a.t_ns > b.t_ns + S // 4 for a, b in pairwise(late))
     estimated = [
         [output for output in run(pipeline, events) if isinstance(output, Estimate)]
@@ -776,7 +776,7 @@ def test_a_node_that_was_held_up_knows_the_same_afterwards(paper: list[Event]) -
     assert again.digest.hexdigest() == busy.digest.hexdigest()
 
 
-def test_an_estimate_is_in_the_digest_with_all_that_matters() -> None:
+def test_digest_covers_every_field_of_an_estimate() -> None:
     (seen,) = Pipeline(settings("47.4,8.55,500")).step(position(0.0, "1:1", (3.0, 4.0, 5.0)))
     assert isinstance(seen, Estimate)
     others = [
@@ -792,7 +792,7 @@ def test_an_estimate_is_in_the_digest_with_all_that_matters() -> None:
     assert len({digest.hexdigest() for digest in digests}) == len(digests)
 
 
-def test_looking_changes_nothing(begun: list[Event]) -> None:
+def test_queries_do_not_change_the_pipeline(begun: list[Event]) -> None:
     """Neither the digest nor later outputs change."""
     quiet, watched = Pipeline(settings()), Pipeline(settings())
     for number, event in enumerate(begun):
@@ -811,7 +811,7 @@ def test_looking_changes_nothing(begun: list[Event]) -> None:
     assert watched.last_update is last
 
 
-def test_geodetic_is_the_way_back() -> None:
+def test_geodetic_inverts_local_coordinates() -> None:
     pipeline = Pipeline(settings("47.4,8.55,500"))
     lat, lon, alt = pipeline.geodetic(np.array([[10.0, 20, -30]]))
     assert (lat[0], lon[0], alt[0]) == pytest.approx(pymap3d.ned2geodetic(10, 20, -30, *PLACE))
@@ -822,7 +822,7 @@ def test_geodetic_is_the_way_back() -> None:
 # --- ticks of a log -----------------------------------------------------------------------------
 
 
-def test_ticks_come_at_the_rate_asked_for() -> None:
+def test_ticks_follow_the_configured_rate() -> None:
     frames = [position(t_s, "1:1") for t_s in (0.0, 0.01, 0.3, 0.31, 1.0)]
     events = list(with_ticks(frames, 20.0))
     ticks = [event.t_ns for event in events if isinstance(event, Tick)]
@@ -834,13 +834,13 @@ def test_ticks_come_at_the_rate_asked_for() -> None:
     assert events.index(frames[4]) == len(events) - 1
 
 
-def test_a_period_is_rounded_once_not_at_every_tick() -> None:
+def test_tick_period_rounding_does_not_accumulate() -> None:
     frames = [position(t_s, "1:1") for t_s in (0.0, 10.0)]
     ticks = [e.t_ns for e in with_ticks(frames, 3.0) if isinstance(e, Tick)]
     assert ticks == [START_NS + n * 333_333_333 for n in range(1, 31)]
 
 
-def test_no_events_no_ticks() -> None:
+def test_no_events_give_no_ticks() -> None:
     assert list(with_ticks([], 20.0)) == []
     garbage = Rejection(t_ns=START_NS, source="udp", reason=Reason.GARBAGE)
     assert list(with_ticks([garbage, garbage], 1000.0)) == [garbage, garbage]
@@ -862,7 +862,7 @@ def test_own_telemetry_and_adsb_of_one_aircraft_get_one_beam() -> None:
 # --- links, lists and round trips ---------------------------------------------------------------
 
 
-def test_who_is_denied_is_not_tracked_and_that_is_counted() -> None:
+def test_denied_senders_are_not_tracked_and_are_counted() -> None:
     lists = {"allow": ["*:1"], "deny": ["2:1", "5:1"]}
     pipeline = Pipeline(settings(tracks=lists))
     for t_s in np.arange(0, 2, 0.1):
@@ -881,7 +881,7 @@ def test_who_is_denied_is_not_tracked_and_that_is_counted() -> None:
     assert refused["5:1"] == 0
 
 
-def test_the_link_that_is_first_is_known_and_both_latencies_are() -> None:
+def test_first_link_and_latency_of_each_link_are_recorded() -> None:
     """``fast`` delivers a report at once and ``slow`` 50 ms later; one report was lost on fast."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
     for n in range(50):
@@ -898,7 +898,7 @@ def test_the_link_that_is_first_is_known_and_both_latencies_are() -> None:
     assert pipeline.senders.link_share("another").first == 0
 
 
-def test_a_round_trip_tells_what_one_way_cannot() -> None:
+def test_round_trips_reveal_one_way_latency() -> None:
     """Every report takes at least 300 ms; the TIMESYNC answers show it."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
     for n in range(40):
@@ -927,7 +927,7 @@ def test_a_round_trip_tells_what_one_way_cannot() -> None:
     assert estimate.uncertainty_s < 0.02
 
 
-def test_who_is_long_gone_is_dropped_and_comes_back_as_new() -> None:
+def test_long_silent_uav_is_dropped_and_returns_as_new() -> None:
     ages = {"coasting_s": 1.0, "stale_s": 2.0, "lost_s": 3.0, "dropped_s": 8.0}
     pipeline = Pipeline(settings("47.4,8.55,500", tracks=ages))
     outputs = run(pipeline, [position(n / 10, "1:1", (50.0, 0.0, 0.0)) for n in range(10)])
@@ -946,7 +946,7 @@ def test_who_is_long_gone_is_dropped_and_comes_back_as_new() -> None:
     assert again.dt_s is None
 
 
-def test_no_more_are_tracked_than_the_settings_allow() -> None:
+def test_number_of_tracks_is_limited() -> None:
     pipeline = Pipeline(settings("47.4,8.55,500", tracks={"most": 3}))
     for n in range(20):
         for sysid in range(1, 11):
@@ -956,7 +956,7 @@ def test_no_more_are_tracked_than_the_settings_allow() -> None:
     assert pipeline.refusals.total == {Reason.TOO_MANY: 7 * 20}
 
 
-def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_clocks_without_a_track_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
     """Invented senders use bounded memory; senders with a track and the carrier keep their
     clocks.
     """
@@ -974,7 +974,7 @@ def test_clocks_of_those_without_a_track_are_bounded(monkeypatch: pytest.MonkeyP
         run(pipeline, [tick(n / 100) for n in range(100)])
 
 
-def test_pauses_without_end_are_not_ticked_through() -> None:
+def test_long_pauses_of_a_log_are_skipped() -> None:
     """A thousand pauses of one hour each would be 36 million ticks."""
     hour_ns = 3_590 * S
     garbage = [
@@ -984,7 +984,7 @@ def test_pauses_without_end_are_not_ticked_through() -> None:
     assert 4 * 35_000 < ticks < 4 * 36_100 + 1_000
 
 
-def test_pauses_of_a_flight_are_ticked_through_however_many() -> None:
+def test_short_pauses_of_a_log_are_ticked_through() -> None:
     """Each is shorter than a minute; together they last a day."""
     garbage = [
         Rejection(t_ns=n * 50 * S, source="log", reason=Reason.GARBAGE) for n in range(1_728)
@@ -993,7 +993,7 @@ def test_pauses_of_a_flight_are_ticked_through_however_many() -> None:
     assert ticks == 1_727 * 50
 
 
-def test_the_clock_of_who_is_long_gone_is_forgotten() -> None:
+def test_clock_of_a_long_silent_sender_is_forgotten() -> None:
     """Except for the carrier's, and not within the hour in which it may return."""
     pipeline = Pipeline(settings())
     run(pipeline, [position(0.0, "5:1"), position(0.0, "7:1")])

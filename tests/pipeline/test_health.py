@@ -82,9 +82,7 @@ SURE, USUAL, WILD = (0.5, 0.1), (12.0, 0.5), (60.0, 50.0)
 
 
 @pytest.mark.parametrize(("errors", "level"), [(SURE, "good"), (USUAL, "weak"), (WILD, "none")])
-def test_the_gain_that_is_sure_or_likely_makes_the_verdict(
-    errors: tuple[float, float], level: str
-) -> None:
+def test_verdict_follows_guaranteed_or_likely_gain(errors: tuple[float, float], level: str) -> None:
     watch = Watch()
     assert watch.see(0, [track("1:1", *errors)]) == level
     verdict = watch.health.verdicts["1:1"]
@@ -95,14 +93,16 @@ def test_the_gain_that_is_sure_or_likely_makes_the_verdict(
     assert (likely is not None and likely >= 10) == (level != "none")
 
 
-def test_it_is_judged_once_a_second() -> None:
+def test_links_are_assessed_once_per_second() -> None:
     watch = Watch()
     watch.see(0, [track("1:1", *SURE)])
     assert watch.see(0.9, [track("1:1", *SURE), track("2:1", *SURE)]) == "good"
     assert watch.see(1.0, [track("1:1", *SURE), track("2:1", *SURE)]) == "good good"
 
 
-def test_many_links_are_judged_in_turn_and_told_together(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_links_are_assessed_in_batches_and_announced_together(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Each link is assessed once per second; links that became worse for one cause share a
     notice.
     """
@@ -124,7 +124,7 @@ def test_many_links_are_judged_in_turn_and_told_together(monkeypatch: pytest.Mon
     assert len(watch.said) == 1
 
 
-def test_worse_is_told_after_a_second_and_better_after_three() -> None:
+def test_worse_level_needs_one_second_and_better_level_three() -> None:
     watch = Watch()
     levels = [watch.see(t_s, [track("1:1", *SURE)]) for t_s in range(2)]
     levels += [watch.see(t_s, [track("1:1", *USUAL)]) for t_s in range(2, 5)]
@@ -139,7 +139,7 @@ def test_worse_is_told_after_a_second_and_better_after_three() -> None:
     assert watch.health.verdicts["1:1"].since_ns == 8 * S
 
 
-def test_a_level_that_is_held_says_why_it_is_so_now() -> None:
+def test_held_level_gives_its_current_reason() -> None:
     watch = Watch()
     assert watch.see(0, [replace(track("1:1", *WILD), age_s=2.0)]) == "none"
     assert watch.see(1, [replace(track("1:1", *USUAL), age_s=3.0)]) == "none"
@@ -150,28 +150,28 @@ def test_a_level_that_is_held_says_why_it_is_so_now() -> None:
     assert watch.health.verdicts["1:1"].blame == why  # a good link has no other reason
 
 
-def test_what_is_held_for_good_has_no_reason() -> None:
+def test_held_good_level_has_no_reason() -> None:
     watch = Watch()
     assert watch.see(0, [track("1:1", *SURE)]) == "good"
     assert watch.see(1, [track("1:1", *USUAL)]) == "good"
     assert watch.health.verdicts["1:1"].blame is None
 
 
-def test_what_comes_and_goes_is_not_told() -> None:
+def test_brief_changes_are_not_announced() -> None:
     watch = Watch()
     for t_s in range(20):
         watch.see(t_s, [track("1:1", *(USUAL if t_s % 2 else SURE))])
     assert watch.said == []
 
 
-def test_what_is_worse_one_way_or_the_other_is_worse() -> None:
+def test_alternating_bad_levels_count_as_worse() -> None:
     watch = Watch()
     watch.see(0, [track("1:1", *SURE)])
     seen = [watch.see(t_s, [track("1:1", *(USUAL if t_s % 2 else WILD))]) for t_s in range(1, 4)]
     assert seen == ["good", "none", "none"]
 
 
-def test_better_must_last_whole() -> None:
+def test_improvement_must_last_three_seconds_without_interruption() -> None:
     """It gets worse in between: the three seconds start again."""
     watch = Watch()
     watch.see(0, [track("1:1", *USUAL)])
@@ -180,7 +180,7 @@ def test_better_must_last_whole() -> None:
     assert seen == [*["weak"] * 6, "good"]
 
 
-def test_a_hair_s_breadth_changes_nothing() -> None:
+def test_level_has_one_decibel_of_hysteresis() -> None:
     """Up to 1 dB below the required gain keeps the level but does not reach it."""
     watch = Watch()
     watch.see(0, [track("1:1", *SURE)])
@@ -196,7 +196,7 @@ def test_a_hair_s_breadth_changes_nothing() -> None:
         assert other.see(0, [track("1:1", *SURE)]) != "good"
 
 
-def test_without_a_beam_there_is_no_link_at_once_and_the_state_is_told_elsewhere() -> None:
+def test_uav_without_beam_has_no_link_at_once_without_a_notice() -> None:
     watch = Watch()
     watch.see(0, [track("1:1", *SURE), track("2:1", *SURE)])
     assert watch.see(1, [track("1:1", *SURE, "stale"), track("2:1", *SURE)]) == "none good"
@@ -204,7 +204,7 @@ def test_without_a_beam_there_is_no_link_at_once_and_the_state_is_told_elsewhere
     assert watch.health.verdicts["1:1"].guaranteed_gain_db is None
 
 
-def test_one_cause_is_told_once() -> None:
+def test_common_cause_is_announced_once() -> None:
     everybody = [track(uav, *SURE) for uav in PLACES]
     watch = Watch()
     watch.see(0, everybody)
@@ -225,7 +225,7 @@ def test_a_uav_that_is_gone_is_forgotten() -> None:
     assert list(watch.health.verdicts) == ["2:1"]
 
 
-def test_an_sinr_that_is_needed_is_turned_into_a_gain() -> None:
+def test_required_sinr_is_converted_to_a_gain() -> None:
     """Twice the range takes 6 dB more; alone in its time slot there is only noise."""
     found = []
     for factor in (1.0, 2.0):

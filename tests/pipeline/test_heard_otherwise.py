@@ -120,7 +120,7 @@ def estimates(fold: Pipeline, frame: Frame) -> list[Estimate]:
     return [one for one in fold.step(frame) if isinstance(one, Estimate)]
 
 
-def test_one_aircraft_that_is_heard_three_ways_gets_one_beam() -> None:
+def test_aircraft_received_three_ways_gets_one_beam() -> None:
     """Telemetry takes precedence over Remote ID, and Remote ID over ADS-B."""
     fold = pipeline()
     fold.step(naming(0))
@@ -142,7 +142,7 @@ def test_one_aircraft_that_is_heard_three_ways_gets_one_beam() -> None:
     )
 
 
-def test_an_event_of_an_aircraft_that_is_known_better_is_that_one() -> None:
+def test_cot_event_of_a_tracked_aircraft_is_merged() -> None:
     fold = pipeline()
     for n in range(12):
         fold.step(transponder(n))
@@ -151,7 +151,7 @@ def test_an_event_of_an_aircraft_that_is_known_better_is_that_one() -> None:
     assert fold.targets.identities.same_as("cot:HAWK") == "icao:4CA7B3"
 
 
-def test_an_events_errors_are_its_bounds_and_late_is_late() -> None:
+def test_cot_event_errors_and_delay_are_applied() -> None:
     """Three standard deviations plus the distance flown in one second."""
     fold = pipeline(tracks={"window_s": 20.0})
     for n in range(20):
@@ -162,7 +162,7 @@ def test_an_events_errors_are_its_bounds_and_late_is_late() -> None:
     assert late.fix.t_ns == pytest.approx(START_NS + 9.5 * S, abs=0.2 * S)
 
 
-def test_an_aircraft_elsewhere_is_another_one() -> None:
+def test_distant_aircraft_keeps_its_own_track() -> None:
     fold = pipeline()
     fold.step(naming(0))
     for n in range(12):
@@ -171,7 +171,7 @@ def test_an_aircraft_elsewhere_is_another_one() -> None:
     assert set(updated(fold, 12).beams.uavs) == {"1:1", RID}
 
 
-def test_a_broadcast_that_two_receivers_hear_counts_once() -> None:
+def test_broadcast_received_twice_counts_once() -> None:
     fold = pipeline()
     for receiver in (9, 10):
         fold.step(naming(0, receiver))
@@ -182,7 +182,7 @@ def test_a_broadcast_that_two_receivers_hear_counts_once() -> None:
     assert list(fold.tracker.uavs) == [RID]
 
 
-def test_a_position_that_comes_ten_seconds_late_is_of_ten_seconds_ago() -> None:
+def test_position_ten_seconds_late_is_dated_by_its_stamp() -> None:
     """By its stamp, as with telemetry."""
     fold = pipeline(tracks={"window_s": 20.0})
     fold.step(naming(0))
@@ -195,7 +195,7 @@ def test_a_position_that_comes_ten_seconds_late_is_of_ten_seconds_ago() -> None:
 
 
 @pytest.mark.parametrize(("code", "horizontal_m"), [(10, 18.5), (9, 55.5), (8, 171.3), (0, 100.0)])
-def test_stated_accuracies_are_the_bounds(code: int, horizontal_m: float) -> None:
+def test_stated_accuracies_set_the_bounds(code: int, horizontal_m: float) -> None:
     """Three times the 68 % radius, plus the distance flown in 0.15 s or, for ADS-B ages, in one
     second."""
     fold = pipeline()
@@ -206,7 +206,7 @@ def test_stated_accuracies_are_the_bounds(code: int, horizontal_m: float) -> Non
     assert seen.fix.noise.horizontal_m == pytest.approx(horizontal_m + 5, abs=0.1)
 
 
-def test_what_a_mavlink_relay_puts_behind_its_message_is_no_accuracy() -> None:
+def test_extra_bytes_of_a_mavlink_relay_are_not_an_accuracy() -> None:
     """Another dialect may have its own fields there; only those of this program's receivers are
     read."""
     theirs = transponder(0, nac_p=11)
@@ -216,7 +216,7 @@ def test_what_a_mavlink_relay_puts_behind_its_message_is_no_accuracy() -> None:
     assert seen.fix.noise.horizontal_m == pytest.approx(105, abs=0.1)
 
 
-def test_lists_keep_out_who_is_named_in_them() -> None:
+def test_denied_remote_id_is_rejected() -> None:
     fold = pipeline(tracks={"deny": ["rid:*"]})
     fold.step(naming(0))
     (refused,) = fold.step(broadcast(0))
@@ -224,7 +224,7 @@ def test_lists_keep_out_who_is_named_in_them() -> None:
     assert (refused.reason, refused.source) == (Reason.NOT_ALLOWED, RID)
 
 
-def test_a_broadcast_without_a_stamp_has_no_time() -> None:
+def test_broadcast_without_stamp_is_rejected() -> None:
     fold = pipeline()
     fold.step(naming(0))
     message = dialect.MAVLink_open_drone_id_location_message(
@@ -235,7 +235,7 @@ def test_a_broadcast_without_a_stamp_has_no_time() -> None:
     assert isinstance(refused, Rejection) and refused.reason is Reason.UNPLACED_STAMP
 
 
-def test_an_export_has_a_row_of_each_report_whatever_its_message() -> None:
+def test_export_has_a_row_for_every_report_message() -> None:
     fold = pipeline(tracks={"deny": ["cot:*"]})
     found = []
     frames = [broadcast(0), naming(0), broadcast(1), transponder(1), event(1), telemetry(1)]
@@ -260,7 +260,7 @@ def test_an_export_has_a_row_of_each_report_whatever_its_message() -> None:
     assert all(one.position is not None for one in found if one is not None)
 
 
-def test_made_up_names_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invented_ids_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """Event ids can be invented freely; the state kept for them is bounded."""
     monkeypatch.setattr(records, "RECORDS_MAX", RECORDS_MAX)
     monkeypatch.setattr(senders, "RECORDS_MAX", RECORDS_MAX)
@@ -290,7 +290,7 @@ def summary(t_s: float, **given: int) -> Frame:
     return framed(t_s, Source(1, 1), dialect.MAVLink_high_latency2_message(**fields))
 
 
-def test_a_uav_that_sends_high_latency2_alone_is_tracked_within_its_bound() -> None:
+def test_uav_with_only_high_latency2_is_tracked_within_its_bound() -> None:
     """One report every 5 s, with height in whole metres and no velocity."""
     into, estimates, t_s = pipeline(), list[Estimate](), 0.0
     for step in range(60):
@@ -308,7 +308,7 @@ def test_a_uav_that_sends_high_latency2_alone_is_tracked_within_its_bound() -> N
 
 
 @pytest.mark.parametrize(("eph", "least_m"), [(0, 3.0), (255, 3.0), (80, 24.0)])
-def test_the_bound_on_a_summary_holds_what_it_states(eph: int, least_m: float) -> None:
+def test_high_latency2_bound_includes_its_stated_accuracy(eph: int, least_m: float) -> None:
     """Three times its stated accuracy, plus one metre for the resolution of its heights."""
     (estimate,) = (
         one for one in pipeline().step(summary(0.0, eph=eph)) if isinstance(one, Estimate)

@@ -5,12 +5,12 @@ from companion.pipeline.refusals import RECENT, SENDERS_MAX, Refusals
 from companion.values import Reason, Rejection
 
 
-def made_refusals() -> Refusals:
+def new_refusals() -> Refusals:
     return Refusals(Records(UavRecord, set[str]().__contains__))
 
 
-def test_counts_by_sender_and_reason() -> None:
-    refusals = made_refusals()
+def test_rejections_are_counted_by_sender_and_reason() -> None:
+    refusals = new_refusals()
     for n in range(20):
         refusals.add(Rejection(t_ns=n, source="1:1", reason=Reason.DUPLICATE))
     refusals.add(Rejection(t_ns=20, source="udp", reason=Reason.GARBAGE, count=7))
@@ -20,8 +20,8 @@ def test_counts_by_sender_and_reason() -> None:
     assert not refusals.of("2:1").counts
 
 
-def test_a_flood_of_senders_forgets_the_one_heard_of_longest_ago() -> None:
-    refusals = made_refusals()
+def test_flood_of_senders_evicts_the_least_recent() -> None:
+    refusals = new_refusals()
     for n in range(2 * SENDERS_MAX):
         refusals.add(Rejection(t_ns=n, source=f"icao:{n:06X}", reason=Reason.NO_POSITION))
         refusals.add(Rejection(t_ns=n, source="1:1", reason=Reason.DUPLICATE))
@@ -46,8 +46,8 @@ def told_at(refusals: Refusals, rejections: list[Rejection]) -> list[float]:
     return [one.t_ns * 1e-9 for one in rejections if refusals.add(one) is not None]
 
 
-def test_a_second_without_a_report_that_is_used_is_told_once() -> None:
-    refusals = made_refusals()
+def test_one_second_of_rejected_reports_is_announced_once() -> None:
+    refusals = new_refusals()
     assert told_at(refusals, [refused(t / 4) for t in range(20)]) == [1.0]
     said = refusals.add(refused(7, "4:1"))
     assert said is None
@@ -59,16 +59,16 @@ def test_a_second_without_a_report_that_is_used_is_told_once() -> None:
     )
 
 
-def test_a_report_that_is_used_ends_the_run() -> None:
-    refusals = made_refusals()
+def test_accepted_report_ends_the_run_of_rejections() -> None:
+    refusals = new_refusals()
     for t in range(40):
         assert refusals.add(refused(t / 4)) is None
         if t % 3 == 0:
             refusals.used("3:1")
 
 
-def test_runs_that_follow_one_another_are_told_every_ten_seconds_at_most() -> None:
-    refusals = made_refusals()
+def test_consecutive_runs_are_announced_at_most_every_ten_seconds() -> None:
+    refusals = new_refusals()
     told = []
     for t in range(30):
         told += told_at(refusals, [refused(t), refused(t + 0.5, reason=Reason.FROZEN)])
@@ -78,15 +78,15 @@ def test_runs_that_follow_one_another_are_told_every_ten_seconds_at_most() -> No
     assert told == [1.0, 11.0, 21.0]
 
 
-def test_what_is_no_report_about_its_sender_is_told_of_nobody() -> None:
-    refusals = made_refusals()
+def test_rejections_unrelated_to_own_reports_are_not_announced() -> None:
+    refusals = new_refusals()
     for reason in (Reason.DUPLICATE, Reason.BAD_CRC, Reason.NOT_ALLOWED, Reason.UNSIGNED):
         assert told_at(refusals, [refused(t, reason=reason) for t in range(9)]) == []
     assert told_at(refusals, [refused(t, "icao:4CA7B3") for t in range(9)]) == []
 
 
-def test_reports_under_a_shared_id_are_why_a_uav_is_silent_and_are_told_elsewhere() -> None:
-    refusals = made_refusals()
+def test_shared_id_explains_silence_without_its_own_notice() -> None:
+    refusals = new_refusals()
     shared = [refused(t / 4, reason=Reason.SHARED_ID) for t in range(20)]
     assert told_at(refusals, shared) == []
     assert refusals.unheard("3:1") is Reason.SHARED_ID

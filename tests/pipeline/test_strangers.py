@@ -85,7 +85,7 @@ def flown(tracker: Tracker, uav: str, reports: int, from_s: float) -> None:
         assert isinstance(tracker.accept(fix(uav, from_s + number * 0.1))[0], Estimate)
 
 
-def test_who_was_here_before_is_not_shut_out_by_strangers(tracker: Tracker) -> None:
+def test_strangers_do_not_evict_a_tracked_uav(tracker: Tracker) -> None:
     flown(tracker, "1:1", ESTABLISHED, 0.0)
     tracker.forget("1:1")  # silent behind a hill for ten minutes
     for number in range(10):
@@ -97,7 +97,7 @@ def test_who_was_here_before_is_not_shut_out_by_strangers(tracker: Tracker) -> N
     assert tracker.uavs == [*(f"200:{number}" for number in range(9)), "1:1"]
 
 
-def test_who_is_tracked_for_long_makes_no_room(tracker: Tracker) -> None:
+def test_long_tracked_uavs_are_not_evicted(tracker: Tracker) -> None:
     flown(tracker, "1:1", ESTABLISHED, 0.0)
     tracker.forget("1:1")
     for number in range(10):
@@ -105,7 +105,7 @@ def test_who_is_tracked_for_long_makes_no_room(tracker: Tracker) -> None:
     assert isinstance(tracker.accept(fix("1:1", 710.0))[0], Rejection)
 
 
-def test_strangers_who_are_refused_leave_nothing_behind(tracker: Tracker) -> None:
+def test_rejected_strangers_leave_no_state(tracker: Tracker) -> None:
     for number in range(10):
         flown(tracker, f"2:{number}", 1, 0.0)
     for number in range(1000):
@@ -113,14 +113,14 @@ def test_strangers_who_are_refused_leave_nothing_behind(tracker: Tracker) -> Non
     assert len(tracker._tracked) == 10
 
 
-def test_only_as_many_are_remembered_as_are_tracked(tracker: Tracker) -> None:
+def test_established_set_is_bounded_by_the_track_limit(tracker: Tracker) -> None:
     for number in range(30):
         flown(tracker, f"3:{number}", ESTABLISHED, 100.0 * number)
         tracker.forget(f"3:{number}")
     assert tracker._established == {f"3:{number}" for number in range(10)}  # the first ones
 
 
-def test_ids_without_end_do_not_fill_the_lists() -> None:
+def test_admission_cache_is_bounded() -> None:
     admits = admission(("1:*", "icao:4*"), ("1:7",))
     for number in range(3 * KNOWN_MAX):
         assert admits(f"icao:{number:06X}") is (f"{number:06X}"[0] == "4")
@@ -128,7 +128,7 @@ def test_ids_without_end_do_not_fill_the_lists() -> None:
     assert [admits(uav) for uav in ("1:1", "1:7", "2:1")] == [True, False, False]
 
 
-def made_senders(carrier: str | None, tracked: Container[str]) -> Senders:
+def new_senders(carrier: str | None, tracked: Container[str]) -> Senders:
     return Senders(
         settings=Settings(),
         carrier=carrier,
@@ -137,9 +137,9 @@ def made_senders(carrier: str | None, tracked: Container[str]) -> Senders:
     )
 
 
-def test_clocks_are_forgotten_between_ticks_and_those_of_tracks_are_kept() -> None:
+def test_clocks_are_evicted_except_those_of_tracks() -> None:
     tracked = {str(Source(number, 1)) for number in range(0, 200, 10)}
-    senders = made_senders("255:1", tracked)
+    senders = new_senders("255:1", tracked)
     for number in range(RECORDS_MAX + 2 * DROPPED_TOGETHER):
         source = Source(255 - number % 256, 1 + number // 256)
         senders.round_trip(RoundTrip(t_ns=2 * S, source=source, sent_ns=S, remote_ns=1))
@@ -148,7 +148,7 @@ def test_clocks_are_forgotten_between_ticks_and_those_of_tracks_are_kept() -> No
     assert str(source) in senders._senders
 
 
-def test_more_tracks_than_clocks_leave_all_of_them_their_own() -> None:
+def test_every_track_keeps_its_clock_beyond_the_limit() -> None:
     class Everyone:
         asked = 0
 
@@ -157,7 +157,7 @@ def test_more_tracks_than_clocks_leave_all_of_them_their_own() -> None:
             return True
 
     everyone = Everyone()
-    senders = made_senders(None, everyone)
+    senders = new_senders(None, everyone)
     many = RECORDS_MAX + 3 * DROPPED_TOGETHER
     for number in range(many):
         senders.round_trip(
@@ -169,8 +169,8 @@ def test_more_tracks_than_clocks_leave_all_of_them_their_own() -> None:
     assert everyone.asked < 4 * many  # the table is not scanned for each new sender
 
 
-def test_what_is_said_beside_positions_is_forgotten() -> None:
-    senders = made_senders("5:1", {"1:1"})
+def test_component_records_are_evicted() -> None:
+    senders = new_senders("5:1", {"1:1"})
     mav = common.MAVLink(None)
 
     def heard(number: int) -> None:
@@ -195,7 +195,7 @@ def test_what_is_said_beside_positions_is_forgotten() -> None:
     assert set(map(str, senders._components)) == {"1:1", "5:1"}
 
 
-def test_records_of_made_up_ids_have_an_end() -> None:
+def test_records_of_invented_ids_are_bounded() -> None:
     records = Records(UavRecord, {"0:1"}.__contains__)
     for number in range(3 * RECORDS_MAX):
         records[f"{number}:1"].refuted += 1
@@ -242,7 +242,7 @@ def yaw_rad(ms: int) -> float:
     return math.radians(ms / 100)
 
 
-def test_an_attitude_from_the_future_does_not_keep_others_out(
+def test_attitude_with_a_future_stamp_does_not_block_later_ones(
     turning: Callable[[list[PlacedAttitude]], list[float]],
 ) -> None:
     honest = [attitude(t, t, yaw_rad(t)) for t in range(0, 5000, 100)]
@@ -257,7 +257,7 @@ def test_an_attitude_from_the_future_does_not_keep_others_out(
     assert known[-1] == pytest.approx(math.degrees(yaw_rad(4900)))
 
 
-def test_a_slower_link_never_turns_the_carrier_back(
+def test_slower_link_does_not_revert_the_attitude(
     turning: Callable[[list[PlacedAttitude]], list[float]],
 ) -> None:
     """Attitudes arrive again two seconds late at their own rate, beside the fresh ones."""
@@ -268,7 +268,7 @@ def test_a_slower_link_never_turns_the_carrier_back(
     assert np.all(np.diff(known) >= 0)
 
 
-def test_attitudes_that_are_resent_at_once_turn_nothing_back(
+def test_burst_of_resent_attitudes_does_not_revert_the_attitude(
     turning: Callable[[list[PlacedAttitude]], list[float]],
 ) -> None:
     fresh = [attitude(t, t, yaw_rad(t)) for t in range(0, 3000, 100)]
@@ -296,7 +296,7 @@ def report(sysid: int, t_s: float) -> Frame:
     )
 
 
-def test_beams_are_for_the_first_and_for_those_of_priority() -> None:
+def test_beams_go_to_first_uavs_and_to_priority_uavs() -> None:
     """However many arrive; a lost UAV frees its place, and all others get a reason."""
     given = {"center": {"source": "47,8,480,0"}, "beams": {"most": 3, "priority": ["90:1"]}}
     pipeline = Pipeline(Settings().override(**given))

@@ -64,7 +64,7 @@ def updates(outputs: list[Output]) -> list[Update]:
     return [one for one in outputs if isinstance(one, Update)]
 
 
-def test_beams_are_those_of_the_tick_though_reports_came_since(flown: list[Event]) -> None:
+def test_beams_are_those_of_the_tick_despite_later_reports(flown: list[Event]) -> None:
     pipeline, expected = Pipeline(SETTINGS), list[Update]()
     differ = 0
     for event in in_two(flown):
@@ -81,7 +81,7 @@ def test_beams_are_those_of_the_tick_though_reports_came_since(flown: list[Event
     assert differ > 30  # otherwise no relevant event came in between
 
 
-def test_with_nothing_in_between_it_is_one_tick(flown: list[Event]) -> None:
+def test_tick_and_tock_without_events_between_equal_one_tick(flown: list[Event]) -> None:
     whole, halves = Pipeline(SETTINGS), Pipeline(SETTINGS)
     for event in flown:
         said = whole.step(event)
@@ -93,7 +93,7 @@ def test_with_nothing_in_between_it_is_one_tick(flown: list[Event]) -> None:
     assert whole.digest.hexdigest() == halves.digest.hexdigest()
 
 
-def test_it_does_not_matter_who_makes_them_and_when(flown: list[Event]) -> None:
+def test_beams_are_the_same_from_any_thread(flown: list[Event]) -> None:
     alone, helped, on = Pipeline(SETTINGS), Pipeline(SETTINGS), set[str]()
     for event in in_two(flown):
         alone.step(event)
@@ -113,7 +113,7 @@ def test_it_does_not_matter_who_makes_them_and_when(flown: list[Event]) -> None:
     assert alone.digest.hexdigest() == helped.digest.hexdigest()
 
 
-def test_where_the_local_frame_began_meanwhile_they_are_made_anew(flown: list[Event]) -> None:
+def test_beams_are_recomputed_if_the_local_frame_changed(flown: list[Event]) -> None:
     """The tick's coordinates belong to no frame or to another one."""
     pipeline = Pipeline(SETTINGS)
     pipeline.step(Tick(flown[0].t_ns, in_two=True))
@@ -127,7 +127,7 @@ def test_where_the_local_frame_began_meanwhile_they_are_made_anew(flown: list[Ev
     assert len(update.beams.beams) == 4
 
 
-def test_a_tock_alone_is_none_and_of_two_ticks_the_last_counts(flown: list[Event]) -> None:
+def test_tock_without_tick_is_ignored_and_last_tick_counts(flown: list[Event]) -> None:
     pipeline = Pipeline(SETTINGS)
     for event in flown:
         pipeline.step(event)
@@ -141,7 +141,7 @@ def test_a_tock_alone_is_none_and_of_two_ticks_the_last_counts(flown: list[Event
     assert pipeline.updates == before + 1
 
 
-def test_a_recording_replays_to_the_same(tmp_path: Path, flown: list[Event]) -> None:
+def test_recording_replays_to_the_same_digest(tmp_path: Path, flown: list[Event]) -> None:
     events = list(in_two(flown))
     pipeline = Pipeline(SETTINGS)
     writer = Writer(
@@ -163,7 +163,7 @@ def test_a_recording_replays_to_the_same(tmp_path: Path, flown: list[Event]) -> 
     assert again.digest.hexdigest() == pipeline.digest.hexdigest()
 
 
-def test_a_reader_that_knows_of_no_tocks_sees_ticks() -> None:
+def test_older_reader_without_tocks_reads_ticks() -> None:
     """It meets one additional field, and a topic that it does not subscribe to."""
     data = schemas.encode_tick(5, in_two=True)
     assert data.startswith(schemas.encode_tick(5))

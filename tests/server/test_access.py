@@ -6,7 +6,7 @@ from companion.server.access import ListenError, bind
 
 
 @pytest.mark.parametrize("token", [None, ""])
-def test_an_address_that_others_reach_wants_a_token_or_a_word(token: str | None) -> None:
+def test_public_address_requires_a_token_or_insecure_flag(token: str | None) -> None:
     """An empty token does not count; a valid one or the insecure flag does."""
     with pytest.raises(ListenError, match=r"0\.0\.0\.0:0: other machines can reach this address"):
         bind("0.0.0.0:0", token=token, insecure=False)
@@ -15,5 +15,5 @@ def test_an_address_that_others_reach_wants_a_token_or_a_word(token: str | None)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.0.0.7"])
-def test_an_address_of_this_machine_alone_wants_neither(host: str) -> None:
+def test_loopback_address_requires_no_token(host: str) -> None:
     bind(f"{host}:0", token=None, insecure=False).close()

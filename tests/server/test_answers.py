@@ -73,7 +73,7 @@ def holds(model: Any, answer: Any) -> None:
     assert adapter.dump_python(read, mode="json") == answer
 
 
-def test_messages_are_found_by_system_and_component(make_node: Any) -> None:
+def test_messages_are_addressed_by_system_and_component(make_node: Any) -> None:
     """In this order, with two different numbers."""
     node = make_node(flown=False)
     raw = pack(heartbeat(Source(sysid=7, compid=9)), 0)
@@ -88,14 +88,14 @@ def test_messages_are_found_by_system_and_component(make_node: Any) -> None:
 
 
 @pytest.mark.parametrize("path", PATHS)
-def test_an_answer_is_what_its_model_says(client: TestClient, path: str) -> None:
+def test_response_matches_its_model(client: TestClient, path: str) -> None:
     answer = client.get(path)
     assert answer.status_code == 200
     assert answer.headers["content-type"] == "application/json"
     holds(PATHS[path], answer.json())
 
 
-def test_what_is_compared_is_not_empty(client: TestClient) -> None:
+def test_compared_responses_are_not_empty(client: TestClient) -> None:
     """Empty lists would match any model."""
     uavs = client.get("/v1/uavs").json()["uavs"]
     assert {uav["id"].startswith("icao:") for uav in uavs} == {True, False}
@@ -113,20 +113,20 @@ def test_what_is_compared_is_not_empty(client: TestClient) -> None:
     assert client.get("/v1/events").json()["events"]
 
 
-def test_before_anything_was_heard_the_models_hold_too(make_node: Any) -> None:
+def test_responses_match_their_models_before_any_report(make_node: Any) -> None:
     with TestClient(create_app(make_node(flown=False))) as client:
         for path in ("/v1/status", "/v1/uavs", "/v1/beams", "/v1/beams/weights", "/v1/design"):
             holds(PATHS.get(path) or beam_state.Beams, client.get(path).json())
 
 
-def test_every_path_of_the_document_is_held_against_its_model(client: TestClient) -> None:
+def test_every_openapi_path_is_checked_against_its_model(client: TestClient) -> None:
     document = client.get("/openapi.json").json()
     shown = {path.split("?")[0] for path in PATHS}
     named = {path.format(uav="1:1", sys=1, comp=1, name="HEARTBEAT") for path in document["paths"]}
     assert named == shown | {"/metrics", "/v1/map/tiles", "/v1/recordings/HEARTBEAT"}
 
 
-def test_the_document_is_made_beside_the_event_loop(
+def test_openapi_document_is_built_off_the_event_loop(
     make_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """It takes 0.2 s, in which all other requests would wait."""
@@ -145,7 +145,7 @@ def test_the_document_is_made_beside_the_event_loop(
     assert beside == [True]
 
 
-def test_the_document_shows_problems_as_problems(client: TestClient) -> None:
+def test_openapi_document_describes_errors_as_problem_json(client: TestClient) -> None:
     document = client.get("/openapi.json").json()
     for path, operations in document["paths"].items():
         for status, shown in operations["get"]["responses"].items():
@@ -157,7 +157,7 @@ def test_the_document_shows_problems_as_problems(client: TestClient) -> None:
     assert "HTTPValidationError" not in document["components"]["schemas"]
 
 
-def test_the_document_says_what_every_field_and_parameter_means(client: TestClient) -> None:
+def test_openapi_document_describes_every_field_and_parameter(client: TestClient) -> None:
     """With the unit in which its name ends."""
     document = client.get("/openapi.json").json()
     lacking: list[str] = []
@@ -193,7 +193,9 @@ def test_the_document_says_what_every_field_and_parameter_means(client: TestClie
         ("GET", "/v1/pattern?points=3602", 422),
     ],
 )
-def test_every_error_is_a_problem(client: TestClient, method: str, path: str, status: int) -> None:
+def test_every_error_is_problem_json(
+    client: TestClient, method: str, path: str, status: int
+) -> None:
     answer = client.request(method, path)
     assert answer.status_code == status
     assert answer.headers["content-type"] == "application/problem+json"
@@ -203,7 +205,7 @@ def test_every_error_is_a_problem(client: TestClient, method: str, path: str, st
         assert answer.headers["allow"] == "GET"
 
 
-def test_a_mistake_of_ours_is_a_problem_too(make_node: Any) -> None:
+def test_internal_error_is_problem_json(make_node: Any) -> None:
     node = make_node(flown=False)
     del node.notices  # makes `events` fail
     with TestClient(create_app(node), raise_server_exceptions=False) as client:
@@ -213,7 +215,7 @@ def test_a_mistake_of_ours_is_a_problem_too(make_node: Any) -> None:
     assert "notices" not in answer.text
 
 
-def test_head_is_get_without_its_body(client: TestClient) -> None:
+def test_head_equals_get_without_a_body(client: TestClient) -> None:
     assert client.head("/v1/status").status_code == 200
     assert client.head("/v1/uavs/9:9").status_code == 404
 
@@ -232,11 +234,11 @@ def test_head_is_get_without_its_body(client: TestClient) -> None:
         (",;q=;,", "json"),
     ],
 )
-def test_what_is_accepted_is_given(accept: str, form: str | None) -> None:
+def test_response_format_follows_the_accept_header(accept: str, form: str | None) -> None:
     assert accepted(accept) == form
 
 
-def test_raw_weights_are_told_by_their_headers_and_npy_is_in_c_order(client: TestClient) -> None:
+def test_raw_weights_match_their_headers_and_npy_is_c_ordered(client: TestClient) -> None:
     """The headers suffice to read them, and every format holds the same numbers."""
     forms = ("application/octet-stream", "application/x-npy", "application/json")
     raw, npy, told = (client.get("/v1/beams/weights", headers={"accept": form}) for form in forms)
@@ -255,14 +257,16 @@ def test_raw_weights_are_told_by_their_headers_and_npy_is_in_c_order(client: Tes
     assert np.isfinite(matrix).all()
 
 
-def test_numbers_that_are_none_are_null(make_node: Any) -> None:
+def test_non_finite_numbers_are_null(make_node: Any) -> None:
     node = make_node()
     node.rates = lambda: {"frames_hz": float("nan"), "updates_hz": float("inf")}
     with TestClient(create_app(node)) as client:
         assert client.get("/v1/status").json()["rates"] == {"frames_hz": None, "updates_hz": None}
 
 
-def test_the_design_is_that_of_the_observer_in_use(client: TestClient, shared_node: Any) -> None:
+def test_design_response_describes_the_active_observer(
+    client: TestClient, shared_node: Any
+) -> None:
     """L by its definition, A(T) M(T); the largest error within the guarantee, at each interval."""
     shown = client.get("/v1/design").json()
     pipeline, certificate = shared_node.pipeline, shown["certificate"]
@@ -284,7 +288,7 @@ def test_the_design_is_that_of_the_observer_in_use(client: TestClient, shared_no
         assert after @ p @ after < start @ p @ start
 
 
-def test_the_position_model_shows_what_companion_design_prints(make_node: Any) -> None:
+def test_position_model_design_equals_companion_design_output(make_node: Any) -> None:
     node = make_node(observer={"model": "position", "alpha": 0.5})
     with TestClient(create_app(node)) as client:
         shown = client.get("/v1/design").json()
@@ -303,7 +307,7 @@ def test_the_position_model_shows_what_companion_design_prints(make_node: Any) -
         assert row == {"uav": row["uav"], **json.loads(json.dumps(expected))}
 
 
-def test_a_beam_costs_what_nulls_take_and_what_its_turn_does(make_node: Any) -> None:
+def test_beam_cost_is_null_loss_plus_time_slot_share(make_node: Any) -> None:
     """At so low a limit every UAV has its own time slot: no null loss, but a quarter of the
     time.
     """
@@ -317,7 +321,7 @@ def test_a_beam_costs_what_nulls_take_and_what_its_turn_does(make_node: Any) -> 
         assert beam["cost_db"] == pytest.approx(beam["loss_db"] + 10 * np.log10(4))
 
 
-def test_a_bearing_is_from_true_north_however_the_carrier_is_turned(
+def test_bearing_is_from_true_north_at_any_carrier_heading(
     client: TestClient, shared_node: Any
 ) -> None:
     """From the positions of track and carrier; angles in the array rotate with it."""
@@ -335,7 +339,7 @@ def test_a_bearing_is_from_true_north_however_the_carrier_is_turned(
     assert abs(shown["array"]["boresight_bearing_deg"]) > 5  # the carrier is rotated
 
 
-def test_how_far_the_machine_is_behind(make_node: Any) -> None:
+def test_arrival_lag_is_reported(make_node: Any) -> None:
     node = make_node()
     began_ns = node.now_ns()
     with TestClient(create_app(node)) as client:
@@ -356,7 +360,7 @@ def test_how_far_the_machine_is_behind(make_node: Any) -> None:
     assert '\ncompanion_link_misstamped_total{link="udpin:127.0.0.1:14550"} 0.0' in metrics
 
 
-def test_a_carrier_that_is_lost_is_shown_where_it_was(make_node: Any) -> None:
+def test_lost_carrier_is_shown_at_its_last_known_position(make_node: Any) -> None:
     node = make_node()
     with TestClient(create_app(node)) as client:
         before = client.get("/v1/status").json()
@@ -373,7 +377,7 @@ def test_a_carrier_that_is_lost_is_shown_where_it_was(make_node: Any) -> None:
     assert beams["left_out"] and {out["reason"] for out in beams["left_out"]} == {center["unfit"]}
 
 
-def test_what_the_charts_show_was_kept(make_node: Any) -> None:
+def test_history_holds_the_charted_values(make_node: Any) -> None:
     node = make_node()
     for _ in range(10):
         node.tick()
@@ -394,7 +398,7 @@ def test_what_the_charts_show_was_kept(make_node: Any) -> None:
             assert columns["pointing_bound_deg"][-1] > 0
 
 
-def test_verdicts_are_in_the_answers_and_in_the_metrics(make_node: Any) -> None:
+def test_verdicts_are_in_responses_and_metrics(make_node: Any) -> None:
     node = make_node(link={"needed_db": 60.0})
     for _ in range(20):
         node.tick()
@@ -421,9 +425,7 @@ def test_verdicts_are_in_the_answers_and_in_the_metrics(make_node: Any) -> None:
         assert f'\ncompanion_verdict{{uav="{uav}",verdict="good"}} 0.0' in metrics
 
 
-def test_a_reported_fix_is_near_the_estimate_and_labels_say_what_is_what(
-    client: TestClient,
-) -> None:
+def test_reported_fix_is_near_the_estimate_and_labels_are_complete(client: TestClient) -> None:
     for uav in client.get("/v1/uavs").json()["uavs"]:
         for name, near in (("lat_deg", 0.5), ("lon_deg", 0.5), ("alt_m", 200.0)):
             assert uav["fix"][name] == pytest.approx(uav[name], abs=near)

@@ -18,7 +18,7 @@ def area(tmp_path: Path) -> Path:
     return path
 
 
-def test_ranges_of_the_file_are_served(shared_node: Any, area: Path) -> None:
+def test_map_file_is_served_by_ranges(shared_node: Any, area: Path) -> None:
     whole = area.read_bytes()
     with TestClient(create_app(shared_node, area=area_map.find(str(area)))) as client:
         assert client.get("/v1/map").json() == {"name": "area.pmtiles"}
@@ -29,20 +29,20 @@ def test_ranges_of_the_file_are_served(shared_node: Any, area: Path) -> None:
         assert beyond.status_code == 416
 
 
-def test_without_a_map_there_is_none(shared_node: Any) -> None:
+def test_no_map_is_served_when_none_is_configured(shared_node: Any) -> None:
     with TestClient(create_app(shared_node)) as client:
         assert client.get("/v1/map").json() == {"name": None}
         assert client.get("/v1/map/tiles").status_code == 404
 
 
-def test_a_map_asks_for_the_token(shared_node: Any, area: Path) -> None:
+def test_map_requires_the_token(shared_node: Any, area: Path) -> None:
     client = TestClient(create_app(shared_node, "s3cret", area))
     assert client.get("/v1/map/tiles").status_code == 401
     allowed = {"authorization": "Bearer s3cret"}
     assert client.get("/v1/map/tiles", headers=allowed).status_code == 200
 
 
-def test_what_is_no_map_is_said_at_the_start(tmp_path: Path, area: Path) -> None:
+def test_invalid_map_file_is_rejected_at_start(tmp_path: Path, area: Path) -> None:
     assert area_map.find(None) is None
     assert area_map.find(str(area)) == area
     (tmp_path / "old.pmtiles").write_bytes(b"PMTiles\x02" + bytes(200))

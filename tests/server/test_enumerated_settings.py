@@ -100,7 +100,7 @@ def check_every_answer(client: TestClient) -> int:
 
 
 @pytest.mark.parametrize(("section", "key", "value"), enumerated())
-def test_every_answer_is_as_the_document_says(
+def test_every_response_matches_the_openapi_document(
     make_node: Any, tmp_path: Path, section: str, key: str, value: Any
 ) -> None:
     more = beside(section, key, value, folder=tmp_path)
@@ -111,7 +111,7 @@ def test_every_answer_is_as_the_document_says(
         assert check_every_answer(client) >= 18
 
 
-def test_an_answer_that_breaks_the_document_is_found(make_node: Any) -> None:
+def test_response_that_violates_the_document_is_detected(make_node: Any) -> None:
     """The document's methods were once copied by hand, and one was missing."""
     node = make_node(beams={"method": "mmse"})
     node.tick()
@@ -127,7 +127,7 @@ def test_an_answer_that_breaks_the_document_is_found(make_node: Any) -> None:
 
 
 @pytest.mark.parametrize("method", list(Method))
-def test_every_binary_form_is_what_its_headers_say(make_node: Any, method: Method) -> None:
+def test_every_binary_format_matches_its_headers(make_node: Any, method: Method) -> None:
     node = make_node(beams={"method": method.value})
     node.tick()
     with TestClient(create_app(node)) as client:

@@ -59,7 +59,7 @@ def uavs(node: StandIn) -> dict[str, Any]:
     return {uav.id: uav for uav in answer.uavs}
 
 
-def test_who_serves_a_uav_is_said_of_it(north: StandIn) -> None:
+def test_uav_lists_its_serving_node(north: StandIn) -> None:
     found = uavs(north)
     assert found["1:1"].served_by == ["north"]
     assert found["1:1"].verdict is not None
@@ -67,7 +67,7 @@ def test_who_serves_a_uav_is_said_of_it(north: StandIn) -> None:
     assert (found["2:1"].verdict, found["2:1"].health) == (None, None)
 
 
-def test_frames_of_a_node_and_those_that_are_used_are_counted_apart(north: StandIn) -> None:
+def test_received_and_used_frames_of_a_node_are_counted_separately(north: StandIn) -> None:
     assert north.fleet is not None
     known = north.fleet.member.neighbours["south"]
     known.frames, known.used = 7, 3
@@ -76,7 +76,7 @@ def test_frames_of_a_node_and_those_that_are_used_are_counted_apart(north: Stand
     assert (south["frames"], south["used"]) == (7, 3)
 
 
-def test_a_node_that_left_stays_in_the_list(north: StandIn) -> None:
+def test_departed_node_stays_in_the_list(north: StandIn) -> None:
     assert north.fleet is not None
     north.fleet.member.node_left(north.now_ns(), "south")
     answer = models.model(fleet_view.Fleet).model_validate(client(north).get("/v1/fleet").json())
@@ -92,7 +92,7 @@ def test_a_node_that_left_stays_in_the_list(north: StandIn) -> None:
     assert 'companion_fleet_nodes{state="gone"} 1' in client(north).get("/metrics").text
 
 
-def test_who_is_served_by_nobody_has_no_link_and_why(north: StandIn) -> None:
+def test_unserved_uav_has_no_link_and_a_reason(north: StandIn) -> None:
     assert north.fleet is not None
     alone = next(uav for uav, one in uavs(north).items() if one.served_by == [])
 
@@ -110,7 +110,7 @@ def test_who_is_served_by_nobody_has_no_link_and_why(north: StandIn) -> None:
     assert said() == ("unserved", "no node of the fleet serves it")
 
 
-def test_the_headline_counts_those_of_nobody_and_names_the_others(north: StandIn) -> None:
+def test_headline_counts_unserved_uavs_and_those_of_other_nodes(north: StandIn) -> None:
     found = uavs(north).values()
     alone = sum(one.served_by == [] for one in found)
     status = models.model(state_view.Status).model_validate(client(north).get("/v1/status").json())
@@ -120,7 +120,7 @@ def test_the_headline_counts_those_of_nobody_and_names_the_others(north: StandIn
     assert f"of {1 + alone} links" in status.health.headline
 
 
-def test_a_node_put_aside_serves_nobody(north: StandIn) -> None:
+def test_excluded_node_serves_no_uavs(north: StandIn) -> None:
     assert north.fleet is not None
     north.fleet.member.trust.excluded["south"] = "has an inconsistent clock"
     assert uavs(north)["2:1"].served_by == []
@@ -129,13 +129,13 @@ def test_a_node_put_aside_serves_nobody(north: StandIn) -> None:
     assert all("south" not in uav.served_by for uav in answer.uavs)
 
 
-def test_without_a_fleet_nobody_is_said_to_serve(shared_node: StandIn) -> None:
+def test_no_serving_node_is_shown_without_a_fleet(shared_node: StandIn) -> None:
     assert {one.served_by for one in uavs(shared_node).values()} == {None}
     assert client(shared_node).get("/v1/status").json()["node"] is None
     assert "companion_fleet" not in client(shared_node).get("/metrics").text
 
 
-def test_the_metrics_have_what_one_is_woken_for(north: StandIn) -> None:
+def test_metrics_include_fleet_alarm_values(north: StandIn) -> None:
     assert north.fleet is not None
     member = north.fleet.member
     for _ in range(100):

@@ -78,7 +78,7 @@ async def ends(client: Client) -> bool:
 # --- heads, bodies and timeouts -------------------------------------------------------------------
 
 
-def test_a_head_without_end_is_cut_off_before_anything_is_asked(make_node: Any) -> None:
+def test_endless_request_head_is_cut_off(make_node: Any) -> None:
     """A client without a token uses no more of the event loop than this."""
     floods = (
         b"GET /" + b"a" * (1 << 25),
@@ -106,7 +106,7 @@ def test_a_head_without_end_is_cut_off_before_anything_is_asked(make_node: Any) 
 @pytest.mark.parametrize(
     "half", [b"", b"G", b"GET / HTTP/1.1\r\nHost: ", REQUEST + b"GET /half"], ids=repr
 )
-def test_who_does_not_finish_a_head_is_let_go(
+def test_unfinished_request_head_times_out(
     make_node: Any, monkeypatch: pytest.MonkeyPatch, half: bytes
 ) -> None:
     """Slowly trickling bytes do not extend the timeout."""
@@ -125,7 +125,9 @@ def test_who_does_not_finish_a_head_is_let_go(
     run_async(half_sent())
 
 
-def test_idle_connections_shut_nobody_out(make_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_idle_connections_do_not_block_new_ones(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The longest idle connection is closed."""
     monkeypatch.setattr(connections, "most_connections", lambda: 20)
 
@@ -143,7 +145,7 @@ def test_idle_connections_shut_nobody_out(make_node: Any, monkeypatch: pytest.Mo
     run_async(crowded())
 
 
-def test_connections_leave_descriptors_for_all_else(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_connection_limit_leaves_spare_file_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
     for soft, most in ((1024, 512), (256, 160), (90, 8), (-1, 512)):
         monkeypatch.setattr(connections.resource, "getrlimit", lambda _, soft=soft: (soft, soft))
         assert connections.most_connections() == most
@@ -162,14 +164,14 @@ def test_connections_leave_descriptors_for_all_else(monkeypatch: pytest.MonkeyPa
         ("127.0.0.1@evil.example", 421),
     ],
 )  # fmt: skip
-def test_only_names_of_this_machine_are_answered(make_node: Any, host: str, status: int) -> None:
+def test_only_known_host_names_are_answered(make_node: Any, host: str, status: int) -> None:
     """A page whose name resolves to this machine (DNS rebinding) sends its own name in Host."""
     node = make_node(flown=False, server={"hosts": ["Mast.example"]})
     with TestClient(create_app(node)) as client:
         assert client.get("/v1/uavs", headers={"host": host}).status_code == status
 
 
-def test_a_stream_is_not_opened_under_another_name(make_node: Any) -> None:
+def test_stream_under_an_unknown_host_name_is_rejected(make_node: Any) -> None:
     async def streamed() -> None:
         async with served(make_node()) as port:
             address = f"ws://127.0.0.1:{port}/v1/stream"
@@ -186,7 +188,7 @@ def test_a_stream_is_not_opened_under_another_name(make_node: Any) -> None:
     run_async(streamed())
 
 
-def test_streams_leave_connections_for_questions(
+def test_stream_limit_leaves_connections_for_requests(
     make_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("companion.server.stream.CLIENTS_MAX", 1)
@@ -205,7 +207,7 @@ def test_streams_leave_connections_for_questions(
 
 
 @pytest.mark.parametrize("scheme", ["Bearer", "bearer", "BEARER"])
-def test_the_scheme_of_a_token_has_no_case(make_node: Any, scheme: str) -> None:
+def test_bearer_scheme_is_case_insensitive(make_node: Any, scheme: str) -> None:
     client = TestClient(create_app(make_node(flown=False), "S3cret"), "http://localhost")
     good = client.get("/v1/uavs", headers={"authorization": f"{scheme} S3cret"})
     wrong = client.get("/v1/uavs", headers={"authorization": f"{scheme} s3CRET"})
@@ -213,14 +215,14 @@ def test_the_scheme_of_a_token_has_no_case(make_node: Any, scheme: str) -> None:
     assert [good.status_code, wrong.status_code, other.status_code] == [200, 401, 401]
 
 
-def test_a_name_is_asked_for_before_a_token(make_node: Any) -> None:
+def test_host_name_is_checked_before_the_token(make_node: Any) -> None:
     assert isinstance(create_app(make_node(flown=False), "secret"), KnownHosts)
 
 
 # --- requests -------------------------------------------------------------------------------------
 
 
-def test_work_is_done_in_turns_and_the_rest_is_told_to_come_again(make_node: Any) -> None:
+def test_excess_work_is_rejected_with_503(make_node: Any) -> None:
     async def crowd() -> list[str]:
         work_slots, begun, free = WorkSlots(at_once=2, waiting=3), [], asyncio.Event()
         loop = asyncio.get_running_loop()
@@ -252,7 +254,7 @@ async def _first(tasks: list["asyncio.Task[str]"], many: int) -> AsyncIterator["
             yield task
 
 
-def test_a_pattern_of_everything_is_not_drawn(
+def test_oversized_pattern_request_is_rejected(
     make_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     node = make_node()
@@ -268,7 +270,7 @@ def test_a_pattern_of_everything_is_not_drawn(
         assert client.get("/v1/pattern?points=3601&uav=1:1").status_code == 200
 
 
-def test_a_codebook_is_asked_no_more_than_can_be_answered(
+def test_codebook_work_is_bounded(
     make_node: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """For any number of elements and stored beams; counted in products, not in seconds."""
@@ -306,7 +308,7 @@ def _codebook_answers(node: Any) -> list[dict[str, Any]]:
     return [beam["codebook"] for beam in shown["beams"]]
 
 
-def test_a_codebook_that_fills_the_memory_is_refused() -> None:
+def test_oversized_codebook_is_rejected() -> None:
     def array(side: int) -> Array:
         return assembly.array(
             Settings().override(array={"kind": "ura", "rows": side, "columns": side})
@@ -317,7 +319,7 @@ def test_a_codebook_that_fills_the_memory_is_refused() -> None:
     assert codebooks.dft(array(32), 2).size == 4096
 
 
-def test_the_history_is_five_minutes_and_no_more(make_node: Any) -> None:
+def test_history_is_limited_to_five_minutes(make_node: Any) -> None:
     node = make_node()
     kept = Series()
     for _ in range(SAMPLES + 50):
@@ -338,7 +340,7 @@ def test_the_history_is_five_minutes_and_no_more(make_node: Any) -> None:
     assert np.isfinite([value for column in columns for value in column if value is not None]).all()
 
 
-def test_the_history_is_made_beside_the_loop(
+def test_history_is_built_off_the_event_loop(
     make_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     import threading

@@ -34,7 +34,7 @@ def moments(shared_node: Any, monkeypatch: pytest.MonkeyPatch) -> Moments:
     return Moments(shared_node, WorkSlots())
 
 
-async def test_many_who_ask_at_once_share_one_answer(moments: Moments, shared_node: Any) -> None:
+async def test_concurrent_requests_share_one_response(moments: Moments, shared_node: Any) -> None:
     made: list[int] = []
 
     def make(update: Update) -> int:
@@ -52,7 +52,7 @@ async def test_many_who_ask_at_once_share_one_answer(moments: Moments, shared_no
     assert (len(made), len(shared_node.looks)) == (3, 2)
 
 
-async def test_the_next_moment_is_made_anew(
+async def test_next_period_is_computed_again(
     moments: Moments, shared_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = await moments.made(0.0, "beams", lambda update: update)
@@ -63,14 +63,14 @@ async def test_the_next_moment_is_made_anew(
     assert second.beams.valid_at_ns - first.beams.valid_at_ns == EVERY_NS
 
 
-async def test_beams_are_made_off_the_event_loop(moments: Moments, shared_node: Any) -> None:
+async def test_beams_are_computed_off_the_event_loop(moments: Moments, shared_node: Any) -> None:
     """For any number of leads: the computations are queued."""
     await asyncio.gather(*(moments.made(lead, "npy", lambda update: update) for lead in range(20)))
     assert len(shared_node.looks) == 20
     assert threading.current_thread() not in shared_node.looks
 
 
-async def test_who_finds_no_room_costs_no_prediction(
+async def test_rejected_request_costs_no_prediction(
     shared_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(shared_node.pipeline, "prepare_update", lambda *_: pytest.fail("predicted"))
@@ -79,7 +79,7 @@ async def test_who_finds_no_room_costs_no_prediction(
     assert refused.value.status_code == 503
 
 
-async def test_one_who_leaves_does_not_take_the_answer_from_the_others(moments: Moments) -> None:
+async def test_cancelled_request_does_not_cancel_shared_work(moments: Moments) -> None:
     begun, go_on = asyncio.Event(), threading.Event()
     loop = asyncio.get_running_loop()
 
@@ -98,7 +98,7 @@ async def test_one_who_leaves_does_not_take_the_answer_from_the_others(moments: 
     assert leaves.cancelled() or leaves.cancelling()
 
 
-async def test_an_error_is_everybody_s(moments: Moments) -> None:
+async def test_error_reaches_every_waiting_request(moments: Moments) -> None:
     def make(_update: Update) -> None:
         raise ValueError("not so")
 

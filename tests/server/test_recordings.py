@@ -42,7 +42,7 @@ def client(make_node: Any, folder: Path) -> Iterator[TestClient]:
         yield client
 
 
-def test_recordings_are_listed_and_nothing_else(client: TestClient) -> None:
+def test_only_recordings_are_listed(client: TestClient) -> None:
     shown = client.get("/v1/recordings").json()["recordings"]
     assert shown == [
         {
@@ -61,7 +61,7 @@ def test_recordings_are_listed_and_nothing_else(client: TestClient) -> None:
     ]
 
 
-def test_a_recording_comes_whole(client: TestClient) -> None:
+def test_recording_is_downloaded_completely(client: TestClient) -> None:
     answer = client.get(f"/v1/recordings/{FINISHED}")
     assert answer.content == BYTES
     assert answer.headers["content-length"] == str(len(BYTES))
@@ -69,7 +69,7 @@ def test_a_recording_comes_whole(client: TestClient) -> None:
     assert answer.headers["content-type"] == "application/x-mcap"
 
 
-def test_the_one_being_written_comes_as_far_as_it_is_flushed(client: TestClient) -> None:
+def test_active_recording_is_served_up_to_its_flushed_end(client: TestClient) -> None:
     assert client.get(f"/v1/recordings/{CURRENT}").content == BYTES[:4096]
     rest = client.get(f"/v1/recordings/{CURRENT}", headers={"range": "bytes=4000-"})
     assert rest.status_code == 206
@@ -80,7 +80,7 @@ def test_the_one_being_written_comes_as_far_as_it_is_flushed(client: TestClient)
     ("asked", "start", "stop"),
     [("0-0", 0, 1), ("100-199", 100, 200), ("1023990-", 1023990, 1024000), ("-7", -7, None)],
 )
-def test_a_range_comes_in_part(client: TestClient, asked: str, start: int, stop: int) -> None:
+def test_byte_range_is_served(client: TestClient, asked: str, start: int, stop: int) -> None:
     answer = client.get(f"/v1/recordings/{FINISHED}", headers={"range": f"bytes={asked}"})
     assert answer.status_code == 206
     assert answer.content == BYTES[start:stop]
@@ -89,7 +89,7 @@ def test_a_range_comes_in_part(client: TestClient, asked: str, start: int, stop:
     assert answer.headers["content-range"] == f"bytes {first}-{last}/{len(BYTES)}"
 
 
-def test_a_range_beyond_the_end_is_refused(client: TestClient) -> None:
+def test_byte_range_beyond_the_end_is_rejected(client: TestClient) -> None:
     answer = client.get(f"/v1/recordings/{FINISHED}", headers={"range": "bytes=1024000-"})
     assert answer.status_code == 416
     assert answer.headers["content-range"] == "bytes */1024000"
@@ -97,11 +97,11 @@ def test_a_range_beyond_the_end_is_refused(client: TestClient) -> None:
 
 
 @pytest.mark.parametrize("header", [None, "", "bytes=", "bytes=-", "bytes=5-2", "bytes=0-1,4-5"])
-def test_a_range_that_says_nothing_is_ignored(header: str | None) -> None:
+def test_invalid_byte_range_is_ignored(header: str | None) -> None:
     assert span(header, 10) is None
 
 
-def test_of_an_empty_file_there_is_no_range() -> None:
+def test_byte_range_of_an_empty_file_is_rejected() -> None:
     with pytest.raises(UnsatisfiableRangeError):
         span("bytes=0-", 0)
     with pytest.raises(UnsatisfiableRangeError):
@@ -128,20 +128,20 @@ def test_of_an_empty_file_there_is_no_range() -> None:
         "none.mcap",
     ],
 )
-def test_nothing_else_is_given(client: TestClient, name: str) -> None:
+def test_files_other_than_recordings_are_not_served(client: TestClient, name: str) -> None:
     answer = client.get(f"/v1/recordings/{name}")
     assert answer.status_code == 404
     assert b"secret" not in answer.content
 
 
-def test_without_a_folder_there_is_nothing(make_node: Any, tmp_path: Path) -> None:
+def test_no_recordings_are_listed_without_a_folder(make_node: Any, tmp_path: Path) -> None:
     for where in ({}, {"recording": {"directory": str(tmp_path / "missing")}}):
         with TestClient(create_app(make_node(flown=False, **where))) as client:
             assert client.get("/v1/recordings").json() == {"recordings": []}
             assert client.get(f"/v1/recordings/{FINISHED}").status_code == 404
 
 
-def test_where_one_file_is_named_only_that_is_shown(make_node: Any, folder: Path) -> None:
+def test_only_the_named_recording_file_is_listed(make_node: Any, folder: Path) -> None:
     node = make_node(flown=False, recording={"directory": str(folder / FINISHED)})
     with TestClient(create_app(node)) as client:
         (only,) = client.get("/v1/recordings").json()["recordings"]

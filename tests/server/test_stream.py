@@ -40,7 +40,7 @@ async def closed(address: str, **options: Any) -> tuple[int, str]:
 
 
 @pytest.mark.parametrize("loop", LOOPS, ids=["asyncio", "uvloop"])
-def test_the_state_comes_at_once_and_with_every_update(
+def test_stream_sends_state_at_once_and_at_every_update(
     make_node: Any, serving: Any, loop: Any
 ) -> None:
     async def check() -> None:
@@ -61,7 +61,7 @@ def test_the_state_comes_at_once_and_with_every_update(
     run_async(check(), loop)
 
 
-def test_records_are_binary_and_those_of_each_update(make_node: Any, serving: Any) -> None:
+def test_stream_sends_binary_records_of_each_update(make_node: Any, serving: Any) -> None:
     async def check() -> None:
         node = make_node(records={"guaranteed": True})
         node.tick()
@@ -94,7 +94,7 @@ def test_records_are_binary_and_those_of_each_update(make_node: Any, serving: An
     run_async(check())
 
 
-def test_only_those_uavs_and_topics_that_are_asked_for(make_node: Any, serving: Any) -> None:
+def test_stream_sends_only_requested_uavs_and_topics(make_node: Any, serving: Any) -> None:
     async def check() -> None:
         node = make_node()
         node.tick()
@@ -115,7 +115,7 @@ def test_only_those_uavs_and_topics_that_are_asked_for(make_node: Any, serving: 
     run_async(check())
 
 
-def test_events_come_when_there_is_a_new_one(make_node: Any, serving: Any) -> None:
+def test_events_are_sent_when_new(make_node: Any, serving: Any) -> None:
     async def check() -> None:
         node = make_node()
         query = "topic=events&topic=status&rate_hz=100"
@@ -133,7 +133,7 @@ def test_events_come_when_there_is_a_new_one(make_node: Any, serving: Any) -> No
     run_async(check())
 
 
-def test_no_more_messages_than_asked_for(make_node: Any, serving: Any) -> None:
+def test_stream_respects_the_requested_rate(make_node: Any, serving: Any) -> None:
     async def check() -> None:
         node = make_node()
         query = "topic=uavs&rate_hz=5"
@@ -151,7 +151,7 @@ def test_no_more_messages_than_asked_for(make_node: Any, serving: Any) -> None:
     run_async(check())
 
 
-def test_a_message_is_made_once_for_all_who_ask_for_the_same(make_node: Any, serving: Any) -> None:
+def test_identical_subscriptions_share_one_message(make_node: Any, serving: Any) -> None:
     """All receive the same bytes, although the clock has advanced."""
 
     async def check() -> None:
@@ -190,7 +190,9 @@ def test_a_message_is_made_once_for_all_who_ask_for_the_same(make_node: Any, ser
         ("uav=" + "%F0%9F%9A%81" * 90, "uav"),
     ],
 )
-def test_bad_arguments_close_it(shared_node: Any, serving: Any, query: str, said_of: str) -> None:
+def test_invalid_arguments_close_the_stream(
+    shared_node: Any, serving: Any, query: str, said_of: str
+) -> None:
     async def check() -> None:
         async with serving(shared_node) as at:
             code, reason = await closed(f"ws://{at}/v1/stream?{query}")
@@ -200,13 +202,13 @@ def test_bad_arguments_close_it(shared_node: Any, serving: Any, query: str, said
     run_async(check())
 
 
-def test_arguments_are_read() -> None:
+def test_stream_arguments_are_parsed() -> None:
     assert wanted(QueryParams("")) == Wanted((Topic.UAVS, Topic.BEAMS), frozenset(), 10.0)
     asked = wanted(QueryParams("uav=1:1&uav=icao:4CA7B3&topic=beams&topic=beams&rate_hz=0.5"))
     assert asked == Wanted((Topic.BEAMS,), frozenset({"1:1", "icao:4CA7B3"}), 0.5)
 
 
-def test_who_sends_something_is_told_that_it_takes_nothing(shared_node: Any, serving: Any) -> None:
+def test_client_message_closes_the_stream(shared_node: Any, serving: Any) -> None:
     async def check() -> None:
         async with serving(shared_node) as at, connect(f"ws://{at}/v1/stream") as websocket:
             await websocket.send("subscribe")
@@ -218,7 +220,7 @@ def test_who_sends_something_is_told_that_it_takes_nothing(shared_node: Any, ser
     run_async(check())
 
 
-def test_a_page_from_elsewhere_may_not_ask(shared_node: Any, serving: Any) -> None:
+def test_foreign_origin_is_rejected(shared_node: Any, serving: Any) -> None:
     async def check() -> None:
         async with serving(shared_node) as at:
             address = f"ws://{at}/v1/stream"
@@ -234,7 +236,7 @@ TOKEN = "s3cret/ü"
 AS_SUBPROTOCOL = "bearer." + base64.urlsafe_b64encode(TOKEN.encode()).decode().rstrip("=")
 
 
-def test_a_token_is_asked_for(shared_node: Any, serving: Any) -> None:
+def test_token_is_required(shared_node: Any, serving: Any) -> None:
     async def check() -> None:
         async with serving(shared_node, TOKEN) as at:
             address = f"ws://{at}/v1/stream"
@@ -258,7 +260,7 @@ def test_a_token_is_asked_for(shared_node: Any, serving: Any) -> None:
     run_async(check())
 
 
-def test_a_token_in_the_header_opens_it_too(shared_node: Any, serving: Any) -> None:
+def test_token_in_the_header_is_accepted(shared_node: Any, serving: Any) -> None:
     async def check() -> None:
         async with serving(shared_node, "s3cret") as at:
             headers = {"authorization": "Bearer s3cret"}
@@ -268,7 +270,7 @@ def test_a_token_in_the_header_opens_it_too(shared_node: Any, serving: Any) -> N
     run_async(check())
 
 
-def test_who_goes_leaves_nothing_behind(make_node: Any, serving: Any) -> None:
+def test_closed_stream_leaves_no_state(make_node: Any, serving: Any) -> None:
     async def check() -> None:
         node = make_node()
         async with serving(node) as at:
@@ -293,9 +295,7 @@ def test_who_goes_leaves_nothing_behind(make_node: Any, serving: Any) -> None:
     run_async(check())
 
 
-def test_a_client_that_does_not_read_misses_messages_and_holds_nobody_up(
-    make_node: Any, serving: Any
-) -> None:
+def test_slow_client_skips_messages_without_delaying_others(make_node: Any, serving: Any) -> None:
     """The reader receives every update; the other one receives messages in transit and then the
     newest."""
 

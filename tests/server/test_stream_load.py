@@ -112,7 +112,7 @@ def measure(
     ("readers", "deaf", "seconds"),
     [(18, 2, 3.0), pytest.param(180, 20, 10.0, marks=pytest.mark.benchmark)],
 )
-def test_a_crowd_holds_nobody_up(
+def test_many_stream_clients_do_not_delay_the_service(
     start_node: Any, tmp_path: Path, readers: int, deaf: int, seconds: float
 ) -> None:
     settings = tmp_path / "settings.toml"

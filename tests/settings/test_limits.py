@@ -106,7 +106,7 @@ def keys() -> dict[str, dict[str, Any]]:
 
 
 @pytest.mark.parametrize("key", keys())
-def test_every_number_has_a_least_and_a_greatest(key: str) -> None:
+def test_every_numeric_setting_has_limits(key: str) -> None:
     for schema in numbers(keys()[key]):
         assert schema.keys() & {"minimum", "exclusiveMinimum"}
         assert schema.keys() & {"maximum", "exclusiveMaximum"}
@@ -138,13 +138,13 @@ def flown(settings: Settings, flight: list[Event], path: Path) -> int:
     return beams
 
 
-def test_the_flight_has_beams(flight: list[Event], tmp_path: Path) -> None:
+def test_limit_flight_produces_beams(flight: list[Event], tmp_path: Path) -> None:
     settings = Settings().override(center={"source": CENTER})
     assert flown(settings, flight, tmp_path / "x.mcap") > 0
 
 
 @pytest.mark.parametrize("key", [key for key in keys() if key.split(".")[0] in REPLAYED_SECTIONS])
-def test_at_its_limits_a_number_flies_or_is_a_line(
+def test_setting_at_its_limit_runs_or_fails_in_one_line(
     flight: list[Event], tmp_path: Path, key: str
 ) -> None:
     section, name = key.split(".")
@@ -159,7 +159,7 @@ def test_at_its_limits_a_number_flies_or_is_a_line(
 
 @pytest.mark.parametrize("section", ["observer", "tracks", "clocks", "radio", "hardware"])
 @pytest.mark.parametrize("end", [0, 1])
-def test_all_numbers_of_a_section_fly_at_their_limits_together(
+def test_all_limits_of_a_section_run_together(
     flight: list[Event], tmp_path: Path, section: str, end: int
 ) -> None:
     given = {"window_s": 60.0} if section == "tracks" else {}  # a log holds no more anyway
@@ -172,7 +172,7 @@ def test_all_numbers_of_a_section_fly_at_their_limits_together(
 
 
 @pytest.mark.parametrize("source", ["90,180,100000,360", "-90,-180,-100000,-360", "0,0,0"])
-def test_at_the_ends_of_the_earth_a_station_flies(
+def test_station_at_extreme_positions_runs(
     flight: list[Event], tmp_path: Path, source: str
 ) -> None:
     flown(Settings().override(center={"source": source}), flight, tmp_path / "x.mcap")

@@ -123,7 +123,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("section", "key", "value", "said", "allowed"), WRONG)
-def test_an_error_names_key_value_and_what_is_allowed(
+def test_settings_error_names_key_value_and_allowed_range(
     section: str, key: str, value: str, said: str, allowed: str
 ) -> None:
     message = refusal(f"[{section}]\n{key} = {value}\n")
@@ -132,7 +132,7 @@ def test_an_error_names_key_value_and_what_is_allowed(
 
 
 @pytest.mark.parametrize("value", ["2", "0", "1.0", '"fast"', "-0.5"])
-def test_alpha_is_auto_or_between_0_and_1(value: str) -> None:
+def test_alpha_accepts_auto_or_0_to_1(value: str) -> None:
     """A key with two kinds of value is named as written, and both kinds are listed."""
     message = refusal(f"[observer]\nalpha = {value}\n")
     assert message.startswith("observer.alpha = "), message
@@ -141,7 +141,7 @@ def test_alpha_is_auto_or_between_0_and_1(value: str) -> None:
 
 
 @pytest.mark.parametrize("value", ["0", "-1", '"some"'])
-def test_weights_hz_is_all_or_above_0(value: str) -> None:
+def test_weights_hz_accepts_all_or_positive(value: str) -> None:
     message = refusal(f"[recording]\nweights_hz = {value}\n")
     assert message.startswith("recording.weights_hz = "), message
     assert "all" in message
@@ -156,7 +156,7 @@ def test_weights_hz_is_all_or_above_0(value: str) -> None:
         ("source = '5:1'\n", "source is not a setting; did you mean center.source?"),
     ],
 )
-def test_a_key_that_is_no_setting_is_named(text: str, said: str) -> None:
+def test_unknown_key_is_named(text: str, said: str) -> None:
     assert refusal(text) == said
 
 
@@ -183,7 +183,7 @@ HEX = "0x" + "f" * 5000
     ],
     ids=range(13),
 )
-def test_text_that_costs_too_much_is_refused_in_a_line(text: str, said: str) -> None:
+def test_expensive_toml_is_rejected_in_one_line(text: str, said: str) -> None:
     began_s = time.process_time()
     assert said in refusal(text)
     assert time.process_time() - began_s < HANG_S  # quadratic time would take hours
@@ -191,7 +191,7 @@ def test_text_that_costs_too_much_is_refused_in_a_line(text: str, said: str) -> 
 
 @given(st.lists(st.sampled_from(['"', "'", "\\", "a", "#", "\n", "=", "."]), max_size=40))
 @example(['"', "a", '"', "#", "a"])
-def test_strings_of_toml_are_found_where_its_reader_finds_them(parts: list[str]) -> None:
+def test_toml_string_scanner_agrees_with_the_parser(parts: list[str]) -> None:
     """The text without its strings has the same keys and types for the parser."""
     text = "x = " + "".join(parts)
     try:
@@ -203,17 +203,17 @@ def test_strings_of_toml_are_found_where_its_reader_finds_them(parts: list[str])
     assert [type(value) for value in bare.values()] == [type(value) for value in read.values()]
 
 
-def test_a_section_is_a_table() -> None:
+def test_section_that_is_not_a_table_is_rejected() -> None:
     assert refusal("center = 3\n").startswith("center = 3: ")
 
 
 @pytest.mark.parametrize("text", ["[array", "array = ", "x = 1\nx = 2\n", "= 3", "a = 'é"])
-def test_what_is_not_toml_is_said_to_be_not_toml(text: str) -> None:
+def test_invalid_toml_is_reported(text: str) -> None:
     assert refusal(text).startswith("not TOML: ")
 
 
 @pytest.mark.parametrize("text", ["[tracks]\ncoasting_s = 100\n", "[tracks]\nlost_s = 10\n"])
-def test_a_track_passes_its_states_in_order(text: str) -> None:
+def test_track_timeouts_out_of_order_are_rejected(text: str) -> None:
     """coasting_s <= stale_s <= lost_s; otherwise a state would be unreachable."""
     assert "tracks" in refusal(text)
 
@@ -221,14 +221,14 @@ def test_a_track_passes_its_states_in_order(text: str) -> None:
 # --- files --------------------------------------------------------------------------------------
 
 
-def test_without_a_file_there_are_the_defaults() -> None:
+def test_defaults_apply_without_a_file() -> None:
     assert load(None) == Settings()
     observer = load(None).observer
     assert (observer.model, observer.acceleration_max_mps2) == ("kinematic", None)
     assert (observer.feed_forward, observer.follow_accuracy) == (True, True)
 
 
-def test_a_file_is_read(tmp_path: Path) -> None:
+def test_settings_file_is_loaded(tmp_path: Path) -> None:
     path = tmp_path / "settings.toml"
     path.write_text('[array]\nelements = 128\n[center]\nsource = "5:1"\n', encoding="utf-8")
     found = load(path)
@@ -236,7 +236,7 @@ def test_a_file_is_read(tmp_path: Path) -> None:
     assert found.beams == BeamSettings()
 
 
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path) -> None:
+def test_unreadable_settings_file_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"missing\.toml: No such file"):
         load(tmp_path / "missing.toml")
     with pytest.raises(ConfigError, match="Is a directory"):
@@ -270,7 +270,7 @@ SCALAR = st.characters(exclude_categories=["Cs"])
     follow=st.booleans(),
     attitude_bound_deg=st.floats(0, 180),
 )
-def test_settings_survive_being_written(
+def test_settings_round_trip_through_toml(
     *,
     directory: str | None,
     urls: list[str],
@@ -305,7 +305,7 @@ def test_settings_survive_being_written(
     assert Settings.from_toml(made.to_toml(), "written") == made
 
 
-def test_what_is_written_holds_every_default() -> None:
+def test_written_settings_include_every_default() -> None:
     text = Settings().to_toml()
     assert Settings.from_toml(text, "written") == Settings()
     written = tomllib.loads(text)
@@ -317,7 +317,7 @@ def test_what_is_written_holds_every_default() -> None:
 # --- options ------------------------------------------------------------------------------------
 
 
-def test_flags_override_and_none_leaves_a_key() -> None:
+def test_options_override_settings_and_none_keeps_them() -> None:
     before = Settings.from_toml('[center]\nsource = "5:1"\n[array]\nelements = 8\n', "x")
     after = before.override(
         center={"source": None}, array={"elements": 16, "kind": None}, links={"urls": ["tcp:a:1"]}
@@ -330,7 +330,7 @@ def test_flags_override_and_none_leaves_a_key() -> None:
     assert before.override() == before
 
 
-def test_a_bad_flag_is_an_error_of_settings() -> None:
+def test_invalid_option_is_a_settings_error() -> None:
     with pytest.raises(ConfigError, match=r"^array\.elements = 0: .*greater than or equal to 1"):
         Settings().override(array={"elements": 0})
     with pytest.raises(ConfigError, match=r"^array\.shape is not a setting"):
@@ -348,16 +348,16 @@ def test_a_bad_flag_is_an_error_of_settings() -> None:
         '[array]\nkind = "uca"\npositions = "there.csv"\n',
     ],
 )
-def test_a_list_of_elements_goes_with_its_kind(text: str) -> None:
+def test_list_array_requires_positions(text: str) -> None:
     assert "needs positions" in refusal(text)
 
 
-def test_a_codebook_file_goes_with_its_kind() -> None:
+def test_listed_codebook_requires_a_file() -> None:
     for text in ('kind = "file"', 'file = "beams.npy"', 'kind = "dft"\nfile = "beams.npy"'):
         assert "needs file" in refusal(f"[codebook]\n{text}\n")
 
 
-def test_a_rectangle_is_not_larger_than_a_line_may_be() -> None:
+def test_rectangle_is_limited_to_4096_elements() -> None:
     assert "at most 4096" in refusal('[array]\nkind = "ura"\nrows = 100\ncolumns = 100\n')
 
 
@@ -400,9 +400,7 @@ def test_element_positions_are_read_into_the_settings(
         ("", "must have 3 or more finite numbers"),
     ],
 )
-def test_a_file_of_positions_that_will_not_do_is_named(
-    tmp_path: Path, text: str | None, said: str
-) -> None:
+def test_invalid_positions_file_is_named(tmp_path: Path, text: str | None, said: str) -> None:
     file = tmp_path / "elements.csv"
     if text is not None:
         file.write_text(text, encoding="utf-8")
@@ -425,12 +423,12 @@ def test_a_file_of_positions_that_will_not_do_is_named(
         ({"kind": "list", "positions_m": [[0, 0, 0], [0, 0, 1, 1, 0, 0]]}, "rows of 3 numbers"),
     ],
 )
-def test_what_is_no_array_is_an_error_of_settings(array: dict[str, object], said: str) -> None:
+def test_invalid_array_is_a_settings_error(array: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=f"^array: .*{said}"):
         assembly.array(Settings().override(array=array))
 
 
-def test_the_coverage_is_the_one_that_is_described() -> None:
+def test_coverage_is_built_from_settings() -> None:
     given = {
         "field_of_view_deg": 120.0,
         "azimuth_limits_deg": [-50.0, 40.0],
@@ -449,7 +447,7 @@ def test_the_coverage_is_the_one_that_is_described() -> None:
         assembly.coverage(wrong)
 
 
-def test_the_equipment_is_the_one_that_is_described(tmp_path: Path) -> None:
+def test_equipment_is_built_from_settings(tmp_path: Path) -> None:
     def made(**sections: dict[str, object]) -> assembly.Equipment:
         found = Settings().override(array={"elements": 4}, **sections)
         return assembly.equipment(found, assembly.array(found))
@@ -485,7 +483,7 @@ def test_the_equipment_is_the_one_that_is_described(tmp_path: Path) -> None:
         assembly.equipment(settings, assembly.array(settings))
 
 
-def test_the_precoder_is_the_one_that_is_described() -> None:
+def test_precoder_is_built_from_settings() -> None:
     given = {
         "method": "rzf", "policy": "drop", "loss_limit_db": 5.0, "condition_limit": 50.0,
         "regularisation": 0.5, "normalisation": "antenna", "priority": ["2:1"], "widen": "no",
@@ -507,11 +505,11 @@ def test_the_precoder_is_the_one_that_is_described() -> None:
     ("given", "means"),
     [(True, Widen.GUARANTEE), (False, Widen.NO), ("likely", Widen.LIKELY), ("no", Widen.NO)],
 )
-def test_widths_of_earlier_settings_mean_what_they_meant(given: object, means: Widen) -> None:
+def test_older_widen_values_keep_their_meaning(given: object, means: Widen) -> None:
     assert BeamSettings.model_validate({"widen": given}).widen is means
 
 
-def test_shares_of_power_need_columns_that_are_scaled_together() -> None:
+def test_power_allocation_requires_a_joint_normalisation() -> None:
     assert BeamSettings(power=Power.MAX_MIN).normalisation is Normalisation.TOTAL
     both = BeamSettings(power=Power.EQUAL, normalisation=Normalisation.ANTENNA)
     assert both.normalisation is Normalisation.ANTENNA
@@ -519,7 +517,7 @@ def test_shares_of_power_need_columns_that_are_scaled_together() -> None:
         BeamSettings(power=Power.EQUAL, normalisation=Normalisation.STREAM)
 
 
-def test_the_array_is_the_one_that_is_described() -> None:
+def test_array_is_built_from_settings() -> None:
     ura = assembly.array(Settings().override(array={"kind": "ura", "rows": 2, "columns": 3}))
     assert (ura.kind, ura.size, ura.grid) == ("ura", 6, (2, 3))
     uca = assembly.array(Settings().override(array={"kind": "uca", "elements": 5}))
@@ -556,7 +554,7 @@ def test_the_array_is_the_one_that_is_described() -> None:
         ),
     ],
 )
-def test_centers(text: str, center: object) -> None:
+def test_center_text_round_trips(text: str, center: object) -> None:
     assert parse_center(text) == center
     assert parse_center(str(center)) == center
 
@@ -583,19 +581,19 @@ def test_centers(text: str, center: object) -> None:
         ("47,inf,500", "longitude"),
     ],
 )
-def test_what_is_no_center_is_refused(text: str, said: str) -> None:
+def test_invalid_center_is_rejected(text: str, said: str) -> None:
     with pytest.raises(ValueError, match=said) as caught:
         parse_center(text)
     assert repr(text) in str(caught.value)
 
 
 @pytest.mark.parametrize("text", ["47,8,nan", "47,8,inf", "47,8,500,nan", "47,8,500,-inf"])
-def test_height_and_heading_of_a_center_are_numbers(text: str) -> None:
+def test_center_height_and_heading_must_be_numbers(text: str) -> None:
     with pytest.raises(ValueError, match=re.escape(repr(text))):
         parse_center(text)
 
 
 @pytest.mark.parametrize("text", ["", "there"])
-def test_whoever_names_no_center_is_told_all_three_kinds(text: str) -> None:
+def test_missing_center_error_lists_all_three_kinds(text: str) -> None:
     with pytest.raises(ValueError, match=r"SYSID:COMPID.*LAT,LON,ALT.*home"):
         parse_center(text)

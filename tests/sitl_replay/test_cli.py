@@ -89,7 +89,7 @@ def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
         (["land"], "No such command 'land'"),
     ],
 )
-def test_a_mistake_is_one_line(
+def test_command_error_is_one_line(
     arguments: list[str], complaint: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)

@@ -33,7 +33,9 @@ def proper(matrix: FloatArray) -> None:
 
 
 @given(ANGLES, ANGLES, ANGLES)
-def test_attitudes_are_mavlink_s(roll: float, pitch: float, yaw: float) -> None:
+def test_attitude_matrix_follows_the_mavlink_convention(
+    roll: float, pitch: float, yaw: float
+) -> None:
     turned = carrier.body_from_ned(roll, pitch, yaw)
     proper(turned)
     assert turned == pytest.approx(oracle(roll, pitch, yaw), abs=1e-12)
@@ -47,7 +49,7 @@ def test_attitudes_are_mavlink_s(roll: float, pitch: float, yaw: float) -> None:
         ((math.pi / 6, 0, 0), (0, 0, 1), (0, 0.5, math.sqrt(0.75))),  # right wing low
     ],
 )
-def test_signs(
+def test_attitude_signs(
     angles_rad: tuple[float, float, float], ned: tuple[int, int, int], body: tuple[float, ...]
 ) -> None:
     assert carrier.body_from_ned(*angles_rad) @ ned == pytest.approx(body, abs=1e-12)
@@ -68,7 +70,7 @@ def integrated(rates: FloatArray, interval_s: float) -> FloatArray:
 
 
 @given(RATES, st.floats(-2.0, 2.0))
-def test_constant_rates_turn_as_the_kinematics_say(
+def test_constant_rates_match_integrated_kinematics(
     rates: tuple[float, float, float], interval_s: float
 ) -> None:
     later = carrier.later_body_from_body(np.array(rates), interval_s)
@@ -76,14 +78,14 @@ def test_constant_rates_turn_as_the_kinematics_say(
     assert later == pytest.approx(integrated(np.array(rates), interval_s), abs=1e-7)
 
 
-def test_turning_right_is_turning_right() -> None:
+def test_positive_yaw_rate_turns_right() -> None:
     """Positive yaw rate is to the right: heading 0 becomes heading 0.3 rad."""
     later = carrier.later_body_from_body(np.array([0, 0, 0.6]), 0.5)
     assert later @ oracle(0, 0, 0) == pytest.approx(oracle(0, 0, 0.3), abs=1e-12)
     assert carrier.later_body_from_body(np.zeros(3), 5.0).tolist() == np.eye(3).tolist()
 
 
-def test_a_fixed_station_is_level_and_faces_its_heading() -> None:
+def test_fixed_station_is_level_and_faces_its_heading() -> None:
     local = LocalFrame(47.4, 8.5, 500.0)
     station = carrier.fixed(7, local, (48.0, 9.5, 100.0), math.radians(90.0))
     assert station.valid_at_ns == 7
@@ -103,7 +105,7 @@ def test_a_fixed_station_is_level_and_faces_its_heading() -> None:
     proper(station.body_from_local)
 
 
-def test_a_vehicle_s_attitude_is_carried_on_to_the_time_of_use(fix: Callable[..., Fix]) -> None:
+def test_carrier_attitude_is_predicted_to_the_time_of_use(fix: Callable[..., Fix]) -> None:
     """Its rates act for as long as its attitude is older than the track's time."""
     local = LocalFrame(47.4, 8.5, 500.0)
     far = (49.0, 12.0)
@@ -177,7 +179,7 @@ def _at(make: Callable[..., Fix], lat_deg: float, lon_deg: float) -> Fix:
     late=st.floats(-1.0, 1.0),
     off_rad=st.floats(0.0, 0.1),
 )
-def test_no_turn_leaves_the_bound_of_the_attitude(
+def test_attitude_bound_covers_every_rotation(
     *,
     rates: tuple[float, float, float],
     way: tuple[float, float, float],
@@ -202,7 +204,7 @@ def test_no_turn_leaves_the_bound_of_the_attitude(
     assert off <= bounds.at(float(np.linalg.norm(rates)), age_s, doubt_s) + 1e-3
 
 
-def test_an_attitude_that_was_lost_says_nothing_soon() -> None:
+def test_attitude_bound_grows_quickly_without_new_attitudes() -> None:
     """A rotation at 60 degrees/s that ended just after the newest attitude, 1.4 s ago."""
     bounds = carrier.AttitudeBounds(math.radians(3.0), math.radians(270.0))
     assert math.degrees(bounds.at(math.radians(60.0), 1.4, 0.0)) > 84.0
@@ -224,7 +226,7 @@ def turning(rate_degps: float) -> Attitude:
     )
 
 
-def test_rates_prove_an_angular_acceleration_and_raise_the_limit() -> None:
+def test_body_rates_refute_and_raise_the_angular_acceleration_limit() -> None:
     """From 0 to 54 degrees/s in 0.25 s, less 2 degrees/s of noise at each end."""
     turns = carrier.AngularAcceleration()
     assert turns.look(turning(0.0), 0, 180.0) is None
@@ -238,7 +240,7 @@ def test_rates_prove_an_angular_acceleration_and_raise_the_limit() -> None:
     assert 180.0 < later < refuted.raised_to  # it decays
 
 
-def test_what_is_possible_or_beyond_belief_raises_nothing() -> None:
+def test_possible_or_implausible_rates_do_not_raise_the_limit() -> None:
     turns = carrier.AngularAcceleration()
     rates = [0.0, 40.0, 0.0, 3000.0, 0.0]  # the third step is 16 times the possible one
     for at, rate in enumerate(rates):
@@ -247,7 +249,7 @@ def test_what_is_possible_or_beyond_belief_raises_nothing() -> None:
     assert turns.look(turning(90.0), 1_010_000_000, 180.0) is None  # 10 ms after the previous one
 
 
-def test_a_contradiction_is_an_angle_in_a_time() -> None:
+def test_contradiction_compares_angle_with_elapsed_time() -> None:
     """Two level attitudes without rates, 90 degrees apart within half a second."""
     before, after = (
         replace(turning(0.0), t_ns=at_ns, yaw_rad=yaw_rad)

@@ -43,7 +43,7 @@ NOISE = ReportNoise(
         ((100, 13.1, -90), Reason.UNREACHABLE),
     ],
 )
-def test_a_report_outside_the_cylinder_cannot_be_true(
+def test_report_outside_the_reachable_cylinder_is_rejected(
     fix: MakeFix, place: tuple[float, ...], reason: Reason | None
 ) -> None:
     """The report's own noise is added: 10 + 3 m horizontally, 4 + 2 m vertically."""
@@ -61,7 +61,7 @@ def test_a_report_outside_the_cylinder_cannot_be_true(
         ((100, 0, -50 - 9.01), Reason.ALTITUDE_JUMP),
     ],
 )
-def test_a_report_may_lead_by_what_a_feedthrough_makes_of_its_speed(
+def test_gate_allows_for_the_feedthrough_lead(
     fix: MakeFix, place: tuple[float, ...], reason: Reason | None
 ) -> None:
     """Horizontally and vertically: 3 m more than the noise bound."""
@@ -69,7 +69,7 @@ def test_a_report_may_lead_by_what_a_feedthrough_makes_of_its_speed(
     assert (None if found is None else found[0]) is reason
 
 
-def test_it_is_said_how_far_and_how_far_is_possible(fix: MakeFix) -> None:
+def test_rejection_states_deviation_and_limit(fix: MakeFix) -> None:
     found = refusal(PREDICTED, fix(0, [130, 40, -50], noise=NOISE))
     assert found == (Reason.UNREACHABLE, "50.0 m off, at most 13.0 m possible")
     found = refusal(PREDICTED, fix(0, [100, 0, -90], noise=NOISE))
@@ -89,7 +89,7 @@ def test_it_is_said_how_far_and_how_far_is_possible(fix: MakeFix) -> None:
         ((0, 0, 0.01), (5, 0, 0), 1.0, False),
     ],
 )
-def test_frozen_positions(
+def test_frozen_positions_are_recognised(
     fix: MakeFix,
     moved: tuple[float, ...],
     velocity: tuple[float, ...] | None,
@@ -114,7 +114,7 @@ def suspects(fix: MakeFix, times_s: list[float], **changed: float) -> Suspects:
         ([0, 1, 2, 3], True), ([0, 1, 13, 14], False), ([0, 1, 13, 14, 16], True),
     ],
 )  # fmt: skip
-def test_it_takes_enough_suspects_over_long_enough(
+def test_run_needs_enough_suspects_over_enough_time(
     fix: MakeFix, times_s: list[float], agree: bool
 ) -> None:
     run = suspects(fix, times_s)
@@ -122,7 +122,7 @@ def test_it_takes_enough_suspects_over_long_enough(
     assert len(suspects(fix, [0, 0.1], reacquire_reports=2, reacquire_s=0.1).take()) == 2
 
 
-def test_suspects_that_contradict_one_another_begin_again(fix: MakeFix) -> None:
+def test_contradicting_suspects_restart_the_run(fix: MakeFix) -> None:
     run = suspects(fix, [0, 1, 2])
     run.add(fix(3 * S, [300, 0, 0], [10, 0, 0]))
     assert not run.agree()
@@ -130,21 +130,21 @@ def test_suspects_that_contradict_one_another_begin_again(fix: MakeFix) -> None:
     assert run.take() == []
 
 
-def test_a_suspect_that_is_late_or_came_twice_counts_for_nothing(fix: MakeFix) -> None:
+def test_late_or_duplicate_suspects_are_ignored(fix: MakeFix) -> None:
     run = suspects(fix, [0, 2])
     run.add(fix(2 * S, [20, 0, 0], [10, 0, 0]))
     run.add(fix(S, [10, 0, 0], [10, 0, 0]))
     assert [one.sender_ns for one in run.take()] == [0, 2 * S]
 
 
-def test_a_run_goes_on_for_as_long_as_it_is_not_forgotten(fix: MakeFix) -> None:
-    run = taking_turns(fix, [0, 1, 2, 3])
+def test_run_stays_consistent_until_it_expires(fix: MakeFix) -> None:
+    run = interleaved_run(fix, [0, 1, 2, 3])
     assert run.is_consistent(3 * S)
     assert run.is_consistent(13 * S - 1)
     assert not run.is_consistent(13 * S)
 
 
-def test_a_run_that_did_not_take_turns_is_no_second_vehicle(fix: MakeFix) -> None:
+def test_run_without_interleaving_is_not_a_duplicate_id(fix: MakeFix) -> None:
     """A step of a few seconds, after which reports are possible again."""
     run = suspects(fix, [0, 1, 2, 3])
     run.interrupt()
@@ -152,10 +152,10 @@ def test_a_run_that_did_not_take_turns_is_no_second_vehicle(fix: MakeFix) -> Non
     assert not run.is_consistent(4 * S)
     run.add(fix(5 * S, [50, 0, 0], [10, 0, 0]))
     assert not run.is_consistent(5 * S)
-    assert not taking_turns(fix, [0, 1, 2]).is_consistent(2 * S)
+    assert not interleaved_run(fix, [0, 1, 2]).is_consistent(2 * S)
 
 
-def taking_turns(fix: MakeFix, times_s: list[float]) -> Suspects:
+def interleaved_run(fix: MakeFix, times_s: list[float]) -> Suspects:
     """Return a run whose reports alternate with possible ones."""
     run = Suspects(OBSERVER, GateSettings())
     for t_s in times_s:
@@ -164,7 +164,7 @@ def taking_turns(fix: MakeFix, times_s: list[float]) -> Suspects:
     return run
 
 
-def test_a_run_is_bounded(fix: MakeFix) -> None:
+def test_run_length_is_bounded(fix: MakeFix) -> None:
     run = suspects(fix, [n / 10 for n in range(1000)])
     kept = run.take()
     assert len(kept) <= 100
@@ -172,12 +172,12 @@ def test_a_run_is_bounded(fix: MakeFix) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [2, 10, 25, 50])
-def test_fast_reports_are_believed_as_soon_as_slow_ones(fix: MakeFix, rate_hz: int) -> None:
+def test_fast_reports_reacquire_as_soon_as_slow_ones(fix: MakeFix, rate_hz: int) -> None:
     run = suspects(fix, [n / rate_hz for n in range(4 * rate_hz)])
     assert run.agree()
 
 
-def test_times_that_are_off_are_worth_the_way_flown_in_them(fix: MakeFix) -> None:
+def test_time_uncertainty_adds_distance_at_the_reported_speed(fix: MakeFix) -> None:
     """At 40 m/s, 2 s apart: one millisecond, the drift over 2 s, and the velocity error."""
     noise = dataclasses.replace(NOISE, velocity_mps=0.5, time_s=0.0)
     before, after = (fix(at * S, (80 * at, 0, -50), (40.0, 0, 0), noise=noise) for at in (0, 2))

@@ -41,7 +41,7 @@ def axes(lat_deg: float, lon_deg: float) -> FloatArray:
 
 
 @given(LATITUDES, LONGITUDES)
-def test_north_east_and_down_point_where_they_should(lat_deg: float, lon_deg: float) -> None:
+def test_ned_axes_match_the_ellipsoid(lat_deg: float, lon_deg: float) -> None:
     assert ned_from_ecef(lat_deg, lon_deg) == pytest.approx(axes(lat_deg, lon_deg), abs=1e-6)
 
 
@@ -53,7 +53,7 @@ def test_north_east_and_down_point_where_they_should(lat_deg: float, lon_deg: fl
     east_deg=st.floats(-1, 1),
     high_m=HEIGHTS,
 )
-def test_places_to_local_points(
+def test_geodetic_positions_convert_to_local_points(
     *,
     lat_deg: float,
     lon_deg: float,
@@ -75,7 +75,7 @@ def test_places_to_local_points(
 
 
 @given(LATITUDES, LONGITUDES, HEIGHTS, st.lists(st.tuples(*[st.floats(-5e4, 5e4)] * 3), min_size=1))
-def test_local_points_to_places_and_back(
+def test_local_points_round_trip_through_geodetic_positions(
     lat_deg: float, lon_deg: float, alt_m: float, points: list[tuple[float, float, float]]
 ) -> None:
     local = LocalFrame(lat_deg, lon_deg, alt_m)
@@ -86,7 +86,7 @@ def test_local_points_to_places_and_back(
         assert local.position_ned_m(*place) == pytest.approx(positions_m[row], abs=1e-5)
 
 
-def test_the_origin_is_at_0() -> None:
+def test_origin_has_zero_coordinates() -> None:
     local = LocalFrame(47.4, 8.5, 500.0)
     assert local.position_ned_m(47.4, 8.5, 500.0) == pytest.approx(np.zeros(3), abs=1e-8)
     assert local.position_ned_m(47.4, 8.5, 510.0) == pytest.approx([0, 0, -10], abs=1e-6)
@@ -104,7 +104,7 @@ def test_local_from_ned_is_a_rotation(lat: float, lon: float, lat2: float, lon2:
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 33.0, 90.0, 200.0, 315.0])
 @pytest.mark.parametrize(("lat_deg", "lon_deg"), [(47.4, 8.6), (52.0, -3.0), (-33.0, 151.0)])
-def test_a_far_velocity_is_that_of_the_local_coordinates(
+def test_distant_velocity_is_rotated_into_the_local_frame(
     lat_deg: float, lon_deg: float, azimuth_deg: float
 ) -> None:
     """Along a great circle by Vincenty's formulae: 10 m in 1 s."""
@@ -137,7 +137,7 @@ METRES = st.floats(-60_000.0, 60_000.0)
     east_m=METRES,
     down_m=st.floats(-12_000.0, 1_000.0),
 )
-def test_places_are_those_of_pymap3d(
+def test_geodetic_positions_match_pymap3d(
     *, lat_deg: float, lon_deg: float, alt_m: float, north_m: float, east_m: float, down_m: float
 ) -> None:
     """pymap3d converts back to the local plane: metres, anywhere on Earth and across 180° E."""
@@ -148,7 +148,7 @@ def test_places_are_those_of_pymap3d(
     assert back_ned_m == pytest.approx((north_m, east_m, down_m), abs=5e-6)
 
 
-def test_the_origin_is_where_it_is() -> None:
+def test_origin_converts_back_to_itself() -> None:
     origin = Place(47.3977419, 8.5455938, 513.0)
     assert LocalFrame(*origin).place(0.0, 0.0, 0.0) == pytest.approx(origin, abs=1e-9)
     assert LocalFrame(*origin).place(0.0, 0.0, -10.0).alt_m == pytest.approx(523.0)

@@ -62,7 +62,7 @@ def same_state(one: object, other: object) -> bool:
     late=st.lists(st.integers(0, 4), min_size=40, max_size=40),
     name=st.sampled_from(list(OBSERVERS)),
 )
-def test_any_order_of_arrival_gives_what_the_right_order_gives(
+def test_any_arrival_order_gives_the_same_state(
     fix: MakeFix, seed: int, gaps_ms: list[int], late: list[int], name: str
 ) -> None:
     """Each report may be overtaken by up to four others, always within the window."""
@@ -84,7 +84,7 @@ def test_any_order_of_arrival_gives_what_the_right_order_gives(
     )
 
 
-def test_a_late_report_is_estimated_from_the_one_before_it(fix: MakeFix) -> None:
+def test_late_report_is_estimated_from_its_predecessor(fix: MakeFix) -> None:
     """Later reports are then estimated from it."""
     first, late, last = (
         fix(0, [0, 0, 0], [1, 0, 0]),
@@ -105,7 +105,7 @@ def test_a_late_report_is_estimated_from_the_one_before_it(fix: MakeFix) -> None
         assert same_state(entry.state, state)
 
 
-def test_a_report_from_before_the_first_becomes_the_first(fix: MakeFix) -> None:
+def test_report_older_than_the_first_becomes_the_first(fix: MakeFix) -> None:
     first, earlier = fix(10 * S, [5, 0, 0]), fix(9 * S, [4, 0, 0])
     history = told(KINEMATIC, [first, earlier])
     assert [entry.fix for entry in history.entries] == [earlier, first]
@@ -120,15 +120,13 @@ def test_a_report_from_before_the_first_becomes_the_first(fix: MakeFix) -> None:
         (15 * S - 1, None), (0, None),
     ],
 )  # fmt: skip
-def test_where_a_report_belongs_and_when_it_is_too_old(
-    fix: MakeFix, sender_ns: int, index: int | None
-) -> None:
+def test_history_index_of_a_report(fix: MakeFix, sender_ns: int, index: int | None) -> None:
     """A report with the time of a stored one would replace it: its index shows that."""
     history = told(KINEMATIC, [fix(n * S // 2, [n, 0, 0]) for n in range(30, 41)])
     assert history.index(sender_ns) == index
 
 
-def test_the_window_does_not_grow(fix: MakeFix) -> None:
+def test_history_is_bounded_by_its_window(fix: MakeFix) -> None:
     """In order or not, the history never exceeds the window, however long the flight."""
     rng = np.random.default_rng(1)
     history = ReportHistory(KINEMATIC, fix(0, [0, 0, 0]), WINDOW_NS)
@@ -144,7 +142,7 @@ def test_the_window_does_not_grow(fix: MakeFix) -> None:
     assert len(history.entries) >= 51
 
 
-def test_after_a_hole_longer_than_the_window_a_late_report_is_still_used(fix: MakeFix) -> None:
+def test_late_report_is_used_after_a_gap_longer_than_the_window(fix: MakeFix) -> None:
     """It is half a second late: the window is measured in time, not in reports."""
     before, after, late = fix(0, [0, 0, 0]), fix(7 * S, [7, 0, 0]), fix(6 * S + S // 2, [6, 0, 0])
     history = told(KINEMATIC, [before, after])
@@ -161,7 +159,7 @@ def test_after_a_hole_longer_than_the_window_a_late_report_is_still_used(fix: Ma
 @given(
     seed=st.integers(0, 2**32 - 1), gaps_ms=st.lists(st.integers(10, 700), min_size=6, max_size=40)
 )
-def test_the_acceleration_is_the_slope_of_the_velocities(
+def test_acceleration_is_the_slope_of_the_velocities(
     fix: MakeFix, seed: int, gaps_ms: list[int]
 ) -> None:
     """numpy.polyfit over the last five seconds, or over the last five velocities."""
@@ -174,7 +172,7 @@ def test_the_acceleration_is_the_slope_of_the_velocities(
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-6)
 
 
-def test_the_acceleration_takes_five_velocities_in_a_row(fix: MakeFix) -> None:
+def test_acceleration_needs_five_consecutive_velocities(fix: MakeFix) -> None:
     made = [fix(n * S // 5, [0, 0, 0], [n, 0, -2 * n]) for n in range(6)]
     assert told(KINEMATIC, made[:4]).accelerations([(5.0, 5)])[0] is None
     assert told(KINEMATIC, made[:5]).accelerations([(5.0, 5)])[0] == pytest.approx([5, 0, -10])

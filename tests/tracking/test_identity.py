@@ -46,17 +46,19 @@ def after(fix: MakeFix, offsets: list[float], *others: Track) -> str | None:
     return identities.same_as(AIRCRAFT)
 
 
-def test_one_aircraft_under_two_names_is_found_after_some_reports(fix: MakeFix) -> None:
+def test_same_aircraft_under_two_ids_is_identified_after_enough_reports(fix: MakeFix) -> None:
     assert after(fix, [30.0] * (REPORTS_TO_DECIDE - 1)) is None
     assert after(fix, [30.0] * REPORTS_TO_DECIDE) == "1:1"
 
 
-def test_far_apart_it_is_itself(fix: MakeFix) -> None:
+def test_distant_aircraft_is_not_merged(fix: MakeFix) -> None:
     assert after(fix, [500.0] * 20) is None
 
 
 @pytest.mark.parametrize(("above_m", "same"), [(120.0, "1:1"), (-120.0, "1:1"), (130.0, None)])
-def test_far_above_or_below_it_is_itself(fix: MakeFix, above_m: float, same: str | None) -> None:
+def test_aircraft_at_a_different_height_is_not_merged(
+    fix: MakeFix, above_m: float, same: str | None
+) -> None:
     """100 m of noise, 20 m for one second of time uncertainty, and 5 m of the track."""
     identities = Identities()
     for n in range(REPORTS_TO_DECIDE):
@@ -66,16 +68,16 @@ def test_far_above_or_below_it_is_itself(fix: MakeFix, above_m: float, same: str
     assert identities.same_as(AIRCRAFT) == same
 
 
-def test_the_nearest_is_taken(fix: MakeFix) -> None:
+def test_nearest_track_is_chosen(fix: MakeFix) -> None:
     assert after(fix, [30.0] * 6, track("2:1", [100, 200, -300])) == "1:1"
 
 
-def test_a_short_meeting_is_no_match(fix: MakeFix) -> None:
+def test_short_encounter_does_not_merge_tracks(fix: MakeFix) -> None:
     """They are within their errors for too few reports."""
     assert after(fix, [400, 300, 100, 0, -100, -300, -400, -500]) is None
 
 
-def test_another_way_of_flying_is_another_aircraft(fix: MakeFix) -> None:
+def test_different_velocity_does_not_merge_tracks(fix: MakeFix) -> None:
     identities = Identities()
     for n in range(20):
         telemetry = [track("1:1", [0, 0, -300])]
@@ -83,7 +85,7 @@ def test_another_way_of_flying_is_another_aircraft(fix: MakeFix) -> None:
     assert identities.same_as(AIRCRAFT) is None
 
 
-def test_it_is_itself_again_when_they_part(fix: MakeFix) -> None:
+def test_merged_tracks_separate_when_they_part(fix: MakeFix) -> None:
     assert after(fix, [30.0] * 8 + [900.0] * (REPORTS_TO_DECIDE - 1)) == "1:1"
     assert after(fix, [30.0] * 8 + [900.0] * REPORTS_TO_DECIDE) is None
 
@@ -107,7 +109,7 @@ def status(h: float | None, v: float | None, vel: float | None) -> GnssStatus:
         ((0.001, 0.001, 0.001), (0.9, 0.9, 1.273, 0.02)),  # below the best accuracy of the fix type
     ],
 )
-def test_reported_accuracies_are_bounds_times_a_factor(
+def test_noise_bound_is_reported_accuracy_times_a_factor(
     accuracies: tuple[float | None, ...], expected: tuple[float, ...]
 ) -> None:
     found = noise.reported(status(*accuracies), noise.NoiseSettings(DEFAULT, 3.0))
@@ -123,7 +125,7 @@ def test_reported_accuracies_can_be_ignored() -> None:
 @pytest.mark.parametrize(
     ("fix_type", "least_m"), [(2, 0.9), (3, 0.9), (4, 0.6), (5, 0.3), (6, 0.03), (8, 0.03)]
 )
-def test_no_fix_is_believed_to_be_better_than_its_kind(fix_type: int, least_m: float) -> None:
+def test_reported_accuracy_is_limited_by_the_fix_type(fix_type: int, least_m: float) -> None:
     """Some receivers state 1 mm when they do not know; 30 cm of an RTK fix is accepted."""
     claimed = replace(status(0.001, 0.001, None), fix_type=fix_type)
     found = noise.reported(claimed, noise.NoiseSettings(DEFAULT, 3.0))
@@ -134,7 +136,7 @@ def test_no_fix_is_believed_to_be_better_than_its_kind(fix_type: int, least_m: f
     )
 
 
-def test_an_aircraft_that_is_forgotten_is_compared_anew(fix: MakeFix) -> None:
+def test_forgotten_aircraft_is_compared_again(fix: MakeFix) -> None:
     identities = Identities()
     telemetry = [track("1:1", [0, 0, -300])]
     for number in range(20_000):
@@ -145,7 +147,7 @@ def test_an_aircraft_that_is_forgotten_is_compared_anew(fix: MakeFix) -> None:
     assert vars(identities) == vars(Identities())
 
 
-def test_made_up_names_take_no_memory(fix: MakeFix) -> None:
+def test_invented_ids_use_bounded_memory(fix: MakeFix) -> None:
     """The oldest entry is evicted, and decided again when it is received again."""
     identities = Identities()
     here = [20.0, 0, -300]

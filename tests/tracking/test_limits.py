@@ -41,11 +41,11 @@ def told(fix: Callable[..., Fix], t_s: float, velocity: object, limits: Limits =
         (13, Airframe.COPTER), (20, Airframe.VTOL), (12345, Airframe.UNKNOWN),
     ],
 )  # fmt: skip
-def test_types_of_aircraft(mav_type: int | None, kind: Airframe) -> None:
+def test_airframe_of_each_mav_type(mav_type: int | None, kind: Airframe) -> None:
     assert airframe(mav_type) is kind
 
 
-def test_lags_differ_in_sign_and_what_is_not_known_has_both() -> None:
+def test_position_lag_depends_on_airframe_and_autopilot() -> None:
     copter, aeroplane = lag_s(Airframe.COPTER, 3), lag_s(Airframe.AEROPLANE, 3)
     assert 0 < copter[0] < 0.0295 < copter[1]
     assert aeroplane[0] < -0.0267 < aeroplane[1] < 0
@@ -54,7 +54,7 @@ def test_lags_differ_in_sign_and_what_is_not_known_has_both() -> None:
     assert lag_s(Airframe.COPTER, 12) == lag_s(Airframe.UNKNOWN, None) == (0.0, 0.06)
 
 
-def test_the_nearest_setting_wins() -> None:
+def test_most_specific_setting_applies() -> None:
     """Order: the UAV's setting, its type's, the general one, the built-in value of its type."""
     given = Settings().override(
         observer={
@@ -81,7 +81,7 @@ def test_the_nearest_setting_wins() -> None:
         max_size=30,
     )
 )
-def test_what_keeps_within_its_limits_is_never_refuted(
+def test_motion_within_the_limits_is_never_refuted(
     fix: Callable[..., Fix], steps: list[tuple[float, ...]]
 ) -> None:
     """At any noise within its bound, and with stamps in whole milliseconds."""
@@ -100,7 +100,7 @@ def test_what_keeps_within_its_limits_is_never_refuted(
     assert known.speed == known.acceleration == RaisedLimit()
 
 
-def test_a_turn_beyond_the_limit_is_proven_raised_and_fades(fix: Callable[..., Fix]) -> None:
+def test_acceleration_limit_is_refuted_raised_and_decays(fix: Callable[..., Fix]) -> None:
     """8 m/s² for two seconds by a type with a limit of 4 m/s²."""
     known, found = Refutations(), []
     for n in range(40):
@@ -119,14 +119,14 @@ def test_a_turn_beyond_the_limit_is_proven_raised_and_fades(fix: Callable[..., F
     assert later.speed_max_mps == 60.0
 
 
-def test_a_speed_beyond_the_limit_is_proven(fix: Callable[..., Fix]) -> None:
+def test_excess_speed_refutes_the_speed_limit(fix: Callable[..., Fix]) -> None:
     known = Refutations()
     (found,) = known.look(told(fix, 0, [70, 0, 0]))
     assert (found.setting, found.limit, found.proven) == ("observer.speed_max_mps", 60.0, 69.7)
     assert known.limits(COPTER, 0).speed_max_mps == RAISED * 69.7
 
 
-def test_what_nothing_can_fly_is_no_proof(fix: Callable[..., Fix]) -> None:
+def test_implausible_reports_do_not_refute_limits(fix: Callable[..., Fix]) -> None:
     """A false report: 500 m/s, or from rest to 30 m/s in a tenth of a second."""
     known = Refutations()
     assert known.look(told(fix, 0, [500, 0, 0])) == []

@@ -18,7 +18,7 @@ from companion.values import Accuracy, AltitudeDatum
 @pytest.mark.parametrize(
     ("velocity", "way_m"), [((30.0, -40.0, 0.0), 50.0), ((0.0, 0.0, 12.0), 12.0), (None, 90.0)]
 )
-def test_a_time_in_whole_seconds_is_worth_the_way_flown_in_one(
+def test_one_second_time_resolution_adds_distance_flown(
     velocity: tuple[float, ...] | None, way_m: float
 ) -> None:
     """At the reported speed, or at the speed limit if none is reported."""
@@ -31,7 +31,7 @@ def test_a_time_in_whole_seconds_is_worth_the_way_flown_in_one(
 
 
 @pytest.mark.parametrize("age_s", [1.5, 10.0])
-def test_an_altitude_of_another_time_is_worth_what_can_be_climbed_between(age_s: float) -> None:
+def test_altitude_age_adds_possible_climb_to_the_bound(age_s: float) -> None:
     """Affects the vertical and the 3-D bound, not the horizontal one."""
     velocity = np.array([30.0, 40.0, 0.0])
     fresh, old = (
@@ -43,7 +43,7 @@ def test_an_altitude_of_another_time_is_worth_what_can_be_climbed_between(age_s:
     assert old.position_m == pytest.approx(math.hypot(old.horizontal_m, old.vertical_m))
 
 
-def test_a_stated_accuracy_takes_the_place_of_what_is_taken_for_granted() -> None:
+def test_stated_accuracy_replaces_the_default() -> None:
     """Field by field, times the configured factor; the geoid error is added unscaled."""
     still = np.zeros(3)
     told = Accuracy(horizontal_m=6.0, vertical_m=20.0, velocity_mps=0.5)
@@ -77,7 +77,7 @@ def test_a_stated_accuracy_takes_the_place_of_what_is_taken_for_granted() -> Non
     assert (exact.horizontal_m, exact.velocity_mps) == (QUANTISATION, QUANTISATION)
 
 
-def test_settings_that_do_not_follow_accuracies_ignore_them() -> None:
+def test_stated_accuracy_is_ignored_when_disabled() -> None:
     told = Accuracy(horizontal_m=6.0, vertical_m=20.0, velocity_mps=0.5, time_s=0.1)
     found = relayed(
         np.ones(3),
@@ -92,7 +92,7 @@ def test_settings_that_do_not_follow_accuracies_ignore_them() -> None:
     )
 
 
-def test_a_height_that_was_brought_to_the_sea_has_what_that_may_be_off() -> None:
+def test_geoid_conversion_error_adds_to_the_height_bound() -> None:
     still, told = np.zeros(3), Accuracy(horizontal_m=6.0, vertical_m=20.0, velocity_mps=0.5)
     found = relayed(
         still,
@@ -116,7 +116,7 @@ def test_a_height_that_was_brought_to_the_sea_has_what_that_may_be_off() -> None
     assert unstated.vertical_m == ADSB_NOISE_M + 4.0
 
 
-def test_a_time_that_is_better_known_is_worth_less_way() -> None:
+def test_better_known_time_adds_less_distance() -> None:
     velocity = np.array([30.0, 40.0, 0.0])
     found = relayed(
         velocity,

@@ -21,19 +21,21 @@ def heard(fix: Callable[..., Fix], interval_s: float, latencies_s: list[float]) 
 @pytest.mark.parametrize(
     ("interval_s", "late_s", "silence_s"), [(0.1, 0.01, 2.0), (0.9, 0.3, 2.7), (5.0, 0.3, 15.0)]
 )
-def test_three_intervals_within_the_limits(
+def test_silence_timeout_is_three_intervals_within_limits(
     fix: Callable[..., Fix], interval_s: float, late_s: float, silence_s: float
 ) -> None:
     pace = heard(fix, interval_s, [late_s] * 10)
     assert pace.silence_s(2.0, 15.0) == pytest.approx(silence_s)
 
 
-def test_before_there_is_a_pace_the_least_counts(fix: Callable[..., Fix]) -> None:
+def test_silence_timeout_is_the_minimum_before_an_interval_is_known(
+    fix: Callable[..., Fix],
+) -> None:
     assert heard(fix, 1.0, [0.1, 0.1]).silence_s(2.0, 15.0) == 2.0
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_a_slow_radio_does_not_flap(fix: Callable[..., Fix], seed: int) -> None:
+def test_slow_radio_does_not_alternate_states(fix: Callable[..., Fix], seed: int) -> None:
     """1.2 reports per second, a tenth of them lost, up to some seconds late, over one hour."""
     rng, pace, changes, coasts = random.Random(seed), ReportTiming(), 0, False
     arrivals = sorted(

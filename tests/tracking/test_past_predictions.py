@@ -65,7 +65,7 @@ def flown(
     return hindsight
 
 
-def test_in_straight_flight_with_noise_nothing_is_fed(fix: Callable[..., Fix]) -> None:
+def test_noisy_straight_flight_selects_constant_velocity(fix: Callable[..., Fix]) -> None:
     straight: Place = lambda t_s: ([10 * t_s, 0, 0], [10, 0, 0])  # noqa: E731
     assert (
         flown(fix, straight, 0.9, seconds=120, noise_mps=0.5, noise_m=1.0).model
@@ -73,25 +73,25 @@ def test_in_straight_flight_with_noise_nothing_is_fed(fix: Callable[..., Fix]) -
     )
 
 
-def test_in_a_quick_turn_a_short_window_is_taken(fix: Callable[..., Fix]) -> None:
+def test_tight_turn_selects_a_short_window(fix: Callable[..., Fix]) -> None:
     """An aeroplane's: over five seconds the acceleration rotates by one radian."""
     way = flown(fix, circling(110.0, 22.0), 0.1, seconds=60, noise_mps=0.05, noise_m=0.05).model
     assert 0 < way.window_s <= 2.5
 
 
-def test_in_a_slow_noisy_turn_something_is_fed(fix: Callable[..., Fix]) -> None:
+def test_slow_noisy_turn_selects_an_acceleration_model(fix: Callable[..., Fix]) -> None:
     assert (
         flown(fix, circling(60.0, 5.0), 0.1, seconds=60, noise_mps=0.05, noise_m=0.02).model
         is not CONSTANT_VELOCITY
     )
 
 
-def test_before_there_is_any_judgement_nothing_is_fed(fix: Callable[..., Fix]) -> None:
+def test_model_is_constant_velocity_before_any_evaluation(fix: Callable[..., Fix]) -> None:
     assert flown(fix, circling(110.0, 22.0), 0.1, seconds=1.0).model is CONSTANT_VELOCITY
     assert PastPredictions().error_p95_m(1.0) is None
 
 
-def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
+def test_error_p95_covers_19_of_20_errors(fix: Callable[..., Fix]) -> None:
     """Over noisy reports at the evaluated ages: 19 of 20 errors, and not many more."""
     place = circling(60.0, 8.0)
     hindsight = flown(fix, place, 0.2, seconds=120, noise_mps=0.2, noise_m=0.5)
@@ -120,7 +120,7 @@ def test_the_usual_error_covers_what_comes(fix: Callable[..., Fix]) -> None:
     st.floats(1.1, 40.0), st.floats(-3.2, 3.2), st.floats(-16.0, 16.0), st.floats(-16.0, 16.0),
     st.floats(0.0, 10.0),
 )  # fmt: skip
-def test_in_a_turn_the_velocity_turns(
+def test_coordinated_turn_rotates_the_velocity(
     speed_mps: float, heading: float, across_mps2: float, along_mps2: float, ahead_s: float
 ) -> None:
     """Against small integration steps; at most as far from straight flight as the lateral
@@ -144,7 +144,7 @@ def test_in_a_turn_the_velocity_turns(
     assert (down, gained[2]) == fading_response(ahead_s, 3.0)
 
 
-def test_who_stands_has_no_direction_to_turn() -> None:
+def test_stationary_uav_uses_decaying_acceleration() -> None:
     turning, straight = (
         AccelerationModel(window_s=1.0, min_velocities=3, decay_s=3.0, turns=True),
         AccelerationModel(window_s=1.0, min_velocities=3, decay_s=3.0),
@@ -155,13 +155,13 @@ def test_who_stands_has_no_direction_to_turn() -> None:
         assert next(found) == next(found)
 
 
-def test_in_a_steady_circle_the_turn_is_fed(fix: Callable[..., Fix]) -> None:
+def test_steady_circle_selects_the_turn_model(fix: Callable[..., Fix]) -> None:
     assert flown(
         fix, circling(60.0, 12.0), 0.8, seconds=60, noise_mps=0.05, noise_m=0.05
     ).model.turns
 
 
-def test_positions_of_a_poor_receiver_are_smoothed(fix: Callable[..., Fix]) -> None:
+def test_noisy_positions_are_smoothed(fix: Callable[..., Fix]) -> None:
     """Half of the noise is removed, also in a turn; a good receiver is hardly smoothed."""
     straight: Place = lambda t_s: ([10 * t_s, 0, 0], [10, 0, 0])  # noqa: E731
     for place in (straight, circling(60.0, 8.0)):
@@ -182,7 +182,7 @@ def test_positions_of_a_poor_receiver_are_smoothed(fix: Callable[..., Fix]) -> N
     assert math.hypot(*flown(fix, circling(60.0, 8.0), 0.8, seconds=60).smoothing_offset) < 0.05
 
 
-def test_over_a_gap_nothing_is_smoothed(fix: Callable[..., Fix]) -> None:
+def test_gap_disables_smoothing(fix: Callable[..., Fix]) -> None:
     hindsight = PastPredictions()
     for n in range(60):
         made = fix(round(n * 6.0 * S), np.array([5.0 * (-1) ** n, 0, 0]), np.zeros(3))
@@ -192,7 +192,7 @@ def test_over_a_gap_nothing_is_smoothed(fix: Callable[..., Fix]) -> None:
 
 
 @pytest.mark.parametrize("decay_s", [3.0, 10.0])
-def test_a_fading_acceleration(decay_s: float) -> None:
+def test_decaying_acceleration_matches_its_integral(decay_s: float) -> None:
     """Against the integral, for velocity and position."""
     times = np.linspace(0, 2.0, 20001)
     speeds = np.concatenate([[0], np.cumsum(np.exp(-(times[:-1] + 5e-5) / decay_s) * 1e-4)])

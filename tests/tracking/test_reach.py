@@ -38,7 +38,7 @@ def unit(vector: tuple[float, ...]) -> FloatArray:
     aside=VECTOR,
     off_m=st.floats(0, 4),
 )
-def test_no_motion_leaves_what_is_possible(
+def test_reachable_set_contains_every_motion(
     *,
     fix: Callable[..., Fix],
     way: tuple[float, ...],
@@ -76,7 +76,7 @@ def test_no_motion_leaves_what_is_possible(
 
 
 @pytest.mark.parametrize(("age_s", "before_s", "after_s"), [(0.2, 0.0, 0.0), (1.2, 0.1, 0.5)])
-def test_the_bound_and_the_ball_are_the_least(
+def test_reachable_bound_and_ball_are_minimal(
     fix: Callable[..., Fix], age_s: float, before_s: float, after_s: float
 ) -> None:
     """Against the farthest possible position and the smallest ball around all of them."""
@@ -96,7 +96,7 @@ def test_the_bound_and_the_ball_are_the_least(
     assert found.radius_m == pytest.approx(float(balls.min()), rel=1e-3)
 
 
-def test_over_a_long_gap_the_greatest_speed_says_more(fix: Callable[..., Fix]) -> None:
+def test_speed_limit_bounds_a_long_gap(fix: Callable[..., Fix]) -> None:
     made = fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE)
     found = reach(
         made,

@@ -41,7 +41,7 @@ def wave(size_m: float, period_s: float) -> Wander:
     return lambda t_s: (size_m * math.sin(2 * math.pi * t_s / period_s), 0.0)
 
 
-def test_a_good_receiver_is_believed(fix: MakeFix) -> None:
+def test_good_receiver_is_trusted(fix: MakeFix) -> None:
     straying = ReceiverCheck(SETTINGS)
     rng = np.random.default_rng(1)
     noisy = flown(fix, lambda _t: tuple((0.05 * rng.standard_normal(2)).tolist()))
@@ -50,12 +50,12 @@ def test_a_good_receiver_is_believed(fix: MakeFix) -> None:
     assert straying.common_error_m(STATED) == pytest.approx(0.07 * STATED.position_m)
 
 
-def test_one_that_is_off_for_good_cannot_be_seen(fix: MakeFix) -> None:
+def test_constant_offset_is_not_detectable(fix: MakeFix) -> None:
     assert told(ReceiverCheck(SETTINGS), flown(fix, lambda _t: (5.0, 5.0))) == []
 
 
 @pytest.mark.parametrize("size_m", [0.8, 1.6, 3.2])
-def test_one_that_wanders_is_found_while_the_bound_still_holds(fix: MakeFix, size_m: float) -> None:
+def test_wandering_receiver_is_detected_while_the_bound_holds(fix: MakeFix, size_m: float) -> None:
     """It is reported early and a few times only, and the raised bound covers the error."""
     straying, wander = ReceiverCheck(SETTINGS), wave(size_m, 15)
     found = told(straying, flown(fix, wander))
@@ -72,12 +72,12 @@ def test_one_that_wanders_is_found_while_the_bound_still_holds(fix: MakeFix, siz
     assert straying.common_error_m(raised) > size_m / math.sqrt(2)
 
 
-def test_a_poor_receiver_that_says_so_may_wander(fix: MakeFix) -> None:
+def test_receiver_with_poor_stated_accuracy_may_wander(fix: MakeFix) -> None:
     honest = ReportNoise(horizontal_m=2.7, vertical_m=2.7, position_m=3.8, velocity_mps=0.5)
     assert told(ReceiverCheck(SETTINGS), flown(fix, wave(0.6, 15), honest)) == []
 
 
-def test_what_is_left_of_the_lag_is_no_fault_of_the_receiver(fix: MakeFix) -> None:
+def test_residual_lag_is_not_attributed_to_the_receiver(fix: MakeFix) -> None:
     late = ReportNoise(
         horizontal_m=0.9, vertical_m=0.9, position_m=1.27, velocity_mps=0.5, time_s=0.06
     )
@@ -89,7 +89,7 @@ def test_what_is_left_of_the_lag_is_no_fault_of_the_receiver(fix: MakeFix) -> No
     assert told(ReceiverCheck(SETTINGS), flown(fix, lag, late)) == []
 
 
-def test_what_is_flown_between_two_reports_is_no_fault_of_the_receiver(fix: MakeFix) -> None:
+def test_motion_between_reports_is_not_attributed_to_the_receiver(fix: MakeFix) -> None:
     """Gusts at 5 rad/s, 25 m/s strong, reported every half second: the velocities do not
     show them.
     """
@@ -107,25 +107,25 @@ def test_what_is_flown_between_two_reports_is_no_fault_of_the_receiver(fix: Make
     assert [found for one in gusty() if (found := careless.look(one, 0.0))]
 
 
-def test_a_leap_is_left_to_the_gate(fix: MakeFix) -> None:
+def test_position_jump_is_left_to_the_gate(fix: MakeFix) -> None:
     """Neither the jump nor the return counts against the receiver."""
     assert (
         told(ReceiverCheck(SETTINGS), flown(fix, lambda t_s: (25.0 * (20 < t_s < 22), 0.0))) == []
     )
 
 
-def test_reports_that_are_far_apart_tell_nothing(fix: MakeFix) -> None:
+def test_sparse_reports_are_not_assessed(fix: MakeFix) -> None:
     assert told(ReceiverCheck(SETTINGS), flown(fix, wave(3.0, 15), step_s=0.8)) == []
 
 
-def test_who_does_not_rest_on_statements_is_not_judged(fix: MakeFix) -> None:
+def test_receiver_without_stated_accuracy_is_not_assessed(fix: MakeFix) -> None:
     for settings, noise in ((NoiseSettings(DEFAULT, None), STATED), (SETTINGS, DEFAULT)):
         straying = ReceiverCheck(settings)
         assert told(straying, flown(fix, wave(3.0, 15), noise)) == []
         assert straying.noise(noise) is noise
 
 
-def test_heights_that_differ_count_as_usual_within_the_bound() -> None:
+def test_height_difference_counts_as_common_error_within_the_bound() -> None:
     straying = ReceiverCheck(SETTINGS)
     for apart_m, usual_m in ((0.3, 0.3), (50.0, 0.9)):
         noise = ReportNoise(

@@ -50,7 +50,9 @@ def tracker() -> Tracker:
         (15.001, "stale"), (59.999, "stale"), (60.001, "lost"), (1e6, "lost"),
     ],
 )  # fmt: skip
-def test_tracks_age(tracker: Tracker, fix: MakeFix, age_s: float, state: str) -> None:
+def test_track_state_follows_its_age(
+    tracker: Tracker, fix: MakeFix, age_s: float, state: str
+) -> None:
     tracker.accept(fix(100 * S, [0, 0, 0]))
     now_ns = 100 * S + round(age_s * 1e9)
     track = tracker.track("1:1", now_ns, same_time(now_ns + S))
@@ -62,7 +64,7 @@ def test_tracks_age(tracker: Tracker, fix: MakeFix, age_s: float, state: str) ->
     assert track.age_s == pytest.approx(age_s + 1.0)
 
 
-def test_a_first_report_is_its_own_estimate(tracker: Tracker, fix: MakeFix) -> None:
+def test_first_report_of_a_track_is_its_estimate(tracker: Tracker, fix: MakeFix) -> None:
     first = tracker.accept(fix(100 * S, [1, 2, 3], late_ns=S // 4))[0]
     assert isinstance(first, Estimate)
     assert first.position_ned_m == (1, 2, 3)
@@ -76,9 +78,7 @@ def test_a_first_report_is_its_own_estimate(tracker: Tracker, fix: MakeFix) -> N
     assert track.latency_s == pytest.approx(0.25)
 
 
-def test_a_second_report_is_judged_by_the_prediction_made_for_it(
-    tracker: Tracker, fix: MakeFix
-) -> None:
+def test_second_report_is_gated_by_its_prediction(tracker: Tracker, fix: MakeFix) -> None:
     first, second = fix(100 * S, [0, 0, 0], [10, 0, 0]), fix(101 * S, [13, 4, 0], [10, 0, 0])
     tracker.accept(first)
     found = tracker.accept(second)[0]
@@ -99,7 +99,7 @@ def test_a_second_report_is_judged_by_the_prediction_made_for_it(
     assert tracker.newest("1:1") is second
 
 
-def test_gamma_is_that_of_the_worst_interval(tracker: Tracker, fix: MakeFix) -> None:
+def test_gamma_is_that_of_the_longest_interval(tracker: Tracker, fix: MakeFix) -> None:
     """Without feedthrough and velocity mu* = b^2 / alpha: the longest interval counts."""
     for t_s in (100, 101, 104, 105):
         tracker.accept(fix(t_s * S, [0, 0, 0]))
@@ -114,7 +114,7 @@ def test_gamma_is_that_of_the_worst_interval(tracker: Tracker, fix: MakeFix) -> 
     ("older_ns", "reason"),
     [(0, Reason.DUPLICATE), (5 * S + 1, Reason.OUT_OF_ORDER), (50 * S, Reason.OUT_OF_ORDER)],
 )
-def test_a_report_that_is_too_old_or_came_twice_is_rejected_and_changes_nothing(
+def test_too_old_or_duplicate_report_is_rejected_without_effect(
     tracker: Tracker, fix: MakeFix, older_ns: int, reason: Reason
 ) -> None:
     tracker.accept(fix(100 * S, [0, 0, 0]))
@@ -133,7 +133,7 @@ def test_a_report_that_is_too_old_or_came_twice_is_rejected_and_changes_nothing(
     assert tracker.newest("1:1") is newest
 
 
-def test_a_late_report_is_put_in_its_place(fix: MakeFix) -> None:
+def test_late_report_is_inserted_in_order(fix: MakeFix) -> None:
     """The resulting state equals that of a timely report."""
     made = [fix(n * S, [10 * n, n * n, 0], [10, 2 * n, 0], late_ns=S // 8) for n in range(100, 106)]
     one, other = Tracker(OBSERVER, SETTINGS), Tracker(OBSERVER, SETTINGS)
@@ -158,7 +158,7 @@ def test_a_late_report_is_put_in_its_place(fix: MakeFix) -> None:
     )  # fmt: skip
 
 
-def test_a_restart_begins_anew(tracker: Tracker, fix: MakeFix) -> None:
+def test_restart_removes_the_track(tracker: Tracker, fix: MakeFix) -> None:
     tracker.accept(fix(100 * S, [0, 0, 0]))
     tracker.accept(fix(100 * S, [0, 0, 0], uav="2:1"))
     assert tracker.uavs == ["1:1", "2:1"]
@@ -173,7 +173,7 @@ def test_a_restart_begins_anew(tracker: Tracker, fix: MakeFix) -> None:
     assert found.dt_s is None
 
 
-def test_tracks_do_not_touch_one_another(fix: MakeFix) -> None:
+def test_tracks_are_independent(fix: MakeFix) -> None:
     both, alone = Tracker(OBSERVER, SETTINGS), Tracker(OBSERVER, SETTINGS)
     for t_s in range(100, 110):
         made = fix(t_s * S, [t_s, 0, 0])
@@ -256,7 +256,7 @@ def every(interval_s: float, start_s: float, end_s: float) -> list[float]:
     return [start_s + interval_s * n for n in range(round((end_s - start_s) / interval_s))]
 
 
-def test_one_bad_report_is_refused_and_nothing_is_gated_on_it(fix: MakeFix) -> None:
+def test_single_outlier_is_rejected_and_does_not_affect_the_gate(fix: MakeFix) -> None:
     """The following good reports are far from the outlier and near the last accepted report."""
     tracker = tracking()
     made = flight(
@@ -270,7 +270,7 @@ def test_one_bad_report_is_refused_and_nothing_is_gated_on_it(fix: MakeFix) -> N
     assert "m off, at most" in refused.detail
 
 
-def test_a_glitch_is_sat_out(fix: MakeFix) -> None:
+def test_short_glitch_is_rejected_throughout(fix: MakeFix) -> None:
     """25 m to the north for 0.8 s: none of it is used, and the bounds hold."""
     tracker = tracking()
     for one in flight(
@@ -287,7 +287,7 @@ def test_a_glitch_is_sat_out(fix: MakeFix) -> None:
     assert seen(tracker, 40).reports == 196
 
 
-def test_a_jump_that_lasts_is_followed_once(fix: MakeFix) -> None:
+def test_lasting_jump_reacquires_the_track_once(fix: MakeFix) -> None:
     """Rejected until it is confirmed; then the track restarts from it."""
     tracker = tracking()
     jumped = flight(fix, every(0.2, 0, 40), lambda t_s: (25, 0, 0) if t_s > 9.9 else (0, 0, 0))
@@ -307,7 +307,7 @@ def test_a_jump_that_lasts_is_followed_once(fix: MakeFix) -> None:
 
 
 @pytest.mark.parametrize("rate_hz", [5, 10, 25, 50])
-def test_a_jump_is_followed_at_any_rate(fix: MakeFix, rate_hz: int) -> None:
+def test_jump_is_reacquired_at_any_report_rate(fix: MakeFix, rate_hz: int) -> None:
     tracker = tracking()
     times_s = every(1 / rate_hz, 0, 10)
     jumped = flight(fix, times_s, lambda t_s: (400, 0, 0) if t_s > 4.99 else (0, 0, 0))
@@ -315,7 +315,7 @@ def test_a_jump_is_followed_at_any_rate(fix: MakeFix, rate_hz: int) -> None:
     assert sum(isinstance(one, Estimate) and one.reacquired for one in outcomes) == 1
 
 
-def test_a_change_of_the_height_s_datum_has_its_own_reason(fix: MakeFix) -> None:
+def test_height_datum_change_is_rejected_as_altitude_jump(fix: MakeFix) -> None:
     tracker = tracking()
     made = flight(fix, every(0.2, 0, 20), lambda t_s: (0, 0, -40) if t_s > 9.9 else (0, 0, 0))
     found = reasons(tracker.accept(one)[0] for one in made)
@@ -324,7 +324,7 @@ def test_a_change_of_the_height_s_datum_has_its_own_reason(fix: MakeFix) -> None
     holds(seen(tracker, 20), circling(20)[0] - np.array([0, 0, 40.0]))
 
 
-def test_positions_that_are_sent_again_are_not_used(fix: MakeFix) -> None:
+def test_repeated_positions_are_rejected_as_frozen(fix: MakeFix) -> None:
     """Fresh stamps and velocities with old positions for three seconds, then normal flight."""
     tracker, outcomes = tracking(), []
     made = flight(fix, every(0.2, 0, 20))
@@ -338,7 +338,7 @@ def test_positions_that_are_sent_again_are_not_used(fix: MakeFix) -> None:
     assert all(isinstance(one, Rejection) for one in outcomes[50:65])
 
 
-def test_a_position_sent_again_just_after_a_jump_was_believed_is_not_used(fix: MakeFix) -> None:
+def test_repeated_position_after_reacquisition_is_rejected_as_frozen(fix: MakeFix) -> None:
     tracker = tracking()
     for one in flight(fix, every(0.2, 0, 20), lambda t_s: (400, 0, 0) if t_s > 9.9 else (0, 0, 0)):
         outcome = tracker.accept(one)[0]
@@ -357,7 +357,7 @@ def two_under_one_id(fix: MakeFix, end_s: float) -> list[Fix]:
     return sorted(here + there, key=lambda one: one.sender_ns)
 
 
-def test_two_vehicles_under_one_id_are_said(fix: MakeFix) -> None:
+def test_duplicate_id_is_reported(fix: MakeFix) -> None:
     """First the second vehicle's reports are rejected, then, while both continue, those of both."""
     tracker = tracking()
     outcomes = [tracker.accept(one)[0] for one in two_under_one_id(fix, 5.9)]
@@ -368,14 +368,14 @@ def test_two_vehicles_under_one_id_are_said(fix: MakeFix) -> None:
     assert late[Reason.SHARED_ID] >= 10
 
 
-def test_of_two_vehicles_under_one_id_neither_becomes_the_track(fix: MakeFix) -> None:
+def test_track_does_not_jump_between_vehicles_of_one_id(fix: MakeFix) -> None:
     """While both continue, the track does not jump from one to the other."""
     tracker = tracking()
     outcomes = [tracker.accept(one)[0] for one in two_under_one_id(fix, 20)]
     assert not any(isinstance(one, Estimate) and one.reacquired for one in outcomes)
 
 
-def test_a_hole_is_coasted_over(fix: MakeFix) -> None:
+def test_track_coasts_over_a_gap(fix: MakeFix) -> None:
     """12 s without a report: the bound grows and holds; the first report after it is accepted."""
     tracker = tracking()
     for one in flight(fix, every(0.2, 0, 10)):
@@ -397,7 +397,7 @@ def test_a_hole_is_coasted_over(fix: MakeFix) -> None:
 
 
 @pytest.mark.parametrize(("gap_s", "anew"), [(59.9, False), (60.1, True)])
-def test_a_lost_track_begins_anew(fix: MakeFix, gap_s: float, anew: bool) -> None:
+def test_lost_track_restarts_at_the_next_report(fix: MakeFix, gap_s: float, anew: bool) -> None:
     """Wherever it reappears: the old track is no longer compared."""
     tracker = tracking()
     tracker.accept(fix(0, [0, 0, 0], [0, 0, 0]))
@@ -422,13 +422,13 @@ def errors_m(fix: MakeFix, feed_mps2: float | None, ahead_s: float) -> float:
     return float(np.mean(off))
 
 
-def test_an_acceleration_fed_forward_helps_in_a_turn(fix: MakeFix) -> None:
+def test_acceleration_feedforward_reduces_error_in_a_turn(fix: MakeFix) -> None:
     """Two seconds ahead, 2.4 m/s^2 are 4.8 m. Noise is smoothed as well."""
     assert errors_m(fix, 5.0, 2.0) < 0.6 * errors_m(fix, None, 2.0)
     assert errors_m(fix, 5.0, 0.0) < 0.6 * errors_m(fix, None, 0.0)
 
 
-def test_what_is_fed_forward_is_within_the_bound(fix: MakeFix) -> None:
+def test_feedforward_displacement_is_included_in_the_bound(fix: MakeFix) -> None:
     """It moves the estimate, and the bound grows by the full displacement in that direction."""
     plain, fed = tracking(), tracking(5.0)
     for n in range(31):
@@ -449,7 +449,7 @@ def test_what_is_fed_forward_is_within_the_bound(fix: MakeFix) -> None:
     assert earlier.position_ned_m.tolist() == seen(plain, 5.5).position_ned_m.tolist()
 
 
-def test_no_more_is_fed_forward_than_is_possible(fix: MakeFix) -> None:
+def test_feedforward_acceleration_is_limited(fix: MakeFix) -> None:
     """Such noisy velocities refute nothing and raise no limit."""
     tracker, noise = tracking(3.0), replace(NOISE, velocity_mps=20.0)
     for n in range(31):  # 5 m/s^2
@@ -460,7 +460,7 @@ def test_no_more_is_fed_forward_than_is_possible(fix: MakeFix) -> None:
 
 
 @pytest.mark.parametrize("doubt_s", [0.0, 0.4])
-def test_no_adversary_leaves_what_the_fleet_says(fix: MakeFix, doubt_s: float) -> None:
+def test_adversaries_stay_within_the_published_track_bounds(fix: MakeFix, doubt_s: float) -> None:
     """Alternating accelerations, full noise, a clock error: no report is rejected, and the truth
     stays within the bounds."""
     for seed in range(rounds(40, 150)):
@@ -489,7 +489,7 @@ def test_no_adversary_leaves_what_the_fleet_says(fix: MakeFix, doubt_s: float) -
             velocity, t_s = velocity + push * step_s, round(t_s + step_s, 9)
 
 
-def test_doubt_of_the_clock_is_worth_the_way_flown_in_it(fix: MakeFix) -> None:
+def test_clock_uncertainty_adds_distance_flown(fix: MakeFix) -> None:
     tracker = tracking()
     tracker.accept(fix(0, [0, 0, 0], [10, 0, 0], noise=NOISE))
     a, b = seen(tracker, 1), seen(tracker, 1, doubt_s=0.5)
@@ -504,7 +504,7 @@ def test_doubt_of_the_clock_is_worth_the_way_flown_in_it(fix: MakeFix) -> None:
     assert b.horizontal_bound_m - a.horizontal_bound_m == pytest.approx(0.5 * 30.0)
 
 
-def test_doubt_of_the_clock_covers_an_acceleration_in_it(fix: MakeFix) -> None:
+def test_clock_uncertainty_covers_acceleration(fix: MakeFix) -> None:
     """At full acceleration and a clock one second early: 2.5 m beyond the path at constant
     speed.
     """
@@ -517,7 +517,7 @@ def test_doubt_of_the_clock_covers_an_acceleration_in_it(fix: MakeFix) -> None:
         holds(seen(tracker, ahead_s, doubt_s=1.0), np.array([5.0 * true_s**2 / 2, 0, 0]))
 
 
-def test_doubt_of_the_clock_covers_a_turn_that_ends_in_it(fix: MakeFix) -> None:
+def test_clock_uncertainty_covers_a_change_of_acceleration(fix: MakeFix) -> None:
     """It brakes at 4 m/s^2, which is fed forward, and accelerates at 5 m/s^2 after the last report.
     The prediction for 3.0 s must still hold at 3.4 s."""
     tracker, exact = tracking(5.0), replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6)
@@ -531,7 +531,7 @@ def test_doubt_of_the_clock_covers_a_turn_that_ends_in_it(fix: MakeFix) -> None:
         holds(seen(tracker, 2 + ahead_s, doubt_s=0.4), truth)
 
 
-def test_who_is_near_is_told_by_the_newest_reports(fix: MakeFix) -> None:
+def test_nearby_uavs_are_found_by_their_newest_reports(fix: MakeFix) -> None:
     """Distance in three dimensions: 60 m east and 80 m up are 100 m."""
     tracker = tracking()
     tracker.accept(fix(0, [900, 0, 0], uav="1:1"))
@@ -545,14 +545,14 @@ def test_who_is_near_is_told_by_the_newest_reports(fix: MakeFix) -> None:
     assert tracker.near(place, 150.0) == ["2:1"]
 
 
-def test_without_a_velocity_doubt_is_worth_the_greatest_speed(fix: MakeFix) -> None:
+def test_clock_uncertainty_without_velocity_uses_the_speed_limit(fix: MakeFix) -> None:
     tracker = Tracker(OBSERVER, SETTINGS)
     tracker.accept(fix(0, [0, 0, 0]))
     a, b = seen(tracker, 1), seen(tracker, 1, doubt_s=0.5)
     assert b.bound_m - a.bound_m == pytest.approx(0.5 * 30.0)
 
 
-def test_what_is_usual_is_within_what_is_possible(fix: MakeFix) -> None:
+def test_error_p95_does_not_exceed_the_bound(fix: MakeFix) -> None:
     """The usual clock error was larger than its present bound."""
     tracker = Tracker(KinematicObserver(KinematicModel(30.0, 8.0)), SETTINGS)
     for t_s in range(100, 130):

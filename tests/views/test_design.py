@@ -8,7 +8,7 @@ from companion.values import Limits
 from companion.views.design import Assumed, _row
 
 
-def test_the_peak_error_is_that_of_the_bounds_assumed() -> None:
+def test_peak_error_uses_the_assumed_bounds() -> None:
     """Acceleration and position noise have different weights and are not interchangeable."""
     gain = np.array([[1.2], [0.8]])
     assumed = Assumed(

@@ -21,7 +21,7 @@ def shown(found: Verdict | None, machine: Blame | None = None) -> Json | None:
     return None if why is None else {"verdict": level} | as_json(why, UtcNs)
 
 
-def test_a_verdict_is_shown_with_its_reason_and_the_gains() -> None:
+def test_verdict_is_shown_with_reason_and_gains() -> None:
     assert shown(WEAK) == {
         "verdict": "weak",
         "cause": "rate",
@@ -35,7 +35,7 @@ def test_a_verdict_is_shown_with_its_reason_and_the_gains() -> None:
     assert health.verdict(None, None) == (None, None)
 
 
-def test_a_machine_that_is_behind_is_to_blame_for_what_is_not_good() -> None:
+def test_overloaded_machine_is_blamed_for_bad_links() -> None:
     machine = health.behind(LagSeen(newest_s=7.0, p95_s=7.0, max_s=7.04, behind=True))
     assert machine is not None
     assert machine.reason == "this machine is overloaded: frames wait up to 7.0 s"
@@ -55,7 +55,7 @@ def test_a_machine_that_is_behind_is_to_blame_for_what_is_not_good() -> None:
     assert health.behind(LagSeen(newest_s=7.0, p95_s=7.0, max_s=7.04, behind=False)) is None
 
 
-def test_the_headline_counts_what_is_good() -> None:
+def test_headline_counts_good_links() -> None:
     good = Verdict(uav="2:1", level=Level.GOOD, blame=None, since_ns=0)
     found = health.summary([WEAK, good, good], None)
     assert (found.good, found.weak, found.none) == (2, 1, 0)
@@ -63,7 +63,7 @@ def test_the_headline_counts_what_is_good() -> None:
     assert health.summary([], None).headline == "no UAV to aim at"
 
 
-def test_the_headline_counts_whom_no_node_serves_and_names_whom_others_do() -> None:
+def test_headline_counts_unserved_uavs_and_lists_other_nodes() -> None:
     good = Verdict(uav="2:1", level=Level.GOOD, blame=None, since_ns=0)
     found = health.summary([good], None, unserved=2, elsewhere=3)
     assert (found.none, found.headline) == (2, "1 of 3 links good, 3 with other nodes")

@@ -39,7 +39,7 @@ def shown(message: Any) -> Any:
     return json.loads(encode(mavlink_messages.dialect().message(found, UtcNs)))
 
 
-def test_a_heartbeat_is_as_mavlink2rest_has_it() -> None:
+def test_heartbeat_matches_the_mavlink2rest_format() -> None:
     heartbeat = generated.MAVLink_heartbeat_message(12, 3, 81, 19, 4, 3)
     assert shown(heartbeat) == {
         "message": {
@@ -62,12 +62,12 @@ def test_a_heartbeat_is_as_mavlink2rest_has_it() -> None:
     }
 
 
-def test_an_unknown_value_of_an_enumeration_is_its_number() -> None:
+def test_unknown_enumeration_value_is_shown_as_a_number() -> None:
     heartbeat = generated.MAVLink_heartbeat_message(250, 3, 0, 0, 0, 3)
     assert shown(heartbeat)["message"]["mavtype"] == {"type": 250}
 
 
-def test_text_comes_as_characters() -> None:
+def test_text_fields_are_character_lists() -> None:
     param = generated.MAVLink_param_value_message(b"SYSID_THISMAV", 0.1, 9, 3, 1)
     message = shown(param)["message"]
     assert message["param_id"] == [*"SYSID_THISMAV", "\0", "\0", "\0"]
@@ -75,7 +75,7 @@ def test_text_comes_as_characters() -> None:
     assert message["param_type"] == {"type": "MAV_PARAM_TYPE_REAL32"}
 
 
-def test_arrays_and_what_is_not_a_number() -> None:
+def test_arrays_are_lists_and_nan_is_null() -> None:
     nan = float("nan")
     attitude = generated.MAVLink_attitude_quaternion_message(5, 1, 0, 0, nan, 0, 0, 0, [0.5] * 4)
     message = shown(attitude)["message"]
@@ -85,7 +85,7 @@ def test_arrays_and_what_is_not_a_number() -> None:
 
 @settings(max_examples=examples(200), deadline=None)
 @given(data=st.data())
-def test_every_message_decodes_as_pymavlink_decodes_it(data: st.DataObject) -> None:
+def test_every_message_decodes_like_pymavlink(data: st.DataObject) -> None:
     msgid = data.draw(st.sampled_from(sorted(generated.mavlink_map)))
     kind = generated.mavlink_map[msgid]
     size = kind.unpacker.size
@@ -126,7 +126,7 @@ def frame(t_ns: int, source: Source, msgid: int = 0) -> Frame:
     return Frame(t_ns=t_ns, link="link", source=source, msgid=msgid, raw=b"")
 
 
-def test_the_newest_is_kept_and_all_are_counted() -> None:
+def test_newest_message_is_kept_and_all_are_counted() -> None:
     store = LastMessages()
     for second in range(11):
         store.add(frame(second * 10**9, SENDER))
@@ -137,7 +137,7 @@ def test_the_newest_is_kept_and_all_are_counted() -> None:
     assert store.find(SENDER, 1) is None
 
 
-def test_a_flood_of_senders_does_not_fill_the_memory() -> None:
+def test_flood_of_senders_uses_bounded_memory() -> None:
     store = LastMessages(most=100)
     store.add(frame(0, Source(1, 1)))
     for number in range(10_000):
@@ -149,7 +149,7 @@ def test_a_flood_of_senders_does_not_fill_the_memory() -> None:
     assert stayed.count == 10_001
 
 
-def test_what_is_listed_does_not_change_any_more() -> None:
+def test_listed_messages_are_snapshots() -> None:
     store = LastMessages()
     store.add(frame(0, SENDER))
     listed = store.by_sender()[SENDER][0]

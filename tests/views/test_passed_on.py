@@ -75,7 +75,7 @@ def said(fold: Pipeline, t_s: float, out: passed_on.Positions | None = None) -> 
     return [mav.decode(bytearray(pack(message, 0))) for message in messages]
 
 
-def test_a_vehicle_is_said_where_it_is_now_by_its_own_clock() -> None:
+def test_vehicle_is_forwarded_at_its_current_position_and_own_time() -> None:
     """0.7 s after its newest report, under its own id and in its own north direction."""
     fold = pipeline()
     for n in range(6):
@@ -94,7 +94,7 @@ def test_a_vehicle_is_said_where_it_is_now_by_its_own_clock() -> None:
 
 
 @pytest.mark.parametrize("geoid_m", [None, -30.0])
-def test_a_vehicle_is_said_to_traffic_management(geoid_m: float | None) -> None:
+def test_vehicle_is_forwarded_as_utm_global_position(geoid_m: float | None) -> None:
     """Decoded by pymavlink; a height above the ellipsoid only where the geoid is known."""
     fold = pipeline({"geoid_m": geoid_m, "geoid_error_m": 2.0} if geoid_m else None)
     for n in range(6):
@@ -127,7 +127,7 @@ def test_a_vehicle_is_said_to_traffic_management(geoid_m: float | None) -> None:
         assert one.v_acc == math.ceil((track.vertical_bound_m + 2) * 1e3)
 
 
-def test_what_is_not_known_any_more_is_not_said() -> None:
+def test_stale_tracks_are_not_forwarded() -> None:
     """A track is stale after 15 s by default."""
     fold = pipeline()
     fold.step(telemetry(0))
@@ -135,7 +135,7 @@ def test_what_is_not_known_any_more_is_not_said() -> None:
     assert said(fold, 16) == passed_on.events(fold, tracks(fold, 16), 10) == []
 
 
-def test_times_only_go_forward_but_for_a_reboot() -> None:
+def test_forwarded_times_increase_except_after_a_reboot() -> None:
     fold, out = pipeline(), passed_on.Positions()
     for n in range(6):
         fold.step(telemetry(n / 2))
@@ -149,7 +149,7 @@ def test_times_only_go_forward_but_for_a_reboot() -> None:
     assert again.time_boot_ms == pytest.approx(26_000, abs=5)
 
 
-def test_reports_that_come_ten_seconds_late_take_nothing_back() -> None:
+def test_late_reports_do_not_move_the_forwarded_position_back() -> None:
     """Every second report is late; the forwarded track continues every 0.2 s."""
     fold, out = pipeline(), passed_on.Positions()
     frames = sorted(
@@ -171,7 +171,7 @@ def test_reports_that_come_ten_seconds_late_take_nothing_back() -> None:
         last_ms, north_m = one.time_boot_ms, at_m[0]
 
 
-def test_an_event_says_what_its_numbers_are() -> None:
+def test_cot_event_states_bounds_course_and_speed() -> None:
     """The guaranteed bound, not a standard deviation; plus the geoid error where it applies."""
     fold = pipeline()
     for n in range(6):
@@ -196,7 +196,7 @@ def test_an_event_says_what_its_numbers_are() -> None:
 
 
 @pytest.mark.parametrize("datum", ["telemetry", "geometric"])
-def test_where_the_geoid_is_known_heights_are_brought_from_one_to_the_other(datum: str) -> None:
+def test_heights_are_converted_where_the_geoid_is_known(datum: str) -> None:
     """With the geoid: above mean sea level. Without: above the ellipsoid, with the conversion error
     in the bound."""
     fold = pipeline({"geoid_m": 48.0, "geoid_error_m": 3.0})
@@ -220,7 +220,7 @@ def test_where_the_geoid_is_known_heights_are_brought_from_one_to_the_other(datu
         assert other.vertical_bound_m > track.vertical_bound_m + 100  # 107 m less 3
 
 
-def test_a_companion_does_not_take_in_what_a_companion_said() -> None:
+def test_events_of_a_companion_are_rejected() -> None:
     fold = pipeline()
     fold.step(telemetry(0))
     (text,) = passed_on.events(fold, tracks(fold, 1), 10.0)
@@ -229,7 +229,7 @@ def test_a_companion_does_not_take_in_what_a_companion_said() -> None:
 
 
 @pytest.mark.parametrize(("datum", "told"), [(0, False), (1, True)])
-def test_heights_by_pressure_are_none_above_the_ellipsoid(datum: int, told: bool) -> None:
+def test_pressure_altitude_is_not_given_as_ellipsoid_height(datum: int, told: bool) -> None:
     fold = pipeline()
     fold.step(adsb(0, datum))
     assert said(fold, 0.5) == []  # it sends no own reports
@@ -240,7 +240,7 @@ def test_heights_by_pressure_are_none_above_the_ellipsoid(datum: int, told: bool
     assert event.uid == "uav-companion-beams.icao.4CA7B3"
 
 
-def test_an_aircraft_that_is_heard_twice_is_said_once() -> None:
+def test_aircraft_received_twice_is_forwarded_once() -> None:
     fold = pipeline()
     for n in range(8):
         fold.step(telemetry(n))

@@ -36,7 +36,7 @@ def test_every_setting_is_shown_with_its_default() -> None:
     }  # fmt: skip
 
 
-def test_a_file_and_the_options_over_it_are_told_apart(tmp_path: Path) -> None:
+def test_settings_from_file_and_options_are_distinguished(tmp_path: Path) -> None:
     path = tmp_path / "mast.toml"
     # A key that the file sets to its default still has the file as source.
     path.write_text(
@@ -55,7 +55,7 @@ def test_a_file_and_the_options_over_it_are_told_apart(tmp_path: Path) -> None:
     }
 
 
-def test_what_a_file_names_is_the_files_and_nothing_else_is(tmp_path: Path) -> None:
+def test_only_keys_in_the_file_have_file_source(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "elements.txt", [[0.0, 0.0, 0.0], [0.0, 0.01, 0.0]])
     path = tmp_path / "mast.toml"
     gains = resources.files("companion.tracking.design") / "kinematic_default.json"
@@ -69,12 +69,14 @@ def test_what_a_file_names_is_the_files_and_nothing_else_is(tmp_path: Path) -> N
     assert shown["array.positions_m"] == ("file", "mast.toml")
 
 
-def test_no_file_is_told_where_there_is_none() -> None:
+def test_no_file_source_without_a_file() -> None:
     assert told(load(None), given(load(None), Origin("file", "None"))) == {}
 
 
 @pytest.mark.parametrize("center", [None, "5:1"])
-def test_a_replayed_recording_is_named(cut_log: Path, tmp_path: Path, center: str | None) -> None:
+def test_replayed_recording_is_named_as_source(
+    cut_log: Path, tmp_path: Path, center: str | None
+) -> None:
     held = settings_for([cut_log], None, "1:1").override(link={"needed_db": 6.0})
     recording = tmp_path / "flight.mcap"
     with writer_for([cut_log], held, recording) as writer:

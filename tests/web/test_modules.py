@@ -40,7 +40,7 @@ def node() -> str:
     return found
 
 
-def test_every_module_is_asked_for_at_once() -> None:
+def test_every_module_is_preloaded() -> None:
     """Otherwise the browser discovers each module only after reading its importer."""
     needed, asked = set[str](), ["main.js"]
     while asked:
@@ -54,7 +54,7 @@ def test_every_module_is_asked_for_at_once() -> None:
 
 
 @pytest.mark.timeout(600)  # for a hanging test
-def test_the_modules_of_the_page_do_what_their_tests_say(tmp_path: Path) -> None:
+def test_page_module_tests_pass(tmp_path: Path) -> None:
     tests = sorted(HERE.glob("*.test.mjs"))
     assert tests
     # In one process: `node --test` starts one per file, which takes longer than the tests.
@@ -74,7 +74,7 @@ def test_the_modules_of_the_page_do_what_their_tests_say(tmp_path: Path) -> None
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_the_page_uses_no_deprecated_name() -> None:
+def test_page_uses_no_deprecated_names() -> None:
     """They are removed in the next version."""
     old = {name for names in FORMER_NAMES.values() for name in names} - {"source"}
     old |= {member.name for member in members(UavState) if member.meaning.deprecated}

@@ -99,7 +99,7 @@ def limited(azimuths_deg: tuple[float, float], elevations_deg: tuple[float, floa
         ),
     ],
 )
-def test_one_clear_reason(
+def test_direction_outside_one_limit_gets_its_reason(
     coverage: Coverage, in_array: FloatArray, in_body: FloatArray, reason: str | None
 ) -> None:
     assert why(coverage, in_array, in_body) == reason
@@ -108,7 +108,7 @@ def test_one_clear_reason(
     assert isinstance(margin, float)
 
 
-def test_of_several_reasons_the_first_counts_and_each_direction_has_its_own() -> None:
+def test_first_violated_limit_is_reported_per_direction() -> None:
     coverage = Coverage(
         field_of_view_rad=math.radians(90),
         azimuth_limits_rad=rad(-30, 30),
@@ -155,7 +155,7 @@ def test_of_several_reasons_the_first_counts_and_each_direction_has_its_own() ->
         (Coverage(hidden=(sector(170, -170, -10, 10),)), FRONT, towards(180, 10), 0.0),
     ],
 )
-def test_margins_known_by_geometry(
+def test_margins_match_hand_computed_values(
     coverage: Coverage, in_array: FloatArray, in_body: FloatArray, margin_deg: float
 ) -> None:
     assert np.degrees(margin_rad(coverage, in_array, in_body)) == pytest.approx(
@@ -219,7 +219,7 @@ def cone_edge(half_rad: float, points: int) -> FloatArray:
 
 @given(SEEDS)
 @settings(max_examples=examples(300), deadline=None)
-def test_the_margin_is_the_nearest_edge_and_nothing_nearer_is_refused(seed: int) -> None:
+def test_margin_equals_angle_to_nearest_coverage_edge(seed: int) -> None:
     """All limits combined, with the array mounted at random on the body."""
     rng = np.random.default_rng(seed)
     view = float(rng.uniform(0.5, 2 * math.pi)) if rng.random() < 0.3 else None
@@ -254,11 +254,11 @@ def test_the_margin_is_the_nearest_edge_and_nothing_nearer_is_refused(seed: int)
         assert set(refusals(coverage, inside @ array_from_body.T, inside)) == {None}
 
 
-def test_a_sector_says_itself_in_degrees() -> None:
+def test_sector_formats_its_limits_in_degrees() -> None:
     assert str(sector(-0.04, 29.96, -12.34, 90)) == "azimuth 0 to 30, elevation -12.3 to 90"
 
 
-def test_margins_come_in_any_shape() -> None:
+def test_margins_accept_arrays_of_any_shape() -> None:
     rng = np.random.default_rng(5)
     directions = rng.standard_normal((4, 5, 3))
     directions /= np.linalg.norm(directions, axis=-1, keepdims=True)
@@ -290,20 +290,20 @@ def test_margins_come_in_any_shape() -> None:
         ((0, 10, 0, math.nan), "elevation 0 to nan degrees: give ascending angles from -90 to 90"),
     ],
 )
-def test_a_sector_that_is_none_is_refused(degrees: tuple[float, ...], reason: str) -> None:
+def test_invalid_sector_is_rejected(degrees: tuple[float, ...], reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         sector(*degrees)
 
 
 @pytest.mark.parametrize("degrees", [0.0, -10.0, 360.1, math.nan, math.inf])
-def test_a_field_of_view_that_is_none_is_refused(degrees: float) -> None:
+def test_invalid_field_of_view_is_rejected(degrees: float) -> None:
     with pytest.raises(
         ValueError, match=r"field of view .* degrees: give more than 0, at most 360"
     ):
         Coverage(field_of_view_rad=math.radians(degrees))
 
 
-def test_steering_limits_that_are_none_are_refused() -> None:
+def test_invalid_steering_limits_are_rejected() -> None:
     with pytest.raises(ValueError, match="steering limits: azimuth 10 to 10 degrees: give a range"):
         limited((10, 10), (-90, 90))
     with pytest.raises(

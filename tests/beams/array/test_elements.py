@@ -46,14 +46,14 @@ def gain_dbi(element: Element, azimuth_deg: float, elevation_deg: float) -> floa
         (103, 0, -22.0),
     ],
 )
-def test_known_gains_of_the_standards_element(
+def test_tr38901_element_gains_match_known_values(
     azimuth_deg: float, elevation_deg: float, dbi: float
 ) -> None:
     assert gain_dbi(TR38901, azimuth_deg, elevation_deg) == pytest.approx(dbi, abs=1e-9)
 
 
 @given(st.floats(0, 180), st.floats(-180, 180))
-def test_the_standards_element_is_the_table_written_out(zenith_deg: float, phi_deg: float) -> None:
+def test_tr38901_element_matches_table_7_3_1(zenith_deg: float, phi_deg: float) -> None:
     """3GPP TR 38.901 table 7.3-1 measures theta from the zenith: 90 degrees is level."""
     vertical_db = -min(12 * ((zenith_deg - 90) / 65) ** 2, 30)
     horizontal_db = -min(12 * (phi_deg / 65) ** 2, 30)
@@ -63,7 +63,7 @@ def test_the_standards_element_is_the_table_written_out(zenith_deg: float, phi_d
 
 
 @pytest.mark.parametrize("exponent", [0.0, 0.5, 1.0, 2.0, 3.7, 8.0])
-def test_a_cosine_element_radiates_all_of_its_power(exponent: float) -> None:
+def test_cosine_element_gain_integrates_to_4_pi(exponent: float) -> None:
     """The integral of the power gain over the sphere is 4 pi."""
     nodes, shares = np.polynomial.legendre.leggauss(400)
     cosine, weight = (nodes + 1) / 2, shares / 2  # ahead; nothing is radiated behind
@@ -77,7 +77,7 @@ def test_a_cosine_element_radiates_all_of_its_power(exponent: float) -> None:
     assert total == pytest.approx(4 * math.pi, rel=1e-5)
 
 
-def test_a_cosine_element_has_the_shape_of_its_name() -> None:
+def test_cosine_element_amplitude_follows_the_cosine() -> None:
     best = gain_dbi(Element(ElementPattern.COSINE, 2.0), 0, 0)
     assert best == pytest.approx(10 * math.log10(6))
     aside = gain_dbi(Element(ElementPattern.COSINE, 2.0), 40, 30)
@@ -126,7 +126,7 @@ def random_direction(rng: np.random.Generator) -> FloatArray:
 @pytest.mark.parametrize("element", ELEMENTS)
 @given(seed=SEEDS)
 @settings(max_examples=examples(60), deadline=None)
-def test_no_direction_within_the_radius_is_out_of_the_range(element: Element, seed: int) -> None:
+def test_amplitudes_within_the_radius_stay_within_the_range(element: Element, seed: int) -> None:
     rng = np.random.default_rng(seed)
     direction = random_direction(rng)
     radius = float(rng.choice([0.0, 1e-9, 1e-3, rng.uniform(0, 0.3), rng.uniform(0, math.pi)]))
@@ -146,7 +146,7 @@ def test_no_direction_within_the_radius_is_out_of_the_range(element: Element, se
 
 @given(seed=SEEDS)
 @settings(max_examples=examples(60), deadline=None)
-def test_the_range_is_attained_by_the_cosine(seed: int) -> None:
+def test_cosine_amplitude_range_is_attained(seed: int) -> None:
     """The extremes lie straight along the outward direction and straight opposite to it."""
     rng = np.random.default_rng(seed)
     element = Element(ElementPattern.COSINE, float(rng.uniform(1, 4)))
@@ -164,7 +164,7 @@ def test_the_range_is_attained_by_the_cosine(seed: int) -> None:
 
 
 @pytest.mark.parametrize("degrees", [-70, -20, 0, 10, 35, 70])
-def test_the_range_of_the_standards_element_is_tight_in_its_main_cuts(degrees: float) -> None:
+def test_tr38901_amplitude_range_is_tight_in_the_principal_cuts(degrees: float) -> None:
     """The maximum is attained; so is the minimum, except in the corner where both cuts combine."""
     radius = math.radians(15)
     far, near = abs(degrees) + 15, max(abs(degrees) - 15, 0)
@@ -180,6 +180,6 @@ def test_the_range_of_the_standards_element_is_tight_in_its_main_cuts(degrees: f
 
 
 @pytest.mark.parametrize("exponent", [-0.1, -3.0, math.nan, math.inf])
-def test_an_exponent_below_zero_is_refused(exponent: float) -> None:
+def test_negative_cosine_exponent_is_rejected(exponent: float) -> None:
     with pytest.raises(ValueError, match=r"exponent of the cosine pattern is .*; give 0 or more"):
         Element(ElementPattern.COSINE, exponent)

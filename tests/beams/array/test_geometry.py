@@ -14,7 +14,7 @@ LIGHT = geometry.SPEED_OF_LIGHT_MPS
 """Frequency at which the wavelength is one metre."""
 
 
-def test_elements_stand_along_y() -> None:
+def test_linear_array_lies_along_y() -> None:
     array = geometry.uniform_linear(5, 3e9, spacing_wavelengths=0.5, array_from_body=EYE)
     assert array.size == 5
     assert array.wavelength_m == pytest.approx(299_792_458 / 3e9)
@@ -28,7 +28,9 @@ def test_elements_stand_along_y() -> None:
     ("elements", "frequency_hz", "spacing"),
     [(0, 1e9, 0.5), (-1, 1e9, 0.5), (4, 0.0, 0.5), (4, -1e9, 0.5), (4, 1e9, 0.0), (4, 1e9, -0.5)],
 )
-def test_what_is_no_array_is_refused(elements: int, frequency_hz: float, spacing: float) -> None:
+def test_array_without_elements_is_rejected(
+    elements: int, frequency_hz: float, spacing: float
+) -> None:
     with pytest.raises(ValueError, match="at least one element"):
         geometry.uniform_linear(
             elements, frequency_hz, spacing_wavelengths=spacing, array_from_body=EYE
@@ -36,7 +38,7 @@ def test_what_is_no_array_is_refused(elements: int, frequency_hz: float, spacing
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf])
-def test_what_is_no_number_is_refused(bad: float) -> None:
+def test_invalid_frequency_or_spacing_is_rejected(bad: float) -> None:
     with pytest.raises(ValueError, match="a frequency and a spacing above 0"):
         geometry.uniform_linear(4, bad, spacing_wavelengths=0.5, array_from_body=EYE)
     with pytest.raises(ValueError, match="a frequency and a spacing above 0"):
@@ -44,14 +46,14 @@ def test_what_is_no_number_is_refused(bad: float) -> None:
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(0, 4), (4, 0), (-1, -1)])
-def test_what_is_no_rectangle_is_refused(rows: int, columns: int) -> None:
+def test_rectangle_without_elements_is_rejected(rows: int, columns: int) -> None:
     with pytest.raises(ValueError, match="at least one element"):
         geometry.uniform_rectangular(
             rows, columns=columns, frequency_hz=1e9, spacing_wavelengths=0.5, array_from_body=EYE
         )
 
 
-def test_a_rectangle_is_numbered_row_by_row_to_the_right_then_down() -> None:
+def test_rectangle_elements_are_numbered_row_by_row() -> None:
     array = geometry.uniform_rectangular(
         3, columns=4, frequency_hz=LIGHT, spacing_wavelengths=0.6, array_from_body=EYE
     )
@@ -63,7 +65,7 @@ def test_a_rectangle_is_numbered_row_by_row_to_the_right_then_down() -> None:
     assert array.element_from_array is None
 
 
-def test_one_row_is_the_line() -> None:
+def test_single_row_rectangle_equals_linear_array() -> None:
     row, line = (
         geometry.uniform_rectangular(
             1, columns=5, frequency_hz=3e9, spacing_wavelengths=0.5, array_from_body=EYE
@@ -76,7 +78,7 @@ def test_one_row_is_the_line() -> None:
 
 
 @pytest.mark.parametrize("elements", [2, 3, 4, 7, 32])
-def test_a_circle_has_its_spacing_between_neighbours_and_starts_at_boresight(elements: int) -> None:
+def test_circle_has_even_spacing_and_starts_at_boresight(elements: int) -> None:
     array = geometry.uniform_circular(elements, LIGHT, spacing_wavelengths=0.5, array_from_body=EYE)
     assert (array.kind, array.size, array.grid) == ("uca", elements, None)
     gaps = np.linalg.norm(array.elements_m - np.roll(array.elements_m, -1, axis=0), axis=1)
@@ -89,7 +91,7 @@ def test_a_circle_has_its_spacing_between_neighbours_and_starts_at_boresight(ele
     assert turn == pytest.approx(2 * math.pi / elements)  # from x to y
 
 
-def test_a_circle_of_one_stands_at_the_origin() -> None:
+def test_single_element_circle_lies_at_the_origin() -> None:
     assert not geometry.uniform_circular(
         1, 1e9, spacing_wavelengths=0.5, array_from_body=EYE
     ).elements_m.any()
@@ -114,7 +116,7 @@ def test_elements_of_a_circle_face_outward_unless_they_are_isotropic() -> None:
     )
 
 
-def test_elements_face_where_they_are_told_and_stay_level() -> None:
+def test_listed_elements_face_their_outward_vector_and_stay_level() -> None:
     rng = np.random.default_rng(2)
     outward = np.concatenate(
         [rng.standard_normal((20, 3)), [[0, 0, 2], [0, 0, -0.5], [1e-13, 0, -1], [-3, 0, 0]]]
@@ -141,7 +143,7 @@ def test_elements_face_where_they_are_told_and_stay_level() -> None:
     assert np.array_equal(turned[21, 1], [0, 1, 0])
 
 
-def test_what_is_listed_is_kept() -> None:
+def test_listed_array_keeps_its_arguments() -> None:
     places = np.random.default_rng(4).uniform(-1, 1, (6, 3))
     lever = np.array([0.1, -0.2, 0.3])
     array = geometry.listed(places, 2e9, array_from_body=EYE, element=COSINE, lever_arm_m=lever)
@@ -177,7 +179,7 @@ TWICE = np.concatenate([PLACES, PLACES[2:3] + 1e-12])
         (PLACES, np.zeros((5, 3)), "with a length above 0"),
     ],
 )
-def test_a_list_that_is_no_array_is_refused(
+def test_invalid_element_list_is_rejected(
     places: FloatArray, outward: FloatArray | None, reason: str
 ) -> None:
     with pytest.raises(ValueError, match=reason):
@@ -187,7 +189,7 @@ def test_a_list_that_is_no_array_is_refused(
 
 
 @pytest.mark.parametrize("rings", [1, 2, 5])
-def test_a_hexagon_has_its_elements_on_a_triangular_lattice(rings: int) -> None:
+def test_hexagonal_array_is_a_triangular_lattice(rings: int) -> None:
     """Neighbours are a spacing apart, inner elements have six; 60° of rotation change nothing."""
     array = geometry.hexagonal(rings, LIGHT, spacing_wavelengths=0.7, array_from_body=EYE)
     placed = array.elements_m
@@ -205,6 +207,6 @@ def test_a_hexagon_has_its_elements_on_a_triangular_lattice(rings: int) -> None:
     assert turned[order[1]] == pytest.approx(placed[order[0]], abs=1e-9)
 
 
-def test_a_hexagon_of_no_rings_is_refused() -> None:
+def test_hexagon_without_rings_is_rejected() -> None:
     with pytest.raises(UserError, match="at least one element"):
         geometry.hexagonal(0, 1e9, spacing_wavelengths=0.5, array_from_body=EYE)

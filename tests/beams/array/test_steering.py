@@ -32,7 +32,7 @@ def unit(azimuth_rad: float, elevation_rad: float) -> tuple[float, float, float]
     return (level * math.cos(azimuth_rad), level * math.sin(azimuth_rad), -math.sin(elevation_rad))
 
 
-def test_the_known_steering_vector() -> None:
+def test_steering_vector_matches_golden_values() -> None:
     """Five elements at 0, 0.1, ..., 0.4 m, 1 GHz, 45 degrees."""
     elements = np.array([[0.0, 0.1 * m, 0.0] for m in range(5)])
     array = Array(
@@ -45,7 +45,7 @@ def test_the_known_steering_vector() -> None:
 
 
 @given(DIRECTIONS, st.integers(0, 2**32 - 1))
-def test_steering_is_the_sum_written_out(angles: list[tuple[float, float]], seed: int) -> None:
+def test_steering_matches_path_length_phases(angles: list[tuple[float, float]], seed: int) -> None:
     """Elements at arbitrary positions in space."""
     elements = np.random.default_rng(seed).uniform(-0.05, 0.05, (7, 3))
     array = Array(kind="list", elements_m=elements, wavelength_m=0.01, array_from_body=np.eye(3))
@@ -59,7 +59,7 @@ def test_steering_is_the_sum_written_out(angles: list[tuple[float, float]], seed
 
 
 @given(st.floats(-1.5, 1.5))
-def test_in_the_plane_it_is_the_published_vector(theta_rad: float) -> None:
+def test_linear_array_steering_matches_the_published_formula(theta_rad: float) -> None:
     """The formula is exp(j 2 pi / wavelength d m sin theta)."""
     array = uniform_linear(8, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     found = steering.steering_matrix(array, np.array([unit(theta_rad, 0.0)]))[:, 0]
@@ -110,7 +110,7 @@ FACING = {
 @pytest.mark.parametrize("name", FACING)
 @given(angles=DIRECTIONS)
 @settings(max_examples=examples(30))
-def test_steering_has_each_elements_gain(name: str, angles: list[tuple[float, float]]) -> None:
+def test_steering_includes_each_element_gain(name: str, angles: list[tuple[float, float]]) -> None:
     array = FACING[name]
     directions = np.array([unit(*pair) for pair in angles])
     found = steering.steering_matrix(array, directions)
@@ -125,7 +125,7 @@ def test_steering_has_each_elements_gain(name: str, angles: list[tuple[float, fl
         assert np.abs(found[:, n]) == pytest.approx(gains[:, n].repeat(array.size if alike else 1))
 
 
-def test_a_direction_seen_by_an_element_that_faces_right() -> None:
+def test_directions_are_rotated_into_the_element_frame() -> None:
     """Array boresight is to the element's left; the array's right is the element's boresight."""
     right = np.array([[0.0, 1.0, 0.0]])
     array = listed(
@@ -141,13 +141,13 @@ def test_a_direction_seen_by_an_element_that_faces_right() -> None:
 
 
 @given(DIRECTIONS)
-def test_angles_are_those_of_the_directions(angles: list[tuple[float, float]]) -> None:
+def test_azimuth_and_elevation_invert_unit_directions(angles: list[tuple[float, float]]) -> None:
     azimuths, elevations = steering.angles_rad(np.array([unit(*pair) for pair in angles]))
     assert azimuths == pytest.approx(np.array([pair[0] for pair in angles]), abs=1e-6)
     assert elevations == pytest.approx(np.array([pair[1] for pair in angles]), abs=1e-6)
 
 
-def test_straight_up_is_up() -> None:
+def test_vertical_directions_have_elevation_of_90_degrees() -> None:
     # Rounding may leave a unit vector a little too long.
     _, elevations = steering.angles_rad(np.array([[0, 0, -1 - 1e-15], [0, 0, 1 + 1e-15]]))
     assert elevations == pytest.approx([math.pi / 2, -math.pi / 2])
@@ -158,7 +158,7 @@ def angle_rad(a: FloatArray, b: FloatArray) -> float:
 
 
 @given(st.floats(1.0, 5000.0), st.floats(1e-3, 0.999), st.integers(0, 2**32 - 1))
-def test_no_position_within_the_ball_is_farther_off(
+def test_pointing_bound_covers_the_error_ball_and_is_tight(
     range_m: float, share: float, seed: int
 ) -> None:
     """The tangent attains the bound."""
@@ -181,7 +181,7 @@ def test_no_position_within_the_ball_is_farther_off(
 
 
 @pytest.mark.parametrize("bound_m", [100.0, 100.1, 1e9])
-def test_inside_the_ball_every_direction_is_possible(bound_m: float) -> None:
+def test_pointing_bound_is_undefined_inside_the_error_ball(bound_m: float) -> None:
     assert steering.pointing_bound_rad(bound_m, 100.0) is None
 
 
@@ -189,7 +189,7 @@ def test_inside_the_ball_every_direction_is_possible(bound_m: float) -> None:
     ("rows", "columns"), [(1, 64), (1, 1024), (8, 8), (64, 1), (5, 33), (1, 1)]
 )
 @pytest.mark.parametrize("users", [1, 7, 300])
-def test_powers_on_a_grid_are_the_exponentials(rows: int, columns: int, users: int) -> None:
+def test_grid_phase_powers_match_exponentials(rows: int, columns: int, users: int) -> None:
     """Any number of users; small and large numbers take different code paths."""
     array = uniform_rectangular(
         rows, columns=columns, frequency_hz=30e9, spacing_wavelengths=0.7, array_from_body=np.eye(3)

@@ -34,7 +34,7 @@ EMPTY = "order = []\n[[table]]\nfrequency_hz = {}e9\nphase_deg = []\ngain_db = [
 SEEDS = st.integers(0, 2**32 - 1)
 
 
-def test_a_table_s_own_frequency_is_that_table() -> None:
+def test_calibration_at_a_listed_frequency_is_unchanged() -> None:
     found = calibration_at(TWO, 10e9)
     assert found.order == (1, 0, 2)
     assert np.degrees(found.phase_rad) == pytest.approx([170, 0, 50])  # by element
@@ -44,7 +44,7 @@ def test_a_table_s_own_frequency_is_that_table() -> None:
     assert calibration_at(TWO, 10.5e9).gain_db == (1.0, 0.2, -1.0)
 
 
-def test_between_tables_phases_go_the_shorter_way_and_bounds_are_the_larger() -> None:
+def test_interpolation_takes_shorter_phase_arc_and_larger_error_bounds() -> None:
     found = calibration_at(TWO, 10.1e9)
     turned = np.exp(1j * (np.array(found.phase_rad) - np.radians([174, 2, 46])))
     assert turned == pytest.approx([1, 1, 1])
@@ -54,7 +54,7 @@ def test_between_tables_phases_go_the_shorter_way_and_bounds_are_the_larger() ->
 
 
 @given(SEEDS, st.floats(0, 1))
-def test_cables_are_interpolated_whatever_their_length(seed: int, share: float) -> None:
+def test_interpolation_tolerates_any_common_cable_delay(seed: int, share: float) -> None:
     """A delay common to all channels rotates them by any angle; their differences stay small."""
     rng = np.random.default_rng(seed)
     common_s, own_s = rng.uniform(-1e-8, 1e-8), rng.uniform(-2e-11, 2e-11, 4)
@@ -75,7 +75,7 @@ def test_cables_are_interpolated_whatever_their_length(seed: int, share: float) 
     assert abs(np.vdot(found, wanted)) == pytest.approx(4.0)  # up to a common phase
 
 
-def test_csv_is_for_any_frequency() -> None:
+def test_csv_calibration_applies_to_any_frequency() -> None:
     text = "channel,element,phase_deg,gain_db\n0,1,90,-1.5\n1,0,0,0\n"
     assert calibration_at(text, 1e9) == calibration_at(text, 2e9) == parse_calibration(text)
 
@@ -118,14 +118,14 @@ ONE = "order = [0, 1]\n[[table]]\nfrequency_hz = 1e9\nphase_deg = [0, 1]\ngain_d
     ],
     ids=lambda value: str(value)[-40:],
 )  # fmt: skip
-def test_what_is_wrong_is_said(text: str, at_hz: float, said: str) -> None:
+def test_invalid_calibration_file_is_reported(text: str, at_hz: float, said: str) -> None:
     with pytest.raises(UserError) as error:
         calibration_at(text, at_hz)
     assert said in str(error.value)
     assert len(str(error.value)) < 600
 
 
-def test_the_frequency_is_that_of_the_array(tmp_path: Path) -> None:
+def test_settings_interpolate_calibration_to_the_array_frequency(tmp_path: Path) -> None:
     table, config = tmp_path / "measured.toml", tmp_path / "settings.toml"
     table.write_text(TWO)
     three = f'elements = 3\n[hardware]\ncalibration = "{table}"\n'

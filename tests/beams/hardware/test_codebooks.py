@@ -88,7 +88,7 @@ def in_plane(sine: float) -> FloatArray:
 
 
 @pytest.mark.parametrize("oversampling", [1, 3])
-def test_the_beams_of_a_line_point_where_their_index_says(oversampling: int) -> None:
+def test_dft_beams_of_a_line_point_at_their_grid_sines(oversampling: int) -> None:
     """Full gain M at sine 2k/K, wrapped; without oversampling a null at every other grid sine."""
     array = line(8, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     book = dft(array, oversampling)
@@ -103,7 +103,9 @@ def test_the_beams_of_a_line_point_where_their_index_says(oversampling: int) -> 
 
 
 @pytest.mark.parametrize(("rows", "columns", "oversampling"), [(3, 4, 1), (2, 3, 2), (5, 1, 2)])
-def test_the_beams_of_a_grid_are_products(rows: int, columns: int, oversampling: int) -> None:
+def test_dft_beams_of_a_grid_are_products_of_line_beams(
+    rows: int, columns: int, oversampling: int
+) -> None:
     """Element (r, c) is r columns + c, beam (kz, ky) is kz Ky + ky; a single column has Ky = 1."""
     book = dft(
         grid(
@@ -137,12 +139,12 @@ def test_a_listed_beam_keeps_its_direction() -> None:
 
 
 @pytest.mark.parametrize("array", [CIRCLE, CLOUD])
-def test_no_transform_without_a_grid(array: Array) -> None:
+def test_dft_codebook_requires_a_grid_array(array: Array) -> None:
     with pytest.raises(ValueError, match=f"kind {array.kind}"):
         dft(array)
 
 
-def test_what_is_no_codebook_is_refused() -> None:
+def test_invalid_codebook_is_rejected() -> None:
     with pytest.raises(ValueError, match="oversampling"):
         dft(LINE, 0)
     for weights, message in [
@@ -162,7 +164,7 @@ def test_what_is_no_codebook_is_refused() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(BOOKS))
-def test_the_best_beam_is_the_one_received_most(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_best_beam_maximises_received_power(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Compared with direct sums, also when computed in blocks."""
     array, book = BOOKS[name]
     rng = np.random.default_rng(3)
@@ -182,7 +184,7 @@ def test_the_best_beam_is_the_one_received_most(name: str, monkeypatch: pytest.M
     assert same == pytest.approx(gains)
 
 
-def test_behind_the_elements_the_order_of_beams_is_that_without_their_pattern() -> None:
+def test_beams_behind_elements_are_ranked_without_the_element_pattern() -> None:
     array = line(8, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=COSINE)
     indices, gains = best(dft(array), array, np.array([[-0.8, 0.6, 0.0], [0.8, 0.6, 0.0]]))
     assert indices[0] == indices[1] == 2
@@ -201,7 +203,7 @@ def test_behind_the_elements_the_order_of_beams_is_that_without_their_pattern() 
 @example("line", 180.0, 0)
 @example("circle", 120.0, 1)
 @example("grid", 0.0, 2)
-def test_the_best_beam_is_always_among_the_candidates(
+def test_candidates_include_the_best_beam_of_every_direction_in_bound(
     name: str, bound_deg: float, seed: int
 ) -> None:
     """Bounds up to 60 degrees and beyond; 80 directions each, half of them on the rim."""
@@ -216,7 +218,7 @@ def test_the_best_beam_is_always_among_the_candidates(
 
 @settings(max_examples=examples(80), deadline=None)
 @given(st.sampled_from(sorted(BOOKS)), st.floats(-9, -1), st.integers(0, 2**32 - 1))
-def test_a_beam_that_is_best_just_inside_the_rim_is_a_candidate(
+def test_candidates_include_beam_that_is_best_only_at_the_rim(
     name: str, exponent: float, seed: int
 ) -> None:
     """The rim lies just past the border between two beams, found by bisection."""
@@ -245,7 +247,7 @@ def test_a_beam_that_is_best_just_inside_the_rim_is_a_candidate(
 
 @pytest.mark.parametrize("oversampling", [1, 2, 4])
 @pytest.mark.parametrize("bound_deg", [0.01, 0.5, 3.0, 12.0, 50.0])
-def test_a_line_sweeps_hardly_more_than_it_must(oversampling: int, bound_deg: float) -> None:
+def test_linear_array_candidates_are_nearly_minimal(oversampling: int, bound_deg: float) -> None:
     """A line needs the beams nearest to some sine in the cone. At most one extra beam at each end
     is swept; for most directions none is."""
     book = dft(LINE, oversampling)
@@ -264,7 +266,7 @@ def test_a_line_sweeps_hardly_more_than_it_must(oversampling: int, bound_deg: fl
 
 
 @pytest.mark.parametrize("name", ["grid", "grid, oversampled", "circle", "cloud, at random"])
-def test_others_sweep_hardly_more_than_they_must(name: str) -> None:
+def test_candidates_of_other_arrays_are_nearly_minimal(name: str) -> None:
     array, book = BOOKS[name]
     rng = np.random.default_rng(9)
     for bound_deg in (0.5, 4.0, 15.0):
@@ -275,12 +277,12 @@ def test_others_sweep_hardly_more_than_they_must(name: str) -> None:
         assert len(found) <= len(seen) + 2
 
 
-def test_any_direction_needs_all_beams() -> None:
+def test_unbounded_direction_makes_every_beam_a_candidate() -> None:
     found = candidates(dft(LINE), LINE, np.array([1.0, 0, 0]), None)
     assert (found == np.arange(16)).all()
 
 
-def test_the_pattern_of_the_elements_does_not_matter_where_all_face_alike() -> None:
+def test_common_element_pattern_does_not_change_candidates() -> None:
     plain = line(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     rng = np.random.default_rng(2)
     for bound_rad in (0.01, 0.3):
@@ -289,7 +291,7 @@ def test_the_pattern_of_the_elements_does_not_matter_where_all_face_alike() -> N
         assert (found == candidates(dft(plain), plain, direction, bound_rad)).all()
 
 
-def test_a_sharp_beam_beside_a_broad_one_is_not_missed() -> None:
+def test_candidates_include_sharp_beam_beside_broad_beam() -> None:
     """One beam uses all elements, the other only the middle one. At the predicted direction the
     sharp beam is weaker and flat, on top of a side lobe: only its curvature shows that it is
     best elsewhere in the cone."""
@@ -303,7 +305,7 @@ def test_a_sharp_beam_beside_a_broad_one_is_not_missed() -> None:
 
 
 @pytest.mark.parametrize("name", BOOKS)
-def test_a_sweep_begins_with_the_strongest(name: str) -> None:
+def test_sweep_order_starts_with_the_strongest_beam(name: str) -> None:
     """Also behind the elements, where their pattern is practically zero."""
     array, book = BOOKS[name]
     rng = np.random.default_rng(4)
@@ -317,7 +319,7 @@ def test_a_sweep_begins_with_the_strongest(name: str) -> None:
         assert (np.diff(gains[order, 0]) <= 1e-12 + 1e-9 * gains.max()).all()
 
 
-def test_equal_beams_are_all_candidates_without_endless_work() -> None:
+def test_duplicate_beams_are_all_candidates_within_bounded_work() -> None:
     weights = np.repeat(dft(GRID).weights, 2, axis=1)
     twice = codebooks.listed(weights, GRID)
     found = candidates(twice, GRID, in_plane(0.3), 0.05)
@@ -325,7 +327,7 @@ def test_equal_beams_are_all_candidates_without_endless_work() -> None:
     assert set(found) == {2 * k + i for k in once for i in (0, 1)}
 
 
-def test_it_is_a_superset_however_early_the_work_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_candidates_are_a_superset_when_work_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
     full = {name: candidates(book, a, in_plane(0.4), 0.2) for name, (a, book) in BOOKS.items()}
     monkeypatch.setattr(codebooks, "RESPONSES_MAX", 1)
     monkeypatch.setattr(codebooks, "BLOCK", 64)
@@ -333,7 +335,7 @@ def test_it_is_a_superset_however_early_the_work_ends(monkeypatch: pytest.Monkey
         assert set(full[name]) <= set(candidates(book, array, in_plane(0.4), 0.2))
 
 
-def test_what_is_no_cone_is_refused() -> None:
+def test_invalid_cone_is_rejected() -> None:
     for direction, bound_rad, message in [
         (np.array([1.0, 1, 0]), 0.1, "unit"),
         (np.array([1.0, 0]), 0.1, "three"),
@@ -358,7 +360,7 @@ def turning(from_rad: float, rate_radps: float) -> Callable[[FloatArray], FloatA
 
 @pytest.mark.parametrize("oversampling", [1, 4])
 @pytest.mark.parametrize("rate_radps", [0.05, -0.05, 0.7])
-def test_the_next_beam_comes_where_the_line_says(oversampling: int, rate_radps: float) -> None:
+def test_next_beam_time_matches_closed_form_of_a_line(oversampling: int, rate_radps: float) -> None:
     """Beams of a half-wave line change at sines (2k + 1) / K, so the time has a closed form."""
     book = dft(LINE, oversampling)
     start_rad = 0.3
@@ -374,7 +376,7 @@ def test_the_next_beam_comes_where_the_line_says(oversampling: int, rate_radps: 
     assert 0 <= found.after_s - after_s <= 1.001e-3
 
 
-def test_nothing_comes_within_the_horizon() -> None:
+def test_no_next_beam_is_reported_beyond_the_horizon() -> None:
     book = dft(LINE)
     assert next_best(book, LINE, turning(0.0, 0.01), 1.0, 0.1) == NextBest(0, None, None)
     # The border at sine 1/16 is crossed after 0.06254 s: the horizon itself is included.
@@ -384,7 +386,7 @@ def test_nothing_comes_within_the_horizon() -> None:
     assert found.after_s == pytest.approx(0.06254, abs=1e-3)
 
 
-def test_a_step_that_is_too_long_passes_over_beams() -> None:
+def test_too_long_sampling_step_skips_beams() -> None:
     """The documented limit: with the sampling step for its rate, no beam is skipped."""
     book, path = dft(LINE, 2), turning(-1.0, 0.5)
     step_s = codebooks.sampling_step_s(book, LINE, 0.5)
@@ -400,7 +402,7 @@ def test_a_step_that_is_too_long_passes_over_beams() -> None:
     assert long.next_index == there != now
 
 
-def test_the_step_is_a_quarter_of_a_beam() -> None:
+def test_sampling_step_is_a_quarter_beam() -> None:
     """Sixteen half-wave elements span 7.5 wavelengths."""
     assert codebooks.sampling_step_s(dft(LINE), LINE, -0.5) == pytest.approx(1 / 7.5 / 0.5 / 4)
     assert codebooks.sampling_step_s(dft(LINE, 4), LINE, 0.5) == pytest.approx(1 / 30 / 0.5 / 4)
@@ -412,6 +414,6 @@ def test_the_step_is_a_quarter_of_a_beam() -> None:
 @pytest.mark.parametrize(
     ("horizon_s", "step_s"), [(0.0, 0.1), (1.0, 0.0), (math.inf, 0.1), (math.nan, 0.1), (1, -1)]
 )
-def test_no_horizon_or_step_is_refused(horizon_s: float, step_s: float) -> None:
+def test_invalid_horizon_or_step_is_rejected(horizon_s: float, step_s: float) -> None:
     with pytest.raises(ValueError, match="horizon"):
         next_best(dft(LINE), LINE, turning(0.0, 1.0), horizon_s, step_s)

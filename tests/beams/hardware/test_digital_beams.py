@@ -42,7 +42,7 @@ def loaded(text: str) -> dict[int, ComplexArray]:
 
 
 @given(st.integers(0, 2**32 - 1))
-def test_what_is_loaded_is_the_codebook_to_the_last_bit(seed: int) -> None:
+def test_oai_table_holds_the_codebook_in_16_bit_integers(seed: int) -> None:
     rng = np.random.default_rng(seed)
     parts = rng.normal(size=(2, 16, 9)) * 10 ** rng.uniform(-3, 0, (16, 9))
     book = codebooks.listed(parts[0] + 1j * parts[1], PANEL)
@@ -55,7 +55,7 @@ def test_what_is_loaded_is_the_codebook_to_the_last_bit(seed: int) -> None:
     assert np.abs(written - np.rint(written)).max() < 0.02  # integers: no further rounding
 
 
-def test_a_calibrated_panel_radiates_the_codebook() -> None:
+def test_calibrated_panel_radiates_the_codebook() -> None:
     """The base station's ports are the channels, and the largest component is in range."""
     rng, book = np.random.default_rng(2), codebooks.dft(PANEL)
     calibration = Calibration(
@@ -72,13 +72,13 @@ def test_a_calibrated_panel_radiates_the_codebook() -> None:
         assert alike == pytest.approx(1.0, abs=1e-4)
 
 
-def test_ids_have_sixteen_bits() -> None:
+def test_oai_table_rejects_more_than_65536_beams() -> None:
     many = Codebook(CodebookKind.LISTED, np.ones((1, 65_537), complex))
     with pytest.raises(UserError, match="65537 beams exceed a digital beam table's 65536"):
         write_oai_dbt(many, Calibration.ideal([0]))
 
 
-def test_the_command_writes_the_codebook_of_the_settings(tmp_path: Path) -> None:
+def test_command_writes_the_configured_codebook(tmp_path: Path) -> None:
     config, out = tmp_path / "panel.toml", tmp_path / "beams.csv"
     config.write_text('[array]\nkind = "ura"\nrows = 4\ncolumns = 4\n[codebook]\nkind = "dft"\n')
     run = CliRunner().invoke

@@ -63,7 +63,7 @@ def channels() -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
-def test_what_channels_add_is_found(name: str) -> None:
+def test_channel_errors_are_estimated_from_exact_responses(name: str) -> None:
     phase, gain_db = channels()
     found = fitted(
         parse_responses(measured(ARRAYS[name], phase, gain_db, 0.0)), ARRAYS[name], ORDER
@@ -77,7 +77,7 @@ def test_what_channels_add_is_found(name: str) -> None:
     np.testing.assert_allclose(again.phase_rad, found.calibration.phase_rad, atol=1e-7)
 
 
-def test_what_remains_is_bounded_and_said() -> None:
+def test_residual_calibration_error_is_bounded_and_reported() -> None:
     phase, gain_db = channels()
     found = fitted(
         parse_responses(measured(ARRAYS["line"], phase, gain_db, 0.05)), ARRAYS["line"], ORDER
@@ -110,18 +110,18 @@ def test_what_remains_is_bounded_and_said() -> None:
         (f"{MEASURED_HEADER}\n1e300,0,0,0,0\n", "azimuth_deg '1e300' is not between"),
     ],
 )
-def test_responses_that_are_none_are_refused(text: str, said: str) -> None:
+def test_invalid_responses_are_rejected(text: str, said: str) -> None:
     with pytest.raises(UserError, match=said):
         parse_responses(text)
 
 
-def test_one_direction_shows_no_error() -> None:
+def test_calibration_requires_two_directions() -> None:
     text = "\n".join([MEASURED_HEADER, *(f"0,0,{c},0,0" for c in range(8))])
     with pytest.raises(UserError, match="two or more"):
         fitted(parse_responses(text), ARRAYS["line"], ORDER)
 
 
-def test_the_command_writes_what_the_settings_read(tmp_path: Path) -> None:
+def test_calibrate_command_writes_a_readable_calibration(tmp_path: Path) -> None:
     responses, out = tmp_path / "responses.csv", tmp_path / "measured.csv"
     before = tmp_path / "order.csv"
     rows = [f"{channel},{m},0,0" for channel, m in enumerate(ORDER)]
@@ -143,7 +143,7 @@ def test_the_command_writes_what_the_settings_read(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
 @pytest.mark.parametrize("kind", [float, np.float64, np.float32])
-def test_pickles_of_numbers_are_read(protocol: int, kind: Any) -> None:
+def test_pickles_of_numbers_are_loaded(protocol: int, kind: Any) -> None:
     phases = [kind(10.0 * n) for n in range(8)]
     gains = [kind(1.0 - n / 32) for n in range(8)]
     if protocol < 3 and kind is not float:
@@ -184,7 +184,7 @@ class Evil:
         (b"h\x00.", "not a pickle"),
     ],
 )
-def test_a_pickle_of_anything_else_is_refused(data: bytes, said: str) -> None:
+def test_pickle_of_other_objects_is_rejected(data: bytes, said: str) -> None:
     with pytest.raises(UserError, match=said):
         phaser_pickles.numbers("phase calibration", data)
     assert not Path("/tmp/pickled").exists()
@@ -199,7 +199,7 @@ def test_a_pickle_takes_no_more_memory_than_its_size() -> None:
     tracemalloc.stop()
 
 
-def test_the_command_reads_a_phaser_s_folder(tmp_path: Path) -> None:
+def test_calibrate_command_reads_a_phaser_folder(tmp_path: Path) -> None:
     for name, value in (("phase", 5.0), ("gain", 0.9)):
         (tmp_path / f"{name}_cal_val.pkl").write_bytes(pickle.dumps([value] * 8))
     out = tmp_path / "measured.csv"

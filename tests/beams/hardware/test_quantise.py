@@ -83,7 +83,7 @@ def every_code(kind: SettableStates) -> IntArray:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_nearest_is_the_nearest_of_all(kind: SettableStates) -> None:
+def test_nearest_setting_matches_exhaustive_search(kind: SettableStates) -> None:
     """In I and Q, or in phase and gain separately."""
     rng = np.random.default_rng(3)
     wanted = np.sqrt(rng.uniform(0, 1, 300)) * np.exp(1j * rng.uniform(-4, 4, 300))
@@ -106,7 +106,7 @@ def test_nearest_is_the_nearest_of_all(kind: SettableStates) -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_what_is_tried_around_a_code_are_codes_and_it_is_among_them(kind: SettableStates) -> None:
+def test_neighbouring_codes_are_valid_and_include_the_code_itself(kind: SettableStates) -> None:
     everything = {tuple(c) for c in every_code(kind).tolist()}
     for code in kind.nearest(np.exp(1j * np.linspace(0, 6, 40)) * np.linspace(0, 1, 40)):
         near = {tuple(c) for c in kind.around(code[np.newaxis])[0].tolist()}
@@ -116,7 +116,7 @@ def test_what_is_tried_around_a_code_are_codes_and_it_is_among_them(kind: Settab
         assert loud.max() < 1 + 0.51 / getattr(kind, "peak", 1e9)
 
 
-def test_below_the_range_it_is_lowest_or_off_whichever_is_nearer() -> None:
+def test_gain_below_range_rounds_to_lowest_level_or_off() -> None:
     """6 dB down is 0.501; below half of that, off is nearer."""
     phase_only, clipped, with_off = (
         Resolution(4),
@@ -131,7 +131,7 @@ def test_below_the_range_it_is_lowest_or_off_whichever_is_nearer() -> None:
     assert np.abs(with_off.values(with_off.nearest(wanted))) == pytest.approx([0.501, 0], abs=1e-3)
 
 
-def test_steps_of_gain_are_counted_from_full() -> None:
+def test_gain_levels_are_steps_below_full_gain() -> None:
     levels = stepped(64, 0.5, 31.0, off=True).levels
     assert len(levels) == 64
     assert levels[-1] == 0
@@ -150,7 +150,7 @@ def test_steps_of_gain_are_counted_from_full() -> None:
         (8, np.nan, 6.0, "gain steps of nan"),
     ],
 )
-def test_a_resolution_that_is_none_is_refused(
+def test_invalid_resolution_is_rejected(
     phases: int, step_db: float | None, range_db: float, said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):
@@ -158,7 +158,7 @@ def test_a_resolution_that_is_none_is_refused(
 
 
 @pytest.mark.parametrize("levels", [(), (0.5,), (1.0, 1.0), (1.0, 0.5, 0.7), (1.0, -0.1)])
-def test_levels_fall_from_full(levels: tuple[float, ...]) -> None:
+def test_gain_levels_that_do_not_decrease_are_rejected(levels: tuple[float, ...]) -> None:
     with pytest.raises(ValueError, match="must decrease"):
         Resolution(8, levels)
 
@@ -168,7 +168,7 @@ def test_levels_fall_from_full(levels: tuple[float, ...]) -> None:
 
 @settings(max_examples=examples(60), deadline=None)
 @given(SEEDS, st.sampled_from(KINDS), st.integers(1, 20), st.integers(1, 3))
-def test_it_is_never_worse_than_rounding_and_says_what_it_costs(
+def test_search_is_no_worse_than_rounding_and_reports_its_cost(
     seed: int, kind: SettableStates, elements: int, directions: int
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -183,7 +183,7 @@ def test_it_is_never_worse_than_rounding_and_says_what_it_costs(
 
 @settings(max_examples=examples(60), deadline=None)
 @given(SEEDS, st.sampled_from(KINDS), st.integers(1, 12))
-def test_the_result_cannot_be_bettered_by_one_element(
+def test_changing_one_element_does_not_lower_the_cost(
     seed: int, kind: SettableStates, elements: int
 ) -> None:
     """No neighbouring setting of a single element costs less, except those that lower full gain."""
@@ -202,7 +202,7 @@ def test_the_result_cannot_be_bettered_by_one_element(
                 assert cost(sent, weights, towards) > found.cost - 1e-9
 
 
-def test_it_comes_near_the_best_of_all_settings() -> None:
+def test_search_result_is_near_the_exhaustive_optimum() -> None:
     """Six elements of two bits: 4**5 distinct settings. Usually the result is the optimum."""
     rng = np.random.default_rng(11)
     kind = Resolution(4)
@@ -220,7 +220,7 @@ def test_it_comes_near_the_best_of_all_settings() -> None:
 
 
 @pytest.mark.parametrize(("bits", "table_db"), [(2, 0.89), (3, 0.22), (4, 0.054), (5, 0.014)])
-def test_a_matched_beam_loses_what_the_theory_says(bits: int, table_db: float) -> None:
+def test_matched_beam_quantisation_loss_matches_theory(bits: int, table_db: float) -> None:
     """64 elements, docs/math.md golden values; at most the sinc of one step."""
     rng = np.random.default_rng(bits)
     losses = []
@@ -233,7 +233,7 @@ def test_a_matched_beam_loses_what_the_theory_says(bits: int, table_db: float) -
     assert np.mean(losses) < -20 * np.log10(np.sinc(1 / 2**bits)) * 1.02
 
 
-def test_six_bits_lose_almost_nothing() -> None:
+def test_six_bit_quantisation_loss_matches_theory() -> None:
     rng = np.random.default_rng(6)
     theory_db = -20 * np.log10(np.sinc(1 / 64))
     assert theory_db == pytest.approx(0.0035, abs=1e-4)
@@ -254,7 +254,7 @@ def test_six_bits_lose_almost_nothing() -> None:
         (Quadrature(31), 8.0),
     ],
 )
-def test_nulls_are_deeper_than_by_rounding(kind: SettableStates, deeper_db: float) -> None:
+def test_search_gives_deeper_nulls_than_rounding(kind: SettableStates, deeper_db: float) -> None:
     """Zero forcing of two users; response at the other over that at the own, mean in dB."""
     rng = np.random.default_rng(5)
     plain, searched, lost = [], [], []
@@ -276,7 +276,7 @@ def test_nulls_are_deeper_than_by_rounding(kind: SettableStates, deeper_db: floa
 
 @settings(max_examples=examples(40), deadline=None)
 @given(SEEDS, st.sampled_from(KINDS))
-def test_a_common_factor_changes_no_code(seed: int, kind: SettableStates) -> None:
+def test_common_weight_factor_does_not_change_codes(seed: int, kind: SettableStates) -> None:
     """Any level; a rotation by a whole phase step shifts only the codes."""
     rng = np.random.default_rng(seed)
     weights, towards = drawn(rng, 9), line([0.1, 0.4], 9)
@@ -288,7 +288,7 @@ def test_a_common_factor_changes_no_code(seed: int, kind: SettableStates) -> Non
 
 @settings(max_examples=examples(40), deadline=None)
 @given(SEEDS)
-def test_channels_are_taken_out(seed: int) -> None:
+def test_quantisation_compensates_for_channels(seed: int) -> None:
     """Fine settings behind any channels radiate the wanted weights."""
     rng = np.random.default_rng(seed)
     weights = np.exp(1j * rng.uniform(0, 7, 12))
@@ -303,7 +303,7 @@ def test_channels_are_taken_out(seed: int) -> None:
 
 @settings(max_examples=examples(40), deadline=None)
 @given(SEEDS, st.sampled_from(KINDS), st.integers(1, 20))
-def test_the_strongest_element_has_full_gain(
+def test_strongest_element_is_set_to_full_gain(
     seed: int, kind: SettableStates, elements: int
 ) -> None:
     """The strongest element is the one whose setting must be largest behind its channel."""
@@ -316,13 +316,13 @@ def test_the_strongest_element_has_full_gain(
     assert full > 1 - 1 / getattr(kind, "peak", 1e9)
 
 
-def test_no_weight_is_off_where_that_can_be() -> None:
+def test_zero_weight_switches_its_element_off() -> None:
     weights = np.array([1, 0, 1j, 0.3], dtype=complex)
     found = quantise(weights, stepped(4, 1.0, 20.0, off=True))
     assert np.abs(found.weights) == pytest.approx([1, 0, 1, 0.3], abs=0.02)
 
 
-def test_a_direction_in_which_nothing_radiates_does_not_count() -> None:
+def test_direction_without_radiation_does_not_affect_codes() -> None:
     weights, seen = drawn(np.random.default_rng(2), 8), line([0.2, 0.5], 8)
     kind = Resolution(16)
     blind = np.insert(seen, 1, 0.0, axis=1)
@@ -343,7 +343,7 @@ def test_a_direction_in_which_nothing_radiates_does_not_count() -> None:
         (np.ones(2, complex), np.array([[1], [np.inf]], complex), None, "and finite"),
     ],
 )
-def test_what_cannot_be_quantised_is_refused(
+def test_invalid_weights_or_channels_are_not_quantised(
     weights: ComplexArray, towards: ComplexArray | None, channel: ComplexArray | None, said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):

@@ -63,7 +63,7 @@ def written(device: Beamformer, table: DeviceTable) -> str:
 # --- calibration --------------------------------------------------------------------------------
 
 
-def test_a_calibration_is_read_in_any_order() -> None:
+def test_calibration_lines_are_accepted_in_any_order() -> None:
     text = "channel,element,phase_deg,gain_db\n1,0,90,-1.5\n\n0,2,-45,0\n 2 , 1 ,1e1,.25\n"
     found = parse_calibration(text)
     assert found.order == (2, 0, 1)
@@ -89,7 +89,7 @@ def test_a_calibration_is_read_in_any_order() -> None:
         ("channel,element,phase_deg,gain_db\n0,0,1,1\n1,2,1,1\n", "element 1 of 2"),
     ],
 )
-def test_a_bad_calibration_is_refused_with_its_line(text: str, said: str) -> None:
+def test_malformed_calibration_is_rejected_with_its_line_number(text: str, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         parse_calibration(text)
 
@@ -106,7 +106,7 @@ def test_a_bad_calibration_is_refused_with_its_line(text: str, said: str) -> Non
         ((), (), (), "one of each"),
     ],
 )
-def test_a_calibration_is_checked(
+def test_inconsistent_calibration_is_rejected(
     phase: tuple[float, ...], gain: tuple[float, ...], order: tuple[int, ...], said: str
 ) -> None:
     with pytest.raises(ValueError, match=said):
@@ -117,7 +117,7 @@ def test_a_calibration_is_checked(
 
 
 @pytest.mark.parametrize("device", list(Beamformer))
-def test_the_channels_radiate_the_wanted_beams(device: Beamformer) -> None:
+def test_table_codes_radiate_the_wanted_beams(device: Beamformer) -> None:
     """Element by element: channel setting times channel response."""
     size = SIZES[device]
     calibration = measured(4, size)
@@ -136,7 +136,7 @@ def test_the_channels_radiate_the_wanted_beams(device: Beamformer) -> None:
     assert np.abs(table.loss_db).max() < 0.1
 
 
-def test_the_loss_is_that_of_the_array_gain() -> None:
+def test_table_loss_is_the_loss_of_array_gain() -> None:
     beam = wanted([0.3, -0.4], 16)[0]
     table = fit(Beamformer.TMYTEK, [beam], measured(9, 16))
     sent, own = table.weights[:, 0], beam.steering[:, 0]
@@ -145,7 +145,7 @@ def test_the_loss_is_that_of_the_array_gain() -> None:
     assert table.loss_db == pytest.approx((10 * math.log10(before / after),))
 
 
-def test_phases_are_taken_out_not_put_in() -> None:
+def test_channel_phase_is_subtracted() -> None:
     """A channel that adds 90 degrees is set back by 90 degrees."""
     ideal = Calibration.ideal(range(16))
     turned = Calibration(
@@ -163,7 +163,7 @@ def test_phases_are_taken_out_not_put_in() -> None:
     assert len(set(phases[1:].tolist())) == 1
 
 
-def test_gains_are_levelled_to_the_weakest() -> None:
+def test_stronger_channels_are_attenuated_to_the_weakest() -> None:
     """The strongest setting is full gain; a channel 3 dB too strong is attenuated by 3 dB."""
     ideal = Calibration.ideal(range(16))
     uneven = Calibration(
@@ -193,7 +193,7 @@ def test_gains_are_levelled_to_the_weakest() -> None:
         (Beamformer.TMYTEK, 16, 1, math.nan, 0, "nan degrees off boresight"),
     ],
 )
-def test_what_a_device_cannot_do_is_refused(
+def test_beams_beyond_device_limits_are_rejected(
     *,
     device: Beamformer,
     size: int,
@@ -213,7 +213,7 @@ def test_what_a_device_cannot_do_is_refused(
         fit(device, [beam] * count, Calibration.ideal(range(size)))
 
 
-def test_the_edge_of_what_it_can_do_is_taken() -> None:
+def test_beams_at_the_device_limits_are_accepted() -> None:
     beam = WantedBeam(
         uav="7:1",
         weights=np.ones(16, dtype=complex),
@@ -224,7 +224,7 @@ def test_the_edge_of_what_it_can_do_is_taken() -> None:
     assert fit(Beamformer.TMYTEK, [beam] * 64, Calibration.ideal(range(16))).codes.shape[0] == 64
 
 
-def test_channels_that_differ_too_much_or_do_not_match_are_refused() -> None:
+def test_unequal_or_mismatched_channels_are_rejected() -> None:
     ideal = Calibration.ideal(range(16))
     beam = wanted([0.1], 16)[0]
     wild = Calibration(
@@ -250,7 +250,7 @@ def test_channels_that_differ_too_much_or_do_not_match_are_refused() -> None:
 
 @settings(max_examples=examples(25), deadline=None)
 @given(SEEDS, st.sampled_from(list(Beamformer)), st.integers(1, 4))
-def test_what_is_written_is_read_back(seed: int, device: Beamformer, count: int) -> None:
+def test_table_round_trips_through_its_text(seed: int, device: Beamformer, count: int) -> None:
     size = SIZES[device]
     rng = np.random.default_rng(seed)
     sines = np.linspace(-0.6, 0.6, count) + rng.uniform(-0.1, 0.1, count)
@@ -268,7 +268,7 @@ def test_what_is_written_is_read_back(seed: int, device: Beamformer, count: int)
 
 @settings(max_examples=examples(40), deadline=None)
 @given(SEEDS, st.sampled_from(list(Beamformer)))
-def test_every_code_survives(seed: int, device: Beamformer) -> None:
+def test_every_code_round_trips(seed: int, device: Beamformer) -> None:
     """Arbitrary codes, off and lowest among them; one has full gain, as in every beam."""
     rng = np.random.default_rng(seed)
     size, kind = SIZES[device], SETTINGS[device]
@@ -289,7 +289,7 @@ def test_every_code_survives(seed: int, device: Beamformer) -> None:
     assert found.weights == pytest.approx(kind.values(codes).T)
 
 
-def test_the_adar1000_table_of_a_phaser() -> None:
+def test_adar1000_table_maps_phaser_channels_to_elements() -> None:
     """Channel 2 of the first chip is element 8 of the CN0566 in pyadi-iio's numbering."""
     calibration = Calibration.ideal(CN0566_ORDER)
     ramp = np.exp(2j * np.pi * 16 / 128 * np.arange(8))  # 45 degrees from element to element
@@ -315,7 +315,7 @@ def test_the_adar1000_table_of_a_phaser() -> None:
     assert {(row[7], row[8]) for row in rows} == {("127", "0")}
 
 
-def test_the_vector_modulator_points_where_its_code_says() -> None:
+def test_vector_modulator_matches_the_data_sheet() -> None:
     """Data sheet: sign and magnitude; quarter turns; within 3.2 degrees and 0.45 dB throughout."""
     assert [devices.vector_modulator(k) for k in (0, 16, 32, 64, 96)] == [
         (0x3F, 0x20),
@@ -337,7 +337,7 @@ def test_the_vector_modulator_points_where_its_code_says() -> None:
     assert all(not byte & 0xC0 for k in range(128) for byte in devices.vector_modulator(k))
 
 
-def test_the_gains_of_the_adar1000_fill_its_range() -> None:
+def test_adar1000_gain_levels_cover_its_range() -> None:
     """31 dB, every step finer than the 0.5 dB of the data sheet, then off."""
     levels = np.array(
         devices.SETTINGS[Beamformer.ADAR1000]
@@ -352,7 +352,7 @@ def test_the_gains_of_the_adar1000_fill_its_range() -> None:
     assert np.diff(decibels).max() < 0
 
 
-def test_the_tmytek_table() -> None:
+def test_tmytek_table_format() -> None:
     table = fit(
         Beamformer.TMYTEK,
         [
@@ -387,7 +387,7 @@ def test_blank_lines_of_a_tmytek_table_are_skipped() -> None:
     assert np.array_equal(parse(Beamformer.TMYTEK, text, ideal).codes, table.codes)
 
 
-def test_what_is_off_does_not_count_for_full_gain() -> None:
+def test_switched_off_channel_is_ignored_for_full_gain() -> None:
     """A table may give any gain for a channel that is switched off."""
     ideal = Calibration.ideal(range(16))
     beam = WantedBeam(
@@ -404,7 +404,7 @@ def test_what_is_off_does_not_count_for_full_gain() -> None:
     assert np.array_equal(found.codes, table.codes)
 
 
-def test_the_sivers_book_loads_as_the_makers_scripts_load_it() -> None:
+def test_sivers_book_loads_like_the_manufacturer_scripts() -> None:
     """The scripts read bytes from the line after the tag, two per word, antenna 15 first."""
     table = fit(Beamformer.SIVERS, wanted([-0.3, 0.4], 16), measured(1, 16))
     lines = encode(table, frequency_hz=60.48e9).splitlines()
@@ -422,7 +422,7 @@ def test_the_sivers_book_loads_as_the_makers_scripts_load_it() -> None:
     assert lines[0] == "# row 0: 1:1"
 
 
-def test_a_sivers_book_needs_a_frequency() -> None:
+def test_sivers_book_requires_a_frequency() -> None:
     table = fit(Beamformer.SIVERS, wanted([0.1], 16), Calibration.ideal(range(16)))
     for frequency, said in ((None, "give its frequency"), (0.0, "not above 0"), (math.inf, "inf")):
         with pytest.raises(ValueError, match=said):
@@ -430,7 +430,7 @@ def test_a_sivers_book_needs_a_frequency() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a,b", 'a"b', "a\nb", " a", "a\u2028b"])
-def test_names_that_would_break_a_line_are_refused(name: str) -> None:
+def test_beam_name_with_a_comma_is_rejected(name: str) -> None:
     beam = WantedBeam(
         uav=name,
         weights=np.ones(8, complex),
@@ -474,7 +474,7 @@ BROKEN = [
 
 
 @pytest.mark.parametrize(("device", "change", "said"), BROKEN)
-def test_a_broken_text_is_refused_with_its_line(
+def test_malformed_table_is_rejected_with_its_line_number(
     device: Beamformer, change: tuple[str, str], said: str
 ) -> None:
     size = SIZES[device]
@@ -492,7 +492,7 @@ def test_a_broken_text_is_refused_with_its_line(
         parse(device, text.replace(*change, 1), ideal)
 
 
-def test_a_table_for_another_array_is_refused() -> None:
+def test_table_for_a_different_array_is_rejected() -> None:
     text = encode(fit(Beamformer.ADAR1000, wanted([0.2], 8), Calibration.ideal(range(8))))
     for other in (Calibration.ideal(CN0566_ORDER), Calibration.ideal(range(12))):
         with pytest.raises(ValueError, match="drives elements"):

@@ -93,7 +93,7 @@ def test_every_beam_of_every_unit_is_within_its_limits(boards: list[Board], seed
     assert refused(encode(table(gains, seed, 4)), boards) == []
 
 
-def test_the_strongest_element_is_as_loud_as_every_board_can_be() -> None:
+def test_strongest_element_gets_largest_gain_common_to_all_boards() -> None:
     gains = parse_unit_gains(UNIT)
     assert gains == UnitGains(Mode.TX, 13.0, 3.5)
     rows = [row.split(",") for row in encode(table(gains, 1, 8)).splitlines()[1:]]
@@ -103,7 +103,7 @@ def test_the_strongest_element_is_as_loud_as_every_board_can_be() -> None:
     assert min(float(row[8]) for row in rows) == 9.5
 
 
-def test_relative_gains_leave_the_limits_of_a_unit() -> None:
+def test_relative_gains_exceed_unit_limits() -> None:
     """This is why the unit's own gain limits are required."""
     boards: list[Board] = [((5.0, 9.5), 4.0)] * 4
     relative = fit(Beamformer.TMYTEK, [zero_beam()], Calibration.ideal(range(16)))
@@ -123,7 +123,7 @@ def zero_beam() -> WantedBeam:
     )
 
 
-def test_a_unit_without_a_range_is_set_by_phases_alone() -> None:
+def test_unit_without_gain_range_is_controlled_by_phase_alone() -> None:
     gains = parse_unit_gains(described([((1.0, 1.0), 0.0)] * 4, "RX"))
     assert gains == UnitGains(Mode.RX, 1.0, 0.0)
     text = encode(fit(Beamformer.TMYTEK, [zero_beam()], Calibration.ideal(range(16)), gains))
@@ -157,7 +157,7 @@ def test_a_unit_without_a_range_is_set_by_phases_alone() -> None:
     ],
     ids=lambda value: str(value)[-40:],
 )
-def test_a_file_that_is_none_says_what_is_wrong(text: str, said: str) -> None:
+def test_invalid_unit_file_is_reported(text: str, said: str) -> None:
     with pytest.raises(UserError) as error:
         parse_unit_gains(text)
     assert said in str(error.value)
@@ -201,7 +201,7 @@ class Unit:
 @pytest.mark.filterwarnings(
     "ignore::pytest.PytestUnraisableExceptionWarning"
 )  # files that it leaves behind
-def test_the_maker_s_own_package_applies_every_beam(tmp_path: Path) -> None:
+def test_manufacturer_package_applies_every_beam(tmp_path: Path) -> None:
     """Its own checks, on a unit that keeps the previously applied settings."""
     batch = pytest.importorskip("tlkcore.TMYBeamConfig")
     codes = importlib.import_module("tlkcore.TMYPublic").RetCode

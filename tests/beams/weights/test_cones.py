@@ -39,7 +39,7 @@ GRIDS = {
 DIRECTIONS = np.array([[0.8, 0.6, 0.0], [0.6, -0.48, 0.64], [1.0, 0.0, 0.0]])
 
 
-def looked_at(array: Array, angles_deg: list[list[float]]) -> ConeSamples:
+def sample_directions(array: Array, angles_deg: list[list[float]]) -> ConeSamples:
     across = shapes.aperture(array)
     seen = cones_on_aperture(across, DIRECTIONS, np.radians(angles_deg))
     return cones(array, across, DIRECTIONS, seen, steering_matrix(array, DIRECTIONS))
@@ -58,8 +58,8 @@ def offsets(array: Array, found: ConeSamples) -> list[FloatArray]:
 
 @pytest.mark.parametrize("array", GRIDS.values(), ids=GRIDS.keys())
 @pytest.mark.parametrize("wide_deg", [0.0, 3.0, 20.0, 90.0])
-def test_fields_are_what_elements_radiate_there(array: Array, wide_deg: float) -> None:
-    found = looked_at(array, [[wide_deg, wide_deg / 2, 1.0], [0.5, 0.5, 0.0]])
+def test_fields_match_element_patterns_at_sample_points(array: Array, wide_deg: float) -> None:
+    found = sample_directions(array, [[wide_deg, wide_deg / 2, 1.0], [0.5, 0.5, 0.0]])
     rng = np.random.default_rng(1)
     weights = rng.normal(size=(array.size, 3)) + 1j * rng.normal(size=(array.size, 3))
     fields = found.fields(weights)
@@ -75,9 +75,9 @@ def test_fields_are_what_elements_radiate_there(array: Array, wide_deg: float) -
 
 @pytest.mark.parametrize("array", GRIDS.values(), ids=GRIDS.keys())
 @pytest.mark.parametrize("wide_deg", [0.0, 3.0, 20.0, 90.0])
-def test_places_are_all_over_the_cone_and_hardly_beyond(array: Array, wide_deg: float) -> None:
+def test_sample_points_cover_the_cone_with_little_excess(array: Array, wide_deg: float) -> None:
     angles_deg = [[wide_deg, wide_deg / 2, 1.0], [0.5, 0.5, 0.0]]
-    found = looked_at(array, angles_deg)
+    found = sample_directions(array, angles_deg)
     beside = offsets(array, found)
     step = [one[1] - one[0] if len(one) > 1 else 2.0 for one in beside]
     axes = shapes.aperture(array).axes

@@ -46,7 +46,7 @@ def outside(candidate: ComplexArray, group: ComplexArray) -> float:
 
 @settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 2**16), st.integers(1, 14), st.integers(3, 16))
-def test_each_takes_in_who_is_most_apart_while_all_fit(
+def test_grouping_adds_the_most_separate_uav_that_fits(
     seed: int, users: int, elements: int
 ) -> None:
     """Every UAV is in one group, every group fits, and each choice is that of the oracle."""
@@ -68,7 +68,7 @@ def test_each_takes_in_who_is_most_apart_while_all_fit(
 
 @settings(max_examples=examples(60), deadline=None)
 @given(st.integers(0, 2**16), st.integers(1, 9))
-def test_those_are_kept_who_fit_with_all_of_higher_priority(seed: int, users: int) -> None:
+def test_kept_uavs_fit_with_all_of_higher_priority(seed: int, users: int) -> None:
     steering = drawn(seed, 8, users)
     order = np.random.default_rng(seed).permutation(users).tolist()
     found = without_the_lowest(steering, order, LIMITS).tolist()
@@ -80,19 +80,19 @@ def test_those_are_kept_who_fit_with_all_of_higher_priority(seed: int, users: in
 
 @settings(max_examples=examples(40), deadline=None)
 @given(st.integers(0, 2**16), st.integers(1, 9))
-def test_what_is_lost_is_that_of_the_pseudo_inverse(seed: int, users: int) -> None:
+def test_loss_matches_the_pseudo_inverse(seed: int, users: int) -> None:
     steering = drawn(seed, 8, users)
     assert (lost_db(steering, LIMITS) <= LIMITS.loss_db) == fit(steering, list(range(users)))
 
 
-def test_twins_take_turns() -> None:
+def test_identical_uavs_get_separate_time_slots() -> None:
     one = np.exp(1j * np.pi * 0.3 * np.arange(8))
     groups = semi_orthogonal(np.stack([one, one, one], axis=1), [2, 0, 1], LIMITS)
     assert [group.tolist() for group in groups] == [[2], [0], [1]]
 
 
 @pytest.mark.parametrize("young", [True, False])
-def test_turns_are_kept_while_they_do_and_a_little_longer_while_young(young: bool) -> None:
+def test_time_slots_are_kept_within_limits_plus_a_margin_while_new(young: bool) -> None:
     sines = np.linspace(-0.5, 0.5, 5)
 
     def at(apart: float) -> ComplexArray:

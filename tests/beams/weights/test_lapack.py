@@ -7,7 +7,7 @@ import scipy.linalg.lapack
 from companion.beams.weights import lapack
 
 
-def test_they_are_those_of_scipy() -> None:
+def test_loaded_routines_match_scipy() -> None:
     rng = np.random.default_rng(1)
     a = rng.normal(size=(8, 3)) + 1j * rng.normal(size=(8, 3))
     gram = lapack.zherk(1.0, a.T)
@@ -21,6 +21,6 @@ def test_they_are_those_of_scipy() -> None:
     np.testing.assert_allclose(lapack.zgemm(1.0, a, ours[1]), a @ ours[1])
 
 
-def test_a_scipy_that_keeps_them_otherwise_is_asked_for_them() -> None:
+def test_routines_fall_back_to_the_scipy_modules() -> None:
     assert lapack._routines("blas", "_kept_elsewhere") is scipy.linalg.blas
     assert lapack._routines("lapack", "_kept_elsewhere") is scipy.linalg.lapack

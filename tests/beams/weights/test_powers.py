@@ -32,7 +32,7 @@ def steering(seed: int, elements: int, users: int) -> ComplexArray:
 
 @pytest.mark.parametrize("users", [1, 2, 5, 16])
 @pytest.mark.parametrize("seed", range(3))
-def test_max_min_is_that_of_bisection_over_linear_programmes(seed: int, users: int) -> None:
+def test_max_min_power_matches_bisection_over_linear_programmes(seed: int, users: int) -> None:
     made = coupling(seed, users)
     share = powers.max_min(made)
     assert share.sum() == pytest.approx(1.0)
@@ -47,7 +47,7 @@ def test_max_min_is_that_of_bisection_over_linear_programmes(seed: int, users: i
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_the_weighted_sum_is_no_less_than_a_search_finds(seed: int) -> None:
+def test_weighted_sum_power_is_no_worse_than_a_search(seed: int) -> None:
     made, worths = coupling(seed, 4), np.array([1.0, 2.0, 0.5, 1.0])
 
     def total(share: FloatArray) -> float:
@@ -68,7 +68,7 @@ def test_the_weighted_sum_is_no_less_than_a_search_finds(seed: int) -> None:
 
 @pytest.mark.parametrize("snr_db", [-10.0, 5.0, 20.0])
 @pytest.mark.parametrize("users", [2, 8, 16])
-def test_mmse_with_max_min_is_the_optimum(users: int, snr_db: float) -> None:
+def test_mmse_with_max_min_power_is_optimal(users: int, snr_db: float) -> None:
     """Uplink-downlink duality: the balanced SINR there is the largest of all beams."""
     a = steering(users, 64, users)
     ranges = np.random.default_rng(users).uniform(0.3, 3.0, users)
@@ -96,7 +96,7 @@ def test_mmse_with_max_min_is_the_optimum(users: int, snr_db: float) -> None:
 
 @pytest.mark.parametrize("snr_db", [-5.0, 10.0, 25.0])
 @pytest.mark.parametrize("users", [4, 16, 32])
-def test_mmse_has_a_greater_sum_of_rates_than_zero_forcing(users: int, snr_db: float) -> None:
+def test_mmse_has_a_higher_sum_rate_than_zero_forcing(users: int, snr_db: float) -> None:
     a = steering(3 * users, 64, users)
     radio = Radio(np.full(users, 10 ** (snr_db / 10) / 4), np.ones(users))
 
@@ -113,14 +113,14 @@ def test_mmse_has_a_greater_sum_of_rates_than_zero_forcing(users: int, snr_db: f
     assert total(Method.MMSE, Power.WEIGHTED_SUM) >= equal - 1e-3
 
 
-def test_without_a_radio_there_is_no_mmse() -> None:
+def test_mmse_requires_a_radio() -> None:
     with pytest.raises(ValueError, match="radio"):
         precode(steering(1, 8, 2), Precoder(method=Method.MMSE))
 
 
 @pytest.mark.parametrize("power", Power)
 @pytest.mark.parametrize("snr_db", [0.0, 60.0, 120.0, 200.0])
-def test_channels_that_are_alike_are_shared_at_any_power(power: Power, snr_db: float) -> None:
+def test_identical_channels_give_finite_normalised_weights(power: Power, snr_db: float) -> None:
     """Two UAVs in one direction, two at mirror directions, and more UAVs than elements."""
     rng = np.random.default_rng(3)
     for users in (4, 12):

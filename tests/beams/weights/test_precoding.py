@@ -88,7 +88,7 @@ def any_array(seed: int) -> Array:
 
 @settings(max_examples=examples(150))
 @given(st.integers(1, 16), st.integers(0, 2**16), st.booleans(), st.data())
-def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
+def test_zero_forcing_has_unit_own_response_and_exact_nulls(
     users: int, seed: int, widen: bool, data: st.DataObject
 ) -> None:
     """Any array, any directions, up to as many users as elements, unless marked as regularised."""
@@ -113,7 +113,7 @@ def test_zero_forcing_gives_each_its_own_and_nothing_of_the_others(
 
 @settings(max_examples=examples(150))
 @given(st.integers(1, 16), st.integers(0, 2**16), st.sampled_from([0.5, 3.0, 10.0]), st.data())
-def test_no_user_loses_more_than_the_limit(
+def test_default_policy_keeps_every_loss_within_the_limit(
     users: int, seed: int, limit_db: float, data: st.DataObject
 ) -> None:
     """Default policy, any array, any UAV positions."""
@@ -123,7 +123,7 @@ def test_no_user_loses_more_than_the_limit(
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_loading_is_the_least_that_keeps_to_the_limit(seed: int) -> None:
+def test_regularisation_is_the_smallest_that_meets_the_limits(seed: int) -> None:
     """Half the loading would exceed a user's loss limit or the condition limit."""
     a = matrix(list(np.random.default_rng(seed).uniform(-0.9, 0.9, 8)))
     found = precode(a, Precoder(condition_limit=1000.0))
@@ -150,7 +150,7 @@ def test_zero_forcing_is_the_pseudo_inverse(users: int) -> None:
 
 
 @pytest.mark.parametrize("normalisation", Normalisation)
-def test_regularised_tends_to_zero_forcing_and_to_maximum_ratio(
+def test_regularised_weights_tend_to_zero_forcing_and_maximum_ratio(
     normalisation: Normalisation,
 ) -> None:
     a = apart(4, 4)
@@ -177,7 +177,7 @@ def test_regularised_tends_to_zero_forcing_and_to_maximum_ratio(
 
 
 @given(SINES, st.floats(-7.0, -1.0), st.floats(1.5, 1e3))
-def test_past_the_condition_limit_it_is_regularised_and_says_so(
+def test_weights_are_regularised_above_the_condition_limit(
     sine: float, separation: float, limit: float
 ) -> None:
     a = matrix([sine, sine + 10**separation])
@@ -189,7 +189,7 @@ def test_past_the_condition_limit_it_is_regularised_and_says_so(
 
 
 @pytest.mark.parametrize("limit", [10.0, 1e2, 1e3, 1e4, 1e5, 1e6])
-def test_zero_forcing_is_exact_at_every_limit_that_settings_allow(limit: float) -> None:
+def test_zero_forcing_is_exact_at_every_allowed_limit(limit: float) -> None:
     """A^T F = I to 1e-9 unless it is marked as a fallback."""
     try:
         BeamSettings(condition_limit=limit, loss_limit_db=60.0)
@@ -204,7 +204,7 @@ def test_zero_forcing_is_exact_at_every_limit_that_settings_allow(limit: float) 
 
 @pytest.mark.parametrize("policy", Policy)
 @pytest.mark.parametrize("sines", [[0.2, 0.2], [0.5, -0.1, 0.5], [0.0] * 5])
-def test_identical_directions_are_finite_under_every_policy(
+def test_identical_directions_give_finite_weights_under_every_policy(
     sines: list[float], policy: Policy
 ) -> None:
     a = matrix(sines)
@@ -239,7 +239,7 @@ def mirrored(offset: float) -> ComplexArray:
 
 
 @pytest.mark.parametrize("policy", Policy)
-def test_through_the_mirror_direction_no_user_loses_more_than_3_db(policy: Policy) -> None:
+def test_crossing_the_mirror_direction_costs_at_most_3_db(policy: Policy) -> None:
     """Plain zero forcing loses 40 dB there."""
     worst_db, plain_db = 0.0, 0.0
     for offset in [0.0, *np.logspace(-6, -0.7, 120)]:
@@ -255,7 +255,7 @@ def test_through_the_mirror_direction_no_user_loses_more_than_3_db(policy: Polic
 
 @settings(max_examples=examples(100))
 @given(st.integers(1, 20), st.integers(0, 2**16), st.data())
-def test_groups_serve_everybody_once_and_each_is_within_the_limits(
+def test_groups_serve_each_uav_once_within_the_limits(
     users: int, seed: int, data: st.DataObject
 ) -> None:
     a = steering.steering_matrix(any_array(seed), somewhere(data, users))
@@ -271,13 +271,13 @@ def test_groups_serve_everybody_once_and_each_is_within_the_limits(
         assert loss_db(together, weights).max() <= 3 + 1e-6
 
 
-def test_those_who_stand_apart_are_one_group() -> None:
+def test_separated_uavs_form_one_group() -> None:
     found = precode(apart(3, 3, 64), Precoder(policy=Policy.GROUP))
     assert found.groups.max() == 0
     assert found.dropped == {}
 
 
-def test_the_lowest_priority_is_dropped_and_it_is_said_why() -> None:
+def test_lowest_priority_uav_is_dropped_with_a_reason() -> None:
     a = matrix([0.3, -0.5, 0.305, 0.7])
     found = precode(a, Precoder(policy=Policy.DROP))
     assert list(found.served) == [0, 1, 3]
@@ -292,7 +292,7 @@ def test_the_lowest_priority_is_dropped_and_it_is_said_why() -> None:
 
 
 @pytest.mark.parametrize("policy", Policy)
-def test_what_elements_radiate_there_is_no_closeness(policy: Policy) -> None:
+def test_weak_element_gain_does_not_count_as_closeness(policy: Policy) -> None:
     """Two UAVs 70 degrees apart, one where narrow elements hardly radiate."""
     line = uniform_linear(
         64,
@@ -325,7 +325,7 @@ def test_what_elements_radiate_there_is_no_closeness(policy: Policy) -> None:
 
 
 @pytest.mark.parametrize("limit", [2.0, 10.0, 1000.0])
-def test_the_loaded_matrix_is_within_the_condition_limit(limit: float) -> None:
+def test_loaded_matrix_meets_the_condition_limit(limit: float) -> None:
     """The loss limit alone would accept it; compared with the weights of the smallest loading."""
     a = matrix([0.3, 0.3 + 1e-5, -0.4])
     found = precode(a, Precoder(condition_limit=limit, loss_limit_db=60.0))
@@ -339,7 +339,7 @@ def test_the_loaded_matrix_is_within_the_condition_limit(limit: float) -> None:
     assert found.weights == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_condition_number_is_that_of_the_worst_group() -> None:
+def test_condition_number_is_the_largest_of_all_groups() -> None:
     a = matrix([0.3, -0.5, 0.305, 0.7, 0.62])
     found = precode(a, Precoder(policy=Policy.GROUP))
     conditions = [np.linalg.cond(a[:, found.groups == t]) for t in range(found.groups.max() + 1)]
@@ -347,7 +347,7 @@ def test_the_condition_number_is_that_of_the_worst_group() -> None:
     assert found.condition_number == pytest.approx(max(conditions), rel=1e-9)
 
 
-def test_a_direction_in_which_nothing_radiates_is_refused() -> None:
+def test_zero_steering_vector_is_rejected() -> None:
     a = matrix([0.3, -0.5])
     a[:, 1] = 0.0
     with pytest.raises(ValueError, match="a steering vector is 0"):
@@ -356,7 +356,7 @@ def test_a_direction_in_which_nothing_radiates_is_refused() -> None:
 
 @pytest.mark.parametrize("regularisation", [1e-300, 1e-15, 1e-9])
 @pytest.mark.parametrize("sines", [[0.3, 0.3], [0.2, 0.2, -0.4], list(np.linspace(-1, 1, 20))])
-def test_however_little_is_loaded_weights_are_finite(
+def test_weights_are_finite_at_any_regularisation(
     regularisation: float, sines: list[float]
 ) -> None:
     a = matrix(sines)
@@ -365,7 +365,7 @@ def test_however_little_is_loaded_weights_are_finite(
     assert np.einsum("mn,mn->n", a, found.weights) == pytest.approx(np.ones(len(sines)), abs=1e-9)
 
 
-def test_who_cannot_be_told_apart_at_all_is_not_said_to_cost_inf_db() -> None:
+def test_drop_reason_of_identical_uavs_contains_no_infinite_loss() -> None:
     found = precode(matrix([0.3, 0.3]), Precoder(policy=Policy.DROP))
     assert found.dropped == {
         1: "too close to a UAV of higher priority: separating all would exceed the limits"
@@ -383,7 +383,7 @@ def test_who_cannot_be_told_apart_at_all_is_not_said_to_cost_inf_db() -> None:
     st.sampled_from(list(Policy)),
     st.data(),
 )
-def test_power_is_what_its_name_says(
+def test_normalisations_scale_power_as_named(
     users: int, seed: int, method: Method, policy: Policy, data: st.DataObject
 ) -> None:
     a = steering.steering_matrix(any_array(seed), somewhere(data, users))
@@ -415,7 +415,7 @@ def test_power_is_what_its_name_says(
         assert ratio == pytest.approx(np.broadcast_to(ratio[0].real, ratio.shape), rel=1e-6)
 
 
-def test_mirror_images_about_the_line_cannot_be_told_apart() -> None:
+def test_mirror_images_about_a_line_are_regularised() -> None:
     """Ahead and behind, above and below: equal for a line along y."""
     array = uniform_linear(64, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     for image in ([-0.6, 0.8, 0.0], [0.0, 0.8, 0.6], [0.0, 0.8, -0.6]):
@@ -431,7 +431,7 @@ def test_more_users_than_elements_are_regularised() -> None:
     assert np.all(np.isfinite(found.weights))
 
 
-def test_one_user_gets_the_conjugate_beam() -> None:
+def test_single_user_gets_the_conjugate_beam() -> None:
     a = matrix([0.37])
     found = precode(a, Precoder())
     assert (found.method, found.condition_number) == (Method.ZERO_FORCING, 1.0)
@@ -439,21 +439,21 @@ def test_one_user_gets_the_conjugate_beam() -> None:
     assert gain_db(a, found.weights) == pytest.approx([10 * math.log10(16)])
 
 
-def test_no_users_no_weights() -> None:
+def test_no_users_give_no_weights() -> None:
     found = precode(np.empty((16, 0), dtype=complex), Precoder())
     assert found.weights.shape == (16, 0)
     assert found.condition_number is None
 
 
 @pytest.mark.parametrize("users", [1, 2])
-def test_what_is_not_a_number_is_refused(users: int) -> None:
+def test_non_finite_steering_is_rejected(users: int) -> None:
     """Weights are always finite."""
     with pytest.raises(ValueError, match="0 or not finite"):
         precode(np.full((4, users), np.nan + 0j), Precoder())
 
 
 @given(st.integers(0, 1000), st.integers(1, 5))
-def test_the_gain_is_the_power_towards_its_own_direction(seed: int, users: int) -> None:
+def test_gain_is_the_normalised_power_towards_its_uav(seed: int, users: int) -> None:
     a = apart(seed, users)
     weights: ComplexArray = np.random.default_rng(seed).standard_normal(
         (16, users)
@@ -466,13 +466,13 @@ def test_the_gain_is_the_power_towards_its_own_direction(seed: int, users: int) 
     assert gain_db(a, precode(a, Precoder()).weights).max() <= 10 * math.log10(16) + 1e-9
 
 
-def test_the_steering_matrix_is_not_written_to() -> None:
+def test_steering_matrix_is_not_modified() -> None:
     a = matrix([0.1, 0.5])
     before = a.copy()
     precode(a, Precoder())
     assert np.array_equal(a, before)
 
 
-def test_a_part_of_the_radio_keeps_what_is_whose() -> None:
+def test_subset_of_radio_keeps_snr_and_weights_of_its_users() -> None:
     part = Radio(np.array([1.0, 2.0, 3.0]), np.array([7.0, 8.0, 9.0])).of(np.array([0, 2]))
     assert (part.snr.tolist(), part.worths.tolist()) == ([1.0, 3.0], [7.0, 9.0])

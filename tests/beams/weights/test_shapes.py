@@ -41,13 +41,13 @@ ALL_DB = {0.25: 17.20, 0.5: 15.05, 1.0: 13.29, 2.0: 11.07, 4.0: 8.52, 8.0: 5.76,
 
 
 @pytest.mark.parametrize("width", ALL_DB)
-def test_the_least_gain_of_a_line_is_near_that_of_free_amplitudes(width: float) -> None:
+def test_least_gain_of_a_line_is_near_the_free_amplitude_optimum(width: float) -> None:
     least = gains_db(sure(64, width), width).min()
     assert ALL_DB[width] - 1.2 < least < ALL_DB[width] + 0.01
 
 
 @pytest.mark.parametrize(("elements", "most"), [(16, 4.0), (256, 10.0)])
-def test_one_table_serves_other_numbers_of_elements(elements: int, most: float) -> None:
+def test_shape_table_applies_to_other_element_counts(elements: int, most: float) -> None:
     for width in (0.25, 0.5, 0.7, 1.0, 1.5, 2.0, 3.0, 4.0, 8.0, 10.0):
         if width <= most:
             here = gains_db(sure(elements, width), width).min() - 10 * np.log10(elements)
@@ -58,7 +58,7 @@ def test_one_table_serves_other_numbers_of_elements(elements: int, most: float) 
 @pytest.mark.parametrize("cone", [1.0, 2.0, 4.0, 8.0])
 @pytest.mark.parametrize("likely", [0.3, 0.6])
 @pytest.mark.parametrize("floor_db", [0.0, 2.5])
-def test_a_likely_shape_has_its_floor_and_gains_by_it(
+def test_likely_shape_keeps_its_floor_and_gains_in_the_middle(
     cone: float, likely: float, floor_db: float
 ) -> None:
     """At least the wanted floor (or 3 dB below the best), and above the guarantee shape in the
@@ -73,7 +73,7 @@ def test_a_likely_shape_has_its_floor_and_gains_by_it(
     assert found[800] > 11.5
 
 
-def test_a_floor_that_is_out_of_reach_is_not_paid_for() -> None:
+def test_unreachable_floor_costs_no_gain() -> None:
     """At most 3.5 dB is reachable within 12 widths; a floor of 0.5 dB, 3 dB below, would cost the
     middle 2 dB more."""
     across, usual = shapes.aperture(line(64)), np.array([[0.8]])
@@ -113,7 +113,7 @@ def test_a_floor_that_is_out_of_reach_is_not_paid_for() -> None:
     ids=["line", "square", "large square"],
 )
 @pytest.mark.parametrize("likely", [0.05, 0.22, 0.5, 1.0])
-def test_a_bound_that_grows_changes_the_gain_little_by_little(
+def test_gain_changes_gradually_as_the_bound_grows(
     array: Array, widest: float, likely: float
 ) -> None:
     """Also between table entries: phases of two kinds have no mean."""
@@ -144,7 +144,7 @@ def disc(width: float) -> FloatArray:
         (32, 4.0, 9.8), (32, 4.15, 9.6), (32, 6.0, 5.2), (32, 8.0, 2.0), (32, 12.0, -1.4),
     ],
 )  # fmt: skip
-def test_the_least_gain_of_a_plane(elements: int, width: float, least_db: float) -> None:
+def test_least_gain_of_a_planar_array(elements: int, width: float, least_db: float) -> None:
     """Beyond four natural widths it was once -30 dB, where a single element has 0 dB."""
     across = shapes.aperture(
         uniform_rectangular(
@@ -160,7 +160,7 @@ def test_the_least_gain_of_a_plane(elements: int, width: float, least_db: float)
     assert 20 * np.log10(np.abs(field).min() / elements) > least_db
 
 
-def test_no_width_is_no_shape() -> None:
+def test_zero_width_gives_no_phases() -> None:
     across = shapes.aperture(line(64))
     nothing = shapes.phases_rad(across, np.zeros((2, 1)), np.zeros((2, 1)))
     assert np.abs(nothing).max() < 1e-9
@@ -169,7 +169,7 @@ def test_no_width_is_no_shape() -> None:
 
 @settings(max_examples=examples(100), deadline=None)
 @given(st.floats(0.01, 30.0), st.floats(0.01, 1.0), st.floats(-5.0, 8.0), st.booleans())
-def test_shapes_follow_widths_without_a_step(
+def test_shapes_are_continuous_in_width(
     cone: float, ratio: float, floor_db: float, plane: bool
 ) -> None:
     array = (
@@ -195,7 +195,7 @@ def test_shapes_follow_widths_without_a_step(
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_any_array_has_finite_phases(seed: int) -> None:
+def test_shape_phases_are_finite_for_any_array(seed: int) -> None:
     rng = np.random.default_rng(seed)
     for count in (1, 2, 5, 24):
         places = rng.uniform(-0.05, 0.05, (count, 3))

@@ -78,7 +78,7 @@ def spread(
 
 @pytest.mark.parametrize("bound_deg", [0.9, 1.6, 2.7, 4.0, 6.0, 9.0, 14.0])
 @pytest.mark.parametrize("azimuth_deg", [0.0, -35.0, 60.0])
-def test_a_beam_for_its_bound_reaches_all_of_it(bound_deg: float, azimuth_deg: float) -> None:
+def test_widened_beam_covers_its_whole_bound(bound_deg: float, azimuth_deg: float) -> None:
     """An even spread would have 1 / 2w of 64; within 4.5 dB of that everywhere."""
     directions = towards((azimuth_deg, 3.0))
     beams = spread(LINE, directions, bound_deg).beams
@@ -90,7 +90,7 @@ def test_a_beam_for_its_bound_reaches_all_of_it(bound_deg: float, azimuth_deg: f
 
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 45.0, 80.0])
-def test_a_likely_beam_is_near_a_sharp_one_and_has_a_floor(azimuth_deg: float) -> None:
+def test_likely_beam_gains_more_than_guarantee_beam_and_has_a_floor(azimuth_deg: float) -> None:
     directions = towards((azimuth_deg, 0.0))
     likely = spread(LINE, directions, 6.0, 0.8, Widen.LIKELY).beams
     sure = spread(LINE, directions, 6.0, 0.8).beams
@@ -101,14 +101,14 @@ def test_a_likely_beam_is_near_a_sharp_one_and_has_a_floor(azimuth_deg: float) -
     assert power_db(LINE, likely, crowd).min() > 0.0
 
 
-def test_elements_all_radiate_alike() -> None:
+def test_widened_beams_have_unit_amplitudes() -> None:
     for widen in (Widen.LIKELY, Widen.GUARANTEE):
         for array in (LINE, RECTANGLE, CIRCLE):
             beams = spread(array, FOUR, 12.0, 2.0, widen).beams
             assert np.abs(beams) == pytest.approx(np.ones(beams.shape))
 
 
-def test_nothing_is_widened_where_all_is_known_or_nothing_is_wanted() -> None:
+def test_beams_are_not_widened_when_disabled_or_bounds_are_small() -> None:
     known = DirectionErrors(likely_rad=np.full(4, 0.01), bounds_rad=np.full(4, 0.1))
     assert widening.spread(LINE, FOUR, known, Widen.NO) is None
     for widen in (Widen.LIKELY, Widen.GUARANTEE):
@@ -118,7 +118,7 @@ def test_nothing_is_widened_where_all_is_known_or_nothing_is_wanted() -> None:
         assert spread(LINE, FOUR, 9.0, 3.0, widen).broadened.all()
 
 
-def test_points_are_beside_each_user_where_the_array_has_room() -> None:
+def test_null_points_are_added_beside_users_when_elements_allow() -> None:
     for array, directions, beside in (
         (LINE, FOUR, 2),
         (RECTANGLE, FOUR, 4),
@@ -130,7 +130,7 @@ def test_points_are_beside_each_user_where_the_array_has_room() -> None:
         assert wide.centres == pytest.approx(steering_matrix(array, directions))
 
 
-def test_what_concerns_some_users_is_theirs_in_their_order() -> None:
+def test_subset_of_widening_matches_its_users_in_order() -> None:
     wide = spread(RECTANGLE, FOUR, [2.0, 9.0, 1.0, 16.0], 1.0)
     assert wide.of(np.arange(4)) is wide
     chosen = np.array([0, 2, 3])
@@ -144,7 +144,7 @@ def test_what_concerns_some_users_is_theirs_in_their_order() -> None:
 
 
 @pytest.mark.parametrize("array", [LINE, RECTANGLE, CIRCLE], ids=["line", "rectangle", "circle"])
-def test_nulls_are_as_wide_as_is_likely(array: Array) -> None:
+def test_nulls_cover_the_likely_directions(array: Array) -> None:
     """The interference falls by at least 6 dB compared with nulls at single points."""
     likely = math.radians(1.5)
     a = steering_matrix(array, FOUR)
@@ -186,7 +186,7 @@ def crowded(
     st.floats(0.1, 20.0),
     st.sampled_from(list(Widen)[:2]),
 )
-def test_nulls_cost_no_least_gain_more_than_their_price(
+def test_nulls_lower_the_least_gain_within_the_limit(
     users: int, seed: int, most_deg: float, widen: Widen
 ) -> None:
     """At the sample points, over the cone and over its likely part."""
@@ -208,7 +208,7 @@ def test_nulls_cost_no_least_gain_more_than_their_price(
         assert (after[~worth] > 1.15 * (before[~worth] / 1.15) ** 14 - 1e-8).all()
 
 
-def test_nulls_seldom_cost_more_between_the_places_that_are_looked_at() -> None:
+def test_nulls_seldom_cost_more_between_sample_points() -> None:
     """Beside a steep flank the edge of a cone may lose more; guarantees are proven elsewhere."""
     lost: list[float] = []
     for seed in range(60):
@@ -227,7 +227,7 @@ def test_nulls_seldom_cost_more_between_the_places_that_are_looked_at() -> None:
     assert max(lost) < 12.0
 
 
-def test_two_uavs_close_together_keep_their_floors() -> None:
+def test_close_uavs_keep_their_floor_gain() -> None:
     """Bounds of 4.7 degrees, 5 degrees apart: exact nulls would leave no floor gain."""
     directions = towards((0.0, 0.0), (5.0, 0.0))
     wide = spread(LINE, directions, 4.7, 1.2)
@@ -243,7 +243,7 @@ def test_two_uavs_close_together_keep_their_floors() -> None:
     assert not found.exact.any()
 
 
-def test_where_nothing_stands_in_the_way_nulls_are_exact() -> None:
+def test_nulls_are_exact_for_separated_uavs() -> None:
     a = steering_matrix(LINE, FOUR)
     for widen in (Widen.LIKELY, Widen.GUARANTEE):
         found = precode(a, Precoder(), spread(LINE, FOUR, 3.0, 1.0, widen))
@@ -254,13 +254,13 @@ def test_where_nothing_stands_in_the_way_nulls_are_exact() -> None:
 
 @settings(max_examples=examples(40), deadline=None)
 @given(st.integers(0, 2**16), st.sampled_from(list(Widen)[:2]))
-def test_beams_follow_directions_without_a_step(seed: int, widen: Widen) -> None:
+def test_beams_are_continuous_as_directions_move(seed: int, widen: Widen) -> None:
     """Through overlapping bounds: no loading starts or stops abruptly."""
     assert least_alike(seed, widen) > 0.75
 
 
 @pytest.mark.parametrize("seed", [178, 994, 13797, 22582, 26960, 28655, 38418, 49021])
-def test_beams_of_two_that_pass_one_another_do_not_turn_round(seed: int) -> None:
+def test_beams_of_crossing_uavs_do_not_flip(seed: int) -> None:
     """Two of four UAVs coincide at some time: a null beside a beam changes its side."""
     for widen in (Widen.LIKELY, Widen.GUARANTEE):
         assert least_alike(seed, widen) > 0.75
@@ -289,7 +289,7 @@ def least_alike(seed: int, widen: Widen) -> float:
 
 @pytest.mark.parametrize("policy", [Policy.GROUP, Policy.DROP])
 @pytest.mark.parametrize("seed", range(4))
-def test_turns_are_exact(policy: Policy, seed: int) -> None:
+def test_time_slots_have_exact_nulls(policy: Policy, seed: int) -> None:
     rng = np.random.default_rng(seed)
     directions = towards(*((azimuth, 0.0) for azimuth in rng.uniform(-6, 6, 7)))
     a = steering_matrix(LINE, directions)
@@ -304,7 +304,7 @@ def test_turns_are_exact(policy: Policy, seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3, 6, 11])
-def test_points_nulled_beside_the_others_leave_nothing_at_them(seed: int) -> None:
+def test_extra_null_points_keep_nulls_at_uavs_exact(seed: int) -> None:
     """On dense arrays rounding would cost ten digits of the nulls unless it is corrected."""
     for spacing in (0.05, 0.1):
         rng = np.random.default_rng(seed)
@@ -320,7 +320,7 @@ def test_points_nulled_beside_the_others_leave_nothing_at_them(seed: int) -> Non
             assert np.abs(response - np.eye(now.sum())).max() <= 1e-10
 
 
-def test_maximum_ratio_takes_the_shapes_as_they_are() -> None:
+def test_maximum_ratio_weights_equal_the_shapes() -> None:
     wide = spread(LINE, FOUR, 5.0)
     found = precode(steering_matrix(LINE, FOUR), Precoder(method=Method.MATCHED), wide).weights
     ratio = found / wide.beams
@@ -376,9 +376,7 @@ EVERY = {
 @pytest.mark.parametrize("array", EVERY.values(), ids=EVERY)
 @settings(max_examples=examples(25), deadline=None)
 @given(data=st.data())
-def test_weights_are_finite_whatever_the_array_and_the_uavs(
-    array: Array, data: st.DataObject
-) -> None:
+def test_weights_are_finite_for_any_array_and_uavs(array: Array, data: st.DataObject) -> None:
     """From one user to twice as many as elements; coincident, opposite, random directions."""
     users = data.draw(st.integers(1, 2 * array.size))
     rng = np.random.default_rng(data.draw(st.integers(0, 2**16)))
@@ -408,7 +406,7 @@ def test_weights_are_finite_whatever_the_array_and_the_uavs(
         assert np.abs(stray - np.eye(now.sum())).max() < 1e-9
 
 
-def test_a_least_gain_that_the_link_needs_is_what_nulls_leave() -> None:
+def test_nulls_preserve_the_gain_that_the_link_needs() -> None:
     """Another UAV within the bound: with 6 dB required the floor stays above 6 dB, otherwise above
     0 dB."""
     directions = towards((0.0, 0.0), (2.0, 0.0))

@@ -103,14 +103,14 @@ def check(found: ZeroForcingSolution | None, a: ComplexArray, tolerance: float =
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("users", [1, 3, 16, 32])
-def test_it_is_the_pseudo_inverse_for_every_array(kind: str, users: int) -> None:
+def test_solution_is_the_pseudo_inverse_for_every_array(kind: str, users: int) -> None:
     rng = np.random.default_rng(users)
     a = steering.steering_matrix(any_array(kind, rng), anywhere(users, rng))
     check(solve(a), a)
 
 
 @pytest.mark.parametrize(("size", "users"), SIZES)
-def test_any_memory_order(size: int, users: int) -> None:
+def test_any_memory_order_is_accepted(size: int, users: int) -> None:
     a = line(spread(users, np.random.default_rng(3)), size)
     for given_as in (a, np.asfortranarray(a), np.repeat(a, 2, axis=1)[:, ::2]):
         before = given_as.copy()
@@ -123,7 +123,7 @@ def test_any_memory_order(size: int, users: int) -> None:
 
 @given(st.integers(0, 10**6), st.integers(1, 40), st.floats(-6, 6))
 @settings(max_examples=examples(30), deadline=None)
-def test_loss_factors_do_not_depend_on_how_columns_are_scaled(
+def test_loss_factors_are_invariant_to_column_scaling(
     seed: int, users: int, decades: float
 ) -> None:
     rng = np.random.default_rng(seed)
@@ -142,7 +142,7 @@ def test_loss_factors_do_not_depend_on_how_columns_are_scaled(
 # --- no solution --------------------------------------------------------------------------------
 
 
-def test_no_users() -> None:
+def test_no_users_give_an_empty_solution() -> None:
     for a in (np.empty((8, 0), dtype=complex), np.empty((0, 0), dtype=complex)):
         found = solve(a)
         assert found is not None
@@ -151,7 +151,7 @@ def test_no_users() -> None:
 
 
 @pytest.mark.parametrize(("size", "users"), SIZES)
-def test_no_answer_is_none_and_what_is_not_finite_an_error(size: int, users: int) -> None:
+def test_singular_matrix_returns_none_and_non_finite_matrix_raises(size: int, users: int) -> None:
     good = line(spread(users, np.random.default_rng(4)), size)
     dark, twice = good.copy(), good.copy()
     dark[:, 2] = 0.0
@@ -167,7 +167,7 @@ def test_no_answer_is_none_and_what_is_not_finite_an_error(size: int, users: int
 
 
 @pytest.mark.parametrize("users", [5, 65, 400])
-def test_more_users_than_elements_have_no_answer(users: int) -> None:
+def test_more_users_than_elements_have_no_solution(users: int) -> None:
     rng = np.random.default_rng(5)
     size = 4 if users == 5 else 64
     a = rng.standard_normal((size, users)) + 1j * rng.standard_normal((size, users))
@@ -179,7 +179,7 @@ def test_more_users_than_elements_have_no_answer(users: int) -> None:
 
 @given(st.floats(-12, 0), st.sampled_from(SIZES))
 @settings(max_examples=examples(60), deadline=None)
-def test_what_is_nearly_singular_shows_in_the_loss_factors(
+def test_loss_factors_grow_for_nearly_singular_matrices(
     separation: float, numbers: tuple[int, int]
 ) -> None:
     """Two users that approach each other: closed form of the loss, and A^T F = I.

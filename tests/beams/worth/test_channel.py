@@ -44,7 +44,7 @@ def directions(seed: int, count: int) -> FloatArray:
 # --- free space ---------------------------------------------------------------------------------
 
 
-def test_friis_by_hand() -> None:
+def test_free_space_gain_matches_friis() -> None:
     """20 log10(4 pi 100 m / 9.993 mm) = 102.0 dB at 30 GHz; 6 dB more at twice the range."""
     gains = free_space_gain(np.array([100.0, 200.0]), SPEED_OF_LIGHT_MPS / 30e9)
     assert 10 * np.log10(gains) == pytest.approx([-101.99, -108.01], abs=0.01)
@@ -52,13 +52,13 @@ def test_friis_by_hand() -> None:
 
 
 @pytest.mark.parametrize("range_m", [0.0, -1.0, math.inf, math.nan])
-def test_a_range_that_is_none_is_refused(range_m: float) -> None:
+def test_invalid_range_is_rejected(range_m: float) -> None:
     with pytest.raises(ValueError, match="ranges_m"):
         free_space_gain(np.array([100.0, range_m]), 0.01)
 
 
 @pytest.mark.parametrize("wavelength_m", [0.0, -0.01, math.inf, math.nan])
-def test_a_wavelength_that_is_none_is_refused(wavelength_m: float) -> None:
+def test_invalid_wavelength_is_rejected(wavelength_m: float) -> None:
     with pytest.raises(ValueError, match="wavelength_m"):
         free_space_gain(100.0, wavelength_m)
 
@@ -66,7 +66,7 @@ def test_a_wavelength_that_is_none_is_refused(wavelength_m: float) -> None:
 # --- Saleh-Valenzuela ---------------------------------------------------------------------------
 
 
-def test_sight_alone_is_the_outer_product_written_out() -> None:
+def test_line_of_sight_channel_is_the_outer_product() -> None:
     """Unconjugated at both ends, unit magnitude, one random phase per UAV."""
     at_node, at_uav = directions(1, 3), directions(2, 3)
     channels = draw(
@@ -123,7 +123,7 @@ def test_sight_alone_is_the_outer_product_written_out() -> None:
     ],
     ids=["isotropic", "outward", "forward"],
 )
-def test_the_mean_energy_is_that_of_antennas_and_elements(
+def test_mean_channel_energy_matches_antennas_and_elements(
     rician_k_db: float, node: Array, uav: Array
 ) -> None:
     many = 4000
@@ -150,7 +150,7 @@ def test_the_mean_energy_is_that_of_antennas_and_elements(
 
 
 @pytest.mark.parametrize("k_db", [-5.0, 3.0, 12.0])
-def test_one_pair_of_antennas_fades_as_rice_does(k_db: float) -> None:
+def test_single_antenna_pair_has_rician_moments(k_db: float) -> None:
     """Moments of a Rician amplitude: E x^2 = 1, E x^4 = 1 + (1 + 2 K) / (1 + K)^2. Exact for any
     number of rays, because ray amplitudes are Gaussian."""
     single = listed(np.zeros((1, 3)), 30e9, array_from_body=np.eye(3))
@@ -176,7 +176,7 @@ def test_one_pair_of_antennas_fades_as_rice_does(k_db: float) -> None:
     assert np.mean(power**2) == pytest.approx(1 + (1 + 2 * k) / (1 + k) ** 2, abs=0.06)
 
 
-def test_the_phase_of_the_sight_is_uniform() -> None:
+def test_line_of_sight_phase_is_uniform() -> None:
     ahead = np.tile([1.0, 0.0, 0.0], (4000, 1))
     turns = draw(
         SIGHT_ONLY,
@@ -190,7 +190,7 @@ def test_the_phase_of_the_sight_is_uniform() -> None:
     assert abs(np.mean(turns**2)) < 0.06
 
 
-def test_rays_of_one_cluster_lie_about_it() -> None:
+def test_cluster_without_spread_has_rank_one() -> None:
     """Without spread the rays of a cluster coincide and the channel has rank 1; with spread it has
     not."""
     ahead = np.array([[1.0, 0.0, 0.0]])
@@ -222,7 +222,7 @@ def test_rays_of_one_cluster_lie_about_it() -> None:
     assert singular[1] > 1e-2 * singular[0]
 
 
-def test_the_spread_is_the_standard_deviation_across_a_cluster() -> None:
+def test_angular_spread_is_the_standard_deviation_of_a_cluster() -> None:
     """Correlation of two elements 2 wavelengths apart. A Laplacian angle of deviation s has the
     characteristic function 1 / (1 + (x s)^2 / 2). Two of them, across a cluster rotated by psi
     at cosine c from the pair, give rho below. Ray amplitudes are Gaussian, so E |h0 h1|^2 = 1 +
@@ -254,7 +254,7 @@ def test_the_spread_is_the_standard_deviation_across_a_cluster() -> None:
     assert np.mean(np.abs(h[:, 0] * h[:, 1]) ** 2) == pytest.approx(wanted, abs=0.08)
 
 
-def test_the_same_seed_draws_the_same_and_k_changes_nothing_else() -> None:
+def test_seed_is_reproducible_and_k_only_changes_the_mix() -> None:
     at_node, at_uav = directions(1, 2), directions(2, 2)
     first, again, other = (
         draw(
@@ -284,7 +284,7 @@ def test_the_same_seed_draws_the_same_and_k_changes_nothing_else() -> None:
 
 
 @given(st.floats(-4000, 4000))
-def test_the_shares_are_those_of_k_at_any_k(k_db: float) -> None:
+def test_power_shares_match_the_k_factor(k_db: float) -> None:
     sight, scattered = SalehValenzuela(rician_k_db=k_db).shares
     assert sight + scattered == pytest.approx(1.0)
     if abs(k_db) < 1000:
@@ -302,13 +302,13 @@ def test_the_shares_are_those_of_k_at_any_k(k_db: float) -> None:
         ({"angular_spread_rad": 4.0}, "angular_spread_rad"),
     ],
 )
-def test_a_channel_that_is_none_is_refused(bad: dict[str, float], name: str) -> None:
+def test_invalid_channel_settings_are_rejected(bad: dict[str, float], name: str) -> None:
     with pytest.raises(ValueError, match=name):
         SalehValenzuela(**bad)  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(("nodes", "uavs"), [(2, 3), (1, 2)])
-def test_directions_come_in_pairs(nodes: int, uavs: int) -> None:
+def test_directions_of_wrong_shape_are_rejected(nodes: int, uavs: int) -> None:
     with pytest.raises(ValueError, match=r"\(N, 3\)"):
         draw(
             SIGHT_ONLY,
@@ -347,7 +347,7 @@ def test_the_combiner_is_matched_and_of_unit_norm() -> None:
     assert np.mean(np.abs(through) ** 2, axis=1) == pytest.approx(np.ones(5), abs=0.04)
 
 
-def test_a_conjugate_beam_meets_the_combined_row() -> None:
+def test_conjugate_beam_matches_the_combined_channel() -> None:
     """F = a* and w^H H = |b| a^T add in phase: M^2 N_U."""
     at_node, at_uav = directions(3, 4), directions(4, 4)
     channels = draw(
@@ -364,7 +364,7 @@ def test_a_conjugate_beam_meets_the_combined_row() -> None:
     assert met == pytest.approx(np.full(4, 8**2 * 4.0))
 
 
-def test_a_uav_that_does_not_hear_is_refused() -> None:
+def test_uav_that_faces_away_is_rejected() -> None:
     channels = np.ones((2, 4, 8), dtype=complex)
     with pytest.raises(ValueError, match="face the node"):
         combined_rows(channels, np.array([[1, 0]] * 4, dtype=complex))
@@ -375,7 +375,7 @@ def test_a_uav_that_does_not_hear_is_refused() -> None:
 # --- blockage -----------------------------------------------------------------------------------
 
 
-def test_blocked_from_the_start_up_to_the_end() -> None:
+def test_blockage_interval_is_half_open() -> None:
     blockages = Blockages(((1.0, 2.0), (4.0, 5.0)), 20.0)
     times = np.array([0.0, 1.0, 1.999, 2.0, 3.0, 4.0, 4.5, 5.0, 9.0])
     assert blockages.attenuation_db(times).tolist() == [0, 20, 20, 0, 0, 20, 20, 0, 0]
@@ -383,7 +383,7 @@ def test_blocked_from_the_start_up_to_the_end() -> None:
     assert Blockages().attenuation_db(times).tolist() == [0.0] * 9
 
 
-def test_what_overlaps_or_touches_is_one() -> None:
+def test_overlapping_or_adjacent_blockages_are_merged() -> None:
     given_s = ((4.0, 5.0), (1.0, 3.0), (2.0, 2.5), (3.0, 3.5), (7.0, 7.0))
     assert Blockages(given_s).intervals_s == ((1.0, 3.5), (4.0, 5.0))
     assert Blockages(((2.0, math.inf), (1.0, 2.0))).intervals_s == ((1.0, math.inf),)
@@ -394,7 +394,7 @@ TIMES = st.integers(0, 40).map(lambda q: q / 4)
 
 @settings(max_examples=examples(60))
 @given(st.lists(st.tuples(TIMES, TIMES).map(lambda p: (min(p), max(p))), max_size=8))
-def test_it_is_what_a_walk_through_the_list_finds(intervals: list[tuple[float, float]]) -> None:
+def test_blocked_matches_a_linear_scan(intervals: list[tuple[float, float]]) -> None:
     blockages = Blockages(tuple(intervals))
     times = np.arange(0, 11, 0.125)
     wanted = [any(start <= t < end for start, end in intervals) for t in times]
@@ -413,14 +413,14 @@ def test_it_is_what_a_walk_through_the_list_finds(intervals: list[tuple[float, f
         ((), math.nan, "depth_db"),
     ],
 )
-def test_a_blockage_that_is_none_is_refused(
+def test_invalid_blockage_is_rejected(
     intervals: tuple[tuple[float, float], ...], depth: float, message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
         Blockages(intervals, depth)
 
 
-def test_drawn_blockages_block_as_a_queue_of_many_servers_is_busy() -> None:
+def test_random_blockages_follow_the_m_m_infinity_probability() -> None:
     """P(blocked at t) = 1 - exp(-rate mean (1 - exp(-t/mean))): M/M/infinity, empty at the
     start."""
     rng = np.random.default_rng(8)
@@ -431,7 +431,7 @@ def test_drawn_blockages_block_as_a_queue_of_many_servers_is_busy() -> None:
     assert np.mean(runs, axis=0) == pytest.approx(wanted, abs=0.025)
 
 
-def test_drawn_blockages_are_those_of_the_seed() -> None:
+def test_random_blockages_are_reproducible_by_seed() -> None:
     def drawn(seed: int) -> Blockages:
         return draw_blockages(np.random.default_rng(seed), 60.0, 0.2, 1.0, 30.0)
 
@@ -452,6 +452,8 @@ def test_drawn_blockages_are_those_of_the_seed() -> None:
         (1.0, 1.0, 0.0),
     ],
 )
-def test_blockages_that_cannot_be_drawn(duration_s: float, rate_hz: float, mean_s: float) -> None:
+def test_invalid_random_blockage_parameters_are_rejected(
+    duration_s: float, rate_hz: float, mean_s: float
+) -> None:
     with pytest.raises(ValueError, match="duration_s"):
         draw_blockages(np.random.default_rng(1), duration_s, rate_hz, mean_s)

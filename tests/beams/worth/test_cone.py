@@ -110,7 +110,7 @@ def holders(cells: Cells, direction: FloatArray) -> FloatArray:
 
 @settings(max_examples=examples(150), deadline=None)
 @given(st.sampled_from(sorted(ARRAYS)), BOUNDS, st.integers(0, 2**32 - 1), st.booleans())
-def test_every_direction_of_a_cone_is_in_a_cell(
+def test_cells_cover_every_direction_of_the_cone(
     kind: str, bound_rad: float, seed: int, endfire: bool
 ) -> None:
     cones, boxes = drawn_cones(ARRAYS[kind], bound_rad, seed, endfire)
@@ -122,7 +122,7 @@ def test_every_direction_of_a_cone_is_in_a_cell(
 
 
 @pytest.mark.parametrize("kind", sorted(ARRAYS))
-def test_the_frame_is_right_handed_and_holds_the_predicted_direction(kind: str) -> None:
+def test_cone_frame_is_right_handed_and_contains_the_predicted_direction(kind: str) -> None:
     """Also 1e-12 off the element line, where a cross product fails."""
     array = ARRAYS[kind]
     rng = np.random.default_rng(2)
@@ -176,7 +176,7 @@ def test_responses_stay_within_the_bounds_of_their_cell(
 
 
 @pytest.mark.parametrize("phases_rad", [0.0, 1.0])
-def test_smaller_cells_say_more_by_the_square(phases_rad: float) -> None:
+def test_cell_bounds_tighten_with_the_square_of_the_cell_size(phases_rad: float) -> None:
     """Quartering the cells cuts the slack to about a sixteenth, also for uneven weights; it is
     never negative."""
     array = ARRAYS["line"]
@@ -209,7 +209,7 @@ def test_smaller_cells_say_more_by_the_square(phases_rad: float) -> None:
     assert (np.divide(losses[:-1], losses[1:]) > 10).all()
 
 
-def test_a_response_of_exactly_nothing_has_a_slope_all_the_same() -> None:
+def test_zero_response_still_has_a_slope_bound() -> None:
     """The phase of a zero response is arbitrary."""
     array = uniform_linear(2, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     cones = cone.cones_around(array, np.array([[1.0, 0, 0]]), np.array([0.1]), np.ones((2, 1)))
@@ -233,7 +233,7 @@ def test_a_response_of_exactly_nothing_has_a_slope_all_the_same() -> None:
         (np.array([[1.0, 0, 0]]), [0.1, 0.1], "pointing bound"),
     ],
 )
-def test_what_is_no_cone_is_refused(
+def test_invalid_cone_is_rejected(
     directions: FloatArray, bounds: list[float], message: str
 ) -> None:
     with pytest.raises(ValueError, match=message):
@@ -249,13 +249,13 @@ def test_what_is_no_cone_is_refused(
         (np.eye(16)[:, :3] * [1, 0, 1], "column 1 .* zero"),
     ],
 )
-def test_weights_that_cannot_be_used_are_refused(weights: FloatArray, message: str) -> None:
+def test_invalid_weights_are_rejected(weights: FloatArray, message: str) -> None:
     with pytest.raises(ValueError, match=message):
         cone.unit_power(ARRAYS["line"], weights.astype(complex))
 
 
 @pytest.mark.parametrize("scale", [1e-300, 1.0, 1e300])
-def test_unit_power_holds_at_any_scale(scale: float) -> None:
+def test_unit_power_normalises_any_scale(scale: float) -> None:
     weights = scale * np.array([[1 + 1j], [0.5], [0]] * 4).astype(complex)
     found = cone.unit_power(
         uniform_linear(12, 1e9, spacing_wavelengths=0.5, array_from_body=EYE), weights

@@ -120,7 +120,7 @@ def searched(
         for one in CASES
     ],
 )
-def test_no_direction_within_the_bound_has_less_or_leaks_more(name: str, kind: str) -> None:
+def test_bounds_hold_for_every_direction_within_the_pointing_bound(name: str, kind: str) -> None:
     """Thousands of directions for each array, kind of weights and bound."""
     array, rng = ARRAYS[name], np.random.default_rng(CASES.index((name, kind)))
     weights = weights_for(array, np.random.default_rng(1))[kind]
@@ -138,7 +138,7 @@ def test_no_direction_within_the_bound_has_less_or_leaks_more(name: str, kind: s
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
 @pytest.mark.parametrize("kind", ["matched", "random"])
-def test_the_bounds_are_close_to_what_a_search_finds(name: str, kind: str) -> None:
+def test_bounds_are_close_to_search_results(name: str, kind: str) -> None:
     """Within 0.1 dB for a gain within 15 dB of the predicted one and a cone of a few beams; within
     1 dB for unequal element patterns, where all work is used up."""
     array = ARRAYS[name]
@@ -166,7 +166,7 @@ def test_the_bounds_are_close_to_what_a_search_finds(name: str, kind: str) -> No
     assert seen >= 3
 
 
-def test_the_gain_is_the_sum_written_out() -> None:
+def test_gain_without_error_matches_direct_summation() -> None:
     """Without error: sum of weights, patterns in each element's own frame, and phases."""
     array = ARRAYS["cloud of patterns"]
     assert array.element_from_array is not None
@@ -187,7 +187,7 @@ def test_the_gain_is_the_sum_written_out() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
-def test_without_error_it_is_the_nominal_gain(name: str) -> None:
+def test_guaranteed_gain_without_error_is_the_nominal_gain(name: str) -> None:
     """To eight digits, and never above it."""
     array = ARRAYS[name]
     aims = within(AHEAD[0], 1.0, np.random.default_rng(2), 40)
@@ -201,7 +201,7 @@ def test_without_error_it_is_the_nominal_gain(name: str) -> None:
             assert 10 ** (found_db / 10) < true
 
 
-def test_a_gain_far_down_is_a_gain() -> None:
+def test_very_low_gain_is_still_guaranteed() -> None:
     """Two elements that almost cancel."""
     weights = np.array([[1.0], [-0.9999]], dtype=complex)
     (found,) = guaranteed_gains_db(
@@ -213,7 +213,7 @@ def test_a_gain_far_down_is_a_gain() -> None:
     assert found == pytest.approx(20 * math.log10(1e-4) - 10 * math.log10(1 + 0.9999**2))
 
 
-def test_a_null_at_the_predicted_direction_leaks_beside_it() -> None:
+def test_leakage_bound_covers_directions_beside_a_null() -> None:
     """The response is exactly zero there: its phase is arbitrary, and the slope still counts."""
     weights = np.array([[1.0], [-1.0]], dtype=complex)
     array = line(2, 1e9, spacing_wavelengths=0.5, array_from_body=EYE)
@@ -225,7 +225,7 @@ def test_a_null_at_the_predicted_direction_leaks_beside_it() -> None:
 
 
 @pytest.mark.parametrize(("elements", "bound_deg"), [(64, 0.79), (128, 0.40)])
-def test_the_known_beams_lose_three_decibels(elements: int, bound_deg: float) -> None:
+def test_golden_beams_lose_3_db_at_half_power_angle(elements: int, bound_deg: float) -> None:
     """docs/math.md golden values. At the exact half-power angle the gain is half, within the
     tolerance."""
     array = line(elements, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
@@ -242,7 +242,7 @@ def test_the_known_beams_lose_three_decibels(elements: int, bound_deg: float) ->
     assert -guarantee.TOLERANCE_DB <= exact - full_db - 10 * math.log10(0.5) <= 1e-9
 
 
-def test_nothing_is_sure_past_a_null() -> None:
+def test_no_gain_is_guaranteed_beyond_a_null() -> None:
     """The first null of 64 half-wave elements is at 1.79 degrees."""
     array = line(64, 30e9, spacing_wavelengths=0.5, array_from_body=EYE)
     weights = np.ones((64, 1), dtype=complex)
@@ -252,7 +252,7 @@ def test_nothing_is_sure_past_a_null() -> None:
         assert (found is not None) == sure
 
 
-def test_nothing_is_sure_of_any_direction() -> None:
+def test_no_gain_is_guaranteed_without_a_bound() -> None:
     """Also for a single element that radiates equally everywhere."""
     weights = np.ones((1, 1), dtype=complex)
     array = line(1, 1e9, spacing_wavelengths=0.5, array_from_body=EYE)
@@ -262,7 +262,7 @@ def test_nothing_is_sure_of_any_direction() -> None:
         assert found == (pytest.approx(0.0),)
 
 
-def test_without_a_bound_the_most_of_any_direction_leaks() -> None:
+def test_leakage_without_a_bound_is_the_maximum_over_all_directions() -> None:
     array = ARRAYS["line"]
     weights = weights_for(array, np.random.default_rng(1))["matched"]
     for bound_rad in (None, math.pi, 7.0, math.inf):
@@ -270,7 +270,7 @@ def test_without_a_bound_the_most_of_any_direction_leaks() -> None:
         assert found == pytest.approx(np.full((1, 3), 32.0), rel=0.012)
 
 
-def test_behind_elements_that_radiate_nothing_there_nothing_arrives() -> None:
+def test_directions_behind_elements_have_no_gain_and_no_leakage() -> None:
     behind = np.array([[-1.0, 0, 0]])
     for array in (
         line(4, 1e9, spacing_wavelengths=0.5, array_from_body=EYE, element=COSINE),
@@ -291,7 +291,7 @@ def test_behind_elements_that_radiate_nothing_there_nothing_arrives() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
-def test_a_larger_bound_promises_no_more(name: str) -> None:
+def test_larger_bound_does_not_raise_the_guaranteed_gain(name: str) -> None:
     """Except for the tolerance, by which either may be off."""
     array = ARRAYS[name]
     weights = weights_for(array, np.random.default_rng(1))["matched"]
@@ -307,7 +307,7 @@ def test_a_larger_bound_promises_no_more(name: str) -> None:
         before_db, before = after_db, most
 
 
-def test_each_beam_is_as_if_alone() -> None:
+def test_beams_are_bounded_independently() -> None:
     array = ARRAYS["grid"]
     weights = weights_for(array, np.random.default_rng(1))["zero forcing"]
     bounds = [0.002, None, 0.08]
@@ -325,7 +325,7 @@ def test_each_beam_is_as_if_alone() -> None:
 
 
 @pytest.mark.parametrize("name", ["line", "grid of patterns", "circle"])
-def test_the_scale_and_the_phase_of_weights_do_not_matter(name: str) -> None:
+def test_weight_scale_and_phase_do_not_change_bounds(name: str) -> None:
     array = ARRAYS[name]
     weights = weights_for(array, np.random.default_rng(1))["zero forcing"]
     found = guaranteed_gains_db(array, AHEAD, [0.01] * 3, weights)
@@ -335,9 +335,7 @@ def test_the_scale_and_the_phase_of_weights_do_not_matter(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
-def test_it_is_a_bound_however_early_the_work_ends(
-    name: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_bounds_hold_when_work_is_limited(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     array, rng = ARRAYS[name], np.random.default_rng(6)
     weights = weights_for(array, np.random.default_rng(1))["matched"]
     full = guaranteed_gains_db(array, AHEAD, [0.05] * 3, weights)
@@ -355,7 +353,7 @@ def test_it_is_a_bound_however_early_the_work_ends(
             assert early_db <= full_db + 1e-9
 
 
-def test_zero_forcing_leaks_nothing_but_for_errors() -> None:
+def test_zero_forcing_leaks_only_with_pointing_errors() -> None:
     array = ARRAYS["line"]
     weights = weights_for(array, np.random.default_rng(1))["zero forcing"]
     still = leakage_bounds(array, AHEAD, [0.0] * 3, weights)
@@ -366,7 +364,7 @@ def test_zero_forcing_leaks_nothing_but_for_errors() -> None:
     assert np.diag(still) == pytest.approx(np.diag(gains(array, AHEAD, weights)))
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_mismatched_arguments_are_rejected() -> None:
     array = ARRAYS["line"]
     with pytest.raises(ValueError, match="2 columns of weights for 3 directions"):
         guaranteed_gains_db(array, AHEAD, [0.1] * 3, np.ones((32, 2), dtype=complex))

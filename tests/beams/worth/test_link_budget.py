@@ -52,7 +52,7 @@ def random_complex(rng: np.random.Generator, *shape: int) -> ComplexArray:
 # --- link budget --------------------------------------------------------------------------------
 
 
-def test_noise_by_hand() -> None:
+def test_noise_power_matches_hand_calculation() -> None:
     """-174 dBm/Hz + 77 dB (50 MHz) + 7 dB = -90 dBm; 30 dBm is one watt."""
     assert 10 * math.log10(BUDGET.noise_power_w * 1e3) == pytest.approx(-174 + 76.99 + 7, abs=0.03)
     assert BUDGET.noise_power_w == pytest.approx(1e-12, rel=0.01)
@@ -73,7 +73,7 @@ def test_noise_by_hand() -> None:
         ((0.0, 1.0, 1.0, 0.0), "temperature_k"),
     ],
 )
-def test_a_budget_that_is_none_is_refused(values: tuple[float, ...], name: str) -> None:
+def test_invalid_link_budget_is_rejected(values: tuple[float, ...], name: str) -> None:
     with pytest.raises(ValueError, match=name):
         LinkBudget(
             tx_power_dbm=values[0],
@@ -88,7 +88,7 @@ def test_a_budget_that_is_none_is_refused(values: tuple[float, ...], name: str) 
 
 @settings(max_examples=examples(40))
 @given(st.integers(0, 1000), st.lists(st.integers(0, 2), min_size=1, max_size=6))
-def test_each_group_sends_the_whole_power_in_equal_streams(seed: int, slots: list[int]) -> None:
+def test_each_time_slot_splits_full_power_equally(seed: int, slots: list[int]) -> None:
     rng = np.random.default_rng(seed)
     weights = random_complex(rng, 5, len(slots)) * 10.0 ** rng.integers(-9, 9, len(slots))
     groups = np.array(slots)
@@ -101,7 +101,7 @@ def test_each_group_sends_the_whole_power_in_equal_streams(seed: int, slots: lis
     assert shared / np.sqrt(powers) == pytest.approx(weights / np.linalg.norm(weights, axis=0))
 
 
-def test_a_stream_that_is_not_sent_takes_no_power() -> None:
+def test_zero_stream_gets_no_power() -> None:
     weights = np.array([[1, 0, 2j], [1, 0, 0]], dtype=complex)
     shared = share_power(weights, 2.0)
     assert np.sum(np.abs(shared) ** 2, axis=0) == pytest.approx([1.0, 0.0, 1.0])
@@ -110,7 +110,7 @@ def test_a_stream_that_is_not_sent_takes_no_power() -> None:
 
 
 @pytest.mark.parametrize("power_w", [0.0, -1.0, math.nan, math.inf])
-def test_power_that_is_none_is_refused(power_w: float) -> None:
+def test_invalid_power_is_rejected(power_w: float) -> None:
     with pytest.raises(ValueError, match="power_w"):
         share_power(np.ones((2, 2), dtype=complex), power_w)
 
@@ -118,7 +118,7 @@ def test_power_that_is_none_is_refused(power_w: float) -> None:
 # --- SINR ---------------------------------------------------------------------------------------
 
 
-def test_it_is_what_a_receiver_measures_on_random_symbols() -> None:
+def test_sinr_matches_a_symbol_level_simulation() -> None:
     """Symbols through the whole chain: weights, scattered channel, noise at each UAV antenna,
     combining. The wanted part is found by correlation; the rest is interference and noise."""
     rng = np.random.default_rng(12)
@@ -153,7 +153,7 @@ def test_it_is_what_a_receiver_measures_on_random_symbols() -> None:
 
 @settings(max_examples=examples(40))
 @given(st.integers(0, 1000), st.lists(st.integers(0, 2), min_size=1, max_size=6))
-def test_it_is_the_sum_written_out(seed: int, slots: list[int]) -> None:
+def test_sinr_matches_direct_summation(seed: int, slots: list[int]) -> None:
     rng = np.random.default_rng(seed)
     users = len(slots)
     responses = random_complex(rng, users, users)
@@ -172,7 +172,7 @@ def test_it_is_the_sum_written_out(seed: int, slots: list[int]) -> None:
     assert (found <= alone + 1e-12).all()
 
 
-def test_many_at_once_are_as_one_by_one() -> None:
+def test_batched_sinr_equals_individual_sinr() -> None:
     rng = np.random.default_rng(3)
     responses, gains = random_complex(rng, 5, 2, 3, 3), rng.uniform(0.1, 1, (5, 2, 3))
     found = sinr(responses, gains, 0.1, np.array([0, 1, 0]))
@@ -181,7 +181,7 @@ def test_many_at_once_are_as_one_by_one() -> None:
         assert found[k] == pytest.approx(sinr(responses[k], gains[k], 0.1, np.array([0, 1, 0])))
 
 
-def test_zero_forcing_on_the_line_of_sight_leaves_noise_alone() -> None:
+def test_zero_forcing_in_line_of_sight_is_limited_by_noise_alone() -> None:
     """SINR = P g / noise times the gain |a^T f|^2 / |f|^2, to the last digits."""
     a = steering.steering_matrix(ARRAY, APART)
     f = precode(a, Precoder()).weights
@@ -191,7 +191,7 @@ def test_zero_forcing_on_the_line_of_sight_leaves_noise_alone() -> None:
     assert found == pytest.approx(gains * towards * 0.25 / BUDGET.noise_power_w, rel=1e-9)
 
 
-def test_matched_antennas_at_the_uav_gain_their_number_exactly() -> None:
+def test_matched_uav_antennas_gain_exactly_their_number() -> None:
     sight = SalehValenzuela(rician_k_db=math.inf)
     weights = share_power(precode(steering.steering_matrix(ARRAY, APART), Precoder()).weights, 1.0)
     gains = free_space_gain(RANGES_M, ARRAY.wavelength_m)
@@ -213,7 +213,7 @@ def test_matched_antennas_at_the_uav_gain_their_number_exactly() -> None:
 
 
 @pytest.mark.parametrize("depth_db", [3.0, 25.0])
-def test_a_blockage_takes_its_decibels_from_the_sinr(depth_db: float) -> None:
+def test_blockage_lowers_sinr_by_its_depth(depth_db: float) -> None:
     """Exactly so without interference; with interference alone the SINR does not change."""
     lost_db = Blockages(((1.0, 2.0),), depth_db).attenuation_db(np.array([0.5, 1.5]))
     gains = 10 ** (-lost_db / 10)[:, np.newaxis] * np.ones(2)
@@ -223,7 +223,7 @@ def test_a_blockage_takes_its_decibels_from_the_sinr(depth_db: float) -> None:
     assert clear == pytest.approx(blocked)
 
 
-def test_interference_far_below_the_signal_is_not_rounded_away() -> None:
+def test_weak_interference_is_not_lost_to_rounding() -> None:
     responses = np.array([[1.0, 1e-12], [1e-12, 1.0]], dtype=complex)
     assert sinr(responses, np.ones(2), 1e-30) == pytest.approx([1e24] * 2, rel=1e-5)
 
@@ -238,7 +238,7 @@ def test_interference_far_below_the_signal_is_not_rounded_away() -> None:
         ((2, 2), 2, 0.1, 3, "groups"),
     ],
 )
-def test_what_does_not_fit_is_refused(
+def test_mismatched_arguments_are_rejected(
     responses: tuple[int, int], gains: int, noise: float, groups: int | None, name: str
 ) -> None:
     slots = None if groups is None else np.zeros(groups, dtype=np.int64)
@@ -249,19 +249,19 @@ def test_what_does_not_fit_is_refused(
 # --- spectral efficiency ------------------------------------------------------------------------
 
 
-def test_it_is_the_logarithm_to_two() -> None:
+def test_spectral_efficiency_is_log2() -> None:
     assert spectral_efficiency(np.array([0.0, 1.0, 3.0, 1023.0])) == pytest.approx([0, 1, 2, 10])
     assert float(spectral_efficiency(1.0, slots=4)) == pytest.approx(0.25)
     assert float(spectral_efficiency(1e-18)) == pytest.approx(1e-18 / math.log(2), abs=0)
 
 
 @given(st.floats(0, 1e12), st.floats(1.001, 10))
-def test_more_is_more(ratio: float, factor: float) -> None:
+def test_spectral_efficiency_increases_with_sinr(ratio: float, factor: float) -> None:
     low, high = spectral_efficiency(np.array([ratio, ratio * factor + 1e-3]))
     assert 0 <= low < high
 
 
-def test_a_rate_that_is_none_is_refused() -> None:
+def test_invalid_sinr_or_slot_count_is_rejected() -> None:
     for ratio in (-0.1, math.nan):
         with pytest.raises(ValueError, match="SINR"):
             spectral_efficiency(np.array([1.0, ratio]))
@@ -278,7 +278,7 @@ def sent(weights: ComplexArray, groups: IntArray | None = None) -> ComplexArray:
 
 @pytest.mark.parametrize("normalisation", Normalisation)
 @pytest.mark.parametrize("groups", [None, np.array([0, 1, 0, 0])])
-def test_what_is_sent_is_the_matrix_that_is_delivered(
+def test_sent_weights_are_the_delivered_matrix_up_to_scale(
     normalisation: Normalisation, groups: IntArray | None
 ) -> None:
     """Up to one factor per time slot; full power, or its share at the busiest element."""
@@ -304,7 +304,7 @@ def test_what_is_sent_is_the_matrix_that_is_delivered(
             assert power.sum() == pytest.approx(3.0)
 
 
-def test_one_uav_by_hand() -> None:
+def test_single_uav_sinr_matches_hand_calculation() -> None:
     """30 dBm + 18.06 dB (64 elements) + 6.02 dB (4 antennas) - 101.99 dB + 89.98 dBm."""
     ahead, at = in_plane(0.0), np.array([100.0])
     f = steering.steering_matrix(ARRAY, ahead).conj() * 7.0  # any normalisation
@@ -314,7 +314,7 @@ def test_one_uav_by_hand() -> None:
     assert found == pytest.approx([30 + 18.06 + 6.02 - 101.99 + 89.98], abs=0.05)
 
 
-def test_it_is_the_sinr_of_the_channel_without_scattering() -> None:
+def test_predicted_sinr_matches_the_line_of_sight_channel() -> None:
     """The whole chain with a drawn channel, for weights that leave interference."""
     weights = steering.steering_matrix(ARRAY, APART).conj()
     groups = np.array([0, 1, 0, 0])
@@ -339,7 +339,7 @@ def test_it_is_the_sinr_of_the_channel_without_scattering() -> None:
     assert found == pytest.approx(wanted, abs=1e-9)
 
 
-def test_a_turn_of_its_own_has_the_whole_power_and_no_interference() -> None:
+def test_separate_time_slots_have_full_power_and_no_interference() -> None:
     close = in_plane(10.0, 10.5)
     weights = steering.steering_matrix(ARRAY, close).conj()
     at = np.array([100.0, 100.0])
@@ -358,7 +358,7 @@ def test_a_turn_of_its_own_has_the_whole_power_and_no_interference() -> None:
     assert (apart > 35).all()
 
 
-def test_behind_the_elements_there_is_nothing() -> None:
+def test_sinr_behind_the_elements_is_minus_infinity() -> None:
     array = uniform_linear(
         8,
         30e9,
@@ -374,7 +374,7 @@ def test_behind_the_elements_there_is_nothing() -> None:
     assert found[1] == -math.inf
 
 
-def test_no_uavs_and_no_antennas() -> None:
+def test_no_uavs_give_no_sinr_and_no_antennas_are_rejected() -> None:
     nothing = np.empty((64, 0), dtype=complex)
     assert (
         predicted_sinr_db(
@@ -396,7 +396,7 @@ def test_no_uavs_and_no_antennas() -> None:
 
 @settings(max_examples=examples(40))
 @given(st.integers(0, 2**32 - 1), st.booleans())
-def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, slots: bool) -> None:
+def test_least_sinr_holds_for_every_link_within_the_bounds(seed: int, slots: bool) -> None:
     """True directions and ranges anywhere in their bounds, against the combined worst case."""
     rng = np.random.default_rng(seed)
     bounds = rng.uniform(0.001, 0.03, 4)
@@ -432,7 +432,7 @@ def test_no_link_within_the_bounds_is_worse_than_the_least(seed: int, slots: boo
         assert (found[known] >= least - 1e-9).all()
 
 
-def test_the_least_is_attained_where_nothing_is_uncertain() -> None:
+def test_least_sinr_equals_predicted_sinr_without_uncertainty() -> None:
     made = precode(steering.steering_matrix(ARRAY, APART), Precoder())
     gains_db = guaranteed_gains_db(ARRAY, APART, [0.0] * 4, made.weights)
     linear = 10 ** (np.array(gains_db, dtype=float) / 10)
@@ -462,7 +462,7 @@ def test_the_least_is_attained_where_nothing_is_uncertain() -> None:
     assert least == pytest.approx(same, abs=1e-6)
 
 
-def test_at_the_least_only_those_of_the_same_turn_are_heard_and_share_the_power() -> None:
+def test_least_sinr_counts_only_uavs_of_the_same_time_slot() -> None:
     """Three UAVs, the last in its own time slot, against direct sums."""
     gains, leaks = np.array([40.0, 50.0]), np.array([[9.0, 3.0, 8.0], [7.0, 6.0, 9.0]])
     groups, users, at = np.array([0, 0, 1]), np.array([1, 2]), np.array([900.0, 500.0])

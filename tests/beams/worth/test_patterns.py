@@ -66,7 +66,7 @@ def dirichlet(count: int, half_phase: FloatArray) -> FloatArray:
 
 @given(SEEDS)
 @settings(max_examples=examples(30), deadline=None)
-def test_the_response_is_the_sum_written_out(seed: int) -> None:
+def test_response_matches_direct_summation(seed: int) -> None:
     rng = np.random.default_rng(seed)
     array = listed(rng.uniform(-0.05, 0.05, (6, 3)), 30e9, array_from_body=EYE)
     weights = rng.standard_normal(6) + 1j * rng.standard_normal(6)
@@ -85,7 +85,7 @@ def test_the_response_is_the_sum_written_out(seed: int) -> None:
             assert found[i, j] == pytest.approx(expected_db, abs=1e-6)
 
 
-def test_the_response_of_a_line_is_dirichlets_kernel() -> None:
+def test_response_of_a_line_is_the_dirichlet_kernel() -> None:
     array = line(17, 0.6)
     azimuths, found = patterns.azimuth_cut(array, np.full(17, 3 - 2j), math.radians(25), 501)
     half_phase = math.pi * 0.6 * math.cos(math.radians(25)) * np.sin(azimuths)
@@ -107,7 +107,7 @@ def test_the_response_of_a_rectangle_is_the_product_of_two_lines() -> None:
     assert 10 ** (found / 10) == pytest.approx(product, abs=1e-9)
 
 
-def test_the_response_of_a_full_circle_is_bessels() -> None:
+def test_response_of_a_full_circle_is_a_bessel_function() -> None:
     """Phased to boresight: M J0^2(k r |u - x|) in its plane, with many elements."""
     array = uniform_circular(96, 30e9, spacing_wavelengths=0.25, array_from_body=EYE)
     radius_m = float(np.linalg.norm(array.elements_m[0]))
@@ -117,7 +117,7 @@ def test_the_response_of_a_full_circle_is_bessels() -> None:
     assert 10 ** (found / 10) == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_golden_steering_vector_gives_the_full_gain_and_no_more_anywhere() -> None:
+def test_golden_steering_vector_reaches_full_gain_only_at_its_direction() -> None:
     """Five elements at 0, 0.1, ..., 0.4 m, 1 GHz, 45 degrees."""
     places = np.array([[0.0, 0.1 * m, 0.0] for m in range(5)])
     array = listed(places, 1e9, array_from_body=EYE)
@@ -132,7 +132,7 @@ def test_the_golden_steering_vector_gives_the_full_gain_and_no_more_anywhere() -
 
 @given(SEEDS, st.sampled_from([Element(), TR38901, Element(ElementPattern.COSINE, 1.5)]))
 @settings(max_examples=examples(20), deadline=None)
-def test_no_weights_have_more_gain_than_the_matched_ones(seed: int, element: Element) -> None:
+def test_matched_weights_maximise_the_gain(seed: int, element: Element) -> None:
     rng = np.random.default_rng(seed)
     array = uniform_circular(8, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=element)
     weights = rng.standard_normal(8) + 1j * rng.standard_normal(8)
@@ -143,7 +143,7 @@ def test_no_weights_have_more_gain_than_the_matched_ones(seed: int, element: Ele
         assert patterns.response_db(array, weights, u) <= best + 1e-9
 
 
-def test_the_gain_counts_the_elements_pattern_and_not_the_size_of_the_weights() -> None:
+def test_gain_includes_element_pattern_but_not_weight_scale() -> None:
     array = line(16, element=TR38901)
     full_db = 10 * math.log10(16) + 8
     for scale in (1.0, 1e-180, 1e150j):
@@ -163,7 +163,7 @@ def test_an_exact_null_is_finite() -> None:
     assert behind == patterns.FLOOR_DB
 
 
-def test_many_directions_are_worked_on_in_blocks_that_leave_no_seam() -> None:
+def test_block_processing_does_not_change_results() -> None:
     array = uniform_rectangular(
         12, columns=12, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
     )
@@ -192,7 +192,7 @@ def test_many_directions_are_worked_on_in_blocks_that_leave_no_seam() -> None:
         (np.zeros(4, complex), "all zero"),
     ],
 )
-def test_weights_that_are_none_are_refused(weights: ComplexArray, reason: str) -> None:
+def test_invalid_pattern_weights_are_rejected(weights: ComplexArray, reason: str) -> None:
     with pytest.raises(ValueError, match=reason):
         patterns.response_db(line(4), weights, BORESIGHT)
     with pytest.raises(ValueError, match=reason):
@@ -202,7 +202,7 @@ def test_weights_that_are_none_are_refused(weights: ComplexArray, reason: str) -
 # --- cuts ---------------------------------------------------------------------------------------
 
 
-def test_cuts_go_through_the_directions_that_they_say() -> None:
+def test_cuts_pass_through_their_directions() -> None:
     array = uniform_rectangular(
         3,
         columns=4,
@@ -226,7 +226,7 @@ def test_cuts_go_through_the_directions_that_they_say() -> None:
 
 
 @pytest.mark.parametrize("points", [1, 0, -3])
-def test_a_cut_of_too_few_points_is_refused(points: int) -> None:
+def test_cut_with_too_few_points_is_rejected(points: int) -> None:
     for cut in (patterns.azimuth_cut, patterns.elevation_cut):
         with pytest.raises(ValueError, match=f"cut has {points} points; give at least 2"):
             cut(line(4), np.ones(4, complex), 0.0, points)
@@ -242,12 +242,12 @@ def width_deg(array: Array, direction: FloatArray = BORESIGHT) -> float:
 
 
 @pytest.mark.parametrize(("elements", "half_deg"), [(64, 0.79), (128, 0.40)])
-def test_the_known_half_power_beamwidths(elements: int, half_deg: float) -> None:
+def test_half_power_beamwidths_match_known_values(elements: int, half_deg: float) -> None:
     assert round(width_deg(line(elements)) / 2, 2) == half_deg
 
 
 @pytest.mark.parametrize(("elements", "spacing"), [(2, 0.5), (3, 0.5), (8, 0.7), (64, 0.5)])
-def test_the_half_power_beamwidth_is_where_the_power_is_half(elements: int, spacing: float) -> None:
+def test_half_power_beamwidth_ends_at_half_power(elements: int, spacing: float) -> None:
     def excess(theta_rad: float) -> float:
         half_phase = np.array(math.pi * spacing * math.sin(theta_rad))
         return float(dirichlet(elements, half_phase) / elements - 0.5)
@@ -257,7 +257,7 @@ def test_the_half_power_beamwidth_is_where_the_power_is_half(elements: int, spac
     assert found == pytest.approx(2 * half_rad, rel=1e-9)
 
 
-def test_no_beamwidth_where_there_is_no_beam() -> None:
+def test_beamwidth_is_none_without_a_main_lobe() -> None:
     assert patterns.half_power_beamwidths_rad(line(1), BORESIGHT) == (None, None)
     # So close that the power never falls to half.
     assert patterns.half_power_beamwidths_rad(line(2, 0.1), BORESIGHT) == (None, None)
@@ -273,7 +273,7 @@ def test_no_beamwidth_where_there_is_no_beam() -> None:
     assert elevation is not None
 
 
-def test_one_element_has_the_width_of_its_pattern() -> None:
+def test_single_element_beamwidth_is_that_of_its_pattern() -> None:
     """12 (angle / 65)^2 dB is 3.01 dB; cos^3 is a half at 37.5 degrees; also across a pole."""
     expected = 65 * math.sqrt(10 * math.log10(2) / 3)
     for mast in (line(1, element=TR38901), line(1, element=Element(ElementPattern.COSINE, 3.0))):
@@ -294,7 +294,7 @@ def test_one_element_has_the_width_of_its_pattern() -> None:
 
 
 @pytest.mark.parametrize("azimuth_deg", [0, 30, -50, 150])
-def test_the_width_of_a_steered_line_is_that_of_sines(azimuth_deg: float) -> None:
+def test_steered_line_beamwidth_is_constant_in_sine(azimuth_deg: float) -> None:
     """The sine relative to the peak's sine is the same as at broadside."""
     array = line(32)
     off = math.sin(math.radians(width_deg(array)) / 2)
@@ -303,7 +303,7 @@ def test_the_width_of_a_steered_line_is_that_of_sines(azimuth_deg: float) -> Non
     assert width_deg(array, towards(azimuth_deg, 0)) == pytest.approx(float(np.ptp(edges)))
 
 
-def test_a_rectangle_has_the_width_of_each_line_and_more_azimuth_when_it_looks_up() -> None:
+def test_rectangle_beamwidths_match_lines_and_widen_in_azimuth_with_elevation() -> None:
     array = uniform_rectangular(
         8, columns=20, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
     )
@@ -315,7 +315,7 @@ def test_a_rectangle_has_the_width_of_each_line_and_more_azimuth_when_it_looks_u
     assert up == pytest.approx(2 * math.degrees(math.asin(sine / math.cos(math.radians(60)))))
 
 
-def test_a_full_circle_has_bessels_width_in_every_direction() -> None:
+def test_full_circle_beamwidth_is_the_bessel_width_in_every_direction() -> None:
     array = uniform_circular(64, 30e9, spacing_wavelengths=0.25, array_from_body=EYE)
     radius_m = float(np.linalg.norm(array.elements_m[0]))
     argument = brentq(lambda x: j0(x) ** 2 - 0.5, 0, 2)
@@ -324,7 +324,7 @@ def test_a_full_circle_has_bessels_width_in_every_direction() -> None:
         assert width_deg(array, towards(azimuth_deg, 0)) == pytest.approx(expected, rel=1e-6)
 
 
-def test_the_lobe_of_a_uniform_line() -> None:
+def test_main_lobe_of_a_uniform_line_matches_known_values() -> None:
     """Half-wave line of 64 elements: first nulls at 1.79 degrees, first side lobe -13.26 dB."""
     found = patterns.lobe(line(64), np.ones(64, complex), towards(0.5, 0))
     assert found.peak_azimuth_rad == pytest.approx(0, abs=1e-8)
@@ -357,7 +357,7 @@ def test_side_lobes_of_chebyshev_weights_are_as_designed(azimuth_deg: float) -> 
     assert found.azimuth.side_lobe_db == pytest.approx(-50, abs=1e-3)
 
 
-def test_a_bump_on_the_flank_of_a_stronger_lobe_has_no_width_of_its_own() -> None:
+def test_shoulder_of_a_stronger_lobe_has_no_beamwidth() -> None:
     """A weaker beam beside a strong one: the gain between them dips by less than half."""
     array, n = line(32), np.arange(32) - 15.5
     weights = np.ones(32) + 0.5 * np.exp(-1j * (math.pi * 2.4 / 32 * n - 1.6))
@@ -372,7 +372,7 @@ def test_a_bump_on_the_flank_of_a_stronger_lobe_has_no_width_of_its_own() -> Non
     assert width == pytest.approx(math.radians(width_deg(array)), rel=0.3)
 
 
-def test_of_side_lobes_almost_alike_the_higher_counts() -> None:
+def test_highest_of_nearly_equal_side_lobes_is_reported() -> None:
     """Independent of which one the scan samples higher: its points miss the peaks."""
     array = line(24)
     for degrees in np.linspace(25, 40, 9):
@@ -385,7 +385,7 @@ def test_of_side_lobes_almost_alike_the_higher_counts() -> None:
         assert found.azimuth.side_lobe_db == pytest.approx(exact_db, abs=1e-4)
 
 
-def test_grating_lobes_are_side_lobes_and_the_mirror_behind_is_not() -> None:
+def test_grating_lobes_count_as_side_lobes_but_mirror_lobe_does_not() -> None:
     """Spacing of one wavelength: equally strong at endfire. A circle covers all around and has
     none."""
     assert patterns.lobe(
@@ -408,7 +408,7 @@ def test_grating_lobes_are_side_lobes_and_the_mirror_behind_is_not() -> None:
     )  # behind, without a mirror image
 
 
-def test_ripple_on_a_flat_top_is_no_end_of_the_lobe() -> None:
+def test_ripple_on_a_flat_top_does_not_end_the_main_lobe() -> None:
     """Two adjacent beams: the power between them dips by 1 dB, which is not a null."""
     array = line(32)
     phase = math.pi / 32 * (np.arange(32) - 15.5)
@@ -468,7 +468,7 @@ def check_null(scan: FloatArray, fallen: int, null: float) -> int:
 @pytest.mark.parametrize("name", ARRAYS)
 @given(seed=SEEDS)
 @settings(max_examples=examples(12), deadline=None, derandomize=True)
-def test_a_lobe_is_what_a_dense_scan_shows(name: str, seed: int) -> None:
+def test_lobe_matches_a_dense_scan(name: str, seed: int) -> None:
     """Any weights, any direction: peak, widths, nulls and side lobe of the exact pattern."""
     rng = np.random.default_rng(seed)
     array = ARRAYS[name]
@@ -523,7 +523,7 @@ def _cut(azimuth: FloatArray, elevation: FloatArray) -> tuple[FloatArray, FloatA
 
 @given(SEEDS)
 @settings(max_examples=examples(40), deadline=None)
-def test_the_peak_of_a_matched_beam_is_found_from_anywhere_on_its_hill(seed: int) -> None:
+def test_peak_is_found_from_anywhere_on_the_main_lobe(seed: int) -> None:
     rng = np.random.default_rng(seed)
     array = uniform_rectangular(
         8, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
@@ -540,7 +540,7 @@ def test_the_peak_of_a_matched_beam_is_found_from_anywhere_on_its_hill(seed: int
     assert found.peak_db == pytest.approx(10 * math.log10(64), abs=1e-6)
 
 
-def test_from_the_bottom_of_a_null_it_climbs_out() -> None:
+def test_peak_search_leaves_a_null() -> None:
     array = uniform_rectangular(
         4, columns=8, frequency_hz=30e9, spacing_wavelengths=0.5, array_from_body=EYE
     )
@@ -553,7 +553,7 @@ def test_from_the_bottom_of_a_null_it_climbs_out() -> None:
     assert found.peak_db > patterns.response_db(array, matched(array, at), saddle) + 1
 
 
-def test_on_a_ridge_the_peak_stays_abreast_of_the_direction() -> None:
+def test_peak_on_a_ridge_is_the_nearest_point() -> None:
     """The peak of a line is a cone: the nearest point of it is meant."""
     array = line(64)
     at = towards(20, 35)
@@ -564,7 +564,7 @@ def test_on_a_ridge_the_peak_stays_abreast_of_the_direction() -> None:
         assert np.linalg.norm(peak - start) < math.radians(0.31)
 
 
-def test_nulls_are_as_deep_as_they_are() -> None:
+def test_null_depth_of_zero_forcing_is_limited_by_rounding() -> None:
     """Zero forcing turns -13.26 dB into rounding noise."""
     array = line(32)
     others = np.stack([towards(20, 0), towards(-33, 10)])

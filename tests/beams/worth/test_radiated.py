@@ -88,7 +88,7 @@ def within(
 
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.parametrize("name", sorted(ARRAYS))
-def test_no_array_that_the_bounds_allow_has_less_or_leaks_more(name: str, fault: str) -> None:
+def test_bounds_hold_for_every_array_within_its_error_bounds(name: str, fault: str) -> None:
     array, rng = faulty(ARRAYS[name], fault), np.random.default_rng(5)
     matched = steering_matrix(array, AHEAD).conj()
     exact = np.linalg.pinv(steering_matrix(array, AHEAD).T)
@@ -105,7 +105,7 @@ def test_no_array_that_the_bounds_allow_has_less_or_leaks_more(name: str, fault:
 
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
-def test_a_guarantee_at_a_point_is_close_to_the_worst_of_all_errors(name: str) -> None:
+def test_guarantee_at_a_point_is_close_to_the_worst_case(name: str) -> None:
     """The worst errors are known there: each channel's part opposes the sum or is reduced."""
     array = faulty(ARRAYS[name], "off")
     own = AHEAD[:1]
@@ -121,7 +121,7 @@ def test_a_guarantee_at_a_point_is_close_to_the_worst_of_all_errors(name: str) -
     assert sure - ideal == pytest.approx(20 * math.log10(share), abs=0.06)
 
 
-def test_weights_are_made_without_dead_elements() -> None:
+def test_weights_exclude_dead_elements() -> None:
     array = faulty(ARRAYS["line"], "dead")
     assert array.live is not None
     steering = steering_matrix(array, AHEAD)
@@ -129,7 +129,7 @@ def test_weights_are_made_without_dead_elements() -> None:
     np.testing.assert_array_equal(steering[array.live], phase_factors(array, AHEAD)[array.live])
 
 
-def test_an_error_of_a_channel_is_bounded_by_its_corners() -> None:
+def test_channel_error_bound_is_attained_at_its_corners() -> None:
     rng = np.random.default_rng(2)
     bound = float(channel_error(np.array([PHASE_RAD]), np.array([GAIN_DB]))[0])
     draws = rng.uniform(-1, 1, (2, 100_000))
@@ -140,7 +140,7 @@ def test_an_error_of_a_channel_is_bounded_by_its_corners() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(ARRAYS))
-def test_a_steering_vector_is_what_each_channel_does_by_itself(name: str) -> None:
+def test_steering_vector_equals_response_of_each_channel_alone(name: str) -> None:
     array = faulty(ARRAYS[name], "all")
     fed = np.eye(array.size, dtype=complex)
     carried = array.carried(fed)  # currents for a unit input in each channel

@@ -32,7 +32,7 @@ def run(arrival: int, boot: int, count: int, every: int = 200) -> Seen:
 
 
 @pytest.mark.parametrize("back_ms", [1_200, 4_800, 9_700])
-def test_a_late_frame_is_no_reboot(back_ms: int) -> None:
+def test_late_frame_does_not_count_as_reboot(back_ms: int) -> None:
     stamps = observe_all([*run(0, 300_000, 50), (9_810, 309_800 - back_ms), (10_000, 310_000)])
     assert not reboots(stamps)
     late, after = stamps[-2:]
@@ -42,7 +42,7 @@ def test_a_late_frame_is_no_reboot(back_ms: int) -> None:
     assert after.latency_s == 0.0
 
 
-def test_a_link_that_lags_by_seconds_is_no_reboot() -> None:
+def test_link_lag_of_seconds_does_not_count_as_reboot() -> None:
     """Beside a fast link or alone, after the sender's first seconds."""
     fast, slow = run(0, 300_000, 100), run(4_001, 300_001, 100)
     assert not reboots(observe_all(sorted([*fast, *slow])))
@@ -52,7 +52,7 @@ def test_a_link_that_lags_by_seconds_is_no_reboot() -> None:
 
 @pytest.mark.parametrize("ahead_ms", [1_100, 4_900])
 @pytest.mark.parametrize("again_ms", [0, 10, 1_000])
-def test_stamps_from_the_future_do_not_move_the_clock(ahead_ms: int, again_ms: int) -> None:
+def test_future_stamps_do_not_move_the_clock(ahead_ms: int, again_ms: int) -> None:
     """One forged stamp, two at one time, or one per second: the vehicle's own stamps are
     unaffected."""
     honest = run(0, 300_000, 50)
@@ -70,7 +70,7 @@ def test_stamps_from_the_future_do_not_move_the_clock(ahead_ms: int, again_ms: i
     assert after.offset_ns == pytest.approx(before.offset_ns, abs=2 * MS)
 
 
-def test_a_link_that_was_late_is_followed_when_it_is_not() -> None:
+def test_clock_follows_a_link_whose_delay_falls() -> None:
     """All frames of half a minute were 3 s late; the clock follows after half a second."""
     late, prompt = run(3_000, 300_000, 150), run(33_000, 333_000, 20)
     stamps = observe_all([*late, *prompt])
@@ -82,7 +82,7 @@ def test_a_link_that_was_late_is_followed_when_it_is_not() -> None:
 
 @pytest.mark.parametrize("boot_ms", [0, 12_000])
 @pytest.mark.parametrize("back_ms", [48_000, 260_000])
-def test_a_reboot_is_one_event_and_begins_anew(back_ms: int, boot_ms: int) -> None:
+def test_reboot_is_detected_once_and_starts_a_new_epoch(back_ms: int, boot_ms: int) -> None:
     before = run(0, boot_ms + back_ms - 9_800, 50)
     stamps = observe_all([*before, *run(10_000, boot_ms, 100)])
     assert reboots(stamps) == [53]  # half a second after the first stamp
@@ -95,7 +95,7 @@ def test_a_reboot_is_one_event_and_begins_anew(back_ms: int, boot_ms: int) -> No
 
 @pytest.mark.parametrize("uptime_ms", [4_000, 9_000])
 @pytest.mark.parametrize("late_ms", [0, 400])
-def test_a_reboot_shortly_after_a_boot(uptime_ms: int, late_ms: int) -> None:
+def test_reboot_shortly_after_boot_is_detected(uptime_ms: int, late_ms: int) -> None:
     """It steps back by no more than a late frame would, and does not catch up."""
     again = [(t + (late_ms if n % 2 else 0), b) for n, (t, b) in enumerate(run(0, 500, 40, 250))]
     seen = run(0, 0, uptime_ms // 100, 100) + [(uptime_ms + 500 + t, b) for t, b in again]
@@ -107,7 +107,7 @@ def test_a_reboot_shortly_after_a_boot(uptime_ms: int, late_ms: int) -> None:
 
 
 @pytest.mark.parametrize(("late_ms", "placed"), [(9_900, True), (10_100, False), (60_000, False)])
-def test_no_frame_is_later_than_ten_seconds(late_ms: int, placed: bool) -> None:
+def test_stamp_more_than_ten_seconds_late_has_no_time(late_ms: int, placed: bool) -> None:
     """A single stamp that lags by more belongs to another clock and has no time."""
     *_, late, after = observe_all(
         [*run(0, 300_000, 100), (19_810, 319_810 - late_ms), (20_000, 320_000)]
@@ -117,7 +117,7 @@ def test_no_frame_is_later_than_ten_seconds(late_ms: int, placed: bool) -> None:
     assert after is not None and after.latency_s == 0.0
 
 
-def test_a_queue_that_is_flushed_in_the_first_seconds_is_no_reboot() -> None:
+def test_flushed_queue_after_boot_does_not_count_as_reboot() -> None:
     """Late frames in a burst catch up with the current stamps."""
     queued = [(8_000 + n * 10, 3_000 + n * 100) for n in range(45)]
     stamps = observe_all([*run(0, 0, 80, 100), *queued, *run(8_500, 8_500, 20, 100)])
@@ -125,7 +125,7 @@ def test_a_queue_that_is_flushed_in_the_first_seconds_is_no_reboot() -> None:
     assert None not in stamps
 
 
-def test_stragglers_of_the_boot_before_have_no_time() -> None:
+def test_stragglers_of_the_previous_boot_have_no_time() -> None:
     """Single or in a burst, up to seconds after the reboot; the new boot continues."""
     again = run(10_000, 1_000, 100)
     late = [(13_105, 108_000), *((14_110 + n, 108_500 + n * 100) for n in range(10))]
@@ -137,7 +137,7 @@ def test_stragglers_of_the_boot_before_have_no_time() -> None:
             assert (stamp is None) == (boot > 50_000), arrival
 
 
-def test_a_leap_soon_after_a_reboot_is_none_of_the_boot_before() -> None:
+def test_jump_after_a_reboot_belongs_to_the_new_boot() -> None:
     """Ahead of every stamp of either boot: accepted after three stamps."""
     seen = [*run(0, 100_000, 50), *run(10_000, 1_000, 20), *run(14_000, 500_000, 20)]
     stamps = observe_all(seen)
@@ -146,7 +146,7 @@ def test_a_leap_soon_after_a_reboot_is_none_of_the_boot_before() -> None:
     assert all(stamp is not None and stamp.latency_s == 0.0 for stamp in stamps[73:])
 
 
-def test_a_stray_stamp_changes_nothing() -> None:
+def test_stray_stamps_are_ignored() -> None:
     """One message of the sender carries another clock, ahead or behind, repeatedly."""
     steady = run(0, 100_000, 200, 100)
     for boot in (7, 660_000, 4_000_000_000):
@@ -157,7 +157,7 @@ def test_a_stray_stamp_changes_nothing() -> None:
         assert [s is None for s in stamps] == [b == boot for _, b in seen]
 
 
-def test_a_leap_ahead_is_no_reboot() -> None:
+def test_forward_jump_does_not_count_as_reboot() -> None:
     seen = [*run(0, 100_000, 50), *run(10_000, 110_000 + 560_000, 50)]
     stamps = observe_all(seen)
     assert not reboots(stamps)
@@ -167,7 +167,7 @@ def test_a_leap_ahead_is_no_reboot() -> None:
     assert all(s.latency_s == 0.0 for s in placed)
 
 
-def test_a_clock_that_stood_still_goes_on() -> None:
+def test_stalled_clock_continues() -> None:
     stamps = observe_all([*run(0, 100_000, 50), *run(70_000, 110_000, 50)])
     assert not reboots(stamps)
     assert None not in stamps
@@ -176,7 +176,7 @@ def test_a_clock_that_stood_still_goes_on() -> None:
     assert lags[10:] == pytest.approx([0.0] * 40)
 
 
-def test_the_wrap_is_neither_a_reboot_nor_a_leap() -> None:
+def test_wrap_counts_as_neither_reboot_nor_jump() -> None:
     start = WRAP_MS - 5_000
     stamps = observe_all([(n * 100, (start + n * 100) % WRAP_MS) for n in range(200)])
     assert not reboots(stamps)
@@ -186,7 +186,7 @@ def test_the_wrap_is_neither_a_reboot_nor_a_leap() -> None:
     assert all(s is not None and s.latency_s == 0.0 for s in stamps)
 
 
-def test_a_link_that_lags_by_seconds_is_no_reboot_after_the_wrap() -> None:
+def test_link_lag_after_the_wrap_does_not_count_as_reboot() -> None:
     """The stamps equal those shortly after boot, but the boot was 49.7 days ago."""
     fast = [(at, boot % WRAP_MS) for at, boot in run(0, WRAP_MS - 10_000, 75)]
     slow = [(at, boot % WRAP_MS) for at, boot in run(4_001, WRAP_MS - 9_999, 100)]
@@ -195,7 +195,7 @@ def test_a_link_that_lags_by_seconds_is_no_reboot_after_the_wrap() -> None:
     assert None not in stamps
 
 
-def test_a_late_frame_from_before_the_wrap() -> None:
+def test_late_frame_from_before_the_wrap_is_placed() -> None:
     stamps = observe_all([(0, WRAP_MS - 1_000), (1_500, 500), (1_600, WRAP_MS - 700), (1_700, 700)])
     assert not reboots(stamps)
     assert [s.latency_s for s in stamps if s] == pytest.approx([0.0, 0.0, 1.3, 0.0])
@@ -203,7 +203,7 @@ def test_a_late_frame_from_before_the_wrap() -> None:
 
 @pytest.mark.parametrize("uptime_ms", [100_000, 2_000_000_000, 4_000_000_000])
 @pytest.mark.parametrize("wrapped", [False, True])
-def test_a_reboot_after_any_uptime(uptime_ms: int, wrapped: bool) -> None:
+def test_reboot_is_detected_after_any_uptime(uptime_ms: int, wrapped: bool) -> None:
     before = run(0, WRAP_MS - 1_000, 10) if wrapped else []
     before = [(t, b % WRAP_MS) for t, b in before]
     seen = [*before, *run(uptime_ms, uptime_ms - 1_000, 10), *run(uptime_ms + 5_000, 700, 10)]
@@ -220,7 +220,7 @@ def test_a_reboot_after_any_uptime(uptime_ms: int, wrapped: bool) -> None:
         max_size=60,
     )
 )
-def test_whatever_comes(steps: Seen) -> None:
+def test_stamp_times_never_exceed_their_arrival(steps: Seen) -> None:
     """Jumps, reboots, wraps and invalid stamps: never later than the arrival."""
     clock, arrival_ns = SenderClock(), EPOCH_NS
     for gap_ms, boot_ms in steps:
@@ -243,20 +243,20 @@ def shared_at(seen: Seen) -> list[int]:
 
 
 @pytest.mark.parametrize("apart_ms", [-3_600_000, -40_000, 40_000, 3_600_000])
-def test_two_clocks_side_by_side_are_two_senders(apart_ms: int) -> None:
+def test_two_concurrent_clocks_are_reported_as_a_shared_id(apart_ms: int) -> None:
     first, second = run(0, 5_000_000, 100), run(10_050, 5_010_000 + apart_ms, 50)
     found = shared_at(sorted([*first, *second]))
     assert 12_500 <= found[0] <= 13_600
     assert found == [t for t, _ in sorted([*first, *second]) if t >= found[0]]
 
 
-def test_once_the_second_is_silent_the_first_is_believed_again() -> None:
+def test_first_clock_is_trusted_again_after_the_second_falls_silent() -> None:
     first, second = run(0, 5_000_000, 200), run(5_050, 9_000_000, 40)
     found = shared_at(sorted([*first, *second]))
     assert found[-1] == pytest.approx(5_050 + 39 * 200 + 10_000, abs=250)
 
 
-def test_what_one_sender_alone_does_is_never_taken_for_two() -> None:
+def test_single_sender_is_never_reported_as_a_shared_id() -> None:
     """Reboots, late frames, another lagging link, a jump, bursts."""
     alone = run(0, 300_000, 100)
     late = [(12_000 + n, 310_000 - 180 * n) for n in range(20)]

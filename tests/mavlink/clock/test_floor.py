@@ -98,13 +98,13 @@ LINKS: dict[str, Latency] = {
 
 @pytest.mark.parametrize("name", LINKS)
 @pytest.mark.parametrize("rate_hz", [1.2, 8.0, 20.0])
-def test_no_link_leads_the_interval_away(name: str, rate_hz: float) -> None:
+def test_offset_interval_holds_on_every_link(name: str, rate_hz: float) -> None:
     for seed in range(rounds(1, 4)):
         for at, off, estimate, _ in answers(LINKS[name], rate_hz=rate_hz, seconds=90, seed=seed):
             assert outside_s(off, estimate) <= 0, f"{name} at {at:.2f} s"
 
 
-def test_there_is_no_cliff_where_the_last_fast_frame_leaves_the_window() -> None:
+def test_uncertainty_has_no_step_when_fast_frames_leave_the_window() -> None:
     found = answers(LINKS["the last fast frame long ago"], seconds=200)
     doubts = [one.uncertainty_s for at, _, one, _ in found if at > 30]  # late frames are followed
     assert min(doubts) > 0.45
@@ -119,7 +119,7 @@ def test_there_is_no_cliff_where_the_last_fast_frame_leaves_the_window() -> None
     st.sampled_from([1.2, 5.0, 20.0]),
     st.integers(0, 10_000),
 )  # fmt: skip
-def test_no_latency_that_follows_another_leads_the_interval_away(
+def test_offset_interval_holds_under_changing_latency(
     spells: list[tuple[float, float, float]], drift: float, rate_hz: float, seed: int
 ) -> None:
     """Periods of varying latency and jitter, in any order, on any clock within its drift.
@@ -141,7 +141,7 @@ def test_no_latency_that_follows_another_leads_the_interval_away(
 @pytest.mark.parametrize(
     "batch", [4, 7, *(pytest.param(n, marks=pytest.mark.full) for n in (8, 13)), 16]
 )
-def test_a_link_that_sends_in_batches_hides_no_latency_behind_their_rhythm(batch: int) -> None:
+def test_offset_interval_holds_on_a_batching_link(batch: int) -> None:
     """The median of the visible latency is half a batch; every n-th frame may have none of it."""
     for phase in range(0, batch, rounds(1 + batch // 5, 1)):
 
@@ -157,7 +157,7 @@ def test_a_link_that_sends_in_batches_hides_no_latency_behind_their_rhythm(batch
 
 @pytest.mark.parametrize("rate_hz", [10.0, 50.0])
 @pytest.mark.parametrize("stood_s", [0.13, 0.18, 1.5])
-def test_a_clock_that_stood_still_is_told_within_a_second(rate_hz: float, stood_s: float) -> None:
+def test_stalled_clock_is_reported_within_a_second(rate_hz: float, stood_s: float) -> None:
     """Three frames reveal it; the interval keeps the old offset too, as the link may be the
     cause.
     """
@@ -178,7 +178,7 @@ def test_a_clock_that_stood_still_is_told_within_a_second(rate_hz: float, stood_
 
 
 @pytest.mark.parametrize("slower_s", [0.1, 0.3, 1.0])
-def test_a_link_that_is_slow_for_a_while_is_not_followed(slower_s: float) -> None:
+def test_temporarily_slow_link_does_not_move_the_estimate(slower_s: float) -> None:
     """It is reported as a possible change, and the most likely offset stays."""
     lasts_s = 0.6 * min(FOLLOWED * slower_s, FOLLOWED_NS / S)
 
@@ -190,7 +190,7 @@ def test_a_link_that_is_slow_for_a_while_is_not_followed(slower_s: float) -> Non
     assert all(abs(off) < 0.02 for at, off, *_ in found if at > 1)
 
 
-def test_after_a_quick_spell_the_line_is_where_it_was() -> None:
+def test_estimate_returns_after_a_fast_period() -> None:
     """Frames placed before their possible arrival are rare exceptions."""
 
     def latency(t: float, rng: random.Random) -> float:
@@ -202,7 +202,7 @@ def test_after_a_quick_spell_the_line_is_where_it_was() -> None:
         assert at < 2 or exception or abs(off + 0.3) < 0.03, at
 
 
-def test_a_steady_link_tells_of_no_change() -> None:
+def test_steady_link_reports_no_change() -> None:
     for name, rate_hz in (("lognormal radio", 1.2), ("lognormal radio", 8.0)):
         for seed in range(rounds(2, 5)):
             found = answers(LINKS[name], rate_hz=rate_hz, seconds=300, seed=seed)
@@ -221,7 +221,7 @@ def slow(t: float) -> float:
 
 
 @pytest.mark.parametrize("trips_s", [1.0, 5.0])
-def test_a_clock_that_runs_slow_for_seconds_is_followed_by_round_trips(trips_s: float) -> None:
+def test_round_trips_follow_a_temporarily_slow_clock(trips_s: float) -> None:
     for seed in range(rounds(2, 5)):
 
         def busy(_t: float, rng: random.Random) -> float:
@@ -235,7 +235,7 @@ def test_a_clock_that_runs_slow_for_seconds_is_followed_by_round_trips(trips_s: 
         assert max(outside_s(off, one) for off, one in late) <= 0.01
 
 
-def test_poor_trips_do_not_beat_good_stamps() -> None:
+def test_slow_round_trips_do_not_override_good_stamps() -> None:
     found = answers(jitter(0.002, 0.008), trips_s=5.0, seconds=40)
     poor = answers(
         lambda t, rng: rng.uniform(0.002, 0.008) if t * 20 % 1 < 1e-6 else 4.0, trips_s=4.9921
@@ -252,7 +252,7 @@ def test_poor_trips_do_not_beat_good_stamps() -> None:
     st.lists(st.tuples(st.integers(1, 3 * S), st.integers(0, 2 * S)), min_size=1, max_size=120),
     st.floats(-250e-6, 250e-6),
 )
-def test_the_sure_side_is_above_the_offset_and_below_every_stamp(
+def test_upper_bound_lies_between_offset_and_every_stamp(
     steps: list[tuple[int, int]], drift: float
 ) -> None:
     """For any latency the truth is below the bound, and no aged stamp is."""

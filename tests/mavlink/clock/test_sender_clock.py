@@ -133,7 +133,9 @@ def rms(values: list[float], around: float = 0.0) -> float:
 
 @pytest.mark.parametrize("drift", [0.0, 1e-4, -1e-4])
 @pytest.mark.parametrize(("sky", "best_s"), [(radio, 0.2), (wifi, 0.010)])
-def test_at_least_as_good_as_the_peer(sky: Link, best_s: float, drift: float) -> None:
+def test_clock_error_is_no_larger_than_jitter_correction(
+    sky: Link, best_s: float, drift: float
+) -> None:
     """In error, and in its variation around the unobservable constant part."""
     runs = [errors_s(sky(seed, drift), drift) for seed in range(rounds(3, 6))]
     ours, theirs = [e for run, _ in runs for e in run], [e for _, run in runs for e in run]
@@ -147,7 +149,7 @@ def test_at_least_as_good_as_the_peer(sky: Link, best_s: float, drift: float) ->
 
 @pytest.mark.parametrize("drift", [0.0, 1e-4, 2.4e-4, -2.4e-4])
 @pytest.mark.parametrize("sky", [radio, pytest.param(wifi, marks=pytest.mark.full)])
-def test_the_uncertainty_holds(sky: Link, drift: float) -> None:
+def test_clock_uncertainty_contains_the_truth(sky: Link, drift: float) -> None:
     """At every time, within the assumed drift; later it shrinks to the link's own scale."""
     for seed in range(rounds(4, 12)):
         clock = SenderClock()
@@ -162,7 +164,7 @@ def test_the_uncertainty_holds(sky: Link, drift: float) -> None:
 
 
 @pytest.mark.parametrize("drift", [0.0246, pytest.param(-0.0234, marks=pytest.mark.full)])
-def test_a_steady_drift_beyond_the_greatest_is_followed_after_a_minute(drift: float) -> None:
+def test_drift_beyond_the_limit_is_followed_after_a_minute(drift: float) -> None:
     """And trusted as soon as no queue can explain the growing delay."""
     clock = SenderClock()
     for arrival_ns, boot_ms in wifi(1, drift):
@@ -179,7 +181,7 @@ def test_a_steady_drift_beyond_the_greatest_is_followed_after_a_minute(drift: fl
 
 @pytest.mark.parametrize("stays", [False, True])
 @pytest.mark.parametrize("rate", [0.003, 0.03])
-def test_a_queue_that_fills_for_a_minute_is_no_drift(rate: float, stays: bool) -> None:
+def test_filling_queue_keeps_the_bound_valid(rate: float, stays: bool) -> None:
     """It looks like drift; both are covered, whether the queue empties at once or stays."""
     rng, seen = random.Random(1), []
     for n in range(1600):
@@ -197,7 +199,7 @@ def test_a_queue_that_fills_for_a_minute_is_no_drift(rate: float, stays: bool) -
         assert -estimate.after_s <= off_s <= estimate.before_s
 
 
-def test_a_known_delay_is_taken_off_and_no_longer_uncertain() -> None:
+def test_known_delay_is_subtracted_and_reduces_uncertainty() -> None:
     seen = radio(1, 0.0)
     plain, told = SenderClock(), SenderClock(ClockAssumptions(constant_delay_s=0.25))
     for arrival_ns, boot_ms in seen:
@@ -211,7 +213,7 @@ def test_a_known_delay_is_taken_off_and_no_longer_uncertain() -> None:
 
 
 @pytest.mark.parametrize("bad", [{"constant_delay_s": -1.0}, {"window_s": 0.0}])
-def test_settings_that_cannot_be(bad: dict[str, float]) -> None:
+def test_invalid_clock_settings_are_rejected(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=f"{next(iter(bad))} is .*, allowed"):
         ClockAssumptions(**bad)  # type: ignore[arg-type]
 
@@ -228,7 +230,7 @@ SKIES = st.builds(
 
 @settings(max_examples=examples(60))
 @given(SKIES, st.lists(st.integers(-1_000 * S, 1_000 * S), min_size=2, max_size=20))
-def test_the_mapping_is_monotone_and_has_an_inverse(
+def test_clock_mapping_is_monotone_and_invertible(
     sky: tuple[list[tuple[int, int]], float], away: list[int]
 ) -> None:
     clock = fed(sky[0])
@@ -243,7 +245,7 @@ def test_the_mapping_is_monotone_and_has_an_inverse(
 
 @settings(max_examples=examples(60))
 @given(SKIES)
-def test_no_stamp_of_the_window_is_later_than_its_arrival(
+def test_stamps_in_the_window_never_exceed_their_arrival(
     sky: tuple[list[tuple[int, int]], float],
 ) -> None:
     """Also by the clock known at the end, except for the drift since."""
@@ -252,7 +254,7 @@ def test_no_stamp_of_the_window_is_later_than_its_arrival(
         assert clock.node_ns(boot_ms * MS) <= arrival_ns + (20 * MS if abs(sky[1]) <= 2.5e-4 else S)
 
 
-def test_a_time_does_not_depend_on_how_late_the_report_came() -> None:
+def test_mapped_time_does_not_depend_on_latency() -> None:
     for late_ms in (0, 16, 627, 3_810):
         clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(20)])
         stamp = clock.observe(EPOCH_NS + (2_000 + late_ms) * MS, 7_000)
@@ -262,7 +264,7 @@ def test_a_time_does_not_depend_on_how_late_the_report_came() -> None:
 
 
 @pytest.mark.parametrize("sky", [radio, wifi])
-def test_who_asks_when_changes_nothing(sky: Link) -> None:
+def test_queries_do_not_change_the_clock(sky: Link) -> None:
     """A clock queried rarely and one queried at every stamp agree."""
     seen = sky(5, 50e-6, 60)
     seldom, often = SenderClock(), SenderClock()
@@ -274,7 +276,7 @@ def test_who_asks_when_changes_nothing(sky: Link) -> None:
             assert known(seldom) == asked
 
 
-def test_before_the_first_stamp_nothing_is_known() -> None:
+def test_clock_is_unknown_before_the_first_stamp() -> None:
     clock = SenderClock()
     assert clock.estimate() is None
     assert clock.timesync(EPOCH_NS, EPOCH_NS + MS, 5 * S) is not None
@@ -284,7 +286,7 @@ def test_before_the_first_stamp_nothing_is_known() -> None:
     assert known(clock).uncertainty_s >= 4.8  # the first frame of all may be that late
 
 
-def test_that_the_first_frames_were_slow_is_soon_ruled_out() -> None:
+def test_initial_uncertainty_shrinks_quickly() -> None:
     """One frame may be nearly 5 s late, but not all frames of five seconds."""
     clock, doubts = SenderClock(ClockAssumptions(drift_max_ppm=0.0)), []
     for n in range(50):
@@ -296,7 +298,7 @@ def test_that_the_first_frames_were_slow_is_soon_ruled_out() -> None:
     assert doubts[49] < 0.1
 
 
-def test_a_line_keeps_the_doubt_of_the_stamps_that_began_it() -> None:
+def test_new_boot_keeps_the_uncertainty_of_its_first_stamps() -> None:
     """A new boot is accepted after some stamps. The earlier ones, shared by another node, are in
     its floor too and may have arrived earlier than placed."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 500_000 + n * 100) for n in range(100)])
@@ -356,7 +358,7 @@ def test_timesync_stays_within_its_uncertainty(drift: float, there_s: float, bac
     assert max(beyond) <= 0.0
 
 
-def test_timesync_sees_the_constant_delay() -> None:
+def test_timesync_measures_the_constant_delay() -> None:
     """One-way observation cannot: every frame takes 300 ms."""
     clock = fed([(EPOCH_NS + n * 100 * MS + 300 * MS, 5_000 + n * 100) for n in range(100)])
     assert known(clock).kind is ClockKind.ENVELOPE
@@ -372,7 +374,7 @@ def test_timesync_sees_the_constant_delay() -> None:
     assert stamp is not None and stamp.latency_s == pytest.approx(0.3, abs=1e-3)
 
 
-def test_round_trips_are_intersected_and_held_below_the_envelope() -> None:
+def test_round_trips_are_intersected_with_the_envelope() -> None:
     """Two slow trips, one delayed on the way out and one on the way back, make a good one."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
     clock.timesync(EPOCH_NS + 9_000 * MS, EPOCH_NS + 10_010 * MS, 15_000 * MS)
@@ -392,7 +394,7 @@ def test_round_trips_are_intersected_and_held_below_the_envelope() -> None:
         ((10_000, 10_020, 1_700_000_010_010), "arrived [0-9.]+ s before"),
     ],
 )
-def test_round_trips_that_cannot_be(trip: tuple[int, int, int], why: str) -> None:
+def test_impossible_round_trips_are_rejected(trip: tuple[int, int, int], why: str) -> None:
     clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
     sent_ms, received_ms, remote_ms = trip
     sent_ns, received_ns = EPOCH_NS + sent_ms * MS, EPOCH_NS + received_ms * MS
@@ -401,7 +403,7 @@ def test_round_trips_that_cannot_be(trip: tuple[int, int, int], why: str) -> Non
 
 
 @pytest.mark.parametrize(("first_ms", "then_ms"), [(400, 900), (900, 400)])
-def test_what_contradicts_is_believed_and_the_doubt_holds_both(first_ms: int, then_ms: int) -> None:
+def test_contradicting_round_trip_widens_bounds_to_hold_both(first_ms: int, then_ms: int) -> None:
     """In either direction of the jump; until three trips agree, both offsets may be true."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 5_000 + n * 100) for n in range(100)])
 
@@ -428,7 +430,7 @@ def test_what_contradicts_is_believed_and_the_doubt_holds_both(first_ms: int, th
     assert known(clock).uncertainty_s < 0.02
 
 
-def test_timesync_ages_and_ends() -> None:
+def test_timesync_estimate_ages_and_expires() -> None:
     seen = [(EPOCH_NS + n * S, 5_000 + n * 1_000) for n in range(700)]
     clock = fed(seen[:20])
     clock.timesync(EPOCH_NS + 18_990 * MS, EPOCH_NS + 19_010 * MS, 24_000 * MS)
@@ -439,7 +441,7 @@ def test_timesync_ages_and_ends() -> None:
     assert known(clock).kind is ClockKind.ENVELOPE
 
 
-def test_a_reboot_ends_what_was_known() -> None:
+def test_reboot_resets_the_clock() -> None:
     clock = fed([(EPOCH_NS + n * 100 * MS, 105_000 + n * 100) for n in range(100)])
     clock.timesync(EPOCH_NS + 9_890 * MS, EPOCH_NS + 9_910 * MS, 114_900 * MS)
     assert known(clock).kind is ClockKind.TIMESYNC
@@ -463,7 +465,7 @@ def test_timesync_past_the_wrap() -> None:
 TRUSTED = ClockAssumptions(trust_gnss=True, node_utc_error_s=0.005)
 
 
-def told_the_time(
+def clock_fed_with_system_time(
     settings: ClockAssumptions, ahead_us: int = 0, exactly: int | None = None
 ) -> SenderClock:
     """Feed a SYSTEM_TIME every second, each frame 300 ms late."""
@@ -477,8 +479,8 @@ def told_the_time(
     return clock
 
 
-def test_gnss_sees_the_constant_delay() -> None:
-    clock = told_the_time(TRUSTED)
+def test_gnss_time_measures_the_constant_delay() -> None:
+    clock = clock_fed_with_system_time(TRUSTED)
     estimate = known(clock)
     assert estimate.kind is ClockKind.GNSS
     assert estimate.constant_delay_s == pytest.approx(0.3, abs=0.001)
@@ -502,29 +504,29 @@ HOUR_US = 3_600_000_000
         (TRUSTED, 0, 5_000_000),  # boot time in the Unix field
     ],
 )
-def test_gnss_that_is_not_used(
+def test_gnss_time_is_ignored_unless_enabled(
     settings: ClockAssumptions, ahead_us: int, exactly: int | None
 ) -> None:
-    clock = told_the_time(settings, ahead_us, exactly)
-    assert known(clock) == known(told_the_time(ClockAssumptions()))
+    clock = clock_fed_with_system_time(settings, ahead_us, exactly)
+    assert known(clock) == known(clock_fed_with_system_time(ClockAssumptions()))
 
 
-def test_one_bad_time_ends_the_trust() -> None:
-    clock = told_the_time(TRUSTED)
+def test_invalid_gnss_time_ends_its_use() -> None:
+    clock = clock_fed_with_system_time(TRUSTED)
     assert clock.system_time(EPOCH_NS + 10_300 * MS, 0, 15_000)
     assert known(clock).kind is ClockKind.ENVELOPE
 
 
-def test_what_was_shown_before_the_nodes_own_clock_was_set_is_forgotten() -> None:
-    clock = told_the_time(TRUSTED)
+def test_gnss_estimate_is_dropped_when_the_node_clock_is_set() -> None:
+    clock = clock_fed_with_system_time(TRUSTED)
     assert known(clock).kind is ClockKind.GNSS
     clock.forget_gnss()
     assert known(clock).kind is ClockKind.ENVELOPE
 
 
-def test_a_sender_that_sets_its_clock_is_believed_once_its_times_agree() -> None:
+def test_changed_sender_clock_is_trusted_once_its_times_agree() -> None:
     """Until then the uncertainty covers both."""
-    clock, doubts = told_the_time(TRUSTED), []
+    clock, doubts = clock_fed_with_system_time(TRUSTED), []
     for n in range(100, 106):
         arrival_ns = EPOCH_NS + n * 100 * MS + 300 * MS
         clock.observe(arrival_ns, 5_000 + n * 100)
@@ -535,8 +537,8 @@ def test_a_sender_that_sets_its_clock_is_believed_once_its_times_agree() -> None
     assert known(clock).constant_delay_s == pytest.approx(0.8, abs=0.001)
 
 
-def test_timesync_is_taken_before_gnss_where_it_is_better() -> None:
-    clock = told_the_time(TRUSTED)
+def test_better_timesync_is_preferred_to_gnss() -> None:
+    clock = clock_fed_with_system_time(TRUSTED)
     clock.timesync(EPOCH_NS + 9_000 * MS, EPOCH_NS + 11_000 * MS, 15_000 * MS)
     assert known(clock).kind is ClockKind.GNSS
     clock.timesync(EPOCH_NS + 9_995 * MS, EPOCH_NS + 10_005 * MS, 15_000 * MS)
@@ -571,7 +573,7 @@ def stamps_of(data: bytes, name: str, ids: set[int]) -> dict[str, list[tuple[int
         pytest.param("sitl_4circle.tlog", 0, 0, marks=pytest.mark.full),
     ],
 )
-def test_reboots_of_real_logs(
+def test_reboots_in_real_logs_are_detected(
     shared_log: Callable[[str], bytes], name: str, reboots: int, leaps: int, ids: set[int]
 ) -> None:
     """After at most one second every stamp has a time, with an uncertainty of the link's scale.
@@ -587,7 +589,7 @@ def test_reboots_of_real_logs(
         assert known(clock).uncertainty_s < 1.0
 
 
-def test_what_a_stamp_costs(capsys: pytest.CaptureFixture[str]) -> None:
+def test_stamp_processing_time_is_bounded(capsys: pytest.CaptureFixture[str]) -> None:
     for name, seen in (("radio", radio(1, 1e-4, 1_000)), ("wifi", wifi(1, 1e-4, 400))):
         clock = SenderClock()
         begun_ns = time.perf_counter_ns()
@@ -598,7 +600,7 @@ def test_what_a_stamp_costs(capsys: pytest.CaptureFixture[str]) -> None:
         assert each_us < 1_000.0  # not a benchmark: a guard against a change of complexity
 
 
-def test_evidence_above_the_floor_is_a_step_of_unknown_drift(
+def test_evidence_above_the_floor_is_a_step_with_infinite_drift(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """The floor leaves 200 ms; a round trip places the offset 120 ms above its lower end."""

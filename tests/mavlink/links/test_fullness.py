@@ -55,7 +55,7 @@ def fill(made: Endpoint) -> int:
     return taken
 
 
-def test_a_connection_is_full_until_it_is_read(run: Run) -> None:
+def test_connection_buffer_is_full_until_read(run: Run) -> None:
     async def test(server: socket.socket) -> None:
         async with serving(f"tcp:127.0.0.1:{server.getsockname()[1]}") as made:
             (key,) = made.peers() or ()
@@ -77,7 +77,7 @@ def test_a_connection_is_full_until_it_is_read(run: Run) -> None:
         run(test(server))
 
 
-def test_a_serial_port_is_full_until_it_is_read(run: Run) -> None:
+def test_serial_buffer_is_full_until_read(run: Run) -> None:
     async def test() -> None:
         far, near = pty.openpty()
         try:
@@ -101,7 +101,7 @@ def test_a_serial_port_is_full_until_it_is_read(run: Run) -> None:
     run(test())
 
 
-def test_a_datagram_socket_is_full_while_the_system_takes_no_more(run: Run) -> None:
+def test_datagram_socket_is_full_while_the_kernel_accepts_no_more(run: Run) -> None:
     near, far = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
     with near, far:
         near.setblocking(False)

@@ -63,7 +63,7 @@ def late_s(sent_ns: list[int], arrived_ns: list[int]) -> list[float]:
 
 
 @linux
-def test_a_frame_that_waited_arrived_when_the_system_had_it(run: Run) -> None:
+def test_queued_frame_has_its_kernel_arrival_time(run: Run) -> None:
     async def test() -> None:
         with peer() as sender:
             async with running("udpin:127.0.0.1:0", time.monotonic_ns) as (link, inbox):
@@ -79,7 +79,7 @@ def test_a_frame_that_waited_arrived_when_the_system_had_it(run: Run) -> None:
 
 
 @linux
-def test_a_backlog_is_let_go_from_its_old_end_and_counted(
+def test_backlog_is_dropped_oldest_first_and_counted(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The frames read are then new ones, not seconds old."""
@@ -102,7 +102,7 @@ def test_a_backlog_is_let_go_from_its_old_end_and_counted(
 
 
 @linux
-def test_so_did_one_over_a_connected_socket(run: Run) -> None:
+def test_connected_socket_has_kernel_arrival_times(run: Run) -> None:
     async def test() -> None:
         with peer() as sender:
             port = sender.getsockname()[1]
@@ -119,7 +119,7 @@ def test_so_did_one_over_a_connected_socket(run: Run) -> None:
 
 
 @pytest.mark.parametrize("why", ["another system", "refused", "no control message"])
-def test_without_a_stamp_a_frame_arrives_when_it_is_read(
+def test_frame_without_kernel_stamp_arrives_when_read(
     run: Run, why: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     if why == "another system":
@@ -144,7 +144,7 @@ def test_without_a_stamp_a_frame_arrives_when_it_is_read(
 
 @linux
 @pytest.mark.parametrize("step_ns", [3_000_000_000, -3_000_000_000, 20_000_000, DAY_NS])
-def test_stamps_of_before_the_wall_clock_was_set_are_not_believed(
+def test_kernel_stamps_from_before_a_clock_set_are_ignored(
     run: Run, step_ns: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Nothing else of the node's time depends on the wall clock."""
@@ -175,7 +175,7 @@ def test_stamps_of_before_the_wall_clock_was_set_are_not_believed(
 
 
 @linux
-def test_what_was_received_before_a_sleep_is_let_go(
+def test_datagrams_received_before_a_suspend_are_dropped(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A datagram waits while the machine is suspended for an hour, which both clocks count."""
@@ -197,7 +197,7 @@ def test_what_was_received_before_a_sleep_is_let_go(
     run(test())
 
 
-def test_a_stream_has_no_stamps(run: Run) -> None:
+def test_stream_frames_arrive_when_read(run: Run) -> None:
     async def test() -> None:
         async with running("tcpin:127.0.0.1:0", time.monotonic_ns) as (link, inbox):
             _, writer = await asyncio.open_connection("127.0.0.1", port_of(link))
@@ -212,9 +212,7 @@ def test_a_stream_has_no_stamps(run: Run) -> None:
     run(test())
 
 
-def test_what_waited_in_a_stream_while_nobody_read_is_let_go(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_stale_stream_data_is_dropped(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """After SIGSTOP or a suspend, old frames must not look current."""
     away_ns = [0]
     monkeypatch.setattr(stale_bytes, "since_boot_ns", lambda: away_ns[0])
@@ -237,7 +235,7 @@ def test_what_waited_in_a_stream_while_nobody_read_is_let_go(
     run(test())
 
 
-def test_a_look_knows_how_much_waits_before_it_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stale_byte_count_covers_only_old_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = [0]
     monkeypatch.setattr(stale_bytes, "since_boot_ns", lambda: now_ns[0])
     ours, theirs = socket.socketpair()
@@ -252,7 +250,7 @@ def test_a_look_knows_how_much_waits_before_it_is_read(monkeypatch: pytest.Monke
 
 
 @linux
-def test_a_reader_that_fails_ends_the_link(run: Run) -> None:
+def test_receiver_exception_ends_the_link(run: Run) -> None:
     """An exception of the node's own code must not be lost in the loop."""
 
     async def test() -> None:
@@ -269,7 +267,7 @@ def test_a_reader_that_fails_ends_the_link(run: Run) -> None:
     run(test())
 
 
-def test_the_watch_tells_when_the_wall_clock_was_set(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clock_watch_detects_a_wall_clock_set(monkeypatch: pytest.MonkeyPatch) -> None:
     wall_ns, monotonic_ns = [10 * DAY_NS], [5]
     monkeypatch.setattr(time, "time_ns", lambda: wall_ns[0])
     monkeypatch.setattr(kernel_time, "since_boot_ns", lambda: monotonic_ns[0])
@@ -284,7 +282,7 @@ def test_the_watch_tells_when_the_wall_clock_was_set(monkeypatch: pytest.MonkeyP
         assert not watch.was_set()
 
 
-def test_a_pause_between_two_clocks_is_no_step(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pause_between_clock_readings_is_not_a_step(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine may preempt this process between the clock readings."""
     now_ns, pause_ns = [0], [0]
 

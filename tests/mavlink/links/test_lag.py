@@ -24,7 +24,7 @@ def steady(lag_s: float, from_s: float, to_s: float) -> list[tuple[float, float]
     return [(from_s + n * 0.05, lag_s) for n in range(round((to_s - from_s) / 0.05))]
 
 
-def test_nothing_is_known_before_a_stamp_and_long_after_one() -> None:
+def test_lag_is_unknown_without_recent_stamps() -> None:
     assert ArrivalLag().seen(BEGIN) == ArrivalLag().seen(0)
     lag, now_ns = fed((0.0, 0.2))
     assert lag.seen(now_ns).newest_s == pytest.approx(0.2)
@@ -32,7 +32,7 @@ def test_nothing_is_known_before_a_stamp_and_long_after_one() -> None:
     assert (seen.newest_s, seen.p95_s, seen.max_s, seen.behind) == (None, None, None, False)
 
 
-def test_the_newest_and_the_worst_of_ten_seconds() -> None:
+def test_lag_reports_newest_and_maximum_of_ten_seconds() -> None:
     lag, now_ns = fed((0, 0.9), *steady(0.01, 1, 9.95), (9.96, 0.4), (9.97, 0.02))
     seen = lag.seen(now_ns)
     assert seen.newest_s == pytest.approx(0.02)
@@ -42,9 +42,7 @@ def test_the_newest_and_the_worst_of_ten_seconds() -> None:
 
 
 @given(st.lists(st.tuples(st.integers(0, 300 * MS), st.integers(0, 3 * S)), min_size=1))
-def test_the_worst_and_the_p95_are_those_of_tenths_of_a_second(
-    steps: list[tuple[int, int]],
-) -> None:
+def test_lag_maximum_and_p95_are_over_tenths_of_a_second(steps: list[tuple[int, int]]) -> None:
     lag, now_ns, slots = ArrivalLag(), BEGIN, []
     for step_ns, lag_ns in steps:
         now_ns += step_ns
@@ -60,7 +58,7 @@ def test_the_worst_and_the_p95_are_those_of_tenths_of_a_second(
     assert seen.newest_s == pytest.approx(steps[-1][1] / S)
 
 
-def test_a_second_above_the_limit_is_behind_and_less_is_not() -> None:
+def test_lag_above_the_limit_for_a_second_counts_as_behind() -> None:
     lag, now_ns = fed(*steady(0.01, 0, 2), *steady(0.6, 2, 2.9))
     assert not lag.seen(now_ns).behind
     lag, now_ns = fed(*steady(0.01, 0, 2), *steady(0.6, 2, 3.2))
@@ -69,20 +67,20 @@ def test_a_second_above_the_limit_is_behind_and_less_is_not() -> None:
     assert not lag.seen(now_ns).behind
 
 
-def test_one_long_pause_is_over_when_it_is_seen() -> None:
+def test_single_long_pause_does_not_count_as_behind() -> None:
     waited = [(3.0 + n * 1e-4, 3.0 - n * 0.1) for n in range(30)]
     lag, now_ns = fed((0, 0.01), *waited, *steady(0.01, 3.1, 4.2))
     assert not lag.seen(now_ns).behind
 
 
-def test_pauses_one_after_the_other_are_a_machine_that_is_behind() -> None:
+def test_repeated_pauses_count_as_behind() -> None:
     """After each pause the queue empties: its last datagram is not late at all."""
     waited = [(k * 0.8 + n * 1e-4, 0.8 - n * 0.1) for k in range(1, 5) for n in range(8)]
     lag, now_ns = fed(*waited)
     assert lag.seen(now_ns).behind
 
 
-def test_it_does_not_flap() -> None:
+def test_behind_state_has_hysteresis() -> None:
     """Once behind, only two seconds without a lag above the limit clear it."""
     late = [*steady(0.01, 0, 1), *steady(0.6, 1, 3)]
     for gap_s in (0.3, 1.0, 1.9):
@@ -96,7 +94,7 @@ def test_it_does_not_flap() -> None:
     assert not lag.seen(now_ns).behind
 
 
-def test_silence_clears_it_too() -> None:
+def test_silence_clears_the_behind_state() -> None:
     lag, now_ns = fed(*steady(0.6, 0, 3))
     assert lag.seen(now_ns + S).behind
     assert not lag.seen(now_ns + 3 * S).behind

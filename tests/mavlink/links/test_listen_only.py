@@ -56,7 +56,7 @@ async def answering(*pieces: bytes, hangs: bool = False) -> AsyncIterator[tuple[
 
 
 @pytest.mark.parametrize("status", [b"HTTP/1.0 200 OK\r\n", b"HTTP/1.1 200 fine\r\nA: b\r\n"])
-def test_a_document_becomes_frames(run: Run, status: bytes) -> None:
+def test_http_document_becomes_frames(run: Run, status: bytes) -> None:
     async def test() -> None:
         pieces = (status, b"\r\n", DOCUMENT[:20], DOCUMENT[20:])
         async with answering(*pieces) as (url, asked), running(url) as (link, inbox):
@@ -78,7 +78,7 @@ def test_a_document_becomes_frames(run: Run, status: bytes) -> None:
         ((b"HTTP/1.1 200 OK\r\n\r\n", *[b" " * (1 << 20)] * 17), "body exceeds"),
     ],
 )  # fmt: skip
-def test_an_answer_that_is_none_takes_the_link_down(
+def test_invalid_http_response_takes_the_link_down(
     run: Run, answer: tuple[bytes, ...], why: str
 ) -> None:
     async def test() -> None:
@@ -90,7 +90,7 @@ def test_an_answer_that_is_none_takes_the_link_down(
     run(test())
 
 
-def test_an_answer_that_does_not_end_is_given_up(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_endless_http_response_times_out(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(http_poll, "ANSWER_S", 0.1)
 
     async def test() -> None:
@@ -103,7 +103,7 @@ def test_an_answer_that_does_not_end_is_given_up(run: Run, monkeypatch: pytest.M
     run(test())
 
 
-def test_what_is_no_document_is_counted(run: Run) -> None:
+def test_invalid_document_is_counted(run: Run) -> None:
     async def test() -> None:
         answer = b"HTTP/1.0 200 OK\r\n\r\n<html>"
         async with answering(answer) as (url, _), running(url) as (link, inbox):
@@ -114,7 +114,7 @@ def test_what_is_no_document_is_counted(run: Run) -> None:
 
 
 @pytest.mark.parametrize("url", ["cot:udp:127.0.0.1:0", "rid:udp:127.0.0.1:0"])
-def test_who_is_only_heard_is_sent_nothing(run: Run, url: str) -> None:
+def test_listen_only_peer_receives_nothing(run: Run, url: str) -> None:
     async def test() -> None:
         async with running(url) as (link, inbox):
             with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
@@ -129,7 +129,7 @@ def test_who_is_only_heard_is_sent_nothing(run: Run, url: str) -> None:
     run(test())
 
 
-def test_a_group_is_joined_and_shared_with_other_programs(run: Run) -> None:
+def test_multicast_group_is_joined_and_shared(run: Run) -> None:
     """As ATAK sends it: to every listener of the group."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.setsockopt(socket.IPPROTO_IP, socket.IP_MULTICAST_LOOP, 1)

@@ -52,7 +52,7 @@ def alone(loop: str, test: str) -> None:
 
 
 @pytest.mark.parametrize("loop", LOOPS)
-def test_a_network_that_is_down_is_waited_for(loop: str) -> None:
+def test_link_waits_for_a_network_that_is_down(loop: str) -> None:
     alone(
         loop,
         """
@@ -87,7 +87,7 @@ async def test():
     )
 
 
-def test_a_peer_that_vanishes_is_noticed_by_its_silence() -> None:
+def test_vanished_peer_is_detected_by_keepalive() -> None:
     """Neither end sends: only the kernel's keepalive can detect it."""
     alone(
         "uvloop",
@@ -106,7 +106,7 @@ async def test():
     )
 
 
-def test_a_link_does_not_connect_to_itself() -> None:
+def test_link_does_not_connect_to_itself() -> None:
     """Without a listener the kernel may choose the called port as the caller's own."""
     alone(
         "uvloop",

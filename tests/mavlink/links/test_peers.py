@@ -48,7 +48,7 @@ class Heard:
 
 
 @given(st.integers(0, 255), st.lists(st.integers(1, 127), max_size=200))
-def test_every_hole_shorter_than_half_a_round_is_counted(first: int, steps: list[int]) -> None:
+def test_sequence_gaps_below_half_the_range_are_counted(first: int, steps: list[int]) -> None:
     """Consecutive frames, of which some are lost."""
     number, numbers = first, [first]
     for step in steps:
@@ -60,13 +60,13 @@ def test_every_hole_shorter_than_half_a_round_is_counted(first: int, steps: list
 
 
 @given(st.integers(0, 255), st.lists(st.integers(1, 5), max_size=200))
-def test_every_repeat_is_counted(first: int, times: list[int]) -> None:
+def test_repeated_frames_are_counted(first: int, times: list[int]) -> None:
     numbers = [first + n for n, copies in enumerate(times) for _ in range(copies)]
     assert Heard().hear(numbers).counts == (0, 0, sum(times) - len(times))
 
 
 @given(st.integers(0, 255), st.lists(st.booleans(), max_size=200))
-def test_a_swapped_pair_is_one_late_frame_that_was_missing(first: int, swaps: list[bool]) -> None:
+def test_swapped_frames_count_as_one_gap_and_one_late(first: int, swaps: list[bool]) -> None:
     numbers = list(range(first, first + 1 + 2 * len(swaps)))
     for n, swapped in enumerate(swaps):
         if swapped:
@@ -76,19 +76,19 @@ def test_a_swapped_pair_is_one_late_frame_that_was_missing(first: int, swaps: li
 
 
 @pytest.mark.parametrize("behind", [2, 10, 126])
-def test_stragglers_among_frames_in_order_are_no_restart(behind: int) -> None:
+def test_stragglers_do_not_count_as_restart(behind: int) -> None:
     """Two routes, one of them slower: nothing is missing, each frame arrives twice."""
     numbers = [n for at in range(1000) for n in ((at, at - behind) if at > behind else (at,))]
     assert Heard().hear(numbers).counts == (0, 999 - behind, 0)
 
 
-def test_frames_in_reverse_are_no_restart() -> None:
+def test_reversed_frames_do_not_count_as_restart() -> None:
     """A restart counts upwards."""
     assert Heard().hear([1, 10, 9, 8, 7, 6, 5, 11]).counts == (8, 5, 0)
 
 
 @pytest.mark.parametrize("lost", [0.0, 0.3])
-def test_a_restart_is_at_most_one_wrong_gap(lost: float) -> None:
+def test_restart_causes_at_most_one_wrong_gap(lost: float) -> None:
     """From any number to any other; also over a lossy link, whose own gaps count."""
     chance = random.Random(1)
     for last in range(0, 256, rounds(25, 5)):
@@ -107,20 +107,20 @@ def test_a_restart_is_at_most_one_wrong_gap(lost: float) -> None:
                 assert gaps <= holes and late + repeats <= RESTART_RUN and repeats <= 1
 
 
-def test_after_a_restart_holes_are_counted_again() -> None:
+def test_gaps_are_counted_after_a_restart() -> None:
     heard = Heard().hear(range(50, 100)).hear(range(20))
     assert heard.counts == (0, RESTART_RUN, 0)
     heard.hear(range(25, 30))
     assert heard.counts == (5, RESTART_RUN, 0)
 
 
-def test_a_hole_of_a_whole_round_is_not_seen() -> None:
+def test_gap_of_256_frames_is_not_detectable() -> None:
     """An 8-bit number cannot show it."""
     assert Heard().hear([0, 1, 256 + 2]).counts == (0, 0, 0)
     assert Heard().hear([0, 1, 256 + 5]).counts == (3, 0, 0)
 
 
-def test_numbers_are_those_of_a_peer_and_a_source() -> None:
+def test_sequence_numbers_are_tracked_per_peer_and_source() -> None:
     heard = Heard()
     for n in range(300):
         heard.hear([n], "a", UAV, t_ns=n)
@@ -140,7 +140,7 @@ def test_numbers_are_those_of_a_peer_and_a_source() -> None:
     assert (status.frames, status.peers) == (1200, 2)
 
 
-def test_the_version_is_that_of_the_last_frame_and_both_are_remembered() -> None:
+def test_mavlink_version_of_each_peer_is_recorded() -> None:
     heard = Heard()
     peer = heard.peers.at("a")
     assert not peer.speaks_v1_only
@@ -154,7 +154,7 @@ def test_the_version_is_that_of_the_last_frame_and_both_are_remembered() -> None
     assert other.speaks_v1_only
 
 
-def test_rejections_are_counted_by_reason_and_move_nothing_else() -> None:
+def test_rejections_are_counted_by_reason_without_other_effect() -> None:
     heard = Heard()
     peer = heard.peers.at("a")
     lost = [
@@ -166,7 +166,7 @@ def test_rejections_are_counted_by_reason_and_move_nothing_else() -> None:
     assert peer.heard_ns is None and heard.peers.active_since(0) == []
 
 
-def test_a_source_is_where_it_was_heard_last() -> None:
+def test_source_is_located_at_the_peer_last_received_from() -> None:
     heard = Heard().hear([1], "a").hear([1], "b").hear([1], "c", Source(2, 1))
     peers = heard.peers
     assert peers.last_of(UAV) is peers.find("b")
@@ -180,20 +180,20 @@ def test_a_source_is_where_it_was_heard_last() -> None:
     assert peers.last_of(UAV) is None
 
 
-def test_peers_heard_lately() -> None:
+def test_recently_received_peers_are_active() -> None:
     heard = Heard().hear([1], "old", t_ns=99).hear([1], "new", t_ns=100)
     heard.peers.at("silent")
     assert [peer.key for peer in heard.peers.active_since(100)] == ["new"]
 
 
-def test_each_peer_is_counted_to_by_itself() -> None:
+def test_each_peer_has_its_own_send_sequence() -> None:
     heard = Heard()
     a, b = heard.peers.at("a"), heard.peers.at("b")
     assert [a.next_sequence() for _ in range(258)] == [*range(256), 0, 1]
     assert b.next_sequence() == 0
 
 
-def test_the_peers_heard_last_are_kept() -> None:
+def test_least_recent_peers_are_evicted() -> None:
     heard = Heard()
     for n in range(PEERS_MAX + 10):
         heard.peers.at(n)
@@ -203,7 +203,7 @@ def test_the_peers_heard_last_are_kept() -> None:
     assert heard.peers.find(0) is not None and heard.peers.find(1) is None
 
 
-def test_invented_senders_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invented_senders_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     """A steady sender loses at most the gap count of that moment."""
     assert SENDERS_MAX <= 1 << 16
     monkeypatch.setattr(peers_module, "SENDERS_MAX", 100)
@@ -219,7 +219,7 @@ def test_invented_senders_do_not_fill_the_memory(monkeypatch: pytest.MonkeyPatch
     assert heard.counts == (0, 0, 0)
 
 
-def test_peers_that_come_and_go_leave_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_evicted_peers_do_not_affect_active_ones(monkeypatch: pytest.MonkeyPatch) -> None:
     """However many there were: remaining peers are tracked, and every gap is counted."""
     monkeypatch.setattr(peers_module, "SENDERS_MAX", 10)
     heard = Heard()

@@ -67,7 +67,7 @@ def cable() -> Iterator[Cable]:
         made.unplug()
 
 
-def hard_bytes(number: int) -> bytes:
+def frame_of_control_bytes(number: int) -> bytes:
     """Return a frame full of terminal control bytes: ^C, ^D, CR, LF, ^Q, ^S, DEL, 0xFF."""
     mav = dialect.MAVLink(None, 1, 1)
     mav.seq = number % 256
@@ -78,13 +78,13 @@ def hard_bytes(number: int) -> bytes:
     )
 
 
-def test_frames_pass_both_ways_whatever_bytes_they_hold(run: Run) -> None:
+def test_serial_link_carries_any_bytes_both_ways(run: Run) -> None:
     async def test() -> None:
         with cable() as wire:
             async with running(f"serial:{wire.path}:921600") as (link, inbox):
                 assert link.send(heartbeat(OURS)) == 0  # not open yet
                 await until_true(lambda: link.status.state == "up")
-                made = [hard_bytes(n) for n in range(10)]
+                made = [frame_of_control_bytes(n) for n in range(10)]
                 for raw in made:
                     os.write(wire.end, raw[:100])
                     await asyncio.sleep(0.001)  # a frame comes in pieces
@@ -108,7 +108,7 @@ def test_frames_pass_both_ways_whatever_bytes_they_hold(run: Run) -> None:
     run(test())
 
 
-def test_a_device_that_is_unplugged_and_plugged_in_again(
+def test_serial_link_recovers_after_unplugging(
     run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The device is absent at first. Half a frame from before does no harm."""
@@ -143,7 +143,7 @@ def test_a_device_that_is_unplugged_and_plugged_in_again(
     run(test())
 
 
-def test_a_hang_up_by_the_system_is_noticed(run: Run) -> None:
+def test_serial_hangup_takes_the_link_down(run: Run) -> None:
     async def test() -> None:
         with cable() as wire:
             async with running(f"serial:{wire.path}:57600") as (link, inbox):
@@ -165,9 +165,7 @@ def test_a_hang_up_by_the_system_is_noticed(run: Run) -> None:
     run(test())
 
 
-def test_a_device_of_another_program_is_waited_for(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_serial_link_waits_for_a_locked_device(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transport, "RETRY_S", (0.01,))
 
     async def test() -> None:
@@ -190,7 +188,7 @@ def test_a_device_of_another_program_is_waited_for(
     run(test())
 
 
-def test_what_is_no_terminal_is_waited_for(run: Run) -> None:
+def test_serial_link_waits_when_the_path_is_not_a_terminal(run: Run) -> None:
     async def test() -> None:
         async with running("serial:/dev/null:57600") as (link, inbox):
             await inbox.until_said(1)
@@ -200,7 +198,7 @@ def test_what_is_no_terminal_is_waited_for(run: Run) -> None:
     run(test())
 
 
-def test_a_device_that_does_not_take_loses_messages_and_no_time(run: Run) -> None:
+def test_blocked_serial_device_drops_messages_without_blocking(run: Run) -> None:
     """It eventually receives whole frames only; dropped ones are counted."""
 
     async def test() -> None:
@@ -226,7 +224,7 @@ def test_a_device_that_does_not_take_loses_messages_and_no_time(run: Run) -> Non
     run(test())
 
 
-def test_its_settings_are_those_of_a_raw_line(run: Run) -> None:
+def test_serial_port_is_configured_raw(run: Run) -> None:
     async def test() -> None:
         with cable() as wire:
             async with running(f"serial:{wire.path}:115200") as (link, _):
@@ -245,7 +243,7 @@ class FaultError(Exception):
     """A program defect."""
 
 
-def test_a_fault_of_the_program_does_not_vanish(run: Run) -> None:
+def test_program_error_is_raised_by_run(run: Run) -> None:
     def receive(_: list[Frame | Rejection]) -> None:
         raise FaultError
 
@@ -265,11 +263,11 @@ def test_a_fault_of_the_program_does_not_vanish(run: Run) -> None:
     run(test())
 
 
-def test_its_buffer_is_short_for_what_waits_in_it_grows_old() -> None:
+def test_serial_write_buffer_holds_less_than_one_second() -> None:
     assert serial_port.WRITE_BUFFER_BYTES * 10 / 57_600 < 1.0
 
 
-def test_pyserial_is_loaded_only_for_a_serial_link() -> None:
+def test_pyserial_is_imported_only_for_serial_links() -> None:
     run = "import sys, companion.mavlink.links.transport; sys.exit('serial' in sys.modules)"
     done = subprocess.run(
         (sys.executable, "-c", run), capture_output=True, check=False, timeout=HANG_S

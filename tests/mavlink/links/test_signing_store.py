@@ -55,7 +55,7 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "state" / "signing.json"
 
 
-def as_left(path: Path, name: str) -> Path:
+def file_after_kill(path: Path, name: str) -> Path:
     """Return the file as a process killed now would leave it."""
     return shutil.copy(path, path.with_name(name))
 
@@ -74,7 +74,7 @@ def as_left(path: Path, name: str) -> Path:
     ],
     ids=["raw", "hex", "upper", "white space", "raw, though it looks like text"],
 )
-def test_a_key_file(tmp_path: Path, data: bytes) -> None:
+def test_key_file_formats_are_read(tmp_path: Path, data: bytes) -> None:
     file = tmp_path / "key"
     file.write_bytes(data)
     assert load_key(file) == (data if len(data) == 32 else KEY)
@@ -97,7 +97,7 @@ def test_a_key_file(tmp_path: Path, data: bytes) -> None:
         bytes(1 << 20),
     ],
 )
-def test_what_is_not_a_key(tmp_path: Path, data: bytes) -> None:
+def test_invalid_key_file_is_rejected_without_leaking_it(tmp_path: Path, data: bytes) -> None:
     file = tmp_path / "key"
     file.write_bytes(data)
     with pytest.raises(LinkError) as error:
@@ -108,13 +108,13 @@ def test_what_is_not_a_key(tmp_path: Path, data: bytes) -> None:
 
 
 @pytest.mark.parametrize("name", ["missing", "."])
-def test_a_key_that_cannot_be_read(tmp_path: Path, name: str) -> None:
+def test_unreadable_key_file_is_reported(tmp_path: Path, name: str) -> None:
     with pytest.raises(LinkError, match="cannot read") as error:
         load_key(tmp_path / name)
     one_line(error, tmp_path / name)
 
 
-def test_the_command_that_is_told_makes_the_key_that_mavproxy_has(tmp_path: Path) -> None:
+def test_suggested_command_creates_the_mavproxy_key(tmp_path: Path) -> None:
     file = tmp_path / "key"
     file.touch()
     with pytest.raises(LinkError) as error:
@@ -136,7 +136,7 @@ def test_the_command_that_is_told_makes_the_key_that_mavproxy_has(tmp_path: Path
 
 
 @pytest.mark.parametrize("mode", [0o600, 0o400, 0o640, 0o604, 0o620, 0o644])
-def test_a_key_that_others_can_read(tmp_path: Path, mode: int) -> None:
+def test_world_readable_key_file_gives_a_warning(tmp_path: Path, mode: int) -> None:
     file = tmp_path / "key"
     file.write_bytes(KEY)
     file.chmod(mode)
@@ -152,7 +152,7 @@ def test_a_key_that_others_can_read(tmp_path: Path, mode: int) -> None:
 # --- across runs --------------------------------------------------------------------------------
 
 
-def test_the_file_is_there_at_once_and_holds_no_key(path: Path) -> None:
+def test_timestamp_file_exists_at_once_and_holds_no_key(path: Path) -> None:
     timestamps = Timestamps(path)
     assert json.loads(path.read_bytes())["links"] == []
     assert path.stat().st_mode & 0o777 == 0o600
@@ -165,7 +165,7 @@ def test_the_file_is_there_at_once_and_holds_no_key(path: Path) -> None:
     assert {file.name for file in path.parent.iterdir()} == {path.name, path.name + ".lock"}
 
 
-def test_a_run_that_ends_in_order_is_gone_on_with(path: Path) -> None:
+def test_timestamps_continue_after_a_clean_shutdown(path: Path) -> None:
     now_ns, heard, stamps = NOW_NS, [], []
     raw = encode.pack(encode.heartbeat(Source(5, 191)), 0)
     for _ in range(3):
@@ -182,7 +182,7 @@ def test_a_run_that_ends_in_order_is_gone_on_with(path: Path) -> None:
     assert sorted(set(numbers)) == numbers
 
 
-def test_another_link_or_key_begins_anew_and_the_first_is_kept(path: Path) -> None:
+def test_new_link_or_key_starts_fresh_and_keeps_the_old_one(path: Path) -> None:
     old = sent(NOW_NS)
     for url, key in ((URL, KEY), ("tcp:h:1", KEY), (URL, OTHER_KEY), (URL, KEY)):
         frame = old if key is KEY else sent(NOW_NS, OTHER_KEY)
@@ -195,7 +195,7 @@ def test_another_link_or_key_begins_anew_and_the_first_is_kept(path: Path) -> No
     assert known == 3
 
 
-def test_the_settings_of_a_guard_are_handed_on(path: Path) -> None:
+def test_signing_settings_are_passed_to_each_link(path: Path) -> None:
     timestamps = Timestamps(path)
     strict = timestamps.guard(URL, KEY, 7, NOW_NS)
     lax = timestamps.guard("tcp:h:1", KEY, 8, NOW_NS, allow_unsigned=True)
@@ -207,7 +207,7 @@ def test_the_settings_of_a_guard_are_handed_on(path: Path) -> None:
     timestamps.close(NOW_NS)
 
 
-def test_from_the_first_moment_a_run_counts_as_not_ended(path: Path) -> None:
+def test_running_process_counts_as_unclean_from_the_start(path: Path) -> None:
     """Killed before the first save, whatever the previous run has left."""
     first = Timestamps(path)
     guard = first.guard(URL, KEY, 0, NOW_NS)
@@ -217,7 +217,7 @@ def test_from_the_first_moment_a_run_counts_as_not_ended(path: Path) -> None:
     guard = second.guard(URL, KEY, 0, NOW_NS)
     lost = [sent(NOW_NS + S // 2), sent(NOW_NS + S // 2, sysid=2)]  # one known, one new
     assert [guard.refusal(frame) for frame in lost] == [None, None]
-    left = as_left(path, "left")
+    left = file_after_kill(path, "left")
     second.close(NOW_NS + S)
 
     third = Timestamps(left)
@@ -276,7 +276,7 @@ def live(path: Path, now_ns: int, lines: int) -> Iterator[tuple[str, int, bytes]
             yield kind, int(t_ns), bytes.fromhex(raw)
 
 
-def test_killed_again_and_again(path: Path) -> None:
+def test_repeated_kills_accept_no_replay_and_reuse_no_timestamp(path: Path) -> None:
     """No received frame is accepted again, no timestamp is reused, and all streams continue within
     seconds."""
     now_ns, heard, stamps = NOW_NS, [], [0]
@@ -291,7 +291,7 @@ def test_killed_again_and_again(path: Path) -> None:
                 assert stamps[-1] > stamps[-2]
         assert lines < 100 or len({frame.source for frame in heard[before:]}) == 3
 
-        left = as_left(path, "left")
+        left = file_after_kill(path, "left")
         timestamps = Timestamps(left)
         guard = timestamps.guard(URL, KEY, 7, now_ns)
         for frame in heard:
@@ -302,7 +302,7 @@ def test_killed_again_and_again(path: Path) -> None:
         timestamps.close(later_ns)
 
 
-def test_time_to_save(path: Path) -> None:
+def test_timestamps_are_saved_each_second_or_every_three_when_idle(path: Path) -> None:
     """Every second while timestamps change; every three seconds in silence, because clocks
     advance.
     """
@@ -321,7 +321,7 @@ def test_time_to_save(path: Path) -> None:
     timestamps.close(NOW_NS + 2 * S)
 
 
-def test_a_snapshot_is_of_its_moment_and_never_replaces_a_newer_one(path: Path) -> None:
+def test_snapshot_never_replaces_a_newer_one(path: Path) -> None:
     timestamps = Timestamps(path)
     guard = timestamps.guard(URL, KEY, 0, NOW_NS)
     first = timestamps.snapshot(NOW_NS + S)
@@ -340,7 +340,7 @@ def test_a_snapshot_is_of_its_moment_and_never_replaces_a_newer_one(path: Path) 
     timestamps.close(NOW_NS + 3 * S)
 
 
-def test_a_file_is_replaced_and_never_written_over(path: Path) -> None:
+def test_timestamp_file_is_replaced_atomically(path: Path) -> None:
     """The old file stays whole until the new one is complete."""
     timestamps = Timestamps(path)
     timestamps.guard(URL, KEY, 0, NOW_NS)
@@ -352,9 +352,7 @@ def test_a_file_is_replaced_and_never_written_over(path: Path) -> None:
     timestamps.close(NOW_NS + S)
 
 
-def test_a_new_file_is_on_the_disk_and_its_name_in_the_folder_too(
-    path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_file_and_its_folder_are_synced(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A power failure cannot be tested, but the system calls can."""
     timestamps = Timestamps(path)
     timestamps.guard(URL, KEY, 0, NOW_NS)
@@ -374,7 +372,7 @@ def test_a_new_file_is_on_the_disk_and_its_name_in_the_folder_too(
     timestamps.close(NOW_NS + 60 * S)
 
 
-def test_threads_write_while_frames_come(path: Path) -> None:
+def test_timestamp_file_stays_whole_under_concurrent_writes(path: Path) -> None:
     """The file is whole at every moment."""
     timestamps = Timestamps(path)
     guard = timestamps.guard(URL, KEY, 0, NOW_NS)
@@ -416,7 +414,7 @@ def refuses(path: Path, said: str) -> None:
     one_line(error, path)
 
 
-def test_a_damaged_file_is_refused_whatever_is_damaged(path: Path) -> None:
+def test_damaged_timestamp_file_is_rejected(path: Path) -> None:
     timestamps = Timestamps(path)
     guard = timestamps.guard(URL, KEY, 0, NOW_NS)
     assert guard.refusal(sent(NOW_NS)) is None
@@ -436,19 +434,19 @@ def test_a_damaged_file_is_refused_whatever_is_damaged(path: Path) -> None:
     ["null", "[]", "7", '"x"', "{}", '{"version":1}', "[" * 100_000, "9" * 9999, "\0", "\udcff"],
     ids=lambda text: text[:14].encode("ascii", "backslashreplace").decode(),
 )
-def test_a_file_of_something_else(path: Path, text: str) -> None:
+def test_foreign_file_is_rejected(path: Path, text: str) -> None:
     path.parent.mkdir()
     path.write_bytes(text.encode(errors="surrogateescape"))
     refuses(path, "damaged")
 
 
-def test_a_file_of_another_version(path: Path) -> None:
+def test_file_of_an_unsupported_version_is_rejected(path: Path) -> None:
     Timestamps(path).close(NOW_NS)
     path.write_text(path.read_text().replace('"version":1', '"version":2'))
     refuses(path, "damaged")
 
 
-def test_places_where_nothing_can_be_kept(tmp_path: Path) -> None:
+def test_unwritable_timestamp_path_is_reported(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     refuses(tmp_path / "file" / "signing.json", "cannot write the signing timestamps")
     (tmp_path / "folder").mkdir()
@@ -457,14 +455,14 @@ def test_places_where_nothing_can_be_kept(tmp_path: Path) -> None:
     refuses(tmp_path / "new", "cannot write the signing timestamps")
 
 
-def test_one_process_at_a_time(path: Path) -> None:
+def test_second_process_on_the_same_timestamp_file_is_rejected(path: Path) -> None:
     timestamps = Timestamps(path)
     refuses(path, "another process")
     timestamps.close(NOW_NS)
     Timestamps(path).close(NOW_NS)
 
 
-def test_a_disk_that_fails_is_told_and_tried_again(path: Path) -> None:
+def test_failed_save_is_reported_and_retried(path: Path) -> None:
     timestamps = Timestamps(path)
     guard = timestamps.guard(URL, KEY, 0, NOW_NS)
     assert guard.refusal(sent(NOW_NS)) is None
@@ -479,7 +477,7 @@ def test_a_disk_that_fails_is_told_and_tried_again(path: Path) -> None:
     timestamps.close(NOW_NS)
 
 
-def test_no_descriptor_is_left_open(path: Path) -> None:
+def test_no_file_descriptor_is_leaked(path: Path) -> None:
     def count() -> int:
         return len(list(Path("/proc/self/fd").iterdir()))
 

@@ -12,7 +12,7 @@ CALLS = 20
 EACH_S = to_loop.SLICE_S / 2
 
 
-def test_other_work_has_its_turn_among_many_calls() -> None:
+def test_queued_calls_do_not_starve_the_event_loop() -> None:
     """Limited by time, because the cost of a call is unknown."""
     made: list[int] = []
     seen: list[int] = []
@@ -37,7 +37,7 @@ def test_other_work_has_its_turn_among_many_calls() -> None:
     assert len(set(seen)) > CALLS / 5
 
 
-def test_what_is_posted_after_all_was_made_is_made_too() -> None:
+def test_call_posted_after_draining_is_executed() -> None:
     made: list[str] = []
 
     async def test() -> None:

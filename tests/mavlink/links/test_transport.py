@@ -96,7 +96,7 @@ def test_datagrams_become_frames(run: Run) -> None:
 
 
 @needs_ipv6
-def test_datagrams_over_ipv6(run: Run) -> None:
+def test_datagrams_over_ipv6_become_frames(run: Run) -> None:
     async def test() -> None:
         async with running("udpin:[::1]:0") as (link, inbox):
             with senders(2, socket.AF_INET6) as both:
@@ -129,7 +129,7 @@ def test_each_peer_has_its_own_splitter(run: Run) -> None:
     run(test())
 
 
-def test_a_truncated_datagram_harms_no_other_peer(run: Run) -> None:
+def test_truncated_datagram_does_not_affect_other_peers(run: Run) -> None:
     async def test() -> None:
         async with running("udpin:127.0.0.1:0") as (link, inbox):
             with senders(2) as (bad, good):
@@ -143,7 +143,7 @@ def test_a_truncated_datagram_harms_no_other_peer(run: Run) -> None:
     run(test())
 
 
-def test_what_is_lost_is_handed_on_and_counted(run: Run) -> None:
+def test_rejected_bytes_are_delivered_and_counted(run: Run) -> None:
     async def test() -> None:
         async with running("udpin:127.0.0.1:0") as (link, inbox):
             raw = frame(1)
@@ -163,7 +163,7 @@ def test_what_is_lost_is_handed_on_and_counted(run: Run) -> None:
     run(test())
 
 
-def test_a_port_scan_does_not_fill_the_memory() -> None:
+def test_port_scan_uses_bounded_memory() -> None:
     """The most recent peers are kept: a peer that keeps sending is never evicted."""
     inbox: list[Frame | Rejection] = []
     link = Link(url=parse_link("udpin:127.0.0.1:0"), receive=inbox.extend, now_ns=lambda: 0)
@@ -183,7 +183,7 @@ def test_a_port_scan_does_not_fill_the_memory() -> None:
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
-def test_a_port_in_use_is_one_line(scheme: str) -> None:
+def test_port_in_use_is_reported_in_one_line(scheme: str) -> None:
     kind = socket.SOCK_DGRAM if scheme == "udpin" else socket.SOCK_STREAM
     with socket.socket(socket.AF_INET, kind) as taken:
         taken.bind(("127.0.0.1", 0))
@@ -196,7 +196,7 @@ def test_a_port_in_use_is_one_line(scheme: str) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
-def test_an_address_of_another_machine_is_one_line(scheme: str) -> None:
+def test_foreign_bind_address_is_reported_in_one_line(scheme: str) -> None:
     url = f"{scheme}:192.0.2.1:0"  # TEST-NET-1: an unassigned address
     with pytest.raises(LinkError) as caught:
         Link(url=parse_link(url), receive=lambda _: None, now_ns=lambda: 0).open()
@@ -206,12 +206,12 @@ def test_an_address_of_another_machine_is_one_line(scheme: str) -> None:
 @pytest.mark.parametrize(
     "url", ["tcp:127.0.0.1:1", "udpout:127.0.0.1:1", "serial:/dev/not-plugged-in:57600"]
 )
-def test_a_peer_or_a_device_that_is_away_is_no_error_at_the_start(url: str) -> None:
+def test_absent_peer_or_device_does_not_fail_at_start(url: str) -> None:
     Link(url=parse_link(url), receive=lambda _: None, now_ns=lambda: 0).open()
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
-def test_the_port_is_free_again_after_a_link(run: Run, scheme: str) -> None:
+def test_port_is_released_after_a_link(run: Run, scheme: str) -> None:
     """Also when the link closes a connection: the kernel remembers those for a minute."""
 
     async def test() -> None:
@@ -267,7 +267,7 @@ async def on_peer_gone(writer: asyncio.StreamWriter) -> None:
     await writer.wait_closed()
 
 
-def test_a_stream_in_pieces(run: Run) -> None:
+def test_fragmented_stream_becomes_frames(run: Run) -> None:
     async def test() -> None:
         async with serving() as server, running(f"tcp:127.0.0.1:{server.port}") as (link, inbox):
             writer = await server.connections.get()
@@ -285,7 +285,7 @@ def test_a_stream_in_pieces(run: Run) -> None:
     run(test())
 
 
-def test_it_connects_again_when_the_server_goes_away(run: Run) -> None:
+def test_client_reconnects_after_the_server_stops(run: Run) -> None:
     """The server stops listening and returns; half a frame from before does no harm."""
 
     async def test() -> None:
@@ -307,7 +307,7 @@ def test_it_connects_again_when_the_server_goes_away(run: Run) -> None:
     run(test())
 
 
-def test_a_link_may_be_there_before_its_server(run: Run) -> None:
+def test_link_waits_for_a_server_that_starts_later(run: Run) -> None:
     async def test() -> None:
         server = Server()
         await server.start()
@@ -327,7 +327,7 @@ def test_a_link_may_be_there_before_its_server(run: Run) -> None:
     run(test())
 
 
-def test_after_a_connection_the_first_retry_is_quick_again(
+def test_successful_connection_resets_the_retry_delay(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(transport, "RETRY_S", (0.0, 2 * LIMIT_S))
@@ -344,12 +344,12 @@ def test_after_a_connection_the_first_retry_is_quick_again(
     run(test())
 
 
-def test_retries_become_rare() -> None:
+def test_retry_delays_increase() -> None:
     assert transport.RETRY_S[0] <= 0.5 and transport.RETRY_S[-1] <= 10
     assert list(transport.RETRY_S) == sorted(transport.RETRY_S)
 
 
-def test_good_frames_in_an_unfinished_claim_are_found_when_the_peer_hangs_up(run: Run) -> None:
+def test_frames_behind_a_damaged_length_are_found_at_disconnect(run: Run) -> None:
     """A damaged length covers the following frames; they are searched because no more bytes will
     arrive."""
 
@@ -369,7 +369,7 @@ def test_good_frames_in_an_unfinished_claim_are_found_when_the_peer_hangs_up(run
 
 
 @pytest.mark.parametrize("greeting", [b"", b"HTTP/1.1 400 Bad Request\r\n\r\n"])
-def test_a_peer_that_hangs_up_at_once_is_not_tried_at_full_speed(
+def test_immediate_disconnects_are_retried_with_backoff(
     run: Run, monkeypatch: pytest.MonkeyPatch, greeting: bytes
 ) -> None:
     """Only frames reset the retry delay; however often it accepts, it is one outage."""
@@ -390,7 +390,7 @@ def test_a_peer_that_hangs_up_at_once_is_not_tried_at_full_speed(
     run(test())
 
 
-def test_it_says_once_that_it_is_down_and_once_that_it_is_back(
+def test_outage_and_recovery_are_announced_once_each(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(transport, "RETRY_S", (0.01,))
@@ -421,7 +421,7 @@ def test_it_says_once_that_it_is_down_and_once_that_it_is_back(
     run(test())
 
 
-def test_a_name_is_looked_up(run: Run) -> None:
+def test_host_name_is_resolved(run: Run) -> None:
     """Any of its addresses may answer: here the first may be ::1, without a listener."""
 
     async def test() -> None:
@@ -448,7 +448,7 @@ async def connected(link: Link, family: int = socket.AF_INET) -> AsyncIterator[s
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", pytest.param("[::1]", marks=needs_ipv6)])
-def test_connections_are_served_side_by_side(run: Run, host: str) -> None:
+def test_connections_are_served_concurrently(run: Run, host: str) -> None:
     """Interleaved half frames; one connection breaks off in the middle of a frame."""
     family = socket.AF_INET6 if host == "[::1]" else socket.AF_INET
 
@@ -473,7 +473,7 @@ def test_connections_are_served_side_by_side(run: Run, host: str) -> None:
     run(test())
 
 
-def test_connections_are_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_number_of_connections_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp, "CONNECTIONS_MAX", 2)
 
     async def test() -> None:
@@ -501,7 +501,7 @@ def test_connections_are_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.parametrize(
     "host", ["127.0.0.1", "localhost", pytest.param("[::1]", marks=needs_ipv6)]
 )
-def test_the_one_peer_is_spoken_to_and_heard(run: Run, host: str) -> None:
+def test_udp_client_exchanges_frames_with_its_peer(run: Run, host: str) -> None:
     async def test() -> None:
         infos = socket.getaddrinfo(host.strip("[]"), 0, type=socket.SOCK_DGRAM)
         family, _, _, _, address = infos[0]
@@ -526,7 +526,7 @@ def test_the_one_peer_is_spoken_to_and_heard(run: Run, host: str) -> None:
     run(test())
 
 
-def test_that_nobody_listens_there_is_no_lost_link(
+def test_refused_datagrams_do_not_take_the_link_down(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The kernel reports a refusal for every datagram; no message of ours is dropped for it, and a
@@ -564,7 +564,7 @@ def test_that_nobody_listens_there_is_no_lost_link(
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="only Linux counts what a socket lost")
-def test_what_overflows_is_counted_to_the_last_datagram(run: Run) -> None:
+def test_overflowed_datagrams_are_counted_exactly(run: Run) -> None:
     """Sent while nothing is read, far beyond the buffer: every lost datagram is counted."""
 
     async def test() -> None:
@@ -587,7 +587,7 @@ def test_what_overflows_is_counted_to_the_last_datagram(run: Run) -> None:
     run(test())
 
 
-def test_the_buffer_is_sized_and_what_was_granted_is_said(run: Run) -> None:
+def test_receive_buffer_size_is_set_and_reported(run: Run) -> None:
     async def test() -> None:
         with senders(1) as (stock,):
             usual = stock.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF)
@@ -605,7 +605,7 @@ def test_the_buffer_is_sized_and_what_was_granted_is_said(run: Run) -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="it is Linux that knows")
-def test_where_the_system_does_not_say_it_is_unknown_and_not_none_lost() -> None:
+def test_overflow_count_is_unknown_where_unsupported() -> None:
     """For a closed socket the number of lost datagrams is unknown."""
     with socket.socket(type=socket.SOCK_DGRAM) as sock:
         assert udp.dropped_by_system(sock) == 0
@@ -615,7 +615,7 @@ def test_where_the_system_does_not_say_it_is_unknown_and_not_none_lost() -> None
 # --- counts -------------------------------------------------------------------------------------
 
 
-def test_what_is_heard_is_counted_by_component(run: Run) -> None:
+def test_received_frames_are_counted_per_component(run: Run) -> None:
     async def test() -> None:
         async with running("udpin:127.0.0.1:0") as (link, inbox):
             assert link.status.heard_ns is None and link.status.components == {}
@@ -660,7 +660,7 @@ class Mailbox:
 
 
 @pytest.mark.usefixtures("unstamped")
-def test_everybody_heard_lately_is_sent_to(run: Run) -> None:
+def test_messages_go_to_every_recently_received_peer(run: Run) -> None:
     """Each with its own sequence numbers and in its own MAVLink version."""
 
     async def test() -> None:
@@ -692,7 +692,7 @@ def test_everybody_heard_lately_is_sent_to(run: Run) -> None:
     run(test())
 
 
-def test_a_source_is_answered_where_it_was_heard_last(run: Run) -> None:
+def test_reply_goes_to_the_peer_last_received_from(run: Run) -> None:
     async def test() -> None:
         with contextlib.ExitStack() as stack:
             a, b = Mailbox(stack), Mailbox(stack)
@@ -710,7 +710,7 @@ def test_a_source_is_answered_where_it_was_heard_last(run: Run) -> None:
     run(test())
 
 
-def test_every_connection_is_sent_to_and_a_source_over_its_own(run: Run) -> None:
+def test_messages_go_to_every_connection_and_replies_to_their_own(run: Run) -> None:
     async def test() -> None:
         loop = asyncio.get_running_loop()
         async with running("tcpin:127.0.0.1:0") as (link, inbox), connected(link) as silent:
@@ -726,7 +726,7 @@ def test_every_connection_is_sent_to_and_a_source_over_its_own(run: Run) -> None
     run(test())
 
 
-def test_a_connection_that_does_not_read_loses_messages_and_no_time(run: Run) -> None:
+def test_blocked_connection_drops_messages_without_blocking(run: Run) -> None:
     """Its buffer is bounded; when it reads again, it receives whole frames only."""
 
     async def test() -> None:
@@ -758,7 +758,7 @@ def test_a_connection_that_does_not_read_loses_messages_and_no_time(run: Run) ->
     run(test())
 
 
-def test_a_peer_that_cannot_be_sent_to_harms_no_other(run: Run) -> None:
+def test_unreachable_peer_does_not_affect_others(run: Run) -> None:
     async def test() -> None:
         with contextlib.ExitStack() as stack:
             peer = Mailbox(stack)
@@ -792,7 +792,7 @@ class OddOnly:
 
 
 @pytest.mark.usefixtures("unstamped")
-def test_what_the_guard_refuses_is_a_rejection_and_moves_nothing(run: Run) -> None:
+def test_frame_rejected_by_the_guard_has_no_other_effect(run: Run) -> None:
     async def test() -> None:
         guard, now = OddOnly(), 1234
         with contextlib.ExitStack() as stack:
@@ -821,7 +821,7 @@ def test_what_the_guard_refuses_is_a_rejection_and_moves_nothing(run: Run) -> No
     run(test())
 
 
-def test_a_link_with_a_guard_speaks_what_can_be_signed(run: Run) -> None:
+def test_guarded_link_sends_mavlink_2(run: Run) -> None:
     async def test() -> None:
         with contextlib.ExitStack() as stack:
             peer = Mailbox(stack)
@@ -838,7 +838,7 @@ def test_a_link_with_a_guard_speaks_what_can_be_signed(run: Run) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["tcp", "tcpin"])
-def test_an_unfinished_frame_is_given_up_before_the_link_has_stopped(run: Run, scheme: str) -> None:
+def test_incomplete_frame_is_rejected_before_the_link_stops(run: Run, scheme: str) -> None:
     """Afterwards it must report nothing more (``running`` checks that)."""
 
     async def test() -> None:
@@ -865,7 +865,7 @@ def test_an_unfinished_frame_is_given_up_before_the_link_has_stopped(run: Run, s
 
 @pytest.mark.parametrize("turns", range(1, 7))
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin", "udpout", "tcp"])
-def test_a_link_that_is_stopped_while_it_opens_leaves_nothing_open(
+def test_link_cancelled_while_opening_leaves_nothing_open(
     run: Run, scheme: str, turns: int
 ) -> None:
     """Cancelled after so many loop iterations. Python or uvloop warns of anything left open; as an
@@ -896,7 +896,7 @@ def test_a_link_that_is_stopped_while_it_opens_leaves_nothing_open(
 
 @pytest.mark.filterwarnings("ignore:unclosed:ResourceWarning")
 @pytest.mark.parametrize("turns", range(7))
-def test_who_connects_while_a_link_stops_is_not_left_waiting(run: Run, turns: int) -> None:
+def test_connection_during_shutdown_is_closed(run: Run, turns: int) -> None:
     """However far the loop had come with the connection when the link was stopped."""
 
     async def test() -> None:
@@ -914,7 +914,7 @@ def test_who_connects_while_a_link_stops_is_not_left_waiting(run: Run, turns: in
     run(test())
 
 
-def test_several_links_at_once(run: Run) -> None:
+def test_several_links_run_concurrently(run: Run) -> None:
     async def test() -> None:
         async with (
             running("udpin:127.0.0.1:0") as (udp_in, heard_udp),
@@ -939,7 +939,7 @@ class FaultError(Exception):
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin", "udpout", "tcp"])
-def test_a_fault_of_the_program_does_not_vanish(run: Run, scheme: str) -> None:
+def test_program_error_is_raised_by_run(run: Run, scheme: str) -> None:
     """``run`` raises what ``receive`` raises, whatever the loop would do with it."""
 
     def receive(_: list[Frame | Rejection]) -> None:
@@ -981,7 +981,7 @@ def test_a_fault_of_the_program_does_not_vanish(run: Run, scheme: str) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])
-def test_a_link_may_be_run_again_on_the_port_that_it_had(run: Run, scheme: str) -> None:
+def test_link_can_be_run_again_on_its_port(run: Run, scheme: str) -> None:
     async def test() -> None:
         came: list[Frame | Rejection] = []
         link = Link(url=parse_link(f"{scheme}:127.0.0.1:0"), receive=came.extend, now_ns=lambda: 0)

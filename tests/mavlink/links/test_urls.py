@@ -40,7 +40,7 @@ from companion.values import shown
         ("serial:/dev/tty µ 1:20000000", "serial", "/dev/tty µ 1", 20_000_000),
     ],
 )
-def test_an_address_is_read_and_written_alike(text: str, scheme: str, host: str, port: int) -> None:
+def test_link_url_round_trips(text: str, scheme: str, host: str, port: int) -> None:
     url = parse_link(text)
     assert (url.scheme, url.host, url.port) == (scheme, host, port)
     assert str(url) == text
@@ -109,7 +109,7 @@ def test_an_address_is_read_and_written_alike(text: str, scheme: str, host: str,
         "zenoh:site?connect=tcp/10.0.0.7:7447 listen=tcp/10.0.0.7:7447",
     ],
 )
-def test_a_bad_address_is_one_line_that_names_it(text: str) -> None:
+def test_invalid_link_url_is_reported_in_one_line(text: str) -> None:
     with pytest.raises(LinkError) as caught:
         parse_link(text)
     message = str(caught.value)
@@ -127,13 +127,13 @@ def test_a_bad_address_is_one_line_that_names_it(text: str) -> None:
         ("cot:tak.lan:8087", "cot:udp:tak.lan:8087, which listens, or cot:tcp:tak.lan:8087?"),
     ],
 )
-def test_what_was_likely_meant_is_said(text: str, meant: str) -> None:
+def test_link_url_error_suggests_a_correction(text: str, meant: str) -> None:
     with pytest.raises(LinkError) as caught:
         parse_link(text)
     assert str(caught.value).endswith(f"did you mean {meant}")
 
 
-def test_only_the_schemes_that_are_asked_for() -> None:
+def test_only_allowed_schemes_are_accepted() -> None:
     assert parse_link("tcp:127.0.0.1:1", ("tcp",)) == LinkUrl(
         scheme="tcp", host="127.0.0.1", port=1
     )
@@ -146,7 +146,7 @@ def test_only_the_schemes_that_are_asked_for() -> None:
 @given(st.sampled_from(SCHEMES), st.text(max_size=20), st.text("0123456789:.-", max_size=6))
 @example("serial", "\x1e", "")
 @example("udp", "\x85", "1")
-def test_any_text_is_an_address_or_a_link_error(scheme: str, host: str, port: str) -> None:
+def test_any_text_is_a_link_url_or_a_link_error(scheme: str, host: str, port: str) -> None:
     """A parsed URL is formatted so that it parses to the same value."""
     try:
         url = parse_link(f"{scheme}:{host}:{port}")

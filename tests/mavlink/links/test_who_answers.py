@@ -43,7 +43,7 @@ def taken() -> Taken:
     return Taken()
 
 
-def test_an_answer_comes_from_where_the_positions_come(taken: Taken) -> None:
+def test_timesync_answer_must_come_from_the_position_peer(taken: Taken) -> None:
     assert isinstance(taken.take(HOME, frame(1)), Frame)
     assert isinstance(taken.take(HOME, answer()), Frame)
     forged = taken.take(ELSEWHERE, answer())
@@ -53,23 +53,23 @@ def test_an_answer_comes_from_where_the_positions_come(taken: Taken) -> None:
     )  # fmt: skip
 
 
-def test_a_router_that_brings_both_is_believed_over_each_way(taken: Taken) -> None:
+def test_answers_are_accepted_from_every_peer_that_brings_positions(taken: Taken) -> None:
     for number, way in enumerate((HOME, ELSEWHERE)):
         taken.take(way, frame(number))
     assert all(isinstance(taken.take(way, answer()), Frame) for way in (HOME, ELSEWHERE))
 
 
-def test_positions_of_another_sender_vouch_for_nothing(taken: Taken) -> None:
+def test_positions_of_another_sender_do_not_authorise_answers(taken: Taken) -> None:
     taken.take(ELSEWHERE, frame(1, sysid=66))
     assert isinstance(taken.take(ELSEWHERE, answer()), Rejection)
 
 
-def test_who_has_long_been_silent_is_asked_anew(taken: Taken) -> None:
+def test_answer_from_a_long_silent_peer_is_rejected(taken: Taken) -> None:
     taken.take(HOME, frame(1))
     taken.now_ns += STAMPS_KEPT_NS + 1
     assert isinstance(taken.take(HOME, answer()), Rejection)
 
 
-def test_a_request_is_no_answer(taken: Taken) -> None:
+def test_timesync_request_is_not_treated_as_an_answer(taken: Taken) -> None:
     assert isinstance(taken.take(ELSEWHERE, answer(0)), Frame)
     assert Splitter("x").feed(0, answer(0))

@@ -93,7 +93,7 @@ def test_samples_arrive_whole_and_in_order(run: Run) -> None:
     run(test())
 
 
-def test_nobody_hears_himself(run: Run) -> None:
+def test_session_does_not_receive_its_own_samples(run: Run) -> None:
     async def test() -> None:
         async with pair() as (one, other):
             heard, elsewhere = Heard(), Heard()
@@ -109,7 +109,7 @@ def test_nobody_hears_himself(run: Run) -> None:
     run(test())
 
 
-def test_who_comes_later_learns_who_is_there_and_who_leaves(run: Run) -> None:
+def test_late_subscriber_learns_present_and_departing_nodes(run: Run) -> None:
     async def test() -> None:
         endpoint = f"tcp/127.0.0.1:{free_port()}"
         async with opened(BusConfig(listen=(endpoint,))) as stays:
@@ -127,7 +127,7 @@ def test_who_comes_later_learns_who_is_there_and_who_leaves(run: Run) -> None:
     run(test())
 
 
-def test_a_question_is_answered_while_the_loop_is_busy(run: Run) -> None:
+def test_query_is_answered_while_the_loop_is_busy(run: Run) -> None:
     async def test() -> None:
         async with pair() as (one, other):
             answers = Heard()
@@ -151,7 +151,7 @@ def test_a_question_is_answered_while_the_loop_is_busy(run: Run) -> None:
     run(test())
 
 
-def test_a_question_may_go_unanswered(run: Run) -> None:
+def test_unanswered_query_does_not_block_others(run: Run) -> None:
     async def test() -> None:
         async with pair() as (one, other):
             answers = Heard()
@@ -166,7 +166,7 @@ def test_a_question_may_go_unanswered(run: Run) -> None:
     run(test())
 
 
-def test_a_defect_in_a_callback_ends_who_runs_the_bus(run: Run) -> None:
+def test_callback_exception_ends_the_bus(run: Run) -> None:
     async def test() -> None:
         async with pair() as (one, other):
             calls = Heard()
@@ -186,7 +186,7 @@ def test_a_defect_in_a_callback_ends_who_runs_the_bus(run: Run) -> None:
     run(test())
 
 
-def test_a_defect_in_an_answer_does_too(run: Run) -> None:
+def test_query_handler_exception_ends_the_bus(run: Run) -> None:
     async def test() -> None:
         async with pair() as (one, other):
             one.serve("site/a", lambda key, payload: bytes([1 // len(payload)]))
@@ -198,7 +198,7 @@ def test_a_defect_in_an_answer_does_too(run: Run) -> None:
     run(test())
 
 
-def test_what_waits_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_receive_queue_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(to_loop, "QUEUE_MAX", 10)
 
     async def test() -> None:
@@ -217,7 +217,7 @@ def test_what_waits_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> Non
     run(test())
 
 
-def test_after_the_end_nothing_is_taken_and_nothing_raised(run: Run) -> None:
+def test_samples_after_close_are_rejected_without_an_exception(run: Run) -> None:
     async def test() -> None:
         async with opened(BusConfig()) as bus:
             bus.put("site/a", b"1")
@@ -241,7 +241,7 @@ def test_a_burst_of_urgent_samples_arrives(run: Run) -> None:
     run(test())
 
 
-def test_what_need_not_be_reliable_goes_by_datagrams(run: Run) -> None:
+def test_best_effort_samples_use_datagrams(run: Run) -> None:
     async def test() -> None:
         ports = free_port(), free_port(socket.SOCK_DGRAM)
         endpoints = (f"tcp/127.0.0.1:{ports[0]}?rel=1", f"udp/127.0.0.1:{ports[1]}?rel=0")
@@ -267,7 +267,7 @@ def test_what_need_not_be_reliable_goes_by_datagrams(run: Run) -> None:
     run(test())
 
 
-def test_many_keys_go_out_all_the_same(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_samples_on_many_keys_are_all_sent(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zenoh_bus, "PUBLISHERS_MAX", 2)
 
     async def test() -> None:
@@ -283,7 +283,7 @@ def test_many_keys_go_out_all_the_same(run: Run, monkeypatch: pytest.MonkeyPatch
     run(test())
 
 
-def test_whether_somebody_listens_and_who_is_near_is_known(run: Run) -> None:
+def test_subscribers_and_neighbours_are_detected(run: Run) -> None:
     async def test() -> None:
         async with pair() as (stays, leaves):
             near = Heard()
@@ -306,7 +306,7 @@ def test_whether_somebody_listens_and_who_is_near_is_known(run: Run) -> None:
     run(test())
 
 
-def test_who_listens_no_more_hears_nothing_and_nothing_is_sent_to_him(run: Run) -> None:
+def test_unsubscribed_session_receives_nothing(run: Run) -> None:
     async def test() -> None:
         async with pair() as (speaks, listens):
             some, others, near = Heard(), Heard(), Heard()
@@ -330,7 +330,7 @@ def test_who_listens_no_more_hears_nothing_and_nothing_is_sent_to_him(run: Run) 
     run(test())
 
 
-def test_a_client_waits_for_its_router_until_it_is_closed(run: Run) -> None:
+def test_client_waits_for_its_router_until_closed(run: Run) -> None:
     async def test() -> None:
         nobody = f"tcp/127.0.0.1:{free_port()}"
         bus = Bus(BusConfig(mode="client", connect=(nobody,)), asyncio.get_running_loop())
@@ -341,7 +341,7 @@ def test_a_client_waits_for_its_router_until_it_is_closed(run: Run) -> None:
     run(test())
 
 
-def test_a_neighbour_that_comes_later_is_found(run: Run) -> None:
+def test_neighbour_that_starts_later_is_found(run: Run) -> None:
     async def test() -> None:
         endpoint = f"tcp/127.0.0.1:{free_port()}"
         config = BusConfig(connect=(endpoint,), retry_s=0.02)
@@ -367,7 +367,7 @@ def listening() -> dict[str, str]:
 
 
 @pytest.mark.skipif(not Path("/proc/net/tcp").exists(), reason="the system has no such list")
-def test_unless_told_otherwise_it_listens_on_this_machine_alone(run: Run) -> None:
+def test_zenoh_listens_on_loopback_by_default(run: Run) -> None:
     async def test() -> None:
         before = listening()
         async with opened(BusConfig()):
@@ -394,7 +394,7 @@ def wrong_configurations(nowhere: Path) -> Iterator[tuple[BusConfig, str]]:
     yield BusConfig(access_control=Path(__file__)), "configuration"
 
 
-def test_a_mistake_is_one_line(tmp_path: Path) -> None:
+def test_command_error_is_one_line(tmp_path: Path) -> None:
     async def said(config: BusConfig) -> str:
         with pytest.raises(UserError) as error:
             await asyncio.to_thread(Bus(config, asyncio.get_running_loop()).open)
@@ -407,7 +407,7 @@ def test_a_mistake_is_one_line(tmp_path: Path) -> None:
         assert "cargo" not in message
 
 
-def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_zenoh_package_names_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     for name in [name for name in chain(sys.modules, ["zenoh"]) if name.startswith("zenoh")]:
         monkeypatch.setitem(sys.modules, name, None)
 
@@ -419,7 +419,7 @@ def test_a_missing_package_is_named_with_its_extra(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.parametrize("mutual", [True, False])
-def test_who_connects_shows_a_certificate_unless_told_otherwise(mutual: bool) -> None:
+def test_mutual_tls_is_the_default(mutual: bool) -> None:
     tls = BusTls(
         ca=Path("ca.pem"), certificate=Path("me.pem"), private_key=Path("me.key"), mutual=mutual
     )

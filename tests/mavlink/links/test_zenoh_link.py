@@ -33,7 +33,7 @@ def listened_to(link: Link) -> bool:
     return bool(link._endpoint.peers())
 
 
-def test_frames_go_both_ways(run: Run, links: tuple[str, str]) -> None:
+def test_frames_pass_both_ways(run: Run, links: tuple[str, str]) -> None:
     async def test() -> None:
         async with running(links[0]) as (hub, at_hub), running(links[1]) as (link, heard):
             await until_true(lambda: listened_to(hub) and listened_to(link))
@@ -50,7 +50,7 @@ def test_frames_go_both_ways(run: Run, links: tuple[str, str]) -> None:
     run(test())
 
 
-def test_nobody_listens_to_the_same_end(run: Run, links: tuple[str, str]) -> None:
+def test_two_non_hub_links_do_not_receive_each_other(run: Run, links: tuple[str, str]) -> None:
     """Two links without a hub do not receive each other; a frame then counts as not sent."""
 
     async def test() -> None:
@@ -66,7 +66,7 @@ def test_nobody_listens_to_the_same_end(run: Run, links: tuple[str, str]) -> Non
     run(test())
 
 
-def test_a_hub_that_goes_is_said_and_found_again(
+def test_lost_hub_is_announced_and_reconnected(
     run: Run, links: tuple[str, str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("companion.mavlink.links.transport.RETRY_S", (0.02,))
@@ -88,7 +88,7 @@ def test_a_hub_that_goes_is_said_and_found_again(
     run(test())
 
 
-def test_a_router_that_is_not_there_is_said(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_router_is_announced(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(zenoh_link, "OPEN_S", 0.05)
 
     async def test() -> None:
@@ -99,7 +99,7 @@ def test_a_router_that_is_not_there_is_said(run: Run, monkeypatch: pytest.Monkey
     run(test())
 
 
-def test_an_address_that_cannot_be_had_is_said(run: Run) -> None:
+def test_unavailable_address_is_announced(run: Run) -> None:
     async def test() -> None:
         async with running("zenoh:site?listen=tcp/192.0.2.1:7447") as (_, heard):
             await heard.until_said(1)
@@ -108,7 +108,7 @@ def test_an_address_that_cannot_be_had_is_said(run: Run) -> None:
     run(test())
 
 
-def test_a_defect_in_who_receives_ends_the_link(run: Run, links: tuple[str, str]) -> None:
+def test_receive_callback_exception_ends_the_link(run: Run, links: tuple[str, str]) -> None:
     async def test() -> None:
         def receive(found: object) -> None:
             raise ZeroDivisionError
@@ -124,7 +124,7 @@ def test_a_defect_in_who_receives_ends_the_link(run: Run, links: tuple[str, str]
     run(test())
 
 
-def test_without_zenoh_the_extra_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_zenoh_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "zenoh", None)
     link = Link(url=parse_link("zenoh:mavlink_raw"), receive=lambda found: None, now_ns=lambda: 1)
     with pytest.raises(UserError, match=r"\[fleet\]"):

@@ -22,6 +22,8 @@ from companion.mavlink.trust.admission import admission
         (("*:1",), ("3:1",), "4:1", True),
     ],
 )
-def test_the_lists(allow: tuple[str, ...], deny: tuple[str, ...], uav: str, admitted: bool) -> None:
+def test_allow_and_deny_lists(
+    allow: tuple[str, ...], deny: tuple[str, ...], uav: str, admitted: bool
+) -> None:
     admits = admission(allow, deny)
     assert admits(uav) is admits(uav) is admitted

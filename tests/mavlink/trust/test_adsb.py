@@ -84,7 +84,7 @@ def refused(found: Report | Rejection) -> Reason:
 # --- one message --------------------------------------------------------------------------------
 
 
-def test_a_complete_message_is_a_report() -> None:
+def test_complete_adsb_message_becomes_a_report() -> None:
     message = said(3, alt=500, velocity=(90, 70), climb=-2, callsign="EIN123", tslc=4)
     found = report(Aircraft().merge(message))
     assert found == Report(
@@ -96,13 +96,13 @@ def test_a_complete_message_is_a_report() -> None:
     )  # fmt: skip
 
 
-def test_what_is_not_vouched_for_stays_unknown() -> None:
+def test_fields_without_valid_flag_are_unknown() -> None:
     found = report(Aircraft().merge(said(0, alt=500, datum=PRESSURE)))
     assert (found.velocity_ne_mps, found.velocity_down_mps, found.heading_deg) == (None,) * 3
     assert found.alt_datum is PRESSURE
 
 
-def test_who_a_rejection_is_of() -> None:
+def test_rejection_names_the_relay_or_the_aircraft() -> None:
     """A message without a position is attributed to its relay, all others to the aircraft."""
     aircraft = Aircraft()
     assert aircraft.merge(said(1, None, alt=9)) == Rejection(
@@ -115,7 +115,7 @@ def test_who_a_rejection_is_of() -> None:
     )
 
 
-def test_aircraft_are_told_apart() -> None:
+def test_aircraft_are_kept_separate() -> None:
     aircraft = Aircraft()
     report(aircraft.merge(said(0, alt=500, callsign="ONE")))
     other = said(0.1, icao=0xABCDEF, callsign="TWO")
@@ -128,7 +128,7 @@ def test_aircraft_are_told_apart() -> None:
 # --- merged by field ----------------------------------------------------------------------------
 
 
-def test_a_position_takes_the_newest_altitude_and_says_how_old_it_is() -> None:
+def test_position_uses_the_newest_altitude_with_its_age() -> None:
     aircraft = Aircraft()
     assert refused(aircraft.merge(said(0, None, alt=500))) is Reason.NO_POSITION
     assert refused(aircraft.merge(said(1, None, alt=510, tslc=1))) is Reason.NO_POSITION
@@ -139,14 +139,14 @@ def test_a_position_takes_the_newest_altitude_and_says_how_old_it_is() -> None:
     assert refused(aircraft.merge(said(10.001, YONDER))) is Reason.NO_ALTITUDE
 
 
-def test_an_altitude_after_the_position_is_as_far_off() -> None:
+def test_altitude_age_limit_applies_in_both_directions() -> None:
     aircraft = Aircraft()
     aircraft.merge(said(0, None, alt=500))
     assert refused(aircraft.merge(said(0, tslc=11))) is Reason.NO_ALTITUDE
     assert report(aircraft.merge(said(0, tslc=10))).alt_age_s == 10.0
 
 
-def test_a_position_that_wanted_an_altitude_is_used_once_there_is_one() -> None:
+def test_position_without_altitude_is_used_when_one_arrives() -> None:
     aircraft = Aircraft()
     assert refused(aircraft.merge(said(0))) is Reason.NO_ALTITUDE
     assert refused(aircraft.merge(said(1, tslc=1))) is Reason.NO_ALTITUDE
@@ -155,7 +155,7 @@ def test_a_position_that_wanted_an_altitude_is_used_once_there_is_one() -> None:
     assert (found.alt_m, found.alt_age_s, found.tslc_s) == (500.0, 1.5, 2.0)
 
 
-def test_a_velocity_goes_with_a_position_of_its_own_second_only() -> None:
+def test_velocity_applies_only_to_positions_of_the_same_second() -> None:
     """Later the aircraft may have turned, and the velocity's bound would not include that."""
     aircraft = Aircraft()
     aircraft.merge(said(0, None, alt=500, velocity=(180, 60), climb=3))
@@ -166,7 +166,7 @@ def test_a_velocity_goes_with_a_position_of_its_own_second_only() -> None:
     assert (found.velocity_ne_mps, found.velocity_down_mps, found.heading_deg) == (None,) * 3
 
 
-def test_horizontal_and_vertical_velocity_are_merged_apart() -> None:
+def test_horizontal_and_vertical_velocity_are_merged_separately() -> None:
     aircraft = Aircraft()
     aircraft.merge(said(0, None, alt=500, velocity=(0, 60)))
     aircraft.merge(said(0.5, None, climb=3))
@@ -175,7 +175,7 @@ def test_horizontal_and_vertical_velocity_are_merged_apart() -> None:
     assert found.velocity_down_mps == pytest.approx(-3.0)
 
 
-def test_a_message_s_own_fields_come_first() -> None:
+def test_fields_of_the_message_take_precedence() -> None:
     """Even where a known value is more recent."""
     aircraft = Aircraft()
     aircraft.merge(said(0.9, None, alt=500, velocity=(0, 60), climb=3))
@@ -186,7 +186,7 @@ def test_a_message_s_own_fields_come_first() -> None:
     assert report(aircraft.merge(said(1.1, THERE))).alt_m == 500.0  # and the newer one is kept
 
 
-def test_a_callsign_is_the_newest_one() -> None:
+def test_newest_callsign_is_kept() -> None:
     aircraft = Aircraft()
     assert aircraft.callsign(UAV) is None
     aircraft.merge(said(0, None, alt=1))
@@ -199,7 +199,7 @@ def test_a_callsign_is_the_newest_one() -> None:
 # --- datums -------------------------------------------------------------------------------------
 
 
-def test_an_aircraft_keeps_its_datum_while_that_is_fresh() -> None:
+def test_aircraft_keeps_its_datum_while_fresh() -> None:
     """Two relays, one per datum: no altitude of the other datum enters the track."""
     aircraft = Aircraft()
     for n in range(20):
@@ -212,7 +212,7 @@ def test_an_aircraft_keeps_its_datum_while_that_is_fresh() -> None:
         assert (found.alt_m, found.alt_age_s) == (500 + n - n % 2, n % 2)
 
 
-def test_a_datum_that_is_no_longer_said_gives_way_to_the_other() -> None:
+def test_expired_datum_is_replaced_by_the_other() -> None:
     aircraft = Aircraft()
     aircraft.merge(said(0, alt=500, datum=PRESSURE))
     found = report(aircraft.merge(said(10, THERE, alt=700)))
@@ -224,7 +224,7 @@ def test_a_datum_that_is_no_longer_said_gives_way_to_the_other() -> None:
     assert report(aircraft.merge(said(12, (47.5, 8.5)))).alt_m == 700.0
 
 
-def test_geometric_altitude_is_preferred_where_there_is_a_choice() -> None:
+def test_geometric_altitude_is_preferred() -> None:
     aircraft = Aircraft()
     aircraft.merge(said(0, None, alt=700))
     aircraft.merge(said(5, None, alt=500, datum=PRESSURE))
@@ -240,7 +240,7 @@ def test_geometric_altitude_is_preferred_where_there_is_a_choice() -> None:
 
 
 @pytest.mark.parametrize("relay", [5, 6])
-def test_the_same_again_is_no_news_however_old_it_says_it_is(relay: int) -> None:
+def test_repeated_message_is_a_duplicate_at_any_stated_age(relay: int) -> None:
     """It does not refresh the position, but the relay counts as alive."""
     aircraft = Aircraft()
     aircraft.merge(said(0, alt=500, velocity=(0, 60)))
@@ -256,7 +256,7 @@ def test_the_same_again_is_no_news_however_old_it_says_it_is(relay: int) -> None
     assert refused(aircraft.merge(said(30, THERE))) is Reason.NO_ALTITUDE
 
 
-def test_a_repeated_position_may_bring_what_was_not_said_before() -> None:
+def test_repeated_position_may_add_new_fields() -> None:
     """The new field is dated like the position."""
     aircraft = Aircraft()
     report(aircraft.merge(said(0, alt=500, datum=PRESSURE)))
@@ -268,7 +268,7 @@ def test_a_repeated_position_may_bring_what_was_not_said_before() -> None:
     assert refused(aircraft.merge(said(10.5, YONDER))) is Reason.NO_ALTITUDE
 
 
-def test_one_that_hovers_is_news_after_a_while() -> None:
+def test_hovering_aircraft_is_reported_again_after_a_while() -> None:
     aircraft = Aircraft()
     times = (0, 10, 20, 30, 30.1, 40, 60.1, 60.3)
     found = [aircraft.merge(said(t_s, alt=500)) for t_s in times]
@@ -280,7 +280,7 @@ def test_one_that_hovers_is_news_after_a_while() -> None:
 @pytest.mark.parametrize(
     "moved", [{"alt": 501.0}, {"climb": 2.0}, {"velocity": (0.0, 61.0)}, {"at": THERE}]
 )
-def test_one_that_moves_is_news_at_once(moved: dict[str, object]) -> None:
+def test_moving_aircraft_is_reported_at_once(moved: dict[str, object]) -> None:
     """A balloon rises over one place."""
     aircraft = Aircraft()
     same: dict[str, object] = {"alt": 500.0, "climb": 1.0, "velocity": (0.0, 60.0), "at": HERE}
@@ -288,7 +288,7 @@ def test_one_that_moves_is_news_at_once(moved: dict[str, object]) -> None:
         report(aircraft.merge(said(t_s, **words)))  # type: ignore[arg-type]
 
 
-def test_a_lagging_relay_repeats_what_was_reported_long_before() -> None:
+def test_lagging_relay_messages_are_duplicates() -> None:
     aircraft = Aircraft()
     places = [(47.4 + n / 1000, 8.5) for n in range(POSITIONS_KEPT)]
     for n, place in enumerate(places):
@@ -298,7 +298,7 @@ def test_a_lagging_relay_repeats_what_was_reported_long_before() -> None:
         assert refused(aircraft.merge(late)) is Reason.DUPLICATE
 
 
-def test_a_position_that_was_news_again_is_remembered_from_then_on() -> None:
+def test_repeated_position_is_remembered_from_its_last_report() -> None:
     aircraft = Aircraft()
     report(aircraft.merge(said(0, alt=500)))
     for n in range(1, POSITIONS_KEPT):
@@ -309,7 +309,7 @@ def test_a_position_that_was_news_again_is_remembered_from_then_on() -> None:
     assert refused(aircraft.merge(said(10, alt=600))) is Reason.DUPLICATE
 
 
-def test_what_is_older_for_certain_is_out_of_order() -> None:
+def test_certainly_older_message_is_out_of_order() -> None:
     aircraft = Aircraft()
     report(aircraft.merge(said(10, HERE, alt=500, tslc=2)))
     older = aircraft.merge(said(11, THERE, alt=480, tslc=4, relay=6))
@@ -322,7 +322,7 @@ def test_what_is_older_for_certain_is_out_of_order() -> None:
     assert refused(aircraft.merge(said(11.002, THERE, alt=480, tslc=5))) is Reason.OUT_OF_ORDER
 
 
-def test_reports_within_the_slack_do_not_walk_back() -> None:
+def test_reports_within_the_slack_do_not_move_the_newest_back() -> None:
     """Each is half a second older than the previous one; all are compared with the newest."""
     aircraft = Aircraft()
     report(aircraft.merge(said(10, (47.4, 8.5), alt=500)))
@@ -330,7 +330,7 @@ def test_reports_within_the_slack_do_not_walk_back() -> None:
     assert refused(aircraft.merge(said(11, (47.6, 8.5), alt=500, tslc=2))) is Reason.OUT_OF_ORDER
 
 
-def test_relays_newest_first() -> None:
+def test_relays_are_listed_newest_first() -> None:
     aircraft = Aircraft()
     assert aircraft.relays(UAV) == ()
     aircraft.merge(said(0, relay=1, alt=500))
@@ -347,7 +347,7 @@ def test_relays_newest_first() -> None:
 # --- expiry -------------------------------------------------------------------------------------
 
 
-def test_without_news_for_two_minutes_it_is_forgotten() -> None:
+def test_aircraft_is_forgotten_after_two_minutes() -> None:
     aircraft = Aircraft()
     aircraft.merge(said(0, alt=500, callsign="EIN123"))
     for t_s in (30, 60, 90, 119):
@@ -362,7 +362,7 @@ def test_without_news_for_two_minutes_it_is_forgotten() -> None:
 
 
 @pytest.mark.parametrize("tslc", [120, 255])
-def test_what_was_last_heard_so_long_ago_is_no_news(tslc: int) -> None:
+def test_message_older_than_two_minutes_is_out_of_order(tslc: int) -> None:
     aircraft = Aircraft()
     assert refused(aircraft.merge(said(0, alt=500, tslc=tslc))) is Reason.OUT_OF_ORDER
     assert aircraft.relays(UAV) == ()
@@ -370,7 +370,7 @@ def test_what_was_last_heard_so_long_ago_is_no_news(tslc: int) -> None:
     assert refused(aircraft.merge(said(1, None, alt=600, tslc=tslc))) is Reason.OUT_OF_ORDER
 
 
-def test_any_number_of_aircraft_takes_so_much_memory() -> None:
+def test_number_of_aircraft_is_bounded() -> None:
     """The least recently updated is evicted; one with updates stays."""
     aircraft = Aircraft()
     first = said(0, alt=500, icao=1)
@@ -394,7 +394,7 @@ def test_any_number_of_aircraft_takes_so_much_memory() -> None:
     assert known == [1, *range(3 * AIRCRAFT_MAX + 1, 4 * AIRCRAFT_MAX)]
 
 
-def test_one_aircraft_takes_so_much_memory() -> None:
+def test_memory_per_aircraft_is_bounded() -> None:
     aircraft = Aircraft()
     template = said(0, alt=500)
     for n in range(200):
@@ -524,9 +524,7 @@ MESSAGES = st.fixed_dictionaries(
 @pytest.mark.full
 @settings(max_examples=examples(400), deadline=None)
 @given(st.lists(st.tuples(STEPS, MESSAGES), max_size=30))
-def test_every_answer_is_what_all_messages_together_say(
-    flow: list[tuple[float, dict[str, object]]],
-) -> None:
+def test_merging_matches_the_brute_force_model(flow: list[tuple[float, dict[str, object]]]) -> None:
     aircraft, models = Aircraft(), {1: Model(), 2: Model()}
     t_s = 0.0
     for step_s, words in flow:
@@ -566,7 +564,7 @@ def merged(log: bytes) -> tuple[list[Report], Counter[Reason], int]:
     return reports, lost, count
 
 
-def test_an_airliner(shared_log: Callable[[str], bytes]) -> None:
+def test_airliner_recording_is_merged(shared_log: Callable[[str], bytes]) -> None:
     """Every message is new at airliner speed."""
     reports, lost, count = merged(shared_log("adsb_pymodes_real.tlog"))
     assert (len(reports) + lost.total(), count) == (933, 933)
@@ -575,7 +573,7 @@ def test_an_airliner(shared_log: Callable[[str], bytes]) -> None:
     assert all(found.alt_age_s == 0.0 and found.velocity_ne_mps for found in reports)
 
 
-def test_simulated_traffic(cut_log: bytes) -> None:
+def test_simulated_traffic_is_merged(cut_log: bytes) -> None:
     reports, lost, count = merged(cut_log)
     assert len(reports) + lost.total() == count == 125
     assert len(reports) > 50
@@ -584,7 +582,7 @@ def test_simulated_traffic(cut_log: bytes) -> None:
         assert all(a != b for a, b in pairwise(own))
 
 
-def test_a_second_relay_of_the_same_changes_nothing(cut_log: bytes) -> None:
+def test_second_relay_does_not_change_the_reports(cut_log: bytes) -> None:
     aircraft, reports = Aircraft(), []
     for event in read_tlog(cut_log, "x"):
         if isinstance(event, Frame) and event.msgid == ADSB_VEHICLE:

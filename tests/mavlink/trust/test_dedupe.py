@@ -43,14 +43,14 @@ def test_the_same_report_over_two_links_counts_once() -> None:
     assert answers == [False, True] * 50
 
 
-def test_a_link_that_lags_behind_another() -> None:
+def test_reports_of_a_lagging_link_are_duplicates() -> None:
     dedupe = Dedupe()
     reports = [sent(EPOCH_NS + n * S, boot_ms=n * 1000) for n in range(25)]
     assert not any(dedupe.is_repeat(frame) for frame in reports)
     assert all(dedupe.is_repeat(f._replace(t_ns=f.t_ns + 25 * S, link="b")) for f in reports)
 
 
-def test_twice_over_one_link_counts_once_and_so_do_three_times() -> None:
+def test_report_repeated_on_one_link_counts_once() -> None:
     dedupe = Dedupe()
     assert [dedupe.is_repeat(sent(EPOCH_NS + n, seq=n)) for n in range(3)] == [False, True, True]
 
@@ -66,7 +66,7 @@ def test_twice_over_one_link_counts_once_and_so_do_three_times() -> None:
     ],
     ids=["boot time", "content", "system", "component", "message"],
 )
-def test_two_reports_are_two(other: Frame) -> None:
+def test_different_reports_are_not_duplicates(other: Frame) -> None:
     dedupe = Dedupe()
     assert not dedupe.is_repeat(sent())
     assert not dedupe.is_repeat(other)
@@ -82,7 +82,7 @@ def test_the_same_report_in_both_versions_counts_once(hdg: int) -> None:
     assert dedupe.is_repeat(sent(link="b", hdg=hdg, v1=True))
 
 
-def test_the_window() -> None:
+def test_duplicate_window_starts_at_the_first_copy() -> None:
     """Counted from the first copy, so that a report repeated forever is accepted again."""
     dedupe = Dedupe()
     assert not dedupe.is_repeat(sent(EPOCH_NS))
@@ -94,7 +94,7 @@ def test_the_window() -> None:
     assert not dedupe.is_repeat(sent(EPOCH_NS + 2 * WINDOW_NS + 2))
 
 
-def test_memory_is_that_of_one_window() -> None:
+def test_memory_is_bounded_by_the_window() -> None:
     dedupe = Dedupe()
     sizes = []
     per_window = WINDOW_NS * 20 // S
@@ -110,7 +110,7 @@ def test_memory_is_that_of_one_window() -> None:
     assert sizes[1] < 1.2 * sizes[0]
 
 
-def test_links_without_end_are_not_all_counted() -> None:
+def test_number_of_counted_links_is_bounded() -> None:
     dedupe = Dedupe()
     for number in range(LINKS_MAX + 100):
         assert not dedupe.is_repeat(sent(link=f"udp:{number}", boot_ms=number))
@@ -120,7 +120,7 @@ def test_links_without_end_are_not_all_counted() -> None:
     assert dedupe.shares["udp:0"].repeats == 1
 
 
-def test_which_link_was_first_and_how_late_each_is() -> None:
+def test_first_link_and_link_latencies_are_counted() -> None:
     """Link b delivers everything of a 40 ms later, and every tenth frame that a lost."""
     dedupe = Dedupe()
     for n in range(100):
@@ -136,7 +136,7 @@ def test_which_link_was_first_and_how_late_each_is() -> None:
     assert list(b.latencies_s) == pytest.approx([0.14] * 100)
 
 
-def test_a_latency_that_is_not_known_is_not_made_up() -> None:
+def test_unknown_latency_is_not_recorded() -> None:
     dedupe = Dedupe()
     assert not dedupe.is_repeat(sent(EPOCH_NS))
     assert dedupe.is_repeat(sent(EPOCH_NS + S))

@@ -91,7 +91,7 @@ def beside(metres: float) -> Callable[[float], Place]:
 # --- one vehicle ----------------------------------------------------------------------------------
 
 
-def test_the_same_reports_over_two_routes_are_of_one(delays: random.Random) -> None:
+def test_same_reports_over_two_routes_are_one_vehicle(delays: random.Random) -> None:
     judge = DuplicateIds()
     slow = heard(OTHER, 10, delay_s=lambda: 0.3 + 2 * delays.random())
     assert refused(judge, heard(HOME, 10), slow) == {HOME: [], OTHER: []}
@@ -104,19 +104,19 @@ def delays() -> random.Random:
 
 
 @pytest.mark.parametrize("hz", [1, 2.5, 10, 50])
-def test_a_second_port_has_stamps_of_its_own(hz: float) -> None:
+def test_second_port_with_own_stamps_is_one_vehicle(hz: float) -> None:
     judge = DuplicateIds()
     found = refused(judge, heard(HOME, 4, begins_s=0.01), heard(OTHER, hz, begins_s=0.137))
     assert found == {HOME: [], OTHER: []}
 
 
-def test_a_radio_that_starts_again_has_another_address() -> None:
+def test_restarted_radio_with_new_address_is_one_vehicle() -> None:
     judge = DuplicateIds()
     found = refused(judge, heard(HOME, 10, lasts_s=20), heard(OTHER, 10, lasts_s=60, begins_s=20.1))
     assert found == {HOME: [], OTHER: []}
 
 
-def test_a_position_that_is_reset_now_and_then_is_no_second_vehicle() -> None:
+def test_position_resets_are_not_a_duplicate_id() -> None:
     def glitches(t_s: float) -> Place:
         return beside(30.0 if t_s % 20 > 10 else 0.0)(t_s)
 
@@ -125,7 +125,7 @@ def test_a_position_that_is_reset_now_and_then_is_no_second_vehicle() -> None:
     assert refused(judge, *both) == {HOME: [], OTHER: []}
 
 
-def test_a_restart_is_no_second_vehicle() -> None:
+def test_restart_is_not_a_duplicate_id() -> None:
     def again(stream: Stream) -> Stream:
         return ((at + 61, boot - 99, peer, beside(500)(at)) for at, boot, peer, _ in stream)
 
@@ -140,7 +140,9 @@ def test_a_restart_is_no_second_vehicle() -> None:
 
 @pytest.mark.parametrize("forged_hz", [1, 4, 20])
 @pytest.mark.parametrize("metres", [8.0, -8.0, 30.0])
-def test_who_copies_the_clock_and_stays_near_is_found(forged_hz: float, metres: float) -> None:
+def test_duplicate_with_copied_clock_and_nearby_path_is_detected(
+    forged_hz: float, metres: float
+) -> None:
     judge = DuplicateIds()
     forged = heard(OTHER, forged_hz, begins_s=10.03, told=beside(metres))
     found = refused(judge, heard(HOME, 4), forged)
@@ -150,7 +152,7 @@ def test_who_copies_the_clock_and_stays_near_is_found(forged_hz: float, metres: 
     assert judge.found == [("1:1", (HOME, OTHER))]
 
 
-def test_a_velocity_that_is_none_is_found_too() -> None:
+def test_duplicate_with_inconsistent_velocity_is_detected() -> None:
     def drifts(t_s: float) -> Place:
         return circle(t_s)._replace(east_mps=circle(t_s).east_mps + 10)
 
@@ -158,7 +160,7 @@ def test_a_velocity_that_is_none_is_found_too() -> None:
     assert refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=drifts))[OTHER]
 
 
-def test_stamps_ahead_and_stamps_behind_are_held_against_the_path() -> None:
+def test_early_and_late_stamps_are_compared_with_the_path() -> None:
     for delay_s in (0.0, 1.5):
         judge = DuplicateIds()
         late = heard(OTHER, 5, told=beside(10), delay_s=lambda by_s=delay_s: by_s)
@@ -166,20 +168,20 @@ def test_stamps_ahead_and_stamps_behind_are_held_against_the_path() -> None:
 
 
 @pytest.mark.parametrize("named", [HOME, "10.0.0.1"])
-def test_a_named_router_is_believed_and_the_other_is_not(named: str) -> None:
+def test_configured_router_is_trusted_over_the_other_peer(named: str) -> None:
     judge = DuplicateIds([named])
     found = refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=beside(20)))
     assert found[HOME] == []
     assert len(found[OTHER]) > 150
 
 
-def test_of_a_named_link_all_are_believed() -> None:
+def test_all_peers_of_a_configured_link_are_trusted() -> None:
     judge = DuplicateIds([LINK])
     found = refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=beside(20)))
     assert found == {HOME: [], OTHER: []}
 
 
-def test_who_agree_again_are_believed_again_and_a_second_time_is_told() -> None:
+def test_agreeing_peers_are_trusted_again_and_a_new_conflict_is_reported() -> None:
     def two_visits(t_s: float) -> bool:
         return 10 < t_s < 20 or 60 < t_s < 70
 
@@ -193,7 +195,7 @@ def test_who_agree_again_are_believed_again_and_a_second_time_is_told() -> None:
 # --- bounds ---------------------------------------------------------------------------------------
 
 
-def test_ids_and_addresses_without_end_take_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_invented_ids_and_addresses_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(duplicate_ids, "SENDERS_MAX", 8)
     judge = DuplicateIds()
     for number in range(200):
@@ -213,7 +215,7 @@ def test_ids_and_addresses_without_end_take_no_memory(monkeypatch: pytest.Monkey
     boot_ms=st.integers(-1, 41),
     later_ms=st.integers(0, 20),
 )
-def test_what_is_held_against_what_is_found_from_the_newest_on(
+def test_path_search_from_the_newest_matches_a_full_search(
     stamps: set[int], boot_ms: int, later_ms: int
 ) -> None:
     """A report lies near the end of a path; searching backwards from there gives the same

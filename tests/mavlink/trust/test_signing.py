@@ -93,7 +93,7 @@ def stamp_of(raw: bytes) -> int:
 
 
 @pytest.mark.parametrize("link_id", [0, 1, 255])
-def test_what_pymavlink_signs_is_taken(link_id: int) -> None:
+def test_frames_signed_by_pymavlink_are_accepted(link_id: int) -> None:
     mav, ours = vehicle(KEY, NOW, link_id), guard()
     for boot_ms in range(300):
         raw = bytes(position(boot_ms).pack(mav))  # type: ignore[attr-defined]
@@ -101,7 +101,7 @@ def test_what_pymavlink_signs_is_taken(link_id: int) -> None:
     assert ours.state(NOW_NS).streams == {(1, 1, link_id): (NOW + 299, 299)}
 
 
-def test_what_we_sign_is_what_pymavlink_signs() -> None:
+def test_signatures_match_pymavlink() -> None:
     """Byte-identical for each message of the service, and accepted by pymavlink's parser."""
     listener = vehicle(KEY, NOW)
     ours = guard(link_id=3)
@@ -124,7 +124,7 @@ def test_what_we_sign_is_what_pymavlink_signs() -> None:
     assert listener.signing.goodsig_count == len(messages)
 
 
-def test_another_key_is_refused_at_both_ends() -> None:
+def test_wrong_key_is_rejected_at_both_ends() -> None:
     raw = bytes(position().pack(vehicle(OTHER_KEY, NOW)))  # type: ignore[attr-defined]
     assert guard().refusal(framed(raw)) is Reason.BAD_SIGNATURE
     assert guard(key=OTHER_KEY).refusal(framed(raw)) is None
@@ -135,7 +135,7 @@ def test_another_key_is_refused_at_both_ends() -> None:
 
 
 @pytest.mark.parametrize("allow_unsigned", [False, True])
-def test_a_flipped_bit_anywhere(allow_unsigned: bool) -> None:
+def test_any_flipped_bit_is_rejected(allow_unsigned: bool) -> None:
     good = sent(NOW).raw
     ours = guard(allow_unsigned=allow_unsigned)
     before = ours.state(NOW_NS)
@@ -167,7 +167,7 @@ def unsigned(*, v1: bool, seq: int = 0) -> Frame:
 
 
 @pytest.mark.parametrize("v1", [False, True])
-def test_unsigned_frames_are_refused_whatever_came_before(v1: bool) -> None:
+def test_unsigned_frames_are_always_rejected(v1: bool) -> None:
     """pymavlink's mavutil creates a new parser on the first MAVLink 2 byte after MAVLink 1, and
     that one has no key."""
     ours = guard()
@@ -181,7 +181,7 @@ def test_unsigned_frames_are_refused_whatever_came_before(v1: bool) -> None:
 
 
 @pytest.mark.parametrize("v1", [False, True])
-def test_allowed_unsigned_frames_pass_but_never_a_wrong_signature(v1: bool) -> None:
+def test_allowing_unsigned_frames_still_rejects_wrong_signatures(v1: bool) -> None:
     ours = guard(allow_unsigned=True)
     for n in range(3):
         before = ours.state(NOW_NS)
@@ -192,7 +192,7 @@ def test_allowed_unsigned_frames_pass_but_never_a_wrong_signature(v1: bool) -> N
         assert ours.refusal(sent(NOW + n)) is Reason.REPLAYED
 
 
-def test_nobody_changes_the_key_over_the_air() -> None:
+def test_setup_signing_does_not_change_the_key() -> None:
     ours, mav = guard(), vehicle(KEY, NOW)
     setup = dialect.MAVLink_setup_signing_message(*OURS, list(OTHER_KEY), NOW + 9)
     plain = bytes(setup.pack(vehicle(None, 0)))
@@ -202,7 +202,7 @@ def test_nobody_changes_the_key_over_the_air() -> None:
     assert ours.refusal(sent(NOW + 10)) is None
 
 
-def test_a_refused_frame_moves_nothing() -> None:
+def test_rejected_frame_does_not_change_timestamps() -> None:
     """A sender without the key must not block a stream. pymavlink stores the timestamp before it
     checks the signature, and then rejects every frame of that sender."""
     ours = guard()
@@ -219,14 +219,14 @@ def test_a_refused_frame_moves_nothing() -> None:
 # --- timestamps ---------------------------------------------------------------------------------
 
 
-def test_a_newcomer_is_at_most_a_minute_behind_the_own_clock() -> None:
+def test_new_stream_may_be_at_most_one_minute_behind_own_clock() -> None:
     ours = guard()
     assert ours.refusal(sent(NOW - 60 * UNITS - 1)) is Reason.REPLAYED
     assert ours.refusal(sent(NOW - 60 * UNITS)) is None
     assert ours.refusal(sent(NOW - 60 * UNITS)) is Reason.REPLAYED
 
 
-def test_a_newcomer_is_at_most_a_minute_behind_what_was_taken() -> None:
+def test_new_stream_may_be_at_most_one_minute_behind_accepted_frames() -> None:
     ours = guard()
     assert ours.refusal(sent(NOW + 100 * UNITS)) is None
     newcomer = (1, 1, 1)  # the same sender over another link id
@@ -234,7 +234,7 @@ def test_a_newcomer_is_at_most_a_minute_behind_what_was_taken() -> None:
     assert ours.refusal(sent(NOW + 40 * UNITS, stream=newcomer)) is None
 
 
-def test_known_streams_go_on_by_their_own_clocks() -> None:
+def test_known_streams_follow_their_own_clocks() -> None:
     ours = guard()
     slow, fast, right = (1, 1, 0), (2, 1, 0), (3, 1, 0)
     assert ours.refusal(sent(NOW - 59 * UNITS, stream=slow)) is None
@@ -247,7 +247,7 @@ def test_known_streams_go_on_by_their_own_clocks() -> None:
     assert guard().ahead_ns(NOW_NS) == 0
 
 
-def test_a_wrong_clock_shuts_out_newcomers_until_they_hear_us() -> None:
+def test_clock_ahead_blocks_new_streams_until_they_receive_our_frames() -> None:
     ours = guard()
     assert ours.refusal(sent(NOW + 3600 * UNITS, stream=(2, 1, 0))) is None
     newcomer = vehicle(KEY, NOW, sysid=7)
@@ -261,14 +261,14 @@ def test_a_wrong_clock_shuts_out_newcomers_until_they_hear_us() -> None:
     assert ours.refusal(report()) is None
 
 
-def test_each_link_takes_the_same_frame_once() -> None:
+def test_each_link_accepts_the_same_frame_once() -> None:
     a, b = guard(link_id=0), guard(link_id=1)
     for n in range(3):
         assert [link.refusal(sent(NOW + n)) for link in (a, b)] == [None, None]
         assert [link.refusal(sent(NOW + n)) for link in (a, b)] == [Reason.REPLAYED] * 2
 
 
-def test_our_own_frames_do_not_come_back() -> None:
+def test_own_signed_frames_are_rejected_as_replayed() -> None:
     ours = guard(link_id=3)
     signed = ours.sign(encode.pack(encode.heartbeat(OURS), 0), NOW_NS)
     assert guard().refusal(framed(signed)) is None
@@ -279,7 +279,7 @@ def test_our_own_frames_do_not_come_back() -> None:
 
 
 @given(st.lists(st.integers(-3 * S, 3 * S) | st.just(0), min_size=1, max_size=60))
-def test_timestamps_increase_and_are_never_behind_the_clock(steps_ns: list[int]) -> None:
+def test_own_timestamps_increase_and_keep_up_with_the_clock(steps_ns: list[int]) -> None:
     ours, now_ns, stamps = guard(), NOW_NS, [-1]
     raw = encode.pack(encode.heartbeat(OURS), 0)
     for step_ns in steps_ns:
@@ -288,20 +288,20 @@ def test_timestamps_increase_and_are_never_behind_the_clock(steps_ns: list[int])
         assert stamps[-1] == max(units(now_ns), stamps[-2] + 1)
 
 
-def test_our_timestamps_follow_what_is_taken() -> None:
+def test_own_timestamps_follow_accepted_frames() -> None:
     ours, raw = guard(), encode.pack(encode.heartbeat(OURS), 0)
     assert ours.refusal(sent(NOW + 5 * UNITS)) is None
     assert stamp_of(ours.sign(raw, NOW_NS)) == NOW + 5 * UNITS + 1
 
 
-def test_a_clock_before_2015() -> None:
+def test_clock_before_2015_gives_increasing_timestamps() -> None:
     ours, raw = guard(), encode.pack(encode.heartbeat(OURS), 0)
     assert [stamp_of(ours.sign(raw, 0)) for _ in range(3)] == [1, 2, 3]
     assert ours.refusal(sent(NOW, t_ns=0)) is None
     assert stamp_of(ours.sign(raw, 0)) == NOW + 1
 
 
-def test_no_timestamp_leaves_none_for_others() -> None:
+def test_highest_timestamp_does_not_exhaust_own_timestamps() -> None:
     ours, raw = guard(), encode.pack(encode.heartbeat(OURS), 0)
     assert ours.refusal(sent(LATEST)) is None
     assert ours.refusal(sent(LATEST)) is Reason.REPLAYED
@@ -312,7 +312,7 @@ def test_no_timestamp_leaves_none_for_others() -> None:
     assert again.refusal(sent(LATEST)) is Reason.REPLAYED
 
 
-def test_only_an_unsigned_frame_of_version_2_can_be_signed() -> None:
+def test_only_unsigned_mavlink_2_frames_can_be_signed() -> None:
     ours, message = guard(), encode.heartbeat(OURS)
     for raw in (encode.pack(message, 0, 1), ours.sign(encode.pack(message, 0), NOW_NS)):
         with pytest.raises(ValueError, match="unsigned MAVLink 2"):
@@ -328,12 +328,12 @@ def test_only_an_unsigned_frame_of_version_2_can_be_signed() -> None:
         ({"link_id": -1}, "is -1, allowed: 0 to 255"),
     ],
 )
-def test_what_a_guard_is_made_of(changes: dict[str, object], said: str) -> None:
+def test_invalid_guard_arguments_are_rejected(changes: dict[str, object], said: str) -> None:
     with pytest.raises(ValueError, match=said):
         guard(**changes)
 
 
-def test_a_fingerprint_tells_keys_apart_and_does_not_give_them_away() -> None:
+def test_fingerprint_identifies_a_key_without_revealing_it() -> None:
     assert fingerprint(KEY) == hashlib.sha256(hashlib.sha256(KEY).digest()).hexdigest()[:8]
     assert fingerprint(KEY) != fingerprint(OTHER_KEY)
 
@@ -341,7 +341,7 @@ def test_a_fingerprint_tells_keys_apart_and_does_not_give_them_away() -> None:
 # --- memory -------------------------------------------------------------------------------------
 
 
-def test_memory_is_bounded_and_what_is_forgotten_stays_refused() -> None:
+def test_evicted_streams_stay_rejected() -> None:
     ours, more = guard(), 20
     frames = [sent(NOW + n, stream=(1 + n % 250, 1, n // 250)) for n in range(STREAMS_MAX + more)]
     assert all(ours.refusal(frame) is None for frame in frames)
@@ -372,7 +372,7 @@ SEQUENCES = st.lists(
 
 @settings(max_examples=examples(300))
 @given(SEQUENCES)
-def test_sequences_by_brute_force(sequence: list[tuple]) -> None:  # type: ignore[type-arg]
+def test_timestamp_rules_match_brute_force(sequence: list[tuple]) -> None:  # type: ignore[type-arg]
     ours, now_ns = guard(), NOW_NS
     taken: list[tuple[tuple[int, int, int], int]] = []
     our_stamps = [-1]
@@ -473,7 +473,7 @@ LIVES = st.lists(
 
 @settings(max_examples=examples(400), deadline=None)
 @given(LIVES, st.integers(0, 2))
-def test_nothing_is_taken_twice_and_no_timestamp_sent_twice(
+def test_crashes_accept_no_frame_twice_and_reuse_no_timestamp(
     life: list[tuple[Callable[..., object], ...]], write_s: int
 ) -> None:
     run = Run(write_s)
@@ -485,7 +485,7 @@ def test_nothing_is_taken_twice_and_no_timestamp_sent_twice(
     assert [run.hear(stream, 0) for stream in KNOWN] == [None] * len(KNOWN)
 
 
-def test_in_order_a_link_goes_on_where_it_ended() -> None:
+def test_clean_restart_continues_where_it_ended() -> None:
     run = Run(0)
     assert [run.hear(stream, 0) for stream in KNOWN] == [None] * 3
     run.stop(0)
@@ -494,7 +494,7 @@ def test_in_order_a_link_goes_on_where_it_ended() -> None:
 
 
 @pytest.mark.parametrize("silent_s", [1, 10, 3600])
-def test_a_stream_that_was_silent_and_is_heard_in_the_last_second(silent_s: int) -> None:
+def test_crash_after_a_silent_stream_resumed(silent_s: int) -> None:
     run = Run(0)
     run.wait(silent_s * 1000 + 500)
     assert run.hear((1, 1, 0), 0) is None
@@ -503,7 +503,7 @@ def test_a_stream_that_was_silent_and_is_heard_in_the_last_second(silent_s: int)
     assert run.hear((1, 1, 0), 0) is None
 
 
-def test_our_frames_of_the_last_second_that_followed_a_clock_ahead() -> None:
+def test_crash_after_own_timestamps_followed_a_clock_ahead() -> None:
     run = Run(0)
     run.wait(60_500)
     assert run.hear((3, 1, 0), 0) is None  # ahead, after a minute of silence
@@ -512,7 +512,7 @@ def test_our_frames_of_the_last_second_that_followed_a_clock_ahead() -> None:
     run.send()
 
 
-def test_a_burst_of_our_own_in_the_last_second() -> None:
+def test_crash_after_a_burst_of_own_frames() -> None:
     """After a crash own timestamps are ahead of the clock, and each frame takes one unit."""
     run = Run(0)
     for _ in range(3):
@@ -523,7 +523,7 @@ def test_a_burst_of_our_own_in_the_last_second() -> None:
 
 
 @pytest.mark.parametrize("crashed", [False, True])
-def test_a_clock_that_stands_a_day_back_at_the_next_start(crashed: bool) -> None:
+def test_clock_set_back_a_day_uses_the_stored_timestamp(crashed: bool) -> None:
     """A small computer without a clock battery: the stored timestamp is used."""
     first = guard()
     assert first.refusal(sent(NOW + 1)) is None
@@ -540,7 +540,7 @@ def test_a_clock_that_stands_a_day_back_at_the_next_start(crashed: bool) -> None
     assert ours.refusal(sent(fresh, stream=(2, 1, 0), t_ns=back_ns)) is None
 
 
-def test_the_own_clock_counts_for_the_next_run() -> None:
+def test_own_clock_is_kept_for_the_next_run() -> None:
     """Without any received or sent frame."""
     ours = guard(state=guard().state(NOW_NS))
     back_ns = NOW_NS - 86_400 * S
@@ -549,7 +549,7 @@ def test_the_own_clock_counts_for_the_next_run() -> None:
 
 
 @pytest.mark.parametrize("ahead_s", [0, 7200])
-def test_crash_after_crash_does_not_add_up(ahead_s: int) -> None:
+def test_repeated_crashes_do_not_accumulate_offset(ahead_s: int) -> None:
     """Neither for own timestamps, which may follow a clock ahead, nor for others."""
     run = Run(0)
     if not ahead_s:

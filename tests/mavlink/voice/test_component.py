@@ -102,12 +102,12 @@ def request(node: ServiceComponent, now_ns: int) -> int:
         ({"attitude_hz": 101.0}, "attitude_hz is 101.0"),
     ],
 )
-def test_what_makes_no_sense_is_refused(changed: dict[str, Any], why: str) -> None:
+def test_invalid_component_settings_are_rejected(changed: dict[str, Any], why: str) -> None:
     with pytest.raises(ValueError, match=why):
         component(**changed)
 
 
-def test_what_makes_sense() -> None:
+def test_valid_component_settings_are_accepted() -> None:
     for sysid, compid in ((1, 191), (254, 255), (5, 2)):
         component(source=Source(sysid, compid), carrier=CARRIER, position_hz=0.1, attitude_hz=100.0)
 
@@ -125,7 +125,7 @@ def beats(node: ServiceComponent, times: Iterator[int], fit: bool = True) -> lis
     return found
 
 
-def test_a_heartbeat_is_that_of_an_onboard_controller() -> None:
+def test_heartbeat_announces_an_onboard_controller() -> None:
     sent = component().due(EPOCH_NS, True, [])
     (beat,) = (m for m, _ in sent if m.msgid == HEARTBEAT)
     (message,) = dialect.MAVLink(None).parse_buffer(pack(beat, 0))
@@ -135,7 +135,7 @@ def test_a_heartbeat_is_that_of_an_onboard_controller() -> None:
     assert message.system_status == dialect.MAV_STATE_ACTIVE
 
 
-def test_once_a_second_and_only_while_fit() -> None:
+def test_heartbeat_is_sent_each_second_only_while_fit() -> None:
     node = component()
     assert beats(node, ticks(EPOCH_NS, 10)) == [EPOCH_NS + n * S for n in range(10)]
     assert beats(node, ticks(EPOCH_NS + 10 * S, 10), fit=False) == []
@@ -143,7 +143,7 @@ def test_once_a_second_and_only_while_fit() -> None:
     assert beats(node, ticks(again, 2)) == [again, again + S]
 
 
-def test_a_stall_is_not_caught_up_with() -> None:
+def test_missed_heartbeats_are_not_sent_later() -> None:
     node = component()
     assert beats(node, iter([EPOCH_NS, EPOCH_NS + 60 * S, EPOCH_NS + 60 * S + 100 * MS])) == [
         EPOCH_NS,
@@ -153,7 +153,9 @@ def test_a_stall_is_not_caught_up_with() -> None:
 
 @settings(max_examples=examples(100), deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3000), st.booleans()), max_size=60))
-def test_never_while_unfit_and_never_closer_than_a_second(steps: list[tuple[int, bool]]) -> None:
+def test_heartbeats_are_at_least_a_second_apart_and_only_while_fit(
+    steps: list[tuple[int, bool]],
+) -> None:
     """Always with its own id, and at once if a second has passed."""
     node, now_ns, last_ns = component(), EPOCH_NS, 0
     for gap_ms, fit in steps:
@@ -168,7 +170,7 @@ def test_never_while_unfit_and_never_closer_than_a_second(steps: list[tuple[int,
 # --- timesync -----------------------------------------------------------------------------------
 
 
-def test_requests_go_to_everybody_often_at_first_fit_or_not() -> None:
+def test_timesync_requests_are_frequent_at_first_and_unconditional() -> None:
     node, times, stamps = component(), [], []
     for t_ns in ticks(EPOCH_NS, 60):
         for message, to in node.due(t_ns, False, []):
@@ -185,7 +187,7 @@ def test_requests_go_to_everybody_often_at_first_fit_or_not() -> None:
 
 
 @pytest.mark.parametrize("trip_ms", [0, 3, 400, 9_999])
-def test_an_answer_is_a_round_trip_of_any_length(trip_ms: int) -> None:
+def test_timesync_answer_becomes_a_round_trip(trip_ms: int) -> None:
     node = component()
     sent_ns = request(node, EPOCH_NS)
     t_ns = EPOCH_NS + trip_ms * MS
@@ -196,7 +198,7 @@ def test_an_answer_is_a_round_trip_of_any_length(trip_ms: int) -> None:
     ]
 
 
-def test_one_that_took_too_long_is_rejected_and_later_unknown() -> None:
+def test_overdue_timesync_answer_is_rejected_then_ignored() -> None:
     node = component()
     sent_ns = request(node, EPOCH_NS)
     for late_s, reasons in ((10.001, [Reason.OUT_OF_ORDER]), (29.0, [Reason.OUT_OF_ORDER])):
@@ -210,7 +212,7 @@ def test_one_that_took_too_long_is_rejected_and_later_unknown() -> None:
     assert heard(node, answer(t_ns, sent_ns, t_ns - BOOT_NS)) == []
 
 
-def test_answers_to_others_and_requests_of_others_are_nothing() -> None:
+def test_foreign_timesync_messages_are_ignored() -> None:
     node = component()
     sent_ns = request(node, EPOCH_NS)
     t_ns = EPOCH_NS + 5 * MS
@@ -223,7 +225,7 @@ def test_answers_to_others_and_requests_of_others_are_nothing() -> None:
     assert len(heard(node, addressed(t_ns, sent_ns, t_ns - BOOT_NS, OURS))) == 1
 
 
-def test_the_first_of_two_answers_counts_and_each_source_has_its_own() -> None:
+def test_first_timesync_answer_of_each_source_is_used() -> None:
     node = component()
     sent_ns = request(node, EPOCH_NS)
     t_ns = EPOCH_NS + 5 * MS
@@ -241,9 +243,7 @@ def test_the_first_of_two_answers_counts_and_each_source_has_its_own() -> None:
 
 @pytest.mark.parametrize("forged_first", [False, True])
 @pytest.mark.parametrize("off_ms", [1000, -1000, 60])
-def test_of_two_answers_that_contradict_each_other_neither_is_used(
-    forged_first: bool, off_ms: int
-) -> None:
+def test_contradicting_timesync_answers_are_both_discarded(forged_first: bool, off_ms: int) -> None:
     """The true answer took 50 ms; the other comes from its own address, and neither is early."""
     node, said = component(), []
     for number in range(3):
@@ -262,7 +262,7 @@ def test_of_two_answers_that_contradict_each_other_neither_is_used(
     assert not [one for one in said if isinstance(one, RoundTrip)]
 
 
-def test_one_that_contradicts_long_after_is_refused_alone() -> None:
+def test_late_contradicting_answer_is_rejected_alone() -> None:
     node = component()
     node.hear(position(EPOCH_NS))
     sent_ns = request(node, EPOCH_NS)
@@ -288,7 +288,7 @@ def test_one_that_contradicts_long_after_is_refused_alone() -> None:
         (1000 * S + (1 << 32) * MS * 100, False),  # not an uptime
     ],
 )
-def test_only_the_clock_of_its_positions_counts(remote_ns: int, good: bool) -> None:
+def test_timesync_answer_must_match_the_position_clock(remote_ns: int, good: bool) -> None:
     node = component()
     sent_ns = request(node, EPOCH_NS)
     node.hear(position(EPOCH_NS))
@@ -300,7 +300,7 @@ def test_only_the_clock_of_its_positions_counts(remote_ns: int, good: bool) -> N
         assert isinstance(heard(node, good_one)[0], RoundTrip)  # that one was not used
 
 
-def test_the_stamp_is_taken_on_to_the_answer() -> None:
+def test_position_clock_is_extrapolated_to_the_answer() -> None:
     node = component()
     node.hear(position(EPOCH_NS))
     sent_ns = request(node, EPOCH_NS + 25 * S)
@@ -309,7 +309,7 @@ def test_the_stamp_is_taken_on_to_the_answer() -> None:
     assert isinstance(said, RoundTrip)
 
 
-def test_who_sends_no_position_has_no_clock_here() -> None:
+def test_source_without_positions_has_no_clock() -> None:
     """A ground station answers too, with Unix time."""
     node = component()
     sent_ns = request(node, EPOCH_NS)
@@ -321,7 +321,7 @@ def test_who_sends_no_position_has_no_clock_here() -> None:
     assert heard(node, answer(EPOCH_NS + 50 * S, sent_ns, 1050 * S, UAV)) == []
 
 
-def test_an_attitude_gives_the_clock_as_well() -> None:
+def test_attitude_stamp_also_gives_the_clock() -> None:
     node = component()
     sent_ns = request(node, EPOCH_NS)
     attitude = dialect.MAVLink_attitude_message(1_000_000, 0, 0, 0, 0, 0, 0)
@@ -338,7 +338,7 @@ def test_an_attitude_gives_the_clock_as_well() -> None:
         max_size=20,
     ),
 )
-def test_the_true_offset_is_in_every_round_trip(
+def test_every_round_trip_contains_the_true_offset(
     sub_ns: int, ways: list[tuple[int, int, int]]
 ) -> None:
     """For any latencies, over one link or two, and any actual sending time."""
@@ -360,7 +360,7 @@ def test_the_true_offset_is_in_every_round_trip(
         assert trip.sent_ns - trip.remote_ns <= BOOT_NS <= trip.t_ns - trip.remote_ns
 
 
-def test_round_trips_are_what_a_clock_needs() -> None:
+def test_round_trips_let_the_clock_measure_constant_delay() -> None:
     """Combined with ``SenderClock``: the constant part of the latency is measured."""
     node, clock, rng = component(), SenderClock(), random.Random(3)
     for t_ns in ticks(EPOCH_NS, 30):
@@ -384,7 +384,7 @@ def test_round_trips_are_what_a_clock_needs() -> None:
 # --- duplicate own id ---------------------------------------------------------------------------
 
 
-def test_someone_else_with_our_id_is_told_of_once_and_again_later() -> None:
+def test_duplicate_own_id_is_announced_every_five_minutes() -> None:
     node = component()
     node.due(EPOCH_NS, True, [])
     theirs = dialect.MAVLink_timesync_message(0, 77)
@@ -407,14 +407,14 @@ def test_someone_else_with_our_id_is_told_of_once_and_again_later() -> None:
         dialect.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0),
     ],
 )
-def test_anything_that_we_did_not_send(message: Any) -> None:
+def test_unknown_frame_with_own_id_is_announced(message: Any) -> None:
     node = component()
     node.due(EPOCH_NS, True, [])
     assert [type(x) for x in node.hear(frame(EPOCH_NS, OURS, message))] == [Notice]
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_our_own_frames_may_come_back(version: int) -> None:
+def test_echoed_own_frames_are_ignored(version: int) -> None:
     """A router forwards them with other sequence numbers, perhaps in the other version."""
     node = component(position_hz=5.0)
     node.due(EPOCH_NS, True, [UAV])
@@ -428,7 +428,7 @@ def test_our_own_frames_may_come_back(version: int) -> None:
     assert kinds == {HEARTBEAT, TIMESYNC, 76, 66}
 
 
-def test_a_heartbeat_like_ours_long_after_our_last_is_another_s() -> None:
+def test_heartbeat_long_after_our_last_is_foreign() -> None:
     node = component()
     (beat,) = (m for m, _ in node.due(EPOCH_NS, True, []) if m.msgid == HEARTBEAT)
     for t_ns in ticks(EPOCH_NS + S, 40):
@@ -450,7 +450,7 @@ def test_a_heartbeat_like_ours_long_after_our_last_is_another_s() -> None:
     st.integers(0, 255),
     st.booleans(),
 )
-def test_any_content_is_survived(msgid: int, payload: bytes, sysid: int, ours: bool) -> None:
+def test_component_survives_any_payload(msgid: int, payload: bytes, sysid: int, ours: bool) -> None:
     """Infinities, NaN, truncated fields and fields beyond the end."""
     node = component(position_hz=5.0, carrier=CARRIER, attitude_hz=5.0)
     node.due(EPOCH_NS, True, [UAV])
@@ -463,14 +463,14 @@ def test_any_content_is_survived(msgid: int, payload: bytes, sysid: int, ours: b
 
 @pytest.mark.parametrize("interval", [float("nan"), float("inf"), -0.0, 1e-30])
 @pytest.mark.parametrize("msgid", [33.0, float("nan"), float("inf"), 33.5])
-def test_any_number_in_a_command(msgid: float, interval: float) -> None:
+def test_component_ignores_any_command_value(msgid: float, interval: float) -> None:
     node = component(position_hz=5.0)
     command = dialect.MAVLink_command_long_message(*UAV, 511, 0, msgid, interval, 0, 0, 0, 0, 0)
     assert node.hear(frame(EPOCH_NS, GCS, command)) == []
 
 
 @pytest.mark.full
-def test_memory_does_not_grow() -> None:
+def test_component_memory_is_bounded() -> None:
     node, sizes = component(position_hz=5.0), []
     tracemalloc.start()
     try:

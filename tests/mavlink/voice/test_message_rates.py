@@ -191,7 +191,7 @@ def set_interval(hz: float, msgid: int = POSITION, target: Source = UAV) -> Any:
 # --- requests -----------------------------------------------------------------------------------
 
 
-def test_a_slow_uav_is_asked_once_and_obeys() -> None:
+def test_slow_uav_receives_one_rate_request() -> None:
     uav = Autopilot(hz=1.0)
     world = World(uav)
     world.run(60)
@@ -207,7 +207,7 @@ def test_a_slow_uav_is_asked_once_and_obeys() -> None:
 
 
 @pytest.mark.parametrize("hz", [4.1, 5.0, 10.0])
-def test_a_rate_that_is_high_enough_is_left_alone(hz: float) -> None:
+def test_sufficient_rate_is_not_requested(hz: float) -> None:
     world = World(Autopilot(hz=hz))
     world.run(60)
     assert not world.requests
@@ -215,13 +215,13 @@ def test_a_rate_that_is_high_enough_is_left_alone(hz: float) -> None:
     assert world.rate().observed_hz == pytest.approx(hz, rel=0.2)
 
 
-def test_the_limit_is_at_four_fifths() -> None:
+def test_request_threshold_is_four_fifths_of_the_wanted_rate() -> None:
     world = World(Autopilot(hz=3.6))
     world.run(30)
     assert len(world.requests) == 1
 
 
-def test_not_before_the_rate_is_known_and_slow_for_a_while() -> None:
+def test_request_waits_until_the_rate_is_known_and_slow() -> None:
     world = World(Autopilot(hz=1.0))
     world.run(4)
     assert not world.requests
@@ -230,7 +230,7 @@ def test_not_before_the_rate_is_known_and_slow_for_a_while() -> None:
     assert 5.0 <= (world.requests[0][0] - EPOCH_NS) / S <= 12.0
 
 
-def test_positions_of_all_and_attitude_of_the_carrier() -> None:
+def test_requests_cover_all_positions_and_the_carrier_attitude() -> None:
     world = World(Autopilot(), Autopilot(source=CARRIER), carrier=CARRIER, attitude_hz=10.0)
     world.run(60)
     asked = {
@@ -242,14 +242,14 @@ def test_positions_of_all_and_attitude_of_the_carrier() -> None:
     assert {(r.uav, r.msgid) for r in world.component.rates()} == asked
 
 
-def test_where_any_rate_will_do_nothing_is_asked() -> None:
+def test_no_rate_is_requested_when_none_is_configured() -> None:
     world = World(Autopilot(source=CARRIER, hz=0.3), carrier=CARRIER, position_hz=None)
     world.run(120)
     assert not world.requests
     assert not world.component.rates()
 
 
-def test_a_message_that_never_came_is_asked_for() -> None:
+def test_message_never_received_is_requested() -> None:
     """The carrier is known by its heartbeat."""
     carrier = Autopilot(source=CARRIER, hz=0.0)
     world = World(carrier, carrier=CARRIER, position_hz=None, attitude_hz=10.0)
@@ -263,7 +263,7 @@ def test_a_message_that_never_came_is_asked_for() -> None:
 # --- acknowledgements ---------------------------------------------------------------------------
 
 
-def test_what_is_lost_is_sent_again_and_says_so() -> None:
+def test_lost_request_is_resent_with_confirmation_count() -> None:
     uav = Autopilot(results=(None, None, dialect.MAV_RESULT_ACCEPTED))
     world = World(uav)
     world.run(60)
@@ -272,7 +272,7 @@ def test_what_is_lost_is_sent_again_and_says_so() -> None:
     assert world.rate().state is RateState.ACCEPTED
 
 
-def test_an_answer_that_is_lost_is_seen_by_the_rate() -> None:
+def test_lost_acknowledgement_is_inferred_from_the_rate() -> None:
     world = World(Autopilot(answers=False))
     world.run(60)
     assert world.rate().state is RateState.ACCEPTED
@@ -291,7 +291,9 @@ def test_an_answer_that_is_lost_is_seen_by_the_rate() -> None:
         ((dialect.MAV_RESULT_TEMPORARILY_REJECTED, dialect.MAV_RESULT_DENIED), 2),
     ],
 )
-def test_an_old_autopilot_knows_streams_only(results: tuple[int | None, ...], tries: int) -> None:
+def test_old_autopilot_falls_back_to_request_data_stream(
+    results: tuple[int | None, ...], tries: int
+) -> None:
     uav = Autopilot(results=results)
     world = World(uav, position_hz=4.5)
     world.run(80)
@@ -306,16 +308,14 @@ def test_an_old_autopilot_knows_streams_only(results: tuple[int | None, ...], tr
     assert not world.notices
 
 
-def test_the_stream_of_the_attitude() -> None:
+def test_attitude_uses_its_data_stream() -> None:
     carrier = Autopilot(source=CARRIER, results=(dialect.MAV_RESULT_UNSUPPORTED,))
     World(carrier, carrier=CARRIER, position_hz=None, attitude_hz=10.0).run(60)
     assert [m.req_stream_id for m in carrier.received[1:]] == [10]
 
 
 @pytest.mark.parametrize(("result", "tries"), [(dialect.MAV_RESULT_UNSUPPORTED, 1), (None, 3)])
-def test_an_autopilot_known_to_do_streams_is_asked_for_streams(
-    result: int | None, tries: int
-) -> None:
+def test_known_stream_autopilot_is_sent_stream_requests(result: int | None, tries: int) -> None:
     uav = Autopilot(results=(result,))
     world = World(uav)
     world.run(60)
@@ -326,7 +326,7 @@ def test_an_autopilot_known_to_do_streams_is_asked_for_streams(
     assert world.rate().observed_hz == pytest.approx(5.0)
 
 
-def test_in_progress_is_waited_for_but_not_for_ever() -> None:
+def test_in_progress_answer_has_a_timeout() -> None:
     results = (dialect.MAV_RESULT_IN_PROGRESS, dialect.MAV_RESULT_ACCEPTED)
     world = World(Autopilot(results=results))
     world.run(60)
@@ -339,7 +339,7 @@ def test_in_progress_is_waited_for_but_not_for_ever() -> None:
     assert 60.0 <= max(forever.gaps_s()) <= 70.0
 
 
-def test_one_that_refuses_both_is_asked_ever_less_often_and_told_of_once() -> None:
+def test_refusing_autopilot_is_asked_with_backoff_and_announced_once() -> None:
     world = World(Autopilot(results=(dialect.MAV_RESULT_DENIED,), streams=False))
     world.run(1500)
     gaps = world.gaps_s()
@@ -355,7 +355,7 @@ def test_one_that_refuses_both_is_asked_ever_less_often_and_told_of_once() -> No
     assert world.rate().asked == len(world.requests)
 
 
-def test_refused_is_seen_and_left_again() -> None:
+def test_refused_state_is_entered_and_left() -> None:
     uav = Autopilot(results=(dialect.MAV_RESULT_DENIED,), streams=False)
     world = World(uav)
     states = set()
@@ -368,7 +368,7 @@ def test_refused_is_seen_and_left_again() -> None:
     assert world.rate().state in (RateState.WATCHING, RateState.STREAMING)
 
 
-def test_one_that_agrees_and_does_nothing_is_not_flooded() -> None:
+def test_accepting_but_inactive_autopilot_is_asked_with_backoff() -> None:
     world = World(Autopilot(obeys=False))
     world.run(1800)
     assert len(world.requests) < 20
@@ -377,7 +377,7 @@ def test_one_that_agrees_and_does_nothing_is_not_flooded() -> None:
     assert world.rate().observed_hz == pytest.approx(1.0)
 
 
-def test_answers_to_others_are_not_ours() -> None:
+def test_acknowledgements_to_others_are_ignored() -> None:
     """An acknowledgement to another component, of another command or from another sender is
     ignored."""
     uav = Autopilot(results=(None,))
@@ -398,7 +398,7 @@ def test_answers_to_others_are_not_ours() -> None:
     assert uav.received[-1].get_type() == "REQUEST_DATA_STREAM"
 
 
-def test_one_command_at_a_time_for_a_uav() -> None:
+def test_commands_to_one_uav_are_sequential() -> None:
     """An acknowledgement does not name the message that it concerns."""
     carrier = Autopilot(source=CARRIER, results=(None,))
     world = World(carrier, carrier=CARRIER, attitude_hz=5.0)
@@ -414,7 +414,7 @@ def test_one_command_at_a_time_for_a_uav() -> None:
     assert other.hz == {POSITION: 5.0, ATTITUDE: 5.0}
 
 
-def test_an_answer_is_to_what_was_asked_last() -> None:
+def test_acknowledgement_applies_to_the_last_command() -> None:
     carrier = Autopilot(source=CARRIER, results=(None, dialect.MAV_RESULT_ACCEPTED))
     world = World(carrier, carrier=CARRIER, attitude_hz=5.0)
     while len(world.requests) < 2:
@@ -426,7 +426,7 @@ def test_an_answer_is_to_what_was_asked_last() -> None:
     assert world.rate(CARRIER, answered).state is RateState.ACCEPTED
 
 
-def test_one_that_is_no_longer_wanted_is_left_alone() -> None:
+def test_uav_no_longer_wanted_receives_no_requests() -> None:
     rates, uav = MessageRates(source=OURS, carrier=None, position_hz=5.0, attitude_hz=None), UAV
     for n in range(600):
         t_ns = EPOCH_NS + n * S // 10
@@ -451,7 +451,7 @@ def test_one_that_is_no_longer_wanted_is_left_alone() -> None:
         dialect.MAVLink_request_data_stream_message(*UAV, 6, 10, 0),
     ],
 )
-def test_who_changed_it_is_named_and_the_rate_asked_for_again(change: Any) -> None:
+def test_component_that_changed_the_rate_is_named(change: Any) -> None:
     world = World(Autopilot())
     world.run(40)
     world.say(change)
@@ -476,7 +476,7 @@ def test_who_changed_it_is_named_and_the_rate_asked_for_again(change: Any) -> No
         dialect.MAVLink_command_long_message(*UAV, 512, 0, 33, 1e6, 0, 0, 0, 0, 0),
     ],
 )
-def test_the_innocent_are_not_named(innocent: Any) -> None:
+def test_unrelated_components_are_not_named(innocent: Any) -> None:
     uav = Autopilot()
     world = World(uav)
     world.run(40)
@@ -490,7 +490,7 @@ def test_the_innocent_are_not_named(innocent: Any) -> None:
     assert world.rate().changed_by == "no request of another component was received"
 
 
-def test_one_who_asked_long_before_is_not_named() -> None:
+def test_old_request_is_not_named_as_cause() -> None:
     uav = Autopilot(hz=5.0)
     world = World(uav)
     world.run(30)
@@ -503,7 +503,7 @@ def test_one_who_asked_long_before_is_not_named() -> None:
     assert world.rate().changed_by == "no request of another component was received"
 
 
-def test_one_whom_we_have_overruled_is_not_named_for_the_next_change() -> None:
+def test_overridden_request_is_not_named_for_the_next_change() -> None:
     uav = Autopilot()
     world = World(uav)
     world.run(40)
@@ -517,7 +517,7 @@ def test_one_whom_we_have_overruled_is_not_named_for_the_next_change() -> None:
     assert world.rate().changed_by == "no request of another component was received"
 
 
-def test_order_that_is_broken_off_is_no_long_order() -> None:
+def test_fluctuating_rate_does_not_reset_the_backoff() -> None:
     """A rate that fluctuates by itself does not cause more requests."""
     uav = Autopilot(results=(None,), streams=False)
     world = World(uav)
@@ -529,7 +529,7 @@ def test_order_that_is_broken_off_is_no_long_order() -> None:
     assert len(world.requests) < 20
 
 
-def test_a_message_that_stops_is_seen_to() -> None:
+def test_stopped_message_is_requested() -> None:
     uav = Autopilot(hz=5.0, results=(None,), streams=False)
     world = World(uav)
     world.run(20)
@@ -541,7 +541,7 @@ def test_a_message_that_stops_is_seen_to() -> None:
     assert world.requests
 
 
-def test_a_change_that_cannot_be_undone_is_told_of_too() -> None:
+def test_ineffective_request_is_announced() -> None:
     uav = Autopilot(hz=5.0, results=(dialect.MAV_RESULT_DENIED,), streams=False)
     world = World(uav)
     world.run(20)
@@ -551,7 +551,7 @@ def test_a_change_that_cannot_be_undone_is_told_of_too() -> None:
     assert texts == ["no request of another component was received", "requests have no effect"]
 
 
-def test_a_restart_is_named() -> None:
+def test_restart_is_named_as_cause() -> None:
     uav = Autopilot()
     world = World(uav)
     world.run(40)
@@ -562,7 +562,7 @@ def test_a_restart_is_named() -> None:
     assert world.rate().observed_hz == pytest.approx(5.0)
 
 
-def test_a_ground_station_that_keeps_changing_it_is_told_of_once_and_not_fought() -> None:
+def test_competing_ground_station_is_announced_once_with_backoff() -> None:
     world = World(Autopilot())
     for _ in range(150):
         world.run(10)
@@ -573,7 +573,7 @@ def test_a_ground_station_that_keeps_changing_it_is_told_of_once_and_not_fought(
     assert world.rate().changed_by == "255:190"
 
 
-def test_after_long_order_the_backoff_begins_anew_and_it_is_said_again() -> None:
+def test_backoff_and_notice_reset_after_a_long_stable_period() -> None:
     world = World(Autopilot())
     for _ in range(40):
         world.run(15)
@@ -609,22 +609,20 @@ def radio(seed: int, loss: float, burst_s: float, jitter_s: float, copies: int =
 @pytest.mark.parametrize("loss", [0.0, 0.3])
 @pytest.mark.parametrize("burst_s", [0.001, 1.5, 4.8])
 @pytest.mark.parametrize("jitter_s", [0.0, 0.5])
-def test_what_the_link_does_is_no_reason_to_ask(
-    loss: float, burst_s: float, jitter_s: float
-) -> None:
+def test_link_impairments_cause_no_requests(loss: float, burst_s: float, jitter_s: float) -> None:
     world = World(Autopilot(hz=5.0), link=radio(1, loss, burst_s, jitter_s, copies=2))
     world.run(120)
     assert len(world.requests) <= (2 if loss else 0)  # occasionally most of a dozen are lost
     assert world.rate().observed_hz is not None
 
 
-def test_bursts_and_repetitions_do_not_hide_a_slow_rate() -> None:
+def test_bursts_and_duplicates_do_not_hide_a_slow_rate() -> None:
     uav = Autopilot(hz=1.0)
     World(uav, link=radio(2, 0.0, 2.5, 0.3, copies=3)).run(60)
     assert uav.hz[POSITION] == 5.0
 
 
-def test_a_uav_that_is_gone_is_not_asked_and_then_forgotten() -> None:
+def test_silent_uav_receives_no_requests_and_is_forgotten() -> None:
     uav = Autopilot(obeys=False)
     world = World(uav)
     world.run(30)
@@ -640,7 +638,7 @@ def test_a_uav_that_is_gone_is_not_asked_and_then_forgotten() -> None:
     assert len(world.requests) == before
 
 
-def test_a_fleet_is_asked_in_turn_and_not_all_at_once() -> None:
+def test_fleet_requests_are_rate_limited_and_fair() -> None:
     """The longest waiting UAV comes first, with at most five requests per second."""
     fleet = [
         Autopilot(source=Source(n, 1), results=(None,), streams=False) for n in range(100, 160)
@@ -669,7 +667,7 @@ EVENTS = st.one_of(
 
 @settings(max_examples=examples(25), deadline=None)
 @given(st.lists(EVENTS, max_size=40))
-def test_whatever_is_heard_there_are_never_more_requests_than_allowed(events: list[Any]) -> None:
+def test_request_limits_hold_for_any_input(events: list[Any]) -> None:
     """Per message at least 5 s apart, in total at most 5 per second; hundreds of seconds of slow
     rates cause no more than the back-off allows."""
     uavs = [CARRIER, UAV, Source(4, 1), Source(6, 1)]

@@ -38,7 +38,7 @@ def said(**changed: Any) -> AdsbVehicle:
     return found
 
 
-def test_an_aircraft_is_read_as_pymavlink_reads_it() -> None:
+def test_aircraft_json_matches_pymavlink() -> None:
     (frame,) = fed(ONE)
     assert isinstance(frame, Frame)
     mav: Any = dialect.MAVLink(None)
@@ -51,7 +51,7 @@ def test_an_aircraft_is_read_as_pymavlink_reads_it() -> None:
     assert (theirs.heading, theirs.ver_velocity, theirs.tslc) == (69, round(-960 * 0.508), 1)
 
 
-def test_its_accuracies_are_limits_of_95_percent() -> None:
+def test_accuracy_codes_are_95_percent_limits() -> None:
     told = said().accuracy
     assert told is not None
     assert told == pytest.approx((0.617 * 10, 0.617 * 45, 0.617 * 3, None), rel=1e-3)
@@ -59,7 +59,7 @@ def test_its_accuracies_are_limits_of_95_percent() -> None:
     assert said(nac_p=15, nac_v=7, gva=3).accuracy is None
 
 
-def test_what_is_not_there_is_unknown() -> None:
+def test_missing_fields_are_unknown() -> None:
     bare = {"hex": "a2fcf2", "lat": 47.0, "lon": -122.0, "seen_pos": 3.9}
     (frame,) = fed(bare)
     assert isinstance(frame, Frame)
@@ -73,7 +73,7 @@ def test_what_is_not_there_is_unknown() -> None:
         assert fed({key: value for key, value in ONE.items() if key != away}) == []
 
 
-def test_only_news_is_handed_on() -> None:
+def test_only_new_positions_are_delivered() -> None:
     poll = AircraftJson("x")
     assert len(poll.feed(1, document(ONE, now=100.0))) == 1
     assert poll.feed(2, document(ONE | {"seen_pos": 0.2}, now=100.0)) == []  # the same document
@@ -89,7 +89,9 @@ def test_only_news_is_handed_on() -> None:
         ({"mlat": ["lat", "lon"]}, "computed by others"), ({"hex": "~a2fcf2"}, "not an ICAO"),
     ],
 )  # fmt: skip
-def test_who_is_placed_by_others_is_not_used(changed: dict[str, Any], why: str) -> None:
+def test_aircraft_located_by_multilateration_are_rejected(
+    changed: dict[str, Any], why: str
+) -> None:
     (found,) = fed(ONE | changed)
     assert isinstance(found, Rejection)
     assert found.reason is Reason.UNKNOWN_MESSAGE and why in found.detail
@@ -103,7 +105,7 @@ def test_who_is_placed_by_others_is_not_used(changed: dict[str, Any], why: str) 
         {"hex": None}, {"track": [1]},
     ],
 )  # fmt: skip
-def test_fields_that_cannot_be_are_refused_and_the_others_are_read(changed: Any) -> None:
+def test_malformed_aircraft_is_rejected_and_others_are_read(changed: Any) -> None:
     refused, read = fed(ONE | changed, ONE)
     assert isinstance(refused, Rejection) and refused.reason is Reason.MALFORMED and refused.detail
     assert isinstance(read, Frame)
@@ -118,12 +120,12 @@ def test_fields_that_cannot_be_are_refused_and_the_others_are_read(changed: Any)
     ],
     ids=range(13),
 )  # fmt: skip
-def test_what_is_no_such_document_is_counted_in_bytes(data: bytes) -> None:
+def test_invalid_document_is_counted_in_bytes(data: bytes) -> None:
     (found,) = AircraftJson("x").feed(7, data)
     assert found == Rejection(t_ns=7, source="x", reason=Reason.GARBAGE, count=len(data) or 1)
 
 
-def test_more_aircraft_than_there_can_be_take_no_memory() -> None:
+def test_too_many_aircraft_use_bounded_memory() -> None:
     poll = AircraftJson("x")
     for start in (0, AIRCRAFT_MAX // 2):
         many = [
@@ -142,7 +144,7 @@ _JSON = st.recursive(
 
 
 @given(st.dictionaries(st.sampled_from(sorted(ONE)), _JSON) | _JSON)
-def test_no_values_are_a_defect(entry: Any) -> None:
+def test_arbitrary_values_never_raise(entry: Any) -> None:
     base = ONE | entry if isinstance(entry, dict) else entry
     for found in fed(base, entry):
         assert isinstance(found, Rejection) or isinstance(decode(found), AdsbVehicle | Rejection)

@@ -52,7 +52,7 @@ def refused(data: bytes) -> Rejection:
     return found
 
 
-def test_an_event_is_a_report_with_the_errors_that_it_states() -> None:
+def test_cot_event_becomes_a_report_with_its_stated_errors() -> None:
     report = said(XML)
     assert (report.uav, report.source) == ("cot:HAWK-1", SENDER)
     assert (report.lat_deg, report.lon_deg) == pytest.approx((51.4774, -0.0015))
@@ -64,14 +64,14 @@ def test_an_event_is_a_report_with_the_errors_that_it_states() -> None:
     assert report.boot_ms == round(at.timestamp() * 1000) % 2**32
 
 
-def test_times_without_a_zone_are_universal() -> None:
+def test_times_without_a_zone_are_utc() -> None:
     assert said(
         changed('time="2026-11-22T10:00:00.250Z" start', 'time="2026-11-22T10:00:00.25" start')
     ) == said(XML)
     assert said(changed("00.250Z", "00.250+00:00")) == said(XML)
 
 
-def test_slopes_and_unknown_errors() -> None:
+def test_slope_and_unknown_errors_are_decoded() -> None:
     sinking = said(changed('speed="12.5"', 'speed="12.5" slope="-45"'))
     assert sinking.velocity_down_mps == pytest.approx(12.5)
     for ce in ("9999999", "9999999.0", "0", "-1", "NaN"):
@@ -85,7 +85,7 @@ def test_slopes_and_unknown_errors() -> None:
     [("", ""), ('ce="4.5"', 'ce="9999999.0"'), ("HAWK-1", "é 1"), ('lat="51.4774"', 'lat="0.0"')],
 )
 @pytest.mark.parametrize("kind", [takproto.TAKProtoVer.MESH, takproto.TAKProtoVer.STREAM])
-def test_takprotos_bytes_say_what_the_xml_says(old: str, new: str, kind: Any) -> None:
+def test_takproto_bytes_decode_like_the_xml(old: str, new: str, kind: Any) -> None:
     """Encoded by another program from the same XML."""
     text = changed(old, new) if old else XML
     (packed,) = fed(bytes(takproto.xml2proto(text.decode(), kind)))
@@ -94,7 +94,7 @@ def test_takprotos_bytes_say_what_the_xml_says(old: str, new: str, kind: Any) ->
     assert decode(packed) == decode(plain)
 
 
-def test_takproto_reads_back_what_is_read_here() -> None:
+def test_takproto_reads_our_events() -> None:
     raw = bytes(takproto.xml2proto(XML.decode(), takproto.TAKProtoVer.MESH))
     theirs = takproto.parse_proto(raw).cotEvent
     ours = from_protobuf(raw[3:])
@@ -129,7 +129,7 @@ def test_takproto_reads_back_what_is_read_here() -> None:
         ('time="2026', 'time="9999999', Reason.MALFORMED),
     ],
 )  # fmt: skip
-def test_what_is_not_used_is_refused(old: str, new: str, reason: Reason) -> None:
+def test_unusable_events_are_rejected(old: str, new: str, reason: Reason) -> None:
     assert refused(changed(old, new)).reason is reason
     assert refused(changed(old, new)).source in ("cot:x", "cot:HAWK-1")
 
@@ -141,7 +141,7 @@ def test_what_is_not_used_is_refused(old: str, new: str, reason: Reason) -> None
         "<a>" * DEPTH_MAX + "</a>" * DEPTH_MAX, "\xff\xfe", "<a" * 40, "<![CDATA[" + "</event>",
     ],
 )  # fmt: skip
-def test_bombs_are_refused(inside: str) -> None:
+def test_xml_bombs_are_rejected(inside: str) -> None:
     raw = XML.replace(b"<detail>", b"<detail>" + inside.encode("latin-1"))
     found = fed(raw)
     assert found and all(isinstance(one, Rejection) for one in found)
@@ -151,14 +151,14 @@ def test_bombs_are_refused(inside: str) -> None:
         from_xml(f'<!DOCTYPE event [<!ENTITY a "b">]>{XML.decode()}'.encode())
 
 
-def test_ids_that_may_not_stand_in_an_address_are_told_apart() -> None:
+def test_ids_with_special_characters_stay_distinct() -> None:
     names = [said(changed("HAWK-1", uid)).uav for uid in ("a/b", "a_b", "a b", "x" * 300)]
     assert len(set(names)) == 4
     assert names[1] == "cot:a_b"
     assert all(len(name) < 64 and "/" not in name and " " not in name for name in names)
 
 
-def test_a_tunnel_of_others_is_none_of_ours() -> None:
+def test_foreign_tunnel_message_is_ignored() -> None:
     (frame,) = fed(XML)
     assert isinstance(frame, Frame)
     assert decode(frame._replace(source=Source(9, 25))) is None
@@ -171,7 +171,7 @@ STREAM = (
 
 
 @given(st.lists(st.integers(1, len(STREAM) - 1), max_size=20))
-def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
+def test_split_input_gives_the_same_result(cuts: list[int]) -> None:
     at = [0, *sorted(cuts), len(STREAM)]
     splitter = CotSplitter("x")
     pieces = [STREAM[a:b] for a, b in pairwise(at)]
@@ -181,7 +181,7 @@ def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
     assert splitter.finish(8) == []
 
 
-def test_what_is_between_events_is_counted() -> None:
+def test_bytes_between_events_are_counted() -> None:
     garbage, frame = sorted(fed(b"noise" + XML + b"more"), key=lambda one: isinstance(one, Frame))
     assert isinstance(frame, Frame)
     assert garbage == Rejection(t_ns=7, source="cot:x", reason=Reason.GARBAGE, count=9)
@@ -191,7 +191,7 @@ def test_what_is_between_events_is_counted() -> None:
 
 
 @pytest.mark.parametrize("piece", [b"<event ", b"\xbf\xff\xff\xff\xff\x7f", b"\xbf", b"<", b"<a>"])
-def test_events_without_an_end_take_no_memory_and_no_time(piece: bytes) -> None:
+def test_endless_events_use_bounded_memory_and_time(piece: bytes) -> None:
     splitter = CotSplitter("x")
     began_s = time.process_time()
     for _ in range(100):
@@ -203,7 +203,7 @@ def test_events_without_an_end_take_no_memory_and_no_time(piece: bytes) -> None:
 
 
 @given(st.binary(max_size=200), st.integers(0, 2))
-def test_no_bytes_are_a_defect(data: bytes, form: int) -> None:
+def test_arbitrary_bytes_never_raise(data: bytes, form: int) -> None:
     wrapped = (data, b"\xbf\x01\xbf" + data, b"<event " + data + b"</event>")[form]
     for found in fed(wrapped + XML):
         assert isinstance(found, Rejection) or isinstance(decode(found), Report)
@@ -213,7 +213,7 @@ _TEXT = st.text(max_size=30) | st.floats().map(str)
 
 
 @given(st.sampled_from(["uid", "type", "how", "time", "lat", "lon", "hae", "ce", "le"]), _TEXT)
-def test_no_attribute_is_a_defect(name: str, text: str) -> None:
+def test_arbitrary_attributes_never_raise(name: str, text: str) -> None:
     root = ElementTree.fromstring(XML)
     point = root.find("point")
     assert point is not None
@@ -223,7 +223,7 @@ def test_no_attribute_is_a_defect(name: str, text: str) -> None:
 
 
 @given(st.binary(max_size=160), st.integers(0, 140))
-def test_no_tunnel_is_a_defect(body: bytes, size: int) -> None:
+def test_arbitrary_tunnel_payloads_never_raise(body: bytes, size: int) -> None:
     (frame,) = fed(XML)
     assert isinstance(frame, Frame)
     payload = frame.payload[:4] + bytes([size]) + body
@@ -233,5 +233,5 @@ def test_no_tunnel_is_a_defect(body: bytes, size: int) -> None:
     assert not math.isnan(said(XML).alt_m)
 
 
-def test_frames_are_of_no_system_and_a_user_s_component() -> None:
+def test_cot_frames_use_system_0_and_a_user_component() -> None:
     assert Source(sysid=0, compid=25) == SENDER

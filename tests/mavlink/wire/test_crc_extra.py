@@ -17,12 +17,12 @@ def as_source(table: dict[int, int], width: int = 100) -> str:
     return "\n".join([*lines, line, "}"])
 
 
-def test_the_seeds_are_those_of_the_dialect() -> None:
+def test_crc_extra_matches_the_dialect() -> None:
     expected = {msgid: kind.crc_extra for msgid, kind in dialect.mavlink_map.items()}
     assert expected == CRC_EXTRA, f"\nthe dialect has another table:\n\n{as_source(expected)}\n"
 
 
-def test_the_printed_table_can_be_pasted() -> None:
+def test_printed_table_is_valid_source() -> None:
     text = as_source(CRC_EXTRA)
     scope: dict[str, object] = {}
     exec(text, scope)
@@ -30,7 +30,7 @@ def test_the_printed_table_can_be_pasted() -> None:
     assert max(map(len, text.splitlines())) <= 100
 
 
-def test_the_longest_payloads_are_those_of_the_dialect() -> None:
+def test_longest_payloads_match_the_dialect() -> None:
     kinds = dialect.mavlink_map
     expected = bytes(kinds[i].unpacker.size if i in kinds else 255 for i in range(256))
     assert expected == LONGEST, f"\nthe dialect has another table:\n\n{expected.hex()}\n"

@@ -223,7 +223,7 @@ def assert_same(found: object, wanted: object) -> None:
             assert have == want and type(have) is type(want), name
 
 
-def test_the_whole_cut_equals_pymavlink(cut_frames: list[bytes]) -> None:
+def test_decoded_log_equals_pymavlink(cut_frames: list[bytes]) -> None:
     mav = dialect.MAVLink(None)
     seen: Counter[str] = Counter()
     for raw in cut_frames:
@@ -244,7 +244,7 @@ def test_the_whole_cut_equals_pymavlink(cut_frames: list[bytes]) -> None:
     }
 
 
-def test_the_cut_moves_in_every_direction(cut_frames: list[bytes]) -> None:
+def test_reported_velocities_match_position_changes(cut_frames: list[bytes]) -> None:
     """Checks signs and units: reported velocities match the changes of position."""
     track = [
         report(as_frame(raw)) for raw in cut_frames if raw[7:10] == b"\x21\0\0" and raw[5] == 1
@@ -265,7 +265,7 @@ def test_the_cut_moves_in_every_direction(cut_frames: list[bytes]) -> None:
 # --- GLOBAL_POSITION_INT ------------------------------------------------------------------------
 
 
-def test_units_and_signs_of_a_position() -> None:
+def test_position_units_and_signs() -> None:
     found = report(
         position(
             -338765432, -1791234567, 35999, alt=-1500, relative_alt=-2, vx=-1234, vy=5, vz=-321
@@ -291,7 +291,7 @@ def test_heading_65535_is_unknown_and_0_is_north() -> None:
 @pytest.mark.parametrize(
     ("lat", "lon"), [(0, 0), (353, -129), (-1, 0), (440_000, 0), (0, -440_000), (310_000, 310_000)]
 )
-def test_near_null_island_nothing_is_believed(make: Make, lat: int, lon: int) -> None:
+def test_positions_near_0_0_are_rejected(make: Make, lat: int, lon: int) -> None:
     assert rejected(make(lat=lat, lon=lon)) is Reason.ZERO_POSITION
 
 
@@ -309,7 +309,7 @@ def test_near_null_island_nothing_is_believed(make: Make, lat: int, lon: int) ->
         (1, -1_800_000_000),
     ],
 )
-def test_everywhere_else_on_earth_is_believed(make: Make, lat: int, lon: int) -> None:
+def test_positions_elsewhere_on_earth_are_accepted(make: Make, lat: int, lon: int) -> None:
     found = decode(make(lat=lat, lon=lon))
     assert isinstance(found, Report | AdsbVehicle)
     place = (found.lat_deg, found.lon_deg) if isinstance(found, Report) else found.position_deg
@@ -328,14 +328,14 @@ def test_everywhere_else_on_earth_is_believed(make: Make, lat: int, lon: int) ->
         (-(2**31), HERE[1]),
     ],
 )
-def test_what_is_no_place_on_earth_is_malformed(make: Make, lat: int, lon: int) -> None:
+def test_position_off_the_earth_is_malformed(make: Make, lat: int, lon: int) -> None:
     assert rejected(make(lat=lat, lon=lon)) is Reason.MALFORMED
 
 
 # --- ADSB_VEHICLE -------------------------------------------------------------------------------
 
 
-def test_the_flags_are_those_of_the_dialect() -> None:
+def test_adsb_flags_match_the_dialect() -> None:
     """One flag at a time; no other field is set."""
     names = {
         dialect.ADSB_FLAGS_VALID_COORDS: "position_deg",
@@ -367,7 +367,7 @@ def test_the_flags_are_those_of_the_dialect() -> None:
     climb=st.integers(-(2**15), 2**15 - 1),
     tslc=st.integers(0, 255),
 )
-def test_an_adsb_field_is_none_exactly_when_nobody_vouches_for_it(
+def test_adsb_field_is_none_exactly_when_its_flag_is_clear(
     *,
     flags: int,
     altitude_type: int,
@@ -413,7 +413,7 @@ def test_an_adsb_field_is_none_exactly_when_nobody_vouches_for_it(
     assert (found.icao, found.uav, found.source) == (0x4CA7B3, "icao:4CA7B3", (7, 3))
 
 
-def test_an_adsb_position_is_not_judged_without_its_flag() -> None:
+def test_adsb_position_without_its_flag_is_not_checked() -> None:
     for place in ({"lat": 0, "lon": 0}, {"lat": 2**31 - 1}):
         assert traffic(adsb(0xFFFF & ~1, **place)).position_deg is None
 
@@ -424,7 +424,7 @@ def test_adsb_climb_is_positive_up() -> None:
 
 
 @pytest.mark.parametrize("flags", [0, 0xFFFF])
-def test_an_address_is_24_bits_and_not_0(flags: int) -> None:
+def test_icao_address_is_24_bits_and_not_0(flags: int) -> None:
     for icao in (0, 1 << 24, 0xFFFF_FFFF):
         assert rejected(adsb(flags, icao=icao)) is Reason.MALFORMED
     assert traffic(adsb(flags, icao=1)).uav == "icao:000001"
@@ -445,7 +445,7 @@ def test_an_address_is_24_bits_and_not_0(flags: int) -> None:
         (b"A\x07B", None),
     ],
 )
-def test_a_callsign_is_what_can_be_read(padded: bytes, callsign: str | None) -> None:
+def test_callsign_keeps_printable_characters(padded: bytes, callsign: str | None) -> None:
     assert traffic(adsb(callsign=padded)).callsign == callsign
 
 
@@ -458,7 +458,7 @@ def test_a_callsign_is_what_can_be_read(padded: bytes, callsign: str | None) -> 
     v=st.lists(st.sampled_from([0, 0, 1, -1, 256]), min_size=3, max_size=3),
     alt=st.sampled_from([0, 256, -1]),
 )
-def test_trailing_zeros_that_mavlink_2_cuts_are_zeros(hdg: int, v: list[int], alt: int) -> None:
+def test_truncated_trailing_zeros_are_restored(hdg: int, v: list[int], alt: int) -> None:
     found = report(position(hdg=hdg, alt=alt, vx=v[0], vy=v[1], vz=v[2]))
     assert found.heading_deg == pytest.approx(hdg / 100)
     assert found.velocity_ne_mps == pytest.approx((v[0] / 100, v[1] / 100))
@@ -466,7 +466,7 @@ def test_trailing_zeros_that_mavlink_2_cuts_are_zeros(hdg: int, v: list[int], al
     assert found.alt_m == pytest.approx(alt / 1000)
 
 
-def test_a_payload_of_one_byte() -> None:
+def test_one_byte_payload_is_decoded() -> None:
     frame = sent(dialect.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
     assert len(frame.payload) == 1
     assert decode(frame) == Attitude(
@@ -497,7 +497,7 @@ def test_a_payload_of_one_byte() -> None:
     )
 
 
-def test_an_adsb_payload_cut_within_its_flags() -> None:
+def test_adsb_payload_truncated_within_its_flags() -> None:
     """One byte of the flags remains, and everything after it is zero."""
     frame = sent(dialect.MAVLink_adsb_vehicle_message(
         1, *HERE, 0, 0, 0, 0, 0, b"", 0, 0, dialect.ADSB_FLAGS_VALID_COORDS, 0
@@ -519,7 +519,7 @@ def test_an_adsb_payload_cut_within_its_flags() -> None:
     )
 
 
-def test_a_later_standard_may_append_fields() -> None:
+def test_appended_extension_fields_are_ignored() -> None:
     frame = position(hdg=35_999)
     longer = bytes([0xFD, 40]) + frame.raw[2:10] + frame.payload + bytes(range(1, 13)) + b"\0\0"
     assert decode(as_frame(longer)) == decode(frame)
@@ -535,7 +535,7 @@ def test_version_1_has_no_extension_fields() -> None:
     assert decode(sent_v1(message, 30)) == bare
 
 
-def test_version_1_reads_as_version_2() -> None:
+def test_version_1_decodes_like_version_2() -> None:
     message = dialect.MAVLink_global_position_int_message(9, *HERE, 4, 5, 6, -7, 8, 0)
     assert decode(sent_v1(message, 28)) == decode(sent(message))
 
@@ -543,7 +543,7 @@ def test_version_1_reads_as_version_2() -> None:
 @pytest.mark.parametrize(
     ("flags", "knows"), [(0, False), (1, True), (831, True), (830, False), (831 | 1024, False)]
 )
-def test_an_estimator_knows_its_attitude_or_not(flags: int, knows: bool) -> None:
+def test_estimator_status_flags_its_attitude(flags: int, knows: bool) -> None:
     message = dialect.MAVLink_ekf_status_report_message(flags, 0.1, 0.2, 0.3, 0.4, 0.5)
     found = decode(sent(message))
     assert isinstance(found, EstimatorStatus)
@@ -552,7 +552,7 @@ def test_an_estimator_knows_its_attitude_or_not(flags: int, knows: bool) -> None
 
 
 @pytest.mark.parametrize("ratio", [math.nan, math.inf, -0.1])
-def test_a_compass_ratio_that_is_none_is_malformed(ratio: float) -> None:
+def test_invalid_compass_ratio_is_malformed(ratio: float) -> None:
     message = dialect.MAVLink_ekf_status_report_message(831, 0.1, 0.2, 0.3, ratio, 0.5)
     found = decode(sent(message))
     assert isinstance(found, Rejection)
@@ -561,7 +561,7 @@ def test_a_compass_ratio_that_is_none_is_malformed(ratio: float) -> None:
 
 @pytest.mark.parametrize("field", ["h_acc", "v_acc", "vel_acc"])
 @pytest.mark.parametrize("unknown", [0, 0xFFFF_FFFF])
-def test_an_accuracy_of_0_or_all_ones_is_unknown(field: str, unknown: int) -> None:
+def test_accuracy_of_0_or_all_ones_is_unknown(field: str, unknown: int) -> None:
     names = {"h_acc": "h_acc_m", "v_acc": "v_acc_m", "vel_acc": "vel_acc_mps"}
     given_mm = {"h_acc": 1000, "v_acc": 2000, "vel_acc": 3000} | {field: unknown}
     found = decode(sent(gps_raw_int(**given_mm)))
@@ -570,7 +570,7 @@ def test_an_accuracy_of_0_or_all_ones_is_unknown(field: str, unknown: int) -> No
         assert getattr(found, name) == want
 
 
-def test_a_unix_clock_of_0_is_none() -> None:
+def test_unix_time_of_0_is_none() -> None:
     found = decode(sent(dialect.MAVLink_system_time_message(0, 4321)))
     assert found == SystemTime(t_ns=T_NS, source=Source(7, 3), unix_us=None, boot_ms=4321)
     found = decode(sent(dialect.MAVLink_system_time_message(2**63 + 1, 2**32 - 1)))
@@ -579,7 +579,7 @@ def test_a_unix_clock_of_0_is_none() -> None:
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("field", range(6))
-def test_an_attitude_that_is_no_number_is_malformed(field: int, bad: float) -> None:
+def test_non_finite_attitude_is_malformed(field: int, bad: float) -> None:
     angles = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
     assert isinstance(decode(attitude(angles)), Attitude)
     angles[field] = bad
@@ -587,7 +587,7 @@ def test_an_attitude_that_is_no_number_is_malformed(field: int, bad: float) -> N
 
 
 @pytest.mark.parametrize("field", range(6))
-def test_an_attitude_that_nothing_can_measure_is_malformed(field: int) -> None:
+def test_implausible_attitude_is_malformed(field: int) -> None:
     """A rate of 10⁶ rad/s would be extrapolated to any attitude."""
     for most in (6.29, -6.29) if field < 3 else (70.0, -70.0):
         angles = [0.1, 0.2, 0.3, 0.4, 0.5, 0.6]
@@ -597,7 +597,7 @@ def test_an_attitude_that_nothing_can_measure_is_malformed(field: int) -> None:
         assert rejected(attitude(angles)) is Reason.MALFORMED
 
 
-def test_the_fields_of_an_attitude_keep_their_order() -> None:
+def test_attitude_fields_keep_their_order() -> None:
     angles = [struct.unpack("<f", struct.pack("<f", 0.1 * n))[0] for n in range(1, 7)]
     assert decode(attitude(angles)) == Attitude(
         t_ns=T_NS,
@@ -612,11 +612,11 @@ def test_the_fields_of_an_attitude_keep_their_order() -> None:
     )
 
 
-def test_a_heartbeat_says_what_it_is_of() -> None:
+def test_heartbeat_gives_type_and_autopilot() -> None:
     found = decode(sent(dialect.MAVLink_heartbeat_message(2, 3, 128, 99, 4, 3)))
     assert found == Presence(t_ns=T_NS, source=Source(7, 3), mav_type=2, autopilot=3)
 
 
-def test_other_messages_are_nobodys() -> None:
+def test_other_messages_are_not_decoded() -> None:
     assert decode(sent(dialect.MAVLink_ping_message(1, 2, 3, 4))) is None
     assert {0, 2, 24, 30, 33, 193, 235, 246, 385} | REMOTE_ID == DECODED

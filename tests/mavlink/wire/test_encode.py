@@ -57,14 +57,14 @@ CASES = {
 @pytest.mark.parametrize(
     ("name", "seq", "version"), list(itertools.product(CASES, (0, 255), (1, 2)))
 )
-def test_frames_are_those_of_the_dialect(name: str, seq: int, version: int) -> None:
+def test_encoded_frames_match_the_dialect(name: str, seq: int, version: int) -> None:
     message, build = CASES[name]
     dialect = dialect_v2 if version == 2 else dialect_v1
     packed = encode.pack(message, seq, version)
     assert packed == reference(dialect, seq, build(dialect))
 
 
-def test_a_payload_of_zeros_keeps_its_first_byte() -> None:
+def test_zero_payload_keeps_one_byte() -> None:
     packed = encode.pack(encode.Outgoing(OURS, encode.TIMESYNC, bytes(16)), 7)
     mav = dialect_v2.MAVLink(None, *OURS)
     mav.seq = 7

@@ -126,7 +126,7 @@ def damaged(frame: bytes) -> bytes:
 # --- intact frames ------------------------------------------------------------------------------
 
 
-def test_what_a_frame_says_is_what_pymavlink_reads() -> None:
+def test_frame_fields_match_pymavlink() -> None:
     made = traffic(210)
     frames, lost = split(made)
     assert raws(frames) == made
@@ -146,7 +146,7 @@ def test_what_a_frame_says_is_what_pymavlink_reads() -> None:
     assert len(signed) > 20 and {frame.version for frame in frames} == {1, 2}
 
 
-def test_many_frames_in_one_datagram() -> None:
+def test_many_frames_in_one_datagram_are_split() -> None:
     made = traffic(70)
     splitter = Splitter("x")
     found = splitter.feed(5, b"".join(made))
@@ -156,7 +156,7 @@ def test_many_frames_in_one_datagram() -> None:
 
 
 @pytest.mark.parametrize("tail", [b"", b"\xfd\x09\x00", b"\xfe", b"\x55\x55"])
-def test_one_frame_over_many_reads(tail: bytes) -> None:
+def test_frame_over_many_reads_is_delivered_once(tail: bytes) -> None:
     """It is delivered once, with its last byte, at that byte's time."""
     for made in traffic(14):
         splitter = Splitter("x")
@@ -167,7 +167,7 @@ def test_one_frame_over_many_reads(tail: bytes) -> None:
         assert found[0].t_ns == 777
 
 
-def test_only_what_is_wanted_is_handed_on_and_all_is_counted() -> None:
+def test_only_wanted_messages_are_delivered_but_all_are_counted() -> None:
     made = traffic(70)
     wanted = frozenset({0, 33})
     splitter = Splitter("x", wanted)
@@ -196,7 +196,7 @@ PIECES = st.lists(
 
 @settings(max_examples=examples(300), deadline=None)
 @given(pieces=PIECES, cuts=st.lists(st.integers(0, 2000), max_size=20))
-def test_frames_and_counts_do_not_depend_on_the_cuts(
+def test_frames_and_counts_do_not_depend_on_read_sizes(
     scan: Scan, pieces: list[bytes], cuts: list[int]
 ) -> None:
     """Whole, byte by byte and in random pieces: pymavlink's frames, and equal losses."""
@@ -230,7 +230,7 @@ def test_random_bytes_full_of_magic_never_raise() -> None:
         assert frames or lost
 
 
-def test_no_more_is_kept_than_a_frame_can_be_long() -> None:
+def test_pending_bytes_are_bounded_by_the_longest_frame() -> None:
     """Inspects internals: bounded memory is not visible from outside."""
     rng = random.Random(2)
     data = b"".join(traffic(50)) + bytes(rng.choices([0xFD, 0xFE, 0, 1, 33, 255], k=20_000))
@@ -291,7 +291,7 @@ def test_every_frame_outside_the_damage_is_found(scan: Scan, kind: str) -> None:
         assert raws(split(bytewise(bytes(data)))[0]) == found
 
 
-def test_a_damaged_length_takes_no_good_frame_with_it() -> None:
+def test_damaged_length_loses_no_good_frame() -> None:
     made = [frame for frame in traffic(40) if len(frame) < 60]
     for victim in range(0, 12):
         frame = made[victim]
@@ -302,7 +302,7 @@ def test_a_damaged_length_takes_no_good_frame_with_it() -> None:
             assert lost == {Reason.BAD_CRC: 1}
 
 
-def test_a_claim_ends_with_the_next_good_frame() -> None:
+def test_failed_frame_ends_at_the_next_good_frame() -> None:
     """Damage behind that frame counts separately, even within the length first claimed."""
     made = [frame for frame in traffic(40) if len(frame) < 40][:12]
     first = made[0][:1] + b"\xff" + made[0][2:]
@@ -313,14 +313,14 @@ def test_a_claim_ends_with_the_next_good_frame() -> None:
         assert lost == {Reason.BAD_CRC: 2, Reason.GARBAGE: 10}
 
 
-def test_the_signature_of_a_damaged_frame_is_no_garbage() -> None:
+def test_signature_of_a_damaged_frame_is_not_garbage() -> None:
     made = [frame for frame in traffic(30) if frame[0] == 0xFD and frame[2] & 1]
     frames, lost = split([made[0], damaged(made[1]), made[2]])
     assert raws(frames) == [made[0], made[2]]
     assert lost == {Reason.BAD_CRC: 1}
 
 
-def test_good_frames_in_an_unfinished_claim_are_found_at_the_end() -> None:
+def test_frames_inside_an_incomplete_frame_are_found_at_the_end() -> None:
     made = [frame for frame in traffic(5) if len(frame) < 60][:3]
     cut_short = made[0][:1] + b"\xff" + made[0][2:]
     splitter = Splitter("x")
@@ -333,7 +333,7 @@ def test_good_frames_in_an_unfinished_claim_are_found_at_the_end() -> None:
 
 
 @pytest.mark.parametrize("v1", [True, False])
-def test_a_damaged_frame_counts_once_and_not_for_its_false_starts(v1: bool) -> None:
+def test_damaged_frame_counts_once_despite_false_starts(v1: bool) -> None:
     made = [
         pack(dialect.MAVLink_encapsulated_data_message(n, FALSE_STARTS), v1=v1, seq=n)
         for n in range(20)
@@ -347,7 +347,7 @@ def test_a_damaged_frame_counts_once_and_not_for_its_false_starts(v1: bool) -> N
 
 
 @pytest.mark.parametrize("v1", [True, False])
-def test_an_unknown_id_counts_once_and_is_not_handed_on(v1: bool) -> None:
+def test_unknown_message_id_counts_once_and_is_not_delivered(v1: bool) -> None:
     assert 255 not in CRC_EXTRA and 0x123456 not in CRC_EXTRA
     good = traffic(7)
     stranger = unknown(v1)
@@ -359,7 +359,7 @@ def test_an_unknown_id_counts_once_and_is_not_handed_on(v1: bool) -> None:
 
 
 @pytest.mark.parametrize("flags", [2, 3, 4, 0x80, 0x81, 0xFF])
-def test_flags_that_nobody_has_defined_are_refused(flags: int) -> None:
+def test_undefined_incompatibility_flags_are_rejected(flags: int) -> None:
     """Its checksum is correct, but the flag's effect on the frame is unknown."""
     good = traffic(4)
     payload = bytes([1, 2, 3, 4, 5, 6, 7, 8, 9])
@@ -373,7 +373,7 @@ def test_flags_that_nobody_has_defined_are_refused(flags: int) -> None:
     assert lost == {Reason.GARBAGE: len(strange)}
 
 
-def test_compatible_flags_are_no_reason_to_refuse() -> None:
+def test_compatibility_flags_are_accepted() -> None:
     frame = checked(bytes([0xFD, 1, 0, 0xFF, 0, 1, 1, 0, 0, 0]), b"\x01", CRC_EXTRA[0])
     assert raws(split([frame])[0]) == [frame]
 
@@ -387,7 +387,7 @@ def test_garbage_is_counted_in_bytes() -> None:
         assert lost == {Reason.GARBAGE: 17 + 5 + 2 + 40}
 
 
-def test_a_truncated_datagram_harms_no_other_peer() -> None:
+def test_truncated_datagram_does_not_affect_other_peers() -> None:
     made = traffic(12)
     peers = [Splitter("x") for _ in range(2)]
     found: list[list[Frame | Rejection]] = [[], []]
@@ -401,7 +401,7 @@ def test_a_truncated_datagram_harms_no_other_peer() -> None:
 # --- whole logs ---------------------------------------------------------------------------------
 
 
-def test_the_cut_against_a_parser_run_over_the_stream(cut_frames: list[bytes]) -> None:
+def test_log_frames_match_a_streaming_parser(cut_frames: list[bytes]) -> None:
     """pymavlink's own ``parse_buffer`` over the frames in order."""
     assert len(cut_frames) == 7698
     stream = b"".join(cut_frames)
@@ -417,7 +417,7 @@ def test_the_cut_against_a_parser_run_over_the_stream(cut_frames: list[bytes]) -
     assert lost == {}
 
 
-def test_the_stamps_of_the_cut_are_garbage(cut_log: bytes, cut_frames: list[bytes]) -> None:
+def test_log_stamps_count_as_garbage(cut_log: bytes, cut_frames: list[bytes]) -> None:
     frames, lost = split([cut_log])
     assert raws(frames) == cut_frames
     assert len(cut_log) == 8 * len(cut_frames) + sum(map(len, cut_frames))
@@ -426,7 +426,9 @@ def test_the_stamps_of_the_cut_are_garbage(cut_log: bytes, cut_frames: list[byte
 
 @pytest.mark.full
 @pytest.mark.parametrize("name", LOGS)
-def test_whole_logs(scan: Scan, shared_log: Callable[[str], bytes], name: str) -> None:
+def test_whole_logs_are_split_like_pymavlink(
+    scan: Scan, shared_log: Callable[[str], bytes], name: str
+) -> None:
     data = shared_log(name)
     expected = scan(data)
     assert len(expected) > 900
@@ -439,7 +441,7 @@ def test_whole_logs(scan: Scan, shared_log: Callable[[str], bytes], name: str) -
         assert frame.msgid == message.get_msgId()
 
 
-def test_more_senders_than_are_kept_are_all_heard() -> None:
+def test_more_senders_than_the_cache_holds_are_all_received() -> None:
     """The state per sender is a cache, cleared when full."""
     sent = [Source(n % 255 + 1, n // 255) for n in range(KNOWN_MAX + 300)]
     splitter = Splitter("x")

@@ -202,7 +202,7 @@ def test_ten_million_bytes_are_accounted_for(kind: str, size: int) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("kind", FLOODS)
-def test_the_work_grows_as_the_bytes_do(kind: str) -> None:
+def test_work_grows_linearly_with_bytes(kind: str) -> None:
     """16 times the bytes in one read: 16 times the work, not 256 times."""
 
     def seconds(data: bytes) -> float:
@@ -217,7 +217,7 @@ def test_the_work_grows_as_the_bytes_do(kind: str) -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("kind", FLOODS)
-def test_no_more_is_kept_than_one_unfinished_frame(kind: str) -> None:
+def test_memory_is_bounded_by_one_incomplete_frame(kind: str) -> None:
     """During a flood and after it, measured with the allocator."""
     rng = random.Random(f"memory {kind}")
     data = FLOODS[kind](rng, 100_000)
@@ -254,7 +254,9 @@ class Damaged:
     untouched: list[Span]
 
 
-def spoil(rng: random.Random, clean: bytes, frames: list[Span], hits: int, other: bytes) -> Damaged:
+def apply_random_damage(
+    rng: random.Random, clean: bytes, frames: list[Span], hits: int, other: bytes
+) -> Damaged:
     """Flip bits, remove bytes, insert noise or a piece of another log: ``hits`` times in all.
 
     One hit in five is at a length byte, which misleads about everything after it.
@@ -341,12 +343,12 @@ def starts(data: bytes) -> int:
     return data.count(0xFD) + data.count(0xFE)
 
 
-def batter(rng: random.Random, log: bytes, other: bytes, rounds: int) -> None:
+def damage_repeatedly(rng: random.Random, log: bytes, other: bytes, rounds: int) -> None:
     """Damage the stream of a log repeatedly: both laws hold every time."""
     clean, frames = stream_of(log)
     false = checked = 0
     for _ in range(rounds):
-        damaged = spoil(rng, clean, frames, rng.choice((1, 5, 40)), other)
+        damaged = apply_random_damage(rng, clean, frames, rng.choice((1, 5, 40)), other)
         found, lost = split(reads(rng, damaged.data))
         check_accounts(damaged.data, found, lost)
         false += check_found(damaged, found)
@@ -359,9 +361,7 @@ def cut(rng: random.Random, data: bytes, size: int) -> bytes:
     return data[at : at + size]
 
 
-def test_what_the_oracle_calls_untouched_is_what_pymavlink_finds(
-    cut_log: bytes, scan: Callable[[bytes], list[bytes]]
-) -> None:
+def test_oracle_agrees_with_pymavlink(cut_log: bytes, scan: Callable[[bytes], list[bytes]]) -> None:
     """Validates the oracle: its frames are pymavlink's, and without damage all are undamaged."""
     data = cut_log[:60_000]
     clean, frames = stream_of(data)
@@ -379,7 +379,7 @@ def test_what_the_oracle_calls_untouched_is_what_pymavlink_finds(
 def test_frames_outside_the_damage_are_found(cut_log: bytes) -> None:
     rng = random.Random("cut log")
     for _ in range(rounds(4, 10)):
-        batter(rng, cut(rng, cut_log, 20_000), cut_log, rounds=20)
+        damage_repeatedly(rng, cut(rng, cut_log, 20_000), cut_log, rounds=20)
 
 
 @pytest.mark.parametrize("name", LOGS)
@@ -389,7 +389,7 @@ def test_frames_of_a_log_outside_the_damage_are_found(
     data = shared_log(name)
     rng = random.Random(f"pieces of {name}")
     for _ in range(4):
-        batter(rng, cut(rng, data, 20_000), cut_log, rounds=10)
+        damage_repeatedly(rng, cut(rng, data, 20_000), cut_log, rounds=10)
 
 
 @pytest.mark.soak
@@ -402,14 +402,14 @@ def test_frames_of_a_whole_log_outside_the_damage_are_found(
     clean, frames = stream_of(data)
     false = checked = 0
     for _ in range(6):
-        damaged = spoil(rng, clean, frames, len(frames) // 20, cut_log)
+        damaged = apply_random_damage(rng, clean, frames, len(frames) // 20, cut_log)
         found, lost = split(reads(rng, damaged.data))
         check_accounts(damaged.data, found, lost)
         false += check_found(damaged, found)
         checked += starts(damaged.data) - len(found)
     assert false <= false_alarms(checked)
     for _ in range(300):
-        batter(rng, cut(rng, data, 20_000), cut_log, rounds=10)
+        damage_repeatedly(rng, cut(rng, data, 20_000), cut_log, rounds=10)
 
 
 # --- any frames between any bytes ---------------------------------------------------------------
@@ -452,7 +452,7 @@ GARBAGE = (
     GARBAGE,
     st.randoms(use_true_random=False),
 )
-def test_frames_between_any_bytes_are_found_however_they_are_cut(
+def test_frames_between_any_bytes_are_found_at_any_read_size(
     pairs: list[tuple[bytes, bytes]], tail: bytes, rng: random.Random
 ) -> None:
     clean = b"".join(frame for _, frame in pairs)
@@ -476,9 +476,9 @@ def test_frames_between_any_bytes_are_found_however_they_are_cut(
 # --- log readers --------------------------------------------------------------------------------
 
 
-def spoil_log(rng: random.Random, log: bytes, other: bytes) -> Damaged:
+def damage_log(rng: random.Random, log: bytes, other: bytes) -> Damaged:
     hits = rng.choice((1, 10, 100, 1000))
-    return spoil(rng, log, account(log).frames, hits, other)
+    return apply_random_damage(rng, log, account(log).frames, hits, other)
 
 
 def check_events(damaged: Damaged, events: list[Event]) -> int:
@@ -504,16 +504,18 @@ def check_stamps(data: bytes, events: list[Event]) -> None:
     assert stamps + sum(map(len, frames)) + losses(events)[Reason.GARBAGE] <= len(data)
 
 
-def has_a_pair(untouched: list[Span]) -> bool:
+def has_adjacent_frames(untouched: list[Span]) -> bool:
     """Return whether two undamaged frames have only a stamp between them."""
     return any(b - a == 8 for (_, a), (b, _) in pairwise(untouched))
 
 
-def read_spoilt(rng: random.Random, log: bytes, other: bytes, path: Path, rounds: int) -> int:
+def read_damaged_log_repeatedly(
+    rng: random.Random, log: bytes, other: bytes, path: Path, rounds: int
+) -> int:
     """Damage and read a telemetry log repeatedly; return how often nothing was left."""
     false = checked = refused = 0
     for _ in range(rounds):
-        damaged = spoil_log(rng, log, other)
+        damaged = damage_log(rng, log, other)
         events = list(read_tlog(damaged.data, "x"))
         false += check_events(damaged, events)
         check_stamps(damaged.data, events)
@@ -523,7 +525,7 @@ def read_spoilt(rng: random.Random, log: bytes, other: bytes, path: Path, rounds
             events = list(read_log(path))
         except LogError as error:
             assert str(path) in str(error) and "\n" not in str(error)
-            assert not has_a_pair(damaged.untouched)
+            assert not has_adjacent_frames(damaged.untouched)
             refused += 1
             continue
         false += check_events(damaged, events)
@@ -531,35 +533,37 @@ def read_spoilt(rng: random.Random, log: bytes, other: bytes, path: Path, rounds
     return refused
 
 
-def test_a_damaged_log_gives_what_is_untouched(cut_log: bytes, tmp_path: Path) -> None:
+def test_undamaged_frames_of_a_damaged_log_are_read(cut_log: bytes, tmp_path: Path) -> None:
     rng = random.Random("damaged log")
     path = tmp_path / "x.tlog"
     refused = 0
     for size in (20_000, 20_000, 3000, 500, 200):
-        refused += read_spoilt(rng, cut(rng, cut_log, size), cut_log, path, rounds=30)
+        refused += read_damaged_log_repeatedly(
+            rng, cut(rng, cut_log, size), cut_log, path, rounds=30
+        )
     assert 10 < refused < 100
 
 
 @pytest.mark.parametrize("name", LOGS)
-def test_a_damaged_piece_of_a_log_gives_what_is_untouched(
+def test_undamaged_frames_of_a_damaged_log_piece_are_read(
     shared_log: Callable[[str], bytes], cut_log: bytes, tmp_path: Path, name: str
 ) -> None:
     rng = random.Random(f"damaged {name}")
     piece = cut(rng, shared_log(name), 20_000)
-    read_spoilt(rng, piece, cut_log, tmp_path / "x.tlog", rounds=10)
+    read_damaged_log_repeatedly(rng, piece, cut_log, tmp_path / "x.tlog", rounds=10)
 
 
 @pytest.mark.soak
 @pytest.mark.parametrize("name", LOGS)
-def test_a_damaged_whole_log_gives_what_is_untouched(
+def test_undamaged_frames_of_a_damaged_whole_log_are_read(
     shared_log: Callable[[str], bytes], cut_log: bytes, tmp_path: Path, name: str
 ) -> None:
     data = shared_log(name)
     rng = random.Random(f"damaged, all of {name}")
-    read_spoilt(rng, data, cut_log, tmp_path / "x.tlog", rounds=5)
+    read_damaged_log_repeatedly(rng, data, cut_log, tmp_path / "x.tlog", rounds=5)
     for _ in range(200):
         piece = cut(rng, data, rng.choice((500, 5000, 20_000)))
-        read_spoilt(rng, piece, cut_log, tmp_path / "x.tlog", rounds=10)
+        read_damaged_log_repeatedly(rng, piece, cut_log, tmp_path / "x.tlog", rounds=10)
 
 
 # --- cost of a flood ----------------------------------------------------------------------------
@@ -575,7 +579,7 @@ MAGIC_FLOODS = {
 
 
 @pytest.mark.parametrize("name", MAGIC_FLOODS)
-def test_a_flood_of_magic_bytes_costs_no_more_sums_than_frames(
+def test_magic_byte_flood_costs_no_extra_checksums(
     name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Checksums over up to 255 bytes at each byte would cost a hundred times as much as frames."""

@@ -71,7 +71,7 @@ def said(item: Frame | Rejection) -> AdsbVehicle:
     return found
 
 
-def test_random_messages_are_read_as_pymodes_reads_them() -> None:
+def test_random_mode_s_messages_match_pymodes() -> None:
     """Every common field is equal, and the same messages are rejected."""
     rng = random.Random(3)
     read = 0
@@ -103,7 +103,7 @@ def test_random_messages_are_read_as_pymodes_reads_them() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_two_halves_are_the_place_that_pymodes_finds_and_that_was_flown(seed: int) -> None:
+def test_even_and_odd_positions_decode_like_pymodes(seed: int) -> None:
     rng = random.Random(seed)
     lat, lon = rng.uniform(-86.9, 86.9), rng.uniform(-180, 180)
     pair = [placed(lat, lon, 0), placed(lat, lon, 1)]
@@ -120,7 +120,7 @@ def test_two_halves_are_the_place_that_pymodes_finds_and_that_was_flown(seed: in
     assert across == pytest.approx(0, abs=3e-5 + 360 / 2**17 / max(zones(lat) - 1, 1))
 
 
-def test_published_messages() -> None:
+def test_published_mode_s_messages_decode() -> None:
     """Positions and other fields as worked out at https://mode-s.org/1090mhz."""
     first, second, named, moving = fed(b"".join(map(beast, (EVEN, ODD, NAMED, MOVING))))
     assert said(first).position_deg is None
@@ -148,7 +148,7 @@ def on_ground(lat_deg: float, lon_deg: float, odd: int, movement: int = 42) -> b
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_position_on_the_ground_counts_from_the_one_in_the_air(seed: int) -> None:
+def test_surface_position_is_relative_to_the_airborne_one(seed: int) -> None:
     """Up to 40 nautical miles away, as pyModeS does with a reference position."""
     rng = random.Random(seed)
     lat, lon = rng.uniform(-80, 80), rng.uniform(-180, 180)
@@ -173,7 +173,7 @@ def test_a_position_on_the_ground_counts_from_the_one_in_the_air(seed: int) -> N
     assert late is not None and late.lat_deg is None
 
 
-def test_a_published_position_on_the_ground() -> None:
+def test_published_surface_position_decodes() -> None:
     """From https://mode-s.org/1090mhz: 52.32061 north, 4.73473 east, near 51.990, 4.375."""
     me = int.from_bytes(bytes.fromhex("8C4841753A8A35323FAEBDAC702D")[4:11], "big")
     half = me >> 17 & 0x1FFFF, me & 0x1FFFF
@@ -182,13 +182,13 @@ def test_a_published_position_on_the_ground() -> None:
     )
 
 
-def test_speeds_on_the_ground_are_those_of_pymodes() -> None:
+def test_surface_speeds_match_pymodes() -> None:
     for code in range(128):
         theirs = pyModeS.decode(on_ground(1.0, 1.0, 0, code).hex()).get("groundspeed")
         assert ground_speed_kt(code) == (None if theirs is None else pytest.approx(theirs, abs=0.6))
 
 
-def test_halves_that_are_too_far_apart_in_time_are_no_place() -> None:
+def test_even_and_odd_positions_too_far_apart_give_no_position() -> None:
     for apart_ns, there in ((PAIR_NS, True), (PAIR_NS + 1, False)):
         heard = Transponders()
         heard.read(0, EVEN)
@@ -220,14 +220,14 @@ def test_stated_accuracies_come_with_the_position(
     )
 
 
-def test_an_accuracy_that_was_stated_long_ago_holds_no_more() -> None:
+def test_stated_accuracy_expires() -> None:
     heard = Transponders()
     heard.read(0, status(10))
     assert heard.read(STATUS_NS, EVEN).nac_p == 10  # type: ignore[union-attr]
     assert heard.read(STATUS_NS + 1, ODD).nac_p == 0  # type: ignore[union-attr]
 
 
-def test_a_message_that_is_held_back_is_old() -> None:
+def test_delayed_message_has_its_age() -> None:
     """By the receiver's 12 MHz counter, relative to the least delayed message so far."""
     splitter = BeastSplitter("x")
     (soon,) = splitter.feed(10 * S, beast(EVEN, 600 * 12_000_000))
@@ -238,7 +238,7 @@ def test_a_message_that_is_held_back_is_old() -> None:
     assert said(again).tslc_s == 0
 
 
-def test_what_is_not_used_is_counted() -> None:
+def test_unused_messages_are_counted() -> None:
     damaged = EVEN[:-1] + bytes([EVEN[-1] ^ 1])
     (refused,) = fed(beast(damaged))
     assert isinstance(refused, Rejection) and refused.reason is Reason.BAD_CRC
@@ -262,7 +262,7 @@ STREAM = b"".join(
 
 
 @given(st.lists(st.integers(1, len(STREAM) - 1), max_size=20))
-def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
+def test_split_input_gives_the_same_result(cuts: list[int]) -> None:
     at = [0, *sorted(cuts), len(STREAM)]
     splitter = BeastSplitter("x")
     pieces = [STREAM[a:b] for a, b in pairwise(at)]
@@ -272,7 +272,7 @@ def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
 
 
 @given(st.lists(st.binary(max_size=60) | st.sampled_from([b"\x1a", b"\x1a3", STREAM[:40]])))
-def test_no_bytes_are_a_defect_or_kept_for_long(pieces: list[bytes]) -> None:
+def test_arbitrary_bytes_never_raise_and_are_not_kept(pieces: list[bytes]) -> None:
     splitter = BeastSplitter("x")
     for piece in pieces:
         for found in splitter.feed(7, piece):

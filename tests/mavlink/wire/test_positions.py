@@ -13,11 +13,11 @@ from companion.values import Frame, Source
 
 
 @pytest.mark.parametrize("msgid", POSITIONS)
-def test_names_are_those_of_the_dialect(msgid: int) -> None:
+def test_message_names_match_the_dialect(msgid: int) -> None:
     assert POSITIONS[msgid].name == dialect.mavlink_map[msgid].msgname
 
 
-def test_a_position_message_is_used_wherever_positions_are() -> None:
+def test_position_messages_are_handled_everywhere() -> None:
     assert POSITIONS.keys() <= DECODED
     assert OWN
     for users in (POSE, SHARED, ACCEPTED_IDS):
@@ -35,7 +35,7 @@ SUMMARIES = st.tuples(
 
 
 @given(SUMMARIES)
-def test_high_latency2_is_read_as_the_dialect_packs_it(summary: tuple[int, ...]) -> None:
+def test_high_latency2_decodes_like_the_dialect(summary: tuple[int, ...]) -> None:
     boot_ms, lat, lon, alt, heading, eph = summary
     kind = dialect.MAVLink_high_latency2_message
     fields = dict.fromkeys(kind.fieldnames, 7) | {

@@ -68,7 +68,7 @@ def reported(message: Any, t_ns: int = 7) -> Report:
     return found
 
 
-def test_a_location_is_read_field_by_field() -> None:
+def test_location_message_is_decoded() -> None:
     """Packed by pymavlink; 15.5 m/s to the north-east and 2 m/s up."""
     report = reported(location())
     assert (report.lat_deg, report.lon_deg) == pytest.approx((62.683472, 21.974944))
@@ -78,7 +78,7 @@ def test_a_location_is_read_field_by_field() -> None:
     assert report.accuracy == pytest.approx((6.17, 6.17, 0.617, 0.15), rel=1e-3)
 
 
-def test_a_pack_says_what_its_messages_say() -> None:
+def test_message_pack_decodes_like_single_messages() -> None:
     """The published example, against the same fields in a single MAVLink message."""
     found = said(packed(NAMED, PACKED))
     assert (found.uas_id, found.aircraft) == ("1588E0123456789ABCDE", None)
@@ -87,7 +87,7 @@ def test_a_pack_says_what_its_messages_say() -> None:
     assert said(packed(NAMED, PACKED, GROUP)).aircraft == 3
 
 
-def test_fast_and_westward_are_packed_otherwise() -> None:
+def test_fast_and_westward_flags_are_decoded() -> None:
     flags = PACKED[1] | 0b11
     fast = PACKED[:1] + bytes([flags, 90, 100]) + PACKED[4:]
     report = said(packed(NAMED, fast)).report
@@ -104,7 +104,7 @@ def test_fast_and_westward_are_packed_otherwise() -> None:
         ({"speed_vertical": 6300}, "velocity_down_mps"), ({"timestamp": 65_535.0}, "boot_ms"),
     ],
 )  # fmt: skip
-def test_what_is_unknown_is_none(changed: dict[str, Any], field: str) -> None:
+def test_unknown_fields_are_none(changed: dict[str, Any], field: str) -> None:
     assert getattr(reported(location(**changed)), field) is None
 
 
@@ -121,7 +121,9 @@ def test_what_is_unknown_is_none(changed: dict[str, Any], field: str) -> None:
         (255, None),
     ],
 )
-def test_codes_of_accuracy_are_limits_of_95_percent(code: int, horizontal_m: float | None) -> None:
+def test_remote_id_accuracy_codes_are_95_percent_limits(
+    code: int, horizontal_m: float | None
+) -> None:
     told = reported(location(horizontal_accuracy=code)).accuracy
     assert told is not None
     assert told.horizontal_m == (
@@ -130,12 +132,12 @@ def test_codes_of_accuracy_are_limits_of_95_percent(code: int, horizontal_m: flo
 
 
 @pytest.mark.parametrize(("code", "time_s"), [(0, None), (1, 0.15), (15, 1.55), (16, None)])
-def test_the_accuracy_of_the_stamp_is_in_tenths(code: int, time_s: float | None) -> None:
+def test_timestamp_accuracy_is_in_tenths_of_a_second(code: int, time_s: float | None) -> None:
     told = reported(location(timestamp_accuracy=code)).accuracy
     assert told is not None and told.time_s == (time_s and pytest.approx(time_s))
 
 
-def test_heights_by_pressure_are_taken_where_there_is_no_other() -> None:
+def test_pressure_altitude_is_used_without_a_geometric_one() -> None:
     by_pressure = reported(location(altitude_geodetic=-1000.0, altitude_barometric=80.0))
     assert (by_pressure.alt_m, by_pressure.alt_datum) == (80.0, AltitudeDatum.PRESSURE)
     flat = said(location(altitude_geodetic=-1000.0))
@@ -143,7 +145,7 @@ def test_heights_by_pressure_are_taken_where_there_is_no_other() -> None:
     assert said(location(latitude=0, longitude=0)).report is None
 
 
-def test_a_stamp_of_the_hour_goes_on_over_the_hour() -> None:
+def test_hourly_stamp_is_unwrapped() -> None:
     """Differences between stamps equal differences between times, across the hour."""
     hour_ns = 1_700_000_000 * S // (3600 * S) * 3600 * S
     before = reported(location(timestamp=3599.0), hour_ns - S // 2).boot_ms
@@ -162,13 +164,13 @@ def test_a_stamp_of_the_hour_goes_on_over_the_hour() -> None:
         packed(NAMED, PACKED[:5] + struct.pack("<i", 2_000_000_000) + PACKED[9:]),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused(message: Any) -> None:
+def test_implausible_messages_are_rejected(message: Any) -> None:
     found = decode(framed(message))
     assert isinstance(found, Rejection)
     assert found.reason is Reason.MALFORMED and found.detail
 
 
-def test_a_vehicles_own_words_to_its_transmitter_are_not_read() -> None:
+def test_messages_from_vehicle_to_transmitter_are_ignored() -> None:
     assert decode(framed(location(mac=b""), source=Source(1, 1))) is None
     assert (
         decode(framed(location(mac=b""))) is None
@@ -177,7 +179,7 @@ def test_a_vehicles_own_words_to_its_transmitter_are_not_read() -> None:
     assert decode(framed(packed(NAMED, PACKED, mac=b""), source=Source(1, 1))) is None
 
 
-def test_ids_that_are_no_text_are_hexadecimal() -> None:
+def test_non_text_ids_are_hexadecimal() -> None:
     assert said(basic_id(b"N.123-x", 2)).uas_id == "N.123-x"
     for text, kind in ((b"\xff\0\x01", 1), (b"a b", 1), (b"../etc", 2), (b"abc", 3), (b"\x01", 4)):
         found = said(basic_id(text, kind)).uas_id
@@ -197,7 +199,7 @@ def refused(found: Any) -> Reason:
     return found.reason
 
 
-def test_a_position_is_that_of_the_name_that_was_heard_from_its_address() -> None:
+def test_position_gets_the_id_received_from_its_address() -> None:
     ids = RemoteIds()
     assert refused(named(ids, location())) is Reason.NO_IDENTITY
     assert named(ids, basic_id()) is None
@@ -208,14 +210,14 @@ def test_a_position_is_that_of_the_name_that_was_heard_from_its_address() -> Non
     assert named(ids, packed(NAMED, PACKED, mac=b"\x01")).uav == "rid:1588E0123456789ABCDE"
 
 
-def test_a_serial_number_is_better_than_the_name_of_a_flight() -> None:
+def test_serial_number_is_preferred_to_a_session_id() -> None:
     ids = RemoteIds()
     for text, kind, name in ((b"x", 4, "78" + 19 * "00"), (b"N1", 2, "N1"), (b"x", 4, "N1")):
         named(ids, basic_id(text, kind))
         assert named(ids, location()).uav == f"rid:{name}"
 
 
-def test_a_name_holds_while_its_address_is_heard() -> None:
+def test_id_expires_with_its_address() -> None:
     ids = RemoteIds()
     named(ids, basic_id(), 0)
     assert isinstance(named(ids, location(), NAMED_NS), Report)
@@ -223,7 +225,7 @@ def test_a_name_holds_while_its_address_is_heard() -> None:
     assert refused(named(ids, location(), 3 * NAMED_NS + 1)) is Reason.NO_IDENTITY
 
 
-def test_who_stands_for_several_aircraft_has_no_position_that_is_ones() -> None:
+def test_group_remote_id_is_rejected_as_shared() -> None:
     ids = RemoteIds()
     assert refused(named(ids, packed(NAMED, PACKED, GROUP))) is Reason.SHARED_ID
     system = dialect.MAVLink_open_drone_id_system_message(
@@ -233,7 +235,7 @@ def test_who_stands_for_several_aircraft_has_no_position_that_is_ones() -> None:
     assert isinstance(named(ids, location()), Report)
 
 
-def test_heights_of_two_datums_are_not_mixed() -> None:
+def test_altitudes_of_two_datums_are_not_mixed() -> None:
     ids = RemoteIds()
     by_pressure = location(altitude_geodetic=-1000.0, altitude_barometric=80.0)
     named(ids, basic_id(), 0)
@@ -243,7 +245,7 @@ def test_heights_of_two_datums_are_not_mixed() -> None:
     assert refused(named(ids, location(altitude_geodetic=-1000.0), S)) is Reason.NO_ALTITUDE
 
 
-def test_made_up_addresses_take_no_memory() -> None:
+def test_invented_addresses_use_bounded_memory() -> None:
     ids = RemoteIds()
     for number in range(ADDRESSES_MAX + 10):
         named(ids, basic_id(mac=(number + 1).to_bytes(4, "big")))
@@ -251,7 +253,7 @@ def test_made_up_addresses_take_no_memory() -> None:
 
 
 @given(st.sampled_from(sorted(READ)), st.binary(max_size=249), st.integers(235, 239))
-def test_no_payload_is_a_defect(msgid: int, payload: bytes, compid: int) -> None:
+def test_arbitrary_payloads_never_raise(msgid: int, payload: bytes, compid: int) -> None:
     source = Source(9, compid)
     frame = Frame(
         t_ns=7,
@@ -267,7 +269,7 @@ def test_no_payload_is_a_defect(msgid: int, payload: bytes, compid: int) -> None
 
 
 @given(st.lists(st.binary(min_size=25, max_size=25), min_size=1, max_size=9))
-def test_no_pack_is_a_defect(messages: list[bytes]) -> None:
+def test_arbitrary_message_packs_never_raise(messages: list[bytes]) -> None:
     payload = bytes(2) + MAC.ljust(20, b"\0") + bytes([25, len(messages)]) + b"".join(messages)
     frame = Frame(
         t_ns=7,

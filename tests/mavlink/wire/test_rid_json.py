@@ -66,7 +66,7 @@ def said(data: bytes) -> RemoteId:
     return found
 
 
-def test_dronescouts_object_is_read_as_pymavlink_reads_its_frames() -> None:
+def test_dronescout_object_decodes_like_pymavlink() -> None:
     frames = [one for one in fed(scouted(uas_data())) if isinstance(one, Frame)]
     mav: Any = dialect.MAVLink(None)
     named, group, placed = [mav.decode(bytearray(one.raw)) for one in frames]
@@ -87,7 +87,7 @@ def test_dronescouts_object_is_read_as_pymavlink_reads_its_frames() -> None:
     assert (placed.timestamp, placed.timestamp_accuracy, group.area_count) == (1234.5, 1, 1)
 
 
-def test_rid_captures_object_has_no_accuracy_but_that_of_its_seconds() -> None:
+def test_rid_capture_object_has_only_a_time_accuracy() -> None:
     found = said(CAPTURED)
     assert found.report is not None and found.heard_as == MAC.replace(":", "")
     assert (found.report.lat_deg, found.report.lon_deg) == pytest.approx((51.5, -0.1))
@@ -111,11 +111,11 @@ def test_rid_captures_object_has_no_accuracy_but_that_of_its_seconds() -> None:
         ({"stamp": 65535.0}, "boot_ms", None), ({"climb": math.nan}, "velocity_down_mps", None),
     ],
 )  # fmt: skip
-def test_what_is_unknown_is_none(changed: Any, field: str, value: Any) -> None:
+def test_unknown_fields_are_none(changed: Any, field: str, value: Any) -> None:
     assert getattr(said(scouted(uas_data(**changed))).report, field) is value
 
 
-def test_codes_that_have_no_meaning_are_unknown() -> None:
+def test_undefined_accuracy_codes_are_unknown() -> None:
     for code in (-1, 16, 99, 2**31 - 1):
         report = said(scouted(uas_data(horizontal=code, vertical=code, time=code))).report
         assert report is not None and report.accuracy is not None
@@ -133,7 +133,7 @@ def test_codes_that_have_no_meaning_are_unknown() -> None:
         CAPTURED.replace(b"51.500000", b"NaN"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_is_refused(data: bytes) -> None:
+def test_implausible_messages_are_rejected(data: bytes) -> None:
     (found,) = fed(data)
     assert isinstance(found, Rejection), found
     assert found.reason is Reason.MALFORMED and found.detail
@@ -142,7 +142,7 @@ def test_what_cannot_be_is_refused(data: bytes) -> None:
 @pytest.mark.parametrize(
     "data", [b"x", b"[]", b"{", b"\xff\xfe", b"[" * 5000, b'{"mac": ' + b"9" * 5000 + b"}"]
 )
-def test_what_is_no_object_is_counted_in_bytes(data: bytes) -> None:
+def test_invalid_json_object_is_counted_in_bytes(data: bytes) -> None:
     assert fed(data + b"\n") == [
         Rejection(t_ns=7, source="rid:x", reason=Reason.GARBAGE, count=len(data) + 1)
     ]
@@ -152,7 +152,7 @@ STREAM = CAPTURED + scouted(uas_data()) + b"\n" + CAPTURED.strip()
 
 
 @given(st.lists(st.integers(1, len(STREAM) - 1), max_size=9))
-def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
+def test_split_input_gives_the_same_result(cuts: list[int]) -> None:
     at = [0, *sorted(cuts), len(STREAM)]
     splitter = RidJson("x")
     pieces = [STREAM[a:b] for a, b in pairwise(at)]
@@ -162,7 +162,7 @@ def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
     assert splitter.finish(8) == []
 
 
-def test_an_object_without_an_end_takes_no_memory() -> None:
+def test_endless_object_uses_bounded_memory() -> None:
     splitter = RidJson("x")
     found = [one for _ in range(500) for one in splitter.feed(7, b'{"a":"' + b"M" * 200)]
     assert len(splitter._pending) <= OBJECT_MAX
@@ -173,10 +173,10 @@ def test_an_object_without_an_end_takes_no_memory() -> None:
 
 
 @given(st.binary(max_size=920).map(scouted) | st.binary(max_size=60))
-def test_no_bytes_are_a_defect(data: bytes) -> None:
+def test_arbitrary_bytes_never_raise(data: bytes) -> None:
     for found in fed(data + b"\n"):
         assert isinstance(found, Rejection) or isinstance(decode(found), RemoteId | Rejection)
 
 
-def test_frames_are_of_no_system_and_a_receiver_s_component() -> None:
+def test_rid_frames_use_system_0_and_a_receiver_component() -> None:
     assert Source(sysid=0, compid=236) == SENDER

@@ -62,7 +62,7 @@ def refused(text: str | bytes) -> Rejection:
     return found
 
 
-def test_a_published_stream_is_read_as_it_is_described() -> None:
+def test_published_sbs_stream_decodes() -> None:
     """Decoded by pymavlink; feet, knots and feet per minute are 0.3048 m, 1852 m/h and
     0.00508 m/s.
     """
@@ -87,14 +87,14 @@ def test_a_published_stream_is_read_as_it_is_described() -> None:
     assert [one.tslc for one in (placed, other)] == [0, 1]
 
 
-def test_a_line_that_was_held_back_is_old() -> None:
+def test_delayed_line_has_its_age() -> None:
     assert said(LATE).tslc_s == 255  # 300 s, limited to the field's maximum
     assert said(CALLED).tslc_s == 2
     assert said(line(f7="14:59:00.000")).tslc_s == 0  # from the future
     assert said(line(f6="", f7="")).tslc_s == 0
 
 
-def test_what_a_line_does_not_say_is_unknown() -> None:
+def test_fields_missing_from_a_line_are_unknown() -> None:
     called = said(CALLED)
     assert (called.callsign, called.uav) == ("BAW4J", "icao:4006B3")
     assert called.position_deg is called.alt_m is called.velocity_ne_mps is None
@@ -115,13 +115,13 @@ def test_what_a_line_does_not_say_is_unknown() -> None:
         {"f11": "9" * 400}, {"f10": "\xe9"},
     ],
 )  # fmt: skip
-def test_fields_that_cannot_be_are_refused(fields: dict[str, str]) -> None:
+def test_malformed_fields_are_rejected(fields: dict[str, str]) -> None:
     found = refused(line(**fields))
     assert (found.reason, found.source) == (Reason.MALFORMED, "sbs:radar:30003")
     assert found.detail
 
 
-def test_what_is_no_line_is_counted_in_bytes() -> None:
+def test_invalid_line_is_counted_in_bytes() -> None:
     assert refused("GET / HTTP/1.1") == Rejection(
         t_ns=7, source="sbs:radar:30003", reason=Reason.GARBAGE, count=16
     )
@@ -133,7 +133,7 @@ def test_what_is_no_line_is_counted_in_bytes() -> None:
     assert ended.finish(8) == [Rejection(t_ns=8, source="x", reason=Reason.GARBAGE, count=5)]
 
 
-def test_a_line_without_an_end_takes_no_memory() -> None:
+def test_endless_line_uses_bounded_memory() -> None:
     splitter = SbsSplitter("x")
     found = [one for _ in range(1000) for one in splitter.feed(7, b"M" * 100)]
     counted = sum(one.count for one in found if isinstance(one, Rejection))
@@ -148,7 +148,7 @@ def test_a_line_without_an_end_takes_no_memory() -> None:
 
 
 @given(st.lists(st.integers(1, len(PUBLISHED) - 1), max_size=20))
-def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
+def test_split_input_gives_the_same_result(cuts: list[int]) -> None:
     at = [0, *sorted(cuts), len(PUBLISHED)]
     splitter = SbsSplitter("x")
     pieces = [PUBLISHED[a:b] for a, b in pairwise(at)]
@@ -157,12 +157,12 @@ def test_pieces_say_what_the_whole_says(cuts: list[int]) -> None:
 
 
 @given(st.binary(max_size=200) | st.text(max_size=80).map(lambda text: f"MSG,{text}".encode()))
-def test_no_bytes_are_a_defect(data: bytes) -> None:
+def test_arbitrary_bytes_never_raise(data: bytes) -> None:
     for found in fed(data):
         assert isinstance(found, Rejection) or isinstance(decode(found), AdsbVehicle | Rejection)
 
 
-def test_an_aircraft_that_a_mavlink_relay_hears_too_stays_one() -> None:
+def test_aircraft_also_relayed_over_mavlink_stays_one_track() -> None:
     pipeline = Pipeline(Settings().override(center={"source": "51.4,-1.0,100"}))
     relay: Any = dialect.MAVLink(None, srcSystem=9, srcComponent=156)
     flags = dialect.ADSB_FLAGS_VALID_COORDS | dialect.ADSB_FLAGS_VALID_ALTITUDE

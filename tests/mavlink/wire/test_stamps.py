@@ -26,14 +26,14 @@ def place(message: type[dialect.MAVLink_message]) -> int | None:
     return None
 
 
-def test_the_table_is_the_dialects() -> None:
+def test_stamp_table_matches_the_dialect() -> None:
     found = {number: place(message) for number, message in dialect.mavlink_map.items()}
     stamped = {number: at for number, at in found.items() if at is not None}
     assert {n: at for n, at in stamped.items() if n not in SETPOINTS} == STAMPED
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_a_stamp_is_read_as_pymavlink_packs_it(version: int) -> None:
+def test_stamp_decodes_like_pymavlink(version: int) -> None:
     """MAVLink 2 truncates trailing zeros of a payload."""
     sender = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
     message = dialect.MAVLink_system_time_message(1_700_000_000_000_000, 70_000)
@@ -41,7 +41,7 @@ def test_a_stamp_is_read_as_pymavlink_packs_it(version: int) -> None:
     assert boot_ms(Frame(t_ns=0, link="udp", source=Source(1, 1), msgid=2, raw=raw)) == 70_000
 
 
-def test_a_payload_that_ends_before_its_stamp_has_zeros() -> None:
+def test_truncated_payload_has_a_stamp_of_zero() -> None:
     payload = struct.pack("<Q", 1)
     raw = bytes((0xFD, len(payload), 0, 0, 0, 1, 1, 2, 0, 0)) + payload + b"\0\0"
     assert boot_ms(Frame(t_ns=0, link="udp", source=Source(1, 1), msgid=2, raw=raw)) == 0

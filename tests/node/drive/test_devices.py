@@ -95,7 +95,7 @@ def factor(gain: int, i: int, q: int) -> complex:
     return amplitude * turned / abs(turned)
 
 
-def test_registers_of_chips_radiate_what_the_text_says(
+def test_chip_registers_radiate_the_table(
     spidev: dict[tuple[int, int], Chip], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     shot, read, _ = flown
@@ -125,7 +125,7 @@ def test_registers_of_chips_radiate_what_the_text_says(
     assert all(chip.closed for chip in spidev.values())
 
 
-def test_an_attenuated_channel_is_15_db_down(
+def test_attenuated_channel_is_15_db_down(
     spidev: dict[tuple[int, int], Chip], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     registers = flown[0].registers
@@ -146,7 +146,7 @@ def test_an_attenuated_channel_is_15_db_down(
     assert 20 * np.log10(got) == pytest.approx([0, -15, 0, -15])
 
 
-def test_too_few_chips_are_a_mistake_of_one_line(
+def test_too_few_chips_are_rejected(
     spidev: dict[tuple[int, int], Chip], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     device = targets.device("adar1000:0.0", print, list)
@@ -162,7 +162,7 @@ def test_too_few_chips_are_a_mistake_of_one_line(
         drive.run(threading.Event())
 
 
-def test_a_line_that_is_not_there_is_tried_again_each_second(
+def test_missing_spi_bus_is_retried_each_second(
     spidev: dict[tuple[int, int], Chip], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     clock, said = Ticking(), list[str]()
@@ -201,7 +201,7 @@ MAP = {"BEAM0": [7, 8, 5, 6], "BEAM1": [3, 4, 1, 2]}
 """Element of each channel of both chips, as in Analog Devices' class."""
 
 
-def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
+def test_phaser_receives_table_codes_with_one_latch_per_update(
     iio: list[tuple[str, str, str]], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     shot, read, text = flown
@@ -240,7 +240,7 @@ def test_a_phaser_gets_the_codes_of_the_text_and_one_latch_an_update(
     assert read.uavs == ("1:1", "2:1", "3:1", "4:1") or "3:1" in read.uavs
 
 
-def test_an_array_that_is_no_phaser_is_refused(
+def test_array_of_wrong_size_for_a_phaser_is_rejected(
     iio: list[tuple[str, str, str]], flown: tuple[DeviceCommand, Any, str]
 ) -> None:
     shot = flown[0]
@@ -261,7 +261,7 @@ def test_an_array_that_is_no_phaser_is_refused(
         drive.step()
 
 
-def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
+def test_phaser_memory_holds_the_codebook_and_updates_select_a_beam(
     iio: list[tuple[str, str, str]],
 ) -> None:
     settings = EIGHT.override(codebook={"kind": "dft", "oversampling": 4})
@@ -317,7 +317,7 @@ def test_a_phaser_s_memory_holds_the_codebook_and_an_update_names_a_beam(
     assert {value for key, value in saved.items() if key.endswith("/120")} == {"120, 0, 0, 0.0"}
 
 
-def test_beams_of_another_codebook_are_not_pointed_to() -> None:
+def test_stored_beams_of_a_different_codebook_are_not_selected() -> None:
     beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
     beam |= {"uav": "1:1", "codebook": {"best": 3}}
     told = {"unfit": None, "beams": [beam], "codebook_beams": 64}
@@ -335,7 +335,7 @@ def test_beams_of_another_codebook_are_not_pointed_to() -> None:
         assert shot.unfit == "codebook of the service differs from --config, or is missing"
 
 
-def test_a_mount_looks_at_the_middle_of_several(flown: tuple[DeviceCommand, Any, str]) -> None:
+def test_mount_points_at_the_centre_of_several_uavs(flown: tuple[DeviceCommand, Any, str]) -> None:
     """Against their own directions and positions; unwanted UAVs do not count."""
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
@@ -368,7 +368,7 @@ def test_a_mount_looks_at_the_middle_of_several(flown: tuple[DeviceCommand, Any,
 
 
 @pytest.mark.parametrize(("lon_deg", "middle_deg"), [((179.9, -179.7), -179.9), ((7.0, 8.0), 7.5)])
-def test_a_middle_is_between_also_at_the_edge_of_the_map(
+def test_centre_of_uavs_is_correct_across_180_degrees_east(
     lon_deg: tuple[float, float], middle_deg: float
 ) -> None:
     one = {
@@ -391,7 +391,7 @@ def test_a_middle_is_between_also_at_the_edge_of_the_map(
     assert "as they surround the array" in (command_for(told, None, wanted, 0).unfit or "")
 
 
-def test_what_a_phaser_cannot_store_is_said() -> None:
+def test_codebook_too_large_for_a_phaser_is_rejected() -> None:
     array = assembly.array(EIGHT)
     with pytest.raises(UserError, match="no stored beams"):
         stored_registers(array, assembly.equipment(EIGHT, array))
@@ -433,7 +433,7 @@ class Recorder:
         self.did.append("close")
 
 
-def test_a_device_rests_once_while_there_is_nothing_and_at_the_end() -> None:
+def test_device_rests_once_without_beams_and_at_the_end() -> None:
     clock = Ticking()
     device, said = Recorder(clock), list[str]()
     fit, stale = (
@@ -461,7 +461,7 @@ def test_a_device_rests_once_while_there_is_nothing_and_at_the_end() -> None:
     ]
 
 
-def test_the_lead_is_the_device_s_own_time_and_late_ones_are_counted() -> None:
+def test_lead_is_the_measured_device_time_and_late_updates_are_counted() -> None:
     clock = Ticking()
     device, source = (
         Recorder(clock, 0.03),
@@ -483,7 +483,7 @@ def test_the_lead_is_the_device_s_own_time_and_late_ones_are_counted() -> None:
     assert told.late == 5  # the first lead is 0
 
 
-def test_a_device_that_fails_is_opened_again_and_rests_again() -> None:
+def test_failed_device_is_reopened_and_rests_again() -> None:
     clock = Ticking()
     device, said = Recorder(clock), list[str]()
     source = Always(
@@ -523,12 +523,12 @@ def test_a_device_that_fails_is_opened_again_and_rests_again() -> None:
         "phaser-memory:",
     ],
 )
-def test_a_target_that_is_none_is_refused(target: str) -> None:
+def test_invalid_target_is_rejected(target: str) -> None:
     with pytest.raises(UserError, match=r"is not (a device|[a-z0-9-]+:)"):
         targets.device(target, print, list)
 
 
-def test_who_is_not_in_the_device_s_table_has_nothing_applied() -> None:
+def test_uav_missing_from_the_device_table_is_not_applied() -> None:
     beam = dict.fromkeys(("bearing_deg", "above_horizon_deg", "lat_deg", "lon_deg", "alt_m"), 0.0)
     told = {"unfit": None, "beams": [beam | {"uav": "1:1"}], "codebook_beams": None}
     shot = command_for(

@@ -28,7 +28,7 @@ def message(sock: socket.socket) -> tuple[Any, Any]:
     return dialect.MAVLink(None).decode(bytearray(data)), sender
 
 
-def test_it_is_told_where_to_look(heard: socket.socket) -> None:
+def test_gimbal_receives_pitch_and_yaw(heard: socket.socket) -> None:
     port = heard.getsockname()[1]
     gimbal = targets.device(f"gimbal:127.0.0.1:{port}:7:154", print, list)
     gimbal.open()
@@ -59,7 +59,7 @@ def test_it_is_told_where_to_look(heard: socket.socket) -> None:
         gimbal.apply(DeviceCommand(valid_at_ns=0, unfit=None))
 
 
-def test_it_is_told_places_where_it_is_asked_to(heard: socket.socket) -> None:
+def test_gimbal_receives_positions_when_configured(heard: socket.socket) -> None:
     port = heard.getsockname()[1]
     gimbal = targets.device(f"gimbal-roi:127.0.0.1:{port}:7:154", print, list)
     gimbal.open()
@@ -87,7 +87,7 @@ def test_it_is_told_places_where_it_is_asked_to(heard: socket.socket) -> None:
 
 
 @pytest.mark.parametrize(("from_north", "sysid"), [(True, 7), (False, 7), (True, 8)])
-def test_its_lag_is_found_from_its_attitude(
+def test_gimbal_lag_is_estimated_from_its_attitude(
     heard: socket.socket, from_north: bool, sysid: int
 ) -> None:
     """Across north, where angles wrap; attitudes relative to the vehicle or of another vehicle's
@@ -120,7 +120,7 @@ def test_its_lag_is_found_from_its_attitude(
     gimbal.close()
 
 
-def test_a_gimbal_is_not_muted() -> None:
+def test_gimbal_does_not_support_mute() -> None:
     with pytest.raises(UserError, match="does not support mute; choose hold or boresight"):
         targets.device("gimbal:127.0.0.1:1:1:154", print, list).check(SafeState.MUTE)
 
@@ -129,6 +129,6 @@ def test_a_gimbal_is_not_muted() -> None:
     "target",
     ["gimbal:here", "gimbal:h:1:1", "gimbal:h:0:1:1", "gimbal:h:1:256:1", "gimbal-roi:h:1:1"],
 )
-def test_what_is_no_gimbal_is_refused(target: str) -> None:
+def test_invalid_gimbal_target_is_rejected(target: str) -> None:
     with pytest.raises(UserError, match="is not gimbal"):
         targets.device(target, print, list)

@@ -127,7 +127,7 @@ def bearing_deg(flown: Any, uav: str, t_s: float) -> float:
 @pytest.mark.full
 @pytest.mark.parametrize("smooth", [False, True], ids=["dead time", "smoothing"])
 @pytest.mark.parametrize("name", ["waypoints", "racetrack"])
-def test_a_mount_is_off_by_half_of_what_one_is_that_follows_reports(
+def test_mount_error_is_half_that_of_following_reports(
     serving: Any, name: str, smooth: bool
 ) -> None:
     flown = {"waypoints": scenario.waypoints, "racetrack": scenario.racetrack}[name](3)
@@ -206,7 +206,7 @@ def opened(port: int) -> Rotator:
     raise AssertionError("rotctld does not listen")
 
 
-def test_hamlib_s_dummy_is_driven_within_its_limits(rotctld: int) -> None:
+def test_hamlib_dummy_is_driven_within_its_limits(rotctld: int) -> None:
     rotator = opened(rotctld)
     assert rotator._limits_deg == (-180.0, 450.0, 0.0, 90.0)
     rotator.apply(
@@ -237,7 +237,7 @@ def test_hamlib_s_dummy_is_driven_within_its_limits(rotctld: int) -> None:
         rotator.apply(DeviceCommand(valid_at_ns=0, unfit=None))
 
 
-def test_the_nearest_turn_within_the_limits_is_taken() -> None:
+def test_nearest_equivalent_azimuth_within_limits_is_chosen() -> None:
     rotator = Rotator("127.0.0.1", 1)
     rotator._limits_deg = (-180.0, 450.0, 0.0, 90.0)
     near = [rotator._near(azimuth) for azimuth in (350.0, 10.0, 100.0, 170.0, 260.0)]
@@ -246,18 +246,18 @@ def test_the_nearest_turn_within_the_limits_is_taken() -> None:
     assert rotator._near(95.0) == 95.0 + 360.0 * (95.0 + 360.0 <= 450.0)
 
 
-def test_a_rotator_radiates_nothing_that_could_be_muted() -> None:
+def test_rotator_does_not_support_mute() -> None:
     with pytest.raises(UserError, match="does not support mute; choose hold or boresight"):
         Rotator("127.0.0.1", 1).check(SafeState.MUTE)
 
 
-def test_nobody_listens() -> None:
+def test_unreachable_rotator_is_a_device_error() -> None:
     with pytest.raises(DeviceError, match="Connection refused"):
         Rotator("127.0.0.1", 1).open()
 
 
 @pytest.mark.parametrize("lag_s", [0.05, 0.2, 0.7])
-def test_a_lag_is_found_from_reports(lag_s: float) -> None:
+def test_lag_is_estimated_from_position_reports(lag_s: float) -> None:
     lag, rng = MountLag(), np.random.default_rng(1)
 
     def at_rad(t_s: float) -> float:
@@ -270,7 +270,7 @@ def test_a_lag_is_found_from_reports(lag_s: float) -> None:
     assert lag.lag_s == pytest.approx(lag_s, abs=0.03)
 
 
-def test_a_lag_is_found_where_reports_count_from_another_turn() -> None:
+def test_lag_is_estimated_across_full_turns() -> None:
     lag = MountLag()
     for n in range(100):
         t_s = 0.1 * n
@@ -279,7 +279,7 @@ def test_a_lag_is_found_where_reports_count_from_another_turn() -> None:
     assert lag.lag_s == pytest.approx(0.4, abs=0.02)
 
 
-def test_a_mount_that_stands_still_shows_no_lag() -> None:
+def test_stationary_mount_has_no_lag() -> None:
     lag = MountLag()
     for n in range(200):
         lag.note_command(n * 100_000_000, 1.0)
@@ -287,7 +287,7 @@ def test_a_mount_that_stands_still_shows_no_lag() -> None:
     assert lag.lag_s == 0.0
 
 
-def test_a_mount_that_goes_its_own_way_has_no_lag() -> None:
+def test_mount_with_unrelated_motion_has_no_lag() -> None:
     lag, rng = MountLag(), np.random.default_rng(3)
     for n in range(200):
         lag.note_command(n * 50_000_000, math.sin(0.5 * n * 0.05))

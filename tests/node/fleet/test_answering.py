@@ -19,7 +19,7 @@ def looks(kept: Unanswered, begin_s: int, end_s: int, heard_ns: dict[str, int]) 
     return found
 
 
-def test_who_is_there_and_never_answers_is_mute_ever_more_rarely() -> None:
+def test_unresponsive_node_is_reported_with_growing_intervals() -> None:
     kept = Unanswered(PATIENCE_NS)
     kept.alive.add("south")
     found = looks(kept, 0, 400, {})
@@ -29,7 +29,7 @@ def test_who_is_there_and_never_answers_is_mute_ever_more_rarely() -> None:
     assert set(waits[3:]) == {PATIENCE_MAX_NS // S}
 
 
-def test_who_answers_is_not_mute() -> None:
+def test_answering_node_is_not_unresponsive() -> None:
     kept = Unanswered(PATIENCE_NS)
     kept.alive.add("south")
     assert looks(kept, 0, 6, {}) == []
@@ -37,7 +37,7 @@ def test_who_answers_is_not_mute() -> None:
     assert looks(kept, 6, 14, {}) == [12]
 
 
-def test_after_a_long_calm_the_next_comes_as_soon_as_the_first() -> None:
+def test_report_interval_resets_after_a_calm_period() -> None:
     kept = Unanswered(PATIENCE_NS)
     kept.alive.add("south")
     assert looks(kept, 0, 7, {}) == [6]
@@ -47,7 +47,7 @@ def test_after_a_long_calm_the_next_comes_as_soon_as_the_first() -> None:
     assert looks(kept, 620, 640, {}) == [626, 638]
 
 
-def test_names_that_somebody_makes_up_cost_one_session_a_minute() -> None:
+def test_invented_node_names_cost_at_most_one_session_per_minute() -> None:
     kept = Unanswered(PATIENCE_NS)
     found = 0
     for second in range(600):
@@ -58,12 +58,12 @@ def test_names_that_somebody_makes_up_cost_one_session_a_minute() -> None:
     assert found <= 13
 
 
-def test_who_is_heard_but_shows_no_sign_of_life_is_there_as_well() -> None:
+def test_node_with_messages_but_without_liveliness_counts_as_present() -> None:
     kept = Unanswered(PATIENCE_NS)
     assert looks(kept, 0, 20, {"south": 19 * S}) == [6, 18]
 
 
-def test_who_is_not_there_is_gone_and_not_mute() -> None:
+def test_absent_node_is_gone_rather_than_unresponsive() -> None:
     kept = Unanswered(PATIENCE_NS)
     assert looks(kept, 0, 20, {"south": -10 * S}) == []
     assert kept.gone(0, {"south": -PATIENCE_NS, "west": -PATIENCE_NS - 1}) == ["west"]
@@ -71,7 +71,7 @@ def test_who_is_not_there_is_gone_and_not_mute() -> None:
     assert kept.gone(0, {"west": -PATIENCE_NS - 1}) == []
 
 
-def test_answers_that_wait_for_this_process_are_waited_for() -> None:
+def test_queued_answers_of_a_suspended_process_are_awaited() -> None:
     kept = Unanswered(PATIENCE_NS)
     kept.alive.add("south")
     assert looks(kept, 0, 3, {}) == []

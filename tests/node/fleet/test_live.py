@@ -48,18 +48,18 @@ def node(
         ({"mode": "client"}, "a client needs the address of a router"),
     ],
 )
-def test_settings_that_make_no_sense_together(settings: dict[str, object], said: str) -> None:
+def test_inconsistent_fleet_settings_are_rejected(settings: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         node(**settings)
 
 
 @pytest.mark.parametrize("endpoint", ["foo", "tcp/192.0.2.1:7447"])
-def test_an_endpoint_that_cannot_be_had(endpoint: str) -> None:
+def test_invalid_zenoh_endpoint_is_rejected(endpoint: str) -> None:
     with pytest.raises(UserError, match="Zenoh"):
         node(listen=[endpoint]).open()
 
 
-def test_a_port_that_is_taken_is_said_before_anything_runs() -> None:
+def test_port_in_use_is_reported_before_start() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()
@@ -68,18 +68,18 @@ def test_a_port_that_is_taken_is_said_before_anything_runs() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "a/b", "a*", "-a", "x" * 33, "a b"])
-def test_a_name_that_is_none(name: str) -> None:
+def test_invalid_node_name_is_rejected(name: str) -> None:
     with pytest.raises(ValueError, match="node"):
         FleetSettings(node=name)
 
 
-def test_a_node_listens_on_this_machine_alone_unless_told_otherwise() -> None:
+def test_node_listens_on_loopback_by_default() -> None:
     config = bus_config(FleetSettings(node="north"))
     assert config.listen == ("tcp/127.0.0.1:0",)
     assert not config.scouting
 
 
-def test_a_status_tells_what_is_sent_from_what_is_heard() -> None:
+def test_status_separates_sent_from_received_rates() -> None:
     one = node(site="harbour")
     one._sent.bps, one._heard.bps, one.damaged = 1000.0, 2000.0, 3
     found = one.status()
@@ -137,7 +137,7 @@ def wire(monkeypatch: pytest.MonkeyPatch) -> Wire:
     return made
 
 
-def test_an_answer_came_when_zenoh_had_it(wire: Wire) -> None:
+def test_answer_time_is_when_zenoh_received_it(wire: Wire) -> None:
     """However long the event loop was busy afterwards."""
     now_ns = [1000 * S]
 
@@ -159,7 +159,7 @@ def test_an_answer_came_when_zenoh_had_it(wire: Wire) -> None:
     run_async(test())
 
 
-def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
+def test_node_with_the_same_name_is_announced_once_and_ignored(wire: Wire) -> None:
     notices: list[Notice] = []
 
     async def test() -> None:
@@ -183,7 +183,7 @@ def test_another_of_its_name_is_said_once_and_not_heard(wire: Wire) -> None:
 
 
 @pytest.mark.parametrize("loop", LOOPS)
-def test_what_is_heard_is_told_at_once_but_not_too_often(wire: Wire, loop: str) -> None:
+def test_received_reports_are_shared_at_once_with_a_rate_limit(wire: Wire, loop: str) -> None:
     """The second report is held back until it is due, independent of ticks and of the pipeline."""
     now_ns = [1000 * S]
 
@@ -223,7 +223,7 @@ def told(wire: Wire) -> list[Shared]:
     return [messages.to_shared(payload) for what, payload in wire.said if what == "heard"]
 
 
-def test_a_change_of_duty_is_said_at_once_and_a_rival_is_answered(wire: Wire) -> None:
+def test_duty_change_is_published_at_once(wire: Wire) -> None:
     """Two nodes serve a UAV only for one message delay, not until the next periodic message."""
     now_ns, steps = [1000 * S], list[Event]()
 
@@ -256,7 +256,7 @@ def test_a_change_of_duty_is_said_at_once_and_a_rival_is_answered(wire: Wire) ->
     run_async(test())
 
 
-def test_who_is_there_and_does_not_answer_makes_it_connect_anew() -> None:
+def test_unresponsive_neighbour_triggers_reconnection() -> None:
     """A real neighbour that is alive but receives no query."""
     import zenoh
 
@@ -295,7 +295,7 @@ def test_who_is_there_and_does_not_answer_makes_it_connect_anew() -> None:
     assert "no answer from south; reconnecting to all nodes" in notices
 
 
-def test_rates_are_in_bits() -> None:
+def test_rates_are_in_bits_per_second() -> None:
     rate = Rate()
     rate.look(0)
     rate.bytes += 250

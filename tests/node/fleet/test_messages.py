@@ -31,7 +31,7 @@ TRIPS = st.lists(
 
 @given(st.builds(Shared, TIMES, FRAMES.map(tuple), TRIPS.map(tuple)))
 @settings(max_examples=examples(100))
-def test_what_was_heard_comes_back(said: Shared) -> None:
+def test_shared_frames_round_trip(said: Shared) -> None:
     assert messages.to_shared(messages.shared(said)) == said
 
 
@@ -47,7 +47,7 @@ def test_what_was_heard_comes_back(said: Shared) -> None:
     )
 )
 @settings(max_examples=examples(100))
-def test_what_a_node_says_of_itself_comes_back_exactly(said: Standing) -> None:
+def test_node_status_round_trips_exactly(said: Standing) -> None:
     """Bit-exact: nodes that compare values must have the same number."""
     assert messages.to_standing(messages.standing(said), "north") == said
 
@@ -61,13 +61,13 @@ def test_what_a_node_says_of_itself_comes_back_exactly(said: Standing) -> None:
     )
 )
 @settings(max_examples=examples(100))
-def test_offers_come_back(said: list[Offer]) -> None:
+def test_offers_round_trip(said: list[Offer]) -> None:
     assert list(messages.to_offers(messages.offers({o.uav: o for o in said}))) == said
 
 
 @given(st.binary(max_size=400))
 @settings(max_examples=examples(300))
-def test_any_bytes_are_read_or_refused(data: bytes) -> None:
+def test_arbitrary_bytes_are_decoded_or_rejected(data: bytes) -> None:
     for read in (
         messages.to_shared,
         messages.to_offers,
@@ -79,7 +79,7 @@ def test_any_bytes_are_read_or_refused(data: bytes) -> None:
             continue
 
 
-def test_what_cannot_be_is_refused() -> None:
+def test_implausible_messages_are_rejected() -> None:
     def standing(**fields: object) -> bytes:
         made: bytes = schemas.StandingMessage(node="north", **fields).SerializeToString()
         return made
@@ -101,13 +101,13 @@ def test_what_cannot_be_is_refused() -> None:
         messages.to_shared(many)
 
 
-def test_times_that_older_nodes_sent_of_themselves_are_skipped() -> None:
+def test_time_field_of_older_nodes_is_ignored() -> None:
     now = schemas.StandingMessage(node="north", most=3).SerializeToString()
     older = b"\x11" + b"\x01" * 8 + b"\x19" + b"\x02" * 8 + now
     assert messages.to_standing(older, "north") == messages.to_standing(now, "north")
 
 
-def test_the_contract_is_described() -> None:
+def test_message_schema_is_published_and_documented() -> None:
     """Every message is in the published schema and in the documentation."""
     page = (Path(__file__).parents[3] / "docs" / "fleet.md").read_text(encoding="utf-8")
     for name in ("Shared", "Standing", "Offers", "Tracks"):

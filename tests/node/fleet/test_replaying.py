@@ -66,9 +66,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     return [record(folder / "a.mcap", "a", a), record(folder / "b.mcap", "b", b)]
 
 
-def test_each_comes_to_its_digest_and_together_they_say_who_served_whom(
-    recorded: list[Path],
-) -> None:
+def test_fleet_replay_matches_digests_and_lists_serving_nodes(recorded: list[Path]) -> None:
     found: dict[str, Any] = replaying.replay(recorded)
     assert [(node["node"], node["same"]) for node in found["nodes"]] == [("a", True), ("b", True)]
     assert found["uavs"] == 2
@@ -79,7 +77,7 @@ def test_each_comes_to_its_digest_and_together_they_say_who_served_whom(
     assert 0.05 < served["twice"] < 0.2  # both nodes serve 1:1 in the last of 5.5 seconds
 
 
-def test_a_duty_and_a_doubt_come_back_from_a_recording(recorded: list[Path]) -> None:
+def test_duty_and_time_uncertainty_are_read_from_a_recording(recorded: list[Path]) -> None:
     read = list(read_log(recorded[1]))
     assert [event.serves for event in read if isinstance(event, Duty)] == [
         (), ("2:1",), ("1:1", "2:1"),
@@ -88,7 +86,9 @@ def test_a_duty_and_a_doubt_come_back_from_a_recording(recorded: list[Path]) -> 
     assert doubts == {0, 700_000}
 
 
-def test_what_is_no_fleet_is_said(recorded: list[Path], tmp_path: Path) -> None:
+def test_recordings_that_are_not_one_fleet_are_rejected(
+    recorded: list[Path], tmp_path: Path
+) -> None:
     alone = record(tmp_path / "alone.mcap", None, events(0, []))
     with pytest.raises(LogError, match=r"no \[fleet\] node"):
         replaying.replay([recorded[0], alone])
@@ -96,9 +96,7 @@ def test_what_is_no_fleet_is_said(recorded: list[Path], tmp_path: Path) -> None:
         replaying.replay([recorded[0], recorded[0]])
 
 
-def test_the_parts_of_one_run_are_one_recording_in_any_order(
-    recorded: list[Path], tmp_path: Path
-) -> None:
+def test_parts_of_one_run_are_joined_in_any_order(recorded: list[Path], tmp_path: Path) -> None:
     made, settings = events(0, [(0.5, ("1:1", "2:1")), (3.05, ("1:1",))]), fleet_settings("a")
     pipeline, part = Pipeline(settings), Part.first()
     paths = [tmp_path / "one.mcap", tmp_path / "two.mcap"]
@@ -124,7 +122,7 @@ def test_the_parts_of_one_run_are_one_recording_in_any_order(
 
 
 @pytest.mark.parametrize("text", ["fleet = 1", "fleet = [[[[" + "[" * 5000, "[fleet]\nnode = 3"])
-def test_settings_of_others_may_be_anything(
+def test_recorded_settings_without_fleet_are_rejected(
     text: str, recorded: list[Path], tmp_path: Path
 ) -> None:
     with Writer(

@@ -64,7 +64,7 @@ def best(offers: dict[str, dict[str, float]], room: dict[str, int]) -> tuple[int
     },
     ROOM,
 )  # three UAVs swap nodes
-def test_it_is_the_best_of_all(offers: dict[str, dict[str, float]], room: dict[str, int]) -> None:
+def test_assignment_is_optimal(offers: dict[str, dict[str, float]], room: dict[str, int]) -> None:
     found = assign(offers, {}, room, 0.0)
     assert all(uav in offers[node] for uav, node in found.items())
     count, greatest_db = best(offers, room)
@@ -79,7 +79,7 @@ def test_it_is_the_best_of_all(offers: dict[str, dict[str, float]], room: dict[s
 @example(
     {node: {f"{n}:1": 20.0 for n in range(6)} for node in NODES}, {f"{n}:1": "a" for n in range(6)}
 )
-def test_it_is_the_best_wherever_it_begins(
+def test_assignment_is_optimal_from_any_start(
     offers: dict[str, dict[str, float]], held: dict[str, str]
 ) -> None:
     found = assign(offers, held, ROOM, 0.0)
@@ -88,7 +88,7 @@ def test_it_is_the_best_wherever_it_begins(
 
 @given(OFFERS, st.randoms(use_true_random=False))
 @settings(max_examples=examples(100))
-def test_order_of_arrival_means_nothing(
+def test_assignment_does_not_depend_on_offer_order(
     offers: dict[str, dict[str, float]], random: object
 ) -> None:
     mixed = {}
@@ -100,19 +100,19 @@ def test_order_of_arrival_means_nothing(
 
 @given(OFFERS)
 @settings(max_examples=examples(100))
-def test_what_is_assigned_stays(offers: dict[str, dict[str, float]]) -> None:
+def test_assignment_is_stable(offers: dict[str, dict[str, float]]) -> None:
     found = assign(offers, {}, ROOM, 0.0)
     assert assign(offers, found, ROOM, 0.0) == found
 
 
-def test_a_little_better_is_no_reason_to_move() -> None:
+def test_uav_moves_only_for_more_than_the_margin() -> None:
     offers = {"a": {"1:1": 18.0}, "b": {"1:1": 20.5}}
     assert assign(offers, {"1:1": "a"}, ROOM | {"b": 10}, 3.0) == {"1:1": "a"}
     assert assign(offers, {"1:1": "a"}, ROOM, 2.0) == {"1:1": "b"}
     assert assign(offers, {}, ROOM, 3.0) == {"1:1": "b"}
 
 
-def test_load_is_shared() -> None:
+def test_assignment_balances_load() -> None:
     uavs = [f"{n}:1" for n in range(12)]
     offers = {node: dict.fromkeys(uavs, 18.0) for node in NODES}
     found = assign(offers, {}, ROOM, 0.0)
@@ -122,14 +122,14 @@ def test_load_is_shared() -> None:
     assert list(beside.values()).count("a") == 0
 
 
-def test_no_node_has_more_than_its_room() -> None:
+def test_assignment_respects_node_capacity() -> None:
     uavs = [f"{n}:1" for n in range(9)]
     offers = {"a": dict.fromkeys(uavs, 30.0), "b": dict.fromkeys(uavs, 1.0)}
     found = assign(offers, {}, {"a": 2, "b": 4}, 0.0)
     assert sorted(found.values()) == ["a"] * 2 + ["b"] * 4
 
 
-def test_a_full_node_makes_room_for_who_has_no_other() -> None:
+def test_full_node_makes_room_for_uav_without_alternative() -> None:
     offers = {"a": {"1:1": 30.0, "2:1": 20.0, "3:1": 10.0}, "b": {"1:1": 5.0, "2:1": 12.0}}
     held = {"1:1": "a", "2:1": "a"}
     assert assign(offers, held, {"a": 2, "b": 2}, 3.0) == {"1:1": "a", "2:1": "b", "3:1": "a"}
@@ -144,7 +144,7 @@ def test_a_full_node_makes_room_for_who_has_no_other() -> None:
         (None, None, None, None),
     ],
 )
-def test_what_is_only_likely_is_worth_less(
+def test_likely_gain_is_worth_less_than_guaranteed_gain(
     sure: float | None, likely: float | None, sinr: float | None, worth: float | None
 ) -> None:
     assert (
@@ -153,12 +153,12 @@ def test_what_is_only_likely_is_worth_less(
     )
 
 
-def test_where_not_all_have_room_those_have_it_who_gain_most() -> None:
+def test_limited_capacity_goes_to_uavs_with_most_gain() -> None:
     offers = {"a": {"1:1": 30.0, "2:1": 20.0}, "b": {"1:1": 29.0, "3:1": 5.0}}
     assert assign(offers, {}, {"a": 1, "b": 1}, 0.0) == {"2:1": "a", "1:1": "b"}
 
 
-def test_who_moves_away_leaves_a_place() -> None:
+def test_departing_uav_frees_capacity() -> None:
     offers = {"a": {"1:1": 10.0, "2:1": 20.0, "3:1": 30.0}, "b": {"1:1": 20.0, "3:1": 10.0}}
     held = {"1:1": "a", "2:1": "a", "3:1": "b"}
     moved = {"1:1": "b", "2:1": "a", "3:1": "a"}

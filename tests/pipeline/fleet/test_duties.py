@@ -51,7 +51,7 @@ class Pair:
         return [one for _ in range(round(10 * seconds)) for one in self.step(talk, alive)]
 
 
-def test_a_new_fleet_listens_first_and_then_serves_once() -> None:
+def test_new_fleet_listens_before_one_node_serves() -> None:
     pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 25.0}})
     seen = pair.run(5)
     assert not any(seen[: 2 * LEASE_NS // (100 * MS) - 2])
@@ -59,7 +59,7 @@ def test_a_new_fleet_listens_first_and_then_serves_once() -> None:
     assert ["a", "b"] not in seen
 
 
-def test_a_handover_is_made_before_the_old_beam_is_given_up() -> None:
+def test_handover_is_make_before_break() -> None:
     pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
     pair.run(5)
     assert list(pair.nodes["a"].serves) == ["1:1"]
@@ -76,7 +76,7 @@ def test_a_handover_is_made_before_the_old_beam_is_given_up() -> None:
     assert SETTLED_NS <= taken[0].t_ns - began_ns <= SETTLED_NS + S
 
 
-def test_a_node_that_dies_is_followed_at_once() -> None:
+def test_uavs_of_a_failed_node_are_taken_over_at_once() -> None:
     pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
     pair.run(5)
     died_ns = pair.now_ns
@@ -87,7 +87,7 @@ def test_a_node_that_dies_is_followed_at_once() -> None:
     assert taken.t_ns - died_ns <= 200 * MS
 
 
-def test_a_node_that_falls_silent_is_followed_after_its_lease() -> None:
+def test_uavs_of_a_silent_node_are_taken_over_after_its_lease() -> None:
     pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
     pair.run(5)
     silent_ns = pair.now_ns
@@ -96,7 +96,7 @@ def test_a_node_that_falls_silent_is_followed_after_its_lease() -> None:
     assert LEASE_NS <= taken.t_ns - silent_ns <= LEASE_NS + 300 * MS
 
 
-def test_parted_both_serve_and_healed_one_does_and_never_none() -> None:
+def test_partition_lets_both_nodes_serve_and_reunion_leaves_one() -> None:
     for worth in (8.0, 20.0, 26.0):  # less than, equal to and more than the other's
         pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": worth}})
         pair.run(5)
@@ -110,7 +110,7 @@ def test_parted_both_serve_and_healed_one_does_and_never_none() -> None:
         assert [] not in pair.run(6)
 
 
-def test_who_can_serve_it_no_more_hands_it_over_at_once() -> None:
+def test_node_that_cannot_serve_hands_over_at_once() -> None:
     pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
     pair.run(5)
     del pair.offers["a"]["1:1"]
@@ -121,14 +121,14 @@ def test_who_can_serve_it_no_more_hands_it_over_at_once() -> None:
     assert pair.run(1)[-1] == []
 
 
-def test_a_full_node_takes_nobody_more() -> None:
+def test_full_node_accepts_no_more_uavs() -> None:
     pair = Pair({"a": {}, "b": {f"{n}:1": 10.0 for n in range(5)}})
     pair.nodes["b"] = Duties(name="b", most=3, lease_ns=LEASE_NS, hysteresis_db=3.0)
     pair.run(6)
     assert len(pair.nodes["b"].serves) == 3
 
 
-def test_the_second_takes_what_the_first_does_not() -> None:
+def test_second_node_serves_what_the_assigned_node_does_not() -> None:
     """The assigned node may not receive the UAV: the other does not wait for it forever."""
     pair = Pair({"a": {"1:1": 20.0}, "b": {"1:1": 10.0}})
     for _ in range(60):
@@ -161,7 +161,7 @@ class Alone:
             self.duties.decide(self.now_ns, offers, frozenset(trusted))
 
 
-def test_what_a_node_claims_that_is_not_believed_is_served() -> None:
+def test_claims_of_an_excluded_node_are_ignored() -> None:
     node = Alone(a=20.0)
     node.run(5, said("b", ("1:1", 30.0)))
     assert not node.duties.serves
@@ -169,7 +169,7 @@ def test_what_a_node_claims_that_is_not_believed_is_served() -> None:
     assert list(node.duties.serves) == ["1:1"]
 
 
-def test_it_is_handed_to_one_and_not_given_up_for_another() -> None:
+def test_handover_is_released_only_to_its_target() -> None:
     node = Alone(a=20.0, b=10.0, c=10.0)
     node.run(4, said("b"), said("c"))
     node.worth["b"] = 30.0
@@ -183,7 +183,7 @@ def test_it_is_handed_to_one_and_not_given_up_for_another() -> None:
     assert not node.duties.serves
 
 
-def test_who_belongs_elsewhere_by_turns_belongs_nowhere_else_for_long() -> None:
+def test_alternating_best_node_starts_no_handover() -> None:
     node = Alone(a=10.0, b=1.0, c=1.0)
     node.run(4, said("b"), said("c"))
     for better, other in ("bc", "cb", "bc"):
@@ -194,7 +194,7 @@ def test_who_belongs_elsewhere_by_turns_belongs_nowhere_else_for_long() -> None:
     assert node.duties.handing == {"1:1": "b"}
 
 
-def test_of_equals_the_first_by_name_keeps_it() -> None:
+def test_equal_claims_are_kept_by_the_first_node_by_name() -> None:
     node = Alone(a=20.0)
     node.run(4, said("b"))
     node.run(1, said("b", ("1:1", 20.0)))

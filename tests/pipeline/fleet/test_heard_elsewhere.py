@@ -120,7 +120,7 @@ def flown(links: Links) -> tuple[list[tuple[float, float, float]], Pipeline]:
     )
 )
 @settings(max_examples=rounds(4, 60))
-def test_the_bound_holds_behind_the_building(links: Links) -> None:
+def test_bound_holds_with_reports_from_another_node(links: Links) -> None:
     seen, pipeline = flown(links)
     broken = [(t, error, bound) for t, error, bound in seen if error > bound + 0.02]
     assert broken == []
@@ -129,7 +129,7 @@ def test_the_bound_holds_behind_the_building(links: Links) -> None:
     assert any(t > SHADOW_S + 2 for t, _, _ in seen)
 
 
-def test_it_stays_small_and_would_grow_alone() -> None:
+def test_shared_reports_keep_the_bound_small() -> None:
     links = Links(
         uplink_s=0.005,
         jitter_s=0.02,
@@ -146,7 +146,7 @@ def test_it_stays_small_and_would_grow_alone() -> None:
     assert math.isfinite(behind)
 
 
-def test_a_doubt_that_were_forgotten_would_be_seen() -> None:
+def test_neighbour_clock_uncertainty_widens_the_clock_estimate() -> None:
     """The node clock's uncertainty is part of the vehicle's and widens it equally."""
     narrow, wide = (
         flown(
@@ -169,7 +169,7 @@ def test_a_doubt_that_were_forgotten_would_be_seen() -> None:
 
 @pytest.mark.full
 @pytest.mark.parametrize("seed", range(40))
-def test_a_slow_link_between_the_nodes(seed: int) -> None:
+def test_bound_holds_over_a_slow_inter_node_link(seed: int) -> None:
     chance = random.Random(seed)
     links = Links(
         uplink_s=0.002,

@@ -37,7 +37,7 @@ def word(now_ns: int, number: int) -> Shared:
     return Shared(now_ns, (SharedFrame(now_ns - 2 * MS, bytes(message.pack(mav))),))
 
 
-def test_a_node_says_where_its_array_is_and_how_much_it_can_do() -> None:
+def test_node_announces_position_reach_and_capacity() -> None:
     node = member(most=5)
     said = node.own_standing(START_NS + 3 * S, (47.0, 8.0, 400.0), 750.0)
     assert said.node == "a"
@@ -45,7 +45,7 @@ def test_a_node_says_where_its_array_is_and_how_much_it_can_do() -> None:
     assert (said.serves, said.handing) == ((), ())
 
 
-def test_a_word_that_comes_after_its_node_went_is_forgotten_in_the_end() -> None:
+def test_message_after_node_departure_is_eventually_forgotten() -> None:
     node = member()
     node.node_joined(START_NS, "b")
     assert [notice.text for notice in node.node_left(START_NS + S, "b")] == ["node b disconnected"]
@@ -59,7 +59,7 @@ def test_a_word_that_comes_after_its_node_went_is_forgotten_in_the_end() -> None
     assert not node.neighbours
 
 
-def test_who_went_is_remembered_for_a_while_and_in_bounded_number() -> None:
+def test_departed_nodes_are_remembered_in_bounded_number() -> None:
     node = member()
     for number in range(GONE_MAX + 6):
         node.node_joined(START_NS, str(number))
@@ -69,7 +69,7 @@ def test_who_went_is_remembered_for_a_while_and_in_bounded_number() -> None:
     assert next(iter(node.gone)) == "8"
 
 
-def test_an_answer_of_who_went_makes_nobody_known_and_is_no_word() -> None:
+def test_clock_answer_of_a_departed_node_does_not_revive_it() -> None:
     """Zenoh's threads answer for the clock while the node's own loop is stalled."""
     node = member()
     node.read_clock("b", START_NS, START_NS, START_NS + MS, START_NS)
@@ -79,7 +79,7 @@ def test_an_answer_of_who_went_makes_nobody_known_and_is_no_word() -> None:
     assert node.neighbours["b"].heard_ns == START_NS
 
 
-def test_invented_nodes_take_no_room_for_ever() -> None:
+def test_invented_nodes_expire() -> None:
     node = member()
     for number in range(NODES_MAX + 10):
         node.take_standing(START_NS, standing(f"n{number}"))
@@ -91,7 +91,7 @@ def test_invented_nodes_take_no_room_for_ever() -> None:
     assert list(node.neighbours) == ["b"]
 
 
-def test_the_first_answers_of_a_clock_are_not_enough() -> None:
+def test_first_clock_answers_do_not_suffice_to_use_frames() -> None:
     """The uncertainty with which a frame was placed stays with its sender's clock."""
     node, now_ns = member(), START_NS
     node.node_joined(now_ns, "b")
@@ -106,7 +106,7 @@ def test_the_first_answers_of_a_clock_are_not_enough() -> None:
     assert frame.doubt_ns < 6 * MS
 
 
-def test_a_vehicle_that_one_node_alone_hears_is_said_with_that_node() -> None:
+def test_unconfirmed_vehicle_is_reported_with_its_node() -> None:
     node = member()
     own = Witness((0.0, 0.0, 0.0), 1000.0, frozenset())
     offer = Offer(uav="66:1", sure_db=None, likely_db=None, sinr_db=None, heard_s=0.1)
@@ -126,7 +126,7 @@ def test_a_vehicle_that_one_node_alone_hears_is_said_with_that_node() -> None:
     ]
 
 
-def test_who_is_served_elsewhere_is_spared_where_that_is_asked_for() -> None:
+def test_uavs_of_other_nodes_are_protected_when_configured() -> None:
     for nulls, spares in ((True, ("2:1",)), (False, ())):
         node = member(nulls=nulls)
         node.take_standing(START_NS, standing("b", ("2:1",)))
@@ -135,7 +135,7 @@ def test_who_is_served_elsewhere_is_spared_where_that_is_asked_for() -> None:
         assert duty.spares == spares
 
 
-def test_who_is_far_away_is_not_near_and_its_offers_are_not_kept() -> None:
+def test_offers_of_distant_nodes_are_discarded() -> None:
     node = member()
     for name, place in (("b", (47.0, 8.0, 0.0)), ("c", (48.0, 8.0, 0.0))):
         node.take_standing(
@@ -166,7 +166,7 @@ def answered(
     return [notice.text for notice in notices]
 
 
-def test_another_life_of_a_node_has_another_clock() -> None:
+def test_restarted_node_gets_a_new_clock() -> None:
     node = member()
     assert answered(node, START_NS, 0.0, 1) == []
     (text,) = answered(node, START_NS + 10 * S, 100.0, 2)
@@ -178,12 +178,12 @@ def test_another_life_of_a_node_has_another_clock() -> None:
     assert node.trust.is_trusted("b")
 
 
-def test_a_clock_that_is_ahead_is_said_to_be() -> None:
+def test_clock_ahead_is_reported() -> None:
     (text,) = answered(member(), START_NS, -5.0, 1)
     assert text.startswith("node b's clock is 4.998 s ahead of this one's")
 
 
-def test_nothing_is_taken_of_a_node_that_is_not_believed() -> None:
+def test_reports_of_an_excluded_node_are_not_used() -> None:
     node = member()
     answered(node, START_NS, 0.0, START_NS)
     now_ns = START_NS + 2 * S
@@ -193,7 +193,7 @@ def test_nothing_is_taken_of_a_node_that_is_not_believed() -> None:
     assert node.take_shared(now_ns, "b", word(now_ns, 2)) == ([], [])
 
 
-def test_offers_stand_for_some_time() -> None:
+def test_offers_expire() -> None:
     node, now_ns = member(), START_NS
     node.set_offers(
         {"1:1": Offer(uav="1:1", sure_db=10.0, likely_db=10.0, sinr_db=10.0, heard_s=0.1)}

@@ -19,9 +19,7 @@ def standing(east_m: float, reach_m: float | None) -> Standing:
 
 
 @given(st.floats(0, 60_000), st.floats(1, 20_000), st.floats(1, 20_000))
-def test_whose_reach_can_meet_this_one_s_is_near(
-    apart_m: float, own_m: float, its_m: float
-) -> None:
+def test_nodes_with_overlapping_reach_are_near(apart_m: float, own_m: float, its_m: float) -> None:
     found = near(HERE, own_m, {"b": standing(apart_m, its_m)}, NOBODY)
     if apart_m <= max(own_m + its_m, ALWAYS_NEAR_M):
         assert found == {"b"}
@@ -29,26 +27,26 @@ def test_whose_reach_can_meet_this_one_s_is_near(
         assert found == NOBODY
 
 
-def test_who_was_near_stays_so_a_little_farther() -> None:
+def test_nearness_has_hysteresis() -> None:
     others = {"b": standing(0.5 * (ENTER_FACTOR + LEAVE_FACTOR) * 16_000, 8000.0)}
     assert near(HERE, 8000.0, others, NOBODY) == NOBODY
     assert near(HERE, 8000.0, others, frozenset(others)) == {"b"}
 
 
-def test_who_hears_nobody_has_the_reach_of_the_other() -> None:
+def test_node_without_reach_uses_that_of_the_other() -> None:
     for own_m, its_m in ((None, 8000.0), (8000.0, None)):
         assert near(HERE, own_m, {"b": standing(15_900, its_m)}, NOBODY) == {"b"}
         assert near(HERE, own_m, {"b": standing(24_000, its_m)}, NOBODY) == NOBODY
     assert near(HERE, None, {"b": standing(40_000, None)}, NOBODY) == NOBODY
 
 
-def test_neighbours_on_a_site_are_near_though_they_hear_little() -> None:
+def test_nodes_of_one_site_are_near_despite_short_reach() -> None:
     """One UAV circles a mast at 100 m; another mast behind a building receives only that UAV."""
     for own_m, its_m in ((100.0, None), (None, 400.0), (100.0, 200.0), (None, None)):
         assert near(HERE, own_m, {"b": standing(1500, its_m)}, NOBODY) == {"b"}
 
 
-def test_of_whom_nothing_is_known_may_be_near() -> None:
+def test_nodes_of_unknown_position_are_near() -> None:
     lost = Standing(node="b", place=None, reach_m=10.0, most=16, serves=())
     assert near(HERE, 10.0, {"b": lost, "c": None}, NOBODY) == {"b", "c"}
     assert near(None, 10.0, {"b": standing(90_000, 10.0)}, NOBODY) == {"b"}

@@ -24,7 +24,7 @@ START_NS = 1_800_000_000_000_000_000
     asked_ms=st.integers(-2000, 20_000),
 )
 @settings(max_examples=examples(200))
-def test_the_truth_is_within(
+def test_neighbour_clock_interval_contains_the_true_offset(
     offset_ms: int, drift: float, ways: list[tuple[int, int]], asked_ms: int
 ) -> None:
     def remote(t_ns: int) -> int:
@@ -47,7 +47,7 @@ def test_the_truth_is_within(
     assert ahead.width_ns <= best_ns + aged_ns
 
 
-def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
+def test_shared_round_trip_is_not_shortened() -> None:
     clock = NeighbourClock()
     trip = RoundTrip(t_ns=500 * MS, source=Source(1, 1), sent_ns=400 * MS, remote_ns=77)
     assert here(trip, clock) is None
@@ -61,7 +61,7 @@ def test_a_round_trip_of_another_node_is_no_shorter_here() -> None:
     assert placed.remote_ns == 77
 
 
-def test_ways_of_long_ago_say_nothing_of_now() -> None:
+def test_old_link_delays_expire() -> None:
     """A node that shares no vehicle any more has no delays, however slow its last messages were."""
     node = Neighbour(clock=NeighbourClock())
     node.note_delay(START_NS, 900 * MS)

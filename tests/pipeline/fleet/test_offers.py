@@ -42,9 +42,7 @@ def flown() -> tuple[Pipeline, FleetMember, int]:
     raise AssertionError
 
 
-def test_an_offer_is_worth_its_gain_over_the_range(
-    flown: tuple[Pipeline, FleetMember, int],
-) -> None:
+def test_offered_sinr_matches_gain_and_range(flown: tuple[Pipeline, FleetMember, int]) -> None:
     pipeline, member, now_ns = flown
     offers = Offers(pipeline, member.reception.silent_s)
     for _ in range(4):
@@ -65,7 +63,7 @@ def test_an_offer_is_worth_its_gain_over_the_range(
         assert offer.sinr_db == pytest.approx(10 * math.log10(snr) + gain_db, abs=0.4)
 
 
-def test_it_hears_as_far_as_the_farthest_that_it_hears_now(
+def test_reach_is_the_range_of_the_farthest_received_uav(
     flown: tuple[Pipeline, FleetMember, int],
 ) -> None:
     pipeline, member, now_ns = flown

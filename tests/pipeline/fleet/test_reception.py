@@ -38,7 +38,7 @@ def tell(
     return [] if frame is None else hearing.take_shared(now_ns, node, frame, content(frame.raw))
 
 
-def test_a_frame_keeps_its_sender_in_both_versions_of_mavlink() -> None:
+def test_shared_frame_keeps_its_sender_in_both_mavlink_versions() -> None:
     message = common.MAVLink_global_position_int_message(
         5000, 473977000, 85456000, 0, 0, 0, 0, 0, 0
     )
@@ -58,7 +58,7 @@ def hear(hearing: Reception, now_ns: int, boot_ms: int) -> None:
     )
 
 
-def test_of_a_vehicle_that_is_heard_here_nothing_else_is_used() -> None:
+def test_shared_frames_of_a_received_vehicle_are_discarded() -> None:
     hearing = Reception()
     for number in range(20):
         hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
@@ -68,7 +68,7 @@ def test_of_a_vehicle_that_is_heard_here_nothing_else_is_used() -> None:
     assert tell(hearing, now_ns, raw(0, msg="heartbeat"), now_ns - 5 * MS) == []
 
 
-def test_of_one_that_falls_silent_what_was_missed_is_taken_up() -> None:
+def test_missed_frames_of_a_silent_vehicle_are_used() -> None:
     hearing = Reception()
     for number in range(20):
         hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)
@@ -90,7 +90,7 @@ def test_of_one_that_falls_silent_what_was_missed_is_taken_up() -> None:
     assert tell(hearing, 16 * S + 50 * MS, raw(6040), 16 * S + 40 * MS) == []
 
 
-def test_nobody_is_silent_whose_reports_wait_here() -> None:
+def test_vehicle_with_queued_reports_is_not_silent() -> None:
     """An overloaded node would otherwise process every report twice."""
     hearing = Reception()
     for number in range(20):
@@ -104,14 +104,14 @@ def test_nobody_is_silent_whose_reports_wait_here() -> None:
     assert len(tell(hearing, later_ns, raw(3900), later_ns - 5 * MS)) == 2
 
 
-def test_who_was_never_heard_here_is_taken_from_others_once() -> None:
+def test_frames_of_an_unreceived_vehicle_are_used_once() -> None:
     hearing = Reception()
     assert len(tell(hearing, 12 * S, raw(1000), 12 * S - 5 * MS, "b")) == 1
     assert tell(hearing, 12 * S, raw(1000), 12 * S - 5 * MS, "c") == []
     assert len(tell(hearing, 12 * S, raw(1100), 12 * S - 5 * MS, "c")) == 1
 
 
-def test_what_comes_before_it_can_be_heard_is_a_contradiction() -> None:
+def test_shared_frame_from_the_future_is_a_contradiction() -> None:
     hearing = Reception()
     assert tell(hearing, 12 * S, raw(1000), 12 * S + 50 * MS) == []
     assert hearing.early == ["b"]
@@ -121,7 +121,7 @@ def test_what_comes_before_it_can_be_heard_is_a_contradiction() -> None:
     assert hearing.early == ["b"]
 
 
-def test_a_liar_about_a_vehicle_that_is_heard_here_is_seen() -> None:
+def test_false_frames_of_a_received_vehicle_are_detected() -> None:
     hearing = Reception()
     for number in range(80):
         now_ns = 11 * S + number * 100 * MS
@@ -132,7 +132,7 @@ def test_a_liar_about_a_vehicle_that_is_heard_here_is_seen() -> None:
     assert len(hearing.contradicted) >= 3
 
 
-def test_damaged_frames_are_none() -> None:
+def test_damaged_shared_frames_are_discarded() -> None:
     hearing = Reception()
     whole = raw(1000)
     for broken in (b"", whole[:-1], whole[:20] + b"\x55" + whole[21:], whole + b"\0", b"\xfd" * 40):
@@ -142,7 +142,7 @@ def test_damaged_frames_are_none() -> None:
     assert hearing.to_own_timeline(12 * S, "b", clock(), SharedFrame(9 * S, bytes(packed))) is None
 
 
-def test_what_was_missed_between_reports_that_were_heard_is_no_news() -> None:
+def test_frames_missed_between_received_reports_are_not_used() -> None:
     hearing = Reception()
     for number in range(20):
         hear(hearing, 11 * S + number * 100 * MS, 1000 + 100 * number)

@@ -67,7 +67,7 @@ class Nodes:
                 self._on_the_way.append((self.now_ns + self.way_ns, name, frame))
 
 
-def test_one_speaks_for_a_vehicle_that_all_hear() -> None:
+def test_one_node_shares_a_vehicle_that_all_receive() -> None:
     nodes = Nodes(("a", "b", "c"))
     nodes.fly(50, ("a", "b", "c"))
     later = [one for one in nodes.told if one[1] >= 10]
@@ -76,7 +76,7 @@ def test_one_speaks_for_a_vehicle_that_all_hear() -> None:
     assert max(late for _, _, late in later) <= 5 * MS
 
 
-def test_who_alone_hears_a_vehicle_speaks_for_it_at_once() -> None:
+def test_only_receiving_node_shares_a_vehicle_at_once() -> None:
     nodes = Nodes(("a", "b", "c"))
     nodes.fly(20, ("a", "b", "c"))
     nodes.told.clear()
@@ -91,7 +91,7 @@ def test_who_alone_hears_a_vehicle_speaks_for_it_at_once() -> None:
     assert sorted(number for _, number, _ in nodes.told if number >= 50) == list(range(50, 60))
 
 
-def test_far_apart_they_still_find_one_speaker() -> None:
+def test_nodes_with_slow_links_agree_on_one_sharing_node() -> None:
     nodes = Nodes(("a", "b", "c"), way_ns=300 * MS)
     nodes.fly(120, ("a", "b", "c"))
     late = [one for one in nodes.told if one[1] >= 80]
@@ -99,7 +99,7 @@ def test_far_apart_they_still_find_one_speaker() -> None:
     assert {number for _, number, _ in late} == set(range(80, 120))
 
 
-def test_round_trips_are_told_by_the_speaker() -> None:
+def test_sharing_node_shares_round_trips() -> None:
     nodes = Nodes(("a", "b"))
     nodes.fly(20, ("a", "b"))
     trip = RoundTrip(t_ns=nodes.now_ns, source=UAV, sent_ns=nodes.now_ns - MS, remote_ns=5)
@@ -111,15 +111,15 @@ def test_round_trips_are_told_by_the_speaker() -> None:
     assert said.trips == (trip,)
 
 
-def spoken_for() -> Sharing:
+def node_sharing_a_vehicle() -> Sharing:
     """Return a node that shares a vehicle."""
     nodes = Nodes(("a",))
     nodes.fly(5, ("a",))
     return nodes.sharing["a"]
 
 
-def test_a_burst_is_told_in_several_words_and_all_of_it() -> None:
-    sharing, now_ns = spoken_for(), 60_000 * MS
+def test_burst_is_shared_completely_in_several_messages() -> None:
+    sharing, now_ns = node_sharing_a_vehicle(), 60_000 * MS
     for number in range(1200):
         frame = report(now_ns, 60_000 + number)
         sharing.frame_received(frame.t_ns, frame, content(frame.raw))
@@ -134,7 +134,7 @@ def test_a_burst_is_told_in_several_words_and_all_of_it() -> None:
     assert len(counts) == 3
 
 
-def test_what_waits_too_long_is_given_up_oldest_first_and_counted() -> None:
+def test_overdue_frames_are_dropped_oldest_first_and_counted() -> None:
     sharing = Sharing("a")
     for number in range(HELD_MAX + 3):
         frame = report(number, number)
@@ -150,7 +150,7 @@ def test_what_waits_too_long_is_given_up_oldest_first_and_counted() -> None:
     assert sharing.dropped == 3
 
 
-def test_vehicles_of_yesterday_make_room_for_those_of_today() -> None:
+def test_old_vehicles_make_room_for_new_ones() -> None:
     sharing = Sharing("a")
     for number in range(VEHICLES_MAX):
         frame = report(0, 1, Source(1 + number % 255, number // 255))
@@ -171,7 +171,7 @@ def test_vehicles_of_yesterday_make_room_for_those_of_today() -> None:
     assert [one.raw for one in said.frames] == [frame.raw]
 
 
-def test_what_is_held_of_a_forgotten_vehicle_is_not_told() -> None:
+def test_held_frames_of_a_forgotten_vehicle_are_not_shared() -> None:
     sharing, frame = Sharing("a"), report(0, 1)
     sharing.frame_received(frame.t_ns, frame, content(frame.raw))
     sharing.forget(601 * S, 600 * S)
@@ -179,7 +179,7 @@ def test_what_is_held_of_a_forgotten_vehicle_is_not_told() -> None:
     assert sharing.wait_ns(602 * S) is None
 
 
-def test_it_says_how_long_to_wait_and_nobody_looks_before() -> None:
+def test_wait_time_is_exact() -> None:
     """A node that does not share holds every frame briefly; it is not woken for each one."""
     sharing = Sharing("b", every_ns=2 * MS)
     assert sharing.wait_ns(S) is None
@@ -198,7 +198,7 @@ def test_it_says_how_long_to_wait_and_nobody_looks_before() -> None:
     assert sharing.wait_ns(S + 63 * MS) is None
 
 
-def test_what_others_tell_waits_too_where_this_node_is_behind() -> None:
+def test_shared_frames_wait_while_this_node_is_behind() -> None:
     """Frames that this node reads late are not late through the others' fault."""
     sharing = Sharing("b")
     frames = [report(S + number * 100 * MS, number) for number in range(3)]

@@ -27,7 +27,7 @@ def flown(pipeline: Pipeline, seconds: float, begins_ns: int = START_NS) -> list
     return [one.text for one in said if isinstance(one, Notice)]
 
 
-def test_who_comes_back_from_another_node_is_not_live_anew() -> None:
+def test_uav_returning_from_another_node_is_not_announced_again() -> None:
     pipeline = Pipeline(Settings().override(center={"source": "47.3977,8.5456,480"}))
     pipeline.step(Duty(START_NS, ("1:1", "2:1")))
     said = flown(pipeline, 1.0)
@@ -37,7 +37,7 @@ def test_who_comes_back_from_another_node_is_not_live_anew() -> None:
     assert said.count("2:1 is live") == 1
 
 
-def test_beams_have_nulls_on_the_spared_as_long_as_they_are() -> None:
+def test_beams_have_nulls_on_protected_uavs() -> None:
     pipeline = Pipeline(
         Settings().override(center={"source": "47.3977,8.5456,480"}, beams={"widen": "no"})
     )

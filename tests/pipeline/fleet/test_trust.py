@@ -29,7 +29,7 @@ def look(
     return [notice.text for notice in said]
 
 
-def test_one_contradiction_is_none_and_several_are() -> None:
+def test_node_is_excluded_after_several_contradictions() -> None:
     trust = Trust()
     for number in range(CONTRADICTIONS - 1):
         assert trust.note_contradiction(number * S, "b", "lies") == []
@@ -49,7 +49,7 @@ def test_one_contradiction_is_none_and_several_are() -> None:
     assert trust.is_trusted("b")
 
 
-def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
+def test_node_sharing_only_unconfirmed_vehicles_is_excluded() -> None:
     trust = Trust()
     phantoms = [
         UnconfirmedVehicle("66:1", "b", (300.0, 0.0, 0.0)),
@@ -62,7 +62,7 @@ def test_vehicles_that_nobody_else_can_hear_put_their_node_aside() -> None:
     assert "66:1, 67:1" in said[0]
 
 
-def test_one_hidden_vehicle_is_unconfirmed_and_no_lie() -> None:
+def test_single_hidden_vehicle_is_unconfirmed_without_exclusion() -> None:
     trust = Trust()
     hidden = [UnconfirmedVehicle("66:1", "b", (300.0, 0.0, 0.0))]
     (said,) = look(trust, hidden, {"a": HERE}, 60)
@@ -74,7 +74,7 @@ def test_one_hidden_vehicle_is_unconfirmed_and_no_lie() -> None:
     assert trust.is_trusted("b")
 
 
-def test_a_few_among_many_are_said_and_their_node_is_believed() -> None:
+def test_few_unconfirmed_vehicles_are_reported_without_exclusion() -> None:
     """Only the node beside a team behind a building receives it."""
     trust = Trust()
     hidden = [UnconfirmedVehicle(f"6{n}:1", "b", (100.0 + n, 0.0, 0.0)) for n in range(4)]
@@ -83,7 +83,7 @@ def test_a_few_among_many_are_said_and_their_node_is_believed() -> None:
     assert trust.is_trusted("b")
 
 
-def test_who_is_far_away_or_was_heard_before_is_no_phantom() -> None:
+def test_distant_or_confirmed_vehicle_is_not_unconfirmed() -> None:
     trust = Trust()
     far = [UnconfirmedVehicle(f"6{n}:1", "b", (900.0 + n, 0.0, 0.0)) for n in range(5)]
     assert look(trust, far, {"a": HERE}, 60) == []

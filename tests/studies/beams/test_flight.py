@@ -658,7 +658,7 @@ def test_two_logs_and_the_table(short: Path, tmp_path: Path) -> None:
         (["--config", "no-such.toml"], "no-such.toml"),
     ],
 )
-def test_a_mistake_is_one_line(
+def test_command_error_is_one_line(
     short: Path, tmp_path: Path, arguments: list[str], says: str
 ) -> None:
     center = [] if "--center" in arguments else ["--center", "5:1"]

@@ -80,7 +80,7 @@ def test_scattered_rays_have_their_share_of_the_power() -> None:
     [(-1.0, 0.0, "--rician-k -1"), (math.nan, 0.0, "--rician-k nan"), (9.0, -1e-9, "--delay-spr"),
      (9.0, 257e-9, "257: give ns from 0 to 256"), (9.0, math.nan, "--delay-spread nan")],
 )  # fmt: skip
-def test_a_channel_that_is_none_is_refused(k_db: float, spread_s: float, said: str) -> None:
+def test_invalid_channel_settings_are_rejected(k_db: float, spread_s: float, said: str) -> None:
     with pytest.raises(ValueError, match=said):
         Scattering(k_db, spread_s)
 

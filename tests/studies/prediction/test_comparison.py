@@ -504,7 +504,7 @@ def test_the_table_that_was_measured_before() -> None:
         (["--learned", "missing.pt"], "missing.pt" if HAS_TORCH else "companion-beams[learned]"),
     ],
 )
-def test_a_mistake_is_one_line(
+def test_command_error_is_one_line(
     cut_log: Path, tmp_path: Path, arguments: list[str], says: str
 ) -> None:
     center = [] if "--center" in arguments else ["--center", "5:1"]

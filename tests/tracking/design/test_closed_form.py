@@ -27,7 +27,7 @@ def grid() -> list[tuple[float, float, float]]:
 
 
 @pytest.mark.parametrize(("b", "d", "alpha"), grid())
-def test_the_closed_form_is_the_optimum_of_the_lmi(b: float, d: float, alpha: float) -> None:
+def test_closed_form_equals_the_lmi_optimum(b: float, d: float, alpha: float) -> None:
     solved = lmi.solve(ONE, b=b * ONE, c=ONE, d=d * ONE, h=ONE, alpha=alpha)
     mu = closed_form.mu_star(b, d, alpha)
     # For mu* = 0 no P attains it; the solver stops slightly above.
@@ -45,12 +45,12 @@ def test_the_closed_form_is_the_optimum_of_the_lmi(b: float, d: float, alpha: fl
 
 
 @pytest.mark.parametrize(("mu", "limit_s"), [(0.05, 0.8873), (0.25, 1.0000), (1.0, 1.2906)])
-def test_the_published_limits(mu: float, limit_s: float) -> None:
+def test_interval_limits_match_the_paper(mu: float, limit_s: float) -> None:
     """The paper used a grid of 0.01 s and found infeasibility at 0.89, 1.01 and 1.3 s."""
     assert round(closed_form.dt_limit_s(mu, 0.5, 0.5), 4) == limit_s
 
 
-def test_the_paper_s_interval_has_no_error_at_all() -> None:
+def test_paper_interval_has_zero_error_gain() -> None:
     found = closed_form.design(0.15, 0.5, 0.5)
     assert found.l_gain == pytest.approx(0.30, abs=1e-12)
     assert (found.mu, found.gamma) == (0.0, 0.0)
@@ -59,7 +59,7 @@ def test_the_paper_s_interval_has_no_error_at_all() -> None:
 
 
 @given(INTERVALS, FEEDTHROUGHS, ALPHAS)
-def test_the_certificate_holds_and_notices_a_wrong_gain(b: float, d: float, alpha: float) -> None:
+def test_certificate_holds_and_rejects_a_wrong_gain(b: float, d: float, alpha: float) -> None:
     found = closed_form.design(b, d, alpha)
     assert found.residual >= -1e-9
     assert found.gamma == math.sqrt(found.mu)
@@ -74,7 +74,7 @@ def test_the_certificate_holds_and_notices_a_wrong_gain(b: float, d: float, alph
 
 
 @given(INTERVALS, FEEDTHROUGHS, ALPHAS)
-def test_a_smaller_mu_is_not_proved(b: float, d: float, alpha: float) -> None:
+def test_certificate_fails_for_a_smaller_mu(b: float, d: float, alpha: float) -> None:
     mu = closed_form.mu_star(b, d, alpha)
     assume(mu > 1e-3)
     smaller = 0.98 * mu
@@ -98,7 +98,7 @@ def test_scalars_and_arrays_agree(intervals: list[float], d: float, alpha: float
 
 
 @given(INTERVALS, FEEDTHROUGHS)
-def test_no_alpha_up_to_the_fastest_is_better_than_the_best(b: float, d: float) -> None:
+def test_chosen_alpha_minimises_mu_within_the_decay_limit(b: float, d: float) -> None:
     best = closed_form.best_alpha(b, d)
     assume(best > 1e-6)
     assert best <= closed_form.FASTEST_DECAY
@@ -114,21 +114,21 @@ def test_no_alpha_up_to_the_fastest_is_better_than_the_best(b: float, d: float) 
 
 
 @given(st.floats(0.0, 2.0), FEEDTHROUGHS, ALPHAS)
-def test_the_limit_is_where_mu_passes_the_bound(mu: float, d: float, alpha: float) -> None:
+def test_interval_limit_is_where_mu_reaches_its_bound(mu: float, d: float, alpha: float) -> None:
     limit_s = closed_form.dt_limit_s(mu, d, alpha)
     assume(limit_s > 1e-3)
     assert closed_form.mu_star(limit_s * (1 - 1e-9), d, alpha) <= mu + 1e-6
     assert closed_form.mu_star(limit_s * (1 + 1e-6) + 1e-6, d, alpha) > mu
 
 
-def test_no_interval_below_zero_is_feasible() -> None:
+def test_interval_limit_is_not_negative() -> None:
     """With a lag no interval meets a small mu; the limit is then 0, not negative."""
     assert closed_form.mu_stars([1e-6], -1.0, 0.5)[0] > 0.9
     assert closed_form.dt_limit_s(0.0, -1.0, 0.5) >= 0.0
 
 
 @given(INTERVALS, FEEDTHROUGHS, st.floats(0.05, 1.95))
-def test_the_peak_gain_is_that_of_the_worst_input(b: float, d: float, l_gain: float) -> None:
+def test_peak_gain_matches_the_worst_case_input(b: float, d: float, l_gain: float) -> None:
     """e+ = (1-l) e + (l d - b) w, with w = -1 or 1 in the worst sense, until it settles."""
     error, q, enters = 0.0, 1 - l_gain, l_gain * d - b
     steps = math.ceil(math.log(1e-12) / math.log(max(abs(q), 1e-3))) + 1
@@ -140,7 +140,7 @@ def test_the_peak_gain_is_that_of_the_worst_input(b: float, d: float, l_gain: fl
     )
 
 
-def test_a_gain_that_does_not_contract_has_no_peak() -> None:
+def test_peak_gain_is_infinite_without_contraction() -> None:
     assert closed_form.peak_gain([0.1, 0.1, 0.5], 0.0, [0.0, 2.0, -1.0]).tolist() == [math.inf] * 3
     assert closed_form.peak_gain(0.5, 0.25, 2.0) == 0.0  # no input
 
@@ -152,7 +152,7 @@ def test_gamma_is_no_less_than_the_exact_peak(b: float, d: float, alpha: float) 
 
 
 @pytest.mark.parametrize("dt_s", [0.0, -0.1, math.nan, math.inf])
-def test_an_interval_is_positive_and_finite(dt_s: float) -> None:
+def test_invalid_interval_is_rejected(dt_s: float) -> None:
     with pytest.raises(ValueError, match="positive number of seconds"):
         closed_form.design(dt_s, 0.5, 0.5)
     with pytest.raises(ValueError, match="positive number of seconds"):
@@ -160,7 +160,7 @@ def test_an_interval_is_positive_and_finite(dt_s: float) -> None:
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.0, -0.5, math.nan])
-def test_alpha_lies_between_0_and_1(alpha: float) -> None:
+def test_alpha_outside_0_to_1_is_rejected(alpha: float) -> None:
     for call in (
         lambda: closed_form.design(0.1, 0.5, alpha),
         lambda: closed_form.gains([0.1], 0.5, alpha),
@@ -171,12 +171,12 @@ def test_alpha_lies_between_0_and_1(alpha: float) -> None:
 
 
 @pytest.mark.parametrize("mu", [-1e-9, math.nan])
-def test_a_bound_on_mu_is_not_negative(mu: float) -> None:
+def test_negative_bound_on_mu_is_rejected(mu: float) -> None:
     with pytest.raises(ValueError, match="allowed: at least 0"):
         closed_form.dt_limit_s(mu, 0.5, 0.5)
 
 
 @pytest.mark.parametrize("feedthrough_s", [math.nan, math.inf, -math.inf])
-def test_a_feedthrough_is_finite(feedthrough_s: float) -> None:
+def test_non_finite_feedthrough_is_rejected(feedthrough_s: float) -> None:
     with pytest.raises(ValueError, match="feedthrough"):
         closed_form.design(0.1, feedthrough_s, 0.5)

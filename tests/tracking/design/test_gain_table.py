@@ -38,7 +38,7 @@ EACH = pytest.mark.parametrize("design", DESIGNS, ids=NAMES)
 
 
 @given(st.floats(0.05, 3.0), st.integers(0, 2**32 - 1))
-def test_the_input_covers_every_acceleration(dt_s: float, seed: int) -> None:
+def test_input_model_covers_every_bounded_acceleration(dt_s: float, seed: int) -> None:
     """Any a(s) in 3-D with |a| <= 5 is B w with |w| <= 1; exact integrals of 40 pieces."""
     rng = np.random.default_rng(seed)
     a = rng.standard_normal((40, 3)) * rng.choice([1.0, 1e-3], (40, 1))
@@ -74,7 +74,7 @@ def worst_level(p: FloatArray, gain: FloatArray, dt_s: float) -> float:
 
 
 @pytest.mark.parametrize(("noise", "alpha"), [(0.2, 0.9), (None, 0.6)])
-def test_acceleration_held_over_the_interval_would_prove_too_little(
+def test_constant_acceleration_model_misses_switching_accelerations(
     noise: float | None, alpha: float
 ) -> None:
     """With B = [T^2/2; T] alone the error leaves the set when the acceleration switches; with this
@@ -100,7 +100,7 @@ def test_acceleration_held_over_the_interval_would_prove_too_little(
 
 
 @EACH
-def test_the_shipped_tables_verify_and_quickly(design: KinematicDesign) -> None:
+def test_shipped_tables_verify_quickly(design: KinematicDesign) -> None:
     assert gain_table.verify(design) == pytest.approx(design.margin, rel=1e-6)
     assert design.margin > 5e-5
     assert (design.dt_s[0], design.dt_s[-1]) == (0.05, 2.0)
@@ -115,7 +115,7 @@ def test_the_shipped_tables_verify_and_quickly(design: KinematicDesign) -> None:
 
 
 @EACH
-def test_the_margin_is_that_of_the_lmi(design: KinematicDesign) -> None:
+def test_table_margin_equals_the_lmi_margin(design: KinematicDesign) -> None:
     """At each grid point, against the general certificate in ``lmi``."""
     margins = []
     position = np.array([[1.0, 0.0]])
@@ -139,7 +139,7 @@ def test_the_margin_is_that_of_the_lmi(design: KinematicDesign) -> None:
 
 
 @EACH
-def test_the_certificate_notices(design: KinematicDesign) -> None:
+def test_certificate_rejects_altered_tables(design: KinematicDesign) -> None:
     p11, p12, p22 = design.lyapunov
     wrong = list(design.corrections)
     wrong[12] = tuple(1.5 * x for x in wrong[12])
@@ -153,7 +153,7 @@ def test_the_certificate_notices(design: KinematicDesign) -> None:
             gain_table.verify(bad)
 
 
-def test_between_the_points_the_certificate_looks_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_certificate_is_checked_between_grid_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """A grid of two end points passes at them and is rejected for the intervals between."""
     ends = replace(
         WITHOUT,
@@ -168,7 +168,7 @@ def test_between_the_points_the_certificate_looks_as_well(monkeypatch: pytest.Mo
 
 
 @EACH
-def test_gains_between_and_beyond_the_points(design: KinematicDesign) -> None:
+def test_gains_are_interpolated_and_clamped_at_the_ends(design: KinematicDesign) -> None:
     low, high = design.dt_s[3], design.dt_s[4]
     middle = gain_table.correction(design, (low + high) / 2)
     assert middle == pytest.approx(np.mean(design.corrections[3:5], axis=0))
@@ -229,7 +229,7 @@ def closed_along(design: KinematicDesign, c: FloatArray, dt_s: FloatArray) -> Fl
 
 
 @EACH
-def test_no_adversary_leaves_the_invariant_set(design: KinematicDesign) -> None:
+def test_adversaries_stay_in_the_invariant_set(design: KinematicDesign) -> None:
     """Hundreds of sequences of 40 intervals in the range, each planned backwards from a goal."""
     rng = np.random.default_rng(7)
     sequences, steps = rounds(400, 2000), 40
@@ -252,7 +252,9 @@ def test_no_adversary_leaves_the_invariant_set(design: KinematicDesign) -> None:
 
 @EACH
 @pytest.mark.parametrize("dt_s", [0.05, 0.1, 0.25, 1.0, 2.0])
-def test_the_peak_of_one_interval_is_reached(design: KinematicDesign, dt_s: float) -> None:
+def test_single_interval_peak_is_attained_but_not_exceeded(
+    design: KinematicDesign, dt_s: float
+) -> None:
     """The exact peak of ``companion design`` is attained by the adversary and never exceeded."""
     limits = KinematicLimits(
         design.acceleration_mps2, design.position_noise_m, design.velocity_noise_mps
@@ -274,7 +276,7 @@ def test_the_peak_of_one_interval_is_reached(design: KinematicDesign, dt_s: floa
 
 
 @EACH
-def test_a_design_is_the_same_after_a_trip_through_text(design: KinematicDesign) -> None:
+def test_design_round_trips_through_json(design: KinematicDesign) -> None:
     assert KinematicDesign.from_json(design.to_json()) == design
     assert hash(design) == hash(replace(design))
 
@@ -300,7 +302,9 @@ def test_a_design_is_the_same_after_a_trip_through_text(design: KinematicDesign)
         ({"acceleration_mps2": 50.0}, "certificate"),
     ],
 )
-def test_a_bad_text_is_refused_in_one_line(change: dict[str, object], fault: str) -> None:
+def test_malformed_design_json_is_rejected_in_one_line(
+    change: dict[str, object], fault: str
+) -> None:
     text = json.dumps({**json.loads(WITH_VELOCITY.to_json()), **change})
     with pytest.raises(DesignError, match=fault) as raised:
         KinematicDesign.from_json(text)
@@ -315,7 +319,7 @@ def test_a_bad_text_is_refused_in_one_line(change: dict[str, object], fault: str
     ],
     ids=range(9),
 )
-def test_what_is_no_design_is_refused(text: str) -> None:
+def test_invalid_design_is_rejected(text: str) -> None:
     with pytest.raises(DesignError):
         KinematicDesign.from_json(text)
 
@@ -328,7 +332,7 @@ def run(*arguments: str) -> Result:
 
 
 @pytest.mark.full
-def test_the_command_designs_each_interval_alone() -> None:
+def test_design_command_designs_each_interval_separately() -> None:
     rows = json.loads(run("--dt", "0.1,1", "--mu-max", "4", "--json").stdout)
     assert [row["dt_s"] for row in rows] == [0.1, 1.0]
     for row, feasible in zip(rows, (True, False), strict=True):
@@ -350,7 +354,7 @@ def test_the_command_designs_each_interval_alone() -> None:
     assert answers.kinematic_row(1.003 * limit_s, motion)["mu"] > 4
 
 
-def test_the_command_without_velocity() -> None:
+def test_design_command_without_velocity() -> None:
     (row,) = json.loads(run("--dt", "0.25", "--no-velocity", "--json").stdout)
     assert np.shape(row["L"]) == (2, 1)
     assert row["peak_gain"] <= row["gamma"] == pytest.approx(1.73, rel=0.01)
@@ -363,7 +367,7 @@ def test_the_command_without_velocity() -> None:
 
 
 @pytest.mark.full
-def test_the_command_writes_a_table(tmp_path: Path) -> None:
+def test_design_command_writes_a_table(tmp_path: Path) -> None:
     out = tmp_path / "table.json"
     bounds = ("--acceleration", "8", "--position-noise", "1", "--velocity-noise", "0.4")
     done = run("--dt-range", "0.1,0.4", *bounds, "--out", str(out))
@@ -378,7 +382,7 @@ def test_the_command_writes_a_table(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_table_without_velocity_costs_little_more_than_its_longest_interval() -> None:
+def test_table_bound_without_velocity_is_near_that_of_the_longest_interval() -> None:
     """One alpha per interval; a common alpha gives 6.1 m here, the longest interval alone 3.3 m."""
     motion = answers.KinematicLimits(5.0, 0.5, None)
     design = answers.table((0.05, 0.5), motion, points=12)
@@ -403,7 +407,7 @@ def test_a_table_without_velocity_costs_little_more_than_its_longest_interval() 
         (["--model", "position", "--out", "x"], "only with --model kinematic"),
     ],
 )
-def test_a_mistake_is_one_line(arguments: list[str], fault: str) -> None:
+def test_command_error_is_one_line(arguments: list[str], fault: str) -> None:
     done = run(*arguments)
     assert done.exit_code != 0
     assert fault in done.stderr

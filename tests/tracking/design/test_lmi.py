@@ -29,7 +29,7 @@ def network(intervals_s: list[float], feedthrough_s: float) -> Plant:
     ("intervals_s", "feedthrough_s", "alpha"),
     [([0.15, 0.6, 1.1], 0.5, 0.5), ([0.1, 0.25], 0.0, 0.9), ([0.2, 0.3, 0.5], -0.2, 0.3)],
 )
-def test_a_network_is_no_worse_than_its_worst_axis(
+def test_network_mu_is_that_of_its_worst_axis(
     intervals_s: list[float], feedthrough_s: float, alpha: float
 ) -> None:
     """Unequal intervals, 2N x 2N, no diagonal structure assumed: mu is the largest of the
@@ -46,7 +46,7 @@ def test_a_network_is_no_worse_than_its_worst_axis(
     assert lmi.lmi_margin(common, gain=gains, mu=worst, plant=plant, alpha=alpha) >= -1e-9
 
 
-def test_the_margin_is_the_least_eigenvalue_of_what_is_written() -> None:
+def test_margin_sign_matches_positive_definiteness_of_the_lmis() -> None:
     """Positive exactly where the unscaled LMIs are positive definite."""
     rng = np.random.default_rng(5)
     signs = set()
@@ -107,19 +107,19 @@ def certify(p: FloatArray, gain: FloatArray, mu: float, plant: Plant) -> None:
     )
 
 
-def test_a_p_that_is_not_positive_is_no_certificate() -> None:
+def test_non_positive_p_is_rejected() -> None:
     """It raises an ``LmiError``, as for every other answer that cannot be confirmed."""
     with pytest.raises(lmi.LmiError, match="not positive"):
         certify(-ONE, ONE, 1.0, (ONE, ONE, ONE, 0 * ONE, ONE))
 
 
 @pytest.mark.parametrize("alpha", [0.0, 1.0, -0.1, 1.1, float("nan")])
-def test_alpha_lies_between_0_and_1(alpha: float) -> None:
+def test_alpha_outside_0_to_1_is_rejected(alpha: float) -> None:
     with pytest.raises(ValueError, match="allowed: 0 to 1, both excluded"):
         lmi.solve(ONE, b=ONE, c=ONE, d=ONE, h=ONE, alpha=alpha)
 
 
-def test_what_cannot_be_met_is_an_error() -> None:
+def test_infeasible_plant_raises_lmi_error() -> None:
     """An unstable, unmeasured state: no gain and no P exist."""
     unmeasured = 0 * ONE
     with pytest.raises(lmi.LmiError, match=r"^the solver"):
@@ -127,13 +127,13 @@ def test_what_cannot_be_met_is_an_error() -> None:
 
 
 @pytest.mark.parametrize("dt_s", [1e-4, 1e-3, 100.0, 1000.0])
-def test_the_unit_of_time_does_not_matter(dt_s: float) -> None:
+def test_solution_is_invariant_to_the_unit_of_time(dt_s: float) -> None:
     """mu scales with the square of the interval: a plant solvable at 1 s is solvable at any."""
     solved = lmi.solve(ONE, b=dt_s * ONE, c=ONE, d=-0.3 * dt_s * ONE, h=ONE, alpha=0.5)
     assert solved.mu == pytest.approx(closed_form.mu_star(dt_s, -0.3 * dt_s, 0.5), rel=1e-3)
 
 
-def test_a_network_with_weighted_outputs_on_random_plants() -> None:
+def test_random_networks_with_output_weights_match_the_closed_form() -> None:
     """mu = max h_i^2 mu*_i, and the deciding axis has the closed form's gain."""
     rng = np.random.default_rng(11)
     decided = 0
@@ -174,20 +174,20 @@ def test_the_published_gains_are_feasible(l_gain: float, mu: float) -> None:
 
 
 @pytest.mark.parametrize("mu_max", [0.05, 0.25, 1.0])
-def test_feasibility_under_a_limit(mu_max: float) -> None:
+def test_solution_meets_a_feasible_mu_limit(mu_max: float) -> None:
     solved = lmi.solve(ONE, b=0.15 * ONE, c=ONE, d=0.5 * ONE, h=ONE, alpha=0.5, mu_max=mu_max)
     assert solved.mu <= mu_max * (1 + 1e-9)
     assert solved.margin > -1e-6
 
 
-def test_what_is_infeasible_under_a_limit() -> None:
+def test_infeasible_mu_limit_raises_lmi_error() -> None:
     limit_s = closed_form.dt_limit_s(0.05, 0.5, 0.5)
     lmi.solve(ONE, b=0.999 * limit_s * ONE, c=ONE, d=0.5 * ONE, h=ONE, alpha=0.5, mu_max=0.05)
     with pytest.raises(lmi.LmiError):
         lmi.solve(ONE, b=1.001 * limit_s * ONE, c=ONE, d=0.5 * ONE, h=ONE, alpha=0.5, mu_max=0.05)
 
 
-def test_an_infimum_that_is_not_attained_is_flagged() -> None:
+def test_unattained_infimum_is_flagged() -> None:
     """b < 2 d: mu can be made arbitrarily small by an arbitrarily large P."""
     for b, d, alpha in ((0.15, 0.5, 0.5), (0.4, 0.5, 0.5), (0.65, 0.5, 0.5)):
         assert closed_form.mu_star(b, d, alpha) == 0
@@ -198,7 +198,7 @@ def test_an_infimum_that_is_not_attained_is_flagged() -> None:
         assert solved.mu == pytest.approx(closed_form.mu_star(b, d, alpha), rel=1e-3)
 
 
-def test_several_intervals_under_one_p_cost_no_more_than_the_worst() -> None:
+def test_common_p_for_several_intervals_has_the_worst_mu() -> None:
     """One axis: docs/math.md states that p = 1 / max mu*(b) serves every b."""
     intervals, d, alpha = [0.1, 0.4, 0.9, 1.2], -0.1, 0.6
     samplings = [lmi.Sampling(a=ONE, b=b * ONE, c=ONE, d=d * ONE) for b in intervals]
@@ -250,21 +250,21 @@ def least_bound_m(intervals_s: list[float], velocity: bool, alphas: list[float])
         *((0.1, False, 1.1), (0.25, False, 1.7), (1.0, False, 7.5)),
     ],
 )
-def test_position_bounds_of_the_kinematic_model(
+def test_kinematic_position_bounds_match_published_values(
     dt_s: float, velocity: bool, bound_m: float
 ) -> None:
     alphas = [0.4, 0.5, 0.6, 0.99, 0.9999]
     assert least_bound_m([dt_s], velocity, alphas) == pytest.approx(bound_m, rel=0.02)
 
 
-def test_one_p_for_a_range_of_intervals() -> None:
+def test_common_p_over_a_range_of_intervals() -> None:
     grid = np.geomspace(0.05, 0.5, 8).tolist()
     common = least_bound_m(grid, True, [0.8, 0.9, 0.95])
     assert common == pytest.approx(1.25, rel=0.03)
     assert common > least_bound_m([0.5], True, [0.9999])
 
 
-def test_multipliers_a_channel_are_no_worse_than_one() -> None:
+def test_multipliers_per_channel_tighten_the_bound() -> None:
     """|w_i| <= 1 for each of three channels is |w| <= sqrt 3 for one: the bound must tighten."""
     sampling = held(0.25, velocity=True)
     plant = (sampling.a, sampling.b, sampling.c, sampling.d, POSITION)
@@ -274,14 +274,14 @@ def test_multipliers_a_channel_are_no_worse_than_one() -> None:
 
 
 @pytest.mark.parametrize("channels", [[1, 1], [3, 0], [2, 2]])
-def test_channels_share_out_the_inputs(channels: list[int]) -> None:
+def test_channels_that_do_not_cover_the_inputs_are_rejected(channels: list[int]) -> None:
     sampling = held(0.25, velocity=True)
     with pytest.raises(ValueError, match="channels must cover the columns"):
         lmi.solve_common([sampling], POSITION, [0.5], channels=channels)
 
 
 @pytest.mark.parametrize("size", [1e-4, 1.0, 1e4])
-def test_the_units_of_the_states_do_not_matter(size: float) -> None:
+def test_solution_is_invariant_to_state_units(size: float) -> None:
     """Position in a different unit than velocity: scaled internally, certified externally."""
     s, change = held(0.25, velocity=True), np.diag([size, 1.0])
     back = np.diag([1 / size, 1.0])
@@ -291,7 +291,7 @@ def test_the_units_of_the_states_do_not_matter(size: float) -> None:
     assert solved.mu == pytest.approx(plain.mu, rel=1e-4)
 
 
-def test_slack_is_left_in_the_decay_lmi() -> None:
+def test_decay_lmi_keeps_its_slack() -> None:
     s = held(0.25, velocity=True)
     plant = (s.a, s.b, s.c, s.d, POSITION)
     for slack in (0.0, 1e-3):

@@ -123,7 +123,7 @@ def sequences(count: int) -> Iterator[tuple[np.random.Generator, str]]:
 
 @pytest.mark.parametrize("told", [1.0, 0.8, 0.0], ids=["reported", "sometimes", "never"])
 @pytest.mark.parametrize("name", GAINS)
-def test_no_adversary_leaves_the_bounds(fix: MakeFix, name: str, told: float) -> None:
+def test_adversaries_stay_within_the_bounds(fix: MakeFix, name: str, told: float) -> None:
     """Irregular reports, some without a velocity; predicted before, at and after each of them."""
     observer = observing(name)
     for rng, kind in sequences(rounds(60, 240)):
@@ -145,7 +145,7 @@ def test_no_adversary_leaves_the_bounds(fix: MakeFix, name: str, told: float) ->
 @pytest.mark.parametrize("interval_s", [0.05, 0.2, 1.0, 3.0])
 @pytest.mark.parametrize("name", ["deadbeat", "blend", "fading"])
 @pytest.mark.parametrize("along", [(0.6, -0.8, 0.0), (0.0, 0.0, 1.0)], ids=["plane", "height"])
-def test_a_greedy_adversary_reaches_the_bounds(
+def test_greedy_adversary_attains_the_bounds(
     fix: MakeFix, name: str, interval_s: float, along: tuple[float, float, float]
 ) -> None:
     """Noise lags as far as allowed behind a UAV that accelerates throughout."""
@@ -198,7 +198,7 @@ def bang_bang(goal: FloatArray, dt_s: float) -> FloatArray:
 @pytest.mark.parametrize(
     ("axis", "noise_m"), [((0.6, -0.8, 0.0), 1.5), ((0.0, 0.0, 1.0), 2.5)], ids=["plane", "height"]
 )
-def test_no_plan_over_many_intervals_leaves_the_bounds(
+def test_planned_adversary_approaches_but_never_exceeds_the_bounds(
     fix: MakeFix, name: str, axis: tuple[float, float, float], noise_m: float
 ) -> None:
     """Noise and acceleration along one axis, each step as planned: never outside, and nearly at the
@@ -233,7 +233,7 @@ def test_no_plan_over_many_intervals_leaves_the_bounds(
     assert closest > 0.95
 
 
-def test_the_gains_are_those_of_the_interval(fix: MakeFix) -> None:
+def test_prediction_uses_the_gain_of_the_interval(fix: MakeFix) -> None:
     """By explicit matrices: x + L (y - x), propagated by A."""
     observer, t = observing("of both"), 0.7
     state = KinematicState(
@@ -262,7 +262,7 @@ def test_the_gains_are_those_of_the_interval(fix: MakeFix) -> None:
     asked_ms=st.integers(-3000, 3000),
     name=st.sampled_from(list(GAINS)),
 )
-def test_a_constant_velocity_is_followed_exactly(
+def test_constant_velocity_is_tracked_exactly(
     fix: MakeFix,
     velocity: tuple[float, float, float],
     intervals_ms: list[int],
@@ -282,7 +282,7 @@ def test_a_constant_velocity_is_followed_exactly(
 
 
 @pytest.mark.parametrize("t_s", [-1.0, 0.3, 2.0])
-def test_a_constant_acceleration_is_missed_by_just_its_own_way(fix: MakeFix, t_s: float) -> None:
+def test_constant_acceleration_error_is_half_a_t_squared(fix: MakeFix, t_s: float) -> None:
     observer, acceleration, state = observing(), np.array([1.0, -2.0, 0.5]), None
     for at_s in (2.0, 2.5, 4.0):
         report, speeds = acceleration * at_s**2 / 2, acceleration * at_s
@@ -294,7 +294,7 @@ def test_a_constant_acceleration_is_missed_by_just_its_own_way(fix: MakeFix, t_s
     assert acceleration * (4.0 + t_s) - found.velocity_ned_mps == pytest.approx(acceleration * t_s)
 
 
-def test_without_reported_velocity_it_is_learned_from_positions(fix: MakeFix) -> None:
+def test_velocity_is_estimated_from_positions(fix: MakeFix) -> None:
     """The error halves with each report at equal intervals; the initial velocity is zero."""
     observer, velocity, state = observing(), np.array([10.0, -5.0, 2.0]), None
     missing = []
@@ -308,7 +308,7 @@ def test_without_reported_velocity_it_is_learned_from_positions(fix: MakeFix) ->
     assert np.array(missing[2:]) / missing[1:-1] == pytest.approx(0.5)
 
 
-def test_two_positions_at_nearly_the_same_time_show_no_great_velocity(fix: MakeFix) -> None:
+def test_nearly_simultaneous_positions_do_not_inflate_velocity(fix: MakeFix) -> None:
     """Two receivers that differ by 3 m, 1 ms apart, are not 1500 m/s."""
     observer, state = observing(), None
     for at_ns, north in ((0, 0.0), (S, 10.0), (S + S // 1000, 13.0)):
@@ -318,7 +318,7 @@ def test_two_positions_at_nearly_the_same_time_show_no_great_velocity(fix: MakeF
 
 
 @pytest.mark.parametrize("gap_s", [20.0, 60.0])
-def test_over_a_long_gap_the_greatest_speed_says_more(fix: MakeFix, gap_s: float) -> None:
+def test_speed_limit_bounds_a_long_gap(fix: MakeFix, gap_s: float) -> None:
     """The speed limit bounds the UAV's path and that of the prediction, whatever the acceleration
     allows."""
     made = fix(0, [5, 5, 5], [20.0, 0, 0], noise=NOISE)
@@ -337,7 +337,7 @@ def test_over_a_long_gap_the_greatest_speed_says_more(fix: MakeFix, gap_s: float
 
 @settings(max_examples=examples(100))
 @given(seed=st.integers(0, 2**32 - 1), told=st.booleans(), name=st.sampled_from(list(GAINS)))
-def test_turning_the_plane_turns_the_estimates(
+def test_rotated_inputs_give_rotated_estimates(
     fix: MakeFix, seed: int, told: bool, name: str
 ) -> None:
     rng, observer = np.random.default_rng(seed), observing(name)

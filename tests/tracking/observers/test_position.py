@@ -93,7 +93,7 @@ def norm_m(vector: FloatArray) -> float:
 
 @pytest.mark.parametrize("alpha", [None, 0.5])
 @pytest.mark.parametrize("feedthrough_s", [0.0, 0.5, -0.3])
-def test_positions_alone_never_leave_the_bound(
+def test_error_stays_within_bound_with_positions_only(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
     """Only speed and noise are bounded; the sender's lead uses the same mean velocity."""
@@ -119,7 +119,7 @@ def test_positions_alone_never_leave_the_bound(
 
 @pytest.mark.parametrize("alpha", [None, 0.3])
 @pytest.mark.parametrize("velocity_lead_s", [0.2, 0.01, 2.0])
-def test_positions_and_velocities_never_leave_the_bound(
+def test_error_stays_within_bound_with_positions_and_velocities(
     fix: MakeFix, velocity_lead_s: float, alpha: float | None
 ) -> None:
     """Speed, acceleration and both noises bounded; a report may come without its velocity."""
@@ -151,7 +151,7 @@ def test_positions_and_velocities_never_leave_the_bound(
 
 
 @pytest.mark.parametrize("alpha", [None, 0.5])
-def test_a_lead_of_the_sender_and_velocities_keep_the_bound(
+def test_error_stays_within_bound_with_sender_lead_and_velocities(
     fix: MakeFix, alpha: float | None
 ) -> None:
     """Checked at the next report's time, up to which the lead's mean velocity is that of the
@@ -177,7 +177,9 @@ def test_a_lead_of_the_sender_and_velocities_keep_the_bound(
 
 @pytest.mark.parametrize("told", [True, False])
 @pytest.mark.parametrize("feedthrough_s", [0.5, -0.3])
-def test_a_lead_in_time_keeps_the_bound(fix: MakeFix, feedthrough_s: float, told: bool) -> None:
+def test_error_stays_within_bound_with_a_time_lead(
+    fix: MakeFix, feedthrough_s: float, told: bool
+) -> None:
     """The sender reports a future or past position, where its mean velocity differs from the
     present one."""
     observer = observing(None, feedthrough_s)
@@ -199,7 +201,7 @@ def test_a_lead_in_time_keeps_the_bound(fix: MakeFix, feedthrough_s: float, told
 
 @pytest.mark.parametrize("alpha", [None, 0.5])
 @pytest.mark.parametrize("feedthrough_s", [0.0, 0.15, 0.5, -0.3])
-def test_a_greedy_adversary_reaches_the_bound(
+def test_greedy_adversary_attains_the_bound(
     fix: MakeFix, feedthrough_s: float, alpha: float | None
 ) -> None:
     """It anticipates the gains and chooses noise and velocity in the worst sense: all of the bound
@@ -242,7 +244,7 @@ def _gain(fix: MakeFix, observer: PositionObserver, b_ns: int) -> float:
     told=st.booleans(),
     lead_s=st.floats(0.01, 1.0),
 )
-def test_a_constant_velocity_is_followed_exactly(
+def test_constant_velocity_is_tracked_exactly(
     *,
     fix: MakeFix,
     velocity: tuple[float, float, float],
@@ -272,7 +274,7 @@ def test_a_constant_velocity_is_followed_exactly(
     assert found.position_ned_m == pytest.approx(speeds * (asked_ns * 1e-9), abs=1e-6)
 
 
-def test_the_velocity_is_the_reported_one_and_may_have_changed_since(fix: MakeFix) -> None:
+def test_velocity_is_the_last_reported_with_a_growing_bound(fix: MakeFix) -> None:
     observer = observing()
     state = observer.begin(fix(0, [0, 0, 0], [4.0, -2.0, 1.0]))
     found = observer.predict(state, 2 * S)
@@ -286,7 +288,7 @@ def test_the_velocity_is_the_reported_one_and_may_have_changed_since(fix: MakeFi
     assert (silent.velocity_ned_mps, silent.velocity_bound_mps) == (None, None)
 
 
-def test_before_the_report_nothing_is_extrapolated(fix: MakeFix) -> None:
+def test_prediction_before_the_report_keeps_the_estimate(fix: MakeFix) -> None:
     """The estimate stays, and its bound grows by the possible path."""
     observer = observing()
     state = observer.begin(fix(10 * S, [1, 2, 3], [20.0, 0, 0]))
@@ -298,7 +300,7 @@ def test_before_the_report_nothing_is_extrapolated(fix: MakeFix) -> None:
     assert at.bound_m == state.bound_m
 
 
-def test_the_first_report_is_the_estimate(fix: MakeFix) -> None:
+def test_first_report_becomes_the_estimate(fix: MakeFix) -> None:
     state = observing(None, -0.5).begin(fix(S, [1, 2, 3]))
     assert state.estimate_ned_m == (1, 2, 3)
     assert state.bound_m == pytest.approx(1.5 + 0.5 * 30.0)

@@ -14,11 +14,11 @@ The library interface for notebooks and programs; everything else is internal an
     print(update.beams.uavs, update.beams.weights.shape)
 
 ``Settings``: all settings; ``override(section={...})`` returns a copy with some replaced.
-``Pipeline``: ``step(event)`` processes events in order of time; ``look(now_ns, lead_s)`` returns
-targets and beams, ``tracks(now_ns, valid_at_ns)`` every tracked UAV, ``clock_estimate(uav)`` the
-state of its clock, ``local`` the local frame. ``Frame``, ``Tick``, ``RoundTrip``: events, from a
-``Source``. ``read_log(path)``: the events of any kind of log. ``UserError``: raised for a user's
-mistakes.
+``Pipeline``: ``step(event)`` processes events in chronological order; ``look(now_ns, lead_s)``
+returns targets and beams, ``tracks(now_ns, valid_at_ns)`` every tracked UAV,
+``clock_estimate(uav)`` the state of its clock, ``local`` the local frame. ``Frame``, ``Tick``,
+``RoundTrip``: events, from a ``Source``. ``read_log(path)``: the events of any kind of log.
+``UserError``: raised for a user's mistakes.
 
 Names are loaded on first use, so that importing this package is fast.
 """

@@ -46,7 +46,7 @@ class ServiceError(Exception):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weights:
-    """The weights of one answer.
+    """Weights from one answer of the service.
 
     uavs         names of the N UAVs
     matrix       (M, N) complex, columns in the order of ``uavs``
@@ -86,12 +86,12 @@ class Client:
         return self.get("/v1/status")
 
     def uavs(self) -> list[Json]:
-        """Return every UAV as it is now."""
+        """Return every UAV in its present state."""
         found: list[Json] = self.get("/v1/uavs")["uavs"]
         return found
 
     def beams(self, lead_ms: float = 0.0) -> Json:
-        """Return ``/v1/beams``: the beams that are applied in ``lead_ms`` milliseconds."""
+        """Return ``/v1/beams``: the beams that will be applied in ``lead_ms`` milliseconds."""
         return self.get("/v1/beams", lead_ms=lead_ms)
 
     def weights(self, lead_ms: float = 0.0) -> Weights:
@@ -143,7 +143,7 @@ class Client:
     def records(self, uavs: Iterable[str] = (), rate_hz: float = 100.0) -> Iterator[bytes]:
         """Yield updates as they are computed, each as one record (``companion.views.records``).
 
-        Otherwise as ``stream``.
+        Arguments and errors are those of ``stream``.
         """
         with closing(self._messages(uavs, ["records"], rate_hz)) as messages:
             for message in messages:
@@ -206,7 +206,7 @@ def _read(answer: HTTPResponse) -> bytes:
 
 
 def _title(error: urllib.error.HTTPError) -> str:
-    """Return the problem's title, or the text of the status without one."""
+    """Return the title of the problem in an answer; the text of its status without one."""
     try:
         return str(json.loads(error.read())["title"])
     except (ValueError, KeyError, TypeError, OSError, HTTPException):

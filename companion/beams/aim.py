@@ -1,4 +1,4 @@
-"""Beams from tracks: which UAVs get one, its direction, and the weights of all beams together."""
+"""Computation of beams from tracks: which UAVs get a beam, its direction, and all weights."""
 
 import math
 from collections.abc import Collection, Sequence
@@ -43,7 +43,7 @@ NEAREST_M: Final = 1.0
 The far field is tens of metres away.
 """
 UNKNOWN_SHARE: Final = 0.25
-"""Ratio of the usual error to its bound, before reports have revealed it.
+"""Estimated ratio of a usual (95 %) error to its bound, before reports have revealed it.
 
 In the logs it is 1/20 for positions, and 1/10 to 1/5 for attitudes.
 """
@@ -149,7 +149,7 @@ def _beams(
     before: Hysteresis | None,
     valid_at_ns: int,
 ) -> tuple[tuple[Beam, ...], Precoding, dict[str, str]]:
-    """Return the beams, their weights, and the UAVs that the policy left out with the reason."""
+    """Return the beams, their weights, and the UAVs that the policy left out, with the reason."""
     tracks, ranges_m, directions = aimed
     uavs = [track.uav for track in tracks]
     each = list(zip(tracks, ranges_m.tolist(), strict=True))
@@ -228,7 +228,7 @@ def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:
 def _out_of_reach(
     directions: FloatArray, array: Array, coverage: Coverage
 ) -> list[tuple[Cause, str] | None]:
-    """Return for each direction why no beam can point there; None if one can."""
+    """Return for each direction why no beam can point there; None if a beam can."""
     reasons: list[str | None] = [None] * len(directions)
     if coverage != EVERYWHERE:
         reasons = refusals(coverage, directions, directions @ array.array_from_body)
@@ -263,8 +263,8 @@ def _usual_rad(
 ) -> float:
     """Return the estimated 95th percentile of the direction error.
 
-    Errors of positions and of the attitude are independent, so they add as squares. Unknown ones
-    are estimated as ``UNKNOWN_SHARE`` of their bounds (docs/math.md 5.3).
+    Errors of positions and of the attitude are independent, so they add as squares. An unknown
+    error is estimated as ``UNKNOWN_SHARE`` of their bounds (docs/math.md 5.3).
     """
 
     def usual(known: float | None, bound: float) -> float:
@@ -282,7 +282,7 @@ def _usual_rad(
 
 
 def _refusal(track: Track, place_ned_m: FloatArray | None) -> tuple[Cause, str] | None:
-    """Return why a track gets no beam from an array at this place; None if it gets one."""
+    """Return why a track gets no beam from an array at this position; None if it gets one."""
     if place_ned_m is None:
         return Cause.CARRIER, "the carrier's position or attitude is unknown"
     if track.state not in AIMABLE:

@@ -16,18 +16,18 @@ from companion.values import Beam, BeamSet, Cause, FloatArray, Method
 
 MAX_RATIO_PER_S: Final = 3.0  # largest factor by which the angles of a shape change in a second
 MAX_ELAPSED_S: Final = 60.0
-"""Longest time between two ticks that counts: after days ``MAX_RATIO_PER_S ** s`` overflows."""
+"""Limit on the time between two ticks, since ``MAX_RATIO_PER_S ** s`` overflows after days."""
 MAX_WIDENING: Final = 3.5
-"""Largest growth in a second, in natural widths: phases at the aperture's ends change as fast."""
+"""Largest growth of a beam's width per second, in natural widths."""
 MAX_NARROWING: Final = 3.0  # largest shrinkage in a second, in natural widths
 MAX_HELD_NARROWING: Final = 1.0
-"""The same for a bound that filled its shape within the last ``HELD_NS``.
+"""Largest narrowing per second if the bound filled the shape within the last ``HELD_NS``.
 
 Over a slow radio a bound grows until the next report; a shape that followed would oscillate.
 """
 HELD_NS: Final = 3_000_000_000
 GUARANTEE_PLANE_SHARE: Final = 1 / 3
-"""Factor of these rates for planar arrays with ``widen = "guarantee"``.
+"""Factor on the rates of widening and narrowing for planar arrays, ``widen = "guarantee"``.
 
 Their beams change most with the width.
 """
@@ -40,10 +40,10 @@ KEPT_NS: Final = 500_000_000  # time for which a method and slots are kept
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Hysteresis:
-    """State after the beams of the last tick.
+    """State of the hysteresis after the beams of the last tick.
 
     shaped       the likely angle and the bound of each UAV's shape, radians
-    filled_ns    when the bound of each UAV was last at least that of its shape
+    filled_ns    when each UAV's bound was last at least its shape's bound
     """
 
     valid_at_ns: int  # when they are applied
@@ -56,7 +56,7 @@ class Hysteresis:
 
 
 def updated(before: Hysteresis | None, made: BeamSet) -> Hysteresis:
-    """Return the state after new beams."""
+    """Return the state of the hysteresis after new beams."""
     slots = {beam.uav: beam.group for beam in made.beams}
     same = before is not None and before.slots == slots
     inexact_ns = None if before is None else before.inexact_ns
@@ -72,7 +72,7 @@ def updated(before: Hysteresis | None, made: BeamSet) -> Hysteresis:
 
 
 def _filled_ns(before: Hysteresis | None, beam: Beam, valid_at_ns: int) -> int:
-    """Return when the bound of a UAV was last at least that of its shape; at first, now."""
+    """Return when the bound of a UAV was last at least its shape's bound; now for a new UAV."""
     bound_rad = 0.0 if beam.pointing_bound_rad is None else beam.pointing_bound_rad
     if before is None or bound_rad >= beam.shaped_bound_rad:
         return valid_at_ns
@@ -121,7 +121,7 @@ def rate_limited_rad(
 def previous_slots(
     before: Hysteresis | None, valid_at_ns: int, uavs: list[str]
 ) -> PreviousSlots | None:
-    """Return the previous slots of these UAVs, -1 for one left out.
+    """Return the previous time slots of these UAVs, -1 for one that was left out.
 
     None if the UAVs have changed.
     """

@@ -13,7 +13,7 @@ from companion.values import Carrier, FloatArray, Track
 
 
 def place_ned_m(carrier: Carrier, array: Array) -> FloatArray:
-    """Position of the array, (3,), local frame: the carrier's position plus the lever arm."""
+    """Return the array's position, (3,), local frame: the carrier's position plus the lever arm."""
     if not array.lever_arm_m.any():
         return carrier.position_ned_m
     place: FloatArray = carrier.position_ned_m + carrier.body_from_local.T @ array.lever_arm_m
@@ -23,7 +23,7 @@ def place_ned_m(carrier: Carrier, array: Array) -> FloatArray:
 def directions(
     tracks: Sequence[Track], carrier: Carrier, array: Array
 ) -> tuple[FloatArray, FloatArray]:
-    """Ranges (N,) in metres and unit directions (N, 3) in the array frame, from the array."""
+    """Return ranges (N,), metres, and unit directions (N, 3), array frame, from array to UAVs."""
     offsets_m = np.array([track.position_ned_m for track in tracks]) - place_ned_m(carrier, array)
     ranges_m = np.sqrt(np.einsum("nk,nk->n", offsets_m, offsets_m))
     array_from_local = array.array_from_body @ carrier.body_from_local
@@ -31,7 +31,7 @@ def directions(
 
 
 LineOfSightRates = tuple[float | None, float | None, float | None]
-"""Rates of azimuth and elevation in rad/s, and of range in m/s."""
+"""Rates of change from array to UAV: azimuth and elevation in rad/s, range in m/s."""
 
 
 def rates(
@@ -41,7 +41,7 @@ def rates(
     ranges_m: FloatArray,
     directions: FloatArray,
 ) -> list[LineOfSightRates]:
-    """Rates of azimuth, elevation (rad/s) and range (m/s) of unit directions in the array frame.
+    """Return rates of azimuth, elevation (rad/s) and range (m/s) of directions in the array frame.
 
     None without a velocity; straight up and straight down the azimuth has no rate.
     """
@@ -81,7 +81,7 @@ def rates(
 def directions_ahead(
     track: Track, carrier: Carrier, array: Array, times_s: FloatArray
 ) -> FloatArray | None:
-    """Unit directions (T, 3) of a UAV at times after the track's own; None without its velocity.
+    """Return unit directions (T, 3) of a UAV at times after the track's own; None without velocity.
 
     Track and carrier are extrapolated at their velocities, the track also with its acceleration,
     and the carrier at its body rates. Boresight is returned where the UAV would be at the array

@@ -72,7 +72,7 @@ JSON = click.option("--json", "as_json", is_flag=True, help="Print one JSON obje
 
 
 def make_folder(out: Path) -> None:
-    """Create the output folder before the work, so that a long command does not fail at its end.
+    """Create the output folder first, so that a long command does not fail at its end.
 
     Folders that were created and are still empty when the command ends are removed.
     """
@@ -92,7 +92,7 @@ class InterruptedByUser(Exception):  # noqa: N818 - not an error
 
 
 class OneLineErrors(click.Group):
-    """Group that prints a user's mistake as one line on stderr, without the usage text.
+    """Command group that prints a user's mistake as one line on stderr, without the usage text.
 
     A user's mistake is a ``UserError``, or an ``OSError`` about a file, a port or a disk.
     Any other exception is a defect and ends with its traceback.
@@ -106,7 +106,7 @@ class OneLineErrors(click.Group):
         standalone_mode: bool = True,
         **extra: Any,
     ) -> Any:
-        """Run; see ``click.Command.main``."""
+        """Run the command line; see ``click.Command.main``."""
         extra |= {"prog_name": prog_name, "complete_var": complete_var, "standalone_mode": False}
         work: Callable[[], Any] = partial(super().main, args, **extra)
         if not standalone_mode:
@@ -145,24 +145,24 @@ class OneLineErrors(click.Group):
 
 
 class Progress:
-    """One line on stderr that is overwritten; prints nothing if stderr is not a terminal."""
+    """Progress line on stderr that is overwritten; prints nothing if stderr is not a terminal."""
 
     def __init__(self) -> None:
         self._on = sys.stderr.isatty()
 
     def show(self, text: str) -> None:
-        """Replace the line."""
+        """Replace the progress line."""
         if self._on:
             width = shutil.get_terminal_size().columns - 1  # a wrapped line cannot be overwritten
             click.echo(f"\r\033[K{printable(text)[:width]}", nl=False, err=True)
 
     def clear(self) -> None:
-        """Remove the line."""
+        """Remove the progress line."""
         self.show("")
 
 
 def log_progress(progress: Progress, ends_s: float | None) -> Callable[[int, float, float], None]:
-    """Return a callback that shows the progress through a log of length ``ends_s`` (None: unknown).
+    """Return a callback that shows the progress through a log of ``ends_s`` (None: unknown).
 
     Its arguments are frames, seconds of log, and wall-clock seconds since the start.
     """

@@ -24,7 +24,7 @@ from companion.cli.replay_text import center_text
 
 
 class _ExportGroup(click.Command):
-    """Command on logs that hands over to ``beams`` if its first argument is that word."""
+    """Command on logs, with ``beams`` as a subcommand if that is its first argument."""
 
     def make_context(
         self,
@@ -33,7 +33,7 @@ class _ExportGroup(click.Command):
         parent: click.Context | None = None,
         **extra: Any,
     ) -> click.Context:
-        """As ``click.Command.make_context``."""
+        """Parse the arguments, as ``click.Command.make_context``."""
         if args[:1] == ["beams"]:
             return beams.make_context(f"{info_name} beams", args[1:], parent, **extra)
         return super().make_context(info_name, args, parent, **extra)

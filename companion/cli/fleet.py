@@ -101,7 +101,7 @@ def _text(answer: dict[str, Any]) -> str:
 
 
 def _offset_text(uav: dict[str, Any]) -> list[str]:
-    """Return what needs attention for a UAV; empty if one node serves it and keeps it."""
+    """Return what needs attention for a UAV; empty if one node serves it steadily."""
     by, to = uav["served_by"], uav["handing_to"]
     said = []
     if len(by) != 1:
@@ -114,7 +114,7 @@ def _offset_text(uav: dict[str, Any]) -> list[str]:
 
 
 def _clock(node: dict[str, Any]) -> str:
-    """Return the midpoint of the clock offset interval, and half its width."""
+    """Return the midpoint of the clock offset interval, and half the interval's width."""
     if node["clock_offset_s"] is None:
         return ""
     offset_s, half_s = node["clock_offset_s"], node["clock_doubt_s"] / 2

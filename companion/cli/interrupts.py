@@ -12,7 +12,7 @@ IMPORT_TIMEOUT_S = 0.02  # delay before an interrupt that met an import is tried
 
 @contextmanager
 def interrupts_end(name: str) -> Iterator[None]:
-    """Context in which Ctrl-C ends the process at once, with one line under this name.
+    """Context in which Ctrl-C ends the process at once, with one line under this program name.
 
     An exception raised by the signal could surface inside a package's import, which may turn it
     into another error. Nothing is open yet, so the process can simply end. After the context,

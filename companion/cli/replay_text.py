@@ -38,7 +38,7 @@ CENTER_DECIMALS: Final = 7  # about 1 cm of latitude
 
 
 def center_text(center: str) -> str:
-    """Return a center as text, the numbers of a place with at most 7 decimals."""
+    """Return a center as text; the numbers of a position have at most 7 decimals."""
     try:
         numbers = [float(part) for part in center.split(",")]
     except ValueError:

@@ -1,4 +1,4 @@
-"""Output of ``run`` and ``demo``: notices and a status line on a terminal, or JSON."""
+"""Output of the commands ``run`` and ``demo``: notices and a status line, or JSON."""
 
 import json
 
@@ -10,7 +10,7 @@ from companion.views import glance
 
 
 class Lines:
-    """Notices as lines on stderr; on a terminal, a status line below them."""
+    """Writer of notices as lines on stderr; on a terminal, with a status line below them."""
 
     def __init__(self) -> None:
         self._progress = Progress()
@@ -31,7 +31,7 @@ class Lines:
 
 
 class JsonLines:
-    """One object a second on stdout: the status, and the new events. Text lines go to stderr."""
+    """Writer of one JSON object a second on stdout: the status, and the new events."""
 
     def __init__(self) -> None:
         self._seen_ns = 0
@@ -45,7 +45,7 @@ class JsonLines:
         say(text, err=True)
 
     def show(self, service: Service) -> None:
-        """Print the object."""
+        """Print the status as a JSON object."""
         fresh = [notice for notice in service.events() if notice.t_ns > self._seen_ns]
         self._seen_ns = max([self._seen_ns, *(notice.t_ns for notice in fresh)])
         click.echo(

@@ -21,7 +21,7 @@ QUARTER: Final = math.pi / 2
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sector:
-    """Range of azimuths to the right and of elevations upwards, radians.
+    """Range of azimuths (positive right) and range of elevations (positive up), radians.
 
     Azimuths are -pi to pi and may cross the tail: from 170 to -170 degrees is 20 degrees wide, from
     -180 to 180 all around; straight up and down the azimuth is 0. A hidden sector is in the
@@ -48,17 +48,17 @@ class Sector:
 
     @property
     def width_rad(self) -> float:
-        """Angle from the first azimuth to the right to the second: above 0, at most 2 pi."""
+        """Width of the azimuth range, from its first azimuth rightward: above 0, at most 2 pi."""
         width = self.azimuth_to_rad - self.azimuth_from_rad
         return width if width >= 0 else max(width + 2 * math.pi, 0.0)
 
     def holds(self, directions: FloatArray) -> BoolArray:
-        """Return whether unit directions (..., 3) are inside or on the edge: (...)."""
+        """Return a mask (...) of the unit directions (..., 3) inside the sector or on its edge."""
         azimuth, elevation = _angles(directions)
         return self.spans(azimuth) & self.reaches(elevation)
 
     def to_edge_rad(self, directions: FloatArray) -> FloatArray:
-        """Return the angle from unit directions (..., 3), in or out, to the nearest edge: (...).
+        """Return angles (...) from directions (..., 3), in or out, to the sector's nearest edge.
 
         Exact: the sides are arcs of great circles, and the nearest point of a parallel has the same
         azimuth or is a corner. A sector all around has no sides; a pole is no edge. Infinite for
@@ -86,7 +86,7 @@ class Sector:
         return (self.elevation_from_rad <= elevation) & (elevation <= self.elevation_to_rad)
 
     def _to_side_rad(self, directions: FloatArray, side_rad: float) -> FloatArray:
-        """Return the angle to the arc of a meridian between the two elevations."""
+        """Return the angle from directions to a side, a meridian's arc between two elevations."""
         x, y, up = directions[..., 0], directions[..., 1], -directions[..., 2]
         ahead = x * math.cos(side_rad) + y * math.sin(side_rad)
         aside = y * math.cos(side_rad) - x * math.sin(side_rad)
@@ -113,7 +113,7 @@ class Sector:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Coverage:
-    """Directions in which the array may point. None, or no hidden sector: no limit.
+    """Directions in which the array may point. A limit of None is no limit.
 
         field_of_view_rad     full angle of a cone about boresight, at most 2 pi, the whole sphere
         azimuth_limits_rad    steering range (from, to) in the array frame, as in a ``Sector``
@@ -157,7 +157,7 @@ EVERYWHERE: Final = Coverage()  # no limits
 def refusals(
     coverage: Coverage, directions_array: FloatArray, directions_body: FloatArray
 ) -> list[str | None]:
-    """Return for each of N directions why no beam may point there; None if one may.
+    """Return for each of N directions why no beam may point there; None if a beam may.
 
     Both arguments are the same unit directions (N, 3): in the array frame and in the carrier's body
     frame.
@@ -213,7 +213,7 @@ def _off_boresight(directions: FloatArray) -> FloatArray:
 
 
 def _angles(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Azimuth and elevation of unit directions (..., 3); by arctan2, exact up to the poles."""
+    """Return azimuth and elevation of unit directions (..., 3); arctan2 is exact up to the poles."""
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     return np.arctan2(y, x), np.arctan2(-z, np.hypot(x, y))
 

@@ -65,8 +65,8 @@ class Element:
     ) -> tuple[FloatArray, FloatArray]:
         """Return bounds (...) on the amplitude within ``radius_rad`` of unit directions (..., 3).
 
-        Both are attained, except at the corners of TR 38.901, where the product of the two cuts is
-        bounded by the extremes of each.
+        Both bounds are attained, except at the corners of TR 38.901, where the product of the two
+        cuts is bounded by the extremes of each.
         """
         match self.pattern:
             case ElementPattern.ISOTROPIC:
@@ -90,13 +90,13 @@ ISOTROPIC: Final = Element()
 
 
 def _azimuth_and_elevation(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Absolute azimuth and elevation; by arctan2, exact to rounding up to the poles."""
+    """Return absolute azimuth and elevation of directions; arctan2 is exact up to the poles."""
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     return np.abs(np.arctan2(y, x)), np.arctan2(np.abs(z), np.hypot(x, y))
 
 
 def _tr38901(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
-    """Amplitude by table 7.3-1, for angles from outward, both 0 or more."""
+    """Amplitude of the 3GPP element (table 7.3-1), for azimuth and elevation angles of 0 or more."""
     down_db = np.minimum(12 * (np.degrees(elevation_rad) / WIDTH_DEG) ** 2, FLOOR_DB)
     aside_db = np.minimum(12 * (np.degrees(azimuth_rad) / WIDTH_DEG) ** 2, FLOOR_DB)
     gain_db = BEST_DBI - np.minimum(down_db + aside_db, FLOOR_DB)

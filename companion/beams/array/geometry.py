@@ -18,12 +18,12 @@ SPEED_OF_LIGHT_MPS: Final = 299_792_458.0
 SAME_PLACE_WAVELENGTHS: Final = 1e-9
 """Distance below which two positions are identical: 1e-8 rad of phase."""
 LINE_WAVELENGTHS: Final = 1e-6
-"""Root mean square distance from a line below which all elements count as on it."""
+"""Root mean square distance from a line below which all elements count as on the line."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Array:
-    """Element positions at a wavelength, and the mount of the array.
+    """Element positions, their wavelength, and the mount of the array.
 
         elements_m          (M, 3), array frame
         wavelength_m        wavelength
@@ -76,17 +76,18 @@ class Array:
         return len(self.elements_m)
 
     def fed(self, weights: ComplexArray) -> ComplexArray:
-        """Return weights (M, K) with those of dead elements set to 0."""
+        """Return weights (M, K) with the weights of dead elements set to 0."""
         return weights if self.live is None else weights * self.live[:, np.newaxis]
 
     def carried(self, weights: ComplexArray) -> ComplexArray:
-        """Return the excitation of the elements, (M, K), when fed with weights (M, K)."""
+        """Return the excitation of the elements, (M, K), if their ports are fed with weights (M,
+        K)."""
         live = self.fed(weights)
         return live if self.coupling is None else self.coupling @ live
 
     @property
     def wavenumber_radpm(self) -> float:
-        """2 pi / wavelength."""
+        """Wavenumber, 2 pi / wavelength."""
         return 2 * np.pi / self.wavelength_m
 
 
@@ -99,7 +100,7 @@ def uniform_linear(
     element: Element = ISOTROPIC,
     lever_arm_m: FloatArray | None = None,
 ) -> Array:
-    """Uniform linear array along y, its first element at the origin.
+    """Build a uniform linear array along y, its first element at the origin.
 
     Raises ``UserError`` for invalid numbers, as do the functions below.
     """
@@ -124,7 +125,7 @@ def uniform_rectangular(
     element: Element = ISOTROPIC,
     lever_arm_m: FloatArray | None = None,
 ) -> Array:
-    """Uniform rectangular array: rows downward (z) of elements to the right (y), row by row.
+    """Build a uniform rectangular array of rows downward (z), each to the right (y).
 
     The first element is at the origin. One row is the uniform linear array.
     """
@@ -155,7 +156,7 @@ def uniform_circular(
     element: Element = ISOTROPIC,
     lever_arm_m: FloatArray | None = None,
 ) -> Array:
-    """Circle around the origin; the spacing is the chord between neighbours.
+    """Build a circle around the origin; the spacing is the chord between neighbours.
 
     The first element is on x, the next ones follow towards y. Elements that are not isotropic face
     outward.
@@ -185,7 +186,7 @@ def hexagonal(
     element: Element = ISOTROPIC,
     lever_arm_m: FloatArray | None = None,
 ) -> Array:
-    """Rings of hexagons about a middle element, on a triangular lattice in the yz plane.
+    """Build rings of hexagons about a middle element, on a triangular lattice in the yz plane.
 
     1 + 3 R (R + 1) elements for R rings, row by row from the top; neighbours are
     ``spacing_wavelengths`` apart. For the same grating lobes it needs 13 % fewer elements per area
@@ -218,9 +219,9 @@ def listed(
     outward: FloatArray | None = None,
     kind: ArrayKind = ArrayKind.LIST,
 ) -> Array:
-    """Elements at any positions (M, 3), facing ``outward`` (M, 3) (None: boresight).
+    """Build an array from positions (M, 3), facing ``outward`` (M, 3) (None: boresight).
 
-    Raises ``UserError`` for two elements at one place: they would be one element wired twice.
+    Raises ``UserError`` for two elements at the same position.
     """
     wavelength_m = _wavelength_m(len(elements_m), frequency_hz, 1.0)
     if elements_m.ndim != 2 or elements_m.shape[1] != 3 or not np.isfinite(elements_m).all():
@@ -250,7 +251,7 @@ def _wavelength_m(elements: int, frequency_hz: float, spacing: float) -> float:
 
 
 def _facing(outward: FloatArray, count: int) -> FloatArray:
-    """element_from_array (M, 3, 3): x outward, y level (to the right of outward) where possible.
+    """Return element_from_array (M, 3, 3): x outward, y level (right of outward) where possible.
 
     An element that faces straight up or down keeps the array's y.
     """

@@ -21,17 +21,17 @@ from companion.beams.array.geometry import Array
 from companion.values import ComplexArray, FloatArray
 
 MIN_ENTRIES_FOR_POWERS: Final = 1000
-"""Entries of a steering matrix from which powers are cheaper than exponentials."""
+"""Least entries of a steering matrix for which powers are cheaper than exponentials."""
 
 
 def angles_rad(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Azimuth and elevation, (N,) each, of unit directions (N, 3) in the array frame."""
+    """Return azimuth and elevation, (N,) each, of unit directions (N, 3) in the array frame."""
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
     return azimuth, np.arcsin(np.clip(-directions[:, 2], -1.0, 1.0))
 
 
 def unit_directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
-    """Unit directions (N, 3) in the array frame of azimuths and elevations (N,)."""
+    """Return unit directions (N, 3) in the array frame for azimuths and elevations (N,)."""
     level = np.cos(elevation_rad)
     return np.stack(
         [level * np.cos(azimuth_rad), level * np.sin(azimuth_rad), -np.sin(elevation_rad)], axis=-1
@@ -39,7 +39,7 @@ def unit_directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> Float
 
 
 def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
-    """A, (M, N): one steering vector per column, for unit directions (N, 3)."""
+    """Return A, (M, N): one steering vector per column, for unit directions (N, 3)."""
     matrix = phase_factors(array, directions)
     if array.element.pattern is not ElementPattern.ISOTROPIC:
         matrix *= amplitudes(array, directions)
@@ -49,7 +49,7 @@ def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
 
 
 def phase_factors(array: Array, directions: FloatArray) -> ComplexArray:
-    """Steering vectors (M, N) without the elements' pattern, for unit directions (N, 3)."""
+    """Return steering vectors (M, N) without the element pattern, for unit directions (N, 3)."""
     if array.grid is not None and array.size * len(directions) >= MIN_ENTRIES_FOR_POWERS:
         return _on_grid(array, directions, *array.grid)
     phase = array.wavenumber_radpm * (array.elements_m @ directions.T)
@@ -59,7 +59,7 @@ def phase_factors(array: Array, directions: FloatArray) -> ComplexArray:
 
 
 def _on_grid(array: Array, directions: FloatArray, rows: int, columns: int) -> ComplexArray:
-    """Phase factors (M, N) of elements row by row on a grid from the origin.
+    """Return phase factors (M, N) for elements row by row on a grid from the origin.
 
     Powers of the factor between neighbours are cheaper than exponentials.
     """
@@ -72,9 +72,9 @@ def _on_grid(array: Array, directions: FloatArray, rows: int, columns: int) -> C
 
 
 def _powers(array: Array, step_m: FloatArray, directions: FloatArray, count: int) -> ComplexArray:
-    """exp(j k step . u) to the powers 0 to ``count`` - 1, (count, N).
+    """Return exp(j k step . u) to the powers 0 to ``count`` - 1, (count, N).
 
-    By doubling, so that rounding does not accumulate along the line.
+    Computed by doubling, so that rounding does not accumulate along the line.
     """
     found: ComplexArray = np.empty((count, len(directions)), dtype=complex)
     found[0] = 1.0
@@ -90,12 +90,13 @@ def _powers(array: Array, step_m: FloatArray, directions: FloatArray, count: int
 
 
 def amplitudes(array: Array, directions: FloatArray) -> FloatArray:
-    """Element amplitudes towards unit directions (N, 3): (M, N), or (1, N) if all face alike."""
+    """Return element amplitudes towards directions (N, 3): (M, N); (1, N) if all face alike."""
     return array.element.amplitude(element_directions(array, directions))
 
 
 def element_directions(array: Array, directions: FloatArray) -> FloatArray:
-    """Unit directions (N, 3) in each element's frame: (M, N, 3), or (1, N, 3) if all face alike."""
+    """Return unit directions (N, 3) in each element's frame: (M, N, 3); (1, N, 3) if all face
+    alike."""
     if array.element_from_array is None:
         return directions[np.newaxis]
     turned: FloatArray = np.einsum("mij,nj->mni", array.element_from_array, directions)
@@ -103,10 +104,10 @@ def element_directions(array: Array, directions: FloatArray) -> FloatArray:
 
 
 def pointing_bound_rad(bound_m: float, range_m: float) -> float | None:
-    """Largest angle to the true direction, for a position error of at most ``bound_m``.
+    """Return the largest angle to the true direction for a position error up to ``bound_m``.
 
-    The angle of the tangent to the ball of the error, asin(bound / range), with the range to the
-    *predicted* position; None if the array lies inside the ball and every direction is possible
-    (docs/math.md 5.3).
+    This is the angle of the tangent to the ball of the error, asin(bound / range), with the range
+    to the *predicted* position; None if the array lies inside the ball and every direction is
+    possible (docs/math.md 5.3).
     """
     return math.asin(bound_m / range_m) if bound_m < range_m else None

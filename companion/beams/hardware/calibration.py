@@ -11,11 +11,11 @@ from companion.values import ComplexArray, FloatArray, UserError, shown
 
 CALIBRATION_HEADER: Final = "channel,element,phase_deg,gain_db"
 BOUNDED_HEADER: Final = f"{CALIBRATION_HEADER},phase_error_deg,gain_error_db"
-"""Header of a table that also states bounds on its errors."""
+"""Header of a calibration table that also states bounds on its errors."""
 GAIN_MAX_DB: Final = 1000.0
-"""Largest magnitude of a gain: beyond it factors overflow."""
+"""Largest magnitude of a gain, dB; larger ones would overflow the factors."""
 DIGITS_MAX: Final = 18
-"""Most digits of a whole number: for thousands of them, ``int`` raises another error."""
+"""Most digits of a whole number; ``int`` raises another error for thousands of digits."""
 PHASE_MAX_DEG: Final = 1e6  # largest magnitude of a phase
 
 
@@ -24,10 +24,10 @@ class Calibration:
     """Measured calibration of an array of M elements.
 
         phase_error_rad, gain_error_db
-                   by element: bounds on the errors of the two; empty: unknown
+                   by element: bounds on the errors of phase and gain; empty: unknown
 
-    A setting is therefore the wanted value less these. Raises ``UserError`` for lengths that
-    differ, values that are not finite, or an order that is no permutation.
+    A setting is the wanted value less these errors. Raises ``UserError`` for lengths that differ,
+    values that are not finite, or an order that is no permutation.
     """
 
     phase_rad: tuple[float, ...]  # by element: phase that the channel adds to its setting
@@ -59,21 +59,21 @@ class Calibration:
 
     @classmethod
     def ideal(cls, order: Sequence[int]) -> Self:
-        """Return a calibration of ideal channels, in this order."""
+        """Return a calibration of ideal channels, with the elements in this order."""
         return cls(phase_rad=(0.0,) * len(order), gain_db=(0.0,) * len(order), order=tuple(order))
 
     @property
     def factors(self) -> ComplexArray:
-        """Factor of each element's channel, (M,)."""
+        """Complex factor of each element's channel, (M,)."""
         factors: ComplexArray = np.exp(1j * np.array(self.phase_rad))
         factors *= 10 ** (np.array(self.gain_db) / 20)
         return factors
 
 
 def channel_error(phase_error_rad: FloatArray, gain_error_db: FloatArray) -> FloatArray:
-    """Largest error of a channel's factor, |actual / wanted - 1|, for bounds on phase and gain.
+    """Return the largest |actual / wanted - 1| of a channel, for bounds on phase and gain.
 
-    It is largest at a corner: the phase at its end, the gain at one of its two.
+    The largest is at a corner: the phase at its bound, the gain at either bound.
     """
     turned = np.exp(1j * np.minimum(phase_error_rad, np.pi))
     ends = [np.abs(10 ** (sign * gain_error_db / 20) * turned - 1) for sign in (1.0, -1.0)]
@@ -84,9 +84,9 @@ def channel_error(phase_error_rad: FloatArray, gain_error_db: FloatArray) -> Flo
 def parse_calibration(text: str) -> Calibration:
     """Parse CSV with the header ``channel,element,phase_deg,gain_db`` and a line for each channel.
 
-    ``,phase_error_deg,gain_error_db`` may follow: bounds on the errors of the two. Channels and
-    elements count from 0; lines may be in any order. Raises ``UserError`` that names the line and
-    the value.
+    ``,phase_error_deg,gain_error_db`` may follow: bounds on the errors of phase and gain. Channels
+    and elements count from 0; lines may be in any order. Raises ``UserError`` that names the line
+    and the value.
     """
     order: dict[int, int] = {}
     measured: dict[int, tuple[float, ...]] = {}
@@ -120,7 +120,7 @@ def parse_calibration(text: str) -> Calibration:
 
 
 def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and fields of each line below ``header``; skip empty lines."""
+    """Yield line number and fields of each line of a CSV text below ``header``; skip empty lines."""
     lines = text.splitlines()
     if not lines or lines[0].strip() != header:
         raise UserError(f"line 1: {lines[0] if lines else ''!r} is not the header {header!r}")
@@ -135,7 +135,8 @@ def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def whole(number: int, name: str, field: str, least: int, most: int) -> int:
-    """Parse a whole number of a line. Raises ``UserError`` outside ``least`` to ``most``."""
+    """Parse a whole number from a line of a table. Raises ``UserError`` outside ``least`` to
+    ``most``."""
     digits = field.removeprefix("-")
     is_one = digits.isascii() and digits.isdecimal() and len(digits) <= DIGITS_MAX
     if not is_one or not least <= int(field) <= most:
@@ -145,7 +146,7 @@ def whole(number: int, name: str, field: str, least: int, most: int) -> int:
 
 
 def real(number: int, name: str, field: str, most: float = math.inf) -> float:
-    """Parse a number of a line, of magnitude up to ``most``; else raise ``UserError``."""
+    """Parse a number from a line of a table; raise ``UserError`` if its magnitude exceeds ``most``."""
     try:
         value = float(field)
     except ValueError:

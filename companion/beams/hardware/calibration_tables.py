@@ -32,7 +32,7 @@ from companion.beams.hardware.calibration import (
 from companion.values import FloatArray, UserError, read_toml, shown
 
 FARTHEST_DEG: Final = 90.0
-"""Largest change of a channel's phase, relative to channel 0's, from one frequency to the next."""
+"""Largest phase change of a channel, relative to channel 0, between adjacent frequencies."""
 SAME: Final = 1e-9  # relative difference at which a frequency still equals a table's
 FREQUENCY_MAX_HZ: Final = 1e15
 LARGEST: Final = 1 << 22  # most characters of a file: 4096 channels at 30 frequencies
@@ -42,7 +42,7 @@ BOUNDS: Final = ("phase_error_deg", "gain_error_db")
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class _Table:
-    """One table: columns (M,) by channel, bounds None if unknown."""
+    """Calibration at one frequency: columns (M,) by channel; a bound is None if it is unknown."""
 
     frequency_hz: float
     phase_deg: FloatArray
@@ -52,7 +52,7 @@ class _Table:
 
 
 def calibration_at(text: str, frequency_hz: float) -> Calibration:
-    """Return the calibration for a frequency; CSV applies to any. Raises ``UserError``."""
+    """Return the calibration for a frequency; a CSV file applies to any. Raises ``UserError``."""
     if text.lstrip().startswith(CALIBRATION_HEADER):
         return parse_calibration(text)
     order, tables = _read(text)

@@ -22,13 +22,11 @@ from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, User
 
 LEVELS: Final = 12  # most rounds of splitting cells
 RESPONSES_MAX: Final = 2**18
-"""Limit on beams times cells examined per query; a started round is finished."""
+"""Limit on beams times cells examined per query; a round that has started is completed."""
 MOST_TERMS: Final = 2**26
-"""Limit on beams times cells times elements per query: it matters for arrays above 256 elements."""
+"""Limit on beams times cells times elements per query, for arrays above 256 elements."""
 MOST_TERMS_AT_FIRST: Final = 2**30
-"""The same for the first round, which is finished once started: half a second. Beyond it, all beams
-must be swept.
-"""
+"""Limit on beams times cells times elements in the first round of a query: half a second."""
 MOST_ENTRIES: Final = 2**22  # elements times beams of a codebook: 64 MB
 BLOCK: Final = 2**19
 """Beams times cells, or beams times directions, computed at once: some tens of megabytes."""
@@ -37,11 +35,11 @@ SAMPLES_PER_BEAM: Final = 4  # samples while a direction crosses one beam
 
 
 WEIGHT_MAX: Final = 1e300
-"""Largest weight of a list; the largest weight of each beam is at least one over it."""
+"""Largest weight accepted in a codebook; each beam's largest must be at least its inverse."""
 
 
 class CodebookKind(StrEnum):
-    """Origin of a codebook."""
+    """Where a codebook came from: a DFT or a file."""
 
     DFT = "dft"
     LISTED = "listed"
@@ -62,7 +60,7 @@ class Codebook:
 
 @dataclass(frozen=True, slots=True)
 class NextBest:
-    """Index that is best now, the one that becomes best next, and in how many seconds.
+    """Index of the best beam now, of the beam that becomes best next, and seconds until then.
 
     ``next_index`` and ``after_s`` are None if no other becomes best within the horizon.
     """
@@ -73,7 +71,7 @@ class NextBest:
 
 
 def dft(array: Array, oversampling: int = 1) -> Codebook:
-    """Beams of a discrete Fourier transform over a line or a grid of elements.
+    """Build the beams of a discrete Fourier transform over a line or a grid of elements.
 
     A line of n elements along y has K = n oversampling beams. The k-th steps by -2 pi k / K from
     element to element, and so points where spacing / wavelength times u_y is k/K, or that less a
@@ -105,7 +103,7 @@ def _line(count: int, oversampling: int) -> ComplexArray:
 
 
 def listed(weights: ComplexArray, array: Array) -> Codebook:
-    """Codebook from a list of weights (M, K), each column scaled to unit power.
+    """Build a codebook from a list of weights (M, K), each column scaled to unit power.
 
     Raises ``UserError`` if they do not match the array, are not finite, or a beam is zero.
     """
@@ -125,7 +123,7 @@ def listed(weights: ComplexArray, array: Array) -> Codebook:
 
 
 def best(codebook: Codebook, array: Array, directions: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Best beam for each unit direction (N, 3), and its gain.
+    """Find the best beam for each unit direction (N, 3), and its gain.
 
     Returns indices (N,), the lowest of equal ones, and array gains |a^T c|^2 (N,), linear, element
     pattern included.
@@ -146,7 +144,7 @@ def _best(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[IntArray,
 
 
 def _gains(codebook: Codebook, array: Array, unit: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Gains (K, N) of all beams towards unit directions, and their common factor (N,)."""
+    """Return gains (K, N) of all beams towards unit directions, and their common factor (N,)."""
     if cone.has_distinct_patterns(array) or array.live is not None or array.coupling is not None:
         power = np.abs(codebook.weights.T @ steering.steering_matrix(array, unit)) ** 2
         return power, np.ones(len(unit))
@@ -172,7 +170,7 @@ def candidates(
     pointing_bound_rad: float | None,
     share: float = 1.0,
 ) -> IntArray:
-    """Indices, ascending, of the beams that must be swept to find the best one.
+    """Return the indices, ascending, of the beams that must be swept to find the best one.
 
     They include the best beam for every true direction within the bound of the unit direction (3,);
     all beams without a bound (None). This is proven: a beam is excluded from a cell only if its
@@ -209,7 +207,7 @@ def candidates(
 def _possible_beams(
     cones: DirectionCones, boxes: Boxes, weights: ComplexArray
 ) -> tuple[BoolArray, BoolArray]:
-    """Beams that can be best somewhere in each box, (K, C), and those best at any middle, (K,)."""
+    """Return masks of beams: best somewhere in each box (K, C), best in any box's middle (K,)."""
     size, beams = weights.shape
     placed = cones.positions_m.T[:, :, np.newaxis] * weights
     stacked = np.concatenate([weights[np.newaxis], placed]).transpose(0, 2, 1)
@@ -238,15 +236,15 @@ def next_best(
     horizon_s: float,
     step_s: float,
 ) -> NextBest:
-    """Best beam now, and the one that becomes best next, to a millisecond.
+    """Find the best beam now and the one that becomes best next, to a millisecond.
 
         directions_at  unit directions (T, 3) for seconds from now (T,)
         horizon_s      how far ahead to search
         step_s         sampling step; the first change between two samples is bisected
 
     A beam that is best for less than a step can be missed; if several changes fall into one step,
-    one of them is found. With ``sampling_step_s`` neither happens in practice. Raises ``UserError``
-    for a horizon or a step not above 0.
+    one of them is found. With ``sampling_step_s`` neither case occurs in practice. Raises
+    ``UserError`` for a horizon or a step not above 0.
     """
     if not (0 < horizon_s < math.inf and step_s > 0):
         raise UserError(
@@ -275,7 +273,7 @@ def next_best(
 
 
 def sampling_step_s(codebook: Codebook, array: Array, rate_radps: float) -> float | None:
-    """Step for ``next_best``: a quarter of the time in which a direction crosses one beam.
+    """Return a step for ``next_best``: a quarter of the time in which a direction crosses a beam.
 
     ``rate_radps`` is the direction's angular rate. A beam is assumed as wide as wavelength /
     extent, or less if there are more beams than elements. None if the direction is constant or the

@@ -29,14 +29,14 @@ TMYTEK_HEADER: Final = "Mode,BeamID,BeamType,beam_db,beam_theta,beam_phi,ch,ch_s
 
 
 def check_name(uav: str) -> str:
-    """Return the name if it is valid in a line of fields. Raises ``UserError`` if not."""
+    """Return a name if it is valid in a line of fields; else raise ``UserError``."""
     if not uav or uav != uav.strip() or not uav.isprintable() or set(uav) & set(',"'):
         raise UserError(f"UAV {uav!r}: name has a comma, quote, line break or outer blank")
     return uav
 
 
 def write_adar1000(uavs: Sequence[str], codes: IntArray, order: Sequence[int]) -> str:
-    """CSV with a line for each beam and channel: the registers of each chip.
+    """Write CSV with a line for each beam and channel: the registers of each chip.
 
     Beams are the RAM positions from 0; chips and elements count from 0, channels of a chip from 1
     as on the data sheet. ``vm_i`` and ``vm_q`` are the vector modulator's register bytes,
@@ -57,7 +57,7 @@ def write_adar1000(uavs: Sequence[str], codes: IntArray, order: Sequence[int]) -
 
 
 def write_tmytek(codes: IntArray, gains: UnitGains) -> str:
-    """CSV for TLKCore with a line for each beam and channel (BeamType 1); beams count from 1.
+    """Write TLKCore's CSV, a line for each beam and channel (BeamType 1); beams count from 1.
 
     A channel that is off gets the lowest gain of the unit, because TLKCore checks the differences
     within its board. The format has no field for names.
@@ -73,7 +73,7 @@ def write_tmytek(codes: IntArray, gains: UnitGains) -> str:
 
 
 def write_sivers(uavs: Sequence[str], codes: IntArray, frequency_hz: float) -> str:
-    """Eder beam book of one table: 64 rows of Q and I bytes, antenna 15 first.
+    """Write an Eder beam book of one table: 64 rows of Q and I bytes, antenna 15 first.
 
     The manufacturer's loader packs each pair to Q << 6 | I. It searches for ``START_TABLE FREQ:``
     (GHz) and skips the text before, where the names of the rows are written. Rows without a beam

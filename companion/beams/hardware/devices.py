@@ -15,7 +15,7 @@ from companion.values import WeightFormat
 
 
 class Beamformer(StrEnum):
-    """Hardware for which weights can be written."""
+    """Kind of phased-array hardware for which weights can be written."""
 
     ADAR1000 = WeightFormat.ADAR1000.value
     TMYTEK = WeightFormat.TMYTEK.value
@@ -24,7 +24,7 @@ class Beamformer(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceLimits:
-    """Limits of a device.
+    """Limits of a phased-array device.
 
     off_boresight_rad  largest steering angle off boresight; None: not stated
     """
@@ -58,7 +58,7 @@ ADAR1000_GAINS: Final = (
     *((code, 1) for code in range(_JOIN, ADAR1000_LOWEST_GAIN - 1, -1)),
     (0, 1),
 )
-"""Gain code and attenuator (1: inserted) of each level; the last one is off."""
+"""Gain code and attenuator (1: inserted) of each gain level; the last level is off."""
 
 # Vector modulator registers of phase codes 0 to 63: data sheet rev. B, tables 13 to 16, as the
 # Linux driver has them. Bit 5 is the sign (1: positive), bits 4-0 the magnitude. Half a turn
@@ -74,7 +74,7 @@ _VM_Q: Final = bytes.fromhex(
 
 
 def vector_modulator(phase_code: int) -> tuple[int, int]:
-    """Return I and Q register bytes of the ADAR1000 for a phase code of 0 to 127."""
+    """Return the I and Q register bytes of an ADAR1000 for a phase code of 0 to 127."""
     half_turn, code = divmod(phase_code, 64)
     i, q = _VM_I[code], _VM_Q[code]
     return (i ^ 0x20, q ^ 0x20 if q & 0x1F else q) if half_turn else (i, q)
@@ -96,7 +96,7 @@ TMYTEK_SETTINGS: Final = stepped(360, TMYTEK_STEP_DB, TMYTEK_RANGE_DB, off=True)
 
 
 class Mode(StrEnum):
-    """Use of a TMYTEK beam: transmission and reception have separate tables."""
+    """Use of a TMYTEK unit: transmission or reception, with a separate table for each."""
 
     TX = "TX"
     RX = "RX"
@@ -126,7 +126,7 @@ SETTINGS: Final[dict[Beamformer, SettableStates]] = {
     Beamformer.TMYTEK: TMYTEK_SETTINGS,
     Beamformer.SIVERS: Quadrature(SIVERS_OFFSET),
 }
-"""Settings of one channel of each device."""
+"""Possible settings of one channel, for each device."""
 
 LIMITS: Final = {
     Beamformer.ADAR1000: DeviceLimits(

@@ -21,11 +21,11 @@ MOST_BEAMS: Final = 1 << 16  # ids of beams have 16 bits
 
 
 def q15(codebook: Codebook, calibration: Calibration) -> IntArray:
-    """Real and imaginary parts (K, M, 2) by beam and port, as 16-bit integers.
+    """Return the weights' real and imaginary parts (K, M, 2) by beam and port, 16-bit integers.
 
     Ports are the calibration's channels, and their errors are compensated. Beams have unit power,
-    unless a weak channel requires a reduction of all to stay within the range. Raises ``UserError``
-    for more beams than ids.
+    unless a weak channel requires lower power of all beams to stay within the range. Raises
+    ``UserError`` for more beams than ids.
     """
     if codebook.size > MOST_BEAMS:
         raise UserError(f"{codebook.size} beams exceed a digital beam table's {MOST_BEAMS}")
@@ -37,7 +37,7 @@ def q15(codebook: Codebook, calibration: Calibration) -> IntArray:
 
 
 def write_oai_dbt(codebook: Codebook, calibration: Calibration) -> str:
-    """CSV: ids are the indices of the codebook, as in the API."""
+    """Write OpenAirInterface's CSV; beam ids are the indices of the codebook, as in the API."""
     table = q15(codebook, calibration)
     lines = [",".join(["beam_id", *(f"txru{port}" for port in range(table.shape[1]))])]
     for beam, row in enumerate((table / FULL_SCALE).tolist()):

@@ -34,7 +34,7 @@ MEASURED_HEADER: Final = "azimuth_deg,elevation_deg,channel,phase_deg,gain_db"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ChannelResponses:
-    """Responses (K, M) of single channels to a source at unit directions (K, 3)."""
+    """Measured responses (K, M) of single channels to a source at unit directions (K, 3)."""
 
     directions: FloatArray
     responses: ComplexArray
@@ -42,7 +42,7 @@ class ChannelResponses:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class FittedCalibration:
-    """Calibration with bounds, and its residual errors.
+    """Calibration fitted to measurements, with bounds, and its residual errors.
 
     phase_deg, gain_db  largest errors that remain, of all channels and directions
     """
@@ -54,7 +54,7 @@ class FittedCalibration:
 
 
 def parse_responses(text: str) -> ChannelResponses:
-    """Parse CSV with the header ``MEASURED_HEADER``: a line for each direction and channel.
+    """Parse responses from CSV with the header ``MEASURED_HEADER``, a line per measurement.
 
     Raises ``UserError`` that names the line, or the missing channel.
     """
@@ -127,7 +127,7 @@ def fitted(measured: ChannelResponses, array: Array, order: Sequence[int]) -> Fi
 
 
 def as_text(calibration: Calibration) -> str:
-    """CSV that ``parse_calibration`` reads, with bounds."""
+    """Return a calibration with bounds as CSV that ``parse_calibration`` reads."""
     errors = calibration.phase_error_rad, calibration.gain_error_db
     phase_off, gain_off = (found or (0.0,) * len(calibration.order) for found in errors)
     lines = [BOUNDED_HEADER]

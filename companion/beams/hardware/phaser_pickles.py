@@ -17,7 +17,7 @@ from companion.values import UserError
 
 ELEMENTS: Final = 8
 ORDER: Final = (6, 7, 4, 5, 2, 3, 0, 1)
-"""Element of each channel: BEAM0 has 7, 8, 5, 6, and BEAM1 3, 4, 1, 2, counted from 1."""
+"""Element of each Phaser channel: BEAM0 has 7, 8, 5, 6, and BEAM1 3, 4, 1, 2, counted from 1."""
 LARGEST_BYTES: Final = 10_000
 _MARK: Final = object()
 _CONSTANTS: Final = (
@@ -29,7 +29,7 @@ _SCALARS: Final = {"f8": "d", "f4": "f", "i8": "q", "i4": "i"}
 
 
 def calibration(phases: bytes, gains: bytes) -> Calibration:
-    """Return the calibration in two pickles; raises ``UserError`` unless each has 8 numbers."""
+    """Return the calibration in two Phaser pickles; ``UserError`` unless each has 8 numbers."""
     added_deg = numbers("phase calibration", phases)
     factors = numbers("gain calibration", gains)
     if not all(factor > 0 for factor in factors):
@@ -180,7 +180,7 @@ def _latin1(text: object, _: object) -> bytes:
 
 
 class _Kind:
-    """Type of number by its name; numpy's state for it only gives the byte order."""
+    """Stand-in for numpy's dtype in a pickle, by name; its pickled state gives the byte order."""
 
     def __init__(self, name: object, *_: object) -> None:
         self.name = name

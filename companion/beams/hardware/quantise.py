@@ -37,20 +37,20 @@ from companion.values import ComplexArray, FloatArray, IntArray
 ROTATIONS: Final = 16  # common rotations that are tried, over one step of phase
 STARTS: Final = 4  # best rotations from which the descent starts
 SWEEPS: Final = 100
-"""Most sweeps of the coordinate descent; it mostly ends after three to eight."""
+"""Most sweeps of the coordinate descent; it usually ends after three to eight."""
 REACH: Final = 2  # steps of phase, gain, I or Q that one move may take
 NEAR: Final = np.array([(i, j) for i in range(-REACH, REACH + 1) for j in range(-REACH, REACH + 1)])
-"""All moves within ``REACH``, as pairs of steps."""
+"""All moves between codes within ``REACH``, as pairs of steps."""
 EMPHASIS: Final = 1.0
-"""Weight w_j if the elements of a_j have amplitude 1.
+"""Weight w_j of an emphasised direction if the elements of a_j have amplitude 1.
 
-At 1 a direction counts as much as the whole pattern. More deepens nulls by less than a decibel and
-costs gain.
+At 1 a direction counts as much as the whole pattern. A larger weight deepens nulls by less than a
+decibel and costs gain.
 """
 
 
 class SettableStates(Protocol):
-    """Settings of one element: codes of two integers each, full gain at amplitude 1.
+    """Possible settings of one element: codes of two integers each, full gain at amplitude 1.
 
     period_rad  the rotation that maps the settings onto themselves
     values      complex factors (...) of codes (..., 2)
@@ -67,7 +67,7 @@ class SettableStates(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Resolution:
-    """Phase shifter and gain control: codes are (phase, gain).
+    """Resolution of a phase shifter with gain control; codes are (phase, gain).
 
     Phase code k is a factor exp(+j 2 pi k / ``phase_steps``); b bits are 2**b steps. Gain code i
     has amplitude ``levels[i]``, decreasing from 1, full gain; a last level of 0 is an element
@@ -90,13 +90,13 @@ class Resolution:
         return 2 * np.pi / self.phase_steps
 
     def values(self, codes: IntArray) -> ComplexArray:
-        """Factors (...) of codes (..., 2)."""
+        """Return the complex factors (...) of codes (..., 2)."""
         phases_rad = self.period_rad * codes[..., 0]
         factors: ComplexArray = np.asarray(self.levels)[codes[..., 1]] * np.exp(1j * phases_rad)
         return factors
 
     def nearest(self, wanted: ComplexArray) -> IntArray:
-        """Codes (..., 2): phase and gain, each rounded separately.
+        """Return the codes (..., 2) nearest to factors: phase and gain, each rounded separately.
 
         An amplitude below the range becomes the lowest level or off, whichever is nearer. An
         amplitude of 1 stays at full gain, whatever its phase error.
@@ -107,7 +107,7 @@ class Resolution:
         return np.stack([phase % self.phase_steps, gain], axis=-1)
 
     def around(self, codes: IntArray) -> IntArray:
-        """Codes (S, n, 2) within ``REACH`` steps of phase and of gain, and the lowest level."""
+        """Return codes (S, n, 2) within ``REACH`` steps of phase and gain, and the lowest level."""
         last = len(self.levels) - 1
         lowest = NEAR[NEAR[:, 1] == 0] + (0, last)
         near = codes[:, np.newaxis] + (np.concatenate([NEAR, lowest]) if last else lowest)
@@ -121,7 +121,7 @@ def stepped(
     gain_range_db: float = 0.0,
     off: bool = False,
 ) -> Resolution:
-    """Equal steps of gain in dB from 0 down to ``-gain_range_db`` (None: no gain control).
+    """Return equal gain steps in dB from 0 to ``-gain_range_db`` (None: no gain control).
 
     ``off``: an element can be switched off. Raises ``ValueError`` for an invalid step or range.
     """
@@ -139,7 +139,7 @@ def stepped(
 
 @dataclass(frozen=True, slots=True)
 class Quadrature:
-    """Vector modulator: codes are (I, Q), integers from -``peak`` to ``peak``.
+    """Resolution of a vector modulator: codes are (I, Q), integers from -``peak`` to ``peak``.
 
     The factor is (I + jQ) / ``peak``, so that full gain is possible at every phase; no code is more
     than half a step above that. I = Q = 0 is off.
@@ -152,17 +152,17 @@ class Quadrature:
         return np.pi / 2
 
     def values(self, codes: IntArray) -> ComplexArray:
-        """Factors (...) of codes (..., 2)."""
+        """Return the complex factors (...) of codes (..., 2)."""
         factors: ComplexArray = codes.astype(np.float64).view(np.complex128)[..., 0] / self.peak
         return factors
 
     def nearest(self, wanted: ComplexArray) -> IntArray:
-        """Codes (..., 2): I and Q, each rounded separately."""
+        """Return the codes (..., 2) nearest to factors: I and Q, each rounded separately."""
         both = np.stack([wanted.real, wanted.imag], axis=-1) * self.peak
         return np.clip(np.rint(both), -self.peak, self.peak).astype(np.int64)
 
     def around(self, codes: IntArray) -> IntArray:
-        """Codes (S, n, 2) within ``REACH`` steps of I and of Q, and not above full gain."""
+        """Return codes (S, n, 2) within ``REACH`` steps of I and Q, and not above full gain."""
         near = codes[:, np.newaxis] + NEAR
         full = np.hypot(near[..., 0], near[..., 1]) <= self.peak + 0.5
         allowed = full & (np.abs(near).max(axis=-1) <= self.peak)
@@ -171,7 +171,7 @@ class Quadrature:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantised:
-    """Settings of one beam.
+    """Quantised settings of one beam.
 
     weights  (M,) that they radiate, channel factors included; the strongest element is at full
              gain
@@ -218,7 +218,8 @@ def quantise(
 
 
 def _target_factors(weights: ComplexArray, factors: ComplexArray) -> ComplexArray:
-    """Factors wanted of the settings: weights over channels, the strongest of amplitude 1."""
+    """Return the wanted factors of the settings: weights over channels, the strongest of amplitude
+    1."""
     if weights.ndim != 1 or factors.shape != weights.shape:
         raise ValueError(f"weights {weights.shape} and channels {factors.shape}: both must be (M,)")
     if not (np.isfinite(weights).all() and np.isfinite(factors).all() and factors.all()):
@@ -232,7 +233,7 @@ def _target_factors(weights: ComplexArray, factors: ComplexArray) -> ComplexArra
 
 
 def _metric(size: int, towards: ComplexArray | None, emphasis: float) -> ComplexArray:
-    """K (M, M): the identity for the pattern, plus a term for each emphasised direction."""
+    """Return K (M, M): the identity for the pattern, plus a term for each emphasised direction."""
     metric = np.eye(size, dtype=complex)
     if towards is None:
         return metric
@@ -246,7 +247,7 @@ def _metric(size: int, towards: ComplexArray | None, emphasis: float) -> Complex
 
 
 def _score(radiated: ComplexArray, metric: ComplexArray, weights: ComplexArray) -> FloatArray:
-    """|g^H K f|^2 / (g^H K g) of each row g of ``radiated`` (n, M)."""
+    """Return |g^H K f|^2 / (g^H K g) for each row g of ``radiated`` (n, M)."""
     towards_wanted = radiated.conj() @ (metric @ weights)
     power = np.einsum("nm,nm->n", radiated.conj() @ metric, radiated).real
     score: FloatArray = np.abs(towards_wanted) ** 2 / power
@@ -260,7 +261,7 @@ def _best_rotations(
     weights: ComplexArray,
     factors: ComplexArray,
 ) -> IntArray:
-    """Codes (``STARTS``, M, 2) rounded at the best of the common rotations, 0 among them."""
+    """Return codes (``STARTS``, M, 2), rounded at the best common rotations, including 0."""
     turns = np.exp(1j * settings.period_rad * np.arange(ROTATIONS) / ROTATIONS)
     codes = np.unique(settings.nearest(turns[:, np.newaxis] * wanted), axis=0)
     best = np.argsort(-_score(factors * settings.values(codes), metric, weights), kind="stable")
@@ -277,12 +278,12 @@ def _descend(
     factors: ComplexArray,
     strongest: int,
 ) -> IntArray:
-    """Coordinate descent from each of ``starts`` (S, M, 2), all at once.
+    """Run coordinate descent from each of ``starts`` (S, M, 2), all at once.
 
     A change of element m by d changes p = g^H K f by d* (K f)_m and q = g^H K g by 2 Re(d* (K g)_m)
     + |d|^2 K_mm, so all settings of one element are compared at once, and K g is updated by one
-    column of K. It is sequential, and meant for exports, not for every update. The strongest
-    element may rotate but not become weaker.
+    column of K. The descent is sequential, and meant for exports, not for every update. The
+    strongest element may rotate but not become weaker.
     """
     codes, set_to = starts.copy(), settings.values(starts)
     least = np.zeros(set_to.shape)

@@ -20,7 +20,7 @@ from companion.values import ComplexArray, IntArray, UserError
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class WantedBeam:
-    """Beam to write for a device.
+    """Beam to convert to settings of a device.
 
     weights                     (M,)
     azimuth_rad, elevation_rad  its direction in the array frame
@@ -37,7 +37,7 @@ class WantedBeam:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DeviceTable:
-    """Settings of a device.
+    """Settings of a device for all beams of a table.
 
     weights  (M, K), by element, as radiated; each beam has its strongest element at full gain,
              and the feed of the array divides the power among beams
@@ -60,7 +60,7 @@ def fit(
     calibration: Calibration,
     gains: UnitGains = RELATIVE,
 ) -> DeviceTable:
-    """Return the settings nearest to the wanted beams; ``gains`` are those of a TMYTEK unit.
+    """Return the settings nearest to the wanted beams; ``gains`` are the gains of a TMYTEK unit.
 
     Raises ``UserError``, with the reason, for beams outside the device's limits.
     """
@@ -90,7 +90,7 @@ def fit(
 
 
 def encode(table: DeviceTable, frequency_hz: float | None = None) -> str:
-    """Return the table in the format of its device (``companion.beams.hardware.device_text``).
+    """Return a device table in the device's format (``companion.beams.hardware.device_text``).
 
     ``frequency_hz`` is needed by Sivers only. Raises ``UserError`` for a value that the format
     cannot hold.
@@ -135,6 +135,6 @@ def _check(
 
 
 def _off_boresight_rad(beam: WantedBeam) -> float:
-    """Angle between the beam's direction and x of the array frame: theta."""
+    """Return the angle theta between a beam's direction and x of the array frame."""
     along = math.cos(beam.elevation_rad) * math.cos(beam.azimuth_rad)
     return float(np.arccos(np.clip(along, -1.0, 1.0)))

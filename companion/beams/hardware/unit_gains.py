@@ -25,13 +25,13 @@ from companion.values import UserError, read_toml, shown
 BOARD_CHANNELS: Final = 4
 BOARDS: Final = TMYTEK_CHANNELS // BOARD_CHANNELS
 UNIT_MAX_DB: Final = 200.0
-"""Largest magnitude of a gain of a unit: each step of its range takes memory."""
+"""Largest magnitude of a gain of a TMYTEK unit, dB; each step of the range takes memory."""
 KEYS: Final = {"mode", "common_db", "element_db"}
 
 
 @dataclass(frozen=True, slots=True)
 class UnitGains:
-    """Gains of all channels of a unit."""
+    """Gains of all channels of a TMYTEK unit."""
 
     mode: Mode  # transmission or reception, which have different limits
     full_gain_db: float  # gain of an element at full gain, in steps of TMYTEK_STEP_DB
@@ -45,11 +45,11 @@ class UnitGains:
 
 
 RELATIVE: Final = UnitGains(Mode.TX, 0.0, TMYTEK_RANGE_DB)
-"""Gains relative to the strongest element, for an unknown unit: it may reject them."""
+"""Gains relative to the strongest element, for an unknown TMYTEK unit, which may reject them."""
 
 
 def parse_unit_gains(text: str) -> UnitGains:
-    """Parse the file described above. Raises ``UserError`` that names the key."""
+    """Parse a TOML file with the gains of a TMYTEK unit. Raises ``UserError`` that names the key."""
     told = read_toml(text)
     if set(told) != KEYS:
         raise UserError(f"keys are {', '.join(sorted(told))}; give {', '.join(sorted(KEYS))}")

@@ -24,13 +24,13 @@ SAMPLES_PER_WIDTH: Final = 6  # samples per natural width of a line
 SAMPLES_PER_WIDTH_IN_PLANE: Final = 8  # the same on each axis of a plane
 EDGE: Final = 0.25  # distance beyond a cone, in sample steps, at which a sample counts half
 MOST_INCLINED: Final = 0.95
-"""Inclination at which ellipses are clipped: more inclined cones reach behind the plane."""
+"""Inclination at which ellipses are clipped; cones inclined more reach behind the plane."""
 RINGS: Final = 4  # rings of directions in which other arrays are sampled
 
 
 @dataclass(frozen=True, slots=True)
 class ApertureCones:
-    """Cones of K sizes about N directions, by the cosines to the axes of an aperture.
+    """Cones of K sizes about N directions, as cosines to the axes of an aperture.
 
     lowest, highest  (K, N, D), the ends of the interval
     """
@@ -49,7 +49,7 @@ class ApertureCones:
 
     @property
     def inclined(self) -> FloatArray:
-        """Inclination of the ellipses that a plane sees, (N,), -1 to 1.
+        """Inclination of the ellipses that a planar array sees, (N,), -1 to 1.
 
         A cone about u is seen as an ellipse like 1 - u u^T, u reduced to the two axes: this is that
         matrix's coefficient of correlation. 0: parallel to the axes.
@@ -61,14 +61,14 @@ class ApertureCones:
 
     @property
     def furthest(self) -> FloatArray:
-        """Distance from the predicted direction to the further end."""
+        """Distance from the predicted direction to the further end of the interval."""
         return np.maximum(self.highest - self.seen, self.seen - self.lowest)
 
 
 def cones_on_aperture(
     across: Aperture, directions: FloatArray, angles_rad: FloatArray
 ) -> ApertureCones:
-    """Return the cones within angles (K, N) of unit directions (N, 3)."""
+    """Return the cones within angles (K, N) of unit directions (N, 3), as an aperture sees them."""
     cosines = np.minimum(np.maximum(directions @ across.axes.T, -1.0), 1.0)
     angle, wide = np.arccos(cosines), angles_rad[:, :, np.newaxis]
     lowest = np.cos(np.minimum(angle + wide, np.pi))
@@ -78,7 +78,7 @@ def cones_on_aperture(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ConeSamples:
-    """Samples of N beams, at P places each.
+    """Samples of N beams, at P directions each.
 
     turns    (M, N), phase factors that steer all beams to one direction, on a grid
     waves    responses of the elements on each axis (n, P_d) to places about it; empty elsewhere
@@ -93,7 +93,7 @@ class ConeSamples:
     counts: FloatArray
 
     def fields(self, weights: ComplexArray) -> ComplexArray:
-        """Return the field of each column (M, N) at its user's places, (N, P)."""
+        """Return the field of each column (M, N) at its user's sampled directions, (N, P)."""
         if not self.waves:
             found: ComplexArray = np.einsum("npm,mn->np", self.vectors, weights)
             return found
@@ -140,7 +140,7 @@ def cones(
 def _grid_samples(
     across: Aperture, seen: ApertureCones, grid: tuple[int, int], wavelength_m: float
 ) -> tuple[list[ComplexArray], FloatArray]:
-    """Return the samples about each predicted direction: waves on each axis, and weights."""
+    """Return samples about each predicted direction on a grid: waves per axis, and weights."""
     wide = across.lengths_m / wavelength_m
     furthest = (seen.furthest * wide).max(axis=(0, 1))
     middles, halves = (seen.middles - seen.seen) * wide, seen.halves * wide
@@ -165,9 +165,9 @@ def _grid_samples(
 
 
 def _off_ellipses(along: FloatArray, down: FloatArray, inclined: FloatArray) -> FloatArray:
-    """Return the distance of places from ellipses: 1 on the rim, (K, N, P_1 P_0).
+    """Return the relative distance of points from ellipses, (K, N, P_1 P_0); 1 on the rim.
 
-    Given places on the first axis (K, N, P_0) and on the second (K, N, P_1), in half intervals.
+    Takes points on the first axis (K, N, P_0) and on the second (K, N, P_1), in half intervals.
     """
     y, z = along[:, :, np.newaxis], down[:, :, :, np.newaxis]
     mixed = inclined[:, np.newaxis, np.newaxis]
@@ -176,7 +176,7 @@ def _off_ellipses(along: FloatArray, down: FloatArray, inclined: FloatArray) -> 
 
 
 def _waves(count: int, finer: int, reach: int) -> ComplexArray:
-    """Return responses of elements, (count, 2 reach + 1), to places ``finer`` per natural width."""
+    """Return responses of elements, (count, 2 reach + 1), to points ``finer`` per natural width."""
     longest = 1 << max(reach - 1, 0).bit_length()
     return _all_waves(count, finer, longest)[:, longest - reach : longest + reach + 1]
 
@@ -222,9 +222,9 @@ def _ring_samples(
 def outside(
     across: Aperture, seen: ApertureCones, around: FloatArray, wavelength_m: float
 ) -> FloatArray:
-    """Distance of directions (P, 3) outside the first of K cones, natural widths, (P, N).
+    """Return the distance of directions (P, 3) outside K cones, natural widths, (P, N).
 
-    0 within.
+    0 within the first cone.
     """
     cosines = (around @ across.axes.T)[:, np.newaxis]
     beyond = np.maximum(np.maximum(seen.lowest[0] - cosines, cosines - seen.highest[0]), 0.0)

@@ -1,4 +1,4 @@
-"""Grouping: which users are served together, given the allowed cost of zero forcing."""
+"""Grouping: which users share a time slot, given the allowed cost of zero forcing."""
 
 import math
 from collections.abc import Sequence
@@ -12,7 +12,7 @@ from companion.values import ComplexArray, FloatArray, IntArray
 
 @dataclass(frozen=True, slots=True)
 class CostLimits:
-    """Allowed cost of zero forcing: the loss of any user, dB, and the condition number."""
+    """Allowed cost of zero forcing: the loss of any user in dB, and the condition number."""
 
     loss_db: float
     condition: float
@@ -20,7 +20,7 @@ class CostLimits:
 
 @dataclass(frozen=True, slots=True)
 class PreviousSlots:
-    """Slot number of each user, -1 if left out; ``young`` if the slots are new."""
+    """Previous time slot of each user, -1 if left out; ``young`` if the slots are new."""
 
     numbers: IntArray
     young: bool
@@ -32,7 +32,7 @@ YOUNG_MARGIN_DB: Final = 1.5  # loss accepted beyond the limit while slots are y
 def kept_groups(
     steering: ComplexArray, before: PreviousSlots, limits: CostLimits
 ) -> list[IntArray] | None:
-    """Return the previous groups if they are still within the limits; else None."""
+    """Return the previous groups if they are still within the cost limits; else None."""
     groups = [np.flatnonzero(before.numbers == n) for n in range(int(before.numbers.max()) + 1)]
     most_db = limits.loss_db + (YOUNG_MARGIN_DB if before.young else 0.0)
     if not groups or any(not len(g) or lost_db(steering[:, g], limits) > most_db for g in groups):
@@ -41,7 +41,7 @@ def kept_groups(
 
 
 def lost_db(steering: ComplexArray, limits: CostLimits) -> float:
-    """Return the loss of the worst user by zero forcing, dB; infinite past the condition limit.
+    """Return the loss of the worst user by zero forcing, dB; infinite above the condition limit.
 
     Computed with columns of equal length: a weak element pattern towards a user does not make the
     user harder to separate.
@@ -61,7 +61,7 @@ def _lost_db(gram: ComplexArray, elements: int, limits: CostLimits) -> float:
 
 
 class _Group:
-    """Growing group: the inverse of its Gram matrix, bordered with each added user."""
+    """Growing group of users: the inverse of its Gram matrix, bordered with each added user."""
 
     def __init__(
         self, *, gram: ComplexArray, first: int, elements: int, limits: CostLimits
@@ -71,7 +71,7 @@ class _Group:
         self._inverse: ComplexArray = np.array([[1.0 / gram[first, first]]])
 
     def take(self, user: int) -> bool:
-        """Add a user if the group stays within the limits; return whether it does."""
+        """Add a user if the group then stays within the limits; return whether it was added."""
         if len(self.members) >= self._elements:
             return False
         beside = self._gram[self.members, user]
@@ -110,7 +110,7 @@ class _Group:
 def semi_orthogonal(
     steering: ComplexArray, order: Sequence[int], limits: CostLimits
 ) -> list[IntArray]:
-    """Groups of users, each within the limits, in the order in which they are served.
+    """Return groups of users, each within the limits, in the order in which they are served.
 
         steering  A, (M, N)
         order     users in descending priority
@@ -156,7 +156,7 @@ def semi_orthogonal(
 def without_the_lowest(
     steering: ComplexArray, order: Sequence[int], limits: CostLimits
 ) -> IntArray:
-    """Return the users kept: by descending priority, each that fits with those kept before."""
+    """Return the users kept: by descending priority, each that fits with those already kept."""
     unit: ComplexArray = steering / np.linalg.norm(steering, axis=0)
     kept = _Group(gram=unit.conj().T @ unit, first=order[0], elements=len(steering), limits=limits)
     for user in order[1:]:

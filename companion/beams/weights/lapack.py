@@ -13,7 +13,7 @@ from typing import Any
 
 
 def _routines(package: str, compiled: str) -> Any:
-    """Load the module ``compiled`` below scipy.linalg, or the public one that exports it."""
+    """Load the module ``compiled`` of scipy.linalg, or the public module that exports it."""
     scipy = find_spec("scipy")
     places = (scipy.submodule_search_locations if scipy else None) or ()
     folders = [str(PurePath(place, "linalg")) for place in places]

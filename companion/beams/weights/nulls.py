@@ -28,17 +28,16 @@ from companion.values import BoolArray, ComplexArray, FloatArray
 
 MAX_NULL_COST: Final = 0.2  # gain that one null may cost, over the remaining gain: 0.8 dB
 FULL_PRICE_DISTANCE: Final = 0.3
-"""Distance from the user's own direction, as 1 - c^2, from which a null is worth its price: some
-.33 natural widths. A nearer null would be ineffective, and change sign where the two directions
-cross.
-"""
+"""Distance 1 - c^2 from the user's direction at which a null may cost the full price: some .33
+natural widths. A nearer null would be ineffective, and change sign where the two directions
+cross."""
 FLOOR_PRICE_DB: Final = 2.5
-"""Largest loss of the least gain by all nulls of a beam, at the samples.
+"""Largest loss of a beam's least gain by all its nulls, at the samples, dB.
 
-Between samples it may be half a decibel more, and rarely more than that.
+Between samples the loss may be half a decibel more, rarely larger.
 """
 PROTECTION_MARGIN: Final = 1.15
-"""Margin of the protected least gain over the one worth keeping, because samples are finite."""
+"""Margin of the protected least gain over the least useful gain, because samples are finite."""
 REDUCTION_EXPONENT: Final = 6.0
 """Exponent of the ratio to ``PROTECTION_MARGIN`` by which a smaller least gain may be reduced."""
 TOLERATED_DIP: Final = 0.05
@@ -50,7 +49,7 @@ NULL_LOADING: Final = (
     0.02  # loading of the points around a predicted direction, relative to their power
 )
 ROUNDING: Final = 1e-10
-"""Loading of the predicted directions against rounding, relative to their power."""
+"""Loading of the predicted directions against rounding errors, relative to their power."""
 
 
 class NulledBeams(NamedTuple):
@@ -61,7 +60,7 @@ class NulledBeams(NamedTuple):
 
 
 def with_nulls(spread: Spread, noise: FloatArray | None = None, exact: bool = False) -> NulledBeams:
-    """Return the beams of a spread with nulls on one another.
+    """Return the widened beams with nulls on one another's users.
 
     spread  widths of beams and nulls
     noise   (N,), loading of each predicted direction, for the least mean square error; None: 0
@@ -103,7 +102,7 @@ def _power(columns: ComplexArray) -> FloatArray:
 
 
 def _protected_gains(least: FloatArray, worth: float) -> FloatArray:
-    """Return the least gains that nulls must leave."""
+    """Return the least gains that nulls must leave to each beam."""
     wanted = PROTECTION_MARGIN * worth
     lowered = np.maximum(least * 10 ** (-FLOOR_PRICE_DB / 10), wanted)
     lowered *= np.minimum(least / wanted, 1.0) ** REDUCTION_EXPONENT
@@ -112,7 +111,7 @@ def _protected_gains(least: FloatArray, worth: float) -> FloatArray:
 
 
 def _shares(spread: Spread, kept: FloatArray, power: FloatArray) -> FloatArray:
-    """Return the share of the field at each point that is removed, (N K, N)."""
+    """Return the share of a beam's field that is removed at each point, (N K, N)."""
     reached = np.abs(spread.reached)
     lengths = spread.gram.diagonal().real
     lengths = np.maximum(lengths, 1e-12 * lengths.max())
@@ -153,7 +152,7 @@ def _correction(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) 
 def _step_back(
     spread: Spread, taken: ComplexArray, known: tuple[ComplexArray, FloatArray], least: FloatArray
 ) -> FloatArray:
-    """Return the share (N,) of the nulls up to which every place has its least gain (N, P); 0: any.
+    """Return the largest share (N,) of nulls that leaves each place its least gain (N, P); 0: any.
 
     With the share t of the correction, the gain at a place is a ratio of two quadratics in t,
 

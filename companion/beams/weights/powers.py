@@ -24,13 +24,13 @@ ROUNDS: Final = 60  # most iterations of a fixed point
 DUAL_ROUNDS: Final = 24  # most iterations that recompute beams
 ENOUGH: Final = 1e-4  # relative change of powers at which a search ends
 ROUNDING: Final = 1e-13
-"""Least loading, relative to the largest power: the rounding error for identical vectors."""
+"""Least loading, relative to the largest power, so that identical vectors can be inverted."""
 LEAST_SHARE: Final = 1e-4
-"""Least share of the equal power that a user keeps, so that every beam exists."""
+"""Least power of a user, relative to an equal share, so that every beam exists."""
 
 
 def max_min(coupling: FloatArray) -> FloatArray:
-    """Return shares (N,) that maximise the least SINR, for a coupling (N, N)."""
+    """Return power shares (N,) that maximise the least SINR, for a coupling (N, N)."""
     own = np.maximum(coupling.diagonal(), 1e-300)
     cross = coupling - np.diag(coupling.diagonal())
     share = np.full(len(own), 1.0 / len(own))
@@ -45,7 +45,7 @@ def max_min(coupling: FloatArray) -> FloatArray:
 
 
 def weighted_sum(coupling: FloatArray, rate_weights: FloatArray) -> FloatArray:
-    """Return shares (N,) at a local maximum of the sum of ``rate_weights`` (N,) times rates."""
+    """Return power shares (N,) at a local maximum of the sum of ``rate_weights`` (N,) times rates."""
     direct = np.sqrt(coupling.diagonal())
     sent = np.full(len(direct), (1.0 / len(direct)) ** 0.5)
     for _ in range(2 * ROUNDS):
@@ -93,8 +93,8 @@ def dual_of_weighted_sum(
 ) -> FloatArray:
     """Return uplink powers (N,) of sum 1 for a large weighted sum of rates.
 
-    Found by WMMSE with beams A* Z: their directions are those of the least mean square error, with
-    powers as the receivers' weights.
+    The search is WMMSE with beams A* Z, whose directions are those of the least mean square error,
+    with powers as the receivers' weights.
     """
     root = np.sqrt(snr)
     channel = root[:, np.newaxis] * gram * root  # H^H H, channels h_i = sqrt(snr) a_i
@@ -120,7 +120,7 @@ def dual_of_weighted_sum(
 
 
 def _inverse(gram: ComplexArray, loading: FloatArray) -> ComplexArray:
-    """(K + X)^-1 for a loading X (N,)."""
+    """Return (K + X)^-1 for a loading X (N,)."""
     loaded = gram.copy()
     least = ROUNDING * float(gram.diagonal().real.max())
     loaded.flat[:: len(loaded) + 1] += np.maximum(loading, least)
@@ -128,7 +128,7 @@ def _inverse(gram: ComplexArray, loading: FloatArray) -> ComplexArray:
 
 
 def _beams(channel: ComplexArray, share: FloatArray) -> ComplexArray:
-    """Coefficients Z (N, N) of beams H* Z of the least mean square error, of equal powers."""
+    """Return coefficients Z (N, N) of the beams H* Z with least mean square error and equal powers."""
     made = _inverse(channel.T, 1.0 / share)
     lengths = np.einsum("in,ij,jn->n", made.conj(), channel.T, made).real
     found: ComplexArray = made / np.sqrt(np.maximum(lengths, 1e-300) * len(share))

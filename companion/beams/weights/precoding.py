@@ -1,4 +1,4 @@
-"""Weights from steering vectors: zero forcing, and the fallbacks where it costs too much.
+"""Weights from steering vectors: zero forcing, and alternatives where it costs too much.
 
 UAV i receives y_i = h_i a(u_i)^T F s + noise (docs/math.md 7, paper eq. (1)). With A = [a(u_1) ...
 a(u_N)], (M, N),
@@ -47,7 +47,7 @@ from companion.values import (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precoder:
-    """How weights are computed.
+    """Settings by which weights are computed.
 
     method           zero forcing, regularised or maximum ratio
     policy           fallback where zero forcing costs too much
@@ -87,7 +87,7 @@ class Precoder:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precoding:
-    """Weights for the K users that are served, and their cost.
+    """Weights for the K users that are served, and the cost of these weights.
 
     ``condition_number`` is that of A with columns of equal length, the largest over the groups;
     None without users.
@@ -118,9 +118,9 @@ class Radio:
 LEAST_LOADING: Final = 1e-12
 """Least loading if RZF itself is the method, relative to the trace of the Gram matrix."""
 ROUNDING: Final = 1e-11
-"""Response to another user, relative to the own one, above which it is removed."""
+"""Response to another user, relative to a beam's own user, above which it is removed."""
 LOADINGS: Final = np.logspace(-6, 6, 49)
-"""Loadings tried by ``_least_loading``, in mean eigenvalues; beyond the last it is MRT to 1e-6."""
+"""Loadings tried by ``_least_loading``, in mean eigenvalues; the last gives MRT to 1e-6."""
 
 
 def precode(
@@ -194,7 +194,7 @@ def _slots(
     priorities: Sequence[int] | None,
     before: PreviousSlots | None,
 ) -> tuple[list[IntArray], dict[int, str]]:
-    """Return the groups of users, and the users left out with the reason.
+    """Return the groups of users by time slot, and the users left out with the reason.
 
     Previous slots are kept while they are within the limits and young, and until there are fewer
     slots or more users are served.
@@ -226,7 +226,7 @@ def _slots(
 
 @dataclass(frozen=True, slots=True)
 class _Columns:
-    """Columns with unit response for some users."""
+    """Columns of weights with unit response for some users."""
 
     weights: ComplexArray
     method: Method
@@ -269,9 +269,9 @@ def _columns(
 def _mmse_loading(
     gram: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
 ) -> FloatArray:
-    """Return the loading of each user for the least mean square error at its share of the power.
+    """Return the loading of each user for the least mean square error at its power share.
 
-    The share is equal, or the uplink share that maximises the worst rate or the weighted sum.
+    Shares are equal, or the uplink shares that maximises the worst rate or the weighted sum.
     """
     if radio is None:
         raise ValueError("MMSE needs the radio parameters")
@@ -288,7 +288,7 @@ def _mmse_loading(
 def _with_power_allocation(
     a: ComplexArray, weights: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
 ) -> ComplexArray:
-    """Return columns (M, K) of a slot with the power allocated by the settings; else unchanged."""
+    """Return columns (M, K) of a slot with power allocated as the settings say; else unchanged."""
     if settings.power is None:
         return weights
     unit: ComplexArray = weights / np.linalg.norm(weights, axis=0)
@@ -308,7 +308,7 @@ def _with_power_allocation(
 def _zero_forcing(
     a: ComplexArray, gram: ComplexArray, condition: float, settings: Precoder
 ) -> _Columns:
-    """Zero forcing if its cost is within the limits, else with the least loading that is.
+    """Apply zero forcing if its cost is within the limits, else with the least loading that is.
 
     The columns of ``a`` (M, N) have unit length.
     """
@@ -324,7 +324,7 @@ def _zero_forcing(
 def _wide_zero_forcing(
     a: ComplexArray, wide: Spread, condition: float, settings: Precoder
 ) -> _Columns:
-    """Shaped beams with nulls on the others: exact where no beam's least gain would suffer."""
+    """Return shaped beams with nulls on other users, exact where no beam's least gain suffers."""
     told_apart = condition <= settings.condition_limit
     found = with_nulls(wide, exact=settings.policy is not Policy.REGULARISE and told_apart)
     if told_apart and found.exact.all():
@@ -334,7 +334,7 @@ def _wide_zero_forcing(
 
 
 def _exactly(a: ComplexArray, found: ComplexArray) -> ComplexArray:
-    """Remove the residual at the predicted directions that rounding or nearby points left."""
+    """Remove the residual response at predicted directions, left by rounding or nearby points."""
     stray = a.T @ found
     own = np.abs(stray.diagonal())
     np.fill_diagonal(stray, 0.0)
@@ -348,7 +348,7 @@ def _exactly(a: ComplexArray, found: ComplexArray) -> ComplexArray:
 
 
 def _unit_response(a: ComplexArray, weights: ComplexArray) -> ComplexArray:
-    """Scale columns so that each UAV receives 1 from its own."""
+    """Scale columns so that each UAV receives 1 from its own column."""
     scaled: ComplexArray = weights / np.einsum("mn,mn->n", a, weights)
     return scaled
 
@@ -358,7 +358,7 @@ def _db(power_ratio: float) -> float:
 
 
 def _loaded(a: ComplexArray, gram: ComplexArray, loading: FloatArray) -> ComplexArray:
-    """A* (A^T A* + X)^-1, X (N,), by the smaller of the two equivalent matrices."""
+    """Return A* (A^T A* + X)^-1, X (N,), by the smaller of the two equivalent matrices."""
     if len(gram) <= len(a):
         loaded: ComplexArray = gram.copy()
         loaded.flat[:: len(loaded) + 1] += loading
@@ -368,7 +368,7 @@ def _loaded(a: ComplexArray, gram: ComplexArray, loading: FloatArray) -> Complex
 
 
 def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:
-    """cond(A) in the 2-norm, from the eigenvalues of A^T A*.
+    """Return cond(A) in the 2-norm, from the eigenvalues of A^T A*.
 
     Always finite: past about 1e7 rounding hides the smallest eigenvalue, and the result stays
     there. With more users than elements the smallest is 0, and only rounding determines the result.
@@ -382,7 +382,7 @@ def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:
 
 
 def _spectrum(a: ComplexArray, gram: ComplexArray) -> tuple[FloatArray, FloatArray]:
-    """Eigenvalues l of A^T A*, ascending, and their shares in each user's column, |v_ik|^2 l_k.
+    """Return eigenvalues l of A^T A*, ascending, and shares in each user's column, |v_ik|^2 l_k.
 
     Computed from the smaller of A^T A* and A* A^T, whose eigenvalues are the same but for zeros,
     which do not contribute to any column: v_k sqrt(l_k) = A^T u_k.
@@ -411,7 +411,7 @@ def _least_loading(a: ComplexArray, gram: ComplexArray, settings: Precoder) -> f
     least = max((values[-1] - square * smallest) / (square - 1), 1e-12 * scale)
 
     def kept(loadings: FloatArray) -> FloatArray:
-        """The worst user's share of its own beam's gain, for each loading."""
+        """Return the worst user's share of its own beam's gain, for each loading."""
         y = 1.0 / (values[:, np.newaxis] + loadings)
         own = shares @ y
         worst: FloatArray = (own**2 / (shares.sum(axis=1)[:, np.newaxis] * (shares @ y**2))).min(0)
@@ -429,7 +429,7 @@ def _least_loading(a: ComplexArray, gram: ComplexArray, settings: Precoder) -> f
 def normalise(weights: ComplexArray, how: Normalisation, slots: IntArray) -> None:
     """Scale columns in place; the columns of one slot share one factor.
 
-    Those of unit response stay unchanged.
+    Columns of unit response stay unchanged.
     """
     if how is Normalisation.UNIT_RESPONSE:
         return
@@ -446,6 +446,6 @@ def normalise(weights: ComplexArray, how: Normalisation, slots: IntArray) -> Non
 
 
 def gain_db(steering: ComplexArray, weights: ComplexArray) -> FloatArray:
-    """Array gain of each column towards its own direction, |a^T f|^2 / |f|^2, in dB, (N,)."""
+    """Return the array gain of each column towards its own direction, |a^T f|^2 / |f|^2, dB, (N,)."""
     gains: FloatArray = 10 * np.log10(power_gains(steering, weights))
     return gains

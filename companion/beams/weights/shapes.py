@@ -22,20 +22,19 @@ from companion.values import FloatArray, IntArray
 TABLES: Final = "shapes.npz"
 CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T  # the corners (8, 3) of a cell of three axes
 WIDEST_PER_ELEMENT: Final = 0.375
-"""Widest beam in natural widths for each element: beyond it they are too far apart to shape one."""
+"""Widest beam per element, in natural widths; elements cannot shape a wider one."""
 USEFUL_LOSS_DB: Final = 2.0
-"""Additional loss in dB, accepted for each dB by which a floor is too low to be useful."""
+"""Additional loss in dB, accepted for each dB by which a floor misses the useful gain."""
 SPARE_DB: Final = 2.5
-"""Margin of a floor over the useful gain: nulls and places between samples reduce it."""
+"""Margin of a floor over the useful gain, dB: nulls and points between samples reduce it."""
 LINE_TRANSITION_WIDTHS: Final = (3.8, 4.8)
-"""Start and end of the transition from square to line tables, in natural widths of a plane's beam.
-"""
+"""Start and end of the blend from square to line tables, in natural widths of a planar beam."""
 LEAST_SHARE: Final = 1 / 16
-"""Least ratio of the widths on the two axes of a plane that its shapes follow."""
+"""Least ratio of a planar beam's widths on its two axes that its shapes follow."""
 
 
 class Shapes(NamedTuple):
-    """Tables of one kind of aperture; phases are psi over it, times 2 pi w in radians.
+    """Tables of phases for one kind of aperture; phases are psi over it, times 2 pi w in radians.
 
     places    (n,), positions of the phases, in apertures from the middle; on each axis of a square
     least_db  (W,), that gain over the number of elements, at the least: losses count from there
@@ -74,13 +73,14 @@ def _table(name: str) -> Shapes:
 
 
 def _even(count: int) -> FloatArray:
-    """Matrix (count, count / 2) from half of an even function, the middle first, to the whole."""
+    """Return the matrix (count, count / 2) from half of an even function, middle first, to all of
+    it."""
     half = count // 2
     return np.concatenate([np.eye(half)[::-1], np.eye(half)])
 
 
 class Aperture(NamedTuple):
-    """Array as its shapes see it: a line, or a plane with two axes.
+    """Array as the shape tables see it: a line, or a plane with two axes.
 
     knots      (K, M), interpolation from a line's table to its elements; empty for a plane
     """
@@ -132,7 +132,7 @@ def phases_rad(
     floor_db: float = 0.0,
     worth_db: float = 0.0,
 ) -> FloatArray:
-    """Return phases (N, M) of N beams.
+    """Return the phases (N, M) that shape N beams.
 
         across    the aperture
         cones     (N, D), widths of the bound on each axis
@@ -141,7 +141,7 @@ def phases_rad(
                   which is at least the least of ``losses``
         worth_db  least useful gain: a floor below it is given up
 
-    They are continuous in all arguments, and 0 where the widths are 0.
+    The phases are continuous in all arguments, and 0 where the widths are 0.
     """
     cones = np.minimum(cones, across.most)
     width = cones.max(axis=1)
@@ -190,7 +190,7 @@ def _psi(
     floor_db: float,
     worth_db: float,
 ) -> list[FloatArray]:
-    """Return phases psi (N, K) of the table per column of widths (N, D); their sum is a shape."""
+    """Return phases psi (N, K) of the table for each column of widths (N, D); their sum is a shape."""
     columns = range(cones.shape[1])
     if likely is None:
         return [_guaranteed_phases(shapes, cones[:, d]) for d in columns]
@@ -204,13 +204,13 @@ def _psi(
 
 
 def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
-    """Return the (ascending) knot before each place, and the next one's weight; extrapolated."""
+    """Return the (ascending) knot before each point, and the next knot's weight; extrapolated."""
     before = np.clip(np.searchsorted(knots, at, side="right") - 1, 0, len(knots) - 2)
     return before, (at - knots[before]) / (knots[before + 1] - knots[before])
 
 
 def _on_axes(axes: Sequence[FloatArray], at: Sequence[FloatArray]) -> tuple[IntArray, FloatArray]:
-    """Return the knots (A, N) before N places on A axes, and the next ones' weights; clipped."""
+    """Return the knots (A, N) before N points on A axes, and the next knots' weights; clipped."""
     places = np.stack(
         [
             np.interp(where, knots, np.arange(len(knots)))
@@ -246,14 +246,14 @@ def _likely_phases(
 
 
 def _on_line(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:
-    """Interpolate phases psi (N, n) of a line at places (M,), linear."""
+    """Interpolate phases psi (N, n) of a line linearly at points (M,)."""
     before, share = _between(shapes.places, placed)
     found: FloatArray = (1 - share) * psi[:, before] + share * psi[:, before + 1]
     return found
 
 
 def _on_square(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:
-    """Interpolate phases psi (N, n n) of a square at places (N, M, 2), bilinear."""
+    """Interpolate phases psi (N, n n) of a square bilinearly at points (N, M, 2)."""
     users, count = np.arange(len(psi))[:, np.newaxis], len(shapes.places)
     grid = psi.reshape(-1, count, count)
     (i, j), (a, b) = zip(*(_between(shapes.places, placed[:, :, d]) for d in (0, 1)), strict=True)

@@ -2,7 +2,7 @@
 
 A UAV is likely within one angle of its predicted direction, and certainly within another one, its
 pointing bound. The phases of ``shapes`` shape a beam for the likely angle with a floor within the
-bound, or for the bound alone. Points around each UAV are also nulled by the others' beams
+bound, or for the bound alone. The beams of other UAVs also have nulls at points around each UAV
 (``nulls``). See docs/math.md 5.5.
 """
 
@@ -19,15 +19,15 @@ from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, Wide
 
 WIDEST_RAD: Final = np.pi / 2  # angle beyond which beams are not widened further
 NULLED_AT: Final = 0.7
-"""Distance of the points around a UAV from its predicted direction, in likely angles."""
+"""Angle from a UAV's predicted direction to the nulled points around it, in likely angles."""
 LEAST_RAD: Final = 1e-6  # likely angle below which no points around a UAV are nulled
 BROADENED: Final = 0.9
-"""Ratio to the sharp beam's gain in the middle, below which a beam counts as broadened."""
+"""Ratio to the sharp beam's gain in the middle below which a beam counts as broadened."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DirectionErrors:
-    """Errors of N directions."""
+    """Likely errors and bounds of N directions."""
 
     likely_rad: FloatArray  # (N,), the angle within which the UAV usually is
     bounds_rad: FloatArray  # (N,), the bound on the angle; 0: unbounded, ignored
@@ -55,7 +55,7 @@ class Spread:
 
     @property
     def each(self) -> int:
-        """K, the points of a user."""
+        """K, the number of points per user."""
         return int(self.points.shape[1] // self.beams.shape[1])
 
     @property
@@ -64,7 +64,7 @@ class Spread:
         return self.points[:, :: self.each]
 
     def of(self, users: IntArray) -> "Spread":
-        """Return the part for some of the users, in their order."""
+        """Return the part for some of the users, in the given order."""
         if len(users) == self.beams.shape[1]:
             return self
         rows = (users[:, np.newaxis] * self.each + np.arange(self.each)).ravel()
@@ -113,7 +113,7 @@ def spread(
 
 
 def _for_the_bound_rad(array: Array, across: shapes.Aperture, seen: ApertureCones) -> FloatArray:
-    """Phases (N, M) for the bound alone: each beam points at the middle of its interval."""
+    """Return phases (N, M) for the bound alone: each beam points at the middle of its interval."""
     shaped = shapes.phases_rad(across, seen.halves[0] * across.lengths_m / array.wavelength_m, None)
     aside = (seen.middles[0] - seen.seen) @ (array.centred_m @ across.axes.T).T
     found: FloatArray = shaped - array.wavenumber_radpm * aside
@@ -121,7 +121,7 @@ def _for_the_bound_rad(array: Array, across: shapes.Aperture, seen: ApertureCone
 
 
 def power_gains(steering: ComplexArray, weights: ComplexArray) -> FloatArray:
-    """Array gain of each column towards its own direction, |a^T f|^2 / |f|^2, (N,).
+    """Return the gain of each column towards its own direction, |a^T f|^2 / |f|^2, (N,).
 
     0 for a zero column.
     """
@@ -134,9 +134,9 @@ def power_gains(steering: ComplexArray, weights: ComplexArray) -> FloatArray:
 def _around(
     array: Array, across: shapes.Aperture, directions: FloatArray, likely_rad: FloatArray
 ) -> FloatArray:
-    """Directions (N, K, 3): each user's own, then those about it on each axis of the array.
+    """Return directions (N, K, 3): each user's own, then points about it on each array axis.
 
-    Each point is a null, so there are none if the array lacks the degrees of freedom.
+    Each point needs a null, so none are added if the array lacks degrees of freedom.
     """
     users, axes = len(directions), across.axes
     spare = (array.size - users) // users if users > 1 else 0

@@ -8,7 +8,7 @@ The diagonal of H gives the cost of zero forcing. The array gain of column i of 
 of a beam for this user alone |a_i|^2. Their ratio, the loss factor |a_i|^2 H_ii, is at least 1 and
 invariant to the scale of columns. Times the machine precision it is about the error of A^T F, as
 rounding in Cholesky scales with the columns too (Demmel, "On floating-point errors in Cholesky",
-LAPACK working note 14, 1989). It therefore also decides whether there is an answer.
+LAPACK working note 14, 1989). It therefore also decides whether a solution exists.
 """
 
 from functools import lru_cache
@@ -20,11 +20,11 @@ from companion.beams.weights.lapack import zgemm, zherk, zposv
 from companion.values import ComplexArray, FloatArray
 
 MOST_LOSS: Final = 1e12
-"""Sum of all loss factors above which there is no answer: 120 dB, where rounding dominates."""
+"""Sum of all loss factors above which no solution is returned: 120 dB, where rounding dominates."""
 
 
 class ZeroForcingSolution(NamedTuple):
-    """Zero-forcing weights and their cost. A tuple, because it is created faster than a dataclass.
+    """Zero-forcing weights and their cost; a tuple, which is faster to create than a dataclass.
 
     weights       F (M, N), complex128, in Fortran order: those of one user are contiguous
     loss_factors  (N,), power gain of a beam for this user alone over that of its column of F
@@ -35,9 +35,9 @@ class ZeroForcingSolution(NamedTuple):
 
 
 def solve(steering: ComplexArray) -> ZeroForcingSolution | None:
-    """Zero-forcing weights for a steering matrix A, (M, N), complex128; C order is the fast one.
+    """Return zero-forcing weights for a steering matrix A, (M, N), complex128; C order is fastest.
 
-    None without an answer: more users than elements, a column of zeros, or columns so nearly
+    None without a solution: more users than elements, a column of zeros, or columns so nearly
     dependent that their loss factors pass ``MOST_LOSS``. Raises ``ValueError`` for numbers that are
     not finite.
     """

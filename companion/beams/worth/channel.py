@@ -25,10 +25,10 @@ from companion.values import ComplexArray, FloatArray
 
 
 def free_space_gain(ranges_m: float | FloatArray, wavelength_m: float) -> FloatArray:
-    """Power gain between isotropic antennas, (wavelength / 4 pi r)^2, H. Friis (1946).
+    """Return the power gain between isotropic antennas, (wavelength / 4 pi r)^2, H. Friis (1946).
 
-    Shape as ``ranges_m``. The gains of elements and arrays are in the steering vectors. Raises
-    ``ValueError`` unless ranges and wavelength are finite and above 0.
+    The result has the shape of ``ranges_m``. The gains of elements and arrays are in the steering
+    vectors. Raises ``ValueError`` unless ranges and wavelength are finite and above 0.
     """
     ranges = np.asarray(ranges_m, dtype=float)
     if not (np.isfinite(ranges).all() and (ranges > 0).all()):
@@ -74,7 +74,7 @@ class SalehValenzuela:
 
     @property
     def shares(self) -> tuple[float, float]:
-        """K/(K+1) and 1/(K+1): mean power of the line of sight and of the scattered rays."""
+        """Return K/(K+1) and 1/(K+1): mean power of the line of sight and of scattered rays."""
         log_k = self.rician_k_db * math.log(10) / 10
         return (
             math.exp(-float(np.logaddexp(0.0, -log_k))),
@@ -91,7 +91,7 @@ def draw(
     directions_at_uav: FloatArray,
     rng: "np.random.Generator",
 ) -> ComplexArray:
-    """Draw H for N independent UAVs: shape (N, N_U, M).
+    """Draw random channels H for N independent UAVs: shape (N, N_U, M).
 
         directions_at_node  (N, 3), unit directions of the line of sight to the UAVs, array frame
         directions_at_uav   (N, 3), unit directions to the node, in the frame of each UAV's
@@ -128,7 +128,7 @@ def draw(
 def _ray_directions(
     settings: SalehValenzuela, users: int, rng: "np.random.Generator"
 ) -> FloatArray:
-    """Unit directions (N * rays, 3), user by user and cluster by cluster.
+    """Return unit directions (N * rays, 3) of rays, user by user and cluster by cluster.
 
     The axes across a cluster are rotated at random about it, so that no direction is preferred: a
     single ray is uniform on the sphere.
@@ -153,7 +153,7 @@ def _unit(vectors: FloatArray) -> FloatArray:
 
 
 def combined_rows(channels: ComplexArray, uav_steering: ComplexArray) -> ComplexArray:
-    """Response of each UAV to each element after combining: w_i^H H_i, shape (N, M).
+    """Return each UAV's response to each element after combining: w_i^H H_i, shape (N, M).
 
         channels      (N, N_U, M)
         uav_steering  (N_U, N), b_i, one column per UAV
@@ -203,13 +203,13 @@ class Blockages:
         object.__setattr__(self, "intervals_s", tuple(merged))
 
     def blocked(self, t_s: float | FloatArray) -> NDArray[np.bool_]:
-        """Whether the link is blocked at times ``t_s``; shape as ``t_s``."""
+        """Return whether the link is blocked at times ``t_s``; shape as ``t_s``."""
         edges = np.array(self.intervals_s, dtype=float).reshape(-1, 2)
         begun = np.searchsorted(edges[:, 0], t_s, side="right")
         return np.asarray(begun > np.searchsorted(edges[:, 1], t_s, side="right"))
 
     def attenuation_db(self, t_s: float | FloatArray) -> FloatArray:
-        """One-way loss at times ``t_s``: the depth or 0 dB; shape as ``t_s``."""
+        """Return the one-way loss at times ``t_s``: the depth or 0 dB; shape as ``t_s``."""
         return np.where(self.blocked(t_s), self.depth_db, 0.0)
 
 

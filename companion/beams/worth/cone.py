@@ -31,9 +31,9 @@ from companion.beams.array.geometry import SAME_PLACE_WAVELENGTHS, Array
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 MOST_INTERVALS: Final = 512
-"""Most initial cells of one cone on a line; undecided ones are split further."""
+"""Most initial cells of one cone of a line array; undecided cells are split further."""
 MOST_RINGS: Final = 16
-"""Most rings of initial cells of one cone elsewhere; undecided ones are split further."""
+"""Most rings of initial cells of one cone of other arrays; undecided cells are split further."""
 LINE_PHASE_RAD: Final = 0.12  # on a line
 DISC_PHASE_RAD: Final = 0.25  # elsewhere
 """RMS phase of the elements from the middle of an initial cell to its end.
@@ -41,14 +41,14 @@ DISC_PHASE_RAD: Final = 0.25  # elsewhere
 Half of its square is the error of the bounds, relative to the largest possible response.
 """
 ROUNDING_RAD: Final = 1e-12
-"""Rounding margin, added to the angle wherever a pattern is bounded within an angle."""
+"""Margin for rounding, added to the angle within which a pattern is bounded, radians."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DirectionCones:
     """N cones of directions, with the data that bound the responses of one array over them.
 
-    w are the largest magnitudes of the weights, patterns included if they differ.
+    ``w`` are the largest magnitudes of the weights, patterns included if they differ.
     """
 
     array: Array
@@ -76,13 +76,13 @@ class Boxes:
     high: FloatArray  # (C, 2), upper ends
 
     def take(self, chosen: BoolArray | slice) -> "Boxes":
-        """Return the boxes selected by a mask or by a slice."""
+        """Return the boxes that a mask or a slice selects."""
         return Boxes(self.cone[chosen], self.low[chosen], self.high[chosen])
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Cells:
-    """C cells in space, each in the union of its K caps.
+    """C cells on the sphere, each in the union of its K caps.
 
     Any direction of a cell differs from its middle by a sum of axes, each times at most its reach.
     A line has one axis, as it does not resolve the others.
@@ -144,7 +144,7 @@ def cones_around(
 ) -> DirectionCones:
     """Return cones within ``bounds_rad`` (N,) of unit directions (N, 3).
 
-    They apply to responses of weights that are at most ``magnitudes`` (M, N).
+    The cones apply to responses of weights that are at most ``magnitudes`` (M, N).
     """
     centred = array.centred_m
     far = centred[np.argmax(np.einsum("mk,mk->m", centred, centred))]
@@ -184,7 +184,7 @@ def cones_around(
 
 
 def _frames(poles: FloatArray, towards: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Pole, e1 and e2 as rows (N, 3, 3), and the angle (N,) from the pole to ``towards``.
+    """Return pole, e1 and e2 as rows (N, 3, 3), and the angle (N,) from the pole to ``towards``.
 
     e1 is on the side of ``towards`` if that differs from the pole.
     """
@@ -227,13 +227,13 @@ def first_boxes(cones: DirectionCones) -> Boxes:
 
 
 def _intervals(count: int) -> tuple[FloatArray, FloatArray]:
-    """Ends of ``count`` equal parts of -1 to 1; the rotation is unused."""
+    """Return the ends of ``count`` equal parts of -1 to 1; the rotation is unused."""
     ends = np.stack([np.linspace(-1.0, 1.0, count + 1), np.zeros(count + 1)], axis=1)
     return ends[:-1], ends[1:]
 
 
 def _sectors(rings: int) -> tuple[FloatArray, FloatArray]:
-    """Rings of the unit disc, the n-th divided into 6n sectors about as long as they are wide."""
+    """Return rings of the unit disc, the n-th in 6n sectors about as long as they are wide."""
     parts = 6 * np.arange(1, rings + 1)
     ring = np.repeat(np.arange(rings), parts)
     sector = np.arange(len(ring)) - np.repeat(np.cumsum(parts) - parts, parts)
@@ -243,7 +243,7 @@ def _sectors(rings: int) -> tuple[FloatArray, FloatArray]:
 
 
 def split(cones: DirectionCones, boxes: Boxes) -> Boxes:
-    """Split each box in four: quarters of the angle on a line, else halves both ways."""
+    """Split each box in four: quarters of the angle on a line, else halves on both axes."""
     angles, turns = (4, 1) if cones.line else (2, 2)
     quarter = np.stack(np.divmod(np.arange(angles * turns), turns), axis=1)
     size = ((boxes.high - boxes.low) / [angles, turns])[:, np.newaxis]
@@ -254,7 +254,7 @@ def split(cones: DirectionCones, boxes: Boxes) -> Boxes:
 
 
 def cells(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
-    """Return the boxes in space.
+    """Return the cells on the sphere of boxes in angle and rotation.
 
     ``caps`` is the number of caps that cover the arc of a cell on a line, an odd number; 1 does not
     cover it, for callers that need no pattern.
@@ -263,7 +263,7 @@ def cells(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
 
 
 def _strips(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
-    """Cells of a line: arcs of the cone about it, of which only the angle matters."""
+    """Return the cells of a line: arcs of the cone about it, of which only the angle matters."""
     low, high = boxes.low[:, 0], boxes.high[:, 0]
     angle, half = (low + high) / 2, (high - low) / 2
     frames = cones.frames[boxes.cone]
@@ -290,7 +290,7 @@ def _strips(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
 
 
 def _turn_rad(cones: DirectionCones, boxes: Boxes) -> FloatArray:
-    """Largest rotation about the line at which a direction is both in the cell and in its cone.
+    """Return the largest rotation about the line for directions both in a cell and its cone.
 
     sin^2(t / 2) = sin((bound + r - tilt) / 2) sin((bound - r + tilt) / 2) / (sin r sin tilt); its
     only extreme between the ends of r is where cos r = cos tilt / cos bound.
@@ -308,7 +308,7 @@ def _turn_rad(cones: DirectionCones, boxes: Boxes) -> FloatArray:
 
 
 def _patches(cones: DirectionCones, boxes: Boxes) -> Cells:
-    """Cells of a disc, with axes inward, along r and along t.
+    """Return the cells of a disc, with axes inward, along r and along t.
 
     u.e_r = sin(r - r_s) - sin r cos r_s (1 - cos(t - t_s)),   u.e_t = sin r sin(t - t_s).
     """
@@ -337,7 +337,8 @@ def _patches(cones: DirectionCones, boxes: Boxes) -> Cells:
 
 
 def _polar(frames: FloatArray, angle: FloatArray, turn: FloatArray) -> FloatArray:
-    """Unit directions (C, K, 3) at angles (C, 1 or K) from, rotations (C, K) about the poles."""
+    """Return unit directions (C, K, 3) at angles (C, 1 or K) from, and rotations (C, K) about, the
+    poles."""
     sine = np.sin(angle)
     parts = np.stack(
         np.broadcast_arrays(np.cos(angle), sine * np.cos(turn), sine * np.sin(turn)), axis=2
@@ -353,7 +354,7 @@ def _highest_sine(boxes: Boxes) -> FloatArray:
 
 
 def _inward(boxes: Boxes, width: FloatArray) -> FloatArray:
-    """Upper bound on 1 - u . u_s for rotations within ``width`` (C, 1) of the middle's.
+    """Return an upper bound on 1 - u . u_s for rotations within ``width`` (C, 1) of the middle's.
 
     u . u_s = cos(r - r_s) - sin r sin r_s (1 - cos(t - t_s)).
     """
@@ -364,13 +365,13 @@ def _inward(boxes: Boxes, width: FloatArray) -> FloatArray:
 
 
 def _angle_rad(inward: FloatArray) -> FloatArray:
-    """Angle whose cosine is 1 - ``inward``, with a margin for rounding."""
+    """Return the angle whose cosine is 1 - ``inward``, with a margin for rounding."""
     angle: FloatArray = 2 * np.arcsin(np.sqrt(np.minimum(inward / 2, 1.0))) + ROUNDING_RAD
     return angle
 
 
 def phasors(cones: DirectionCones, pieces: Cells) -> tuple[ComplexArray, FloatArray | None]:
-    """Response of each element to the middle of each cell, (M, C), and its largest change in it.
+    """Return each element's response to each cell's middle, (M, C), and its largest change there.
 
     The change is None if all elements face alike; their pattern is then left out. Phases are from
     the origin of the array frame; any other point would do.
@@ -388,7 +389,7 @@ def phasors(cones: DirectionCones, pieces: Cells) -> tuple[ComplexArray, FloatAr
 def response_range(
     cones: DirectionCones, pieces: Cells, responses: ComplexArray, moments: ComplexArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Bounds of |response| over each cell, (..., C), lower (may be negative) and upper.
+    """Return lower (may be negative) and upper bounds of |response| over each cell, (..., C).
 
     responses  (..., C), responses to the middles
     moments    (B, ..., C), the same sums with every term times its element's position: sum p_m

@@ -25,10 +25,10 @@ from companion.values import ComplexArray, FloatArray, IntArray
 TOLERANCE_DB: Final = 0.05  # difference between bound and attained gain at which the search ends
 TOLERANCE: Final = 1 - 10 ** (-TOLERANCE_DB / 20)  # the same as a relative amplitude
 NOTHING_DB: Final = 40.0
-"""Depth below the weights' greatest possible gain beyond which a gain is not refined."""
+"""Depth below the weights' greatest possible gain beyond which a gain is not refined, dB."""
 LEVELS: Final = 12  # most rounds of splitting cells
 CAPS: Final = 8
-"""Caps, plus one, that cover the arc of an initial cell on a line; each split doubles them."""
+"""Number of caps, plus one, on the arc of an initial cell of a line; each split doubles it."""
 MOST_SPLIT: Final = 4096  # most cells split for one cone; those with many caps count as more
 BLOCK: Final = 2**18  # elements or caps, times cells, computed at once: some megabytes
 
@@ -39,7 +39,7 @@ def guaranteed_gains_db(
     pointing_bounds_rad: Sequence[float | None],
     weights: ComplexArray,
 ) -> tuple[float | None, ...]:
-    """Least array gain of each beam within its pointing bound, proven, dB.
+    """Return each beam's least array gain within its pointing bound, proven, dB.
 
         directions           (N, 3), unit directions, array frame
         pointing_bounds_rad  (N,), half angles of the cones; None: any direction
@@ -73,7 +73,7 @@ def leakage_bounds(
     pointing_bounds_rad: Sequence[float | None],
     weights: ComplexArray,
 ) -> FloatArray:
-    """Largest array gain (N, J), linear, of beam j within the pointing bound of UAV i.
+    """Return the largest array gain (N, J), linear, of beam j within UAV i's pointing bound.
 
         directions           (N, 3), unit directions, array frame
         pointing_bounds_rad  (N,), half angles of the cones; None: any direction
@@ -92,7 +92,7 @@ def leakage_bounds(
 
 
 def _cones(directions: FloatArray, given: Sequence[float | None]) -> tuple[FloatArray, FloatArray]:
-    """Return checked unit directions and their bounds; no bound becomes pi."""
+    """Return checked unit directions and their bounds; a bound of None becomes pi."""
     bounds = np.array([np.pi if bound is None else bound for bound in given], dtype=float)
     return cone.unit_directions(directions, bounds), bounds
 
@@ -100,9 +100,9 @@ def _cones(directions: FloatArray, given: Sequence[float | None]) -> tuple[Float
 def _off(
     array: Array, unit: FloatArray, bounds: FloatArray, weights: ComplexArray
 ) -> FloatArray | float:
-    """Return the largest change (N,) of the response of column n over cone n by channel errors.
+    """Return the largest change (N,) by channel errors of the response of column n over cone n.
 
-    The sum over elements, as if all errors added up.
+    The worst case: the errors of all elements add up.
     """
     if array.channel_error is None:
         return 0.0
@@ -120,7 +120,7 @@ def _extremes(
 ) -> FloatArray:
     """Return the least response (N,) of column n over cone n.
 
-    With ``most``, the largest, negated: everything is then negated, so that it is a least as well.
+    With ``most``, the negated largest response: a least one as well.
     """
     if len(unit) == 0:
         return np.empty(0)
@@ -186,7 +186,7 @@ def _over_cells(
 def _by_cone(
     cones: DirectionCones, weights: ComplexArray, received: ComplexArray, cone_of: IntArray
 ) -> ComplexArray:
-    """For each cell the response of its cone's weights, and its moments by position, (1 + B, C).
+    """Return for each cell its weights' response and moments by position, (1 + B, C).
 
     Cells are in the order of their cones, so that each cone needs one matrix product.
     """
@@ -206,7 +206,7 @@ def covered_bounds(
     directions: FloatArray,
     pointing_bounds_rad: Sequence[float | None],
 ) -> list[float | None]:
-    """Return the bounds of unit directions (N, 3), array frame; None outside the coverage.
+    """Return pointing bounds of directions (N, 3), array frame; None if they leave the coverage.
 
     A UAV may then be outside the coverage, and nothing is guaranteed.
     """

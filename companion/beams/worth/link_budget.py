@@ -53,7 +53,7 @@ class LinkBudget:
 
     @property
     def noise_power_w(self) -> float:
-        """Noise in the band at one antenna, watts: k T B times the noise figure."""
+        """Noise power in the band at one antenna, watts: k T B times the noise figure."""
         thermal_w = BOLTZMANN_JPK * self.temperature_k * self.bandwidth_hz
         return float(thermal_w * 10 ** (self.noise_figure_db / 10))
 
@@ -61,7 +61,7 @@ class LinkBudget:
 def isotropic_snr(
     ranges_m: FloatArray, array: Array, budget: LinkBudget, uav_antennas: int = 1
 ) -> FloatArray:
-    """SNR (N,) at UAVs in free space if an isotropic antenna had the whole power."""
+    """Return the SNR (N,) at UAVs in free space if an isotropic antenna had the whole power."""
     path_gains = uav_antennas * free_space_gain(ranges_m, array.wavelength_m)
     found: FloatArray = path_gains * (budget.tx_power_w / budget.noise_power_w)
     return found
@@ -70,11 +70,12 @@ def isotropic_snr(
 def share_power(
     weights: ComplexArray, power_w: float, groups: IntArray | None = None
 ) -> ComplexArray:
-    """Weights (M, N) with the total power shared equally by the streams of each group.
+    """Return weights (M, N) with the power shared equally by the streams of each group.
 
     Column j becomes f_j / |f_j| sqrt(power / streams of its group), in square roots of watts;
     ``groups`` (N,) numbers each UAV's slot (None: all at once). A column of zeros is an inactive
-    stream: it stays, and the others share its power. Raises ``ValueError`` for a power not above 0.
+    stream: it stays zero, and the others share its power. Raises ``ValueError`` for a power not
+    above 0.
     """
     if not 0 < power_w < math.inf:
         raise ValueError(f"power_w {power_w} must be finite and above 0")
@@ -92,7 +93,7 @@ def sinr(
     noise_power_w: float,
     groups: IntArray | None = None,
 ) -> FloatArray:
-    """Signal over interference and noise at each UAV, as a power ratio: (..., N).
+    """Return signal over interference and noise at each UAV, a power ratio: (..., N).
 
         responses      (..., N, N), h_i f_j: row i the UAV that receives, column j the stream;
                        weights in square roots of watts (``share_power``)
@@ -120,7 +121,7 @@ def sinr(
 
 
 def _together(groups: IntArray | None, users: int) -> FloatArray:
-    """(N, N): 1 if two UAVs are served at the same time, else 0."""
+    """Return (N, N): 1 if two UAVs are served in the same time slot, else 0."""
     if groups is None:
         return np.ones((users, users))
     if groups.shape != (users,):
@@ -130,7 +131,7 @@ def _together(groups: IntArray | None, users: int) -> FloatArray:
 
 
 def spectral_efficiency(ratio: float | FloatArray, slots: int = 1) -> FloatArray:
-    """log2(1 + SINR) / slots, bit/s/Hz: Shannon's limit for Gaussian interference.
+    """Return log2(1 + SINR) / slots, bit/s/Hz: Shannon's limit for Gaussian interference.
 
     ``ratio`` is the SINR as a power ratio, any shape; ``slots`` the number of groups served one
     after the other, for equal times. Raises ``ValueError`` for a negative SINR or less than one
@@ -151,7 +152,7 @@ def transmitted(
     groups: IntArray | None = None,
     normalisation: Normalisation = Normalisation.TOTAL,
 ) -> ComplexArray:
-    """Weights (M, N) as transmitted, in square roots of watts: one factor for all of a group.
+    """Return weights (M, N) as transmitted, in square roots of watts, one factor per group.
 
         weights        as published
         power_w        power of all streams of a group together
@@ -179,7 +180,7 @@ def predicted_sinr_db(
     budget: LinkBudget,
     uav_antennas: int = 1,
 ) -> FloatArray:
-    """Predicted SINR of each UAV on the line of sight, dB, (N,).
+    """Predict the SINR of each UAV on the line of sight, dB, (N,).
 
         directions    (N, 3), predicted unit directions, array frame
         ranges_m      (N,), predicted ranges
@@ -188,8 +189,8 @@ def predicted_sinr_db(
         budget        noise
         uav_antennas  isotropic antennas of each UAV, combined towards the node
 
-    Free space, no scattering, no blockage; -inf if no element faces the UAV. Time slots reduce the
-    rate, not the SINR. Raises ``ValueError`` as its parts do.
+    Assumes free space, no scattering and no blockage; -inf if no element faces the UAV. Time slots
+    reduce the rate, not the SINR. Raises ``ValueError`` as its parts do.
     """
     if uav_antennas < 1:
         raise ValueError(f"uav_antennas {uav_antennas} must be at least 1")
@@ -202,7 +203,7 @@ def predicted_sinr_db(
 
 
 def sent_weights(beam_set: BeamSet, budget: LinkBudget) -> ComplexArray:
-    """Weights (M, N) of an update as transmitted, in square roots of watts."""
+    """Return weights (M, N) of an update as transmitted, in square roots of watts."""
     slots, normalisation = beam_set.slots, beam_set.normalisation
     return transmitted(beam_set.weights, budget.tx_power_w, slots, normalisation)
 
@@ -214,7 +215,7 @@ def sinr_of_beams_db(
     budget: LinkBudget,
     uav_antennas: int = 1,
 ) -> FloatArray:
-    """SINR (N,) of the UAVs of an update in given unit directions (N, 3), dB."""
+    """Return the SINR (N,) of the UAVs of an update in given unit directions (N, 3), dB."""
     sent = sent_weights(beam_set, budget)
     ranges_m, slots = beam_set.ranges_m, beam_set.slots
     return predicted_sinr_db(
@@ -240,7 +241,7 @@ def least_sinr_db(
     wavelength_m: float,
     uav_antennas: int = 1,
 ) -> FloatArray:
-    """Least SINR of some of N UAVs on the line of sight, dB, (K,).
+    """Return the least SINR of some of N UAVs on the line of sight, dB, (K,).
 
         least_gains  (K,), least array gain of each one's own beam, linear
         leaks        (K, N), largest array gain of each beam towards it, linear

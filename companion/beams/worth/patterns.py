@@ -22,22 +22,22 @@ from companion.beams.array.geometry import SAME_PLACE_WAVELENGTHS, Array
 from companion.values import ComplexArray, FloatArray
 
 FLOOR_DB: Final = -200.0
-"""Lowest value returned, also for an exact null: JSON has no minus infinity."""
+"""Lowest gain returned, dB, also for an exact null: JSON has no minus infinity."""
 BLOCK: Final = 8192  # entries of a steering matrix computed at once, so that they stay in the cache
 POINTS_PER_SIDE_LOBE: Final = 8  # points of a scan per narrowest possible lobe
 LEAST_POINTS: Final = 360  # least number of points of a scan around a circle
 NEAR: Final = 64  # points examined first to either side of a peak; they nearly always suffice
 SECTIONS: Final = np.linspace(0.0, 1.0, 17)
-"""Relative positions examined to narrow an interval: 16 times for a crossing, 8 for an extreme."""
+"""Relative positions in an interval at which it is examined, to narrow it step by step."""
 HALVING_ROUNDS: Final = 10
 EXTREME_ROUNDS: Final = 12
 RIVALS_DB: Final = 0.5
-"""Difference to the highest side lobe of the scan within which another may be the highest."""
+"""Gap below the highest scanned side lobe within which another lobe may be the highest, dB."""
 PERPENDICULAR_COSINE: Final = (
     1e-4  # boresight component below which a direction counts as perpendicular to it
 )
 RIPPLE_DB: Final = 1.0
-"""Largest rise of the gain above the peak within a lobe, as in a broadened one."""
+"""Largest rise of the gain above the peak within a lobe, as in a broadened lobe, dB."""
 CLIMB_MOVES: Final = 400
 SINGULAR: Final = 1e-9  # slope and curvature, relative to the gain, below which they are rounding
 
@@ -48,10 +48,10 @@ _QUADRATIC = np.linalg.pinv(np.stack([_X**0, _X, _Y, _X**2 / 2, _X * _Y, _Y**2 /
 
 
 def response_db(array: Array, weights: ComplexArray, directions: FloatArray) -> FloatArray:
-    """Array gain of weights (M,) towards unit directions (..., 3) in the array frame; dB, (...).
+    """Return the array gain of weights (M,) towards directions (..., 3), array frame; dB, (...).
 
-    At least ``FLOOR_DB``. Raises ``ValueError`` for weights that are not M finite numbers, or all
-    zero, as do the functions below.
+    The result is at least ``FLOOR_DB``. Raises ``ValueError`` for weights that are not M finite
+    numbers, or all zero, as do the functions below.
     """
     return _db(_gains(array, _unit_power(array, weights), directions))
 
@@ -59,7 +59,7 @@ def response_db(array: Array, weights: ComplexArray, directions: FloatArray) -> 
 def azimuth_cut(
     array: Array, weights: ComplexArray, elevation_rad: float, points: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Azimuths (points,) from -pi to pi, both included, and the response in dB there.
+    """Return azimuths (points,) from -pi to pi, both included, and the response in dB there.
 
     The last point repeats the first, so that a polar plot is a closed curve. Raises ``ValueError``
     for fewer than two points.
@@ -72,7 +72,7 @@ def azimuth_cut(
 def elevation_cut(
     array: Array, weights: ComplexArray, azimuth_rad: float, points: int
 ) -> tuple[FloatArray, FloatArray]:
-    """Elevations (points,) from -pi/2 to pi/2, both included, and the response in dB there.
+    """Return elevations (points,) from -pi/2 to pi/2, both included, and the response in dB.
 
     Raises ``ValueError`` for fewer than two points.
     """
@@ -84,7 +84,7 @@ def elevation_cut(
 def sphere(
     array: Array, weights: ComplexArray, azimuths_rad: FloatArray, elevations_rad: FloatArray
 ) -> FloatArray:
-    """Response in dB on a grid: one row for each elevation, one column for each azimuth."""
+    """Return the response in dB on a grid: a row per elevation, a column per azimuth."""
     azimuth, elevation = np.meshgrid(azimuths_rad, elevations_rad)
     level = np.cos(elevation)
     directions = np.stack(
@@ -96,13 +96,13 @@ def sphere(
 def null_depths_db(
     array: Array, weights: ComplexArray, peak_db: float, directions: FloatArray
 ) -> FloatArray:
-    """Response towards directions (N, 3) less that of a peak, (N,): -60 is a null 60 dB deep."""
+    """Return responses towards directions (N, 3) less a peak's, (N,): -60 is a null 60 dB deep."""
     return response_db(array, weights, directions) - peak_db
 
 
 @dataclass(frozen=True, slots=True)
 class CutLobe:
-    """Lobe in one cut through its peak; angles of the cut, radians.
+    """Lobe of a pattern in one cut through its peak; angles of the cut, radians.
 
         half_power_width_rad  between the nearest points on either side where the gain falls to half
         first_nulls_rad       the first minimum beyond them on either side, as angles from the peak,
@@ -122,7 +122,7 @@ class CutLobe:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Lobe:
-    """Lobe that contains a direction: its peak (array frame, gain in dB), and its two cuts."""
+    """Lobe of a pattern: its peak (array frame, gain in dB), and its two cuts."""
 
     peak_azimuth_rad: float
     peak_elevation_rad: float
@@ -151,10 +151,10 @@ def lobe(array: Array, weights: ComplexArray, direction: FloatArray) -> Lobe:
 def half_power_beamwidths_rad(
     array: Array, direction: FloatArray
 ) -> tuple[float | None, float | None]:
-    """Full widths at half power, in azimuth and in elevation, of the beam matched to a direction.
+    """Return half-power widths, azimuth and elevation, of the beam matched to a direction.
 
-    ``direction`` (3,) is a unit vector in the array frame. None if the gain never falls to half
-    along that cut; both are None if no element radiates towards the direction.
+    ``direction`` (3,) is a unit vector in the array frame. A width is None if the gain never falls
+    to half along that cut; both are None if no element radiates towards the direction.
     """
     matched = steering.steering_matrix(array, direction[np.newaxis])[:, 0].conj()
     if not matched.any():
@@ -170,7 +170,7 @@ def half_power_beamwidths_rad(
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Circle:
-    """Directions middle + cos(t) ahead + sin(t) aside: on the sphere for every t."""
+    """Circle of directions: middle + cos(t) ahead + sin(t) aside, on the sphere for every t."""
 
     middle: FloatArray
     ahead: FloatArray
@@ -178,19 +178,19 @@ class _Circle:
 
     @classmethod
     def parallel(cls, elevation_rad: float) -> Self:
-        """Circle along azimuth, at one elevation."""
+        """Return the circle along azimuth, at one elevation."""
         level = math.cos(elevation_rad)
         middle = np.array([0.0, 0.0, -math.sin(elevation_rad)])
         return cls(middle, np.array([level, 0.0, 0.0]), np.array([0.0, level, 0.0]))
 
     @classmethod
     def meridian(cls, azimuth_rad: float) -> Self:
-        """Circle along elevation, at one azimuth, continued over the poles."""
+        """Return the circle along elevation, at one azimuth, continued over the poles."""
         ahead = np.array([math.cos(azimuth_rad), math.sin(azimuth_rad), 0.0])
         return cls(np.zeros(3), ahead, np.array([0.0, 0.0, -1.0]))
 
     def directions(self, angles_rad: FloatArray) -> FloatArray:
-        """Unit directions (..., 3) at angles (...)."""
+        """Return unit directions (..., 3) at angles (...) of the circle."""
         cosine, sine = np.cos(angles_rad)[..., np.newaxis], np.sin(angles_rad)[..., np.newaxis]
         found: FloatArray = self.middle + cosine * self.ahead + sine * self.aside
         return found
@@ -205,7 +205,7 @@ class _Cut:
     circle: _Circle
 
     def gains(self, angles_rad: FloatArray) -> FloatArray:
-        """Array gain (not dB) at angles (...)."""
+        """Return the array gain (not dB) at angles (...) of the circle."""
         return _gains(self.array, self.weights, self.circle.directions(angles_rad))
 
     def points(self) -> int:
@@ -255,12 +255,11 @@ def _gains(array: Array, weights: ComplexArray, directions: FloatArray) -> Float
 
 
 def _peak_direction(array: Array, weights: ComplexArray, direction: FloatArray) -> FloatArray:
-    """Return the unit direction (3,) of the local maximum that an ascent from ``direction``
-    reaches.
+    """Return the direction (3,) of the local maximum reached by ascent from ``direction``.
 
     Newton's method on a quadratic through 3 x 3 directions, in steps too short to leave a lobe.
-    They lie along the axes of the array as seen from there, which mostly are those of the maximum:
-    on a ridge (a line of elements has its peak on a cone) it ascends straight.
+    These directions lie along the array's axes as seen from there, usually those of the maximum: on
+    a ridge (a line of elements has its peak on a cone) it ascends straight.
     """
     centred = array.centred_m
     aperture_m = 2 * float(np.linalg.norm(centred, axis=1).max())
@@ -293,8 +292,8 @@ def _peak_direction(array: Array, weights: ComplexArray, direction: FloatArray) 
 def _uphill(slope: FloatArray, curvature: FloatArray, bend: float) -> FloatArray:
     """Return the step (2,) to the maximum of a quadratic, at most 2 along each of its axes.
 
-    From a minimum or a saddle it follows the axis that rises most. On a ridge, an apparent rise is
-    that of the sphere itself: it is at most ``bend`` of the other axis' curvature.
+    From a minimum or a saddle the step follows the axis that rises most. On a ridge, an apparent
+    rise is that of the sphere itself: it is at most ``bend`` of the other axis' curvature.
     """
     values, axes = np.linalg.eigh(curvature)
     along = slope @ axes
@@ -313,7 +312,8 @@ def _cut_lobe(cut: _Cut, peak_rad: float) -> CutLobe:
 
 
 def _half_power(cut: _Cut, peak_rad: float) -> tuple[float | None, tuple[float, float] | None]:
-    """Width at half power, and the first minima beyond it as angles from the peak."""
+    """Return the width of a lobe at half power, and the first minima beyond, as angles from the
+    peak."""
     half = float(cut.gains(np.array(peak_rad))) / 2
     points = cut.points()
     step = 2 * math.pi / points
@@ -338,7 +338,7 @@ def _half_power(cut: _Cut, peak_rad: float) -> tuple[float | None, tuple[float, 
 def _crossings(
     cut: _Cut, peak_rad: float, half: float, inner: FloatArray, step: float
 ) -> FloatArray:
-    """Distances (2,) below and above the peak, both positive, where the gain is ``half``.
+    """Return distances (2,) below and above the peak, both positive, where the gain is ``half``.
 
     ``inner`` (2, 1) are angles from the peak, one step before the crossing.
     """
@@ -365,7 +365,7 @@ def _extremes(cut: _Cut, brackets: FloatArray, sign: float) -> tuple[FloatArray,
 
 
 def _side_lobe_db(cut: _Cut, peak_rad: float, nulls: tuple[float, float]) -> float | None:
-    """Highest maximum outside the first nulls, less the peak, dB."""
+    """Return the highest maximum outside the first nulls, less the peak, dB."""
     points = cut.points()
     step = 2 * math.pi / points
     offsets: FloatArray = step * np.arange(points, dtype=np.float64)
@@ -390,6 +390,6 @@ def _side_lobe_db(cut: _Cut, peak_rad: float, nulls: tuple[float, float]) -> flo
 
 
 def _mirrored(array: Array) -> bool:
-    """Return whether a direction and its image in the yz plane look alike, patterns apart."""
+    """Return whether directions and their images in the yz plane look alike to the elements."""
     depths = np.ptp(array.elements_m[:, 0]) / array.wavelength_m
     return array.element_from_array is None and bool(depths < SAME_PLACE_WAVELENGTHS)

@@ -1,4 +1,4 @@
-"""Assignment of stamps to lines: late frames, reboots, clock jumps, and the wrap of the boot clock.
+"""Assignment of stamps to clock lines: late frames, reboots, clock jumps, and clock wrap.
 
 While a sender runs, its stamps lie on or above one line (``floor.py``). A stamp belongs to the
 line while it is less than ``late_max_ns`` off it:
@@ -35,16 +35,16 @@ _WRAP_MS: Final = 1 << 32
 WRAP_NS: Final = _WRAP_MS * _NS_PER_MS
 """Period of a boot clock: its 32-bit milliseconds wrap after 49.7 days."""
 _EARLY_NS: Final = -_NS
-"""Least lateness of a stamp that fits an established line; negative: it may be 1 s early."""
+"""Least lateness of a stamp that fits an established line: -1 s, so 1 s early still fits."""
 _ESTABLISHED: Final = 20  # stamps of a line that a single early stamp can no longer move
 _RUN_KEPT: Final = 64  # stamps kept of a run
 _RIVAL_LASTS_NS: Final = 3 * _NS
-"""Least duration of a second clock that counts as one."""
+"""Least duration of a second clock line under one id before it counts as a second clock."""
 _RIVAL_SILENT_NS: Final = 10 * _NS  # silence after which a second clock is forgotten
 
 
 class PlacedStamp(NamedTuple):
-    """Stamp placed on a line."""
+    """Stamp that was assigned to a clock line."""
 
     x_ns: int  # the sender's time since boot, unwrapped
     new_line: bool = False  # True for the first stamp on a new line
@@ -54,7 +54,7 @@ class PlacedStamp(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class _RivalLine:
-    """Stamps off the line, (arrival ns, boot ms), that lie on a line of their own."""
+    """Stamps off the line, (arrival ns, boot ms), that fit a second line."""
 
     stamps: list[tuple[int, int]] = field(default_factory=list)
     lowest_ns: int = 0
@@ -93,7 +93,7 @@ class _RivalLine:
 
 
 class BootLine:
-    """Line of one sender's boot clock; ``observe`` takes its stamps in order of arrival.
+    """Clock line of one sender's boot clock; ``observe`` takes its stamps in order of arrival.
 
     window_ns, drift_max
                  as for ``Floor``
@@ -135,7 +135,7 @@ class BootLine:
         return self._begin_new_line(rebooted=stepped_back)
 
     def notice(self, arrival_ns: int, boot_ms: int) -> bool:
-        """Add a stamp that cannot start a line. Return whether it lies on the current one."""
+        """Add a stamp that cannot start a line. Return whether the stamp lies on the current line."""
         if not self.floor.count:
             return False
         x_ns = _unwrap(boot_ms, self.newest_ns)
@@ -156,7 +156,7 @@ class BootLine:
         return _unwrap(boot_ms, self.newest_ns)
 
     def late_ns(self, arrival_ns: int, x_ns: int) -> int:
-        """Return the height of a stamp above the line, ns; negative below it."""
+        """Return how far a stamp is above the line, ns; negative below the line."""
         return arrival_ns - x_ns - self.floor.at(x_ns)
 
     def fits(self, arrival_ns: int, x_ns: int) -> bool:
@@ -185,7 +185,7 @@ class BootLine:
         return self._accept(arrival_ns, x_ns)
 
     def _place_ahead(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
-        """Place a stamp that implies that all earlier ones were late, once others confirm it.
+        """Once others confirm it, place a stamp that implies that all earlier ones were late.
 
         A single forged stamp could otherwise move the clock by any amount.
         """
@@ -198,14 +198,14 @@ class BootLine:
         return self._accept(arrival_ns, _unwrap(boot_ms, self.newest_ns))
 
     def _place_delayed(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp:
-        """Place a stamp in order but too late: the link stalled, or the clock stood still."""
+        """Place a stamp in order but too late: the link stalled, or the clock stalled."""
         if self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(5, 2 * _NS):
             return self._begin_new_line(rebooted=False)
         self.newest_ns = x_ns
         return PlacedStamp(x_ns=x_ns)
 
     def _is_straggler(self, arrival_ns: int, boot_ms: int, late_ns: int) -> bool:
-        """Return whether a stamp fits the previous line and not the current one."""
+        """Return whether a stamp fits the previous line and not the current line."""
         if self._previous is None:
             return False
         before, left_ns = self._previous
@@ -218,7 +218,7 @@ class BootLine:
         return fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
 
     def _begin_new_line(self, *, rebooted: bool) -> PlacedStamp:
-        """Make the run the line. After a reboot the sender's timeline restarts."""
+        """Make the run of stamps the new line. After a reboot the sender's timeline restarts."""
         stamps = list(self._run.stamps)
         self._run.stamps.clear()
         self._rival.stamps.clear()

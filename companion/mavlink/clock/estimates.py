@@ -1,4 +1,4 @@
-"""Values of a sender's clock: assumptions, estimates and changes."""
+"""Values that describe a sender's clock: assumptions, estimates and changes."""
 
 import math
 from dataclasses import dataclass
@@ -8,7 +8,7 @@ from companion.values.described import DescribedEnum, Meaning
 
 
 class ClockKind(DescribedEnum):
-    """Evidence from which a sender's clock is estimated."""
+    """Kind of evidence from which a sender's clock is estimated."""
 
     TIMESYNC = "timesync", "TIMESYNC round trips"
     GNSS = "gnss", "SYSTEM_TIME of a GNSS receiver"
@@ -16,7 +16,7 @@ class ClockKind(DescribedEnum):
 
 
 class Guarantee(DescribedEnum):
-    """Whether both ends of a clock's interval were measured."""
+    """Whether both ends of a clock offset's interval were measured."""
 
     MEASURED = "measured", "both ends were measured"
     ASSUMED = "assumed", "one end is assumed"
@@ -62,7 +62,7 @@ class Stamp:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockEstimate:
-    """Estimate of a sender's clock relative to the node's."""
+    """Estimate of a sender's clock relative to the node's clock."""
 
     kind: Annotated[ClockKind, Meaning("evidence that leaves the least uncertainty")]
     guarantee: Annotated[

@@ -35,7 +35,7 @@ class Interval(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class DriftProven:
-    """Drift beyond the assumed one: ``drift``, a ratio; inf for a sudden step.
+    """Proof that a clock drifts more than assumed: ``drift``, a ratio; inf for a sudden step.
 
     ``step_ns`` is the distance of the offset from the interval expected.
     """
@@ -45,7 +45,7 @@ class DriftProven:
 
 
 class OffsetEvidence:
-    """Interval of the offset from all evidence of one kind.
+    """Interval of a clock offset from all evidence of one kind.
 
     drift_max    largest drift assumed, a ratio
     """
@@ -70,7 +70,8 @@ class OffsetEvidence:
         return max(self._drift_max, faded)
 
     def add(self, new: Interval) -> DriftProven | None:
-        """Add evidence.
+        """Add evidence. Return the drift that the evidence proves; None if it agrees with earlier
+        ones.
 
         Return the drift that it proves; None if it agrees with earlier evidence.
         """
@@ -105,15 +106,17 @@ class OffsetEvidence:
         return Interval(x_ns, one.low_ns - slack, one.high_ns + slack)
 
     def newest(self, x_ns: int) -> Interval:
-        """Return the interval at a sender time, from evidence since the newest contradiction.
+        """Return the offset's interval at a sender time, from evidence since the last
+        contradiction.
 
-        There must be some.
+        Some evidence must exist.
         """
         assert self._known is not None
         return self._aged(self._known, x_ns)
 
     def at(self, x_ns: int) -> Interval | None:
-        """Return the interval at a sender time, with the doubt interval; None without evidence."""
+        """Return the offset's interval at a sender time, incl. the doubt interval; None without
+        evidence."""
         if self._known is None:
             return None
         known = self._aged(self._known, x_ns)

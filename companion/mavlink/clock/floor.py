@@ -39,13 +39,13 @@ FEWEST, RECENT = 3, 8
 WORST_LATENCY_NS: Final = 5e9
 """Greatest latency of a frame; radios have delivered up to 4.8 s late."""
 START_NS: Final = 250_000_000
-"""Time that counts as one frame at the start, when the first few may all be slow together."""
+"""Time that counts as one frame at the start, as the first few frames may all be slow together."""
 _RARE: Final = 7.0
 """Once in 1000 the least of n exponential latencies exceeds the true minimum by 7/n of a mean."""
 
 
 class Heights(NamedTuple):
-    """Heights of a floor at one sender time, ns."""
+    """Bounds on a clock offset by its floor at one sender time, ns."""
 
     upper_bound: int  # upper bound of the offset if the clock stayed within its drift
     highest: int  # upper bound of the offset even if the clock changed before the last frames
@@ -54,7 +54,7 @@ class Heights(NamedTuple):
 
 
 class _Level:
-    """Level floor under steadily rising stamps: valid if a queue, not drift, caused the rise.
+    """Level floor under steadily rising stamps, valid if a queue, not drift, caused the rise.
 
     upper_bound bound on the offset in that case, at the newest stamp, relative to the level base
     touched_ns  sender time of the stamp that set it
@@ -169,7 +169,7 @@ class Floor:
         return y_ns - y0_ns - self.drift * (x_ns - x0_ns)
 
     def _late_height(self) -> float:
-        """Return the least height of the last few frames if all are improbably late, else -inf."""
+        """Return the least height of the last few frames if all are improbably late; else -inf."""
         heights = [
             height + self._drift_max * (self.newest_ns - at_ns) for at_ns, height in self._recent
         ]
@@ -183,7 +183,7 @@ class Floor:
         return -np.inf
 
     def _all_late(self, spell: LateSpell) -> None:
-        """Report a spell of late frames once.
+        """Report a spell of late frames once; restart the line at their height if it lasts.
 
         Restart the line at their height when it has lasted.
         """
@@ -204,7 +204,7 @@ class Floor:
                 self._drifts()
 
     def _drifts(self) -> None:
-        """Restart the floor along the drift, on the least heights of the window."""
+        """Restart the floor along the drift, through the least heights of the window."""
         newest_ns, level = self.newest_ns, self._upper_bound
         self._level = _Level(self._last_change_ns)
         self._base = (newest_ns, self._base[1] + round(level))
@@ -223,7 +223,7 @@ class Floor:
         return self._base[1] + round(self._line + self.drift * (x_ns - self._base[0]))
 
     def heights(self, x_ns: int) -> Heights:
-        """Return the bounds on the offset at a sender time."""
+        """Return the bounds on the clock offset at a sender time."""
         drift_max, newest_ns = self._drift_max, self.newest_ns
         base_ns = self._base[1]
         sure, line, recent = self._upper_bound, self._line, self._risen
@@ -248,7 +248,7 @@ class Floor:
         )
 
     def _tilted(self, height: float) -> float:
-        """Convert a height at the newest stamp to one above the level base."""
+        """Convert a height at the newest stamp to a height above the level base."""
         return height + self.drift * (self.newest_ns - self._base[0])
 
     @property
@@ -258,11 +258,12 @@ class Floor:
 
     @property
     def late_ns(self) -> float:
-        """Present lateness of all frames, by the clock or by the link; 0 if they are on time."""
+        """Present lateness of all frames, due to clock or link, ns; 0 if they are on time."""
         return max(0.0, self._lateness.height - self._line)
 
     def residual_ns(self) -> float:
-        """Return the possible excess of the fastest frame so far, due to the short observation.
+        """Return how much later than possible the fastest frame so far may be, as few were
+        observed.
 
         The least of n exponential latencies is above their minimum by up to 7 means / n; and the
         first frames may all have been slow.
@@ -280,7 +281,8 @@ class Floor:
     def may_drift_ns(self, x_ns: int) -> tuple[int, int]:
         """Return the least and greatest drift of the offset since the newest stamp, ns.
 
-        Beyond ``drift_max``. It includes 0 while the apparent drift may be a queue.
+        Counted is drift beyond ``drift_max``. The range includes 0 while the apparent drift may be
+        a queue.
         """
         drifted_ns = self.drifted_ns(x_ns)
         if self._level is None:

@@ -17,8 +17,7 @@ SAMPLES: Final = 256
 RESOLUTION_NS: Final = 1e6  # resolution of the stamps
 _LOTS: Final = 1 << 32
 _STEADY: Final = 0.1
-"""Ratio of a sloped line's mean gap to the level line's, below which the slope is a steady drift.
-"""
+"""Largest ratio of a sloped line's mean gap to a level line's that shows a steady drift."""
 
 
 class Latencies:
@@ -27,7 +26,7 @@ class Latencies:
     window_ns   time over which stamps are kept
     drift_max   largest drift assumed, a ratio
     median_ns   attribute: median of the visible latencies at the last ``measure``
-    mean_ns     attribute: their mean
+    mean_ns     attribute: mean of the visible latencies
     """
 
     def __init__(self, window_ns: int, drift_max: float) -> None:
@@ -122,7 +121,7 @@ class Latencies:
 
 
 def _slope_over(points: list[tuple[float, float]], x: float) -> float:
-    """Return the slope of the lower hull's edge over ``x``, for ordered points; 0 without one."""
+    """Return the slope of the lower hull's edge over ``x``, for ordered points; 0 without an edge."""
     hull: list[tuple[float, float]] = []
     for point in points:
         while len(hull) > 1:

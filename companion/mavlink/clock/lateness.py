@@ -23,7 +23,7 @@ LEAST_CHANGE_NS: Final = 5e6
 """Smallest change that is detected: stamps have a resolution of some milliseconds."""
 FEWEST: Final = 8  # fewest frames of a change
 FOLLOWED: Final = 40.0
-"""Multiple of their lateness for which all frames must be late before the line follows them."""
+"""How long frames must be late before the line follows them, as a multiple of their lateness."""
 FOLLOWED_NS: Final = 20_000_000_000  # time after which the line follows in any case
 _BLOCK_NS: Final = 250_000_000
 _BLOCKS: Final = 240
@@ -31,7 +31,7 @@ _BLOCK_COUNT: Final = 4  # frames of a block that count as independent
 
 
 class LateSpell(NamedTuple):
-    """Spell in which all frames are late."""
+    """Spell in which all frames of a sender are late."""
 
     height: float  # least height of the late frames, aged to the newest, ns
     since_ns: int  # sender time of the first of them
@@ -40,7 +40,7 @@ class LateSpell(NamedTuple):
 
 
 class _Block:
-    """Stamps of a quarter of a second: their number, and the least height above the line."""
+    """Stamps of a quarter of a second: how many, and their least height above the line."""
 
     __slots__ = ("count", "first_ns", "gap_ns", "height", "index", "x_ns")
 
@@ -54,7 +54,7 @@ class _Block:
 class SenderLateness:
     """Heights of one sender's frames above its line. ``add`` takes the newest ones.
 
-    ``height`` is that of the current spell, -inf without one.
+    ``height`` is the height of the current spell, -inf without a spell.
     """
 
     def __init__(self, drift_max: float) -> None:
@@ -65,7 +65,7 @@ class SenderLateness:
         self._dropped_ns = 0  # sender time of that block
 
     def clear(self) -> None:
-        """Restart, as the line does."""
+        """Restart the measurement, because the line restarted."""
         self._blocks.clear()
         self.height = -math.inf
 

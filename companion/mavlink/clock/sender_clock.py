@@ -35,7 +35,7 @@ _NS_PER_MS: Final = 1_000_000
 _MAX_DEPTH_NS: Final = 10 * _NS
 """Largest depth of the offset below the floor that evidence may claim."""
 _LATENCY_S: Final = (-0.02, 5.0)
-"""Least and greatest latency that a trusted GNSS time may imply, seconds."""
+"""Least and greatest plausible latency by a trusted GNSS time, seconds."""
 _GNSS_CHECKS: Final = 5  # GNSS times in a row that must be plausible before one is used
 INVISIBLE_RATIO: Final = 0.1
 """Estimated ratio of the invisible part of the latency to the median of the visible part.
@@ -44,13 +44,11 @@ A point estimate, not a bound: it improves most of the latency laws tried (docs/
 makes none much worse.
 """
 MIN_INVISIBLE_NS: Final = 25 * _NS_PER_MS
-"""Least upper limit assumed for the invisible latency, even if visible parts are shorter: a serial
-line's.
-"""
+"""Least limit assumed for the invisible latency, even if visible parts are shorter."""
 
 
 class SenderClock:
-    """Clock of one sender.
+    """Clock of one sender, on the node's timeline.
 
     ``observe`` takes the stamps of its reports in order of arrival, ``notice`` those of its other
     messages. ``change`` is the clock change that the newest stamp or answer revealed, or None.
@@ -170,7 +168,7 @@ class SenderClock:
         return self._add(self._gnss, Interval(x_ns, offset_ns - error_ns, offset_ns + error_ns))
 
     def _add(self, evidence: OffsetEvidence, new: Interval) -> str | None:
-        """Add an interval to the evidence. Return None, or why it cannot be about this clock."""
+        """Add an interval to the evidence. Return None, or why it cannot belong to this clock."""
         floor = self._line.floor
         sure_ns, highest_ns, _, _ = floor.heights(new.x_ns)
         early_ns = new.low_ns - highest_ns - _NS_PER_MS
@@ -207,7 +205,7 @@ class SenderClock:
         return newest_ns + round(ahead_ns / (1.0 + floor.drift))
 
     def estimate(self, node_ns: int | None = None) -> ClockEstimate | None:
-        """Return the clock at a node time (default: its newest stamp); None before that."""
+        """Return the clock at a node time (default: its newest stamp); None before the first stamp."""
         floor = self._line.floor
         if not floor:
             return None
@@ -228,8 +226,8 @@ class SenderClock:
     def time(self, node_ns: int) -> tuple[int, float, float, float] | None:
         """Return the clock at a node time, as in ``ClockEstimate``; None before the first stamp.
 
-        The offset (node time less sender time), ns; then, in seconds, how much larger and how much
-        smaller it may be, and its usual error.
+        Returns the offset (node time less sender time), ns; then, in seconds, how much larger and
+        how much smaller the offset may be, and its usual error.
         """
         if not self._line.floor.count:
             return None
@@ -265,7 +263,7 @@ class SenderClock:
         return math.hypot(INVISIBLE_RATIO * floor.median_ns + _NS_PER_MS, floor.late_ns) * 1e-9
 
     def _interval(self, x_ns: int) -> tuple[ClockKind, int, int, int]:
-        """Return the offset at a sender time: kind, least, greatest and most likely; ns.
+        """Return the offset at a sender time: kind of evidence, least, greatest and likeliest; ns.
 
         The kind is the evidence that leaves the least uncertainty. A measurement takes precedence
         where it contradicts an assumption.

@@ -1,4 +1,4 @@
-"""Interface of a link's endpoints, and their shared functions.                              [shell]
+"""Interface of a link's endpoints, and the functions that endpoints share. [shell]
 
 An endpoint serves one connection after the other. ``serve`` ends with an exception, the reason,
 when a connection is lost, and is called again after a while. The endpoint reports events to its
@@ -52,10 +52,11 @@ class Endpoint(Protocol):
         """Return the peers that get a broadcast; None: those received recently."""
 
     def write(self, key: Hashable, raw: bytes) -> bool:
-        """Send a frame to a peer. Never waits and never raises; False if it was not accepted."""
+        """Send a frame to a peer. Never waits and never raises; False if the frame was not
+        accepted."""
 
     def fullness(self, key: Hashable) -> float:
-        """Return the filled share, 0 to 1, of a peer's send buffer; 0 for a peer that is gone.
+        """Return the filled share, 0 to 1, of a peer's send buffer; 0 for a disconnected peer.
 
         For callers that prefer to wait rather than lose a frame.
         """
@@ -81,7 +82,7 @@ def address_text(address: Address | None) -> str:
 
 
 def settle(lost: asyncio.Future[Exception], why: Exception) -> None:
-    """Record why a connection is lost.
+    """Record why a connection is lost: only the first reason, and none after a cancellation.
 
     Only the first reason counts, and none after a cancellation.
     """
@@ -90,7 +91,7 @@ def settle(lost: asyncio.Future[Exception], why: Exception) -> None:
 
 
 def bound(url: LinkUrl, kind: socket.SocketKind) -> socket.socket:
-    """Return a socket bound to a link's address. Raises ``OSError`` if it is unavailable.
+    """Return a socket bound to a link's address. Raises ``OSError`` if the address is unavailable.
 
     The name lookup is synchronous: this is called before the loop runs. At a multicast address the
     group is joined, and other programs of this machine may listen too.
@@ -129,7 +130,7 @@ def _join(
 async def resolved(
     url: LinkUrl, kind: socket.SocketKind
 ) -> list[tuple[socket.AddressFamily, Address]]:
-    """Return the addresses of a link's host, at least one, without blocking the loop."""
+    """Return the addresses of a link's host, at least one, without blocking the event loop."""
     loop = asyncio.get_running_loop()
     infos = await loop.getaddrinfo(url.host, url.port, type=kind)
     return [(family, address) for family, _, _, _, address in infos]

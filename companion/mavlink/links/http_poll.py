@@ -58,7 +58,8 @@ class HttpPoll:
 async def _get(url: LinkUrl) -> bytes:
     """Return the body of a document (HTTP/1.0, RFC 1945: it ends where the server hangs up).
 
-    Raises ``OSError`` if it is not available, ``ValueError`` or ``EOFError`` for malformed HTTP.
+    Raises ``OSError`` if the document is not available, ``ValueError`` or ``EOFError`` for
+    malformed HTTP.
     """
     secure = ssl.create_default_context() if url.way == "https" else None
     reader, writer = await asyncio.open_connection(url.host, url.port, ssl=secure, limit=HEAD_MAX)

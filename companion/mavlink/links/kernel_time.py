@@ -16,11 +16,12 @@ import time
 from typing import Final
 
 SO_TIMESTAMPNS: Final[int] = getattr(socket, "SO_TIMESTAMPNS", 35)
-"""Linux, include/uapi/asm-generic/socket.h; the type of the control message as well."""
+"""Socket option and control message type of time stamps (Linux, include/uapi/asm-generic/socket.h).
+"""
 SET_NS: Final = 1_000_000  # least step of the wall clock that matters
 
 _BOOTTIME: Final[int] = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
-"""Linux's clock that continues during suspend; elsewhere the one that stops."""
+"""Linux's clock that continues during suspend; on other systems, one that stops."""
 _TIMESPEC: Final = struct.Struct("@ll")
 ANCILLARY_BYTES: Final[int] = socket.CMSG_SPACE(_TIMESPEC.size)
 """Buffer size that ``recvmsg`` needs for the stamp."""
@@ -71,7 +72,7 @@ class SetWatch:
         self._least_ns, self._greatest_ns = _distance_ns()
 
     def note(self) -> None:
-        """Reset: no datagram with an earlier stamp is waiting."""
+        """Start to watch: no datagram with an earlier stamp is waiting."""
         self._least_ns, self._greatest_ns = _distance_ns()
 
     def was_set(self) -> bool:
@@ -81,7 +82,7 @@ class SetWatch:
 
 
 def _distance_ns() -> tuple[int, int]:
-    """Return wall clock less time since boot, ns: least and most, since reading takes time."""
+    """Return wall clock less time since boot, ns: least and most, as reading takes time."""
     before_ns = since_boot_ns()
     wall_ns = time.time_ns()
     return wall_ns - since_boot_ns(), wall_ns - before_ns

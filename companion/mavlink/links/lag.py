@@ -35,14 +35,14 @@ class LagSeen:
 
 
 class ArrivalLag:
-    """Lags of the stamped datagrams of all links. Times do not decrease."""
+    """Processing lags of the stamped datagrams of all links. Times do not decrease."""
 
     def __init__(self) -> None:
         self._newest_ns = 0
         self._slots: deque[list[int]] = deque([[0, 0]], KEPT_NS // SLOT_NS + 1)  # when, worst lag
 
     def observe(self, now_ns: int, lag_ns: int) -> None:
-        """Record the lag of a datagram that is processed now."""
+        """Record the lag of a datagram that is being processed now."""
         self._newest_ns = lag_ns
         newest = self._slots[-1]
         if now_ns - newest[0] >= SLOT_NS:

@@ -29,7 +29,7 @@ PEERS_MAX: Final = 4096  # most recent peers kept: a port scan must not fill the
 SENDERS_MAX: Final = 16_384
 """Most sequences followed over all peers, so that forged senders do not fill the memory either.
 
-Beyond it all are reset, which loses only the gaps of that moment.
+Beyond the limit all are reset, which loses only the gaps of that moment.
 """
 RESTART_RUN: Final = 3  # late frames in a row, in increasing order, that prove a restart
 
@@ -89,7 +89,7 @@ class Peer:
 
     @property
     def speaks_v1_only(self) -> bool:
-        """True if every frame from it was MAVLink 1, and there was one."""
+        """True if the peer sent at least one frame, and all of them were MAVLink 1."""
         return self.versions == 1
 
     def brings_stamps(self, source: Source, now_ns: int) -> bool:
@@ -129,7 +129,7 @@ class Peers:
         return len(self._peers)
 
     def at(self, key: Hashable) -> Peer:
-        """Return the peer of a key, created if new. It becomes the last candidate for eviction."""
+        """Return the peer of a key, created if new; it becomes the last candidate for eviction."""
         peer = self._peers.get(key)
         if peer is not None:
             self._peers.move_to_end(key)
@@ -143,11 +143,11 @@ class Peers:
         return peer
 
     def find(self, key: Hashable) -> Peer | None:
-        """Return the peer of a key; None if unknown or gone."""
+        """Return the peer of a key; None if it is unknown or disconnected."""
         return self._peers.get(key)
 
     def forget(self, peer: Peer) -> None:
-        """Remove a peer that hung up or is evicted."""
+        """Remove a peer that disconnected or is evicted."""
         del self._peers[peer.key]
         self._senders -= len(peer.senders)
 
@@ -156,7 +156,7 @@ class Peers:
         return [p for p in self._peers.values() if p.heard_ns is not None and p.heard_ns >= t_ns]
 
     def last_of(self, source: Source) -> Peer | None:
-        """Return the peer over which a source was last received; None if it is gone."""
+        """Return the peer over which a source was last received; None if it is disconnected."""
         component = self._components.get(source)
         if component is None or self._peers.get(component.peer.key) is not component.peer:
             return None

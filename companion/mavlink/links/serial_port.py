@@ -1,4 +1,4 @@
-"""Serial port of a link, by pyserial and the loop's own readers.                         [shell]"""
+"""Serial port of a link, by pyserial and the event loop's own readers. [shell]"""
 
 import asyncio
 import contextlib
@@ -37,7 +37,7 @@ class SerialPort:
         """Do nothing: the device may be plugged in later."""
 
     async def serve(self) -> None:
-        """Open the device and serve until it is gone."""
+        """Open the device and serve it until it is disconnected."""
         loop = asyncio.get_running_loop()
         port = _opened(self._url.host, self._url.port)
         self._descriptor = descriptor = port.fileno()
@@ -72,7 +72,7 @@ class SerialPort:
         return True
 
     def fullness(self, key: Hashable) -> float:
-        """Return the filled share of the buffer, including the system's."""
+        """Return the filled share of the send buffer, including the system's."""
         if self._descriptor is None:
             return 0.0
         waiting = len(self._unsent) + _waiting(self._descriptor)
@@ -119,7 +119,7 @@ class SerialPort:
 
 
 def _opened(device: str, baud: int) -> Any:
-    """Open the port: raw, 8N1, exclusive, non-blocking.
+    """Open the serial port: raw, 8N1, exclusive, non-blocking.
 
     Raises ``OSError`` if it is not available.
     """
@@ -142,7 +142,7 @@ def _opened(device: str, baud: int) -> Any:
 
 
 def _waiting(descriptor: int) -> int:
-    """Return the bytes in the system's send buffer; 0 if the device is gone."""
+    """Return the bytes in the system's send buffer; 0 if the device is disconnected."""
     try:
         return cast(int, struct.unpack("i", fcntl.ioctl(descriptor, termios.TIOCOUTQ, bytes(4)))[0])
     except OSError:
@@ -150,7 +150,7 @@ def _waiting(descriptor: int) -> int:
 
 
 def _close(port: Any) -> None:
-    """Close without waiting (up to half a minute) for unsent bytes."""
+    """Close the serial port without waiting (up to half a minute) for unsent bytes."""
     if _waiting(port.fileno()):
         with contextlib.suppress(termios.error):  # the device is gone, with its unsent bytes
             termios.tcflush(port.fileno(), termios.TCOFLUSH)

@@ -56,7 +56,7 @@ def load_key(path: Path) -> bytes:
 
 
 def key_warning(path: Path) -> str | None:
-    """Return a warning if other users may read or change a key file; None if not."""
+    """Return a warning if other users may read or change a key file; else None."""
     try:
         mode = path.stat().st_mode
     except OSError as error:
@@ -77,21 +77,21 @@ def _how_to_make(path: Path) -> str:
 
 
 class _LinkKey(NamedTuple):
-    """Owner of a set of timestamps: a link's URL and the fingerprint of its key."""
+    """Identity of a set of timestamps: a link's URL and the fingerprint of its key."""
 
     url: str
     key: str
 
 
 class _Kept(NamedTuple):
-    """State of a link; ``clean`` if the link was closed properly."""
+    """Stored state of a link; ``clean`` if the link was closed properly."""
 
     state: State
     clean: bool
 
 
 class SigningSnapshot(NamedTuple):
-    """States to write; ``number`` counts the snapshots."""
+    """Signing states to write; ``number`` counts the snapshots."""
 
     number: int
     links: Mapping[_LinkKey, _Kept]
@@ -187,7 +187,7 @@ class Timestamps:
 
 
 def _locked(path: Path) -> int:
-    """Return a descriptor that locks the file against other processes until it is closed."""
+    """Return a descriptor that locks the file against other processes until closed."""
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         lock = os.open(_beside(path, ".lock"), os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -204,7 +204,7 @@ def _locked(path: Path) -> int:
 
 
 def _read(path: Path) -> dict[_LinkKey, _Kept]:
-    """Return the content of the file; empty if there is no file yet."""
+    """Return the content of the timestamps file; empty if there is no file yet."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -221,7 +221,7 @@ def _read(path: Path) -> dict[_LinkKey, _Kept]:
 
 
 def _checked_links(data: bytes) -> list[dict[str, Any]] | None:
-    """Return the list of links as written; None if the file's digest does not match."""
+    """Return the links in a timestamps file; None if its digest does not match."""
     with contextlib.suppress(ValueError, RecursionError, TypeError, KeyError):
         content = json.loads(data)
         if content["version"] == _VERSION and content["sha256"] == _digest(content["links"]):

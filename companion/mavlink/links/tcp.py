@@ -24,14 +24,13 @@ WRITE_BUFFER_BYTES: Final = 64 << 10
 CONNECT_S: Final = 5.0
 """Timeout of a connection attempt; the system's own is two minutes, with ever longer pauses."""
 CONNECTIONS_MAX: Final = 256
-"""Most connections of a listening link, since each takes a file descriptor; more are closed at
-once."""
+"""Most connections of a listening link (each takes a file descriptor); more are closed at once."""
 SILENCE_S: Final = 12
 """Seconds without an acknowledgement after which a connection is closed."""
 
 
 class TcpOut:
-    """Link that connects to one peer."""
+    """TCP client of a link: connects to one peer."""
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
@@ -57,7 +56,7 @@ class TcpOut:
             stream.abort()
 
     def peers(self) -> Collection[Hashable]:
-        """Return the one peer, while connected."""
+        """Return the one peer, while it is connected."""
         return () if self._stream is None else (self._stream,)
 
     def write(self, key: Hashable, raw: bytes) -> bool:
@@ -70,7 +69,7 @@ class TcpOut:
 
 
 class TcpIn:
-    """Link that listens. Each connection is a separate peer."""
+    """TCP server of a link. Each connection is a separate peer."""
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
@@ -86,7 +85,7 @@ class TcpIn:
         return port
 
     async def serve(self) -> None:
-        """Serve connections. The loss of one does not end this."""
+        """Serve connections. The loss of one does not end the endpoint."""
         loop = asyncio.get_running_loop()
         fault: asyncio.Future[Exception] = loop.create_future()
         sock, self._socket = self._socket or _listening(self._url), None
@@ -173,7 +172,7 @@ class _Stream(asyncio.Protocol):
         self._upcalls.on_peer_gone(self)
 
     def write(self, raw: bytes) -> bool:
-        """Send a frame, or buffer it while there is room; False if there is none."""
+        """Send a frame, or buffer it while there is room; False if the buffer is full."""
         transport = self._transport
         if transport is None or not self.is_open():
             return False
@@ -183,17 +182,17 @@ class _Stream(asyncio.Protocol):
         return True
 
     def is_open(self) -> bool:
-        """Return whether it is writable."""
+        """Return whether the connection is writable."""
         return self._transport is not None and not self._transport.is_closing()
 
     def fullness(self) -> float:
-        """Return the filled share of the buffer; 0 when it has ended."""
+        """Return the filled share of the buffer; 0 when the connection has ended."""
         if self._transport is None:
             return 0.0
         return self._transport.get_write_buffer_size() / WRITE_BUFFER_BYTES
 
     def abort(self) -> None:
-        """Close the connection and discard unsent bytes.
+        """Close the connection and discard unsent bytes; if it is not yet made, on connect.
 
         At once on connect if it is not yet made.
         """

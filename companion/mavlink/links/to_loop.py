@@ -8,12 +8,12 @@ from collections.abc import Callable
 from typing import Final
 
 QUEUE_MAX: Final = 20_000
-"""Most calls that may wait for the loop; more are dropped and counted."""
+"""Most calls that may wait for the event loop; more are dropped and counted."""
 SLICE_S: Final = 0.003  # time slice, after which other work of the event loop runs
 
 
 class ToLoop:
-    """Queue of calls from threads, run on the loop in order until ``end`` or until one fails.
+    """Queue of calls from threads, run on the event loop in order until ``end`` or a failure.
 
     handed_over  calls made
     dropped      calls that found ``QUEUE_MAX`` waiting
@@ -30,7 +30,7 @@ class ToLoop:
         self._fault: asyncio.Future[None] = loop.create_future()
 
     def post(self, call: Callable[[], None]) -> None:
-        """Queue a call for the loop; from any thread."""
+        """Queue a call for the event loop; may be called on any thread."""
         with self._lock:
             if self._is_over:
                 return
@@ -47,13 +47,13 @@ class ToLoop:
             self.end()
 
     def fail(self, fault: Exception) -> None:
-        """End, on the loop, after a defect of a call; ``run`` raises it."""
+        """Stop on the event loop after a call failed; ``run`` raises its exception."""
         self.end()
         if not self._fault.done():
             self._fault.set_exception(fault)
 
     def end(self) -> None:
-        """Make no further call; from any thread."""
+        """Make no further call; may be called on any thread."""
         with self._lock:
             self._is_over = True
             self._waiting.clear()

@@ -41,10 +41,9 @@ from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
 __all__ = ["Link", "LinkStatus", "MessageSigning", "Notify", "Receive", "endpoint"]
 
 RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
-"""Seconds from one attempt to serve a lost link to the next; the last is repeated."""
+"""Seconds between attempts to serve a lost link, in order; the last value is repeated."""
 STEADY_S: Final = 1.0
-"""Seconds a connection must hold before it is reported as back; a shorter one is part of the
-outage."""
+"""Seconds for which a connection must last before it is reported as restored."""
 PEER_ACTIVE_S: Final = 10.0
 """A listening UDP link sends to the peers from which a frame arrived within this many seconds."""
 
@@ -53,10 +52,10 @@ Notify = Callable[[Notice], None]
 
 
 class MessageSigning(Protocol):
-    """Message signing of one link (https://mavlink.io/en/guide/message_signing.html)."""
+    """Interface of one link's message signing (https://mavlink.io/en/guide/message_signing.html)."""
 
     def refusal(self, frame: Frame) -> Reason | None:
-        """Return why a frame must be rejected; None to accept it.
+        """Return why a frame must be rejected; None to accept. Called once per frame, in order.
 
         Called once per frame, in order.
         """
@@ -66,7 +65,7 @@ class MessageSigning(Protocol):
 
 
 class Link:
-    """One link. Call ``open`` for early errors, then ``run`` until cancelled.
+    """One link of the service, of any scheme.
 
         receive        called on the event loop with the frames and rejections of each datagram or
                        read
@@ -148,7 +147,7 @@ class Link:
     # --- receiving --------------------------------------------------------------------------
 
     def take(self, key: Hashable, data: bytes, age_ns: int | None = None) -> None:
-        """Split the bytes that a peer sent and pass on the frames.
+        """Split the bytes that a peer sent into frames, and pass them on.
 
         ``age_ns`` is the time since their arrival; None if unknown: they count as arrived now.
         """
@@ -182,7 +181,7 @@ class Link:
         )
 
     def _checked_for_duplicates(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
-        """Return the item, or its rejection if the sender's peers contradict each other."""
+        """Return the item, or a rejection if the sender's peers contradict each other."""
         if isinstance(item, Rejection) or item.msgid not in POSE:
             return item
         if not self._duplicate_ids.rejects(str(self.url), peer.address or str(self.url), item):
@@ -216,10 +215,10 @@ class Link:
     # --- sending ----------------------------------------------------------------------------
 
     def send(self, message: Outgoing) -> int:
-        """Send to every recent peer (udpin), to every connection (tcpin), or to the one peer.
+        """Send to every recent peer (udpin), every connection (tcpin), or the one peer.
 
-        "Recent" is within ``PEER_ACTIVE_S``. Returns how many accepted it. Never waits and never
-        raises.
+        "Recent" is within ``PEER_ACTIVE_S``. Returns how many accepted the frame. Never waits and
+        never raises.
         """
         keys = self._endpoint.peers()
         if keys is None:
@@ -295,7 +294,7 @@ class Link:
 
 
 def _checked_timesync(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
-    """Return the item, or the rejection of a TIMESYNC from a peer without its sender's stamps.
+    """Return the item; a rejection for a TIMESYNC from a peer without its sender's stamps.
 
     Any program that reaches the socket could otherwise shift a clock. Routers deliver both.
     """

@@ -28,7 +28,7 @@ Measured: docs/field-notes.md 3.
 """
 OVERFLOW_CHECK_S: Final = 1.0  # longest time between two reads of the system's drop counter
 OVERFLOW_CHECK_DATAGRAMS: Final = 1024
-"""Datagrams after which the drop counter is read even before that time."""
+"""Number of datagrams after which the drop counter is read, even before its period."""
 STALE_NS: Final = 2_000_000_000
 """Age at which a datagram is discarded: a busy machine then processes new data, not a backlog."""
 READ_AT_ONCE: Final = 32
@@ -67,7 +67,7 @@ def _prepare(sock: socket.socket, status: LinkStatus) -> None:
 
 
 def _fullness(sock: socket.socket) -> float:
-    """Return 1 if the system would not accept a datagram now, else 0: there is no buffer here."""
+    """Return 1 if the system would not accept a datagram now, else 0; this program buffers none."""
     if sock.fileno() < 0:  # closed by its transport
         return 0.0
     poll = select.poll()
@@ -91,7 +91,7 @@ def _readiness(sock: socket.socket) -> Iterator[int]:
 
 
 class UdpIn:
-    """Link that listens for datagrams.
+    """UDP link that listens. One socket serves all senders, whose addresses are the keys.
 
     One socket serves all senders; their addresses are the keys.
     """
@@ -138,7 +138,7 @@ class UdpIn:
         return True
 
     def fullness(self, key: Hashable) -> float:
-        """Return 1 if the system would not accept a datagram now, else 0.
+        """Return 1 if the system would not accept a datagram now, else 0; alike for all peers.
 
         The same for all peers.
         """
@@ -146,7 +146,7 @@ class UdpIn:
 
 
 class UdpOut:
-    """Link with one peer: its socket is connected, so that other senders are ignored.
+    """UDP link with one peer, whose connected socket ignores other senders.
 
     An ICMP refusal is no error: the peer may start later. After a local error, such as a network
     that is down, the socket is recreated, since the old one would keep its local address.
@@ -159,7 +159,7 @@ class UdpOut:
         self._datagrams: _Datagrams | None = None
 
     def open(self) -> None:
-        """Do nothing."""
+        """Do nothing: ``serve`` opens the socket."""
 
     async def serve(self) -> None:
         """Read the peer's datagrams.
@@ -185,7 +185,7 @@ class UdpOut:
                 self._datagrams = None
 
     def peers(self) -> Collection[Hashable]:
-        """Return the one peer, None, while there is a socket."""
+        """Return the one peer, None, while a socket is open."""
         return () if self._datagrams is None else (None,)
 
     def write(self, key: Hashable, raw: bytes) -> bool:
@@ -281,7 +281,7 @@ class _Datagrams:
                 self._count_dropped()
 
     def _age_ns(self, ancillary: kernel_time.Ancillary, was_set: bool) -> int | None:
-        """Return how long a datagram has waited, ns; None without a valid stamp."""
+        """Return how long a datagram has waited, ns; None without a valid time stamp."""
         stamp_ns = kernel_time.stamp_ns(ancillary)
         if stamp_ns is None:
             self._status.arrival = "read"

@@ -157,7 +157,7 @@ def _serial(text: str, device: str, baud: int) -> LinkUrl:
 
 
 def _suggestion(text: str) -> str:
-    """Return a suggestion for the end of a message; empty without one."""
+    """Return a suggested link for the end of a message; empty if none is similar."""
     scheme, _, address = text.partition(":")
     if not text.isprintable():
         return ""
@@ -184,7 +184,7 @@ def _suggestion(text: str) -> str:
 
 
 def _form(scheme: str, schemes: Collection[Scheme]) -> str:
-    """Return what a link of a scheme looks like; of an unknown scheme, which ones there are."""
+    """Return the form of a scheme's links; for an unknown scheme, the list of schemes."""
     if scheme in schemes:
         return _FORMS.get(scheme, f"{scheme}:HOST:PORT")
     return f"a link; give one of {', '.join(f'{one}:' for one in schemes)}"

@@ -25,14 +25,14 @@ if TYPE_CHECKING:
 
 ERROR_MAX: Final = 150  # largest number of characters of an error of Zenoh
 PUBLISHERS_MAX: Final = 1024
-"""Most keys declared, so that their names are sent once; beyond it, all are declared again."""
+"""Most keys declared to Zenoh, which shortens their names; beyond it, all are declared again."""
 NO_ROUTER: Final = "Unable to connect"
 """Zenoh's message when a client reaches none of its endpoints."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BusStatus:
-    """Counters, which only increase.
+    """Counters of a Zenoh session, which only increase.
 
     sent     samples given to Zenoh. It does not report drops at a congested link: number the
              samples, so that the receiver sees the gaps
@@ -45,7 +45,7 @@ class BusStatus:
 
 
 def open_peer(config: BusConfig) -> "zenoh.Session":
-    """Open the session of a peer before there is a loop; blocks.
+    """Open a peer's Zenoh session before the event loop runs; blocks. ``UserError`` as ``open``.
 
     Raises ``UserError`` as ``open``.
     """
@@ -58,7 +58,7 @@ def open_peer(config: BusConfig) -> "zenoh.Session":
 
 
 class Bus:
-    """Zenoh session. All methods but ``open`` and ``close`` are called on the loop.
+    """Zenoh session. All methods but ``open`` and ``close`` are called on the event loop.
 
     ``session`` is one that is already open (``open_peer``); None: ``open`` opens one.
 
@@ -113,7 +113,7 @@ class Bus:
         await self._to_loop.run()
 
     def close(self) -> None:
-        """Close the session; blocks until the others are notified, then delivers nothing."""
+        """Close the session; blocks until the others are notified. Nothing is delivered afterwards."""
         self._to_loop.end()
         self._ended.set()
         if self._session is not None:
@@ -133,9 +133,9 @@ class Bus:
         """Publish a sample; False if Zenoh did not accept it.
 
         A congested link drops samples silently. ``express`` sends a sample at once, without
-        batching; for single samples only, since at most ``QUEUED`` of a burst fit the queue. Not
-        ``reliable``: over an endpoint with ``?rel=0`` if there is one, without waiting for lost
-        samples.
+        batching; for single samples only, since at most ``QUEUED`` of a burst fit the queue. A
+        sample that is not ``reliable`` goes over an endpoint with ``?rel=0`` if there is one,
+        without waiting for lost samples.
         """
         import zenoh
 
@@ -160,7 +160,7 @@ class Bus:
     def ask(
         self, key: str, payload: bytes, timeout_s: float, take: Callable[[bytes, int], None]
     ) -> None:
-        """Query ``key``; ``take`` is called with each answer that arrives in time.
+        """Query ``key``; ``take`` is called with each answer that arrives within the timeout.
 
         Its second argument is the monotonic time, ns, at which Zenoh's thread received the answer.
         """
@@ -243,7 +243,7 @@ class Bus:
         self._declared.append(self._opened().liveliness().declare_token(key))
 
     def watch(self, key_expr: str, take: Callable[[str, bool], None]) -> None:
-        """Call ``take`` with each live key, True, and with False when it is gone."""
+        """Call ``take`` with each live key and True; with the key and False once it is not."""
         import zenoh
 
         def seen(sample: "zenoh.Sample") -> None:
@@ -255,7 +255,7 @@ class Bus:
         self._declared.append(liveliness.declare_subscriber(key_expr, callback, history=True))
 
     def neighbours(self, take: Callable[[str, bool], None]) -> None:
-        """Call ``take`` with each directly connected session's id: True; False on disconnection.
+        """Call ``take`` with each directly connected session's id and True; False on disconnection.
 
         Sessions behind a router are excluded.
         """

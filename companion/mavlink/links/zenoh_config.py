@@ -8,7 +8,7 @@ from typing import Any, Final, Literal, get_args
 from companion.values import UserError
 
 QUEUED: Final = 16
-"""Batches of each priority that wait for the network, the most that Zenoh allows.
+"""Batches of each priority that may wait for the network; the most that Zenoh allows.
 
 With Zenoh's default of 2, and without waiting, only 2 of 5 express samples in a row arrive.
 """
@@ -67,7 +67,7 @@ class BusConfig:
 
 
 def sections(config: BusConfig) -> dict[str, str]:
-    """Return Zenoh's configuration as JSON5 by path.
+    """Return Zenoh's configuration as JSON5 by path; ``UserError`` if a file cannot be read.
 
     Raises ``UserError`` if a file cannot be read.
     """

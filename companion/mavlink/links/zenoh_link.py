@@ -29,7 +29,7 @@ OPEN_S: Final = 5.0  # how long to wait for a router before the link is reported
 
 
 class ZenohLink:
-    """Link over its own Zenoh session; all others under the same key are its one peer.
+    """Link over its own Zenoh session; all other sessions under the same key are its one peer.
 
     It ends when its last neighbour disconnects, and is then opened again.
     """
@@ -83,12 +83,13 @@ class ZenohLink:
         return self._bus is not None and self._bus.put(self._said_key, raw)
 
     def fullness(self, key: Hashable) -> float:
-        """Return 0: Zenoh does not report it."""
+        """Return 0: Zenoh does not report its buffers."""
         return 0.0
 
 
 def configuration(url: LinkUrl) -> BusConfig:
-    """Return the configuration: peer if it listens, else client (routers do not serve peers)."""
+    """Return the session's configuration: peer if it listens, else client (routers do not serve
+    peers)."""
     options = [option.partition("=") for option in url.path.split("&")]
     listen = tuple(value for name, _, value in options if name == "listen")
     connect = tuple(value for name, _, value in options if name == "connect")

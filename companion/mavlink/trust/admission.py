@@ -6,7 +6,7 @@ from functools import lru_cache
 from typing import Final
 
 KNOWN_MAX: Final = 8192
-"""Size of the cache of answers; bounded, since senders may invent any number of ids."""
+"""Size of the cache of decisions; bounded, since senders may invent any number of ids."""
 
 
 def admission(allow: Iterable[str], deny: Iterable[str]) -> Callable[[str], bool]:

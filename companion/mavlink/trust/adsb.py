@@ -25,22 +25,22 @@ from companion.values import AdsbVehicle, AltitudeDatum, Reason, Rejection, Repo
 
 _NS: Final = 1_000_000_000
 SLACK_NS: Final = _NS
-"""Time resolution of whole seconds: two closer times have no certain order."""
+"""Resolution of times in whole seconds: the order of two closer times is unknown."""
 ALTITUDE_KEPT_NS: Final = 10 * _NS
-"""Largest time between a position and the altitude joined to it."""
+"""Largest time between a position and the altitude that completes it."""
 VELOCITY_KEPT_NS: Final = SLACK_NS
-"""Largest time between a position and the velocity joined to it.
+"""Largest time between a position and the velocity that completes it.
 
 The error of an old velocity is unbounded: at a bank angle of 30 degrees it changes by 5.7 m/s every
-second. Within the slack it may be simultaneous with the position. Transponders send both twice a
-second (RTCA DO-260B), so older ones are seldom needed.
+second. Within ``SLACK_NS`` the two may be simultaneous. Transponders send both twice a second (RTCA
+DO-260B), so older ones are seldom needed.
 """
 REPEATED_NS: Final = 30 * _NS
 """How long the same position counts as a repeat; later, the aircraft may be hovering."""
 FORGOTTEN_S: Final = 120
-"""Seconds without news after which an aircraft is forgotten; older messages are discarded."""
+"""Seconds without a message after which an aircraft is forgotten; older messages are discarded."""
 AIRCRAFT_MAX: Final = 2000
-"""Most aircraft remembered; beyond it the one longest without news is forgotten."""
+"""Most aircraft remembered; beyond it the one silent for longest is forgotten."""
 POSITIONS_KEPT: Final = 32
 """Reported positions remembered per aircraft.
 
@@ -73,7 +73,7 @@ class _RelayedAircraft:
             self.relays.popitem(last=False)
 
     def learn(self, message: AdsbVehicle, true_ns: int) -> None:
-        """Store every field that is present and newer than the known one."""
+        """Store every field of a message that is present and newer than the stored one."""
         if message.alt_datum is not None:
             altitude = _newest(self.altitudes.get(message.alt_datum), true_ns, message.alt_m)
             if altitude is not None:
@@ -84,7 +84,7 @@ class _RelayedAircraft:
         self.callsign = _newest(self.callsign, true_ns, message.callsign)
 
     def repeated(self, message: AdsbVehicle) -> AdsbVehicle | None:
-        """Return the reported message that this one repeats; None if it has new content."""
+        """Return the reported message that a message repeats; None if it has new content."""
         assert message.position_deg is not None
         before = self.reported.get(message.position_deg)
         if before is None or _differs(before, message):
@@ -107,7 +107,7 @@ class _RelayedAircraft:
         return None
 
     def report(self, message: AdsbVehicle, at_deg: tuple[float, float]) -> Report | None:
-        """Return the report of a new position; None if no altitude is known for it."""
+        """Return the report of a new position; None if no altitude is known for that position."""
         altitude = self.altitude(message)
         if altitude is None:
             return None
@@ -138,7 +138,7 @@ class _RelayedAircraft:
 
 
 class Aircraft:
-    """All relayed aircraft. ``merge`` takes the messages about them in order of arrival.
+    """State of all relayed aircraft. ``merge`` takes their messages in order of arrival.
 
     At most ``AIRCRAFT_MAX`` are remembered, and none longer than ``FORGOTTEN_S`` without news.
     Their names are those of ``AdsbVehicle.uav``.
@@ -224,14 +224,14 @@ def _true_ns(message: AdsbVehicle) -> int:
 
 
 def _newest(before: _Dated[_T] | None, true_ns: int, value: _T | None) -> _Dated[_T] | None:
-    """Return the newer of a received value, with its time, and the known one."""
+    """Return the newer of two values with their times: the received one or the stored one."""
     if value is None or (before is not None and true_ns < before[0]):
         return before
     return true_ns, value
 
 
 def _fitting(own: _T | None, known: _Dated[_T] | None, true_ns: int) -> _T | None:
-    """Return the message's own value, or the known one if it is of nearly the same time."""
+    """Return the message's own value, or the stored value if it is of nearly the same time."""
     if own is not None or known is None or abs(true_ns - known[0]) > VELOCITY_KEPT_NS:
         return own
     return known[1]

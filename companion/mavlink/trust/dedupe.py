@@ -19,7 +19,7 @@ LATENCIES_KEPT: Final = 256  # newest latencies kept per link
 
 @dataclass(slots=True)
 class LinkShare:
-    """Contribution of one link.
+    """Contribution of one link to the reports.
 
     latencies_s  latencies of the newest reports over this link, repeats included
     """
@@ -31,7 +31,7 @@ class LinkShare:
 
 @dataclass(slots=True)
 class _First:
-    """First arrival of a report; its latency is None until it is known."""
+    """First arrival of a report; its latency is None until known."""
 
     t_ns: int
     link: str
@@ -39,14 +39,14 @@ class _First:
 
 
 class Dedupe:
-    """Memory of the reports of the last ``WINDOW_NS`` by content, with counts by link."""
+    """Contents of the reports of the last ``WINDOW_NS``, with counts by link."""
 
     def __init__(self) -> None:
         self.shares: dict[str, LinkShare] = {}
         self._seen: OrderedDict[bytes, _First] = OrderedDict()  # in order of arrival
 
     def is_repeat(self, frame: Frame) -> bool:
-        """Count a frame; return True if the same content arrived before, within the window."""
+        """Count a frame; return True if the same content arrived before it, within the window."""
         while self._seen and next(iter(self._seen.values())).t_ns < frame.t_ns - WINDOW_NS:
             self._seen.popitem(last=False)
         share = self._share(frame.link)
@@ -79,7 +79,8 @@ class Dedupe:
 def content(raw: bytes) -> bytes:
     """Return sender, message id and payload of a frame, without trailing zeros of the payload.
 
-    MAVLink 2 truncates those; MAVLink 1 has one byte for the message id. Both give the same result.
+    MAVLink 2 truncates those; MAVLink 1 has one byte for the message id. Both versions give the
+    same result.
     """
     if raw[0] == 0xFD:  # the fields are contiguous
         return raw[5 : 10 + raw[1]].rstrip(b"\0")

@@ -29,14 +29,14 @@ from companion.values import Frame, Vector
 
 CONTRADICTIONS: Final = 5
 SPACED_NS: Final = 500_000_000
-"""Time within which contradictions count as one: a position reset causes a few."""
+"""Time within which contradictions count once: a position reset causes several."""
 KEPT_NS: Final = 30_000_000_000  # how long a peer and a contradiction are remembered
 SLACK_M: Final = 3.0
 STALE_S: Final = 0.1
 SLACK_MPS: Final = 1.0
 ACCELERATION_MPS2: Final = 20.0
 STRETCH_MS: Final = 2000
-"""Longest time between two reports of a peer with which another one is compared."""
+"""Longest time between two reports of a peer that a third report is compared with."""
 RESTARTED_MS: Final = 10_000  # a stamp that steps back further is from another boot
 
 SENDERS_MAX: Final = 4096  # senders followed; new ones beyond it are not followed
@@ -48,7 +48,7 @@ _METRES: Final = 111_195.0 * 1e-7  # metres in 1e-7 degrees of latitude
 
 @dataclass(slots=True)
 class _Path:
-    """Reports of a sender over one peer; ``is_router``: the settings trust the peer."""
+    """Path of a sender over one peer; ``is_router``: the settings trust the peer."""
 
     is_router: bool
     heard_ns: int
@@ -68,8 +68,8 @@ class _SenderPaths:
 class DuplicateIds:
     """Detector of two senders under one id, by the peers that deliver their frames.
 
-    ``routers`` names trusted peers: a link as in the settings, HOST or HOST:PORT.
-    ``found`` holds the ids found since it was last emptied, with their peers.
+    ``routers`` names trusted peers: a link as in the settings, HOST or HOST:PORT. ``found`` holds
+    the duplicate ids since it was last emptied, with their peers.
     """
 
     def __init__(self, routers: Collection[str] = ()) -> None:
@@ -124,8 +124,8 @@ class DuplicateIds:
     def _contradicts(self, sender: _SenderPaths, path: _Path, said: OwnPosition) -> bool:
         """Add a report to its path. Return whether it proves two senders.
 
-        It is compared with the stretches of other peers, and their reports with the stretch that it
-        ends.
+        The report is compared with the stretches of other peers, and their reports with the stretch
+        that it ends.
         """
         before = path.reports[-1] if path.reports else None
         if before is not None and said.boot_ms <= before.boot_ms:
@@ -148,7 +148,7 @@ class DuplicateIds:
         return False
 
     def _is_duplicate(self, frame: Frame, sender: _SenderPaths) -> bool:
-        """Return whether the peers of a sender contradict each other; add it to ``found`` once."""
+        """Return whether the peers of a sender contradict each other; add it to ``found`` if so."""
         when = sender.contradicted_ns
         while when and frame.t_ns - when[0] > KEPT_NS:
             when.popleft()
@@ -161,7 +161,7 @@ class DuplicateIds:
 
 
 def _around(reports: deque[OwnPosition], boot_ms: int) -> Iterator[tuple[OwnPosition, OwnPosition]]:
-    """Yield the stretches of a path that contain a stamp, newest first: one, or two that meet."""
+    """Yield the stretches of a path that contain a stamp (one, or two that meet), newest first."""
     for last, first in pairwise(reversed(reports)):
         if boot_ms > last.boot_ms:
             return

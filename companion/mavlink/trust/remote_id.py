@@ -14,7 +14,7 @@ from companion.values import AltitudeDatum, Reason, Rejection, RemoteId, Report,
 
 NAMED_NS: Final = 60_000_000_000  # how long an id holds after the last message of its address
 ADDRESSES_MAX: Final = 4096
-"""Most addresses remembered; beyond it the one silent for longest is forgotten."""
+"""Most radio addresses remembered; beyond it the one silent for longest is forgotten."""
 DATUM_NS: Final = 10_000_000_000  # how long an aircraft keeps the datum of its heights
 
 
@@ -29,13 +29,13 @@ class _AddressRecord:
 
 
 class RemoteIds:
-    """State of each address, per receiver. ``merge`` takes messages in order of arrival."""
+    """State of each radio address, per receiver. ``merge`` takes messages in order of arrival."""
 
     def __init__(self) -> None:
         self._known: OrderedDict[tuple[Source, str], _AddressRecord] = OrderedDict()
 
     def merge(self, message: RemoteId) -> Report | Rejection | None:
-        """Return the report that a message completes, under its aircraft's id; None if it has none.
+        """Return the report that a message completes, under its aircraft's id; None if incomplete.
 
         Rejections and their reasons:
 

@@ -1,4 +1,4 @@
-"""MAVLink 2 message signing: the frames that a link with a key accepts, and the signing of its own.
+"""MAVLink 2 message signing of a link with a key: received frames, and those that it sends.
 
 The 13 bytes that follow the checksum of a signed frame
 (https://mavlink.io/en/guide/message_signing.html):
@@ -55,23 +55,24 @@ MINUTE: Final = 60 * SECOND
 STREAMS_MAX: Final = 4096  # streams remembered per link
 LATEST: Final = (1 << 48) - 1  # largest timestamp of 48 bits
 FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
-"""Largest timestamp that the local timestamp follows: ten years before ``LATEST``."""
+"""Largest received timestamp that the local one follows: ten years before ``LATEST``."""
 MARGIN: Final = 5 * SECOND
-"""Largest lag of the state on disk in a killed process: see ``State.after_crash``."""
+"""Largest lag of a killed process's state on disk: see ``State.after_crash``."""
 BURST: Final = SECOND
-"""Upper limit on the frames sent in ``MARGIN``; each takes one unit if the clock is behind."""
+"""Upper limit on the frames sent in ``MARGIN``; each uses one unit of time if the clock is behind.
+"""
 
 Stream = tuple[int, int, int]  # system id and component id of the sender, and its link id
 ReceivedTimestamp = tuple[int, int | None]
-"""Newest timestamp of a stream, and its lead over the own clock when it was accepted.
+"""Newest timestamp of a stream, and how far it was ahead of the own clock when accepted.
 
-The lead is None for a stream of this node.
+The difference is None for a stream of this node.
 """
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class State:
-    """Persistent state of a guard; times in units of 10 µs since 2015."""
+    """Persistent signing state of a link; times in units of 10 µs since 2015."""
 
     clock: int = 0  # the own clock when this was saved
     local: int = 0  # the local timestamp
@@ -201,14 +202,14 @@ class LinkSigning:
         )
 
     def ahead_ns(self, now_ns: int) -> int:
-        """Return the lead of the local timestamp over the own clock, ns, at least 0.
+        """Return how far the local timestamp is ahead of the own clock, ns, at least 0.
 
         Minutes or more mean that a sender's clock is or was wrong, or the own clock.
         """
         return max(0, self._local * UNIT_NS + EPOCH_NS - now_ns)
 
     def _too_old(self, clock: int) -> int:
-        """Return the newest timestamp that is too old for a new stream."""
+        """Return the newest timestamp that a new stream must exceed."""
         return max(self._floor, max(self._local, clock) - MINUTE - 1)
 
     def _remember(self, stream: Stream, heard: ReceivedTimestamp) -> None:

@@ -60,16 +60,16 @@ from companion.values import (
 _NS: Final = 1_000_000_000
 COMMAND_ACK: Final = 77
 ACCEPTED_IDS: Final = POSE | {HEARTBEAT, REQUEST_DATA_STREAM, COMMAND_LONG, COMMAND_ACK, TIMESYNC}
-"""Ids of the messages that ``ServiceComponent.hear`` requires."""
+"""Ids of the messages that ``ServiceComponent.hear`` processes."""
 
 HEARTBEAT_NS: Final = _NS  # time between two heartbeats
 TIMESYNC_NS: Final = (1 * _NS, 5 * _NS)
-"""Time between TIMESYNC requests: for the first ``TIMESYNC_FIRST``, and later."""
+"""Time between TIMESYNC requests: of the first ``TIMESYNC_FIRST``, and of later ones."""
 TIMESYNC_FIRST: Final = 10  # requests sent at the shorter interval
 LONGEST_TRIP_NS: Final = 10 * _NS  # longest round trip that is used
 KEPT_NS: Final = 30 * _NS  # how long sent messages and senders' newest stamps are remembered
 HELD_NS: Final = 2 * _NS
-"""How long an answer waits for a contradicting one: the delay of a slow radio."""
+"""How long an answer is held until a contradicting one could have arrived over a slow radio."""
 CLOCKS_APART_NS: Final = 60 * _NS
 """Largest difference between an answer and the sender's boot clock.
 
@@ -210,7 +210,7 @@ class ServiceComponent:
         self._doubted = told
 
     def _own_id_received(self, frame: Frame, outputs: list[RoundTrip | Rejection | Notice]) -> None:
-        """Handle a frame under this service's id: an echo of its own, or another sender's."""
+        """Handle a frame under this service's id: its own echo, or another sender's frame."""
         sent_ns = self._sent.get(_content(frame.msgid, frame.payload))
         if sent_ns is not None and frame.t_ns - sent_ns <= KEPT_NS:
             return
@@ -259,7 +259,7 @@ class ServiceComponent:
     def _discard_contradicting(
         self, first: RoundTrip, second: RoundTrip, outputs: list[RoundTrip | Rejection | Notice]
     ) -> None:
-        """Discard two answers that cannot be of one clock; the first only if it is still held."""
+        """Discard two answers that cannot come from one clock; the first only if it is still held."""
         discarded = [first, second] if first in self._held else [second]
         self._held = [trip for trip in self._held if trip is not first]
         detail = "TIMESYNC: two answers contradict each other"
@@ -310,7 +310,7 @@ def _refused(t_ns: int, source: Source, why: Reason, detail: str) -> Rejection:
 
 
 def _agree(one: RoundTrip, other: RoundTrip) -> bool:
-    """Return whether two answers to one request can be of one clock, whatever their delays.
+    """Return whether two answers to one request can come from one clock, whatever their delays.
 
     A request that takes several routes is answered several times. Each answer bounds the offset;
     for one clock the intervals overlap, to a millisecond of rounding.
@@ -321,12 +321,12 @@ def _agree(one: RoundTrip, other: RoundTrip) -> bool:
 
 
 def _content(msgid: int, payload: bytes) -> tuple[int, bytes]:
-    """Return the part of a message that a router leaves unchanged in either MAVLink version."""
+    """Return the part of a message that routers leave unchanged in both MAVLink versions."""
     return msgid, payload.rstrip(b"\0")
 
 
 def _is_boot_time(remote_ns: int, t_ns: int, stamp_t_ns: int, boot_ms: int) -> bool:
-    """Return whether ``remote_ns`` is the clock of the stamp ``boot_ms`` at ``stamp_t_ns``.
+    """Return whether ``remote_ns`` can be the clock of stamp ``boot_ms`` at ``stamp_t_ns``.
 
     The stamp wraps after 49.7 days; ``remote_ns`` does not.
     """

@@ -1,4 +1,4 @@
-"""Requests to the autopilots for message rates, for all UAVs together.
+"""Requests to all autopilots for message rates; ``rate_watch`` handles one message of one UAV.
 
 ``rate_watch`` decides about one message of one UAV.
 """
@@ -27,7 +27,7 @@ class _Uav:
 
 
 class MessageRates:
-    """Monitored messages of all UAVs.
+    """Monitored messages of all UAVs, with the requests for their rates.
 
     ``source`` requests ``position_hz`` of every UAV and ``attitude_hz`` of the carrier; None: any
     rate is accepted. ``notices`` collects messages to the operator; the reader empties it.
@@ -52,7 +52,7 @@ class MessageRates:
         self._sent: deque[int] = deque(maxlen=REQUESTS_PER_S)
 
     def message_received(self, t_ns: int, source: Source) -> None:
-        """Record that any message of this sender arrived."""
+        """Record that a message of this sender arrived, of any kind."""
         uav = self._uavs.get(source)
         if uav is not None:
             uav.heard_ns = t_ns
@@ -68,7 +68,7 @@ class MessageRates:
             watch.observed.add(t_ns, boot_ms)
 
     def requested(self, request: Request) -> None:
-        """Record a rate request of another component."""
+        """Record that another component requested a message rate."""
         self._others.append(request)
 
     def acknowledged(self, t_ns: int, source: Source, result: int) -> None:

@@ -41,14 +41,14 @@ from companion.values.described import DescribedEnum, Meaning
 _NS: Final = 1_000_000_000
 SLOW_BELOW: Final = 0.8  # fraction of the wanted rate below which a rate is slow
 SETTLE_NS: Final = 5 * _NS
-"""Least time a rate must be slow, or sufficient, to count as such; it also takes five messages."""
+"""Least time for which a rate must be slow, or sufficient, to count; five messages too."""
 TRIES: Final = 3  # SET_MESSAGE_INTERVAL requests in one round before REQUEST_DATA_STREAM is tried
 BACKOFF_NS: Final = (5 * _NS, 300 * _NS)
-"""Shortest and longest time between two requests for one message of one UAV."""
+"""Shortest and longest time between two rate requests for one message of one UAV."""
 IN_ORDER_NS: Final = 600 * _NS
-"""Time of a sufficient rate after which the back-off is reset and notices may be repeated."""
+"""Time of a sufficient rate after which the back-off is reset and notices may repeat."""
 ATTRIBUTION_NS: Final = 30 * _NS
-"""Longest time between another component's request and a rate change attributed to it."""
+"""Longest time between another component's request and a rate change it may explain."""
 _ACK_WAIT_NS: Final = 5 * _NS
 """How long the answer to a command blocks the next command to that UAV."""
 _PROGRESS_NS: Final = 60 * _NS
@@ -61,7 +61,7 @@ _WRAP_MS: Final = 1 << 32
 
 _NAMES: Final = {GLOBAL_POSITION_INT: "GLOBAL_POSITION_INT", ATTITUDE: "ATTITUDE"}
 STREAM: Final = {GLOBAL_POSITION_INT: 6, ATTITUDE: 10}
-"""Data stream that carries a message: MAV_DATA_STREAM_POSITION, MAV_DATA_STREAM_EXTRA1."""
+"""Data stream of each message: MAV_DATA_STREAM_POSITION, MAV_DATA_STREAM_EXTRA1."""
 _ACCEPTED, _TEMPORARILY_REJECTED, _IN_PROGRESS = 0, 1, 5  # MAV_RESULT; all others are refusals
 RESTART: Final = "a restart"
 NO_REQUEST_SEEN: Final = "no request of another component was received"
@@ -102,7 +102,7 @@ class Request(NamedTuple):
     hz: float | None
 
     def explains(self, uav: Source, msgid: int, wanted_hz: float) -> bool:
-        """Return whether this request may have made a message slower than wanted."""
+        """Return whether this request may have made a message slower than wanted by the service."""
         addressed = all(mine in (0, its) for mine, its in zip(self.target, uav, strict=True))
         return addressed and msgid in self.msgids and (self.hz is None or self.hz < wanted_hz)
 
@@ -119,7 +119,7 @@ class ObservedRate:
         self.stamps_ms: list[int] = []  # the newest, sorted and unwrapped
 
     def add(self, t_ns: int, boot_ms: int) -> None:
-        """Add one message. A late stamp is sorted in; a repeated one is ignored."""
+        """Add one message. A late stamp is sorted in; a repeated stamp is ignored."""
         newest_ms = boot_ms if self._newest_ms is None else self._newest_ms
         step_ms = (boot_ms - newest_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
         if step_ms <= -_LATE_MS:
@@ -169,7 +169,7 @@ class Watch:
         return _NS / max(median_ns, heard_ns - self.observed.last_ns)
 
     def view(self, heard_ns: int) -> MessageRate:
-        """Return the state at the UAV's last message."""
+        """Return the state of the watch at the UAV's last message."""
         observed_hz = self.observed_hz(heard_ns)
         return MessageRate(
             uav=self.uav,
@@ -182,7 +182,7 @@ class Watch:
         )
 
     def review(self, now_ns: int, heard_ns: int, others: Iterable[Request]) -> list[Notice]:
-        """Check the rate. Return the resulting notices."""
+        """Check the rate of the message. Return the resulting notices."""
         observed_hz = self.observed_hz(heard_ns)
         silence_ns = heard_ns - self.observed.last_ns
         slow_hz = self.wanted_hz * SLOW_BELOW
@@ -199,7 +199,8 @@ class Watch:
         return []
 
     def ready(self, now_ns: int) -> bool:
-        """Return whether a request is due: the rate settled as slow, and the back-off is over."""
+        """Return whether a request is due: the rate has been slow for long, and the back-off is
+        over."""
         since_ns = self._slow_since_ns
         slow = since_ns is not None and self._is_settled(since_ns, now_ns)
         return slow and now_ns >= self.next_ns
@@ -213,7 +214,7 @@ class Watch:
         return unanswered and now_ns < self.asked_ns + _ACK_WAIT_NS
 
     def ask(self, now_ns: int, source: Source) -> Outgoing:
-        """Build the request that is due and record that it was sent."""
+        """Build the rate request that is due, and record that it was sent."""
         if self.state is not RateState.ASKED:  # a new round
             self._backoff_ns = min(max(2 * self._backoff_ns, BACKOFF_NS[0]), BACKOFF_NS[1])
             self._tries = 0
@@ -269,7 +270,7 @@ class Watch:
     def _handle_slow(
         self, now_ns: int, since_ns: int, observed_hz: float | None, others: Iterable[Request]
     ) -> list[Notice]:
-        """Handle a rate that settled as slow: it was changed, or the last request did not help."""
+        """Handle a rate that has been slow for long: it changed, or the last request did not help."""
         comes = "is not sent" if observed_hz is None else f"is sent at {observed_hz:.2g} Hz"
         text = f"{self.uav}: {_NAMES[self.msgid]} {comes}, not at {self.wanted_hz:g} Hz: "
         if self._was_in_order:
@@ -285,7 +286,7 @@ class Watch:
         return []
 
     def _cause_of_change(self, since_ns: int, others: Iterable[Request]) -> str:
-        """Return the latest known cause between our own newest request and the change."""
+        """Return the latest known cause of a rate change since the service's newest request."""
         after_ns = max(since_ns - ATTRIBUTION_NS, self.asked_ns)
         causes = [
             (request.t_ns, str(request.by))

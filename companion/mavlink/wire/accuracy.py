@@ -12,7 +12,7 @@ from typing import Final
 from companion.values import Accuracy
 
 OF_95: Final = math.sqrt(math.log(1 - 0.68) / math.log(1 - 0.95))
-"""Radius that holds 68 % of errors over that which holds 95 %, in a plane (Rayleigh): 0.617.
+"""Ratio of the radius of 68 % of errors to the radius of 95 %, in a plane (Rayleigh): 0.617.
 
 Along a line it is 0.507; the larger ratio is used for heights too.
 """
@@ -29,7 +29,7 @@ _VERTICAL_M: Final = (*_GVA_M, 25.0, 10.0, 3.0, 1.0)
 
 
 def adsb(nac_p: int, nac_v: int, gva: int) -> Accuracy | None:
-    """Convert NACp, NACv and GVA; None if all are unknown."""
+    """Convert NACp, NACv and GVA to accuracies; None if all are unknown."""
     known = Accuracy(
         horizontal_m=_of(_NACP_M, nac_p),
         vertical_m=_of(_GVA_M, gva),
@@ -39,7 +39,7 @@ def adsb(nac_p: int, nac_v: int, gva: int) -> Accuracy | None:
 
 
 def remote_id(horizontal: int, vertical: int, speed: int) -> Accuracy:
-    """Convert the codes of a Remote ID location."""
+    """Convert the accuracy codes of a Remote ID location."""
     return Accuracy(
         horizontal_m=_of(_HORIZONTAL_M, horizontal),
         vertical_m=_of(_VERTICAL_M, vertical),

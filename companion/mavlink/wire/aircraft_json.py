@@ -30,7 +30,7 @@ class AircraftJson(ForeignSplitter):
         self._true_at: OrderedDict[int, float] = OrderedDict()  # by ICAO address
 
     def feed(self, t_ns: int, data: bytes) -> Items:
-        """Parse a document received at ``t_ns``; return what is new in it."""
+        """Parse a document received at ``t_ns``; return the frames of what changed in it."""
         try:
             if len(data) > DOCUMENT_MAX:
                 raise ValueError(f"{len(data)} bytes")
@@ -65,7 +65,7 @@ class AircraftJson(ForeignSplitter):
         return self._aircraft(t_ns, message)
 
     def _is_news(self, message: AircraftState, true_at: float) -> bool:
-        """Return whether a position is newer than the last one read.
+        """Return whether a position is newer than the last one read, by ages in tenths of seconds.
 
         Ages are in tenths of seconds.
         """
@@ -124,7 +124,7 @@ def _aircraft_state(entry: object) -> AircraftState | str | None:
 
 
 def _number(entry: Any, key: str, least: float, most: float) -> float | None:
-    """Return a number; None if the key is absent. Raises ``ValueError`` beyond the limits."""
+    """Return the number under a key; None if absent. Raises ``ValueError`` beyond the limits."""
     value = entry.get(key)
     if value is None:
         return None

@@ -78,9 +78,9 @@ class BeastSplitter(ForeignSplitter):
 
 
 def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:
-    """Unescape ``size`` bytes from an index; return them and the index after them.
+    """Unescape ``size`` message bytes from an index; return them and the index after them.
 
-    None if another message begins there, or if the data end (the index is then their end).
+    The bytes are None if another message begins within them, or if the data end there.
     """
     body = bytearray()
     while len(body) < size:
@@ -96,7 +96,7 @@ def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:
 
 
 class _Lateness:
-    """Delay of messages beyond the least delayed one, by the receiver's counter.
+    """Delay of messages beyond the least delayed message, by the receiver's counter.
 
     A counter jump larger than the greatest delay of a message is a restart.
     """

@@ -17,13 +17,13 @@ from xml.parsers import expat
 DEPTH_MAX: Final = 32  # deepest nesting of elements
 UNKNOWN: Final = 9_999_999.0
 OWN: Final = "uav-companion-beams."
-"""Prefix of the ids of events that this program sends about others."""
+"""Prefix of the ids of events that this program writes about other aircraft."""
 _TIME_MAX_MS: Final = 1 << 48
 _AIR: Final = re.compile(r"a-[a-zA-Z.]-A(-.*)?")
 
 
 class CotEvent(NamedTuple):
-    """Event: id, type, how it was determined, time (Unix, ms), position and motion.
+    """Cursor on Target event: id, type, how it was determined, time (Unix, ms), position, motion.
 
     ``ce_m`` and ``le_m`` are standard deviations; None: unknown.
     """
@@ -43,12 +43,12 @@ class CotEvent(NamedTuple):
 
     @property
     def is_aircraft(self) -> bool:
-        """Whether it is the position of something airborne (type a-?-A)."""
+        """Whether the event is the position of an airborne object (type a-?-A)."""
         return _AIR.fullmatch(self.kind) is not None
 
 
 def from_xml(text: bytes) -> CotEvent:
-    """Parse one event. Raises ``ValueError``."""
+    """Parse one event from XML. Raises ``ValueError``."""
     found: dict[str, dict[str, str]] = {}
     depth = 0
 
@@ -122,7 +122,7 @@ def _checked(
 
 
 def from_protobuf(message: bytes) -> CotEvent | None:
-    """Parse a TakMessage; None for one without an event. Raises ``ValueError``."""
+    """Parse a TakMessage; None if it contains no event. Raises ``ValueError``."""
     body = dict(_fields(message)).get(2)
     if body is None:
         return None
@@ -144,7 +144,8 @@ def from_protobuf(message: bytes) -> CotEvent | None:
 
 
 def _fields(message: bytes) -> Iterator[tuple[int, int | float | bytes]]:
-    """Yield fields by number, in order (https://protobuf.dev/programming-guides/encoding/)."""
+    """Yield number and value of each protobuf field
+    (https://protobuf.dev/programming-guides/encoding/)."""
     at = 0
     while at < len(message):
         tag, at = varint(message, at)

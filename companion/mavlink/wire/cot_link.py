@@ -90,7 +90,7 @@ class CotSplitter(ForeignSplitter):
 
 
 def _rejection_reason(event: CotEvent) -> str:
-    """Return why an event must be rejected; empty to use it."""
+    """Return why an event must be rejected; empty if it is usable."""
     if not event.is_aircraft:
         return "not an aircraft"
     if event.how.startswith("h"):
@@ -137,7 +137,7 @@ def _tak(raw: bytes) -> CotEvent | None:
 
 
 def _name(uid: str) -> str:
-    """Return an event's uid, or a shortened one with a hash if it has other characters."""
+    """Return an event's uid; a shortened one with a hash if it has unsuitable characters."""
     if _PLAIN.fullmatch(uid):
         return uid
     short = re.sub(r"[^A-Za-z0-9._-]", "_", uid)[:40]
@@ -159,7 +159,7 @@ def _outgoing(event: CotEvent) -> Outgoing:
 
 
 def report(frame: Frame) -> Report | None:
-    """Return the report in a TUNNEL of ``SENDER``; None for any other. Raises ``ValueError``."""
+    """Return the report in a TUNNEL of ``SENDER``; None for other frames. Raises ``ValueError``."""
     if frame.source != SENDER:
         return None
     payload = frame.payload.ljust(_HEAD.size + 128, b"\0")

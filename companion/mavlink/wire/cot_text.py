@@ -46,7 +46,7 @@ def event(uav: str, at_ns: int, stale_ns: int, place: CotPosition, remarks: str)
 
 
 def uid(uav: str) -> str:
-    """Return the event id of a UAV; companion services recognise and ignore such events."""
+    """Return a UAV's event id, which companion services recognise and ignore."""
     return OWN + uav.replace(":", ".")
 
 

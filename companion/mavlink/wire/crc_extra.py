@@ -59,7 +59,7 @@ LONGEST: bytes = bytes.fromhex(
     "361a2125ffffffff2a0effffffffffffffffffffffff080303060702202a032f"
     "2d4908ffffff2a2841b6282affffffffff203c3d06022613fe241e12123609ff"
 )
-"""Bytes of the longest payload, extensions included, of each message that MAVLink 1 can carry.
+"""Longest payload in bytes, extensions included, of each message that MAVLink 1 can carry.
 
 255 for an id without a message.
 """

@@ -1,4 +1,4 @@
-"""Decoders: one function per message, from a frame to a value, each field with its own validity.
+"""Decoders of MAVLink messages: one function per message, from a frame to a value.
 
 Sources: the message definitions of https://mavlink.io/en/messages/common.html. MAVLink 2 truncates
 trailing zero bytes of a payload, and a version 1 frame has no extension fields: both are read as
@@ -52,7 +52,7 @@ _ICAO_MAX: Final = 0xFF_FFFF
 
 
 class _RefusedError(Exception):
-    """Internal error: the message must be rejected, for this reason."""
+    """Internal error: the message must be rejected, for the reason that it contains."""
 
     def __init__(self, reason: Reason, detail: str = "") -> None:
         super().__init__(reason)
@@ -83,7 +83,7 @@ def decode(frame: Frame) -> Message | Rejection | None:
 def _position(lat_1e7: int, lon_1e7: int) -> tuple[float, float]:
     """Return latitude and longitude in degrees.
 
-    Rejects coordinates out of range, and those that are sent before there is a fix.
+    Rejects coordinates out of range, and coordinates sent before a fix.
     """
     lat_deg, lon_deg = lat_1e7 * 1e-7, lon_1e7 * 1e-7
     if abs(lat_deg) > 90.0 or abs(lon_deg) > 180.0:
@@ -204,12 +204,12 @@ _GPS_RAW_INT = struct.Struct("<QiiiHHHHBBiIIIIH")
 
 
 def _accuracy(thousandths: int) -> float | None:
-    """Return an accuracy in m or m/s; None if it was not sent, or is all ones."""
+    """Return an accuracy in m or m/s; None if not sent, or if all bits are ones."""
     return None if thousandths in (0, _UNKNOWN) else thousandths * 1e-3
 
 
 def _gps_raw_int(frame: Frame) -> GnssStatus:
-    """Decode fix type and accuracies; the accuracies are extension fields, 0 if not sent."""
+    """Decode fix type and accuracies; the latter are extension fields, 0 if not sent."""
     fields = unpack(frame, _GPS_RAW_INT)
     h_acc, v_acc, vel_acc = fields[11:14]
     return GnssStatus(
@@ -228,7 +228,7 @@ _SYSTEM_TIME = struct.Struct("<QI")
 
 
 def _system_time(frame: Frame) -> SystemTime:
-    """Decode Unix time and boot time; Unix time 0 means that the sender has none.
+    """Decode Unix time and boot time, unchecked; Unix time 0 means that the sender has none.
 
     Neither is checked.
     """

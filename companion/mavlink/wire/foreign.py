@@ -9,7 +9,7 @@ from companion.values import Frame, Reason, Rejection
 
 Items = list[Frame | Rejection]
 MLAT: Final = "MLAT position: its accuracy is not stated"
-"""Why a position that several receivers computed from arrival times is not used."""
+"""Reason for not using a position that receivers computed from arrival times."""
 
 
 class ForeignSplitter:
@@ -22,7 +22,7 @@ class ForeignSplitter:
         self._seq = 0
 
     def finish(self, t_ns: int) -> Items:
-        """End the stream: an unfinished message is garbage."""
+        """End the stream: an unfinished message counts as garbage."""
         stray, self._pending, self._overlong = len(self._pending), b"", False
         return self._garbage(t_ns, stray)
 
@@ -38,7 +38,7 @@ class ForeignSplitter:
         return kept, garbage
 
     def _drop_overlong(self, most: int) -> int:
-        """Drop an unfinished line of more than ``most`` bytes. Return its length so far."""
+        """Drop an unfinished line of more than ``most`` bytes. Return the bytes dropped so far."""
         if len(self._pending) <= most:
             return 0
         stray, self._pending, self._overlong = len(self._pending), b"", True
@@ -58,7 +58,7 @@ class ForeignSplitter:
         return Frame(t_ns=t_ns, link=self.link, source=message.source, msgid=message.msgid, raw=raw)
 
     def _aircraft(self, t_ns: int, state: AircraftState) -> Items:
-        """Return the ADSB_VEHICLE of an aircraft's state; empty if nothing is known."""
+        """Return the ADSB_VEHICLE of an aircraft's state; no frame if nothing is known."""
         payload = state.payload()
         return (
             [] if payload is None else [self._frame(t_ns, Outgoing(SENDER, ADSB_VEHICLE, payload))]

@@ -42,7 +42,7 @@ _find_start = re.compile(rb"\xfd(?:.[\x00\x01]|.?\Z)|\xfe", re.DOTALL).search
 
 
 def examine(buffer: bytes, at: int, end: int) -> int:
-    """Return the length in bytes of the valid frame at ``at``, or a verdict of at most 0.
+    """Return the length in bytes of the valid frame at index ``at``, or a verdict of at most 0.
 
     INCOMPLETE       the bytes so far fit a frame that continues past ``end``
     NOT_A_FRAME      no magic byte, or undefined incompatibility flags
@@ -79,7 +79,7 @@ def examine(buffer: bytes, at: int, end: int) -> int:
 
 
 def claimed_length(buffer: bytes, at: int, end: int) -> int:
-    """Return the length in bytes that the frame at ``at`` claims; 1 if it is unknown."""
+    """Return the length in bytes that the frame at index ``at`` claims; 1 if unknown."""
     if end - at < 3 or buffer[at] not in (MAGIC_V1, MAGIC_V2):
         return 1
     if buffer[at] == MAGIC_V1:
@@ -88,12 +88,12 @@ def claimed_length(buffer: bytes, at: int, end: int) -> int:
 
 
 def is_shaped(raw: bytes) -> bool:
-    """Return whether bytes have the start and length of one frame; the content is not checked."""
+    """Return whether bytes have the start and length of one frame; contents are not checked."""
     return len(raw) >= SHORTEST and claimed_length(raw, 0, len(raw)) == len(raw)
 
 
 def next_magic(buffer: bytes, at: int, end: int) -> int:
-    """Return the index of the next magic byte at or after ``at``; ``end`` without one."""
+    """Return the index of the next magic byte from index ``at`` on; ``end`` without one."""
     found = _find_magic(buffer, at, end)
     return found.start() if found else end
 
@@ -130,7 +130,7 @@ class Checker:
         self._sources: dict[tuple[int, int], Source] = {}
 
     def at(self, buffer: bytes, at: int, end: int) -> Checked | int:
-        """Return the frame at ``at``, or the verdict of ``examine``, at most 0."""
+        """Return the frame at an index, or the verdict of ``examine``, at most 0."""
         if end - at >= 12 and buffer[at] == MAGIC_V2 and not buffer[at + 2]:
             known = self._known.get(buffer[at + 5 : at + 10])
             stop = at + 12 + buffer[at + 1]
@@ -175,7 +175,7 @@ class Splitter:
         self._checker = Checker()
 
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
-        """Parse bytes that arrived at ``t_ns``; return the frames that end in them.
+        """Parse bytes that arrived at ``t_ns``; return the frames that these bytes complete.
 
         Other bytes are returned as rejections, one per reason.
         """
@@ -194,7 +194,7 @@ class Splitter:
         return self._split(t_ns, self._pending + data if self._pending else data, last=False)
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """End the stream: search an unfinished frame for others and discard it."""
+        """End the stream: search an unfinished frame for other frames and discard it."""
         return self._split(t_ns, self._pending, last=True)
 
     def _split(self, t_ns: int, buffer: bytes, *, last: bool) -> list[Frame | Rejection]:
@@ -241,7 +241,7 @@ class Splitter:
         claimed_to: int,
         buffer: bytes,
     ) -> int:
-        """Count the bytes skipped from ``at`` to ``resume``.
+        """Count the bytes skipped between two indexes, as failed frames and garbage.
 
         Returns the end of the lengths claimed by failed frames.
         """

@@ -20,13 +20,12 @@ SIZE: Final = 14  # bytes of an extended squitter
 PAIR_NS: Final = 10_000_000_000
 """Largest time between the even and the odd half of one position (DO-260B, A.1.7.7)."""
 STATUS_NS: Final = 30_000_000_000
-"""How long a stated accuracy holds: it is sent every 2.5 s (DO-260B, 2.2.3.3)."""
+"""Validity of a stated accuracy, which is sent every 2.5 s (DO-260B, 2.2.3.3)."""
 AIRCRAFT_MAX: Final = 2000
 """Most aircraft remembered; beyond it the one silent for longest is forgotten."""
 GROUND_NS: Final = 240_000_000_000
-"""Largest age of the reference of a position on the ground: at 340 m/s it is 45 nautical miles
-away, half the ambiguity of the position.
-"""
+"""Largest age of the reference of a position on the ground: at 340 m/s the aircraft is 45 nautical
+miles away, half the ambiguity of the position."""
 _POLYNOMIAL: Final = 0xFFF409
 _CPR: Final = 1 << 17
 _LETTERS: Final = "?ABCDEFGHIJKLMNOPQRSTUVWXYZ????? ???????????????0123456789??????"
@@ -35,7 +34,7 @@ _MOVEMENT: Final = (
     (1, 0.0, 0.0), (2, 0.125, 0.125), (9, 1.0, 0.25), (13, 2.0, 0.5), (39, 15.0, 1.0),
     (94, 70.0, 2.0), (109, 100.0, 5.0), (124, 175.0, 0.0),
 )  # fmt: skip
-"""First code, its speed and the step of the following codes, knots."""
+"""Ground speed codes: first code, its speed and the step of the following codes, knots."""
 
 
 def parity(message: bytes) -> int:
@@ -49,7 +48,7 @@ def parity(message: bytes) -> int:
 
 @dataclass(slots=True, kw_only=True)
 class _AircraftMemory:
-    """State of an aircraft that later messages need: half positions, accuracies, times."""
+    """State of an aircraft for later messages: half positions, accuracies, times."""
 
     halves: dict[int, tuple[int, int, int]] = field(default_factory=dict)  # odd: t_ns, lat, lon
     nac_p: tuple[int, int] = (0, 0)  # value, t_ns
@@ -59,7 +58,7 @@ class _AircraftMemory:
 
 
 class Transponders:
-    """Decoder of the messages of many aircraft. ``read`` takes them in order of arrival."""
+    """Decoder of the Mode S messages of many aircraft. ``read`` takes them in order of arrival."""
 
     def __init__(self) -> None:
         self._heard: OrderedDict[int, _AircraftMemory] = OrderedDict()
@@ -104,7 +103,7 @@ def _callsign(me: int) -> str:
 
 
 def _status(heard: _AircraftMemory, t_ns: int, me: int, *, airborne: bool) -> None:
-    """Store the accuracies of an operational status; version 0 has none, the ground no GVA."""
+    """Store the accuracies of an operational status; version 0 has none, ground positions no GVA."""
     version = me >> 13 & 7
     if version in (1, 2):
         heard.nac_p = (me >> 8 & 15, t_ns)
@@ -136,7 +135,7 @@ def _position(
 
 
 def _on_ground(heard: _AircraftMemory, t_ns: int, icao: int, me: int) -> AircraftState:
-    """Decode a position on the ground, nearest to the last known one, and its motion."""
+    """Decode a position on the ground, the nearest to the last known position, and its motion."""
     place = None
     if heard.place is not None and t_ns - heard.place[0] <= GROUND_NS:
         half = me >> 17 & 0x1FFFF, me & 0x1FFFF
@@ -162,7 +161,7 @@ def ground_deg(half: tuple[int, int], near: tuple[float, float], odd: int) -> tu
 
 
 def _nearest(part: float, near_deg: float, zone_deg: float) -> float:
-    """Return the angle at a fraction of a zone that is nearest to another angle."""
+    """Return the angle, at a fraction of a zone, that is nearest to another angle."""
     within = near_deg % zone_deg / zone_deg
     return zone_deg * (math.floor(near_deg / zone_deg) + math.floor(0.5 + within - part) + part)
 

@@ -1,4 +1,4 @@
-"""Fields of a payload."""
+"""Unpacking of the fields of a message's payload."""
 
 import struct
 from typing import Any

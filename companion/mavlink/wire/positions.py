@@ -1,4 +1,4 @@
-"""Table of the messages that carry positions, from which everything else derives.
+"""Table of the messages that carry positions, the only place where they are listed.
 
 To add a message with a vehicle's own position, write its reader and a row in ``POSITIONS``. The
 message is then decoded, compared between peers and nodes, shared within a fleet, timed and exported
@@ -20,7 +20,7 @@ HIGH_LATENCY2: Final = 235
 
 
 class OwnPosition(NamedTuple):
-    """Position that a vehicle sent of itself; None: not in its message.
+    """Position that a vehicle sent of itself; a field is None if its message lacks it.
 
     lat_1e7, lon_1e7  WGS84, 1e-7 degrees
     """
@@ -96,7 +96,7 @@ POSITIONS: Final = {
     MESSAGE_PACK: PositionMessage("OPEN_DRONE_ID_MESSAGE_PACK"),
     TUNNEL: PositionMessage("TUNNEL"),
 }
-"""Messages that carry a position, or may, by id."""
+"""Messages that carry a position, or may carry one, by id."""
 _READERS: Final = {msgid: one.read for msgid, one in POSITIONS.items() if one.read is not None}
 OWN: Final = frozenset(_READERS)  # messages in which vehicles report their own positions
 

@@ -37,7 +37,7 @@ _PACK = struct.Struct("<xx20sBB225s")
 
 
 def remote_id(frame: Frame) -> RemoteId | None:
-    """Decode a message of a receiver; None for a vehicle's own. Raises ``ValueError``."""
+    """Decode a message of a Remote ID receiver; None for a vehicle's own. Raises ``ValueError``."""
     said = _READERS[frame.msgid](frame)
     is_own = frame.source.compid not in RECEIVERS
     if (is_own or said.uas_id is None) and not any(bytes.fromhex(said.heard_as)):
@@ -131,7 +131,7 @@ READ: Final = frozenset(_READERS)  # message ids that remote_id reads
 
 
 def _add_id(said: RemoteId, kind: int, uas_id: bytes) -> RemoteId:
-    """Add an id, unless it has one of a better kind: serial number, registration, flight id."""
+    """Add an id unless a better kind is known: serial number, registration, flight id."""
     name = uas_id.rstrip(b"\0 ")
     if not name or kind == 0 or (said.id_kind is not None and said.id_kind <= kind):
         return said
@@ -142,7 +142,8 @@ def _add_id(said: RemoteId, kind: int, uas_id: bytes) -> RemoteId:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Place:
-    """Location: 1e-7 degrees, metres, m/s (climb is positive up), and accuracy codes."""
+    """Location in a Remote ID message: 1e-7 degrees, metres, m/s (climb is positive up), accuracy
+    codes."""
 
     lat_1e7: int
     lon_1e7: int
@@ -190,7 +191,7 @@ def _located(said: RemoteId, at: _Place) -> RemoteId:
 
 
 def _accuracy(horizontal: int, vertical: int, speed: int, time: int) -> Accuracy:
-    """Decode the accuracy codes; the stamp's, in steps of 0.1 s, gains half a step."""
+    """Decode accuracy codes; the stamp's accuracy, in steps of 0.1 s, gains half a step."""
     known = accuracy.remote_id(horizontal, vertical, speed)
     return known._replace(time_s=0.1 * time + 0.05 if 0 < time < 16 else None)
 

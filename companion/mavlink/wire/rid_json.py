@@ -125,7 +125,7 @@ def _uas_data(mac: bytes, uas: bytes) -> Iterator[tuple[int, bytes]]:
 
 
 def _captured(mac: bytes, found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
-    """Convert an object of rid_capture; the key alone gives the kind of id."""
+    """Convert an object of rid_capture; the kind of an id follows from its key alone."""
     for key, kind in (("uav id", 1), ("caa registration", 2)):
         name = found.get(key)
         if isinstance(name, str) and name:
@@ -155,7 +155,7 @@ def _captured(mac: bytes, found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
 
 
 def _number(value: object) -> float:
-    """Return a number, or NaN."""
+    """Return the number in a value; NaN if it has none."""
     return float(value) if isinstance(value, int | float) else math.nan
 
 

@@ -20,7 +20,7 @@ from companion.values import Reason
 
 LINE_MAX: Final = 512  # longest line, bytes; a longer one is garbage
 _SILENT: Final = frozenset((b"SEL", b"ID", b"AIR", b"STA", b"CLK"))
-"""Lines about the writer's own display."""
+"""Kinds of lines about the writer's own display, which are ignored."""
 _NUMBER: Final = re.compile(r"-?\d{1,9}(?:\.\d{1,9})?")
 
 
@@ -82,7 +82,7 @@ def _number(text: str, least: float, most: float) -> float | None:
 
 
 def _age_s(stamps: list[str]) -> int:
-    """Return whole seconds from the message (date, time) to the line (date, time); 0 if unknown."""
+    """Return whole seconds from the message's time to the line's time; 0 if unknown."""
     try:
         came, written = (
             datetime.strptime(f"{day} {time}", "%Y/%m/%d %H:%M:%S.%f")

@@ -1,4 +1,4 @@
-"""Boot stamps of messages that are not decoded otherwise.
+"""Boot stamps of messages that the service does not decode otherwise.
 
 Any message with ``time_boot_ms`` shows its sender's boot clock. The table is that of pymavlink's
 generated ``all`` dialect, without the setpoints that ground stations send (82, 84, 86): their time

@@ -213,7 +213,7 @@ def _off_boresight(directions: FloatArray) -> FloatArray:
 
 
 def _angles(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return azimuth and elevation of unit directions (..., 3); arctan2 is exact up to the poles."""
+    """Return azimuth and elevation of directions (..., 3); arctan2 is exact up to the poles."""
     x, y, z = directions[..., 0], directions[..., 1], directions[..., 2]
     return np.arctan2(y, x), np.arctan2(-z, np.hypot(x, y))
 

@@ -96,7 +96,7 @@ def _azimuth_and_elevation(directions: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def _tr38901(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:
-    """Amplitude of the 3GPP element (table 7.3-1), for azimuth and elevation angles of 0 or more."""
+    """Amplitude of the 3GPP element (table 7.3-1), for azimuths and elevations of 0 or more."""
     down_db = np.minimum(12 * (np.degrees(elevation_rad) / WIDTH_DEG) ** 2, FLOOR_DB)
     aside_db = np.minimum(12 * (np.degrees(azimuth_rad) / WIDTH_DEG) ** 2, FLOOR_DB)
     gain_db = BEST_DBI - np.minimum(down_db + aside_db, FLOOR_DB)

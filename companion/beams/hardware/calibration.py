@@ -120,7 +120,8 @@ def parse_calibration(text: str) -> Calibration:
 
 
 def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and fields of each line of a CSV text below ``header``; skip empty lines."""
+    """Yield line number and fields of each line of a CSV text below ``header``, except empty
+    ones."""
     lines = text.splitlines()
     if not lines or lines[0].strip() != header:
         raise UserError(f"line 1: {lines[0] if lines else ''!r} is not the header {header!r}")
@@ -146,7 +147,7 @@ def whole(number: int, name: str, field: str, least: int, most: int) -> int:
 
 
 def real(number: int, name: str, field: str, most: float = math.inf) -> float:
-    """Parse a number from a line of a table; raise ``UserError`` if its magnitude exceeds ``most``."""
+    """Parse a number from a line of a table; ``UserError`` if its magnitude exceeds ``most``."""
     try:
         value = float(field)
     except ValueError:

@@ -49,7 +49,7 @@ RELATIVE: Final = UnitGains(Mode.TX, 0.0, TMYTEK_RANGE_DB)
 
 
 def parse_unit_gains(text: str) -> UnitGains:
-    """Parse a TOML file with the gains of a TMYTEK unit. Raises ``UserError`` that names the key."""
+    """Parse a TOML file with the gains of a TMYTEK unit. ``UserError`` names the key."""
     told = read_toml(text)
     if set(told) != KEYS:
         raise UserError(f"keys are {', '.join(sorted(told))}; give {', '.join(sorted(KEYS))}")

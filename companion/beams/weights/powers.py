@@ -45,7 +45,7 @@ def max_min(coupling: FloatArray) -> FloatArray:
 
 
 def weighted_sum(coupling: FloatArray, rate_weights: FloatArray) -> FloatArray:
-    """Return power shares (N,) at a local maximum of the sum of ``rate_weights`` (N,) times rates."""
+    """Return power shares (N,) at a local maximum of the sum of ``rate_weights`` times rates."""
     direct = np.sqrt(coupling.diagonal())
     sent = np.full(len(direct), (1.0 / len(direct)) ** 0.5)
     for _ in range(2 * ROUNDS):
@@ -128,7 +128,8 @@ def _inverse(gram: ComplexArray, loading: FloatArray) -> ComplexArray:
 
 
 def _beams(channel: ComplexArray, share: FloatArray) -> ComplexArray:
-    """Return coefficients Z (N, N) of the beams H* Z with least mean square error and equal powers."""
+    """Return coefficients Z (N, N) of the beams H* Z of least mean square error, of equal
+    powers."""
     made = _inverse(channel.T, 1.0 / share)
     lengths = np.einsum("in,ij,jn->n", made.conj(), channel.T, made).real
     found: ComplexArray = made / np.sqrt(np.maximum(lengths, 1e-300) * len(share))

@@ -446,6 +446,6 @@ def normalise(weights: ComplexArray, how: Normalisation, slots: IntArray) -> Non
 
 
 def gain_db(steering: ComplexArray, weights: ComplexArray) -> FloatArray:
-    """Return the array gain of each column towards its own direction, |a^T f|^2 / |f|^2, dB, (N,)."""
+    """Return each column's array gain towards its own direction, |a^T f|^2 / |f|^2, dB, (N,)."""
     gains: FloatArray = 10 * np.log10(power_gains(steering, weights))
     return gains

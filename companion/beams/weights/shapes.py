@@ -190,7 +190,7 @@ def _psi(
     floor_db: float,
     worth_db: float,
 ) -> list[FloatArray]:
-    """Return phases psi (N, K) of the table for each column of widths (N, D); their sum is a shape."""
+    """Return the table's phases psi (N, K) for each column of widths (N, D), to be summed."""
     columns = range(cones.shape[1])
     if likely is None:
         return [_guaranteed_phases(shapes, cones[:, d]) for d in columns]

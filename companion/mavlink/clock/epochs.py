@@ -135,7 +135,7 @@ class BootLine:
         return self._begin_new_line(rebooted=stepped_back)
 
     def notice(self, arrival_ns: int, boot_ms: int) -> bool:
-        """Add a stamp that cannot start a line. Return whether the stamp lies on the current line."""
+        """Add a stamp that cannot start a line. Return whether it lies on the current line."""
         if not self.floor.count:
             return False
         x_ns = _unwrap(boot_ms, self.newest_ns)

@@ -70,8 +70,7 @@ class OffsetEvidence:
         return max(self._drift_max, faded)
 
     def add(self, new: Interval) -> DriftProven | None:
-        """Add evidence. Return the drift that the evidence proves; None if it agrees with earlier
-        ones.
+        """Add evidence. Return the drift that it proves; None if it agrees with earlier evidence.
 
         Return the drift that it proves; None if it agrees with earlier evidence.
         """
@@ -106,8 +105,7 @@ class OffsetEvidence:
         return Interval(x_ns, one.low_ns - slack, one.high_ns + slack)
 
     def newest(self, x_ns: int) -> Interval:
-        """Return the offset's interval at a sender time, from evidence since the last
-        contradiction.
+        """Return the offset's interval at a sender time, by evidence since the last contradiction.
 
         Some evidence must exist.
         """
@@ -115,8 +113,7 @@ class OffsetEvidence:
         return self._aged(self._known, x_ns)
 
     def at(self, x_ns: int) -> Interval | None:
-        """Return the offset's interval at a sender time, incl. the doubt interval; None without
-        evidence."""
+        """Return the offset's interval at a sender time, doubt included; None without evidence."""
         if self._known is None:
             return None
         known = self._aged(self._known, x_ns)

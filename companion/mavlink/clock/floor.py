@@ -56,7 +56,7 @@ class Heights(NamedTuple):
 class _Level:
     """Level floor under steadily rising stamps, valid if a queue, not drift, caused the rise.
 
-    upper_bound bound on the offset in that case, at the newest stamp, relative to the level base
+    upper_bound offset bound if a queue caused it, at the newest stamp, relative to the level base
     touched_ns  sender time of the stamp that set it
     """
 
@@ -262,8 +262,7 @@ class Floor:
         return max(0.0, self._lateness.height - self._line)
 
     def residual_ns(self) -> float:
-        """Return how much later than possible the fastest frame so far may be, as few were
-        observed.
+        """Return how late the fastest frame so far may have been, as few frames were observed.
 
         The least of n exponential latencies is above their minimum by up to 7 means / n; and the
         first frames may all have been slow.

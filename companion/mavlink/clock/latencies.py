@@ -121,7 +121,7 @@ class Latencies:
 
 
 def _slope_over(points: list[tuple[float, float]], x: float) -> float:
-    """Return the slope of the lower hull's edge over ``x``, for ordered points; 0 without an edge."""
+    """Return the slope of the lower hull's edge over ``x``, for ordered points; 0 if none."""
     hull: list[tuple[float, float]] = []
     for point in points:
         while len(hull) > 1:

@@ -205,7 +205,7 @@ class SenderClock:
         return newest_ns + round(ahead_ns / (1.0 + floor.drift))
 
     def estimate(self, node_ns: int | None = None) -> ClockEstimate | None:
-        """Return the clock at a node time (default: its newest stamp); None before the first stamp."""
+        """Return the clock at a node time (default: its newest stamp); None before the first."""
         floor = self._line.floor
         if not floor:
             return None

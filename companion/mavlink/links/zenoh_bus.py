@@ -113,7 +113,7 @@ class Bus:
         await self._to_loop.run()
 
     def close(self) -> None:
-        """Close the session; blocks until the others are notified. Nothing is delivered afterwards."""
+        """Close the session; blocks until the others are notified, then delivers nothing more."""
         self._to_loop.end()
         self._ended.set()
         if self._session is not None:

@@ -259,7 +259,7 @@ class ServiceComponent:
     def _discard_contradicting(
         self, first: RoundTrip, second: RoundTrip, outputs: list[RoundTrip | Rejection | Notice]
     ) -> None:
-        """Discard two answers that cannot come from one clock; the first only if it is still held."""
+        """Discard two answers that cannot be of one clock; the first only if still held."""
         discarded = [first, second] if first in self._held else [second]
         self._held = [trip for trip in self._held if trip is not first]
         detail = "TIMESYNC: two answers contradict each other"

@@ -270,7 +270,7 @@ class Watch:
     def _handle_slow(
         self, now_ns: int, since_ns: int, observed_hz: float | None, others: Iterable[Request]
     ) -> list[Notice]:
-        """Handle a rate that has been slow for long: it changed, or the last request did not help."""
+        """Handle a rate that stays slow: it changed, or the last request did not help."""
         comes = "is not sent" if observed_hz is None else f"is sent at {observed_hz:.2g} Hz"
         text = f"{self.uav}: {_NAMES[self.msgid]} {comes}, not at {self.wanted_hz:g} Hz: "
         if self._was_in_order:

@@ -75,8 +75,7 @@ def global_position_int(
     velocity_ned_mps: tuple[float, float, float],
     heading_deg: float | None,
 ) -> Outgoing:
-    """Encode GLOBAL_POSITION_INT; ``place`` is latitude and longitude in degrees, altitude in
-    metres.
+    """Encode GLOBAL_POSITION_INT; ``place`` is latitude and longitude (degrees), metres.
 
     Speeds are clipped to the range of the message.
     """

@@ -103,7 +103,7 @@ def _callsign(me: int) -> str:
 
 
 def _status(heard: _AircraftMemory, t_ns: int, me: int, *, airborne: bool) -> None:
-    """Store the accuracies of an operational status; version 0 has none, ground positions no GVA."""
+    """Store an operational status's accuracies; version 0 has none, ground positions no GVA."""
     version = me >> 13 & 7
     if version in (1, 2):
         heard.nac_p = (me >> 8 & 15, t_ns)

@@ -142,8 +142,7 @@ def _add_id(said: RemoteId, kind: int, uas_id: bytes) -> RemoteId:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Place:
-    """Location in a Remote ID message: 1e-7 degrees, metres, m/s (climb is positive up), accuracy
-    codes."""
+    """Location in a Remote ID message: 1e-7 degrees, metres, m/s (climb is positive up), codes."""
 
     lat_1e7: int
     lon_1e7: int

@@ -30,7 +30,7 @@ _BEGIN_NS: Final = 1_700_000_000 * _S
 
 @dataclass(frozen=True, slots=True)
 class Capacity:
-    """Result of the measurement."""
+    """Result of the capacity measurement."""
 
     uavs: int | None  # UAVs that take SHARE of a processor; None: more than MOST
     report_s: float  # time that a report takes
@@ -40,8 +40,7 @@ class Capacity:
 def measure(
     settings: Settings, clock_s: Callable[[], float] = time.process_time, processor: float = 1.0
 ) -> Capacity:
-    """Simulate ``FEW`` and then ``MORE`` UAVs around an array of these settings; takes about a
-    second.
+    """Simulate ``FEW`` and then ``MORE`` UAVs around an array of these settings, about a second.
 
     ``processor`` is the fraction of one processor that this process may use.
     """

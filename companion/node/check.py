@@ -25,7 +25,7 @@ from companion.views import uav_state
 
 TIMED_UPDATES: Final = 5  # number of timed computations of beams
 BUSY: Final = 0.3
-"""Fraction of the update interval that beams may take before it is reported."""
+"""Fraction of the update interval for computing beams above which it is reported."""
 NOISY: Final = 0.01  # share of frames with a wrong checksum from which on a link is noisy
 FORMATS: Final = {
     "sbs": "BaseStation lines (30003)",
@@ -33,7 +33,7 @@ FORMATS: Final = {
     "rid": "Remote ID in JSON",
     "cot": "Cursor on Target",
 }
-"""Formats of receivers other than MAVLink, by the scheme of their links."""
+"""Name of each receiver format other than MAVLink, by the scheme of its links."""
 NAMED_MAX: Final = 8  # largest number of vehicles named in a line
 
 
@@ -97,7 +97,7 @@ def _capacity(settings: Settings) -> Finding:
 
 
 def _links_to_open(settings: Settings, urls: list[str]) -> Settings:
-    """Return the settings of a run over these links that records and sends nothing else."""
+    """Return run settings with these links, but without recording or other outputs."""
     source = settings.center.source or "home"
     kept = settings.override(links={"urls": urls}, center={"source": source})
     keys = {url: key for url, key in kept.signing.keys.items() if url in urls}
@@ -186,7 +186,7 @@ def _links(service: Service) -> Iterator[Finding]:
 
 
 def _not_understood(subject: str, scheme: str, link: LinkStatus) -> Finding:
-    """Return the finding for a receiver that sent bytes, but no position."""
+    """Return the finding for a receiver that sent bytes, but no readable position."""
     refused = ", ".join(f"{count} {reason}" for reason, count in link.lost.items())
     if not refused:
         return Finding(

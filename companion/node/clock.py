@@ -13,13 +13,13 @@ from typing import Final
 from companion.mavlink.links.kernel_time import since_boot_ns
 
 SET_NS: Final = 10_000_000
-"""Least step of the wall clock that is followed; clock discipline affects both clocks alike."""
+"""Least step of the wall clock that is followed; both clocks are disciplined alike."""
 READ_NS: Final = 1_000_000
-"""Longest time for reading both clocks if their readings are to be compared."""
+"""Longest time for reading both clocks if the two readings are to be compared."""
 
 
 class NodeClock:
-    """Timeline of a node, ns since the Unix epoch by the wall clock at the start.
+    """Timeline of a node, ns, which starts at the wall clock's time since the Unix epoch.
 
     ``wall_ns`` and ``since_boot_ns`` are the clocks of the machine.
     """

@@ -1,4 +1,4 @@
-"""Export: logs through the same fold as a replay, written as tables."""
+"""Export: logs through the same pipeline as a replay, written as tables."""
 
 import time
 from collections.abc import Callable, Sequence

@@ -121,7 +121,7 @@ class Gateway:
             self._timestamps.close(self._now_ns())
 
     async def _save(self, timestamps: Timestamps) -> None:
-        """Save signing timestamps off the event loop.
+        """Save signing timestamps on another thread than the event loop's.
 
         A disk error is reported once, and saving is retried.
         """
@@ -180,7 +180,7 @@ class Gateway:
         return self._component is not None
 
     def speak(self, fit: bool, uavs: Iterable[Source]) -> None:
-        """Send due messages. Call it about ten times a second.
+        """Send the messages that are due. Call it about ten times a second.
 
         ``fit``: the service is ready. ``uavs``: the UAVs whose positions matter.
         """
@@ -204,7 +204,7 @@ class Gateway:
             self.links[max(heard)[1]].send_to(target, message)
 
     def rates(self) -> list[MessageRate]:
-        """Return the requested message rates and their state."""
+        """Return the requested message rates and the state of each request."""
         return self._component.rates() if self._component else []
 
 

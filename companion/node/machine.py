@@ -22,7 +22,7 @@ from companion.settings.model import Settings
 from companion.values import UserError
 
 LOW_DISK_BYTES: Final = 2_000_000_000
-"""Free disk space below which recordings are at risk: some hours of four UAVs."""
+"""Free disk space below which recordings are at risk: it holds some hours of four UAVs."""
 BUFFER_BYTES: Final = 1_000_000
 """Receive buffer below which bursts of UDP may be lost (docs/links.md)."""
 UNSYNCHRONISED_STATE: Final = 5  # TIME_ERROR of adjtimex(2): the clock is not synchronised
@@ -38,7 +38,7 @@ class Grade(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Finding:
-    """One checked item: its name, its grade, and a remedy."""
+    """Finding of a check: the checked item, its grade, and a remedy."""
 
     subject: str
     grade: Grade
@@ -47,7 +47,7 @@ class Finding:
 
 
 def look(settings: Settings, *, token: str | None, insecure: bool) -> Iterator[Finding]:
-    """Yield findings about this machine's ports, devices, disk and clock; nothing is kept open."""
+    """Yield findings about this machine's ports, devices, disk and clock; keeps nothing open."""
     yield _served(settings.server.listen, token=token, insecure=insecure)
     for url in settings.links.urls:
         yield _link(parse_link(url))
@@ -156,8 +156,7 @@ def _disk(folder: Path) -> Finding:
 
 
 def processor_share(root: Path = Path("/")) -> float:
-    """Return the fraction of one processor that control groups allow this process; 1 without a
-    quota.
+    """Return the fraction of a processor that control groups allow this process; 1: no quota.
 
     A quota, as of a container, suspends the process for part of the time, which processor time does
     not show. ``root`` is the root of the system's files.
@@ -180,7 +179,7 @@ def processor_share(root: Path = Path("/")) -> float:
 
 
 def _quota(folder: Path) -> float:
-    """Return the quota of one control group, of either version; infinite without one."""
+    """Return the processor quota of one control group, of either version; infinite without one."""
     names = (("cpu.max",), ("cpu.cfs_quota_us", "cpu.cfs_period_us"))
     for name in names:
         try:

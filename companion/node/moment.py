@@ -15,11 +15,11 @@ from companion.values import Update, UserError
 PROGRESS_EVERY: Final = 20_000  # events between two calls of progress
 
 ENDS_NS: Final = 60_000_000_000
-"""Tolerance of a log's ends against its first and last event, as stamps may step or jump."""
+"""Tolerance of a log's first and last time against its events, as stamps may step or jump."""
 
 
 class MomentError(UserError):
-    """Time that is not in the log."""
+    """Error of a requested time that is not in the log."""
 
 
 def look(
@@ -37,7 +37,7 @@ def look(
         settings  as for a replay
         at        seconds from the log's first event, or a date and time with zone (RFC 3339),
                   by the node's wall clock
-        lead_s    time from then until the beams are applied
+        lead_s time from ``at`` until the beams are applied
         progress  called occasionally with seconds of log
         latency_s as for a replay
 

@@ -19,7 +19,7 @@ from companion.views import passed_on
 
 
 class Outlet:
-    """The links of ``[out]``. Call ``open`` for early errors, then ``run`` until cancelled."""
+    """Links of ``[out]``. Call ``open`` for early errors, then ``run`` until cancelled."""
 
     def __init__(
         self,
@@ -59,7 +59,7 @@ class Outlet:
         return [*(link.status for link in self._frames), *events]
 
     def open(self) -> None:
-        """Bind the addresses of links that listen. Raises ``LinkError`` if one is in use."""
+        """Bind the addresses of links that listen. ``LinkError`` if an address is in use."""
         for link in (*self._frames, *self._events):
             link.open()
 
@@ -72,7 +72,7 @@ class Outlet:
                 group.create_task(self._send_all(), name="out")
 
     async def _send_all(self) -> None:
-        """Send at the rate; times missed while the loop was blocked are skipped."""
+        """Send positions at the rate; times missed while the loop was blocked are skipped."""
         loop = asyncio.get_running_loop()
         period_s = 1 / self._settings.rate_hz
         due_s = loop.time()

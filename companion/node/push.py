@@ -21,14 +21,13 @@ from companion.values import Notice, Severity, Update, UserError
 from companion.views import guaranteed_gain, records
 
 LARGEST_DATAGRAM: Final = 65_000
-"""Limit on the size of a datagram, below that of both address families."""
+"""Limit on the bytes of a datagram, below the limits of IPv4 and IPv6."""
 RECOVERED_AFTER: Final = 50
-"""Successful datagrams in a row before recovery is reported: errors arrive late."""
+"""Successful datagrams in a row before recovery is reported, as errors arrive late."""
 
 
 class Push:
-    """The outputs of ``[records]``. Call ``open`` for early errors, then ``run`` until
-    cancelled."""
+    """Outputs of ``[records]``. Call ``open`` for early errors, then ``run`` until cancelled."""
 
     def __init__(
         self,
@@ -65,7 +64,7 @@ class Push:
             self._ring = Ring(Path(self._settings.shared_memory))
 
     def newest(self, update: Update, number: int) -> None:
-        """Push this update next; updates are numbered from 0."""
+        """Queue this update as the next to push; updates are numbered from 0."""
         if self._sockets or self._ring:
             self._newest = update, number
             self._fresh.set()

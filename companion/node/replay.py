@@ -1,4 +1,4 @@
-"""Replay: logs through the same fold as the live service, as fast as possible."""
+"""Replay: logs through the same pipeline as the live service, as fast as possible."""
 
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -45,7 +45,7 @@ def settings_for(logs: Sequence[Path], config: Path | None, center: str | None) 
 def layers_for(
     logs: Sequence[Path], config: Path | None, center: str | None
 ) -> tuple[Settings, Origins]:
-    """Return the settings as ``settings_for``, and the origin of each.
+    """Return the settings as ``settings_for`` does, and the origin of each setting.
 
     A recording contains every setting. Values at their default, and sections that do not affect
     estimates or beams (``Settings.from_recording``), count as defaults.
@@ -65,8 +65,7 @@ def layers_for(
 
 
 def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Writer:
-    """Return the recording of the replay: at ``out``, else in the settings' directory or
-    ``recordings/``."""
+    """Return the writer of a replay's recording, at ``out`` or in the recordings' folder."""
     complete, kept = embedded(settings), settings.recording
     first_ns = next(read_flight(logs)).t_ns
     where = out or Path(kept.directory or "recordings")
@@ -95,12 +94,12 @@ class Run:
 
     @property
     def at_s(self) -> float:
-        """Seconds of log so far."""
+        """Time within the log so far, seconds."""
         return (self.tally.last_ns - (self.tally.first_ns or 0)) * 1e-9
 
     @property
     def took_s(self) -> float:
-        """Seconds since the start."""
+        """Wall-clock time since the start, seconds."""
         return time.monotonic() - self._started_s
 
     def step(self, event: Event) -> list[Output]:
@@ -181,12 +180,12 @@ def length_s(logs: Sequence[Path]) -> float | None:
 
 
 def vehicle_logs(logs: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return the vehicles whose onboard logs are among these, as JSON. Raises ``LogError``."""
+    """Return the vehicles whose onboard logs are among some logs, as JSON. Raises ``LogError``."""
     return [one.as_json() for one in vehicles(logs)]
 
 
 def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0) -> Iterator[Event]:
-    """Return all events in order of time, with ticks; those of several parts of one run unchanged.
+    """Return all events in order of time, with ticks; events of parts of one run as recorded.
 
     ``latency_s`` as for ``replay``. Raises ``LogError`` for an unusable log, or if one part of a
     run is given twice.
@@ -201,15 +200,15 @@ def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0)
 
 
 def in_order(logs: Sequence[Path]) -> list[Path] | None:
-    """Return the parts of one run in order; None if the logs are not that.
+    """Return the parts of one run in order; None if the logs are not parts of one run.
 
-    Raises ``LogError`` if one is unreadable or given twice.
+    Raises ``LogError`` if a log is unreadable or given twice.
     """
     return _in_order(_recording_infos(logs))
 
 
 def missing(logs: Sequence[Path]) -> list[str]:
-    """Return what recordings report as missing, one line each.
+    """Return what recordings report as missing from them, one line each.
 
     A replay of such recordings cannot reproduce the live run's digest. Raises ``LogError`` as for a
     replay.

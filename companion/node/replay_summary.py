@@ -12,7 +12,7 @@ from companion.values import Estimate, Event, Update, kind_of
 
 @dataclass(slots=True, kw_only=True)
 class Tally:
-    """Figures collected during a replay."""
+    """Figures collected during a replay, for its summary."""
 
     reports: Counter[str] = field(default_factory=Counter)
     dt_s: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
@@ -27,7 +27,7 @@ class Tally:
     last_ns: int = 0
 
     def event(self, event: Event) -> None:
-        """Note the time span of the events."""
+        """Extend the time span of the replay by an event."""
         if self.first_ns is None:
             self.first_ns = event.t_ns
         self.last_ns = max(self.last_ns, event.t_ns)  # a frame may be processed after a later tick
@@ -96,7 +96,7 @@ def summary(pipeline: Pipeline, tally: Tally) -> dict[str, Any]:
 
 
 def _unaimed(pipeline: Pipeline, tally: Tally) -> str | None:
-    """Return why no beam was computed in the whole log; None if one was."""
+    """Return why no beam was computed in the whole log; None if a beam was computed."""
     update = pipeline.last_update
     if tally.updates:
         return None

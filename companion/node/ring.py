@@ -1,6 +1,6 @@
 """Records in shared memory: a ring buffer with one writing process and any number of readers.
 
-All processes map the file. It has a header of 64 bytes, then slots of equal size: a lock (8 bytes),
+All processes map one file. It has a header of 64 bytes, then slots of equal size: a lock (8 bytes),
 the length of the record (4), 4 reserved bytes, and the record. Record n, from 0, is in slot n
 modulo the number of slots. Its lock is 2 n + 1 while it is being written and 2 n + 2 when it is
 complete; a reader copies the record and compares the lock before and after (a seqlock). The writer
@@ -22,8 +22,7 @@ MAGIC: Final = b"UAVBRING"
 VERSION: Final = 1
 SLOTS: Final = 256  # a quarter of a second at 1000 records/s, for a delayed reader
 SLOT_BYTES: Final = 1 << 16
-"""Size of a slot. Memory is allocated on first use, so a slot costs the size of its largest record.
-"""
+"""Size of a ring buffer's slot; memory is allocated on first use, for its largest record."""
 HEAD_BYTES: Final = 64
 SLOT_HEAD_BYTES: Final = 16
 LARGEST_RECORD: Final = SLOT_BYTES - SLOT_HEAD_BYTES
@@ -31,7 +30,7 @@ LIVE: Final = 1  # state of a ring with a writer; 0: its writer has ended
 
 
 def _require_ring(path: Path) -> None:
-    """Raise ``UserError`` if a file exists that is not a ring."""
+    """Raise ``UserError`` if a file exists that is not a ring buffer."""
     if path.exists():
         with path.open("rb") as file:
             if file.read(len(MAGIC)) != MAGIC:
@@ -39,7 +38,7 @@ def _require_ring(path: Path) -> None:
 
 
 class Ring:
-    """The writer's end. Raises ``UserError`` for an unusable path.
+    """Writer of a ring buffer in shared memory. Raises ``UserError`` for an unusable path.
 
     The file replaces an earlier ring of that name, which its readers keep until they reopen it; a
     file that is not a ring is kept. Readable by the owner and the group.
@@ -80,7 +79,7 @@ class Ring:
         self._words[3] = self.written
 
     def close(self) -> None:
-        """Mark the ring as ended, and delete its file unless another ring has replaced it."""
+        """Mark the ring buffer as ended, and delete its file unless another one has replaced it."""
         self._halves[5] = 0
         del self._words, self._halves
         self._map.close()

@@ -49,12 +49,12 @@ from companion.views.state import RecordingStatus, ReplayStatus
 SLICE_S: Final = 0.005
 """Longest time that the replay blocks the event loop."""
 MEASURED_AT_ONCE: Final = 20_000
-"""Events read at once while measuring the log's length; it can be stopped only in between."""
+"""Events read between two checks for a stop, while the log's length is measured."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReplayRequest:
-    """Parameters of a replay.
+    """Parameters of a replay with page and API.
 
     latency_s as in ``companion.node.replay.replay``
     area_map  the map under the plan view, from the user's own settings, not from a recording
@@ -225,7 +225,7 @@ class ServedReplay:
         return self._now_ns
 
     def uptime_s(self) -> float:
-        """Return seconds since the start of the replay, in real time."""
+        """Return the wall-clock seconds since the start of the replay."""
         return time.monotonic() - self._started_s
 
     def links(self) -> list[LinkStatus]:
@@ -256,8 +256,7 @@ class ServedReplay:
         return self._rates.newest()
 
     def unfit(self) -> list[str]:
-        """Return why the live service was not ready at that time, and whether the replay has
-        finished."""
+        """Return why the live service was not ready at that time, or that the replay has ended."""
         update = self.pipeline.last_update
         reasons = ["the replay has finished"] if self._finished else []
         if update is None:
@@ -277,7 +276,7 @@ class ServedReplay:
         await self._ticked.wait()
 
     def fleet_status(self) -> None:
-        """Return None: a recording contains of a fleet only the UAVs served."""
+        """Return None: a recording contains of its fleet only the UAVs that its node served."""
 
     def replay(self) -> ReplayStatus:
         """Return the progress of the replay."""
@@ -291,7 +290,7 @@ class ServedReplay:
 
 
 class _ReplayedLink:
-    """Counts of one link, from its frames in the log, which does not distinguish its peers."""
+    """Counts of one link, from its frames in the log, which does not name the peers."""
 
     def __init__(self, url: str) -> None:
         self.status = LinkStatus(url=url)

@@ -1,4 +1,4 @@
-"""The live service: links, timer, recorder and HTTP around one pipeline.
+"""The live service: connects links, timer, recorder and HTTP with one pipeline.
 
 Over 300 lines: it connects all parts of the running service.
 """
@@ -49,13 +49,12 @@ from companion.views.state import RecordingStatus
 
 
 class Service:
-    """A running node, with the interface of the HTTP server. ``answering`` is set once HTTP is
-    served.
+    """Running node, with the interface of the HTTP server.
 
-    ``clock`` is this machine's unless a test provides another one. ``say`` gets one line for the
-    operator per notice. Raises ``LinkError`` if a link cannot be opened, ``ConfigError`` for
-    unusable settings, ``OSError`` if the recording cannot be opened, ``LiveError`` if the live
-    channels cannot be served.
+    ``answering`` is set once HTTP is served. ``clock`` is this machine's unless a test provides
+    another one. ``say`` gets one line for the operator per notice. Raises ``LinkError`` if a link
+    cannot be opened, ``ConfigError`` for unusable settings, ``OSError`` if the recording cannot be
+    opened, ``LiveError`` if the live channels cannot be served.
     """
 
     def __init__(
@@ -248,7 +247,7 @@ class Service:
             )
 
     async def _end_on_defect(self) -> None:
-        """Raise a defect of the fold, which ends the service.
+        """Raise a defect of the pipeline, which ends the service.
 
         A link's callback would only log it, and beams must not be computed from an inconsistent
         state.
@@ -320,7 +319,7 @@ class Service:
             self.lateness.observe(loop.time() - due_s)
 
     async def _update(self) -> float:
-        """Predict the UAVs, compute the beams on a thread, and take them; the first ones directly.
+        """Predict the UAVs, and compute the beams on a thread; the first beams directly.
 
         The first request must already find an update. Returns the seconds used, on the loop and of
         the processor.
@@ -470,7 +469,7 @@ class Service:
 
 
 def _took_s(work: Callable[[], object]) -> float:
-    """Do work on this thread; return the processor time used."""
+    """Call a function on this thread; return the processor time that it used, seconds."""
     began_s = time.thread_time()
     work()
     return time.thread_time() - began_s

@@ -29,7 +29,7 @@ CLOSE_TIMEOUT_S: Final = 2
 
 
 class Server(uvicorn.Server):
-    """uvicorn for a node, without signal handlers.
+    """uvicorn server for a node, without signal handlers.
 
     ``serve(sockets=[bound socket])`` runs until ``should_exit`` is set; ``answering`` is set once
     it accepts requests. ``token`` and ``area``: see ``create_app``.
@@ -71,13 +71,13 @@ class RateMeter:
         self._counts: deque[tuple[int, int, int]] = deque()
 
     def count(self, now_ns: int, frames: int, updates: int) -> None:
-        """Note the totals so far."""
+        """Note the total counts so far."""
         self._counts.append((now_ns, frames, updates))
         while self._counts[0][0] < now_ns - RATE_WINDOW_S * 1e9:
             self._counts.popleft()
 
     def newest(self) -> dict[str, float | None]:
-        """Return ``frames_hz`` and ``updates_hz``; None before the second count."""
+        """Return ``frames_hz`` and ``updates_hz``; both None before the second count."""
         if len(self._counts) < 2:
             return {"frames_hz": None, "updates_hz": None}
         (t0, frames0, updates0), (t1, frames1, updates1) = self._counts[0], self._counts[-1]
@@ -159,8 +159,7 @@ def _configure_interpreter() -> None:
 
 
 def _loop_factory() -> Callable[[], asyncio.AbstractEventLoop] | None:
-    """Return the loop factory of uvloop, which handles ten times as many datagrams; None without
-    it.
+    """Return uvloop's loop factory, which handles ten times as many datagrams; None without uvloop.
 
     Measured: docs/field-notes.md 3.
     """

@@ -20,13 +20,13 @@ STATUS_EVERY_S: Final = 1.0  # time between two status lines
 
 
 class Console(Protocol):
-    """Output of a run to the terminal or pipe that started it."""
+    """Output of a run to its terminal or pipe."""
 
     def say(self, text: str) -> None:
         """Print a line about an event."""
 
     def serves(self, text: str) -> None:
-        """Print the address served, or at the end the recording."""
+        """Print the address that is served, or at the end the recording."""
 
     def show(self, service: Service) -> None:
         """Print the status."""

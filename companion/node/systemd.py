@@ -25,7 +25,7 @@ OPENING_S: Final = 1.0
 STATUS_EVERY_S: Final = 5.0
 """Time between two status lines without a watchdog."""
 LATE_AGAIN: Final = 0.05
-"""Fraction of the watchdog's time after which late updates are checked again.
+"""Fraction of the watchdog's period after which late updates are checked again.
 
 A short delay at the moment of a keep-alive then does not cause a restart.
 """
@@ -46,7 +46,7 @@ class Manager:
         self.watchdog_s = watchdog_s
 
     def tell(self, *lines: str) -> str | None:
-        """Send one message. Returns the error text, or None. Never blocks."""
+        """Send one message to the service manager. Returns an error text or None. Never blocks."""
         message = "\n".join(lines).encode()
         try:
             with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC) as out:
@@ -58,7 +58,7 @@ class Manager:
 
 
 def manager(environ: Mapping[str, str]) -> Manager | None:
-    """Return the manager that started this process; None if there is none.
+    """Return the service manager that started this process; None without one.
 
     Raises ``UserError`` for invalid environment variables.
     """
@@ -78,8 +78,7 @@ def _watchdog_s(environ: Mapping[str, str]) -> float | None:
 async def keep_informed(
     manager: Manager, service: Service, say: Callable[[str], None], until: asyncio.Event
 ) -> None:
-    """Notify the manager that the service is ready, then that it is alive, and finally that it
-    stops.
+    """Notify the service manager that the service is ready, then alive, and at last that it stops.
 
     Ready means that HTTP answers and every link is open, with or without a peer. Returns when
     ``until`` is set. A message that cannot be sent is reported once.
@@ -103,14 +102,14 @@ async def keep_informed(
 
 
 def _wait_s(watchdog_s: float | None, again: bool) -> float:
-    """Return the time to the next message: half the watchdog's, by sd_watchdog_enabled(3)."""
+    """Return the time to the next message: half the watchdog's (sd_watchdog_enabled(3))."""
     if watchdog_s is None:
         return STATUS_EVERY_S
     return watchdog_s * (LATE_AGAIN if again else 0.5)
 
 
 def status_line(service: Service) -> str:
-    """Return one line for the operator: UAVs by state, links, the recording."""
+    """Return a status line for the operator: UAVs by state, links, the recording."""
     update, links = service.pipeline.last_update, service.links()
     states = Counter(track.state for track in update.tracks) if update else Counter()
     uavs = ", ".join(f"{states[state]} {state}" for state in TrackState if states[state])

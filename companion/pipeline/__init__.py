@@ -1,1 +1,1 @@
-"""The fold that turns frames into tracks and beams, and its construction from the settings."""
+"""The pipeline, which turns frames into tracks and beams, and its construction."""

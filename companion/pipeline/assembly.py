@@ -34,7 +34,7 @@ from companion.tracking.tracker import Ages, Tracker, TrackerSettings
 from companion.values import FloatArray, Limits, LimitSource, ReportNoise, UserError, kind_of
 
 FLOOR_MARGIN_DB: Final = 2.9
-"""Default margin of the floor of a likely beam above the gain that the link needs."""
+"""Default margin of a likely beam's gain floor above the gain that the link needs, dB."""
 COUPLING_MAX: Final = 1e6
 """Limit of the largest entry of a coupling matrix; its inverse is the lower limit."""
 COUPLING_CONDITION_MAX: Final = 1e6
@@ -94,7 +94,7 @@ def _channel_error(settings: Settings, size: int) -> FloatArray | None:
 
 
 def calibration(settings: Settings, size: int) -> Calibration | None:
-    """Return the calibration of the channels of ``size`` elements; None without one.
+    """Return the calibration of the channels of ``size`` elements; None if there is none.
 
     Raises ``ConfigError``.
     """
@@ -183,7 +183,7 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
 
 
 def precoder(settings: Settings) -> Precoder:
-    """Return the precoder."""
+    """Return the precoder that the settings describe."""
     given = settings.beams
     budget, antennas = radio(settings)
     worth_db = 0.0 if settings.link.needed_sinr_db is not None else settings.link.needed_db
@@ -206,7 +206,7 @@ def precoder(settings: Settings) -> Precoder:
 
 
 def radio(settings: Settings) -> tuple[LinkBudget, int]:
-    """Return the link budget, and the number of antennas that each UAV combines."""
+    """Return the link budget, and the number of antennas that each UAV combines, as set."""
     given = settings.radio
     budget = LinkBudget(
         tx_power_dbm=given.tx_power_dbm,
@@ -217,7 +217,7 @@ def radio(settings: Settings) -> tuple[LinkBudget, int]:
 
 
 def noise(settings: Settings) -> NoiseSettings:
-    """Return the bounds on the errors of reports."""
+    """Return the bounds on the errors of reports, as set."""
     given = settings.observer
     most_m = given.position_noise_m
     default = ReportNoise(
@@ -239,21 +239,21 @@ class AircraftAssumptions:
 
     @property
     def lag_middle_s(self) -> float:
-        """Middle of the lag interval, subtracted from a position's time."""
+        """Middle of the position lag's interval, which is subtracted from a position's time."""
         return (self.lag_s[0] + self.lag_s[1]) / 2
 
     @property
     def lag_rest_s(self) -> float:
-        """Half width of the lag interval."""
+        """Half the width of the position lag's interval."""
         return (self.lag_s[1] - self.lag_s[0]) / 2
 
 
 def assumed(
     settings: Settings, uav: str, mav_type: int | None, autopilot: int | None
 ) -> AircraftAssumptions:
-    """Return the assumptions about a UAV: its own settings, else its type's, else the general ones.
+    """Return the assumptions about a UAV: of its own settings, of its type, or the general ones.
 
-    Without any, the defaults of its type apply. ``mav_type`` and ``autopilot`` are from its
+    If no setting applies, the defaults of its type do. ``mav_type`` and ``autopilot`` are from its
     heartbeat; None if none was received.
     """
     given = settings.observer

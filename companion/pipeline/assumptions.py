@@ -1,4 +1,4 @@
-"""Refuted assumptions, each with the setting that it is in. Each is reported once."""
+"""Refuted assumptions, each with the setting that contains it. Each is reported once."""
 
 from typing import Final
 
@@ -21,7 +21,7 @@ NOTICE_INTERVAL_NS: Final = (
 
 
 def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:
-    """Return the refutations, each followed by a notice if it exceeds what was reported before."""
+    """Return refutations, each followed by a notice if it exceeds what was reported before."""
     out: list[Refuted | Notice] = []
     for one in filter(None, refuted):
         out.append(one)

@@ -11,11 +11,11 @@ from typing import Final
 from companion.values import Beam, Blame, Carrier, Cause, LeftOut, Reason, Track, TrackState
 
 CLOSE_UAVS_DB: Final = 3.0
-"""Loss, compared with a beam for one UAV alone, from which on the other UAVs are the cause."""
+"""Loss against a beam for one UAV alone above which the other UAVs are the cause, dB."""
 SPARSE_S: Final = 0.25  # interval between reports from which on a higher rate helps
 LATE_S: Final = 0.15  # latency from which on a faster link helps
 SILENT_S: Final = 1.0
-"""Age of the newest report from which on a UAV is silent, if that is also several intervals."""
+"""Least age of the newest report of a silent UAV, seconds, if it is also several intervals."""
 SILENT_INTERVALS: Final = 3.0
 
 TIMESYNC: Final = "allow TIMESYNC: set `[presence] enabled = true`, over a two-way link"
@@ -25,7 +25,7 @@ STEADIER_LINK: Final = "use a MAVLink link with a steadier delay"
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkEvidence:
-    """What is known about a UAV in addition to its track."""
+    """Facts about a UAV's link in addition to its track."""
 
     clock_assumed: bool  # the constant part of its latency is only assumed
     refused: Reason | None  # why its newest reports were rejected; None: they were used
@@ -154,7 +154,7 @@ def _bound_cause(beam: Beam, track: Track, carrier: Carrier, evidence: LinkEvide
 
 
 def _growth_m(track: Track, seconds: float) -> float:
-    """Return how far a UAV can deviate in this time from what its last report predicts."""
+    """Return how far a UAV can deviate within a time from the prediction of its last report."""
     way_m = track.limits.speed_max_mps * seconds
     if track.velocity_ned_mps is None:
         return way_m

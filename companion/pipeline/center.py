@@ -1,4 +1,4 @@
-"""The carrier of the array, and the local frame, whose origin is fixed or the first report."""
+"""Carrier of the array, and the local frame, whose origin is fixed or the first report."""
 
 import math
 from dataclasses import dataclass, replace
@@ -38,10 +38,10 @@ HOME_SETTLING_S: Final = 120.0
 HOME_HEIGHT_M: Final = 20.0  # least error of the first height for which ``home`` moves
 
 NOTICE_RATIO: Final = 1.25
-"""Multiple of the attitude bound last reported above which it is reported again."""
+"""Ratio to the attitude bound last reported above which the bound is reported again."""
 MIN_CONSISTENT_SAMPLES: Final = 4  # older-stamped attitudes in a row that replace the newest
 CONSISTENT_TIME_NS: Final = 500_000_000
-"""Least duration of that run; attitudes that are resent arrive all at once."""
+"""Least duration of a run of consistent attitudes; resent ones arrive all at once."""
 MEAN_INTERVAL_NS: Final = (
     250_000_000  # largest difference between the steps of arrivals and of stamps
 )
@@ -49,7 +49,7 @@ MEAN_INTERVAL_NS: Final = (
 
 @dataclass(frozen=True, slots=True)
 class _AttitudeRun:
-    """Run of attitudes: arrival of the first, arrival and stamp of the last."""
+    """Run of consistent attitudes: arrival of the first, arrival and stamp of the last."""
 
     began_ns: int
     last: tuple[int, int]
@@ -57,7 +57,7 @@ class _AttitudeRun:
 
 
 class CarrierTracker:
-    """Position and attitude of the array.
+    """Tracker of the array's position and attitude.
 
     place    the fixed station, or the vehicle that is tracked; ``home`` until the first report
     local    the local frame; None before the first report, unless the station is fixed
@@ -138,7 +138,7 @@ class CarrierTracker:
         return replace(report, alt_m=above_sea_m, alt_datum=AltitudeDatum.MSL)
 
     def turn(self, placed: PlacedAttitude, turn_degps2: float) -> Refuted | None:
-        """Take in an attitude of the carrier, unless it is older than the newest.
+        """Process an attitude of the carrier, unless it is older than the newest one.
 
         Returns the refutation of ``turn_degps2``, the largest assumed angular acceleration, if any.
         """
@@ -153,7 +153,7 @@ class CarrierTracker:
         return self._angular_acceleration.look(placed.attitude, placed.sender_ns, turn_degps2)
 
     def _contradicts(self, placed: PlacedAttitude, turn_degps2: float) -> Contradiction | None:
-        """Return the excess of the difference to the newest attitude: one of both is wrong."""
+        """Return how much an attitude differs from the newest beyond the errors: one is wrong."""
         if self._attitude is None:
             return None
         before_ns, before = self._attitude
@@ -172,7 +172,7 @@ class CarrierTracker:
         return None if self._attitude is None else (now.sender_ns - self._attitude[0]) * 1e-9
 
     def trust(self, status: EstimatorStatus) -> Refuted | None:
-        """Take in the estimator status of the carrier. Returns a refutation if the bound grew."""
+        """Process the carrier's estimator status. Returns a refutation if the bound grew."""
         self._estimator = status
         if self.attitude_bound_rad <= NOTICE_RATIO * self._doubted_rad:
             return None
@@ -205,7 +205,7 @@ class CarrierTracker:
         return at[0] - began_ns >= CONSISTENT_TIME_NS and count + 1 >= MIN_CONSISTENT_SAMPLES
 
     def restarted(self, uav: str) -> None:
-        """Drop the carrier's attitude if the carrier rebooted, since its stamps start again."""
+        """Discard the carrier's attitude if the carrier rebooted, since its stamps start again."""
         if uav == self.vehicle:
             self._attitude = None
             self._contradicted = None
@@ -226,7 +226,7 @@ class CarrierTracker:
         return Notice(t_ns=report.t_ns, severity=Severity.INFO, subject="home", text=text)
 
     def moved(self, placed: PlacedReport, anew: Estimate) -> Notice | None:
-        """Move ``home`` if the track that set it was soon restarted at a very different height.
+        """Move ``home`` if the track that set it restarts soon at a very different height.
 
         An autopilot's first height may be wrong. Returns None if home stays.
         """
@@ -247,7 +247,7 @@ class CarrierTracker:
     # --- pose of the array ------------------------------------------------------------------
 
     def station(self, valid_at_ns: int) -> Carrier | str:
-        """Return the array of a fixed station, or the reason why its position is unknown."""
+        """Return the carrier for a fixed station, or the reason why its position is unknown."""
         at = self.place
         if self.local is None or not isinstance(at, FixedCenter):
             return "no report yet"
@@ -262,7 +262,7 @@ class CarrierTracker:
         at: SenderTime,
         turn_degps2: float,
     ) -> Carrier | str:
-        """Return the array on the vehicle, or the reason why its position or attitude is unknown.
+        """Return the carrier aboard the vehicle, or the reason why its pose is unknown.
 
             track        the carrier's track at the time ``at``; None if it has none
             newest       its newest accepted report

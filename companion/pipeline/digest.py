@@ -17,7 +17,7 @@ class Digest:
         self._hash = hashlib.sha256()
 
     def add(self, output: Estimate | Update) -> None:
-        """Add one output: little-endian doubles and integers, names in UTF-8."""
+        """Add one output to the digest: little-endian doubles and integers, names in UTF-8."""
         if isinstance(output, Estimate):
             self._estimate(output.fix.uav, output.fix.t_ns, output.position_ned_m, output.bound_m)
             return

@@ -13,7 +13,7 @@ from companion.values import ArrayKind, FloatArray, UserError
 
 
 def placed(settings: Settings) -> geometry.Array:
-    """Return the elements on their mount. Raises ``ConfigError``."""
+    """Return the array's elements on their mount. Raises ``ConfigError``."""
     given = settings.array
     mount = body_from_ned(
         *np.radians([given.mount_roll_deg, given.mount_pitch_deg, given.mount_yaw_deg])

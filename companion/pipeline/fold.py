@@ -1,4 +1,4 @@
-"""The whole program as a fold over events, used by the live service, replay and the tests.
+"""The whole program as a function from events to outputs, for live service, replay and tests.
 
 Pure and synchronous. Time comes with the events; the same events always give the same outputs and
 the same digest. A report passes through these parts in order:
@@ -67,17 +67,17 @@ from companion.values import (
 DROP_EVERY: Final = 100
 """Number of updates between two searches for tracks without recent reports."""
 PROTECTED_SHARE: Final = 4
-"""Number of array elements per protected UAV of another node: each null costs one."""
+"""Array elements needed per protected UAV of another node, since each null costs one."""
 NOTICED_STEP_S: Final = 0.5
-"""Least step of the wall clock that is reported; smaller ones are applied silently."""
+"""Least step of the wall clock for a notice; smaller steps are applied silently."""
 NEAR_M: Final = 2000.0
 """Largest distance between two reports of one aircraft, whatever its speed and their latency."""
 
 
 class Aiming(NamedTuple):
-    """Beams of a split tick, until its ``Tock``.
+    """Beams of a split tick that are computed until its ``Tock``.
 
-    made   computes them and assesses their links, once, on the first calling thread
+    made computes the beams and assesses their links, once, on the first calling thread
     local  the local frame that they are in
     """
 
@@ -86,7 +86,7 @@ class Aiming(NamedTuple):
 
 
 class Pipeline:
-    """State of the program.
+    """State of the program, from which events produce outputs.
 
     ``step`` takes events in the order of ``values.Event``; the other methods change nothing.
     ``aiming``: beams of a split tick that are still to be computed; None if none are pending.
@@ -240,7 +240,7 @@ class Pipeline:
         return [*dropped] if tick.in_two else [*dropped, *self._finish_update(tick.t_ns)]
 
     def _finish_update(self, now_ns: int) -> list[Output]:
-        """Take the beams of the last tick, and assess links.
+        """Adopt the computed beams of the last tick, and assess the links.
 
         Recompute the beams if the local frame was re-anchored meanwhile.
         """
@@ -300,8 +300,7 @@ class Pipeline:
     # --- queries ----------------------------------------------------------------------------
 
     def look(self, now_ns: int, lead_s: float = 0.0) -> Update:
-        """Return targets and beams at the actuation delay plus ``lead_s`` from now. Changes
-        nothing."""
+        """Return targets and beams for ``lead_s`` plus the actuation delay. Changes nothing."""
         return self.prepare_update(now_ns, lead_s)()
 
     def prepare_update(self, now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
@@ -369,10 +368,9 @@ class Pipeline:
     def tracks(
         self, now_ns: int, valid_at_ns: int, uavs: Iterable[str] | None = None
     ) -> list[Track]:
-        """Return every tracked UAV, target or not, predicted to ``valid_at_ns``; without the
-        carrier.
+        """Return every tracked UAV, target or not, predicted to ``valid_at_ns``, but no carrier.
 
-        ``uavs`` limits them; None: all.
+        ``uavs`` limits the tracks; None: all.
         """
         others = self.tracker.uavs if uavs is None else uavs
         others = [uav for uav in others if uav != self.center.vehicle]
@@ -409,7 +407,7 @@ class Pipeline:
         return 0 if record is None else record.refuted
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
-        """Return the state of a UAV's clock; None if it has none."""
+        """Return the state of a UAV's clock; None if no clock is known."""
         return self.senders.clock_estimate(uav)
 
     @property

@@ -34,13 +34,13 @@ from companion.values import (
 )
 
 EVERY_NS: Final = 1_000_000_000
-"""Interval between two assessments of a link; one round through all links takes as long."""
+"""Interval between two assessments of a link; a round through all links takes as long."""
 AT_ONCE: Final = 16
-"""Least number of links assessed per update; more if a round would take too long."""
+"""Least number of links assessed per update; more if the round would take too long."""
 HOLD_WORSE_NS: Final = 1_000_000_000  # hold time before a verdict gets worse
 HOLD_BETTER_NS: Final = 3_000_000_000  # hold time before a verdict gets better
 HYSTERESIS_DB: Final = 1.0
-"""Gain margin: a link keeps its level until the gain falls this far below what it needs."""
+"""Gain margin by which a link may fall below its need before its level changes, dB."""
 NAMED: Final = 6  # largest number of UAVs named in one notice
 RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}  # levels from the worst to the best
 
@@ -56,8 +56,7 @@ class Site:
 
 
 class _Link(NamedTuple):
-    """A beam, the gain that its link needs, its guaranteed and its likely gain (None: no such
-    gain)."""
+    """Link to assess: beam, needed gain, guaranteed and likely gain (None: no such gain)."""
 
     beam: Beam
     needed_db: float
@@ -66,7 +65,7 @@ class _Link(NamedTuple):
 
 
 class LinkBatch(NamedTuple):
-    """Links to assess: whether they start a round, which UAVs are still queued, and the links."""
+    """Batch of links to assess: whether it starts a round, the UAVs still queued, the links."""
 
     begins: bool
     waiting: list[str]
@@ -74,7 +73,7 @@ class LinkBatch(NamedTuple):
 
 
 class HealthMonitor:
-    """The verdicts. ``verdicts`` contains the current one of each target, by its id."""
+    """Monitor of the links. ``verdicts`` holds the current verdict of each target, by its id."""
 
     def __init__(self, need: NeedSettings, site: Site) -> None:
         self.verdicts: dict[str, Verdict] = {}
@@ -172,8 +171,7 @@ class HealthMonitor:
     def _least_db(
         self, beam_set: BeamSet, towards: FloatArray, which: Sequence[int]
     ) -> tuple[Sequence[float | None], Sequence[float | None]]:
-        """Return the least gain of these beams within their UAVs' bounds, and within the usual
-        error."""
+        """Return each beam's least gain within its UAV's bound, and within the usual error."""
         array, beams = self._site.array, [beam_set.beams[i] for i in which]
         both = np.tile(towards[which], (2, 1))
         angles = [beam.pointing_bound_rad for beam in beams]
@@ -186,7 +184,7 @@ class HealthMonitor:
     def _level(
         self, uav: str, needed_db: float, sure_db: float | None, likely_db: float | None
     ) -> Level:
-        """Return the level by the gains; the current level is kept within ``HYSTERESIS_DB``."""
+        """Return a link's level by its gains; a level is kept within ``HYSTERESIS_DB``."""
         held = self.verdicts.get(uav)
         rank = RANK[held.level] if held else RANK[Level.NONE]
 
@@ -272,9 +270,9 @@ def _of_left_out(update: Update, tracks: dict[str, Track]) -> dict[str, Verdict]
 def _needed_db(
     need: NeedSettings, site: Site, beam_set: BeamSet, towards: FloatArray
 ) -> list[float]:
-    """Return the array gain that each link needs.
+    """Return the array gain that each link needs, dB.
 
-    With ``needed_sinr_db`` it is the beam's gain less the excess of its SINR.
+    With ``needed_sinr_db`` that is the beam's gain less the excess of its SINR.
     """
     beams = beam_set.beams
     if need.needed_sinr_db is None:

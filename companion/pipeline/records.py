@@ -18,7 +18,7 @@ class Records(dict[str, _T]):
     """Records by id. ``records[uav]`` creates a missing one; deleting it forgets the id.
 
     ``make`` creates a record, ``is_kept`` says which ids are never dropped to make room. There may
-    be more of those than ``RECORDS_MAX``, so the table is searched again only after
+    be more protected ids than ``RECORDS_MAX``, so the table is searched again only after
     ``DROPPED_TOGETHER`` additions.
     """
 
@@ -49,7 +49,7 @@ class UnusedRun:
 
 @dataclass(slots=True, kw_only=True)
 class UavRecord:
-    """What is remembered of a UAV until it reboots or its track is dropped.
+    """Record of a UAV, kept until it reboots or its track is dropped.
 
     proven          largest reported value of each refuted setting
     """

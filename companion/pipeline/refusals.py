@@ -25,7 +25,7 @@ REPORT_REASONS: Final = frozenset(
 """Reasons to reject a sender's report about itself."""
 RECENT: Final = 8  # recent rejections kept per sender
 SENDERS_MAX: Final = 4096
-"""Senders remembered, so that a flood of forged addresses cannot exhaust the memory.
+"""Most senders remembered, so that forged addresses cannot exhaust the memory.
 
 Beyond it the least recently rejected one is forgotten.
 """
@@ -40,7 +40,7 @@ class SenderRejections:
 
 
 class Refusals:
-    """Counts of rejections. ``total`` includes senders that were forgotten."""
+    """Counts of rejections by sender. ``total`` includes senders that were forgotten."""
 
     def __init__(self, records: UavRecords) -> None:
         self.total: Counter[Reason] = Counter()
@@ -77,13 +77,13 @@ class Refusals:
         return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
 
     def used(self, uav: str) -> None:
-        """Note that a report was accepted."""
+        """Note that a sender's report was accepted."""
         record = self._records.get(uav)
         if record is not None:
             record.unused = None
 
     def unheard(self, uav: str) -> Reason | None:
-        """Return why the newest reports of a sender are rejected; None if they are used."""
+        """Return why a sender's newest reports are rejected; None if they are accepted."""
         record = self._records.get(uav)
         run = None if record is None else record.unused
         return run.reason if run is not None and run.reports > 1 else None

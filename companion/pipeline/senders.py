@@ -1,4 +1,4 @@
-"""Senders of frames: finds the sender and the time of every message.
+"""Senders of frames: determines the sender and the time of every message.
 
 Each sender has a record of its clock; each component one of its other messages: heartbeat, GNSS
 status, and the noise bounds derived from it. A message leaves here with its time on the sender's
@@ -52,9 +52,9 @@ from companion.values import (
 
 RECEIVER_WAIT_NS: Final = 10_000_000_000  # time for which a new track waits for its GNSS receiver
 ACCURACY_AGE_MAX_US: Final = 30_000_000
-"""Largest delay of a receiver status that is out of order; a larger step back means a reboot.
+"""Largest step back of a receiver status that is out of order; a larger one is a reboot.
 
-As long as reports are remembered (``dedupe``).
+Equal to the time for which reports are remembered (``dedupe``).
 """
 KEPT_NS: Final = 3_600_000_000_000
 """Time for which a silent sender without a track is kept; each clock takes some 50 kB."""
@@ -73,7 +73,7 @@ HEIGHT_FILTER_WEIGHT: Final = (
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PlacedReport:
-    """A report with its time.
+    """Report with its time on the sender's and the node's timeline.
 
     noise      bounds on its errors; None for a relayed aircraft, whose errors depend on its
                speed
@@ -88,7 +88,7 @@ class PlacedReport:
 
 @dataclass(frozen=True, slots=True)
 class PlacedAttitude:
-    """An attitude of the carrier with its time on the carrier's timeline."""
+    """Attitude of the carrier with its time on the carrier's timeline."""
 
     attitude: Attitude
     sender_ns: int
@@ -96,11 +96,11 @@ class PlacedAttitude:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FrameOutcome:
-    """The outcome of one frame.
+    """Outcome of processing one frame.
 
     message    a message with its time; None if nothing remains to be done
     outputs    notices and rejections
-    restarted  sender whose past is to be forgotten; None if none is
+    restarted  sender whose records must be discarded; None: none
     change     change of the sender's clock that the frame showed; None without one
     """
 
@@ -115,7 +115,7 @@ NO_OUTCOME: Final = FrameOutcome()  # outcome of a frame without further effect
 
 @dataclass(slots=True)
 class Sender:
-    """A sender with a clock: a vehicle, or an aircraft that broadcasts its own stamps."""
+    """Sender with a clock: a vehicle, or an aircraft that broadcasts its own stamps."""
 
     clock: SenderClock
     stamped_ns: int | None = None  # arrival of the clock's newest stamp; None: none yet
@@ -139,7 +139,7 @@ class ComponentState:
 
 
 class Senders:
-    """All senders of frames.
+    """All senders of frames, with their clocks.
 
         carrier  id of the vehicle that carries the array: always admitted, and the only one whose
                  attitude is used
@@ -237,7 +237,7 @@ class Senders:
     def notice(self, frame: Frame) -> ClockChange | None:
         """Pass the stamp of an otherwise ignored frame to its sender's clock.
 
-        Returns the change of that clock that it showed.
+        Returns the clock change that the stamp revealed.
         """
         sender = self._senders.get(str(frame.source))
         if sender is None:
@@ -248,22 +248,22 @@ class Senders:
     def round_trip(self, event: RoundTrip) -> ClockChange | None:
         """Pass a TIMESYNC round trip to its sender's clock.
 
-        Returns the change of that clock that it showed.
+        Returns the clock change that the round trip revealed.
         """
         clock = self._senders[str(event.source)].clock
         clock.timesync(event.sent_ns, event.t_ns, event.remote_ns)
         return clock.change
 
     def utc_is(self, offset_ns: int) -> None:
-        """Set the difference between UTC and the node's timeline, from now on."""
+        """Set the difference between UTC and the node's timeline, valid from now on."""
         self._utc_offset_ns = offset_ns
         for sender in self._senders.values():
             sender.clock.forget_gnss()
 
     def _telemetry(self, report: Report, doubt_ns: int = 0) -> FrameOutcome:
-        """Place a report by its stamp; noise bounds are set only for a vehicle that reports itself.
+        """Place a report in time by its stamp; noise bounds only for a vehicle that reports itself.
 
-        ``doubt_ns`` is that of its frame.
+        ``doubt_ns`` is the uncertainty of its frame's arrival.
         """
         assert report.boot_ms is not None
         uav, t_ns = report.uav, report.t_ns
@@ -300,8 +300,7 @@ class Senders:
         )
 
     def _errors(self, report: Report, time_s: float) -> ReportNoise:
-        """Return bounds on a report's errors, with the recent height difference of receiver and
-        autopilot.
+        """Return bounds on a report's errors, with the receiver's recent height difference.
 
         ``time_s`` is the largest error of the report's time.
         """
@@ -335,7 +334,7 @@ class Senders:
         )
 
     def _relayed(self, said: AdsbVehicle) -> FrameOutcome:
-        """Place a report of an aircraft that a receiver relays.
+        """Place in time a report of an aircraft that a receiver relays.
 
         The track restarts when the altitude datum changes, since the difference depends on the
         weather.
@@ -408,7 +407,7 @@ class Senders:
     def _stamp(
         self, sender: Sender, name: str, arrival_ns: int, boot_ms: int, doubt_ns: int = 0
     ) -> tuple[Stamp | None, tuple[Notice, ...]]:
-        """Place a stamp on the sender's timeline; returns a notice if it shows a reboot."""
+        """Place a stamp on the sender's timeline; return a notice if the stamp shows a reboot."""
         stamp = sender.clock.observe(arrival_ns, boot_ms, doubt_ns)
         sender.stamped_ns = arrival_ns
         if stamp is None or not stamp.rebooted:
@@ -419,7 +418,7 @@ class Senders:
         return stamp, (Notice(t_ns=arrival_ns, severity=Severity.WARNING, subject=name, text=text),)
 
     def time(self, uav: str, node_ns: int) -> SenderTime:
-        """Convert a node time to a UAV's own timeline; for a relayed aircraft they are the same."""
+        """Convert a node time to a UAV's own timeline; a relayed aircraft's is the node's."""
         sender = self._senders.get(uav)
         known = sender.clock.time(node_ns) if sender else None
         if known is None:
@@ -436,12 +435,12 @@ class Senders:
         )
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
-        """Return the state of a UAV's clock; None if it has none."""
+        """Return the state of a UAV's clock; None if no clock is known."""
         sender = self._senders.get(uav)
         return sender.clock.estimate() if sender else None
 
     def assumed(self, uav: str) -> assembly.AircraftAssumptions:
-        """Return the assumptions about a UAV, by its newest heartbeat."""
+        """Return the assumptions about a UAV, by the type in its newest heartbeat."""
         vehicle = kind_of(uav).reports_itself
         component = self._components.get(Source.parse(uav)) if vehicle else None
         heard = None if component is None else component.presence
@@ -471,7 +470,7 @@ class Senders:
         return name in self._tracked or name == self._carrier
 
     def link_share(self, link: str) -> LinkShare:
-        """Return what a link has contributed to the reports so far."""
+        """Return the contribution of a link to the reports so far."""
         return self._dedupe.shares.get(link) or LinkShare()
 
 
@@ -480,7 +479,7 @@ def _refused(message: Report | AdsbVehicle, reason: Reason) -> FrameOutcome:
 
 
 def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:
-    """Reject a report under an id with two boot clocks, with one notice."""
+    """Reject a report under an id with two boot clocks; publish one notice."""
     refused = Rejection(
         t_ns=t_ns, source=uav, reason=Reason.SHARED_ID, detail="two boot clocks under this id"
     )

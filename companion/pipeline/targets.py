@@ -41,12 +41,12 @@ class Targets:
         return [uav for uav in wanted if uav in served]
 
     def protected(self, uavs: Iterable[str]) -> list[str]:
-        """Return the UAVs of other nodes to protect by nulls, in the order given."""
+        """Return the UAVs of other nodes to be protected by nulls, in the order given."""
         spares = frozenset(self.duty.spares if self.duty else ())
         return [uav for uav in uavs if uav in spares and self.wants(uav)]
 
     def better_known(self, uav: str, others: Iterable[str]) -> list[str]:
-        """Return those of the others whose id is preferred to that of a relayed aircraft.
+        """Return those of some UAVs whose ids are preferred to a relayed aircraft's.
 
         Preferred are telemetry, then Remote ID, ADS-B and Cursor on Target. Tracks already merged
         into another one are excluded.
@@ -79,7 +79,7 @@ class Targets:
         return notices
 
     def dropped(self, now_ns: int, silent: Iterable[str]) -> list[Notice]:
-        """Return a notice for each target that is dropped; other traffic has none."""
+        """Return a notice for each dropped target; none for other traffic."""
         return [
             Notice(
                 t_ns=now_ns,

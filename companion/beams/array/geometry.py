@@ -80,8 +80,7 @@ class Array:
         return weights if self.live is None else weights * self.live[:, np.newaxis]
 
     def carried(self, weights: ComplexArray) -> ComplexArray:
-        """Return the excitation of the elements, (M, K), if their ports are fed with weights (M,
-        K)."""
+        """Return the excitation of the elements, (M, K), for ports fed with weights (M, K)."""
         live = self.fed(weights)
         return live if self.coupling is None else self.coupling @ live
 

@@ -95,8 +95,7 @@ def amplitudes(array: Array, directions: FloatArray) -> FloatArray:
 
 
 def element_directions(array: Array, directions: FloatArray) -> FloatArray:
-    """Return unit directions (N, 3) in each element's frame: (M, N, 3); (1, N, 3) if all face
-    alike."""
+    """Unit directions (N, 3) in element frames: (M, N, 3), or (1, N, 3) if all face alike."""
     if array.element_from_array is None:
         return directions[np.newaxis]
     turned: FloatArray = np.einsum("mij,nj->mni", array.element_from_array, directions)

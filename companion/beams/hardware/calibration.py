@@ -120,8 +120,7 @@ def parse_calibration(text: str) -> Calibration:
 
 
 def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
-    """Yield line number and fields of each line of a CSV text below ``header``, except empty
-    ones."""
+    """Yield number and fields of each non-empty line of a CSV text below ``header``."""
     lines = text.splitlines()
     if not lines or lines[0].strip() != header:
         raise UserError(f"line 1: {lines[0] if lines else ''!r} is not the header {header!r}")
@@ -136,8 +135,7 @@ def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
 
 
 def whole(number: int, name: str, field: str, least: int, most: int) -> int:
-    """Parse a whole number from a line of a table. Raises ``UserError`` outside ``least`` to
-    ``most``."""
+    """Parse a whole number from a line of a table; ``UserError`` outside ``least`` to ``most``."""
     digits = field.removeprefix("-")
     is_one = digits.isascii() and digits.isdecimal() and len(digits) <= DIGITS_MAX
     if not is_one or not least <= int(field) <= most:

@@ -218,8 +218,7 @@ def quantise(
 
 
 def _target_factors(weights: ComplexArray, factors: ComplexArray) -> ComplexArray:
-    """Return the wanted factors of the settings: weights over channels, the strongest of amplitude
-    1."""
+    """Return the wanted factors of settings: weights over channels, the strongest being 1."""
     if weights.ndim != 1 or factors.shape != weights.shape:
         raise ValueError(f"weights {weights.shape} and channels {factors.shape}: both must be (M,)")
     if not (np.isfinite(weights).all() and np.isfinite(factors).all() and factors.all()):

@@ -128,8 +128,7 @@ def _inverse(gram: ComplexArray, loading: FloatArray) -> ComplexArray:
 
 
 def _beams(channel: ComplexArray, share: FloatArray) -> ComplexArray:
-    """Return coefficients Z (N, N) of the beams H* Z of least mean square error, of equal
-    powers."""
+    """Return coefficients Z (N, N) of beams H* Z of least mean square error and equal powers."""
     made = _inverse(channel.T, 1.0 / share)
     lengths = np.einsum("in,ij,jn->n", made.conj(), channel.T, made).real
     found: ComplexArray = made / np.sqrt(np.maximum(lengths, 1e-300) * len(share))

@@ -73,8 +73,7 @@ def _table(name: str) -> Shapes:
 
 
 def _even(count: int) -> FloatArray:
-    """Return the matrix (count, count / 2) from half of an even function, middle first, to all of
-    it."""
+    """Return the matrix (count, count / 2) that mirrors half of an even function, middle first."""
     half = count // 2
     return np.concatenate([np.eye(half)[::-1], np.eye(half)])
 

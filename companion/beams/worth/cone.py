@@ -337,8 +337,7 @@ def _patches(cones: DirectionCones, boxes: Boxes) -> Cells:
 
 
 def _polar(frames: FloatArray, angle: FloatArray, turn: FloatArray) -> FloatArray:
-    """Return unit directions (C, K, 3) at angles (C, 1 or K) from, and rotations (C, K) about, the
-    poles."""
+    """Return directions (C, K, 3) at angles (C, 1 or K) and rotations (C, K) about the poles."""
     sine = np.sin(angle)
     parts = np.stack(
         np.broadcast_arrays(np.cos(angle), sine * np.cos(turn), sine * np.sin(turn)), axis=2

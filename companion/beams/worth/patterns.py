@@ -312,8 +312,7 @@ def _cut_lobe(cut: _Cut, peak_rad: float) -> CutLobe:
 
 
 def _half_power(cut: _Cut, peak_rad: float) -> tuple[float | None, tuple[float, float] | None]:
-    """Return the width of a lobe at half power, and the first minima beyond, as angles from the
-    peak."""
+    """Return a lobe's width at half power, and the first minima beyond, from the peak."""
     half = float(cut.gains(np.array(peak_rad))) / 2
     points = cut.points()
     step = 2 * math.pi / points

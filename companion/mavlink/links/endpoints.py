@@ -52,8 +52,7 @@ class Endpoint(Protocol):
         """Return the peers that get a broadcast; None: those received recently."""
 
     def write(self, key: Hashable, raw: bytes) -> bool:
-        """Send a frame to a peer. Never waits and never raises; False if the frame was not
-        accepted."""
+        """Send a frame to a peer. Never waits, never raises; False if it was not accepted."""
 
     def fullness(self, key: Hashable) -> float:
         """Return the filled share, 0 to 1, of a peer's send buffer; 0 for a disconnected peer.

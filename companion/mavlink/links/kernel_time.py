@@ -16,8 +16,7 @@ import time
 from typing import Final
 
 SO_TIMESTAMPNS: Final[int] = getattr(socket, "SO_TIMESTAMPNS", 35)
-"""Socket option and control message type of time stamps (Linux, include/uapi/asm-generic/socket.h).
-"""
+"""Socket option, and type of its control message: Linux, include/uapi/asm-generic/socket.h."""
 SET_NS: Final = 1_000_000  # least step of the wall clock that matters
 
 _BOOTTIME: Final[int] = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)

@@ -59,8 +59,7 @@ FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
 MARGIN: Final = 5 * SECOND
 """Largest lag of a killed process's state on disk: see ``State.after_crash``."""
 BURST: Final = SECOND
-"""Upper limit on the frames sent in ``MARGIN``; each uses one unit of time if the clock is behind.
-"""
+"""Upper limit on frames sent in ``MARGIN``; each takes one time unit if the clock is behind."""
 
 Stream = tuple[int, int, int]  # system id and component id of the sender, and its link id
 ReceivedTimestamp = tuple[int, int | None]

@@ -199,8 +199,7 @@ class Watch:
         return []
 
     def ready(self, now_ns: int) -> bool:
-        """Return whether a request is due: the rate has been slow for long, and the back-off is
-        over."""
+        """Return whether a request is due: the rate stays slow, and the back-off is over."""
         since_ns = self._slow_since_ns
         slow = since_ns is not None and self._is_settled(since_ns, now_ns)
         return slow and now_ns >= self.next_ns

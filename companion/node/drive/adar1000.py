@@ -23,7 +23,7 @@ CLOCK_HZ: Final = 10_000_000
 
 
 class Chips:
-    """Chips by bus and device number, in the order of the table's chips."""
+    """ADAR1000 chips by SPI bus and device number, in the order of the table's chips."""
 
     takes = DeviceInput.REGISTERS
     lead_s = None
@@ -52,12 +52,12 @@ class Chips:
             raise DeviceError(f"SPI {bus}.{number}: {error.strerror or error}") from error
 
     def apply(self, command: DeviceCommand) -> None:
-        """Write gain, I and Q of every channel, then one load pulse to each chip."""
+        """Write gain, I and Q of every channel, then send one load pulse to each chip."""
         assert command.registers is not None
         self._write(command.registers)
 
     def rest(self, safe: SafeState) -> None:
-        """Hold, point to boresight, or mute every channel."""
+        """Hold the state, point to boresight, or mute every channel."""
         if safe is SafeState.HOLD:
             return
         i, q = vector_modulator(0)

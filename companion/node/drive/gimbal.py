@@ -27,14 +27,14 @@ DO_SET_ROI_NONE: Final = 197
 SET_PITCHYAW: Final = 287
 ATTITUDE_STATUS: Final = 285
 IN_EARTH_FRAME: Final = 4 | 8 | 16 | 64
-"""GIMBAL_MANAGER_FLAGS: roll, pitch and yaw locked, and yaw from north."""
+"""GIMBAL_MANAGER_FLAGS of a command: roll, pitch and yaw locked, and yaw from north."""
 YAW_FROM_NORTH: Final = 16 | 64
-"""GIMBAL_DEVICE_FLAGS of an attitude whose yaw is from north: either one."""
+"""GIMBAL_DEVICE_FLAGS that show that an attitude's yaw is from north: either one."""
 ONBOARD_COMPUTER: Final = 191
 
 
 class Gimbal:
-    """A gimbal; its boresight is north and level."""
+    """Gimbal as a device; its boresight is north and level."""
 
     takes = DeviceInput.POINTING
 
@@ -52,7 +52,7 @@ class Gimbal:
 
     @property
     def lead_s(self) -> float:
-        """Lag estimated from its attitude reports; 0 without any."""
+        """Lag estimated from the gimbal's attitude reports; 0 without reports."""
         return self._lag.lag_s
 
     def check(self, safe: SafeState) -> None:
@@ -72,7 +72,7 @@ class Gimbal:
             raise DeviceError(f"gimbal at {host}:{port}: {error.strerror or error}") from error
 
     def apply(self, command: DeviceCommand) -> None:
-        """Read the reported attitudes, and point."""
+        """Read the attitudes reported so far, and point the gimbal."""
         self._receive()
         yaw_rad = _near(command.bearing_rad, self._last_rad)
         self._last_rad = yaw_rad
@@ -98,7 +98,7 @@ class Gimbal:
         self.say(SET_PITCHYAW, struct.pack("<I4f3B", IN_EARTH_FRAME, *angles, *rates, *recipient))
 
     def say(self, msgid: int, payload: bytes) -> None:
-        """Send a message to the gimbal."""
+        """Send a MAVLink message to the gimbal."""
         own = Source(self.target[0], ONBOARD_COMPUTER)
         raw = pack(Outgoing(own, msgid, payload), self._sequence)
         self._sequence = (self._sequence + 1) & 0xFF
@@ -146,5 +146,5 @@ class RoiGimbal(Gimbal):
 
 
 def _near(angle_rad: float, other_rad: float) -> float:
-    """Return the angle plus full turns, within half a turn of the other one."""
+    """Return the angle plus full turns, within half a turn of a reference angle."""
     return other_rad + math.remainder(angle_rad - other_rad, 2 * math.pi)

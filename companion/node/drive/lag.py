@@ -11,10 +11,9 @@ MOST_S: Final = 2.0  # largest lag considered
 STEP_S: Final = 0.01
 SAMPLES_MIN: Final = 20  # least number of reports for an estimate
 LEAST_RAD: Final = np.radians(2.0)
-"""Movement within the stored reports below which the estimate is kept."""
+"""Movement within the stored reports, radians, below which the lag estimate is kept."""
 RESIDUAL_MAX: Final = 0.2
-"""Largest fraction of the movement that the lag may leave unexplained, as by a mount at its limit.
-"""
+"""Largest fraction of the movement that the lag may leave unexplained."""
 KEPT: Final = 100
 
 
@@ -31,7 +30,7 @@ class MountLag:
         self._commands.append((at_ns * 1e-9, azimuth_rad))
 
     def note_report(self, at_ns: int, azimuth_rad: float) -> None:
-        """Note a reported direction, and update the estimate."""
+        """Note a reported direction, and update the lag estimate."""
         self._reports.append((at_ns * 1e-9, azimuth_rad))
         if len(self._reports) >= SAMPLES_MIN:
             self._estimate(np.array(self._commands).T, np.array(self._reports).T)

@@ -25,7 +25,7 @@ LATE_SHARE: Final = 0.1
 
 
 class SafeState(StrEnum):
-    """State of a device without beams, and after the end."""
+    """Safe state of a device, for when there are no beams, and after the end."""
 
     HOLD = "hold"
     BORESIGHT = "boresight"
@@ -33,7 +33,7 @@ class SafeState(StrEnum):
 
 
 class DeviceInput(StrEnum):
-    """The part of an update that a device applies."""
+    """Kind of data that a device applies from an update."""
 
     POINTING = "pointing"
     REGISTERS = "adar1000"
@@ -41,11 +41,11 @@ class DeviceInput(StrEnum):
 
 
 class DeviceError(Exception):
-    """Failure of a device, or a device that is unreachable; it is retried."""
+    """Failure of a device, or an unreachable device; the operation is retried."""
 
 
 class SourceLostError(Exception):
-    """Service that does not answer."""
+    """Error of a service that does not answer."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -69,10 +69,10 @@ class DeviceCommand:
 
 
 class BeamSource(Protocol):
-    """Source of beams."""
+    """Source of beams for a device."""
 
     def ask(self, lead_s: float) -> DeviceCommand:
-        """Return the command for this time from now. Raises ``SourceLostError``."""
+        """Return the device command for a time in ``lead_s``. Raises ``SourceLostError``."""
 
 
 class Device(Protocol):
@@ -99,7 +99,7 @@ class Device(Protocol):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DriveStatus:
-    """State of a drive.
+    """State of a driven device.
 
     p50_ms, p99_ms time from request to application; None before the first
     """
@@ -116,7 +116,7 @@ class DriveStatus:
 
 
 class Drive:
-    """One device that is being driven.
+    """Loop that drives one device.
 
     ``say`` gets a line for each change. Raises ``UserError`` for a safe state that the device does
     not support.
@@ -147,7 +147,7 @@ class Drive:
         self._applied = self._late = self._skipped = self._failures = 0
 
     def run(self, stop: threading.Event) -> None:
-        """Apply updates until ``stop`` is set; then leave the device in its safe state."""
+        """Apply updates until ``stop`` is set; then put the device into its safe state."""
         due_ns = self._now_ns()
         try:
             while not stop.is_set():
@@ -161,7 +161,7 @@ class Drive:
             self.end()
 
     def step(self) -> None:
-        """Fetch one update and apply it, or go to the safe state if there is none."""
+        """Fetch one update and apply it; without an update, go to the safe state."""
         try:
             if not self._reached():
                 return
@@ -200,7 +200,7 @@ class Drive:
 
     @property
     def lead_s(self) -> float:
-        """Lead of the next request."""
+        """Lead of the next request: how far ahead its beams are computed, seconds."""
         own_s = self._device.lead_s
         if own_s is not None:
             return own_s
@@ -225,7 +225,7 @@ class Drive:
         )
 
     def _reached(self) -> bool:
-        """Return whether the device is open; tries to open it at intervals."""
+        """Return whether the device is open; at intervals, try to open it."""
         if not self._open and self._now_ns() >= self._again_ns:
             self._device.open()
             self._open = True

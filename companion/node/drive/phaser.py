@@ -2,10 +2,10 @@
 
 Eight elements on two ADAR1000, receive only. Phase, gain and attenuator of every element are
 written, then latched once: ``set_chan_phase``, ``set_chan_gain`` and ``set_all_gain`` of
-``adi.CN0566`` latch at each call, and are not used. Its own calibration is not applied, since the
-registers already include the service's. The map from elements to chips and channels is that of
-``adi.CN0566``, where elements count from 1. Never tested on hardware: the tests run its own class
-on a mock of libiio.
+``adi.CN0566`` latch at each call, and are not used. The Phaser's own calibration is not applied,
+since the registers already include the service's. The map from elements to chips and channels is
+that of ``adi.CN0566``, where elements count from 1. Never tested on hardware: the tests run
+pyadi-iio's class on a mock of libiio.
 """
 
 from typing import Any, Final
@@ -19,7 +19,7 @@ FULL_GAIN: Final = 127
 
 
 class Phaser:
-    """A Phaser at a libiio URI."""
+    """Phaser as a device, at a libiio URI."""
 
     takes = DeviceInput.REGISTERS
     lead_s = None
@@ -34,7 +34,7 @@ class Phaser:
         require(safe, tuple(SafeState), "a Phaser")
 
     def open(self) -> None:
-        """Connect and switch to receive. Raises ``UserError`` without pyadi-iio."""
+        """Connect to the Phaser and switch to receive. Raises ``UserError`` without pyadi-iio."""
         try:
             from adi import CN0566
         except (ImportError, AttributeError, OSError) as error:  # OSError: libiio is missing
@@ -47,7 +47,7 @@ class Phaser:
         self._shown = {}
 
     def apply(self, command: DeviceCommand) -> None:
-        """Write changed registers, and latch once."""
+        """Write the changed registers, and latch once."""
         assert command.registers is not None
         self._set(self.settings_of(command.registers))
 
@@ -60,7 +60,7 @@ class Phaser:
         return {element: (phase, gain, off) for element, phase, gain, off in rows}
 
     def rest(self, safe: SafeState) -> None:
-        """Hold, point to boresight, or mute every element."""
+        """Hold the state, point to boresight, or mute every element."""
         match safe:
             case SafeState.BORESIGHT:
                 self._set(dict.fromkeys(range(ELEMENTS), (0, FULL_GAIN, 0)))

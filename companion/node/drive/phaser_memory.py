@@ -3,7 +3,7 @@
 The codebook is stored once, when the device is opened; an update then only selects the memory
 position of each channel, and latches once. Two positions are reserved for the safe states. Channels
 are selected one by one: ``common_mem_enable`` of ``adi.adar1000`` writes a wrong attribute. Never
-tested on hardware: the tests run its own class on a mock of libiio.
+tested on hardware: the tests run pyadi-iio's class on a mock of libiio.
 """
 
 from collections.abc import Sequence
@@ -19,7 +19,7 @@ MUTE: Final = POSITIONS - 1
 
 
 class PhaserMemory(Phaser):
-    """A Phaser whose memory contains a codebook, given as registers (8, 8) of each beam."""
+    """Phaser as a device whose memory holds a codebook, as registers (8, 8) of each beam."""
 
     takes = DeviceInput.STORED
 
@@ -48,12 +48,12 @@ class PhaserMemory(Phaser):
         self._position = None
 
     def apply(self, command: DeviceCommand) -> None:
-        """Select a beam for all channels, and latch once."""
+        """Select a stored beam for all channels, and latch once."""
         assert command.stored is not None
         self._use(command.stored)
 
     def rest(self, safe: SafeState) -> None:
-        """Hold, point to boresight, or mute every element."""
+        """Hold the state, point to boresight, or mute every element."""
         if safe is not SafeState.HOLD:
             self._use(BORESIGHT if safe is SafeState.BORESIGHT else MUTE)
 

@@ -1,6 +1,6 @@
 """A rotator behind hamlib's rotctld: ``rotctld:HOST:PORT``.
 
-Its protocol is lines of text (rotctld(1) of hamlib): ``P AZ EL`` points, ``p`` returns the
+The protocol is lines of text (rotctld(1) of hamlib): ``P AZ EL`` points, ``p`` returns the
 direction, ``S`` stops; answers end with ``RPRT 0``, or another number for an error.
 """
 
@@ -18,7 +18,7 @@ TIMEOUT_S: Final = 2.0
 
 
 class Rotator:
-    """A rotator, commanded to the direction of the UAV after its own lag, within its limits.
+    """Rotator as a device, led by its own lag and kept within its limits.
 
     Its boresight is azimuth and elevation 0.
     """
@@ -36,7 +36,7 @@ class Rotator:
 
     @property
     def lead_s(self) -> float:
-        """Lag estimated from its reports; 0 before it has moved."""
+        """Lag estimated from the rotator's reports; 0 before it has moved."""
         return self._lag.lag_s
 
     def check(self, safe: SafeState) -> None:
@@ -44,7 +44,7 @@ class Rotator:
         require(safe, (SafeState.HOLD, SafeState.BORESIGHT), "a rotator")
 
     def open(self) -> None:
-        """Connect, and read its limits."""
+        """Connect to rotctld, and read the rotator's limits."""
         try:
             self._socket = socket.create_connection(self._address, TIMEOUT_S)
         except OSError as error:
@@ -59,7 +59,7 @@ class Rotator:
         self._last_deg = self._where_deg()[0]
 
     def apply(self, command: DeviceCommand) -> None:
-        """Read its direction, and point.
+        """Read the rotator's direction, and point the rotator.
 
         The direction is read first: a rotator that restarts its motion at each command has then had
         the whole interval.
@@ -71,20 +71,20 @@ class Rotator:
         self._lag.note_command(self._now_ns(), math.radians(azimuth_deg))
 
     def rest(self, safe: SafeState) -> None:
-        """Stop, or go to boresight."""
+        """Stop the rotator, or point it to boresight."""
         if safe is SafeState.HOLD:
             self._ask("+S")
         else:
             self._point(0.0, 0.0)
 
     def close(self) -> None:
-        """Disconnect."""
+        """Disconnect from rotctld."""
         if self._socket:
             self._socket.close()
             self._socket = None
 
     def _near(self, azimuth_deg: float) -> float:
-        """Return the same azimuth within its limits, by the shortest way if there are two."""
+        """Return the same azimuth within the limits; of two, the one by the shorter rotation."""
         low, high, _, _ = self._limits_deg
         turns = [azimuth_deg + 360.0 * n for n in (-2, -1, 0, 1, 2)]
         within = [one for one in turns if low <= one <= high]
@@ -104,7 +104,7 @@ class Rotator:
         return float(found[1]), float(found[2])
 
     def _ask(self, command: str) -> str:
-        """Return the answer to a command in the extended form, which ends with RPRT."""
+        """Return rotctld's answer to a command in the extended form, which ends with RPRT."""
         if self._socket is None:
             raise DeviceError("not connected")
         try:

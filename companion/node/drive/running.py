@@ -1,4 +1,4 @@
-"""A drive as a command, and inside a service."""
+"""Driving a device: as a command, and inside a service."""
 
 import asyncio
 import signal
@@ -15,9 +15,9 @@ ENDS_S: Final = 5.0  # time limit for a device to reach its safe state at the en
 def run_until_stopped(
     drive: Drive, show: Callable[[DriveStatus], None], seconds: float | None
 ) -> None:
-    """Drive until SIGINT, SIGTERM or ``seconds`` have passed; ``show`` is called once a second.
+    """Drive a device until SIGINT, SIGTERM or ``seconds`` have passed.
 
-    Raises the exception that ended the drive.
+    ``show`` is called once a second. Raises the exception that ended the drive.
     """
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -42,7 +42,7 @@ def run_until_stopped(
 
 
 async def run_in_thread(drive: Drive) -> None:
-    """Drive on a thread until cancelled; raises the exception that ended the drive."""
+    """Drive a device on a thread until cancelled; raises the exception that ended the drive."""
     stop, failed = threading.Event(), list[BaseException]()
     loop, ended = asyncio.get_running_loop(), asyncio.Event()
 

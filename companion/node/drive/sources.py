@@ -31,7 +31,7 @@ ANSWERS_S: Final = 5.0  # timeout for an answer of the event loop
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamRequest:
-    """UAVs to follow: the first of these that has a beam, else any UAV if ``anybody``.
+    """Request for beams: the first of these UAVs that has one, else any UAV if ``anybody``.
 
     centre        a mount points at the centre of all of them instead
     stored_beams  size of the codebook in the device; None: it has none
@@ -51,14 +51,14 @@ class BeamRequest:
 
 
 class HttpSource:
-    """Beams of a service over HTTP."""
+    """Source of beams: a service over HTTP."""
 
     def __init__(self, client: Client, wanted: BeamRequest) -> None:
         self._client = client
         self._wanted = wanted
 
     def ask(self, lead_s: float) -> DeviceCommand:
-        """Return the command for this time from now; takes at most two requests."""
+        """Return the device command for a time in ``lead_s``; takes at most two requests."""
         lead_ms = min(max(lead_s, 0.0), 10.0) * 1e3
         valid_at_ns = time.time_ns() + round(lead_ms * 1e6)
         try:
@@ -76,7 +76,7 @@ class HttpSource:
 
 
 class LocalSource:
-    """Beams of the pipeline of this process, which runs on an event loop."""
+    """Source of beams: the pipeline of this process, which runs on an event loop."""
 
     def __init__(
         self,
@@ -94,7 +94,7 @@ class LocalSource:
         self._wanted = wanted
 
     def ask(self, lead_s: float) -> DeviceCommand:
-        """Return the command for this time from now; only the beams come from the loop."""
+        """Return the command for a time in ``lead_s``; only the beams are computed on the loop."""
         asked = asyncio.run_coroutine_threadsafe(self._look(lead_s), self._loop)
         try:
             update = asked.result(ANSWERS_S)
@@ -109,7 +109,7 @@ class LocalSource:
 def command_of(
     pipeline: Pipeline, equipment: Equipment, update: Update, wanted: BeamRequest
 ) -> DeviceCommand:
-    """Return the command from one update. Only the requested beam is fitted to the device."""
+    """Return the device command from one update. Only the requested beam is quantised."""
     beams, text = update.beams, None
     uav = followed_uavs(beams.uavs, wanted)
     if update.unfit is None and uav is not None and wanted.takes is DeviceInput.REGISTERS:
@@ -135,7 +135,7 @@ def command_of(
 def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
     """Return the registers (M, 8) of each beam of the codebook. Raises ``UserError`` without one.
 
-    Each is fitted towards its direction of largest gain.
+    Each beam is fitted towards its direction of largest gain.
     """
     codebook = equipment.codebook
     if codebook is None:
@@ -156,7 +156,7 @@ def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
 
 
 def followed_uavs(uavs: Collection[str], wanted: BeamRequest) -> str | None:
-    """Return the UAV to serve of those that have beams; None if there is none."""
+    """Return the UAV to follow of those that have beams; None if no wanted UAV has one."""
     uav = next((one for one in wanted.uavs if one in uavs), None)
     return next(iter(uavs), None) if uav is None and wanted.anybody else uav
 
@@ -164,7 +164,7 @@ def followed_uavs(uavs: Collection[str], wanted: BeamRequest) -> str | None:
 def command_for(
     told: dict[str, Any], text: str | None, wanted: BeamRequest, valid_at_ns: int
 ) -> DeviceCommand:
-    """Return the command for the requested UAV, from an answer of the API."""
+    """Return the device command for the requested UAV, from an answer of the API."""
     if told["unfit"] is not None:
         return DeviceCommand(valid_at_ns=valid_at_ns, unfit=str(told["unfit"]))
     named = {beam["uav"]: beam for beam in told["beams"]}
@@ -201,7 +201,7 @@ def command_for(
 
 
 def _middle(beams: list[dict[str, Any]], valid_at_ns: int) -> DeviceCommand:
-    """Return the mean direction of these beams, and the mean of their positions."""
+    """Return the mean direction of beams, and the mean position of their UAVs."""
     bearing = np.radians([beam["bearing_deg"] for beam in beams])
     above = np.radians([beam["above_horizon_deg"] for beam in beams])
     level = np.cos(above)

@@ -1,4 +1,4 @@
-"""Targets of a drive; a device's module is loaded on first use.
+"""Target strings of a drive and their devices; a device's module is loaded on first use.
 
     rotctld:HOST:PORT       a rotator behind hamlib's rotctld
     gimbal:HOST:PORT:SYSID:COMPID
@@ -84,7 +84,7 @@ def device(
 
 
 class DryRun:
-    """A device that accepts and prints every command."""
+    """Device of a dry run: accepts and prints every command."""
 
     lead_s = None
 

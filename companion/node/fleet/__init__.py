@@ -1,1 +1,1 @@
-"""A live node of a fleet, over Zenoh."""
+"""Live operation of a node in a fleet, over Zenoh."""

@@ -10,18 +10,18 @@ from collections.abc import Mapping
 from typing import Final
 
 PATIENCE_MAX_NS: Final = 60_000_000_000
-"""Limit on the time between two sessions.
+"""Limit on the time between two new sessions.
 
 A node that never answers, or forged names, must not cost the others their sessions.
 """
 RESET_NS: Final = 600_000_000_000
-"""Time after a new session after which the interval to the next one is reset."""
+"""Time without a new session after which the interval to the next one is reset."""
 BLOCKED_NS: Final = 3_000_000_000
-"""Time without a check after which this process was suspended, and answers may still be queued."""
+"""Time without a check that shows that this process was suspended; answers may be queued."""
 
 
 class Unanswered:
-    """Start of the unanswered requests to each node.
+    """Nodes with unanswered requests, each with the time of the first of these.
 
     A node may be silent for ``patience_ns``. The time between two new sessions is at least twice
     that, and doubles each time. ``alive`` are the nodes with a liveliness token.
@@ -44,7 +44,7 @@ class Unanswered:
         self._since.pop(node, None)
 
     def gone(self, now_ns: int, heard_ns: Mapping[str, int]) -> list[str]:
-        """Return nodes without a recent message; ``heard_ns``: time of each node's last one."""
+        """Return nodes without a recent message; ``heard_ns`` is when each was last received."""
         before_ns = now_ns - self._patience_ns
         return [n for n, at_ns in heard_ns.items() if n not in self.alive and at_ns < before_ns]
 

@@ -8,7 +8,7 @@ Take = Callable[[str, bytes], None]
 
 
 class Listening:
-    """Subscriptions by node. ``base`` is the site's key.
+    """Subscriptions to other nodes. ``base`` is the site's key.
 
     ``heard`` and ``offered`` are called with the key and the payload of a sample.
     """
@@ -20,7 +20,7 @@ class Listening:
         self._ends: dict[str, list[Callable[[], None]]] = {}
 
     def to(self, nodes: frozenset[str]) -> None:
-        """Subscribe to these nodes, and to no others."""
+        """Subscribe to these nodes, and end all other subscriptions."""
         for node in nodes - self._ends.keys():
             self._ends[node] = [
                 self._bus.subscribe(f"{self._base}/{node}/{what}", take)

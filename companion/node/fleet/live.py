@@ -32,16 +32,16 @@ STANDING_S: Final = 0.2  # time between two standings
 ASKED_S: Final = 0.5  # time between two requests for another node's clock
 ANSWERED_S: Final = 3.0  # timeout of an answer
 PATIENCE_S: Final = 6.0
-"""Least time without answers from a node that is present, after which the session is renewed."""
+"""Least time without answers from a present node after which the session is renewed."""
 RETRY_S: Final = 2.0  # time between two attempts to reopen a session
 PATIENCE_LEASES: Final = 4.0  # the same limit in leases
 LOOK_S: Final = 0.3
-"""Time between two batches of offers, out of step with the updates."""
+"""Time between two batches of offers, not a multiple of the update interval."""
 OFFERED_S: Final = 1.0  # time between two messages of offers, and of tracks
 
 
 class LiveFleetNode:
-    """This node in a fleet. ``open`` blocks; ``run`` serves until cancelled.
+    """Live operation of this node in a fleet. ``open`` blocks; ``run`` serves until cancelled.
 
         settings  [fleet], with a name
         pipeline  pipeline of this node
@@ -102,7 +102,7 @@ class LiveFleetNode:
             self._session = open_peer(self._config)
 
     async def run(self) -> None:
-        """Take part until cancelled; a client that cannot connect reports it, and serves alone."""
+        """Run until cancelled; a client that cannot connect reports it, and serves alone."""
         has_taken_part = False
         while True:
             try:
@@ -122,7 +122,7 @@ class LiveFleetNode:
                 await asyncio.sleep(RETRY_S)  # this node's former endpoints are free by then
 
     async def _take_part(self) -> None:
-        """Take part with one session, until it must be renewed (``answering.py``)."""
+        """Run in the fleet with one session, until it must be renewed (``answering.py``)."""
         bus = Bus(self._config, asyncio.get_running_loop(), self._session)
         try:
             if self._session is None:
@@ -152,7 +152,7 @@ class LiveFleetNode:
             await asyncio.to_thread(bus.close)
 
     def _is_link_one_way(self, now_ns: int) -> bool:
-        """Return whether a present node does not answer; removes nodes that left."""
+        """Return whether a present node does not answer; remove nodes that left."""
         heard_ns = {node: known.heard_ns for node, known in self.member.neighbours.items()}
         for node in self._unanswered.gone(now_ns, heard_ns):
             self._publish(self.member.node_left(now_ns, node))
@@ -190,7 +190,7 @@ class LiveFleetNode:
     # --- own input and decisions ------------------------------------------------------------
 
     def on_event(self, event: Event) -> None:
-        """Take in an event of this node's own links, before the pipeline.
+        """Process an event of this node's own links, before the pipeline does.
 
         Frames for which this node is the speaker are published at once, within the rate limit.
         """
@@ -205,7 +205,7 @@ class LiveFleetNode:
             self._publish_received(now_ns)
 
     def ticked(self, now_ns: int) -> None:
-        """Decide which UAVs this node serves. Call it after every update of the pipeline."""
+        """Decide which UAVs this node serves; called after every update of the pipeline."""
         duty, notices = self.member.decide(now_ns)
         if duty is not None:
             self._step(duty)
@@ -234,7 +234,7 @@ class LiveFleetNode:
     # --- output -----------------------------------------------------------------------------
 
     def _key(self, what: str, node: str | None = None) -> str:
-        """Return the key under which a node publishes; None: this node."""
+        """Return the key under which a node publishes; None stands for this node."""
         return f"{PREFIX}/{self.settings.site}/{node or self.name}/{what}"
 
     def _put(
@@ -283,7 +283,7 @@ class LiveFleetNode:
             self._bus.ask(key, b"", ANSWERED_S, self._clock_answer(node, self._now_ns()))
 
     def _clock_answer(self, node: str, sent_ns: int) -> Callable[[bytes, int], None]:
-        """Return the callback for the answer to a request sent now."""
+        """Return the callback for the answer to a clock request that is sent now."""
 
         def take(answer: bytes, arrived_ns: int) -> None:
             self._unanswered.answered(node)
@@ -299,7 +299,7 @@ class LiveFleetNode:
     # --- input from other nodes -------------------------------------------------------------
 
     def _node(self, key: str) -> str | None:
-        """Return the node of a key; None for an invalid name, which is counted."""
+        """Return the node that a key names; None for an invalid name, which is counted."""
         node = key.split("/")[-2]
         if is_node_name(node):
             return node
@@ -307,7 +307,7 @@ class LiveFleetNode:
         return None
 
     def _receive_loop(self, take: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
-        """Return a callback that passes valid samples of other nodes on, and counts the others."""
+        """Return a callback that passes on valid samples of other nodes, and counts the others."""
 
         def taken(key: str, payload: bytes) -> None:
             node = self._node(key)

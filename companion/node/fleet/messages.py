@@ -1,7 +1,8 @@
 """Messages between nodes: protobuf, with the same descriptions as a recording's messages.
 
-Version 1 of the contract in docs/fleet.md: fields are added, and the number of a removed one is
-never reused. Received messages are parsed with limits; invalid ones raise ``FleetMessageError``.
+This is version 1 of the contract in docs/fleet.md: fields are added, and the number of a removed
+one is never reused. Received messages are parsed with limits; invalid ones raise
+``FleetMessageError``.
 """
 
 import math
@@ -15,14 +16,14 @@ from companion.values import Offer, RoundTrip, Shared, SharedFrame, Standing
 
 FRAMES_MAX: Final = 4096  # limit on frames, and on round trips, in one message
 CLOCK: Final = struct.Struct("<qq")
-"""Answer to a clock request: start of the node, and its present time; ns."""
+"""Format of an answer to a clock request: start of the node, and its present time; ns."""
 OFFERS_MAX: Final = 10_000
 NAME_MAX: Final = 64
 _LATEST_NS: Final = 1 << 62
 
 
 class FleetMessageError(ValueError):
-    """Malformed message, or one with impossible values."""
+    """Error of a fleet message that is malformed or has impossible values."""
 
 
 def shared(said: Shared) -> bytes:
@@ -54,7 +55,7 @@ def to_shared(data: bytes) -> Shared:
 
 
 def standing(said: Standing) -> bytes:
-    """Encode a node's standing."""
+    """Encode a node's status message (``Standing``)."""
     message = schemas.StandingMessage(
         node=said.node, place=said.place or (), reach_m=said.reach_m, most=said.most
     )
@@ -67,7 +68,7 @@ def standing(said: Standing) -> bytes:
 
 
 def to_standing(data: bytes, node: str) -> Standing:
-    """Decode a node's standing, received under its own key. Raises ``FleetMessageError``."""
+    """Decode a node's ``Standing``, received under its own key. Raises ``FleetMessageError``."""
     try:
         message = schemas.StandingMessage.FromString(data)
     except DecodeError as error:

@@ -1,4 +1,4 @@
-"""Recordings of a fleet's nodes, replayed together: their digests, and the UAVs that each served.
+"""Replay of a fleet's recordings together: digests, and the UAVs that each node served.
 
 Each recording contains all input of its node, including frames from other nodes, so that each is
 replayed by itself. The assignment of UAVs to nodes is compared on the nodes' own clocks.
@@ -22,7 +22,7 @@ SAMPLE_NS: Final = 100_000_000  # sampling interval of the assignment
 
 @dataclass(slots=True, kw_only=True)
 class NodeRun:
-    """One node's run: its parts, its digest now and as recorded, and its duties in order."""
+    """Run of one node: its parts, its digest now and as recorded, and its duties in order."""
 
     node: str
     logs: list[Path]
@@ -84,7 +84,7 @@ def _name(log: Path) -> str:
 
 
 def _one_run(name: str, logs: list[Path]) -> list[Path]:
-    """Return the recordings of one node in order. Raises ``LogError`` if they are from two runs."""
+    """Return the recordings of one node in order; ``LogError`` if they are from two runs."""
     ordered = logs if len(logs) == 1 else replaying.in_order(logs)
     if ordered is None:
         raise LogError(
@@ -114,7 +114,7 @@ def _run(
 
 
 def _together(runs: Sequence[NodeRun]) -> dict[str, Any]:
-    """Return the fractions of the common time in which UAVs had one node, several, or none.
+    """Return the fractions of common time in which UAVs had one serving node, several, or none.
 
     A UAV counts from the first time at which any node serves it.
     """

@@ -2,7 +2,7 @@
 
 
 class Rate:
-    """Bits per second, from the bytes between two calls of ``look``."""
+    """Data rate in bits per second, from the bytes between two calls of ``look``."""
 
     def __init__(self) -> None:
         self.bytes = 0
@@ -10,7 +10,7 @@ class Rate:
         self._before: tuple[int, int] | None = None
 
     def look(self, now_ns: int) -> None:
-        """Compute the rate since the last call."""
+        """Compute the data rate since the last call."""
         if self._before is not None and now_ns > self._before[0]:
             t_ns, had = self._before
             self.bps = 8e9 * (self.bytes - had) / (now_ns - t_ns)

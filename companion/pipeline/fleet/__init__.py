@@ -1,1 +1,1 @@
-"""A fleet of nodes: shared frames, clocks of other nodes, assignment of UAVs, trust."""
+"""Fleet of nodes: shared frames, clocks of other nodes, assignment of UAVs, trust."""

@@ -7,7 +7,7 @@ the UAVs that it serves, so one more UAV at a node with n costs all of them toge
     10 (n + 1) log10(n + 1) - 10 n log10(n)   dB.
 
 Starting from the current assignment, UAVs without a node are placed. Then UAVs move in rings, each
-into the place that the next one leaves, while such a ring gains anything. Each further place at a
+to the node that the next one leaves, while such a ring increases the sum. Each further UAV at a
 node costs more than the one before, so this is a minimum cost flow: without an improving ring the
 assignment is optimal (Klein, "A primal method for minimal cost flows", 1967). A UAV's current node
 has a bonus of ``hysteresis_db``. The result depends on no order of arrival, chance or leader.
@@ -21,23 +21,23 @@ import numpy as np
 from companion.values import FloatArray, IntArray, Offer
 
 LIKELY_PENALTY_DB: Final = 10.0
-"""Deduction for a gain that is only likely, not guaranteed."""
+"""Deduction from an offer whose gain is only likely, not guaranteed, dB."""
 STEP_DB: Final = 0.1  # offers are rounded to steps, so that all nodes have the same numbers
 UNSERVED_DB: Final = -1e6
-"""Value of not being served: so low that every UAV is served if possible."""
+"""Value of not being served, dB: so low that every UAV is served if possible."""
 CYCLES_MAX: Final = 1000  # largest number of rings of moves per decision
 ROUNDING_DB: Final = 1e-7  # a smaller gain is a rounding error
 
 
 def offer_value_db(offer: Offer) -> float | None:
-    """Return the value of an offer to its UAV; None if the node cannot serve it."""
+    """Return the value of an offer to its UAV, dB; None if the node cannot serve the UAV."""
     if offer.sinr_db is None or offer.sure_db is not None:
         return offer.sinr_db
     return offer.sinr_db - LIKELY_PENALTY_DB
 
 
 def offer_values_db(offers: Mapping[str, Offer]) -> dict[str, float]:
-    """Return the values of all offers that have one."""
+    """Return the values, dB, of all offers that can serve their UAV."""
     found = ((uav, offer_value_db(offer)) for uav, offer in offers.items())
     return {uav: worth for uav, worth in found if worth is not None}
 
@@ -49,7 +49,7 @@ def assign(
     hysteresis_db: float,
     beside: Mapping[str, int] | None = None,
 ) -> dict[str, str]:
-    """Return the node that should serve each UAV, without UAVs for which no node has room.
+    """Return the node that should serve each UAV; UAVs for which no node has room are left out.
 
     offers         value of each node's offers, dB, by node and UAV
     holders        node that serves a UAV now
@@ -78,7 +78,7 @@ def assign(
 
 
 def _price_db(load: IntArray) -> FloatArray:
-    """Return the cost of one more UAV by the node's load; zero for not being served."""
+    """Return the cost of one more UAV by the node's load, dB; zero for not being served."""
     more = load + 1.0
     price: FloatArray = 10.0 * (more * np.log10(more) - load * np.log10(np.maximum(load, 1.0)))
     price[-1] = 0.0
@@ -86,7 +86,7 @@ def _price_db(load: IntArray) -> FloatArray:
 
 
 def _place(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> None:
-    """Assign each UAV without a node to the best node with room, as a start for the moves."""
+    """Assign each UAV without a node to the best node with room, as a start for the improvement."""
     unassigned = len(room) - 1
     for i in np.flatnonzero(at == unassigned):
         load[unassigned] -= 1
@@ -95,7 +95,7 @@ def _place(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> N
 
 
 def _improve(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> None:
-    """Move UAVs in rings, each into the place that the next one leaves, while that gains."""
+    """Move UAVs in rings, each to the node that the next one leaves, while the sum increases."""
     for _ in range(CYCLES_MAX):
         gain, who = _gains_db(worth, at)
         left = _price_db(np.maximum(load - 1, 0))
@@ -114,7 +114,7 @@ def _improve(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) ->
 
 
 def _gains_db(worth: FloatArray, at: IntArray) -> tuple[FloatArray, IntArray]:
-    """Return the largest gain of moving one UAV between two nodes, (from, to), and which UAV."""
+    """Return the largest gain, (from, to), of moving one UAV between two nodes, and that UAV."""
     count = worth.shape[1]
     gain, who = np.full((count, count), -np.inf), np.zeros((count, count), dtype=int)
     for a in range(count):
@@ -127,7 +127,7 @@ def _gains_db(worth: FloatArray, at: IntArray) -> tuple[FloatArray, IntArray]:
 
 
 def _positive_cycle(edges: FloatArray) -> list[tuple[int, int]]:
-    """Return a ring of edges with a positive sum; empty if none exists (Bellman, Ford).
+    """Return a ring of edges with a positive sum; empty if no such ring exists (Bellman, Ford).
 
     ``edges`` lead from row to column.
     """

@@ -23,15 +23,15 @@ from companion.values import Standing
 from companion.values.described import Meaning
 
 NEW_NODE_DELAY_NS: Final = 500_000_000
-"""Time without a holder after which a UAV is claimed; longer than the delay of a message."""
+"""Time without a serving node after which a UAV is claimed; longer than a message's delay."""
 ASSIGNED_NS: Final = 500_000_000  # time between two assignments while the nodes are the same
 SETTLED_NS: Final = 2_000_000_000
-"""Time for which a UAV must belong elsewhere before it is handed over."""
+"""Time for which a UAV must be assigned elsewhere before it is handed over."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Handover:
-    """A change of the node that serves a UAV, with this node as one side."""
+    """Change of the node that serves a UAV; this node is the old or the new one."""
 
     t_ns: Annotated[int, Meaning("when this node changed it")]
     uav: Annotated[str, Meaning("UAV that changed its node", example="3:1")]
@@ -40,7 +40,7 @@ class Handover:
 
 
 class Duties:
-    """The duties of one node.
+    """Duties of one node: the UAVs that it serves, and its handovers.
 
     name           its name
     most           largest number of UAVs that it serves
@@ -68,7 +68,7 @@ class Duties:
     # --- input ------------------------------------------------------------------------------
 
     def hear(self, now_ns: int, said: Standing) -> None:
-        """Take in the standing of another node."""
+        """Process the ``Standing`` of another node."""
         self._others[said.node] = (now_ns, said)
 
     def gone(self, now_ns: int, node: str) -> None:
@@ -78,7 +78,7 @@ class Duties:
             self._free_since[uav] = now_ns - NEW_NODE_DELAY_NS
 
     def others(self, now_ns: int) -> dict[str, Standing]:
-        """Return the newest standing of each other node whose lease has not expired."""
+        """Return the newest ``Standing`` of each other node whose lease has not expired."""
         for name in [n for n, (t_ns, _) in self._others.items() if now_ns - t_ns > self._lease_ns]:
             self.gone(now_ns, name)
         return {name: said for name, (_, said) in self._others.items()}
@@ -118,7 +118,7 @@ class Duties:
         standing: Mapping[str, Standing],
         offers: Mapping[str, Mapping[str, float]],
     ) -> dict[str, str]:
-        """Assign the UAVs that this node offers to serve, or serves.
+        """Assign the UAVs that this node offers to serve, or already serves.
 
         If all nodes receive all UAVs, these are all UAVs, and every node finds the same assignment.
         """
@@ -210,7 +210,7 @@ class Duties:
 
 
 def _claims(standing: Mapping[str, Standing]) -> dict[str, dict[str, float]]:
-    """Return the other nodes that serve each UAV, with its value to them when they claimed it."""
+    """Return the other nodes that serve each UAV, with its value to each at the claim, dB."""
     claims = dict[str, dict[str, float]]()
     for node, said in standing.items():
         for uav, worth in said.serves:

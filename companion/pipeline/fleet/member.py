@@ -1,4 +1,4 @@
-"""One node of a fleet: everything beyond its own pipeline, without a network.
+"""One node of a fleet: everything beyond its own pipeline, without network access.
 
 Pure: time is an argument, messages come in by methods, and outgoing messages are returned. The
 live node and the study of many nodes in virtual time use the same class.
@@ -44,13 +44,14 @@ ToLocal = Callable[[Place], Vector]
 
 
 class FleetMember:
-    """One node of a fleet. ``name`` is its name; ``elements`` is the size of its array.
+    """Logic of one node of a fleet: what it receives, decides and publishes.
 
-    ``neighbours`` are the other nodes by name, ``offers`` this node's own, ``handovers`` the newest
-    ones of this node, of ``handed_over`` in total. ``place`` and ``reach_m`` are the position of
-    its array and its range, as last published. ``near`` are the other nodes whose reports and
-    offers are used (``nearness.py``). ``gone`` are nodes that left, in order, with time and
-    position, until they return or are forgotten.
+    ``name`` is its name; ``elements`` is the size of its array. ``neighbours`` are the other nodes
+    by name, ``offers`` this node's own, ``handovers`` the newest ones of this node, of
+    ``handed_over`` in total. ``place`` and ``reach_m`` are the position of its array and its range,
+    as last published. ``near`` are the other nodes whose reports and offers are used
+    (``nearness.py``). ``gone`` are nodes that left, in order, with time and position, until they
+    return or are forgotten.
     """
 
     def __init__(
@@ -82,7 +83,7 @@ class FleetMember:
     # --- own input --------------------------------------------------------------------------
 
     def frame_received(self, now_ns: int, frame: Frame) -> None:
-        """Take in a frame received over one of this node's own links."""
+        """Process a frame received over one of this node's own links."""
         self.reception.behind_ns = max(now_ns - frame.t_ns, 0)
         if frame.msgid in SHARED:
             key = self.reception.take_received(frame)
@@ -90,7 +91,7 @@ class FleetMember:
                 self.sharing.frame_received(now_ns, frame, key)
 
     def round_trip_measured(self, trip: RoundTrip) -> None:
-        """Take in a TIMESYNC round trip of this node."""
+        """Process a TIMESYNC round trip that this node measured."""
         if self.neighbours:
             self.sharing.round_trip_measured(trip)
 
@@ -121,7 +122,7 @@ class FleetMember:
     def read_clock(
         self, node: str, started_ns: int, sent_ns: int, received_ns: int, remote_ns: int
     ) -> list[Notice]:
-        """Take in a reading of another node's clock, between two times of this one's."""
+        """Process a reading of another node's clock, between two times of this node's clock."""
         known = self.neighbours.get(node)  # no sign of life: Zenoh's threads answer
         if known is None:
             return []
@@ -147,7 +148,7 @@ class FleetMember:
     def take_shared(
         self, now_ns: int, node: str, said: Shared
     ) -> tuple[list[Frame | RoundTrip], list[Notice]]:
-        """Take in frames from another node. Returns the events for the pipeline, and notices."""
+        """Process frames from another node. Returns the events for the pipeline, and notices."""
         known = self._neighbour(now_ns, node)
         if known is None or not self.trust.is_trusted(node):
             return [], []
@@ -190,14 +191,14 @@ class FleetMember:
         return notices
 
     def take_standing(self, now_ns: int, said: Standing) -> None:
-        """Take in the standing of another node."""
+        """Process the ``Standing`` of another node."""
         known = self._neighbour(now_ns, said.node)
         if known is not None:
             known.standing = said
             self.duties.hear(now_ns, said)
 
     def take_offers(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> None:
-        """Take in all offers of another node."""
+        """Process all offers of another node."""
         known = self._neighbour(now_ns, node)
         if known is not None:
             known.offers = {offer.uav: offer for offer in offers}
@@ -210,7 +211,7 @@ class FleetMember:
         self.offers = dict(offers)
 
     def decide(self, now_ns: int) -> tuple[Duty | None, list[Notice]]:
-        """Decide which UAVs this node serves: returns its duty, None if unchanged, and notices."""
+        """Decide which UAVs this node serves. Returns its duty (None: unchanged) and notices."""
         notices = self.trust.readmit(now_ns)
         trusted = frozenset(node for node in self.neighbours if self.trust.is_trusted(node))
         offers = {self.name: offer_values_db(self.offers)}
@@ -251,8 +252,7 @@ class FleetMember:
     def check_vehicles(
         self, now_ns: int, positions: Mapping[str, Vector], own: Witness, local: ToLocal
     ) -> list[Notice]:
-        """Check vehicles that only one other node receives against all nodes that should receive
-        them.
+        """Check vehicles that only one other node receives against all that should receive them.
 
         ``positions`` are those of all vehicles known here, ``own`` is what this node receives.
         """
@@ -278,7 +278,7 @@ class FleetMember:
         return self.trust.check_vehicles(now_ns, told, witnesses, counts)
 
     def own_standing(self, now_ns: int, place: Place | None, reach_m: float | None) -> Standing:
-        """Return this node's standing, with position and range of its array; updates ``near``."""
+        """Return this node's ``Standing``, with its array's position and range; update ``near``."""
         self.place, self.reach_m = place, reach_m
         others = {node: known.standing for node, known in self.neighbours.items()}
         self.near = near(place, reach_m, others, self.near)
@@ -294,8 +294,7 @@ class FleetMember:
         )
 
     def _neighbour(self, now_ns: int, node: str) -> Neighbour | None:
-        """Return the record of a node that sent a message; None for this one, and beyond
-        ``NODES_MAX``."""
+        """Return the record of a sending node; None for this node, and beyond ``NODES_MAX``."""
         if node == self.name:
             return None
         known = self.neighbours.get(node)

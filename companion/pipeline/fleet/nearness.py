@@ -1,4 +1,4 @@
-"""Near nodes: those that may receive or serve the same UAVs as this one.
+"""Near nodes: those that may receive or serve the same UAVs as this node.
 
 Distant arrays have no UAV in common. So a node uses only the reports and offers of near nodes:
 those within a fixed distance, or whose ranges overlap. Its traffic then does not grow with the
@@ -14,13 +14,13 @@ from companion.values import Standing
 
 Place = tuple[float, float, float]
 ENTER_FACTOR: Final = 1.1
-"""Factor on the overlap of both ranges within which a node becomes near.
+"""Factor on the sum of two ranges within which a node becomes near.
 
 More than 1, as a range is only the distance of the farthest vehicle received so far.
 """
 LEAVE_FACTOR: Final = 1.3  # factor beyond which a near node ceases to be near
 ALWAYS_NEAR_M: Final = 10_000.0
-"""Distance within which a node is always near: a range is not the limit of an array."""
+"""Distance within which a node is always near; a range is not an array's limit."""
 
 
 def near(

@@ -21,28 +21,28 @@ from companion.values import Offer, RoundTrip, Standing
 DRIFT_MAX: Final = 200e-6
 """Largest drift between two nodes' clocks, a ratio: two ordinary crystals, disciplined or not."""
 ANSWERS: Final = 3
-"""Number of answers from which on a node's frames are used; the first answers are slow."""
+"""Number of clock answers after which a node's frames are used; the first answers are slow."""
 DELAYS_KEPT: Final = 4096
 DELAYS_WINDOW_NS: Final = 60_000_000_000  # time for which delays of reports are kept
 NOTICED_OFFSET_NS: Final = 100_000_000
-"""Clock offset between two nodes from which on a notice is published; with NTP it is smaller."""
+"""Clock offset between two nodes above which a notice is published; NTP keeps it smaller."""
 
 
 @dataclass(frozen=True, slots=True)
 class ClockOffset:
-    """This node's timeline less another's: an interval, ns."""
+    """Clock offset, this node's timeline less another's: an interval, ns."""
 
     low_ns: int
     high_ns: int
 
     @property
     def width_ns(self) -> int:
-        """Width of the interval."""
+        """Width of the clock offset's interval, ns."""
         return self.high_ns - self.low_ns
 
 
 class NeighbourClock:
-    """The clock of one other node."""
+    """Clock of one other node, on this node's timeline."""
 
     def __init__(self) -> None:
         self._evidence = OffsetEvidence(DRIFT_MAX)
@@ -50,18 +50,18 @@ class NeighbourClock:
         self._answers = 0
 
     def note_answer(self, sent_ns: int, received_ns: int, remote_ns: int) -> DriftProven | None:
-        """Take in a reading of the other clock; return the contradiction that it proves."""
+        """Process a reading of the other clock; return the contradiction that it proves."""
         self._newest_ns = remote_ns
         self._answers += 1
         return self._evidence.add(Interval(remote_ns, sent_ns - remote_ns, received_ns - remote_ns))
 
     @property
     def is_settled(self) -> bool:
-        """Whether frames can be placed; a sender's clock would keep the widest interval."""
+        """Whether the clock is known well enough to place frames in time."""
         return self._answers >= ANSWERS
 
     def offset(self, remote_ns: int) -> ClockOffset | None:
-        """Return the offset at a time of the other node; None before the first answer."""
+        """Return the clock offset at a time of the other node; None before the first answer."""
         known = self._evidence.at(remote_ns)
         return (
             None
@@ -70,7 +70,7 @@ class NeighbourClock:
         )
 
     def newest_offset(self) -> ClockOffset | None:
-        """Return the offset at the newest answer; None before the first."""
+        """Return the clock offset at the newest answer; None before the first answer."""
         return None if self._newest_ns is None else self.offset(self._newest_ns)
 
 
@@ -90,7 +90,7 @@ class Neighbour:
     _delays_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=DELAYS_KEPT))
 
     def note_delay(self, now_ns: int, way_ns: int) -> None:
-        """Note the largest possible delay of a report from this node."""
+        """Note the largest possible delay of a report from the other node."""
         self._delays_ns.append((now_ns, way_ns))
 
     def delays_ns(self, now_ns: int) -> list[int]:
@@ -100,7 +100,7 @@ class Neighbour:
 
 
 def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:
-    """Convert another node's round trip to this node's timeline, not shortened.
+    """Convert another node's round trip to this node's timeline, no shorter than it was.
 
     None while that node's clock is unknown.
     """

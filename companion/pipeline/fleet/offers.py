@@ -1,4 +1,4 @@
-"""Offers of this node: the gain and SINR that it would give each UAV, if it served that UAV alone.
+"""Offers of this node: gain and SINR that it would give each UAV, if it served that UAV alone.
 
 Offers are computed in batches: for a new UAV at once, otherwise about every two seconds. The
 caller holds the pipeline while UAVs are predicted; the beams are computed on any thread.
@@ -22,8 +22,7 @@ MIN_BATCH: Final = 2  # least number of UAVs per batch
 
 
 class Offers:
-    """The offers of one node. ``silent_s`` returns the age of a UAV's last report here; None:
-    never."""
+    """Offers of one node. ``silent_s`` returns the age of a UAV's last report; None: never."""
 
     def __init__(self, pipeline: Pipeline, silent_s: Callable[[str, int], float | None]) -> None:
         self.made: dict[str, Offer] = {}
@@ -36,7 +35,7 @@ class Offers:
         self._last_ns: int | None = None
 
     def look(self, now_ns: int) -> Callable[[], dict[str, Offer]] | None:
-        """Return a function that computes the offers that are due, on any thread; None if none is.
+        """Return a function that computes the due offers, on any thread; None if none are due.
 
         Pass its result to ``take``. Call this a few times a second, not at every update: it takes
         milliseconds even for few UAVs.
@@ -58,7 +57,7 @@ class Offers:
         self.made |= made
 
     def _made_of(self, now_ns: int, uavs: list[str]) -> Callable[[], dict[str, Offer]]:
-        """Predict these UAVs now, and return a function that computes their offers."""
+        """Predict some UAVs now, and return a function that computes the offers to them."""
         pipeline = self._pipeline
         at_ns = now_ns + round(pipeline.settings.beams.actuation_delay_s * 1e9)
         carrier = pipeline.carrier(now_ns, at_ns)
@@ -109,7 +108,7 @@ class Offers:
         return made
 
     def _least_db(self, made: BeamSet, angles_rad: list[float | None]) -> tuple[float | None, ...]:
-        """Return the least gain of each beam within these angles of its UAV's direction."""
+        """Return the least gain of each beam within given angles of its UAV's direction, dB."""
         array, towards = self._pipeline.array, directions(made)
         bounds = guarantee.covered_bounds(array, self._pipeline.coverage, towards, angles_rad)
         return guarantee.guaranteed_gains_db(array, towards, bounds, made.weights)

@@ -1,4 +1,4 @@
-"""Frames that this node receives itself, and those shared by other nodes; its own have priority.
+"""Reception of frames by this node, and of frames shared by other nodes; its own have priority.
 
 A shared report is used only if its vehicle is silent here. A node that sends wrong reports under a
 vehicle's id then cannot affect vehicles that this node receives. Shared reports of a vehicle that
@@ -19,16 +19,16 @@ from companion.pipeline.fleet.neighbours import NeighbourClock
 from companion.values import Frame, SharedFrame, Source
 
 SHARED: Final = OWN | {HEARTBEAT, GPS_RAW_INT}
-"""Messages that nodes share: position, accuracy and type of a vehicle."""
+"""Messages that nodes share with each other: position, accuracy and type of a vehicle."""
 KEPT_NS: Final = 10_000_000_000  # time for which contents of frames are remembered
 SILENT_INTERVALS: Final = 2.5
-"""Usual report intervals without a report after which a vehicle is silent here."""
+"""Report intervals without a report after which a vehicle is silent at this node."""
 SILENT_NS: Final = (200_000_000, 2_000_000_000)  # least and largest time for that
 MISSED: Final = 64  # shared reports kept per vehicle that were not received here
 VEHICLES_MAX: Final = 4096
-"""Limit on vehicles with a record; shared reports of others are used as they come."""
+"""Limit on vehicles with a record; beyond it, shared reports are used without a check."""
 FUTURE_NS: Final = 1_000_000
-"""Tolerance for frames received in the future, by the bounds on the clocks."""
+"""Tolerance for shared frames that seem received in the future, by the clock bounds."""
 OWN_NODE: Final = "here"
 
 
@@ -39,7 +39,7 @@ class RecentFrames:
         self._seen: OrderedDict[bytes, int] = OrderedDict()
 
     def note(self, now_ns: int, key: bytes) -> bool:
-        """Note a content. Returns whether it is new."""
+        """Note a frame's content. Returns whether the content is new."""
         while self._seen and next(iter(self._seen.values())) < now_ns - KEPT_NS:
             self._seen.popitem(last=False)
         if key in self._seen:
@@ -53,7 +53,7 @@ class RecentFrames:
 
 @dataclass(slots=True)
 class _VehicleReception:
-    """Reception of one vehicle: last report, usual interval, and missed shared reports."""
+    """Reception of one vehicle: last report, usual interval, and shared reports missed here."""
 
     heard_ns: int
     interval_ns: float = 0.0
@@ -67,7 +67,7 @@ class _VehicleReception:
 
 
 class Reception:
-    """Frames received here, and selection of the shared frames for the pipeline.
+    """Reception of frames, and selection of the shared frames for the pipeline.
 
     ``contradicted`` and ``early`` contain names of nodes whose frames contradict those of this or
     another node, or come too early; the reader clears them. ``behind_ns`` is the age of this node's
@@ -85,7 +85,7 @@ class Reception:
         self._duplicate_ids = DuplicateIds({OWN_NODE})
 
     def take_received(self, frame: Frame) -> bytes:
-        """Take in a frame received here, of a message in ``SHARED``. Returns its content."""
+        """Process a frame, of a message in ``SHARED``, received here. Returns its content."""
         key = content(frame.raw)
         if frame.msgid not in OWN:
             return key
@@ -140,7 +140,7 @@ class Reception:
         return key in self._shared
 
     def take_shared(self, now_ns: int, node: str, frame: Frame, key: bytes) -> list[Frame]:
-        """Return the frames for the pipeline after another node shared a frame; usually none."""
+        """Return frames for the pipeline after another node shared a frame; usually none."""
         if frame.msgid in OWN:
             return self._report(now_ns, node, frame, key)
         vehicle = self._vehicles.get(frame.source)
@@ -166,10 +166,10 @@ class Reception:
         return missed
 
     def silent_s(self, uav: str, now_ns: int) -> float | None:
-        """Return the age of a vehicle's last report received here; None: never received."""
+        """Return the age of a vehicle's last report received by this node; None: never received."""
         vehicle = self._vehicles.get(Source.parse(uav))
         return None if vehicle is None else (now_ns - vehicle.heard_ns) * 1e-9
 
     def forget(self, now_ns: int, after_ns: int) -> None:
-        """Forget vehicles that were not received here for this time."""
+        """Forget vehicles that this node has not received for a given time."""
         self._vehicles = {k: v for k, v in self._vehicles.items() if now_ns - v.heard_ns < after_ns}

@@ -1,4 +1,4 @@
-"""Sharing of this node's frames with the others: each report is shared once, by its speaker.
+"""Sharing of this node's frames with other nodes: one node, the speaker, shares each report.
 
 Several nodes that receive the same vehicle would all share the same reports. So one of them is its
 speaker and shares at once; the others hold a report for a moment and share it only if no other node
@@ -16,15 +16,15 @@ from companion.pipeline.fleet.reception import VEHICLES_MAX, RecentFrames
 from companion.values import Frame, RoundTrip, Shared, SharedFrame, Source
 
 HOLD_NS: Final = (60_000_000, 2_000_000_000)
-"""Least and largest time for which a report is held; longer than a message takes."""
+"""Least and largest time for which a report is held; longer than a message's delay."""
 HOLD: Final = 1.5  # hold time as a multiple of the longest message delay
 HOLD_DECAY: Final = 0.999  # factor on the hold time after each report shared by another in time
 SPEAKER_FRAMES: Final = 2
 """Reports in a row that no other node shared, after which this node becomes the speaker."""
 HELD_MAX: Final = 20_000
-"""Limit each on held frames, queued frames and queued round trips."""
+"""Limit on held frames, on queued frames, and on queued round trips."""
 AT_ONCE: Final = 500
-"""Limit on frames, and on round trips, per message; the rest goes into the next one."""
+"""Limit on frames, and on round trips, per message; the rest follows in the next message."""
 
 
 _T = TypeVar("_T")
@@ -32,7 +32,7 @@ _T = TypeVar("_T")
 
 @dataclass(slots=True)
 class _SpeakerState:
-    """A vehicle received here: last reception, whether this node is its speaker, and late reports.
+    """Vehicle received by this node: last reception, whether this node is its speaker.
 
     ``late`` counts reports in a row that this node had to share after holding them.
     """
@@ -69,7 +69,7 @@ class Sharing:
         self._trips: deque[RoundTrip] = deque()
 
     def frame_received(self, now_ns: int, frame: Frame, key: bytes) -> None:
-        """Take in a frame received here, with its content.
+        """Process a frame received by this node, with its content.
 
         The hold time starts now, not at its arrival: if frames are queued here, so are the other
         nodes' messages. Otherwise an overloaded node would also share what the others have shared,
@@ -90,13 +90,13 @@ class Sharing:
             self._enqueue(self._held, _Held(now_ns + round(self._hold_ns), key, frame))
 
     def round_trip_measured(self, trip: RoundTrip) -> None:
-        """Take in a round trip; it is shared if this node is the vehicle's speaker."""
+        """Process a round trip; share it if this node is the vehicle's speaker."""
         speaker = self._speakers.get(trip.source)
         if speaker is not None and speaker.is_own:
             self._enqueue(self._trips, trip)
 
     def note_shared(self, now_ns: int, node: str, source: Source, key: bytes, way_ns: int) -> None:
-        """Note that another node shared a report, with the largest delay of its message."""
+        """Note that another node shared a report, and the largest delay of its message."""
         self._by_others.note(now_ns, key)
         if key in self._shared_by_self:
             speaker = self._speakers.get(source)
@@ -107,7 +107,7 @@ class Sharing:
             self._hold_ns = max(HOLD_DECAY * self._hold_ns, HOLD_NS[0])
 
     def next_message(self, now_ns: int) -> Shared | None:
-        """Return the message to publish now; None if there is none, or the last is too recent."""
+        """Return the message to publish now; None if empty, or if the last one is too recent."""
         self._release_held(now_ns)
         if 0 <= now_ns - self._sent_ns < self._every_ns:
             return None
@@ -145,11 +145,11 @@ class Sharing:
         return max(due_ns - now_ns, 0)
 
     def forget(self, now_ns: int, after_ns: int) -> None:
-        """Forget vehicles that were not received here for this time."""
+        """Forget vehicles that this node has not received for a given time."""
         self._speakers = {k: v for k, v in self._speakers.items() if now_ns - v.heard_ns < after_ns}
 
     def clear(self) -> None:
-        """Forget everything: no other node is connected."""
+        """Forget everything, since no other node is connected."""
         self._speakers.clear()
         self._held.clear()
         self._frames.clear()
@@ -169,5 +169,5 @@ class Sharing:
 
 
 def _first(waiting: deque[_T]) -> tuple[_T, ...]:
-    """Take the first ``AT_ONCE`` entries."""
+    """Remove and return the first ``AT_ONCE`` entries of a queue."""
     return tuple(waiting.popleft() for _ in range(min(AT_ONCE, len(waiting))))

@@ -10,18 +10,18 @@ from companion.pipeline.fold import Pipeline
 from companion.values import Carrier, Notice, Vector, kind_of
 
 RECENT_S: Final = 5.0
-"""Largest age of a vehicle's last report for it to count for the range."""
+"""Largest age of a vehicle's last report at which it counts for this node's range, seconds."""
 
 
 class Surroundings:
-    """UAVs and carrier of one node's pipeline, for its part in the fleet."""
+    """UAVs and carrier of one node's pipeline, as its fleet logic needs them."""
 
     def __init__(self, pipeline: Pipeline, member: FleetMember) -> None:
         self._pipeline = pipeline
         self._member = member
 
     def place(self) -> Place | None:
-        """Return latitude, longitude and height of this node's array; None if unknown."""
+        """Return latitude, longitude and height of this node's array; None if they are unknown."""
         carrier, local = self._pipeline.last_carrier, self._pipeline.local
         if carrier is None or local is None:
             return None
@@ -29,7 +29,7 @@ class Surroundings:
         return place.lat_deg, place.lon_deg, place.alt_m
 
     def reach_m(self, now_ns: int) -> float | None:
-        """Return the distance of the farthest vehicle received here; None without any."""
+        """Return the distance of the farthest vehicle that this node receives; None without any."""
         carrier = self._pipeline.last_carrier
         return None if carrier is None else self._reach_m(carrier, self._positions(), now_ns)
 
@@ -43,8 +43,7 @@ class Surroundings:
         return max(away_m, default=None)
 
     def phantoms(self, now_ns: int) -> list[Notice]:
-        """Check vehicles that only one other node receives against the nodes that should receive
-        them."""
+        """Check vehicles that only one other node receives against those that should."""
         local, carrier = self._pipeline.local, self._pipeline.last_carrier
         if local is None or carrier is None:
             return []

@@ -24,13 +24,13 @@ CONTRADICTION_WINDOW_NS: Final = 30_000_000_000
 EXCLUDED_NS: Final = 300_000_000_000  # duration of an exclusion
 PHANTOMS_MIN: Final = 2  # number of phantom vehicles from which on their node is excluded
 SILENT_AFTER_NS: Final = 8_000_000_000
-"""Time after which a vehicle that others should receive, but do not, counts as a phantom."""
+"""Time without reception elsewhere after which a vehicle counts as a phantom."""
 REACH_SHARE: Final = 0.7
 """Fraction of a node's range within which it receives every vehicle."""
 
 
 class Witness(NamedTuple):
-    """A node that can confirm or refute that a vehicle is at a position."""
+    """Node that can confirm or refute that a vehicle is at a position."""
 
     place_ned_m: tuple[float, float, float]  # position of its array in the local frame
     reach_m: float  # distance of the farthest vehicle that it receives itself
@@ -46,7 +46,7 @@ class UnconfirmedVehicle(NamedTuple):
 
 
 class Trust:
-    """Trust in the other nodes. ``excluded`` maps excluded nodes to the reason."""
+    """Trust in other nodes. ``excluded`` maps excluded nodes to the reason."""
 
     def __init__(self) -> None:
         self.excluded: dict[str, str] = {}
@@ -60,7 +60,7 @@ class Trust:
         return node not in self.excluded
 
     def note_contradiction(self, now_ns: int, node: str, what: str) -> list[Notice]:
-        """Note a contradiction; ``what`` is a predicate, to follow "it"."""
+        """Note a node's contradiction; ``what`` is a predicate, to follow "it"."""
         times = self._times.setdefault((node, what), deque(maxlen=CONTRADICTIONS))
         times.append(now_ns)
         if len(times) < CONTRADICTIONS or now_ns - times[0] > CONTRADICTION_WINDOW_NS:
@@ -74,8 +74,7 @@ class Trust:
         witnesses: Mapping[str, Witness],
         heard: Mapping[str, int],
     ) -> list[Notice]:
-        """Check vehicles that only one other node shares against the nodes that should receive
-        them.
+        """Check vehicles that only one other node shares against those that should receive them.
 
         ``heard`` is the number of vehicles that each node claims to receive.
         """
@@ -108,7 +107,7 @@ class Trust:
 
     @property
     def unconfirmed(self) -> frozenset[str]:
-        """Vehicles that only one node shares, though others should receive them."""
+        """Vehicles that only one other node shares, though more nodes should receive them."""
         return frozenset(self._silent_since)
 
     def forget(self, now_ns: int) -> None:

@@ -1,8 +1,8 @@
-"""A recorder on its own thread, so that the event loop never waits for a disk.
+"""Recorder on its own thread, so that the event loop never waits for a disk.
 
 The queue is bounded; events that do not fit are counted and reported. After a disk error, writing
-is retried with growing delays; on a full disk, as soon as it has space. Events not yet on the disk
-are kept in the queue, and the recording continues in a new file, which states what is missing.
+is retried with growing delays; on a full disk, as soon as the disk has space. Events not yet on the
+disk are kept in the queue, and the recording continues in a new file, which states what is missing.
 
 Over 300 lines: one thread with its queue, its failures and its parts.
 """
@@ -22,7 +22,7 @@ from companion.recording.writer import Writer
 from companion.values import ClockSet, Event, Output, Severity
 
 QUEUE_MAX: Final = 50_000
-"""Limit on events waiting to be written: some seconds of the busiest stream.
+"""Limit on events waiting to be written: some seconds of the busiest traffic.
 
 About 60 MB if twenty UAVs report ten times a second (1.3 kB per event with its outputs).
 """
@@ -31,10 +31,9 @@ GATHER_S: Final = 0.02
 AT_ONCE: Final = 500  # events between two checks whether a flush is due
 FLUSH_S: Final = 1.0  # time between two flushes to disk
 FLUSH_FIRST_S: Final = 0.1
-"""Time before the first flush of a file; it then doubles, so that a short run also leaves a file.
-"""
+"""Time before the first flush of a file; it then doubles, so that a short run is saved too."""
 RETRY_FIRST_S: Final = 1.0
-"""Time before the first retry after a disk error; it doubles each time.
+"""Time before the first retry after a disk error; the time doubles with each retry.
 
 Free space on a full disk is checked without writing, at the interval of the first retry.
 """
@@ -43,14 +42,14 @@ STOP_MAX_S: Final = 30.0  # longest wait for an unresponsive disk at the end of 
 RESUME_BATCH: Final = 2000
 """Events written at once when a recording continues: some hundred kilobytes."""
 MIN_FREE_BYTES: Final = 8 << 20
-"""Free space needed to continue a recording; with less it would soon stop again."""
+"""Free space needed to continue a recording; with less, it would soon stop again."""
 
 _TOO_SLOW: Final = "the disk was too slow"
 
 
 @dataclass(frozen=True, slots=True)
 class Rotation:
-    """When a new part begins: at a size in bytes, or after a time in seconds; None: never."""
+    """When a new part of a recording begins: at a size in bytes or after seconds; None: never."""
 
     size_bytes: float | None = None
     after_s: float | None = None
@@ -60,7 +59,7 @@ NEVER: Final = Rotation()  # never begin a new part
 
 
 class _Item(NamedTuple):
-    """An event and its outputs; ``missed`` events before it did not fit into the queue."""
+    """Event with its outputs; ``missed`` events before it did not fit into the queue."""
 
     event: Event | None
     outputs: Sequence[Output]
@@ -75,7 +74,7 @@ class BackgroundRecorder:
     """Recorder on a thread, with one ``Writer`` for each part from ``start`` to ``stop``.
 
         open_part  creates the writer of a part. The first is created at once, and its ``OSError``
-                   is raised to the caller; errors of later ones are handled here
+                   is raised to the caller; errors of later parts are handled here
         geodetic   converts positions, for ``Encoder.output``
         rotation   when a new part begins
         queue_max  limit on queued events
@@ -125,7 +124,7 @@ class BackgroundRecorder:
         self._thread.start()
 
     def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
-        """Queue an event and its outputs; the event is None for outputs without one.
+        """Queue an event and its outputs; the event is None for outputs without an event.
 
         Never blocks. Call it on one thread only.
 
@@ -195,7 +194,7 @@ class BackgroundRecorder:
                 return
 
     def _record(self) -> bool:
-        """Write until stopped; return False after an error."""
+        """Write queued events until stopped; return False after an error."""
         try:
             self._resume()
             self._write_until_stopped()
@@ -206,7 +205,7 @@ class BackgroundRecorder:
         return True
 
     def _resume(self) -> None:
-        """Begin a file with the events that the previous file did not get."""
+        """Begin a file with the events that could not be written to the previous file."""
         if self._lost:
             t_ns = next((item.t_ns for item in self._unflushed if item.t_ns), self.written_ns or 0)
             self._writer.hole(Hole(t_ns, self._lost, self._why))
@@ -247,7 +246,7 @@ class BackgroundRecorder:
             self._writer.output(output, self._geodetic)
 
     def _write_utc(self, event: Event) -> None:
-        """Begin each file with the offset to UTC, so that it can be read alone."""
+        """Begin each file with the offset to UTC, so that one file alone can be read."""
         known = self._clock_set
         if isinstance(event, ClockSet):
             self._clock_set = event
@@ -276,7 +275,7 @@ class BackgroundRecorder:
             self._open_next()
 
     def _open_next(self) -> None:
-        """Open the next part, or the same part again if nothing of it is on the disk."""
+        """Open the next part, or the same part again if none of it is on the disk."""
         before = self._writer
         part = self._part.after(before.path.name) if before.flushed else self._part
         made = self._open_part(part)
@@ -286,7 +285,7 @@ class BackgroundRecorder:
     # --- disk errors ------------------------------------------------------------------------
 
     def _fail(self, error: OSError) -> None:
-        """Handle a disk error; it is reported once, not at every retry."""
+        """Handle a disk error; publish a notice of the first, but not of failed retries."""
         self._why = error.strerror or str(error)
         if self.failure is None:
             text = f"nothing is recorded: {self._writer.path}: {self._why}; trying again"
@@ -298,7 +297,7 @@ class BackgroundRecorder:
             self._unflushed.clear()
 
     def _reopen(self) -> bool:
-        """Retry until it works; return False if the service ends before."""
+        """Retry to open a file until that succeeds; return False if the service ends before."""
         while True:
             stopped = self._stopping.wait(self._retry_s)
             try:

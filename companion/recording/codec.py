@@ -19,9 +19,9 @@ from companion.values import (
 )
 
 FRAME_ID: Final = "wgs84"
-"""Frame of every LocationFix: Earth-fixed, x through 0° E, z through the north pole."""
+"""Frame of reference of every LocationFix: Earth-fixed, x through 0° E, z to the north pole."""
 OFFSET_MAX_NS: Final = 1 << 62
-"""Limit on the offset of UTC from a timeline, 146 years, so that their sum is a valid date."""
+"""Limit on UTC less the node's timeline, 146 years, so that results are valid dates."""
 _LEVEL: Final = {
     Severity.INFO: schemas.LogMessage.INFO,
     Severity.WARNING: schemas.LogMessage.WARNING,
@@ -73,7 +73,7 @@ def predicted(track: Track, lat_deg: float, lon_deg: float, alt_m: float) -> Any
 
 
 def _spread(message: Any, horizontal_m: float, vertical_m: float) -> None:
-    """Set the covariance of a LocationFix from bounds; east, north, up."""
+    """Set the covariance of a LocationFix from error bounds; order east, north, up."""
     plane_m2, height_m2 = horizontal_m**2 / 2, vertical_m**2
     message.position_covariance.extend((plane_m2, 0, 0, 0, plane_m2, 0, 0, 0, height_m2))
     message.position_covariance_type = schemas.LocationFixMessage.APPROXIMATED
@@ -127,7 +127,7 @@ def to_duty(data: bytes) -> Duty:
 
 
 def to_clock_set(data: bytes) -> ClockSet:
-    """Decode a change of the clock. Raises ``DecodeError``, or ``ValueError`` if out of range."""
+    """Decode a step of the wall clock. Raises ``DecodeError``, or ``ValueError`` out of range."""
     found = fields.value_of(ClockSet, schemas.ClockSetMessage.FromString(data))
     if abs(found.utc_offset_ns) > OFFSET_MAX_NS:
         raise ValueError("UTC offset out of range")
@@ -135,7 +135,7 @@ def to_clock_set(data: bytes) -> ClockSet:
 
 
 def to_rejection(data: bytes) -> Rejection | None:
-    """Decode a rejection; None for one by the pipeline, which a replay will repeat."""
+    """Decode a rejection; None for the pipeline's own rejections, which a replay repeats."""
     message = schemas.RejectionMessage.FromString(data)
     if not message.is_event:
         return None

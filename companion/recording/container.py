@@ -30,7 +30,7 @@ MAGIC: Final = b"\x89MCAP0\r\n"
 _HEADER: Final = struct.Struct("<BQ")  # opcode, length of the body
 _MESSAGE: Final = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _END: Final = struct.Struct("<BQQQI8s")
-"""The footer record and the magic bytes.
+"""Layout of an MCAP file's footer record and magic bytes.
 
 Opcode, length, start of the summary, start of its offsets, and CRC-32 from the start of the summary
 to just before itself.
@@ -38,7 +38,7 @@ to just before itself.
 _UNCHECKED: Final = 4 + len(MAGIC)
 
 LARGEST: Final = 1 << 25
-"""Limit on the size of a record, or of a chunk's contents.
+"""Limit on the bytes of an MCAP record, or of a chunk's contents.
 
 Chunks of this program have about 1 MiB, the largest settings 27 MiB.
 """
@@ -46,14 +46,14 @@ _LARGEST_MESSAGE: Final = 1 << 24
 _LARGEST_SUMMARY: Final = 1 << 26  # two weeks of a chunk a second
 _DESCRIPTIONS: Final = 1 << 25  # limit on all schemas and channels together, bytes
 _LARGEST_PAIRS: Final = 1 << 16
-"""Limit on a channel, or a metadata record, in bytes.
+"""Limit on the bytes of a channel record or of a metadata record.
 
 Their names and values become objects of many more bytes; those of this program have hundreds.
 """
 _PAIR: Final = 256  # overhead of a name and its value in memory, bytes
 _MOST: Final = 10_000  # limit each on attachments and on metadata records of a file
 _RATIO_MAX: Final = 50
-"""Limit on unpacked bytes per byte of a file, in addition to one largest chunk.
+"""Limit on unpacked bytes per byte of a file, beyond the contents of one largest chunk.
 
 Ten times the ratio found in recordings; a decompression bomb has thousands.
 """
@@ -65,11 +65,11 @@ _DAMAGE: Final = (McapError, struct.error, ValueError, OverflowError)
 _READ: Final = frozenset(
     (Opcode.ATTACHMENT, Opcode.METADATA, Opcode.SCHEMA, Opcode.CHANNEL, Opcode.MESSAGE)
 )
-"""Records outside of chunks that are read; the others are indexes."""
+"""Record types that are read outside of chunks; the others are indexes."""
 
 
 class Message(NamedTuple):
-    """A message of a recording, with its channel."""
+    """Message of a recording, with its channel."""
 
     channel: Channel
     sequence: int
@@ -79,7 +79,7 @@ class Message(NamedTuple):
 
 
 class Damage(NamedTuple):
-    """Bytes that could not be read, or without a description."""
+    """Bytes of a recording that could not be read, or that lack a description."""
 
     size_bytes: int
 
@@ -88,9 +88,9 @@ Content = Message | Attachment | Metadata | Damage
 
 
 class Walk:
-    """One pass over a file. Iterate once; its attributes are complete afterwards.
+    """Single pass over an MCAP file. Iterate once; its attributes are complete afterwards.
 
-    ``topics`` limits the messages returned; None: all; empty: none, and chunks are skipped unread.
+    ``topics`` limits the messages returned. None: all. Empty: none; chunks are skipped unread.
     Raises ``OSError`` if the file cannot be read.
     """
 
@@ -129,7 +129,7 @@ class Walk:
                 self._describe(opcode, body)
 
     def _records(self, file: IO[bytes]) -> Iterator[tuple[int, int]]:
-        """Yield (opcode, length) of the records, with the file positioned at the body."""
+        """Yield (opcode, length) of each record, with the file positioned at the record's body."""
         size = self.path.stat().st_size
         self._room = LARGEST + _RATIO_MAX * size
         at = len(file.read(len(MAGIC)))
@@ -221,8 +221,7 @@ class Walk:
 
 
 def _split(data: bytes) -> Iterator[tuple[int, bytes]]:
-    """Yield (opcode, body) of the records in a chunk. Raises ``ValueError`` for an incomplete
-    one."""
+    """Yield (opcode, body) of the records in a chunk. ``ValueError`` for an incomplete record."""
     at, end = 0, len(data)
     while at < end:
         opcode, length = _HEADER.unpack_from(data, at)

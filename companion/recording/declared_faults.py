@@ -20,7 +20,7 @@ _END_NS: Final = 2**62
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeclaredFault:
-    """A fault of one vehicle, by its system id, between two times of the log."""
+    """Fault of one vehicle, by system id, between two times of the log."""
 
     sysid: int
     name: str
@@ -29,7 +29,7 @@ class DeclaredFault:
 
 
 def declared_faults(log: Path) -> tuple[DeclaredFault, ...]:
-    """Return the faults declared beside a log; none without such a file.
+    """Return the faults declared beside a log; none if there is no such file.
 
     Raises ``LogError`` if the file is not a list of events.
     """
@@ -68,8 +68,7 @@ def _is_end(name: str) -> bool:
 
 
 def _ends(name: str, said: str) -> bool:
-    """Return whether an entry ends a fault: ``X_on`` ends ``X_off``, ``X_end`` all that begin with
-    X."""
+    """Return whether an entry ends a fault: ``X_on`` ends ``X_off``, ``X_end`` all ``X...``."""
     if said.endswith("_on"):
         return name == f"{said.removesuffix('_on')}_off"
     return said.endswith("_end") and name.startswith(said.removesuffix("_end"))

@@ -12,11 +12,11 @@ from companion.recording.tlog import STAMP
 
 _TAIL: Final = 1 << 16  # bytes at the end of a telemetry log that are searched for its last frame
 _LONGEST_NS: Final = 10 * 86_400 * 1_000_000_000
-"""A log that seems longer has a wrong stamp at one end."""
+"""Longest plausible log; a longer one has a wrong stamp at one end."""
 
 
 def span_ns(logs: Sequence[Path]) -> tuple[int, int] | None:
-    """Return the first and last time of some logs together, ns since 1970.
+    """Return the common first and last time of some logs, ns since 1970.
 
     None if the ends of one of them are unknown: raw MAVLink, a truncated recording, jumping stamps.
     Raises ``OSError`` for a file that cannot be read.

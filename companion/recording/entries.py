@@ -1,4 +1,4 @@
-"""Encoding of events and outputs as messages on topics, for recordings and live viewers.
+"""Encoding of events and outputs as messages on topics, for recordings and viewers.
 
 Events, which drive the pipeline, are all sent, in order. Of the outputs, every fix is sent;
 tracks, weights and the scene are sent at a limited rate, since a replay computes them again.
@@ -37,7 +37,7 @@ Latitude and longitude are in degrees, altitude is in metres, each (N,).
 """
 
 Emit = Callable[[str, Schema, int, bytes], None]
-"""Function that takes topic, schema, time in nanoseconds and the message's bytes."""
+"""Function to which topic, schema, time in nanoseconds and the message's bytes are passed."""
 
 NAMED: Final = (
     (schemas.FRAMES_TOPIC, schemas.FRAME),
@@ -49,11 +49,11 @@ NAMED: Final = (
     (schemas.SCENE_TOPIC, schemas.SCENE_UPDATE),
     (schemas.LOG_TOPIC, schemas.LOG),
 )
-"""Topics that exist in every run; those of a UAV are added with it."""
+"""Topics that exist in every run; a UAV's topics are added with the UAV."""
 
 
 class RateLimit:
-    """Rate limit, by the times of the items; None: no limit."""
+    """Rate limit by the times of the limited items; a rate of None is no limit."""
 
     def __init__(self, rate_hz: float | None) -> None:
         self._period_ns = 0 if rate_hz is None else int(1e9 / rate_hz)
@@ -87,7 +87,7 @@ class Encoder:
         self._frame_bytes = schemas.FrameEncoder().encode
 
     def event(self, event: Event) -> None:
-        """Send an event that drives the pipeline: in the order of the calls, before its outputs."""
+        """Send an event that drives the pipeline: in the order of calls, before its outputs."""
         self._last_event = event
         if isinstance(event, Frame):  # before the match: nearly all events are frames
             data = self._frame_bytes(event)
@@ -113,7 +113,7 @@ class Encoder:
                 self._emit(schemas.CLOCK_TOPIC, schemas.CLOCK_SET, event.t_ns, data)
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
-        """Send an output. A rejection that is the last event itself is not sent twice.
+        """Send an output, except a rejection that is itself the last event sent.
 
         A fix is sent at its arrival; its message contains the time at which it was true.
         ``geodetic`` is only called with the positions of an update's tracks, if there are any.

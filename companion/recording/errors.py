@@ -1,7 +1,7 @@
-"""The error for a file that cannot be used."""
+"""Error for a log file that cannot be used."""
 
 from companion.values import UserError
 
 
 class LogError(UserError):
-    """A file that cannot be used. The message is one line: the file, and the reason."""
+    """Error of a log file that cannot be used. The message is one line: file and reason."""

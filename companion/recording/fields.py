@@ -34,7 +34,7 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, slots=True)
 class RecordedRejection:
-    """A rejection, and whether it is an event of the pipeline rather than its output."""
+    """Rejection as recorded, with whether it is an event of the pipeline or its output."""
 
     rejection: Annotated[Rejection, Inline()]
     is_event: Annotated[bool, Meaning("whether it comes from framing, before the pipeline", 7)]
@@ -42,7 +42,7 @@ class RecordedRejection:
 
 @dataclass(frozen=True, slots=True)
 class RecordedTrack:
-    """A track, and the time of its update."""
+    """Track as recorded, with the time of its update."""
 
     track: Annotated[Track, Inline()]
     t_ns: Annotated[int, Meaning("when the update was computed", 14)]
@@ -93,11 +93,11 @@ CLASSES: Final[dict[str, type]] = {
     "Offer": Offer,
     "ClockSet": ClockSet,
 }
-"""The messages of recordings, and the classes whose described values are their fields."""
+"""Classes of the values that recordings contain, by the name of their message."""
 
 
 class Field(NamedTuple):
-    """One field of a message: its declaration, and its getter."""
+    """Field of a recorded message: its declaration, and its getter."""
 
     number: int
     name: str
@@ -110,8 +110,9 @@ class Field(NamedTuple):
 def fields(message: str) -> tuple[Field, ...]:
     """Return the fields of a recorded message, by number.
 
-    The protobuf type follows from the value's: times are fixed64, other integers uint32, vectors
-    and tuples repeated, optional values optional; a ``Source`` is two fields, sysid and compid.
+    The protobuf type follows from the value's type: times are fixed64, other integers uint32,
+    vectors and tuples repeated, optional values optional; a ``Source`` is two fields, sysid and
+    compid.
     """
     found = (one for member in members(CLASSES[message]) for one in _fields(member))
     return tuple(sorted(found, key=lambda one: one.number))
@@ -157,7 +158,7 @@ def _part(get: Callable[[Any], Any], part: str) -> Callable[[Any], Any]:
 
 
 def _listed(get: Callable[[Any], Any]) -> Callable[[Any], list[float]]:
-    """Return a getter of a vector as a list, empty if unknown."""
+    """Return a getter that returns a vector as a list, empty if unknown."""
 
     def listed(value: Any) -> list[float]:
         vector = get(value)
@@ -171,12 +172,12 @@ def _messages(name: str, get: Callable[[Any], Any]) -> Callable[[Any], list[dict
 
 
 def values(message: str, value: Any) -> dict[str, Any]:
-    """Return the fields of a message by name."""
+    """Return the values of the fields of a message, by field name."""
     return {one.name: one.get(value) for one in fields(message)}
 
 
 def value_of(kind: type[T], found: Any) -> T:
-    """Return a flat value of a class from its message."""
+    """Return a value of a class without nested values, from its message."""
     values = {
         member.name: Source(found.sysid, found.compid)
         if member.type is Source

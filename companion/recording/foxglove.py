@@ -1,8 +1,8 @@
-"""Live channels of a recording on a WebSocket, for Foxglove and Lichtblick.
+"""Live channels with a recording's messages on a WebSocket, for Foxglove and Lichtblick.
 
-Needs the package foxglove-sdk, which the extra ``live`` installs. The server is the package's, on
-its own threads; the messages are encoded on a thread here. The event loop only queues events;
-events that a slow viewer cannot take are dropped.
+Needs the package foxglove-sdk, which the extra ``live`` installs. The package's server runs on its
+own threads; messages are encoded on another thread. The event loop only queues events; events that
+a slow viewer cannot take are dropped.
 """
 
 import contextlib
@@ -27,7 +27,7 @@ _Item = tuple[Event | None, Sequence[Output]]
 
 
 class LiveError(UserError):
-    """The live channels cannot be served."""
+    """Error of live channels that cannot be served."""
 
 
 class LiveChannels:
@@ -72,11 +72,11 @@ class LiveChannels:
         self._thread = threading.Thread(target=self._run, name="foxglove", daemon=True)
 
     def start(self) -> None:
-        """Start to send."""
+        """Start to send messages."""
         self._thread.start()
 
     def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
-        """Queue an event and its outputs; the event is None for outputs without one.
+        """Queue an event and its outputs; the event is None for outputs without an event.
 
         Never blocks.
         """

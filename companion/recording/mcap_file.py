@@ -1,4 +1,4 @@
-"""Writer of MCAP: chunks of messages with their indexes, attachments, metadata, and the summary.
+"""Writer of MCAP files: chunks of messages with indexes, attachments, metadata, summary.
 
 The library's writer creates objects for every message and packs each of its fields separately,
 which takes most of the time of a recording. Here a message is one packed head and its bytes; rare
@@ -36,7 +36,7 @@ from companion.recording.container import MAGIC
 
 CHUNK_BYTES: Final = 1 << 20  # size of its contents at which a chunk ends
 _MESSAGE: Final = struct.Struct("<BQHIQQ")
-"""Opcode, length of the body, channel, sequence, log time and publish time of a message."""
+"""Layout of a message: opcode, body length, channel, sequence, log time, publish time."""
 _FIELDS: Final = _MESSAGE.size - 9  # size of a message's head, without opcode and length
 _INDEX: Final = struct.Struct("<BQHI")  # opcode, length, channel, length of the entries
 _FOOTER_START: Final = struct.Struct("<BQQQ")  # the part of the footer that its checksum covers
@@ -49,7 +49,7 @@ def _bytes(record: McapRecord) -> bytes:
 
 
 class McapFile:
-    """An MCAP file written to a stream, which stays open.
+    """MCAP file that is written to a stream, which stays open.
 
     Log times must be at least 0, sequence numbers below 2^32. Any method raises ``OSError`` if the
     stream does.

@@ -1,4 +1,4 @@
-"""Runs recorded in several files, and the events missing from them.
+"""Runs that were recorded in several files, and the events missing from these files.
 
 A recording is split into *parts* by size and time, and continues in a new part after a disk error.
 Each part identifies itself, so that a replay can join them. Where events could not be recorded, a
@@ -20,7 +20,7 @@ from companion.values import UserError, printable
 PART: Final = "part"
 HOLE: Final = "hole"
 HOLES_MAX: Final = 1000
-"""Limit on holes listed individually; the events of further ones are added to the last."""
+"""Limit on gaps that are listed one by one; further missing events are added to the last gap."""
 WHY_MAX: Final = 200
 EVENTS_MAX: Final = (1 << 63) - 1
 NUMBER_DIGITS: Final = 9  # limit on the digits of a part's number
@@ -28,7 +28,7 @@ _LATEST_NS: Final = 1 << 62
 
 
 class Part(NamedTuple):
-    """Identity of a part: its run, and its number in it."""
+    """Identity of a part of a recording: its run, and its number in the run."""
 
     run: str  # the same in all parts of a run
     number: int  # from 1
@@ -36,20 +36,20 @@ class Part(NamedTuple):
 
     @classmethod
     def first(cls) -> Self:
-        """Return the first part of a new run."""
+        """Return the identity of the first part of a new run."""
         return cls(uuid4().hex, 1, "")
 
     def after(self, name: str) -> "Part":
-        """Return the part that follows this one, which is in the file ``name``."""
+        """Return the identity of the next part, given that this part is in the file ``name``."""
         return Part(self.run, self.number + 1, name)
 
     def metadata(self) -> dict[str, str]:
-        """Return the part as in a file."""
+        """Return the part's identity as metadata of a file."""
         return {"run": self.run, "number": str(self.number), "continues": self.continues}
 
     @classmethod
     def from_metadata(cls, found: Mapping[str, str]) -> "Part | None":
-        """Parse a part; None if the metadata are not one."""
+        """Parse a part's identity; None if the metadata contain none."""
         number = found.get("number", "")
         if not number.isdecimal() or len(number) > NUMBER_DIGITS or "run" not in found:
             return None
@@ -57,19 +57,19 @@ class Part(NamedTuple):
 
 
 class Hole(NamedTuple):
-    """A gap: ``events`` before ``t_ns``, after those written before, were not recorded."""
+    """Gap in a recording: ``events`` events before ``t_ns`` were not recorded."""
 
     t_ns: int
     events: int
     why: str
 
     def metadata(self) -> dict[str, str]:
-        """Return the hole as in a file."""
+        """Return the gap as metadata of a file."""
         return {"t_ns": str(self.t_ns), "events": str(self.events), "why": self.why}
 
     @classmethod
     def from_metadata(cls, found: Mapping[str, str]) -> "Hole":
-        """Parse a hole. Raises ``ValueError`` if the metadata are not one."""
+        """Parse a gap. Raises ``ValueError`` if the metadata do not describe a gap."""
         try:
             why = "".join(printable(found["why"][:WHY_MAX]).split("\n"))
             hole = cls(_whole(found["t_ns"]), _whole(found["events"]), why)
@@ -83,23 +83,23 @@ class Hole(NamedTuple):
 
 
 def _whole(text: str) -> int:
-    """Parse a number of a hole. Raises ``ValueError`` if it is invalid or has too many digits."""
+    """Parse a number of a gap. Raises ``ValueError`` if it is invalid or has too many digits."""
     if not text.isdecimal() or len(text) > len(str(EVENTS_MAX)):
         raise ValueError("hole with an invalid number")
     return int(text)
 
 
 class RecordingInfo(NamedTuple):
-    """A log's statement about itself: its part, if any, and the events missing from it."""
+    """What a log states about itself: its part, if any, and the events missing from it."""
 
     part: Part | None
     holes: tuple[Hole, ...]
 
 
 def read_recording_info(path: Path) -> RecordingInfo:
-    """Read the story of a file; empty for a log that is not a recording.
+    """Read what a file states about itself; empty for a log that is not a recording.
 
-    Raises ``OSError`` if it cannot be read.
+    Raises ``OSError`` if the file cannot be read.
     """
     with path.open("rb") as file:
         if file.read(len(MAGIC)) != MAGIC:
@@ -119,7 +119,7 @@ def read_recording_info(path: Path) -> RecordingInfo:
 
 
 def in_order(stories: Mapping[Path, RecordingInfo]) -> list[Path] | None:
-    """Return the parts of one run in the order in which they were written; None for other logs.
+    """Return the parts of one run in the order of writing; None for other logs.
 
     Raises ``UserError`` if two files are the same part.
     """
@@ -136,7 +136,7 @@ def in_order(stories: Mapping[Path, RecordingInfo]) -> list[Path] | None:
 
 
 def missing(stories: Mapping[Path, RecordingInfo], ordered: Sequence[Path]) -> list[str]:
-    """Return what a replay of these logs lacks, one line each; empty for a complete run."""
+    """Return what a replay of some logs lacks, one line each; empty for a complete run."""
     lines = []
     before = 0
     for path in ordered:

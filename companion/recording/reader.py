@@ -34,11 +34,11 @@ __all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flig
 LogKind = Literal["tlog", "mavlink", "mcap", "foreign-mcap", "capture", "dataflash", "ulog", "csv"]
 ATTACHMENTS: Final = frozenset(file.attachment for file in NAMED_FILES)
 _MAPPED_BYTES: Final = 1 << 26
-"""Size from which on a log is memory-mapped instead of read."""
+"""Least size of a log that is memory-mapped instead of read."""
 _LATEST_NS: Final = 1 << 62
 """Latest time of an event, the year 2116: results computed from times fit into 63 bits."""
 LARGEST_EVENT: Final = 1 << 21
-"""Limit on the size of an event: that of a duty with the largest number of names."""
+"""Limit on the bytes of an event: a duty with the largest number of names."""
 _UNCERTAINTY_MAX_NS: Final = 3_600_000_000_000
 """Largest uncertainty of a frame's arrival: results computed from it fit into 63 bits."""
 _EVENT_TOPICS: Final = frozenset(
@@ -83,7 +83,7 @@ def read_log(log: Path | str, latency_s: float = 0.0) -> Iterator[Event]:
 
 
 def _begun(path: Path, events: Iterator[Event], what: str, *kinds: type) -> Iterator[Event]:
-    """Return the events, which must include one of ``kinds``; raises errors at once."""
+    """Return the events, read up to the first of ``kinds``, so that errors are raised at once."""
     before: list[Event] = []
     try:
         for event in events:
@@ -111,7 +111,7 @@ def read_flight(logs: Sequence[Path], latency_s: float = 0.0) -> Iterator[Event]
 
 
 def vehicles(logs: Sequence[Path]) -> list[Vehicle]:
-    """Return the vehicles of the onboard logs among these; empty without any.
+    """Return the vehicles of the onboard logs among some logs; empty without onboard logs.
 
     Raises ``LogError`` for an unusable log, or logs of different flights.
     """
@@ -120,7 +120,7 @@ def vehicles(logs: Sequence[Path]) -> list[Vehicle]:
 
 
 def flights(logs: Sequence[Path]) -> list[tuple[Path, ...]]:
-    """Group logs by flight: all onboard logs are one flight, any other log is one by itself.
+    """Group logs by flight: all onboard logs are one flight, every other log is its own.
 
     Raises ``LogError`` for an unusable log.
     """
@@ -146,13 +146,13 @@ def center_of(logs: Sequence[Path], center: str | None) -> str | None:
 def read_parts(paths: Sequence[Path]) -> Iterator[Event]:
     """Return the events of recordings one after the other; some may contain none.
 
-    As ``read_log``, but ``LogError`` is raised only when a file is reached.
+    Like ``read_log``, except that ``LogError`` is raised only when a file is reached.
     """
     return chain.from_iterable(map(_recorded, paths))
 
 
 class RecordedSettings(NamedTuple):
-    """Settings of the run that was recorded."""
+    """Settings of a run, as its recording contains them."""
 
     text: str  # TOML
     files: dict[str, bytes]  # files that they name, by name of the attachment
@@ -177,7 +177,7 @@ def read_settings(path: Path) -> RecordedSettings | None:
 
 
 def digest_of(path: Path) -> str | None:
-    """Return the digest in a recording; None if it is truncated."""
+    """Return the digest in a recording; None if the recording is truncated."""
     if log_kind(path) != "mcap":
         return None
     for content in Walk(path, frozenset()):
@@ -187,7 +187,7 @@ def digest_of(path: Path) -> str | None:
 
 
 def utc_offset_ns(paths: Sequence[Path]) -> int:
-    """Return UTC less the timeline of recordings, by the last value in them; 0 without any.
+    """Return UTC less the timeline of recordings, by their last value, ns; 0 without a value.
 
     Raises ``LogError`` if that value is invalid.
     """
@@ -211,7 +211,7 @@ def _offset_ns(path: Path, data: bytes) -> int:
 
 
 def _open(path: Path) -> tuple[LogKind, bytes]:
-    """Return the kind of a log, and its bytes unless it is read piece by piece."""
+    """Return the kind of a log, and its bytes unless they are read piece by piece."""
     try:
         if not (path.is_file() or path.is_dir()) and path.exists():
             raise LogError(f"{path}: not a file")
@@ -253,8 +253,7 @@ def _whole(file: IO[bytes]) -> bytes:
 
 
 def _ours(path: Path) -> bool:
-    """Return whether this program wrote an MCAP file: one of its channels is known, or it has
-    none."""
+    """Return whether this program wrote an MCAP file: it has a known channel, or no channel."""
     walk = Walk(path, frozenset())
     next(iter(walk), None)  # the end of the file, if it exists, has all channels
     if not walk.channels:

@@ -1,4 +1,4 @@
-"""Recovery: completes a truncated recording.
+"""Recovery: completion of a truncated recording.
 
 Intact content is written again like a recording, so the result has its index and opens in every
 viewer. The truncated original is removed only when its replacement is complete and on the disk.
@@ -21,16 +21,16 @@ from companion.recording.writer import ACTIVE, free_name, opened, sync_folder
 
 _PARTIAL: Final = ".recovering"
 CHANNELS_MAX: Final = 65_535
-"""Limit on channels with messages: they are numbered from 1, in two bytes."""
+"""Limit on channels with messages, which are numbered from 1, in two bytes."""
 DAMAGED: Final = ".damaged"
 
 
 class UnreadableError(LogError):
-    """The file contains no recording."""
+    """Error of a file that contains no recording."""
 
 
 class BeingRecordedError(LogError):
-    """The recording is still open in another process."""
+    """Error of a recording that is still open in another process."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,9 +47,10 @@ class Recovered:
 def recover(path: Path) -> Recovered:
     """Complete ``x.mcap.active`` as ``x.mcap``, a truncated ``x.mcap`` as ``x.recovered.mcap``.
 
-    Existing files are never overwritten; then it becomes ``x-1.mcap`` and so on. ``x.mcap.active``
-    is removed afterwards, a truncated ``x.mcap`` is kept. Raises ``LogError`` if the file is not an
-    MCAP file, is being recorded, cannot be read, or if its replacement cannot be written.
+    Existing files are never overwritten: the new file is then ``x-1.mcap`` and so on.
+    ``x.mcap.active`` is removed afterwards, a truncated ``x.mcap`` is kept. Raises ``LogError`` if
+    the file is not an MCAP file, is being recorded, cannot be read, or if its replacement cannot be
+    written.
     """
     try:
         return _recover(path)
@@ -65,7 +66,7 @@ def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
     """Recover every ``*.mcap.active`` in a folder.
 
     A file that is not a recording, or causes an unexpected error, is reported and kept as
-    ``x.mcap.damaged``, so that it is not tried again at each start. After a disk error it is
+    ``x.mcap.damaged``, so that it is not tried again at each start. After a disk error the file is
     reported and left.
 
     A file that another process is recording is skipped, and is not in the list.
@@ -133,7 +134,7 @@ def _rewrite(path: Path, head: bytes) -> Recovered:
 
 
 class _Tally:
-    """Counts of recovered messages."""
+    """Counts of the messages that were recovered."""
 
     def __init__(self) -> None:
         self._messages: Counter[str] = Counter()
@@ -154,7 +155,7 @@ class _Tally:
 
 
 class _Copy:
-    """Copies the contents of a walk to a new file, with new ids of schemas and channels."""
+    """Copy of a walk's contents to a new file, with new ids of schemas and channels."""
 
     def __init__(self, mcap: McapFile, walk: Walk, tally: _Tally) -> None:
         self._mcap = mcap

@@ -1,4 +1,4 @@
-"""The beams as a 3D scene for viewers.
+"""3D scene of the beams, for viewers.
 
 Viewers use z upwards, so the frames are (REP 103 of ROS): ``map``, east-north-up at the origin of
 the local frame, child of ``wgs84``, which is Earth-fixed; ``carrier``, forward-left-up, child of
@@ -29,9 +29,9 @@ CARRIER: Final = "carrier"
 ARRAY: Final = "array"
 LIFETIMES: Final = 3  # lifetime of an entity, in periods of the scene
 WIDEST_RAD: Final = math.pi / 3
-"""Widest cone drawn: the beam of a line of elements is not limited in one direction."""
+"""Widest beam drawn, radians: the beam of a line of elements has no limit in one direction."""
 HALF_POWER: Final = 0.886
-"""Full width at half power of a uniform aperture, in wavelengths per aperture.
+"""Full half-power width of a uniform aperture's beam, in wavelengths per aperture.
 
 Van Trees, Optimum Array Processing, 2.4: 0.891 for ten elements and 0.886 in the limit.
 """
@@ -48,7 +48,7 @@ COLOURS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Scene:
-    """Drawing of updates for an array, ``rate_hz`` times a second (> 0)."""
+    """Drawing of updates for an array, at ``rate_hz`` (> 0)."""
 
     array: Array
     rate_hz: float
@@ -89,7 +89,7 @@ class Scene:
         return schemas.SceneUpdateMessage(entities=entities)
 
     def _uav(self, track: Track, t_ns: int) -> Any:
-        """Return a name, a point, and the upright cylinder of a UAV's bound, if it is finite."""
+        """Return a name, a point, and the upright cylinder of a UAV's bound, if finite, to draw."""
         north_m, east_m, down_m = track.position_ned_m.tolist()
         pose = {"position": {"x": east_m, "y": north_m, "z": -down_m}, "orientation": {"w": 1.0}}
         colour = COLOURS[track.state]
@@ -133,11 +133,11 @@ class Scene:
             yield entity
 
     def widths_rad(self, towards: FloatArray) -> FloatArray:
-        """Return approximate full widths (N, 2) at half power across unit directions (N, 3).
+        """Return approximate half-power widths (N, 2) of beams at unit directions (N, 3).
 
-        In the array frame, horizontally and vertically: the widths of a uniform aperture with the
-        extent seen from the direction, at most ``WIDEST_RAD``. For drawing only; ``patterns``
-        computes the exact ones.
+        Full widths in the array frame, horizontal and vertical: the widths of a uniform aperture
+        with the extent seen from the direction, at most ``WIDEST_RAD``. For drawing only;
+        ``patterns`` computes the exact ones.
         """
         array = self.array
         seen_m = array.elements_m @ _across(towards)[:, :, :2]
@@ -153,7 +153,7 @@ class Scene:
 
 
 def _across(towards: FloatArray) -> FloatArray:
-    """Return rotations to the array frame (N, 3, 3): axes right of, below and along directions."""
+    """Return rotations (N, 3, 3) to the array frame from axes right of, below, along directions."""
     x, y, z = towards.T
     lengths = np.hypot(x, y)
     upright = lengths <= 1e-9  # straight up or down

@@ -1,4 +1,4 @@
-"""The messages of a recording: protobuf on every channel.
+"""Messages of a recording: protobuf on every channel.
 
 Positions, log lines and the scene are Foxglove's own messages, which viewers display directly
 (docs/field-notes.md 4). The fields of the others are the described values of their classes
@@ -45,7 +45,7 @@ _FLEET: Final[dict[str, list[str]]] = {
     "Offers": ["repeated Offer offer"],
     "Tracks": ["repeated Track track"],
 }  # fmt: skip
-"""Messages between the nodes of a fleet (docs/fleet.md); they are not recorded.
+"""Messages that nodes of a fleet exchange (docs/fleet.md); they are not recorded.
 
 A field is "[repeated|optional] type name"; its number is its index in the list, so fields are only
 ever appended.
@@ -140,7 +140,7 @@ SceneUpdateMessage: Final[Any] = SceneUpdate
 
 
 class Schema(NamedTuple):
-    """A message type as in MCAP: full name, serialised ``FileDescriptorSet``."""
+    """Schema of a message type, as in MCAP: full name, serialised ``FileDescriptorSet``."""
 
     name: str
     descriptor_set: bytes
@@ -221,7 +221,7 @@ def encode_tick(t_ns: int, *, in_two: bool = False) -> bytes:
 
 
 _RAW_HEADS: Final = (b"", *(bytes((_RAW,)) + _varint(size) for size in range(1, RAW_MAX + 1)))
-"""Tag and length of a frame's bytes, by their number; empty for none."""
+"""Tag and length that precede a frame's bytes, by their number; empty for no bytes."""
 
 
 HEADS_MAX: Final = 10_000  # limit on cached heads of frames
@@ -230,8 +230,8 @@ HEADS_MAX: Final = 10_000  # limit on cached heads of frames
 class FrameEncoder:
     """Encoder of ``companion.Frame`` messages; caches the packed head of each (link, source, id).
 
-    Hours of traffic contain only a few hundred of them, so that for each frame only its time and
-    its bytes are packed.
+    Hours of traffic contain only a few hundred distinct heads, so that for each frame only its time
+    and its bytes are packed.
     """
 
     def __init__(self) -> None:

@@ -1,4 +1,4 @@
-"""Tracks and beams in 3D as point clouds, for Rerun, which draws nothing else.
+"""Tracks and beams in 3D as point clouds, a form that Rerun draws.
 
 Rerun opens MCAP files and draws Foxglove's PointCloud and FrameTransform, but not the SceneUpdate
 of a recording; its own package has 500 MB and is not needed. A track is the positions of its last
@@ -33,7 +33,7 @@ _FIELDS: Final = (
 
 
 class SpaceFile:
-    """A file of point clouds being written; use it as a context manager.
+    """File of point clouds, open for writing; a context manager.
 
     Raises ``OSError`` if it cannot be written.
     """
@@ -62,7 +62,7 @@ class SpaceFile:
         self._file.close()
 
     def add(self, update: Update, local: LocalFrame | None) -> None:
-        """Draw an update, at the rate of the scene."""
+        """Draw an update, at most at the rate of the scene."""
         if update.t_ns < self._due_ns or local is None:
             return
         self._due_ns = update.t_ns + round(1e9 / self._scene.rate_hz)

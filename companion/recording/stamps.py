@@ -1,23 +1,22 @@
-"""A usable time line from unreliable time stamps.
+"""Repair of unreliable time stamps: a usable time line.
 
 Logs from the field have stamps that step back a little (several links merged into one file), that
 jump by days or by 10¹² s for one frame, or that jump permanently (the clock was set). A player that
-sleeps for their differences hangs (docs/field-notes.md 1). The time line returned here never steps
-back and never jumps by more than an hour: such a stamp is clamped to the previous time. If the
-following stamps continue from it, the clock was set, and the time line continues with that shift.
-Otherwise it was one bad stamp, and nothing changes.
+waits for the differences of such stamps hangs (docs/field-notes.md 1). The time line returned here
+never steps back and never jumps by more than an hour: such a stamp is clamped to the previous time.
+If the following stamps continue from it, the clock was set, and the time line continues with that
+shift. Otherwise it was one bad stamp, and nothing changes.
 """
 
 from collections.abc import Sequence
 from typing import Final
 
 LARGEST_LEAP_NS: Final = 3_600_000_000_000
-"""Longest plausible gap in a recording; a stamp beyond it is wrong."""
+"""Longest plausible gap in a recording; a stamp after a longer one is wrong."""
 STEP_HOLD_NS: Final = 1_000_000_000
-"""Time for which stamps must continue behind the time line before a step back counts as a set
-clock.
+"""Time for which stamps must stay behind the time line before a step back is a set clock.
 
-For steps of at most an hour: frames of a slower link step back and forth among others.
+This is for steps of at most an hour: frames of a slower link step back and forth among others.
 """
 _LATEST_START_NS: Final = 1 << 62
 """Latest start of a log, the year 2116.
@@ -33,8 +32,8 @@ def _is_plausible(step_ns: int) -> bool:
 class RepairedStamps:
     """Time line of successive stamps. ``first`` are the first few stamps, in nanoseconds.
 
-    It starts at the first stamp; at the second if only the second is consistent with the third; at
-    0 if the start is impossible.
+    The time line starts at the first stamp; at the second if only the second is consistent with the
+    third; at 0 if the start is impossible.
     """
 
     def __init__(self, first: Sequence[int]) -> None:
@@ -51,9 +50,9 @@ class RepairedStamps:
         self._resumed: tuple[int, int] | None = None  # first and last stamp since clamping began
 
     def place(self, stamp_ns: int) -> int | None:
-        """Advance to this stamp; ``t_ns`` is then its time.
+        """Advance the time line to a stamp; ``t_ns`` is then the time of that stamp.
 
-        Returns None for a good stamp, else its error in nanoseconds (not 0).
+        Returns None for a good stamp, else the stamp's error in nanoseconds (not 0).
         """
         step_ns = stamp_ns + self._shift_ns - self.t_ns
         if 0 <= step_ns <= LARGEST_LEAP_NS:  # inlined ``_is_plausible``, for speed

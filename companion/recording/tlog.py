@@ -1,4 +1,4 @@
-"""Logs of other programs: telemetry logs, and raw MAVLink.
+"""Logs of other programs: telemetry logs (.tlog), and raw MAVLink.
 
 A telemetry log (.tlog) has, before every frame, the Unix time in microseconds as eight bytes,
 big-endian. Raw MAVLink has no stamps; the sender's boot clock replaces them.
@@ -28,7 +28,7 @@ _PIECE: Final = 1 << 16
 _PAIRS_MIN: Final = 50
 _SEARCHED_BYTES: Final = 1 << 26  # bytes of a file that are searched for MAVLink
 _TIMED: Final = frozenset((33, 30, 2))
-"""GLOBAL_POSITION_INT, ATTITUDE and SYSTEM_TIME, whose boot stamps date raw MAVLink."""
+"""Messages whose boot stamps date raw MAVLink: GLOBAL_POSITION_INT, ATTITUDE, SYSTEM_TIME."""
 _magics = re.compile(b"[\xfd\xfe]").finditer
 
 
@@ -36,10 +36,10 @@ _magics = re.compile(b"[\xfd\xfe]").finditer
 
 
 def sniff(data: bytes) -> Literal["tlog", "mavlink"] | None:
-    """Return the kind of a log, by the bytes between consecutive frames.
+    """Return the kind of a log, by the bytes between consecutive MAVLink frames.
 
-    None without MAVLink. A lone frame counts only at the start of the file, since twenty megabytes
-    of noise contain one by chance.
+    None without MAVLink. A single frame counts only at the start of the file, since twenty
+    megabytes of noise contain one by chance.
     """
     stamped = bare = 0
     at, end = 0, min(len(data), _SEARCHED_BYTES)
@@ -73,9 +73,9 @@ def _next_frame(data: bytes, at: int, end: int) -> tuple[int, int]:
 
 
 _StampedFrame = tuple[int | None, Checked | None, dict[Reason, int]]
-"""Stamp of a frame of a telemetry log, ns; the frame; bytes skipped before it.
+"""Frame of a telemetry log: its stamp, ns; the frame; bytes skipped before it.
 
-The stamp is None if it does not fit before the frame, the frame is None at the end.
+The stamp is None without room for one before the frame; the frame is None at the end.
 """
 
 
@@ -138,9 +138,9 @@ def _stamped_frames(data: bytes) -> Iterator[_StampedFrame]:
 
 
 def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:
-    """Count the contents of [at, stop), which has no valid frame, as ``Splitter`` does.
+    """Count the contents of [at, stop), which holds no valid frame, as ``Splitter`` does.
 
-    Consecutive invalid frames, each with its stamp, count once each; other bytes are garbage.
+    Each invalid frame counts once, including its 8-byte time stamp; other bytes are garbage.
     """
     lost: dict[Reason, int] = {}
     end = len(data)
@@ -162,10 +162,10 @@ def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:
 
 
 def read_raw(data: bytes, link: str) -> Iterator[Event]:
-    """Yield the events of raw MAVLink. Their time is the boot clock of the first source that sends
-    one.
+    """Yield the events of raw MAVLink, timed by the boot clock of the first source that sends one.
 
-    It starts at the epoch and never steps back; earlier frames get the time of the first stamp.
+    The time starts at the epoch and never steps back; earlier frames get the time of the first
+    stamp.
     """
     frames = (event for event in _split(data, link) if isinstance(event, Frame))
     first = next((one for one in frames if _boot_ns(one, one.source) is not None), None)

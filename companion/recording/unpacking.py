@@ -1,4 +1,4 @@
-"""Decompression of an MCAP chunk, limited to a given size whatever its header claims.
+"""Decompression of an MCAP chunk, limited to a given size whatever the chunk's header claims.
 
 A zstd frame states the size of its contents, and the library allocates it before reading: 131 kB
 asked for 4.2 GB. So the size is checked first.
@@ -11,21 +11,21 @@ from typing import Final
 from zstandard import ZstdDecompressor, ZstdError, frame_content_size
 
 _HEAD: Final = struct.Struct("<QQQII")
-"""Start and end of the times, size and CRC-32 of the contents, length of the compression's name."""
+"""Layout of a chunk's head: start and end time, size and CRC-32 of the contents, name length."""
 _SIZE: Final = struct.Struct("<Q")
 _NAME_MAX: Final = 16
 _UNKNOWN: Final = -1
 
 
 class DamagedChunkError(ValueError):
-    """A chunk that cannot be decompressed."""
+    """Error of a chunk that cannot be decompressed."""
 
 
 def unpacked(body: bytes, most: int) -> bytes:
-    """Return the contents of a chunk's record, at most ``most`` bytes.
+    """Return the contents of a chunk record, at most ``most`` bytes.
 
-    Raises ``DamagedChunkError`` if they are larger, do not match their header, or have an unknown
-    compression.
+    Raises ``DamagedChunkError`` if the contents are larger, do not match their header, or have an
+    unknown compression.
     """
     try:
         _, _, size, checksum, name = _HEAD.unpack_from(body)
@@ -46,7 +46,7 @@ def unpacked(body: bytes, most: int) -> bytes:
 
 
 def _unpack(compression: bytes, packed: memoryview, size: int) -> bytes:
-    """Return the contents if they have ``size`` bytes; else at most one byte more."""
+    """Return the unpacked contents if they have ``size`` bytes; else at most one byte more."""
     match compression:
         case b"":
             return bytes(packed)

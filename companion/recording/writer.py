@@ -40,11 +40,11 @@ SUMMARY: Final = "summary"
 
 
 class _Topics:
-    """The channels of a file by topic; each is added with its first message.
+    """Channels of an MCAP file by topic; each is added with its first message.
 
-    Separate from the writer, which would otherwise reference itself through its encoder. Such a
-    cycle keeps a finished file's megabytes until a full garbage collection, which is rare in the
-    service.
+    The class is separate from the writer, which would otherwise reference itself through its
+    encoder. Such a cycle keeps a finished file's megabytes until a full garbage collection, which
+    is rare in the service.
     """
 
     def __init__(self, mcap: McapFile) -> None:
@@ -54,7 +54,7 @@ class _Topics:
         self._channel_ids: dict[str, int] = {}
 
     def add(self, topic: str, schema: schemas.Schema, t_ns: int, data: bytes) -> None:
-        """Write a message; called by ``Encoder``."""
+        """Write a message to a topic; called by ``Encoder``."""
         channel_id = self._channel_ids.get(topic) or self._channel(topic, schema)
         stamp_ns = t_ns if t_ns > 0 else 0
         self._mcap.message(channel_id, stamp_ns, stamp_ns, self.messages & 0xFFFFFFFF, data)
@@ -70,14 +70,14 @@ class _Topics:
 
 
 class Writer:
-    """One recording, open from the start until ``close`` or ``abandon``.
+    """Recording that is open until ``close`` or ``abandon``.
 
         where          a folder (created if missing), where the file is called
                        ``companion-YYYYmmddTHHMMSSZ.mcap`` after ``started_ns`` (UTC), with -1, -2 …
                        if that exists; or, if the name ends in ``.mcap``, the file itself, which
                        replaces an existing one on ``close``
         settings_toml  the settings, attached to the file
-        files          files that the settings name, attached before them; by attachment
+        files files that the settings name, attached before the settings; by attachment
         versions       versions of programs, as a metadata record
         weights_hz     as for ``Encoder``
         started_ns     start of the recording
@@ -135,8 +135,7 @@ class Writer:
         return self._final if self._finished else _beside(self._final)
 
     def event(self, event: Event) -> None:
-        """Record an event that drives the pipeline: in the order of the calls, before its
-        outputs."""
+        """Record an event that drives the pipeline: in the order of calls, before its outputs."""
         self._encoder.event(event)
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
@@ -144,7 +143,7 @@ class Writer:
         self._encoder.output(output, geodetic)
 
     def hole(self, hole: Hole) -> None:
-        """Record that events are missing here."""
+        """Record that events are missing at this point."""
         self._mcap.flush()
         self._mcap.metadata(HOLE, hole.metadata())
 
@@ -162,7 +161,7 @@ class Writer:
         self.flushed = self.messages
 
     def close(self, metadata: Mapping[str, str]) -> Path:
-        """Finish and rename the file; ``metadata``, if not empty, becomes its record ``summary``.
+        """Finish and rename the file; write ``metadata``, if any, as its record ``summary``.
 
         Returns the file's path. Closing twice does nothing.
         """
@@ -191,8 +190,8 @@ class Writer:
     def salvage(self) -> bool:
         """Close an unwritable file, truncated to the last flush.
 
-        The rest can then go into another file; a file without messages is removed. Returns False if
-        the truncation failed: then it is unknown which part of the rest the file contains.
+        The rest can then be written to another file; a file without messages is removed. Returns
+        False if the truncation failed: then it is unknown which part of the rest the file contains.
         """
         if self._file.closed:
             return True
@@ -238,10 +237,10 @@ def free_name(wanted: Path) -> Path:
 
 
 def open_alone(path: Path) -> BufferedWriter:
-    """Open and truncate a file that no other process is recording to.
+    """Open and truncate a file, unless another process is recording to it.
 
-    Raises ``BlockingIOError`` if one is. The lock ends with the process, so it also distinguishes
-    leftovers from files in use.
+    Raises ``BlockingIOError`` if another process is. The lock ends with the process, so it also
+    distinguishes leftovers from files in use.
     """
     file = opened(path, os.O_APPEND)
     try:
@@ -255,13 +254,13 @@ def open_alone(path: Path) -> BufferedWriter:
 
 
 def opened(path: Path, flags: int) -> BufferedWriter:
-    """Open a file for writing, created if missing and not readable by all users."""
+    """Open a file for writing; create it, if missing, not readable by all users."""
     descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | flags, FILE_MODE)
     return os.fdopen(descriptor, "ab" if flags & os.O_APPEND else "wb")
 
 
 def _reserve(folder: Path, started_ns: int) -> Path:
-    """Return a name that no finished or open recording has; creates its ``.active`` file."""
+    """Return a name that no finished or open recording has; create its ``.active`` file."""
     folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
     started = datetime.fromtimestamp(started_ns // 1_000_000_000, tz=UTC)
     name, number = f"companion-{started:%Y%m%dT%H%M%SZ}", 0
@@ -278,7 +277,7 @@ def _reserve(folder: Path, started_ns: int) -> Path:
 
 
 def sync_folder(folder: Path) -> None:
-    """Flush a folder to the disk: a new name is durable only after that."""
+    """Flush a folder to the disk; without that, a new file name is not durable."""
     descriptor = os.open(folder, os.O_RDONLY)
     try:
         os.fsync(descriptor)

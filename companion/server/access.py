@@ -19,7 +19,7 @@ from companion.values import UserError
 OPEN_PATHS: Final = frozenset({"/healthz", "/docs", "/openapi.json"})
 """Paths that need no token, in addition to the page's own files; they contain no secrets."""
 SUBPROTOCOL: Final = "companion.v1"
-"""Subprotocol selected for a WebSocket client that offers any."""
+"""Subprotocol that is selected for a WebSocket client that offers any."""
 BEARER: Final = "bearer."
 """Prefix of a subprotocol that carries the token, base64url without padding.
 
@@ -28,14 +28,14 @@ A page in a browser cannot set headers, and a token in the URL would end up in l
 UNAUTHORISED: Final = 4401  # close code of a WebSocket without a valid token
 
 UNSENT_BYTES: Final = 16_384
-"""Limit on unsent bytes in the kernel for a slow client; connections inherit it.
+"""Limit on unsent bytes in the kernel for a slow client; inherited by its connections.
 
 The default is megabytes, so a slow reader of a stream would receive outdated data.
 """
 
 
 class ListenError(UserError):
-    """Address on which the server cannot listen."""
+    """Error of an address on which the server cannot listen."""
 
 
 def parse_listen(text: str) -> tuple[str, int]:
@@ -48,7 +48,7 @@ def parse_listen(text: str) -> tuple[str, int]:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach the address."""
+    """Return whether an address is reachable from this machine only."""
     if host == "localhost":
         return True
     try:
@@ -96,10 +96,10 @@ def _own_names() -> frozenset[str]:
 class KnownHosts:
     """ASGI middleware: ``Host`` must name this machine, by address or by a known name.
 
-    A page from elsewhere may let its own name resolve to this machine (DNS rebinding) and then read
-    this API as its own origin. Its requests carry that name. Addresses are always allowed;
-    ``names`` are further names, such as that of a reverse proxy. Other requests are answered with
-    421, and their WebSockets rejected.
+    A page of another site may let its own name resolve to this machine (DNS rebinding) and then
+    read this API as its own origin. The requests of such a page carry that name. Addresses are
+    always allowed; ``names`` are further names, such as that of a reverse proxy. Other requests are
+    answered with 421, and their WebSockets rejected.
     """
 
     def __init__(self, app: ASGIApp, names: Collection[str] = ()) -> None:
@@ -116,7 +116,7 @@ class KnownHosts:
             await problem(421, title)(scope, receive, send)
 
     def _are_known(self, hosts: list[str]) -> bool:
-        """Return whether all are known; browsers always send exactly one."""
+        """Return whether all given hosts are known; browsers always send exactly one."""
         names = [_host_name(host) for host in hosts]
         return all(name in self._names or _is_address(name) for name in names)
 
@@ -140,9 +140,9 @@ def _is_address(name: str) -> bool:
 class BearerToken:
     """ASGI middleware: every path needs ``Authorization: Bearer TOKEN``, except ``open_paths``.
 
-    A WebSocket may send the token as a subprotocol instead (``BEARER``), beside ``SUBPROTOCOL``.
-    Without a valid token it is opened and closed with 4401, whatever its path: a page in a browser
-    cannot see the status of a rejected handshake.
+    A WebSocket may send the token as a subprotocol instead (``BEARER``), beside ``SUBPROTOCOL``. A
+    WebSocket without a valid token is opened and closed with 4401, whatever its path: a page in a
+    browser cannot see the status of a rejected handshake.
     """
 
     def __init__(self, app: ASGIApp, token: str, open_paths: Collection[str] = OPEN_PATHS) -> None:

@@ -1,4 +1,4 @@
-"""The HTTP API and the dashboard's files for a running node. Read only."""
+"""The HTTP API and the dashboard's files for a running node; read-only."""
 
 from pathlib import Path
 from typing import Annotated, Final
@@ -28,7 +28,7 @@ from companion.views.state import Node
 
 CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
 DRAWN_POLICY: Final = CONTENT_POLICY + b"; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
-"""Policy of ``/docs``: Swagger UI embeds images in its style sheet, and sets inline styles."""
+"""Content security policy of ``/docs``: Swagger UI uses embedded images and inline styles."""
 UavId = Annotated[str, PathParameter(description=UAV_FORMS)]
 DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
 
@@ -231,7 +231,7 @@ class _Files:
 
 
 class _Edge:
-    """ASGI middleware for HEAD requests and security headers.
+    """ASGI middleware that handles HEAD requests and adds security headers.
 
     HEAD is handled as GET, and the server omits the body. The headers allow a page to load nothing
     from elsewhere.

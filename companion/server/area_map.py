@@ -1,6 +1,6 @@
-"""The map under the plan view: a PMTiles file of the user, served by byte ranges.
+"""The map below the plan view: a PMTiles file of the user, served by byte ranges.
 
-Format: PMTiles, version 3 (github.com/protomaps/PMTiles). Its path comes from the node's own
+Format: PMTiles, version 3 (github.com/protomaps/PMTiles). The file's path comes from the node's own
 settings, never from a recording: the author of a recording must not choose which files are served.
 """
 
@@ -21,13 +21,13 @@ MEDIA_TYPE: Final = "application/vnd.pmtiles"
 
 @dataclass(frozen=True, slots=True)
 class AreaMap:
-    """The map under the plan view."""
+    """Map under the plan view of the page."""
 
     name: Annotated[str | None, Meaning("name of the map's file; null without one")]
 
 
 def find(named: str | None) -> Path | None:
-    """Return the file of ``[page] map``. Raises ``UserError`` if it is not a PMTiles file."""
+    """Return the map file of ``[page] map``. Raises ``UserError`` if it is not PMTiles."""
     if named is None:
         return None
     try:
@@ -41,7 +41,7 @@ def find(named: str | None) -> Path | None:
 
 
 def add(app: FastAPI, file: Path | None) -> None:
-    """Add the routes to the application."""
+    """Add the routes of the map to the application."""
 
     @app.get(
         "/v1/map",

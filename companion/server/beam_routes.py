@@ -16,7 +16,7 @@ from companion.views import pattern as pattern_view
 from companion.views.state import Node
 
 ANGLES_MAX: Final = 20_000
-"""Limit on beams times angles in one answer; at the limit, an answer takes half a second."""
+"""Limit on beams times angles in one answer, which then takes half a second."""
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
 Cut = Annotated[
     pattern_view.Cut, Query(description="the angle that varies; the other is the beam's own")
@@ -28,7 +28,7 @@ _BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 
 
 def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
-    """Add the routes to the application; their computations run in ``work_slots``."""
+    """Add the routes to the application; they compute in ``work_slots``."""
     pipeline, equipment = node.pipeline, node.equipment
     moments = Moments(node, work_slots)
 
@@ -103,9 +103,9 @@ def _weight_answers() -> dict[int | str, dict[str, Any]]:
 
 
 def accepted(accept: str) -> WeightFormat | None:
-    """Return the format that an Accept header prefers; None if it accepts none.
+    """Return the weight format that an Accept header prefers; None if it accepts none.
 
-    RFC 9110: the highest q, the first of equal ones.
+    By RFC 9110, the format with the highest q is preferred, the first of equal ones.
     """
     forms = {form.media_type: form for form in WeightFormat}
     parts = [part.lower().replace(" ", "") for part in accept.split(",")]
@@ -121,6 +121,6 @@ def accepted(accept: str) -> WeightFormat | None:
 
 
 def _quality(part: str) -> float:
-    """Return the q of one part of an Accept header; 1 if missing or malformed."""
+    """Return the q value of one part of an Accept header; 1 if missing or malformed."""
     found = re.search(r";q=([01](?:\.\d*)?)(?:;|$)", part)
     return float(found[1]) if found else 1.0

@@ -1,4 +1,4 @@
-"""HTTP connections with limits on the size of heads, on waiting, and on their number.
+"""HTTP connections with limits on the size of heads, on waiting times, and on their number.
 
 uvicorn reads heads of any length, waits forever for incomplete ones, and accepts connections until
 no descriptors are left. All of that happens before any token is checked.
@@ -11,27 +11,27 @@ from typing import Any, Final
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 HEAD_BYTES: Final = 16_384
-"""Limit on a request's line and headers; browsers send one or two thousand bytes."""
+"""Limit on the bytes of a request line and headers; browsers send one or two thousand."""
 BODY_BYTES: Final = 65_536  # limit on a request's body; no route uses one
 HEAD_S: Final = 10.0
-"""Time limit from connecting, or from the last answer, to a complete head."""
+"""Time limit for a complete head, from connecting or from the last answer, seconds."""
 STALL_TIMEOUT_S: Final = 60.0  # time limit for a client that reads nothing of an answer
 _MOST: Final = 512
 _OWN: Final = 96  # descriptors reserved for links, recordings and files
 
 
 def most_connections() -> int:
-    """Return the limit on connections, so that links and recordings always have descriptors."""
+    """Return the limit on connections that leaves descriptors for links and recordings."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     return _MOST if soft == resource.RLIM_INFINITY else max(8, min(_MOST, soft - _OWN))
 
 
 class TooLongError(Exception):
-    """A head that exceeds its limit."""
+    """Error of a request head that exceeds its limit."""
 
 
 class BoundedProtocol(HttpToolsProtocol):
-    """uvicorn's protocol with limits. Beyond the limit, the longest idle connection is closed."""
+    """uvicorn's protocol with limits; beyond them, the longest idle connection is closed."""
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
@@ -86,12 +86,12 @@ class BoundedProtocol(HttpToolsProtocol):
         super().on_message_begin()
 
     def on_url(self, url: bytes) -> None:
-        """Take a piece of the URL."""
+        """Process a piece of the URL."""
         self._count(len(url))
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Take a header."""
+        """Process a header."""
         self._count(len(name) + len(value) + 4)
         super().on_header(name, value)
 
@@ -102,7 +102,7 @@ class BoundedProtocol(HttpToolsProtocol):
         super().on_headers_complete()
 
     def on_body(self, body: bytes) -> None:
-        """Take a piece of a body, which is ignored."""
+        """Ignore a piece of a request's body."""
         self._body_bytes += len(body)
         if self._body_bytes > BODY_BYTES:
             raise TooLongError
@@ -120,7 +120,7 @@ class BoundedProtocol(HttpToolsProtocol):
             self._await_head()
 
     def _count(self, size: int) -> None:
-        """Raise if the head exceeds its limit; the parser then rejects the request."""
+        """Count bytes of the head; beyond the limit, raise, and the parser rejects the request."""
         self._head_bytes += size
         if self._head_bytes > HEAD_BYTES:
             raise TooLongError
@@ -128,12 +128,12 @@ class BoundedProtocol(HttpToolsProtocol):
     # --- waiting ------------------------------------------------------------------------------
 
     def pause_writing(self) -> None:
-        """Start the time limit: the client does not read."""
+        """Start the time limit, since the client does not read."""
         super().pause_writing()
         self._stalled = self.loop.call_later(STALL_TIMEOUT_S, self.transport.abort)
 
     def resume_writing(self) -> None:
-        """Cancel the time limit: the client reads again."""
+        """Cancel the time limit, since the client reads again."""
         super().resume_writing()
         if self._stalled is not None:
             self._stalled.cancel()

@@ -1,4 +1,4 @@
-"""The routes ``/v1/recordings`` and ``/v1/mavlink``: recorded files, and the last messages."""
+"""The routes ``/v1/recordings`` and ``/v1/mavlink``: recorded files, and last messages."""
 
 from typing import Annotated
 

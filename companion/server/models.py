@@ -1,7 +1,7 @@
 """Models of the API's answers, built from described values, for the OpenAPI document only.
 
-They do not validate answers. Names and units follow the rules of ``companion.views.as_json``; a
-value's description is its meaning and its unit.
+The models do not validate answers. Names and units follow the rules of ``companion.views.as_json``;
+a value's description is its meaning and its unit.
 """
 
 import functools
@@ -27,7 +27,7 @@ from companion.views.as_json import FORMER_NAMES, name_in_json
 
 @dataclass(frozen=True, slots=True)
 class Problem:
-    """An error (RFC 9457). ``title`` says what is wrong, in one line."""
+    """Error response (RFC 9457). ``title`` says in one line what is wrong."""
 
     type: Annotated[Literal["about:blank"], Meaning("kind of problem (RFC 9457)")]
     title: Annotated[str, Meaning("what is wrong, in one line", example="no UAV '9:9' is tracked")]
@@ -53,7 +53,7 @@ class Readiness:
 
 @functools.cache
 def model(described: type) -> type[BaseModel]:
-    """Return the pydantic model of a described class, under the same name."""
+    """Return the pydantic model of a described class; it has the same name."""
     fields: dict[str, Any] = {}
     for member in members(described):
         if "api" not in member.meaning.absent:
@@ -92,7 +92,7 @@ def _field(member: Member) -> tuple[Any, Any]:
 
 
 def outward(kind: Any) -> Any:
-    """Return a type as in JSON: described classes as models, tuples as lists."""
+    """Return a Python type as it is in JSON: described classes as models, tuples as lists."""
     kind, optional = bare(kind)
     if optional:
         return outward(kind) | None
@@ -117,7 +117,7 @@ def outward(kind: Any) -> Any:
 
 
 def describe_enumerations(schemas: dict[str, Any]) -> None:
-    """Add the meanings of their values to the enumerations of an OpenAPI document."""
+    """Add the meaning of each value to the enumerations of an OpenAPI document."""
     for kind in DescribedEnum.__subclasses__():
         if kind.__name__ in schemas:
             meanings = [f"{one}: {one.meaning}" for one in kind]

@@ -1,7 +1,7 @@
-"""Answers about beams, computed once for all clients that ask for the same moment.
+"""Answers about beams, computed once for all clients that request the same moment.
 
 Moments are ``EVERY_NS`` apart. A request between two of them is answered for the next one: beams
-are never for a past time, and at most that much later than requested. UAVs are predicted on the
+are never for a past time, and at most ``EVERY_NS`` later than requested. UAVs are predicted on the
 event loop, where the state is consistent; the rest is computed in a work slot off the loop.
 """
 
@@ -20,7 +20,7 @@ T = TypeVar("T")
 
 
 class Moments:
-    """Answers for the current moment. One per node, used on its event loop."""
+    """Answers of one node for the current moment, used on its event loop."""
 
     def __init__(self, node: Node, work_slots: WorkSlots) -> None:
         self._node = node
@@ -30,8 +30,7 @@ class Moments:
         self._answers: dict[tuple[float, Hashable], asyncio.Task[Any]] = {}
 
     async def made(self, lead_ms: float, what: Hashable, make: Callable[[Update], T]) -> T:
-        """Return ``make`` of the beams applied ``lead_ms`` from the moment, computed on another
-        thread.
+        """Return ``make`` of the beams for ``lead_ms`` after the moment, computed on a thread.
 
         ``what`` identifies the answer among those made from the same beams; an existing one is
         reused. Raises what ``make`` raises, and ``HTTPException`` 503 if the work slots are full.
@@ -78,6 +77,6 @@ def _memoised(make: Callable[[], T]) -> Callable[[], T]:
 
 
 def _seen(task: asyncio.Task[Any]) -> None:
-    """Retrieve an error whose clients have all left, so that asyncio does not warn about it."""
+    """Retrieve an error that no client awaits any more, so that asyncio does not warn."""
     if not task.cancelled():
         task.exception()

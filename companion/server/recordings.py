@@ -1,8 +1,8 @@
-"""The files of ``/v1/recordings``, and their bytes, whole or in part.
+"""Files of ``/v1/recordings``, and their bytes, whole or in part.
 
-Only files directly in the recording directory that are named like a recording: no folders, no
-symbolic links. A recording in progress can be read up to its last flush: every reader that accepts
-truncated files can open it, and ``companion recover`` completes it.
+Served are only files directly in the recording directory that are named like a recording: no
+folders, no symbolic links. A recording in progress can be read up to its last flush: every reader
+that accepts truncated files can open it, and ``companion recover`` completes it.
 """
 
 import os
@@ -28,12 +28,12 @@ _PIECE_BYTES: Final = 1 << 18
 
 
 class UnsatisfiableRangeError(ValueError):
-    """Range that begins beyond the end of the file."""
+    """Error of a byte range that begins beyond the end of the file."""
 
 
 @dataclass(frozen=True, slots=True)
 class Current:
-    """The recording in progress: its name, and the number of bytes on disk."""
+    """Recording in progress: its name, and how many of its bytes are on the disk."""
 
     name: str | None
     bytes: int
@@ -41,7 +41,7 @@ class Current:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Recording:
-    """A file available at ``/v1/recordings/{name}``."""
+    """Recording that is available at ``/v1/recordings/{name}``."""
 
     name: Annotated[str, Meaning("name of the file", example="companion-20261120T130000Z.mcap")]
     bytes: Annotated[int | None, Meaning("size of the file")]
@@ -105,9 +105,9 @@ def _utc_ns(text: str) -> UtcNs:
 
 
 def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, int] | None:
-    """Return an open recording, and how many of its bytes may be read; None if there is none.
+    """Return an open recording, and how many bytes may be read; None if the name is unknown.
 
-    It remains the same file if its name changes afterwards.
+    The open file remains the same if its name changes afterwards.
     """
     found = next((entry for entry in _entries(where) if entry.name == name), None)
     if found is None:
@@ -122,7 +122,7 @@ def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, in
 
 
 def span(header: str | None, size: int) -> tuple[int, int] | None:
-    """Return the first byte of a Range header and the one after the last; None for the whole file.
+    """Return a Range header's first byte and the byte after its last; None for the whole file.
 
     RFC 9110, 14.2: a malformed header, or one with several ranges, may be ignored. Raises
     ``UnsatisfiableRangeError`` for a range beyond the end.
@@ -142,7 +142,7 @@ def span(header: str | None, size: int) -> tuple[int, int] | None:
 
 
 async def pieces(file: BinaryIO, start: int, stop: int) -> AsyncIterator[bytes]:
-    """Yield the bytes from ``start`` to before ``stop``, off the event loop; closes the file."""
+    """Yield a file's bytes from ``start`` to ``stop``, off the event loop; close the file."""
     with file:
         await run_in_threadpool(file.seek, start)
         while start < stop:

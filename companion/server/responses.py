@@ -1,4 +1,4 @@
-"""The API's responses: fast JSON, errors as problems (RFC 9457), and both documented.
+"""Responses of the API: fast JSON, errors as problems (RFC 9457), and their documentation.
 
 Answers are not validated: the models of ``models.py`` only describe them, and the tests compare
 both.
@@ -27,7 +27,7 @@ _MEANINGS: Final = {
 
 
 def encode(content: object) -> bytes:
-    """Return JSON bytes; numbers that are not finite become null."""
+    """Return a value as JSON bytes; numbers that are not finite become null."""
     return orjson.dumps(content, option=orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY)
 
 
@@ -53,7 +53,7 @@ def answers(kind: Any, *problems: int) -> dict[int | str, dict[str, Any]]:
 
 
 def refusals(*problems: int) -> dict[int | str, dict[str, Any]]:
-    """Return the problems of an operation, for the OpenAPI document."""
+    """Return the problems that an operation may answer with, for the OpenAPI document."""
     return {
         status: {"model": models.model(models.Problem), "description": _MEANINGS[status]}
         for status in problems
@@ -81,7 +81,7 @@ async def _unprocessable(_request: Request, error: Exception) -> JSONResponse:
 
 
 async def _failed(_request: Request, _error: Exception) -> JSONResponse:
-    """Answer an unexpected error; uvicorn logs the traceback, which the client does not see."""
+    """Answer an unexpected error; uvicorn logs the traceback, which clients do not get."""
     return problem(500, "internal error of the service; see its log")
 
 

@@ -42,20 +42,20 @@ RATE_HZ: Final = 10.0
 LEAST_HZ, MOST_HZ = 0.1, 100.0
 _UAV: Final = re.compile("|".join(kind.pattern for kind in UavKind), re.ASCII)
 CLIENTS_MAX: Final = 256
-"""Limit on streams: half of the connections; the others are left for requests."""
+"""Limit on streams: half of the connections; the other half is left for requests."""
 SLOTS: Final = 32
-"""Number of slots that spread the clients' messages after an update.
+"""Number of slots over which clients' messages are spread after an update.
 
-They span the first half of the update interval: a hundred messages at once would delay everything
-else. A few clients do not wait.
+The slots span the first half of the update interval: a hundred messages at once would delay
+everything else. A few clients do not wait.
 """
 _EARLY: Final = 0.25
-"""Fraction of its period by which a message may be early; updates are not exact."""
+"""Fraction of its period by which a message may be early, as updates are not exact."""
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """Request of a client; empty ``uavs`` means all."""
+    """What a stream's client requested; empty ``uavs`` means all."""
 
     topics: tuple[Topic, ...] = (Topic.UAVS, Topic.BEAMS)
     uavs: frozenset[str] = frozenset()
@@ -63,7 +63,7 @@ class Wanted:
 
 
 def wanted(query: QueryParams) -> Wanted:
-    """Parse the arguments. Raises ``UserError`` that names the first invalid one."""
+    """Parse the arguments of a stream. Raises ``UserError`` that names the first invalid one."""
     unknown = set(query) - {"uav", "topic", "rate_hz"}
     if unknown:
         raise UserError(f"unknown argument {min(unknown)[:40]!r}; use uav, topic, rate_hz")
@@ -95,7 +95,7 @@ class Snapshot:
 
 
 class Stream:
-    """All clients of one node. ``clients`` are connected now, ``sent`` counts messages."""
+    """All stream clients of one node. ``clients`` are connected now, ``sent`` counts messages."""
 
     def __init__(self, node: Node) -> None:
         self.clients = 0
@@ -171,14 +171,14 @@ class Stream:
                 await asyncio.sleep(turn_s)
 
     def _version(self, topic: Topic) -> object:
-        """Return a value that differs whenever there is something new to send."""
+        """Return a value of a topic that changes whenever there is something new to send."""
         if topic is Topic.EVENTS:
             events = self._node.events()
             return events[-1] if events else "none yet"
         return self._node.pipeline.updates
 
     async def _message(self, topic: Topic, uavs: frozenset[str]) -> str | bytes:
-        """Return the message; encode it on first use."""
+        """Return the message of a topic; encode it on first use."""
         if self._snapshot.number != self._node.pipeline.updates:
             self._snapshot = Snapshot(self._node.pipeline.updates)
         snapshot = self._snapshot
@@ -204,5 +204,5 @@ def _is_from_here(websocket: WebSocket) -> bool:
 
 
 def _short(reason: str) -> str:
-    """Truncate a reason to the limit of a close frame, 123 bytes."""
+    """Truncate a close reason to the limit of a close frame, 123 bytes."""
     return reason.encode()[:120].decode(errors="ignore")

@@ -18,7 +18,7 @@ from companion.views.state import Node
 
 
 class Topic(StrEnum):
-    """Topic of the stream; its messages are the answers of the path of that name."""
+    """Topic of the stream; its messages equal the answers of the path of that name."""
 
     UAVS = "uavs"
     BEAMS = "beams"
@@ -31,7 +31,7 @@ class Topic(StrEnum):
 
 
 def message(topic: Topic, body: Json, uavs: frozenset[str]) -> str | bytes:
-    """Return a body as sent: binary for records, else JSON; only for ``uavs`` if not empty."""
+    """Return a topic's body as sent: binary for records, else JSON; only ``uavs`` if not empty."""
     if topic is Topic.RECORDS:
         return _record(body, uavs)
     return encode({"topic": topic, **(_only(topic, body, uavs) if uavs else body)}).decode()
@@ -48,7 +48,7 @@ def _record(body: Json, uavs: frozenset[str]) -> bytes:
 
 
 def _only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
-    """Return a body without the other UAVs; values of no particular UAV stay."""
+    """Return a body without other UAVs; values that belong to no UAV stay."""
     match topic:
         case Topic.UAVS:
             return body | {"uavs": [one for one in body["uavs"] if one["id"] in uavs]}
@@ -115,7 +115,7 @@ BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {
 
 
 async def body(topic: Topic, node: Node) -> Json:
-    """Return the body of a topic, as the path of its name answers."""
+    """Return the body of a topic, as the path of the same name answers."""
     made = BODIES[topic](node)
     found: Json = await made if inspect.isawaitable(made) else made
     return found

@@ -1,4 +1,4 @@
-"""Slots for work off the event loop: a few run at once, some wait, the rest is rejected."""
+"""Slots for work off the event loop: a few requests run at once, some wait, the rest fail."""
 
 import asyncio
 from collections.abc import Callable
@@ -8,7 +8,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 
 AT_ONCE: Final = 2
-"""Requests that compute at the same time; each takes interpreter time from the links."""
+"""Number of requests that compute at once; each takes interpreter time from the links."""
 WAITING: Final = 64  # requests that wait for a slot; one second of work
 
 T = TypeVar("T")
@@ -22,12 +22,12 @@ class WorkSlots:
         self._room = at_once + waiting
 
     def refuse_if_full(self) -> None:
-        """Raise ``HTTPException`` 503 if the queue is full."""
+        """Raise ``HTTPException`` 503 if the queue of waiting requests is full."""
         if self._room == 0:
             raise HTTPException(503, "too many requests at once", {"retry-after": "1"})
 
     async def run(self, work: Callable[[], T]) -> T:
-        """Run the work on another thread when a slot is free. Raises ``HTTPException`` 503."""
+        """Run work on another thread when a slot is free. Raises ``HTTPException`` 503."""
         self.refuse_if_full()
         self._room -= 1
         try:

@@ -21,7 +21,7 @@ def _ascending(interval: Interval) -> Interval:
 
 
 def _named_width(given: object) -> object:
-    """Convert the booleans of earlier settings: true is GUARANTEE, false is NO."""
+    """Convert booleans of earlier settings to a ``Widen``: true is GUARANTEE, false is NO."""
     if isinstance(given, bool):
         return Widen.GUARANTEE if given else Widen.NO
     return given
@@ -97,7 +97,7 @@ class ArraySettings(Section):
 
 
 class BeamSettings(Section):
-    """When and how weights are computed, and what happens if that costs too much gain.
+    """Settings of when and how weights are computed, and of the fallback if gain is lost.
 
         update_hz          rate at which weights are computed for recordings and the dashboard; for
                            an HTTP request, weights are computed for the time that it asks for
@@ -149,7 +149,7 @@ class BeamSettings(Section):
     @model_validator(mode="before")
     @classmethod
     def _together(cls, given: Any) -> Any:
-        """Default to "total" if power is shared: only jointly scaled columns show the shares."""
+        """Default to "total" if power is shared, since only jointly scaled columns show shares."""
         if isinstance(given, dict) and given.get("power") is not None:
             return {"normalisation": Normalisation.TOTAL} | given
         return given
@@ -162,7 +162,7 @@ class BeamSettings(Section):
 
 
 class CodebookSettings(Section):
-    """The stored beams of an array that can only select among them.
+    """Stored beams of an array that can only select among them.
 
     dft   for lines and rectangles: ``oversampling`` times as many beams as elements on each
           axis
@@ -201,7 +201,7 @@ class HardwareSettings(Section):
 
 
 class RadioSettings(Section):
-    """The radio link, from which SNR and SINR are computed.
+    """Parameters of the radio link, from which SNR and SINR are computed.
 
     noise_figure_db  noise figure of the UAVs' receivers
     """
@@ -213,7 +213,7 @@ class RadioSettings(Section):
 
 
 class NeedSettings(Section):
-    """What a good link to a UAV needs.
+    """Requirements of a good link to a UAV.
 
     needed_db       least array gain over an isotropic antenna, dB
     needed_sinr_db  if set, used instead: SINR of the lowest rate, by the budget of ``[radio]``

@@ -14,7 +14,7 @@ HEIGHT_MAX_M: Final = 1e5  # largest height of a station above or below mean sea
 
 @dataclass(frozen=True, slots=True)
 class VehicleCenter:
-    """Center on a vehicle, by its MAVLink source; its position and attitude are tracked."""
+    """Carrier that is a vehicle, by its MAVLink source; its position and attitude are tracked."""
 
     source: Source
 
@@ -24,7 +24,7 @@ class VehicleCenter:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FixedCenter:
-    """Center at a fixed place, level.
+    """Carrier that is a station at a fixed position, level.
 
     Latitude and longitude in degrees, altitude in metres, heading in degrees clockwise from true
     north.
@@ -41,7 +41,7 @@ class FixedCenter:
 
 @dataclass(frozen=True, slots=True)
 class HomeCenter:
-    """Fixed station at the position of the first accepted report, level and facing north."""
+    """Carrier that is a station at the first accepted report's position, level, facing north."""
 
     def __str__(self) -> str:
         return "home"
@@ -51,7 +51,7 @@ CenterPlace = VehicleCenter | FixedCenter | HomeCenter
 
 
 def parse_center(text: str) -> CenterPlace:
-    """Parse ``SYSID:COMPID``, ``LAT,LON,ALT[,HEADING]`` or ``home``.
+    """Parse a carrier: ``SYSID:COMPID``, ``LAT,LON,ALT[,HEADING]`` or ``home``.
 
     Raises ``UserError`` for anything else.
     """

@@ -1,4 +1,4 @@
-"""Reading of settings from a TOML file, and of the files that they name."""
+"""Reading of settings from a TOML file, and of the files that these settings name."""
 
 import errno
 from collections.abc import Mapping
@@ -20,7 +20,7 @@ from companion.values import ComplexArray, FloatArray, UserError
 
 DEFAULT_DESIGN: Final = "kinematic_default.json"
 LARGEST_BYTES: Final = 1 << 24
-"""Largest file that is read: a codebook of 1024 elements and as many beams."""
+"""Largest file that is read, bytes: a codebook of 1024 elements and as many beams."""
 
 
 def load(path: Path | None) -> Settings:
@@ -40,7 +40,7 @@ def load(path: Path | None) -> Settings:
 
 
 def embedded(settings: Settings) -> Settings:
-    """Return the settings with the contents of all files that they name, for a complete recording.
+    """Return the settings with the contents of all named files, for a complete recording.
 
     Raises ``ConfigError`` if a file cannot be read.
     """
@@ -50,7 +50,7 @@ def embedded(settings: Settings) -> Settings:
 
 
 def layered(path: Path | None, options: Mapping[str, dict[str, Any]]) -> tuple[Settings, Origins]:
-    """Return the settings of a file, overridden by options, and the origin of each key.
+    """Return the settings of a file, overridden by options, with the origin of each key.
 
     ``path`` as in ``load``, ``options`` as in ``Settings.override``. Raises ``ConfigError``.
     """
@@ -113,7 +113,7 @@ def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
 
 
 def matrix_of(settings: Settings, file: NamedFile) -> ComplexArray | None:
-    """Return the matrix of a .npy file that the settings name; None if they name none.
+    """Return the matrix of a .npy file that the settings name; None if they name no file.
 
     Raises ``ConfigError`` if the file cannot be read or is not a matrix.
     """
@@ -129,7 +129,7 @@ def matrix_of(settings: Settings, file: NamedFile) -> ComplexArray | None:
 
 
 def text_of(settings: Settings, file: NamedFile) -> str | None:
-    """Return the text of a file that the settings name; None if they name none.
+    """Return the text of a file that the settings name; None if they name no file.
 
     Raises ``ConfigError`` if the file cannot be read.
     """
@@ -141,7 +141,7 @@ def text_of(settings: Settings, file: NamedFile) -> str | None:
 
 
 def _content(settings: Settings, file: NamedFile) -> bytes | None:
-    """Return a file's bytes, from the settings or else from disk; None if they name no file."""
+    """Return a named file's bytes, from the settings or else from disk; None if none is named."""
     path = _path(settings, file)
     if path is None:
         return None
@@ -174,9 +174,9 @@ def _read(path: Path) -> bytes:
 
 
 def kinematic_design(settings: Settings) -> KinematicDesign:
-    """Return the kinematic observer's gains from the file in the settings, or the built-in ones.
+    """Return the kinematic observer's gains, from the file in the settings or the built-in ones.
 
-    Their certificate is verified. Raises ``ConfigError`` if they are unusable.
+    The certificate of the gains is verified. Raises ``ConfigError`` if they are unusable.
     """
     text = text_of(settings, DESIGN)
     if text is None:

@@ -25,7 +25,7 @@ def _name(text: str) -> str:
 
 
 class FleetSettings(Section):
-    """The fleet of this node; it needs the extra ``fleet``.
+    """Settings of this node's fleet; a fleet needs the extra ``fleet``.
 
     node           name of this node, unique in the fleet; None: no fleet
     site           name of the fleet; nodes of other sites are ignored

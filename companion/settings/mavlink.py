@@ -19,7 +19,7 @@ LinkText = Annotated[str, AfterValidator(_link)]
 
 
 class LinkSettings(Section):
-    """The links on which MAVLink, and reports of other receivers, are received.
+    """Links on which MAVLink, and reports of other receivers, are received.
 
     URLs are ``udpin:``, ``udpout:``, ``tcp:`` or ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD``,
     ``zenoh:KEY``, and those of other receivers: ``sbs:`` or ``readsb:HOST:PORT``,
@@ -27,8 +27,8 @@ class LinkSettings(Section):
     ``cot:tcp:HOST:PORT``.
 
     ``routers`` are trusted peers: if peers contradict each other about the position of a vehicle,
-    theirs is used. A peer is a link as in ``urls``, HOST, or HOST:PORT. Two peers that agree about
-    a vehicle need no entry.
+    the position by ``routers`` is used. A peer is a link as in ``urls``, HOST, or HOST:PORT. Two
+    peers that agree about a vehicle need no entry.
     """
 
     urls: tuple[LinkText, ...] = ()
@@ -43,8 +43,8 @@ class PresenceSettings(Section):
         position_hz   rate requested of UAVs whose GLOBAL_POSITION_INT is slower; None: no request
         attitude_hz   rate of ATTITUDE requested of the carrier; None: no request
 
-    If enabled, it acts as an onboard computer: it sends a heartbeat while it can compute beams, and
-    TIMESYNC requests.
+    If enabled, the service acts as an onboard computer: it sends a heartbeat while it can compute
+    beams, and TIMESYNC requests.
     """
 
     enabled: bool = False
@@ -55,7 +55,7 @@ class PresenceSettings(Section):
 
 
 class SigningSettings(Section):
-    """MAVLink 2 signing.
+    """Settings of MAVLink 2 message signing.
 
         keys            file of the key for each link, by URL as in ``links.urls``
         allow_unsigned  links with a key that also accept unsigned frames
@@ -106,7 +106,7 @@ def _out_link(text: str) -> str:
 
 
 class OutSettings(Section):
-    """Tracks sent to other programs on separate links: nothing unless ``urls`` are given.
+    """Settings of tracks sent to other programs on separate links: none unless ``urls`` are given.
 
     urls     ``udpout:``, ``tcp:``, ``tcpin:HOST:PORT``, ``serial:DEVICE:BAUD`` or ``zenoh:KEY`` get
              ``message`` of each vehicle that reports itself; ``cot:udp:HOST:PORT``
@@ -126,7 +126,7 @@ class OutSettings(Section):
 
 
 class TrackSettings(Section):
-    """Which UAVs are tracked, and how a track ages.
+    """Settings of which UAVs are tracked, and of how a track ages.
 
         allow              UAVs to track; empty: all
         deny               UAVs not to track; overrides ``allow``

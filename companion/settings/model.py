@@ -41,7 +41,7 @@ from companion.settings.tracking import ClockSettings, ObserverSettings
 from companion.values import UserError, read_toml, shown
 
 MIN_SIMILARITY: Final = 0.7
-"""Similarity (difflib's ratio) from which on a name is suggested for an unknown setting."""
+"""Least similarity (difflib's ratio) of a setting that is suggested for an unknown one."""
 
 REPLAYED_SECTIONS: Final = frozenset(
     (
@@ -114,7 +114,7 @@ class Settings(Section):
 
     @classmethod
     def from_recording(cls, text: str, where: str, attached: Mapping[str, bytes]) -> Self:
-        """Parse the settings of a recording, only the sections in ``REPLAYED_SECTIONS``.
+        """Parse the settings in a recording, only the sections in ``REPLAYED_SECTIONS``.
 
         The recording is untrusted: addresses, outgoing links, directories and paths in it are
         ignored. Files that the settings name are taken from ``attached``, by their names there.
@@ -144,11 +144,11 @@ class Settings(Section):
 
     @property
     def files(self) -> Mapping[str, bytes]:
-        """Contents of the named files that were read, by name of the attachment."""
+        """Contents of the files that the settings name and that were read, by attachment name."""
         return self._files
 
     def with_files(self, files: Mapping[str, bytes]) -> Self:
-        """Return a copy with other ``files``."""
+        """Return a copy of the settings with other ``files``."""
         copy = self.model_copy()
         copy._files = files
         return copy
@@ -158,7 +158,7 @@ class Settings(Section):
         return tomli_w.dumps(self.model_dump(mode="json", exclude_none=True))
 
     def override(self, **sections: dict[str, Any]) -> "Settings":
-        """Return a copy with keys of sections replaced; a value of None keeps the key.
+        """Return a copy with some keys of sections replaced; a value of None keeps the key.
 
         The set of given keys (pydantic's ``model_fields_set``) is kept. Raises ``ConfigError`` if
         the result is unusable.
@@ -215,7 +215,7 @@ def _missing_files(where: str, setting: str) -> ConfigError:
 
 
 def sections(text: str, where: str) -> dict[str, Any]:
-    """Parse TOML into sections, unvalidated. Raises ``ConfigError`` as ``read_toml``."""
+    """Parse TOML into sections, unvalidated. Raises ``ConfigError`` like ``read_toml``."""
     try:
         return read_toml(text)
     except UserError as error:
@@ -223,7 +223,7 @@ def sections(text: str, where: str) -> dict[str, Any]:
 
 
 def _suggestion(place: tuple[int | str, ...]) -> str:
-    """Return a suggestion of the most similar setting; empty if none is similar."""
+    """Return a suggestion of the most similar setting's name; empty if none is similar."""
     section, *keys = map(str, place)
     if not keys:
         near = difflib.get_close_matches(section, Settings.model_fields, 1, MIN_SIMILARITY)
@@ -244,7 +244,7 @@ def _keys(section: Section) -> list[str]:
 
 
 def _first(error: ValidationError) -> str:
-    """Return the first error as one line: key, value, allowed values.
+    """Return the first error of invalid settings as one line: key, value, allowed values.
 
     A key with several allowed types has one error per type; the line contains all of them.
     """

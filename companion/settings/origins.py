@@ -9,18 +9,18 @@ from companion.settings.model import Settings
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Source that set a value; ``name`` is the file or recording, None for the others."""
+    """Source that set a value; ``name`` is the file or recording, None for other kinds."""
 
     kind: Literal["file", "recording", "option", "program"]
     name: str | None = None
 
 
 Origins = Mapping[tuple[str, str], Origin]
-"""Origins by section and key; a key without one has its default."""
+"""Origins of settings by section and key; a key without an origin has its default."""
 
 
 def given(settings: Settings, origin: Origin) -> Origins:
-    """Return the origins of all keys that were given, also of those given as their default."""
+    """Return the origins of all keys that were given, even if the default was given."""
     return {
         (section, key): origin
         for section in settings.model_fields_set
@@ -29,7 +29,7 @@ def given(settings: Settings, origin: Origin) -> Origins:
 
 
 def changed(settings: Settings, origin: Origin) -> Origins:
-    """Return the origins of all keys that differ from their default."""
+    """Return the origins of all keys whose values differ from the default."""
     plain = Settings()
     return {
         (section, key): origin
@@ -40,7 +40,7 @@ def changed(settings: Settings, origin: Origin) -> Origins:
 
 
 def of_options(options: Mapping[str, Mapping[str, Any]]) -> Origins:
-    """Return the origins of all keys that ``Settings.override`` replaces with these sections."""
+    """Return the origins of all keys that ``Settings.override`` replaces with some sections."""
     return {
         (section, key): Origin("option")
         for section, keys in options.items()

@@ -13,7 +13,7 @@ _ADDRESS: Final = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([0-9.]+)):([0-9]{1,5})")
 
 
 def host_and_port(text: str) -> tuple[str, int]:
-    """Parse IP:PORT, IPv6 in brackets. Raises ``UserError`` for anything else."""
+    """Parse IP:PORT (IPv6 in brackets). Raises ``UserError`` for any other form."""
     found = _ADDRESS.fullmatch(text)
     try:
         host = str(ipaddress.ip_address(found[1] or found[2])) if found else ""
@@ -31,7 +31,7 @@ def _addresses(texts: tuple[str, ...]) -> tuple[str, ...]:
 
 
 class RecordSettings(Section):
-    """Destinations of binary records, which contain the weights of each update in a fixed layout.
+    """Destinations of binary records with the weights of each update, in a fixed layout.
 
     udp            addresses (IP:PORT) to which datagrams are sent
     shared_memory  file of a ring buffer of records, such as /dev/shm/uav-beams
@@ -45,7 +45,7 @@ class RecordSettings(Section):
 
 
 class RecordingSettings(Section):
-    """Directory, rates and file sizes of recordings.
+    """Settings of recordings: directory, rates and file sizes.
 
         directory   folder of the recordings; None: no recording
         weights_hz  largest rate of recorded weights and tracks, or "all"
@@ -64,11 +64,11 @@ class RecordingSettings(Section):
 
 
 class DriveSettings(Section):
-    """A device that the service drives itself.
+    """Settings of a device that the service drives itself.
 
     target    as for ``companion drive``, such as rotctld:HOST:PORT; None: no device
     uavs      UAVs to follow, highest priority first; empty: [beams] priority, then any UAV
-    aim       "first": the first of them that has a beam; "centre": a mount points at the centre of
+    aim "first": the first UAV with a beam; "centre": a mount points at the centre of
               all that have one
     on_stale  state of the device without beams, and after the end
     """
@@ -80,10 +80,10 @@ class DriveSettings(Section):
 
 
 class PageSettings(Section):
-    """Extras of the page.
+    """Settings of extras of the page.
 
     ``map`` is a PMTiles file for the background of the plan view; None: range rings only. This
-    service serves it; the page loads nothing from elsewhere.
+    service serves the map; the page loads nothing from other servers.
     """
 
     map: str | None = None

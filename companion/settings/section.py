@@ -6,10 +6,10 @@ from companion.values import UserError
 
 
 class ConfigError(UserError):
-    """Unusable settings."""
+    """Error of unusable settings."""
 
 
 class Section(BaseModel):
-    """Section of the settings: frozen; unknown keys are errors."""
+    """Base of a settings section: frozen; unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)

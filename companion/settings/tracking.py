@@ -9,7 +9,7 @@ from companion.values import UserError
 
 
 class ClockSettings(Section):
-    """How senders' boot clocks are mapped to the node's timeline.
+    """Settings of how senders' boot clocks are mapped to the node's timeline.
 
         constant_delay_s  smallest latency of the link if it is known, seconds: one-way traffic
                           cannot show it. TIMESYNC or trusted GNSS time replaces it
@@ -39,7 +39,7 @@ Lag = tuple[
 
 
 class LimitSettings(Section):
-    """Assumptions about some aircraft; unset keys are as for the others.
+    """Assumptions about some aircraft; an unset key has the value for the other aircraft.
 
     speed_max_mps          largest speed, norm of a 3-vector
     acceleration_max_mps2  largest acceleration, norm of a 3-vector
@@ -62,9 +62,9 @@ AirframeName = Literal["copter", "aeroplane", "vtol", "helicopter", "rover", "un
 
 
 class ObserverSettings(LimitSettings):
-    """The observer and the bounds that it assumes.
+    """Settings of the observer, and the bounds that it assumes.
 
-    If reports refute a bound, it is raised for their UAV and a notice is published.
+    If a UAV's reports refute a bound, it is raised for this UAV and a notice is published.
 
     model                  "kinematic" (acceleration unknown) or "position" (velocity unknown)
     alpha                  decay rate of the position model's certificate, or "auto"

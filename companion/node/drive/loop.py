@@ -72,7 +72,7 @@ class BeamSource(Protocol):
     """Source of beams for a device."""
 
     def ask(self, lead_s: float) -> DeviceCommand:
-        """Return the device command for a time in ``lead_s``. Raises ``SourceLostError``."""
+        """Return the device command for ``lead_s`` seconds from now. Raises ``SourceLostError``."""
 
 
 class Device(Protocol):

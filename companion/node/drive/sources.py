@@ -58,7 +58,7 @@ class HttpSource:
         self._wanted = wanted
 
     def ask(self, lead_s: float) -> DeviceCommand:
-        """Return the device command for a time in ``lead_s``; takes at most two requests."""
+        """Return the device command for ``lead_s`` from now; takes at most two requests."""
         lead_ms = min(max(lead_s, 0.0), 10.0) * 1e3
         valid_at_ns = time.time_ns() + round(lead_ms * 1e6)
         try:
@@ -94,7 +94,7 @@ class LocalSource:
         self._wanted = wanted
 
     def ask(self, lead_s: float) -> DeviceCommand:
-        """Return the command for a time in ``lead_s``; only the beams are computed on the loop."""
+        """Return the device command for ``lead_s`` from now; the loop computes only the beams."""
         asked = asyncio.run_coroutine_threadsafe(self._look(lead_s), self._loop)
         try:
             update = asked.result(ANSWERS_S)

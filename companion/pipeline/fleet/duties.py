@@ -9,9 +9,9 @@ nothing.
 - A UAV that belongs elsewhere is handed over: its holder announces the new node, and serves until
   that node announces that it serves. Two nodes then serve it for the delay of one message, and
   never none.
-- If two nodes serve the same UAV without a handover, as after a partition, the one drops it whose
-  value at its claim was lower. Both see these constant numbers, so never both drop it. Names decide
-  between equal values.
+- If two nodes serve the same UAV without a handover, as after a partition, the node whose value at
+  its claim was lower drops it. Both nodes know these constant values, so never both drop it. Names
+  decide between equal values.
 """
 
 from collections.abc import Mapping

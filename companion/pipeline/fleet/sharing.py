@@ -32,9 +32,9 @@ _T = TypeVar("_T")
 
 @dataclass(slots=True)
 class _SpeakerState:
-    """Vehicle received by this node: last reception, whether this node is its speaker.
+    """Vehicle received by this node: last reception, speaker, and late reports.
 
-    ``late`` counts reports in a row that this node had to share after holding them.
+    ``is_own``: this node is its speaker. ``late`` counts reports in a row that this node had to share after holding them.
     """
 
     heard_ns: int

@@ -42,7 +42,7 @@ _VTOL: Final = 22
 
 
 def read(data: Bytes) -> Onboard:
-    """Return the samples of a log; unusable ones are counted."""
+    """Return the samples of a DataFlash log; unusable samples are counted."""
     walked = walk(data, _WANTED)
     tables = {name: table(data, walked, name) for name in _WANTED}
     lost: dict[Reason, int] = {}
@@ -71,7 +71,7 @@ def read(data: Bytes) -> Onboard:
 
 
 def _timed(of: DataflashTable, lost: dict[Reason, int]) -> DataflashTable:
-    """Return the rows in order of time; rows of several cores or receivers at one time are kept."""
+    """Return the rows in order of time, including several of one time from cores or receivers."""
     boot_us = times(of)
     if len(boot_us) != len(of):
         count(lost, Reason.MALFORMED, len(of))
@@ -115,7 +115,7 @@ def _identity(parameters: DataflashTable, versions: DataflashTable) -> tuple[int
 
 
 def _build(values: dict[bytes, float]) -> int:
-    """Return the kind of vehicle by parameters that only it has; 0 if unknown."""
+    """Return the kind of vehicle by parameters that only this kind has; 0 if unknown."""
     if b"Q_ENABLE" in values:
         return 3
     return 2 if b"FRAME_CLASS" in values else 0
@@ -201,7 +201,7 @@ def _velocities(boot_us: IntArray, tables: dict[str, DataflashTable]) -> FloatAr
 def _filled(
     velocity: FloatArray, boot_us: IntArray, fixes: Fixes | None, way: FloatArray, notes: list[str]
 ) -> FloatArray:
-    """Fill in missing velocities: the receiver's over ground, else from positions."""
+    """Fill in missing velocities from the receiver's ground velocity, else from positions."""
     missing: BoolArray = np.array(np.isnan(velocity).any(axis=1))
     notes.append(f"no estimated velocity at {missing.sum()} of {len(boot_us)} positions")
     put = way.copy()

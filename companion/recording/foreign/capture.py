@@ -1,4 +1,4 @@
-"""MAVLink from packets: captures of a network, and MCAP files of other programs.
+"""MAVLink frames from packets: network captures, and MCAP files of other programs.
 
 Each flow of packets has its own splitter, like each peer of a live link; TCP segments are put in
 order first. In an MCAP, channels whose encoding, schema or topic contains "mavlink" are searched
@@ -17,9 +17,9 @@ from companion.recording.stamps import STEP_HOLD_NS, RepairedStamps
 from companion.values import Event, Frame, Reason, Rejection
 
 _FLOWS_MAX: Final = 512
-"""Limit on concurrent flows; beyond it, the least recently active one is ended."""
+"""Limit on concurrent flows of packets; beyond it, the least recently active flow is ended."""
 _AHEAD_MAX: Final = 64
-"""Limit on TCP segments that wait for a missing one; beyond it, the missing one counts as lost."""
+"""Limit on TCP segments that wait for a missing one, which then counts as lost."""
 _MAGICS: Final = (b"\xfd", b"\xfe")
 
 
@@ -65,7 +65,7 @@ def read_capture(path: Path) -> Iterator[Event]:
 
 
 class _Flow:
-    """One flow of packets, and the frames in it. Returns nothing before its first frame."""
+    """Flow of packets, and the MAVLink frames in it; nothing is returned before its first frame."""
 
     def __init__(self, name: str) -> None:
         self._splitter = Splitter(name)
@@ -73,14 +73,14 @@ class _Flow:
         self._ahead: dict[int, bytes] = {}
 
     def take(self, t_ns: int, found: Segment) -> list[Frame | Rejection]:
-        """Return the frames that end in a packet."""
+        """Return the frames that end in a packet of this flow."""
         if found.tcp_seq is None:
             whole = self._splitter.feed(t_ns, found.payload)
             return self._frames_only(whole)
         return self._frames_only(self._splitter.feed(t_ns, self._in_order(found, found.tcp_seq)))
 
     def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """Return the rest when the flow ends."""
+        """Return the remaining frames when the flow ends."""
         rest = b"".join(self._ahead[seq] for seq in sorted(self._ahead))
         self._ahead.clear()
         return self._frames_only([*self._splitter.feed(t_ns, rest), *self._splitter.finish(t_ns)])
@@ -89,7 +89,7 @@ class _Flow:
         return events if self._splitter.frames else []
 
     def _in_order(self, found: Segment, seq: int) -> bytes:
-        """Return the bytes that are next in order: repeated bytes are dropped, later ones wait."""
+        """Return the next bytes in TCP order: repeated ones are dropped, later ones wait."""
         if found.tcp_syn:
             self._next = (seq + 1) & 0xFFFF_FFFF
             self._ahead.clear()
@@ -112,7 +112,7 @@ class _Flow:
         return [seq for seq in self._ahead if self._distance(seq) <= 0]
 
     def _distance(self, seq: int) -> int:
-        """Return how far a sequence number is ahead of the next expected one; it may wrap."""
+        """Return how far a TCP sequence number is ahead of the next expected one, modulo 2^32."""
         assert self._next is not None
         return (seq - self._next + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
 
@@ -121,7 +121,7 @@ class _Flow:
 
 
 def read_mcap(path: Path) -> Iterator[Event]:
-    """Yield the frames in the MAVLink channels of an MCAP by another program.
+    """Yield the frames in the MAVLink channels of an MCAP file of another program.
 
     Each link is a topic. Raises ``OSError`` if the file cannot be read.
     """
@@ -151,5 +151,5 @@ def read_mcap(path: Path) -> Iterator[Event]:
 
 
 def _is_frame(refused: Rejection) -> bool:
-    """Return whether a rejected sequence of bytes was a frame, and not a wrapper of one."""
+    """Return whether rejected bytes were a MAVLink frame, rather than bytes around one."""
     return refused.reason in (Reason.BAD_CRC, Reason.UNKNOWN_MESSAGE)

@@ -1,4 +1,4 @@
-"""A table of positions as text, whose header names each column with its unit.
+"""Table of positions as text, whose header names each column with its unit.
 
     # sysid = 3
     # mav_type = 2
@@ -52,11 +52,11 @@ _RESOLUTION_S: Final = 1e-3
 
 
 class NoTableError(Exception):
-    """Text that is not a table of positions; the message is one line for the user."""
+    """Error of text that is not a table of positions; the message is one line for the user."""
 
 
 def read(text: bytes | Bytes) -> Onboard:
-    """Return the samples of a table. Raises ``NoTableError`` if its header is unsuitable.
+    """Return the samples of a table. Raises ``NoTableError`` for an unsuitable header.
 
     Of very many lines only every n-th is kept.
     """
@@ -79,7 +79,7 @@ def read(text: bytes | Bytes) -> Onboard:
 
 
 class _Reading(io.RawIOBase):
-    """Bytes as a file, without copying all of them."""
+    """File object that reads bytes without copying all of them."""
 
     def __init__(self, data: bytes | Bytes) -> None:
         self._data = memoryview(data) if isinstance(data, bytes) else data.data
@@ -126,7 +126,7 @@ def _cells(line: str) -> list[str]:
 def _rows(
     lines: Iterable[str], header: str, used: list[tuple[int, str]], timed: str
 ) -> tuple[FloatArray, int]:
-    """Return the used columns of all numeric lines, (N, K), and the number of other lines.
+    """Return the used columns of all numeric lines, (N, K), and how many lines are not numeric.
 
     An empty cell is NaN.
     """

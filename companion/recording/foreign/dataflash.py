@@ -42,7 +42,7 @@ Column = NDArray[np.generic]
 
 
 class Format(NamedTuple):
-    """Layout of one type of message: its fields, and which are in hundredths."""
+    """Layout of one type of DataFlash message: its fields, and which are in hundredths."""
 
     name: str
     length: int
@@ -51,7 +51,7 @@ class Format(NamedTuple):
 
 
 class DataflashIndex(NamedTuple):
-    """Contents of a log.
+    """Index of the messages in a DataFlash log.
 
     formats  by type
     at       offsets of the messages of each wanted type, in the order of the file; of very many
@@ -67,7 +67,7 @@ class DataflashIndex(NamedTuple):
 
 
 class DataflashTable:
-    """Messages of one type, as columns. Empty if the log has none."""
+    """Messages of one type in a DataFlash log, as columns; empty if the log has none."""
 
     def __init__(self, data: Bytes, layout: Format | None, at: IntArray) -> None:
         self._layout = layout
@@ -87,7 +87,7 @@ class DataflashTable:
         return self._records.dtype.names is not None and column in self._records.dtype.names
 
     def raw(self, column: str) -> Column:
-        """Return a column as in the file, (N,)."""
+        """Return a column with the values as in the file, (N,)."""
         found: Column = self._records[column]
         return found
 
@@ -110,7 +110,7 @@ class DataflashTable:
         return found
 
     def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "DataflashTable":
-        """Return some of the messages."""
+        """Return the table with only some of its messages."""
         picked = DataflashTable.__new__(DataflashTable)
         picked._layout, picked._at = self._layout, self._at[chosen]
         picked._records = self._records[chosen]
@@ -135,7 +135,7 @@ def walk(data: Bytes, wanted: Collection[str]) -> DataflashIndex:
 
 
 def table(data: Bytes, walked: DataflashIndex, name: str) -> DataflashTable:
-    """Return the messages of one name."""
+    """Return the messages of one name in a DataFlash log."""
     for number, layout in walked.formats.items():
         if layout.name == name and number in walked.at:
             return DataflashTable(data, layout, walked.at[number])
@@ -146,7 +146,7 @@ def table(data: Bytes, walked: DataflashIndex, name: str) -> DataflashTable:
 
 
 def _describe(data: Bytes) -> tuple[dict[int, Format], int]:
-    """Return the formats in a log by type, and the number of rejected descriptions.
+    """Return the message layouts in a log by type, and the number of rejected descriptions.
 
     The first description of a type counts, as its messages were written with it.
     """
@@ -164,7 +164,7 @@ def _describe(data: Bytes) -> tuple[dict[int, Format], int]:
 
 
 def _format(body: bytes) -> Format | None:
-    """Return the format in the body of an FMT message; None if it is inconsistent."""
+    """Return the message layout in the body of an FMT message; None if inconsistent."""
     length, name = body[1], body[2:6].rstrip(b"\0").decode("ascii")
     letters = body[6:22].rstrip(b"\0").decode("latin-1")
     columns = body[22:86].rstrip(b"\0").decode("latin-1").split(",")
@@ -200,7 +200,7 @@ _OWN: Final = Format(
 
 
 def _chains(data: Bytes, lengths: IntArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Yield the offsets of messages, and their types, by block of the file."""
+    """Yield the offsets of messages, and the types of the messages, by block of the file."""
     resume = 0
     for begin in range(0, data.size, _BLOCK):
         at, types = _candidate_headers(data, begin, min(begin + _BLOCK, data.size), lengths)
@@ -215,8 +215,7 @@ def _chains(data: Bytes, lengths: IntArray) -> Iterator[tuple[IntArray, IntArray
 def _candidate_headers(
     data: Bytes, begin: int, end: int, lengths: IntArray
 ) -> tuple[IntArray, IntArray]:
-    """Return the offsets in [begin, end) of candidates: a message followed by another, or by the
-    end."""
+    """Return offsets in [begin, end) of messages that another one, or the end, follows."""
     ahead = data[begin : end + 2 * _LONGEST + _HEAD]
     if ahead.size < _HEAD:
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64)
@@ -234,7 +233,7 @@ def _candidate_headers(
 
 
 def _chained(at: IntArray, behind: IntArray) -> IntArray:
-    """Return the rows reached from the first by following each message to the next.
+    """Return the rows of a block that are reached from the first by following each message.
 
     The next row is nearly always the next message; it is searched only if not.
     """

@@ -16,7 +16,7 @@ import numpy as np
 from companion.values import FloatArray, IntArray
 
 RECEIVER_LAG_S: Final = 0.2
-"""Largest usual delay between a fix and its delivery by a receiver.
+"""Largest usual delay from a fix until the receiver delivers it, seconds.
 
 The relative time of two logs is uncertain by the difference of their receivers.
 """
@@ -26,11 +26,11 @@ _LEAPS: Final = (
     (1_483_228_800, 18), (1_435_708_800, 17), (1_341_100_800, 16), (1_230_768_000, 15),
     (1_136_073_600, 14),
 )  # fmt: skip
-"""Unix time from which GPS time is ahead by this many seconds; 13 before 2006."""
+"""Unix times, and by how many seconds GPS time is ahead from then on; 13 before 2006."""
 FIRST_UNIX_US: Final = 1_104_537_600_000_000  # 2005: no such log is older
 LAST_UNIX_US: Final = 4_102_444_800_000_000  # the year 2100; other times are invalid
 _APART_US: Final = 1_000_000
-"""Largest difference between offsets of one clock; others come from a receiver without the time."""
+"""Largest difference between offsets of one clock, us; larger for a receiver without the time."""
 _POINTS: Final = 100
 _DRIFT_SPAN_US: Final = 60_000_000
 _DRIFT_MAX: Final = 1e-3
@@ -39,7 +39,7 @@ _RESOLUTION_S: Final = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GpsTime:
-    """Unix time of a boot clock: ``boot + offset + drift * (boot - at)``."""
+    """Boot clock in Unix time: ``boot + offset + drift * (boot - at)``."""
 
     offset_us: int
     drift: float
@@ -54,7 +54,7 @@ class GpsTime:
 
 
 def unix_us(week: IntArray, week_ms: IntArray) -> IntArray:
-    """Return Unix times (N,), us, of GPS weeks and milliseconds in them; 0 if impossible."""
+    """Return Unix times (N,), us, from GPS weeks and milliseconds of the week; 0 if impossible."""
     possible = (week > 0) & (week < 10_000) & (week_ms >= 0) & (week_ms < WEEK_S * 1000)
     gps_s = GPS_EPOCH_S + np.where(possible, week, 0) * WEEK_S
     ahead_s = np.full(len(week), 13)
@@ -65,9 +65,9 @@ def unix_us(week: IntArray, week_ms: IntArray) -> IntArray:
 
 
 def fit(boot_us: IntArray, fixed_us: IntArray) -> GpsTime | None:
-    """Fit a line to fixes: the boot times of their reception, and their Unix times.
+    """Fit a boot clock to fixes, given the boot times of their reception and their Unix times.
 
-    A Unix time of 0 is unknown. None without a fix, or if most of them contradict each other.
+    A Unix time of 0 is unknown. Returns None without a fix, or if most fixes contradict each other.
     """
     sound = (fixed_us >= FIRST_UNIX_US) & (fixed_us <= LAST_UNIX_US) & (boot_us >= 0)
     sound &= boot_us < FIRST_UNIX_US

@@ -1,4 +1,4 @@
-"""Detection of files by their first bytes: onboard logs, captures, and unsupported files."""
+"""Detection of files by their first bytes: onboard logs, captures, unsupported files."""
 
 from typing import Final, Literal
 
@@ -27,7 +27,7 @@ HEAD_BYTES: Final = max(len(magic) for magic, _ in _KINDS)
 
 
 def read_piecewise(head: bytes) -> Piecewise | None:
-    """Return the kind of an onboard log or capture with these first bytes; None for others."""
+    """Return the kind of an onboard log or capture with these first bytes; None if neither."""
     return next((kind for magic, kind in _PIECEWISE if head.startswith(magic)), None)
 
 

@@ -1,7 +1,7 @@
 """Samples in the onboard log of one vehicle, whatever its format.
 
-All times are microseconds of its boot clock. Arrays of one kind of sample have the same length and
-are in order of time.
+All times are microseconds of the vehicle's boot clock. Arrays of one kind of sample have the same
+length and are in order of time.
 """
 
 from collections.abc import Mapping
@@ -15,16 +15,16 @@ from companion.values import BoolArray, FloatArray, IntArray, Reason
 
 REBOOT_US: Final = 10_000_000  # a larger step back of a boot clock is a reboot, not disorder
 NEAR_US: Final = 500_000
-"""Largest time between a position and the velocity or heading assigned to it."""
+"""Largest time between a position and the velocity or heading that is combined with it."""
 _NEAR: Final = 4
 _STAMP_JUMP_US: Final = 120_000_000
-"""Largest deviation of a stamp from the median of its neighbours in the file."""
+"""Largest deviation of a stamp from its neighbours' median in the file; else an outlier."""
 METRES_PER_DEGREE: Final = 111_195.0
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class OnboardPositions:
-    """Estimated positions.
+    """Positions that the autopilot estimated.
 
     lat_1e7, lon_1e7  (N,), 1e-7 degrees
     """
@@ -49,7 +49,7 @@ class Attitudes:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Fixes:
-    """Reports of the satellite receiver in use, (N,) each."""
+    """Reports of the satellite receiver in use, each an array (N,)."""
 
     boot_us: IntArray
     unix_us: IntArray  # the time of the fix; 0: unknown
@@ -72,7 +72,7 @@ class Fixes:
         return velocity
 
     def fixed(self) -> "Fixes | None":
-        """Return the fixes with a position; None without any."""
+        """Return the fixes that have a position; None without any."""
         rows = self.fix_type >= 3
         if not rows.any():
             return None
@@ -93,7 +93,7 @@ class Fixes:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Truth:
-    """The simulator's positions, and its quaternions ned from body (N, 4), wxyz."""
+    """The simulator's true positions, and quaternions (N, 4), wxyz, that rotate body to NED."""
 
     boot_us: IntArray
     lat_1e7: IntArray
@@ -105,7 +105,7 @@ class Truth:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Onboard:
-    """The log of one vehicle."""
+    """Samples in the onboard log of one vehicle."""
 
     sysid: int | None  # its MAVLink system id, if the log has it
     compid: int  # its component id
@@ -150,8 +150,7 @@ def time_ordered(boot_us: IntArray) -> tuple[IntArray, int]:
 
 
 def on_earth(lat_1e7: IntArray, lon_1e7: IntArray, *others: FloatArray) -> BoolArray:
-    """Return whether each position (N,) is on Earth, and the other values (N,) finite and
-    plausible."""
+    """Return a mask of positions (N,) on Earth whose other values (N,) are finite and plausible."""
     sound: BoolArray = (np.abs(lat_1e7) <= 900_000_000) & (np.abs(lon_1e7) <= 1_800_000_000)
     for other in others:
         sound &= np.isfinite(other) & (np.abs(other) < 1e6)
@@ -159,7 +158,7 @@ def on_earth(lat_1e7: IntArray, lon_1e7: IntArray, *others: FloatArray) -> BoolA
 
 
 def sound_rows(values: FloatArray, most: float) -> BoolArray:
-    """Return whether all numbers of each row (N, K) are finite and smaller than ``most``."""
+    """Return a mask of the rows (N, K) whose numbers are all finite and smaller than ``most``."""
     sound: BoolArray = np.array((np.abs(values) < most).all(axis=1))  # false for NaN
     return sound
 
@@ -201,7 +200,7 @@ def between(at_us: IntArray, boot_us: IntArray, values: FloatArray, gap_us: int)
 def velocities_of(
     boot_us: IntArray, lat_1e7: IntArray, lon_1e7: IntArray, alt_m: FloatArray
 ) -> FloatArray:
-    """Return velocities (N, 3), north-east-down, m/s, from adjacent positions; 0 for one."""
+    """Return velocities (N, 3), NED, m/s, from adjacent positions; 0 for a single position."""
     if len(boot_us) < 2:
         return np.zeros((len(boot_us), 3))
     t_s = _ascending_s(boot_us)
@@ -214,14 +213,14 @@ def velocities_of(
 
 
 def _ascending_s(boot_us: IntArray) -> FloatArray:
-    """Return seconds since the first, strictly ascending, as stamps step back at a reboot."""
+    """Return times in seconds since the first, made strictly ascending across reboots."""
     t_s = (boot_us - boot_us[0]) * 1e-6
     ascending_s: FloatArray = np.maximum.accumulate(t_s) + np.arange(len(t_s)) * 1e-9
     return ascending_s
 
 
 def body_rates_of(boot_us: IntArray, euler_rad: FloatArray) -> FloatArray:
-    """Return body rates (N, 3), rad/s, from adjacent attitudes; 0 for a single one.
+    """Return body rates (N, 3), rad/s, from adjacent attitudes; 0 for a single attitude.
 
     The rates of roll, pitch and yaw give those of the body by the kinematics of Euler angles.
     """

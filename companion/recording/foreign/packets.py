@@ -1,4 +1,4 @@
-"""Packets of a capture: pcap and pcapng, Ethernet and similar links, IPv4 and IPv6, UDP and TCP.
+"""Packets of a network capture: pcap, pcapng; Ethernet and similar links; IPv4, IPv6; UDP, TCP.
 
 Formats: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng; link types by
 https://www.tcpdump.org/linktypes.html. Truncated packets and fragments return their available part
@@ -15,7 +15,7 @@ PCAP: Final = {
     b"\x4d\x3c\xb2\xa1": ("<", 1),
     b"\xa1\xb2\x3c\x4d": (">", 1),
 }
-"""First bytes of a pcap, with its byte order and the nanoseconds per unit of its stamps."""
+"""First bytes of a pcap file, with its byte order and the nanoseconds per unit of its stamps."""
 PCAPNG: Final = b"\x0a\x0d\x0d\x0a"
 _LARGEST: Final = 1 << 18  # limit on a packet or block, bytes: more than any link carries
 _INTERFACES_MAX: Final = 1024
@@ -29,7 +29,7 @@ _V6_EXTENSIONS: Final = frozenset((0, 43, 60))
 
 
 class Packet(NamedTuple):
-    """A captured packet: time, ns since 1970; link type; captured bytes."""
+    """Captured packet: time, ns since 1970; link type; captured bytes."""
 
     t_ns: int
     link_type: int
@@ -37,7 +37,7 @@ class Packet(NamedTuple):
 
 
 class Segment(NamedTuple):
-    """The payload of a packet: its flow, and for TCP its sequence number."""
+    """Payload of a packet with its flow, and for TCP its sequence number."""
 
     flow: str
     payload: bytes
@@ -88,7 +88,7 @@ def _rest(file: IO[bytes]) -> int:
 
 
 class _Interface(NamedTuple):
-    """An interface of a pcapng: its link type, unit of time, and time offset."""
+    """Interface of a pcapng file: link type, unit of time, and time offset."""
 
     link_type: int
     numerator_ns: int

@@ -47,11 +47,11 @@ Lost = dict[Reason, int]
 
 
 class UnknownFlagsError(Exception):
-    """A file with unknown incompatibility flags."""
+    """Error of a ULog file with unknown incompatibility flags."""
 
 
 def read(data: Bytes) -> Onboard:
-    """Return the samples of a log; unusable ones are counted.
+    """Return the samples of a ULog; unusable samples are counted.
 
     Raises ``UnknownFlagsError`` if the file requires an unsupported feature.
     """
@@ -84,7 +84,7 @@ def read(data: Bytes) -> Onboard:
 
 
 def _times(of: UlogTable) -> IntArray:
-    """Return the times of samples: that of their input if known, else that of their publication."""
+    """Return the times of samples: the time of their input if known, else of publication."""
     sampled = of.integers("timestamp_sample")
     found = of.integers("timestamp") if sampled is None or not sampled.all() else sampled
     return np.zeros(0, dtype=np.int64) if found is None else found
@@ -120,7 +120,7 @@ def _armed(status: UlogTable) -> tuple[tuple[int, bool], ...]:
 
 
 def _degrees(of: UlogTable, old: str, new: str) -> IntArray:
-    """Return latitudes or longitudes, 1e-7 degrees: integers in old logs, degrees in new ones."""
+    """Return latitudes or longitudes in 1e-7 degrees; old logs have integers, new ones degrees."""
     whole = of.integers(old)
     if whole is not None:
         return whole
@@ -219,7 +219,7 @@ def _headings(boot_us: IntArray, local: UlogTable) -> FloatArray:
 
 
 def _turns(of: UlogTable, lost: Lost) -> tuple[IntArray, FloatArray]:
-    """Return times (N,) and quaternions (N, 4) of length 1."""
+    """Return times (N,) and attitude quaternions (N, 4) of length 1."""
     quaternions = of.numbers("q", 4)
     length = np.linalg.norm(quaternions, axis=1) if len(of) else np.zeros(0)
     sound = np.abs(length - 1) < 0.1

@@ -1,4 +1,4 @@
-"""The satellite receiver in use, from ArduPilot's DataFlash log: GPS and GPA.
+"""The satellite receiver in use, by the GPS and GPA messages of ArduPilot's DataFlash log.
 
 GPA has the accuracy of each GPS message, and the boot time at which the fix was received (SMS).
 """
@@ -18,7 +18,7 @@ _LATE_US: Final = 2e6
 
 
 def times(of: DataflashTable) -> IntArray:
-    """Return boot times (N,) of messages, microseconds; empty if they have none."""
+    """Return boot times (N,) of messages, microseconds; empty if the messages have none."""
     exact = of.integers("TimeUS")
     if exact is not None:
         return exact
@@ -35,7 +35,7 @@ def count(lost: dict[Reason, int], reason: Reason, number: int) -> None:
 def fixes_of(
     gps: DataflashTable, accuracy: DataflashTable, lost: dict[Reason, int]
 ) -> tuple[Fixes | None, GpsTime | None]:
-    """Return the fixes of the receiver in use, and the boot clock on GPS time."""
+    """Return the fixes of the receiver in use, and the boot clock's relation to GPS time."""
     used, instance = gps.integers("U"), gps.integers("I")
     if used is not None and used.any():
         gps = gps.rows(used > 0)
@@ -82,7 +82,7 @@ def _by_time(boot_us: IntArray) -> IntArray:
 
 
 def _nearest(boot_us: IntArray, gps: DataflashTable, accuracy: DataflashTable) -> FloatArray:
-    """Return accuracies and the boot time of the fix, ms, (N, 4), from GPA; NaN: unknown."""
+    """Return accuracies and boot times of fixes, ms, (N, 4), from GPA; NaN: unknown."""
     found = np.full((len(boot_us), 4), np.nan)
     mine, other = gps.integers("I"), accuracy.integers("I")
     if mine is not None and other is not None and len(mine):

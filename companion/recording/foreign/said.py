@@ -1,4 +1,4 @@
-"""MAVLink frames with the samples of an onboard log.
+"""MAVLink frames that contain the samples of an onboard log.
 
 Each sample is sent once, at its own time: ATTITUDE, GLOBAL_POSITION_INT, GPS_RAW_INT with its
 accuracies, and SIM_STATE for the truth, directly after a stamped message of the same time if there
@@ -52,7 +52,7 @@ Payloads = NDArray[np.void]
 
 
 class _Said(NamedTuple):
-    """Messages of one kind, in order of time; at equal times the lower rank comes first."""
+    """Frames of one message type, in order of time; at equal times the lower rank is first."""
 
     rank: int
     msgid: int
@@ -96,16 +96,16 @@ def frames(log: Onboard, link: str, source: Source, latency_s: float) -> Iterato
 
 
 def _rows(order: IntArray, times_ns: IntArray) -> Iterator[tuple[tuple[int, int], int]]:
-    """Yield (kind, row) and time of every message, converted block by block."""
+    """Yield (kind, row) and time of every message, in blocks."""
     for begin in range(0, len(order), _BLOCK):
         some = slice(begin, begin + _BLOCK)
         yield from zip(order[some].tolist(), times_ns[some].tolist(), strict=True)
 
 
 def _in_order(kinds: list[_Said]) -> tuple[IntArray, IntArray]:
-    """Return (kind, row) of every message in order of time, (N, 2), and their boot times (N,).
+    """Return (kind, row) of every message in order of time, (N, 2), and boot times (N,).
 
-    A boot clock that steps back within one kind was restarted; its later messages come last.
+    A boot clock that steps back within one kind was restarted; messages after that come last.
     """
     boots = np.concatenate([kind.boot_us for kind in kinds])
     lives = np.concatenate([_lives(kind.boot_us) for kind in kinds])
@@ -149,7 +149,7 @@ def _kinds(log: Onboard) -> list[_Said]:
 
 
 def _seconds(times: list[IntArray]) -> IntArray:
-    """Return the first time of all in each second of the boot clock, by boot."""
+    """Return the first time of any message in each second of the boot clock, by boot."""
     every = np.concatenate([np.zeros(0, dtype=np.int64), *times])
     lives = np.concatenate([np.zeros(0, dtype=np.int64), *map(_lives, times)])
     order = np.lexsort((every, lives))
@@ -223,7 +223,7 @@ def _ms(boot_us: IntArray) -> Any:
 
 
 def _whole(values: FloatArray, kind: str, unknown: int = 0) -> Any:
-    """Round values to integers of a kind, clipped to its range; NaN becomes ``unknown``."""
+    """Round values to an integer type, clipped to its range; NaN becomes ``unknown``."""
     limits = np.iinfo(kind)
     bound = np.clip(np.nan_to_num(values, nan=0.0), limits.min, limits.max)
     return np.where(np.isnan(values), unknown, np.round(bound)).astype(kind)

@@ -4,13 +4,13 @@ from collections.abc import Iterable, MutableSequence, Sequence
 from typing import Final, Generic, TypeVar
 
 SAMPLES_MAX: Final = 200_000
-"""Limit on the samples of one kind kept of a log: more than an hour at 50 Hz."""
+"""Limit on the samples of one kind kept from a log: more than an hour at 50 Hz."""
 
 T = TypeVar("T")
 
 
 class Thinned(Generic[T]):
-    """Keeps all items up to the limit, then every second, fourth, ...
+    """Collection that keeps all items up to a limit, then every second, fourth and so on.
 
     ``kept`` is the sequence that stores them, empty at first.
     """
@@ -23,13 +23,13 @@ class Thinned(Generic[T]):
         self._seen = 0
 
     def add(self, one: T) -> None:
-        """Add one."""
+        """Add one item."""
         if self._seen % self.stride == 0:
             self._keep((one,))
         self._seen += 1
 
     def extend(self, some: Sequence[T]) -> None:
-        """Add several, in order."""
+        """Add several items, in order."""
         self._keep(some[-self._seen % self.stride :: self.stride])
         self._seen += len(some)
 

@@ -33,7 +33,7 @@ _NAMES: Final = {"dataflash": "DataFlash", "ulog": "ULog", "csv": "a table"}
 
 
 class Vehicle(NamedTuple):
-    """The onboard log of one vehicle of a flight, and the id that the vehicle gets."""
+    """Onboard log of one vehicle of a flight, and the id that the vehicle gets."""
 
     path: Path
     kind: str
@@ -42,7 +42,7 @@ class Vehicle(NamedTuple):
 
     @property
     def apart_s(self) -> float:
-        """Bound on the error of its times relative to other logs; 0 if they are used unchanged.
+        """Bound on the error of the log's times relative to other logs; 0 if used unchanged.
 
         Receivers are late by 0 to ``RECEIVER_LAG_S``: by at most half of it off the middle.
         """
@@ -73,7 +73,7 @@ class Vehicle(NamedTuple):
         return f" (id {self.log.sysid} in the log is taken by another)"
 
     def as_json(self) -> dict[str, Any]:
-        """Return the same as JSON."""
+        """Return vehicle, accuracy of its time, and substitutions as JSON."""
         clock = self.log.clock
         return {
             "log": self.path.name,
@@ -88,7 +88,7 @@ class Vehicle(NamedTuple):
 
 
 def opened(logs: Sequence[tuple[Path, str]]) -> list[Vehicle]:
-    """Return the vehicles of logs, given with their kinds.
+    """Return the vehicles whose onboard logs are given, each with its kind of log.
 
     Raises ``LogError`` for an unusable log, or for logs of different flights.
     """
@@ -110,7 +110,7 @@ def opened(logs: Sequence[tuple[Path, str]]) -> list[Vehicle]:
 
 
 def events(vehicles: Sequence[Vehicle], latency_s: float) -> Iterator[Event]:
-    """Return their events in order of time, each sample arriving ``latency_s`` later."""
+    """Return the vehicles' events in order of time; a sample arrives after ``latency_s``."""
     each = [said.frames(one.log, one.path.name, one.source, latency_s) for one in vehicles]
     return heapq.merge(*each, key=lambda event: event.t_ns)
 
@@ -125,7 +125,7 @@ def _read(path: Path, kind: str) -> Onboard:
 
 @functools.lru_cache(maxsize=KEPT)
 def _read_once(path: Path, kind: str, _seen: tuple[int, int, int]) -> Onboard:
-    """Return the log in a file with status ``_seen``; cached, as commands read it several times."""
+    """Return the samples in a file with status ``_seen``; cached for repeated reads."""
     try:
         with path.open("rb") as file:  # the map is closed with its last reference
             whole = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)

@@ -45,7 +45,7 @@ _candidates = re.compile(rb"(?=[\s\S]{2}[BFIMPQARDLCSO])").finditer
 
 
 class UlogTopic(NamedTuple):
-    """One instance of a topic: its fields, and the offsets of its samples.
+    """Instance of a ULog topic: its fields, and the offsets of its samples.
 
     Of very many samples only every n-th is kept.
     """
@@ -59,7 +59,7 @@ class UlogTopic(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class UlogIndex:
-    """Contents of a log."""
+    """Index of the samples in a ULog."""
 
     topics: list[UlogTopic] = field(default_factory=list)  # wanted topics
     parameters: dict[str, float] = field(default_factory=dict)  # values at the start
@@ -70,7 +70,7 @@ class UlogIndex:
 
 
 class UlogTable:
-    """Samples of a topic, as columns. Empty if the log has none."""
+    """Samples of a ULog topic, as columns; empty if the log has none."""
 
     def __init__(self, data: Bytes, topic: UlogTopic | None) -> None:
         self._records: NDArray[np.void] = np.zeros(0, dtype=[])
@@ -86,7 +86,7 @@ class UlogTable:
         return self._records.dtype.names is not None and column in self._records.dtype.names
 
     def numbers(self, column: str, width: int = 1) -> FloatArray:
-        """Return a column as numbers, (N,), or (N, ``width``) of an array; NaN if missing."""
+        """Return a column as numbers: (N,), or (N, ``width``) for an array; NaN if missing."""
         shape = (len(self),) if width == 1 else (len(self), width)
         if column not in self:
             return np.full(shape, np.nan)
@@ -109,7 +109,7 @@ class UlogTable:
         return found
 
     def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "UlogTable":
-        """Return some of the samples."""
+        """Return the table with only some of its samples."""
         picked = UlogTable.__new__(UlogTable)
         picked._records = self._records[chosen]
         return picked
@@ -130,7 +130,7 @@ def walk(data: Bytes, wanted: Collection[str]) -> UlogIndex:
 
 
 class _Walker:
-    """One pass over a file."""
+    """Single pass over a ULog file."""
 
     def __init__(self, data: Bytes, wanted: Collection[str]) -> None:
         self._data = memoryview(data.data)
@@ -151,7 +151,7 @@ class _Walker:
         return self._found
 
     def _parts(self) -> Iterator[int]:
-        """Yield the offsets of data appended to a truncated file (after a crash)."""
+        """Yield the offsets of data that were appended to a truncated file (after a crash)."""
         head = self._data[_HEADER : _HEADER + _MESSAGE.size + _FLAGS.size]
         if len(head) < _MESSAGE.size + _FLAGS.size or head[2] != _FLAG_BITS:
             return
@@ -161,7 +161,7 @@ class _Walker:
             yield from sorted(at for at in offsets if _HEADER < at < len(self._data))
 
     def _stretch(self, at: int, end: int) -> None:
-        """Process the messages of [at, end); invalid bytes are skipped and counted."""
+        """Process the messages in [at, end); skip and count invalid bytes."""
         data, unpack = self._data, _MESSAGE.unpack_from
         while at + 3 <= end:
             size, kind = unpack(data, at)
@@ -185,7 +185,7 @@ class _Walker:
         self._found.lost += end - at
 
     def _fits(self, at: int, end: int) -> int:
-        """Return the end of the message at ``at``, if it is plausible; else 0."""
+        """Return the end of a message at ``at``, if a message there is plausible; else 0."""
         if at + 3 > end:
             return 0
         size, kind = _MESSAGE.unpack_from(self._data, at)
@@ -199,8 +199,7 @@ class _Walker:
         return int(stop)
 
     def _resume(self, at: int, end: int) -> int:
-        """Return the first offset from ``at`` on with consecutive valid messages; ``end`` without
-        one."""
+        """Return the first offset from ``at`` on of consecutive valid messages; ``end`` if none."""
         for match in _candidates(self._data, at, end):
             start = stop = match.start()
             for _ in range(_IN_A_ROW):
@@ -245,7 +244,7 @@ class _Walker:
         self._topics[number] = topic
 
     def _size(self, name: str, depth: int) -> tuple[int, int]:
-        """Return the least (without final padding) and largest size of a topic; 0 if unknown."""
+        """Return a topic's least size (without final padding) and largest size; 0 if unknown."""
         least = most = 0
         for each in filter(None, self._formats.get(name, "").split(";")):
             match = _FIELD.match(each)
@@ -273,7 +272,7 @@ class _Walker:
 
 
 def _layout(fields: str) -> np.dtype[np.void] | None:
-    """Return the fields up to the final padding; None for nested fields, or repeated names."""
+    """Return a topic's fields up to the final padding; None for nested or repeated fields."""
     described: list[tuple[str, str, tuple[int, ...]]] = []
     kept = 0
     for each in filter(None, fields.split(";")):

@@ -1,4 +1,4 @@
-"""Columns of an exported table, derived from the described values of a row's class."""
+"""Columns of an exported table, derived from the described values of the rows' class."""
 
 import math
 from collections.abc import Callable, Iterator, Mapping
@@ -33,7 +33,7 @@ class ColumnKind(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Column:
-    """A column of a table; ``get`` returns its value from a row."""
+    """Column of a table; ``get`` returns the column's value from a row."""
 
     name: str
     kind: ColumnKind
@@ -42,13 +42,13 @@ class Column:
 
     @property
     def unit(self) -> str:
-        """Unit of its values; empty without one."""
+        """Unit of the column's values; empty without one."""
         return unit(self.name) if self.kind is not ColumnKind.TIME else "UTC"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Table:
-    """A table: its name, what a row is, and its columns in order.
+    """Table of an export: its name, what a row is, and its columns in order.
 
     ``former_names`` are column names of the previous version, which are still written, last.
     """
@@ -84,7 +84,7 @@ class Table:
 
 
 def _columns(row_class: type) -> Iterator[Column]:
-    """Yield the columns of a class: a time has two, a vector three, an angle is in degrees."""
+    """Yield the columns of a class: two for a time, three for a vector; angles in degrees."""
     for member in members(row_class):
         name, get, meaning = member.name, member.get, member.meaning.text
         if "export" in member.meaning.absent:
@@ -121,8 +121,7 @@ def _kind(member: Member) -> ColumnKind:
 
 
 def _along(name: str, direction: str) -> str:
-    """Return the name of a component: ``velocity_ned_mps`` to the north is
-    ``velocity_north_mps``."""
+    """Return the name of a vector's component, such as ``velocity_north_mps``."""
     stem, _, ending = name.rpartition("_")
     return f"{stem.removesuffix('_ned')}_{direction}_{ending}"
 
@@ -144,7 +143,7 @@ def _degrees(get: Callable[[Any], Any]) -> Callable[[Any], float | None]:
 
 
 def _text(value: object) -> str | None:
-    """Return text that any program can read: invalid Unicode, as in a file's name, is escaped."""
+    """Return text that any program can read: invalid Unicode is escaped, as in a file name."""
     said = "" if value is None else str(value)
     if not said.isprintable():
         said = said.encode("utf-8", "backslashreplace").decode().replace("\0", "\\0")

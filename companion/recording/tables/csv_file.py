@@ -1,4 +1,4 @@
-"""A table as CSV (RFC 4180), UTF-8, with line feeds; unknown values are empty fields."""
+"""Table as CSV (RFC 4180), UTF-8, with line feeds; unknown values are empty fields."""
 
 import csv
 import io
@@ -12,7 +12,7 @@ _BEGINNING: Final = datetime(1970, 1, 1)  # UTC without a zone, which all reader
 
 
 class CsvFile:
-    """Rows of one table, written to an open file one by one."""
+    """CSV writer of one table's rows, to an open file."""
 
     def __init__(self, file: IO[bytes], table: Table) -> None:
         self._text = io.TextIOWrapper(file, encoding="utf-8", newline="")
@@ -22,7 +22,7 @@ class CsvFile:
         self._truths = [i for i, col in enumerate(table.columns) if col.kind is ColumnKind.TRUTH]
 
     def add(self, row: Sequence[Value]) -> None:
-        """Write a row. Raises ``OSError`` if that fails."""
+        """Write a row. Raises ``OSError`` if writing fails."""
         cells = list(row)
         for i in self._times:
             cells[i] = utc(row[i])
@@ -31,7 +31,7 @@ class CsvFile:
         self._rows.writerow(cells)
 
     def finish(self) -> None:
-        """Flush the rest; the file stays open. Raises ``OSError``."""
+        """Flush the remaining rows; the file stays open. Raises ``OSError``."""
         self._text.flush()
         self._text.detach()
 

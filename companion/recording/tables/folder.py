@@ -1,8 +1,8 @@
-"""The folder of an export: one file per table, renamed when the export is complete.
+"""Folder of an export: one file per table, renamed when the export is complete.
 
-While being written a file is called ``….active``. ``export.json`` lists the contents of the folder.
-It is removed before the first table is replaced and written after the last, so that with it, all
-tables are of the same export.
+A file that is being written is called ``….active``. ``export.json`` lists the contents of the
+folder. It is removed before the first table is replaced and written after the last, so that with
+it, all tables are of the same export.
 """
 
 import contextlib
@@ -22,7 +22,7 @@ CONTENTS: Final = "export.json"  # contents of an export; written last
 
 
 class TableFile(Protocol):
-    """One table being written, in any format."""
+    """Table being written to a file, in any format."""
 
     def add(self, row: Sequence[Value]) -> None: ...
     def finish(self) -> None: ...
@@ -32,11 +32,11 @@ FORMATS: Final[dict[str, Callable[[IO[bytes], Table], TableFile]]] = {
     "csv": CsvFile,
     "parquet": ParquetFile,
 }
-"""Writers of a table, by the suffix of its file."""
+"""Classes that write a table, by the suffix of its file."""
 
 
 class TableFolder:
-    """The tables of one export, open from the start until ``close`` or the end of the ``with``.
+    """Tables of one export, open until ``close`` or the end of the ``with``.
 
         where   the folder; created if missing
         form    a key of ``FORMATS``
@@ -64,7 +64,7 @@ class TableFolder:
     def add(self, table: str, item: Any, utc_offset_ns: int = 0) -> None:
         """Write a row for ``item``: see ``Table.row``.
 
-        Raises ``OSError`` if that fails.
+        Raises ``OSError`` if writing fails.
         """
         self._files[table].add(self._tables[table].row(item, utc_offset_ns))
         self.rows[table] += 1
@@ -94,7 +94,7 @@ class TableFolder:
         return [self._where / name for name in (*names.values(), CONTENTS)]
 
     def abandon(self) -> None:
-        """Remove the files written so far, except renamed ones."""
+        """Remove the files written so far, except those already renamed."""
         for name in self._open:
             self._active(self._name(name)).unlink(missing_ok=True)
         if self._open:

@@ -1,4 +1,4 @@
-"""A table as Parquet, written by pyarrow, which the extra ``parquet`` installs.
+"""Table as Parquet, written by pyarrow, which the extra ``parquet`` installs.
 
 The metadata of the schema describe a row; those of a field, its unit and meaning.
 """
@@ -14,7 +14,7 @@ ALWAYS: Final = (ColumnKind.INTEGER, ColumnKind.TRUTH)
 
 
 class ParquetFile:
-    """Rows of one table, written to an open file in groups.
+    """Parquet writer of one table's rows, in groups, to an open file.
 
     Raises ``UserError`` if pyarrow is not installed.
     """
@@ -43,13 +43,13 @@ class ParquetFile:
         return arrow.field(column.name, types[column.kind], column.kind not in ALWAYS, said)
 
     def add(self, row: Sequence[Value]) -> None:
-        """Add a row, and write the group when it is full. Raises ``OSError``."""
+        """Add a row, and write the group of rows when it is full. Raises ``OSError``."""
         self._waiting.append(row)
         if len(self._waiting) >= BATCH:
             self._write()
 
     def finish(self) -> None:
-        """Write the rest, and the file's end; the file stays open. Raises ``OSError``."""
+        """Write remaining rows and the file's end; the file stays open. Raises ``OSError``."""
         self._write()
         self._writer.close()
 

@@ -1,4 +1,4 @@
-"""Provenance of an answer: the command line and the versions of the programs."""
+"""Provenance of a study's answer: the command line and the versions of the programs."""
 
 import platform
 import shlex
@@ -33,7 +33,7 @@ def _written(value: Any) -> str:
 
 
 def versions(packages: Sequence[str] = PACKAGES) -> dict[str, str]:
-    """Return the versions of this program, of packages that computed the numbers, and of Python."""
+    """Return the versions of this program, of packages that compute its numbers, and of Python."""
     return {
         "companion": companion.__version__,
         **{name: version(name) for name in packages},

@@ -34,7 +34,8 @@ _T = TypeVar("_T")
 class _SpeakerState:
     """Vehicle received by this node: last reception, speaker, and late reports.
 
-    ``is_own``: this node is its speaker. ``late`` counts reports in a row that this node had to share after holding them.
+    ``is_own``: this node is the speaker. ``late`` counts reports in a row that this node had to
+    share after holding them.
     """
 
     heard_ns: int

@@ -24,7 +24,7 @@ RANGE_DB: Final = 35.0  # range of gains drawn below the largest; lower ones are
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GainCurve:
-    """Gain to draw."""
+    """Gain of the beams to draw."""
 
     name: str  # its name in the legend
     line: int  # number of its line style
@@ -40,7 +40,7 @@ KINDS: Final = (
 
 
 def charts(watched: StudiedFlight) -> dict[str, plotting.Draw]:
-    """Return the figures of one log by name; without a codebook there is no share to sweep."""
+    """Return the figures of one log by name; the share to sweep needs a codebook."""
     found: dict[str, plotting.Draw]
     found = {"gain": partial(_gain, watched), "gain_had": partial(_gain_distribution, watched)}
     if watched.codebook_beams is not None:
@@ -80,7 +80,7 @@ def _sweep(watched: StudiedFlight) -> "Figure":
 
 
 def _gain_distribution(watched: StudiedFlight) -> "Figure":
-    """Share of looks with at least a given gain: as set, and sharp beside it."""
+    """Draw the share of samples with at least a given gain: as set, and sharp."""
     sets = {"as set": [sample.as_set for sample in watched.samples]}
     if watched.widen:
         sets["sharp"] = [sample.sharp for sample in watched.samples]
@@ -110,7 +110,7 @@ def _over_time(
 ) -> None:
     """Draw a line through the middles of the bins, with a gap at each NaN.
 
-    A value alone between two gaps is a dot.
+    A single value between two gaps is a dot.
     """
     middles = (edges[1:] + edges[:-1]) / 2
     axes.plot(middles, values, label=label, **how)
@@ -120,7 +120,7 @@ def _over_time(
 
 
 def _gains(worths: Sequence[Worth | None], kind: GainCurve) -> FloatArray:
-    """Return gains of one kind, ascending; -inf if not guaranteed."""
+    """Return gains of one kind in ascending order; -inf if not guaranteed."""
     found = np.array([_of(worth, kind.value) for worth in worths if worth is not None])
     if kind.unknown:
         found = found[np.isfinite(found)]
@@ -134,7 +134,7 @@ def _kinds(watched: StudiedFlight) -> list[GainCurve]:
 def _edges(watched: StudiedFlight) -> FloatArray:
     """Return edges of the time bins, (B + 1,).
 
-    There are at most half as many bins as looks, so that no bin is empty by chance.
+    There are at most half as many bins as sampling instants, so that no bin is empty by chance.
     """
     times = np.unique([sample.t_s for sample in watched.samples])
     bins = int(np.clip(len(times) // 2, 1, BINS))
@@ -153,7 +153,7 @@ def _least(samples: Sequence[Sample], edges: FloatArray, kind: GainCurve) -> Flo
 def _worst(
     samples: Sequence[Sample], edges: FloatArray, value: Callable[[Sample], float], worse: np.ufunc
 ) -> FloatArray:
-    """Return the worst value in each bin (B,); NaN for an empty bin, and for infinite values."""
+    """Return the worst value in each bin (B,); NaN if it is infinite or the bin is empty."""
     found = np.full(len(edges) - 1, np.nan)
     where = np.clip(
         np.searchsorted(edges, [s.t_s for s in samples], "right") - 1, 0, len(found) - 1
@@ -164,7 +164,7 @@ def _worst(
 
 
 def _of(worth: Worth | None, value: Callable[[Worth], float | None]) -> float:
-    """Return a gain of a beam: NaN without a beam, -inf for a beam without that gain."""
+    """Return a gain of a beam, dB: NaN without a beam, -inf for a beam without that gain."""
     if worth is None:
         return math.nan
     found = value(worth)

@@ -7,7 +7,7 @@ compared with those of ``[beams] widen = false`` for the same tracks, which show
 benefit of widening. With a codebook (that of the settings, else a DFT's if the elements are on a
 grid) it also computes the share that must be swept to include the best stored beam.
 
-Over 300 lines: one study: its settings, its looks, its answer.
+Over 300 lines: one study: its settings, its samples, its answer.
 """
 
 import math
@@ -42,7 +42,7 @@ PROGRESS_EVERY: Final = 20  # looks between two progress messages
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamStudy:
-    """Parameters of the study.
+    """Parameters of the beam study.
 
         links     names of the links over which widths and predictors are compared; may be empty
 
@@ -65,7 +65,7 @@ class BeamStudy:
 
     @property
     def command(self) -> str:
-        """Command line of this study."""
+        """Command line of the study."""
         logs = chain.from_iterable(self.flights)
         given = {"center": self.center, "config": self.config, "links": self.links, "hz": self.hz}
         return command_line("beams", *logs, **given)
@@ -73,7 +73,7 @@ class BeamStudy:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StudiedFlight:
-    """One flight: every UAV at every look, in order of time; the array and the kind of truth."""
+    """One flight: samples of every UAV in order of time, the array, and the source of the truth."""
 
     log: str
     center: str
@@ -98,7 +98,7 @@ class StudiedFlight:
 
 @dataclass(frozen=True, slots=True)
 class Sight:
-    """Data shared by all looks at one log."""
+    """Data shared by all sampling instants of one log."""
 
     pipeline: Pipeline
     equipment: Equipment
@@ -107,7 +107,7 @@ class Sight:
     def worths(
         self, beam_set: BeamSet, carrier: Carrier, truly: dict[str, FloatArray]
     ) -> dict[str, Worth]:
-        """Return the performance of each beam of a set, by UAV.
+        """Return the performance of each beam of a set of beams, by UAV.
 
         ``truly`` holds the true directions, (3,) each.
         """
@@ -137,9 +137,9 @@ class Sight:
     def swept(
         self, towards: FloatArray, bound_rad: float | None, truly: FloatArray | None
     ) -> tuple[int | None, float | None, bool | None]:
-        """Return the best stored beam of a direction (3,), the share to sweep, whether it misses.
+        """Return a direction's (3,) best stored beam, the share to sweep, and whether it misses.
 
-        A share misses if it lacks the truly best beam. None: unknown.
+        A share misses if it lacks the beam that is best for the true direction. None: unknown.
         """
         if self.codebook is None:
             return None, None, None
@@ -154,9 +154,10 @@ class Sight:
 
 
 def sight(pipeline: Pipeline) -> Sight:
-    """Return radio and codebook of the settings; raises ``ConfigError`` if impossible.
+    """Return radio and codebook of the settings; raises ``ConfigError`` if they are inconsistent.
 
-    Without a codebook in the settings it is that of a DFT over the array's own grid, if it has one.
+    Without a codebook in the settings, the codebook is a DFT's over the array's own grid, if it has
+    one.
     """
     equipment = assembly.equipment(pipeline.settings, pipeline.array)
     codebook = equipment.codebook
@@ -216,7 +217,7 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
 
 
 def _angle_rad(towards: FloatArray, truly: FloatArray) -> float:
-    """Return the angle between two unit directions (3,); exact for small ones."""
+    """Return the angle between two unit directions (3,); exact also for small angles."""
     return math.atan2(float(np.linalg.norm(np.cross(towards, truly))), float(towards @ truly))
 
 
@@ -224,7 +225,7 @@ def _angle_rad(towards: FloatArray, truly: FloatArray) -> float:
 
 
 def updates(logs: Sequence[Path], pipeline: Pipeline, hz: float) -> Iterator[tuple[float, Update]]:
-    """Yield seconds into a flight, at ``hz``, each with the update of the latest tick.
+    """Yield the time within a flight in seconds, at ``hz``, each with the latest tick's update.
 
     Each update is yielded once. Steps the pipeline through the whole flight.
     """
@@ -248,7 +249,7 @@ def watch(
     hz: float,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> StudiedFlight:
-    """Study the logs of one flight.
+    """Study the logs of one flight through the pipeline.
 
     Raises ``UserError``, ``LogError`` or ``ConfigError`` if no UAV gets a beam.
     """

@@ -1,4 +1,4 @@
-"""Beam widths and predictors compared over links: gains, guarantees and rates, with truth.
+"""Comparison of beam widths and predictors over links: gains, guarantees, rates, with truth.
 
 Each UAV's own frames pass through a link, the log's own or one of ``studies.prediction``; the
 carrier's frames stay as logged. At every tick beams are computed in each of the three widths for
@@ -50,7 +50,7 @@ from companion.values import (
 )
 
 OTHER_PREDICTORS: Final = ("hold", "kalman-peng", "dead-reckoning-arrival")
-"""Predictors whose beams are sharp and compared with the product's."""
+"""Other predictors, whose sharp beams are compared with the product's."""
 LOOK_EVERY: Final = 4  # ticks from one look to the next; beams are computed at each tick
 ALIKE: Final = 0.9  # correlation of two shapes of one beam below which it has changed
 JUMP_DB: Final = 1.0  # change of a predicted gain from tick to tick that is a jump
@@ -58,7 +58,7 @@ JUMP_DB: Final = 1.0  # change of a predicted gain from tick to tick that is a j
 
 @dataclass(slots=True, kw_only=True)
 class _Variant:
-    """One width or predictor, with its results."""
+    """One compared case, a beam width or a predictor, with its results."""
 
     name: str
     widen: Widen
@@ -73,7 +73,7 @@ class _Variant:
     violations: int = 0
 
     def row(self) -> Row:
-        """Return the figures; shares are of beams, and None without data."""
+        """Return the figures of a case; shares are of beams, and None without data."""
         return {
             "beams": self.name,
             "n": len(self.predicted_db),
@@ -95,7 +95,7 @@ class _Variant:
 def events(
     logs: Sequence[Path], link: RadioLink, settings: Settings, seed: int = 1
 ) -> tuple[Iterator[Event], dict[str, list[ObservedReport]], LocalFrame]:
-    """Return a node's events over a link, with ticks; each UAV's reports; their local frame."""
+    """Return a node's events over a link, with ticks; each UAV's reports; the local frame."""
     center = settings.center.source or "home"
     flown = vehicles.load(logs, center)
     streams = {
@@ -119,7 +119,7 @@ def events(
 
 
 class _OtherPredictor:
-    """Another predictor of each UAV, in the pipeline's frame."""
+    """Another predictor for all UAVs, in the pipeline's local frame."""
 
     def __init__(
         self, name: str, observed: dict[str, list[ObservedReport]], settings: Settings
@@ -130,7 +130,7 @@ class _OtherPredictor:
         self._predictors = {uav: self._make() for uav in observed}
 
     def tracks(self, update: Update, local: LocalFrame, pipeline: Pipeline) -> tuple[Track, ...]:
-        """Return the tracks of an update, at this predictor's positions."""
+        """Return the tracks of an update with this predictor's positions."""
         found = []
         for track in update.tracks:
             waiting, predictor = self._waiting.get(track.uav, []), self._predictors.get(track.uav)
@@ -194,7 +194,7 @@ def _make(
     truth: ArrayTruth | None,
     looks: bool,
 ) -> None:
-    """Compute the beams of one width or predictor, and record their performance."""
+    """Compute the beams of one beam width or predictor, and record their performance."""
     assert update.carrier is not None
     made = aim(
         update.t_ns,
@@ -250,11 +250,11 @@ COLUMNS: Final = (
     ("violated", "violations"), ("bit/s/Hz", "spectral_efficiency_mean"),
     ("changed", "changed_shape_share"), ("jumps", "jump_share"),
 )  # fmt: skip
-"""Headings and keys of the table."""
+"""Headings and keys of the table of beam widths and predictors."""
 
 
 def cells(row: Row) -> list[str]:
-    """Format a row."""
+    """Format a row of the table of beam widths and predictors."""
     found = []
     for _, key in COLUMNS:
         value = row[key]
@@ -268,5 +268,5 @@ def cells(row: Row) -> list[str]:
 
 
 def text(rows: Sequence[Row]) -> str:
-    """Return the table as text."""
+    """Return the table of beam widths and predictors as text."""
     return text_table([[words for words, _ in COLUMNS], *map(cells, rows)])

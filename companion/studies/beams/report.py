@@ -24,7 +24,7 @@ COMPARED: Final = (
     ("time slots: most", ("turns_max",)),
     ("condition number: largest", ("condition_number_max",)),
 )
-"""Figures shown for beams as set and for sharp ones, side by side."""
+"""Keys of figures that are shown for beams as set and for sharp beams, side by side."""
 AS_FOUND: Final = (
     ("looks with a beam", ("n",)),
     ("tracked without a beam", ("without_beam",)),
@@ -40,7 +40,7 @@ AS_FOUND: Final = (
         ("codebook_misses", "codebook_misses_within_bound"),
     ),
 )
-"""Figures that are independent of the beam width."""
+"""Keys of figures that do not depend on the beam width."""
 
 _CAPTIONS: Final = {
     "gain": "Array gain over time, the least in each interval. A gap in the line of the guaranteed"
@@ -76,7 +76,7 @@ def files(
 
 
 def text(found: Sequence[StudiedFlight], compared: Sequence[Row] = ()) -> str:
-    """Return the tables as text, all UAVs of a log together."""
+    """Return the tables of the study as text, all UAVs of a log together."""
     parts = [_text(watched) for watched in found]
     for log in dict.fromkeys(row["log"] for row in compared):
         of_this_log = [row for row in compared if row["log"] == log]

@@ -1,4 +1,4 @@
-"""Performance of beams at each look, and its summary."""
+"""Performance of beams at each sampling instant, and its summary."""
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
@@ -16,12 +16,12 @@ from companion.values import BeamSet, FloatArray, Method
 Row = dict[str, Any]
 ROUNDING_DB: Final = 1e-9  # rounding tolerance between true and guaranteed gain
 SHARP: Final = "sharp_"
-"""Prefix of the keys for beams with ``[beams] widen = false``; others are for those as set."""
+"""Prefix of keys for beams with ``[beams] widen = false``; other keys are for beams as set."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Worth:
-    """One beam at one time; gains are of the array in dB, element pattern included.
+    """Performance of one beam at one time; gains are the array's, dB, element pattern included.
 
     guaranteed_gain_db   least gain within the pointing bound; None: not guaranteed
     """
@@ -46,11 +46,11 @@ class Worth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sample:
-    """One tracked UAV at one look. Without a beam all but the first two fields are None.
+    """One tracked UAV at one sampling instant; without a beam only the first two fields are set.
 
     pointing_bound_rad  bound on the angle between predicted and true direction
     codebook_best       index of the best stored beam for the predicted direction
-    sweep_share         share of the codebook that must be swept to include the best
+    sweep_share share of the codebook to sweep for the best stored beam
     """
 
     t_s: float  # seconds into the log
@@ -71,13 +71,13 @@ class Sample:
 
 
 def summed_up(samples: Sequence[Sample]) -> Row:
-    """Return the figures over samples.
+    """Return the summary figures of samples.
 
-    Counts and shares are of looks at which the UAV had a beam, except ``without_beam``. None
-    without data. Percentiles are values that occurred, and count missing values: 95 % of all looks
-    have at least the guaranteed gain p5, which is None if fewer have any. Violations and misses are
-    broken guarantees: those within the bound are faults of this program, the others follow from
-    settings whose bounds did not hold.
+    Counts and shares are of samples in which the UAV had a beam, except ``without_beam``. None
+    without data. Percentiles are values that occurred, and count missing values: 95 % of all
+    samples have at least the guaranteed gain p5, which is None if fewer have any. Violations and
+    misses are broken guarantees: those of UAVs within the bound are faults of this program, the
+    others follow from settings whose bounds did not hold.
     """
     served = [sample for sample in samples if sample.as_set is not None]
     bounds = [_or(sample.pointing_bound_rad, math.inf) for sample in served]
@@ -103,7 +103,7 @@ def summed_up(samples: Sequence[Sample]) -> Row:
 
 
 def _of_beams(beams: Sequence[tuple[Worth, bool]], prefix: str) -> Row:
-    """Return each figure of the beams, paired with whether the UAV was beyond its bound."""
+    """Return each figure of the beams, paired with whether the UAV was outside its bound."""
     worths = [worth for worth, _ in beams]
     gains = [worth.gain_db for worth in worths]
     sure = [_or(worth.guaranteed_gain_db, -math.inf) for worth in worths]
@@ -137,7 +137,7 @@ def _of_beams(beams: Sequence[tuple[Worth, bool]], prefix: str) -> Row:
 def given(
     pipeline: Pipeline, made: BeamSet, truly: Mapping[str, FloatArray]
 ) -> tuple[Sequence[float | None], FloatArray]:
-    """Return guaranteed gains of beams, dB, and their power gains (N,) towards the true directions.
+    """Return guaranteed gains of beams, dB, and power gains (N,) towards the true directions.
 
     ``truly`` holds the true directions, (3,) each, by UAV; without one the gain is NaN.
     """
@@ -153,9 +153,9 @@ def given(
 
 
 def percentile(values: Sequence[float], percent: float) -> float | None:
-    """Return the least value that occurred and is not below ``percent`` of all.
+    """Return the least of some values that is not below ``percent`` of all of them.
 
-    None if it is not finite, or if there are no values.
+    None if that value is not finite, or if there are no values.
     """
     if not values:
         return None
@@ -164,7 +164,7 @@ def percentile(values: Sequence[float], percent: float) -> float | None:
 
 
 def mean(values: Sequence[float]) -> float | None:
-    """Return the mean; None without values."""
+    """Return the mean of values; None without values."""
     return float(np.mean(values)) if values else None
 
 

@@ -27,7 +27,7 @@ _WIDEST_SLOPE: Final = 1.0  # beams per sine, in codebooks: start of the search,
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Geometry:
-    """Array's position in normalised coordinates, and the other fitted parameters.
+    """Fitted parameters: the array's position in normalised coordinates, and the others.
 
     height   of the flight above the array, in the scale of the second axis; one for all samples
     """
@@ -46,7 +46,7 @@ class Geometry:
         return self._at(delayed(place, self.lag))
 
     def _at(self, place: FloatArray) -> FloatArray:
-        """Return the same for positions that are already delayed."""
+        """Return the expected beams at positions (N, 2) that are already delayed."""
         east = (place[:, 0] - self.x) * np.exp(self.stretch)
         north = place[:, 1] - self.y
         across = north * np.cos(self.yaw) - east * np.sin(self.yaw)
@@ -68,7 +68,7 @@ def delayed(place: FloatArray, lag: float) -> FloatArray:
 def fit(
     place: FloatArray, beam: IntArray, learned: BoolArray, beams: int, *, simple: bool = False
 ) -> Geometry:
-    """Fit the geometry to the training samples; a simple one has no height or lag."""
+    """Fit the geometry to the training samples; a simple geometry has no height or lag."""
     height = 0.0 if simple else _HEIGHT
     begin = [
         Geometry(
@@ -97,7 +97,7 @@ def fit(
 def refit(
     begin: Geometry, place: FloatArray, beam: IntArray, learned: BoolArray, beams: int
 ) -> Geometry:
-    """Fit to fewer samples, with a known lag."""
+    """Fit the geometry to fewer samples, with a known lag."""
     _, found = _fitted(begin, place, beam, learned, beams)
     return found
 
@@ -105,9 +105,9 @@ def refit(
 def _fitted(
     begin: Geometry, place: FloatArray, beam: IntArray, learned: BoolArray, beams: int
 ) -> tuple[float, Geometry]:
-    """Return the least cost, robust against outliers, and its geometry.
+    """Return the least cost of a fit, robust against outliers, and its geometry.
 
-    A height of 0 is not fitted.
+    If the height is 0, it is not fitted.
     """
     there = delayed(place, begin.lag)[learned]
     first = [begin.x, begin.y, begin.stretch, begin.yaw, begin.middle, begin.slope, begin.height]

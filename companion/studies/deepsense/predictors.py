@@ -3,7 +3,7 @@
 ``nearest`` and ``geometry`` are published methods, for comparison. ``kernel`` is the product's
 method: the density of beams over the beam that a geometry with a height expects, by a Gaussian
 kernel (Nadaraya 1964, Watson 1964), and by the distance from that beam where there are few samples.
-All make their choices from the training samples only.
+All predictors make their choices from the training samples only.
 """
 
 from collections.abc import Callable
@@ -32,7 +32,7 @@ _REFLECTED: Final = 0.01
 
 
 def nearest(samples: Samples, _: BoolArray) -> Fitted:
-    """Votes of the nearest samples; ties favour the beam of the nearer one."""
+    """Predict by votes of the nearest samples; ties favour the beam of the nearer sample."""
     return partial(_votes, samples)
 
 
@@ -47,7 +47,7 @@ def _votes(samples: Samples, learned: BoolArray) -> FloatArray:
 
 
 def plain(samples: Samples, learned: BoolArray) -> Fitted:
-    """Beams by their distance from the one for the sine of the bearing."""
+    """Predict by the distance of beams from the beam for the sine of the bearing."""
     at = geometry.fit(samples.place, samples.beam, learned, samples.beams, simple=True)
     likely = _beside(samples, at.beams(samples.place), 1.0)
     likely /= likely.sum(axis=1, keepdims=True)
@@ -55,7 +55,7 @@ def plain(samples: Samples, learned: BoolArray) -> Fitted:
 
 
 def kernel(samples: Samples, learned: BoolArray) -> Fitted:
-    """Density of beams over the expected one, with a kernel chosen on the training samples."""
+    """Predict by the density of beams over the expected beam; the kernel is chosen in training."""
     at, (width, weight) = chosen(samples, learned)
     return lambda mask: averaged(samples, mask, _leave_one_out(samples, mask, at), width, weight)
 
@@ -75,7 +75,7 @@ def chosen(samples: Samples, learned: BoolArray) -> tuple[Geometry, tuple[float,
 
 
 def _leave_one_out(samples: Samples, learned: BoolArray, at: Geometry) -> list[Geometry]:
-    """Return geometries from parts of the training samples; their spread is the doubt."""
+    """Return geometries from parts of the training samples; their spread shows uncertainty."""
     counted = learned & samples.apart()
     return [
         geometry.refit(at, samples.place, samples.beam, counted & ~part, samples.beams)
@@ -86,7 +86,7 @@ def _leave_one_out(samples: Samples, learned: BoolArray, at: Geometry) -> list[G
 def averaged(
     samples: Samples, learned: BoolArray, geometries: list[Geometry], width: float, weight: float
 ) -> FloatArray:
-    """Return probabilities (N, beams), the mean over geometries."""
+    """Return the mean of the probabilities (N, beams) over geometries."""
     found: FloatArray = np.mean(
         [density(samples, learned, at, width, weight) for at in geometries], axis=0
     )
@@ -94,7 +94,7 @@ def averaged(
 
 
 def own(likely: FloatArray, beam: IntArray) -> FloatArray:
-    """Return the probability of each beam (N,) among those of all (N, beams)."""
+    """Return the probability (N,) of each sample's beam among those of all beams (N, beams)."""
     found: FloatArray = likely[np.arange(len(beam)), beam % likely.shape[1]]
     return found
 
@@ -113,7 +113,8 @@ def density(
 ) -> FloatArray:
     """Return probabilities (N, beams) from training samples with about the same expected beam.
 
-    They are counted in small cells; a sample in the same cell counts 1, and the prior ``weight``.
+    Training samples are counted in small cells; a sample in the same cell counts 1, and the prior
+    ``weight``.
     """
     counted = learned & samples.apart()
     expected = at.beams(samples.place)
@@ -136,7 +137,7 @@ def density(
 
 
 def _beside(samples: Samples, expected: FloatArray, scale: float) -> FloatArray:
-    """Decay with the distance (N, beams) of beams from the expected one, in ``scale`` beams."""
+    """Return a decay with the distance (N, beams) from the expected beam, in ``scale`` beams."""
     off = np.abs(np.arange(samples.beams) - expected[:, None])
     found: FloatArray = np.exp(-off / scale)
     return found

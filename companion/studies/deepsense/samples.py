@@ -8,14 +8,14 @@ import numpy as np
 from companion.values import BoolArray, FloatArray, IntArray
 
 _STATIONARY_SHARE: Final = 0.1
-"""Weight of a sample at the previous position, relative to one a mean step farther."""
+"""Weight of a sample at the previous position, relative to a sample a mean step away."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Samples:
-    """Measured samples, in order of time.
+    """Measured samples of a scenario, in order of time.
 
-    power      (N, beams), received power of each, linear; None if the table has none
+    power (N, beams), received power per beam, linear; None if the table has none
     """
 
     name: str  # of the table
@@ -25,7 +25,7 @@ class Samples:
     power: FloatArray | None = None
 
     def neighbours_alike(self) -> float:
-        """Return the share of samples with the previous one's beam: what a random split leaks."""
+        """Return the share of samples whose beam equals the previous sample's."""
         return float(np.mean(self.beam[1:] == self.beam[:-1]))
 
     def apart(self) -> BoolArray:
@@ -49,13 +49,13 @@ def blocks(count: int, number: int, folds: int) -> list[BoolArray]:
 
 
 def shuffled(count: int, folds: int, seed: int) -> list[BoolArray]:
-    """Return random folds, as published: masks (N,). Neighbours in time are on both sides."""
+    """Return random folds, as published: masks (N,). Neighbours in time are in different folds."""
     which = np.random.default_rng(seed).permutation(count) % folds
     return [which == fold for fold in range(folds)]
 
 
 def inner(learned: BoolArray, number: int, folds: int) -> list[BoolArray]:
-    """Return blocks within the training samples, for choices that must not use the test samples."""
+    """Return blocks within the training samples, for choices made without the test samples."""
     (rows,) = np.nonzero(learned)
     found = []
     for part in blocks(len(rows), number, folds):

@@ -24,13 +24,13 @@ PREDICTORS: Final[dict[str, Predictor]] = {
 TARGETS: Final = {1: 45.0, 3: 82.0, 5: 95.0}  # the product's targets on blocks, percent
 _CALIBRATION: Final = (16, 4)
 _TARGET_COVERAGE: Final = 1 - 0.75 * (1 - COVERAGE)
-"""Aimed coverage: a quarter of the allowed misses is in reserve, for blocks that are harder."""
+"""Coverage aimed at: a quarter of the allowed misses is reserved for harder blocks."""
 
 
 def study(
     samples: Samples, seed: int, progress: Callable[[str], None] = lambda _text: None
 ) -> dict[str, Any]:
-    """Return the answer as written to ``deepsense.json``."""
+    """Return the answer of the study, as written to ``deepsense.json``."""
     count = len(samples.beam)
     splits = {"blocks": blocks(count, BLOCKS, FOLDS), "shuffled": shuffled(count, FOLDS, seed)}
     rows = []
@@ -82,7 +82,7 @@ def _scores(samples: Samples, predictor: Predictor, folds: list[BoolArray]) -> d
 def _threshold(samples: Samples, fitted: Fitted, learned: BoolArray) -> float:
     """Return the probability threshold for enough coverage, in blocks of training samples.
 
-    Of all sets with the same mean coverage, those by one such threshold are the smallest (Sadinle,
+    Of all sets with the same mean coverage, sets by one such threshold are the smallest (Sadinle,
     Lei and Wasserman 2019).
     """
     reached = []
@@ -98,7 +98,7 @@ def _sizes(likely: FloatArray, threshold: float) -> IntArray:
 
 
 def _lost_db(power: FloatArray, likely: FloatArray) -> FloatArray:
-    """Return the loss of received power by the likeliest beam against the best one, dB, (N,)."""
+    """Return the loss of received power by the likeliest beam against the best beam, dB, (N,)."""
     columns = np.argmax(likely, axis=1) % power.shape[1]
     got = power[np.arange(len(power)), columns]
     found: FloatArray = 10.0 * np.log10(power.max(axis=1) / np.maximum(got, 1e-12))
@@ -106,7 +106,7 @@ def _lost_db(power: FloatArray, likely: FloatArray) -> FloatArray:
 
 
 def text(answer: dict[str, Any]) -> str:
-    """Return the table as text."""
+    """Return the table of scores as text."""
     lines = [
         f"{answer['table']}: {answer['samples']} samples, {answer['beams']} beams;"
         f" {answer['neighbours_alike']:.0%} of neighbours share a beam",

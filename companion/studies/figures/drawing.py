@@ -12,7 +12,7 @@ INK: Final = "#111111"
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Line:
-    """Polyline through points (N, 2).
+    """Polyline of a drawing through points (N, 2).
 
     ``colour`` is #rrggbb; ``dash`` alternates drawn and blank lengths, empty for a solid line.
     """
@@ -25,7 +25,7 @@ class Line:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TextLabel:
-    """Text whose baseline starts, is centred or ends at x, y, by ``anchor``."""
+    """Text of a drawing; its baseline starts, is centred or ends at x, y, by ``anchor``."""
 
     x: float
     y: float
@@ -47,7 +47,7 @@ class Drawing:
 
 
 def svg(drawing: Drawing) -> str:
-    """Return the drawing as an SVG document, which HTML may embed."""
+    """Return a drawing as an SVG document, which HTML may embed."""
     size = f'viewBox="0 0 {drawing.width} {drawing.height}" width="{drawing.width}"'
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" {size} role="img"'

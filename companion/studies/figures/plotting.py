@@ -60,7 +60,7 @@ def style() -> Iterator[None]:
 def new(
     rows: int, columns: int, size_in: tuple[float, float], **options: Any
 ) -> "tuple[Figure, list[Axes]]":
-    """Return a figure and its panels in row order; sizes in inches."""
+    """Return a new figure and its panels in row order; sizes in inches."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=size_in)
@@ -75,18 +75,18 @@ def line(number: int) -> dict[str, Any]:
 
 
 def marked(number: int) -> dict[str, Any]:
-    """Return ``line`` with a marker: for curves through few points, or many curves."""
+    """Return colour, dash and marker of a line, for curves through few points, or many curves."""
     return line(number) | {"marker": MARKS[number % len(MARKS)]}
 
 
 def below(figure: "Figure", axes: "Axes", columns: int) -> None:
-    """Place one legend for all panels below them, with the entries of one."""
+    """Place one legend for all panels of a figure below them, with the entries of one panel."""
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
 def title_panels(panels: "Sequence[Axes]", titles: Sequence[str]) -> None:
-    """Title the panels (a), (b) and so on."""
+    """Title the panels of a figure (a), (b) and so on."""
     for number, (axes, title) in enumerate(zip(panels, titles, strict=True)):
         axes.set_title(f"({chr(ord('a') + number)}) {title}")
 

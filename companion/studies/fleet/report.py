@@ -24,7 +24,7 @@ CAPTIONS: Final = {
 
 
 def cells(one: FleetSize) -> list[str]:
-    """Return one size as a row of the table."""
+    """Return the results of one fleet size as a row of the table."""
     return [
         str(one.nodes),
         str(one.uavs),
@@ -42,7 +42,7 @@ def cells(one: FleetSize) -> list[str]:
 
 
 def text(found: Sequence[FleetSize]) -> str:
-    """Return the table as text."""
+    """Return the table of fleet sizes as text."""
     return text_table([COLUMNS, *map(cells, found)])
 
 

@@ -1,4 +1,4 @@
-"""UAVs on circles over a grid of nodes: positions, reports and the nodes' offers."""
+"""Simulated UAVs on circles over a grid of nodes: positions, reports, the nodes' offers."""
 
 import math
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ NEAREST_M: Final = 50.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sky:
-    """Scenario of UAVs, nodes and their network."""
+    """Parameters of the scenario: UAVs, nodes and their network."""
 
     nodes: int
     uavs: int
@@ -31,7 +31,7 @@ class Sky:
 
 
 class SkySimulation:
-    """The sky over time; times are seconds since its start.
+    """Positions of the UAVs over time; times are seconds since the start.
 
     ``names`` are the nodes, ``uavs`` the UAVs, ``places_m`` (nodes, 2) the positions of the nodes.
     """
@@ -51,7 +51,7 @@ class SkySimulation:
         self._mavs: dict[str, Any] = {}
 
     def ranges_m(self, t_s: float) -> FloatArray:
-        """Return distances (nodes, UAVs)."""
+        """Return the distances (nodes, UAVs) at a time, metres."""
         angles = self._phases + self._speeds_mps / self._radii_m * t_s
         around = np.column_stack([np.cos(angles), np.sin(angles)])
         positions_m = self._centres_m + self._radii_m[:, np.newaxis] * around
@@ -60,7 +60,7 @@ class SkySimulation:
         return found
 
     def offers(self, ranges_m: FloatArray) -> dict[str, Offer]:
-        """Return the offers of a node at these distances (UAVs,), for the UAVs within its reach."""
+        """Return a node's offers to the UAVs within its reach, from distances (UAVs,)."""
         found = {}
         for i in np.flatnonzero(ranges_m < self._reach_m).tolist():
             loss_db = 20 * math.log10(max(float(ranges_m[i]), NEAREST_M) / 1000)

@@ -16,7 +16,7 @@ HALF = 0.5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetSize:
-    """Results of a fleet of one size.
+    """Results of the fleet study for a fleet of one size.
 
     twice, none         share of the time in which a UAV within reach had several nodes, or none
     told_kbps           kilobits per second that a node sends, without headers, by kind of message
@@ -40,9 +40,9 @@ class FleetSize:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetStudy:
-    """Parameters of the study: sizes as (nodes, UAVs), virtual time and network.
+    """Parameters of the fleet study: sizes as (nodes, UAVs), virtual time and network.
 
-    ``spacing_m`` is between neighbouring nodes.
+    ``spacing_m`` is the distance between neighbouring nodes.
     """
 
     sizes: tuple[tuple[int, int], ...]
@@ -120,7 +120,7 @@ def _counted(world: World, seconds: float) -> FleetCounts:
 
 
 def _measure_takeover(world: World) -> tuple[float | None, int]:
-    """Kill the busiest node; return the time until its UAVs are served again, and their number."""
+    """Kill the busiest node; return the time until its UAVs are served, and how many there are."""
     victim = max(world.members, key=lambda name: len(world.members[name].duties.serves))
     orphans = set(world.members[victim].duties.serves)
     began_ns, taken = world.now_ns, dict[str, float]()
@@ -152,6 +152,6 @@ def _measure_healing_s(world: World) -> float:
 
 
 def answer(asked: FleetStudy, found: Sequence[FleetSize], command: str) -> dict[str, Any]:
-    """Return parameters and results as JSON."""
+    """Return parameters and results of the study as JSON."""
     sizes = [asdict(one) for one in found]
     return {"sizes": sizes, "asked": asdict(asked), "command": command, "versions": versions()}

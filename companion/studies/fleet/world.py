@@ -37,7 +37,7 @@ HEADER_BYTES: Final = 110
 
 @dataclass(slots=True, kw_only=True)
 class FleetCounts:
-    """Counts of a period; those of UAVs are of UAVs within reach of some node, summed over ticks.
+    """Counts of a period, summed over ticks; UAVs count while within reach of some node.
 
     A UAV counts once it has been within reach for ``ENTRY_S``, the time allowed for a first
     assignment.
@@ -63,7 +63,7 @@ class FleetCounts:
 
 
 class World:
-    """Fleet in virtual time; ``cpu_s`` returns the processor time used."""
+    """Simulated fleet in virtual time; ``cpu_s`` returns the processor time used."""
 
     def __init__(
         self, sky: Sky, settings: FleetSettings, cpu_s: Callable[[], float] = lambda: 0.0
@@ -114,7 +114,7 @@ class World:
             watch()
 
     def kill(self, name: str, seen_s: float = 0.05) -> None:
-        """End a node's process; the others lose its liveliness after ``seen_s``."""
+        """End a node's process; the others notice its missing liveliness after ``seen_s``."""
         self.dead.add(name)
         at_ns = self.now_ns + round(seen_s * SECOND_NS)
         for other in self._names:
@@ -268,7 +268,7 @@ class World:
         return found
 
     def servable(self) -> set[str]:
-        """Return the UAVs within reach of a living node."""
+        """Return the UAVs within reach of at least one living node."""
         alive = [number for number, name in enumerate(self._names) if name not in self.dead]
         if not alive:
             return set()

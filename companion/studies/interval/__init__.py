@@ -1,1 +1,1 @@
-"""Report rate that a UAV needs."""
+"""Study of the report rate that a UAV needs."""

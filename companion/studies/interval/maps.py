@@ -30,7 +30,7 @@ FEEDTHROUGHS_S: Final = (-0.2, 0.0, 0.2, 0.5)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Maps:
-    """Maps of the study."""
+    """Maps of the interval study."""
 
     alpha: FloatArray  # (A,), decay axis
     feedthrough_s: FloatArray  # (D,), feedthrough axis
@@ -81,7 +81,7 @@ def study(progress: Progress) -> tuple[dict[str, Any], Maps]:
 def rates() -> list[dict[str, float]]:
     """Return the longest intervals by error, speed and feedthrough, at the best alpha.
 
-    With alpha free the largest interval is the larger of 2 d, below which the input can be
+    If alpha is free, the largest interval is the larger of 2 d, below which the input can be
     cancelled, and d + error / speed, which alpha near 1 approaches without cancellation.
     """
     found = []

@@ -16,11 +16,11 @@ from companion.values import BoolArray, ComplexArray, FloatArray, IntArray
 
 CODED_BITS: Final = modulation.BITS * len(ofdm.DATA)
 BLOCK_BITS: Final = CODED_BITS // len(coding.GENERATORS) - coding.TAIL
-"""Bits of a coded block, without its tail."""
+"""Number of payload bits in a coded block, without the code's tail."""
 
 
 class Estimation(StrEnum):
-    """Channel knowledge of a receiver: flat estimate from its pilots, or exact."""
+    """How a receiver knows its channel: by a flat estimate from pilots, or exactly."""
 
     PILOTS = "pilots"
     IDEAL = "ideal"
@@ -28,7 +28,7 @@ class Estimation(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Sent:
-    """B blocks to each of N UAVs."""
+    """Transmitted data: B blocks to each of N UAVs."""
 
     bits: BoolArray  # (N, B, 306)
     coded: BoolArray  # (N, B, 936), coded bits
@@ -38,7 +38,7 @@ class Sent:
 
 
 def send(users: int, blocks: int, rng: np.random.Generator) -> Sent:
-    """Draw random bits and encode them.
+    """Draw random bits and encode them into blocks.
 
     Raises ``ValueError`` for more streams than pilots.
     """
@@ -60,7 +60,7 @@ def send(users: int, blocks: int, rng: np.random.Generator) -> Sent:
 
 
 def through(taps: ComplexArray, samples: ComplexArray) -> ComplexArray:
-    """Return samples (N, B, 320) as received without noise.
+    """Return the noise-free received samples (N, B, 320) of blocks after a channel.
 
     Blocks are consecutive; every stream passes every delay of ``taps`` (T, N, N).
     """
@@ -81,7 +81,7 @@ def noise(users: int, blocks: int, rng: np.random.Generator) -> ComplexArray:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BlockErrors:
-    """Errors by UAV and block, (N, B) each."""
+    """Errors of received blocks by UAV and block, (N, B) each."""
 
     raw_errors: IntArray  # wrong hard decisions on coded bits
     decoded_errors: IntArray  # wrong bits after decoding
@@ -91,7 +91,7 @@ class BlockErrors:
 def receive(
     sent: Sent, heard: ComplexArray, noise_power: float, taps: ComplexArray, estimation: Estimation
 ) -> BlockErrors:
-    """Decode received carriers (N, B, 256), noise included.
+    """Decode received carriers (N, B, 256), noise included; count errors.
 
         noise_power  per carrier, over the energy of a symbol
         taps         (T, N, N), used for the exact channel only

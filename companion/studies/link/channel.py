@@ -52,7 +52,7 @@ class Scattering:
 
     @property
     def profile(self) -> FloatArray:
-        """Shares of the scattered power by delay in samples, (T,); they add up to 1."""
+        """Share of the scattered power at each delay in samples, (T,); the shares add up to 1."""
         spread = self.delay_spread_s * SAMPLE_RATE_HZ
         if spread == 0:
             return np.ones(1)
@@ -68,7 +68,7 @@ def draw(
     truly: FloatArray,
     rng: np.random.Generator,
 ) -> ComplexArray:
-    """Draw the response of each UAV to each element after combining, at each delay: (T, N, M).
+    """Draw each UAV's response to each element after combining, at each delay: (T, N, M).
 
     ``truly`` are the true directions (N, 3) in the array frame. UAVs have the array's attitude.
     Units: the line of sight alone has gain 1 from an element to an antenna.
@@ -100,7 +100,7 @@ def draw(
 
 
 def weights(array: Array, instant: Instant, by: PositionSource, precoder: Precoder) -> ComplexArray:
-    """Return weights (M, N), columns of unit norm, not widened, for the directions by ``by``.
+    """Return weights (M, N), unit-norm columns, not widened, for the directions ``by``.
 
     Raises ``UserError`` if the precoder omits UAVs or uses time slots.
     """
@@ -128,7 +128,7 @@ def responses(rows: ComplexArray, sent: ComplexArray, alone: FloatArray) -> Comp
 def alone(array: Array, uav_array: Array, truly: FloatArray) -> FloatArray:
     """Return the line-of-sight amplitude (N,) at each UAV of an exact beam of unit norm.
 
-    The UAV's antennas are combined: |a| |b|, which is sqrt(M N_U) for isotropic elements.
+    The UAV's antennas are combined: the amplitude is |a| |b|, sqrt(M N_U) for isotropic elements.
     """
     at_node = np.linalg.norm(steering_matrix(array, truly), axis=0)
     at_uav = np.linalg.norm(steering_matrix(uav_array, -truly), axis=0)

@@ -1,4 +1,4 @@
-"""Convolutional code of the link, rate 1/3, constraint length 7, and its Viterbi decoder.
+"""Convolutional code of the link: rate 1/3, constraint length 7, and its Viterbi decoder.
 
 Generators 133, 171, 165 (octal), newest bit in the most significant place; each block ends with
 six zeros, which return the encoder to state 0. A state is the last six bits, newest in the most
@@ -26,11 +26,11 @@ BATCH: Final = 128  # blocks decoded at once: their path metrics fit the process
 _TAPS: Final = np.array(
     [[bool(g >> (TAIL - i) & 1) for i in range(CONSTRAINT)] for g in GENERATORS], dtype=np.bool_
 )
-"""(3, 7): whether a generator uses the bit of i bits ago."""
+"""Matrix (3, 7): whether a generator uses the bit of i bits ago."""
 
 
 def _butterfly_signs() -> NDArray[np.float32]:
-    """Return (32, 3): the output of state 2j after a 0, with +1 for a 0 and -1 for a 1."""
+    """Return (32, 3), the output of state 2j after a 0 bit, with +1 for a 0 and -1 for a 1."""
     states = 2 * np.arange(STATES // 2)
     held = np.array([states >> (CONSTRAINT - 1 - i) & 1 for i in range(1, CONSTRAINT)])
     sent = _TAPS[:, 1:].astype(int) @ held % 2
@@ -56,8 +56,8 @@ def encode(bits: BoolArray) -> BoolArray:
 def decode(soft: FloatArray) -> BoolArray:
     """Return the most likely blocks of bits (B, k) of soft code words (B, 3 (k + 6)).
 
-    ``soft`` is log P(bit 0) / P(bit 1), up to a positive factor per block. Single precision. Raises
-    ``ValueError`` for a length that no code word has.
+    ``soft`` is log P(bit 0) / P(bit 1), up to a positive factor per block. Computed in single
+    precision. Raises ``ValueError`` for a length that no code word has.
     """
     blocks, length = soft.shape
     steps = length // len(GENERATORS)
@@ -74,7 +74,7 @@ def decode(soft: FloatArray) -> BoolArray:
 
 
 def _decisions(soft: NDArray[np.float32]) -> BoolArray:
-    """Return (steps, 64, B): whether the best path into a state is from its odd predecessor."""
+    """Return (steps, 64, B): whether the best path into a state comes from its odd predecessor."""
     steps, _, blocks = soft.shape
     half = STATES // 2
     odd_wins = np.empty((steps, STATES, blocks), dtype=np.bool_)
@@ -93,7 +93,7 @@ def _decisions(soft: NDArray[np.float32]) -> BoolArray:
 
 
 def _trace_back(odd_wins: BoolArray) -> BoolArray:
-    """Return the bits (steps, B) that led to state 0 at the end."""
+    """Return the bits (steps, B) of the best path, which ends in state 0."""
     steps, _, blocks = odd_wins.shape
     bits = np.empty((steps, blocks), dtype=np.bool_)
     every, state = np.arange(blocks), np.zeros(blocks, dtype=np.int64)

@@ -21,7 +21,7 @@ LABELS: Final = {
 
 
 def drawings(answer: dict[str, Any]) -> dict[str, tuple[str, plotting.Draw]]:
-    """Return caption and drawing of each figure by name."""
+    """Return caption and drawing of each figure of the study, by name."""
     return {
         "link_ber": (
             "Bit error rate. Bands: 95 % confidence, from the variance between instants."

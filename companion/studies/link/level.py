@@ -42,7 +42,7 @@ TARGET: Final = 1e-3  # bit error rate at which curves are compared
 
 
 def snrs(first_db: float, last_db: float, step_db: float) -> tuple[float, ...]:
-    """Return the SNRs from first to last in steps, dB.
+    """Return SNRs from the first to the last in equal steps, dB.
 
     Raises ``UserError`` for a range out of order.
     """
@@ -59,7 +59,7 @@ def snrs(first_db: float, last_db: float, step_db: float) -> tuple[float, ...]:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkStudy:
-    """Parameters of the study.
+    """Parameters of the link study.
 
         logs        of one flight with the simulator's truth; none: the paper's circles
 
@@ -91,7 +91,7 @@ class LinkStudy:
 
     @property
     def command(self) -> str:
-        """Command line of this study."""
+        """Command line of the study."""
         return command_line(
             "link",
             *self.logs,
@@ -110,7 +110,7 @@ class LinkStudy:
 
 
 Counts = dict[tuple[str, float], list[BlockErrors]]
-"""Errors by kind of positions and SNR in dB, one entry per instant."""
+"""Counts of errors by kind of positions and SNR in dB, one entry per instant."""
 
 
 def uav_array(settings: Settings) -> Array:
@@ -148,7 +148,7 @@ def exchange(
 ) -> Iterable[tuple[tuple[str, float], BlockErrors]]:
     """Send the same blocks with the same noise over every channel (T, N, N), at every SNR.
 
-    Over ``awgn`` the receiver has exact channel knowledge.
+    Over ``awgn`` the receiver knows the channel exactly.
     """
     users = channels[AWGN].shape[-1]
     sent = blocks.send(users, setting.blocks, rng)
@@ -165,7 +165,7 @@ def exchange(
 def study(
     setting: LinkStudy, progress: Callable[[str], None] = lambda _text: None
 ) -> dict[str, Any]:
-    """Return the content of ``link.json``.
+    """Return the answer of the study, the content of ``link.json``.
 
     Raises ``UserError``, ``LogError`` or ``ConfigError`` if there is nothing to study.
     """

@@ -35,10 +35,11 @@ def modulate(bits: BoolArray) -> ComplexArray:
 def soft_bits(received: ComplexArray, noise_power: ArrayLike) -> FloatArray:
     """Return max-log ratios log P(bit 0) / P(bit 1), (..., 4 n), of equalised symbols (..., n).
 
-    ``noise_power`` is that of both axes together, per symbol energy; it broadcasts to the symbols.
-    Max-log keeps only the largest term of each sum over symbols: (min over symbols with bit 1 of |y
-    - s|^2 - min over those with bit 0) / noise power. With y in levels of an axis, the ratio of the
-    sign is 4 y plus 4 for each level by which |y| exceeds 2; that of the amplitude is 8 - 4 |y|.
+    ``noise_power`` is the power on both axes together, per symbol energy; it broadcasts to the
+    symbols. Max-log keeps only the largest term of each sum over symbols: (min over symbols with
+    bit 1 of |y - s|^2 - min over those with bit 0) / noise power. With y in levels of an axis, the
+    ratio of the sign is 4 y plus 4 for each level by which |y| exceeds 2; that of the amplitude is
+    8 - 4 |y|.
     """
     levels = np.stack([received.real, received.imag], axis=-1) / SCALE
     size = np.abs(levels)
@@ -52,9 +53,9 @@ def soft_bits(received: ComplexArray, noise_power: ArrayLike) -> FloatArray:
 def bit_error_rate(snr: ArrayLike) -> FloatArray:
     """Return the exact bit error rate of hard decisions in white Gaussian noise; ``snr`` is Es/N0.
 
-    The mean over the two kinds of bits; ``snr`` is a power ratio. Source: K. Cho and D. Yoon, "On
-    the general BER expression of one- and two-dimensional amplitude modulations", IEEE Trans.
-    Communications 50(7), 2002.
+    The result is the mean over sign bits and amplitude bits; ``snr`` is a power ratio. Source: K.
+    Cho and D. Yoon, "On the general BER expression of one- and two-dimensional amplitude
+    modulations", IEEE Trans. Communications 50(7), 2002.
     """
     step = np.sqrt(np.asarray(snr, dtype=float) / 10)
     rate: FloatArray = 3 / 8 * erfc(step) + 1 / 4 * erfc(3 * step) - 1 / 8 * erfc(5 * step)

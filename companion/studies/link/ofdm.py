@@ -21,7 +21,7 @@ PILOTS: Final = np.array([26, 54, 90, 118, 140, 168, 204, 232], dtype=np.int64) 
 DATA: Final[IntArray] = np.setdiff1d(np.arange(CARRIERS), np.concatenate([NULLS, PILOTS]))
 STREAMS: Final = len(PILOTS)  # number of streams that pilots can separate
 PILOT_SIGNS: Final[FloatArray] = hadamard(STREAMS).astype(float)
-"""(8, 8): one row of pilots per stream, by Sylvester's construction.
+"""Signs of the pilots, (8, 8), a row per stream, by Sylvester's construction.
 
 The rows are orthogonal: over a flat channel no stream disturbs the estimate of another.
 """
@@ -36,14 +36,14 @@ def carriers(data: ComplexArray, pilots: FloatArray) -> ComplexArray:
 
 
 def samples(placed: ComplexArray) -> ComplexArray:
-    """Return samples (..., 320) of carriers (..., 256), prefix first."""
+    """Return the time samples (..., 320) of carriers (..., 256), prefix first."""
     body = np.fft.ifft(np.fft.ifftshift(placed, axes=-1), norm="ortho")
     sent: ComplexArray = np.concatenate([body[..., -PREFIX:], body], axis=-1)
     return sent
 
 
 def received_carriers(heard: ComplexArray) -> ComplexArray:
-    """Return carriers (..., 256) of samples (..., 320), prefix removed."""
+    """Return the carriers (..., 256) of time samples (..., 320), prefix removed."""
     found: ComplexArray = np.fft.fftshift(np.fft.fft(heard[..., PREFIX:], norm="ortho"), axes=-1)
     return found
 
@@ -57,7 +57,8 @@ def frequency_response(taps: ComplexArray) -> ComplexArray:
 def flat_estimate(heard: ComplexArray, pilots: FloatArray) -> ComplexArray:
     """Estimate phase and amplitude of a flat channel, (..., 1), from carriers (..., 256).
 
-    The mean over the pilots: its noise is an eighth of a carrier's, which costs 0.5 dB.
+    The estimate is the mean over the pilots: its noise is an eighth of a carrier's, which costs 0.5
+    dB.
     """
     estimate: ComplexArray = (heard[..., PILOTS] * pilots).mean(axis=-1, keepdims=True)
     return estimate

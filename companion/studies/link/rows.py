@@ -16,7 +16,7 @@ Z95: Final = 1.959963984540054  # half-width of a 95 per cent interval, in stand
 def row(
     positions: str, snr_db: float, coded: bool, counted: Sequence[BlockErrors], symbol_s: float
 ) -> Row:
-    """Return one point of a curve over all UAVs; ``counted`` has one entry per instant.
+    """Return one point of an error-rate curve over all UAVs; ``counted`` has one entry per instant.
 
     ber, bler     shares of wrong bits and of wrong blocks
     evm_percent   median over blocks of the RMS error of equalised symbols, over the RMS of a symbol
@@ -75,7 +75,7 @@ def interval(wrong: FloatArray, tried: FloatArray, independent: float) -> tuple[
 
 
 def crossing_db(rows: Sequence[Row], positions: str, coded: bool, target: float) -> float | None:
-    """Return the SNR from which on a curve stays below a bit error rate, dB; None without one.
+    """Return the SNR above which a curve stays below a bit error rate, dB; None without one.
 
     Interpolated linearly on the logarithm of the rate; a lower point without errors counts as one
     wrong bit.

@@ -32,7 +32,7 @@ RATE_RADPS: Final = 0.5
 GUST: Final = 0.2  # gust over nominal speed; gusts turn ten times as fast
 GUST_RATIO: Final = 10.0
 REPORTED_M: Final = 0.01
-"""Resolution of a position (and, in m/s, of a velocity) in GLOBAL_POSITION_INT."""
+"""Resolution of positions (m) and velocities (m/s) in GLOBAL_POSITION_INT."""
 WARM_UP_S: Final = 5.0
 DURATION_S: Final = 60.0
 LOOKS_HZ: Final = 10.0
@@ -40,7 +40,7 @@ MAX_DRAWS: Final = 100  # largest number of draws per instant
 
 
 class PositionSource(StrEnum):
-    """Positions that point the beams."""
+    """Source of the positions at which beams point: truth, prediction or last report."""
 
     PERFECT = "perfect"
     PREDICTED = "predicted"
@@ -49,7 +49,7 @@ class PositionSource(StrEnum):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Instant:
-    """Unit directions (N, 3) by kind of positions, array frame, in equal order of UAVs."""
+    """Directions at one instant: unit vectors (N, 3) by kind of positions, array frame."""
 
     t_s: float
     towards: dict[PositionSource, FloatArray]
@@ -57,9 +57,9 @@ class Instant:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """Instants of the study, and the array.
+    """Instants of the link study, with the array.
 
-    ``unresolved_share`` is the share of excluded instants: even with the true directions, zero
+    ``unresolved_share`` is the share of excluded instants: even for the true directions, zero
     forcing within the limits of the settings cannot separate all UAVs.
     """
 
@@ -71,7 +71,7 @@ class Scenario:
 
 @dataclass(frozen=True, slots=True)
 class Reports:
-    """Interval and latency of the circling UAVs' reports, seconds.
+    """Interval and latency of the reports of circling UAVs, seconds.
 
     Raises ``UserError`` for values out of range.
     """
@@ -91,7 +91,7 @@ class Reports:
 
 @dataclass(frozen=True, slots=True)
 class Circle:
-    """Circle around the array, flown clockwise, with gusts: the paper's flight in continuous time.
+    """Circle around the array, flown clockwise with gusts: the paper's flight, continuous in time.
 
     Velocity R w [cos, -sin](w t + phase), plus a fifth of that at ten times the rate (docs/math.md
     8.2).
@@ -122,7 +122,7 @@ PAPER: Final = tuple(Circle(radius_m, i * math.pi / 2) for i, radius_m in enumer
 def circles(
     settings: Settings, reports: Reports, instants: int, rng: np.random.Generator
 ) -> Scenario:
-    """Return the paper's four UAVs at ``instants`` random times of a minute.
+    """Return the scenario of the paper's four UAVs at ``instants`` random times of a minute.
 
     The array is level and faces north. Times at which it cannot separate the UAVs are drawn again.
     The observer has the true bounds of the circles.
@@ -154,7 +154,7 @@ def circles(
 def _resolved_times(
     settings: Settings, array: Array, instants: int, rng: np.random.Generator
 ) -> tuple[FloatArray, int]:
-    """Return times of use, ascending, and the number of draws."""
+    """Return times of use at which the array separates the UAVs, and how many were drawn."""
     times_s = list[float]()
     for tried in range(1, MAX_DRAWS * instants + 1):
         t_s = WARM_UP_S + DURATION_S * float(rng.random())
@@ -167,7 +167,7 @@ def _resolved_times(
 
 
 def _resolved(settings: Settings, array: Array, truly: FloatArray) -> bool:
-    """Whether zero forcing of the true directions (N, 3) is within the settings' limits."""
+    """Return whether zero forcing for true directions (N, 3) is within the settings' limits."""
     asked = replace(assembly.precoder(settings), method=Method.ZERO_FORCING)
     made = precode(steering_matrix(array, truly), asked)
     return made.method is Method.ZERO_FORCING and not made.groups.any() and not made.dropped
@@ -187,7 +187,7 @@ def _bounded(settings: Settings) -> Settings:
 def _positions_by_source(
     circle: Circle, starts_s: float, times_s: FloatArray, reports: Reports, settings: Settings
 ) -> dict[PositionSource, FloatArray]:
-    """Return positions (K, 3) of one UAV at the times of use (K,), by kind."""
+    """Return positions (K, 3) of one UAV at the times of use (K,), by position source."""
     predictors: dict[PositionSource, Predictor] = {
         PositionSource.PREDICTED: TrackPredictor(settings),
         PositionSource.HELD: Hold(),
@@ -210,7 +210,7 @@ def _positions_by_source(
 
 
 def _report(circle: Circle, made_s: float, latency_s: float) -> ObservedReport:
-    """Return a report as received; the sender's clock is known."""
+    """Return a report as a predictor receives it; the sender's clock is known."""
     position_m, velocity_mps = (
         np.round(one / REPORTED_M) * REPORTED_M for one in circle.at(made_s)
     )
@@ -239,7 +239,7 @@ def from_logs(
     rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> Scenario:
-    """Draw instants of a flight, from ``LOOKS_HZ`` samples per second of the running pipeline.
+    """Draw instants of a flight, from ``LOOKS_HZ`` samples per second of the pipeline.
 
     Raises ``UserError``, ``LogError`` or ``ConfigError`` for logs without the simulator's truth.
     """
@@ -271,7 +271,7 @@ def from_logs(
 def _seen(
     t_s: float, update: Update, pipeline: Pipeline, truth: array_truth.ArrayTruth
 ) -> Instant | None:
-    """Return the directions of UAVs with a beam and a known truth; None without any."""
+    """Return the directions of UAVs that have a beam and a known truth; None without any."""
     carrier = update.carrier
     if carrier is None or not update.beams.beams:
         return None

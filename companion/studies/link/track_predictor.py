@@ -10,7 +10,7 @@ from companion.values import AltitudeDatum, Fix, Report, SenderTime, Source, vec
 
 
 class TrackPredictor:
-    """Predictor by the product's own tracking."""
+    """Predictor that uses the product's own tracking."""
 
     def __init__(self, settings: Settings) -> None:
         self._tracker = assembly.tracker(settings)
@@ -38,7 +38,7 @@ class TrackPredictor:
         )
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """Return the track at that time, with its bound."""
+        """Return the track at a time, with its bound."""
         at = SenderTime(
             node_ns=at_ns,
             sender_ns=at_ns - self._offset_ns,

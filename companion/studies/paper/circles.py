@@ -25,7 +25,7 @@ GUST_RATE_RATIO: Final = 10.0
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PaperScenario:
-    """Parameters of the scenario; initial phases are a quarter turn apart."""
+    """Parameters of the published scenario; initial phases are a quarter turn apart."""
 
     radii_m: tuple[float, ...] = (100.0, 150.0, 200.0, 250.0)  # one per UAV
     rate_radps: float = 0.5  # angular rate of every UAV
@@ -48,19 +48,19 @@ class PaperFlight:
 
     @property
     def time_s(self) -> FloatArray:
-        """Times of the positions, (K + 1,)."""
+        """Times of the positions, (K + 1,), seconds."""
         times: FloatArray = np.arange(len(self.position_m)) * np.float64(self.scenario.dt_s)
         return times
 
     @property
     def largest_input_mps(self) -> float:
-        """sup ||W||, the norm over all UAVs together."""
+        """Largest unknown input, sup ||W||, the norm over all UAVs together, m/s."""
         return float(stacked(self.input_mps).max())
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Tracked:
-    """Estimates of the observer with one gain."""
+    """Estimates of the published observer with one gain."""
 
     gain: float  # l
     estimate_m: FloatArray  # (K + 1, N, 2), predicted one report ahead
@@ -69,13 +69,13 @@ class Tracked:
 
 
 def stacked(vectors: FloatArray) -> FloatArray:
-    """Return the norm over all UAVs and axes of (K, N, 2), at each step (K,)."""
+    """Return the norm of (K, N, 2) over all UAVs and axes, at each step (K,)."""
     norms: FloatArray = np.linalg.norm(vectors.reshape(len(vectors), -1), axis=1)
     return norms
 
 
 def fly(scenario: PaperScenario) -> PaperFlight:
-    """Return the flight, which starts on the circles."""
+    """Return the flight of the published scenario, which starts on the circles."""
     radii = np.array(scenario.radii_m)
     phases = np.arange(len(radii)) * np.pi / 2
     turns = scenario.rate_radps * scenario.dt_s * np.arange(scenario.steps)[:, np.newaxis]
@@ -95,7 +95,7 @@ def fly(scenario: PaperScenario) -> PaperFlight:
 
 
 def _heading(angle_rad: FloatArray) -> FloatArray:
-    """Return [cos, -sin] of angles (...), (..., 2)."""
+    """Return unit vectors [cos, -sin], (..., 2), of angles (...)."""
     heading: FloatArray = np.stack([np.cos(angle_rad), -np.sin(angle_rad)], axis=-1)
     return heading
 
@@ -126,7 +126,7 @@ def track(flight: PaperFlight, gain: float, start_m: FloatArray | None = None) -
 
 
 def running_bounds(flight: PaperFlight, gain: float) -> FloatArray:
-    """Return the running bound on ||E_k||, (K + 1,): |q| e + |l d - b| ||W||, true ||W_k||."""
+    """Return the running bound on ||E_k||, (K + 1,): |q| e + |l d - b| ||W||, with true ||W_k||."""
     scenario, bounds = flight.scenario, [0.0]
     enters = abs(gain * scenario.feedthrough_s - scenario.dt_s)
     for size in stacked(flight.input_mps).tolist():
@@ -157,7 +157,7 @@ def gain_mu(dt_s: float, feedthrough_s: float, alpha: float, gain: float) -> flo
 
 @dataclass(frozen=True, slots=True)
 class Irregular:
-    """Largest |e| / sup|w| over random intervals with an adversarial input."""
+    """Errors over random intervals with an adversarial input: largest |e| / sup|w|."""
 
     fixed_s: float  # with a fixed gain
     scheduled_s: float  # with a gain scheduled by the interval
@@ -167,7 +167,7 @@ class Irregular:
 def irregular(
     scenario: PaperScenario, gain: float, longest_s: float, steps: int, rng: np.random.Generator
 ) -> Irregular:
-    """Return the errors over random intervals of 0.05 s to ``longest_s``.
+    """Return the largest errors over random intervals of 0.05 s to ``longest_s``.
 
     The input has size 1 and its sign always increases the error.
     """
@@ -187,7 +187,7 @@ def irregular(
 def adversarial_input_error(scenario: PaperScenario, gain: float, steps: int = 400) -> float:
     """Return |W^ - W| / sup|W| under the worst input for G = [b; 0], by simulation.
 
-    A constant input builds up the error, then reverses at the end.
+    The worst input is constant, then reverses at the end.
     """
     b, d = scenario.dt_s, scenario.feedthrough_s
     place, estimate, miss = np.zeros(1), np.zeros(1), 0.0

@@ -20,7 +20,7 @@ class ClaimVerdict(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Claim:
-    """Statement of the paper and the criterion for its verdict."""
+    """Claim of the paper and the criterion for its verdict."""
 
     statement: str  # text of the claim
     key: str  # path of the deciding number
@@ -30,7 +30,7 @@ class Claim:
 
 
 def lookup(answer: dict[str, Any], key: str) -> float:
-    """Return the number at a path such as ``levels/L = 0.39/gamma_s``.
+    """Return the number at a path in the study's answer, such as ``levels/L = 0.39/gamma_s``.
 
     Raises ``KeyError`` if the path does not lead to a number.
     """
@@ -46,7 +46,7 @@ def lookup(answer: dict[str, Any], key: str) -> float:
 
 
 def judge(answer: dict[str, Any]) -> list[dict[str, Any]]:
-    """Return every claim with its number, result and verdict."""
+    """Return every claim with its deciding number, the result and the verdict."""
     return [
         {
             "statement": claim.statement,

@@ -26,9 +26,9 @@ from companion.tracking.design import closed_form
 from companion.values import FloatArray
 
 PAPER_LEVELS: Final = ((0.05, 0.39), (0.25, 0.60), (1.0, 0.76))
-"""Bounds on mu, s², and the paper's gain L for each."""
+"""The paper's bounds on mu, s², each with its gain L."""
 PAPER_INFEASIBLE_S: Final = {0.05: 0.89, 0.25: 1.01, 1.0: 1.3}
-"""First infeasible interval of the paper on a grid of 0.01 s, by mu."""
+"""First infeasible interval in the paper by mu, on a grid of 0.01 s."""
 GRID_S: Final = 0.01
 ALPHAS: Final = (0.5, 0.1, 0.01)
 PAPER_ALPHA: Final = 0.5
@@ -38,7 +38,7 @@ PAPER_BITS: Final = 4  # bits per symbol of 16-QAM
 PAPER_CODE_RATE: Final = 1 / 3
 SIZES: Final = (64, 128)
 INSTANTS: Final = (14, 58)
-"""Steps at which the patterns are drawn: no UAV is near the mirror image of another."""
+"""Steps at which patterns are drawn, when no UAV is near another one's mirror image."""
 STEADY_STEPS: Final = 2000  # steps to measure a steady error
 BLOCKAGES_PER_MINUTE: Final = (0.0, 6.0, 15.0, 30.0, 60.0)
 DRAWS: Final = 2
@@ -48,7 +48,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Material:
-    """Data for the figures."""
+    """Data for the figures of the reproduction."""
 
     flight: PaperFlight
     tracked: dict[str, Tracked]  # by name of the gain
@@ -110,7 +110,7 @@ def study(seed: int, progress: Progress) -> tuple[dict[str, Any], Material]:
 
 
 def _tracked(flight: PaperFlight) -> dict[str, Tracked]:
-    """Run the observer with the three published gains and the optimum, without initial error."""
+    """Run the observer with the published gains and the optimum, from the true start."""
     scenario = flight.scenario
     best = closed_form.gain(scenario.dt_s, scenario.feedthrough_s, scenario.alpha)
     gains = {level_name(gain): gain for _, gain in PAPER_LEVELS} | {OPTIMUM: best}
@@ -133,7 +133,7 @@ def _scenario(flight: PaperFlight) -> dict[str, Any]:
 
 
 def _levels(flight: PaperFlight, tracked: dict[str, Tracked]) -> dict[str, dict[str, float]]:
-    """Return errors and bounds of each gain: steady over many steps, and from a wrong start."""
+    """Return errors and bounds of each gain: over many steps, and from a wrong start."""
     scenario, found = flight.scenario, {}
     long_flight = published_scenario.fly(replace(scenario, steps=STEADY_STEPS))
     for name, one in tracked.items():
@@ -208,7 +208,7 @@ def _designs(flight: PaperFlight) -> tuple[list[dict[str, Any]], dict[float, Tra
 
 
 def _alphas(flight: PaperFlight, alphas: dict[float, Tracked]) -> dict[str, Any]:
-    """Return the largest errors at each alpha over many steps, with the gain of the figure."""
+    """Return the largest errors at each alpha over many steps, with the gain of figure 4."""
     long_flight = published_scenario.fly(replace(flight.scenario, steps=STEADY_STEPS))
     found = {}
     for alpha, one in alphas.items():
@@ -225,7 +225,7 @@ def _alphas(flight: PaperFlight, alphas: dict[float, Tracked]) -> dict[str, Any]
 
 
 def _waveform() -> dict[str, float]:
-    """Return the largest rate of the stated waveform: bits of a symbol over its time and bandwidth.
+    """Return the largest rate of the stated waveform: a symbol's bits over its time and bandwidth.
 
     The transform has at least as many points as there are subcarriers.
     """
@@ -334,7 +334,7 @@ def _array(flight: PaperFlight) -> dict[str, Any]:
 
 
 def _arccos_error_deg(position_m: FloatArray) -> float:
-    """Return the largest error of arccos(x / r), which always assumes y >= 0."""
+    """Return the largest error of arccos(x / r), which assumes y >= 0, degrees."""
     ranges_m = np.linalg.norm(position_m, axis=-1)
     angle = np.arccos(np.clip(position_m[..., 0] / ranges_m, -1, 1))
     true = np.arctan2(position_m[..., 1], position_m[..., 0])

@@ -25,7 +25,7 @@ FIGURE_SPAN_S = 13.0  # time span of figures: slightly over one turn
 
 
 def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callable[[], "Figure"]]]:
-    """Return caption and drawing of each figure by name, in the order of the paper."""
+    """Return caption and drawing of each figure of the paper by name, in the paper's order."""
     return {
         "paths": (
             "Paths of the four UAVs and positions predicted one report ahead, over one turn.",

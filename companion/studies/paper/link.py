@@ -27,7 +27,7 @@ UAV_ANTENNAS: Final = 4
 BUDGET: Final = LinkBudget(tx_power_dbm=30.0, bandwidth_hz=50e6, noise_figure_db=7.0)
 PRECODER: Final = Precoder(widen=Widen.NO)
 PROBING: Final = EchoProbing(dwell_s=0.005, position_gain=0.9, rate_gain=0.5)
-"""Baseline in its favour: it integrates half of all time, and its rate tracker follows the turn."""
+"""Favourable settings of echo probing: it integrates half of all time and tracks turn rates."""
 MEAN_BLOCKAGE_S: Final = 0.5
 RATE_DECIMATION: Final = 5  # probing intervals per computed rate
 
@@ -46,9 +46,10 @@ def directions(position_m: FloatArray) -> FloatArray:
 
 
 def responses(array: Array, true_m: FloatArray, aimed_m: FloatArray) -> ComplexArray:
-    """Return the response of UAV i at its true position to beam j: (T, N, N).
+    """Return the responses of UAVs at their true positions to the beams: (T, N, N).
 
-    Beams aim at the estimated positions. In square roots of watts: the budget's power is included.
+    Beams aim at the estimated positions. Responses are in square roots of watts: the budget's power
+    is included.
     """
     heard = []
     for true, aimed in zip(directions(true_m), directions(aimed_m), strict=True):
@@ -63,7 +64,7 @@ def efficiency(
 ) -> FloatArray:
     """Return spectral efficiency, bit/s/Hz, (T, N).
 
-    ``attenuation_db`` (T, N) is that of blockages.
+    ``attenuation_db`` (T, N) is due to blockages.
     """
     ranges_m = np.linalg.norm(true_m, axis=-1)
     gains = UAV_ANTENNAS * channel.free_space_gain(ranges_m, array.wavelength_m)
@@ -86,7 +87,7 @@ def zero_forcing_loss_db(array: Array, position_m: FloatArray) -> FloatArray:
 
 
 def conjugate_responses(array: Array, position_m: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Return |a^T f| and |a^H f| (N,) of zero-forcing beams at their UAVs: corrected, printed."""
+    """Return |a^T f| (corrected) and |a^H f| (printed), (N,), of beams at their UAVs."""
     steering = steering_matrix(array, directions(position_m))
     weights = precode(steering, PRECODER).weights
     right = np.abs(np.einsum("mn,mn->n", steering, weights))
@@ -94,7 +95,7 @@ def conjugate_responses(array: Array, position_m: FloatArray) -> tuple[FloatArra
 
 
 def between(flight: PaperFlight, place_m: FloatArray, time_s: FloatArray) -> FloatArray:
-    """Interpolate positions (K + 1, N, 2) of the steps at times (T,): (T, N, 2)."""
+    """Interpolate positions (K + 1, N, 2), given at the steps, at times (T,): (T, N, 2)."""
     at = time_s / flight.scenario.dt_s
     step = np.minimum(np.floor(at + 1e-9).astype(int), len(place_m) - 2)
     share = (at - step)[:, np.newaxis, np.newaxis]
@@ -122,7 +123,7 @@ def under_blockage(
     rng: np.random.Generator,
     progress: Callable[[str], None],
 ) -> BlockageComparison:
-    """Compare location-aware beams, aimed at estimates (K + 1, N, 2), with echo probing.
+    """Compare location-aware beams, aimed at estimates (K + 1, N, 2), to echo probing.
 
     Every scheme has the same precoder and the same blockages, ``draws`` times per rate.
     """
@@ -155,7 +156,7 @@ def under_blockage(
 def _attenuation_db(
     users: int, time_s: FloatArray, rate_hz: float, rng: np.random.Generator
 ) -> FloatArray:
-    """Attenuation by blockages, drawn independently per UAV, (T, N)."""
+    """Draw the attenuation by blockages, independent per UAV, (T, N), dB."""
     last_s = float(time_s[-1])
     drawn = [channel.draw_blockages(rng, last_s, rate_hz, MEAN_BLOCKAGE_S) for _ in range(users)]
     return np.stack([one.attenuation_db(time_s) for one in drawn], axis=1)
@@ -164,7 +165,7 @@ def _attenuation_db(
 def _echo_efficiency(
     array: Array, true_m: FloatArray, lost_db: FloatArray, rng: np.random.Generator
 ) -> FloatArray:
-    """Return spectral efficiency (T / RATE_DECIMATION, N) of the baseline; 0 during a sweep."""
+    """Return the baseline's spectral efficiency (T / RATE_DECIMATION, N); 0 during a sweep."""
     state = probing.started(directions(true_m[0]))
     pointed, served = [], []
     for at, (there, places) in enumerate(zip(directions(true_m), true_m, strict=True)):

@@ -30,7 +30,7 @@ BOOT_MS: Final = 10_000
 VELOCITY_LEAD_S: Final = 0.2
 NO_HEADING: Final = 0xFFFF
 _LAYOUT: Final = struct.Struct("<IiiiihhhH")
-"""time_boot_ms, lat, lon, alt, relative_alt, vx, vy, vz, hdg.
+"""Fields of GLOBAL_POSITION_INT: time_boot_ms, lat, lon, alt, relative_alt, vx, vy, vz, hdg.
 
 Source: https://mavlink.io/en/messages/common.html#GLOBAL_POSITION_INT.
 """
@@ -38,7 +38,7 @@ Source: https://mavlink.io/en/messages/common.html#GLOBAL_POSITION_INT.
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Agreement:
-    """Largest difference between service and library over all UAVs and steps."""
+    """Largest differences between service and library over all UAVs and steps."""
 
     reports: int  # reports accepted
     rejections: int  # reports rejected
@@ -50,8 +50,8 @@ class Agreement:
 def settings(flight: PaperFlight) -> Settings:
     """Return the service's settings for the scenario.
 
-    The array is level and faces north; limits are those of this motion. Stamps are exact and frames
-    arrive without delay.
+    The array is level and faces north; limits are the largest values of this motion. Stamps are
+    exact and frames arrive without delay.
     """
     scenario = flight.scenario
     fastest_mps = 1.01 * float(np.linalg.norm(flight.input_mps, axis=-1).max())
@@ -73,7 +73,7 @@ def settings(flight: PaperFlight) -> Settings:
 
 
 def frames(flight: PaperFlight) -> list[bytes]:
-    """Return the concatenated frames of each step in order of UAVs, 1:1 first."""
+    """Return the concatenated frames of all UAVs at each step, 1:1 first."""
     local = LocalFrame(*ORIGIN)
     sent = []
     for step, (places, inputs) in enumerate(zip(flight.report_m, flight.input_mps, strict=True)):
@@ -97,7 +97,7 @@ def frames(flight: PaperFlight) -> list[bytes]:
 
 
 def compare(flight: PaperFlight) -> Agreement:
-    """Run the scenario through splitter, pipeline and beams, and through the library."""
+    """Run the scenario through the service (splitter, pipeline, beams) and through the library."""
     pipeline, splitter = Pipeline(settings(flight)), Splitter("paper")
     names = [f"{number + 1}:1" for number in range(len(flight.scenario.radii_m))]
     expected = _expected(flight)

@@ -26,7 +26,7 @@ def paper_files(
 
 
 def text(answer: dict[str, Any]) -> str:
-    """Return the claims and their verdicts, one line each."""
+    """Return the paper's claims with their verdicts, one line each."""
     return "\n".join(f"{row['verdict']:24} {row['statement']}" for row in answer["claims"])
 
 

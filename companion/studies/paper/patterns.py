@@ -28,7 +28,7 @@ def weights(array: Array, position_m: FloatArray) -> ComplexArray:
 
 
 def azimuths_rad(position_m: FloatArray) -> FloatArray:
-    """Return azimuths (N,) of positions (N, 2) seen from the array."""
+    """Return azimuths (N,) of positions (N, 2) as seen from the array."""
     angles: FloatArray = np.arctan2(position_m[:, 1], position_m[:, 0])
     return angles
 

@@ -1,7 +1,7 @@
-"""Baseline of echo probing, which finds UAVs by the echoes of its own beams.
+"""Echo probing, the baseline that location-aware beams are compared with: UAVs are found by echoes.
 
-Location-aware beams are compared with it. It receives only radar echoes of the UAVs (the idea of
-radar-assisted beams: F. Liu et al. 2020). In each probing interval
+The baseline receives only radar echoes of the UAVs (the idea of radar-assisted beams: F. Liu et al.
+2020). In each probing interval
 
 1. the beam of a UAV points at the direction predicted by its tracker;
 2. the echo returns with the two-way loss of the radar equation, less the pointing loss, less twice
@@ -37,7 +37,7 @@ A line, for example, cannot measure angles across its length, and its beams do n
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EchoProbing:
-    """Settings of the baseline.
+    """Settings of the echo-probing baseline.
 
     dwell_s            coherent integration time of an echo, and time of each beam of a sweep; at
                        most ``interval_s``
@@ -89,13 +89,13 @@ class EchoProbing:
 
     @property
     def sweep_intervals(self) -> int:
-        """Duration of a sweep in intervals, rounded up."""
+        """Duration of a sweep in probing intervals, rounded up."""
         return math.ceil(self.sweep_beams * self.dwell_s / self.interval_s - 1e-9)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EchoState:
-    """State of the baseline after one interval, N UAVs."""
+    """State of the echo-probing baseline after one interval, N UAVs."""
 
     pointed: FloatArray  # (N, 3), beam directions: unit vectors, array frame
     served: NDArray[np.bool_]  # (N,), whether the UAV had its beam; False during a sweep
@@ -107,7 +107,7 @@ class EchoState:
 
 
 def started(directions: FloatArray) -> EchoState:
-    """Return the state of beams that have just found their UAVs at unit directions (N, 3)."""
+    """Return the initial state: beams have just found their UAVs at unit directions (N, 3)."""
     users = len(directions)
     yes, none = np.ones(users, dtype=bool), np.zeros(users, dtype=np.int64)
     return EchoState(
@@ -162,9 +162,9 @@ def step(
     snr: FloatArray,
     rng: np.random.Generator,
 ) -> EchoState:
-    """Advance by one probing interval.
+    """Advance the baseline by one probing interval.
 
-        directions  (N, 3), unit directions of the UAVs in it
+        directions (N, 3), unit directions of the UAVs
         snr         (N,), ``echo_snr`` now, blockage included
 
     Every step draws the same number of random values, so that runs with one seed differ only by the
@@ -200,7 +200,7 @@ def step(
 
 
 def alignment(array: Array, pointed: FloatArray, directions: FloatArray) -> FloatArray:
-    """Return the gain of matched beams towards other directions, relative to their peak, 0 to 1.
+    """Return the gain of matched beams towards other directions over the peak gain, 0 to 1.
 
     |a(u)^T a(p)*|^2 / (|a(u)|^2 |a(p)|^2), (N,), for beams at unit directions p and UAVs at u,
     both (N, 3); 0 where no element faces either.
@@ -218,11 +218,11 @@ def direction_error_rad(
 ) -> FloatArray:
     """Draw rotation vectors (N, 3) from a true to a measured direction, at the Cramer-Rao bound.
 
-    One plane wave of unknown amplitude and phase, SNR ``snr`` (N,) at the output of the array: the
-    Fisher information of an angle along a unit axis t across u is 2 snr (2 pi/wavelength)^2 t^T C
-    t, C the covariance of the element positions, weighted by received power (P. Stoica and
-    A. Nehorai 1989; 6 / (SNR M (M^2 - 1)) for a line, in electrical angle and SNR at one element).
-    The error is zero along an axis to which the array is blind, and without an echo.
+    Model: one plane wave of unknown amplitude and phase, SNR ``snr`` (N,) at the output of the
+    array: the Fisher information of an angle along a unit axis t across u is 2 snr (2
+    pi/wavelength)^2 t^T C t, C the covariance of the element positions, weighted by received power
+    (P. Stoica and A. Nehorai 1989; 6 / (SNR M (M^2 - 1)) for a line, in electrical angle and SNR at
+    one element). The error is zero along an axis to which the array is blind, and without an echo.
     """
     across = np.eye(3) - directions[:, :, np.newaxis] * directions[:, np.newaxis, :]
     spread = _spread_m2(array, directions)

@@ -31,7 +31,7 @@ from companion.values import FloatArray
 
 @dataclass(frozen=True, slots=True)
 class Step:
-    """Result of one report: the estimate for the time of the next, and both W^ (m/s)."""
+    """Result of one report: the estimate for the next report's time, and both W^ (m/s)."""
 
     estimate_m: FloatArray
     unknown_input_bd_mps: FloatArray
@@ -47,7 +47,7 @@ def step(
     gain: float | None = None,
     alpha: float | None = None,
 ) -> Step:
-    """Apply one step over the interval that follows the report.
+    """Apply one step of the published observer over the interval that follows the report.
 
     ``gain`` None schedules it by the interval with ``alpha`` (None: the best for the interval).
     Raises ``ValueError`` for an interval that is not positive.
@@ -63,7 +63,7 @@ def step(
 
 
 def unknown_input_peak(dt_s: float, feedthrough_s: float, gain: float) -> tuple[float, float]:
-    """Return the exact largest |W^ - w| / sup|w| of both, [b; d] first; inf without contraction."""
+    """Return the exact largest |W^ - w| / sup|w| of both left inverses; inf if not contracting."""
     b, d = dt_s, feedthrough_s
     peak_s = float(closed_form.peak_gain(b, d, gain))
     enters = abs(gain * d - b)
@@ -74,6 +74,6 @@ def unknown_input_peak(dt_s: float, feedthrough_s: float, gain: float) -> tuple[
 
 
 def unknown_input_bound(dt_s: float, feedthrough_s: float, gamma_s: float) -> tuple[float, float]:
-    """Return bounds on the same from gamma alone: sqrt(5) |G+| gamma, and 2 gamma / b."""
+    """Return bounds on |W^ - w| / sup|w| from gamma alone: sqrt(5) |G+| gamma, and 2 gamma / b."""
     pseudo_inverse = 1 / float(np.hypot(dt_s, feedthrough_s))
     return float(np.sqrt(5)) * pseudo_inverse * gamma_s, 2 * gamma_s / dt_s

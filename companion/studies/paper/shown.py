@@ -11,7 +11,7 @@ from typing import Any, Final
 
 
 class Likeness(StrEnum):
-    """Relation of our figure to the paper's."""
+    """Relation of this study's figure to the paper's."""
 
     SAME = "same"
     DIFFERS = "differs"
@@ -20,7 +20,7 @@ class Likeness(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Figure:
-    """Figure of the paper: its number, its content, and the relation of ours with the reason."""
+    """Figure of the paper: its number and content; how this study's figure differs, and why."""
 
     number: int
     shows: str
@@ -30,7 +30,7 @@ class Figure:
 
 @dataclass(frozen=True, slots=True)
 class AssumedSetting:
-    """Setting that the paper does not give: the value assumed here and what it affects."""
+    """Setting that the paper does not state: the value assumed here, and what it affects."""
 
     setting: str
     taken: str
@@ -131,7 +131,7 @@ GUESSES: Final = (
 
 
 def as_json() -> dict[str, Any]:
-    """Return figures and guesses as JSON."""
+    """Return the figures and the assumed settings as JSON."""
     return {
         "figures": [asdict(one) for one in FIGURES],
         "guesses": [asdict(one) for one in GUESSES],

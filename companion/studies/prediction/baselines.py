@@ -3,7 +3,7 @@
 All answer the same question: at ``now_ns``, from what has arrived by then, where is the UAV at
 ``at_ns``? They differ in their use of a report's time:
 
-* ``Hold`` and ``DeadReckoningOnArrival`` use only its arrival, and trust the last to arrive;
+* ``Hold`` and ``DeadReckoningOnArrival`` use only its arrival, and use the last report to arrive;
 * ``DeadReckoning`` and the Kalman filters use the time when it was made (the sender's clock), so
   that they handle late and overtaken reports correctly. They stay on the sender's own timeline, and
   convert the requested time by the clock offset of the last report to arrive.
@@ -15,13 +15,13 @@ from typing import Final, NamedTuple, Protocol
 from companion.values import FloatArray, GnssStatus
 
 TRACKER_TIMEOUT_NS: Final = 5_000_000_000
-"""Silence after which AntennaTracker considers a vehicle lost."""
+"""Silence after which ArduPilot's AntennaTracker considers a vehicle lost."""
 _S_PER_NS: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ObservedReport:
-    """Report as it reaches a predictor.
+    """Report as a predictor receives it.
 
     The baselines do not use ``clock_bound_s`` and ``gnss``.
     """
@@ -57,7 +57,7 @@ class Predictor(Protocol):
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
         """Return the state at ``at_ns`` from reports that arrived by ``now_ns``.
 
-        None without any.
+        None without reports.
         """
 
 
@@ -81,7 +81,7 @@ class Hold:
 
 
 class DeadReckoningOnArrival:
-    """Dead reckoning from the last report, as if made on arrival: ArduPilot's AntennaTracker.
+    """Dead reckoning from the last report as if it was made on arrival: AntennaTracker's method.
 
     If nothing arrived for 5 s the estimate stops moving. One fault of the original is corrected: it
     adds vz, which is positive down, to the altitude. A lead, which the original does not have, is
@@ -93,11 +93,11 @@ class DeadReckoningOnArrival:
         self._last: ObservedReport | None = None
 
     def report(self, report: ObservedReport) -> None:
-        """Keep the last report to arrive, at any age."""
+        """Keep the last report to arrive, however old it is."""
         self._last = report
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """Return position plus velocity times the time since arrival, and the lead."""
+        """Return position plus velocity times the time since arrival plus the lead."""
         last = self._last
         if last is None:
             return None
@@ -127,7 +127,7 @@ class DeadReckoning:
 
 
 def _straight_on(report: ObservedReport, interval_ns: int) -> Predicted:
-    """Constant velocity for an interval; without a reported velocity the position is held."""
+    """Extrapolate at constant velocity; without a reported velocity, hold the position."""
     velocity = report.velocity_ned_mps
     if velocity is None:
         return Predicted(position_ned_m=report.position_ned_m, velocity_ned_mps=None, bound_m=None)

@@ -9,7 +9,7 @@ announced.
 
 The Kalman filters are tuned in hindsight, once for each log and link: their process and measurement
 noise are the best of a grid over all UAVs and leads, an advantage that no user has. ``kalman-peng``
-has the noise of the settings, and is never tuned.
+assumes the noise of the settings, and is never tuned.
 
 Each log over each link is a separate piece of work: see ``companion.studies.running.fan_out``.
 """
@@ -60,9 +60,9 @@ LINKS: Final = ("clean", "radio", "hostile")  # default links
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PredictionStudy:
-    """Parameters of the study.
+    """Parameters of the prediction study.
 
-        links     names of links, of those in ``radio_link``
+        links names of links, from those in ``radio_link``
 
     The choice of processes or cluster does not change the rows. Raises ``UserError`` for values out
     of range.
@@ -94,13 +94,13 @@ class PredictionStudy:
 
     @property
     def over(self) -> tuple[RadioLink, ...]:
-        """Links, each once, in the order named."""
+        """Links to study, each once, in the order given."""
         links = {link.name: link for link in radio_link.LINKS} | {RADIO.name: self.radio}
         return tuple(links[name] for name in dict.fromkeys(self.links))
 
     @property
     def command(self) -> str:
-        """Command line of this study."""
+        """Command line of the study."""
         radio = self.radio
         return command_line(
             "prediction",
@@ -136,7 +136,7 @@ def compare(
     setting: PredictionStudy,
     progress: Callable[[str], None] = lambda _text: None,
 ) -> LogComparison:
-    """Run every predictor on every UAV of a log, over one link. No rows if none flies."""
+    """Run every predictor on every UAV of a log over one link. No rows if no UAV flies."""
     cases: list[Case] = []
 
     def clock() -> SenderClock:
@@ -178,15 +178,15 @@ def compare(
 
 
 def as_true(settings: Settings, kind: Kind) -> Settings:
-    """Return the settings with which the product is evaluated against a kind of truth.
+    """Return settings for evaluating the product against one source of truth.
 
-    If the truth is computed from the reports themselves, they do not lag behind it.
+    If the truth is computed from the reports themselves, reports do not lag behind it.
     """
     return settings.override(observer={"lag_s": (0.0, 0.0)}) if kind == "reports" else settings
 
 
 def rivals(setting: PredictionStudy, tuned: Mapping[str, Tuning]) -> dict[str, Make]:
-    """Return the predictors to compare the product with, by name, in the order of the tables."""
+    """Return the predictors that the product is compared with, by name, in table order."""
     known = known_tuning(setting.settings)
     makes = dict(SIMPLE)
     makes |= {name: kalman(name, tuning) for name, tuning in tuned.items()}
@@ -198,7 +198,7 @@ def rivals(setting: PredictionStudy, tuned: Mapping[str, Tuning]) -> dict[str, M
 
 @dataclass(frozen=True, slots=True)
 class Piece:
-    """Piece of work: the logs of one flight over one link."""
+    """Unit of work: the logs of one flight over one link."""
 
     setting: PredictionStudy
     logs: tuple[Path, ...]
@@ -206,7 +206,7 @@ class Piece:
 
 
 def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> LogComparison:
-    """Read a log and compare. Raises ``UserError`` or ``LogError`` if it has nothing to study."""
+    """Read a log and compare; ``UserError`` or ``LogError`` if it has nothing to study."""
     progress(f"reading {vehicles.named(piece.logs)}")
     flown = vehicles.load(piece.logs, center_of(piece.logs, piece.setting.center))
     return compare(flown, piece.link, piece.setting, progress)

@@ -1,6 +1,6 @@
 """Delivery of messages by a link: arrival times, and the reports for predictors.
 
-The product receives the frames themselves; the baselines get observed reports, whose times are by
+The product receives the frames themselves; the baselines get observed reports, whose times are from
 the product's clock, which uses the stamps of all messages. All random values derive from a seed and
 the vehicle's id.
 """
@@ -26,12 +26,12 @@ from companion.values import BoolArray, FloatArray, Frame, IntArray, RoundTrip, 
 
 P95: Final = 1.6448536269514722  # the 95th percentile of the standard normal distribution
 ROUND_TRIP_NS: Final = 10_000_000
-"""Duration of the round trips, one a second, that measure a known clock."""
+"""Duration of each round trip by which a known clock is measured once a second."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Delivery:
-    """Messages of one vehicle that a link delivers, in order of arrival.
+    """Messages of one vehicle as a link delivers them, in order of arrival.
 
     events     the frames with their arrival times, and round trips; empty for a flight without
                frames
@@ -138,7 +138,7 @@ def _sends(flight: Flight) -> _Sends:
 
 
 def _begins_ns(flight: Flight) -> int:
-    """Return when the UAV is first seen to fly; if never, when its first report arrived."""
+    """Return when the UAV first seems to fly; if never, when its first report arrived."""
     (flies,) = np.nonzero(flight.flying(flight.arrival_ns))
     return int(flight.arrival_ns[flies[0] if len(flies) else 0])
 
@@ -146,7 +146,7 @@ def _begins_ns(flight: Flight) -> int:
 def _passed(
     rng: np.random.Generator, sends: _Sends, reports: int, link: RadioLink, begins_ns: int | None
 ) -> tuple[IntArray, Times]:
-    """Return the rows that arrive, and their arrival times."""
+    """Return the indexes of messages that arrive, and their arrival times."""
     if begins_ns is not None:
         order = np.argsort(sends.sent_ns, kind="stable")
         came_ns, arrives = hostile_link.arrivals_ns(rng, sends.sent_ns[order], begins_ns)
@@ -193,7 +193,7 @@ def _thinned_each(sends: _Sends, rows: IntArray, rate_hz: float) -> IntArray:
 
 
 def _known(flight: Flight) -> tuple[RoundTrip, ...]:
-    """Return round trips as the service would have measured over the log's own link."""
+    """Return the round trips that the service would have measured over the log's own link."""
     found: list[RoundTrip] = []
     source = Source.parse(flight.uav)
     each = zip(flight.arrival_ns.tolist(), flight.made_ns.tolist(), flight.boot_ms, strict=True)
@@ -232,7 +232,7 @@ def on_sender_clock(
     is_report: BoolArray,
     trips: tuple[RoundTrip, ...] = (),
 ) -> PlacedMessages:
-    """Place reports among messages (n,) in time by the product's clock; stamp -1: none.
+    """Place reports, among messages (n,), in time by the product's clock; stamp -1: none.
 
     The clock also receives the other messages, and ``trips``, as in the pipeline.
     """

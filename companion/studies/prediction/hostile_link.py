@@ -19,12 +19,12 @@ FAST_S: Final = 0.02
 SLOW_S: Final = 0.5
 
 Latency = Callable[[np.random.Generator, FloatArray], FloatArray]
-"""Function from send times (n,) within the regime to latencies (n,), seconds both."""
+"""Function from send times (n,) in a regime to latencies (n,), both in seconds."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Regime:
-    """Regime: its name in reports, duration, latency, and whether frames overtake."""
+    """Regime of a hostile link: name, duration, latency, and whether frames overtake."""
 
     name: str
     lasts_s: float
@@ -33,7 +33,7 @@ class Regime:
 
 
 def _first_fast(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """The first frame takes 5 ms, all others 0.3 s."""
+    """Latency of 5 ms for the first frame, 0.3 s for all others."""
     return np.where(np.arange(len(at_s)) == 0, 0.005, 0.3)
 
 
@@ -42,22 +42,22 @@ def _steady(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
 
 
 def _step(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """0.02 s, from the fifth second 0.5 s."""
+    """Latency of 0.02 s, from the fifth second 0.5 s."""
     return np.where(at_s < 5, FAST_S, SLOW_S)
 
 
 def _ramp(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """From 0.02 to 1 s within 20 s, constant for 5 s, and back within 20 s."""
+    """Latency from 0.02 to 1 s within 20 s, constant for 5 s, and back within 20 s."""
     return np.interp(at_s, [0.0, 20.0, 25.0, 45.0], [FAST_S, 1.0, 1.0, FAST_S])
 
 
 def _sawtooth(_rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """From 0 to 0.8 s within 6 s, repeatedly."""
+    """Latency from 0 to 0.8 s within 6 s, repeatedly."""
     return 0.8 * (at_s % 6.0) / 6.0
 
 
 def _wandering(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """AR(1) about 0.3 s with a deviation of 0.15 s and a memory of 2 s; at least 5 ms."""
+    """Latency of 0.3 s with AR(1) noise: deviation 0.15 s, memory 2 s; at least 5 ms."""
     found = np.empty(len(at_s))
     now_s, last_s = 0.3, 0.0
     for row, drawn in enumerate(rng.standard_normal(len(at_s)).tolist()):
@@ -68,7 +68,7 @@ def _wandering(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
 
 
 def _bursts(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """Open for 0.5 to 2 s, then everything is held for 1 to 4 s and delivered at once."""
+    """Latency of a link open for 0.5 to 2 s, then blocked for 1 to 4 s, in turn."""
     found = np.full(len(at_s), FAST_S)
     opens_s = 0.0
     while len(at_s) and opens_s < at_s[-1]:
@@ -80,14 +80,14 @@ def _bursts(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
 
 
 def _changes(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """Every 4 s from a fast network with little jitter to a slow one with much, and back."""
+    """Latency that alternates every 4 s between a fast steady network and a slow jittery one."""
     slow = (at_s // 4.0) % 2 == 1
     jitter_s = rng.standard_exponential(len(at_s))
     return np.where(slow, 0.4 + 0.1 * jitter_s, FAST_S + 0.01 * jitter_s)
 
 
 def _overtaking(rng: np.random.Generator, at_s: FloatArray) -> FloatArray:
-    """Each frame independently: anything up to 0.8 s."""
+    """Latency of up to 0.8 s, independent for each frame."""
     return rng.uniform(0.0, 0.8, len(at_s))
 
 
@@ -116,7 +116,7 @@ def regimes_at(t_ns: Times, begins_ns: int) -> IntArray:
 def arrivals_ns(
     rng: np.random.Generator, sent_ns: Times, begins_ns: int
 ) -> tuple[Times, BoolArray]:
-    """Return arrival times of frames sent at ascending times (n,), and whether they arrive."""
+    """Return arrival times of frames sent at ascending times (n,), and whether each arrives."""
     arrives = np.asarray(sent_ns >= begins_ns)
     arrival_ns = sent_ns.copy()
     rounds = (sent_ns - begins_ns) // ROUND_NS

@@ -22,17 +22,17 @@ from companion.studies.prediction.baselines import ObservedReport, Predicted
 from companion.values import FloatArray
 
 HISTORY: Final = 64
-"""Reports that a Kalman filter keeps, so that a late one can be sorted in."""
+"""Number of reports that a Kalman filter keeps, so that a late one can be sorted in."""
 _S_PER_NS: Final = 1e-9
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Tuning:
-    """Noise assumed by a Kalman filter, the same on each axis.
+    """Noise that a Kalman filter assumes, the same on each axis.
 
     ``process_density`` is the spectral density of the white noise in the last derivative's rate,
-    m²/s³ for two states (acceleration), m²/s⁵ for three (jerk). The others are standard deviations;
-    ``start_*`` are those of states that the first report does not contain.
+    m²/s³ for two states (acceleration), m²/s⁵ for three (jerk). The other values are standard
+    deviations; ``start_*`` are those of states that the first report does not contain.
     """
 
     process_density: float
@@ -43,7 +43,7 @@ class Tuning:
 
 
 class _Filtered(NamedTuple):
-    """Report and the state after it: mean (n, 3), covariance (n, n) common to the axes."""
+    """Report and filter state after it: mean (n, 3), covariance (n, n) common to the axes."""
 
     report: ObservedReport
     mean: FloatArray
@@ -56,7 +56,7 @@ class Kalman:
     An overtaken report is sorted in and later ones are filtered again, if it is among the last
     ``HISTORY``; an older one is dropped.
 
-    With several tunings it is as many filters at once, and all results have a first axis for them.
+    Several tunings are as many filters at once, and all results have a first axis for them.
     """
 
     def __init__(self, states: int, tuning: Tuning, *others: Tuning) -> None:
@@ -142,7 +142,7 @@ def _conditioned(
 ) -> tuple[FloatArray, FloatArray]:
     """Condition mean (..., n, 3), covariance (..., n, n) on a state measured per axis (3,).
 
-    The noise of the measurement is (...).
+    The measurement's noise has the shape (...).
     """
     column = covariance[..., state]
     gain = (column / (column[..., state] + noise * noise)[..., None])[..., None]
@@ -153,7 +153,7 @@ def _conditioned(
 
 @lru_cache(maxsize=1024)
 def transition(states: int, interval_s: float) -> FloatArray:
-    """F, (n, n): one axis over an interval with its last derivative constant."""
+    """Return F, (n, n): one axis over an interval with its last derivative constant."""
     t = interval_s
     if states == 2:
         return np.array([[1.0, t], [0.0, 1.0]])
@@ -162,7 +162,7 @@ def transition(states: int, interval_s: float) -> FloatArray:
 
 @lru_cache(maxsize=1024)
 def process_noise(states: int, interval_s: float, density: float) -> FloatArray:
-    """Q, (n, n): covariance added over an interval by white noise in the last derivative's rate."""
+    """Return Q, (n, n): covariance that white noise in the last derivative's rate adds."""
     k = states - 1
     return np.array(
         [

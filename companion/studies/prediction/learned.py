@@ -38,7 +38,7 @@ FLIGHTS: Final = 240
 LEADS_A_WINDOW: Final = 4
 
 Network: TypeAlias = Any
-"""``torch.nn.ModuleDict``; PyTorch's own types exist only if it is installed."""
+"""Type of a network, ``torch.nn.ModuleDict``, which exists only with PyTorch."""
 
 
 def network() -> Network:
@@ -48,7 +48,7 @@ def network() -> Network:
 
 
 def _accelerations(net: Network, state: Any, lead_s: Any) -> Any:
-    """Accelerations (B, 3), frame of the window, m/s², for states (B, HIDDEN) and leads (B, 1)."""
+    """Return accelerations (B, 3), window's frame, m/s², for states (B, HIDDEN), leads (B, 1)."""
     return net["head"](torch.cat([state, lead_s / LEAD_MAX_S], dim=1)) * ACCELERATION_UNIT_MPS2
 
 
@@ -56,7 +56,7 @@ def _accelerations(net: Network, state: Any, lead_s: Any) -> Any:
 
 
 class Learned:
-    """Predictor of one UAV by a trained network."""
+    """Predictor of one UAV by a trained LSTM network."""
 
     def __init__(self, net: Network) -> None:
         self._net = net
@@ -65,7 +65,7 @@ class Learned:
         self._state: Any = None
 
     def report(self, report: ObservedReport) -> None:
-        """Add a report; the recurrent part runs once for each."""
+        """Add a report; the recurrent part of the network runs once per report."""
         if self._recent.add(report):
             self._window = self._recent.window()
             seen = torch.tensor(self._window.seen[None], dtype=torch.float32)
@@ -73,7 +73,7 @@ class Learned:
                 self._state = self._net["lstm"](seen)[1][0][0]
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """Dead reckoning from the newest report, plus the network's correction."""
+        """Return dead reckoning from the newest report, plus the network's correction."""
         window = self._window
         if window is None:
             return None
@@ -95,7 +95,7 @@ class Learned:
 def load(path: Path) -> Callable[[], Predictor]:
     """Return a factory of predictors with a trained network.
 
-    Raises ``UserError`` for a file without one, ``OSError`` if it cannot be read.
+    Raises ``UserError`` for a file without a network, ``OSError`` if it cannot be read.
     """
     torch.set_num_threads(1)
     net = network()
@@ -118,7 +118,7 @@ def load(path: Path) -> Callable[[], Predictor]:
 def examples(
     seed: int, flights: int, progress: Callable[[str], None]
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return training examples; only windows of K reports with a known future.
+    """Return training examples: windows of K reports with a known future.
 
     Windows (N, K, 7), leads (N, L) in s, and deviations (N, L, 3) of the UAV from straight flight,
     frame of the window, m.
@@ -200,7 +200,7 @@ def train(
 
 
 def _loss(net: Network, seen: Any, leads: Any, ways: Any) -> Any:
-    """Huber's loss of the deviations, metres; squares would be dominated by the long leads."""
+    """Return Huber's loss of the deviations, metres; squares would weigh long leads too much."""
     state = net["lstm"](seen)[1][0][0]
     state = state.repeat_interleave(LEADS_A_WINDOW, dim=0)
     lead_s = leads.reshape(-1, 1)
@@ -209,5 +209,5 @@ def _loss(net: Network, seen: Any, leads: Any, ways: Any) -> Any:
 
 
 def save(held: dict[str, Any], path: Path) -> None:
-    """Write the result of ``train``."""
+    """Write the result of ``train`` to a file."""
     torch.save(held, path)

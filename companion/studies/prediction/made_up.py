@@ -2,7 +2,7 @@
 
 A flight turns, accelerates and climbs by Ornstein-Uhlenbeck processes about its own values: some
 circle, some fly straight, some wander. Velocity is the integral of acceleration and position of
-velocity, so that the three are consistent. Frame: local NED, metres; not at any place on Earth.
+velocity, so that the three are consistent. Frame: local NED, metres; not at any position on Earth.
 """
 
 from typing import Final
@@ -24,7 +24,7 @@ VELOCITY_NOISE_MPS: Final = 0.1
 
 
 def flight(rng: np.random.Generator, uav: str, seconds: float = 60.0) -> Flight:
-    """Return one flight with noisy reports, 10 a second, each with a latency of 5 ms."""
+    """Return one random flight with noisy reports, 10 a second, each with 5 ms latency."""
     n = round(seconds / STEP_S)
     position, velocity = _motion(rng, n)
     t_ns = EPOCH_NS + np.arange(n, dtype=np.int64) * round(STEP_S * 1e9)
@@ -47,9 +47,9 @@ def flight(rng: np.random.Generator, uav: str, seconds: float = 60.0) -> Flight:
 
 
 def made_ns(made: Flight, sender_ns: Times, first: FloatArray) -> Times:
-    """Return the true times of reports (N,) by their sender's clock.
+    """Return the true times of reports (N,) by the sender's clock.
 
-    ``first`` is the position (3,) in the first of them, which identifies it.
+    ``first`` is the position (3,) in the first report, which identifies the flight.
     """
     (row,) = np.flatnonzero((made.position_ned_m == first).all(axis=1))
     times: Times = made.arrival_ns[row] - DELAY_NS + sender_ns - sender_ns[0]
@@ -57,9 +57,9 @@ def made_ns(made: Flight, sender_ns: Times, first: FloatArray) -> Times:
 
 
 def link(rng: np.random.Generator) -> RadioLink:
-    """Return a link between a clean one at 10 Hz and a slow radio.
+    """Return a random link between a clean one at 10 Hz and a slow radio.
 
-    Its sender's clock is known, as by TIMESYNC: the network should not learn a clock's errors.
+    The sender's clock is known, as by TIMESYNC: the network should not learn a clock's errors.
     """
     rate_hz = float(np.exp(rng.uniform(np.log(0.5), np.log(10.0))))
     median_s = float(np.exp(rng.uniform(np.log(0.01), np.log(1.0))))
@@ -74,7 +74,7 @@ def link(rng: np.random.Generator) -> RadioLink:
 
 
 def _motion(rng: np.random.Generator, n: int) -> tuple[FloatArray, FloatArray]:
-    """Return positions and velocities (n, 3)."""
+    """Return positions and velocities (n, 3) of a random flight."""
     turn = _wander(rng, n, rng.choice([0.0, rng.uniform(-0.5, 0.5)]), rng.uniform(0, 0.2), 5.0)
     speed = np.abs(_wander(rng, n, rng.uniform(1.0, 20.0), rng.uniform(0, 2.0), 8.0))
     climb = _wander(rng, n, 0.0, rng.uniform(0, 1.5), 5.0)
@@ -90,7 +90,7 @@ def _motion(rng: np.random.Generator, n: int) -> tuple[FloatArray, FloatArray]:
 def _wander(
     rng: np.random.Generator, n: int, about: float, deviation: float, memory_s: float
 ) -> FloatArray:
-    """Ornstein-Uhlenbeck process (n,) from its stationary state, smoothed over half a second.
+    """Return an Ornstein-Uhlenbeck process (n,), stationary, smoothed over half a second.
 
     The smoothing models a vehicle's inertia.
     """

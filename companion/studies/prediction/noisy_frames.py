@@ -30,7 +30,7 @@ class Noise:
 
 
 def noise(rng: np.random.Generator, reports: int, link: RadioLink) -> Noise:
-    """Draw the noise of a link for a number of reports."""
+    """Draw the noise that a link adds to a number of reports."""
     if not (link.noise_m or link.noise_mps):
         return Noise(np.zeros((reports, 3)), np.zeros((reports, 3)))
     drawn = np.clip(rng.standard_normal((2, reports, 3)), -NOISE_MOST, NOISE_MOST)
@@ -38,7 +38,7 @@ def noise(rng: np.random.Generator, reports: int, link: RadioLink) -> Noise:
 
 
 def changed(flight: Flight, added: Noise, link: RadioLink) -> list[Frame]:
-    """Return the frames of a flight with this noise in its reports."""
+    """Return the frames of a flight with noise added to its reports."""
     frames = list(flight.frames)
     if not (frames and (link.noise_m or link.noise_mps)):
         return frames

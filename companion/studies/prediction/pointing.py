@@ -1,4 +1,4 @@
-"""Questions of a pointer on a log, a predictor's answers, and their scores."""
+"""Questions where a UAV will be, a predictor's answers, and their scores."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -27,7 +27,7 @@ Row = dict[str, Any]
 class Questions:
     """Questions about one UAV: at times ``now_ns`` (K,), for each lead (L,).
 
-    counts       (L, K), whether the answer is scored: the UAV flies then, and both are known
+    counts (L, K), whether the answer is scored: the UAV flies then, and both are known
     regime       (K,), index of the regime of a hostile link; None over other links
     """
 
@@ -40,7 +40,7 @@ class Questions:
     regime: IntArray | None = None
 
     def every(self, step: int) -> "Questions":
-        """Return every ``step``-th question."""
+        """Return every ``step``-th of the questions."""
         return Questions(
             now_ns=self.now_ns[::step],
             leads_ns=self.leads_ns,
@@ -54,7 +54,7 @@ class Questions:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Answers:
-    """Positions (L, K, 3), bounds and usual errors (L, K); NaN without one.
+    """Answers of a predictor: positions (L, K, 3), bounds and usual errors (L, K); NaN if none.
 
     ``refuted_ns`` are the times at which the product reported that an assumption was refuted.
     """
@@ -72,7 +72,7 @@ def questions(
     from_ns: int,
     begins_ns: int | None = None,
 ) -> Questions:
-    """Return questions, ``ASK_HZ`` a second from ``from_ns``, while any of their answers counts.
+    """Return questions, ``ASK_HZ`` a second from ``from_ns``, while any answer is scored.
 
     ``begins_ns`` is when a hostile link was switched on.
     """
@@ -103,7 +103,7 @@ def questions(
 
 
 def answers(predictor: Predictor, observed: Sequence[ObservedReport], asked: Questions) -> Answers:
-    """Play the reports to a predictor, with the questions in between."""
+    """Play the reports to a predictor, with the questions in between; return the answers."""
     came_ns = [each.arrival_ns for each in observed]
     return _played(predictor.report, observed, came_ns, predictor.predict, asked)
 
@@ -111,7 +111,7 @@ def answers(predictor: Predictor, observed: Sequence[ObservedReport], asked: Que
 def product_answers(
     product: Product, events: Sequence[Frame | RoundTrip], asked: Questions
 ) -> Answers:
-    """Play events to the product, with the questions in between."""
+    """Play events to the product, with the questions in between; return the answers."""
     came_ns = [event.t_ns for event in events]
     given = _played(product.hear, events, came_ns, product.predict, asked)
     return replace(given, refuted_ns=tuple(product.refuted_ns))
@@ -146,7 +146,7 @@ def _played(
 
 
 def angles_deg(towards: FloatArray, truly: FloatArray) -> FloatArray:
-    """Return the angle between two directions, (..., 3) each, in degrees; exact for small ones."""
+    """Return angles between directions, (..., 3) each, degrees; exact also for small ones."""
     across = np.linalg.norm(np.cross(towards, truly), axis=-1)
     found: FloatArray = np.degrees(np.arctan2(across, np.sum(towards * truly, axis=-1)))
     return found
@@ -154,7 +154,7 @@ def angles_deg(towards: FloatArray, truly: FloatArray) -> FloatArray:
 
 @dataclass(frozen=True, slots=True)
 class Receiver:
-    """Array that points, and the SNR in dB at a UAV with the beam on it."""
+    """Array that points at a UAV, and the SNR in dB at the UAV in the beam's middle."""
 
     array: Array
     snr_db: float = SNR_DB
@@ -163,11 +163,11 @@ class Receiver:
 def score(
     asked: Questions, given: Answers, lead: int, receiver: Receiver | None = None
 ) -> Row | None:
-    """Return the figures of one lead; None if no answer counts. Without bounds theirs are None.
+    """Return the figures of one lead; None if no answer counts. Bound figures may be None.
 
     ``bound_tightness`` is the median bound over the 95th percentile of the error: 1 would be a
     bound as small as the error. ``usual_covers`` is the share of answers with a usual error whose
-    error was no larger. ``se_loss_bps_hz`` is that of ``receiver``, None without one.
+    error was no larger. ``se_loss_bps_hz`` is the loss of ``receiver``, None without one.
     """
     counts = asked.counts[lead] & ~np.isnan(given.position_ned_m[lead, :, 0])
     if not counts.any():

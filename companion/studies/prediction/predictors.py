@@ -2,8 +2,9 @@
 
 ``kalman-peng`` is named after Peng et al. (2018), cited elsewhere for a Kalman filter of position
 and velocity with known statistics. The paper was not available: no number and no equation here is
-theirs. The motion model is the constant-velocity one of ``companion.studies.prediction.kalman``,
-and the statistics are those of ``known_tuning``, which uses the settings and never a log.
+from that paper. The motion model is the constant-velocity one of
+``companion.studies.prediction.kalman``, and the statistics are those of ``known_tuning``, which
+uses the settings and never a log.
 """
 
 from collections.abc import Callable, Mapping
@@ -31,7 +32,7 @@ MANOEUVRE_S: Final = 1.0  # duration of an acceleration, as kalman-peng assumes
 
 
 class Product:
-    """The product as a predictor of one UAV: pipeline from frames to tracks.
+    """Product as a predictor of one UAV: its pipeline, from frames to tracks.
 
     The array is at the origin of the study's local frame, so that its frame is the study's.
 
@@ -52,7 +53,7 @@ class Product:
                 self.refuted_ns.append(output.t_ns)
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
-        """Return the track at that time, with its bound."""
+        """Return the track at a time, with its bound."""
         for track in self._pipeline.tracks(now_ns, at_ns):
             if track.uav == self.uav:
                 return Predicted(
@@ -65,11 +66,11 @@ class Product:
 
 
 MODELS: Final = {f"uio-{model}": model for model in ("position", "kinematic")}
-"""The product's observers, by their names as predictors."""
+"""Observers of the product, by their names as predictors."""
 
 
 def product(settings: Settings, name: str, uav: str, origin: tuple[float, float, float]) -> Product:
-    """Return the product with the observer of a name in ``MODELS``."""
+    """Return the product as a predictor, with an observer of ``MODELS``."""
     return Product(settings.override(observer={"model": MODELS[name]}), uav, origin)
 
 
@@ -81,14 +82,14 @@ SIMPLE: Final[Mapping[str, Make]] = {
 
 
 def kalman(name: str, tuning: Tuning) -> Make:
-    """Return a factory of one of the ``KALMAN_STATES`` filters with its noise."""
+    """Return a factory of one of the ``KALMAN_STATES`` filters with given noise."""
     return lambda: Kalman(KALMAN_STATES[name], tuning)
 
 
 def learned(path: Path) -> Make:
     """Return a factory of predictors with the network in a file.
 
-    Raises ``UserError`` if it contains none or PyTorch is missing.
+    Raises ``UserError`` if the file contains no network, or PyTorch is missing.
     """
     with needs("torch", "learned", "--learned"):
         from companion.studies.prediction.learned import load

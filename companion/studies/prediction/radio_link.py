@@ -1,8 +1,8 @@
 """Links over which predictors are compared: the effect of each on a vehicle's messages.
 
 A radio thins every kind of message to a rate, loses some, and delays each by an independent
-lognormal time, so that they overtake one another. ``hostile_link`` has the regimes of the hostile
-link.
+lognormal time, so that they overtake one another. ``hostile_link`` defines the regimes of the
+hostile link.
 """
 
 import math
@@ -14,7 +14,7 @@ from companion.values import UserError
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RadioLink:
-    """Effect of a link on messages.
+    """Effect of a radio link on messages.
 
         latency_s    median and 95th percentile of the added latency; None: no latency is added
         known_delay  the sender's clock is known as well as over the log's own link, as by TIMESYNC
@@ -48,20 +48,19 @@ class RadioLink:
 
     @property
     def as_logged(self) -> bool:
-        """Whether the link changes nothing."""
+        """Whether the link leaves the log's messages unchanged."""
         return self == RadioLink(name=self.name)
 
 
 CLEAN: Final = RadioLink(name="clean")  # the log's own link
 RADIO: Final = RadioLink(name="radio", rate_hz=1.2, latency_s=(0.6, 2.2), loss=0.1)
-"""Slow telemetry radio."""
+"""Link of a slow telemetry radio."""
 HOSTILE: Final = RadioLink(name="hostile", hostile=True)
-"""The log's own rate, with a latency that changes in every way."""
+"""Link at the log's own rate whose latency changes in many ways."""
 NOISY: Final = RadioLink(
     name="noisy", rate_hz=1.25, latency_s=(0.7, 1.0), noise_m=0.9, noise_mps=0.25
 )
-"""Long intervals and a poor receiver, as in real logs: a report every 0.8 s, with errors of 1.4 m.
-"""
+"""Link with long intervals and a poor receiver: a report per 0.8 s, errors of 1.4 m."""
 LINKS: Final = (CLEAN, RADIO, HOSTILE, NOISY)
 NOISE_MOST: Final = 1.7
-"""Deviations per axis at which added noise is clipped: 3 for all three axes together."""
+"""Limit of added noise in deviations per axis, so that all three axes together stay below 3."""

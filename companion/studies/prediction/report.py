@@ -34,7 +34,7 @@ def files(
 
 
 def drawings(found: Sequence[LogComparison]) -> dict[str, tuple[str, plotting.Draw]]:
-    """Return caption and drawing of each figure by its name."""
+    """Return caption and drawing of each figure of the study, by name."""
     return {
         name: (f"{ANGLE.caption}, over lead: {summary.title(compared)}", partial(_curves, compared))
         for name, compared in _named(found).items()
@@ -82,7 +82,7 @@ def _section(name: str, compared: LogComparison) -> dict[str, Any]:
 
 
 def _table(compared: LogComparison, measure: Measure) -> dict[str, Any]:
-    """Return the caption, and each predictor's figure at each lead and whether it is the best."""
+    """Return a caption, and each predictor's figure at each lead with whether it is the best."""
     leads, predictors = summary.axes_of(compared)
     cells = {
         name: [pooled(compared.rows, name, lead_s, measure) for lead_s in leads]
@@ -107,7 +107,7 @@ def _table(compared: LogComparison, measure: Measure) -> dict[str, Any]:
 
 
 def _curves(compared: LogComparison) -> "Figure":
-    """RMS angle (logarithmic) over lead, one line per predictor. Zeros are left out."""
+    """Draw the RMS angle (logarithmic) over lead, one line per predictor, without zeros."""
     from matplotlib.ticker import LogLocator
 
     leads, predictors = summary.axes_of(compared)

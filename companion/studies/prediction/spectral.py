@@ -1,8 +1,8 @@
 """Cost of a wrong direction: spectral efficiency lost against perfect knowledge.
 
 The array of the settings faces the UAV: its boresight in the UAV's true direction, its y axis
-level. There its beam is narrowest. The matched beam f = a(v)* / |a(v)| for a predicted direction v
-gives, for the UAV in the true direction u, the share
+level. In that direction the beam is narrowest. The matched beam f = a(v)* / |a(v)| for a predicted
+direction v gives, for the UAV in the true direction u, the share
 
     g = |a(u)^T f|^2 / |a(u)|^2                        (1 with perfect knowledge)
 
@@ -28,7 +28,7 @@ AT_ONCE: Final = 1_000_000  # entries of a steering matrix in memory at a time
 
 
 def array_from_local(truly: FloatArray) -> FloatArray:
-    """Rotations (K, 3, 3) into the frame of an array that faces unit directions (K, 3), NED.
+    """Return rotations (K, 3, 3) to the frame of an array that faces directions (K, 3), NED.
 
     Straight up or down its y axis points east.
     """
@@ -38,7 +38,7 @@ def array_from_local(truly: FloatArray) -> FloatArray:
 
 
 def gains(array: Array, towards: FloatArray, truly: FloatArray) -> FloatArray:
-    """g (K,) of matched beams along ``towards`` for UAVs along ``truly``, (K, 3) of any length."""
+    """Return g (K,) of matched beams along ``towards`` for UAVs along ``truly``, (K, 3) each."""
     u, v = (way / np.linalg.norm(way, axis=1, keepdims=True) for way in (truly, towards))
     seen = np.einsum("kij,kj->ki", array_from_local(u), v)
     at = steering_matrix(array, np.array([[1.0, 0.0, 0.0]]))[:, 0]
@@ -56,7 +56,7 @@ def gains(array: Array, towards: FloatArray, truly: FloatArray) -> FloatArray:
 
 
 def loss_bps_hz(array: Array, towards: FloatArray, truly: FloatArray, snr_db: float) -> float:
-    """Mean loss over K predictions, bit/s/Hz; at least 0."""
+    """Return the mean loss over K predictions, bit/s/Hz; at least 0."""
     snr = 10 ** (snr_db / 10)
     share = np.minimum(gains(array, towards, truly), 1.0)
     return float(np.mean(np.log2((1 + snr) / (1 + snr * share))))

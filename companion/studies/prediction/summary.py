@@ -12,7 +12,7 @@ from companion.studies.prediction.pointing import HALF_BEAMWIDTH_DEG, Row
 
 
 class Pool(StrEnum):
-    """How the figures of several UAVs are combined, each weighted by its answers."""
+    """How the figures of several UAVs are combined, each weighted by its number of answers."""
 
     RMS = "all UAVs together"
     MEAN = "mean over all UAVs"
@@ -21,7 +21,7 @@ class Pool(StrEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Measure:
-    """Figure of the rows and its presentation."""
+    """Figure in the rows of a comparison, and how it is shown."""
 
     key: str  # its key in a row
     caption: str  # caption of its table
@@ -84,7 +84,7 @@ MEASURES: Final = (
 def pooled(
     rows: Sequence[Row], predictor: str, lead_s: float, measure: Measure = ANGLE
 ) -> float | None:
-    """Return one figure over all UAVs; None without rows, or if a UAV has no figure."""
+    """Return one figure over all UAVs; None without rows, or if a UAV lacks the figure."""
     chosen = [row for row in rows if row["predictor"] == predictor and row["lead_s"] == lead_s]
     values = [(row["n"], row[measure.key]) for row in chosen]
     if not values or any(value is None for _, value in values):
@@ -118,7 +118,7 @@ def _beyond(counts: Mapping[str, int]) -> str:
 
 
 def left_out(compared: LogComparison) -> list[str]:
-    """Return a line on answers in the windows of declared faults, if there are any."""
+    """Return a line on the answers within declared faults; empty without any."""
     left = {row["predictor"]: 0 for row in compared.rows if row["in_faults"]}
     for row in compared.rows:
         left[row["predictor"]] = left.get(row["predictor"], 0) + (row["in_faults"] or 0)

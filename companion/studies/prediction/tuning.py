@@ -14,7 +14,7 @@ from companion.studies.truth.vehicles import Flight
 from companion.values import FloatArray
 
 TUNE_EVERY: Final = 5
-"""Step between the questions on which the grid is searched.
+"""Step between the questions that are used to search the grid of tunings.
 
 The cost is smooth over the grid, and there are many candidates.
 """
@@ -24,13 +24,13 @@ DENSITIES: Final = {
     "kalman-ca": (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 10.0),
 }
 NOISES: Final = tuple(product_of((0.03, 0.3), (0.1, 0.3)))
-"""Noise of position (m) and velocity (m/s) on the grid for tuning the filters.
+"""Grid of position noise (m) and velocity noise (m/s) for tuning the filters.
 
-``DENSITIES`` has its process noises.
+``DENSITIES`` has the grid's process noises.
 """
 
 Case = tuple[Flight, Delivery, Questions]
-"""A flight, its delivery by a link, and the questions."""
+"""Case for tuning: a flight, its delivery by a link, and the questions."""
 
 
 def tune(name: str, cases: Sequence[Case]) -> Tuning:
@@ -54,7 +54,7 @@ def tune(name: str, cases: Sequence[Case]) -> Tuning:
 def _squares(
     name: str, tunings: Sequence[Tuning], delivery: Delivery, asked: Questions
 ) -> FloatArray:
-    """Return squared errors (n, T) of answers that count, m², of each tuning; NaN without one."""
+    """Return squared errors (n, T), m², of scored answers per tuning; NaN without an answer."""
     few = asked.every(TUNE_EVERY)
     filters = Kalman(KALMAN_STATES[name], *tunings)
     found = np.full((*few.counts.shape, len(tunings)), np.nan)

@@ -19,14 +19,14 @@ KEYS: Final = ("answers", "violations", "announced", "in_faults", "worst_of_boun
 
 
 def counted(asked: Questions, given: Answers, lead: int) -> Row:
-    """Return the counts of one lead; None for predictors without a bound.
+    """Return the counts of violations for one lead; None for predictors without a bound.
 
     answers         answers outside the windows of declared faults
     violations      those whose truth is outside the bound
     announced       violations that were announced
     in_faults       answers inside such a window
     worst_of_bound  the largest error over its bound, outside the windows
-    regimes         the first three for each regime of a hostile link
+    regimes the first three counts for each regime of a hostile link
     """
     bound = given.bound_m[lead]
     known = asked.counts[lead] & ~np.isnan(given.position_ned_m[lead, :, 0])
@@ -47,7 +47,7 @@ def counted(asked: Questions, given: Answers, lead: int) -> Row:
 
 
 def announced(asked: Questions, given: Answers) -> BoolArray:
-    """Return whether an assumption about the UAV had been refuted at each question, (K,)."""
+    """Return whether an assumption about the UAV was refuted before each question, (K,)."""
     if not given.refuted_ns:
         return np.zeros(len(asked.now_ns), dtype=bool)
     found: BoolArray = asked.now_ns + SAME_SECOND_NS >= min(given.refuted_ns)
@@ -77,7 +77,7 @@ def unannounced(rows: Iterable[Row]) -> int:
 
 
 def notice(rows: Sequence[Row]) -> str | None:
-    """Return one line on unannounced violations, by the worst row; None without any."""
+    """Return one line on unannounced violations, by the worst row; None if there are none."""
     total = unannounced(rows)
     if not total:
         return None

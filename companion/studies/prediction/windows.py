@@ -1,7 +1,7 @@
 """Input of a learned predictor: the last reports, scaled and relative to the newest position.
 
-Each report gives seven numbers: its time before the newest; its position relative to it; its
-velocity. All are rotated about the vertical so that the newest velocity points along x: no
+Each report gives seven numbers: its time before the newest report; its position relative to that;
+its velocity. All are rotated about the vertical so that the newest velocity points along x: no
 direction is preferred. Reports are ordered by the sender's clock, at any intervals; an overtaken
 one is sorted in.
 """
@@ -17,7 +17,7 @@ from companion.values import FloatArray
 
 REPORTS: Final = 10  # K: number of last reports used
 FORGOTTEN_NS: Final = 20_000_000_000
-"""Age relative to the newest report beyond which a report is not used."""
+"""Age relative to the newest report above which a report is not used."""
 FEATURES: Final = 7
 TIME_UNIT_S: Final = 1.0
 WAY_UNIT_M: Final = 20.0
@@ -25,7 +25,7 @@ SPEED_UNIT_MPS: Final = 10.0
 
 
 class Window(NamedTuple):
-    """Newest report and the network's input."""
+    """Input of the network, with the newest report."""
 
     sender_ns: int  # when it was made, sender's timeline
     position_ned_m: FloatArray  # (3,), its position
@@ -42,7 +42,7 @@ class RecentReports:
         self.offset_ns = 0
 
     def add(self, report: ObservedReport) -> bool:
-        """Add a report; return whether the window changed. A late one only updates the clock."""
+        """Add a report; return whether the window changed. A late report only updates the clock."""
         self.offset_ns = report.sent_ns - report.sender_ns
         reports = self._reports
         at = bisect_right(reports, report.sender_ns, key=lambda each: each.sender_ns)
@@ -82,7 +82,7 @@ class RecentReports:
 def _velocities(reports: list[ObservedReport], ago_s: FloatArray, places: FloatArray) -> FloatArray:
     """Return reported velocities; if missing, the mean velocity since the previous report.
 
-    The first report takes that to the next; a single report is at rest.
+    The first report gets the mean velocity to the next one; a single report is at rest.
     """
     speeds = np.zeros_like(places)
     if len(reports) > 1:
@@ -95,7 +95,7 @@ def _velocities(reports: list[ObservedReport], ago_s: FloatArray, places: FloatA
 
 
 def _about_vertical(velocity: FloatArray) -> FloatArray:
-    """Rotation (3, 3), local from seen, whose x is the horizontal direction of a velocity."""
+    """Return the rotation (3, 3), local from window; x is a velocity's horizontal direction."""
     course = math.atan2(velocity[1], velocity[0])
     c, s = math.cos(course), math.sin(course)
     return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])

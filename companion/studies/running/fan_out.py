@@ -1,7 +1,7 @@
 """Parallel execution of one function over many items: on local cores, or on a Dask cluster.
 
-Answers are in the order of the questions, so that a parallel run gives the same result as a serial
-one. The first error in that order is raised, and pending items are cancelled. Processes are started
+Results are in the order of the items, so that a parallel run gives the same result as a serial one.
+The first error in that order is raised, and pending items are cancelled. Processes are started
 fresh ("spawn"), with one BLAS thread each: more threads than cores would slow each other down.
 
 Dask: ``distributed.Client``, its documentation; the extra ``[cluster]``. Its workers limit
@@ -38,7 +38,7 @@ def cores() -> int:
 def on_cores(
     work: Callable[[Asked], Answer], asked: Sequence[Asked], jobs: int, told: Progress
 ) -> list[Answer]:
-    """Return the answers, computed by ``jobs`` processes; ``work`` must be a module's function."""
+    """Return the results of ``jobs`` processes; ``work`` must be a module's function."""
     count = min(jobs, len(asked))
     context = multiprocessing.get_context("spawn")
     with (
@@ -55,7 +55,7 @@ def on_cores(
 
 
 def _gathered(futures: "Sequence[Future[Answer]]", told: Progress) -> list[Answer]:
-    """Return the answers in order; raise the first error in order as soon as it is determined."""
+    """Return the results in order; raise the first error in order as soon as it is known."""
     first = 0
     for done, _ in enumerate(as_completed(futures), start=1):
         told(done)
@@ -66,7 +66,7 @@ def _gathered(futures: "Sequence[Future[Answer]]", told: Progress) -> list[Answe
 
 
 def _left_to_parent() -> None:
-    """Ignore Ctrl-C, which reaches every process of a terminal: only the parent handles it."""
+    """Ignore Ctrl-C in a worker: a terminal sends it to every process, the parent handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
@@ -91,7 +91,7 @@ def on_cluster(
     told: Progress,
     answers_s: float = CLUSTER_ANSWERS_S,
 ) -> list[Answer]:
-    """Return the answers, computed by the workers of the Dask scheduler at an address.
+    """Return the results of the workers of the Dask scheduler at an address.
 
     Raises ``UserError`` if the address is malformed, ``distributed`` is not installed, or no worker
     appears within ``answers_s``.

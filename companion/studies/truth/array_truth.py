@@ -2,7 +2,7 @@
 
 SIM_STATE of a UAV gives its position; that of the vehicle that carries the array gives position and
 attitude. Only then is a whole pointing bound tested: both positions and the attitude. Without a
-SIM_STATE of the carrier its predicted pose counts as true, and reports state this.
+SIM_STATE of the carrier, its predicted pose counts as true; study reports state this.
 """
 
 from collections.abc import Mapping, Sequence
@@ -29,7 +29,7 @@ CARRIER_PREDICTED: Final = "SIM_STATE, carrier as predicted"
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CarrierTruth:
-    """Trajectory of the carrier and its attitude, ned from body, in seconds after ``from_ns``."""
+    """Trajectory and attitude (ned from body) of the carrier, in seconds after ``from_ns``."""
 
     flight: Flight
     from_ns: int
@@ -38,7 +38,7 @@ class CarrierTruth:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class ArrayTruth:
-    """Truth in a log, for the array of a pipeline.
+    """True directions in a log, for the array of a pipeline.
 
     carrier  the carrier's truth; None: its pose is the predicted one, which is exact for a fixed
              station
@@ -75,7 +75,7 @@ class ArrayTruth:
 def known_directions(
     truth: ArrayTruth | None, tracks: Sequence[Track], predicted: Carrier, array: Array
 ) -> dict[str, FloatArray]:
-    """Return the known true unit directions (3,) by UAV."""
+    """Return the true unit directions (3,) that are known, by UAV."""
     if truth is None:
         return {}
     found = truth.directions(tracks, predicted, array)
@@ -87,7 +87,7 @@ def known_directions(
 
 
 def load(logs: Sequence[Path], pipeline: Pipeline) -> ArrayTruth | None:
-    """Return the truth in the logs of a flight, for the array of a pipeline; None without truth.
+    """Return the true directions in a flight's logs, for a pipeline's array; None without truth.
 
     The pipeline's local frame must exist, which needs at least one report of a vehicle.
     """

@@ -3,10 +3,10 @@
 The offset, arrival less boot time, is the offset of the clocks plus a latency. The estimate takes
 the least offset within ``WINDOW_NS`` before a stamp and within ``WINDOW_NS`` after it, and returns
 the greater of the two (at the ends of a log the only one). A late frame has faster ones on both
-sides. If the boot clock paused or was set, the frames on one side of the change all differ, and the
+sides. If the boot clock paused or was set, all frames on one side of the change differ, and the
 other side gives the clock. The remaining error is the latency of the fastest frame.
 
-A boot clock that steps back by more than ``REBOOT_STEP_NS`` has restarted, which starts a new life.
+A boot clock that steps back by more than ``REBOOT_STEP_NS`` has restarted, which starts a new boot.
 """
 
 from dataclasses import dataclass
@@ -20,13 +20,12 @@ from companion.values import IntArray
 REBOOT_STEP_NS: Final = 10_000_000_000
 WINDOW_NS: Final = 10_000_000_000
 EDGE_NS: Final = 3_000_000_000
-"""Least time span on one side of a stamp for that side to count; a shorter one may hold only late
-frames."""
+"""Least time span before or after a stamp that counts; a shorter one may hold only late frames."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class BootClock:
-    """Samples of one boot clock, one per stamp in order of arrival, (N,)."""
+    """Samples of one boot clock, one per stamp, in order of arrival, (N,)."""
 
     arrival_ns: Times
     boot_ns: Times  # value of the stamp
@@ -34,7 +33,7 @@ class BootClock:
     made_ns: Times  # time of creation on the log's timeline
 
     def node_ns(self, boot_ns: Times, life: IntArray) -> Times:
-        """Convert boot times (K,) of given lives to the log's timeline, (K,)."""
+        """Convert boot times (K,) to the log's timeline, (K,), given the boot of each."""
         found = np.empty(len(boot_ns), dtype=np.int64)
         for number in np.unique(life).tolist():
             wanted, (known,) = life == number, np.nonzero(self.life == number)
@@ -49,7 +48,7 @@ class BootClock:
 
 
 def boot_clock(arrival_ns: Times, boot_ns: Times) -> BootClock:
-    """Estimate the clock behind these stamps, (N,), in order of arrival."""
+    """Estimate a sender's boot clock from stamps (N,), in order of arrival."""
     life = lives(boot_ns)
     made_ns = np.empty_like(boot_ns)
     for number in range(int(life[-1]) + 1 if len(life) else 0):
@@ -70,7 +69,7 @@ def boot_clock(arrival_ns: Times, boot_ns: Times) -> BootClock:
 
 
 def lives(boot_ns: Times) -> IntArray:
-    """Return the number of restarts before each stamp, (N,), found by backward steps."""
+    """Return the number of reboots before each stamp, (N,), found by backward steps."""
     if len(boot_ns) == 0:
         return np.zeros(0, dtype=np.int64)
     found: IntArray = np.cumsum(np.diff(boot_ns, prepend=boot_ns[0]) < -REBOOT_STEP_NS)
@@ -80,7 +79,7 @@ def lives(boot_ns: Times) -> IntArray:
 def least(values: Times, starts: IntArray, stops: IntArray) -> Times:
     """Return the minimum of ``values[start:stop]`` for each pair, (K,); no range may be empty.
 
-    Uses minima over powers of two, two of which cover any range.
+    The method uses minima over powers of two, two of which cover any range.
     """
     levels = [values]
     while 2 ** len(levels) <= len(values):

@@ -24,24 +24,24 @@ from companion.studies.truth.trajectory import GAP_NS, Times
 from companion.values import FloatArray, IntArray
 
 NEIGHBOURHOODS_NS: Final = (1_000_000_000, 10_000_000_000)
-"""Ranges, on the track's own time, within which a known time counts; the second is the fallback.
+"""Ranges of track time within which a known time counts; the second is the fallback.
 
 Errors of velocity accumulate with distance.
 """
 NARROW_BRACKET_NS: Final = 5_000_000  # a narrower bracket determines the time: its middle
 SIMULTANEOUS_NS: Final = 7_000_000
-"""Largest observed spread of arrivals of messages sent together, on a link without queues."""
+"""Largest spread of arrivals of messages sent together, on a link without queues."""
 BRACKET_ERROR_NS: Final = 2_000_000
-"""Largest error of a bracket, by stamps in whole milliseconds and by the period of a loop."""
+"""Largest error of a bracket: stamps are whole milliseconds, and loops have a period."""
 MIN_SPEED_MPS: Final = 0.5
 """Speed below which distance does not determine the time between two points."""
 PACE_RATIOS: Final = (0.5, 2.0)
-"""Arrivals keep the sender's pace if the gap between two is that of their stamps times 0.5 to 2."""
+"""Limits of the ratio of an arrival gap to a stamp gap at which arrivals keep the pace."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Brackets:
-    """Truth messages (N,) in stream order, with the stamped messages around each."""
+    """Truth messages (N,) in stream order, with the stamped messages before and after each."""
 
     arrival_ns: Times  # arrival of the truth message
     before_ns: Times  # boot time of the stamped message before it
@@ -51,7 +51,7 @@ class Brackets:
     life: IntArray  # number of restarts of the boot clock
 
     def rows(self, chosen: NDArray[np.bool_]) -> "Brackets":
-        """Return the selected messages."""
+        """Return the brackets of selected messages."""
         return Brackets(
             arrival_ns=self.arrival_ns[chosen],
             before_ns=self.before_ns[chosen],
@@ -67,7 +67,7 @@ def boot_times_ns(
 ) -> Times:
     """Return the creation times, boot time (N,), of truth messages.
 
-    Their positions and velocities are (N, 3); NaN for an unknown velocity.
+    Positions and velocities are (N, 3); NaN for an unknown velocity.
     """
     paced, pins = _interpolated_by_arrival(brackets), _determined_ns(brackets)
     alone = np.where(np.isnan(pins), np.where(np.isnan(paced), brackets.before_ns, paced), pins)
@@ -105,7 +105,7 @@ def _interpolated_by_arrival(brackets: Brackets) -> FloatArray:
 
 
 def _times_between_s(position_ned_m: FloatArray, velocity_ned_mps: FloatArray) -> FloatArray:
-    """Return times (N - 1,) from each point to the next, by distance along the mean velocity.
+    """Return times (N - 1,) from each point to the next, by distance over mean velocity.
 
     NaN at low speed. In a turn by x rad the chord over the mean velocity is too long by x²/12.
     """
@@ -122,7 +122,7 @@ def _times_between_s(position_ned_m: FloatArray, velocity_ned_mps: FloatArray) -
 
 
 def _determined_ns(brackets: Brackets) -> FloatArray:
-    """Times (N,) that a bracket or an arrival determines; NaN for others."""
+    """Return times (N,) that a bracket or an arrival determines; NaN for other messages."""
     narrow = brackets.after_ns - brackets.before_ns <= NARROW_BRACKET_NS
     steady = _keeps_pace(brackets)
     with_before = steady & (brackets.arrival_ns - brackets.before_arrival_ns <= SIMULTANEOUS_NS)

@@ -29,7 +29,7 @@ _SIMSTATE = struct.Struct("<9fii")
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TruthMessage:
-    """Truth message of the simulator."""
+    """Truth message, which the simulator writes into the log."""
 
     arrival_ns: int
     before: int  # index of the stamp before it on its link, among the stamps of its vehicle
@@ -39,7 +39,7 @@ class TruthMessage:
 
 @dataclass(slots=True)
 class _Order:
-    """Order of one vehicle's messages on one link: the last stamp, and truth messages since."""
+    """Order of one vehicle's messages on one link: last stamp, truth messages since then."""
 
     last: int | None = None
     waiting: list[tuple[int, int, bytes]] = field(default_factory=list)  # msgid, arrival, payload
@@ -49,11 +49,11 @@ class _Order:
 class VehicleStream:
     """Messages of one vehicle in order of arrival.
 
-    reports      its reports, without repeats
+    reports reports, without repeats
     report_at    index of each report among the frames
     gnss         last receiver status before each report
     frames       its frames, except truth messages
-    round_trips  its TIMESYNC round trips
+    round_trips TIMESYNC round trips
     stamps       arrival and boot time of its stamped messages, ns
     said         truth messages, by message id
     """
@@ -71,12 +71,12 @@ class VehicleStream:
     _links: dict[str, _Order] = field(default_factory=dict)
 
     def clock(self) -> BootClock:
-        """Estimate its boot clock from all stamps."""
+        """Estimate the vehicle's boot clock from all stamps."""
         rows = np.array(self.stamps, dtype=np.int64).reshape(-1, 2)
         return boot_clock(rows[:, 0], rows[:, 1])
 
     def take(self, frame: Frame, dedupe: Dedupe) -> None:
-        """Add a frame of this vehicle; ``dedupe`` holds the reports of all vehicles."""
+        """Add a frame of the vehicle; ``dedupe`` holds the reports of all vehicles."""
         order = self._links.get(frame.link)
         if order is None:
             order = self._links.setdefault(frame.link, _Order())
@@ -114,14 +114,14 @@ class VehicleStream:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthMessages:
-    """Brackets and payloads of truth messages in stream order."""
+    """Truth messages of one kind in stream order: brackets and payloads."""
 
     brackets: Brackets
     payloads: tuple[bytes, ...]
 
 
 def truth_messages(stream: VehicleStream, msgid: int, clock: BootClock) -> TruthMessages:
-    """Return the truth messages of one kind that lie between two stamps of one life."""
+    """Return truth messages of one kind between two stamps that no reboot separates."""
     said = stream.said[msgid]
     before = np.array([each.before for each in said], dtype=np.int64)
     after = np.array([each.after for each in said], dtype=np.int64)
@@ -139,7 +139,7 @@ def truth_messages(stream: VehicleStream, msgid: int, clock: BootClock) -> Truth
 
 
 def sim_state(payload: bytes) -> tuple[float, ...]:
-    """Decode a SIM_STATE: quaternion (4), …, latitude, longitude (1e-7 degrees) last."""
+    """Decode a SIM_STATE: quaternion (4) first, latitude and longitude (1e-7 degrees) last."""
     return _SIM_STATE.unpack(payload.ljust(_SIM_STATE.size, b"\0")[: _SIM_STATE.size])
 
 

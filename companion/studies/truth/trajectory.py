@@ -12,15 +12,15 @@ Times = NDArray[np.int64]
 Kind = Literal["SIM_STATE", "SIMSTATE", "reports"]
 
 GAP_NS: Final = 2_500_000_000
-"""Longest gap between two points that is interpolated."""
+"""Longest gap between two points of a trajectory that is interpolated."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Trajectory:
     """Positions and velocities, (N, 3), local frame, at ascending times (N,).
 
-    ``ned_from_body`` are attitudes (N, 4), quaternions w, x, y, z; zeros for an unknown one, None
-    if all are unknown.
+    ``ned_from_body`` are attitudes (N, 4), quaternions w, x, y, z; zeros for an unknown attitude,
+    None if all are unknown.
     """
 
     kind: Kind
@@ -57,7 +57,7 @@ def ascending(
 ) -> Trajectory:
     """Return a trajectory sorted by time without repeated times.
 
-    A NaN velocity is replaced by the one between neighbours.
+    A NaN velocity is replaced by the mean velocity between the neighbours.
     """
     times, rows = np.unique(t_ns, return_index=True)
     position, velocity = position_ned_m[rows], velocity_ned_mps[rows]

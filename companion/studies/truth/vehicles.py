@@ -44,12 +44,12 @@ FLYING_SPEED_MPS: Final = 1.0
 FLYING_HEIGHT_M: Final = 2.0
 BEFORE_FAULT_NS: Final = 1_000_000_000
 AFTER_FAULT_NS: Final = 5_000_000_000
-"""Time after a declared fault for the vehicle's own estimate to settle."""
+"""Time after a declared fault in which the vehicle's own estimate settles."""
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Flight:
-    """One vehicle of a log: its reports in order of arrival, and the truth.
+    """One vehicle's flight in a log: its reports in order of arrival, and the truth.
 
     gnss              last receiver status of the vehicle at each report
     report_at         (N,), index of each report among the frames; empty without frames
@@ -70,14 +70,14 @@ class Flight:
     faults: tuple[tuple[int, int], ...] = ()  # windows of its declared faults: from, to
 
     def in_fault(self, from_ns: Times, to_ns: Times) -> BoolArray:
-        """Return whether the window of a declared fault overlaps each interval, (...)."""
+        """Return whether each interval, (...), overlaps the window of a declared fault."""
         found = np.zeros(np.shape(from_ns), dtype=bool)
         for begins_ns, ends_ns in self.faults:
             found |= (from_ns <= ends_ns) & (to_ns >= begins_ns)
         return found
 
     def flying(self, t_ns: Times) -> NDArray[np.bool_]:
-        """Return whether it flies: faster than 1 m/s and, by its last report, higher than 2 m."""
+        """Return whether the UAV flies: above 1 m/s and, by its last report, above 2 m."""
         _, velocity = self.truth.at(t_ns)
         last = np.searchsorted(self.arrival_ns, t_ns, side="right") - 1
         height = np.where(last < 0, 0.0, self.height_m[np.maximum(last, 0)])
@@ -88,9 +88,9 @@ class Flight:
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Flown:
-    """Flights of a log and position of the array: fixed (3,), or a trajectory.
+    """Flights of a log with the array's position: fixed (3,), or a trajectory.
 
-    ``origin`` is that of the local frame: latitude and longitude in degrees, altitude in metres.
+    ``origin`` is the local frame's origin: latitude and longitude in degrees, altitude in metres.
     """
 
     log: str
@@ -113,9 +113,9 @@ def named(logs: Sequence[Path]) -> str:
 
 
 def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
-    """Read a log, or the logs of a flight.
+    """Read the flights of a log, or of the logs of a flight.
 
-    Raises ``UserError`` or ``LogError`` if they contain nothing to study.
+    Raises ``UserError`` or ``LogError`` if the logs contain nothing to study.
     """
     logs = [logs] if isinstance(logs, Path) else logs
     path = " ".join(map(str, logs))
@@ -153,7 +153,7 @@ def load(logs: Path | Sequence[Path], center_text: str | None) -> Flown:
 def _windows(
     faults: tuple[DeclaredFault, ...], stream: VehicleStream
 ) -> tuple[tuple[int, int], ...]:
-    """Return the windows of a vehicle's faults, outside of which its assumptions hold."""
+    """Return the windows of a vehicle's faults; outside them its assumptions hold."""
     sysid = stream.reports[0].source.sysid
     return tuple(
         (fault.from_ns - BEFORE_FAULT_NS, fault.to_ns + AFTER_FAULT_NS)
@@ -218,7 +218,7 @@ def _velocity(local: LocalFrame, report: Report) -> FloatArray:
 
 
 def _simulated(stream: VehicleStream, clock: BootClock, local: LocalFrame) -> Trajectory | None:
-    """Return the trajectory by SIM_STATE; None if it has no valid position or time."""
+    """Return the trajectory by SIM_STATE messages; None without a valid position or time."""
     said = truth_messages(stream, SIM_STATE, clock)
     points, attitudes, kept = [], [], []
     for payload in said.payloads:
@@ -253,7 +253,8 @@ def _placed(
 ) -> Trajectory | None:
     """Return the trajectory by SIMSTATE, at the heights of the reports created at ``made_ns``.
 
-    The reported velocities give the times between its points. None as for ``_simulated``.
+    The reported velocities give the times between its points. None if there is no valid position or
+    time.
     """
     said = truth_messages(stream, SIMSTATE, clock)
     places = np.array([simstate(payload)[9:11] for payload in said.payloads]).reshape(-1, 2)

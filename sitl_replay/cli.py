@@ -29,17 +29,17 @@ PROGRESS_EVERY_S = 0.5
 
 
 def as_links(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> tuple[LinkUrl, ...]:
-    """Parse the URLs of links to send to. Usage error if one is invalid."""
+    """Parse the URLs of links to send to. Usage error if a URL is invalid."""
     return tuple(_url(value) for value in values)
 
 
 def as_source(_: click.Context, __: click.Parameter, value: str) -> LinkUrl:
-    """Parse the URL of a link to receive from. Usage error if it is invalid."""
+    """Parse the URL of a link to receive from. Usage error if the URL is invalid."""
     return _url(value)
 
 
 def as_faults(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> list[Fault]:
-    """Parse the faults. Usage error if one is invalid."""
+    """Parse the values of ``--fault``. Usage error if one is invalid."""
     try:
         return in_order([Fault.parse(value) for value in values])
     except UserError as error:
@@ -47,12 +47,12 @@ def as_faults(_: click.Context, __: click.Parameter, values: tuple[str, ...]) ->
 
 
 def as_duration(_: click.Context, __: click.Parameter, value: str | None) -> float | None:
-    """Parse a duration in seconds. None if it is not given."""
+    """Parse a duration in seconds; None if no duration is given."""
     return None if value is None else _positive(value, "a positive number of seconds")
 
 
 def as_speed(_: click.Context, __: click.Parameter, value: str) -> float | None:
-    """Parse a speed factor. None for "max", which means without waiting."""
+    """Parse a speed factor; None for "max", which sends without waiting."""
     return None if value == "max" else _positive(value, "a positive number or 'max'")
 
 
@@ -279,9 +279,9 @@ def list_scenarios(as_json: bool) -> None:
 
 
 def frames_of(logs: Sequence[Path], tally: player.Tally) -> Iterator[Frame]:
-    """The frames of the logs, merged by time; unusable data is counted.
+    """Return the frames of logs, merged by time; unusable data is counted.
 
-    Reads up to the first frame, so that an unreadable log is reported at once.
+    The logs are read up to the first frame, so that an unreadable log is reported at once.
     """
     from companion.recording.reader import LogError, read_flight
 
@@ -307,7 +307,7 @@ def _frames_among(events: Iterable[Event], tally: player.Tally) -> Iterator[Fram
 
 
 def run(work: Coroutine[Any, Any, object], count: player.Tally | recorder.RecordingTally) -> None:
-    """Run until the end, SIGINT or SIGTERM. An error prints one line and exits non-zero."""
+    """Run a command until its end, SIGINT or SIGTERM. An error prints a line and exits non-zero."""
     asyncio.run(_until_signal(work, count))
 
 
@@ -336,7 +336,7 @@ async def _progress(count: player.Tally | recorder.RecordingTally) -> None:
 
 
 def conclude(count: player.Tally | recorder.RecordingTally, done: str, as_json: bool) -> None:
-    """Print the summary. Exits with 1 if a link was lost during the run."""
+    """Print the summary. Exit with status 1 if a link was lost during the run."""
     if as_json:
         click.echo(json.dumps(summary_of(count)))
     else:
@@ -352,7 +352,7 @@ def conclude(count: player.Tally | recorder.RecordingTally, done: str, as_json: 
 
 
 def summary_of(count: player.Tally | recorder.RecordingTally) -> dict[str, Any]:
-    """The object that ``--json`` prints."""
+    """Return the object that ``--json`` prints."""
     common = {
         "frames": count.frames,
         "bytes": count.octets,

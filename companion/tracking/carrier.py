@@ -15,7 +15,7 @@ from companion.values import Attitude, Carrier, EstimatorStatus, Fix, FloatArray
 
 
 def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArray:
-    """Rotation (3, 3) from north-east-down to body axes, by roll, pitch and yaw in radians.
+    """Return the rotation (3, 3) from north-east-down to body axes for roll, pitch, yaw, rad.
 
     Angles are MAVLink's: yaw rotates about z, then pitch about y, then roll about x. Source: the
     aerospace sequence 3-2-1, e.g. Groves, Principles of GNSS (2013), eq. 2.22.
@@ -33,7 +33,7 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArr
 
 
 def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> FloatArray:
-    """Rotation (3, 3) from a body's axes now to its axes ``interval_s`` seconds later.
+    """Return the rotation (3, 3) from body axes now to body axes ``interval_s`` later.
 
     ``body_rates_radps`` (3,) are constant rates about the body axes. Rodrigues' formula for the
     rotation vector -rates * interval; the sign is negative because coordinates rotate opposite to
@@ -66,8 +66,8 @@ def fixed(
 ) -> Carrier:
     """Return the carrier of a fixed, level station.
 
-    ``place`` is latitude and longitude in degrees and height in metres; ``heading_rad`` is
-    clockwise from true north.
+    ``place`` is the position: latitude and longitude in degrees and height in metres;
+    ``heading_rad`` is clockwise from true north.
     """
     body_from_local = body_from_ned(0.0, 0.0, heading_rad) @ local.local_from_ned(*place[:2]).T
     still = np.zeros(3)
@@ -93,7 +93,7 @@ class AttitudeBounds:
     acceleration_radps2: float  # greatest angular acceleration
 
     def at(self, rate_radps: float, age_s: float, doubt_s: float) -> float:
-        """Return the bound after ``age_s``, known to ``doubt_s``, at an angular rate (norm); rad.
+        """Return the bound after ``age_s`` (known to ``doubt_s``) at an angular rate (norm), rad.
 
         See docs/math.md 5.3.
         """
@@ -110,7 +110,7 @@ class Contradiction:
     apart_s: float  # time between them
 
     def at(self, age_s: float) -> float:
-        """Return the bound on the newer one after a time, whichever is right; rad.
+        """Return the bound on the newer attitude after a time, whichever is right; rad.
 
         A wrong angular rate causes ``apart_rad`` in ``apart_s``.
         """
@@ -123,7 +123,7 @@ APART_MAX_S: Final = 1.0  # longest time between two attitudes that are compared
 def contradiction(
     before: Attitude, after: Attitude, apart_s: float, bounds: AttitudeBounds
 ) -> Contradiction | None:
-    """Check whether an attitude contradicts the previous one beyond the errors of both.
+    """Check whether an attitude contradicts the previous one by more than both errors allow.
 
     Each is extrapolated to the other's time at its own rates: forward reveals a wrong angle,
     backward a wrong rate. ``apart_s`` is positive.
@@ -170,12 +170,12 @@ def reported_bound_rad(status: EstimatorStatus | None, least_rad: float) -> floa
 
 
 RATES_APART_S: Final = 0.05
-"""Least time between two angular rates that are compared: stamps are whole milliseconds."""
+"""Least time between two angular rates that are compared, since stamps are whole milliseconds."""
 RATE_NOISE_DEGPS: Final = 2.0  # bound on the error of a reported angular rate
 
 
 class AngularAcceleration:
-    """Least angular acceleration of a carrier that its reported angular rates prove."""
+    """Limit of a carrier's angular acceleration, raised by what reported rates prove."""
 
     def __init__(self) -> None:
         self._raised = RaisedLimit()
@@ -186,7 +186,7 @@ class AngularAcceleration:
         return self._raised.at(base_degps2, sender_ns)
 
     def look(self, attitude: Attitude, sender_ns: int, base_degps2: float) -> Refuted | None:
-        """Check an attitude. Return the refutation of the limit, which is then raised."""
+        """Check an attitude. Return the refutation of the limit, which is then raised, if any."""
         rates = (attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps)
         before = self._newest
         if before is not None and sender_ns - before[0] < RATES_APART_S * 1e9:
@@ -225,7 +225,7 @@ def moving(
     """Return the carrier aboard a vehicle, at the time of its track.
 
     track         the vehicle's track: position, velocity and bound
-    newest        its newest report; north and down are taken there, a few metres away
+    newest        its newest report; its north and down are used, a few metres away
     attitude      its newest attitude, extrapolated at its body rates
     since_ns      age of that attitude at the track's time
     doubt_s       bound on the error of that age

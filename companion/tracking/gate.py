@@ -1,4 +1,4 @@
-"""Gate: which reports can be true, and when a track must be restarted because it is itself wrong.
+"""Gate: which reports can be true, and when a track must be restarted because it is wrong.
 
 A report is rejected if the UAV cannot have reached it: it lies outside the bound of the prediction
 from the last *accepted* report, given the bounds on acceleration, speed and noise, plus its own
@@ -17,7 +17,7 @@ from companion.values import Fix, Reason
 
 FROZEN_SPEED_MPS = 1.0  # least reported speed at which an unchanged position counts as frozen
 FROZEN_TRAVEL_M = 0.3
-"""Least distance that this speed must have covered while the position stayed the same."""
+"""Least distance travelled by the reported speed for an unchanged position to count as frozen."""
 
 ALTERNATIONS: Final = 3
 """Alternations of rejected and possible reports that prove two vehicles."""
@@ -26,7 +26,7 @@ SHARED_S: Final = 3.0  # seconds over which they must alternate
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class GateSettings:
-    """Conditions under which rejected reports replace the track.
+    """Conditions under which rejected reports replace a track.
 
     lead_m             how far a report may be ahead of or behind the position, beyond its noise (a
                        feedthrough)
@@ -51,7 +51,7 @@ class GateSettings:
 
 
 def _flown_distance_m(fix: Fix, within_s: float) -> float:
-    """Return the largest distance flown within a time about a report, m; 0 without a velocity."""
+    """Return the largest distance flown within a time of a report, m; 0 without velocity."""
     velocity = fix.velocity_ned_mps
     if velocity is None:
         return 0.0
@@ -62,7 +62,7 @@ def _flown_distance_m(fix: Fix, within_s: float) -> float:
 
 
 def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reason, str] | None:
-    """Return why a report cannot be true, given the prediction for its time; None if it can."""
+    """Return why a report cannot be true, given the prediction for its time; None if possible."""
     (n, e, d), (there_n, there_e, there_d) = predicted.position_ned_m, fix.position_ned_m
     down = there_d - d
     horizontal_m = math.hypot(there_n - n, there_e - e)
@@ -97,7 +97,7 @@ class Suspects(Generic[State]):
         self._interrupted = False
 
     def add(self, fix: Fix) -> None:
-        """Add a rejected report: it continues the run, or starts another."""
+        """Add a rejected report: it continues the run, or starts a new run."""
         if self._run:
             last = self._run[-1]
             predicted = self._observer.predict(self._observer.begin(last), fix.sender_ns)
@@ -114,11 +114,11 @@ class Suspects(Generic[State]):
         self._run.append(fix)
 
     def interrupt(self) -> None:
-        """Record that a report was possible: the run may be another vehicle's, or is over."""
+        """Record that a report was possible: the run may be another vehicle's, or may be over."""
         self._interrupted = True
 
     def agree(self) -> bool:
-        """Return whether the run is long enough, in reports and in seconds."""
+        """Return whether the run is long enough, by number of reports and by seconds."""
         if len(self._run) < self._settings.reacquire_reports:
             return False
         lasted_ns = self._run[-1].sender_ns - self._begun_ns
@@ -128,14 +128,13 @@ class Suspects(Generic[State]):
     def silence_s(self) -> float:
         """Time without a possible report after which the run replaces the track, seconds.
 
-        Longer if possible reports came in between: it may be another vehicle's.
+        The time is longer if possible reports came in between: the run may be another vehicle's.
         """
         least_s = self._settings.reacquire_s
         return max(least_s, SHARED_S) if self._alternations else least_s
 
     def is_consistent(self, sender_ns: int) -> bool:
-        """Return whether the run is a second vehicle's: it continues while possible reports
-        alternate."""
+        """Return whether the run is a second vehicle's: possible reports alternate with it."""
         if len(self._run) < self._settings.reacquire_reports or self._alternations < ALTERNATIONS:
             return False
         if self._run[-1].sender_ns - self._begun_ns < SHARED_S * 1e9:
@@ -143,7 +142,7 @@ class Suspects(Generic[State]):
         return sender_ns - self._run[-1].sender_ns < self._settings.forget_s * 1e9
 
     def take(self) -> list[Fix]:
-        """Remove and return the run."""
+        """Remove and return the run of rejected reports."""
         run = list(self._run)
         self._run.clear()
         return run

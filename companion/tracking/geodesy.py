@@ -23,7 +23,7 @@ SECOND_ECCENTRICITY2: Final = (SEMI_MAJOR_M / SEMI_MINOR_M) ** 2 - 1
 
 
 def ned_from_ecef(lat_deg: float, lon_deg: float) -> FloatArray:
-    """Rotation (3, 3) from earth-centred axes to north-east-down at a place.
+    """Return the rotation (3, 3) from earth-centred axes to north-east-down at a position.
 
     Source: e.g. Groves, Principles of GNSS (2013), eq. 2.150.
     """
@@ -39,7 +39,7 @@ def ned_from_ecef(lat_deg: float, lon_deg: float) -> FloatArray:
 
 
 class Place(NamedTuple):
-    """Point on Earth: WGS84 degrees, metres above the ellipsoid or mean sea level, as given."""
+    """Position on Earth: WGS84 degrees, metres above the ellipsoid or mean sea level, as given."""
 
     lat_deg: Annotated[float, Meaning("latitude, WGS84", example=47.3977)]
     lon_deg: Annotated[float, Meaning("longitude, WGS84", example=8.5456)]
@@ -47,7 +47,7 @@ class Place(NamedTuple):
 
 
 class _Axes:
-    """North, east and down at a place, by sines and cosines."""
+    """North, east and down axes at a position, by sines and cosines."""
 
     __slots__ = ("cos_lat", "cos_lon", "sin_lat", "sin_lon")
 
@@ -57,7 +57,7 @@ class _Axes:
         self.sin_lon, self.cos_lon = math.sin(lon), math.cos(lon)
 
     def ecef_m(self, alt_m: float) -> Vector:
-        """Earth-centred coordinates of the place at a height."""
+        """Return earth-centred coordinates of the position at a height."""
         sine, cosine = self.sin_lat, self.cos_lat
         normal_m = SEMI_MAJOR_M**2 / math.hypot(SEMI_MAJOR_M * cosine, SEMI_MINOR_M * sine)
         across_m = (normal_m + alt_m) * cosine
@@ -65,7 +65,7 @@ class _Axes:
         return across_m * self.cos_lon, across_m * self.sin_lon, z_m
 
     def ned(self, x: float, y: float, z: float) -> Vector:
-        """Rotate an earth-centred vector to north, east and down of the place."""
+        """Rotate an earth-centred vector to north, east and down at the position."""
         out = self.cos_lon * x + self.sin_lon * y
         return (
             self.cos_lat * z - self.sin_lat * out,
@@ -74,7 +74,8 @@ class _Axes:
         )
 
     def ecef(self, north: float, east: float, down: float) -> Vector:
-        """Rotate north, east, down of the place to an earth-centred vector; inverse of ``ned``."""
+        """Rotate north, east, down at the position to an earth-centred vector; inverse of
+        ``ned``."""
         out = -self.sin_lat * north - self.cos_lat * down
         return (
             self.cos_lon * out - self.sin_lon * east,
@@ -84,7 +85,7 @@ class _Axes:
 
 
 class LocalFrame:
-    """North-east-down at an origin given in degrees and metres."""
+    """Local north-east-down frame at an origin given in degrees and metres."""
 
     def __init__(self, lat_deg: float, lon_deg: float, alt_m: float) -> None:
         self.origin = (lat_deg, lon_deg, alt_m)
@@ -104,22 +105,22 @@ class LocalFrame:
     def localise(
         self, lat_deg: float, lon_deg: float, alt_m: float, velocity_ned: Vector | None
     ) -> tuple[Vector, Vector | None]:
-        """Return local coordinates of a place, and of a velocity given in north-east-down there."""
+        """Return local coordinates of a position, and of a velocity in north-east-down there."""
         there, here = _Axes(lat_deg, lon_deg), self._axes
         (x, y, z), (x0, y0, z0) = there.ecef_m(alt_m), self._origin
         position = here.ned(x - x0, y - y0, z - z0)
         return position, None if velocity_ned is None else here.ned(*there.ecef(*velocity_ned))
 
     def position_ned_m(self, lat_deg: float, lon_deg: float, alt_m: float) -> FloatArray:
-        """Return local coordinates of a place in metres, (3,)."""
+        """Return local coordinates (3,) of a position on Earth, in metres."""
         return np.array(self.localise(lat_deg, lon_deg, alt_m, None)[0])
 
     def local_from_ned(self, lat_deg: float, lon_deg: float) -> FloatArray:
-        """Rotation (3, 3) from north-east-down at another place to this frame."""
+        """Return the rotation (3, 3) from north-east-down at a position to this frame."""
         return self._local_from_ecef @ ned_from_ecef(lat_deg, lon_deg).T
 
     def place(self, north_m: float, east_m: float, down_m: float) -> Place:
-        """Return the place of one local point; faster than ``geodetic`` for single points."""
+        """Return the position on Earth of one local point; faster than ``geodetic``."""
         return _geodetic(
             *(at + x * north_m + y * east_m + z * down_m for at, x, y, z in self._rows)
         )
@@ -133,7 +134,7 @@ class LocalFrame:
 
 
 def _geodetic(x_m: float, y_m: float, z_m: float) -> Place:
-    """Return the place of an earth-centred point.
+    """Return the position on Earth of an earth-centred point.
 
     Bowring's formula (1976), two steps: exact to rounding at all flight altitudes. pymap3d does the
     same for arrays; for the few points of an update its overhead would dominate.

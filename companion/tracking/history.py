@@ -14,12 +14,12 @@ from companion.tracking.observers.estimates import Observer, Prediction, State
 from companion.values import Fix, Vector
 
 ACCELERATION_REPORTS_MAX = 25
-"""Most velocities used for an acceleration: of more, only every n-th over the whole window."""
+"""Most velocities used for an acceleration; of more, every n-th over the whole window."""
 
 
 @dataclass(slots=True)
 class Entry(Generic[State]):
-    """Report, the observer's state there, and the prediction for it (None for the first)."""
+    """Report with the observer's state at it, and the prediction for it (None for the first)."""
 
     fix: Fix
     state: State
@@ -27,7 +27,7 @@ class Entry(Generic[State]):
 
 
 class ReportHistory(Generic[State]):
-    """Reports of one UAV within the window.
+    """Recent reports of one UAV, within the window.
 
     ``entries`` are in order of the sender's time, and never empty.
     """
@@ -39,11 +39,11 @@ class ReportHistory(Generic[State]):
 
     @property
     def newest(self) -> Entry[State]:
-        """Entry from which predictions start."""
+        """Newest entry, from which predictions start."""
         return self.entries[-1]
 
     def index(self, sender_ns: int) -> int | None:
-        """Return the index for a report with this time; None if it is too old to be used."""
+        """Return the index at which to insert a report; None if it is too old to be used."""
         if sender_ns > self.newest.fix.sender_ns:
             return len(self.entries)
         if sender_ns < self.newest.fix.sender_ns - self._window_ns:
@@ -53,7 +53,7 @@ class ReportHistory(Generic[State]):
     def insert(self, index: int, fix: Fix, predicted: Prediction | None = None) -> None:
         """Insert a report and estimate all later states again.
 
-        ``predicted`` is the previous entry's prediction for it, if already computed.
+        ``predicted`` is the previous entry's prediction for the report, if already computed.
         """
         if predicted is not None and index == len(self.entries):
             state = self._observer.after(self.newest.state, predicted, fix)

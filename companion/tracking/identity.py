@@ -3,7 +3,7 @@
 Two beams on one aircraft have nearly equal steering vectors, which ruin zero forcing. A relayed
 aircraft is identified with a track of a better kind (telemetry, or Remote ID before ADS-B) after
 several reports in a row that agree with it within the errors of both. It is separated again after
-as many that do not.
+as many that do not agree.
 """
 
 import math
@@ -19,7 +19,7 @@ SPEED_APART_MPS: Final = 15.0  # difference in velocity above which two tracks a
 
 @dataclass(slots=True)
 class _Relayed:
-    """State of a relayed aircraft.
+    """State of a relayed aircraft, for its identification.
 
     same_as   the better track of the same aircraft; None if there is none
     """
@@ -36,7 +36,7 @@ class Identities:
         self._relayed: dict[str, _Relayed] = {}
 
     def same_as(self, uav: str) -> str | None:
-        """Return the better track of the same aircraft; None without one."""
+        """Return the better track of a relayed aircraft; None if it has none."""
         known = self._relayed.get(uav)
         return None if known is None else known.same_as
 
@@ -62,7 +62,7 @@ class Identities:
 
 
 def _apart_m(relayed: Fix, track: Track) -> float | None:
-    """Return the horizontal distance if report and track can be one aircraft, else None."""
+    """Return the horizontal distance if report and track can be one aircraft; else None."""
     (n, e, d), (to_n, to_e, to_d) = relayed.position_ned_m, track.position_ned_m.tolist()
     apart_m = math.hypot(n - to_n, e - to_e)
     if apart_m > relayed.noise.horizontal_m + track.horizontal_bound_m:

@@ -1,8 +1,8 @@
 """Limits of an aircraft: assumed by its type, and raised when its reports refute them.
 
 The bounds assume a largest speed and a largest acceleration. Two reported velocities prove a mean
-acceleration between them of at least (|v2 - v1| - n1 - n2) / T, n their noise. If that exceeds the
-limit, the assumption is refuted: the limit of this aircraft is raised at once, and decays over
+acceleration between them of at least (|v2 - v1| - n1 - n2) / T, with n their noise. If that exceeds
+the limit, the assumption is refuted: the limit of this aircraft is raised at once, and decays over
 minutes. See docs/math.md 5.6.
 """
 
@@ -17,16 +17,15 @@ from companion.values import Fix, Limits, LimitSource, Refuted
 RAISED: Final = 1.5  # multiple of the proven value that is assumed from then on
 DECAY_S: Final = 120.0  # time constant with which a raised limit decays
 MAX_PLAUSIBLE_RATIO: Final = 6.0
-"""Multiple of the limit above which a proof is rejected: the report is wrong, not the limit."""
+"""Multiple of a limit above which a proof is rejected: the report is wrong, not the limit."""
 PAIR_SPANS_S: Final = (0.001, 0.2, 0.5, 1.0, 2.0)
-"""Least times between two velocities that are compared: with the previous one, and with older ones.
-"""
+"""Least times between two velocities that are compared: adjacent ones, and older ones."""
 _PAIRS_NS: Final = tuple(round(least_s * 1e9) for least_s in PAIR_SPANS_S)
 _KEPT: Final = 64
 
 
 class Airframe(StrEnum):
-    """Kind of aircraft, by its limits."""
+    """Kind of aircraft, which determines its assumed limits."""
 
     COPTER = "copter"
     AEROPLANE = "aeroplane"
@@ -69,10 +68,10 @@ LIMITS: Final = {
         speed_mps=400.0, acceleration_mps2=16.0, lag_s=(0.0, 0.0), turn_degps2=720.0
     ),
 }
-"""Limits from real and simulated logs: docs/field-notes.md 1."""
+"""Assumed limits by kind of aircraft, from real and simulated logs: docs/field-notes.md 1."""
 ARDUPILOT_LAG_S: Final = {Airframe.COPTER: (0.019, 0.040), Airframe.AEROPLANE: (-0.033, -0.019)}
 ARDUPILOT_ANY_LAG_S: Final = (-0.033, 0.040)
-"""Lag of ArduPilot's positions in simulation; it differs in sign between copters and aeroplanes."""
+"""Lag of ArduPilot's positions, any aircraft: copters and aeroplanes differ in its sign."""
 
 _ARDUPILOT: Final = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
 _AIRFRAMES: Final = {
@@ -87,13 +86,13 @@ _AIRFRAMES: Final = {
 def airframe(mav_type: int | None) -> Airframe:
     """Return the kind of aircraft by MAV_TYPE (minimal.xml) of its heartbeat.
 
-    None: not received.
+    A type of None is one that was not received.
     """
     return Airframe.UNKNOWN if mav_type is None else _AIRFRAMES.get(mav_type, Airframe.UNKNOWN)
 
 
 def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
-    """Return least and largest lag of a position, s, by MAV_AUTOPILOT and kind of aircraft."""
+    """Return the least and largest lag of a position, s, by MAV_AUTOPILOT and kind of aircraft."""
     if autopilot == _ARDUPILOT:
         return ARDUPILOT_LAG_S.get(kind, ARDUPILOT_ANY_LAG_S)
     return LIMITS[kind].lag_s
@@ -101,7 +100,7 @@ def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
 
 @dataclass(slots=True)
 class RaisedLimit:
-    """Raised limit: its value, and the sender time of the raise."""
+    """Limit that was raised: its value, and the sender time at which it was raised."""
 
     to: float = 0.0
     at_ns: int = 0
@@ -112,7 +111,7 @@ class RaisedLimit:
         return self.to
 
     def at(self, limit: float, sender_ns: int) -> float:
-        """Return the limit in force at a sender time."""
+        """Return the limit that applies at a sender time."""
         if self.to <= limit:
             return limit
         faded = math.exp(-max(0, sender_ns - self.at_ns) * 1e-9 / DECAY_S)
@@ -120,7 +119,7 @@ class RaisedLimit:
 
 
 class Refutations:
-    """Limits of one UAV that its reports refuted. ``look`` takes reports in any order."""
+    """Refuted limits of one UAV. ``look`` takes its reports in any order."""
 
     def __init__(self) -> None:
         self.speed = RaisedLimit()
@@ -129,7 +128,7 @@ class Refutations:
         self._velocities: list[tuple[float, float, float, float, float]] = []
 
     def limits(self, base: Limits, sender_ns: int) -> Limits:
-        """Return the limits in force at a sender time."""
+        """Return the limits that apply at a sender time."""
         speed = self.speed.at(base.speed_max_mps, sender_ns)
         acceleration = self.acceleration.at(base.acceleration_max_mps2, sender_ns)
         if speed == base.speed_max_mps and acceleration == base.acceleration_max_mps2:
@@ -137,7 +136,7 @@ class Refutations:
         return Limits(speed, acceleration, LimitSource.RAISED)
 
     def look(self, fix: Fix) -> list[Refuted]:
-        """Check a report against its limits. Return the refutations; the limits are raised."""
+        """Check a report against the limits. Raise refuted limits, and return the refutations."""
         base, velocity = fix.limits, fix.velocity_ned_mps
         if base is None or velocity is None:
             return []
@@ -161,7 +160,7 @@ class Refutations:
         return found
 
     def _proven(self, fix: Fix, north: float, east: float, down: float) -> float:
-        """Return the largest mean acceleration that a velocity proves with earlier ones, m/s²."""
+        """Return the largest mean acceleration proven by a velocity and earlier ones, m/s²."""
         most, noise = 0.0, fix.noise
         times_ns, end = self._times_ns, len(self._times_ns)
         for least_ns in _PAIRS_NS:

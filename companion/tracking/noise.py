@@ -1,4 +1,4 @@
-"""Bounds on the errors of a report, from stated accuracies or for relayed aircraft."""
+"""Bounds on the errors of a report, from stated accuracies or, for relayed aircraft, their kind."""
 
 import math
 from dataclasses import dataclass
@@ -7,34 +7,34 @@ from typing import Final
 from companion.values import Accuracy, AltitudeDatum, GnssStatus, ReportNoise, Vector
 
 QUANTISATION: Final = 0.02
-"""Least noise bound, m and m/s, whatever accuracy is stated.
+"""Least noise bound, m and m/s, however good the stated accuracy is.
 
 GLOBAL_POSITION_INT has steps of 1.1 cm and 1 cm/s.
 """
 LEAST_ACCURACY_M: Final = {4: 0.2, 5: 0.1, 6: 0.01, 7: 0.01, 8: 0.01}
-"""Best credible accuracy for a type of fix (GPS_FIX_TYPE): differential, RTK float and fixed,
-static, PPP. Some receivers state a millimetre if they do not know their accuracy.
-"""
+"""Best credible accuracy by GPS_FIX_TYPE: differential, RTK float and fixed, static, PPP. Some
+receivers state a millimetre if they do not know their accuracy."""
 PLAIN_ACCURACY_M: Final = 0.3  # best credible accuracy of any other fix
 ADSB_TIME_BOUND_S: Final = 1.0
-"""Uncertainty of the time of an ADS-B report: ``tslc`` is in whole seconds."""
+"""Uncertainty of the time of an ADS-B report, whose ``tslc`` is in whole seconds."""
 ADSB_NOISE_M: Final = 100.0
-"""Bound on the position error of an ADS-B report.
+"""Default bound on the position error of an ADS-B report, metres.
 
-It exceeds what most transponders guarantee (NACp 8: 93 m) and the steps of pressure altitude.
+The bound exceeds what most transponders guarantee (NACp 8: 93 m) and the steps of pressure
+altitude.
 """
 ADSB_VELOCITY_NOISE_MPS: Final = 10.0  # bound on the velocity error of an ADS-B report (NACv 1)
 GEOID_M: Final = 107.0
 """Largest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 
 Heights above the ellipsoid are compared with telemetry's, which are above mean sea level. If the
-geoid height is unknown they are not converted, and may be off by this much.
+geoid height is unknown, heights are not converted, and may be off by this much.
 """
 
 
 @dataclass(frozen=True, slots=True)
 class NoiseSettings:
-    """How noise bounds are derived.
+    """Settings of how noise bounds are derived.
 
     default  bounds without better information
     factor   multiple of a stated accuracy (a standard deviation or 68 % radius, as receivers state
@@ -83,8 +83,8 @@ def relayed(
         geoid_error_m
                   largest error of a height that was converted to mean sea level
 
-    The uncertainty of its time adds the distance flown in it, and an altitude that was true
-    ``alt_age_s`` apart adds the distance climbed in that time.
+    The uncertainty of the report's time adds the distance flown in that time, and an altitude that
+    was true ``alt_age_s`` apart adds the distance climbed in that time.
     """
     known = Accuracy() if accuracy is None or factor is None else accuracy
     time_s = ADSB_TIME_BOUND_S if known.time_s is None else known.time_s

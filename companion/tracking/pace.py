@@ -1,4 +1,4 @@
-"""Report timing of a UAV, and the silence that is still normal for it.
+"""Timing of a UAV's reports, and the longest silence that is still normal.
 
 A link that delivers a report every 0.8 s with a latency up to a second does not lose its UAV
 between reports. A track coasts only after a silence longer than three of its own intervals plus the
@@ -13,12 +13,11 @@ from companion.values import Fix
 KEPT: Final = 16  # reports from which the timing is measured
 INTERVALS: Final = 3.0
 SILENCES: Final = 1.25
-"""Multiple of the second longest recent silence that is still normal; the longest may be an
-outlier."""
+"""Multiple of the second longest recent silence that is normal; the longest may be an outlier."""
 
 
 class ReportTiming:
-    """Intervals, latencies and silences of the newest reports. ``add`` takes accepted reports."""
+    """Intervals, latencies and silences of a UAV's reports. ``add`` takes accepted reports."""
 
     def __init__(self) -> None:
         self._intervals_s: deque[float] = deque(maxlen=KEPT)
@@ -51,5 +50,5 @@ class ReportTiming:
         return max(usual_s, SILENCES * sorted(self._ages_s)[-2])
 
     def silence_s(self, least_s: float, most_s: float) -> float:
-        """Return the age of the newest report, s, beyond which the track coasts; limited."""
+        """Return the age of the newest report above which a track coasts, seconds; limited."""
         return min(max(least_s, self._silence_s), most_s)

@@ -21,7 +21,7 @@ from companion.values import Fix, Vector
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AccelerationModel:
-    """Model of the acceleration that is fed forward.
+    """Model of an acceleration that is fed forward in predictions.
 
     turns     coordinated turn: the lateral acceleration rotates with the velocity and does not
               decay; the longitudinal part is dropped
@@ -44,27 +44,26 @@ ACCELERATION_MODELS: Final = (
     AccelerationModel(window_s=2.5, min_velocities=3, decay_s=3.0, turns=True),
     AccelerationModel(window_s=5.0, min_velocities=5, decay_s=3.0, turns=True),
 )
-"""None; quick turns of short and long duration; a sustained turn; a slow one with noisy reports;
-circles."""
+"""No model; quick turns, short and long; a sustained turn; a slow, noisy one; circles."""
 WINDOWS: Final = sorted(
     {(way.window_s, way.min_velocities) for way in ACCELERATION_MODELS if way.window_s}
 )
-"""Distinct windows of the models with the numbers of velocities they need, ascending."""
+"""Distinct windows of the acceleration models, each with the velocities needed, ascending."""
 TURNING_MPS: Final = 1.0  # horizontal speed below which the course is undefined
 SMOOTHING_SHARE: Final = 0.35  # share of the newest report in a smoothed position
 SMOOTHING_GAP_S: Final = 5.0  # gap between reports over which positions are not smoothed
 ZERO: Final = (0.0, 0.0, 0.0)
 COMPARED_AGES_S: Final = (1.0, 2.0)
-"""Least ages of the predictions by which models are compared: short, and as over a slow radio."""
+"""Least ages of predictions by which models are compared: short, and over a slow radio."""
 MEMORY_S: Final = 20.0  # time constant with which squared errors decay
 SWITCH_RATIO: Final = 0.9
-"""Ratio to the present model's mean square error that another must be below to replace it."""
+"""Ratio of mean square errors below which another acceleration model replaces the present one."""
 SWITCH_AFTER: Final = 4  # comparisons before a model other than constant velocity is selected
 AGES_S: Final = (0.25, 1.0, 2.5)
-"""Least ages of the predictions whose errors are kept for the usual error."""
+"""Least ages of the predictions whose errors are kept, to estimate the usual error."""
 ERRORS_KEPT: Final = 200
 QUANTILE: Final = 0.95
-"""Quantile of the errors that is the usual one: of n errors the ceil((n + 1) QUANTILE)-th."""
+"""Quantile of past errors that is the usual error: of n, the ceil((n + 1) QUANTILE)-th."""
 ERRORS_LEAST: Final = 20
 SPACING_S: Final = 0.3  # least time between evaluated reports; more would add no information
 _KEPT: Final = 64
@@ -72,7 +71,7 @@ _KEPT: Final = 64
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PastPrediction:
-    """State at a report, from which the predictions of all models can be repeated."""
+    """State at a past report, from which all models' predictions can be repeated."""
 
     sender_ns: int
     position: Vector
@@ -113,7 +112,7 @@ class _PastPrediction:
 
 @dataclass(slots=True, kw_only=True)
 class _Errors:
-    """Newest errors of predictions of about one age."""
+    """Newest errors of predictions that were about equally old."""
 
     in_order: deque[float] = field(default_factory=lambda: deque(maxlen=ERRORS_KEPT))
     sorted_m: list[float] = field(default_factory=list)
@@ -133,7 +132,7 @@ class _Errors:
 
 
 class PastPredictions:
-    """Past predictions of one UAV. ``add`` takes its reports in order of the sender's time."""
+    """Past predictions of one UAV. ``add`` takes reports in order of the sender's time."""
 
     def __init__(self) -> None:
         self._states: deque[_PastPrediction] = deque(maxlen=_KEPT)
@@ -152,11 +151,11 @@ class PastPredictions:
 
     @property
     def smoothing_offset(self) -> Vector:
-        """Offset of the position used from the newest reported one; m, local frame."""
+        """Offset of the used position from the newest reported position; m, local frame."""
         return self._smoothing_offset if self._model >= len(ACCELERATION_MODELS) else ZERO
 
     def smooth(self, fix: Fix) -> None:
-        """Update the smoothed position by the newest report: by every one, before ``add``."""
+        """Update the smoothed position by the newest report; call it for all, before ``add``."""
         before, velocity = self._smoothed, fix.velocity_ned_mps
         self._smoothed, self._smoothing_offset = None, ZERO
         if velocity is None:
@@ -178,7 +177,7 @@ class PastPredictions:
         self._smoothed = (fix.sender_ns, place, velocity)
 
     def is_due(self, sender_ns: int) -> bool:
-        """Return whether a report of this time must be added."""
+        """Return whether a report at this time must be added."""
         return not self._states or sender_ns - self._states[-1].sender_ns >= SPACING_S * 1e9
 
     def add(self, fix: Fix, accelerations: tuple[Vector | None, ...]) -> None:
@@ -207,7 +206,7 @@ class PastPredictions:
             )
 
     def _older(self, sender_ns: int, least_s: float) -> _PastPrediction | None:
-        """Return the newest stored state at least this old; None if older than 2 s + twice that."""
+        """Return the newest stored state at least this old; None beyond 2 s + twice that age."""
         newest_ns = sender_ns - round(least_s * 1e9)
         for made in reversed(self._states):
             if made.sender_ns <= newest_ns:
@@ -235,9 +234,10 @@ class PastPredictions:
             self._model = best
 
     def error_p95_m(self, age_s: float) -> float | None:
-        """Return the 95th percentile of recent errors at an age; None with too few.
+        """Return the 95th percentile of recent errors at an age; None with too few errors.
 
-        It is interpolated between the observed ages, and extrapolated with the square of the age.
+        The percentile is interpolated between the observed ages, and extrapolated with the square
+        of the age.
         """
         known = [
             (one.age_s, one.error_p95_m) for one in self._errors if one.error_p95_m is not None
@@ -257,7 +257,7 @@ class PastPredictions:
 def fed_forward(
     way: AccelerationModel, acceleration: Vector, velocity: Vector, ahead_s: float
 ) -> tuple[Vector, Vector]:
-    """Displacement (m) and change of velocity (m/s) by an acceleration within a time.
+    """Return displacement (m) and change of velocity (m/s) by an acceleration within a time.
 
     A turn in the plane at the rate w = (v x a) / v^2 rotates the velocity by w t, and the
     displacement is the integral of that (docs/math.md 5.1).
@@ -280,9 +280,9 @@ def fed_forward(
 
 
 def fading_response(ahead_s: float, decay_s: float) -> tuple[float, float]:
-    """Displacement (s²) and gain in speed (s) by a decaying unit acceleration within a time.
+    """Return displacement (s²) and gain in speed (s) by a decaying unit acceleration.
 
-    s(τ) of docs/math.md 5.1, and its derivative.
+    These are s(τ) of docs/math.md 5.1, and its derivative.
     """
     shrink = math.exp(-ahead_s / decay_s)
     return decay_s * decay_s * (shrink - 1.0 + ahead_s / decay_s), decay_s * (1.0 - shrink)

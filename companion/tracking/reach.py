@@ -6,7 +6,7 @@ of at most a, the UAV is within
     R(s) = n_p + |s| n_v + a s^2 / 2    of    p + v s
 
 If s is only known to lie between two times, all of these balls are possible. |q - (p + v s)| and
-R(s) are both convex in s, so for every place q their sum is largest at one of the two ends: the
+R(s) are both convex in s, so for every position q their sum is largest at one of the two ends: the
 bound about a prediction q is the larger of the two, and exact. Older reports add nothing to the
 worst case. See docs/math.md 5.1.
 """
@@ -18,7 +18,7 @@ from companion.values import Fix, Limits, SenderTime, Vector
 
 
 class Reach(NamedTuple):
-    """Bounds about a prediction, and the smallest ball that contains the reachable set."""
+    """Bounds about a prediction, and the smallest ball around the reachable set."""
 
     bound_m: float  # bound on the norm of the prediction's error
     horizontal_m: float  # bound on its part in the plane
@@ -75,7 +75,7 @@ def reach(fix: Fix, limits: Limits, predicted_ned_m: Vector, at: SenderTime) -> 
 
 
 def _ball(fix: Fix, ends: tuple[float, float], radii: list[float]) -> tuple[Vector, float]:
-    """Return the smallest ball that contains the balls at both ends, and so all between them."""
+    """Return the smallest ball around the balls at both ends, and so around all between them."""
     assert fix.velocity_ned_mps is not None
     (n, e, d), (v_n, v_e, v_d) = fix.position_ned_m, fix.velocity_ned_mps
     apart = math.sqrt(v_n * v_n + v_e * v_e + v_d * v_d) * (ends[1] - ends[0])

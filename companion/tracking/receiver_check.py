@@ -1,4 +1,4 @@
-"""Detection of receivers that are worse than stated: positions that deviate from dead reckoning.
+"""Check for receivers that are worse than stated: positions deviate from dead reckoning.
 
 A receiver states the radius that holds two of three of its positions, and the bound on a report's
 error rests on it. Velocities are measured independently of positions, by Doppler. Within a few
@@ -21,22 +21,21 @@ WITHIN_NS: Final = 5_000_000_000  # time within which positions are compared
 APART_NS: Final = 500_000_000
 """Longest time between two reports over which dead reckoning by their velocities is valid."""
 GOOD_DEVIATION_M: Final = 0.4
-"""Deviation of good receivers' positions, whatever they state: velocities have errors, too."""
+"""Deviation of a good receiver's positions, whatever it states, as velocities have errors."""
 UNSEEN_FACTOR: Final = 0.5
 """Multiple of the root sum square of the displacement that is possible unseen between reports.
 
-It is hardly ever the largest that the aircraft can cause.
+An aircraft's displacement hardly ever reaches the largest possible value.
 """
 COMMON_ERROR: Final = 0.07
-"""Usual share of the noise bound that is common to all reports, so that none reveals it."""
+"""Usual share of the noise bound that all reports have in common, so that none reveals it."""
 COMMON_ERROR_REFUTED: Final = 0.82
-"""The same for a receiver that deviates: 95 of 100 lie within 2.45 deviations in the plane, of 3.
-"""
+"""Usual common share of the noise bound for a receiver that deviates: 2.45 of 3 deviations."""
 NOTICE_RATIO: Final = 1.25  # increase after which a deviation is reported again
 
 
 class ReceiverCheck:
-    """Comparison of one UAV's positions with its velocities. ``look`` takes the newest report.
+    """Check of one UAV's positions by its velocities. ``look`` takes the newest report.
 
     ``settings`` are those from which the bounds on their noise were derived.
     """
@@ -49,7 +48,7 @@ class ReceiverCheck:
         self._deviation_m = 0.0
 
     def look(self, fix: Fix, acceleration_mps2: float) -> Refuted | None:
-        """Check a report. Return the refutation of its receiver's accuracy, if it is new.
+        """Check a report. Return the refutation of the receiver's accuracy, if it is new.
 
         ``acceleration_mps2`` is the aircraft's largest acceleration.
         """
@@ -129,10 +128,10 @@ class ReceiverCheck:
 
 
 def _step_deviation(before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float, float]:
-    """Deviation of a position from dead reckoning by the velocities, north and east, metres.
+    """Return the deviation of a position from dead reckoning, north and east, metres.
 
-    The third value bounds the possible unseen displacement between the two reports. Horizontal
-    only: heights come from a barometer.
+    The third value bounds the possible unseen displacement between the two reports. Only horizontal
+    positions are checked: heights come from a barometer.
     """
     assert before.velocity_ned_mps is not None and fix.velocity_ned_mps is not None
     half_s = (fix.sender_ns - before.sender_ns) * 0.5e-9

@@ -1,8 +1,8 @@
 """Tracks of all UAVs: assignment and gating of reports, and the states of tracks.
 
 A track is live while reports arrive, coasting when they fail to, stale when too old for a beam, and
-lost; the ages at which it changes are settings. Nothing here keeps time: only the newest accepted
-report and the time asked for matter.
+lost; the ages at which it changes are settings. The module keeps no time: only the newest accepted
+report and the requested time matter.
 
 Over 300 lines: reports in and tracks out share the state of a track.
 """
@@ -42,12 +42,12 @@ from companion.values import (
 )
 
 ESTABLISHED: Final = 50
-"""Reports that establish a UAV: when it returns, tracks with fewer reports make room for it."""
+"""Number of reports that establish a UAV: tracks with fewer make room for its return."""
 
 
 @dataclass(frozen=True, slots=True)
 class Ages:
-    """Ages of the newest report, in seconds, beyond which a track changes to the next state.
+    """Ages of a track's newest report above which the track changes state, seconds.
 
     ``coasting_s`` is a minimum: it is longer on a slow link (``pace.py``).
     """
@@ -57,7 +57,7 @@ class Ages:
     lost_s: float = 60.0
 
     def state(self, age_s: float, pace: ReportTiming) -> TrackState:
-        """Return the state of a track whose newest report is this old, given its own timing."""
+        """Return the state of a track by the age of its newest report and its usual timing."""
         coasting_s = pace.silence_s(self.coasting_s, self.stale_s)
         if age_s > self.lost_s:
             return TrackState.LOST
@@ -85,7 +85,7 @@ class TrackerSettings:
 
 @dataclass(slots=True)
 class _Past:
-    """State that survives a restarted track.
+    """State of a UAV that survives a restart of its track.
 
     ``receiver_check`` is None if stated noise is trusted.
     """
@@ -97,7 +97,7 @@ class _Past:
 
 @dataclass(slots=True, kw_only=True)
 class _Tracked:
-    """One track: its newest reports, and the state derived from them."""
+    """Track of one UAV: its newest reports, and the state derived from them."""
 
     past: _Past
     history: ReportHistory[Any]
@@ -113,7 +113,7 @@ class _Tracked:
 
 
 class Tracker:
-    """All tracks, by UAV id. ``accept`` takes reports; ``track`` predicts to a time.
+    """Tracks of all UAVs by id. ``accept`` takes reports; ``track`` predicts to a time.
 
     Tracks are on each sender's own timeline, so that link delays change neither the intervals nor
     their order. The caller of ``track`` converts the time to that timeline.
@@ -149,7 +149,7 @@ class Tracker:
         return _Past(Refutations(), None if noise is None else ReceiverCheck(noise), ReportTiming())
 
     def _with_refuted_limits(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
-        """Return a report with the bounds as raised by refutations, and its own refutations."""
+        """Return a report with its raised bounds, and the refutations by this report."""
         given = self._limits(fix)
         found = past.refutations.look(fix if fix.limits else replace(fix, limits=given))
         limits, noise = past.refutations.limits(given, fix.sender_ns), fix.noise
@@ -203,14 +203,14 @@ class Tracker:
         return first
 
     def _is_lost(self, tracked: _Tracked, fix: Fix) -> bool:
-        """Return whether the gap before a report is too long for the track to gate it."""
+        """Return whether the gap before a report is too long to gate the report by its track."""
         gap_s = (fix.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
         return gap_s > self._settings.ages.lost_s
 
     def _basic_rejection(
         self, tracked: _Tracked, index: int, fix: Fix
     ) -> tuple[Reason, str] | None:
-        """Check a report without a prediction: a repeated stamp, or a resent position."""
+        """Reject a report without a prediction: for a repeated stamp, or a resent position."""
         entries = tracked.history.entries
         if index < len(entries) and entries[index].fix.sender_ns == fix.sender_ns:
             return Reason.DUPLICATE, "a second report with the same stamp"
@@ -293,7 +293,7 @@ class Tracker:
         tracked.acceleration = by_window.get(predictions.model.window_s)
 
     def forget(self, uav: str) -> None:
-        """Forget a track, because its sender was restarted or is gone."""
+        """Forget a track, because its sender restarted or no longer sends."""
         tracked = self._tracked.pop(uav, None)
         room = len(self._established) < self._settings.most  # earlier UAVs take precedence
         if room and tracked is not None and tracked.reports >= ESTABLISHED:
@@ -307,7 +307,7 @@ class Tracker:
     # --- output: tracks ---------------------------------------------------------------------
 
     def track(self, uav: str, now_ns: int, at: SenderTime) -> Track | None:
-        """Predict one UAV to ``at.node_ns``, with its state at ``now_ns``; None if unknown."""
+        """Predict a UAV to ``at.node_ns``; its state is that at ``now_ns``. None if unknown."""
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
@@ -395,21 +395,21 @@ class Tracker:
         return fix.limits or self._settings.limits
 
     def __contains__(self, uav: object) -> bool:
-        """Whether there is a track of this UAV."""
+        """Return whether a UAV has a track."""
         return uav in self._tracked
 
     def newest(self, uav: str) -> Fix | None:
-        """Return the newest accepted report of a UAV; None if it was never seen."""
+        """Return the newest accepted report of a UAV; None if the UAV has no track."""
         tracked = self._tracked.get(uav)
         return tracked.history.newest.fix if tracked else None
 
     @property
     def uavs(self) -> list[str]:
-        """Ids of all tracks, in the order of their start."""
+        """Ids of all UAVs with a track, in the order in which the tracks started."""
         return list(self._tracked)
 
     def state(self, uav: str, now: SenderTime) -> TrackState | None:
-        """Return the state of a track, without a prediction; None if it was never seen."""
+        """Return the state of a UAV's track, without a prediction; None if it has no track."""
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
@@ -428,7 +428,7 @@ class Tracker:
 def _fastest_mps(
     velocity: Vector | None, bound_mps: float | None, limits: Limits, within_s: float
 ) -> float:
-    """Return the largest speed within a time of the instant of a prediction."""
+    """Return the largest speed within a time of the prediction's instant."""
     if velocity is None or bound_mps is None:
         return limits.speed_max_mps
     gained_mps = limits.acceleration_max_mps2 * within_s
@@ -471,7 +471,7 @@ def _sum(one: Vector, other: Vector) -> Vector:
 
 
 def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:
-    """Clip an acceleration to the largest size."""
+    """Clip an acceleration to the largest allowed size."""
     if acceleration is None:
         return None
     north, east, down = acceleration
@@ -483,7 +483,7 @@ def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:
 
 
 def _unknown_input(history: ReportHistory[Any]) -> Vector | None:
-    """Unknown input over the newest interval: W^ = (x^+ - x^) / dT, m/s.
+    """Return the unknown input over the newest interval: W^ = (x^+ - x^) / dT, m/s.
 
     See docs/math.md 3, paper eq. (12); None if there are fewer than two reports.
     """

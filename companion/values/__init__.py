@@ -1,4 +1,4 @@
-"""Frozen values that flow through the program, from a received frame to a set of weights.
+"""Frozen values that the program passes on, from a received frame to a set of weights.
 
 Conventions, here and everywhere:
 

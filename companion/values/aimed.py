@@ -12,8 +12,7 @@ from companion.values.numbers import ComplexArray, FloatArray, IntArray
 
 
 class Method(DescribedEnum):
-    """Way to compute the weights; regularised zero forcing also replaces zero forcing that costs
-    too much."""
+    """Method of computing weights; regularised zero forcing also replaces costly zero forcing."""
 
     ZERO_FORCING = "zf", "zero forcing"
     REGULARISED = "rzf", "regularised zero forcing"
@@ -32,7 +31,7 @@ class ArrayKind(DescribedEnum):
 
 
 class Power(DescribedEnum):
-    """Power allocation between the beams of one time slot."""
+    """Method of power allocation between the beams of one time slot."""
 
     EQUAL = "equal", "equally"
     MAX_MIN = "max-min", "so that the least SINR is as large as possible"
@@ -52,7 +51,7 @@ class Normalisation(DescribedEnum):
 
 
 class Policy(DescribedEnum):
-    """Fallback where zero forcing would cost a UAV too much gain."""
+    """Fallback if zero forcing would cost a UAV too much gain."""
 
     REGULARISE = "regularise", "add a diagonal loading to the Gram matrix"
     GROUP = "group", "serve groups of UAVs, each in a time slot of its own"
@@ -60,7 +59,7 @@ class Policy(DescribedEnum):
 
 
 class Widen(DescribedEnum):
-    """Criterion for the width of beams."""
+    """Criterion for the width of the beams."""
 
     LIKELY = "likely", "for the usual pointing error, with a guaranteed floor within the bound"
     GUARANTEE = "guarantee", "for the bound: the largest guaranteed gain within it"
@@ -132,7 +131,7 @@ class Beam:
 
 @dataclass(frozen=True, slots=True)
 class LeftOut:
-    """Tracked UAV without a beam, with the cause and the reason in words."""
+    """Tracked UAV that gets no beam, with the cause and the reason in words."""
 
     uav: Annotated[str, Meaning("UAV without a beam", 1)]
     cause: Cause
@@ -143,7 +142,7 @@ class LeftOut:
 class BeamSet:
     """Beams and weights of one update.
 
-    Zero forcing gives AᵀF = I within a time slot (no conjugate; diagonal under other
+    Zero forcing gives AᵀF = I within a time slot (without conjugation; diagonal under other
     normalisations): each UAV lies in a null of the others' beams. See docs/math.md 7.
     """
 
@@ -174,7 +173,7 @@ class BeamSet:
 
     @property
     def slots(self) -> IntArray:
-        """Time slot of each beam, (N,)."""
+        """Time slot of each beam's UAV, (N,)."""
         return np.array([beam.group for beam in self.beams], dtype=np.int64)
 
     @property

@@ -1,4 +1,4 @@
-"""Description of each value that leaves the program, declared once, beside the value.
+"""Descriptions of the values that leave the program, each declared once, beside the value.
 
     age_s: Annotated[float, Meaning("age of the newest accepted report", 4)]
 
@@ -41,7 +41,7 @@ _DEGREES: Final = {"_rad": "_deg", "_radps": "_degps"}
 
 @dataclass(frozen=True, slots=True)
 class Meaning:
-    """Description of a value, and how each output writes it.
+    """Description of a value, and how each output of the program writes it.
 
     text        a phrase in plain English, without the unit; it gives the meaning of None
                 if that is more than "unknown"
@@ -50,7 +50,7 @@ class Meaning:
     example     for the OpenAPI document
     wire        protobuf type, if it differs from the rule of ``companion.recording.fields``
     absent      outputs that omit it, each with the reason
-    deprecated  replacement: the value is removed in the next version
+    deprecated replacement: the value is removed in the next version
     """
 
     text: str
@@ -77,14 +77,14 @@ class DescribedEnum(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Inline:
-    """Marker of a described value that is replaced by its own members."""
+    """Marker of a described value whose own members replace it."""
 
     prefix: str = ""  # prepended to their names
     omit: tuple[str, ...] = ()  # members left out
 
 
 class Member(NamedTuple):
-    """One described value of a class."""
+    """Described value of a class."""
 
     name: str  # name inside the program; with the prefix if inlined
     type: Any  # annotation without Annotated and without None
@@ -116,7 +116,7 @@ def is_described(kind: Any) -> bool:
 
 
 def bare(annotation: Any) -> tuple[Any, bool]:
-    """Strip ``Annotated``, ``NewType`` and None; return the type and whether None was allowed."""
+    """Return a type without ``Annotated``, ``NewType`` and None, and whether None was allowed."""
     if typing.get_origin(annotation) is typing.Annotated:
         return bare(typing.get_args(annotation)[0])
     if isinstance(annotation, typing.NewType):
@@ -129,7 +129,7 @@ def bare(annotation: Any) -> tuple[Any, bool]:
 
 
 def is_vector(kind: Any) -> bool:
-    """Return whether a type is that of a numpy array."""
+    """Return whether a type is a numpy array."""
     return "ndarray" in str(kind)
 
 
@@ -142,12 +142,12 @@ def in_degrees(name: str) -> str:
 
 
 def is_in_radians(name: str) -> bool:
-    """Return whether a name is that of an angle or rate in radians."""
+    """Return whether a value's name is an angle or a rate in radians."""
     return name.endswith(tuple(_DEGREES))
 
 
 def unit(name: str) -> str:
-    """Return the unit that a name ends in; empty if it has none."""
+    """Return the unit that a value's name ends in; empty if it has none."""
     return UNITS.get(name.rpartition("_")[2], "") if "_" in name else ""
 
 
@@ -171,7 +171,7 @@ def _members(described: type) -> Iterator[Member]:
 
 
 def _annotations(described: type) -> dict[str, Any]:
-    """Return the annotations of fields and properties, those of base classes first."""
+    """Return the annotations of fields and properties of a class, base classes first."""
     hints = typing.get_type_hints(described, include_extras=True)
     found: dict[str, Any] = {}
     for base in reversed(described.__mro__):
@@ -192,7 +192,7 @@ def _metadata(annotation: Any) -> tuple[Any, ...]:
 
 
 def _chain(outer: str, inner: Callable[[Any], Any]) -> Callable[[Any], Any]:
-    """Return a getter through an attribute; one C call if both are attributes."""
+    """Return a getter of an attribute's attribute; one C call if both are plain attributes."""
     if isinstance(inner, operator.attrgetter):
         path = str(inner.__reduce__()[1][0])
         return operator.attrgetter(f"{outer}.{path}")

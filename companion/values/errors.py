@@ -1,4 +1,4 @@
-"""Base class of every error that a user can cause, and the display of untrusted values."""
+"""Base class of errors that a user can cause, and the display of untrusted values."""
 
 from typing import Final
 
@@ -13,7 +13,7 @@ class UserError(ValueError):
 
 
 def shown(given: object) -> str:
-    """Return the ``repr`` of a value as an error message shows it, cut to ``SHOWN_MAX``."""
+    """Return the ``repr`` of a value for an error message, cut to ``SHOWN_MAX``."""
     try:
         text = repr(given)
     except ValueError:  # Python's limit on the digits of an integer
@@ -22,5 +22,5 @@ def shown(given: object) -> str:
 
 
 def printable(text: str) -> str:
-    """Remove control characters, such as terminal escapes, from a text; keep its line breaks."""
+    """Remove control characters, such as terminal escapes, from a text; keep line breaks."""
     return "".join(char for char in text if char.isprintable() or char == "\n")

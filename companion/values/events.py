@@ -27,7 +27,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Tock:
-    """Event at which the beams of the preceding split tick are computed."""
+    """Event at which the beams of the preceding split tick are ready."""
 
     t_ns: Annotated[int, Meaning("when they are computed", 1)]
 
@@ -54,7 +54,7 @@ DUTY_MAX: Final = 10_000  # most UAVs that a duty serves, and most that it prote
 
 @dataclass(frozen=True, slots=True)
 class Duty:
-    """UAVs that this node of a fleet serves from now on, and those that it protects."""
+    """UAVs that this node of a fleet serves from now on, and UAVs that it protects."""
 
     t_ns: Annotated[int, Meaning("when the duty begins", 1)]
     serves: Annotated[tuple[str, ...], Meaning("UAVs that get a beam", 2)]
@@ -64,13 +64,13 @@ class Duty:
 
 
 Event = Frame | Tick | Tock | Rejection | RoundTrip | ClockSet | Duty
-"""Every event that drives the pipeline, in the order of processing.
+"""Any event that drives the pipeline, in the order of processing.
 
-This is the order of time, with one exception: a frame's time is its arrival. If the node was busy,
-a tick with a later time may precede the frame.
+Events are in order of time, with one exception: a frame's time is its arrival. If the node was
+busy, a tick with a later time may precede the frame.
 
 Framing emits rejections as events: the bytes are discarded, but their arrival must be recorded. A
 round trip is an event because only the service knows its own requests. ``ClockSet`` is an event so
-that a replay prints the same times as the service. A duty is one because other nodes take part in
-the decision.
+that a replay prints the same times as the service. A duty is an event because other nodes take part
+in the decision.
 """

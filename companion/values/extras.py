@@ -1,4 +1,4 @@
-"""Optional packages, and the one-line error if one is not installed."""
+"""Optional packages, and the one-line error if such a package is not installed."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -8,7 +8,7 @@ from companion.values.errors import UserError
 
 @contextmanager
 def needs(package: str, extra: str, what: str) -> Iterator[None]:
-    """Guard an import: raise ``UserError`` with the install command if the package is missing."""
+    """Guard an import: raise ``UserError`` with the install command if a package is missing."""
     try:
         yield
     except ModuleNotFoundError as error:

@@ -1,4 +1,4 @@
-"""Values of a fleet: the messages that its nodes exchange."""
+"""Values of a fleet: the messages that nodes exchange."""
 
 from dataclasses import dataclass
 from typing import Annotated, NamedTuple
@@ -8,7 +8,7 @@ from companion.values.events import RoundTrip
 
 
 class SharedFrame(NamedTuple):
-    """Frame that a node received: its arrival on that node's timeline, and its bytes."""
+    """Frame that another node received: its arrival on that node's timeline, and its bytes."""
 
     heard_ns: int
     raw: bytes
@@ -16,7 +16,7 @@ class SharedFrame(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Shared:
-    """Recent frames and round trips of a node, for the other nodes; times on its own timeline."""
+    """Recent frames and round trips that a node shares; times on the node's own timeline."""
 
     told_ns: int  # when it was published
     frames: tuple[SharedFrame, ...] = ()  # frames from vehicles, in the order of arrival
@@ -47,7 +47,7 @@ class Offer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Standing:
-    """Status that a node publishes a few times a second.
+    """Status message that a node publishes a few times a second.
 
     node       its name
     place      of its array: latitude and longitude in degrees, height above mean sea level in

@@ -15,7 +15,7 @@ class Level(DescribedEnum):
 
 
 class Cause(DescribedEnum):
-    """Main limit of a link."""
+    """Main cause that limits a link."""
 
     CARRIER = "carrier", "the array's position or attitude is too uncertain"
     SILENT = "silent", "no report arrives"
@@ -34,7 +34,7 @@ class Cause(DescribedEnum):
 
 @dataclass(frozen=True, slots=True)
 class Blame:
-    """Cause of a weak link, with a reason in words and a remedy."""
+    """Cause of a weak link, with the reason in words and a remedy."""
 
     cause: Annotated[Cause, Meaning("main limit of the link; null for a good link")]
     reason: Annotated[str, Meaning("the cause in words", example="reports 1.1 s apart")]
@@ -49,7 +49,7 @@ class Blame:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Verdict:
-    """Quality of the link to a UAV."""
+    """Verdict on the link to a UAV."""
 
     uav: str
     level: Level

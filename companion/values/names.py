@@ -7,7 +7,7 @@ from typing import Final, NamedTuple, Self
 from companion.values.errors import UserError, shown
 
 DIGITS_MAX: Final = 18
-"""Most digits of an id: for thousands of them, ``int`` raises another error."""
+"""Most digits of an id; ``int`` raises another error for thousands of digits."""
 
 
 class Source(NamedTuple):
@@ -27,7 +27,7 @@ class Source(NamedTuple):
 
 @lru_cache(maxsize=4096)
 def _ids(text: str) -> tuple[int, int]:
-    """Parse system and component id; cached, because every update parses the same names."""
+    """Parse system and component id; cached, as every update parses the same ids."""
     sysid, colon, compid = text.partition(":")
     if not (colon and sysid.isdecimal() and compid.isdecimal()):
         raise UserError(f"{shown(text)} is not SYSID:COMPID, such as 5:1")
@@ -37,14 +37,14 @@ def _ids(text: str) -> tuple[int, int]:
 
 
 class UavKind(Enum):
-    """Kind of a UAV's id, best identification first.
+    """Kind of a UAV's id, from the best identification to the worst.
 
     The aircraft's own telemetry comes first, then its broadcasts, then reports of others.
 
         prefix         prefix of its ids, before a colon; empty for SYSID:COMPID
         pattern        regular expression of its ids
         may_be_manned  whether an aircraft of this kind may carry people
-        rank           its place in this order, from 0
+        rank its position in this order, from 0
 
     Only a vehicle reports itself: it has a MAVLink source, a link and a clock of its own.
     """
@@ -62,15 +62,15 @@ class UavKind(Enum):
         self.reports_itself = not prefix
 
     def uav(self, name: str) -> str:
-        """Return the id of an aircraft of this kind, from its name."""
+        """Return the UAV id of an aircraft of this kind, from its name."""
         return f"{self.prefix}:{name}"
 
 
 _KINDS: Final = {kind.prefix: kind for kind in UavKind}
 UAV_FORMS: Final = "SYSID:COMPID, icao:HEX, rid:ID or cot:UID"
-"""Formats of the ids of all kinds."""
+"""Formats of UAV ids of all kinds."""
 
 
 def kind_of(uav: str) -> UavKind:
-    """Return the kind of a UAV's id."""
+    """Return the kind of a UAV id."""
     return _KINDS.get(uav.partition(":")[0], UavKind.VEHICLE)

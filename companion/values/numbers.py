@@ -1,10 +1,10 @@
-"""Types of vectors and numpy arrays. Arrays held by values are never written to."""
+"""Types of vectors and numpy arrays. Arrays in values are never written to."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 Vector = tuple[float, float, float]
-"""Tuple of three numbers; arithmetic on it is several times faster than on small arrays."""
+"""Vector as a tuple of three numbers; several times faster than a small array."""
 FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]

@@ -29,9 +29,9 @@ class Notice:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Update:
-    """Every tracked UAV at the time of use, with its beams.
+    """Tracks of all UAVs at the time of use, with their beams.
 
-    carrier  where the array is; None while unknown, and then there are no beams
+    carrier position of the array; None while unknown, and then there are no beams
     """
 
     t_ns: int  # when the update was computed, node time
@@ -42,4 +42,4 @@ class Update:
 
 
 Output = Rejection | Estimate | Notice | Refuted | Update
-"""Every value that the pipeline can return for an event."""
+"""Any value that the pipeline can return for an event."""

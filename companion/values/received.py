@@ -10,7 +10,7 @@ from companion.values.names import Source, UavKind
 class Frame(NamedTuple):
     """MAVLink frame with a correct checksum.
 
-    It is a tuple for speed: one is created for every frame received, used or not.
+    The class is a tuple for speed: one is created for every frame received, used or not.
     """
 
     t_ns: Annotated[
@@ -33,12 +33,12 @@ class Frame(NamedTuple):
 
     @property
     def seq(self) -> int:
-        """The sender's 8-bit sequence number."""
+        """Sequence number of the sender, 8 bits."""
         return self.raw[4] if self.raw[0] == 0xFD else self.raw[2]
 
     @property
     def payload(self) -> bytes:
-        """Payload as sent; MAVLink 2 senders truncate trailing zeros."""
+        """Payload as sent; MAVLink 2 senders truncate its trailing zeros."""
         start = 10 if self.raw[0] == 0xFD else 6
         return self.raw[start : start + self.raw[1]]
 
@@ -143,7 +143,7 @@ class AdsbVehicle:
 class RemoteId:
     """Message that a Remote ID receiver relays from one radio: an id, a position, or both.
 
-    None: not sent.
+    A field is None if it was not sent.
     """
 
     t_ns: int
@@ -177,7 +177,7 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Presence:
-    """HEARTBEAT of a component; it does not prove that there is a vehicle."""
+    """Presence of a component by its HEARTBEAT, which does not prove that there is a vehicle."""
 
     t_ns: int
     source: Source
@@ -205,7 +205,7 @@ class GnssStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SystemTime:
-    """Sender's Unix clock, in microseconds, with its boot time (SYSTEM_TIME)."""
+    """Clock readings of a sender: Unix time in microseconds, and boot time (SYSTEM_TIME)."""
 
     t_ns: int
     source: Source

@@ -1,8 +1,8 @@
-"""Untrusted TOML, parsed in bounded time and memory.
+"""Parsing of untrusted TOML in bounded time and memory.
 
 ``tomllib`` needs time and memory quadratic in the number of parts of a key. For integers with
 thousands of digits and for deep nesting it raises errors other than its own. Text that would cost
-too much is rejected before.
+too much is rejected before it is parsed.
 """
 
 import re
@@ -12,27 +12,26 @@ from typing import Any, Final
 from companion.values.errors import UserError
 
 LARGEST: Final = 1 << 20
-"""Most characters outside strings: settings with 4096 separately oriented elements need 3/4 of it.
-"""
+"""Most TOML characters outside strings: settings with 4096 oriented elements need 3/4 of it."""
 LARGEST_TEXT: Final = 1 << 25
-"""Most characters in all: the largest attachment of a recording, in bytes."""
+"""Most TOML characters in all: the largest attachment of a recording, in bytes."""
 _STRINGS: Final = re.compile(
     r""""{3}(?:[^"\\]++|\\.|"(?!""))*+(?:"{3,5}+)?|"""  # of several lines
     r"""'{3}(?:[^']++|'(?!''))*+(?:'{3,5}+)?|"""
     r""""(?:[^"\\\n]++|\\[^\n])*+"?|'[^'\n]*+'?|#[^\n]*+""",
     re.DOTALL,
 )
-"""TOML string or comment, at any position.
+"""Pattern of a TOML string or comment, at any position.
 
 An unterminated string matches up to where TOML would stop. Possessive quantifiers prevent
 backtracking.
 """
 _DEEP: Final = re.compile(r"(?:\.[^.=,\n]*){16}")
-"""Key with more parts than any format read here has."""
+"""Pattern of a key with more parts than any format that is read has."""
 
 
 def read_toml(text: str, largest: int = LARGEST) -> dict[str, Any]:
-    """Parse TOML text. Raises ``UserError`` if it is invalid or too large.
+    """Parse TOML text. Raises ``UserError`` if the text is invalid or too large.
 
     ``largest`` is the limit on characters without strings and comments.
     """

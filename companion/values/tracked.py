@@ -26,7 +26,7 @@ class ReportNoise:
 
 
 class LimitSource(DescribedEnum):
-    """Origin of an aircraft's limits."""
+    """Where an aircraft's limits came from."""
 
     SETTINGS = "settings", "[observer] in the settings"
     TYPE = "type", "the aircraft's type"
@@ -35,7 +35,7 @@ class LimitSource(DescribedEnum):
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Largest speed and acceleration of an aircraft, norms of 3-vectors: the bounds assume both."""
+    """Largest speed and acceleration of an aircraft, norms of 3-vectors, assumed by bounds."""
 
     speed_max_mps: Annotated[float, Meaning("largest speed that the bounds assume", 21)]
     acceleration_max_mps2: Annotated[
@@ -48,7 +48,7 @@ class Limits:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Refuted:
-    """Assumption that reports refuted, in the unit of its setting; it was raised."""
+    """Assumption that reports refuted and that was raised, in the unit of its setting."""
 
     t_ns: Annotated[int, Meaning("when it was refuted")]
     uav: str
@@ -60,7 +60,7 @@ class Refuted:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fix:
-    """Report placed on the node's timeline and in the local frame.
+    """Report with its time on the node's timeline and its position in the local frame.
 
     sender_ns  when the position was true, on the sender's timeline; intervals between reports are
                computed from it, since link delay does not affect it
@@ -121,7 +121,7 @@ class SenderTime:
 
 
 class TrackState(DescribedEnum):
-    """State of a track by the age of its newest report; ``[tracks]`` sets the limits."""
+    """State of a track, by the age of its newest report; ``[tracks]`` sets the limits."""
 
     LIVE = "live", "reports arrive"
     COASTING = "coasting", "predicted without new reports"
@@ -134,10 +134,10 @@ _LOCAL_FRAME: Final = "coordinates of the node's own frame; see `lat_deg` … an
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Track:
-    """One UAV at the instant ``valid_at_ns``. Vectors are (3,), in the local frame.
+    """One UAV predicted to the instant ``valid_at_ns``. Vectors are (3,), in the local frame.
 
-    The bounds hold if the assumed limits of speed, acceleration and noise do (docs/math.md 5.6).
-    None: unknown.
+    The bounds hold if the assumed limits of speed, acceleration and noise do (docs/math.md 5.6). A
+    value of None is unknown.
     """
 
     uav: Annotated[str, Meaning("id of the UAV", 1, label="UAV", example="3:1")]

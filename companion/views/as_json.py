@@ -34,7 +34,7 @@ FORMER_NAMES: Final[Mapping[str, Mapping[str, str]]] = {
     "MessageRate": {"message_id": "msgid"},
     "UavState": {"altitude_datum": "alt_datum"},
 }
-"""Deprecated names from the previous version, by class; they are still written."""
+"""Deprecated names of values from the previous version, by class; they are still written."""
 
 
 def as_json(item: Any, utc_ns: Utc) -> Json:
@@ -50,7 +50,7 @@ def as_json(item: Any, utc_ns: Utc) -> Json:
 
 
 def name_in_json(name: str) -> str:
-    """Return the name of a value in the API, by the unit that it has inside the program."""
+    """Return the name of a value in the API, from its name and unit inside the program."""
     return "at" if name == "t_ns" else in_degrees(name).removesuffix("_ns")
 
 
@@ -62,7 +62,7 @@ def rfc3339(t_ns: UtcNs) -> str:
 
 @functools.lru_cache(maxsize=1024)
 def _to_the_second(seconds: int) -> str:
-    """Return date and time; cached, as an answer has many times within the same few seconds."""
+    """Return date and time to the second; cached, as answers have many times within seconds."""
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}"
 
 
@@ -78,7 +78,7 @@ _PLAIN: Final = (str, int, float, bool)
 
 @functools.cache
 def _plan(kind: Any) -> tuple[Plan, tuple[tuple[str, str], ...]]:
-    """Return name, getter and writer of each value of a class, and former names of some.
+    """Return name, getter and writer of each value of a class, and former names if any.
 
     Values that are JSON already have no writer.
     """
@@ -112,7 +112,7 @@ def _writer(member: Member) -> Write | None:
 
 
 def _any(value: Any, utc_ns: Utc) -> Any:
-    """Convert arrays and tuples to lists, described values inside them to objects."""
+    """Convert arrays and tuples to lists, and described values inside them to objects."""
     if value is None or isinstance(value, str | int | float):
         return value
     if isinstance(value, dict):

@@ -1,6 +1,6 @@
 """Beams as shown by the API and ``companion weights``: degrees, dB, null for unknown.
 
-Everything is computed on request from an immutable update, so any thread may do it.
+All values are computed on request from an immutable update, on any thread.
 """
 
 import functools
@@ -37,7 +37,7 @@ LEAD: Final = "requested lead: valid_at is this long after the request, or up to
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StoredBeam:
-    """The codebook's beam that serves a UAV, and the next one."""
+    """Beam of the codebook that serves a UAV, and the next one."""
 
     best: Annotated[int, Meaning("number of the codebook's beam that serves this UAV now")]
     gain_db: Annotated[
@@ -56,7 +56,7 @@ class StoredBeam:
 
 @dataclass(frozen=True, slots=True)
 class Pointing:
-    """Where a beam points over the ground."""
+    """Direction of a beam over the ground."""
 
     bearing_deg: Annotated[float, Meaning("direction from true north, clockwise")]
     above_horizon_deg: Annotated[float, Meaning("angle of the direction above the horizon")]
@@ -121,7 +121,7 @@ class Beams:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Weights:
-    """The complex weights, M rows; columns in the order of ``uavs``."""
+    """Complex weights, M rows; columns in the order of ``uavs``."""
 
     made: Annotated[BeamSet, Inline(omit=("groups", "regularised"))]
     lead_ms: Annotated[float, Meaning(LEAD)]
@@ -170,8 +170,7 @@ def beams(
 
 @functools.lru_cache(maxsize=4)
 def _beamwidths_rad(array: Array) -> tuple[float | None, float | None]:
-    """Return the half-power beamwidths of a boresight beam in azimuth and elevation; cached by
-    array."""
+    """Return half-power widths of a boresight beam, azimuth and elevation; cached by array."""
     return patterns.half_power_beamwidths_rad(array, np.array([1.0, 0.0, 0.0]))
 
 
@@ -217,7 +216,7 @@ def _entries(pipeline: Pipeline, equipment: Equipment, update: Update) -> Iterat
 def _stored_beams(
     pipeline: Pipeline, equipment: Equipment, update: Update, beam: Beam, towards: FloatArray
 ) -> StoredBeam | None:
-    """Return the best stored beam for a UAV, the next one with its time, and those to sweep."""
+    """Return a UAV's best stored beam, the next one with its time, and those to sweep."""
     codebook, array = equipment.codebook, pipeline.array
     if codebook is None:
         return None
@@ -239,7 +238,7 @@ def _stored_beams(
 def _next_best(
     pipeline: Pipeline, equipment: Equipment, update: Update, beam: Beam
 ) -> codebooks.NextBest | None:
-    """Return the next stored beam if the UAV keeps its motion; None if that is unknown."""
+    """Return the next stored beam if the UAV keeps its motion; None if the motion is unknown."""
     codebook, carrier, array = equipment.codebook, update.carrier, pipeline.array
     track = next((track for track in update.tracks if track.uav == beam.uav), None)
     if codebook is None or carrier is None or track is None:

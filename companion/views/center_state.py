@@ -22,7 +22,7 @@ class Angles:
 
 @dataclass(frozen=True, slots=True)
 class Pose:
-    """Position and attitude of the array's carrier at a time."""
+    """Position and attitude of the array's carrier at one time."""
 
     place: Annotated[Place, Inline()]
     carrier: Annotated[Carrier, Inline()]
@@ -41,7 +41,7 @@ class Pose:
 
 @dataclass(frozen=True, slots=True)
 class LastPose:
-    """The last known position and attitude."""
+    """Last known position and attitude of the array's carrier."""
 
     t_ns: Annotated[int, Meaning("time of the position")]
     pose: Annotated[Pose, Inline()]
@@ -49,7 +49,7 @@ class LastPose:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Center:
-    """The carrier of the array; its values are null while its position is unknown."""
+    """Carrier of the array; position and attitude are null while unknown."""
 
     source: Annotated[
         str, Meaning("the vehicle SYSID:COMPID, the coordinates, or home", example="5:1")

@@ -1,4 +1,4 @@
-"""The answer of ``/v1/design``: the observer in use, its gains, and its certificate."""
+"""Answer of ``/v1/design``: the observer in use, its gains, and its certificate."""
 
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
@@ -46,7 +46,7 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UavDesign:
-    """The gains at a UAV's interval, with the keys of ``companion design --json``."""
+    """Gains at a UAV's report interval, with the keys of ``companion design --json``."""
 
     uav: Annotated[str, Meaning("id of the UAV", example="3:1")]
     dt_s: Annotated[float, Meaning("interval between reports")]
@@ -77,7 +77,7 @@ class UavDesign:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Design:
-    """The observer in use."""
+    """Answer about the observer in use."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     model: Annotated[Model, Meaning("the observer's model")]
@@ -95,7 +95,7 @@ def _bounds(given: ObserverSettings, limits: Limits) -> Assumed:
 class DesignView:
     """Observer design of one node's settings; the gain table is read once.
 
-    Raises ``ConfigError`` if that fails.
+    Raises ``ConfigError`` if the gain table cannot be read.
     """
 
     def __init__(self, settings: Settings) -> None:
@@ -107,8 +107,8 @@ class DesignView:
         """Return the answer of ``/v1/design``.
 
         ``designs`` has the keys of ``companion design --json``, with one entry for each UAV with a
-        known interval. ``feasible``: the interval is in the certified range; beyond it, the gains
-        at its end apply.
+        known interval. ``feasible``: the interval is in the certified range; outside of this range,
+        the gains at its end apply.
         """
         shown = Design(
             valid_at_ns=now_ns,
@@ -146,7 +146,7 @@ class DesignView:
 
 
 def _scale(table: KinematicDesign, given: Assumed) -> float:
-    """Return the largest ratio of an assumed bound to that of the table.
+    """Return the largest ratio of an assumed bound to the bound in the gain table.
 
     The error dynamics are linear, so the guarantee scales by the same factor (docs/math.md 4).
     """
@@ -160,7 +160,7 @@ def _scale(table: KinematicDesign, given: Assumed) -> float:
 
 
 def _certificate(table: KinematicDesign, given: Assumed) -> Certificate:
-    """Return the certificate, valid for every order of intervals within the range."""
+    """Return the gain table's certificate, valid for every order of intervals in its range."""
     scale = _scale(table, given)
     return Certificate(
         P=table.p.tolist(),
@@ -173,9 +173,9 @@ def _certificate(table: KinematicDesign, given: Assumed) -> Certificate:
 
 
 def _kinematic(table: KinematicDesign, given: Assumed, dt_s: float) -> Json:
-    """Return the gains from the table.
+    """Return the gains of the kinematic model from its table.
 
-    Mu, gamma and residual are those of its certificate, which covers all intervals.
+    Mu, gamma and residual are from the table's certificate, which covers all intervals.
     """
     bound_m = _scale(table, given) * gain_table.invariant_bound(table)
     noise_mps = None if table.velocity_noise_mps is None else given.velocity_noise_mps

@@ -1,4 +1,4 @@
-"""The fleet as shown by the API: nodes, UAVs that each serves, offers, handovers."""
+"""The fleet as shown by the API: nodes, the UAVs that each serves, offers, handovers."""
 
 from dataclasses import dataclass, field
 from typing import Annotated
@@ -28,7 +28,7 @@ class NodeState(DescribedEnum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetNode:
-    """A node of the fleet: this one, then the others by name, and then those that left."""
+    """Node of the fleet: this node, then the others by name, and then those that left."""
 
     node: Annotated[str, Meaning("name of the node", example="north")]
     is_self: Annotated[bool, Meaning("whether this is the node that answers the request")] = False
@@ -88,7 +88,7 @@ class FleetOffer:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetUav:
-    """A UAV, the nodes that serve it, and what each node offers it."""
+    """UAV with the nodes that serve it, and with the offer of each node."""
 
     uav: Annotated[str, Meaning("id of the UAV", example="3:1")]
     served_by: Annotated[
@@ -146,7 +146,7 @@ def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
 
 
 def nodes(member: FleetMember, now_ns: int) -> list[FleetNode]:
-    """Return this node, then the others by name, and then those that left."""
+    """Return the nodes: this one, then the others by name, and then those that left."""
     own = FleetNode(
         node=member.name,
         is_self=True,
@@ -194,7 +194,7 @@ def _node(name: str, member: FleetMember, now_ns: int) -> FleetNode:
 
 
 def _ways_ms(known: Neighbour, now_ns: int) -> tuple[float | None, float | None]:
-    """Return median and 99th percentile of the delays of reports; None if none came."""
+    """Return median and 99th percentile of the delays of reports, ms; None without reports."""
     ways_ns = known.delays_ns(now_ns)
     if not ways_ns:
         return None, None
@@ -224,7 +224,7 @@ def _uavs(member: FleetMember, now_ns: int) -> list[FleetUav]:
 
 
 def _natural(uav: str) -> tuple[int, int, str]:
-    """Return a sort key: telemetry by its numbers, then the others by name."""
+    """Return a sort key of UAV ids: telemetry by its numbers, then other kinds by name."""
     sysid, _, compid = uav.partition(":")
     is_plain = sysid.isdecimal() and compid.isdecimal()
     return (int(sysid), int(compid), uav) if is_plain else (256, 0, uav)

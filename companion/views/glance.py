@@ -15,7 +15,7 @@ NAMED: Final = 2  # largest number of UAVs in the status line
 
 
 def glance(node: Node) -> Json:
-    """Return links, UAVs with their verdicts, recording and headline."""
+    """Return the short status: links, UAVs with their verdicts, recording and headline."""
     pipeline, now_ns = node.pipeline, node.now_ns()
     verdicts, update = pipeline.health.verdicts, pipeline.last_update
     machine = health.behind(node.arrival_lag.seen(now_ns))
@@ -42,7 +42,7 @@ def glance(node: Node) -> Json:
 
 
 def line(node: Node) -> str:
-    """Return the status as one line, with the worst links."""
+    """Return the short status as one line, with the worst links."""
     now_ns, verdicts = node.now_ns(), node.pipeline.health.verdicts
     up = sum(link.state == "up" for link in node.links())
     frames_hz = node.rates().get("frames_hz")
@@ -65,7 +65,7 @@ def line(node: Node) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Events:
-    """The newest notices, oldest first."""
+    """Newest notices, oldest first."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     events: Annotated[list[Notice], Meaning("the notices, oldest first")]
@@ -77,7 +77,7 @@ def events(node: Node) -> Json:
 
 
 def as_events(node: Node, notices: Sequence[Notice]) -> list[Json]:
-    """Return notices as in ``/v1/events``."""
+    """Return notices in the form of ``/v1/events``."""
     return [as_json(notice, node.pipeline.utc_ns) for notice in notices]
 
 

@@ -1,4 +1,4 @@
-"""Least gain and least SINR of beams over all positions that the bounds allow."""
+"""Least gain and least SINR of beams over all UAV positions that the bounds allow."""
 
 from collections.abc import Sequence
 from typing import Final
@@ -13,11 +13,11 @@ from companion.values import ComplexArray, FloatArray, Update, UserError
 from companion.views.quantised import device_table
 
 CANDIDATES_MAX: Final = 16
-"""Largest number of beams with guaranteed SINRs; the work grows with its square."""
+"""Largest number of beams for which guaranteed SINRs are computed; work grows with its square."""
 
 
 def gains_db(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[float | None]:
-    """Return the guaranteed gain of each beam of an update; None without a guarantee."""
+    """Return the guaranteed gain of each beam of an update, dB; None without a guarantee."""
     if not update.beams.beams:
         return []
     weights = _radiated(pipeline, equipment, update)
@@ -35,8 +35,8 @@ def of_beams(
 ) -> tuple[Sequence[float | None], Sequence[float | None]]:
     """Return least gain and least SINR of each beam within its UAV's bound.
 
-    A gain is None if the UAV may be out of coverage, in a null, or anywhere. All SINRs are None if
-    there are more than ``CANDIDATES_MAX`` beams.
+    A gain is None if the UAV may be out of coverage, in a null, or in any direction. All SINRs are
+    None if there are more than ``CANDIDATES_MAX`` beams.
     """
     array, beam_set = pipeline.array, update.beams
     weights = _radiated(pipeline, equipment, update)
@@ -69,14 +69,14 @@ def of_beams(
 def _minimum_db(
     pipeline: Pipeline, update: Update, towards: FloatArray, weights: ComplexArray
 ) -> tuple[Sequence[float | None], Sequence[float | None]]:
-    """Return each pointing bound, None if it leaves the coverage, and the least gain within."""
+    """Return each pointing bound, None if it leaves the coverage, and the least gain within, dB."""
     angles = [beam.pointing_bound_rad for beam in update.beams.beams]
     bounds = guarantee.covered_bounds(pipeline.array, pipeline.coverage, towards, angles)
     return bounds, guarantee.guaranteed_gains_db(pipeline.array, towards, bounds, weights)
 
 
 def _radiated(pipeline: Pipeline, equipment: Equipment, update: Update) -> ComplexArray | None:
-    """Return the weights, quantised for a device if any; None if it cannot apply them."""
+    """Return the weights, quantised if a device is set; None if the device cannot apply them."""
     if equipment.device is None:
         return update.beams.weights
     try:

@@ -1,7 +1,7 @@
 """Verdicts on the links to UAVs, as shown by the API.
 
-If this machine is overloaded, that is the cause of every link that is not good: the pipeline
-then receives only old reports.
+If this machine is overloaded, the overload is the cause of every link that is not good: the
+pipeline then receives only old reports.
 """
 
 from collections import Counter
@@ -16,7 +16,7 @@ from companion.values.described import Inline, Meaning
 
 @dataclass(frozen=True, slots=True)
 class LinkHealth:
-    """Cause and gains of the verdict on the link to a UAV; gains are those of the array."""
+    """Verdict on the link to a UAV: cause, and gains of the array."""
 
     blame: Annotated[Blame | None, Inline()]
     verdict: Annotated[Verdict | None, Inline()]
@@ -24,7 +24,7 @@ class LinkHealth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Headline:
-    """Number of good, weak and missing links to UAVs; and as text."""
+    """Number of good, weak and missing links to UAVs, also as text."""
 
     good: Annotated[int, Meaning("number of UAVs whose link has the guaranteed gain that it needs")]
     weak: Annotated[int, Meaning("number of UAVs whose link usually has the gain that it needs")]
@@ -36,7 +36,7 @@ class Headline:
 
 
 def behind(seen: LagSeen) -> Blame | None:
-    """Return the cause if this machine is overloaded; None otherwise."""
+    """Return the cause of weak links if this machine is overloaded; None otherwise."""
     if not seen.behind:
         return None
     return Blame(
@@ -49,7 +49,7 @@ def behind(seen: LagSeen) -> Blame | None:
 def verdict(
     found: Verdict | None, machine: Blame | None, unserved: Blame | None = None
 ) -> tuple[Level | None, LinkHealth | None]:
-    """Return the verdict on one UAV's link, and its cause.
+    """Return the verdict on the link to one UAV, and its cause.
 
     ``unserved`` is the reason why no node of the fleet serves the UAV, which then has no link.
     """
@@ -64,7 +64,7 @@ def verdict(
 def summary(
     verdicts: Iterable[Verdict], machine: Blame | None, *, unserved: int = 0, elsewhere: int = 0
 ) -> Headline:
-    """Count the links of each level, and return the counts also as text.
+    """Return the number of links of each level, also as text.
 
     ``unserved`` UAVs have no node of the fleet; ``elsewhere`` counts those that other nodes serve.
     """

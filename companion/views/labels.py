@@ -1,4 +1,4 @@
-"""Names, units and meanings of the values in the API; the page takes its labels from here."""
+"""Names, units and meanings of the values in the API, from which the page takes its labels."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -37,7 +37,7 @@ class Label:
 
 @dataclass(frozen=True, slots=True)
 class Labels:
-    """Names, units and meanings of values by class and name, and of enumerations by value."""
+    """Names, units and meanings of values by class, and of enumerations by value."""
 
     values: Annotated[dict[str, dict[str, Label]], Meaning("by class and name of the value")]
     enumerations: Annotated[dict[str, dict[str, str]], Meaning("meanings by enumeration and value")]

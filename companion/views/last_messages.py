@@ -7,7 +7,7 @@ from typing import Final
 from companion.values import Frame, Source
 
 KEPT_MAX: Final = 8192
-"""Frames kept, so that a flood of forged senders cannot exhaust the memory.
+"""Most frames kept, so that a flood of forged senders cannot exhaust the memory.
 
 Beyond it the least recently received one is dropped.
 """
@@ -15,7 +15,7 @@ Beyond it the least recently received one is dropped.
 
 @dataclass(slots=True)
 class Kept:
-    """Newest frame of one message from one sender, number of frames, and arrival of the first."""
+    """Newest frame of one message of one sender, the number of frames, and the first arrival."""
 
     frame: Frame
     first_ns: int
@@ -23,7 +23,7 @@ class Kept:
 
     @property
     def frequency_hz(self) -> float | None:
-        """Mean rate; None after a single message."""
+        """Mean rate of the message; None after a single one."""
         passed_ns = self.frame.t_ns - self.first_ns
         return (self.count - 1) / (passed_ns * 1e-9) if passed_ns > 0 else None
 
@@ -36,7 +36,7 @@ class LastMessages:
         self._kept: OrderedDict[tuple[Source, int], Kept] = OrderedDict()
 
     def add(self, frame: Frame) -> None:
-        """Keep a frame instead of the previous one."""
+        """Store a frame in place of the sender's previous frame of that message."""
         key = frame.source, frame.msgid
         kept = self._kept.get(key)
         if kept is not None:
@@ -49,7 +49,7 @@ class LastMessages:
             self._kept.popitem(last=False)
 
     def find(self, source: Source, msgid: int) -> Kept | None:
-        """Return the newest message of a kind from a sender; None if there is none."""
+        """Return the newest message of a kind from a sender; None if none was received."""
         return self._kept.get((source, msgid))
 
     def by_sender(self) -> dict[Source, list[Kept]]:

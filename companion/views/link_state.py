@@ -14,7 +14,7 @@ from companion.values.described import Inline, Meaning
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkReports:
-    """Reports received over a link, and their age at arrival."""
+    """Reports received over a link: how many, and how old they were at arrival."""
 
     total: Annotated[int, Meaning("reports received over this link")]
     first: Annotated[int, Meaning("reports that no other link delivered before")]
@@ -30,7 +30,7 @@ class LinkReports:
 
 @dataclass(frozen=True, slots=True)
 class LinkState:
-    """One link; ``lost`` counts rejected frames by reason, garbage in bytes."""
+    """Link; ``lost`` counts rejected frames by reason, and garbage in bytes."""
 
     status: Annotated[LinkStatus, Inline()]
     age_s: Annotated[float | None, Meaning("time since the last frame")]
@@ -39,7 +39,7 @@ class LinkState:
 
 @dataclass(frozen=True, slots=True)
 class Component:
-    """One component received over a link."""
+    """Component received over a link."""
 
     id: Annotated[Source, Meaning("SYSID:COMPID", example="3:1")]
     status: Annotated[ComponentStatus, Inline()]
@@ -48,7 +48,7 @@ class Component:
 
 @dataclass(frozen=True, slots=True)
 class HeardLink:
-    """One link and the components received over it."""
+    """Link with the components received over it."""
 
     link: Annotated[LinkState, Inline()]
     components: Annotated[list[Component], Meaning("components received, by id")]
@@ -56,7 +56,7 @@ class HeardLink:
 
 @dataclass(frozen=True, slots=True)
 class OutLink:
-    """One link of ``[out]``, which only sends."""
+    """Link of ``[out]``, which only sends."""
 
     status: Annotated[
         LinkStatus,
@@ -69,7 +69,7 @@ class OutLink:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Links:
-    """Links, the components received over each, and the requested message rates."""
+    """Links with the components received over each, and the requested message rates."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     links: Annotated[list[HeardLink], Meaning("the links, in the order of the settings")]
@@ -78,7 +78,7 @@ class Links:
 
 
 def link(item: LinkStatus, share: LinkShare, now_ns: int) -> LinkState:
-    """Return one link of ``/v1/status`` and ``/v1/links``."""
+    """Return a link in the form of ``/v1/status`` and ``/v1/links``."""
     age_s = None if item.heard_ns is None else (now_ns - item.heard_ns) * 1e-9
     total, latencies = share.first + share.repeats, list(share.latencies_s)
     p50, p95 = np.percentile(latencies, [50, 95]).tolist() if latencies else (None, None)

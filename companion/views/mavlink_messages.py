@@ -43,7 +43,7 @@ class MessageStatus:
 
 @dataclass(frozen=True, slots=True)
 class MavlinkMessage:
-    """The last message of its kind: ``type`` is its name, beside its fields."""
+    """Last message of its kind: ``type`` is its name, beside its fields."""
 
     message: Annotated[
         dict[str, Any],
@@ -57,7 +57,7 @@ class MavlinkMessage:
 
 @dataclass(frozen=True, slots=True)
 class MavlinkComponent:
-    """One component: its last messages by name."""
+    """Component with its last messages by name."""
 
     id: Annotated[int, Meaning("component id")]
     messages: Annotated[dict[str, MavlinkMessage], Meaning("last message of each kind, by name")]
@@ -65,7 +65,7 @@ class MavlinkComponent:
 
 @dataclass(frozen=True, slots=True)
 class MavlinkVehicle:
-    """One system: its components by id."""
+    """System with its components by id."""
 
     id: Annotated[int, Meaning("system id")]
     components: Annotated[dict[str, MavlinkComponent], Meaning("components of the system, by id")]
@@ -86,7 +86,7 @@ class Dialect:
         return self._ids.get(name)
 
     def message(self, kept: Kept, utc_ns: Callable[[int], UtcNs]) -> Json | None:
-        """Return one message and its status; None for an unknown id."""
+        """Return one message with its status; None for an unknown message id."""
         kind = self._classes.get(kept.frame.msgid)
         if kind is None:
             return None
@@ -107,8 +107,7 @@ class Dialect:
         }
 
     def _fields(self, kind: Any, payload: bytes) -> Iterator[tuple[str, Any]]:
-        """Yield names and values. Pads zeros that MAVLink 2 truncates; ignores fields of later
-        dialects."""
+        """Yield names and values of fields, with truncated zeros; skip fields of later dialects."""
         size = kind.unpacker.size
         values = iter(kind.unpacker.unpack(payload[:size].ljust(size, b"\0")))
         types = dict(zip(kind.fieldnames, kind.fieldtypes, strict=True))
@@ -136,7 +135,7 @@ class Dialect:
 
 @functools.cache
 def dialect() -> Dialect:
-    """Return the dialect; loads it once."""
+    """Return the dialect of pymavlink; load it once."""
     return Dialect()
 
 

@@ -1,4 +1,4 @@
-"""Positions sent to other programs: each aircraft at this moment, from its track.
+"""Positions sent to other programs: each aircraft's present position, from its track.
 
 Only live and coasting tracks are sent. A late report may change the next position, but the times
 sent for an aircraft never go backwards.
@@ -24,7 +24,7 @@ _REBOOT_MS: Final = 60_000  # a larger backward step of a boot clock means a reb
 
 
 class Positions:
-    """Position of each vehicle that reports itself, as a message from that vehicle.
+    """Positions of vehicles that report themselves, as messages from these vehicles.
 
     ``utm``: as UTM_GLOBAL_POSITION, ``every_s`` apart; otherwise as GLOBAL_POSITION_INT.
     """
@@ -35,7 +35,7 @@ class Positions:
         self._boot_ms: dict[str, int] = {}  # boot time in the last message, by UAV
 
     def outgoing(self, pipeline: Pipeline, tracks: Iterable[Track]) -> list[Outgoing]:
-        """Return the messages for the tracks at their time, stamped by the senders' clocks."""
+        """Return the messages for the tracks at their time, stamped by each sender's clock."""
         found = [
             message
             for track in tracks
@@ -81,7 +81,7 @@ class Positions:
         relative_alt_m: float | None,
         velocity_ned_mps: tuple[float, float, float],
     ) -> Outgoing:
-        """Its height is above the ellipsoid, so it is sent only if the undulation is known."""
+        """Return a track as UTM_GLOBAL_POSITION; its height needs a known undulation."""
         known = pipeline.settings.observer.geoid_m is not None
         undulation_m, off_m = _geoid(pipeline) if known else (0.0, 0.0)
         lat_deg, lon_deg, alt_m = place
@@ -142,7 +142,7 @@ def _geoid(pipeline: Pipeline) -> tuple[float, float]:
 
 
 def _remarks_text(track: Track, datum: AltitudeDatum, geoid_m: float) -> str:
-    """Return text that explains the numbers of an event."""
+    """Return text that explains the numbers of a Cursor on Target event."""
     words = [
         f"ce {track.horizontal_bound_m:.1f} m and le are guaranteed bounds, not standard deviations"
     ]

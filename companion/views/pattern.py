@@ -19,7 +19,7 @@ Cut = Literal["azimuth", "elevation"]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamPattern:
-    """The response of one beam along the cut."""
+    """Response of one beam along a cut."""
 
     uav: Annotated[str, Meaning("UAV of the beam", example="3:1")]
     at_deg: Annotated[float, Meaning("the other angle of the cut, which is constant")]
@@ -37,7 +37,7 @@ class BeamPattern:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Pattern:
-    """The array's response in dB along a cut through each beam."""
+    """Response of the array in dB along a cut through each beam."""
 
     valid_at_ns: Annotated[int, Meaning("when the beams are applied")]
     lead_ms: Annotated[float, Meaning(LEAD)]

@@ -1,4 +1,4 @@
-"""Updates as binary records: one fixed, self-describing little-endian layout.
+"""Updates as binary records in one fixed, self-describing little-endian layout.
 
 A record is a header, an entry for each beam, and the weights: beam after beam, complex64 by
 element. ``examples/c/uav_beams.h`` reads the same layout. Unknown values are NaN. An update that
@@ -23,8 +23,7 @@ COMPLEX64: Final = 1  # dtype of weights as pairs of float32, real part first
 WIDENED: Final = 1  # flag of a beam with a widened main lobe
 EXACT: Final = 1  # flag of a record in which each UAV is in a null of all other beams of its slot
 CHECKED_FROM: Final = 20
-"""First byte covered by the checksum (CRC-32 as in zlib), which extends to the end of the record.
-"""
+"""First byte of a record that the checksum covers (CRC-32 as in zlib), up to the record's end."""
 ID_BYTES: Final = 72
 
 HEADER: Final = np.dtype(
@@ -66,11 +65,11 @@ BEAM: Final = np.dtype(
     ]
 )
 NORMALISATIONS: Final = tuple(Normalisation)
-"""Values of ``normalisation`` by index: 0 is unit-response, then stream, total, antenna."""
+"""Values of a record's ``normalisation`` by index: 0 unit-response, then stream, total, antenna."""
 
 
 def in_utc(pipeline: Pipeline, beam_set: BeamSet) -> BeamSet:
-    """Return the beams with their times in UTC instead of on the node's timeline."""
+    """Return beams whose times are in UTC instead of on the node's timeline."""
     t_ns, valid_at_ns = map(pipeline.utc_ns, (beam_set.t_ns, beam_set.valid_at_ns))
     return replace(beam_set, t_ns=t_ns, valid_at_ns=valid_at_ns)
 

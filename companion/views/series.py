@@ -1,6 +1,6 @@
 """Samples for the charts: one per second of every UAV, over the last minutes.
 
-The page collects its own samples; these are for a page that has just been opened.
+An open page collects its own samples; these are for a page that has just been opened.
 """
 
 from collections import deque
@@ -18,7 +18,7 @@ Column = list[float | None]
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UavHistory:
-    """Samples of one UAV, as many as ``at``; null where a value was unknown."""
+    """Samples of one UAV, one per time in ``at``; null where a value was unknown."""
 
     pointing_bound_deg: Annotated[
         Column, Meaning("largest angle between the predicted and the true direction")
@@ -30,7 +30,7 @@ class UavHistory:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """One sample per second, oldest first."""
+    """Samples of the last minutes, one per second, oldest first."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     at: Annotated[list[str], Meaning("when each sample was taken")]
@@ -39,11 +39,11 @@ class History:
 
 FIELDS: Final = tuple(member.name for member in members(UavHistory))
 Sample = tuple[int, dict[str, tuple[float | None, ...]]]
-"""Time of an update, ns, and the values of ``FIELDS`` for each UAV."""
+"""Sample of an update: its time, ns, and the values of ``FIELDS`` for each UAV."""
 
 
 class Series:
-    """The samples. ``add`` is called after every tick."""
+    """Samples for the charts. ``add`` is called after every tick."""
 
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque(maxlen=SAMPLES)
@@ -72,7 +72,7 @@ class Series:
 
 
 def show(samples: list[Sample], now_ns: int, utc_ns: Utc) -> Json:
-    """Return the answer of ``/v1/history``, in columns. May run on any thread."""
+    """Return the answer of ``/v1/history``, in columns. Runs on any thread."""
     uavs = dict.fromkeys(uav for _, sample in samples for uav in sample)
     nothing = (None,) * len(FIELDS)
     return {

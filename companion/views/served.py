@@ -12,7 +12,7 @@ from companion.values import Blame, Offer, Standing
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FleetStatus:
-    """State of this node in its fleet."""
+    """State of this node and of its fleet."""
 
     member: FleetMember  # its knowledge and decisions
     site: str  # name of the fleet
@@ -23,7 +23,7 @@ class FleetStatus:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Served:
-    """Nodes that serve the UAVs for which beams are wanted."""
+    """Nodes that serve each UAV for which a beam is wanted."""
 
     node: str  # this node
     by: Mapping[str, list[str]]  # nodes that serve each UAV, without excluded nodes
@@ -36,7 +36,7 @@ class Served:
 
 
 def served_uavs(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Served | None:
-    """Return which nodes serve each UAV, and why none does; None without a fleet."""
+    """Return which nodes serve each UAV, and why no node does; None without a fleet."""
     if status is None:
         return None
     member = status.member
@@ -69,20 +69,20 @@ def offers_of(member: FleetMember) -> dict[str, dict[str, Offer]]:
 
 
 def standing(member: FleetMember, now_ns: int) -> dict[str, Standing]:
-    """Return the state of the other nodes that are present and trusted, by name."""
+    """Return the ``Standing`` of other nodes that are present and trusted, by name."""
     others = sorted(member.duties.others(now_ns).items())
     return {name: said for name, said in others if member.trust.is_trusted(name)}
 
 
 def _full(member: FleetMember, now_ns: int) -> dict[str, bool]:
-    """Return for each node that is present whether it serves as many UAVs as it may."""
+    """Return for each present node whether it serves as many UAVs as it may."""
     others = standing(member, now_ns).items()
     full = {name: len(said.serves) >= said.most for name, said in others}
     return full | {member.name: len(member.duties.serves) >= member.most}
 
 
 def served_by(member: FleetMember, now_ns: int) -> dict[str, list[str]]:
-    """Return the nodes that serve each UAV, this one first; untrusted nodes are ignored."""
+    """Return the nodes that serve each UAV, this node first; untrusted nodes are ignored."""
     served_by: dict[str, list[str]] = {uav: [member.name] for uav in member.duties.serves}
     for name, said in standing(member, now_ns).items():
         for uav, _ in said.serves:

@@ -9,12 +9,12 @@ from companion.values.described import Meaning
 from companion.views.as_json import Json
 
 LONGEST: Final = 400
-"""Longest text shown in full; contents of files may have millions of characters."""
+"""Longest text of a setting shown in full; contents of files may have millions of characters."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Setting:
-    """One setting and its origin."""
+    """Setting with its default and its origin."""
 
     value: Annotated[Any, Meaning("value in effect, in the unit that the key's name ends in")]
     default: Annotated[Any, Meaning("the default value")]
@@ -27,7 +27,7 @@ class Setting:
 
 @dataclass(frozen=True, slots=True)
 class EffectiveSettings:
-    """The settings by section and key."""
+    """Effective settings by section and key."""
 
     sections: Annotated[dict[str, dict[str, Setting]], Meaning("settings by section and key")]
 

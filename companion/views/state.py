@@ -25,7 +25,7 @@ from companion.views.served import FleetStatus, served_uavs
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordingStatus:
-    """The recording that is being written."""
+    """Recording that is being written."""
 
     state: Annotated[
         Literal["recording", "degraded", "off"],
@@ -56,7 +56,7 @@ class ReplayStatus:
 
 @dataclass(frozen=True, slots=True)
 class Throughput:
-    """Rates over the last seconds."""
+    """Rates of frames and updates over the last seconds."""
 
     frames_hz: Annotated[float | None, Meaning("rate of MAVLink frames")]
     updates_hz: Annotated[float | None, Meaning("rate of beam updates")]
@@ -64,7 +64,7 @@ class Throughput:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Status:
-    """The service at a glance; ``replay`` is null in a live service."""
+    """Status of the service at a glance; ``replay`` is null in a live service."""
 
     version: Annotated[str, Meaning("version of the program")]
     node: Annotated[
@@ -160,7 +160,7 @@ def status(node: Node, version: str) -> Json:
 
 
 def summary(node: Node, now_ns: int) -> Headline:
-    """Return the headline, including UAVs that no node of a fleet serves."""
+    """Return the headline on the links, including UAVs that no node of a fleet serves."""
     pipeline = node.pipeline
     served = served_uavs(pipeline, node.fleet_status(), now_ns)
     verdicts, machine = pipeline.health.verdicts, health.behind(node.arrival_lag.seen(now_ns))

@@ -19,7 +19,7 @@ from companion.views.state import Node
 
 @dataclass(frozen=True, slots=True)
 class ReportedFix:
-    """The newest reported position of a UAV, and its time."""
+    """Newest reported position of a UAV, with its time."""
 
     t_ns: Annotated[int, Meaning("time of the position")]
     place: Annotated[Place, Inline()]
@@ -27,7 +27,7 @@ class ReportedFix:
 
 @dataclass(frozen=True, slots=True)
 class Assumptions:
-    """Assumptions of the bounds of one UAV, and how often its reports or stamps refuted them."""
+    """Assumptions for one UAV's bounds, and how often its reports or stamps refuted them."""
 
     limits: Annotated[Limits, Inline()]
     refuted: Annotated[int, Meaning("how often reports or time stamps have refuted an assumption")]
@@ -41,7 +41,7 @@ _BOUND_AXES: Final = Meaning(
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UavState:
-    """One UAV at ``valid_at``; north, east and down are measured from the array."""
+    """State of one UAV at ``valid_at``; north, east and down are measured from the array."""
 
     id: Annotated[str, Meaning("SYSID:COMPID, icao:HEX, rid:ID or cot:UID", example="3:1")]
     verdict: Annotated[
@@ -92,7 +92,7 @@ class UavState:
 
 @dataclass(frozen=True, slots=True)
 class Uavs:
-    """Every UAV with a track, at ``valid_at``."""
+    """States of every UAV with a track, at ``valid_at``."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     uavs: Annotated[list[UavState], Meaning("the UAVs")]
@@ -105,7 +105,7 @@ def uavs(node: Node) -> Json:
 
 
 def states(node: Node, now_ns: int, only: str | None = None) -> list[UavState]:
-    """Return every UAV, or one, as it is now."""
+    """Return the present state of every UAV, or of one."""
     pipeline = node.pipeline
     tracks = [
         track for track in pipeline.tracks(now_ns, now_ns) if only is None or track.uav == only
@@ -133,7 +133,7 @@ def _state(
     machine: Blame | None,
     served: Served | None,
 ) -> UavState:
-    """Return one UAV; ``machine`` is the cause of weak links if this machine is overloaded."""
+    """Return the state of a UAV; ``machine`` is the cause of weak links by overload."""
     north_m, east_m, down_m = (
         (None, None, None)
         if carrier is None

@@ -21,7 +21,7 @@ from companion.views.quantised import device_table
 
 
 def headers(pipeline: Pipeline, beam_set: BeamSet) -> dict[str, str]:
-    """Return the metadata of the weights as HTTP headers; ``raw`` has no other."""
+    """Return the metadata of weights as HTTP headers, the only metadata of ``raw``."""
     valid_at_ns = pipeline.utc_ns(beam_set.valid_at_ns)
     return {
         "x-format": "complex64-le-row-major-1",
@@ -39,7 +39,7 @@ def headers(pipeline: Pipeline, beam_set: BeamSet) -> dict[str, str]:
 def encode(
     form: WeightFormat, beam_set: BeamSet, pipeline: Pipeline, equipment: Equipment, lead_ms: float
 ) -> bytes:
-    """Return the weights in a format.
+    """Return weights in a format for a program or a device.
 
     Raises ``UserError`` with the reason if a device cannot apply them.
     """

@@ -1,1 +1,1 @@
-"""Faults to inject into traffic, with a seed: pure functions of a stream of frames."""
+"""Faults to inject into traffic, random by a seed: pure functions of a stream of frames."""

@@ -18,11 +18,11 @@ Sender = tuple[int, int]  # system and component id
 
 
 class FaultError(UserError):
-    """An invalid fault request. The message is one line, with what is allowed."""
+    """Error of an invalid fault request. The message is one line, with what is allowed."""
 
 
 class Bound(NamedTuple):
-    """One number of a fault's value.
+    """Limits of one number in a fault's value.
 
     low, high  limits, inclusive
     """
@@ -34,7 +34,7 @@ class Bound(NamedTuple):
     whole: bool = False  # only whole numbers
 
     def read(self, text: str) -> float:
-        """Parse ``text``. Raises ``FaultError`` if it is not a number within the limits."""
+        """Parse a number. Raises ``FaultError`` if it is not a number within the limits."""
         try:
             number = float(text)
         except ValueError:
@@ -46,7 +46,7 @@ class Bound(NamedTuple):
 
 
 class Kind(NamedTuple):
-    """A kind of fault. ``is_event``: can be given several times for the same frames."""
+    """Kind of fault. ``is_event``: it can be given several times for the same frames."""
 
     name: str
     bounds: tuple[Bound, ...]
@@ -56,7 +56,7 @@ class Kind(NamedTuple):
 
     @property
     def form(self) -> str:
-        """The syntax, such as ``glitch=T:M[:N]``."""
+        """Syntax of the kind of fault, such as ``glitch=T:M[:N]``."""
         letters = [bound.letter for bound in self.bounds if bound.default is None]
         optional = [f"[:{bound.letter}]" for bound in self.bounds if bound.default is not None]
         return f"{self.name}={':'.join(letters)}{''.join(optional)}"
@@ -167,7 +167,7 @@ _ORDER: Final = {name: place for place, name in enumerate(KINDS)}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """One fault: name, numbers, and the system and component it applies to (None: all)."""
+    """Requested fault: name, numbers, and the system and component it applies to (None: all)."""
 
     name: str
     values: tuple[float, ...]
@@ -175,7 +175,7 @@ class Fault:
     compid: int | None = None
 
     def __str__(self) -> str:
-        """The name and the system, as in ``frozen@3:1``."""
+        """Return the name and the system of a fault, as in ``frozen@3:1``."""
         system = "" if self.sysid is None else f"@{self.sysid}"
         return f"{self.name}{system}" + ("" if self.compid is None else f":{self.compid}")
 
@@ -205,14 +205,14 @@ class Fault:
         return cls(name=name, values=(*given, *defaults), sysid=sysid, compid=compid)
 
     def concerns(self, sender: Sender) -> bool:
-        """Whether the fault applies to the frames of this system and component."""
+        """Return whether the fault applies to the frames of a system and component."""
         if self.sysid is None:
             return True
         return self.sysid == sender[0] and self.compid in (None, sender[1])
 
 
 def in_order(faults: Sequence[Fault]) -> list[Fault]:
-    """The faults in the order of application.
+    """Return the faults in the order of application.
 
     Raises ``FaultError`` if a fault that is not an event is given twice for the same frames.
     """
@@ -225,7 +225,7 @@ def in_order(faults: Sequence[Fault]) -> list[Fault]:
 
 
 def described() -> str:
-    """Help text of all faults, a paragraph each, in the order of application."""
+    """Return the help text of all faults, a paragraph each, in the order of application."""
     return "\n\n".join(f"{k.form}: {k.meaning}. Example: {k.example}" for k in KINDS.values())
 
 

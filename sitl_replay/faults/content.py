@@ -28,7 +28,7 @@ TIME_BOOT_MS_AT: Final[dict[int, int]] = {
     60051: 0, 60052: 0, 60053: 0,
 }
 # fmt: on
-"""Offset of ``time_boot_ms`` (milliseconds since boot, 32 bits) in the payload, by message id."""
+"""Offset in the payload of ``time_boot_ms`` (ms since boot, 32 bits), by message id."""
 
 _POSITION_AT: Final = 4
 _POSITION: Final = struct.Struct("<iiii")  # lat, lon (degE7), alt, relative_alt (mm)
@@ -36,24 +36,24 @@ _WRAP_MS: Final = 1 << 32
 
 
 def msgid_of(raw: bytes) -> int:
-    """The message id of a MAVLink 1 or 2 frame."""
+    """Return the message id of a MAVLink 1 or 2 frame."""
     return int.from_bytes(raw[7:10], "little") if raw[0] == MAGIC_V2 else raw[5]
 
 
 def sender_of(raw: bytes) -> Sender:
-    """The sender of a MAVLink 1 or 2 frame."""
+    """Return the sender of a MAVLink 1 or 2 frame."""
     return (raw[5], raw[6]) if raw[0] == MAGIC_V2 else (raw[3], raw[4])
 
 
 def seq_of(raw: bytes) -> int:
-    """The sequence number of a MAVLink 1 or 2 frame."""
+    """Return the sequence number of a MAVLink 1 or 2 frame."""
     return raw[4] if raw[0] == MAGIC_V2 else raw[2]
 
 
 def payload_of(raw: bytes, size: int) -> bytes:
-    """The first ``size`` bytes of the payload, with the zeros that MAVLink 2 truncates.
+    """Return the first ``size`` bytes of a payload, with the zeros that MAVLink 2 truncates.
 
-    Shorter if the payload of a MAVLink 1 frame is shorter.
+    The result is shorter if the payload of a MAVLink 1 frame is.
     """
     if raw[0] != MAGIC_V2:
         return raw[6 : 6 + min(raw[1], size)]
@@ -61,7 +61,7 @@ def payload_of(raw: bytes, size: int) -> bytes:
 
 
 def rewritten(raw: bytes, at: int = 0, field: bytes = b"", seq: int | None = None) -> bytes:
-    """The frame with ``field`` at offset ``at`` of its payload, and with ``seq`` (None: unchanged).
+    """Return a frame with ``field`` at payload offset ``at``, and ``seq`` (None: unchanged).
 
     The checksum is recomputed and the signature removed. Returns the same frame if nothing changes,
     if the message is unknown (so that there is no checksum), or if a MAVLink 1 payload is too
@@ -85,7 +85,7 @@ def rewritten(raw: bytes, at: int = 0, field: bytes = b"", seq: int | None = Non
 
 
 def boot_ms_of(raw: bytes) -> int | None:
-    """``time_boot_ms`` of a frame; None if its message has none."""
+    """Return ``time_boot_ms`` of a frame; None if its message has no such field."""
     at = TIME_BOOT_MS_AT.get(msgid_of(raw))
     if at is None:
         return None
@@ -94,20 +94,20 @@ def boot_ms_of(raw: bytes) -> int | None:
 
 
 def with_boot_ms(raw: bytes, boot_ms: int) -> bytes:
-    """The frame with another ``time_boot_ms``, modulo 2³². Only for messages with that field."""
+    """Return a frame with another ``time_boot_ms``, modulo 2³²; the message must have the field."""
     return rewritten(
         raw, TIME_BOOT_MS_AT[msgid_of(raw)], (boot_ms % _WRAP_MS).to_bytes(4, "little")
     )
 
 
 class Drift:
-    """Makes the boot clock fast by ``ppm`` parts per million since boot (negative: slow)."""
+    """Fault that makes the boot clock fast by ``ppm`` parts per million (negative: slow)."""
 
     def __init__(self, ppm: float) -> None:
         self._ppm = ppm
 
     def __call__(self, t_s: float, raw: bytes) -> bytes:
-        """The frame as sent at ``t_s``."""
+        """Return the frame as sent at ``t_s`` with this fault."""
         boot_ms = boot_ms_of(raw)
         return (
             raw
@@ -117,7 +117,7 @@ class Drift:
 
 
 class Reboot:
-    """Restarts every sender's boot clock at 0 at ``at_s``; its next frame has sequence number 0.
+    """Fault that restarts every sender's boot clock and sequence numbers at 0, at ``at_s``.
 
     The time of the reboot on a sender's clock is computed from its first time stamp after ``at_s``,
     assuming no delay. A frame with an older time stamp belongs to the previous boot: its time stamp
@@ -130,7 +130,7 @@ class Reboot:
         self._booted_ms: dict[Sender, int] = {}
 
     def __call__(self, t_s: float, raw: bytes) -> bytes:
-        """The frame as sent at ``t_s``."""
+        """Return the frame as sent at ``t_s`` with this fault."""
         if t_s < self._at_s:
             return raw
         sender, boot_ms = sender_of(raw), boot_ms_of(raw)
@@ -144,7 +144,7 @@ class Reboot:
 
 
 class Frozen:
-    """Makes GLOBAL_POSITION_INT repeat a sender's last position, from ``at_s`` for ``lasts_s``.
+    """Fault that repeats a sender's last GLOBAL_POSITION_INT from ``at_s`` for ``lasts_s``.
 
     Latitude, longitude and both altitudes are repeated; time stamps, velocity and heading are
     unchanged. If a sender has no report before ``at_s``, its first one after that is repeated.
@@ -156,7 +156,7 @@ class Frozen:
         self._positions: dict[Sender, bytes] = {}
 
     def __call__(self, t_s: float, raw: bytes) -> bytes:
-        """The frame as sent at ``t_s``."""
+        """Return the frame as sent at ``t_s`` with this fault."""
         if t_s >= self._end_s or (position := _position_of(raw)) is None:
             return raw
         if t_s < self._at_s:
@@ -166,7 +166,7 @@ class Frozen:
 
 
 class Glitch:
-    """Displaces ``reports`` GLOBAL_POSITION_INT of each sender by ``metres``, from ``at_s`` on.
+    """Fault that displaces ``reports`` positions of each sender by ``metres``, from ``at_s`` on.
 
     The offset is horizontal, in one direction per sender that depends on ``seed`` and the sender's
     ids; altitudes are unchanged.
@@ -180,7 +180,7 @@ class Glitch:
         self._done: dict[Sender, int] = {}
 
     def __call__(self, t_s: float, raw: bytes) -> bytes:
-        """The frame as sent at ``t_s``."""
+        """Return the frame as sent at ``t_s`` with this fault."""
         if t_s < self._at_s or (position := _position_of(raw)) is None:
             return raw
         sender = sender_of(raw)

@@ -14,49 +14,49 @@ from sitl_replay.faults.asked import Sender
 WITHIN_S: Final = 0.2
 """Maximum delay of a duplicate or of a reordered frame."""
 JITTER_MAX: Final = 10.0
-"""Limit of exponential draws, as a multiple of the mean (1 in 22 000 is limited)."""
+"""Limit of exponential draws, as a multiple of the mean (1 in 22 000 exceeds it)."""
 GARBAGE_MAX_BYTES: Final = 64
 _NEVER: Final = 1 << 60
 
 
 class Loss:
-    """Loses a frame with probability ``share``."""
+    """Fault that loses a frame with probability ``share``."""
 
     def __init__(self, rng: random.Random, share: float) -> None:
         self._rng = rng
         self._share = share
 
     def loses(self) -> bool:
-        """Whether the next frame is lost."""
+        """Return whether the next frame is lost."""
         return self._rng.random() < self._share
 
 
 class Duplication:
-    """Duplicates a frame with probability ``share``: the copy arrives 0 to 0.2 s later."""
+    """Fault that duplicates a frame with probability ``share``; the copy is 0 to 0.2 s late."""
 
     def __init__(self, rng: random.Random, share: float) -> None:
         self._rng = rng
         self._share = share
 
     def lag_s(self) -> float | None:
-        """Delay of the copy of the next frame; None: no copy."""
+        """Return the delay of the next frame's copy, seconds; None: no copy."""
         chance, lag_s = self._rng.random(), self._rng.uniform(0.0, WITHIN_S)
         return lag_s if chance < self._share else None
 
 
 class Delay:
-    """Delays every frame by ``delay_s``."""
+    """Fault that delays every frame by ``delay_s``."""
 
     def __init__(self, delay_s: float) -> None:
         self._delay_s = delay_s
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
-        """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
+        """Return when a frame leaves that enters the link at ``now_s``, this stage at ``t_s``."""
         return t_s + self._delay_s
 
 
 class Jitter:
-    """Delays every frame by a random time, exponential with mean ``mean_s``.
+    """Fault that delays every frame by a random time, exponential with mean ``mean_s``.
 
     The frames of one sender stay in order: a frame waits for a delayed one before it. If a sender's
     frames are closer than ``mean_s``, most are therefore delayed by more than that: at r frames per
@@ -69,7 +69,7 @@ class Jitter:
         self._last_s: dict[Sender, float] = {}
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
-        """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
+        """Return when a frame leaves that enters the link at ``now_s``, this stage at ``t_s``."""
         late_s = self._mean_s * min(self._rng.expovariate(1.0), JITTER_MAX)
         released_s = max(t_s + late_s, self._last_s.get(sender, t_s))
         self._last_s[sender] = released_s
@@ -77,10 +77,10 @@ class Jitter:
 
 
 class Burst:
-    """Blocks the link for ``shut_s`` at a time, on average for a share ``share`` of the time.
+    """Fault that blocks the link for ``shut_s`` at a time, on average for a ``share`` of the time.
 
-    It starts open, and is open for exponentially distributed times. Frames of a blocked time arrive
-    together at its end, in order. ``t_s`` may decrease, but not below ``now_s``.
+    The link starts open, and is open for exponentially distributed times. Frames of a blocked time
+    arrive together at its end, in order. ``t_s`` may decrease, but not below ``now_s``.
     """
 
     def __init__(self, rng: random.Random, share: float, shut_s: float) -> None:
@@ -91,7 +91,7 @@ class Burst:
         self._next_s = self._opening_s()
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
-        """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
+        """Return when a frame leaves that enters the link at ``now_s``, this stage at ``t_s``."""
         while self._block_starts_s and self._block_starts_s[0] + self._blocked_s <= now_s:
             del self._block_starts_s[0]
         while self._next_s <= t_s:
@@ -105,20 +105,20 @@ class Burst:
 
 
 class Reordering:
-    """Holds a frame for 0 to 0.2 s with probability ``share``, so that later ones overtake it."""
+    """Fault that holds a frame for 0 to 0.2 s with probability ``share``: others overtake it."""
 
     def __init__(self, rng: random.Random, share: float) -> None:
         self._rng = rng
         self._share = share
 
     def release_s(self, now_s: float, t_s: float, sender: Sender) -> float:
-        """Departure time of a frame that enters the link at ``now_s``, this stage at ``t_s``."""
+        """Return when a frame leaves that enters the link at ``now_s``, this stage at ``t_s``."""
         chance, held_s = self._rng.random(), self._rng.uniform(0.0, WITHIN_S)
         return t_s + held_s if chance < self._share else t_s
 
 
 class BitErrors:
-    """Inverts every bit with probability ``rate``, independently."""
+    """Fault that inverts every bit with probability ``rate``, independently."""
 
     def __init__(self, rng: random.Random, rate: float) -> None:
         self._rng = rng
@@ -126,7 +126,7 @@ class BitErrors:
         self._good_bits = self._run()
 
     def damaged(self, raw: bytes) -> bytes:
-        """The bytes that arrive."""
+        """Return the bytes of a frame as they arrive."""
         bits = 8 * len(raw)
         if self._good_bits >= bits:
             self._good_bits -= bits
@@ -139,7 +139,7 @@ class BitErrors:
         return bytes(out)
 
     def _run(self) -> int:
-        """Number of good bits before the next bad one, drawn from a geometric distribution."""
+        """Return the number of good bits before the next bad bit, drawn geometrically."""
         if self._rate == 0.0:
             return _NEVER
         bits = math.log(1.0 - self._rng.random()) / math.log1p(-self._rate)
@@ -147,27 +147,27 @@ class BitErrors:
 
 
 class Truncation:
-    """Truncates a frame with probability ``share``: at least 1 byte is kept, at least 1 removed."""
+    """Fault that truncates a frame with probability ``share``, keeping at least 1 byte."""
 
     def __init__(self, rng: random.Random, share: float) -> None:
         self._rng = rng
         self._share = share
 
     def damaged(self, raw: bytes) -> bytes:
-        """The bytes that arrive."""
+        """Return the bytes of a frame as they arrive."""
         chance, place = self._rng.random(), self._rng.random()
         return raw[: 1 + int(place * (len(raw) - 1))] if chance < self._share else raw
 
 
 class Garbage:
-    """Inserts 1 to 64 random bytes before a frame with probability ``share``."""
+    """Fault that inserts 1 to 64 random bytes before a frame with probability ``share``."""
 
     def __init__(self, rng: random.Random, share: float) -> None:
         self._rng = rng
         self._share = share
 
     def noise(self) -> bytes:
-        """The bytes to insert before the next frame; may be empty."""
+        """Return the bytes to insert before the next frame; may be empty."""
         chance, key = self._rng.random(), self._rng.random()
         if chance >= self._share:
             return b""

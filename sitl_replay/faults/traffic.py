@@ -1,4 +1,4 @@
-"""Applies the requested faults to a stream of frames. Pure.
+"""Application of the requested faults to a stream of frames. Pure.
 
 Time is seconds since the start of the stream. The faults of senders (``Senders``) come first and
 are the same on every link. Then each link applies its faults with its own random streams
@@ -31,11 +31,11 @@ from sitl_replay.faults.link import (
 HELD_MAX: Final = 100_000  # maximum of delayed frames over all links; further ones are lost
 OVERFLOW: Final = "overflow"  # name under which these are counted
 CONTENT: Final = frozenset(("drift", "reboot", "frozen", "glitch"))
-"""Names of the faults of senders."""
+"""Names of the faults that apply to senders."""
 
 
 class Senders:
-    """Applies the faults of senders to all frames, in the order of sending.
+    """Stage that applies the faults of senders to all frames, in the order of sending.
 
     ``touched`` counts the frames changed by each fault.
     """
@@ -47,7 +47,7 @@ class Senders:
         touched.update({str(fault): 0 for fault in chosen})
 
     def altered(self, t_s: float, raw: bytes) -> bytes:
-        """The frame as its sender sends it at ``t_s``."""
+        """Return a frame as its sender sends it at ``t_s``, with the faults."""
         for fault, effect in self._faults:
             if fault.concerns(sender_of(raw)):
                 before, raw = raw, effect(t_s, raw)
@@ -65,7 +65,7 @@ class Delivery(NamedTuple):
 
 
 class Network:
-    """Applies the faults of links to all frames, in the order of sending; each link separately.
+    """Stage that applies the faults of each link to all frames, in the order of sending.
 
     ``touched`` counts, over all links, the frames that each fault has lost, duplicated, delayed or
     corrupted. Times must not decrease.
@@ -95,13 +95,13 @@ class Network:
                 )
 
     def due(self, until_s: float = math.inf) -> Iterator[Delivery]:
-        """Remove and yield what arrives up to and including ``until_s``, by time."""
+        """Remove and yield the bytes that arrive up to and including ``until_s``, by time."""
         while self._held and self._held[0].t_s <= until_s:
             yield heapq.heappop(self._held)
 
 
 class _Link:
-    """The faults of one link, by stage."""
+    """Faults of one link, by stage."""
 
     def __init__(self, faults: Sequence[Fault], seed: str, touched: Counter[str]) -> None:
         effects = [(fault, _on_link(fault, random.Random(f"{seed} {fault}"))) for fault in faults]
@@ -115,7 +115,7 @@ class _Link:
         self._garbage = [(f, e) for f, e in effects if isinstance(e, Garbage)]
 
     def carry(self, now_s: float, raw: bytes) -> Iterator[tuple[float, bytes]]:
-        """What arrives of a frame sent at ``now_s``, with its time."""
+        """Return what arrives of a frame sent at ``now_s``, with the times of arrival."""
         sender = sender_of(raw)
         for fault, loss in self._loss:
             if fault.concerns(sender) and loss.loses():

@@ -17,7 +17,7 @@ class Leaning:
     path: Path
 
     def __call__(self, t_s: float) -> Pose:
-        """Roll and pitch from the thrust, yaw from the heading of the path."""
+        """Return roll and pitch by the thrust, and yaw by the heading of the path."""
         now = self.path(t_s)
         north, east, down = now.acceleration_ned_mps2
         north_rate, east_rate, down_rate = now.jerk_ned_mps3
@@ -49,10 +49,10 @@ class Leaning:
 class Banked:
     """Attitude of a fixed wing in level, coordinated flight: tan(bank) = airspeed · turn rate / g.
 
-    Yaw is the direction of the velocity through the air: that of the path minus the mean wind (m/s
-    north and east, the direction the wind blows to). The turn rate is the yaw rate. ``pitch_rad``
-    is the angle of attack. Source: the coordinated turn, e.g. R. Beard, T. McLain, Small Unmanned
-    Aircraft, section 5.2.
+    Yaw is the direction of the velocity through the air: the path's velocity minus the mean wind
+    (m/s north and east, the direction the wind blows to). The turn rate is the yaw rate.
+    ``pitch_rad`` is the angle of attack. Source: the coordinated turn, e.g. R. Beard, T. McLain,
+    Small Unmanned Aircraft, section 5.2.
     """
 
     path: Path
@@ -60,7 +60,7 @@ class Banked:
     pitch_rad: float
 
     def __call__(self, t_s: float) -> Pose:
-        """Roll from the turn rate, yaw from the velocity through the air."""
+        """Return roll by the turn rate, and yaw by the velocity through the air."""
         now = self.path(t_s)
         north = now.velocity_ned_mps[0] - self.wind_ne_mps[0]
         east = now.velocity_ned_mps[1] - self.wind_ne_mps[1]

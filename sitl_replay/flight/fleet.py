@@ -1,4 +1,4 @@
-"""Vehicles, their message intervals, and scenarios of vehicles."""
+"""Vehicles, the intervals of their messages, and scenarios of vehicles."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -23,7 +23,7 @@ UAV_SYSIDS: Final = tuple(n for n in range(1, HIGHEST_SYSID + 1) if n != CARRIER
 
 
 class Airframe(Enum):
-    """Contents of HEARTBEAT: MAV_TYPE, and the number of ArduPilot's guided mode."""
+    """Kind of vehicle, as in HEARTBEAT: MAV_TYPE, and the number of ArduPilot's guided mode."""
 
     COPTER = (2, 4)
     PLANE = (1, 15)
@@ -39,7 +39,7 @@ class Airframe(Enum):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Vehicle:
-    """One vehicle: id, motion, and message intervals."""
+    """Vehicle of a scenario: id, motion, and message intervals."""
 
     source: Source  # system and component id
     trajectory: Callable[[float], Motion]  # position and velocity at a time
@@ -61,7 +61,7 @@ class Vehicle:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Scenario:
-    """A carrier at ``origin`` and the UAVs around it.
+    """Scenario: a carrier at ``origin`` and the UAVs around it.
 
     ``home_alt_m`` is the reference of relative altitudes.
     """
@@ -75,13 +75,14 @@ class Scenario:
 
     @property
     def vehicles(self) -> tuple[Vehicle, ...]:
-        """The carrier first, then the UAVs."""
+        """All vehicles: the carrier first, then the UAVs."""
         return (self.carrier, *self.uavs)
 
     def truth(self, uav: Source | str, t_s: float) -> tuple[Motion, ...]:
-        """True motions at a time of all vehicles with an id, ``3:1`` or ``icao:F00001``.
+        """Return the true motions at a time of all vehicles with an id, ``3:1`` or ``icao:F00001``.
 
-        NED from the carrier. Several if vehicles share the id; empty if none has it.
+        Motions are NED from the carrier: several if vehicles share the id; empty if none has the
+        id.
         """
         wanted = str(uav)
         aircraft = {craft.icao: craft for one in self.vehicles for craft in one.hears}
@@ -104,18 +105,18 @@ CARRIER = Vehicle(
 
 
 def uav_source(index: int) -> Source:
-    """The id of UAV ``index`` (from 0): 1:1, 2:1 and so on to 250:1, then 1:2."""
+    """Return the id of UAV ``index`` (from 0): 1:1, 2:1 and so on to 250:1, then 1:2."""
     component, system = divmod(index, len(UAV_SYSIDS))
     return Source(UAV_SYSIDS[system], component + 1)
 
 
 def uptime_ms(index: int) -> int:
-    """The boot clock of a UAV at the start of the scenario; different for every UAV."""
+    """Return the boot clock of a UAV at the scenario's start, different for every UAV."""
     return 61_007 + 37_219 * index
 
 
 def around_carrier(name: str, description: str, uavs: tuple[Vehicle, ...]) -> Scenario:
-    """A scenario at the default place with the default carrier."""
+    """Return a scenario at the default position with the default carrier."""
     return Scenario(
         name=name,
         description=description,
@@ -127,7 +128,7 @@ def around_carrier(name: str, description: str, uavs: tuple[Vehicle, ...]) -> Sc
 
 
 def checked(uavs: int, fewest: int = 1) -> int:
-    """Return ``uavs``. Raises ``UserError`` if it is not ``fewest`` to ``MAX_UAVS``."""
+    """Return a number of UAVs. Raises ``UserError`` if it is not ``fewest`` to ``MAX_UAVS``."""
     if not fewest <= uavs <= MAX_UAVS:
         raise UserError(f"{uavs} UAVs; allowed: {fewest} to {MAX_UAVS}")
     return uavs

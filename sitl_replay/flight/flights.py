@@ -1,4 +1,4 @@
-"""One UAV of each scenario: path, attitude, effect of the wind, and message intervals.
+"""Flights of single UAVs: path, attitude, effect of the wind, and message intervals.
 
 UAVs are counted from 0; random numbers depend on the seed and that number only.
 
@@ -55,7 +55,7 @@ def uav(
     attitude: Callable[[float], Pose],
     airframe: Airframe = Airframe.COPTER,
 ) -> Vehicle:
-    """A UAV with one of four report rates, 4 to 10 Hz."""
+    """Return a UAV with one of four report rates, 4 to 10 Hz."""
     return Vehicle(
         source=uav_source(index),
         trajectory=trajectory,
@@ -68,12 +68,12 @@ def uav(
 
 
 def calm(index: int, path: Path) -> Vehicle:
-    """A copter on a path in still air."""
+    """Return a copter on a path in still air."""
     return uav(index, Flight(path), Leaning(path))
 
 
 def circling(index: int, centre_m: float = 250.0) -> Vehicle:
-    """A copter in still air on a circle of 40 m radius, away from the others."""
+    """Return a copter in still air on a circle of 40 m radius, away from the others."""
     north_m, east_m = on_spiral(index, centre_m)
     return calm(
         index,
@@ -87,7 +87,7 @@ def circling(index: int, centre_m: float = 250.0) -> Vehicle:
 
 
 def touring(index: int, seed: int) -> Vehicle:
-    """A copter on a tour of waypoints, in turbulence."""
+    """Return a copter on a tour of waypoints, in turbulence."""
     rng = random.Random(f"{seed} tour {index}")
     north_m, east_m = on_spiral(index, 250.0)
     path = Tour.over(
@@ -98,7 +98,7 @@ def touring(index: int, seed: int) -> Vehicle:
 
 
 def racing(index: int, seed: int) -> Vehicle:
-    """A fixed wing on a racetrack, in turbulence."""
+    """Return a fixed wing on a racetrack, in turbulence."""
     rng = random.Random(f"{seed} racetrack {index}")
     north_m, east_m = on_spiral(index, 450.0)
     height_m = 60.0 + 30.0 * (index % 8)
@@ -121,10 +121,10 @@ def racing(index: int, seed: int) -> Vehicle:
 
 
 def paired(index: int, *, mirrored: bool) -> Vehicle:
-    """One of a pair that swings about the same azimuth and elevation in opposite directions.
+    """Return one of a pair that swings about one azimuth and elevation in opposite directions.
 
-    Even numbers are the nearer ones. ``mirrored``: the farther one swings behind the carrier, about
-    the azimuth mirrored in the east-west line.
+    UAVs with even numbers are nearer to the carrier. ``mirrored``: the farther one swings behind
+    the carrier, about the azimuth mirrored in the east-west line.
     """
     pair, second = divmod(index, 2)
     shell, slot = divmod(pair, len(PAIR_AZIMUTHS_DEG))
@@ -152,7 +152,7 @@ def paired(index: int, *, mirrored: bool) -> Vehicle:
 
 
 def swarming(index: int, seed: int) -> Vehicle:
-    """One of a thousand copters, which circles in its own cell and sends at low rates.
+    """Return one of a thousand copters: it circles in its own cell and sends at low rates.
 
     Cells are 300 m wide, circles at most 90 m in radius. Ten copters share a cell, in layers 40 m
     apart. Neighbouring cells fill the layers evenly.
@@ -182,10 +182,10 @@ def swarming(index: int, seed: int) -> Vehicle:
 
 
 def aircraft(uav_trajectory: Callable[[float], Motion]) -> tuple[Aircraft, ...]:
-    """Aircraft with transponders about the carrier; the last is a UAV, wherever that flies.
+    """Return aircraft with transponders about the carrier; the last one is a UAV.
 
-    Addresses are of a block that ICAO has not given to any state. One says nothing of its speed,
-    one nothing of its height, one is heard without a position a third of the time.
+    Addresses are from a block that ICAO has not assigned. One aircraft reports no speed, one no
+    height, and one no position a third of the time.
     """
 
     def holding(north_m: float, east_m: float, height_m: float, speed_mps: float) -> Flight:
@@ -257,9 +257,9 @@ def aircraft(uav_trajectory: Callable[[float], Motion]) -> tuple[Aircraft, ...]:
 
 
 def on_spiral(index: int, spacing_m: float) -> tuple[float, float]:
-    """North and east of a point on a sunflower spiral, on which points are evenly spaced.
+    """Return north and east of a point on a sunflower spiral, whose points are evenly spaced.
 
-    None is nearer to the carrier than 1.4 times the spacing. Source: H. Vogel, "A better way to
+    No point is nearer to the carrier than 1.4 times the spacing. Source: H. Vogel, "A better way to
     construct the sunflower head", Mathematical Biosciences 44, 1979.
     """
     range_m, azimuth_rad = spacing_m * math.sqrt(index + 2.0), index * GOLDEN_ANGLE_RAD
@@ -267,7 +267,7 @@ def on_spiral(index: int, spacing_m: float) -> tuple[float, float]:
 
 
 def wind_course_rad(seed: int) -> float:
-    """Direction the mean wind blows to, the same for all UAVs."""
+    """Return the direction that the mean wind blows to, the same for all UAVs, radians."""
     return random.Random(f"{seed} wind").uniform(0.0, math.tau)
 
 
@@ -297,7 +297,7 @@ def _waypoints(rng: random.Random, centre_ned_m: Vector) -> tuple[Vector, ...]:
 
 
 def _cell_centres_m() -> tuple[tuple[float, float], ...]:
-    """The cells of a grid around the carrier without its own cell, nearest first."""
+    """Return the cells of a grid around the carrier, without its own cell, nearest first."""
     numbers = range(-5, 6)
     cells = sorted(
         ((n, e) for n in numbers for e in numbers if (n, e) != (0, 0)),

@@ -20,16 +20,16 @@ GUST_RATE_RATIO = 10.0
 
 
 class Motion(NamedTuple):
-    """Position and velocity of a vehicle: NED metres from the carrier, NED m/s."""
+    """Motion of a vehicle: position in NED metres from the carrier, velocity in NED m/s."""
 
     position_ned_m: Vector
     velocity_ned_mps: Vector
 
 
 class Kinematics(NamedTuple):
-    """A point of a path with its derivatives, and the heading.
+    """Point of a path with its derivatives, and the heading.
 
-    NED from the carrier: metres, m/s, m/s², m/s³; heading clockwise from north, radians.
+    Values are NED from the carrier: metres, m/s, m/s², m/s³; heading clockwise from north, radians.
     """
 
     position_ned_m: Vector
@@ -44,7 +44,7 @@ Path = Callable[[float], Kinematics]
 
 
 class Pose(NamedTuple):
-    """Attitude in rad and body rates (about forward, right, down) in rad/s."""
+    """Pose of a vehicle: attitude in rad, body rates (about forward, right, down) in rad/s."""
 
     roll_rad: float
     pitch_rad: float
@@ -56,7 +56,7 @@ class Pose(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Circle:
-    """The paper's flight (docs/math.md 8.2): a clockwise circle around the carrier, with gusts.
+    """Path of the paper (docs/math.md 8.2): a clockwise circle around the carrier, with gusts.
 
     Velocity is v + d, v = Rω[cos(ωt+φ), −sin(ωt+φ)] and d = gust·Rω[cos(10ωt+φ), −sin(10ωt+φ)]
     (north, east); the position is its exact integral, centred on the carrier. ``height_m`` is above
@@ -83,7 +83,7 @@ class Circle:
 
 @dataclass(frozen=True, slots=True)
 class Hover:
-    """A fixed point, NED metres from the carrier."""
+    """Motion at a fixed point, NED metres from the carrier."""
 
     position_ned_m: Vector
 
@@ -93,9 +93,9 @@ class Hover:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Sway:
-    """A level attitude with slow oscillations, at a heading that is constant or turns steadily.
+    """Attitude that is level with slow oscillations, at a constant or steadily turning heading.
 
-    Roll and pitch oscillate by ``amplitude_rad``, yaw by half of it, at three frequencies whose
+    Roll and pitch oscillate by ``amplitude_rad``, yaw by half of that, at three frequencies whose
     common period is long. ``phase_rad`` makes vehicles differ.
     """
 
@@ -131,13 +131,13 @@ class Sway:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """A path as flown: with the displacement by gusts, if any."""
+    """Path as flown, with the displacement by gusts, if any."""
 
     path: Path
     displacement: Callable[[float], Motion] | None = None
 
     def __call__(self, t_s: float) -> Motion:
-        """Position, and velocity as its derivative."""
+        """Return position, and velocity as its derivative."""
         on_path = self.path(t_s)
         position_ned_m, velocity_ned_mps = on_path.position_ned_m, on_path.velocity_ned_mps
         if self.displacement is None:
@@ -147,15 +147,15 @@ class Flight:
 
 
 def plus(a: Vector, b: Vector) -> Vector:
-    """The sum of two vectors."""
+    """Return the sum of two vectors."""
     return (a[0] + b[0], a[1] + b[1], a[2] + b[2])
 
 
 def body_rates(roll_rad: float, pitch_rad: float, euler_rates_radps: Vector) -> Vector:
-    """Body rates (p, q, r) about forward, right, down from the rates of roll, pitch and yaw.
+    """Return body rates (p, q, r) about forward, right, down from rates of roll, pitch, yaw.
 
-    All in rad/s. Source: the kinematic equation of the yaw-pitch-roll sequence, e.g. Stevens, Lewis
-    and Johnson, Aircraft Control and Simulation, eq. 1.4-3.
+    All rates are in rad/s. Source: the kinematic equation of the yaw-pitch-roll sequence, e.g.
+    Stevens, Lewis and Johnson, Aircraft Control and Simulation, eq. 1.4-3.
     """
     roll_rate, pitch_rate, yaw_rate = euler_rates_radps
     sin_roll, cos_roll = math.sin(roll_rad), math.cos(roll_rad)

@@ -1,7 +1,7 @@
 """Paths: tours of waypoints, racetracks, orbits, and swings in bearing around the carrier.
 
-Each gives position, velocity, acceleration and jerk in closed form (the start of a racetrack's turn
-by a quadrature exact to rounding), from which attitudes and their rates follow exactly.
+Each path gives position, velocity, acceleration and jerk in closed form (the start of a racetrack's
+turn by a quadrature exact to rounding), from which attitudes and their rates follow exactly.
 
 Over 300 lines: a list of paths, a class each.
 """
@@ -17,7 +17,7 @@ import numpy as np
 from sitl_replay.flight.motion import Kinematics, Vector
 
 MAX_RAMP_SLOPE: Final = 1.875
-"""Largest slope of ``Ramp.value``: a ramp to v in T takes an acceleration of 1.875 v / T."""
+"""Largest slope of ``Ramp.value``: a ramp to v in T needs an acceleration of 1.875 v / T."""
 
 _nodes, _weights = np.polynomial.legendre.leggauss(8)
 # Gauss–Legendre on 0 to 1, exact to degree 15; the course changes by about half a radian.
@@ -28,7 +28,7 @@ _QUADRATURE: Final = tuple(
 
 
 class Ramp(NamedTuple):
-    """A smooth step from 0 to 1 over x from 0 to 1, with its integral and two derivatives.
+    """Smooth step from 0 to 1 over x from 0 to 1, with its integral and two derivatives.
 
     The minimum-jerk polynomial 10x³ − 15x⁴ + 6x⁵ (T. Flash, N. Hogan, J. Neurosci. 5, 1985), used
     here for a speed or a turn rate.
@@ -41,7 +41,7 @@ class Ramp(NamedTuple):
 
     @classmethod
     def at(cls, x: float) -> Self:
-        """The step at ``x``, which is 0 to 1."""
+        """Return the smooth step at ``x``, which is 0 to 1."""
         cubed = x * x * x
         return cls(
             integral=cubed * x * (2.5 - 3.0 * x + x * x),
@@ -53,7 +53,7 @@ class Ramp(NamedTuple):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Leg:
-    """A straight line from stop to stop, then a stop in which the heading turns to the next leg.
+    """Straight path between two stops, then a stop in which the heading turns to the next leg.
 
     Speed ramps up to ``speed_mps`` within ``ramp_s``, is constant, and ramps down.
     """
@@ -76,7 +76,7 @@ class Leg:
         return self.moving_s + self.stand_s
 
     def at(self, t_s: float) -> Kinematics:
-        """The point ``t_s`` seconds after the start of the leg."""
+        """Return the point ``t_s`` seconds after the start of the leg."""
         along, speed, acceleration, jerk = self._progress(min(t_s, self.moving_s))
         turned = Ramp.at(max(0.0, t_s - self.moving_s) / self.stand_s)
         north, east, down = self.direction
@@ -95,7 +95,7 @@ class Leg:
         )
 
     def _progress(self, t_s: float) -> tuple[float, float, float, float]:
-        """Metres along the leg and three derivatives. The end mirrors the start in time."""
+        """Return metres along the leg and three derivatives. The end mirrors the start in time."""
         if t_s > self.moving_s / 2.0:
             left, speed, acceleration, jerk = self._progress(self.moving_s - t_s)
             return self.length_m - left, speed, -acceleration, jerk
@@ -112,7 +112,7 @@ class Leg:
 
 
 class Limits(NamedTuple):
-    """Limits of a multirotor: speed along the leg, climb, acceleration."""
+    """Limits of a multirotor: speed along a leg, climb, acceleration."""
 
     speed_mps: float
     climb_mps: float
@@ -121,7 +121,7 @@ class Limits(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Tour:
-    """A closed tour of waypoints, with a stop at each. ``ends_s``: end time of each leg."""
+    """Closed tour of waypoints, with a stop at each. ``ends_s``: end time of each leg."""
 
     legs: tuple[Leg, ...]
     ends_s: tuple[float, ...]
@@ -131,7 +131,7 @@ class Tour:
     def over(
         cls, waypoints: tuple[Vector, ...], limits: Limits, stand_s: float, offset_s: float
     ) -> Self:
-        """A tour of ``waypoints`` (NED metres, none vertically above the next) and back.
+        """Return a tour of ``waypoints`` (NED metres, none vertically above the next) and back.
 
         ``offset_s`` is the time into the tour at time 0.
         """
@@ -166,7 +166,7 @@ class Tour:
         return cls(tuple(legs), tuple(accumulate(leg.duration_s for leg in legs)), offset_s)
 
     def __call__(self, t_s: float) -> Kinematics:
-        """The point at a time of the scenario; the tour repeats."""
+        """Return the point at a time of the scenario; the tour repeats."""
         into_s = (t_s + self.offset_s) % self.ends_s[-1]
         index = min(bisect_right(self.ends_s, into_s), len(self.legs) - 1)
         leg = self.legs[index]
@@ -175,7 +175,7 @@ class Tour:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Racetrack:
-    """A stadium at constant height and ground speed: two straights, two half turns clockwise.
+    """Stadium at constant height and ground speed: two straights, two half turns clockwise.
 
     The turn rate ramps up to speed / radius within ``roll_s``, and down again, as an aircraft
     rolls.
@@ -198,7 +198,7 @@ class Racetrack:
 
     @property
     def turn_s(self) -> float:
-        """Duration of a half turn, including rolling in and out."""
+        """Duration of a half turn, including rolling in and out, seconds."""
         return math.pi * self.radius_m / self.speed_mps + self.roll_s
 
     @property
@@ -206,7 +206,7 @@ class Racetrack:
         return 2.0 * (self.straight_m / self.speed_mps + self.turn_s)
 
     def __call__(self, t_s: float) -> Kinematics:
-        """The point at a time of the scenario.
+        """Return the point at a time of the scenario.
 
         The second half of a lap is the first mirrored in the centre.
         """
@@ -231,7 +231,7 @@ class Racetrack:
         return _steered(position, self.speed_mps, axis + course, rate, growth)
 
     def _turn(self, t_s: float) -> tuple[float, float, float, float, float]:
-        """Metres along and across since the start of the turn; course and two derivatives.
+        """Return metres along and across since the start of the turn; course, two derivatives.
 
         The second half of a turn is the first one mirrored and in reverse.
         """
@@ -262,7 +262,7 @@ class Racetrack:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Orbit:
-    """A circle around a point at constant height, with the heading along the course.
+    """Circle around a point at constant height, with the heading along the course.
 
     Positive rates turn clockwise, negative ones counter-clockwise. ``phase_rad`` is the bearing
     from the centre at time 0.
@@ -274,7 +274,7 @@ class Orbit:
     phase_rad: float
 
     def __call__(self, t_s: float) -> Kinematics:
-        """The point at a time of the scenario."""
+        """Return the point at a time of the scenario."""
         bearing = self.phase_rad + self.rate_radps * t_s
         north, east, down = self.centre_ned_m
         position = (
@@ -290,7 +290,7 @@ class Orbit:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Swing:
-    """A swing on an arc around the carrier: azimuth + amplitude sin(ωt + φ), radians from north.
+    """Swing on an arc around the carrier: azimuth + amplitude sin(ωt + φ), radians from north.
 
     The range is horizontal. The heading points away from the carrier at the middle of the arc.
     """
@@ -303,7 +303,7 @@ class Swing:
     phase_rad: float
 
     def __call__(self, t_s: float) -> Kinematics:
-        """The point at a time of the scenario."""
+        """Return the point at a time of the scenario."""
         angle = self.omega_radps * t_s + self.phase_rad
         swing, omega = self.amplitude_rad, self.omega_radps
         azimuth = self.azimuth_rad + swing * math.sin(angle)
@@ -332,7 +332,7 @@ class Swing:
 def _steered(
     position: Vector, speed: float, course: float, rate: float, growth: float
 ) -> Kinematics:
-    """Level flight at constant speed along ``course``; ``growth`` is the derivative of ``rate``."""
+    """Return level flight at constant speed along ``course``; ``growth`` is d(``rate``)/dt."""
     cosine, sine = speed * math.cos(course), speed * math.sin(course)
     return Kinematics(
         position_ned_m=position,

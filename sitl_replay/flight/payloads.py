@@ -1,8 +1,8 @@
 """Payloads of vehicles' messages: one function per message.
 
 Layouts follow https://mavlink.io/en/messages/common.html in wire order: largest first, then
-extensions. Encoded with ``struct`` for speed, since a thousand vehicles send thousands of frames a
-second; ``tests/sitl_replay`` decodes them with pymavlink.
+extensions. Payloads are encoded with ``struct`` for speed, since a thousand vehicles send thousands
+of frames a second; ``tests/sitl_replay`` decodes them with pymavlink.
 """
 
 import math
@@ -32,7 +32,7 @@ RTK_FIXED: Final = 6  # GPS_FIX_TYPE
 # error of micrometres at these ranges.
 GEOID_HEIGHT_M: Final = 47.4
 PRESSURE_OFFSET_M: Final = -64.0
-"""Error of pressure altitude in the scenarios: 1021 hPa at sea level."""
+"""Error of pressure altitude in the scenarios, metres: 1021 hPa at sea level."""
 
 UNKNOWN_U16: Final = 0xFFFF
 COURSE_SPEED_MIN_MPS: Final = 0.1
@@ -46,7 +46,7 @@ _ADSB_VEHICLE: Final = struct.Struct("<IiiiHHhHHB9sBB")
 
 
 class Sample(NamedTuple):
-    """One vehicle at the time of a message."""
+    """State of one vehicle at the time of a message."""
 
     local: LocalFrame  # the carrier's local frame
     home_alt_m: float  # reference of relative altitudes
@@ -60,7 +60,7 @@ Builder = Callable[[Sample], Outgoing]
 
 
 def heartbeat(sample: Sample) -> Outgoing:
-    """HEARTBEAT of an ArduPilot copter or plane, armed and in guided mode."""
+    """Encode HEARTBEAT of an ArduPilot copter or plane, armed and in guided mode."""
     airframe = sample.vehicle.airframe
     payload = _HEARTBEAT.pack(
         airframe.guided_mode, airframe.mav_type, ARDUPILOT, BASE_MODE, ACTIVE, MAVLINK_VERSION
@@ -69,7 +69,7 @@ def heartbeat(sample: Sample) -> Outgoing:
 
 
 def global_position_int(sample: Sample) -> Outgoing:
-    """GLOBAL_POSITION_INT: degE7, mm above mean sea level and above home, cm/s NED, cdeg."""
+    """Encode GLOBAL_POSITION_INT: degE7, mm above mean sea level and home, cm/s NED, cdeg."""
     vehicle = sample.vehicle
     position_ned_m, (north_mps, east_mps, down_mps) = vehicle.trajectory(sample.t_s)
     lat_deg, lon_deg, alt_m = sample.local.place(*position_ned_m)
@@ -88,13 +88,13 @@ def global_position_int(sample: Sample) -> Outgoing:
 
 
 def attitude(sample: Sample) -> Outgoing:
-    """ATTITUDE: radians and rad/s, as in ``motion.Pose``."""
+    """Encode ATTITUDE: radians and rad/s, as in ``motion.Pose``."""
     payload = _ATTITUDE.pack(sample.boot_ms, *sample.vehicle.attitude(sample.t_s))
     return Outgoing(sample.vehicle.source, ATTITUDE, payload)
 
 
 def gps_raw_int(sample: Sample) -> Outgoing:
-    """GPS_RAW_INT of a receiver with an RTK fix; the reports are within its accuracies."""
+    """Encode GPS_RAW_INT of a receiver with an RTK fix; reports are within its accuracies."""
     motion = sample.vehicle.trajectory(sample.t_s)
     lat_deg, lon_deg, alt_m = sample.local.place(*motion.position_ned_m)
     speed_mps, course_cdeg = _over_ground(motion)
@@ -119,15 +119,16 @@ def gps_raw_int(sample: Sample) -> Outgoing:
 
 
 def system_time(sample: Sample) -> Outgoing:
-    """SYSTEM_TIME: the same time on the GNSS clock and on the boot clock."""
+    """Encode SYSTEM_TIME: the same time on the GNSS clock and on the boot clock."""
     payload = _SYSTEM_TIME.pack(sample.unix_us, sample.boot_ms)
     return Outgoing(sample.vehicle.source, SYSTEM_TIME, payload)
 
 
 def adsb_vehicle(sample: Sample, told: Relayed) -> Outgoing:
-    """ADSB_VEHICLE of a contact: mm above its datum, course over ground, vertical speed **up**.
+    """Encode ADSB_VEHICLE: mm above its datum, course over ground, vertical speed **up**.
 
-    A field without its flag contains the garbage of the contact. A stationary one has no course.
+    A field without its flag contains the garbage of the contact. A stationary aircraft has no
+    course.
     """
     _, contact, tslc_s = told
     aircraft, valid = contact.aircraft, contact.valid
@@ -163,7 +164,7 @@ def adsb_vehicle(sample: Sample, told: Relayed) -> Outgoing:
 
 
 def _over_ground(motion: Motion) -> tuple[float, int]:
-    """Speed in m/s and course in centidegrees, ``UNKNOWN_U16`` if stationary."""
+    """Return speed in m/s and course in centidegrees, ``UNKNOWN_U16`` if stationary."""
     north_mps, east_mps, _ = motion.velocity_ned_mps
     speed_mps = math.hypot(north_mps, east_mps)
     moving = speed_mps > COURSE_SPEED_MIN_MPS

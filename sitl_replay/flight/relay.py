@@ -1,8 +1,8 @@
 """Aircraft with transponders, and the ADS-B receivers that relay them.
 
 An aircraft sends a squitter about once a second. A receiver misses single squitters, and at times
-all of several seconds. It sends the last one repeatedly, with only the whole seconds since
-(``tslc``) changed, until it is too old. The numbers come from docs/field-notes.md 1,
+all of several seconds. The receiver sends the last squitter repeatedly, with only the whole seconds
+since (``tslc``) changed, until it is too old. The numbers come from docs/field-notes.md 1,
 "ADSB_VEHICLE". Pure: random numbers depend on the seed, the aircraft and the receiver.
 """
 
@@ -22,12 +22,12 @@ OUTAGE_SHARE: Final = 0.02  # share of squitters that start a time without recep
 OUTAGE_S: Final = (3.0, 5.0)  # minimum and maximum of that time
 RELAY_INTERVAL_S: Final = (0.2, 2.6)  # minimum and maximum between two relayed messages
 CONTENT_AGE_MAX_S: Final = 3.0
-"""Age beyond which content is not sent again. A receiver is then never silent for 10 s."""
+"""Age above which content is not sent again; a receiver is then never silent for 10 s."""
 GARBAGE_OCTETS: Final = 38  # length of the payload of ADSB_VEHICLE
 
 
 class Valid(IntFlag):
-    """ADSB_FLAGS: which fields of ADSB_VEHICLE are valid."""
+    """Flags of valid fields in ADSB_VEHICLE (ADSB_FLAGS)."""
 
     COORDS = 1
     ALTITUDE = 2
@@ -43,7 +43,7 @@ EVERYTHING: Final = Valid(0b1011_1111)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Aircraft:
-    """An aircraft: its motion (NED from the carrier) and what its transponder reports.
+    """Aircraft: its motion (NED from the carrier) and what its transponder reports.
 
         placeless_share  share of squitters without a position (only altitude and squawk), like
                          Mode S replies
@@ -65,7 +65,7 @@ class Aircraft:
 
 
 class Contact(NamedTuple):
-    """A received squitter: time, valid fields, and the content of the other fields."""
+    """Received squitter: time, valid fields, and the content of the other fields."""
 
     aircraft: Aircraft
     t_s: float
@@ -74,7 +74,7 @@ class Contact(NamedTuple):
 
 
 class Relayed(NamedTuple):
-    """A contact relayed at ``t_s``, ``tslc_s`` whole seconds after its reception."""
+    """Contact that is relayed at ``t_s``, ``tslc_s`` whole seconds after its reception."""
 
     t_s: float
     contact: Contact
@@ -82,7 +82,7 @@ class Relayed(NamedTuple):
 
 
 def squitters(aircraft: Aircraft, seed: int) -> Iterator[Contact]:
-    """The squitters of an aircraft (endless), the same for every receiver."""
+    """Yield the squitters of an aircraft (endless), the same for every receiver."""
     rng = random.Random(f"{seed} {aircraft} squitters")
     t_s = rng.uniform(0.0, SQUITTER_INTERVAL_S)
     while True:
@@ -100,9 +100,9 @@ def squitters(aircraft: Aircraft, seed: int) -> Iterator[Contact]:
 
 
 def heard(aircraft: Aircraft, receiver: str, seed: int) -> Iterator[Contact]:
-    """The squitters of an aircraft that a receiver receives (endless).
+    """Yield the squitters of an aircraft that a receiver receives (endless).
 
-    After a missed one, and after a time without reception, the next one is received.
+    After a missed squitter, and after a time without reception, the next one is received.
     """
     rng = random.Random(f"{seed} {receiver} hears {aircraft}")
     outage_end_s = 0.0
@@ -121,7 +121,7 @@ def heard(aircraft: Aircraft, receiver: str, seed: int) -> Iterator[Contact]:
 
 
 def relayed(aircraft: Aircraft, receiver: str, seed: int) -> Iterator[Relayed]:
-    """The messages that a receiver relays of an aircraft (endless), by time."""
+    """Yield the messages about an aircraft that a receiver relays (endless), by time."""
     rng = random.Random(f"{seed} {receiver} relays {aircraft}")
     contacts = heard(aircraft, receiver, seed)
     last, after = next(contacts), next(contacts)

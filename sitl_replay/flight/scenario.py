@@ -3,7 +3,7 @@
 Each builder takes the number of UAVs (and a seed, if it uses random numbers) and returns a
 ``Scenario``, whose vehicles move as functions of the seconds since its start (conventions: see
 ``motion``). An additional UAV does not change the others, except in ``hover``, which spreads them
-evenly. Raises ``UserError`` for a number of UAVs that is not possible.
+evenly. A builder raises ``UserError`` for an impossible number of UAVs.
 """
 
 import math
@@ -65,16 +65,16 @@ HEIGHTS_M = (0.0, 10.0, 20.0, 30.0)
 
 
 class Builder(Protocol):
-    """Makes a scenario of ``uavs`` UAVs; ``seed`` is that of the random numbers."""
+    """Function that builds a scenario of ``uavs`` UAVs; ``seed`` seeds the random numbers."""
 
     def __call__(self, uavs: int = 4, seed: int = 0) -> Scenario:
-        """The scenario. Raises ``UserError`` for a number of UAVs that is not possible."""
+        """Return the scenario. Raises ``UserError`` for an impossible number of UAVs."""
 
 
 def paper(uavs: int = 4, gust: float = PAPER_GUST) -> Scenario:
     """The paper's UAVs on circles of 100, 150, 200, 250 m and so on around the carrier.
 
-    Each is a quarter turn from the previous one, at 0.5 rad/s (beyond four: see
+    Each UAV is a quarter turn from the previous one, at 0.5 rad/s (beyond four: see
     ``PAPER_TOP_SPEED_MPS``).
     """
     return around_carrier(
@@ -101,8 +101,9 @@ def hover(uavs: int = 4) -> Scenario:
 def waypoints(uavs: int = 4, seed: int = 0) -> Scenario:
     """Copters on tours of five or six waypoints each, some 200 m and more from the carrier.
 
-    At most 12 m/s and 3 m/s², 3 m/s up and down; a stop of 4 s and a turn at each waypoint. Dryden
-    turbulence at a mean wind of 6 m/s displaces them by some decimetres, at some dm/s.
+    They fly at most 12 m/s and 3 m/s², 3 m/s up and down, with a stop of 4 s and a turn at each
+    waypoint. Dryden turbulence at a mean wind of 6 m/s displaces them by some decimetres, at some
+    dm/s.
     """
     return around_carrier(
         "waypoints",
@@ -114,7 +115,7 @@ def waypoints(uavs: int = 4, seed: int = 0) -> Scenario:
 def racetrack(uavs: int = 4, seed: int = 0) -> Scenario:
     """Fixed wings on stadiums at 20 to 30 m/s over ground, in coordinated turns of up to 30°.
 
-    In a mean wind of 6 m/s with Dryden turbulence: yaw differs from the course, and airspeed varies
+    In a mean wind of 6 m/s with Dryden turbulence, yaw differs from the course, and airspeed varies
     with the wind.
     """
     return around_carrier(
@@ -127,8 +128,8 @@ def racetrack(uavs: int = 4, seed: int = 0) -> Scenario:
 def crossing(uavs: int = 4) -> Scenario:
     """Pairs, one behind the other from the carrier, that swing in opposite directions.
 
-    In still air, at the same elevation: when their azimuths cross, every half swing (15.7 s), their
-    directions are exactly equal. An odd one swings alone.
+    They fly in still air at the same elevation: when their azimuths cross, every half swing (15.7
+    s), their directions are exactly equal. If the number is odd, the last UAV swings alone.
     """
     return around_carrier(
         "crossing",
@@ -138,7 +139,7 @@ def crossing(uavs: int = 4) -> Scenario:
 
 
 def mirror(uavs: int = 4) -> Scenario:
-    """Pairs as in ``crossing``, but with the second behind the carrier, mirrored in its array.
+    """Pairs as in ``crossing``, but with the second UAV behind the carrier, mirrored in its array.
 
     The array faces north, with elements from west to east. When a pair passes mirrored directions,
     every half swing (15.7 s), a linear array cannot separate the two.
@@ -153,9 +154,10 @@ def mirror(uavs: int = 4) -> Scenario:
 def swarm(uavs: int = 4, seed: int = 0) -> Scenario:
     """Up to 1000 copters, each on its own circle, in ten layers over 3 km by 3 km.
 
-    The minimum distance of two is 40 m. Each sends 6.3 frames a second (4 reports, a heartbeat, an
-    attitude, a fifth of a GPS_RAW_INT, a tenth of a SYSTEM_TIME), the carrier 34: 100 UAVs give 664
-    frames a second, 1000 give 6334. Ids: 1:1 to 250:1 without the carrier's, then 1:2 and so on.
+    The minimum distance between two is 40 m. Each copter sends 6.3 frames a second (4 reports, a
+    heartbeat, an attitude, a fifth of a GPS_RAW_INT, a tenth of a SYSTEM_TIME), the carrier 34: 100
+    UAVs give 664 frames a second, 1000 give 6334. Ids: 1:1 to 250:1 without the carrier's, then 1:2
+    and so on.
     """
     return around_carrier(
         "swarm",
@@ -199,7 +201,7 @@ def shared_id(uavs: int = 4) -> Scenario:
 
 
 def _unseeded(build: Callable[[int], Scenario]) -> Builder:
-    """The builder of a scenario without random numbers: the seed has no effect."""
+    """Return the builder of a scenario without random numbers, which ignores the seed."""
 
     def built(uavs: int = 4, seed: int = 0) -> Scenario:
         return build(uavs)

@@ -1,4 +1,4 @@
-"""A scenario as MAVLink 2: the frames of each vehicle, with their times.
+"""Schedule of a scenario as MAVLink 2: the frames of each vehicle, with their times.
 
 Pure: the schedule is a function of the scenario, a seed and the Unix time of its start. A message
 is sampled at a whole millisecond, so that its time stamp is exact, and sent up to ``JITTER_S``
@@ -32,7 +32,7 @@ JITTER_S = 0.005
 
 
 class Transmission(NamedTuple):
-    """One frame: time of sending (seconds since the start), sender, and bytes."""
+    """Frame to send: time of sending (seconds since the start), sender, and bytes."""
 
     t_s: float
     vehicle: Vehicle
@@ -42,7 +42,7 @@ class Transmission(NamedTuple):
 def schedule(
     scenario: Scenario, seed: int = 0, epoch_ns: int = 0, duration_s: float | None = None
 ) -> Iterator[Transmission]:
-    """Every frame of the scenario in the order of sending; endless if ``duration_s`` is None.
+    """Yield every frame of a scenario in order of sending; endless if ``duration_s`` is None.
 
     ``epoch_ns`` is the Unix time at the start. The same arguments give the same bytes; another seed
     gives other phases and jitter of the timers. Each vehicle has its own sequence numbers, even if

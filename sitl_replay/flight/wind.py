@@ -34,7 +34,7 @@ HIGHEST_X: Final = 100.0
 
 
 class Turbulence(NamedTuple):
-    """Intensities and scale lengths along the mean wind, across it, and vertical."""
+    """Turbulence: intensities and scale lengths along the mean wind, across it, and vertical."""
 
     sigma_mps: Vector
     length_m: Vector
@@ -42,7 +42,7 @@ class Turbulence(NamedTuple):
 
 
 class Hold(NamedTuple):
-    """Position control of a vehicle: d̈ = (w − ḋ)/drag_s − 2ζω ḋ − ω² d.
+    """Position control of a vehicle in wind: d̈ = (w − ḋ)/drag_s − 2ζω ḋ − ω² d.
 
     d is the displacement and w the gust, both along one axis; ``drag_s`` is the time constant of
     the drag, ω = ``natural_radps`` and ζ = ``damping`` those of the control loop.
@@ -53,7 +53,7 @@ class Hold(NamedTuple):
     drag_s: float
 
     def response(self, omega_radps: float) -> complex:
-        """Displacement in metres for a gust of 1 m/s at a frequency."""
+        """Return the displacement in metres for a gust of 1 m/s at a frequency."""
         s = 1j * omega_radps
         drag_hz = 1.0 / self.drag_s
         loop_hz = 2.0 * self.damping * self.natural_radps
@@ -62,14 +62,14 @@ class Hold(NamedTuple):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Sines:
-    """A sum of sines for each of three axes, Σ a sin(ωt + φ); arrays of (3, ``BANDS``)."""
+    """Sums of sines for each of three axes, Σ a sin(ωt + φ); arrays of (3, ``BANDS``)."""
 
     amplitude: FloatArray
     omega_radps: FloatArray
     phase_rad: FloatArray
 
     def __call__(self, t_s: float) -> tuple[FloatArray, FloatArray]:
-        """The three sums and their time derivatives."""
+        """Return the three sums and their time derivatives."""
         angle_rad = self.omega_radps * t_s + self.phase_rad
         slope = self.amplitude * self.omega_radps
         return (
@@ -89,7 +89,7 @@ class Displacement:
     wind_rad: float
 
     def __call__(self, t_s: float) -> Motion:
-        """Metres and m/s, NED."""
+        """Return the displacement in metres and its rate in m/s, NED."""
         offset_m, rate_mps = self.sines(t_s)
         return Motion(self._ned(offset_m), self._ned(rate_mps))
 
@@ -100,7 +100,7 @@ class Displacement:
 
 
 def low_altitude(height_m: float, wind_mps: float, airspeed_mps: float) -> Turbulence:
-    """Turbulence at a height above the ground, for a mean wind at 20 feet (6 m).
+    """Return the turbulence at a height above ground, for a mean wind at 20 feet (6 m).
 
     MIL-F-8785C, with h in feet: L_w = h, L_u = L_v = h / (0.177 + 0.000823 h)^1.2, σ_w = 0.1 of the
     wind, σ_u = σ_v = σ_w / (0.177 + 0.000823 h)^0.4. Heights are limited to 10 to 1000 feet.
@@ -117,20 +117,20 @@ def low_altitude(height_m: float, wind_mps: float, airspeed_mps: float) -> Turbu
 
 
 def power_along(x: float) -> float:
-    """Share of the power of Φ_u below x = Lω/V: its integral over σ²."""
+    """Return the share of the power of Φ_u below x = Lω/V: its integral over σ²."""
     return 2.0 / math.pi * math.atan(x)
 
 
 def power_across(x: float) -> float:
-    """Share of the power of Φ_v and Φ_w below x = Lω/V: their integral over σ²."""
+    """Return the share of the power of Φ_v and Φ_w below x = Lω/V: their integral over σ²."""
     return (2.0 * math.atan(x) - x / (1.0 + x * x)) / math.pi
 
 
 def gusts(turbulence: Turbulence, rng: Random) -> Sines:
-    """Gust velocities in m/s, along the mean wind, across it, down: one sine per band.
+    """Return gust velocities in m/s, along the mean wind, across it, down: a sine per band.
 
-    Each has the power of its band, at a frequency drawn from the spectrum within it: the average
-    over many draws is the Dryden spectrum.
+    Each sine has the power of its band, at a frequency drawn from the spectrum within it: the
+    average over many draws is the Dryden spectrum.
     """
     ratio = HIGHEST_X / LOWEST_X
     amplitude, omega_radps, phase_rad = np.zeros((3, 3, BANDS))
@@ -148,7 +148,7 @@ def gusts(turbulence: Turbulence, rng: Random) -> Sines:
 
 
 def _where(share: Callable[[float], float], wanted: float, low_x: float, high_x: float) -> float:
-    """The x at which an increasing ``share`` is ``wanted``, by bisection to 1e-6."""
+    """Return the x at which an increasing ``share`` is ``wanted``, by bisection to 1e-6."""
     for _ in range(20):
         middle_x = (low_x + high_x) / 2.0
         if share(middle_x) < wanted:
@@ -159,7 +159,7 @@ def _where(share: Callable[[float], float], wanted: float, low_x: float, high_x:
 
 
 def displaced(wind: Sines, hold: Hold) -> Sines:
-    """Steady-state displacement in metres of a vehicle with control ``hold`` in ``wind``."""
+    """Return the steady-state displacement in metres of a vehicle with ``hold`` in ``wind``."""
     responses = [[hold.response(float(omega)) for omega in axis] for axis in wind.omega_radps]
     polar = np.array([[cmath.polar(response) for response in axis] for axis in responses])
     return Sines(wind.amplitude * polar[:, :, 0], wind.omega_radps, wind.phase_rad + polar[:, :, 1])

@@ -1,1 +1,1 @@
-"""Sends scenarios and logs as live traffic, and records traffic."""
+"""Sending of scenarios and logs as live traffic, and recording of traffic."""

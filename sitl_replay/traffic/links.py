@@ -8,7 +8,7 @@ serial:DEVICE:BAUD    a serial port
 zenoh:KEY             to every listener over Zenoh; ?as=hub is the vehicles' end
 
 There is no reconnection to a lost peer. Sending never waits for a slow peer: a frame that it does
-not accept is dropped and counted. To wait instead, await ``writable`` first.
+not accept is dropped and counted. To wait for room instead, await ``writable`` first.
 """
 
 import asyncio
@@ -27,12 +27,12 @@ PEERS_MAX: Final = (
 LINGER_S: Final = 1.0  # maximum wait for buffered data when closing
 FULL: Final = 0.5  # share of a peer's buffer above which writable waits
 RETRY_S: Final = 1.0
-"""Time from the loss of a route to the next attempt; datagrams are dropped meanwhile."""
+"""Time from the loss of a network route to the next attempt; datagrams are dropped meanwhile."""
 _ROOM_POLL_S: Final = 0.001
 _FIRST_PEER_POLL_S: Final = 0.01
 
 Receive = Callable[[Hashable, bytes], None]
-"""Function called with the sender (one key per peer) and its bytes; ``b""`` if it has closed."""
+"""Function called with a peer's key and the received bytes; ``b""`` if the peer has closed."""
 
 
 def ignore(_peer: Hashable, _data: bytes) -> None:
@@ -40,7 +40,7 @@ def ignore(_peer: Hashable, _data: bytes) -> None:
 
 
 class TrafficLink:
-    """A link to send and receive frames; made by ``open_link``.
+    """Link to send and receive frames; made by ``open_link``.
 
     url      the link, with the port that the system chose for port 0
     lost     why the link has ended; empty while it is open
@@ -68,7 +68,7 @@ class TrafficLink:
         self._endpoint = transport.endpoint(url, LinkStatus(url=str(url)), upcalls)
 
     async def open(self) -> None:
-        """Bind the address, connect or open. Raises ``LinkError`` if that is not possible."""
+        """Bind the address, connect or open the device. Raises ``LinkError`` if impossible."""
         try:
             port = self._endpoint.open()
         except OSError as error:
@@ -101,12 +101,12 @@ class TrafficLink:
             await asyncio.sleep(RETRY_S)
 
     def peers(self) -> Collection[Hashable]:
-        """All peers that a frame is sent to."""
+        """All peers to which a frame is sent."""
         peers = self._endpoint.peers()
         return tuple(self._heard) if peers is None else peers
 
     async def first_peer(self) -> None:
-        """Wait until there is a peer, or the link has ended."""
+        """Wait until a peer is connected, or the link has ended."""
         while not self.peers() and not self.serving.done():
             await asyncio.sleep(_FIRST_PEER_POLL_S)
 
@@ -120,7 +120,7 @@ class TrafficLink:
             self.dropped += not self._endpoint.write(key, raw)
 
     def send_empty(self) -> None:
-        """Send an empty datagram, for peers that answer only to senders they know.
+        """Send an empty datagram, for peers that only answer senders they know.
 
         No effect on links other than ``udpout``.
         """
@@ -128,16 +128,16 @@ class TrafficLink:
             self._endpoint.write(None, b"")
 
     async def writable(self) -> None:
-        """Wait until there is a peer and all peers accept a frame, or the link has ended."""
+        """Wait until all peers, at least one, accept a frame, or the link has ended."""
         await self.first_peer()
         while self._max_fullness() > FULL:
             await asyncio.sleep(_ROOM_POLL_S)
             await self.first_peer()
 
     async def close(self) -> None:
-        """Send the buffered data, within a second, and close.
+        """Send the buffered data, within a second, and close the link.
 
-        Raises the exception of a defect that has ended the link.
+        Raises the exception that ended the link, if it was a defect.
         """
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(LINGER_S):
@@ -165,7 +165,7 @@ class TrafficLink:
 
 
 async def open_link(url: LinkUrl, receive: Receive = ignore) -> TrafficLink:
-    """Open a link. Raises ``LinkError`` if that is not possible."""
+    """Open a link. Raises ``LinkError`` if the link cannot be opened."""
     link = TrafficLink(url, receive)
     await link.open()
     return link

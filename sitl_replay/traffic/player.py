@@ -1,4 +1,4 @@
-"""Sends a schedule or a log over links, in real time or without waiting."""
+"""Player: sends a schedule or a log over links, in real time or without waiting."""
 
 import asyncio
 import contextlib
@@ -31,7 +31,7 @@ BATCH = 32
 
 @dataclass(slots=True, kw_only=True)
 class Tally:
-    """Counts of what has been sent so far, updated while it runs.
+    """Counts of what has been sent so far, updated during the run.
 
     frames      frames, each counted once for all links, whether delivered or not
     octets      their bytes
@@ -55,14 +55,14 @@ class Tally:
     lost: list[str] = field(default_factory=list)
 
     def count(self, raw: bytes) -> None:
-        """Count one frame."""
+        """Count one sent frame."""
         self.frames += 1
         self.octets += len(raw)
         self.messages[msgid_of(raw)] += 1
 
 
 def message_name(known: int) -> str:
-    """The name of a message id; ``UNKNOWN_`` and the id if the dialect has none."""
+    """Return the name of a message id; ``UNKNOWN_`` and the id if the dialect has none."""
     message = dialect.mavlink_map.get(known)
     return str(message.msgname) if message else f"UNKNOWN_{known}"
 
@@ -150,7 +150,7 @@ async def play(
 
 
 def on_timeline(frames: Iterable[Frame], tally: Tally) -> Iterator[tuple[float, bytes]]:
-    """Seconds since the first frame, in steps of 0 to 5 s, and the raw frame."""
+    """Yield seconds since the first frame, in steps of 0 to 5 s, and the raw frame."""
     elapsed_ns = 0
     before_ns: int | None = None
     for frame in frames:
@@ -185,7 +185,7 @@ async def _opened(urls: Sequence[LinkUrl], tally: Tally) -> AsyncIterator[list[T
 
 
 class _Sending:
-    """One run over open links, timed from one start time, so that errors do not accumulate."""
+    """Run over open links, timed from one start time, so that errors do not accumulate."""
 
     def __init__(
         self, *, endpoints: list[TrafficLink], network: Network, speed: float | None, tally: Tally
@@ -218,7 +218,7 @@ class _Sending:
             self._remove_ended_links()
 
     async def _until(self, t_s: float) -> None:
-        """Wait until a time; let other tasks run even if there is no need to wait."""
+        """Wait until a time; even without a wait, let other tasks run."""
         speed = self._speed
         wait_s = 0.0 if speed is None else self._start_s + t_s / speed - self._loop.time()
         if wait_s > 0.0 or self._steps % BATCH == 0:
@@ -232,7 +232,7 @@ class _Sending:
         endpoint.send(delivery.raw)
 
     def _remove_ended_links(self) -> None:
-        """Continue with the remaining links. Raises ``LinkError`` if there are none."""
+        """Continue with the remaining links. Raises ``LinkError`` if no link remains."""
         gone = [f"{one.url}: {one.lost}" for one in self._open_links if one.lost]
         if not gone:
             return

@@ -1,4 +1,4 @@
-"""Writes tlogs for QGroundControl and MAVProxy: 8 bytes of Unix µs (big-endian) per frame."""
+"""Recorder of tlogs for QGroundControl and MAVProxy: 8 bytes of Unix µs (big-endian) per frame."""
 
 import asyncio
 import logging
@@ -22,10 +22,10 @@ FLUSH_EVERY_NS: Final = 1_000_000_000
 
 
 class TlogWriter:
-    """A tlog being written, as a context manager; an existing file is overwritten.
+    """Tlog that is being written, as a context manager; an existing file is overwritten.
 
-    Flushed every second of time stamps, so a killed process loses at most a second. Raises
-    ``OSError`` if the file cannot be opened or written.
+    The file is flushed every second of time stamps, so a killed process loses at most a second.
+    Raises ``OSError`` if the file cannot be opened or written.
     """
 
     def __init__(self, path: Path) -> None:
@@ -106,7 +106,7 @@ async def record(
 async def _listen(
     endpoint: TrafficLink, frame_writer: "_FrameWriter", duration_s: float | None
 ) -> bool:
-    """Receive until the duration is over (False) or the link has ended (True)."""
+    """Receive until the duration is over (return False) or the link has ended (True)."""
     loop = asyncio.get_running_loop()
     end_s = math.inf if duration_s is None else loop.time() + duration_s
     while (left_s := end_s - loop.time()) > 0.0:
@@ -124,7 +124,7 @@ async def _listen(
 
 
 class _FrameWriter:
-    """Splits the bytes of peers into frames and writes them."""
+    """Writer that splits the bytes of peers into frames and writes the frames."""
 
     def __init__(self, url: LinkUrl, writer: TlogWriter, heard: RecordingTally) -> None:
         self.writer = writer
@@ -138,7 +138,7 @@ class _FrameWriter:
         self._unix_less_monotonic_ns = time.time_ns() - time.monotonic_ns()
 
     def take(self, peer: object, data: bytes) -> None:
-        """Process bytes of a peer; ``b""`` if it has closed."""
+        """Process the bytes of a peer; ``b""`` if the peer has closed."""
         if self.failed.done():
             return
         self.has_heard = True
@@ -151,7 +151,7 @@ class _FrameWriter:
             self.failed.set_result(error)
 
     def finish(self) -> None:
-        """Process the rest of each peer's unfinished frame."""
+        """Process the remaining bytes of each peer's unfinished frame."""
         for peer in tuple(self._splitters):
             self._give_up(peer)
 

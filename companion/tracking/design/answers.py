@@ -18,10 +18,10 @@ if TYPE_CHECKING:
     from companion.tracking.design.lmi import LmiSolution, Sampling
 
 POSITION: Final = np.array([[1.0, 0.0]])
-"""Output matrix H of the kinematic model: mu bounds the position."""
+"""Output matrix H of the kinematic model, by which mu bounds the position error."""
 
 FASTEST_SHARE: Final = 0.98
-"""Largest alpha of a table; with alpha = 1 no error would persist from step to step."""
+"""Largest alpha of a table; at alpha = 1 no error would persist from step to step."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +51,7 @@ def row(
     model: str,
     method: str,
 ) -> dict[str, Any]:
-    """Position model's design for one interval, with the keys of ``companion design --json``.
+    """Return the position model's design for one interval, as in ``companion design --json``.
 
         dt_s           interval between reports, seconds
         feedthrough_s  time by which a report leads the position, seconds
@@ -87,7 +87,7 @@ def row(
 
 
 def _by_lmi(dt_s: float, feedthrough_s: float, alpha: float) -> dict[str, float]:
-    """Solve the same axis by CVXPY and Clarabel, which only this function loads."""
+    """Solve the design of one axis by CVXPY and Clarabel, which only this function loads."""
     from companion.tracking.design import lmi
 
     one = np.eye(1)
@@ -104,7 +104,7 @@ def _by_lmi(dt_s: float, feedthrough_s: float, alpha: float) -> dict[str, float]
 
 
 def as_text(row: dict[str, Any]) -> str:
-    """Format one row as text."""
+    """Format one row of a design as text."""
     kinematic_model = row["model"] == "kinematic"
     unit = "m" if kinematic_model else "s"
     limit = "" if row["dt_limit_s"] is None else f"  dt limit {row['dt_limit_s']:.4f} s"
@@ -132,12 +132,12 @@ def kinematic_row(
     mu_max: float | None = None,
     dt_limit_s: float | None = None,
 ) -> dict[str, Any]:
-    """Kinematic model's design for one interval alone.
+    """Return the kinematic model's design for one interval alone.
 
-    It has the keys of ``row``, with L and Q nested. ``mu`` is in m². ``gamma`` is the certified and
-    ``peak_gain`` the exact largest position error, in metres, under the bounds of ``motion``
-    (docs/math.md 4). Raises ``UserError`` for an interval or alpha out of range, ``LmiError`` if
-    the solver fails.
+    The result has the keys of ``row``, with L and Q nested. ``mu`` is in m². ``gamma`` is the
+    certified and ``peak_gain`` the exact largest position error, in metres, under the bounds of
+    ``motion`` (docs/math.md 4). Raises ``UserError`` for an interval or alpha out of range,
+    ``LmiError`` if the solver fails.
     """
     if not 0 < dt_s < np.inf:
         raise UserError("interval between reports: give a positive number of seconds")
@@ -163,15 +163,15 @@ def kinematic_row(
 def kinematic_rows(
     dts_s: Sequence[float], motion: KinematicLimits, alpha: float | None, mu_max: float | None
 ) -> list[dict[str, Any]]:
-    """``kinematic_row`` at each interval; values independent of the interval are computed once."""
+    """Return ``kinematic_row`` at each interval; shared values are computed once."""
     limit_s = _dt_limit_s(mu_max, motion, alpha) if dts_s and mu_max is not None else None
     return [kinematic_row(dt_s, motion, alpha, mu_max, limit_s) for dt_s in dts_s]
 
 
 def peak_error_m(dt_s: float, gain: FloatArray, motion: KinematicLimits) -> float:
-    """Exact largest position error in the long run at one interval and gain, metres, on one axis.
+    """Return the largest position error in the long run at one interval and gain, m, one axis.
 
-    The l-infinity gain: the sum over k of the largest |h (A - L C)^k (L n - g)|, where the
+    This is the l-infinity gain: the sum over k of the largest |h (A - L C)^k (L n - g)|, where the
     acceleration may change within each interval. Infinite if the gain does not contract.
     """
     noises = np.array([motion.position_noise_m, motion.velocity_noise_mps or 0.0])
@@ -190,7 +190,7 @@ def peak_error_m(dt_s: float, gain: FloatArray, motion: KinematicLimits) -> floa
 
 
 def _absolute_integral(slope: float, start: float, dt_s: float) -> float:
-    """Integral of |slope u + start| over u from 0 to T."""
+    """Return the integral of |slope u + start| over u from 0 to T."""
     end = start + slope * dt_s
     if start * end >= 0:
         return float(abs(start + end) * dt_s / 2)
@@ -207,7 +207,7 @@ def _sampling(dt_s: float, motion: KinematicLimits) -> "tuple[Sampling, tuple[in
 
 
 def _optimum(dt_s: float, motion: KinematicLimits, alpha: float | None) -> "LmiSolution":
-    """Solve the LMI at one interval; ``alpha=None``: the best of a grid, refined once."""
+    """Solve the LMI at one interval; ``alpha=None``: use the best alpha of a grid, refined once."""
     from companion.tracking.design import lmi
 
     sampling, channels = _sampling(dt_s, motion)
@@ -229,7 +229,7 @@ def _optimum(dt_s: float, motion: KinematicLimits, alpha: float | None) -> "LmiS
 
 
 def _least(at: "Callable[[float], LmiSolution]", tried: Sequence[float]) -> "LmiSolution":
-    """Return the solution with the smallest mu. Raises the last failure if every attempt fails."""
+    """Return the solution with the smallest mu. If all attempts fail, raise the last failure."""
     from companion.tracking.design.lmi import LmiError
 
     found, failure = [], LmiError("the search for alpha has no candidate")
@@ -244,7 +244,7 @@ def _least(at: "Callable[[float], LmiSolution]", tried: Sequence[float]) -> "Lmi
 
 
 def _dt_limit_s(mu_max: float, motion: KinematicLimits, alpha: float | None) -> float:
-    """Return the largest interval with mu within the limit, to 0.1 %; 0 without one.
+    """Return the largest interval with mu within the limit, to 0.1 %; 0 without such an interval.
 
     By bisection: mu grows with the interval, from the noise alone to about (a T^2 / sqrt 3)^2.
     """
@@ -264,7 +264,7 @@ def _dt_limit_s(mu_max: float, motion: KinematicLimits, alpha: float | None) -> 
 def table(
     dt_range_s: Sequence[float], motion: KinematicLimits, points: int = 24, slack: float = 1e-4
 ) -> KinematicDesign:
-    """Gains over a range of intervals under one P, also verified between the grid's points.
+    """Compute gains over a range of intervals under one P; verify them between grid points too.
 
         dt_range_s  shortest and longest interval, seconds
         motion      bounds on acceleration and noise
@@ -272,7 +272,7 @@ def table(
         slack       margin required of the LMIs, for intervals between the points
 
     The decay is alpha(T) = 1 - exp(-T/tau), so that the error decays in proportion to the interval.
-    A single alpha would require of the shortest interval what only the longest can achieve, and
+    A single alpha would demand from the shortest interval what only the longest can achieve, and
     make the bound up to twice as large. tau is searched: among those within 1 % of the smallest
     bound the shortest is taken, which decays fastest. See docs/math.md 4.
 
@@ -339,7 +339,7 @@ def _flags(motion: KinematicLimits) -> str:
 
 
 def described(found: KinematicDesign) -> str:
-    """Return one line about a table."""
+    """Return one line of text about a gain table."""
     return (
         f"{len(found.dt_s)} intervals from {found.dt_s[0]:g} to {found.dt_s[-1]:g} s, position"
         f" within {gain_table.invariant_bound(found):.3g} m, margin {found.margin:.1e}"

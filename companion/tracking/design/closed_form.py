@@ -37,7 +37,7 @@ cent gains almost nothing.
 
 
 def _check(dt_s: ArrayLike, alpha: float) -> FloatArray:
-    """Return the intervals as an array.
+    """Return the intervals as an array, checked together with alpha.
 
     Raises ``UserError`` for an interval or alpha out of range.
     """
@@ -50,15 +50,15 @@ def _check(dt_s: ArrayLike, alpha: float) -> FloatArray:
 
 
 def mu_star(dt_s: float, feedthrough_s: float, alpha: float) -> float:
-    """Smallest feasible mu (s²) at one interval; 0 if the error can be cancelled.
+    """Return the smallest feasible mu (s²) at one interval; 0 if the error can be cancelled.
 
-    mu*(b) of docs/math.md 2.2.
+    It is mu*(b) of docs/math.md 2.2.
     """
     return max(0.0, _excess(dt_s, feedthrough_s, alpha) / alpha)
 
 
 def gain(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> float:
-    """Optimal gain l* on the report at one interval; q* = 1 - l* (docs/math.md 2.2).
+    """Return the optimal gain l* for the report at one interval; q* = 1 - l* (docs/math.md 2.2).
 
     ``alpha=None``: ``best_alpha``. Plain arithmetic, because it runs for every report and
     prediction.
@@ -72,25 +72,25 @@ def gain(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> float
 
 
 def _excess(b: float, d: float, alpha: float) -> float:
-    """(d - b)^2 - (1 - alpha) d^2, rounding errors set to 0: ``best_alpha`` is on the edge."""
+    """Return (d - b)^2 - (1 - alpha) d^2, with rounding errors set to 0, as at ``best_alpha``."""
     excess = (d - b) ** 2 - (1 - alpha) * d * d
     return excess if excess > 4 * EPSILON * d * d else min(excess, 0.0)
 
 
 def mu_stars(dt_s: ArrayLike, feedthrough_s: float, alpha: float) -> FloatArray:
-    """``mu_star`` at each of an array of intervals, in the same shape."""
+    """Return ``mu_star`` for each of an array of intervals, in the same shape."""
     b, d = _check(dt_s, alpha), feedthrough_s
     return np.maximum(0.0, ((d - b) ** 2 - (1 - alpha) * d * d) / alpha)
 
 
 def gains(dt_s: ArrayLike, feedthrough_s: float, alpha: float) -> FloatArray:
-    """``gain`` at each of an array of intervals, in the same shape."""
+    """Return ``gain`` for each of an array of intervals, in the same shape."""
     b = _check(dt_s, alpha)
     return np.array([gain(x, feedthrough_s, alpha) for x in b.flat]).reshape(b.shape)
 
 
 def dt_limit_s(mu_max: float, feedthrough_s: float, alpha: float) -> float:
-    """Largest interval (s) at which ``mu <= mu_max`` (s²) is feasible; 0 if there is none.
+    """Return the largest interval (s) at which ``mu <= mu_max`` (s²) is feasible; 0 if none is.
 
     Raises ``UserError`` for a negative ``mu_max`` or an alpha outside (0, 1).
     """
@@ -102,9 +102,9 @@ def dt_limit_s(mu_max: float, feedthrough_s: float, alpha: float) -> float:
 
 
 def best_alpha(dt_s: float, feedthrough_s: float) -> float:
-    """Alpha with the smallest mu* at one interval.
+    """Return the alpha with the smallest mu* at one interval.
 
-    If the feedthrough allows mu* = 0 (b < 2d), this is the largest alpha that still does, up to
+    If the feedthrough allows mu* = 0 (b < 2d), this is the largest alpha for which mu* = 0, up to
     ``FASTEST_DECAY``: it has the fastest certified decay. Otherwise mu* decreases with alpha, and
     ``FASTEST_DECAY`` is returned.
     """
@@ -115,7 +115,7 @@ def best_alpha(dt_s: float, feedthrough_s: float) -> float:
 
 
 def peak_gain(dt_s: ArrayLike, feedthrough_s: float, l_gain: ArrayLike) -> FloatArray:
-    """Exact largest |e| / sup|w| (s) with a fixed gain: |l d - b| / (1 - |1 - l|).
+    """Return the largest |e| / sup|w| (s) with a fixed gain, exactly: |l d - b| / (1 - |1 - l|).
 
     This is the sum of the error's absolute impulse response (docs/math.md 2.4). Infinite if the
     gain does not contract, unless no input enters.
@@ -129,7 +129,7 @@ def peak_gain(dt_s: ArrayLike, feedthrough_s: float, l_gain: ArrayLike) -> Float
 def lmi_margin(
     dt_s: float, *, feedthrough_s: float, alpha: float, l_gain: float, mu: float, p: float
 ) -> float:
-    """Smallest eigenvalue of both LMIs at a solution; non-negative proves it.
+    """Return the smallest eigenvalue of both LMIs at a solution, which it proves if >= 0.
 
     The matrices are scaled by congruence (P to 1), so that the margin is dimensionless.
     """
@@ -157,7 +157,7 @@ class ClosedFormDesign:
 
 
 def design(dt_s: float, feedthrough_s: float, alpha: float | None = None) -> ClosedFormDesign:
-    """Optimal gain at one interval; ``alpha=None``: ``best_alpha``.
+    """Return the optimal gain at one interval; ``alpha=None``: use ``best_alpha``.
 
     If mu* = 0 the infimum over P is not attained: the certificate is then given at p = 1, which
     proves the decay LMI, and mu is the limit. Raises ``UserError`` for an interval, feedthrough or

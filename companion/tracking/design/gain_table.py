@@ -35,17 +35,17 @@ from companion.values import FloatArray, UserError
 FORMAT: Final = "kinematic-design-1"
 LARGEST: Final = 1 << 20  # most characters of a design; the program's own has 4500
 NUMBER_MAX: Final = 1e30
-"""Largest number in a design; its shortest interval is one over it."""
+"""Largest number accepted in a design; the shortest interval accepted is its inverse."""
 CHECKS_PER_STEP: Final = 5  # intervals that verify checks per step of the design's grid
 
 
 class DesignError(UserError):
-    """Design that cannot be read, or that its own certificate does not confirm."""
+    """Error of a design that cannot be read, or that its own certificate does not confirm."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KinematicDesign:
-    """Gains over a grid of intervals, with their certificate.
+    """Gains of the kinematic model over a grid of intervals, with their certificate.
 
         velocity_noise_mps  bound on the error of a reported velocity; None: not reported
         corrections         M at each interval, row by row: m11, m12, m21, m22 if velocity is
@@ -125,7 +125,7 @@ class KinematicDesign:
 
 
 def transition(dt_s: float) -> FloatArray:
-    """A(T) (2, 2): position and velocity T seconds later, without acceleration."""
+    """Return A(T) (2, 2): position and velocity T seconds later, without acceleration."""
     return np.array([[1.0, dt_s], [0.0, 1.0]])
 
 
@@ -138,9 +138,9 @@ def _transitions(dt_s: FloatArray) -> FloatArray:
 def inputs(
     dt_s: float, acceleration_mps2: float, position_noise_m: float, velocity_noise_mps: float | None
 ) -> tuple[FloatArray, FloatArray, tuple[int, ...]]:
-    """Input matrices B (2, m) and D (r, m), and the widths of the channels of w.
+    """Return input matrices B (2, m) and D (r, m), and the widths of the channels of w.
 
-    They are the arguments of ``lmi.Sampling``. The first channel has two columns, for acceleration
+    These are arguments of ``lmi.Sampling``. The first channel has two columns, for acceleration
     that varies within the interval; then one column for each noise. ``velocity_noise_mps=None``:
     velocity is not reported, r = 1.
     """
@@ -156,7 +156,7 @@ def inputs(
 
 
 def correction(design: KinematicDesign, dt_s: float) -> tuple[float, ...]:
-    """M(T), row by row: linear between the grid's intervals, constant beyond its ends.
+    """Return M(T), row by row: linear between the grid's intervals, constant outside them.
 
     Beyond the ends the running bound still holds; the invariant set is not certified there.
     """
@@ -171,7 +171,7 @@ def correction(design: KinematicDesign, dt_s: float) -> tuple[float, ...]:
 
 
 def gain(design: KinematicDesign, dt_s: float) -> FloatArray:
-    """L(T) = A(T) M(T), (2, 2), or (2, 1) without velocity; entries in 1, s and 1/s."""
+    """Return L(T) = A(T) M(T), (2, 2), or (2, 1) without velocity; entries in 1, s and 1/s."""
     m = np.array(correction(design, dt_s)).reshape(2, -1)
     found: FloatArray = transition(dt_s) @ m
     return found
@@ -181,10 +181,11 @@ def gain(design: KinematicDesign, dt_s: float) -> FloatArray:
 
 
 def verify(design: KinematicDesign) -> float:
-    """Smallest eigenvalue of the LMIs over a grid finer than the design's, with P scaled to I.
+    """Return the smallest eigenvalue of the LMIs over a finer grid than the design's.
 
-    Raises ``DesignError`` if it is negative, so that invariance is not proven, or if the design is
-    malformed. Batched: it takes a few milliseconds.
+    P is scaled to I. Raises ``DesignError`` if the eigenvalue is negative, so that invariance is
+    not proven, or if the design is malformed. The computation is batched and takes a few
+    milliseconds.
     """
     _check(design)
     nodes = np.arange(len(design.dt_s))
@@ -231,7 +232,7 @@ def _check(design: KinematicDesign) -> None:
 def _margins(
     design: KinematicDesign, dt_s: FloatArray, m: FloatArray, multipliers: FloatArray
 ) -> FloatArray:
-    """Smallest eigenvalue at each interval: dt (K,), M (K, 2, r), multipliers (K, 1 + r)."""
+    """Return the smallest eigenvalue per interval: dt (K,), M (K, 2, r), multipliers (K, 1 + r)."""
     r = m.shape[2]
     sizes = (design.acceleration_mps2, design.position_noise_m, design.velocity_noise_mps)
     shares = np.concatenate([multipliers[:, :1], multipliers], axis=1)  # acceleration: 2 columns
@@ -254,9 +255,9 @@ def _margins(
 
 
 def invariant_bound(design: KinematicDesign, c: ArrayLike = (1.0, 0.0)) -> float:
-    """sup |c^T e| over the invariant set: sqrt(c^T P^-1 c).
+    """Return sup |c^T e| over the invariant set: sqrt(c^T P^-1 c).
 
-    c = [1, t] gives the position t s later.
+    c = [1, t] gives the position error t s later.
     """
     vector = np.asarray(c, dtype=float)
     return float(np.sqrt(vector @ np.linalg.solve(design.p, vector)))

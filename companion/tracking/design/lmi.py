@@ -36,14 +36,14 @@ import numpy as np
 from companion.values import FloatArray, UserError
 
 TOLERANCE: Final = 1e-6
-"""Largest negative eigenvalue of a scaled LMI that is accepted: the accuracy of the solver."""
+"""Largest magnitude of an accepted negative eigenvalue of a scaled LMI: the solver's accuracy."""
 
 NEARLY_ZERO: Final = 1e-3
-"""A mu below this, in units of the input, may be an infimum of 0 that no P attains."""
+"""Limit, in units of the input, below which mu may be an infimum of 0 that no P attains."""
 
 
 class LmiError(UserError):
-    """The solver gave no solution that its own certificate confirms."""
+    """Error of a solver that gave no solution confirmed by its own certificate."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -58,7 +58,7 @@ class Sampling:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LmiSolution:
-    """Design and its certificate, checked by eigenvalues in numpy alone.
+    """Solution of the LMIs and its certificate, checked by eigenvalues in numpy alone.
 
     attained     False if mu can be lowered to 0 while P grows without bound: the mu given is
                  certified, but is not the smallest
@@ -88,7 +88,8 @@ def solve(
     channels: Sequence[int] | None = None,
     mu_max: float | None = None,
 ) -> LmiSolution:
-    """``solve_common`` for one sampling time: A (n, n), B (n, m), C (r, n), D (r, m), H (k, n)."""
+    """Call ``solve_common`` for one sampling time: A (n, n), B (n, m), C (r, n), D (r, m), H (k,
+    n)."""
     return solve_common(
         [Sampling(a=a, b=b, c=c, d=d)], h, [alpha], channels=channels, mu_max=mu_max
     )
@@ -104,7 +105,7 @@ def solve_common(
     slack: float = 0.0,
     scale: FloatArray | None = None,
 ) -> LmiSolution:
-    """Gains with the smallest mu, under one P for all sampling times.
+    """Find the gains with the smallest mu under one P for all sampling times.
 
         samplings  the plant at each of K sampling times
         h          H (k, n), the output whose error mu bounds
@@ -152,7 +153,7 @@ def solve_common(
 def _scalings(
     samplings: Sequence[Sampling], scale: FloatArray | None
 ) -> Iterator[tuple[FloatArray, FloatArray]]:
-    """Yield sizes of states (n,) and reports (r,) to try: given, by the inputs, and ones."""
+    """Yield sizes of states (n,) and reports (r,) to try: as given, from the inputs, and ones."""
     inputs = np.max([np.linalg.norm(s.b, axis=1) for s in samplings], axis=0)
     noises = np.max([np.linalg.norm(s.d, axis=1) for s in samplings], axis=0)
     seen = np.max([np.abs(s.c) for s in samplings], axis=0)
@@ -177,7 +178,7 @@ def _solve_scaled(
     states: FloatArray,
     reports: FloatArray,
 ) -> LmiSolution:
-    """Solve with states and reports in the given units, and certify in the original ones."""
+    """Solve with scaled states and reports, and certify in the original units."""
     unit = float(np.max(np.abs(h) @ states)) or 1.0
     scaled = [
         Sampling(
@@ -209,7 +210,7 @@ def _solve_sdp(
     mu_max: float | None,
     slack: float,
 ) -> tuple[FloatArray, list[FloatArray], FloatArray]:
-    """Return P, the Z and the multipliers (K, channels) from the solver."""
+    """Return P, each Z and the multipliers (K, channels) that the solver found."""
     n, k = samplings[0].a.shape[0], h.shape[0]
     p = cp.Variable((n, n), symmetric=True)
     mu = cp.Variable(nonneg=True)
@@ -256,7 +257,7 @@ def _with_attainment(
     states: FloatArray,
     reports: FloatArray,
 ) -> LmiSolution:
-    """Mark a small mu as not attained if a hundredth of it is feasible as well."""
+    """Mark a small mu as not attained if a hundredth of that mu is feasible as well."""
     try:
         _solve_scaled(
             samplings,
@@ -323,7 +324,7 @@ def lmi_margin(
     alpha: float,
     shares: FloatArray | None = None,
 ) -> float:
-    """Smallest eigenvalue of both LMIs at (P, L, mu), scaled by congruence so that P is I.
+    """Return the smallest eigenvalue of both LMIs at (P, L, mu), scaled so that P is I.
 
     ``plant`` is A, B, C, D, H; ``shares`` (m,) is the multiplier for each column of B, or None for
     one channel with alpha for all columns.

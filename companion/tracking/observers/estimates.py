@@ -1,4 +1,4 @@
-"""Interface of the observers, so that tracks are independent of the one in use."""
+"""Interface of the observers, which keeps tracks independent of the observer in use."""
 
 from typing import NamedTuple, Protocol, TypeVar
 
@@ -8,12 +8,12 @@ State = TypeVar("State")
 
 
 class Prediction(NamedTuple):
-    """Predicted UAV at a given time; vectors are in the local frame.
+    """Predicted state of a UAV at a given time; vectors are in the local frame.
 
         velocity_bound_mps  bound on the norm of the velocity error; None without a velocity
 
-    The position error lies in the upright cylinder of ``horizontal_m`` and ``vertical_m``. It is a
-    tuple for speed: several are created for each report.
+    The position error lies in the upright cylinder of ``horizontal_m`` and ``vertical_m``. The
+    class is a tuple for speed: several are created for each report.
     """
 
     position_ned_m: Vector  # estimated position
@@ -29,17 +29,18 @@ class Observer(Protocol[State]):
     """Observer as pure functions of frozen states. Times are the sender's own, in ns."""
 
     def begin(self, fix: Fix) -> State:
-        """Return the state of a track with one report."""
+        """Return the state of a track that has one report."""
         ...
 
     def predict(self, state: State, sender_ns: int) -> Prediction:
-        """Predict the UAV to a time before or after the state's report."""
+        """Predict a UAV's state at a time before or after the state's report."""
         ...
 
     def carry(self, state: State, sender_ns: int) -> tuple[Vector, Vector] | None:
-        """Predict position and velocity if ``reach.py`` bounds them, else return None.
+        """Predict position and velocity if ``reach.py`` bounds them; else return None.
 
-        It does if the observer's own bound is no smaller than that from the newest report alone.
+        ``reach.py`` does if the observer's own bound is no smaller than that from the newest report
+        alone.
         """
         ...
 

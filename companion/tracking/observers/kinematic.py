@@ -35,16 +35,16 @@ VELOCITY_SHARE = 0.5
 Over equal intervals the error then has the eigenvalues 0 and 1 - share.
 """
 MIN_DIFFERENCE_S = 0.1
-"""Least interval for a velocity derived from positions; below it, their noise would mean km/s."""
+"""Least interval for a velocity from positions, whose noise would mean km/s below it."""
 
 
 def deadbeat(interval_s: float) -> Gain:
-    """L = A(T): the report alone, extrapolated at its velocity; optimal in the worst case."""
+    """Return L = A(T): the report alone, extrapolated at its velocity; worst-case optimal."""
     return 1.0, interval_s, 0.0, 1.0
 
 
 def scheduled(design: KinematicDesign) -> GainSchedule:
-    """L = A(T) M(T) with the design's M, held constant beyond the ends of the design's range."""
+    """Return L = A(T) M(T) with the design's M, held constant outside the design's range."""
 
     def gain(interval_s: float) -> Gain:
         m11, m12, m21, m22 = correction(design, interval_s)
@@ -55,7 +55,7 @@ def scheduled(design: KinematicDesign) -> GainSchedule:
 
 @dataclass(frozen=True, slots=True)
 class KinematicModel:
-    """Bounds on speed and acceleration (norms), and the schedule of gains.
+    """Settings of the kinematic observer: bounds on speed and acceleration (norms), and gains.
 
     The bounds apply to reports that have no ``limits`` of their own.
     """
@@ -67,7 +67,7 @@ class KinematicModel:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class KinematicState:
-    """Estimate at a report's time before that report is used, its bounds, and the report.
+    """Estimate at a report's time before the report is used, its bounds, and the report.
 
     position_ned_m, velocity_ned_mps
                   the estimate, local frame
@@ -93,7 +93,7 @@ class KinematicObserver:
         self.model = model
 
     def begin(self, fix: Fix) -> KinematicState:
-        """Return the state of a track with one report, which is the estimate.
+        """Return the state of a track that has one report, whose values are the estimate.
 
         Without a reported velocity the estimate is at rest, with the largest speed as its bound.
         """
@@ -118,7 +118,7 @@ class KinematicObserver:
         return self._bounded(state, t, gain, position, velocity)
 
     def carry(self, state: KinematicState, sender_ns: int) -> tuple[Vector, Vector] | None:
-        """Position and velocity of ``predict``; None if no velocity is reported."""
+        """Return position and velocity as ``predict``; None if no velocity is reported."""
         if state.fix.velocity_ned_mps is None:
             return None
         t = (sender_ns - state.fix.sender_ns) * 1e-9
@@ -166,7 +166,7 @@ class KinematicObserver:
         return self._limited(fix, reach_m, found, model.speed_max_mps)
 
     def _gain(self, state: KinematicState, t: float) -> Gain:
-        """Return the scheduled gain; without a velocity, A(t) [1; share / previous interval]."""
+        """Return the scheduled gain; without velocity, A(t) [1; share / previous interval]."""
         if state.fix.velocity_ned_mps is not None:
             return self.model.gain(t)
         if state.interval_s is None:
@@ -177,7 +177,7 @@ class KinematicObserver:
     def after(self, state: KinematicState, predicted: Prediction, fix: Fix) -> KinematicState:
         """Return the state at a report.
 
-        The delayed observer's estimate there does not use that report yet.
+        The observer is delayed: the estimate at a report does not use that report yet.
         """
         velocity, bound_mps = predicted.velocity_ned_mps, predicted.velocity_bound_mps
         assert velocity is not None
@@ -217,7 +217,7 @@ class KinematicObserver:
 
 
 def _propagated(state: KinematicState, t: float, gain: Gain) -> tuple[Vector, Vector]:
-    """Return position and velocity a time after the state's report, by the gain for that time."""
+    """Return position and velocity at a time after the state's report, by that time's gain."""
     fix = state.fix
     l11, l12, l21, l22 = gain
     m11, m12, m22 = 1.0 - l11, t - l12, 1.0 - l22

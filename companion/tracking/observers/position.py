@@ -32,7 +32,7 @@ from companion.values import Fix, Vector
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PositionModel:
-    """Settings of the observer.
+    """Settings of the position observer.
 
     Speed and acceleration are norms of 3-vectors that are never exceeded.
 
@@ -51,7 +51,7 @@ class PositionModel:
 
 @dataclass(frozen=True, slots=True)
 class PositionState:
-    """Estimate at a report's time before that report is used; its bound; and the report."""
+    """Estimate at a report's time before the report is used, its bound, and the report."""
 
     fix: Fix
     estimate_ned_m: Vector
@@ -65,7 +65,7 @@ class PositionObserver:
         self.model = model
 
     def begin(self, fix: Fix) -> PositionState:
-        """Return the state of a track with one report, which is the estimate."""
+        """Return the state of a track that has one report, whose position is the estimate."""
         lead_m = abs(self.model.feedthrough_s) * (fix.limits or self.model).speed_max_mps
         return PositionState(fix, fix.position_ned_m, fix.noise.position_m + lead_m)
 
@@ -98,13 +98,13 @@ class PositionObserver:
         return self._prediction(state, estimate, bound_m, b, closed_form.mu_star(b, d, alpha))
 
     def carry(self, _state: PositionState, _sender_ns: int) -> tuple[Vector, Vector] | None:
-        """None: the observer has its own bound."""
+        """Return None: ``reach.py`` does not bound this observer's predictions."""
         return None
 
     def after(self, _state: PositionState, predicted: Prediction, fix: Fix) -> PositionState:
         """Return the state at a report.
 
-        The delayed observer's estimate there does not use that report yet.
+        The observer is delayed: the estimate at a report does not use that report yet.
         """
         return PositionState(fix, predicted.position_ned_m, predicted.bound_m)
 
@@ -129,7 +129,7 @@ class PositionObserver:
 
 
 def _corrected(state: PositionState, lead_s: float, gain: float) -> Vector:
-    """Return the estimate, corrected by the gain towards the report with its lead."""
+    """Return the estimate corrected by the gain towards the report, which is led forward."""
     x1, x2, x3 = state.estimate_ned_m
     y1, y2, y3 = state.fix.position_ned_m
     v1, v2, v3 = state.fix.velocity_ned_mps or (0.0, 0.0, 0.0)

@@ -1,4 +1,4 @@
-"""The tables of an export, one module per subject: columns with unit, meaning and value.
+"""Tables of an export, one module per subject: columns with unit, meaning and value.
 
-``docs/export.md`` is generated from these.
+``docs/export.md`` is generated from these tables.
 """

@@ -1,4 +1,4 @@
-"""The table of reports: every received position, used or not."""
+"""Table of reports: every received position, used or not."""
 
 import math
 from collections.abc import Sequence
@@ -28,7 +28,7 @@ from companion.values.described import Inline, Meaning
 
 @dataclass(frozen=True, kw_only=True)
 class Heard:
-    """A received report: with its estimate if it was used, otherwise with the reason.
+    """Received report, with its estimate if it was used, else with the reason.
 
     ``said`` is None if the message could not be decoded.
     """
@@ -142,7 +142,7 @@ class Heard:
 
 
 def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
-    """Return the report in a frame with its outcome; None if the frame has no report."""
+    """Return the report in a frame, with its outcome; None if the frame contains no report."""
     if frame.msgid not in POSITIONS:
         return None
     for output in outputs:

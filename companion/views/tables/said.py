@@ -1,4 +1,4 @@
-"""The tables of rejections and of events."""
+"""Tables of rejections and of events."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ REFUTED: Final = "refuted"
 def rows(
     event: Event, outputs: Sequence[Output], local: LocalFrame | None
 ) -> Iterator[tuple[str, Any]]:
-    """Yield all rows that an event adds, each with the name of its table."""
+    """Yield all table rows that an event adds, each with the name of its table."""
     if isinstance(event, Frame):
         heard = reports.heard(event, outputs)
         if heard is not None:
@@ -36,7 +36,7 @@ def rows(
 
 @dataclass(frozen=True, slots=True)
 class RejectionRow:
-    """A rejection, with the name of its message."""
+    """Rejection, with the name of the message."""
 
     rejection: Annotated[Rejection, Inline()]
 
@@ -55,7 +55,7 @@ class RejectionRow:
 
 @dataclass(frozen=True, slots=True)
 class EventRow:
-    """A notice, or an assumption that reports refuted."""
+    """Notice, or assumption that reports refuted."""
 
     notice: Annotated[Notice | None, Inline(omit=("t_ns", "subject"))]
     refuted: Annotated[Refuted | None, Inline(omit=("t_ns",))]

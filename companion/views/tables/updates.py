@@ -1,4 +1,4 @@
-"""The tables of updates: the array, tracks and beams, ten times a second."""
+"""Tables of updates: the array, tracks and beams, ten times a second."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from companion.values.described import Inline, Meaning
 
 
 class _OfUpdate:
-    """Times of a row of an update: when it was computed, and when its beams are applied."""
+    """Times of an update's row: when it was computed, and when its beams are applied."""
 
     update: Update
 
@@ -26,7 +26,7 @@ class _OfUpdate:
 
 @dataclass(frozen=True)
 class UpdateRow(_OfUpdate):
-    """An update, with the origin of the local frame and the carrier's position if known."""
+    """Update, with the local frame's origin and, if known, the carrier's position."""
 
     update: Update
     carrier_place: Annotated[Place | None, Inline(prefix="carrier_")]
@@ -55,7 +55,7 @@ class UpdateRow(_OfUpdate):
 
 @dataclass(frozen=True, kw_only=True)
 class TrackRow(_OfUpdate):
-    """A track at an update, and its position."""
+    """Track at an update, with its position."""
 
     update: Update
     track: Annotated[Track, Inline(omit=("valid_at_ns",))]
@@ -65,7 +65,7 @@ class TrackRow(_OfUpdate):
 
 @dataclass(frozen=True)
 class BeamRow(_OfUpdate):
-    """A beam at an update."""
+    """Beam at an update."""
 
     update: Update
     beam: Annotated[Beam, Inline()]

@@ -74,8 +74,7 @@ class _Axes:
         )
 
     def ecef(self, north: float, east: float, down: float) -> Vector:
-        """Rotate north, east, down at the position to an earth-centred vector; inverse of
-        ``ned``."""
+        """Rotate north, east, down at the position to earth-centred axes; inverse of ``ned``."""
         out = -self.sin_lat * north - self.cos_lat * down
         return (
             self.cos_lon * out - self.sin_lon * east,

@@ -144,8 +144,7 @@ def from_protobuf(message: bytes) -> CotEvent | None:
 
 
 def _fields(message: bytes) -> Iterator[tuple[int, int | float | bytes]]:
-    """Yield number and value of each protobuf field
-    (https://protobuf.dev/programming-guides/encoding/)."""
+    """Yield number and value of each field (https://protobuf.dev/programming-guides/encoding/)."""
     at = 0
     while at < len(message):
         tag, at = varint(message, at)

@@ -88,8 +88,7 @@ def solve(
     channels: Sequence[int] | None = None,
     mu_max: float | None = None,
 ) -> LmiSolution:
-    """Call ``solve_common`` for one sampling time: A (n, n), B (n, m), C (r, n), D (r, m), H (k,
-    n)."""
+    """Solve for one sampling time, with A (n, n), B (n, m), C (r, n), D (r, m), H (k, n)."""
     return solve_common(
         [Sampling(a=a, b=b, c=c, d=d)], h, [alpha], channels=channels, mu_max=mu_max
     )

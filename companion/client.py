@@ -61,7 +61,7 @@ class Weights:
 
 
 class Client:
-    """A connection to one service.
+    """Connection to one service over HTTP and WebSocket.
 
         url        ``http://HOST:PORT``; raises ``UserError`` for any other form
         token      bearer token, if the service requires one

@@ -14,7 +14,7 @@ from companion.cli.console import JSON, Progress, make_folder
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Studied:
-    """The outcome of a study."""
+    """Outcome of a study."""
 
     answer: dict[str, Any]
     report: Callable[[], Mapping[str, bytes]]  # page and figures, by file name

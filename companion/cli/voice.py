@@ -21,12 +21,12 @@ class Lines:
         say(text, err=True)
 
     def serves(self, text: str) -> None:
-        """Print a line on stdout."""
+        """Print a line on stdout, such as the address of the page."""
         self._progress.clear()
         say(text)
 
     def show(self, service: Service) -> None:
-        """Refresh the status line."""
+        """Refresh the status line on the terminal."""
         self._progress.show(glance.line(service))
 
 
@@ -37,11 +37,11 @@ class JsonLines:
         self._seen_ns = 0
 
     def say(self, text: str) -> None:
-        """Print a line on stderr."""
+        """Print a line for the operator on stderr."""
         say(text, err=True)
 
     def serves(self, text: str) -> None:
-        """Print a line on stderr."""
+        """Print the address or recording on stderr."""
         say(text, err=True)
 
     def show(self, service: Service) -> None:

@@ -27,7 +27,7 @@ SAVE_EVERY_S: Final = 0.25  # interval of checks whether signing timestamps must
 
 
 class Gateway:
-    """All links of the service.
+    """All MAVLink links of the service.
 
     Call ``open`` for early errors, ``run`` until cancelled, then ``close``.
 

@@ -53,7 +53,7 @@ class Outlet:
                 self._frames.append(link)
 
     def links(self) -> list[LinkStatus]:
-        """Return the counts of each link; links for events under their names in the settings."""
+        """Return the counts of each link of ``[out]``, under its name in the settings."""
         named = zip(self._events, self._named, strict=True)
         events = [replace(link.status, url=text) for link, text in named]
         return [*(link.status for link in self._frames), *events]

@@ -70,7 +70,7 @@ class Push:
             self._fresh.set()
 
     async def run(self) -> None:
-        """Push updates until cancelled."""
+        """Push updates to the outputs until cancelled."""
         while True:
             await self._fresh.wait()
             self._fresh.clear()
@@ -110,7 +110,7 @@ class Push:
         self._notify(Notice(t_ns=self._now_ns(), severity=severity, subject="records", text=text))
 
     def close(self) -> None:
-        """Close all outputs."""
+        """Close all outputs of ``[records]``."""
         for sock in self._sockets.values():
             with contextlib.suppress(OSError):
                 sock.close()

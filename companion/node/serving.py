@@ -71,7 +71,7 @@ class RateMeter:
         self._counts: deque[tuple[int, int, int]] = deque()
 
     def count(self, now_ns: int, frames: int, updates: int) -> None:
-        """Note the total counts so far."""
+        """Note the total numbers of frames and updates so far."""
         self._counts.append((now_ns, frames, updates))
         while self._counts[0][0] < now_ns - RATE_WINDOW_S * 1e9:
             self._counts.popleft()
@@ -89,7 +89,7 @@ class RateMeter:
 
 
 def address(http: socket.socket) -> str:
-    """Return the URL of a bound socket."""
+    """Return the URL of a listening socket."""
     host, port = http.getsockname()[:2]
     return f"http://{f'[{host}]' if ':' in host else host}:{port}"
 

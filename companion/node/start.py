@@ -29,7 +29,7 @@ class Console(Protocol):
         """Print the address that is served, or at the end the recording."""
 
     def show(self, service: Service) -> None:
-        """Print the status."""
+        """Print the status of the service."""
 
 
 def run(

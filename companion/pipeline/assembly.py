@@ -302,7 +302,7 @@ def observer(settings: Settings) -> PositionObserver | KinematicObserver:
 
 
 def clock(settings: Settings) -> SenderClock:
-    """Return a clock for a new sender."""
+    """Return a clock estimator for a new sender."""
     given = settings.clocks
     return SenderClock(
         ClockAssumptions(
@@ -316,7 +316,7 @@ def clock(settings: Settings) -> SenderClock:
 
 
 def tracker(settings: Settings) -> Tracker:
-    """Return a tracker without tracks."""
+    """Return a new tracker, without tracks."""
     given, kept, limits = settings.observer, settings.tracks, default_limits(settings)
     leads = given.model == "position"
     lead_m = abs(given.feedthrough_s) * limits.speed_max_mps if leads else 0.0

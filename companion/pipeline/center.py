@@ -34,7 +34,7 @@ from companion.values import (
 )
 
 HOME_SETTLING_S: Final = 120.0
-"""Time after its first report in which a restarted track may move ``home``."""
+"""Time after a track's first report in which its restart may move ``home``, seconds."""
 HOME_HEIGHT_M: Final = 20.0  # least error of the first height for which ``home`` moves
 
 NOTICE_RATIO: Final = 1.25

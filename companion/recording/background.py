@@ -120,7 +120,7 @@ class BackgroundRecorder:
     # --- called on the event loop -----------------------------------------------------------
 
     def start(self) -> None:
-        """Start to write."""
+        """Start to write events."""
         self._thread.start()
 
     def put(self, event: Event | None, outputs: Sequence[Output]) -> None:
@@ -173,7 +173,7 @@ class BackgroundRecorder:
 
     @property
     def file(self) -> str:
-        """Name of the newest file."""
+        """Name of the newest file of the recording."""
         return self._writer.path.name
 
     @property
@@ -183,7 +183,7 @@ class BackgroundRecorder:
 
     @property
     def queued(self) -> int:
-        """Events waiting to be written."""
+        """Number of events that wait to be written."""
         return len(self._queue)
 
     # --- called on the thread ---------------------------------------------------------------

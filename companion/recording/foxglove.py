@@ -86,7 +86,7 @@ class LiveChannels:
             self.dropped += 1
 
     def stop(self) -> None:
-        """Stop serving."""
+        """Stop the live server."""
         self._stopping.set()
         with contextlib.suppress(queue.Full):
             self._queue.put_nowait(None)

@@ -126,7 +126,7 @@ class Writer:
 
     @property
     def messages(self) -> int:
-        """Messages recorded so far."""
+        """Number of messages recorded so far."""
         return self._topics.messages
 
     @property

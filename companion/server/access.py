@@ -58,7 +58,7 @@ def is_loopback(host: str) -> bool:
 
 
 def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
-    """Return the listening socket.
+    """Return the socket on which the server listens.
 
     Raises ``ListenError`` if the address is unavailable, or if other machines could reach it
     without a token.

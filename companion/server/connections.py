@@ -81,17 +81,17 @@ class BoundedProtocol(HttpToolsProtocol):
     # --- callbacks of the parser --------------------------------------------------------------
 
     def on_message_begin(self) -> None:
-        """Start a request."""
+        """Note the start of a request."""
         self._head_bytes = self._body_bytes = 0
         super().on_message_begin()
 
     def on_url(self, url: bytes) -> None:
-        """Process a piece of the URL."""
+        """Process a piece of the request's URL."""
         self._count(len(url))
         super().on_url(url)
 
     def on_header(self, name: bytes, value: bytes) -> None:
-        """Process a header."""
+        """Process a header of the request."""
         self._count(len(name) + len(value) + 4)
         super().on_header(name, value)
 
@@ -114,7 +114,7 @@ class BoundedProtocol(HttpToolsProtocol):
         super().on_message_complete()
 
     def on_response_complete(self) -> None:
-        """End an answer."""
+        """Note the end of an answer."""
         super().on_response_complete()
         if not self.transport.is_closing() and self.is_waiting:
             self._await_head()

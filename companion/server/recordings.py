@@ -54,7 +54,7 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Recordings:
-    """The recordings, by name."""
+    """Answer with the recordings, by name."""
 
     recordings: Annotated[list[Recording], Meaning("the recordings, by name")]
 

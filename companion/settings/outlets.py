@@ -80,7 +80,7 @@ class DriveSettings(Section):
 
 
 class PageSettings(Section):
-    """Settings of extras of the page.
+    """Settings of the page's map.
 
     ``map`` is a PMTiles file for the background of the plan view; None: range rings only. This
     service serves the map; the page loads nothing from other servers.

@@ -146,7 +146,7 @@ class PastPredictions:
 
     @property
     def model(self) -> AccelerationModel:
-        """Acceleration model in use."""
+        """Acceleration model in use for the UAV."""
         return ACCELERATION_MODELS[self._model % len(ACCELERATION_MODELS)]
 
     @property

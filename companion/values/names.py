@@ -1,4 +1,4 @@
-"""Ids of frame senders and of UAVs."""
+"""Identifiers: ids of frame senders and of UAVs."""
 
 from enum import Enum
 from functools import lru_cache

@@ -88,7 +88,7 @@ class BeamState:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ArrayState:
-    """The antenna array."""
+    """Antenna array as the API shows it."""
 
     kind: Annotated[ArrayKind, Meaning("geometry of the array")]
     elements: Annotated[int, Meaning("number of elements")]

@@ -181,7 +181,7 @@ class Fault:
 
     @classmethod
     def parse(cls, text: str) -> Self:
-        """Parse a fault.
+        """Parse a value of ``--fault``.
 
         Raises ``FaultError`` with the cause and what is allowed.
         """

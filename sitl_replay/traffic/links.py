@@ -36,7 +36,7 @@ Receive = Callable[[Hashable, bytes], None]
 
 
 def ignore(_peer: Hashable, _data: bytes) -> None:
-    """Discard received bytes."""
+    """Discard received bytes: a ``Receive`` for links that only send."""
 
 
 class TrafficLink:

@@ -15,7 +15,7 @@ from companion.values import FloatArray, UserError
 
 
 class ElementPattern(StrEnum):
-    """Shape of an element's pattern."""
+    """Shape of an antenna element's pattern."""
 
     ISOTROPIC = "isotropic"
     COSINE = "cosine"

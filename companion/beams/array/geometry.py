@@ -72,7 +72,7 @@ class Array:
 
     @property
     def size(self) -> int:
-        """M, the number of elements."""
+        """M, the number of elements of the array."""
         return len(self.elements_m)
 
     def fed(self, weights: ComplexArray) -> ComplexArray:

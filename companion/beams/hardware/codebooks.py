@@ -54,7 +54,7 @@ class Codebook:
 
     @property
     def size(self) -> int:
-        """K, the number of beams."""
+        """K, the number of beams in the codebook."""
         return int(self.weights.shape[1])
 
 

@@ -39,7 +39,7 @@ class UnitGains:
 
     @property
     def settings(self) -> Resolution:
-        """Possible settings of one channel."""
+        """Possible gain and phase settings of one channel."""
         step_db = TMYTEK_STEP_DB if self.range_db else None
         return stepped(360, step_db, self.range_db, off=True)
 

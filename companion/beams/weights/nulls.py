@@ -44,7 +44,7 @@ TOLERATED_DIP: Final = 0.05
 """Relative depth of a dip below the protected gain that is tolerated: some .15 dB."""
 NEGLIGIBLE_GAIN: Final = 1e-9  # gain that counts as 0
 NULL_WIDTHS: Final = 1.0
-"""Natural widths from a cone's edge at which a null no longer reaches into it."""
+"""Distance from a cone's edge, in natural widths, at which a null does not affect the cone."""
 NULL_LOADING: Final = (
     0.02  # loading of the points around a predicted direction, relative to their power
 )

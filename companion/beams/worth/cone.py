@@ -233,7 +233,7 @@ def _intervals(count: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _sectors(rings: int) -> tuple[FloatArray, FloatArray]:
-    """Return rings of the unit disc, the n-th in 6n sectors about as long as they are wide."""
+    """Return cells of the unit disc: ring n has 6n sectors about as long as they are wide."""
     parts = 6 * np.arange(1, rings + 1)
     ring = np.repeat(np.arange(rings), parts)
     sector = np.arange(len(ring)) - np.repeat(np.cumsum(parts) - parts, parts)

@@ -232,7 +232,7 @@ def _db(gains: FloatArray) -> FloatArray:
 
 
 def _unit_power(array: Array, weights: ComplexArray) -> ComplexArray:
-    """Scale weights to |f| = 1, in two steps, since squares of very small numbers are 0."""
+    """Scale weights to |f| = 1 in two steps, since squares of very small numbers are 0."""
     if weights.shape != (array.size,) or not np.isfinite(weights).all():
         raise ValueError(f"weights must be {array.size} finite numbers, one for each element")
     most = np.abs(weights).max()

@@ -111,7 +111,7 @@ class BootLine:
         self._previous: tuple[Floor, int] | None = None  # the previous line, and when it was left
 
     def observe(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
-        """Place a stamp.
+        """Place a stamp on the clock line.
 
         Returns None for a frame of the previous line, and for a stamp off the line that is not yet
         confirmed by others.
@@ -185,7 +185,7 @@ class BootLine:
         return self._accept(arrival_ns, x_ns)
 
     def _place_ahead(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
-        """Once others confirm it, place a stamp that implies that all earlier ones were late.
+        """Place a stamp that implies that all earlier ones were late, once others confirm it.
 
         A single forged stamp could otherwise move the clock by any amount.
         """

@@ -115,7 +115,7 @@ class Floor:
     # --- input ------------------------------------------------------------------------------
 
     def add(self, x_ns: int, y_ns: int) -> None:
-        """Add a stamp: its sender time, and its arrival less that time."""
+        """Add a stamp: its sender time, and its arrival less its sender time."""
         self.rise_ns = 0.0
         self._newest_arrival_ns = x_ns + y_ns
         if not self.count:

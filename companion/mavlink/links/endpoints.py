@@ -34,7 +34,7 @@ class Upcalls(NamedTuple):
 
 
 class Endpoint(Protocol):
-    """One end of a link, of any kind."""
+    """One end of a link, of any kind: a socket, a serial device, a Zenoh session."""
 
     def open(self) -> int | None:
         """Claim local resources before the loop runs; return the port of a listening link.

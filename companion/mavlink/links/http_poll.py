@@ -47,11 +47,11 @@ class HttpPoll:
         return ()
 
     def write(self, key: Hashable, raw: bytes) -> bool:
-        """Send nothing."""
+        """Send nothing: the link is receive-only."""
         return False
 
     def fullness(self, key: Hashable) -> float:
-        """Return 0: there is no buffer."""
+        """Return 0: the link has no send buffer."""
         return 0.0
 
 

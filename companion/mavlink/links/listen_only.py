@@ -14,7 +14,7 @@ class TcpListen(TcpOut):
         return ()
 
     def write(self, key: Hashable, raw: bytes) -> bool:
-        """Send nothing."""
+        """Send nothing: the link is receive-only."""
         return False
 
 
@@ -22,5 +22,5 @@ class UdpListen(UdpIn):
     """Receive-only link that listens for datagrams."""
 
     def write(self, key: Hashable, raw: bytes) -> bool:
-        """Send nothing."""
+        """Send nothing: the link is receive-only."""
         return False

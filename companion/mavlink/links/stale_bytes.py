@@ -31,7 +31,7 @@ class StaleBytes:
         self._next = asyncio.get_running_loop().call_later(LOOK_S, self.watch)
 
     def close(self) -> None:
-        """Stop checking."""
+        """Stop checking for stale bytes."""
         if self._next is not None:
             self._next.cancel()
 

@@ -101,7 +101,7 @@ class TcpIn:
                 stream.abort()
 
     def peers(self) -> Collection[Hashable]:
-        """Return every writable connection."""
+        """Return every connection to which frames can be written."""
         return tuple(stream for stream in self._streams if stream.is_open())
 
     def write(self, key: Hashable, raw: bytes) -> bool:

@@ -244,7 +244,7 @@ class Link:
         return peer is not None and self._send(peer, message)
 
     def _send(self, peer: Peer, message: Outgoing) -> bool:
-        """Send to one peer: as MAVLink 1 if it uses only that and the link has no guard.
+        """Send to one peer: as MAVLink 1 if the peer uses only that and the link has no guard.
 
         MAVLink 1 cannot be signed.
         """

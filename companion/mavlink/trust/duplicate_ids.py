@@ -148,7 +148,7 @@ class DuplicateIds:
         return False
 
     def _is_duplicate(self, frame: Frame, sender: _SenderPaths) -> bool:
-        """Return whether the peers of a sender contradict each other; add it to ``found`` if so."""
+        """Return whether a sender's peers contradict each other; if so, add it to ``found``."""
         when = sender.contradicted_ns
         while when and frame.t_ns - when[0] > KEPT_NS:
             when.popleft()

@@ -234,7 +234,7 @@ class Watch:
         )
 
     def acknowledged(self, t_ns: int, result: int) -> None:
-        """Process a COMMAND_ACK to the newest request; after a refusal it answers another."""
+        """Process a COMMAND_ACK to the newest request; on refusal, a data stream is next."""
         if self._by_stream:
             return
         if result == _ACCEPTED:

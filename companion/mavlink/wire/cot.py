@@ -167,7 +167,7 @@ def _fields(message: bytes) -> Iterator[tuple[int, int | float | bytes]]:
 
 
 def varint(message: bytes, at: int) -> tuple[int, int]:
-    """Decode a varint; return it and the index after it. Raises ``ValueError``."""
+    """Decode a varint; return its value and the index after it. Raises ``ValueError``."""
     value = 0
     for number, byte in enumerate(message[at : at + 10]):
         value |= (byte & 0x7F) << 7 * number

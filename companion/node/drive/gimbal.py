@@ -85,7 +85,7 @@ class Gimbal:
             self._point(DeviceCommand(valid_at_ns=0, unfit=None))
 
     def close(self) -> None:
-        """Close the socket."""
+        """Close the gimbal's socket."""
         if self._socket:
             self._socket.close()
             self._socket = None

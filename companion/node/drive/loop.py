@@ -50,7 +50,7 @@ class SourceLostError(Exception):
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class DeviceCommand:
-    """Command to a device.
+    """Command that a drive sends to a device.
 
     place        position of the UAV: latitude and longitude in degrees, height above mean sea level
                  in metres; None if unknown
@@ -91,7 +91,7 @@ class Device(Protocol):
     def open(self) -> None: ...
     def apply(self, command: DeviceCommand) -> None: ...
     def rest(self, safe: SafeState) -> None:
-        """Go to a safe state."""
+        """Put the device into a safe state."""
 
     def close(self) -> None:
         """Close the device; raises nothing."""

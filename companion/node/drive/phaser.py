@@ -70,7 +70,7 @@ class Phaser:
                 pass
 
     def close(self) -> None:
-        """Release the Phaser."""
+        """Release the connection to the Phaser."""
         self._phaser = None
 
     def _set(self, wanted: dict[int, tuple[int, int, int]]) -> None:

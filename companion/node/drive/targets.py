@@ -96,10 +96,10 @@ class DryRun:
         """Accept every safe state."""
 
     def open(self) -> None:
-        """Do nothing."""
+        """Do nothing: there is no device."""
 
     def apply(self, shot: DeviceCommand) -> None:
-        """Print the command."""
+        """Print the device command."""
         if shot.stored is not None:
             self._say(f"{shot.uav}: stored beam {shot.stored}")
             return
@@ -112,8 +112,8 @@ class DryRun:
         self._say(f"{shot.uav}: element:phase/gain {' '.join(sets)}")
 
     def rest(self, safe: SafeState) -> None:
-        """Print the safe state."""
+        """Print the device's safe state."""
         self._say(f"safe state: {safe}")
 
     def close(self) -> None:
-        """Do nothing."""
+        """Do nothing: there is no device."""

@@ -36,11 +36,11 @@ class Unanswered:
         self._looked_ns: int | None = None
 
     def asked(self, now_ns: int, node: str) -> None:
-        """Note a request to a node."""
+        """Note a clock request to a node."""
         self._since.setdefault(node, now_ns)
 
     def answered(self, node: str) -> None:
-        """Note an answer of a node."""
+        """Note a node's answer to a clock request."""
         self._since.pop(node, None)
 
     def gone(self, now_ns: int, heard_ns: Mapping[str, int]) -> list[str]:

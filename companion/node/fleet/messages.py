@@ -92,7 +92,7 @@ def to_standing(data: bytes, node: str) -> Standing:
 
 
 def offers(said: dict[str, Offer]) -> bytes:
-    """Encode all offers of a node."""
+    """Encode all offers of a node to UAVs."""
     message = schemas.OffersMessage()
     message.offer.extend(schemas.message("Offer", one) for one in said.values())
     found: bytes = message.SerializeToString()

@@ -36,7 +36,7 @@ from companion.values import (
 NODES_MAX: Final = 256  # limit on other nodes; further ones are ignored
 HANDOVERS_KEPT: Final = 500
 OFFERS_KEPT_NS: Final = 10_000_000_000
-"""Validity of a node's offers."""
+"""Time for which a node's offers are valid."""
 FORGET_NS: Final = 600_000_000_000
 GONE_MAX: Final = 64  # limit on remembered nodes that left
 

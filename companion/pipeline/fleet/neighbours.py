@@ -76,7 +76,7 @@ class NeighbourClock:
 
 @dataclass(slots=True, kw_only=True)
 class Neighbour:
-    """State of another node."""
+    """State of another node of the fleet."""
 
     clock: NeighbourClock
     started_ns: int | None = None

@@ -53,7 +53,7 @@ class Offers:
         return self._made_of(now_ns, chosen) if chosen else None
 
     def take(self, made: dict[str, Offer]) -> None:
-        """Store computed offers."""
+        """Store the computed offers."""
         self.made |= made
 
     def _made_of(self, now_ns: int, uavs: list[str]) -> Callable[[], dict[str, Offer]]:

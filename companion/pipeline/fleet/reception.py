@@ -60,7 +60,7 @@ class _VehicleReception:
     missed: deque[Frame] = field(default_factory=lambda: deque(maxlen=MISSED))
 
     def is_silent(self, now_ns: int) -> bool:
-        """Return whether its last report is too old, if all frames until ``now_ns`` were read."""
+        """Return whether the vehicle's last report is too old, if no frame is unread."""
         least_ns, most_ns = SILENT_NS
         wait_ns = min(max(SILENT_INTERVALS * self.interval_ns, least_ns), most_ns)
         return now_ns - self.heard_ns > wait_ns

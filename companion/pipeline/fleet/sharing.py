@@ -162,7 +162,7 @@ class Sharing:
         self._enqueue(self._frames, SharedFrame(frame.t_ns, frame.raw))
 
     def _enqueue(self, waiting: deque[_T], one: _T) -> None:
-        """Add to a queue; drop its oldest entry if it is full."""
+        """Add to a queue of frames or round trips; drop its oldest entry if it is full."""
         if len(waiting) >= HELD_MAX:
             waiting.popleft()
             self.dropped += 1

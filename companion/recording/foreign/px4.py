@@ -1,4 +1,4 @@
-"""Interpretation of PX4's ULog.
+"""Interpretation of PX4's ULog: topics to samples.
 
 Meanings and units: https://docs.px4.io/main/en/msg_docs/. GLOBAL_POSITION_INT is built as in PX4,
 from vehicle_global_position and the velocity of vehicle_local_position; ``*_groundtruth`` is the

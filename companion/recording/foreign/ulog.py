@@ -116,7 +116,7 @@ class UlogTable:
 
 
 def table(data: Bytes, walked: UlogIndex, *names: str) -> UlogTable:
-    """Return the samples of the first of these topics in the log, from its lowest instance."""
+    """Return the samples of the first of some topics that the log has, from its lowest instance."""
     for name in names:
         there = [topic for topic in walked.topics if topic.name == name and len(topic.at)]
         if there:

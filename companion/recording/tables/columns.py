@@ -13,7 +13,7 @@ _AXES: Final = ("north", "east", "down")
 
 
 class ColumnKind(StrEnum):
-    """Kind of the values of a column.
+    """Kind of the values in a column.
 
     TEXT     text; an empty text is unknown
     NUMBER   64-bit floating point; a number that is not finite is unknown

@@ -65,7 +65,7 @@ class BeamStudy:
 
     @property
     def command(self) -> str:
-        """Command line of the study."""
+        """Command line that runs the study."""
         logs = chain.from_iterable(self.flights)
         given = {"center": self.center, "config": self.config, "links": self.links, "hz": self.hz}
         return command_line("beams", *logs, **given)

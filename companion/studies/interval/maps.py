@@ -30,7 +30,7 @@ FEEDTHROUGHS_S: Final = (-0.2, 0.0, 0.2, 0.5)
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
 class Maps:
-    """Maps of the interval study."""
+    """Maps of the interval study: gains and errors over alpha and feedthrough."""
 
     alpha: FloatArray  # (A,), decay axis
     feedthrough_s: FloatArray  # (D,), feedthrough axis

@@ -91,7 +91,7 @@ class LinkStudy:
 
     @property
     def command(self) -> str:
-        """Command line of the study."""
+        """Command line that runs the study."""
         return command_line(
             "link",
             *self.logs,

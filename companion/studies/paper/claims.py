@@ -11,7 +11,7 @@ from typing import Any, Final
 
 
 class ClaimVerdict(StrEnum):
-    """Verdict on a claim."""
+    """Verdict on a claim of the paper."""
 
     HOLDS = "holds"
     CORRECTED = "holds with a correction"

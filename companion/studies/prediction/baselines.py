@@ -68,7 +68,7 @@ class Hold:
         self._last: ObservedReport | None = None
 
     def report(self, report: ObservedReport) -> None:
-        """Replace the held report."""
+        """Replace the held report by a new one."""
         self._last = report
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:

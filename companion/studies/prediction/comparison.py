@@ -100,7 +100,7 @@ class PredictionStudy:
 
     @property
     def command(self) -> str:
-        """Command line of the study."""
+        """Command line that runs the study."""
         radio = self.radio
         return command_line(
             "prediction",

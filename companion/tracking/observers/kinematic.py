@@ -175,7 +175,7 @@ class KinematicObserver:
         return 1.0 + rate * t, 0.0, rate, 0.0
 
     def after(self, state: KinematicState, predicted: Prediction, fix: Fix) -> KinematicState:
-        """Return the state at a report.
+        """Return the observer's state at a report.
 
         The observer is delayed: the estimate at a report does not use that report yet.
         """

@@ -102,7 +102,7 @@ class PositionObserver:
         return None
 
     def after(self, _state: PositionState, predicted: Prediction, fix: Fix) -> PositionState:
-        """Return the state at a report.
+        """Return the observer's state at a report.
 
         The observer is delayed: the estimate at a report does not use that report yet.
         """

@@ -55,7 +55,7 @@ class UpdateRow(_OfUpdate):
 
 @dataclass(frozen=True, kw_only=True)
 class TrackRow(_OfUpdate):
-    """Track at an update, with its position."""
+    """Track at an update with its position, as a table row."""
 
     update: Update
     track: Annotated[Track, Inline(omit=("valid_at_ns",))]
@@ -65,7 +65,7 @@ class TrackRow(_OfUpdate):
 
 @dataclass(frozen=True)
 class BeamRow(_OfUpdate):
-    """Beam at an update."""
+    """Beam at an update, as a table row."""
 
     update: Update
     beam: Annotated[Beam, Inline()]

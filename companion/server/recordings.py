@@ -54,7 +54,7 @@ class Recording:
 
 @dataclass(frozen=True, slots=True)
 class Recordings:
-    """Answer with the recordings, by name."""
+    """List of the available recordings, by name."""
 
     recordings: Annotated[list[Recording], Meaning("the recordings, by name")]
 

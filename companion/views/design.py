@@ -77,7 +77,7 @@ class UavDesign:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Design:
-    """Answer about the observer in use."""
+    """Observer in use, with its gains and its certificate."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     model: Annotated[Model, Meaning("the observer's model")]

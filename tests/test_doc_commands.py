@@ -76,8 +76,8 @@ HELP = click.Option(["--help"])
 def ended(words: list[str], where: Path, studied: Callable[..., Path]) -> None:
     """Run a command on a log to its end."""
     if words[1] == "study":
-        given = [str(ROOT / "tests/data/sitl_4circle_cut.tlog") if one.endswith(".tlog") else one
-                 for one in words[2:-2]]  # fmt: skip
+        log = str(ROOT / "tests/data/sitl_4circle_cut.tlog")
+        given = [log if one.endswith(".tlog") or one == "LOG" else one for one in words[2:-2]]
         assert words[-2] == "--out"
         assert (studied(*given) / f"{given[0]}.html").exists()
         return

@@ -223,7 +223,7 @@ def test_invalid_codebook_is_reported_once(
     config.write_text(f'[codebook]\nkind = "file"\nfile = "{file}"\n', encoding="utf-8")
     message = mistake(cut_log, "--config", str(config), at="1e6")
     assert said in message
-    assert message.count("codebook") == 1
+    assert message.replace(str(tmp_path), "").count("codebook") == 1
 
 
 def test_integer_codebook_is_accepted(cut_log: Path, tmp_path: Path) -> None:

@@ -133,7 +133,7 @@ def test_no_bound_is_violated(flights: dict[str, Outcome], name: str) -> None:
 def test_a_drift_beyond_the_greatest_is_told(flights: dict[str, Outcome]) -> None:
     """A clock that is 2.4 % slow looks like a link that slows; one that is fast hides nothing."""
     done = flights["senders"]
-    told = {one["subject"] for one in done.events if "stood still" in one["text"]}
+    told = {one["subject"] for one in done.events if "clock stalled" in one["text"]}
     assert "1:1" in told or "6:1" in told
     for uav in ("1:1", "6:1"):
         assert done.touched[f"drift@{uav}"] > 100
@@ -355,7 +355,9 @@ def test_of_two_with_one_id_a_track_follows_one(flights: dict[str, Outcome]) -> 
 def test_two_with_one_id_are_told(flights: dict[str, Outcome]) -> None:
     done = flights["shared-id"]
     assert done.uavs["1:1"]["rejected"]["shared-id"] > 0
-    assert [one["severity"] for one in done.events if "share the id" in one["text"]] == ["warning"]
+    assert [one["severity"] for one in done.events if "send under the id" in one["text"]] == [
+        "warning"
+    ]
 
 
 def test_adsb_traffic_is_tracked_apart_and_one_of_it_is_known(flights: dict[str, Outcome]) -> None:

@@ -204,7 +204,7 @@ def test_a_node_that_invents_vehicles_is_put_aside(fleet: Fleet) -> None:
             await asyncio.to_thread(bus.close)
 
     run_async(lie())
-    assert "node liar is not believed" in fleet.nodes["b"].errors()
+    assert "node liar is excluded for" in fleet.nodes["b"].errors()
 
 
 def test_a_node_that_is_killed_is_followed(fleet: Fleet) -> None:

@@ -128,7 +128,7 @@ def test_flight_is_assessed(tmp_path: Path) -> None:
         sending.terminate()
     assert done.returncode == 0, done.stdout + done.stderr
     found = {each["subject"]: each for each in json.loads(done.stdout)["findings"]}
-    assert "frames of 1:1" in found[f"link udpin:127.0.0.1:{port}"]["text"]
+    assert "frames from 1:1" in found[f"link udpin:127.0.0.1:{port}"]["text"]
     assert found["carrier 5:1"]["grade"] == "ok"
     judged = [each for name, each in found.items() if name.startswith("UAV ")]
     assert len(judged) >= 2

@@ -482,7 +482,7 @@ def test_lobe_matches_a_dense_scan(name: str, seed: int) -> None:
     assert patterns.response_db(array, weights, peak) == pytest.approx(found.peak_db, abs=1e-6)
     near = peak + 1e-3 * rng.standard_normal((50, 3))
     near /= np.linalg.norm(near, axis=1)[:, np.newaxis]
-    assert patterns.response_db(array, weights, near).max() <= found.peak_db + 1e-6
+    assert patterns.response_db(array, weights, near).max() <= found.peak_db + 1e-5
     offsets = np.linspace(0, 2 * np.pi, 20_001)
     flat = name.startswith(("line", "rectangle"))
     for lobe, along in (

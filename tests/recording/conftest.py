@@ -1,4 +1,4 @@
-"""Small recordings and frames, made here; and where the big logs are, if they are."""
+"""Small synthetic recordings and frames, and the location of the large logs if present."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -41,7 +41,7 @@ SHARED = Path(__file__).parents[3] / "shared" / "data"
 
 @pytest.fixture(scope="session")
 def shared_logs() -> list[Path]:
-    """Every log that other programs made; the test is skipped where they are missing."""
+    """All logs from other programs; the test is skipped if they are missing."""
     logs = sorted(SHARED.glob("*.tlog"))
     if not logs:
         pytest.skip(f"the shared recordings are missing ({SHARED})")
@@ -71,13 +71,13 @@ def wire() -> Callable[..., list[bytes]]:
 
 @pytest.fixture(scope="session")
 def geodetic() -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]:
-    """A stand-in for the geodesy: it only has to tell the axes apart."""
+    """Stub for the geodesy; it only has to distinguish the axes."""
     return lambda ned_m: (47 + ned_m[:, 0] / 1e5, 8 + ned_m[:, 1] / 1e5, -ned_m[:, 2])
 
 
 @pytest.fixture(scope="session")
 def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
-    """``events(n)``: frames, ticks, framing rejections, round trips; times step back."""
+    """``events(n)``: frames, ticks, framing rejections, round trips; times may step back."""
 
     def make(count: int) -> list[Event]:
         made: list[Event] = []
@@ -128,7 +128,7 @@ def _track(uav: str, t_ns: int) -> Track:
 
 @pytest.fixture(scope="session")
 def update() -> Callable[[int], Update]:
-    """``update(t_ns)``: two tracks, one beam on each, one UAV left out."""
+    """``update(t_ns)``: two tracks with one beam each, and one UAV left out."""
     weights = np.array((np.arange(8).reshape(4, 2) + 0.5) * (1 - 2j), dtype=np.complex128)
 
     def make(t_ns: int) -> Update:
@@ -184,7 +184,7 @@ def update() -> Callable[[int], Update]:
 
 @pytest.fixture(scope="session")
 def estimate() -> Estimate:
-    """An accepted report, true a tenth of a second before it came."""
+    """An accepted report that was measured a tenth of a second before its arrival."""
     report = Report(
         t_ns=START_NS,
         uav="1:1",
@@ -223,9 +223,9 @@ def record(
     update: Callable[[int], Update],
     estimate: Estimate,
 ) -> Callable[..., list[Event]]:
-    """``record(writer, n)``: writes n frames and what came of them; returns the events.
+    """``record(writer, n)``: write n frames and their outputs; return the events.
 
-    ``flush_every``: frames between flushes; ``flushed`` takes (bytes, events) at each.
+    ``flush_every``: frames between flushes; ``flushed`` receives (bytes, events) at each flush.
     """
 
     def run(
@@ -249,7 +249,7 @@ def record(
                 )
                 writer.output(notice, geodetic)
             if isinstance(event, Rejection):
-                writer.output(event, geodetic)  # as the pipeline hands it through
+                writer.output(event, geodetic)  # as the pipeline passes it on
             if flush_every and number % flush_every == 0:
                 writer.flush()
                 if flushed is not None:

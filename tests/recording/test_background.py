@@ -1,4 +1,4 @@
-"""The recorder's thread: it writes what it is handed, and its failures stay its own."""
+"""The recorder thread writes what is queued, and its failures do not reach the service."""
 
 import errno
 import os
@@ -49,7 +49,7 @@ def nowhere(positions: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
 
 
 def recorder(folder: Path, rotation: Rotation | None = None, **more: int) -> BackgroundRecorder:
-    """A recorder on fresh files."""
+    """A recorder with new files."""
 
     def open_part(part: Part) -> Writer:
         return Writer(
@@ -67,7 +67,7 @@ def recorder(folder: Path, rotation: Rotation | None = None, **more: int) -> Bac
 
 
 def wait_until(good: Callable[[], bool], seconds: float = HANG_S) -> None:
-    """The recorder is another thread's: it is asked until it is so."""
+    """Poll until the condition holds: the recorder runs in another thread."""
     end = time.monotonic() + seconds
     while not good():
         assert time.monotonic() < end
@@ -75,12 +75,12 @@ def wait_until(good: Callable[[], bool], seconds: float = HANG_S) -> None:
 
 
 def on_disk(made: BackgroundRecorder) -> int:
-    """Messages that are safe in the newest file."""
+    """Number of messages flushed to the newest file."""
     return made._writer.flushed
 
 
 def waiting(made: BackgroundRecorder) -> int:
-    """Items in the queue."""
+    """Number of queued items."""
     return made.queued
 
 
@@ -93,7 +93,7 @@ def ticks(first: int, last: int) -> list[Event]:
 
 
 def incompressible(first: int, last: int) -> list[Event]:
-    """Events that take more room than the last page of a file on a full disk may have left."""
+    """Events larger than the free part of the last page of a file on a full disk."""
     make = Random(first)
     return [
         Rejection(
@@ -115,7 +115,7 @@ def parts_of(folder: Path) -> list[Path]:
 
 
 def test_who_lives_for_a_moment_leaves_what_it_heard(tmp_path: Path) -> None:
-    """Before a second has passed, the first events are on the disk; later they may wait for it."""
+    """The first events are on disk within a second; later ones may wait for the next flush."""
     made = recorder(tmp_path)
     made.start()
     begun_s = time.monotonic()
@@ -158,12 +158,12 @@ def test_a_full_disk_that_is_emptied_leaves_no_hole(small_disk: Path) -> None:
     wait_until(lambda: made.failure is None)
     events += hand_over(made, ticks(9000, 9100))
     made.stop({"digest": "d"})
-    (severity, said), *_, (_, again) = made.news()  # a busy disk may be said to be slow between
+    (severity, said), *_, (_, again) = made.news()  # a busy machine may report a slow disk
     assert severity is Severity.ERROR and "No space left" in said
     assert "recording again" in again
     assert made.dropped == 0 and not made.degraded
     first, second = parts_of(small_disk)
-    assert first.name.endswith(".active")  # recovered when the service starts again
+    assert first.name.endswith(".active")  # recovered at the next start of the service
     assert list(log_events([second, first], Settings())) == events
     assert missing([first, second]) == []
     assert missing([second]) == [f"{second}: part 1 of the run is missing"]
@@ -172,7 +172,8 @@ def test_a_full_disk_that_is_emptied_leaves_no_hole(small_disk: Path) -> None:
 
 
 def test_a_full_disk_keeps_no_file_of_nothing(small_disk: Path) -> None:
-    """One was left by each new attempt, to be recovered as a recording without a frame."""
+    """Regression: each retry left an empty file, which was recovered as a recording without
+    frames."""
     fill(small_disk)
     with pytest.raises(OSError, match="No space left"):
         Writer(
@@ -184,9 +185,9 @@ def test_a_full_disk_keeps_no_file_of_nothing(small_disk: Path) -> None:
 def test_a_full_disk_is_looked_at_again_as_soon_however_long_it_is_full(
     small_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Waiting twice as long each time, it kept in memory twice what the outage made it keep."""
+    """Regression: with a doubling retry interval, the queue kept twice the events of the outage."""
     monkeypatch.setattr(background, "RETRY_FIRST_S", 0.01)
-    monkeypatch.setattr(background, "GATHER_S", 0.005)  # so that each longer wait is a retry's
+    monkeypatch.setattr(background, "GATHER_S", 0.005)  # so that only retries wait this long
     made, waits_s = recorder(small_disk), list[float]()
     wait = made._stopping.wait
 
@@ -211,7 +212,7 @@ def test_a_full_disk_is_looked_at_again_as_soon_however_long_it_is_full(
 def test_what_fits_into_little_room_is_kept_of_what_waits(
     small_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All that waited had to fit at once, and was written anew by each attempt."""
+    """Regression: all queued events had to fit at once and were rewritten by each retry."""
     monkeypatch.setattr(background, "RETRY_FIRST_S", 0.05)
     monkeypatch.setattr(background, "RETRY_MAX_S", 0.05)
     monkeypatch.setattr(background, "MIN_FREE_BYTES", 0)
@@ -270,7 +271,7 @@ def test_a_disk_that_stays_full_is_said_once_and_does_not_hold_up_the_end(small_
     began_s = time.monotonic()
     made.stop({})
     assert time.monotonic() - began_s < 5
-    kept = made._finished_messages + on_disk(made)  # what was written before it was all handed over
+    kept = made._finished_messages + on_disk(made)  # written before all events were queued
     assert made.dropped == 2999 - kept
     assert len(made.news()) == 1
     assert kept or [path.name for path in small_disk.iterdir()] == [BALLAST]
@@ -298,7 +299,7 @@ print(made.dropped, [text for _, text in made.news()][0])
 
 @pytest.mark.full
 def test_a_file_that_may_not_grow_is_gone_on_with_in_another(tmp_path: Path) -> None:
-    """Without root: a limit on the size of files, which the system enforces in mid-write."""
+    """Without root: the system enforces a file size limit in the middle of a write."""
     done = subprocess.run(
         [sys.executable, "-c", _LIMITED, tmp_path, Path(__file__).parent, ROOT / "tests"],
         capture_output=True, text=True, check=True, timeout=HANG_S,
@@ -332,7 +333,7 @@ def test_a_folder_that_is_removed_is_made_again(tmp_path: Path) -> None:
 def test_a_slow_disk_drops_counts_and_tells(
     tmp_path: Path, update: Callable[[int], Update]
 ) -> None:
-    """The thread is at work on an output that waits for a pipe, as a write waits for a disk."""
+    """The thread blocks on an output that waits for a pipe, as a write waits for a slow disk."""
     reading, writing = os.pipe()
     waits = [True]
 
@@ -386,7 +387,7 @@ def said(t_ns: int) -> list[Output]:
 
 
 def test_a_hole_in_the_queue_counts_events_alone(tmp_path: Path) -> None:
-    """What is said without one is dropped too, but nothing of the log is missing for it."""
+    """Notices without a log event are dropped too, but they are not missing from the log."""
     made = recorder(tmp_path, queue_max=2)
     hand_over(made, ticks(1, 5))
     for n in range(3):
@@ -402,7 +403,7 @@ def test_a_hole_in_the_queue_counts_events_alone(tmp_path: Path) -> None:
 
 
 class _Broken(Writer):
-    """A file on a disk that fails for good: it cannot even be cut back."""
+    """A file on a disk that fails permanently: even truncation fails."""
 
     def flush(self) -> None:
         if self.messages:
@@ -435,7 +436,7 @@ def test_a_hole_in_a_broken_file_counts_events_alone(
     hand_over(made, ticks(1, 3))
     for n in range(3):
         made.put(None, said(START_NS + n))
-    made.start()  # as many as are kept: the disk is asked for all of them at once
+    made.start()  # as many as fit in the queue: one write asks the disk for all of them
     wait_until(lambda: made.failure is None and sound.exists())
     hand_over(made, ticks(3, 4))
     made.stop({})

@@ -1,4 +1,4 @@
-"""Faults that a log declares, read from the list beside it."""
+"""Faults declared in the event list next to a log."""
 
 import json
 from pathlib import Path
@@ -58,7 +58,7 @@ def test_what_is_no_list_of_events(tmp_path: Path, text: str) -> None:
 
 @pytest.mark.full
 def test_the_faults_of_a_simulated_flight() -> None:
-    """Each vehicle has its own window, widened for its estimate to settle."""
+    """Each vehicle has its own fault window, widened until its estimate has settled."""
     flights = vehicles.load(shared_log("sitl_4circle_wander.tlog"), "5:1").flights
     lasts_s = {f.uav: [(b - a) / S for a, b in f.faults] for f in flights}
     assert {uav: len(each) for uav, each in lasts_s.items()} == dict.fromkeys(lasts_s, 1)

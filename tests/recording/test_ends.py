@@ -1,4 +1,5 @@
-"""When a log begins and ends, from its two ends: as reading all of it says, or unknown."""
+"""Start and end time of a log, read from its two ends: equal to those of a full read, or
+unknown."""
 
 import random
 import struct
@@ -63,7 +64,8 @@ def test_a_small_file_tells_nothing(tmp_path: Path, tlog: Path, content: bytes) 
 def test_damage_is_never_a_failure_nor_another_time(
     tmp_path: Path, tlog: Path, recording: Path
 ) -> None:
-    """Any byte of the ends changed or cut off: unknown, or what a whole reading may say too."""
+    """Any byte of the ends changed or cut: the span is unknown or one that a full read may also
+    give."""
     rng = random.Random(5)
     damaged = tmp_path / "damaged"
     for path in (tlog, recording):

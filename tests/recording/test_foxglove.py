@@ -1,4 +1,4 @@
-"""The live channels, as a viewer has them: a WebSocket client that knows only the protocol."""
+"""The live channels, received by a WebSocket client that knows only the protocol."""
 
 import asyncio
 import base64
@@ -30,7 +30,7 @@ Geodetic = Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArray]]
 
 
 async def advertised(viewer: ClientConnection, topics: set[str]) -> dict[str, Any]:
-    """The channels by topic, once all of these are there."""
+    """The channels by topic, once all given topics are announced."""
     found: dict[str, Any] = {}
     while not topics <= found.keys():
         said = json.loads(await asyncio.wait_for(viewer.recv(), HANG_S))
@@ -40,7 +40,7 @@ async def advertised(viewer: ClientConnection, topics: set[str]) -> dict[str, An
 
 
 def message_class(channel: dict[str, Any]) -> Any:
-    """The class that a channel's schema, as it is sent, describes."""
+    """The message class described by a channel's schema."""
 
     pool = DescriptorPool()
     for file in FileDescriptorSet.FromString(base64.b64decode(channel["schema"])).file:
@@ -89,7 +89,7 @@ def test_a_viewer_is_sent_what_a_recording_holds(
         t_ns = next(now)
         live.put(Tick(t_ns), [estimate, update(t_ns)])
 
-    feed()  # before anybody watches: the topics of the UAV are announced by it
+    feed()  # before any viewer connects: this announces the topics of the UAV
     topics = {"/ticks", "/scene", "/tracks", "/beams/weights", "/uav/1:1/fix", "/uav/1:1/predicted"}
     try:
         found = run_async(watch(live.port, topics, feed))

@@ -1,4 +1,4 @@
-"""Recordings that were made to do harm: bounded in memory and time, and a line for the user."""
+"""Hostile recordings: bounded memory and time, and a one-line error for the user."""
 
 import os
 import random
@@ -43,7 +43,7 @@ def chunk(compression: bytes, packed: bytes, size: int, checksum: int = 0) -> by
 
 
 def described(topic: bytes = schemas.FRAMES_TOPIC.encode()) -> bytes:
-    """A schema and a channel with the id 1."""
+    """A schema and a channel, both with id 1."""
     schema = struct.pack("<H", 1) + text(b"companion.Frame") + text(b"protobuf") + text(b"")
     channel = struct.pack("<HH", 1, 1) + text(topic) + text(b"protobuf") + text(b"")
     return record(3, schema) + record(4, channel)
@@ -67,7 +67,7 @@ def no_frame(raw: bytes, t_ns: int = 1) -> bytes:
     return schemas.FrameMessage(t_ns=t_ns, sysid=1, compid=1, raw=raw).SerializeToString()
 
 
-# --- leftovers ----------------------------------------------------------------------------------
+# --- unfinished files ---------------------------------------------------------------------------
 
 
 def leftovers() -> dict[str, bytes]:
@@ -92,7 +92,7 @@ def test_a_leftover_is_dealt_with_once(tmp_path: Path, name: str) -> None:
     (found,) = recover_leftovers(tmp_path)
     assert isinstance(found, Recovered | LogError)
     assert not leftover.exists()
-    assert len(list(tmp_path.iterdir())) == 1  # finished, or as it was under another name
+    assert len(list(tmp_path.iterdir())) == 1  # finished, or unchanged under another name
     assert recover_leftovers(tmp_path) == []
     if isinstance(found, LogError):
         assert (tmp_path / "x.mcap.damaged").read_bytes() == leftovers()[name]
@@ -131,7 +131,7 @@ def test_a_leftover_that_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
 def test_random_damage_raises_nothing_else(
     tmp_path: Path, events: Callable[[int], list[Event]]
 ) -> None:
-    """Bytes changed, taken out, doubled, and lengths made large, 3000 times."""
+    """Bytes changed, removed and duplicated, and lengths enlarged, 3000 times."""
     _damaged_at_random(tmp_path, events, range(3000))
 
 
@@ -192,9 +192,9 @@ def damaged(whole: bytes, rng: random.Random) -> bytes:
 
 
 def bombs(folder: Path) -> list[Path]:
-    """Files that ask for gigabytes."""
+    """Files that would expand to gigabytes."""
     made = {
-        # 131 kB whose frame holds 4.2 GB, of which the chunk says nothing, or the same.
+        # 131 kB whose frame holds 4.2 GB; the chunk header omits the size or states it.
         "frame": MAGIC + chunk(b"zstd", zeros_zstd(4_200_000_000), 1000),
         "both": MAGIC + chunk(b"zstd", zeros_zstd(4_200_000_000), 4_200_000_000),
         "claim": MAGIC + chunk(b"zstd", zeros_zstd(1000, 2**62), 2**62),
@@ -280,7 +280,7 @@ for path in map(Path, sys.argv[1:]):
     "names", [QUICK, *(pytest.param(names, marks=pytest.mark.full) for names in (SLOW, PAIRS))]
 )
 def test_no_file_takes_more_memory_than_there_is(tmp_path: Path, names: frozenset[str]) -> None:
-    """Nor for ever: each is read, told and recovered within ``HANG_S``."""
+    """Time is bounded too: each file is read, described and recovered within ``HANG_S``."""
     wanted = [path for path in bombs(tmp_path) if path.stem in names]
     command = [sys.executable, "-c", _READ_ALL, *map(str, wanted)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=HANG_S)
@@ -307,7 +307,7 @@ def test_all_pairs_of_all_channels_are_bounded(tmp_path: Path) -> None:
     path.write_bytes(MAGIC + b"".join(_packed(_channel(number, pairs)) for number in range(1, 60)))
     walk = Walk(path)
     found = [isinstance(content, Damage) for content in walk]
-    assert found == sorted(found)  # once it is too much, nothing further is read
+    assert found == sorted(found)  # beyond the limit, reading stops
     assert 20 < len(walk.channels) < 40
     assert sum(len(channel.metadata) for channel in walk.channels.values()) < 140_000
 
@@ -337,11 +337,11 @@ def test_messages_are_read_as_they_are_asked_for(tmp_path: Path) -> None:
     walk = iter(Walk(path))
     assert isinstance(next(walk), Message)
     rest = list(walk)
-    assert len(rest) == 10_000  # all messages, and then the damage after them
+    assert len(rest) == 10_000  # all messages, then the damage after them
     assert isinstance(rest[-1], Damage)
 
 
-# --- what is whole, and nonsense ----------------------------------------------------------------
+# --- intact and malformed contents --------------------------------------------------------------
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""The layout that comes with the documentation is whole, and names only what a recording has."""
+"""The documented layout is complete and names only what a recording contains."""
 
 import json
 import re
@@ -14,7 +14,7 @@ PANELS = {"3D", "map", "Plot", "RosOut"}
 
 
 def leaves(node: Any) -> list[str]:
-    """The panels of a tree of splits."""
+    """The panels in a tree of splits."""
     if isinstance(node, str):
         return [node]
     assert node["direction"] in ("row", "column")

@@ -1,4 +1,4 @@
-"""Our writer of MCAP against that of the library: the same calls give the same bytes."""
+"""Our MCAP writer against the library's: the same calls give the same bytes."""
 
 import io
 import random
@@ -16,7 +16,7 @@ TOPICS = ("/a", "/b", "/uav/1:1/fix")
 
 
 def play(seed: int, made: McapFile | Library) -> None:
-    """The same calls to either: descriptions between messages, times in no order, flushes."""
+    """The same calls for both writers: schemas between messages, unordered times, flushes."""
     ours, chance = isinstance(made, McapFile), random.Random(seed)
     calls: Any = made
     attach = calls.attachment if ours else calls.add_attachment

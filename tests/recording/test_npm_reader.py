@@ -1,4 +1,4 @@
-"""The reader that web viewers use finds in our recordings what we wrote."""
+"""The MCAP reader of web viewers finds all messages in our recordings."""
 
 import hashlib
 import json
@@ -24,7 +24,7 @@ SCRIPT = Path(__file__).with_name("read_with_npm.mjs")
 
 @pytest.fixture(scope="module")
 def packages(pytestconfig: pytest.Config) -> Path:
-    """Where the packages are, kept from run to run; skipped where they are not to be had."""
+    """Folder of the packages, kept between runs; the test is skipped if they are unavailable."""
     npm = shutil.which("npm")
     if npm is None or shutil.which("node") is None:
         pytest.skip("there is no node and npm here")
@@ -44,7 +44,7 @@ def packages(pytestconfig: pytest.Config) -> Path:
 
 
 def read_with_npm(packages: Path, path: Path) -> Any:
-    """What the script prints."""
+    """The output of the script."""
     done = subprocess.run(
         ["node", SCRIPT, path],
         env=os.environ | {"PACKAGES": str(packages)},
@@ -57,7 +57,7 @@ def read_with_npm(packages: Path, path: Path) -> Any:
 
 
 def read_with_python(path: Path) -> dict[str, dict[str, Any]]:
-    """The same by the Python package."""
+    """The same output from the Python package."""
     topics: dict[str, dict[str, Any]] = {}
     with path.open("rb") as file:
         for schema, channel, message in make_reader(file).iter_messages():

@@ -1,4 +1,4 @@
-"""Files of one run find their order, and say what is missing; those of several do not mix."""
+"""Parts of one run are ordered and missing parts reported; parts of different runs do not mix."""
 
 import json
 import subprocess
@@ -41,7 +41,7 @@ def write(path: Path, part: Part | None, events: list[Event], hole: Hole | None 
 
 @pytest.fixture
 def run_in_three(tmp_path: Path, short_log: Path) -> tuple[list[Path], list[Event], str]:
-    """A flight in three parts whose names are not in order, its events and its digest."""
+    """A flight in three parts whose names are not in order, with its events and digest."""
     settings = Settings()
     pipeline = Pipeline(settings)
     events = list(with_ticks(read_log(short_log), settings.beams.update_hz))
@@ -80,7 +80,7 @@ def test_a_recovered_part_keeps_its_place(
 
 def test_what_is_not_there_is_said(run_in_three: tuple[list[Path], list[Event], str]) -> None:
     one, two, three = run_in_three[0]
-    assert missing_of([one, two]) == []  # of the end nobody can know
+    assert missing_of([one, two]) == []  # a missing last part cannot be detected
     assert missing_of([one, three]) == [f"{three}: part 2 of the run is missing"]
     assert missing_of([three]) == [f"{three}: part 1 to 2 of the run is missing"]
     assert missing_of([three, two]) == [f"{two}: part 1 of the run is missing"]
@@ -111,7 +111,7 @@ def test_different_runs_are_merged_by_time_as_before(tmp_path: Path, alone: bool
     one = write(tmp_path / "a.mcap", None if alone else Part.first(), [Tick(1), Tick(3)])
     other = write(tmp_path / "b.mcap", Part.first(), [Tick(2)])
     assert in_order({log: read_recording_info(log) for log in (one, other)}) is None
-    assert list(log_events([one, other], Settings())) == []  # ticks of their own are made
+    assert list(log_events([one, other], Settings())) == []  # ticks are generated
 
 
 def test_an_empty_part_is_part_of_a_run(tmp_path: Path) -> None:
@@ -130,7 +130,7 @@ def test_nonsense_about_parts_is_none() -> None:
 
 
 def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, short_log: Path) -> None:
-    """The file that the settings name may be another one, or none, when it is replayed."""
+    """The gains file named in the settings may have changed or be missing at replay."""
     from importlib import resources
 
     shipped = (resources.files("companion.tracking.design") / "kinematic_default.json").read_text()

@@ -1,4 +1,4 @@
-"""A recording cut anywhere, by whatever, is finished with no more than one flush lost."""
+"""Recovery of a recording truncated anywhere loses at most one flush."""
 
 import random
 import signal
@@ -102,7 +102,7 @@ def test_a_torn_file_reads_as_far_as_it_goes(
 def test_everything_of_an_intact_part_is_kept(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
-    """Message for message, outputs included, byte for byte."""
+    """Compare message for message, outputs included, byte for byte."""
     whole, _, flushed = recording
     cut = tmp_path / "cut.mcap"
     size = flushed[-1][0]
@@ -131,7 +131,7 @@ def test_a_finished_recording_is_left_alone(
     assert (result.path, result.changed, result.lost_bytes) == (whole, False, 0)
     assert whole.read_bytes() == before
     assert names(whole.parent) == [whole.name]
-    # Killed between the last byte and the new name: only the name is missing.
+    # Killed between the last byte and the rename: only the name is missing.
     active = tmp_path / "done.mcap.active"
     active.write_bytes(before)
     assert recover(active).path.read_bytes() == before
@@ -188,7 +188,7 @@ def test_damage_in_the_middle_costs_one_chunk_and_is_said(
 def test_damage_at_the_beginning_costs_no_more(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
-    """The first chunk describes the channels, and so does the end of the file if it is there."""
+    """The first chunk describes the channels, and so does the end of the file if present."""
     whole, driven, flushed = recording
     broken = bytearray(whole.read_bytes())
     broken[flushed[0][0] + 200] ^= 0xFF
@@ -200,7 +200,7 @@ def test_damage_at_the_beginning_costs_no_more(
     result = recover(path)
     assert result.lost_bytes == said.count
     assert list(read_log(result.path)) == events
-    # Neither one nor the other: what is there means nothing, and that is said.
+    # Without both, the remaining data cannot be decoded, and this is reported.
     path.write_bytes(broken[:-1])
     with pytest.raises(LogError, match="no MAVLink frame"):
         read_log(path)

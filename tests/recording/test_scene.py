@@ -1,4 +1,4 @@
-"""The picture in space says what the beams and tracks say, in frames with z upwards."""
+"""The 3D scene shows the beams and tracks of the update, in frames with z up."""
 
 import math
 from dataclasses import replace
@@ -43,7 +43,7 @@ def array_on(turn: tuple[float, float, float], lever_arm_m: FloatArray) -> Array
 
 
 def update_of(array: Array, turn: tuple[float, float, float], place_ned_m: FloatArray) -> Update:
-    """One track, live, and a beam on it, as the array at that place and attitude sees it."""
+    """One live track with a beam, seen from the array at the given position and attitude."""
     carrier = Carrier(
         valid_at_ns=NOW_NS,
         position_ned_m=np.array([10.0, -20.0, -30.0]),
@@ -125,7 +125,7 @@ def test_what_is_drawn_ends_at_the_uav(
     assert xyz(cone.pose.position) + half == pytest.approx(end, abs=1e-6)
     assert (cone.bottom_scale, cone.top_scale) == (0, 1)  # the apex is at the array
 
-    # The chain of frames leads to the same: the UAV's place seen from the array, z upwards.
+    # The chain of frames gives the same: the UAV position relative to the array, z up.
     on_map, on_carrier = scene.transforms(update)
     assert (on_map.parent_frame_id, on_map.child_frame_id) == (MAP, CARRIER)
     assert (on_carrier.parent_frame_id, on_carrier.child_frame_id) == (CARRIER, ARRAY)
@@ -188,7 +188,7 @@ def test_the_bound_is_the_cylinder_that_is_guaranteed_and_goes_by_itself() -> No
 
 @given(st.floats(-89, 89), st.floats(-180, 180), st.floats(-100, 9000))
 def test_the_map_stands_on_the_earth(lat_deg: float, lon_deg: float, alt_m: float) -> None:
-    """A point of the map, put into the Earth's frame, is where pymap3d has it."""
+    """A map point transformed to the Earth frame equals the result of pymap3d."""
     array = array_on((0.0, 0.0, 0.0), np.zeros(3))
     found = Scene(array, 2.0).origin(NOW_NS, lat_deg, lon_deg, alt_m)
     assert (found.parent_frame_id, found.child_frame_id) == ("wgs84", MAP)

@@ -1,4 +1,4 @@
-"""The hand-packed messages are those of the generated classes; values survive the round trip."""
+"""Hand-packed messages equal those of the generated classes; round trips are lossless."""
 
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
@@ -45,7 +45,7 @@ def test_a_hand_packed_frame_is_the_generated_one(frame: Frame) -> None:
         doubt_ns=frame.doubt_ns,
     )
     encoder = schemas.FrameEncoder()
-    encoder.encode(frame._replace(t_ns=7, raw=b"another"))  # its head is kept
+    encoder.encode(frame._replace(t_ns=7, raw=b"another"))  # its header is cached
     assert encoder.encode(frame) == generated.SerializeToString(deterministic=True)
 
 
@@ -81,7 +81,7 @@ def test_every_schema_is_complete_in_itself() -> None:
                    schemas.WEIGHTS, schemas.LOCATION_FIX, schemas.LOG):  # fmt: skip
         pool = DescriptorPool()
         for file in FileDescriptorSet.FromString(schema.descriptor_set).file:
-            pool.Add(file)  # raises where a dependency does not come before it
+            pool.Add(file)  # raises if a dependency does not precede its user
         assert pool.FindMessageTypeByName(schema.name).full_name == schema.name
 
 
@@ -101,7 +101,7 @@ def test_an_optional_field_says_so_to_every_reader() -> None:
 
 
 def test_the_numbers_of_the_fields_stay() -> None:
-    """A recording made yesterday is read tomorrow: these numbers are written in files."""
+    """Old recordings stay readable: these field numbers are stored in files."""
     numbers = {
         (name, field.name): field.number
         for message, name in ((schemas.FrameMessage, "Frame"), (schemas.RejectionMessage, "Rej"))

@@ -1,4 +1,4 @@
-"""Stamps of every bad kind come out as a time line that can be slept on."""
+"""Bad timestamps of every kind become a monotonic timeline that can be played."""
 
 from itertools import pairwise
 
@@ -54,7 +54,7 @@ def test_a_clock_set_back_does_not_stop_the_time() -> None:
     stamps += [50 * S + i * S // 10 for i in range(100)]
     times, bad = place_all(stamps)
     assert times[-1] == times[9] + stamps[-1] - stamps[10]
-    assert sum(bad) == 10  # a second of tenths before it is believed
+    assert sum(bad) == 10  # a second of 0.1 s steps before the new time is accepted
 
 
 def test_a_bad_first_stamp_does_not_move_all_others() -> None:

@@ -1,4 +1,4 @@
-"""Logs of other programs: every intact frame is found, whatever is broken around it."""
+"""Logs of other programs: every intact frame is found, whatever is damaged around it."""
 
 import random
 import struct
@@ -45,9 +45,9 @@ def lost(events: list[Event]) -> Counter[Reason]:
 
 
 def pymavlink_frames(data: bytes, gap: int) -> Iterator[bytes]:
-    """Frames that pymavlink itself can decode, from left to right, ``gap`` bytes before each.
+    """Frames that pymavlink can decode, from left to right, with ``gap`` bytes before each.
 
-    pymavlink takes frames of unknown ids without checking them; those are left out.
+    pymavlink accepts frames with unknown ids unchecked; those are excluded.
     """
     mav = dialect.MAVLink(None)
     at = gap
@@ -105,13 +105,13 @@ def test_a_frame_of_an_unknown_id_costs_only_itself(wire: Wire) -> None:
 
 
 def test_a_stamp_may_hold_magic_bytes(wire: Wire) -> None:
-    """Eight bytes that look like a frame's start, between two that cannot be checked."""
+    """Eight bytes that look like a frame header, between two frames that cannot be checked."""
     frames = wire(3)
     false_start = struct.pack(">Q", 0x0006_0AFD_0000_0000)
     data = stamped(frames) + (false_start + UNKNOWN) * 3 + false_start + frames[0]
     assert lost(list(read_tlog(data, "x"))) == {
         Reason.UNKNOWN_MESSAGE: 3,
-        Reason.BAD_STAMP: 1,  # it is of another year, but that is all
+        Reason.BAD_STAMP: 1,  # the only error: it belongs to another year
     }
 
 
@@ -119,7 +119,7 @@ def test_a_stamp_may_hold_magic_bytes(wire: Wire) -> None:
 
 
 def test_a_flipped_byte_costs_only_its_frame(wire: Wire) -> None:
-    """At every byte of a log in turn; a byte of a stamp costs no frame at all."""
+    """At every byte of a log in turn; a damaged timestamp byte loses no frame."""
     frames = wire(8)
     data = stamped(frames)
     record_of = [n for n, frame in enumerate(frames) for _ in range(8 + len(frame))]
@@ -160,7 +160,7 @@ def test_a_splice_costs_only_what_is_cut(wire: Wire) -> None:
         before = [f for f, end in zip(frames, ends, strict=True) if end <= first]
         after = [f for f, end in zip(frames, ends, strict=True) if end - len(f) >= last]
         found = raws(events)
-        # Two frames that are cut where they are alike make one of them again.
+        # Two frames cut at identical bytes join to one of them.
         joined = found[len(before) : len(found) - len(after)]
         assert found == [*before, *joined, *after]
         assert len(joined) <= 1 and set(joined) <= set(frames)
@@ -203,7 +203,7 @@ def test_a_bad_first_stamp_leaves_the_others_alone(wire: Wire) -> None:
 @settings(max_examples=examples(200))
 @given(st.lists(st.binary(max_size=40) | st.sampled_from([UNKNOWN, b"\xfd", b"\xfe\x09"])))
 def test_any_bytes_at_all(pieces: list[bytes]) -> None:
-    """Nothing raises, time never steps back, and no more is lost than was there."""
+    """Nothing raises, time is monotonic, and no more bytes are lost than were present."""
     data = b"".join(pieces)
     for events in (list(read_tlog(data, "x")), list(read_raw(data, "x"))):
         times = [event.t_ns for event in events]
@@ -215,7 +215,7 @@ def test_any_bytes_at_all(pieces: list[bytes]) -> None:
 
 
 def test_raw_mavlink_has_the_first_clocks_time(wire: Wire) -> None:
-    frames = wire(60)  # a heartbeat first; then positions and attitudes of 1:1 and 2:1 by turns
+    frames = wire(60)  # a heartbeat first; then positions and attitudes of 1:1 and 2:1 alternately
     events = list(read_raw(b"".join(frames), "x"))
     assert sniff(b"".join(frames)) == "mavlink"
     assert raws(events) == frames
@@ -224,7 +224,7 @@ def test_raw_mavlink_has_the_first_clocks_time(wire: Wire) -> None:
     times_ms = [event.t_ns // 1_000_000 for event in events]
     expected, now_ms = [], first_ms
     for number in range(60):
-        if number % 3 and number % 2:  # tells the time, and is of 2:1
+        if number % 3 and number % 2:  # has a clock and belongs to 2:1
             now_ms = 1000 + 10 * number
         expected.append(now_ms)
     assert times_ms == expected
@@ -309,7 +309,7 @@ def test_what_cannot_be_used_is_said_in_one_line(tmp_path: Path, wire: Wire) -> 
 
 @pytest.mark.full
 def test_the_logs_of_other_programs(shared_logs: list[Path]) -> None:
-    """Every frame that pymavlink finds, and no other, on a time line that goes on."""
+    """Every frame that pymavlink finds, and no other, on a monotonic timeline."""
     for path in shared_logs:
         assert log_kind(path) == "tlog"
         events = list(read_log(path))

@@ -1,4 +1,4 @@
-"""What is written can be read back, in order, by this program and by any reader of MCAP."""
+"""Recordings are read back in order by this program and by any MCAP reader."""
 
 import gc
 import os
@@ -38,7 +38,8 @@ def open_writer(where: Path, weights_hz: float | None = None) -> Writer:
 
 
 def decode_all(path: Path) -> list[tuple[str, Any, Any]]:
-    """(topic, MCAP message, decoded message) in file order, by the file's own schemas alone."""
+    """(topic, MCAP message, decoded message) in file order, decoded by the file's own schemas
+    only."""
     classes: dict[int, Any] = {}
     found = []
     with path.open("rb") as file:
@@ -54,7 +55,7 @@ def decode_all(path: Path) -> list[tuple[str, Any, Any]]:
 
 
 def test_the_events_come_back_as_they_were(tmp_path: Path, record: Record) -> None:
-    """Links, equal times, times that step back, and no output among them."""
+    """Links, equal times and backward steps are kept; outputs are not read as events."""
     writer = open_writer(tmp_path)
     driven = record(writer, 500, flush_every=37)
     path = writer.close({})
@@ -70,7 +71,7 @@ def test_the_events_come_back_as_they_were(tmp_path: Path, record: Record) -> No
 def test_a_file_that_is_done_with_leaves_no_memory_behind(
     tmp_path: Path, record: Record, end: Callable[[Writer], object]
 ) -> None:
-    """A megabyte and a half of each stayed: full garbage collections are rare in the service."""
+    """Regression: 1.5 MB per file stayed, as full garbage collections are rare in the service."""
     gc.disable()
     try:
         writer = open_writer(tmp_path)
@@ -118,14 +119,14 @@ def test_a_file_that_is_asked_for_by_name_is_replaced_on_close(tmp_path: Path) -
     writer = open_writer(path)
     assert path.read_bytes() == b"what was there before"
     with pytest.raises(BlockingIOError):
-        open_writer(path)  # and the first is not emptied by that
+        open_writer(path)  # which does not truncate the first file
     writer.event(Tick(5))
     assert writer.close({}) == path
     assert list(read_log(path)) == [Tick(5)]
 
 
 def test_a_flush_reaches_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """That the power may fail cannot be had in a test: what was asked of the system can."""
+    """A power failure cannot be tested; the sync requests to the system can."""
     writer = open_writer(tmp_path)
     synced: list[int] = []
     monkeypatch.setattr(
@@ -135,7 +136,7 @@ def test_a_flush_reaches_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     writer.flush()
     assert synced == [writer.path.stat().st_size] == [writer.size_bytes]
     size = writer.close({}).stat().st_size
-    assert synced[1] == size and len(synced) == 3  # the last is the folder, for the new name
+    assert synced[1] == size and len(synced) == 3  # the last sync is the folder's, for the new name
 
 
 def test_left_without_close_it_stays_active(tmp_path: Path, record: Record) -> None:
@@ -166,7 +167,7 @@ def test_every_channel_can_be_decoded_from_the_file_alone(tmp_path: Path, record
     assert counts["/mavlink/frames"] == sum(isinstance(event, Frame) for event in driven)
     by_pipeline = Counter(m.is_event for topic, _, m in found if topic == "/rejections")
     assert by_pipeline[True] == sum(isinstance(event, Rejection) for event in driven)
-    assert by_pipeline[False] == len(driven) // 3  # and none of the above a second time
+    assert by_pipeline[False] == len(driven) // 3  # and no topic above occurs twice
     assert [message.sequence for _, message, _ in found] == list(range(len(found)))
     frames = [(raw.log_time, message.t_ns) for topic, raw, message in found if "frames" in topic]
     assert frames == [(event.t_ns, event.t_ns) for event in driven if isinstance(event, Frame)]
@@ -186,7 +187,7 @@ def test_a_fix_and_a_prediction_as_viewers_see_them(tmp_path: Path, record: Reco
     assert predicted.timestamp.ToNanoseconds() == raw.log_time + 5
     covariance = np.array(predicted.position_covariance).reshape(3, 3)
     track = found["/tracks"][1]
-    # The mean squares that the bounds allow: half the horizontal one on each axis of the plane.
+    # Mean squares allowed by the bounds: half of the horizontal one on each axis of the plane.
     plane, height = track.horizontal_bound_m**2 / 2, track.vertical_bound_m**2
     assert covariance == pytest.approx(np.diag([plane, plane, height]))
     assert predicted.position_covariance_type == predicted.APPROXIMATED
@@ -233,7 +234,7 @@ def test_weights_are_row_major_complex64(
     [
         (None, 1, 50, 50),
         (10.0, 20, 500, 100),  # 10 s of updates at 50 Hz
-        (10.0, 100, 100, 100),  # as often as asked: none is lost to rounding
+        (10.0, 100, 100, 100),  # at exactly the given rate: none is lost to rounding
         (10.0, 1000, 20, 20),
         (30.0, 1, 1001, 31),
     ],
@@ -304,7 +305,7 @@ def test_six_minutes_of_busy_traffic_are_written_in_two_seconds(
     tmp_path: Path, events: Callable[[int], list[Event]], estimate: Estimate, geodetic: Any,
     update: Callable[[int], Update],
 ) -> None:  # fmt: skip
-    """117 000 frames, 17 000 fixes, 15 000 predictions; as much again for a busy machine."""
+    """117 000 frames, 17 000 fixes, 15 000 predictions; the limit is doubled for a busy machine."""
     driven = events(117_000)
     updates = [update(START_NS + number) for number in range(7_500)]
     writer = open_writer(tmp_path)
@@ -322,7 +323,7 @@ def test_six_minutes_of_busy_traffic_are_written_in_two_seconds(
 
 
 def test_what_is_salvaged_ends_at_the_last_flush(tmp_path: Path) -> None:
-    """A chunk that went to the disk by itself since then is taken back: it is written elsewhere."""
+    """A chunk written to disk since the last flush is removed: it is written to the next file."""
     writer = open_writer(tmp_path)
     noise = np.random.default_rng(1)
     writer.event(Tick(5))
@@ -341,7 +342,7 @@ def test_what_is_salvaged_ends_at_the_last_flush(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])
 def test_who_flies_where_is_not_for_all_to_read(tmp_path: Path, umask: int) -> None:
-    """Recordings are for their owner and its group, recovered ones too, and so are new folders."""
+    """Recordings, recovered files and new folders are accessible to the owner and group only."""
     before = os.umask(umask)
     try:
         folder = tmp_path / "recordings"

@@ -1,4 +1,4 @@
-"""MAVLink in packets: real ones off the loopback, made ones of every kind, and hostile ones."""
+"""MAVLink in packet captures: captured on loopback, synthetic of every kind, and hostile."""
 
 import contextlib
 import random
@@ -32,7 +32,7 @@ def raws(events: list[Event] | Iterator[Event]) -> list[bytes]:
     return [event.raw for event in events if isinstance(event, Frame)]
 
 
-# --- packets as they are described -------------------------------------------------------------
+# --- synthetic packets -------------------------------------------------------------------------
 
 
 def udp(payload: bytes, ports: tuple[int, int] = (14555, 14550)) -> bytes:
@@ -89,7 +89,7 @@ def pcapng(rows: list[tuple[int, bytes]], order: str = "<", resolution: int = 9)
     for t_ns, data in rows:
         stamp = t_ns // 10 ** (9 - resolution)
         head = struct.pack(f"{order}5I", 0, stamp >> 32, stamp & 0xFFFFFFFF, len(data), len(data))
-        out += block(5, b"x" * 12, order)  # statistics: passed over
+        out += block(5, b"x" * 12, order)  # statistics block: skipped
         out += block(6, head + data, order)
     return out
 
@@ -149,7 +149,8 @@ def test_a_vlan_and_a_padded_packet(tmp_path: Path) -> None:
 
 
 def test_each_way_has_a_splitter_of_its_own(tmp_path: Path) -> None:
-    """Frames in halves, two ways in turn: no half meets the other way's."""
+    """Frames split in halves, two directions interleaved: halves of different directions do not
+    mix."""
     halves = []
     for n, frame in enumerate(FRAMES):
         for part in (frame[:9], frame[9:]):
@@ -244,11 +245,11 @@ def test_more_ways_than_are_followed(tmp_path: Path) -> None:
     assert len(raws(events_of(pcap(many), tmp_path))) == 3000
 
 
-# --- real packets ------------------------------------------------------------------------------
+# --- captured packets --------------------------------------------------------------------------
 
 
 def sent_over_loopback() -> None:
-    """Half of the frames over UDP, half over TCP, in pieces that are no frames."""
+    """Send half of the frames over UDP and half over TCP, in segments that split frames."""
     with (
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as here,
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as there,
@@ -282,18 +283,18 @@ def test_packets_that_the_system_captured(tmp_path: Path) -> None:
         sender = threading.Thread(target=sent_over_loopback)
         sender.start()
         seen: list[tuple[int, bytes]] = []
-        sent_until_s = time.monotonic() + 3.0  # others may use the loopback all the time
+        sent_until_s = time.monotonic() + 3.0  # others may use the loopback
         with contextlib.suppress(TimeoutError):
             while sender.is_alive() or time.monotonic() < sent_until_s:
                 data, (_, _, direction, *_) = tap.recvfrom(65536)
-                if direction != socket.PACKET_OUTGOING:  # each is seen going and coming
+                if direction != socket.PACKET_OUTGOING:  # captured twice: out and in
                     seen.append((START_NS + len(seen) * 1000, data))
         sender.join(HANG_S)
     found = events_of(pcap(seen), tmp_path)
     assert set(raws(found)) >= set(FRAMES)
 
 
-# --- MCAP of others ----------------------------------------------------------------------------
+# --- MCAP files of other programs --------------------------------------------------------------
 
 
 def others_mcap(

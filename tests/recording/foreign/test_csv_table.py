@@ -1,4 +1,4 @@
-"""Tables with a header that says what they hold."""
+"""CSV tables whose header names their columns."""
 
 from pathlib import Path
 
@@ -56,7 +56,7 @@ def test_times_with_their_zone() -> None:
         1_795_345_200_500_000,
         1_795_345_201_000_000,
     ]
-    assert log.lost == {Reason.MALFORMED: 1}  # the last says no zone
+    assert log.lost == {Reason.MALFORMED: 1}  # the last one has no time zone
 
 
 def test_attitudes_and_accuracies_are_said(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""DataFlash: every value against pymavlink's DFReader; damage costs what is damaged alone."""
+"""DataFlash: every value against pymavlink's DFReader; damage loses only damaged messages."""
 
 import struct
 from collections import Counter
@@ -25,7 +25,7 @@ def as_bytes(data: bytes) -> dataflash.Bytes:
 
 
 def peers(path: Path, names: tuple[str, ...]) -> dict[str, list[Any]]:
-    """The messages as pymavlink reads them."""
+    """The messages as read by pymavlink."""
     reader = DFReader_binary(str(path))
     found: dict[str, list[Any]] = {name: [] for name in names}
     while (message := reader.recv_match(type=list(names))) is not None:
@@ -35,7 +35,7 @@ def peers(path: Path, names: tuple[str, ...]) -> dict[str, list[Any]]:
 
 
 def require_equal(path: Path) -> Counter[str]:
-    """Compare every number of every message, and return how many messages there were."""
+    """Compare every number of every message and return the number of messages per type."""
     data = as_bytes(path.read_bytes())
     walked = walk(data, NAMES)
     theirs = peers(path, NAMES)
@@ -176,7 +176,7 @@ def fmt(number: int, length: int, name: bytes, letters: bytes, columns: bytes) -
 def test_a_description_that_contradicts_itself_is_refused_and_counted() -> None:
     head = fmt(128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
     wrong = [
-        fmt(200, 12, b"POS", b"QLL", b"TimeUS,Lat,Lng"),  # it is longer
+        fmt(200, 12, b"POS", b"QLL", b"TimeUS,Lat,Lng"),  # longer than its format
         fmt(201, 19, b"POS", b"QLL", b"TimeUS,Lat"),
         fmt(202, 19, b"POS", b"Q?L", b"TimeUS,Lat,Lng"),
         fmt(203, 19, b"POS", b"QLL", b"TimeUS,Lat,Lat"),

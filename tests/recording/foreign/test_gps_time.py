@@ -1,4 +1,4 @@
-"""A boot clock on GPS time: drift, late fixes, receivers without the time, leap seconds."""
+"""Boot clock aligned to GPS time: drift, late fixes, receivers without time, leap seconds."""
 
 from datetime import UTC, datetime
 
@@ -13,7 +13,7 @@ EPOCH_US = 1_795_000_000_000_000
 
 
 def clock(seconds: int, drift: float, late_us: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Boot times at which fixes were had, and the fixes' Unix times."""
+    """Boot times of fixes and the Unix times of these fixes."""
     made_us = np.arange(seconds * 5, dtype=np.int64) * 200_000 + 5_000_000
     unix_us = EPOCH_US + np.round(made_us * (1 + drift)).astype(np.int64)
     return made_us + late_us, unix_us
@@ -26,10 +26,10 @@ def test_drift_and_jitter(drift: float, seed: int) -> None:
     found = gps_time.fit(boot_us, unix_us)
     assert found is not None
     error_us = found.unix_us(boot_us - late_us) - unix_us
-    # What all are late alike cannot be seen: half of the jitter here.
+    # A delay common to all fixes is unobservable: here half of the jitter.
     assert (
         np.abs(error_us + 20_000).max() < 12_000
-    )  # of 3000 seeds 1.7 ms at the median, 9.1 at most
+    )  # over 3000 seeds: median 1.7 ms, maximum 9.1 ms
     assert 0.015 < found.uncertainty_s < 0.025
 
 
@@ -43,7 +43,7 @@ def test_a_receiver_without_the_time_says_nothing() -> None:
 
 def test_a_few_wrong_fixes_do_not_count() -> None:
     boot_us, unix_us = clock(100, 0.0, np.zeros(500, dtype=np.int64))
-    unix_us[::5] -= 604_800_000_000  # a week behind, before it knew better
+    unix_us[::5] -= 604_800_000_000  # a week behind, before the receiver knew the week
     found = gps_time.fit(boot_us, unix_us)
     assert found is not None
     assert (found.offset_us, found.fixes, found.drift) == (EPOCH_US, 400, 0.0)
@@ -64,7 +64,7 @@ def test_leap_seconds(utc: datetime, leaps: int) -> None:
     week, week_ms = divmod(gps_ms, 604_800_000)
     (found,) = gps_time.unix_us(np.array([week]), np.array([week_ms]))
     off_s = found * 1e-6 - utc.timestamp()
-    # Within the leaps of a change of them the count before it may stand: nobody flew by it.
+    # On the day of a leap second the previous count may apply.
     assert abs(off_s) <= (1 if utc.month in (1, 7) or utc.second == 59 else 0)
 
 

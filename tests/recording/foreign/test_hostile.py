@@ -1,4 +1,4 @@
-"""Hostile logs: whatever is done to a file, reading it ends soon, with events or one line."""
+"""Hostile logs: reading any damaged file ends soon, with events or a one-line error."""
 
 import random
 import struct
@@ -26,7 +26,7 @@ SLOWEST_S = 20.0
 
 
 def damaged(data: bytes, seed: int) -> bytes:
-    """The file with a few of the things done to it that happen to files, or are done to them."""
+    """Return the file with a few random kinds of damage."""
     rng = random.Random(seed)
     out = bytearray(data)
     for _ in range(rng.randint(1, 6)):
@@ -58,7 +58,7 @@ def damaged(data: bytes, seed: int) -> bytes:
 
 
 def read(path: Path) -> tuple[int, int]:
-    """Frames and rejections, at times that never step back; (0, 0) for what is refused."""
+    """Count of frames and rejections, at monotonic times; (0, 0) for a rejected file."""
     frames = rejections = last_ns = 0
     try:
         for event in read_log(path):
@@ -86,7 +86,7 @@ def test_damaged_files(kind: str, tmp_path: Path) -> None:
         assert time.monotonic() - begin < SLOWEST_S, seed
         assert frames <= 4 * sound, seed
         used += frames > 0
-    assert used > tried / 4  # most damage leaves something to be used
+    assert used > tried / 4  # most damaged files still yield frames
 
 
 def many_heads() -> bytes:
@@ -138,7 +138,7 @@ def test_absurd_files_are_bounded(make: Callable[[], bytes], tmp_path: Path) -> 
     assert peak < 60_000_000 + 8 * len(data)
 
 
-# --- counts without end --------------------------------------------------------------------------
+# --- huge sample counts ---------------------------------------------------------------------------
 
 MOST_MB = 300
 """Memory in which any log is read, the program's own 70 MB and the file's pages included."""
@@ -176,7 +176,7 @@ def many_messages() -> bytes:
 
 
 def many_samples() -> bytes:
-    """Of the topic that a flight describes first."""
+    """Of the first topic that a flight describes."""
     body = struct.pack("<ddf", 47.0, 8.0, 500.0)
     return flight(seconds=10).data + b"".join(
         b"\x1e\x00D\x00\x00" + (20_000_000 + n * 100).to_bytes(8, "little") + body
@@ -191,7 +191,7 @@ def many_samples() -> bytes:
 def test_counts_without_end_take_no_more_memory_than_there_is(
     tmp_path: Path, name: str, made: Callable[[], bytes]
 ) -> None:
-    """Every n-th is read: of all there were, a gigabyte and a half."""
+    """Every n-th sample is read: all of them would take 1.5 GB."""
     path = tmp_path / name
     path.write_bytes(made())
     command = [sys.executable, "-c", _READ, str(path)]

@@ -1,4 +1,4 @@
-"""What vehicles' own logs have in common."""
+"""Common parts of onboard logs."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""What a vehicle wrote of itself, as frames: decoded by pymavlink, and by the product."""
+"""Onboard log samples as frames, decoded by pymavlink and by the product."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -20,7 +20,7 @@ def log(aeroplane: Path) -> Onboard:
 
 
 def by_peer(events: list[Event]) -> dict[str, list[Any]]:
-    """The frames as pymavlink decodes them, by name."""
+    """Frames decoded by pymavlink, by message name."""
     link = dialect.MAVLink(None)
     found: dict[str, list[Any]] = {}
     for event in events:
@@ -71,7 +71,7 @@ def test_frames_arrive_at_gps_time_and_in_order(log: Onboard) -> None:
 
 
 def test_the_truth_stands_behind_a_stamp_of_its_time(log: Onboard) -> None:
-    """Studies put SIM_STATE, which has no stamp, in time by what stands around it."""
+    """Studies date SIM_STATE, which has no timestamp, by the neighbouring messages."""
     assert log.truth is not None
     stamps: list[int] = []
     last_ms = 0

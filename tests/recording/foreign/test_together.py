@@ -1,4 +1,4 @@
-"""Logs of one vehicle each as one flight, and the same flight as a telemetry log."""
+"""Logs of single vehicles merged into one flight, and the same flight as a telemetry log."""
 
 import json
 import shutil
@@ -132,7 +132,7 @@ def test_the_truth_in_the_logs_is_used(aeroplane: Path, carrier: Path) -> None:
     (flight,) = flown.flights
     assert flight.uav == "1:1" and flight.truth.kind == "SIM_STATE"
     assert flown.log == f"{aeroplane.name} + {carrier.name}"
-    # The estimator knows where it is; its position is a frame or so off its stamp.
+    # The estimator is accurate; its position is offset from its timestamp by about one frame.
     place, _ = flight.truth.at(flight.made_ns)
     error_m = np.linalg.norm(place - flight.position_ned_m, axis=1)
     assert np.nanmedian(error_m) < 1.5 and np.isfinite(error_m).mean() > 0.95
@@ -141,7 +141,8 @@ def test_the_truth_in_the_logs_is_used(aeroplane: Path, carrier: Path) -> None:
 def test_how_well_logs_lie_beside_one_another_is_in_the_settings_of_their_replay(
     aeroplane: Path, carrier: Path, tmp_path: Path
 ) -> None:
-    """0.001 s by the fixes and half of what receivers differ; a log alone lies beside none."""
+    """0.001 s from the fixes plus half of the difference between receivers; a single log has
+    none."""
     config = tmp_path / "settings.toml"
     config.write_text('[clocks.apart_s]\n"5:1" = 0.02\n')
     both = [aeroplane, carrier]
@@ -152,7 +153,7 @@ def test_how_well_logs_lie_beside_one_another_is_in_the_settings_of_their_replay
 
 @pytest.mark.parametrize("sign", [-1, 1])
 def test_a_timeline_that_is_off_is_in_the_bounds(aeroplane: Path, carrier: Path, sign: int) -> None:
-    """An adversary moves all of one vehicle's log by as much as is said: 0.8 s at 22 m/s."""
+    """An adversary shifts one vehicle's whole log by the stated uncertainty: 0.8 s at 22 m/s."""
     off_ns, tracks_at = sign * 800_000_000, {}
     for name, apart_s, moved_ns in (("true", {}, 0), ("bare", {}, off_ns),
                                     ("said", {"1:1": 0.8}, off_ns)):  # fmt: skip
@@ -175,16 +176,16 @@ def test_a_timeline_that_is_off_is_in_the_bounds(aeroplane: Path, carrier: Path,
     }
     assert off_m["bare"] > tracks_at["bare"].bound_m
     assert off_m["said"] <= tracks_at["said"].bound_m
-    assert off_m["said"] == pytest.approx(off_m["bare"], rel=0.01)  # the estimate is the same
+    assert off_m["said"] == pytest.approx(off_m["bare"], rel=0.01)  # the estimate is unchanged
 
 
 # --- the same flight in another format ------------------------------------------------------------
 
 
 def tracks(logs: list[Path], uav: str) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Boot times (N,), s, of a UAV's accepted reports, their places (N, 3), and velocities.
+    """Boot times (N,), s, of a UAV's accepted reports, positions (N, 3), velocities and estimates.
 
-    The estimates go with them: each is the observer's answer at the time of the report.
+    Each estimate is the observer's answer at the time of its report.
     """
     settings = Settings().override(center={"source": "47.3977419,8.5455937,488.1"})
     pipeline = Pipeline(settings)
@@ -201,7 +202,7 @@ def tracks(logs: list[Path], uav: str) -> tuple[FloatArray, FloatArray, FloatArr
 
 
 def between(t_s: FloatArray, known_s: FloatArray, states: FloatArray) -> FloatArray:
-    """Places by cubic Hermite between reports, NaN beyond them."""
+    """Positions by cubic Hermite interpolation between reports; NaN outside."""
     after = np.clip(np.searchsorted(known_s, t_s), 1, len(known_s) - 1)
     span = (known_s[after] - known_s[after - 1])[:, None]
     s = ((t_s - known_s[after - 1])[:, None]) / span
@@ -216,10 +217,9 @@ def between(t_s: FloatArray, known_s: FloatArray, states: FloatArray) -> FloatAr
 @pytest.mark.full
 @pytest.mark.parametrize("uav", ["1:1", "5:1"])
 def test_the_same_flight_gives_the_same_tracks(uav: str) -> None:
-    """Reports at equal boot times are the same place; so are the observer's estimates.
+    """Reports at equal boot times have equal positions, and so do the observer's estimates.
 
-    Both are sampled ten times a second, the aeroplane in the same turn of its loop, the copter
-    20 ms apart.
+    Both logs are sampled at 10 Hz: the aeroplane in the same timer cycle, the copter 20 ms apart.
     """
     bins = [shared_log(f"sitl_planes_circle_{vehicle}.bin") for vehicle in (1, 5)]
     t_s, states, estimates = tracks(bins, uav)

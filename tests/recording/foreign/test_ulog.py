@@ -92,14 +92,14 @@ def test_damage_costs_what_is_damaged(size: int) -> None:
     whole, cut = (ulog.walk(as_bytes(data), px4._WANTED) for data in (made.data, torn))
     kept = sum(len(topic.at) for topic in cut.topics)
     assert whole.lost == 0 and cut.lost <= size + 200
-    assert cut.lost or size < 300  # a byte inside of a sample does not show
+    assert cut.lost or size < 300  # a changed byte inside a sample is undetectable
     assert kept >= sum(len(topic.at) for topic in whole.topics) - size // 20 - 2
 
 
 def test_data_appended_after_a_crash_are_read() -> None:
     made = flight()
     end = len(made.data)
-    torn = made.data[:-7]  # the last message was cut, and more was appended behind it
+    torn = made.data[:-7]  # the last message was truncated, and more was appended after it
     late = message(
         "D", struct.pack("<Hddd", 0, 0, 0, 0)[:2] + struct.pack("<Qddf", 9_000_000, 47.5, 8, 500)
     )
@@ -120,7 +120,7 @@ def test_what_asks_for_more_than_is_known_is_refused() -> None:
     [
         "uint64_t timestamp;double[99999] lat;double lon;float alt;",
         "uint64_t timestamp;double[99999999999] lat;",
-        "vehicle_global_position lat;",  # of itself
+        "vehicle_global_position lat;",  # nested in itself
         "uint64_t timestamp;uint64_t timestamp;",
         "uint64_t timestamp;nothing lat;",
         "",
@@ -141,7 +141,7 @@ def test_a_lone_message_among_garbage_is_none() -> None:
     torn = made.data[:-1] + b"\xff" * 50 + false + b"\xff" * 50
     walked = ulog.walk(as_bytes(torn), ("vehicle_global_position",))
     assert len(walked.topics[0].at) == 40
-    assert walked.lost >= 99 + len(false)  # one byte ends the cut sample
+    assert walked.lost >= 99 + len(false)  # one byte completes the truncated sample
 
 
 def test_a_receiver_without_a_fix_does_not_know_the_time() -> None:

@@ -1,4 +1,4 @@
-"""The command: what it prints, and that a mistake is one line on stderr."""
+"""The command line: its output, and one-line errors on stderr."""
 
 import json
 import random
@@ -148,7 +148,7 @@ def test_fly_sends_and_sums_up(receiver: socket.socket, tmp_path: Path) -> None:
 
 
 def test_fly_gives_the_seed_to_the_scenario(receiver: socket.socket, tmp_path: Path) -> None:
-    # A record holds what was sent, stamped: positions tell which tour was flown.
+    # The recording holds the sent frames with timestamps; positions identify the flown tour.
     tlog = tmp_path / "a.tlog"
     arguments = ["fly", "waypoints", "--to", url_of(receiver), "--duration", "0.3", "--seed", "9"]
     result = CliRunner().invoke(main, [*arguments, "--record", str(tlog)])
@@ -192,7 +192,7 @@ def test_record_until_a_signal(tmp_path: Path) -> None:
         sender.connect(("127.0.0.1", port))
         sender.settimeout(0.02)
         accepted = 0
-        while accepted < 5:  # a port that nobody listens on yet refuses what was sent before
+        while accepted < 5:  # a port without a listener refuses earlier packets
             assert recording.poll() is None
             try:
                 sender.send(raw)
@@ -211,7 +211,7 @@ def test_record_until_a_signal(tmp_path: Path) -> None:
 
 
 def written(path: Path, stamps_s: list[float]) -> list[bytes]:
-    """A tlog under the stamps given; its frames."""
+    """Write a tlog with the given timestamps; return its frames."""
     frames = [sent.raw for sent in schedule(scenario.hover(), duration_s=2.0)][: len(stamps_s)]
     with TlogWriter(path) as writer:
         for t_s, raw in zip(stamps_s, frames, strict=True):
@@ -246,7 +246,7 @@ def test_a_log_without_a_frame_is_one_line(content: bytes, tmp_path: Path) -> No
 def test_a_log_that_breaks_on_the_way_is_one_line(
     receiver: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # What a reader does on a torn file: some frames, then its error.
+    # Behaviour of a reader on a truncated file: some frames, then its error.
     raw = next(schedule(scenario.hover())).raw
 
     def torn() -> Iterator[Frame]:
@@ -313,7 +313,8 @@ def test_the_help_has_every_fault(command: str) -> None:
 
 
 def written_as(kind: str, folder: Path, stamps_s: list[float]) -> tuple[Path, list[bytes]]:
-    """A log of a kind with frames under the stamps given; a raw one has boot clocks instead."""
+    """Write a log of the given format with the given timestamps; a raw one has boot clocks
+    instead."""
     if kind == "tlog":
         return folder / "a.tlog", written(folder / "a.tlog", stamps_s)
     frames = []

@@ -1,4 +1,4 @@
-"""What ``--fault`` says, and what is said of a mistake in it."""
+"""Parsing of ``--fault``, and its error messages."""
 
 import re
 from itertools import permutations

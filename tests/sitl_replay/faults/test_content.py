@@ -1,4 +1,4 @@
-"""Rewritten frames, as pymavlink's generated dialect reads them."""
+"""Rewritten frames, decoded by pymavlink's generated dialect."""
 
 import math
 import random
@@ -42,21 +42,21 @@ def sending(seq: int = 7, *, signed: bool = False) -> Any:
 
 
 def read(raw: bytes) -> Any:
-    """The one message in a frame; the oracle checks its checksum."""
+    """The one message in a frame; pymavlink checks its checksum."""
     (message,) = dialect.MAVLink(None).parse_buffer(raw)
     assert message.get_type() != "BAD_DATA"
     return message
 
 
 def fields(raw: bytes) -> dict[str, Any]:
-    """All that a frame says, its sequence number as well."""
+    """All fields of a frame, with its sequence number."""
     message = read(raw)
     said = {name: repr(value) for name, value in message.to_dict().items()}
     return said | {"seq": message.get_seq(), "from": sender_of(raw), "magic": raw[0]}
 
 
 def made(kind: Any, rng: random.Random) -> Any:
-    """A message of a kind with random fields."""
+    """A message of the given type with random fields."""
     lengths = dict(zip(kind.ordered_fieldnames, kind.array_lengths, strict=True))
     values: list[Any] = []
     for name, base in zip(kind.fieldnames, kind.fieldtypes, strict=True):
@@ -92,7 +92,7 @@ def test_every_boot_clock_is_rewritten_and_nothing_else(kind: Any, v1: bool) -> 
 def test_zeros_at_the_end_of_a_payload_are_cut_and_put_back(
     old_ms: int, new_ms: int, lon: int
 ) -> None:
-    # All behind the longitude is 0, or all behind the stamp, or all.
+    # All bytes after the longitude are 0, or all after the timestamp, or all.
     make = dialect.MAVLink_global_position_int_message
     raw = make(old_ms, 0, lon, 0, 0, 0, 0, 0, 0).pack(sending())
     assert with_boot_ms(raw, new_ms) == make(new_ms, 0, lon, 0, 0, 0, 0, 0, 0).pack(sending())
@@ -103,7 +103,7 @@ def test_a_frame_that_stays_as_it_is_keeps_its_very_bytes() -> None:
     raw = message.pack(sending(signed=True))
     assert with_boot_ms(raw, 1000) is raw
     assert rewritten(raw, seq=7) is raw
-    assert Drift(1.0)(0.0, raw) is raw  # a thousandth of a millisecond
+    assert Drift(1.0)(0.0, raw) is raw  # 0.001 ms
 
 
 def test_a_signed_frame_that_is_rewritten_loses_its_signature() -> None:
@@ -126,7 +126,7 @@ def test_what_cannot_be_checked_or_is_too_short_is_left_alone() -> None:
 
 
 def reports(count: int, sysid: int = 9, step_ms: int = 100) -> list[tuple[float, bytes]]:
-    """Reports every 0.1 s, each from another place."""
+    """Reports every 0.1 s, each at another position."""
     sender = dialect.MAVLink(None, srcSystem=sysid, srcComponent=1)
     out = []
     for number in range(count):
@@ -215,7 +215,7 @@ def test_frozen_before_any_report_repeats_the_first() -> None:
     assert frozen(0.0, first) is first
     assert read(frozen(0.1, second)).lat == read(first).lat
     (_, other) = reports(1, sysid=8)[0]
-    assert frozen(0.1, other) is other  # each sender has its own
+    assert frozen(0.1, other) is other  # each sender has its own direction
 
 
 @given(

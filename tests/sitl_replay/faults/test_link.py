@@ -1,4 +1,4 @@
-"""The faults of links, each by the law that it promises."""
+"""Link faults, each against its documented distribution."""
 
 import math
 import random
@@ -31,7 +31,7 @@ def rng(seed: int = 1) -> random.Random:
 
 
 def within(count: int, share: float, of: int = MANY) -> bool:
-    """Whether a count is within 4.5 deviations of what independent chances give."""
+    """Whether a count is within 4.5 standard deviations of a binomial distribution."""
     return abs(count - share * of) <= 4.5 * math.sqrt(of * share * (1.0 - share))
 
 
@@ -105,7 +105,7 @@ def test_jitter_keeps_the_order_of_each_sender_and_of_nobody_else() -> None:
         assert times_s == sorted(times_s)
         late_s = [t_s - n / 20 for n, t_s in enumerate(times_s)]
         assert min(late_s) >= 0.0
-        # The law that the docstring states.
+        # The distribution stated in the docstring.
         assert statistics.median(late_s) == pytest.approx(
             0.5 * math.log(20 * 0.5 / math.log(2)), rel=0.1
         )
@@ -124,7 +124,7 @@ def test_a_burst_shuts_the_link_for_that_share_of_the_time(share: float, shut_s:
     assert max(r - t for t, r in held) <= shut_s + 1e-9
     openings_s = sorted({r for _, r in held})
     assert all(b - a >= shut_s for a, b in pairwise(openings_s))
-    # What comes while it is shut comes at once.
+    # Frames that arrive while the link is closed are released together.
     assert max(sum(r == opening for _, r in held) for opening in openings_s[:20]) >= 20
     assert len(burst._block_starts_s) <= 2
 

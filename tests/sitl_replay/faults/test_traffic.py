@@ -1,4 +1,4 @@
-"""Streams of frames through all their faults: nothing lost or invented but what was asked for."""
+"""Frame streams through all faults: no frame is lost or added except as requested."""
 
 import random
 from collections import Counter
@@ -25,7 +25,7 @@ def parsed(*texts: str) -> list[Fault]:
 def through(
     faults: list[Fault], links: int = 1, seed: int = 0, stream: list[tuple[float, bytes]] = STREAM
 ) -> tuple[list[Delivery], Counter[str]]:
-    """What arrives, as the player takes it out, and what was touched."""
+    """The arriving frames, as the player takes them, and the count of affected frames."""
     touched: Counter[str] = Counter()
     senders, network = (
         Senders(faults, seed, touched),
@@ -155,7 +155,7 @@ def test_damage() -> None:
     whole = Counter(got) & Counter(RAWS)
     untouched = len(RAWS) - whole.total()
     hit = touched["bit-errors"] + touched["truncation"]
-    assert 0.8 * hit < untouched <= hit  # some frames are both
+    assert 0.8 * hit < untouched <= hit  # some frames are hit by both
     assert all(count > 0 for count in touched.values())
 
 
@@ -181,12 +181,13 @@ def test_one_system_alone(kind: object) -> None:
 
 
 def test_the_order_of_application() -> None:
-    """Senders' faults, loss and duplication, time, damage; whatever the order of the options."""
+    """Order: sender faults, loss and duplication, delay, damage; independent of the option
+    order."""
     texts = ["truncation=0.2", "delay=0.5", "duplication=0.4", "loss=0.3", "reboot=5", "drift=9000"]
     results = [through(parsed(*order)) for order in list(permutations(texts))[:: rounds(149, 37)]]
     assert all(one == results[0] for one in results)
     out, touched = results[0]
-    # The whole is what its stages give one after the other.
+    # The result equals the stages applied one after the other.
     senders = Senders(parsed("drift=9000"), 0, Counter())
     sent = [(t_s, senders.altered(t_s, raw)) for t_s, raw in STREAM]
     senders = Senders(parsed("reboot=5"), 0, Counter())

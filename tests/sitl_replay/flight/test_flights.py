@@ -1,4 +1,4 @@
-"""How the UAVs of each scenario fly: derivatives, limits, attitudes, and who meets whom."""
+"""Trajectories of each scenario: derivatives, limits, attitudes and encounters."""
 
 import itertools
 import math
@@ -23,7 +23,7 @@ STEP_S = 1e-4
 
 
 def sampled(uav: Vehicle, times_s: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Positions and velocities, a row a time."""
+    """Positions and velocities, one row per time."""
     motions = [uav.trajectory(float(t_s)) for t_s in times_s]
     return np.array([m[0] for m in motions]), np.array([m[1] for m in motions])
 
@@ -46,7 +46,7 @@ def test_each_derivative_is_that_of_the_one_before(
     points = [path(t_s + d) for d in (-STEP_S, 0.0, STEP_S)]
     for order in range(3):
         slope = (np.array(points[2][order]) - points[0][order]) / (2 * STEP_S)
-        # The jerk is continuous, but its slope leaps where a ramp begins: half a step of that.
+        # The jerk is continuous, but its slope jumps at the start of a ramp: tolerate half a step.
         assert slope == pytest.approx(points[1][order + 1], abs=2e-3 if order == 2 else 1e-5)
     turned_rad = math.remainder(points[2].heading_rad - points[0].heading_rad, math.tau)
     assert turned_rad / (2 * STEP_S) == pytest.approx(points[1].heading_rate_radps, abs=1e-5)
@@ -54,7 +54,7 @@ def test_each_derivative_is_that_of_the_one_before(
 
 @pytest.mark.parametrize(
     ("name", "speed_mps", "acceleration_mps2"),
-    # The path's own limits, and what the gusts of a lively hour add to them.
+    # The path's own limits, plus the gusts of a windy hour.
     [("waypoints", 12.5, 3.5), ("racetrack", 32.0, 7.0), ("crossing", 10.001, 2.5),
      ("mirror", 10.001, 2.5), ("swarm", 13.001, 2.85), ("adsb", 12.5, 3.5),
      ("shared-id", 8.001, 1.61)],
@@ -80,8 +80,8 @@ def test_copters_lean_and_planes_bank_moderately(name: str) -> None:
 
 
 def test_thrust_of_a_leaning_copter_makes_its_acceleration() -> None:
-    # The body's up axis by a rotation matrix written out; a pull of any size along it.
-    # Along the nose on tours, across it on orbits and swings.
+    # The body's up axis by an explicit rotation matrix; the thrust acts along it.
+    # Tours accelerate along the nose, orbits and swings across it.
     fleets = (scenario.waypoints(4, seed=2), scenario.crossing(4), scenario.swarm(4))
     for uav in (uav for fleet in fleets for uav in fleet.uavs):
         leaning = uav.attitude
@@ -170,7 +170,7 @@ def test_racetracks_are_closed_stadiums_at_one_speed() -> None:
         positions = np.array([point.position_ned_m for point in points])
         assert positions[0] == pytest.approx(positions[-1], abs=1e-6)
         assert positions[:-1].mean(axis=0) == pytest.approx(path.centre_ned_m, abs=1e-6)
-        # A polygon of so many corners is shorter than the lap by less than a millionth.
+        # The polygon with this many corners is shorter than the lap by less than 1e-6.
         around_m = np.linalg.norm(np.diff(positions, axis=0), axis=1).sum()
         assert around_m == pytest.approx(path.speed_mps * path.lap_s, rel=1e-6)
         speeds = [math.hypot(*point.velocity_ned_mps) for point in points]
@@ -219,14 +219,14 @@ def direction(uav: Vehicle, t_s: float) -> FloatArray:
 
 
 def meetings_s(uav: Vehicle) -> FloatArray:
-    """When the swing is at its middle."""
+    """Times at which the swing is at its middle."""
     path = path_of(uav)
     assert isinstance(path, Swing)
     first_s = (-path.phase_rad % math.pi) / SWING_RADPS
     return first_s + math.pi / SWING_RADPS * np.arange(4)
 
 
-MIRROR = np.array([-1.0, 1.0, 1.0])  # in the east-west line of the elements: north for south
+MIRROR = np.array([-1.0, 1.0, 1.0])  # mirrored at the east-west line: north to south
 
 
 @pytest.mark.parametrize(("name", "image"), [("crossing", np.ones(3)), ("mirror", MIRROR)])
@@ -237,7 +237,7 @@ def test_pairs_meet_in_direction_and_part_again(name: str, image: FloatArray) ->
                 direction(near, meeting_s) - image * direction(far, meeting_s)
             )
             assert apart_rad < 1e-9
-            # Between the meetings they are well apart, on the one side and then on the other.
+            # Between encounters they are well separated, first on one side, then on the other.
             quarter_s = math.pi / SWING_RADPS / 2
             east = [
                 direction(near, t_s)[1] - direction(far, t_s)[1]

@@ -1,4 +1,4 @@
-"""Aircraft and their receivers: the rules of ADS-B as MAVLink has it, read by pymavlink."""
+"""Aircraft and their receivers: ADS-B rules of MAVLink, decoded by pymavlink."""
 
 import math
 from collections import defaultdict
@@ -31,7 +31,7 @@ Told = tuple[float, bytes, Any]
 
 @pytest.fixture(scope="module")
 def told(flight: Scenario) -> dict[tuple[Source, int], list[Told]]:
-    """By relay and aircraft: when it was sent, the frame, what pymavlink reads."""
+    """By relay and aircraft: send time, frame, message decoded by pymavlink."""
     parser = dialect.MAVLink(None)
     found: dict[tuple[Source, int], list[Told]] = defaultdict(list)
     for t_s, vehicle, raw in schedule(flight, SEED, duration_s=DURATION_S):
@@ -53,7 +53,7 @@ def test_two_relays_tell_of_the_same_aircraft(
     assert len(aircraft) == 6
     for one in aircraft.values():
         first, second = (list(islice(heard(one, f"{n}:1", SEED), 60)) for n in (1, 2))
-        # Most squitters reach both, some only the one or the other; what is heard is the same.
+        # Most transmissions reach both relays, some only one; the content is the same.
         assert len(set(first) & set(second)) > 30
         assert set(first[:45]) - set(second)
         assert set(second[:45]) - set(first)
@@ -182,7 +182,7 @@ def test_the_service_reads_each_as_it_is_meant(
                 continue
             assert read.uav == f"icao:{icao:06X}"
             assert (read.alt_m is None) == (icao == 0xF00005)
-            # At the time that tslc gives, it is where it is said to be: to a second of flight.
+            # At the time given by tslc, its position is correct to one second of flight.
             (truth,) = flight.truth(read.uav, t_s - message.tslc - 0.5)
             north_m, east_m, _ = pymap3d.geodetic2ned(
                 *read.position_deg, flight.origin.alt_m, *flight.origin

@@ -29,14 +29,14 @@ def test_velocity_is_the_derivative_of_position(vehicle: Vehicle, t_s: float) ->
 
 
 def rotation(pose: Pose) -> Rotation:
-    """NED from body."""
+    """Rotation from body to NED."""
     return Rotation.from_euler("ZYX", [pose.yaw_rad, pose.pitch_rad, pose.roll_rad])
 
 
 @pytest.mark.parametrize("vehicle", ALL)
 @pytest.mark.parametrize("t_s", TIMES_S)
 def test_body_rates_are_those_of_the_attitude(vehicle: Vehicle, t_s: float) -> None:
-    # The turn between two moments, seen from the body, is what gyroscopes measure.
+    # The rotation between two times, in the body frame, is what gyroscopes measure.
     before = rotation(vehicle.attitude(t_s - STEP_S))
     after = rotation(vehicle.attitude(t_s + STEP_S))
     measured_radps = (before.inv() * after).as_rotvec() / (2 * STEP_S)
@@ -44,7 +44,7 @@ def test_body_rates_are_those_of_the_attitude(vehicle: Vehicle, t_s: float) -> N
 
 
 def test_body_rates_far_from_level() -> None:
-    # At ±1° the cross terms hardly show: a large sway proves the signs.
+    # At ±1° the cross terms are negligible: a large sway verifies the signs.
     sway = Sway(turn_rate_radps=0.4, amplitude_rad=0.8)
     for t_s in TIMES_S:
         turn = rotation(sway(t_s - STEP_S)).inv() * rotation(sway(t_s + STEP_S))

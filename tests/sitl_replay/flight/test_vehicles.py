@@ -1,4 +1,4 @@
-"""The schedule: decoded by pymavlink's generated parser, against the scenario it was made from."""
+"""The schedule, decoded by pymavlink's generated parser, against its scenario."""
 
 import hashlib
 import itertools
@@ -23,7 +23,7 @@ EPOCH_NS = 1_760_000_000_000_000_000
 DURATION_S = 5.0
 
 
-# Those where every vehicle has an id of its own; below are the others.
+# Scenarios in which every vehicle has its own id; the others follow below.
 @pytest.fixture(scope="module", params=[name for name in scenario.BUILDERS if name != "shared-id"])
 def flight(request: pytest.FixtureRequest) -> Scenario:
     return scenario.BUILDERS[request.param](5)
@@ -36,7 +36,7 @@ def sent(flight: Scenario) -> list[Transmission]:
 
 @pytest.fixture(scope="module")
 def messages(sent: list[Transmission]) -> dict[str, list[tuple[float, Vehicle, Any]]]:
-    """By message: when it is sent, who sends it, what pymavlink reads."""
+    """By message: send time, sender, message decoded by pymavlink."""
     parser = dialect.MAVLink(None)
     decoded = defaultdict(list)
     for t_s, vehicle, raw in sent:
@@ -46,7 +46,7 @@ def messages(sent: list[Transmission]) -> dict[str, list[tuple[float, Vehicle, A
 
 
 def sampled_s(vehicle: Vehicle, message: Any) -> float:
-    """Scenario time of a message by its boot clock."""
+    """Scenario time of a message from its boot clock."""
     return float((message.time_boot_ms - vehicle.uptime_ms) / 1000)
 
 
@@ -115,7 +115,7 @@ def test_rates(flight: Scenario, messages: dict[str, list[tuple[float, Vehicle, 
         for name, interval_s in intervals_s.items():
             times_s = np.array([t_s for t_s, sender, _ in messages[name] if sender is vehicle])
             assert abs(len(times_s) - DURATION_S / interval_s) <= 1
-            # Jitter does not add up.
+            # Jitter does not accumulate.
             grid_s = times_s[:1] + interval_s * np.arange(len(times_s))
             assert (np.abs(times_s - grid_s) <= JITTER_S).all()
     relayed = {"ADSB_VEHICLE"} if flight.name == "adsb" else set()
@@ -167,7 +167,7 @@ def test_global_position_int(
 
 
 def test_velocity_down_is_positive() -> None:
-    # No scenario sinks, so this one does: GLOBAL_POSITION_INT's vz is positive down.
+    # No scenario descends, so this one does: GLOBAL_POSITION_INT's vz is positive down.
     def sinking(t_s: float) -> scenario.Motion:
         return scenario.Motion((0.0, 0.0, 3.0 * t_s), (0.0, 0.0, 3.0))
 
@@ -230,7 +230,7 @@ def test_gps_raw_int(
         else:
             assert message.cog == 0xFFFF
         assert message.fix_type >= dialect.GPS_FIX_TYPE_DGPS
-        # The accuracies hold for what quantisation leaves.
+        # The accuracies cover the quantisation errors.
         assert message.h_acc / 1e3 >= 0.006 * math.sqrt(2)
         assert message.v_acc / 1e3 >= 0.0005
         assert message.vel_acc / 1e3 >= 0.005 * math.sqrt(3)
@@ -259,7 +259,7 @@ def test_both_clocks_of_system_time(messages: dict[str, list[tuple[float, Vehicl
         offsets_us[vehicle.source].add(message.time_unix_usec - 1000 * message.time_boot_ms)
         sent_us = EPOCH_NS // 1000 + 1e6 * t_s
         assert 0 <= sent_us - message.time_unix_usec <= 1e6 * JITTER_S + 1000
-    # One offset for each vehicle, and no two booted at the same time.
+    # One offset per vehicle, and no two vehicles booted at the same time.
     assert all(len(found) == 1 for found in offsets_us.values())
     assert len(set.union(*offsets_us.values())) == len(offsets_us)
     assert len(offsets_us) > 1
@@ -274,7 +274,7 @@ def test_the_largest_fleet_can_be_packed(name: str) -> None:
 
 
 def test_frames_are_those_that_pymavlink_packs(sent: list[Transmission]) -> None:
-    # Read and packed again by the generated dialect: cut zeros, checksum and all.
+    # Decoded and encoded again by the generated dialect, with truncated zeros and checksum.
     parser = dialect.MAVLink(None)
     for _, vehicle, raw in sent:
         (message,) = parser.parse_buffer(raw)
@@ -296,7 +296,7 @@ LIKE_OTHERS = ("racetrack", "mirror", "crossing")
     ],
 )
 def test_the_service_reads_where_each_vehicle_is(name: str) -> None:
-    # Over some time, so that stops, turns and meetings are among it; a frame in 40 will do.
+    # Long enough to include stops, turns and encounters; one frame in 40 is sufficient.
     flight = scenario.BUILDERS[name](6, seed=4)
     reports = 0
     for t_s, vehicle, raw in itertools.islice(
@@ -332,7 +332,7 @@ def test_two_that_share_an_id_keep_clocks_and_sequences_of_their_own() -> None:
         [int.from_bytes(t.raw[10:14], "little") for t in one if t.raw[7] == 33] for one in twins
     ]
     assert max(clocks_ms[0]) < min(clocks_ms[1])
-    # Not in step either: their timers and jitters are their own.
+    # Their phases differ too: each has its own timers and jitter.
     assert twins[0][0].t_s != twins[1][0].t_s
 
 

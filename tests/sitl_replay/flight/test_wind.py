@@ -43,7 +43,7 @@ def filter_power(axis: int, omega_radps: FloatArray) -> FloatArray:
 
 @pytest.mark.parametrize("axis", range(3))
 def test_power_of_each_octave_is_that_of_the_forming_filter(axis: int) -> None:
-    # Sampled in time, as anyone would measure it; dozens of winds, each of a quarter of an hour.
+    # Sampled in time, as in a measurement: dozens of winds of 15 minutes each.
     rng = Random(5)
     step_s, steps = 0.05, 2**14
     times_s = step_s * np.arange(steps)
@@ -84,12 +84,12 @@ def test_shares_of_power_are_integrals_of_the_spectra(x: float) -> None:
 
 
 def test_low_altitude_forms() -> None:
-    # By hand at 100 feet: shape 0.177 + 0.0823 = 0.2593; its powers 1.2 and 0.4.
+    # Hand calculation at 100 feet: shape 0.177 + 0.0823 = 0.2593; its powers 1.2 and 0.4.
     calm = low_altitude(30.48, 10.0, 15.0)
     assert calm.length_m == pytest.approx((153.99, 153.99, 30.48), rel=1e-3)
     assert calm.sigma_mps == pytest.approx((1.7159, 1.7159, 1.0), rel=1e-3)
     assert calm.airspeed_mps == 15.0
-    # At 1000 feet the three are alike, as they are above.
+    # At 1000 feet the three are equal, as they are above.
     high = low_altitude(304.8, 10.0, 15.0)
     assert high.length_m == pytest.approx((304.8,) * 3, rel=1e-3)
     assert low_altitude(900.0, 10.0, 15.0) == high

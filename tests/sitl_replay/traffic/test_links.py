@@ -22,7 +22,7 @@ FRAME = bytes(range(1, 41))
 
 @pytest.fixture(params=[asyncio.new_event_loop, uvloop.new_event_loop], ids=["asyncio", "uvloop"])
 def run(request: pytest.FixtureRequest) -> Callable[[Coroutine[Any, Any, Any]], Any]:
-    """Runs a scene to its end on one kind of loop, within some seconds."""
+    """Run a scene to its end on the given event loop, within a time limit."""
 
     def until_done(scene: Coroutine[Any, Any, Any]) -> Any:
         return run_async(scene, request.param)
@@ -34,14 +34,14 @@ Run = Callable[[Coroutine[Any, Any, Any]], Any]
 
 
 async def until(good: Callable[[], Any]) -> None:
-    """Poll: what the other end has got is not ours to await."""
+    """Poll until true: data received by the other end cannot be awaited."""
     async with asyncio.timeout(5.0):
         while not good():
             await asyncio.sleep(0.005)
 
 
 async def received(bound: socket.socket) -> tuple[bytes, Any]:
-    """The next datagram of a socket that no loop knows, and from where."""
+    """The next datagram of a socket outside the event loop, and its sender."""
     found: list[tuple[bytes, Any]] = []
 
     def arrived() -> bool:
@@ -54,7 +54,7 @@ async def received(bound: socket.socket) -> tuple[bytes, Any]:
 
 
 class Heard:
-    """What an endpoint hands on."""
+    """The data that an endpoint passes on."""
 
     def __init__(self) -> None:
         self.pieces: list[tuple[object, bytes]] = []
@@ -67,7 +67,7 @@ class Heard:
 
 
 def udp(host: str = "127.0.0.1") -> socket.socket:
-    """A bound datagram socket; the test is skipped where the host's family is missing."""
+    """A bound datagram socket; the test is skipped if the host's address family is unavailable."""
     family = socket.AF_INET6 if ":" in host else socket.AF_INET
     bound = socket.socket(family, socket.SOCK_DGRAM)
     try:
@@ -112,7 +112,7 @@ def test_udpin_sends_to_everybody_it_has_heard(run: Run, host: str) -> None:
         address = (host.strip("[]"), endpoint.url.port)
         endpoint.send(b"nobody there")
         assert (endpoint.dropped, bool(endpoint.peers())) == (1, False)
-        first.sendto(b"", address)  # an opener
+        first.sendto(b"", address)  # an opening packet
         await endpoint.first_peer()
         await endpoint.writable()
         endpoint.send(b"one")
@@ -145,7 +145,7 @@ def test_udpin_goes_on_when_peers_are_gone_and_keeps_a_bounded_number(run: Run) 
         for peer in (first, early):
             assert (await received(peer))[0] == b"one"
         first.sendto(b".", address)
-        last.sendto(b".", address)  # one too many: the one unheard for longest goes
+        last.sendto(b".", address)  # one too many: the peer silent for longest is removed
         await until(lambda: len(heard.octets()) == PEERS_MAX + 2)
         endpoint.send(b"two")
         for peer in (first, last):
@@ -197,12 +197,12 @@ def test_what_is_dropped_is_not_kept(run: Run) -> None:
 
 
 async def none_lost(link: TrafficLink, far: int, frames: list[bytes]) -> None:
-    """As fast as the link takes it, to a peer that reads a little at a time; then it is closed."""
+    """Send as fast as the link accepts to a peer that reads slowly; then close the link."""
     os.set_blocking(far, False)
     got = bytearray()
 
     def read_some() -> int:
-        with contextlib.suppress(OSError):  # nothing there; EIO from a line without its other end
+        with contextlib.suppress(OSError):  # no data; EIO from a line without its other end
             got.extend(os.read(far, 1 << 16))
         return len(got)
 
@@ -304,7 +304,7 @@ def test_a_visitor_that_does_not_read_holds_nobody_up(run: Run) -> None:
             await until(lambda: len(server.peers()) == 1)
             dropped = server.dropped
             await server.close()
-        assert server.dropped >= dropped  # the count outlives the connection
+        assert server.dropped >= dropped  # the count persists after the connection
         return sent, dropped
 
     sent, dropped = run(scene())
@@ -331,7 +331,7 @@ def test_a_link_that_cannot_be_opened_is_told_by_its_url(
 
 
 def terminal() -> tuple[int, LinkUrl]:
-    """The far end of a serial line, and the link to the near one."""
+    """The far end of a serial line, and the link to the near end."""
     far, near = pty.openpty()
     url = parse_link(f"serial:{os.ttyname(near)}:921600")
     os.close(near)  # pyserial opens it again
@@ -371,7 +371,7 @@ def test_a_slow_serial_port_drops_whole_frames_and_keeps_little(run: Run) -> Non
         got = bytearray()
 
         def read_some() -> bool:
-            """Whether there is nothing to be read: EIO is what an end without its other says."""
+            """Whether there is no data to read: a line without its other end returns EIO."""
             try:
                 got.extend(os.read(far, 1000))
             except OSError:
@@ -383,7 +383,7 @@ def test_a_slow_serial_port_drops_whole_frames_and_keeps_little(run: Run) -> Non
         while not unsent:
             port.send(FRAME)
             sent += 1
-        closing = asyncio.ensure_future(port.close())  # with some of it still here
+        closing = asyncio.ensure_future(port.close())  # with some data still queued here
         await until(lambda: read_some() and closing.done())
         assert bytes(got) == FRAME * sent
 

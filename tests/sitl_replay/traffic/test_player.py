@@ -37,7 +37,7 @@ def url_of(bound: socket.socket) -> str:
 
 
 def waiting(bound: socket.socket) -> list[bytes]:
-    """What has arrived."""
+    """The frames that have arrived."""
     bound.setblocking(False)
     found = []
     with contextlib.suppress(BlockingIOError):
@@ -47,7 +47,7 @@ def waiting(bound: socket.socket) -> list[bytes]:
 
 
 def log_of(stamps_s: list[float]) -> list[Frame]:
-    """Frames of the hover scenario under the stamps given."""
+    """Frames of the hover scenario with the given timestamps."""
     made = schedule(scenario.hover(1))
     return [
         Frame(
@@ -62,7 +62,7 @@ def log_of(stamps_s: list[float]) -> list[Frame]:
 
 
 def without_clock(raw: bytes) -> bytes | None:
-    """A frame, unless it tells the time of day."""
+    """A frame without its time of day."""
     return None if msgid_of(raw) == dialect.MAVLINK_MSG_ID_SYSTEM_TIME else raw
 
 
@@ -197,7 +197,7 @@ def test_a_refused_tcp_peer_is_told_by_its_url() -> None:
 
 @pytest.mark.full
 def test_a_peer_that_does_not_read_holds_nobody_up(receiver: socket.socket) -> None:
-    # Real time: frames for it are dropped and counted, once its buffers are full.
+    # In real time: frames for this peer are dropped and counted once its buffers are full.
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         url = f"tcp:127.0.0.1:{deaf.getsockname()[1]}"
@@ -257,7 +257,7 @@ def test_at_full_speed_a_slow_tcp_peer_loses_nothing() -> None:
 
         async def serve(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
             nonlocal count, stalled_at
-            while tally.frames != stalled_at:  # read only when nothing more goes in
+            while tally.frames != stalled_at:  # read only once the buffers are full
                 stalled_at = tally.frames
                 await asyncio.sleep(0.05)
             while data := await reader.read(1 << 16):
@@ -362,7 +362,7 @@ def test_a_serial_port_gets_the_stream() -> None:
     try:
         tally = run_async(player.play(log_of([0.0, 0.05, 0.1]), [url]))
         sent, got = b"".join(frame.raw for frame in log_of([0.0, 0.05, 0.1])), b""
-        while len(got) < len(sent):  # a terminal gives what it has
+        while len(got) < len(sent):  # a terminal returns what it has
             got += os.read(far, 4096)
         assert got == sent
     finally:
@@ -392,7 +392,7 @@ def test_faults_strike_each_link_by_itself(receiver: socket.socket) -> None:
         assert tally.frames == len(frames)
         assert tally.faults["loss"] == 2 * len(frames) - len(got[0]) // 2 - len(got[1]) // 2
         assert tally.faults["delay"] == 2 * len(frames) - tally.faults["loss"]
-        assert 0.75 <= tally.duration_s < 1.2  # what is late is waited for
+        assert 0.75 <= tally.duration_s < 1.2  # delayed frames are awaited
 
 
 def test_late_frames_come_late_in_real_time(receiver: socket.socket) -> None:

@@ -1,4 +1,4 @@
-"""tlogs, read back by pymavlink's own reader, and recordings of real sockets."""
+"""tlogs read back by pymavlink, and recordings of real sockets."""
 
 import asyncio
 import contextlib
@@ -27,7 +27,7 @@ ENOUGH = 40
 
 
 def read_by_mavutil(tlog: Path) -> list[tuple[float, bytes]]:
-    """Stamp and frame of every message: the oracle."""
+    """Timestamp and frame of every message, read by mavutil."""
     mavutil = pytest.importorskip("pymavlink.mavutil")
     reader = mavutil.mavlink_connection(str(tlog), dialect="ardupilotmega")
     found = []
@@ -80,19 +80,19 @@ def test_a_flight_is_recorded_as_it_was_sent(tmp_path: Path) -> None:
     assert max(late_s) - min(late_s) < 3e-6
 
 
-# Sent until somebody listens; no scenario has this message.
+# Sent until a receiver listens; no scenario contains this message.
 KNOCK = dialect.MAVLink_ping_message(1, 2, 3, 4).pack(dialect.MAVLink(None, 9, 9))
 
 
 async def until(heard: recorder.RecordingTally, count: int) -> None:
-    """Wait for so many frames, knocks aside."""
+    """Wait for the given number of frames, opening packets excluded."""
     async with asyncio.timeout(5.0):
         while heard.frames - heard.messages[dialect.MAVLINK_MSG_ID_PING] < count:
             await asyncio.sleep(0.005)
 
 
 def test_udp_is_recorded_peer_by_peer(tmp_path: Path, frames: list[bytes]) -> None:
-    # One peer sends half a frame, then another peer whole ones: those must not suffer.
+    # One peer sends half a frame, then another sends whole ones, which must not be affected.
     tlog = tmp_path / "heard.tlog"
     port = free_port(socket.SOCK_DGRAM)
     heard = recorder.RecordingTally()
@@ -152,7 +152,7 @@ def test_tcp_is_recorded_to_its_end(tmp_path: Path, frames: list[bytes]) -> None
 
 
 def test_frames_behind_a_torn_one_are_kept_at_the_end(tmp_path: Path, frames: list[bytes]) -> None:
-    # A header that claims 255 bytes, and two whole frames within what it claims.
+    # A header that claims 255 bytes, and two whole frames within these bytes.
     tlog = tmp_path / "heard.tlog"
     claim = bytes([0xFD, 255, 0, 0, 0, 9, 1, 33, 0, 0])
 
@@ -194,7 +194,7 @@ def test_a_taken_port_is_told(tmp_path: Path) -> None:
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
 def test_a_full_disk_is_an_error(frames: list[bytes]) -> None:
-    # It ends the recording at once, though more could come.
+    # The error ends the recording at once, though more data could arrive.
     port = free_port(socket.SOCK_DGRAM)
     url = LinkUrl(scheme="udpin", host="127.0.0.1", port=port)
 
@@ -217,7 +217,7 @@ def test_a_full_disk_is_an_error(frames: list[bytes]) -> None:
 async def waited_for(
     heard: recorder.RecordingTally, frames: int, task: "asyncio.Task[object]"
 ) -> None:
-    """Wait for so many frames, then end the recording as a signal does."""
+    """Wait for the given number of frames, then end the recording as a signal does."""
     async with asyncio.timeout(5.0):
         while heard.frames < frames:
             assert not task.done(), task.exception()
@@ -232,7 +232,7 @@ async def waited_for(
 def test_what_is_played_over_any_link_is_recorded(
     tmp_path: Path, frames: list[bytes], pair: str, host: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """The recorder at one end, the player at the other, whoever of them listens."""
+    """The recorder at one end and the player at the other; either may be the listener."""
     tlog = tmp_path / "heard.tlog"
     heard, listening = recorder.RecordingTally(), pair.split()
     log = [
@@ -311,7 +311,7 @@ def test_serial_is_recorded_until_it_is_unplugged(tmp_path: Path, frames: list[b
         task = asyncio.create_task(recorder.record(url, tlog, heard=heard))
         sent = b"".join(frames[:3])
         async with asyncio.timeout(5.0):
-            while heard.frames < 1:  # what comes before the port is set up is thrown away
+            while heard.frames < 1:  # bytes received before the port is set up are discarded
                 os.write(far, KNOCK)
                 await asyncio.sleep(0.02)
             for at in range(0, len(sent), 7):
@@ -336,13 +336,13 @@ def test_a_recorder_is_silent_but_for_its_opener(tmp_path: Path, frames: list[by
         task = asyncio.create_task(recorder.record(url, tmp_path / "a.tlog", heard=heard))
         got: list[bytes] = []
         async with asyncio.timeout(8.0):
-            while len(got) < 2:  # a second apart, until it hears something
+            while len(got) < 2:  # a second apart, until it receives data
                 with contextlib.suppress(BlockingIOError):
                     data, address = vehicle.recvfrom(300)
                     got.append(data)
                 await asyncio.sleep(0.005)
         vehicle.sendto(frames[0], address)
-        await asyncio.sleep(1.2)  # no third one comes: nothing to wait for
+        await asyncio.sleep(1.2)  # no third packet arrives: nothing to wait for
         with contextlib.suppress(BlockingIOError):
             got.append(vehicle.recv(300))
         await waited_for(heard, 1, task)
@@ -357,7 +357,7 @@ def test_a_recorder_is_silent_but_for_its_opener(tmp_path: Path, frames: list[by
 def test_what_was_heard_is_on_disk_when_it_falls_silent(
     tmp_path: Path, frames: list[bytes]
 ) -> None:
-    """So that a killed process loses a second, not what came since the last flush."""
+    """A killed process loses at most a second, not everything since the last flush."""
     tlog, port = tmp_path / "a.tlog", free_port(socket.SOCK_DGRAM)
     heard = recorder.RecordingTally()
 
@@ -381,7 +381,7 @@ def test_a_visitor_who_leaves_does_not_end_the_recording_of_a_server(
 ) -> None:
     tlog = tmp_path / "a.tlog"
     heard = recorder.RecordingTally()
-    claim = bytes([0xFD, 255, 0, 0, 0, 9, 1, 33, 0, 0])  # swallows what comes behind it
+    claim = bytes([0xFD, 255, 0, 0, 0, 9, 1, 33, 0, 0])  # hides the frames after it
 
     async def scene() -> None:
         url = parse_link("tcpin:127.0.0.1:0")

@@ -1,4 +1,4 @@
-"""Flights made up for the studies' tests."""
+"""Synthetic flights for tests of the studies."""
 
 import struct
 from collections.abc import Callable
@@ -18,7 +18,7 @@ ORIGIN = (47.4, 8.5, 400.0)
 
 
 def frames(uav: str, arrival_ns: np.ndarray, flight: tuple[np.ndarray, ...]) -> tuple[Frame, ...]:
-    """GLOBAL_POSITION_INT at boot times (ms) of positions and velocities, local frame."""
+    """GLOBAL_POSITION_INT at the given boot times (ms), positions and velocities, local frame."""
     local, source, found = LocalFrame(*ORIGIN), Source.parse(uav), []
     for seq, (came_ns, boot_ms, where, moves) in enumerate(
         zip(arrival_ns.tolist(), *(column.tolist() for column in flight), strict=True)
@@ -36,7 +36,8 @@ def frames(uav: str, arrival_ns: np.ndarray, flight: tuple[np.ndarray, ...]) -> 
 
 @pytest.fixture(scope="session")
 def straight_flight() -> MakeFlight:
-    """``straight_flight(n, uav=...)``: 10 Hz, 12 m/s, 30 m up; each report 5 ms on its way."""
+    """``straight_flight(n, uav=...)``: 10 Hz, 12 m/s, 30 m high; each report takes 5 ms to
+    arrive."""
 
     def make(n: int = 600, uav: str = "1:1", height_m: float = 30.0) -> Flight:
         boot_ms = 5000 + 100 * np.arange(n)

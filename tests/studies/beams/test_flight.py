@@ -1,4 +1,4 @@
-"""Beams over a flight: against a second pipeline, other readers of the log, and sums by hand."""
+"""Beam study of a flight: against a second pipeline, other log readers, and hand calculations."""
 
 import json
 import math
@@ -14,7 +14,7 @@ import numpy as np
 import pymap3d
 import pytest
 from click.testing import CliRunner
-from pymavlink import mavutil  # the oracle: tests alone may import it
+from pymavlink import mavutil  # reference implementation: only tests may import it
 from support import ROOT, shared_log
 
 from companion.beams.array.coverage import EVERYWHERE, Coverage
@@ -43,7 +43,7 @@ UAVS = {"1:1", "2:1", "3:1", "4:1"}
 
 
 def run(*arguments: str | Path) -> Any:
-    """The command, as the console script runs it."""
+    """Run the command as the console script does."""
     return CliRunner().invoke(main, ["study", "beams", *map(str, arguments)])
 
 
@@ -57,7 +57,7 @@ def cut() -> Path:
 
 
 def without(path: Path, out: Path, unwanted: Callable[[Frame], bool]) -> Path:
-    """The log without some frames, as .tlog."""
+    """Write the log without some frames, as .tlog."""
     with out.open("wb") as file:
         for event in read_log(path):
             if isinstance(event, Frame) and not unwanted(event):
@@ -67,7 +67,7 @@ def without(path: Path, out: Path, unwanted: Callable[[Frame], bool]) -> Path:
 
 @pytest.fixture(scope="module")
 def short(cut: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first eight seconds of it."""
+    """The first eight seconds of the log."""
     ends_ns = next(read_log(cut)).t_ns + 8 * S
     return without(cut, tmp_path_factory.mktemp("log") / "8s.tlog", lambda f: f.t_ns > ends_ns)
 
@@ -87,7 +87,7 @@ def looked(cut: Path) -> tuple[Pipeline, Update]:
     raise AssertionError
 
 
-# --- sums by hand -------------------------------------------------------------------------------
+# --- hand calculations --------------------------------------------------------------------------
 
 
 def worth(gain_db: float = 10.0, **given: Any) -> Worth:
@@ -107,7 +107,7 @@ def worth(gain_db: float = 10.0, **given: Any) -> Worth:
 
 
 def test_sums_by_hand() -> None:
-    """Four looks, one without a beam and one without a guarantee."""
+    """Four samples, one without a beam and one without a guarantee."""
     samples = [
         Sample(t_s=0.0, uav="1:1"),
         Sample(
@@ -179,14 +179,14 @@ def test_without_beams_nothing_is_known() -> None:
     assert all(row[key] is None for key in row.keys() - counts)
 
 
-# --- looking ------------------------------------------------------------------------------------
+# --- samples ------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
     "hz", [*(pytest.param(hz, marks=pytest.mark.full) for hz in (5.0, 100.0)), 7.0]
 )
 def test_looks_are_at_the_last_tick(short: Path, hz: float) -> None:
-    """Each update once, however often one looks."""
+    """Each update is sampled once, whatever the sampling rate."""
     settings = Settings().override(center={"source": "home"}, beams={"targets": "telemetry"})
     pipeline, ticks, begins_ns, ends_ns = Pipeline(settings), [], None, 0
     for event in log_events([short], settings):
@@ -217,7 +217,7 @@ def test_sharp_beams_are_those_of_a_pipeline_that_does_not_widen(
         assert (ours.t_s, ours.uav) == (theirs.t_s, theirs.uav)
         assert ours.sharp is not None
         assert theirs.as_set is not None
-        # Their name follows with a delay, as it would in flight.
+        # Their id arrives with a delay, as in flight.
         assert replace(ours.sharp, method=theirs.as_set.method) == theirs.as_set
     assert not any(s.sharp.widened for s in watched.samples if s.sharp)
     assert any(s.as_set.widened for s in watched.samples if s.as_set)
@@ -232,14 +232,14 @@ def test_what_is_promised_is_kept(watched: StudiedFlight) -> None:
     assert row["codebook_misses"] == 0
     assert row["pointing_bound_median_deg"] < 8.0
     assert row["sweep_share_mean"] < 0.15
-    # What widening costs, and what it gives.
+    # The cost and the benefit of widening.
     assert row["gain_median_db"] < row[SHARP + "gain_median_db"] - 0.5
     assert row["guaranteed_share"] > 0.8
     assert row[SHARP + "guaranteed_share"] < 0.5
 
 
 def brute_gain_db(pipeline: Pipeline, towards: np.ndarray, weights: np.ndarray) -> float:
-    """Element by element."""
+    """The gain, summed element by element."""
     array = pipeline.array
     total = 0j
     for place_m, weight in zip(array.elements_m, weights, strict=True):
@@ -301,7 +301,7 @@ def _best(pipeline: Pipeline, seen: Sight, towards: np.ndarray) -> int:
 
 
 def test_a_codebook_that_is_missed_is_said(looked: tuple[Pipeline, Update], cut: Path) -> None:
-    """A truth far off: outside the bound, and its best beam is not swept."""
+    """The true direction is far off: outside the bound, and its best beam is not swept."""
     pipeline, update = looked
     truth = array_truth.load([cut], pipeline)
     assert truth is not None
@@ -370,8 +370,8 @@ def simulated(path: Path) -> dict[str, np.ndarray]:
 
 
 def test_true_directions_by_another_way(cut: Path, looked: tuple[Pipeline, Update]) -> None:
-    """By pymavlink, pymap3d, and the angles instead of the quaternion. The predicted attitude is
-    off by a degree: it would not pass."""
+    """By pymavlink, pymap3d, and Euler angles instead of the quaternion. The predicted attitude
+    is off by a degree and would fail this test."""
     pipeline, update = looked
     truth = array_truth.load([cut], pipeline)
     assert truth is not None
@@ -395,7 +395,7 @@ def test_true_directions_by_another_way(cut: Path, looked: tuple[Pipeline, Updat
 
 
 def _about(axis: str, angle: float) -> np.ndarray:
-    """Frame rotation about an axis."""
+    """Rotation of the frame about an axis."""
     c, s = math.cos(angle), math.sin(angle)
     return {
         "x": np.array([[1, 0, 0], [0, c, s], [0, -s, c]]),
@@ -454,7 +454,7 @@ def test_a_log_without_truth(short: Path, tmp_path: Path) -> None:
 
 
 def test_a_station(short: Path) -> None:
-    """What stands has no attitude to be wrong about."""
+    """A fixed station has no attitude error."""
     found = watch([short], Settings().override(center={"source": "47.3977419,8.5455938,500"}), 0.5)
     row = summed_up(found.samples)
     assert found.truth == "SIM_STATE"
@@ -469,7 +469,7 @@ def test_a_station(short: Path) -> None:
 
 @pytest.mark.full
 def test_a_sweep_of_a_tenth_of_a_panel_s_beams_holds_the_best(cut: Path) -> None:
-    """The 64 beams of 8 × 8 elements, once a track has its bound."""
+    """The 64 beams of 8 × 8 elements, once the track has its bound."""
     panel = on_carrier(array={"kind": "ura"}, codebook={"kind": "dft"})
     samples = watch([cut], panel, 5.0).samples
     assert not any(sample.missed for sample in samples)
@@ -495,7 +495,7 @@ def test_the_codebook_of_the_settings_and_none(short: Path) -> None:
 
 
 def test_figures_show_the_worst_and_leave_gaps() -> None:
-    """Forty looks; in ten nothing is guaranteed, and one gain is low."""
+    """Forty samples; ten have no guarantee, and one gain is low."""
     samples = tuple(
         Sample(
             t_s=float(t),
@@ -523,10 +523,10 @@ def test_figures_show_the_worst_and_leave_gaps() -> None:
     )
     drawn = charts(watched)
     gain = curves(drawn["gain"]().axes[0])
-    assert gain.keys() == {"predicted", "guaranteed"}  # without truth nothing is true
+    assert gain.keys() == {"predicted", "guaranteed"}  # without truth there are no true values
     told = charts(replace(watched, truth="SIM_STATE"))
     assert curves(told["gain"]().axes[0]).keys() == gain.keys() | {"true"}
-    # Two looks to a bin; the worst of each.
+    # Two samples per bin; the worst of each.
     assert list(gain["predicted"][1]) == [0.0 if n == 31 * 20 // 39 else 10.0 for n in range(20)]
     assert np.isnan(gain["guaranteed"][1]).nonzero()[0].tolist() == [5, 6, 7, 8, 9]
     (share,) = curves(drawn["sweep"]().axes[0]).values()
@@ -534,7 +534,7 @@ def test_figures_show_the_worst_and_leave_gaps() -> None:
     as_set, _ = drawn["gain_had"]().axes
     had = curves(as_set)
     low = as_set.get_xlim()[0]
-    # Three looks of four have a guarantee, each of them the same.
+    # Three samples of four have a guarantee, all equal.
     assert (had["guaranteed"][0][0], had["guaranteed"][1][0]) == (low, 75.0)
     assert (had["guaranteed"][0][-1], had["guaranteed"][1].max()) == (5.0, 75.0)
     assert had["predicted"][1][0] == 100.0
@@ -573,7 +573,7 @@ def test_a_value_between_two_gaps_is_a_dot() -> None:
 
 
 def curves(axes: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """The named lines of a panel: their x and y."""
+    """The named lines of a panel: their x and y values."""
     return {
         line.get_label(): (np.asarray(line.get_xdata()), np.asarray(line.get_ydata()))
         for line in axes.lines
@@ -585,7 +585,7 @@ def curves(axes: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
 
 
 class Page(HTMLParser):
-    """What a page holds, and that its elements close."""
+    """Elements of a page; fails if one is left open."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -685,7 +685,7 @@ def test_a_rate_that_is_none() -> None:
 
 
 def test_where_a_bound_does_not_hold_no_more_is_lost(short: Path) -> None:
-    """Settings that promise too much: what is guaranteed breaks there, and only there."""
+    """Overconfident settings: the guarantee fails where the bound fails, and only there."""
     bold = {"follow_accuracy": False, "position_noise_m": 0.05, "velocity_noise_mps": 0.05}
     held = {"attitude_bound_deg": 0.1, "turn_acceleration_max_degps2": 0.0}
     settings = on_carrier(observer=bold).override(center=held)

@@ -1,4 +1,4 @@
-"""Ways of making beams over links: against a second pipeline, and by what must hold of each."""
+"""Beam widths and predictors over links: against a second pipeline, and by required properties."""
 
 import json
 from pathlib import Path
@@ -25,7 +25,7 @@ WORDS = ["study", "beams", "--center", "5:1", "--hz", "1", "--links"]
 
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The first half of the log; the last frame may be torn."""
+    """The first half of the log; the last frame may be truncated."""
     log = tmp_path_factory.mktemp("log") / "begun.tlog"
     whole = CUT.read_bytes()
     log.write_bytes(whole[: len(whole) // 2])
@@ -34,7 +34,7 @@ def begun(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def report(begun: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """What the command wrote of its comparison."""
+    """The comparison written by the command."""
     out = tmp_path_factory.mktemp("modes")
     done = CliRunner().invoke(main, [*WORDS, "clean", "--out", str(out), str(begun)])
     assert done.exit_code == 0, done.output

@@ -1,4 +1,4 @@
-"""Measured beams: the splits, the tables as they come, the predictors on beams that are known."""
+"""Measured beams: the splits, the tables, and the predictors on known beams."""
 
 import json
 from dataclasses import replace
@@ -21,7 +21,7 @@ BEAMS = 32
 def flown(
     seed: int, count: int = 1500, lag: int = 0, height: float = 0.0, y: float = -0.4
 ) -> tuple[FloatArray, IntArray]:
-    """A path by an array at (0.5, y), and its beams by the sine from the array's middle."""
+    """A path past an array at (0.5, y), and its beams from the sine about the array centre."""
     rng = np.random.default_rng(seed)
     turn = np.cumsum(rng.normal(0, 0.05, count))
     place = 0.5 + 0.45 * np.stack(
@@ -51,7 +51,7 @@ def test_choices_are_made_within_what_is_learned_from() -> None:
 
 @pytest.mark.full
 def test_no_predictor_sees_what_is_tested() -> None:
-    """Other beams where it is tested change nothing of what is predicted there."""
+    """Other beams in the tested samples do not change their predictions."""
     place, beam = flown(1)
     tested = blocks(len(beam), 20, 5)[1]
     lied = np.where(tested, (beam * 7 + 3) % BEAMS, beam)
@@ -81,7 +81,7 @@ def test_a_height_is_found_and_tells_beams_that_the_bearing_does_not() -> None:
 
 
 def test_the_expected_beam_by_hand() -> None:
-    """3 across, 4 away and 12 up are a sine of 3/13; looking the other way it is its negative."""
+    """3 across, 4 away and 12 up give a sine of 3/13; with the opposite yaw, its negative."""
     at = geometry.Geometry(
         x=0.0, y=0.0, stretch=np.log(2.0), yaw=0.0, middle=16.0, slope=26.0, height=12.0, lag=0.0
     )
@@ -110,7 +110,7 @@ def test_a_delay_is_a_shift() -> None:
 
 
 def test_what_stays_where_it_is_counts_little() -> None:
-    """Of 500 samples in flight all count; of 500 that hover, a tenth."""
+    """All of 500 samples in flight count; of 500 hovering ones, a tenth."""
     way = np.concatenate([np.arange(500.0), np.full(500, 499.0)])
     apart = Samples(
         name="x", place=np.stack([way, 0 * way], axis=1), beam=np.ones(1000, int), beams=BEAMS
@@ -121,7 +121,7 @@ def test_what_stays_where_it_is_counts_little() -> None:
 
 
 def test_the_density_is_of_what_is_near_and_else_beside_the_expected_beam() -> None:
-    """Learned where beams 10 and 12 are expected, 10 and 13 are best; of 20 nothing is known."""
+    """Where beams 10 and 12 are expected, 10 and 13 are best; for 20 there are no samples."""
     at = geometry.Geometry(
         x=0.0, y=0.0, stretch=0.0, yaw=0.0, middle=0.0, slope=32.0, height=0.0, lag=0.0
     )
@@ -136,7 +136,7 @@ def test_the_density_is_of_what_is_near_and_else_beside_the_expected_beam() -> N
     assert likely[120, 21] > likely[120, 23] > likely[120, 0] > 1e-4
     heavy = predictors.density(samples, np.arange(150) < 100, at, 0.25, 500.0)
     assert heavy[60, 12] > 0.05 > likely[60, 12]
-    assert heavy[60, 10] > 2 * heavy[60, 14]  # as far aside, and popular
+    assert heavy[60, 10] > 2 * heavy[60, 14]  # equally far off, and frequent
 
 
 def test_predictions_are_averaged_over_geometries() -> None:
@@ -151,7 +151,7 @@ def test_predictions_are_averaged_over_geometries() -> None:
 
 
 def test_a_threshold_covers_in_other_blocks() -> None:
-    """Where it was not learned they are 0 to 1 evenly: 99.25 of 100 are above 0.0075."""
+    """Held-out values are uniform on 0 to 1: 99.25 % are above 0.0075."""
     count = 20_000
     beam = np.random.default_rng(3).permutation(count) % 2
     chance = np.random.default_rng(4).permutation(count) / count
@@ -179,7 +179,7 @@ def test_ranks_and_candidate_sets() -> None:
 
 
 def written(folder: Path, *, files: bool) -> Path:
-    """A scenario as a table alone, or as the folder that the data come in, with powers."""
+    """Write a scenario as a single table, or as the published folder with powers."""
     place, beam = flown(4, 400)
     lines = [
         "index,unit1_pwr_60ghz,unit2_loc,unit1_beam" if files else "index,unit2_pos,unit1_beam"
@@ -240,7 +240,7 @@ def test_what_is_no_scenario_is_said(text: str, why: str, tmp_path: Path) -> Non
 
 @pytest.mark.full
 def test_the_drone_scenario_on_blocks() -> None:
-    """The published rivals as they were measured before, and what is reached beside them."""
+    """The published baselines as measured before, and our results beside them."""
     samples = measured_beams.read(shared_log("deepsense_scenario23.csv"))
     assert (len(samples.beam), samples.beams) == (11_387, 32)
     assert samples.neighbours_alike() == pytest.approx(0.82, abs=0.005)
@@ -251,4 +251,6 @@ def test_the_drone_scenario_on_blocks() -> None:
     assert plain["top_3"] == pytest.approx(78.2, abs=0.7)
     assert ours["top_1"] > 48 and ours["top_3"] > 87 and ours["top_5"] > 95
     assert ours["set_size_mean"] < 8 and ours["set_coverage"] > 0.99
-    assert rows["shuffled", "nearest neighbours"]["top_1"] > near["top_1"] + 5  # it leaks
+    assert (
+        rows["shuffled", "nearest neighbours"]["top_1"] > near["top_1"] + 5
+    )  # leakage

@@ -1,4 +1,4 @@
-"""Drawings: what an SVG holds."""
+"""Drawings: contents of an SVG."""
 
 from xml.etree import ElementTree
 

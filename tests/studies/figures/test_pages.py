@@ -1,4 +1,4 @@
-"""Pages: words that are handed in stay words, and a value that is missing is an error."""
+"""Pages: values are escaped, and a missing value is an error."""
 
 import pytest
 from jinja2 import UndefinedError
@@ -14,7 +14,7 @@ def test_nothing_handed_in_can_leave_its_place() -> None:
     figure = {"name": EVIL, "caption": EVIL, "png_base64": ""}
     page = pages.page(PAGE, answer=answer, figures={"one": figure})
     assert EVIL not in page and "<script>" not in page and 'x"y' not in page
-    assert page.count("&gt;&lt;script&gt;") == 3 + 3  # what made it; id, alternative, caption
+    assert page.count("&gt;&lt;script&gt;") == 3 + 3  # generator; id, alternative text, caption
 
 
 def test_a_page_is_the_same_again_and_loads_nothing() -> None:

@@ -1,4 +1,4 @@
-"""Figures: lines that can be told apart, files that are the same again, words that are safe."""
+"""Figures: distinguishable lines, reproducible files, escaped text."""
 
 from base64 import b64encode
 from itertools import pairwise

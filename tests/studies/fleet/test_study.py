@@ -1,4 +1,4 @@
-"""The command ``companion study fleet``: what it says, and that it says the same again."""
+"""The command ``companion study fleet``: its answer, and its reproducibility."""
 
 import json
 from pathlib import Path
@@ -77,7 +77,7 @@ def test_a_sample_of_the_reports_counts_for_all() -> None:
 def test_shares_are_of_uavs_served_once_twice_and_not_at_all(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Six, one and three of ten; with half of the nodes apart, four of eight are unserved."""
+    """Six, one and three of ten; with half of the nodes cut off, four of eight are unserved."""
     counted = [
         FleetCounts(served=6, twice=1, unserved=3, handovers=4),
         FleetCounts(served=4, twice=0, unserved=4),

@@ -1,4 +1,4 @@
-"""Fleets in virtual time, with links that delay and lose, partitions and deaths."""
+"""Fleets in virtual time: links with delay and loss, partitions and node failures."""
 
 from dataclasses import replace
 
@@ -15,7 +15,7 @@ SETTINGS = FleetSettings(node="any")
 
 
 def shares(counted: FleetCounts) -> tuple[float, float, float]:
-    """Shares of one, several, and no node."""
+    """Shares of UAVs served by one, by several, and by no node."""
     found = counted.served, counted.twice, counted.unserved
     return tuple(one / sum(found) for one in found)  # type: ignore[return-value]
 
@@ -87,8 +87,8 @@ def test_parted_nobody_is_unserved_and_it_heals(
 
 @pytest.mark.parametrize("sampled", [40])
 def test_reports_are_told_about_once(sampled: int) -> None:
-    """All hear all; after the first moments each report is told by one of them."""
-    several = SETTINGS.model_copy(update={"share_hz": 100.0})  # in a word, with its head
+    """All nodes receive all reports; after the start, one node shares each report."""
+    several = SETTINGS.model_copy(update={"share_hz": 100.0})  # in one message, with its header
     world = settled(Sky(nodes=3, uavs=sampled, spacing_m=300.0, sampled=sampled), several)
     world.run(5)
     bits = 8 * world.counted.sent["heard"] / 5
@@ -97,7 +97,7 @@ def test_reports_are_told_about_once(sampled: int) -> None:
 
 
 def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
-    """Four times as many nodes on four times the area: each has the like around it."""
+    """Four times the nodes on four times the area: the same density around each."""
     told = []
     for nodes in (4, 16):
         sky = Sky(nodes=nodes, uavs=2 * nodes, spacing_m=9000.0, sampled=2 * nodes, report_hz=1.0)
@@ -110,7 +110,7 @@ def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
         assert none == 0
         received = world.counted.received
         told.append((received["heard"] + received["offers"]) / nodes)
-    assert told[1] < 2 * told[0]  # two are near each of four, up to four each of sixteen
+    assert told[1] < 2 * told[0]  # two near each of four nodes, up to four near each of sixteen
 
 
 def test_what_is_told_arrives_with_its_heads() -> None:
@@ -133,7 +133,7 @@ def test_parted_nothing_arrives_and_dead_nothing_is_heard() -> None:
     world.parted = lambda one, other: False
     world.run(1)
     world.kill("n000")
-    member = world.members["n000"]  # some of what it is told is on its way
+    member = world.members["n000"]  # some messages are still in flight
     before = {name: one.heard_ns for name, one in member.neighbours.items()}
     world.run(1)
     assert {name: one.heard_ns for name, one in member.neighbours.items()} == before

@@ -1,4 +1,4 @@
-"""Maps of feasible intervals: against the definition by scanning, simulation, and the page."""
+"""Maps of feasible intervals: against a scan by definition, a simulation, and the page."""
 
 import json
 import math
@@ -18,7 +18,7 @@ from companion.tracking.design import closed_form
 
 @pytest.fixture(scope="module")
 def made(studied: Callable[..., Path]) -> Path:
-    """Where ``companion study dt`` has written everything."""
+    """The folder with the output of ``companion study dt``."""
     return studied("dt")
 
 
@@ -34,7 +34,7 @@ def drawn() -> Maps:
 
 
 def margin(dt_s: float, feedthrough_s: float, alpha: float, mu: float) -> float:
-    """The best margin of the LMIs over all gains at a mu: the definition, by scanning."""
+    """The best margin of the LMIs over all gains at a mu: a scan by definition."""
     return max(
         closed_form.lmi_margin(
             dt_s, feedthrough_s=feedthrough_s, alpha=alpha, l_gain=l_gain, mu=mu, p=1 / mu
@@ -56,7 +56,7 @@ def test_the_limit_is_where_no_gain_is_left(drawn: Maps, mu: float) -> None:
 
 
 def test_the_peak_is_reached_and_never_above_gamma(drawn: Maps) -> None:
-    """By flying an input that always pushes outward."""
+    """By simulating an input that always pushes outward."""
     for alpha in maps.ALPHAS:
         peaks, gammas = drawn.peak_gain_s[alpha], drawn.gamma_s[alpha]
         assert (peaks <= gammas + 1e-7).all()
@@ -87,8 +87,8 @@ def test_the_published_limits_are_on_the_map(drawn: Maps) -> None:
 
 @pytest.mark.full
 def test_without_a_lead_the_error_is_the_way_flown(answer: dict[str, Any]) -> None:
-    """At feedthrough 0 the interval is error / speed (alpha near 1); with a lag it is less by the
-    lag, with a lead never less than twice the lead nearly."""
+    """At feedthrough 0 the interval is error / speed (alpha near 1). A lag shortens it by the
+    lag; with a lead it is at least almost twice the lead."""
     for row in answer["rates"]:
         reach_s, d = row["error_m"] / row["speed_mps"], row["feedthrough_s"]
         if d == 0:

@@ -1,4 +1,4 @@
-"""Blocks of bits through the link: against theory, and against sums done otherwise."""
+"""Blocks of bits through the link: against theory and independent calculations."""
 
 import numpy as np
 import pytest
@@ -35,8 +35,8 @@ def test_streams_that_pilots_cannot_tell_apart_are_refused() -> None:
 
 
 def test_in_time_as_in_frequency() -> None:
-    """Every stream through every delay, one block running into the next: after the prefix it is
-    one complex number for each carrier, stream and UAV."""
+    """Every stream through every delay, with consecutive blocks: after prefix removal the
+    channel is one complex number per carrier, stream and UAV."""
     rng = np.random.default_rng(2)
     taps = rng.standard_normal((20, 3, 3)) + 1j * rng.standard_normal((20, 3, 3))
     sent = send(3, 4, rng)
@@ -50,7 +50,7 @@ def test_in_time_as_in_frequency() -> None:
 
 @pytest.mark.parametrize("estimation", list(Estimation))
 def test_without_noise_nothing_is_wrong(estimation: Estimation) -> None:
-    """Whatever the phase and the strength of the channel; over delays if it is known exactly."""
+    """For any channel phase and strength; with delays if the channel is known exactly."""
     sent = send(2, 3, np.random.default_rng(4))
     taps: ComplexArray = (np.eye(2) * np.array([0.01j, -3.0]))[np.newaxis]
     if estimation is Estimation.IDEAL:
@@ -62,7 +62,7 @@ def test_without_noise_nothing_is_wrong(estimation: Estimation) -> None:
 
 
 def test_blocks_that_are_not_decoded_would_decode_to_the_same() -> None:
-    """At a rate at which some blocks have no wrong coded bit, and some decode wrongly."""
+    """At a rate where some blocks have no wrong coded bit, and some decode wrongly."""
     rng = np.random.default_rng(5)
     sent = send(4, 60, rng)
     power = np.logspace(-0.4, -1.9, 60)[:, np.newaxis]
@@ -78,7 +78,8 @@ def test_blocks_that_are_not_decoded_would_decode_to_the_same() -> None:
 
 
 def test_few_wrong_bits_can_be_another_word() -> None:
-    """One bit sends 15: heard as the word of a neighbour, a block decodes to that neighbour."""
+    """One information bit changes 15 coded bits: a block received as its neighbour decodes to
+    it."""
     sent = send(1, 2, np.random.default_rng(8))
     other = sent.bits.copy()
     other[0, 1, 100] ^= True
@@ -91,9 +92,10 @@ def test_few_wrong_bits_can_be_another_word() -> None:
 
 @pytest.mark.full
 def test_error_rates_over_white_noise_are_those_of_theory() -> None:
-    """The exact curve lies within the intervals, and within 0.1 dB where errors are many; EVM is
-    the noise; coded, 1e-3 is reached at 5.3 dB, where commpy's own modem and decoder on 200 blocks
-    of 306 bits gave 2.0e-3 at 5.0 dB and 4.7e-4 at 5.5 dB: too slow to be done again here."""
+    """The exact curve lies within the intervals, and within 0.1 dB where errors are frequent.
+    EVM equals the noise. Coded, 1e-3 is reached at 5.3 dB: commpy's modem and decoder on 200
+    blocks of 306 bits gave 2.0e-3 at 5.0 dB and 4.7e-4 at 5.5 dB, but are too slow to run
+    here."""
     setting = LinkStudy(snr_db=(4, 16, 1), blocks=40)
     counts: dict[tuple[str, float], list[BlockErrors]] = {}
     channels = {AWGN: np.eye(4, dtype=complex)[np.newaxis]}
@@ -114,5 +116,5 @@ def test_error_rates_over_white_noise_are_those_of_theory() -> None:
                 for by in (0.1, -0.1)]  # fmt: skip
         assert near[0] < found["ber"] < near[1]
         assert found["evm_percent"] == pytest.approx(100 * 10 ** (-found["snr_db"] / 20), rel=0.01)
-    assert outside <= 3  # of 13, one in twenty by chance
+    assert outside <= 3  # of 13; one in twenty by chance
     assert crossing_db(rows, AWGN, True, 1e-3) == pytest.approx(5.3, abs=0.15)

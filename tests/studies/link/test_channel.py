@@ -1,4 +1,4 @@
-"""What each UAV hears of each stream: powers, delays, zero forcing."""
+"""Received amplitude of each stream at each UAV: powers, delays, zero forcing."""
 
 import math
 from dataclasses import replace
@@ -26,7 +26,7 @@ def seen_at(azimuths: FloatArray) -> FloatArray:
 
 
 def instant(off_deg: float = 0.0) -> Instant:
-    """Four UAVs apart; predicted and held positions off by so much and twice that."""
+    """Four separated UAVs; predicted positions off by the given angle, held ones by twice that."""
     off = np.radians(off_deg)
     kinds = zip(PositionSource, (0.0, off, 2 * off), strict=True)
     return Instant(0.0, {kind: seen_at(AZIMUTHS + by) for kind, by in kinds})
@@ -41,7 +41,7 @@ def heard(seen: Instant, by: PositionSource, scattering: Scattering = SIGHT) -> 
 
 
 def test_zero_forcing_by_the_truth_leaves_no_interference() -> None:
-    """And costs each UAV its loss factor, against 1 for a beam on it alone."""
+    """Each UAV loses its loss factor, relative to a beam on it alone."""
     (amplitudes,) = heard(instant(), PositionSource.PERFECT)
     steering = steering_matrix(
         assembly.array(Settings()), instant().towards[PositionSource.PERFECT]
@@ -61,7 +61,7 @@ def test_beams_that_miss_interfere() -> None:
 
 
 def test_scattered_rays_have_their_share_of_the_power() -> None:
-    """In units of the line of sight to one antenna; their delays as the profile says."""
+    """Relative to the line of sight at one antenna; delays follow the profile."""
     array, own = assembly.array(Settings()), uav_array(Settings())
     many = seen_at(np.tile(AZIMUTHS, 20))
     scattering = Scattering(3.0, 40e-9)

@@ -5,7 +5,7 @@ from itertools import product
 
 import numpy as np
 import pytest
-from commpy.channelcoding import Trellis, conv_encode, viterbi_decode  # the oracle
+from commpy.channelcoding import Trellis, conv_encode, viterbi_decode  # reference implementation
 from scipy.stats import norm
 from support import rounds
 
@@ -16,7 +16,7 @@ from companion.values import BoolArray, FloatArray
 
 @pytest.fixture(scope="module")
 def trellis() -> Trellis:
-    """commpy's, the newest bit most significant."""
+    """commpy's trellis, with the newest bit most significant."""
     return Trellis(np.array([6]), np.array([[0o133, 0o171, 0o165]]), polynomial_format="Matlab")
 
 
@@ -25,7 +25,7 @@ def drawn(blocks: int, bits: int, seed: int) -> BoolArray:
 
 
 def by_shift_register(bits: BoolArray) -> list[int]:
-    """Octal digits read as wires: 133 is 1 011 011, 171 is 1 111 001, 165 is 1 110 101."""
+    """Octal digits as taps: 133 is 1 011 011, 171 is 1 111 001, 165 is 1 110 101."""
     wires = ((0, 2, 3, 5, 6), (0, 1, 2, 3, 6), (0, 1, 2, 4, 6))
     register, sent = [0] * 7, []
     for bit in [*bits.astype(int).tolist(), *[0] * 6]:
@@ -42,7 +42,7 @@ def test_code_words_are_those_of_a_shift_register_and_of_commpy(trellis: Trellis
 
 
 def test_one_bit_sends_the_generators() -> None:
-    """Its impulse response, read down the outputs."""
+    """Its impulse response, read along the outputs."""
     sent = encode(np.array([True])).reshape(7, 3).astype(int)
     read = [int("".join(map(str, sent[:, output])), 2) for output in range(3)]
     assert read == list(GENERATORS) == [0o133, 0o171, 0o165]
@@ -55,13 +55,13 @@ def test_blocks_of_any_shape() -> None:
 
 
 def test_without_noise_every_block_comes_back() -> None:
-    """More blocks than are decoded at once."""
+    """More blocks than one decoder batch."""
     bits = drawn(BATCH + 3, 50, 3)
     assert (decode(1.0 - 2.0 * encode(bits)) == bits).all()
 
 
 def test_the_decoder_is_brute_force() -> None:
-    """Every word of short blocks correlated with what was heard, in heavy noise."""
+    """Every word of short blocks correlated with the received one, in heavy noise."""
     words = np.array(list(product([False, True], repeat=8)))
     signs = 1.0 - 2.0 * encode(words)
     heard = np.random.default_rng(4).standard_normal((400, signs.shape[1]))
@@ -71,7 +71,7 @@ def test_the_decoder_is_brute_force() -> None:
 
 
 def by_commpy(soft: FloatArray, trellis: Trellis, bits: int) -> BoolArray:
-    """It does not know that the code ends in state 0, unless certain zeros follow."""
+    """commpy assumes no final state 0, unless known zeros follow."""
     certain = np.full(3 * 10, -1e3)
     heard = np.concatenate([-soft, certain])
     found = viterbi_decode(heard, trellis, len(heard) // 3, decoding_type="unquantized")
@@ -81,7 +81,7 @@ def by_commpy(soft: FloatArray, trellis: Trellis, bits: int) -> BoolArray:
 @pytest.mark.full
 @pytest.mark.parametrize("snr_db", [1.0, 2.0])
 def test_noisy_blocks_are_decoded_as_by_commpy(trellis: Trellis, snr_db: float) -> None:
-    """16-QAM at bit error rates of some per cent: the same errors, bit by bit."""
+    """16-QAM at bit error rates of a few per cent: the same errors, bit by bit."""
     bits = drawn(30, 38, 6)
     n0 = 10 ** (-snr_db / 10)
     symbols = modulate(encode(bits))
@@ -107,7 +107,7 @@ def test_what_is_no_code_word_is_refused(length: int) -> None:
 def spectrum(most: int) -> FloatArray:
     """Information bits on paths that leave state 0 and return, by weight up to ``most``.
 
-    By a walk over the trellis with the wires of ``by_shift_register``, independent of the product.
+    Computed by a walk over the trellis of ``by_shift_register``, independent of the product.
     """
 
     def sent(register: int) -> int:
@@ -137,7 +137,7 @@ def test_the_error_rate_is_that_of_theory() -> None:
     """Antipodal symbols: within 0.3 dB of the union bound over the distance spectrum, where the
     bound is tight."""
     weights = spectrum(26)
-    assert np.flatnonzero(weights)[0] == 15  # the free distance of the best such codes
+    assert np.flatnonzero(weights)[0] == 15  # free distance of the best such codes
 
     def bound(eb_n0_db: float) -> float:
         eb_n0 = 10 ** (eb_n0_db / 10)

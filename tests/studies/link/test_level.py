@@ -1,4 +1,4 @@
-"""The study and its command: errors have their reasons, and the same command the same numbers."""
+"""The link study and its command: causes of errors, and reproducible results."""
 
 import json
 import math
@@ -28,8 +28,9 @@ def scenario() -> Scenario:
 
 
 def test_errors_that_noise_does_not_make_are_interference(scenario: Scenario) -> None:
-    """Without noise: a UAV whose signal is 20 dB above all interference errs nowhere, one whose
-    signal is below it errs in every block; held positions are left with errors for that reason."""
+    """Without noise, a UAV with a signal 20 dB above all interference has no errors, and one
+    below the interference has errors in every block. This explains the errors at held
+    positions."""
     setting = LinkStudy(snr_db=(80, 80, 1), blocks=3, scattering=Scattering(math.inf))
     counts = simulate(setting, scenario)
     errors = {
@@ -58,7 +59,7 @@ def test_levels() -> None:
 
 
 class Links(HTMLParser):
-    """What a page would fetch."""
+    """Resources that a page would fetch."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -69,7 +70,7 @@ class Links(HTMLParser):
 
 
 def run(*arguments: str | Path) -> Any:
-    """The command, as the console script runs it."""
+    """Run the command as the console script does."""
     return CliRunner().invoke(main, ["study", "link", *map(str, arguments)])
 
 
@@ -78,7 +79,7 @@ SMALL = ("--snr", "4:20:8", "--instants", 4, "--blocks", 2)
 
 @pytest.mark.full
 def test_the_command_writes_numbers_figures_and_a_page(tmp_path: Path) -> None:
-    """And the same again from the command that the answer names."""
+    """The command given in the answer reproduces the output."""
     done = run(*SMALL, "--out", tmp_path / "a", "--json")
     assert done.exit_code == 0, done.output
     answer = json.loads((tmp_path / "a" / "link.json").read_text())
@@ -108,7 +109,7 @@ def test_the_command_writes_numbers_figures_and_a_page(tmp_path: Path) -> None:
 
 
 def each_curve_is_drawn(answer: dict[str, Any]) -> None:
-    """Throughput, uncoded and coded: a line for each kind of positions, all told apart."""
+    """Throughput, uncoded and coded: one distinct line for each kind of positions."""
     _, draw = figures.drawings(answer)["link_rate"]
     for axes, coded in zip(draw().axes, (False, True), strict=True):
         drawn = {line.get_label(): line.get_xydata().tolist() for line in axes.lines}
@@ -162,7 +163,7 @@ def test_what_cannot_be_studied_is_one_line(
 
 
 def test_each_instant_draws_for_itself(scenario: Scenario) -> None:
-    """The same place twice has other bits and other noise, and comes out the same again."""
+    """The same position twice has different bits and noise, and is reproducible."""
     twice = replace(scenario, instants=scenario.instants[:1] * 2)
     setting = LinkStudy(snr_db=(10, 10, 1), blocks=4)
     first, second = simulate(setting, twice)["perfect", 10]

@@ -51,7 +51,7 @@ def test_soft_bits_are_those_of_brute_force(places: list[tuple[float, float]], n
 
 
 def test_without_noise_the_signs_are_the_bits() -> None:
-    """And each symbol is weighed by its own noise."""
+    """Each symbol is weighted by its own noise."""
     n0 = np.linspace(0.1, 2.0, 16)
     soft = soft_bits(POINTS, n0).reshape(16, BITS)
     assert ((soft < 0) == LABELS).all()
@@ -60,7 +60,7 @@ def test_without_noise_the_signs_are_the_bits() -> None:
 
 @pytest.mark.parametrize("snr_db", [-5, 5, 15, 22])
 def test_the_exact_rate_is_the_sum_over_decision_regions(snr_db: float) -> None:
-    """Per axis: levels 3, 1, -1, -3 with labels 01, 00, 10, 11, decided at 2, 0 and -2."""
+    """Per axis: levels 3, 1, -1, -3 with labels 01, 00, 10, 11, decision thresholds 2, 0 and -2."""
     snr = 10 ** (snr_db / 10)
     sigma = math.sqrt(10 / (2 * snr))
     levels, labels = (3, 1, -1, -3), ("01", "00", "10", "11")

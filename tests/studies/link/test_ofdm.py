@@ -1,4 +1,4 @@
-"""The plan of the carriers, the transforms, and what a delay within the prefix does."""
+"""The carrier plan, the transforms, and the effect of a delay within the prefix."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def drawn(*shape: int, seed: int = 1) -> ComplexArray:
 
 
 def test_the_plan_is_the_papers() -> None:
-    """Counting from 1: nulls [1:7 129 251:256], pilots as listed, data everywhere else."""
+    """Counting from 1: nulls [1:7 129 251:256], pilots as listed, data on all others."""
     nulls = [*range(1, 8), 129, *range(251, 257)]
     pilots = [26, 54, 90, 118, 140, 168, 204, 232]
     assert (NULLS + 1).tolist() == nulls
@@ -36,7 +36,8 @@ def test_the_plan_is_the_papers() -> None:
 
 
 def test_the_null_in_the_middle_is_at_0_hz() -> None:
-    """Symbols without mean; the lowest carrier turns once backwards as the next one up does."""
+    """Symbols have zero mean; the lowest carrier rotates once backwards, the next upper one
+    forwards."""
     sent = samples(carriers(drawn(3, 234), PILOT_SIGNS[0]))
     assert sent[:, PREFIX:].mean(axis=-1) == pytest.approx(np.zeros(3), abs=1e-12)
     one = np.zeros(CARRIERS, dtype=complex)
@@ -56,7 +57,7 @@ def test_energy_is_kept_and_the_prefix_repeats_the_end() -> None:
 
 @pytest.mark.parametrize("delay", [0, 1, 17, PREFIX])
 def test_a_delay_within_the_prefix_is_a_ramp_of_phase(delay: int) -> None:
-    """Whatever the symbol before was."""
+    """Independent of the preceding symbol."""
     stream = samples(carriers(drawn(2, 234), PILOT_SIGNS[0]))
     late = np.concatenate([np.zeros(delay), stream.ravel()])[: 2 * SAMPLES].reshape(2, SAMPLES)
     ramp = np.exp(-2j * np.pi * delay * (np.arange(CARRIERS) - 128) / CARRIERS)
@@ -76,7 +77,7 @@ def test_a_delay_beyond_the_prefix_is_not() -> None:
 
 
 def test_pilots_tell_streams_apart() -> None:
-    """Over a flat channel each stream's estimate is its own gain, whatever the others are."""
+    """Over a flat channel each stream's estimate is its own gain, independent of the others."""
     gains = drawn(8, seed=3)
     heard = np.einsum("n,nc->c", gains, carriers(drawn(8, 234), PILOT_SIGNS))
     found = [flat_estimate(heard, signs)[0] for signs in PILOT_SIGNS]

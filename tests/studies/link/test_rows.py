@@ -1,4 +1,4 @@
-"""Rates and their confidence: against sums by hand."""
+"""Rates and their confidence intervals, against hand calculations."""
 
 from typing import Any
 
@@ -10,7 +10,7 @@ from companion.studies.link.rows import crossing_db, interval, row
 
 
 def test_intervals() -> None:
-    """Wilson's, by hand; wider where clusters differ; never without a width."""
+    """Wilson intervals by hand; wider if clusters differ; never of zero width."""
     even = np.full(10, 20.0)
     assert interval(np.full(10, 0.0), even, 200.0) == pytest.approx((0.0, 0.018845), abs=1e-5)
     assert interval(np.array([30.0]), np.array([100.0]), 100.0) == pytest.approx(

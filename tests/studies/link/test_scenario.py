@@ -1,4 +1,4 @@
-"""Where UAVs are and beams point: against the replay's circles and their own past."""
+"""UAV positions and beam directions: against the replay's circles and their own past."""
 
 import numpy as np
 import pytest
@@ -29,7 +29,7 @@ def test_the_circles_are_those_of_the_replay() -> None:
 
 
 def test_perfect_is_the_truth_and_held_is_as_late_as_its_report(scenario: Scenario) -> None:
-    """A held position is one that the UAV had 0.06 to 0.21 s before its beam is used."""
+    """A held position is the UAV's position 0.06 to 0.21 s before its beam is used."""
     for seen in scenario.instants:
         ages_s = np.arange(0.0, 0.3, 0.001)
         for i, circle in enumerate(PAPER):
@@ -54,7 +54,7 @@ def test_prediction_points_within_the_beam(scenario: Scenario) -> None:
 
 
 def test_what_the_array_cannot_tell_apart_is_left_out(scenario: Scenario) -> None:
-    """A line array sees its front and its back alike: seldom three decibels are lost for it."""
+    """A linear array cannot separate front and back; the loss for it rarely exceeds 3 dB."""
     array = assembly.array(Settings())
     for seen in scenario.instants:
         solved = solve(steering_matrix(array, seen.towards[PositionSource.PERFECT]))

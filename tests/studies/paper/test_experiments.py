@@ -1,4 +1,4 @@
-"""The published experiments: golden values, bounds, claims held to their numbers, and the page."""
+"""The published experiments: golden values, bounds, claims against their numbers, and the page."""
 
 import json
 import math
@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pymavlink.dialects.v20 import common  # the oracle: tests alone may import it
+from pymavlink.dialects.v20 import common  # reference implementation: only tests may import it
 
 from companion.studies.paper import circles as scenario
 from companion.studies.paper import claims, link, mavlink
@@ -26,7 +26,7 @@ LEVELS = ("L = 0.39", "L = 0.60", "L = 0.76")
 
 @pytest.fixture(scope="module")
 def made(studied: Callable[..., Path]) -> Path:
-    """Where ``companion study paper`` has written everything."""
+    """The folder with the output of ``companion study paper``."""
     return studied("paper")
 
 
@@ -78,13 +78,15 @@ def test_the_solver_finds_what_the_closed_form_says(answer: dict[str, Any]) -> N
 
 
 def test_what_the_text_says_in_passing_is_held_to_numbers(answer: dict[str, Any]) -> None:
-    """Levels by the formula of docs/math.md 2.2; the waveform by its own numbers."""
+    """Levels by the formula of docs/math.md 2.2; the waveform by its own parameters."""
     published = {"L = 0.39": 0.21, "L = 0.60": 0.47, "L = 0.76": 0.96}
     for name, gamma_s in published.items():
         gain = answer["levels"][name]["gain"]
         least_s = abs(0.5 * gain - 0.15) / math.sqrt(0.5 * (1 - (1 - gain) ** 2 / 0.5))
         assert answer["levels"][name]["gamma_s"] == pytest.approx(least_s)
-        assert 1 < gamma_s / least_s < 3  # what was published is a bound, and up to three times so
+        assert (
+            1 < gamma_s / least_s < 3
+        )  # published bound: up to 3 times larger
     gains = [answer["alphas"][alpha]["gain"] for alpha in ("0.5", "0.1", "0.01")]
     errors = [answer["alphas"][alpha]["error_sup_m"] for alpha in ("0.5", "0.1", "0.01")]
     assert gains == sorted(gains, reverse=True) and errors == sorted(errors, reverse=True)
@@ -124,7 +126,7 @@ def test_every_figure_of_the_paper_is_held_against_ours(answer: dict[str, Any], 
 
 
 def test_the_flight_is_the_one_written_out_step_by_step(flight: PaperFlight) -> None:
-    """By complex numbers and a loop: north + j east."""
+    """With complex numbers and a loop: north + j east."""
     for uav, radius in enumerate((100, 150, 200, 250)):
         phase = uav * math.pi / 2
         place = radius * complex(math.sin(phase), math.cos(phase))
@@ -141,7 +143,7 @@ def test_the_flight_is_the_one_written_out_step_by_step(flight: PaperFlight) -> 
 
 
 def test_the_other_reading_of_the_gust_is_a_velocity() -> None:
-    """|W| is then at most 1.2 times |v|, all UAVs together."""
+    """|W| is then at most 1.2 times |v|, over all UAVs."""
     flight = scenario.fly(PaperScenario(literal=False))
     nominal = 0.5 * math.hypot(100, 150, 200, 250)
     assert flight.largest_input_mps == pytest.approx(1.2 * nominal)
@@ -174,7 +176,7 @@ def test_every_error_stays_below_the_running_bound_and_that_below_the_others(
 
 
 def test_the_running_bound_is_not_slack(answer: dict[str, Any]) -> None:
-    """In the scenario the error comes within a tenth of it at L = 0.76."""
+    """In the scenario the error reaches 90 % of it at L = 0.76."""
     levels = answer["levels"]["L = 0.76"]
     assert 0.9 * levels["peak_bound_m"] < levels["error_sup_m"] <= levels["peak_bound_m"]
 
@@ -226,7 +228,7 @@ def test_angle_errors_do_not_know_where_north_is(flight: PaperFlight) -> None:
 
 
 def test_a_beam_that_points_right_is_worth_shannon(flight: PaperFlight) -> None:
-    """One UAV alone: 64 elements, 4 antennas, 30 dBm, free space, by hand."""
+    """A single UAV: 64 elements, 4 antennas, 30 dBm, free space, by hand."""
     place = np.array([[[120.0, 40.0]]])
     array = link.line(64)
     heard = link.responses(array, place, place)
@@ -247,7 +249,7 @@ def test_places_between_the_steps_are_on_the_way(flight: PaperFlight) -> None:
 
 
 def test_the_blockages_are_the_same_for_every_scheme(answer: dict[str, Any]) -> None:
-    """Nothing but the optimum is above it, and more blockages are never better."""
+    """No scheme exceeds the optimum, and more blockages never increase the rate."""
     means = answer["blockage"]["mean_bit_s_hz"]
     for found in means.values():
         assert found == sorted(found, reverse=True)
@@ -273,7 +275,8 @@ def test_the_same_seed_gives_the_same_rates(flight: PaperFlight) -> None:
 
 
 def test_the_service_agrees_with_the_library(answer: dict[str, Any]) -> None:
-    """To the rounding of the message: 1e-7 degree is 11 mm, a velocity is off by 7 mm/s at most."""
+    """To the quantisation of the message: 1e-7 degree is 11 mm; velocity errors are at most 7
+    mm/s."""
     found = answer["mavlink"]
     assert found["reports"] == 4 * 170 and found["rejections"] == 0
     kept = [found[name] for name in ("estimate_m", "direction_deg", "settled_m")]
@@ -353,7 +356,7 @@ def test_the_verdicts(answer: dict[str, Any]) -> None:
 
 
 def test_another_number_is_another_verdict(answer: dict[str, Any]) -> None:
-    """Nothing is typed in: a limit that differs from the paper's fails the claim."""
+    """No verdict is hard-coded: a limit that differs from the paper's fails the claim."""
     answer = json.loads(json.dumps(answer))
     answer["limits"]["0.25"]["off_s"] = 0.01
     answer["blockage"]["gain_over_echo_bit_s_hz"]["optimum"] = -0.1
@@ -373,11 +376,11 @@ def test_a_claim_is_a_question(answer: dict[str, Any]) -> None:
     assert len({claim.statement for claim in claims.CLAIMS}) == len(claims.CLAIMS)
 
 
-# --- what is written ----------------------------------------------------------------------------
+# --- output files -------------------------------------------------------------------------------
 
 
 class Page(HTMLParser):
-    """Addresses that a page asks for, its scripts, figures and text."""
+    """Addresses fetched by a page, its scripts, figures and text."""
 
     def __init__(self, path: Path) -> None:
         super().__init__()

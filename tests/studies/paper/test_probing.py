@@ -1,4 +1,4 @@
-"""The echo baseline: its errors against a simulated receiver, its losses against stories."""
+"""The echo baseline: errors against a simulated receiver, losses in constructed cases."""
 
 import dataclasses
 import math
@@ -57,7 +57,7 @@ def flown(
     array: Array = LINE,
     seed: int = 1,
 ) -> list[EchoState]:
-    """One UAV along azimuths in the plane, echo SNRs beside them, from a beam that points right."""
+    """One UAV along azimuths in the plane, with echo SNRs, starting from an aligned beam."""
     rng = np.random.default_rng(seed)
     state = started(in_plane(float(azimuths_rad[0])))
     states = []
@@ -73,7 +73,7 @@ def flown(
 
 
 def test_the_echo_by_hand() -> None:
-    """Out and back: power density at the UAV, what it scatters, what the aperture collects."""
+    """Both ways: power density at the UAV, scattered power, power collected by the aperture."""
     probing = EchoProbing(cross_section_m2=0.05, dwell_s=1e-3)
     found = echo_snr(probing, BUDGET, LINE, directions=in_plane(0.0), ranges_m=np.array([200.0]))
     sphere = 4 * math.pi * 200.0**2
@@ -85,7 +85,7 @@ def test_the_echo_by_hand() -> None:
 
 
 def test_what_weakens_the_echo() -> None:
-    """Range to the fourth; a blockage on both ways; the power shared with others; the element."""
+    """Range to the fourth; a blockage both ways; power shared among UAVs; the element pattern."""
     probing = EchoProbing()
     where, at = in_plane(0.0, 0.0), np.array([100.0, 200.0])
     near, far = echo_snr(probing, BUDGET, LINE, directions=where, ranges_m=at)
@@ -158,12 +158,12 @@ def test_the_error_of_a_line_is_the_published_bound(azimuth_rad: float) -> None:
     wanted = electrical / (math.pi * math.cos(azimuth_rad))
     assert errors[:, 2].std() == pytest.approx(wanted, rel=0.05)
     assert abs(errors[:, 2].mean()) < 4 * wanted / math.sqrt(many)
-    # A line sees nothing across its length, and no beam of it cares.
+    # A linear array has no resolution along its axis, and its beams do not depend on it.
     assert errors[:, :2] == pytest.approx(np.zeros((many, 2)), abs=1e-12)
 
 
 def test_the_error_is_what_the_best_receiver_has() -> None:
-    """Maximum likelihood, simulated: the peak of the beamformed snapshot, elements and noise."""
+    """Simulated maximum likelihood: the beamformer peak of the noisy snapshot."""
     line, true_sine, snr = (
         uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)),
         0.3,
@@ -196,8 +196,8 @@ def test_the_error_of_any_array_is_the_inverse_of_its_information(element: Eleme
     scale = math.sqrt(snr / np.sum(weight**2))
 
     def snapshot(x: FloatArray) -> FloatArray:
-        """Amplitude, phase, two angles: to real and imaginary parts. Amplitudes are not used as
-        evidence of direction."""
+        """Map amplitude, phase and two angles to real and imaginary parts. Amplitudes carry no
+        information about direction."""
         moved = true + x[2] * axes[0] + x[3] * axes[1]
         phase = array.wavenumber_radpm * array.elements_m @ moved
         made = (scale + x[0]) * weight * np.exp(1j * (phase + x[1]))
@@ -225,7 +225,7 @@ def test_without_an_echo_there_is_no_error() -> None:
 
 @pytest.mark.parametrize("array", [LINE, PANEL], ids=["line", "panel"])
 def test_with_strong_echoes_it_points_where_the_last_one_came_from(array: Array) -> None:
-    """Behind by one interval of motion, and by the bound's error, no more."""
+    """The lag is one interval of motion plus the bound's error, and no more."""
     probing = EchoProbing(interval_s=0.01)
     azimuths = -0.5 + 0.3 * 0.01 * np.arange(200)  # 0.3 rad/s
     states = flown(probing, azimuths, np.full(200, 1e8), array)
@@ -236,8 +236,8 @@ def test_with_strong_echoes_it_points_where_the_last_one_came_from(array: Array)
 
 
 def test_with_a_rate_it_catches_up() -> None:
-    """The alpha-beta tracker has no lag on a constant rate, and keeps the rate through a blockage:
-    the beam without one is held."""
+    """The alpha-beta tracker has no lag at a constant rate and keeps the rate through a
+    blockage; a beam without a rate is held."""
     azimuths = 0.3 * 0.01 * np.arange(320)
     snr = np.where(np.arange(320) < 300, 1e8, 0.0)
     held = EchoProbing(patience_intervals=50)
@@ -247,14 +247,14 @@ def test_with_a_rate_it_catches_up() -> None:
         assert off_rad(states[299].pointed, in_plane(azimuths[299])) == pytest.approx(
             [lag], abs=2e-4
         )
-        # The last echo came at 299; it is 319 now.
+        # The last echo arrived at 299; now it is 319.
         assert off_rad(states[319].pointed, in_plane(azimuths[319])) == pytest.approx(
             [drift], abs=4e-3
         )
 
 
 def test_an_echo_moves_the_estimate_by_the_gains() -> None:
-    """alpha of the way to where it came from, and beta of it an interval; all of it by a sweep."""
+    """alpha of the innovation, and beta of it per interval; all of it after a sweep."""
     probing = EchoProbing(
         interval_s=0.02, position_gain=0.6, rate_gain=0.3, patience_intervals=0, sweep_beams=1
     )
@@ -303,7 +303,7 @@ def test_a_uav_that_has_left_the_lobe_is_lost_and_costs_a_sweep() -> None:
     states = flown(probing, azimuths, np.where(clear, 1e6, 0.0))
     served = [bool(state.served[0]) for state in states]
     heard = [bool(state.heard[0]) for state in states]
-    # 10 to 15: six silent intervals, one more than its patience; 16 to 22: the sweep.
+    # 10 to 15: six intervals without echo, one above the limit; 16 to 22: the sweep.
     assert served == [True] * 16 + [False] * 7 + [True] * 17
     assert heard == [True] * 10 + [False] * 12 + [True] * 18
     assert off_rad(states[23].pointed, in_plane(0.2)) < 1e-3
@@ -313,7 +313,7 @@ def test_a_uav_that_has_left_the_lobe_is_lost_and_costs_a_sweep() -> None:
 def test_it_sweeps_until_a_sweep_ends_with_an_echo() -> None:
     probing = EchoProbing(interval_s=0.01, dwell_s=0.001, sweep_beams=30, patience_intervals=2)
     states = flown(probing, np.zeros(30), np.where(np.arange(30) < 14, 0.0, 1e6))
-    # Silent 0 to 2; sweeps 3-5, 6-8, 9-11, and 12-14, which ends in the clear.
+    # No echo 0 to 2; sweeps 3-5, 6-8, 9-11, and 12-14, which ends without blockage.
     assert [bool(s.served[0]) for s in states] == [True] * 3 + [False] * 12 + [True] * 15
     assert [bool(s.heard[0]) for s in states] == [False] * 14 + [True] * 16
 
@@ -330,7 +330,8 @@ def test_a_rate_does_not_outlive_the_track() -> None:
 
 
 def test_an_echo_through_a_side_lobe_counts_only_where_it_may() -> None:
-    """The first side lobe of a line, 13.3 dB down at 1.43 null widths, with an echo to spare."""
+    """The first side lobe of a linear array, 13.3 dB down at 1.43 null widths, with a strong
+    echo."""
     side = math.asin(1.43 * 2 / 64)
     probing = EchoProbing(patience_intervals=100)
     any_lobe = dataclasses.replace(probing, lobe_db=math.inf)
@@ -372,7 +373,7 @@ def test_the_codebook_weakens_the_echo_of_a_sweep(spare_db: float, heard: bool) 
 
 
 def test_a_weaker_echo_is_a_worse_one() -> None:
-    """The error of the estimate is that of the strength which pointing off leaves."""
+    """The estimation error follows the echo strength left after mispointing."""
     probing = EchoProbing()
     many = 4000
     start, there = started(np.tile(in_plane(0.0), (many, 1))), in_plane(HALF_BEAM_RAD)
@@ -393,7 +394,7 @@ def test_a_weaker_echo_is_a_worse_one() -> None:
 @settings(max_examples=examples(25), deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0.1, 1))
 def test_whatever_happens_the_state_is_sound(seed: int, rate_gain: float, gain: float) -> None:
-    """Random flights through random blockages: unit vectors, rates across, sweeps of known cost."""
+    """Random flights and blockages: unit vectors, tangential rates, sweeps of known duration."""
     probing = EchoProbing(
         patience_intervals=2, sweep_beams=25, rate_gain=rate_gain, position_gain=gain
     )

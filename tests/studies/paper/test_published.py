@@ -1,4 +1,4 @@
-"""The observer as published, against its own claims and against adversaries."""
+"""The published observer, against its own claims and against adversaries."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ B, D = 0.15, 0.5
 
 
 def errors(gain: float, b: float, d: float, w: np.ndarray) -> tuple[np.ndarray, ...]:
-    """Errors of x^ and of both W^ over a sequence of inputs, from an exact start."""
+    """Errors of x^ and of both W^ over an input sequence, from an exact start."""
     x = estimate = np.zeros(1)
     found = []
     for wk in w:
@@ -29,7 +29,7 @@ def errors(gain: float, b: float, d: float, w: np.ndarray) -> tuple[np.ndarray, 
 
 
 def worst_input(gain: float, b: float, d: float, steps: int, last: float) -> np.ndarray:
-    """The input of size 1 that drives the error up for ``steps``, then ends with ``last``."""
+    """The input of size 1 that increases the error for ``steps``, then ends with ``last``."""
     q = 1 - gain
     signs = np.sign(q) ** np.arange(steps)[::-1] * np.sign(gain * d - b)
     return np.append(np.where(signs == 0, 1.0, signs), last)
@@ -37,7 +37,7 @@ def worst_input(gain: float, b: float, d: float, steps: int, last: float) -> np.
 
 @pytest.mark.parametrize("gain", [*PAPER_GAINS, 1.2])
 def test_peaks_are_exact(gain: float) -> None:
-    """Never exceeded by random inputs, reached by the worst one."""
+    """Never exceeded by random inputs, attained by the worst one."""
     rng = np.random.default_rng(7)
     peak_e = float(closed_form.peak_gain(B, D, gain))
     peak_bd, peak_b0 = published.unknown_input_peak(B, D, gain)
@@ -55,7 +55,7 @@ def test_peaks_are_exact(gain: float) -> None:
 
 @pytest.mark.parametrize("gain", PAPER_GAINS)
 def test_two_gamma_holds_where_three_was_claimed(gain: float) -> None:
-    """The exact peak is 2 |l d - b| / b; at L = .76 more than the published 3 gamma."""
+    """The exact peak is 2 |l d - b| / b; at L = .76 it exceeds the published 3 gamma."""
     _, peak_b0 = published.unknown_input_peak(B, D, gain)
     assert peak_b0 == pytest.approx(2 * abs(gain * D - B) / B)
 
@@ -79,7 +79,7 @@ def test_at_the_optimum_there_is_no_error_at_all() -> None:
 
 
 def test_irregular_intervals_keep_the_guarantee() -> None:
-    """|e| <= gamma sup|w| with gamma over the intervals that occurred, whatever their order."""
+    """|e| <= gamma sup|w| with gamma over the intervals that occurred, in any order."""
     rng = np.random.default_rng(3)
     alpha, d, worst = 0.95, -0.5, 0.0  # where gamma is close to the exact peak
     for _ in range(rounds(500, 2000)):

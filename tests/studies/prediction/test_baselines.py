@@ -1,5 +1,5 @@
-"""Rivals of the observer: analytic cases, AntennaTracker's habits, and Kalman against least
-squares over the whole flight and against the noise integral."""
+"""Baselines of the observer: analytic cases, AntennaTracker's behaviour, and Kalman filters
+against least squares over the whole flight and against the noise integral."""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -47,7 +47,8 @@ def observed(
     late_s: float = 0.0,
     offset_s: float = 0.0,
 ) -> ObservedReport:
-    """A report, ``late_s`` on its way, the sender's timeline ``offset_s`` behind the node's."""
+    """A report that takes ``late_s`` to arrive, the sender's timeline ``offset_s`` behind the
+    node's."""
     return ObservedReport(
         arrival_ns=round((sent_s + late_s) * S),
         sent_ns=round(sent_s * S),
@@ -63,14 +64,14 @@ def straight(sent_s: float, late_s: float = 0.0) -> ObservedReport:
 
 
 def ask(predictor: Predictor, now_s: float, lead_s: float = 0.0) -> Predicted:
-    """An answer that must be there."""
+    """A prediction that must exist."""
     predicted = predictor.predict(round(now_s * S), round((now_s + lead_s) * S))
     assert predicted is not None
     return predicted
 
 
 def wandering(n: int, seed: int = 5, late_s: float = 0.0) -> list[ObservedReport]:
-    """Irregular reports of nothing in particular; every third is without velocity."""
+    """Irregular reports of a random flight; every third is without velocity."""
     rng = np.random.default_rng(seed)
     times = np.cumsum(rng.uniform(0.05, 1.5, n))
     return [
@@ -92,7 +93,7 @@ def test_a_straight_flight_without_delay_is_exact(
     predictor = make()
     for sent_s in (0.0, 0.3, 1.4, 1.5, 4.0):
         predictor.report(straight(sent_s))
-    # A filter forgets its vague start as its measurements' weight allows.
+    # A filter loses its uncertain start as the weight of its measurements allows.
     exact = 1e-9 if not isinstance(predictor, Kalman) else 0.02
     predicted = ask(predictor, 4.5, lead_s)
     assert predicted.position_ned_m == pytest.approx(P0 + V0 * (4.5 + lead_s), abs=exact)
@@ -108,7 +109,7 @@ def test_hold_holds_the_last_to_arrive() -> None:
 
 
 def test_arrival_time_misses_by_the_latency() -> None:
-    """The whole difference: speed times latency."""
+    """The whole error is speed times latency."""
     by_arrival, by_sender = DeadReckoningOnArrival(), DeadReckoning()
     for predictor in (by_arrival, by_sender):
         predictor.report(straight(1.0, late_s=0.6))
@@ -138,7 +139,7 @@ def test_the_tracker_gives_up_after_five_seconds() -> None:
 
 @pytest.mark.parametrize("make", ALL[2:])
 def test_a_clock_set_right_moves_what_came_before(make: Callable[[], Predictor]) -> None:
-    """The first reports were put 0.5 s too late; once that is known, it holds for all of them."""
+    """The first reports were dated 0.5 s too late; the correction applies to all of them."""
     predictor = make()
     for sent_s in (1.0, 1.5, 2.0, 2.5, 3.0):
         placed_s, right = sent_s + 0.5, P0 + V0 * sent_s
@@ -146,7 +147,7 @@ def test_a_clock_set_right_moves_what_came_before(make: Callable[[], Predictor])
     assert ask(predictor, 3.5).position_ned_m == pytest.approx(P0 + V0 * 3.0, abs=0.1)
     predictor.report(
         observed(2.4, P0 + V0 * 2.4, V0, offset_s=1000.0)
-    )  # overtaken, but sooner here
+    )  # reordered, but earlier here
     assert ask(predictor, 3.5).position_ned_m == pytest.approx(P0 + V0 * 3.5, abs=0.1)
 
 
@@ -183,9 +184,9 @@ def test_model_is_the_integral_of_the_noise(states: int) -> None:
 
 
 def least_squares(reports: Sequence[ObservedReport], states: int, tuning: Tuning) -> FloatArray:
-    """The last state (n, 3) by one weighted least-squares fit of all states to everything known.
+    """The last state (n, 3) by one weighted least-squares fit of all states to all measurements.
 
-    Each line says: these states, so combined, are this, give or take one standard deviation.
+    Each row is a linear combination of states, its value and its standard deviation.
     """
     n = states
     lines: list[FloatArray] = []
@@ -268,7 +269,7 @@ def test_order_of_arrival_does_not_matter(states: int) -> None:
 
 def test_a_report_older_than_the_history_is_dropped() -> None:
     reports = wandering(kalman.HISTORY + 20)
-    stiff = Tuning(process_density=1e-6)  # it remembers, so that beginning anew would show
+    stiff = Tuning(process_density=1e-6)  # it remembers, so a restart would be visible
     whole, late = Kalman(2, stiff), Kalman(2, stiff)
     for report in reports[1:]:
         whole.report(report)

@@ -1,4 +1,4 @@
-"""Predictors compared: the scoring by hand, and the command on logs."""
+"""Comparison of predictors: hand-computed scores, and the command on logs."""
 
 import json
 import math
@@ -63,12 +63,12 @@ BOTH = ("--links", "clean,radio")
 
 
 def run(*arguments: str | Path) -> Any:
-    """The command, as the console script runs it."""
+    """Run the command as the console script does."""
     return CliRunner().invoke(main, ["study", "prediction", *map(str, arguments)])
 
 
 def fine(done: Any) -> bool:
-    """Whether it did its work, whatever it then said of the bounds."""
+    """Whether it completed, whatever it reported about the bounds."""
     return done.exit_code == 0 or (done.exit_code == 3 and "bounds were violated" in done.stderr)
 
 
@@ -76,7 +76,7 @@ def fine(done: Any) -> bool:
 
 
 def asked(truth_ned_m: np.ndarray, array_ned_m: np.ndarray) -> Questions:
-    """One lead, everything counts."""
+    """Questions at one lead, all of which count."""
     n = len(truth_ned_m)
     return Questions(
         now_ns=np.arange(n),
@@ -141,7 +141,7 @@ def test_angles_are_exact_when_small_and_when_large() -> None:
 
 
 class Witness:
-    """A predictor that notes what it knew when it was asked."""
+    """A predictor that records the reports known at each question."""
 
     def __init__(self) -> None:
         self.arrived: list[int] = []
@@ -182,13 +182,13 @@ def test_only_what_has_arrived_is_used(straight_flight: Callable[..., Flight]) -
     assert np.array_equal(given.position_ned_m[0, :, 2], known)
     ahead = given.position_ned_m[1, :, 1] - given.position_ned_m[1, :, 0]
     assert ahead == pytest.approx(0.5 * S)
-    # What lies past the end of the truth is not scored: half a second of questions.
+    # Times after the end of the truth are not scored: half a second of questions.
     assert plan.counts[0].sum() - plan.counts[1].sum() == 10
 
 
 @pytest.mark.full
 def test_a_straight_flight_is_all_latency(straight_flight: Callable[..., Flight]) -> None:
-    """Each rival errs by its speed times what it does not know of the time, and by no more."""
+    """Each baseline errs by at most its speed times its time uncertainty."""
     flight = straight_flight(1200)
     at_once = Settings().override(observer={"lag_s": (0.0, 0.0)})
     setting = PredictionStudy(logs=(Path("x"),), leads_s=(0.0, 1.0), settings=at_once)
@@ -202,8 +202,8 @@ def test_a_straight_flight_is_all_latency(straight_flight: Callable[..., Flight]
         assert {name for name, _ in rms} == NAMES
         for name in ("dead-reckoning", "kalman-cv", "kalman-ca"):
             assert rms[name, 1.0] == pytest.approx(0.005 * speed_mps, rel=0.1)
-        # The product hears reports of whole centimetres; over the radio it has to measure the
-        # clock, and until the first round trip it is off by more.
+        # The product receives reports in whole centimetres; over the radio it must measure the
+        # clock, and its error is larger until the first round trip.
         for name in ("uio-position", "uio-kinematic"):
             assert 0 < rms[name, 1.0] < (0.006 if link is CLEAN else 0.02) * speed_mps
         if link is CLEAN:
@@ -285,7 +285,7 @@ def test_the_command_on_a_short_flight(cut_log: Path, tmp_path: Path) -> None:
 
 @pytest.mark.full
 def test_processes_do_not_change_the_answer(cut_log: Path, tmp_path: Path) -> None:
-    """Two logs of two names, in the order in which they were given."""
+    """Two logs with two names, in the given order."""
     other = tmp_path / "another.tlog"
     other.write_bytes(cut_log.read_bytes()[:200_000])
     asked = (other, cut_log, "--center", "5:1", "--lead", "0.5", "--out", tmp_path, "--json")
@@ -299,7 +299,7 @@ def test_processes_do_not_change_the_answer(cut_log: Path, tmp_path: Path) -> No
 
 @pytest.mark.full
 def test_the_spectral_efficiency_is_of_the_settings_array(cut_log: Path, tmp_path: Path) -> None:
-    """Eight elements have a wide beam: they lose little. So does little power."""
+    """Eight elements have a wide beam and lose little; so does low power."""
     config = tmp_path / "few.toml"
     config.write_text("[array]\nelements = 8\n")
     asked = (cut_log, "--center", "5:1", "--lead", "1", "--jobs", "1", "--out", tmp_path, "--json")
@@ -355,7 +355,7 @@ def test_a_log_without_the_simulators_word(tmp_path: Path) -> None:
 
 
 class Page(HTMLParser):
-    """What a page holds, and that its elements close."""
+    """Elements of a page; fails if one is left open."""
 
     def __init__(self, text: str) -> None:
         super().__init__()
@@ -411,7 +411,7 @@ def compared(log: str, link: RadioLink, angles: dict[str, list[float | None]]) -
 
 
 def test_the_figure_shows_every_angle_and_tells_predictors_apart() -> None:
-    """What is zero or unknown is a gap: a logarithmic axis has no place for it."""
+    """Zero or unknown values are gaps: a logarithmic axis cannot show them."""
     angles: dict[str, list[float | None]]
     angles = {f"p{n}": [0.1 + n, 0.2 + n, 0.3 + n] for n in range(9)}
     angles["p3"] = [0.5, 0.0, None]
@@ -431,7 +431,7 @@ def test_the_figure_shows_every_angle_and_tells_predictors_apart() -> None:
 
 
 def test_figures_are_named_by_link_and_numbered_by_log() -> None:
-    """A log over a link without a row has no figure, and the others keep their names."""
+    """A log without a row for a link has no figure, and the others keep their names."""
     found = [
         compared(log, link, {"hold": [1.0]} if (log, link) != ("a", RADIO) else {})
         for log in ("a", "b")
@@ -442,8 +442,8 @@ def test_figures_are_named_by_link_and_numbered_by_log() -> None:
     assert captions["angle_radio_2"].endswith("b, radio link")
 
 
-# RMS angle in degrees of system 1 at leads 0, .1 and .3 s, measured before this study was
-# written, by another program on another draw of the same radio.
+# RMS angle in degrees of system 1 at leads 0, .1 and .3 s, measured before this study
+# existed, by another program with another random draw of the same radio.
 MEASURED = {
     "clean": {
         "hold": (0.40, 0.89, 1.9),
@@ -481,8 +481,8 @@ def test_the_table_that_was_measured_before() -> None:
             for lead, expected in enumerate(MEASURED[link.name][name]):
                 found = score(plan, given, lead)
                 assert found is not None
-                # Within a quarter, or better: the clock follows a drift that theirs did not, and
-                # every stamp counts for it. Truth is dated by stamps, so the reports' lag is seen.
+                # Within 25 %, or better: our clock follows a drift that theirs ignored, and uses
+                # every timestamp. Truth is dated by timestamps, so the reports' lag is visible.
                 assert found["angle_rms_deg"] <= math.hypot(1.25 * expected, LAG_DEG)
                 assert found["angle_rms_deg"] >= expected * 0.45
 

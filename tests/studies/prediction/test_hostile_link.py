@@ -1,4 +1,4 @@
-"""The hostile link: each regime does what its name says, and order is kept where it says so."""
+"""The hostile link: each regime behaves as named, and keeps the frame order where stated."""
 
 import numpy as np
 import pytest
@@ -12,7 +12,7 @@ NAMES = [regime.name for regime in REGIMES]
 
 
 def latency_s(seed: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Latencies of what arrives, and the regime in which each was sent."""
+    """Latencies of the arriving frames, and the regime in which each was sent."""
     came_ns, arrives = arrivals_ns(np.random.default_rng(seed), SENT_NS, BEGINS_NS)
     late_s = (came_ns - SENT_NS)[arrives] * 1e-9
     return late_s, regimes_at(SENT_NS[arrives], BEGINS_NS)
@@ -33,7 +33,7 @@ def test_each_regime_is_what_it_is_called() -> None:
     first = of("first-fast")
     assert first[0] == pytest.approx(0.005)
     assert first[2:] == pytest.approx(0.3)
-    assert of("steady")[20:] == pytest.approx(0.02)  # the queue of before has gone
+    assert of("steady")[20:] == pytest.approx(0.02)  # the earlier queue is empty
     step = of("step")
     assert step[[40, 90, 110, -1]] == pytest.approx([0.02, 0.02, 0.5, 0.5])
     ramp = of("ramp")

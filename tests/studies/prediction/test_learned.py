@@ -1,4 +1,4 @@
-"""The LSTM predictor: learning, its file, and what it is worth. Needs PyTorch: extra [learned]."""
+"""The LSTM predictor: training, its file, and its accuracy. Needs PyTorch: extra [learned]."""
 
 import json
 from pathlib import Path
@@ -21,7 +21,7 @@ S = 1_000_000_000
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A network that has learned a little."""
+    """A network after short training."""
     path = tmp_path_factory.mktemp("learned") / "net.pt"
     held, loss_m = learned.train(seed=1, epochs=8, flights=40)
     assert loss_m < 0.6
@@ -47,12 +47,12 @@ def test_examples_are_departures_from_straight_flight() -> None:
     assert np.ptp(np.diff(seen[:, :, 0], axis=1)) > 0.1  # irregular
     assert leads.shape == ways.shape[:2]
     near = leads < 0.1
-    # A tenth of a second on, what is left is the noise of position and a little of velocity.
+    # After 0.1 s the deviation is the position noise and a little of the velocity noise.
     assert np.std(ways[near]) == pytest.approx(0.1, rel=0.3)
 
 
 def rms_m(predictor: Predictor, seed: int, lead_s: float) -> float:
-    """Over a flight that was not trained on, over a link of its own, at irregular times."""
+    """On a flight outside the training set, over its own link, at irregular times."""
     rng = np.random.default_rng([seed, 99])
     made = made_up.flight(rng, "1:1")
     observed = deliver(made, made_up.link(rng), seed).observed
@@ -88,7 +88,7 @@ def observed(made_s: float, position: list[float], velocity: list[float] | None)
 
 
 def test_it_answers_whatever_comes(trained: Path) -> None:
-    """Nothing, one report, one without velocity, overtaken ones, a long silence."""
+    """No report, one, one without velocity, reordered ones, a long gap."""
     predictor = learned.load(trained)()
     assert predictor.predict(0, S) is None
     predictor.report(observed(10, [0, 0, -30], None))
@@ -97,7 +97,7 @@ def test_it_answers_whatever_comes(trained: Path) -> None:
     assert alone.position_ned_m == pytest.approx([0, 0, -30])
     predictor.report(observed(12, [20, 0, -30], [10, 0, 0]))
     before = predictor.predict(12 * S, 13 * S)
-    predictor.report(observed(10, [5, 5, 5], [0, 0, 0]))  # of the same time as another
+    predictor.report(observed(10, [5, 5, 5], [0, 0, 0]))  # at the same time as another
     after = predictor.predict(12 * S, 13 * S)
     assert before is not None
     assert after is not None
@@ -107,12 +107,12 @@ def test_it_answers_whatever_comes(trained: Path) -> None:
     assert near.position_ned_m == pytest.approx([20, 0, -30], abs=1e-3)
     far = [predictor.predict(12 * S, (12 + s) * S) for s in (5, 100, 195)]
     places = np.array([each.position_ned_m for each in far if each is not None])
-    # Past the last lead it flies straight.
+    # After the last lead the prediction is straight.
     assert (places[1] - places[0]) / 95 == pytest.approx((places[2] - places[1]) / 95)
 
 
 def test_the_commands(cut_log: Path, tmp_path: Path) -> None:
-    """Train, compare; processes do not change what the network says."""
+    """Train and compare; the process count does not change the predictions."""
     net = tmp_path / "deep" / "net.pt"
     done = run("train", "--out", net, "--seed", "3", "--epochs", "1", "--flights", "3", "--json")
     assert done.exit_code == 0, done.stderr

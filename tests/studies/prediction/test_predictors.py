@@ -1,4 +1,4 @@
-"""The predictors of a study that are not tested with the tracking."""
+"""Predictors of a study that are not covered by the tracking tests."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ def test_known_noise_is_that_of_the_settings() -> None:
 
 
 def test_a_filter_of_known_noise_against_one_written_out() -> None:
-    """One axis, as in a textbook: position and velocity measured together, irregular times."""
+    """One axis, as in a textbook: position and velocity measured together, at irregular times."""
     tuning = known_tuning(Settings())
     rng = np.random.default_rng(4)
     times_s = np.cumsum(rng.uniform(0.1, 1.5, 12))

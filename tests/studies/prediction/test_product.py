@@ -1,4 +1,4 @@
-"""The product in the study: it hears frames, and is the product; what it announces is counted."""
+"""The product in the study: it receives frames like the pipeline; bound violations are counted."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,7 +36,7 @@ def circling() -> Flown:
 
 
 def test_over_the_logs_own_link_it_is_the_pipeline(circling: Flown) -> None:
-    """Whoever feeds the whole log to a pipeline gets the same tracks."""
+    """A pipeline fed with the whole log gives the same tracks."""
     settings = Settings()
     flight = circling.flights[0]
     delivery = deliver(flight, CLEAN, 1)
@@ -60,9 +60,9 @@ def test_over_the_logs_own_link_it_is_the_pipeline(circling: Flown) -> None:
 
 @pytest.mark.parametrize("link", [CLEAN, RADIO, HOSTILE], ids=lambda link: link.name)
 def test_the_baselines_clock_is_the_products(link: RadioLink, circling: Flown) -> None:
-    """They hear the same stamps: an accepted report was made when both say that it was made.
+    """Both use the same timestamps: they agree when an accepted report was measured.
 
-    The product knows besides how far behind its stamp the position is.
+    The product also knows the lag of the position behind its timestamp.
     """
     flight = next(flight for flight in circling.flights if flight.uav == "2:1")
     delivery = deliver(flight, link, 1, lambda: assembly.clock(Settings()))
@@ -80,7 +80,7 @@ def test_the_baselines_clock_is_the_products(link: RadioLink, circling: Flown) -
     ]
     assert len(made_ns) > 10
     assert np.median(lags_s) == pytest.approx(0.03, abs=1e-3)
-    # Where several come at once, any of them may be meant.
+    # If several arrive at once, the match is ambiguous.
     assert np.ptp(lags_s) < 0.001 or link is HOSTILE
 
 
@@ -97,14 +97,14 @@ def test_a_radio_thins_each_kind_of_message(circling: Flown) -> None:
     clean, radio = (kinds(deliver(flight, link, 1).events) for link in (CLEAN, RADIO))
     span_s = (circling.span_ns[1] - circling.span_ns[0]) * 1e-9
     assert radio.keys() <= clean.keys() >= {0, 2, 24, 30, 33}
-    assert not {108, 164} & clean.keys()  # the simulator's words are for the study alone
+    assert not {108, 164} & clean.keys()  # the simulator's messages are only for the study
     for msgid in (30, 33, 24):
         assert radio[msgid] == pytest.approx(span_s * 1.2 * 0.9, rel=0.25)
     delivery = deliver(flight, RADIO, 1)
     arrivals = [event.t_ns for event in delivery.events]
     assert arrivals == sorted(arrivals)
     reports = [e.t_ns for e in delivery.events if isinstance(e, Frame) and e.msgid == 33]
-    # A first report or two may be without a clock: all others are the same for the baselines.
+    # The first reports may have no clock yet: all others are the same for the baselines.
     assert {each.arrival_ns for each in delivery.observed} <= set(reports)
     assert len(reports) - len(delivery.observed) <= 2
 
@@ -152,7 +152,7 @@ def test_noise_is_the_same_for_all_and_is_said(circling: Flown) -> None:
 def asked_and_given(
     errors_m: list[float], refuted_ns: tuple[int, ...] = ()
 ) -> tuple[Questions, Answers]:
-    """One answer a second with a bound of 1 m."""
+    """One answer per second with a bound of 1 m."""
     n = len(errors_m)
     truth = np.zeros((1, n, 3))
     asked = Questions(
@@ -174,7 +174,7 @@ def asked_and_given(
 
 
 def test_violations_are_counted_and_what_was_announced_of_them() -> None:
-    """Refuted at 3.5 s: what is broken at 2 s was not announced, at 3 and 5 s it was."""
+    """Refuted at 3.5 s: the violation at 2 s was not announced, those at 3 and 5 s were."""
     errors_m = [0.5, 0.9, 1.5, 1.1, 0.2, 4.0]
     asked, given = asked_and_given(errors_m, (round(3.5 * S), 50 * S))
     found = violations.counted(asked, given, 0)
@@ -236,7 +236,8 @@ def short(path: Path) -> Path:
 def test_a_broken_bound_is_an_exit_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, announces: bool
 ) -> None:
-    """With bounds of 1 mm all are broken: 3 and one line, unless it was said; all is written."""
+    """Bounds of 1 mm are all violated: exit status 3 and one line unless announced; files are
+    written."""
     answers = comparison.product_answers
 
     def tight(*asked: Any) -> Answers:

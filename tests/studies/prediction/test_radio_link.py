@@ -1,4 +1,4 @@
-"""The simulated radio: what it was asked for is what comes out, and the same again."""
+"""The simulated radio: its output matches its settings and is reproducible."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -15,7 +15,7 @@ MakeFlight = Callable[..., Flight]
 
 
 def latencies_s(flight: Flight, delivery: Delivery) -> np.ndarray:
-    """What was added to each report, found by its position, which no other report has."""
+    """The latency added to each report, matched by its unique position."""
     row_of = {tuple(position): row for row, position in enumerate(flight.position_ned_m)}
     rows = [row_of[tuple(each.position_ned_m)] for each in delivery.observed]
     arrived = np.array([each.arrival_ns for each in delivery.observed])
@@ -28,7 +28,7 @@ def test_a_clean_link_is_the_log(straight_flight: MakeFlight) -> None:
     assert [each.arrival_ns for each in delivery.observed] == flight.arrival_ns.tolist()
     assert (latencies_s(flight, delivery) == 0).all()
     assert delivery.rate_hz == pytest.approx(10)
-    # A delay that is always the same cannot be seen.
+    # A constant delay is unobservable.
     assert delivery.latency_s == pytest.approx(0, abs=1e-6)
 
 
@@ -45,7 +45,7 @@ def test_latency_loss_and_rate_are_as_asked(straight_flight: MakeFlight) -> None
     arrivals = [each.arrival_ns for each in delivery.observed]
     assert arrivals == sorted(arrivals)
     sent = np.array([each.sent_ns for each in delivery.observed])
-    assert 0.05 < np.mean(np.diff(sent) < 0) < 0.5  # overtaken
+    assert 0.05 < np.mean(np.diff(sent) < 0) < 0.5  # reordered
 
 
 def test_the_seed_decides_and_each_uav_has_its_own(straight_flight: MakeFlight) -> None:
@@ -76,14 +76,14 @@ def test_the_envelope_leaves_the_constant_part(
     off_s = [(e.sent_ns - made_ns[tuple(e.position_ned_m)]) * 1e-9 for e in delivery.observed]
     off_s = off_s[100:]
     if known_delay:
-        assert np.abs(np.array(off_s) - 0.005).max() < 1e-6  # what the log itself has
+        assert np.abs(np.array(off_s) - 0.005).max() < 1e-6  # of the log itself
     else:
         assert np.ptp(off_s) > 0.01
         assert abs(np.median(off_s)) < 0.3
 
 
 def test_the_senders_timeline_goes_on_after_a_restart(straight_flight: MakeFlight) -> None:
-    """Intervals are the sender's own; where its clock began anew, the node's."""
+    """Intervals are those of the sender's clock; at a restart, those of the node's clock."""
     flight = straight_flight(600)
     restarted = flight.boot_ms.copy()
     restarted[300:] -= restarted[300] - 42
@@ -91,7 +91,7 @@ def test_the_senders_timeline_goes_on_after_a_restart(straight_flight: MakeFligh
     made = np.array([each.sender_ns for each in delivery.observed])
     steps = np.diff(made) / 100_000_000
     assert steps == pytest.approx(np.round(steps))
-    # Only the first stamps after the restart are left out: others must agree first.
+    # Only the first timestamps after the restart are skipped until others confirm them.
     (gap,) = steps[steps > 1.5]
     assert gap < 8
     sent = np.array([each.sent_ns for each in delivery.observed])

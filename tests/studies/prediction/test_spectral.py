@@ -1,4 +1,4 @@
-"""What a wrong direction costs: against sums written out, and what must be so."""
+"""Rate loss of a wrong direction: against explicit sums, and required properties."""
 
 import math
 from dataclasses import replace
@@ -19,7 +19,7 @@ WAVELENGTH_M = 299_792_458.0 / 30e9
 
 
 def direction(azimuth_deg: float, elevation_deg: float = 0.0) -> np.ndarray:
-    """NED, (1, 3)."""
+    """NED unit vector, (1, 3)."""
     azimuth, elevation = math.radians(azimuth_deg), math.radians(elevation_deg)
     level = math.cos(elevation)
     return np.array([[level * math.cos(azimuth), level * math.sin(azimuth), -math.sin(elevation)]])
@@ -28,7 +28,7 @@ def direction(azimuth_deg: float, elevation_deg: float = 0.0) -> np.ndarray:
 @pytest.mark.parametrize("off_deg", [0.0, 0.3, 0.79, 1.0, 1.7, 5.0, 20.0])
 @pytest.mark.parametrize("bearing_deg", [0.0, 77.0, -130.0])
 def test_a_line_by_its_array_factor(off_deg: float, bearing_deg: float) -> None:
-    """64 elements half a wavelength apart: a sum of phasors, written out."""
+    """64 elements half a wavelength apart: an explicit sum of phasors."""
     total = sum(
         complex(math.cos(x), math.sin(x))
         for x in (math.pi * m * math.sin(math.radians(off_deg)) for m in range(64))
@@ -72,7 +72,7 @@ def test_never_a_gain(azimuth: float, elevation: float, off: float, snr_db: floa
 
 
 def test_many_are_the_mean_of_each() -> None:
-    """More than fit at once."""
+    """More than one batch."""
     rng = np.random.default_rng(2)
     count = spectral.AT_ONCE // ARRAY.size + 7
     truly = rng.normal(size=(count, 3))
@@ -83,7 +83,7 @@ def test_many_are_the_mean_of_each() -> None:
 
 
 def test_where_no_element_radiates_nothing_is_given() -> None:
-    """Behind: the beam that would be formed there is none."""
+    """Behind the array: no beam can be formed there."""
     ahead_only = replace(ARRAY, element=Element(ElementPattern.COSINE, 1.0))
     assert spectral.gains(ahead_only, direction(180), direction(0)) == pytest.approx([0.0])
     assert spectral.loss_bps_hz(ahead_only, direction(180), direction(0), 20) == pytest.approx(

@@ -1,4 +1,4 @@
-"""What a learned predictor sees, and the flights that are made up for it."""
+"""Input of a learned predictor, and synthetic flights for its training."""
 
 import numpy as np
 import pytest
@@ -27,7 +27,7 @@ def report(
     velocity: list[float] | np.ndarray | None,
     arrived_ns: int | None = None,
 ) -> ObservedReport:
-    """Made and arrived on one timeline, the sender's 5 s behind it."""
+    """Report times and arrivals on one timeline, with the sender's clock 5 s behind."""
     place = np.array(position, dtype=float)
     speed = None if velocity is None else np.array(velocity, dtype=float)
     return ObservedReport(
@@ -95,7 +95,8 @@ def test_velocities_that_are_not_reported() -> None:
 
 @pytest.mark.parametrize("seed", range(6))
 def test_a_made_up_flight_is_a_motion(seed: int) -> None:
-    """Velocity is the way's derivative, acceleration is a multirotor's, noise is as stated."""
+    """Velocity is the derivative of position, acceleration is a multirotor's, noise is as
+    stated."""
     flight = made_up.flight(np.random.default_rng(seed), "1:1")
     t_s = (flight.truth.t_ns - flight.truth.t_ns[0]) * 1e-9
     way = np.gradient(flight.truth.position_ned_m, t_s, axis=0)

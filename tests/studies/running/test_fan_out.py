@@ -1,4 +1,4 @@
-"""Work in parallel: real processes, and a real Dask cluster on loopback."""
+"""Parallel work: real processes, and a real Dask cluster on loopback."""
 
 import json
 import multiprocessing
@@ -29,7 +29,7 @@ answer = len(list(here.iterdir()))
 
 
 def test_answers_come_in_order() -> None:
-    """The first takes by far the longest."""
+    """The first job takes by far the longest."""
     told: list[int] = []
     found = fan_out.on_cores(eval, ["(3 ** 2_000_000).bit_length()", "2", "3", "4"], 2, told.append)
     assert found == [3169926, 2, 3, 4]
@@ -37,7 +37,7 @@ def test_answers_come_in_order() -> None:
 
 
 def test_two_at_once(tmp_path: Path) -> None:
-    """Each waits for the other: one after the other they would not meet."""
+    """Each job waits for the other: sequential jobs would not finish."""
     script, here = tmp_path / "meet.py", tmp_path / "here"
     here.mkdir()
     script.write_text(MEET.format(here=str(here)))
@@ -64,7 +64,7 @@ def test_the_first_mistake_in_order_is_raised() -> None:
 
 
 def test_after_a_mistake_the_rest_is_given_up(tmp_path: Path) -> None:
-    """But for what was on its way to the process already; nothing goes on behind one's back."""
+    """Except jobs already sent to the process; no process keeps running."""
     touch = "__import__('time').sleep(0.05) or open({!r}, 'w').close()"
     rest = [touch.format(str(tmp_path / str(n))) for n in range(20)]
     with pytest.raises(ValueError, match="'x'"):
@@ -87,7 +87,7 @@ def test_a_mistake_in_a_process_is_one_line(cut_log: Path, tmp_path: Path) -> No
 
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
-    """A scheduler and two workers, each a process of its own."""
+    """A scheduler and two workers, each in its own process."""
     distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not here")
     with distributed.LocalCluster(
         n_workers=2, threads_per_worker=1, processes=True, dashboard_address="127.0.0.1:0"
@@ -116,7 +116,7 @@ def test_a_cluster_answers_in_order_and_says_the_first_mistake(cluster: Any) -> 
     asked = ["__import__('time').sleep(0.3) or int('first')", "int('second')", "1"]
     with pytest.raises(ValueError, match="'first'"):
         fan_out.on_cluster(eval, asked, address, id)
-    # The cluster is another's: it is left as it was.
+    # The cluster is shared: it is left unchanged.
     assert fan_out.on_cluster(len, ["abc"], address, id) == [3]
     pids = fan_out.on_cluster(eval, ["__import__('os').getpid()"] * 8, address, id)
     assert os.getpid() not in pids

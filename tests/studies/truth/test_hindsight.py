@@ -1,4 +1,4 @@
-"""A boot clock in hindsight: late frames, bursts, a clock that stands still, a restart."""
+"""A boot clock in hindsight: late frames, bursts, a stalled clock, a restart."""
 
 import numpy as np
 import pytest
@@ -10,7 +10,7 @@ EPOCH_NS = 1_700_000_000 * S
 
 
 def stream(late_s: np.ndarray, stands_s: float = 0.0) -> tuple[BootClock, np.ndarray]:
-    """Ten stamps a second, and when they were made; at half of them the clock stood still."""
+    """Ten timestamps per second and their true times; the clock stalls at half of them."""
     n = len(late_s)
     made_ns = EPOCH_NS + np.arange(n, dtype=np.int64) * (S // 10)
     boot_ns = made_ns - EPOCH_NS + 5 * S
@@ -30,7 +30,7 @@ def test_a_clock_that_stood_still_is_right_on_both_sides() -> None:
 
 
 def test_bursts_are_no_clock() -> None:
-    """Everything is held for up to 5 s and comes at once: the clock goes on as before."""
+    """Messages are held for up to 5 s and arrive at once: the clock continues unchanged."""
     late_s = np.full(900, 0.001)
     for begin, length in ((0, 12), (100, 50), (400, 30), (890, 10)):
         late_s[begin : begin + length] += np.arange(length, 0, -1) * 0.1

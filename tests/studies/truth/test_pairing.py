@@ -1,11 +1,11 @@
-"""When truth messages were made: on a circle of known times, and by the autopilot's own log."""
+"""Times of truth messages: on a circle with known times, and against the autopilot's own log."""
 
 import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
-from pymavlink import DFReader  # the oracle: tests alone may import it
+from pymavlink import DFReader  # reference implementation: only tests may import it
 from support import ROOT, SHARED, shared_log
 
 from companion.mavlink.wire.encode import Outgoing, pack
@@ -75,11 +75,11 @@ def log(path: Path, every_s: float, from_s: float, held: bool, with_neighbour: b
 
 
 def errors_ms(path: Path, made_s: np.ndarray) -> np.ndarray:
-    """How far off the truth messages of a log are, less what a clock leaves in common."""
+    """Errors of the truth message times, without the constant part of the clock."""
     (flight,) = vehicles.load(path, "{},{},{}".format(*HOME)).flights
     expected = np.array([[*circle(t_s)[2:], 0.0] for t_s in made_s])
     found = flight.truth.velocity_ned_mps
-    # By their velocities: of one round no two are alike.
+    # Matched by velocity: within one lap no two are equal.
     row = [int(np.argmin(np.linalg.norm(found - each, axis=1))) for each in expected[:240]]
     off = (flight.truth.t_ns[row] - EPOCH_US * 1000) * 1e-6 - made_s[:240] * 1e3
     return np.asarray(off)
@@ -93,15 +93,15 @@ def errors_ms(path: Path, made_s: np.ndarray) -> np.ndarray:
 def test_the_order_dates_them(
     tmp_path: Path, every_s: float, from_s: float, with_neighbour: bool, held: bool
 ) -> None:
-    """In the same go as a report, in between, at a rhythm of their own; steadily and in bursts."""
+    """Sent with a report, in between, or at their own rate; continuously and in bursts."""
     made_s = log(tmp_path / "a.tlog", every_s, from_s, held, with_neighbour)
-    once = made_s < made_s[0] + 2 * np.pi * RADIUS_M / SPEED_MPS  # the circle's first round
+    once = made_s < made_s[0] + 2 * np.pi * RADIUS_M / SPEED_MPS  # the first lap
     off_ms = errors_ms(tmp_path / "a.tlog", made_s[once])
     assert np.abs(off_ms).max() < 8  # .16 m at 20 m/s
 
 
 def lead_ms(flight: Flight) -> np.ndarray:
-    """How far ahead along its way each report in flight is."""
+    """Lead of each report along the flight direction."""
     position, velocity = flight.truth.at(flight.made_ns)
     speed = np.linalg.norm(velocity, axis=1)
     flies = ~np.isnan(speed) & (speed > 3) & flight.flying(flight.made_ns)
@@ -110,7 +110,7 @@ def lead_ms(flight: Flight) -> np.ndarray:
 
 
 def lead_by_the_autopilot_ms(path: Path) -> float:
-    """The same by the DataFlash log of the autopilot, at equal stamps, where no link can err."""
+    """The same from the autopilot's DataFlash log at equal timestamps, free of link errors."""
     reader = DFReader.DFReader_binary(str(path))
     rows: dict[str, list[list[float]]] = {"SIM2": [], "XKF1": []}
     while (m := reader.recv_match(type=list(rows))) is not None:
@@ -129,7 +129,7 @@ def lead_by_the_autopilot_ms(path: Path) -> float:
 
 @pytest.mark.full
 def test_aeroplanes_report_ahead_and_copters_behind() -> None:
-    """The autopilot's own log says the same of its aeroplane: it is no matter of dating."""
+    """The autopilot's own log agrees for its aeroplane: the lead is not a dating error."""
     own_ms = lead_by_the_autopilot_ms(shared_log("sitl_planes_circle_1.bin"))
     assert own_ms == pytest.approx(26.7, abs=1)
     for flight in vehicles.load(SHARED / "sitl_planes_circle.tlog", "5:1").flights:
@@ -140,7 +140,7 @@ def test_aeroplanes_report_ahead_and_copters_behind() -> None:
 
 
 def test_truth_of_a_flight_is_its_own_clock() -> None:
-    """The way from one truth message to the next takes the time between them."""
+    """The distance between consecutive truth messages matches the time between them."""
     for flight in vehicles.load(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog", "5:1").flights:
         truth = flight.truth
         mean = (truth.velocity_ned_mps[1:] + truth.velocity_ned_mps[:-1]) / 2

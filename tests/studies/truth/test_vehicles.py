@@ -1,4 +1,4 @@
-"""What is read from a log: against pymavlink, and against motions that are known."""
+"""Contents read from a log: against pymavlink, and against known motions."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pymavlink import mavutil  # the oracle: tests alone may import it
+from pymavlink import mavutil  # reference implementation: only tests may import it
 from support import ROOT, shared_log
 
 from companion.studies.truth import vehicles
@@ -19,7 +19,7 @@ S = 1_000_000_000
 
 
 def cubic(t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """A motion that Hermite's cubic meets exactly."""
+    """A motion that cubic Hermite interpolation reproduces exactly."""
     c = np.array([[1.0, -2.0, 3.0], [0.5, 4.0, -1.0], [0.3, -0.2, 0.1], [0.02, 0.01, -0.03]])
     powers = t_s[:, None] ** np.arange(4)
     slopes = np.arange(1, 4) * t_s[:, None] ** np.arange(3)
@@ -65,7 +65,7 @@ def test_nothing_is_known_outside_and_in_gaps() -> None:
 
 
 def without(path: Path, out: Path, name: str) -> Path:
-    """A log less the messages of one name."""
+    """Write a log without the messages of one name."""
     reader = mavutil.mavlogfile(str(path))
     with out.open("wb") as file:
         while (m := reader.recv_msg()) is not None:
@@ -76,7 +76,8 @@ def without(path: Path, out: Path, name: str) -> Path:
 
 
 def test_the_older_word_of_the_simulator(cut: Path, tmp_path: Path) -> None:
-    """SIMSTATE says where as SIM_STATE does, to its last digit; how high, the reports do."""
+    """SIMSTATE has the horizontal position of SIM_STATE to its last digit; height is from
+    reports."""
     newer = vehicles.load(cut, "5:1")
     older = vehicles.load(without(cut, tmp_path / "older.tlog", "SIM_STATE"), "5:1")
     neither = without(tmp_path / "older.tlog", tmp_path / "neither.tlog", "SIMSTATE")
@@ -94,7 +95,8 @@ def test_the_older_word_of_the_simulator(cut: Path, tmp_path: Path) -> None:
 
 
 def test_times_are_those_of_the_least_delay() -> None:
-    """A drifting clock, late reports, a restart: made again to the best delay of some seconds."""
+    """A drifting clock, late reports, a restart: recovered up to the minimum delay of some
+    seconds."""
     rng = np.random.default_rng(3)
     made_ns = np.arange(0, 120 * S, S // 10)
     drift = 1e-4
@@ -103,7 +105,7 @@ def test_times_are_those_of_the_least_delay() -> None:
     late_ns = np.round(rng.exponential(0.05, len(made_ns)) * S).astype(np.int64)
     found = boot_clock(made_ns + late_ns, boot_ms * 1_000_000).made_ns
     error_s = (found - made_ns) * 1e-9
-    assert np.abs(error_s).max() < 0.006  # half a window of drift, and a lucky report
+    assert np.abs(error_s).max() < 0.006  # half a window of drift, and a report with low delay
     assert np.abs(error_s - np.median(error_s)).mean() < 0.001
 
 
@@ -113,7 +115,7 @@ def cut() -> Path:
 
 
 def by_pymavlink(path: Path) -> tuple[dict[str, list[list[float]]], dict[str, list[list[float]]]]:
-    """Reports and SIM_STATE, place and velocity, of each source, by another reader."""
+    """Reports and SIM_STATE, position and velocity, of each source, by another reader."""
     reader = mavutil.mavlogfile(str(path))
     reports: dict[str, list[list[float]]] = {}
     states: dict[str, list[list[float]]] = {}
@@ -151,7 +153,8 @@ def test_a_log_is_read_as_pymavlink_reads_it(cut: Path) -> None:
 
 
 def test_truth_and_reports_agree_in_time(cut: Path) -> None:
-    """The simulated autopilot itself is 20 to 30 ms behind; a clock wrong by more would show."""
+    """The simulated autopilot itself is 20 to 30 ms behind; a larger clock error would be
+    visible."""
     for flight in vehicles.load(cut, "5:1").flights:
         made_ns = flight.made_ns
         position, velocity = flight.truth.at(made_ns)

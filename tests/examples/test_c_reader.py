@@ -1,4 +1,4 @@
-"""Records for machines, read by the C header: built by gcc, compared with numpy."""
+"""Binary records read by the C header: built by gcc, compared with numpy."""
 
 import shutil
 import struct
@@ -20,7 +20,7 @@ STRICT = ("-O2", "-Wall", "-Wextra", "-Werror")
 
 
 def built(folder: Path, compiler: str, standard: str, source: str) -> Path:
-    """An example, compiled with every warning an error."""
+    """An example compiled with warnings as errors."""
     if shutil.which(compiler) is None:
         pytest.skip(f"no {compiler} on this machine")
     out = folder / Path(source).stem
@@ -40,7 +40,7 @@ def follower(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def beam_set(rng: np.random.Generator, elements: int, beams: int) -> BeamSet:
-    """Beams of any numbers: a record promises nothing of them."""
+    """Beams with arbitrary values: the record format does not restrict them."""
     known = iter(rng.normal(size=8 * beams).tolist())
     made = tuple(
         Beam(
@@ -75,7 +75,7 @@ def beam_set(rng: np.random.Generator, elements: int, beams: int) -> BeamSet:
 
 
 def printed(printer: Path, parts: list[bytes]) -> list[list[str]]:
-    """What the C program says of each, line by line, in words."""
+    """Lines of words printed by the C program for each record."""
     fed = b"".join(struct.pack("<I", len(part)) + part for part in parts)
     done = subprocess.run([printer], input=fed, capture_output=True, check=True, timeout=HANG_S)
     return [line.split(" ") for line in done.stdout.decode().splitlines()]
@@ -140,7 +140,7 @@ def layout(kind: np.dtype[Any]) -> list[tuple[np.dtype[Any], int]]:
 
 
 def follow(follower: Path, ring: Path, write: Any) -> tuple[int, int]:
-    """Records that came and that were lost, of those that ``write`` puts."""
+    """Received and lost records of those that ``write`` puts."""
     with started([follower, ring], stdout=subprocess.PIPE, text=True) as process:
         assert line_of(process, process.stdout) == "open\n"
         write()
@@ -166,7 +166,7 @@ def test_a_thousand_updates_a_second_come_without_loss(follower: Path, tmp_path:
 
 
 def test_no_record_is_torn_by_a_writer_that_laps_its_reader(follower: Path, tmp_path: Path) -> None:
-    """As fast as it goes: what was overwritten is counted, and what came is whole."""
+    """At full speed: overwritten records are counted, and received ones are complete."""
     ring, rng = Ring(tmp_path / "ring"), np.random.default_rng(4)
     made = [next(iter(records.encode(beam_set(rng, 60, n), n))) for n in range(1, 9)]
     assert all(len(record) <= LARGEST_RECORD for record in made)

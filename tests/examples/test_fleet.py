@@ -1,4 +1,4 @@
-"""The example of a fleet's security: strangers are refused, with a certificate and without."""
+"""The fleet security example: peers without a valid certificate are rejected."""
 
 import asyncio
 import contextlib
@@ -44,7 +44,7 @@ def test_the_configuration_names_what_there_is() -> None:
 
 
 class Node:
-    """A session as the example configures it, and what it heard."""
+    """A session configured as in the example, and its received messages."""
 
     def __init__(
         self,
@@ -109,7 +109,7 @@ async def node(*arguments: Any, **options: Any) -> AsyncIterator[Node]:
 
 
 async def spoken(speaker: Node, listener: Node, name: str, payload: bytes) -> None:
-    """Publish under a name, once it is known that the listener listens."""
+    """Publish under a name once the listener has subscribed."""
     while not speaker.bus.is_wanted(f"{SITE}/{name}/heard"):
         await asyncio.sleep(0.005)
     speaker.bus.put(f"{SITE}/{name}/heard", payload)
@@ -126,7 +126,7 @@ def test_nodes_hear_each_other_and_nobody_speaks_for_another(certificates: Path)
         ):
             await one.until(lambda: len(one.near) == 3)
             for stranger in (looker, guest, two):
-                stranger.bus.alive(f"{SITE}/roof-3/alive")  # a lie
+                stranger.bus.alive(f"{SITE}/roof-3/alive")  # impersonation
             two.bus.alive(f"{SITE}/roof-2/alive")
             await one.until(lambda: one.seen)
             await spoken(looker, one, "roof-2", b"invented")
@@ -138,10 +138,10 @@ def test_nodes_hear_each_other_and_nobody_speaks_for_another(certificates: Path)
             await spoken(one, looker, "roof-1", b"news")
             await looker.until(lambda: looker.heard)
             assert looker.heard == [(f"{SITE}/roof-1/heard", b"news")]
-            # What strangers said went before, and nothing of it came; the guest was told nothing.
+            # Messages of strangers were sent before and did not arrive; the guest received nothing.
             assert one.heard == [(f"{SITE}/roof-2/heard", b"mine")]
             assert one.seen == [(f"{SITE}/roof-2/alive", True)]
-            assert not guest.heard and guest.seen == [(f"{SITE}/roof-3/alive", True)]  # his own
+            assert not guest.heard and guest.seen == [(f"{SITE}/roof-3/alive", True)]  # its own
             assert not guest.bus.is_wanted(f"{SITE}/guest/heard")
 
     run_async(test())
@@ -150,7 +150,7 @@ def test_nodes_hear_each_other_and_nobody_speaks_for_another(certificates: Path)
 def test_who_shows_no_certificate_of_the_authority_is_refused(
     certificates: Path, tmp_path: Path
 ) -> None:
-    forged = made(tmp_path / "forged", "roof-2")  # a good name, of another authority
+    forged = made(tmp_path / "forged", "roof-2")  # a valid name, signed by another authority
     forged.joinpath("ca.pem").write_bytes(certificates.joinpath("ca.pem").read_bytes())
 
     async def test() -> None:

@@ -20,7 +20,7 @@ COUNT = 4000
 
 @pytest.fixture(scope="module")
 def python() -> str:
-    """A Python that has GNU Radio."""
+    """A Python interpreter with GNU Radio."""
     known = PYTHON and subprocess.run(
         [PYTHON, "-c", "import gnuradio.blocks"], capture_output=True, check=False, timeout=HANG_S
     )
@@ -68,7 +68,7 @@ def noise(rng: np.random.Generator, rows: int, columns: int) -> ComplexArray:
 @pytest.mark.full
 @pytest.mark.parametrize("uavs", [["1:1", "icao:4CA7B3"], ["2:1"]])
 def test_streams_go_out_by_the_newest_weights(python: str, tmp_path: Path, uavs: list[str]) -> None:
-    """Records change between blocks of samples; damaged and foreign ones change nothing."""
+    """Weights change between sample blocks; damaged and foreign records have no effect."""
     rng, elements = np.random.default_rng(3), 8
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
@@ -86,7 +86,7 @@ def test_streams_go_out_by_the_newest_weights(python: str, tmp_path: Path, uavs:
         assert process.stdout
 
         def through(samples: ComplexArray) -> ComplexArray:
-            """The samples of all elements, (M, n), for those of all UAVs, (N, n)."""
+            """The samples of all elements, (M, n), from those of all UAVs, (N, n)."""
             process.stdin.write(samples.T.astype(np.complex64).tobytes())
             process.stdin.flush()
             found = process.stdout.read(8 * elements * samples.shape[1])
@@ -106,7 +106,7 @@ def test_streams_go_out_by_the_newest_weights(python: str, tmp_path: Path, uavs:
             got, wanted = through(samples), weights[:, 1:].astype(np.complex128) @ samples
             assert np.abs(got - wanted).max() < 1e-6 * np.abs(wanted).max()
         says.send(record(5, ["9:9"], noise(rng, elements, 1)))
-        assert not through(noise(rng, len(uavs), COUNT)).any()  # nobody of ours has a beam
+        assert not through(noise(rng, len(uavs), COUNT)).any()  # no own UAV has a beam
         process.stdin.close()
         assert process.stdout.read() == b""
         assert process.wait(HANG_S) == 0
@@ -114,7 +114,7 @@ def test_streams_go_out_by_the_newest_weights(python: str, tmp_path: Path, uavs:
 
 @pytest.mark.full
 def test_weights_that_are_too_old_are_silence(python: str) -> None:
-    """In GNU Radio's own process: a block whose records stop is muted, and speaks again."""
+    """In GNU Radio's own process: a block without new records is muted, and resumes."""
     weights = noise(np.random.default_rng(1), 2, 1)
     first, second = (record(n, ["1:1"], weights).hex() for n in (1, 2))
     done = subprocess.run(

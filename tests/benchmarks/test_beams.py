@@ -1,4 +1,4 @@
-"""Beams against optima and against sharp ones, as ratios in one run: ``make bench``."""
+"""Beams against optima and against sharp ones, as ratios within one run: ``make bench``."""
 
 import time
 
@@ -39,7 +39,8 @@ AT = Carrier(
 
 
 def most_db(width: float, elements: int) -> float:
-    """The greatest least gain with free amplitudes: a linear programme over autocorrelations."""
+    """Upper limit of the minimum gain with free amplitudes: a linear programme over
+    autocorrelations."""
     u = np.union1d(np.linspace(0, elements / 2, 8 * elements + 1), np.linspace(0, width, 200))
     cosines = 2 * np.cos(2 * np.pi * np.outer(u, np.arange(1, elements)) / elements)
     rows = np.c_[-cosines, u <= width]
@@ -61,14 +62,14 @@ def test_shapes_of_lines_against_free_amplitudes(elements: int) -> None:
         u = np.linspace(-width, width, 2001)
         field = np.exp(2j * np.pi * np.outer(u, np.arange(elements) / elements) + 1j * phases)
         least = 10 * np.log10((np.abs(field.sum(axis=1)) ** 2).min() / elements)
-        # Optima over the number of elements do not depend on it, but near the end of a short line.
+        # Optima relative to the element count do not depend on it, except for short arrays.
         best = most_db(width, min(elements, 64)) + 10 * np.log10(elements / min(elements, 64))
         print(f"  w = {width:5}: {least:6.2f}, {least - best:+.2f}")
         assert least > best - 4.5
 
 
 def climbed(phases: FloatArray, response: ComplexArray) -> FloatArray:
-    """Phases from which no small change makes the least gain greater: softer minima at first."""
+    """Phases at a local maximum of the minimum gain, found with softened minima first."""
 
     def cost(at: FloatArray, sharpness: float) -> tuple[float, FloatArray]:
         radiated = np.exp(1j * at)
@@ -144,7 +145,7 @@ def fixed_point(a: ComplexArray, snr: FloatArray) -> float:
 
 
 def wmmse(a: ComplexArray, snr: FloatArray) -> float:
-    """The sum of rates that WMMSE over whole beams comes to."""
+    """The sum rate reached by WMMSE over whole beams."""
     h = (np.sqrt(snr) * a).T  # rows are channels
     v = h.conj().T / np.linalg.norm(h)
     for _ in range(100):

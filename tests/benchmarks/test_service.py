@@ -1,4 +1,4 @@
-"""The running service's figures: its start, its memory, and what it answers: ``make bench``."""
+"""Figures of the running service: startup, memory, and answers per second: ``make bench``."""
 
 import asyncio
 import statistics
@@ -23,7 +23,7 @@ PEER = "import numpy, fastapi, uvicorn, google.protobuf.message, zstandard"
 
 
 async def _ask(node: Node, path: str, accept: str, until_s: float) -> int:
-    """How many answers one client gets over one connection."""
+    """Answers per second for one client over one connection."""
     address = node.url.removeprefix("http://")
     host, port = address.rsplit(":", 1)
     reader, writer = await asyncio.open_connection(host, int(port))
@@ -56,7 +56,7 @@ def answers_per_s(node: Node, path: str, accept: str = "*/*") -> float:
 
 @pytest.fixture
 def flown(start_node: Any, tmp_path: Path) -> Any:
-    """A service that records four UAVs, and has beams on them."""
+    """A service that records four UAVs and forms beams towards them."""
     node = start_node(*RUN, "--record", str(tmp_path))
     to = f"udpout:127.0.0.1:{node.udp_port}"
     flight = [str(BIN / "sitl-replay"), "fly", "waypoints", "--to", to]
@@ -106,7 +106,8 @@ def test_the_start_against_loading_its_libraries(start_node: Any, figures: Figur
 
 
 def test_from_a_frame_to_weights(cut_log: Path, figures: Figures) -> None:
-    """In this process: a frame taken in, and a look at all beams; numpy's own speed beside it."""
+    """In this process: one frame received, and one update of all beams; numpy's speed for
+    comparison."""
     pipeline = Pipeline(Settings().override(center={"source": "5:1"}))
     took_us: dict[str, list[float]] = {"a frame": [], "a look at all beams": []}
     unit: list[float] = []

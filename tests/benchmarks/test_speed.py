@@ -1,4 +1,4 @@
-"""Speed as ratios against peers, measured in the same run: ``make bench``."""
+"""Speed as ratios to other programs, measured in the same run: ``make bench``."""
 
 import json
 import statistics
@@ -35,7 +35,7 @@ ROUNDS = 5
 
 
 def interleaved(*works: Callable[[], object], rounds: int = ROUNDS) -> list[list[float]]:
-    """Seconds of each in each round, one after the other in turn, so that a slow spell hits all."""
+    """Seconds of each per round, interleaved, so that a slow phase affects all."""
     took: list[list[float]] = [[] for _ in works]
     for _ in range(rounds):
         for times, work in zip(took, works, strict=True):
@@ -46,7 +46,7 @@ def interleaved(*works: Callable[[], object], rounds: int = ROUNDS) -> list[list
 
 
 def test_replay_against_reading_the_log(tmp_path: Path, figures: Figures) -> None:
-    """The whole command, against mavlogdump that prints the reports of the same log."""
+    """The whole command, against mavlogdump printing the reports of the same log."""
     log = shared_log("sitl_4circle.tlog")
     ours = [BIN / "companion", "replay", log, "--center", "5:1", "--json"]
     theirs = [BIN / "mavlogdump.py", "--types", "GLOBAL_POSITION_INT", log]
@@ -102,7 +102,7 @@ def test_splitting_against_pymavlink(figures: Figures) -> None:
 
 
 def users_of_a_line(elements: int, users: int) -> ComplexArray:
-    """The steering matrix of a half-wave line for users in directions that are all different."""
+    """The steering matrix of a half-wavelength linear array for users in distinct directions."""
     array = geometry.uniform_linear(
         elements, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
     )
@@ -138,7 +138,8 @@ def test_zero_forcing_against_pinv(elements: int, users: int, figures: Figures) 
 
 @pytest.mark.parametrize("uavs", [4, 64])
 def test_a_kinematic_update_with_prediction_and_bound(uavs: int, figures: Figures) -> None:
-    """A report taken in and a prediction made; its cost must not grow with the UAVs."""
+    """One report received and one prediction made; the cost must not grow with the number of
+    UAVs."""
     each_us = {count: _update_us(count) for count in (4, uavs)}
     figures.note(f"update and prediction, {uavs} UAVs", each_us[uavs], "us each", "less")
     assert each_us[uavs] < 2 * each_us[4]
@@ -200,7 +201,7 @@ def _update_us(uavs: int) -> float:
 
 
 def test_reading_a_vehicles_own_log_against_the_formats_own_readers(figures: Figures) -> None:
-    """All frames of a log, against its own reader: of all messages, and of those that are used."""
+    """All frames of a log, against its reference reader: all messages, and only the used ones."""
     from pymavlink.DFReader import DFReader_binary
 
     from companion.recording.foreign import ardupilot, px4

@@ -19,10 +19,11 @@ REPORTS = 3
 
 
 def furthest_m(fixes: list[Fix], until_ns: int, off: FloatArray, limit_mps2: float) -> float:
-    """How far along a unit vector a motion can be that agrees with all reports, from the newest.
+    """The greatest distance along a unit vector of a motion consistent with all reports.
 
     A second-order cone programme: accelerations are steps of at most ``limit_mps2``, and positions
-    and velocities at the reports are within their noise. Returns the way from the newest position.
+    and velocities at the reports are within their noise. Returns the distance from the newest
+    position.
     """
     newest = fixes[-1]
     times_s = sorted(
@@ -48,7 +49,7 @@ def furthest_m(fixes: list[Fix], until_ns: int, off: FloatArray, limit_mps2: flo
 
 @pytest.mark.benchmark
 def test_the_bound_is_little_more_than_the_exact_worst_case() -> None:
-    """Over a slow radio, in turns; the direction of the worst case is that of the bound's end."""
+    """Over a slow radio, with turns; the worst-case direction is that of the bound's end."""
     genes = default_rng(5).random(adversary.GENES)
     genes[8 * adversary.KNOTS + 9] = 0.7  # a report each .8 s
     genes[8 * adversary.KNOTS + 14] = 0.0  # that is only heard
@@ -79,5 +80,5 @@ def test_the_bound_is_little_more_than_the_exact_worst_case() -> None:
             break
     print(f"bound over the exact worst case: {statistics.median(ratios):.3f} in the median of")
     print(f"{len(ratios)}, {min(ratios):.3f} to {max(ratios):.3f}")
-    assert min(ratios) > 0.999  # what is possible is inside
+    assert min(ratios) > 0.999  # a feasible motion is inside the bound
     assert statistics.median(ratios) <= 1.05

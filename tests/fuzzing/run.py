@@ -29,7 +29,7 @@ MEMORY_MB = 1500
 
 
 def main() -> int:
-    """Search one target for some seconds."""
+    """Fuzz one target for some seconds."""
     name, seconds, *options = sys.argv[1:]
     work = ROOT / "build" / "fuzz" / name
     work.mkdir(parents=True, exist_ok=True)
@@ -44,7 +44,7 @@ def main() -> int:
 
 
 def keep(found: Path, corpus: Path) -> None:
-    """Copy some of what was found, of all lengths: it all reached something new at its time."""
+    """Copy some of the found inputs, of all lengths: each reached new code when found."""
     files = sorted(
         (one for one in found.iterdir() if one.is_file()), key=lambda x: x.stat().st_size
     )
@@ -53,7 +53,7 @@ def keep(found: Path, corpus: Path) -> None:
 
 
 def child() -> None:
-    """The process in which the code is instrumented."""
+    """The process with instrumented code."""
     import atheris
 
     sys.path[:0] = [str(HERE), str(HERE.parent), str(ROOT)]

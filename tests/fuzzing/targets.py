@@ -34,7 +34,7 @@ HEARD = sorted(DECODED.union(STAMPED))
 
 
 def framing(data: bytes) -> None:
-    """However the bytes are cut, the same frames come out, and every byte is accounted for."""
+    """However the bytes are split, the same frames result, and every byte is accounted for."""
     step, data = 1 + (data[0] if data else 0), data[1:]
     whole, cut = Splitter("whole"), Splitter("cut")
     once = [*whole.feed(1, data), *whole.finish(1)]
@@ -50,7 +50,7 @@ def framing(data: bytes) -> None:
 
 
 def fold(data: bytes) -> None:
-    """A pipeline takes any frames in any order of time, and what comes of them are numbers."""
+    """A pipeline accepts any frames in any time order, and its outputs are finite."""
     pipeline = _pipeline()
     for event in _events(data):
         for output in pipeline.step(event):
@@ -69,7 +69,7 @@ def _pipeline() -> Pipeline:
 
 
 def _events(data: bytes) -> Iterator[Any]:
-    """Each event: kind, sender, time since the one before in ms, length, then so much payload."""
+    """Each event: kind, sender, time since the previous one in ms, length, then the payload."""
     at, t_ns = 0, 1_800_000_000 * S
     while at + 5 <= len(data):
         kind, sender, ms, size = struct.unpack_from("<BBHB", data, at)
@@ -94,7 +94,7 @@ def _now(data: bytes) -> int:
 
 
 def recovery(data: bytes) -> None:
-    """A leftover is dealt with once; what is finished of it is read to its end."""
+    """An unfinished file is processed once; its recovered part is read to its end."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "x.mcap.active").write_bytes(MAGIC + data)
@@ -106,7 +106,7 @@ def recovery(data: bytes) -> None:
         else:
             assert "\n" not in str(told)
             kind = str(told).partition(": ")[2].split(":")[0]
-            assert not kind.endswith("Error"), told  # what nobody has foreseen
+            assert not kind.endswith("Error"), told  # unexpected errors
 
 
 def _read(path: Path) -> Iterator[Any]:
@@ -117,7 +117,7 @@ def _read(path: Path) -> Iterator[Any]:
 
 
 def settings(data: bytes) -> None:
-    """A text is settings, which give themselves back, or a mistake in one line."""
+    """A text is valid settings, which round-trip, or a one-line error."""
     try:
         found = Settings.from_toml(data.decode("utf-8", "replace"), "fuzzed.toml")
     except UserError as error:
@@ -127,9 +127,9 @@ def settings(data: bytes) -> None:
 
 
 def http(data: bytes) -> None:
-    """Whatever is asked, and with whatever headers: no answer is a defect of the program.
+    """Any request with any headers: no answer is an internal server error.
 
-    What is no HTTP never comes as far as this: bytes of it that a server refuses are left out.
+    Invalid HTTP never reaches this point: bytes that the server rejects are skipped.
     """
     line, *lines = data.split(b"\n")
     path, _, query = bytes(one for one in line if 0x21 <= one < 0x7F).partition(b"?")

@@ -1,4 +1,4 @@
-"""What the search of ``run.py`` has kept: bytes that reach different code, former failures."""
+"""The corpus kept by ``run.py``: bytes that reach different code, and former failures."""
 
 from pathlib import Path
 

@@ -1,4 +1,4 @@
-"""Everything that goes wrong, at once, for ten minutes: the service goes on and loses nothing."""
+"""Ten minutes with all faults at once: the service keeps running and loses no data."""
 
 import contextlib
 import json
@@ -27,7 +27,7 @@ from companion.values import Source
 UAVS = 20
 FRAMES_HZ = 1000
 SETTINGS = "[recording]\nrotate_s = 60.0\n"
-STREAM = "/v1/stream?topic=uavs&topic=beams&topic=status&rate_hz=10"  # as the page has it
+STREAM = "/v1/stream?topic=uavs&topic=beams&topic=status&rate_hz=10"  # as in the documentation
 STALLED = 40
 MEMORY = "process_resident_memory_bytes"
 CYCLE_S = 60.0
@@ -37,14 +37,14 @@ GROWS_MB = 12.0
 
 
 def vehicles(port: int, count: int, frames_hz: int, first: int) -> "subprocess.Popen[bytes]":
-    """Vehicles that fly in one process, until it is ended."""
+    """Vehicles that fly in one process, until it is stopped."""
     sender = [sys.executable, str(ROOT / "tests" / "load_sender.py")]
     numbers = map(str, (port, count, frames_hz, 3600, first))
     return subprocess.Popen([*sender, *numbers], stdout=subprocess.DEVNULL)
 
 
 class Flapping(threading.Thread):
-    """A peer over TCP that hangs up every few seconds, often in the middle of a frame."""
+    """A TCP peer that disconnects every few seconds, often in the middle of a frame."""
 
     def __init__(self) -> None:
         super().__init__(daemon=True)
@@ -62,13 +62,13 @@ class Flapping(threading.Thread):
                 with peer, contextlib.suppress(OSError):
                     for _ in range(rng.randrange(20, 200)):
                         peer.send(said)
-                        time.sleep(0.02)  # the pace of a peer
+                        time.sleep(0.02)  # the frame rate of a peer
                     peer.send(said[: rng.randrange(1, len(said))])
 
 
 @contextlib.contextmanager
 def stalling(url: str) -> Iterator[None]:
-    """Clients that ask and never read, or never finish asking."""
+    """Clients that send requests and never read, or never complete a request."""
     host, _, port = url.removeprefix("http://").partition(":")
     with contextlib.ExitStack() as stack:
         for number in range(STALLED):
@@ -83,7 +83,7 @@ def stalling(url: str) -> Iterator[None]:
 
 
 class Page(threading.Thread):
-    """Reads the stream as the page does; ``ages_s`` of the beams as they came."""
+    """Read the stream as the page does; ``ages_s`` of the beams on arrival."""
 
     def __init__(self, node: Node) -> None:
         super().__init__(daemon=True)
@@ -92,7 +92,7 @@ class Page(threading.Thread):
         self._url = node.url.replace("http", "ws") + STREAM
 
     def run(self) -> None:
-        while not self.until.is_set():  # a hang is a shorter time than a soak
+        while not self.until.is_set():  # a hang timeout is shorter than a soak test
             with contextlib.suppress(TimeoutError):
                 run_async(self._read())
 
@@ -110,8 +110,8 @@ def resident_mb(node: Node) -> float:
 
 
 class Troubles:
-    """What happens in each ``cycle_s``: the disk fills and has room again, the carrier vanishes and
-    another takes over; finished parts are tidied away, as somebody has to."""
+    """Disturbances in each ``cycle_s``: the disk fills and is freed, the carrier disappears and
+    another takes over; finished parts are removed, as an operator must do."""
 
     def __init__(self, node: Node, disk: Path, kept: Path, cycle_s: float) -> None:
         self._node, self._disk, self._kept = node, disk, kept
@@ -124,7 +124,7 @@ class Troubles:
         return vehicles(self._node.udp_port, 1, 50, 0)
 
     def at(self, passed_s: float) -> None:
-        """Whatever is due by now."""
+        """Run all actions that are due."""
         cycle, into_s = divmod(passed_s, self._cycle_s)
         quarter = int(4 * into_s / self._cycle_s)
         if self._done == (cycle, quarter):
@@ -143,19 +143,19 @@ class Troubles:
                 self.took_over += 1
 
     def tidy(self) -> None:
-        """Take all but the newest part off the disk; what was cut short is recovered there."""
+        """Remove all but the newest part from the disk; truncated parts are recovered elsewhere."""
         for part in sorted(self._disk.glob("*.mcap*"), key=lambda path: path.stat().st_mtime)[:-1]:
             shutil.copy(part, self._kept)
             part.unlink()
 
     def over(self) -> None:
-        """The disk has room, and nobody flies."""
+        """Free the disk and stop all flights."""
         end(self.carrier)
         (self._disk / BALLAST).unlink(missing_ok=True)
 
 
 class Seen(NamedTuple):
-    """What was measured while it went; memory with the time since it began."""
+    """Measurements during the run; memory with the time since the start."""
 
     healthy_s: list[float]
     memory: list[tuple[float, float]]  # s, MB
@@ -167,7 +167,7 @@ class Seen(NamedTuple):
 
 
 def tell(table: Any, seconds: float, seen: Seen) -> None:
-    """Put what was measured into the table, and hold it against what is asked."""
+    """Add the measurements to the table and check them against their limits."""
     window_s = min(CYCLE_S, seconds / 4)
     first_mb = seen.usual_mb(seconds / 4, window_s)
     grown_mb = seen.usual_mb(seconds - window_s, window_s) - first_mb
@@ -220,7 +220,7 @@ def test_whatever_goes_wrong_at_once_it_goes_on_and_all_is_recorded(
                 assert node.get("/healthz")[0] == 200
                 healthy_s.append(time.monotonic() - asked_s)
                 memory.append((passed_s, resident_mb(node)))
-                time.sleep(0.2)  # between two questions
+                time.sleep(0.2)  # between two requests
         troubles.over()
         node.wait_until("/v1/status", lambda answer: answer["recording"]["state"] == "recording")
         status = node.json("/v1/status")
@@ -233,7 +233,7 @@ def test_whatever_goes_wrong_at_once_it_goes_on_and_all_is_recorded(
     code, _, err = node.stop()
     assert code == 0, err
     shutil.copytree(small_disk, kept, dirs_exist_ok=True)
-    recover_leftovers(kept)  # as the next start does, of what the full disk cut short
+    recover_leftovers(kept)  # as the next start does with the part truncated by the full disk
     parts = sorted(
         kept.iterdir(), key=lambda path: getattr(read_recording_info(path).part, "number", 0)
     )

@@ -1,4 +1,4 @@
-"""Cursor on Target on links, by datagrams and by a connection: shown, recorded, replayed alike."""
+"""Cursor on Target links over UDP and TCP: shown, recorded, and replayed identically."""
 
 import json
 import socket
@@ -38,7 +38,7 @@ def test_events_are_heard_and_replay_alike(start_node: Any, tmp_path: Path) -> N
             )
             status, _, errors = node.stop()
             peer.settimeout(HANG_S)
-            assert peer.recv(1) == b""  # nothing was ever sent to it
+            assert peer.recv(1) == b""  # the service sent nothing to it
     assert status == 0, errors
     assert {one["id"] for one in answer["uavs"]} == {"cot:A", "cot:B"}
     (recording,) = tmp_path.glob("*.mcap")

@@ -1,4 +1,4 @@
-"""Devices driven by real processes: a service's own, and another's over HTTP."""
+"""Devices driven by real processes: the service's own device, and a remote one over HTTP."""
 
 import json
 import re
@@ -17,7 +17,7 @@ EIGHT = "[array]\nelements = 8\nfrequency_hz = 10.5e9\n"
 
 
 def where_deg(port: int) -> tuple[float, float]:
-    """Where the rotator points, asked beside whoever drives it."""
+    """The rotator's direction, queried alongside the driver."""
     with socket.create_connection(("127.0.0.1", port), HANG_S) as line:
         line.sendall(b"p\n")
         answer = b""
@@ -52,7 +52,7 @@ def test_a_service_drives_its_rotator_and_reaches_it_again(
         first = where_deg(rotctld)
         waiting = threading.Event()
         while abs(where_deg(rotctld)[0] - first[0]) < 0.3:
-            waiting.wait(0.1)  # the dummy begins its turn anew at each command, and is slow so
+            waiting.wait(0.1)  # the dummy restarts its slow turn at each command
         assert node.stop(signal.SIGTERM)[0] == 0
 
 

@@ -1,7 +1,7 @@
-"""Every fault into a live service: what the API says of it, what is recorded, how it recovers.
+"""Every fault against a live service: API answers, recording and recovery.
 
-Flights are synthetic: what is lost, cut and doubled, and in which order it arrives, hangs on the
-seed alone. So counts are exact where nothing else is said; only latencies hang on the machine.
+Flights are synthetic: loss, truncation, duplication and arrival order depend only on the seed.
+Counts are therefore exact unless stated otherwise; only latencies depend on the machine.
 """
 
 import re
@@ -50,11 +50,11 @@ BITES = 9
 
 @pytest.fixture(scope="module")
 def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
-    """All cases flown, at once."""
+    """All cases, flown at once."""
     return fly_all(CASES, tmp_path_factory.mktemp("faults"))
 
 
-# --- whatever the fault -------------------------------------------------------------------------
+# --- any fault ----------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -77,16 +77,16 @@ def test_the_recording_replays_to_the_same_and_holds_what_the_api_said(
     assert refused == done.rejected
     said = [(one.name, one.message) for one in done.recorded[schemas.LOG_TOPIC]]
     told = [(event["subject"], event["text"]) for event in done.events]
-    assert said[: len(told)] == told  # those after it were of the silence at the end
+    assert said[: len(told)] == told  # later ones are about the silence at the end
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_in_the_end_all_are_live_with_beams(flights: dict[str, Outcome], name: str) -> None:
     done = flights[name]
     flown = set(done.reports_flown) - {"5:1"}
-    flown -= {"1:1"} if name == "shared-id" else set()  # who that is, nobody knows
+    flown -= {"1:1"} if name == "shared-id" else set()  # the identity of this track is ambiguous
     assert len(done.moments) > 5
-    # One of the last: a machine that is busy elsewhere for 2 s makes tracks coast.
+    # One of the last moments: tracks coast if the machine is busy for 2 s.
     good = [
         moment
         for moment in done.moments[-4:]
@@ -108,14 +108,15 @@ def test_who_has_no_fault_loses_nothing(flights: dict[str, Outcome], name: str) 
             assert (heard[uav]["frames"], heard[uav]["gaps"]) == (frames[uav], 0), uav
     for uav in honest(done) - {"5:1"}:
         assert done.uavs[uav]["reports"] == done.reports_flown[uav], uav
-        assert set(done.uavs[uav]["rejected"]) <= {"no-position"}, uav  # what it relays by ADS-B
+        assert set(done.uavs[uav]["rejected"]) <= {"no-position"}, uav  # relayed by ADS-B
         states = {moment.uavs[uav]["state"] for moment in done.moments if uav in moment.uavs}
         assert states <= {"live", "coasting"}, uav  # coasting: the machine was busy elsewhere
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_no_bound_is_violated(flights: dict[str, Outcome], name: str) -> None:
-    """Against the flown truth. A delay is seen once GNSS tells of it: the bounds hold from then."""
+    """Against the flown truth. A delay is measured once GNSS time is available; bounds hold from
+    then."""
     done = flights[name]
     checked = 0
     for uav in done.last.uavs:
@@ -127,11 +128,11 @@ def test_no_bound_is_violated(flights: dict[str, Outcome], name: str) -> None:
     assert checked > 2 * len(done.last.uavs)
 
 
-# --- senders' faults ----------------------------------------------------------------------------
+# --- sender faults ------------------------------------------------------------------------------
 
 
 def test_a_drift_beyond_the_greatest_is_told(flights: dict[str, Outcome]) -> None:
-    """A clock that is 2.4 % slow looks like a link that slows; one that is fast hides nothing."""
+    """A clock 2.4 % slow looks like a link that slows down; a fast clock hides nothing."""
     done = flights["senders"]
     told = {one["subject"] for one in done.events if "clock stalled" in one["text"]}
     assert "1:1" in told or "6:1" in told
@@ -147,14 +148,14 @@ def test_a_reboot_is_said_once_and_the_track_begins_anew(flights: dict[str, Outc
     assert len(texts) == 1
     stepped = re.fullmatch(r"2:1 was restarted: its boot clock stepped back to (\S+) s", texts[0])
     assert stepped is not None, texts
-    assert 0.5 <= float(stepped[1]) < 2.0  # three stamps over half a second confirm it
+    assert 0.5 <= float(stepped[1]) < 2.0  # three timestamps over half a second confirm it
     unplaced = done.rejected["unplaced-stamp"]
     assert done.uavs["2:1"]["rejected"] == {"unplaced-stamp": unplaced}
     assert 2 <= unplaced <= 10
     since = [frame for frame in done.flown if is_report(frame, "2:1") and boot_s(frame) < 50.0]
     assert done.uavs["2:1"]["reports"] + unplaced == len(since)
     (link,) = done.links
-    # Back to 0 looks late; three in a row are a sender that starts again, and no gap.
+    # Sequence 0 looks late; three in a row indicate a restarted sender, not a gap.
     assert (link["late"], link["gaps"], link["repeats"]) == (3, 0, 0)
 
 
@@ -196,11 +197,11 @@ def test_a_glitch_is_refused_report_by_report(flights: dict[str, Outcome]) -> No
     assert _of_the_track(done.said("4:1")) <= {"4:1 is live", "4:1 is coasting", *unheard}
 
 
-# --- links' faults ------------------------------------------------------------------------------
+# --- link faults --------------------------------------------------------------------------------
 
 
 def test_what_is_lost_shows_as_gaps(flights: dict[str, Outcome]) -> None:
-    """But for what is lost before a sender's first frame, and after its last."""
+    """Except frames lost before a sender's first received frame and after its last."""
     done = flights["loss"]
     (link,) = done.links
     assert link["frames"] == done.sent["frames"] - sum(done.touched.values())
@@ -230,7 +231,7 @@ def test_what_comes_twice_counts_once(flights: dict[str, Outcome]) -> None:
 
 
 def _of_the_track(said: list[str]) -> set[str]:
-    """What was said, but for the verdicts on links: they are told of one or of several together."""
+    """Event texts without verdicts on links, which may concern one or several together."""
     return {text for text in said if not text.startswith("link")}
 
 
@@ -239,12 +240,12 @@ def test_a_delay_is_measured_where_gnss_tells_of_it(flights: dict[str, Outcome])
     for uav, late_s in {"1:1": 0.3, "2:1": 0.3, "3:1": 0.0, "4:1": 0.0}.items():
         clock = done.last.uavs[uav]["clock"]
         assert clock["kind"] == "gnss", uav
-        assert clock["uncertainty_s"] < GNSS_ERROR_S + 0.07  # and what the drift may be off
+        assert clock["uncertainty_s"] < GNSS_ERROR_S + 0.07  # plus the possible drift
         assert clock["constant_delay_s"] == pytest.approx(late_s, abs=clock["uncertainty_s"])
         entries = (one.uavs[uav] for one in done.moments if uav in one.uavs)
         known = [entry for entry in entries if entry["clock"]["kind"] == "gnss"]
         assert len(known) > 2
-        for entry in known[1:]:  # the newest report before the first may be of before it was known
+        for entry in known[1:]:  # the newest report may precede the first clock estimate
             assert entry["latency_s"] >= late_s - entry["clock"]["uncertainty_s"], uav
     (link,) = done.links
     assert link["frames"] == done.sent["frames"]
@@ -265,13 +266,13 @@ def test_the_first_of_two_jittery_links_counts(flights: dict[str, Outcome]) -> N
         assert reports["first_share"] == reports["first"] / total
         assert 0.3 < reports["first_share"] < 0.7  # equals
         assert 0.05 < reports["latency_p50_s"] < reports["latency_p95_s"]
-        assert reports["latency_p95_s"] < 1.0  # ten means: what the longest jitter is
+        assert reports["latency_p95_s"] < 1.0  # ten means: the longest jitter
     for uav, entry in done.uavs.items():
         assert entry["reports"] == done.reports_flown[uav], uav
 
 
 def test_a_burst_comes_late_and_is_all_used(flights: dict[str, Outcome]) -> None:
-    """Where a share of the frames waits for up to 1 s, that is how late the last 5 % are."""
+    """If a share of the frames waits for up to 1 s, the 95th percentile has that latency."""
     done = flights["burst"]
     (link,) = done.links
     struck = done.touched["burst"] / done.sent["frames"]
@@ -300,9 +301,9 @@ def test_what_is_overtaken_is_late_and_is_used(flights: dict[str, Outcome]) -> N
 def test_what_is_damaged_is_counted_and_costs_no_other(
     flights: dict[str, Outcome], name: str
 ) -> None:
-    """A struck frame is one bad checksum or unknown message; or garbage, where its magic byte or
-    flags are struck, or hardly more than these are left of it: few. Stray bytes of a cut frame
-    that look like a magic byte may begin one more: fewer still."""
+    """A damaged frame is a bad checksum or an unknown message; a few become garbage if their
+    magic byte or flags are hit or little else remains. Very rarely, bytes of a truncated
+    frame that look like a magic byte start one more."""
     done = flights[name]
     (link,) = done.links
     struck = sum(done.touched.values())
@@ -324,7 +325,7 @@ def test_what_is_damaged_is_counted_and_costs_no_other(
 
 
 def test_garbage_is_counted_in_bytes_and_costs_no_frame(flights: dict[str, Outcome]) -> None:
-    """But for bytes of it that a false start in it claims: a magic byte is one in 128."""
+    """Except garbage bytes claimed by a false header: one byte in 128 is a magic byte."""
     done = flights["garbage"]
     (link,) = done.links
     nothing_invented(done)
@@ -342,7 +343,7 @@ def test_garbage_is_counted_in_bytes_and_costs_no_frame(flights: dict[str, Outco
 
 
 def test_of_two_with_one_id_a_track_follows_one(flights: dict[str, Outcome]) -> None:
-    """They are 600 m apart: whoever it is, it is never the other, nor something between."""
+    """They are 600 m apart: the track stays on one of them, never on the other or in between."""
     done = flights["shared-id"]
     followed = {off_m.index(min(off_m)) for off_m, _ in done.errors_m("1:1")}
     assert len(followed) == 1
@@ -364,7 +365,7 @@ def test_adsb_traffic_is_tracked_apart_and_one_of_it_is_known(flights: dict[str,
     done = flights["adsb"]
     relayed = {uav: one for uav, one in done.last.uavs.items() if uav.startswith("icao:")}
     assert {"icao:F00001", "icao:F00002", "icao:F00006"} <= set(relayed)
-    assert "icao:F00005" not in relayed  # it never says how high it is
+    assert "icao:F00005" not in relayed  # it never sends its height
     assert relayed["icao:F00006"]["same_as"] == "3:1"
     assert {one["same_as"] for uav, one in relayed.items() if uav != "icao:F00006"} == {None}
     assert not any(one["target"] for one in relayed.values())
@@ -376,18 +377,18 @@ def test_adsb_traffic_is_tracked_apart_and_one_of_it_is_known(flights: dict[str,
     assert done.rejected["duplicate"] > 0
 
 
-# --- what was flown and what came ---------------------------------------------------------------
+# --- sent and received frames -------------------------------------------------------------------
 
 
 def honest(done: Outcome) -> set[str]:
-    """Who has no fault, the carrier 5:1 among them, where not everybody has it."""
+    """UAVs without faults, including the carrier 5:1 if a fault does not affect all."""
     if done.case.scenario == "shared-id":
         return set(done.reports_flown) - {"1:1"}
     return set(done.reports_flown) - done.case.struck
 
 
 def is_report(frame: Frame, uav: str | None = None) -> bool:
-    """Whether it is a GLOBAL_POSITION_INT, of a vehicle or of any."""
+    """Whether a frame is a GLOBAL_POSITION_INT, of the given vehicle or of any."""
     return frame.msgid == GLOBAL_POSITION_INT and uav in (None, str(frame.source))
 
 
@@ -397,7 +398,7 @@ def boot_s(report: Frame) -> float:
 
 
 def places(done: Outcome, uav: str) -> list[int]:
-    """The places in its sender's stream of a vehicle's frames, in the order in which they came."""
+    """Positions of the received frames in their sender's stream, in order of arrival."""
     sent = [frame.raw for frame in done.flown if str(frame.source) == uav]
     place = {raw: number for number, raw in enumerate(sent)}
     assert len(place) == len(sent)
@@ -405,17 +406,17 @@ def places(done: Outcome, uav: str) -> list[int]:
 
 
 def holes(done: Outcome, uav: str) -> int:
-    """Frames that are missing between a vehicle's first and its last that came."""
+    """Frames missing between a vehicle's first and last received frame."""
     came = places(done, uav)
     return max(came) - min(came) + 1 - len(came)
 
 
 def overtaken_frames(done: Outcome, uav: str) -> int:
-    """Frames of a vehicle that came after a later one."""
+    """Frames of a vehicle that arrived after a later one."""
     came = places(done, uav)
     return sum(number < max(came[:at], default=0) for at, number in enumerate(came))
 
 
 def nothing_invented(done: Outcome) -> None:
-    """Every frame that was taken for one was sent, and came once."""
+    """Every accepted frame was sent, and accepted once."""
     assert Counter(one.raw for one in done.received) <= Counter(one.raw for one in done.flown)

@@ -1,4 +1,5 @@
-"""Three nodes, real processes over real Zenoh: who serves, who is heard, who lies, who dies."""
+"""Three nodes as real processes over real Zenoh: allocation, reception, false nodes, node
+failure."""
 
 import asyncio
 import json
@@ -28,7 +29,7 @@ UAVS = 6
 
 @dataclass(kw_only=True)
 class Fleet:
-    """The nodes, what they hear, and every answer that was held against the truth."""
+    """The nodes, what each UAV receives, and every answer checked against the truth."""
 
     nodes: dict[str, Node]
     sky: FleetSky
@@ -38,7 +39,7 @@ class Fleet:
     over: threading.Event = field(default_factory=threading.Event)
 
     def watch(self) -> None:
-        """Hold every position of every living node against the truth until it is over."""
+        """Check every position of every living node against the truth until the end of the run."""
         while not self.over.is_set():
             for name, node in list(self.nodes.items()):
                 if node.process.poll() is None:
@@ -49,7 +50,7 @@ class Fleet:
         try:
             answer = node.json("/v1/uavs")
         except OSError:
-            return  # it died meanwhile
+            return  # the node stopped meanwhile
         utc_s = datetime.fromisoformat(answer["valid_at"]).timestamp()
         utc_s -= AHEAD_S if name == "c" else 0.0
         for uav in answer["uavs"]:
@@ -62,7 +63,7 @@ class Fleet:
                 self.broken.append(f"{name} {uav['id']} {error_m:.2f} > {uav['bound_m']:.2f}")
 
     def served_by(self, *names: str) -> dict[str, set[str]]:
-        """Nodes that say of themselves that they serve each UAV."""
+        """The nodes that report serving each UAV."""
         found: dict[str, set[str]] = {uav: set() for uav in self.sky.names}
         for name in names or self.nodes:
             for uav in self.nodes[name].json("/v1/fleet")["uavs"]:
@@ -71,11 +72,11 @@ class Fleet:
         return found
 
     def until(self, what: Any, seconds: float = HANG_S) -> None:
-        """Wait until something holds."""
+        """Wait until the condition holds."""
         limit = time.monotonic() + seconds
         while not what():
             assert time.monotonic() < limit, self.served_by()
-            time.sleep(0.05)  # between two questions to other processes
+            time.sleep(0.05)  # between two requests to other processes
 
 
 AHEAD_S = 3.0
@@ -133,7 +134,7 @@ def test_every_uav_has_one_node(fleet: Fleet) -> None:
         by = list(fleet.served_by().values())
         return all(len(one) == 1 for one in by) and len(set.union(*by)) >= 2
 
-    fleet.until(shared)  # whoever was there first hands over what others are better for
+    fleet.until(shared)  # the first node hands over UAVs that others serve better
     by = fleet.served_by()
     answer = fleet.nodes["a"].json("/v1/fleet")
     assert [node["node"] for node in answer["nodes"]] == ["a", "b", "c"]
@@ -180,7 +181,7 @@ def test_who_is_silent_here_and_heard_there_keeps_a_small_bound(fleet: Fleet) ->
 
 
 def test_a_node_that_invents_vehicles_is_put_aside(fleet: Fleet) -> None:
-    """It speaks Zenoh like a node, and tells of vehicles that are not there."""
+    """It speaks Zenoh like a node, and reports vehicles that do not exist."""
 
     async def lie() -> None:
         loop = asyncio.get_running_loop()
@@ -208,7 +209,7 @@ def test_a_node_that_invents_vehicles_is_put_aside(fleet: Fleet) -> None:
 
 
 def test_a_node_that_is_killed_is_followed(fleet: Fleet) -> None:
-    """Last but one: nothing of it is there afterwards."""
+    """Runs second to last: the killed node is not restarted."""
     fleet.until(lambda: all(len(by) == 1 for by in fleet.served_by().values()))
     by = fleet.served_by()
     victim = max(NAMES, key=lambda name: sum(name in one for one in by.values()))
@@ -225,7 +226,7 @@ def test_no_bound_was_broken_all_the_while(fleet: Fleet) -> None:
 
 
 def _put_aside(fleet: Fleet) -> bool:
-    """Whether every node has put the liar aside."""
+    """Whether every node has excluded the false node."""
     answers = [node.json("/v1/fleet")["nodes"] for node in fleet.nodes.values()]
     return all(
         any(one["node"] == "liar" and one["state"] == "aside" for one in nodes) for nodes in answers

@@ -1,4 +1,4 @@
-"""Three live nodes over a network that delays, loses and parts: namespaces and TUN devices."""
+"""Three live nodes over a network with delay, loss and partitions: namespaces and TUN devices."""
 
 import json
 import os
@@ -16,7 +16,7 @@ PARTED_S = 30.0
 
 @pytest.fixture(scope="module")
 def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """Ten UAVs over 20 ms and 2 % loss each way, and 30 s in which one node is cut off."""
+    """Ten UAVs over 20 ms delay and 2 % loss each way, with one node cut off for 30 s."""
     try:
         given = ("unshare", "--net", "test", "-w", "/dev/net/tun")
         subprocess.run(given, check=True, capture_output=True, timeout=HANG_S)
@@ -40,11 +40,11 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 
 
 def test_nobody_is_unserved_whole_or_parted_and_it_heals(seen: dict[str, Any]) -> None:
-    """How long that takes is said in docs/fleet.md; a fleet that does not heal fails the flight."""
+    """Healing times are in docs/fleet.md; a fleet that does not heal fails the run."""
     for when in ("whole", "parted"):
         assert sum(seen[when].values()) > 50
         assert seen[when]["none"] == 0
-    assert seen["parted"]["twice"] > seen["parted"]["once"]  # the partition was one
+    assert seen["parted"]["twice"] > seen["parted"]["once"]  # the partition took effect
 
 
 def test_no_bound_was_broken(seen: dict[str, Any]) -> None:

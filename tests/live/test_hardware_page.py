@@ -1,4 +1,4 @@
-"""The page onto hardware: its ten lines are run, each device a stand-in, on one service."""
+"""The hardware page of the docs: its ten commands run against simulated devices and one service."""
 
 import importlib.util
 import json
@@ -53,7 +53,7 @@ Check = Callable[[subprocess.CompletedProcess[str], dict[str, Any]], None]
 
 @contextmanager
 def rotator(words: list[str]) -> Iterator[tuple[str, Check]]:
-    """Hamlib's own dummy: it has left its rest."""
+    """Hamlib's dummy rotator: it has left its rest position."""
     with dummy_rotator() as port:
 
         def check(done: subprocess.CompletedProcess[str], told: dict[str, Any]) -> None:
@@ -66,7 +66,7 @@ def rotator(words: list[str]) -> Iterator[tuple[str, Check]]:
 
 @contextmanager
 def gimbal(words: list[str]) -> Iterator[tuple[str, Check]]:
-    """A port that hears what pymavlink reads."""
+    """A port that receives frames with pymavlink."""
     kind = words[2].split(":")[0]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as heard:
         heard.bind(("127.0.0.1", 0))
@@ -92,7 +92,7 @@ def gimbal(words: list[str]) -> Iterator[tuple[str, Check]]:
 
 @contextmanager
 def phaser(words: list[str]) -> Iterator[tuple[str, Check]]:
-    """Analog Devices' own class over a libiio that notes what is written."""
+    """Analog Devices' own class over a libiio stub that records writes."""
     if importlib.util.find_spec("adi") is None:
         pytest.skip("no pyadi-iio")
 
@@ -103,7 +103,7 @@ def phaser(words: list[str]) -> Iterator[tuple[str, Check]]:
             assert len(re.findall(r"^\d:1: element:phase/gain 0:\d+", done.stdout, re.M)) > 3
             return
         (updates,) = re.findall(r"^(\d+) updates", done.stdout, re.M)
-        assert written["rx_load_spi"] == 2 * int(updates) + 2  # and once at the beginning
+        assert written["rx_load_spi"] == 2 * int(updates) + 2  # and once at the start
         if words[2].startswith("phaser-memory"):
             assert written["beam_pos_save"] == 8 * (8 + 2)
             assert written["beam_pos_load"] >= 8
@@ -117,7 +117,7 @@ def phaser(words: list[str]) -> Iterator[tuple[str, Check]]:
 
 @contextmanager
 def chips(words: list[str]) -> Iterator[tuple[str, Check]]:
-    """Two chips that decode their registers, silenced at the end."""
+    """Two chips that decode their registers, switched off at the end."""
 
     def check(done: subprocess.CompletedProcess[str], told: dict[str, Any]) -> None:
         assert words[-2:] == ["--on-stale", "mute"]

@@ -1,4 +1,4 @@
-"""Every kind of link into a live service: signed, serial, several at once, gone and back."""
+"""Every kind of link of a live service: signed, serial, several at once, lost and restored."""
 
 import json
 import os
@@ -32,7 +32,7 @@ def report(boot_ms: int, sysid: int = 1) -> Any:
 
 
 class Sender:
-    """Frames over UDP, signed or not, one every 50 ms of its boot clock."""
+    """Frames over UDP, signed or unsigned, one per 50 ms of its boot clock."""
 
     def __init__(self, port: int, sysid: int, key: bytes | None = None) -> None:
         self.mav = dialect.MAVLink(None, sysid, 1)
@@ -54,7 +54,7 @@ class Sender:
 
     def send(self, raw: bytes) -> bytes:
         self._socket.send(raw)
-        time.sleep(0.002)  # so that each comes as a datagram of its own time
+        time.sleep(0.002)  # so that each arrives as a separate datagram with its own time
         return raw
 
     def __enter__(self) -> "Sender":
@@ -70,7 +70,7 @@ def rejected(node: Any) -> dict[str, int]:
 
 
 def test_signatures_are_checked_and_a_restart_remembers(start_node: Any, tmp_path: Path) -> None:
-    """Right key, wrong key, no signature, a frame played again, MAVLink 1 in between, restart."""
+    """Right key, wrong key, no signature, a replayed frame, MAVLink 1 in between, restart."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -117,7 +117,7 @@ def test_signatures_are_checked_and_a_restart_remembers(start_node: Any, tmp_pat
         right.send(last)
         third.wait_until("/v1/status", lambda s: s["rejected"].get("replayed") == 1)
         end = time.monotonic() + 15
-        while third.json("/v1/status")["frames"] == 0:  # refused until newer than what may be lost
+        while third.json("/v1/status")["frames"] == 0:  # rejected until newer than lost ones
             assert time.monotonic() < end
             right.send(right.frame())
             right.mav.signing.timestamp = round((time.time() - 1_420_070_400) * 1e5)
@@ -144,7 +144,7 @@ def test_a_key_that_is_none_is_told_at_the_start(tmp_path: Path) -> None:
 
 
 def test_timestamps_that_cannot_be_kept_cost_no_recording(start_node: Any, tmp_path: Path) -> None:
-    """The folder of signing timestamps vanishes in the air: said, and the recording ends whole."""
+    """The signing timestamp folder disappears: this is reported, and the recording is complete."""
     (tmp_path / "radio.key").write_bytes(KEY)
     kept = tmp_path / "kept"
     settings = tmp_path / "settings.toml"
@@ -182,7 +182,7 @@ def pty() -> Iterator[tuple[int, str]]:
 
 
 def test_a_serial_line(start_node: Any, pty: tuple[int, str]) -> None:
-    """Split anywhere, with noise before it."""
+    """Frames split at arbitrary bytes, with noise before them."""
     far, device = pty
     node = start_node("run", "--link", UDP, "--link", f"serial:{device}:57600", *HTTP)
     node.wait_until("/v1/status", lambda s: s["links"][1]["state"] == "up")
@@ -211,7 +211,7 @@ def test_a_peer_that_goes_and_returns_is_told_once_each(start_node: Any) -> None
             node.wait_until("/v1/status", lambda s: s["links"][1]["state"] == "connecting")
             reasons = json.loads(node.get("/readyz")[1])["reasons"]
             assert "no link is up" not in reasons
-            time.sleep(1.5)  # some tries that fail
+            time.sleep(1.5)  # some failed attempts
             with socket.create_server(("127.0.0.1", port)) as back:
                 peer, _ = back.accept()
                 with peer:
@@ -253,6 +253,6 @@ def test_killed_and_started_again_tracks_are_live_after_two_reports(
     again.wait_until("/v1/status", lambda s: s["frames"] == 16)
     assert again.stop()[0] == 0
     finished = sorted(tmp_path.glob("*.mcap"))
-    assert len(finished) == 2  # what the killed one left was recovered
+    assert len(finished) == 2  # the file of the killed service was recovered
     assert not list(tmp_path.glob("*.active"))
     assert sum(1 for event in read_log(finished[1]) if type(event).__name__ == "Frame") == 16

@@ -22,7 +22,7 @@ ASKED_EVERY_S = 0.02
 
 
 class Watch:
-    """Asks ``/healthz`` all the time, and keeps how long the answers took."""
+    """Request ``/healthz`` continuously and record the response times."""
 
     def __init__(self, url: str) -> None:
         self.took_s: list[float] = []
@@ -47,7 +47,7 @@ class Watch:
 
 
 def load(node: Any, seconds: float) -> int:
-    """Send; returns how many frames."""
+    """Send frames; return their number."""
     sender = [sys.executable, str(ROOT / "tests" / "load_sender.py")]
     numbers = [node.udp_port, SENDERS, FRAMES_HZ, seconds]
     done = subprocess.run(
@@ -63,7 +63,7 @@ def load(node: Any, seconds: float) -> int:
 
 
 def heard(node: Any, frames: int) -> Any:
-    """The status once all is read that was sent, or when that does not become true."""
+    """The status once all sent frames are read, or at the timeout."""
     end = time.monotonic() + 5
     while (status := node.json("/v1/status"))["frames"] < frames and time.monotonic() < end:
         time.sleep(0.05)
@@ -93,7 +93,7 @@ def test_no_frame_of_a_busy_sky_is_lost(start_node: Any, tmp_path: Path) -> None
 def test_half_a_minute_of_it_and_the_service_stays_at_hand(
     start_node: Any, tmp_path: Path, recorded: bool, figures: Figures
 ) -> None:
-    """The limit of 50 ms is the product's own; it is of a machine with two cores."""
+    """The limit of 50 ms is the product's own, on a machine with two cores."""
     node = start_node(*RUN, *CENTER, *(["--record", str(tmp_path)] if recorded else []))
     with Watch(node.url) as watch:
         sent = load(node, 30.0)

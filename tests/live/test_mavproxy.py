@@ -1,4 +1,4 @@
-"""MAVProxy, as it comes from its makers, routes between the vehicles and the service."""
+"""An unmodified MAVProxy routes between the vehicles and the service."""
 
 import json
 import socket
@@ -24,7 +24,7 @@ def free_port(kind: socket.SocketKind) -> int:
 
 @pytest.fixture
 def router(tmp_path: Path) -> Iterator[Router]:
-    """Starts MAVProxy with a master and outputs, its files in a folder of its own."""
+    """Start MAVProxy with a master and outputs, in its own folder."""
     started: list[subprocess.Popen[bytes]] = []
 
     def start(master: str, *outputs: str) -> None:
@@ -49,7 +49,7 @@ def router(tmp_path: Path) -> Iterator[Router]:
 
 @pytest.fixture
 def fly() -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
-    """Starts ``sitl-replay fly``."""
+    """Start ``sitl-replay fly``."""
     started: list[subprocess.Popen[str]] = []
 
     def start(scenario: str, to: str, seconds: float) -> "subprocess.Popen[str]":
@@ -65,7 +65,7 @@ def fly() -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
 def test_over_datagrams_and_over_a_connection_at_once(
     start_node: Any, router: Router, fly: Any, tmp_path: Path
 ) -> None:
-    """Both outputs of the router lead to the service: every report comes twice, and counts once."""
+    """Both router outputs lead to the service: every report arrives twice and counts once."""
     master, out = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
     node = start_node(
         "run", "--link", "udpin:127.0.0.1:0", "--link", f"tcp:127.0.0.1:{out}",
@@ -106,7 +106,7 @@ def test_over_datagrams_and_over_a_connection_at_once(
 def test_what_the_service_says_reaches_the_vehicle_and_its_answer_the_service(
     start_node: Any, router: Router, tmp_path: Path
 ) -> None:
-    """The request for a rate, its acknowledgement and TIMESYNC, there and back through a router."""
+    """A rate request, its acknowledgement and TIMESYNC, both ways through a router."""
     master = free_port(socket.SOCK_DGRAM)
     settings = tmp_path / "settings.toml"
     settings.write_text(

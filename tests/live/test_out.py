@@ -1,4 +1,4 @@
-"""What goes on to others, over real sockets: steady and never backwards, however late it came."""
+"""Output to other programs over real sockets: steady and never backwards, whatever the delay."""
 
 import json
 import math
@@ -34,7 +34,7 @@ def bound() -> socket.socket:
 
 
 def flown(log: Path, seconds: float) -> dict[int, Any]:
-    """A flight written to a log; by system, what each report of it said: boot time, place."""
+    """Write a flight to a log; return boot time and position of each report by system."""
     mav: Any = dialect.MAVLink(None)
     reports: dict[int, list[tuple[float, ...]]] = defaultdict(list)
     with TlogWriter(log) as writer:
@@ -55,8 +55,8 @@ def test_packets_that_are_ten_seconds_late_take_nobody_back(
 ) -> None:
     """The same traffic over two links, one of them ten seconds late (mavlink-router, issue 457).
 
-    Whoever passes on what comes in sends every vehicle back by ten seconds at each late packet.
-    Here each is where the log has it at the time that is said of it.
+    Forwarding every packet would move each vehicle back by ten seconds at each late one. The output
+    matches the logged position at its stated time.
     """
     truth = flown(tmp_path / "flight.tlog", 25.0)
     heard: dict[int, list[tuple[float, Any]]] = defaultdict(list)
@@ -84,7 +84,7 @@ def test_packets_that_are_ten_seconds_late_take_nobody_back(
                 end(process)
         late = [link["reports"] for link in node.json("/v1/links")["links"]]
         node.stop()
-    assert late[1]["latency_p50_s"] == pytest.approx(10, abs=1)  # they came, and that late
+    assert late[1]["latency_p50_s"] == pytest.approx(10, abs=1)  # they arrived, with that delay
     assert len(heard) >= 3
     for sysid, said in heard.items():
         stamps = np.array([one.time_boot_ms for _, one in said])
@@ -106,7 +106,7 @@ def test_packets_that_are_ten_seconds_late_take_nobody_back(
 
 
 def test_events_go_out_as_xml_that_takproto_reads(start_node: Any, tmp_path: Path) -> None:
-    """To a datagram's peer and over a connection; a stop ends it, and --silent sends nothing."""
+    """Over UDP and TCP; a stop ends the output, and --silent sends nothing."""
     with bound() as far_end, socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(HANG_S)
         config = tmp_path / "config.toml"

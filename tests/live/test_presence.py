@@ -1,4 +1,4 @@
-"""The service among others: pymavlink's own connections hear it, answer it, and miss it."""
+"""The service as a MAVLink component: pymavlink connections receive, answer and miss it."""
 
 import time
 from collections import Counter
@@ -48,18 +48,18 @@ def test_it_beats_asks_and_is_acknowledged(start_node: Any, settings: str, tmp_p
 
         node.wait_until("/v1/links", in_order, 40.0)
         assert carrier.rates_hz == {33: 10.0, 30: 20.0}
-        assert uav.rates_hz == {33: 10.0, 30: 1.0}  # nobody needs its attitude
+        assert uav.rates_hz == {33: 10.0, 30: 1.0}  # its attitude is not needed
 
         seen = node.wait_until("/v1/uavs/1:1", lambda u: u["clock"]["kind"] == "timesync")
         assert seen["clock"]["uncertainty_s"] < 0.05
         asked_of = Counter(m.get_type() for _, m in carrier.heard)
-        assert asked_of["COMMAND_LONG"] <= 4  # once for each message, and little more
+        assert asked_of["COMMAND_LONG"] <= 4  # one request per message, with few repeats
         assert {m.get_srcSystem() for _, m in uav.heard} == {5}  # never a ground station's 255
 
         carrier.silent = True
         node.wait_until("/readyz", lambda answer: not answer["ready"])
         last_s = time.monotonic()
-        time.sleep(3.0)  # it is what is not there that is looked for
+        time.sleep(3.0)  # checks for the absence of messages
         assert not [m for t_s, m in uav.heard if t_s > last_s + 0.3 and is_heartbeat(m)]
         carrier.silent = False
         uav.wait_for(is_heartbeat)
@@ -74,5 +74,5 @@ def test_it_says_nothing_unless_it_is_allowed_to(start_node: Any, settings: str,
     address = f"udpout:127.0.0.1:{node.udp_port}"
     with Vehicle(address, 5, 10.0, 10.0) as carrier, Vehicle(address, 1, 10.0, 1.0) as uav:
         node.wait_until("/readyz", lambda answer: answer["ready"])
-        time.sleep(2.5)  # time enough for heartbeats, if there were any
+        time.sleep(2.5)  # long enough for heartbeats, if any were sent
         assert carrier.heard == uav.heard == []

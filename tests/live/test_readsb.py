@@ -1,4 +1,4 @@
-"""readsb on a link, by its Beast port and by its web server: shown, recorded, replayed alike."""
+"""readsb links, by Beast port and by web server: shown, recorded, and replayed identically."""
 
 import http.server
 import json
@@ -17,7 +17,7 @@ ODD = b"\x1a3\0\0\0\0\0\0\x80" + bytes.fromhex("8D40621D58C386435CC412692AD6")
 
 
 def same_digest(recording: Path) -> dict[str, Any]:
-    """The summary of the recording's replay, which has the digest that was recorded."""
+    """The replay summary of a recording, with the recorded digest."""
     done = subprocess.run(
         [BIN / "companion", "replay", recording, "--no-record", "--json"],
         capture_output=True, text=True, check=False, timeout=HANG_S,
@@ -40,7 +40,7 @@ def test_a_beast_stream_is_heard_and_replays_alike(start_node: Any, tmp_path: Pa
             (seen,) = node.wait_until("/v1/uavs", lambda answer: answer["uavs"])["uavs"]
             status, _, errors = node.stop()
             receiver.settimeout(HANG_S)
-            assert receiver.recv(1) == b""  # nothing was ever sent to it
+            assert receiver.recv(1) == b""  # the service sent nothing to it
     assert status == 0, errors
     assert seen["id"] == "icao:40621D"
     summary = same_digest(next(tmp_path.glob("*.mcap")))
@@ -50,7 +50,7 @@ def test_a_beast_stream_is_heard_and_replays_alike(start_node: Any, tmp_path: Pa
 
 @pytest.fixture
 def web() -> Iterator[tuple[str, dict[str, Any]]]:
-    """A web server whose aircraft.json is that of the dictionary, and its URL."""
+    """A web server whose aircraft.json is the dictionary, and its URL."""
     answer: dict[str, Any] = {}
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -62,7 +62,7 @@ def web() -> Iterator[tuple[str, dict[str, Any]]]:
             self.wfile.write(body)
 
         def log_message(self, *_: Any) -> None:
-            """Say nothing."""
+            """Suppress the log output."""
 
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler) as server:
         thread = threading.Thread(target=server.serve_forever, args=(0.05,))

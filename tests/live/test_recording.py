@@ -1,4 +1,4 @@
-"""Recordings of the live service: killed, cut into parts, out of room, read by other programs."""
+"""Recordings of the live service: killed, split into parts, removed folder, other readers."""
 
 import json
 import random
@@ -26,7 +26,7 @@ FRAMES_HZ = 400
 
 
 def send(node: Node, seconds: float) -> "subprocess.Popen[str]":
-    """Steady traffic from vehicles that hover."""
+    """Steady traffic from hovering vehicles."""
     sender = [sys.executable, ROOT / "tests" / "load_sender.py"]
     numbers = (node.udp_port, SENDERS, FRAMES_HZ, seconds)
     command = [*sender, *map(str, numbers)]
@@ -34,7 +34,7 @@ def send(node: Node, seconds: float) -> "subprocess.Popen[str]":
 
 
 def replayed(*logs: Path) -> dict[str, Any]:
-    """What ``companion replay`` says of logs."""
+    """The JSON output of ``companion replay`` for the given logs."""
     command = [BIN / "companion", "replay", *logs, "--no-record", "--json"]
     answer: dict[str, Any] = json.loads(
         subprocess.run(command, check=True, stdout=-1, timeout=HANG_S).stdout
@@ -43,13 +43,13 @@ def replayed(*logs: Path) -> dict[str, Any]:
 
 
 def killed_while_recording(folder: Path, seconds: float) -> float:
-    """Kill a service under traffic at some moment; so many seconds before that are lost."""
+    """Kill a service under traffic at some time; return the seconds of traffic lost before that."""
     node = Node(*RUN, "--record", str(folder))
     flight = send(node, seconds + 60)
     try:
         node.wait_until("/v1/status", lambda answer: answer["recording"]["messages"] > 0)
         begun_ns = time.time_ns()
-        time.sleep(seconds)  # the moment is the point
+        time.sleep(seconds)  # a random time
         killed_ns = time.time_ns()
         node.process.send_signal(signal.SIGKILL)
     finally:
@@ -60,7 +60,7 @@ def killed_while_recording(folder: Path, seconds: float) -> float:
     (found,) = recover_leftovers(folder)
     assert isinstance(found, Recovered)
     assert list(read_parts([found.path])) == before
-    if before:  # killed later than after a second
+    if before:  # killed more than a second after the start
         summary = replay([found.path], settings_for([found.path], None, None))
         assert summary["frames"] == sum(isinstance(event, Frame) for event in before) > 0
         assert summary["missing"] == []
@@ -68,8 +68,8 @@ def killed_while_recording(folder: Path, seconds: float) -> float:
 
 
 def kills(folder: Path, count: int, at_once: int, longest_s: float) -> list[float]:
-    """So many services, each killed at a moment of its own: a second is between two flushes, and
-    writing and a busy machine take some time."""
+    """Kill many services at different times: a flush interval is one second, plus write time and
+    delays of a busy machine."""
     rng = random.Random(6)
     moments = [rng.uniform(0.1, longest_s) for _ in range(count)]
     with ThreadPoolExecutor(at_once) as pool:
@@ -125,7 +125,7 @@ def test_a_folder_taken_away_does_not_stop_the_beams(start_node: Any, tmp_path: 
     with send(node, 20) as flight:
         node.wait_until("/v1/status", lambda answer: answer["recording"]["bytes"] > 20_000)
         shutil.rmtree(kept)
-        kept.touch()  # nor can it be made again
+        kept.touch()  # nor can it be created again
         node.wait_until("/v1/status", lambda answer: answer["recording"]["state"] == "degraded")
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == SENDERS - 1)
         beams = node.json("/v1/beams")

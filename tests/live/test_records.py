@@ -1,4 +1,4 @@
-"""Records for machines from a running service: over UDP, and in shared memory by the example."""
+"""Binary records from a running service: over UDP, and in shared memory by the example."""
 
 import itertools
 import json
@@ -62,13 +62,13 @@ def test_records_come_with_each_update_and_hold_what_the_api_says(
             count, last = len(streamed), max(streamed)
             while sequence(body) < last:
                 body = heard.recv(1 << 16)
-                assert streamed.pop(sequence(body), body) == body  # the same, byte for byte
-            assert len(streamed) < count  # either way may have left some out
+                assert streamed.pop(sequence(body), body) == body  # identical, byte for byte
+            assert len(streamed) < count  # either path may have skipped some
             node.stop()
             said = process.communicate(timeout=HANG_S)[0]
     assert [name.decode() for name in beams["uav"]] == [one["uav"] for one in told["beams"]]
     for one, beam in zip(told["beams"], beams, strict=True):
-        assert abs(one["gain_db"] - beam["gain_db"]) < 3.0  # of another moment
+        assert abs(one["gain_db"] - beam["gain_db"]) < 3.0  # of another update
         if not np.isnan(beam["guaranteed_gain_db"]):
             assert beam["guaranteed_gain_db"] <= beam["gain_db"] + 1e-9
     count, lost = re.findall(r"(\d+) records, (\d+) lost", said)[0]
@@ -90,4 +90,4 @@ def test_nobody_who_listens_is_told_once_and_ends_nothing(start_node: Any, tmp_p
 
     assert "refused" in json.dumps(told(node.wait_until("/v1/events", told)))
     node.wait_until("/v1/status", lambda answer: answer["uptime_s"] > 1)
-    assert len(told(node.json("/v1/events"))) == 1  # not at each datagram
+    assert len(told(node.json("/v1/events"))) == 1  # not for each datagram

@@ -1,4 +1,4 @@
-"""A Remote ID receiver's datagrams on a link: shown, recorded, and replayed to the same digest."""
+"""Remote ID datagrams on a link: shown, recorded, and replayed to the same digest."""
 
 import json
 import socket

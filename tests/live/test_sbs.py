@@ -32,7 +32,7 @@ def test_a_receiver_is_heard_and_replays_alike(start_node: Any, tmp_path: Path) 
             links = node.json("/v1/links")["links"]
             status, _, errors = node.stop()
             receiver.settimeout(HANG_S)
-            assert receiver.recv(1) == b""  # nothing was ever sent to it
+            assert receiver.recv(1) == b""  # the service sent nothing to it
     assert status == 0, errors
     assert (seen["id"], seen["alt_m"] > 11_000) == ("icao:4CA2D6", True)
     (link,) = [one for one in links if one["url"] == url]

@@ -1,7 +1,7 @@
-"""Clocks that run slow for seconds, on a busy machine: what is said of them, and of the bounds.
+"""Clocks that run slow for seconds on a busy machine: reported times and bounds.
 
-A simulator that is short of time does this: its clock stands behind the world's, and where it flies
-is by its own clock. Round trips hold the clock on both sides, however busy the machine is.
+An overloaded simulator behaves like this: its clock falls behind real time, and its motion follows
+its own clock. Round trips bound the clock on both sides, however busy the machine is.
 """
 
 import contextlib
@@ -32,7 +32,8 @@ SPIN: Final = "while True: pass"
 
 
 class SlowClock:
-    """A boot clock that is slow by ``SLOW`` for 5 s of every 15, and as much too fast for the next.
+    """A boot clock slow by ``SLOW`` for 5 s of every 15, and fast by the same rate for the next 5
+    s.
 
     ``begin_s`` is a time of ``time.monotonic``.
     """
@@ -51,9 +52,9 @@ class SlowClock:
 
 
 def bounds_of(recording: Path, clocks: dict[str, SlowClock], epoch_s: float) -> dict[str, Any]:
-    """Errors over bounds, bounds and uncertainties of a recording, as they were said live.
+    """Error-to-bound ratios, bounds and uncertainties of a recording, as published live.
 
-    ``epoch_s`` is Unix time less ``time.monotonic``.
+    ``epoch_s`` is Unix time minus ``time.monotonic``.
     """
     pipeline = Pipeline(SETTINGS)
     found: dict[str, Any] = {"ratios": [], "bounds_m": [], "clocks_s": [], "trips": 0}
@@ -94,7 +95,7 @@ def test_clocks_that_run_slow_for_seconds_break_no_bound(
         address = f"udpout:127.0.0.1:{node.udp_port}"
         for uav in UAVS:
             stack.enter_context(Vehicle(address, uav, 10.0, 1.0, clocks[f"{uav}:1"]))
-        time.sleep(60.0)  # four turns of the clocks
+        time.sleep(60.0)  # four cycles of the clocks
         node.stop()
     (recording,) = (tmp_path / "rec").glob("*.mcap")
     found = bounds_of(recording, clocks, epoch_s)

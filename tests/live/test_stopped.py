@@ -1,4 +1,4 @@
-"""The whole service is stopped for a while, as by a debugger or a machine that sleeps."""
+"""The whole service is suspended for a while, as by a debugger or a sleeping machine."""
 
 import signal
 import subprocess
@@ -19,7 +19,7 @@ FRAMES_HZ = 400
 
 @pytest.mark.full
 def test_a_service_that_was_stopped_goes_on_within_seconds(start_node: Any, tmp_path: Path) -> None:
-    """Traffic goes on meanwhile; what waits too long is let go, and counted."""
+    """Traffic continues meanwhile; messages that wait too long are discarded and counted."""
     node = start_node(*RUN, "--record", str(tmp_path))
     sender = [sys.executable, ROOT / "tests" / "load_sender.py"]
     command = [*map(str, sender), str(node.udp_port), "4", str(FRAMES_HZ), "600"]
@@ -28,7 +28,7 @@ def test_a_service_that_was_stopped_goes_on_within_seconds(start_node: Any, tmp_
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 3)
         before = node.json("/v1/links")["links"][0]
         node.process.send_signal(signal.SIGSTOP)
-        time.sleep(STOPPED_S)  # how long it is stopped is the point
+        time.sleep(STOPPED_S)  # suspended for this long
         node.process.send_signal(signal.SIGCONT)
         begun_s = time.monotonic()
         node.wait_until(

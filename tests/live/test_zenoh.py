@@ -1,4 +1,4 @@
-"""A flight that comes over Zenoh: tracked as over any other link."""
+"""A flight received over Zenoh is tracked as over any other link."""
 
 import subprocess
 from typing import Any

@@ -251,6 +251,4 @@ def test_the_drone_scenario_on_blocks() -> None:
     assert plain["top_3"] == pytest.approx(78.2, abs=0.7)
     assert ours["top_1"] > 48 and ours["top_3"] > 87 and ours["top_5"] > 95
     assert ours["set_size_mean"] < 8 and ours["set_coverage"] > 0.99
-    assert (
-        rows["shuffled", "nearest neighbours"]["top_1"] > near["top_1"] + 5
-    )  # leakage
+    assert rows["shuffled", "nearest neighbours"]["top_1"] > near["top_1"] + 5  # leakage

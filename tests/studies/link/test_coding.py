@@ -71,7 +71,7 @@ def test_the_decoder_is_brute_force() -> None:
 
 
 def by_commpy(soft: FloatArray, trellis: Trellis, bits: int) -> BoolArray:
-    """commpy assumes no final state 0, unless known zeros follow."""
+    """Decode with commpy; certain zeros are appended so that it ends in state 0."""
     certain = np.full(3 * 10, -1e3)
     heard = np.concatenate([-soft, certain])
     found = viterbi_decode(heard, trellis, len(heard) // 3, decoding_type="unquantized")

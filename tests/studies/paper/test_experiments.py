@@ -84,9 +84,7 @@ def test_what_the_text_says_in_passing_is_held_to_numbers(answer: dict[str, Any]
         gain = answer["levels"][name]["gain"]
         least_s = abs(0.5 * gain - 0.15) / math.sqrt(0.5 * (1 - (1 - gain) ** 2 / 0.5))
         assert answer["levels"][name]["gamma_s"] == pytest.approx(least_s)
-        assert (
-            1 < gamma_s / least_s < 3
-        )  # published bound: up to 3 times larger
+        assert 1 < gamma_s / least_s < 3  # published bound: up to 3 times larger
     gains = [answer["alphas"][alpha]["gain"] for alpha in ("0.5", "0.1", "0.01")]
     errors = [answer["alphas"][alpha]["error_sup_m"] for alpha in ("0.5", "0.1", "0.01")]
     assert gains == sorted(gains, reverse=True) and errors == sorted(errors, reverse=True)

@@ -50,7 +50,7 @@ def most_db(width: float, elements: int) -> float:
 
 
 @pytest.mark.parametrize("elements", [16, 64, 256])
-def test_shapes_of_lines_against_free_amplitudes(elements: int) -> None:
+def test_linear_array_beam_shapes_against_free_amplitudes(elements: int) -> None:
     across = shapes.aperture(
         uniform_linear(elements, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
     )
@@ -88,7 +88,7 @@ def climbed(phases: FloatArray, response: ComplexArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("elements", [8, 16])
-def test_shapes_of_planes_against_a_search(elements: int) -> None:
+def test_planar_array_beam_shapes_against_a_search(elements: int) -> None:
     across = shapes.aperture(
         uniform_rectangular(
             elements,
@@ -225,7 +225,7 @@ def test_widened_beams_against_sharp_ones(
     figures.note(f"aim {elements}x{users}, sharp", sharp_s * 1e6, "us", "less")
 
 
-def test_groups_of_three_hundred(figures: Figures) -> None:
+def test_time_slot_update_of_300_uavs(figures: Figures) -> None:
     how = Precoder(policy=Policy.GROUP, widen=Widen.NO)
     seconds = took_s(how, 64, 300, 0.008, 5)
     assert figures.note("an update of 300 UAVs in turns", seconds * 1e3, "ms", "less") < 200

@@ -65,7 +65,7 @@ def flown(start_node: Any, tmp_path: Path) -> Any:
         yield node
 
 
-def test_what_the_service_answers_in_a_second(flown: Any, figures: Figures) -> None:
+def test_requests_answered_per_second(flown: Any, figures: Figures) -> None:
     asked = {
         "/healthz": ("/healthz", "*/*"),
         "weights, npy": ("/v1/beams/weights", "application/x-npy"),
@@ -90,7 +90,7 @@ def test_memory_of_the_service(flown: Any, figures: Figures) -> None:
     figures.note("memory, 4 UAVs, recording", int(held["VmRSS"].split()[0]) / 1024, "MB", "less")
 
 
-def test_the_start_against_loading_its_libraries(start_node: Any, figures: Figures) -> None:
+def test_startup_time_against_library_import(start_node: Any, figures: Figures) -> None:
     ready_s, loaded_s = [], []
     for _ in range(3):
         begin = time.perf_counter()
@@ -105,7 +105,7 @@ def test_the_start_against_loading_its_libraries(start_node: Any, figures: Figur
     figures.ratio("start over loading its libraries", ready_s, loaded_s)
 
 
-def test_from_a_frame_to_weights(cut_log: Path, figures: Figures) -> None:
+def test_time_from_frame_to_weights(cut_log: Path, figures: Figures) -> None:
     """In this process: one frame received, and one update of all beams; numpy's speed for
     comparison."""
     pipeline = Pipeline(Settings().override(center={"source": "5:1"}))

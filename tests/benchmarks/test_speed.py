@@ -137,7 +137,9 @@ def test_zero_forcing_against_pinv(elements: int, users: int, figures: Figures) 
 
 
 @pytest.mark.parametrize("uavs", [4, 64])
-def test_a_kinematic_update_with_prediction_and_bound(uavs: int, figures: Figures) -> None:
+def test_update_and_prediction_cost_is_independent_of_fleet_size(
+    uavs: int, figures: Figures
+) -> None:
     """One report received and one prediction made; the cost must not grow with the number of
     UAVs."""
     each_us = {count: _update_us(count) for count in (4, uavs)}
@@ -200,7 +202,7 @@ def _update_us(uavs: int) -> float:
     return statistics.median(seconds) / (rounds * uavs) * 1e6
 
 
-def test_reading_a_vehicles_own_log_against_the_formats_own_readers(figures: Figures) -> None:
+def test_onboard_log_reading_against_reference_readers(figures: Figures) -> None:
     """All frames of a log, against its reference reader: all messages, and only the used ones."""
     from pymavlink.DFReader import DFReader_binary
 

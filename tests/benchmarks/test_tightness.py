@@ -48,7 +48,7 @@ def furthest_m(fixes: list[Fix], until_ns: int, off: FloatArray, limit_mps2: flo
 
 
 @pytest.mark.benchmark
-def test_the_bound_is_little_more_than_the_exact_worst_case() -> None:
+def test_bound_is_close_to_the_exact_worst_case() -> None:
     """Over a slow radio, with turns; the worst-case direction is that of the bound's end."""
     genes = default_rng(5).random(adversary.GENES)
     genes[8 * adversary.KNOTS + 9] = 0.7  # a report each .8 s

@@ -81,7 +81,7 @@ def printed(printer: Path, parts: list[bytes]) -> list[list[str]]:
     return [line.split(" ") for line in done.stdout.decode().splitlines()]
 
 
-def test_a_thousand_records_are_read_as_they_were_made(printer: Path) -> None:
+def test_c_reader_reads_a_thousand_records_unchanged(printer: Path) -> None:
     rng = np.random.default_rng(7)
     sets = [beam_set(rng, int(rng.integers(1, 70)), int(rng.integers(0, 9))) for _ in range(1000)]
     sure = [[None if rng.random() < 0.3 else rng.normal() for _ in one.beams] for one in sets]
@@ -100,7 +100,7 @@ def test_a_thousand_records_are_read_as_they_were_made(printer: Path) -> None:
     assert next(lines, None) is None
 
 
-def test_a_damaged_record_is_refused_wherever_the_damage_is(printer: Path) -> None:
+def test_damaged_record_is_rejected_at_every_byte(printer: Path) -> None:
     (whole,) = records.encode(beam_set(np.random.default_rng(1), 5, 2), 3)
     bad = [whole[:i] + bytes([whole[i] ^ 1 << i % 8]) + whole[i + 1 :] for i in range(len(whole))]
     cut = [whole[:i] for i in range(len(whole))]
@@ -110,7 +110,7 @@ def test_a_damaged_record_is_refused_wherever_the_damage_is(printer: Path) -> No
     assert printed(printer, [whole + b"more"])[0][0] == "record"
 
 
-def test_a_record_too_large_goes_in_parts_that_are_whole() -> None:
+def test_large_record_is_split_into_complete_parts() -> None:
     one = beam_set(np.random.default_rng(2), 64, 50)
     parts = list(records.encode(one, 4, None, 9000))
     assert len(parts) > 3
@@ -127,7 +127,7 @@ def test_a_record_too_large_goes_in_parts_that_are_whole() -> None:
         list(records.encode(one, 4, None, 700))
 
 
-def test_the_header_in_c_has_the_layout_of_the_header_in_python() -> None:
+def test_record_layout_has_c_sizes_and_alignment() -> None:
     assert records.HEADER.itemsize == 96
     assert records.BEAM.itemsize == 144
     assert all(offset % min(kind.itemsize, 8) == 0 for kind, offset in layout(records.HEADER))
@@ -149,7 +149,7 @@ def follow(follower: Path, ring: Path, write: Any) -> tuple[int, int]:
     return int(said[0]), int(said[2])
 
 
-def test_a_thousand_updates_a_second_come_without_loss(follower: Path, tmp_path: Path) -> None:
+def test_thousand_updates_per_second_arrive_without_loss(follower: Path, tmp_path: Path) -> None:
     ring = Ring(tmp_path / "ring")
     (record,) = records.encode(beam_set(np.random.default_rng(3), 64, 4), 0)
 
@@ -165,7 +165,9 @@ def test_a_thousand_updates_a_second_come_without_loss(follower: Path, tmp_path:
     assert not (tmp_path / "ring").exists()
 
 
-def test_no_record_is_torn_by_a_writer_that_laps_its_reader(follower: Path, tmp_path: Path) -> None:
+def test_overrun_reader_counts_losses_and_reads_no_torn_record(
+    follower: Path, tmp_path: Path
+) -> None:
     """At full speed: overwritten records are counted, and received ones are complete."""
     ring, rng = Ring(tmp_path / "ring"), np.random.default_rng(4)
     made = [next(iter(records.encode(beam_set(rng, 60, n), n))) for n in range(1, 9)]
@@ -181,7 +183,7 @@ def test_no_record_is_torn_by_a_writer_that_laps_its_reader(follower: Path, tmp_
     assert came > 256
 
 
-def test_a_file_that_is_no_ring_is_left_alone(tmp_path: Path) -> None:
+def test_file_that_is_not_a_ring_is_not_overwritten(tmp_path: Path) -> None:
     mine = tmp_path / "thesis.txt"
     mine.write_text("years of work")
     with pytest.raises(UserError, match="is not a ring of records"):

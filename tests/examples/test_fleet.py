@@ -34,7 +34,7 @@ def certificates(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made(tmp_path_factory.mktemp("tls"), "roof-1", "roof-2", "looker", "guest")
 
 
-def test_the_configuration_names_what_there_is() -> None:
+def test_example_configuration_is_consistent_with_access_rights() -> None:
     said = tomllib.loads((EXAMPLE / "roof-1.toml").read_text(encoding="utf-8"))["fleet"]
     assert f"companion/{said['site']}" == SITE
     rights = (EXAMPLE / said["access_control"]).read_text(encoding="utf-8")
@@ -115,7 +115,7 @@ async def spoken(speaker: Node, listener: Node, name: str, payload: bytes) -> No
     speaker.bus.put(f"{SITE}/{name}/heard", payload)
 
 
-def test_nodes_hear_each_other_and_nobody_speaks_for_another(certificates: Path) -> None:
+def test_nodes_communicate_and_cannot_impersonate_another(certificates: Path) -> None:
     async def test() -> None:
         endpoint = f"tls/127.0.0.1:{free_port()}"
         async with (
@@ -147,9 +147,7 @@ def test_nodes_hear_each_other_and_nobody_speaks_for_another(certificates: Path)
     run_async(test())
 
 
-def test_who_shows_no_certificate_of_the_authority_is_refused(
-    certificates: Path, tmp_path: Path
-) -> None:
+def test_peer_without_a_valid_certificate_is_rejected(certificates: Path, tmp_path: Path) -> None:
     forged = made(tmp_path / "forged", "roof-2")  # a valid name, signed by another authority
     forged.joinpath("ca.pem").write_bytes(certificates.joinpath("ca.pem").read_bytes())
 

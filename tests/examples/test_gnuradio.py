@@ -67,7 +67,7 @@ def noise(rng: np.random.Generator, rows: int, columns: int) -> ComplexArray:
 
 @pytest.mark.full
 @pytest.mark.parametrize("uavs", [["1:1", "icao:4CA7B3"], ["2:1"]])
-def test_streams_go_out_by_the_newest_weights(python: str, tmp_path: Path, uavs: list[str]) -> None:
+def test_streams_use_the_newest_weights(python: str, tmp_path: Path, uavs: list[str]) -> None:
     """Weights change between sample blocks; damaged and foreign records have no effect."""
     rng, elements = np.random.default_rng(3), 8
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
@@ -113,7 +113,7 @@ def test_streams_go_out_by_the_newest_weights(python: str, tmp_path: Path, uavs:
 
 
 @pytest.mark.full
-def test_weights_that_are_too_old_are_silence(python: str) -> None:
+def test_outdated_weights_mute_the_output(python: str) -> None:
     """In GNU Radio's own process: a block without new records is muted, and resumes."""
     weights = noise(np.random.default_rng(1), 2, 1)
     first, second = (record(n, ["1:1"], weights).hex() for n in (1, 2))

@@ -188,7 +188,7 @@ def tell(table: Any, seconds: float, seen: Seen) -> None:
 @pytest.mark.parametrize(
     "seconds", [40.0, pytest.param(600.0, marks=[pytest.mark.soak, pytest.mark.timeout(1800)])]
 )
-def test_whatever_goes_wrong_at_once_it_goes_on_and_all_is_recorded(
+def test_service_survives_all_faults_at_once_and_records_all(
     start_node: Any, small_disk: Path, tmp_path: Path, table: Any, seconds: float
 ) -> None:
     (tmp_path / "settings.toml").write_text(SETTINGS)

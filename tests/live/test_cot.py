@@ -14,7 +14,7 @@ EVENT = (
 )
 
 
-def test_events_are_heard_and_replay_alike(start_node: Any, tmp_path: Path) -> None:
+def test_cot_events_are_received_and_replay_identically(start_node: Any, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(HANG_S)
         node = start_node(

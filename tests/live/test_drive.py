@@ -33,7 +33,7 @@ def fly(port: int, seconds: float) -> Any:
     return started(command, stdout=subprocess.DEVNULL)
 
 
-def test_a_service_drives_its_rotator_and_reaches_it_again(
+def test_service_drives_its_rotator_and_reconnects(
     start_node: Any, tmp_path: Path, rotctld: int
 ) -> None:
     config = tmp_path / "settings.toml"
@@ -56,9 +56,7 @@ def test_a_service_drives_its_rotator_and_reaches_it_again(
         assert node.stop(signal.SIGTERM)[0] == 0
 
 
-def test_another_s_beams_are_applied_over_http_until_the_service_is_gone(
-    start_node: Any, tmp_path: Path
-) -> None:
+def test_remote_beams_are_applied_over_http_until_shutdown(start_node: Any, tmp_path: Path) -> None:
     config = tmp_path / "settings.toml"
     config.write_text(EIGHT)
     node = start_node(*RUN, "--config", str(config))
@@ -79,7 +77,7 @@ def test_another_s_beams_are_applied_over_http_until_the_service_is_gone(
     assert "no answer from the service" in err
 
 
-def test_how_it_goes_is_said_each_second(start_node: Any, tmp_path: Path) -> None:
+def test_drive_status_is_reported_each_second(start_node: Any, tmp_path: Path) -> None:
     config = tmp_path / "settings.toml"
     config.write_text(EIGHT)
     node = start_node(*RUN, "--config", str(config))

@@ -58,7 +58,7 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Outcome]:
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_the_recording_replays_to_the_same_and_holds_what_the_api_said(
+def test_recording_replays_identically_and_matches_the_api(
     flights: dict[str, Outcome], name: str
 ) -> None:
     done = flights[name]
@@ -81,7 +81,7 @@ def test_the_recording_replays_to_the_same_and_holds_what_the_api_said(
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_in_the_end_all_are_live_with_beams(flights: dict[str, Outcome], name: str) -> None:
+def test_all_uavs_are_live_with_beams_at_the_end(flights: dict[str, Outcome], name: str) -> None:
     done = flights[name]
     flown = set(done.reports_flown) - {"5:1"}
     flown -= {"1:1"} if name == "shared-id" else set()  # the identity of this track is ambiguous
@@ -98,7 +98,7 @@ def test_in_the_end_all_are_live_with_beams(flights: dict[str, Outcome], name: s
 
 
 @pytest.mark.parametrize("name", [n for n, case in CASES.items() if case.struck or not case.faults])
-def test_who_has_no_fault_loses_nothing(flights: dict[str, Outcome], name: str) -> None:
+def test_uavs_without_faults_lose_no_report(flights: dict[str, Outcome], name: str) -> None:
     done = flights[name]
     frames = Counter(str(frame.source) for frame in done.flown)
     for link in done.links:
@@ -131,7 +131,7 @@ def test_no_bound_is_violated(flights: dict[str, Outcome], name: str) -> None:
 # --- sender faults ------------------------------------------------------------------------------
 
 
-def test_a_drift_beyond_the_greatest_is_told(flights: dict[str, Outcome]) -> None:
+def test_drift_beyond_the_limit_is_reported(flights: dict[str, Outcome]) -> None:
     """A clock 2.4 % slow looks like a link that slows down; a fast clock hides nothing."""
     done = flights["senders"]
     told = {one["subject"] for one in done.events if "clock stalled" in one["text"]}
@@ -142,7 +142,7 @@ def test_a_drift_beyond_the_greatest_is_told(flights: dict[str, Outcome]) -> Non
         assert done.uavs[uav]["reports"] == done.reports_flown[uav]
 
 
-def test_a_reboot_is_said_once_and_the_track_begins_anew(flights: dict[str, Outcome]) -> None:
+def test_reboot_is_reported_once_and_restarts_the_track(flights: dict[str, Outcome]) -> None:
     done = flights["senders"]
     texts = [event["text"] for event in done.events if "restarted" in event["text"]]
     assert len(texts) == 1
@@ -159,7 +159,7 @@ def test_a_reboot_is_said_once_and_the_track_begins_anew(flights: dict[str, Outc
     assert (link["late"], link["gaps"], link["repeats"]) == (3, 0, 0)
 
 
-def test_a_frozen_position_is_refused_and_the_track_coasts(flights: dict[str, Outcome]) -> None:
+def test_frozen_position_is_rejected_and_the_track_coasts(flights: dict[str, Outcome]) -> None:
     done = flights["senders"]
     frozen = done.touched["frozen@3:1"]
     assert frozen == pytest.approx(3.0 / 0.2, abs=1)  # five reports a second
@@ -182,7 +182,7 @@ def test_a_frozen_position_is_refused_and_the_track_coasts(flights: dict[str, Ou
     assert all("3:1" in one.beamed for one in fit)  # also while it coasts
 
 
-def test_a_glitch_is_refused_report_by_report(flights: dict[str, Outcome]) -> None:
+def test_glitch_reports_are_rejected_individually(flights: dict[str, Outcome]) -> None:
     done = flights["senders"]
     assert done.touched["glitch@4:1"] == 6
     assert done.uavs["4:1"]["rejected"] == {"unreachable": 6}
@@ -200,7 +200,7 @@ def test_a_glitch_is_refused_report_by_report(flights: dict[str, Outcome]) -> No
 # --- link faults --------------------------------------------------------------------------------
 
 
-def test_what_is_lost_shows_as_gaps(flights: dict[str, Outcome]) -> None:
+def test_lost_frames_are_counted_as_gaps(flights: dict[str, Outcome]) -> None:
     """Except frames lost before a sender's first received frame and after its last."""
     done = flights["loss"]
     (link,) = done.links
@@ -215,7 +215,7 @@ def test_what_is_lost_shows_as_gaps(flights: dict[str, Outcome]) -> None:
         assert done.uavs[uav]["reports"] < 0.9 * done.reports_flown[uav]
 
 
-def test_what_comes_twice_counts_once(flights: dict[str, Outcome]) -> None:
+def test_duplicate_frames_count_once(flights: dict[str, Outcome]) -> None:
     done = flights["duplication"]
     (link,) = done.links
     copies = sum(done.touched.values())
@@ -235,7 +235,7 @@ def _of_the_track(said: list[str]) -> set[str]:
     return {text for text in said if not text.startswith("link")}
 
 
-def test_a_delay_is_measured_where_gnss_tells_of_it(flights: dict[str, Outcome]) -> None:
+def test_delay_is_measured_if_gnss_time_is_available(flights: dict[str, Outcome]) -> None:
     done = flights["delay"]
     for uav, late_s in {"1:1": 0.3, "2:1": 0.3, "3:1": 0.0, "4:1": 0.0}.items():
         clock = done.last.uavs[uav]["clock"]
@@ -252,7 +252,7 @@ def test_a_delay_is_measured_where_gnss_tells_of_it(flights: dict[str, Outcome])
     assert (link["gaps"], link["late"], done.rejected) == (0, 0, {})
 
 
-def test_the_first_of_two_jittery_links_counts(flights: dict[str, Outcome]) -> None:
+def test_first_copy_over_two_jittery_links_is_used(flights: dict[str, Outcome]) -> None:
     done = flights["jitter"]
     total = done.reports_flown.total()
     assert done.touched["jitter"] == 2 * done.sent["frames"]
@@ -271,7 +271,7 @@ def test_the_first_of_two_jittery_links_counts(flights: dict[str, Outcome]) -> N
         assert entry["reports"] == done.reports_flown[uav], uav
 
 
-def test_a_burst_comes_late_and_is_all_used(flights: dict[str, Outcome]) -> None:
+def test_late_bursts_are_used_completely(flights: dict[str, Outcome]) -> None:
     """If a share of the frames waits for up to 1 s, the 95th percentile has that latency."""
     done = flights["burst"]
     (link,) = done.links
@@ -285,7 +285,7 @@ def test_a_burst_comes_late_and_is_all_used(flights: dict[str, Outcome]) -> None
         assert entry["reports"] == done.reports_flown[uav], uav
 
 
-def test_what_is_overtaken_is_late_and_is_used(flights: dict[str, Outcome]) -> None:
+def test_reordered_frames_are_late_and_used(flights: dict[str, Outcome]) -> None:
     done = flights["reordering"]
     (link,) = done.links
     overtaken = sum(overtaken_frames(done, one["id"]) for one in link["components"])
@@ -298,7 +298,7 @@ def test_what_is_overtaken_is_late_and_is_used(flights: dict[str, Outcome]) -> N
 
 
 @pytest.mark.parametrize("name", ["bit-errors", "truncation"])
-def test_what_is_damaged_is_counted_and_costs_no_other(
+def test_damaged_frames_are_counted_and_lose_no_others(
     flights: dict[str, Outcome], name: str
 ) -> None:
     """A damaged frame is a bad checksum or an unknown message; a few become garbage if their
@@ -324,7 +324,7 @@ def test_what_is_damaged_is_counted_and_costs_no_other(
         assert done.uavs[uav]["reports"] == sum(is_report(one, uav) for one in done.received)
 
 
-def test_garbage_is_counted_in_bytes_and_costs_no_frame(flights: dict[str, Outcome]) -> None:
+def test_garbage_is_counted_in_bytes_and_loses_no_frame(flights: dict[str, Outcome]) -> None:
     """Except garbage bytes claimed by a false header: one byte in 128 is a magic byte."""
     done = flights["garbage"]
     (link,) = done.links
@@ -342,7 +342,7 @@ def test_garbage_is_counted_in_bytes_and_costs_no_frame(flights: dict[str, Outco
 # --- scenarios ----------------------------------------------------------------------------------
 
 
-def test_of_two_with_one_id_a_track_follows_one(flights: dict[str, Outcome]) -> None:
+def test_track_of_a_shared_id_follows_one_uav(flights: dict[str, Outcome]) -> None:
     """They are 600 m apart: the track stays on one of them, never on the other or in between."""
     done = flights["shared-id"]
     followed = {off_m.index(min(off_m)) for off_m, _ in done.errors_m("1:1")}
@@ -353,7 +353,7 @@ def test_of_two_with_one_id_a_track_follows_one(flights: dict[str, Outcome]) -> 
     assert sum(refused.values()) >= done.reports_flown["1:1"] // 2
 
 
-def test_two_with_one_id_are_told(flights: dict[str, Outcome]) -> None:
+def test_shared_id_is_reported(flights: dict[str, Outcome]) -> None:
     done = flights["shared-id"]
     assert done.uavs["1:1"]["rejected"]["shared-id"] > 0
     assert [one["severity"] for one in done.events if "send under the id" in one["text"]] == [
@@ -361,7 +361,7 @@ def test_two_with_one_id_are_told(flights: dict[str, Outcome]) -> None:
     ]
 
 
-def test_adsb_traffic_is_tracked_apart_and_one_of_it_is_known(flights: dict[str, Outcome]) -> None:
+def test_adsb_aircraft_have_own_tracks_and_one_matches_a_uav(flights: dict[str, Outcome]) -> None:
     done = flights["adsb"]
     relayed = {uav: one for uav, one in done.last.uavs.items() if uav.startswith("icao:")}
     assert {"icao:F00001", "icao:F00002", "icao:F00006"} <= set(relayed)

@@ -142,7 +142,7 @@ def test_every_uav_has_one_node(fleet: Fleet) -> None:
     assert beams == {uav for uav, one in by.items() if one == {"a"}}
 
 
-def test_a_clock_that_is_wrong_is_said_and_allowed_for(fleet: Fleet) -> None:
+def test_wrong_node_clock_is_estimated_and_reported(fleet: Fleet) -> None:
     def found(answer: Any) -> Any:
         (node,) = [one for one in answer["nodes"] if one["node"] == "c"]
         return node["clock_doubt_s"] is not None and node
@@ -154,7 +154,7 @@ def test_a_clock_that_is_wrong_is_said_and_allowed_for(fleet: Fleet) -> None:
     fleet.until(lambda: found(fleet.nodes["a"].json("/v1/fleet"))["state"] == "there")
 
 
-def test_who_is_silent_here_and_heard_there_keeps_a_small_bound(fleet: Fleet) -> None:
+def test_uav_received_only_by_another_node_keeps_a_small_bound(fleet: Fleet) -> None:
     uav = fleet.sky.names[0]
     port = fleet.nodes["a"].udp_port
 
@@ -180,7 +180,7 @@ def test_who_is_silent_here_and_heard_there_keeps_a_small_bound(fleet: Fleet) ->
         fleet.sky.heard_at[uav].add(port)
 
 
-def test_a_node_that_invents_vehicles_is_put_aside(fleet: Fleet) -> None:
+def test_node_that_invents_vehicles_is_excluded(fleet: Fleet) -> None:
     """It speaks Zenoh like a node, and reports vehicles that do not exist."""
 
     async def lie() -> None:
@@ -208,7 +208,7 @@ def test_a_node_that_invents_vehicles_is_put_aside(fleet: Fleet) -> None:
     assert "node liar is excluded for" in fleet.nodes["b"].errors()
 
 
-def test_a_node_that_is_killed_is_followed(fleet: Fleet) -> None:
+def test_uavs_of_a_killed_node_are_taken_over(fleet: Fleet) -> None:
     """Runs second to last: the killed node is not restarted."""
     fleet.until(lambda: all(len(by) == 1 for by in fleet.served_by().values()))
     by = fleet.served_by()
@@ -220,7 +220,7 @@ def test_a_node_that_is_killed_is_followed(fleet: Fleet) -> None:
     fleet.until(lambda: all(len(one) == 1 for one in fleet.served_by(*rest).values()))
 
 
-def test_no_bound_was_broken_all_the_while(fleet: Fleet) -> None:
+def test_no_bound_was_violated_during_the_run(fleet: Fleet) -> None:
     assert fleet.checked > 100
     assert fleet.broken == []
 

@@ -39,7 +39,7 @@ def seen(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     return found
 
 
-def test_nobody_is_unserved_whole_or_parted_and_it_heals(seen: dict[str, Any]) -> None:
+def test_no_uav_is_unserved_before_or_during_a_partition(seen: dict[str, Any]) -> None:
     """Healing times are in docs/fleet.md; a fleet that does not heal fails the run."""
     for when in ("whole", "parted"):
         assert sum(seen[when].values()) > 50
@@ -47,6 +47,6 @@ def test_nobody_is_unserved_whole_or_parted_and_it_heals(seen: dict[str, Any]) -
     assert seen["parted"]["twice"] > seen["parted"]["once"]  # the partition took effect
 
 
-def test_no_bound_was_broken(seen: dict[str, Any]) -> None:
+def test_no_bound_was_violated_over_tun_links(seen: dict[str, Any]) -> None:
     assert seen["checked"] > 500
     assert seen["broken"] == []

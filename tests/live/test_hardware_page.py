@@ -145,7 +145,7 @@ def kind_of(line: str) -> str:
 
 
 @pytest.mark.parametrize("line", DRIVES)
-def test_a_line_of_the_page_drives_its_device(
+def test_each_page_command_drives_its_device(
     served: tuple[Node, Path], tmp_path: Path, line: str
 ) -> None:
     node, folder = served
@@ -170,7 +170,7 @@ def test_a_line_of_the_page_drives_its_device(
         check(done, json.loads(told.read_text()))
 
 
-def test_every_device_has_a_line_and_the_settings_of_the_page_are_good() -> None:
+def test_page_covers_every_device_with_valid_settings() -> None:
     assert len(LINES) <= 10
     assert {kind_of(line) for line in DRIVES} == set(STAND_INS)
     assert sum("--dry-run" in line for line in DRIVES) == 1

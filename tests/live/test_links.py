@@ -69,7 +69,7 @@ def rejected(node: Any) -> dict[str, int]:
     return counts
 
 
-def test_signatures_are_checked_and_a_restart_remembers(start_node: Any, tmp_path: Path) -> None:
+def test_signatures_are_checked_across_a_restart(start_node: Any, tmp_path: Path) -> None:
     """Right key, wrong key, no signature, a replayed frame, MAVLink 1 in between, restart."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
@@ -124,7 +124,7 @@ def test_signatures_are_checked_and_a_restart_remembers(start_node: Any, tmp_pat
             time.sleep(0.05)
 
 
-def test_a_key_that_is_none_is_told_at_the_start(tmp_path: Path) -> None:
+def test_invalid_signing_key_is_reported_at_startup(tmp_path: Path) -> None:
     (tmp_path / "radio.key").write_text("secret")
     settings = tmp_path / "settings.toml"
     settings.write_text(
@@ -143,7 +143,9 @@ def test_a_key_that_is_none_is_told_at_the_start(tmp_path: Path) -> None:
     assert done.stderr.count("\n") == 1
 
 
-def test_timestamps_that_cannot_be_kept_cost_no_recording(start_node: Any, tmp_path: Path) -> None:
+def test_unwritable_signing_timestamps_keep_the_recording_intact(
+    start_node: Any, tmp_path: Path
+) -> None:
     """The signing timestamp folder disappears: this is reported, and the recording is complete."""
     (tmp_path / "radio.key").write_bytes(KEY)
     kept = tmp_path / "kept"
@@ -181,7 +183,7 @@ def pty() -> Iterator[tuple[int, str]]:
     os.close(near)
 
 
-def test_a_serial_line(start_node: Any, pty: tuple[int, str]) -> None:
+def test_serial_link_with_split_frames_and_noise(start_node: Any, pty: tuple[int, str]) -> None:
     """Frames split at arbitrary bytes, with noise before them."""
     far, device = pty
     node = start_node("run", "--link", UDP, "--link", f"serial:{device}:57600", *HTTP)
@@ -198,7 +200,7 @@ def test_a_serial_line(start_node: Any, pty: tuple[int, str]) -> None:
     assert {uav["id"] for uav in node.json("/v1/uavs")["uavs"]} == {"1:1", "2:1", "5:1"}
 
 
-def test_a_peer_that_goes_and_returns_is_told_once_each(start_node: Any) -> None:
+def test_link_down_and_up_are_each_reported_once(start_node: Any) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         port = server.getsockname()[1]
         node = start_node("run", "--link", UDP, "--link", f"tcp:127.0.0.1:{port}", *HTTP)
@@ -225,9 +227,7 @@ def test_a_peer_that_goes_and_returns_is_told_once_each(start_node: Any) -> None
     assert "down" in about[0] and "back" in about[1]
 
 
-def test_killed_and_started_again_tracks_are_live_after_two_reports(
-    start_node: Any, tmp_path: Path
-) -> None:
+def test_tracks_are_live_two_reports_after_a_restart(start_node: Any, tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]

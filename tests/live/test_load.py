@@ -70,7 +70,7 @@ def heard(node: Any, frames: int) -> Any:
     return status
 
 
-def test_no_frame_of_a_busy_sky_is_lost(start_node: Any, tmp_path: Path) -> None:
+def test_no_frame_is_lost_under_full_load(start_node: Any, tmp_path: Path) -> None:
     node = start_node(*RUN, *CENTER, "--record", str(tmp_path))
     sent = load(node, 3.0)
     status = heard(node, sent)
@@ -90,7 +90,7 @@ def test_no_frame_of_a_busy_sky_is_lost(start_node: Any, tmp_path: Path) -> None
 
 @pytest.mark.benchmark
 @pytest.mark.parametrize("recorded", [False, True])
-def test_half_a_minute_of_it_and_the_service_stays_at_hand(
+def test_service_stays_responsive_under_full_load(
     start_node: Any, tmp_path: Path, recorded: bool, figures: Figures
 ) -> None:
     """The limit of 50 ms is the product's own, on a machine with two cores."""

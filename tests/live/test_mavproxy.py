@@ -62,7 +62,7 @@ def fly() -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
         end(process)
 
 
-def test_over_datagrams_and_over_a_connection_at_once(
+def test_mavproxy_over_udp_and_tcp_counts_each_report_once(
     start_node: Any, router: Router, fly: Any, tmp_path: Path
 ) -> None:
     """Both router outputs lead to the service: every report arrives twice and counts once."""
@@ -103,7 +103,7 @@ def test_over_datagrams_and_over_a_connection_at_once(
     assert set(summary["uavs"]) == {"1:1", "2:1", "3:1", "4:1"}
 
 
-def test_what_the_service_says_reaches_the_vehicle_and_its_answer_the_service(
+def test_mavproxy_routes_requests_and_answers(
     start_node: Any, router: Router, tmp_path: Path
 ) -> None:
     """A rate request, its acknowledgement and TIMESYNC, both ways through a router."""

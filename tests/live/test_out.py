@@ -50,9 +50,7 @@ def flown(log: Path, seconds: float) -> dict[int, Any]:
 
 
 @pytest.mark.full
-def test_packets_that_are_ten_seconds_late_take_nobody_back(
-    start_node: Any, tmp_path: Path
-) -> None:
+def test_packets_ten_seconds_late_move_no_uav_backwards(start_node: Any, tmp_path: Path) -> None:
     """The same traffic over two links, one of them ten seconds late (mavlink-router, issue 457).
 
     Forwarding every packet would move each vehicle back by ten seconds at each late one. The output
@@ -105,7 +103,7 @@ def test_packets_that_are_ten_seconds_late_take_nobody_back(
         assert off_m.max() < 10  # ten seconds back is 200 m
 
 
-def test_events_go_out_as_xml_that_takproto_reads(start_node: Any, tmp_path: Path) -> None:
+def test_output_events_are_readable_by_takproto(start_node: Any, tmp_path: Path) -> None:
     """Over UDP and TCP; a stop ends the output, and --silent sends nothing."""
     with bound() as far_end, socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(HANG_S)
@@ -152,7 +150,7 @@ def test_events_go_out_as_xml_that_takproto_reads(start_node: Any, tmp_path: Pat
     assert "guaranteed bounds" in text.decode()
 
 
-def test_silent_is_silent(start_node: Any, tmp_path: Path) -> None:
+def test_silent_service_opens_no_output_connection(start_node: Any, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         config = tmp_path / "config.toml"
         config.write_text(f'[out]\nurls = ["cot:tcp:127.0.0.1:{server.getsockname()[1]}"]\n')

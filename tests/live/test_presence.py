@@ -27,7 +27,9 @@ def is_heartbeat(message: Any) -> bool:
     return bool(message.get_type() == "HEARTBEAT" and message.get_srcSystem() == 5)
 
 
-def test_it_beats_asks_and_is_acknowledged(start_node: Any, settings: str, tmp_path: Path) -> None:
+def test_service_sends_heartbeats_and_acknowledged_requests(
+    start_node: Any, settings: str, tmp_path: Path
+) -> None:
     node = start_node(*RUN, "--config", settings, "--record", str(tmp_path))
     address = f"udpout:127.0.0.1:{node.udp_port}"
     with Vehicle(address, 5, 2.0, 5.0) as carrier, Vehicle(address, 1, 2.0, 1.0) as uav:
@@ -68,7 +70,7 @@ def test_it_beats_asks_and_is_acknowledged(start_node: Any, settings: str, tmp_p
 
 
 @pytest.mark.parametrize("how", ["by default", "--silent"])
-def test_it_says_nothing_unless_it_is_allowed_to(start_node: Any, settings: str, how: str) -> None:
+def test_service_sends_nothing_unless_enabled(start_node: Any, settings: str, how: str) -> None:
     silent = ("--config", settings, "--silent") if how == "--silent" else ()
     node = start_node(*RUN, *silent)
     address = f"udpout:127.0.0.1:{node.udp_port}"

@@ -27,7 +27,7 @@ def same_digest(recording: Path) -> dict[str, Any]:
     return summary
 
 
-def test_a_beast_stream_is_heard_and_replays_alike(start_node: Any, tmp_path: Path) -> None:
+def test_beast_stream_is_received_and_replays_identically(start_node: Any, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(HANG_S)
         node = start_node(
@@ -72,7 +72,7 @@ def web() -> Iterator[tuple[str, dict[str, Any]]]:
         thread.join(HANG_S)
 
 
-def test_aircraft_json_is_polled_and_replays_alike(
+def test_aircraft_json_is_polled_and_replays_identically(
     start_node: Any, tmp_path: Path, web: tuple[str, dict[str, Any]]
 ) -> None:
     url, answer = web

@@ -84,18 +84,18 @@ def kills(folder: Path, count: int, at_once: int, longest_s: float) -> list[floa
     return lost_s
 
 
-def test_killed_at_any_moment_it_loses_a_second_at_most(tmp_path: Path) -> None:
+def test_killed_service_loses_at_most_a_second(tmp_path: Path) -> None:
     kills(tmp_path, 6, 3, 2.5)
 
 
 @pytest.mark.soak
-def test_killed_fifty_times_it_loses_a_second_at_most_each_time(tmp_path: Path, table: Any) -> None:
+def test_service_killed_50_times_loses_at_most_a_second_each(tmp_path: Path, table: Any) -> None:
     lost_s = kills(tmp_path, 50, 2, 5.0)
     table.add("lost by 50 kills, median", lost_s[25], "s", "< 1 s")
     table.add("lost by 50 kills, most", lost_s[-1], "s", "< 1.5 s")
 
 
-def test_the_parts_of_a_run_replay_to_its_digest(start_node: Any, tmp_path: Path) -> None:
+def test_parts_of_a_run_replay_to_its_digest(start_node: Any, tmp_path: Path) -> None:
     settings = tmp_path / "settings.toml"
     settings.write_text("[recording]\nrotate_s = 1.0\n")
     node = start_node(*RUN, "--config", str(settings), "--record", str(tmp_path / "kept"))
@@ -119,7 +119,7 @@ def test_the_parts_of_a_run_replay_to_its_digest(start_node: Any, tmp_path: Path
     assert len(replayed(logs[0], logs[2])["missing"]) == 1
 
 
-def test_a_folder_taken_away_does_not_stop_the_beams(start_node: Any, tmp_path: Path) -> None:
+def test_removed_recording_folder_does_not_stop_the_beams(start_node: Any, tmp_path: Path) -> None:
     kept = tmp_path / "kept"
     node = start_node(*RUN, "--record", str(kept))
     with send(node, 20) as flight:

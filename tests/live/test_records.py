@@ -24,9 +24,7 @@ def sequence(record: bytes) -> int:
     return int(np.frombuffer(record, records.HEADER, 1)[0]["sequence"])
 
 
-def test_records_come_with_each_update_and_hold_what_the_api_says(
-    start_node: Any, tmp_path: Path
-) -> None:
+def test_records_follow_each_update_and_match_the_api(start_node: Any, tmp_path: Path) -> None:
     follower, ring = tmp_path / "follow_ring", tmp_path / "ring"
     source = ROOT / "examples" / "c" / "follow_ring.cpp"
     if shutil.which("g++") is None:
@@ -77,7 +75,7 @@ def test_records_come_with_each_update_and_hold_what_the_api_says(
     assert not ring.exists()
 
 
-def test_nobody_who_listens_is_told_once_and_ends_nothing(start_node: Any, tmp_path: Path) -> None:
+def test_missing_udp_listener_is_reported_once(start_node: Any, tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -15,7 +15,7 @@ SAID = (
 )
 
 
-def test_a_receiver_is_heard_and_replays_alike(start_node: Any, tmp_path: Path) -> None:
+def test_receiver_data_is_tracked_and_replays_identically(start_node: Any, tmp_path: Path) -> None:
     node = start_node(
         *("run", "--link", "udpin:127.0.0.1:0", "--link", "rid:udp:127.0.0.1:0"),
         *("--center", "51.5,-0.1,100"),

@@ -14,7 +14,7 @@ LINE = (
 )
 
 
-def test_a_receiver_is_heard_and_replays_alike(start_node: Any, tmp_path: Path) -> None:
+def test_receiver_data_is_tracked_and_replays_identically(start_node: Any, tmp_path: Path) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         server.settimeout(HANG_S)
         url = f"sbs:127.0.0.1:{server.getsockname()[1]}"

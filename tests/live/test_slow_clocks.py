@@ -81,7 +81,7 @@ def bounds_of(recording: Path, clocks: dict[str, SlowClock], epoch_s: float) -> 
 
 @pytest.mark.full
 @pytest.mark.parametrize("busy", [0, 4])
-def test_clocks_that_run_slow_for_seconds_break_no_bound(
+def test_clocks_slow_for_seconds_violate_no_bound(
     start_node: Any, tmp_path: Path, busy: int, record_property: Any
 ) -> None:
     (tmp_path / "settings.toml").write_text(SETTINGS.to_toml())

@@ -18,7 +18,7 @@ FRAMES_HZ = 400
 
 
 @pytest.mark.full
-def test_a_service_that_was_stopped_goes_on_within_seconds(start_node: Any, tmp_path: Path) -> None:
+def test_suspended_service_resumes_within_seconds(start_node: Any, tmp_path: Path) -> None:
     """Traffic continues meanwhile; messages that wait too long are discarded and counted."""
     node = start_node(*RUN, "--record", str(tmp_path))
     sender = [sys.executable, ROOT / "tests" / "load_sender.py"]

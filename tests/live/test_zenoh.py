@@ -9,7 +9,7 @@ from support import BIN, free_port, started
 pytest.importorskip("zenoh")
 
 
-def test_a_flight_over_zenoh_is_tracked(start_node: Any) -> None:
+def test_flight_over_zenoh_is_tracked(start_node: Any) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     node = start_node(
         *("run", "--link", f"zenoh:mavlink_raw?connect={endpoint}", "--center", "5:1"),

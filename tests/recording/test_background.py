@@ -114,7 +114,7 @@ def parts_of(folder: Path) -> list[Path]:
     return sorted(found, key=lambda path: read_recording_info(path).part or Part("", 0, ""))
 
 
-def test_who_lives_for_a_moment_leaves_what_it_heard(tmp_path: Path) -> None:
+def test_first_events_are_flushed_immediately(tmp_path: Path) -> None:
     """The first events are on disk within a second; later ones may wait for the next flush."""
     made = recorder(tmp_path)
     made.start()
@@ -126,7 +126,7 @@ def test_who_lives_for_a_moment_leaves_what_it_heard(tmp_path: Path) -> None:
     assert took_s < background.FLUSH_S
 
 
-def test_what_is_put_is_in_the_file_in_order(tmp_path: Path) -> None:
+def test_queued_events_are_written_in_order(tmp_path: Path) -> None:
     made = recorder(tmp_path)
     made.start()
     events = [
@@ -143,7 +143,7 @@ def test_what_is_put_is_in_the_file_in_order(tmp_path: Path) -> None:
     assert missing([path]) == []
 
 
-def test_a_full_disk_that_is_emptied_leaves_no_hole(small_disk: Path) -> None:
+def test_freed_disk_space_leaves_no_gap(small_disk: Path) -> None:
     made = recorder(small_disk)
     made.start()
     events = hand_over(made, ticks(1, 100))
@@ -171,7 +171,7 @@ def test_a_full_disk_that_is_emptied_leaves_no_hole(small_disk: Path) -> None:
     assert made.messages == len(events)
 
 
-def test_a_full_disk_keeps_no_file_of_nothing(small_disk: Path) -> None:
+def test_full_disk_leaves_no_empty_file(small_disk: Path) -> None:
     """Regression: each retry left an empty file, which was recovered as a recording without
     frames."""
     fill(small_disk)
@@ -182,7 +182,7 @@ def test_a_full_disk_keeps_no_file_of_nothing(small_disk: Path) -> None:
     assert [path.name for path in small_disk.iterdir()] == [BALLAST]
 
 
-def test_a_full_disk_is_looked_at_again_as_soon_however_long_it_is_full(
+def test_full_disk_retry_interval_does_not_grow(
     small_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: with a doubling retry interval, the queue kept twice the events of the outage."""
@@ -209,7 +209,7 @@ def test_a_full_disk_is_looked_at_again_as_soon_however_long_it_is_full(
     assert list(log_events(parts_of(small_disk), Settings())) == events
 
 
-def test_what_fits_into_little_room_is_kept_of_what_waits(
+def test_queued_events_that_fit_in_the_free_space_are_kept(
     small_disk: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Regression: all queued events had to fit at once and were rewritten by each retry."""
@@ -234,7 +234,7 @@ def test_what_fits_into_little_room_is_kept_of_what_waits(
     assert list(log_events(parts_of(small_disk), Settings())) == events
 
 
-def test_an_outage_longer_than_the_queue_is_a_hole_that_is_told(small_disk: Path) -> None:
+def test_outage_longer_than_the_queue_is_recorded_as_a_gap(small_disk: Path) -> None:
     made = recorder(small_disk, queue_max=1000)
     made.start()
     head = hand_over(made, ticks(1, 100))
@@ -262,7 +262,7 @@ def test_an_outage_longer_than_the_queue_is_a_hole_that_is_told(small_disk: Path
     assert [severity for severity, _ in made.news()] == ["error", "info", "info"]
 
 
-def test_a_disk_that_stays_full_is_said_once_and_does_not_hold_up_the_end(small_disk: Path) -> None:
+def test_full_disk_is_reported_once_and_does_not_delay_shutdown(small_disk: Path) -> None:
     made = recorder(small_disk)
     made.start()
     fill(small_disk)
@@ -298,7 +298,7 @@ print(made.dropped, [text for _, text in made.news()][0])
 
 
 @pytest.mark.full
-def test_a_file_that_may_not_grow_is_gone_on_with_in_another(tmp_path: Path) -> None:
+def test_file_size_limit_continues_the_run_in_a_new_part(tmp_path: Path) -> None:
     """Without root: the system enforces a file size limit in the middle of a write."""
     done = subprocess.run(
         [sys.executable, "-c", _LIMITED, tmp_path, Path(__file__).parent, ROOT / "tests"],
@@ -312,7 +312,7 @@ def test_a_file_that_may_not_grow_is_gone_on_with_in_another(tmp_path: Path) -> 
     assert missing(logs) == []
 
 
-def test_a_folder_that_is_removed_is_made_again(tmp_path: Path) -> None:
+def test_removed_folder_is_recreated(tmp_path: Path) -> None:
     folder = tmp_path / "recordings"
     made = recorder(folder)
     made.start()
@@ -330,7 +330,7 @@ def test_a_folder_that_is_removed_is_made_again(tmp_path: Path) -> None:
     assert "the file was removed" in made.news()[0][1]
 
 
-def test_a_slow_disk_drops_counts_and_tells(
+def test_slow_disk_drops_events_and_reports_the_count(
     tmp_path: Path, update: Callable[[int], Update]
 ) -> None:
     """The thread blocks on an output that waits for a pipe, as a write waits for a slow disk."""
@@ -386,7 +386,7 @@ def said(t_ns: int) -> list[Output]:
     ]
 
 
-def test_a_hole_in_the_queue_counts_events_alone(tmp_path: Path) -> None:
+def test_queue_overflow_gap_counts_only_log_events(tmp_path: Path) -> None:
     """Notices without a log event are dropped too, but they are not missing from the log."""
     made = recorder(tmp_path, queue_max=2)
     hand_over(made, ticks(1, 5))
@@ -415,7 +415,7 @@ class _Broken(Writer):
         return False
 
 
-def test_a_hole_in_a_broken_file_counts_events_alone(
+def test_write_failure_gap_counts_only_log_events(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("companion.recording.background.RETRY_FIRST_S", 0.001)
@@ -447,7 +447,7 @@ def test_a_hole_in_a_broken_file_counts_events_alone(
     assert (hole.events, hole.why) == (2, os.strerror(errno.EIO))
 
 
-def test_a_part_says_by_itself_what_its_times_lack_to_be_utc(tmp_path: Path) -> None:
+def test_each_part_holds_its_utc_offset(tmp_path: Path) -> None:
     made = recorder(tmp_path, Rotation(1.0, None))
     made.start()
     clock_set = ClockSet(START_NS, -5)
@@ -461,7 +461,7 @@ def test_a_part_says_by_itself_what_its_times_lack_to_be_utc(tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("rotation", [Rotation(1.0, None), Rotation(None, 0.5)])
-def test_a_new_part_goes_on_where_the_one_before_ends(tmp_path: Path, rotation: Rotation) -> None:
+def test_new_part_continues_where_the_previous_ends(tmp_path: Path, rotation: Rotation) -> None:
     made = recorder(tmp_path, rotation)
     made.start()
     events = []

@@ -19,7 +19,7 @@ def declare(log: Path, *events: tuple[float, int, str]) -> Path:
     return log
 
 
-def test_what_begins_and_what_ends(tmp_path: Path) -> None:
+def test_fault_start_and_end_events_form_intervals(tmp_path: Path) -> None:
     log = declare(
         tmp_path / "a.tlog",
         (100.0, 3, "gps_off"), (101.0, 2, "gps_on"), (108.5, 3, "gps_on"),
@@ -34,7 +34,7 @@ def test_what_begins_and_what_ends(tmp_path: Path) -> None:
     )
 
 
-def test_no_list_is_no_fault(tmp_path: Path) -> None:
+def test_missing_fault_list_means_no_faults(tmp_path: Path) -> None:
     assert declared_faults(tmp_path / "a.tlog") == ()
 
 
@@ -50,14 +50,14 @@ def test_no_list_is_no_fault(tmp_path: Path) -> None:
     ],
     ids=range(6),
 )
-def test_what_is_no_list_of_events(tmp_path: Path, text: str) -> None:
+def test_invalid_fault_list_is_rejected(tmp_path: Path, text: str) -> None:
     (tmp_path / "a.tlog.events.json").write_text(text)
     with pytest.raises(LogError, match="must be a list of entries"):
         declared_faults(tmp_path / "a.tlog")
 
 
 @pytest.mark.full
-def test_the_faults_of_a_simulated_flight() -> None:
+def test_faults_of_a_simulated_flight_are_read() -> None:
     """Each vehicle has its own fault window, widened until its estimate has settled."""
     flights = vehicles.load(shared_log("sitl_4circle_wander.tlog"), "5:1").flights
     lasts_s = {f.uav: [(b - a) / S for a, b in f.faults] for f in flights}

@@ -41,7 +41,7 @@ def recording(tmp_path: Path, record: Callable[..., list[Event]]) -> Path:
     return writer.close({"digest": "d"})
 
 
-def test_the_ends_are_those_of_reading_all(tlog: Path, recording: Path) -> None:
+def test_time_span_equals_that_of_a_full_read(tlog: Path, recording: Path) -> None:
     for path in (tlog, recording):
         times = [event.t_ns for event in read_log(path)]
         assert span_ns([path]) == (min(times), max(times))
@@ -54,14 +54,14 @@ def test_the_ends_are_those_of_reading_all(tlog: Path, recording: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"\x00", b"\xfd" * 8, bytes(9), b"\x89MCAP0\r\n"])
-def test_a_small_file_tells_nothing(tmp_path: Path, tlog: Path, content: bytes) -> None:
+def test_small_file_has_unknown_time_span(tmp_path: Path, tlog: Path, content: bytes) -> None:
     small = tmp_path / "small"
     small.write_bytes(content)
     assert span_ns([small]) is None
     assert span_ns([tlog, small]) is None
 
 
-def test_damage_is_never_a_failure_nor_another_time(
+def test_damaged_ends_give_the_full_read_span_or_unknown(
     tmp_path: Path, tlog: Path, recording: Path
 ) -> None:
     """Any byte of the ends changed or cut: the span is unknown or one that a full read may also

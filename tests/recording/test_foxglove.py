@@ -71,7 +71,7 @@ async def watch(port: int, topics: set[str], feed: Callable[[], None]) -> dict[s
 
 
 @pytest.mark.full
-def test_a_viewer_is_sent_what_a_recording_holds(
+def test_viewer_receives_the_channels_of_a_recording(
     geodetic: Geodetic, update: Callable[[int], Update], estimate: Estimate
 ) -> None:
     live = LiveChannels(
@@ -104,14 +104,14 @@ def test_a_viewer_is_sent_what_a_recording_holds(
     assert live.dropped == 0
 
 
-def test_a_port_that_is_taken_is_said(geodetic: Geodetic) -> None:
+def test_port_in_use_is_reported(geodetic: Geodetic) -> None:
     live = LiveChannels(host="127.0.0.1", port=0, geodetic=geodetic, scene=None)
     with pytest.raises(LiveError, match=rf"cannot listen on 127\.0\.0\.1:{live.port}"):
         LiveChannels(host="127.0.0.1", port=live.port, geodetic=geodetic, scene=None)
     live.stop()
 
 
-def test_the_service_serves_them(start_node: Any) -> None:
+def test_service_publishes_the_live_channels(start_node: Any) -> None:
     node = start_node(
         "run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "1:1",
         "--foxglove", "0",
@@ -133,7 +133,7 @@ main(["run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center
 
 
 @pytest.mark.full
-def test_without_the_extra_it_is_one_line() -> None:
+def test_missing_foxglove_extra_is_a_one_line_error() -> None:
     done = subprocess.run(
         [sys.executable, "-c", _WITHOUT],
         capture_output=True,
@@ -145,7 +145,7 @@ def test_without_the_extra_it_is_one_line() -> None:
     assert done.stderr.count("\n") == 1 and "foxglove-sdk" in done.stderr, done.stderr
 
 
-def test_it_is_not_loaded_where_it_is_not_asked_for() -> None:
+def test_foxglove_is_not_imported_unless_enabled() -> None:
     code = "import sys, companion.node.service; print('foxglove' in sys.modules)"
     done = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True, timeout=HANG_S

@@ -86,7 +86,7 @@ def leftovers() -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("name", leftovers())
-def test_a_leftover_is_dealt_with_once(tmp_path: Path, name: str) -> None:
+def test_unfinished_file_is_recovered_or_set_aside_once(tmp_path: Path, name: str) -> None:
     leftover = tmp_path / "x.mcap.active"
     leftover.write_bytes(leftovers()[name])
     (found,) = recover_leftovers(tmp_path)
@@ -99,7 +99,7 @@ def test_a_leftover_is_dealt_with_once(tmp_path: Path, name: str) -> None:
         assert str(found).endswith("; kept as x.mcap.damaged")
 
 
-def test_a_leftover_that_nobody_has_foreseen_is_put_aside(
+def test_unfinished_file_with_unexpected_error_is_set_aside(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def explode(_: object) -> None:
@@ -117,7 +117,7 @@ def test_a_leftover_that_nobody_has_foreseen_is_put_aside(
     assert (tmp_path / "0.mcap.damaged").read_bytes() == b"older"
 
 
-def test_a_leftover_that_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
+def test_unfinished_entry_that_is_not_a_file_does_not_block(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "x.mcap.active")
     (found,) = recover_leftovers(tmp_path)
     assert "not a file" in str(found)
@@ -128,14 +128,14 @@ def test_a_leftover_that_is_no_file_is_not_waited_for(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_random_damage_raises_nothing_else(
+def test_random_damage_raises_only_log_errors(
     tmp_path: Path, events: Callable[[int], list[Event]]
 ) -> None:
     """Bytes changed, removed and duplicated, and lengths enlarged, 3000 times."""
     _damaged_at_random(tmp_path, events, range(3000))
 
 
-def test_some_random_damage_raises_nothing_else(
+def test_random_damage_sample_raises_only_log_errors(
     tmp_path: Path, events: Callable[[int], list[Event]]
 ) -> None:
     _damaged_at_random(tmp_path, events, range(100_000, 100_150))
@@ -279,7 +279,9 @@ for path in map(Path, sys.argv[1:]):
 @pytest.mark.parametrize(
     "names", [QUICK, *(pytest.param(names, marks=pytest.mark.full) for names in (SLOW, PAIRS))]
 )
-def test_no_file_takes_more_memory_than_there_is(tmp_path: Path, names: frozenset[str]) -> None:
+def test_decompression_bombs_are_read_in_bounded_memory(
+    tmp_path: Path, names: frozenset[str]
+) -> None:
     """Time is bounded too: each file is read, described and recovered within ``HANG_S``."""
     wanted = [path for path in bombs(tmp_path) if path.stem in names]
     command = [sys.executable, "-c", _READ_ALL, *map(str, wanted)]
@@ -290,7 +292,7 @@ def test_no_file_takes_more_memory_than_there_is(tmp_path: Path, names: frozense
     assert max(peaks_mb.values()) < MOST_MB, peaks_mb
 
 
-def test_pairs_without_end_are_damage(tmp_path: Path) -> None:
+def test_too_many_metadata_pairs_are_damage(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     kept = _metadata(_pairs(3))
     for wide in (_metadata(_pairs(9000)), _packed(_channel(1, _pairs(9000)))):
@@ -301,7 +303,7 @@ def test_pairs_without_end_are_damage(tmp_path: Path) -> None:
         assert len(found.metadata) == 3
 
 
-def test_all_pairs_of_all_channels_are_bounded(tmp_path: Path) -> None:
+def test_metadata_pairs_of_all_channels_are_bounded(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     pairs = _pairs(4000)
     path.write_bytes(MAGIC + b"".join(_packed(_channel(number, pairs)) for number in range(1, 60)))
@@ -313,7 +315,7 @@ def test_all_pairs_of_all_channels_are_bounded(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("each", [_metadata(b""), record(ATTACHMENT, _attachment())])
-def test_more_of_a_kind_than_any_file_has_is_lost(tmp_path: Path, each: bytes) -> None:
+def test_records_beyond_the_limit_per_kind_are_discarded(tmp_path: Path, each: bytes) -> None:
     torn = tmp_path / "x.mcap.active"
     torn.write_bytes(MAGIC + each * 10_100 + described() + message(no_frame(FRAME)))
     found = recover(torn)
@@ -322,7 +324,7 @@ def test_more_of_a_kind_than_any_file_has_is_lost(tmp_path: Path, each: bytes) -
     assert sum(isinstance(one, Attachment | Metadata) for one in Walk(found.path)) == 10_000
 
 
-def test_more_channels_than_a_recording_has_are_put_aside(tmp_path: Path) -> None:
+def test_recording_with_too_many_channels_is_set_aside(tmp_path: Path) -> None:
     torn = tmp_path / "x.mcap.active"
     torn.write_bytes(MAGIC + _packed(b"".join(_channel(number) for number in range(1 << 16))))
     (told,) = recover_leftovers(tmp_path)
@@ -331,7 +333,7 @@ def test_more_channels_than_a_recording_has_are_put_aside(tmp_path: Path) -> Non
     assert [path.name for path in tmp_path.iterdir()] == ["x.mcap.damaged"]
 
 
-def test_messages_are_read_as_they_are_asked_for(tmp_path: Path) -> None:
+def test_messages_are_read_lazily(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(MAGIC + _packed(described() + message(b"") * 10_000 + b"\x05"))
     walk = iter(Walk(path))
@@ -349,14 +351,14 @@ def test_messages_are_read_as_they_are_asked_for(tmp_path: Path) -> None:
     [b"", b"\xfe", b"\xfd" + bytes(10), FRAME + b"\0", b"\xfd\xff" + bytes(12), b"\0" * 20],
     ids=["empty", "magic", "short", "long", "cut", "none"],
 )
-def test_a_frame_that_is_none_is_said(tmp_path: Path, raw: bytes) -> None:
+def test_malformed_frame_is_rejected(tmp_path: Path, raw: bytes) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(MAGIC + _packed(described() + message(no_frame(raw))))
     with pytest.raises(LogError, match="not a recording of this program: malformed frame"):
         list(read_log(path))
 
 
-def test_a_time_beyond_all_time_is_said(tmp_path: Path) -> None:
+def test_event_time_out_of_range_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(MAGIC + _packed(described() + message(no_frame(FRAME, 2**63))))
     with pytest.raises(LogError, match="event time out of range"):
@@ -385,7 +387,7 @@ def test_a_time_beyond_all_time_is_said(tmp_path: Path) -> None:
     ],
     ids=["ids", "names", "names without end", "twice and again"],
 )
-def test_an_event_that_is_none_is_said(tmp_path: Path, topic: str, data: bytes, said: str) -> None:
+def test_malformed_event_is_rejected(tmp_path: Path, topic: str, data: bytes, said: str) -> None:
     path = tmp_path / "x.mcap"
     frame = MAGIC + _packed(described() + message(no_frame(FRAME)))
     path.write_bytes(frame + _packed(described(topic.encode()) + message(data)))
@@ -396,7 +398,7 @@ def test_an_event_that_is_none_is_said(tmp_path: Path, topic: str, data: bytes, 
 @pytest.mark.parametrize(
     "data", [b"\xff\xff", schemas.ClockSetMessage(utc_offset_ns=2**63 - 1).SerializeToString()]
 )
-def test_a_clock_that_cannot_be_is_said_wherever_it_is_read(tmp_path: Path, data: bytes) -> None:
+def test_invalid_clock_event_is_rejected_by_every_reader(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(MAGIC + _packed(described(schemas.CLOCK_TOPIC.encode()) + message(data)))
     for read in (lambda: list(read_log(path)), lambda: utc_offset_ns([path])):
@@ -404,7 +406,7 @@ def test_a_clock_that_cannot_be_is_said_wherever_it_is_read(tmp_path: Path, data
             read()
 
 
-def test_settings_that_are_no_text_are_said(tmp_path: Path) -> None:
+def test_settings_that_are_not_utf8_are_rejected(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     with path.open("wb") as file:
         mcap = McapFile(file)
@@ -417,7 +419,7 @@ def test_settings_that_are_no_text_are_said(tmp_path: Path) -> None:
         read_settings(path)
 
 
-def test_holes_without_number_are_counted_together(tmp_path: Path) -> None:
+def test_gaps_beyond_the_limit_are_merged(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(MAGIC + record(METADATA, _hole()) * (HOLES_MAX + 5))
     holes = read_recording_info(path).holes
@@ -425,7 +427,7 @@ def test_holes_without_number_are_counted_together(tmp_path: Path) -> None:
     assert holes[-1].events == 2 * 6
 
 
-def test_a_hole_says_nothing_that_a_terminal_obeys_and_no_number_beyond_all(tmp_path: Path) -> None:
+def test_gap_text_is_sanitised_and_its_count_bounded(tmp_path: Path) -> None:
     hole = Hole.from_metadata({"t_ns": "5", "events": "1", "why": "\x1b[2J\x1b]0;x\x07\ndisk \x9b"})
     assert hole.why == "[2J]0;xdisk "
     for events in ("-1", "", "9" * 19, "9" * 4300, "9" * 5000):
@@ -441,11 +443,11 @@ def test_a_hole_says_nothing_that_a_terminal_obeys_and_no_number_beyond_all(tmp_
 
 
 @pytest.mark.parametrize("number", ["9" * 10, "9" * 5000])
-def test_a_part_beyond_all_numbers_is_none(number: str) -> None:
+def test_part_number_out_of_range_is_ignored(number: str) -> None:
     assert Part.from_metadata({"run": "r", "number": number}) is None
 
 
-def test_what_others_pack_with_lz4_is_read(tmp_path: Path) -> None:
+def test_lz4_chunks_of_other_programs_are_read(tmp_path: Path) -> None:
     import lz4.frame
 
     contents = described(b"/mavlink/raw") + message(FRAME) * 3
@@ -458,13 +460,13 @@ def test_what_others_pack_with_lz4_is_read(tmp_path: Path) -> None:
         assert sum(isinstance(content, Message) for content in Walk(path)) == found
 
 
-def test_a_recovered_file_of_others_keeps_what_has_no_schema(tmp_path: Path) -> None:
+def test_recovery_keeps_foreign_messages_without_schema(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
     path.write_bytes(leftovers()["no-schema"])
     assert recover(path).messages == {"/a": 1}
 
 
-def test_what_is_whole_is_read_as_ever(tmp_path: Path) -> None:
+def test_intact_recording_is_read_unchanged(tmp_path: Path) -> None:
     driven = [Tick(5), Frame(t_ns=6, link="udp", source=Source(1, 1), msgid=0, raw=FRAME)]
     with Writer(
         where=tmp_path / "x.mcap", settings_toml="", versions={}, weights_hz=None, started_ns=0

@@ -21,13 +21,13 @@ def leaves(node: Any) -> list[str]:
     return [*leaves(node["first"]), *leaves(node["second"])]
 
 
-def test_every_panel_is_placed_once() -> None:
+def test_layout_places_every_panel_once() -> None:
     placed = leaves(LAYOUT["layout"])
     assert sorted(placed) == sorted(LAYOUT["configById"])
     assert {panel.split("!")[0] for panel in placed} == PANELS
 
 
-def test_it_names_only_topics_fields_and_frames_that_are_there() -> None:
+def test_layout_names_only_existing_topics_fields_and_frames() -> None:
     panels = LAYOUT["configById"]
     topics = dict(entries.NAMED)
     assert topics[panels["RosOut!log"]["topicToRender"]] is schemas.LOG

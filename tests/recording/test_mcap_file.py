@@ -43,7 +43,7 @@ def play(seed: int, made: McapFile | Library) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_the_bytes_are_the_librarys(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_writer_bytes_equal_the_mcap_library(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     size = (1 << 20, 2000)[seed % 2]
     monkeypatch.setattr(mcap_file, "CHUNK_BYTES", size)
     ours, theirs = io.BytesIO(), io.BytesIO()
@@ -54,7 +54,7 @@ def test_the_bytes_are_the_librarys(seed: int, monkeypatch: pytest.MonkeyPatch) 
     assert ours.getvalue() == theirs.getvalue()
 
 
-def test_a_viewer_finds_messages_by_their_index(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_messages_are_found_through_the_index(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(mcap_file, "CHUNK_BYTES", 500)
     out = io.BytesIO()
     made = McapFile(out)

@@ -69,7 +69,7 @@ def read_with_python(path: Path) -> dict[str, dict[str, Any]]:
     return {topic: found | {"hash": found["hash"].hexdigest()} for topic, found in topics.items()}
 
 
-def test_the_npm_reader_finds_every_message(
+def test_npm_reader_finds_every_message(
     tmp_path: Path, packages: Path, record: Callable[..., list[Event]]
 ) -> None:
     part = Part("abc", 2, "one.mcap")

@@ -40,7 +40,7 @@ def write(path: Path, part: Part | None, events: list[Event], hole: Hole | None 
 
 
 @pytest.fixture
-def run_in_three(tmp_path: Path, short_log: Path) -> tuple[list[Path], list[Event], str]:
+def run_of_three_parts(tmp_path: Path, short_log: Path) -> tuple[list[Path], list[Event], str]:
     """A flight in three parts whose names are not in order, with its events and digest."""
     settings = Settings()
     pipeline = Pipeline(settings)
@@ -56,10 +56,10 @@ def run_in_three(tmp_path: Path, short_log: Path) -> tuple[list[Path], list[Even
     return logs, events, pipeline.digest.hexdigest()
 
 
-def test_parts_in_any_order_replay_to_the_digest_of_the_run(
-    run_in_three: tuple[list[Path], list[Event], str],
+def test_shuffled_parts_replay_to_the_digest_of_the_run(
+    run_of_three_parts: tuple[list[Path], list[Event], str],
 ) -> None:
-    logs, events, digest = run_in_three
+    logs, events, digest = run_of_three_parts
     for shuffled in permutations(logs):
         assert list(log_events(shuffled, Settings())) == events
     summary = replay([logs[2], logs[0], logs[1]], Settings())
@@ -68,25 +68,27 @@ def test_parts_in_any_order_replay_to_the_digest_of_the_run(
     assert replay(logs[1:], Settings())["digest"] != digest
 
 
-def test_a_recovered_part_keeps_its_place(
-    run_in_three: tuple[list[Path], list[Event], str], tmp_path: Path
+def test_recovered_part_keeps_its_position_in_the_run(
+    run_of_three_parts: tuple[list[Path], list[Event], str], tmp_path: Path
 ) -> None:
-    logs, events, _ = run_in_three
+    logs, events, _ = run_of_three_parts
     cut = tmp_path / "d.mcap.active"
     cut.write_bytes(logs[1].read_bytes()[:-400])
     assert read_recording_info(recover(cut).path) == read_recording_info(logs[1])
     assert list(log_events([logs[0], tmp_path / "d.mcap", logs[2]], Settings())) == events
 
 
-def test_what_is_not_there_is_said(run_in_three: tuple[list[Path], list[Event], str]) -> None:
-    one, two, three = run_in_three[0]
+def test_missing_parts_are_reported(
+    run_of_three_parts: tuple[list[Path], list[Event], str],
+) -> None:
+    one, two, three = run_of_three_parts[0]
     assert missing_of([one, two]) == []  # a missing last part cannot be detected
     assert missing_of([one, three]) == [f"{three}: part 2 of the run is missing"]
     assert missing_of([three]) == [f"{three}: part 1 to 2 of the run is missing"]
     assert missing_of([three, two]) == [f"{two}: part 1 of the run is missing"]
 
 
-def test_a_hole_is_said_where_it_is(tmp_path: Path) -> None:
+def test_gap_is_reported_with_its_time_and_event_count(tmp_path: Path) -> None:
     part = Part.first()
     path = write(tmp_path / "a.mcap", part, [Tick(7)], Hole(START_NS, 12, "no room"))
     assert read_recording_info(path).holes == (Hole(START_NS, 12, "no room"),)
@@ -99,7 +101,7 @@ def test_a_hole_is_said_where_it_is(tmp_path: Path) -> None:
     assert (done.returncode, "no beam was computed" in done.stderr) == (1, True)
 
 
-def test_a_part_twice_is_refused(tmp_path: Path) -> None:
+def test_duplicate_part_is_rejected(tmp_path: Path) -> None:
     part = Part.first()
     logs = [write(tmp_path / f"{name}.mcap", part, [Tick(7)]) for name in "ab"]
     with pytest.raises(LogError, match=r"a\.mcap and .*b\.mcap are both part 1 of one run"):
@@ -107,21 +109,21 @@ def test_a_part_twice_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("alone", [False, True])
-def test_different_runs_are_merged_by_time_as_before(tmp_path: Path, alone: bool) -> None:
+def test_parts_of_different_runs_are_merged_by_time(tmp_path: Path, alone: bool) -> None:
     one = write(tmp_path / "a.mcap", None if alone else Part.first(), [Tick(1), Tick(3)])
     other = write(tmp_path / "b.mcap", Part.first(), [Tick(2)])
     assert in_order({log: read_recording_info(log) for log in (one, other)}) is None
     assert list(log_events([one, other], Settings())) == []  # ticks are generated
 
 
-def test_an_empty_part_is_part_of_a_run(tmp_path: Path) -> None:
+def test_empty_part_belongs_to_its_run(tmp_path: Path) -> None:
     part = Part.first()
     one = write(tmp_path / "a.mcap", part, [Tick(1)])
     other = write(tmp_path / "b.mcap", part.after("a.mcap"), [])
     assert list(log_events([one, other], Settings())) == [Tick(1)]
 
 
-def test_nonsense_about_parts_is_none() -> None:
+def test_invalid_part_metadata_is_ignored() -> None:
     assert Part.from_metadata({"run": "a", "number": "x"}) is None
     assert Part.from_metadata({"number": "1"}) is None
     part = Part.first().after("x")
@@ -129,7 +131,7 @@ def test_nonsense_about_parts_is_none() -> None:
     assert missing({}, []) == []
 
 
-def test_a_recording_holds_the_gains_of_its_observer(tmp_path: Path, short_log: Path) -> None:
+def test_recording_holds_its_observer_gains(tmp_path: Path, short_log: Path) -> None:
     """The gains file named in the settings may have changed or be missing at replay."""
     from importlib import resources
 

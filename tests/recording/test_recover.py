@@ -48,7 +48,7 @@ def recovered_events(path: Path) -> list[Event]:
         return []
 
 
-def test_cut_anywhere_no_more_than_one_flush_is_lost(
+def test_truncation_anywhere_loses_at_most_one_flush(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
     whole, driven, flushed = recording
@@ -87,7 +87,7 @@ def test_cut_anywhere_no_more_than_one_flush_is_lost(
         assert summary.statistics.message_count == sum(result.messages.values())
 
 
-def test_a_torn_file_reads_as_far_as_it_goes(
+def test_truncated_file_is_read_up_to_the_cut(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
     whole, driven, flushed = recording
@@ -99,7 +99,7 @@ def test_a_torn_file_reads_as_far_as_it_goes(
             assert list(read_log(torn)) == driven[:events]
 
 
-def test_everything_of_an_intact_part_is_kept(
+def test_recovery_keeps_every_message_of_the_intact_part(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
     """Compare message for message, outputs included, byte for byte."""
@@ -122,7 +122,7 @@ def test_everything_of_an_intact_part_is_kept(
     assert result.last_ns == max(log_time for _, _, log_time, _ in kept)
 
 
-def test_a_finished_recording_is_left_alone(
+def test_recovery_leaves_a_finished_recording_unchanged(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
     whole, driven, _ = recording
@@ -138,7 +138,7 @@ def test_a_finished_recording_is_left_alone(
     assert list(read_log(tmp_path / "done.mcap")) == driven
 
 
-def test_no_other_file_is_overwritten(
+def test_recovery_overwrites_no_other_file(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
     whole, _, _ = recording
@@ -148,7 +148,7 @@ def test_no_other_file_is_overwritten(
     assert (tmp_path / "x.mcap").read_bytes() == b"mine"
 
 
-def test_the_original_stays_until_the_new_file_is_whole(
+def test_failed_recovery_keeps_the_original(
     tmp_path: Path,
     recording: tuple[Path, list[Event], list[tuple[int, int]]],
     monkeypatch: pytest.MonkeyPatch,
@@ -167,7 +167,7 @@ def test_the_original_stays_until_the_new_file_is_whole(
     assert names(tmp_path) == ["whole", "x.mcap.active"]
 
 
-def test_damage_in_the_middle_costs_one_chunk_and_is_said(
+def test_damaged_chunk_is_lost_alone_and_reported(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
     whole, driven, flushed = recording
@@ -185,7 +185,7 @@ def test_damage_in_the_middle_costs_one_chunk_and_is_said(
     assert list(read_log(result.path)) == [*driven[:first], *driven[last:]]
 
 
-def test_damage_at_the_beginning_costs_no_more(
+def test_damaged_first_chunk_is_lost_alone(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
     """The first chunk describes the channels, and so does the end of the file if present."""
@@ -208,7 +208,7 @@ def test_damage_at_the_beginning_costs_no_more(
     assert recover(path).lost_bytes > 2 * said.count
 
 
-def test_the_latest_time_need_not_be_the_last(tmp_path: Path) -> None:
+def test_recovery_reports_the_latest_time_of_all_messages(tmp_path: Path) -> None:
     with Writer(
         where=tmp_path / "x.mcap", settings_toml="", versions={}, weights_hz=None, started_ns=0
     ) as writer:
@@ -219,7 +219,7 @@ def test_the_latest_time_need_not_be_the_last(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_flipped_bytes_never_raise(
+def test_flipped_bits_never_raise(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]], seed: int
 ) -> None:
     broken = bytearray(recording[0].read_bytes())
@@ -235,7 +235,7 @@ def test_flipped_bytes_never_raise(
     assert after == before
 
 
-def test_leftovers_are_recovered_and_what_cannot_be_is_told(
+def test_unfinished_files_are_recovered_and_failures_reported(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
 ) -> None:
     data = recording[0].read_bytes()
@@ -257,7 +257,7 @@ def test_leftovers_are_recovered_and_what_cannot_be_is_told(
     ]  # fmt: skip
 
 
-def test_what_is_no_recording_is_said(tmp_path: Path) -> None:
+def test_recover_rejects_files_that_are_not_recordings(tmp_path: Path) -> None:
     (tmp_path / "empty.mcap").touch()
     (tmp_path / "text.mcap").write_text("hello, this is no recording")
     for name, why in [
@@ -288,7 +288,7 @@ for number in itertools.count():
 """
 
 
-def test_a_killed_process_loses_nothing_that_was_flushed(tmp_path: Path) -> None:
+def test_killed_process_loses_no_flushed_event(tmp_path: Path) -> None:
     with started(
         [sys.executable, "-c", _RECORD_FOREVER, str(tmp_path)], stdout=subprocess.PIPE, text=True
     ) as process:

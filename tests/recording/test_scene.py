@@ -105,7 +105,7 @@ def turned(quaternion: object) -> Rotation:
 
 
 @given(TURNS, TURNS, st.tuples(*[st.floats(-500, 500)] * 3))
-def test_what_is_drawn_ends_at_the_uav(
+def test_drawn_line_of_sight_ends_at_the_uav(
     mount: tuple[float, float, float],
     attitude: tuple[float, float, float],
     place: tuple[float, float, float],
@@ -142,7 +142,7 @@ def test_what_is_drawn_ends_at_the_uav(
     assert seen == pytest.approx(np.array(expected), abs=1e-6)
 
 
-def test_a_level_carrier_that_faces_north_has_x_north_and_z_up() -> None:
+def test_level_carrier_facing_north_has_x_north_and_z_up() -> None:
     array = array_on((0, 0, 0), np.array([1.0, 2.0, 3.0]))
     update = update_of(array, (0, 0, 0), np.array([1000.0, 0.0, 0.0]))
     on_map, on_carrier = Scene(array, 2.0).transforms(update)
@@ -154,7 +154,7 @@ def test_a_level_carrier_that_faces_north_has_x_north_and_z_up() -> None:
 
 
 @pytest.mark.parametrize("azimuth_deg", [0.0, 30.0, -50.0])
-def test_cones_are_about_as_wide_as_the_beams(azimuth_deg: float) -> None:
+def test_cone_widths_match_the_beamwidths(azimuth_deg: float) -> None:
     array = uniform_rectangular(
         16, columns=32, frequency_hz=3e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)
     )
@@ -169,7 +169,7 @@ def test_cones_are_about_as_wide_as_the_beams(azimuth_deg: float) -> None:
     assert across < upright / 2 <= WIDEST_RAD / 2
 
 
-def test_the_bound_is_the_cylinder_that_is_guaranteed_and_goes_by_itself() -> None:
+def test_cylinder_shows_the_bound_and_disappears_without_it() -> None:
     array = array_on((0, 0, 0), np.zeros(3))
     update = update_of(array, (0, 0, 0), np.array([1000.0, 0.0, 0.0]))
     uav, _ = Scene(array, 4.0).picture(update).entities
@@ -187,7 +187,7 @@ def test_the_bound_is_the_cylinder_that_is_guaranteed_and_goes_by_itself() -> No
 
 
 @given(st.floats(-89, 89), st.floats(-180, 180), st.floats(-100, 9000))
-def test_the_map_stands_on_the_earth(lat_deg: float, lon_deg: float, alt_m: float) -> None:
+def test_map_frame_matches_pymap3d(lat_deg: float, lon_deg: float, alt_m: float) -> None:
     """A map point transformed to the Earth frame equals the result of pymap3d."""
     array = array_on((0.0, 0.0, 0.0), np.zeros(3))
     found = Scene(array, 2.0).origin(NOW_NS, lat_deg, lon_deg, alt_m)

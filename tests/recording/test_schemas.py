@@ -34,7 +34,7 @@ REJECTIONS = st.builds(
 @example(Frame(t_ns=1, link="x" * 200, source=Source(0, 255), msgid=2**24 - 1, raw=b"\xfd" * 200))
 @example(Frame(t_ns=0, link="", source=Source(0, 0), msgid=0, raw=b"\xfd" * 127))
 @example(Frame(t_ns=0, link="", source=Source(0, 0), msgid=0, raw=b"\xfd" * 128))
-def test_a_hand_packed_frame_is_the_generated_one(frame: Frame) -> None:
+def test_hand_packed_frame_equals_the_generated_class(frame: Frame) -> None:
     generated = schemas.FrameMessage(
         t_ns=frame.t_ns,
         link=frame.link,
@@ -50,12 +50,12 @@ def test_a_hand_packed_frame_is_the_generated_one(frame: Frame) -> None:
 
 
 @given(TIMES, st.booleans())
-def test_a_hand_packed_tick_is_the_generated_one(t_ns: int, in_two: bool) -> None:
+def test_hand_packed_tick_equals_the_generated_class(t_ns: int, in_two: bool) -> None:
     generated = schemas.TickMessage(t_ns=t_ns, in_two=in_two)
     assert schemas.encode_tick(t_ns, in_two=in_two) == generated.SerializeToString()
 
 
-def test_frames_of_made_up_ids_fill_no_memory() -> None:
+def test_frame_encoder_cache_is_bounded() -> None:
     encoder = schemas.FrameEncoder()
     for number in range(schemas.HEADS_MAX + 10):
         frame = Frame(t_ns=1, link=f"udp:{number}", source=Source(1, 1), msgid=0, raw=b"\xfe")
@@ -64,19 +64,19 @@ def test_frames_of_made_up_ids_fill_no_memory() -> None:
 
 
 @given(FRAMES)
-def test_a_frame_survives_the_round_trip(frame: Frame) -> None:
+def test_frame_round_trip_is_lossless(frame: Frame) -> None:
     assert codec.to_frame(schemas.FrameEncoder().encode(frame), {}) == frame
 
 
 @given(REJECTIONS)
-def test_a_rejection_survives_the_round_trip(rejection: Rejection) -> None:
+def test_rejection_round_trip_is_lossless(rejection: Rejection) -> None:
     data = schemas.encode("Rejection", fields.RecordedRejection(rejection, True))
     assert codec.to_rejection(data) == rejection
     output = schemas.encode("Rejection", fields.RecordedRejection(rejection, False))
     assert codec.to_rejection(output) is None
 
 
-def test_every_schema_is_complete_in_itself() -> None:
+def test_every_schema_is_self_contained() -> None:
     for schema in (schemas.FRAME, schemas.TICK, schemas.REJECTION, schemas.TRACK,
                    schemas.WEIGHTS, schemas.LOCATION_FIX, schemas.LOG):  # fmt: skip
         pool = DescriptorPool()
@@ -85,7 +85,7 @@ def test_every_schema_is_complete_in_itself() -> None:
         assert pool.FindMessageTypeByName(schema.name).full_name == schema.name
 
 
-def test_an_optional_field_says_so_to_every_reader() -> None:
+def test_optional_fields_are_marked_in_the_descriptor() -> None:
     file = FileDescriptorSet.FromString(schemas.TRACK.descriptor_set).file[0]
     [track] = [message for message in file.message_type if message.name == "Track"]
     optional = [field.name for field in track.field if field.proto3_optional]
@@ -100,7 +100,7 @@ def test_an_optional_field_says_so_to_every_reader() -> None:
     ]
 
 
-def test_the_numbers_of_the_fields_stay() -> None:
+def test_event_field_numbers_are_unchanged() -> None:
     """Old recordings stay readable: these field numbers are stored in files."""
     numbers = {
         (name, field.name): field.number
@@ -148,7 +148,7 @@ NUMBERS = {
 """The number of each field that a version has written. A number keeps its meaning for good."""
 
 
-def test_a_number_that_was_written_once_keeps_its_meaning() -> None:
+def test_published_field_numbers_keep_their_fields() -> None:
     for message, written in NUMBERS.items():
         now = {one.name: one.number for one in fields.fields(message)}
         then = {name: int(number) for name, number in (one.split("=") for one in written.split())}

@@ -78,7 +78,7 @@ def pymavlink_frames(data: bytes, gap: int) -> Iterator[bytes]:
 
 
 @pytest.mark.parametrize("v1", [False, True])
-def test_an_intact_log_gives_every_frame_at_its_stamp(wire: Wire, v1: bool) -> None:
+def test_intact_tlog_yields_every_frame_at_its_timestamp(wire: Wire, v1: bool) -> None:
     frames = wire(100, v1=v1)
     data = stamped(frames)
     assert sniff(data) == "tlog"
@@ -94,7 +94,7 @@ def test_an_intact_log_gives_every_frame_at_its_stamp(wire: Wire, v1: bool) -> N
         assert event.source == (message.get_srcSystem(), message.get_srcComponent())
 
 
-def test_a_frame_of_an_unknown_id_costs_only_itself(wire: Wire) -> None:
+def test_unknown_message_id_loses_only_its_frame(wire: Wire) -> None:
     frames = wire(40)
     mixed = [*frames[:10], UNKNOWN, *frames[10:20], UNKNOWN, UNKNOWN, *frames[20:], UNKNOWN]
     events = list(read_tlog(stamped(mixed), "x"))
@@ -104,7 +104,7 @@ def test_a_frame_of_an_unknown_id_costs_only_itself(wire: Wire) -> None:
     assert after.t_ns == (START_US + 11 * 10_000) * 1000
 
 
-def test_a_stamp_may_hold_magic_bytes(wire: Wire) -> None:
+def test_timestamp_may_contain_magic_bytes(wire: Wire) -> None:
     """Eight bytes that look like a frame header, between two frames that cannot be checked."""
     frames = wire(3)
     false_start = struct.pack(">Q", 0x0006_0AFD_0000_0000)
@@ -118,7 +118,7 @@ def test_a_stamp_may_hold_magic_bytes(wire: Wire) -> None:
 # --- damaged ------------------------------------------------------------------------------------
 
 
-def test_a_flipped_byte_costs_only_its_frame(wire: Wire) -> None:
+def test_flipped_byte_loses_only_its_frame(wire: Wire) -> None:
     """At every byte of a log in turn; a damaged timestamp byte loses no frame."""
     frames = wire(8)
     data = stamped(frames)
@@ -134,7 +134,7 @@ def test_a_flipped_byte_costs_only_its_frame(wire: Wire) -> None:
             assert lost(events), at
 
 
-def test_damage_is_counted_as_on_the_wire(wire: Wire) -> None:
+def test_damaged_frames_are_counted_as_on_the_wire(wire: Wire) -> None:
     frames = wire(30)
     bad_crc = bytearray(frames[3])
     bad_crc[-1] ^= 0xFF
@@ -146,7 +146,7 @@ def test_damage_is_counted_as_on_the_wire(wire: Wire) -> None:
     assert times == sorted(times)
 
 
-def test_a_splice_costs_only_what_is_cut(wire: Wire) -> None:
+def test_removed_section_loses_only_its_frames(wire: Wire) -> None:
     frames = wire(60)
     data = stamped(frames)
     ends, at = [], 0
@@ -176,7 +176,7 @@ def test_garbage_between_records_is_counted_in_bytes(wire: Wire) -> None:
     assert lost(events)[Reason.GARBAGE] == 33
 
 
-def test_a_bad_stamp_is_said_and_the_frame_handed_on(wire: Wire) -> None:
+def test_bad_timestamp_is_reported_and_its_frame_kept(wire: Wire) -> None:
     frames = wire(20)
     data = bytearray(stamped(frames))
     at = sum(8 + len(frame) for frame in frames[:5])
@@ -193,7 +193,7 @@ def test_a_bad_stamp_is_said_and_the_frame_handed_on(wire: Wire) -> None:
     ]
 
 
-def test_a_bad_first_stamp_leaves_the_others_alone(wire: Wire) -> None:
+def test_bad_first_timestamp_leaves_the_others_unchanged(wire: Wire) -> None:
     frames = wire(10)
     data = struct.pack(">Q", START_US + 10**18) + stamped(frames)[8:]
     times = [event.t_ns for event in read_tlog(data, "x") if isinstance(event, Frame)]
@@ -202,7 +202,7 @@ def test_a_bad_first_stamp_leaves_the_others_alone(wire: Wire) -> None:
 
 @settings(max_examples=examples(200))
 @given(st.lists(st.binary(max_size=40) | st.sampled_from([UNKNOWN, b"\xfd", b"\xfe\x09"])))
-def test_any_bytes_at_all(pieces: list[bytes]) -> None:
+def test_arbitrary_bytes_never_raise_and_time_is_monotonic(pieces: list[bytes]) -> None:
     """Nothing raises, time is monotonic, and no more bytes are lost than were present."""
     data = b"".join(pieces)
     for events in (list(read_tlog(data, "x")), list(read_raw(data, "x"))):
@@ -214,7 +214,7 @@ def test_any_bytes_at_all(pieces: list[bytes]) -> None:
 # --- raw ----------------------------------------------------------------------------------------
 
 
-def test_raw_mavlink_has_the_first_clocks_time(wire: Wire) -> None:
+def test_raw_mavlink_uses_the_first_vehicle_clock(wire: Wire) -> None:
     frames = wire(60)  # a heartbeat first; then positions and attitudes of 1:1 and 2:1 alternately
     events = list(read_raw(b"".join(frames), "x"))
     assert sniff(b"".join(frames)) == "mavlink"
@@ -230,13 +230,13 @@ def test_raw_mavlink_has_the_first_clocks_time(wire: Wire) -> None:
     assert times_ms == expected
 
 
-def test_raw_mavlink_without_a_clock_is_at_the_epoch() -> None:
+def test_raw_mavlink_without_a_clock_starts_at_the_epoch() -> None:
     mav = dialect.MAVLink(None)
     heartbeat = bytes(mav.heartbeat_encode(2, 3, 0, 0, 4).pack(mav))
     assert [event.t_ns for event in read_raw(heartbeat * 3, "x")] == [0, 0, 0]
 
 
-def test_messages_of_one_sender_may_be_a_little_out_of_step() -> None:
+def test_slightly_reordered_boot_times_are_tolerated() -> None:
     mav = dialect.MAVLink(None)
     boots_ms = [1000, 1010, 1004, 1020, 1015]
     data = b"".join(bytes(mav.attitude_encode(ms, 0, 0, 0, 0, 0, 0).pack(mav)) for ms in boots_ms)
@@ -245,7 +245,7 @@ def test_messages_of_one_sender_may_be_a_little_out_of_step() -> None:
     assert lost(events) == {}
 
 
-def test_raw_mavlink_goes_on_over_a_reboot() -> None:
+def test_raw_mavlink_time_continues_after_a_reboot() -> None:
     mav = dialect.MAVLink(None)
     boots_ms = [90_000, 90_500, 91_000, 200, 700, 1_200, 1_700]
     data = b"".join(bytes(mav.attitude_encode(ms, 0, 0, 0, 0, 0, 0).pack(mav)) for ms in boots_ms)
@@ -256,7 +256,7 @@ def test_raw_mavlink_goes_on_over_a_reboot() -> None:
 # --- files --------------------------------------------------------------------------------------
 
 
-def test_the_content_decides_not_the_name(tmp_path: Path, wire: Wire) -> None:
+def test_log_kind_depends_on_content_not_name(tmp_path: Path, wire: Wire) -> None:
     frames = wire(20)
     tlog, raw = tmp_path / "a.mcap", tmp_path / "b.tlog"
     tlog.write_bytes(stamped(frames))
@@ -267,19 +267,19 @@ def test_the_content_decides_not_the_name(tmp_path: Path, wire: Wire) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 2])
-def test_a_log_of_a_frame_or_two(wire: Wire, count: int) -> None:
+def test_very_short_logs_are_recognised(wire: Wire, count: int) -> None:
     frames = wire(count)
     assert sniff(stamped(frames)) == "tlog"
     assert sniff(b"".join(frames)) == "mavlink"
 
 
-def test_a_damaged_beginning_does_not_hide_the_kind(wire: Wire) -> None:
+def test_damaged_start_does_not_hide_the_log_kind(wire: Wire) -> None:
     frames = wire(30)
     assert sniff(stamped(frames)[5:]) == "tlog"
     assert sniff(b"".join(frames)[5:]) == "mavlink"
 
 
-def test_what_cannot_be_used_is_said_in_one_line(tmp_path: Path, wire: Wire) -> None:
+def test_unusable_log_is_a_one_line_error(tmp_path: Path, wire: Wire) -> None:
     noise = random.Random(3).randbytes(300_000)
     lone = noise[:5000] + wire(1)[0] + noise[5000:9000]
     cases: dict[str, tuple[bytes | None, str]] = {
@@ -308,7 +308,7 @@ def test_what_cannot_be_used_is_said_in_one_line(tmp_path: Path, wire: Wire) -> 
 
 
 @pytest.mark.full
-def test_the_logs_of_other_programs(shared_logs: list[Path]) -> None:
+def test_logs_of_other_programs_yield_the_frames_of_pymavlink(shared_logs: list[Path]) -> None:
     """Every frame that pymavlink finds, and no other, on a monotonic timeline."""
     for path in shared_logs:
         assert log_kind(path) == "tlog"

@@ -54,7 +54,7 @@ def decode_all(path: Path) -> list[tuple[str, Any, Any]]:
     return found
 
 
-def test_the_events_come_back_as_they_were(tmp_path: Path, record: Record) -> None:
+def test_written_events_are_read_back_unchanged(tmp_path: Path, record: Record) -> None:
     """Links, equal times and backward steps are kept; outputs are not read as events."""
     writer = open_writer(tmp_path)
     driven = record(writer, 500, flush_every=37)
@@ -68,7 +68,7 @@ def test_the_events_come_back_as_they_were(tmp_path: Path, record: Record) -> No
     [lambda one: one.close({}), Writer.salvage, Writer.abandon],
     ids=["close", "salvage", "abandon"],
 )
-def test_a_file_that_is_done_with_leaves_no_memory_behind(
+def test_finished_writer_is_freed_without_garbage_collection(
     tmp_path: Path, record: Record, end: Callable[[Writer], object]
 ) -> None:
     """Regression: 1.5 MB per file stayed, as full garbage collections are rare in the service."""
@@ -85,7 +85,7 @@ def test_a_file_that_is_done_with_leaves_no_memory_behind(
         gc.enable()
 
 
-def test_the_file_has_its_name_settings_and_metadata(tmp_path: Path, record: Record) -> None:
+def test_file_has_its_name_settings_and_metadata(tmp_path: Path, record: Record) -> None:
     writer = open_writer(tmp_path / "new folder")
     assert writer.path.name == "companion-20231114T221320Z.mcap.active"
     assert writer.path.exists()
@@ -99,7 +99,7 @@ def test_the_file_has_its_name_settings_and_metadata(tmp_path: Path, record: Rec
     assert writer.size_bytes == path.stat().st_size
 
 
-def test_nothing_is_overwritten_in_a_folder(tmp_path: Path) -> None:
+def test_writer_overwrites_no_file_in_a_folder(tmp_path: Path) -> None:
     first, second = open_writer(tmp_path), open_writer(tmp_path)
     second_path, first_path = second.close({}), first.close({})
     third = open_writer(tmp_path)
@@ -113,7 +113,7 @@ def test_nothing_is_overwritten_in_a_folder(tmp_path: Path) -> None:
     ]
 
 
-def test_a_file_that_is_asked_for_by_name_is_replaced_on_close(tmp_path: Path) -> None:
+def test_explicitly_named_file_is_replaced_on_close(tmp_path: Path) -> None:
     path = tmp_path / "out.mcap"
     path.write_bytes(b"what was there before")
     writer = open_writer(path)
@@ -125,7 +125,7 @@ def test_a_file_that_is_asked_for_by_name_is_replaced_on_close(tmp_path: Path) -
     assert list(read_log(path)) == [Tick(5)]
 
 
-def test_a_flush_reaches_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_flush_syncs_the_file_to_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A power failure cannot be tested; the sync requests to the system can."""
     writer = open_writer(tmp_path)
     synced: list[int] = []
@@ -139,7 +139,7 @@ def test_a_flush_reaches_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     assert synced[1] == size and len(synced) == 3  # the last sync is the folder's, for the new name
 
 
-def test_left_without_close_it_stays_active(tmp_path: Path, record: Record) -> None:
+def test_writer_left_unclosed_keeps_the_active_name(tmp_path: Path, record: Record) -> None:
     with open_writer(tmp_path) as writer:
         driven = record(writer, 20)
         writer.flush()
@@ -147,7 +147,7 @@ def test_left_without_close_it_stays_active(tmp_path: Path, record: Record) -> N
     assert list(read_log(writer.path)) == driven
 
 
-def test_every_channel_can_be_decoded_from_the_file_alone(tmp_path: Path, record: Record) -> None:
+def test_every_channel_decodes_from_the_file_alone(tmp_path: Path, record: Record) -> None:
     writer = open_writer(tmp_path)
     driven = record(writer, 120)
     found = decode_all(writer.close({}))
@@ -173,7 +173,7 @@ def test_every_channel_can_be_decoded_from_the_file_alone(tmp_path: Path, record
     assert frames == [(event.t_ns, event.t_ns) for event in driven if isinstance(event, Frame)]
 
 
-def test_a_fix_and_a_prediction_as_viewers_see_them(tmp_path: Path, record: Record) -> None:
+def test_fix_and_prediction_have_positions_and_covariances(tmp_path: Path, record: Record) -> None:
     writer = open_writer(tmp_path)
     record(writer, 30)
     found = {topic: (raw, message) for topic, raw, message in decode_all(writer.close({}))}
@@ -193,7 +193,7 @@ def test_a_fix_and_a_prediction_as_viewers_see_them(tmp_path: Path, record: Reco
     assert predicted.position_covariance_type == predicted.APPROXIMATED
 
 
-def test_unknown_is_not_zero(tmp_path: Path, record: Record) -> None:
+def test_unknown_values_are_unset_not_zero(tmp_path: Path, record: Record) -> None:
     writer = open_writer(tmp_path)
     record(writer, 30)
     found = {topic: message for topic, _, message in decode_all(writer.close({}))}
@@ -239,7 +239,7 @@ def test_weights_are_row_major_complex64(
         (30.0, 1, 1001, 31),
     ],
 )
-def test_weights_are_thinned_by_the_updates_own_time(
+def test_weights_are_thinned_by_update_time(
     *,
     tmp_path: Path,
     update: Callable[[int], Update],
@@ -257,7 +257,7 @@ def test_weights_are_thinned_by_the_updates_own_time(
     assert counts["/tracks"] == 2 * kept
 
 
-def test_a_clock_set_back_does_not_silence_the_weights(
+def test_backward_clock_step_does_not_suppress_weights(
     tmp_path: Path, update: Callable[[int], Update], geodetic: Any
 ) -> None:
     writer = open_writer(tmp_path, 10.0)
@@ -267,7 +267,7 @@ def test_a_clock_set_back_does_not_silence_the_weights(
     assert counts["/beams/weights"] == 3
 
 
-def test_a_recording_can_be_recorded_again(tmp_path: Path, record: Record) -> None:
+def test_recording_of_a_replay_equals_the_original(tmp_path: Path, record: Record) -> None:
     """Replay of a replay: the second generation equals the first."""
     writer = open_writer(tmp_path)
     driven = record(writer, 50)
@@ -277,7 +277,7 @@ def test_a_recording_can_be_recorded_again(tmp_path: Path, record: Record) -> No
     assert list(read_log(again.close({}))) == driven
 
 
-def test_a_chunk_is_closed_before_it_grows_large(tmp_path: Path) -> None:
+def test_chunk_size_is_limited(tmp_path: Path) -> None:
     writer = open_writer(tmp_path)
     noise = np.random.default_rng(1)
     frames = [
@@ -301,7 +301,7 @@ def test_a_chunk_is_closed_before_it_grows_large(tmp_path: Path) -> None:
 
 
 @pytest.mark.benchmark
-def test_six_minutes_of_busy_traffic_are_written_in_two_seconds(
+def test_six_minutes_of_traffic_are_written_within_four_seconds(
     tmp_path: Path, events: Callable[[int], list[Event]], estimate: Estimate, geodetic: Any,
     update: Callable[[int], Update],
 ) -> None:  # fmt: skip
@@ -322,7 +322,7 @@ def test_six_minutes_of_busy_traffic_are_written_in_two_seconds(
     assert took_s < 4.0
 
 
-def test_what_is_salvaged_ends_at_the_last_flush(tmp_path: Path) -> None:
+def test_salvaged_file_ends_at_the_last_flush(tmp_path: Path) -> None:
     """A chunk written to disk since the last flush is removed: it is written to the next file."""
     writer = open_writer(tmp_path)
     noise = np.random.default_rng(1)
@@ -341,7 +341,7 @@ def test_what_is_salvaged_ends_at_the_last_flush(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])
-def test_who_flies_where_is_not_for_all_to_read(tmp_path: Path, umask: int) -> None:
+def test_recordings_are_not_world_readable(tmp_path: Path, umask: int) -> None:
     """Recordings, recovered files and new folders are accessible to the owner and group only."""
     before = os.umask(umask)
     try:

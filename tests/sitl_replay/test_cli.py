@@ -103,7 +103,7 @@ def test_command_error_is_one_line(
     assert complaint in line
 
 
-def test_a_refused_connection_is_one_line() -> None:
+def test_refused_connection_is_a_one_line_error() -> None:
     with socket.socket() as gone:
         gone.bind(("127.0.0.1", 0))
         url = url_of(gone, "tcp")
@@ -124,7 +124,7 @@ def test_every_help_has_an_example(command: click.Command) -> None:
     assert "Example: sitl-replay" in " ".join(result.stdout.split())
 
 
-def test_list() -> None:
+def test_list_command_shows_every_scenario() -> None:
     text = CliRunner().invoke(main, ["list"]).stdout
     listed = json.loads(CliRunner().invoke(main, ["list", "--json"]).stdout)
     assert [one["name"] for one in listed] == list(scenario.BUILDERS)
@@ -133,7 +133,7 @@ def test_list() -> None:
         assert f"{one['name']:9} {one['description']}\n" in text
 
 
-def test_fly_sends_and_sums_up(receiver: socket.socket, tmp_path: Path) -> None:
+def test_fly_sends_frames_and_prints_a_summary(receiver: socket.socket, tmp_path: Path) -> None:
     tlog = tmp_path / "a.tlog"
     arguments = ["fly", "hover", "--uavs", "2", "--to", url_of(receiver), "--duration", "0.3"]
     result = CliRunner().invoke(main, [*arguments, "--seed", "8", "--record", str(tlog), "--json"])
@@ -147,7 +147,7 @@ def test_fly_sends_and_sums_up(receiver: socket.socket, tmp_path: Path) -> None:
     assert sources == {1, 2, 5}
 
 
-def test_fly_gives_the_seed_to_the_scenario(receiver: socket.socket, tmp_path: Path) -> None:
+def test_fly_passes_the_seed_to_the_scenario(receiver: socket.socket, tmp_path: Path) -> None:
     # The recording holds the sent frames with timestamps; positions identify the flown tour.
     tlog = tmp_path / "a.tlog"
     arguments = ["fly", "waypoints", "--to", url_of(receiver), "--duration", "0.3", "--seed", "9"]
@@ -160,7 +160,7 @@ def test_fly_gives_the_seed_to_the_scenario(receiver: socket.socket, tmp_path: P
 
 
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_a_flight_well(
+def test_signal_ends_a_flight_cleanly(
     receiver: socket.socket, tmp_path: Path, stop: signal.Signals
 ) -> None:
     tlog = tmp_path / "a.tlog"
@@ -178,7 +178,7 @@ def test_a_signal_ends_a_flight_well(
     assert tlog.stat().st_size > 0
 
 
-def test_record_until_a_signal(tmp_path: Path) -> None:
+def test_record_runs_until_a_signal(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
@@ -219,7 +219,7 @@ def written(path: Path, stamps_s: list[float]) -> list[bytes]:
     return frames
 
 
-def test_play(receiver: socket.socket, tmp_path: Path) -> None:
+def test_play_sends_the_frames_of_a_log(receiver: socket.socket, tmp_path: Path) -> None:
     pytest.importorskip("companion.recording.reader")
     log = tmp_path / "a.tlog"
     frames = written(log, [0.0, 0.05, 0.1, 0.2])
@@ -232,7 +232,7 @@ def test_play(receiver: socket.socket, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", random.Random(1).randbytes(100), b"\n" * 5000], ids=len)
-def test_a_log_without_a_frame_is_one_line(content: bytes, tmp_path: Path) -> None:
+def test_log_without_frames_is_a_one_line_error(content: bytes, tmp_path: Path) -> None:
     pytest.importorskip("companion.recording.reader")
     log = tmp_path / "bad.tlog"
     log.write_bytes(content)
@@ -243,7 +243,7 @@ def test_a_log_without_a_frame_is_one_line(content: bytes, tmp_path: Path) -> No
     assert "bad.tlog" in line
 
 
-def test_a_log_that_breaks_on_the_way_is_one_line(
+def test_log_error_during_playback_is_a_one_line_error(
     receiver: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Behaviour of a reader on a truncated file: some frames, then its error.
@@ -259,7 +259,7 @@ def test_a_log_that_breaks_on_the_way_is_one_line(
     assert receiver.recv(300) == raw
 
 
-def test_broken_stamps_are_told_once(receiver: socket.socket, tmp_path: Path) -> None:
+def test_bad_timestamps_are_reported_once(receiver: socket.socket, tmp_path: Path) -> None:
     pytest.importorskip("companion.recording.reader")
     log = tmp_path / "a.tlog"
     written(log, [0.0, 100.0, 300.0, 300.1, 200.0])
@@ -271,7 +271,7 @@ def test_broken_stamps_are_told_once(receiver: socket.socket, tmp_path: Path) ->
     assert 0.1 <= json.loads(result.stdout)["duration_s"] < 0.6
 
 
-def test_rejections_of_a_log_are_summed_up(receiver: socket.socket, tmp_path: Path) -> None:
+def test_rejections_of_a_log_are_summarised(receiver: socket.socket, tmp_path: Path) -> None:
     pytest.importorskip("companion.recording.reader")
     log = tmp_path / "a.tlog"
     frames = written(log, [0.0, 0.01, 1e7, 0.02, 0.03, 0.04])
@@ -287,7 +287,7 @@ def test_rejections_of_a_log_are_summed_up(receiver: socket.socket, tmp_path: Pa
     assert summary["duration_s"] < 1.0
 
 
-def test_a_link_lost_on_the_way_is_a_failure(receiver: socket.socket) -> None:
+def test_link_lost_during_playback_is_a_failure(receiver: socket.socket) -> None:
     def leave() -> None:
         server.accept()[0].close()
 
@@ -306,7 +306,7 @@ def test_a_link_lost_on_the_way_is_a_failure(receiver: socket.socket) -> None:
 
 
 @pytest.mark.parametrize("command", ["play", "fly"])
-def test_the_help_has_every_fault(command: str) -> None:
+def test_help_describes_every_fault(command: str) -> None:
     text = " ".join(CliRunner().invoke(main, [command, "--help"]).stdout.split())
     for kind in KINDS.values():
         assert f"{kind.form}: {kind.meaning}. Example: {kind.example}" in text
@@ -338,7 +338,7 @@ def written_as(kind: str, folder: Path, stamps_s: list[float]) -> tuple[Path, li
 
 
 @pytest.mark.parametrize("kind", ["tlog", "raw", "mcap"])
-def test_every_kind_of_log_is_played_with_its_broken_stamps_clamped(
+def test_bad_timestamps_are_clamped_in_every_log_format(
     kind: str, receiver: socket.socket, tmp_path: Path
 ) -> None:
     path, frames = written_as(kind, tmp_path, [0.0, 10.0, 10.1, 200.0, 200.1])
@@ -353,7 +353,7 @@ def test_every_kind_of_log_is_played_with_its_broken_stamps_clamped(
     assert "2 time stamps step back, or jump by more than 5 s" in line
 
 
-def test_faults_are_summed_up(receiver: socket.socket, tmp_path: Path) -> None:
+def test_faults_are_summarised(receiver: socket.socket, tmp_path: Path) -> None:
     path, frames = written_as("tlog", tmp_path, [0.01 * number for number in range(60)])
     arguments = ["play", str(path), "--to", url_of(receiver), "--seed", "7"]
     for text in ("duplication@1:1=1", "loss=0.5", "jitter@77=1"):
@@ -374,7 +374,7 @@ def test_faults_are_summed_up(receiver: socket.socket, tmp_path: Path) -> None:
     assert text.endswith(f", loss: {lost}, duplication@1:1: {doubled}, jitter@77: 0\n")
 
 
-def test_a_flight_for_those_who_connect(tmp_path: Path) -> None:
+def test_tcp_server_flight_serves_connecting_peers(tmp_path: Path) -> None:
     arguments = ["fly", "paper", "--to", "tcpin:127.0.0.1:0", "--fault", "reboot=0.1", "--json"]
     with started(
         [*COMMAND, *arguments], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True

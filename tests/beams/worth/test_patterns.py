@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given, note, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import find_peaks
@@ -470,6 +470,7 @@ def check_null(scan: FloatArray, fallen: int, null: float) -> int:
 @settings(max_examples=examples(12), deadline=None, derandomize=True)
 def test_lobe_matches_a_dense_scan(name: str, seed: int) -> None:
     """Any weights, any direction: peak, widths, nulls and side lobe of the exact pattern."""
+    note(f"seed {seed}")
     rng = np.random.default_rng(seed)
     array = ARRAYS[name]
     at = towards(rng.uniform(-180, 180), rng.uniform(-75, 75))

@@ -111,7 +111,9 @@ def events_of(data: bytes, tmp_path: Path) -> list[Event]:
 
 @pytest.mark.parametrize("link_type", LINKS)
 @pytest.mark.parametrize("version", [4, 6])
-def test_every_link_and_address(link_type: int, version: int, tmp_path: Path) -> None:
+def test_capture_reads_every_link_type_and_ip_version(
+    link_type: int, version: int, tmp_path: Path
+) -> None:
     found = events_of(pcap(rows(link_type, version), link_type), tmp_path)
     assert raws(found) == FRAMES
     assert [event.t_ns - START_NS for event in found] == [n * STEP_NS for n in range(60)]
@@ -120,19 +122,19 @@ def test_every_link_and_address(link_type: int, version: int, tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("magic", PCAP)
-def test_both_orders_and_both_units(magic: bytes, tmp_path: Path) -> None:
+def test_pcap_reads_both_byte_orders_and_time_units(magic: bytes, tmp_path: Path) -> None:
     assert raws(events_of(pcap(rows(), magic=magic), tmp_path)) == FRAMES
 
 
 @pytest.mark.parametrize("order", "<>")
 @pytest.mark.parametrize("resolution", [6, 9])
-def test_pcapng(order: str, resolution: int, tmp_path: Path) -> None:
+def test_pcapng_frames_and_timestamps_are_read(order: str, resolution: int, tmp_path: Path) -> None:
     found = events_of(pcapng(rows(), order, resolution), tmp_path)
     assert raws(found) == FRAMES
     assert found[-1].t_ns == START_NS + 59 * STEP_NS
 
 
-def test_a_packet_without_a_time_has_that_of_the_one_before(tmp_path: Path) -> None:
+def test_packet_without_timestamp_inherits_the_previous_one(tmp_path: Path) -> None:
     first, (_, data) = rows()[:1], rows()[1]
     simple = block(3, struct.pack("<I", len(data)) + data)
     found = events_of(pcapng(first) + simple, tmp_path)
@@ -140,7 +142,7 @@ def test_a_packet_without_a_time_has_that_of_the_one_before(tmp_path: Path) -> N
     assert [event.t_ns for event in found] == [START_NS, START_NS]
 
 
-def test_a_vlan_and_a_padded_packet(tmp_path: Path) -> None:
+def test_vlan_tag_and_ethernet_padding_are_stripped(tmp_path: Path) -> None:
     tagged = [
         (t_ns, data[:12] + b"\x81\x00\x00\x05" + data[12:] + bytes(9)) for t_ns, data in rows()
     ]
@@ -148,7 +150,7 @@ def test_a_vlan_and_a_padded_packet(tmp_path: Path) -> None:
     assert raws(found) == FRAMES and not [e for e in found if isinstance(e, Rejection)]
 
 
-def test_each_way_has_a_splitter_of_its_own(tmp_path: Path) -> None:
+def test_each_direction_has_its_own_frame_splitter(tmp_path: Path) -> None:
     """Frames split in halves, two directions interleaved: halves of different directions do not
     mix."""
     halves = []
@@ -163,7 +165,7 @@ def test_each_way_has_a_splitter_of_its_own(tmp_path: Path) -> None:
 
 
 @given(st.integers(0, 2**32), st.integers(0, 2**32 - 1))
-def test_segments_of_tcp_in_any_order_and_more_than_once(seed: int, begins: int) -> None:
+def test_reordered_and_duplicate_tcp_segments_are_reassembled(seed: int, begins: int) -> None:
     rng = random.Random(seed)
     stream = b"".join(FRAMES)
     cuts = sorted({0, len(stream), *(rng.randrange(len(stream)) for _ in range(40))})
@@ -179,7 +181,7 @@ def test_segments_of_tcp_in_any_order_and_more_than_once(seed: int, begins: int)
     assert not [event for event in found if isinstance(event, Rejection)]
 
 
-def test_a_segment_that_never_came_costs_its_frames(tmp_path: Path) -> None:
+def test_missing_tcp_segment_loses_only_its_frames(tmp_path: Path) -> None:
     stream = b"".join(FRAMES * 20)
     parts = [(at, stream[at : at + 100]) for at in range(0, len(stream), 100)]
     lost = parts.pop(20)
@@ -188,7 +190,7 @@ def test_a_segment_that_never_came_costs_its_frames(tmp_path: Path) -> None:
     assert lost and len(FRAMES) * 20 - 12 <= len(raws(found)) < len(FRAMES) * 20
 
 
-def test_other_traffic_says_nothing(tmp_path: Path) -> None:
+def test_capture_without_mavlink_is_rejected(tmp_path: Path) -> None:
     rng = random.Random(5)
     others = [(START_NS, LINKS[1](v4(udp(rng.randbytes(300), (53, 4000))))) for _ in range(50)]
     fragments = [(START_NS, LINKS[1](v4(udp(FRAMES[0]), fragment=0x2000)))] * 5
@@ -201,14 +203,14 @@ def test_other_traffic_says_nothing(tmp_path: Path) -> None:
         read_log(path)
 
 
-def test_a_capture_that_was_cut_gives_what_is_there(tmp_path: Path) -> None:
+def test_truncated_capture_is_read_up_to_the_cut(tmp_path: Path) -> None:
     for data in (pcap(rows()), pcapng(rows())):
         found = events_of(data[: len(data) * 2 // 3], tmp_path)
         whole = raws(found)
         assert whole == FRAMES[: len(whole)] and 38 <= len(whole) <= 41
 
 
-def test_an_absurd_length_ends_it_and_is_counted(tmp_path: Path) -> None:
+def test_absurd_packet_length_ends_reading_and_is_counted(tmp_path: Path) -> None:
     data = pcap(rows()) + struct.pack("<4I", 0, 0, 0xFFFFFFF0, 0) + bytes(5000)
     found = events_of(data, tmp_path)
     assert raws(found) == FRAMES
@@ -218,14 +220,16 @@ def test_an_absurd_length_ends_it_and_is_counted(tmp_path: Path) -> None:
 
 
 @given(st.binary(max_size=200), st.integers(0, 300))
-def test_any_packet(data: bytes, link_type: int) -> None:
+def test_arbitrary_packet_bytes_never_raise(data: bytes, link_type: int) -> None:
     for kind in (link_type, *LINKS):
         found = segment(Packet(0, kind, data))
         assert found is None or len(found.payload) <= len(data)
 
 
 @pytest.mark.parametrize("whole", [pcap(rows()), pcapng(rows()), pcap(rows(101, 6), 101)])
-def test_damaged_captures(whole: bytes, tmp_path: Path) -> None:
+def test_damaged_captures_yield_only_sent_frames_in_time_order(
+    whole: bytes, tmp_path: Path
+) -> None:
     path = tmp_path / "net"
     for seed in range(150):
         rng = random.Random(seed)
@@ -240,7 +244,7 @@ def test_damaged_captures(whole: bytes, tmp_path: Path) -> None:
         assert set(raws(found)) <= set(FRAMES)
 
 
-def test_more_ways_than_are_followed(tmp_path: Path) -> None:
+def test_flows_beyond_the_tracking_limit_lose_no_frame(tmp_path: Path) -> None:
     many = [(START_NS + n, LINKS[1](v4(udp(FRAMES[n % 60], (n + 1, 14550))))) for n in range(3000)]
     assert len(raws(events_of(pcap(many), tmp_path))) == 3000
 
@@ -272,7 +276,7 @@ def sent_over_loopback() -> None:
                 pass
 
 
-def test_packets_that_the_system_captured(tmp_path: Path) -> None:
+def test_packets_captured_on_loopback_are_read(tmp_path: Path) -> None:
     try:
         tap = socket.socket(socket.AF_PACKET, socket.SOCK_RAW, socket.htons(3))
     except (PermissionError, AttributeError):
@@ -297,7 +301,7 @@ def test_packets_that_the_system_captured(tmp_path: Path) -> None:
 # --- MCAP files of other programs --------------------------------------------------------------
 
 
-def others_mcap(
+def foreign_mcap(
     path: Path, encoding: str, topic: str, *, end: bool = True, chunks: bool = True
 ) -> None:
     with path.open("wb") as file:
@@ -318,11 +322,9 @@ def others_mcap(
     ("encoding", "topic"), [("mavlink", "/uav/raw"), ("protobuf", "/MAVLink/in")]
 )
 @pytest.mark.parametrize("chunks", [True, False])
-def test_an_mcap_of_another_program(
-    encoding: str, topic: str, chunks: bool, tmp_path: Path
-) -> None:
+def test_foreign_mcap_is_read(encoding: str, topic: str, chunks: bool, tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
-    others_mcap(path, encoding, topic, chunks=chunks)
+    foreign_mcap(path, encoding, topic, chunks=chunks)
     assert log_kind(path) == "foreign-mcap"
     found = list(read_log(path))
     assert raws(found) == FRAMES
@@ -330,23 +332,23 @@ def test_an_mcap_of_another_program(
     assert found[-1].t_ns == START_NS + 59 * STEP_NS
 
 
-def test_an_mcap_of_another_program_that_was_cut(tmp_path: Path) -> None:
+def test_truncated_foreign_mcap_is_read_up_to_the_cut(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
-    others_mcap(path, "mavlink", "/uav/raw", chunks=False)
+    foreign_mcap(path, "mavlink", "/uav/raw", chunks=False)
     path.write_bytes(path.read_bytes()[:4000])
     found = list(read_log(path))
     assert 20 < len(raws(found)) < 60
     assert isinstance(found[-1], Rejection) and found[-1].reason is Reason.GARBAGE
 
 
-def test_an_mcap_without_mavlink(tmp_path: Path) -> None:
+def test_mcap_without_mavlink_is_rejected(tmp_path: Path) -> None:
     path = tmp_path / "x.mcap"
-    others_mcap(path, "cdr", "/imu")
+    foreign_mcap(path, "cdr", "/imu")
     with pytest.raises(LogError, match="an MCAP file, but no MAVLink frame in it"):
         read_log(path)
 
 
-def test_a_capture_and_a_log_of_a_vehicle_are_one_flight(aeroplane: Path, tmp_path: Path) -> None:
+def test_capture_and_onboard_log_merge_into_one_flight(aeroplane: Path, tmp_path: Path) -> None:
     path = tmp_path / "net.pcap"
     first_ns = next(iter(read_log(aeroplane))).t_ns
     path.write_bytes(pcap([(t - START_NS + first_ns, data) for t, data in rows()]))

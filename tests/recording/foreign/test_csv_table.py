@@ -22,7 +22,7 @@ def read(text: str) -> csv_table.Onboard:
     return csv_table.read(text.encode())
 
 
-def test_places_times_and_the_way_between_them() -> None:
+def test_csv_positions_and_times_are_read_and_velocities_derived() -> None:
     log = read(f"# sysid = 42\n# mav_type = 2\n{HEAD}\n{ROWS}\n")
     assert (log.sysid, log.mav_type, log.lost) == (42, 2, {})
     at = log.positions
@@ -37,7 +37,9 @@ def test_places_times_and_the_way_between_them() -> None:
 @pytest.mark.parametrize("divider", [",", ";", "\t"])
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
 @pytest.mark.parametrize("mark", ["", "\ufeff"])
-def test_dividers_and_line_ends(divider: str, newline: str, mark: str) -> None:
+def test_csv_separators_and_line_endings_are_accepted(
+    divider: str, newline: str, mark: str
+) -> None:
     text = mark + f"{HEAD},vn_mps,ve_mps,vd_mps,heading_deg,extra\n"
     text += "1795000000,47,8.5,500,1.5,-2.5,0.5,90,x\n1795000001,47,8.5,500,,,,,\n"
     log = read(text.replace(",", divider).replace("\n", newline))
@@ -48,7 +50,7 @@ def test_dividers_and_line_ends(divider: str, newline: str, mark: str) -> None:
     assert "column not used: extra" in log.notes
 
 
-def test_times_with_their_zone() -> None:
+def test_iso_times_with_and_without_zone_are_parsed() -> None:
     times = ("2026-11-22T12:00:00.5+01:00", "2026-11-22T11:00:01Z", "2026-11-22T11:00:02")
     log = read("time,lat_deg,lon_deg,alt_m\n" + "".join(f"{time},47,8,5\n" for time in times))
     assert log.positions is not None and log.clock is not None
@@ -59,7 +61,7 @@ def test_times_with_their_zone() -> None:
     assert log.lost == {Reason.MALFORMED: 1}  # the last one has no time zone
 
 
-def test_attitudes_and_accuracies_are_said(tmp_path: Path) -> None:
+def test_csv_attitudes_and_accuracies_become_frames(tmp_path: Path) -> None:
     path = tmp_path / "flight.csv"
     path.write_text(
         f"{HEAD},roll_deg,pitch_deg,yaw_deg,h_acc_m,v_acc_m,vel_acc_mps,fix_type\n"
@@ -85,12 +87,12 @@ def test_attitudes_and_accuracies_are_said(tmp_path: Path) -> None:
         ("\n\n", "text without a table"),
     ],
 )
-def test_what_is_no_such_table_is_said(text: str, why: str) -> None:
+def test_invalid_csv_table_is_rejected_with_a_reason(text: str, why: str) -> None:
     with pytest.raises(NoTableError, match=why):
         read(text)
 
 
-def test_lines_that_are_no_numbers_are_counted() -> None:
+def test_malformed_csv_lines_are_counted() -> None:
     bad = [
         "1795000001,47,8.5",
         "1795000002,x,8.5,5",
@@ -104,7 +106,7 @@ def test_lines_that_are_no_numbers_are_counted() -> None:
 
 
 @given(st.text(max_size=300), st.booleans())
-def test_any_text(text: str, with_header: bool) -> None:
+def test_arbitrary_text_is_a_table_or_rejected(text: str, with_header: bool) -> None:
     try:
         log = read(f"{HEAD}\n{text}" if with_header else text)
     except NoTableError:

@@ -51,24 +51,24 @@ def require_equal(path: Path) -> Counter[str]:
     return Counter({name: len(messages) for name, messages in theirs.items()})
 
 
-def test_every_value_is_that_of_dfreader(aeroplane: Path) -> None:
+def test_dataflash_values_equal_dfreader(aeroplane: Path) -> None:
     assert require_equal(aeroplane)["POS"] == 200
 
 
 @pytest.mark.full
 @pytest.mark.parametrize("vehicle", [1, 5])
-def test_every_value_of_a_whole_flight_is_that_of_dfreader(vehicle: int) -> None:
+def test_dataflash_values_of_a_whole_flight_equal_dfreader(vehicle: int) -> None:
     assert require_equal(shared_log(f"sitl_planes_circle_{vehicle}.bin"))["POS"] > 2000
 
 
-def test_it_is_known_who_wrote_it(aeroplane: Path, carrier: Path) -> None:
+def test_sysid_vehicle_type_and_autopilot_are_read(aeroplane: Path, carrier: Path) -> None:
     one, five = (ardupilot.read(as_bytes(path.read_bytes())) for path in (aeroplane, carrier))
     assert (one.sysid, one.mav_type, one.autopilot) == (1, 1, 3)
     assert (five.sysid, five.mav_type, five.autopilot) == (5, 2, 3)
     assert one.lost == five.lost == {}
 
 
-def test_a_position_has_the_velocity_of_the_core_in_use(aeroplane: Path) -> None:
+def test_position_uses_velocity_of_the_primary_ekf_core(aeroplane: Path) -> None:
     log = ardupilot.read(as_bytes(CUT))
     theirs = peers(aeroplane, ("POS", "XKF1", "XKF4", "ATT"))
     primary = theirs["XKF4"][0].PI
@@ -90,7 +90,7 @@ def test_a_position_has_the_velocity_of_the_core_in_use(aeroplane: Path) -> None
     assert same > 190
 
 
-def test_attitudes_are_angles_with_their_rates(aeroplane: Path) -> None:
+def test_attitudes_hold_angles_and_matching_rates(aeroplane: Path) -> None:
     log = ardupilot.read(as_bytes(CUT))
     assert log.attitudes is not None
     theirs = peers(aeroplane, ("ATT",))["ATT"]
@@ -104,7 +104,7 @@ def test_attitudes_are_angles_with_their_rates(aeroplane: Path) -> None:
     assert np.corrcoef(turned_rad, rolled_rad)[0, 1] > 0.8
 
 
-def test_accuracies_stand_beside_their_fix(aeroplane: Path) -> None:
+def test_accuracies_are_matched_to_their_fix(aeroplane: Path) -> None:
     log = ardupilot.read(as_bytes(CUT))
     assert log.fixes is not None
     theirs = peers(aeroplane, ("GPA",))["GPA"]
@@ -125,7 +125,7 @@ def messages(data: bytes) -> int:
     return sum(len(at) for at in walked.at.values())
 
 
-def test_a_hole_in_the_middle_costs_what_it_cut() -> None:
+def test_gap_in_dataflash_loses_only_the_removed_messages() -> None:
     whole = messages(CUT)
     data = as_bytes(CUT)
     pos = next(iter(walk(data, ("POS",)).at.values()))
@@ -138,7 +138,7 @@ def test_a_hole_in_the_middle_costs_what_it_cut() -> None:
 
 
 @pytest.mark.parametrize("tail", [b"", b"\xa3", b"\xa3\x95", b"\xa3\x95\x80", bytes(300)])
-def test_a_tail_costs_no_more_than_the_last_message(tail: bytes) -> None:
+def test_trailing_bytes_lose_at_most_the_last_message(tail: bytes) -> None:
     found = walk(as_bytes(CUT + tail), NAMES)
     whole = walk(as_bytes(CUT), NAMES)
     short = sum(map(len, whole.at.values())) - sum(map(len, found.at.values()))
@@ -147,7 +147,7 @@ def test_a_tail_costs_no_more_than_the_last_message(tail: bytes) -> None:
     assert found.lost <= len(tail) + 256
 
 
-def test_a_false_beginning_inside_a_message_is_none() -> None:
+def test_false_header_inside_a_message_is_ignored() -> None:
     data = bytearray(CUT)
     sim = next(iter(walk(as_bytes(CUT), ("SIM",)).at.values()))
     number = data[sim[10] + 2]
@@ -157,7 +157,7 @@ def test_a_false_beginning_inside_a_message_is_none() -> None:
     assert found.lost == 0
 
 
-def test_blocks_are_no_seams(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_block_size_does_not_change_the_result(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = walk(as_bytes(CUT), NAMES)
     for block in (1000, 4097, 65_536):
         monkeypatch.setattr(dataflash, "_BLOCK", block)
@@ -173,7 +173,7 @@ def fmt(number: int, length: int, name: bytes, letters: bytes, columns: bytes) -
     return b"\xa3\x95\x80" + body
 
 
-def test_a_description_that_contradicts_itself_is_refused_and_counted() -> None:
+def test_inconsistent_format_message_is_rejected_and_counted() -> None:
     head = fmt(128, 89, b"FMT", b"BBnNZ", b"Type,Length,Name,Format,Columns")
     wrong = [
         fmt(200, 12, b"POS", b"QLL", b"TimeUS,Lat,Lng"),  # longer than its format
@@ -187,7 +187,7 @@ def test_a_description_that_contradicts_itself_is_refused_and_counted() -> None:
     assert set(found.formats) == {128}
 
 
-def test_wild_stamps_are_left_out_and_counted() -> None:
+def test_invalid_timestamps_are_discarded_and_counted() -> None:
     data = bytearray(CUT)
     pos = next(iter(walk(as_bytes(CUT), ("POS",)).at.values()))
     for row, stamp_us in ((20, 0), (40, 2**63 + 5), (60, 10**15)):
@@ -204,7 +204,7 @@ DESCRIBED = CUT.rfind(b"\xa3\x95\x80") + 89
 
 
 @given(st.binary(max_size=400), st.integers(DESCRIBED, len(CUT)))
-def test_garbage_put_in_costs_itself_and_a_message(garbage: bytes, at: int) -> None:
+def test_inserted_garbage_loses_at_most_adjacent_messages(garbage: bytes, at: int) -> None:
     found = walk(as_bytes(CUT[:at] + garbage + CUT[at:]), NAMES)
     lost = len(CUT) + len(garbage)
     whole = messages(CUT)

@@ -20,7 +20,7 @@ def clock(seconds: int, drift: float, late_us: np.ndarray) -> tuple[np.ndarray, 
 
 
 @given(st.floats(-4e-4, 4e-4), st.integers(0, 2**32))
-def test_drift_and_jitter(drift: float, seed: int) -> None:
+def test_gps_clock_fit_follows_drift_and_jitter(drift: float, seed: int) -> None:
     late_us = np.random.default_rng(seed).integers(0, 40_000, 5 * 600)
     boot_us, unix_us = clock(600, drift, late_us)
     found = gps_time.fit(boot_us, unix_us)
@@ -33,7 +33,7 @@ def test_drift_and_jitter(drift: float, seed: int) -> None:
     assert 0.015 < found.uncertainty_s < 0.025
 
 
-def test_a_receiver_without_the_time_says_nothing() -> None:
+def test_no_clock_without_valid_gps_time() -> None:
     boot_us = np.arange(50, dtype=np.int64) * 200_000
     assert gps_time.fit(boot_us, np.zeros(50, dtype=np.int64)) is None
     assert gps_time.fit(boot_us[:0], boot_us[:0]) is None
@@ -41,7 +41,7 @@ def test_a_receiver_without_the_time_says_nothing() -> None:
     assert gps_time.fit(boot_us, wild) is None
 
 
-def test_a_few_wrong_fixes_do_not_count() -> None:
+def test_clock_fit_ignores_outlier_fixes() -> None:
     boot_us, unix_us = clock(100, 0.0, np.zeros(500, dtype=np.int64))
     unix_us[::5] -= 604_800_000_000  # a week behind, before the receiver knew the week
     found = gps_time.fit(boot_us, unix_us)
@@ -59,7 +59,7 @@ def test_a_few_wrong_fixes_do_not_count() -> None:
         (datetime(2026, 11, 22, tzinfo=UTC), 18),
     ],
 )
-def test_leap_seconds(utc: datetime, leaps: int) -> None:
+def test_gps_time_to_utc_applies_leap_seconds(utc: datetime, leaps: int) -> None:
     gps_ms = round((utc.timestamp() - 315_964_800 + leaps) * 1000)
     week, week_ms = divmod(gps_ms, 604_800_000)
     (found,) = gps_time.unix_us(np.array([week]), np.array([week_ms]))
@@ -69,5 +69,5 @@ def test_leap_seconds(utc: datetime, leaps: int) -> None:
 
 
 @pytest.mark.parametrize(("week", "week_ms"), [(0, 5), (-3, 5), (2000, -1), (2000, 604_800_000)])
-def test_weeks_that_cannot_be(week: int, week_ms: int) -> None:
+def test_invalid_gps_weeks_yield_no_time(week: int, week_ms: int) -> None:
     assert gps_time.unix_us(np.array([week]), np.array([week_ms])).tolist() == [0]

@@ -72,7 +72,7 @@ def read(path: Path) -> tuple[int, int]:
 
 
 @pytest.mark.parametrize("kind", FILES)
-def test_damaged_files(kind: str, tmp_path: Path) -> None:
+def test_damaged_files_are_read_within_the_time_limit(kind: str, tmp_path: Path) -> None:
     path = tmp_path / f"x.{kind}"
     whole = FILES[kind]
     path.write_bytes(whole)
@@ -123,7 +123,9 @@ def quotes() -> bytes:
 @pytest.mark.parametrize(
     "make", [many_heads, many_topics, deep_topics, noise_behind, one_line, quotes]
 )
-def test_absurd_files_are_bounded(make: Callable[[], bytes], tmp_path: Path) -> None:
+def test_absurd_files_are_read_in_bounded_time_and_memory(
+    make: Callable[[], bytes], tmp_path: Path
+) -> None:
     data = make()
     path = tmp_path / "absurd"
     path.write_bytes(data)
@@ -188,7 +190,7 @@ def many_samples() -> bytes:
 @pytest.mark.parametrize(
     ("name", "made"), [("a.csv", many_lines), ("a.bin", many_messages), ("a.ulg", many_samples)]
 )
-def test_counts_without_end_take_no_more_memory_than_there_is(
+def test_huge_sample_counts_are_read_in_bounded_memory(
     tmp_path: Path, name: str, made: Callable[[], bytes]
 ) -> None:
     """Every n-th sample is read: all of them would take 1.5 GB."""

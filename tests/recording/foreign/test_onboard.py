@@ -5,7 +5,7 @@ import numpy as np
 from companion.recording.foreign.onboard import Fixes
 
 
-def test_positions_of_a_receiver_are_its_fixes() -> None:
+def test_positions_from_a_receiver_equal_its_fixes() -> None:
     fixes = Fixes(
         boot_us=np.array([1, 2]),
         unix_us=np.array([0, 0]),

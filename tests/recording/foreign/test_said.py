@@ -30,7 +30,7 @@ def by_peer(events: list[Event]) -> dict[str, list[Any]]:
     return found
 
 
-def test_every_sample_is_said_once_with_its_values(log: Onboard) -> None:
+def test_each_sample_becomes_one_frame_with_its_values(log: Onboard) -> None:
     heard = by_peer(list(said.frames(log, "x", Source(1, 1), 0.0)))
     positions, attitudes, fixes, truth = log.positions, log.attitudes, log.fixes, log.truth
     assert positions and attitudes and fixes and truth
@@ -57,7 +57,7 @@ def test_every_sample_is_said_once_with_its_values(log: Onboard) -> None:
     assert abs(told.time_unix_usec - expected) < 1000
 
 
-def test_frames_arrive_at_gps_time_and_in_order(log: Onboard) -> None:
+def test_frames_are_ordered_by_gps_time(log: Onboard) -> None:
     assert log.clock is not None and log.positions is not None
     events = list(said.frames(log, "x", Source(1, 1), 0.0))
     late = list(said.frames(log, "x", Source(1, 1), 0.25))
@@ -70,7 +70,7 @@ def test_frames_arrive_at_gps_time_and_in_order(log: Onboard) -> None:
     assert [event.seq for event in events[:300]] == [n & 255 for n in range(300)]
 
 
-def test_the_truth_stands_behind_a_stamp_of_its_time(log: Onboard) -> None:
+def test_truth_frame_follows_a_frame_with_its_timestamp(log: Onboard) -> None:
     """Studies date SIM_STATE, which has no timestamp, by the neighbouring messages."""
     assert log.truth is not None
     stamps: list[int] = []
@@ -84,7 +84,7 @@ def test_the_truth_stands_behind_a_stamp_of_its_time(log: Onboard) -> None:
     assert stamps == (log.truth.boot_us // 1000).tolist()
 
 
-def test_values_out_of_reach_are_clipped_and_unknown_ones_said_so(log: Onboard) -> None:
+def test_out_of_range_values_are_clipped_and_unknown_ones_marked(log: Onboard) -> None:
     at = log.positions
     assert at is not None and log.fixes is not None
     wild = replace(
@@ -103,12 +103,12 @@ def test_values_out_of_reach_are_clipped_and_unknown_ones_said_so(log: Onboard) 
     assert isinstance(decoded[0], Report) and decoded[0].heading_deg is None
 
 
-def test_without_gps_time_the_time_is_that_since_boot(log: Onboard) -> None:
+def test_frames_use_boot_time_without_gps_time(log: Onboard) -> None:
     first = next(iter(said.frames(replace(log, clock=None), "x", Source(1, 1), 0.0)))
     assert first.t_ns == 120_004_784_000 or 120e9 <= first.t_ns < 121e9
 
 
-def test_a_leap_is_clamped_and_said(log: Onboard) -> None:
+def test_time_jump_is_clamped_and_reported(log: Onboard) -> None:
     assert log.positions is not None
     later = log.positions.boot_us.copy()
     later[100:] += 5 * 3_600_000_000

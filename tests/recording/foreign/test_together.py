@@ -27,13 +27,13 @@ from companion.studies.truth import vehicles as truth
 from companion.values import Estimate, FloatArray, Frame
 
 
-def test_it_is_told_by_content(aeroplane: Path, tmp_path: Path) -> None:
+def test_log_kind_is_detected_by_content(aeroplane: Path, tmp_path: Path) -> None:
     renamed = shutil.copy(aeroplane, tmp_path / "flight.tlog")
     assert log_kind(renamed) == "dataflash"
     assert log_kind(shared_log("px4_sample_small.ulg")) == "ulog"
 
 
-def test_two_logs_are_one_flight_on_gps_time(aeroplane: Path, carrier: Path) -> None:
+def test_two_logs_merge_into_one_flight_on_gps_time(aeroplane: Path, carrier: Path) -> None:
     one, five = vehicles([aeroplane, carrier])
     assert (str(one.source), str(five.source)) == ("1:1", "5:1")
     events = list(read_flight([aeroplane, carrier]))
@@ -48,14 +48,14 @@ def test_two_logs_are_one_flight_on_gps_time(aeroplane: Path, carrier: Path) -> 
     assert "on GPS time to 0.001 s by 100 fixes" in one.notice()
 
 
-def test_vehicles_of_one_id_are_told_apart(aeroplane: Path, tmp_path: Path) -> None:
+def test_duplicate_sysid_gets_a_new_id(aeroplane: Path, tmp_path: Path) -> None:
     again = Path(shutil.copy(aeroplane, tmp_path / "again.bin"))
     first, second = vehicles([aeroplane, again])
     assert (first.source.sysid, second.source.sysid) == (1, 2)
     assert "id 1 in the log is taken by another" in second.notice()
 
 
-def test_an_id_that_another_log_says_is_not_given_away(
+def test_assigned_id_avoids_ids_of_other_logs(
     aeroplane: Path, carrier: Path, tmp_path: Path
 ) -> None:
     nameless = tmp_path / "nameless.bin"
@@ -65,7 +65,7 @@ def test_an_id_that_another_log_says_is_not_given_away(
     assert "no id in the log" in vehicles([nameless])[0].notice()
 
 
-def test_a_log_may_name_the_carrier(aeroplane: Path, carrier: Path, cut_log: Path) -> None:
+def test_carrier_can_be_given_as_a_log_name(aeroplane: Path, carrier: Path, cut_log: Path) -> None:
     both = [aeroplane, carrier]
     assert center_of(both, str(carrier)) == center_of(both, carrier.name) == "5:1"
     assert center_of(both, "7:1") == "7:1"
@@ -74,13 +74,13 @@ def test_a_log_may_name_the_carrier(aeroplane: Path, carrier: Path, cut_log: Pat
         center_of([cut_log], cut_log.name)
 
 
-def test_logs_of_one_vehicle_are_one_flight_and_others_each_their_own(
+def test_single_vehicle_logs_form_one_flight_others_stand_alone(
     aeroplane: Path, carrier: Path, cut_log: Path
 ) -> None:
     assert flights([aeroplane, cut_log, carrier]) == [(aeroplane, carrier), (cut_log,)]
 
 
-def test_logs_of_different_days_are_no_flight(carrier: Path, tmp_path: Path) -> None:
+def test_logs_of_different_days_are_rejected_as_one_flight(carrier: Path, tmp_path: Path) -> None:
     table = tmp_path / "late.csv"
     table.write_text("unix_s,lat_deg,lon_deg,alt_m\n1795400000,47,8,500\n1795400001,47,8,500\n")
     with pytest.raises(
@@ -89,7 +89,7 @@ def test_logs_of_different_days_are_no_flight(carrier: Path, tmp_path: Path) -> 
         read_flight([carrier, table])
 
 
-def test_a_log_without_gps_time_stands_alone(carrier: Path, tmp_path: Path) -> None:
+def test_log_without_gps_time_cannot_be_merged(carrier: Path, tmp_path: Path) -> None:
     table = tmp_path / "plain.csv"
     table.write_text("t_s,lat_deg,lon_deg,alt_m\n0,47,8,500\n1,47,8,500\n")
     assert sum(isinstance(event, Frame) for event in read_log(table)) == 4
@@ -105,7 +105,7 @@ def replayed(*words: str | Path) -> dict[str, Any]:
     return found
 
 
-def test_replay_records_what_replays_to_the_same_digest(
+def test_recorded_replay_of_merged_logs_has_the_same_digest(
     aeroplane: Path, carrier: Path, tmp_path: Path
 ) -> None:
     recording = tmp_path / "x.mcap"
@@ -116,7 +116,7 @@ def test_replay_records_what_replays_to_the_same_digest(
     assert replayed(recording, "--no-record")["digest"] == found["digest"]
 
 
-def test_a_latency_is_what_was_asked_for(aeroplane: Path) -> None:
+def test_replay_applies_the_given_latency(aeroplane: Path) -> None:
     def first_ns(latency_s: float) -> int:
         return next(iter(read_log(aeroplane, latency_s))).t_ns
 
@@ -127,7 +127,7 @@ def test_a_latency_is_what_was_asked_for(aeroplane: Path) -> None:
     assert at_once["uavs"]["1:1"]["reports"] == late["uavs"]["1:1"]["reports"] == 200
 
 
-def test_the_truth_in_the_logs_is_used(aeroplane: Path, carrier: Path) -> None:
+def test_simulator_truth_in_the_logs_is_loaded(aeroplane: Path, carrier: Path) -> None:
     flown = truth.load([aeroplane, carrier], "5:1")
     (flight,) = flown.flights
     assert flight.uav == "1:1" and flight.truth.kind == "SIM_STATE"
@@ -138,7 +138,7 @@ def test_the_truth_in_the_logs_is_used(aeroplane: Path, carrier: Path) -> None:
     assert np.nanmedian(error_m) < 1.5 and np.isfinite(error_m).mean() > 0.95
 
 
-def test_how_well_logs_lie_beside_one_another_is_in_the_settings_of_their_replay(
+def test_replay_settings_hold_the_clock_offset_uncertainty(
     aeroplane: Path, carrier: Path, tmp_path: Path
 ) -> None:
     """0.001 s from the fixes plus half of the difference between receivers; a single log has
@@ -152,7 +152,7 @@ def test_how_well_logs_lie_beside_one_another_is_in_the_settings_of_their_replay
 
 
 @pytest.mark.parametrize("sign", [-1, 1])
-def test_a_timeline_that_is_off_is_in_the_bounds(aeroplane: Path, carrier: Path, sign: int) -> None:
+def test_bounds_cover_a_timeline_offset(aeroplane: Path, carrier: Path, sign: int) -> None:
     """An adversary shifts one vehicle's whole log by the stated uncertainty: 0.8 s at 22 m/s."""
     off_ns, tracks_at = sign * 800_000_000, {}
     for name, apart_s, moved_ns in (("true", {}, 0), ("bare", {}, off_ns),
@@ -216,7 +216,7 @@ def between(t_s: FloatArray, known_s: FloatArray, states: FloatArray) -> FloatAr
 
 @pytest.mark.full
 @pytest.mark.parametrize("uav", ["1:1", "5:1"])
-def test_the_same_flight_gives_the_same_tracks(uav: str) -> None:
+def test_onboard_logs_and_telemetry_log_give_the_same_tracks(uav: str) -> None:
     """Reports at equal boot times have equal positions, and so do the observer's estimates.
 
     Both logs are sampled at 10 Hz: the aeroplane in the same timer cycle, the copter 20 ms apart.
@@ -235,7 +235,7 @@ def test_the_same_flight_gives_the_same_tracks(uav: str) -> None:
     assert np.median(off_m) == pytest.approx(np.median(tlog_off_m), abs=0.05)
 
 
-def test_a_log_is_read_once_and_again_when_it_has_changed(aeroplane: Path, tmp_path: Path) -> None:
+def test_log_is_cached_until_the_file_changes(aeroplane: Path, tmp_path: Path) -> None:
     log = tmp_path / "uav.bin"
     whole = aeroplane.read_bytes()
     log.write_bytes(whole)

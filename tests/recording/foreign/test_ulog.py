@@ -17,7 +17,7 @@ def as_bytes(data: bytes) -> Bytes:
     return np.frombuffer(data, dtype=np.uint8)
 
 
-def test_every_value_is_that_of_pyulog() -> None:
+def test_ulog_values_equal_pyulog() -> None:
     pyulog = pytest.importorskip("pyulog")
     path = shared_log("px4_sample_small.ulg")
     theirs = pyulog.ULog(str(path))
@@ -46,7 +46,7 @@ def test_every_value_is_that_of_pyulog() -> None:
     assert compared > 80_000
 
 
-def test_the_receivers_positions_stand_in_where_there_are_no_others() -> None:
+def test_receiver_positions_replace_missing_estimates() -> None:
     pyulog = pytest.importorskip("pyulog")
     path = shared_log("px4_sample_small.ulg")
     theirs = pyulog.ULog(str(path)).get_dataset("vehicle_gps_position").data
@@ -63,7 +63,7 @@ def test_the_receivers_positions_stand_in_where_there_are_no_others() -> None:
     assert any("receiver" in note for note in log.notes)
 
 
-def test_estimates_and_truth_as_written() -> None:
+def test_estimates_and_truth_match_the_written_values() -> None:
     log = px4.read(as_bytes(flight().data))
     assert (log.sysid, log.mav_type, log.lost, log.notes) == (7, 2, {}, ())
     assert log.positions is not None and log.truth is not None and log.attitudes is not None
@@ -85,7 +85,7 @@ def test_pyulog_reads_what_the_tests_write(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("size", [1, 7, 300, 3000])
-def test_damage_costs_what_is_damaged(size: int) -> None:
+def test_ulog_damage_loses_only_the_damaged_messages(size: int) -> None:
     made = flight(seconds=40)
     at = len(made.data) // 3
     torn = made.data[:at] + b"\xff" * size + made.data[at + size :]
@@ -109,7 +109,7 @@ def test_data_appended_after_a_crash_are_read() -> None:
     assert len(walked.topics[0].at) == 41
 
 
-def test_what_asks_for_more_than_is_known_is_refused() -> None:
+def test_unknown_incompatible_flags_are_rejected() -> None:
     data = HEADER + message("B", bytes(8) + b"\x02" + bytes(31)) + flight().data[59:]
     with pytest.raises(px4.UnknownFlagsError):
         px4.read(as_bytes(data))
@@ -127,7 +127,7 @@ def test_what_asks_for_more_than_is_known_is_refused() -> None:
         ";;;",
     ],
 )
-def test_topics_that_cannot_be_are_refused_and_counted(fields: str) -> None:
+def test_invalid_topics_are_rejected_and_counted(fields: str) -> None:
     made = Written()
     made.topic("vehicle_global_position", fields, "Qddf", [(1, 47.0, 8.0, 500.0)] * 3)
     log = px4.read(as_bytes(made.data))
@@ -135,7 +135,7 @@ def test_topics_that_cannot_be_are_refused_and_counted(fields: str) -> None:
     assert log.lost[Reason.MALFORMED] >= 1
 
 
-def test_a_lone_message_among_garbage_is_none() -> None:
+def test_lone_message_inside_garbage_is_ignored() -> None:
     made = flight()
     false = message("D", struct.pack("<HQddf", 0, 5_000_000, 1.0, 2.0, 3.0))
     torn = made.data[:-1] + b"\xff" * 50 + false + b"\xff" * 50
@@ -144,6 +144,6 @@ def test_a_lone_message_among_garbage_is_none() -> None:
     assert walked.lost >= 99 + len(false)  # one byte completes the truncated sample
 
 
-def test_a_receiver_without_a_fix_does_not_know_the_time() -> None:
+def test_receiver_without_fix_yields_no_clock() -> None:
     assert px4.read(as_bytes(flight().data)).clock is not None
     assert px4.read(as_bytes(flight(fix_type=2).data)).clock is None

@@ -22,14 +22,14 @@ from sitl_replay.faults.asked import KINDS, Fault, FaultError, described, in_ord
         ("bit-errors=1e-5", Fault(name="bit-errors", values=(1e-5,))),
     ],
 )
-def test_a_fault_is_read(text: str, expected: Fault) -> None:
+def test_fault_option_is_parsed(text: str, expected: Fault) -> None:
     fault = Fault.parse(text)
     assert fault == expected
     assert str(fault) == text.partition("=")[0]
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: str(kind.name))
-def test_every_example_is_one_and_every_fault_is_described(kind: object) -> None:
+def test_every_fault_example_parses_and_is_described(kind: object) -> None:
     assert Fault.parse(kind.example).name == kind.name  # type: ignore[attr-defined]
     assert f"{kind.form}: " in described()  # type: ignore[attr-defined]
 
@@ -57,14 +57,14 @@ def test_every_example_is_one_and_every_fault_is_described(kind: object) -> None
         ("loss@x:1=0.1", "'x:1' is not SYSID"),
     ],
 )
-def test_a_mistake_is_one_line_that_says_what_is_allowed(text: str, complaint: str) -> None:
+def test_invalid_fault_is_a_one_line_error_with_allowed_values(text: str, complaint: str) -> None:
     with pytest.raises(FaultError, match=re.escape(complaint)) as caught:
         Fault.parse(text)
     assert "\n" not in str(caught.value)
 
 
 @given(st.text(max_size=30) | st.from_regex(r"(loss|glitch|frozen)(@[0-9:]*)?=[0-9.:e-]*"))
-def test_any_text_is_a_fault_or_a_mistake(text: str) -> None:
+def test_arbitrary_text_is_a_fault_or_a_fault_error(text: str) -> None:
     try:
         fault = Fault.parse(text)
     except FaultError:
@@ -74,7 +74,7 @@ def test_any_text_is_a_fault_or_a_mistake(text: str) -> None:
     assert all(b.low <= v <= b.high for b, v in zip(bounds, fault.values, strict=True))
 
 
-def test_the_order_is_not_that_of_the_command_line() -> None:
+def test_fault_order_is_independent_of_the_command_line() -> None:
     texts = ("garbage=0.1", "delay=1", "frozen=9:1", "frozen=3:1", "loss@2=0.5", "loss=0.1")
     orders = {tuple(map(str, in_order([*map(Fault.parse, one)]))) for one in permutations(texts)}
     assert orders == {("frozen", "frozen", "loss", "loss@2", "delay", "garbage")}
@@ -82,14 +82,14 @@ def test_the_order_is_not_that_of_the_command_line() -> None:
     assert (first.values[0], second.values[0]) == (3.0, 9.0)
 
 
-def test_what_is_no_event_is_given_once_for_the_same_frames() -> None:
+def test_duplicate_continuous_fault_is_rejected() -> None:
     different = [Fault.parse(text) for text in ("loss=0.1", "loss@1=0.2", "loss@1:1=0.3")]
     assert len(in_order(different)) == 3
     with pytest.raises(FaultError, match="loss@1 is given 2 times"):
         in_order([*different, Fault.parse("loss@1=0.2")])
 
 
-def test_whose_frames() -> None:
+def test_fault_applies_to_the_selected_senders() -> None:
     senders = [(3, 1), (3, 2), (4, 1)]
     for text, expected in [
         ("loss=0", senders),

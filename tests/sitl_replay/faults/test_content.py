@@ -69,7 +69,7 @@ def stamped() -> list[Any]:
     return [kind for kind in dialect.mavlink_map.values() if "time_boot_ms" in kind.fieldnames]
 
 
-def test_the_table_has_every_message_with_a_boot_clock() -> None:
+def test_table_lists_every_message_with_a_boot_clock() -> None:
     assert set(TIME_BOOT_MS_AT) == {kind.id for kind in stamped()}
 
 
@@ -78,7 +78,7 @@ def test_the_table_has_every_message_with_a_boot_clock() -> None:
     [(kind, v1) for kind in stamped() for v1 in (False, True) if kind.id < 256 or not v1],
     ids=str,
 )
-def test_every_boot_clock_is_rewritten_and_nothing_else(kind: Any, v1: bool) -> None:
+def test_only_the_boot_clock_field_is_rewritten(kind: Any, v1: bool) -> None:
     raw = made(kind, random.Random(kind.id)).pack(sending(), force_mavlink1=v1)
     new_ms = 0x87654321
     changed = with_boot_ms(raw, new_ms)
@@ -89,7 +89,7 @@ def test_every_boot_clock_is_rewritten_and_nothing_else(kind: Any, v1: bool) -> 
 
 @given(old_ms=st.integers(0, 2**32 - 1), new_ms=st.integers(0, 2**32 - 1), lon=st.integers(-9, 9))
 @settings(max_examples=examples(60))
-def test_zeros_at_the_end_of_a_payload_are_cut_and_put_back(
+def test_payload_truncation_of_trailing_zeros_is_kept_consistent(
     old_ms: int, new_ms: int, lon: int
 ) -> None:
     # All bytes after the longitude are 0, or all after the timestamp, or all.
@@ -98,7 +98,7 @@ def test_zeros_at_the_end_of_a_payload_are_cut_and_put_back(
     assert with_boot_ms(raw, new_ms) == make(new_ms, 0, lon, 0, 0, 0, 0, 0, 0).pack(sending())
 
 
-def test_a_frame_that_stays_as_it_is_keeps_its_very_bytes() -> None:
+def test_unchanged_frame_keeps_its_bytes() -> None:
     message = dialect.MAVLink_attitude_message(1000, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     raw = message.pack(sending(signed=True))
     assert with_boot_ms(raw, 1000) is raw
@@ -106,7 +106,7 @@ def test_a_frame_that_stays_as_it_is_keeps_its_very_bytes() -> None:
     assert Drift(1.0)(0.0, raw) is raw  # 0.001 ms
 
 
-def test_a_signed_frame_that_is_rewritten_loses_its_signature() -> None:
+def test_rewritten_signed_frame_loses_its_signature() -> None:
     message = dialect.MAVLink_attitude_message(1000, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0)
     raw = message.pack(sending(signed=True))
     assert raw[2] == 1
@@ -117,7 +117,7 @@ def test_a_signed_frame_that_is_rewritten_loses_its_signature() -> None:
     assert changed == message.pack(sending())
 
 
-def test_what_cannot_be_checked_or_is_too_short_is_left_alone() -> None:
+def test_unknown_or_too_short_frames_are_left_unchanged() -> None:
     unknown = bytes([0xFD, 1, 0, 0, 7, 9, 4, 0xFF, 0xFF, 0xFF, 1, 0, 0])
     assert rewritten(unknown, seq=8) is unknown
     short = bytes([0xFE, 2, 7, 9, 4, 30, 1, 0, 0, 0])
@@ -140,7 +140,7 @@ def reports(count: int, sysid: int = 9, step_ms: int = 100) -> list[tuple[float,
 
 
 @pytest.mark.parametrize("ppm", [24_000.0, -24_000.0, 0.0])
-def test_drift(ppm: float) -> None:
+def test_drift_scales_the_boot_clock(ppm: float) -> None:
     drift = Drift(ppm)
     for t_s, raw in reports(20):
         boot_ms = read(raw).time_boot_ms
@@ -149,13 +149,13 @@ def test_drift(ppm: float) -> None:
         }
 
 
-def test_a_drifting_clock_wraps() -> None:
+def test_drifting_clock_wraps_at_32_bits() -> None:
     raw = dialect.MAVLink_attitude_message(2**32 - 1000, *[0.0] * 6).pack(sending())
     expected = (2**32 - 1000 + round((2**32 - 1000) * 0.001)) % 2**32
     assert boot_ms_of(Drift(1000.0)(0.0, raw)) == expected
 
 
-def test_reboot() -> None:
+def test_reboot_resets_boot_clock_and_sequence() -> None:
     reboot = Reboot(1.05)
     before = reports(30)
     after = [(t_s, reboot(t_s, raw)) for t_s, raw in before]
@@ -167,7 +167,7 @@ def test_reboot() -> None:
         }
 
 
-def test_a_late_frame_of_the_boot_before_keeps_its_stamp() -> None:
+def test_late_frame_of_the_previous_boot_keeps_its_timestamp() -> None:
     reboot = Reboot(0.0)
     frames = [raw for _, raw in reports(3)]
     assert boot_ms_of(reboot(0.0, frames[1])) == 0
@@ -175,7 +175,7 @@ def test_a_late_frame_of_the_boot_before_keeps_its_stamp() -> None:
     assert boot_ms_of(reboot(0.1, frames[2])) == 100
 
 
-def test_every_sender_reboots_on_its_own_clock_and_counts_all_its_frames() -> None:
+def test_every_sender_reboots_with_its_own_clock_and_sequence() -> None:
     reboot = Reboot(1.0)
     seen: dict[tuple[int, int], list[int]] = {}
     stamps: dict[tuple[int, int], list[int]] = {}
@@ -196,7 +196,7 @@ def test_every_sender_reboots_on_its_own_clock_and_counts_all_its_frames() -> No
 POSITION = ("lat", "lon", "alt", "relative_alt")
 
 
-def test_frozen() -> None:
+def test_frozen_repeats_the_last_position() -> None:
     frozen = Frozen(1.0, 0.5)
     before = reports(20)
     last = fields(before[9][1])
@@ -209,7 +209,7 @@ def test_frozen() -> None:
     assert frozen(1.2, attitude) is attitude
 
 
-def test_frozen_before_any_report_repeats_the_first() -> None:
+def test_frozen_before_any_report_repeats_the_first_position() -> None:
     frozen = Frozen(0.0, 1.0)
     first, second = (raw for _, raw in reports(2))
     assert frozen(0.0, first) is first
@@ -225,7 +225,9 @@ def test_frozen_before_any_report_repeats_the_first() -> None:
     seed=st.integers(0, 5),
 )
 @settings(max_examples=examples(60))
-def test_glitch(metres: float, lat_deg: float, lon_deg: float, seed: int) -> None:
+def test_glitch_moves_the_given_number_of_reports(
+    metres: float, lat_deg: float, lon_deg: float, seed: int
+) -> None:
     glitch = Glitch(at_s=1.0, metres=metres, reports=3, seed=str(seed))
     lat, lon = round(lat_deg * 1e7), round(lon_deg * 1e7)
     bearings_deg = []
@@ -248,7 +250,7 @@ def test_glitch(metres: float, lat_deg: float, lon_deg: float, seed: int) -> Non
         assert max(bearings_deg) - min(bearings_deg) < 1e-6
 
 
-def test_each_sender_and_seed_glitches_its_own_way() -> None:
+def test_glitch_direction_differs_per_sender_and_seed() -> None:
     places = {
         (read(glitched).lat, read(glitched).lon)
         for seed in ("1", "2")
@@ -261,7 +263,7 @@ def test_each_sender_and_seed_glitches_its_own_way() -> None:
     assert min(lats) < -math.cos(1.0) * 89_000 or max(lats) > math.cos(1.0) * 89_000
 
 
-def test_message_ids_of_both_versions() -> None:
+def test_message_id_sender_and_sequence_of_both_versions() -> None:
     message = dialect.MAVLink_attitude_message(1, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0)
     for v1 in (False, True):
         raw = message.pack(sending(), force_mavlink1=v1)

@@ -36,7 +36,7 @@ def within(count: int, share: float, of: int = MANY) -> bool:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.01, 0.44, 1.0])
-def test_a_share_is_lost_doubled_held_cut_and_littered(share: float) -> None:
+def test_link_faults_affect_the_given_share_of_frames(share: float) -> None:
     loss, doubling = Loss(rng(1), share), Duplication(rng(2), share)
     holding, cutting = Reordering(rng(3), share), Truncation(rng(4), share)
     littering = Garbage(rng(5), share)
@@ -62,7 +62,7 @@ def test_a_share_is_lost_doubled_held_cut_and_littered(share: float) -> None:
 
 @given(low=st.floats(0.0, 1.0), high=st.floats(0.0, 1.0))
 @settings(max_examples=examples(30))
-def test_a_larger_share_takes_what_a_smaller_one_takes(low: float, high: float) -> None:
+def test_larger_share_includes_the_frames_of_a_smaller_one(low: float, high: float) -> None:
     low, high = sorted((low, high))
     for make in (Loss, Duplication, Reordering, Truncation, Garbage):
 
@@ -82,11 +82,11 @@ def test_a_larger_share_takes_what_a_smaller_one_takes(low: float, high: float) 
         assert all(more or not less for less, more in zip(taken(low), taken(high), strict=True))
 
 
-def test_delay() -> None:
+def test_delay_adds_a_constant_time() -> None:
     assert Delay(0.25).release_s(1.0, 2.0, SENDER) == 2.25
 
 
-def test_jitter_is_exponential_where_nobody_waits() -> None:
+def test_jitter_of_isolated_frames_is_exponential() -> None:
     jitter = Jitter(rng(), 0.5)
     late_s = sorted(jitter.release_s(t, t, SENDER) - t for t in range(0, 100 * MANY, 100))
     assert statistics.fmean(late_s) == pytest.approx(0.5, rel=0.03)
@@ -95,7 +95,7 @@ def test_jitter_is_exponential_where_nobody_waits() -> None:
     assert late_s[-1] <= 5.0
 
 
-def test_jitter_keeps_the_order_of_each_sender_and_of_nobody_else() -> None:
+def test_jitter_keeps_the_frame_order_only_per_sender() -> None:
     jitter = Jitter(rng(), 0.5)
     released: dict[tuple[int, int], list[float]] = {(1, 1): [], (2, 1): []}
     for number in range(4000):
@@ -113,7 +113,7 @@ def test_jitter_keeps_the_order_of_each_sender_and_of_nobody_else() -> None:
 
 
 @pytest.mark.parametrize(("share", "shut_s"), [(0.3, 2.0), (0.05, 0.5), (0.9, 1.0)])
-def test_a_burst_shuts_the_link_for_that_share_of_the_time(share: float, shut_s: float) -> None:
+def test_burst_closes_the_link_for_the_given_share_of_time(share: float, shut_s: float) -> None:
     burst = Burst(rng(), share, shut_s)
     step_s = shut_s / 20
     times_s = [step_s * number for number in range(120_000)]
@@ -129,7 +129,7 @@ def test_a_burst_shuts_the_link_for_that_share_of_the_time(share: float, shut_s:
     assert len(burst._block_starts_s) <= 2
 
 
-def test_a_burst_may_be_asked_for_earlier_times_again() -> None:
+def test_burst_release_times_are_independent_of_query_order() -> None:
     forth, back = Burst(rng(), 0.5, 0.3), Burst(rng(), 0.5, 0.3)
     times_s = [number / 50 for number in range(1000)]
     once = {t_s: forth.release_s(t_s, t_s, SENDER) for t_s in times_s}
@@ -138,13 +138,13 @@ def test_a_burst_may_be_asked_for_earlier_times_again() -> None:
     assert {t_s: back.release_s(0.0, t_s, SENDER) for t_s in shuffled} == once
 
 
-def test_no_burst() -> None:
+def test_zero_burst_share_delays_nothing() -> None:
     burst = Burst(rng(), 0.0, 1.0)
     assert [burst.release_s(t, t, SENDER) for t in (0.0, 5.0, 1e9)] == [0.0, 5.0, 1e9]
 
 
 @pytest.mark.parametrize("rate", [1e-4, 0.01, 0.5])
-def test_bits_are_inverted_each_by_itself(rate: float) -> None:
+def test_bit_errors_are_independent_per_bit(rate: float) -> None:
     errors = BitErrors(rng(), rate)
     counts = [0] * 80
     frame = bytes(10)
@@ -158,7 +158,7 @@ def test_bits_are_inverted_each_by_itself(rate: float) -> None:
     assert all(within(count, rate, MANY) for count in counts)
 
 
-def test_bit_errors_in_pieces_are_those_of_the_whole() -> None:
+def test_bit_errors_are_independent_of_frame_boundaries() -> None:
     whole, pieces = BitErrors(rng(), 0.02), BitErrors(rng(), 0.02)
     stream = rng(5).randbytes(3000)
     sizes, at, parts = rng(6), 0, []
@@ -169,11 +169,11 @@ def test_bit_errors_in_pieces_are_those_of_the_whole() -> None:
     assert b"".join(parts) == whole.damaged(stream) != stream
 
 
-def test_no_bit_errors() -> None:
+def test_zero_bit_error_rate_changes_nothing() -> None:
     errors = BitErrors(rng(), 0.0)
     frame = bytes(100)
     assert all(errors.damaged(frame) is frame for _ in range(1000))
 
 
-def test_a_frame_of_one_byte_cannot_be_cut() -> None:
+def test_one_byte_frame_is_not_truncated() -> None:
     assert Truncation(rng(), 1.0).damaged(b"a") == b"a"

@@ -46,7 +46,7 @@ def frames(deliveries: list[Delivery], link: int = 0) -> list[bytes]:
 RAWS = [raw for _, raw in STREAM]
 
 
-def test_without_faults_everything_comes_at_once_on_every_link() -> None:
+def test_without_faults_all_frames_pass_undelayed_on_every_link() -> None:
     out, touched = through([], links=3)
     assert [(one.t_s, one.link, one.raw) for one in out] == [
         (t_s, link, raw) for t_s, raw in STREAM for link in range(3)
@@ -55,7 +55,7 @@ def test_without_faults_everything_comes_at_once_on_every_link() -> None:
 
 
 @pytest.mark.parametrize("text", [kind.example for kind in KINDS.values()])
-def test_the_same_seed_gives_the_same_and_another_another(text: str) -> None:
+def test_faults_are_determined_by_the_seed(text: str) -> None:
     faults = parsed(text)
     assert through(faults, 2, seed=4) == through(faults, 2, seed=4)
     if faults[0].name in {"drift", "reboot", "frozen", "delay"}:
@@ -69,7 +69,7 @@ TIMING = ["delay=0.3", "jitter=0.4", "burst=0.3:1", "reordering=0.3", "jitter@1=
 
 @given(st.sets(st.sampled_from(TIMING)), st.integers(0, 3))
 @settings(max_examples=examples(25), deadline=None)
-def test_being_late_loses_and_invents_nothing(texts: set[str], seed: int) -> None:
+def test_delay_faults_lose_and_add_no_frames(texts: set[str], seed: int) -> None:
     out, touched = through(parsed(*texts), seed=seed)
     assert Counter(frames(out)) == Counter(RAWS)
     assert all(a.t_s <= b.t_s for a, b in pairwise(out))
@@ -79,7 +79,7 @@ def test_being_late_loses_and_invents_nothing(texts: set[str], seed: int) -> Non
 
 
 @pytest.mark.parametrize("text", ["delay=0.3", "jitter=0.4", "burst=0.3:1", "delay@2=1"])
-def test_only_reordering_reorders_the_frames_of_a_sender(text: str) -> None:
+def test_only_the_reordering_fault_reorders_a_sender(text: str) -> None:
     def by_sender(raws: list[bytes]) -> dict[tuple[int, int], list[bytes]]:
         found: dict[tuple[int, int], list[bytes]] = {}
         for raw in raws:
@@ -96,7 +96,7 @@ def test_delay_is_exact() -> None:
     assert touched == {"delay": len(STREAM)}
 
 
-def test_loss_and_duplication_are_counted_to_the_frame() -> None:
+def test_loss_and_duplication_counts_are_exact() -> None:
     out, touched = through(parsed("loss=0.2", "duplication=0.3"))
     counts = Counter(frames(out))
     assert set(counts) <= set(RAWS)
@@ -109,7 +109,7 @@ def test_loss_and_duplication_are_counted_to_the_frame() -> None:
     assert all(0.0 <= times_s[-1] - times_s[0] <= 0.2 for times_s in seen.values())
 
 
-def test_what_is_lost_does_not_depend_on_what_else_is_given() -> None:
+def test_lost_frames_are_independent_of_other_faults() -> None:
     alone = Counter(frames(through(parsed("loss=0.2"))[0]))
     others = ("jitter=0.3", "burst=0.1:1", "reordering=0.5", "drift=0")
     assert Counter(frames(through(parsed("loss=0.2", *others))[0])) == alone
@@ -117,7 +117,7 @@ def test_what_is_lost_does_not_depend_on_what_else_is_given() -> None:
     assert set(frames(doubled)) == set(alone)
 
 
-def test_one_fault_does_not_choose_the_frames_of_another() -> None:
+def test_faults_select_frames_independently() -> None:
     out, _ = through(parsed("duplication=0.3", "reordering=0.3"))
     times_s: dict[bytes, list[float]] = {}
     for one in out:
@@ -127,7 +127,7 @@ def test_one_fault_does_not_choose_the_frames_of_another() -> None:
     assert len(held & doubled) / len(doubled) == pytest.approx(0.3, abs=0.08)
 
 
-def test_what_is_on_time_comes_at_once() -> None:
+def test_due_frames_are_released_once() -> None:
     network = Network(faults=parsed("delay=0.5"), links=1, seed=0, touched=Counter())
     network.take(1.0, RAWS[0])
     assert list(network.due(1.4999)) == []
@@ -135,7 +135,7 @@ def test_what_is_on_time_comes_at_once() -> None:
     assert list(network.due()) == []
 
 
-def test_links_have_losses_of_their_own_and_the_same_senders() -> None:
+def test_losses_are_per_link_and_sender_faults_are_shared() -> None:
     faults = parsed("loss=0.3", "frozen@2=5:5", "drift=1000")
     out, touched = through(faults, links=2)
     first, second = set(frames(out, 0)), set(frames(out, 1))
@@ -147,7 +147,7 @@ def test_links_have_losses_of_their_own_and_the_same_senders() -> None:
     assert touched["frozen@2"] > 10
 
 
-def test_damage() -> None:
+def test_damage_faults_are_counted() -> None:
     faults = parsed("bit-errors=0.0005", "truncation=0.1", "garbage=0.05")
     out, touched = through(faults)
     got = frames(out)
@@ -159,14 +159,14 @@ def test_damage() -> None:
     assert all(count > 0 for count in touched.values())
 
 
-def test_damage_alone_keeps_the_sizes_and_the_times() -> None:
+def test_bit_errors_keep_frame_sizes_and_times() -> None:
     out, touched = through(parsed("bit-errors=0.001"))
     assert [(one.t_s, len(one.raw)) for one in out] == [(t_s, len(raw)) for t_s, raw in STREAM]
     assert touched["bit-errors"] == sum(a.raw != b for a, b in zip(out, RAWS, strict=True)) > 100
 
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: str(kind.name))
-def test_one_system_alone(kind: object) -> None:
+def test_fault_for_one_system_leaves_the_others_unchanged(kind: object) -> None:
     events = {"reboot": "5", "frozen": "5:5", "glitch": "5:100:3"}
     chances = {"drift": "9000", "delay": "1", "jitter": "1", "burst": "0.5:1", "bit-errors": "0.1"}
     name = kind.name  # type: ignore[attr-defined]
@@ -180,7 +180,7 @@ def test_one_system_alone(kind: object) -> None:
     assert through(parsed(f"{name}@77={value}"))[0] == through([])[0]
 
 
-def test_the_order_of_application() -> None:
+def test_faults_are_applied_in_a_fixed_order() -> None:
     """Order: sender faults, loss and duplication, delay, damage; independent of the option
     order."""
     texts = ["truncation=0.2", "delay=0.5", "duplication=0.4", "loss=0.3", "reboot=5", "drift=9000"]
@@ -202,14 +202,14 @@ def test_the_order_of_application() -> None:
     assert all(t.startswith(o) for o, t in cut)
 
 
-def test_no_burst_comes_apart_by_jitter() -> None:
+def test_jitter_does_not_split_bursts() -> None:
     out, touched = through(parsed("burst=0.5:2", "jitter=0.3"))
     openings = Counter(one.t_s for one in out)
     assert max(openings.values()) > 40
     assert touched["burst"] > 0.3 * len(RAWS)
 
 
-def test_what_is_held_is_bounded_and_the_rest_is_counted() -> None:
+def test_held_frames_are_bounded_and_overflow_is_counted() -> None:
     touched: Counter[str] = Counter()
     network = Network(faults=parsed("delay=10"), links=1, seed=0, touched=touched)
     for number in range(HELD_MAX + 7):
@@ -221,12 +221,12 @@ def test_what_is_held_is_bounded_and_the_rest_is_counted() -> None:
     assert OVERFLOW not in through(parsed("delay=0.01"))[1]
 
 
-def test_touched_says_zero_of_what_did_nothing() -> None:
+def test_ineffective_faults_are_counted_as_zero() -> None:
     _, touched = through(parsed("loss=0", "reboot=1000", "burst=0:1"))
     assert dict(touched) == {"loss": 0, "reboot": 0, "burst": 0}
 
 
-def test_senders_touch_what_they_change() -> None:
+def test_sender_faults_count_the_changed_frames() -> None:
     stamped = sum(boot_ms_of(raw) is not None for raw in RAWS)
     assert through(parsed("drift=24000"))[1] == {"drift": stamped}
     since = sum(t_s >= 5.0 for t_s, _ in STREAM)
@@ -239,7 +239,7 @@ def test_senders_touch_what_they_change() -> None:
 
 @given(st.lists(st.sampled_from([k.example for k in KINDS.values()]), unique=True), st.integers())
 @settings(max_examples=examples(20), deadline=None)
-def test_any_faults_together_come_in_order_of_time(texts: list[str], seed: int) -> None:
+def test_any_fault_combination_yields_frames_in_time_order(texts: list[str], seed: int) -> None:
     stream = random.Random(seed).choices(STREAM, k=300)
     stream.sort()
     out, _ = through(parsed(*texts), links=2, seed=seed, stream=stream)

@@ -35,7 +35,7 @@ def path_of(uav: Vehicle) -> Path:
 
 @given(st.sampled_from(NEW), st.integers(0, 1000), st.integers(3, 40), st.floats(0.0, 7200.0))
 @settings(max_examples=examples(150), deadline=None)
-def test_each_derivative_is_that_of_the_one_before(
+def test_velocity_acceleration_and_heading_rate_are_derivatives(
     name: str, seed: int, uavs: int, t_s: float
 ) -> None:
     uav = BUILDERS[name](uavs, seed).uavs[-1]
@@ -70,7 +70,7 @@ def test_speeds_and_accelerations_stay_within_limits(
 
 
 @pytest.mark.parametrize("name", NEW)
-def test_copters_lean_and_planes_bank_moderately(name: str) -> None:
+def test_copter_tilt_and_plane_bank_stay_moderate(name: str) -> None:
     steepest_deg = 30.001 if name == "racetrack" else 20.0
     for uav in BUILDERS[name](8, seed=3).uavs:
         poses = np.array([uav.attitude(t_s) for t_s in np.arange(0.0, 150.0, 0.5)])
@@ -79,7 +79,7 @@ def test_copters_lean_and_planes_bank_moderately(name: str) -> None:
         assert np.abs(poses[:, 2]).max() <= math.pi
 
 
-def test_thrust_of_a_leaning_copter_makes_its_acceleration() -> None:
+def test_copter_tilt_produces_its_acceleration() -> None:
     # The body's up axis by an explicit rotation matrix; the thrust acts along it.
     # Tours accelerate along the nose, orbits and swings across it.
     fleets = (scenario.waypoints(4, seed=2), scenario.crossing(4), scenario.swarm(4))
@@ -123,7 +123,7 @@ def test_tours_stop_at_every_waypoint_and_turn_there() -> None:
             assert math.hypot(*flying.velocity_ned_mps) == pytest.approx(leg.speed_mps)
 
 
-def test_the_nose_has_turned_when_the_next_leg_begins() -> None:
+def test_heading_matches_the_next_leg_at_its_start() -> None:
     for tour in tours():
         for leg, after in itertools.pairwise((*tour.legs, tour.legs[0])):
             left_rad = leg.at(leg.duration_s).heading_rad - after.at(0.0).heading_rad
@@ -131,12 +131,12 @@ def test_the_nose_has_turned_when_the_next_leg_begins() -> None:
             assert abs(leg.turn_rad) <= math.pi
 
 
-def test_every_seed_has_tours_of_its_own() -> None:
+def test_tours_differ_per_seed() -> None:
     first, second = (path_of(scenario.waypoints(1, seed).uavs[0]) for seed in (1, 2))
     assert math.dist(first(0.0).position_ned_m, second(0.0).position_ned_m) > 1.0
 
 
-def test_tours_are_as_quick_as_their_limits_allow() -> None:
+def test_tours_reach_their_speed_or_acceleration_limits() -> None:
     for tour in tours():
         for leg in tour.legs:
             climb_mps = abs(leg.direction[2]) * leg.speed_mps
@@ -151,7 +151,7 @@ def test_tours_are_as_quick_as_their_limits_allow() -> None:
             assert 2.9 < peak <= 3.0 + 1e-9
 
 
-def test_the_ramp_is_smooth_at_both_ends() -> None:
+def test_ramp_is_smooth_at_both_ends() -> None:
     assert Ramp.at(0.0) == (0.0, 0.0, 0.0, 0.0)
     assert Ramp.at(1.0) == pytest.approx((0.5, 1.0, 0.0, 0.0))
 
@@ -182,7 +182,7 @@ def test_racetracks_are_closed_stadiums_at_one_speed() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_banks_are_those_of_coordinated_turns_in_the_wind(seed: int) -> None:
+def test_bank_angle_is_that_of_a_coordinated_turn_in_wind(seed: int) -> None:
     course_rad = wind_course_rad(seed)
     wind_mps = WIND_MPS * np.array([math.cos(course_rad), math.sin(course_rad)])
     for uav, path in racetracks(seed):
@@ -199,7 +199,7 @@ def test_banks_are_those_of_coordinated_turns_in_the_wind(seed: int) -> None:
             assert math.degrees(pose.pitch_rad) == pytest.approx(3.0)
 
 
-def test_without_wind_the_bank_is_that_of_speed_and_radius() -> None:
+def test_bank_angle_without_wind_follows_speed_and_radius() -> None:
     for _, path in racetracks(1):
         turning_s = path.straight_m / path.speed_mps + path.turn_s / 2 - path.offset_s
         bank_rad = Banked(path, (0.0, 0.0), 0.0)(turning_s).roll_rad
@@ -230,7 +230,7 @@ MIRROR = np.array([-1.0, 1.0, 1.0])  # mirrored at the east-west line: north to 
 
 
 @pytest.mark.parametrize(("name", "image"), [("crossing", np.ones(3)), ("mirror", MIRROR)])
-def test_pairs_meet_in_direction_and_part_again(name: str, image: FloatArray) -> None:
+def test_pairs_align_in_direction_and_separate_again(name: str, image: FloatArray) -> None:
     for near, far in pairs(name):
         for meeting_s in meetings_s(near):
             apart_rad = np.linalg.norm(
@@ -247,13 +247,13 @@ def test_pairs_meet_in_direction_and_part_again(name: str, image: FloatArray) ->
             assert east[0] * east[1] < 0.0
 
 
-def test_crossing_pairs_stand_one_behind_the_other() -> None:
+def test_crossing_pairs_have_different_ranges() -> None:
     for near, far in pairs("crossing"):
         ranges_m = [np.linalg.norm(uav.trajectory(0.0).position_ned_m) for uav in (near, far)]
         assert ranges_m[1] == pytest.approx(1.6 * ranges_m[0])
 
 
-def test_mirrored_pairs_stand_before_and_behind_the_array() -> None:
+def test_mirrored_pairs_are_in_front_of_and_behind_the_array() -> None:
     for t_s in np.arange(0.0, 60.0, 2.0):
         for before, behind in pairs("mirror"):
             assert direction(before, t_s)[0] > 0.3
@@ -261,12 +261,12 @@ def test_mirrored_pairs_stand_before_and_behind_the_array() -> None:
 
 
 @pytest.mark.parametrize("name", ["crossing", "mirror"])
-def test_an_odd_one_swings_alone(name: str) -> None:
+def test_odd_uav_count_is_supported(name: str) -> None:
     assert len(BUILDERS[name](5).uavs) == 5
 
 
 @pytest.mark.parametrize("uavs", [100, 1000])
-def test_a_swarm_is_spread_and_does_not_collide(uavs: int) -> None:
+def test_swarm_is_spread_out_without_collisions(uavs: int) -> None:
     fleet = scenario.swarm(uavs, seed=4).uavs
     for t_s in (0.0, 33.3, 1234.5):
         positions = np.array([uav.trajectory(t_s).position_ned_m for uav in fleet])
@@ -277,7 +277,7 @@ def test_a_swarm_is_spread_and_does_not_collide(uavs: int) -> None:
         assert np.linalg.norm(positions, axis=1).min() > 200.0
 
 
-def test_every_layer_of_a_swarm_is_as_full_as_the_others() -> None:
+def test_swarm_layers_are_equally_filled() -> None:
     heights_m = [-uav.trajectory(0.0).position_ned_m[2] for uav in scenario.swarm(100).uavs]
     counts = {height: len(list(same)) for height, same in itertools.groupby(sorted(heights_m))}
     assert counts == {40.0 * layer: 10 for layer in range(1, 11)}

@@ -46,7 +46,7 @@ def aircraft(flight: Scenario) -> dict[int, Aircraft]:
     return {one.icao: one for one in flight.uavs[0].hears}
 
 
-def test_two_relays_tell_of_the_same_aircraft(
+def test_two_relays_report_the_same_aircraft_independently(
     told: dict[tuple[Source, int], list[Told]], aircraft: dict[int, Aircraft]
 ) -> None:
     assert set(told) == {(Source(n, 1), icao) for n in (1, 2) for icao in aircraft}
@@ -61,7 +61,7 @@ def test_two_relays_tell_of_the_same_aircraft(
         assert not times_s[0] & times_s[1]
 
 
-def test_aircraft_squitter_once_a_second(aircraft: dict[int, Aircraft]) -> None:
+def test_aircraft_transmit_once_per_second(aircraft: dict[int, Aircraft]) -> None:
     for one in aircraft.values():
         times_s = [contact.t_s for contact in islice(squitters(one, SEED), 300)]
         assert all(0.95 <= after - before <= 1.05 for before, after in pairwise(times_s))
@@ -71,7 +71,7 @@ def test_aircraft_squitter_once_a_second(aircraft: dict[int, Aircraft]) -> None:
         assert 0.1 * 300 < missed < 0.35 * 300
 
 
-def test_it_is_told_again_every_02_to_26_s_and_never_silent_for_10_s(
+def test_relay_interval_is_0_2_to_2_6_s_and_at_most_10_s(
     told: dict[tuple[Source, int], list[Told]],
 ) -> None:
     gaps_s = [after[0] - before[0] for found in told.values() for before, after in pairwise(found)]
@@ -82,7 +82,7 @@ def test_it_is_told_again_every_02_to_26_s_and_never_silent_for_10_s(
     assert sum(ordinary) / len(ordinary) > 1.0
 
 
-def test_content_stays_until_the_next_contact_but_for_tslc(
+def test_relayed_content_except_tslc_changes_only_on_contact(
     told: dict[tuple[Source, int], list[Told]], aircraft: dict[int, Aircraft]
 ) -> None:
     for (source, icao), found in told.items():
@@ -101,7 +101,7 @@ def test_content_stays_until_the_next_contact_but_for_tslc(
         assert same > 0.1 * len(found)
 
 
-def test_what_counts_is_true_and_the_rest_is_garbage(
+def test_valid_fields_are_true_and_invalid_fields_random(
     flight: Scenario, told: dict[tuple[Source, int], list[Told]], aircraft: dict[int, Aircraft]
 ) -> None:
     garbage = defaultdict(set)
@@ -143,7 +143,7 @@ def test_what_counts_is_true_and_the_rest_is_garbage(
     assert all(len(values) > 20 for values in garbage.values())
 
 
-def test_a_course_is_told_of_what_moves_alone(
+def test_heading_is_valid_only_for_moving_aircraft(
     told: dict[tuple[Source, int], list[Told]], aircraft: dict[int, Aircraft]
 ) -> None:
     told_courses = set()
@@ -157,7 +157,7 @@ def test_a_course_is_told_of_what_moves_alone(
     assert told_courses == {(True, False), (False, True)}
 
 
-def test_one_is_at_times_heard_without_a_position(
+def test_one_aircraft_is_sometimes_relayed_without_position(
     told: dict[tuple[Source, int], list[Told]],
 ) -> None:
     for (_, icao), found in told.items():
@@ -170,7 +170,7 @@ def test_one_is_at_times_heard_without_a_position(
             assert not placeless
 
 
-def test_the_service_reads_each_as_it_is_meant(
+def test_service_decodes_relayed_aircraft_correctly(
     flight: Scenario, told: dict[tuple[Source, int], list[Told]]
 ) -> None:
     for (source, icao), found in told.items():
@@ -194,7 +194,9 @@ def test_the_service_reads_each_as_it_is_meant(
             assert off_m <= 0.51 * speed_mps + 15.0
 
 
-def test_one_is_a_uav_of_the_fleet(flight: Scenario, aircraft: dict[int, Aircraft]) -> None:
+def test_one_aircraft_is_a_uav_of_the_fleet(
+    flight: Scenario, aircraft: dict[int, Aircraft]
+) -> None:
     twice = [
         (str(uav.source), str(one))
         for one in aircraft.values()
@@ -204,7 +206,9 @@ def test_one_is_a_uav_of_the_fleet(flight: Scenario, aircraft: dict[int, Aircraf
     assert twice == [("3:1", "icao:F00006")]
 
 
-def test_both_datums_and_a_length_of_callsign_that_fits(aircraft: dict[int, Aircraft]) -> None:
+def test_aircraft_use_both_altitude_datums_and_valid_callsigns(
+    aircraft: dict[int, Aircraft],
+) -> None:
     assert {one.datum for one in aircraft.values()} == {
         AltitudeDatum.PRESSURE,
         AltitudeDatum.GEOMETRIC,

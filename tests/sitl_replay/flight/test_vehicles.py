@@ -50,7 +50,7 @@ def sampled_s(vehicle: Vehicle, message: Any) -> float:
     return float((message.time_boot_ms - vehicle.uptime_ms) / 1000)
 
 
-def test_frames_are_mavlink_2_of_their_vehicle(sent: list[Transmission]) -> None:
+def test_frames_are_mavlink_2_with_their_vehicle_ids(sent: list[Transmission]) -> None:
     for _, vehicle, raw in sent:
         assert raw[0] == 0xFD
         assert tuple(raw[5:7]) == vehicle.source
@@ -71,28 +71,28 @@ def test_sequence_numbers_wrap() -> None:
     assert carrier[255:258] == [255, 0, 1]
 
 
-def test_order_and_bounds_of_time(sent: list[Transmission]) -> None:
+def test_send_times_are_sorted_and_within_the_duration(sent: list[Transmission]) -> None:
     times_s = [t_s for t_s, _, _ in sent]
     assert times_s == sorted(times_s)
     assert times_s[0] >= 0.0
     assert DURATION_S - 0.1 < times_s[-1] < DURATION_S
 
 
-def test_without_a_duration_it_goes_on(flight: Scenario, sent: list[Transmission]) -> None:
+def test_schedule_without_duration_is_endless(flight: Scenario, sent: list[Transmission]) -> None:
     endless = schedule(flight, seed=3, epoch_ns=EPOCH_NS)
     longer = list(itertools.islice(endless, len(sent) + 1))
     assert longer[:-1] == sent
     assert longer[-1].t_s >= DURATION_S
 
 
-def test_the_seed_decides(flight: Scenario, sent: list[Transmission]) -> None:
+def test_schedule_is_determined_by_the_seed(flight: Scenario, sent: list[Transmission]) -> None:
     again = list(schedule(flight, seed=3, epoch_ns=EPOCH_NS, duration_s=DURATION_S))
     other = list(schedule(flight, seed=4, epoch_ns=EPOCH_NS, duration_s=DURATION_S))
     assert again == sent
     assert [t.t_s for t in other] != [t.t_s for t in sent]
 
 
-def test_one_more_uav_changes_nothing_for_the_others() -> None:
+def test_adding_a_uav_leaves_other_frames_unchanged() -> None:
     few, many = (
         [t for t in schedule(scenario.paper(uavs), duration_s=3.0) if t.raw[5] <= 3]
         for uavs in (3, 4)
@@ -100,7 +100,9 @@ def test_one_more_uav_changes_nothing_for_the_others() -> None:
     assert few == many
 
 
-def test_rates(flight: Scenario, messages: dict[str, list[tuple[float, Vehicle, Any]]]) -> None:
+def test_message_rates_match_the_schedule(
+    flight: Scenario, messages: dict[str, list[tuple[float, Vehicle, Any]]]
+) -> None:
     seldom = flight.name == "swarm"
     for vehicle in flight.vehicles:
         attitude_s = 0.05 if vehicle is flight.carrier else 1.0 if seldom else 0.2
@@ -122,7 +124,7 @@ def test_rates(flight: Scenario, messages: dict[str, list[tuple[float, Vehicle, 
     assert set(messages) == {*intervals_s, *relayed}
 
 
-def test_a_swarm_sends_the_frames_that_it_says() -> None:
+def test_swarm_sends_the_stated_frame_rate() -> None:
     flight = scenario.swarm(100)
     sent = [t.vehicle for t in schedule(flight, duration_s=20.0)]
     by_carrier = sum(vehicle is flight.carrier for vehicle in sent)
@@ -131,13 +133,15 @@ def test_a_swarm_sends_the_frames_that_it_says() -> None:
     assert {uav.report_interval_s for uav in flight.uavs} == {0.25}
 
 
-def test_vehicles_are_out_of_step(messages: dict[str, list[tuple[float, Vehicle, Any]]]) -> None:
+def test_vehicles_send_at_different_phases(
+    messages: dict[str, list[tuple[float, Vehicle, Any]]],
+) -> None:
     first_s = [t_s for t_s, _, _ in messages["HEARTBEAT"]][:6]
     assert max(first_s) - min(first_s) > 0.1
     assert min(np.diff(first_s)) > 0.0
 
 
-def test_stamps_are_just_before_sending(
+def test_timestamps_precede_sending_by_the_jitter_at_most(
     messages: dict[str, list[tuple[float, Vehicle, Any]]],
 ) -> None:
     for name in ("GLOBAL_POSITION_INT", "ATTITUDE", "SYSTEM_TIME"):
@@ -166,7 +170,7 @@ def test_global_position_int(
         assert 0 <= message.hdg < 36_000
 
 
-def test_velocity_down_is_positive() -> None:
+def test_downward_velocity_is_positive() -> None:
     # No scenario descends, so this one does: GLOBAL_POSITION_INT's vz is positive down.
     def sinking(t_s: float) -> scenario.Motion:
         return scenario.Motion((0.0, 0.0, 3.0 * t_s), (0.0, 0.0, 3.0))
@@ -202,7 +206,7 @@ def test_attitude(messages: dict[str, list[tuple[float, Vehicle, Any]]]) -> None
         assert (*read, *rates) == pytest.approx(pose, rel=1e-6, abs=1e-9)
 
 
-def test_uavs_of_the_paper_face_where_they_fly() -> None:
+def test_paper_uavs_face_their_direction_of_flight() -> None:
     calm = scenario.paper(gust=0.0)
     for uav in calm.uavs:
         north_mps, east_mps, _ = uav.trajectory(4.2).velocity_ned_mps
@@ -253,7 +257,9 @@ def test_heartbeat(messages: dict[str, list[tuple[float, Vehicle, Any]]]) -> Non
         assert message.system_status == dialect.MAV_STATE_ACTIVE
 
 
-def test_both_clocks_of_system_time(messages: dict[str, list[tuple[float, Vehicle, Any]]]) -> None:
+def test_system_time_has_a_constant_offset_per_vehicle(
+    messages: dict[str, list[tuple[float, Vehicle, Any]]],
+) -> None:
     offsets_us = defaultdict(set)
     for t_s, vehicle, message in messages["SYSTEM_TIME"]:
         offsets_us[vehicle.source].add(message.time_unix_usec - 1000 * message.time_boot_ms)
@@ -266,14 +272,14 @@ def test_both_clocks_of_system_time(messages: dict[str, list[tuple[float, Vehicl
 
 
 @pytest.mark.parametrize("name", ["paper", "swarm"])
-def test_the_largest_fleet_can_be_packed(name: str) -> None:
+def test_largest_fleet_can_be_encoded(name: str) -> None:
     fleet = scenario.BUILDERS[name](scenario.MAX_UAVS)
     assert {t.vehicle.source for t in schedule(fleet, duration_s=1.1)} == {
         vehicle.source for vehicle in fleet.vehicles
     }
 
 
-def test_frames_are_those_that_pymavlink_packs(sent: list[Transmission]) -> None:
+def test_frames_equal_those_packed_by_pymavlink(sent: list[Transmission]) -> None:
     # Decoded and encoded again by the generated dialect, with truncated zeros and checksum.
     parser = dialect.MAVLink(None)
     for _, vehicle, raw in sent:
@@ -295,7 +301,7 @@ LIKE_OTHERS = ("racetrack", "mirror", "crossing")
         for one in scenario.BUILDERS
     ],
 )
-def test_the_service_reads_where_each_vehicle_is(name: str) -> None:
+def test_service_decodes_each_vehicle_position(name: str) -> None:
     # Long enough to include stops, turns and encounters; one frame in 40 is sufficient.
     flight = scenario.BUILDERS[name](6, seed=4)
     reports = 0
@@ -321,7 +327,7 @@ def test_the_service_reads_where_each_vehicle_is(name: str) -> None:
     assert reports > 20
 
 
-def test_two_that_share_an_id_keep_clocks_and_sequences_of_their_own() -> None:
+def test_uavs_with_a_shared_id_keep_separate_clocks() -> None:
     flight = scenario.shared_id(4)
     sent = list(schedule(flight, duration_s=8.0))
     twins = [[t for t in sent if t.vehicle is uav] for uav in flight.uavs[:2]]
@@ -346,7 +352,7 @@ GOLDEN = {
 
 
 @pytest.mark.parametrize(("name", "seed"), GOLDEN)
-def test_the_first_scenarios_are_what_they_were(name: str, seed: int) -> None:
+def test_scenario_frames_match_their_golden_digests(name: str, seed: int) -> None:
     digest = hashlib.sha256()
     for sent in schedule(scenario.BUILDERS[name](4), seed, EPOCH_NS, duration_s=20.0):
         digest.update(f"{sent.t_s!r} {sent.raw.hex()}\n".encode())
@@ -354,7 +360,7 @@ def test_the_first_scenarios_are_what_they_were(name: str, seed: int) -> None:
 
 
 @pytest.mark.benchmark
-def test_a_swarm_is_made_faster_than_it_flies() -> None:
+def test_swarm_frames_are_generated_faster_than_real_time() -> None:
     frames = schedule(scenario.swarm(1000))
     next(frames)
     start_s = time.perf_counter()

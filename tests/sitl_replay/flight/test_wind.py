@@ -42,7 +42,7 @@ def filter_power(axis: int, omega_radps: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_power_of_each_octave_is_that_of_the_forming_filter(axis: int) -> None:
+def test_octave_power_matches_the_forming_filter(axis: int) -> None:
     # Sampled in time, as in a measurement: dozens of winds of 15 minutes each.
     rng = Random(5)
     step_s, steps = 0.05, 2**14
@@ -67,7 +67,7 @@ def test_power_of_each_octave_is_that_of_the_forming_filter(axis: int) -> None:
 
 
 @pytest.mark.parametrize("axis", range(3))
-def test_the_whole_power_is_the_intensity_squared(axis: int) -> None:
+def test_total_power_is_the_squared_intensity(axis: int) -> None:
     wind = gusts(TURBULENCE, Random(1))
     power = float(np.sum(wind.amplitude[axis] ** 2) / 2)
     assert power == pytest.approx(TURBULENCE.sigma_mps[axis] ** 2, rel=0.03)
@@ -75,7 +75,7 @@ def test_the_whole_power_is_the_intensity_squared(axis: int) -> None:
 
 
 @pytest.mark.parametrize("x", [0.1, 1.0, 7.0])
-def test_shares_of_power_are_integrals_of_the_spectra(x: float) -> None:
+def test_power_shares_are_integrals_of_the_spectra(x: float) -> None:
     along, _ = integrate.quad(lambda u: 2 / math.pi / (1 + u**2), 0, x)
     across, _ = integrate.quad(lambda u: (1 + 3 * u**2) / (1 + u**2) ** 2 / math.pi, 0, x)
     assert power_along(x) == pytest.approx(along)
@@ -83,7 +83,7 @@ def test_shares_of_power_are_integrals_of_the_spectra(x: float) -> None:
     assert power_along(1e9) == pytest.approx(1.0) == pytest.approx(power_across(1e9))
 
 
-def test_low_altitude_forms() -> None:
+def test_low_altitude_lengths_and_intensities() -> None:
     # Hand calculation at 100 feet: shape 0.177 + 0.0823 = 0.2593; its powers 1.2 and 0.4.
     calm = low_altitude(30.48, 10.0, 15.0)
     assert calm.length_m == pytest.approx((153.99, 153.99, 30.48), rel=1e-3)
@@ -97,7 +97,7 @@ def test_low_altitude_forms() -> None:
 
 
 @pytest.mark.parametrize("hold", [COPTER_HOLD, PLANE_HOLD, Hold(1.5, 0.4, 0.5)])
-def test_displacement_solves_the_equation_of_the_hold(hold: Hold) -> None:
+def test_displacement_solves_the_position_hold_equation(hold: Hold) -> None:
     wind = gusts(TURBULENCE, Random(2))
     moved = displaced(wind, hold)
     start_m, start_mps = moved(0.0)
@@ -115,7 +115,7 @@ def test_displacement_solves_the_equation_of_the_hold(hold: Hold) -> None:
 
 
 @pytest.mark.parametrize("course_deg", [0, 37, 90, 200])
-def test_displacement_is_turned_to_where_the_wind_blows(course_deg: int) -> None:
+def test_displacement_is_rotated_to_the_wind_direction(course_deg: int) -> None:
     sines = displaced(gusts(TURBULENCE, Random(3)), COPTER_HOLD)
     along_north = Rotation.from_euler("z", course_deg, degrees=True)
     moved = Displacement(sines, math.radians(course_deg))(4.0)
@@ -123,7 +123,7 @@ def test_displacement_is_turned_to_where_the_wind_blows(course_deg: int) -> None
         assert read == pytest.approx(along_north.apply(meant))
 
 
-def test_winds_differ_by_their_generator_alone() -> None:
+def test_winds_are_determined_by_the_seed() -> None:
     one, same, other = (gusts(TURBULENCE, Random(seed)) for seed in (1, 1, 2))
     assert np.array_equal(one(3.0), same(3.0))
     assert not np.isclose(one(3.0)[0], other(3.0)[0]).any()

@@ -80,7 +80,7 @@ def udp(host: str = "127.0.0.1") -> socket.socket:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
-def test_udpout_sends_hears_and_knocks(run: Run, host: str) -> None:
+def test_udpout_sends_receives_and_opens_with_an_empty_packet(run: Run, host: str) -> None:
     heard = Heard()
 
     async def scene(other: socket.socket) -> list[bytes]:
@@ -103,7 +103,7 @@ def test_udpout_sends_hears_and_knocks(run: Run, host: str) -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
-def test_udpin_sends_to_everybody_it_has_heard(run: Run, host: str) -> None:
+def test_udpin_sends_to_every_known_peer(run: Run, host: str) -> None:
     heard = Heard()
 
     async def scene(first: socket.socket, second: socket.socket) -> None:
@@ -130,7 +130,7 @@ def test_udpin_sends_to_everybody_it_has_heard(run: Run, host: str) -> None:
     assert heard.octets() == b"hello"
 
 
-def test_udpin_goes_on_when_peers_are_gone_and_keeps_a_bounded_number(run: Run) -> None:
+def test_udpin_survives_lost_peers_and_bounds_their_number(run: Run) -> None:
     async def scene(first: socket.socket, early: socket.socket, last: socket.socket) -> None:
         heard = Heard()
         endpoint = await open_link(parse_link("udpin:127.0.0.1:0"), heard)
@@ -158,7 +158,7 @@ def test_udpin_goes_on_when_peers_are_gone_and_keeps_a_bounded_number(run: Run) 
         run(scene(first, early, last))
 
 
-def test_tcp_hears_and_is_lost_when_the_peer_closes(run: Run) -> None:
+def test_tcp_receives_and_is_lost_when_the_peer_closes(run: Run) -> None:
     heard = Heard()
 
     async def scene() -> TrafficLink:
@@ -183,7 +183,7 @@ def test_tcp_hears_and_is_lost_when_the_peer_closes(run: Run) -> None:
     assert (peer.lost, peer.broken, peer.dropped) == ("the peer hung up", False, 0)
 
 
-def test_what_is_dropped_is_not_kept(run: Run) -> None:
+def test_dropped_frames_are_not_buffered(run: Run) -> None:
     async def scene(url: LinkUrl) -> None:
         peer = await open_link(url)
         while peer.dropped < 1000:
@@ -196,7 +196,7 @@ def test_what_is_dropped_is_not_kept(run: Run) -> None:
         run(scene(LinkUrl(scheme="tcp", host="127.0.0.1", port=deaf.getsockname()[1])))
 
 
-async def none_lost(link: TrafficLink, far: int, frames: list[bytes]) -> None:
+async def assert_no_frame_lost(link: TrafficLink, far: int, frames: list[bytes]) -> None:
     """Send as fast as the link accepts to a peer that reads slowly; then close the link."""
     os.set_blocking(far, False)
     got = bytearray()
@@ -221,22 +221,24 @@ async def none_lost(link: TrafficLink, far: int, frames: list[bytes]) -> None:
     assert (bytes(got), link.dropped, link.lost) == (b"".join(frames), 0, "")
 
 
-def test_a_connection_loses_nothing_to_who_waits(run: Run) -> None:
+def test_tcp_loses_no_frame_if_the_sender_waits(run: Run) -> None:
     async def scene(server: socket.socket) -> None:
         link = await open_link(
             LinkUrl(scheme="tcp", host="127.0.0.1", port=server.getsockname()[1])
         )
         with server.accept()[0] as far:
-            await none_lost(link, far.fileno(), [n.to_bytes(4, "big") * 250 for n in range(20_000)])
+            await assert_no_frame_lost(
+                link, far.fileno(), [n.to_bytes(4, "big") * 250 for n in range(20_000)]
+            )
 
     with socket.create_server(("127.0.0.1", 0)) as server:
         run(scene(server))
 
 
-def test_a_serial_port_loses_nothing_to_who_waits(run: Run) -> None:
+def test_serial_port_loses_no_frame_if_the_sender_waits(run: Run) -> None:
     async def scene(far: int, url: LinkUrl) -> None:
         frames = [n.to_bytes(4, "big") * 10 for n in range(2_000)]
-        await none_lost(await open_link(url), far, frames)
+        await assert_no_frame_lost(await open_link(url), far, frames)
 
     far, url = terminal()
     try:
@@ -246,7 +248,7 @@ def test_a_serial_port_loses_nothing_to_who_waits(run: Run) -> None:
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
-def test_tcpin_serves_everybody_from_then_on(run: Run, host: str) -> None:
+def test_tcpin_serves_every_peer_from_its_connection_on(run: Run, host: str) -> None:
     async def scene() -> tuple[list[bytes], Heard]:
         heard = Heard()
         server = await open_link(parse_link(f"tcpin:{host}:0"), heard)
@@ -288,7 +290,7 @@ def test_tcpin_serves_everybody_from_then_on(run: Run, host: str) -> None:
     assert len({peer for peer, _ in heard.pieces}) == 3
 
 
-def test_a_visitor_that_does_not_read_holds_nobody_up(run: Run) -> None:
+def test_tcp_client_that_does_not_read_delays_no_other(run: Run) -> None:
     async def scene() -> tuple[int, int]:
         server = await open_link(parse_link("tcpin:127.0.0.1:0"))
         address = ("127.0.0.1", server.url.port)
@@ -322,9 +324,7 @@ def test_a_visitor_that_does_not_read_holds_nobody_up(run: Run) -> None:
         ("tcpin:192.0.2.1:5760", "Cannot assign requested address"),
     ],
 )
-def test_a_link_that_cannot_be_opened_is_told_by_its_url(
-    run: Run, text: str, complaint: str
-) -> None:
+def test_link_open_error_names_the_url(run: Run, text: str, complaint: str) -> None:
     with pytest.raises(LinkError, match=complaint) as caught:
         run(open_link(parse_link(text)))
     assert str(caught.value).startswith(f"{text}: ")
@@ -339,7 +339,7 @@ def terminal() -> tuple[int, LinkUrl]:
     return far, url
 
 
-def test_serial_sends_and_hears_every_byte(run: Run) -> None:
+def test_serial_sends_and_receives_every_byte_value(run: Run) -> None:
     async def scene(far: int, url: LinkUrl) -> bytes:
         heard = Heard()
         port = await open_link(url, heard)
@@ -358,7 +358,7 @@ def test_serial_sends_and_hears_every_byte(run: Run) -> None:
         os.close(far)
 
 
-def test_a_slow_serial_port_drops_whole_frames_and_keeps_little(run: Run) -> None:
+def test_slow_serial_port_drops_whole_frames(run: Run) -> None:
     async def scene(far: int, url: LinkUrl) -> None:
         port = await open_link(url)
         sent = 0
@@ -394,7 +394,7 @@ def test_a_slow_serial_port_drops_whole_frames_and_keeps_little(run: Run) -> Non
         os.close(far)
 
 
-def test_an_unplugged_serial_port_is_lost(run: Run) -> None:
+def test_unplugged_serial_port_is_lost(run: Run) -> None:
     heard = Heard()
 
     async def scene(far: int, url: LinkUrl) -> TrafficLink:
@@ -411,7 +411,7 @@ def test_an_unplugged_serial_port_is_lost(run: Run) -> None:
     assert heard.pieces == [(None, b"")]
 
 
-def test_a_serial_port_is_had_by_one_alone(run: Run) -> None:
+def test_serial_port_is_opened_exclusively(run: Run) -> None:
     async def scene(url: LinkUrl) -> None:
         port = await open_link(url)
         with pytest.raises(LinkError, match=r"^serial:.*: "):

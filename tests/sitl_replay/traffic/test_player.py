@@ -66,7 +66,7 @@ def without_clock(raw: bytes) -> bytes | None:
     return None if msgid_of(raw) == dialect.MAVLINK_MSG_ID_SYSTEM_TIME else raw
 
 
-def test_a_udp_socket_receives_what_is_flown(receiver: socket.socket) -> None:
+def test_udp_socket_receives_the_flown_frames(receiver: socket.socket) -> None:
     tally = run_async(player.fly(scenario.paper(), [url_of(receiver)], 0.6, seed=5))
     got = waiting(receiver)
     meant = [sent.raw for sent in schedule(scenario.paper(), seed=5, duration_s=0.6)]
@@ -75,14 +75,14 @@ def test_a_udp_socket_receives_what_is_flown(receiver: socket.socket) -> None:
     assert tally.messages.total() == tally.frames
 
 
-def test_it_flies_in_real_time(receiver: socket.socket) -> None:
+def test_flight_runs_in_real_time(receiver: socket.socket) -> None:
     tally = run_async(player.fly(scenario.hover(), [url_of(receiver)], 0.5))
     last_s = [sent.t_s for sent in schedule(scenario.hover(), duration_s=0.5)][-1]
     assert tally.duration_s >= last_s
     assert tally.duration_s < last_s + 0.3
 
 
-def test_every_link_gets_every_frame(receiver: socket.socket) -> None:
+def test_every_link_receives_every_frame(receiver: socket.socket) -> None:
     with socket.socket(socket.AF_INET6, socket.SOCK_DGRAM) as second:
         try:
             second.bind(("::1", 0))
@@ -93,7 +93,7 @@ def test_every_link_gets_every_frame(receiver: socket.socket) -> None:
         assert len(waiting(receiver)) == len(waiting(second)) == tally.frames > 0
 
 
-def test_a_refused_udp_peer_is_no_error(receiver: socket.socket) -> None:
+def test_refused_udp_peer_is_not_an_error(receiver: socket.socket) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as gone:
         gone.bind(("127.0.0.1", 0))
         nobody = url_of(gone)
@@ -102,7 +102,7 @@ def test_a_refused_udp_peer_is_no_error(receiver: socket.socket) -> None:
     assert tally.lost == []
 
 
-def test_udp_goes_on_when_the_peer_comes_back() -> None:
+def test_udp_resumes_when_the_peer_returns() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as first:
         first.bind(("127.0.0.1", 0))
         address = first.getsockname()
@@ -131,7 +131,7 @@ def test_udp_goes_on_when_the_peer_comes_back() -> None:
     assert run_async(scene())[0] == 0xFD
 
 
-def test_a_tcp_peer_gets_the_stream() -> None:
+def test_tcp_peer_receives_the_stream() -> None:
     async def scene() -> tuple[bytes, player.Tally]:
         received = bytearray()
         ended = asyncio.Event()
@@ -163,7 +163,7 @@ async def closing_server() -> tuple[asyncio.Server, str]:
     return server, f"tcp:127.0.0.1:{server.sockets[0].getsockname()[1]}"
 
 
-def test_a_vanished_tcp_peer_ends_the_flight() -> None:
+def test_lost_tcp_peer_ends_the_flight() -> None:
     async def scene() -> None:
         server, url = await closing_server()
         async with server:
@@ -173,7 +173,7 @@ def test_a_vanished_tcp_peer_ends_the_flight() -> None:
     run_async(scene())
 
 
-def test_the_other_links_outlive_a_vanished_peer(
+def test_other_links_continue_after_a_lost_peer(
     receiver: socket.socket, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def scene() -> tuple[str, player.Tally]:
@@ -187,7 +187,7 @@ def test_the_other_links_outlive_a_vanished_peer(
     assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
-def test_a_refused_tcp_peer_is_told_by_its_url() -> None:
+def test_refused_tcp_peer_error_names_the_url() -> None:
     with socket.socket() as gone:
         gone.bind(("127.0.0.1", 0))
         port = gone.getsockname()[1]
@@ -196,7 +196,7 @@ def test_a_refused_tcp_peer_is_told_by_its_url() -> None:
 
 
 @pytest.mark.full
-def test_a_peer_that_does_not_read_holds_nobody_up(receiver: socket.socket) -> None:
+def test_tcp_peer_that_does_not_read_does_not_block_playback(receiver: socket.socket) -> None:
     # In real time: frames for this peer are dropped and counted once its buffers are full.
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         deaf.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -207,9 +207,7 @@ def test_a_peer_that_does_not_read_holds_nobody_up(receiver: socket.socket) -> N
     assert 0 < tally.dropped < tally.frames
 
 
-def test_a_cancelled_flight_closes_its_links_and_its_log(
-    receiver: socket.socket, tmp_path: Path
-) -> None:
+def test_cancelled_flight_closes_its_links_and_log(receiver: socket.socket, tmp_path: Path) -> None:
     tlog = tmp_path / "cut.tlog"
     tally = player.Tally()
 
@@ -230,7 +228,7 @@ def test_a_cancelled_flight_closes_its_links_and_its_log(
     assert tlog.stat().st_size == tally.octets + 8 * tally.frames
 
 
-def test_a_log_is_played_as_it_is(receiver: socket.socket) -> None:
+def test_log_is_played_unchanged(receiver: socket.socket) -> None:
     frames = log_of([0.0, 0.1, 0.15, 0.3])
     tally = run_async(player.play(frames, [url_of(receiver)]))
     assert waiting(receiver) == [frame.raw for frame in frames]
@@ -239,7 +237,9 @@ def test_a_log_is_played_as_it_is(receiver: socket.socket) -> None:
 
 
 @pytest.mark.parametrize(("speed", "seconds"), [(2.0, 0.15), (None, 0.0)])
-def test_speed(receiver: socket.socket, speed: float | None, seconds: float) -> None:
+def test_playback_speed_scales_the_duration(
+    receiver: socket.socket, speed: float | None, seconds: float
+) -> None:
     frames = log_of([0.0, 0.1, 0.2, 0.3])
     tally = run_async(player.play(frames, [url_of(receiver)], speed))
     assert len(waiting(receiver)) == 4
@@ -247,7 +247,7 @@ def test_speed(receiver: socket.socket, speed: float | None, seconds: float) -> 
 
 
 @pytest.mark.full
-def test_at_full_speed_a_slow_tcp_peer_loses_nothing() -> None:
+def test_slow_tcp_peer_loses_no_frame_at_full_speed() -> None:
     frames = log_of([0.0] * 20) * 10_000
 
     async def scene() -> tuple[int, player.Tally]:
@@ -278,7 +278,7 @@ def test_at_full_speed_a_slow_tcp_peer_loses_nothing() -> None:
     assert count == tally.octets == sum(len(frame.raw) for frame in frames)
 
 
-def test_broken_stamps_are_clamped_and_counted() -> None:
+def test_bad_timestamps_are_clamped_and_counted() -> None:
     tally = player.Tally()
     stamps_s = [100.0, 101.0, 41.0, 42.5, 1e9, 1e9 + 5.0, 0.0, 0.25]
     times_s = [t_s for t_s, _ in player.on_timeline(log_of(stamps_s), tally)]
@@ -286,7 +286,7 @@ def test_broken_stamps_are_clamped_and_counted() -> None:
     assert tally.clamped == 3
 
 
-def test_message_names() -> None:
+def test_message_names_include_unknown_ids() -> None:
     assert player.message_name(168) == "WIND"
     assert player.message_name(70_000) == "UNKNOWN_70000"
 
@@ -302,7 +302,7 @@ async def port_told(caplog: pytest.LogCaptureFixture) -> int:
     return int(texts[0].split(": ")[0].rpartition(":")[2])
 
 
-def test_a_tcp_server_waits_for_its_first_peer_and_outlives_it(
+def test_tcp_server_waits_for_its_first_peer_and_survives_it(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     async def scene() -> tuple[bytes, bytes, player.Tally]:
@@ -328,7 +328,7 @@ def test_a_tcp_server_waits_for_its_first_peer_and_outlives_it(
     assert [record.levelname for record in caplog.records] == ["WARNING"]
 
 
-def test_with_nobody_connected_frames_are_dropped(caplog: pytest.LogCaptureFixture) -> None:
+def test_frames_are_dropped_without_connected_peers(caplog: pytest.LogCaptureFixture) -> None:
     async def scene() -> player.Tally:
         flight = asyncio.create_task(
             player.play(log_of([0.0, 0.4, 0.5, 0.6]), ["tcpin:127.0.0.1:0"])
@@ -343,7 +343,7 @@ def test_with_nobody_connected_frames_are_dropped(caplog: pytest.LogCaptureFixtu
     assert (tally.frames, tally.dropped, tally.lost) == (4, 3, [])
 
 
-def test_a_udp_server_sends_to_who_has_sent_it_something(
+def test_udp_server_sends_to_peers_that_sent_a_packet(
     receiver: socket.socket, caplog: pytest.LogCaptureFixture
 ) -> None:
     async def scene() -> None:
@@ -355,7 +355,7 @@ def test_a_udp_server_sends_to_who_has_sent_it_something(
     assert waiting(receiver) == [frame.raw for frame in log_of([0.0, 0.1, 0.2])]
 
 
-def test_a_serial_port_gets_the_stream() -> None:
+def test_serial_port_receives_the_stream() -> None:
     far, near = pty.openpty()
     url = f"serial:{os.ttyname(near)}:57600"
     os.close(near)
@@ -374,7 +374,7 @@ def faults(*texts: str) -> list[Fault]:
     return [Fault.parse(text) for text in texts]
 
 
-def test_faults_strike_each_link_by_itself(receiver: socket.socket) -> None:
+def test_faults_apply_to_each_link_independently(receiver: socket.socket) -> None:
     frames = log_of([0.01 * number for number in range(60)])
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as second:
         second.bind(("127.0.0.1", 0))
@@ -395,7 +395,7 @@ def test_faults_strike_each_link_by_itself(receiver: socket.socket) -> None:
         assert 0.75 <= tally.duration_s < 1.2  # delayed frames are awaited
 
 
-def test_late_frames_come_late_in_real_time(receiver: socket.socket) -> None:
+def test_delayed_frames_arrive_late_in_real_time(receiver: socket.socket) -> None:
     async def scene() -> list[float]:
         loop = asyncio.get_running_loop()
         start_s = loop.time()
@@ -416,7 +416,7 @@ def test_late_frames_come_late_in_real_time(receiver: socket.socket) -> None:
     assert min(arrivals_s) >= 0.3
 
 
-def test_faults_pass_as_fast_as_the_log(receiver: socket.socket) -> None:
+def test_fault_delays_scale_with_playback_speed(receiver: socket.socket) -> None:
     frames = log_of([0.0, 1.0, 2.0])
     asked = faults("delay=2")
     tally = run_async(player.play(frames, [url_of(receiver)], 10.0, faults=asked))
@@ -426,7 +426,7 @@ def test_faults_pass_as_fast_as_the_log(receiver: socket.socket) -> None:
     assert len(waiting(receiver)) == 6
 
 
-def test_a_flight_records_what_its_senders_send(receiver: socket.socket, tmp_path: Path) -> None:
+def test_flight_log_holds_the_frames_as_sent(receiver: socket.socket, tmp_path: Path) -> None:
     tlog = tmp_path / "a.tlog"
     asked = faults("loss=1", "reboot=0.2")
     tally = run_async(
@@ -446,7 +446,7 @@ def test_a_flight_records_what_its_senders_send(receiver: socket.socket, tmp_pat
     assert list(map(without_clock, raws)) == list(map(without_clock, sent))
 
 
-def test_faults_that_do_not_go_together_open_nothing(tmp_path: Path) -> None:
+def test_conflicting_faults_open_no_link(tmp_path: Path) -> None:
     with pytest.raises(FaultError, match="loss is given 2 times"):
         run_async(
             player.fly(scenario.hover(), ["tcp:127.0.0.1:1"], faults=faults("loss=1", "loss=0.5"))

@@ -44,7 +44,7 @@ def frames() -> list[bytes]:
     return [sent.raw for sent in made]
 
 
-def test_mavutil_reads_what_is_written(tmp_path: Path, frames: list[bytes]) -> None:
+def test_mavutil_reads_the_written_tlog(tmp_path: Path, frames: list[bytes]) -> None:
     tlog = tmp_path / "a.tlog"
     start_ns = 1_760_000_000_123_456_789
     with recorder.TlogWriter(tlog) as writer:
@@ -65,7 +65,7 @@ def test_a_killed_process_loses_at_most_a_second(tmp_path: Path, frames: list[by
         assert 35 - 10 <= on_disk < 35
 
 
-def test_a_flight_is_recorded_as_it_was_sent(tmp_path: Path) -> None:
+def test_flight_is_recorded_as_sent(tmp_path: Path) -> None:
     tlog = tmp_path / "flight.tlog"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
         sink.bind(("127.0.0.1", 0))
@@ -91,7 +91,7 @@ async def until(heard: recorder.RecordingTally, count: int) -> None:
             await asyncio.sleep(0.005)
 
 
-def test_udp_is_recorded_peer_by_peer(tmp_path: Path, frames: list[bytes]) -> None:
+def test_udp_peers_are_recorded_separately(tmp_path: Path, frames: list[bytes]) -> None:
     # One peer sends half a frame, then another sends whole ones, which must not be affected.
     tlog = tmp_path / "heard.tlog"
     port = free_port(socket.SOCK_DGRAM)
@@ -135,7 +135,7 @@ async def serve(data: bytes) -> tuple[asyncio.Server, LinkUrl]:
     return server, LinkUrl(scheme="tcp", host="127.0.0.1", port=port)
 
 
-def test_tcp_is_recorded_to_its_end(tmp_path: Path, frames: list[bytes]) -> None:
+def test_tcp_stream_is_recorded_to_its_end(tmp_path: Path, frames: list[bytes]) -> None:
     tlog = tmp_path / "heard.tlog"
     damaged = bytearray(frames[3])
     damaged[12] ^= 0x40
@@ -151,7 +151,7 @@ def test_tcp_is_recorded_to_its_end(tmp_path: Path, frames: list[bytes]) -> None
     assert heard.rejected == {Reason.BAD_CRC.value: 1}
 
 
-def test_frames_behind_a_torn_one_are_kept_at_the_end(tmp_path: Path, frames: list[bytes]) -> None:
+def test_frames_after_a_truncated_frame_are_recorded(tmp_path: Path, frames: list[bytes]) -> None:
     # A header that claims 255 bytes, and two whole frames within these bytes.
     tlog = tmp_path / "heard.tlog"
     claim = bytes([0xFD, 255, 0, 0, 0, 9, 1, 33, 0, 0])
@@ -165,9 +165,7 @@ def test_frames_behind_a_torn_one_are_kept_at_the_end(tmp_path: Path, frames: li
     assert [raw for _, raw in read_by_mavutil(tlog)] == frames[:2]
 
 
-def test_a_peer_that_leaves_before_the_duration_is_an_error(
-    tmp_path: Path, frames: list[bytes]
-) -> None:
+def test_peer_closing_before_the_duration_is_an_error(tmp_path: Path, frames: list[bytes]) -> None:
     async def scene() -> None:
         server, url = await serve(frames[0])
         async with server:
@@ -177,14 +175,14 @@ def test_a_peer_that_leaves_before_the_duration_is_an_error(
         run_async(scene())
 
 
-def test_the_duration_ends_a_recording(tmp_path: Path) -> None:
+def test_duration_ends_a_recording(tmp_path: Path) -> None:
     url = LinkUrl(scheme="udpin", host="127.0.0.1", port=free_port(socket.SOCK_DGRAM))
     heard = run_async(recorder.record(url, tmp_path / "silence.tlog", 0.05))
     assert heard.frames == 0
     assert 0.05 <= heard.duration_s < 1.0
 
 
-def test_a_taken_port_is_told(tmp_path: Path) -> None:
+def test_port_in_use_is_an_error(tmp_path: Path) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as owner:
         owner.bind(("127.0.0.1", 0))
         url = LinkUrl(scheme="udpin", host="127.0.0.1", port=owner.getsockname()[1])
@@ -229,7 +227,7 @@ async def waited_for(
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "[::1]"])
 @pytest.mark.parametrize("pair", ["udpin udpout", "udpout udpin", "tcp tcpin", "tcpin tcp"])
-def test_what_is_played_over_any_link_is_recorded(
+def test_frames_played_over_any_link_are_recorded(
     tmp_path: Path, frames: list[bytes], pair: str, host: str, caplog: pytest.LogCaptureFixture
 ) -> None:
     """The recorder at one end and the player at the other; either may be the listener."""
@@ -270,7 +268,7 @@ def test_what_is_played_over_any_link_is_recorded(
     assert abs(read[0][0] - time.time()) < 60.0
 
 
-def test_what_is_played_over_zenoh_is_recorded(tmp_path: Path, frames: list[bytes]) -> None:
+def test_frames_played_over_zenoh_are_recorded(tmp_path: Path, frames: list[bytes]) -> None:
     pytest.importorskip("zenoh")
     tlog, heard = tmp_path / "heard.tlog", recorder.RecordingTally()
     log = [
@@ -301,7 +299,7 @@ def has_ipv6() -> bool:
     return True
 
 
-def test_serial_is_recorded_until_it_is_unplugged(tmp_path: Path, frames: list[bytes]) -> None:
+def test_serial_port_is_recorded_until_unplugged(tmp_path: Path, frames: list[bytes]) -> None:
     tlog = tmp_path / "heard.tlog"
     far, near = pty.openpty()
     url = parse_link(f"serial:{os.ttyname(near)}:57600")
@@ -328,7 +326,7 @@ def test_serial_is_recorded_until_it_is_unplugged(tmp_path: Path, frames: list[b
     assert [raw for _, raw in read_by_mavutil(tlog) if raw != KNOCK] == frames[:3]
 
 
-def test_a_recorder_is_silent_but_for_its_opener(tmp_path: Path, frames: list[bytes]) -> None:
+def test_recorder_sends_only_its_opening_packet(tmp_path: Path, frames: list[bytes]) -> None:
     heard = recorder.RecordingTally()
 
     async def scene(vehicle: socket.socket) -> list[bytes]:
@@ -354,7 +352,7 @@ def test_a_recorder_is_silent_but_for_its_opener(tmp_path: Path, frames: list[by
         assert run_async(scene(vehicle)) == [b"", b""]
 
 
-def test_what_was_heard_is_on_disk_when_it_falls_silent(
+def test_received_frames_are_on_disk_when_traffic_stops(
     tmp_path: Path, frames: list[bytes]
 ) -> None:
     """A killed process loses at most a second, not everything since the last flush."""
@@ -376,7 +374,7 @@ def test_what_was_heard_is_on_disk_when_it_falls_silent(
     run_async(scene())
 
 
-def test_a_visitor_who_leaves_does_not_end_the_recording_of_a_server(
+def test_disconnecting_client_does_not_end_a_server_recording(
     tmp_path: Path, frames: list[bytes], caplog: pytest.LogCaptureFixture
 ) -> None:
     tlog = tmp_path / "a.tlog"
@@ -403,7 +401,7 @@ def test_a_visitor_who_leaves_does_not_end_the_recording_of_a_server(
     assert [raw for _, raw in read_by_mavutil(tlog)] == frames[:2]
 
 
-def test_mavlogdump_reads_what_was_recorded(tmp_path: Path) -> None:
+def test_mavlogdump_reads_the_recording(tmp_path: Path) -> None:
     tlog = tmp_path / "flight.tlog"
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sink:
         sink.bind(("127.0.0.1", 0))

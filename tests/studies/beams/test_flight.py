@@ -106,7 +106,7 @@ def worth(gain_db: float = 10.0, **given: Any) -> Worth:
     return replace(blank, **given)
 
 
-def test_sums_by_hand() -> None:
+def test_summary_matches_hand_computed_values() -> None:
     """Four samples, one without a beam and one without a guarantee."""
     samples = [
         Sample(t_s=0.0, uav="1:1"),
@@ -172,7 +172,7 @@ def test_sums_by_hand() -> None:
     assert row[SHARP + "violations"] == row[SHARP + "violations_within_bound"] == 1
 
 
-def test_without_beams_nothing_is_known() -> None:
+def test_summary_without_beams_is_unknown() -> None:
     row = summed_up([Sample(t_s=0.0, uav="1:1"), Sample(t_s=1.0, uav="1:1")])
     assert (row["n"], row["without_beam"]) == (0, 2)
     counts = {"n", "without_beam", "n_true", "sharp_n"}
@@ -185,7 +185,7 @@ def test_without_beams_nothing_is_known() -> None:
 @pytest.mark.parametrize(
     "hz", [*(pytest.param(hz, marks=pytest.mark.full) for hz in (5.0, 100.0)), 7.0]
 )
-def test_looks_are_at_the_last_tick(short: Path, hz: float) -> None:
+def test_samples_are_taken_at_the_last_tick(short: Path, hz: float) -> None:
     """Each update is sampled once, whatever the sampling rate."""
     settings = Settings().override(center={"source": "home"}, beams={"targets": "telemetry"})
     pipeline, ticks, begins_ns, ends_ns = Pipeline(settings), [], None, 0
@@ -207,9 +207,7 @@ def test_looks_are_at_the_last_tick(short: Path, hz: float) -> None:
     assert len(seen) == pytest.approx(8 * min(hz, settings.beams.update_hz), abs=2)
 
 
-def test_sharp_beams_are_those_of_a_pipeline_that_does_not_widen(
-    cut: Path, watched: StudiedFlight
-) -> None:
+def test_sharp_beams_equal_a_pipeline_without_widening(cut: Path, watched: StudiedFlight) -> None:
     sharp = watch([cut], on_carrier(beams={"widen": False}), 0.5)
     assert (watched.widen, sharp.widen) == (True, False)
     assert len(watched.samples) == len(sharp.samples) > 40
@@ -223,7 +221,7 @@ def test_sharp_beams_are_those_of_a_pipeline_that_does_not_widen(
     assert any(s.as_set.widened for s in watched.samples if s.as_set)
 
 
-def test_what_is_promised_is_kept(watched: StudiedFlight) -> None:
+def test_guaranteed_gain_and_bounds_hold(watched: StudiedFlight) -> None:
     row = summed_up(watched.samples)
     assert watched.truth == "SIM_STATE"
     assert set(watched.by_uav) == UAVS
@@ -257,7 +255,7 @@ def around(towards: np.ndarray, bound_rad: float, rng: np.random.Generator) -> n
 
 
 @pytest.mark.full
-def test_a_look_by_brute_force(cut: Path, looked: tuple[Pipeline, Update]) -> None:
+def test_sample_matches_brute_force(cut: Path, looked: tuple[Pipeline, Update]) -> None:
     pipeline, update = looked
     truth = array_truth.load([cut], pipeline)
     assert truth is not None
@@ -300,7 +298,7 @@ def _best(pipeline: Pipeline, seen: Sight, towards: np.ndarray) -> int:
     return int(np.argmax([brute_gain_db(pipeline, towards, beam) for beam in beams]))
 
 
-def test_a_codebook_that_is_missed_is_said(looked: tuple[Pipeline, Update], cut: Path) -> None:
+def test_codebook_miss_is_reported(looked: tuple[Pipeline, Update], cut: Path) -> None:
     """The true direction is far off: outside the bound, and its best beam is not swept."""
     pipeline, update = looked
     truth = array_truth.load([cut], pipeline)
@@ -316,7 +314,7 @@ def test_a_codebook_that_is_missed_is_said(looked: tuple[Pipeline, Update], cut:
         assert samples[uav].as_set.true_gain_db is None
 
 
-def test_nothing_is_guaranteed_past_the_edge_of_coverage(looked: tuple[Pipeline, Update]) -> None:
+def test_no_guarantee_beyond_the_coverage_edge(looked: tuple[Pipeline, Update]) -> None:
     pipeline, update = looked
     (sample,) = (s for s in look(sight(pipeline), update, None, 0.0) if s.uav == "2:1")
     (beam,) = (beam for beam in update.beams.beams if beam.uav == "2:1")
@@ -334,7 +332,7 @@ def test_nothing_is_guaranteed_past_the_edge_of_coverage(looked: tuple[Pipeline,
         assert (found.guaranteed_gain_db is not None) == sure
 
 
-def test_turns_are_in_the_spectral_efficiency(looked: tuple[Pipeline, Update]) -> None:
+def test_spectral_efficiency_accounts_for_time_slots(looked: tuple[Pipeline, Update]) -> None:
     pipeline, update = looked
     grouped = replace(
         update.beams, beams=tuple(replace(b, group=i) for i, b in enumerate(update.beams.beams))
@@ -347,7 +345,7 @@ def test_turns_are_in_the_spectral_efficiency(looked: tuple[Pipeline, Update]) -
     assert sorted(one.group for one in found.values()) == [0, 1, 2, 3]
 
 
-def test_an_untracked_carrier_leaves_no_beam(looked: tuple[Pipeline, Update]) -> None:
+def test_untracked_carrier_yields_samples_without_beam(looked: tuple[Pipeline, Update]) -> None:
     pipeline, update = looked
     lost = replace(update, carrier=None)
     samples = look(sight(pipeline), lost, None, 3.0)
@@ -369,7 +367,7 @@ def simulated(path: Path) -> dict[str, np.ndarray]:
     return {source: np.array(rows) for source, rows in found.items()}
 
 
-def test_true_directions_by_another_way(cut: Path, looked: tuple[Pipeline, Update]) -> None:
+def test_true_directions_match_pymap3d(cut: Path, looked: tuple[Pipeline, Update]) -> None:
     """By pymavlink, pymap3d, and Euler angles instead of the quaternion. The predicted attitude
     is off by a degree and would fail this test."""
     pipeline, update = looked
@@ -404,7 +402,7 @@ def _about(axis: str, angle: float) -> np.ndarray:
     }[axis]
 
 
-def test_past_the_end_of_the_truth_nothing_is_known(
+def test_true_directions_are_nan_outside_the_truth(
     cut: Path, looked: tuple[Pipeline, Update]
 ) -> None:
     pipeline, update = looked
@@ -426,12 +424,12 @@ def test_past_the_end_of_the_truth_nothing_is_known(
     assert np.isnan(unseen.directions(update.tracks, update.carrier, pipeline.array)).all()
 
 
-def test_the_truth_of_the_carrier_alone_is_none(short: Path, tmp_path: Path) -> None:
+def test_carrier_truth_alone_gives_no_truth(short: Path, tmp_path: Path) -> None:
     log = without(short, tmp_path / "own.tlog", lambda f: f.msgid == 108 and f.source.sysid < 5)
     assert watch([log], on_carrier(), 0.5).truth is None
 
 
-def test_a_carrier_without_truth_is_as_predicted(short: Path, tmp_path: Path) -> None:
+def test_carrier_without_truth_uses_its_predicted_pose(short: Path, tmp_path: Path) -> None:
     log = without(short, tmp_path / "some.tlog", lambda f: f.msgid == 108 and f.source.sysid == 5)
     found = watch([log], on_carrier(), 0.5)
     row = summed_up(found.samples)
@@ -442,7 +440,7 @@ def test_a_carrier_without_truth_is_as_predicted(short: Path, tmp_path: Path) ->
 
 
 @pytest.mark.full
-def test_a_log_without_truth(short: Path, tmp_path: Path) -> None:
+def test_log_without_truth_leaves_true_values_unknown(short: Path, tmp_path: Path) -> None:
     log = without(short, tmp_path / "none.tlog", lambda frame: frame.msgid == 108)
     done = run(log, "--center", "5:1", "--hz", "0.5", "--out", tmp_path, "--json")
     assert done.exit_code == 0, done.stderr
@@ -453,7 +451,7 @@ def test_a_log_without_truth(short: Path, tmp_path: Path) -> None:
     assert summary["n"] > 0
 
 
-def test_a_station(short: Path) -> None:
+def test_fixed_station_violates_no_bound(short: Path) -> None:
     """A fixed station has no attitude error."""
     found = watch([short], Settings().override(center={"source": "47.3977419,8.5455938,500"}), 0.5)
     row = summed_up(found.samples)
@@ -468,7 +466,7 @@ def test_a_station(short: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_sweep_of_a_tenth_of_a_panel_s_beams_holds_the_best(cut: Path) -> None:
+def test_sweep_of_a_tenth_of_the_beams_holds_the_best_beam(cut: Path) -> None:
     """The 64 beams of 8 × 8 elements, once the track has its bound."""
     panel = on_carrier(array={"kind": "ura"}, codebook={"kind": "dft"})
     samples = watch([cut], panel, 5.0).samples
@@ -479,7 +477,7 @@ def test_a_sweep_of_a_tenth_of_a_panel_s_beams_holds_the_best(cut: Path) -> None
     assert max(shares) <= 0.1
 
 
-def test_the_codebook_of_the_settings_and_none(short: Path) -> None:
+def test_codebook_follows_the_settings(short: Path) -> None:
     fine = watch([short], on_carrier(codebook={"kind": "dft", "oversampling": 2}), 0.5)
     assert fine.codebook_beams == 128
     assert summed_up(fine.samples)["codebook_misses"] == 0
@@ -494,7 +492,7 @@ def test_the_codebook_of_the_settings_and_none(short: Path) -> None:
 # --- the figures --------------------------------------------------------------------------------
 
 
-def test_figures_show_the_worst_and_leave_gaps() -> None:
+def test_figures_show_the_worst_value_and_gaps() -> None:
     """Forty samples; ten have no guarantee, and one gain is low."""
     samples = tuple(
         Sample(
@@ -540,7 +538,7 @@ def test_figures_show_the_worst_and_leave_gaps() -> None:
     assert had["predicted"][1][0] == 100.0
 
 
-def test_a_value_between_two_gaps_is_a_dot() -> None:
+def test_isolated_value_between_gaps_is_a_dot() -> None:
     samples = tuple(
         Sample(
             t_s=float(t),
@@ -608,7 +606,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.full
-def test_the_command_writes_what_it_says(short: Path, tmp_path: Path) -> None:
+def test_command_writes_the_files_it_reports(short: Path, tmp_path: Path) -> None:
     out = tmp_path / "deep" / "report"
     done = run(short, "--center", "5:1", "--hz", "0.5", "--out", out, "--json")
     assert done.exit_code == 0, done.stderr
@@ -636,7 +634,7 @@ def test_the_command_writes_what_it_says(short: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_two_logs_and_the_table(short: Path, tmp_path: Path) -> None:
+def test_two_logs_are_tabulated_and_plotted_separately(short: Path, tmp_path: Path) -> None:
     done = run(short, short, "--center", "5:1", "--hz", "0.5", "--out", tmp_path)
     assert done.exit_code == 0, done.stderr
     assert done.stdout.count("truly less than guaranteed") == 2
@@ -671,7 +669,7 @@ def test_command_error_is_one_line(
     assert not list(tmp_path.iterdir())
 
 
-def test_without_a_center_it_says_where_the_array_stands(tmp_path: Path) -> None:
+def test_missing_center_reports_the_assumed_array_position(tmp_path: Path) -> None:
     done = run(shared_log("real_bluerobotics_server.tlog"), "--out", tmp_path)
     assert done.exit_code == 1
     said, line = done.stderr.splitlines()
@@ -679,12 +677,12 @@ def test_without_a_center_it_says_where_the_array_stands(tmp_path: Path) -> None
     assert "no UAV gets a beam" in line
 
 
-def test_a_rate_that_is_none() -> None:
+def test_invalid_rate_is_rejected() -> None:
     with pytest.raises(ValueError, match="--hz 1001"):
         BeamStudy(flights=(), settings=(), hz=1001.0)
 
 
-def test_where_a_bound_does_not_hold_no_more_is_lost(short: Path) -> None:
+def test_guarantee_fails_only_where_the_bound_fails(short: Path) -> None:
     """Overconfident settings: the guarantee fails where the bound fails, and only there."""
     bold = {"follow_accuracy": False, "position_noise_m": 0.05, "velocity_noise_mps": 0.05}
     held = {"attitude_bound_deg": 0.1, "turn_acceleration_max_degps2": 0.0}

@@ -48,7 +48,7 @@ def rows(report: Path) -> dict[str, modes.Row]:
     return {row["beams"]: row for row in told["modes"]}
 
 
-def test_each_width_gives_what_it_is_for(rows: dict[str, modes.Row]) -> None:
+def test_each_width_improves_its_target_gain(rows: dict[str, modes.Row]) -> None:
     likely, sure, sharp = (rows[name] for name in ("likely", "guarantee", "no"))
     assert sure["guaranteed_gain_median_db"] > likely["guaranteed_gain_median_db"] > 0
     assert likely["true_gain_median_db"] > sure["true_gain_median_db"] + 2
@@ -67,9 +67,7 @@ def test_each_width_gives_what_it_is_for(rows: dict[str, modes.Row]) -> None:
     }
 
 
-def test_the_likely_row_is_of_the_pipeline_s_own_beams(
-    begun: Path, rows: dict[str, modes.Row]
-) -> None:
+def test_likely_row_uses_the_beams_of_the_pipeline(begun: Path, rows: dict[str, modes.Row]) -> None:
     pipeline = Pipeline(SETTINGS)
     heard, _, _ = modes.events([begun], CLEAN, SETTINGS)
     ticks, gains_db, sure_db = 0, [], []
@@ -94,7 +92,7 @@ def test_the_likely_row_is_of_the_pipeline_s_own_beams(
     assert row["guaranteed_above_0_db_share"] == pytest.approx(above)
 
 
-def test_over_a_radio_the_carrier_is_heard_as_it_was() -> None:
+def test_radio_link_leaves_carrier_frames_unchanged() -> None:
     heard, observed, _ = modes.events([CUT], RADIO, SETTINGS)
     events = list(heard)
     times = [event.t_ns for event in events]
@@ -107,7 +105,7 @@ def test_over_a_radio_the_carrier_is_heard_as_it_was() -> None:
     assert len(observed["1:1"]) < 0.5 * len(logged["1:1"])
 
 
-def test_the_command_compares_over_the_links_that_are_named(
+def test_command_compares_over_the_given_links(
     report: Path, rows: dict[str, modes.Row], tmp_path: Path
 ) -> None:
     assert list(rows)[:3] == ["likely", "guarantee", "no"]
@@ -117,7 +115,7 @@ def test_the_command_compares_over_the_links_that_are_named(
     assert "give some of clean, radio, hostile, noisy" in str(wrong.output) + str(wrong.exception)
 
 
-def test_logs_of_the_vehicles_themselves_are_one_flight(tmp_path: Path) -> None:
+def test_onboard_logs_form_one_flight(tmp_path: Path) -> None:
     """The carrier is one file, the UAV another, and both have the simulator's truth."""
     folder = ROOT / "tests" / "data"
     logs = [str(folder / f"sitl_planes_cut_{number}.bin") for number in (1, 5)]

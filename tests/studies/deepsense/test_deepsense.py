@@ -43,14 +43,14 @@ def test_blocks_are_contiguous_and_each_sample_is_tested_once(number: int) -> No
     assert (shuffled(1000, 5, 3)[0] == shuffled(1000, 5, 3)[0]).all()
 
 
-def test_choices_are_made_within_what_is_learned_from() -> None:
+def test_inner_folds_partition_the_training_samples() -> None:
     tested = blocks(1000, 20, 5)[2]
     parts = inner(~tested, 16, 4)
     assert np.sum(parts, axis=0).tolist() == (~tested).astype(int).tolist()
 
 
 @pytest.mark.full
-def test_no_predictor_sees_what_is_tested() -> None:
+def test_no_predictor_sees_the_tested_beams() -> None:
     """Other beams in the tested samples do not change their predictions."""
     place, beam = flown(1)
     tested = blocks(len(beam), 20, 5)[1]
@@ -61,7 +61,7 @@ def test_no_predictor_sees_what_is_tested() -> None:
         np.testing.assert_array_equal(honest[tested], other[tested])
 
 
-def test_the_geometry_and_the_lag_are_found() -> None:
+def test_fit_recovers_geometry_and_lag() -> None:
     place, beam = flown(2, lag=2)
     at = geometry.fit(place, beam, np.ones(len(beam), dtype=bool), BEAMS)
     assert at.lag == 2.0
@@ -69,7 +69,7 @@ def test_the_geometry_and_the_lag_are_found() -> None:
     assert abs(at.x - 0.5) < 0.15
 
 
-def test_a_height_is_found_and_tells_beams_that_the_bearing_does_not() -> None:
+def test_fit_recovers_height_and_improves_beams() -> None:
     place, beam = flown(6, height=0.3, y=0.4)
     learned = np.arange(len(beam)) < 1000
     high = geometry.fit(place, beam, learned, BEAMS)
@@ -80,7 +80,7 @@ def test_a_height_is_found_and_tells_beams_that_the_bearing_does_not() -> None:
     assert off < 0.45 and off_flat > 2 * off
 
 
-def test_the_expected_beam_by_hand() -> None:
+def test_expected_beam_matches_hand_computed_values() -> None:
     """3 across, 4 away and 12 up give a sine of 3/13; with the opposite yaw, its negative."""
     at = geometry.Geometry(
         x=0.0, y=0.0, stretch=np.log(2.0), yaw=0.0, middle=16.0, slope=26.0, height=12.0, lag=0.0
@@ -92,7 +92,7 @@ def test_the_expected_beam_by_hand() -> None:
     np.testing.assert_allclose(aside.beams(np.array([[2.0, 3.0]])), [16 - 26 * 4 / 13])
 
 
-def test_fewer_samples_give_another_geometry_with_the_same_lag() -> None:
+def test_refit_on_fewer_samples_keeps_the_lag() -> None:
     place, beam = flown(3, lag=1)
     learned = np.ones(len(beam), dtype=bool)
     at = geometry.fit(place, beam, learned, BEAMS)
@@ -101,7 +101,7 @@ def test_fewer_samples_give_another_geometry_with_the_same_lag() -> None:
     assert np.abs(again.beams(place) - at.beams(place))[:700].mean() < 0.3
 
 
-def test_a_delay_is_a_shift() -> None:
+def test_delay_shifts_and_interpolates_positions() -> None:
     place = np.random.default_rng(1).random((50, 2))
     np.testing.assert_array_equal(geometry.delayed(place, 0.0), place)
     np.testing.assert_array_equal(geometry.delayed(place, 3.0)[3:], place[:-3])
@@ -109,7 +109,7 @@ def test_a_delay_is_a_shift() -> None:
     np.testing.assert_allclose(halves, (place[1:] + place[:-1]) / 2)
 
 
-def test_what_stays_where_it_is_counts_little() -> None:
+def test_hovering_samples_are_thinned() -> None:
     """All of 500 samples in flight count; of 500 hovering ones, a tenth."""
     way = np.concatenate([np.arange(500.0), np.full(500, 499.0)])
     apart = Samples(
@@ -120,7 +120,7 @@ def test_what_stays_where_it_is_counts_little() -> None:
     assert 25 <= rest.sum() <= 35
 
 
-def test_the_density_is_of_what_is_near_and_else_beside_the_expected_beam() -> None:
+def test_density_uses_near_samples_else_the_expected_beam() -> None:
     """Where beams 10 and 12 are expected, 10 and 13 are best; for 20 there are no samples."""
     at = geometry.Geometry(
         x=0.0, y=0.0, stretch=0.0, yaw=0.0, middle=0.0, slope=32.0, height=0.0, lag=0.0
@@ -150,7 +150,7 @@ def test_predictions_are_averaged_over_geometries() -> None:
     np.testing.assert_allclose(mean, sum(each) / 4)
 
 
-def test_a_threshold_covers_in_other_blocks() -> None:
+def test_threshold_covers_held_out_blocks() -> None:
     """Held-out values are uniform on 0 to 1: 99.25 % are above 0.0075."""
     count = 20_000
     beam = np.random.default_rng(3).permutation(count) % 2
@@ -169,7 +169,7 @@ def test_a_threshold_covers_in_other_blocks() -> None:
     assert not any((mask & ~learned).any() for mask in seen)
 
 
-def test_ranks_and_candidate_sets() -> None:
+def test_ranks_and_set_sizes_match_hand_computed_values() -> None:
     likely = np.array([[0.1, 0.6, 0.3], [0.2, 0.3, 0.5]])
     assert predictors.rank_of(likely, np.array([2, 2])).tolist() == [1, 0]
     assert predictors.rank_of(np.ones((1, 5)), np.array([2])).tolist() == [4]
@@ -198,7 +198,7 @@ def written(folder: Path, *, files: bool) -> Path:
 
 @pytest.mark.full
 @pytest.mark.parametrize("files", [True, False])
-def test_the_command_and_its_page(files: bool, tmp_path: Path) -> None:
+def test_deepsense_command_writes_json_page_and_figures(files: bool, tmp_path: Path) -> None:
     where, out = written(tmp_path, files=files), tmp_path / "out"
     given = ["study", "deepsense", str(where), "--out", str(out), "--json"]
     done = CliRunner().invoke(main, given, prog_name="companion")
@@ -228,7 +228,7 @@ def test_the_command_and_its_page(files: bool, tmp_path: Path) -> None:
         ("unit2_pos,unit1_beam\n" + '"[1,2]",99999\n' * 300, "beam index out of range"),
     ],
 )
-def test_what_is_no_scenario_is_said(text: str, why: str, tmp_path: Path) -> None:
+def test_invalid_scenario_is_rejected(text: str, why: str, tmp_path: Path) -> None:
     path = tmp_path / "x.csv"
     path.write_text(text)
     with pytest.raises(UserError, match=why):
@@ -239,7 +239,7 @@ def test_what_is_no_scenario_is_said(text: str, why: str, tmp_path: Path) -> Non
 
 
 @pytest.mark.full
-def test_the_drone_scenario_on_blocks() -> None:
+def test_drone_scenario_scores_on_contiguous_blocks() -> None:
     """The published baselines as measured before, and our results beside them."""
     samples = measured_beams.read(shared_log("deepsense_scenario23.csv"))
     assert (len(samples.beam), samples.beams) == (11_387, 32)

@@ -7,7 +7,7 @@ import numpy as np
 from companion.studies.figures.drawing import Drawing, Line, TextLabel, svg
 
 
-def test_svg_says_what_is_drawn() -> None:
+def test_svg_holds_the_drawn_elements() -> None:
     words = (TextLabel(x=30, y=20, text="a < b & c", anchor="end", size=11.0, colour="#555555"),)
     text = svg(
         Drawing(

@@ -9,7 +9,7 @@ PAGE = "figures/page.html.j2"
 EVIL = "x\"y'></code></style><script>"
 
 
-def test_nothing_handed_in_can_leave_its_place() -> None:
+def test_page_values_are_escaped() -> None:
     answer = {"command": EVIL, "versions": {EVIL: EVIL}}
     figure = {"name": EVIL, "caption": EVIL, "png_base64": ""}
     page = pages.page(PAGE, answer=answer, figures={"one": figure})
@@ -17,7 +17,7 @@ def test_nothing_handed_in_can_leave_its_place() -> None:
     assert page.count("&gt;&lt;script&gt;") == 3 + 3  # generator; id, alternative text, caption
 
 
-def test_a_page_is_the_same_again_and_loads_nothing() -> None:
+def test_page_is_reproducible_and_self_contained() -> None:
     answer = {"command": "companion study", "versions": {"numpy": "2", "scipy": "1"}}
     page = pages.page(PAGE, answer=answer, figures={})
     assert page == pages.page(PAGE, answer=answer, figures={})
@@ -26,7 +26,7 @@ def test_a_page_is_the_same_again_and_loads_nothing() -> None:
     assert "http" not in page
 
 
-def test_a_value_that_is_missing_is_an_error() -> None:
+def test_missing_page_value_raises() -> None:
     with pytest.raises(UndefinedError, match="answer"):
         pages.page(PAGE, figures={})
     with pytest.raises(UndefinedError, match="command"):

@@ -25,7 +25,7 @@ def test_36_lines_differ_in_colour_or_dash_and_neighbours_in_both() -> None:
         assert one[0] != next_one[0] and one[1] != next_one[1]
 
 
-def test_a_figure_is_the_same_again_and_leaves_the_style_as_it_was() -> None:
+def test_figure_is_reproducible_and_restores_the_style() -> None:
     before = dict(matplotlib.rcParams)
     svg, png = plotting.render_figure(drawn)
     assert (svg, png) == plotting.render_figure(drawn)
@@ -33,7 +33,7 @@ def test_a_figure_is_the_same_again_and_leaves_the_style_as_it_was() -> None:
     assert dict(matplotlib.rcParams) == before
 
 
-def test_files_are_the_page_and_each_figure_twice() -> None:
+def test_files_are_the_page_and_each_figure_as_svg_and_png() -> None:
     said: list[str] = []
     values = {"answer": ANSWER}
     drawings = {"one": ("a < b", drawn)}

@@ -23,7 +23,9 @@ def found(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any
     return out, json.loads(ran.stdout)
 
 
-def test_every_uav_has_one_node_and_a_death_is_followed(found: tuple[Path, dict[str, Any]]) -> None:
+def test_every_uav_has_one_node_and_node_loss_triggers_takeover(
+    found: tuple[Path, dict[str, Any]],
+) -> None:
     _, answer = found
     assert [(one["nodes"], one["uavs"]) for one in answer["sizes"]] == [(2, 8), (4, 16)]
     for one in answer["sizes"]:
@@ -36,7 +38,7 @@ def test_every_uav_has_one_node_and_a_death_is_followed(found: tuple[Path, dict[
     assert large["link_kbps"] > small["link_kbps"]
 
 
-def test_the_page_and_its_figures_are_there(found: tuple[Path, dict[str, Any]]) -> None:
+def test_page_figures_and_json_are_written(found: tuple[Path, dict[str, Any]]) -> None:
     out, answer = found
     page = (out / "fleet.html").read_text(encoding="utf-8")
     assert answer["command"] in page
@@ -47,7 +49,7 @@ def test_the_page_and_its_figures_are_there(found: tuple[Path, dict[str, Any]]) 
     assert kept == answer
 
 
-def test_the_same_again_is_the_same(found: tuple[Path, dict[str, Any]]) -> None:
+def test_fleet_study_is_reproducible(found: tuple[Path, dict[str, Any]]) -> None:
     _, answer = found
     asked = study.FleetStudy(sizes=((2, 8),), seconds=2.0)
     (again,) = study.answer(asked, list(study.run(asked, lambda: 0.0)), "")["sizes"]
@@ -56,13 +58,13 @@ def test_the_same_again_is_the_same(found: tuple[Path, dict[str, Any]]) -> None:
 
 
 @pytest.mark.parametrize("span", ["x", "3..", "0..5", "9..3", "1..99999"])
-def test_a_span_that_is_none_is_said(span: str, tmp_path: Path) -> None:
+def test_invalid_node_span_is_rejected(span: str, tmp_path: Path) -> None:
     ran = CliRunner().invoke(main, ["study", "fleet", "--nodes", span, "--out", str(tmp_path)])
     assert ran.exit_code == 2
     assert "Traceback" not in ran.output
 
 
-def test_a_sample_of_the_reports_counts_for_all() -> None:
+def test_sampled_reports_scale_to_the_whole_fleet() -> None:
     all_of_them, half = (
         next(
             study.run(
@@ -74,9 +76,7 @@ def test_a_sample_of_the_reports_counts_for_all() -> None:
     assert half.told_kbps["heard"] == pytest.approx(all_of_them.told_kbps["heard"], rel=0.3)
 
 
-def test_shares_are_of_uavs_served_once_twice_and_not_at_all(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_shares_of_uavs_served_once_twice_and_unserved(monkeypatch: pytest.MonkeyPatch) -> None:
     """Six, one and three of ten; with half of the nodes cut off, four of eight are unserved."""
     counted = [
         FleetCounts(served=6, twice=1, unserved=3, handovers=4),

@@ -35,7 +35,7 @@ def test_every_uav_has_one_node() -> None:
     assert none == 0
 
 
-def test_clocks_apart_by_seconds_are_found_and_no_lies() -> None:
+def test_clock_offsets_of_seconds_are_bounded_without_exclusion() -> None:
     world = settled(Sky(nodes=4, uavs=20, sampled=10))
     for name, member in world.members.items():
         for other, known in member.neighbours.items():
@@ -47,7 +47,7 @@ def test_clocks_apart_by_seconds_are_found_and_no_lies() -> None:
         assert not member.trust.excluded
 
 
-def test_a_death_leaves_nobody_alone_for_two_seconds() -> None:
+def test_uavs_of_a_failed_node_are_served_within_two_seconds() -> None:
     world = settled(Sky(nodes=3, uavs=60, sampled=0, spacing_m=500))
     victim = max(world.members, key=lambda name: len(world.members[name].duties.serves))
     orphans = set(world.members[victim].duties.serves)
@@ -65,7 +65,7 @@ def test_a_death_leaves_nobody_alone_for_two_seconds() -> None:
     seed=st.integers(0, 1000),
 )
 @settings(max_examples=examples(16))
-def test_parted_nobody_is_unserved_and_it_heals(
+def test_partition_leaves_no_uav_unserved_and_heals(
     nodes: int, loss: float, delay_s: float, cut: int, seed: int
 ) -> None:
     sky = Sky(
@@ -86,7 +86,7 @@ def test_parted_nobody_is_unserved_and_it_heals(
 
 
 @pytest.mark.parametrize("sampled", [40])
-def test_reports_are_told_about_once(sampled: int) -> None:
+def test_each_report_is_shared_once(sampled: int) -> None:
     """All nodes receive all reports; after the start, one node shares each report."""
     several = SETTINGS.model_copy(update={"share_hz": 100.0})  # in one message, with its header
     world = settled(Sky(nodes=3, uavs=sampled, spacing_m=300.0, sampled=sampled), several)
@@ -96,7 +96,7 @@ def test_reports_are_told_about_once(sampled: int) -> None:
     assert bits <= 1.15 * frames * 8 * (40 + 8)
 
 
-def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
+def test_traffic_per_node_stays_bounded_as_the_area_grows() -> None:
     """Four times the nodes on four times the area: the same density around each."""
     told = []
     for nodes in (4, 16):
@@ -113,7 +113,7 @@ def test_what_a_node_is_told_does_not_grow_with_a_fleet_that_spreads() -> None:
     assert told[1] < 2 * told[0]  # two near each of four nodes, up to four near each of sixteen
 
 
-def test_what_is_told_arrives_with_its_heads() -> None:
+def test_received_bytes_include_packet_headers() -> None:
     world = World(Sky(nodes=3, uavs=10, spacing_m=400.0, loss=0.0, sampled=5), SETTINGS)
     world.run(3)
     world.counted = FleetCounts()
@@ -124,7 +124,7 @@ def test_what_is_told_arrives_with_its_heads() -> None:
         assert world.counted.received[what] == 2 * sent
 
 
-def test_parted_nothing_arrives_and_dead_nothing_is_heard() -> None:
+def test_partitioned_and_dead_nodes_exchange_no_messages() -> None:
     world = settled(Sky(nodes=3, uavs=10, spacing_m=400.0, sampled=5))
     world.parted = lambda one, other: True
     world.run(1)
@@ -139,7 +139,7 @@ def test_parted_nothing_arrives_and_dead_nothing_is_heard() -> None:
     assert {name: one.heard_ns for name, one in member.neighbours.items()} == before
 
 
-def test_a_clock_is_known_to_the_way_there_and_back() -> None:
+def test_clock_offset_width_is_the_round_trip_time() -> None:
     world = settled(Sky(nodes=2, uavs=0, delay_s=0.05))
     for member in world.members.values():
         for known in member.neighbours.values():

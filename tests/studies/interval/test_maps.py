@@ -44,7 +44,7 @@ def margin(dt_s: float, feedthrough_s: float, alpha: float, mu: float) -> float:
 
 
 @pytest.mark.parametrize("mu", maps.MUS_S2)
-def test_the_limit_is_where_no_gain_is_left(drawn: Maps, mu: float) -> None:
+def test_interval_limit_is_where_no_feasible_gain_remains(drawn: Maps, mu: float) -> None:
     for row, column in ((10, 10), (25, 24), (40, 24), (55, 40)):
         limit_s = float(drawn.limit_s[mu][row, column])
         d, alpha = float(drawn.feedthrough_s[row]), float(drawn.alpha[column])
@@ -55,7 +55,7 @@ def test_the_limit_is_where_no_gain_is_left(drawn: Maps, mu: float) -> None:
             assert margin(0.06, d, alpha, mu) < 0
 
 
-def test_the_peak_is_reached_and_never_above_gamma(drawn: Maps) -> None:
+def test_peak_gain_is_attained_and_at_most_gamma(drawn: Maps) -> None:
     """By simulating an input that always pushes outward."""
     for alpha in maps.ALPHAS:
         peaks, gammas = drawn.peak_gain_s[alpha], drawn.gamma_s[alpha]
@@ -69,7 +69,7 @@ def test_the_peak_is_reached_and_never_above_gamma(drawn: Maps) -> None:
             assert peaks[row, column] == pytest.approx(error, abs=1e-6)
 
 
-def test_axes_and_maps_have_their_shapes(answer: dict[str, Any]) -> None:
+def test_map_shapes_match_their_axes(answer: dict[str, Any]) -> None:
     rows = len(answer["feedthrough_s"])
     for values in answer["limit_s"].values():
         assert np.shape(values) == (rows, len(answer["alpha"]))
@@ -78,7 +78,7 @@ def test_axes_and_maps_have_their_shapes(answer: dict[str, Any]) -> None:
             assert np.shape(values) == (rows, len(answer["dt_s"]))
 
 
-def test_the_published_limits_are_on_the_map(drawn: Maps) -> None:
+def test_map_contains_the_published_limits(drawn: Maps) -> None:
     row = int(np.argmin(np.abs(drawn.feedthrough_s - 0.5)))
     column = int(np.argmin(np.abs(drawn.alpha - 0.5)))
     found = [drawn.limit_s[mu][row, column] for mu in maps.MUS_S2]
@@ -86,7 +86,7 @@ def test_the_published_limits_are_on_the_map(drawn: Maps) -> None:
 
 
 @pytest.mark.full
-def test_without_a_lead_the_error_is_the_way_flown(answer: dict[str, Any]) -> None:
+def test_longest_interval_follows_error_speed_and_feedthrough(answer: dict[str, Any]) -> None:
     """At feedthrough 0 the interval is error / speed (alpha near 1). A lag shortens it by the
     lag; with a lead it is at least almost twice the lead."""
     for row in answer["rates"]:
@@ -101,7 +101,7 @@ def test_without_a_lead_the_error_is_the_way_flown(answer: dict[str, Any]) -> No
     assert len(answer["rates"]) == math.prod(map(len, axes))
 
 
-def test_the_page_stands_alone(made: Path) -> None:
+def test_page_is_self_contained(made: Path) -> None:
     text = (made / "dt.html").read_text("utf-8")
     assert "<script" not in text and "http" not in text.replace("http-equiv", "")
     assert text.count("<figure") == 3
@@ -110,7 +110,7 @@ def test_the_page_stands_alone(made: Path) -> None:
 
 
 @pytest.mark.full
-def test_the_same_command_gives_the_same_bytes(made: Path, tmp_path: Path) -> None:
+def test_command_output_is_reproducible(made: Path, tmp_path: Path) -> None:
     assert CliRunner().invoke(main, ["study", "dt", "--out", str(tmp_path)]).exit_code == 0
     names = sorted(path.name for path in made.iterdir())
     assert names == sorted(path.name for path in tmp_path.iterdir())
@@ -118,7 +118,7 @@ def test_the_same_command_gives_the_same_bytes(made: Path, tmp_path: Path) -> No
         assert (made / name).read_bytes() == (tmp_path / name).read_bytes(), name
 
 
-def test_the_terminal_is_told_the_longest_intervals(answer: dict[str, Any]) -> None:
+def test_terminal_output_lists_the_longest_intervals(answer: dict[str, Any]) -> None:
     lines = maps.text(answer).splitlines()
     assert len(lines) == 1 + len(answer["rates"])
     for line, one in zip(lines[1:], answer["rates"], strict=True):

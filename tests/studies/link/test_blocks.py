@@ -19,7 +19,7 @@ from companion.studies.link.rows import crossing_db, row
 from companion.values import ComplexArray
 
 
-def test_a_block_fills_its_symbol() -> None:
+def test_block_fills_its_ofdm_symbol() -> None:
     assert (BLOCK_BITS, CODED_BITS) == (306, 936)
     sent = send(4, 3, np.random.default_rng(1))
     assert sent.samples.shape == (4, 3, 320)
@@ -29,12 +29,12 @@ def test_a_block_fills_its_symbol() -> None:
     assert np.mean(np.abs(placed[..., ofdm.DATA]) ** 2) == pytest.approx(1.0, rel=0.02)
 
 
-def test_streams_that_pilots_cannot_tell_apart_are_refused() -> None:
+def test_more_streams_than_pilots_can_separate_are_rejected() -> None:
     with pytest.raises(ValueError, match="9 UAVs at once: the pilots separate at most 8 streams"):
         send(9, 1, np.random.default_rng(1))
 
 
-def test_in_time_as_in_frequency() -> None:
+def test_time_domain_channel_equals_frequency_response() -> None:
     """Every stream through every delay, with consecutive blocks: after prefix removal the
     channel is one complex number per carrier, stream and UAV."""
     rng = np.random.default_rng(2)
@@ -49,7 +49,7 @@ def test_in_time_as_in_frequency() -> None:
 
 
 @pytest.mark.parametrize("estimation", list(Estimation))
-def test_without_noise_nothing_is_wrong(estimation: Estimation) -> None:
+def test_noiseless_link_has_no_errors(estimation: Estimation) -> None:
     """For any channel phase and strength; with delays if the channel is known exactly."""
     sent = send(2, 3, np.random.default_rng(4))
     taps: ComplexArray = (np.eye(2) * np.array([0.01j, -3.0]))[np.newaxis]
@@ -61,7 +61,7 @@ def test_without_noise_nothing_is_wrong(estimation: Estimation) -> None:
     assert counted.square_error.max() < 1e-20
 
 
-def test_blocks_that_are_not_decoded_would_decode_to_the_same() -> None:
+def test_skipped_decoding_gives_the_same_error_counts() -> None:
     """At a rate where some blocks have no wrong coded bit, and some decode wrongly."""
     rng = np.random.default_rng(5)
     sent = send(4, 60, rng)
@@ -77,7 +77,7 @@ def test_blocks_that_are_not_decoded_would_decode_to_the_same() -> None:
     assert (counted.raw_errors == ((soft < 0) != sent.coded).sum(axis=-1)).all()
 
 
-def test_few_wrong_bits_can_be_another_word() -> None:
+def test_received_neighbour_code_word_decodes_to_the_neighbour() -> None:
     """One information bit changes 15 coded bits: a block received as its neighbour decodes to
     it."""
     sent = send(1, 2, np.random.default_rng(8))
@@ -91,7 +91,7 @@ def test_few_wrong_bits_can_be_another_word() -> None:
 
 
 @pytest.mark.full
-def test_error_rates_over_white_noise_are_those_of_theory() -> None:
+def test_awgn_error_rates_match_theory() -> None:
     """The exact curve lies within the intervals, and within 0.1 dB where errors are frequent.
     EVM equals the noise. Coded, 1e-3 is reached at 5.3 dB: commpy's modem and decoder on 200
     blocks of 306 bits gave 2.0e-3 at 5.0 dB and 4.7e-4 at 5.5 dB, but are too slow to run

@@ -40,7 +40,7 @@ def heard(seen: Instant, by: PositionSource, scattering: Scattering = SIGHT) -> 
     return channel.responses(rows, sent, channel.alone(array, own, truly))
 
 
-def test_zero_forcing_by_the_truth_leaves_no_interference() -> None:
+def test_zero_forcing_with_true_positions_has_no_interference() -> None:
     """Each UAV loses its loss factor, relative to a beam on it alone."""
     (amplitudes,) = heard(instant(), PositionSource.PERFECT)
     steering = steering_matrix(
@@ -52,7 +52,7 @@ def test_zero_forcing_by_the_truth_leaves_no_interference() -> None:
     assert np.abs(amplitudes - np.diag(amplitudes.diagonal())).max() < 1e-12
 
 
-def test_beams_that_miss_interfere() -> None:
+def test_mispointed_beams_interfere() -> None:
     (near,), (far,) = (
         heard(instant(0.1), by) for by in (PositionSource.PREDICTED, PositionSource.HELD)
     )
@@ -60,7 +60,7 @@ def test_beams_that_miss_interfere() -> None:
     assert 1e-3 < stray[0] < stray[1]
 
 
-def test_scattered_rays_have_their_share_of_the_power() -> None:
+def test_scattered_rays_have_their_share_of_power() -> None:
     """Relative to the line of sight at one antenna; delays follow the profile."""
     array, own = assembly.array(Settings()), uav_array(Settings())
     many = seen_at(np.tile(AZIMUTHS, 20))
@@ -85,12 +85,12 @@ def test_invalid_channel_settings_are_rejected(k_db: float, spread_s: float, sai
         Scattering(k_db, spread_s)
 
 
-def test_all_delays_stay_within_the_prefix() -> None:
+def test_all_delays_fit_in_the_cyclic_prefix() -> None:
     assert len(Scattering(9.0, 256e-9).profile) - 1 <= ofdm.PREFIX
     assert Scattering(9.0, 0.0).profile.tolist() == [1.0]
 
 
-def test_a_policy_that_does_not_serve_all_is_refused() -> None:
+def test_policy_that_leaves_uavs_unserved_is_rejected() -> None:
     close = replace(
         instant(), towards=dict.fromkeys(PositionSource, seen_at(np.radians([0.0, 0.1])))
     )

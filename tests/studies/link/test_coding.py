@@ -34,33 +34,33 @@ def by_shift_register(bits: BoolArray) -> list[int]:
     return sent
 
 
-def test_code_words_are_those_of_a_shift_register_and_of_commpy(trellis: Trellis) -> None:
+def test_code_words_match_a_shift_register_and_commpy(trellis: Trellis) -> None:
     bits = drawn(6, 40, 1)
     for block, word in zip(bits, encode(bits), strict=True):
         assert word.astype(int).tolist() == by_shift_register(block)
         assert word.astype(int).tolist() == conv_encode(block.astype(int), trellis).tolist()
 
 
-def test_one_bit_sends_the_generators() -> None:
+def test_impulse_response_equals_the_generators() -> None:
     """Its impulse response, read along the outputs."""
     sent = encode(np.array([True])).reshape(7, 3).astype(int)
     read = [int("".join(map(str, sent[:, output])), 2) for output in range(3)]
     assert read == list(GENERATORS) == [0o133, 0o171, 0o165]
 
 
-def test_blocks_of_any_shape() -> None:
+def test_encoder_accepts_blocks_of_any_shape() -> None:
     bits = drawn(6, 9, 2)
     assert (encode(bits.reshape(2, 3, 9)).reshape(6, -1) == encode(bits)).all()
     assert encode(bits).shape == (6, 3 * 15)
 
 
-def test_without_noise_every_block_comes_back() -> None:
+def test_noiseless_blocks_decode_without_error() -> None:
     """More blocks than one decoder batch."""
     bits = drawn(BATCH + 3, 50, 3)
     assert (decode(1.0 - 2.0 * encode(bits)) == bits).all()
 
 
-def test_the_decoder_is_brute_force() -> None:
+def test_decoder_matches_brute_force() -> None:
     """Every word of short blocks correlated with the received one, in heavy noise."""
     words = np.array(list(product([False, True], repeat=8)))
     signs = 1.0 - 2.0 * encode(words)
@@ -80,7 +80,7 @@ def by_commpy(soft: FloatArray, trellis: Trellis, bits: int) -> BoolArray:
 
 @pytest.mark.full
 @pytest.mark.parametrize("snr_db", [1.0, 2.0])
-def test_noisy_blocks_are_decoded_as_by_commpy(trellis: Trellis, snr_db: float) -> None:
+def test_noisy_blocks_decode_as_in_commpy(trellis: Trellis, snr_db: float) -> None:
     """16-QAM at bit error rates of a few per cent: the same errors, bit by bit."""
     bits = drawn(30, 38, 6)
     n0 = 10 ** (-snr_db / 10)
@@ -93,13 +93,13 @@ def test_noisy_blocks_are_decoded_as_by_commpy(trellis: Trellis, snr_db: float) 
     assert (found == expected).all()
 
 
-def test_the_scale_of_a_block_does_not_matter() -> None:
+def test_decoding_is_independent_of_block_scale() -> None:
     soft = np.random.default_rng(8).standard_normal((20, 3 * 46))
     assert (decode(soft) == decode(soft * np.logspace(-3, 3, 20)[:, None])).all()
 
 
 @pytest.mark.parametrize("length", [0, 18, 20])
-def test_what_is_no_code_word_is_refused(length: int) -> None:
+def test_invalid_code_word_length_is_rejected(length: int) -> None:
     with pytest.raises(ValueError, match=f"{length} soft bits do not make a code word"):
         decode(np.zeros((1, length)))
 
@@ -133,7 +133,7 @@ def spectrum(most: int) -> FloatArray:
     return found
 
 
-def test_the_error_rate_is_that_of_theory() -> None:
+def test_coded_error_rate_matches_the_union_bound() -> None:
     """Antipodal symbols: within 0.3 dB of the union bound over the distance spectrum, where the
     bound is tight."""
     weights = spectrum(26)

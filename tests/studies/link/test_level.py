@@ -27,7 +27,7 @@ def scenario() -> Scenario:
     return circles(Settings(), Reports(), 40, np.random.default_rng(1))
 
 
-def test_errors_that_noise_does_not_make_are_interference(scenario: Scenario) -> None:
+def test_noiseless_errors_come_from_interference(scenario: Scenario) -> None:
     """Without noise, a UAV with a signal 20 dB above all interference has no errors, and one
     below the interference has errors in every block. This explains the errors at held
     positions."""
@@ -52,7 +52,7 @@ def test_errors_that_noise_does_not_make_are_interference(scenario: Scenario) ->
         assert (wrong[ratio < 1] > 0).all()
 
 
-def test_levels() -> None:
+def test_snr_levels_are_equally_spaced_within_the_range() -> None:
     assert snrs(-2, 1, 1) == (-2.0, -1.0, 0.0, 1.0)
     assert snrs(0, 1, 0.3) == (0.0, 0.3, 0.6, 0.9)
     assert snrs(0, 0.3, 0.1) == (0.0, 0.1, 0.2, 0.3)
@@ -78,7 +78,7 @@ SMALL = ("--snr", "4:20:8", "--instants", 4, "--blocks", 2)
 
 
 @pytest.mark.full
-def test_the_command_writes_numbers_figures_and_a_page(tmp_path: Path) -> None:
+def test_link_command_writes_json_figures_and_page(tmp_path: Path) -> None:
     """The command given in the answer reproduces the output."""
     done = run(*SMALL, "--out", tmp_path / "a", "--json")
     assert done.exit_code == 0, done.output
@@ -126,7 +126,7 @@ def each_curve_is_drawn(answer: dict[str, Any]) -> None:
 
 
 @pytest.mark.full
-def test_a_log_goes_through_the_pipeline(tmp_path: Path) -> None:
+def test_link_study_reads_a_log_through_the_pipeline(tmp_path: Path) -> None:
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     done = run(log, "--center", "5:1", *SMALL, "--out", tmp_path)
     assert done.exit_code == 0, done.output
@@ -154,7 +154,7 @@ def test_a_log_goes_through_the_pipeline(tmp_path: Path) -> None:
         (("nowhere.tlog",), "nowhere.tlog"),
     ],
 )
-def test_what_cannot_be_studied_is_one_line(
+def test_invalid_link_study_input_is_a_one_line_error(
     arguments: tuple[str | int, ...], said: str, tmp_path: Path
 ) -> None:
     done = run(*map(str, arguments), "--out", tmp_path / "out")
@@ -162,7 +162,7 @@ def test_what_cannot_be_studied_is_one_line(
     assert said in done.stderr and done.stderr.count("\n") == 1
 
 
-def test_each_instant_draws_for_itself(scenario: Scenario) -> None:
+def test_each_instant_has_its_own_bits_and_noise(scenario: Scenario) -> None:
     """The same position twice has different bits and noise, and is reproducible."""
     twice = replace(scenario, instants=scenario.instants[:1] * 2)
     setting = LinkStudy(snr_db=(10, 10, 1), blocks=4)

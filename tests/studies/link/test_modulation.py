@@ -20,18 +20,18 @@ POINTS = np.array(
 """3GPP TS 38.211, 5.1.4, for labels in counting order, written out."""
 
 
-def test_the_constellation_is_that_of_the_standard() -> None:
+def test_constellation_matches_the_standard() -> None:
     assert modulate(LABELS.ravel()) == pytest.approx(POINTS)
     assert np.mean(np.abs(POINTS) ** 2) == pytest.approx(1.0)
 
 
-def test_neighbours_differ_in_one_bit() -> None:
+def test_neighbouring_symbols_differ_in_one_bit() -> None:
     for i, j in product(range(16), repeat=2):
         if abs(POINTS[i] - POINTS[j]) == pytest.approx(2 * SCALE):
             assert np.count_nonzero(LABELS[i] != LABELS[j]) == 1
 
 
-def test_bits_that_fill_no_symbol_are_refused() -> None:
+def test_bit_count_not_filling_symbols_is_rejected() -> None:
     with pytest.raises(ValueError, match="6 bits do not fill symbols of 4"):
         modulate(np.zeros((2, 6), dtype=bool))
 
@@ -40,7 +40,7 @@ parts = st.floats(-3, 3)
 
 
 @given(st.lists(st.tuples(parts, parts), min_size=1, max_size=8), st.floats(1e-3, 10))
-def test_soft_bits_are_those_of_brute_force(places: list[tuple[float, float]], n0: float) -> None:
+def test_soft_bits_match_brute_force(places: list[tuple[float, float]], n0: float) -> None:
     received = np.array([complex(*place) for place in places])
     metric = np.abs(received[:, None] - POINTS) ** 2 / n0
     expected = [
@@ -50,7 +50,7 @@ def test_soft_bits_are_those_of_brute_force(places: list[tuple[float, float]], n
     assert soft_bits(received, n0) == pytest.approx(np.ravel(expected), abs=1e-9 / n0)
 
 
-def test_without_noise_the_signs_are_the_bits() -> None:
+def test_soft_bit_signs_of_clean_symbols_are_the_bits() -> None:
     """Each symbol is weighted by its own noise."""
     n0 = np.linspace(0.1, 2.0, 16)
     soft = soft_bits(POINTS, n0).reshape(16, BITS)
@@ -59,7 +59,7 @@ def test_without_noise_the_signs_are_the_bits() -> None:
 
 
 @pytest.mark.parametrize("snr_db", [-5, 5, 15, 22])
-def test_the_exact_rate_is_the_sum_over_decision_regions(snr_db: float) -> None:
+def test_exact_bit_error_rate_sums_over_decision_regions(snr_db: float) -> None:
     """Per axis: levels 3, 1, -1, -3 with labels 01, 00, 10, 11, decision thresholds 2, 0 and -2."""
     snr = 10 ** (snr_db / 10)
     sigma = math.sqrt(10 / (2 * snr))
@@ -75,7 +75,7 @@ def test_the_exact_rate_is_the_sum_over_decision_regions(snr_db: float) -> None:
 
 
 @pytest.mark.parametrize("snr_db", [4.0, 10.0, 16.5])
-def test_hard_decisions_in_noise_err_at_the_exact_rate(snr_db: float) -> None:
+def test_simulated_bit_error_rate_matches_the_exact_rate(snr_db: float) -> None:
     """Within four standard deviations and 0.1 dB."""
     rng = np.random.default_rng(5)
     bits = rng.random(1_200_000) < 0.5

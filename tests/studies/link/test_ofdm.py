@@ -25,7 +25,7 @@ def drawn(*shape: int, seed: int = 1) -> ComplexArray:
     return rng.standard_normal(shape) + 1j * rng.standard_normal(shape)
 
 
-def test_the_plan_is_the_papers() -> None:
+def test_carrier_plan_matches_the_paper() -> None:
     """Counting from 1: nulls [1:7 129 251:256], pilots as listed, data on all others."""
     nulls = [*range(1, 8), 129, *range(251, 257)]
     pilots = [26, 54, 90, 118, 140, 168, 204, 232]
@@ -35,7 +35,7 @@ def test_the_plan_is_the_papers() -> None:
     assert sorted([*(DATA + 1), *pilots, *nulls]) == list(range(1, CARRIERS + 1))
 
 
-def test_the_null_in_the_middle_is_at_0_hz() -> None:
+def test_middle_null_carrier_is_at_0_hz() -> None:
     """Symbols have zero mean; the lowest carrier rotates once backwards, the next upper one
     forwards."""
     sent = samples(carriers(drawn(3, 234), PILOT_SIGNS[0]))
@@ -46,7 +46,7 @@ def test_the_null_in_the_middle_is_at_0_hz() -> None:
     assert samples(one)[PREFIX:] == pytest.approx(turning)
 
 
-def test_energy_is_kept_and_the_prefix_repeats_the_end() -> None:
+def test_transform_keeps_energy_and_prefix_repeats_the_end() -> None:
     placed = carriers(drawn(4, 234), PILOT_SIGNS[:4])
     sent = samples(placed)
     assert sent.shape == (4, SAMPLES)
@@ -56,7 +56,7 @@ def test_energy_is_kept_and_the_prefix_repeats_the_end() -> None:
 
 
 @pytest.mark.parametrize("delay", [0, 1, 17, PREFIX])
-def test_a_delay_within_the_prefix_is_a_ramp_of_phase(delay: int) -> None:
+def test_delay_within_the_prefix_is_a_phase_ramp(delay: int) -> None:
     """Independent of the preceding symbol."""
     stream = samples(carriers(drawn(2, 234), PILOT_SIGNS[0]))
     late = np.concatenate([np.zeros(delay), stream.ravel()])[: 2 * SAMPLES].reshape(2, SAMPLES)
@@ -68,7 +68,7 @@ def test_a_delay_within_the_prefix_is_a_ramp_of_phase(delay: int) -> None:
     assert frequency_response(taps)[:, 0] == pytest.approx(ramp)
 
 
-def test_a_delay_beyond_the_prefix_is_not() -> None:
+def test_delay_beyond_the_prefix_causes_interference() -> None:
     stream = samples(carriers(drawn(2, 234), PILOT_SIGNS[0])).ravel()
     late = np.concatenate([np.zeros(PREFIX + 1), stream])[: 2 * SAMPLES].reshape(2, SAMPLES)
     sent = carriers(drawn(2, 234), PILOT_SIGNS[0])[1]
@@ -76,7 +76,7 @@ def test_a_delay_beyond_the_prefix_is_not() -> None:
     assert np.abs(np.abs(received_carriers(late)[1]) - np.abs(sent)).max() > 0.01
 
 
-def test_pilots_tell_streams_apart() -> None:
+def test_pilots_separate_streams() -> None:
     """Over a flat channel each stream's estimate is its own gain, independent of the others."""
     gains = drawn(8, seed=3)
     heard = np.einsum("n,nc->c", gains, carriers(drawn(8, 234), PILOT_SIGNS))
@@ -84,7 +84,7 @@ def test_pilots_tell_streams_apart() -> None:
     assert found == pytest.approx(gains.tolist())
 
 
-def test_white_noise_keeps_its_power_and_the_estimate_averages_it() -> None:
+def test_pilot_estimate_averages_white_noise() -> None:
     noise = received_carriers(drawn(4000, SAMPLES, seed=4))
     assert np.mean(np.abs(noise) ** 2) == pytest.approx(2.0, rel=0.01)
     estimates = flat_estimate(noise, PILOT_SIGNS[3])

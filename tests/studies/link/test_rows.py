@@ -9,7 +9,7 @@ from companion.studies.link.blocks import BlockErrors
 from companion.studies.link.rows import crossing_db, interval, row
 
 
-def test_intervals() -> None:
+def test_wilson_intervals_match_hand_computed_values() -> None:
     """Wilson intervals by hand; wider if clusters differ; never of zero width."""
     even = np.full(10, 20.0)
     assert interval(np.full(10, 0.0), even, 200.0) == pytest.approx((0.0, 0.018845), abs=1e-5)
@@ -23,7 +23,7 @@ def test_intervals() -> None:
     assert interval(even, even, 200.0)[1] == 1.0
 
 
-def test_a_row_by_hand() -> None:
+def test_result_row_matches_hand_computed_values() -> None:
     """Two instants of one UAV and two blocks each."""
     counted = [
         BlockErrors(np.array([[0, 9]]), np.array([[0, 3]]), np.array([[0.01, 0.04]])),
@@ -37,7 +37,7 @@ def test_a_row_by_hand() -> None:
     assert coded["rate_bps"] == pytest.approx(0.75 * 306 / 6.4e-6)
 
 
-def test_where_a_curve_falls_to_a_rate() -> None:
+def test_crossing_snr_is_interpolated() -> None:
     def curve(*rates: float) -> list[dict[str, Any]]:
         return [{"positions": "held", "coded": True, "snr_db": 2.0 * i, "ber": rate,
                  "n_bits": 10_000} for i, rate in enumerate(rates)]  # fmt: skip

@@ -17,7 +17,7 @@ def scenario() -> Scenario:
     return circles(Settings(), Reports(), 60, np.random.default_rng(1))
 
 
-def test_the_circles_are_those_of_the_replay() -> None:
+def test_circles_match_the_flight_replay() -> None:
     for circle in PAPER:
         flown = Flown(
             radius_m=circle.radius_m, rate_radps=0.5, phase_rad=circle.phase_rad, height_m=0.0
@@ -28,7 +28,7 @@ def test_the_circles_are_those_of_the_replay() -> None:
             assert velocity == pytest.approx(flown(t_s).velocity_ned_mps)
 
 
-def test_perfect_is_the_truth_and_held_is_as_late_as_its_report(scenario: Scenario) -> None:
+def test_held_position_age_matches_report_interval_and_latency(scenario: Scenario) -> None:
     """A held position is the UAV's position 0.06 to 0.21 s before its beam is used."""
     for seen in scenario.instants:
         ages_s = np.arange(0.0, 0.3, 0.001)
@@ -53,7 +53,7 @@ def test_prediction_points_within_the_beam(scenario: Scenario) -> None:
     assert np.median(off[PositionSource.PREDICTED]) < 0.1 * np.median(off[PositionSource.HELD])
 
 
-def test_what_the_array_cannot_tell_apart_is_left_out(scenario: Scenario) -> None:
+def test_inseparable_positions_are_excluded(scenario: Scenario) -> None:
     """A linear array cannot separate front and back; the loss for it rarely exceeds 3 dB."""
     array = assembly.array(Settings())
     for seen in scenario.instants:

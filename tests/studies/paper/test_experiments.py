@@ -44,12 +44,12 @@ def flight() -> PaperFlight:
 # --- golden values (MATH: 8), from the answer ---------------------------------------------------
 
 
-def test_the_limits_are_the_golden_ones(answer: dict[str, Any]) -> None:
+def test_interval_limits_match_golden_values(answer: dict[str, Any]) -> None:
     found = [answer["limits"][mu]["limit_s"] for mu in ("0.05", "0.25", "1")]
     assert found == pytest.approx([0.8873, 1.0000, 1.2906], abs=5e-5)
 
 
-def test_the_input_and_the_steady_errors_are_the_golden_ones(answer: dict[str, Any]) -> None:
+def test_input_and_steady_errors_match_golden_values(answer: dict[str, Any]) -> None:
     levels = answer["levels"]
     assert answer["scenario"]["input_sup_mps"] == pytest.approx(428.66, abs=0.01)
     assert levels["L = 0.39"]["angle_error_deg"] == pytest.approx(6.24, abs=0.01)
@@ -57,7 +57,7 @@ def test_the_input_and_the_steady_errors_are_the_golden_ones(answer: dict[str, A
     assert levels["optimum"]["angle_error_deg"] < 1e-9
 
 
-def test_the_beam_is_the_golden_one(answer: dict[str, Any]) -> None:
+def test_beam_matches_golden_values(answer: dict[str, Any]) -> None:
     small, large = answer["array"]["sizes"]["64"], answer["array"]["sizes"]["128"]
     assert small["half_power_deg"] == pytest.approx(0.79, abs=0.005)
     assert large["half_power_deg"] == pytest.approx(0.40, abs=0.005)
@@ -66,7 +66,7 @@ def test_the_beam_is_the_golden_one(answer: dict[str, Any]) -> None:
     assert losses == pytest.approx([0.89, 0.22, 0.054, 0.014], rel=0.05)
 
 
-def test_the_solver_finds_what_the_closed_form_says(answer: dict[str, Any]) -> None:
+def test_lmi_solver_matches_the_closed_form(answer: dict[str, Any]) -> None:
     for row in answer["designs"]:
         assert row["feasible_gamma_s"] ** 2 <= row["mu_max_s2"] * (1 + 1e-6)
         assert row["feasible_margin"] >= -1e-6
@@ -77,7 +77,7 @@ def test_the_solver_finds_what_the_closed_form_says(answer: dict[str, Any]) -> N
         assert row["printed_sign_eigenvalue"] > 1
 
 
-def test_what_the_text_says_in_passing_is_held_to_numbers(answer: dict[str, Any]) -> None:
+def test_numbers_in_the_paper_text_are_reproduced(answer: dict[str, Any]) -> None:
     """Levels by the formula of docs/math.md 2.2; the waveform by its own parameters."""
     published = {"L = 0.39": 0.21, "L = 0.60": 0.47, "L = 0.76": 0.96}
     for name, gamma_s in published.items():
@@ -95,7 +95,7 @@ def test_what_the_text_says_in_passing_is_held_to_numbers(answer: dict[str, Any]
     assert 250 < answer["scenario"]["farthest_m"] < 500
 
 
-def test_every_figure_of_the_paper_is_held_against_ours(answer: dict[str, Any], made: Path) -> None:
+def test_every_paper_figure_is_compared(answer: dict[str, Any], made: Path) -> None:
     figures = answer["paper"]["figures"]
     assert [one["number"] for one in figures] == list(range(1, 11))
     assert {one["likeness"] for one in figures} == {"same", "differs", "cannot be told"}
@@ -123,7 +123,7 @@ def test_every_figure_of_the_paper_is_held_against_ours(answer: dict[str, Any], 
 # --- the scenario and its bounds ----------------------------------------------------------------
 
 
-def test_the_flight_is_the_one_written_out_step_by_step(flight: PaperFlight) -> None:
+def test_flight_matches_a_step_by_step_simulation(flight: PaperFlight) -> None:
     """With complex numbers and a loop: north + j east."""
     for uav, radius in enumerate((100, 150, 200, 250)):
         phase = uav * math.pi / 2
@@ -140,7 +140,7 @@ def test_the_flight_is_the_one_written_out_step_by_step(flight: PaperFlight) -> 
             place += 0.15 * w
 
 
-def test_the_other_reading_of_the_gust_is_a_velocity() -> None:
+def test_alternative_gust_model_bounds_the_input_by_velocity() -> None:
     """|W| is then at most 1.2 times |v|, over all UAVs."""
     flight = scenario.fly(PaperScenario(literal=False))
     nominal = 0.5 * math.hypot(100, 150, 200, 250)
@@ -148,7 +148,7 @@ def test_the_other_reading_of_the_gust_is_a_velocity() -> None:
 
 
 @pytest.mark.parametrize("gain", [0.3, 0.39, 0.6, 0.76, 0.9])
-def test_the_estimate_is_what_the_matrices_give(flight: PaperFlight, gain: float) -> None:
+def test_estimate_matches_the_matrix_form(flight: PaperFlight, gain: float) -> None:
     """The stacked observer, X^ = Q X^ + L Y, as 8 x 8 matrices."""
     tracked = scenario.track(flight, gain)
     q, big_l = (1 - gain) * np.eye(8), gain * np.eye(8)
@@ -161,9 +161,7 @@ def test_the_estimate_is_what_the_matrices_give(flight: PaperFlight, gain: float
 
 
 @pytest.mark.parametrize("gain", [0.2, 0.3, 0.39, 0.6, 0.76, 0.95])
-def test_every_error_stays_below_the_running_bound_and_that_below_the_others(
-    flight: PaperFlight, gain: float
-) -> None:
+def test_error_running_bound_peak_and_gamma_are_ordered(flight: PaperFlight, gain: float) -> None:
     tracked = scenario.track(flight, gain)
     errors = scenario.stacked(tracked.estimate_m - flight.position_m)
     running = scenario.running_bounds(flight, gain)
@@ -173,14 +171,14 @@ def test_every_error_stays_below_the_running_bound_and_that_below_the_others(
     assert running.max() <= peak + 1e-9 <= gamma + 2e-9
 
 
-def test_the_running_bound_is_not_slack(answer: dict[str, Any]) -> None:
+def test_peak_bound_is_tight_in_the_scenario(answer: dict[str, Any]) -> None:
     """In the scenario the error reaches 90 % of it at L = 0.76."""
     levels = answer["levels"]["L = 0.76"]
     assert 0.9 * levels["peak_bound_m"] < levels["error_sup_m"] <= levels["peak_bound_m"]
 
 
 @given(st.floats(0.05, 1.5), st.floats(-0.3, 0.8), st.floats(0.05, 0.95), st.floats(0.05, 1.5))
-def test_the_least_mu_of_a_gain_is_certified_and_less_is_not(
+def test_smallest_mu_of_a_gain_is_certified_and_smaller_is_not(
     dt_s: float, feedthrough_s: float, alpha: float, gain: float
 ) -> None:
     """Against the eigenvalues of the LMIs."""
@@ -204,19 +202,19 @@ def test_the_least_mu_of_a_gain_is_certified_and_less_is_not(
 
 
 @pytest.mark.parametrize("name", LEVELS)
-def test_the_adversary_reaches_the_exact_peak(answer: dict[str, Any], name: str) -> None:
+def test_adversarial_input_attains_the_exact_peak(answer: dict[str, Any], name: str) -> None:
     row = answer["unknown_input"][name]
     assert row["b0_adversary"] == pytest.approx(row["b0_peak"], rel=1e-9)
     assert row["b0_in_scenario"] <= row["b0_peak"] <= row["safe_2_gamma_over_dt"]
     assert row["bd_in_scenario"] <= row["bd_peak"] <= row["bd_bound"]
 
 
-def test_a_scheduled_gain_keeps_its_bound_on_irregular_intervals() -> None:
+def test_scheduled_gain_keeps_its_bound_at_irregular_intervals() -> None:
     found = scenario.irregular(PaperScenario(), 0.39, 1.2, 5000, np.random.default_rng(7))
     assert found.scheduled_s <= found.gamma_s < found.fixed_s
 
 
-def test_angle_errors_do_not_know_where_north_is(flight: PaperFlight) -> None:
+def test_rotation_by_90_deg_gives_90_deg_angle_error(flight: PaperFlight) -> None:
     turned = np.array([[0.0, 1.0], [-1.0, 0.0]])
     off = np.degrees(scenario.angle_errors_rad(flight, flight.position_m @ turned))
     assert off == pytest.approx(np.full_like(off, 90.0))
@@ -225,7 +223,7 @@ def test_angle_errors_do_not_know_where_north_is(flight: PaperFlight) -> None:
 # --- the link and the service -------------------------------------------------------------------
 
 
-def test_a_beam_that_points_right_is_worth_shannon(flight: PaperFlight) -> None:
+def test_aligned_beam_attains_the_shannon_rate(flight: PaperFlight) -> None:
     """A single UAV: 64 elements, 4 antennas, 30 dBm, free space, by hand."""
     place = np.array([[[120.0, 40.0]]])
     array = link.line(64)
@@ -238,7 +236,7 @@ def test_a_beam_that_points_right_is_worth_shannon(flight: PaperFlight) -> None:
     assert blocked == pytest.approx(math.log2(1 + 64 * 4 * loss / noise_w / 10**2.5))
 
 
-def test_places_between_the_steps_are_on_the_way(flight: PaperFlight) -> None:
+def test_positions_between_steps_are_interpolated(flight: PaperFlight) -> None:
     step = flight.scenario.dt_s
     found = link.between(flight, flight.position_m, np.array([0.0, 0.5, 1.0, 1.5]) * step)
     first, second, third = flight.position_m[:3]
@@ -246,7 +244,7 @@ def test_places_between_the_steps_are_on_the_way(flight: PaperFlight) -> None:
     assert found == pytest.approx(np.array(wanted))
 
 
-def test_the_blockages_are_the_same_for_every_scheme(answer: dict[str, Any]) -> None:
+def test_every_scheme_has_the_same_blockages(answer: dict[str, Any]) -> None:
     """No scheme exceeds the optimum, and more blockages never increase the rate."""
     means = answer["blockage"]["mean_bit_s_hz"]
     for found in means.values():
@@ -272,7 +270,7 @@ def test_the_same_seed_gives_the_same_rates(flight: PaperFlight) -> None:
     assert rates_of(5) == rates_of(5) != rates_of(6)
 
 
-def test_the_service_agrees_with_the_library(answer: dict[str, Any]) -> None:
+def test_service_results_match_the_library(answer: dict[str, Any]) -> None:
     """To the quantisation of the message: 1e-7 degree is 11 mm; velocity errors are at most 7
     mm/s."""
     found = answer["mavlink"]
@@ -281,7 +279,7 @@ def test_the_service_agrees_with_the_library(answer: dict[str, Any]) -> None:
     assert kept == pytest.approx([0.0052, 0.0015, 0.0033], rel=0.2)
 
 
-def test_the_frames_are_what_pymavlink_reads(flight: PaperFlight) -> None:
+def test_frames_are_decoded_by_pymavlink(flight: PaperFlight) -> None:
     parser = common.MAVLink(None)
     data = b"".join(mavlink.frames(flight)[:3])
     messages = parser.parse_buffer(data)
@@ -297,7 +295,7 @@ def test_the_frames_are_what_pymavlink_reads(flight: PaperFlight) -> None:
 # --- claims -------------------------------------------------------------------------------------
 
 
-def test_every_claim_is_backed_by_its_number(answer: dict[str, Any]) -> None:
+def test_every_claim_shows_its_computed_number(answer: dict[str, Any]) -> None:
     rows = answer["claims"]
     assert len(rows) == len(claims.CLAIMS) >= 15
     for row, claim in zip(rows, claims.CLAIMS, strict=True):
@@ -338,7 +336,7 @@ VERDICTS = {
 """The verdict on each claim, by the number that decides it."""
 
 
-def test_the_verdicts(answer: dict[str, Any]) -> None:
+def test_claims_have_the_expected_verdicts(answer: dict[str, Any]) -> None:
     assert {row["key"]: row["verdict"] for row in answer["claims"]} == VERDICTS
     by_statement = {row["statement"]: row["verdict"] for row in answer["claims"]}
     for part, verdict in (
@@ -353,7 +351,7 @@ def test_the_verdicts(answer: dict[str, Any]) -> None:
         assert [by_statement[one] for one in by_statement if part in one] == [verdict]
 
 
-def test_another_number_is_another_verdict(answer: dict[str, Any]) -> None:
+def test_changed_number_changes_the_verdict(answer: dict[str, Any]) -> None:
     """No verdict is hard-coded: a limit that differs from the paper's fails the claim."""
     answer = json.loads(json.dumps(answer))
     answer["limits"]["0.25"]["off_s"] = 0.01
@@ -364,12 +362,12 @@ def test_another_number_is_another_verdict(answer: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize("key", ["limits", "limits/2", "designs/99/alpha", "command", "command/x"])
-def test_a_key_without_a_number_is_refused(answer: dict[str, Any], key: str) -> None:
+def test_claim_key_without_a_number_is_rejected(answer: dict[str, Any], key: str) -> None:
     with pytest.raises(KeyError):
         claims.lookup(answer, key)
 
 
-def test_a_claim_is_a_question(answer: dict[str, Any]) -> None:
+def test_claims_have_unique_nonempty_statements(answer: dict[str, Any]) -> None:
     assert all(isinstance(claim, Claim) and claim.statement for claim in claims.CLAIMS)
     assert len({claim.statement for claim in claims.CLAIMS}) == len(claims.CLAIMS)
 
@@ -395,9 +393,7 @@ class Page(HTMLParser):
         self.words.append(data)
 
 
-def test_the_page_needs_nothing_else_and_tells_every_claim(
-    made: Path, answer: dict[str, Any]
-) -> None:
+def test_page_is_self_contained_and_lists_every_claim(made: Path, answer: dict[str, Any]) -> None:
     page = Page(made / "paper.html")
     words = " ".join(page.words)
     assert "script" not in page.tags
@@ -409,7 +405,7 @@ def test_the_page_needs_nothing_else_and_tells_every_claim(
     assert all(version in words for version in answer["versions"].values())
 
 
-def test_figures_are_whole_and_in_both_formats(made: Path) -> None:
+def test_figures_are_valid_svg_and_png(made: Path) -> None:
     names = {path.stem for path in made.glob("*.svg")}
     assert names == {path.stem for path in made.glob("*.png")}
     for path in made.glob("*.svg"):
@@ -417,7 +413,7 @@ def test_figures_are_whole_and_in_both_formats(made: Path) -> None:
         assert (made / f"{path.stem}.png").read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
-def test_the_json_holds_only_numbers_that_json_has(made: Path) -> None:
+def test_json_contains_no_nan_or_infinity(made: Path) -> None:
     def refuse(text: str) -> float:
         raise AssertionError(f"{text} is no JSON")
 

@@ -72,7 +72,7 @@ def flown(
 # --- the radar equation -------------------------------------------------------------------------
 
 
-def test_the_echo_by_hand() -> None:
+def test_echo_snr_matches_hand_computed_values() -> None:
     """Both ways: power density at the UAV, scattered power, power collected by the aperture."""
     probing = EchoProbing(cross_section_m2=0.05, dwell_s=1e-3)
     found = echo_snr(probing, BUDGET, LINE, directions=in_plane(0.0), ranges_m=np.array([200.0]))
@@ -84,7 +84,7 @@ def test_the_echo_by_hand() -> None:
     assert 10 * math.log10(found[0]) == pytest.approx(34.5, abs=1.0)
 
 
-def test_what_weakens_the_echo() -> None:
+def test_echo_weakens_with_range_blockage_and_shared_power() -> None:
     """Range to the fourth; a blockage both ways; power shared among UAVs; the element pattern."""
     probing = EchoProbing()
     where, at = in_plane(0.0, 0.0), np.array([100.0, 200.0])
@@ -120,7 +120,7 @@ CIRCLE = uniform_circular(
 
 
 @pytest.mark.parametrize("array", [LINE, PANEL, CIRCLE], ids=["line", "panel", "circle"])
-def test_alignment_is_the_gain_lost_by_pointing_off(array: Array) -> None:
+def test_alignment_equals_the_gain_lost_by_mispointing(array: Array) -> None:
     rng = np.random.default_rng(2)
     pointed, true = (v / np.linalg.norm(v, axis=1)[:, None] for v in rng.normal(size=(2, 20, 3)))
     found = alignment(array, pointed, true)
@@ -133,7 +133,7 @@ def test_alignment_is_the_gain_lost_by_pointing_off(array: Array) -> None:
     assert (found <= 1).all()
 
 
-def test_a_beam_is_at_half_power_at_its_half_width() -> None:
+def test_alignment_is_one_half_at_half_beamwidth() -> None:
     assert alignment(LINE, in_plane(0.0), in_plane(HALF_BEAM_RAD)) == pytest.approx([0.5], abs=0.01)
     patch = uniform_linear(
         8,
@@ -149,7 +149,7 @@ def test_a_beam_is_at_half_power_at_its_half_width() -> None:
 
 
 @pytest.mark.parametrize("azimuth_rad", [0.0, 0.9, -1.3])
-def test_the_error_of_a_line_is_the_published_bound(azimuth_rad: float) -> None:
+def test_linear_array_error_matches_the_published_bound(azimuth_rad: float) -> None:
     """6 / (SNR M (M^2 - 1)) in electrical angle, SNR at one element."""
     many, snr = 4000, 100.0
     true = np.tile(in_plane(azimuth_rad), (many, 1))
@@ -162,7 +162,7 @@ def test_the_error_of_a_line_is_the_published_bound(azimuth_rad: float) -> None:
     assert errors[:, :2] == pytest.approx(np.zeros((many, 2)), abs=1e-12)
 
 
-def test_the_error_is_what_the_best_receiver_has() -> None:
+def test_direction_error_matches_maximum_likelihood() -> None:
     """Simulated maximum likelihood: the beamformer peak of the noisy snapshot."""
     line, true_sine, snr = (
         uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3)),
@@ -184,7 +184,7 @@ def test_the_error_is_what_the_best_receiver_has() -> None:
 @pytest.mark.parametrize(
     "element", [Element(), Element(ElementPattern.TR38901)], ids=["same", "3gpp"]
 )
-def test_the_error_of_any_array_is_the_inverse_of_its_information(element: Element) -> None:
+def test_direction_error_matches_inverse_fisher_information(element: Element) -> None:
     """Fisher information by numerical derivatives of the snapshot, amplitude and phase unknown."""
     array = uniform_circular(
         12, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3), element=element
@@ -214,7 +214,7 @@ def test_the_error_of_any_array_is_the_inverse_of_its_information(element: Eleme
     assert rotations @ true == pytest.approx(np.zeros(many), abs=1e-12)
 
 
-def test_without_an_echo_there_is_no_error() -> None:
+def test_zero_snr_adds_no_direction_error() -> None:
     true = in_plane(0.1, 0.2)
     found = direction_error_rad(PANEL, true, np.zeros(2), np.random.default_rng(1))
     assert found.tolist() == [[0.0] * 3] * 2
@@ -224,7 +224,7 @@ def test_without_an_echo_there_is_no_error() -> None:
 
 
 @pytest.mark.parametrize("array", [LINE, PANEL], ids=["line", "panel"])
-def test_with_strong_echoes_it_points_where_the_last_one_came_from(array: Array) -> None:
+def test_strong_echoes_point_the_beam_at_the_last_echo(array: Array) -> None:
     """The lag is one interval of motion plus the bound's error, and no more."""
     probing = EchoProbing(interval_s=0.01)
     azimuths = -0.5 + 0.3 * 0.01 * np.arange(200)  # 0.3 rad/s
@@ -235,7 +235,7 @@ def test_with_strong_echoes_it_points_where_the_last_one_came_from(array: Array)
     assert behind[1:] == pytest.approx(np.full(199, 0.003), abs=1e-4)
 
 
-def test_with_a_rate_it_catches_up() -> None:
+def test_rate_estimate_removes_the_tracking_lag() -> None:
     """The alpha-beta tracker has no lag at a constant rate and keeps the rate through a
     blockage; a beam without a rate is held."""
     azimuths = 0.3 * 0.01 * np.arange(320)
@@ -253,7 +253,7 @@ def test_with_a_rate_it_catches_up() -> None:
         )
 
 
-def test_an_echo_moves_the_estimate_by_the_gains() -> None:
+def test_echo_updates_the_estimate_by_the_tracker_gains() -> None:
     """alpha of the innovation, and beta of it per interval; all of it after a sweep."""
     probing = EchoProbing(
         interval_s=0.02, position_gain=0.6, rate_gain=0.3, patience_intervals=0, sweep_beams=1
@@ -275,7 +275,7 @@ def test_an_echo_moves_the_estimate_by_the_gains() -> None:
     assert state.estimate == pytest.approx(in_plane(0.9), abs=1e-6)
 
 
-def test_without_an_echo_the_beam_is_held_still() -> None:
+def test_missing_echo_holds_the_beam() -> None:
     probing = EchoProbing(patience_intervals=30)
     azimuths = 0.05 * 0.01 * np.arange(40)
     states = flown(probing, azimuths, np.where(np.arange(40) < 10, 1e8, 0.0))
@@ -286,7 +286,7 @@ def test_without_an_echo_the_beam_is_held_still() -> None:
     assert [int(state.silent[0]) for state in states[8:12]] == [0, 0, 1, 2]
 
 
-def test_it_resumes_where_the_uav_is_still_in_the_lobe() -> None:
+def test_tracking_resumes_while_the_uav_is_in_the_main_lobe() -> None:
     probing = EchoProbing(patience_intervals=30)
     azimuths = np.concatenate([np.zeros(10), np.full(20, 0.9 * HALF_BEAM_RAD)])
     states = flown(probing, azimuths, np.where((np.arange(30) < 10) | (np.arange(30) > 20), 1e6, 0))
@@ -295,7 +295,7 @@ def test_it_resumes_where_the_uav_is_still_in_the_lobe() -> None:
     assert off_rad(states[22].pointed, in_plane(azimuths[22])) < 1e-3
 
 
-def test_a_uav_that_has_left_the_lobe_is_lost_and_costs_a_sweep() -> None:
+def test_uav_outside_the_main_lobe_requires_a_sweep() -> None:
     probing = EchoProbing(interval_s=0.01, dwell_s=0.001, sweep_beams=64, patience_intervals=5)
     assert probing.sweep_intervals == 7
     azimuths = np.where(np.arange(40) < 10, 0.0, 0.2)  # seven beamwidths away
@@ -310,7 +310,7 @@ def test_a_uav_that_has_left_the_lobe_is_lost_and_costs_a_sweep() -> None:
     assert states[22].silent.tolist() == [0]
 
 
-def test_it_sweeps_until_a_sweep_ends_with_an_echo() -> None:
+def test_sweeps_repeat_until_one_ends_with_an_echo() -> None:
     probing = EchoProbing(interval_s=0.01, dwell_s=0.001, sweep_beams=30, patience_intervals=2)
     states = flown(probing, np.zeros(30), np.where(np.arange(30) < 14, 0.0, 1e6))
     # No echo 0 to 2; sweeps 3-5, 6-8, 9-11, and 12-14, which ends without blockage.
@@ -318,7 +318,7 @@ def test_it_sweeps_until_a_sweep_ends_with_an_echo() -> None:
     assert [bool(s.heard[0]) for s in states] == [False] * 14 + [True] * 16
 
 
-def test_a_rate_does_not_outlive_the_track() -> None:
+def test_lost_track_resets_the_rate() -> None:
     probing = EchoProbing(patience_intervals=1, rate_gain=0.5, position_gain=0.9, sweep_beams=20)
     azimuths = 0.003 * np.arange(60)
     snr = np.where((np.arange(60) < 20) | (np.arange(60) > 40), 1e8, 0.0)
@@ -329,7 +329,7 @@ def test_a_rate_does_not_outlive_the_track() -> None:
     assert all(not state.turn_radps.any() for state in sweeping)
 
 
-def test_an_echo_through_a_side_lobe_counts_only_where_it_may() -> None:
+def test_side_lobe_echo_counts_only_if_enabled() -> None:
     """The first side lobe of a linear array, 13.3 dB down at 1.43 null widths, with a strong
     echo."""
     side = math.asin(1.43 * 2 / 64)
@@ -342,7 +342,7 @@ def test_an_echo_through_a_side_lobe_counts_only_where_it_may() -> None:
 
 
 @pytest.mark.parametrize(("spare_db", "heard"), [(0.1, True), (-0.1, False)])
-def test_pointing_off_weakens_the_echo_below_detection(spare_db: float, heard: bool) -> None:
+def test_mispointing_weakens_the_echo_below_detection(spare_db: float, heard: bool) -> None:
     probing = EchoProbing(detection_snr_db=13.0)
     there = in_plane(HALF_BEAM_RAD)
     lost_db = -10 * math.log10(float(alignment(LINE, in_plane(0.0), there)[0]))
@@ -359,7 +359,7 @@ def test_pointing_off_weakens_the_echo_below_detection(spare_db: float, heard: b
 
 
 @pytest.mark.parametrize(("spare_db", "heard"), [(0.1, True), (-0.1, False)])
-def test_the_codebook_weakens_the_echo_of_a_sweep(spare_db: float, heard: bool) -> None:
+def test_codebook_loss_weakens_the_sweep_echo(spare_db: float, heard: bool) -> None:
     probing = EchoProbing(patience_intervals=0, sweep_beams=1, sweep_loss_db=3.9)
     rng = np.random.default_rng(1)
     lost = step(
@@ -372,7 +372,7 @@ def test_the_codebook_weakens_the_echo_of_a_sweep(spare_db: float, heard: bool) 
     assert bool(state.heard[0]) is heard
 
 
-def test_a_weaker_echo_is_a_worse_one() -> None:
+def test_mispointed_echo_has_a_larger_error() -> None:
     """The estimation error follows the echo strength left after mispointing."""
     probing = EchoProbing()
     many = 4000
@@ -393,7 +393,9 @@ def test_a_weaker_echo_is_a_worse_one() -> None:
 
 @settings(max_examples=examples(25), deadline=None)
 @given(st.integers(0, 2**32 - 1), st.floats(0, 1), st.floats(0.1, 1))
-def test_whatever_happens_the_state_is_sound(seed: int, rate_gain: float, gain: float) -> None:
+def test_random_blockages_keep_the_tracker_state_valid(
+    seed: int, rate_gain: float, gain: float
+) -> None:
     """Random flights and blockages: unit vectors, tangential rates, sweeps of known duration."""
     probing = EchoProbing(
         patience_intervals=2, sweep_beams=25, rate_gain=rate_gain, position_gain=gain
@@ -417,7 +419,7 @@ def test_whatever_happens_the_state_is_sound(seed: int, rate_gain: float, gain: 
         assert (state.silent <= 2).all() or (state.sweep_left[state.silent > 2] > 0).all()
 
 
-def test_uavs_do_not_disturb_one_another_and_the_seed_decides() -> None:
+def test_uav_tracks_are_independent_and_seeded() -> None:
     probing = EchoProbing(patience_intervals=1)
     true = in_plane(-0.5, 0.1, 0.7)
 
@@ -442,7 +444,7 @@ def test_uavs_do_not_disturb_one_another_and_the_seed_decides() -> None:
     assert alone.sweep_left[2] > 0
 
 
-def test_a_step_writes_to_nothing_that_it_is_given() -> None:
+def test_step_does_not_modify_its_arguments() -> None:
     state, true = started(in_plane(0.0, 0.1)), in_plane(0.01, 0.11)
     before = [np.copy(getattr(state, f.name)) for f in dataclasses.fields(state)]
     step(
@@ -479,7 +481,7 @@ def test_a_step_writes_to_nothing_that_it_is_given() -> None:
         {"rate_gain": math.nan},
     ],
 )
-def test_a_baseline_that_is_none_is_refused(bad: dict[str, float]) -> None:
+def test_invalid_probing_settings_are_rejected(bad: dict[str, float]) -> None:
     with pytest.raises(ValueError, match=next(iter(bad))):
         EchoProbing(**bad)  # type: ignore[arg-type]
 

@@ -36,7 +36,7 @@ def worst_input(gain: float, b: float, d: float, steps: int, last: float) -> np.
 
 
 @pytest.mark.parametrize("gain", [*PAPER_GAINS, 1.2])
-def test_peaks_are_exact(gain: float) -> None:
+def test_peak_gains_are_attained_and_never_exceeded(gain: float) -> None:
     """Never exceeded by random inputs, attained by the worst one."""
     rng = np.random.default_rng(7)
     peak_e = float(closed_form.peak_gain(B, D, gain))
@@ -54,13 +54,13 @@ def test_peaks_are_exact(gain: float) -> None:
 
 
 @pytest.mark.parametrize("gain", PAPER_GAINS)
-def test_two_gamma_holds_where_three_was_claimed(gain: float) -> None:
+def test_unknown_input_peak_equals_the_closed_form(gain: float) -> None:
     """The exact peak is 2 |l d - b| / b; at L = .76 it exceeds the published 3 gamma."""
     _, peak_b0 = published.unknown_input_peak(B, D, gain)
     assert peak_b0 == pytest.approx(2 * abs(gain * D - B) / B)
 
 
-def test_the_published_bound_fails() -> None:
+def test_published_unknown_input_bound_is_violated() -> None:
     """At L = .76 the exact peak is 3.07, and three times its gamma of .96 is 2.88."""
     _, peak_b0 = published.unknown_input_peak(B, D, 0.76)
     assert peak_b0 == pytest.approx(3.07, abs=5e-3)
@@ -71,14 +71,14 @@ def test_the_published_bound_fails() -> None:
     assert published.unknown_input_peak(B, D, 0.76)[0] < safe_bd
 
 
-def test_at_the_optimum_there_is_no_error_at_all() -> None:
+def test_optimal_gain_gives_zero_error() -> None:
     w = np.random.default_rng(1).normal(0, 100, 100)
     assert np.abs(np.array(errors(0.3, B, D, w))).max() < 1e-9
     scheduled = published.step(np.zeros(2), report_m=np.array([3.0, -1.0]), dt_s=B, feedthrough_s=D)
     assert scheduled.estimate_m == pytest.approx([0.9, -0.3])
 
 
-def test_irregular_intervals_keep_the_guarantee() -> None:
+def test_irregular_intervals_keep_the_gamma_bound() -> None:
     """|e| <= gamma sup|w| with gamma over the intervals that occurred, in any order."""
     rng = np.random.default_rng(3)
     alpha, d, worst = 0.95, -0.5, 0.0  # where gamma is close to the exact peak
@@ -98,6 +98,6 @@ def test_irregular_intervals_keep_the_guarantee() -> None:
 
 
 @pytest.mark.parametrize("dt_s", [0.0, -1.0, float("nan")])
-def test_an_interval_is_positive(dt_s: float) -> None:
+def test_nonpositive_interval_is_rejected(dt_s: float) -> None:
     with pytest.raises(ValueError, match="positive"):
         published.step(np.zeros(1), report_m=np.zeros(1), dt_s=dt_s, feedthrough_s=D)

@@ -81,13 +81,13 @@ def wandering(n: int, seed: int = 5, late_s: float = 0.0) -> list[ObservedReport
 
 
 @pytest.mark.parametrize("make", ALL)
-def test_nothing_is_known_before_the_first_report(make: Callable[[], Predictor]) -> None:
+def test_no_prediction_before_the_first_report(make: Callable[[], Predictor]) -> None:
     assert make().predict(0, S) is None
 
 
 @pytest.mark.parametrize("make", ALL[1:])
 @pytest.mark.parametrize("lead_s", [0.0, 1.0])
-def test_a_straight_flight_without_delay_is_exact(
+def test_straight_flight_without_delay_is_predicted_exactly(
     make: Callable[[], Predictor], lead_s: float
 ) -> None:
     predictor = make()
@@ -101,14 +101,14 @@ def test_a_straight_flight_without_delay_is_exact(
     assert predicted.bound_m is None
 
 
-def test_hold_holds_the_last_to_arrive() -> None:
+def test_hold_uses_the_last_report_to_arrive() -> None:
     predictor = Hold()
     predictor.report(straight(2.0, late_s=0.1))
     predictor.report(straight(1.0, late_s=1.2))
     assert ask(predictor, 9.0, 1.0).position_ned_m == pytest.approx(P0 + V0)
 
 
-def test_arrival_time_misses_by_the_latency() -> None:
+def test_arrival_time_prediction_lags_by_the_latency() -> None:
     """The whole error is speed times latency."""
     by_arrival, by_sender = DeadReckoningOnArrival(), DeadReckoning()
     for predictor in (by_arrival, by_sender):
@@ -118,7 +118,7 @@ def test_arrival_time_misses_by_the_latency() -> None:
     assert ask(by_sender, 2.0, 0.3).position_ned_m == pytest.approx(truly)
 
 
-def test_an_overtaken_report_misleads_only_who_goes_by_arrival() -> None:
+def test_reordered_report_misleads_only_arrival_time_prediction() -> None:
     by_arrival, by_sender = DeadReckoningOnArrival(), DeadReckoning()
     for predictor in (by_arrival, by_sender):
         predictor.report(straight(2.0, late_s=0.1))
@@ -127,7 +127,7 @@ def test_an_overtaken_report_misleads_only_who_goes_by_arrival() -> None:
     assert ask(by_arrival, 2.5, 1.0).position_ned_m == pytest.approx(P0 - V0)
 
 
-def test_the_tracker_gives_up_after_five_seconds() -> None:
+def test_antenna_tracker_stops_predicting_after_five_seconds() -> None:
     predictor = DeadReckoningOnArrival()
     predictor.report(straight(0.0))
     assert ask(predictor, 4.9).position_ned_m == pytest.approx(P0 + V0 * 4.9)
@@ -138,7 +138,7 @@ def test_the_tracker_gives_up_after_five_seconds() -> None:
 
 
 @pytest.mark.parametrize("make", ALL[2:])
-def test_a_clock_set_right_moves_what_came_before(make: Callable[[], Predictor]) -> None:
+def test_clock_correction_applies_to_earlier_reports(make: Callable[[], Predictor]) -> None:
     """The first reports were dated 0.5 s too late; the correction applies to all of them."""
     predictor = make()
     for sent_s in (1.0, 1.5, 2.0, 2.5, 3.0):
@@ -152,7 +152,7 @@ def test_a_clock_set_right_moves_what_came_before(make: Callable[[], Predictor])
 
 
 @pytest.mark.parametrize("make", ALL[1:3])
-def test_without_a_velocity_the_position_is_held(make: Callable[[], Predictor]) -> None:
+def test_position_is_held_without_velocity(make: Callable[[], Predictor]) -> None:
     predictor = make()
     predictor.report(observed(0.0, P0))
     assert ask(predictor, 3.0, 1.0).position_ned_m == pytest.approx(P0)
@@ -168,7 +168,7 @@ def generator(states: int) -> FloatArray:
 
 
 @pytest.mark.parametrize("states", [2, 3])
-def test_model_is_the_integral_of_the_noise(states: int) -> None:
+def test_process_noise_equals_its_numerical_integral(states: int) -> None:
     interval_s, density = 0.7, 1.9
     into = np.zeros((states, 1))
     into[-1] = 1.0
@@ -220,7 +220,7 @@ def least_squares(reports: Sequence[ObservedReport], states: int, tuning: Tuning
 
 @pytest.mark.parametrize("states", [2, 3])
 @pytest.mark.parametrize("count", [1, 2, 25])
-def test_filter_is_the_least_squares_fit(states: int, count: int) -> None:
+def test_kalman_filter_equals_the_least_squares_fit(states: int, count: int) -> None:
     reports = wandering(count)
     predictor = Kalman(states, TUNING)
     for report in reports:
@@ -234,7 +234,7 @@ def test_filter_is_the_least_squares_fit(states: int, count: int) -> None:
 
 
 @pytest.mark.parametrize("states", [2, 3])
-def test_several_filters_at_once_are_each_their_own(states: int) -> None:
+def test_batched_filters_equal_separate_filters(states: int) -> None:
     tunings = [
         TUNING,
         Tuning(
@@ -255,7 +255,7 @@ def test_several_filters_at_once_are_each_their_own(states: int) -> None:
 
 
 @pytest.mark.parametrize("states", [2, 3])
-def test_order_of_arrival_does_not_matter(states: int) -> None:
+def test_arrival_order_does_not_change_the_prediction(states: int) -> None:
     reports = wandering(5)
     answers = []
     for order in itertools.permutations(reports):
@@ -280,6 +280,6 @@ def test_a_report_older_than_the_history_is_dropped() -> None:
     assert not np.allclose(ask(late, 70.0).position_ned_m, ask(whole, 70.0).position_ned_m)
 
 
-def test_a_filter_has_two_or_three_states() -> None:
+def test_unsupported_state_count_is_rejected() -> None:
     with pytest.raises(ValueError, match="allowed: 2 or 3"):
         Kalman(4, TUNING)

@@ -88,7 +88,7 @@ def asked(truth_ned_m: np.ndarray, array_ned_m: np.ndarray) -> Questions:
     )
 
 
-def test_scores_by_hand() -> None:
+def test_scores_match_hand_computed_values() -> None:
     """100 m away: 1 m across is .573 degrees, 2 m across 1.146, 5 m along none."""
     array = np.tile([5.0, -7.0, 2.0], (4, 1))
     true = array + np.array([100.0, 0.0, 0.0])
@@ -114,7 +114,7 @@ def test_scores_by_hand() -> None:
     assert found["se_loss_bps_hz"] is None
 
 
-def test_without_bounds_or_answers() -> None:
+def test_scores_without_bounds_or_answers_are_none() -> None:
     true = np.array([[100.0, 0, 0], [0, 100.0, 0]])
     both = asked(true, np.zeros((2, 3)))
     nothing = np.full((1, 2), np.nan)
@@ -134,7 +134,7 @@ def test_without_bounds_or_answers() -> None:
     )
 
 
-def test_angles_are_exact_when_small_and_when_large() -> None:
+def test_small_and_large_angles_are_exact() -> None:
     east, almost = np.array([0.0, 1.0, 0.0]), np.array([0.0, 1.0, 1e-9])
     assert pointing.angles_deg(east, almost) == pytest.approx(math.degrees(1e-9))
     assert pointing.angles_deg(east, -3 * east) == pytest.approx(180.0)
@@ -171,7 +171,7 @@ def flown(flight: Flight) -> Flown:
     )
 
 
-def test_only_what_has_arrived_is_used(straight_flight: Callable[..., Flight]) -> None:
+def test_predictions_use_only_arrived_reports(straight_flight: Callable[..., Flight]) -> None:
     flight = straight_flight(300)
     delivery = deliver(flight, RADIO, 1)
     plan = questions(flown(flight), flight, (0.0, 0.5), delivery.observed[0].arrival_ns)
@@ -187,7 +187,9 @@ def test_only_what_has_arrived_is_used(straight_flight: Callable[..., Flight]) -
 
 
 @pytest.mark.full
-def test_a_straight_flight_is_all_latency(straight_flight: Callable[..., Flight]) -> None:
+def test_straight_flight_errors_equal_speed_times_latency(
+    straight_flight: Callable[..., Flight],
+) -> None:
     """Each baseline errs by at most its speed times its time uncertainty."""
     flight = straight_flight(1200)
     at_once = Settings().override(observer={"lag_s": (0.0, 0.0)})
@@ -214,7 +216,7 @@ def test_a_straight_flight_is_all_latency(straight_flight: Callable[..., Flight]
         assert all(row["violations"] in (None, 0) for row in found.rows)
 
 
-def test_a_truth_that_is_made_of_reports_does_not_lag_behind_them() -> None:
+def test_report_based_truth_has_no_report_lag() -> None:
     given = Settings()
     assert as_true(given, "SIM_STATE") is given
     reports = as_true(given, "reports")
@@ -222,7 +224,7 @@ def test_a_truth_that_is_made_of_reports_does_not_lag_behind_them() -> None:
     assert assembly.assumed(given, "1:1", 2, 3).lag_s != (0.0, 0.0)
 
 
-def test_the_grid_is_searched(straight_flight: Callable[..., Flight]) -> None:
+def test_tuning_searches_the_grid(straight_flight: Callable[..., Flight]) -> None:
     """On a straight flight with noise the stiffest filter is the best."""
     flight = straight_flight(300)
     rng = np.random.default_rng(2)
@@ -242,7 +244,7 @@ def test_the_grid_is_searched(straight_flight: Callable[..., Flight]) -> None:
 
 
 @pytest.mark.full
-def test_the_command_on_a_short_flight(cut_log: Path, tmp_path: Path) -> None:
+def test_command_runs_on_a_short_flight(cut_log: Path, tmp_path: Path) -> None:
     out = tmp_path / "deep" / "report"
     done = run(cut_log, "--center", "5:1", "--lead", "0,0.5", "--out", out, "--json")
     assert fine(done), done.stderr
@@ -284,7 +286,7 @@ def test_the_command_on_a_short_flight(cut_log: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_processes_do_not_change_the_answer(cut_log: Path, tmp_path: Path) -> None:
+def test_process_count_does_not_change_the_answer(cut_log: Path, tmp_path: Path) -> None:
     """Two logs with two names, in the given order."""
     other = tmp_path / "another.tlog"
     other.write_bytes(cut_log.read_bytes()[:200_000])
@@ -298,7 +300,7 @@ def test_processes_do_not_change_the_answer(cut_log: Path, tmp_path: Path) -> No
 
 
 @pytest.mark.full
-def test_the_spectral_efficiency_is_of_the_settings_array(cut_log: Path, tmp_path: Path) -> None:
+def test_spectral_efficiency_uses_the_configured_array(cut_log: Path, tmp_path: Path) -> None:
     """Eight elements have a wide beam and lose little; so does low power."""
     config = tmp_path / "few.toml"
     config.write_text("[array]\nelements = 8\n")
@@ -316,7 +318,7 @@ def test_the_spectral_efficiency_is_of_the_settings_array(cut_log: Path, tmp_pat
 
 
 @pytest.mark.full
-def test_the_text_shows_every_measure(cut_log: Path, tmp_path: Path) -> None:
+def test_text_output_shows_every_measure(cut_log: Path, tmp_path: Path) -> None:
     done = run(cut_log, "--center", "5:1", "--lead", "0,1", "--out", tmp_path)
     assert fine(done), done.stderr
     blocks = done.stdout.split("\n\n")
@@ -344,7 +346,7 @@ def test_the_text_shows_every_measure(cut_log: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_log_without_the_simulators_word(tmp_path: Path) -> None:
+def test_log_without_simulator_truth_uses_reports(tmp_path: Path) -> None:
     log = shared_log("real_devmangrani_flight54.tlog")
     asked = (log, "--lead", "0.3", "--jobs", "1", "--out", tmp_path, "--json")
     done = run(*asked, "--links", "clean,noisy")
@@ -378,7 +380,7 @@ class Page(HTMLParser):
 
 
 @pytest.mark.full
-def test_the_page_needs_nothing_else(cut_log: Path, tmp_path: Path) -> None:
+def test_page_loads_nothing_external(cut_log: Path, tmp_path: Path) -> None:
     done = run(cut_log, "--center", "5:1", "--lead", "0", "--out", tmp_path)
     assert fine(done), done.stderr
     links = ("clean", "radio", "hostile")
@@ -410,7 +412,7 @@ def compared(log: str, link: RadioLink, angles: dict[str, list[float | None]]) -
     return LogComparison(log=log, center="5:1", link=link, rows=rows, tuned={})
 
 
-def test_the_figure_shows_every_angle_and_tells_predictors_apart() -> None:
+def test_figure_shows_every_angle_with_distinct_predictor_styles() -> None:
     """Zero or unknown values are gaps: a logarithmic axis cannot show them."""
     angles: dict[str, list[float | None]]
     angles = {f"p{n}": [0.1 + n, 0.2 + n, 0.3 + n] for n in range(9)}
@@ -464,7 +466,7 @@ LAG_DEG = math.degrees(0.0295 * 5.2 / 60)
 
 
 @pytest.mark.full
-def test_the_table_that_was_measured_before() -> None:
+def test_angle_errors_match_previously_measured_values() -> None:
     log = vehicles.load(shared_log("sitl_4circle.tlog"), "5:1")
     (flight,) = (flight for flight in log.flights if flight.uav == "1:1")
     for link in (CLEAN, RADIO):
@@ -526,7 +528,9 @@ def test_command_error_is_one_line(
         ("real_eagle_c2_gui.tlog", "no UAV flies while"),
     ],
 )
-def test_a_log_with_nothing_to_study(name: str, says: str, tmp_path: Path) -> None:
+def test_log_without_usable_flight_is_a_one_line_error(
+    name: str, says: str, tmp_path: Path
+) -> None:
     done = run(shared_log(name), "--center", "home", "--out", tmp_path)
     assert done.exit_code == 1
     (line,) = done.stderr.splitlines()
@@ -534,7 +538,7 @@ def test_a_log_with_nothing_to_study(name: str, says: str, tmp_path: Path) -> No
     assert says in line
 
 
-def test_an_output_that_cannot_be(cut_log: Path, tmp_path: Path) -> None:
+def test_unwritable_output_is_a_one_line_error(cut_log: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     done = run(cut_log, "--center", "5:1", "--out", tmp_path / "file")
     assert done.exit_code == 1

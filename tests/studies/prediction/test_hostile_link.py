@@ -23,13 +23,13 @@ def of(name: str) -> np.ndarray:
     return np.asarray(late_s[regime == NAMES.index(name)])
 
 
-def test_the_link_begins_in_flight() -> None:
+def test_hostile_link_delivers_no_frame_before_its_start() -> None:
     came_ns, arrives = arrivals_ns(np.random.default_rng(1), SENT_NS, BEGINS_NS)
     assert np.array_equal(arrives, SENT_NS >= BEGINS_NS)
     assert came_ns[arrives].min() == BEGINS_NS + 5_000_000
 
 
-def test_each_regime_is_what_it_is_called() -> None:
+def test_each_regime_has_its_named_latency() -> None:
     first = of("first-fast")
     assert first[0] == pytest.approx(0.005)
     assert first[2:] == pytest.approx(0.3)
@@ -53,21 +53,21 @@ def test_each_regime_is_what_it_is_called() -> None:
     assert 0.7 < of("overtaking").max() < 0.81
 
 
-def test_bursts_come_at_once() -> None:
+def test_burst_frames_arrive_together() -> None:
     came_ns, arrives = arrivals_ns(np.random.default_rng(1), SENT_NS, BEGINS_NS)
     here = arrives & (regimes_at(SENT_NS, BEGINS_NS) == NAMES.index("bursts"))
     at_once = np.unique(came_ns[here], return_counts=True)[1]
     assert at_once.max() > 20
 
 
-def test_order_is_kept_but_where_frames_overtake() -> None:
+def test_frames_are_reordered_only_in_the_overtaking_regime() -> None:
     came_ns, arrives = arrivals_ns(np.random.default_rng(1), SENT_NS, BEGINS_NS)
     overtakes = regimes_at(SENT_NS, BEGINS_NS) == NAMES.index("overtaking")
     assert (np.diff(came_ns[arrives & ~overtakes]) >= 0).all()
     assert (np.diff(came_ns[overtakes & arrives]) < 0).mean() > 0.2
 
 
-def test_the_seed_decides_and_regimes_come_again() -> None:
+def test_latency_is_seeded_and_regimes_repeat() -> None:
     assert np.array_equal(latency_s(3)[0], latency_s(3)[0])
     assert not np.array_equal(latency_s(3)[0], latency_s(4)[0])
     again = BEGINS_NS + np.array([0, ROUND_NS - 1, ROUND_NS, 5 * ROUND_NS + 21 * S])

@@ -33,14 +33,14 @@ def run(*arguments: str | Path) -> Any:
     return CliRunner().invoke(main, ["study", *map(str, arguments)])
 
 
-def test_the_same_seed_gives_the_same_network() -> None:
+def test_training_is_reproducible_from_the_seed() -> None:
     nets = [learned.train(seed, epochs=1, flights=3)[0]["weights"] for seed in (5, 5, 6)]
     assert all(torch.equal(nets[0][key], nets[1][key]) for key in nets[0])
     assert not all(torch.equal(nets[0][key], nets[2][key]) for key in nets[0])
     assert torch.get_num_threads() == 1
 
 
-def test_examples_are_departures_from_straight_flight() -> None:
+def test_examples_are_deviations_from_straight_flight() -> None:
     seen, leads, ways = learned.examples(3, 4, lambda _text: None)
     assert seen.shape[1:] == (REPORTS, 7)
     assert (np.diff(seen[:, :, 0], axis=1) > 0).all()
@@ -68,7 +68,7 @@ def rms_m(predictor: Predictor, seed: int, lead_s: float) -> float:
     return float(np.sqrt(np.nanmean(squares)))
 
 
-def test_it_has_learned_more_than_straight_flight(trained: Path) -> None:
+def test_network_beats_straight_line_prediction(trained: Path) -> None:
     make = learned.load(trained)
     ours = np.array([rms_m(make(), seed, 2.0) for seed in range(12)])
     straight = np.array([rms_m(DeadReckoning(), seed, 2.0) for seed in range(12)])
@@ -87,7 +87,7 @@ def observed(made_s: float, position: list[float], velocity: list[float] | None)
     )
 
 
-def test_it_answers_whatever_comes(trained: Path) -> None:
+def test_network_predicts_for_any_report_sequence(trained: Path) -> None:
     """No report, one, one without velocity, reordered ones, a long gap."""
     predictor = learned.load(trained)()
     assert predictor.predict(0, S) is None
@@ -111,7 +111,7 @@ def test_it_answers_whatever_comes(trained: Path) -> None:
     assert (places[1] - places[0]) / 95 == pytest.approx((places[2] - places[1]) / 95)
 
 
-def test_the_commands(cut_log: Path, tmp_path: Path) -> None:
+def test_train_and_compare_commands_work(cut_log: Path, tmp_path: Path) -> None:
     """Train and compare; the process count does not change the predictions."""
     net = tmp_path / "deep" / "net.pt"
     done = run("train", "--out", net, "--seed", "3", "--epochs", "1", "--flights", "3", "--json")
@@ -129,7 +129,7 @@ def test_the_commands(cut_log: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("content", [b"", b"not a network", b"PK\x03\x04rubbish"])
-def test_a_file_that_is_no_network(cut_log: Path, tmp_path: Path, content: bytes) -> None:
+def test_invalid_network_file_is_rejected(cut_log: Path, tmp_path: Path, content: bytes) -> None:
     bad = tmp_path / "bad.pt"
     bad.write_bytes(content)
     done = run("prediction", cut_log, "--learned", bad, "--center", "5:1", "--out", tmp_path)
@@ -138,7 +138,7 @@ def test_a_file_that_is_no_network(cut_log: Path, tmp_path: Path, content: bytes
     assert "not a network of" in line
 
 
-def test_a_network_of_another_kind(tmp_path: Path) -> None:
+def test_incompatible_network_is_rejected(tmp_path: Path) -> None:
     weights = learned.network().state_dict()
     few = dict(list(weights.items())[1:])
     for held in ({"format": "another", "weights": weights}, {"format": learned.FORMAT}, [1]):

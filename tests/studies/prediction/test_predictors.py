@@ -11,14 +11,14 @@ from companion.studies.prediction.predictors import MANOEUVRE_S, known_tuning
 S = 1_000_000_000
 
 
-def test_known_noise_is_that_of_the_settings() -> None:
+def test_known_noise_tuning_follows_the_settings() -> None:
     given = {"acceleration_max_mps2": 6.0, "position_noise_m": 1.5, "velocity_noise_mps": 0.9}
     tuning = known_tuning(Settings().override(observer={**given, "accuracy_factor": 3.0}))
     assert tuning.process_density == pytest.approx(4.0 * MANOEUVRE_S)
     assert (tuning.position_noise_m, tuning.velocity_noise_mps) == pytest.approx((0.5, 0.3))
 
 
-def test_a_filter_of_known_noise_against_one_written_out() -> None:
+def test_known_noise_filter_matches_a_textbook_filter() -> None:
     """One axis, as in a textbook: position and velocity measured together, at irregular times."""
     tuning = known_tuning(Settings())
     rng = np.random.default_rng(4)

@@ -35,7 +35,7 @@ def circling() -> Flown:
     return vehicles.load(CUT, PLACE)
 
 
-def test_over_the_logs_own_link_it_is_the_pipeline(circling: Flown) -> None:
+def test_product_over_the_clean_link_equals_the_pipeline(circling: Flown) -> None:
     """A pipeline fed with the whole log gives the same tracks."""
     settings = Settings()
     flight = circling.flights[0]
@@ -59,7 +59,7 @@ def test_over_the_logs_own_link_it_is_the_pipeline(circling: Flown) -> None:
 
 
 @pytest.mark.parametrize("link", [CLEAN, RADIO, HOSTILE], ids=lambda link: link.name)
-def test_the_baselines_clock_is_the_products(link: RadioLink, circling: Flown) -> None:
+def test_baselines_and_product_use_the_same_clock(link: RadioLink, circling: Flown) -> None:
     """Both use the same timestamps: they agree when an accepted report was measured.
 
     The product also knows the lag of the position behind its timestamp.
@@ -92,7 +92,7 @@ def kinds(events: tuple[Frame | RoundTrip, ...]) -> dict[int, int]:
     return found
 
 
-def test_a_radio_thins_each_kind_of_message(circling: Flown) -> None:
+def test_radio_link_thins_each_message_type(circling: Flown) -> None:
     flight = circling.flights[0]
     clean, radio = (kinds(deliver(flight, link, 1).events) for link in (CLEAN, RADIO))
     span_s = (circling.span_ns[1] - circling.span_ns[0]) * 1e-9
@@ -109,7 +109,7 @@ def test_a_radio_thins_each_kind_of_message(circling: Flown) -> None:
     assert len(reports) - len(delivery.observed) <= 2
 
 
-def test_a_known_clock_is_known_by_round_trips(straight_flight: Callable[..., Flight]) -> None:
+def test_known_delay_gives_a_tight_clock_bound(straight_flight: Callable[..., Flight]) -> None:
     flight = straight_flight(600)
     known = RadioLink(name="radio", rate_hz=1.2, latency_s=(0.6, 2.2), loss=0.1, known_delay=True)
     for link, bound_s in ((RADIO, 0.1), (known, 0.05)):
@@ -121,7 +121,7 @@ def test_a_known_clock_is_known_by_round_trips(straight_flight: Callable[..., Fl
         assert (found.uncertainty_s < bound_s) == link.known_delay
 
 
-def test_noise_is_the_same_for_all_and_is_said(circling: Flown) -> None:
+def test_frames_and_reports_share_noise_within_stated_accuracy(circling: Flown) -> None:
     """Frames and observed reports hold the same noise, and the receiver's accuracy covers it."""
     flight = circling.flights[0]
     delivery = deliver(flight, NOISY, 1)
@@ -173,7 +173,7 @@ def asked_and_given(
     )
 
 
-def test_violations_are_counted_and_what_was_announced_of_them() -> None:
+def test_violations_and_announced_violations_are_counted() -> None:
     """Refuted at 3.5 s: the violation at 2 s was not announced, those at 3 and 5 s were."""
     errors_m = [0.5, 0.9, 1.5, 1.1, 0.2, 4.0]
     asked, given = asked_and_given(errors_m, (round(3.5 * S), 50 * S))
@@ -192,14 +192,14 @@ def test_violations_are_counted_and_what_was_announced_of_them() -> None:
     assert violations.notice([head | kept]) is None
 
 
-def test_declared_faults_do_not_count() -> None:
+def test_violations_in_declared_faults_are_counted_apart() -> None:
     asked, given = asked_and_given([0.5, 2.0, 2.0, 0.5])
     fault = np.array([[False, True, False, False]])
     found = violations.counted(replace(asked, in_fault=fault), given, 0)
     assert (found["answers"], found["violations"], found["in_faults"]) == (3, 1, 1)
 
 
-def test_regimes_say_where() -> None:
+def test_violations_are_counted_per_regime() -> None:
     asked, given = asked_and_given([0.5, 2.0, 2.0, 0.5])
     found = violations.counted(replace(asked, regime=np.array([0, 0, 3, 3])), given, 0)
     assert found["regimes"] == {
@@ -208,7 +208,7 @@ def test_regimes_say_where() -> None:
     }
 
 
-def test_the_product_notes_what_is_refuted_of_its_uav(
+def test_product_records_refuted_settings_of_its_uav(
     monkeypatch: pytest.MonkeyPatch, circling: Flown
 ) -> None:
     refuted = Refuted(
@@ -233,7 +233,7 @@ def short(path: Path) -> Path:
 
 
 @pytest.mark.parametrize("announces", [False, True])
-def test_a_broken_bound_is_an_exit_status(
+def test_unannounced_bound_violation_sets_the_exit_status(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, announces: bool
 ) -> None:
     """Bounds of 1 mm are all violated: exit status 3 and one line unless announced; files are
@@ -258,14 +258,14 @@ def test_a_broken_bound_is_an_exit_status(
     assert ("announced" in done.stdout) == announces
 
 
-def test_links_that_there_are_not(tmp_path: Path) -> None:
+def test_unknown_link_names_are_rejected(tmp_path: Path) -> None:
     asked = ["study", "prediction", str(CUT), "--links", "clean,bad", "--out", str(tmp_path)]
     done = CliRunner().invoke(main, asked)
     assert done.exit_code == 1
     assert "give some of clean, radio, hostile, noisy" in done.stderr
 
 
-def test_a_hostile_link_begins_in_flight(circling: Flown) -> None:
+def test_hostile_link_starts_in_flight(circling: Flown) -> None:
     flying = [flight for flight in circling.flights if flight.uav != "5:1"]  # that one hovers
     assert len(flying) == 4
     for flight in flying:

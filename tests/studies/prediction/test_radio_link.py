@@ -22,7 +22,7 @@ def latencies_s(flight: Flight, delivery: Delivery) -> np.ndarray:
     return (arrived - flight.arrival_ns[rows]) * 1e-9
 
 
-def test_a_clean_link_is_the_log(straight_flight: MakeFlight) -> None:
+def test_clean_link_delivers_the_log_unchanged(straight_flight: MakeFlight) -> None:
     flight = straight_flight()
     delivery = deliver(flight, CLEAN, 1)
     assert [each.arrival_ns for each in delivery.observed] == flight.arrival_ns.tolist()
@@ -32,7 +32,7 @@ def test_a_clean_link_is_the_log(straight_flight: MakeFlight) -> None:
     assert delivery.latency_s == pytest.approx(0, abs=1e-6)
 
 
-def test_latency_loss_and_rate_are_as_asked(straight_flight: MakeFlight) -> None:
+def test_latency_loss_and_rate_match_the_link_settings(straight_flight: MakeFlight) -> None:
     reports = rounds(20_000, 60_000)
     flight = straight_flight(reports)
     delivery = deliver(flight, RADIO, 1)
@@ -48,7 +48,7 @@ def test_latency_loss_and_rate_are_as_asked(straight_flight: MakeFlight) -> None
     assert 0.05 < np.mean(np.diff(sent) < 0) < 0.5  # reordered
 
 
-def test_the_seed_decides_and_each_uav_has_its_own(straight_flight: MakeFlight) -> None:
+def test_arrivals_are_seeded_per_uav(straight_flight: MakeFlight) -> None:
     def arrivals(uav: str, seed: int) -> list[int]:
         return [e.arrival_ns for e in deliver(straight_flight(uav=uav), RADIO, seed).observed]
 
@@ -58,7 +58,7 @@ def test_the_seed_decides_and_each_uav_has_its_own(straight_flight: MakeFlight) 
 
 
 @pytest.mark.parametrize("known_delay", [False, True])
-def test_the_envelope_leaves_the_constant_part(
+def test_clock_envelope_keeps_the_constant_latency(
     straight_flight: MakeFlight, known_delay: bool
 ) -> None:
     flight = straight_flight(3000)
@@ -82,7 +82,7 @@ def test_the_envelope_leaves_the_constant_part(
         assert abs(np.median(off_s)) < 0.3
 
 
-def test_the_senders_timeline_goes_on_after_a_restart(straight_flight: MakeFlight) -> None:
+def test_sender_timeline_continues_after_a_restart(straight_flight: MakeFlight) -> None:
     """Intervals are those of the sender's clock; at a restart, those of the node's clock."""
     flight = straight_flight(600)
     restarted = flight.boot_ms.copy()
@@ -109,6 +109,6 @@ def test_the_senders_timeline_goes_on_after_a_restart(straight_flight: MakeFligh
         ({"loss": -0.1}, "give a share from 0 to below 1"),
     ],
 )
-def test_what_no_link_can_be(values: dict[str, float], says: str) -> None:
+def test_invalid_link_settings_are_rejected(values: dict[str, float], says: str) -> None:
     with pytest.raises(ValueError, match=says):
         RadioLink(name="radio", **values)  # type: ignore[arg-type]

@@ -27,7 +27,7 @@ def direction(azimuth_deg: float, elevation_deg: float = 0.0) -> np.ndarray:
 
 @pytest.mark.parametrize("off_deg", [0.0, 0.3, 0.79, 1.0, 1.7, 5.0, 20.0])
 @pytest.mark.parametrize("bearing_deg", [0.0, 77.0, -130.0])
-def test_a_line_by_its_array_factor(off_deg: float, bearing_deg: float) -> None:
+def test_linear_array_loss_matches_its_array_factor(off_deg: float, bearing_deg: float) -> None:
     """64 elements half a wavelength apart: an explicit sum of phasors."""
     total = sum(
         complex(math.cos(x), math.sin(x))
@@ -43,15 +43,15 @@ def test_a_line_by_its_array_factor(off_deg: float, bearing_deg: float) -> None:
     assert lost == pytest.approx(math.log2(1 + snr) - math.log2(1 + snr * expected), abs=1e-9)
 
 
-def test_half_power_is_at_the_half_beamwidth() -> None:
+def test_gain_is_one_half_at_half_beamwidth() -> None:
     assert spectral.gains(ARRAY, direction(0.79), direction(0)) == pytest.approx([0.5], abs=0.01)
 
 
-def test_a_line_does_not_see_errors_across_it() -> None:
+def test_linear_array_ignores_errors_across_its_axis() -> None:
     assert spectral.gains(ARRAY, direction(20, 10), direction(20, -15)) == pytest.approx([1.0])
 
 
-def test_the_frame_faces_the_uav_and_is_level() -> None:
+def test_array_frame_faces_the_uav_and_is_level() -> None:
     rng = np.random.default_rng(1)
     truly = rng.normal(size=(50, 3))
     truly /= np.linalg.norm(truly, axis=1, keepdims=True)
@@ -65,13 +65,15 @@ def test_the_frame_faces_the_uav_and_is_level() -> None:
 
 @settings(deadline=None, max_examples=examples(50))
 @given(st.floats(-180, 180), st.floats(-80, 80), st.floats(-30, 30), st.floats(-40, 40))
-def test_never_a_gain(azimuth: float, elevation: float, off: float, snr_db: float) -> None:
+def test_pointing_error_never_increases_efficiency(
+    azimuth: float, elevation: float, off: float, snr_db: float
+) -> None:
     truly, towards = direction(azimuth, elevation), direction(azimuth + off, elevation)
     lost = spectral.loss_bps_hz(ARRAY, towards, truly, snr_db)
     assert 0 <= lost <= math.log2(1 + 10 ** (snr_db / 10))
 
 
-def test_many_are_the_mean_of_each() -> None:
+def test_batched_gains_equal_single_gains() -> None:
     """More than one batch."""
     rng = np.random.default_rng(2)
     count = spectral.AT_ONCE // ARRAY.size + 7
@@ -82,7 +84,7 @@ def test_many_are_the_mean_of_each() -> None:
     assert spectral.gains(ARRAY, towards, truly)[rows] == pytest.approx(alone, abs=1e-9)
 
 
-def test_where_no_element_radiates_nothing_is_given() -> None:
+def test_gain_is_zero_where_no_element_radiates() -> None:
     """Behind the array: no beam can be formed there."""
     ahead_only = replace(ARRAY, element=Element(ElementPattern.COSINE, 1.0))
     assert spectral.gains(ahead_only, direction(180), direction(0)) == pytest.approx([0.0])

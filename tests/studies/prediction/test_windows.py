@@ -46,7 +46,7 @@ def seen(*reports: ObservedReport) -> np.ndarray:
     return recent.window().seen
 
 
-def test_a_window_by_hand() -> None:
+def test_window_matches_hand_computed_values() -> None:
     """Flying east: east is ahead, south to the right."""
     found = seen(report(10 * S, [0, 0, -30], [0, 10, 0]), report(12 * S, [4, 20, -32], [0, 10, -1]))
     assert found.shape == (2, FEATURES)
@@ -57,7 +57,7 @@ def test_a_window_by_hand() -> None:
 
 @settings(deadline=None, max_examples=examples(50))
 @given(st.integers(0, 2**32 - 1), st.floats(-np.pi, np.pi))
-def test_neither_place_nor_north_nor_order_matters(seed: int, turn: float) -> None:
+def test_window_is_invariant_to_position_heading_and_order(seed: int, turn: float) -> None:
     rng = np.random.default_rng(seed)
     n = int(rng.integers(2, REPORTS + 1))
     times = np.cumsum(rng.integers(1, S, n))
@@ -73,7 +73,7 @@ def test_neither_place_nor_north_nor_order_matters(seed: int, turn: float) -> No
     assert seen(*[moved[k] for k in rng.permutation(n)]) == pytest.approx(expected, abs=1e-6)
 
 
-def test_the_last_reports_are_kept() -> None:
+def test_window_keeps_the_last_reports() -> None:
     recent = RecentReports()
     for k in range(REPORTS + 5):
         assert recent.add(report((k + 1) * S, [k, 0, 0], [1, 0, 0]))
@@ -85,7 +85,7 @@ def test_the_last_reports_are_kept() -> None:
     assert len(recent.window().seen) == 1
 
 
-def test_velocities_that_are_not_reported() -> None:
+def test_missing_velocities_are_derived_from_positions() -> None:
     found = seen(
         report(S, [0, 0, 0], None), report(2 * S, [3, 0, 0], None), report(4 * S, [9, 0, 0], None)
     )
@@ -94,7 +94,7 @@ def test_velocities_that_are_not_reported() -> None:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_a_made_up_flight_is_a_motion(seed: int) -> None:
+def test_synthetic_flight_is_physically_consistent(seed: int) -> None:
     """Velocity is the derivative of position, acceleration is a multirotor's, noise is as
     stated."""
     flight = made_up.flight(np.random.default_rng(seed), "1:1")
@@ -114,7 +114,7 @@ def test_a_made_up_flight_is_a_motion(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_reports_of_made_up_flights_are_irregular_and_timed(seed: int) -> None:
+def test_synthetic_reports_are_irregular_and_timestamped(seed: int) -> None:
     rng = np.random.default_rng(seed)
     flight = made_up.flight(rng, "1:1")
     observed = deliver(flight, made_up.link(rng), seed).observed

@@ -28,7 +28,7 @@ answer = len(list(here.iterdir()))
 """
 
 
-def test_answers_come_in_order() -> None:
+def test_parallel_results_keep_the_input_order() -> None:
     """The first job takes by far the longest."""
     told: list[int] = []
     found = fan_out.on_cores(eval, ["(3 ** 2_000_000).bit_length()", "2", "3", "4"], 2, told.append)
@@ -36,7 +36,7 @@ def test_answers_come_in_order() -> None:
     assert told == [1, 2, 3, 4]
 
 
-def test_two_at_once(tmp_path: Path) -> None:
+def test_two_jobs_run_concurrently(tmp_path: Path) -> None:
     """Each job waits for the other: sequential jobs would not finish."""
     script, here = tmp_path / "meet.py", tmp_path / "here"
     here.mkdir()
@@ -45,9 +45,7 @@ def test_two_at_once(tmp_path: Path) -> None:
     assert fan_out.on_cores(eval, [f"{each}['answer']" for each in asked], 2, id) == [2, 2]
 
 
-def test_processes_have_one_blas_thread_and_leave_ctrl_c_to_their_parent(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_workers_use_one_blas_thread_and_ignore_sigint(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OPENBLAS_NUM_THREADS", "7")
     monkeypatch.delenv("MKL_NUM_THREADS", raising=False)
     found = fan_out.on_cores(os.getenv, fan_out.BLAS_THREADS, 2, id)
@@ -57,13 +55,13 @@ def test_processes_have_one_blas_thread_and_leave_ctrl_c_to_their_parent(
     assert fan_out.on_cores(signal.getsignal, [signal.SIGINT], 1, id) == [signal.SIG_IGN]
 
 
-def test_the_first_mistake_in_order_is_raised() -> None:
+def test_first_error_in_input_order_is_raised() -> None:
     asked = ["__import__('time').sleep(0.5) or int('first')", "int('second')", "1"]
     with pytest.raises(ValueError, match="'first'"):
         fan_out.on_cores(eval, asked, 2, id)
 
 
-def test_after_a_mistake_the_rest_is_given_up(tmp_path: Path) -> None:
+def test_error_cancels_the_remaining_jobs(tmp_path: Path) -> None:
     """Except jobs already sent to the process; no process keeps running."""
     touch = "__import__('time').sleep(0.05) or open({!r}, 'w').close()"
     rest = [touch.format(str(tmp_path / str(n))) for n in range(20)]
@@ -74,7 +72,7 @@ def test_after_a_mistake_the_rest_is_given_up(tmp_path: Path) -> None:
 
 
 @pytest.mark.full
-def test_a_mistake_in_a_process_is_one_line(cut_log: Path, tmp_path: Path) -> None:
+def test_worker_error_is_a_one_line_error(cut_log: Path, tmp_path: Path) -> None:
     asked = ["study", "prediction", str(cut_log), str(tmp_path / "missing.tlog"), "--jobs", "2"]
     done = CliRunner().invoke(main, [*asked, "--center", "5:1", "--out", str(tmp_path)])
     assert done.exit_code == 1
@@ -96,9 +94,7 @@ def cluster() -> Iterator[Any]:
 
 
 @pytest.mark.full
-def test_a_cluster_gives_what_one_process_gives(
-    cluster: Any, cut_log: Path, tmp_path: Path
-) -> None:
+def test_cluster_result_equals_one_process(cluster: Any, cut_log: Path, tmp_path: Path) -> None:
     asked = ["study", "prediction", str(cut_log), "--center", "5:1", "--lead", "0.5", "--json"]
     answers = []
     for way in (["--jobs", "1"], ["--cluster", cluster.scheduler_address]):
@@ -108,7 +104,7 @@ def test_a_cluster_gives_what_one_process_gives(
     assert answers[0] == answers[1]
 
 
-def test_a_cluster_answers_in_order_and_says_the_first_mistake(cluster: Any) -> None:
+def test_cluster_keeps_the_order_and_raises_the_first_error(cluster: Any) -> None:
     address, told = cluster.scheduler_address, list[int]()
     asked = ["__import__('time').sleep(0.3) or 1", "2", "3"]
     assert fan_out.on_cluster(eval, asked, address, told.append) == [1, 2, 3]
@@ -123,18 +119,18 @@ def test_a_cluster_answers_in_order_and_says_the_first_mistake(cluster: Any) -> 
 
 
 @pytest.mark.parametrize("address", ["", "nonsense", "tcp://h", "tcp://h:port", "http://h:1"])
-def test_an_address_that_is_none(address: str) -> None:
+def test_invalid_scheduler_address_is_rejected(address: str) -> None:
     with pytest.raises(ValueError, match="not an address such as tcp://"):
         fan_out.on_cluster(len, ["abc"], address, id)
 
 
-def test_a_scheduler_that_is_not_there() -> None:
+def test_unreachable_scheduler_is_reported() -> None:
     pytest.importorskip("distributed", reason="the extra [cluster] is not here")
     with pytest.raises(ValueError, match="no scheduler answers"):
         fan_out.on_cluster(len, ["abc"], "tcp://127.0.0.1:9", id, 0.3)
 
 
-def test_a_scheduler_without_workers() -> None:
+def test_scheduler_without_workers_is_reported() -> None:
     distributed = pytest.importorskip("distributed", reason="the extra [cluster] is not here")
     with (
         distributed.LocalCluster(n_workers=0, dashboard_address="127.0.0.1:0") as empty,
@@ -151,7 +147,7 @@ def test_a_scheduler_without_workers() -> None:
         ("torch", "learned", ["train", "--out"]),
     ],
 )
-def test_what_is_not_installed_is_said(
+def test_missing_extra_names_the_package_to_install(
     package: str, extra: str, arguments: list[str], tmp_path: Path, cut_log: Path
 ) -> None:
     given = [str(cut_log) if word == "x.tlog" else word for word in arguments]
@@ -167,7 +163,7 @@ def test_what_is_not_installed_is_said(
     assert f"needs the package {package}: pip install 'uav-companion-beams[{extra}]'" in line
 
 
-def test_neither_is_loaded_unasked() -> None:
+def test_torch_and_dask_are_not_imported_unless_used() -> None:
     run = (
         "import sys, companion.cli.main, companion.studies.prediction.comparison;"
         "import companion.studies.running.fan_out;"

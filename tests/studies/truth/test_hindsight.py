@@ -23,13 +23,13 @@ def off_ms(found: BootClock, made_ns: np.ndarray) -> np.ndarray:
     return np.asarray((found.made_ns - made_ns) * 1e-6)
 
 
-def test_a_clock_that_stood_still_is_right_on_both_sides() -> None:
+def test_stalled_clock_is_correct_before_and_after() -> None:
     late_s = np.abs(np.random.default_rng(2).normal(0.0, 0.004, 600))
     clock, made_ns = stream(late_s, stands_s=0.18)
     assert np.abs(off_ms(clock, made_ns)).max() < 5
 
 
-def test_bursts_are_no_clock() -> None:
+def test_late_bursts_do_not_move_the_clock() -> None:
     """Messages are held for up to 5 s and arrive at once: the clock continues unchanged."""
     late_s = np.full(900, 0.001)
     for begin, length in ((0, 12), (100, 50), (400, 30), (890, 10)):
@@ -38,7 +38,7 @@ def test_bursts_are_no_clock() -> None:
     assert off_ms(clock, made_ns) == pytest.approx(1.0, abs=1e-3)
 
 
-def test_a_restart_begins_another_life() -> None:
+def test_restart_begins_a_new_boot_period() -> None:
     first, made_ns = stream(np.full(300, 0.002))
     boot_ns = np.concatenate([first.boot_ns, first.boot_ns - 100])
     arrival_ns = np.concatenate([first.arrival_ns, first.arrival_ns + 60 * S])
@@ -50,7 +50,7 @@ def test_a_restart_begins_another_life() -> None:
     assert np.diff(placed)[0] == pytest.approx(60 * S + 100, abs=200)
 
 
-def test_the_least_of_ranges() -> None:
+def test_range_minimum_matches_direct_computation() -> None:
     rng = np.random.default_rng(1)
     values = rng.integers(-1000, 1000, 70)
     starts = rng.integers(0, 69, 200)

@@ -90,7 +90,7 @@ def errors_ms(path: Path, made_s: np.ndarray) -> np.ndarray:
     ("every_s", "from_s", "with_neighbour"),
     [(0.1, 0.0, False), (0.1, 0.06, True), (0.25, 0.02, True), (0.25, 0.0, False)],
 )
-def test_the_order_dates_them(
+def test_message_order_determines_truth_times(
     tmp_path: Path, every_s: float, from_s: float, with_neighbour: bool, held: bool
 ) -> None:
     """Sent with a report, in between, or at their own rate; continuously and in bursts."""
@@ -128,7 +128,7 @@ def lead_by_the_autopilot_ms(path: Path) -> float:
 
 
 @pytest.mark.full
-def test_aeroplanes_report_ahead_and_copters_behind() -> None:
+def test_aeroplane_reports_lead_and_copter_reports_lag_the_truth() -> None:
     """The autopilot's own log agrees for its aeroplane: the lead is not a dating error."""
     own_ms = lead_by_the_autopilot_ms(shared_log("sitl_planes_circle_1.bin"))
     assert own_ms == pytest.approx(26.7, abs=1)
@@ -139,7 +139,7 @@ def test_aeroplanes_report_ahead_and_copters_behind() -> None:
         assert np.median(lead_ms(flight)) == pytest.approx(-30, abs=2)
 
 
-def test_truth_of_a_flight_is_its_own_clock() -> None:
+def test_truth_times_are_consistent_with_its_motion() -> None:
     """The distance between consecutive truth messages matches the time between them."""
     for flight in vehicles.load(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog", "5:1").flights:
         truth = flight.truth

@@ -42,7 +42,7 @@ def test_interpolation_is_exact_for_a_cubic() -> None:
     assert velocity == pytest.approx(expected[1])
 
 
-def test_nothing_is_known_outside_and_in_gaps() -> None:
+def test_trajectory_is_unknown_outside_and_in_gaps() -> None:
     t_s = np.array([0.0, 1.0, 4.0, 5.0])
     position, velocity = cubic(t_s)
     trajectory = Trajectory(
@@ -75,7 +75,7 @@ def without(path: Path, out: Path, name: str) -> Path:
     return out
 
 
-def test_the_older_word_of_the_simulator(cut: Path, tmp_path: Path) -> None:
+def test_simstate_truth_matches_sim_state(cut: Path, tmp_path: Path) -> None:
     """SIMSTATE has the horizontal position of SIM_STATE to its last digit; height is from
     reports."""
     newer = vehicles.load(cut, "5:1")
@@ -94,7 +94,7 @@ def test_the_older_word_of_the_simulator(cut: Path, tmp_path: Path) -> None:
         assert np.percentile(off_mps[flying, :2], 95) < 1.0
 
 
-def test_times_are_those_of_the_least_delay() -> None:
+def test_estimated_times_have_the_minimum_delay() -> None:
     """A drifting clock, late reports, a restart: recovered up to the minimum delay of some
     seconds."""
     rng = np.random.default_rng(3)
@@ -131,7 +131,7 @@ def by_pymavlink(path: Path) -> tuple[dict[str, list[list[float]]], dict[str, li
     return reports, states
 
 
-def test_a_log_is_read_as_pymavlink_reads_it(cut: Path) -> None:
+def test_log_contents_match_pymavlink(cut: Path) -> None:
     place = (47.3977419, 8.5455938, 25.0)
     flown = vehicles.load(cut, "47.3977419,8.5455938,25")
     reports, states = by_pymavlink(cut)
@@ -167,7 +167,7 @@ def test_truth_and_reports_agree_in_time(cut: Path) -> None:
         assert np.linalg.norm(miss, axis=1).max() < 1.0
 
 
-def test_the_carrier_is_no_flight_and_moves(cut: Path) -> None:
+def test_carrier_is_excluded_from_flights_and_moves(cut: Path) -> None:
     flown = vehicles.load(cut, "5:1")
     assert flown.center == "5:1"
     assert {flight.uav for flight in flown.flights} == {"1:1", "2:1", "3:1", "4:1"}
@@ -177,7 +177,7 @@ def test_the_carrier_is_no_flight_and_moves(cut: Path) -> None:
     assert np.isnan(position[1]).all()
 
 
-def test_without_a_simulator_the_reports_are_the_truth() -> None:
+def test_reports_are_the_truth_without_a_simulator() -> None:
     flown = vehicles.load(shared_log("real_dronekit_flight2015.tlog"), None)
     (flight,) = flown.flights
     assert flight.truth.kind == "reports"
@@ -188,7 +188,7 @@ def test_without_a_simulator_the_reports_are_the_truth() -> None:
     assert position == pytest.approx(flight.position_ned_m[some])
 
 
-def test_flying_is_fast_and_up(straight_flight: Callable[..., Flight]) -> None:
+def test_flying_requires_speed_and_height(straight_flight: Callable[..., Flight]) -> None:
     high, low = straight_flight(), straight_flight(height_m=1.5)
     t_ns = high.truth.t_ns[10:20]
     assert high.flying(t_ns).all()
@@ -205,6 +205,6 @@ def test_flying_is_fast_and_up(straight_flight: Callable[..., Flight]) -> None:
     ("center", "says"),
     [("9:1", "the carrier 9:1 reports no position"), ("x", "'x' is not SYSID:COMPID")],
 )
-def test_a_carrier_that_is_not_there(cut: Path, center: str, says: str) -> None:
+def test_unknown_carrier_is_rejected(cut: Path, center: str, says: str) -> None:
     with pytest.raises(ValueError, match=says):
         vehicles.load(cut, center)

@@ -68,10 +68,16 @@ def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reaso
     horizontal_m = math.hypot(there_n - n, there_e - e)
     limit_m = predicted.horizontal_m + fix.noise.horizontal_m + lead_m
     if horizontal_m > limit_m:
-        return Reason.UNREACHABLE, f"{horizontal_m:.1f} m off, at most {limit_m:.1f} m possible"
+        return (
+            Reason.UNREACHABLE,
+            f"{horizontal_m:.1f} m from the prediction, at most {limit_m:.1f} m possible",
+        )
     limit_m = predicted.vertical_m + fix.noise.vertical_m + lead_m
     if abs(down) > limit_m:
-        return Reason.ALTITUDE_JUMP, f"{-down:+.1f} m of height, at most {limit_m:.1f} m possible"
+        return (
+            Reason.ALTITUDE_JUMP,
+            f"{-down:+.1f} m above the prediction, at most {limit_m:.1f} m possible",
+        )
     return None
 
 

@@ -85,7 +85,9 @@ class Design:
     certificate: Annotated[
         Certificate | None, Meaning("certificate of the table of gains; null for the closed form")
     ]
-    designs: Annotated[list[UavDesign], Meaning("the gains at each UAV's own interval")]
+    designs: Annotated[
+        list[UavDesign], Meaning("observer gains at each UAV's interval between reports")
+    ]
 
 
 def _bounds(given: ObserverSettings, limits: Limits) -> Assumed:

@@ -189,7 +189,7 @@ def test_glitch_reports_are_rejected_individually(flights: dict[str, Outcome]) -
     assert set(done.rejected) == {"unplaced-stamp", "frozen", "unreachable"}
     assert done.uavs["4:1"]["reports"] == done.reports_flown["4:1"] - 6
     for one in done.uavs["4:1"]["recent_rejections"]:
-        off = re.fullmatch(r"(\S+) m off, at most (\S+) m possible", one["detail"])
+        off = re.fullmatch(r"(\S+) m from the prediction, at most (\S+) m possible", one["detail"])
         assert off is not None, one
         assert float(off[1]) == pytest.approx(500.0, abs=float(off[2]))
     unheard = {text for text in done.said("4:1") if text.startswith("no report of 4:1 was used")}

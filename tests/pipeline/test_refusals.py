@@ -38,7 +38,7 @@ def refused(t_s: float, uav: str = "3:1", reason: Reason = Reason.UNREACHABLE) -
         t_ns=round(t_s * 1e9),
         source=uav,
         reason=reason,
-        detail="45.0 m off, at most 4.0 m possible",
+        detail="45.0 m from the prediction, at most 4.0 m possible",
     )
 
 
@@ -55,7 +55,7 @@ def test_one_second_of_rejected_reports_is_announced_once() -> None:
     assert said is not None
     assert said.text == (
         "no report of 4:1 was used in the last 1.5 s: unreachable,"
-        " 45.0 m off, at most 4.0 m possible"
+        " 45.0 m from the prediction, at most 4.0 m possible"
     )
 
 

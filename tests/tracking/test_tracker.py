@@ -267,7 +267,7 @@ def test_single_outlier_is_rejected_and_does_not_affect_the_gate(fix: MakeFix) -
     refused = outcomes[50]
     assert isinstance(refused, Rejection)
     assert (refused.t_ns, refused.source) == (10 * S, "1:1")
-    assert "m off, at most" in refused.detail
+    assert "m from the prediction, at most" in refused.detail
 
 
 def test_short_glitch_is_rejected_throughout(fix: MakeFix) -> None:

@@ -81,7 +81,7 @@ def _read(text: str) -> tuple[list[int], list[_Table]]:
     for low, high in itertools.pairwise(tables):
         where = f"{low.frequency_hz:.9g} Hz and {high.frequency_hz:.9g} Hz"
         if low.frequency_hz == high.frequency_hz:
-            raise UserError(f"{low.frequency_hz:.9g} Hz has two tables")
+            raise UserError(f"{low.frequency_hz:.9g} Hz has two tables; give one")
         if (low.phase_error_deg is None) != (high.phase_error_deg is None):
             raise UserError(f"tables for {where}: give bounds in all tables, or in none")
     return order, tables

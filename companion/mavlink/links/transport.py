@@ -316,7 +316,10 @@ def _checked_origin(item: Frame | Rejection) -> Frame | Rejection:
     """
     if isinstance(item, Rejection) or item.msgid != TUNNEL or item.source != SENDER:
         return item
-    who, detail = str(item.source), "TUNNEL: this sender is a Cursor on Target link of the service"
+    who, detail = (
+        str(item.source),
+        "TUNNEL: sender id 0:25 is reserved for the service's Cursor on Target links",
+    )
     return Rejection(
         t_ns=item.t_ns, source=who, reason=Reason.NOT_ALLOWED, msgid=TUNNEL, detail=detail
     )

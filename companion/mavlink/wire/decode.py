@@ -131,7 +131,7 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
     icao, lat, lon, alt_mm, heading_cdeg, speed_cmps, climb_cmps, flags = fields[:8]
     altitude_type, callsign, _, tslc_s = fields[9:]
     if not 0 < icao <= _ICAO_MAX:
-        raise _RefusedError(Reason.MALFORMED, f"ICAO address {icao:#x}")
+        raise _RefusedError(Reason.MALFORMED, f"ICAO address {icao:#x} has more than 24 bits")
     heading_deg = heading_cdeg * 1e-2 if flags & _HEADING and heading_cdeg <= 36_000 else None
     velocity_ne_mps = None
     if flags & _VELOCITY and heading_deg is not None:

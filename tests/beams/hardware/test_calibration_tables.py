@@ -90,7 +90,7 @@ ONE = "order = [0, 1]\n[[table]]\nfrequency_hz = 1e9\nphase_deg = [0, 1]\ngain_d
         (TWO, 10.51e9, "is outside the range of the tables"),
         (ONE, 1.01e9, "is outside the range of the tables, 1e+09 to 1e+09 Hz"),
         (TWO.replace("50.0]", "150.0]"), 10.1e9, "channel 2 over channel 0 changes by -130"),
-        (TWO.replace("10.5e9", "10e9"), 10e9, "1e+10 Hz has two tables"),
+        (TWO.replace("10.5e9", "10e9"), 10e9, "1e+10 Hz has two tables; give one"),
         (TWO.replace("[1, 0, 2]", "[1, 0, 1]"), 10e9, "[1, 0, 1] does not contain each of 0 to 2"),
         (TWO.replace("[1, 0, 2]", "[1, 0, 2.0]"), 10e9, "is not a list of whole numbers"),
         (TWO.replace("[1, 0, 2]", "[1, 0]"), 10e9, "is not 2 finite numbers"),

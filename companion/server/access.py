@@ -27,6 +27,7 @@ A page in a browser cannot set headers, and a token in the URL would end up in l
 """
 UNAUTHORISED: Final = 4401  # close code of a WebSocket without a valid token
 
+TOKEN_MIN: Final = 16  # characters of a token that other machines may try to guess
 UNSENT_BYTES: Final = 16_384
 """Limit on unsent bytes in the kernel for a slow client; inherited by its connections.
 
@@ -68,6 +69,11 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
         raise ListenError(
             f"{listen}: other machines can reach this address; set COMPANION_TOKEN to a bearer"
             " token, or give --insecure"
+        )
+    if not is_loopback(host) and token and len(token) < TOKEN_MIN and not insecure:
+        raise ListenError(
+            f"{listen}: COMPANION_TOKEN has {len(token)} characters, which can be guessed;"
+            f" give {TOKEN_MIN} or more, such as those of `openssl rand -hex 16`"
         )
     try:
         family, kind, proto, _, address = socket.getaddrinfo(

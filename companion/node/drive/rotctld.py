@@ -14,7 +14,9 @@ from typing import Final
 from companion.node.drive.lag import MountLag
 from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
 
-TIMEOUT_S: Final = 2.0
+TIMEOUT_S: Final = 2.0  # for a whole answer
+ANSWER_MAX_BYTES: Final = 65_536
+_NUMBER: Final = r"(-?\d{1,6}(?:\.\d{0,12})?)(?![\d.])"
 
 
 class Rotator:
@@ -52,10 +54,11 @@ class Rotator:
             raise DeviceError(f"rotctld at {host}:{port}: {error.strerror or error}") from error
         self._unread = b""
         text = self._ask("+\\dump_caps")
-        found = [re.search(rf"{name}:\s*(-?[\d.]+)", text) for name in _LIMITS]
+        found = [re.search(rf"{name}:\s*{_NUMBER}", text) for name in _LIMITS]
         if all(found):
             low, high, least, most = (float(one[1]) for one in found if one)
-            self._limits_deg = low, high, least, most
+            if low < high and least < most:
+                self._limits_deg = low, high, least, most
         self._last_deg = self._where_deg()[0]
 
     def apply(self, command: DeviceCommand) -> None:
@@ -98,7 +101,7 @@ class Rotator:
 
     def _where_deg(self) -> tuple[float, float]:
         text = self._ask("+p")
-        found = re.search(r"Azimuth:\s*(-?[\d.]+)\s+Elevation:\s*(-?[\d.]+)", text)
+        found = re.search(rf"Azimuth:\s*{_NUMBER}\s+Elevation:\s*{_NUMBER}", text)
         if found is None:
             raise DeviceError(f"rotctld reports no direction: {text[:80]!r}")
         return float(found[1]), float(found[2])
@@ -107,9 +110,14 @@ class Rotator:
         """Return rotctld's answer to a command in the extended form, which ends with RPRT."""
         if self._socket is None:
             raise DeviceError("not connected")
+        ends_s = time.monotonic() + TIMEOUT_S
         try:
             self._socket.sendall(command.encode() + b"\n")
-            while not (found := re.search(rb"RPRT (-?\d+)\n", self._unread)):
+            while not (found := re.search(rb"RPRT (-?\d{1,6})\n", self._unread)):
+                left_s = ends_s - time.monotonic()
+                if left_s <= 0 or len(self._unread) > ANSWER_MAX_BYTES:
+                    raise DeviceError(f"rotctld does not end its answer to {command!r}")
+                self._socket.settimeout(left_s)
                 more = self._socket.recv(4096)
                 if not more:
                     raise DeviceError("rotctld closed the connection")

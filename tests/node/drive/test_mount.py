@@ -293,3 +293,73 @@ def test_mount_with_unrelated_motion_has_no_lag() -> None:
         lag.note_command(n * 50_000_000, math.sin(0.5 * n * 0.05))
         lag.note_report(n * 50_000_000, float(rng.uniform(-1, 1)))
     assert lag.lag_s == 0.0
+
+
+# --- a rotctld with malformed answers --------------------------------------------------------------
+
+
+@pytest.fixture
+def answers() -> Iterator[Any]:
+    """``answers(reply)``: the port of a server that gives every command this reply, byte by byte if
+    ``drips``."""
+    servers: list[socketserver.TCPServer] = []
+    over = threading.Event()
+
+    def serve(reply: bytes, *, drips: bool = False) -> int:
+        class Handler(socketserver.BaseRequestHandler):
+            def handle(self) -> None:
+                while not over.is_set() and self.request.recv(4096):
+                    for at in range(len(reply)) if drips else ():
+                        self.request.sendall(reply[at : at + 1])
+                        if over.wait(0.02):
+                            return
+                    if not drips:
+                        self.request.sendall(reply)
+
+        server = socketserver.ThreadingTCPServer(("127.0.0.1", 0), Handler)
+        server.daemon_threads = True
+        servers.append(server)
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        return int(server.server_address[1])
+
+    yield serve
+    over.set()
+    for server in servers:
+        server.shutdown()
+        server.server_close()
+
+
+@pytest.mark.parametrize(
+    "reply",
+    [
+        b"Azimuth: 1.2.3\nElevation: 4\nRPRT 0\n",
+        b"Azimuth: -.\nElevation: .\nRPRT 0\n",
+        b"Azimuth: " + b"9" * 400 + b"\nElevation: 0\nRPRT 0\n",
+        b"Azimuth: nan\nElevation: inf\nRPRT 0\n",
+        b"RPRT 0\n",
+        b"RPRT -1\n",
+        b"\xff\xfe\x00RPRT 0\n",
+        b"x" * 100_000,
+    ],
+)
+def test_malformed_answers_are_device_errors(answers: Any, reply: bytes) -> None:
+    rotator = Rotator("127.0.0.1", answers(reply))
+    with pytest.raises(DeviceError):
+        rotator.open()
+    rotator.close()
+
+
+def test_answer_that_drips_is_given_up(answers: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.node.drive.rotctld.TIMEOUT_S", 0.3)
+    rotator = Rotator("127.0.0.1", answers(b"Azimuth: " + b"1" * 100_000, drips=True))
+    with pytest.raises(DeviceError, match="rotctld"):
+        rotator.open()
+    rotator.close()
+
+
+def test_impossible_limits_are_ignored(answers: Any) -> None:
+    caps = b"Min Azimuth: 90\nMax Azimuth: -90\nMin Elevation: 0\nMax Elevation: 90\n"
+    rotator = Rotator("127.0.0.1", answers(caps + b"Azimuth: 5\nElevation: 6\nRPRT 0\n"))
+    rotator.open()
+    assert rotator._limits_deg == (0.0, 360.0, 0.0, 90.0)
+    rotator.close()

@@ -295,7 +295,7 @@ def test_mount_with_unrelated_motion_has_no_lag() -> None:
     assert lag.lag_s == 0.0
 
 
-# --- a rotctld with malformed answers --------------------------------------------------------------
+# --- a rotctld with malformed answers -------------------------------------------------------------
 
 
 @pytest.fixture

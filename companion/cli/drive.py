@@ -100,7 +100,7 @@ def drive(
             client,
             BeamRequest(
                 uavs=uavs,
-                anybody=not uavs,
+                any_uav=not uavs,
                 takes=device.takes,
                 stored_beams=len(stored) or None,
                 centre=aim == "centre",

@@ -221,7 +221,7 @@ class Service:
         try:
             centre = kept.drive.aim == "centre"
             wanted = BeamRequest(
-                uavs=uavs, anybody=not kept.drive.uavs, takes=self._device.takes, centre=centre
+                uavs=uavs, any_uav=not kept.drive.uavs, takes=self._device.takes, centre=centre
             )
             source = LocalSource(
                 loop=loop,

@@ -31,7 +31,7 @@ ANSWERS_S: Final = 5.0  # timeout for an answer of the event loop
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class BeamRequest:
-    """Request for beams: the first of these UAVs that has one, else any UAV if ``anybody``.
+    """Request for beams: the first of these UAVs that has one, else any UAV if ``any_uav``.
 
     centre        a mount points at the centre of all of them instead
     stored_beams  size of the codebook in the device; None: it has none
@@ -40,7 +40,7 @@ class BeamRequest:
     """
 
     uavs: tuple[str, ...]
-    anybody: bool
+    any_uav: bool
     takes: DeviceInput
     stored_beams: int | None = None
     centre: bool = False
@@ -158,7 +158,7 @@ def stored_registers(array: Array, equipment: Equipment) -> list[IntArray]:
 def followed_uavs(uavs: Collection[str], wanted: BeamRequest) -> str | None:
     """Return the UAV to follow of those that have beams; None if no wanted UAV has one."""
     uav = next((one for one in wanted.uavs if one in uavs), None)
-    return next(iter(uavs), None) if uav is None and wanted.anybody else uav
+    return next(iter(uavs), None) if uav is None and wanted.any_uav else uav
 
 
 def command_for(
@@ -172,7 +172,7 @@ def command_for(
     if uav is None:
         return DeviceCommand(valid_at_ns=valid_at_ns, unfit="none of the UAVs to follow has a beam")
     if wanted.centre:
-        several = named if wanted.anybody else wanted.uavs
+        several = named if wanted.any_uav else wanted.uavs
         return _middle([named[one] for one in several if one in named], valid_at_ns)
     beam, rows = named[uav], None if text is None else registers_of(text, uav)
     if rows is not None and not len(rows):

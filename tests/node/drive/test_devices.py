@@ -43,7 +43,7 @@ def flown() -> tuple[DeviceCommand, Any, str]:
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
     equipment = assembly.equipment(EIGHT, pipeline.array)
-    wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=DeviceInput.REGISTERS)
+    wanted = BeamRequest(uavs=("3:1",), any_uav=False, takes=DeviceInput.REGISTERS)
     shot = command_of(pipeline, equipment, update, wanted)
     text = weight_formats.encode(
         WeightFormat.ADAR1000, update.beams, pipeline, equipment, 0
@@ -269,7 +269,7 @@ def test_phaser_memory_holds_the_codebook_and_updates_select_a_beam(
     pipeline, update = moment.look([log], settings, "3")
     equipment = assembly.equipment(settings, pipeline.array)
     stored = stored_registers(pipeline.array, equipment)
-    wanted = BeamRequest(uavs=("3:1",), anybody=False, takes=DeviceInput.STORED, stored_beams=32)
+    wanted = BeamRequest(uavs=("3:1",), any_uav=False, takes=DeviceInput.STORED, stored_beams=32)
     shot = command_of(pipeline, equipment, update, wanted)
     told = beam_state.beams(pipeline, equipment, update, 0.0, 0.0)
     (beam,) = [one for one in told["beams"] if one["uav"] == "3:1"]
@@ -322,14 +322,14 @@ def test_stored_beams_of_a_different_codebook_are_not_selected() -> None:
     beam |= {"uav": "1:1", "codebook": {"best": 3}}
     told = {"unfit": None, "beams": [beam], "codebook_beams": 64}
     fits = command_for(
-        told, None, BeamRequest(uavs=(), anybody=True, takes=DeviceInput.STORED, stored_beams=64), 0
+        told, None, BeamRequest(uavs=(), any_uav=True, takes=DeviceInput.STORED, stored_beams=64), 0
     )
     assert (fits.unfit, fits.stored) == (None, 3)
     for size, held in ((64, 32), (None, 32), (None, None)):
         shot = command_for(
             told | {"codebook_beams": size},
             None,
-            BeamRequest(uavs=(), anybody=True, takes=DeviceInput.STORED, stored_beams=held),
+            BeamRequest(uavs=(), any_uav=True, takes=DeviceInput.STORED, stored_beams=held),
             0,
         )
         assert shot.unfit == "codebook of the service differs from --config, or is missing"
@@ -347,7 +347,7 @@ def test_mount_points_at_the_centre_of_several_uavs(flown: tuple[DeviceCommand, 
         np.array([np.cos(e) * np.cos(b), np.cos(e) * np.sin(b), np.sin(e)]) for b, e in angles
     )
     wanted = BeamRequest(
-        uavs=("9:9", "2:1", "1:1"), anybody=False, takes=DeviceInput.POINTING, centre=True
+        uavs=("9:9", "2:1", "1:1"), any_uav=False, takes=DeviceInput.POINTING, centre=True
     )
     for shot in (
         command_of(pipeline, equipment, update, wanted),
@@ -360,11 +360,11 @@ def test_mount_points_at_the_centre_of_several_uavs(flown: tuple[DeviceCommand, 
         seen = pipeline.local.position_ned_m(*shot.place)
         mid = np.mean([t.position_ned_m for t in update.tracks if t.uav in ("1:1", "2:1")], axis=0)
         np.testing.assert_allclose(seen, mid, atol=0.01)
-    everybody = BeamRequest(uavs=("1:1",), anybody=True, takes=DeviceInput.POINTING, centre=True)
+    everybody = BeamRequest(uavs=("1:1",), any_uav=True, takes=DeviceInput.POINTING, centre=True)
     around = command_of(pipeline, equipment, update, everybody)
     assert "as they surround the array" in (around.unfit or "")  # four on one circle
     with pytest.raises(UserError, match="works only for a mount"):
-        BeamRequest(uavs=(), anybody=True, takes=DeviceInput.REGISTERS, centre=True)
+        BeamRequest(uavs=(), any_uav=True, takes=DeviceInput.REGISTERS, centre=True)
 
 
 @pytest.mark.parametrize(("lon_deg", "middle_deg"), [((179.9, -179.7), -179.9), ((7.0, 8.0), 7.5)])
@@ -383,7 +383,7 @@ def test_centre_of_uavs_is_correct_across_180_degrees_east(
         one | {"uav": "2:1", "bearing_deg": 20.0, "lon_deg": lon_deg[1]},
     ]
     told = {"unfit": None, "beams": beams, "codebook_beams": None}
-    wanted = BeamRequest(uavs=(), anybody=True, takes=DeviceInput.POINTING, centre=True)
+    wanted = BeamRequest(uavs=(), any_uav=True, takes=DeviceInput.POINTING, centre=True)
     shot = command_for(told, None, wanted, 0)
     assert np.degrees(shot.bearing_rad) == pytest.approx(5.0)
     assert shot.place == pytest.approx((1.0, middle_deg, 5.0))
@@ -534,7 +534,7 @@ def test_uav_missing_from_the_device_table_is_not_applied() -> None:
     shot = command_for(
         told,
         "the head of a table\n",
-        BeamRequest(uavs=(), anybody=True, takes=DeviceInput.REGISTERS),
+        BeamRequest(uavs=(), any_uav=True, takes=DeviceInput.REGISTERS),
         0,
     )
     assert shot.unfit == "1:1 has no beam in the device's table"

@@ -135,7 +135,7 @@ def test_mount_error_is_half_that_of_following_reports(
     settings = Settings().override(center={"source": "5:1"}, observer={"lag_s": (0.0, 0.0)})
     pipeline = Pipeline(settings)
     equipment = assembly.equipment(settings, pipeline.array)
-    wanted = BeamRequest(uavs=("1:1",), anybody=False, takes=DeviceInput.POINTING)
+    wanted = BeamRequest(uavs=("1:1",), any_uav=False, takes=DeviceInput.POINTING)
 
     class Here:
         def ask(self, lead_s: float) -> DeviceCommand:

@@ -14,6 +14,7 @@ import json
 import random
 import re
 import sys
+import tempfile
 from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from html.parser import HTMLParser
@@ -53,9 +54,15 @@ class Text(NamedTuple):
 # --- errors, notices and details ----------------------------------------------------------------
 
 
-def _example(text: str) -> str:
+_TEST_FOLDER: Final = re.compile(
+    r"/[^ '\":,]*/pytest-of-[^/]*/pytest-\d+/(?:popen-\w+/)?[^/ '\":,]+(/?)"
+)
+
+
+def example(text: str) -> str:
     """Return a collected text without folders and ports of the test machine."""
-    text = re.sub(r"/[^ '\":]*/(?:test_|pytest|tmp)[^ '\":/]*/", "", text)
+    text = _TEST_FOLDER.sub(lambda found: "" if found[1] else "folder", text)
+    text = re.sub(rf"{tempfile.gettempdir()}/tmp\w+/", "", text).replace(f"{ROOT}/", "")
     text = re.sub(r"(127\.0\.0\.1|\[::1\]|localhost):\d{5}", r"\1:14550", text)
     return listed(text)
 
@@ -129,7 +136,7 @@ def write_messages(collected: Path) -> None:
     places: dict[tuple[str, str], list[str]] = defaultdict(list)
     for line in sorted(set(collected.read_text(encoding="utf-8").splitlines())):
         found = json.loads(line)
-        text = _example(found["text"])
+        text = example(found["text"])
         if text.isascii() and text.isprintable() and len(text) <= LENGTH_MAX:
             places[found["kind"], found["place"]].append(text)
     parts = [HEAD]

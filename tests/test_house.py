@@ -11,6 +11,7 @@ import re
 import shutil
 import subprocess
 import sys
+import tempfile
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
@@ -847,6 +848,26 @@ def test_the_list_of_texts_has_every_kind() -> None:
     counted = {kind: int(count) for count, kind in map(str.split, done.stderr.splitlines())}
     assert set(counted) == {"error", "notice", "detail", "rest", "help", "page"}
     assert counted["error"] > 300 and counted["rest"] < 80
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("{tmp}/pytest-of-me/pytest-7/popen-gw0/test_a0/x.mcap: is empty", "x.mcap: is empty"),
+        ("{tmp}/pytest-of-me/pytest-7/test_a0: is a folder", "folder: is a folder"),
+        ("{tmp}/tmp0w_g/x.mcap: is empty", "x.mcap: is empty"),
+        ("{root}/tests/data/x.tlog: is empty", "tests/data/x.tlog: is empty"),
+        ("/dev/zero: not a file", "/dev/zero: not a file"),
+    ],
+)
+def test_listed_text_has_no_folder_of_the_test_machine(text: str, shown: str) -> None:
+    sys.path.insert(0, str(ROOT / "docs"))
+    import list_texts
+
+    collected = text.format(tmp=tempfile.gettempdir(), root=ROOT)
+    assert list_texts.example(collected) == shown
+    written = list_texts.MESSAGES.read_text(encoding="utf-8")
+    assert not re.search(rf"{ROOT}|{tempfile.gettempdir()}/|pytest", written)
 
 
 def test_every_error_of_the_code_is_in_the_list_of_texts() -> None:

@@ -23,7 +23,9 @@ CENTER = click.option(
 LOGS = click.argument(
     "logs", metavar="LOG...", nargs=-1, required=True, type=click.Path(path_type=Path)
 )
-SEED = click.option("--seed", type=click.IntRange(min=0), default=1)
+SEED = click.option(
+    "--seed", type=click.IntRange(min=0), default=1, help="Seed of the random numbers."
+)
 SECONDS = click.option(
     "--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds."
 )

@@ -19,7 +19,7 @@ SILENT_S: Final = 1.0
 SILENT_INTERVALS: Final = 3.0
 
 TIMESYNC: Final = "allow TIMESYNC: set `[presence] enabled = true`, over a two-way link"
-APART: Final = 'fly them apart, or set `[beams] policy = "group"`'
+FLY_APART: Final = 'fly them apart, or set `[beams] policy = "group"`'
 STEADIER_LINK: Final = "use a MAVLink link with a steadier delay"
 
 
@@ -49,7 +49,7 @@ def of_left_out(out: LeftOut, track: Track | None, unfit: str | None) -> Blame:
         )
     match out.cause:
         case Cause.CROWDED:
-            remedy = APART
+            remedy = FLY_APART
         case Cause.SILENT if track is not None:
             return _silence_cause(track)
         case Cause.MACHINE:
@@ -113,7 +113,7 @@ def _attitude_cause(carrier: Carrier, evidence: LinkEvidence) -> Blame:
 def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
     if beam.loss_db > CLOSE_UAVS_DB:
         return Blame(
-            Cause.CROWDED, f"other UAVs in its direction cost it {beam.loss_db:.0f} dB", APART
+            Cause.CROWDED, f"other UAVs in its direction cost it {beam.loss_db:.0f} dB", FLY_APART
         )
     return Blame(
         Cause.RANGE,

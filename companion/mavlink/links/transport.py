@@ -32,7 +32,7 @@ from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
 from companion.mavlink.trust.duplicate_ids import DuplicateIds
-from companion.mavlink.wire.cot_link import SENDER, TUNNEL
+from companion.mavlink.wire import cot_link
 from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.foreign import ForeignSplitter
@@ -314,14 +314,18 @@ def _checked_origin(item: Frame | Rejection) -> Frame | Rejection:
 
     Any MAVLink peer could otherwise make tracks of aircraft, as if a receiver had reported them.
     """
-    if isinstance(item, Rejection) or item.msgid != TUNNEL or item.source != SENDER:
+    if (
+        isinstance(item, Rejection)
+        or item.msgid != cot_link.TUNNEL
+        or item.source != cot_link.SENDER
+    ):
         return item
     who, detail = (
         str(item.source),
         "TUNNEL: sender id 0:25 is reserved for the service's Cursor on Target links",
     )
     return Rejection(
-        t_ns=item.t_ns, source=who, reason=Reason.NOT_ALLOWED, msgid=TUNNEL, detail=detail
+        t_ns=item.t_ns, source=who, reason=Reason.NOT_ALLOWED, msgid=item.msgid, detail=detail
     )
 
 

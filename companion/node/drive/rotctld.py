@@ -112,6 +112,7 @@ class Rotator:
             raise DeviceError("not connected")
         ends_s = time.monotonic() + TIMEOUT_S
         try:
+            self._socket.settimeout(TIMEOUT_S)
             self._socket.sendall(command.encode() + b"\n")
             while not (found := re.search(rb"RPRT (-?\d{1,6})\n", self._unread)):
                 left_s = ends_s - time.monotonic()

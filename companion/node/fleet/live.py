@@ -155,7 +155,7 @@ class LiveFleetNode:
         """Return whether a present node does not answer; remove nodes that left."""
         heard_ns = {node: known.heard_ns for node, known in self.member.neighbours.items()}
         for node in self._unanswered.gone(now_ns, heard_ns):
-            self._publish(self.member.node_left(now_ns, node))
+            self._notify_all(self.member.node_left(now_ns, node))
         unresponsive = self._unanswered.unresponsive(now_ns, heard_ns)
         if unresponsive:
             text = f"no answer from {', '.join(unresponsive)}; reconnecting to all nodes"
@@ -210,7 +210,7 @@ class LiveFleetNode:
         if duty is not None:
             self._step(duty)
             self._publish_standing(now_ns)  # at once, not with the next one
-        self._publish(notices)
+        self._notify_all(notices)
 
     def _publish_received(self, now_ns: int) -> None:
         said = self.member.sharing.next_message(now_ns)
@@ -270,7 +270,7 @@ class LiveFleetNode:
                 ]
             )
             self._put("tracks", said.SerializeToString())
-        self._publish(self._around.phantoms(now_ns))
+        self._notify_all(self._around.phantoms(now_ns))
         self._sent.look(now_ns)
         self._heard.look(now_ns)
 
@@ -292,7 +292,9 @@ class LiveFleetNode:
                 return
             started_ns, remote_ns = messages.CLOCK.unpack(answer)
             received_ns = self._now_ns() - (time.monotonic_ns() - arrived_ns)
-            self._publish(self.member.read_clock(node, started_ns, sent_ns, received_ns, remote_ns))
+            self._notify_all(
+                self.member.read_clock(node, started_ns, sent_ns, received_ns, remote_ns)
+            )
 
         return take
 
@@ -325,7 +327,7 @@ class LiveFleetNode:
         events, notices = self.member.take_shared(now_ns, node, messages.to_shared(payload))
         for event in events:
             self._step(event)
-        self._publish(notices)
+        self._notify_all(notices)
 
     def _stands(self, node: str, payload: bytes) -> None:
         said = messages.to_standing(payload, node)
@@ -347,7 +349,7 @@ class LiveFleetNode:
             return
         if not is_alive:
             self._unanswered.alive.discard(node)
-            self._publish(self.member.node_left(self._now_ns(), node))
+            self._notify_all(self.member.node_left(self._now_ns(), node))
             return
         self._unanswered.alive.add(node)
         if node not in self.member.neighbours:
@@ -367,7 +369,7 @@ class LiveFleetNode:
             Notice(t_ns=self._now_ns(), severity=Severity.ERROR, subject="fleet", text=text)
         )
 
-    def _publish(self, notices: list[Notice]) -> None:
+    def _notify_all(self, notices: list[Notice]) -> None:
         for notice in notices:
             self._notify(notice)
 

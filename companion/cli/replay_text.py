@@ -22,10 +22,9 @@ def text(summary: dict[str, Any]) -> str:
     if relayed:
         lines.append(f"  {len(relayed)} relayed aircraft (ADS-B), {sum(relayed)} reports")
     beams = summary["beams"]
-    lines.append(
-        f"{beams['updates']} beam updates, {beams['regularised']} regularised,"
-        f" condition number up to {_number(beams['condition_number_max'])}"
-    )
+    largest = beams["condition_number_max"]
+    condition = "" if largest is None else f", condition number up to {_number(largest)}"
+    lines.append(f"{beams['updates']} beam updates, {beams['regularised']} regularised{condition}")
     lines += [f"  not used: {n} {_REASONS[why].meaning}" for why, n in summary["rejected"].items()]
     lines += [f"  missing: {line}" for line in summary["missing"]]
     if summary["recording"]:

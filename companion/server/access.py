@@ -72,8 +72,8 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
         )
     if not is_loopback(host) and token and len(token) < TOKEN_MIN and not insecure:
         raise ListenError(
-            f"{listen}: COMPANION_TOKEN has {len(token)} characters, which can be guessed;"
-            f" give {TOKEN_MIN} or more, such as those of `openssl rand -hex 16`"
+            f"{listen}: COMPANION_TOKEN is so short that it can be guessed;"
+            f" give {TOKEN_MIN} or more characters, such as those of `openssl rand -hex 16`"
         )
     try:
         family, kind, proto, _, address = socket.getaddrinfo(

@@ -39,6 +39,7 @@ PERPENDICULAR_COSINE: Final = (
 RIPPLE_DB: Final = 1.0
 """Largest rise of the gain above the peak within a lobe, as in a broadened lobe, dB."""
 CLIMB_MOVES: Final = 400
+ROUNDING: Final = 1e-12  # of a gain, relative
 SINGULAR: Final = 1e-9  # slope and curvature, relative to the gain, below which they are rounding
 
 _GRID = np.stack(np.meshgrid([-1.0, 0.0, 1.0], [-1.0, 0.0, 1.0]), axis=-1).reshape(9, 2)
@@ -274,7 +275,7 @@ def _peak_direction(array: Array, weights: ComplexArray, direction: FloatArray) 
         gains = _gains(array, weights, around / np.linalg.norm(around, axis=1)[:, np.newaxis])
         _, x, y, xx, xy, yy = (_QUADRATIC @ (gains / max(gains.max(), 1e-300))).tolist()
         step = _uphill(np.array([x, y]), np.array([[xx, xy], [xy, yy]]), 4 * reach**2)
-        higher = gains[4] >= best
+        higher = gains[4] >= best * (1 - ROUNDING)  # also where it returns to the top
         if higher:
             best, top, onward = gains[4], here, here + reach * (step @ across)
         else:  # the previous step was too long

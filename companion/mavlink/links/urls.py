@@ -172,7 +172,8 @@ def _suggestion(text: str) -> str:
     if scheme in ("beast", "dump1090", "adsb"):
         return f"; did you mean readsb:{address or 'HOST:30005'}?"
     if scheme == "udp":
-        return f"; did you mean udpin:{address or '0.0.0.0:14550'}, which listens?"
+        address = f"0.0.0.0:{address}" if address.isdecimal() else address or "0.0.0.0:14550"
+        return f"; did you mean udpin:{address}, which listens?"
     if text.isdecimal():
         return f"; did you mean udpin:0.0.0.0:{text}?"
     near = difflib.get_close_matches(scheme, SCHEMES, 1, 0.5)

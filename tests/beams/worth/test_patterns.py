@@ -5,7 +5,7 @@ import math
 
 import numpy as np
 import pytest
-from hypothesis import given, note, settings
+from hypothesis import example, given, note, settings
 from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize_scalar
 from scipy.signal import find_peaks
@@ -467,6 +467,9 @@ def check_null(scan: FloatArray, fallen: int, null: float) -> int:
 
 @pytest.mark.parametrize("name", ARRAYS)
 @given(seed=SEEDS)
+@example(seed=83349502)  # rectangle: the top of the ascent came a second time, by rounding lower
+@example(seed=118810788)  # list: the same
+@example(seed=2361328139)  # rectangle: a lobe 0.03 degrees behind the plane of the array
 @settings(max_examples=examples(12), deadline=None, derandomize=True)
 def test_lobe_matches_a_dense_scan(name: str, seed: int) -> None:
     """Any weights, any direction: peak, widths, nulls and side lobe of the exact pattern."""
@@ -483,7 +486,7 @@ def test_lobe_matches_a_dense_scan(name: str, seed: int) -> None:
     assert patterns.response_db(array, weights, peak) == pytest.approx(found.peak_db, abs=1e-6)
     near = peak + 1e-3 * rng.standard_normal((50, 3))
     near /= np.linalg.norm(near, axis=1)[:, np.newaxis]
-    assert patterns.response_db(array, weights, near).max() <= found.peak_db + 1e-5
+    assert patterns.response_db(array, weights, near).max() <= found.peak_db + 1e-6
     offsets = np.linspace(0, 2 * np.pi, 20_001)
     flat = name.startswith(("line", "rectangle"))
     for lobe, along in (
@@ -505,14 +508,14 @@ def test_lobe_matches_a_dense_scan(name: str, seed: int) -> None:
         left = check_null(scan[::-1], left, -lobe.first_nulls_rad[0] / step)
         right = check_null(scan, right, lobe.first_nulls_rad[1] / step)
         outside = scan[right : len(scan) - left]
-        counted = np.full(len(outside), True)
+        counted = sure = np.full(len(outside), True)
         if flat and abs(peak[0]) > 1e-4:
             ahead = directions[right : len(scan) - left, 0] * math.copysign(1, peak[0])
-            counted = ahead >= -2 * step
+            counted, sure = ahead >= -2 * step, ahead >= 2 * step  # the plane is between
         tops, _ = find_peaks(outside)
         clear, _ = find_peaks(outside, prominence=0.3)
         best = max(outside[tops][counted[tops]], default=-math.inf)
-        surely = max(outside[clear][counted[clear]], default=-math.inf)
+        surely = max(outside[clear][sure[clear]], default=-math.inf)
         side_db = -math.inf if lobe.side_lobe_db is None else lobe.side_lobe_db
         assert surely - 0.01 <= side_db <= best + 0.01
 

@@ -125,6 +125,7 @@ def test_invalid_link_url_is_reported_in_one_line(text: str) -> None:
         ("sbs:radar.lan", "sbs:radar.lan:30003?"),
         ("reedsb:radar.lan:30005", "readsb:?"),
         ("cot:tak.lan:8087", "cot:udp:tak.lan:8087, which listens, or cot:tcp:tak.lan:8087?"),
+        ("udp:14550", "udpin:0.0.0.0:14550, which listens?"),
     ],
 )
 def test_link_url_error_suggests_a_correction(text: str, meant: str) -> None:

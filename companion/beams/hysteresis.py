@@ -32,7 +32,8 @@ GUARANTEE_PLANE_SHARE: Final = 1 / 3
 Their beams change most with the width.
 """
 MIN_WIDTHS: Final = 0.25
-"""Angle in natural widths below which a shape does not change; growth starts from it."""
+"""Angle in natural widths that has no effect on a shape: reached at once; growth by factors starts
+there."""
 MAX_WIDTHS: Final = 16.0
 """Angle in natural widths beyond which a wider bound no longer changes the shape."""
 KEPT_NS: Final = 500_000_000  # time for which a method and slots are kept

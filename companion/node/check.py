@@ -66,7 +66,7 @@ def check(
         )
     if urls and seconds > 0:
         show(f"listening for {seconds:g} s")
-        service = _listen(_links_to_open(settings, urls), seconds)
+        service = _listen(_listening_settings(settings, urls), seconds)
         yield from _reception(service, settings)
 
 
@@ -96,7 +96,7 @@ def _capacity(settings: Settings) -> Finding:
     return Finding(subject="capacity", grade=Grade.OK, text=text)
 
 
-def _links_to_open(settings: Settings, urls: list[str]) -> Settings:
+def _listening_settings(settings: Settings, urls: list[str]) -> Settings:
     """Return run settings with these links, but without recording or other outputs."""
     source = settings.center.source or "home"
     kept = settings.override(links={"urls": urls}, center={"source": source})
@@ -220,7 +220,10 @@ def _uavs(service: Service) -> Iterator[Finding]:
     if not shown:
         remedy = "wait for a position fix; see `rejected` in /v1/status"
         yield Finding(
-            subject="UAVs", grade=Grade.FAULT, text="no UAV with a beam was received", remedy=remedy
+            subject="UAVs",
+            grade=Grade.FAULT,
+            text="no UAV for which a beam is wanted was received",
+            remedy=remedy,
         )
     for one in shown:
         track = one.track

@@ -69,19 +69,19 @@ class Outlet:
             for link in (*self._frames, *self._events):
                 group.create_task(link.run(), name=f"out {link.url}")
             if self._frames or self._events:
-                group.create_task(self._send_all(), name="out")
+                group.create_task(self._send_loop(), name="out")
 
-    async def _send_all(self) -> None:
+    async def _send_loop(self) -> None:
         """Send positions at the rate; times missed while the loop was blocked are skipped."""
         loop = asyncio.get_running_loop()
         period_s = 1 / self._settings.rate_hz
         due_s = loop.time()
         while True:
-            self._send_text()
+            self._send_once()
             due_s = max(due_s + period_s, loop.time())
             await asyncio.sleep(due_s - loop.time())
 
-    def _send_text(self) -> None:
+    def _send_once(self) -> None:
         now_ns = self._now_ns()
         named = self._pipeline.tracks(now_ns, now_ns)
         tracks = [track for track in named if self._admits(track.uav)]

@@ -97,16 +97,16 @@ class Push:
             sock.send(record)
         except OSError as error:  # no receiver, or a full queue: the next record is newer anyway
             if text not in self._refused:
-                self._notify_failure(Severity.WARNING, f"records to {text} fail: {error.strerror}")
+                self._notify_state(Severity.WARNING, f"records to {text} fail: {error.strerror}")
             self._refused[text] = 0
         else:
             if text in self._refused:
                 self._refused[text] += 1
                 if self._refused[text] >= RECOVERED_AFTER:
                     del self._refused[text]
-                    self._notify_failure(Severity.INFO, f"records to {text} are sent again")
+                    self._notify_state(Severity.INFO, f"records to {text} are sent again")
 
-    def _notify_failure(self, severity: Severity, text: str) -> None:
+    def _notify_state(self, severity: Severity, text: str) -> None:
         self._notify(Notice(t_ns=self._now_ns(), severity=severity, subject="records", text=text))
 
     def close(self) -> None:

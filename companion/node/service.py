@@ -88,7 +88,7 @@ class Service:
         self._live = self._open_live()
         self._traffic = Gateway(
             settings=settings,
-            step=self._process_frame,
+            step=self._process_own_event,
             notify=self._notify,
             now_ns=self._timeline.now_ns,
         )
@@ -141,7 +141,7 @@ class Service:
                 tasks.append(group.create_task(self._traffic.run(), name="links"))
                 tasks.append(group.create_task(self._outlet.run(), name="out"))
                 tasks.append(group.create_task(self._push.run(), name="records"))
-                tasks.append(group.create_task(self._drive_input(), name="drive"))
+                tasks.append(group.create_task(self._run_drive(), name="drive"))
                 if self.fleet is not None:
                     tasks.append(group.create_task(self.fleet.run(), name="fleet"))
                 tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
@@ -183,7 +183,7 @@ class Service:
 
     # --- input of the pipeline --------------------------------------------------------------
 
-    def _process_frame(self, event: Event) -> None:
+    def _process_own_event(self, event: Event) -> None:
         """Process an event of this node's own links."""
         if self.fleet is not None:
             self.fleet.on_event(event)  # first: other nodes wait for it
@@ -207,7 +207,7 @@ class Service:
         if offset_ns is not None:
             self._step(ClockSet(self._timeline.now_ns(), offset_ns))
 
-    async def _drive_input(self) -> None:
+    async def _run_drive(self) -> None:
         """Drive the device of ``[drive]``; a user's error ends the drive, not the service."""
         if self._device is None:
             return

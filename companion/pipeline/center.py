@@ -42,7 +42,7 @@ NOTICE_RATIO: Final = 1.25
 MIN_CONSISTENT_SAMPLES: Final = 4  # older-stamped attitudes in a row that replace the newest
 CONSISTENT_TIME_NS: Final = 500_000_000
 """Least duration of a run of consistent attitudes; resent ones arrive all at once."""
-MEAN_INTERVAL_NS: Final = (
+STEP_MISMATCH_MAX_NS: Final = (
     250_000_000  # largest difference between the steps of arrivals and of stamps
 )
 
@@ -198,7 +198,7 @@ class CarrierTracker:
         run = self._consistency
         if run is not None:
             step_ns, sender_step_ns = at[0] - run.last[0], at[1] - run.last[1]
-            if sender_step_ns <= 0 or abs(step_ns - sender_step_ns) > MEAN_INTERVAL_NS:
+            if sender_step_ns <= 0 or abs(step_ns - sender_step_ns) > STEP_MISMATCH_MAX_NS:
                 run = None
         began_ns, count = (at[0], 0) if run is None else (run.began_ns, run.count)
         self._consistency = _AttitudeRun(began_ns, at, count + 1)

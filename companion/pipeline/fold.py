@@ -277,7 +277,7 @@ class Pipeline:
         age_s = None if now is None else self.center.attitude_age_s(now)
         return LinkEvidence(
             clock_assumed=self._is_assumed(uav),
-            refused=self.refusals.unheard(uav),
+            refused=self.refusals.current_rejection(uav),
             attitude_bound_rad=self.center.attitude_bound_rad,
             attitude_age_s=0.0 if age_s is None else age_s,
             carrier_doubt_s=0.0 if now is None else now.bound_s,

@@ -7,7 +7,7 @@ from typing import Final
 from companion.pipeline.records import UavRecords, UnusedRun
 from companion.values import Notice, Reason, Rejection, Severity, kind_of
 
-SILENT_AFTER_NS: Final = 1_000_000_000
+REJECTED_AFTER_NS: Final = 1_000_000_000
 """Time without an accepted report of a sender after which a notice is published."""
 NOTICE_INTERVAL_NS: Final = 10_000_000_000  # least time between two such notices about one sender
 REPORT_REASONS: Final = frozenset(
@@ -63,7 +63,7 @@ class Refusals:
         run.reports += 1
         run.reason = refused.reason
         lasted_ns = refused.t_ns - run.since_ns
-        if run.is_reported or run.reports < 2 or lasted_ns < SILENT_AFTER_NS:
+        if run.is_reported or run.reports < 2 or lasted_ns < REJECTED_AFTER_NS:
             return None
         if refused.reason is Reason.SHARED_ID:
             return None  # a shared id has its own notice
@@ -82,7 +82,7 @@ class Refusals:
         if record is not None:
             record.unused = None
 
-    def unheard(self, uav: str) -> Reason | None:
+    def current_rejection(self, uav: str) -> Reason | None:
         """Return why a sender's newest reports are rejected; None if they are accepted."""
         record = self._records.get(uav)
         run = None if record is None else record.unused

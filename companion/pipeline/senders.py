@@ -51,7 +51,7 @@ from companion.values import (
 )
 
 RECEIVER_WAIT_NS: Final = 10_000_000_000  # time for which a new track waits for its GNSS receiver
-ACCURACY_AGE_MAX_US: Final = 30_000_000
+STATUS_REORDER_MAX_US: Final = 30_000_000
 """Largest step back of a receiver status that is out of order; a larger one is a reboot.
 
 Equal to the time for which reports are remembered (``dedupe``).
@@ -214,7 +214,7 @@ class Senders:
                 component = self._component(message)
                 stated_us, newest_us = message.time_us, component.stated_us
                 # An older status comes over a second, slower link.
-                if not 0 < stated_us < newest_us <= stated_us + ACCURACY_AGE_MAX_US:
+                if not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US:
                     component.stated_us = stated_us
                     component.noise = noise.reported(message, self._noise_settings)
                     component.receiver = message

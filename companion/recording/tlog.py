@@ -115,7 +115,7 @@ def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
         t_ns=t_ns,
         source=link,
         reason=Reason.BAD_STAMP,
-        detail=f"{abs(off_ns) / 1e9:.6g} s {way} the previous stamp; set to that one",
+        detail=f"{abs(off_ns) / 1e9:.6g} s {way} the log's time; the log's time is used",
     )
 
 

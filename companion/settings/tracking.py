@@ -68,7 +68,8 @@ class ObserverSettings(LimitSettings):
 
     model                  "kinematic" (acceleration unknown) or "position" (velocity unknown)
     alpha                  decay rate of the position model's certificate, or "auto"
-    feedthrough_s          position model: direct effect of the velocity on a report, seconds
+    feedthrough_s          position model: time by which a report leads the position, seconds;
+                           negative: it lags
     velocity_lead_s        position model: least lead derived from a reported velocity, seconds
     feed_forward           kinematic model: feed an estimated acceleration forward
     design                 kinematic model: file of gains written by ``companion design --model

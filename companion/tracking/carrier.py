@@ -200,7 +200,7 @@ class AngularAcceleration:
         limit = self._raised.at(base_degps2, sender_ns)
         if not limit < proven < MAX_PLAUSIBLE_RATIO * base_degps2:
             return None
-        to = self._raised.raised_value(proven, sender_ns)
+        to = self._raised.raise_above(proven, sender_ns)
         return Refuted(
             t_ns=attitude.t_ns,
             uav=str(attitude.source),

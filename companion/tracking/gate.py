@@ -139,7 +139,7 @@ class Suspects(Generic[State]):
         least_s = self._settings.reacquire_s
         return max(least_s, SHARED_S) if self._alternations else least_s
 
-    def is_consistent(self, sender_ns: int) -> bool:
+    def is_second_vehicle(self, sender_ns: int) -> bool:
         """Return whether the run is a second vehicle's: possible reports alternate with it."""
         if len(self._run) < self._settings.reacquire_reports or self._alternations < ALTERNATIONS:
             return False

@@ -105,7 +105,7 @@ class RaisedLimit:
     to: float = 0.0
     at_ns: int = 0
 
-    def raised_value(self, proven: float, sender_ns: int) -> float:
+    def raise_above(self, proven: float, sender_ns: int) -> float:
         """Raise the limit above a proven value; return the new limit."""
         self.to, self.at_ns = RAISED * proven, sender_ns
         return self.to
@@ -178,7 +178,7 @@ class Refutations:
     def _raise(
         self, raised: RaisedLimit, fix: Fix, setting: str, limit: float, proven: float
     ) -> Refuted:
-        to = raised.raised_value(proven, fix.sender_ns)
+        to = raised.raise_above(proven, fix.sender_ns)
         return Refuted(
             t_ns=fix.arrival_ns,
             uav=fix.uav,

@@ -135,7 +135,7 @@ class Tracker:
         """
         tracked = self._tracked.get(fix.uav)
         past = self._new_past() if tracked is None else tracked.past
-        fix, refuted = self._with_refuted_limits(past, fix)
+        fix, refuted = self._with_raised_limits(past, fix)
         full = tracked is None and len(self._tracked) >= self._settings.most
         if full and not self._make_room(fix.uav):
             why = f"limit of {self._settings.most} tracks reached"
@@ -148,7 +148,7 @@ class Tracker:
         noise = self._settings.noise
         return _Past(Refutations(), None if noise is None else ReceiverCheck(noise), ReportTiming())
 
-    def _with_refuted_limits(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
+    def _with_raised_limits(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
         """Return a report with its raised bounds, and the refutations by this report."""
         given = self._limits(fix)
         found = past.refutations.look(fix if fix.limits else replace(fix, limits=given))
@@ -175,7 +175,7 @@ class Tracker:
             return self._suspect(tracked, fix, impossible)
         tracked.believable_ns = max(tracked.believable_ns, fix.sender_ns)
         tracked.suspects.interrupt()
-        if tracked.suspects.is_consistent(fix.sender_ns):
+        if tracked.suspects.is_second_vehicle(fix.sender_ns):
             return _rejected(fix, Reason.SHARED_ID, "a second vehicle reports under this id")
         return self._use(tracked, index, fix, predicted)
 

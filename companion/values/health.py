@@ -42,7 +42,7 @@ class Blame:
         str,
         Meaning(
             "remedy: an action that a person can take now",
-            example="ask for 10 Hz ([presence] position_hz)",
+            example="request reports at 10 Hz: set `[presence] position_hz = 10`",
         ),
     ]
 

@@ -141,7 +141,7 @@ class Track:
     """
 
     uav: Annotated[str, Meaning("id of the UAV", 1, label="UAV", example="3:1")]
-    state: Annotated[TrackState, Meaning("age of the newest report", 2)]
+    state: Annotated[TrackState, Meaning("state of the track, by the age of its newest report", 2)]
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold", 3)]
     age_s: Annotated[float, Meaning("age of the newest accepted report", 4)]
     position_ned_m: Annotated[

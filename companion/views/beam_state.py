@@ -29,9 +29,7 @@ RESPONSE_SAMPLES_MAX: Final = 2000  # largest number of sampled directions over 
 RESPONSE_SAMPLES_MIN: Final = 32  # smallest number, however large the codebook
 RESPONSES_MAX: Final = 2**28
 """Limit on samples times codebook beams times elements, over all UAVs of one answer."""
-MIN_AMPLITUDE_SHARE: Final = (
-    8  # number of UAVs up to which each gets the full work limit of a request
-)
+FULL_WORK_UAVS: Final = 8  # number of UAVs up to which each gets the full work limit
 LEAD: Final = "requested lead: valid_at is this long after the request, or up to 10 ms more"
 
 
@@ -221,7 +219,7 @@ def _stored_beams(
     if codebook is None:
         return None
     (best,), gains = codebooks.best(codebook, array, towards[np.newaxis])
-    share = min(1.0, MIN_AMPLITUDE_SHARE / len(update.beams.beams))
+    share = min(1.0, FULL_WORK_UAVS / len(update.beams.beams))
     swept = codebooks.candidates(codebook, array, towards, beam.pointing_bound_rad, share)
     following = _next_best(pipeline, equipment, update, beam)
     return StoredBeam(

@@ -102,7 +102,7 @@ class DesignView:
 
     def __init__(self, settings: Settings) -> None:
         self._observer = settings.observer
-        self._default_airframe = _bounds(settings.observer, assembly.default_limits(settings))
+        self._default_bounds = _bounds(settings.observer, assembly.default_limits(settings))
         self._table = None if self._observer.model == "position" else kinematic_design(settings)
 
     def show(self, pipeline: Pipeline, now_ns: int) -> Json:
@@ -115,10 +115,10 @@ class DesignView:
         shown = Design(
             valid_at_ns=now_ns,
             model=self._observer.model,
-            assumed=self._default_airframe,
+            assumed=self._default_bounds,
             certificate=None
             if self._table is None
-            else _certificate(self._table, self._default_airframe),
+            else _certificate(self._table, self._default_bounds),
             designs=[
                 UavDesign(uav=track.uav, **self._row(pipeline, track, track.dt_s))
                 for track in pipeline.tracks(now_ns, now_ns)

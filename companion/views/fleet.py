@@ -41,7 +41,8 @@ class FleetNode:
     near: Annotated[
         bool,
         Meaning(
-            "whether the ranges of the node and this node overlap; only then they share reports"
+            "whether the node is near: ranges overlap, within about 10 km, or position unknown;"
+            " only near nodes exchange reports and offers"
         ),
     ] = False
     reason: Annotated[str | None, Meaning("why the node is excluded")] = None

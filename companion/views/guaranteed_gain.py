@@ -12,7 +12,7 @@ from companion.pipeline.fold import Pipeline
 from companion.values import ComplexArray, FloatArray, Update, UserError
 from companion.views.quantised import device_table
 
-CANDIDATES_MAX: Final = 16
+SINR_BEAMS_MAX: Final = 16
 """Largest number of beams for which guaranteed SINRs are computed; work grows with its square."""
 
 
@@ -36,7 +36,7 @@ def of_beams(
     """Return least gain and least SINR of each beam within its UAV's bound.
 
     A gain is None if the UAV may be out of coverage, in a null, or in any direction. All SINRs are
-    None if there are more than ``CANDIDATES_MAX`` beams.
+    None if there are more than ``SINR_BEAMS_MAX`` beams.
     """
     array, beam_set = pipeline.array, update.beams
     weights = _radiated(pipeline, equipment, update)
@@ -45,7 +45,7 @@ def of_beams(
     bounds, gains_db = _minimum_db(pipeline, update, towards, weights)
     known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
     unknown: list[float | None] = [None] * len(bounds)
-    if not known or len(bounds) > CANDIDATES_MAX or update.carrier is None:
+    if not known or len(bounds) > SINR_BEAMS_MAX or update.carrier is None:
         return gains_db, unknown
     farthest_m = {track.uav: track.bound_m + update.carrier.bound_m for track in update.tracks}
     ranges_m = np.array([beam.range_m + farthest_m[beam.uav] for beam in beam_set.beams])

@@ -19,7 +19,7 @@ from companion.pipeline.fold import Pipeline
 from companion.tracking.noise import GEOID_M
 from companion.values import AltitudeDatum, Source, Track, TrackState, kind_of
 
-KNOWN_DATUMS: Final = (TrackState.LIVE, TrackState.COASTING)
+SENT_STATES: Final = (TrackState.LIVE, TrackState.COASTING)  # states of tracks that are sent
 _REBOOT_MS: Final = 60_000  # a larger backward step of a boot clock means a reboot
 
 
@@ -40,7 +40,7 @@ class Positions:
             message
             for track in tracks
             if kind_of(track.uav).reports_itself
-            and track.state in KNOWN_DATUMS
+            and track.state in SENT_STATES
             and (message := self._one(pipeline, track)) is not None
         ]
         for uav in self._boot_ms.keys() - set(pipeline.tracker.uavs):
@@ -104,7 +104,7 @@ def events(pipeline: Pipeline, tracks: Iterable[Track], stale_s: float) -> list[
     return [
         _event(pipeline, track, stale_s)
         for track in tracks
-        if track.state in KNOWN_DATUMS and pipeline.targets.identities.same_as(track.uav) is None
+        if track.state in SENT_STATES and pipeline.targets.identities.same_as(track.uav) is None
     ]
 
 

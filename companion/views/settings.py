@@ -20,7 +20,7 @@ class Setting:
     default: Annotated[Any, Meaning("the default value")]
     source: Annotated[
         Literal["default", "file", "recording", "option", "program"],
-        Meaning("origin of the value: default, file, option, environment, or the demo"),
+        Meaning("origin of the value; program: set by the program itself, as in its demo"),
     ]
     file: Annotated[str | None, Meaning("the file or recording that set it")]
 

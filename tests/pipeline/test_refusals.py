@@ -89,4 +89,4 @@ def test_shared_id_explains_silence_without_its_own_notice() -> None:
     refusals = new_refusals()
     shared = [refused(t / 4, reason=Reason.SHARED_ID) for t in range(20)]
     assert told_at(refusals, shared) == []
-    assert refusals.unheard("3:1") is Reason.SHARED_ID
+    assert refusals.current_rejection("3:1") is Reason.SHARED_ID

@@ -139,9 +139,9 @@ def test_late_or_duplicate_suspects_are_ignored(fix: MakeFix) -> None:
 
 def test_run_stays_consistent_until_it_expires(fix: MakeFix) -> None:
     run = interleaved_run(fix, [0, 1, 2, 3])
-    assert run.is_consistent(3 * S)
-    assert run.is_consistent(13 * S - 1)
-    assert not run.is_consistent(13 * S)
+    assert run.is_second_vehicle(3 * S)
+    assert run.is_second_vehicle(13 * S - 1)
+    assert not run.is_second_vehicle(13 * S)
 
 
 def test_run_without_interleaving_is_not_a_duplicate_id(fix: MakeFix) -> None:
@@ -149,10 +149,10 @@ def test_run_without_interleaving_is_not_a_duplicate_id(fix: MakeFix) -> None:
     run = suspects(fix, [0, 1, 2, 3])
     run.interrupt()
     run.interrupt()
-    assert not run.is_consistent(4 * S)
+    assert not run.is_second_vehicle(4 * S)
     run.add(fix(5 * S, [50, 0, 0], [10, 0, 0]))
-    assert not run.is_consistent(5 * S)
-    assert not interleaved_run(fix, [0, 1, 2]).is_consistent(2 * S)
+    assert not run.is_second_vehicle(5 * S)
+    assert not interleaved_run(fix, [0, 1, 2]).is_second_vehicle(2 * S)
 
 
 def interleaved_run(fix: MakeFix, times_s: list[float]) -> Suspects:

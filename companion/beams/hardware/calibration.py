@@ -26,8 +26,8 @@ class Calibration:
         phase_error_rad, gain_error_db
                    by element: bounds on the errors of phase and gain; empty: unknown
 
-    A setting is the wanted value less these errors. Raises ``UserError`` for lengths that differ,
-    values that are not finite, or an order that is no permutation.
+    A setting is the wanted value less ``phase_rad`` and ``gain_db``. Raises ``UserError`` for
+    lengths that differ, values that are not finite, or an order that is no permutation.
     """
 
     phase_rad: tuple[float, ...]  # by element: phase that the channel adds to its setting

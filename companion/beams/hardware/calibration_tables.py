@@ -96,7 +96,9 @@ def _table(given: Any, size: int) -> _Table:
         raise UserError(f"table has {', '.join(given)}; give frequency_hz, {', '.join(names)}")
     frequency = given["frequency_hz"]
     if not is_number(frequency, FREQUENCY_MAX_HZ) or frequency <= 0:
-        raise UserError(f"frequency_hz = {shown(frequency)} is not a number from 0 to 1e15")
+        raise UserError(
+            f"frequency_hz = {shown(frequency)} is out of range; give a number above 0, up to 1e15"
+        )
     columns: dict[str, FloatArray] = {}
     for name in names:
         column = given[name]

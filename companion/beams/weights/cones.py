@@ -222,9 +222,9 @@ def _ring_samples(
 def outside(
     across: Aperture, seen: ApertureCones, around: FloatArray, wavelength_m: float
 ) -> FloatArray:
-    """Return the distance of directions (P, 3) outside K cones, natural widths, (P, N).
+    """Return how far directions (P, 3) are outside the first of K cones, natural widths, (P, N).
 
-    0 within the first cone.
+    0 within that cone.
     """
     cosines = (around @ across.axes.T)[:, np.newaxis]
     beyond = np.maximum(np.maximum(seen.lowest[0] - cosines, cosines - seen.highest[0]), 0.0)

@@ -87,7 +87,7 @@ def with_nulls(spread: Spread, noise: FloatArray | None = None, exact: bool = Fa
     if exact:
         return NulledBeams(spread.beams - taken, whole)
     least = (counts * kept[:, :, np.newaxis]).max(axis=0)
-    back = _step_back(spread, taken, (fields, power), least)
+    back = _allowed_share(spread, taken, (fields, power), least)
     return NulledBeams(spread.beams - back * taken, whole & (back >= 1.0))
 
 
@@ -149,7 +149,7 @@ def _correction(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) 
     return taken
 
 
-def _step_back(
+def _allowed_share(
     spread: Spread, taken: ComplexArray, known: tuple[ComplexArray, FloatArray], least: FloatArray
 ) -> FloatArray:
     """Return the largest share (N,) of nulls that leaves each place its least gain (N, P); 0: any.

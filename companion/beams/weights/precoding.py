@@ -196,8 +196,8 @@ def _slots(
 ) -> tuple[list[IntArray], dict[int, str]]:
     """Return the groups of users by time slot, and the users left out with the reason.
 
-    Previous slots are kept while they are within the limits and young, and until there are fewer
-    slots or more users are served.
+    Previous slots within the limits are kept while they are young; later they are kept until others
+    need fewer slots or serve more users.
     """
     everyone = np.arange(steering.shape[1])
     if settings.policy is Policy.REGULARISE or settings.method is not Method.ZERO_FORCING:

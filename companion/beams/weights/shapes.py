@@ -23,7 +23,7 @@ TABLES: Final = "shapes.npz"
 CORNERS: Final = np.indices((2, 2, 2)).reshape(3, 8).T  # the corners (8, 3) of a cell of three axes
 WIDEST_PER_ELEMENT: Final = 0.375
 """Widest beam per element, in natural widths; elements cannot shape a wider one."""
-USEFUL_LOSS_DB: Final = 2.0
+LOSS_PER_MISSING_DB: Final = 2.0
 """Additional loss in dB, accepted for each dB by which a floor misses the useful gain."""
 SPARE_DB: Final = 2.5
 """Margin of a floor over the useful gain, dB: nulls and points between samples reduce it."""
@@ -197,7 +197,7 @@ def _psi(
     best_db += 10 * math.log10(elements)
     least_db = len(columns) * math.exp(shapes.losses[0])
     lacking_db = np.maximum(worth_db + SPARE_DB + least_db - best_db, 0.0)
-    loss_db = np.maximum(best_db - floor_db, least_db) + USEFUL_LOSS_DB * lacking_db
+    loss_db = np.maximum(best_db - floor_db, least_db) + LOSS_PER_MISSING_DB * lacking_db
     loss_db /= len(columns)
     return [_likely_phases(shapes, cones[:, d], likely[:, d], loss_db) for d in columns]
 

@@ -50,7 +50,8 @@ class ClockAssumptions:
 class Stamp:
     """Stamp placed on the sender's and the node's timelines.
 
-    node_utc_error_s  bound on the error of the node timeline against UTC; None: unbounded
+    sender_ns  the sender's time since boot, unwrapped past its 32-bit milliseconds; starts again
+               after a reboot
     latency_s  estimated age of the stamp on arrival, at least 0
     rebooted   True once, at the stamp that confirms a reboot
     """

@@ -57,21 +57,21 @@ class _Level:
     """Level floor under steadily rising stamps, valid if a queue, not drift, caused the rise.
 
     upper_bound offset bound if a queue caused it, at the newest stamp, relative to the level base
-    touched_ns  sender time of the stamp that set it
+    bound_set_ns  sender time of the stamp that set it
     """
 
-    __slots__ = ("touched_ns", "upper_bound")
+    __slots__ = ("bound_set_ns", "upper_bound")
 
-    def __init__(self, touched_ns: int) -> None:
+    def __init__(self, bound_set_ns: int) -> None:
         self.upper_bound = 0.0
-        self.touched_ns = touched_ns
+        self.bound_set_ns = bound_set_ns
 
     def add(self, x_ns: int, height: float, ahead_ns: int, drift_max: float) -> None:
         """Add a stamp that is ``ahead_ns`` ahead of the newest one."""
         self.upper_bound += drift_max * max(0, ahead_ns)
         as_of_now = height + drift_max * max(0, -ahead_ns)
         if as_of_now <= self.upper_bound:
-            self.upper_bound, self.touched_ns = as_of_now, x_ns
+            self.upper_bound, self.bound_set_ns = as_of_now, x_ns
 
 
 class Floor:
@@ -101,7 +101,7 @@ class Floor:
         self._base = (0, 0)  # x, y: heights are relative to base y + drift * (x - base x)
         self._upper_bound = self._line = 0.0  # heights at newest_ns
         self._level: _Level | None = None  # floor if the apparent drift is a queue
-        self._last_change_ns = 0  # x of the stamp that set ``upper_bound``
+        self._bound_set_ns = 0  # x of the stamp that set ``upper_bound``
         self._since_ns = 0  # x of the line's last restart
         self._risen = -np.inf  # height of the last few frames, if they are suspiciously late
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT)
@@ -120,7 +120,7 @@ class Floor:
         self._newest_arrival_ns = x_ns + y_ns
         if not self.count:
             self._base = (x_ns, y_ns)
-            self._since_ns = self._last_change_ns = x_ns
+            self._since_ns = self._bound_set_ns = x_ns
             self.newest_ns, self._first_arrival_ns = x_ns, x_ns + y_ns
         self.count += 1
         height = self._height(x_ns, y_ns)
@@ -135,7 +135,7 @@ class Floor:
         else:
             as_of_now = height - self._drift_max * ahead_ns
         if as_of_now <= self._upper_bound:
-            self._upper_bound, self._last_change_ns = as_of_now, x_ns
+            self._upper_bound, self._bound_set_ns = as_of_now, x_ns
         gap = as_of_now - self._line
         self._line = min(self._line, as_of_now)
         self._recent.append((x_ns, height))
@@ -148,7 +148,7 @@ class Floor:
                 self._all_late(late_spell)
         if self._line - self._upper_bound > WORST_LATENCY_NS:
             # No frame is that late: the clock changed.
-            self._upper_bound, self._last_change_ns = self._line, x_ns
+            self._upper_bound, self._bound_set_ns = self._line, x_ns
         level = self._level
         if level is not None and self._tilted(self._line) - level.upper_bound > WORST_LATENCY_NS:
             self._level = None  # no queue is that long: the clock drifts
@@ -206,13 +206,13 @@ class Floor:
     def _drifts(self) -> None:
         """Restart the floor along the drift, through the least heights of the window."""
         newest_ns, level = self.newest_ns, self._upper_bound
-        self._level = _Level(self._last_change_ns)
+        self._level = _Level(self._bound_set_ns)
         self._base = (newest_ns, self._base[1] + round(level))
         points = self._visible.tilt(self.drift, newest_ns, level)
         self._upper_bound = self._line = min(
             height + self._drift_max * (newest_ns - at_ns) for at_ns, height in points
         )
-        self._since_ns = self._last_change_ns = points[0][0]
+        self._since_ns = self._bound_set_ns = points[0][0]
         self._lateness.clear()
         self._recent.clear()
 
@@ -232,12 +232,12 @@ class Floor:
         if len(self._recent) == RECENT:
             least = min([h + drift_max * (newest_ns - at_ns) for at_ns, h in self._recent])
             recent = max(recent, least)
-        aged = 2.0 * drift_max * (newest_ns - self._last_change_ns)
+        aged = 2.0 * drift_max * (newest_ns - self._bound_set_ns)
         highest, least = max(sure, line, recent) + moved, sure - aged + moved
         sure += moved
         if self._level is not None:
             level = self._level.upper_bound
-            aged = 2.0 * drift_max * (newest_ns - self._level.touched_ns)
+            aged = 2.0 * drift_max * (newest_ns - self._level.bound_set_ns)
             sure, highest = min(sure, level), max(highest, level)
             least = min(least, level - aged)
         return Heights(
@@ -293,7 +293,7 @@ class Floor:
         measured = self._height(x_ns, height_ns)
         self._upper_bound = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
         self._level = None
-        self._since_ns = self._last_change_ns = x_ns
+        self._since_ns = self._bound_set_ns = x_ns
         self._risen = -np.inf
         self._lateness.clear()
         self._recent.clear()

@@ -18,7 +18,7 @@ import numpy as np
 from companion.values import IntArray, UserError
 
 REMEMBERED: Final = 1000  # updates whose times are kept
-LEAD_QUANTILE: Final = 51  # updates whose median time is the next lead
+LEAD_UPDATES: Final = 51  # updates whose median time is the next lead
 RETRY_NS: Final = 1_000_000_000  # time between two attempts to open a device
 LATE_SHARE: Final = 0.1
 """Fraction of the update interval by which an update may be late."""
@@ -205,7 +205,7 @@ class Drive:
         if own_s is not None:
             return own_s
         return (
-            statistics.median(list(self._took_ns)[-LEAD_QUANTILE:]) * 1e-9 if self._took_ns else 0.0
+            statistics.median(list(self._took_ns)[-LEAD_UPDATES:]) * 1e-9 if self._took_ns else 0.0
         )
 
     def status(self) -> DriveStatus:

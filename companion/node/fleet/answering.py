@@ -9,7 +9,7 @@ requests detect this. Only a new session fixes it.
 from collections.abc import Mapping
 from typing import Final
 
-PATIENCE_MAX_NS: Final = 60_000_000_000
+SESSION_INTERVAL_MAX_NS: Final = 60_000_000_000
 """Limit on the time between two new sessions.
 
 A node that never answers, or forged names, must not cost the others their sessions.
@@ -73,5 +73,5 @@ class Unanswered:
         if passed_ns < self._gap_ns:
             return False
         self._found_ns = now_ns
-        self._gap_ns = min(2 * self._gap_ns, PATIENCE_MAX_NS)
+        self._gap_ns = min(2 * self._gap_ns, SESSION_INTERVAL_MAX_NS)
         return True

@@ -178,8 +178,8 @@ class LiveFleetNode:
         base = f"{PREFIX}/{self.settings.site}"
         bus.serve(self._key("time"), self._time)
         bus.serve(self._key("schema"), lambda key, payload: schemas.SHARED.descriptor_set)
-        bus.subscribe(f"{base}/*/standing", self._receive_loop(self._stands))
-        heard, offered = self._receive_loop(self._shared), self._receive_loop(self._offered)
+        bus.subscribe(f"{base}/*/standing", self._valid_only(self._stands))
+        heard, offered = self._valid_only(self._shared), self._valid_only(self._offered)
         self._listening = Listening(bus=bus, base=base, heard=heard, offered=offered)
         bus.watch(f"{base}/*/alive", self._seen)
         bus.alive(self._key("alive"))
@@ -308,8 +308,9 @@ class LiveFleetNode:
         self.damaged += 1
         return None
 
-    def _receive_loop(self, take: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
-        """Return a callback that passes on valid samples of other nodes, and counts the others."""
+    def _valid_only(self, take: Callable[[str, bytes], None]) -> Callable[[str, bytes], None]:
+        """Return a callback that passes on valid samples of other nodes; others are counted as
+        damaged."""
 
         def taken(key: str, payload: bytes) -> None:
             node = self._node(key)

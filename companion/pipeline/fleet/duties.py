@@ -5,7 +5,7 @@ for one lease. A node without a message for that time, or whose liveliness token
 nothing.
 
 - A UAV without a node is claimed by the assigned node: at once if its holder left, otherwise after
-  ``NEW_NODE_DELAY_NS``. If the assigned node does not claim it within a lease, the next one does.
+  ``CLAIM_DELAY_NS``. If the assigned node does not claim it within a lease, the next one does.
 - A UAV that belongs elsewhere is handed over: its holder announces the new node, and serves until
   that node announces that it serves. Two nodes then serve it for the delay of one message, and
   never none.
@@ -22,7 +22,7 @@ from companion.pipeline.fleet.assignment import assign
 from companion.values import Standing
 from companion.values.described import Meaning
 
-NEW_NODE_DELAY_NS: Final = 500_000_000
+CLAIM_DELAY_NS: Final = 500_000_000
 """Time without a serving node after which a UAV is claimed; longer than a message's delay."""
 ASSIGNED_NS: Final = 500_000_000  # time between two assignments while the nodes are the same
 SETTLED_NS: Final = 2_000_000_000
@@ -75,7 +75,7 @@ class Duties:
         """Remove a node that left: the UAVs that it served may be claimed at once."""
         _, said = self._others.pop(node, (0, None))
         for uav, _ in said.serves if said else ():
-            self._free_since[uav] = now_ns - NEW_NODE_DELAY_NS
+            self._free_since[uav] = now_ns - CLAIM_DELAY_NS
 
     def others(self, now_ns: int) -> dict[str, Standing]:
         """Return the newest ``Standing`` of each other node whose lease has not expired."""
@@ -203,7 +203,7 @@ class Duties:
                 continue
             free_ns = now_ns - self._free_since.setdefault(uav, now_ns)
             late_ns = 0 if wanted.get(uav) == self._name else self._lease_ns
-            if has_listened and free_ns >= NEW_NODE_DELAY_NS + late_ns:
+            if has_listened and free_ns >= CLAIM_DELAY_NS + late_ns:
                 self.serves[uav] = mine[uav]
         for uav in [uav for uav in self._free_since if uav not in mine or uav in self.serves]:
             del self._free_since[uav]

@@ -6,7 +6,7 @@ A node is excluded if it
 - has an inconsistent clock: repeated round trips that no drift explains;
 - shares reports that contradict those received here or by other nodes;
 - shares vehicles that only it receives, at positions where others receive everything: at least
-  ``PHANTOMS_MIN`` of them for ``SILENT_AFTER_NS``, and most of what it receives. A few such
+  ``PHANTOMS_MIN`` of them for ``PHANTOM_AFTER_NS``, and most of what it receives. A few such
   vehicles may be hidden by an obstacle: they cause a notice and stay unconfirmed.
 """
 
@@ -23,7 +23,7 @@ CONTRADICTIONS: Final = (
 CONTRADICTION_WINDOW_NS: Final = 30_000_000_000
 EXCLUDED_NS: Final = 300_000_000_000  # duration of an exclusion
 PHANTOMS_MIN: Final = 2  # number of phantom vehicles from which on their node is excluded
-SILENT_AFTER_NS: Final = 8_000_000_000
+PHANTOM_AFTER_NS: Final = 8_000_000_000
 """Time without reception elsewhere after which a vehicle counts as a phantom."""
 REACH_SHARE: Final = 0.7
 """Fraction of a node's range within which it receives every vehicle."""
@@ -52,7 +52,7 @@ class Trust:
         self.excluded: dict[str, str] = {}
         self._until_ns: dict[str, int] = {}
         self._times: dict[tuple[str, str], deque[int]] = {}
-        self._silent_since: dict[str, tuple[str, int]] = {}
+        self._unconfirmed_since: dict[str, tuple[str, int]] = {}
         self._notified: set[str] = set()
 
     def is_trusted(self, node: str) -> bool:
@@ -78,16 +78,19 @@ class Trust:
 
         ``heard`` is the number of vehicles that each node claims to receive.
         """
-        before, self._silent_since = self._silent_since, {}
+        before, self._unconfirmed_since = self._unconfirmed_since, {}
         for one in told:
             others = [w for name, w in witnesses.items() if name != one.node]
             has_been_heard = any(one.uav in w.heard for w in others)
             if not has_been_heard and any(_should_receive(w, one) for w in others):
                 node, since_ns = before.get(one.uav, (one.node, now_ns))
-                self._silent_since[one.uav] = (one.node, since_ns if node == one.node else now_ns)
+                self._unconfirmed_since[one.uav] = (
+                    one.node,
+                    since_ns if node == one.node else now_ns,
+                )
         phantoms = dict[str, list[str]]()
-        for uav, (node, since_ns) in self._silent_since.items():
-            if now_ns - since_ns >= SILENT_AFTER_NS:
+        for uav, (node, since_ns) in self._unconfirmed_since.items():
+            if now_ns - since_ns >= PHANTOM_AFTER_NS:
                 phantoms.setdefault(node, []).append(uav)
         said = []
         for node, uavs in phantoms.items():
@@ -102,13 +105,13 @@ class Trust:
                 )
                 said.append(_notice(now_ns, node, text, Severity.WARNING))
             self._notified.update(uavs)
-        self._notified &= self._silent_since.keys()
+        self._notified &= self._unconfirmed_since.keys()
         return said
 
     @property
     def unconfirmed(self) -> frozenset[str]:
         """Vehicles that only one other node shares, though more nodes should receive them."""
-        return frozenset(self._silent_since)
+        return frozenset(self._unconfirmed_since)
 
     def forget(self, now_ns: int) -> None:
         """Forget contradictions that have expired."""

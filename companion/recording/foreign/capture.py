@@ -55,7 +55,7 @@ def read_capture(path: Path) -> Iterator[Event]:
             events = flow.take(timeline.t_ns, found)
             if events and off_ns is not None and abs(off_ns) > STEP_HOLD_NS:
                 way = "before" if off_ns < 0 else "after"
-                detail = f"{abs(off_ns) / 1e9:.6g} s {way} the previous stamp; set to that one"
+                detail = f"{abs(off_ns) / 1e9:.6g} s {way} the log's time; the log's time is used"
                 yield Rejection(
                     t_ns=timeline.t_ns, source=found.flow, reason=Reason.BAD_STAMP, detail=detail
                 )

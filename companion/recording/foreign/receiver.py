@@ -57,7 +57,7 @@ def fixes_of(
         np.where(known, week, 0).astype(np.int64), np.where(known, week_ms, -1).astype(np.int64)
     )
     beside = _nearest(boot_us, gps, accuracy)
-    previous_us = np.where(np.isfinite(beside[:, 3]), beside[:, 3] * 1e3, boot_us).astype(np.int64)
+    received_us = np.where(np.isfinite(beside[:, 3]), beside[:, 3] * 1e3, boot_us).astype(np.int64)
     satellites = gps.numbers("NSats")
     places = gps.integers("Lat"), gps.integers("Lng")
     assert places[0] is not None and places[1] is not None
@@ -73,7 +73,7 @@ def fixes_of(
         speed_mps=gps.numbers("Spd"),
         course_deg=gps.numbers("GCrs"),
     )
-    return fixes, gps_time.fit(previous_us, fixed_us)
+    return fixes, gps_time.fit(received_us, fixed_us)
 
 
 def _by_time(boot_us: IntArray) -> IntArray:

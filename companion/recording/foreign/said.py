@@ -85,7 +85,7 @@ def frames(log: Onboard, link: str, source: Source, latency_s: float) -> Iterato
         off_ns = timeline.place(t_ns)
         if off_ns is not None:
             side = "before" if off_ns < 0 else "after"
-            detail = f"{abs(off_ns) / 1e9:.6g} s {side} the previous stamp; set to that one"
+            detail = f"{abs(off_ns) / 1e9:.6g} s {side} the log's time; the log's time is used"
             yield Rejection(
                 t_ns=timeline.t_ns + latency_ns, source=link, reason=Reason.BAD_STAMP, detail=detail
             )

@@ -2,7 +2,7 @@
 
 from itertools import pairwise
 
-from companion.node.fleet.answering import BLOCKED_NS, PATIENCE_MAX_NS, Unanswered
+from companion.node.fleet.answering import BLOCKED_NS, SESSION_INTERVAL_MAX_NS, Unanswered
 
 S = 1_000_000_000
 PATIENCE_NS = 6 * S
@@ -26,7 +26,7 @@ def test_unresponsive_node_is_reported_with_growing_intervals() -> None:
     waits = [after - before for before, after in pairwise(found)]
     assert found[0] == 6
     assert waits[:3] == [12, 24, 48]
-    assert set(waits[3:]) == {PATIENCE_MAX_NS // S}
+    assert set(waits[3:]) == {SESSION_INTERVAL_MAX_NS // S}
 
 
 def test_answering_node_is_not_unresponsive() -> None:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-from companion.pipeline.fleet.duties import NEW_NODE_DELAY_NS, SETTLED_NS, Duties, Handover
+from companion.pipeline.fleet.duties import CLAIM_DELAY_NS, SETTLED_NS, Duties, Handover
 from companion.values import Standing
 
 MS = 1_000_000
@@ -136,7 +136,7 @@ def test_second_node_serves_what_the_assigned_node_does_not() -> None:
         pair.nodes["b"].hear(pair.now_ns, said("a"))
         pair.nodes["b"].decide(pair.now_ns, pair.offers, frozenset("a"))
     assert list(pair.nodes["b"].serves) == ["1:1"]
-    assert NEW_NODE_DELAY_NS < LEASE_NS
+    assert CLAIM_DELAY_NS < LEASE_NS
 
 
 def said(node: str, *serves: tuple[str, float]) -> Standing:

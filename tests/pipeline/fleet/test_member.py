@@ -5,7 +5,7 @@ import struct
 from pymavlink.dialects.v20 import common
 
 from companion.pipeline.fleet.member import FORGET_NS, GONE_MAX, NODES_MAX, FleetMember
-from companion.pipeline.fleet.trust import CONTRADICTIONS, SILENT_AFTER_NS, Witness
+from companion.pipeline.fleet.trust import CONTRADICTIONS, PHANTOM_AFTER_NS, Witness
 from companion.settings.fleet import FleetSettings
 from companion.values import Offer, Shared, SharedFrame, Standing
 
@@ -111,7 +111,7 @@ def test_unconfirmed_vehicle_is_reported_with_its_node() -> None:
     own = Witness((0.0, 0.0, 0.0), 1000.0, frozenset())
     offer = Offer(uav="66:1", sure_db=None, likely_db=None, sinr_db=None, heard_s=0.1)
     said = []
-    for now_ns in range(START_NS, START_NS + 2 * SILENT_AFTER_NS, S):
+    for now_ns in range(START_NS, START_NS + 2 * PHANTOM_AFTER_NS, S):
         node.take_standing(now_ns, standing("b"))
         node.take_offers(now_ns, "b", (offer,))
         places = {"66:1": (300.0, 0.0, 0.0)}

@@ -5,7 +5,7 @@ from collections import Counter
 from companion.pipeline.fleet.trust import (
     CONTRADICTIONS,
     EXCLUDED_NS,
-    SILENT_AFTER_NS,
+    PHANTOM_AFTER_NS,
     Trust,
     UnconfirmedVehicle,
     Witness,
@@ -56,7 +56,7 @@ def test_node_sharing_only_unconfirmed_vehicles_is_excluded() -> None:
         UnconfirmedVehicle("67:1", "b", (0.0, 400.0, 0.0)),
     ]
     far = Witness((5000.0, 0.0, 0.0), 1000.0, frozenset())  # it receives nothing and cannot confirm
-    said = look(trust, phantoms, {"a": HERE, "c": far}, SILENT_AFTER_NS // S + 2)
+    said = look(trust, phantoms, {"a": HERE, "c": far}, PHANTOM_AFTER_NS // S + 2)
     assert len(said) == 1
     assert "node b is excluded for 5 minutes" in said[0]
     assert "66:1, 67:1" in said[0]

@@ -84,8 +84,8 @@ def directions_ahead(
     """Return unit directions (T, 3) of a UAV at times after the track's own; None without velocity.
 
     Track and carrier are extrapolated at their velocities, the track also with its acceleration,
-    and the carrier at its body rates. Boresight is returned where the UAV would be at the array
-    itself.
+    and the carrier at its body rates. The result is valid while these motions continue. Boresight
+    is returned where the UAV would be at the array itself.
     """
     velocity, own = track.velocity_ned_mps, carrier.velocity_ned_mps
     if velocity is None or own is None:

@@ -57,7 +57,7 @@ class Part(NamedTuple):
 
 
 class Hole(NamedTuple):
-    """Gap in a recording: ``events`` events before ``t_ns`` were not recorded."""
+    """Gap: ``events`` events before ``t_ns``, and after the last one written, were not recorded."""
 
     t_ns: int
     events: int

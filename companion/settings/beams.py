@@ -123,7 +123,7 @@ class BeamSettings(Section):
                            the link needs ([link] needed_db), most of which nulls may cost
         power              how beams share the power: "equal", "max-min" (largest minimum SINR),
                            "weighted-sum" (of rates); unset: as the normalisation scales them. If
-                           set, the default of ``normalisation`` is "total"
+                           set, ``normalisation`` must be "total" (then the default) or "antenna"
         rate_weights       weight of a UAV's rate for "weighted-sum", by UAV id; 1 for the others
 
     ``condition_limit`` is at most 1000: up to there the zero-forcing identity holds to 1e-9, and

@@ -141,7 +141,10 @@ def text_of(settings: Settings, file: NamedFile) -> str | None:
 
 
 def _content(settings: Settings, file: NamedFile) -> bytes | None:
-    """Return a named file's bytes, from the settings or else from disk; None if none is named."""
+    """Return a named file's bytes, from the settings or else from disk; None if none is named.
+
+    Raises ``ConfigError``.
+    """
     path = _path(settings, file)
     if path is None:
         return None

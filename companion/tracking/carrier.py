@@ -123,7 +123,7 @@ APART_MAX_S: Final = 1.0  # longest time between two attitudes that are compared
 def contradiction(
     before: Attitude, after: Attitude, apart_s: float, bounds: AttitudeBounds
 ) -> Contradiction | None:
-    """Check whether an attitude contradicts the previous one by more than both errors allow.
+    """Return how an attitude contradicts the previous one beyond both errors; else None.
 
     Each is extrapolated to the other's time at its own rates: forward reveals a wrong angle,
     backward a wrong rate. ``apart_s`` is positive.

@@ -30,7 +30,8 @@ An aircraft's displacement hardly ever reaches the largest possible value.
 COMMON_ERROR: Final = 0.07
 """Usual share of the noise bound that all reports have in common, so that none reveals it."""
 COMMON_ERROR_REFUTED: Final = 0.82
-"""Usual common share of the noise bound for a receiver that deviates: 2.45 of 3 deviations."""
+"""The same for a receiver that deviates: 95 % of plane errors are within 2.45 of the bound's 3
+deviations."""
 NOTICE_RATIO: Final = 1.25  # increase after which a deviation is reported again
 
 

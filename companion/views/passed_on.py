@@ -81,7 +81,10 @@ class Positions:
         relative_alt_m: float | None,
         velocity_ned_mps: tuple[float, float, float],
     ) -> Outgoing:
-        """Return a track as UTM_GLOBAL_POSITION; its height needs a known undulation."""
+        """Return a track as UTM_GLOBAL_POSITION.
+
+        Its height is above the ellipsoid, so it is given only with a known undulation.
+        """
         known = pipeline.settings.observer.geoid_m is not None
         undulation_m, off_m = _geoid(pipeline) if known else (0.0, 0.0)
         lat_deg, lon_deg, alt_m = place

@@ -220,7 +220,8 @@ def listed(
 ) -> Array:
     """Build an array from positions (M, 3), facing ``outward`` (M, 3) (None: boresight).
 
-    Raises ``UserError`` for two elements at the same position.
+    Raises ``UserError`` for two elements at the same position, which would be one element wired
+    twice.
     """
     wavelength_m = _wavelength_m(len(elements_m), frequency_hz, 1.0)
     if elements_m.ndim != 2 or elements_m.shape[1] != 3 or not np.isfinite(elements_m).all():

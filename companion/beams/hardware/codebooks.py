@@ -26,7 +26,8 @@ RESPONSES_MAX: Final = 2**18
 MOST_TERMS: Final = 2**26
 """Limit on beams times cells times elements per query, for arrays above 256 elements."""
 MOST_TERMS_AT_FIRST: Final = 2**30
-"""Limit on beams times cells times elements in the first round of a query: half a second."""
+"""Limit on beams times cells times elements in the first round of a query: half a second. Beyond
+it, all beams must be swept."""
 MOST_ENTRIES: Final = 2**22  # elements times beams of a codebook: 64 MB
 BLOCK: Final = 2**19
 """Beams times cells, or beams times directions, computed at once: some tens of megabytes."""

@@ -39,7 +39,8 @@ Between samples the loss may be half a decibel more, rarely larger.
 PROTECTION_MARGIN: Final = 1.15
 """Margin of the protected least gain over the least useful gain, because samples are finite."""
 REDUCTION_EXPONENT: Final = 6.0
-"""Exponent of the ratio to ``PROTECTION_MARGIN`` by which a smaller least gain may be reduced."""
+"""Exponent of the ratio of a smaller least gain to the protected gain, by which that gain is
+reduced."""
 TOLERATED_DIP: Final = 0.05
 """Relative depth of a dip below the protected gain that is tolerated: some .15 dB."""
 NEGLIGIBLE_GAIN: Final = 1e-9  # gain that counts as 0

@@ -52,13 +52,10 @@ Notify = Callable[[Notice], None]
 
 
 class MessageSigning(Protocol):
-    """Interface of one link's message signing (https://mavlink.io/en/guide/message_signing.html)."""
+    """Interface of a link's message signing (https://mavlink.io/en/guide/message_signing.html)."""
 
     def refusal(self, frame: Frame) -> Reason | None:
-        """Return why a frame must be rejected; None to accept. Called once per frame, in order.
-
-        Called once per frame, in order.
-        """
+        """Return why a frame must be rejected; None to accept. Called once per frame, in order."""
 
     def sign(self, raw: bytes, now_ns: int) -> bytes:
         """Return a packed MAVLink 2 frame with its signature appended."""
@@ -66,6 +63,8 @@ class MessageSigning(Protocol):
 
 class Link:
     """One link of the service, of any scheme.
+
+    Call ``open`` for early errors, then ``run`` until cancelled.
 
         receive        called on the event loop with the frames and rejections of each datagram or
                        read

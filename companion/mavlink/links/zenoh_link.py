@@ -88,7 +88,10 @@ class ZenohLink:
 
 
 def configuration(url: LinkUrl) -> BusConfig:
-    """Return the configuration: peer if it listens, else client: routers do not serve peers."""
+    """Return the configuration: peer if it listens, else client.
+
+    No router forwards what peers publish.
+    """
     options = [option.partition("=") for option in url.path.split("&")]
     listen = tuple(value for name, _, value in options if name == "listen")
     connect = tuple(value for name, _, value in options if name == "connect")

@@ -44,7 +44,10 @@ class Unanswered:
         self._since.pop(node, None)
 
     def gone(self, now_ns: int, heard_ns: Mapping[str, int]) -> list[str]:
-        """Return nodes without a recent message; ``heard_ns`` is when each was last received."""
+        """Return nodes with neither a liveliness token nor a message within ``patience_ns``.
+
+        heard_ns  when each node was last received
+        """
         before_ns = now_ns - self._patience_ns
         return [n for n, at_ns in heard_ns.items() if n not in self.alive and at_ns < before_ns]
 

@@ -209,7 +209,8 @@ class LiveFleetNode:
         duty, notices = self.member.decide(now_ns)
         if duty is not None:
             self._step(duty)
-            self._publish_standing(now_ns)  # at once, not with the next one
+            # at once: until then two nodes serve a UAV that was handed over
+            self._publish_standing(now_ns)
         self._notify_all(notices)
 
     def _publish_received(self, now_ns: int) -> None:

@@ -123,7 +123,8 @@ class FleetMember:
         self, node: str, started_ns: int, sent_ns: int, received_ns: int, remote_ns: int
     ) -> list[Notice]:
         """Process a reading of another node's clock, between two times of this node's clock."""
-        known = self.neighbours.get(node)  # no sign of life: Zenoh's threads answer
+        # an answer proves no life: Zenoh's threads give it even if the node hangs
+        known = self.neighbours.get(node)
         if known is None:
             return []
         if known.started_ns != started_ns:  # a restarted node has another timeline

@@ -21,7 +21,8 @@ from companion.values import Offer, RoundTrip, Standing
 DRIFT_MAX: Final = 200e-6
 """Largest drift between two nodes' clocks, a ratio: two ordinary crystals, disciplined or not."""
 ANSWERS: Final = 3
-"""Number of clock answers after which a node's frames are used; the first answers are slow."""
+"""Clock answers after which a node's frames are used: a sender's clock keeps its largest doubt, and
+the first answer is slow."""
 DELAYS_KEPT: Final = 4096
 DELAYS_WINDOW_NS: Final = 60_000_000_000  # time for which delays of reports are kept
 NOTICED_OFFSET_NS: Final = 100_000_000
@@ -50,7 +51,7 @@ class NeighbourClock:
         self._answers = 0
 
     def note_answer(self, sent_ns: int, received_ns: int, remote_ns: int) -> DriftProven | None:
-        """Process a reading of the other clock; return the contradiction that it proves."""
+        """Process a reading of the other clock; return the contradiction it proves, or None."""
         self._newest_ns = remote_ns
         self._answers += 1
         return self._evidence.add(Interval(remote_ns, sent_ns - remote_ns, received_ns - remote_ns))

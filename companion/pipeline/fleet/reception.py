@@ -70,9 +70,10 @@ class Reception:
     """Reception of frames, and selection of the shared frames for the pipeline.
 
     ``contradicted`` and ``early`` contain names of nodes whose frames contradict those of this or
-    another node, or come too early; the reader clears them. ``behind_ns`` is the age of this node's
-    newest frame when it was read: a vehicle whose reports are still queued here is not silent.
-    Otherwise an overloaded node would also use all shared frames, and be more overloaded.
+    another node, or arrive before they can have been received; the reader clears them.
+    ``behind_ns`` is the age of this node's newest frame when it was read: a vehicle whose reports
+    are still queued here is not silent. Otherwise an overloaded node would also use all shared
+    frames, and be more overloaded.
     """
 
     def __init__(self) -> None:

@@ -135,7 +135,7 @@ class Trust:
 
 
 def _should_receive(witness: Witness, told: UnconfirmedVehicle) -> bool:
-    """Return whether a vehicle is at a position where this node receives everything."""
+    """Return whether a vehicle is at a position where the witness should receive every vehicle."""
     away_m = math.dist(witness.place_ned_m, told.position_ned_m)
     return away_m < REACH_SHARE * witness.reach_m
 

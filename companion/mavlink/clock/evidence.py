@@ -70,10 +70,7 @@ class OffsetEvidence:
         return max(self._drift_max, faded)
 
     def add(self, new: Interval) -> DriftProven | None:
-        """Add evidence. Return the drift that it proves; None if it agrees with earlier evidence.
-
-        Return the drift that it proves; None if it agrees with earlier evidence.
-        """
+        """Add evidence. Return the drift it proves; None if it agrees with earlier evidence."""
         before = self._known
         if before is None:
             self._known = new

@@ -183,10 +183,7 @@ class Floor:
         return -np.inf
 
     def _all_late(self, spell: LateSpell) -> None:
-        """Report a spell of late frames once; restart the line at their height if it lasts.
-
-        Restart the line at their height when it has lasted.
-        """
+        """Report a spell of late frames once; restart the line at their height if it lasts."""
         if spell.is_news:
             rise_ns = spell.height - max(self._line, self._upper_bound)
             self.rise_ns = rise_ns if rise_ns > LEAST_CHANGE_NS else 0.0

@@ -81,10 +81,7 @@ def address_text(address: Address | None) -> str:
 
 
 def settle(lost: asyncio.Future[Exception], why: Exception) -> None:
-    """Record why a connection is lost: only the first reason, and none after a cancellation.
-
-    Only the first reason counts, and none after a cancellation.
-    """
+    """Record why a connection is lost: only the first reason, and none after a cancellation."""
     if not lost.done():
         lost.set_result(why)
 

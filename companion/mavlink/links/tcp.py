@@ -192,10 +192,7 @@ class _Stream(asyncio.Protocol):
         return self._transport.get_write_buffer_size() / WRITE_BUFFER_BYTES
 
     def abort(self) -> None:
-        """Close the connection and discard unsent bytes; if it is not yet made, on connect.
-
-        At once on connect if it is not yet made.
-        """
+        """Close the connection and discard unsent bytes; if not yet made, close it on connect."""
         self._is_accepted = False
         if self._transport is not None:
             self._transport.abort()

@@ -91,10 +91,7 @@ def _readiness(sock: socket.socket) -> Iterator[int]:
 
 
 class UdpIn:
-    """UDP link that listens. One socket serves all senders, whose addresses are the keys.
-
-    One socket serves all senders; their addresses are the keys.
-    """
+    """UDP link that listens. One socket serves all senders, whose addresses are the keys."""
 
     def __init__(self, url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> None:
         self._url = url
@@ -138,10 +135,7 @@ class UdpIn:
         return True
 
     def fullness(self, key: Hashable) -> float:
-        """Return 1 if the system would not accept a datagram now, else 0; alike for all peers.
-
-        The same for all peers.
-        """
+        """Return 1 if the system would not accept a datagram now, else 0; alike for all peers."""
         return 0.0 if self._socket is None else _fullness(self._socket)
 
 

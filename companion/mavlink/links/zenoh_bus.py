@@ -45,9 +45,9 @@ class BusStatus:
 
 
 def open_peer(config: BusConfig) -> "zenoh.Session":
-    """Open a peer's Zenoh session before the event loop runs; blocks. ``UserError`` as ``open``.
+    """Open a peer's Zenoh session before the event loop runs; blocks.
 
-    Raises ``UserError`` as ``open``.
+    Raises ``UserError`` as ``Bus.open``.
     """
     with needs("zenoh", "fleet", "Zenoh"):
         import zenoh

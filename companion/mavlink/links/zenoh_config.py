@@ -67,7 +67,7 @@ class BusConfig:
 
 
 def sections(config: BusConfig) -> dict[str, str]:
-    """Return Zenoh's configuration as JSON5 by path; ``UserError`` if a file cannot be read.
+    """Return Zenoh's configuration as JSON5, by path.
 
     Raises ``UserError`` if a file cannot be read.
     """

@@ -1,7 +1,4 @@
-"""Requests to all autopilots for message rates; ``rate_watch`` handles one message of one UAV.
-
-``rate_watch`` decides about one message of one UAV.
-"""
+"""Requests to all autopilots for message rates; ``rate_watch`` handles one message of one UAV."""
 
 from collections import deque
 from collections.abc import Iterable

@@ -65,10 +65,7 @@ class AircraftJson(ForeignSplitter):
         return self._aircraft(t_ns, message)
 
     def _is_news(self, message: AircraftState, true_at: float) -> bool:
-        """Return whether a position is newer than the last one read, by ages in tenths of seconds.
-
-        Ages are in tenths of seconds.
-        """
+        """Return whether a position is newer than the last read, by ages in tenths of seconds."""
         before = self._true_at.pop(message.icao, None)
         self._true_at[message.icao] = true_at
         if len(self._true_at) > AIRCRAFT_MAX:

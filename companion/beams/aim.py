@@ -264,7 +264,7 @@ def _usual_rad(
     """Return the estimated 95th percentile of the direction error.
 
     Errors of positions and of the attitude are independent, so they add as squares. An unknown
-    error is estimated as ``UNKNOWN_SHARE`` of their bounds (docs/math.md 5.3).
+    error is estimated as ``UNKNOWN_SHARE`` of its bound (docs/math.md 5.3).
     """
 
     def usual(known: float | None, bound: float) -> float:

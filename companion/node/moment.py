@@ -37,7 +37,7 @@ def look(
         settings  as for a replay
         at        seconds from the log's first event, or a date and time with zone (RFC 3339),
                   by the node's wall clock
-        lead_s time from ``at`` until the beams are applied
+        lead_s    time from ``at`` until the beams are applied
         progress  called occasionally with seconds of log
         latency_s as for a replay
 

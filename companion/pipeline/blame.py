@@ -190,7 +190,8 @@ def _age_cause(track: Track) -> Blame:
     return Blame(
         Cause.AGILE,
         f"it may accelerate by up to {track.limits.acceleration_max_mps2:.0f} m/s²",
-        "raise `[presence] position_hz`, or lower `[observer] acceleration_max_mps2` to its limit",
+        "raise `[presence] position_hz`, or lower `[observer] acceleration_max_mps2` to what the"
+        " UAV can do",
     )
 
 

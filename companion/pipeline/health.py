@@ -197,8 +197,7 @@ class HealthMonitor:
         return Level.WEAK if enough(likely_db, Level.WEAK) else Level.NONE
 
     def _with_hold_time(self, fresh: Verdict) -> Verdict:
-        """Return the new verdict, or the current level with the new values until the hold time
-        ends."""
+        """Return the new verdict; until its hold time ends, with the current level."""
         uav, held = fresh.uav, self.verdicts.get(fresh.uav)
         if held is None:
             return fresh
@@ -221,6 +220,7 @@ class HealthMonitor:
         return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
 
     def _notices(self, update: Update) -> list[Notice]:
+        """Return notices of changed verdicts; one for all links if the carrier is the cause."""
         before, self._noticed = self._noticed, self.verdicts
         was, self._unfit = self._unfit, update.unfit
         if update.unfit is not None:

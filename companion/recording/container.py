@@ -174,6 +174,7 @@ class Walk:
             yield from self._in_chunk(_HEADER.pack(opcode, len(body)) + body)
 
     def _in_chunk(self, data: bytes) -> Iterator[Content]:
+        """Yield the wanted messages of a chunk; store its schemas and channels."""
         channels, topics = self.channels, self._topics
         orphaned = 0
         for opcode, body in _split(data):

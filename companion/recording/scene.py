@@ -70,8 +70,7 @@ class Scene:
         ]
 
     def origin(self, t_ns: int, lat_deg: float, lon_deg: float, alt_m: float) -> Any:
-        """Return ``foxglove.FrameTransform``: position and orientation of the map's origin on the
-        Earth.
+        """Return ``foxglove.FrameTransform`` of the map's origin on the Earth.
 
         Degrees and metres; the parent is the Earth-fixed frame (EPSG 4978). Heights above sea level
         are used as heights above the ellipsoid, as everywhere here.
@@ -81,8 +80,7 @@ class Scene:
         return _transform(timestamp(t_ns), FRAME_ID, MAP, stands, ecef_from_map)
 
     def picture(self, update: Update) -> Any:
-        """Return ``foxglove.SceneUpdate``: an entity for each UAV (position and bound) and for each
-        beam."""
+        """Return ``foxglove.SceneUpdate`` with an entity per UAV (position, bound) and per beam."""
         entities = [self._uav(track, update.t_ns) for track in update.tracks]
         if update.carrier is not None and update.beams.beams:
             entities += self._beams(update, update.carrier)
@@ -108,8 +106,7 @@ class Scene:
         return entity
 
     def _beams(self, update: Update, carrier: Carrier) -> Iterator[Any]:
-        """Yield cones from the array to the range of each UAV, as wide as its beam at half
-        power."""
+        """Yield half-power cones from the array to the range of each UAV."""
         towards = directions(update.beams)
         map_from_array = ENU_FROM_NED @ carrier.body_from_local.T @ self.array.array_from_body.T
         begin = ENU_FROM_NED @ line_of_sight.place_ned_m(carrier, self.array)

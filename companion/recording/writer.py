@@ -77,7 +77,7 @@ class Writer:
                        if that exists; or, if the name ends in ``.mcap``, the file itself, which
                        replaces an existing one on ``close``
         settings_toml  the settings, attached to the file
-        files files that the settings name, attached before the settings; by attachment
+        files          files that the settings name, attached before the settings; by attachment
         versions       versions of programs, as a metadata record
         weights_hz     as for ``Encoder``
         started_ns     start of the recording

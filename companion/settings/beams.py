@@ -89,7 +89,7 @@ class ArraySettings(Section):
         listed = self.positions is not None or self.positions_m is not None
         if (self.kind is ArrayKind.LIST) != listed:
             raise UserError(
-                'kind = "list" needs positions or positions_m; other kinds need neither'
+                'kind = "list" needs positions or positions_m; with other kinds leave both out'
             )
         if self.kind is ArrayKind.URA and self.rows * self.columns > 4096:
             raise UserError("too many elements: rows x columns must be at most 4096")
@@ -97,7 +97,7 @@ class ArraySettings(Section):
 
 
 class BeamSettings(Section):
-    """Settings of when and how weights are computed, and of the fallback if gain is lost.
+    """When and how weights are computed, and the fallback where zero forcing costs too much gain.
 
         update_hz          rate at which weights are computed for recordings and the dashboard; for
                            an HTTP request, weights are computed for the time that it asks for
@@ -118,9 +118,10 @@ class BeamSettings(Section):
                            within the pointing bound; "guarantee", for the bound: the largest least
                            gain within it; "no", sharp. Earlier settings' true means "guarantee",
                            false "no"
-        floor_db           that floor, over an isotropic element, where it leaves 3 dB to the best;
-                           it is relaxed as it gets further out of reach. Unset: 2.9 dB more than
-                           the link needs ([link] needed_db), most of which nulls may cost
+        floor_db           gain floor of "likely" beams, over an isotropic element; at least 3 dB
+                           below the best possible, and relaxed where it cannot be reached. Unset:
+                           2.9 dB more than the link needs ([link] needed_db), most of which nulls
+                           may cost
         power              how beams share the power: "equal", "max-min" (largest minimum SINR),
                            "weighted-sum" (of rates); unset: as the normalisation scales them. If
                            set, ``normalisation`` must be "total" (then the default) or "antenna"

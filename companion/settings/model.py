@@ -128,11 +128,11 @@ class Settings(Section):
         for file in NAMED_FILES:
             if file.key in (keys := _table(found, file.section)):
                 if file.attachment not in attached:
-                    raise _missing_files(where, file.setting)
+                    raise _missing_file_error(where, file.setting)
                 keys[file.key] = file.attachment
                 files[file.attachment] = attached[file.attachment]
         if "positions" in _table(found, "array"):  # recordings have ``positions_m`` instead
-            raise _missing_files(where, "array.positions")
+            raise _missing_file_error(where, "array.positions")
         return cls._from_sections(found, where).with_files(files)
 
     @classmethod
@@ -208,7 +208,7 @@ def _table(found: dict[str, Any], section: str) -> dict[str, Any]:
     return keys if isinstance(keys, dict) else {}
 
 
-def _missing_files(where: str, setting: str) -> ConfigError:
+def _missing_file_error(where: str, setting: str) -> ConfigError:
     return ConfigError(
         f"{where}: file of {setting} is not in the recording; give the settings with --config"
     )

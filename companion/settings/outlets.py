@@ -68,8 +68,8 @@ class DriveSettings(Section):
 
     target    as for ``companion drive``, such as rotctld:HOST:PORT; None: no device
     uavs      UAVs to follow, highest priority first; empty: [beams] priority, then any UAV
-    aim "first": the first UAV with a beam; "centre": a mount points at the centre of
-              all that have one
+    aim       "first": the first UAV with a beam; "centre": a mount points at the centre of all
+              that have one
     on_stale  state of the device without beams, and after the end
     """
 

@@ -76,7 +76,8 @@ def refusal(predicted: Prediction, fix: Fix, lead_m: float = 0.0) -> tuple[Reaso
     if abs(down) > limit_m:
         return (
             Reason.ALTITUDE_JUMP,
-            f"{-down:+.1f} m above the prediction, at most {limit_m:.1f} m possible",
+            f"{abs(down):.1f} m {'above' if down < 0 else 'below'} the prediction,"
+            f" at most {limit_m:.1f} m possible",
         )
     return None
 

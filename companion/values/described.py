@@ -50,7 +50,7 @@ class Meaning:
     example     for the OpenAPI document
     wire        protobuf type, if it differs from the rule of ``companion.recording.fields``
     absent      outputs that omit it, each with the reason
-    deprecated replacement: the value is removed in the next version
+    deprecated  replacement; the value is removed in the next version
     """
 
     text: str

@@ -44,7 +44,7 @@ class UavKind(Enum):
         prefix         prefix of its ids, before a colon; empty for SYSID:COMPID
         pattern        regular expression of its ids
         may_be_manned  whether an aircraft of this kind may carry people
-        rank its position in this order, from 0
+        rank           its position in this order, from 0
 
     Only a vehicle reports itself: it has a MAVLink source, a link and a clock of its own.
     """

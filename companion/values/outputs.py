@@ -31,7 +31,7 @@ class Notice:
 class Update:
     """Tracks of all UAVs at the time of use, with their beams.
 
-    carrier position of the array; None while unknown, and then there are no beams
+    carrier  position of the array; None while unknown, and then there are no beams
     """
 
     t_ns: int  # when the update was computed, node time

@@ -23,7 +23,7 @@ def gains_db(pipeline: Pipeline, equipment: Equipment, update: Update) -> list[f
     weights = _radiated(pipeline, equipment, update)
     if weights is None:
         return [None] * len(update.beams.beams)
-    return list(_minimum_db(pipeline, update, directions(update.beams), weights)[1])
+    return list(_bounds_and_gains_db(pipeline, update, directions(update.beams), weights)[1])
 
 
 def of_beams(
@@ -42,7 +42,7 @@ def of_beams(
     weights = _radiated(pipeline, equipment, update)
     if weights is None:
         return [None] * len(beam_set.beams), [None] * len(beam_set.beams)
-    bounds, gains_db = _minimum_db(pipeline, update, towards, weights)
+    bounds, gains_db = _bounds_and_gains_db(pipeline, update, towards, weights)
     known = [i for i, gain_db in enumerate(gains_db) if gain_db is not None]
     unknown: list[float | None] = [None] * len(bounds)
     if not known or len(bounds) > SINR_BEAMS_MAX or update.carrier is None:
@@ -66,7 +66,7 @@ def of_beams(
     return gains_db, unknown
 
 
-def _minimum_db(
+def _bounds_and_gains_db(
     pipeline: Pipeline, update: Update, towards: FloatArray, weights: ComplexArray
 ) -> tuple[Sequence[float | None], Sequence[float | None]]:
     """Return each pointing bound, None if it leaves the coverage, and the least gain within, dB."""

@@ -170,6 +170,7 @@ def _place(pipeline: Pipeline, track: Track) -> tuple[float, float, float]:
 def _velocity_ned_mps(
     pipeline: Pipeline, track: Track, place: tuple[float, float, float]
 ) -> tuple[float, float, float] | None:
+    """Return the velocity in north-east-down at the aircraft, from the local frame; else None."""
     if track.velocity_ned_mps is None or pipeline.local is None:
         return None
     there_from_local = pipeline.local.local_from_ned(place[0], place[1]).T

@@ -73,7 +73,9 @@ def test_rejection_states_deviation_and_limit(fix: MakeFix) -> None:
     found = refusal(PREDICTED, fix(0, [130, 40, -50], noise=NOISE))
     assert found == (Reason.UNREACHABLE, "50.0 m from the prediction, at most 13.0 m possible")
     found = refusal(PREDICTED, fix(0, [100, 0, -90], noise=NOISE))
-    assert found == (Reason.ALTITUDE_JUMP, "+40.0 m above the prediction, at most 6.0 m possible")
+    assert found == (Reason.ALTITUDE_JUMP, "40.0 m above the prediction, at most 6.0 m possible")
+    found = refusal(PREDICTED, fix(0, [100, 0, -10], noise=NOISE))
+    assert found == (Reason.ALTITUDE_JUMP, "40.0 m below the prediction, at most 6.0 m possible")
 
 
 @pytest.mark.parametrize(

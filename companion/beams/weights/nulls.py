@@ -153,7 +153,9 @@ def _correction(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) 
 def _allowed_share(
     spread: Spread, taken: ComplexArray, known: tuple[ComplexArray, FloatArray], least: FloatArray
 ) -> FloatArray:
-    """Return the largest share (N,) of nulls that leaves each place its least gain (N, P); 0: any.
+    """Return the largest share (N,) of the correction that leaves each place its least gain.
+
+    least  (N, P), least gains; 0 does not limit
 
     With the share t of the correction, the gain at a place is a ratio of two quadratics in t,
 

@@ -271,7 +271,7 @@ def _mmse_loading(
 ) -> FloatArray:
     """Return the loading of each user for the least mean square error at its power share.
 
-    Shares are equal, or the uplink shares that maximises the worst rate or the weighted sum.
+    Shares are equal, or the uplink shares that maximise the worst rate or the weighted sum.
     """
     if radio is None:
         raise ValueError("MMSE needs the radio parameters")

@@ -136,8 +136,8 @@ def phases_rad(
         across    the aperture
         cones     (N, D), widths of the bound on each axis
         likely    (N, D), widths of the likely error; None: only the bound counts
-        floor_db  least gain wanted over the cone, over an isotropic element; it limits the loss,
-                  which is at least the least of ``losses``
+        floor_db  least gain wanted over the cone, over an isotropic element; not above the best
+                  possible gain less the least of ``losses``
         worth_db  least useful gain: a floor below it is given up
 
     The phases are continuous in all arguments, and 0 where the widths are 0.

@@ -74,7 +74,7 @@ class SalehValenzuela:
 
     @property
     def shares(self) -> tuple[float, float]:
-        """Return K/(K+1) and 1/(K+1): mean power of the line of sight and of scattered rays."""
+        """K/(K+1) and 1/(K+1): mean power of the line of sight and of the scattered rays."""
         log_k = self.rician_k_db * math.log(10) / 10
         return (
             math.exp(-float(np.logaddexp(0.0, -log_k))),

@@ -21,8 +21,8 @@ Address = tuple[Any, ...]  # a socket address as the system writes it: for IPv6 
 class Upcalls(NamedTuple):
     """Callbacks by which an endpoint reports events to its link.
 
-    take      a peer, by the endpoint's key for it, sent bytes; the last argument is their age by
-              the system's time stamp, ns, or None without a stamp
+    take      a peer sent bytes: its key, the bytes, and their age by the system's time stamp, ns
+              (None without a stamp)
     stale     bytes of a peer that waited too long to be used
     """
 

@@ -181,6 +181,7 @@ def _within(
 
 
 def _contradicts_stretch(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> bool:
+    """Return whether a report between the stamps of two others cannot be from their sender."""
     stretch_ms = last.boot_ms - first.boot_ms
     if stretch_ms > STRETCH_MS:
         return False

@@ -148,6 +148,8 @@ class Duties:
         standing: Mapping[str, Standing],
         offers: Mapping[str, Mapping[str, float]],
     ) -> None:
+        """Drop UAVs that another node took over, holds by a better claim, or that no node can
+        serve."""
         for uav in [uav for uav in self.serves if uav in claims]:
             rivals = {
                 node: worth
@@ -168,6 +170,8 @@ class Duties:
     def _hand_over(
         self, now_ns: int, wanted: Mapping[str, str], offers: Mapping[str, Mapping[str, float]]
     ) -> None:
+        """Announce the new node of UAVs assigned elsewhere for ``SETTLED_NS``, or out of reach
+        here."""
         for uav in self.serves:
             to = wanted.get(uav, self._name)
             if to == self._name:
@@ -190,6 +194,7 @@ class Duties:
         standing: Mapping[str, Standing],
         offers: Mapping[str, Mapping[str, float]],
     ) -> None:
+        """Claim UAVs handed to this node, and unserved ones that are due."""
         mine = offers.get(self._name, {})
         handed = {uav for said in standing.values() for uav, to in said.handing if to == self._name}
         has_listened = self._begun_ns is not None and now_ns - self._begun_ns >= self._lease_ns

@@ -119,6 +119,7 @@ class Sharing:
         return Shared(now_ns, frames, trips)
 
     def _release_held(self, now_ns: int) -> None:
+        """Drop held frames that another node shared; queue those that none shared in time."""
         while self._held:
             due_ns, key, frame = self._held[0]
             speaker = self._speakers.get(frame.source)

@@ -95,6 +95,7 @@ def _timed(of: DataflashTable, lost: dict[Reason, int]) -> DataflashTable:
 
 
 def _identity(parameters: DataflashTable, versions: DataflashTable) -> tuple[int | None, int]:
+    """Return system id (None: unknown) and MAV_TYPE (0, generic: unknown)."""
     values: dict[bytes, float] = {}
     if "Name" in parameters and "Value" in parameters:
         names = np.char.rstrip(parameters.raw("Name").astype("S16"), b"\0")

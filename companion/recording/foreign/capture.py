@@ -24,10 +24,10 @@ _MAGICS: Final = (b"\xfd", b"\xfe")
 
 
 def read_capture(path: Path) -> Iterator[Event]:
-    """Yield the events of a capture; each flow is a link, such as
-    ``udp:10.0.0.2:14555>10.0.0.1:14550``.
+    """Yield the events of a capture.
 
-    Flows without a frame return nothing. Raises ``OSError`` if the file cannot be read.
+    Each flow is a link, such as ``udp:10.0.0.2:14555>10.0.0.1:14550``. Flows without a frame return
+    nothing. Raises ``OSError`` if the file cannot be read.
     """
     flows: OrderedDict[str, _Flow] = OrderedDict()
     timeline: RepairedStamps | None = None

@@ -175,6 +175,7 @@ def segment(packet: Packet) -> Segment | None:
 
 
 def _network(packet: Packet) -> int | None:
+    """Return the offset of the IP header, by link type; None for other packets."""
     data, kind = packet.data, packet.link_type
     match kind:
         case 1:  # Ethernet

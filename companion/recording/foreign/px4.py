@@ -101,6 +101,8 @@ def _timed(of: UlogTable, lost: Lost) -> UlogTable:
 
 
 def _identity(walked: ulog.UlogIndex, status: UlogTable) -> tuple[int | None, int, int]:
+    """Return system id (None: unknown), component id and MAV_TYPE, by parameters or else status."""
+
     def stated(parameter: str, column: str) -> int | None:
         value = walked.parameters.get(parameter)
         values = status.integers(column)

@@ -129,7 +129,7 @@ def peak_gain(dt_s: ArrayLike, feedthrough_s: float, l_gain: ArrayLike) -> Float
 def lmi_margin(
     dt_s: float, *, feedthrough_s: float, alpha: float, l_gain: float, mu: float, p: float
 ) -> float:
-    """Return the smallest eigenvalue of both LMIs at a solution, which it proves if >= 0.
+    """Return the smallest eigenvalue of both LMIs; a value >= 0 proves the solution.
 
     The matrices are scaled by congruence (P to 1), so that the margin is dimensionless.
     """

@@ -178,7 +178,7 @@ def _beams(
         precoder.widen,
     )
     matrix = steering.steering_matrix(array, directions) if spread is None else spread.centres
-    worths = np.array([precoder.rate_weights.get(uav, 1.0) for uav in uavs])
+    rate_weights = np.array([precoder.rate_weights.get(uav, 1.0) for uav in uavs])
     made = precode(
         matrix,
         precoder,
@@ -186,7 +186,7 @@ def _beams(
         priorities=_priorities(tracks, precoder.priority),
         radio=Radio(
             link_budget.isotropic_snr(ranges_m, array, precoder.budget, precoder.uav_antennas),
-            worths,
+            rate_weights,
         ),
         before=hysteresis.previous_slots(before, valid_at_ns, uavs),
     )

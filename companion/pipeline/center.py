@@ -74,7 +74,7 @@ class CarrierTracker:
             None  # between the newest attitude and the previous one
         )
         self._angular_acceleration = carrier.AngularAcceleration()
-        self._consistency: _AttitudeRun | None = None  # attitudes stamped earlier than the newest
+        self._older_run: _AttitudeRun | None = None  # attitudes stamped earlier than the newest
         self._least_bound_rad = math.radians(settings.center.attitude_bound_deg)
         self._estimator: EstimatorStatus | None = None
         self._doubted_rad = self._least_bound_rad  # largest bound reported so far
@@ -147,7 +147,7 @@ class CarrierTracker:
                 return None
             self._angular_acceleration = carrier.AngularAcceleration()
             self._attitude = None
-        self._consistency = None
+        self._older_run = None
         self._contradicted = self._contradicts(placed, turn_degps2)
         self._attitude = placed.sender_ns, placed.attitude
         return self._angular_acceleration.look(placed.attitude, placed.sender_ns, turn_degps2)
@@ -195,13 +195,13 @@ class CarrierTracker:
         slower link are also older, but then the newest keeps advancing meanwhile.
         """
         at = (placed.attitude.t_ns, placed.sender_ns)
-        run = self._consistency
+        run = self._older_run
         if run is not None:
             step_ns, sender_step_ns = at[0] - run.last[0], at[1] - run.last[1]
             if sender_step_ns <= 0 or abs(step_ns - sender_step_ns) > STEP_MISMATCH_MAX_NS:
                 run = None
         began_ns, count = (at[0], 0) if run is None else (run.began_ns, run.count)
-        self._consistency = _AttitudeRun(began_ns, at, count + 1)
+        self._older_run = _AttitudeRun(began_ns, at, count + 1)
         return at[0] - began_ns >= CONSISTENT_TIME_NS and count + 1 >= MIN_CONSISTENT_SAMPLES
 
     def restarted(self, uav: str) -> None:
@@ -210,7 +210,7 @@ class CarrierTracker:
             self._attitude = None
             self._contradicted = None
             self._estimator = None
-            self._consistency = None
+            self._older_run = None
             self._angular_acceleration = carrier.AngularAcceleration()
 
     def _set_origin(self, report: Report) -> Notice:

@@ -166,7 +166,7 @@ class Pipeline:
     def _frame(self, frame: Frame) -> list[Output]:
         self.frames += 1
         if frame.msgid not in DECODED:
-            change = self.senders.notice(frame) if frame.msgid in STAMPED else None
+            change = self.senders.add_stamp(frame) if frame.msgid in STAMPED else None
             return [] if change is None else self._changed(frame.t_ns, str(frame.source), change)
         heard = self.senders.hear(frame)
         if heard is NO_OUTCOME:

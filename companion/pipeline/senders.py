@@ -177,7 +177,7 @@ class Senders:
     def hear(self, frame: Frame) -> FrameOutcome:
         """Process one frame of a message that is decoded (``decode.DECODED``)."""
         if frame.msgid == ATTITUDE and frame.source != self._carrier_source:
-            change = self.notice(frame)
+            change = self.add_stamp(frame)
             return NO_OUTCOME if change is None else FrameOutcome(change=change)
         message = decode(frame)
         match message:
@@ -219,7 +219,7 @@ class Senders:
                     component.noise = noise.reported(message, self._noise_settings)
                     component.receiver = message
             case SystemTime():
-                change = self.notice(frame)
+                change = self.add_stamp(frame)
                 if message.unix_us is not None:
                     clock = self._senders[str(message.source)].clock
                     on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
@@ -234,7 +234,7 @@ class Senders:
         component.heard_ns = message.t_ns
         return component
 
-    def notice(self, frame: Frame) -> ClockChange | None:
+    def add_stamp(self, frame: Frame) -> ClockChange | None:
         """Pass the stamp of an otherwise ignored frame to its sender's clock.
 
         Returns the clock change that the stamp revealed.
@@ -242,7 +242,7 @@ class Senders:
         sender = self._senders.get(str(frame.source))
         if sender is None:
             return None
-        sender.clock.notice(frame.t_ns, boot_ms(frame))
+        sender.clock.add_stamp(frame.t_ns, boot_ms(frame))
         return sender.clock.change
 
     def round_trip(self, event: RoundTrip) -> ClockChange | None:

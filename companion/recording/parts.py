@@ -118,13 +118,13 @@ def read_recording_info(path: Path) -> RecordingInfo:
     return RecordingInfo(part, tuple(holes))
 
 
-def in_order(stories: Mapping[Path, RecordingInfo]) -> list[Path] | None:
+def in_order(infos: Mapping[Path, RecordingInfo]) -> list[Path] | None:
     """Return the parts of one run in the order of writing; None for other logs.
 
     Raises ``UserError`` if two files are the same part.
     """
-    parts = {path: story.part for path, story in stories.items() if story.part is not None}
-    if len(parts) < max(2, len(stories)) or len({part.run for part in parts.values()}) != 1:
+    parts = {path: info.part for path, info in infos.items() if info.part is not None}
+    if len(parts) < max(2, len(infos)) or len({part.run for part in parts.values()}) != 1:
         return None
     ordered = sorted(parts, key=lambda path: parts[path].number)
     for one, other in pairwise(ordered):
@@ -135,19 +135,19 @@ def in_order(stories: Mapping[Path, RecordingInfo]) -> list[Path] | None:
     return ordered
 
 
-def missing(stories: Mapping[Path, RecordingInfo], ordered: Sequence[Path]) -> list[str]:
+def missing(infos: Mapping[Path, RecordingInfo], ordered: Sequence[Path]) -> list[str]:
     """Return what a replay of some logs lacks, one line each; empty for a complete run."""
     lines = []
     before = 0
     for path in ordered:
-        story = stories[path]
-        if story.part is not None:
-            skipped = range(before + 1, story.part.number)
+        info = infos[path]
+        if info.part is not None:
+            skipped = range(before + 1, info.part.number)
             if skipped:
                 which = " to ".join(dict.fromkeys((str(skipped[0]), str(skipped[-1]))))
                 lines.append(f"{path}: part {which} of the run is missing")
-            before = story.part.number
-        for hole in story.holes:
+            before = info.part.number
+        for hole in info.holes:
             at = datetime.fromtimestamp(hole.t_ns * 1e-9, tz=UTC).isoformat(timespec="seconds")
             lines.append(f"{path}: {hole.events} events before {at} are missing: {hole.why}")
     return lines

@@ -46,7 +46,7 @@ ACCELERATION_MODELS: Final = (
 )
 """No model; quick turns, short and long; a sustained turn; a slow, noisy one; circles."""
 WINDOWS: Final = sorted(
-    {(way.window_s, way.min_velocities) for way in ACCELERATION_MODELS if way.window_s}
+    {(model.window_s, model.min_velocities) for model in ACCELERATION_MODELS if model.window_s}
 )
 """Distinct windows of the acceleration models, each with the velocities needed, ascending."""
 TURNING_MPS: Final = 1.0  # horizontal speed below which the course is undefined
@@ -79,29 +79,29 @@ class _PastPrediction:
     accelerations: tuple[Vector | None, ...]
     smoothing_offset: Vector  # of the smoothed position from the reported one
 
-    def error_m(self, way: int, there: Vector, ahead_s: float) -> float:
+    def error_m(self, model: int, there: Vector, ahead_s: float) -> float:
         """Return the distance of a model's prediction from a position reported later.
 
         Models are numbered as in ``ACCELERATION_MODELS``, then once more over smoothed positions.
         """
         (reported_m,), (smoothed_m,) = self.errors_m(
-            (way % len(ACCELERATION_MODELS),), there, ahead_s
+            (model % len(ACCELERATION_MODELS),), there, ahead_s
         )
-        return reported_m if way < len(ACCELERATION_MODELS) else smoothed_m
+        return reported_m if model < len(ACCELERATION_MODELS) else smoothed_m
 
     def errors_m(
-        self, ways: Sequence[int], there: Vector, ahead_s: float
+        self, models: Sequence[int], there: Vector, ahead_s: float
     ) -> tuple[list[float], list[float]]:
         """Return the errors of several models: over reported positions, and over smoothed ones."""
         (n, e, d), (vn, ve, vd), (tn, te, td) = self.position, self.velocity, there
         n, e, d = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
         aside_n, aside_e, aside_d = self.smoothing_offset
         reported, smoothed = [], []
-        for way in ways:
-            given, north, east, down = self.accelerations[way], n, e, d
+        for model in models:
+            given, north, east, down = self.accelerations[model], n, e, d
             if given is not None:
                 (by_n, by_e, by_d), _ = fed_forward(
-                    ACCELERATION_MODELS[way], given, self.velocity, ahead_s
+                    ACCELERATION_MODELS[model], given, self.velocity, ahead_s
                 )
                 north, east, down = north + by_n, east + by_e, down + by_d
             reported.append(math.sqrt(north * north + east * east + down * down))
@@ -255,18 +255,22 @@ class PastPredictions:
 
 
 def fed_forward(
-    way: AccelerationModel, acceleration: Vector, velocity: Vector, ahead_s: float
+    model: AccelerationModel, acceleration: Vector, velocity: Vector, ahead_s: float
 ) -> tuple[Vector, Vector]:
     """Return displacement (m) and change of velocity (m/s) by an acceleration within a time.
 
     A turn in the plane at the rate w = (v x a) / v^2 rotates the velocity by w t, and the
     displacement is the integral of that (docs/math.md 5.1).
     """
-    way_s2, gain_s = fading_response(ahead_s, way.decay_s)
+    displacement_s2, gain_s = fading_response(ahead_s, model.decay_s)
     (a, b, c), (north, east, _) = acceleration, velocity
     level = north * north + east * east
-    if not way.turns or level < TURNING_MPS**2:
-        return (way_s2 * a, way_s2 * b, way_s2 * c), (gain_s * a, gain_s * b, gain_s * c)
+    if not model.turns or level < TURNING_MPS**2:
+        return (displacement_s2 * a, displacement_s2 * b, displacement_s2 * c), (
+            gain_s * a,
+            gain_s * b,
+            gain_s * c,
+        )
     rate = (north * b - east * a) / level
     angle = min(max(rate * ahead_s, -math.pi), math.pi)
     along, across = math.sin(angle), 1.0 - math.cos(angle)
@@ -274,7 +278,7 @@ def fed_forward(
     less = ahead_s * (along / angle - 1.0 if abs(angle) > 1e-3 else -angle * angle / 6.0)
     aside = ahead_s * (across / angle if abs(angle) > 1e-3 else angle / 2.0)
     return (
-        (less * north - aside * east, less * east + aside * north, way_s2 * c),
+        (less * north - aside * east, less * east + aside * north, displacement_s2 * c),
         (-across * north - along * east, -across * east + along * north, gain_s * c),
     )
 

@@ -54,7 +54,7 @@ class Standing:
                metres; None if unknown
     reach_m    distance of the farthest UAV that it receives itself; None without one
     most       largest number of UAVs that it serves
-    serves     UAVs that it serves, each with its worth when it was claimed, dB
+    serves     UAVs that it serves, each with its value when it was claimed, dB
     handing    handovers in progress: the UAV, and the node that takes it over
     """
 

@@ -751,5 +751,5 @@ def test_precoding_receives_snr_and_rate_weight_of_each_uav(
         coverage=coverage,
     )
     (radio,) = given
-    assert radio.worths.tolist() == [1.0, 4.0]
+    assert radio.rate_weights.tolist() == [1.0, 4.0]
     assert radio.snr[0] == pytest.approx(4 * radio.snr[1])  # half the distance

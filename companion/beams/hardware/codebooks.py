@@ -23,12 +23,12 @@ from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, User
 LEVELS: Final = 12  # most rounds of splitting cells
 RESPONSES_MAX: Final = 2**18
 """Limit on beams times cells examined per query; a round that has started is completed."""
-MOST_TERMS: Final = 2**26
+TERMS_MAX: Final = 2**26
 """Limit on beams times cells times elements per query, for arrays above 256 elements."""
-MOST_TERMS_AT_FIRST: Final = 2**30
+FIRST_TERMS_MAX: Final = 2**30
 """Limit on beams times cells times elements in the first round of a query: half a second. Beyond
 it, all beams must be swept."""
-MOST_ENTRIES: Final = 2**22  # elements times beams of a codebook: 64 MB
+ENTRIES_MAX: Final = 2**22  # elements times beams of a codebook: 64 MB
 BLOCK: Final = 2**19
 """Beams times cells, or beams times directions, computed at once: some tens of megabytes."""
 RESOLUTION_S: Final = 1e-3  # precision of the time at which the best beam changes
@@ -85,8 +85,8 @@ def dft(array: Array, oversampling: int = 1) -> Codebook:
     if oversampling < 1:
         raise UserError(f"oversampling is {oversampling}, allowed: 1 or more")
     entries = array.size * math.prod(_beams(count, oversampling) for count in array.grid)
-    if entries > MOST_ENTRIES:
-        raise UserError(f"codebook has {entries} weights, allowed: at most {MOST_ENTRIES}")
+    if entries > ENTRIES_MAX:
+        raise UserError(f"codebook has {entries} weights, allowed: at most {ENTRIES_MAX}")
     down, across = (_line(count, oversampling) for count in array.grid)
     return Codebook(CodebookKind.DFT, np.kron(down, across).astype(np.complex128))
 
@@ -189,9 +189,9 @@ def candidates(
     alive = np.arange(codebook.size)
     found = np.zeros(codebook.size, dtype=bool)
     boxes = cone.first_boxes(cones)
-    if len(boxes.cone) * codebook.weights.size > share * MOST_TERMS_AT_FIRST:
+    if len(boxes.cone) * codebook.weights.size > share * FIRST_TERMS_MAX:
         return np.arange(codebook.size)
-    spent, most = 0, share * min(RESPONSES_MAX, MOST_TERMS // array.size)
+    spent, most = 0, share * min(RESPONSES_MAX, TERMS_MAX // array.size)
     for level in range(LEVELS):
         possible, seen = _possible_beams(cones, boxes, carried[:, alive])
         found[alive[seen]] = True

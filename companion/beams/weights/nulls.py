@@ -7,14 +7,14 @@ A beam g reaches the points p of the others by r_p = a_p^T g. The corrected beam
 leaves (1 - s_p) r_p there and its own points unchanged: exactly where X is 0, at the predicted
 directions, and in the least-squares sense at the points around them. Each s_p is limited by
 
-* the price: with c_p the correlation of a_p with the user's own a and q_p that with g, removing
+* the cost: with c_p the correlation of a_p with the user's own a and q_p that with g, removing
   this one alone costs the gain 1 + s^2 q^2 / (1 - c^2). Each may cost ``MAX_NULL_COST``, and
-  towards c = 1 nothing (``FULL_PRICE_DISTANCE``);
+  towards c = 1 nothing (``FULL_COST_DISTANCE``);
 * the floor: within a user's own cone at least the least gain must be left, and outside a part of it
   that decreases with the distance of the null from the cone.
 
 Finally the correction of each beam is scaled back by one factor. Then the least gain over its cone,
-and over the likely part of it, loses at most ``FLOOR_PRICE_DB`` and does not fall below the gain
+and over the likely part of it, loses at most ``FLOOR_LOSS_MAX_DB`` and does not fall below the gain
 that the link needs. A least gain below that need is of little use, and given up for the nulls. All
 of this depends continuously on the directions. See docs/math.md 5.5.
 """
@@ -27,11 +27,11 @@ from companion.beams.weights.widening import Spread
 from companion.values import BoolArray, ComplexArray, FloatArray
 
 MAX_NULL_COST: Final = 0.2  # gain that one null may cost, over the remaining gain: 0.8 dB
-FULL_PRICE_DISTANCE: Final = 0.3
-"""Distance 1 - c^2 from the user's direction at which a null may cost the full price: some .33
-natural widths. A nearer null would be ineffective, and change sign where the two directions
-cross."""
-FLOOR_PRICE_DB: Final = 2.5
+FULL_COST_DISTANCE: Final = 0.3
+"""Distance 1 - c^2 from the user's direction at which a null may cost all of
+``MAX_NULL_COST``: some .33 natural widths. A nearer null would be ineffective, and change sign
+where the two directions cross."""
+FLOOR_LOSS_MAX_DB: Final = 2.5
 """Largest loss of a beam's least gain by all its nulls, at the samples, dB.
 
 Between samples the loss may be half a decibel more, rarely larger.
@@ -105,7 +105,7 @@ def _power(columns: ComplexArray) -> FloatArray:
 def _protected_gains(least: FloatArray, worth: float) -> FloatArray:
     """Return the least gains that nulls must leave to each beam."""
     wanted = PROTECTION_MARGIN * worth
-    lowered = np.maximum(least * 10 ** (-FLOOR_PRICE_DB / 10), wanted)
+    lowered = np.maximum(least * 10 ** (-FLOOR_LOSS_MAX_DB / 10), wanted)
     lowered *= np.minimum(least / wanted, 1.0) ** REDUCTION_EXPONENT
     kept: FloatArray = np.maximum(lowered, NEGLIGIBLE_GAIN)
     return kept
@@ -120,7 +120,7 @@ def _shares(spread: Spread, kept: FloatArray, power: FloatArray) -> FloatArray:
     alike = np.abs(spread.gram[:, :: spread.each]) ** 2 / np.outer(lengths, centres)
     cost = reached**2 / np.outer(lengths, power) / np.maximum(1.0 - alike, 1e-12)
     priced = np.sqrt(MAX_NULL_COST / np.maximum(cost, MAX_NULL_COST))
-    priced *= np.minimum((1.0 - alike) / FULL_PRICE_DISTANCE, 1.0)
+    priced *= np.minimum((1.0 - alike) / FULL_COST_DISTANCE, 1.0)
     near = np.clip(1.0 - spread.outside / NULL_WIDTHS, 0.0, 1.0) ** 2
     left = np.sqrt(kept * power) * near
     floored = 1.0 - np.minimum(left / np.maximum(reached, 1e-300), 1.0)

@@ -108,11 +108,11 @@ class Radio:
     """Radio parameters of N users."""
 
     snr: FloatArray  # (N,), of an isotropic antenna that has the whole power, as a power ratio
-    worths: FloatArray  # (N,), weights of the rates
+    rate_weights: FloatArray  # (N,), weights of the rates
 
     def of(self, users: IntArray) -> "Radio":
         """Return the parameters of some of the users."""
-        return Radio(self.snr[users], self.worths[users])
+        return Radio(self.snr[users], self.rate_weights[users])
 
 
 LEAST_LOADING: Final = 1e-12
@@ -280,7 +280,7 @@ def _mmse_loading(
         case Power.MAX_MIN:
             return 1 / (snr * powers.dual_of_max_min(gram, snr))
         case Power.WEIGHTED_SUM:
-            return 1 / (snr * powers.dual_of_weighted_sum(gram, snr, radio.worths[users]))
+            return 1 / (snr * powers.dual_of_weighted_sum(gram, snr, radio.rate_weights[users]))
         case _:
             return len(users) / snr
 
@@ -300,7 +300,7 @@ def _with_power_allocation(
     if settings.power is Power.MAX_MIN:
         share = powers.max_min(coupling)
     else:
-        share = powers.weighted_sum(coupling, radio.worths[users])
+        share = powers.weighted_sum(coupling, radio.rate_weights[users])
     shared: ComplexArray = unit * np.sqrt(share)
     return shared
 

@@ -134,7 +134,7 @@ class BootLine:
         stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % _WRAP_MS
         return self._begin_new_line(rebooted=stepped_back)
 
-    def notice(self, arrival_ns: int, boot_ms: int) -> bool:
+    def add_stamp(self, arrival_ns: int, boot_ms: int) -> bool:
         """Add a stamp that cannot start a line. Return whether it lies on the current line."""
         if not self.floor.count:
             return False

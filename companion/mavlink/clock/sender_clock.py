@@ -50,8 +50,9 @@ MIN_INVISIBLE_NS: Final = 25 * _NS_PER_MS
 class SenderClock:
     """Clock of one sender, on the node's timeline.
 
-    ``observe`` takes the stamps of its reports in order of arrival, ``notice`` those of its other
-    messages. ``change`` is the clock change that the newest stamp or answer revealed, or None.
+    ``observe`` takes the stamps of its reports in order of arrival, ``add_stamp`` those of its
+    other messages. ``change`` is the clock change that the newest stamp or answer revealed, or
+    None.
     """
 
     def __init__(self, settings: ClockAssumptions | None = None) -> None:
@@ -90,10 +91,10 @@ class SenderClock:
             self._latency_s = latency_s
         return Stamp(placed.x_ns, latency_s, placed.rebooted)
 
-    def notice(self, arrival_ns: int, boot_ms: int) -> None:
+    def add_stamp(self, arrival_ns: int, boot_ms: int) -> None:
         """Add the stamp of any other message, if it lies on the line of the reports."""
         self.change = self._known = None
-        if self._line.notice(arrival_ns, boot_ms):
+        if self._line.add_stamp(arrival_ns, boot_ms):
             self._note_change()
 
     def _note_change(self, jump_ns: int = 0) -> None:

@@ -1,1 +1,1 @@
-"""UDP, TCP, serial, HTTP and Zenoh endpoints that carry MAVLink and related formats.     [shell]"""
+"""UDP, TCP, serial, HTTP and Zenoh endpoints that carry MAVLink and related formats."""

@@ -1,4 +1,4 @@
-"""Interface of a link's endpoints, and the functions that endpoints share. [shell]
+"""Interface of a link's endpoints, and the functions that endpoints share.
 
 An endpoint serves one connection after the other. ``serve`` ends with an exception, the reason,
 when a connection is lost, and is called again after a while. The endpoint reports events to its

@@ -1,4 +1,4 @@
-"""Link that polls a document over HTTP.                                                  [shell]"""
+"""Link that polls a document over HTTP."""
 
 import asyncio
 import ssl

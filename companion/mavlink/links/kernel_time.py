@@ -1,4 +1,4 @@
-"""Kernel time stamps of received datagrams: SO_TIMESTAMPNS.                                 [shell]
+"""Kernel time stamps of received datagrams: SO_TIMESTAMPNS.
 
 A datagram may wait in its socket while this process is busy. The stamp, which Linux sets on
 reception, shows how long, so that a busy host is not mistaken for a slow radio.

@@ -1,4 +1,4 @@
-"""Endpoint and splitter of each link scheme.                                             [shell]"""
+"""Endpoint and splitter of each link scheme."""
 
 from collections.abc import Callable
 

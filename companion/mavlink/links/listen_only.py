@@ -1,4 +1,4 @@
-"""Receive-only endpoints, for formats other than MAVLink.                                [shell]"""
+"""Receive-only endpoints, for formats other than MAVLink."""
 
 from collections.abc import Collection, Hashable
 

@@ -1,4 +1,4 @@
-"""Serial port of a link, by pyserial and the event loop's own readers. [shell]"""
+"""Serial port of a link, by pyserial and the event loop's own readers."""
 
 import asyncio
 import contextlib

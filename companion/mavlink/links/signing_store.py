@@ -1,4 +1,4 @@
-"""Signing keys in files, and signing timestamps that persist across runs.                   [shell]
+"""Signing keys in files, and signing timestamps that persist across runs.
 
 Without the timestamps of the last run, any recorded frame could be replayed to the next one. After
 a kill or a power loss the file lags behind: it is written every second, or every three while no

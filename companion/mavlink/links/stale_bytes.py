@@ -1,4 +1,4 @@
-"""Stale bytes of a stream, which waited while this process was suspended, as by SIGSTOP.    [shell]
+"""Stale bytes of a stream, which waited while this process was suspended, as by SIGSTOP.
 
 The bytes of a stream have no time stamps. Those that were waiting when the process resumed may be
 as old as the suspension, and must not count as just arrived.

@@ -1,4 +1,4 @@
-"""TCP endpoints of a link: a client, and a server.                                       [shell]"""
+"""TCP endpoints of a link: a client, and a server."""
 
 import asyncio
 import errno

@@ -1,4 +1,4 @@
-"""Calls from threads to the event loop: one queue, with one wake-up for all its entries. [shell]"""
+"""Calls from threads to the event loop: one queue, with one wake-up for all its entries."""
 
 import asyncio
 import threading

@@ -1,4 +1,4 @@
-"""Links that carry MAVLink and related formats.                                             [shell]
+"""Links that carry MAVLink and related formats.
 
     udpin:HOST:PORT      listen for datagrams, from any number of peers
     udpout:HOST:PORT     send datagrams to one peer, and receive its answers

@@ -1,4 +1,4 @@
-"""UDP endpoints of a link: one socket that serves all senders, or a connected one.          [shell]
+"""UDP endpoints of a link: one socket that serves all senders, or a connected one.
 
 Over 300 lines: both are read alike, and the system calls on a socket belong together.
 """

@@ -1,4 +1,4 @@
-"""Zenoh session: publications, subscriptions, queries and liveliness.                       [shell]
+"""Zenoh session: publications, subscriptions, queries and liveliness.
 
 Over 300 lines: the only file that uses Zenoh (https://zenoh.io, the extra ``[fleet]``). Its
 callbacks run on its own threads; their data are passed to the event loop. Only queries are answered

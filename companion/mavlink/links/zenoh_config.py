@@ -1,4 +1,4 @@
-"""Configuration of a Zenoh session, and its conversion to Zenoh's own.                   [shell]"""
+"""Configuration of a Zenoh session, and its conversion to Zenoh's own."""
 
 import json
 from dataclasses import dataclass

@@ -1,4 +1,4 @@
-"""Link with raw MAVLink frames over Zenoh.                                                  [shell]
+"""Link with raw MAVLink frames over Zenoh.
 
     zenoh:KEY                        through the router on this machine, tcp/127.0.0.1:7447
     zenoh:KEY?connect=ENDPOINT       through another router, or to a listening peer

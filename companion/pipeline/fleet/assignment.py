@@ -6,11 +6,11 @@ the UAVs that it serves, so one more UAV at a node with n costs all of them toge
 
     10 (n + 1) log10(n + 1) - 10 n log10(n)   dB.
 
-Starting from the current assignment, UAVs without a node are placed. Then UAVs move in rings, each
-to the node that the next one leaves, while such a ring increases the sum. Each further UAV at a
-node costs more than the one before, so this is a minimum cost flow: without an improving ring the
-assignment is optimal (Klein, "A primal method for minimal cost flows", 1967). A UAV's current node
-has a bonus of ``hysteresis_db``. The result depends on no order of arrival, chance or leader.
+Starting from the current assignment, UAVs without a node are placed. Then UAVs move in cycles,
+each to the node that the next one leaves, while such a cycle increases the sum. Each further UAV at
+a node costs more than the one before, so this is a minimum cost flow: without an improving cycle
+the assignment is optimal (Klein, "A primal method for minimal cost flows", 1967). A UAV's current
+node has a bonus of ``hysteresis_db``. The result depends on no order of arrival, chance or leader.
 """
 
 from collections.abc import Mapping
@@ -25,7 +25,7 @@ LIKELY_PENALTY_DB: Final = 10.0
 STEP_DB: Final = 0.1  # offers are rounded to steps, so that all nodes have the same numbers
 UNSERVED_DB: Final = -1e6
 """Value of not being served, dB: so low that every UAV is served if possible."""
-CYCLES_MAX: Final = 1000  # largest number of rings of moves per decision
+CYCLES_MAX: Final = 1000  # largest number of cycles of moves per decision
 ROUNDING_DB: Final = 1e-7  # a smaller gain is a rounding error
 
 
@@ -95,7 +95,7 @@ def _place(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> N
 
 
 def _improve(worth: FloatArray, room: IntArray, at: IntArray, load: IntArray) -> None:
-    """Move UAVs in rings, each to the node that the next one leaves, while the sum increases."""
+    """Move UAVs in cycles, each to the node that the next one leaves, while the sum increases."""
     for _ in range(CYCLES_MAX):
         gain, who = _gains_db(worth, at)
         left = _price_db(np.maximum(load - 1, 0))
@@ -127,7 +127,7 @@ def _gains_db(worth: FloatArray, at: IntArray) -> tuple[FloatArray, IntArray]:
 
 
 def _positive_cycle(edges: FloatArray) -> list[tuple[int, int]]:
-    """Return a ring of edges with a positive sum; empty if no such ring exists (Bellman, Ford).
+    """Return a cycle of edges with a positive sum; empty without one (Bellman, Ford).
 
     ``edges`` lead from row to column.
     """
@@ -144,8 +144,8 @@ def _positive_cycle(edges: FloatArray) -> list[tuple[int, int]]:
     at = int(np.flatnonzero(better)[0])
     for _ in range(count):
         at = int(before[at])
-    ring, end = list[tuple[int, int]](), at
-    while not ring or at != end:
-        ring.append((int(before[at]), at))
+    cycle, end = list[tuple[int, int]](), at
+    while not cycle or at != end:
+        cycle.append((int(before[at]), at))
         at = int(before[at])
-    return ring
+    return cycle

@@ -246,7 +246,7 @@ def on_sender_clock(
             clock.timesync(trip.sent_ns, trip.t_ns, trip.remote_ns)
         if not is_report[row]:
             if stamp_ms >= 0 and start_ns is not None:
-                clock.notice(arrived_ns, stamp_ms)
+                clock.add_stamp(arrived_ns, stamp_ms)
             continue
         stamp = clock.observe(arrived_ns, stamp_ms)
         estimate = clock.estimate()

@@ -1,1 +1,1 @@
-"""Work on many cores or a cluster.                                                       [shell]"""
+"""Work on many cores or a cluster."""

@@ -1,4 +1,4 @@
-"""Reader of DeepSense 6G tables: a position and the best beam for each sample.              [shell]
+"""Reader of DeepSense 6G tables: a position and the best beam for each sample.
 
 A scenario is a CSV file, or a folder with one. Positions are in the table (``unit2_pos``, two
 numbers in brackets) or in small text files that it names (``unit2_loc``), received powers per beam

@@ -475,4 +475,4 @@ def test_steering_matrix_is_not_modified() -> None:
 
 def test_subset_of_radio_keeps_snr_and_weights_of_its_users() -> None:
     part = Radio(np.array([1.0, 2.0, 3.0]), np.array([7.0, 8.0, 9.0])).of(np.array([0, 2]))
-    assert (part.snr.tolist(), part.worths.tolist()) == ([1.0, 3.0], [7.0, 9.0])
+    assert (part.snr.tolist(), part.rate_weights.tolist()) == ([1.0, 3.0], [7.0, 9.0])

@@ -169,7 +169,7 @@ def test_image_installs_and_runs_from_its_build_context(tmp_path: Path) -> None:
     code = (
         "import companion, pathlib\n"
         f"assert pathlib.Path(companion.__file__).is_relative_to({str(installed)!r})\n"
-        "from companion.server.app import web_directory\n"
+        "from companion.server.page import web_directory\n"
         f"assert web_directory().is_relative_to({str(installed)!r})\n"
         "assert (web_directory() / 'index.html').is_file()\n"
         "from companion.studies.figures.pages import page\n"

@@ -5,6 +5,7 @@ It is read by `make check` alone, and is never imported.
 
 # ruff: noqa: B018, F821
 served.should_exit  # uvicorn's server looks at it
+websocket.pending_ping_payload, websocket.pong_timer  # uvicorn's WebSocket looks at them
 made.redirect_slashes  # Starlette's router looks at it
 app.openapi  # FastAPI asks for the document by it
 message.position_covariance_type  # a field of protobuf's

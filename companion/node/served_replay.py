@@ -267,6 +267,10 @@ class ServedReplay:
         """Return nothing: a replay sends no requests."""
         return []
 
+    def notify(self, notice: Notice) -> None:
+        """Publish a notice of the server, which is not part of the log."""
+        self._notices.append(notice)
+
     def events(self) -> list[Notice]:
         """Return the newest notices, oldest first."""
         return list(self._notices)

@@ -89,14 +89,14 @@ class Service:
         self._traffic = Gateway(
             settings=settings,
             step=self._process_own_event,
-            notify=self._notify,
+            notify=self.notify,
             now_ns=self._timeline.now_ns,
         )
         self.arrival_lag = self._traffic.lag
         self._outlet = Outlet(
             settings=settings,
             pipeline=self.pipeline,
-            notify=self._notify,
+            notify=self.notify,
             now_ns=self._timeline.now_ns,
         )
         now_ns = self._timeline.now_ns
@@ -108,7 +108,7 @@ class Service:
             settings=settings.records,
             pipeline=self.pipeline,
             equipment=self.equipment,
-            notify=self._notify,
+            notify=self.notify,
             now_ns=now_ns,
         )
         self._traffic.open()
@@ -177,7 +177,7 @@ class Service:
             settings=settings.fleet,
             pipeline=self.pipeline,
             step=self._step,
-            notify=self._notify,
+            notify=self.notify,
             now_ns=now_ns,
         )
 
@@ -216,7 +216,7 @@ class Service:
 
         def say(text: str) -> None:
             notice = Notice(t_ns=self.now_ns(), severity=Severity.INFO, subject="drive", text=text)
-            loop.call_soon_threadsafe(self._notify, notice)
+            loop.call_soon_threadsafe(self.notify, notice)
 
         try:
             centre = kept.drive.aim == "centre"
@@ -242,7 +242,7 @@ class Service:
             await run_in_thread(drive)
         except UserError as error:
             text = f"driving of the device has ended: {error}"
-            self._notify(
+            self.notify(
                 Notice(t_ns=self.now_ns(), severity=Severity.ERROR, subject="drive", text=text)
             )
 
@@ -260,13 +260,14 @@ class Service:
         if self._live:
             self._live.put(event, outputs)
 
-    def _notify(self, notice: Notice) -> None:
+    def notify(self, notice: Notice) -> None:
+        """Record and publish a notice to the operator."""
         self._hand_over(None, [notice])
         self._show(notice)
 
     def _notify_recorder_state(self, recorder: BackgroundRecorder) -> None:
         for severity, text in recorder.news():
-            self._notify(
+            self.notify(
                 Notice(t_ns=self.now_ns(), severity=severity, subject="recording", text=text)
             )
 
@@ -280,7 +281,7 @@ class Service:
             text, severity = "this machine is no longer overloaded", Severity.INFO
         else:
             text, severity = f"{machine.reason}; {machine.remedy}", Severity.WARNING
-        self._notify(Notice(t_ns=self.now_ns(), severity=severity, subject="machine", text=text))
+        self.notify(Notice(t_ns=self.now_ns(), severity=severity, subject="machine", text=text))
 
     def _show(self, notice: Notice) -> None:
         self.notices.append(notice)

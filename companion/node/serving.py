@@ -17,6 +17,9 @@ import uvicorn
 
 from companion.server.app import create_app
 from companion.server.connections import BoundedProtocol
+from companion.server.request_queue import RequestQueue
+from companion.server.websocket_connections import PING_S, PONG_S, BoundedWebSocket
+from companion.server.work_slots import WorkSlots
 from companion.views.state import Node
 
 T = TypeVar("T")
@@ -24,6 +27,7 @@ T = TypeVar("T")
 RATE_WINDOW_S: Final = 2.0  # time over which frames and updates per second are averaged
 NOTICES_KEPT: Final = 200
 STREAM_TAKES_BYTES: Final = 1024  # largest message accepted from a WebSocket client
+BACKLOG: Final = 128  # connections accepted in one iteration of the event loop
 CLOSE_TIMEOUT_S: Final = 2
 """Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
 
@@ -38,14 +42,20 @@ class Server(uvicorn.Server):
     def __init__(
         self, *, node: Node, token: str | None, answering: asyncio.Event, area: Path | None = None
     ) -> None:
-        app = create_app(node, token, area)
+        work_slots = WorkSlots()
+        queue = RequestQueue(lambda: node.pipeline.aiming is not None or work_slots.running > 0)
+        app = create_app(node, token, area, work_slots=work_slots)
         super().__init__(
             uvicorn.Config(
                 app,
                 log_level="warning",
                 lifespan="off",
-                http=BoundedProtocol,
+                http=partial(BoundedProtocol, queue),  # type: ignore[arg-type]
+                ws=BoundedWebSocket,
+                backlog=BACKLOG,
                 access_log=False,
+                ws_ping_interval=PING_S,
+                ws_ping_timeout=PONG_S,
                 ws_max_size=STREAM_TAKES_BYTES,
                 ws_per_message_deflate=False,  # a message is encoded once for all clients
                 timeout_graceful_shutdown=CLOSE_TIMEOUT_S,

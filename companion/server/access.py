@@ -1,9 +1,11 @@
 """Access control: this machine is trusted; other machines need a bearer token."""
 
+import asyncio
 import base64
 import binascii
 import hmac
 import ipaddress
+import math
 import socket
 import sys
 from collections.abc import Collection
@@ -14,7 +16,9 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from companion.server.responses import problem
-from companion.values import UserError
+from companion.values import Notice, Severity, UserError
+from companion.values.budget import Budget
+from companion.views.state import Node
 
 OPEN_PATHS: Final = frozenset({"/healthz", "/docs", "/openapi.json"})
 """Paths that need no token, in addition to the page's own files; they contain no secrets."""
@@ -28,6 +32,11 @@ A page in a browser cannot set headers, and a token in the URL would end up in l
 UNAUTHORISED: Final = 4401  # close code of a WebSocket without a valid token
 
 TOKEN_MIN: Final = 16  # characters of a token that other machines may try to guess
+WRONG_MAX: Final = 10  # wrong tokens of an address that are answered at once
+WRONG_PER_S: Final = 0.1
+WRONG_DELAY_S: Final = 1.0  # delay of the answer to a further one
+NOTICE_EVERY_S: Final = 60.0  # shortest time between two notices of wrong tokens
+ADDRESSES_MAX: Final = 1024  # addresses whose wrong tokens are remembered
 UNSENT_BYTES: Final = 16_384
 """Limit on unsent bytes in the kernel for a slow client; inherited by its connections.
 
@@ -143,6 +152,40 @@ def _is_address(name: str) -> bool:
     return True
 
 
+class WrongTokens:
+    """Wrong tokens by the address that sent them: counted, reported, and answered late.
+
+    An address may be wrong ``WRONG_MAX`` times, and regains ``WRONG_PER_S`` a second. After that
+    each wrong token is answered ``WRONG_DELAY_S`` later, and a notice is published, at most once in
+    ``NOTICE_EVERY_S``. A correct token is never delayed: others may share the address.
+    """
+
+    def __init__(self, node: Node) -> None:
+        self.count = 0
+        self._node = node
+        self._budgets: dict[str, Budget] = {}
+        self._notified_s = -math.inf
+
+    def delay_s(self, address: str, now_s: float) -> float:
+        """Count a wrong token; return the time until it is to be answered, seconds."""
+        self.count += 1
+        budget = self._budgets.pop(address, None) or Budget(WRONG_PER_S, WRONG_MAX)
+        self._budgets[address] = budget
+        if len(self._budgets) > ADDRESSES_MAX:
+            del self._budgets[next(iter(self._budgets))]
+        if budget.spend(1, now_s):
+            return 0.0
+        if now_s >= self._notified_s + NOTICE_EVERY_S:
+            self._notified_s = now_s
+            text = f"{address} sends wrong tokens; {self.count} have been rejected since the start"
+            self._node.notify(
+                Notice(
+                    t_ns=self._node.now_ns(), severity=Severity.WARNING, subject="http", text=text
+                )
+            )
+        return WRONG_DELAY_S
+
+
 class BearerToken:
     """ASGI middleware: every path needs ``Authorization: Bearer TOKEN``, except ``open_paths``.
 
@@ -151,15 +194,27 @@ class BearerToken:
     browser cannot see the status of a rejected handshake.
     """
 
-    def __init__(self, app: ASGIApp, token: str, open_paths: Collection[str] = OPEN_PATHS) -> None:
+    def __init__(
+        self, *, app: ASGIApp, token: str, open_paths: Collection[str], wrong: WrongTokens
+    ) -> None:
         self._app = app
         self._token = token.encode()
         self._open_paths = frozenset(open_paths)
+        self._wrong = wrong
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if (scope["type"] == "http" and scope["path"] in self._open_paths) or self._may(scope):
+        if scope["type"] == "http" and scope["path"] in self._open_paths:
             await self._app(scope, receive, send)
-        elif scope["type"] == "websocket":
+            return
+        given = _tokens(scope)
+        if any(hmac.compare_digest(one, self._token) for one in given):
+            await self._app(scope, receive, send)
+            return
+        if given:
+            address = scope["client"][0] if scope.get("client") else "unknown address"
+            now_s = asyncio.get_running_loop().time()
+            await asyncio.sleep(self._wrong.delay_s(address, now_s))
+        if scope["type"] == "websocket":
             websocket = WebSocket(scope, receive, send)
             offered = scope.get("subprotocols", [])
             await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
@@ -168,13 +223,15 @@ class BearerToken:
             title, headers = "a bearer token is needed", {"www-authenticate": "Bearer"}
             await problem(401, title, headers)(scope, receive, send)
 
-    def _may(self, scope: Scope) -> bool:
-        scheme, _, credentials = Headers(scope=scope).get("authorization", "").partition(" ")
-        given = [credentials.strip().encode()] if scheme.lower() == "bearer" else []
-        for offered in scope.get("subprotocols", []):
-            if offered.startswith(BEARER):
-                given.append(_decoded(offered.removeprefix(BEARER)))
-        return any(hmac.compare_digest(one, self._token) for one in given)
+
+def _tokens(scope: Scope) -> list[bytes]:
+    """Return the tokens of a request, in its header or as subprotocols."""
+    scheme, _, credentials = Headers(scope=scope).get("authorization", "").partition(" ")
+    given = [credentials.strip().encode()] if scheme.lower() == "bearer" else []
+    for offered in scope.get("subprotocols", []):
+        if offered.startswith(BEARER):
+            given.append(_decoded(offered.removeprefix(BEARER)))
+    return given
 
 
 def _decoded(text: str) -> bytes:

@@ -3,18 +3,18 @@
 from pathlib import Path
 from typing import Annotated, Final
 
-from fastapi import FastAPI, HTTPException, WebSocket
+from fastapi import FastAPI, HTTPException, Request, WebSocket
 from fastapi import Path as PathParameter
-from fastapi.responses import FileResponse, Response
-from fastapi.staticfiles import StaticFiles
+from fastapi.responses import Response
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from starlette.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
 from companion.server import area_map, beam_routes, file_routes, models, responses
-from companion.server.access import OPEN_PATHS, BearerToken, KnownHosts
+from companion.server.access import OPEN_PATHS, BearerToken, KnownHosts, WrongTokens
 from companion.server.metrics import NodeCollector
+from companion.server.page import PageFiles, web_directory
 from companion.server.responses import answer, answers, encode, json_response
 from companion.server.stream import Stream
 from companion.server.work_slots import WorkSlots
@@ -39,10 +39,17 @@ the time of the request, given as `valid_at`, so answers have no ETag. Errors ar
 """
 
 
-def create_app(node: Node, token: str | None = None, area: Path | None = None) -> ASGIApp:
+def create_app(
+    node: Node,
+    token: str | None = None,
+    area: Path | None = None,
+    *,
+    work_slots: WorkSlots | None = None,
+) -> ASGIApp:
     """Return the ASGI application for a node.
 
-    ``area`` is the map under the plan view (``companion.server.area_map``).
+    ``area`` is the map under the plan view (``companion.server.area_map``), ``work_slots`` are
+    shared with the server, which yields to them.
 
     With a token, all paths need it except ``/healthz`` and the page's own files; the page asks the
     user for the token.
@@ -57,9 +64,10 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
     )
     app.router.redirect_slashes = False
     responses.install(app)
-    stream = Stream(node)
-    _health_routes(app, node, stream)
-    work_slots = WorkSlots()
+    stream, page = Stream(node), PageFiles(web_directory())
+    wrong_tokens = WrongTokens(node)
+    _health_routes(app, NodeCollector(node, stream, wrong_tokens), node)
+    work_slots = work_slots or WorkSlots()
     _state_routes(app, node, work_slots)
     beam_routes.add(app, node, work_slots)
     file_routes.add(app, node)
@@ -70,37 +78,25 @@ def create_app(node: Node, token: str | None = None, area: Path | None = None) -
         return answer(await run_in_threadpool(app.openapi))
 
     @app.get("/docs", include_in_schema=False)
-    async def docs() -> Response:
-        return FileResponse(web_directory() / "docs.html")
+    async def docs(request: Request) -> Response:
+        return page.answer("/docs.html", request.scope)
 
     @app.websocket("/v1/stream")
     async def streamed(websocket: WebSocket) -> None:
         await stream.serve(websocket)
 
     # Not mounted: a mount at / would match paths with a wrong method first, and hide the 405.
-    app.router.default = _Files(StaticFiles(directory=web_directory(), html=True))
+    app.router.default = page
     secured: ASGIApp = _Edge(app)
     if token:
-        secured = BearerToken(secured, token, OPEN_PATHS | _page_paths())
+        open_paths = OPEN_PATHS | page.paths
+        secured = BearerToken(app=secured, token=token, open_paths=open_paths, wrong=wrong_tokens)
     return KnownHosts(secured, node.pipeline.settings.server.hosts)
 
 
-def web_directory() -> Path:
-    """Return the folder of the dashboard's files: in the installed package, or in a checkout."""
-    package = Path(companion.__file__).parent
-    installed = package / "_web"
-    return installed if installed.is_dir() else package.parent / "web"
-
-
-def _page_paths() -> frozenset[str]:
-    root = web_directory()
-    files = {f"/{file.relative_to(root).as_posix()}" for file in root.rglob("*") if file.is_file()}
-    return frozenset({"/"} | files)
-
-
-def _health_routes(app: FastAPI, node: Node, stream: Stream) -> None:
+def _health_routes(app: FastAPI, collector: NodeCollector, node: Node) -> None:
     registry = CollectorRegistry(auto_describe=False)
-    registry.register(NodeCollector(node, stream))
+    registry.register(collector)
     ProcessCollector(registry=registry)
 
     @app.get("/healthz", summary="Liveness of the process", responses=answers(models.Health))
@@ -215,19 +211,6 @@ def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
     )
     async def design() -> Response:
         return answer(design_view.show(node.pipeline, node.now_ns()))
-
-
-class _Files:
-    """ASGI application for paths outside the API: the dashboard's files."""
-
-    def __init__(self, files: StaticFiles) -> None:
-        self._files = files
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] == "http":
-            await self._files(scope, receive, send)
-        else:
-            await WebSocket(scope, receive, send).close()  # closed before it is open: 403
 
 
 class _Edge:

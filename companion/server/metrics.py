@@ -18,6 +18,7 @@ from prometheus_client.registry import Collector
 import companion
 from companion.mavlink.links.lag import LagSeen
 from companion.mavlink.links.status import LinkStatus
+from companion.server.access import WrongTokens
 from companion.server.fleet_metrics import fleet_metrics
 from companion.server.stream import Stream
 from companion.values import BeamSet, Level, Track, Verdict
@@ -36,11 +37,12 @@ def _help(described: Any, name: str) -> str:
 
 
 class NodeCollector(Collector):
-    """Counters and gauges of a node and of its stream."""
+    """Counters and gauges of a node and of its server."""
 
-    def __init__(self, node: Node, stream: Stream) -> None:
+    def __init__(self, node: Node, stream: Stream, wrong_tokens: WrongTokens) -> None:
         self._node = node
         self._stream = stream
+        self._wrong_tokens = wrong_tokens
 
     def collect(self) -> Iterator[Metric]:
         """Yield all metrics at this moment."""
@@ -84,6 +86,11 @@ class NodeCollector(Collector):
         )
         yield CounterMetricFamily(
             "companion_stream_messages", "Messages sent over /v1/stream", value=self._stream.sent
+        )
+        yield CounterMetricFamily(
+            "companion_wrong_tokens",
+            "HTTP requests with a wrong bearer token",
+            value=self._wrong_tokens.count,
         )
 
     def _arrival_lag(self) -> Iterator[Metric]:

@@ -8,16 +8,19 @@
 Every message is a JSON object: the answer of the path of that name, with ``topic`` and
 ``valid_at``. ``records`` are the exception: binary messages, each the whole record of an update
 (``companion.views.records``). Nothing is queued: after each message a client gets the newest state,
-so a slow client misses messages, delays no other client and uses no more memory. A message is
-encoded once for all clients with the same request. ``events`` are sent when there is a new one.
+so a slow client misses messages, delays no other client and uses no more memory. A client that
+takes nothing for 10 s is disconnected. A message is encoded once for all clients with the same
+request. ``events`` are sent when there is a new one.
 
-Close codes: 1003 the client sent a message (the stream accepts none), 1012 the service ends, 1013
-too many streams are open, 4401 missing or wrong token (``access``), 4403 request by a page from
-elsewhere, 4422 invalid arguments. The reason has details.
+Close codes: 1003 the client sent a message (the stream accepts none), 1008 it sent too much, 1012
+the service ends, 1013 too many streams are open, or another client takes this place, 4401 missing
+or wrong token (``access``), 4403 request by a page from elsewhere, 4422 invalid arguments. The
+reason has details.
 """
 
 import asyncio
 import re
+from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any, Final
 from urllib.parse import urlsplit
@@ -28,6 +31,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from companion.server import topics
 from companion.server.access import SUBPROTOCOL
 from companion.server.topics import Topic
+from companion.server.websocket_connections import BoundedWebSocket
 from companion.values import UAV_FORMS, UavKind, UserError
 from companion.views.state import Node
 
@@ -43,6 +47,11 @@ LEAST_HZ, MOST_HZ = 0.1, 100.0
 _UAV: Final = re.compile("|".join(kind.pattern for kind in UavKind), re.ASCII)
 CLIENTS_MAX: Final = 256
 """Limit on streams: half of the connections; the other half is left for requests."""
+QUIET_S: Final = 5.0
+"""Time without a sign that a client reads, after which it makes room for another, seconds.
+
+It is longer than the time between two pings.
+"""
 SLOTS: Final = 32
 """Number of slots over which clients' messages are spread after an update.
 
@@ -95,15 +104,20 @@ class Snapshot:
 
 
 class Stream:
-    """All stream clients of one node. ``clients`` are connected now, ``sent`` counts messages."""
+    """All stream clients of one node. ``sent`` counts messages."""
 
     def __init__(self, node: Node) -> None:
-        self.clients = 0
         self.sent = 0
+        self._open: list[WebSocket] = []
         self._node = node
         self._snapshot = Snapshot(-1)
         self._in_slot = [0] * SLOTS
         self._slot_s = 0.5 / SLOTS / node.pipeline.settings.beams.update_hz
+
+    @property
+    def clients(self) -> int:
+        """Number of clients connected now."""
+        return len(self._open)
 
     async def serve(self, websocket: WebSocket) -> None:
         """Serve one client until it disconnects or violates the protocol."""
@@ -112,7 +126,7 @@ class Stream:
         if not _is_from_here(websocket):
             await websocket.close(ELSEWHERE, "pages of other sites may not connect")
             return
-        if self.clients >= CLIENTS_MAX:
+        if self.clients >= CLIENTS_MAX and not self._makes_room(websocket):
             await websocket.close(TOO_MANY, "too many streams are open")
             return
         try:
@@ -122,14 +136,35 @@ class Stream:
             return
         slot = self._in_slot.index(min(self._in_slot))
         self._in_slot[slot] += 1
-        self.clients += 1
+        self._open.append(websocket)
         try:
             await self._attend(websocket, asked, slot * self._slot_s)
         except WebSocketDisconnect:
             pass  # disconnected while a message was sent
         finally:
-            self.clients -= 1
+            if websocket in self._open:
+                self._open.remove(websocket)
             self._in_slot[slot] -= 1
+
+    def _makes_room(self, newcomer: WebSocket) -> bool:
+        """Close a stream in favour of another client, and return whether there is one to close.
+
+        It is one of the address with the most streams, or a client that shows no sign of reading.
+        """
+        streams = [(one, held) for one in self._open if (held := _connection(one)) is not None]
+        held_by = Counter(_host(one) for one in self._open)
+        host, most = held_by.most_common(1)[0]
+        if most > held_by[_host(newcomer)] + 1:
+            streams = [pair for pair in streams if _host(pair[0]) == host]
+        else:
+            quiet_s = asyncio.get_running_loop().time() - QUIET_S
+            streams = [pair for pair in streams if pair[1].alive_s < quiet_s]
+        if not streams:
+            return False
+        websocket, connection = min(streams, key=lambda pair: pair[1].alive_s)
+        self._open.remove(websocket)
+        connection.replace(TOO_MANY, "another client takes this place")
+        return True
 
     async def _attend(self, websocket: WebSocket, asked: Wanted, turn_s: float) -> None:
         sending = asyncio.create_task(self._send(websocket, asked, turn_s))
@@ -189,6 +224,16 @@ class Stream:
         if message is None:
             message = snapshot.messages[topic, uavs] = topics.message(topic, body, uavs)
         return message
+
+
+def _connection(websocket: WebSocket) -> BoundedWebSocket | None:
+    """Return a client's connection; None under another server, as in tests."""
+    found: BoundedWebSocket | None = websocket.scope.get("state", {}).get("connection")
+    return found
+
+
+def _host(websocket: WebSocket) -> str | None:
+    return websocket.client.host if websocket.client else None
 
 
 def _is_from_here(websocket: WebSocket) -> bool:

@@ -15,9 +15,13 @@ T = TypeVar("T")
 
 
 class WorkSlots:
-    """Work slots of one node. A request beyond the queue is rejected with status 503."""
+    """Work slots of one node. A request beyond the queue is rejected with status 503.
+
+    ``running`` is the number of requests that compute now.
+    """
 
     def __init__(self, at_once: int = AT_ONCE, waiting: int = WAITING) -> None:
+        self.running = 0
         self._free = asyncio.Semaphore(at_once)
         self._room = at_once + waiting
 
@@ -32,6 +36,10 @@ class WorkSlots:
         self._room -= 1
         try:
             async with self._free:
-                return await run_in_threadpool(work)
+                self.running += 1
+                try:
+                    return await run_in_threadpool(work)
+                finally:
+                    self.running -= 1
         finally:
             self._room += 1

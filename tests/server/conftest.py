@@ -75,6 +75,10 @@ class StandIn:
             Notice(t_ns=self._now_ns, severity=Severity.INFO, subject="test", text=text)
         )
 
+    def notify(self, notice: Notice) -> None:
+        """Publish a notice of the server."""
+        self.notices.append(notice)
+
     async def ticked(self) -> None:
         """Return after the next tick."""
         await self._ticked.wait()

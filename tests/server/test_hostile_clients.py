@@ -1,7 +1,6 @@
 """Hostile clients: no request head, connection, host name or request delays the others."""
 
 import asyncio
-import contextlib
 import socket
 from collections.abc import AsyncIterator, Callable
 from typing import Any
@@ -9,71 +8,21 @@ from typing import Any
 import numpy as np
 import pytest
 import websockets
+from http_support import REQUEST, asked, connected, ends, served
 from starlette.testclient import TestClient
 from support import HANG_S, run_async
 
 from companion.beams.array.geometry import Array
 from companion.beams.hardware import codebooks
-from companion.node.serving import Server
 from companion.pipeline import assembly
 from companion.server import connections
-from companion.server.access import KnownHosts, bind
+from companion.server.access import KnownHosts
 from companion.server.app import create_app
 from companion.server.work_slots import WorkSlots
 from companion.settings.model import Settings
 from companion.values import UserError, UtcNs
 from companion.views import beam_state, series
 from companion.views.series import SAMPLES, Series
-
-REQUEST = b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
-
-
-Client = tuple[asyncio.StreamReader, asyncio.StreamWriter]
-OPEN: list[asyncio.StreamWriter] = []
-
-
-@contextlib.asynccontextmanager
-async def served(node: Any, token: str | None = None) -> AsyncIterator[int]:
-    """Run the service's own server around a node; yields its port."""
-    answering = asyncio.Event()
-    with bind("127.0.0.1:0", token=token, insecure=False) as listening:
-        server = Server(node=node, token=token, answering=answering)
-        task = asyncio.create_task(server.serve(sockets=[listening]))
-        await asyncio.wait_for(answering.wait(), HANG_S)
-        try:
-            yield listening.getsockname()[1]
-        finally:
-            for writer in OPEN:
-                writer.close()
-                with contextlib.suppress(ConnectionError):
-                    await asyncio.wait_for(writer.wait_closed(), HANG_S)
-            OPEN.clear()
-            server.should_exit = True
-            await task
-
-
-async def connected(port: int) -> Client:
-    """Return a connection, which ``served`` closes."""
-    client = await asyncio.wait_for(asyncio.open_connection("127.0.0.1", port), HANG_S)
-    OPEN.append(client[1])
-    return client
-
-
-async def asked(client: Client, request: bytes = REQUEST) -> bytes:
-    """Return the first line of the response; empty if the connection was closed."""
-    reader, writer = client
-    with contextlib.suppress(ConnectionError):
-        writer.write(request)
-        return await asyncio.wait_for(reader.readline(), HANG_S)
-    return b""
-
-
-async def ends(client: Client) -> bool:
-    """Wait until the server has closed a connection."""
-    with contextlib.suppress(ConnectionError):
-        await asyncio.wait_for(client[0].read(), HANG_S)
-    return True
-
 
 # --- heads, bodies and timeouts -------------------------------------------------------------------
 

@@ -1,0 +1,74 @@
+"""Order in which requests are started: a few in each iteration of the event loop.
+
+Any number of connections can each have a request ready. Started all at once, they would delay the
+links and the beam update by the sum of their times. A loop that never rests also starves the
+threads that compute beams: each waits for the interpreter some hundred times.
+"""
+
+import asyncio
+from collections import deque
+from collections.abc import Callable
+from typing import Final
+
+from companion.values.budget import Budget
+
+AT_ONCE: Final = 4  # requests started in one iteration of the event loop
+PER_S: Final = 500.0  # requests of all connections that are started before those over a budget
+SAVED: Final = 1000.0
+BESIDE_WORK_S: Final = 0.005
+"""Time between two requests over a budget while a thread computes, seconds."""
+
+Start = Callable[[], None]
+
+
+class RequestQueue:
+    """Requests of all connections that are not started yet.
+
+    Requests within the budget of their connection, and of all connections together, are started
+    first. The others wait for threads that compute: ``is_busy`` says whether one does. ``late``
+    counts those others.
+    """
+
+    def __init__(self, is_busy: Callable[[], bool]) -> None:
+        self.late = 0
+        self._is_busy = is_busy
+        self._budget = Budget(PER_S, SAVED)
+        self._prompt: deque[Start] = deque()
+        self._late: deque[Start] = deque()
+        self._late_from_s = 0.0  # no request over a budget starts before this time
+        self._wakes: asyncio.Handle | None = None
+
+    def add(self, start: Start, *, within_budget: bool) -> None:
+        """Start a request in an iteration to come. ``start`` must not raise."""
+        if within_budget and self._budget.spend(1, asyncio.get_running_loop().time()):
+            self._prompt.append(start)
+        else:
+            self.late += 1
+            self._late.append(start)
+        self._schedule()
+
+    def _start_some(self) -> None:
+        self._wakes = None
+        left = AT_ONCE
+        while left and self._prompt:
+            self._prompt.popleft()()
+            left -= 1
+        now_s = asyncio.get_running_loop().time()
+        while left and self._late and now_s >= self._late_from_s:
+            if self._is_busy():
+                self._late_from_s = now_s + BESIDE_WORK_S
+            self._late.popleft()()
+            left -= 1
+        self._schedule()
+
+    def _schedule(self) -> None:
+        """Continue in the next iteration, or when the next request over a budget may start."""
+        loop = asyncio.get_running_loop()
+        wait_s = 0.0 if self._prompt else self._late_from_s - loop.time()
+        if self._wakes is not None:
+            self._wakes.cancel()
+            self._wakes = None
+        if self._prompt or (self._late and wait_s <= 0):
+            self._wakes = loop.call_soon(self._start_some)
+        elif self._late:
+            self._wakes = loop.call_later(wait_s, self._start_some)

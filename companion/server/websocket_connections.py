@@ -1,0 +1,129 @@
+"""WebSocket connections with limits on what a client sends and on how long it takes nothing.
+
+A client of the stream has nothing to send but answers to pings. uvicorn answers any number of
+pings, also those of a client that was refused.
+"""
+
+import asyncio
+from typing import Any, Final
+
+from uvicorn.protocols.utils import ClientDisconnected
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+
+from companion.server.connections import BUFFER_BYTES, STALL_TIMEOUT_S
+from companion.values.budget import Budget
+
+BYTES_PER_S: Final = 256.0  # bytes that a client may send; a pong every few seconds needs less
+BYTES_SAVED: Final = 2048.0
+TOO_MUCH: Final = 1008  # close code of a client that sends more
+CLOSE_S: Final = 2.0  # time limit for a client to confirm that the connection is closed
+PING_S: Final = 4.0  # time between pings
+PONG_S: Final = STALL_TIMEOUT_S - PING_S
+"""Time limit for the answer to a ping, or for another sign that the client reads, seconds."""
+
+
+class BoundedWebSocket(WebSocketsSansIOProtocol):
+    """uvicorn's protocol with limits. ``alive_s`` is the newest sign that the client reads."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.alive_s = self.loop.time()
+        self.app_state = {**self.app_state, "connection": self}
+        self._budget = Budget(BYTES_PER_S, BYTES_SAVED)
+        self._stalled: asyncio.TimerHandle | None = None
+        self._closing: asyncio.TimerHandle | None = None
+
+    def connection_made(self, transport: Any) -> None:
+        """Take over a connection; see ``asyncio.Protocol``."""
+        super().connection_made(transport)
+        transport.set_write_buffer_limits(high=BUFFER_BYTES)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        """Clean up; see ``asyncio.Protocol``."""
+        for timer in (self._stalled, self._closing):
+            if timer is not None:
+                timer.cancel()
+        super().connection_lost(exc)
+
+    def abort(self) -> None:
+        """Close the connection at once; messages go nowhere."""
+        self.disconnected = True
+        self.writable.set()
+        self.transport.abort()
+
+    def rank(self) -> tuple[int, float] | None:
+        """Return the order of replacement: only clients that were refused are replaced."""
+        is_refused = self.close_sent and not self.transport.is_closing()
+        return (0, self.alive_s) if is_refused else None
+
+    def data_received(self, data: bytes) -> None:
+        """Process bytes of a client; see ``asyncio.Protocol``."""
+        if self.transport.is_closing():
+            return
+        # The first bytes are the request's head, which is limited already.
+        if self.handshake_initiated and not self._budget.spend(len(data), self.loop.time()):
+            self._refuse()
+            return
+        super().data_received(data)
+
+    def _refuse(self) -> None:
+        """Close the connection of a client that sends too much, without reading on."""
+        if self.handshake_complete and not self.close_sent:
+            self.conn.send_close(TOO_MUCH, "the stream accepts no messages")
+            self.handle_parser_exception()
+            self._abort_later()
+        else:
+            self.abort()
+
+    async def send(self, message: Any) -> None:
+        """Send a message of the application; see ASGI."""
+        if self.close_sent and not self.disconnected:
+            raise ClientDisconnected  # closed here, because the client sent too much
+        await super().send(message)
+        if self.close_sent:
+            self._abort_later()
+
+    def replace(self, code: int, reason: str) -> None:
+        """Close the connection in favour of another client."""
+        if not self.close_sent and not self.transport.is_closing():
+            self.conn.send_close(code, reason)
+            self.handle_parser_exception()
+        if self._stalled is not None:
+            self.abort()
+        else:
+            self._abort_later()
+
+    def _abort_later(self) -> None:
+        if self._closing is None:
+            self._closing = self.loop.call_later(CLOSE_S, self.abort)
+
+    # --- signs that the client reads ----------------------------------------------------------
+
+    def handle_pong(self, event: Any) -> None:
+        """Note the answer to a ping."""
+        self.alive_s = self.loop.time()
+        super().handle_pong(event)
+
+    def keepalive_timeout(self) -> None:
+        """Close the connection, unless the client took bytes since the ping was sent."""
+        if self.alive_s > self.ping_sent_at:
+            self.pending_ping_payload = self.pong_timer = (
+                None  # a late answer starts no second ping
+            )
+            self.schedule_ping()
+        else:
+            super().keepalive_timeout()
+            self._abort_later()
+
+    def pause_writing(self) -> None:
+        """Start the time limit, since the client does not read."""
+        super().pause_writing()
+        self._stalled = self.loop.call_later(STALL_TIMEOUT_S, self.abort)
+
+    def resume_writing(self) -> None:
+        """Cancel the time limit, since the client reads again."""
+        super().resume_writing()
+        self.alive_s = self.loop.time()
+        if self._stalled is not None:
+            self._stalled.cancel()
+            self._stalled = None

@@ -1,0 +1,351 @@
+"""Budgets of connections: requests, WebSocket frames, unread answers, wrong tokens."""
+
+import asyncio
+import contextlib
+import os
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+import uvloop
+import websockets
+from http_support import Client, asked, connected, ends, served
+from starlette.testclient import TestClient
+from support import HANG_S, run_async
+
+from companion.node import serving
+from companion.server import access, connections, stream, websocket_connections
+from companion.server.app import create_app
+from companion.server.request_queue import AT_ONCE, RequestQueue
+from companion.values import Severity
+from companion.values.budget import Budget
+
+LOOPS: list[Callable[[], asyncio.AbstractEventLoop] | None] = [None, uvloop.new_event_loop]
+PING = b"\x89\x80\0\0\0\0"
+TOKEN = "a token of sixteen characters"
+
+
+def get(path: str, *headers: str) -> bytes:
+    lines = [f"GET {path} HTTP/1.1", "Host: 127.0.0.1", *headers]
+    return "\r\n".join([*lines, "", ""]).encode()
+
+
+UPGRADE = get(
+    "/v1/stream", "Connection: Upgrade", "Upgrade: websocket", "Sec-WebSocket-Version: 13",
+    "Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==",
+)  # fmt: skip
+
+
+# --- budgets --------------------------------------------------------------------------------------
+
+
+def test_budget_is_spent_and_regained_with_time() -> None:
+    budget = Budget(per_s=2.0, most=3.0)
+    assert [budget.spend(1, 5.0) for _ in range(4)] == [True, True, True, False]
+    assert not budget.spend(1, 5.4)
+    assert budget.spend(1, 5.5)
+    assert not budget.spend(1, 5.0)  # a time in the past gives nothing
+    assert budget.spend(3, 100.0)
+    assert not budget.spend(0.1, 100.0)
+
+
+async def answered(client: Client) -> bool:
+    """Request ``/healthz`` on a connection that stays open; return whether it was answered."""
+    reader, writer = client
+    writer.write(get("/healthz"))
+    with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
+        head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HANG_S)
+        await reader.readexactly(len(b'{"status":"ok"}'))
+        return head.startswith(b"HTTP/1.1 200 OK")
+    return False
+
+
+# --- pipelined requests ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loop", LOOPS, ids=["asyncio", "uvloop"])
+def test_pipelined_requests_are_answered_in_order(make_node: Any, loop: Any) -> None:
+    """Also if all arrive at once, and some are invalid paths."""
+    paths = [path for _ in range(100) for path in ("/healthz", "/nowhere", "/v1/uavs", "/readyz")]
+    expected = [200, 404, 200, 200] * 100
+
+    async def pipelined() -> list[int]:
+        async with served(make_node()) as port:
+            reader, writer = await connected(port)
+            writer.write(b"".join(map(get, paths)))
+            statuses = []
+            for _ in paths:
+                head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HANG_S)
+                size = int(head.lower().partition(b"content-length: ")[2].partition(b"\r")[0])
+                await reader.readexactly(size)
+                statuses.append(int(head.split()[1]))
+            return statuses
+
+    assert run_async(pipelined(), loop) == expected
+
+
+@pytest.mark.parametrize("loop", LOOPS, ids=["asyncio", "uvloop"])
+def test_pipelined_requests_wait_in_the_client(make_node: Any, loop: Any) -> None:
+    """A client that reads no answer can send a few requests; the rest is not read."""
+    flood = get("/v1/uavs") * 250_000
+
+    async def flooded() -> None:
+        async with served(make_node(), TOKEN) as port:
+            reader, writer = await connected(port)
+            reader._transport.pause_reading()  # type: ignore[attr-defined]
+            writer.write(flood)
+            for _ in range(50):  # answers to others, while the flood waits
+                assert await asked(await connected(port)) == b"HTTP/1.1 200 OK\r\n"
+            unsent = writer.transport.get_write_buffer_size()
+            assert unsent > 0.5 * len(flood)
+
+    run_async(flooded(), loop)
+
+
+def test_few_requests_are_parsed_ahead(make_node: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    waiting = list[int]()
+    answer = connections.BoundedProtocol.on_response_complete
+
+    def noted(self: Any) -> None:
+        waiting.append(len(self.pipeline))
+        answer(self)
+
+    monkeypatch.setattr(connections.BoundedProtocol, "on_response_complete", noted)
+
+    async def flooded() -> None:
+        async with served(make_node(flown=False)) as port:
+            reader, writer = await connected(port)
+            writer.write(b"GET /healthz HTTP/1.1\r\n\r\n" * 3000)
+            while len(waiting) < 1000:
+                await asyncio.wait_for(reader.read(1 << 16), HANG_S)
+
+    run_async(flooded())
+    assert max(waiting) <= 15
+
+
+def test_request_framing_without_end_is_cut_off(make_node: Any) -> None:
+    """Extensions of chunks are neither head nor body."""
+    head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: chunked\r\n\r\n1;"
+
+    async def flooded() -> None:
+        async with served(make_node(flown=False), TOKEN) as port:
+            client = await connected(port)
+            client[1].write(head + b"a" * (1 << 24))
+            assert await ends(client)
+            assert client[1].transport.get_write_buffer_size() > 1 << 23 or (
+                client[1].transport.is_closing()
+            )
+
+    run_async(flooded())
+
+
+def test_requests_over_a_budget_wait_for_others_and_for_threads() -> None:
+    async def queued() -> None:
+        busy = True
+        queue = RequestQueue(lambda: busy)
+        started = list[str]()
+        at = [0]
+        done = asyncio.Event()
+
+        def start(name: str) -> Callable[[], None]:
+            def run() -> None:
+                started.append(name)
+                at.append(at[-1] if at[-1] == iteration[0] else iteration[0])
+                if len(started) == 30:
+                    done.set()
+
+            return run
+
+        iteration = [0]
+
+        def count() -> None:
+            iteration[0] += 1
+            if not done.is_set():
+                asyncio.get_running_loop().call_soon(count)
+
+        count()
+        for _ in range(10):
+            queue.add(start("late"), within_budget=False)
+        for _ in range(20):
+            queue.add(start("prompt"), within_budget=True)
+        await asyncio.sleep(0)
+        while len(started) < 22:  # one at a time while threads compute
+            await asyncio.sleep(0)
+        assert started[:20] == ["prompt"] * 20
+        assert iteration[0] >= 20 / AT_ONCE
+        busy = False
+        await done.wait()
+        assert started[20:] == ["late"] * 10
+        assert queue.late == 10
+
+    run_async(queued())
+
+
+def test_new_clients_replace_those_that_do_not_read(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The connections of a flood make room, also while all of them wait for answers."""
+    monkeypatch.setattr(connections, "most_connections", lambda: 20)
+    flood = get("/openapi.json") * 2000
+
+    async def crowded() -> None:
+        async with served(make_node()) as port:
+            kept = await connected(port)
+            for _ in range(40):
+                reader, writer = await connected(port)
+                reader._transport.pause_reading()  # type: ignore[attr-defined]
+                writer.write(flood)
+                assert await asked(await connected(port)) == b"HTTP/1.1 200 OK\r\n"
+                assert await answered(kept)
+
+    run_async(crowded())
+
+
+def test_client_that_takes_nothing_of_an_answer_is_disconnected(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(connections, "STALL_TIMEOUT_S", 0.3)
+
+    async def stalled() -> None:
+        async with served(make_node()) as port:
+            reader, writer = await connected(port)
+            reader._transport.pause_reading()  # type: ignore[attr-defined]
+            writer.write(get("/openapi.json") * 200)
+            with contextlib.suppress(ConnectionError):
+                while not writer.transport.is_closing():
+                    writer.write(b"x")
+                    await asyncio.wait_for(writer.drain(), HANG_S)
+                    await asyncio.sleep(0.05)  # between two attempts to send
+
+    run_async(stalled())
+
+
+# --- WebSockets -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("loop", LOOPS, ids=["asyncio", "uvloop"])
+@pytest.mark.parametrize(("token", "refused"), [(None, False), (TOKEN, True)])
+def test_flood_of_pings_closes_the_websocket(
+    make_node: Any, token: str | None, refused: bool, loop: Any
+) -> None:
+    """After a refusal (4401) too."""
+    flood = PING * 100_000
+    code = 4401 if refused else websocket_connections.TOO_MUCH
+
+    async def flooded() -> bytes:
+        async with served(make_node(), token) as port:
+            reader, writer = await connected(port)
+            writer.write(UPGRADE)
+            assert (await asyncio.wait_for(reader.readline(), HANG_S)).startswith(b"HTTP/1.1 101")
+            writer.write(flood)
+            said = b""
+            with contextlib.suppress(ConnectionError):
+                while piece := await asyncio.wait_for(reader.read(1 << 16), HANG_S):
+                    said += piece
+            return said
+
+    said = run_async(flooded(), loop)
+    pongs = said.count(b"\x8a\0")
+    assert pongs < websocket_connections.BYTES_SAVED
+    # The end of the connection may overtake the close frame.
+    assert code.to_bytes(2, "big") in said or pongs == 0
+
+
+def test_client_that_answers_no_ping_is_disconnected(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A client that reads stays."""
+    monkeypatch.setattr(serving, "PING_S", 0.1)
+    monkeypatch.setattr(serving, "PONG_S", 0.3)
+
+    async def silent() -> None:
+        async with (
+            served(make_node()) as port,
+            websockets.connect(f"ws://127.0.0.1:{port}/v1/stream") as reading,
+        ):
+            for _ in range(2):
+                await asyncio.wait_for(reading.recv(), HANG_S)
+            mute = await connected(port)
+            mute[1].write(UPGRADE)
+            assert await ends(mute)
+            await asyncio.wait_for(await reading.ping(), HANG_S)
+
+    run_async(silent())
+
+
+def test_stream_of_a_silent_client_makes_room(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "CLIENTS_MAX", 2)
+    monkeypatch.setattr(stream, "QUIET_S", 0.5)
+    monkeypatch.setattr(serving, "PING_S", 0.1)
+    monkeypatch.setattr(serving, "PONG_S", 1e6)
+
+    async def crowded() -> None:
+        async with served(make_node()) as port:
+            address = f"ws://127.0.0.1:{port}/v1/stream"
+            mute = await connected(port)
+            mute[1].write(UPGRADE)
+            assert (await asyncio.wait_for(mute[0].readline(), HANG_S)).startswith(b"HTTP/1.1 101")
+            async with websockets.connect(address) as reading:
+                assert await asyncio.wait_for(reading.recv(), HANG_S)
+                while True:  # until the silent client has been silent for long enough
+                    with contextlib.suppress(websockets.ConnectionClosed):
+                        async with websockets.connect(address) as newcomer:
+                            assert await asyncio.wait_for(newcomer.recv(), HANG_S)
+                            break
+                assert await ends(mute)
+                await asyncio.wait_for(await reading.ping(), HANG_S)
+
+    run_async(crowded())
+
+
+# --- tokens ---------------------------------------------------------------------------------------
+
+
+def test_wrong_tokens_are_counted_told_and_answered_late(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    delays = list[float]()
+
+    async def noted(delay_s: float) -> None:
+        delays.append(delay_s)
+
+    monkeypatch.setattr(access.asyncio, "sleep", noted)
+    node = make_node(flown=False)
+    client = TestClient(create_app(node, TOKEN), "http://localhost")
+    wrong = {"authorization": "Bearer " + "x" * 16}
+    for _ in range(15):
+        assert client.get("/v1/uavs", headers=wrong).status_code == 401
+    assert delays[:10] == [0.0] * 10
+    assert delays[10:] == [access.WRONG_DELAY_S] * 5
+    told = [notice for notice in node.notices if notice.subject == "http"]
+    assert [(one.severity, one.text) for one in told] == [
+        (Severity.WARNING, "testclient sends wrong tokens; 11 have been rejected since the start")
+    ]
+    right = {"authorization": f"Bearer {TOKEN}"}
+    assert client.get("/v1/uavs", headers=right).status_code == 200
+    assert client.get("/v1/uavs").status_code == 401  # no token is no wrong token
+    assert len(delays) == 15
+    assert "companion_wrong_tokens_total 15.0" in client.get("/metrics", headers=right).text
+
+
+def test_addresses_of_wrong_tokens_are_bounded(make_node: Any) -> None:
+    wrong = access.WrongTokens(make_node(flown=False))
+    for number in range(access.ADDRESSES_MAX + 10):
+        wrong.delay_s(f"10.0.{number // 256}.{number % 256}", 1.0)
+    assert len(wrong._budgets) == access.ADDRESSES_MAX
+    assert wrong.count == access.ADDRESSES_MAX + 10
+
+
+def test_page_files_are_cached_by_etag(make_node: Any) -> None:
+    client = TestClient(create_app(make_node(flown=False)), "http://localhost")
+    page = client.get("/")
+    assert page.text.startswith("<!doctype html>")
+    assert page.content == client.get("/index.html").content
+    again = client.get("/", headers={"if-none-match": page.headers["etag"]})
+    assert (again.status_code, again.content) == (304, b"")
+    assert client.post("/main.js").status_code == 405
+    assert client.get("/vendor").status_code == 404
+    assert client.get("/../pyproject.toml").status_code == 404
+    assert os.sep == "/" and client.get("/main.js").headers["content-type"].startswith("text/java")

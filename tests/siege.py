@@ -1,0 +1,195 @@
+"""A service under attack, and what its users see of it: looks at health, beams, bounds and memory.
+
+``besieged`` starts the flight of ``siege_flight`` around a service; ``looking`` looks at it from a
+thread, as an operator's page would, while an attack runs.
+"""
+
+import contextlib
+import json
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from siege_flight import UAVS, degrees, place
+from support import HANG_S, ROOT, Node, end
+
+RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+LOOK_S = 0.1
+HONEST = frozenset(f"{sysid}:1" for sysid in UAVS)
+PAGE_MB = 4096 / 1e6
+M_PER_DEG_LAT = 111_195.0
+
+
+@dataclass
+class Looks:
+    """What was seen: times of health checks, looks without all beams, bounds broken in silence."""
+
+    health_s: list[float] = field(default_factory=list)
+    looks: int = 0
+    without_beams: list[str] = field(default_factory=list)
+    broken: list[str] = field(default_factory=list)
+    memory_mb: list[float] = field(default_factory=list)
+    rates_hz: list[float] = field(default_factory=list)
+
+    def health_ms(self, percent: float) -> float:
+        """Percentile of the time of ``/healthz``, milliseconds."""
+        return float(np.percentile(self.health_s, percent)) * 1e3
+
+    @property
+    def grown_mb(self) -> float:
+        """Largest memory less the first."""
+        return max(self.memory_mb) - self.memory_mb[0]
+
+    def __str__(self) -> str:
+        return (
+            f"health p50 {self.health_ms(50):.0f} p99 {self.health_ms(99):.0f} ms, no beams in"
+            f" {len(self.without_beams)} of {self.looks} looks {self.without_beams[:2]},"
+            f" {len(self.broken)} broken in silence {self.broken[:2]},"
+            f" {self.memory_mb[0]:.0f} + {self.grown_mb:.0f} MB,"
+            f" updates {min(self.rates_hz, default=0):.1f} to {max(self.rates_hz, default=0):.1f}/s"
+        )
+
+
+def resident_mb(node: Node) -> float:
+    """Resident memory of the service now."""
+    return int(Path(f"/proc/{node.process.pid}/statm").read_text().split()[1]) * PAGE_MB
+
+
+def _ask(url: str, token: str | None) -> Any:
+    headers = {"authorization": f"Bearer {token}"} if token else {}
+    request = urllib.request.Request(url, headers=headers)
+    with urllib.request.urlopen(request, timeout=HANG_S) as answer:
+        return json.loads(answer.read())
+
+
+def broken(uav: Any, at_s: float) -> str | None:
+    """How far a UAV shown as good is beyond its bound; None if it is not."""
+    sysid = int(uav["id"].partition(":")[0])
+    north, east, alt = place(sysid, at_s)
+    lat, lon = degrees(north, east)
+    off_n = (uav["lat_deg"] - lat) * M_PER_DEG_LAT
+    off_e = (uav["lon_deg"] - lon) * M_PER_DEG_LAT * np.cos(np.radians(lat))
+    far = float(np.hypot(off_n, off_e))
+    # A report has the resolution of its fields.
+    if (
+        far <= uav["horizontal_bound_m"] + 0.05
+        and abs(uav["alt_m"] - alt) <= uav["vertical_bound_m"] + 0.05
+    ):
+        return None
+    return f"{uav['id']} off by {far:.1f} m, bound {uav['horizontal_bound_m']:.1f} m"
+
+
+class Looking(threading.Thread):
+    """Look at a service until stopped; ``seen`` has the results."""
+
+    def __init__(self, node: Node, token: str | None = None) -> None:
+        super().__init__(daemon=True)
+        self.seen = Looks(memory_mb=[resident_mb(node)])
+        self.until = threading.Event()
+        self._node, self._token = node, token
+        self._announced: set[str] = set()
+
+    def run(self) -> None:
+        while not self.until.wait(LOOK_S):
+            try:
+                self._look()
+            except OSError as error:
+                self.seen.looks += 1
+                self.seen.without_beams.append(f"{type(error).__name__}: {error}")
+
+    def _look(self) -> None:
+        url, seen = self._node.url, self.seen
+        started_s = time.monotonic()
+        try:
+            _ask(url + "/healthz", None)
+        finally:
+            seen.health_s.append(time.monotonic() - started_s)
+        seen.memory_mb.append(resident_mb(self._node))
+        beams = _ask(url + "/v1/beams", self._token)
+        seen.looks += 1
+        missing = HONEST - {beam["uav"] for beam in beams["beams"]}
+        if missing:
+            said = [(left["uav"], left["reason"]) for left in beams["left_out"]]
+            seen.without_beams.append(f"{sorted(missing)} {said[:4]}")
+        status = _ask(url + "/v1/status", self._token)
+        if status["rates"]["updates_hz"] is not None:
+            seen.rates_hz.append(status["rates"]["updates_hz"])
+        self._check_bounds()
+
+    def _check_bounds(self) -> None:
+        for uav in HONEST:
+            try:
+                shown = _ask(f"{self._node.url}/v1/uavs/{uav}", self._token)
+            except urllib.error.HTTPError:
+                continue  # not tracked: no beam, which the look counts
+            at_s = datetime.fromisoformat(shown["valid_at"]).timestamp()
+            found = broken(shown, at_s)
+            if found and shown["verdict"] == "good" and not self._is_announced(uav):
+                self.seen.broken.append(found)
+
+    def _is_announced(self, uav: str) -> bool:
+        events = _ask(f"{self._node.url}/v1/events", self._token)["events"]
+        return any(one["subject"] == uav and one["severity"] != "info" for one in events)
+
+
+@contextlib.contextmanager
+def besieged(start_node: Any, *words: str) -> Iterator[Node]:
+    """Run a service around which five honest vehicles fly, until all four UAVs have beams."""
+    node = start_node(*RUN, *words)
+    with flight(node.udp_port):
+        node.wait_until(
+            "/v1/beams", lambda answer: {beam["uav"] for beam in answer["beams"]} >= HONEST
+        )
+        yield node
+
+
+@contextlib.contextmanager
+def flight(udp_port: int) -> Iterator["subprocess.Popen[str]"]:
+    """Fly the honest vehicles in a process of their own."""
+    sender = [sys.executable, str(ROOT / "tests" / "siege_flight.py"), str(udp_port)]
+    process = subprocess.Popen(sender, stdout=subprocess.PIPE, text=True)
+    try:
+        yield process
+    finally:
+        end(process)
+
+
+@contextlib.contextmanager
+def looking(node: Node, token: str | None = None) -> Iterator[Looks]:
+    """Look at a service for as long as the block runs."""
+    thread = Looking(node, token)
+    thread.start()
+    try:
+        yield thread.seen
+    finally:
+        thread.until.set()
+        thread.join(HANG_S)
+
+
+def attacked(attack: Callable[[Node, threading.Event], None], node: Node, seconds: float) -> Looks:
+    """Run an attack on a thread for some seconds, and return what was seen meanwhile."""
+    until = threading.Event()
+    attacker = threading.Thread(target=attack, args=(node, until), daemon=True)
+    with looking(node) as seen:
+        attacker.start()
+        time.sleep(seconds)  # the length of the attack, which nothing ends earlier
+    until.set()
+    attacker.join(HANG_S)
+    return seen
+
+
+def tcp(node: Node) -> socket.socket:
+    """A connection to the service's HTTP port."""
+    host, _, port = node.url.removeprefix("http://").partition(":")
+    made = socket.create_connection((host, int(port)), timeout=HANG_S)
+    made.settimeout(1.0)
+    return made

@@ -1,8 +1,13 @@
 # The service in a container, for amd64 and arm64. It runs as an unprivileged user on a root file
 # system that may be read-only. See docs/deployment.md.
-ARG BASE=python:3.11-slim-bookworm
+#
+# The digests are those of multi-platform indexes; the tags are for readers. The digest of the full
+# image is that of the publisher's record of 19 September 2026; that of the slim one was its tag's from
+# 21 September to 1 October. Each was found for its tag in three unrelated public repositories at
+# least. docs/deployment.md says how to verify and renew them.
+ARG BASE=python:3.11.16-slim-bookworm@sha256:a36c24f9cbdf4fd0f52d67f0823eeac19c2028c637cecc392d97f980d4fec56b
 # The full image of the same Python; only `strip` is used of its additions.
-ARG BUILD=python:3.11-bookworm
+ARG BUILD=python:3.11.16-bookworm@sha256:b99029c95d3d37fb1e4e76d287f7984373dca77c665885986e31b2c95260c13c
 
 FROM ${BUILD} AS build
 ENV PIP_DISABLE_PIP_VERSION_CHECK=1 PIP_NO_CACHE_DIR=1

@@ -62,6 +62,25 @@ def test_make_check_covers_dockerfile_and_compose_file() -> None:
     assert "vendor.compose-spec docker-compose.yml" in recipe
 
 
+def unpinned(dockerfile: str) -> list[str]:
+    """Return each stage of a Dockerfile whose base image has no digest."""
+    bases = dict(re.findall(r"^ARG (\w+)=(\S+)$", dockerfile, re.MULTILINE))
+    images = re.findall(r"^FROM (?:\$\{(\w+)\}|(\S+))", dockerfile, re.MULTILINE)
+    named = [bases.get(argument, argument) or image for argument, image in images]
+    return [image for image in named if not re.fullmatch(r"\S+@sha256:[0-9a-f]{64}", image)]
+
+
+def test_base_images_are_pinned_by_digest() -> None:
+    assert unpinned(DOCKERFILE) == []
+    tag = "python:3.11-slim-bookworm"
+    assert unpinned(re.sub(r"(ARG BASE=)\S+", rf"\g<1>{tag}", DOCKERFILE)) == [tag]
+    assert unpinned(DOCKERFILE.replace("FROM ${BASE}", f"FROM {tag}")) == [tag]
+    # `/opt/venv` is copied from one image to the other: both need the same Python and Debian.
+    tags = re.findall(r"^ARG \w+=(python:\S+)@", DOCKERFILE, re.MULTILINE)
+    assert len(tags) == 2
+    assert len({one.replace("-slim", "") for one in tags}) == 1
+
+
 def test_packages_are_installed_as_hashed_wheels() -> None:
     (install,) = [line for line in DOCKERFILE.splitlines() if "requirements.lock" in line][-1:]
     assert "--require-hashes" in install

@@ -93,8 +93,19 @@ def test_containers_run_without_privileges(name: str) -> None:
     assert service["read_only"] is True
     assert service["cap_drop"] == ["ALL"]
     assert service["security_opt"] == ["no-new-privileges:true"]
-    assert "user" not in service  # the image's user
+    assert service["user"] == "10001:10001"
     assert re.findall(r"^USER (\S+)$", DOCKERFILE, re.MULTILINE) == ["10001:10001"]
+    assert "privileged" not in service
+    assert not {"cap_add", "devices", "network_mode", "pid", "ipc"} & set(service)
+
+
+@pytest.mark.parametrize("name", ["companion", "sim"])
+def test_containers_have_limits(name: str) -> None:
+    service = yaml.safe_load(COMPOSE)["services"][name]
+    assert (service["pids_limit"], service["mem_limit"]) == (128, "1g")
+    assert service["tmpfs"] == ["/tmp:size=64m"]
+    volumes = [volume for volume in service.get("volumes", []) if not volume.endswith(":ro")]
+    assert volumes == (["recordings:/recordings"] if name == "companion" else [])
 
 
 def test_page_is_published_on_loopback_only() -> None:

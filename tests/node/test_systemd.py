@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 from support import BIN, HANG_S, ROOT, run_async
 
 from companion.node import systemd
@@ -225,31 +226,69 @@ def test_full_notify_socket_does_not_block_the_service(tmp_path: Path) -> None:
         assert answers[-1] == "Resource temporarily unavailable"
 
 
-def test_documented_systemd_unit_is_valid(tmp_path: Path) -> None:
-    analyze = shutil.which("systemd-analyze")
-    if analyze is None:
-        pytest.skip("no systemd-analyze here")
+EXPOSURE = {"companion": 15, "companion-serial": 20}
+"""Largest exposure level of each documented unit, in tenths; versions of systemd differ."""
+
+
+@pytest.fixture
+def units() -> dict[str, str]:
+    """The documented unit, and the unit with the drop-in for serial links."""
     text = (ROOT / "docs" / "deployment.md").read_text(encoding="utf-8")
-    unit = text.split("```ini\n")[1].split("```")[0]
+    unit, drop_in = (block.split("```")[0] for block in text.split("```ini\n")[1:3])
     program = "/opt/companion/bin/companion"
     assert f"ExecStart={program} run " in unit
+    unit = unit.replace(program, "/bin/true")
+    assert drop_in.startswith("[Service]\n")
+    serial = drop_in.removeprefix("[Service]\n") + "\n[Install]"
+    return {"companion": unit, "companion-serial": unit.replace("[Install]", serial)}
+
+
+def analyze(*arguments: object) -> "subprocess.CompletedProcess[str]":
+    """Run systemd-analyze; skips where there is none."""
+    program = shutil.which("systemd-analyze")
+    if program is None:
+        pytest.skip("no systemd-analyze: install systemd")
+    command = [program, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, check=False, timeout=HANG_S)
+
+
+@pytest.mark.parametrize("name", EXPOSURE)
+def test_documented_systemd_unit_is_valid(tmp_path: Path, units: dict[str, str], name: str) -> None:
     path = tmp_path / "companion.node.service"
-    path.write_text(unit.replace(program, "/bin/true"), encoding="utf-8")
-    done = subprocess.run(
-        [analyze, "verify", "--man=no", path],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=HANG_S,
-    )
+    path.write_text(units[name], encoding="utf-8")
+    done = analyze("verify", "--man=no", path)
     ours = [line for line in done.stderr.splitlines() if "companion.node.service" in line]
     assert (done.returncode, ours) == (0, [])
-    path.write_text(unit.replace("WatchdogSec", "WatchDogSec"), encoding="utf-8")
-    done = subprocess.run(
-        [analyze, "verify", "--man=no", path],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=HANG_S,
-    )
-    assert "WatchDogSec" in done.stderr  # the check is effective
+    path.write_text(units[name].replace("WatchdogSec", "WatchDogSec"), encoding="utf-8")
+    assert "WatchDogSec" in analyze("verify", "--man=no", path).stderr  # the check is effective
+
+
+@pytest.mark.parametrize("name", EXPOSURE)
+def test_documented_systemd_unit_exposes_little(
+    tmp_path: Path, units: dict[str, str], name: str
+) -> None:
+    path = tmp_path / f"{name}.service"
+
+    def is_confined(unit: str) -> bool:
+        path.write_text(unit, encoding="utf-8")
+        level = f"--threshold={EXPOSURE[name]}"
+        done = analyze("security", "--no-pager", "--offline=true", level, path)
+        assert "Overall exposure level" in done.stdout, done.stderr
+        return done.returncode == 0
+
+    assert is_confined(units[name])
+    assert not is_confined(units[name].replace("\nCapabilityBoundingSet=\n", "\n"))
+
+
+@pytest.mark.parametrize("name", EXPOSURE)
+def test_documented_systemd_unit_has_the_containers_limits(
+    units: dict[str, str], name: str
+) -> None:
+    compose = yaml.safe_load((ROOT / "docker-compose.yml").read_text(encoding="utf-8"))
+    container = compose["services"]["companion"]
+    lines = units[name].splitlines()
+    assert f"TasksMax={container['pids_limit']}" in lines
+    assert f"MemoryMax={container['mem_limit'].upper()}" in lines
+    for line in ("NoNewPrivileges=yes", "CapabilityBoundingSet=", "ProtectSystem=strict"):
+        assert line in lines
+    assert [line for line in lines if "ReadWritePaths" in line] == []  # StateDirectory alone

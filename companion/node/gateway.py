@@ -13,7 +13,7 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
-from companion.mavlink.trust.duplicate_ids import DuplicateIds
+from companion.mavlink.trust.known_peers import KnownPeers
 from companion.mavlink.voice.component import ACCEPTED_IDS, ComponentSpec, ServiceComponent
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.mavlink.wire.encode import Outgoing
@@ -53,7 +53,7 @@ class Gateway:
         self._hear = ACCEPTED_IDS if self._component else frozenset()
         self._timestamps: Timestamps | None = None
         signed = set(settings.signing.keys) - set(settings.signing.allow_unsigned)
-        self._duplicate_ids = DuplicateIds({*settings.links.routers, *signed})
+        self._known_peers = KnownPeers({*settings.links.routers, *signed})
         self._settings = settings
         self.links: list[Link] = []
         self.lag = ArrivalLag()  # delay from the arrival of datagrams to their processing
@@ -101,7 +101,7 @@ class Gateway:
             notify=self._notify,
             guard=guard,
             lag=self.lag,
-            duplicate_ids=self._duplicate_ids,
+            known_peers=self._known_peers,
         )
 
     async def run(self) -> None:
@@ -161,18 +161,18 @@ class Gateway:
                         self._notify(found)
                     else:
                         self._step(found)
-        self._notify_duplicates()
+        self._notify_strangers()
 
-    def _notify_duplicates(self) -> None:
-        for who, peers in self._duplicate_ids.found:
+    def _notify_strangers(self) -> None:
+        for who, stranger, known in self._known_peers.contradicted:
             text = (
-                f"{who}: reports from {' and '.join(peers)} contradict each other and are rejected;"
-                " add the trusted peer to `[links] routers`"
+                f"{who}: reports from {stranger} contradict those from {' and '.join(known)} and"
+                " are rejected; add the trusted peer to `[links] routers`"
             )
             self._notify(
                 Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=who, text=text)
             )
-        self._duplicate_ids.found.clear()
+        self._known_peers.contradicted.clear()
 
     @property
     def has_component(self) -> bool:

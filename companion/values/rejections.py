@@ -18,6 +18,7 @@ class Reason(DescribedEnum):
     ALTITUDE_JUMP = "altitude-jump", "reports at an unreachable height: the datum has changed"
     FROZEN = "frozen", "new time stamps on an old position, although the reported velocity is not 0"
     SHARED_ID = "shared-id", "reports of two vehicles under one id"
+    STRANGER = "stranger", "frames of a peer in the name of a UAV that a known peer reports"
     ZERO_POSITION = "zero-position", "reports near 0° N 0° E, which are sent before a fix"
     NO_POSITION = "no-position", "relayed aircraft without valid coordinates"
     NO_IDENTITY = "no-identity", "Remote ID positions received before the id of their sender"

@@ -148,8 +148,10 @@ def where(north_m: float, boot_ms: int) -> bytes:
     )
 
 
-@pytest.mark.parametrize("routers", [[], ["127.0.0.1:5"]])
-def test_contradicting_peers_are_announced_once_and_rejected(routers: list[str]) -> None:
+@pytest.mark.parametrize(("routers", "refused_port"), [([], 6), (["127.0.0.1:6"], 5)])
+def test_contradicting_peer_is_announced_once_and_rejected(
+    routers: list[str], refused_port: int
+) -> None:
     """The second one copies the clock and claims to be 20 m away: too little for the gate."""
     stepped: list[Event] = []
     said: list[Notice] = []
@@ -172,8 +174,13 @@ def test_contradicting_peers_are_announced_once_and_rejected(routers: list[str])
         for link in gateway.links:
             link._endpoint._socket.close()  # type: ignore[attr-defined]
     refused = [one for one in stepped if isinstance(one, Rejection)]
-    assert {one.reason for one in refused} == {Reason.SHARED_ID}
+    assert {one.reason for one in refused} == {Reason.STRANGER}
     believed = [one for one in stepped[-50:] if isinstance(one, Frame)]
-    assert len(believed) == (25 if routers else 0)
+    assert len(believed) == 25
+    assert {one.link for one in believed} == {gateway.links[6 - refused_port].status.url}
     (told,) = said
-    assert "1:1: reports from 127.0.0.1:5 and 127.0.0.1:6 contradict each other" in told.text
+    known_port = 11 - refused_port
+    assert (
+        f"1:1: reports from 127.0.0.1:{refused_port} contradict those from 127.0.0.1:{known_port}"
+        in told.text
+    )

@@ -31,9 +31,8 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
-from companion.mavlink.trust.duplicate_ids import DuplicateIds
+from companion.mavlink.trust.known_peers import KnownPeers
 from companion.mavlink.wire import cot_link
-from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
@@ -72,7 +71,7 @@ class Link:
         notify         called once when the link is lost, and once when it is back
         guard          rejects received frames and signs sent ones; None: no signing
         lag            records how late datagrams are processed
-        duplicate_ids  rejects contradictory reports of peers; shared by all links
+        known_peers    rejects frames of strangers in the name of others; shared by all links
 
     All methods but ``open`` must be called on the event loop; ``open`` is called before it runs.
     """
@@ -86,16 +85,17 @@ class Link:
         notify: Notify | None = None,
         guard: MessageSigning | None = None,
         lag: ArrivalLag | None = None,
-        duplicate_ids: DuplicateIds | None = None,
+        known_peers: KnownPeers | None = None,
     ) -> None:
         self.url = url
         self.status = LinkStatus(url=str(url))
+        self._name = str(url)
         self._receive = receive
         self._now_ns = now_ns
         self._notify = notify
         self._guard = guard
         self._lag = lag or ArrivalLag()
-        self._duplicate_ids = duplicate_ids or DuplicateIds()
+        self._known_peers = known_peers or KnownPeers()
         self._peers = Peers(self.status, self._finish, splitter(url))
         upcalls = Upcalls(
             up=self._up,
@@ -174,20 +174,23 @@ class Link:
             found = [_checked_origin(item) for item in found]
         if self._guard is not None:
             found = [_checked_by_guard(self._guard, item) for item in found]
+        found = [self._checked_for_strangers(peer, item) for item in found]
         self._peers.count(peer, found)
-        self._receive(
-            [self._checked_for_duplicates(peer, _checked_timesync(peer, item)) for item in found]
-        )
+        self._receive([_checked_timesync(peer, item) for item in found])
 
-    def _checked_for_duplicates(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
-        """Return the item, or a rejection if the sender's peers contradict each other."""
-        if isinstance(item, Rejection) or item.msgid not in POSE:
+    def _checked_for_strangers(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
+        """Return the item, or a rejection if a known peer brings this message of its sender."""
+        if isinstance(item, Rejection):
             return item
-        if not self._duplicate_ids.rejects(str(self.url), peer.address or str(self.url), item):
+        detail = self._known_peers.refusal(self._name, peer.address or self._name, item)
+        if detail is None:
             return item
-        who, detail = str(item.source), "two peers contradict each other"
         return Rejection(
-            t_ns=item.t_ns, source=who, reason=Reason.SHARED_ID, msgid=item.msgid, detail=detail
+            t_ns=item.t_ns,
+            source=str(item.source),
+            reason=Reason.STRANGER,
+            msgid=item.msgid,
+            detail=detail,
         )
 
     def _peer_gone(self, key: Hashable) -> None:

@@ -20,7 +20,7 @@ from companion.mavlink.links import kernel_time, tcp, transport, udp
 from companion.mavlink.links.peers import PEERS_MAX
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
-from companion.mavlink.wire.encode import Outgoing, heartbeat, timesync
+from companion.mavlink.wire.encode import Outgoing, heartbeat, pack, timesync
 from companion.mavlink.wire.framing import Splitter
 from companion.values import Frame, Reason, Rejection, Severity, Source
 
@@ -101,9 +101,9 @@ def test_datagrams_over_ipv6_become_frames(run: Run) -> None:
         async with running("udpin:[::1]:0") as (link, inbox):
             with senders(2, socket.AF_INET6) as both:
                 for n, sender in enumerate(both):
-                    sender.sendto(frame(n), ("::1", port_of(link)))
+                    sender.sendto(frame(n, sysid=1 + n), ("::1", port_of(link)))
                 await inbox.until(2)
-            assert sorted(inbox.raws) == sorted([frame(0), frame(1)])
+            assert sorted(inbox.raws) == sorted([frame(0), frame(1, sysid=2)])
             assert link.status.peers == 2
             assert link.status.url.startswith("udpin:[::1]:")
 
@@ -458,15 +458,16 @@ def test_connections_are_served_concurrently(run: Run, host: str) -> None:
             await until_true(lambda: link.status.state == "up")
             async with connected(link, family) as a, connected(link, family) as b:
                 async with connected(link, family) as broken:
-                    for stream, raw in ((a, frame(1)), (b, frame(2)), (broken, frame(3))):
+                    second = frame(2, sysid=2)
+                    for stream, raw in ((a, frame(1)), (b, second), (broken, frame(3))):
                         stream.send(raw[:20])
                     await until_true(lambda: link.status.bytes == 60)
                 await until_true(lambda: bool(link.status.lost))
                 a.send(frame(1)[20:])
                 await inbox.until(1)
-                b.send(frame(2)[20:])
+                b.send(second[20:])
                 await inbox.until(2)
-            assert inbox.raws == [frame(1), frame(2)]
+            assert inbox.raws == [frame(1), second]
             assert (link.status.state, link.status.peers) == ("up", 3)
             assert link.status.lost == {"garbage": 20} and inbox.notices == []
 
@@ -481,7 +482,7 @@ def test_number_of_connections_is_bounded(run: Run, monkeypatch: pytest.MonkeyPa
         async with running("tcpin:127.0.0.1:0") as (link, inbox), connected(link) as first:
             async with connected(link) as second:
                 first.send(frame(1))
-                second.send(frame(2))
+                second.send(frame(2, sysid=2))
                 await inbox.until(2)
                 async with connected(link) as third:
                     with contextlib.suppress(ConnectionResetError):
@@ -489,7 +490,7 @@ def test_number_of_connections_is_bounded(run: Run, monkeypatch: pytest.MonkeyPa
                 assert link.send(heartbeat(OURS)) == 2 and link.status.send_dropped == 0
             await until_true(lambda: link.send(heartbeat(OURS)) == 1)  # it has noticed the end
             async with connected(link) as fourth:
-                fourth.send(frame(3))
+                fourth.send(frame(3, sysid=3))
                 await inbox.until(3)
 
     run(test())
@@ -676,7 +677,7 @@ def test_messages_go_to_every_recently_received_peer(run: Run) -> None:
                 now[0] = 1
                 new.socket.sendto(frame(0, sysid=2), to)
                 v1.socket.sendto(frame(0, sysid=3, version=1), to)
-                both.socket.sendto(frame(0, version=1) + frame(1), to)
+                both.socket.sendto(frame(0, sysid=4, version=1) + frame(1, sysid=4), to)
                 noise.socket.sendto(b"\xfe\x00noise", to)
                 await inbox.until(5)
                 assert link.send(heartbeat(OURS)) == 4
@@ -693,6 +694,8 @@ def test_messages_go_to_every_recently_received_peer(run: Run) -> None:
 
 
 def test_reply_goes_to_the_peer_last_received_from(run: Run) -> None:
+    """Messages other than positions: a stranger's positions would not count."""
+
     async def test() -> None:
         with contextlib.ExitStack() as stack:
             a, b = Mailbox(stack), Mailbox(stack)
@@ -700,12 +703,28 @@ def test_reply_goes_to_the_peer_last_received_from(run: Run) -> None:
                 to, one = ("127.0.0.1", port_of(link)), Source(1, 1)
                 assert not link.send_to(one, heartbeat(OURS))
                 for n, peer in enumerate((a, b, a)):
-                    peer.socket.sendto(frame(n), to)
+                    peer.socket.sendto(pack(heartbeat(one), n), to)
                     await inbox.until(n + 1)
                     assert link.send_to(one, heartbeat(OURS))
                     assert not link.send_to(Source(1, 2), heartbeat(OURS))
                 assert [seq for _, seq, _ in a.got()] == [0, 1]
                 assert [seq for _, seq, _ in b.got()] == [0]
+
+    run(test())
+
+
+def test_reply_does_not_go_to_a_stranger(run: Run) -> None:
+    async def test() -> None:
+        with contextlib.ExitStack() as stack:
+            known, stranger = Mailbox(stack), Mailbox(stack)
+            async with running("udpin:127.0.0.1:0") as (link, inbox):
+                to = ("127.0.0.1", port_of(link))
+                for n, peer in enumerate((known, stranger)):
+                    peer.socket.sendto(frame(n), to)
+                    await until_true(lambda n=n: len(inbox.items) == n + 1)
+                assert link.send_to(Source(1, 1), heartbeat(OURS))
+                assert (len(known.got()), len(stranger.got())) == (1, 0)
+                assert link.status.lost == {"stranger": 1}
 
     run(test())
 

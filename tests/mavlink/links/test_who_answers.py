@@ -49,13 +49,24 @@ def test_timesync_answer_must_come_from_the_position_peer(taken: Taken) -> None:
     forged = taken.take(ELSEWHERE, answer())
     assert isinstance(forged, Rejection)
     assert (forged.source, forged.reason, forged.msgid) == (
-        "1:1", Reason.UNPLACED_STAMP, TIMESYNC,
+        "1:1", Reason.STRANGER, TIMESYNC,
     )  # fmt: skip
 
 
-def test_answers_are_accepted_from_every_peer_that_brings_positions(taken: Taken) -> None:
-    for number, way in enumerate((HOME, ELSEWHERE)):
-        taken.take(way, frame(number))
+def test_answer_without_positions_from_anywhere_is_rejected(taken: Taken) -> None:
+    forged = taken.take(ELSEWHERE, answer())
+    assert isinstance(forged, Rejection)
+    assert forged.reason is Reason.UNPLACED_STAMP
+
+
+def test_answers_are_accepted_from_every_known_peer(taken: Taken) -> None:
+    """A second route is known after its positions have agreed for some seconds."""
+    for number in range(80):
+        taken.now_ns += 100_000_000
+        for way in (HOME, ELSEWHERE):
+            taken.take(way, frame(100 * number))
+        if number == 20:
+            assert isinstance(taken.take(ELSEWHERE, answer()), Rejection)
     assert all(isinstance(taken.take(way, answer()), Frame) for way in (HOME, ELSEWHERE))
 
 

@@ -1,64 +1,17 @@
 """One id from two peers: one vehicle or two. The adversary copies clock and path."""
 
-import math
 import random
 from collections import deque
-from collections.abc import Callable, Iterable
 from itertools import pairwise
-from typing import NamedTuple
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from peer_streams import HOME, LINK, OTHER, Place, S, Stream, beside, circle, heard, report
 
-from companion.mavlink.trust import duplicate_ids
+from companion.mavlink.trust import duplicate_ids, paths
 from companion.mavlink.trust.duplicate_ids import KEPT_NS, DuplicateIds
-from companion.mavlink.wire.encode import Outgoing, pack
-from companion.mavlink.wire.framing import Splitter
-from companion.mavlink.wire.positions import GLOBAL_POSITION_INT, OwnPosition
-from companion.values import Frame, Source
-
-S = 1_000_000_000
-LINK = "udpin:0.0.0.0:14550"
-HOME, OTHER = "10.0.0.1:14550", "10.0.0.66:4000"
-
-
-class Place(NamedTuple):
-    """Position of a vehicle, in m north and east of an origin, and its velocity."""
-
-    north_m: float
-    east_m: float
-    north_mps: float
-    east_mps: float
-
-
-def circle(t_s: float) -> Place:
-    """20 m/s, 60 m wide: 13 m/s² of centripetal acceleration, more than most can fly."""
-    angle, speed = t_s / 3, 20.0
-    return Place(
-        north_m=60 * math.cos(angle),
-        east_m=60 * math.sin(angle),
-        north_mps=-speed * math.sin(angle),
-        east_mps=speed * math.cos(angle),
-    )
-
-
-def report(t_ns: int, boot_s: float, place: Place, sysid: int = 1) -> Frame:
-    source, payload = Source(sysid, 1), bytearray()
-    degrees = place.north_m / 111_195.0, place.east_m / 111_195.0 / math.cos(math.radians(47.0))
-    payload += round(boot_s * 1000).to_bytes(4, "little")
-    for value in (47e7 + degrees[0] * 1e7, 8e7 + degrees[1] * 1e7, 488_000, 25_000):
-        payload += round(value).to_bytes(4, "little", signed=True)
-    for value in (place.north_mps * 100, place.east_mps * 100, 0):
-        payload += round(value).to_bytes(2, "little", signed=True)
-    raw = pack(Outgoing(source, GLOBAL_POSITION_INT, bytes(payload) + b"\1\0"), 0, 2)
-    (frame,) = Splitter("x").feed(t_ns, raw)
-    assert isinstance(frame, Frame)
-    return frame
-
-
-Stream = Iterable[tuple[float, float, str, Place]]
-"""Arrival time, clock, delivering peer and claimed position."""
+from companion.mavlink.wire.positions import OwnPosition
 
 
 def refused(judge: DuplicateIds, *streams: Stream) -> dict[str, list[float]]:
@@ -68,24 +21,6 @@ def refused(judge: DuplicateIds, *streams: Stream) -> dict[str, list[float]]:
         if judge.rejects(LINK, peer, report(round(arrives_s * S), boot_s, place)):
             found[peer].append(arrives_s)
     return found
-
-
-def heard(
-    peer: str,
-    hz: float,
-    *,
-    lasts_s: float = 60.0,
-    delay_s: Callable[[], float] = lambda: 0.05,
-    begins_s: float = 0.0,
-    told: Callable[[float], Place] = circle,
-) -> Stream:
-    for number in range(round((lasts_s - begins_s) * hz)):
-        t_s = begins_s + number / hz
-        yield t_s + delay_s(), 100 + t_s, peer, told(t_s)
-
-
-def beside(metres: float) -> Callable[[float], Place]:
-    return lambda t_s: circle(t_s)._replace(north_m=circle(t_s).north_m + metres)
 
 
 # --- one vehicle ----------------------------------------------------------------------------------
@@ -237,5 +172,5 @@ def test_path_search_from_the_newest_matches_a_full_search(
     first, last = said(boot_ms), said(boot_ms + later_ms)
     around = [one for one in pairwise(reports) if one[0].boot_ms <= boot_ms <= one[1].boot_ms]
     within = [one for one in reports if first.boot_ms <= one.boot_ms <= last.boot_ms]
-    assert list(duplicate_ids._around(reports, boot_ms)) == around[::-1]
-    assert list(duplicate_ids._within(reports, first, last)) == within[::-1]
+    assert list(paths.around(reports, boot_ms)) == around[::-1]
+    assert list(paths.within(reports, first, last)) == within[::-1]

@@ -1,0 +1,258 @@
+"""Known peers of each sender, and strangers, whose frames are not used beside those of known ones.
+
+A sender may be received over any number of peers (routers, second radios), and anybody that
+reaches a link's port may send in its name. The first peer of a sender is known. While a known peer
+is current, the messages that it brings are not accepted from a stranger. A stranger becomes known
+
+* when its positions have agreed with those of the current known peers for ``PROBATION_NS`` and in
+  ``AGREEMENTS`` comparisons; each contradiction doubles that time,
+* at once if no known peer is current: a vehicle whose radio restarted has another address,
+* at once if the settings name it as a router.
+
+Positions agree as in ``duplicate_ids``. If two known peers contradict each other, the one that was
+known later is a stranger again. So the vehicle that was here first stays believed, and a stranger
+costs it nothing; whoever sends first in a vehicle's name is believed until it falls silent.
+
+The messages that a known peer does not bring are accepted from any peer: routes may be divided by
+message. Messages with a time stamp and TIMESYNC are not, since they move clocks.
+"""
+
+from collections import OrderedDict, deque
+from collections.abc import Collection
+from dataclasses import dataclass, field
+from typing import Final
+
+from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
+from companion.mavlink.trust.paths import Path
+from companion.mavlink.wire.decode import DECODED, POSE
+from companion.mavlink.wire.encode import TIMESYNC
+from companion.mavlink.wire.positions import OWN, read
+from companion.mavlink.wire.stamps import STAMPED
+from companion.values import Frame, Source
+
+PROBATION_NS: Final = 5_000_000_000
+PROBATION_MOST_NS: Final = 300_000_000_000
+AGREEMENTS: Final = 5
+CURRENT_NS: Final = (1_000_000_000, 2_000_000_000)
+"""Least and largest time after a message for which a peer is current."""
+CURRENT_INTERVALS: Final = 3.0  # that time in intervals between its messages
+SENDERS_MAX: Final = 4096  # senders followed; those of known peers are forgotten last
+PEERS_MAX: Final = 4  # known peers of a sender, and strangers compared with them
+NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one sender
+
+STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
+_TIMED: Final = frozenset({*STAMPED, TIMESYNC})
+_JUDGED: Final = DECODED | POSE | _TIMED
+
+
+@dataclass(slots=True, kw_only=True)
+class _Peer:
+    """Peer of one sender. ``since_ns`` is when it became known, or a stranger."""
+
+    is_router: bool
+    since_ns: int
+    heard_ns: int
+    interval_ns: float = 0.0
+    msgids: set[int] = field(default_factory=set)
+    path: Path = field(default_factory=Path)
+    agreements: int = 0
+    agrees_since_ns: int = 0
+    probation_ns: int = PROBATION_NS
+
+    def is_current(self, now_ns: int) -> bool:
+        """Return whether the peer's newest message is so new that more are to be expected."""
+        least_ns, most_ns = CURRENT_NS
+        wait_ns = min(max(CURRENT_INTERVALS * self.interval_ns, least_ns), most_ns)
+        return now_ns - self.heard_ns <= wait_ns
+
+    def hear(self, now_ns: int) -> None:
+        """Note the arrival of a position or attitude."""
+        passed_ns = now_ns - self.heard_ns
+        if passed_ns > KEPT_NS:
+            self.since_ns = now_ns
+        elif passed_ns > 0:
+            self.interval_ns += 0.1 * (passed_ns - self.interval_ns)
+        self.heard_ns = max(now_ns, self.heard_ns)
+
+
+@dataclass(slots=True, kw_only=True)
+class _Sender:
+    """Peers of one sender, and the times of contradictions between them."""
+
+    known: dict[str, _Peer] = field(default_factory=dict)
+    strangers: dict[str, _Peer] = field(default_factory=dict)
+    contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
+    notified_ns: int = -NOTICE_NS
+
+
+class KnownPeers:
+    """Known peers and strangers of all senders.
+
+    ``routers`` names trusted peers: a link as in the settings, HOST or HOST:PORT. ``contradicted``
+    holds the senders in whose name a stranger reports another path, with stranger and known peers,
+    since it was last emptied.
+    """
+
+    def __init__(self, routers: Collection[str] = ()) -> None:
+        self.contradicted: list[tuple[str, str, tuple[str, ...]]] = []
+        self._routers = frozenset(routers)
+        self._senders: OrderedDict[Source, _Sender] = OrderedDict()  # by the last position
+
+    def refusal(self, link: str, peer: str, frame: Frame) -> str | None:
+        """Process a frame; return why it must be rejected, None to accept it.
+
+        ``link`` is the link as in the settings, ``peer`` the peer's HOST:PORT, or the link again if
+        it has only one peer.
+        """
+        if frame.msgid not in _JUDGED:
+            return None
+        sender = self._senders.get(frame.source)
+        if sender is None:
+            if frame.msgid not in POSE:
+                return None
+            sender = self._follow(frame)
+        known = sender.known.get(peer)
+        if known is not None:
+            return self._known(sender, peer, known, frame)
+        current = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
+        is_router = self._is_router(link, peer)
+        if not current or is_router:
+            if frame.msgid in POSE:
+                self._make_known(sender, peer, self._new(frame, is_router), frame)
+            return None
+        brings = frame.msgid in _TIMED or any(frame.msgid in one.msgids for one in current)
+        if not brings:
+            return None
+        if frame.msgid in OWN:
+            self._compare_stranger(sender, peer, frame)
+            if peer in sender.known:
+                return None
+        return STRANGER
+
+    def is_known(self, source: Source, peer: str) -> bool:
+        """Return whether a peer is a known one of a sender."""
+        sender = self._senders.get(source)
+        return sender is not None and peer in sender.known
+
+    # --- known peers --------------------------------------------------------------------------
+
+    def _known(self, sender: _Sender, peer: str, known: _Peer, frame: Frame) -> str | None:
+        known.msgids.add(frame.msgid)
+        if frame.msgid not in POSE:
+            return None
+        known.hear(frame.t_ns)
+        self._senders.move_to_end(frame.source)
+        if frame.msgid not in OWN or (len(sender.known) == 1 and not sender.strangers):
+            return None
+        said = read(frame)
+        before = known.path.newest
+        if not known.path.add(said):
+            return None
+        for name, stranger in list(sender.strangers.items()):
+            if frame.t_ns - stranger.heard_ns > KEPT_NS:
+                del sender.strangers[name]
+                continue
+            agrees = known.path.agrees_with(stranger.path, before, said)
+            self._judge(sender, name, stranger, agrees, frame)
+        for name, other in list(sender.known.items()):
+            if other is known or known.path.agrees_with(other.path, before, said) is not False:
+                continue
+            later = min((known, peer), (other, name), key=lambda one: _standing(one[0]))[1]
+            if not sender.known[later].is_router:
+                self._demote(sender, later, frame)
+        return None if peer in sender.known else STRANGER
+
+    def _demote(self, sender: _Sender, name: str, frame: Frame) -> None:
+        """Make a known peer a stranger, since it contradicts one that was known earlier."""
+        peer = sender.known.pop(name)
+        self._add(sender.strangers, name, peer, frame.t_ns)
+        self._judge(sender, name, peer, False, frame)
+
+    def _make_known(self, sender: _Sender, name: str, peer: _Peer, frame: Frame) -> None:
+        for old in [k for k, v in sender.known.items() if frame.t_ns - v.heard_ns > KEPT_NS]:
+            del sender.known[old]
+        sender.strangers.pop(name, None)
+        peer.since_ns = frame.t_ns
+        peer.msgids.add(frame.msgid)
+        peer.hear(frame.t_ns)
+        self._senders.move_to_end(frame.source)
+        self._add(sender.known, name, peer, frame.t_ns)
+
+    # --- strangers ----------------------------------------------------------------------------
+
+    def _compare_stranger(self, sender: _Sender, name: str, frame: Frame) -> None:
+        stranger = sender.strangers.get(name)
+        if stranger is None:
+            stranger = self._new(frame, False)
+            self._add(sender.strangers, name, stranger, frame.t_ns)
+        stranger.hear(frame.t_ns)
+        said = read(frame)
+        before = stranger.path.newest
+        if not stranger.path.add(said):
+            return
+        agreed = [
+            stranger.path.agrees_with(one.path, before, said)
+            for one in sender.known.values()
+            if one.is_current(frame.t_ns)
+        ]
+        if False in agreed:
+            self._judge(sender, name, stranger, False, frame)
+        elif True in agreed:
+            self._judge(sender, name, stranger, True, frame)
+
+    def _judge(
+        self, sender: _Sender, name: str, stranger: _Peer, agrees: bool | None, frame: Frame
+    ) -> None:
+        """Count a comparison of a stranger with a known peer."""
+        if agrees is None:
+            return
+        if not agrees:
+            stranger.agreements = 0
+            stranger.probation_ns = min(2 * stranger.probation_ns, PROBATION_MOST_NS)
+            self._note_contradiction(sender, name, frame)
+            return
+        if stranger.agreements == 0:
+            stranger.agrees_since_ns = frame.t_ns
+        stranger.agreements += 1
+        proven_ns = frame.t_ns - stranger.agrees_since_ns
+        if stranger.agreements >= AGREEMENTS and proven_ns >= stranger.probation_ns:
+            self._make_known(sender, name, stranger, frame)
+
+    def _note_contradiction(self, sender: _Sender, name: str, frame: Frame) -> None:
+        """Publish contradictions that are more than the resets of an autopilot's position."""
+        when = sender.contradicted_ns
+        while when and frame.t_ns - when[0] > KEPT_NS:
+            when.popleft()
+        if not when or frame.t_ns - when[-1] >= SPACED_NS:
+            when.append(frame.t_ns)
+        if len(when) >= CONTRADICTIONS and frame.t_ns - sender.notified_ns >= NOTICE_NS:
+            sender.notified_ns = frame.t_ns
+            self.contradicted.append((str(frame.source), name, tuple(sender.known)))
+
+    # --- tables -------------------------------------------------------------------------------
+
+    def _is_router(self, link: str, peer: str) -> bool:
+        return not {link, peer, peer.rpartition(":")[0].strip("[]")}.isdisjoint(self._routers)
+
+    @staticmethod
+    def _new(frame: Frame, is_router: bool) -> _Peer:
+        return _Peer(is_router=is_router, since_ns=frame.t_ns, heard_ns=frame.t_ns)
+
+    @staticmethod
+    def _add(peers: dict[str, _Peer], name: str, peer: _Peer, now_ns: int) -> None:
+        """Add a peer. Beyond ``PEERS_MAX`` silent ones go, then the last to become what it is."""
+        peers[name] = peer
+        if len(peers) > PEERS_MAX:
+            silent = [one for one in peers if not peers[one].is_current(now_ns)]
+            del peers[min(silent or peers, key=lambda one: _standing(peers[one]))]
+
+    def _follow(self, frame: Frame) -> _Sender:
+        """Start to follow a sender; beyond ``SENDERS_MAX`` the one silent for longest goes."""
+        if len(self._senders) >= SENDERS_MAX:
+            self._senders.popitem(last=False)
+        return self._senders.setdefault(frame.source, _Sender())
+
+
+def _standing(peer: _Peer) -> tuple[bool, int]:
+    """Return what decides which of two peers is believed, the higher one."""
+    return peer.is_router, -peer.since_ns

@@ -1,0 +1,245 @@
+"""Known peers and strangers: who was first stays believed, a second route of one vehicle counts."""
+
+import math
+import struct
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from peer_streams import HOME, LINK, OTHER, Place, S, Stream, beside, circle, heard, report
+
+from companion.mavlink.trust import known_peers, paths
+from companion.mavlink.trust.duplicate_ids import KEPT_NS
+from companion.mavlink.trust.known_peers import PROBATION_NS, STRANGER, KnownPeers
+from companion.mavlink.wire.decode import SYSTEM_TIME
+from companion.mavlink.wire.encode import TIMESYNC, Outgoing, heartbeat, pack
+from companion.mavlink.wire.framing import Splitter
+from companion.values import Frame, Source
+
+PROBATION_S = PROBATION_NS / S
+
+
+def rejected(peers: KnownPeers, *streams: Stream) -> dict[str, list[float]]:
+    """Return the times of rejections per peer, for interleaved streams."""
+    found: dict[str, list[float]] = {}
+    for arrives_s, boot_s, peer, place in sorted(one for stream in streams for one in stream):
+        found.setdefault(peer, [])
+        if peers.refusal(LINK, peer, report(round(arrives_s * S), boot_s, place)) is not None:
+            found[peer].append(arrives_s)
+    return found
+
+
+def message(t_s: float, out: Outgoing) -> Frame:
+    (frame,) = Splitter("x").feed(round(t_s * S), pack(out, 0, 2))
+    assert isinstance(frame, Frame)
+    return frame
+
+
+def drifting(rate_mps: float, from_s: float) -> Callable[[float], Place]:
+    return lambda t_s: beside(rate_mps * max(0.0, t_s - from_s))(t_s)
+
+
+# --- one vehicle ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("hz", [1, 2.5, 10, 50])
+@pytest.mark.parametrize("delay_s", [0.05, 0.7])
+def test_second_route_is_used_once_it_has_agreed(hz: float, delay_s: float) -> None:
+    """Also with stamps of its own, and if it is slower than the first."""
+    second = heard(OTHER, hz, begins_s=10.137, delay_s=lambda: delay_s)
+    found = rejected(KnownPeers(), heard(HOME, 4), second)
+    assert found[HOME] == []
+    assert found[OTHER]
+    assert max(found[OTHER]) <= 10.137 + PROBATION_S + delay_s + max(2.0, 2 / hz)
+
+
+def test_restarted_radio_with_new_address_is_used_after_a_second() -> None:
+    peers = KnownPeers()
+    found = rejected(peers, heard(HOME, 10, lasts_s=20), heard(OTHER, 10, begins_s=20.1))
+    assert found[HOME] == []
+    assert all(t_s < 21.1 for t_s in found[OTHER])
+    assert peers.contradicted == []
+
+
+def test_position_resets_of_one_vehicle_cost_the_first_route_nothing() -> None:
+    def glitches(t_s: float) -> Place:
+        return beside(30.0 if t_s % 20 > 10 else 0.0)(t_s)
+
+    peers = KnownPeers()
+    found = rejected(peers, heard(HOME, 4, told=glitches), heard(OTHER, 5, told=glitches))
+    assert found[HOME] == []
+    assert peers.contradicted == []
+
+
+def test_messages_that_the_known_peer_does_not_bring_are_accepted_from_others() -> None:
+    peers = KnownPeers()
+    rejected(peers, heard(HOME, 4, lasts_s=10))
+    assert peers.refusal(LINK, OTHER, message(10.0, heartbeat(Source(1, 1)))) is None
+    assert peers.refusal(LINK, HOME, message(10.0, heartbeat(Source(1, 1)))) is None
+    assert peers.refusal(LINK, OTHER, message(10.0, heartbeat(Source(1, 1)))) == STRANGER
+    other_id = message(10.0, heartbeat(Source(2, 1)))
+    assert peers.refusal(LINK, OTHER, other_id) is None
+
+
+@pytest.mark.parametrize(
+    ("msgid", "payload"),
+    [
+        (TIMESYNC, struct.pack("<qq", 7, 8)),
+        (SYSTEM_TIME, struct.pack("<QI", 7, 8)),
+        (116, struct.pack("<Ihhhhhhhhh", 7, *range(1, 10))),  # SCALED_IMU2
+    ],
+)
+def test_clocks_are_not_moved_by_strangers(msgid: int, payload: bytes) -> None:
+    """By messages too that the known peer does not bring."""
+    peers = KnownPeers()
+    rejected(peers, heard(HOME, 4, lasts_s=10))
+    answer = message(10.0, Outgoing(Source(1, 1), msgid, payload))
+    assert peers.refusal(LINK, OTHER, answer) == STRANGER
+    assert peers.refusal(LINK, HOME, answer) is None
+
+
+# --- strangers ------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("forged_hz", [0.04, 1, 4, 20])
+@pytest.mark.parametrize("metres", [8.0, -8.0, 50.0])
+def test_vehicle_that_was_first_stays_believed(forged_hz: float, metres: float) -> None:
+    """Also if the forged stamps are ahead of its own."""
+    for ahead_s in (0.0, 0.2):
+        forged = (
+            (at_s, boot_s + ahead_s, peer, place)
+            for at_s, boot_s, peer, place in heard(
+                OTHER, forged_hz, begins_s=10.03, told=beside(metres)
+            )
+        )
+        peers = KnownPeers()
+        found = rejected(peers, heard(HOME, 4), forged)
+        assert found[HOME] == []
+        assert len(found[OTHER]) == round((60 - 10.03) * forged_hz)
+        if forged_hz >= 1:
+            assert peers.contradicted == [("1:1", OTHER, (HOME,))]
+
+
+def test_fresh_ports_evict_no_known_peer_and_are_never_believed() -> None:
+    """Each report comes from another port, near the true path and drifting away."""
+    forged = (
+        (at_s, boot_s + 0.05, f"10.0.0.66:{number}", place)
+        for number, (at_s, boot_s, _, place) in enumerate(
+            heard(OTHER, 40, begins_s=10.0, told=drifting(2.0, 10.0))
+        )
+    )
+    peers = KnownPeers()
+    found = rejected(peers, heard(HOME, 10), forged)
+    assert found[HOME] == []
+    assert sum(len(times) for times in found.values()) == 2000
+    assert [one[0] for one in peers.contradicted] == ["1:1"]
+
+
+def test_stranger_that_agrees_first_and_drifts_is_rejected_within_the_slack() -> None:
+    peers = KnownPeers()
+    forged = heard(OTHER, 10, begins_s=10.03, told=drifting(2.0, 30.0))
+    found = rejected(peers, heard(HOME, 10), forged)
+    assert found[HOME] == []
+    assert not [t_s for t_s in found[OTHER] if 17 < t_s < 30]
+    slack_s = (paths.SLACK_M + 20.0 * paths.STALE_S) / 2.0  # drifts 2 m/s, flies 20 m/s
+    refused_s = [t_s for t_s in found[OTHER] if t_s > 30]
+    assert len(refused_s) > 10 * (60 - 30 - slack_s - 0.5)
+
+
+def test_each_contradiction_doubles_the_probation() -> None:
+    """A stranger that agrees in between is used later each time."""
+
+    def told(t_s: float) -> Place:
+        return beside(30.0 if 20 < t_s < 21 else 0.0)(t_s)
+
+    peers = KnownPeers()
+    found = rejected(peers, heard(HOME, 10), heard(OTHER, 10, begins_s=10.03, told=told))
+    assert found[HOME] == []
+    first = [t_s for t_s in found[OTHER] if t_s < 20]
+    second = [t_s for t_s in found[OTHER] if t_s > 20]
+    assert max(first) == pytest.approx(10 + PROBATION_S, abs=0.5)
+    assert max(second) > 21 + 1.9 * PROBATION_S
+
+
+def test_stranger_is_used_when_the_known_peer_falls_silent() -> None:
+    peers = KnownPeers()
+    found = rejected(
+        peers, heard(HOME, 10, lasts_s=20), heard(OTHER, 10, begins_s=10.03, told=beside(20))
+    )
+    assert all(t_s < 21.2 for t_s in found[OTHER])
+
+
+def test_first_peer_is_believed_again_after_a_gap_used_by_a_stranger() -> None:
+    def with_gap() -> Stream:
+        return (one for one in heard(HOME, 10) if not 20 < one[0] < 24)
+
+    peers = KnownPeers()
+    found = rejected(peers, with_gap(), heard(OTHER, 10, begins_s=10.03, told=beside(20)))
+    assert found[HOME] == []
+    assert not [t_s for t_s in found[OTHER] if 21.2 < t_s < 24]
+    assert len([t_s for t_s in found[OTHER] if t_s > 24.5]) > 10 * (60 - 25)
+
+
+@pytest.mark.parametrize("named", [OTHER, "10.0.0.66"])
+def test_router_is_believed_over_a_peer_that_was_first(named: str) -> None:
+    peers = KnownPeers([named])
+    found = rejected(peers, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=beside(20)))
+    assert found[OTHER] == []
+    assert len(found[HOME]) > 190
+
+
+def test_all_peers_of_a_configured_link_are_trusted() -> None:
+    peers = KnownPeers([LINK])
+    found = rejected(peers, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=beside(20)))
+    assert found == {HOME: [], OTHER: []}
+
+
+@given(
+    st.lists(
+        st.tuples(
+            st.floats(0, 60), st.sampled_from(["a", "b", "c"]), st.floats(-300, 300),
+            st.floats(-3, 3),
+        ),
+        max_size=60,
+    )
+)  # fmt: skip
+def test_no_stranger_costs_the_first_peer_a_report(
+    forged: list[tuple[float, str, float, float]],
+) -> None:
+    """Whatever strangers send, at any time after the first report, with any clock and place."""
+    stream = [
+        (0.2 + at_s, 100 + at_s + ahead_s, f"10.0.0.66:{peer}", beside(off_m)(at_s))
+        for at_s, peer, off_m, ahead_s in forged
+    ]
+    found = rejected(KnownPeers(), heard(HOME, 5), stream)
+    assert found[HOME] == []
+
+
+# --- bounds ---------------------------------------------------------------------------------------
+
+
+def test_invented_ids_and_addresses_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(known_peers, "SENDERS_MAX", 8)
+    peers = KnownPeers()
+    for number in range(400):
+        peer, sysid = f"10.0.0.9:{number}", number % 100 + 2
+        t_ns = number * S // 10
+        peers.refusal(LINK, HOME, report(t_ns, t_ns / S, circle(t_ns / S)))
+        peers.refusal(LINK, peer, report(t_ns, number, circle(0), sysid))
+        peers.refusal(LINK, peer, report(t_ns, t_ns / S, circle(0)))
+    assert len(peers._senders) == 8
+    assert Source(1, 1) in peers._senders
+    for sender in peers._senders.values():
+        assert len(sender.known) <= known_peers.PEERS_MAX
+        assert len(sender.strangers) <= known_peers.PEERS_MAX
+
+
+def test_silent_peers_are_forgotten() -> None:
+    peers = KnownPeers()
+    for number in range(20):
+        t_ns = number * (KEPT_NS + S)
+        peers.refusal(LINK, f"10.0.0.9:{number}", report(t_ns, t_ns / S, circle(0)))
+    (sender,) = peers._senders.values()
+    assert len(sender.known) == 1
+    assert math.isfinite(next(iter(sender.known.values())).interval_ns)

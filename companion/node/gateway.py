@@ -14,6 +14,7 @@ from companion.mavlink.links.signing_store import Timestamps, key_warning, load_
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
 from companion.mavlink.trust.known_peers import KnownPeers
+from companion.mavlink.trust.newcomers import Newcomers
 from companion.mavlink.voice.component import ACCEPTED_IDS, ComponentSpec, ServiceComponent
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.mavlink.wire.encode import Outgoing
@@ -23,6 +24,7 @@ from companion.settings.section import ConfigError
 from companion.values import Event, Frame, Notice, Reason, Rejection, Severity, Source, UserError
 
 SETUP_SIGNING: Final = 256  # message that carries a signing key in plain; it is never recorded
+NOTICE_EVERY_NS: Final = 60_000_000_000  # least time between two notices of too many senders
 SAVE_EVERY_S: Final = 0.25  # interval of checks whether signing timestamps must be saved
 
 
@@ -54,6 +56,8 @@ class Gateway:
         self._timestamps: Timestamps | None = None
         signed = set(settings.signing.keys) - set(settings.signing.allow_unsigned)
         self._known_peers = KnownPeers({*settings.links.routers, *signed})
+        self._newcomers = Newcomers()
+        self._refusal_notice_ns = -NOTICE_EVERY_NS
         self._settings = settings
         self.links: list[Link] = []
         self.lag = ArrivalLag()  # delay from the arrival of datagrams to their processing
@@ -102,6 +106,7 @@ class Gateway:
             guard=guard,
             lag=self.lag,
             known_peers=self._known_peers,
+            newcomers=self._newcomers,
         )
 
     async def run(self) -> None:
@@ -162,6 +167,7 @@ class Gateway:
                     else:
                         self._step(found)
         self._notify_strangers()
+        self._notify_newcomers()
 
     def _notify_strangers(self) -> None:
         for who, stranger, known in self._known_peers.contradicted:
@@ -173,6 +179,18 @@ class Gateway:
                 Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=who, text=text)
             )
         self._known_peers.contradicted.clear()
+
+    def _notify_newcomers(self) -> None:
+        """Publish a notice while frames of new senders are rejected, at most once a minute."""
+        now_ns = self._now_ns()
+        if self._newcomers.refused and now_ns - self._refusal_notice_ns >= NOTICE_EVERY_NS:
+            self._refusal_notice_ns = now_ns
+            self._newcomers.refused = 0
+            text = (
+                "there are too many new senders, and their frames are rejected;"
+                " set `[tracks] allow`, or sign the links"
+            )
+            self._notify(Notice(t_ns=now_ns, severity=Severity.WARNING, subject="links", text=text))
 
     @property
     def has_component(self) -> bool:

@@ -25,6 +25,8 @@ CONNECT_S: Final = 5.0
 """Timeout of a connection attempt; the system's own is two minutes, with ever longer pauses."""
 CONNECTIONS_MAX: Final = 256
 """Most connections of a listening link (each takes a file descriptor); more are closed at once."""
+PIECE_BYTES: Final = 4096
+"""Bytes of a connection that are processed before other work runs; some hundred frames."""
 SILENCE_S: Final = 12
 """Seconds without an acknowledgement after which a connection is closed."""
 
@@ -145,6 +147,8 @@ class _Stream(asyncio.Protocol):
         self._is_accepted = is_accepted
         self._address = ""
         self._held_up: StaleBytes | None = None
+        self._unread = b""  # bytes received beyond a piece
+        self._reads: asyncio.Handle | None = None
 
     def __str__(self) -> str:
         return self._address
@@ -161,13 +165,39 @@ class _Stream(asyncio.Protocol):
         stale = self._held_up.stale(data) if self._held_up else 0
         if stale:
             self._upcalls.stale(self, data[:stale])
-        if len(data) > stale:
-            self._upcalls.take(self, data[stale:] if stale else data, None)
+        self._unread += data[stale:]
+        if self._reads is None:
+            self._read_piece()
+
+    def _read_piece(self) -> None:
+        """Process a piece of the received bytes; read no others before all are processed."""
+        self._reads = None
+        piece, self._unread = self._unread[:PIECE_BYTES], self._unread[PIECE_BYTES:]
+        if piece:
+            self._upcalls.take(self, piece, None)
+        if self._transport is None:
+            return
+        if self._unread:
+            self._transport.pause_reading()
+            self._reads = asyncio.get_running_loop().call_soon(self._read_next)
+        else:
+            self._transport.resume_reading()
+
+    def _read_next(self) -> None:
+        try:
+            self._read_piece()
+        except Exception as fault:  # a defect must end the link, not disappear
+            self._on_close(self, fault)
+            self.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
         if self._held_up:
             self._held_up.close()
+        if self._reads is not None:
+            self._reads.cancel()
+        if self._unread:
+            self._upcalls.take(self, self._unread, None)
         self._on_close(self, exc or HungUpError("the peer hung up"))
         self._upcalls.on_peer_gone(self)
 

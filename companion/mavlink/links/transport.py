@@ -21,6 +21,7 @@ Over 300 lines: what a link receives, sends and reports is one class.
 """
 
 import asyncio
+import time
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from typing import Final, Protocol
@@ -32,6 +33,7 @@ from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
 from companion.mavlink.trust.known_peers import KnownPeers
+from companion.mavlink.trust.newcomers import Newcomers
 from companion.mavlink.wire import cot_link
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.foreign import ForeignSplitter
@@ -43,6 +45,8 @@ RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 """Seconds between attempts to serve a lost link, in order; the last value is repeated."""
 STEADY_S: Final = 1.0
 """Seconds for which a connection must last before it is reported as restored."""
+REFUSED_EVERY_NS: Final = 500_000_000
+"""Least time between two rejections of newcomers, each with the number of their frames."""
 PEER_ACTIVE_S: Final = 10.0
 """A listening UDP link sends to the peers from which a frame arrived within this many seconds."""
 
@@ -72,6 +76,7 @@ class Link:
         guard          rejects received frames and signs sent ones; None: no signing
         lag            records how late datagrams are processed
         known_peers    rejects frames of strangers in the name of others; shared by all links
+        newcomers      limits new senders; shared by all links
 
     All methods but ``open`` must be called on the event loop; ``open`` is called before it runs.
     """
@@ -86,6 +91,7 @@ class Link:
         guard: MessageSigning | None = None,
         lag: ArrivalLag | None = None,
         known_peers: KnownPeers | None = None,
+        newcomers: Newcomers | None = None,
     ) -> None:
         self.url = url
         self.status = LinkStatus(url=str(url))
@@ -96,6 +102,9 @@ class Link:
         self._guard = guard
         self._lag = lag or ArrivalLag()
         self._known_peers = known_peers or KnownPeers()
+        self._newcomers = newcomers or Newcomers()
+        self._refused = 0  # frames of newcomers not reported yet
+        self._refused_ns = 0
         self._peers = Peers(self.status, self._finish, splitter(url))
         upcalls = Upcalls(
             up=self._up,
@@ -150,15 +159,17 @@ class Link:
 
         ``age_ns`` is the time since their arrival; None if unknown: they count as arrived now.
         """
+        began_s = time.perf_counter()
         peer = self._peers.at(key)
         self.status.bytes += len(data)
-        t_ns = self._now_ns()
+        now_ns = t_ns = self._now_ns()
         if age_ns is not None:
             self._lag.observe(t_ns, age_ns)
             t_ns -= age_ns
         found = peer.splitter.feed(t_ns, data)
         if found:
             self._pass_on(peer, found)
+        self._newcomers.worked(now_ns, time.perf_counter() - began_s, age_ns)
 
     def _count_stale(self, key: Hashable, data: bytes) -> None:
         """Count the frames in stale bytes, and keep the splitter synchronised with the stream."""
@@ -174,9 +185,26 @@ class Link:
             found = [_checked_origin(item) for item in found]
         if self._guard is not None:
             found = [_checked_by_guard(self._guard, item) for item in found]
+        found = self._admitted(found)
         found = [self._checked_for_strangers(peer, item) for item in found]
         self._peers.count(peer, found)
         self._receive([_checked_timesync(peer, item) for item in found])
+
+    def _admitted(self, found: list[Frame | Rejection]) -> list[Frame | Rejection]:
+        """Return the items without frames of newcomers beyond the limits, which are counted."""
+        now_ns = self._now_ns()
+        admits = self._newcomers.admits
+        kept = [
+            item for item in found if isinstance(item, Rejection) or admits(item.source, now_ns)
+        ]
+        self._refused += len(found) - len(kept)
+        if self._refused and now_ns - self._refused_ns >= REFUSED_EVERY_NS:
+            refused = Rejection(
+                t_ns=now_ns, source=self.status.url, reason=Reason.NEWCOMER, count=self._refused
+            )
+            kept.append(refused)
+            self._refused, self._refused_ns = 0, now_ns
+        return kept
 
     def _checked_for_strangers(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
         """Return the item, or a rejection if a known peer brings this message of its sender."""
@@ -207,6 +235,7 @@ class Link:
 
     def _overflow(self, count: int) -> None:
         """Count dropped datagrams or frames; their senders are unknown."""
+        self._newcomers.lost()
         lost = self.status.lost
         lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
         reject = Rejection(

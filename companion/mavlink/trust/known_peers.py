@@ -29,6 +29,7 @@ from companion.mavlink.wire.encode import TIMESYNC
 from companion.mavlink.wire.positions import OWN, read
 from companion.mavlink.wire.stamps import STAMPED
 from companion.values import Frame, Source
+from companion.values.budget import Budget
 
 PROBATION_NS: Final = 5_000_000_000
 PROBATION_MOST_NS: Final = 300_000_000_000
@@ -38,6 +39,7 @@ CURRENT_NS: Final = (1_000_000_000, 2_000_000_000)
 CURRENT_INTERVALS: Final = 3.0  # that time in intervals between its messages
 SENDERS_MAX: Final = 4096  # senders followed; those of known peers are forgotten last
 PEERS_MAX: Final = 4  # known peers of a sender, and strangers compared with them
+COMPARED_PER_S: Final = 30.0  # positions of strangers compared per sender and second
 NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one sender
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
@@ -83,6 +85,7 @@ class _Sender:
     strangers: dict[str, _Peer] = field(default_factory=dict)
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
     notified_ns: int = -NOTICE_NS
+    comparisons: Budget = field(default_factory=lambda: Budget(COMPARED_PER_S, COMPARED_PER_S))
 
 
 class KnownPeers:
@@ -123,16 +126,11 @@ class KnownPeers:
         brings = frame.msgid in _TIMED or any(frame.msgid in one.msgids for one in current)
         if not brings:
             return None
-        if frame.msgid in OWN:
+        if frame.msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
             self._compare_stranger(sender, peer, frame)
             if peer in sender.known:
                 return None
         return STRANGER
-
-    def is_known(self, source: Source, peer: str) -> bool:
-        """Return whether a peer is a known one of a sender."""
-        sender = self._senders.get(source)
-        return sender is not None and peer in sender.known
 
     # --- known peers --------------------------------------------------------------------------
 

@@ -1018,3 +1018,17 @@ def test_link_can_be_run_again_on_its_port(run: Run, scheme: str) -> None:
                 await task
 
     run(test())
+
+
+def test_flood_over_a_connection_is_processed_in_pieces(run: Run) -> None:
+    """Other work runs in between, and no frame is lost."""
+
+    async def test() -> None:
+        async with running("tcpin:127.0.0.1:0") as (link, inbox), connected(link) as peer:
+            raws = [frame(n, seq=n % 256) for n in range(5000)]
+            await asyncio.get_running_loop().sock_sendall(peer, b"".join(raws))
+            await inbox.until(len(raws))
+            assert inbox.raws == raws
+            assert max(inbox.batches) <= tcp.PIECE_BYTES / len(raws[0]) + 1
+
+    run(test())

@@ -1,0 +1,86 @@
+"""Admission of new senders: so many a second, and none beside known ones on a busy machine.
+
+Anybody that reaches a link's port can invent senders. Each takes a clock, a track and beams, so the
+number of new ones is limited. When frames take more than ``BUSY`` of the time and are read late or
+lost, those of the newest senders are dropped before they are decoded, until the rest are in time:
+who was here first keeps being served.
+"""
+
+from bisect import bisect_left
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Final
+
+from companion.values import Source
+from companion.values.budget import Budget
+
+NEW_PER_S: Final = 50.0  # new senders a second
+NEW_SAVED: Final = 500.0  # new senders at once, as when a fleet is switched on
+SENDERS_MAX: Final = 4096
+"""Most senders remembered; beyond it the one silent for longest is new again."""
+BUSY: Final = 0.6  # share of the time above which frames of the newest senders are dropped
+IDLE: Final = 0.4  # share below which more senders are served again
+LATE_NS: Final = 50_000_000  # age of a datagram that was read late
+WINDOW_NS: Final = 250_000_000  # time over which the share is measured
+
+
+class Newcomers:
+    """Senders of all links, in the order of their admission. ``refused`` counts frames."""
+
+    def __init__(self) -> None:
+        self.refused = 0
+        self._numbers: OrderedDict[Source, int] = OrderedDict()  # by the newest frame
+        self._budget = Budget(NEW_PER_S, NEW_SAVED)
+        self._count = 0
+        self._served_below: int | None = None  # number from which senders are not served
+        self._began_ns = 0
+        self._worked_s = 0.0
+        self._is_late = False
+
+    def admits(self, source: Source, now_ns: int) -> bool:
+        """Return whether a frame of a sender may be used; count it if not."""
+        number = self._numbers.get(source)
+        if number is None:
+            if not self._budget.spend(1, now_ns * 1e-9):
+                self.refused += 1
+                return False
+            number = self._numbers[source] = self._count
+            self._count += 1
+            if len(self._numbers) > SENDERS_MAX:
+                self._numbers.popitem(last=False)
+        else:
+            self._numbers.move_to_end(source)
+        if self._served_below is None or number < self._served_below:
+            return True
+        self.refused += 1
+        return False
+
+    def lost(self) -> None:
+        """Note that frames were lost before they were read."""
+        self._is_late = True
+
+    def worked(self, now_ns: int, seconds: float, age_ns: int | None) -> None:
+        """Note the time that the frames of a datagram took, and adapt who is served.
+
+        ``age_ns`` is how long the datagram waited; None if unknown.
+        """
+        self._worked_s += seconds
+        if age_ns is not None and age_ns > LATE_NS:
+            self._is_late = True
+        passed_ns = now_ns - self._began_ns
+        if passed_ns < WINDOW_NS:
+            return
+        share, self._worked_s, self._began_ns = self._worked_s / (passed_ns * 1e-9), 0.0, now_ns
+        is_late, self._is_late = self._is_late, False
+        if share > BUSY and is_late:
+            self._serve(lambda served: min(served - 1, int(served * BUSY / share)))
+        elif share < IDLE and self._served_below is not None:
+            self._serve(lambda served: max(served + 8, served * 5 // 4))
+
+    def _serve(self, wanted: Callable[[int], int]) -> None:
+        """Change the number of served senders, which are the oldest; at least one is served."""
+        numbers = sorted(self._numbers.values())
+        below = self._served_below
+        served = len(numbers) if below is None else bisect_left(numbers, below)
+        most = max(1, wanted(served))
+        self._served_below = None if most >= len(numbers) else numbers[most]

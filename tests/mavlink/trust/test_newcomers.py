@@ -1,0 +1,84 @@
+"""Admission of new senders: bounded in number, and the oldest are served first."""
+
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.mavlink.trust import newcomers
+from companion.mavlink.trust.newcomers import LATE_NS, NEW_PER_S, NEW_SAVED, WINDOW_NS, Newcomers
+from companion.values import Source
+
+S = 1_000_000_000
+
+
+def source(number: int) -> Source:
+    return Source(1 + number // 250, 1 + number % 250)
+
+
+def served(senders: Newcomers, most: int, now_ns: int) -> list[int]:
+    return [number for number in range(most) if senders.admits(source(number), now_ns)]
+
+
+def window(senders: Newcomers, number: int, share: float, age_ns: int = 0) -> None:
+    """Note a window of time of which frames took a share."""
+    senders.worked(number * WINDOW_NS, share * WINDOW_NS * 1e-9, age_ns)
+
+
+def test_new_senders_are_limited_and_known_ones_are_not() -> None:
+    senders = Newcomers()
+    assert served(senders, 2000, 0) == list(range(int(NEW_SAVED)))
+    assert senders.refused == 1500
+    later = served(senders, 2000, S)
+    assert later == list(range(int(NEW_SAVED + NEW_PER_S)))
+
+
+def test_new_vehicle_is_admitted_during_a_flood_of_invented_ids() -> None:
+    senders = Newcomers()
+    vehicle, number = Source(255, 255), 0
+    for tick in range(100):  # 3000 invented ids and ten frames of the vehicle a second
+        for _ in range(300):
+            senders.admits(source(number % 60_000), tick * S // 10)
+            number += 1
+        if tick >= 20 and senders.admits(vehicle, tick * S // 10):
+            break
+    assert tick < 100
+    assert senders.admits(vehicle, 100 * S)
+
+
+def test_active_senders_are_not_evicted_by_invented_ones() -> None:
+    senders = Newcomers()
+    for tick in range(2000):
+        assert senders.admits(Source(255, 255), tick * S // 10)
+        for number in range(10):
+            senders.admits(source(tick * 10 + number), tick * S // 10)
+    assert len(senders._numbers) <= newcomers.SENDERS_MAX
+
+
+def test_newest_senders_are_dropped_while_frames_are_late() -> None:
+    """And are served again afterwards."""
+    senders = Newcomers()
+    window(senders, 1, 0.0)
+    assert len(served(senders, 100, 0)) == 100
+    window(senders, 2, 0.9)  # busy, but in time
+    assert len(served(senders, 100, 0)) == 100
+    window(senders, 3, 0.9, LATE_NS + 1)
+    assert served(senders, 100, 0) == list(range(66))
+    senders.lost()
+    window(senders, 4, 0.9)
+    assert served(senders, 100, 0) == list(range(44))
+    window(senders, 5, 0.5)
+    assert served(senders, 100, 0) == list(range(44))
+    for number in range(6, 20):
+        window(senders, number, 0.1)
+    assert len(served(senders, 100, 0)) == 100
+
+
+@given(st.lists(st.tuples(st.floats(0, 5), st.booleans()), max_size=60))
+def test_oldest_sender_is_always_served(loads: list[tuple[float, bool]]) -> None:
+    """Whatever the load: those served are the oldest ones."""
+    senders = Newcomers()
+    served(senders, 50, 0)
+    for number, (share, late) in enumerate(loads, 1):
+        window(senders, number, share, 2 * LATE_NS if late else 0)
+        now = served(senders, 50, 0)
+        assert now == list(range(len(now)))
+        assert now

@@ -22,7 +22,7 @@ class Upcalls(NamedTuple):
     """Callbacks by which an endpoint reports events to its link.
 
     take      a peer sent bytes: its key, the bytes, and their age by the system's time stamp, ns
-              (None without a stamp)
+              (None without a stamp); raises ``StalledError`` to end the connection
     stale     bytes of a peer that waited too long to be used
     """
 
@@ -63,6 +63,10 @@ class Endpoint(Protocol):
 
 class HungUpError(ConnectionError):
     """The other end closed the connection properly."""
+
+
+class StalledError(ConnectionAbortedError):
+    """Error of a peer that sends bytes, but completes no message."""
 
 
 def reason(error: OSError) -> str:

@@ -7,12 +7,13 @@ from typing import Final
 
 from companion.mavlink.links.endpoints import Upcalls
 from companion.mavlink.links.urls import LinkUrl
+from companion.mavlink.wire.aircraft_json import DOCUMENT_MAX
 
 PERIOD_S: Final = 1.0
 """Seconds from one request to the next; receivers write a document about once a second."""
 ANSWER_S: Final = 5.0  # timeout of a request
 HEAD_MAX: Final = 16 << 10
-BODY_MAX: Final = 16 << 20
+BODY_MAX: Final = DOCUMENT_MAX
 
 
 class HttpPoll:

@@ -22,6 +22,7 @@ from typing import Final, Protocol
 from companion.mavlink.links.endpoints import address_text
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
 from companion.mavlink.wire.decode import POSE
+from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
 from companion.values import Frame, Rejection, Source
 
@@ -141,6 +142,13 @@ class Peers:
         peer = self._peers[key] = Peer(key, self._splitter(self._status.url))
         self._status.peers += 1
         return peer
+
+    def has_incomplete(self) -> bool:
+        """Return whether a peer of another format has sent bytes, but no complete message yet."""
+        return any(
+            isinstance(peer.splitter, ForeignSplitter) and peer.splitter.is_incomplete
+            for peer in self._peers.values()
+        )
 
     def find(self, key: Hashable) -> Peer | None:
         """Return the peer of a key; None if it is unknown or disconnected."""

@@ -26,7 +26,7 @@ from collections.abc import Callable, Hashable
 from dataclasses import replace
 from typing import Final, Protocol
 
-from companion.mavlink.links.endpoints import Upcalls, reason
+from companion.mavlink.links.endpoints import StalledError, Upcalls, reason
 from companion.mavlink.links.kinds import endpoint, splitter
 from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
@@ -47,6 +47,8 @@ STEADY_S: Final = 1.0
 """Seconds for which a connection must last before it is reported as restored."""
 REFUSED_EVERY_NS: Final = 500_000_000
 """Least time between two rejections of newcomers, each with the number of their frames."""
+UNFINISHED_S: Final = 10
+"""Seconds of received bytes without a complete message after which a connection is closed."""
 PEER_ACTIVE_S: Final = 10.0
 """A listening UDP link sends to the peers from which a frame arrived within this many seconds."""
 
@@ -158,6 +160,7 @@ class Link:
         """Split the bytes that a peer sent into frames, and pass them on.
 
         ``age_ns`` is the time since their arrival; None if unknown: they count as arrived now.
+        Raises ``StalledError`` if a server of another format completes no message.
         """
         began_s = time.perf_counter()
         peer = self._peers.at(key)
@@ -170,6 +173,10 @@ class Link:
         if found:
             self._pass_on(peer, found)
         self._newcomers.worked(now_ns, time.perf_counter() - began_s, age_ns)
+        if isinstance(peer.splitter, ForeignSplitter) and not self.url.listens:
+            began_ns = peer.splitter.unfinished_ns
+            if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
+                raise StalledError(f"no complete message in the bytes of {UNFINISHED_S} s")
 
     def _count_stale(self, key: Hashable, data: bytes) -> None:
         """Count the frames in stale bytes, and keep the splitter synchronised with the stream."""
@@ -300,6 +307,10 @@ class Link:
             self._steady = loop.call_later(STEADY_S, self._notify_up)
 
     def _notify_up(self) -> None:
+        """Report a restored connection, but not one that has only sent part of a message."""
+        if self._peers.has_incomplete():
+            self._steady = asyncio.get_running_loop().call_later(STEADY_S, self._notify_up)
+            return
         self._is_out = False
         self._say(Severity.INFO, "is back")
 

@@ -8,6 +8,7 @@ is unknown, and addresses that are not ICAO's (``~``).
 
 import json
 import math
+import re
 from collections import OrderedDict
 from typing import Any, Final
 
@@ -17,22 +18,24 @@ from companion.values import Reason
 
 DOCUMENT_MAX: Final = 8 << 20  # largest document, bytes: some 10 000 aircraft
 AIRCRAFT_MAX: Final = 10_000  # most aircraft read from a document, and remembered
+BRACKETS_MAX: Final = 10 * AIRCRAFT_MAX
+"""Most objects and lists in a document; an aircraft has four. Each takes 70 bytes when parsed."""
+_ICAO: Final = re.compile(r"[0-9A-Fa-f]{6}")
 _NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s", "mode_ac")
 """Types of aircraft that do not report their position themselves."""
 
 
 class AircraftJson(ForeignSplitter):
-    """Converter of documents to frames; ``feed`` takes a whole one."""
+    """Converter of documents to frames; ``feed`` takes a whole one and returns what changed."""
 
     def __init__(self, link: str) -> None:
         super().__init__(link)
         self._written: float | None = None
         self._true_at: OrderedDict[int, float] = OrderedDict()  # by ICAO address
 
-    def feed(self, t_ns: int, data: bytes) -> Items:
-        """Parse a document received at ``t_ns``; return the frames of what changed in it."""
+    def _parse(self, t_ns: int, data: bytes) -> Items:
         try:
-            if len(data) > DOCUMENT_MAX:
+            if len(data) > DOCUMENT_MAX or data.count(b"[") + data.count(b"{") > BRACKETS_MAX:
                 raise ValueError(f"{len(data)} bytes")
             document = json.loads(data)
             if not isinstance(document, dict):
@@ -43,6 +46,7 @@ class AircraftJson(ForeignSplitter):
                 raise ValueError("no time, or no aircraft")
         except (ValueError, KeyError, RecursionError):
             return self._garbage(t_ns, len(data) or 1)
+        self._complete += 1
         if written == self._written:  # the same document as before
             return []
         self._written = written
@@ -81,7 +85,7 @@ def _aircraft_state(entry: object) -> AircraftState | str | None:
     if not isinstance(entry, dict):
         raise ValueError("aircraft entry is not a JSON object")
     name = entry.get("hex")
-    if not isinstance(name, str) or not 6 <= len(name) <= 7:
+    if not isinstance(name, str) or not _ICAO.fullmatch(name.removeprefix("~")):
         raise ValueError("aircraft has no valid address")
     if name.startswith("~"):
         return "not an ICAO address"

@@ -35,11 +35,7 @@ class BeastSplitter(ForeignSplitter):
         self._transponders = Transponders()
         self._lateness = _Lateness()
 
-    def feed(self, t_ns: int, data: bytes) -> Items:
-        """Parse bytes that arrived at ``t_ns``.
-
-        Return the frames and rejections of their messages.
-        """
+    def _parse(self, t_ns: int, data: bytes) -> Items:
         data, at, garbage = self._pending + data, 0, 0
         out: Items = []
         while True:
@@ -58,6 +54,7 @@ class BeastSplitter(ForeignSplitter):
             if body is None:  # another message begins within this one
                 garbage += end - at
             else:
+                self._complete += 1
                 out += self._message(t_ns, data[at + 1], body)
             at = end
         return out + self._garbage(t_ns, garbage)
@@ -84,9 +81,11 @@ def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:
     """
     body = bytearray()
     while len(body) < size:
-        if at >= len(data) or data[at:] == _ESCAPE:
+        if at >= len(data):
             return None, len(data)
         if data[at] == 0x1A:
+            if at + 1 == len(data):
+                return None, len(data)
             if data[at + 1] != 0x1A:
                 return None, at
             at += 1

@@ -13,17 +13,46 @@ MLAT: Final = "MLAT position: its accuracy is not stated"
 
 
 class ForeignSplitter:
-    """Base of the splitters of other formats, with the interface of ``framing.Splitter``."""
+    """Base of the splitters of other formats, with the interface of ``framing.Splitter``.
+
+    ``unfinished_ns`` is the arrival time of the first bytes since the last complete message; None
+    if there are none. A subclass counts each complete message in ``_complete``, unusable ones too.
+    """
 
     def __init__(self, link: str) -> None:
         self.link = link
+        self.unfinished_ns: int | None = None
+        self._complete = 0
         self._pending = b""  # unfinished message
         self._overlong = False  # whether the rest of a too long line is being skipped
         self._seq = 0
 
+    @property
+    def is_incomplete(self) -> bool:
+        """Whether bytes arrived, but no complete message yet."""
+        return self.unfinished_ns is not None and not self._complete
+
+    def feed(self, t_ns: int, data: bytes) -> Items:
+        """Parse bytes that arrived at ``t_ns``.
+
+        Return the frames and rejections of their messages.
+        """
+        complete = self._complete
+        items = self._parse(t_ns, data)
+        is_partial = bool(self._pending) or self._overlong
+        if self._complete != complete:
+            self.unfinished_ns = t_ns if is_partial else None
+        elif self.unfinished_ns is None and (is_partial or items):  # partial, or only garbage
+            self.unfinished_ns = t_ns
+        return items
+
+    def _parse(self, t_ns: int, data: bytes) -> Items:
+        raise NotImplementedError
+
     def finish(self, t_ns: int) -> Items:
         """End the stream: an unfinished message counts as garbage."""
         stray, self._pending, self._overlong = len(self._pending), b"", False
+        self.unfinished_ns = None
         return self._garbage(t_ns, stray)
 
     def _lines(self, lines: Iterable[bytes], most: int) -> tuple[list[bytes], int]:
@@ -59,7 +88,10 @@ class ForeignSplitter:
 
     def _aircraft(self, t_ns: int, state: AircraftState) -> Items:
         """Return the ADSB_VEHICLE of an aircraft's state; no frame if nothing is known."""
-        payload = state.payload()
+        try:
+            payload = state.payload()
+        except ValueError as error:
+            return self._refused(t_ns, Reason.MALFORMED, str(error), ADSB_VEHICLE)
         return (
             [] if payload is None else [self._frame(t_ns, Outgoing(SENDER, ADSB_VEHICLE, payload))]
         )

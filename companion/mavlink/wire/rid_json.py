@@ -34,14 +34,17 @@ _UAS_LOCATION = struct.Struct("<ifffddffifiiiiif")
 _AT = {"location": 64, "system": 808, "valid": 892, "end": 914}
 
 
+_STATUS: Final = {"debug", "status"}  # keys of objects about the receiver itself
+
+
+class _FormatError(Exception):
+    """Error of an object in another format than those that are read."""
+
+
 class RidJson(ForeignSplitter):
     """Converter of the objects of one peer to frames."""
 
-    def feed(self, t_ns: int, data: bytes) -> Items:
-        """Parse bytes that arrived at ``t_ns``.
-
-        Return the frames and rejections of their objects.
-        """
+    def _parse(self, t_ns: int, data: bytes) -> Items:
         *lines, self._pending = (self._pending + data).replace(b"\0", b"\n").split(b"\n")
         kept, garbage = self._lines(lines, OBJECT_MAX)
         out = [item for line in kept if line.strip() for item in self._object(t_ns, line)]
@@ -56,8 +59,11 @@ class RidJson(ForeignSplitter):
         found = _parsed(text)
         if found is None:
             return self._garbage(t_ns, len(text) + 1)
+        self._complete += 1
         try:
             return [self._frame(t_ns, Outgoing(SENDER, *one)) for one in list(_messages(found))]
+        except _FormatError as why:
+            return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, str(why))
         except (ValueError, struct.error, OverflowError) as why:
             return self._refused(t_ns, Reason.MALFORMED, str(why)[:80], LOCATION)
 
@@ -71,12 +77,17 @@ def _parsed(text: bytes) -> dict[str, Any] | None:
 
 
 def _messages(found: dict[str, Any]) -> Iterator[tuple[int, bytes]]:
-    """Yield message ids and payloads of an object; nothing if its format is unknown."""
+    """Yield message ids and payloads of an object; nothing for a status of the receiver.
+
+    Raises ``_FormatError`` for an object of another format.
+    """
     data = found.get("data")
     if isinstance(data, dict) and isinstance(data.get("UASdata"), str):
         yield from _uas_data(_mac(data.get("MAC address")), base64.b64decode(data["UASdata"]))
     elif "uav id" in found or "uav latitude" in found:
         yield from _captured(_mac(found.get("mac")), found)
+    elif not _STATUS & set(found):
+        raise _FormatError("object of an unknown format")
 
 
 def _mac(text: object) -> bytes:

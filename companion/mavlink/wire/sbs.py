@@ -27,8 +27,7 @@ _NUMBER: Final = re.compile(r"-?\d{1,9}(?:\.\d{1,9})?")
 class SbsSplitter(ForeignSplitter):
     """Converter of the lines of one connection to frames."""
 
-    def feed(self, t_ns: int, data: bytes) -> Items:
-        """Parse bytes that arrived at ``t_ns``; return frames and rejections of complete lines."""
+    def _parse(self, t_ns: int, data: bytes) -> Items:
         *lines, self._pending = (self._pending + data).split(b"\n")
         kept, garbage = self._lines(lines, LINE_MAX)
         out: Items = []
@@ -38,6 +37,8 @@ class SbsSplitter(ForeignSplitter):
                 out += self._line(t_ns, line, kind)
             elif line.strip() and kind not in _SILENT:
                 garbage += len(line) + 1
+                continue
+            self._complete += 1  # an empty line is the heartbeat of readsb
         return out + self._garbage(t_ns, garbage + self._drop_overlong(LINE_MAX))
 
     def _line(self, t_ns: int, line: bytes, kind: bytes) -> Items:

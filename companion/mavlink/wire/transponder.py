@@ -16,6 +16,8 @@ SENDER: Final = Source(0, 156)  # sender of the frames: no system, MAV_COMP_ID_A
 _LAYOUT: Final = struct.Struct("<IiiiHHhHHB9sBBBBB")
 _COORDS, _ALTITUDE, _HEADING, _VELOCITY, _CALLSIGN, _VERTICAL = 1, 2, 4, 8, 16, 128  # ADSB_FLAGS
 _PRESSURE, _GEOMETRIC = 0, 1  # ADSB_ALTITUDE_TYPE
+SPEED_MAX_KT: Final = 1200
+"""Limit on a speed. The field of ADSB_VEHICLE ends at 1274 kt; Mode S can state 5781 kt."""
 _FOOT_MM: Final = 304.8
 _KNOT_CMPS: Final = 1852 / 36
 _FPM_CMPS: Final = 30.48 / 60
@@ -43,7 +45,10 @@ class AircraftState(NamedTuple):
     age_s: int = 0
 
     def payload(self) -> bytes | None:
-        """Return the payload of the ADSB_VEHICLE; None if nothing is known."""
+        """Return the payload of the ADSB_VEHICLE; None if nothing is known.
+
+        Raises ``ValueError`` for a speed that does not fit into it.
+        """
         placed = self.lat_deg is not None and self.lon_deg is not None
         told = (
             (_COORDS, placed),
@@ -56,6 +61,8 @@ class AircraftState(NamedTuple):
         flags = sum(flag for flag, there in told if there)
         if not flags:
             return None
+        if self.speed_kt is not None and self.speed_kt > SPEED_MAX_KT:
+            raise ValueError(f"speed {self.speed_kt:.0f} kt exceeds {SPEED_MAX_KT} kt")
         return _LAYOUT.pack(
             self.icao,
             round((self.lat_deg or 0.0) * 1e7) if placed else 0,

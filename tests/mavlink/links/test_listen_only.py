@@ -8,11 +8,13 @@ import contextlib
 import json
 import socket
 from collections.abc import AsyncIterator
+from itertools import count
+from typing import cast
 
 import pytest
-from link_support import LIMIT_S, LOOPS, Run, port_of, runner, running
+from link_support import LIMIT_S, LOOPS, Run, port_of, runner, running, until_true
 
-from companion.mavlink.links import http_poll
+from companion.mavlink.links import http_poll, transport
 from companion.mavlink.wire.encode import heartbeat
 from companion.values import Reason, Source
 
@@ -147,3 +149,187 @@ def test_multicast_group_is_joined_and_shared(run: Run) -> None:
                 await second.until(1)
 
         run(test())
+
+
+# --- servers that send bytes, but no message ------------------------------------------------------
+
+
+class Seconds:
+    """A clock that the test sets."""
+
+    def __init__(self) -> None:
+        self.t_ns = 1
+
+    def now_ns(self) -> int:
+        return self.t_ns
+
+
+@contextlib.asynccontextmanager
+async def connections(scheme: str) -> AsyncIterator[tuple[str, asyncio.Queue[asyncio.Transport]]]:
+    """Run a server; yields its link and the connections that it accepts."""
+    accepted: asyncio.Queue[asyncio.Transport] = asyncio.Queue()
+    opened: list[asyncio.Transport] = []
+
+    class Accepted(asyncio.Protocol):
+        def connection_made(self, transport: asyncio.BaseTransport) -> None:
+            opened.append(cast(asyncio.Transport, transport))
+            accepted.put_nowait(opened[-1])
+
+    server = await asyncio.get_running_loop().create_server(Accepted, "127.0.0.1", 0)
+    try:
+        yield f"{scheme}:127.0.0.1:{server.sockets[0].getsockname()[1]}", accepted
+    finally:
+        server.close()
+        for transport in opened:
+            transport.abort()
+
+
+SBS = b"MSG,3,1,1,4006B3,1,,,,,,38000,,,51.4,-0.1,,,0,0,0,0\n"
+BEAST = b"\x1a3" + bytes(6) + b"\x80" + bytes.fromhex("8D4840D6202CC371C32CE0576098")
+RID = b'{"mac": "01:02", "uav id": "X"}\n'
+SENT = {"sbs": SBS, "readsb": BEAST, "rid": RID, "cot:tcp": EVENT}
+
+
+@pytest.mark.parametrize("scheme", SENT)
+def test_server_that_drips_bytes_is_announced_once_and_reconnected(
+    run: Run, monkeypatch: pytest.MonkeyPatch, scheme: str
+) -> None:
+    monkeypatch.setattr(transport, "RETRY_S", (0.001,))
+    monkeypatch.setattr(transport, "STEADY_S", 0.001)
+    clock = Seconds()
+
+    async def drip(link: transport.Link, connection: asyncio.Transport) -> None:
+        """A byte a second of one message, until the link hangs up."""
+        for at in range(transport.UNFINISHED_S + 2):
+            before = link.status.bytes
+            connection.write(SENT[scheme][at : at + 1])
+            await until_true(lambda before=before: link.status.bytes > before)
+            clock.t_ns += 1_000_000_000
+
+    async def test() -> None:
+        async with (
+            connections(scheme) as (url, accepted),
+            running(url, clock.now_ns) as (link, inbox),
+        ):
+            for _ in range(2):
+                await drip(link, await accepted.get())
+            why = "no complete message in the bytes of 10 s"
+            connection = await accepted.get()
+            assert inbox.texts == [f"link {url} is down: {why}; trying again"]
+            assert sum(one.count for one in inbox.rejections) == 2 * 12
+            connection.write(SENT[scheme])
+            await inbox.until_said(2)
+            assert inbox.texts[1] == f"link {url} is back"
+            assert link.status.frames == 1
+
+    run(test())
+
+
+@pytest.mark.parametrize(
+    "piece",
+    [b"x" * 5000, b"<event " * 700, b"\xbf" * 5000, b"[" * 5000],
+    ids=["text", "events", "lengths", "lists"],
+)
+@pytest.mark.parametrize("scheme", SENT)
+def test_server_of_another_protocol_is_announced_and_counted(
+    run: Run, monkeypatch: pytest.MonkeyPatch, scheme: str, piece: bytes
+) -> None:
+    """Data without an end of line or message; the memory for them is bounded."""
+    monkeypatch.setattr(transport, "RETRY_S", (0.001,))
+    clock = Seconds()
+
+    async def test() -> None:
+        async with (
+            connections(scheme) as (url, accepted),
+            running(url, clock.now_ns) as (link, inbox),
+        ):
+            connection = await accepted.get()
+            for second in range(transport.UNFINISHED_S + 2):
+                connection.write(piece)
+                total = (second + 1) * len(piece)
+                await until_true(lambda total=total: link.status.bytes >= total)
+                for peer in link._peers._peers.values():
+                    assert len(peer.splitter._pending) <= 32_768  # type: ignore[attr-defined]
+                clock.t_ns += 1_000_000_000
+            await inbox.until_said(1)
+            assert "no complete message in the bytes of 10 s" in inbox.texts[0]
+            await accepted.get()
+            assert link.status.lost == {Reason.GARBAGE: 12 * len(piece)}
+
+    run(test())
+
+
+@pytest.mark.parametrize("scheme", SENT)
+def test_slow_but_complete_messages_keep_the_connection(run: Run, scheme: str) -> None:
+    """A quiet receiver, whose reads end within a message."""
+    clock = Seconds()
+
+    async def test() -> None:
+        async with (
+            connections(scheme) as (url, accepted),
+            running(url, clock.now_ns) as (link, inbox),
+        ):
+            connection = await accepted.get()
+            for n in range(1, 5):
+                before = link.status.bytes
+                connection.write(SENT[scheme][:9])
+                await until_true(lambda before=before: link.status.bytes >= before + 9)
+                clock.t_ns += 9_000_000_000
+                connection.write(SENT[scheme][9:])
+                await inbox.until(n)
+                clock.t_ns += 3_600_000_000_000
+            assert inbox.texts == [] and link.status.lost == {}
+
+    run(test())
+
+
+def test_web_server_without_valid_documents_is_announced(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(http_poll, "PERIOD_S", 0.001)
+    monkeypatch.setattr(transport, "RETRY_S", (0.001,))
+    clock = count(1, 1_000_000_000)
+
+    async def test() -> None:
+        answer = b"HTTP/1.0 200 OK\r\n\r\n<html>"
+        async with answering(answer) as (url, _), running(url, lambda: next(clock)) as (_, inbox):
+            await inbox.until_said(1)
+            assert "no complete message in the bytes of 10 s" in inbox.texts[0]
+            seen = len(inbox.items)
+            await inbox.until_true(lambda: len(inbox.items) > seen + 3)  # it is still polled
+            assert len(inbox.texts) == 1
+
+    run(test())
+
+
+@pytest.mark.parametrize(
+    "drip",
+    [
+        b"HTTP/1.0 200 OK\r\nA: " + b"b" * 1000, b"HTTP/1.0 200 OK\r\n\r\n" + b" " * 1000,
+        b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n" + b"1\r\n \r\n" * 200,
+    ],
+    ids=["header", "body", "chunks"],
+)  # fmt: skip
+def test_http_answer_that_drips_times_out(
+    run: Run, monkeypatch: pytest.MonkeyPatch, drip: bytes
+) -> None:
+    """Each byte arrives in time, the whole answer does not."""
+    monkeypatch.setattr(http_poll, "ANSWER_S", 0.2)
+    monkeypatch.setattr(transport, "RETRY_S", (0.001,))
+
+    async def test() -> None:
+        async with (
+            connections("readsb") as (address, accepted),
+            running(address.replace(":", ":http://", 1) + "/a") as (link, inbox),
+        ):
+            connection, dripped = await accepted.get(), 0
+            while not connection.is_closing() and not inbox.texts:
+                connection.write(drip[dripped : dripped + 1])
+                dripped += 1
+                await asyncio.sleep(0.01)
+            await inbox.until_said(1)
+            assert "timed out" in inbox.texts[0]
+            assert link.status.bytes == 0 and 1 < dripped < 500
+            await accepted.get()  # tried again
+
+    run(test())

@@ -8,7 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 
-from companion.mavlink.wire.aircraft_json import AIRCRAFT_MAX, DOCUMENT_MAX, AircraftJson
+from companion.mavlink.wire.aircraft_json import (
+    AIRCRAFT_MAX,
+    BRACKETS_MAX,
+    DOCUMENT_MAX,
+    AircraftJson,
+)
 from companion.mavlink.wire.decode import decode
 from companion.values import AdsbVehicle, AltitudeDatum, Frame, Reason, Rejection
 
@@ -102,7 +107,8 @@ def test_aircraft_located_by_multilateration_are_rejected(
     [
         {"lat": 91}, {"lon": float("nan")}, {"lat": "47"}, {"lat": True}, {"gs": float("inf")},
         {"alt_geom": 1e300}, {"seen_pos": -1}, {"nac_p": 99}, {"hex": "xyzxyz"}, {"hex": 5},
-        {"hex": None}, {"track": [1]},
+        {"hex": None}, {"track": [1]}, {"hex": "-12345"}, {"hex": "0x1234"}, {"hex": "fffffff"},
+        {"hex": "1_2345"}, {"hex": "~"}, {"hex": "\u0663" * 6}, {"lat": 10**4000},
     ],
 )  # fmt: skip
 def test_malformed_aircraft_is_rejected_and_others_are_read(changed: Any) -> None:
@@ -117,8 +123,9 @@ def test_malformed_aircraft_is_rejected_and_others_are_read(changed: Any) -> Non
         b"", b"<html>", b"[]", b"{}", b'{"now": 1}', b'{"now": 1, "aircraft": 5}', b"\xff\xfe",
         b"[" * 100_000, b'{"now": ' + b"9" * 5000 + b"}", b'{"now": NaN, "aircraft": []}',
         b'{"now": true, "aircraft": []}', b"null", b" " * (DOCUMENT_MAX + 1),
+        b'{"now": 1, "aircraft": [' + b"{}," * BRACKETS_MAX + b"{}]}",
     ],
-    ids=range(13),
+    ids=range(14),
 )  # fmt: skip
 def test_invalid_document_is_counted_in_bytes(data: bytes) -> None:
     (found,) = AircraftJson("x").feed(7, data)

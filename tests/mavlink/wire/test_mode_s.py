@@ -255,6 +255,30 @@ def test_unused_messages_are_counted() -> None:
     assert isinstance(garbage, Rejection) and garbage.count == 4
 
 
+@given(
+    st.lists(st.tuples(st.integers(0, (1 << 56) - 1), st.integers(0, 3 * S)), max_size=20),
+    st.sampled_from([0x88, 0x8D, 0x90, 0x92]),
+)
+def test_any_content_of_an_intact_message_is_decoded_or_rejected(
+    contents: list[tuple[int, int]], head: int
+) -> None:
+    splitter, t_ns = BeastSplitter("x"), 0
+    for me, later_ns in contents:
+        t_ns += later_ns
+        for found in splitter.feed(t_ns, beast(message(me, head=head))):
+            assert isinstance(found, Rejection) or isinstance(
+                decode(found), AdsbVehicle | Rejection
+            )
+
+
+@pytest.mark.parametrize(("subtype", "speed_kt"), [(1, 1445), (2, 5781)])
+def test_speed_beyond_the_message_is_malformed(subtype: int, speed_kt: int) -> None:
+    """Mode S can state 5781 kt; the field of ADSB_VEHICLE ends at 1274 kt."""
+    (found,) = fed(beast(message(19 << 51 | subtype << 48 | 1023 << 32 | 1023 << 21)))
+    assert isinstance(found, Rejection) and found.reason is Reason.MALFORMED
+    assert found.detail == f"speed {speed_kt} kt exceeds 1200 kt"
+
+
 STREAM = b"".join(
     beast(raw, 26 + 0x1A1A * number)
     for number, raw in enumerate((EVEN, ODD, NAMED, placed(26.0, 26.1, 0), MOVING, status(26 % 12)))

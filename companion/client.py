@@ -11,12 +11,13 @@ Synchronous; needs only the standard library, numpy and websockets. For use by o
 import base64
 import io
 import json
+import time
 import urllib.error
 import urllib.request
 from collections.abc import Generator, Iterable, Iterator
 from contextlib import closing
 from dataclasses import dataclass
-from http.client import HTTPException, HTTPResponse
+from http.client import HTTPException, HTTPResponse, IncompleteRead
 from typing import Any, Final
 from urllib.parse import quote, urlencode, urlsplit
 
@@ -29,6 +30,8 @@ from companion.values import ComplexArray, UserError
 Json = dict[str, Any]
 
 SUBPROTOCOL: Final = "companion.v1"
+ANSWER_MAX: Final = 1 << 28  # longest answer, bytes; 4 million weights take a quarter of it
+PIECE_BYTES: Final = 1 << 16
 
 
 class ServiceError(Exception):
@@ -98,7 +101,7 @@ class Client:
         """Return the weights to apply in ``lead_ms`` milliseconds."""
         query = urlencode({"lead_ms": lead_ms})
         with self._open(f"/v1/beams/weights?{query}", "application/x-npy") as answer:
-            body, headers = _read(answer), answer.headers
+            body, headers = _read(answer, self._timeout_s), answer.headers
         uavs = tuple(name for name in headers["x-uavs"].split(",") if name)
         matrix = np.load(io.BytesIO(body), allow_pickle=False)
         groups = tuple(int(slot) for slot in headers["x-groups"].split(",") if slot)
@@ -110,16 +113,16 @@ class Client:
         """Return the weights to apply in ``lead_ms`` milliseconds, as text for a device."""
         query = urlencode({"lead_ms": lead_ms})
         with self._open(f"/v1/beams/weights?{query}", media_type) as answer:
-            return _read(answer).decode()
+            return _read(answer, self._timeout_s).decode(errors="replace")
 
     def get(self, path: str, **query: object) -> Json:
         """Return the answer of any path of the API that returns a JSON object."""
         address = quote(path) + ("?" + urlencode(query, doseq=True) if query else "")
         with self._open(address, "application/json") as answer:
-            body = _read(answer)
+            body = _read(answer, self._timeout_s)
         try:
             found = json.loads(body)
-        except ValueError as error:
+        except (ValueError, RecursionError) as error:
             raise ServiceError(None, f"{self._url}: the answer is not JSON") from error
         if not isinstance(found, dict):
             raise ServiceError(None, f"{self._url}: the answer is not a JSON object")
@@ -198,9 +201,19 @@ def _is_address(url: str) -> bool:
     return found.scheme in ("http", "https") and bool(found.hostname) and port != 0
 
 
-def _read(answer: HTTPResponse) -> bytes:
+def _read(answer: HTTPResponse, timeout_s: float) -> bytes:
+    """Return the body of an answer. Every piece has a timeout, and the whole body has one too."""
+    ends_s, body = time.monotonic() + timeout_s, bytearray()
     try:
-        return answer.read()
+        while piece := answer.read1(PIECE_BYTES):
+            body += piece
+            if len(body) > ANSWER_MAX:
+                raise ServiceError(None, f"the answer exceeds {ANSWER_MAX} bytes")
+            if time.monotonic() > ends_s:
+                raise ServiceError(None, f"the answer takes longer than {timeout_s:g} s")
+        if answer.length:
+            raise IncompleteRead(bytes(body), answer.length)
+        return bytes(body)
     except (OSError, HTTPException) as error:
         raise ServiceError(None, f"the answer is incomplete: {_reason(error)}") from error
 
@@ -208,8 +221,8 @@ def _read(answer: HTTPResponse) -> bytes:
 def _title(error: urllib.error.HTTPError) -> str:
     """Return the title of the problem in an answer; the text of its status without one."""
     try:
-        return str(json.loads(error.read())["title"])
-    except (ValueError, KeyError, TypeError, OSError, HTTPException):
+        return str(json.loads(error.read(PIECE_BYTES))["title"])
+    except (ValueError, LookupError, TypeError, OSError, HTTPException, RecursionError):
         return str(error.reason)
 
 

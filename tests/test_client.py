@@ -4,6 +4,7 @@ import contextlib
 import itertools
 import json
 import socket
+import socketserver
 import threading
 from collections.abc import Iterator
 from contextlib import closing
@@ -178,3 +179,59 @@ def test_foreign_http_service_raises_service_error() -> None:
         finally:
             server.shutdown()
             thread.join(HANG_S)
+
+
+@contextlib.contextmanager
+def _answering(head: bytes, piece: bytes) -> Iterator[str]:
+    """Run a server that answers with a header, and then with pieces without an end."""
+    over = threading.Event()
+
+    class Endless(socketserver.BaseRequestHandler):
+        def handle(self) -> None:
+            self.request.recv(4096)
+            with contextlib.suppress(OSError):
+                self.request.sendall(b"HTTP/1.1 " + head + b"\r\n\r\n")
+                while not over.wait(0.005):
+                    self.request.sendall(piece)
+
+    with socketserver.ThreadingTCPServer(("127.0.0.1", 0), Endless) as server:
+        server.daemon_threads = True
+        thread = threading.Thread(target=server.serve_forever, daemon=True)
+        thread.start()
+        try:
+            yield f"http://127.0.0.1:{server.server_address[1]}"
+        finally:
+            over.set()
+            server.shutdown()
+            thread.join(HANG_S)
+
+
+HEADS = [b"200 OK", b"200 OK\r\nTransfer-Encoding: chunked", b"200 OK\r\nContent-Length: 99999999"]
+
+
+@pytest.mark.parametrize("head", HEADS, ids=["unlimited", "chunked", "announced"])
+def test_answer_that_drips_is_given_up(head: bytes) -> None:
+    """Each piece arrives in time, the whole answer does not."""
+    piece = b"1\r\n \r\n" if b"chunked" in head else b" "
+    with (
+        _answering(head, piece) as url,
+        pytest.raises(ServiceError, match=r"the answer takes longer than 0\.3 s"),
+    ):
+        Client(url, timeout_s=0.3).status()
+
+
+def test_endless_answer_uses_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.client.ANSWER_MAX", 200_000)
+    with (
+        _answering(HEADS[0], bytes(65_536)) as url,
+        pytest.raises(ServiceError, match="the answer exceeds 200000 bytes"),
+    ):
+        Client(url).status()
+
+
+def test_deeply_nested_answer_is_no_json() -> None:
+    with (
+        _answering(b"200 OK\r\nContent-Length: 200000", b"[" * 200_000) as url,
+        pytest.raises(ServiceError, match="the answer is not JSON"),
+    ):
+        Client(url).status()

@@ -128,9 +128,10 @@ def _text(final_status: "DriveStatus") -> str:
     times = ""
     if final_status.p50_ms is not None:
         times = f", to apply p50 {final_status.p50_ms:.1f} ms p99 {final_status.p99_ms:.1f} ms"
+    rejected = "".join(f", {n} {why}" for why, n in sorted(final_status.rejected.items()))
     rate = "" if final_status.rate_hz is None else f" at {final_status.rate_hz:.1f} Hz"
     return (
         f"{final_status.applied} updates{rate}{times}, lead {final_status.lead_ms:.0f} ms;"
         f" {final_status.late} late, {final_status.skipped} skipped,"
-        f" {final_status.failures} failures"
+        f" {final_status.failures} failures{rejected}"
     )

@@ -10,7 +10,14 @@ modulo 4. Never tested on hardware: the tests check the resulting register value
 from typing import Any, Final
 
 from companion.beams.hardware.devices import ADAR1000_CHANNELS, vector_modulator
-from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
+from companion.node.drive.loop import (
+    NO_REPLIES,
+    DeviceCommand,
+    DeviceError,
+    DeviceInput,
+    SafeState,
+    require,
+)
 from companion.values import IntArray, UserError
 
 RX_GAIN: Final = 0x10
@@ -26,6 +33,7 @@ class Chips:
     """ADAR1000 chips by SPI bus and device number, in the order of the table's chips."""
 
     takes = DeviceInput.REGISTERS
+    rejected = NO_REPLIES
     lead_s = None
 
     def __init__(self, places: list[tuple[int, int]]) -> None:

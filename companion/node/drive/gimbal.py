@@ -12,6 +12,7 @@ import math
 import socket
 import struct
 import time
+from collections import Counter
 from collections.abc import Callable
 from typing import Final
 
@@ -19,7 +20,7 @@ from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.node.drive.lag import MountLag
 from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
-from companion.values import Frame, Source
+from companion.values import Frame, Reason, Rejection, Source
 
 COMMAND_INT: Final = 75
 DO_SET_ROI_LOCATION: Final = 195
@@ -31,6 +32,8 @@ IN_EARTH_FRAME: Final = 4 | 8 | 16 | 64
 YAW_FROM_NORTH: Final = 16 | 64
 """GIMBAL_DEVICE_FLAGS that show that an attitude's yaw is from north: either one."""
 ONBOARD_COMPUTER: Final = 191
+RECEIVED_MAX: Final = 1000  # datagrams read in one update; more are a failure of the gimbal
+UNIT_ERROR_MAX: Final = 0.1  # largest deviation of an attitude's quaternion from length 1
 
 
 class Gimbal:
@@ -47,6 +50,7 @@ class Gimbal:
         self._lag = MountLag()
         self._socket: socket.socket | None = None
         self._splitter = Splitter("gimbal", frozenset((ATTITUDE_STATUS,)))
+        self.rejected: Counter[str] = Counter()
         self._sequence = 0
         self._last_rad = self._seen_rad = 0.0
 
@@ -110,24 +114,33 @@ class Gimbal:
             raise DeviceError(f"gimbal: {error.strerror or error}") from error
 
     def _receive(self) -> None:
-        """Read the attitudes received so far."""
-        while self._socket is not None:
+        """Read the attitudes received so far. A datagram contains whole messages."""
+        for _ in range(RECEIVED_MAX):
+            if self._socket is None:
+                return
             try:
                 data = self._socket.recv(2048)
             except BlockingIOError:
                 return
             except OSError as error:
                 raise DeviceError(f"gimbal: {error.strerror or error}") from error
-            for frame in self._splitter.feed(self._now_ns(), data):
-                if isinstance(frame, Frame) and frame.source.sysid == self.target.sysid:
-                    self._note(frame)
+            now_ns = self._now_ns()
+            for found in self._splitter.feed(now_ns, data) + self._splitter.finish(now_ns):
+                if isinstance(found, Rejection):
+                    self.rejected[found.reason] += found.count
+                elif found.source.sysid == self.target.sysid:
+                    self._note(found)
+        raise DeviceError(f"gimbal sent more than {RECEIVED_MAX} messages between two updates")
 
     def _note(self, frame: Frame) -> None:
         payload = frame.raw[10 : 10 + frame.raw[1]].ljust(40, b"\0")
         w, x, y, z = struct.unpack_from("<4f", payload, 4)
         (flags,) = struct.unpack_from("<H", payload, 36)
+        if not abs(math.hypot(w, x, y, z) - 1) <= UNIT_ERROR_MAX:
+            self.rejected[Reason.MALFORMED] += 1
+            return
         yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-        if flags & YAW_FROM_NORTH and math.isfinite(yaw_rad):
+        if flags & YAW_FROM_NORTH:
             self._seen_rad = _near(yaw_rad, self._seen_rad)
             self._lag.note_report(frame.t_ns, self._seen_rad)
 

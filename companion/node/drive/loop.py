@@ -8,18 +8,21 @@ reports.
 import statistics
 import threading
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final, Protocol
 
 import numpy as np
 
-from companion.values import IntArray, UserError
+from companion.values import IntArray, UserError, printable
 
 REMEMBERED: Final = 1000  # updates whose times are kept
 LEAD_UPDATES: Final = 51  # updates whose median time is the next lead
 RETRY_NS: Final = 1_000_000_000  # time between two attempts to open a device
+SLOW_NS: Final = 5_000_000_000  # duration of an update after which it is reported
+TEXT_MAX: Final = 200  # longest text that is reported, characters
+NO_REPLIES: Final[Mapping[str, int]] = {}  # rejected replies of a device that never rejects one
 LATE_SHARE: Final = 0.1
 """Fraction of the update interval by which an update may be late."""
 
@@ -78,10 +81,14 @@ class BeamSource(Protocol):
 class Device(Protocol):
     """Device to which beams are applied. Every method may raise ``DeviceError``.
 
-    lead_s  lag that the device itself shows; None: only the time to apply counts
+    lead_s    lag that the device itself shows; None: only the time to apply counts
+    rejected  replies that could not be used but were not needed, by reason
     """
 
     takes: DeviceInput  # required content of a command
+
+    @property
+    def rejected(self) -> Mapping[str, int]: ...
 
     @property
     def lead_s(self) -> float | None: ...
@@ -112,6 +119,7 @@ class DriveStatus:
     late: int  # updates that were applied too late
     skipped: int  # updates that were skipped because the device was not ready
     failures: int  # failures of the device, each followed by a new attempt
+    rejected: dict[str, int]  # replies of the device that could not be used, by reason
     resting: str | None  # why there is nothing to apply; None: there is a beam
 
 
@@ -138,13 +146,16 @@ class Drive:
         self._period_ns = round(1e9 / update_hz)
         self._safe = safe
         self._now_ns = now_ns
-        self._say = say
+        self._report = say
         self._open = False
         self._again_ns = 0
         self._resting: str | None = None
         self._took_ns: deque[int] = deque(maxlen=REMEMBERED)
         self._at_ns: deque[int] = deque(maxlen=REMEMBERED)
         self._applied = self._late = self._skipped = self._failures = 0
+        self._waits: tuple[int, str] | None = None  # since when, and for what an update waits
+        self._reported_wait: tuple[int, str] | None = None
+        self._reported_rejections: set[str] = set()
 
     def run(self, stop: threading.Event) -> None:
         """Apply updates until ``stop`` is set; then put the device into its safe state."""
@@ -163,11 +174,34 @@ class Drive:
     def step(self) -> None:
         """Fetch one update and apply it; without an update, go to the safe state."""
         try:
+            self._step()
+        finally:
+            self._waits = None
+
+    def report_wait(self) -> None:
+        """Report once that an update waits for more than 5 s; for calls on another thread.
+
+        Libraries of devices have no timeout for a whole answer.
+        """
+        waits = self._waits
+        if waits is None or waits == self._reported_wait:
+            return
+        if self._now_ns() - waits[0] > SLOW_NS:
+            self._reported_wait = waits
+            self._say(
+                f"{waits[1]} has not answered for {SLOW_NS // 1_000_000_000} s; still waiting"
+            )
+
+    def _step(self) -> None:
+        try:
+            self._waits = self._now_ns(), "the device"
             if not self._reached():
                 return
             began_ns = self._now_ns()
             try:
+                self._waits = began_ns, "the service"
                 command = self._source.ask(self.lead_s)
+                self._waits = self._now_ns(), "the device"
             except SourceLostError as error:
                 self._rest(f"no answer from the service: {error}")
                 return
@@ -178,6 +212,9 @@ class Drive:
         except DeviceError as error:
             self._handle_failure(error)
             return
+        for reason in self._device.rejected.keys() - self._reported_rejections:
+            self._reported_rejections.add(reason)
+            self._say(f"a reply of the device is rejected ({reason}); others are only counted")
         ended_ns = self._now_ns()
         self._took_ns.append(ended_ns - began_ns)
         self._at_ns.append(ended_ns)
@@ -221,8 +258,13 @@ class Drive:
             late=self._late,
             skipped=self._skipped,
             failures=self._failures,
+            rejected=dict(self._device.rejected),
             resting=self._resting,
         )
+
+    def _say(self, text: str) -> None:
+        """Report a change, with what a device or a service wrote into it, in one line."""
+        self._report(printable(" ".join(text.split()))[:TEXT_MAX])
 
     def _reached(self) -> bool:
         """Return whether the device is open; at intervals, try to open it."""

@@ -8,9 +8,18 @@ that of ``adi.CN0566``, where elements count from 1. Never tested on hardware: t
 pyadi-iio's class on a mock of libiio.
 """
 
+import contextlib
+from collections.abc import Iterator
 from typing import Any, Final
 
-from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
+from companion.node.drive.loop import (
+    NO_REPLIES,
+    DeviceCommand,
+    DeviceError,
+    DeviceInput,
+    SafeState,
+    require,
+)
 from companion.values import IntArray, UserError
 
 ELEMENTS: Final = 8
@@ -22,6 +31,7 @@ class Phaser:
     """Phaser as a device, at a libiio URI."""
 
     takes = DeviceInput.REGISTERS
+    rejected = NO_REPLIES
     lead_s = None
 
     def __init__(self, uri: str) -> None:
@@ -39,11 +49,9 @@ class Phaser:
             from adi import CN0566
         except (ImportError, AttributeError, OSError) as error:  # OSError: libiio is missing
             raise UserError(f"a Phaser needs pyadi-iio and libiio: {error}") from error
-        try:
+        with self._access():
             self._phaser = CN0566(uri=self._uri)
             self._phaser.configure(device_mode="rx")
-        except Exception as error:  # pyadi-iio raises plain exceptions
-            raise DeviceError(f"no Phaser at {self._uri}: {error}") from error
         self._shown = {}
 
     def apply(self, command: DeviceCommand) -> None:
@@ -74,16 +82,26 @@ class Phaser:
         self._phaser = None
 
     def _set(self, wanted: dict[int, tuple[int, int, int]]) -> None:
-        try:
+        shown, self._shown = self._shown, {}  # unknown while it is written, and after a failure
+        with self._access():
             for element, (phase, gain, attenuated) in wanted.items():
-                if self._shown.get(element) == (phase, gain, attenuated):
+                if shown.get(element) == (phase, gain, attenuated):
                     continue
                 one = self._phaser.elements[element + 1]
                 one.rx_phase = phase * DEGREES
                 one.rx_gain = gain
                 one.rx_attenuator = bool(attenuated)
             self._phaser.latch_rx_settings()
-        except OSError as error:
-            self._shown = {}
-            raise DeviceError(f"the Phaser at {self._uri}: {error}") from error
         self._shown = dict(wanted)
+
+    @contextlib.contextmanager
+    def _access(self) -> Iterator[None]:
+        """Raise ``DeviceError`` for every exception of pyadi-iio.
+
+        It raises plain exceptions, and those of its own parsing of a reply.
+        """
+        try:
+            yield
+        except Exception as error:
+            cause = str(error) or type(error).__name__
+            raise DeviceError(f"the Phaser at {self._uri}: {cause}") from error

@@ -9,7 +9,7 @@ tested on hardware: the tests run pyadi-iio's class on a mock of libiio.
 from collections.abc import Sequence
 from typing import Final
 
-from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState
+from companion.node.drive.loop import DeviceCommand, DeviceInput, SafeState
 from companion.node.drive.phaser import DEGREES, ELEMENTS, FULL_GAIN, Phaser
 from companion.values import IntArray, UserError
 
@@ -36,15 +36,13 @@ class PhaserMemory(Phaser):
         kept = dict(enumerate(self._beams))
         kept[BORESIGHT] = dict.fromkeys(range(ELEMENTS), (0, FULL_GAIN, 0))
         kept[MUTE] = dict.fromkeys(range(ELEMENTS), (0, 0, 1))
-        try:
+        with self._access():
             for position, settings in kept.items():
                 for element, (phase, gain, attenuated) in settings.items():
                     one = self._phaser.elements[element + 1]
                     one.save_rx_beam(position, bool(attenuated), gain, phase * DEGREES)
             for chip in self._phaser.devices.values():
                 chip.beam_mem_enable = True
-        except OSError as error:
-            raise DeviceError(f"the Phaser at {self._uri}: {error}") from error
         self._position = None
 
     def apply(self, command: DeviceCommand) -> None:
@@ -58,12 +56,10 @@ class PhaserMemory(Phaser):
             self._use(BORESIGHT if safe is SafeState.BORESIGHT else MUTE)
 
     def _use(self, position: int) -> None:
-        try:
-            if position != self._position:
+        selected, self._position = self._position, None  # unknown after a failure
+        with self._access():
+            if position != selected:
                 for element in range(ELEMENTS):
                     self._phaser.elements[element + 1].rx_beam_state = position
             self._phaser.latch_rx_settings()
-        except OSError as error:
-            self._position = None
-            raise DeviceError(f"the Phaser at {self._uri}: {error}") from error
         self._position = position

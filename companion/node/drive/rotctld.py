@@ -12,7 +12,15 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.node.drive.lag import MountLag
-from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
+from companion.node.drive.loop import (
+    NO_REPLIES,
+    DeviceCommand,
+    DeviceError,
+    DeviceInput,
+    SafeState,
+    require,
+)
+from companion.values import shown
 
 TIMEOUT_S: Final = 2.0  # for a whole answer
 ANSWER_MAX_BYTES: Final = 65_536
@@ -26,6 +34,7 @@ class Rotator:
     """
 
     takes = DeviceInput.POINTING
+    rejected = NO_REPLIES
 
     def __init__(self, host: str, port: int, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._address = host, port
@@ -103,7 +112,7 @@ class Rotator:
         text = self._ask("+p")
         found = re.search(rf"Azimuth:\s*{_NUMBER}\s+Elevation:\s*{_NUMBER}", text)
         if found is None:
-            raise DeviceError(f"rotctld reports no direction: {text[:80]!r}")
+            raise DeviceError(f"rotctld reports no direction: {shown(text)}")
         return float(found[1]), float(found[2])
 
     def _ask(self, command: str) -> str:

@@ -1,6 +1,7 @@
 """Driving a device: as a command, and inside a service."""
 
 import asyncio
+import contextlib
 import signal
 import threading
 from collections.abc import Callable
@@ -30,6 +31,7 @@ def run_until_stopped(
         step_s = STATUS_EVERY_S if left_s is None else min(STATUS_EVERY_S, left_s)
         if stop.wait(step_s):
             break
+        drive.report_wait()
         show(drive.status())
         if left_s is not None:
             left_s -= step_s
@@ -53,7 +55,10 @@ async def run_in_thread(drive: Drive) -> None:
     thread = threading.Thread(target=run, name="drive", daemon=True)
     thread.start()
     try:
-        await ended.wait()
+        while not ended.is_set():
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(ended.wait(), STATUS_EVERY_S)
+            drive.report_wait()
     finally:
         stop.set()
         await asyncio.to_thread(thread.join, ENDS_S)

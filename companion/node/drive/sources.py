@@ -27,6 +27,9 @@ from companion.views.quantised import device_table
 ADAR1000: Final = WeightFormat.ADAR1000.media_type
 MIN_MEAN_VECTOR: Final = 0.1  # length of the mean of unit directions below which it is undefined
 ANSWERS_S: Final = 5.0  # timeout for an answer of the event loop
+STORED_MAX: Final = 1 << 16  # limit on the index of a stored beam
+REGISTER_LIMITS: Final = np.array([1 << 16, 5, 1 << 16, 128, 128, 2, 64, 64])
+"""Limits of the columns of a table for ADAR1000: channels count from 1, I and Q have six bits."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,7 +75,30 @@ class HttpSource:
             if error.status == 409:
                 return DeviceCommand(valid_at_ns=valid_at_ns, unfit=error.title)
             raise SourceLostError(str(error)) from error
-        return command_for(told, text, self._wanted, valid_at_ns)
+        try:
+            command = command_for(told, text, self._wanted, valid_at_ns)
+            _require_plausible(command)
+        except (LookupError, TypeError, ValueError, ArithmeticError, AttributeError) as error:
+            raise SourceLostError(
+                "beams are malformed; check the address of the service"
+            ) from error
+        return command
+
+
+def _require_plausible(command: DeviceCommand) -> None:
+    """Raise ``ValueError`` for values of a service that no device can apply."""
+    lat_deg, lon_deg, alt_m = command.place or (0.0, 0.0, 0.0)
+    limited = ((lat_deg, 90.0), (lon_deg, 180.0), (alt_m, 1e6), (command.above_rad, math.pi / 2))
+    if not all(abs(value) <= most for value, most in (*limited, (command.bearing_rad, 7.0))):
+        raise ValueError("position or direction out of range")
+    if command.stored is not None and not 0 <= command.stored < STORED_MAX:
+        raise ValueError("index of a stored beam out of range")
+    rows = command.registers
+    if rows is None:
+        return
+    channels = {(chip, channel) for chip, channel, *_ in rows.tolist()}
+    if not ((rows >= 0) & (rows < REGISTER_LIMITS)).all() or len(channels) != len(rows):
+        raise ValueError("registers out of range, or twice for one channel")
 
 
 class LocalSource:

@@ -20,7 +20,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from companion.node.drive.loop import Device, DeviceCommand, DeviceInput, SafeState
+from companion.node.drive.loop import NO_REPLIES, Device, DeviceCommand, DeviceInput, SafeState
 from companion.values import IntArray, Source, UserError
 from companion.values.errors import shown
 
@@ -87,6 +87,7 @@ class DryRun:
     """Device of a dry run: accepts and prints every command."""
 
     lead_s = None
+    rejected = NO_REPLIES
 
     def __init__(self, takes: DeviceInput, say: Callable[[str], None]) -> None:
         self.takes = takes

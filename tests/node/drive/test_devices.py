@@ -1,8 +1,12 @@
 """Device drivers: a chip stand-in that decodes its registers, the Phaser's own class over a
 recording libiio, and codes equal to those of the device's table."""
 
+import asyncio
+import contextlib
+import math
 import sys
 import threading
+import time
 from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
@@ -13,13 +17,19 @@ import numpy as np
 import pytest
 from device_reading import parse
 from device_stand_ins import CHIPS, Chip, iio_module, spidev_module
-from support import ROOT
+from hypothesis import given
+from hypothesis import strategies as st
+from support import HANG_S, ROOT, run_async
 
 from companion.beams.hardware.calibration import Calibration
 from companion.beams.hardware.devices import Beamformer
 from companion.node import moment
+from companion.node.drive import running as driving
 from companion.node.drive import targets
+from companion.node.drive.adar1000 import Chips
+from companion.node.drive.gimbal import Gimbal, RoiGimbal
 from companion.node.drive.loop import (
+    NO_REPLIES,
     DeviceCommand,
     DeviceError,
     DeviceInput,
@@ -27,10 +37,16 @@ from companion.node.drive.loop import (
     SafeState,
     SourceLostError,
 )
-from companion.node.drive.sources import BeamRequest, command_for, command_of, stored_registers
+from companion.node.drive.sources import (
+    BeamRequest,
+    HttpSource,
+    command_for,
+    command_of,
+    stored_registers,
+)
 from companion.pipeline import assembly
 from companion.settings.model import Settings
-from companion.values import UserError, WeightFormat
+from companion.values import Source, UserError, WeightFormat
 from companion.views import beam_state, weight_formats
 
 EIGHT = Settings().override(center={"source": "5:1"}, array={"elements": 8, "frequency_hz": 10.5e9})
@@ -409,6 +425,7 @@ class Recorder:
 
     takes = DeviceInput.POINTING
     lead_s = None
+    rejected = NO_REPLIES
 
     def __init__(self, clock: Ticking, takes_s: float = 0.0) -> None:
         self.did: list[str] = []
@@ -538,3 +555,241 @@ def test_uav_missing_from_the_device_table_is_not_applied() -> None:
         0,
     )
     assert shot.unfit == "1:1 has no beam in the device's table"
+
+
+# --- replies that no device or service should give ------------------------------------------------
+
+
+class Faulty:
+    """A libiio object whose attributes all raise the same."""
+
+    def __init__(self, error: Exception) -> None:
+        object.__setattr__(self, "_error", error)
+
+    def __getattr__(self, name: str) -> Any:
+        raise self._error
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise self._error
+
+
+ERRORS = [
+    OSError(5, "I/O error"), ValueError("could not convert string to float: '1.2.3'"),
+    KeyError("rx_load_spi"), IndexError("list index out of range"), TypeError("NoneType"),
+    UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), AttributeError(),
+    OverflowError("int too large"), Exception("Device not found!"),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("target", ["phaser:ip:x", "phaser-memory:ip:x"])
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_any_error_of_pyadi_iio_is_a_device_error(
+    iio: list[tuple[str, str, str]],
+    flown: tuple[DeviceCommand, Any, str],
+    target: str,
+    error: Exception,
+) -> None:
+    """While it is applied and while it is opened; then everything is written again."""
+    registers = flown[0].registers
+    assert registers is not None
+    device = targets.device(target, print, lambda: [registers] * 3)
+    clock, said = Ticking(), list[str]()
+    drive = Drive(
+        source=Always(replace(flown[0], stored=1)),
+        device=device,
+        update_hz=10.0,
+        safe=SafeState.HOLD,
+        now_ns=clock.now_ns,
+        say=said.append,
+    )
+    drive.step()
+    phaser = device._phaser  # type: ignore[attr-defined]
+    device._phaser = SimpleNamespace(  # type: ignore[attr-defined]
+        elements=dict.fromkeys(range(1, 9), Faulty(error)),
+        latch_rx_settings=lambda: Faulty(error).latched,
+    )
+    drive.step()
+    assert drive.status().failures == 1
+    assert said[-1].startswith("the device failed: the Phaser at ip:x: ")
+    assert said[-1].isprintable() and not said[-1].endswith(": ")
+    clock.t_ns += 1_000_000_000
+    written = len(iio)
+    drive.step()
+    names = {name for _, name, _ in iio[written:]}
+    assert ("beam_pos_load" if "memory" in target else "phase") in names
+    assert drive.status().applied == 2 and device._phaser is not phaser  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize(
+    ("target", "name"), [("phaser:ip:x", "phase"), ("phaser-memory:ip:x", "beam_pos_load")]
+)
+def test_failed_write_to_a_phaser_is_repeated(
+    iio: list[tuple[str, str, str]], target: str, name: str
+) -> None:
+    """What a failed update has written is unknown: the next one writes it again."""
+    device = targets.device(target, print, list)
+    device.open()
+    device.rest(SafeState.BORESIGHT)
+    phaser = device._phaser  # type: ignore[attr-defined]
+    device._phaser = SimpleNamespace(  # type: ignore[attr-defined]
+        elements=phaser.elements, latch_rx_settings=lambda: Faulty(ValueError("x")).latched
+    )
+    with pytest.raises(DeviceError):
+        device.rest(SafeState.MUTE)
+    device._phaser = phaser  # type: ignore[attr-defined]
+    written = len(iio)
+    device.rest(SafeState.BORESIGHT)
+    assert Counter(name for _, name, _ in iio[written:])[name] == 8
+
+
+def test_device_that_never_answers_is_reported_once() -> None:
+    """From another thread, while the update waits."""
+    clock, said = Ticking(), list[str]()
+
+    class Hanging(Recorder):
+        def apply(self, shot: DeviceCommand) -> None:
+            for _ in range(20):
+                clock.t_ns += 1_000_000_000
+                drive.report_wait()
+            super().apply(shot)
+
+    class Slow(Always):
+        def ask(self, lead_s: float) -> DeviceCommand:
+            clock.t_ns += 6_000_000_000
+            drive.report_wait()
+            return super().ask(lead_s)
+
+    drive = Drive(
+        source=Slow(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
+        device=Hanging(clock),
+        update_hz=10.0,
+        safe=SafeState.HOLD,
+        now_ns=clock.now_ns,
+        say=said.append,
+    )
+    drive.step()
+    drive.report_wait()
+    assert said == [
+        "the device is connected",
+        "the service has not answered for 5 s; still waiting",
+        "the device has not answered for 5 s; still waiting",
+    ]
+
+
+def test_running_drive_reports_a_device_that_hangs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.node.drive.loop.SLOW_NS", 1)
+    monkeypatch.setattr(driving, "STATUS_EVERY_S", 0.001)
+    reported, said = threading.Event(), list[str]()
+
+    class Hanging(Recorder):
+        def apply(self, shot: DeviceCommand) -> None:
+            assert reported.wait(HANG_S)
+
+    def say(text: str) -> None:
+        said.append(text)
+        if "has not answered" in text:
+            reported.set()
+
+    drive = Drive(
+        source=Always(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
+        device=Hanging(Ticking()),
+        update_hz=10.0,
+        safe=SafeState.HOLD,
+        now_ns=time.monotonic_ns,
+        say=say,
+    )
+
+    async def run() -> None:
+        task = asyncio.create_task(driving.run_in_thread(drive))
+        await asyncio.to_thread(reported.wait, HANG_S)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+    run_async(run())
+    assert reported.is_set()
+
+
+BEAM = {"uav": "1:1", "bearing_deg": 10.0, "above_horizon_deg": 5.0, "lat_deg": 47.0,
+        "lon_deg": 8.0, "alt_m": 500.0, "codebook": {"best": 3}}  # fmt: skip
+ODD = [None, True, "", "x", "\x1b[2J\n", -1, 1e300, 10**400, math.nan, math.inf, [], [[]], {}]
+"""Values that JSON can have, in the place of others."""
+
+
+class Replying:
+    """A client whose service gives these answers."""
+
+    def __init__(self, told: Any, text: str) -> None:
+        self._told, self._text = told, text
+
+    def beams(self, lead_ms: float) -> Any:
+        return self._told
+
+    def table(self, media_type: str, lead_ms: float) -> str:
+        return self._text
+
+
+@pytest.mark.parametrize("takes", DeviceInput)
+@given(data=st.data())
+def test_any_answer_of_a_service_is_usable_or_a_lost_service(
+    takes: DeviceInput, data: st.DataObject
+) -> None:
+    told: dict[str, Any] = {"unfit": None, "beams": [dict(BEAM)], "codebook_beams": 64}
+    where = data.draw(st.sampled_from(["told", "beam", "codebook"]))
+    inner = {"told": told, "beam": told["beams"][0], "codebook": {"best": 3}}[where]
+    told["beams"][0]["codebook"] = inner if where == "codebook" else {"best": 3}
+    key = data.draw(st.sampled_from(sorted(inner)))
+    inner[key] = data.draw(st.sampled_from(ODD))
+    row = ["0", "1:1", "0", "1", "2", "3", "4.0", "5", "1", "0x1f", "0x3f"]
+    row[data.draw(st.integers(0, 10))] = data.draw(
+        st.sampled_from(["", "-1", "9" * 5000, "nan", "1e9", "0xfff", "\u0661"])
+    )
+    text = data.draw(st.sampled_from(["head\n" + ",".join(row) + "\n", "", "head\n1:1,1:1\n"]))
+    client: Any = Replying(told, text)
+    wanted = BeamRequest(uavs=(), any_uav=True, takes=takes)
+    try:
+        shot = HttpSource(client, wanted).ask(0.0)
+    except SourceLostError as error:
+        assert str(error) == "beams are malformed; check the address of the service"
+        return
+    if shot.unfit is not None:
+        return
+    gimbals = [of(host="127.0.0.1", port=1, target=Source(1, 154)) for of in (Gimbal, RoiGimbal)]
+    for gimbal in gimbals:
+        gimbal.say = lambda msgid, payload: None  # type: ignore[method-assign]
+        gimbal.apply(shot)
+    if shot.registers is not None:
+        words: list[list[int]] = []
+        chips = Chips([(0, 0)] * (int(shot.registers[:, 0].max()) + 1))
+        chips._lines = [SimpleNamespace(xfer2=words.append) for _ in chips._places]
+        chips.apply(shot)
+        assert all(0 <= byte < 256 for word in words for byte in word)
+
+
+def test_table_of_a_service_is_applied_and_its_repetition_is_not(
+    flown: tuple[DeviceCommand, Any, str],
+) -> None:
+    shot, _, text = flown
+    told = {"unfit": None, "beams": [BEAM | {"uav": "3:1"}], "codebook_beams": None}
+    wanted = BeamRequest(uavs=("3:1",), any_uav=False, takes=DeviceInput.REGISTERS)
+    twice: Any = Replying(told, text + "".join(text.splitlines(keepends=True)[1:]))
+    once: Any = Replying(told, text)
+    np.testing.assert_array_equal(HttpSource(once, wanted).ask(0.0).registers, shot.registers)
+    with pytest.raises(SourceLostError, match="beams are malformed"):
+        HttpSource(twice, wanted).ask(0.0)
+
+
+def test_texts_of_a_service_are_reported_in_one_printable_line() -> None:
+    said = list[str]()
+    unfit = "\x1b[2Jfar\n" + "x" * 5000
+    drive = Drive(
+        source=Always(DeviceCommand(valid_at_ns=0, unfit=unfit)),
+        device=Recorder(Ticking()),
+        update_hz=10.0,
+        safe=SafeState.HOLD,
+        now_ns=Ticking().now_ns,
+        say=said.append,
+    )
+    drive.step()
+    assert said[1].startswith("hold: [2Jfar xxx")
+    assert len(said[1]) == 200 and said[1].isprintable()

@@ -1,17 +1,18 @@
 """Gimbals over pymavlink: commands sent, and evaluation of the gimbal's own attitude."""
 
 import math
+import random
 import socket
 from collections.abc import Iterator
 from typing import Any
 
 import pytest
 from pymavlink.dialects.v20 import all as dialect
-from support import HANG_S
+from support import HANG_S, rounds
 
 from companion.node.drive import targets
 from companion.node.drive.gimbal import Gimbal
-from companion.node.drive.loop import DeviceCommand, DeviceError, SafeState
+from companion.node.drive.loop import DeviceCommand, DeviceError, Drive, SafeState
 from companion.values import Source, UserError
 
 
@@ -132,3 +133,102 @@ def test_gimbal_does_not_support_mute() -> None:
 def test_invalid_gimbal_target_is_rejected(target: str) -> None:
     with pytest.raises(UserError, match="is not gimbal"):
         targets.device(target, print, list)
+
+
+# --- hostile gimbals ------------------------------------------------------------------------------
+
+HOLD = DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1", bearing_rad=0.5)
+
+
+@pytest.fixture
+def linked(heard: socket.socket) -> Iterator[tuple[Gimbal, Any]]:
+    """A gimbal, and the function by which it sends: one datagram for each argument."""
+    gimbal = Gimbal(host="127.0.0.1", port=heard.getsockname()[1], target=Source(7, 154))
+    gimbal.open()
+    gimbal.apply(HOLD)
+    _, sender = message(heard)
+    yield gimbal, lambda *datagrams: [heard.sendto(one, sender) for one in datagrams]
+    gimbal.close()
+
+
+def attitude(*quaternion: float) -> bytes:
+    mav = dialect.MAVLink(None, srcSystem=7, srcComponent=154)
+    said = mav.gimbal_device_attitude_status_encode(0, 0, 0, 16, quaternion, 0, 0, 0, 0)
+    return bytes(said.pack(mav))
+
+
+NAN, INF = math.nan, math.inf
+
+
+@pytest.mark.parametrize(
+    "quaternion",
+    [(NAN, 0, 0, 0), (0, INF, 0, -INF), (3e38, 3e38, 3e38, 3e38), (0, 0, 0, 0), (9, 0, 0, 0)],
+)
+def test_impossible_attitude_is_counted_and_reported_once(
+    linked: tuple[Gimbal, Any], quaternion: tuple[float, ...]
+) -> None:
+    gimbal, send = linked
+    said: list[str] = []
+    drive = Drive(
+        source=Always(),
+        device=gimbal,
+        update_hz=10.0,
+        safe=SafeState.HOLD,
+        now_ns=lambda: 0,
+        say=said.append,
+    )
+    drive._open = True
+    for n in (1, 2):
+        send(attitude(*quaternion))
+        drive.step()
+        assert drive.status().rejected == {"malformed": n}
+    assert said == ["a reply of the device is rejected (malformed); others are only counted"]
+    assert gimbal._seen_rad == 0.0 and drive.status().applied == 2
+
+
+def test_any_datagram_of_a_gimbal_is_used_or_counted(linked: tuple[Gimbal, Any]) -> None:
+    gimbal, send = linked
+    rng, valid = random.Random(5), attitude(1, 0, 0, 0)
+    used = 0
+    for _ in range(rounds(300, 3000)):
+        data = bytearray(valid[: rng.randrange(1, len(valid) + 1)])
+        for _ in range(rng.randrange(3)):
+            data[rng.randrange(len(data))] = rng.randrange(256)
+        used += bytes(data) == valid
+        counted = sum(gimbal.rejected.values())
+        send(bytes(data))
+        gimbal.apply(HOLD)
+        assert bytes(data) == valid or sum(gimbal.rejected.values()) > counted
+        send(valid)  # what was cut before does not damage the next one
+        gimbal.apply(HOLD)
+        used += 1
+        assert len(gimbal._lag._reports) == min(used, gimbal._lag._reports.maxlen or 0)
+
+
+def test_flood_of_a_gimbal_is_a_failure(linked: tuple[Gimbal, Any]) -> None:
+    gimbal, _ = linked
+    endless = Endless()
+    gimbal._socket, before = endless, gimbal._socket  # type: ignore[assignment]
+    assert before is not None
+    before.close()
+    with pytest.raises(DeviceError, match="more than 1000 messages between two updates"):
+        gimbal.apply(HOLD)
+    assert endless.read == 1000
+
+
+class Endless:
+    """A socket whose peer sends faster than it is read."""
+
+    def __init__(self) -> None:
+        self.read = 0
+
+    def recv(self, _: int) -> bytes:
+        self.read += 1
+        return b"\xfd" * 20
+
+    def close(self) -> None: ...
+
+
+class Always:
+    def ask(self, lead_s: float) -> DeviceCommand:
+        return HOLD

@@ -9,6 +9,8 @@ from typing import Final
 
 QUEUE_MAX: Final = 20_000
 """Most calls that may wait for the event loop; more are dropped and counted."""
+BYTES_MAX: Final = 64 << 20
+"""Most bytes that the waiting calls may hold; calls beyond it are dropped and counted."""
 SLICE_S: Final = 0.003  # time slice, after which other work of the event loop runs
 
 
@@ -16,7 +18,7 @@ class ToLoop:
     """Queue of calls from threads, run on the event loop in order until ``end`` or a failure.
 
     handed_over  calls made
-    dropped      calls that found ``QUEUE_MAX`` waiting
+    dropped      calls that found ``QUEUE_MAX`` waiting, or no room for their bytes
     """
 
     def __init__(self, loop: asyncio.AbstractEventLoop) -> None:
@@ -24,20 +26,22 @@ class ToLoop:
         self.dropped = 0
         self._loop = loop
         self._lock = threading.Lock()
-        self._waiting: deque[Callable[[], None]] = deque()
+        self._waiting: deque[tuple[Callable[[], None], int]] = deque()
+        self._bytes = 0
         self._is_woken = False
         self._is_over = False
         self._fault: asyncio.Future[None] = loop.create_future()
 
-    def post(self, call: Callable[[], None]) -> None:
-        """Queue a call for the event loop; may be called on any thread."""
+    def post(self, call: Callable[[], None], size: int = 0) -> None:
+        """Queue a call for the event loop, which holds this many bytes; on any thread."""
         with self._lock:
             if self._is_over:
                 return
-            if len(self._waiting) >= QUEUE_MAX:
+            if len(self._waiting) >= QUEUE_MAX or self._bytes + size > BYTES_MAX:
                 self.dropped += 1
                 return
-            self._waiting.append(call)
+            self._waiting.append((call, size))
+            self._bytes += size
             if self._is_woken:
                 return
             self._is_woken = True
@@ -57,6 +61,7 @@ class ToLoop:
         with self._lock:
             self._is_over = True
             self._waiting.clear()
+            self._bytes = 0
 
     async def run(self) -> None:
         """Wait until cancelled; raise the exception of a failed call."""
@@ -69,7 +74,8 @@ class ToLoop:
                 if not self._waiting:
                     self._is_woken = False
                     return
-                call = self._waiting.popleft()
+                call, size = self._waiting.popleft()
+                self._bytes -= size
             try:
                 call()
             except Exception as fault:

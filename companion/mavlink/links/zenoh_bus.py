@@ -170,7 +170,7 @@ class Bus:
             arrived_ns = time.monotonic_ns()
             if reply.ok is not None:
                 answer = reply.ok.payload.to_bytes()
-                self._to_loop.post(lambda: take(answer, arrived_ns))
+                self._to_loop.post(lambda: take(answer, arrived_ns), len(answer))
 
         self._opened().get(
             key,
@@ -197,7 +197,7 @@ class Bus:
         def heard(sample: "zenoh.Sample") -> None:
             if sample.kind == zenoh.SampleKind.PUT:
                 key, payload = str(sample.key_expr), sample.payload.to_bytes()
-                self._to_loop.post(lambda: take(key, payload))
+                self._to_loop.post(lambda: take(key, payload), len(payload))
 
         subscriber = self._opened().declare_subscriber(
             key_expr,

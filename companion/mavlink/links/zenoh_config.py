@@ -12,6 +12,7 @@ QUEUED: Final = 16
 
 With Zenoh's default of 2, and without waiting, only 2 of 5 express samples in a row arrive.
 """
+MESSAGE_MAX: Final = 4 << 20  # longest sample, bytes; Zenoh's default is a gigabyte
 LINKS_MAX: Final = 4  # links to one neighbour: two of each kind, where both connect to each other
 
 Priority = Literal[
@@ -97,6 +98,7 @@ def sections(config: BusConfig) -> dict[str, str]:
         # Otherwise an attempt hangs with ever longer TCP retries after the network is back.
         "transport/unicast/open_timeout": round(config.attempt_s * 1000),
         "transport/unicast/accept_timeout": round(config.attempt_s * 1000),
+        "transport/link/rx/max_message_size": MESSAGE_MAX,
         "transport/link/tx/lease": round(config.lease_s * 1000),
         "transport/link/tx/keep_alive": config.keep_alive,
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": 0,

@@ -17,7 +17,7 @@ from companion.node.fleet.config import bus_config
 from companion.node.fleet.listening import Listening
 from companion.node.fleet.messages import FleetMessageError
 from companion.node.fleet.traffic import Rate
-from companion.pipeline.fleet.member import FleetMember
+from companion.pipeline.fleet.member import NODES_MAX, FleetMember
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
 from companion.pipeline.fold import Pipeline
@@ -86,6 +86,7 @@ class LiveFleetNode:
         self._flushing: asyncio.TimerHandle | None = None
         self._flush_ns = 0  # due time of the flush
         self._has_duplicate = False
+        self._warned: set[str] = set()
         self._listening: Listening | None = None
         patience_s = max(PATIENCE_S, PATIENCE_LEASES * settings.lease_s)
         self._unanswered = Unanswered(round(patience_s * 1e9))
@@ -290,6 +291,7 @@ class LiveFleetNode:
             self._unanswered.answered(node)
             if len(answer) != messages.CLOCK.size:
                 self.damaged += 1
+                self._notify_malformed(node, "malformed clock answer")
                 return
             started_ns, remote_ns = messages.CLOCK.unpack(answer)
             received_ns = self._now_ns() - (time.monotonic_ns() - arrived_ns)
@@ -319,8 +321,9 @@ class LiveFleetNode:
             try:
                 if node is not None:
                     take(node, payload)
-            except FleetMessageError:
+            except FleetMessageError as error:
                 self.damaged += 1
+                self._notify_malformed(str(node), str(error))
 
         return taken
 
@@ -353,14 +356,35 @@ class LiveFleetNode:
             self._unanswered.alive.discard(node)
             self._notify_all(self.member.node_left(self._now_ns(), node))
             return
-        self._unanswered.alive.add(node)
+        is_new = node not in self.member.neighbours
+        self.member.node_joined(self._now_ns(), node)
         if node not in self.member.neighbours:
-            text = f"node {node} connected"
-            now_ns = self._now_ns()
-            self.member.node_joined(now_ns, node)
+            self._notify_once("fleet", f"more than {NODES_MAX} nodes; further ones are ignored")
+            return
+        self._unanswered.alive.add(node)
+        if is_new:
             self._notify(
-                Notice(t_ns=now_ns, severity=Severity.INFO, subject=f"node {node}", text=text)
+                Notice(
+                    t_ns=self._now_ns(),
+                    severity=Severity.INFO,
+                    subject=f"node {node}",
+                    text=f"node {node} connected",
+                )
             )
+
+    def _notify_malformed(self, node: str, why: str) -> None:
+        """Report a node's first malformed message."""
+        text = f"node {node}: message discarded: {why}; further ones are only counted"
+        self._notify_once(f"node {node}", text)
+
+    def _notify_once(self, subject: str, text: str) -> None:
+        """Publish the first warning about a subject, for a bounded number of subjects."""
+        if subject in self._warned or len(self._warned) > NODES_MAX:
+            return
+        self._warned.add(subject)
+        self._notify(
+            Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=subject, text=text)
+        )
 
     def _notify_duplicate(self) -> None:
         if self._has_duplicate:
@@ -384,5 +408,5 @@ class LiveFleetNode:
             site=self.settings.site,
             sent_bps=self._sent.bps,
             heard_bps=self._heard.bps,
-            damaged=self.damaged,
+            damaged=self.damaged + self.member.reception.unusable,
         )

@@ -7,18 +7,21 @@ one is never reused. Received messages are parsed with limits; invalid ones rais
 
 import math
 import struct
-from typing import Final
+from typing import Any, Final
 
 from google.protobuf.message import DecodeError
 
 from companion.recording import fields, schemas
-from companion.values import Offer, RoundTrip, Shared, SharedFrame, Standing
+from companion.values import Offer, RoundTrip, Shared, SharedFrame, Standing, shown
 
 FRAMES_MAX: Final = 4096  # limit on frames, and on round trips, in one message
 CLOCK: Final = struct.Struct("<qq")
 """Format of an answer to a clock request: start of the node, and its present time; ns."""
 OFFERS_MAX: Final = 10_000
 NAME_MAX: Final = 64
+MESSAGE_MAX: Final = 2 << 20
+"""Longest message that is parsed, bytes: the largest number of frames or UAVs fits into it."""
+PLACE_MAX: Final = (90.0, 180.0, 1e6)  # latitude and longitude in degrees, height in metres
 _LATEST_NS: Final = 1 << 62
 
 
@@ -40,10 +43,7 @@ def shared(said: Shared) -> bytes:
 
 def to_shared(data: bytes) -> Shared:
     """Decode another node's frames. Raises ``FleetMessageError``."""
-    try:
-        message = schemas.SharedMessage.FromString(data)
-    except DecodeError as error:
-        raise FleetMessageError("malformed message of frames") from error
+    message = _parsed(schemas.SharedMessage, data, "message of frames")
     if len(message.frame) > FRAMES_MAX or len(message.trip) > FRAMES_MAX:
         raise FleetMessageError("too many frames in one message")
     first_ns = message.first_ns
@@ -69,16 +69,14 @@ def standing(said: Standing) -> bytes:
 
 def to_standing(data: bytes, node: str) -> Standing:
     """Decode a node's ``Standing``, received under its own key. Raises ``FleetMessageError``."""
-    try:
-        message = schemas.StandingMessage.FromString(data)
-    except DecodeError as error:
-        raise FleetMessageError("malformed standing") from error
+    message = _parsed(schemas.StandingMessage, data, "standing")
     if message.node != node:
-        raise FleetMessageError(f"name in the message differs: {message.node[:NAME_MAX]!r}")
+        raise FleetMessageError(f"name in the message differs: {shown(message.node)}")
     if len(message.serves) > OFFERS_MAX or len(message.handing) > OFFERS_MAX:
         raise FleetMessageError("too many UAVs in one message")
     place = tuple(message.place)
-    if len(place) not in (0, 3) or not all(map(math.isfinite, place)):
+    limits = zip(place, PLACE_MAX, strict=False)
+    if len(place) not in (0, 3) or not all(abs(value) <= most for value, most in limits):
         raise FleetMessageError("invalid place")
     reach_m = message.reach_m if message.HasField("reach_m") else None
     return Standing(
@@ -101,10 +99,7 @@ def offers(said: dict[str, Offer]) -> bytes:
 
 def to_offers(data: bytes) -> tuple[Offer, ...]:
     """Decode another node's offers. Raises ``FleetMessageError``."""
-    try:
-        message = schemas.OffersMessage.FromString(data)
-    except DecodeError as error:
-        raise FleetMessageError("malformed message of offers") from error
+    message = _parsed(schemas.OffersMessage, data, "message of offers")
     if len(message.offer) > OFFERS_MAX:
         raise FleetMessageError("too many offers in one message")
     names = ("sure_db", "likely_db", "sinr_db", "heard_s")
@@ -115,6 +110,15 @@ def to_offers(data: bytes) -> tuple[Offer, ...]:
         )
         for one in message.offer
     )
+
+
+def _parsed(kind: Any, data: bytes, what: str) -> Any:
+    if len(data) > MESSAGE_MAX:
+        raise FleetMessageError(f"{what} has more than {MESSAGE_MAX} bytes")
+    try:
+        return kind.FromString(data)
+    except DecodeError as error:
+        raise FleetMessageError(f"malformed {what}") from error
 
 
 def _time(t_ns: int) -> int:
@@ -130,6 +134,6 @@ def _number(value: float) -> float:
 
 
 def _name(text: str) -> str:
-    if not text or len(text) > NAME_MAX or not text.isprintable():
+    if not text or len(text) > NAME_MAX or not (text.isascii() and text.isprintable()):
         raise FleetMessageError("invalid name")
     return text

@@ -171,8 +171,12 @@ class FleetMember:
             events += self.reception.take_shared(now_ns, node, frame, key)
         for trip in said.trips:
             silent_s = self.reception.silent_s(str(trip.source), now_ns - self.reception.behind_ns)
-            placed = here(trip, known.clock) if silent_s is None or silent_s > 1.0 else None
-            if placed is not None:
+            if silent_s is not None and silent_s <= 1.0:
+                continue
+            placed = here(now_ns, trip, known.clock)
+            if placed is None:
+                self.reception.unusable += 1
+            else:
                 events.append(placed)
         known.used += len(events)
         return events, self._contradictions(now_ns)

@@ -23,6 +23,9 @@ DRIFT_MAX: Final = 200e-6
 ANSWERS: Final = 3
 """Clock answers after which a node's frames are used: a sender's clock keeps its largest doubt, and
 the first answer is slow."""
+OLDEST_NS: Final = 600_000_000_000
+"""Largest age of what another node shares. Times before 1970 cannot be recorded at all, and frames
+whose arrival is uncertain by an hour are read back as damage."""
 DELAYS_KEPT: Final = 4096
 DELAYS_WINDOW_NS: Final = 60_000_000_000  # time for which delays of reports are kept
 NOTICED_OFFSET_NS: Final = 100_000_000
@@ -100,17 +103,15 @@ class Neighbour:
         return [way_ns for came_ns, way_ns in self._delays_ns if came_ns > oldest_ns]
 
 
-def here(trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:
+def here(now_ns: int, trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:
     """Convert another node's round trip to this node's timeline, no shorter than it was.
 
-    None while that node's clock is unknown.
+    None while that node's clock is unknown, or if the result is not within ``OLDEST_NS`` of now.
     """
     sent, received = clock.offset(trip.sent_ns), clock.offset(trip.t_ns)
     if sent is None or received is None:
         return None
-    return RoundTrip(
-        t_ns=trip.t_ns + received.high_ns,
-        source=trip.source,
-        sent_ns=trip.sent_ns + sent.low_ns,
-        remote_ns=trip.remote_ns,
-    )
+    t_ns, sent_ns = trip.t_ns + received.high_ns, trip.sent_ns + sent.low_ns
+    if min(sent_ns, t_ns) < max(now_ns - OLDEST_NS, 0) or max(sent_ns, t_ns) > now_ns + OLDEST_NS:
+        return None
+    return RoundTrip(t_ns=t_ns, source=trip.source, sent_ns=sent_ns, remote_ns=trip.remote_ns)

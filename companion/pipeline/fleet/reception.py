@@ -15,7 +15,7 @@ from companion.mavlink.trust.duplicate_ids import DuplicateIds
 from companion.mavlink.wire.decode import GPS_RAW_INT, HEARTBEAT
 from companion.mavlink.wire.framing import MAGIC_V2, SHORTEST, examine
 from companion.mavlink.wire.positions import OWN
-from companion.pipeline.fleet.neighbours import NeighbourClock
+from companion.pipeline.fleet.neighbours import OLDEST_NS, NeighbourClock
 from companion.values import Frame, SharedFrame, Source
 
 SHARED: Final = OWN | {HEARTBEAT, GPS_RAW_INT}
@@ -73,13 +73,15 @@ class Reception:
     another node, or arrive before they can have been received; the reader clears them.
     ``behind_ns`` is the age of this node's newest frame when it was read: a vehicle whose reports
     are still queued here is not silent. Otherwise an overloaded node would also use all shared
-    frames, and be more overloaded.
+    frames, and be more overloaded. ``unusable`` counts shared frames and round trips that
+    are damaged, or older than ``OLDEST_NS``.
     """
 
     def __init__(self) -> None:
         self.contradicted: list[str] = []
         self.early: list[str] = []
         self.behind_ns = 0
+        self.unusable = 0
         self._heard = RecentFrames()
         self._shared = RecentFrames()
         self._vehicles: dict[Source, _VehicleReception] = {}
@@ -114,7 +116,10 @@ class Reception:
         """
         raw = shared.raw
         ahead = clock.offset(shared.heard_ns)
-        if ahead is None or len(raw) < SHORTEST or examine(raw, 0, len(raw)) != len(raw):
+        if ahead is None:
+            return None
+        if len(raw) < SHORTEST or examine(raw, 0, len(raw)) != len(raw):
+            self.unusable += 1
             return None
         if raw[0] == MAGIC_V2:
             source, msgid = Source(raw[5], raw[6]), int.from_bytes(raw[7:10], "little")
@@ -125,6 +130,9 @@ class Reception:
         least_ns, most_ns = shared.heard_ns + ahead.low_ns, shared.heard_ns + ahead.high_ns
         if least_ns > now_ns + FUTURE_NS:
             self.early.append(node)
+            return None
+        if least_ns < now_ns - OLDEST_NS or most_ns < 0:
+            self.unusable += 1
             return None
         t_ns = min(most_ns, max(now_ns, least_ns))
         return Frame(

@@ -55,3 +55,22 @@ def test_call_posted_after_draining_is_executed() -> None:
 
     run_async(test())
     assert made == ["one", "two"]
+
+
+def test_queued_bytes_are_bounded() -> None:
+    """20 000 samples of 4 MB would be 80 GB."""
+    made: list[int] = []
+
+    async def test() -> None:
+        calls = ToLoop(asyncio.get_running_loop())
+        quarter = to_loop.BYTES_MAX // 4
+        for _ in range(2):
+            for number in range(6):
+                calls.post(lambda number=number: made.append(number), quarter)
+            done = asyncio.Event()
+            calls.post(done.set)
+            await done.wait()
+        assert calls.dropped == 4
+
+    run_async(test())
+    assert made == [0, 1, 2, 3] * 2

@@ -15,7 +15,7 @@ import pytest
 from link_support import LOOPS, Run, runner
 from support import free_port, run_async
 
-from companion.mavlink.links import to_loop, zenoh_bus
+from companion.mavlink.links import to_loop, zenoh_bus, zenoh_config
 from companion.mavlink.links.zenoh_bus import Bus
 from companion.mavlink.links.zenoh_config import QUEUED, BusConfig, BusTls, sections
 from companion.values import UserError
@@ -213,6 +213,46 @@ def test_receive_queue_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
             await heard.until(10)
             assert [payload[0] for _, payload in heard] == list(range(10))
             assert one.status.dropped == 90
+
+    run(test())
+
+
+def test_samples_beyond_the_limit_are_not_received(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh itself discards them, and the connection stays."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    async def test() -> None:
+        monkeypatch.setattr(zenoh_config, "MESSAGE_MAX", 200_000)
+        async with opened(BusConfig(listen=(endpoint,))) as one:
+            monkeypatch.setattr(zenoh_config, "MESSAGE_MAX", 1 << 30)
+            async with opened(BusConfig(connect=(endpoint,))) as other:
+                heard = Heard()
+                one.subscribe("site/b", heard.take)
+                await joined(one, other)
+                for size in (150_000, 250_000, 3):
+                    other.put("site/b", bytes(size))
+                await heard.until(2)
+                assert [len(payload) for _, payload in heard] == [150_000, 3]
+
+    run(test())
+
+
+def test_received_bytes_are_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(to_loop, "BYTES_MAX", 10_000)
+
+    async def test() -> None:
+        async with pair() as (one, other):
+            heard = Heard()
+            one.subscribe("site/b", heard.take)
+            await joined(one, other)
+            for _ in range(20):
+                other.put("site/b", bytes(1000))
+            while one.status.dropped < 10:  # the loop does nothing else meanwhile
+                time.sleep(0.001)
+            await heard.until(10)
+            assert one.status.dropped == 10
 
     run(test())
 

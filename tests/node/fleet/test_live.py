@@ -1,15 +1,18 @@
 """Settings that a fleet node rejects in one line, and messages that it accepts from others."""
 
 import asyncio
+import math
 import socket
 import time
 from collections.abc import Callable
 from typing import Any
 
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from link_support import LOOPS, runner
 from pymavlink.dialects.v20 import common
-from support import HANG_S, free_port, run_async
+from support import HANG_S, examples, free_port, run_async
 
 from companion.mavlink.links.zenoh_bus import open_peer
 from companion.mavlink.links.zenoh_config import BusConfig
@@ -17,11 +20,25 @@ from companion.node.fleet import live, messages
 from companion.node.fleet.config import bus_config
 from companion.node.fleet.live import LiveFleetNode
 from companion.node.fleet.traffic import Rate
+from companion.pipeline.fleet.member import NODES_MAX
 from companion.pipeline.fold import Pipeline
+from companion.recording import codec, schemas
 from companion.settings.fleet import FleetSettings
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
-from companion.values import Duty, Event, Frame, Notice, Offer, Shared, Source, Standing, UserError
+from companion.values import (
+    Duty,
+    Event,
+    Frame,
+    Notice,
+    Offer,
+    RoundTrip,
+    Severity,
+    Shared,
+    Source,
+    Standing,
+    UserError,
+)
 
 pytest.importorskip("zenoh")
 MS = 1_000_000
@@ -301,3 +318,115 @@ def test_rates_are_in_bits_per_second() -> None:
     rate.bytes += 250
     rate.look(2 * S)
     assert rate.bps == 1000.0
+
+
+# --- malformed samples ----------------------------------------------------------------------------
+
+
+SAMPLES = {"standing": b"\x0a\x03abc", "heard": b"\xff", "offers": b"\x0a\xff"}
+
+
+def test_malformed_samples_are_counted_and_reported_once_for_each_node() -> None:
+    notices: list[Notice] = []
+    member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
+    member._valid_only(member._offered)("companion/site/east/offers", SAMPLES["offers"])
+    for _ in range(3):
+        for what, take in (
+            ("standing", member._stands),
+            ("heard", member._shared),
+            ("offers", member._offered),
+        ):
+            member._valid_only(take)(f"companion/site/south/{what}", SAMPLES[what])
+    assert member.status().damaged == 10
+    assert [one.text for one in notices] == [
+        "node east: message discarded: malformed message of offers; further ones are only counted",
+        "node south: message discarded: name in the message differs: 'abc'; further ones are only"
+        " counted",
+    ]
+    assert {one.severity for one in notices} == {Severity.WARNING}
+
+
+def test_malformed_clock_answer_is_counted_and_reported() -> None:
+    notices: list[Notice] = []
+    member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
+    for answer in (b"", bytes(15), bytes(1000)):
+        member._clock_answer("south", 0)(answer, 0)
+    assert member.damaged == 3
+    assert ["malformed clock answer" in one.text for one in notices] == [True]
+
+
+def test_names_of_absent_nodes_are_bounded_and_reported_once() -> None:
+    """A stranger may declare any number of liveliness tokens."""
+    notices: list[Notice] = []
+    member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
+
+    for n in range(3 * NODES_MAX):
+        member._seen(f"companion/site/n{n}/alive", True)
+    assert len(member.member.neighbours) == len(member._unanswered.alive) == NODES_MAX
+    texts = [one.text for one in notices]
+    assert len(texts) == NODES_MAX + 1
+    assert texts[-1] == "more than 256 nodes; further ones are ignored"
+    for n in range(10 * NODES_MAX):
+        member._valid_only(member._offered)(f"companion/site/n{n}/offers", b"\xff")
+    assert len(member._warned) <= NODES_MAX + 1
+
+
+CLOCKS_NS = st.sampled_from([0, 1, -1, 1 << 62, -(1 << 63), (1 << 63) - 1, 1000 * S, 10**18])
+
+
+@given(data=st.data())
+@settings(max_examples=examples(400))
+def test_whatever_a_node_sends_can_be_recorded_and_replayed(data: st.DataObject) -> None:
+    """Its frames, round trips, positions and duties, by any clock."""
+    now_ns = data.draw(st.sampled_from([S, 10**18, 1_800_000_000 * S]))
+    events: list[Event] = []
+    member = node(now=lambda: now_ns)
+    member._step = events.append
+    member._bus = Wire()  # type: ignore[assignment]
+    remote_ns = data.draw(CLOCKS_NS)
+    member.member.node_joined(now_ns, "south")
+    answer = messages.CLOCK.pack(data.draw(CLOCKS_NS), remote_ns)
+    for _ in range(3):
+        member._clock_answer("south", now_ns - MS)(answer, time.monotonic_ns())
+    mav = common.MAVLink(None, srcSystem=1, srcComponent=1)
+    report = common.MAVLink_global_position_int_message(5, 473977000, 85456000, 0, 0, 0, 0, 0, 0)
+    raw = bytes(report.pack(mav))
+    times = st.sampled_from([0, max(remote_ns, 0), max(remote_ns - S, 0)])
+    uavs = st.sampled_from(["1:1", "9:9", "foo", "x" * 64, "\u0663:1", "1:1:1"])
+    numbers = st.sampled_from([0.0, 1e9, -1e9, math.inf, math.nan, 90.0, 1e300])
+    trip = {"t_ns": times, "sent_ns": times, "remote_ns": CLOCKS_NS}
+    trip |= {"sysid": st.just(1), "compid": st.just(1)}
+    served = {"uav": uavs, "worth_db": numbers}
+    samples = {
+        "heard": schemas.SharedMessage(
+            first_ns=data.draw(times),
+            told_ns=data.draw(times),
+            frame=[{"after_ns": data.draw(st.sampled_from([0, 1])), "raw": raw}],
+            trip=[data.draw(st.fixed_dictionaries(trip))],
+        ),
+        "standing": schemas.StandingMessage(
+            node="south",
+            place=[data.draw(numbers) for _ in range(data.draw(st.sampled_from([0, 3])))],
+            reach_m=data.draw(numbers),
+            serves=[data.draw(st.fixed_dictionaries(served))],
+            handing=[{"uav": data.draw(uavs), "to": data.draw(uavs)}],
+        ),
+        "offers": schemas.OffersMessage(
+            offer=[{"uav": data.draw(uavs), "sure_db": data.draw(numbers), "heard_s": 1.0}]
+        ),
+    }
+    takes = {"heard": member._shared, "standing": member._stands, "offers": member._offered}
+    for what, sample in samples.items():
+        key = f"companion/site/south/{what}"
+        member._valid_only(takes[what])(key, sample.SerializeToString())
+    member.ticked(now_ns)
+    for event in events:
+        member._pipeline.step(event)
+        match event:
+            case Frame():
+                codec.to_frame(schemas.FrameEncoder().encode(event), {})
+                assert event.doubt_ns < 3600 * S  # more is read back as damage
+            case RoundTrip():
+                codec.to_round_trip(schemas.encode("RoundTrip", event))
+            case Duty():
+                codec.to_duty(schemas.encode("Duty", event))

@@ -1,5 +1,6 @@
 """Fleet messages: encoded and decoded unchanged; others are rejected with a reason."""
 
+import struct
 from pathlib import Path
 
 import pytest
@@ -14,6 +15,7 @@ from companion.values import Offer, RoundTrip, Shared, SharedFrame, Source, Stan
 
 TIMES = st.integers(0, 1 << 62)
 NAMES = st.text("abc:0123456789", min_size=1, max_size=20)
+PLACES = st.tuples(st.floats(-90, 90), st.floats(-180, 180), st.floats(-1e6, 1e6))
 NUMBERS = st.floats(-1e9, 1e9, allow_nan=False)
 UNSURE = st.none() | NUMBERS
 FRAMES = st.lists(st.builds(SharedFrame, st.integers(0, 1 << 61), st.binary(max_size=300)))
@@ -39,7 +41,7 @@ def test_shared_frames_round_trip(said: Shared) -> None:
     st.builds(
         Standing,
         node=st.just("north"),
-        place=st.none() | st.tuples(NUMBERS, NUMBERS, NUMBERS),
+        place=st.none() | PLACES,
         reach_m=UNSURE,
         most=st.integers(0, 10_000),
         serves=st.lists(st.tuples(NAMES, NUMBERS)).map(tuple),
@@ -89,6 +91,10 @@ def test_implausible_messages_are_rejected() -> None:
         (standing(), "south"),  # it names another node
         (standing(place=[1.0]), "north"),
         (standing(place=[1.0, float("nan"), 0.0]), "north"),
+        (standing(place=[90.5, 0.0, 0.0]), "north"),
+        (standing(place=[1.0, 1e300, 0.0]), "north"),
+        (standing(reach_m=float("nan")), "north"),
+        (standing(serves=[{"uav": "\u0663:1", "worth_db": 1.0}]), "north"),
         (standing(serves=[{"uav": "1:1", "worth_db": float("inf")}]), "north"),
         (standing(serves=[{"uav": "", "worth_db": 1.0}]), "north"),
         (standing(serves=[{"uav": "x" * 65, "worth_db": 1.0}]), "north"),
@@ -97,7 +103,7 @@ def test_implausible_messages_are_rejected() -> None:
         with pytest.raises(FleetMessageError):
             messages.to_standing(wrong, node)
     many = schemas.SharedMessage(frame=[{}] * (messages.FRAMES_MAX + 1)).SerializeToString()
-    with pytest.raises(FleetMessageError):
+    with pytest.raises(FleetMessageError, match="too many frames in one message"):
         messages.to_shared(many)
 
 
@@ -113,3 +119,68 @@ def test_message_schema_is_published_and_documented() -> None:
     for name in ("Shared", "Standing", "Offers", "Tracks"):
         assert f"companion.{name}" in page
         assert name.encode() in schemas.SHARED.descriptor_set
+
+
+LARGE = {"shared": messages.to_shared, "offers": messages.to_offers}
+
+
+@pytest.mark.parametrize("name", LARGE)
+def test_message_beyond_the_limit_is_not_parsed(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A sample may have 4 MB; the largest valid messages fit into 2 MB."""
+    uav = "x" * messages.NAME_MAX
+    offers = {
+        str(n): Offer(uav=uav, sure_db=1.0, likely_db=1.0, sinr_db=1.0, heard_s=1.0)
+        for n in range(messages.OFFERS_MAX)
+    }
+    frames = (SharedFrame(1 << 61, bytes(280)),) * messages.FRAMES_MAX
+    largest = {"offers": messages.offers(offers), "shared": messages.shared(Shared(0, frames, ()))}
+    LARGE[name](largest[name])
+    parsed: list[int] = []
+    kind = {"shared": "SharedMessage", "offers": "OffersMessage"}[name]
+    counting = type("Counting", (), {"FromString": lambda data: parsed.append(len(data))})
+    monkeypatch.setattr(schemas, kind, counting)
+    with pytest.raises(FleetMessageError, match="has more than 2097152 bytes"):
+        LARGE[name](bytes(messages.MESSAGE_MAX + 1))
+    assert not parsed
+
+
+def _fields(*numbers: int) -> st.SearchStrategy[bytes]:
+    """Bytes of protobuf with these fields, of any type and content."""
+
+    def encoded(parts: list[tuple[int, int, int, bytes]]) -> bytes:
+        out = b""
+        for number, kind, value, data in parts:
+            out += bytes([number << 3 | kind])
+            out += {
+                0: messages.schemas._varint(value),
+                1: struct.pack("<Q", value),
+                2: messages.schemas._varint(len(data)) + data,
+            }[kind]
+        return out
+
+    part = st.tuples(
+        st.sampled_from(numbers),
+        st.sampled_from([0, 1, 2]),
+        st.integers(0, (1 << 64) - 1) | st.sampled_from([0, 0x7FF0 << 48, 0x7FF8 << 48, 1 << 62]),
+        st.binary(max_size=12),
+    )
+    return st.lists(part, max_size=6).map(encoded)
+
+
+@given(
+    outer=_fields(1, 2, 3, 4, 5, 6, 7, 8), inner=_fields(1, 2, 3, 4, 5), number=st.integers(1, 8)
+)
+@settings(max_examples=examples(300))
+def test_any_protobuf_is_decoded_or_rejected_in_one_line(
+    outer: bytes, inner: bytes, number: int
+) -> None:
+    data = outer + bytes([number << 3 | 2, len(inner) & 127]) + inner + b"\x0a\x05north"
+    for read in (
+        messages.to_shared,
+        messages.to_offers,
+        lambda some: messages.to_standing(some, "north"),
+    ):
+        try:
+            read(data)
+        except FleetMessageError as error:
+            assert str(error).isprintable() and len(str(error)) < 100

@@ -50,15 +50,40 @@ def test_neighbour_clock_interval_contains_the_true_offset(
 def test_shared_round_trip_is_not_shortened() -> None:
     clock = NeighbourClock()
     trip = RoundTrip(t_ns=500 * MS, source=Source(1, 1), sent_ns=400 * MS, remote_ns=77)
-    assert here(trip, clock) is None
+    assert here(1600 * MS, trip, clock) is None
     # The other clock lags by 1 s; the request took 4 ms, the answer 6 ms.
     clock.note_answer(1000 * MS, 1010 * MS, 4 * MS)
-    placed = here(trip, clock)
+    placed = here(1600 * MS, trip, clock)
     assert placed is not None
     assert placed.sent_ns <= 1400 * MS
     assert placed.t_ns >= 1500 * MS
     assert placed.t_ns - placed.sent_ns <= 100 * MS + 10 * MS + 4 * DRIFT_MAX * 500 * MS
     assert placed.remote_ns == 77
+
+
+def test_round_trips_that_cannot_be_recorded_are_not_used() -> None:
+    """Of another time than now, on this node's timeline: long ago, in the future, before 1970."""
+    clock, second = NeighbourClock(), 1000 * MS
+    clock.note_answer(START_NS, START_NS + MS, 1000 * second)
+
+    def placed(t_ns: int, sent_ns: int, now_ns: int = START_NS) -> RoundTrip | None:
+        trip = RoundTrip(t_ns=t_ns, source=Source(1, 1), sent_ns=sent_ns, remote_ns=77)
+        return here(now_ns, trip, clock)
+
+    now_ns = 1000 * second
+    assert placed(now_ns, now_ns - second) is not None
+    for t_ns, sent_ns in (
+        (now_ns, now_ns - 700 * second),
+        (0, 0),
+        (now_ns + 700 * second, now_ns),
+        (1 << 62, now_ns),
+        (now_ns, 1 << 62),
+    ):
+        assert placed(t_ns, sent_ns) is None
+    assert placed(0, 0, START_NS - now_ns) is not None
+    clock = NeighbourClock()
+    clock.note_answer(second, second + MS, 1000 * second)
+    assert placed(900 * second, 900 * second, second) is None
 
 
 def test_old_link_delays_expire() -> None:

@@ -151,3 +151,18 @@ def test_frames_missed_between_received_reports_are_not_used() -> None:
     at_ns = 14 * S
     taken = tell(hearing, at_ns + 5 * MS, raw(4000), at_ns)
     assert [one.raw for one in taken] == [raw(2950), raw(4000)]
+
+
+def test_shared_frames_that_cannot_be_recorded_are_counted() -> None:
+    """Received long ago, before 1970, or damaged."""
+    hearing, now_ns = Reception(), 1000 * S
+    good = raw(1)
+    for heard_ns, data in ((now_ns - 700 * S, good), (0, good), (now_ns, good[:-1]), (now_ns, b"")):
+        assert tell(hearing, now_ns, data, heard_ns) == []
+    assert hearing.unusable == 4
+    early = NeighbourClock()
+    early.note_answer(S, S + MS, 1000 * S)
+    assert hearing.to_own_timeline(2 * S, "b", early, SharedFrame(900 * S, good)) is None
+    assert hearing.unusable == 5
+    assert len(tell(hearing, now_ns, good, now_ns - 500 * S)) == 1
+    assert hearing.unusable == 5

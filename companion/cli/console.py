@@ -2,17 +2,19 @@
 
 import shutil
 import sys
+import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, Final, NoReturn
 
 import click
 
 from companion.cli.interrupts import interrupts_raised
 from companion.values import UserError, printable
 
+LOG_EVERY_S: Final = 10.0  # time between two progress lines without a terminal
 CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings file (TOML).")
 CENTER = click.option(
     "--center",
@@ -147,16 +149,25 @@ class OneLineErrors(click.Group):
 
 
 class Progress:
-    """Progress line on stderr that is overwritten; prints nothing if stderr is not a terminal."""
+    """Progress line on stderr that is overwritten; ``show`` prints nothing without a terminal."""
 
     def __init__(self) -> None:
         self._on = sys.stderr.isatty()
+        self._logged_s = time.monotonic()
 
     def show(self, text: str) -> None:
         """Replace the progress line."""
         if self._on:
             width = shutil.get_terminal_size().columns - 1  # a wrapped line cannot be overwritten
             click.echo(f"\r\033[K{printable(text)[:width]}", nl=False, err=True)
+
+    def log(self, text: str) -> None:
+        """Replace the progress line; without a terminal, print a line every ten seconds."""
+        if self._on:
+            self.show(text)
+        elif time.monotonic() - self._logged_s >= LOG_EVERY_S:
+            self._logged_s = time.monotonic()
+            click.echo(printable(text), err=True)
 
     def clear(self) -> None:
         """Remove the progress line."""
@@ -173,6 +184,6 @@ def log_progress(progress: Progress, ends_s: float | None) -> Callable[[int, flo
         remaining = ""
         if ends_s and at_s > 0:
             remaining = f" of {ends_s:.0f} s, {max(0.0, ends_s / at_s - 1) * wall_s:.0f} s to go"
-        progress.show(f"{frames} frames, {at_s:.0f} s of log{remaining}")
+        progress.log(f"{frames} frames, {at_s:.0f} s of log{remaining}")
 
     return show

@@ -210,7 +210,9 @@ def replay(
     pace = _speed(speed or ("1" if serve else "max"))
     gc.set_threshold(200_000)  # millions of short-lived values without reference cycles
     progress = Progress()
+    progress.show(f"reading {', '.join(log.name for log in logs)}")
     settings, origins = replaying.layers_for(logs, config, center)
+    progress.clear()
     if settings.center.source is None:
         click.echo("no --center: array placed at the position of the first report", err=True)
     print_vehicles(logs)

@@ -69,7 +69,9 @@ def weights(
     if out is not None and not out.parent.is_dir():
         raise click.UsageError(f"--out {out}: folder {out.parent} does not exist; create it")
     progress = Progress()
+    progress.show(f"reading {', '.join(log.name for log in logs)}")
     settings = settings_for(logs, config, center)
+    progress.clear()
     print_vehicles(logs)
     equipment = assembly.equipment(settings, assembly.array(settings))
     pipeline, update = moment.look(
@@ -77,7 +79,7 @@ def weights(
         settings,
         at,
         lead_s=lead_ms * 1e-3,
-        progress=lambda done_s: progress.show(f"{done_s:.0f} s"),
+        progress=lambda done_s: progress.log(f"{done_s:.0f} s of log"),
         latency_s=latency_s,
     )
     progress.clear()

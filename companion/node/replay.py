@@ -174,9 +174,18 @@ def replay(
 
 
 def length_s(logs: Sequence[Path]) -> float | None:
-    """Return the total length of some logs, by their ends; None if unknown."""
+    """Return the total length of some logs, by their ends; None if unknown.
+
+    Raises ``LogError`` for an unusable log.
+    """
     span_ns = ends.span_ns(logs)
-    return None if span_ns is None else (span_ns[1] - span_ns[0]) * 1e-9
+    if span_ns is not None:
+        return (span_ns[1] - span_ns[0]) * 1e-9
+    aboard = vehicles(logs)
+    if not aboard or len(aboard) < len(logs):
+        return None
+    spans_us = [one.span_us for one in aboard]
+    return (max(last for _, last in spans_us) - min(first for first, _ in spans_us)) * 1e-6
 
 
 def vehicle_logs(logs: Sequence[Path]) -> list[dict[str, Any]]:

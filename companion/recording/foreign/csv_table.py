@@ -14,7 +14,7 @@ import csv
 import io
 import math
 from array import array
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from datetime import datetime
 from functools import partial
 from typing import Any, Final
@@ -131,30 +131,54 @@ def _rows(
     An empty cell is NaN.
     """
     divider = max(",;\t", key=header.count)
+    columns = [(number, _reader(name, timed)) for number, name in used]
+    least = 1 + max(number for number, _ in used)
     found: Thinned[array[float]] = Thinned([])
     bad = 0
     for line in lines:
         if not line.strip() or line.startswith("#"):
             continue
         try:
-            cells = next(csv.reader([line], delimiter=divider))
-            row = [_number(cells[number], name, timed) for number, name in used]
-            found.add(array("d", row))
-        except (ValueError, IndexError, csv.Error, OverflowError):
+            cells = _cells_of(line, divider)
+            if len(cells) < least:  # an exception for each of millions of lines takes seconds
+                bad += 1
+                continue
+            found.add(array("d", [read(cells[number]) for number, read in columns]))
+        except (ValueError, csv.Error, OverflowError):
             bad += 1
     return np.array(found.kept, dtype=np.float64).reshape(-1, len(used)), bad
 
 
-def _number(cell: str, name: str, timed: str) -> float:
+def _cells_of(line: str, divider: str) -> list[str]:
+    """Return the cells of a line. Without quotes they are what is between the dividers."""
+    if '"' in line:
+        return next(csv.reader([line], delimiter=divider))
+    return line.rstrip("\n").split(divider)
+
+
+def _reader(name: str, timed: str) -> Callable[[str], float]:
+    """Return the function that reads a cell of a column; it raises ``ValueError``."""
     if name == "time":
-        then = datetime.fromisoformat(cell.strip())
-        if then.tzinfo is None:
-            raise ValueError
-        return then.timestamp()
-    value = float(cell) if cell.strip() else math.nan
-    if name in (timed, *PLACE) and not math.isfinite(value):
+        return _instant
+    return _finite if name in (timed, *PLACE) else _number
+
+
+def _instant(cell: str) -> float:
+    then = datetime.fromisoformat(cell.strip())
+    if then.tzinfo is None:
+        raise ValueError
+    return then.timestamp()
+
+
+def _finite(cell: str) -> float:
+    value = float(cell)
+    if not math.isfinite(value):
         raise ValueError
     return value
+
+
+def _number(cell: str) -> float:
+    return float(cell) if cell.strip() else math.nan
 
 
 def _onboard(

@@ -51,6 +51,14 @@ class Vehicle(NamedTuple):
             return 0.0
         return clock.uncertainty_s + RECEIVER_LAG_S / 2
 
+    @property
+    def span_us(self) -> tuple[int, int]:
+        """Times of the first and the last position, microseconds; since boot without GPS time."""
+        assert self.log.positions is not None
+        boot_us, clock = _ends(self.log.positions.boot_us), self.log.clock
+        first, last = (boot_us if clock is None else clock.unix_us(boot_us)).tolist()
+        return first, last
+
     def notice(self) -> str:
         """Return one line for the user: vehicle, accuracy of its time, and substitutions."""
         clock = self.log.clock
@@ -149,9 +157,7 @@ def _require_one_flight(vehicles: Sequence[Vehicle]) -> None:
             raise LogError(
                 f"{one.path}: no GPS time, so other logs cannot be joined; give it alone"
             )
-        assert one.log.positions is not None
-        at_us = one.log.clock.unix_us(_ends(one.log.positions.boot_us))
-        spans.append((int(at_us[0]), int(at_us[1]), one.path))
+        spans.append((*one.span_us, one.path))
     spans.sort(key=lambda span: span[:2])
     for before, after in pairwise(spans):
         apart_s = (after[0] - before[1]) * 1e-6

@@ -1,6 +1,10 @@
 """CSV tables whose header names their columns."""
 
+import csv
+import sys
 from pathlib import Path
+from types import FrameType
+from typing import Any
 
 import numpy as np
 import pytest
@@ -112,3 +116,45 @@ def test_arbitrary_text_is_a_table_or_rejected(text: str, with_header: bool) -> 
     except NoTableError:
         return
     assert log.positions is None or len(log.positions.boot_us) <= text.count("\n") + 300
+
+
+def counted_calls(text: str) -> tuple[int, int]:
+    """How often functions of the reader are called, and exceptions raised."""
+    calls = raised = 0
+
+    def count(frame: FrameType, event: str, arg: Any) -> Any:
+        nonlocal calls, raised
+        if frame.f_code.co_filename != csv_table.__file__:
+            return None
+        calls += event == "call" and frame.f_code.co_name in ("_cells_of", "_finite")
+        raised += event == "exception"
+        return count
+
+    lines = csv_table._lines(text.encode())
+    _, header = csv_table._header(lines)
+    used = list(enumerate(header.split(",")))
+    sys.settrace(count)
+    try:
+        csv_table._rows(lines, header, used, "unix_s")
+    finally:
+        sys.settrace(None)
+    return calls, raised
+
+
+def test_work_for_a_line_is_bounded() -> None:
+    """By counted calls: one for the line and one a cell, and no exception for a short line."""
+    for line, calls in (("1795000000,47,8.5,500", 5), ("1", 1)):
+        few, many = (counted_calls(f"{HEAD}\n" + f"{line}\n" * n) for n in (100, 1100))
+        assert [b - a for a, b in zip(few, many, strict=True)] == [1000 * calls, 0]
+
+
+CELLS = ["1", "47", "", " ", '"1"', '"1,2"', '"', "a", "nan", "1_0", "\0", '8""5', "\x0b", "\u2028"]
+
+
+@given(
+    st.lists(st.lists(st.sampled_from(CELLS), min_size=2, max_size=6), max_size=6),
+    st.sampled_from(",;\t"),
+)
+def test_cells_are_those_of_the_csv_module(rows: list[list[str]], divider: str) -> None:
+    for line in (divider.join(row) + "\n" for row in rows):
+        assert csv_table._cells_of(line, divider) == next(csv.reader([line], delimiter=divider))

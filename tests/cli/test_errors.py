@@ -109,6 +109,8 @@ def test_every_user_facing_error_is_a_user_error() -> None:
         "UnknownFlagsError",  # the same
         "DeviceError",  # leads to the safe state and a retry, announced once
         "SourceLostError",  # the same
+        "StalledError",  # the link connects again, announced once
+        "_FormatError",  # becomes a Rejection where it is raised
         "FleetMessageError",  # becomes a counted rejected sample
     }
     run = (

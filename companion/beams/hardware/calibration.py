@@ -123,14 +123,15 @@ def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
     """Yield number and fields of each non-empty line of a CSV text below ``header``."""
     lines = text.splitlines()
     if not lines or lines[0].strip() != header:
-        raise UserError(f"line 1: {lines[0] if lines else ''!r} is not the header {header!r}")
+        first = shown(lines[0] if lines else "")
+        raise UserError(f"line 1: {first} is not the header {header!r}")
     columns = header.count(",") + 1
     for number, line in enumerate(lines[1:], start=2):
         if not line.strip(", \t"):
             continue
         found = [field.strip() for field in line.split(",")]
         if len(found) != columns:
-            raise UserError(f"line {number}: {line!r} has {len(found)} fields, not {columns}")
+            raise UserError(f"line {number}: {shown(line)} has {len(found)} fields, not {columns}")
         yield number, found
 
 

@@ -76,7 +76,7 @@ def device(
         case "none" if where in tuple(DeviceInput):
             return DryRun(DeviceInput(where), say)
     if kind in FORMS:
-        raise UserError(f"{target!r} is not {FORMS[kind]}")
+        raise UserError(f"{shown(target)} is not {FORMS[kind]}")
     near = difflib.get_close_matches(kind, FORMS, 1)
     meant = f"; did you mean {FORMS[near[0]]}?" if near else ""
     known = ", ".join(f"{one}:" for one in FORMS)

@@ -206,3 +206,10 @@ def test_calibrate_command_reads_a_phaser_folder(tmp_path: Path) -> None:
     done = CliRunner().invoke(main, ["calibrate", str(tmp_path), "--out", str(out)])
     assert done.exit_code == 0, done.stderr
     assert parse_calibration(out.read_text()).order == ORDER
+
+
+def test_error_for_a_long_line_repeats_only_its_start() -> None:
+    for text in ("x" * 1_000_000, MEASURED_HEADER + "\n" + "1," * 1_000_000):
+        with pytest.raises(UserError, match=r"^line [12]: ") as raised:
+            parse_responses(text)
+        assert len(str(raised.value)) <= 200

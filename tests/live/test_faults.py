@@ -253,17 +253,19 @@ def test_delay_is_measured_if_gnss_time_is_available(flights: dict[str, Outcome]
 
 
 def test_first_copy_over_two_jittery_links_is_used(flights: dict[str, Outcome]) -> None:
+    """The later one counts once its positions have agreed with those of the first."""
     done = flights["jitter"]
     total = done.reports_flown.total()
     assert done.touched["jitter"] == 2 * done.sent["frames"]
-    assert done.rejected == {"duplicate": total}
+    assert set(done.rejected) <= {"duplicate", "stranger"}
+    assert 0.8 * total < done.rejected["duplicate"] <= total
     assert sum(link["reports"]["first"] for link in done.links) == total
     for link in done.links:
         assert link["frames"] == done.sent["frames"]
         assert (link["gaps"], link["late"], link["repeats"]) == (0, 0, 0)
         reports = link["reports"]
-        assert reports["total"] == total
-        assert reports["first_share"] == reports["first"] / total
+        assert 0.8 * total < reports["total"] <= total
+        assert reports["first_share"] == reports["first"] / reports["total"]
         assert 0.3 < reports["first_share"] < 0.7  # equals
         assert 0.05 < reports["latency_p50_s"] < reports["latency_p95_s"]
         assert reports["latency_p95_s"] < 1.0  # ten means: the longest jitter

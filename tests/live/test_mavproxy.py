@@ -65,7 +65,10 @@ def fly() -> Iterator[Callable[..., "subprocess.Popen[str]"]]:
 def test_mavproxy_over_udp_and_tcp_counts_each_report_once(
     start_node: Any, router: Router, fly: Any, tmp_path: Path
 ) -> None:
-    """Both router outputs lead to the service: every report arrives twice and counts once."""
+    """Both router outputs lead to the service: every report arrives twice and counts once.
+
+    What the second one brings besides positions is used after these have agreed for 5 s.
+    """
     master, out = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
     node = start_node(
         "run", "--link", "udpin:127.0.0.1:0", "--link", f"tcp:127.0.0.1:{out}",
@@ -87,7 +90,7 @@ def test_mavproxy_over_udp_and_tcp_counts_each_report_once(
     assert all(one["latency_p50_s"] < 1.0 for one in reports)
     assert {uav["id"] for uav in node.json("/v1/uavs")["uavs"]} == {"1:1", "2:1", "3:1", "4:1"}
     rejected = node.json("/v1/status")["rejected"]
-    assert set(rejected) == {"duplicate"}
+    assert set(rejected) <= {"duplicate", "stranger"}
     assert rejected["duplicate"] > 0.3 * min(one["total"] for one in reports)
 
     assert node.stop()[0] == 0

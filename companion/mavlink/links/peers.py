@@ -16,7 +16,7 @@ Stragglers between frames in order never form such a run.
 """
 
 from collections import OrderedDict
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from typing import Final, Protocol
 
 from companion.mavlink.links.endpoints import address_text
@@ -170,10 +170,19 @@ class Peers:
             return None
         return component.peer
 
-    def count(self, peer: Peer, found: list[Frame | Rejection]) -> None:
-        """Count the items that a peer sent, in order."""
+    def count(
+        self,
+        peer: Peer,
+        found: Sequence[Frame | Rejection],
+        checked: Sequence[Frame | Rejection] | None = None,
+    ) -> None:
+        """Count the items that a peer sent, in order.
+
+        ``checked`` has a rejection in place of each frame that was not accepted from this peer:
+        messages to its sender do not go there.
+        """
         status, senders = self._status, peer.senders
-        for item in found:
+        for item, kept in zip(found, checked or found, strict=True):
             if isinstance(item, Rejection):
                 status.lost[item.reason] = status.lost.get(item.reason, 0) + item.count
                 continue
@@ -186,12 +195,16 @@ class Peers:
             if sender is None:
                 sender = self._add_source(peer, item)
             component = sender.component
-            component.peer = peer
+            is_accepted = kept is item
+            if is_accepted:
+                component.peer = peer
             counts = component.status
             counts.frames += 1
             counts.heard_ns = t_ns
             counts.mavlink = version
-            if msgid in POSE:  # their stamps are of the clock that TIMESYNC measures
+            if (
+                is_accepted and msgid in POSE
+            ):  # their stamps are of the clock that TIMESYNC measures
                 sender.stamped_ns = t_ns
             peer.versions |= version
             peer.heard_ns = status.heard_ns = t_ns

@@ -193,9 +193,9 @@ class Link:
         if self._guard is not None:
             found = [_checked_by_guard(self._guard, item) for item in found]
         found = self._admitted(found)
-        found = [self._checked_for_strangers(peer, item) for item in found]
-        self._peers.count(peer, found)
-        self._receive([_checked_timesync(peer, item) for item in found])
+        checked = [self._checked_for_strangers(peer, item) for item in found]
+        self._peers.count(peer, found, checked)
+        self._receive([_checked_timesync(peer, item) for item in checked])
 
     def _admitted(self, found: list[Frame | Rejection]) -> list[Frame | Rejection]:
         """Return the items without frames of newcomers beyond the limits, which are counted."""

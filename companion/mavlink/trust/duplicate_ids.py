@@ -18,7 +18,7 @@ from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.mavlink.trust.paths import Path
+from companion.mavlink.trust.paths import SLACK_M, Path
 from companion.mavlink.wire.positions import OWN, OwnPosition, read
 from companion.values import Frame
 
@@ -108,11 +108,15 @@ class DuplicateIds:
     def _contradicts(self, sender: _SenderPaths, path: _PeerPath, said: OwnPosition) -> bool:
         """Add a report to its path. Return whether it contradicts that of another peer."""
         before = path.path.newest
-        return path.path.add(said) and any(
-            path.path.agrees_with(other.path, before, said) is False
+        if not path.path.add(said):
+            return False
+        others = [
+            other.path
             for other in sender.paths.values()
             if other is not path and not (other.is_router and path.is_router)
-        )
+        ]
+        excesses = [path.path.excess_m(other, before, said) for other in others]
+        return any(excess is not None and excess > SLACK_M for excess in excesses)
 
     def _is_duplicate(self, frame: Frame, sender: _SenderPaths) -> bool:
         """Return whether a sender's peers contradict each other; if so, add it to ``found``."""

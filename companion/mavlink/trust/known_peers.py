@@ -2,31 +2,34 @@
 
 A sender may be received over any number of peers (routers, second radios), and anybody that
 reaches a link's port may send in its name. The first peer of a sender is known. While a known peer
-is current, the messages that it brings are not accepted from a stranger. A stranger becomes known
+is current, the messages that it brings are not accepted from a stranger, except positions that
+agree with its path to ``AGREEMENT_M``. A stranger becomes known
 
 * when its positions have agreed with those of the current known peers for ``PROBATION_NS`` and in
   ``AGREEMENTS`` comparisons; each contradiction doubles that time,
 * at once if no known peer is current: a vehicle whose radio restarted has another address,
 * at once if the settings name it as a router.
 
-Positions agree as in ``duplicate_ids``. If two known peers contradict each other, the one that was
-known later is a stranger again. So the vehicle that was here first stays believed, and a stranger
-costs it nothing; whoever sends first in a vehicle's name is believed until it falls silent.
+If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
+again; its positions are used only as far as they agree with those of the other. So the vehicle that
+was here first stays believed, and a stranger costs it nothing; whoever sends first in a vehicle's
+name is believed until it falls silent.
 
 The messages that a known peer does not bring are accepted from any peer: routes may be divided by
 message. Messages with a time stamp and TIMESYNC are not, since they move clocks.
 """
 
+import math
 from collections import OrderedDict, deque
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
-from companion.mavlink.trust.paths import Path
+from companion.mavlink.trust.paths import SLACK_M, Path
 from companion.mavlink.wire.decode import DECODED, POSE
 from companion.mavlink.wire.encode import TIMESYNC
-from companion.mavlink.wire.positions import OWN, read
+from companion.mavlink.wire.positions import OWN, OwnPosition, read
 from companion.mavlink.wire.stamps import STAMPED
 from companion.values import Frame, Source
 from companion.values.budget import Budget
@@ -34,6 +37,8 @@ from companion.values.budget import Budget
 PROBATION_NS: Final = 5_000_000_000
 PROBATION_MOST_NS: Final = 300_000_000_000
 AGREEMENTS: Final = 5
+AGREEMENT_M: Final = 1.0
+"""Largest deviation, beyond what flight explains, of a stranger's position that is used."""
 CURRENT_NS: Final = (1_000_000_000, 2_000_000_000)
 """Least and largest time after a message for which a peer is current."""
 CURRENT_INTERVALS: Final = 3.0  # that time in intervals between its messages
@@ -60,6 +65,7 @@ class _Peer:
     agreements: int = 0
     agrees_since_ns: int = 0
     probation_ns: int = PROBATION_NS
+    contradicted_ns: int = -SPACED_NS
 
     def is_current(self, now_ns: int) -> bool:
         """Return whether the peer's newest message is so new that more are to be expected."""
@@ -127,9 +133,8 @@ class KnownPeers:
         if not brings:
             return None
         if frame.msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
-            self._compare_stranger(sender, peer, frame)
-            if peer in sender.known:
-                return None
+            agrees = self._agrees(sender, peer, frame)
+            return None if agrees or peer in sender.known else STRANGER
         return STRANGER
 
     # --- known peers --------------------------------------------------------------------------
@@ -149,22 +154,28 @@ class KnownPeers:
         for name, stranger in list(sender.strangers.items()):
             if frame.t_ns - stranger.heard_ns > KEPT_NS:
                 del sender.strangers[name]
-                continue
-            agrees = known.path.agrees_with(stranger.path, before, said)
-            self._judge(sender, name, stranger, agrees, frame)
+            else:
+                excess_m = known.path.excess_m(stranger.path, before, said)
+                self._judge(sender, name, stranger, excess_m, frame)
+        worst_m = -math.inf  # against peers that were known earlier
         for name, other in list(sender.known.items()):
-            if other is known or known.path.agrees_with(other.path, before, said) is not False:
+            if other is known:
                 continue
-            later = min((known, peer), (other, name), key=lambda one: _standing(one[0]))[1]
-            if not sender.known[later].is_router:
-                self._demote(sender, later, frame)
-        return None if peer in sender.known else STRANGER
+            excess_m = _excess_m(known, other, before, said)
+            is_later = _standing(known) < _standing(other)
+            if is_later and not known.is_router:
+                worst_m = max(worst_m, excess_m)
+            if excess_m > SLACK_M:
+                later = peer if is_later else name
+                if not sender.known[later].is_router:
+                    self._demote(sender, later, frame)
+        return None if peer in sender.known and worst_m <= AGREEMENT_M else STRANGER
 
     def _demote(self, sender: _Sender, name: str, frame: Frame) -> None:
         """Make a known peer a stranger, since it contradicts one that was known earlier."""
         peer = sender.known.pop(name)
         self._add(sender.strangers, name, peer, frame.t_ns)
-        self._judge(sender, name, peer, False, frame)
+        self._judge(sender, name, peer, math.inf, frame)
 
     def _make_known(self, sender: _Sender, name: str, peer: _Peer, frame: Frame) -> None:
         for old in [k for k, v in sender.known.items() if frame.t_ns - v.heard_ns > KEPT_NS]:
@@ -178,7 +189,8 @@ class KnownPeers:
 
     # --- strangers ----------------------------------------------------------------------------
 
-    def _compare_stranger(self, sender: _Sender, name: str, frame: Frame) -> None:
+    def _agrees(self, sender: _Sender, name: str, frame: Frame) -> bool:
+        """Compare a stranger's position with the known peers; return whether it agrees with one."""
         stranger = sender.strangers.get(name)
         if stranger is None:
             stranger = self._new(frame, False)
@@ -187,26 +199,26 @@ class KnownPeers:
         said = read(frame)
         before = stranger.path.newest
         if not stranger.path.add(said):
-            return
-        agreed = [
-            stranger.path.agrees_with(one.path, before, said)
-            for one in sender.known.values()
-            if one.is_current(frame.t_ns)
-        ]
-        if False in agreed:
-            self._judge(sender, name, stranger, False, frame)
-        elif True in agreed:
-            self._judge(sender, name, stranger, True, frame)
+            return False
+        current = [one.path for one in sender.known.values() if one.is_current(frame.t_ns)]
+        behind = [stranger.path.excess_m(path, before, said) for path in current]
+        ahead = [path.excess_ahead_m(said) for path in current]
+        excess_m = max((one for one in behind if one is not None), default=None)
+        self._judge(sender, name, stranger, excess_m, frame)
+        found = [one for one in (*behind, *ahead) if one is not None]
+        return bool(found) and max(found) <= AGREEMENT_M
 
     def _judge(
-        self, sender: _Sender, name: str, stranger: _Peer, agrees: bool | None, frame: Frame
+        self, sender: _Sender, name: str, stranger: _Peer, excess_m: float | None, frame: Frame
     ) -> None:
         """Count a comparison of a stranger with a known peer."""
-        if agrees is None:
+        if excess_m is None:
             return
-        if not agrees:
+        if excess_m > SLACK_M:
             stranger.agreements = 0
-            stranger.probation_ns = min(2 * stranger.probation_ns, PROBATION_MOST_NS)
+            if frame.t_ns - stranger.contradicted_ns >= SPACED_NS:
+                stranger.probation_ns = min(2 * stranger.probation_ns, PROBATION_MOST_NS)
+                stranger.contradicted_ns = frame.t_ns
             self._note_contradiction(sender, name, frame)
             return
         if stranger.agreements == 0:
@@ -249,6 +261,12 @@ class KnownPeers:
         if len(self._senders) >= SENDERS_MAX:
             self._senders.popitem(last=False)
         return self._senders.setdefault(frame.source, _Sender())
+
+
+def _excess_m(known: _Peer, other: _Peer, before: OwnPosition | None, said: OwnPosition) -> float:
+    """Return how far a new report is off another known peer's path; -inf: not comparable."""
+    excesses = (known.path.excess_m(other.path, before, said), other.path.excess_ahead_m(said))
+    return max((one for one in excesses if one is not None), default=-math.inf)
 
 
 def _standing(peer: _Peer) -> tuple[bool, int]:

@@ -24,6 +24,7 @@ SLACK_MPS: Final = 1.0
 ACCELERATION_MPS2: Final = 20.0
 STRETCH_MS: Final = 2000
 """Longest time between two reports of a peer that a third report is compared with."""
+AHEAD_MS: Final = 250  # longest time by which a report is compared with an older one
 RESTARTED_MS: Final = 10_000  # a stamp that steps back further is from another boot
 REPORTS_KEPT: Final = 32  # newest reports kept of a peer
 
@@ -53,19 +54,41 @@ class Path:
         self.reports.append(said)
         return True
 
-    def agrees_with(
+    def excess_m(
         self, other: "Path", before: OwnPosition | None, said: OwnPosition
-    ) -> bool | None:
-        """Return whether a new report agrees with another peer's path; None: not comparable.
+    ) -> float | None:
+        """Return how far a new report is off another peer's path, beyond what flight explains.
 
         The report is compared with the stretches of the other path, and the other's reports with
-        the stretch that it ends, which begins at ``before``.
+        the stretch that it ends, which begins at ``before``. None: not comparable. Above
+        ``SLACK_M`` the two contradict each other.
         """
         pairs = [(said, *stretch) for stretch in around(other.reports, said.boot_ms)]
         if before is not None:
             pairs += [(one, before, said) for one in within(other.reports, before, said)]
-        agreed = [one for one in (_agrees(*pair) for pair in pairs) if one is not None]
-        return all(agreed) if agreed else None
+        excesses = [one for one in (_excess_m(*pair) for pair in pairs) if one is not None]
+        return max(excesses, default=None)
+
+    def excess_ahead_m(self, said: OwnPosition) -> float | None:
+        """Return the same for a report that is ahead of this path by at most ``AHEAD_MS``.
+
+        With constant velocity the distance is at most a dt^2 / 2.
+        """
+        last = self.newest
+        if last is None or last.velocity_ned_mps is None:
+            return None
+        ahead_s = (said.boot_ms - last.boot_ms) * 1e-3
+        if not 0 < ahead_s <= AHEAD_MS * 1e-3:
+            return None
+        north, east, down = (ahead_s * speed for speed in last.velocity_ned_mps)
+        scale_n, scale_e, _ = scales = _scales(said)
+        lat, lon, alt = _place(last)
+        there = (lat + north / scale_n, lon + east / scale_e, alt - down)
+        off_m = math.hypot(
+            *(scale * (a - b) for scale, a, b in zip(scales, _place(said), there, strict=True))
+        )
+        stale_m = STALE_S * math.hypot(*last.velocity_ned_mps)
+        return off_m - stale_m - ACCELERATION_MPS2 * ahead_s**2 / 2
 
 
 def around(reports: deque[OwnPosition], boot_ms: int) -> Iterator[tuple[OwnPosition, OwnPosition]]:
@@ -88,10 +111,10 @@ def within(
             yield one
 
 
-def _agrees(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> bool | None:
-    """Return whether a report between the stamps of two others can be from their sender.
+def _excess_m(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> float | None:
+    """Return how far a report between the stamps of two others is off, beyond what flight explains.
 
-    None if they are too far apart to tell.
+    Infinite if the velocity shows another sender; None if the stamps are too far apart to tell.
     """
     stretch_ms = last.boot_ms - first.boot_ms
     if stretch_ms > STRETCH_MS:
@@ -99,17 +122,20 @@ def _agrees(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> bool | 
     share, dt_s = (said.boot_ms - first.boot_ms) / stretch_ms, stretch_ms * 1e-3
     velocities = [v for v in (one.velocity_ned_mps for one in (said, first, last)) if v is not None]
     fastest_mps = max((math.hypot(*velocity) for velocity in velocities), default=0.0)
-    limit_m = SLACK_M + STALE_S * fastest_mps + ACCELERATION_MPS2 * dt_s**2 / 8
-    scales = (_METRES, _METRES * math.cos(math.radians(said.lat_1e7 * 1e-7)), 1.0)
     between = _between(_place(first), _place(last), share)
-    places = zip(scales, _place(said), between, strict=True)
-    if math.hypot(*(scale * (a - b) for scale, a, b in places)) > limit_m:
-        return False
-    if len(velocities) < 3:
-        return True
-    velocity, before, after = velocities
-    off_mps = math.dist(velocity, _between(before, after, share))
-    return off_mps <= SLACK_MPS + ACCELERATION_MPS2 * dt_s / 2
+    places = zip(_scales(said), _place(said), between, strict=True)
+    off_m = math.hypot(*(scale * (a - b) for scale, a, b in places))
+    if len(velocities) == 3:
+        velocity, before, after = velocities
+        off_mps = math.dist(velocity, _between(before, after, share))
+        if off_mps > SLACK_MPS + ACCELERATION_MPS2 * dt_s / 2:
+            return math.inf
+    return off_m - STALE_S * fastest_mps - ACCELERATION_MPS2 * dt_s**2 / 8
+
+
+def _scales(said: OwnPosition) -> Vector:
+    """Return metres per unit of latitude, longitude and height at a report."""
+    return _METRES, _METRES * math.cos(math.radians(said.lat_1e7 * 1e-7)), 1.0
 
 
 def _place(said: OwnPosition) -> Vector:

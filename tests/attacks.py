@@ -228,3 +228,29 @@ def frames(per_s: float, msgid: int = 27, ports: int = 1) -> Attack:
                 until.wait(0.002)
 
     return attack
+
+
+def tcp_flood() -> Attack:
+    """Frames as fast as they are read, over ten connections of a TCP link."""
+
+    def attack(node: Node, until: threading.Event) -> None:
+        (link,) = [
+            one for one in node.json("/v1/links")["links"] if one["url"].startswith("tcpin:")
+        ]
+        port = int(link["url"].rpartition(":")[2])
+        raws = [frame((200, 1), number % 256, 27, bytes(25) + b"\1") for number in range(4096)]
+        blob = b"".join(raws)
+        with contextlib.ExitStack() as stack:
+            made = [
+                stack.enter_context(socket.create_connection(("127.0.0.1", port)))
+                for _ in range(10)
+            ]
+            for one in made:
+                one.setblocking(False)
+            while not until.is_set():
+                for one in made:
+                    with contextlib.suppress(BlockingIOError):
+                        one.send(blob)
+                until.wait(0.001)
+
+    return attack

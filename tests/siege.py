@@ -16,10 +16,10 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from siege_flight import UAVS, degrees, place
+from siege_flight import CARRIER, UAVS, degrees, place
 from support import HANG_S, ROOT, Node, end
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
@@ -139,6 +139,36 @@ class Looking(threading.Thread):
     def _is_announced(self, uav: str) -> bool:
         events = _ask(f"{self._node.url}/v1/events", self._token)["events"]
         return any(one["subject"] == uav and one["severity"] != "info" for one in events)
+
+
+class Losses(NamedTuple):
+    """Frames received and missing of each honest vehicle."""
+
+    frames: dict[str, int]
+    gaps: dict[str, int]
+
+    def __sub__(self, before: "Losses") -> "Losses":
+        return Losses(
+            {key: self.frames[key] - before.frames.get(key, 0) for key in self.frames},
+            {key: self.gaps[key] - before.gaps.get(key, 0) for key in self.gaps},
+        )
+
+    @property
+    def share(self) -> float:
+        """Largest share of a vehicle's frames that is missing."""
+        return max(
+            self.gaps[key] / max(1, self.gaps[key] + self.frames[key]) for key in self.frames
+        )
+
+
+def honest_losses(node: Node) -> Losses:
+    """Read the counts of the honest vehicles from the first link."""
+    components = node.json("/v1/links")["links"][0]["components"]
+    names = HONEST | {f"{CARRIER}:1"}
+    kept = [one for one in components if one["id"] in names]
+    return Losses(
+        {one["id"]: one["frames"] for one in kept}, {one["id"]: one["gaps"] for one in kept}
+    )
 
 
 @contextlib.contextmanager

@@ -4,6 +4,7 @@ Over 300 lines: a function for each section of the settings, and nothing else.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -274,6 +275,23 @@ def assumed(
     turn_degps2 = settings.center.turn_acceleration_max_degps2
     return AircraftAssumptions(
         limits, lag, known.turn_degps2 if turn_degps2 is None else turn_degps2
+    )
+
+
+def widest(assumptions: Sequence[AircraftAssumptions]) -> AircraftAssumptions:
+    """Return the assumptions that contain all given ones, with the source of the last."""
+    if len(assumptions) == 1:
+        return assumptions[0]
+    limits = [one.limits for one in assumptions]
+    lags = [one.lag_s for one in assumptions]
+    return AircraftAssumptions(
+        Limits(
+            max(one.speed_max_mps for one in limits),
+            max(one.acceleration_max_mps2 for one in limits),
+            limits[-1].limits_source,
+        ),
+        (min(low for low, _ in lags), max(high for _, high in lags)),
+        max(one.turn_degps2 for one in assumptions),
     )
 
 

@@ -122,6 +122,9 @@ class Sender:
     is_shared: bool = False  # whether a notice said that two senders share this id
 
 
+TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
+
+
 @dataclass(slots=True, kw_only=True)
 class ComponentState:
     """State of a MAVLink component other than its positions.
@@ -131,7 +134,7 @@ class ComponentState:
     """
 
     heard_ns: int = 0  # arrival of the newest of these messages
-    presence: Presence | None = None  # its newest heartbeat
+    types: tuple[tuple[int, int], ...] = ()  # types and autopilots of its heartbeats, newest last
     receiver: GnssStatus | None = None  # its newest GNSS status
     stated_us: int = 0
     noise: ReportNoise | None = None  # bounds on the noise of its reports, from that status
@@ -226,7 +229,11 @@ class Senders:
                     clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
                 return NO_OUTCOME if change is None else FrameOutcome(change=change)
             case Presence():
-                self._component(message).presence = message
+                component = self._component(message)
+                told = (message.mav_type, message.autopilot)
+                if component.types[-1:] != (told,):
+                    rest = [one for one in component.types if one != told]
+                    component.types = (*rest[1 - TYPES_MAX :], told)
         return NO_OUTCOME
 
     def _component(self, message: GnssStatus | Presence) -> ComponentState:
@@ -440,13 +447,18 @@ class Senders:
         return sender.clock.estimate() if sender else None
 
     def assumed(self, uav: str) -> assembly.AircraftAssumptions:
-        """Return the assumptions about a UAV, by the type in its newest heartbeat."""
+        """Return the assumptions about a UAV, by the types in its heartbeats.
+
+        An aircraft that changes its type, as one that takes off vertically and then flies as an
+        aeroplane, is between both for a while: the assumptions contain those of all its types.
+        """
         vehicle = kind_of(uav).reports_itself
         component = self._components.get(Source.parse(uav)) if vehicle else None
-        heard = None if component is None else component.presence
-        if heard is None:
+        if component is None or not component.types:
             return self._assumed(uav, None, None)
-        return self._assumed(uav, heard.mav_type, heard.autopilot)
+        if len(component.types) == 1:
+            return self._assumed(uav, *component.types[0])
+        return assembly.widest([self._assumed(uav, *one) for one in component.types])
 
     # --- memory -----------------------------------------------------------------------------
 

@@ -99,6 +99,8 @@ class BoundedProtocol(HttpToolsProtocol):
         """Clean up; see ``asyncio.Protocol``."""
         self._cancel()
         self._unparsed.clear()
+        if self._answered is not None:
+            self._answered.disconnected = True  # uvicorn tells the newest request only
         if self.transport is not None:
             self._read_again()
             super().connection_lost(exc)
@@ -218,10 +220,18 @@ class BoundedProtocol(HttpToolsProtocol):
         """Queue an answer; ``RequestQueue`` starts it."""
         self._over_budget = not self._budget.spend(1, self.loop.time())
 
+        async def until_closed(scope: Any, receive: Any, send: Any) -> None:
+            async def send_if_open(message: Any) -> None:
+                if self.transport.is_closing():
+                    cycle.disconnected = True
+                await send(message)
+
+            await app(scope, receive, send_if_open)
+
         def start() -> None:
             if not self.transport.is_closing():
                 self._answered = cycle
-                super(BoundedProtocol, self)._start_asgi_task(cycle, app)
+                super(BoundedProtocol, self)._start_asgi_task(cycle, until_closed)
 
         self._queue.add(start, within_budget=not self._over_budget)
 

@@ -105,6 +105,24 @@ def test_aeroplane_turn_refutes_nothing() -> None:
     assert (track.limits.limits_source, track.limits.acceleration_max_mps2) == ("type", 16.0)
 
 
+@pytest.mark.parametrize("types", [(1, 2), (2, 1), (19, 1)])
+def test_aircraft_that_changes_its_type_keeps_the_wider_assumptions(types: tuple[int, int]) -> None:
+    """It takes off vertically and flies as an aeroplane, or back: in between it is both."""
+    into = pipeline()
+    out: list[Output] = []
+    for number, frame in enumerate(turning("1:1", 10)):
+        if number % 10 == 0:
+            out += into.step(heartbeat(number / 10, "1:1", types[number >= 50]))
+        out += into.step(frame)
+    assumed = into.senders.assumed("1:1")
+    assert assumed.limits.acceleration_max_mps2 == 16.0
+    assert assumed.lag_s[0] <= -0.033
+    if 2 in types:
+        assert assumed.lag_s == (-0.033, 0.040)
+    changed_ns = START_NS + 5 * S
+    assert not [one for one in out if isinstance(one, Refuted) and one.t_ns > changed_ns]
+
+
 @pytest.mark.parametrize(("mav_type", "lag_s"), [(2, 0.0295), (1, -0.026)])
 def test_position_lag_is_corrected(mav_type: int, lag_s: float) -> None:
     """Positions of ArduPilot copters lag their stamps, those of aeroplanes lead them."""

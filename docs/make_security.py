@@ -1,0 +1,252 @@
+"""Write the table of ways in, and their budgets, into docs/security.md.
+
+    python docs/make_security.py [--check]
+
+The numbers are those of the code. With --check nothing is written; status 1 says that the page is
+not up to date. ``tests/test_ways_in.py`` fails for a link scheme, a route or a kind of file that no
+row covers.
+"""
+
+# ruff: noqa: E501 - cells of a table
+
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final
+
+from companion.beams.hardware import codebooks, phaser_pickles
+from companion.mavlink.links import http_poll, tcp, to_loop, transport, udp, zenoh_config
+from companion.mavlink.trust import known_peers, newcomers
+from companion.mavlink.wire import aircraft_json, cot_link, rid_json, sbs
+from companion.node.drive import gimbal, rotctld
+from companion.node.fleet import messages
+from companion.recording import background
+from companion.recording.foreign import thinned
+from companion.server import (
+    access,
+    connections,
+    request_queue,
+    stream,
+    websocket_connections,
+    work_slots,
+)
+from companion.settings import files
+
+PAGE: Final = Path(__file__).resolve().parent / "security.md"
+BEGIN, END = "<!-- ways in: written by docs/make_security.py -->", "<!-- end of ways in -->"
+
+
+@dataclass(frozen=True, kw_only=True)
+class WayIn:
+    """A way by which strangers reach the service, and its budget.
+
+    ``covers`` names link schemes (``link:``), routes (``route:``), kinds of files (``file:``) or
+    devices (``device:``). ``over`` is what happens beyond the budget; ``test`` exhausts it.
+    """
+
+    name: str
+    covers: tuple[str, ...]
+    size: str
+    items: str
+    work: str
+    over: str
+    test: str
+
+
+def kb(size: int) -> str:
+    """Return a size in the largest whole unit."""
+    if size >= 1 << 20:
+        return f"{size >> 20} MB"
+    return f"{size >> 10} kB" if size >= 1024 else f"{size} bytes"
+
+
+NEW: Final = f"{newcomers.NEW_PER_S:.0f} new senders/s, {newcomers.NEW_SAVED:.0f} at once"
+STRANGERS: Final = (
+    f"{known_peers.COMPARED_PER_S:.0f} positions/s of strangers are compared for each sender"
+)
+OLDEST: Final = f"the oldest senders first, above {100 * newcomers.BUSY:.0f} % of the time"
+LOOP: Final = (
+    f"{request_queue.AT_ONCE} started in an iteration; less than 2 ms each on the event loop"
+)
+SLOTS: Final = f"{work_slots.AT_ONCE} at a time on threads, {work_slots.WAITING} waiting"
+SIEGE: Final = "tests/live/test_siege.py::test_attack_costs_no_beam_and_no_bound"
+LISTEN: Final = "tests/mavlink/links/test_listen_only.py"
+HOSTILE: Final = "tests/server/test_connection_budgets.py"
+LOGS: Final = "tests/recording/test_hostile.py"
+
+WAYS: Final = (
+    WayIn(
+        name="MAVLink over UDP",
+        covers=("link:udpin", "link:udpout"),
+        size=f"{kb(udp.RECEIVE_BUFFER_BYTES)} in the kernel, at most {udp.STALE_NS / 1e9:.0f} s old",
+        items=f"{NEW}; {STRANGERS}",
+        work=OLDEST,
+        over="dropped before decoding, counted (`newcomer`, `stranger`, `socket-overflow`)",
+        test=SIEGE,
+    ),
+    WayIn(
+        name="MAVLink over TCP, serial lines",
+        covers=("link:tcp", "link:tcpin", "link:serial"),
+        size=f"pieces of {kb(tcp.PIECE_BYTES)}",
+        items=f"{tcp.CONNECTIONS_MAX} connections; {NEW}",
+        work=OLDEST,
+        over="the sender waits",
+        test="tests/mavlink/links/test_transport.py::test_flood_over_a_connection_is_processed_in_pieces",
+    ),
+    WayIn(
+        name="Zenoh: MAVLink and fleets",
+        covers=("link:zenoh",),
+        size=f"{kb(zenoh_config.MESSAGE_MAX)} a sample, {kb(to_loop.BYTES_MAX)} waiting; {kb(messages.MESSAGE_MAX)} a message",
+        items=f"{to_loop.QUEUE_MAX} samples waiting; {messages.FRAMES_MAX} frames and {messages.OFFERS_MAX} offers in a message",
+        work=f"slices of {1e3 * to_loop.SLICE_S:.0f} ms",
+        over="dropped and counted",
+        test="tests/mavlink/links/test_zenoh_bus.py::test_receive_queue_is_bounded",
+    ),
+    WayIn(
+        name="receivers: SBS, Beast, Remote ID, Cursor on Target",
+        covers=("link:sbs", "link:readsb", "link:rid", "link:cot"),
+        size=f"{kb(sbs.LINE_MAX)} a line, {kb(rid_json.OBJECT_MAX)} an object, {kb(cot_link.EVENT_MAX)} an event",
+        items=f"{aircraft_json.AIRCRAFT_MAX} aircraft",
+        work=OLDEST,
+        over=f"garbage; a server without a complete message in {transport.UNFINISHED_S} s is disconnected",
+        test=f"{LISTEN}::test_server_that_drips_bytes_is_announced_once_and_reconnected",
+    ),
+    WayIn(
+        name="aircraft.json over HTTP",
+        covers=("link:readsb:http",),
+        size=f"{kb(http_poll.HEAD_MAX)} of headers, {kb(http_poll.BODY_MAX)} of body",
+        items=f"{aircraft_json.AIRCRAFT_MAX} aircraft",
+        work="one request at a time",
+        over="the poll fails, with a notice",
+        test="tests/mavlink/wire/test_aircraft_json.py::test_too_many_aircraft_use_bounded_memory",
+    ),
+    WayIn(
+        name="HTTP connections",
+        covers=("connections",),
+        size=f"{kb(connections.HEAD_BYTES)} of head, {kb(connections.BODY_BYTES)} of body, {kb(connections.PIECE_BYTES)} parsed ahead, {kb(connections.BUFFER_BYTES)} of answer",
+        items=f"{connections._MOST} connections; {connections.REQUESTS_PER_S:.0f} requests/s each, {request_queue.PER_S:.0f}/s in all",
+        work=LOOP,
+        over="requests wait, after those of others; clients that take nothing for "
+        f"{connections.STALL_TIMEOUT_S:.0f} s are disconnected",
+        test=f"{HOSTILE}::test_pipelined_requests_wait_in_the_client",
+    ),
+    WayIn(
+        name="answers from the event loop",
+        covers=(
+            "route:/healthz", "route:/readyz", "route:/v1/status", "route:/v1/events",
+            "route:/v1/fleet", "route:/v1/labels", "route:/v1/map", "route:/v1/settings",
+            "route:/v1/links", "route:/v1/uavs/{uav}",
+        ),
+        size="-",
+        items="as of the connection",
+        work=LOOP,
+        over="as of the connection",
+        test="tests/server/test_route_cost.py",
+    ),
+    WayIn(
+        name="answers that are computed",
+        covers=(
+            "route:/v1/uavs", "route:/metrics", "route:/v1/design", "route:/v1/history",
+            "route:/v1/beams", "route:/v1/beams/weights", "route:/v1/pattern",
+            "route:/v1/mavlink/vehicles",
+            "route:/v1/mavlink/vehicles/{sys}/components/{comp}/messages",
+            "route:/v1/mavlink/vehicles/{sys}/components/{comp}/messages/{name}",
+        ),
+        size="-",
+        items="one for all that ask for the same moment",
+        work=SLOTS,
+        over="503, before any work",
+        test="tests/server/test_hostile_clients.py::test_excess_work_is_rejected_with_503",
+    ),
+    WayIn(
+        name="files over HTTP",
+        covers=("route:/v1/recordings", "route:/v1/recordings/{name}", "route:/v1/map/tiles", "page"),
+        size=f"{kb(connections.BUFFER_BYTES)} of a file in memory; the page's files are read once",
+        items="as of the connection",
+        work=LOOP,
+        over="as of the connection",
+        test=f"{HOSTILE}::test_client_that_takes_nothing_of_an_answer_is_disconnected",
+    ),
+    WayIn(
+        name="WebSocket `/v1/stream`",
+        covers=("route:/v1/stream",),
+        size=f"{websocket_connections.BYTES_PER_S:.0f} bytes/s from a client, {kb(int(websocket_connections.BYTES_SAVED))} at once; nothing is queued for it",
+        items=f"{stream.CLIENTS_MAX} clients",
+        work="a message is encoded once for all",
+        over="closed and not read",
+        test=f"{HOSTILE}::test_flood_of_pings_closes_the_websocket",
+    ),
+    WayIn(
+        name="bearer tokens",
+        covers=("tokens",),
+        size=f"at least {access.TOKEN_MIN} characters",
+        items=f"{access.WRONG_MAX} wrong ones of an address, then {access.WRONG_PER_S:g}/s",
+        work="-",
+        over=f"answered {access.WRONG_DELAY_S:.0f} s later, counted, with a notice",
+        test=f"{HOSTILE}::test_wrong_tokens_are_counted_told_and_answered_late",
+    ),
+    WayIn(
+        name="recordings and logs",
+        covers=("file:mcap", "file:tlog", "file:dataflash", "file:ulog", "file:capture", "file:csv"),
+        size="lengths are checked against the file before unpacking; below 300 MB",
+        items=f"{thinned.SAMPLES_MAX} samples of a kind",
+        work="linear in the file, with progress",
+        over="damage is skipped and counted",
+        test=f"{LOGS}::test_decompression_bombs_are_read_in_bounded_memory",
+    ),
+    WayIn(
+        name="settings and calibrations",
+        covers=("file:toml", "file:json", "file:calibration", "file:npz", "file:pickle"),
+        size=f"{kb(files.LARGEST_BYTES)} of settings; {kb(phaser_pickles.LARGEST_BYTES)} of a pickle",
+        items=f"{codebooks.ENTRIES_MAX} weights of a codebook",
+        work="linear in the text",
+        over="rejected in one line",
+        test="tests/settings/test_load.py::test_expensive_toml_is_rejected_in_one_line",
+    ),
+    WayIn(
+        name="replies of devices",
+        covers=("device:rotctld", "device:gimbal", "device:phaser", "device:adar1000"),
+        size=f"{kb(rotctld.ANSWER_MAX_BYTES)} an answer",
+        items=f"{gimbal.RECEIVED_MAX} datagrams of a gimbal in an update",
+        work="on a thread of its own",
+        over="the device failed: counted, announced, tried again",
+        test="tests/node/drive/test_mount.py",
+    ),
+    WayIn(
+        name="the recorder",
+        covers=("recorder",),
+        size=f"{kb(background.MIN_FREE_BYTES)} of the disk stay free",
+        items=f"{background.QUEUE_MAX} events waiting",
+        work="on a thread of its own",
+        over="events are not recorded, which is counted and announced",
+        test="tests/live/test_all_together.py::test_service_survives_all_faults_at_once_and_records_all",
+    ),
+)  # fmt: skip
+
+
+def table() -> str:
+    """Return the table in Markdown."""
+    head = "| way in | bytes | items | work | beyond it | test |\n|---|---|---|---|---|---|\n"
+    return head + "".join(
+        f"| {one.name} | {one.size} | {one.items} | {one.work} | {one.over} | `{one.test}` |\n"
+        for one in WAYS
+    )
+
+
+def page(text: str) -> str:
+    """Return the page with a new table."""
+    before, rest = text.split(BEGIN)
+    return f"{before}{BEGIN}\n{table()}{END}{rest.split(END)[1]}"
+
+
+def main() -> int:
+    """Write the page, or check it."""
+    text = PAGE.read_text(encoding="utf-8")
+    if "--check" in sys.argv[1:]:
+        return int(page(text) != text)
+    PAGE.write_text(page(text), encoding="utf-8")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

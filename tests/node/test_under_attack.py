@@ -1,0 +1,39 @@
+"""Five attacks at once on a service: beams in each look, no broken bound, and an end in time."""
+
+import threading
+from typing import Any
+
+import attacks
+from siege import attacked, besieged
+from support import HANG_S
+
+SECONDS = 4.0
+AT_ONCE = (
+    attacks.pipelined(2),
+    attacks.pings(5),
+    attacks.forged_carrier(0.5),
+    attacks.drifting(2.0, 10.0, fresh_ports=True, ahead_s=0.05),
+    attacks.ghosts(1000.0),
+)
+
+
+def all_at_once(node: Any, until: threading.Event) -> None:
+    """Run all attacks, each on a thread."""
+    running = [
+        threading.Thread(target=attack, args=(node, until), daemon=True) for attack in AT_ONCE
+    ]
+    for thread in running:
+        thread.start()
+    for thread in running:
+        thread.join(HANG_S)
+
+
+def test_attacks_at_once_cost_no_beam_and_no_bound(start_node: Any) -> None:
+    with besieged(start_node) as node:
+        seen = attacked(all_at_once, node, SECONDS)
+        code, _, err = node.stop()
+    assert seen.looks
+    assert seen.without_beams == []
+    assert seen.broken == []
+    assert code == 0
+    assert "Traceback" not in err

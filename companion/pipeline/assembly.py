@@ -31,7 +31,8 @@ from companion.tracking.limits import LIMITS, Airframe, airframe, lag_s
 from companion.tracking.noise import NoiseSettings
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver, scheduled
 from companion.tracking.observers.position import PositionModel, PositionObserver
-from companion.tracking.tracker import Ages, Tracker, TrackerSettings
+from companion.tracking.track_snapshot import Ages
+from companion.tracking.tracker import Tracker, TrackerSettings
 from companion.values import FloatArray, Limits, LimitSource, ReportNoise, UserError, kind_of
 
 FLOOR_MARGIN_DB: Final = 2.9

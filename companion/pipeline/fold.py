@@ -35,10 +35,11 @@ from companion.pipeline.digest import Digest
 from companion.pipeline.health import HealthMonitor, LinkBatch, Site
 from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import Refusals
-from companion.pipeline.senders import NO_OUTCOME, PlacedAttitude, PlacedReport, Senders
+from companion.pipeline.senders import NO_OUTCOME, PlacedAttitude, PlacedReport, Senders, Timeline
 from companion.pipeline.targets import Targets
 from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
+from companion.tracking.track_snapshot import TrackSnapshot
 from companion.values import (
     Carrier,
     Cause,
@@ -83,6 +84,17 @@ class Aiming(NamedTuple):
 
     made: Callable[[], tuple[Update, LinkBatch | None]]
     local: LocalFrame | None
+
+
+class UavSnapshot(NamedTuple):
+    """One UAV after all events so far: its track and its clock, for any thread."""
+
+    track: TrackSnapshot
+    timeline: Timeline
+
+    def at(self, now_ns: int, valid_at_ns: int) -> Track:
+        """Predict the UAV to ``valid_at_ns``; its state is that at ``now_ns``."""
+        return self.track.at(now_ns, self.timeline.time(valid_at_ns))
 
 
 class Pipeline:
@@ -208,7 +220,8 @@ class Pipeline:
         self.refusals.used(fix.uav)
         if not kind_of(fix.uav).reports_itself:
             near = self.targets.better_known(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))
-            self.targets.identities.observe(fix, self._tracks(near, fix.t_ns, fix.t_ns))
+            tracks = [one.at(fix.t_ns, fix.t_ns) for one in self.snapshots(near)]
+            self.targets.identities.observe(fix, tracks)
         if accepted.reacquired:
             said.append(assumptions.track_restarted(self.records[fix.uav], accepted))
             said += self._move_home(placed, accepted)
@@ -304,20 +317,23 @@ class Pipeline:
         return self.prepare_update(now_ns, lead_s)()
 
     def prepare_update(self, now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
-        """Predict the tracks now, and return a function that computes the beams of ``look``.
+        """Select the UAVs now, and return a function that computes the beams of ``look``.
 
-        That function may be called at any later time, on any thread.
+        That function predicts the UAVs from snapshots. It may be called at any later time, on any
+        thread.
         """
         delay_s = self.settings.beams.actuation_delay_s + lead_s
         valid_at_ns = now_ns + round(delay_s * 1e9)
         selected, others = self._selected(now_ns)
-        tracks = self._tracks(selected, now_ns, valid_at_ns)
+        snapshots = self.snapshots(selected)
         found = self.carrier(now_ns, valid_at_ns)
         known, unfit = (None, found) if isinstance(found, str) else (found, None)
         before = self._hysteresis
-        protected = self._protected(now_ns, valid_at_ns, known)
+        spared = self.snapshots(self.targets.protected(self.tracker.uavs))
 
         def made() -> Update:
+            tracks = [one.at(now_ns, valid_at_ns) for one in snapshots]
+            protected = self._protected([one.at(now_ns, valid_at_ns) for one in spared], known)
             beams = aim(
                 now_ns,
                 valid_at_ns=valid_at_ns,
@@ -331,14 +347,16 @@ class Pipeline:
             if protected:
                 beams = without(beams, {track.uav for track in protected})
             if others:
-                beams = replace(beams, left_out=(*beams.left_out, *others))
+                why = f"limit of {self.settings.beams.most} UAVs with beams is reached"
+                left_out = (LeftOut(uav, Cause.MACHINE, why) for uav in others)
+                beams = replace(beams, left_out=(*beams.left_out, *left_out))
             return Update(
                 t_ns=now_ns, carrier=known, unfit=unfit, tracks=tuple(tracks), beams=beams
             )
 
         return made
 
-    def _selected(self, now_ns: int) -> tuple[list[str], list[LeftOut]]:
+    def _selected(self, now_ns: int) -> tuple[list[str], list[str]]:
         """Return the targets that get beams, and those beyond ``[beams] most``.
 
         Order: UAVs of ``priority``, then those with recent reports, then those tracked longest.
@@ -349,21 +367,17 @@ class Pipeline:
         first = frozenset(self.settings.beams.priority)
         silent = frozenset(self.tracker.silent(now_ns, self.settings.tracks.lost_s))
         ranked = sorted(wanted, key=lambda uav: (uav not in first, uav in silent))
-        why = f"limit of {most} UAVs with beams is reached"
         selected = frozenset(ranked[:most])
-        left = [LeftOut(uav, Cause.MACHINE, why) for uav in ranked[most:]]
-        return [uav for uav in wanted if uav in selected], left
+        return [uav for uav in wanted if uav in selected], ranked[most:]
 
-    def _protected(self, now_ns: int, valid_at_ns: int, carrier: Carrier | None) -> list[Track]:
-        """Return the UAVs of other nodes to protect by nulls: the nearest ones, up to a limit.
-
-        Empty unless ``[fleet] nulls`` is set.
-        """
-        protected = self._tracks(self.targets.protected(self.tracker.uavs), now_ns, valid_at_ns)
-        if carrier is None or not protected:
+    def _protected(self, tracks: list[Track], carrier: Carrier | None) -> list[Track]:
+        """Return the UAVs of other nodes to protect by nulls: the nearest ones, up to a limit."""
+        if carrier is None or not tracks:
             return []
-        protected.sort(key=lambda one: math.dist(one.position_ned_m, carrier.position_ned_m))
-        return protected[: self.array.size // PROTECTED_SHARE]
+        by_distance = sorted(
+            tracks, key=lambda one: math.dist(one.position_ned_m, carrier.position_ned_m)
+        )
+        return by_distance[: self.array.size // PROTECTED_SHARE]
 
     def tracks(
         self, now_ns: int, valid_at_ns: int, uavs: Iterable[str] | None = None
@@ -374,13 +388,13 @@ class Pipeline:
         """
         others = self.tracker.uavs if uavs is None else uavs
         others = [uav for uav in others if uav != self.center.vehicle]
-        return self._tracks(others, now_ns, valid_at_ns)
+        return [one.at(now_ns, valid_at_ns) for one in self.snapshots(others)]
 
-    def _tracks(self, uavs: Iterable[str], now_ns: int, valid_at_ns: int) -> list[Track]:
-        found = (
-            self.tracker.track(uav, now_ns, self.senders.time(uav, valid_at_ns)) for uav in uavs
-        )
-        return [track for track in found if track is not None]
+    def snapshots(self, uavs: Iterable[str]) -> list[UavSnapshot]:
+        """Return snapshots of those UAVs that have a track, in the order given."""
+        tracks = ((uav, self.tracker.snapshot(uav)) for uav in uavs)
+        timeline = self.senders.timeline
+        return [UavSnapshot(track, timeline(uav)) for uav, track in tracks if track is not None]
 
     def carrier(self, now_ns: int, valid_at_ns: int) -> Carrier | str:
         """Return position and attitude of the array, or the reason why they are unknown."""

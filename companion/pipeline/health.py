@@ -65,11 +65,15 @@ class _Link(NamedTuple):
 
 
 class LinkBatch(NamedTuple):
-    """Batch of links to assess: whether it starts a round, the UAVs still queued, the links."""
+    """Batch of links to assess: whether it starts a round, the UAVs still queued, the links.
+
+    ``left_out`` are the verdicts on UAVs without a beam, at the start of a round.
+    """
 
     begins: bool
     waiting: list[str]
     links: list[_Link]
+    left_out: dict[str, Verdict]
 
 
 class HealthMonitor:
@@ -102,7 +106,8 @@ class HealthMonitor:
         chosen = frozenset(waiting[:many])
         which = [i for i, beam in enumerate(update.beams.beams) if beam.uav in chosen]
         links = [] if update.carrier is None or not which else self._links(update.beams, which)
-        return LinkBatch(begins, waiting[many:], links)
+        left_out = _of_left_out(update) if begins else {}
+        return LinkBatch(begins=begins, waiting=waiting[many:], links=links, left_out=left_out)
 
     def _links(self, beam_set: BeamSet, which: Sequence[int]) -> list[_Link]:
         towards = directions(beam_set)
@@ -131,10 +136,9 @@ class HealthMonitor:
             return []
         self._waiting = weighed.waiting
         tracks = {track.uav: track for track in update.tracks}
-        fresh = dict[str, Verdict]()
+        fresh = dict(weighed.left_out)
         if weighed.begins:
             self._round_start_ns = update.t_ns
-            fresh = _of_left_out(update, tracks)
         for link in weighed.links:
             fresh[link.beam.uav] = self._judge_link(update, link, tracks, evidence)
         held = self.verdicts | {
@@ -203,6 +207,8 @@ class HealthMonitor:
             return fresh
         if fresh.level is held.level:
             self._pending.pop(uav, None)
+            if fresh.needed_gain_db is held.needed_gain_db is None and fresh.blame == held.blame:
+                return held  # still without a beam; there may be thousands
             return replace(fresh, since_ns=held.since_ns)
         better = RANK[fresh.level] > RANK[held.level]
         was_better, since_ns = self._pending.get(uav, (better, fresh.since_ns))
@@ -255,7 +261,8 @@ def _notice(t_ns: int, alike: Sequence[Verdict]) -> Notice:
     return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=one.uav, text=text)
 
 
-def _of_left_out(update: Update, tracks: dict[str, Track]) -> dict[str, Verdict]:
+def _of_left_out(update: Update) -> dict[str, Verdict]:
+    tracks = {track.uav: track for track in update.tracks}
     return {
         out.uav: Verdict(
             uav=out.uav,

@@ -13,9 +13,10 @@ from collections.abc import Container
 from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import islice
-from typing import Final
+from typing import Final, NamedTuple
 
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Stamp
+from companion.mavlink.clock.reading import ClockReading
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.trust.admission import admission
 from companion.mavlink.trust.adsb import Aircraft
@@ -111,6 +112,31 @@ class FrameOutcome:
 
 
 NO_OUTCOME: Final = FrameOutcome()  # outcome of a frame without further effect
+
+
+class Timeline(NamedTuple):
+    """Timeline of one UAV, which any thread may convert times with.
+
+    clock   its sender's clock; None: reports are on the node's timeline
+    rest_s  largest error of its reports' time that the clock does not include
+    """
+
+    clock: ClockReading | None
+    rest_s: float
+
+    def time(self, node_ns: int) -> SenderTime:
+        """Convert a node time to this timeline."""
+        if self.clock is None:
+            bound_s = noise.ADSB_TIME_BOUND_S
+            return SenderTime(node_ns=node_ns, sender_ns=node_ns, before_s=bound_s, after_s=bound_s)
+        offset_ns, before_s, after_s, usual_s = self.clock.time(node_ns)
+        return SenderTime(
+            node_ns=node_ns,
+            sender_ns=node_ns - offset_ns,
+            before_s=before_s + self.rest_s,
+            after_s=after_s + self.rest_s,
+            usual_s=math.hypot(usual_s, self.rest_s),
+        )
 
 
 @dataclass(slots=True)
@@ -426,20 +452,13 @@ class Senders:
 
     def time(self, uav: str, node_ns: int) -> SenderTime:
         """Convert a node time to a UAV's own timeline; a relayed aircraft's is the node's."""
+        return self.timeline(uav).time(node_ns)
+
+    def timeline(self, uav: str) -> Timeline:
+        """Return a UAV's own timeline as it is known now."""
         sender = self._senders.get(uav)
-        known = sender.clock.time(node_ns) if sender else None
-        if known is None:
-            bound_s = noise.ADSB_TIME_BOUND_S
-            return SenderTime(node_ns=node_ns, sender_ns=node_ns, before_s=bound_s, after_s=bound_s)
-        offset_ns, before_s, after_s, usual_s = known
-        rest_s = self.assumed(uav).lag_rest_s
-        return SenderTime(
-            node_ns=node_ns,
-            sender_ns=node_ns - offset_ns,
-            before_s=before_s + rest_s,
-            after_s=after_s + rest_s,
-            usual_s=math.hypot(usual_s, rest_s),
-        )
+        reading = sender.clock.reading() if sender else None
+        return Timeline(reading, 0.0 if reading is None else self.assumed(uav).lag_rest_s)
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """Return the state of a UAV's clock; None if no clock is known."""

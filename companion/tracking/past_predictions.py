@@ -68,6 +68,9 @@ ERRORS_LEAST: Final = 20
 SPACING_S: Final = 0.3  # least time between evaluated reports; more would add no information
 _KEPT: Final = 64
 
+UsualErrors = tuple[tuple[float, float], ...]
+"""Ages of past predictions, s, each with the 95th percentile of their errors, m."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _PastPrediction:
@@ -233,25 +236,30 @@ class PastPredictions:
         if self._costs[best] < SWITCH_RATIO * self._costs[self._model]:
             self._model = best
 
-    def error_p95_m(self, age_s: float) -> float | None:
-        """Return the 95th percentile of recent errors at an age; None with too few errors.
-
-        The percentile is interpolated between the observed ages, and extrapolated with the square
-        of the age.
-        """
-        known = [
+    @property
+    def usual_errors(self) -> UsualErrors:
+        """Observed ages of predictions, ascending, each with the 95th percentile of its errors."""
+        return tuple(
             (one.age_s, one.error_p95_m) for one in self._errors if one.error_p95_m is not None
-        ]
-        if not known:
-            return None
-        first_s, first_m = known[0]
-        if age_s <= first_s:
-            return first_m
-        for (a_s, a_m), (b_s, b_m) in pairwise(known):
-            if age_s <= b_s:
-                return a_m + (b_m - a_m) * (age_s - a_s) / (b_s - a_s)
-        last_s, last_m = known[-1]
-        return last_m * (age_s / last_s) ** 2
+        )
+
+
+def usual_error_m(known: UsualErrors, age_s: float) -> float | None:
+    """Return the 95th percentile of recent errors at an age; None with too few errors.
+
+    The percentile is interpolated between the observed ages, and extrapolated with the square of
+    the age.
+    """
+    if not known:
+        return None
+    first_s, first_m = known[0]
+    if age_s <= first_s:
+        return first_m
+    for (a_s, a_m), (b_s, b_m) in pairwise(known):
+        if age_s <= b_s:
+            return a_m + (b_m - a_m) * (age_s - a_s) / (b_s - a_s)
+    last_s, last_m = known[-1]
+    return last_m * (age_s / last_s) ** 2
 
 
 def fed_forward(

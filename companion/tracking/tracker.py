@@ -11,26 +11,18 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import Any, Final
 
-import numpy as np
-
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
 from companion.tracking.history import ReportHistory
 from companion.tracking.limits import Refutations
 from companion.tracking.noise import NoiseSettings
 from companion.tracking.observers.estimates import Observer, Prediction
 from companion.tracking.pace import ReportTiming
-from companion.tracking.past_predictions import (
-    ACCELERATION_MODELS,
-    WINDOWS,
-    PastPredictions,
-    fed_forward,
-)
-from companion.tracking.reach import Reach, reach
+from companion.tracking.past_predictions import ACCELERATION_MODELS, WINDOWS, PastPredictions
 from companion.tracking.receiver_check import ReceiverCheck
+from companion.tracking.track_snapshot import Ages, TrackSnapshot
 from companion.values import (
     Estimate,
     Fix,
-    FloatArray,
     Limits,
     Reason,
     Refuted,
@@ -43,27 +35,6 @@ from companion.values import (
 
 ESTABLISHED: Final = 50
 """Number of reports that establish a UAV: tracks with fewer make room for its return."""
-
-
-@dataclass(frozen=True, slots=True)
-class Ages:
-    """Ages of a track's newest report above which the track changes state, seconds.
-
-    ``coasting_s`` is a minimum: it is longer on a slow link (``pace.py``).
-    """
-
-    coasting_s: float = 2.0
-    stale_s: float = 15.0
-    lost_s: float = 60.0
-
-    def state(self, age_s: float, pace: ReportTiming) -> TrackState:
-        """Return the state of a track by the age of its newest report and its usual timing."""
-        coasting_s = pace.silence_s(self.coasting_s, self.stale_s)
-        if age_s > self.lost_s:
-            return TrackState.LOST
-        if age_s > self.stale_s:
-            return TrackState.STALE
-        return TrackState.COASTING if age_s > coasting_s else TrackState.LIVE
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -97,7 +68,10 @@ class _Past:
 
 @dataclass(slots=True, kw_only=True)
 class _Tracked:
-    """Track of one UAV: its newest reports, and the state derived from them."""
+    """Track of one UAV: its newest reports, and the state derived from them.
+
+    ``snapshot`` is None until it is needed, and again after the next report.
+    """
 
     past: _Past
     history: ReportHistory[Any]
@@ -110,6 +84,7 @@ class _Tracked:
     mu_max_s2: float | None = None
     acceleration: Vector | None = None
     predictions: PastPredictions = field(default_factory=PastPredictions)
+    snapshot: TrackSnapshot | None = None
 
 
 class Tracker:
@@ -134,6 +109,8 @@ class Tracker:
         raise the bounds before the report is checked.
         """
         tracked = self._tracked.get(fix.uav)
+        if tracked is not None:
+            tracked.snapshot = None
         past = self._new_past() if tracked is None else tracked.past
         fix, refuted = self._with_raised_limits(past, fix)
         full = tracked is None and len(self._tracked) >= self._settings.most
@@ -308,91 +285,41 @@ class Tracker:
 
     def track(self, uav: str, now_ns: int, at: SenderTime) -> Track | None:
         """Predict a UAV to ``at.node_ns``; its state is that at ``now_ns``. None if unknown."""
+        snapshot = self.snapshot(uav)
+        return None if snapshot is None else snapshot.at(now_ns, at)
+
+    def snapshot(self, uav: str) -> TrackSnapshot | None:
+        """Return the track of a UAV as it is now; the same one until its next report."""
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
-        now = at.sender_ns - (at.node_ns - now_ns)
-        position, velocity, possible = self._predict(tracked, at)
-        newest = tracked.history.newest
-        last = tracked.newest
-        return Track(
-            uav=uav,
-            state=self._settings.ages.state((now - newest.fix.sender_ns) * 1e-9, tracked.past.pace),
-            valid_at_ns=at.node_ns,
-            age_s=(at.sender_ns - newest.fix.sender_ns) * 1e-9,
-            position_ned_m=np.array(position),
-            velocity_ned_mps=_array(velocity),
-            unknown_input_mps=_array(tracked.unknown_input),
-            acceleration_ned_mps2=_array(tracked.acceleration),
-            bound_m=possible.bound_m,
-            horizontal_bound_m=possible.horizontal_m,
-            vertical_bound_m=possible.vertical_m,
-            set_center_ned_m=np.array(possible.center_ned_m),
-            set_radius_m=possible.radius_m,
-            limits=self._limits(newest.fix),
-            error_p95_m=self._error_p95_m(tracked, velocity, at, possible.bound_m),
-            clock_bound_s=at.bound_s,
-            dt_s=last.dt_s,
-            latency_s=(newest.fix.arrival_ns - newest.fix.t_ns) * 1e-9,
-            gamma=None if tracked.mu_max_s2 is None else math.sqrt(tracked.mu_max_s2),
-            innovation_m=last.innovation_m,
-            reports=tracked.reports,
-        )
-
-    def _predict(self, tracked: _Tracked, at: SenderTime) -> tuple[Vector, Vector | None, Reach]:
-        """Return position and velocity, including feed-forward, and the reachable set.
-
-        See docs/math.md 5.1.
-        """
-        newest = tracked.history.newest
-        limits = self._limits(newest.fix)
-        velocity: Vector | None
-        carried = self._observer.carry(newest.state, at.sender_ns)
-        if carried is not None:
-            position, velocity = _with_feed_forward(tracked, at, *carried)
-            return position, velocity, reach(newest.fix, limits, position, at)
-        found = self._observer.predict(newest.state, at.sender_ns)
-        position, velocity = found.position_ned_m, found.velocity_ned_mps
-        if velocity is not None:
-            position, velocity = _with_feed_forward(tracked, at, position, velocity)
-        fastest_mps = _fastest_mps(velocity, found.velocity_bound_mps, limits, at.bound_s)
-        widened_m = at.bound_s * fastest_mps
-        bound_m = found.bound_m + widened_m
-        horizontal_m, vertical_m = found.horizontal_m + widened_m, found.vertical_m + widened_m
-        return (
-            position,
-            velocity,
-            Reach(
-                bound_m=bound_m,
-                horizontal_m=horizontal_m,
-                vertical_m=vertical_m,
-                center_ned_m=position,
-                radius_m=bound_m,
-            ),
-        )
-
-    def _error_p95_m(
-        self, tracked: _Tracked, velocity: Vector | None, at: SenderTime, bound_m: float
-    ) -> float | None:
-        """Return the usual error, from past errors, the receiver's common error and the clock.
-
-        Past errors may exceed the present bound, which limits the result.
-        """
-        age_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
-        seen_m = tracked.predictions.error_p95_m(age_s)
-        if seen_m is None:
-            return None
-        if velocity is not None:
-            newest = tracked.history.newest.fix
-            receiver_check = tracked.past.receiver_check
-            common_m = (
-                0.0 if receiver_check is None else receiver_check.common_error_m(newest.noise)
+        if tracked.snapshot is None:
+            newest, predictions = tracked.history.newest, tracked.predictions
+            check, ages = tracked.past.receiver_check, self._settings.ages
+            tracked.snapshot = TrackSnapshot(
+                observer=self._observer,
+                ages=ages,
+                limits=self._limits(newest.fix),
+                fix=newest.fix,
+                state=newest.state,
+                last=tracked.newest,
+                coasting_s=tracked.past.pace.silence_s(ages.coasting_s, ages.stale_s),
+                reports=tracked.reports,
+                unknown_input=tracked.unknown_input,
+                mu_max_s2=tracked.mu_max_s2,
+                acceleration=tracked.acceleration,
+                model=predictions.model,
+                smoothing_offset=predictions.smoothing_offset,
+                usual_errors=predictions.usual_errors,
+                common_error_m=0.0 if check is None else check.common_error_m(newest.fix.noise),
             )
-            seen_m = math.hypot(seen_m, common_m, math.hypot(*velocity) * at.usual_s)
-        return min(seen_m, bound_m)
+        return tracked.snapshot
 
     def _limits(self, fix: Fix) -> Limits:
         return fix.limits or self._settings.limits
+
+    def __len__(self) -> int:
+        return len(self._tracked)
 
     def __contains__(self, uav: object) -> bool:
         """Return whether a UAV has a track."""
@@ -413,8 +340,9 @@ class Tracker:
         tracked = self._tracked.get(uav)
         if tracked is None:
             return None
-        age_s = (now.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
-        return self._settings.ages.state(age_s, tracked.past.pace)
+        ages, newest = self._settings.ages, tracked.history.newest.fix
+        coasting_s = tracked.past.pace.silence_s(ages.coasting_s, ages.stale_s)
+        return ages.state((now.sender_ns - newest.sender_ns) * 1e-9, coasting_s)
 
     def near(self, position_ned_m: Vector, within_m: float) -> list[str]:
         """Return the UAVs whose newest accepted report is within a distance of a local position."""
@@ -423,16 +351,6 @@ class Tracker:
             for uav, tracked in self._tracked.items()
             if math.dist(tracked.history.newest.fix.position_ned_m, position_ned_m) < within_m
         ]
-
-
-def _fastest_mps(
-    velocity: Vector | None, bound_mps: float | None, limits: Limits, within_s: float
-) -> float:
-    """Return the largest speed within a time of the prediction's instant."""
-    if velocity is None or bound_mps is None:
-        return limits.speed_max_mps
-    gained_mps = limits.acceleration_max_mps2 * within_s
-    return min(limits.speed_max_mps, math.hypot(*velocity) + bound_mps + gained_mps)
 
 
 def _initial_estimate(fix: Fix) -> Estimate:
@@ -447,27 +365,6 @@ def _initial_estimate(fix: Fix) -> Estimate:
 
 def _rejected(fix: Fix, reason: Reason, detail: str) -> Rejection:
     return Rejection(t_ns=fix.arrival_ns, source=fix.uav, reason=reason, detail=detail)
-
-
-def _with_feed_forward(
-    tracked: _Tracked, at: SenderTime, position: Vector, velocity: Vector
-) -> tuple[Vector, Vector]:
-    """Add feed-forward and smoothing to a predicted position and velocity."""
-    ahead_s = (at.sender_ns - tracked.history.newest.fix.sender_ns) * 1e-9
-    position = _sum(position, tracked.predictions.smoothing_offset)
-    if tracked.acceleration is None or ahead_s <= 0:
-        return position, velocity
-    moved, gained = fed_forward(tracked.predictions.model, tracked.acceleration, velocity, ahead_s)
-    return _sum(position, moved), _sum(velocity, gained)
-
-
-def _array(vector: Vector | None) -> FloatArray | None:
-    return None if vector is None else np.array(vector)
-
-
-def _sum(one: Vector, other: Vector) -> Vector:
-    (x, y, z), (a, b, c) = one, other
-    return x + a, y + b, z + c
 
 
 def _cut(acceleration: Vector | None, most_mps2: float) -> Vector | None:

@@ -18,6 +18,7 @@ from companion.tracking.past_predictions import (
     AccelerationModel,
     PastPredictions,
     fading_response,
+    usual_error_m,
     fed_forward,
 )
 from companion.values import Fix
@@ -88,7 +89,7 @@ def test_slow_noisy_turn_selects_an_acceleration_model(fix: Callable[..., Fix]) 
 
 def test_model_is_constant_velocity_before_any_evaluation(fix: Callable[..., Fix]) -> None:
     assert flown(fix, circling(110.0, 22.0), 0.1, seconds=1.0).model is CONSTANT_VELOCITY
-    assert PastPredictions().error_p95_m(1.0) is None
+    assert usual_error_m(PastPredictions().usual_errors, 1.0) is None
 
 
 def test_error_p95_covers_19_of_20_errors(fix: Callable[..., Fix]) -> None:
@@ -96,7 +97,7 @@ def test_error_p95_covers_19_of_20_errors(fix: Callable[..., Fix]) -> None:
     place = circling(60.0, 8.0)
     hindsight = flown(fix, place, 0.2, seconds=120, noise_mps=0.2, noise_m=0.5)
     rng, covered, count = np.random.default_rng(2), 0, 2000
-    usual_m = hindsight.error_p95_m(1.0)
+    usual_m = usual_error_m(hindsight.usual_errors, 1.0)
     assert usual_m is not None
     for _ in range(count):
         t_s = rng.uniform(0, 100)
@@ -111,7 +112,7 @@ def test_error_p95_covers_19_of_20_errors(fix: Callable[..., Fix]) -> None:
         seen = np.array(later) + rng.normal(0, 0.5, 3)
         covered += float(np.linalg.norm(told - seen)) <= usual_m
     assert 0.9 <= covered / count <= 0.99
-    ages = [hindsight.error_p95_m(age) for age in (0.0, 0.25, 1.0, 3.0, 10.0)]
+    ages = [usual_error_m(hindsight.usual_errors, age) for age in (0.0, 0.25, 1.0, 3.0, 10.0)]
     assert ages == sorted(ages)  # type: ignore[type-var]
 
 

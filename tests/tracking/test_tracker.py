@@ -12,7 +12,8 @@ from support import rounds
 from companion.tracking.gate import GateSettings
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver
 from companion.tracking.observers.position import PositionModel, PositionObserver
-from companion.tracking.tracker import Ages, Tracker, TrackerSettings
+from companion.tracking.track_snapshot import Ages
+from companion.tracking.tracker import Tracker, TrackerSettings
 from companion.values import (
     Estimate,
     Fix,

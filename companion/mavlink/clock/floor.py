@@ -274,16 +274,10 @@ class Floor:
         """Return the change of the floor from its newest stamp by the detected drift, ns."""
         return round(self.drift * (x_ns - self.newest_ns))
 
-    def may_drift_ns(self, x_ns: int) -> tuple[int, int]:
-        """Return the least and greatest drift of the offset since the newest stamp, ns.
-
-        Counted is drift beyond ``drift_max``. The range includes 0 while the apparent drift may be
-        a queue.
-        """
-        drifted_ns = self.drifted_ns(x_ns)
-        if self._level is None:
-            return drifted_ns, drifted_ns
-        return min(0, drifted_ns), max(0, drifted_ns)
+    @property
+    def may_be_queue(self) -> bool:
+        """Whether the detected drift may be a queue that fills."""
+        return self._level is not None
 
     def restart_at(self, height_ns: int, x_ns: int) -> None:
         """Restart at a height that was measured at a sender time, because the clock changed."""

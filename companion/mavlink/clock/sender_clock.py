@@ -25,10 +25,10 @@ from companion.mavlink.clock.estimates import (
     ClockChange,
     ClockEstimate,
     ClockKind,
-    Guarantee,
     Stamp,
 )
 from companion.mavlink.clock.evidence import DriftProven, Interval, OffsetEvidence
+from companion.mavlink.clock.reading import ClockReading
 
 _NS: Final = 1_000_000_000
 _NS_PER_MS: Final = 1_000_000
@@ -69,6 +69,7 @@ class SenderClock:
         self._latency_s = 0.0
         self._doubt_ns = 0  # largest doubt of all stamps
         self._known: tuple[ClockKind, int, int, int] | None = None  # at the newest stamp
+        self._reading: ClockReading | None = None
 
     def observe(self, arrival_ns: int, boot_ms: int, doubt_ns: int = 0) -> Stamp | None:
         """Place a stamp whose frame may have arrived up to ``doubt_ns`` earlier.
@@ -77,7 +78,7 @@ class SenderClock:
         confirmed by others: that report has no time and cannot be used.
         """
         placed = self._line.observe(arrival_ns, boot_ms)
-        self.change = self._known = None
+        self.change = self._known = self._reading = None
         # A stamp without a place may start a line that later ones confirm, and be its floor.
         self._doubt_ns = max(self._doubt_ns, doubt_ns)
         if placed is None:
@@ -93,7 +94,7 @@ class SenderClock:
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> None:
         """Add the stamp of any other message, if it lies on the line of the reports."""
-        self.change = self._known = None
+        self.change = self._known = self._reading = None
         if self._line.add_stamp(arrival_ns, boot_ms):
             self._note_change()
 
@@ -119,7 +120,7 @@ class SenderClock:
             received_ns  when the answer was received, node time
             remote_ns    the sender's boot time when it answered
         """
-        self.change = self._known = None
+        self.change = self._known = self._reading = None
         if not self._line.floor:
             return "no stamp of this sender received yet"
         if received_ns < sent_ns:
@@ -137,7 +138,7 @@ class SenderClock:
         latencies between -20 ms and 5 s (each limit widened by the node's own error). Returns None,
         or the reason why it is not used.
         """
-        self.change = self._known = None
+        self.change = self._known = self._reading = None
         refused = self._system_time(arrival_ns, unix_us, boot_ms)
         if refused is not None:
             self.forget_gnss()
@@ -145,7 +146,7 @@ class SenderClock:
 
     def forget_gnss(self) -> None:
         """Discard the evidence of SYSTEM_TIME, for example after the node's own clock was set."""
-        self._known = None
+        self._known = self._reading = None
         self._gnss_plausible = 0
         self._gnss.clear()
 
@@ -205,63 +206,47 @@ class SenderClock:
         ahead_ns = node_ns - newest_ns - self._now()[3]
         return newest_ns + round(ahead_ns / (1.0 + floor.drift))
 
-    def estimate(self, node_ns: int | None = None) -> ClockEstimate | None:
-        """Return the clock at a node time (default: its newest stamp); None before the first."""
-        floor = self._line.floor
-        if not floor:
-            return None
-        x_ns = self._line.newest_ns if node_ns is None else self.sender_ns(node_ns)
-        kind, low_ns, high_ns, likely_ns = self._at(x_ns)
-        guarantee = Guarantee.ASSUMED if kind is ClockKind.ENVELOPE else Guarantee.MEASURED
-        return ClockEstimate(
-            kind=kind,
-            guarantee=guarantee,
-            offset_ns=likely_ns,
-            before_s=(high_ns - likely_ns + _NS_PER_MS) * 1e-9,
-            after_s=(likely_ns - low_ns + _NS_PER_MS) * 1e-9,
-            drift_ppm=floor.drift * 1e6,
-            constant_delay_s=(floor.at(x_ns) - likely_ns) * 1e-9,
-            latency_s=self._latency_s,
-        )
-
-    def time(self, node_ns: int) -> tuple[int, float, float, float] | None:
-        """Return the clock at a node time, as in ``ClockEstimate``; None before the first stamp.
-
-        Returns the offset (node time less sender time), ns; then, in seconds, how much larger and
-        how much smaller the offset may be, and its usual error.
-        """
+    def reading(self) -> ClockReading | None:
+        """Return the clock as known now, for any thread; None before the first stamp."""
         if not self._line.floor.count:
             return None
-        kind, low_ns, high_ns, likely_ns = self._at(self.sender_ns(node_ns))
-        before_s = (high_ns - likely_ns + _NS_PER_MS) * 1e-9
-        after_s = (likely_ns - low_ns + _NS_PER_MS) * 1e-9
-        return likely_ns, before_s, after_s, self._usual_s(kind, low_ns, high_ns)
+        if self._reading is None:
+            kind, *offset_ns = self._now()
+            newest_ns, floor = self._line.newest_ns, self._line.floor
+            self._reading = ClockReading(
+                kind=kind,
+                offset_ns=(offset_ns[0], offset_ns[1], offset_ns[2]),
+                newest_ns=newest_ns,
+                assumed_drift=max(
+                    self._timesync.drift_at(newest_ns), self._gnss.drift_at(newest_ns)
+                ),
+                drift=floor.drift,
+                may_be_queue=floor.may_be_queue,
+                usual_s=math.hypot(INVISIBLE_RATIO * floor.median_ns + _NS_PER_MS, floor.late_ns)
+                * 1e-9,
+                floor_ns=floor.at(newest_ns),
+                latency_s=self._latency_s,
+            )
+        return self._reading
 
-    def _at(self, x_ns: int) -> tuple[ClockKind, int, int, int]:
-        """Return the interval of the offset, aged to a sender time."""
-        kind, low_ns, high_ns, likely_ns = self._now()
-        newest_ns = self._line.newest_ns
-        drift = max(self._timesync.drift_at(newest_ns), self._gnss.drift_at(newest_ns))
-        slack_ns = math.ceil(drift * abs(x_ns - newest_ns))
-        least_ns, most_ns = self._line.floor.may_drift_ns(x_ns)
-        return (
-            kind,
-            low_ns - slack_ns + least_ns,
-            high_ns + slack_ns + most_ns,
-            likely_ns + self._line.floor.drifted_ns(x_ns),
-        )
+    def estimate(self, node_ns: int | None = None) -> ClockEstimate | None:
+        """Return the clock at a node time (default: its newest stamp); None before the first."""
+        reading = self.reading()
+        if reading is None or node_ns is None:
+            return None if reading is None else reading.estimate()
+        x_ns = reading.sender_ns(node_ns)
+        return reading.estimate(x_ns, self._line.floor.at(x_ns))
+
+    def time(self, node_ns: int) -> tuple[int, float, float, float] | None:
+        """Return the clock at a node time, as ``ClockReading``; None before the first stamp."""
+        reading = self.reading()
+        return None if reading is None else reading.time(node_ns)
 
     def _now(self) -> tuple[ClockKind, int, int, int]:
         """Return the interval of the offset at the newest stamp; cached until new input."""
         if self._known is None:
             self._known = self._interval(self._line.newest_ns)
         return self._known
-
-    def _usual_s(self, kind: ClockKind, low_ns: int, high_ns: int) -> float:
-        if kind is not ClockKind.ENVELOPE:
-            return (high_ns - low_ns) / 4 * 1e-9
-        floor = self._line.floor
-        return math.hypot(INVISIBLE_RATIO * floor.median_ns + _NS_PER_MS, floor.late_ns) * 1e-9
 
     def _interval(self, x_ns: int) -> tuple[ClockKind, int, int, int]:
         """Return the offset at a sender time: kind of evidence, least, greatest and likeliest; ns.

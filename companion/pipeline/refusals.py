@@ -39,6 +39,9 @@ class SenderRejections:
     recent: deque[Rejection] = field(default_factory=lambda: deque(maxlen=RECENT))
 
 
+_NO_REJECTIONS: Final = SenderRejections()
+
+
 class Refusals:
     """Counts of rejections by sender. ``total`` includes senders that were forgotten."""
 
@@ -101,5 +104,5 @@ class Refusals:
         sender.recent.append(refused)
 
     def of(self, sender: str) -> SenderRejections:
-        """Return the rejections of one sender; empty for an unknown one."""
-        return self._senders.get(sender) or SenderRejections()
+        """Return the rejections of one sender, to be read only; empty for an unknown one."""
+        return self._senders.get(sender) or _NO_REJECTIONS

@@ -34,7 +34,14 @@ class Targets:
 
     def among(self, uavs: Iterable[str]) -> list[str]:
         """Return the UAVs for which beams are wanted, in the order given."""
-        wanted = [uav for uav in uavs if self.wants(uav)]
+        same_as, carrier, all_kinds = self.identities.same_as, self._carrier, self._all
+        wanted = [  # as ``wants``, for thousands at every tick
+            uav
+            for uav in uavs
+            if uav != carrier
+            and (all_kinds or kind_of(uav).reports_itself)
+            and same_as(uav) is None
+        ]
         if self.duty is None:
             return wanted
         served = frozenset(self.duty.serves)

@@ -6,16 +6,24 @@ from typing import Annotated, Final
 from fastapi import FastAPI, HTTPException, Request, WebSocket
 from fastapi import Path as PathParameter
 from fastapi.responses import Response
-from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from starlette.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
 from companion.server import area_map, beam_routes, file_routes, models, responses
 from companion.server.access import OPEN_PATHS, BearerToken, KnownHosts, WrongTokens
-from companion.server.metrics import NodeCollector
+from companion.server.giving_way import GivingWay
+from companion.server.large_answers import FEW_ITEMS, LargeAnswers, Make
+from companion.server.metrics import NodeMetrics
 from companion.server.page import PageFiles, web_directory
-from companion.server.responses import answer, answers, encode, json_response
+from companion.server.responses import (
+    answer,
+    answers,
+    encode,
+    encode_in_parts,
+    json_response,
+    refusals,
+)
 from companion.server.stream import Stream
 from companion.server.work_slots import WorkSlots
 from companion.values import UAV_FORMS
@@ -64,13 +72,14 @@ def create_app(
     )
     app.router.redirect_slashes = False
     responses.install(app)
-    stream, page = Stream(node), PageFiles(web_directory())
-    wrong_tokens = WrongTokens(node)
-    _health_routes(app, NodeCollector(node, stream, wrong_tokens), node)
     work_slots = work_slots or WorkSlots()
-    _state_routes(app, node, work_slots)
+    large = LargeAnswers(node, work_slots)
+    stream, page = Stream(node, large), PageFiles(web_directory())
+    wrong_tokens = WrongTokens(node)
+    _health_routes(app, node, large, NodeMetrics(node, stream, wrong_tokens))
+    _state_routes(app, node, large)
     beam_routes.add(app, node, work_slots)
-    file_routes.add(app, node)
+    file_routes.add(app, node, large)
     area_map.add(app, area)
 
     @app.get("/openapi.json", include_in_schema=False)
@@ -94,11 +103,9 @@ def create_app(
     return KnownHosts(secured, node.pipeline.settings.server.hosts)
 
 
-def _health_routes(app: FastAPI, collector: NodeCollector, node: Node) -> None:
-    registry = CollectorRegistry(auto_describe=False)
-    registry.register(collector)
-    ProcessCollector(registry=registry)
-
+def _health_routes(
+    app: FastAPI, node: Node, large: LargeAnswers, node_metrics: NodeMetrics
+) -> None:
     @app.get("/healthz", summary="Liveness of the process", responses=answers(models.Health))
     async def healthz() -> Response:
         return answer({"status": "ok"})
@@ -122,14 +129,15 @@ def _health_routes(app: FastAPI, collector: NodeCollector, node: Node) -> None:
         "/metrics",
         summary="Prometheus metrics",
         response_class=Response,
-        responses={200: {"content": {"text/plain": {}}}},
+        responses={200: {"content": {"text/plain": {}}}, **refusals(503)},
     )
     async def metrics() -> Response:
-        return Response(generate_latest(registry), media_type="text/plain; version=0.0.4")
+        made = await large.of_uavs("metrics", node_metrics.prepare)
+        return Response(made, media_type="text/plain; version=0.0.4")
 
 
-def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
-    design_view = DesignView(node.pipeline.settings)
+def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
+    design_view, pipeline = DesignView(node.pipeline.settings), node.pipeline
 
     @app.get(
         "/v1/status",
@@ -139,9 +147,9 @@ def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
     async def status() -> Response:
         return answer(state.status(node, companion.__version__))
 
-    @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(uav_state.Uavs))
+    @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(uav_state.Uavs, 503))
     async def uavs() -> Response:
-        return answer(uav_state.uavs(node))
+        return json_response((await large.uavs()).whole)
 
     @app.get(
         "/v1/uavs/{uav}",
@@ -157,18 +165,28 @@ def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
     @app.get(
         "/v1/links",
         summary="Links, the components received over each, and the requested message rates",
-        responses=answers(Links),
+        responses=answers(Links, 503),
     )
     async def links() -> Response:
-        return answer(state.links(node))
+        def prepare() -> Make[bytes]:
+            show = state.links(node)
+            return lambda way: encode_in_parts(show(), way, depth=4)
+
+        many = state.component_count(node) > FEW_ITEMS
+        return json_response(await large.made("links", prepare, is_large=many))
 
     @app.get(
         "/v1/fleet",
         summary="The nodes of the fleet, and the UAVs that each serves",
-        responses=answers(fleet_view.Fleet),
+        responses=answers(fleet_view.Fleet, 503),
     )
     async def fleet() -> Response:
-        return answer(fleet_view.fleet(node.pipeline, node.fleet_status(), node.now_ns()))
+        def prepare() -> Make[bytes]:
+            shown = fleet_view.fleet(node.fleet_status(), node.now_ns())
+            return lambda way: encode_in_parts(as_json(shown, pipeline.utc_ns), way)
+
+        many = fleet_view.offer_count(node.fleet_status()) > FEW_ITEMS
+        return json_response(await large.made("fleet", prepare, is_large=many))
 
     @app.get(
         "/v1/events", summary="The newest notices to the operator", responses=answers(glance.Events)
@@ -182,9 +200,11 @@ def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
         responses=answers(series.History, 503),
     )
     async def history() -> Response:
-        samples, now_ns = node.series.samples(), node.now_ns()
-        utc_ns = node.pipeline.utc_ns
-        return await work_slots.run(lambda: answer(series.show(samples, now_ns, utc_ns)))
+        def prepare() -> Make[bytes]:
+            samples, now_ns = node.series.samples(), node.now_ns()
+            return lambda way: encode_in_parts(series.show(samples, now_ns, pipeline.utc_ns), way)
+
+        return json_response(await large.made("history", prepare))
 
     @app.get(
         "/v1/settings",
@@ -207,10 +227,18 @@ def _state_routes(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
     @app.get(
         "/v1/design",
         summary="The observer in use: gains at each UAV's interval, and their certificate",
-        responses=answers(Design),
+        responses=answers(Design, 503),
     )
     async def design() -> Response:
-        return answer(design_view.show(node.pipeline, node.now_ns()))
+        def prepare(seen: uav_state.Overview) -> Make[bytes]:
+            def make(way: GivingWay) -> bytes:
+                snapshots = way.between(known.snapshot for known in seen.uavs)
+                shown = design_view.show(snapshots, seen.now_ns, pipeline.utc_ns)
+                return encode_in_parts(shown, way)
+
+            return make
+
+        return json_response(await large.of_uavs("design", prepare))
 
 
 class _Edge:

@@ -1,5 +1,6 @@
 """The routes ``/v1/recordings`` and ``/v1/mavlink``: recorded files, and last messages."""
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import FastAPI, Header, HTTPException, Path
@@ -7,9 +8,19 @@ from fastapi.responses import Response, StreamingResponse
 from starlette.concurrency import run_in_threadpool
 
 from companion.server import recordings
-from companion.server.responses import answer, answers, refusals
+from companion.server.giving_way import GivingWay
+from companion.server.large_answers import LargeAnswers, Make
+from companion.server.responses import (
+    answer,
+    answers,
+    encode,
+    encode_in_parts,
+    json_response,
+    refusals,
+)
 from companion.values import Source
 from companion.views import mavlink_messages
+from companion.views.last_messages import Kept
 from companion.views.state import Node
 
 SystemId = Annotated[int, Path(ge=0, le=255, description="MAVLink system id")]
@@ -19,10 +30,10 @@ MessageName = Annotated[str, Path(description="MAVLink name, such as GLOBAL_POSI
 Range = Annotated[str | None, Header(alias="range", description="bytes=FIRST-LAST")]
 
 
-def add(app: FastAPI, node: Node) -> None:
+def add(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     """Add the routes to the application."""
     _recordings(app, node)
-    _mavlink(app, node)
+    _mavlink(app, node, large)
 
 
 def _recordings(app: FastAPI, node: Node) -> None:
@@ -77,28 +88,38 @@ def _recordings(app: FastAPI, node: Node) -> None:
         )
 
 
-def _mavlink(app: FastAPI, node: Node) -> None:
+def _mavlink(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     kept, utc_ns = node.last_messages, node.pipeline.utc_ns
 
     @app.get(
         "/v1/mavlink/vehicles",
         summary="The last messages of all components, as in mavlink2rest",
-        responses=answers(dict[str, mavlink_messages.MavlinkVehicle]),
+        responses=answers(dict[str, mavlink_messages.MavlinkVehicle], 503),
     )
     async def vehicles() -> Response:
-        shown = mavlink_messages.vehicles
-        return answer(await run_in_threadpool(shown, kept.by_sender(), utc_ns))
+        def prepare() -> Make[bytes]:
+            found = kept.all()
+            return lambda way: encode_in_parts(
+                mavlink_messages.vehicles(found, utc_ns), way, depth=4
+            )
+
+        return json_response(await large.made("vehicles", prepare))
 
     @app.get(
         "/v1/mavlink/vehicles/{sys}/components/{comp}/messages",
         summary="The last messages of one component",
-        responses=answers(dict[str, mavlink_messages.MavlinkMessage], 404, 422),
+        responses=answers(dict[str, mavlink_messages.MavlinkMessage], 404, 422, 503),
     )
     async def messages(sys: SystemId, comp: ComponentId) -> Response:
-        found = kept.by_sender().get(Source(sys, comp))
-        if found is None:
-            raise HTTPException(404, f"no message received from {sys}:{comp}")
-        return answer(await run_in_threadpool(mavlink_messages.messages, found, utc_ns))
+        def make(found: list[Kept], _way: GivingWay) -> bytes:
+            theirs = [one for one in found if one.frame.source == (sys, comp)]
+            if not theirs:
+                raise HTTPException(404, f"no message received from {sys}:{comp}")
+            theirs.sort(key=lambda one: one.frame.msgid)
+            return encode(mavlink_messages.messages(theirs, utc_ns))
+
+        what = "messages", sys, comp
+        return json_response(await large.made(what, lambda: partial(make, kept.all())))
 
     @app.get(
         "/v1/mavlink/vehicles/{sys}/components/{comp}/messages/{name}",

@@ -4,9 +4,10 @@ Names follow Prometheus: base units, ``_total`` for counters. The process's own 
 CPU, open files) come from the client library.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import Any, Final
 
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import (
     CounterMetricFamily,
     GaugeMetricFamily,
@@ -20,10 +21,13 @@ from companion.mavlink.links.lag import LagSeen
 from companion.mavlink.links.status import LinkStatus
 from companion.server.access import WrongTokens
 from companion.server.fleet_metrics import fleet_metrics
+from companion.server.giving_way import GivingWay
+from companion.server.large_answers import Make
 from companion.server.stream import Stream
 from companion.values import BeamSet, Level, Track, Verdict
 from companion.values.described import meaning
 from companion.views.state import Node, RecordingStatus
+from companion.views.uav_state import Overview
 
 LINK_COUNTS: Final = (
     "frames", "bytes", "gaps", "sent", "send_dropped", "misstamped", "overflowed"
@@ -36,23 +40,45 @@ def _help(described: Any, name: str) -> str:
     return text[0].upper() + text[1:]
 
 
-class NodeCollector(Collector):
-    """Counters and gauges of a node and of its server."""
+class _Given(Collector):
+    """Metrics that are known already."""
+
+    def __init__(self, metrics: Iterable[Metric]) -> None:
+        self._metrics = metrics
+
+    def collect(self) -> Iterable[Metric]:
+        """Return the metrics."""
+        return self._metrics
+
+
+class NodeMetrics:
+    """Counters and gauges of a node, of its server and of its process."""
 
     def __init__(self, node: Node, stream: Stream, wrong_tokens: WrongTokens) -> None:
         self._node = node
         self._stream = stream
         self._wrong_tokens = wrong_tokens
+        self._process = ProcessCollector(registry=CollectorRegistry())
 
-    def collect(self) -> Iterator[Metric]:
-        """Yield all metrics at this moment."""
-        yield from self._service()
-        yield from self._arrival_lag()
-        yield from self._links()
-        yield from self._uavs()
-        yield from self._verdicts()
-        yield from fleet_metrics(self._node)
-        yield from self._recording()
+    def prepare(self, overview: Overview) -> Make[bytes]:
+        """Read the node; return a function that writes its metrics, on any thread."""
+        before = [*self._service(), *self._arrival_lag(), *self._links()]
+        beams, verdicts = list(self._beams()), list(self._node.pipeline.health.verdicts.values())
+        after = [*fleet_metrics(self._node), *self._recording()]
+
+        def made(way: GivingWay) -> bytes:
+            registry = CollectorRegistry(auto_describe=False)
+            node = [
+                *before,
+                *_uavs(way.between(overview.tracks())),
+                *beams,
+                *_verdicts(verdicts),
+                *after,
+            ]
+            registry.register(_Given(way.between([*node, *self._process.collect()])))
+            return generate_latest(registry)
+
+        return made
 
     def _service(self) -> Iterator[Metric]:
         node, pipeline = self._node, self._node.pipeline
@@ -125,30 +151,8 @@ class NodeCollector(Collector):
                 lost.add_metric([link.url, str(reason)], count)
         yield from (up, *families.values(), lost)
 
-    def _uavs(self) -> Iterator[Metric]:
-        pipeline, now_ns = self._node.pipeline, self._node.now_ns()
-        states = GaugeMetricFamily("companion_uavs", "UAVs by state", labels=["state"])
-        bounds = GaugeMetricFamily(
-            "companion_bound_meters", _help(Track, "bound_m"), labels=["uav"]
-        )
-        latency = GaugeMetricFamily(
-            "companion_latency_seconds", _help(Track, "latency_s"), labels=["uav"]
-        )
-        likely = GaugeMetricFamily(
-            "companion_likely_error_meters", _help(Track, "error_p95_m"), labels=["uav"]
-        )
-        by_state: dict[str, int] = {}
-        for track in pipeline.tracks(now_ns, now_ns):
-            by_state[track.state] = by_state.get(track.state, 0) + 1
-            bounds.add_metric([track.uav], track.bound_m)
-            if track.error_p95_m is not None:
-                likely.add_metric([track.uav], track.error_p95_m)
-            if track.latency_s is not None:
-                latency.add_metric([track.uav], track.latency_s)
-        for state, count in by_state.items():
-            states.add_metric([str(state)], count)
-        yield from (states, bounds, likely, latency)
-        update = pipeline.last_update
+    def _beams(self) -> Iterator[Metric]:
+        update = self._node.pipeline.last_update
         if update is not None:
             beams = update.beams
             yield GaugeMetricFamily("companion_beams", "Beams formed", value=len(beams.beams))
@@ -158,27 +162,6 @@ class NodeCollector(Collector):
                     _help(BeamSet, "condition_number"),
                     value=beams.condition_number,
                 )
-
-    def _verdicts(self) -> Iterator[Metric]:
-        levels = GaugeMetricFamily(
-            "companion_verdict",
-            "1 for the verdict on the link to each UAV, 0 for the others",
-            labels=["uav", "verdict"],
-        )
-        gains = {
-            name: GaugeMetricFamily(
-                f"companion_{name}_gain_decibels", _help(Verdict, f"{name}_gain_db"), labels=["uav"]
-            )
-            for name in GAINS
-        }
-        for found in self._node.pipeline.health.verdicts.values():
-            for level in Level:
-                levels.add_metric([found.uav, str(level)], float(found.level is level))
-            for name in GAINS:
-                gain_db = getattr(found, f"{name}_gain_db")
-                if gain_db is not None:
-                    gains[name].add_metric([found.uav], gain_db)
-        yield from (levels, *gains.values())
 
     def _recording(self) -> Iterator[Metric]:
         recording = self._node.recording()
@@ -204,3 +187,47 @@ class NodeCollector(Collector):
             _help(RecordingStatus, "dropped"),
             value=recording.dropped,
         )
+
+
+def _uavs(tracks: Iterable[Track]) -> Iterator[Metric]:
+    states = GaugeMetricFamily("companion_uavs", "UAVs by state", labels=["state"])
+    bounds = GaugeMetricFamily("companion_bound_meters", _help(Track, "bound_m"), labels=["uav"])
+    latency = GaugeMetricFamily(
+        "companion_latency_seconds", _help(Track, "latency_s"), labels=["uav"]
+    )
+    likely = GaugeMetricFamily(
+        "companion_likely_error_meters", _help(Track, "error_p95_m"), labels=["uav"]
+    )
+    by_state: dict[str, int] = {}
+    for track in tracks:
+        by_state[track.state] = by_state.get(track.state, 0) + 1
+        bounds.add_metric([track.uav], track.bound_m)
+        if track.error_p95_m is not None:
+            likely.add_metric([track.uav], track.error_p95_m)
+        if track.latency_s is not None:
+            latency.add_metric([track.uav], track.latency_s)
+    for state, count in by_state.items():
+        states.add_metric([str(state)], count)
+    yield from (states, bounds, likely, latency)
+
+
+def _verdicts(verdicts: Iterable[Verdict]) -> Iterator[Metric]:
+    levels = GaugeMetricFamily(
+        "companion_verdict",
+        "1 for the verdict on the link to each UAV, 0 for the others",
+        labels=["uav", "verdict"],
+    )
+    gains = {
+        name: GaugeMetricFamily(
+            f"companion_{name}_gain_decibels", _help(Verdict, f"{name}_gain_db"), labels=["uav"]
+        )
+        for name in GAINS
+    }
+    for found in verdicts:
+        for level in Level:
+            levels.add_metric([found.uav, str(level)], float(found.level is level))
+        for name in GAINS:
+            gain_db = getattr(found, f"{name}_gain_db")
+            if gain_db is not None:
+                gains[name].add_metric([found.uav], gain_db)
+    yield from (levels, *gains.values())

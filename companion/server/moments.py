@@ -10,6 +10,7 @@ import threading
 from collections.abc import Callable, Hashable
 from typing import Any, Final, TypeVar
 
+from companion.server.shared_work import seen
 from companion.server.work_slots import WorkSlots
 from companion.values import Update
 from companion.views.state import Node
@@ -46,7 +47,7 @@ class Moments:
             self._work_slots.refuse_if_full()  # before predicting
             look = self._read(now_ns, moment * EVERY_NS - now_ns, lead_ms)
             task = asyncio.create_task(self._work_slots.run(lambda: make(look())))
-            task.add_done_callback(_seen)
+            task.add_done_callback(seen)
             self._answers[lead_ms, what] = task
         found: T = await asyncio.shield(task)  # a client that leaves must not cancel it for others
         return found
@@ -74,9 +75,3 @@ def _memoised(make: Callable[[], T]) -> Callable[[], T]:
             return made[0]
 
     return found
-
-
-def _seen(task: asyncio.Task[Any]) -> None:
-    """Retrieve an error that no client awaits any more, so that asyncio does not warn."""
-    if not task.cancelled():
-        task.exception()

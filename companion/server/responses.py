@@ -14,6 +14,7 @@ from fastapi.responses import JSONResponse, Response
 from starlette.exceptions import HTTPException
 
 from companion.server import models
+from companion.server.giving_way import GivingWay
 
 PROBLEM_TYPE: Final = "application/problem+json"
 _MEANINGS: Final = {
@@ -29,6 +30,24 @@ _MEANINGS: Final = {
 def encode(content: object) -> bytes:
     """Return a value as JSON bytes; numbers that are not finite become null."""
     return orjson.dumps(content, option=orjson.OPT_NON_STR_KEYS | orjson.OPT_SERIALIZE_NUMPY)
+
+
+def encode_in_parts(content: object, way: GivingWay, depth: int = 2) -> bytes:
+    """Return the same bytes as ``encode``, without holding the interpreter for all of it.
+
+    ``encode`` is one call, during which no other thread runs: 5 ms for a megabyte. Here it is
+    called for each item ``depth`` containers deep, and gives way between them.
+    """
+    if depth and isinstance(content, dict):
+        items = way.between(content.items())
+        parts = [
+            encode(str(key)) + b":" + encode_in_parts(one, way, depth - 1) for key, one in items
+        ]
+        return b"{" + b",".join(parts) + b"}"
+    if depth and isinstance(content, list):
+        some = [encode_in_parts(one, way, depth - 1) for one in way.between(content)]
+        return b"[" + b",".join(some) + b"]"
+    return encode(content)
 
 
 def answer(content: object, status: int = 200) -> Response:

@@ -21,21 +21,26 @@ reason has details.
 import asyncio
 import re
 from collections import Counter
+from collections.abc import Coroutine
 from dataclasses import dataclass, field
-from typing import Any, Final
+from functools import partial
+from typing import Any, Final, TypeVar
 from urllib.parse import urlsplit
 
 from starlette.datastructures import QueryParams
+from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from companion.server import topics
 from companion.server.access import SUBPROTOCOL
-from companion.server.topics import Topic
+from companion.server.large_answers import LargeAnswers
+from companion.server.shared_work import seen
+from companion.server.topics import Body, Topic
 from companion.server.websocket_connections import BoundedWebSocket
 from companion.values import UAV_FORMS, UavKind, UserError
 from companion.views.state import Node
 
-Json = dict[str, Any]
+T = TypeVar("T")
 
 SLOW_CLIENT: Final = 1003
 TOO_MANY: Final = 1013
@@ -99,15 +104,18 @@ class Snapshot:
     """Messages of one update: each topic is looked up once, each message encoded once."""
 
     number: int
-    bodies: dict[Topic, "asyncio.Task[Json]"] = field(default_factory=dict)
-    messages: dict[tuple[Topic, frozenset[str]], str | bytes] = field(default_factory=dict)
+    bodies: dict[Topic, "asyncio.Task[Body]"] = field(default_factory=dict)
+    messages: dict[tuple[Topic, frozenset[str]], "asyncio.Task[str | bytes]"] = field(
+        default_factory=dict
+    )
 
 
 class Stream:
     """All stream clients of one node. ``sent`` counts messages."""
 
-    def __init__(self, node: Node) -> None:
+    def __init__(self, node: Node, large: LargeAnswers) -> None:
         self.sent = 0
+        self._large = large
         self._open: list[WebSocket] = []
         self._node = node
         self._snapshot = Snapshot(-1)
@@ -192,8 +200,11 @@ class Stream:
                 for topic in asked.topics:
                     version = self._version(topic)
                     if said.get(topic) != version:
+                        try:
+                            message = await self._message(topic, asked.uavs)
+                        except HTTPException:  # too many requests at once: with the next update
+                            continue
                         said[topic] = version
-                        message = await self._message(topic, asked.uavs)
                         if isinstance(message, bytes):
                             await websocket.send_bytes(message)
                         else:
@@ -216,14 +227,24 @@ class Stream:
         """Return the message of a topic; encode it on first use."""
         if self._snapshot.number != self._node.pipeline.updates:
             self._snapshot = Snapshot(self._node.pipeline.updates)
-        snapshot = self._snapshot
+        messages = self._snapshot.messages
+        if (topic, uavs) not in messages:
+            messages[topic, uavs] = _task(self._encoded(self._snapshot, topic, uavs))
+        return await asyncio.shield(messages[topic, uavs])  # other clients may wait for it too
+
+    async def _encoded(self, snapshot: Snapshot, topic: Topic, uavs: frozenset[str]) -> str | bytes:
         if topic not in snapshot.bodies:
-            snapshot.bodies[topic] = asyncio.create_task(topics.body(topic, self._node))
-        body = await asyncio.shield(snapshot.bodies[topic])  # other clients may wait for it too
-        message = snapshot.messages.get((topic, uavs))
-        if message is None:
-            message = snapshot.messages[topic, uavs] = topics.message(topic, body, uavs)
-        return message
+            snapshot.bodies[topic] = _task(topics.body(topic, self._node, self._large))
+        body = await asyncio.shield(snapshot.bodies[topic])
+        encode = partial(topics.message, topic, body, uavs)
+        what, many = (topic, uavs, snapshot.number), topics.is_large(topic, body, uavs)
+        return await self._large.made(what, lambda: encode, is_large=many)
+
+
+def _task(work: Coroutine[Any, Any, T]) -> "asyncio.Task[T]":
+    task = asyncio.create_task(work)
+    task.add_done_callback(seen)
+    return task
 
 
 def _connection(websocket: WebSocket) -> BoundedWebSocket | None:

@@ -1,19 +1,18 @@
 """Messages of ``/v1/stream``: a body for each topic, and the part of it that a client requested."""
 
-import inspect
-from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from enum import StrEnum
-from typing import Any, Final
-
-from starlette.concurrency import run_in_threadpool
+from functools import partial
+from typing import Final
 
 import companion
-from companion.server.responses import encode
+from companion.server.giving_way import GivingWay
+from companion.server.large_answers import FEW_ITEMS, FEW_UAVS, LargeAnswers, Make, UavParts
+from companion.server.responses import encode_in_parts
 from companion.values import BeamSet
-from companion.views import beam_state, glance, guaranteed_gain, records, state, uav_state
+from companion.views import beam_state, glance, guaranteed_gain, records, state
 from companion.views import fleet as fleet_view
-from companion.views.as_json import Json
+from companion.views.as_json import Json, as_json
 from companion.views.state import Node
 
 
@@ -30,28 +29,64 @@ class Topic(StrEnum):
     EVENTS = "events"
 
 
-def message(topic: Topic, body: Json, uavs: frozenset[str]) -> str | bytes:
+@dataclass(frozen=True, slots=True)
+class RecordBody:
+    """Beams of one update as they go into a record; their times are in UTC."""
+
+    beams: BeamSet
+    sequence: int
+    guaranteed_db: list[float | None] | None
+
+
+Body = Json | RecordBody | UavParts
+
+FEW_WEIGHTS: Final = 2048  # weights up to which the event loop encodes at once
+
+
+def message(topic: Topic, body: Body, uavs: frozenset[str], way: GivingWay) -> str | bytes:
     """Return a topic's body as sent: binary for records, else JSON; only ``uavs`` if not empty."""
-    if topic is Topic.RECORDS:
+    if isinstance(body, RecordBody):
         return _record(body, uavs)
-    return encode({"topic": topic, **(_only(topic, body, uavs) if uavs else body)}).decode()
+    if isinstance(body, UavParts):
+        return body.encode({"topic": topic}, uavs).decode()
+    shown = _only(topic, body, uavs) if uavs else body
+    depth = 4 if topic is Topic.LINKS else 2
+    return encode_in_parts({"topic": topic, **shown}, way, depth).decode()
 
 
-def _record(body: Json, uavs: frozenset[str]) -> bytes:
-    made: BeamSet = body["beams"]
+def is_large(topic: Topic, body: Body, uavs: frozenset[str]) -> bool:
+    """Return whether the encoding of a message would delay the event loop."""
+    if isinstance(body, RecordBody):
+        return body.beams.weights.size > FEW_WEIGHTS
+    if topic is not Topic.LINKS and 0 < len(uavs) <= FEW_UAVS:
+        return False
+    if isinstance(body, UavParts):
+        return len(body.parts) > FEW_UAVS
+    match topic:
+        case Topic.BEAMS:
+            return len(body["beams"]) + len(body["left_out"]) > FEW_ITEMS
+        case Topic.WEIGHTS:
+            return len(body["uavs"]) * len(body["re"]) > FEW_WEIGHTS
+        case Topic.LINKS:
+            return sum(len(one["components"]) for one in body["links"]) > FEW_ITEMS
+        case Topic.FLEET:
+            return len(body["uavs"]) > FEW_ITEMS
+        case _:
+            return False
+
+
+def _record(body: RecordBody, uavs: frozenset[str]) -> bytes:
+    made, sure = body.beams, body.guaranteed_db
     kept = [i for i, uav in enumerate(made.uavs) if not uavs or uav in uavs]
     shown = replace(made, beams=tuple(made.beams[i] for i in kept), weights=made.weights[:, kept])
-    sure = body["guaranteed_db"]
     held = None if sure is None else [sure[i] for i in kept]
-    (whole,) = records.encode(shown, body["sequence"], held)
+    (whole,) = records.encode(shown, body.sequence, held)
     return whole
 
 
 def _only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
     """Return a body without other UAVs; values that belong to no UAV stay."""
     match topic:
-        case Topic.UAVS:
-            return body | {"uavs": [one for one in body["uavs"] if one["id"] in uavs]}
         case Topic.BEAMS:
             parts = {
                 key: [one for one in body[key] if one["uav"] in uavs]
@@ -70,31 +105,30 @@ def _only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
             return body
 
 
-async def _beams(node: Node) -> Json:
+def _beams(node: Node) -> Make[Json]:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
     age_s = (node.now_ns() - update.t_ns) * 1e-9
-    return await run_in_threadpool(
-        beam_state.beams, node.pipeline, node.equipment, update, age_s=age_s, lead_ms=0.0
-    )
+    pipeline, equipment = node.pipeline, node.equipment
+    return lambda _: beam_state.beams(pipeline, equipment, update, age_s, 0.0)
 
 
-def _weights(node: Node) -> Json:
+def _weights(node: Node) -> Make[Json]:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
-    return beam_state.weights(node.pipeline, update.beams, 0.0)
+    return lambda _: beam_state.weights(node.pipeline, update.beams, 0.0)
 
 
-async def _records(node: Node) -> Json:
+def _records(node: Node) -> Make[RecordBody]:
     pipeline = node.pipeline
     update, number = pipeline.last_update, max(pipeline.updates - 1, 0)
     update = update or pipeline.look(node.now_ns())
-    sure = None
-    if pipeline.settings.records.guaranteed:
-        sure = await run_in_threadpool(guaranteed_gain.gains_db, pipeline, node.equipment, update)
-    return {
-        "beams": records.in_utc(pipeline, update.beams),
-        "sequence": number,
-        "guaranteed_db": sure,
-    }
+
+    def made(_way: GivingWay) -> RecordBody:
+        sure = None
+        if pipeline.settings.records.guaranteed:
+            sure = guaranteed_gain.gains_db(pipeline, node.equipment, update)
+        return RecordBody(records.in_utc(pipeline, update.beams), number, sure)
+
+    return made
 
 
 def _status(node: Node) -> Json:
@@ -102,20 +136,41 @@ def _status(node: Node) -> Json:
     return {"valid_at": shown["time"], **shown}
 
 
-BODIES: Final[dict[Topic, Callable[[Node], Any]]] = {
-    Topic.UAVS: uav_state.uavs,
-    Topic.BEAMS: _beams,
-    Topic.WEIGHTS: _weights,
-    Topic.RECORDS: _records,
-    Topic.STATUS: _status,
-    Topic.LINKS: state.links,
-    Topic.FLEET: lambda node: fleet_view.fleet(node.pipeline, node.fleet_status(), node.now_ns()),
-    Topic.EVENTS: glance.events,
-}
+def _links(node: Node) -> Make[Json]:
+    show = state.links(node)
+    return lambda _: show()
 
 
-async def body(topic: Topic, node: Node) -> Json:
-    """Return the body of a topic, as the path of the same name answers."""
-    made = BODIES[topic](node)
-    found: Json = await made if inspect.isawaitable(made) else made
-    return found
+def _fleet(node: Node) -> Make[Json]:
+    shown = fleet_view.fleet(node.fleet_status(), node.now_ns())
+    return lambda _: as_json(shown, node.pipeline.utc_ns)
+
+
+async def body(topic: Topic, node: Node, large: LargeAnswers) -> Body:
+    """Return the body of a topic, as the path of the same name answers.
+
+    Raises ``HTTPException`` 503 if the work slots are full.
+    """
+    update = node.pipeline.last_update
+    beams = 0 if update is None else update.beams.weights.size
+    match topic:
+        case Topic.UAVS:
+            return await large.uavs()
+        case Topic.BEAMS:
+            return await large.made(topic, partial(_beams, node))
+        case Topic.WEIGHTS:
+            many = beams > FEW_WEIGHTS
+            return await large.made(topic, partial(_weights, node), is_large=many)
+        case Topic.RECORDS:
+            many = node.pipeline.settings.records.guaranteed
+            return await large.made(topic, partial(_records, node), is_large=many)
+        case Topic.STATUS:
+            return _status(node)
+        case Topic.LINKS:
+            many = state.component_count(node) > FEW_ITEMS
+            return await large.made(topic, partial(_links, node), is_large=many)
+        case Topic.FLEET:
+            many = fleet_view.offer_count(node.fleet_status()) > FEW_ITEMS
+            return await large.made(topic, partial(_fleet, node), is_large=many)
+        case Topic.EVENTS:
+            return glance.events(node)

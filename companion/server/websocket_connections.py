@@ -9,6 +9,7 @@ from typing import Any, Final
 
 from uvicorn.protocols.utils import ClientDisconnected
 from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.exceptions import InvalidState
 
 from companion.server.connections import BUFFER_BYTES, STALL_TIMEOUT_S
 from companion.values.budget import Budget
@@ -20,6 +21,10 @@ CLOSE_S: Final = 2.0  # time limit for a client to confirm that the connection i
 PING_S: Final = 4.0  # time between pings
 PONG_S: Final = STALL_TIMEOUT_S - PING_S
 """Time limit for the answer to a ping, or for another sign that the client reads, seconds."""
+
+
+FRAGMENT_CHARS: Final = 65_536
+"""Characters of a message that are sent, and copied for its client, at a time."""
 
 
 class BoundedWebSocket(WebSocketsSansIOProtocol):
@@ -79,9 +84,28 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         """Send a message of the application; see ASGI."""
         if self.close_sent and not self.disconnected:
             raise ClientDisconnected  # closed here, because the client sent too much
-        await super().send(message)
+        text = message.get("text") if self.handshake_complete else None
+        if text is not None and len(text) > FRAGMENT_CHARS:
+            await self._send_in_fragments(text)
+        else:
+            await super().send(message)
         if self.close_sent:
             self._abort_later()
+
+    async def _send_in_fragments(self, text: str) -> None:
+        """Send a message of megabytes a fragment at a time, as fast as the client takes them."""
+        for start in range(0, len(text), FRAGMENT_CHARS):
+            await self.writable.wait()
+            if self.disconnected:
+                raise ClientDisconnected
+            piece = text[start : start + FRAGMENT_CHARS].encode()
+            send = self.conn.send_continuation if start else self.conn.send_text
+            try:
+                send(piece, start + FRAGMENT_CHARS >= len(text))
+            except InvalidState:  # closed meanwhile
+                raise ClientDisconnected from None
+            self.transport.write(b"".join(self.conn.data_to_send()))
+            await asyncio.sleep(0)
 
     def replace(self, code: int, reason: str) -> None:
         """Close the connection in favour of another client."""

@@ -1,7 +1,8 @@
 """Slots for work off the event loop: a few requests run at once, some wait, the rest fail."""
 
 import asyncio
-from collections.abc import Callable
+import contextlib
+from collections.abc import AsyncIterator, Callable
 from typing import Final, TypeVar
 
 from starlette.concurrency import run_in_threadpool
@@ -23,6 +24,7 @@ class WorkSlots:
     def __init__(self, at_once: int = AT_ONCE, waiting: int = WAITING) -> None:
         self.running = 0
         self._free = asyncio.Semaphore(at_once)
+        self._no_long = asyncio.Semaphore(1)
         self._room = at_once + waiting
 
     def refuse_if_full(self) -> None:
@@ -30,16 +32,25 @@ class WorkSlots:
         if self._room == 0:
             raise HTTPException(503, "too many requests at once", {"retry-after": "1"})
 
-    async def run(self, work: Callable[[], T]) -> T:
-        """Run work on another thread when a slot is free. Raises ``HTTPException`` 503."""
+    @contextlib.asynccontextmanager
+    async def slot(self, *, is_long: bool = False) -> AsyncIterator[None]:
+        """Hold a slot, as soon as one is free. Raises ``HTTPException`` 503.
+
+        Long work holds one slot at a time, so that the other one is left for short work.
+        """
         self.refuse_if_full()
         self._room -= 1
         try:
-            async with self._free:
+            async with self._no_long if is_long else contextlib.nullcontext(), self._free:
                 self.running += 1
                 try:
-                    return await run_in_threadpool(work)
+                    yield
                 finally:
                     self.running -= 1
         finally:
             self._room += 1
+
+    async def run(self, work: Callable[[], T]) -> T:
+        """Run work on another thread when a slot is free. Raises ``HTTPException`` 503."""
+        async with self.slot():
+            return await run_in_threadpool(work)

@@ -1,21 +1,23 @@
 """Answer of ``/v1/design``: the observer in use, its gains, and its certificate."""
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 
 from companion.pipeline import assembly
-from companion.pipeline.fold import Pipeline
+from companion.pipeline.fold import UavSnapshot
 from companion.settings.files import kinematic_design
 from companion.settings.model import Settings
 from companion.settings.tracking import ObserverSettings
 from companion.tracking.design import answers, gain_table
 from companion.tracking.design.gain_table import KinematicDesign
 from companion.tracking.observers.kinematic import VELOCITY_SHARE
-from companion.values import FloatArray, Limits, Track
+from companion.tracking.track_snapshot import TrackSnapshot
+from companion.values import FloatArray, Limits
 from companion.values.described import Inline, Meaning
-from companion.views.as_json import Json, as_json
+from companion.views.as_json import Json, Utc, as_json
 
 Matrix = list[list[float]]
 Model = Literal["kinematic", "position"]
@@ -105,8 +107,8 @@ class DesignView:
         self._default_bounds = _bounds(settings.observer, assembly.default_limits(settings))
         self._table = None if self._observer.model == "position" else kinematic_design(settings)
 
-    def show(self, pipeline: Pipeline, now_ns: int) -> Json:
-        """Return the answer of ``/v1/design``.
+    def show(self, snapshots: Iterable[UavSnapshot], now_ns: int, utc_ns: Utc) -> Json:
+        """Return the answer of ``/v1/design`` for UAVs without the carrier. Runs on any thread.
 
         ``designs`` has the keys of ``companion design --json``, with one entry for each UAV with a
         known interval. ``feasible``: the interval is in the certified range; outside of this range,
@@ -120,16 +122,15 @@ class DesignView:
             if self._table is None
             else _certificate(self._table, self._default_bounds),
             designs=[
-                UavDesign(uav=track.uav, **self._row(pipeline, track, track.dt_s))
-                for track in pipeline.tracks(now_ns, now_ns)
-                if track.dt_s is not None and track.dt_s > 0
+                UavDesign(uav=track.fix.uav, **self._row(track, track.last.dt_s))
+                for track, _ in snapshots
+                if track.last.dt_s is not None and track.last.dt_s > 0
             ],
         )
-        return as_json(shown, pipeline.utc_ns)
+        return as_json(shown, utc_ns)
 
-    def _row(self, pipeline: Pipeline, track: Track, dt_s: float) -> Json:
-        given, newest = self._observer, pipeline.tracker.newest(track.uav)
-        has_velocity = newest is not None and newest.velocity_ned_mps is not None
+    def _row(self, track: TrackSnapshot, dt_s: float) -> Json:
+        given, has_velocity = self._observer, track.fix.velocity_ned_mps is not None
         if self._table is not None:
             bounds = _bounds(given, track.limits)
             return _kinematic(self._table, bounds, dt_s) if has_velocity else _shared(bounds, dt_s)

@@ -8,11 +8,9 @@ import numpy as np
 from companion.pipeline.fleet.duties import Handover
 from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fleet.neighbours import Neighbour
-from companion.pipeline.fold import Pipeline
 from companion.tracking.geodesy import Place
 from companion.values import Offer
 from companion.values.described import DescribedEnum, Inline, Meaning
-from companion.views.as_json import Json, as_json
 from companion.views.served import FleetStatus, offers_of, served_by, standing
 
 
@@ -126,24 +124,31 @@ class Fleet:
     ] = 0
 
 
-def fleet(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Json:
-    """Return the answer of ``/v1/fleet``; ``node`` is null without a fleet."""
-    shown = Fleet(valid_at_ns=now_ns)
-    if status is not None:
-        member = status.member
-        shown = Fleet(
-            valid_at_ns=now_ns,
-            node=member.name,
-            site=status.site,
-            nodes=nodes(member, now_ns),
-            uavs=_uavs(member, now_ns),
-            handovers=list(member.handovers),
-            sent_bps=status.sent_bps,
-            heard_bps=status.heard_bps,
-            damaged=status.damaged,
-            untold=member.sharing.dropped,
-        )
-    return as_json(shown, pipeline.utc_ns)
+def offer_count(status: FleetStatus | None) -> int:
+    """Return how many offers of all nodes the answer of ``/v1/fleet`` is made of."""
+    if status is None:
+        return 0
+    others = (known.offers or () for known in status.member.neighbours.values())
+    return len(status.member.offers) + sum(map(len, others))
+
+
+def fleet(status: FleetStatus | None, now_ns: int) -> Fleet:
+    """Return the answer of ``/v1/fleet``, which any thread may convert to JSON."""
+    if status is None:
+        return Fleet(valid_at_ns=now_ns)
+    member = status.member
+    return Fleet(
+        valid_at_ns=now_ns,
+        node=member.name,
+        site=status.site,
+        nodes=nodes(member, now_ns),
+        uavs=_uavs(member, now_ns),
+        handovers=list(member.handovers),
+        sent_bps=status.sent_bps,
+        heard_bps=status.heard_bps,
+        damaged=status.damaged,
+        untold=member.sharing.dropped,
+    )
 
 
 def nodes(member: FleetMember, now_ns: int) -> list[FleetNode]:

@@ -1,8 +1,8 @@
 """The newest frame of every message from every sender; frames are decoded only on request."""
 
 from collections import OrderedDict
-from dataclasses import dataclass
-from typing import Final
+from collections.abc import Iterable
+from typing import Final, NamedTuple
 
 from companion.values import Frame, Source
 
@@ -13,19 +13,18 @@ Beyond it the least recently received one is dropped.
 """
 
 
-@dataclass(slots=True)
-class Kept:
+class Kept(NamedTuple):
     """Newest frame of one message of one sender, the number of frames, and the first arrival."""
 
     frame: Frame
     first_ns: int
-    count: int = 1
+    counter: int = 1
 
     @property
     def frequency_hz(self) -> float | None:
         """Mean rate of the message; None after a single one."""
         passed_ns = self.frame.t_ns - self.first_ns
-        return (self.count - 1) / (passed_ns * 1e-9) if passed_ns > 0 else None
+        return (self.counter - 1) / (passed_ns * 1e-9) if passed_ns > 0 else None
 
 
 class LastMessages:
@@ -40,8 +39,7 @@ class LastMessages:
         key = frame.source, frame.msgid
         kept = self._kept.get(key)
         if kept is not None:
-            kept.frame = frame
-            kept.count += 1
+            self._kept[key] = Kept(frame, kept.first_ns, kept.counter + 1)
             self._kept.move_to_end(key)
             return
         self._kept[key] = Kept(frame, frame.t_ns)
@@ -52,10 +50,14 @@ class LastMessages:
         """Return the newest message of a kind from a sender; None if none was received."""
         return self._kept.get((source, msgid))
 
-    def by_sender(self) -> dict[Source, list[Kept]]:
-        """Return copies of all frames, safe for another thread, ordered by sender and id."""
-        found: dict[Source, list[Kept]] = {}
-        for (source, _), kept in sorted(self._kept.items()):
-            copy = Kept(kept.frame, kept.first_ns, kept.count)
-            found.setdefault(source, []).append(copy)
-        return found
+    def all(self) -> list[Kept]:
+        """Return all frames, for any thread."""
+        return list(self._kept.values())
+
+
+def by_sender(kept: Iterable[Kept]) -> dict[Source, list[Kept]]:
+    """Return frames by sender, ordered by sender and message id."""
+    found: dict[Source, list[Kept]] = {}
+    for one in sorted(kept, key=lambda one: (one.frame.source, one.frame.msgid)):
+        found.setdefault(one.frame.source, []).append(one)
+    return found

@@ -77,6 +77,10 @@ class Links:
     message_rates: Annotated[list[MessageRate], Meaning("rates requested of UAVs")]
 
 
+Components = list[tuple[Source, ComponentStatus]]
+"""Components received over a link, with their counts."""
+
+
 def link(item: LinkStatus, share: LinkShare, now_ns: int) -> LinkState:
     """Return a link in the form of ``/v1/status`` and ``/v1/links``."""
     age_s = None if item.heard_ns is None else (now_ns - item.heard_ns) * 1e-9
@@ -96,9 +100,12 @@ def link(item: LinkStatus, share: LinkShare, now_ns: int) -> LinkState:
     )
 
 
-def components(item: LinkStatus, now_ns: int) -> list[Component]:
-    """Return the components received over a link, ordered by system and component."""
+def components(received: Components, now_ns: int) -> list[Component]:
+    """Return the components received over a link, ordered by system and component.
+
+    Those may receive frames meanwhile, after ``now_ns``; their age is then 0.
+    """
     return [
-        Component(who, heard, (now_ns - heard.heard_ns) * 1e-9)
-        for who, heard in sorted(item.components.items())
+        Component(who, heard, max(0, now_ns - heard.heard_ns) * 1e-9)
+        for who, heard in sorted(received, key=lambda pair: pair[0])
     ]

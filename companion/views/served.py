@@ -1,13 +1,14 @@
 """Nodes of the fleet that serve each UAV, and reasons why no node serves a UAV."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from companion.pipeline import blame
 from companion.pipeline.fleet.assignment import offer_value_db
 from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fold import Pipeline
-from companion.values import Blame, Offer, Standing
+from companion.values import Blame, Offer, Standing, Track
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -27,7 +28,7 @@ class Served:
 
     node: str  # this node
     by: Mapping[str, list[str]]  # nodes that serve each UAV, without excluded nodes
-    unserved: Mapping[str, Blame]  # UAVs that no node serves, with the reason
+    unserved: Sequence[str]  # UAVs that no node serves
     elsewhere: int  # number of UAVs that only other nodes serve
 
     def is_here(self, uav: str) -> bool:
@@ -35,26 +36,54 @@ class Served:
         return self.node in self.by.get(uav, [])
 
 
-def served_uavs(pipeline: Pipeline, status: FleetStatus | None, now_ns: int) -> Served | None:
-    """Return which nodes serve each UAV, and why no node does; None without a fleet."""
+def served_uavs(
+    pipeline: Pipeline, status: FleetStatus | None, now_ns: int, uavs: Iterable[str] | None = None
+) -> Served | None:
+    """Return which nodes serve each UAV; None without a fleet. ``uavs``: None means all."""
     if status is None:
         return None
-    member = status.member
+    member, wants = status.member, pipeline.targets.wants
     by = served_by(member, now_ns)
-    wanted = [uav for uav in pipeline.tracker.uavs if pipeline.targets.wants(uav)]
-    alone = [uav for uav in wanted if uav not in by]
-    tracks = pipeline.tracks(now_ns, now_ns, alone) if alone else []
-    full = _full(member, now_ns) if tracks else {}
-    offers = offers_of(member) if tracks else {}
-    unserved = dict[str, Blame]()
-    for track in tracks:
-        given = offers.get(track.uav, {})
+    wanted = [uav for uav in (pipeline.tracker.uavs if uavs is None else uavs) if wants(uav)]
+    return Served(
+        node=member.name,
+        by=by,
+        unserved=[uav for uav in wanted if uav not in by],
+        elsewhere=sum(uav in by and member.name not in by[uav] for uav in wanted),
+    )
+
+
+class Within(NamedTuple):
+    """What the nodes of a fleet can do for a UAV that none of them serves.
+
+    reached  some node's array has a gain towards it
+    full     each of those serves as many UAVs as it may
+    """
+
+    reached: bool
+    full: bool
+
+    def blame(self, track: Track) -> Blame:
+        """Return why no node serves the UAV."""
+        return blame.of_unserved(track, reached=self.reached, full=self.full)
+
+
+def within_reach(
+    status: FleetStatus | None, served: Served | None, now_ns: int
+) -> dict[str, Within]:
+    """Return what the fleet can do for each UAV that it does not serve; empty without a fleet."""
+    if status is None or served is None or not served.unserved:
+        return {}
+    full, offers = _full(status.member, now_ns), offers_of(status.member)
+    found = dict[str, Within]()
+    for uav in served.unserved:
         able = [
-            full.get(node, False) for node, one in given.items() if offer_value_db(one) is not None
+            full.get(node, False)
+            for node, one in offers.get(uav, {}).items()
+            if offer_value_db(one) is not None
         ]
-        unserved[track.uav] = blame.of_unserved(track, reached=bool(able), full=all(able))
-    elsewhere = sum(uav in by and member.name not in by[uav] for uav in wanted)
-    return Served(node=member.name, by=by, unserved=unserved, elsewhere=elsewhere)
+        found[uav] = Within(bool(able), all(able))
+    return found
 
 
 def offers_of(member: FleetMember) -> dict[str, dict[str, Offer]]:

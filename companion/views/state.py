@@ -1,6 +1,6 @@
 """The state of the program as shown by the API."""
 
-from collections.abc import Awaitable, Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Literal, Protocol
 
@@ -18,7 +18,7 @@ from companion.views.center_state import Center
 from companion.views.health import Headline
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
-from companion.views.link_state import HeardLink, Links, LinkState, OutLink
+from companion.views.link_state import Components, HeardLink, Links, LinkState, OutLink
 from companion.views.series import Series
 from companion.views.served import FleetStatus, served_uavs
 
@@ -119,21 +119,34 @@ class Node(Protocol):
     def ticked(self) -> Awaitable[None]: ...
 
 
-def links(node: Node) -> Json:
-    """Return the answer of ``/v1/links``."""
-    now_ns = node.now_ns()
-    heard = [
-        HeardLink(
-            link_state.link(item, node.pipeline.senders.link_share(item.url), now_ns),
-            link_state.components(item, now_ns),
-        )
-        for item in node.links()
-    ]
+def component_count(node: Node) -> int:
+    """Return the number of components received over all links."""
+    return sum(len(item.components) for item in node.links())
+
+
+def links(node: Node) -> Callable[[], Json]:
+    """Read the links; return a function that makes the answer of ``/v1/links``, on any thread.
+
+    There may be thousands of components; their counts are read by that function.
+    """
+    now_ns, utc_ns = node.now_ns(), node.pipeline.utc_ns
+    heard, components = list[HeardLink](), list[Components]()
+    for item in node.links():
+        share = node.pipeline.senders.link_share(item.url)
+        heard.append(HeardLink(link_state.link(item, share, now_ns), []))
+        components.append(list(item.components.items()))
     out = [OutLink(item) for item in node.out_links()]
-    return as_json(
-        Links(valid_at_ns=now_ns, links=heard, out=out, message_rates=node.message_rates()),
-        node.pipeline.utc_ns,
+    shown = as_json(
+        Links(valid_at_ns=now_ns, links=heard, out=out, message_rates=node.message_rates()), utc_ns
     )
+
+    def made() -> Json:
+        for one, received in zip(shown["links"], components, strict=True):
+            found = link_state.components(received, now_ns)
+            one["components"] = [as_json(component, utc_ns) for component in found]
+        return shown
+
+    return made
 
 
 def status(node: Node, version: str) -> Json:

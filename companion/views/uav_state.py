@@ -1,19 +1,33 @@
-"""UAVs as shown by the API."""
+"""UAVs as shown by the API.
 
+What is known about them is read where the pipeline runs; states are computed from it on any thread.
+"""
+
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
 
-import numpy as np
-
 from companion.mavlink.clock.estimates import ClockEstimate
-from companion.pipeline.fold import Pipeline
-from companion.tracking.geodesy import Place
-from companion.values import AltitudeDatum, Blame, Carrier, Level, Limits, Rejection, Track, Vector
+from companion.pipeline.fold import Pipeline, UavSnapshot
+from companion.tracking.geodesy import LocalFrame, Place
+from companion.values import (
+    AltitudeDatum,
+    Blame,
+    Carrier,
+    Level,
+    Limits,
+    Reason,
+    Rejection,
+    Source,
+    Track,
+    Vector,
+    Verdict,
+)
 from companion.values.described import Inline, Meaning
 from companion.views import health
 from companion.views.as_json import Json, as_json
 from companion.views.health import LinkHealth
-from companion.views.served import Served, served_uavs
+from companion.views.served import Served, Within, served_uavs, within_reach
 from companion.views.state import Node
 
 
@@ -106,68 +120,130 @@ def uavs(node: Node) -> Json:
 
 def states(node: Node, now_ns: int, only: str | None = None) -> list[UavState]:
     """Return the present state of every UAV, or of one."""
-    pipeline = node.pipeline
-    tracks = [
-        track for track in pipeline.tracks(now_ns, now_ns) if only is None or track.uav == only
-    ]
-    if not tracks or pipeline.local is None:
-        return []
+    known = known_uavs(node.pipeline, node.pipeline.tracker.uavs if only is None else [only])
+    return list(overview(node, known, now_ns).states())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KnownUav:
+    """What is known about one UAV besides its place in time; nothing changes it afterwards."""
+
+    snapshot: UavSnapshot
+    is_target: bool
+    same_as: str | None
+    callsign: str | None
+    relays: tuple[Source, ...]
+    judged: Verdict | None
+    refuted: int
+    rejected: Mapping[Reason, int]
+    recent_rejections: list[Rejection]
+
+
+def known_uavs(pipeline: Pipeline, uavs: Iterable[str]) -> list[KnownUav]:
+    """Return what is known about those UAVs that have a track, without the carrier."""
+    targets, aircraft, verdicts = pipeline.targets, pipeline.senders.aircraft, pipeline.health
+    known = []
+    for snapshot in pipeline.snapshots(uav for uav in uavs if uav != pipeline.center.vehicle):
+        uav = snapshot.track.fix.uav
+        refused = pipeline.refusals.of(uav)
+        known.append(
+            KnownUav(
+                snapshot=snapshot,
+                is_target=targets.wants(uav),
+                same_as=targets.identities.same_as(uav),
+                callsign=aircraft.callsign(uav),
+                relays=aircraft.relays(uav),
+                judged=verdicts.verdicts.get(uav),
+                refuted=pipeline.refuted(uav),
+                rejected=dict(refused.counts),
+                recent_rejections=list(refused.recent),
+            )
+        )
+    return known
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overview:
+    """UAVs, carrier and fleet as known now. Any thread may compute states from it.
+
+    local      the local frame of all positions; None: there is none yet
+    machine    cause of weak links by overload
+    within     what the fleet can do for UAVs that it does not serve
+    """
+
+    now_ns: int
+    uavs: Sequence[KnownUav]
+    local: LocalFrame | None
+    carrier: Carrier | None
+    machine: Blame | None
+    served: Served | None
+    within: Mapping[str, Within]
+
+    def tracks(self) -> Iterator[Track]:
+        """Yield the UAVs predicted to now."""
+        for known in self.uavs:
+            yield known.snapshot.at(self.now_ns, self.now_ns)
+
+    def states(self) -> Iterator[UavState]:
+        """Yield the state of each UAV now; none before there is a local frame."""
+        if self.local is None:
+            return
+        for known, track in zip(self.uavs, self.tracks(), strict=True):
+            yield _state(self, known, track, self.local.place(*track.position_ned_m.tolist()))
+
+
+def overview(node: Node, uavs: Sequence[KnownUav], now_ns: int) -> Overview:
+    """Return an overview of some UAVs; ``now_ns`` is not before they became known."""
+    pipeline, status = node.pipeline, node.fleet_status()
     found = pipeline.carrier(now_ns, now_ns)
-    carrier = None if isinstance(found, str) else found
-    columns = pipeline.local.geodetic(np.array([track.position_ned_m for track in tracks]))
-    places = zip(*(column.tolist() for column in columns), strict=True)
-    machine = health.behind(node.arrival_lag.seen(now_ns))
-    served = served_uavs(pipeline, node.fleet_status(), now_ns)
-    return [
-        _state(pipeline, track, carrier, place=Place(*place), machine=machine, served=served)
-        for track, place in zip(tracks, places, strict=True)
-    ]
+    names = [known.snapshot.track.fix.uav for known in uavs]
+    served = served_uavs(pipeline, status, now_ns, names)
+    return Overview(
+        now_ns=now_ns,
+        uavs=uavs,
+        local=pipeline.local,
+        carrier=None if isinstance(found, str) else found,
+        machine=health.behind(node.arrival_lag.seen(now_ns)),
+        served=served,
+        within=within_reach(status, served, now_ns),
+    )
 
 
-def _state(
-    pipeline: Pipeline,
-    track: Track,
-    carrier: Carrier | None,
-    *,
-    place: Place,
-    machine: Blame | None,
-    served: Served | None,
-) -> UavState:
-    """Return the state of a UAV; ``machine`` is the cause of weak links by overload."""
+def _state(seen: Overview, known: KnownUav, track: Track, place: Place) -> UavState:
+    carrier, served, uav = seen.carrier, seen.served, track.uav
     north_m, east_m, down_m = (
         (None, None, None)
         if carrier is None
         else (track.position_ned_m - carrier.position_ned_m).tolist()
     )
-    uav, refused = track.uav, pipeline.refusals.of(track.uav)
-    is_target = pipeline.targets.wants(uav)
     is_here = served is None or served.is_here(uav)
-    judged = pipeline.health.verdicts.get(uav) if is_here else None
-    unserved = None if served is None else served.unserved.get(uav)
-    level, why = health.verdict(judged, machine, unserved)
-    newest, aircraft = pipeline.tracker.newest(uav), pipeline.senders.aircraft
-    report = newest.report if newest else None
+    within = seen.within.get(uav)
+    level, why = health.verdict(
+        known.judged if is_here else None,
+        seen.machine,
+        None if within is None else within.blame(track),
+    )
+    newest, clock = known.snapshot.track.fix, known.snapshot.timeline.clock
+    report = newest.report
     return UavState(
         id=uav,
         verdict=level,
         health=why,
-        target=is_target,
-        served_by=served.by.get(uav, []) if served and is_target else None,
-        same_as=pipeline.targets.identities.same_as(uav),
-        callsign=aircraft.callsign(uav),
-        relays=[str(relay) for relay in aircraft.relays(uav)],
-        alt_datum=report.alt_datum if report else None,
-        fix=ReportedFix(newest.t_ns, Place(report.lat_deg, report.lon_deg, report.alt_m))
-        if newest and report
-        else None,
+        target=known.is_target,
+        served_by=served.by.get(uav, []) if served and known.is_target else None,
+        same_as=known.same_as,
+        callsign=known.callsign,
+        relays=[str(relay) for relay in known.relays],
+        alt_datum=report.alt_datum,
+        fix=ReportedFix(newest.t_ns, Place(report.lat_deg, report.lon_deg, report.alt_m)),
         place=place,
         north_m=north_m,
         east_m=east_m,
         down_m=down_m,
-        heading_deg=report.heading_deg if report else None,
+        heading_deg=report.heading_deg,
         track=track,
-        assumptions=Assumptions(track.limits, pipeline.refuted(uav)),
-        clock=pipeline.clock_estimate(uav),
-        rejected={str(reason): count for reason, count in sorted(refused.counts.items())},
-        recent_rejections=list(refused.recent),
+        assumptions=Assumptions(track.limits, known.refuted),
+        clock=None if clock is None else clock.estimate(),
+        rejected={str(reason): count for reason, count in sorted(known.rejected.items())},
+        recent_rejections=known.recent_rejections,
     )

@@ -157,14 +157,14 @@ def test_identical_subscriptions_share_one_message(make_node: Any, serving: Any)
     async def check() -> None:
         node = make_node()
         made = 0
-        links = node.links
+        message_rates = node.message_rates
 
         def counted() -> Any:
             nonlocal made
             made += 1
-            return links()
+            return message_rates()
 
-        node.links = counted
+        node.message_rates = counted
         async with serving(node) as at:
             many = [await connect(f"ws://{at}/v1/stream?topic=links") for _ in range(10)]
             texts = {await asyncio.wait_for(one.recv(), SOON_S) for one in many}

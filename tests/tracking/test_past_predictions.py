@@ -18,8 +18,8 @@ from companion.tracking.past_predictions import (
     AccelerationModel,
     PastPredictions,
     fading_response,
-    usual_error_m,
     fed_forward,
+    usual_error_m,
 )
 from companion.values import Fix
 

@@ -29,8 +29,8 @@ settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "quick"))
 ALONE = (
     "tests/browser/", "tests/live/", "tests/node/", "tests/test_readme.py", "tests/test_client.py",
     "tests/test_deployment.py", "tests/test_confinement.py", "tests/test_acceptance.py",
-    "tests/server/test_stream_load.py", "tests/recording/test_background.py",
-    "tests/recording/test_foxglove.py",
+    "tests/server/test_stream_load.py", "tests/server/test_ghosts.py",
+    "tests/recording/test_background.py", "tests/recording/test_foxglove.py",
 )  # fmt: skip
 """Tests that start services: one after the other, beside those of the pure rooms."""
 FULL = ("tests/live/", "tests/browser/test_reports.py", "tests/studies/paper/test_experiments.py")

@@ -6,6 +6,7 @@ Data received over these links is ignored.
 import asyncio
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Final
 
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.transport import Link
@@ -14,8 +15,10 @@ from companion.mavlink.trust.admission import admission
 from companion.mavlink.wire.encode import pack
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
-from companion.values import Notice, Source
+from companion.values import Notice, Source, Track
 from companion.views import passed_on
+
+AT_ONCE: Final = 16  # UAVs whose positions are sent in one iteration of the event loop
 
 
 class Outlet:
@@ -77,14 +80,19 @@ class Outlet:
         period_s = 1 / self._settings.rate_hz
         due_s = loop.time()
         while True:
-            self._send_once()
+            await self._send_once()
             due_s = max(due_s + period_s, loop.time())
             await asyncio.sleep(due_s - loop.time())
 
-    def _send_once(self) -> None:
-        now_ns = self._now_ns()
-        named = self._pipeline.tracks(now_ns, now_ns)
-        tracks = [track for track in named if self._admits(track.uav)]
+    async def _send_once(self) -> None:
+        """Send the positions of all UAVs, of a few in one iteration of the event loop."""
+        uavs = [uav for uav in self._pipeline.tracker.uavs if self._admits(uav)]
+        for start in range(0, len(uavs), AT_ONCE):
+            now_ns = self._now_ns()
+            self._send(self._pipeline.tracks(now_ns, now_ns, uavs[start : start + AT_ONCE]))
+            await asyncio.sleep(0)
+
+    def _send(self, tracks: list[Track]) -> None:
         if self._frames:
             for message in self._positions.outgoing(self._pipeline, tracks):
                 number = self._sequences.get(message.source, 0)

@@ -366,7 +366,9 @@ class Pipeline:
             return wanted, []
         first = frozenset(self.settings.beams.priority)
         silent = frozenset(self.tracker.silent(now_ns, self.settings.tracks.lost_s))
-        ranked = sorted(wanted, key=lambda uav: (uav not in first, uav in silent))
+        ranked = wanted
+        if first or silent:
+            ranked = sorted(wanted, key=lambda uav: (uav not in first, uav in silent))
         selected = frozenset(ranked[:most])
         return [uav for uav in wanted if uav in selected], ranked[most:]
 

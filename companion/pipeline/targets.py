@@ -1,10 +1,16 @@
 """Targets: the UAVs for which beams are wanted, and notices when their states change."""
 
 from collections.abc import Iterable, Mapping
+from functools import lru_cache
 
 from companion.settings.model import Settings
 from companion.tracking.identity import Identities
 from companion.values import Duty, Notice, Severity, TrackState, kind_of
+
+
+@lru_cache(maxsize=4096)
+def _reports_itself(uav: str) -> bool:
+    return kind_of(uav).reports_itself
 
 
 class Targets:
@@ -34,13 +40,11 @@ class Targets:
 
     def among(self, uavs: Iterable[str]) -> list[str]:
         """Return the UAVs for which beams are wanted, in the order given."""
-        same_as, carrier, all_kinds = self.identities.same_as, self._carrier, self._all
+        merged, carrier, all_kinds = self.identities.merged, self._carrier, self._all
         wanted = [  # as ``wants``, for thousands at every tick
             uav
             for uav in uavs
-            if uav != carrier
-            and (all_kinds or kind_of(uav).reports_itself)
-            and same_as(uav) is None
+            if uav not in merged and (all_kinds or _reports_itself(uav)) and uav != carrier
         ]
         if self.duty is None:
             return wanted

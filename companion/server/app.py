@@ -17,10 +17,12 @@ from companion.server.large_answers import FEW_ITEMS, LargeAnswers, Make
 from companion.server.metrics import NodeMetrics
 from companion.server.page import PageFiles, web_directory
 from companion.server.responses import (
+    BodyResponse,
     answer,
     answers,
     encode,
     encode_in_parts,
+    encode_with_items,
     json_response,
     refusals,
 )
@@ -133,7 +135,7 @@ def _health_routes(
     )
     async def metrics() -> Response:
         made = await large.of_uavs("metrics", node_metrics.prepare)
-        return Response(made, media_type="text/plain; version=0.0.4")
+        return BodyResponse(made, media_type="text/plain; version=0.0.4")
 
 
 def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
@@ -232,9 +234,9 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     async def design() -> Response:
         def prepare(seen: uav_state.Overview) -> Make[bytes]:
             def make(way: GivingWay) -> bytes:
-                snapshots = way.between(known.snapshot for known in seen.uavs)
-                shown = design_view.show(snapshots, seen.now_ns, pipeline.utc_ns)
-                return encode_in_parts(shown, way)
+                designs = design_view.designs(known.snapshot for known in seen.uavs)
+                rows = (encode(as_json(one, pipeline.utc_ns)) for one in way.between(designs))
+                return encode_with_items(design_view.show(seen.now_ns, pipeline.utc_ns), rows)
 
             return make
 

@@ -8,7 +8,7 @@ from fastapi.responses import Response
 
 from companion.server import models
 from companion.server.moments import Moments
-from companion.server.responses import answers, encode, json_response, refusals
+from companion.server.responses import BodyResponse, answers, encode, json_response, refusals
 from companion.server.work_slots import WorkSlots
 from companion.values import Update, UserError, WeightFormat
 from companion.views import beam_state, weight_formats
@@ -65,7 +65,7 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
             body, headers = await moments.made(lead_ms, form, make)
         except UserError as error:  # the device cannot apply the current beams
             raise HTTPException(409, str(error)) from error
-        return Response(body, media_type=form.media_type, headers=headers)
+        return BodyResponse(body, media_type=form.media_type, headers=headers)
 
     @app.get(
         "/v1/pattern",

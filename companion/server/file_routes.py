@@ -20,7 +20,7 @@ from companion.server.responses import (
 )
 from companion.values import Source
 from companion.views import mavlink_messages
-from companion.views.last_messages import Kept
+from companion.views.last_messages import Kept, by_sender
 from companion.views.state import Node
 
 SystemId = Annotated[int, Path(ge=0, le=255, description="MAVLink system id")]
@@ -99,9 +99,12 @@ def _mavlink(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     async def vehicles() -> Response:
         def prepare() -> Make[bytes]:
             found = kept.all()
-            return lambda way: encode_in_parts(
-                mavlink_messages.vehicles(found, utc_ns), way, depth=4
-            )
+
+            def make(way: GivingWay) -> bytes:
+                senders = way.between(by_sender(found).items())
+                return encode_in_parts(mavlink_messages.vehicles(senders, utc_ns), way, depth=4)
+
+            return make
 
         return json_response(await large.made("vehicles", prepare))
 

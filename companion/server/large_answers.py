@@ -15,7 +15,7 @@ from typing import Final, TypeVar
 from starlette.concurrency import run_in_threadpool
 
 from companion.server.giving_way import NEVER, GivingWay
-from companion.server.responses import encode
+from companion.server.responses import encode, encode_with_items
 from companion.server.shared_work import SharedWork
 from companion.server.work_slots import WorkSlots
 from companion.views import uav_state
@@ -46,9 +46,8 @@ class UavParts:
 
     def encode(self, head: Json, only: frozenset[str]) -> bytes:
         """Return the answer as JSON after the values of ``head``; ``only`` some UAVs if given."""
-        chosen = [part for uav, part in self.parts.items() if not only or uav in only]
-        start = encode({**head, "valid_at": self.valid_at, "uavs": []}).removesuffix(b"]}")
-        return start + b",".join(chosen) + b"]}"
+        chosen = (part for uav, part in self.parts.items() if not only or uav in only)
+        return encode_with_items({**head, "valid_at": self.valid_at, "uavs": []}, chosen)
 
 
 class LargeAnswers:
@@ -86,8 +85,8 @@ class LargeAnswers:
 
         async def work() -> T:
             async with self._work_slots.slot(is_long=True):
-                overview = await self._shared.run("overview", self._overview)
-                return await run_in_threadpool(prepare(overview), GivingWay(self._makes_beams))
+                make = prepare(await self._overview())
+                return await run_in_threadpool(make, GivingWay(self._makes_beams))
 
         return await self._shared.run(what, work)
 

@@ -72,10 +72,13 @@ class NodeMetrics:
                 *before,
                 *_uavs(way.between(overview.tracks())),
                 *beams,
-                *_verdicts(verdicts),
+                *_verdicts(way.between(verdicts)),
                 *after,
             ]
-            registry.register(_Given(way.between([*node, *self._process.collect()])))
+            for metric in node:
+                # They are read once, one after the other.
+                metric.samples = way.between(metric.samples)  # type: ignore[assignment]
+            registry.register(_Given([*node, *self._process.collect()]))
             return generate_latest(registry)
 
         return made

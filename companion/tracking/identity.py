@@ -30,9 +30,10 @@ class _Relayed:
 
 
 class Identities:
-    """Assignment of relayed aircraft to better tracks."""
+    """Assignment of relayed aircraft to better tracks. ``merged`` are those that have one."""
 
     def __init__(self) -> None:
+        self.merged: set[str] = set()
         self._relayed: dict[str, _Relayed] = {}
 
     def same_as(self, uav: str) -> str | None:
@@ -43,6 +44,7 @@ class Identities:
     def forget(self, uav: str) -> None:
         """Forget a relayed aircraft."""
         self._relayed.pop(uav, None)
+        self.merged.discard(uav)
 
     def observe(self, relayed: Fix, better: list[Track]) -> None:
         """Compare a relayed report with the better tracks at its time."""
@@ -53,12 +55,15 @@ class Identities:
         if known is None:
             known = self._relayed[relayed.uav] = _Relayed(match)
             if len(self._relayed) > RELAYED_MAX:
-                del self._relayed[next(iter(self._relayed))]
+                self.forget(next(iter(self._relayed)))
         elif known.near != match:
             known.near, known.in_a_row = match, 0
         known.in_a_row += 1
         if known.in_a_row >= REPORTS_TO_DECIDE:
             known.same_as = match or None
+            self.merged.discard(relayed.uav)
+            if match:
+                self.merged.add(relayed.uav)
 
 
 def _apart_m(relayed: Fix, track: Track) -> float | None:

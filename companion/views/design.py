@@ -1,8 +1,9 @@
 """Answer of ``/v1/design``: the observer in use, its gains, and its certificate."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Annotated, Literal, NamedTuple
+from functools import lru_cache
+from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 
@@ -14,11 +15,11 @@ from companion.settings.tracking import ObserverSettings
 from companion.tracking.design import answers, gain_table
 from companion.tracking.design.gain_table import KinematicDesign
 from companion.tracking.observers.kinematic import VELOCITY_SHARE
-from companion.tracking.track_snapshot import TrackSnapshot
 from companion.values import FloatArray, Limits
 from companion.values.described import Inline, Meaning
 from companion.views.as_json import Json, Utc, as_json
 
+ROWS_KEPT: Final = 4096
 Matrix = list[list[float]]
 Model = Literal["kinematic", "position"]
 
@@ -99,6 +100,8 @@ def _bounds(given: ObserverSettings, limits: Limits) -> Assumed:
 class DesignView:
     """Observer design of one node's settings; the gain table is read once.
 
+    The answer is that of ``show``, with the ``designs`` of all UAVs but the carrier.
+
     Raises ``ConfigError`` if the gain table cannot be read.
     """
 
@@ -106,14 +109,10 @@ class DesignView:
         self._observer = settings.observer
         self._default_bounds = _bounds(settings.observer, assembly.default_limits(settings))
         self._table = None if self._observer.model == "position" else kinematic_design(settings)
+        self._known_row = lru_cache(ROWS_KEPT)(self._row)  # until the next report nothing changes
 
-    def show(self, snapshots: Iterable[UavSnapshot], now_ns: int, utc_ns: Utc) -> Json:
-        """Return the answer of ``/v1/design`` for UAVs without the carrier. Runs on any thread.
-
-        ``designs`` has the keys of ``companion design --json``, with one entry for each UAV with a
-        known interval. ``feasible``: the interval is in the certified range; outside of this range,
-        the gains at its end apply.
-        """
+    def show(self, now_ns: int, utc_ns: Utc) -> Json:
+        """Return the answer of ``/v1/design``, to which ``designs`` is to be added."""
         shown = Design(
             valid_at_ns=now_ns,
             model=self._observer.model,
@@ -121,18 +120,27 @@ class DesignView:
             certificate=None
             if self._table is None
             else _certificate(self._table, self._default_bounds),
-            designs=[
-                UavDesign(uav=track.fix.uav, **self._row(track, track.last.dt_s))
-                for track, _ in snapshots
-                if track.last.dt_s is not None and track.last.dt_s > 0
-            ],
+            designs=[],
         )
         return as_json(shown, utc_ns)
 
-    def _row(self, track: TrackSnapshot, dt_s: float) -> Json:
-        given, has_velocity = self._observer, track.fix.velocity_ned_mps is not None
+    def designs(self, snapshots: Iterable[UavSnapshot]) -> Iterator[UavDesign]:
+        """Yield the designs of UAVs with a known interval, as in ``companion design --json``.
+
+        ``feasible``: the interval is in the certified range; outside of this range, the gains at
+        its end apply. Runs on any thread.
+        """
+        for track, _ in snapshots:
+            dt_s = track.last.dt_s
+            if dt_s is not None and dt_s > 0:
+                has_velocity = track.fix.velocity_ned_mps is not None
+                row = self._known_row(dt_s, has_velocity, track.limits)
+                yield UavDesign(uav=track.fix.uav, **row)
+
+    def _row(self, dt_s: float, has_velocity: bool, limits: Limits) -> Json:
+        given = self._observer
         if self._table is not None:
-            bounds = _bounds(given, track.limits)
+            bounds = _bounds(given, limits)
             return _kinematic(self._table, bounds, dt_s) if has_velocity else _shared(bounds, dt_s)
         lead_s = given.feedthrough_s
         if has_velocity:

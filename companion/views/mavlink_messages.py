@@ -16,10 +16,10 @@ from typing import Annotated, Any, Final
 
 import numpy as np
 
-from companion.values import UtcNs
+from companion.values import Source, UtcNs
 from companion.values.described import Meaning
 from companion.views.as_json import Json, rfc3339
-from companion.views.last_messages import Kept, by_sender
+from companion.views.last_messages import Kept
 
 _PLAIN: Final = {"char", "float", "double"}
 
@@ -145,11 +145,13 @@ def messages(kept: Iterable[Kept], utc_ns: Callable[[int], UtcNs]) -> Json:
     return {one["message"]["type"]: one for one in shown if one is not None}
 
 
-def vehicles(kept: Iterable[Kept], utc_ns: Callable[[int], UtcNs]) -> Json:
+def vehicles(
+    by_sender: Iterable[tuple[Source, list[Kept]]], utc_ns: Callable[[int], UtcNs]
+) -> Json:
     """Return all vehicles, their components, and the components' last messages."""
     found: Json = {}
-    for source, theirs in by_sender(kept).items():
+    for source, kept in by_sender:
         vehicle = found.setdefault(str(source.sysid), {"id": source.sysid, "components": {}})
-        component = {"id": source.compid, "messages": messages(theirs, utc_ns)}
+        component = {"id": source.compid, "messages": messages(kept, utc_ns)}
         vehicle["components"][str(source.compid)] = component
     return found

@@ -69,6 +69,17 @@ class StandIn:
         self._ticked.set()
         self._ticked.clear()
 
+    def advance(self, after_s: float) -> None:
+        """Advance time without an update."""
+        self._now_ns += round(after_s * 1e9)
+
+    def pretend_update(self, text: str) -> None:
+        """Publish a notice and the newest beams once more, as after an update."""
+        self.say(text)
+        self.pipeline.updates += 1
+        self._ticked.set()
+        self._ticked.clear()
+
     def say(self, text: str) -> None:
         """Publish a notice to the operator."""
         self.notices.append(

@@ -57,12 +57,12 @@ class Offers:
         self.made |= made
 
     def _made_of(self, now_ns: int, uavs: list[str]) -> Callable[[], dict[str, Offer]]:
-        """Predict some UAVs now, and return a function that computes the offers to them."""
+        """Read some UAVs now, and return a function that computes the offers to them."""
         pipeline = self._pipeline
         at_ns = now_ns + round(pipeline.settings.beams.actuation_delay_s * 1e9)
         carrier = pipeline.carrier(now_ns, at_ns)
         known = None if isinstance(carrier, str) else carrier
-        tracks = pipeline.tracks(now_ns, at_ns, uavs)
+        snapshots = pipeline.snapshots(uavs)
         heard_s = {uav: self._silent_s(uav, now_ns) for uav in uavs}
         array, alone, coverage = pipeline.array, self._alone, pipeline.coverage
 
@@ -71,7 +71,7 @@ class Offers:
                 aim(
                     now_ns,
                     valid_at_ns=at_ns,
-                    tracks=tracks,
+                    tracks=[one.at(now_ns, at_ns) for one in snapshots],
                     carrier=known,
                     array=array,
                     precoder=alone,

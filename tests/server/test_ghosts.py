@@ -1,0 +1,94 @@
+"""2000 invented UAVs, then eight clients that ask for all of them: beam updates continue."""
+
+import http.client
+import subprocess
+import sys
+import threading
+import time
+from collections import Counter
+from typing import Any
+
+import pytest
+from siege import besieged
+from support import HANG_S, ROOT, Node
+
+GHOSTS = 1990  # with the honest vehicles as many as `[tracks] most`
+CLIENTS = 8
+ROUTES = ("/v1/uavs", "/metrics", "/v1/design", "/v1/mavlink/vehicles")
+LEAST_HZ = 9.0
+SHARE = 0.8
+"""Share of the updates without clients that remains with them, whatever else this machine does."""
+
+
+class Clients:
+    """Clients that ask for some routes in turn, each over one connection, until told to stop."""
+
+    def __init__(self, node: Node, routes: tuple[str, ...]) -> None:
+        self.statuses = Counter[int]()
+        self._until = threading.Event()
+        self._host = node.url.removeprefix("http://")
+        self._threads = [
+            threading.Thread(target=self._ask, args=(routes, number), daemon=True)
+            for number in range(CLIENTS)
+        ]
+
+    def _ask(self, routes: tuple[str, ...], number: int) -> None:
+        connection = http.client.HTTPConnection(self._host, timeout=HANG_S)
+        while not self._until.is_set():
+            connection.request("GET", routes[number % len(routes)])
+            answer = connection.getresponse()
+            answer.read()
+            self.statuses[answer.status] += 1
+            number += 1
+        connection.close()
+
+    def __enter__(self) -> "Clients":
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._until.set()
+        for thread in self._threads:
+            thread.join(HANG_S)
+
+
+def invade(node: Node) -> None:
+    """Let ``GHOSTS`` vehicles appear."""
+    sender = [sys.executable, str(ROOT / "tests" / "crowd.py"), str(node.udp_port), str(GHOSTS)]
+    subprocess.run(sender, check=True, env={"PYTHONPATH": str(ROOT)}, timeout=HANG_S)
+    uavs = node.json("/v1/uavs")["uavs"]
+    assert len(uavs) > GHOSTS - 20  # a few datagrams may be lost
+
+
+def updates_hz(node: Node, seconds: float) -> float:
+    """Return the rate of beam updates over some seconds."""
+    before, begun_s = node.json("/v1/status")["updates"], time.monotonic()
+    time.sleep(seconds)  # the time over which is measured
+    after = node.json("/v1/status")["updates"]
+    return float(after - before) / (time.monotonic() - begun_s)
+
+
+def test_beams_are_updated_while_clients_ask_for_all_uavs(start_node: Any) -> None:
+    with besieged(start_node) as node:
+        invade(node)
+        alone_hz = updates_hz(node, 2.0)
+        with Clients(node, ROUTES) as clients:
+            asked_hz = updates_hz(node, 4.0)
+    assert asked_hz > SHARE * alone_hz
+    assert set(clients.statuses) == {200}
+    assert clients.statuses[200] > CLIENTS
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(600)
+@pytest.mark.parametrize("routes", [*((route,) for route in ROUTES), ROUTES], ids="+".join)
+def test_beams_are_updated_while_clients_ask_for_all_uavs_soak(
+    start_node: Any, routes: tuple[str, ...]
+) -> None:
+    with besieged(start_node) as node:
+        invade(node)
+        with Clients(node, routes):
+            rates = [updates_hz(node, 10.0) for _ in range(3)]
+    print(f"{'+'.join(routes)}: {min(rates):.1f} to {max(rates):.1f} updates/s")
+    assert min(rates) >= LEAST_HZ

@@ -184,8 +184,8 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     )
     async def fleet() -> Response:
         def prepare() -> Make[bytes]:
-            shown = fleet_view.fleet(node.fleet_status(), node.now_ns())
-            return lambda way: encode_in_parts(as_json(shown, pipeline.utc_ns), way)
+            show = fleet_view.fleet(node.fleet_status(), node.now_ns())
+            return lambda way: encode_in_parts(as_json(show(), pipeline.utc_ns), way)
 
         many = fleet_view.offer_count(node.fleet_status()) > FEW_ITEMS
         return json_response(await large.made("fleet", prepare, is_large=many))

@@ -142,8 +142,8 @@ def _links(node: Node) -> Make[Json]:
 
 
 def _fleet(node: Node) -> Make[Json]:
-    shown = fleet_view.fleet(node.fleet_status(), node.now_ns())
-    return lambda _: as_json(shown, node.pipeline.utc_ns)
+    show = fleet_view.fleet(node.fleet_status(), node.now_ns())
+    return lambda _: as_json(show(), node.pipeline.utc_ns)
 
 
 async def body(topic: Topic, node: Node, large: LargeAnswers) -> Body:

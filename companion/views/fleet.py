@@ -1,6 +1,8 @@
 """The fleet as shown by the API: nodes, the UAVs that each serves, offers, handovers."""
 
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Annotated
 
 import numpy as np
@@ -132,23 +134,24 @@ def offer_count(status: FleetStatus | None) -> int:
     return len(status.member.offers) + sum(map(len, others))
 
 
-def fleet(status: FleetStatus | None, now_ns: int) -> Fleet:
-    """Return the answer of ``/v1/fleet``, which any thread may convert to JSON."""
+def fleet(status: FleetStatus | None, now_ns: int) -> Callable[[], Fleet]:
+    """Read the fleet; return a function that makes the answer of ``/v1/fleet``, on any thread."""
     if status is None:
-        return Fleet(valid_at_ns=now_ns)
+        return partial(Fleet, valid_at_ns=now_ns)
     member = status.member
-    return Fleet(
+    uavs = _uavs(member, now_ns)
+    shown = Fleet(
         valid_at_ns=now_ns,
         node=member.name,
         site=status.site,
         nodes=nodes(member, now_ns),
-        uavs=_uavs(member, now_ns),
         handovers=list(member.handovers),
         sent_bps=status.sent_bps,
         heard_bps=status.heard_bps,
         damaged=status.damaged,
         untold=member.sharing.dropped,
     )
+    return lambda: replace(shown, uavs=uavs())
 
 
 def nodes(member: FleetMember, now_ns: int) -> list[FleetNode]:
@@ -212,17 +215,17 @@ def _place(place: tuple[float, float, float] | None) -> Place | None:
     return None if place is None else Place(*place)
 
 
-def _uavs(member: FleetMember, now_ns: int) -> list[FleetUav]:
+def _uavs(member: FleetMember, now_ns: int) -> Callable[[], list[FleetUav]]:
     offers, by = offers_of(member), served_by(member, now_ns)
-    handing = dict(member.duties.handing)
+    handing, unconfirmed = dict(member.duties.handing), frozenset(member.trust.unconfirmed)
     for said in standing(member, now_ns).values():
         handing |= dict(said.handing)
-    return [
+    return lambda: [
         FleetUav(
             uav=uav,
             served_by=by.get(uav, []),
             handing_to=handing.get(uav),
-            unconfirmed=uav in member.trust.unconfirmed,
+            unconfirmed=uav in unconfirmed,
             offers=[FleetOffer(name, one) for name, one in sorted(offers.get(uav, {}).items())],
         )
         for uav in sorted({*offers, *by}, key=_natural)

@@ -85,7 +85,7 @@ def crowded(uavs: int, directory: Path) -> StandIn:
             raws = [(GLOBAL_POSITION_INT, report(index, number, 100_000 + 100 * number))]
             raws += [(HEARTBEAT, heartbeat(index, 0))] if number == 0 else []
             for msgid, raw in raws:
-                frame = Frame(node.now_ns(), link, source, msgid, raw)
+                frame = Frame(t_ns=node.now_ns(), link=link, source=source, msgid=msgid, raw=raw)
                 node.last_messages.add(frame)
                 node.pipeline.step(frame)
     links = [LinkStatus(url=link, state="up", heard_ns=node.now_ns(), components=heard)]
@@ -133,9 +133,13 @@ class Serving:
     def __init__(self, node: StandIn) -> None:
         self.node, self.port = node, 0
         self._ready = threading.Event()
-        self.thread = threading.Thread(target=lambda: asyncio.run(self._serve()), daemon=True)
+        self.thread = threading.Thread(target=self._run, daemon=True)
         self.thread.start()
         assert self._ready.wait(HANG_S)
+
+    def _run(self) -> None:
+        with asyncio.Runner() as runner:
+            runner.run(self._serve())
 
     async def _serve(self) -> None:
         self._loop, self._until = asyncio.get_running_loop(), asyncio.Event()

@@ -471,8 +471,8 @@ class Senders:
         An aircraft that changes its type, as one that takes off vertically and then flies as an
         aeroplane, is between both for a while: the assumptions contain those of all its types.
         """
-        vehicle = kind_of(uav).reports_itself
-        component = self._components.get(Source.parse(uav)) if vehicle else None
+        source = _source(uav)
+        component = None if source is None else self._components.get(source)
         if component is None or not component.types:
             return self._assumed(uav, None, None)
         if len(component.types) == 1:
@@ -503,6 +503,12 @@ class Senders:
     def link_share(self, link: str) -> LinkShare:
         """Return the contribution of a link to the reports so far."""
         return self._dedupe.shares.get(link) or LinkShare()
+
+
+@lru_cache(RECORDS_MAX)
+def _source(uav: str) -> Source | None:
+    """Return the MAVLink source of a UAV; None for a relayed aircraft, which has none."""
+    return Source.parse(uav) if kind_of(uav).reports_itself else None
 
 
 def _refused(message: Report | AdsbVehicle, reason: Reason) -> FrameOutcome:

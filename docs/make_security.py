@@ -141,7 +141,7 @@ WAYS: Final = (
         items="as of the connection",
         work=LOOP,
         over="as of the connection",
-        test="tests/server/test_route_cost.py",
+        test="tests/server/test_route_cost.py::test_no_route_holds_the_event_loop",
     ),
     WayIn(
         name="answers that are computed",
@@ -210,7 +210,7 @@ WAYS: Final = (
         items=f"{gimbal.RECEIVED_MAX} datagrams of a gimbal in an update",
         work="on a thread of its own",
         over="the device failed: counted, announced, tried again",
-        test="tests/node/drive/test_mount.py",
+        test="tests/node/drive/test_mount.py::test_malformed_answers_are_device_errors",
     ),
     WayIn(
         name="the recorder",

@@ -223,8 +223,8 @@ def start_node() -> Iterator[Any]:
     """Starts nodes, and ends those that a test left."""
     nodes: list[Node] = []
 
-    def start(*arguments: str) -> Node:
-        nodes.append(Node(*arguments))
+    def start(*arguments: str, code: str | None = None) -> Node:
+        nodes.append(Node(*arguments, code=code))
         return nodes[-1]
 
     yield start

@@ -1,4 +1,7 @@
-"""Carrier of the array, and the local frame, whose origin is fixed or the first report."""
+"""Carrier of the array, and the local frame, whose origin is fixed or the first report.
+
+Over 300 lines: position, attitude and frame of the carrier change together.
+"""
 
 import math
 from dataclasses import dataclass, replace
@@ -36,7 +39,8 @@ from companion.values import (
 HOME_SETTLING_S: Final = 120.0
 """Time after a track's first report in which its restart may move ``home``, seconds."""
 HOME_HEIGHT_M: Final = 20.0  # least error of the first height for which ``home`` moves
-
+STATUS_KEPT_NS: Final = 5_000_000_000
+"""Time for which an estimator status counts beside newer ones of other links."""
 NOTICE_RATIO: Final = 1.25
 """Ratio to the attitude bound last reported above which the bound is reported again."""
 MIN_CONSISTENT_SAMPLES: Final = 4  # older-stamped attitudes in a row that replace the newest
@@ -76,7 +80,7 @@ class CarrierTracker:
         self._angular_acceleration = carrier.AngularAcceleration()
         self._older_run: _AttitudeRun | None = None  # attitudes stamped earlier than the newest
         self._least_bound_rad = math.radians(settings.center.attitude_bound_deg)
-        self._estimator: EstimatorStatus | None = None
+        self._estimators: dict[str, EstimatorStatus] = {}  # newest status over each link
         self._doubted_rad = self._least_bound_rad  # largest bound reported so far
         self._attitude_kept_s = settings.tracks.coasting_s
         self._accuracy_factor = assembly.noise(settings).factor
@@ -165,15 +169,24 @@ class CarrierTracker:
     @property
     def attitude_bound_rad(self) -> float:
         """Bound on the error of the carrier's reported attitudes."""
-        return carrier.reported_bound_rad(self._estimator, self._least_bound_rad)
+        bounds = (
+            carrier.reported_bound_rad(one, self._least_bound_rad)
+            for one in self._estimators.values()
+        )
+        return max(bounds, default=self._least_bound_rad)
 
     def attitude_age_s(self, now: SenderTime) -> float | None:
         """Return the age of the carrier's newest attitude; None if there is none."""
         return None if self._attitude is None else (now.sender_ns - self._attitude[0]) * 1e-9
 
     def trust(self, status: EstimatorStatus) -> Refuted | None:
-        """Process the carrier's estimator status. Returns a refutation if the bound grew."""
-        self._estimator = status
+        """Process the carrier's estimator status. Returns a refutation if the bound grew.
+
+        A status has no stamp: over another, slower link it may be older. The worst one counts.
+        """
+        kept, after_ns = self._estimators, status.t_ns - STATUS_KEPT_NS
+        kept = {link: one for link, one in kept.items() if one.t_ns > after_ns}
+        self._estimators = kept | {status.link: status}
         if self.attitude_bound_rad <= NOTICE_RATIO * self._doubted_rad:
             return None
         self._doubted_rad = self.attitude_bound_rad
@@ -209,7 +222,7 @@ class CarrierTracker:
         if uav == self.vehicle:
             self._attitude = None
             self._contradicted = None
-            self._estimator = None
+            self._estimators.clear()
             self._older_run = None
             self._angular_acceleration = carrier.AngularAcceleration()
 

@@ -217,12 +217,14 @@ class SystemTime:
 class EstimatorStatus:
     """Status of an autopilot's attitude estimator (EKF_STATUS_REPORT).
 
+    link            link over which it came
     knows_attitude  whether the estimator reports its attitude as valid
     compass_ratio   compass innovation over the estimator's gate: above 1 it rejects the compass
     """
 
     t_ns: int
     source: Source
+    link: str
     knows_attitude: bool
     compass_ratio: float
 

@@ -343,6 +343,20 @@ def estimator(t_s: float, ratio: float, flags: int = 831, source: str = "5:1") -
     return sent(t_s, source, message)
 
 
+def test_old_estimator_status_of_a_slower_link_does_not_reduce_the_bound() -> None:
+    """A status has no stamp. After a while without a contradiction the newer one counts alone."""
+    pipeline = Pipeline(settings().override(center={"source": "5:1"}))
+    run(pipeline, [position(0.1, "5:1"), attitude(0.1, "5:1")])
+    pipeline.step(estimator(1.0, 0.8))
+    bad_rad = pipeline.center.attitude_bound_rad
+    assert bad_rad == pytest.approx(0.48)
+    pipeline.step(estimator(1.5, 0.01)._replace(link="slower"))
+    assert pipeline.center.attitude_bound_rad == bad_rad
+    pipeline.step(estimator(2.0, 0.02))
+    pipeline.step(estimator(8.0, 0.02))
+    assert pipeline.center.attitude_bound_rad == pytest.approx(math.radians(3.0))
+
+
 def test_attitude_bound_follows_the_estimator_status() -> None:
     """A ratio can only widen the bound; without an attitude estimate any attitude is possible."""
     held = {"source": "5:1", "turn_acceleration_max_degps2": 0.0}

@@ -249,7 +249,11 @@ def _ekf_status_report(frame: Frame) -> EstimatorStatus:
         raise _RefusedError(Reason.MALFORMED, "compass ratio is negative or not finite")
     knows = bool(flags & _KNOWS_ATTITUDE) and not flags & _UNINITIALIZED
     return EstimatorStatus(
-        t_ns=frame.t_ns, source=frame.source, knows_attitude=knows, compass_ratio=compass_ratio
+        t_ns=frame.t_ns,
+        source=frame.source,
+        link=frame.link,
+        knows_attitude=knows,
+        compass_ratio=compass_ratio,
     )
 
 

@@ -161,7 +161,11 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
         case "EKF_STATUS_REPORT":
             knows = m.flags & dialect.EKF_ATTITUDE != 0
             return EstimatorStatus(
-                t_ns=t_ns, source=source, knows_attitude=knows, compass_ratio=m.compass_variance
+                t_ns=t_ns,
+                source=source,
+                link=link,
+                knows_attitude=knows,
+                compass_ratio=m.compass_variance,
             )
         case "GPS_RAW_INT":
             h_acc, v_acc, vel_acc = (

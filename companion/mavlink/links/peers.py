@@ -184,7 +184,7 @@ class Peers:
         status, senders = self._status, peer.senders
         for item, kept in zip(found, checked or found, strict=True):
             if isinstance(item, Rejection):
-                status.lost[item.reason] = status.lost.get(item.reason, 0) + item.count
+                self.count_rejection(item)
                 continue
             t_ns, _, source, msgid, raw, _ = item
             if raw[0] == MAGIC_V2:
@@ -214,6 +214,11 @@ class Peers:
                 sender.run = 0
             else:
                 self._out_of_order(sender, number)
+
+    def count_rejection(self, refused: Rejection) -> None:
+        """Count a rejection of bytes or frames of this link."""
+        lost = self._status.lost
+        lost[refused.reason] = lost.get(refused.reason, 0) + refused.count
 
     def _out_of_order(self, sender: _PeerSender, number: int) -> None:
         step = (number - sender.due + 1) & 0xFF

@@ -149,6 +149,7 @@ class _Stream(asyncio.Protocol):
         self._held_up: StaleBytes | None = None
         self._unread = b""  # bytes received beyond a piece
         self._reads: asyncio.Handle | None = None
+        self._fault: Exception | None = None  # raised by the processing of a later piece
 
     def __str__(self) -> str:
         return self._address
@@ -187,7 +188,7 @@ class _Stream(asyncio.Protocol):
         try:
             self._read_piece()
         except Exception as fault:  # a defect must end the link, not disappear
-            self._on_close(self, fault)
+            self._fault = fault
             self.abort()
 
     def connection_lost(self, exc: Exception | None) -> None:
@@ -196,9 +197,13 @@ class _Stream(asyncio.Protocol):
             self._held_up.close()
         if self._reads is not None:
             self._reads.cancel()
-        if self._unread:
-            self._upcalls.take(self, self._unread, None)
-        self._on_close(self, exc or HungUpError("the peer hung up"))
+        why = exc or self._fault or HungUpError("the peer hung up")
+        try:
+            if self._unread:
+                self._upcalls.take(self, self._unread, None)
+        except Exception as fault:
+            why = fault
+        self._on_close(self, why)
         self._upcalls.on_peer_gone(self)
 
     def write(self, raw: bytes) -> bool:

@@ -32,8 +32,8 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
-from companion.mavlink.trust.known_peers import KnownPeers
-from companion.mavlink.trust.newcomers import Newcomers
+from companion.mavlink.trust.known_peers import JUDGED, KnownPeers
+from companion.mavlink.trust.newcomers import LATE_NS, Newcomers
 from companion.mavlink.wire import cot_link
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.foreign import ForeignSplitter
@@ -52,7 +52,11 @@ UNFINISHED_S: Final = 10
 PEER_ACTIVE_S: Final = 10.0
 """A listening UDP link sends to the peers from which a frame arrived within this many seconds."""
 
-Receive = Callable[[list[Frame | Rejection]], None]
+CHECKED: Final = JUDGED | {cot_link.TUNNEL}  # messages that are not accepted from every peer
+RESERVED: Final = "TUNNEL: sender id 0:25 is reserved for the service's Cursor on Target links"
+
+Received = Frame | Rejection
+Receive = Callable[[list[Received]], None]
 Notify = Callable[[Notice], None]
 
 
@@ -172,7 +176,12 @@ class Link:
         found = peer.splitter.feed(t_ns, data)
         if found:
             self._pass_on(peer, found)
-        self._newcomers.worked(now_ns, time.perf_counter() - began_s, age_ns)
+        newcomers = self._newcomers
+        if age_ns is not None and age_ns > LATE_NS:
+            newcomers.late()
+        newcomers.worked_s += time.perf_counter() - began_s
+        if now_ns >= newcomers.adapts_ns:
+            newcomers.adapt(now_ns)
         if isinstance(peer.splitter, ForeignSplitter) and not self.url.listens:
             began_ns = peer.splitter.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
@@ -187,44 +196,64 @@ class Link:
             self.status.overflowed = (self.status.overflowed or 0) + frames
             self._overflow(frames)
 
-    def _pass_on(self, peer: Peer, found: list[Frame | Rejection]) -> None:
-        if not isinstance(peer.splitter, ForeignSplitter):
-            found = [_checked_origin(item) for item in found]
+    def _pass_on(self, peer: Peer, found: list[Received]) -> None:
+        """Count what a peer sent, and pass on what is accepted from it.
+
+        Most frames are of senders that are served, and of messages that need no check.
+        """
         if self._guard is not None:
             found = [_checked_by_guard(self._guard, item) for item in found]
-        found = self._admitted(found)
-        checked = [self._checked_for_strangers(peer, item) for item in found]
-        self._peers.count(peer, found, checked)
-        self._receive([_checked_timesync(peer, item) for item in checked])
+        served, has_timesync = self._newcomers.served, False
+        counted, checked = list[Received](), list[Received]()
+        for item in found:
+            kept = item
+            if isinstance(item, Frame):
+                _, _, source, msgid, _, _ = item
+                if source not in served and not self._newcomers.admits(source, item.t_ns):
+                    self._refused += 1
+                    continue
+                if msgid in CHECKED:
+                    kept = self._checked(peer, item)
+                    has_timesync |= msgid == TIMESYNC
+            counted.append(item)
+            checked.append(kept)
+        self._peers.count(peer, counted, checked)
+        if has_timesync:
+            checked = [_checked_timesync(peer, item) for item in checked]
+        if self._refused:
+            self._report_refused(checked)
+        self._receive(checked)
 
-    def _admitted(self, found: list[Frame | Rejection]) -> list[Frame | Rejection]:
-        """Return the items without frames of newcomers beyond the limits, which are counted."""
+    def _report_refused(self, items: list[Received]) -> None:
+        """Add a rejection with the number of newcomers' frames, if one is due."""
         now_ns = self._now_ns()
-        admits = self._newcomers.admits
-        kept = [
-            item for item in found if isinstance(item, Rejection) or admits(item.source, now_ns)
-        ]
-        self._refused += len(found) - len(kept)
-        if self._refused and now_ns - self._refused_ns >= REFUSED_EVERY_NS:
+        if now_ns - self._refused_ns >= REFUSED_EVERY_NS:
             refused = Rejection(
                 t_ns=now_ns, source=self.status.url, reason=Reason.NEWCOMER, count=self._refused
             )
-            kept.append(refused)
+            items.append(refused)
+            self._peers.count_rejection(refused)
             self._refused, self._refused_ns = 0, now_ns
-        return kept
 
-    def _checked_for_strangers(self, peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
-        """Return the item, or a rejection if a known peer brings this message of its sender."""
-        if isinstance(item, Rejection):
-            return item
-        detail = self._known_peers.refusal(self._name, peer.address or self._name, item)
+    def _checked(self, peer: Peer, frame: Frame) -> Received:
+        """Return the frame, or a rejection if it is not accepted from this peer.
+
+        Inner messages of Cursor on Target links come from such links only: any peer could otherwise
+        make tracks of aircraft, as if a receiver had reported them.
+        """
+        reason = Reason.STRANGER
+        if frame.msgid == cot_link.TUNNEL and frame.source == cot_link.SENDER:
+            is_own = isinstance(peer.splitter, ForeignSplitter)
+            reason, detail = Reason.NOT_ALLOWED, None if is_own else RESERVED
+        else:
+            detail = self._known_peers.refusal(self._name, peer.address or self._name, frame)
         if detail is None:
-            return item
+            return frame
         return Rejection(
-            t_ns=item.t_ns,
-            source=str(item.source),
-            reason=Reason.STRANGER,
-            msgid=item.msgid,
+            t_ns=frame.t_ns,
+            source=str(frame.source),
+            reason=reason,
+            msgid=frame.msgid,
             detail=detail,
         )
 
@@ -242,7 +271,7 @@ class Link:
 
     def _overflow(self, count: int) -> None:
         """Count dropped datagrams or frames; their senders are unknown."""
-        self._newcomers.lost()
+        self._newcomers.late()
         lost = self.status.lost
         lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
         reject = Rejection(
@@ -348,26 +377,6 @@ def _checked_timesync(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
     who = str(item.source)
     return Rejection(
         t_ns=item.t_ns, source=who, reason=Reason.UNPLACED_STAMP, msgid=TIMESYNC, detail=detail
-    )
-
-
-def _checked_origin(item: Frame | Rejection) -> Frame | Rejection:
-    """Return the item, or its rejection if only a Cursor on Target link makes such messages.
-
-    Any MAVLink peer could otherwise make tracks of aircraft, as if a receiver had reported them.
-    """
-    if (
-        isinstance(item, Rejection)
-        or item.msgid != cot_link.TUNNEL
-        or item.source != cot_link.SENDER
-    ):
-        return item
-    who, detail = (
-        str(item.source),
-        "TUNNEL: sender id 0:25 is reserved for the service's Cursor on Target links",
-    )
-    return Rejection(
-        t_ns=item.t_ns, source=who, reason=Reason.NOT_ALLOWED, msgid=item.msgid, detail=detail
     )
 
 

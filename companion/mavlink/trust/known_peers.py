@@ -20,7 +20,7 @@ message. Messages with a time stamp and TIMESYNC are not, since they move clocks
 """
 
 import math
-from collections import OrderedDict, deque
+from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, field
 from typing import Final
@@ -49,7 +49,8 @@ NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one se
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
 _TIMED: Final = frozenset({*STAMPED, TIMESYNC})
-_JUDGED: Final = DECODED | POSE | _TIMED
+JUDGED: Final = DECODED | POSE | _TIMED
+"""Messages that ``refusal`` judges; it accepts all others."""
 
 
 @dataclass(slots=True, kw_only=True)
@@ -59,7 +60,7 @@ class _Peer:
     is_router: bool
     since_ns: int
     heard_ns: int
-    interval_ns: float = 0.0
+    messages: int = 1  # positions and attitudes since then
     msgids: set[int] = field(default_factory=set)
     path: Path = field(default_factory=Path)
     agreements: int = 0
@@ -70,17 +71,17 @@ class _Peer:
     def is_current(self, now_ns: int) -> bool:
         """Return whether the peer's newest message is so new that more are to be expected."""
         least_ns, most_ns = CURRENT_NS
-        wait_ns = min(max(CURRENT_INTERVALS * self.interval_ns, least_ns), most_ns)
-        return now_ns - self.heard_ns <= wait_ns
+        interval_ns = (self.heard_ns - self.since_ns) / self.messages
+        return now_ns - self.heard_ns <= min(
+            max(CURRENT_INTERVALS * interval_ns, least_ns), most_ns
+        )
 
     def hear(self, now_ns: int) -> None:
         """Note the arrival of a position or attitude."""
-        passed_ns = now_ns - self.heard_ns
-        if passed_ns > KEPT_NS:
-            self.since_ns = now_ns
-        elif passed_ns > 0:
-            self.interval_ns += 0.1 * (passed_ns - self.interval_ns)
-        self.heard_ns = max(now_ns, self.heard_ns)
+        if now_ns - self.heard_ns > KEPT_NS:
+            self.since_ns, self.messages = now_ns, 0
+        self.heard_ns = now_ns
+        self.messages += 1
 
 
 @dataclass(slots=True, kw_only=True)
@@ -92,6 +93,11 @@ class _Sender:
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
     notified_ns: int = -NOTICE_NS
     comparisons: Budget = field(default_factory=lambda: Budget(COMPARED_PER_S, COMPARED_PER_S))
+
+    @property
+    def heard_ns(self) -> int:
+        """Arrival of the newest position or attitude from a known peer."""
+        return max((one.heard_ns for one in self.known.values()), default=0)
 
 
 class KnownPeers:
@@ -105,7 +111,7 @@ class KnownPeers:
     def __init__(self, routers: Collection[str] = ()) -> None:
         self.contradicted: list[tuple[str, str, tuple[str, ...]]] = []
         self._routers = frozenset(routers)
-        self._senders: OrderedDict[Source, _Sender] = OrderedDict()  # by the last position
+        self._senders: dict[Source, _Sender] = {}
 
     def refusal(self, link: str, peer: str, frame: Frame) -> str | None:
         """Process a frame; return why it must be rejected, None to accept it.
@@ -113,16 +119,23 @@ class KnownPeers:
         ``link`` is the link as in the settings, ``peer`` the peer's HOST:PORT, or the link again if
         it has only one peer.
         """
-        if frame.msgid not in _JUDGED:
+        msgid = frame.msgid
+        if msgid not in JUDGED:
             return None
         sender = self._senders.get(frame.source)
         if sender is None:
-            if frame.msgid not in POSE:
+            if msgid not in POSE:
                 return None
             sender = self._follow(frame)
         known = sender.known.get(peer)
         if known is not None:
-            return self._known(sender, peer, known, frame)
+            known.msgids.add(msgid)
+            if msgid not in POSE:
+                return None
+            known.hear(frame.t_ns)
+            if msgid not in OWN or (len(sender.known) == 1 and not sender.strangers):
+                return None
+            return self._compare_known(sender, peer, known, frame)
         current = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
         is_router = self._is_router(link, peer)
         if not current or is_router:
@@ -139,14 +152,8 @@ class KnownPeers:
 
     # --- known peers --------------------------------------------------------------------------
 
-    def _known(self, sender: _Sender, peer: str, known: _Peer, frame: Frame) -> str | None:
-        known.msgids.add(frame.msgid)
-        if frame.msgid not in POSE:
-            return None
-        known.hear(frame.t_ns)
-        self._senders.move_to_end(frame.source)
-        if frame.msgid not in OWN or (len(sender.known) == 1 and not sender.strangers):
-            return None
+    def _compare_known(self, sender: _Sender, peer: str, known: _Peer, frame: Frame) -> str | None:
+        """Compare a known peer's position with those of all other peers of its sender."""
         said = read(frame)
         before = known.path.newest
         if not known.path.add(said):
@@ -183,8 +190,7 @@ class KnownPeers:
         sender.strangers.pop(name, None)
         peer.since_ns = frame.t_ns
         peer.msgids.add(frame.msgid)
-        peer.hear(frame.t_ns)
-        self._senders.move_to_end(frame.source)
+        peer.messages, peer.heard_ns = 1, frame.t_ns
         self._add(sender.known, name, peer, frame.t_ns)
 
     # --- strangers ----------------------------------------------------------------------------
@@ -259,7 +265,7 @@ class KnownPeers:
     def _follow(self, frame: Frame) -> _Sender:
         """Start to follow a sender; beyond ``SENDERS_MAX`` the one silent for longest goes."""
         if len(self._senders) >= SENDERS_MAX:
-            self._senders.popitem(last=False)
+            del self._senders[min(self._senders, key=lambda one: self._senders[one].heard_ns)]
         return self._senders.setdefault(frame.source, _Sender())
 
 

@@ -21,20 +21,29 @@ SENDERS_MAX: Final = 4096
 BUSY: Final = 0.6  # share of the time above which frames of the newest senders are dropped
 IDLE: Final = 0.4  # share below which more senders are served again
 LATE_NS: Final = 50_000_000  # age of a datagram that was read late
+KEPT_NS: Final = 5_000_000_000  # time between two looks at which senders are active
 WINDOW_NS: Final = 250_000_000  # time over which the share is measured
 
 
 class Newcomers:
-    """Senders of all links, in the order of their admission. ``refused`` counts frames."""
+    """Senders of all links, in the order of their admission. ``refused`` counts frames.
+
+    ``served`` holds senders whose frames are admitted without a call of ``admits``; it is emptied
+    from time to time, so that ``admits`` learns which senders are active. ``worked_s`` is the time
+    that frames took since the last call of ``adapt``, due from ``adapts_ns``.
+    """
 
     def __init__(self) -> None:
         self.refused = 0
+        self.served: set[Source] = set()
+        self.worked_s = 0.0
+        self.adapts_ns = 0
         self._numbers: OrderedDict[Source, int] = OrderedDict()  # by the newest frame
         self._budget = Budget(NEW_PER_S, NEW_SAVED)
         self._count = 0
         self._served_below: int | None = None  # number from which senders are not served
         self._began_ns = 0
-        self._worked_s = 0.0
+        self._cleared_ns = 0
         self._is_late = False
 
     def admits(self, source: Source, now_ns: int) -> bool:
@@ -51,26 +60,23 @@ class Newcomers:
         else:
             self._numbers.move_to_end(source)
         if self._served_below is None or number < self._served_below:
+            self.served.add(source)
             return True
         self.refused += 1
         return False
 
-    def lost(self) -> None:
-        """Note that frames were lost before they were read."""
+    def late(self) -> None:
+        """Note that frames were read late, or lost before they were read."""
         self._is_late = True
 
-    def worked(self, now_ns: int, seconds: float, age_ns: int | None) -> None:
-        """Note the time that the frames of a datagram took, and adapt who is served.
-
-        ``age_ns`` is how long the datagram waited; None if unknown.
-        """
-        self._worked_s += seconds
-        if age_ns is not None and age_ns > LATE_NS:
-            self._is_late = True
-        passed_ns = now_ns - self._began_ns
-        if passed_ns < WINDOW_NS:
-            return
-        share, self._worked_s, self._began_ns = self._worked_s / (passed_ns * 1e-9), 0.0, now_ns
+    def adapt(self, now_ns: int) -> None:
+        """Adapt who is served to the share of the time that frames took."""
+        passed_ns = max(1, now_ns - self._began_ns)
+        share, self.worked_s = self.worked_s / (passed_ns * 1e-9), 0.0
+        self._began_ns, self.adapts_ns = now_ns, now_ns + WINDOW_NS
+        if now_ns - self._cleared_ns > KEPT_NS:
+            self.served.clear()
+            self._cleared_ns = now_ns
         is_late, self._is_late = self._is_late, False
         if share > BUSY and is_late:
             self._serve(lambda served: min(served - 1, int(served * BUSY / share)))
@@ -83,4 +89,5 @@ class Newcomers:
         below = self._served_below
         served = len(numbers) if below is None else bisect_left(numbers, below)
         most = max(1, wanted(served))
+        self.served.clear()
         self._served_below = None if most >= len(numbers) else numbers[most]

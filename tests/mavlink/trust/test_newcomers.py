@@ -4,7 +4,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.mavlink.trust import newcomers
-from companion.mavlink.trust.newcomers import LATE_NS, NEW_PER_S, NEW_SAVED, WINDOW_NS, Newcomers
+from companion.mavlink.trust.newcomers import NEW_PER_S, NEW_SAVED, WINDOW_NS, Newcomers
 from companion.values import Source
 
 S = 1_000_000_000
@@ -18,9 +18,12 @@ def served(senders: Newcomers, most: int, now_ns: int) -> list[int]:
     return [number for number in range(most) if senders.admits(source(number), now_ns)]
 
 
-def window(senders: Newcomers, number: int, share: float, age_ns: int = 0) -> None:
+def window(senders: Newcomers, number: int, share: float, is_late: bool = False) -> None:
     """Note a window of time of which frames took a share."""
-    senders.worked(number * WINDOW_NS, share * WINDOW_NS * 1e-9, age_ns)
+    senders.worked_s += share * WINDOW_NS * 1e-9
+    if is_late:
+        senders.late()
+    senders.adapt(number * WINDOW_NS)
 
 
 def test_new_senders_are_limited_and_known_ones_are_not() -> None:
@@ -60,10 +63,9 @@ def test_newest_senders_are_dropped_while_frames_are_late() -> None:
     assert len(served(senders, 100, 0)) == 100
     window(senders, 2, 0.9)  # busy, but in time
     assert len(served(senders, 100, 0)) == 100
-    window(senders, 3, 0.9, LATE_NS + 1)
+    window(senders, 3, 0.9, is_late=True)
     assert served(senders, 100, 0) == list(range(66))
-    senders.lost()
-    window(senders, 4, 0.9)
+    window(senders, 4, 0.9, is_late=True)
     assert served(senders, 100, 0) == list(range(44))
     window(senders, 5, 0.5)
     assert served(senders, 100, 0) == list(range(44))
@@ -78,7 +80,7 @@ def test_oldest_sender_is_always_served(loads: list[tuple[float, bool]]) -> None
     senders = Newcomers()
     served(senders, 50, 0)
     for number, (share, late) in enumerate(loads, 1):
-        window(senders, number, share, 2 * LATE_NS if late else 0)
+        window(senders, number, share, is_late=late)
         now = served(senders, 50, 0)
         assert now == list(range(len(now)))
         assert now

@@ -77,13 +77,19 @@ class Peer:
     ``address`` is its HOST:PORT; empty if the endpoint has only one peer.
     """
 
-    __slots__ = ("_sequence", "address", "heard_ns", "key", "senders", "splitter", "versions")
+    __slots__ = (
+        "_sequence", "address", "heard_ns", "key", "senders", "served", "served_since", "splitter",
+        "versions",
+    )  # fmt: skip
 
     def __init__(self, key: Hashable, splitter: Splits) -> None:
         self.key = key
         self.address = address_text(key) if isinstance(key, tuple) else str(key or "")
         self.splitter = splitter
         self.senders: dict[Source, _PeerSender] = {}
+        self.served: set[Source] = set()
+        """Senders whose frames from this peer are admitted without a further look."""
+        self.served_since = 0  # generation of ``Newcomers``
         self.heard_ns: int | None = None
         self.versions = 0  # bit 0: MAVLink 1 received, bit 1: MAVLink 2 received
         self._sequence = 0

@@ -203,13 +203,16 @@ class Link:
         """
         if self._guard is not None:
             found = [_checked_by_guard(self._guard, item) for item in found]
-        served, has_timesync = self._newcomers.served, False
+        newcomers, has_timesync = self._newcomers, False
+        if peer.served_since != newcomers.generation:
+            peer.served.clear()
+            peer.served_since = newcomers.generation
         counted, checked = list[Received](), list[Received]()
         for item in found:
             kept = item
             if isinstance(item, Frame):
                 _, _, source, msgid, _, _ = item
-                if source not in served and not self._newcomers.admits(source, item.t_ns):
+                if source not in peer.served and not self._is_admitted(peer, source, item.t_ns):
                     self._refused += 1
                     continue
                 if msgid in CHECKED:
@@ -223,6 +226,15 @@ class Link:
         if self._refused:
             self._report_refused(checked)
         self._receive(checked)
+
+    def _is_admitted(self, peer: Peer, source: Source, now_ns: int) -> bool:
+        """Return whether a sender's frame may be used; remember it of one that is served."""
+        address = peer.address or self._name
+        strange = self._known_peers.is_stranger(self._name, address, source, now_ns)
+        admitted = self._newcomers.admits(source, now_ns, is_stranger=strange)
+        if admitted and not strange:
+            peer.served.add(source)
+        return admitted
 
     def _report_refused(self, items: list[Received]) -> None:
         """Add a rejection with the number of newcomers' frames, if one is due."""

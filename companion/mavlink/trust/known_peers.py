@@ -15,8 +15,9 @@ again; its positions are used only as far as they agree with those of the other.
 was here first stays believed, and a stranger costs it nothing; whoever sends first in a vehicle's
 name is believed until it falls silent.
 
-The messages that a known peer does not bring are accepted from any peer: routes may be divided by
-message. Messages with a time stamp and TIMESYNC are not, since they move clocks.
+What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
+in a vehicle's name. Messages that move the sender's clock or its bounds are not: those with a time
+stamp, TIMESYNC, HEARTBEAT, GPS_RAW_INT and EKF_STATUS_REPORT.
 """
 
 import math
@@ -27,7 +28,7 @@ from typing import Final
 
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
 from companion.mavlink.trust.paths import SLACK_M, Path
-from companion.mavlink.wire.decode import DECODED, POSE
+from companion.mavlink.wire.decode import DECODED, EKF_STATUS_REPORT, GPS_RAW_INT, HEARTBEAT, POSE
 from companion.mavlink.wire.encode import TIMESYNC
 from companion.mavlink.wire.positions import OWN, OwnPosition, read
 from companion.mavlink.wire.stamps import STAMPED
@@ -48,8 +49,8 @@ COMPARED_PER_S: Final = 30.0  # positions of strangers compared per sender and s
 NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one sender
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
-_TIMED: Final = frozenset({*STAMPED, TIMESYNC})
-JUDGED: Final = DECODED | POSE | _TIMED
+_ABOUT_SENDER: Final = frozenset({*STAMPED, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT})
+JUDGED: Final = DECODED | POSE | _ABOUT_SENDER
 """Messages that ``refusal`` judges; it accepts all others."""
 
 
@@ -142,13 +143,20 @@ class KnownPeers:
             if frame.msgid in POSE:
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
             return None
-        brings = frame.msgid in _TIMED or any(frame.msgid in one.msgids for one in current)
+        brings = frame.msgid in _ABOUT_SENDER or any(frame.msgid in one.msgids for one in current)
         if not brings:
             return None
         if frame.msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
             agrees = self._agrees(sender, peer, frame)
             return None if agrees or peer in sender.known else STRANGER
         return STRANGER
+
+    def is_stranger(self, link: str, peer: str, source: Source, now_ns: int) -> bool:
+        """Return whether a peer sends in the name of a sender with other, current known peers."""
+        sender = self._senders.get(source)
+        if sender is None or peer in sender.known or self._is_router(link, peer):
+            return False
+        return any(one.is_current(now_ns) for one in sender.known.values())
 
     # --- known peers --------------------------------------------------------------------------
 

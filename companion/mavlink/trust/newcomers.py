@@ -2,8 +2,8 @@
 
 Anybody that reaches a link's port can invent senders. Each takes a clock, a track and beams, so the
 number of new ones is limited. When frames take more than ``BUSY`` of the time and are read late or
-lost, those of the newest senders are dropped before they are decoded, until the rest are in time:
-who was here first keeps being served.
+lost, those of strangers (``known_peers``) are dropped before they are decoded, then those of the
+newest senders, until the rest are in time: who was here first keeps being served.
 """
 
 from bisect import bisect_left
@@ -20,6 +20,7 @@ SENDERS_MAX: Final = 4096
 """Most senders remembered; beyond it the one silent for longest is new again."""
 BUSY: Final = 0.6  # share of the time above which frames of the newest senders are dropped
 IDLE: Final = 0.4  # share below which more senders are served again
+STRANGERS_WAIT_NS: Final = 10_000_000_000  # time for which strangers are not served after that
 LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 KEPT_NS: Final = 5_000_000_000  # time between two looks at which senders are active
 WINDOW_NS: Final = 250_000_000  # time over which the share is measured
@@ -28,26 +29,35 @@ WINDOW_NS: Final = 250_000_000  # time over which the share is measured
 class Newcomers:
     """Senders of all links, in the order of their admission. ``refused`` counts frames.
 
-    ``served`` holds senders whose frames are admitted without a call of ``admits``; it is emptied
-    from time to time, so that ``admits`` learns which senders are active. ``worked_s`` is the time
-    that frames took since the last call of ``adapt``, due from ``adapts_ns``.
+    What ``admits`` says of a sender holds while ``generation`` stays the same; it changes from time
+    to time, so that ``admits`` learns which senders are active. ``worked_s`` is the time that frames
+    took since the last call of ``adapt``, due from ``adapts_ns``.
     """
 
     def __init__(self) -> None:
         self.refused = 0
-        self.served: set[Source] = set()
+        self.generation = 0
         self.worked_s = 0.0
         self.adapts_ns = 0
         self._numbers: OrderedDict[Source, int] = OrderedDict()  # by the newest frame
         self._budget = Budget(NEW_PER_S, NEW_SAVED)
         self._count = 0
         self._served_below: int | None = None  # number from which senders are not served
+        self._had_strangers = False  # whether strangers were served since the machine was late
+        self._strangers_from_ns = 0  # time from which frames of strangers are served
         self._began_ns = 0
-        self._cleared_ns = 0
+        self._changed_ns = 0
         self._is_late = False
 
-    def admits(self, source: Source, now_ns: int) -> bool:
-        """Return whether a frame of a sender may be used; count it if not."""
+    def admits(self, source: Source, now_ns: int, *, is_stranger: bool = False) -> bool:
+        """Return whether a frame of a sender may be used; count it if not.
+
+        ``is_stranger``: it comes from another peer than the sender's known ones.
+        """
+        if is_stranger and now_ns < self._strangers_from_ns:
+            self.refused += 1
+            return False
+        self._had_strangers |= is_stranger
         number = self._numbers.get(source)
         if number is None:
             if not self._budget.spend(1, now_ns * 1e-9):
@@ -60,7 +70,6 @@ class Newcomers:
         else:
             self._numbers.move_to_end(source)
         if self._served_below is None or number < self._served_below:
-            self.served.add(source)
             return True
         self.refused += 1
         return False
@@ -74,11 +83,16 @@ class Newcomers:
         passed_ns = max(1, now_ns - self._began_ns)
         share, self.worked_s = self.worked_s / (passed_ns * 1e-9), 0.0
         self._began_ns, self.adapts_ns = now_ns, now_ns + WINDOW_NS
-        if now_ns - self._cleared_ns > KEPT_NS:
-            self.served.clear()
-            self._cleared_ns = now_ns
+        if now_ns - self._changed_ns > KEPT_NS:
+            self.generation += 1
+            self._changed_ns = now_ns
         is_late, self._is_late = self._is_late, False
         if share > BUSY and is_late:
+            were_served = now_ns >= self._strangers_from_ns
+            self._strangers_from_ns = now_ns + STRANGERS_WAIT_NS
+            if were_served and self._had_strangers:
+                self._had_strangers = False
+                return
             self._serve(lambda served: min(served - 1, int(served * BUSY / share)))
         elif share < IDLE and self._served_below is not None:
             self._serve(lambda served: max(served + 8, served * 5 // 4))
@@ -89,5 +103,5 @@ class Newcomers:
         below = self._served_below
         served = len(numbers) if below is None else bisect_left(numbers, below)
         most = max(1, wanted(served))
-        self.served.clear()
+        self.generation += 1
         self._served_below = None if most >= len(numbers) else numbers[most]

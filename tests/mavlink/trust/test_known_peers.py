@@ -11,9 +11,10 @@ from peer_streams import HOME, LINK, OTHER, Place, S, Stream, beside, circle, he
 from companion.mavlink.trust import known_peers, paths
 from companion.mavlink.trust.duplicate_ids import KEPT_NS
 from companion.mavlink.trust.known_peers import PROBATION_NS, STRANGER, KnownPeers
-from companion.mavlink.wire.decode import SYSTEM_TIME
+from companion.mavlink.wire.decode import EKF_STATUS_REPORT, GPS_RAW_INT, HEARTBEAT, SYSTEM_TIME
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, heartbeat, pack
 from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.values import Frame, Source
 
 PROBATION_S = PROBATION_NS / S
@@ -71,12 +72,13 @@ def test_position_resets_of_one_vehicle_cost_the_first_route_nothing() -> None:
     assert peers.contradicted == []
 
 
-def test_messages_that_the_known_peer_does_not_bring_are_accepted_from_others() -> None:
+def test_messages_about_other_aircraft_are_accepted_if_the_known_peer_brings_none() -> None:
     peers = KnownPeers()
     rejected(peers, heard(HOME, 4, lasts_s=10))
-    assert peers.refusal(LINK, OTHER, message(10.0, heartbeat(Source(1, 1)))) is None
-    assert peers.refusal(LINK, HOME, message(10.0, heartbeat(Source(1, 1)))) is None
-    assert peers.refusal(LINK, OTHER, message(10.0, heartbeat(Source(1, 1)))) == STRANGER
+    aircraft = Outgoing(Source(1, 1), ADSB_VEHICLE, bytes(range(38)))
+    assert peers.refusal(LINK, OTHER, message(10.0, aircraft)) is None
+    assert peers.refusal(LINK, HOME, message(10.0, aircraft)) is None
+    assert peers.refusal(LINK, OTHER, message(10.0, aircraft)) == STRANGER
     other_id = message(10.0, heartbeat(Source(2, 1)))
     assert peers.refusal(LINK, OTHER, other_id) is None
 
@@ -87,15 +89,29 @@ def test_messages_that_the_known_peer_does_not_bring_are_accepted_from_others() 
         (TIMESYNC, struct.pack("<qq", 7, 8)),
         (SYSTEM_TIME, struct.pack("<QI", 7, 8)),
         (116, struct.pack("<Ihhhhhhhhh", 7, *range(1, 10))),  # SCALED_IMU2
+        (HEARTBEAT, struct.pack("<IBBBBB", 4, 7, 3, 217, 4, 3)),
+        (GPS_RAW_INT, bytes(29) + b"\1"),
+        (EKF_STATUS_REPORT, bytes(20) + b"\1\4"),
     ],
 )
-def test_clocks_are_not_moved_by_strangers(msgid: int, payload: bytes) -> None:
+def test_clocks_and_bounds_are_not_moved_by_strangers(msgid: int, payload: bytes) -> None:
     """By messages too that the known peer does not bring."""
     peers = KnownPeers()
     rejected(peers, heard(HOME, 4, lasts_s=10))
     answer = message(10.0, Outgoing(Source(1, 1), msgid, payload))
     assert peers.refusal(LINK, OTHER, answer) == STRANGER
     assert peers.refusal(LINK, HOME, answer) is None
+
+
+def test_stranger_is_a_peer_in_the_name_of_a_sender_with_a_current_known_peer() -> None:
+    peers = KnownPeers({"10.0.0.9"})
+    assert not peers.is_stranger(LINK, OTHER, Source(1, 1), 0)
+    rejected(peers, heard(HOME, 4, lasts_s=10))
+    assert peers.is_stranger(LINK, OTHER, Source(1, 1), 10 * S)
+    assert not peers.is_stranger(LINK, HOME, Source(1, 1), 10 * S)
+    assert not peers.is_stranger(LINK, OTHER, Source(2, 1), 10 * S)
+    assert not peers.is_stranger(LINK, "10.0.0.9:7", Source(1, 1), 10 * S)
+    assert not peers.is_stranger(LINK, OTHER, Source(1, 1), 13 * S)
 
 
 # --- strangers ------------------------------------------------------------------------------------

@@ -4,7 +4,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.mavlink.trust import newcomers
-from companion.mavlink.trust.newcomers import NEW_PER_S, NEW_SAVED, WINDOW_NS, Newcomers
+from companion.mavlink.trust.newcomers import (
+    NEW_PER_S,
+    NEW_SAVED,
+    STRANGERS_WAIT_NS,
+    WINDOW_NS,
+    Newcomers,
+)
 from companion.values import Source
 
 S = 1_000_000_000
@@ -72,6 +78,20 @@ def test_newest_senders_are_dropped_while_frames_are_late() -> None:
     for number in range(6, 20):
         window(senders, number, 0.1)
     assert len(served(senders, 100, 0)) == 100
+
+
+def test_strangers_are_dropped_before_any_sender_while_frames_are_late() -> None:
+    senders, now_ns = Newcomers(), 2 * WINDOW_NS
+    assert len(served(senders, 100, 0)) == 100
+    assert senders.admits(source(0), 0, is_stranger=True)
+    window(senders, 1, 0.0)
+    window(senders, 2, 0.9, is_late=True)
+    assert not senders.admits(source(0), now_ns, is_stranger=True)
+    assert len(served(senders, 100, now_ns)) == 100
+    window(senders, 3, 0.9, is_late=True)  # the rest is too much too
+    assert served(senders, 100, now_ns) == list(range(66))
+    assert not senders.admits(source(0), now_ns + STRANGERS_WAIT_NS, is_stranger=True)
+    assert senders.admits(source(0), now_ns + STRANGERS_WAIT_NS + WINDOW_NS, is_stranger=True)
 
 
 @given(st.lists(st.tuples(st.floats(0, 5), st.booleans()), max_size=60))

@@ -41,7 +41,7 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
         def make(update: Update) -> bytes:
             return encode(beam_state.beams(pipeline, equipment, update, 0.0, lead_ms))
 
-        return json_response(await moments.made(lead_ms, "beams", make))
+        return json_response(await moments.made(lead_ms, "beams", make, is_usual=True))
 
     @app.get(
         "/v1/beams/weights",
@@ -62,7 +62,7 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
             return body, {**weight_formats.headers(pipeline, made), "vary": "accept"}
 
         try:
-            body, headers = await moments.made(lead_ms, form, make)
+            body, headers = await moments.made(lead_ms, form, make, is_usual=True)
         except UserError as error:  # the device cannot apply the current beams
             raise HTTPException(409, str(error)) from error
         return BodyResponse(body, media_type=form.media_type, headers=headers)

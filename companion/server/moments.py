@@ -30,11 +30,14 @@ class Moments:
         self._reads: dict[float, Callable[[], Update]] = {}
         self._answers: dict[tuple[float, Hashable], asyncio.Task[Any]] = {}
 
-    async def made(self, lead_ms: float, what: Hashable, make: Callable[[Update], T]) -> T:
+    async def made(
+        self, lead_ms: float, what: Hashable, make: Callable[[Update], T], *, is_usual: bool = False
+    ) -> T:
         """Return ``make`` of the beams for ``lead_ms`` after the moment, computed on a thread.
 
         ``what`` identifies the answer among those made from the same beams; an existing one is
-        reused. Raises what ``make`` raises, and ``HTTPException`` 503 if the work slots are full.
+        reused. ``is_usual``: one of a few answers, which at a lead of 0 do not wait for others.
+        Raises what ``make`` raises, and ``HTTPException`` 503 if the work slots are full.
         """
         now_ns = self._node.now_ns()
         moment = -(-now_ns // EVERY_NS)
@@ -44,9 +47,12 @@ class Moments:
             self._answers.clear()
         task = self._answers.get((lead_ms, what))
         if task is None:
-            self._work_slots.refuse_if_full()  # before predicting
+            is_shared = is_usual and lead_ms == 0
+            self._work_slots.refuse_if_full(is_shared=is_shared)  # before predicting
             look = self._read(now_ns, moment * EVERY_NS - now_ns, lead_ms)
-            task = asyncio.create_task(self._work_slots.run(lambda: make(look())))
+            task = asyncio.create_task(
+                self._work_slots.run(lambda: make(look()), is_shared=is_shared)
+            )
             task.add_done_callback(seen)
             self._answers[lead_ms, what] = task
         found: T = await asyncio.shield(task)  # a client that leaves must not cancel it for others

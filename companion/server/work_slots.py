@@ -11,6 +11,7 @@ from starlette.exceptions import HTTPException
 AT_ONCE: Final = 2
 """Number of requests that compute at once; each takes interpreter time from the links."""
 WAITING: Final = 64  # requests that wait for a slot; one second of work
+SHARED_WAITING: Final = 16  # answers for all that wait for the slot of their own
 
 T = TypeVar("T")
 
@@ -26,10 +27,12 @@ class WorkSlots:
         self._free = asyncio.Semaphore(at_once)
         self._no_long = asyncio.Semaphore(1)
         self._room = at_once + waiting
+        self._shared_free = asyncio.Semaphore(1)
+        self._shared_room = SHARED_WAITING
 
-    def refuse_if_full(self) -> None:
+    def refuse_if_full(self, *, is_shared: bool = False) -> None:
         """Raise ``HTTPException`` 503 if the queue of waiting requests is full."""
-        if self._room == 0:
+        if self._room == 0 and not (is_shared and self._shared_room):
             raise HTTPException(503, "too many requests at once", {"retry-after": "1"})
 
     @contextlib.asynccontextmanager
@@ -50,7 +53,24 @@ class WorkSlots:
         finally:
             self._room += 1
 
-    async def run(self, work: Callable[[], T]) -> T:
-        """Run work on another thread when a slot is free. Raises ``HTTPException`` 503."""
-        async with self.slot():
+    @contextlib.asynccontextmanager
+    async def _shared_slot(self) -> AsyncIterator[None]:
+        self._shared_room -= 1
+        try:
+            async with self._shared_free:
+                self.running += 1
+                try:
+                    yield
+                finally:
+                    self.running -= 1
+        finally:
+            self._shared_room += 1
+
+    async def run(self, work: Callable[[], T], *, is_shared: bool = False) -> T:
+        """Run work on another thread when a slot is free. Raises ``HTTPException`` 503.
+
+        ``is_shared``: all clients share the answer. It has a slot of its own, so that it does not
+        wait for requests whose answers nobody shares.
+        """
+        async with self._shared_slot() if is_shared and self._shared_room else self.slot():
             return await run_in_threadpool(work)

@@ -79,6 +79,15 @@ async def test_rejected_request_costs_no_prediction(
     assert refused.value.status_code == 503
 
 
+async def test_usual_answer_does_not_wait_for_others(shared_node: Any) -> None:
+    full = Moments(shared_node, WorkSlots(0, 0))
+    found = await full.made(0.0, "beams", lambda update: update, is_usual=True)
+    assert isinstance(found, Update)
+    for lead_ms, is_usual in ((1.0, True), (0.0, False)):
+        with pytest.raises(HTTPException, match="too many requests"):
+            await full.made(lead_ms, "other", lambda update: update, is_usual=is_usual)
+
+
 async def test_cancelled_request_does_not_cancel_shared_work(moments: Moments) -> None:
     begun, go_on = asyncio.Event(), threading.Event()
     loop = asyncio.get_running_loop()

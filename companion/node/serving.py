@@ -48,7 +48,7 @@ class Server(uvicorn.Server):
         super().__init__(
             uvicorn.Config(
                 app,
-                log_level="warning",
+                log_level="error",  # a warning for each malformed request could fill a disk
                 lifespan="off",
                 http=partial(BoundedProtocol, queue),  # type: ignore[arg-type]
                 ws=BoundedWebSocket,

@@ -82,6 +82,7 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
 
     async def send(self, message: Any) -> None:
         """Send a message of the application; see ASGI."""
+        await self.writable.wait()  # the connection may be closed meanwhile
         if self.close_sent and not self.disconnected:
             raise ClientDisconnected  # closed here, because the client sent too much
         text = message.get("text") if self.handshake_complete else None

@@ -251,6 +251,40 @@ def test_flood_of_pings_closes_the_websocket(
     assert code.to_bytes(2, "big") in said or pongs == 0
 
 
+def test_message_to_a_client_closed_while_it_did_not_read_is_no_error() -> None:
+    async def closed() -> None:
+        held = websocket_connections.BoundedWebSocket.__new__(
+            websocket_connections.BoundedWebSocket
+        )
+        held.writable = asyncio.Event()
+        held.handshake_complete, held.close_sent, held.disconnected = True, False, False
+        held.initial_response = None
+        sending = asyncio.create_task(held.send({"type": "websocket.send", "text": "{}"}))
+        await asyncio.sleep(0)
+        held.close_sent = True  # the client sent too much
+        held.writable.set()
+        with pytest.raises(websocket_connections.ClientDisconnected):
+            await sending
+
+    run_async(closed())
+
+
+def test_malformed_requests_write_nothing_to_the_log(
+    make_node: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A line for each could fill a disk."""
+
+    async def flooded() -> None:
+        async with served(make_node()) as port:
+            for _ in range(5):
+                _, writer = await connected(port)
+                writer.write(b"no request at all\r\n\r\n")
+            assert await asked(await connected(port)) == b"HTTP/1.1 200 OK\r\n"
+
+    run_async(flooded())
+    assert capfd.readouterr().err == ""
+
+
 def test_client_that_answers_no_ping_is_disconnected(
     make_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

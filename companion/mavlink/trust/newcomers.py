@@ -29,9 +29,9 @@ WINDOW_NS: Final = 250_000_000  # time over which the share is measured
 class Newcomers:
     """Senders of all links, in the order of their admission. ``refused`` counts frames.
 
-    What ``admits`` says of a sender holds while ``generation`` stays the same; it changes from time
-    to time, so that ``admits`` learns which senders are active. ``worked_s`` is the time that frames
-    took since the last call of ``adapt``, due from ``adapts_ns``.
+    What ``admits`` says of a sender holds while ``generation`` stays the same. That changes from
+    time to time, so that ``admits`` learns which senders are active. ``worked_s`` is the time that
+    frames took since the last call of ``adapt``, due from ``adapts_ns``.
     """
 
     def __init__(self) -> None:

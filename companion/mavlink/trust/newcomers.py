@@ -44,7 +44,7 @@ class Newcomers:
         self._count = 0
         self._served_below: int | None = None  # number from which senders are not served
         self._had_strangers = False  # whether strangers were served since the machine was late
-        self._strangers_from_ns = 0  # time from which frames of strangers are served
+        self._strangers_from_ns = -(1 << 62)  # time from which those of strangers are served
         self._began_ns = 0
         self._changed_ns = 0
         self._is_late = False

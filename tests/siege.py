@@ -172,10 +172,10 @@ def honest_losses(node: Node) -> Losses:
 
 
 @contextlib.contextmanager
-def besieged(start_node: Any, *words: str) -> Iterator[Node]:
+def besieged(start_node: Any, *words: str, key: bytes | None = None) -> Iterator[Node]:
     """Run a service around which five honest vehicles fly, until all four UAVs have beams."""
     node = start_node(*RUN, *words)
-    with flight(node.udp_port):
+    with flight(node.udp_port, key):
         node.wait_until(
             "/v1/beams", lambda answer: {beam["uav"] for beam in answer["beams"]} >= HONEST
         )
@@ -183,9 +183,10 @@ def besieged(start_node: Any, *words: str) -> Iterator[Node]:
 
 
 @contextlib.contextmanager
-def flight(udp_port: int) -> Iterator["subprocess.Popen[str]"]:
-    """Fly the honest vehicles in a process of their own."""
+def flight(udp_port: int, key: bytes | None = None) -> Iterator["subprocess.Popen[str]"]:
+    """Fly the honest vehicles in a process of their own; with a key, their frames are signed."""
     sender = [sys.executable, str(ROOT / "tests" / "siege_flight.py"), str(udp_port)]
+    sender += [] if key is None else [key.hex()]
     process = subprocess.Popen(sender, stdout=subprocess.PIPE, text=True)
     try:
         yield process

@@ -1,13 +1,14 @@
 """Five honest vehicles in a process of their own: four UAVs on circles, and the carrier.
 
-    python tests/siege_flight.py UDP_PORT
+    python tests/siege_flight.py UDP_PORT [KEY]
 
 They fly until the process is stopped, each from a socket of its own, with ``HZ`` positions and
-attitudes a second. ``place`` is where each is at a time of the wall clock, so that another process
-can compare.
+attitudes a second, signed if a key in hexadecimal is given. ``place`` is where each is at a time of
+the wall clock, so that another process can compare.
 """
 
 import contextlib
+import hashlib
 import json
 import math
 import signal
@@ -16,7 +17,10 @@ import struct
 import sys
 import time
 
+from fastcrc import crc16
 from load_sender import ATTITUDE, GLOBAL_POSITION_INT, HEARTBEAT, SYSTEM_TIME, frame
+
+from companion.mavlink.wire.crc_extra import CRC_EXTRA
 
 HZ = 10
 CARRIER = 5
@@ -26,6 +30,8 @@ RADIUS_M, RATE_RADPS = 60.0, 0.1
 M_PER_DEG = 111_195.0
 BOOT_S = 1000.0  # time since boot when the flight begins
 STEP_S = 0.005
+SIGNED = 1  # incompatibility flag
+STAMPS_BEGIN_S = 1_420_070_400  # 2015, from where signatures count their time
 
 
 def place(sysid: int, at_s: float) -> tuple[float, float, float]:
@@ -72,17 +78,29 @@ def boot_ms(at_s: float, sysid: int) -> int:
     return round((at_s % 1e6 + BOOT_S * sysid) * 1000) % 2**32
 
 
-class Vehicle:
-    """One honest sender; ``sent`` counts its frames."""
+def signed(raw: bytes, at_s: float, key: bytes) -> bytes:
+    """Sign a frame of ``load_sender`` (https://mavlink.io/en/guide/message_signing.html)."""
+    body = raw[1:2] + bytes([SIGNED]) + raw[3:-2]
+    extra = bytes([CRC_EXTRA[int.from_bytes(raw[7:10], "little")]])
+    whole = raw[:1] + body + struct.pack("<H", crc16.mcrf4xx(body + extra))
+    stamp = b"\1" + round((at_s - STAMPS_BEGIN_S) * 1e5).to_bytes(6, "little")
+    return whole + stamp + hashlib.sha256(key + whole + stamp).digest()[:6]
 
-    def __init__(self, sysid: int, port: int) -> None:
-        self.sysid, self.sent = sysid, 0
+
+class Vehicle:
+    """One honest sender; ``sent`` counts its frames, which a ``key`` signs."""
+
+    def __init__(self, sysid: int, port: int, key: bytes | None = None) -> None:
+        self.sysid, self.sent, self._key = sysid, 0, key
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(("127.0.0.1", port))
 
     def send(self, msgid: int, payload: bytes) -> None:
+        raw = frame((self.sysid, 1), self.sent % 256, msgid, payload)
+        if self._key is not None:
+            raw = signed(raw, time.time() + self.sent * 1e-5, self._key)  # no stamp twice
         with contextlib.suppress(ConnectionRefusedError):
-            self._socket.send(frame((self.sysid, 1), self.sent % 256, msgid, payload))
+            self._socket.send(raw)
         self.sent += 1
 
     def step(self, number: int) -> None:
@@ -97,7 +115,7 @@ class Vehicle:
             self.send(SYSTEM_TIME, struct.pack("<QI", round(at_s * 1e6), boot))
 
 
-def main(port: int) -> None:
+def main(port: int, key: bytes | None = None) -> None:
     """Fly until SIGTERM, and print the number of frames sent by each."""
     stopped = False
 
@@ -106,7 +124,7 @@ def main(port: int) -> None:
         stopped = True
 
     signal.signal(signal.SIGTERM, stop)
-    vehicles = [Vehicle(sysid, port) for sysid in (*UAVS, CARRIER)]
+    vehicles = [Vehicle(sysid, port, key) for sysid in (*UAVS, CARRIER)]
     begun_s, number = time.monotonic(), 0
     while not stopped:
         for index, vehicle in enumerate(vehicles):
@@ -118,4 +136,4 @@ def main(port: int) -> None:
 
 
 if __name__ == "__main__":
-    main(int(sys.argv[1]))
+    main(int(sys.argv[1]), *map(bytes.fromhex, sys.argv[2:]))

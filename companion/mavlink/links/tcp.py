@@ -4,6 +4,7 @@ import asyncio
 import errno
 import os
 import socket
+from collections import deque
 from collections.abc import Callable, Collection, Hashable
 from dataclasses import replace
 from typing import Final, cast
@@ -26,7 +27,11 @@ CONNECT_S: Final = 5.0
 CONNECTIONS_MAX: Final = 256
 """Most connections of a listening link (each takes a file descriptor); more are closed at once."""
 PIECE_BYTES: Final = 4096
-"""Bytes of a connection that are processed before other work runs; some hundred frames."""
+"""Bytes that are read and processed before other work runs; some hundred frames.
+
+A link processes one such piece in an iteration of the event loop, of its connections in turn: many
+connections take no more of the processor than one. The rest waits in the system's buffers.
+"""
 SILENCE_S: Final = 12
 """Seconds without an acknowledgement after which a connection is closed."""
 
@@ -47,7 +52,7 @@ class TcpOut:
         loop = asyncio.get_running_loop()
         sock = await _connected(self._url)
         lost: asyncio.Future[Exception] = loop.create_future()
-        stream = _Stream(self._upcalls, lambda _, why: settle(lost, why))
+        stream = _Stream(self._upcalls, lambda _, why: settle(lost, why), _Turns())
         try:
             await loop.create_connection(lambda: stream, sock=sock)
             self._stream = stream
@@ -78,6 +83,7 @@ class TcpIn:
         self._upcalls = upcalls
         self._socket: socket.socket | None = None
         self._streams: set[_Stream] = set()
+        self._turns = _Turns()
 
     def open(self) -> int:
         """Listen; return the port. Raises ``OSError`` if the address is not available."""
@@ -121,13 +127,32 @@ class TcpIn:
                 settle(fault, why)
 
         if len(self._streams) >= CONNECTIONS_MAX:
-            return _Stream(self._upcalls, on_close, is_accepted=False)
-        stream = _Stream(self._upcalls, on_close)
+            return _Stream(self._upcalls, on_close, self._turns, is_accepted=False)
+        stream = _Stream(self._upcalls, on_close, self._turns)
         self._streams.add(stream)
         return stream
 
 
-class _Stream(asyncio.Protocol):
+class _Turns:
+    """Order in which the connections of a link are processed: a piece of one per iteration."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[_Stream] = deque()
+
+    def add(self, stream: "_Stream") -> None:
+        """Queue a connection with a piece that is not processed yet."""
+        self._waiting.append(stream)
+        if len(self._waiting) == 1:
+            asyncio.get_running_loop().call_soon(self._next)
+
+    def _next(self) -> None:
+        self._waiting[0].process()
+        self._waiting.popleft()
+        if self._waiting:
+            asyncio.get_running_loop().call_soon(self._next)
+
+
+class _Stream(asyncio.BufferedProtocol):
     """One connection, which is also the key of its peer.
 
     ``on_close`` is called with the reason when it ends. A connection that is not ``is_accepted`` is
@@ -138,18 +163,21 @@ class _Stream(asyncio.Protocol):
         self,
         upcalls: Upcalls,
         on_close: Callable[["_Stream", Exception], None],
+        turns: _Turns,
         *,
         is_accepted: bool = True,
     ) -> None:
         self._upcalls = upcalls
         self._on_close = on_close
+        self._turns = turns
         self._transport: asyncio.Transport | None = None
         self._is_accepted = is_accepted
         self._address = ""
         self._held_up: StaleBytes | None = None
-        self._unread = b""  # bytes received beyond a piece
-        self._reads: asyncio.Handle | None = None
-        self._fault: Exception | None = None  # raised by the processing of a later piece
+        self._buffer = bytearray(PIECE_BYTES)
+        self._piece: bytes | None = None  # read, and not processed yet
+        self._lost: Exception | None = None
+        self._fault: Exception | None = None  # raised by the processing of a piece
 
     def __str__(self) -> str:
         return self._address
@@ -162,47 +190,42 @@ class _Stream(asyncio.Protocol):
         if not self._is_accepted:
             self._transport.abort()
 
-    def data_received(self, data: bytes) -> None:
+    def get_buffer(self, sizehint: int) -> bytearray:
+        return self._buffer
+
+    def buffer_updated(self, nbytes: int) -> None:
+        data = bytes(self._buffer[:nbytes])
         stale = self._held_up.stale(data) if self._held_up else 0
         if stale:
             self._upcalls.stale(self, data[:stale])
-        self._unread += data[stale:]
-        if self._reads is None:
-            self._read_piece()
-
-    def _read_piece(self) -> None:
-        """Process a piece of the received bytes; read no others before all are processed."""
-        self._reads = None
-        piece, self._unread = self._unread[:PIECE_BYTES], self._unread[PIECE_BYTES:]
-        if piece:
-            self._upcalls.take(self, piece, None)
-        if self._transport is None:
-            return
-        if self._unread:
+        if stale < nbytes and self._transport is not None:
+            self._piece = data[stale:]
             self._transport.pause_reading()
-            self._reads = asyncio.get_running_loop().call_soon(self._read_next)
-        else:
-            self._transport.resume_reading()
+            self._turns.add(self)
 
-    def _read_next(self) -> None:
+    def process(self) -> None:
+        """Process the piece that was read; then read the next one, or end."""
+        piece, self._piece = self._piece, None
         try:
-            self._read_piece()
+            if piece:
+                self._upcalls.take(self, piece, None)
         except Exception as fault:  # a defect must end the link, not disappear
             self._fault = fault
             self.abort()
+        if self._lost is not None:
+            self._end(self._lost)
+        elif self._transport is not None and not self._transport.is_closing():
+            self._transport.resume_reading()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._transport = None
         if self._held_up:
             self._held_up.close()
-        if self._reads is not None:
-            self._reads.cancel()
-        why = exc or self._fault or HungUpError("the peer hung up")
-        try:
-            if self._unread:
-                self._upcalls.take(self, self._unread, None)
-        except Exception as fault:
-            why = fault
+        self._lost = exc or self._fault or HungUpError("the peer hung up")
+        if self._piece is None:
+            self._end(self._lost)
+
+    def _end(self, why: Exception) -> None:
         self._on_close(self, why)
         self._upcalls.on_peer_gone(self)
 
@@ -227,8 +250,10 @@ class _Stream(asyncio.Protocol):
         return self._transport.get_write_buffer_size() / WRITE_BUFFER_BYTES
 
     def abort(self) -> None:
-        """Close the connection and discard unsent bytes; if not yet made, close it on connect."""
+        """Close the connection and discard all bytes; if not yet made, close it on connect."""
         self._is_accepted = False
+        if self._piece is not None:
+            self._piece = b""
         if self._transport is not None:
             self._transport.abort()
 

@@ -179,7 +179,8 @@ class Link:
         newcomers = self._newcomers
         if age_ns is not None and age_ns > LATE_NS:
             newcomers.late()
-        newcomers.worked_s += time.perf_counter() - began_s
+        spent_s = time.perf_counter() - began_s
+        newcomers.worked_s += spent_s * _share_of_frames(found, len(data))
         if now_ns >= newcomers.adapts_ns:
             newcomers.adapt(now_ns)
         if isinstance(peer.splitter, ForeignSplitter) and not self.url.listens:
@@ -397,3 +398,8 @@ def _checked_by_guard(guard: MessageSigning, item: Frame | Rejection) -> Frame |
     if refusal is None or isinstance(item, Rejection):
         return item
     return Rejection(t_ns=item.t_ns, source=str(item.source), reason=refusal, msgid=item.msgid)
+
+
+def _share_of_frames(found: list[Frame | Rejection], size: int) -> float:
+    """Return the share of the bytes that were frames: dropping senders saves no other work."""
+    return min(1.0, sum(len(item.raw) for item in found if isinstance(item, Frame)) / max(1, size))

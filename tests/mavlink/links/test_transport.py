@@ -20,6 +20,7 @@ from companion.mavlink.links import kernel_time, tcp, transport, udp
 from companion.mavlink.links.peers import PEERS_MAX
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
+from companion.mavlink.trust.newcomers import Newcomers
 from companion.mavlink.wire.encode import Outgoing, heartbeat, pack, timesync
 from companion.mavlink.wire.framing import Splitter
 from companion.values import Frame, Reason, Rejection, Severity, Source
@@ -1030,5 +1031,49 @@ def test_flood_over_a_connection_is_processed_in_pieces(run: Run) -> None:
             await inbox.until(len(raws))
             assert inbox.raws == raws
             assert max(inbox.batches) <= tcp.PIECE_BYTES / len(raws[0]) + 1
+
+    run(test())
+
+
+def test_connections_are_processed_in_turn_a_piece_at_a_time(run: Run) -> None:
+    """Many flooding connections take no more time of an iteration than one, and end in order."""
+
+    async def test() -> None:
+        async with running("tcpin:127.0.0.1:0") as (link, inbox), contextlib.AsyncExitStack() as on:
+            flood = [
+                b"".join(frame(n, sysid, seq=n % 256) for n in range(2000)) for sysid in range(1, 6)
+            ]
+            loop, grown = asyncio.get_running_loop(), list[int]()
+            for raws in flood:
+                peer = await on.enter_async_context(connected(link))
+                await loop.sock_sendall(peer, raws)
+                peer.shutdown(socket.SHUT_WR)
+            while link.status.bytes < sum(map(len, flood)):
+                before = link.status.bytes
+                await asyncio.sleep(0)  # one iteration
+                grown.append(link.status.bytes - before)
+            assert 0 < max(grown) <= tcp.PIECE_BYTES
+            assert len(inbox.frames) == len(flood) * 2000  # nothing of a closed one is lost
+
+    run(test())
+
+
+def test_work_on_garbage_is_not_charged_to_senders(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise a flood of random bytes would have frames of honest senders dropped."""
+    charged = list[float]()
+
+    def worked(_: Newcomers, now_ns: int, seconds: float, age_ns: int | None) -> None:
+        charged.append(seconds)
+
+    monkeypatch.setattr(Newcomers, "worked", worked)
+
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, _):
+            await until_true(lambda: link.status.state == "up")
+            for data in (b"\xfd\x09garbage" * 400, frame(1)):
+                link.take(("127.0.0.1", 9), data)
+            assert charged[0] == 0.0 < charged[1]
 
     run(test())

@@ -22,6 +22,9 @@ NAME_MAX: Final = 64
 MESSAGE_MAX: Final = 2 << 20
 """Longest message that is parsed, bytes: the largest number of frames or UAVs fits into it."""
 PLACE_MAX: Final = (90.0, 180.0, 1e6)  # latitude and longitude in degrees, height in metres
+NUMBER_MAX: Final = 1e9  # largest magnitude of other numbers
+DB_MAX: Final = 300.0
+"""Largest gain or value in dB, and the least with the sign changed; no link budget is near it."""
 _LATEST_NS: Final = 1 << 62
 
 
@@ -84,7 +87,7 @@ def to_standing(data: bytes, node: str) -> Standing:
         place=(place[0], place[1], place[2]) if place else None,
         reach_m=None if reach_m is None else _number(reach_m),
         most=min(message.most, OFFERS_MAX),
-        serves=tuple((_name(one.uav), _number(one.worth_db)) for one in message.serves),
+        serves=tuple((_name(one.uav), _number(one.worth_db, DB_MAX)) for one in message.serves),
         handing=tuple((_name(one.uav), _name(one.to)) for one in message.handing),
     )
 
@@ -102,11 +105,14 @@ def to_offers(data: bytes) -> tuple[Offer, ...]:
     message = _parsed(schemas.OffersMessage, data, "message of offers")
     if len(message.offer) > OFFERS_MAX:
         raise FleetMessageError("too many offers in one message")
-    names = ("sure_db", "likely_db", "sinr_db", "heard_s")
+    limits = {"sure_db": DB_MAX, "likely_db": DB_MAX, "sinr_db": DB_MAX, "heard_s": NUMBER_MAX}
     return tuple(
         Offer(
             uav=_name(one.uav),
-            **{name: _number(getattr(one, name)) if one.HasField(name) else None for name in names},
+            **{
+                name: _number(getattr(one, name), most) if one.HasField(name) else None
+                for name, most in limits.items()
+            },
         )
         for one in message.offer
     )
@@ -127,8 +133,8 @@ def _time(t_ns: int) -> int:
     return t_ns
 
 
-def _number(value: float) -> float:
-    if not math.isfinite(value) or abs(value) > 1e9:
+def _number(value: float, most: float = NUMBER_MAX) -> float:
+    if not math.isfinite(value) or abs(value) > most:
         raise FleetMessageError(f"number {value} is out of range")
     return value
 

@@ -12,6 +12,8 @@ nothing.
 - If two nodes serve the same UAV without a handover, as after a partition, the node whose value at
   its claim was lower drops it. Both nodes know these constant values, so never both drop it. Names
   decide between equal values.
+- A claim counts only while its node's own offer supports it: a node cannot take UAVs by claiming
+  more than it offers.
 """
 
 from collections.abc import Mapping
@@ -25,6 +27,8 @@ from companion.values.described import Meaning
 CLAIM_DELAY_NS: Final = 500_000_000
 """Time without a serving node after which a UAV is claimed; longer than a message's delay."""
 ASSIGNED_NS: Final = 500_000_000  # time between two assignments while the nodes are the same
+CLAIM_EXCESS_DB: Final = 20.0
+"""Largest excess of a claim over the present offer of its node; offers change after a claim."""
 SETTLED_NS: Final = 2_000_000_000
 """Time for which a UAV must be assigned elsewhere before it is handed over."""
 
@@ -96,9 +100,9 @@ class Duties:
         if self._begun_ns is None:
             self._begun_ns = now_ns
         standing = {n: s for n, s in self.others(now_ns).items() if n in trusted}
-        claims = _claims(standing)
         before = dict(self.serves)
         known = {node: given for node, given in offers.items() if node in {*standing, self._name}}
+        claims = _claims(standing, known)
         at_ns, nodes = self._assigned
         if now_ns - at_ns >= ASSIGNED_NS or nodes != standing.keys():
             self._assigned = now_ns, frozenset(standing)
@@ -214,12 +218,19 @@ class Duties:
             del self._free_since[uav]
 
 
-def _claims(standing: Mapping[str, Standing]) -> dict[str, dict[str, float]]:
-    """Return the other nodes that serve each UAV, with its value to each at the claim, dB."""
+def _claims(
+    standing: Mapping[str, Standing], offers: Mapping[str, Mapping[str, float]]
+) -> dict[str, dict[str, float]]:
+    """Return the other nodes that serve each UAV, with its value to each at the claim, dB.
+
+    Claims that the offer of their node does not support are left out.
+    """
     claims = dict[str, dict[str, float]]()
     for node, said in standing.items():
+        given = offers.get(node, {})
         for uav, worth in said.serves:
-            claims.setdefault(uav, {})[node] = worth
+            if uav in given and worth <= given[uav] + CLAIM_EXCESS_DB:
+                claims.setdefault(uav, {})[node] = worth
     return claims
 
 

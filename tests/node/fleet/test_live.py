@@ -261,6 +261,8 @@ def test_duty_change_is_published_at_once(wire: Wire) -> None:
         ((what, payload),) = wire.said
         assert what == "standing"
         assert messages.to_standing(payload, "north").serves[0][0] == "1:1"
+        better = Offer(uav="1:1", sure_db=10.0, likely_db=10.0, sinr_db=25.0, heard_s=0.1)
+        wire.takes["offers"]("companion/site/south/offers", messages.offers({"1:1": better}))
         rival = Standing(node="south", place=None, reach_m=None, most=4, serves=(("1:1", 25.0),))
         wire.takes["standing"]("companion/site/south/standing", messages.standing(rival))
         last = steps[-1]

@@ -17,7 +17,8 @@ TIMES = st.integers(0, 1 << 62)
 NAMES = st.text("abc:0123456789", min_size=1, max_size=20)
 PLACES = st.tuples(st.floats(-90, 90), st.floats(-180, 180), st.floats(-1e6, 1e6))
 NUMBERS = st.floats(-1e9, 1e9, allow_nan=False)
-UNSURE = st.none() | NUMBERS
+DECIBELS = st.floats(-300, 300)
+UNSURE = st.none() | DECIBELS
 FRAMES = st.lists(st.builds(SharedFrame, st.integers(0, 1 << 61), st.binary(max_size=300)))
 TRIPS = st.lists(
     st.builds(
@@ -42,9 +43,9 @@ def test_shared_frames_round_trip(said: Shared) -> None:
         Standing,
         node=st.just("north"),
         place=st.none() | PLACES,
-        reach_m=UNSURE,
+        reach_m=st.none() | NUMBERS,
         most=st.integers(0, 10_000),
-        serves=st.lists(st.tuples(NAMES, NUMBERS)).map(tuple),
+        serves=st.lists(st.tuples(NAMES, DECIBELS)).map(tuple),
         handing=st.lists(st.tuples(NAMES, NAMES)).map(tuple),
     )
 )
@@ -57,7 +58,12 @@ def test_node_status_round_trips_exactly(said: Standing) -> None:
 @given(
     st.lists(
         st.builds(
-            Offer, uav=NAMES, sure_db=UNSURE, likely_db=UNSURE, sinr_db=UNSURE, heard_s=UNSURE
+            Offer,
+            uav=NAMES,
+            sure_db=UNSURE,
+            likely_db=UNSURE,
+            sinr_db=UNSURE,
+            heard_s=st.none() | NUMBERS,
         ),
         unique_by=lambda o: o.uav,
     )
@@ -94,6 +100,7 @@ def test_implausible_messages_are_rejected() -> None:
         (standing(place=[90.5, 0.0, 0.0]), "north"),
         (standing(place=[1.0, 1e300, 0.0]), "north"),
         (standing(reach_m=float("nan")), "north"),
+        (standing(serves=[{"uav": "1:1", "worth_db": 301.0}]), "north"),
         (standing(serves=[{"uav": "\u0663:1", "worth_db": 1.0}]), "north"),
         (standing(serves=[{"uav": "1:1", "worth_db": float("inf")}]), "north"),
         (standing(serves=[{"uav": "", "worth_db": 1.0}]), "north"),

@@ -41,8 +41,7 @@ class Pair:
             other = "b" if name == "a" else "a"
             if talk and other in alive:
                 self.nodes[name].hear(self.now_ns, words[other])
-            known = self.offers if talk else {name: self.offers[name]}
-            self.changes += self.nodes[name].decide(self.now_ns, known, NODES - {name})
+            self.changes += self.nodes[name].decide(self.now_ns, self.offers, NODES - {name})
             seen.append([one for one in alive if self.nodes[one].serves])
         return seen
 
@@ -162,7 +161,7 @@ class Alone:
 
 
 def test_claims_of_an_excluded_node_are_ignored() -> None:
-    node = Alone(a=20.0)
+    node = Alone(a=20.0, b=30.0)
     node.run(5, said("b", ("1:1", 30.0)))
     assert not node.duties.serves
     node.run(5, said("b", ("1:1", 30.0)), trusted="c")
@@ -194,8 +193,22 @@ def test_alternating_best_node_starts_no_handover() -> None:
     assert node.duties.handing == {"1:1": "b"}
 
 
-def test_equal_claims_are_kept_by_the_first_node_by_name() -> None:
+def test_claims_without_a_similar_offer_take_no_uav() -> None:
+    """Otherwise a node takes every UAV by claiming impossible values."""
     node = Alone(a=20.0)
+    node.run(4, said("b"))
+    node.run(1, said("b", ("1:1", 200.0)))  # no offer at all
+    assert list(node.duties.serves) == ["1:1"]
+    node.worth["b"] = 179.0
+    node.run(0.1, said("b", ("1:1", 200.0)))
+    assert list(node.duties.serves) == ["1:1"]
+    node.worth["b"] = 181.0
+    node.run(0.1, said("b", ("1:1", 200.0)))
+    assert not node.duties.serves
+
+
+def test_equal_claims_are_kept_by_the_first_node_by_name() -> None:
+    node = Alone(a=20.0, b=20.0)
     node.run(4, said("b"))
     node.run(1, said("b", ("1:1", 20.0)))
     assert list(node.duties.serves) == ["1:1"]

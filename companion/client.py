@@ -11,7 +11,9 @@ Synchronous; needs only the standard library, numpy and websockets. For use by o
 import base64
 import io
 import json
+import math
 import time
+import tokenize
 import urllib.error
 import urllib.request
 from collections.abc import Generator, Iterable, Iterator
@@ -25,13 +27,22 @@ import numpy as np
 from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import connect
 
-from companion.values import ComplexArray, UserError
+from companion.values import ComplexArray, UserError, shown
 
 Json = dict[str, Any]
 
 SUBPROTOCOL: Final = "companion.v1"
 ANSWER_MAX: Final = 1 << 28  # longest answer, bytes; 4 million weights take a quarter of it
 PIECE_BYTES: Final = 1 << 16
+_UNREADABLE: Final = (
+    ValueError, TypeError, LookupError, OverflowError, MemoryError, SyntaxError, RecursionError,
+    tokenize.TokenError,
+)  # fmt: skip
+"""What numpy raises for a malformed header; it does not list them."""
+_READ_HEADER: Final = {
+    (1, 0): np.lib.format.read_array_header_1_0,
+    (2, 0): np.lib.format.read_array_header_2_0,
+}
 
 
 class ServiceError(Exception):
@@ -102,12 +113,16 @@ class Client:
         query = urlencode({"lead_ms": lead_ms})
         with self._open(f"/v1/beams/weights?{query}", "application/x-npy") as answer:
             body, headers = _read(answer, self._timeout_s), answer.headers
-        uavs = tuple(name for name in headers["x-uavs"].split(",") if name)
-        matrix = np.load(io.BytesIO(body), allow_pickle=False)
-        groups = tuple(int(slot) for slot in headers["x-groups"].split(",") if slot)
-        return Weights(
-            uavs=uavs, matrix=matrix, valid_at_ns=int(headers["x-valid-at-ns"]), groups=groups
-        )
+        try:
+            return Weights(
+                uavs=tuple(name for name in headers.get("x-uavs", "").split(",") if name),
+                matrix=_matrix(body),
+                valid_at_ns=int(headers.get("x-valid-at-ns", "")),
+                groups=tuple(int(slot) for slot in headers.get("x-groups", "").split(",") if slot),
+            )
+        except _UNREADABLE as error:
+            reason = f"the weights are malformed: {shown(str(error))}"
+            raise ServiceError(None, reason) from error
 
     def table(self, media_type: str, lead_ms: float = 0.0) -> str:
         """Return the weights to apply in ``lead_ms`` milliseconds, as text for a device."""
@@ -216,6 +231,21 @@ def _read(answer: HTTPResponse, timeout_s: float) -> bytes:
         return bytes(body)
     except (OSError, HTTPException) as error:
         raise ServiceError(None, f"the answer is incomplete: {_reason(error)}") from error
+
+
+def _matrix(body: bytes) -> ComplexArray:
+    """Return the matrix of an ``.npy`` file. Raises an error before memory is allocated for it."""
+    file = io.BytesIO(body)
+    version = np.lib.format.read_magic(file)
+    if version not in _READ_HEADER:
+        raise ValueError(f"version {version} of .npy is not supported")
+    shape, _, dtype = _READ_HEADER[version](file)
+    if dtype.kind != "c" or len(shape) != 2:
+        raise ValueError(f"{len(shape)} axes of {dtype}, not a complex matrix")
+    if min(shape) < 0 or math.prod(shape) * dtype.itemsize != len(body) - file.tell():
+        raise ValueError(f"shape {shape} does not fit into the {len(body)} bytes of the answer")
+    matrix: ComplexArray = np.load(io.BytesIO(body), allow_pickle=False)
+    return matrix
 
 
 def _title(error: urllib.error.HTTPError) -> str:

@@ -5,7 +5,9 @@ import itertools
 import json
 import socket
 import socketserver
+import struct
 import threading
+import tracemalloc
 from collections.abc import Iterator
 from contextlib import closing
 from http.server import BaseHTTPRequestHandler, HTTPServer
@@ -235,3 +237,55 @@ def test_deeply_nested_answer_is_no_json() -> None:
         pytest.raises(ServiceError, match="the answer is not JSON"),
     ):
         Client(url).status()
+
+
+def npy(header: str, data: bytes = bytes(8)) -> bytes:
+    """An ``.npy`` file, whatever its header says."""
+    text = header.encode()
+    return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text)) + text + data
+
+
+HOSTILE = {
+    "huge": npy("{'descr': '<c8', 'fortran_order': False, 'shape': (1000000000, 1000000), }"),
+    "beyond 64 bits": npy(f"{{'descr': '<c8', 'fortran_order': False, 'shape': ({10**30}, 9), }}"),
+    "negative": npy("{'descr': '<c8', 'fortran_order': False, 'shape': (-1, -1), }"),
+    "objects": npy("{'descr': '|O', 'fortran_order': False, 'shape': (1, 1), }"),
+    "one axis": npy("{'descr': '<c8', 'fortran_order': False, 'shape': (1,), }"),
+    "no numbers": npy("{'descr': 'zz', 'fortran_order': False, 'shape': (1, 1), }"),
+    "nested": npy("(" * 9000),
+    "long header": npy(
+        "{'descr': '<c8', 'fortran_order': False, 'shape': (1, 1), }" + " " * 60_000
+    ),
+    "cut": npy("{'descr': '<c8', 'fortran_order': False, 'shape': (1, 1), }", bytes(7)),
+    "cut header": b"\x93NUMPY\x01\x00\xff\xff{",
+    "version": b"\x93NUMPY\x09\x00" + bytes(100),
+    "pickle": b"\x80\x04cposix\nsystem\n.",
+    "zip": b"PK\x03\x04" + bytes(100),
+    "empty": b"",
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_hostile_weights_are_rejected_in_one_line_and_little_memory(name: str) -> None:
+    body = HOSTILE[name]
+    head = b"200 OK\r\nx-valid-at-ns: 1\r\nContent-Length: %d" % len(body)
+    tracemalloc.start()
+    try:
+        with (
+            _answering(head, body) as url,
+            pytest.raises(ServiceError, match="the weights are malformed") as raised,
+        ):
+            Client(url, timeout_s=5.0).weights()
+        assert tracemalloc.get_traced_memory()[1] < 10e6
+    finally:
+        tracemalloc.stop()
+    assert "\n" not in str(raised.value)
+
+
+def test_weights_without_their_headers_are_malformed() -> None:
+    body = npy("{'descr': '<c8', 'fortran_order': False, 'shape': (1, 1), }")
+    with (
+        _answering(b"200 OK\r\nContent-Length: %d" % len(body), body) as url,
+        pytest.raises(ServiceError, match="the weights are malformed"),
+    ):
+        Client(url).weights()

@@ -30,6 +30,8 @@ def find(named: str | None) -> Path | None:
     """Return the map file of ``[page] map``. Raises ``UserError`` if it is not PMTiles."""
     if named is None:
         return None
+    if Path(named).exists() and not (Path(named).is_file() or Path(named).is_dir()):
+        raise UserError(f"page.map = {named!r}: a pipe or a device; give a PMTiles file")
     try:
         with Path(named).open("rb") as file:
             head = file.read(len(MAGIC))

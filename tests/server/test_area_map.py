@@ -1,5 +1,6 @@
 """The map under the plan view: byte ranges of the user's file, never of a file named in a log."""
 
+import os
 from pathlib import Path
 from typing import Any
 
@@ -51,3 +52,10 @@ def test_invalid_map_file_is_rejected_at_start(tmp_path: Path, area: Path) -> No
             area_map.find(str(tmp_path / name))
     with pytest.raises(UserError, match="Is a directory"):
         area_map.find(str(tmp_path))
+
+
+def test_pipe_in_place_of_a_map_is_not_opened(tmp_path: Path) -> None:
+    """Opening it would wait for a writer, and the service would not start."""
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(UserError, match="a pipe or a device"):
+        area_map.find(str(tmp_path / "pipe"))

@@ -1,11 +1,12 @@
 """Counts of rejections, by sender and reason."""
 
-from collections import Counter, OrderedDict, deque
+from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
 from typing import Final
 
 from companion.pipeline.records import UavRecords, UnusedRun
 from companion.values import Notice, Reason, Rejection, Severity, kind_of
+from companion.values.newest import Newest
 
 REJECTED_AFTER_NS: Final = 1_000_000_000
 """Time without an accepted report of a sender after which a notice is published."""
@@ -36,7 +37,7 @@ class SenderRejections:
     """Rejections of one sender (a UAV, component or link): counts by reason, and the newest."""
 
     counts: Counter[Reason] = field(default_factory=Counter)
-    recent: deque[Rejection] = field(default_factory=lambda: deque(maxlen=RECENT))
+    recent: Newest[Rejection] = field(default_factory=lambda: Newest(RECENT))
 
 
 _NO_REJECTIONS: Final = SenderRejections()

@@ -8,12 +8,12 @@ docs/math.md 5.2.
 """
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from typing import Final, Generic
 
 from companion.tracking.observers.estimates import Observer, Prediction, State
 from companion.values import Fix, Reason
+from companion.values.newest import Newest
 
 FROZEN_SPEED_MPS = 1.0  # least reported speed at which an unchanged position counts as frozen
 FROZEN_TRAVEL_M = 0.3
@@ -98,7 +98,7 @@ class Suspects(Generic[State]):
     def __init__(self, observer: Observer[State], settings: GateSettings) -> None:
         self._observer = observer
         self._settings = settings
-        self._run: deque[Fix] = deque(maxlen=64)
+        self._run: Newest[Fix] = Newest(64)
         self._begun_ns = 0
         self._alternations = 0
         self._interrupted = False

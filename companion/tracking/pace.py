@@ -5,10 +5,10 @@ between reports. A track coasts only after a silence longer than three of its ow
 spread of latencies, and longer than recent silences.
 """
 
-from collections import deque
 from typing import Final
 
 from companion.values import Fix
+from companion.values.newest import Newest
 
 KEPT: Final = 16  # reports from which the timing is measured
 INTERVALS: Final = 3.0
@@ -20,9 +20,9 @@ class ReportTiming:
     """Intervals, latencies and silences of a UAV's reports. ``add`` takes accepted reports."""
 
     def __init__(self) -> None:
-        self._intervals_s: deque[float] = deque(maxlen=KEPT)
-        self._latencies_s: deque[float] = deque(maxlen=KEPT)
-        self._ages_s: deque[float] = deque(maxlen=KEPT)
+        self._intervals_s: Newest[float] = Newest(KEPT)
+        self._latencies_s: Newest[float] = Newest(KEPT)
+        self._ages_s: Newest[float] = Newest(KEPT)
         self._newest: Fix | None = None
         self._silence_s = 0.0
 

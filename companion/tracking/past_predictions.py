@@ -10,13 +10,13 @@ that the near future resembles the recent past.
 
 import math
 from bisect import insort
-from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from itertools import chain, pairwise
 from typing import Final
 
 from companion.values import Fix, Vector
+from companion.values.newest import Newest
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -117,7 +117,7 @@ class _PastPrediction:
 class _Errors:
     """Newest errors of predictions that were about equally old."""
 
-    in_order: deque[float] = field(default_factory=lambda: deque(maxlen=ERRORS_KEPT))
+    in_order: Newest[float] = field(default_factory=lambda: Newest(ERRORS_KEPT))
     sorted_m: list[float] = field(default_factory=list)
     age_s: float = 0.0
     judged_ns: int = 0
@@ -138,12 +138,14 @@ class PastPredictions:
     """Past predictions of one UAV. ``add`` takes reports in order of the sender's time."""
 
     def __init__(self) -> None:
-        self._states: deque[_PastPrediction] = deque(maxlen=_KEPT)
+        self._states: Newest[_PastPrediction] = Newest(_KEPT)
         self._costs = [0.0] * (2 * len(ACCELERATION_MODELS))
         self._comparisons = 0
         self._compared_ns = 0
         self._model = 0
-        self._errors = tuple(_Errors() for _ in AGES_S)
+        self._errors: dict[
+            float, _Errors
+        ] = {}  # by least age, from the first prediction of that age
         self._smoothed: tuple[int, Vector, Vector] | None = None  # time, position, velocity
         self._smoothing_offset: Vector = ZERO
 
@@ -190,9 +192,14 @@ class PastPredictions:
         """
         there = fix.position_ned_m
         self._compare(fix.sender_ns, there)
-        for errors, least_s in zip(self._errors, AGES_S, strict=True):
+        for least_s in AGES_S:
             made = self._older(fix.sender_ns, least_s)
-            if made is not None and made.sender_ns > errors.judged_ns:
+            if made is None:
+                continue
+            errors = self._errors.get(least_s)
+            if errors is None:
+                errors = self._errors[least_s] = _Errors()
+            if made.sender_ns > errors.judged_ns:
                 errors.judged_ns = made.sender_ns
                 age_s = (fix.sender_ns - made.sender_ns) * 1e-9
                 errors.add(made.error_m(self._model, there, age_s), age_s)
@@ -240,7 +247,9 @@ class PastPredictions:
     def usual_errors(self) -> UsualErrors:
         """Observed ages of predictions, ascending, each with the 95th percentile of its errors."""
         return tuple(
-            (one.age_s, one.error_p95_m) for one in self._errors if one.error_p95_m is not None
+            (one.age_s, one.error_p95_m)
+            for one in map(self._errors.get, AGES_S)
+            if one is not None and one.error_p95_m is not None
         )
 
 

@@ -10,7 +10,6 @@ becomes that of a receiver without a stated accuracy, or more if the deviation w
 """
 
 import math
-from collections import deque
 from dataclasses import replace
 from typing import Final
 
@@ -44,7 +43,7 @@ class ReceiverCheck:
     def __init__(self, settings: NoiseSettings) -> None:
         self._settings = settings
         # Sender time, deviation north and east in m, sum of squares of the unseen displacements.
-        self._seen: deque[tuple[int, float, float, float]] = deque()
+        self._seen: list[tuple[int, float, float, float]] = []
         self._newest: Fix | None = None
         self._deviation_m = 0.0
 
@@ -105,7 +104,7 @@ class ReceiverCheck:
         _, north, east, unseen_m2 = seen[-1]
         seen.append((sender_ns, north + north_m, east + east_m, unseen_m2 + unseen_m**2))
         while sender_ns - seen[0][0] > WITHIN_NS:
-            seen.popleft()
+            del seen[0]
         (_, north_0, east_0, before_m2), (_, north, east, unseen_m2) = seen[0], seen[-1]
         return math.hypot(north - north_0, east - east_0), math.sqrt(unseen_m2 - before_m2)
 

@@ -1,5 +1,6 @@
 """Identifiers: ids of frame senders and of UAVs."""
 
+import sys
 from enum import Enum
 from functools import lru_cache
 from typing import Final, NamedTuple, Self
@@ -62,8 +63,11 @@ class UavKind(Enum):
         self.reports_itself = not prefix
 
     def uav(self, name: str) -> str:
-        """Return the UAV id of an aircraft of this kind, from its name."""
-        return f"{self.prefix}:{name}"
+        """Return the UAV id of an aircraft of this kind, from its name.
+
+        All reports of an aircraft share one string, of which many are kept.
+        """
+        return sys.intern(f"{self.prefix}:{name}")
 
 
 _KINDS: Final = {kind.prefix: kind for kind in UavKind}

@@ -22,6 +22,7 @@ from companion.tracking.past_predictions import (
     usual_error_m,
 )
 from companion.values import Fix
+from companion.values.newest import Newest
 
 S = 1_000_000_000
 OBSERVER = KinematicObserver(KinematicModel(60.0, 20.0))
@@ -200,3 +201,10 @@ def test_decaying_acceleration_matches_its_integral(decay_s: float) -> None:
     way, gain = fading_response(2.0, decay_s)
     assert gain == pytest.approx(speeds[-1], rel=1e-6)
     assert way == pytest.approx(float(np.trapezoid(speeds, times)), rel=1e-6)
+
+
+def test_newest_values_are_kept_up_to_the_limit() -> None:
+    kept = Newest[int](3)
+    for value in range(5):
+        kept.append(value)
+    assert kept == [2, 3, 4]

@@ -180,7 +180,9 @@ class Link:
         if age_ns is not None and age_ns > LATE_NS:
             newcomers.late()
         spent_s = time.perf_counter() - began_s
-        newcomers.worked_s += spent_s * _share_of_frames(found, len(data))
+        if len(found) != 1 or isinstance(found[0], Rejection):
+            spent_s *= _share_of_frames(found, len(data))
+        newcomers.worked_s += spent_s
         if now_ns >= newcomers.adapts_ns:
             newcomers.adapt(now_ns)
         if isinstance(peer.splitter, ForeignSplitter) and not self.url.listens:

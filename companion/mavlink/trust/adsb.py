@@ -62,15 +62,15 @@ class _RelayedAircraft:
     velocity_ne: _Dated[tuple[float, float]] | None = None
     velocity_down: _Dated[float] | None = None
     callsign: _Dated[str] | None = None
-    reported: OrderedDict[tuple[float, float], AdsbVehicle] = field(default_factory=OrderedDict)
-    relays: OrderedDict[Source, int] = field(default_factory=OrderedDict)  # last message, ns
+    reported: dict[tuple[float, float], AdsbVehicle] = field(default_factory=dict)
+    relays: dict[Source, int] = field(default_factory=dict)  # last message, ns
 
     def hear(self, relay: Source, t_ns: int) -> None:
         """Record that a relay reported the aircraft at ``t_ns``."""
+        self.relays.pop(relay, None)
         self.relays[relay] = t_ns
-        self.relays.move_to_end(relay)
         while len(self.relays) > RELAYS_KEPT or _is_past(next(iter(self.relays.values())), t_ns):
-            self.relays.popitem(last=False)
+            del self.relays[next(iter(self.relays))]
 
     def learn(self, message: AdsbVehicle, true_ns: int) -> None:
         """Store every field of a message that is present and newer than the stored one."""
@@ -114,10 +114,10 @@ class _RelayedAircraft:
         true_ns = _true_ns(message)
         self.datum, alt_m, age_ns = altitude
         self.position_ns = max(true_ns, self.position_ns or true_ns)
+        self.reported.pop(at_deg, None)
         self.reported[at_deg] = message
-        self.reported.move_to_end(at_deg)
         if len(self.reported) > POSITIONS_KEPT:
-            self.reported.popitem(last=False)
+            del self.reported[next(iter(self.reported))]
         return Report(
             t_ns=message.t_ns,
             uav=message.uav,

@@ -147,7 +147,9 @@ def valid_frames(_: random.Random) -> bytes:
 
 def garbage(rng: random.Random) -> bytes:
     """Random bytes, a quarter of them the first byte of a frame."""
-    return bytes(rng.choice((0xFD, 0xFE, rng.randrange(256), rng.randrange(256))) for _ in range(65536))
+    return bytes(
+        rng.choice((0xFD, 0xFE, rng.randrange(256), rng.randrange(256))) for _ in range(65536)
+    )
 
 
 def half_frames(rng: random.Random) -> bytes:
@@ -169,7 +171,9 @@ def half_frames(rng: random.Random) -> bytes:
 
 def sbs_lies(rng: random.Random, now_s: float) -> bytes:
     """One line of an aircraft that does not exist, at an impossible place, time or speed."""
-    day = time.strftime("%Y/%m/%d,%H:%M:%S", time.gmtime(now_s + rng.choice((0, -300, 86_400, 1e8))))
+    day = time.strftime(
+        "%Y/%m/%d,%H:%M:%S", time.gmtime(now_s + rng.choice((0, -300, 86_400, 1e8)))
+    )
     lat, lon = rng.choice(
         ((LAT0 + rng.gauss(0, 0.01), LON0 + rng.gauss(0, 0.01)), (90.0, 180.0), (-90.0, -180.0),
          (0.0, 0.0), (123.0, 999.0), (rng.uniform(-90, 90), rng.uniform(-180, 180)))
@@ -197,10 +201,7 @@ def beast_lies(rng: random.Random, _: float) -> bytes:
 
 
 class LyingServer:
-    """A receiver's server: lies ``per_s`` times a second to the first connections, then drips.
-
-    ``accepted`` counts its connections.
-    """
+    """A receiver's server that lies ``per_s`` times a second; each hundredth lie is cut short."""
 
     def __init__(self, lie: Callable[[random.Random, float], bytes], per_s: float) -> None:
         rng, now_s = random.Random(8), time.time()
@@ -208,14 +209,12 @@ class LyingServer:
         self._per_s = per_s
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._listener.getsockname()[1])
-        self.accepted = 0
 
     def attack(self, _: Node, until: threading.Event) -> None:
-        """Serve until the event is set: lies, and a byte of one of them at every hundredth."""
+        """Serve one connection until the event is set."""
         self._listener.settimeout(HANG_S)
         with self._listener:
             peer, _ = self._listener.accept()
-            self.accepted += 1
             with peer, contextlib.suppress(OSError):
                 begun_s, sent = time.monotonic(), 0
                 while not until.is_set():
@@ -268,15 +267,17 @@ class Liar:
         return Shared(time.time_ns(), tuple(frames))
 
     def _offers(self) -> dict[str, Offer]:
-        gain_db = {"gains": 1e8}.get(self._lie, -100.0)
+        gain_db = {"gains": 290.0}.get(self._lie, -100.0)
         return {
             uav: Offer(uav=uav, sure_db=gain_db, likely_db=gain_db, sinr_db=gain_db, heard_s=0.1)
             for uav in self._names
         }
 
     def _standing(self) -> Standing:
-        serves = tuple((uav, 1e8) for uav in self._names) if self._lie == "duties" else ()
-        return Standing(node="liar", place=(LAT0, LON0, 550.0), reach_m=None, most=1000, serves=serves)
+        serves = tuple((uav, 290.0) for uav in self._names) if self._lie == "duties" else ()
+        return Standing(
+            node="liar", place=(LAT0, LON0, 550.0), reach_m=None, most=1000, serves=serves
+        )
 
 
 def _clock(started_ns: int) -> bytes:

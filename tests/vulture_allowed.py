@@ -24,3 +24,5 @@ one_uav, streamed, healthz, readyz, listing, download, list_scenarios, predictio
 served.readable, served.readinto  # `io` calls them
 exception  # the name of an argument of `__exit__`
 row.shows, row.likeness, row.bears_on  # read by the template of the paper's page
+stream.get_buffer, stream.buffer_updated  # asyncio calls them
+sizehint  # the name of an argument of `get_buffer`

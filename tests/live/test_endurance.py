@@ -32,6 +32,7 @@ from companion.values import Frame
 
 SHORT_S, LONG_S = 5.0, 30.0
 GROWS_MB = 30.0
+MAP_MB = 40.0  # threads that read files, and 64 kB of each answer that is not read
 FULL_TABLE_MB = 40.0
 """For 2000 tracks, the limit of ``[tracks] most``: 10 kB each, besides what time alone takes."""
 UDP = "udpin:127.0.0.1:0"
@@ -366,4 +367,4 @@ def test_reads_of_a_hostile_map_cost_no_beam(start_node: Any, tmp_path: Path, ta
         seen = attacked(reads_of_a_map(area), node, SHORT_S)
         assert node.get("/v1/map/tiles")[0] == 404
         stopped(node)
-    told(table, "a hostile map", seen)
+    told(table, "a hostile map", seen, MAP_MB)

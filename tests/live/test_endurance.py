@@ -344,7 +344,7 @@ def reads_of_a_map(area: Path) -> Attack:
                    (3.0, lambda: (area.unlink(), os.mkfifo(area)))]  # fmt: skip
         held = list[socket.socket]()  # open, and they read no more
         with contextlib.ExitStack() as stack:
-            while not until.is_set():
+            while not until.wait(0.05):  # between two rounds
                 if changes and time.monotonic() - begun_s > changes[0][0]:
                     changes.pop(0)[1]()
                 for wanted in RANGES:

@@ -16,8 +16,9 @@ was here first stays believed, and a stranger costs it nothing; whoever sends fi
 name is believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
-in a vehicle's name. Messages that move the sender's clock or its bounds are not: those with a time
-stamp, TIMESYNC, HEARTBEAT, GPS_RAW_INT and EKF_STATUS_REPORT.
+in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
+position or attitude, any message with a time stamp, TIMESYNC, HEARTBEAT, GPS_RAW_INT and
+EKF_STATUS_REPORT.
 """
 
 import math
@@ -49,8 +50,10 @@ COMPARED_PER_S: Final = 30.0  # positions of strangers compared per sender and s
 NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one sender
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
-_ABOUT_SENDER: Final = frozenset({*STAMPED, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT})
-JUDGED: Final = DECODED | POSE | _ABOUT_SENDER
+_ABOUT_SENDER: Final = frozenset(
+    {*STAMPED, *POSE, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT}
+)
+JUDGED: Final = DECODED | _ABOUT_SENDER
 """Messages that ``refusal`` judges; it accepts all others."""
 
 

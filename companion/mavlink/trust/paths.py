@@ -72,7 +72,8 @@ class Path:
     def excess_ahead_m(self, said: OwnPosition) -> float | None:
         """Return the same for a report that is ahead of this path by at most ``AHEAD_MS``.
 
-        With constant velocity the distance is at most a dt^2 / 2.
+        With constant velocity the distance is at most a dt^2 / 2. Infinite if the velocities differ
+        by more than ``SLACK_MPS`` and a dt.
         """
         last = self.newest
         if last is None or last.velocity_ned_mps is None:
@@ -80,6 +81,9 @@ class Path:
         ahead_s = (said.boot_ms - last.boot_ms) * 1e-3
         if not 0 < ahead_s <= AHEAD_MS * 1e-3:
             return None
+        velocity, most_mps = said.velocity_ned_mps, SLACK_MPS + ACCELERATION_MPS2 * ahead_s
+        if velocity is not None and math.dist(velocity, last.velocity_ned_mps) > most_mps:
+            return math.inf
         north, east, down = (ahead_s * speed for speed in last.velocity_ned_mps)
         scale_n, scale_e, _ = scales = _scales(said)
         lat, lon, alt = _place(last)

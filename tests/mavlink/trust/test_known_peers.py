@@ -14,6 +14,7 @@ from companion.mavlink.trust.known_peers import PROBATION_NS, STRANGER, KnownPee
 from companion.mavlink.wire.decode import EKF_STATUS_REPORT, GPS_RAW_INT, HEARTBEAT, SYSTEM_TIME
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, heartbeat, pack
 from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.positions import HIGH_LATENCY2
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.values import Frame, Source
 
@@ -91,6 +92,7 @@ def test_messages_about_other_aircraft_are_accepted_if_the_known_peer_brings_non
         (116, struct.pack("<Ihhhhhhhhh", 7, *range(1, 10))),  # SCALED_IMU2
         (HEARTBEAT, struct.pack("<IBBBBB", 4, 7, 3, 217, 4, 3)),
         (GPS_RAW_INT, bytes(29) + b"\1"),
+        (HIGH_LATENCY2, bytes(41) + b"\1"),
         (EKF_STATUS_REPORT, bytes(20) + b"\1\4"),
     ],
 )
@@ -150,6 +152,17 @@ def test_fresh_ports_evict_no_known_peer_and_are_never_believed() -> None:
     late = [t_s for times in found.values() for t_s in times if t_s > 10.1 + within_slack_s]
     assert len(late) >= 40 * (50 - within_slack_s) - 2
     assert [one[0] for one in peers.contradicted] == ["1:1"]
+
+
+def test_right_place_ahead_of_time_with_a_wrong_velocity_is_not_used() -> None:
+    forged = (
+        (at_s, boot_s + 0.05, f"10.0.0.66:{number}", place._replace(north_mps=place.north_mps + 30))
+        for number, (at_s, boot_s, _, _) in enumerate(heard(OTHER, 25, begins_s=10.0))
+        for place in [circle(boot_s + 0.05 - 100)]
+    )
+    found = rejected(KnownPeers(), heard(HOME, 10), forged)
+    assert found.pop(HOME) == []
+    assert sum(map(len, found.values())) == 25 * 50
 
 
 def test_stranger_that_agrees_first_and_drifts_is_rejected_within_the_slack() -> None:

@@ -17,6 +17,7 @@ from companion.values.budget import Budget
 
 HEAD_BYTES: Final = 16_384
 """Limit on the bytes of a request line and headers; browsers send one or two thousand."""
+HEADERS_MOST: Final = 100  # limit on a request's headers; each takes microseconds to parse
 BODY_BYTES: Final = 65_536  # limit on a request's body; no route uses one
 HEAD_S: Final = 10.0
 """Time limit for a complete head, from connecting or from the last answer, seconds."""
@@ -165,6 +166,8 @@ class BoundedProtocol(HttpToolsProtocol):
     def on_header(self, name: bytes, value: bytes) -> None:
         """Process a header of the request."""
         self._count(len(name) + len(value) + 4)
+        if len(self.headers) >= HEADERS_MOST:
+            raise TooLongError
         super().on_header(name, value)
 
     def on_headers_complete(self) -> None:

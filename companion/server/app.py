@@ -1,5 +1,6 @@
 """The HTTP API and the dashboard's files for a running node; read-only."""
 
+import asyncio
 from pathlib import Path
 from typing import Annotated, Final
 
@@ -84,9 +85,14 @@ def create_app(
     file_routes.add(app, node, large)
     area_map.add(app, area)
 
+    described = list["asyncio.Task[bytes]"]()
+
     @app.get("/openapi.json", include_in_schema=False)
     async def openapi() -> Response:
-        return answer(await run_in_threadpool(app.openapi))
+        if not described:  # built once: it takes most of a second of interpreter time
+            making = run_in_threadpool(lambda: encode(app.openapi()))
+            described.append(asyncio.create_task(making))
+        return json_response(await asyncio.shield(described[0]))
 
     @app.get("/docs", include_in_schema=False)
     async def docs(request: Request) -> Response:

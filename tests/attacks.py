@@ -120,6 +120,30 @@ def requests(threads: int, path: str = "/v1/uavs") -> Attack:
     return attack
 
 
+def distinct_requests(threads: int) -> Attack:
+    """Requests whose answers nobody shares, each over a new connection."""
+    paths = (
+        "/v1/beams?lead_ms={:.3f}", "/v1/pattern?points=1801&cut_deg={:.3f}",
+        "/v1/beams/weights?lead_ms={:.3f}", "/v1/uavs",
+    )  # fmt: skip
+
+    def attack(node: Node, until: threading.Event) -> None:
+        def one(number: int) -> None:
+            rng = random.Random(number)
+            while not until.is_set():
+                with contextlib.suppress(OSError), tcp(node) as made:
+                    made.send(_get(rng.choice(paths).format(rng.uniform(0.0, 90.0))))
+                    made.recv(1 << 16)
+
+        running = [threading.Thread(target=one, args=(n,), daemon=True) for n in range(threads)]
+        for thread in running:
+            thread.start()
+        for thread in running:
+            thread.join()
+
+    return attack
+
+
 # --- MAVLink --------------------------------------------------------------------------------------
 
 

@@ -24,6 +24,7 @@ from support import HANG_S, ROOT, Node, end
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 LOOK_S = 0.1
+RECENT_S = 5.0  # a warning older than this announces no broken bound
 HONEST = frozenset(f"{sysid}:1" for sysid in UAVS)
 PAGE_MB = 4096 / 1e6
 M_PER_DEG_LAT = 111_195.0
@@ -133,12 +134,16 @@ class Looking(threading.Thread):
                 continue  # not tracked: no beam, which the look counts
             at_s = datetime.fromisoformat(shown["valid_at"]).timestamp()
             found = broken(shown, at_s)
-            if found and shown["verdict"] == "good" and not self._is_announced(uav):
+            if found and shown["verdict"] == "good" and not self._is_announced(uav, at_s):
                 self.seen.broken.append(found)
 
-    def _is_announced(self, uav: str) -> bool:
+    def _is_announced(self, uav: str, at_s: float) -> bool:
+        """Return whether a warning about a UAV was published shortly before."""
         events = _ask(f"{self._node.url}/v1/events", self._token)["events"]
-        return any(one["subject"] == uav and one["severity"] != "info" for one in events)
+        recent = [
+            one for one in events if datetime.fromisoformat(one["at"]).timestamp() > at_s - RECENT_S
+        ]
+        return any(one["subject"] == uav and one["severity"] != "info" for one in recent)
 
 
 class Losses(NamedTuple):

@@ -27,7 +27,7 @@ T = TypeVar("T")
 RATE_WINDOW_S: Final = 2.0  # time over which frames and updates per second are averaged
 NOTICES_KEPT: Final = 200
 STREAM_TAKES_BYTES: Final = 1024  # largest message accepted from a WebSocket client
-BACKLOG: Final = 128  # connections accepted in one iteration of the event loop
+BACKLOG: Final = 512  # connections that wait to be accepted; one beyond it is repeated after 1 s
 CLOSE_TIMEOUT_S: Final = 2
 """Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
 

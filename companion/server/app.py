@@ -7,7 +7,6 @@ from typing import Annotated, Final
 from fastapi import FastAPI, HTTPException, Request, WebSocket
 from fastapi import Path as PathParameter
 from fastapi.responses import Response
-from starlette.concurrency import run_in_threadpool
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 import companion
@@ -28,6 +27,7 @@ from companion.server.responses import (
     refusals,
 )
 from companion.server.stream import Stream
+from companion.server.threads import in_thread
 from companion.server.work_slots import WorkSlots
 from companion.values import UAV_FORMS
 from companion.views import fleet as fleet_view
@@ -90,7 +90,7 @@ def create_app(
     @app.get("/openapi.json", include_in_schema=False)
     async def openapi() -> Response:
         if not described:  # built once: it takes most of a second of interpreter time
-            making = run_in_threadpool(lambda: encode(app.openapi()))
+            making = in_thread(lambda: encode(app.openapi()))
             described.append(asyncio.create_task(making))
         return json_response(await asyncio.shield(described[0]))
 

@@ -5,7 +5,6 @@ from typing import Annotated
 
 from fastapi import FastAPI, Header, HTTPException, Path
 from fastapi.responses import Response, StreamingResponse
-from starlette.concurrency import run_in_threadpool
 
 from companion.server import recordings
 from companion.server.giving_way import GivingWay
@@ -18,6 +17,7 @@ from companion.server.responses import (
     json_response,
     refusals,
 )
+from companion.server.threads import in_thread
 from companion.values import Source
 from companion.views import mavlink_messages
 from companion.views.last_messages import Kept, by_sender
@@ -49,7 +49,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
         responses=answers(recordings.Recordings),
     )
     async def listing() -> Response:
-        return answer({"recordings": await run_in_threadpool(recordings.listed, where, current())})
+        return answer({"recordings": await in_thread(recordings.listed, where, current())})
 
     @app.get(
         "/v1/recordings/{name}",
@@ -62,7 +62,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
         },
     )
     async def download(name: RecordingName, wanted: Range = None) -> Response:
-        found = await run_in_threadpool(recordings.opened, where, name, current())
+        found = await in_thread(recordings.opened, where, name, current())
         if found is None:
             raise HTTPException(404, f"no recording {name!r}")
         file, size = found
@@ -130,7 +130,7 @@ def _mavlink(app: FastAPI, node: Node, large: LargeAnswers) -> None:
         responses=answers(mavlink_messages.MavlinkMessage, 404, 422),
     )
     async def message(sys: SystemId, comp: ComponentId, name: MessageName) -> Response:
-        dialect = await run_in_threadpool(mavlink_messages.dialect)
+        dialect = await in_thread(mavlink_messages.dialect)
         msgid = dialect.msgid(name)
         found = None if msgid is None else kept.find(Source(sys, comp), msgid)
         if found is None:

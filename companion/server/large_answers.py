@@ -12,11 +12,10 @@ from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import Final, TypeVar
 
-from starlette.concurrency import run_in_threadpool
-
 from companion.server.giving_way import NEVER, GivingWay
 from companion.server.responses import encode, encode_with_items
 from companion.server.shared_work import SharedWork
+from companion.server.threads import in_thread
 from companion.server.work_slots import WorkSlots
 from companion.views import uav_state
 from companion.views.as_json import Json, Utc, as_json, rfc3339
@@ -72,7 +71,7 @@ class LargeAnswers:
 
         async def work() -> T:
             async with self._work_slots.slot(is_long=True):
-                return await run_in_threadpool(prepare(), GivingWay(self._makes_beams))
+                return await in_thread(prepare(), GivingWay(self._makes_beams))
 
         return await self._shared.run(what, work)
 
@@ -86,7 +85,7 @@ class LargeAnswers:
         async def work() -> T:
             async with self._work_slots.slot(is_long=True):
                 make = prepare(await self._overview())
-                return await run_in_threadpool(make, GivingWay(self._makes_beams))
+                return await in_thread(make, GivingWay(self._makes_beams))
 
         return await self._shared.run(what, work)
 

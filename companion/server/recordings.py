@@ -13,9 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, BinaryIO, Final, Literal
 
-from starlette.concurrency import run_in_threadpool
-
 from companion.recording.writer import ACTIVE
+from companion.server.threads import in_thread
 from companion.values import UtcNs
 from companion.values.described import Meaning
 from companion.views.as_json import Json, rfc3339
@@ -144,9 +143,9 @@ def span(header: str | None, size: int) -> tuple[int, int] | None:
 async def pieces(file: BinaryIO, start: int, stop: int) -> AsyncIterator[bytes]:
     """Yield a file's bytes from ``start`` to ``stop``, off the event loop; close the file."""
     with file:
-        await run_in_threadpool(file.seek, start)
+        await in_thread(file.seek, start)
         while start < stop:
-            piece = await run_in_threadpool(file.read, min(_PIECE_BYTES, stop - start))
+            piece = await in_thread(file.read, min(_PIECE_BYTES, stop - start))
             if not piece:
                 return
             start += len(piece)

@@ -5,8 +5,9 @@ import contextlib
 from collections.abc import AsyncIterator, Callable
 from typing import Final, TypeVar
 
-from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
+
+from companion.server.threads import in_thread
 
 AT_ONCE: Final = 2
 """Number of requests that compute at once; each takes interpreter time from the links."""
@@ -73,4 +74,4 @@ class WorkSlots:
         wait for requests whose answers nobody shares.
         """
         async with self._shared_slot() if is_shared and self._shared_room else self.slot():
-            return await run_in_threadpool(work)
+            return await in_thread(work)

@@ -30,6 +30,7 @@ CASES: dict[str, Case] = {
         attacks.pipelined(300, "/main.js", reads=False), 60.0
     ),
     "a new connection for each request, 8 at once": Case(attacks.requests(8)),
+    "distinct requests, 20 at once": Case(attacks.distinct_requests(20)),
     "pings over one WebSocket": Case(attacks.pings(1)),
     "pings over 20 WebSockets": Case(attacks.pings(20)),
     "256 streams that read nothing": Case(attacks.unread_streams(256), 60.0),

@@ -37,3 +37,20 @@ def test_attacks_at_once_cost_no_beam_and_no_bound(start_node: Any) -> None:
     assert seen.broken == []
     assert code == 0
     assert "Traceback" not in err
+
+
+def test_service_ends_while_answers_are_computed(start_node: Any) -> None:
+    """Requests that nobody awaits any more leave no thread that keeps the process."""
+    with besieged(start_node) as node:
+        until = threading.Event()
+        attacker = threading.Thread(
+            target=attacks.distinct_requests(20), args=(node, until), daemon=True
+        )
+        attacker.start()
+        before = node.json("/v1/status")["updates"]
+        node.wait_until("/v1/status", lambda status: status["updates"] > before + 10)
+        code, _, err = node.stop()
+        until.set()
+        attacker.join(HANG_S)
+    assert code == 0, err
+    assert "Traceback" not in err

@@ -84,6 +84,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._stalled: asyncio.TimerHandle | None = None
         self._since_s = 0.0  # time of the connection, of the last head, or of the last answer
         self._over_budget = False
+        self._is_lost = False
         self._answered: Any = None  # the request that is being answered, or the last one
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -98,6 +99,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def connection_lost(self, exc: Exception | None) -> None:
         """Clean up; see ``asyncio.Protocol``."""
+        self._is_lost = True
         self._cancel()
         self._unparsed.clear()
         if self._answered is not None:
@@ -105,6 +107,7 @@ class BoundedProtocol(HttpToolsProtocol):
         if self.transport is not None:
             self._read_again()
             super().connection_lost(exc)
+            self.cycle = self._answered = None  # type: ignore[assignment]  # breaks a cycle
 
     def data_received(self, data: bytes) -> None:
         """Process bytes of a client; see ``asyncio.Protocol``."""
@@ -261,6 +264,8 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def _abort_after(self, seconds: float) -> None:
         self._cancel()
+        if self._is_lost:
+            return  # a timer would keep the connection's memory until then
         self._deadline = self.loop.call_later(seconds, self.abort)
 
     def _cancel(self) -> None:

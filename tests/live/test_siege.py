@@ -29,7 +29,7 @@ CASES: dict[str, Case] = {
     "300 connections that read nothing of the page": Case(
         attacks.pipelined(300, "/main.js", reads=False), 60.0
     ),
-    "a new connection for each request, 8 at once": Case(attacks.requests(8)),
+    "a new connection for each request, 8 at once": Case(attacks.requests(8), 80.0),
     "distinct requests, 20 at once": Case(attacks.distinct_requests(20)),
     "pings over one WebSocket": Case(attacks.pings(1)),
     "pings over 20 WebSockets": Case(attacks.pings(20)),

@@ -124,7 +124,7 @@ WAYS: Final = (
         name="HTTP connections",
         covers=("connections",),
         size=f"{kb(connections.HEAD_BYTES)} of head, {kb(connections.BODY_BYTES)} of body, {kb(connections.PIECE_BYTES)} parsed ahead, {kb(connections.BUFFER_BYTES)} of answer",
-        items=f"{connections._MOST} connections; {connections.REQUESTS_PER_S:.0f} requests/s each, {request_queue.PER_S:.0f}/s in all",
+        items=f"{connections.CONNECTIONS_MAX} connections; {connections.REQUESTS_PER_S:.0f} requests/s each, {request_queue.REQUESTS_PER_S:.0f}/s in all",
         work=LOOP,
         over="requests wait, after those of others; clients that take nothing for "
         f"{connections.STALL_TIMEOUT_S:.0f} s are disconnected",

@@ -13,6 +13,7 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
+from companion.mavlink.trust.admission import admission
 from companion.mavlink.trust.known_peers import KnownPeers
 from companion.mavlink.trust.newcomers import Newcomers
 from companion.mavlink.voice.component import ACCEPTED_IDS, ComponentSpec, ServiceComponent
@@ -56,7 +57,9 @@ class Gateway:
         self._timestamps: Timestamps | None = None
         signed = set(settings.signing.keys) - set(settings.signing.allow_unsigned)
         self._known_peers = KnownPeers({*settings.links.routers, *signed})
-        self._newcomers = Newcomers()
+        tracks = settings.tracks
+        named = admission(tracks.allow, tracks.deny) if tracks.allow else None
+        self._newcomers = Newcomers(named) if named else Newcomers()
         self._refusal_notice_ns = -NOTICE_EVERY_NS
         self._settings = settings
         self.links: list[Link] = []
@@ -187,8 +190,8 @@ class Gateway:
             self._refusal_notice_ns = now_ns
             self._newcomers.refused = 0
             text = (
-                "there are too many new senders, and their frames are rejected;"
-                " set `[tracks] allow`, or sign the links"
+                "more frames of new senders arrive than are served, and some are rejected;"
+                " name the vehicles in `[tracks] allow`, or sign the links"
             )
             self._notify(Notice(t_ns=now_ns, severity=Severity.WARNING, subject="links", text=text))
 

@@ -51,6 +51,7 @@ from companion.values import (
     kind_of,
 )
 
+TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 RECEIVER_WAIT_NS: Final = 10_000_000_000  # time for which a new track waits for its GNSS receiver
 STATUS_REORDER_MAX_US: Final = 30_000_000
 """Largest step back of a receiver status that is out of order; a larger one is a reboot.
@@ -146,9 +147,6 @@ class Sender:
     clock: SenderClock
     stamped_ns: int | None = None  # arrival of the clock's newest stamp; None: none yet
     is_shared: bool = False  # whether a notice said that two senders share this id
-
-
-TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 
 
 @dataclass(slots=True, kw_only=True)
@@ -256,10 +254,10 @@ class Senders:
                 return NO_OUTCOME if change is None else FrameOutcome(change=change)
             case Presence():
                 component = self._component(message)
-                told = (message.mav_type, message.autopilot)
-                if component.types[-1:] != (told,):
-                    rest = [one for one in component.types if one != told]
-                    component.types = (*rest[1 - TYPES_MAX :], told)
+                newest = (message.mav_type, message.autopilot)
+                if component.types[-1:] != (newest,):
+                    others = [one for one in component.types if one != newest]
+                    component.types = (*others[1 - TYPES_MAX :], newest)
         return NO_OUTCOME
 
     def _component(self, message: GnssStatus | Presence) -> ComponentState:

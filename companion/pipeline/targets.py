@@ -34,22 +34,24 @@ class Targets:
 
     def wants(self, uav: str) -> bool:
         """Return whether a beam is wanted for this UAV."""
-        if uav == self._carrier or self.identities.same_as(uav) is not None:
-            return False
-        return self._all or kind_of(uav).reports_itself
+        return bool(self._wanted((uav,)))
 
     def among(self, uavs: Iterable[str]) -> list[str]:
         """Return the UAVs for which beams are wanted, in the order given."""
-        merged, carrier, all_kinds = self.identities.merged, self._carrier, self._all
-        wanted = [  # as ``wants``, for thousands at every tick
-            uav
-            for uav in uavs
-            if uav not in merged and (all_kinds or _reports_itself(uav)) and uav != carrier
-        ]
+        wanted = self._wanted(uavs)
         if self.duty is None:
             return wanted
         served = frozenset(self.duty.serves)
         return [uav for uav in wanted if uav in served]
+
+    def _wanted(self, uavs: Iterable[str]) -> list[str]:
+        """Return the UAVs for which beams are wanted by any node; of thousands at every tick."""
+        merged, carrier, all_kinds = self.identities.merged, self._carrier, self._all
+        return [
+            uav
+            for uav in uavs
+            if uav not in merged and (all_kinds or _reports_itself(uav)) and uav != carrier
+        ]
 
     def protected(self, uavs: Iterable[str]) -> list[str]:
         """Return the UAVs of other nodes to be protected by nulls, in the order given."""

@@ -169,7 +169,7 @@ class WrongTokens:
     def delay_s(self, address: str, now_s: float) -> float:
         """Count a wrong token; return the time until it is to be answered, seconds."""
         self.count += 1
-        budget = self._budgets.pop(address, None) or Budget(WRONG_PER_S, WRONG_MAX)
+        budget = self._budgets.pop(address, None) or Budget(per_s=WRONG_PER_S, most=WRONG_MAX)
         self._budgets[address] = budget
         if len(self._budgets) > ADDRESSES_MAX:
             del self._budgets[next(iter(self._budgets))]

@@ -17,7 +17,7 @@ from companion.values.budget import Budget
 
 HEAD_BYTES: Final = 16_384
 """Limit on the bytes of a request line and headers; browsers send one or two thousand."""
-HEADERS_MOST: Final = 100  # limit on a request's headers; each takes microseconds to parse
+HEADERS_MOST: Final = 100  # limit on a request's headers; each takes microseconds
 BODY_BYTES: Final = 65_536  # limit on a request's body; no route uses one
 HEAD_S: Final = 10.0
 """Time limit for a complete head, from connecting or from the last answer, seconds."""
@@ -33,18 +33,16 @@ REQUESTS_PER_S: Final = 50.0  # requests of a connection that are started before
 REQUESTS_SAVED: Final = 200.0
 SETTLED_S: Final = 2.0
 """Time for a new connection's request, and for an answer, before it makes room for another."""
-_MOST: Final = 512
-_OWN: Final = 96  # descriptors reserved for links, recordings and files
+CONNECTIONS_MAX: Final = 512
+RESERVED: Final = 96  # descriptors for links, recordings and files
 
 
 def most_connections() -> int:
     """Return the limit on connections that leaves descriptors for links and recordings."""
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    return _MOST if soft == resource.RLIM_INFINITY else max(8, min(_MOST, soft - _OWN))
-
-
-class TooLongError(Exception):
-    """Error of a request head or body that exceeds its limit."""
+    if soft == resource.RLIM_INFINITY:
+        return CONNECTIONS_MAX
+    return max(8, min(CONNECTIONS_MAX, soft - RESERVED))
 
 
 class _HoldingFlow(FlowControl):
@@ -74,12 +72,10 @@ class BoundedProtocol(HttpToolsProtocol):
     def __init__(self, queue: RequestQueue, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **kwargs)
         self._queue = queue
-        self._budget = Budget(REQUESTS_PER_S, REQUESTS_SAVED)
+        self._budget = Budget(per_s=REQUESTS_PER_S, most=REQUESTS_SAVED)
         self._unparsed = bytearray()
         self._in_head = True
         self._parsed_bytes = 0  # since the last complete request, framing of its body included
-        self._head_bytes = 0
-        self._body_bytes = 0
         self._deadline: asyncio.TimerHandle | None = None
         self._stalled: asyncio.TimerHandle | None = None
         self._since_s = 0.0  # time of the connection, of the last head, or of the last answer
@@ -116,12 +112,6 @@ class BoundedProtocol(HttpToolsProtocol):
         self._unparsed += data
         self._parse()
 
-    def abort(self) -> None:
-        """Close the connection at once; an unfinished answer goes nowhere."""
-        if self._answered is not None:
-            self._answered.disconnected = True
-        self.transport.abort()
-
     def rank(self) -> tuple[int, float] | None:
         """Return the order of replacement, lowest first; None if it is being closed.
 
@@ -145,8 +135,9 @@ class BoundedProtocol(HttpToolsProtocol):
             del self._unparsed[:PIECE_BYTES]
             self._parsed_bytes += len(piece)
             super().data_received(piece)
-            limit = HEAD_BYTES if self._in_head else HEAD_BYTES + BODY_BYTES
-            if self._parsed_bytes > limit and not self.transport.is_closing():
+            most = HEAD_BYTES if self._in_head else HEAD_BYTES + BODY_BYTES
+            is_long = self._parsed_bytes > most or len(self.headers or ()) > HEADERS_MOST
+            if is_long and not self.transport.is_closing():
                 self.send_400_response("The request is too long.")
         self.flow.hold(bool(self._unparsed))  # type: ignore[attr-defined]
 
@@ -156,36 +147,12 @@ class BoundedProtocol(HttpToolsProtocol):
 
     # --- callbacks of the parser --------------------------------------------------------------
 
-    def on_message_begin(self) -> None:
-        """Note the start of a request."""
-        self._head_bytes = self._body_bytes = 0
-        super().on_message_begin()
-
-    def on_url(self, url: bytes) -> None:
-        """Process a piece of the request's URL."""
-        self._count(len(url))
-        super().on_url(url)
-
-    def on_header(self, name: bytes, value: bytes) -> None:
-        """Process a header of the request."""
-        self._count(len(name) + len(value) + 4)
-        if len(self.headers) >= HEADERS_MOST:
-            raise TooLongError
-        super().on_header(name, value)
-
     def on_headers_complete(self) -> None:
         """Start the answer: the head is complete."""
         self._cancel()
         self._in_head = False
         self._since_s = self.loop.time()
         super().on_headers_complete()
-
-    def on_body(self, body: bytes) -> None:
-        """Ignore a piece of a request's body."""
-        self._body_bytes += len(body)
-        if self._body_bytes > BODY_BYTES:
-            raise TooLongError
-        super().on_body(body)
 
     def on_message_complete(self) -> None:
         """End a request; further bytes belong to the next head."""
@@ -214,12 +181,6 @@ class BoundedProtocol(HttpToolsProtocol):
         super().send_400_response(msg)
         self._abort_after(STALL_TIMEOUT_S)
 
-    def _count(self, size: int) -> None:
-        """Count bytes of the head; beyond the limit, raise, and the parser rejects the request."""
-        self._head_bytes += size
-        if self._head_bytes > HEAD_BYTES:
-            raise TooLongError
-
     # --- answers ------------------------------------------------------------------------------
 
     def _start_asgi_task(self, cycle: Any, app: Any) -> None:
@@ -246,7 +207,7 @@ class BoundedProtocol(HttpToolsProtocol):
     def pause_writing(self) -> None:
         """Start the time limit, since the client does not read."""
         super().pause_writing()
-        self._stalled = self.loop.call_later(STALL_TIMEOUT_S, self.abort)
+        self._stalled = self.loop.call_later(STALL_TIMEOUT_S, self.transport.abort)
 
     def resume_writing(self) -> None:
         """Cancel the time limit, since the client reads again."""
@@ -266,7 +227,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._cancel()
         if self._is_lost:
             return  # a timer would keep the connection's memory until then
-        self._deadline = self.loop.call_later(seconds, self.abort)
+        self._deadline = self.loop.call_later(seconds, self.transport.abort)
 
     def _cancel(self) -> None:
         if self._deadline is not None:
@@ -282,5 +243,5 @@ def _replace_one(connections: set[Any]) -> bool:
     ranks = [(rank, one) for one in connections if (rank := one.rank()) is not None]
     if not ranks:
         return False
-    min(ranks, key=lambda ranked: ranked[0])[1].abort()
+    min(ranks, key=lambda ranked: ranked[0])[1].transport.abort()
     return True

@@ -13,8 +13,8 @@ from typing import Final
 from companion.values.budget import Budget
 
 AT_ONCE: Final = 4  # requests started in one iteration of the event loop
-PER_S: Final = 500.0  # requests of all connections that are started before those over a budget
-SAVED: Final = 1000.0
+REQUESTS_PER_S: Final = 500.0  # requests of all connections, before those over a budget
+REQUESTS_SAVED: Final = 1000.0
 BESIDE_WORK_S: Final = 0.005
 """Time between two requests over a budget while a thread computes, seconds."""
 
@@ -25,14 +25,12 @@ class RequestQueue:
     """Requests of all connections that are not started yet.
 
     Requests within the budget of their connection, and of all connections together, are started
-    first. The others wait for threads that compute: ``is_busy`` says whether one does. ``late``
-    counts those others.
+    first. The others wait for threads that compute: ``is_busy`` says whether one does.
     """
 
     def __init__(self, is_busy: Callable[[], bool]) -> None:
-        self.late = 0
         self._is_busy = is_busy
-        self._budget = Budget(PER_S, SAVED)
+        self._budget = Budget(per_s=REQUESTS_PER_S, most=REQUESTS_SAVED)
         self._prompt: deque[Start] = deque()
         self._late: deque[Start] = deque()
         self._late_from_s = 0.0  # no request over a budget starts before this time
@@ -43,7 +41,6 @@ class RequestQueue:
         if within_budget and self._budget.spend(1, asyncio.get_running_loop().time()):
             self._prompt.append(start)
         else:
-            self.late += 1
             self._late.append(start)
         self._schedule()
 

@@ -21,8 +21,6 @@ CLOSE_S: Final = 2.0  # time limit for a client to confirm that the connection i
 PING_S: Final = 4.0  # time between pings
 PONG_S: Final = STALL_TIMEOUT_S - PING_S
 """Time limit for the answer to a ping, or for another sign that the client reads, seconds."""
-
-
 FRAGMENT_CHARS: Final = 65_536
 """Characters of a message that are sent, and copied for its client, at a time."""
 
@@ -34,7 +32,7 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         super().__init__(*args, **kwargs)
         self.alive_s = self.loop.time()
         self.app_state = {**self.app_state, "connection": self}
-        self._budget = Budget(BYTES_PER_S, BYTES_SAVED)
+        self._budget = Budget(per_s=BYTES_PER_S, most=BYTES_SAVED)
         self._stalled: asyncio.TimerHandle | None = None
         self._closing: asyncio.TimerHandle | None = None
 
@@ -132,9 +130,8 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
     def keepalive_timeout(self) -> None:
         """Close the connection, unless the client took bytes since the ping was sent."""
         if self.alive_s > self.ping_sent_at:
-            self.pending_ping_payload = self.pong_timer = (
-                None  # a late answer starts no second ping
-            )
+            # A late answer must not start a second series of pings.
+            self.pending_ping_payload = self.pong_timer = None
             self.schedule_ping()
         else:
             super().keepalive_timeout()

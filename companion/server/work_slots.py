@@ -17,6 +17,14 @@ SHARED_WAITING: Final = 16  # answers for all that wait for the slot of their ow
 T = TypeVar("T")
 
 
+class _Slots:
+    """Slots of one kind, and the room for requests that wait for them."""
+
+    def __init__(self, at_once: int, waiting: int) -> None:
+        self.free = asyncio.Semaphore(at_once)
+        self.room = at_once + waiting
+
+
 class WorkSlots:
     """Work slots of one node. A request beyond the queue is rejected with status 503.
 
@@ -25,53 +33,36 @@ class WorkSlots:
 
     def __init__(self, at_once: int = AT_ONCE, waiting: int = WAITING) -> None:
         self.running = 0
-        self._free = asyncio.Semaphore(at_once)
+        self._usual = _Slots(at_once, waiting)
+        self._shared = _Slots(1, SHARED_WAITING - 1)
         self._no_long = asyncio.Semaphore(1)
-        self._room = at_once + waiting
-        self._shared_free = asyncio.Semaphore(1)
-        self._shared_room = SHARED_WAITING
 
     def refuse_if_full(self, *, is_shared: bool = False) -> None:
         """Raise ``HTTPException`` 503 if the queue of waiting requests is full."""
-        if self._room == 0 and not (is_shared and self._shared_room):
+        if self._usual.room == 0 and not (is_shared and self._shared.room):
             raise HTTPException(503, "too many requests at once", {"retry-after": "1"})
 
     @contextlib.asynccontextmanager
-    async def slot(self, *, is_long: bool = False) -> AsyncIterator[None]:
+    async def slot(self, *, is_long: bool = False, is_shared: bool = False) -> AsyncIterator[None]:
         """Hold a slot, as soon as one is free. Raises ``HTTPException`` 503.
 
-        Long work holds one slot at a time, so that the other one is left for short work.
+        Long work holds one slot at a time, so that the other one is left for short work. Shared
+        work, whose answer all clients get, has a slot of its own.
         """
-        self.refuse_if_full()
-        self._room -= 1
+        self.refuse_if_full(is_shared=is_shared)
+        slots = self._shared if is_shared and self._shared.room else self._usual
+        slots.room -= 1
         try:
-            async with self._no_long if is_long else contextlib.nullcontext(), self._free:
+            async with self._no_long if is_long else contextlib.nullcontext(), slots.free:
                 self.running += 1
                 try:
                     yield
                 finally:
                     self.running -= 1
         finally:
-            self._room += 1
-
-    @contextlib.asynccontextmanager
-    async def _shared_slot(self) -> AsyncIterator[None]:
-        self._shared_room -= 1
-        try:
-            async with self._shared_free:
-                self.running += 1
-                try:
-                    yield
-                finally:
-                    self.running -= 1
-        finally:
-            self._shared_room += 1
+            slots.room += 1
 
     async def run(self, work: Callable[[], T], *, is_shared: bool = False) -> T:
-        """Run work on another thread when a slot is free. Raises ``HTTPException`` 503.
-
-        ``is_shared``: all clients share the answer. It has a slot of its own, so that it does not
-        wait for requests whose answers nobody shares.
-        """
-        async with self._shared_slot() if is_shared and self._shared_room else self.slot():
+        """Run work on another thread when a slot is free. Raises ``HTTPException`` 503."""
+        async with self.slot(is_shared=is_shared):
             return await in_thread(work)

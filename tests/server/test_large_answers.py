@@ -115,7 +115,7 @@ async def test_stream_continues_after_a_refusal(
     node, slots, refused = make_node(), WorkSlots(), asyncio.Event()
     refuse_if_full = slots.refuse_if_full
 
-    def full() -> None:
+    def full(**_: bool) -> None:
         refused.set()
         raise HTTPException(503)
 

@@ -78,8 +78,8 @@ class Peer:
     """
 
     __slots__ = (
-        "_sequence", "address", "heard_ns", "key", "senders", "served", "served_since", "splitter",
-        "versions",
+        "_sequence", "address", "heard_ns", "key", "senders", "served", "served_generation",
+        "splitter", "versions",
     )  # fmt: skip
 
     def __init__(self, key: Hashable, splitter: Splits) -> None:
@@ -89,7 +89,7 @@ class Peer:
         self.senders: dict[Source, _PeerSender] = {}
         self.served: set[Source] = set()
         """Senders whose frames from this peer are admitted without a further look."""
-        self.served_since = 0  # generation of ``Newcomers``
+        self.served_generation = 0  # of ``Newcomers``, when ``served`` was emptied
         self.heard_ns: int | None = None
         self.versions = 0  # bit 0: MAVLink 1 received, bit 1: MAVLink 2 received
         self._sequence = 0
@@ -208,9 +208,7 @@ class Peers:
             counts.frames += 1
             counts.heard_ns = t_ns
             counts.mavlink = version
-            if (
-                is_accepted and msgid in POSE
-            ):  # their stamps are of the clock that TIMESYNC measures
+            if is_accepted and msgid in POSE:  # stamps of the clock that TIMESYNC measures
                 sender.stamped_ns = t_ns
             peer.versions |= version
             peer.heard_ns = status.heard_ns = t_ns

@@ -32,8 +32,8 @@ CONNECTIONS_MAX: Final = 256
 PIECE_BYTES: Final = 4096
 """Bytes that are read and processed before other work runs; some hundred frames.
 
-A link processes one such piece in an iteration of the event loop, of its connections in turn: many
-connections take no more of the processor than one. The rest waits in the system's buffers.
+A link processes one such piece in an iteration of the event loop, of one connection after the
+other: many take no more of the processor than one. The rest waits in the system's buffers.
 """
 SILENCE_S: Final = 12
 """Seconds without an acknowledgement after which a connection is closed."""
@@ -56,7 +56,7 @@ class TcpOut:
         sock = await _connected(self._url)
         lost: asyncio.Future[Exception] = loop.create_future()
         stream = _Stream(
-            upcalls=self._upcalls, on_close=lambda _, why: settle(lost, why), turns=_Turns()
+            upcalls=self._upcalls, on_close=lambda _, why: settle(lost, why), order=_ReadOrder()
         )
         try:
             await loop.create_connection(lambda: stream, sock=sock)
@@ -88,7 +88,7 @@ class TcpIn:
         self._upcalls = upcalls
         self._socket: socket.socket | None = None
         self._streams: set[_Stream] = set()
-        self._turns = _Turns()
+        self._order = _ReadOrder()
 
     def open(self) -> int:
         """Listen; return the port. Raises ``OSError`` if the address is not available."""
@@ -133,14 +133,14 @@ class TcpIn:
 
         if len(self._streams) >= CONNECTIONS_MAX:
             return _Stream(
-                upcalls=self._upcalls, on_close=on_close, turns=self._turns, is_accepted=False
+                upcalls=self._upcalls, on_close=on_close, order=self._order, is_accepted=False
             )
-        stream = _Stream(upcalls=self._upcalls, on_close=on_close, turns=self._turns)
+        stream = _Stream(upcalls=self._upcalls, on_close=on_close, order=self._order)
         self._streams.add(stream)
         return stream
 
 
-class _Turns:
+class _ReadOrder:
     """Order in which the connections of a link are processed: a piece of one per iteration."""
 
     def __init__(self) -> None:
@@ -171,12 +171,12 @@ class _Stream(asyncio.BufferedProtocol):
         *,
         upcalls: Upcalls,
         on_close: Callable[["_Stream", Exception], None],
-        turns: _Turns,
+        order: _ReadOrder,
         is_accepted: bool = True,
     ) -> None:
         self._upcalls = upcalls
         self._on_close = on_close
-        self._turns = turns
+        self._order = order
         self._transport: asyncio.Transport | None = None
         self._is_accepted = is_accepted
         self._address = ""
@@ -208,7 +208,7 @@ class _Stream(asyncio.BufferedProtocol):
         if stale < nbytes and self._transport is not None:
             self._piece = data[stale:]
             self._transport.pause_reading()
-            self._turns.add(self)
+            self._order.add(self)
 
     def process(self) -> None:
         """Process the piece that was read; then read the next one, or end."""

@@ -207,9 +207,9 @@ class Link:
         if self._guard is not None:
             found = [_checked_by_guard(self._guard, item) for item in found]
         newcomers, has_timesync = self._newcomers, False
-        if peer.served_since != newcomers.generation:
+        if peer.served_generation != newcomers.generation:
             peer.served.clear()
-            peer.served_since = newcomers.generation
+            peer.served_generation = newcomers.generation
         counted, checked = list[Received](), list[Received]()
         for item in found:
             kept = item

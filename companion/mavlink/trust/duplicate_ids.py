@@ -9,8 +9,6 @@ they have agreed for that long. Unlike boot clocks (``clock/epochs.py``) and fli
 
 The peers of links are judged by ``known_peers.py``; here no peer was first, as among nodes of a
 fleet.
-
-Peers that the settings name as routers are trusted, even if others contradict them.
 """
 
 from collections import deque
@@ -32,9 +30,9 @@ PEERS_MAX: Final = 4  # peers followed per sender, the most recent
 
 @dataclass(slots=True)
 class _PeerPath:
-    """Path of a sender over one peer; ``is_router``: the settings trust the peer."""
+    """Path of a sender over one peer."""
 
-    is_router: bool
+    is_trusted: bool
     heard_ns: int
     path: Path = field(default_factory=Path)
 
@@ -46,27 +44,21 @@ class _SenderPaths:
     heard_ns: int
     paths: dict[str, _PeerPath] = field(default_factory=dict)
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
-    is_reported: bool = False
+    is_duplicate: bool = False
 
 
 class DuplicateIds:
     """Detector of two senders under one id, by the peers that deliver their frames.
 
-    ``routers`` names trusted peers: a link as in the settings, HOST or HOST:PORT. ``found`` holds
-    the duplicate ids since it was last emptied, with their peers.
+    ``trusted`` names peers whose frames are never rejected.
     """
 
-    def __init__(self, routers: Collection[str] = ()) -> None:
-        self.found: list[tuple[str, tuple[str, ...]]] = []
-        self._routers = frozenset(routers)
+    def __init__(self, trusted: Collection[str] = ()) -> None:
+        self._trusted = frozenset(trusted)
         self._senders: dict[tuple[int, int], _SenderPaths] = {}
 
-    def rejects(self, link: str, peer: str, frame: Frame) -> bool:
-        """Process a frame of ``decode.POSE``. Return whether it must be rejected.
-
-        ``link`` is the link as in the settings, ``peer`` the peer's HOST:PORT, or the link again if
-        it has only one peer.
-        """
+    def rejects(self, peer: str, frame: Frame) -> bool:
+        """Process a frame of ``decode.POSE``. Return whether it must be rejected."""
         sender = self._senders.get(frame.source)
         if sender is None:
             sender = self._follow(frame)
@@ -75,7 +67,7 @@ class DuplicateIds:
         sender.heard_ns = frame.t_ns
         path = sender.paths.get(peer)
         if path is None:
-            path = self._add_peer(sender, link, peer, frame.t_ns)
+            path = self._add_peer(sender, peer, frame.t_ns)
         path.heard_ns = frame.t_ns
         if len(sender.paths) == 1:
             return False
@@ -83,7 +75,7 @@ class DuplicateIds:
             when = sender.contradicted_ns
             if not when or frame.t_ns - when[-1] >= SPACED_NS:
                 when.append(frame.t_ns)
-        return self._is_duplicate(frame, sender) and not path.is_router
+        return self._is_duplicate(frame, sender) and not path.is_trusted
 
     def _follow(self, frame: Frame) -> _SenderPaths | None:
         """Start to follow a sender; None if ``SENDERS_MAX`` is reached."""
@@ -94,16 +86,15 @@ class DuplicateIds:
                 return None
         return self._senders.setdefault(frame.source, _SenderPaths(heard_ns=frame.t_ns))
 
-    def _add_peer(self, sender: _SenderPaths, link: str, peer: str, t_ns: int) -> _PeerPath:
+    def _add_peer(self, sender: _SenderPaths, peer: str, t_ns: int) -> _PeerPath:
         """Start to follow a peer of a sender; forget silent peers."""
         paths = sender.paths
         for name in [name for name, path in paths.items() if t_ns - path.heard_ns > KEPT_NS]:
             del paths[name]
         if len(paths) >= PEERS_MAX:
-            strangers = [name for name, path in paths.items() if not path.is_router]
-            del paths[min(strangers or paths, key=lambda name: paths[name].heard_ns)]
-        known = {link, peer, peer.rpartition(":")[0].strip("[]")}
-        return paths.setdefault(peer, _PeerPath(not known.isdisjoint(self._routers), t_ns))
+            others = [name for name, path in paths.items() if not path.is_trusted]
+            del paths[min(others or paths, key=lambda name: paths[name].heard_ns)]
+        return paths.setdefault(peer, _PeerPath(peer in self._trusted, t_ns))
 
     def _contradicts(self, sender: _SenderPaths, path: _PeerPath, said: OwnPosition) -> bool:
         """Add a report to its path. Return whether it contradicts that of another peer."""
@@ -113,19 +104,16 @@ class DuplicateIds:
         others = [
             other.path
             for other in sender.paths.values()
-            if other is not path and not (other.is_router and path.is_router)
+            if other is not path and not (other.is_trusted and path.is_trusted)
         ]
         excesses = [path.path.excess_m(other, before, said) for other in others]
         return any(excess is not None and excess > SLACK_M for excess in excesses)
 
     def _is_duplicate(self, frame: Frame, sender: _SenderPaths) -> bool:
-        """Return whether a sender's peers contradict each other; if so, add it to ``found``."""
+        """Return whether a sender's peers contradict each other, and have not agreed since."""
         when = sender.contradicted_ns
         while when and frame.t_ns - when[0] > KEPT_NS:
             when.popleft()
-        if sender.is_reported:
-            sender.is_reported = bool(when)
-        elif len(when) >= CONTRADICTIONS:
-            sender.is_reported = True
-            self.found.append((str(frame.source), tuple(sender.paths)))
-        return sender.is_reported
+        enough = 1 if sender.is_duplicate else CONTRADICTIONS
+        sender.is_duplicate = len(when) >= enough
+        return sender.is_duplicate

@@ -96,7 +96,9 @@ class _Sender:
     strangers: dict[str, _Peer] = field(default_factory=dict)
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
     notified_ns: int = -NOTICE_NS
-    comparisons: Budget = field(default_factory=lambda: Budget(COMPARED_PER_S, COMPARED_PER_S))
+    comparisons: Budget = field(
+        default_factory=lambda: Budget(per_s=COMPARED_PER_S, most=COMPARED_PER_S)
+    )
 
     @property
     def heard_ns(self) -> int:
@@ -143,13 +145,12 @@ class KnownPeers:
         current = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
         is_router = self._is_router(link, peer)
         if not current or is_router:
-            if frame.msgid in POSE:
+            if msgid in POSE:
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
             return None
-        brings = frame.msgid in _ABOUT_SENDER or any(frame.msgid in one.msgids for one in current)
-        if not brings:
+        if msgid not in _ABOUT_SENDER and not any(msgid in one.msgids for one in current):
             return None
-        if frame.msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
+        if msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
             agrees = self._agrees(sender, peer, frame)
             return None if agrees or peer in sender.known else STRANGER
         return STRANGER

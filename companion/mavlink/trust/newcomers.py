@@ -32,15 +32,19 @@ class Newcomers:
     What ``admits`` says of a sender holds while ``generation`` stays the same. That changes from
     time to time, so that ``admits`` learns which senders are active. ``worked_s`` is the time that
     frames took since the last call of ``adapt``, due from ``adapts_ns``.
+
+    ``is_named`` says whether the settings name a vehicle: those are always admitted, so that a
+    service that starts during a flood serves them.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, is_named: Callable[[str], bool] = lambda _: False) -> None:
+        self._is_named = is_named
         self.refused = 0
         self.generation = 0
         self.worked_s = 0.0
         self.adapts_ns = 0
         self._numbers: OrderedDict[Source, int] = OrderedDict()  # by the newest frame
-        self._budget = Budget(NEW_PER_S, NEW_SAVED)
+        self._budget = Budget(per_s=NEW_PER_S, most=NEW_SAVED)
         self._count = 0
         self._served_below: int | None = None  # number from which senders are not served
         self._had_strangers = False  # whether strangers were served since the machine was late
@@ -58,6 +62,8 @@ class Newcomers:
             self.refused += 1
             return False
         self._had_strangers |= is_stranger
+        if self._is_named(str(source)):
+            return True
         number = self._numbers.get(source)
         if number is None:
             if not self._budget.spend(1, now_ns * 1e-9):

@@ -93,8 +93,7 @@ class Reception:
         if frame.msgid not in OWN:
             return key
         self._heard.note(frame.t_ns, key)
-        self._duplicate_ids.rejects(OWN_NODE, OWN_NODE, frame)
-        self._duplicate_ids.found.clear()  # reported per node, in ``contradicted``
+        self._duplicate_ids.rejects(OWN_NODE, frame)
         vehicle = self._vehicles.get(frame.source)
         if vehicle is None:
             if len(self._vehicles) < VEHICLES_MAX:
@@ -159,8 +158,7 @@ class Reception:
         is_new = self._shared.note(now_ns, key)
         if key in self._heard or not is_new:
             return []
-        is_refused = self._duplicate_ids.rejects(node, node, frame)
-        self._duplicate_ids.found.clear()
+        is_refused = self._duplicate_ids.rejects(node, frame)
         if is_refused:
             self.contradicted.append(node)
             return []

@@ -53,6 +53,16 @@ def test_new_vehicle_is_admitted_during_a_flood_of_invented_ids() -> None:
     assert senders.admits(vehicle, 100 * S)
 
 
+def test_named_vehicles_are_admitted_during_a_flood() -> None:
+    """Also if the service starts under attack, and while the newest senders are dropped."""
+    senders = Newcomers(lambda uav: uav == "255:255")
+    served(senders, 2000, 0)
+    window(senders, 1, 0.9, is_late=True)
+    assert senders.admits(Source(255, 255), 0)
+    assert not senders.admits(Source(255, 254), 0)
+    assert not senders.admits(Source(255, 255), WINDOW_NS, is_stranger=True)
+
+
 def test_active_senders_are_not_evicted_by_invented_ones() -> None:
     senders = Newcomers()
     for tick in range(2000):

@@ -11,7 +11,8 @@ nothing.
   never none.
 - If two nodes serve the same UAV without a handover, as after a partition, the node whose value at
   its claim was lower drops it. Both nodes know these constant values, so never both drop it. Names
-  decide between equal values.
+  decide between equal values. If a third node is taking the UAV over meanwhile, the three can yield
+  in a circle: it is free then, and claimed after ``CLAIM_DELAY_NS``.
 - A claim counts only while its node's own offer supports it: a node cannot take UAVs by claiming
   more than it offers.
 """

@@ -126,4 +126,4 @@ def flown(hours: int) -> tuple[list[float], int]:
             if (event.t_ns - begins_ns) // (3600 * S) > len(found):
                 found.append(resident_mb())
     found.append(resident_mb())
-    return found, len(pipeline.senders._clocks)
+    return found, len(pipeline.senders._senders)

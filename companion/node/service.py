@@ -11,7 +11,7 @@ from collections.abc import Callable, Coroutine, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import companion
 from companion.mavlink.links.status import LinkStatus
@@ -40,12 +40,16 @@ from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
 from companion.values import ClockSet, Event, Frame, Notice, Output, Severity, Tick, Tock, UserError
-from companion.views.health import behind
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
 from companion.views.served import FleetStatus
-from companion.views.state import RecordingStatus
+from companion.views.state import RecordingStatus, overload
+
+HELD_UP_S: Final = 0.02  # lateness of a tick from which links are read before it
+READ_FIRST_S: Final = 0.1  # longest time for that
+READ_ROUNDS: Final = 3  # least number of iterations of the event loop for that
+WAIT_NS: Final = 20_000_000  # wait for this machine that does not matter for beams
 
 
 class Service:
@@ -273,7 +277,7 @@ class Service:
 
     def _notify_overload(self) -> None:
         """Publish a notice when this machine becomes overloaded, and when it recovers."""
-        machine = behind(self.arrival_lag.seen(self.now_ns()))
+        machine = overload(self, self.now_ns())
         if (machine is not None) is self._is_behind:
             return
         self._is_behind = machine is not None
@@ -317,7 +321,23 @@ class Service:
             ended_s = loop.time()
             due_s = max(due_s + period_s, ended_s + spent_s + (ended_s - began_s))
             await asyncio.sleep(due_s - loop.time())
-            self.lateness.observe(loop.time() - due_s)
+            late_s = loop.time() - due_s
+            self.lateness.observe(late_s)
+            if late_s > HELD_UP_S:
+                self.arrival_lag.held_up(self.now_ns(), round(late_s * 1e9))
+                await self._read_first()
+
+    async def _read_first(self) -> None:
+        """Let the links read what arrived while the event loop was held up.
+
+        Beams are then aimed by reports that would otherwise wait until after the update.
+        """
+        loop = asyncio.get_running_loop()
+        until_s = loop.time() + READ_FIRST_S
+        for _ in range(READ_ROUNDS):  # in the first one, the loop only finds what is readable
+            await asyncio.sleep(0)
+        while self.arrival_lag.waiting_ns(self.now_ns()) > WAIT_NS and loop.time() < until_s:
+            await asyncio.sleep(0)
 
     async def _update(self) -> float:
         """Predict the UAVs, and compute the beams on a thread; the first beams directly.
@@ -327,7 +347,14 @@ class Service:
         """
         loop, now_ns = asyncio.get_running_loop(), self._timeline.now_ns
         began_s = loop.time()
-        self._step(Tick(now_ns(), in_two=self.pipeline.updates > 0))
+        waited_ns = self.arrival_lag.waiting_ns(now_ns())
+        self._step(
+            Tick(
+                now_ns(),
+                in_two=self.pipeline.updates > 0,
+                waited_ns=waited_ns if waited_ns > WAIT_NS else 0,
+            )
+        )
         spent_s = loop.time() - began_s
         if self.pipeline.aiming is not None:
             spent_s += await loop.run_in_executor(self._aimer, _took_s, self.pipeline.aiming.made)
@@ -391,7 +418,7 @@ class Service:
         update = self.pipeline.last_update
         states = [link.status.state for link in self._traffic.links]
         reasons = [] if "up" in states else ["no link is up"]
-        machine = behind(self.arrival_lag.seen(self.now_ns()))
+        machine = overload(self, self.now_ns())
         if machine is not None:  # late updates and old data are only symptoms of it
             return [*reasons, machine.reason]
         if update is None or self.updates_late():

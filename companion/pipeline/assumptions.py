@@ -15,9 +15,12 @@ _UNITS: Final = {
     "center.turn_acceleration_max_degps2": "°/s²",
     "center.attitude_bound_deg": "°",
 }
-NOTICE_INTERVAL_NS: Final = (
-    60_000_000_000  # least time between two notices of a change of a clock or link
-)
+NOTICED_STEP_S: Final = 0.02
+"""Least change of a clock or link for a notice: 0.4 m at 20 m/s, which the bound covers."""
+WARNED_STEP_S: Final = 0.1  # change from which the notice is a warning
+GATHERED_NS: Final = 5_000_000_000  # time over which changes are gathered in one notice
+NOTICE_INTERVAL_NS: Final = 60_000_000_000  # least time between two such notices
+NAMED: Final = 6  # largest number of senders named in one notice
 
 
 def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Notice]:
@@ -42,32 +45,61 @@ def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Not
 
 def clock_changed(
     record: UavRecord, t_ns: int, sender: str, change: ClockChange, drift_max_ppm: float
-) -> list[Refuted | Notice]:
-    """Return a change of a sender's clock or link as a refutation and a notice."""
-    drift = change.drift_ppm
+) -> Refuted:
+    """Return a change of a sender's clock or link as a refutation."""
     record.refuted += 1
-    out: list[Refuted | Notice] = [
-        Refuted(
-            t_ns=t_ns,
-            uav=sender,
-            setting="clocks.drift_max_ppm",
-            limit=drift_max_ppm,
-            proven=drift,
-            raised_to=drift,
+    return Refuted(
+        t_ns=t_ns,
+        uav=sender,
+        setting="clocks.drift_max_ppm",
+        limit=drift_max_ppm,
+        proven=change.drift_ppm,
+        raised_to=change.drift_ppm,
+    )
+
+
+class ClockNotices:
+    """Notices of changed clocks and links, gathered: ordinary clocks change by milliseconds."""
+
+    def __init__(self) -> None:
+        self._changes: dict[str, ClockChange] = {}  # the largest of each sender
+        self._since_ns = 0
+        self._noticed_ns: int | None = None
+
+    def add(self, t_ns: int, sender: str, change: ClockChange) -> Notice | None:
+        """Process a change. Returns a notice of a clock jump; other changes are gathered."""
+        if change.leapt:
+            text = _clock_text(sender, change)
+            return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=sender, text=text)
+        if abs(change.step_s) < NOTICED_STEP_S:
+            return None
+        if not self._changes:
+            self._since_ns = t_ns
+        before = self._changes.get(sender)
+        if before is None or abs(change.step_s) > abs(before.step_s):
+            self._changes[sender] = change
+        return None
+
+    def due(self, t_ns: int) -> Notice | None:
+        """Return a notice of the gathered changes, if one is due."""
+        if not self._changes or t_ns - self._since_ns < GATHERED_NS:
+            return None
+        if self._noticed_ns is not None and t_ns - self._noticed_ns < NOTICE_INTERVAL_NS:
+            return None
+        self._noticed_ns, changes, self._changes = t_ns, self._changes, {}
+        largest_s = max(abs(change.step_s) for change in changes.values())
+        severity = Severity.WARNING if largest_s >= WARNED_STEP_S else Severity.INFO
+        (sender, change), *others = changes.items()
+        if not others:
+            text = _clock_text(sender, change)
+            return Notice(t_ns=t_ns, severity=severity, subject=sender, text=text)
+        names = ", ".join(list(changes)[:NAMED])
+        rest = f" and {len(changes) - NAMED} more" if len(changes) > NAMED else ""
+        text = (
+            f"clocks or links of {names}{rest} changed by up to {largest_s * 1e3:.0f} ms; the"
+            " bounds cover it"
         )
-    ]
-    notified_ns = record.clock_notice_ns
-    if change.leapt or notified_ns is None or t_ns - notified_ns >= NOTICE_INTERVAL_NS:
-        record.clock_notice_ns = t_ns
-        out.append(
-            Notice(
-                t_ns=t_ns,
-                severity=Severity.WARNING,
-                subject=sender,
-                text=_clock_text(sender, change),
-            )
-        )
-    return out
+        return Notice(t_ns=t_ns, severity=severity, subject="clocks", text=text)
 
 
 def _clock_text(sender: str, change: ClockChange) -> str:

@@ -1,13 +1,16 @@
-"""Causes of weak links: what limits a beam most, as text, and a remedy.
+"""Causes of weak links: the input that limits a beam, as text, and a remedy.
 
-The guaranteed gain is the least gain within the pointing bound. A large bound is therefore the
-cause: the carrier's attitude or position, or one part of the bound on the UAV's position.
+The guaranteed gain is the least gain within the pointing bound. The cause of a large bound is the
+input that, if it were ideal, would reduce it most (``angle_parts``): the carrier's attitude or
+position, the UAV's reports, a clock, or this machine.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Final
 
+from companion.pipeline.angle_parts import AngleParts, ErrorSource, largest
+from companion.tracking.carrier import AttitudeParts
 from companion.values import Beam, Blame, Carrier, Cause, LeftOut, Reason, Track, TrackState
 
 CLOSE_UAVS_DB: Final = 3.0
@@ -21,24 +24,46 @@ SILENT_INTERVALS: Final = 3.0
 TIMESYNC: Final = "allow TIMESYNC: set `[presence] enabled = true`, over a two-way link"
 FLY_APART: Final = 'fly them apart, or set `[beams] policy = "group"`'
 STEADIER_LINK: Final = "use a MAVLink link with a steadier delay"
+CHECK_LINK: Final = "check its MAVLink link: power, range, antenna"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LinkEvidence:
-    """Facts about a UAV's link in addition to its track."""
+    """Facts about a UAV's link in addition to its track.
 
-    clock_assumed: bool  # the constant part of its latency is only assumed
-    refused: Reason | None  # why its newest reports were rejected; None: they were used
-    attitude_bound_rad: float = 0.0  # bound on the error of the carrier's attitudes when measured
-    attitude_age_s: float = 0.0  # age of the newest of them
-    carrier_doubt_s: float = 0.0  # bound on the error of the carrier's clock
-    carrier_assumed: bool = False  # the constant part of its latency is only assumed
+    clock_assumed    the constant part of its latency is only assumed
+    refused          why its newest reports were rejected; None: they were used
+    waited_s         time for which frames may have waited for this machine
+    attitude         parts of the bound on the carrier's attitude
+    attitude_age_s   age of the carrier's newest attitude; None without one
+    carrier_assumed  the constant part of the carrier's latency is only assumed
+    """
+
+    clock_assumed: bool
+    refused: Reason | None
+    waited_s: float = 0.0
+    attitude: AttitudeParts = field(default_factory=AttitudeParts)
+    attitude_age_s: float | None = None
+    carrier_assumed: bool = False
 
 
-def of_left_out(out: LeftOut, track: Track | None, unfit: str | None) -> Blame:
-    """Return why a UAV has no beam. ``unfit`` is the reason why no UAV can have one.
+def of_machine(waited_s: float) -> Blame:
+    """Return this machine as the cause: frames waited so long to be read."""
+    return Blame(
+        Cause.MACHINE,
+        f"this machine is overloaded: frames wait up to {waited_s:.1f} s",
+        "close other programs and pages, or lower `[beams] update_hz`",
+    )
 
-    ``track`` is None if there are too many UAVs to predict them all.
+
+def of_left_out(
+    out: LeftOut, track: Track | None, unfit: str | None, refused: Reason | None = None
+) -> Blame:
+    """Return why a UAV has no beam.
+
+    track    the UAV's track; None if there are too many UAVs to predict them all
+    unfit    why no UAV can have a beam; None if UAVs can
+    refused  why its newest reports were rejected; None if they were used, or if none arrives
     """
     if unfit is not None:
         return Blame(
@@ -50,6 +75,8 @@ def of_left_out(out: LeftOut, track: Track | None, unfit: str | None) -> Blame:
     match out.cause:
         case Cause.CROWDED:
             remedy = FLY_APART
+        case Cause.SILENT if refused is not None:
+            return _refused_cause(refused)
         case Cause.SILENT if track is not None:
             return _silence_cause(track)
         case Cause.MACHINE:
@@ -78,36 +105,78 @@ def of_unserved(track: Track, *, reached: bool, full: bool) -> Blame:
 
 
 def of_beam(
-    beam: Beam, track: Track, carrier: Carrier, needed_db: float, evidence: LinkEvidence
+    beam: Beam,
+    track: Track,
+    needed_db: float,
+    evidence: LinkEvidence,
+    parts: AngleParts,
+    *,
+    carrier: Carrier,
+    when_good: AngleParts | None = None,
 ) -> Blame:
-    """Return why a beam may lack, or likely lacks, the gain that its link needs."""
+    """Return why a beam may lack, or likely lacks, the gain that its link needs.
+
+    ``parts`` are those of its pointing bound; ``when_good`` those when the link was last good.
+    """
     silence = _silence(track, evidence)
     if silence is not None:
         return silence
     # A widened beam has less gain because of its bound, not because of other UAVs.
     if not beam.widened and (beam.gain_db < needed_db or beam.loss_db > CLOSE_UAVS_DB):
         return _short_of_gain(beam, needed_db)
-    seen_rad = math.asin(min(1.0, (track.bound_m + carrier.bound_m) / max(beam.range_m, 1e-9)))
-    if carrier.attitude_bound_rad > seen_rad:
-        return _attitude_cause(carrier, evidence)
-    return _bound_cause(beam, track, carrier, evidence)
+    match largest(parts, when_good):
+        case ErrorSource.MACHINE:
+            return of_machine(evidence.waited_s)
+        case ErrorSource.CARRIER_POSITION:
+            return _carrier_position_cause(carrier, evidence)
+        case ErrorSource.AGE:
+            return _age_cause(track)
+        case ErrorSource.CLOCK:
+            return _clock(track, evidence)
+        case ErrorSource.POSITION:
+            return Blame(
+                Cause.POSITION,
+                f"at {beam.range_m:.0f} m, its position is uncertain by {track.bound_m:.0f} m",
+                "fly farther from the array, or fit a better GNSS receiver to the UAV",
+            )
+        case part:
+            return _attitude_cause(part, carrier, evidence)
 
 
-def _attitude_cause(carrier: Carrier, evidence: LinkEvidence) -> Blame:
-    """Return why the carrier's attitude is uncertain: its error, its age, or its clock."""
-    if carrier.attitude_bound_rad < 1.5 * evidence.attitude_bound_rad:
-        remedy = (
-            "fit a dual-antenna GNSS or calibrate the compass, then lower"
-            " `[center] attitude_bound_deg`"
-        )
-    elif evidence.carrier_doubt_s <= evidence.attitude_age_s:
-        remedy = "request ATTITUDE from the carrier at 10 Hz: set `[presence] attitude_hz = 10`"
-    elif evidence.carrier_assumed:
-        remedy = f"improve the carrier's clock: {TIMESYNC}"
-    else:
-        remedy = f"improve the carrier's clock: {STEADIER_LINK}"
+def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence) -> Blame:
+    """Return why the carrier's attitude is uncertain, by the part of its bound."""
     known = f"{math.degrees(carrier.attitude_bound_rad):.0f}°"
-    return Blame(Cause.CARRIER, f"the carrier's attitude is uncertain by {known}", remedy)
+    reason = f"the carrier's attitude is uncertain by {known}"
+    match part:
+        case ErrorSource.ATTITUDE:
+            remedy = (
+                "fit a dual-antenna GNSS or calibrate the compass, then lower"
+                " `[center] attitude_bound_deg`"
+            )
+        case ErrorSource.ATTITUDE_AGE:
+            age_s = (evidence.attitude_age_s or 0.0) - evidence.waited_s
+            if age_s > SILENT_S:
+                reason = f"no attitude from the carrier for {age_s:.1f} s"
+                return Blame(Cause.CARRIER, reason, CHECK_LINK)
+            remedy = "request ATTITUDE from the carrier at 10 Hz: set `[presence] attitude_hz = 10`"
+        case ErrorSource.ATTITUDE_CONFLICT:
+            reason = f"attitudes of the carrier contradict each other by {known}"
+            remedy = (
+                "check that only one component sends the carrier's ATTITUDE, and its gyroscopes"
+            )
+        case _:
+            better = TIMESYNC if evidence.carrier_assumed else STEADIER_LINK
+            remedy = f"improve the carrier's clock: {better}"
+    return Blame(Cause.CARRIER, reason, remedy)
+
+
+def _carrier_position_cause(carrier: Carrier, evidence: LinkEvidence) -> Blame:
+    age_s = (carrier.age_s or 0.0) - evidence.waited_s
+    if age_s > SILENT_S:
+        reason = f"no position from the carrier for {age_s:.1f} s"
+        return Blame(Cause.CARRIER, reason, CHECK_LINK)
+    reason = f"the carrier's position is uncertain by {carrier.bound_m:.0f} m"
+    return Blame(Cause.CARRIER, reason, "fit a better GNSS receiver to the carrier")
 
 
 def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
@@ -123,70 +192,45 @@ def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
     )
 
 
-def _bound_cause(beam: Beam, track: Track, carrier: Carrier, evidence: LinkEvidence) -> Blame:
-    """Return why the position is uncertain, as seen from the array."""
-    aged_s = max(track.age_s, track.dt_s or 0.0)
-    growth_m = _growth_m(track, aged_s)
-    doubted_m = _growth_m(track, aged_s + track.clock_bound_s) - growth_m
-    if track.velocity_ned_mps is not None:
-        doubted_m += math.hypot(*track.velocity_ned_mps) * track.clock_bound_s
-    parts = {
-        Cause.RATE: growth_m,
-        Cause.CLOCK: doubted_m,
-        Cause.CARRIER: carrier.bound_m,
-        Cause.POSITION: track.bound_m - growth_m - doubted_m,
-    }
-    match max(parts, key=lambda cause: parts[cause]):
-        case Cause.RATE:
-            return _age_cause(track)
-        case Cause.CLOCK:
-            return _clock(track, evidence)
-        case Cause.CARRIER:
-            reason = f"the carrier's position is uncertain by {carrier.bound_m:.0f} m"
-            return Blame(Cause.CARRIER, reason, "fit a better GNSS receiver to the carrier")
-        case _:
-            reason = f"at {beam.range_m:.0f} m, its position is uncertain by"
-            return Blame(
-                Cause.POSITION,
-                f"{reason} {track.bound_m:.0f} m",
-                "fly farther from the array, or fit a better GNSS receiver to the UAV",
-            )
-
-
-def _growth_m(track: Track, seconds: float) -> float:
-    """Return how far a UAV can deviate within a time from the prediction of its last report."""
-    way_m = track.limits.speed_max_mps * seconds
-    if track.velocity_ned_mps is None:
-        return way_m
-    return min(track.limits.acceleration_max_mps2 * seconds**2 / 2, way_m)
-
-
 def _silence(track: Track, evidence: LinkEvidence) -> Blame | None:
     if evidence.refused is not None:
-        return Blame(
-            Cause.REFUSED,
-            f"its reports are rejected: {evidence.refused}",
-            "open the UAV's details and read its rejections",
-        )
-    if track.age_s > max(SILENT_S, SILENT_INTERVALS * (track.dt_s or 0.0)):
+        return _refused_cause(evidence.refused)
+    if _is_silent(track, evidence.waited_s):
         return _silence_cause(track)
     return None
 
 
+def of_coasting(track: Track, evidence: LinkEvidence) -> Blame:
+    """Return why the link of a coasting UAV is not good, although its gain is enough."""
+    return _silence(track, evidence) or _silence_cause(track)
+
+
+def _is_silent(track: Track, waited_s: float) -> bool:
+    """Return whether no report has arrived for longer than its interval and latency explain."""
+    unheard_s = track.age_s - (track.latency_s or 0.0) - waited_s
+    return unheard_s > max(SILENT_S, SILENT_INTERVALS * (track.dt_s or 0.0))
+
+
+def _refused_cause(refused: Reason) -> Blame:
+    return Blame(
+        Cause.REFUSED,
+        f"its reports are rejected: {refused}",
+        "open the UAV's details and read its rejections",
+    )
+
+
 def _silence_cause(track: Track) -> Blame:
-    remedy = "check its MAVLink link: power, range, antenna"
-    return Blame(Cause.SILENT, f"no report for {track.age_s:.1f} s", remedy)
+    return Blame(Cause.SILENT, f"no report for {track.age_s:.1f} s", CHECK_LINK)
 
 
 def _age_cause(track: Track) -> Blame:
     """Return why a prediction spans a long time: sparse reports, late reports, or an agile UAV."""
-    if track.dt_s is not None and track.dt_s >= SPARSE_S:
+    late_s = track.latency_s or 0.0
+    if track.dt_s is not None and track.dt_s >= max(SPARSE_S, late_s):
         remedy = "request reports at 10 Hz: set `[presence] position_hz = 10`"
         return Blame(Cause.RATE, f"reports {track.dt_s:.1f} s apart", remedy)
-    if track.latency_s is not None and track.latency_s >= LATE_S:
-        return Blame(
-            Cause.LATE, f"reports arrive {track.latency_s:.1f} s late", "use a faster MAVLink link"
-        )
+    if late_s >= LATE_S:
+        return _late(late_s)
     return Blame(
         Cause.AGILE,
         f"it may accelerate by up to {track.limits.acceleration_max_mps2:.0f} m/s²",
@@ -195,8 +239,14 @@ def _age_cause(track: Track) -> Blame:
     )
 
 
+def _late(late_s: float) -> Blame:
+    return Blame(Cause.LATE, f"reports arrive {late_s:.1f} s late", "use a faster MAVLink link")
+
+
 def _clock(track: Track, evidence: LinkEvidence) -> Blame:
-    doubt_s = track.clock_bound_s
+    doubt_s, late_s = track.clock_bound_s, track.latency_s or 0.0
+    if not evidence.clock_assumed and late_s >= max(LATE_S, doubt_s / 2):
+        return _late(late_s)  # the link's delay is what makes the clock uncertain
     known = f"{doubt_s * 1e3:.0f} ms" if doubt_s < 1.0 else f"{doubt_s:.1f} s"
     if evidence.clock_assumed:
         return Blame(Cause.CLOCK, f"its clock is unmeasured, uncertain by {known}", TIMESYNC)

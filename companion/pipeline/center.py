@@ -161,10 +161,13 @@ class CarrierTracker:
         if self._attitude is None:
             return None
         before_ns, before = self._attitude
-        limit_degps2 = self._angular_acceleration.limit_degps2(turn_degps2, placed.sender_ns)
-        bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(limit_degps2))
+        bounds = self._attitude_bounds(placed.sender_ns, turn_degps2)
         apart_s = (placed.sender_ns - before_ns) * 1e-9
         return carrier.contradiction(before, placed.attitude, apart_s, bounds)
+
+    def _attitude_bounds(self, sender_ns: int, turn_degps2: float) -> carrier.AttitudeBounds:
+        limit_degps2 = self._angular_acceleration.limit_degps2(turn_degps2, sender_ns)
+        return carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(limit_degps2))
 
     @property
     def attitude_bound_rad(self) -> float:
@@ -178,6 +181,27 @@ class CarrierTracker:
     def attitude_age_s(self, now: SenderTime) -> float | None:
         """Return the age of the carrier's newest attitude; None if there is none."""
         return None if self._attitude is None else (now.sender_ns - self._attitude[0]) * 1e-9
+
+    def attitude_parts(
+        self, at: SenderTime, turn_degps2: float, waited_s: float
+    ) -> carrier.AttitudeParts:
+        """Return the parts of the bound on the carrier's attitude at the time ``at``.
+
+        Frames waited ``waited_s`` for this machine. All parts are zero for a station.
+        """
+        if self._attitude is None:
+            return carrier.AttitudeParts()
+        made_ns, attitude = self._attitude
+        age_s = (at.sender_ns - made_ns) * 1e-9
+        rates = (attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps)
+        against = self._contradicted
+        return self._attitude_bounds(at.sender_ns, turn_degps2).parts(
+            math.hypot(*rates),
+            age_s,
+            at.bound_s,
+            waited_s=waited_s,
+            conflict_rad=0.0 if against is None else against.at(abs(age_s) + at.bound_s),
+        )
 
     def trust(self, status: EstimatorStatus) -> Refuted | None:
         """Process the carrier's estimator status. Returns a refutation if the bound grew.
@@ -296,8 +320,7 @@ class CarrierTracker:
         made_ns, attitude = self._attitude
         if now.sender_ns - made_ns > self._attitude_kept_s * 1e9:
             return f"the attitude of the carrier {self.vehicle} is too old"
-        turn_degps2 = self._angular_acceleration.limit_degps2(turn_degps2, at.sender_ns)
-        bounds = carrier.AttitudeBounds(self.attitude_bound_rad, math.radians(turn_degps2))
+        bounds = self._attitude_bounds(at.sender_ns, turn_degps2)
         since_ns = at.sender_ns - made_ns
         return carrier.moving(
             self.local,

@@ -38,6 +38,7 @@ from companion.pipeline.refusals import Refusals
 from companion.pipeline.senders import NO_OUTCOME, PlacedAttitude, PlacedReport, Senders, Timeline
 from companion.pipeline.targets import Targets
 from companion.settings.model import Settings
+from companion.tracking.carrier import AttitudeParts
 from companion.tracking.geodesy import LocalFrame
 from companion.tracking.track_snapshot import TrackSnapshot
 from companion.values import (
@@ -115,6 +116,8 @@ class Pipeline:
         self.last_update: Update | None = None
         self.last_carrier: Carrier | None = None
         self.aiming: Aiming | None = None
+        self._clock_notices = assumptions.ClockNotices()
+        self._waited_s = 0.0  # for which frames may have waited for this machine at the last tick
         self._hysteresis: Hysteresis | None = None  # updated by ticks only, so that looks are pure
         self.digest = Digest()
         self.array = assembly.array(settings)
@@ -204,7 +207,9 @@ class Pipeline:
             return []
         drift_max_ppm = self.settings.clocks.drift_max_ppm
         record = self.records[sender]
-        return [*assumptions.clock_changed(record, t_ns, sender, change, drift_max_ppm)]
+        refuted = assumptions.clock_changed(record, t_ns, sender, change, drift_max_ppm)
+        jump = self._clock_notices.add(t_ns, sender, change)
+        return [refuted] if jump is None else [refuted, jump]
 
     def _report(self, placed: PlacedReport) -> list[Output]:
         report = placed.report
@@ -248,6 +253,7 @@ class Pipeline:
         self.center.restarted(uav)
 
     def _tick(self, tick: Tick) -> list[Output]:
+        self._waited_s = tick.waited_ns * 1e-9
         dropped = self._drop_silent(tick.t_ns) if (self.updates + 1) % DROP_EVERY == 0 else []
         self.aiming = Aiming(cache(self._aimed_of(self.prepare_update(tick.t_ns))), self.local)
         return [*dropped] if tick.in_two else [*dropped, *self._finish_update(tick.t_ns)]
@@ -273,7 +279,8 @@ class Pipeline:
             states |= {} if state is None else {self.center.vehicle: state}
         said = self.targets.changes(now_ns, states)
         judged = self.health.judge(self.last_update, weighed, partial(self._evidence, now_ns))
-        return [*said, *judged, self.last_update]
+        changed = self._clock_notices.due(now_ns)
+        return [*said, *judged, *([changed] if changed else ()), self.last_update]
 
     def _aimed_of(
         self, make: Callable[[], Update]
@@ -286,14 +293,18 @@ class Pipeline:
 
     def _evidence(self, now_ns: int, uav: str) -> LinkEvidence:
         vehicle = self.center.vehicle
-        now = None if vehicle is None else self.senders.time(vehicle, now_ns)
-        age_s = None if now is None else self.center.attitude_age_s(now)
+        age_s, attitude = None, AttitudeParts()
+        if vehicle is not None:
+            at = self.senders.time(vehicle, now_ns)
+            age_s = self.center.attitude_age_s(at)
+            turn_degps2 = self.senders.assumed(vehicle).turn_degps2
+            attitude = self.center.attitude_parts(at, turn_degps2, self._waited_s)
         return LinkEvidence(
             clock_assumed=self._is_assumed(uav),
-            refused=self.refusals.current_rejection(uav),
-            attitude_bound_rad=self.center.attitude_bound_rad,
-            attitude_age_s=0.0 if age_s is None else age_s,
-            carrier_doubt_s=0.0 if now is None else now.bound_s,
+            refused=self.refusals.current_rejection(uav, now_ns),
+            waited_s=self._waited_s,
+            attitude=attitude,
+            attitude_age_s=age_s,
             carrier_assumed=vehicle is not None and self._is_assumed(vehicle),
         )
 

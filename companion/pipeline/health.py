@@ -1,8 +1,11 @@
 """Verdicts on the links to all UAVs, and notices when they change.
 
 Once a second, the guaranteed and the likely gain of each beam are compared with the gain that the
-link needs. Links are assessed in batches, one per update, so that no update is delayed. A verdict
-changes only after a hold time and with a gain margin, so that it does not flap.
+link needs. Links are assessed in batches, one per update, so that no update is delayed; those whose
+beam has got worse since are assessed at once. A verdict falls at once, and rises after a hold time
+and with a gain margin, so that it does not flap.
+
+Over 300 lines: assessment, hold times and notices are the life of one verdict.
 """
 
 import math
@@ -18,6 +21,7 @@ from companion.beams.array.geometry import Array
 from companion.beams.worth import guarantee, link_budget
 from companion.beams.worth.link_budget import LinkBudget
 from companion.pipeline import blame
+from companion.pipeline.angle_parts import AngleParts, angle_parts
 from companion.pipeline.blame import LinkEvidence
 from companion.settings.beams import NeedSettings
 from companion.values import (
@@ -29,6 +33,7 @@ from companion.values import (
     Notice,
     Severity,
     Track,
+    TrackState,
     Update,
     Verdict,
 )
@@ -37,10 +42,18 @@ EVERY_NS: Final = 1_000_000_000
 """Interval between two assessments of a link; a round through all links takes as long."""
 AT_ONCE: Final = 16
 """Least number of links assessed per update; more if the round would take too long."""
-HOLD_WORSE_NS: Final = 1_000_000_000  # hold time before a verdict gets worse
+FALLEN_AT_ONCE: Final = 32  # most links assessed per update because their beams got worse
 HOLD_BETTER_NS: Final = 3_000_000_000  # hold time before a verdict gets better
-HYSTERESIS_DB: Final = 1.0
-"""Gain margin by which a link may fall below its need before its level changes, dB."""
+MARGIN_DB: Final = 1.0
+"""Gain above the need that a link must have for its level to rise, dB."""
+SLACK_RATIO: Final = 1.02  # growth of a bound for which a link is not assessed again at once
+SLACK_DB: Final = 0.1  # the same for a loss of gain
+GOOD_KEPT_NS: Final = 30_000_000_000
+"""Time for which the smallest bound of a good link is kept, to find what has grown since."""
+COASTING_S: Final = 2.0
+"""Age of the newest report of a coasting UAV beyond which its link is not good, seconds."""
+ANNOUNCED_AFTER_NS: Final = 1_000_000_000
+"""Time for which a link must have another level than the last announced one for a notice."""
 NAMED: Final = 6  # largest number of UAVs named in one notice
 RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}  # levels from the worst to the best
 
@@ -65,15 +78,34 @@ class _Link(NamedTuple):
 
 
 class LinkBatch(NamedTuple):
-    """Batch of links to assess: whether it starts a round, the UAVs still queued, the links.
+    """Batch of links to assess.
 
-    ``left_out`` are the verdicts on UAVs without a beam, at the start of a round.
+    begins   whether it starts a round
+    waiting  UAVs still queued in the round
+    early    UAVs assessed out of order, because their beams got worse
+    links    the links, with their gains
     """
 
     begins: bool
     waiting: list[str]
+    early: frozenset[str]
     links: list[_Link]
-    left_out: dict[str, Verdict]
+
+
+class _Assessed(NamedTuple):
+    """Beam as it was when its link was assessed: errors of its direction, and its gain."""
+
+    bound_rad: float
+    p95_rad: float
+    gain_db: float
+
+    def is_worse(self, beam: Beam) -> bool:
+        """Return whether a beam is worse than this one by more than the slack."""
+        return (
+            _or_inf(beam.pointing_bound_rad) > SLACK_RATIO * self.bound_rad
+            or _or_inf(beam.pointing_p95_rad) > SLACK_RATIO * self.p95_rad
+            or beam.gain_db < self.gain_db - SLACK_DB
+        )
 
 
 class HealthMonitor:
@@ -87,7 +119,10 @@ class HealthMonitor:
         self._last_ns: int | None = None  # time of the previous update
         self._waiting: list[str] = []  # UAVs still queued in this round
         self._noticed: dict[str, Verdict] = {}  # verdicts at the last notice
-        self._pending: dict[str, tuple[bool, int]] = {}  # pending change: better?, since when
+        self._changed_ns: dict[str, int] = {}  # since when a level is not the announced one
+        self._better_since_ns: dict[str, int] = {}  # since when a link has been better
+        self._assessed: dict[str, _Assessed] = {}  # the worst beam since the last round
+        self._when_good: dict[str, tuple[int, AngleParts]] = {}  # smallest bound while good
         self._unfit: str | None = None
 
     def next_batch(self, update: Update) -> LinkBatch | None:
@@ -95,19 +130,27 @@ class HealthMonitor:
 
         Changes nothing. Takes milliseconds, and may run on any thread.
         """
+        beams = update.beams.beams
         begun_ns, last_ns = self._round_start_ns, self._last_ns
         begins = begun_ns is None or not 0 <= update.t_ns - begun_ns < EVERY_NS
-        waiting = [beam.uav for beam in update.beams.beams] if begins else self._waiting
-        if not begins and not waiting:
+        waiting = [beam.uav for beam in beams] if begins else self._waiting
+        fallen = [beam.uav for beam in beams if self._may_have_fallen(beam)][:FALLEN_AT_ONCE]
+        if not begins and not waiting and not fallen:
             return None
         elapsed_ns = 0 if last_ns is None else update.t_ns - last_ns
-        share = len(update.beams.beams) * min(max(elapsed_ns / EVERY_NS, 0.0), 1.0)
+        share = len(beams) * min(max(elapsed_ns / EVERY_NS, 0.0), 1.0)
         many = max(AT_ONCE, math.ceil(share))
-        chosen = frozenset(waiting[:many])
-        which = [i for i, beam in enumerate(update.beams.beams) if beam.uav in chosen]
+        due = frozenset(waiting[:many])
+        early = frozenset(fallen) - due
+        which = [i for i, beam in enumerate(beams) if beam.uav in due or beam.uav in early]
         links = [] if update.carrier is None or not which else self._links(update.beams, which)
-        left_out = _of_left_out(update) if begins else {}
-        return LinkBatch(begins=begins, waiting=waiting[many:], links=links, left_out=left_out)
+        return LinkBatch(begins=begins, waiting=waiting[many:], early=early, links=links)
+
+    def _may_have_fallen(self, beam: Beam) -> bool:
+        held, before = self.verdicts.get(beam.uav), self._assessed.get(beam.uav)
+        if held is None or before is None or held.level is Level.NONE:
+            return False
+        return before.is_worse(beam)
 
     def _links(self, beam_set: BeamSet, which: Sequence[int]) -> list[_Link]:
         towards = directions(beam_set)
@@ -132,22 +175,42 @@ class HealthMonitor:
         UAVs whose link is not good.
         """
         self._last_ns = update.t_ns
-        if weighed is None:
-            return []
-        self._waiting = weighed.waiting
+        begins = weighed is not None and weighed.begins
         tracks = {track.uav: track for track in update.tracks}
-        fresh = dict(weighed.left_out)
-        if weighed.begins:
+        fresh = self._of_left_out(update, tracks, evidence, all_of_them=begins)
+        if weighed is None and not fresh:
+            return []
+        if weighed is not None:
+            self._waiting = weighed.waiting
+            for link in weighed.links:
+                self._note_beam(link.beam, is_early=link.beam.uav in weighed.early)
+                fresh[link.beam.uav] = self._judge_link(update, link, tracks, evidence)
+        if begins:
             self._round_start_ns = update.t_ns
-        for link in weighed.links:
-            fresh[link.beam.uav] = self._judge_link(update, link, tracks, evidence)
         held = self.verdicts | {
             uav: self._with_hold_time(verdict) for uav, verdict in fresh.items()
         }
         names = dict.fromkeys((*tracks, *(out.uav for out in update.beams.left_out)))
         self.verdicts = {uav: held[uav] for uav in names if uav in held}
-        self._pending = {uav: kept for uav, kept in self._pending.items() if uav in tracks}
+        if begins:
+            for kept in (self._better_since_ns, self._assessed, self._when_good):
+                for uav in [uav for uav in kept if uav not in tracks]:
+                    del kept[uav]
         return [] if self._waiting else self._notices(update)
+
+    def _note_beam(self, beam: Beam, *, is_early: bool) -> None:
+        """Note how uncertain the beam of an assessed link was; the worst of a round counts."""
+        now = _Assessed(
+            _or_inf(beam.pointing_bound_rad), _or_inf(beam.pointing_p95_rad), beam.gain_db
+        )
+        before = self._assessed.get(beam.uav)
+        if before is not None and is_early:
+            now = _Assessed(
+                max(before.bound_rad, now.bound_rad),
+                max(before.p95_rad, now.p95_rad),
+                min(before.gain_db, now.gain_db),
+            )
+        self._assessed[beam.uav] = now
 
     def _judge_link(
         self,
@@ -159,9 +222,28 @@ class HealthMonitor:
         uav, carrier = link.beam.uav, update.carrier
         level = self._level(uav, link.needed_db, link.guaranteed_db, link.likely_db)
         why = None
-        if level is not Level.GOOD and carrier is not None:
-            known = tracks[uav], carrier, link.needed_db, evidence(uav)
-            why = blame.of_beam(link.beam, *known)
+        if carrier is not None:
+            track, known = tracks[uav], evidence(uav)
+            parts = angle_parts(link.beam, track, carrier, known.attitude, known.waited_s)
+            coasting = track.state is TrackState.COASTING and track.age_s > COASTING_S
+            held = self.verdicts.get(uav)
+            if level is not Level.GOOD and held and held.blame and _is_enough(link):
+                why = held.blame  # only the margin is missing
+            elif level is not Level.GOOD:
+                when_good = self._when_good.get(uav)
+                why = blame.of_beam(
+                    link.beam,
+                    track,
+                    link.needed_db,
+                    known,
+                    parts,
+                    carrier=carrier,
+                    when_good=None if when_good is None else when_good[1],
+                )
+            elif coasting:
+                level, why = Level.WEAK, blame.of_coasting(track, known)
+            else:
+                self._note_good(uav, update.t_ns, parts)
         return Verdict(
             uav=uav,
             level=level,
@@ -171,6 +253,13 @@ class HealthMonitor:
             guaranteed_gain_db=link.guaranteed_db,
             likely_gain_db=link.likely_db,
         )
+
+    def _note_good(self, uav: str, t_ns: int, parts: AngleParts) -> None:
+        """Note the parts of the bound of a good link: the smallest bound of the last while."""
+        before = self._when_good.get(uav)
+        is_old = before is None or t_ns - before[0] > GOOD_KEPT_NS
+        if before is None or is_old or sum(parts.values()) <= sum(before[1].values()):
+            self._when_good[uav] = (t_ns, parts)
 
     def _least_db(
         self, beam_set: BeamSet, towards: FloatArray, which: Sequence[int]
@@ -188,59 +277,84 @@ class HealthMonitor:
     def _level(
         self, uav: str, needed_db: float, sure_db: float | None, likely_db: float | None
     ) -> Level:
-        """Return a link's level by its gains; a level is kept within ``HYSTERESIS_DB``."""
+        """Return a link's level by its gains; a level rises only with ``MARGIN_DB``."""
         held = self.verdicts.get(uav)
-        rank = RANK[held.level] if held else RANK[Level.NONE]
+        rank = RANK[held.level] if held else RANK[Level.GOOD]
 
         def enough(gain_db: float | None, level: Level) -> bool:
-            hysteresis_db = HYSTERESIS_DB if rank >= RANK[level] else 0.0
-            return gain_db is not None and gain_db >= needed_db - hysteresis_db
+            margin_db = 0.0 if rank >= RANK[level] else MARGIN_DB
+            return gain_db is not None and gain_db >= needed_db + margin_db
 
         if enough(sure_db, Level.GOOD):
             return Level.GOOD
         return Level.WEAK if enough(likely_db, Level.WEAK) else Level.NONE
 
     def _with_hold_time(self, fresh: Verdict) -> Verdict:
-        """Return the new verdict; until its hold time ends, with the current level."""
+        """Return the new verdict; with the current level until a better one has been held."""
         uav, held = fresh.uav, self.verdicts.get(fresh.uav)
-        if held is None:
+        if held is not None and RANK[fresh.level] > RANK[held.level]:
+            since_ns = self._better_since_ns.setdefault(uav, fresh.since_ns)
+            if fresh.since_ns - since_ns < HOLD_BETTER_NS:
+                why = fresh.blame or held.blame
+                return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
+        self._better_since_ns.pop(uav, None)
+        if held is None or fresh.level is not held.level:
             return fresh
-        if fresh.level is held.level:
-            self._pending.pop(uav, None)
-            if fresh.needed_gain_db is held.needed_gain_db is None and fresh.blame == held.blame:
-                return held  # still without a beam; there may be thousands
-            return replace(fresh, since_ns=held.since_ns)
-        better = RANK[fresh.level] > RANK[held.level]
-        was_better, since_ns = self._pending.get(uav, (better, fresh.since_ns))
-        if was_better is not better:
-            since_ns = fresh.since_ns
-        self._pending[uav] = (better, since_ns)
-        # Without a beam no gain can fluctuate, so the verdict changes at once.
-        wait_ns = (
-            HOLD_BETTER_NS if better else HOLD_WORSE_NS if fresh.needed_gain_db is not None else 0
-        )
-        if fresh.since_ns - since_ns >= wait_ns:
-            del self._pending[uav]
-            return fresh
-        why = None if held.level is Level.GOOD else fresh.blame or held.blame
-        return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
+        if fresh.needed_gain_db is held.needed_gain_db is None and fresh.blame == held.blame:
+            return held  # still without a beam; there may be thousands
+        return replace(fresh, since_ns=held.since_ns)
+
+    def _of_left_out(
+        self,
+        update: Update,
+        tracks: dict[str, Track],
+        evidence: Callable[[str], LinkEvidence],
+        *,
+        all_of_them: bool,
+    ) -> dict[str, Verdict]:
+        """Return verdicts on UAVs without a beam: all, or only those that had a link before."""
+        found = dict[str, Verdict]()
+        for out in update.beams.left_out:
+            held = self.verdicts.get(out.uav)
+            if not all_of_them and (held is None or held.needed_gain_db is None):
+                continue
+            silent = update.unfit is None and out.cause is Cause.SILENT
+            refused = evidence(out.uav).refused if silent else None
+            found[out.uav] = Verdict(
+                uav=out.uav,
+                level=Level.NONE,
+                blame=blame.of_left_out(out, tracks.get(out.uav), update.unfit, refused),
+                since_ns=update.t_ns,
+            )
+        return found
 
     def _notices(self, update: Update) -> list[Notice]:
-        """Return notices of changed verdicts; one for all links if the carrier is the cause."""
-        before, self._noticed = self._noticed, self.verdicts
+        """Return notices of changed verdicts; one for all links if the carrier is the cause.
+
+        A change is announced once it has lasted for ``ANNOUNCED_AFTER_NS``, unless the link is
+        better again and only its hold time keeps the level.
+        """
         was, self._unfit = self._unfit, update.unfit
         if update.unfit is not None:
             text = f"no links: {update.unfit}"
-            news = before and was is None
+            news = self._noticed and was is None
+            self._noticed, self._changed_ns = self.verdicts, {}
             return (
                 [Notice(t_ns=update.t_ns, severity=Severity.WARNING, subject="beams", text=text)]
                 if news
                 else []
             )
+        before, self._noticed = self._noticed, dict(self.verdicts)
+        changed_ns, self._changed_ns = self._changed_ns, {}
         changed = dict[tuple[Level, Cause | None], list[Verdict]]()
         for uav, verdict in self.verdicts.items():
             held = before.get(uav)
             if held is None or held.level is verdict.level:
+                continue
+            since_ns = changed_ns.get(uav, update.t_ns)
+            is_brief = update.t_ns - since_ns < ANNOUNCED_AFTER_NS or uav in self._better_since_ns
+            if verdict.needed_gain_db is not None and is_brief:
+                self._noticed[uav], self._changed_ns[uav] = held, since_ns
                 continue
             cause = verdict.blame.cause if verdict.blame else None
             # A UAV that is stale or lost, and therefore without a beam, has its own notice.
@@ -261,17 +375,12 @@ def _notice(t_ns: int, alike: Sequence[Verdict]) -> Notice:
     return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=one.uav, text=text)
 
 
-def _of_left_out(update: Update) -> dict[str, Verdict]:
-    tracks = {track.uav: track for track in update.tracks}
-    return {
-        out.uav: Verdict(
-            uav=out.uav,
-            level=Level.NONE,
-            blame=blame.of_left_out(out, tracks.get(out.uav), update.unfit),
-            since_ns=update.t_ns,
-        )
-        for out in update.beams.left_out
-    }
+def _is_enough(link: _Link) -> bool:
+    return link.guaranteed_db is not None and link.guaranteed_db >= link.needed_db
+
+
+def _or_inf(angle_rad: float | None) -> float:
+    return math.inf if angle_rad is None else angle_rad
 
 
 def _needed_db(

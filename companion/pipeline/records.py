@@ -39,9 +39,10 @@ class Records(dict[str, _T]):
 
 @dataclass(slots=True, kw_only=True)
 class UnusedRun:
-    """Run of reports that were all rejected: its start, and the reason of the newest."""
+    """Run of reports that were all rejected: its start, and time and reason of the newest."""
 
     since_ns: int
+    newest_ns: int
     reason: Reason
     reports: int = 0
     is_reported: bool = False
@@ -56,7 +57,6 @@ class UavRecord:
 
     refuted: int = 0  # how often assumptions about it were refuted
     proven: dict[str, float] = field(default_factory=dict)
-    clock_notice_ns: int | None = None  # when a change of its clock or link was last reported
     waits_ns: int | None = None  # start of the wait for its GNSS receiver to confirm its reports
     unused: UnusedRun | None = None  # current run of rejected reports
     unused_notice_ns: int | None = None  # when such a run was last reported

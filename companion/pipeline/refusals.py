@@ -10,6 +10,8 @@ from companion.values.newest import Newest
 
 REJECTED_AFTER_NS: Final = 1_000_000_000
 """Time without an accepted report of a sender after which a notice is published."""
+ARRIVING_NS: Final = 5_000_000_000
+"""Time since the newest rejected report after which a sender is silent, not rejected."""
 NOTICE_INTERVAL_NS: Final = 10_000_000_000  # least time between two such notices about one sender
 REPORT_REASONS: Final = frozenset(
     {
@@ -62,10 +64,12 @@ class Refusals:
             return None
         record = self._records[uav]
         if record.unused is None:
-            record.unused = UnusedRun(since_ns=refused.t_ns, reason=refused.reason)
+            record.unused = UnusedRun(
+                since_ns=refused.t_ns, newest_ns=refused.t_ns, reason=refused.reason
+            )
         run = record.unused
         run.reports += 1
-        run.reason = refused.reason
+        run.reason, run.newest_ns = refused.reason, refused.t_ns
         lasted_ns = refused.t_ns - run.since_ns
         if run.is_reported or run.reports < 2 or lasted_ns < REJECTED_AFTER_NS:
             return None
@@ -86,11 +90,16 @@ class Refusals:
         if record is not None:
             record.unused = None
 
-    def current_rejection(self, uav: str) -> Reason | None:
-        """Return why a sender's newest reports are rejected; None if they are accepted."""
+    def current_rejection(self, uav: str, now_ns: int) -> Reason | None:
+        """Return why a sender's newest reports are rejected.
+
+        None if they are accepted, or if none has arrived for ``ARRIVING_NS``.
+        """
         record = self._records.get(uav)
         run = None if record is None else record.unused
-        return run.reason if run is not None and run.reports > 1 else None
+        if run is None or run.reports < 2 or now_ns - run.newest_ns > ARRIVING_NS:
+            return None
+        return run.reason
 
     def _count(self, refused: Rejection) -> None:
         self.total[refused.reason] += refused.count

@@ -95,7 +95,7 @@ class Encoder:
             return
         match event:
             case Tick():
-                data = schemas.encode_tick(event.t_ns, in_two=event.in_two)
+                data = schemas.encode("Tick", event)
                 self._emit(schemas.TICKS_TOPIC, schemas.TICK, event.t_ns, data)
             case Tock():
                 data = schemas.encode("Tock", event)

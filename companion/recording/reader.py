@@ -311,7 +311,7 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
         return frame
     if topic == schemas.TICKS_TOPIC:
         tick = schemas.TickMessage.FromString(data)
-        return Tick(tick.t_ns, tick.in_two)
+        return Tick(tick.t_ns, tick.in_two, max(0, tick.waited_ns))
     if topic == schemas.TOCKS_TOPIC:
         return Tock(schemas.TockMessage.FromString(data).t_ns)
     if topic == schemas.ROUND_TRIPS_TOPIC:

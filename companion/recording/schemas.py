@@ -6,8 +6,8 @@ Positions, log lines and the scene are Foxglove's own messages, which viewers di
 meaning. A ``Schema`` contains the complete ``FileDescriptorSet``, so that a recording can be
 decoded with nothing but the file.
 
-``FrameEncoder`` and ``encode_tick`` pack the two most frequent messages by hand; the bytes equal
-those of the generated classes (a test compares them).
+``FrameEncoder`` packs the most frequent message by hand; the bytes equal those of the generated
+class (a test compares them).
 """
 
 import functools
@@ -196,7 +196,6 @@ SCENE_TOPIC: Final = "/scene"
 RAW_MAX: Final = 280
 """Largest frame in bytes: 10 header, 255 payload, 2 checksum, 13 signature."""
 _TIME = struct.Struct("<BQ")
-_IN_TWO = 0x10  # field of a tick
 _T_NS, _LINK, _SYSID, _COMPID, _MSGID, _RAW, _DOUBT_NS = (
     0x09, 0x12, 0x18, 0x20, 0x28, 0x32, 0x38,
 )  # fmt: skip
@@ -213,11 +212,6 @@ def _varint(value: int) -> bytes:
 
 def _number(tag: int, value: int) -> bytes:
     return bytes([tag]) + _varint(value) if value else b""
-
-
-def encode_tick(t_ns: int, *, in_two: bool = False) -> bytes:
-    """Encode ``companion.Tick``; ``t_ns`` in [0, 2⁶⁴)."""
-    return (_TIME.pack(_T_NS, t_ns) if t_ns else b"") + _number(_IN_TWO, in_two)
 
 
 _RAW_HEADS: Final = (b"", *(bytes((_RAW,)) + _varint(size) for size in range(1, RAW_MAX + 1)))

@@ -85,6 +85,17 @@ def fixed(
     )
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AttitudeParts:
+    """Parts of the bound on the carrier's attitude by their causes, rad; their sum is the bound."""
+
+    error_rad: float = 0.0  # error of the reported attitude
+    age_rad: float = 0.0  # extrapolation over its age, without the wait for this machine
+    waiting_rad: float = 0.0  # extrapolation over the wait for this machine
+    clock_rad: float = 0.0  # uncertainty of its age
+    conflict_rad: float = 0.0  # contradiction with the previous attitude
+
+
 @dataclass(frozen=True, slots=True)
 class AttitudeBounds:
     """Bounds on the error of an attitude that is extrapolated at its rates."""
@@ -100,6 +111,26 @@ class AttitudeBounds:
         furthest_s = abs(age_s) + doubt_s
         turned = self.acceleration_radps2 * furthest_s * furthest_s / 2.0
         return min(math.pi, self.attitude_rad + rate_radps * doubt_s + turned)
+
+    def parts(
+        self,
+        rate_radps: float,
+        age_s: float,
+        doubt_s: float,
+        *,
+        waited_s: float,
+        conflict_rad: float,
+    ) -> AttitudeParts:
+        """Return the parts of the bound ``at``; frames waited ``waited_s`` for this machine."""
+        aged = self.at(rate_radps, age_s, 0.0)
+        fresh = self.at(rate_radps, max(abs(age_s) - waited_s, 0.0), 0.0)
+        return AttitudeParts(
+            error_rad=self.attitude_rad,
+            age_rad=fresh - self.attitude_rad,
+            waiting_rad=aged - fresh,
+            clock_rad=self.at(rate_radps, age_s, doubt_s) - aged,
+            conflict_rad=conflict_rad,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,13 @@ class Tick:
             2,
         ),
     ] = False
+    waited_ns: Annotated[
+        int,
+        Meaning(
+            "time for which frames may have waited to be read by this machine when beams were due",
+            3,
+        ),
+    ] = 0
 
 
 @dataclass(frozen=True, slots=True)

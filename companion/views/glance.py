@@ -9,7 +9,7 @@ from companion.values import Blame, Level, Notice, Verdict, kind_of
 from companion.values.described import Meaning
 from companion.views import health
 from companion.views.as_json import Json, as_json, rfc3339
-from companion.views.state import Node, summary
+from companion.views.state import Node, overload, summary
 
 NAMED: Final = 2  # largest number of UAVs in the status line
 
@@ -18,7 +18,7 @@ def glance(node: Node) -> Json:
     """Return the short status: links, UAVs with their verdicts, recording and headline."""
     pipeline, now_ns = node.pipeline, node.now_ns()
     verdicts, update = pipeline.health.verdicts, pipeline.last_update
-    machine = health.behind(node.arrival_lag.seen(now_ns))
+    machine = overload(node, now_ns)
     recording = node.recording()
     return {
         "at": rfc3339(pipeline.utc_ns(now_ns)),
@@ -49,7 +49,7 @@ def line(node: Node) -> str:
     parts = [f"{up} of {len(node.links())} links up"]
     if frames_hz is not None:
         parts[0] += f", {frames_hz:.0f} frames/s"
-    machine = health.behind(node.arrival_lag.seen(now_ns))
+    machine = overload(node, now_ns)
     parts.append(summary(node, now_ns).headline)
     if machine is not None:
         parts.append(machine.reason)

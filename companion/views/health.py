@@ -1,17 +1,21 @@
 """Verdicts on the links to UAVs, as shown by the API.
 
-If this machine is overloaded, the overload is the cause of every link that is not good: the
-pipeline then receives only old reports.
+If this machine is overloaded, no link is shown as good: beams are aimed by old reports, or held for
+longer than planned.
 """
 
 from collections import Counter
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Final
 
 from companion.mavlink.links.lag import LagSeen
+from companion.pipeline.blame import of_machine
 from companion.values import Blame, Cause, Level, Verdict
 from companion.values.described import Inline, Meaning
+
+UPDATE_AGE_S: Final = 0.6  # age of the newest update beyond which no link is good, seconds
+PERIODS: Final = 5  # the same in periods, if updates are rarer
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,15 +39,25 @@ class Headline:
     behind: Annotated[str | None, Meaning("text that this machine is overloaded; null: it is not")]
 
 
-def behind(seen: LagSeen) -> Blame | None:
-    """Return the cause of weak links if this machine is overloaded; None otherwise."""
-    if not seen.behind:
+def behind(seen: LagSeen, update_age_s: float | None, update_hz: float) -> Blame | None:
+    """Return the cause of weak links if this machine is overloaded; None otherwise.
+
+    ``update_age_s`` is the age of the newest update, None before the first one.
+    """
+    if seen.behind:
+        return of_machine(seen.longest_s)
+    if update_age_s is None or update_age_s <= max(UPDATE_AGE_S, PERIODS / update_hz):
         return None
     return Blame(
         Cause.MACHINE,
-        f"this machine is overloaded: frames wait up to {seen.max_s or 0.0:.1f} s",
-        "close other programs and pages, or lower `[beams] update_hz`",
+        f"this machine is overloaded: the newest beams are {update_age_s:.1f} s old",
+        of_machine(0.0).remedy,
     )
+
+
+def level_of(found: Verdict, machine: Blame | None) -> Level:
+    """Return the level shown: no link is good while this machine is overloaded."""
+    return Level.WEAK if found.level is Level.GOOD and machine is not None else found.level
 
 
 def verdict(
@@ -57,8 +71,8 @@ def verdict(
         return Level.NONE, LinkHealth(machine or unserved, None)
     if found is None:
         return None, None
-    why = None if found.level is Level.GOOD else machine or found.blame
-    return found.level, LinkHealth(why, found)
+    why = machine if found.level is Level.GOOD else found.blame
+    return level_of(found, machine), LinkHealth(why, found)
 
 
 def summary(
@@ -68,7 +82,7 @@ def summary(
 
     ``unserved`` UAVs have no node of the fleet; ``elsewhere`` counts those that other nodes serve.
     """
-    counts = Counter(found.level for found in verdicts)
+    counts = Counter(level_of(found, machine) for found in verdicts)
     counts[Level.NONE] += unserved
     good, total = counts[Level.GOOD], counts.total()
     parts = [f"{good} of {total} links good"] if total else []

@@ -10,7 +10,7 @@ from companion.mavlink.voice.rate_watch import MessageRate
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.settings.origins import Origins
-from companion.values import Notice
+from companion.values import Blame, Notice
 from companion.values.described import Meaning
 from companion.views import center_state, health, link_state
 from companion.views.as_json import Json, as_json
@@ -173,11 +173,21 @@ def status(node: Node, version: str) -> Json:
     return as_json(shown, pipeline.utc_ns)
 
 
+def overload(node: Node, now_ns: int) -> Blame | None:
+    """Return the cause of weak links if this machine is overloaded; None otherwise."""
+    if node.replay() is not None:
+        return None
+    update = node.pipeline.last_update
+    age_s = None if update is None else (now_ns - update.t_ns) * 1e-9
+    update_hz = node.pipeline.settings.beams.update_hz
+    return health.behind(node.arrival_lag.seen(now_ns), age_s, update_hz)
+
+
 def summary(node: Node, now_ns: int) -> Headline:
     """Return the headline on the links, including UAVs that no node of a fleet serves."""
     pipeline = node.pipeline
     served = served_uavs(pipeline, node.fleet_status(), now_ns)
-    verdicts, machine = pipeline.health.verdicts, health.behind(node.arrival_lag.seen(now_ns))
+    verdicts, machine = pipeline.health.verdicts, overload(node, now_ns)
     if served is None:
         return health.summary(verdicts.values(), machine)
     here = [one for uav, one in verdicts.items() if served.is_here(uav)]

@@ -28,7 +28,7 @@ from companion.views import health
 from companion.views.as_json import Json, as_json
 from companion.views.health import LinkHealth
 from companion.views.served import Served, Within, served_uavs, within_reach
-from companion.views.state import Node
+from companion.views.state import Node, overload
 
 
 @dataclass(frozen=True, slots=True)
@@ -203,7 +203,7 @@ def overview(node: Node, uavs: Sequence[KnownUav], now_ns: int) -> Overview:
         uavs=uavs,
         local=pipeline.local,
         carrier=None if isinstance(found, str) else found,
-        machine=health.behind(node.arrival_lag.seen(now_ns)),
+        machine=overload(node, now_ns),
         served=served,
         within=within_reach(status, served, now_ns),
     )

@@ -9,7 +9,9 @@ import pymavlink.dialects.v20.all as dialect
 import pytest
 
 from companion import Frame, Pipeline, RoundTrip, Settings, Source, Tick
-from companion.values import Estimate, Notice, Output, Reason, Refuted, Rejection, Update
+from companion.mavlink.clock.estimates import ClockChange
+from companion.pipeline.assumptions import ClockNotices
+from companion.values import Estimate, Notice, Output, Reason, Refuted, Rejection, Severity, Update
 
 START_NS = 1_760_000_000_000_000_000
 S = 1_000_000_000
@@ -174,8 +176,39 @@ def test_stalled_clock_is_announced_and_refutes_the_drift_limit() -> None:
     refuted = [one for one in out if isinstance(one, Refuted)]
     assert [one.setting for one in refuted] == ["clocks.drift_max_ppm"]
     assert 20 < (refuted[0].t_ns - START_NS) / S < 21.3
+    out += into.step(Tick(START_NS + 30 * S))
     (told,) = (one for one in out if isinstance(one, Notice) and "clock stalled" in one.text)
     assert told.subject == "1:1" and "150 ms" in told.text
+
+
+def test_changes_of_clocks_are_gathered_and_small_ones_left_out() -> None:
+    notices = ClockNotices()
+
+    def changed(t_s: float, sender: str, step_s: float) -> None:
+        change = ClockChange(proven=True, step_s=step_s, drift_ppm=900.0)
+        assert notices.add(START_NS + round(t_s * S), sender, change) is None
+
+    def due(t_s: float) -> Notice | None:
+        return notices.due(START_NS + round(t_s * S))
+
+    changed(0, "1:1", 0.002)
+    assert due(60) is None
+    for number in range(1, 10):
+        changed(60 + number / 10, f"{number}:1", 0.02 + number / 1000)
+    assert due(65) is None
+    first = due(65.2)
+    assert first is not None
+    assert first.severity is Severity.INFO
+    assert first.text == (
+        "clocks or links of 1:1, 2:1, 3:1, 4:1, 5:1, 6:1 and 3 more changed by up to 29 ms; the"
+        " bounds cover it"
+    )
+    changed(70, "1:1", 0.5)
+    assert due(100) is None
+    second = due(125.2)
+    assert second is not None
+    assert (second.severity, second.subject) == (Severity.WARNING, "1:1")
+    assert due(300) is None
 
 
 def test_contradicting_round_trip_is_announced_at_most_once() -> None:

@@ -7,7 +7,9 @@ import pytest
 import tracks
 
 from companion.pipeline import blame
+from companion.pipeline.angle_parts import AngleParts, angle_parts
 from companion.pipeline.blame import LinkEvidence
+from companion.tracking.carrier import AttitudeParts
 from companion.values import Beam, Carrier, Cause, LeftOut, Limits, Reason, Track, TrackState
 
 FINE = LinkEvidence(clock_assumed=False, refused=None)
@@ -51,8 +53,10 @@ def blamed(
     carrier: Carrier = CARRIER,
     beam: Beam = BEAM,
     evidence: LinkEvidence = FINE,
+    when_good: AngleParts | None = None,
 ) -> tuple[Cause, str, str]:
-    found = blame.of_beam(beam, track, carrier, 10.0, evidence)
+    parts = angle_parts(beam, track, carrier, evidence.attitude, evidence.waited_s)
+    found = blame.of_beam(beam, track, 10.0, evidence, parts, carrier=carrier, when_good=when_good)
     return found.cause, found.reason, found.remedy
 
 
@@ -60,7 +64,7 @@ def blamed(
     ("changed", "cause", "reason"),
     [
         ({}, Cause.POSITION, "at 100 m, its position is uncertain by 3 m"),
-        ({"dt_s": 1.1, "age_s": 0.9, "bound_m": 5.0}, Cause.RATE, "reports 1.1 s apart"),
+        ({"dt_s": 1.1, "age_s": 1.1, "bound_m": 5.0}, Cause.RATE, "reports 1.1 s apart"),
         ({"age_s": 0.9, "latency_s": 0.6, "dt_s": 0.2, "bound_m": 3.0}, Cause.LATE,
          "reports arrive 0.6 s late"),
         ({"limits": Limits(60.0, 190.0), "age_s": 0.2, "bound_m": 5.0}, Cause.AGILE,
@@ -102,24 +106,65 @@ def test_unmeasured_clock_remedy_is_timesync() -> None:
     assert "TIMESYNC" in remedy
 
 
-def test_carrier_is_blamed_for_its_attitude_and_position() -> None:
-    turned = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2))
-    assert turned[:2] == (Cause.CARRIER, "the carrier's attitude is uncertain by 11°")
-    assert "10 Hz" in turned[2]
-    as_given = replace(FINE, attitude_bound_rad=0.18)
-    compass = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2), evidence=as_given)
-    assert compass[:2] == turned[:2]
-    assert "compass" in compass[2]
-    doubted = replace(FINE, attitude_age_s=0.1, carrier_doubt_s=0.15)
-    for assumed, word in ((True, "TIMESYNC"), (False, "steadier")):
-        clock = blamed(
-            carrier=replace(CARRIER, attitude_bound_rad=0.2),
-            evidence=replace(doubted, carrier_assumed=assumed),
-        )
-        assert clock[:2] == turned[:2]
-        assert word in clock[2]
+@pytest.mark.parametrize(
+    ("attitude", "evidence", "reason", "remedy"),
+    [
+        (AttitudeParts(age_rad=0.19), {"attitude_age_s": 0.9}, "attitude is uncertain by 11°",
+         "10 Hz"),
+        (AttitudeParts(age_rad=0.19), {"attitude_age_s": 1.4}, "no attitude from the carrier",
+         "power"),
+        (AttitudeParts(error_rad=0.18, age_rad=0.01), {}, "is uncertain by 11°", "compass"),
+        (AttitudeParts(clock_rad=0.19), {"carrier_assumed": True}, "uncertain by 11°", "TIMESYNC"),
+        (AttitudeParts(clock_rad=0.19), {}, "attitude is uncertain by 11°", "steadier"),
+        (AttitudeParts(conflict_rad=0.19), {}, "contradict each other", "only one component"),
+    ],
+)  # fmt: skip
+def test_carrier_is_blamed_for_its_attitude(
+    attitude: AttitudeParts, evidence: dict[str, float], reason: str, remedy: str
+) -> None:
+    known = replace(FINE, attitude=attitude, **evidence)  # type: ignore[arg-type]
+    found = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2), evidence=known)
+    assert found[0] is Cause.CARRIER
+    assert reason in found[1]
+    assert remedy in found[2]
+
+
+def test_carrier_is_blamed_for_its_position() -> None:
     placed = blamed(carrier=replace(CARRIER, bound_m=8.0))
     assert placed[:2] == (Cause.CARRIER, "the carrier's position is uncertain by 8 m")
+    silent = blamed(carrier=replace(CARRIER, bound_m=8.0, age_s=1.4))
+    assert silent[1] == "no position from the carrier for 1.4 s"
+
+
+def test_wait_for_this_machine_is_blamed_on_it() -> None:
+    """All of the age comes from this machine: neither the link nor the compass is at fault."""
+    old = replace(TRACK, age_s=0.9, bound_m=5.0)
+    waiting = replace(FINE, waited_s=0.8, attitude=AttitudeParts(waiting_rad=0.02))
+    turned = replace(CARRIER, attitude_bound_rad=0.03)
+    found = blamed(old, turned, evidence=waiting)
+    assert found[:2] == (Cause.MACHINE, "this machine is overloaded: frames wait up to 0.8 s")
+    assert blamed(replace(old, age_s=1.7), turned, evidence=waiting)[0] is Cause.MACHINE
+    assert blamed(replace(old, age_s=2.7), turned, evidence=waiting)[0] is Cause.SILENT
+
+
+def test_what_grew_since_the_link_was_good_is_the_cause_even_if_another_part_is_larger() -> None:
+    compass = AttitudeParts(error_rad=0.05)
+    good = angle_parts(BEAM, TRACK, CARRIER, compass, 0.0)
+    turned = replace(CARRIER, attitude_bound_rad=0.08)
+    for more, word in (
+        (AttitudeParts(error_rad=0.05, age_rad=0.03), "10 Hz"),
+        (AttitudeParts(error_rad=0.05, clock_rad=0.03), "steadier"),
+        (AttitudeParts(error_rad=0.055), "compass"),  # within the tolerance: the largest part
+    ):
+        found = blamed(carrier=turned, evidence=replace(FINE, attitude=more), when_good=good)
+        assert word in found[2]
+        assert "compass" in blamed(carrier=turned, evidence=replace(FINE, attitude=more))[2]
+
+
+def test_steady_delay_is_late_not_silent() -> None:
+    late = replace(TRACK, age_s=1.6, latency_s=1.5, dt_s=0.3, bound_m=8.0)
+    assert blamed(late)[:2] == (Cause.LATE, "reports arrive 1.5 s late")
+    assert blamed(replace(late, age_s=2.7))[0] is Cause.SILENT
 
 
 def test_rejected_reports_are_the_first_cause() -> None:
@@ -151,6 +196,8 @@ def test_uav_without_beam_gets_the_left_out_reason() -> None:
     stale = replace(TRACK, state=TrackState.STALE, age_s=12.0)
     found = blame.of_left_out(LeftOut("3:1", Cause.SILENT, "its reports are stale"), stale, None)
     assert (found.cause, found.reason) == (Cause.SILENT, "no report for 12.0 s")
+    frozen = blame.of_left_out(LeftOut("3:1", Cause.SILENT, "stale"), stale, None, Reason.FROZEN)
+    assert (frozen.cause, frozen.reason) == (Cause.REFUSED, "its reports are rejected: frozen")
 
 
 def test_globally_silent_uav_is_not_blamed_on_missing_nodes() -> None:

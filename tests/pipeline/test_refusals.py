@@ -1,7 +1,7 @@
 """Rejections: counted by sender, with bounded memory under a flood of ids."""
 
 from companion.pipeline.records import Records, UavRecord
-from companion.pipeline.refusals import RECENT, SENDERS_MAX, Refusals
+from companion.pipeline.refusals import ARRIVING_NS, RECENT, SENDERS_MAX, Refusals
 from companion.values import Reason, Rejection
 
 
@@ -89,4 +89,6 @@ def test_shared_id_explains_silence_without_its_own_notice() -> None:
     refusals = new_refusals()
     shared = [refused(t / 4, reason=Reason.SHARED_ID) for t in range(20)]
     assert told_at(refusals, shared) == []
-    assert refusals.current_rejection("3:1") is Reason.SHARED_ID
+    newest_ns = shared[-1].t_ns
+    assert refusals.current_rejection("3:1", newest_ns + ARRIVING_NS) is Reason.SHARED_ID
+    assert refusals.current_rejection("3:1", newest_ns + ARRIVING_NS + 1) is None  # silent now

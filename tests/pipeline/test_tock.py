@@ -165,6 +165,6 @@ def test_recording_replays_to_the_same_digest(tmp_path: Path, flown: list[Event]
 
 def test_older_reader_without_tocks_reads_ticks() -> None:
     """It meets one additional field, and a topic that it does not subscribe to."""
-    data = schemas.encode_tick(5, in_two=True)
-    assert data.startswith(schemas.encode_tick(5))
+    data = schemas.encode("Tick", Tick(5, in_two=True))
+    assert data.startswith(schemas.encode("Tick", Tick(5)))
     assert schemas.TickMessage.FromString(data).t_ns == 5

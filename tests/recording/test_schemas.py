@@ -49,12 +49,6 @@ def test_hand_packed_frame_equals_the_generated_class(frame: Frame) -> None:
     assert encoder.encode(frame) == generated.SerializeToString(deterministic=True)
 
 
-@given(TIMES, st.booleans())
-def test_hand_packed_tick_equals_the_generated_class(t_ns: int, in_two: bool) -> None:
-    generated = schemas.TickMessage(t_ns=t_ns, in_two=in_two)
-    assert schemas.encode_tick(t_ns, in_two=in_two) == generated.SerializeToString()
-
-
 def test_frame_encoder_cache_is_bounded() -> None:
     encoder = schemas.FrameEncoder()
     for number in range(schemas.HEADS_MAX + 10):

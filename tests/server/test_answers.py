@@ -345,7 +345,9 @@ def test_arrival_lag_is_reported(make_node: Any) -> None:
     node = make_node()
     began_ns = node.now_ns()
     with TestClient(create_app(node)) as client:
-        nothing = {"newest_s": None, "p95_s": None, "max_s": None, "behind": False}
+        nothing = {
+            "newest_s": None, "p95_s": None, "max_s": None, "behind": False, "longest_s": 0.0,
+        }  # fmt: skip
         assert client.get("/v1/status").json()["arrival_lag"] == nothing
         assert "companion_arrival_lag" not in client.get("/metrics").text
         for tenth in range(20):
@@ -353,7 +355,10 @@ def test_arrival_lag_is_reported(make_node: Any) -> None:
         node.tick(1.9)
         status = client.get("/v1/status").json()
         holds(state.Status, status)
-        lag = {"newest_s": 0.700000019, "p95_s": 0.700000018, "max_s": 0.700000019, "behind": True}
+        lag = {
+            "newest_s": 0.700000019, "p95_s": 0.700000018, "max_s": 0.700000019, "behind": True,
+            "longest_s": 0.700000019,
+        }  # fmt: skip
         assert status["arrival_lag"] == pytest.approx(lag, abs=1e-10)
         assert status["health"]["behind"] == "this machine is overloaded: frames wait up to 0.7 s"
         metrics = client.get("/metrics").text
@@ -381,7 +386,7 @@ def test_lost_carrier_is_shown_at_its_last_known_position(make_node: Any) -> Non
 
 def test_history_holds_the_charted_values(make_node: Any) -> None:
     node = make_node()
-    for _ in range(10):
+    for _ in range(6):
         node.tick()
         node.series.add(node.pipeline)
     with TestClient(create_app(node)) as client:
@@ -395,14 +400,15 @@ def test_history_holds_the_charted_values(make_node: Any) -> None:
         if uav["target"]:
             columns = history["uavs"][uav["id"]]
             assert {len(column) for column in columns.values()} == {len(times)}
-            assert columns["guaranteed_gain_db"][-1] == uav["health"]["guaranteed_gain_db"]
+            last_db = columns["guaranteed_gain_db"][-1]
+            assert uav["health"]["guaranteed_gain_db"] in (last_db, None)  # None: no beam since
             assert columns["innovation_m"][-1] is not None
             assert columns["pointing_bound_deg"][-1] > 0
 
 
 def test_verdicts_are_in_responses_and_metrics(make_node: Any) -> None:
     node = make_node(link={"needed_db": 60.0})
-    for _ in range(20):
+    for _ in range(3):
         node.tick()
     with TestClient(create_app(node)) as client:
         uavs = client.get("/v1/uavs").json()["uavs"]

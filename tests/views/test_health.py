@@ -35,12 +35,17 @@ def test_verdict_is_shown_with_reason_and_gains() -> None:
     assert health.verdict(None, None) == (None, None)
 
 
-def test_overloaded_machine_is_blamed_for_bad_links() -> None:
-    machine = health.behind(LagSeen(newest_s=7.0, p95_s=7.0, max_s=7.04, behind=True))
+def seen(*, behind: bool) -> LagSeen:
+    return LagSeen(newest_s=0.1, p95_s=7.0, max_s=9.0, behind=behind, longest_s=7.04)
+
+
+def test_no_link_is_good_while_the_machine_is_overloaded() -> None:
+    """Links that are worse keep their own cause: the machine may not be it."""
+    machine = health.behind(seen(behind=True), 0.1, 10.0)
     assert machine is not None
     assert machine.reason == "this machine is overloaded: frames wait up to 7.0 s"
     weak = shown(WEAK, machine)
-    assert weak is not None and weak["reason"] == machine.reason
+    assert weak is not None and weak["reason"] == "reports 1.1 s apart"
     good = Verdict(
         uav="1:1",
         level=Level.GOOD,
@@ -50,9 +55,21 @@ def test_overloaded_machine_is_blamed_for_bad_links() -> None:
         guaranteed_gain_db=3.0,
         likely_gain_db=4.5,
     )
-    fine = shown(good, machine)
-    assert fine is not None and fine["reason"] is None
-    assert health.behind(LagSeen(newest_s=7.0, p95_s=7.0, max_s=7.04, behind=False)) is None
+    held = shown(good, machine)
+    assert held is not None and (held["verdict"], held["cause"]) == ("weak", "machine")
+    fine = shown(good)
+    assert fine is not None and (fine["verdict"], fine["reason"]) == ("good", None)
+    assert health.summary([good, WEAK], machine).headline == "0 of 2 links good"
+
+
+def test_old_beams_are_the_machine_fault() -> None:
+    quiet = seen(behind=False)
+    assert health.behind(quiet, 0.6, 10.0) is None
+    assert health.behind(quiet, None, 10.0) is None  # no beams yet
+    assert health.behind(quiet, 4.9, 1.0) is None  # five periods
+    old = health.behind(quiet, 0.7, 10.0)
+    assert old is not None
+    assert old.reason == "this machine is overloaded: the newest beams are 0.7 s old"
 
 
 def test_headline_counts_good_links() -> None:

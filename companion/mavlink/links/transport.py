@@ -184,7 +184,7 @@ class Link:
             spent_s *= _share_of_frames(found, len(data))
         newcomers.worked_s += spent_s
         if now_ns >= newcomers.adapts_ns:
-            newcomers.adapt(now_ns)
+            newcomers.adapt(now_ns, time.thread_time())
         if isinstance(peer.splitter, ForeignSplitter) and not self.url.listens:
             began_ns = peer.splitter.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:

@@ -18,8 +18,8 @@ NEW_PER_S: Final = 50.0  # new senders a second
 NEW_SAVED: Final = 500.0  # new senders at once, as when a fleet is switched on
 SENDERS_MAX: Final = 4096
 """Most senders remembered; beyond it the one silent for longest is new again."""
-BUSY: Final = 0.6  # share of the time above which frames of the newest senders are dropped
-IDLE: Final = 0.4  # share below which more senders are served again
+BUSY: Final = 0.5  # share of the time above which frames of the newest senders are dropped
+IDLE: Final = 0.35  # share below which more senders are served again
 STRANGERS_WAIT_NS: Final = 10_000_000_000  # time for which strangers are not served after that
 LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 KEPT_NS: Final = 5_000_000_000  # time between two looks at which senders are active
@@ -50,6 +50,7 @@ class Newcomers:
         self._had_strangers = False  # whether strangers were served since the machine was late
         self._strangers_from_ns = -(1 << 62)  # time from which those of strangers are served
         self._began_ns = 0
+        self._used_s = 0.0
         self._changed_ns = 0
         self._is_late = False
 
@@ -84,10 +85,15 @@ class Newcomers:
         """Note that frames were read late, or lost before they were read."""
         self._is_late = True
 
-    def adapt(self, now_ns: int) -> None:
-        """Adapt who is served to the share of the time that frames took."""
+    def adapt(self, now_ns: int, used_s: float) -> None:
+        """Adapt who is served to the share of the time that frames took.
+
+        ``used_s`` is the processor time that the calling thread has used so far: a process that is
+        stopped, or waits for a processor, is late without any fault of its senders.
+        """
         passed_ns = max(1, now_ns - self._began_ns)
-        share, self.worked_s = self.worked_s / (passed_ns * 1e-9), 0.0
+        worked_s = min(self.worked_s, used_s - self._used_s)
+        share, self.worked_s, self._used_s = worked_s / (passed_ns * 1e-9), 0.0, used_s
         self._began_ns, self.adapts_ns = now_ns, now_ns + WINDOW_NS
         if now_ns - self._changed_ns > KEPT_NS:
             self.generation += 1

@@ -58,43 +58,43 @@ def test_lag_maximum_and_p95_are_over_tenths_of_a_second(steps: list[tuple[int, 
     assert seen.newest_s == pytest.approx(steps[-1][1] / S)
 
 
-def test_lag_above_the_limit_for_a_second_counts_as_behind() -> None:
-    lag, now_ns = fed(*steady(0.01, 0, 2), *steady(0.6, 2, 2.9))
-    assert not lag.seen(now_ns).behind
-    lag, now_ns = fed(*steady(0.01, 0, 2), *steady(0.6, 2, 3.2))
+def test_one_wait_above_the_limit_counts_as_behind_for_two_seconds() -> None:
+    lag, now_ns = fed(*steady(0.01, 0, 2), (2.0, 0.6), *steady(0.01, 2.1, 3.9))
     assert lag.seen(now_ns).behind
-    lag, now_ns = fed(*steady(LIMIT_NS / S, 0, 5))
+    assert lag.seen(now_ns).longest_s == pytest.approx(0.6)
+    lag, now_ns = fed(*steady(0.01, 0, 2), (2.0, 0.6), *steady(0.01, 2.1, 4.2))
+    assert not lag.seen(now_ns).behind
+    lag, now_ns = fed(*steady(0.01, 0, 2), (2.0, LIMIT_NS / S))
     assert not lag.seen(now_ns).behind
 
 
-def test_single_long_pause_does_not_count_as_behind() -> None:
-    waited = [(3.0 + n * 1e-4, 3.0 - n * 0.1) for n in range(30)]
-    lag, now_ns = fed((0, 0.01), *waited, *steady(0.01, 3.1, 4.2))
-    assert not lag.seen(now_ns).behind
-
-
-def test_repeated_pauses_count_as_behind() -> None:
+@pytest.mark.parametrize(
+    ("apart_s", "behind"), [(0.3, False), (0.5, True), (1.5, True), (2.1, False)]
+)
+def test_repeated_wait_counts_as_behind(apart_s: float, behind: bool) -> None:
     """After each pause the queue empties: its last datagram is not late at all."""
-    waited = [(k * 0.8 + n * 1e-4, 0.8 - n * 0.1) for k in range(1, 5) for n in range(8)]
-    lag, now_ns = fed(*waited)
-    assert lag.seen(now_ns).behind
-
-
-def test_behind_state_has_hysteresis() -> None:
-    """Once behind, only two seconds without a lag above the limit clear it."""
-    late = [*steady(0.01, 0, 1), *steady(0.6, 1, 3)]
-    for gap_s in (0.3, 1.0, 1.9):
-        lag, now_ns = fed(*late, *steady(0.01, 3, 3 + gap_s))
-        assert lag.seen(now_ns).behind
-        lag, now_ns = fed(*late, *steady(0.01, 3, 3 + gap_s), (3 + gap_s, 0.6))
-        assert lag.seen(now_ns).behind
-    lag, now_ns = fed(*late, *steady(0.01, 3, 5.2))
-    assert not lag.seen(now_ns).behind
-    lag, now_ns = fed(*late, *steady(0.01, 3, 5.2), (5.2, 0.6))
-    assert not lag.seen(now_ns).behind
+    late = [(2.0, 0.3), (2.01, 0.0), (2.0 + apart_s, 0.3), (2.01 + apart_s, 0.0)]
+    lag, now_ns = fed(*steady(0.01, 0, 2), *late)
+    assert lag.seen(now_ns).behind is behind
 
 
 def test_silence_clears_the_behind_state() -> None:
     lag, now_ns = fed(*steady(0.6, 0, 3))
     assert lag.seen(now_ns + S).behind
     assert not lag.seen(now_ns + 3 * S).behind
+
+
+def test_event_loop_that_is_held_up_counts_without_any_datagram() -> None:
+    lag = ArrivalLag()
+    lag.held_up(BEGIN, 600 * MS)
+    seen = lag.seen(BEGIN + S)
+    assert (seen.behind, seen.newest_s, seen.max_s) == (True, None, None)
+    assert seen.longest_s == pytest.approx(0.6)
+    assert not lag.seen(BEGIN + 3 * S).behind
+
+
+def test_datagrams_wait_as_long_as_the_newest_one_for_a_tenth_of_a_second() -> None:
+    lag, now_ns = fed((0.0, 0.4), (0.1, 0.3))
+    assert lag.waiting_ns(now_ns) == 300 * MS
+    assert lag.waiting_ns(now_ns + SLOT_NS) == 300 * MS
+    assert lag.waiting_ns(now_ns + SLOT_NS + 1) == 0

@@ -24,12 +24,24 @@ def served(senders: Newcomers, most: int, now_ns: int) -> list[int]:
     return [number for number in range(most) if senders.admits(source(number), now_ns)]
 
 
-def window(senders: Newcomers, number: int, share: float, is_late: bool = False) -> None:
-    """Note a window of time of which frames took a share."""
+def window(
+    senders: Newcomers, number: int, share: float, is_late: bool = False, used: float = 1.0
+) -> None:
+    """Note a window of time of which frames took a share, and the thread used a share."""
     senders.worked_s += share * WINDOW_NS * 1e-9
     if is_late:
         senders.late()
-    senders.adapt(number * WINDOW_NS)
+    senders.adapt(number * WINDOW_NS, used * number * WINDOW_NS * 1e-9)
+
+
+def test_process_that_is_stopped_drops_no_sender() -> None:
+    """Frames took nearly all of the time by the clock, but little of the processor."""
+    for used, all_served in ((0.3, True), (1.0, False)):
+        senders = Newcomers()
+        served(senders, 20, 0)
+        for number in range(1, 9):
+            window(senders, number, 0.9, is_late=True, used=used)
+        assert (len(served(senders, 20, 9 * WINDOW_NS)) == 20) is all_served
 
 
 def test_new_senders_are_limited_and_known_ones_are_not() -> None:
@@ -80,11 +92,11 @@ def test_newest_senders_are_dropped_while_frames_are_late() -> None:
     window(senders, 2, 0.9)  # busy, but in time
     assert len(served(senders, 100, 0)) == 100
     window(senders, 3, 0.9, is_late=True)
-    assert served(senders, 100, 0) == list(range(66))
+    assert served(senders, 100, 0) == list(range(55))
     window(senders, 4, 0.9, is_late=True)
-    assert served(senders, 100, 0) == list(range(44))
-    window(senders, 5, 0.5)
-    assert served(senders, 100, 0) == list(range(44))
+    assert served(senders, 100, 0) == list(range(30))
+    window(senders, 5, 0.4)
+    assert served(senders, 100, 0) == list(range(30))
     for number in range(6, 20):
         window(senders, number, 0.1)
     assert len(served(senders, 100, 0)) == 100
@@ -99,7 +111,7 @@ def test_strangers_are_dropped_before_any_sender_while_frames_are_late() -> None
     assert not senders.admits(source(0), now_ns, is_stranger=True)
     assert len(served(senders, 100, now_ns)) == 100
     window(senders, 3, 0.9, is_late=True)  # the rest is too much too
-    assert served(senders, 100, now_ns) == list(range(66))
+    assert served(senders, 100, now_ns) == list(range(55))
     assert not senders.admits(source(0), now_ns + STRANGERS_WAIT_NS, is_stranger=True)
     assert senders.admits(source(0), now_ns + STRANGERS_WAIT_NS + WINDOW_NS, is_stranger=True)
 

@@ -1,5 +1,6 @@
 """Short status of the running service, for a terminal's status line and for JSON lines."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated, Final
@@ -90,7 +91,14 @@ def _verdict(pipeline: Pipeline, found: Verdict | None, machine: Blame | None) -
 def _worst_first(verdicts: list[Verdict]) -> list[Verdict]:
     ranks = {Level.NONE: 0, Level.WEAK: 1}
     poor = [verdict for verdict in verdicts if verdict.level in ranks]
-    return sorted(poor, key=lambda verdict: ranks[verdict.level])
+    return sorted(poor, key=lambda verdict: (ranks[verdict.level], _spare_db(verdict)))
+
+
+def _spare_db(verdict: Verdict) -> float:
+    """Return the guaranteed gain less the needed one; -inf without one."""
+    if verdict.guaranteed_gain_db is None or verdict.needed_gain_db is None:
+        return -math.inf
+    return verdict.guaranteed_gain_db - verdict.needed_gain_db
 
 
 def _worst(verdict: Verdict) -> str:

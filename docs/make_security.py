@@ -133,7 +133,7 @@ WAYS: Final = (
     WayIn(
         name="answers from the event loop",
         covers=(
-            "route:/healthz", "route:/readyz", "route:/v1/status", "route:/v1/events",
+            "route:/healthz", "route:/register_service", "route:/readyz", "route:/v1/status", "route:/v1/events",
             "route:/v1/fleet", "route:/v1/labels", "route:/v1/map", "route:/v1/settings",
             "route:/v1/links", "route:/v1/uavs/{uav}",
         ),

@@ -5,7 +5,7 @@ sent.
 """
 
 import asyncio
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Final
 
@@ -18,11 +18,22 @@ from companion.mavlink.trust.known_peers import KnownPeers
 from companion.mavlink.trust.newcomers import Newcomers
 from companion.mavlink.voice.component import ACCEPTED_IDS, ComponentSpec, ServiceComponent
 from companion.mavlink.voice.rate_watch import MessageRate
+from companion.mavlink.voice.verdict_reports import VerdictReports
 from companion.mavlink.wire.encode import Outgoing
 from companion.settings.center import VehicleCenter, parse_center
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
-from companion.values import Event, Frame, Notice, Reason, Rejection, Severity, Source, UserError
+from companion.values import (
+    Event,
+    Frame,
+    Notice,
+    Reason,
+    Rejection,
+    Severity,
+    Source,
+    UserError,
+    Verdict,
+)
 
 SETUP_SIGNING: Final = 256  # message that carries a signing key in plain; it is never recorded
 NOTICE_EVERY_NS: Final = 60_000_000_000  # least time between two notices of too many senders
@@ -53,6 +64,11 @@ class Gateway:
         self._notify = notify
         self._now_ns = now_ns
         self._component = component(settings)
+        self._verdict_reports = (
+            VerdictReports(self._component.source)
+            if self._component and settings.presence.verdicts
+            else None
+        )
         self._hear = ACCEPTED_IDS if self._component else frozenset()
         self._timestamps: Timestamps | None = None
         signed = set(settings.signing.keys) - set(settings.signing.allow_unsigned)
@@ -200,13 +216,19 @@ class Gateway:
         """Whether this service sends messages of its own."""
         return self._component is not None
 
-    def speak(self, fit: bool, uavs: Iterable[Source]) -> None:
+    def speak(self, fit: bool, uavs: Iterable[Source], verdicts: Mapping[str, Verdict]) -> None:
         """Send the messages that are due. Call it about ten times a second.
 
-        ``fit``: the service is ready. ``uavs``: the UAVs whose positions matter.
+        fit       whether the service is ready
+        uavs      UAVs whose positions matter
+        verdicts  current verdicts on links, by UAV
         """
         if self._component is None:
             return
+        if self._verdict_reports is not None:
+            for message in self._verdict_reports.due(self._now_ns(), verdicts):
+                for link in self.links:
+                    link.send(message)
         for message, target in self._component.due(self._now_ns(), fit, uavs):
             if target is None:
                 for link in self.links:

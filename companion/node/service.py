@@ -313,7 +313,9 @@ class Service:
             if self._recorder:
                 self._notify_recorder_state(self._recorder)
             if self._traffic.has_component:
-                self._traffic.speak(not self.unfit(), self.pipeline.reporters())
+                self._traffic.speak(
+                    not self.unfit(), self.pipeline.reporters(), self.pipeline.health.verdicts
+                )
             self._notify_overload()
             self.series.add(self.pipeline)
             self._ticked.set()  # wakes all current waiters;

@@ -20,7 +20,7 @@ from companion.values import Notice, Severity, UserError
 from companion.values.budget import Budget
 from companion.views.state import Node
 
-OPEN_PATHS: Final = frozenset({"/healthz", "/docs", "/openapi.json"})
+OPEN_PATHS: Final = frozenset({"/healthz", "/register_service", "/docs", "/openapi.json"})
 """Paths that need no token, in addition to the page's own files; they contain no secrets."""
 SUBPROTOCOL: Final = "companion.v1"
 """Subprotocol that is selected for a WebSocket client that offers any."""

@@ -119,6 +119,14 @@ def _health_routes(
         return answer({"status": "ok"})
 
     @app.get(
+        "/register_service",
+        summary="Description of this service for BlueOS, which shows its page in a menu",
+        responses=answers(models.Registration),
+    )
+    async def register_service() -> Response:
+        return answer(as_json(models.REGISTRATION, node.pipeline.utc_ns))
+
+    @app.get(
         "/readyz",
         summary="Whether the service is ready, or why not (503)",
         responses=answers(models.Readiness)

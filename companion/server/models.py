@@ -8,10 +8,11 @@ import functools
 import types
 import typing
 from dataclasses import dataclass
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, create_model
 
+import companion
 from companion.values import UtcNs
 from companion.values.described import (
     DescribedEnum,
@@ -39,6 +40,33 @@ class Health:
     """Liveness of the process."""
 
     status: Annotated[Literal["ok"], Meaning("ok: the process answers")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Registration:
+    """Description of a web service for BlueOS, which looks for it on every port of its computer.
+
+    Source: BlueOS, development of extensions (https://blueos.cloud/docs/stable/development/extensions).
+    """
+
+    name: Annotated[str, Meaning("name in BlueOS's menu")]
+    description: Annotated[str, Meaning("what the service does, in one line")]
+    icon: Annotated[str, Meaning("name of an icon of Material Design Icons")]
+    company: Annotated[str, Meaning("who publishes it")]
+    version: Annotated[str, Meaning("version of the program")]
+    webpage: Annotated[str, Meaning("path of the documentation")]
+    api: Annotated[str, Meaning("path of the OpenAPI document")]
+
+
+REGISTRATION: Final = Registration(
+    name="Companion",
+    description="Beams of an antenna array towards UAVs, with guaranteed pointing bounds",
+    icon="mdi-radio-tower",
+    company="companion",
+    version=companion.__version__,
+    webpage="/docs",
+    api="/openapi.json",
+)
 
 
 @dataclass(frozen=True, slots=True)

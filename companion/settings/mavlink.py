@@ -42,6 +42,8 @@ class PresenceSettings(Section):
         component_id  its component id
         position_hz   rate requested of UAVs whose GLOBAL_POSITION_INT is slower; None: no request
         attitude_hz   rate of ATTITUDE requested of the carrier; None: no request
+        verdicts      whether verdicts on links are sent to ground stations: a STATUSTEXT at each
+                      change, and each second NAMED_VALUE_FLOAT with the spare gain of each link
 
     If enabled, the service acts as an onboard computer: it sends a heartbeat while it can compute
     beams, and TIMESYNC requests.
@@ -52,6 +54,7 @@ class PresenceSettings(Section):
     component_id: Annotated[int, Field(ge=25, le=250)] = 191
     position_hz: Annotated[float, Field(ge=0.1, le=100)] | None = None
     attitude_hz: Annotated[float, Field(ge=0.1, le=100)] | None = None
+    verdicts: bool = False
 
 
 class SigningSettings(Section):

@@ -4,13 +4,15 @@ import json
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
 from mav_vehicle import Vehicle
-from support import BIN, HANG_S, end, read_metadata
+from pymavlink import mavutil
+from support import BIN, HANG_S, ROOT, end, read_metadata
 
 Router = Callable[..., None]
 
@@ -131,3 +133,48 @@ def test_mavproxy_routes_requests_and_answers(
         assert seen["clock"]["uncertainty_s"] < 0.5
         beat = uav.wait_for(lambda m: m.get_type() == "HEARTBEAT" and m.get_srcSystem() == 200)
         assert beat.get_srcComponent() == 191
+
+
+def test_verdicts_reach_mavproxy_and_a_ground_station(
+    start_node: Any, fly: Any, tmp_path: Path
+) -> None:
+    """By the module of the examples, which asks the service; and as STATUSTEXT over MAVLink."""
+    master, station = free_port(socket.SOCK_DGRAM), free_port(socket.SOCK_STREAM)
+    (tmp_path / "settings.toml").write_text(
+        "[presence]\nenabled = true\nverdicts = true\n[link]\nneeded_db = 60.0\n"
+    )
+    node = start_node(
+        "run", "--link", "udpin:127.0.0.1:0", "--link", f"tcpin:127.0.0.1:{station}",
+        "--center", "5:1", "--listen", "127.0.0.1:0", "--config", str(tmp_path / "settings.toml"),
+    )  # fmt: skip
+    shown = tmp_path / "mavproxy.txt"
+    command = [
+        sys.executable, str(BIN / "mavproxy.py"), f"--master=udpin:127.0.0.1:{master}",
+        f"--out=udpout:127.0.0.1:{node.udp_port}", "--streamrate=-1", "--non-interactive",
+        "--daemon", f"--state-basedir={tmp_path}", "--default-modules=output,link",
+        f"--cmd=module load mavproxy_companion; companion {node.url}",
+    ]  # fmt: skip
+    path = f"{ROOT / 'examples' / 'mavproxy'}:{ROOT}"
+    environment = {"HOME": str(tmp_path), "PATH": str(BIN), "MAVLINK20": "1", "PYTHONPATH": path}
+    with shown.open("wb") as log:
+        process = subprocess.Popen(
+            command, stdin=subprocess.DEVNULL, stdout=log, stderr=log, env=environment
+        )
+    pilot = mavutil.mavlink_connection(f"tcp:127.0.0.1:{station}", source_system=255)
+    try:
+        fly("hover", f"udpout:127.0.0.1:{master}", 60.0)
+        texts = list[str]()
+        while not (texts and "Link" in texts[-1]):
+            texts.append(pilot.recv_match(type="STATUSTEXT", blocking=True, timeout=HANG_S).text)
+        assert texts[-1].startswith("Link ") and " none: " in texts[-1]
+        values = pilot.recv_match(type="NAMED_VALUE_FLOAT", blocking=True, timeout=HANG_S)
+        assert (values.name, values.value) == ("linksgood", 0.0)
+        node.wait_until("/v1/status", lambda answer: answer["health"]["none"] == 4, 40.0)
+        end_s = time.monotonic() + HANG_S
+        while not all(f"companion: {n}:1 none: " in shown.read_text() for n in range(1, 5)):
+            assert process.poll() is None and time.monotonic() < end_s, shown.read_text()[-2000:]
+            time.sleep(0.1)  # the console is a file: nothing tells when it grows
+        assert "Traceback" not in shown.read_text()
+    finally:
+        pilot.close()
+        end(process)

@@ -119,7 +119,7 @@ def test_request_goes_over_the_link_last_received_on() -> None:
                     found.append(int.from_bytes(raw[7:10], "little"))
                 return found
 
-            gateway.speak(True, [Source(1, 1)])
+            gateway.speak(True, [Source(1, 1)], {})
             first.send(frame(1000))
             await until_true(lambda: len(stepped) == 1)
             for _ in range(9):
@@ -127,7 +127,7 @@ def test_request_goes_over_the_link_last_received_on() -> None:
                 heard = len(stepped)
                 second.send(beat())
                 await until_true(lambda heard=heard: len(stepped) > heard)
-                gateway.speak(True, [Source(1, 1)])
+                gateway.speak(True, [Source(1, 1)], {})
             assert COMMAND_LONG in await told(second, 9)
             assert COMMAND_LONG not in await told(first, 9)
         serving.cancel()

@@ -119,10 +119,13 @@ class ComponentSpec:
 
 
 class ServiceComponent:
-    """The service as a MAVLink component. Times are node times and do not decrease."""
+    """The service as a MAVLink component. Times are node times and do not decrease.
+
+    ``source`` is its system and component id.
+    """
 
     def __init__(self, settings: ComponentSpec) -> None:
-        self._source = settings.source
+        self.source = settings.source
         self._rates = MessageRates(
             source=settings.source,
             carrier=settings.carrier,
@@ -146,7 +149,7 @@ class ServiceComponent:
         Returns the round trips, rejections and notices since the last call.
         """
         outputs: list[RoundTrip | Rejection | Notice] = []
-        if frame.source == self._source:
+        if frame.source == self.source:
             self._own_id_received(frame, outputs)
         elif frame.msgid in POSE:
             is_stamped = frame.msgid in stamps.STAMPED
@@ -183,13 +186,13 @@ class ServiceComponent:
         out: list[tuple[Outgoing, Source | None]] = []
         if fit and now_ns >= self._heartbeat_ns:
             self._heartbeat_ns = now_ns + HEARTBEAT_NS
-            out.append((heartbeat(self._source), None))
+            out.append((heartbeat(self.source), None))
         if now_ns >= self._timesync_ns:
             self._timesyncs += 1
             self._timesync_ns = now_ns + TIMESYNC_NS[self._timesyncs >= TIMESYNC_FIRST]
-            sent_ns = now_ns - (now_ns - self._source.sysid) % 1000
+            sent_ns = now_ns - (now_ns - self.source.sysid) % 1000
             self._answered[sent_ns] = {}
-            out.append((timesync(self._source, sent_ns), None))
+            out.append((timesync(self.source, sent_ns), None))
         out += self._rates.due(now_ns, uavs)
         for message, _ in out:
             self._sent[_content(message.msgid, message.payload)] = now_ns
@@ -216,10 +219,10 @@ class ServiceComponent:
             return
         if self._conflict_ns is None or frame.t_ns - self._conflict_ns >= CONFLICT_NOTICE_NS:
             self._conflict_ns = frame.t_ns
-            text = f"{frame.link}: another sender uses {self._source}, this service's id"
+            text = f"{frame.link}: another sender uses {self.source}, this service's id"
             outputs.append(
                 Notice(
-                    t_ns=frame.t_ns, severity=Severity.WARNING, subject=str(self._source), text=text
+                    t_ns=frame.t_ns, severity=Severity.WARNING, subject=str(self.source), text=text
                 )
             )
 
@@ -299,9 +302,9 @@ class ServiceComponent:
 
     def _is_addressed_to_us(self, sysid: int, compid: int) -> bool:
         """Return whether an answer may be for this service: addressed to it, or broadcast."""
-        return sysid in (_BROADCAST, self._source.sysid) and compid in (
+        return sysid in (_BROADCAST, self.source.sysid) and compid in (
             _BROADCAST,
-            self._source.compid,
+            self.source.compid,
         )
 
 

@@ -22,6 +22,8 @@ GLOBAL_POSITION_INT: Final = 33
 REQUEST_DATA_STREAM: Final = 66
 COMMAND_LONG: Final = 76
 TIMESYNC: Final = 111
+NAMED_VALUE_FLOAT: Final = 251
+STATUSTEXT: Final = 253
 UTM_GLOBAL_POSITION: Final = 340
 
 MAV_CMD_SET_MESSAGE_INTERVAL: Final = 511
@@ -64,6 +66,21 @@ def heartbeat(source: Source) -> Outgoing:
         "<IBBBBB", 0, _ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, _ACTIVE, _MAVLINK_VERSION
     )
     return Outgoing(source, HEARTBEAT, payload)
+
+
+def statustext(source: Source, severity: int, text: str) -> Outgoing:
+    """Encode STATUSTEXT without its extensions; ``severity`` is a MAV_SEVERITY.
+
+    The text is cut to 50 characters; those outside ASCII become question marks.
+    """
+    payload = struct.pack("<B50s", severity, text.encode("ascii", "replace"))
+    return Outgoing(source, STATUSTEXT, payload)
+
+
+def named_value_float(source: Source, boot_ms: int, name: str, value: float) -> Outgoing:
+    """Encode NAMED_VALUE_FLOAT; the name is cut to 10 ASCII characters."""
+    payload = struct.pack("<If10s", boot_ms, value, name.encode("ascii", "replace"))
+    return Outgoing(source, NAMED_VALUE_FLOAT, payload)
 
 
 def global_position_int(

@@ -11,7 +11,7 @@ from typing import Any, Final, NoReturn
 
 import click
 
-from companion.cli.interrupts import interrupts_raised
+from companion.cli.interrupts import INTERRUPTED, interrupts_raised
 from companion.values import UserError, printable
 
 LOG_EVERY_S: Final = 10.0  # time between two progress lines without a terminal
@@ -92,7 +92,7 @@ def make_folder(out: Path) -> None:
 
 
 class InterruptedByUser(Exception):  # noqa: N818 - not an error
-    """Ctrl-C during a command; its text is the user's next step."""
+    """Ctrl-C or SIGTERM during a command; its text is the user's next step."""
 
 
 class OneLineErrors(click.Group):
@@ -128,7 +128,7 @@ class OneLineErrors(click.Group):
         except click.ClickException as error:
             self._end(error.format_message(), error.exit_code)
         except (InterruptedByUser, click.Abort) as error:
-            self._end(str(error) or "interrupted", 130)
+            self._end(str(error) or "interrupted", INTERRUPTED)
         except UserError as error:
             self._end(str(error), 1)
         except OSError as error:

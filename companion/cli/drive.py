@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from companion.cli.console import CONFIG, SECONDS
+from companion.cli.console import CONFIG, SECONDS, InterruptedByUser
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -117,9 +117,11 @@ def drive(
         if as_json:
             click.echo(json.dumps(asdict(final_status)))
 
-    running.run_until_stopped(driven, show, seconds)
+    interrupted = running.run_until_stopped(driven, show, seconds)
     final_status = driven.status()
     click.echo(_text(final_status), err=as_json)
+    if not final_status.applied and interrupted:
+        raise InterruptedByUser("interrupted; nothing was applied")
     if not final_status.applied:
         raise UserError("nothing was applied: no beams, or the device rejected them all")
 

@@ -1,59 +1,100 @@
-"""Handling of Ctrl-C: while a command loads, while it runs, and after it has ended."""
+"""Handling of Ctrl-C and SIGTERM: while a command loads, while it runs, and after it has ended.
 
+Both end a command with one line and the exit status ``INTERRUPTED``. A service that runs handles
+them itself (``companion.node.serving``), and ends with the status 0.
+"""
+
+import atexit
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import Final
 
-IMPORT_TIMEOUT_S = 0.02  # delay before an interrupt that met an import is tried again
+INTERRUPTED: Final = 130  # exit status
+SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
+RETRY_S: Final = 0.02  # delay before an interrupt that could not be raised is tried again
 
 
 @contextmanager
 def interrupts_end(name: str) -> Iterator[None]:
-    """Context in which Ctrl-C ends the process at once, with one line under this program name.
+    """Context in which an interrupt ends the process at once, with one line under this name.
 
     An exception raised by the signal could surface inside a package's import, which may turn it
-    into another error. Nothing is open yet, so the process can simply end. After the context,
-    Ctrl-C has its default action: it ends the interpreter silently.
+    into another error. Nothing is open yet, so the process can simply end. Signals that the script
+    has blocked since its start (``scripts/companion``) are delivered now. After the context the
+    same applies, until the interpreter is being torn down: then the command has ended, and an
+    interrupt changes nothing.
     """
 
     def end(_number: int, _frame: object) -> None:
         os.write(2, f"{name}: interrupted\n".encode())
-        os._exit(130)
+        os._exit(INTERRUPTED)
 
-    signal.signal(signal.SIGINT, end)
+    for number in SIGNALS:
+        signal.signal(number, end)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    atexit.register(_ignore)
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, signal.SIG_DFL)
+        for number in SIGNALS:
+            signal.signal(number, end)
+
+
+def _ignore() -> None:
+    for number in SIGNALS:
+        signal.signal(number, signal.SIG_IGN)
 
 
 @contextmanager
 def interrupts_raised() -> Iterator[None]:
-    """Context in which Ctrl-C raises ``KeyboardInterrupt``, delayed until running imports end.
+    """Context in which an interrupt raises ``KeyboardInterrupt``, once running imports have ended.
 
     Commands import modules while they run. A package may turn an exception raised during its import
-    into another error, or suppress it.
+    into another error, or suppress it; so does the interpreter in a finalizer. A second interrupt
+    has the effect that it had outside the context.
     """
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may set signal handlers
         return
-    before = signal.signal(signal.SIGINT, _interrupt)
+    raised = False
+
+    def interrupt(number: int, at: FrameType | None) -> None:
+        nonlocal raised
+        if _imports(at):
+            retry()
+            return
+        if raised and not isinstance(outside, int | None):
+            outside(number, at)
+        raised = True
+        raise KeyboardInterrupt
+
+    def retry() -> None:
+        nonlocal raised
+        raised = False
+        signal.signal(signal.SIGALRM, interrupt)
+        signal.setitimer(signal.ITIMER_REAL, RETRY_S)
+
+    def lost(error: "sys.UnraisableHookArgs") -> None:
+        if error.exc_type is KeyboardInterrupt:
+            retry()
+        else:
+            unraisable(error)
+
+    unraisable, sys.unraisablehook = sys.unraisablehook, lost
+    before = {number: signal.signal(number, interrupt) for number in SIGNALS}
+    outside = before[signal.SIGINT]
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
+        for number, handler in before.items():
+            signal.signal(number, handler)
         signal.setitimer(signal.ITIMER_REAL, 0.0)  # the command ended before the retry
-
-
-def _interrupt(_number: int, at: FrameType | None) -> None:
-    if _imports(at):
-        signal.signal(signal.SIGALRM, _interrupt)
-        signal.setitimer(signal.ITIMER_REAL, IMPORT_TIMEOUT_S)
-        return
-    raise KeyboardInterrupt
+        sys.unraisablehook = unraisable
 
 
 def _imports(at: FrameType | None) -> bool:

@@ -48,6 +48,7 @@ def check(
     """Yield findings, static ones first; then listen for ``seconds`` over the usable links.
 
     ``show`` is called with the current activity. Sends what ``[presence]`` allows, like a run.
+    Raises ``KeyboardInterrupt`` if a signal ends the listening.
     """
     faulty = set[str]()
     for finding in machine.look(settings, token=token, insecure=insecure):
@@ -116,7 +117,8 @@ def _listening_settings(settings: Settings, urls: list[str]) -> Settings:
 def _listen(settings: Settings, seconds: float) -> Service:
     with bind("127.0.0.1:0", token=None, insecure=False) as http:
         service = Service(settings=settings, say=lambda _: None)
-        run_until_stopped(lambda until: service.run(http, None, until), seconds)
+        if run_until_stopped(lambda until: service.run(http, None, until), seconds):
+            raise KeyboardInterrupt  # too short to be assessed
     return service
 
 

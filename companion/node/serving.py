@@ -132,26 +132,33 @@ async def in_daemon_thread(work: Callable[[], T]) -> T:
 
 def run_until_stopped(
     main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None = None
-) -> None:
-    """Run ``main`` on a new event loop.
+) -> bool:
+    """Run ``main`` on a new event loop; return whether a signal stopped it.
 
     ``main`` gets an event that is set by SIGINT, SIGTERM, or after ``seconds``; it must then
     finish.
     """
     _configure_interpreter()
     with asyncio.Runner(loop_factory=_loop_factory()) as runner:
-        runner.run(_stopped_by_signal(main, seconds))
+        return runner.run(_stopped_by_signal(main, seconds))
 
 
 async def _stopped_by_signal(
     main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None
-) -> None:
+) -> bool:
     loop, until = asyncio.get_running_loop(), asyncio.Event()
+    received: list[int] = []
+
+    def stop(number: int) -> None:
+        received.append(number)
+        until.set()
+
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, until.set)
+        loop.add_signal_handler(number, stop, number)
     if seconds is not None:
         loop.call_later(seconds, until.set)
     await main(until)
+    return bool(received)
 
 
 def _configure_interpreter() -> None:

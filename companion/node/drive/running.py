@@ -15,14 +15,20 @@ ENDS_S: Final = 5.0  # time limit for a device to reach its safe state at the en
 
 def run_until_stopped(
     drive: Drive, show: Callable[[DriveStatus], None], seconds: float | None
-) -> None:
+) -> bool:
     """Drive a device until SIGINT, SIGTERM or ``seconds`` have passed.
 
-    ``show`` is called once a second. Raises the exception that ended the drive.
+    ``show`` is called once a second. Return whether a signal stopped it. Raises the exception that
+    ended the drive.
     """
-    stop = threading.Event()
-    for number in (signal.SIGINT, signal.SIGTERM):
-        signal.signal(number, lambda *_: stop.set())
+    stop, received = threading.Event(), list[int]()
+
+    def interrupt(number: int, _frame: object) -> None:
+        received.append(number)
+        stop.set()
+
+    for known in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(known, interrupt)
     failed: list[BaseException] = []
     thread = threading.Thread(target=_run, args=(drive, stop, failed), name="drive", daemon=True)
     thread.start()
@@ -41,6 +47,7 @@ def run_until_stopped(
     thread.join(ENDS_S)
     if failed:
         raise failed[0]
+    return bool(received)
 
 
 async def run_in_thread(drive: Drive) -> None:

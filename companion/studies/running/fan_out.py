@@ -25,6 +25,7 @@ Asked = TypeVar("Asked")
 Answer = TypeVar("Answer")
 Progress = Callable[[int], None]  # called with the number of finished pieces
 
+ENDS: Final = (signal.SIGINT, signal.SIGTERM)
 CLUSTER_ANSWERS_S: Final = 10
 ADDRESS: Final = re.compile(r"(tcp|tls)://([\w.-]+|\[[0-9a-fA-F:.]+\]):\d{1,5}")
 BLAS_THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -45,9 +46,14 @@ def on_cores(
         _one_blas_thread(),
         ProcessPoolExecutor(count, mp_context=context, initializer=_left_to_parent) as pool,
     ):
-        futures = [pool.submit(work, each) for each in asked]
         try:
+            with _interrupts_held():  # each call may start a process
+                futures = [pool.submit(work, each) for each in asked]
             return _gathered(futures, told)
+        except KeyboardInterrupt:
+            for child in multiprocessing.active_children():
+                child.terminate()  # its result is of no use
+            raise
         except BaseException:
             # Wait here: the second call, by ``with``, would revoke the cancellation.
             pool.shutdown(cancel_futures=True)
@@ -68,6 +74,21 @@ def _gathered(futures: "Sequence[Future[Answer]]", told: Progress) -> list[Answe
 def _left_to_parent() -> None:
     """Ignore Ctrl-C in a worker: a terminal sends it to every process, the parent handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDS)
+
+
+@contextmanager
+def _interrupts_held() -> Iterator[None]:
+    """Context in which Ctrl-C and SIGTERM wait, also in processes started in it.
+
+    A worker that receives one while its interpreter starts, or whose parent is interrupted while it
+    starts the worker, would print a traceback. The alarm is a postponed interrupt.
+    """
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, [*ENDS, signal.SIGALRM])
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

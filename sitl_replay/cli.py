@@ -17,8 +17,9 @@ from typing import Any
 import click
 
 from companion import __version__
-from companion.cli.console import OneLineErrors
+from companion.cli.console import OneLineErrors, print_truncated
 from companion.mavlink.links.urls import MAVLINK, LinkUrl, parse_link
+from companion.node.signals import interrupts_held, release_interrupts
 from companion.values import Event, Frame, Reason, Rejection, UserError
 from sitl_replay.faults.asked import Fault, described, in_order
 from sitl_replay.faults.traffic import HELD_MAX, OVERFLOW
@@ -219,6 +220,7 @@ def play(
     tally = player.Tally()
     urls = [str(url) for url in links]
     frames = frames_of(logs, tally)
+    print_truncated(logs)
     run(player.play(frames, urls, speed, faults=faults, seed=seed, tally=tally), tally)
     if tally.clamped:
         click.echo(
@@ -308,7 +310,8 @@ def _frames_among(events: Iterable[Event], tally: player.Tally) -> Iterator[Fram
 
 def run(work: Coroutine[Any, Any, object], count: player.Tally | recorder.RecordingTally) -> None:
     """Run a command until its end, SIGINT or SIGTERM. An error prints a line and exits non-zero."""
-    asyncio.run(_until_signal(work, count))
+    with interrupts_held():  # until the loop has handlers
+        asyncio.run(_until_signal(work, count))
 
 
 async def _until_signal(
@@ -318,6 +321,7 @@ async def _until_signal(
     task = asyncio.ensure_future(work)
     for known in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(known, task.cancel)
+    release_interrupts()
     progress = asyncio.ensure_future(_progress(count)) if sys.stderr.isatty() else None
     try:
         # Only the handlers above cancel the task: a requested end.

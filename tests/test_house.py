@@ -202,11 +202,11 @@ def foreign_imports(path: str, text: str) -> list[str]:
 
 
 def strangers(path: str, text: str) -> list[str]:
-    """``sitl_replay`` imports only the values, the wire, geodesy, the reader and the console."""
+    """``sitl_replay`` imports only values, wire, geodesy, reader, console and signals."""
     if not path.startswith("sitl_replay/"):
         return []
     allowed = re.compile(
-        r"companion\.(values|mavlink|tracking\.geodesy|recording\.reader|cli\.(console|interrupts)|__version__)(\.|$)"
+        r"companion\.(values|mavlink|tracking\.geodesy|recording\.reader|node\.signals|cli\.(console|interrupts)|__version__)(\.|$)"
     )
     return [
         f"{path}:{line}: imports {name}"

@@ -1,5 +1,6 @@
 """Options that the commands share, one-line errors on stderr, and progress on a terminal."""
 
+import errno
 import shutil
 import sys
 import time
@@ -60,13 +61,22 @@ def say(text: str, err: bool = False) -> None:
     click.echo(printable(text), err=err)
 
 
-def print_vehicles(logs: Sequence[Path]) -> None:
-    """Print on stderr, for each onboard log among ``logs``, its vehicle and the accuracy of its
-    time."""
+def print_log_notices(logs: Sequence[Path]) -> None:
+    """Print on stderr the vehicle of each onboard log, with the accuracy of its time, and each log
+    that is truncated."""
     from companion.recording.reader import vehicles
 
+    print_truncated(logs)
     for one in vehicles(logs):
         say(one.notice(), err=True)
+
+
+def print_truncated(logs: Sequence[Path]) -> None:
+    """Print on stderr each log that ends early."""
+    from companion.recording.truncated import truncated
+
+    for log in truncated(logs):
+        say(log.notice(), err=True)
 
 
 JSON_LINES = click.option(
@@ -80,8 +90,9 @@ def make_folder(out: Path) -> None:
 
     Folders that were created and are still empty when the command ends are removed.
     """
-    made = [each for each in (out, *out.parents) if not each.exists()]
-    out.mkdir(parents=True, exist_ok=True)
+    from companion.recording import folders
+
+    made = folders.make_folder(out, "--out")
 
     def single_line() -> None:
         for each in made:
@@ -133,6 +144,8 @@ class OneLineErrors(click.Group):
             self._end(str(error), 1)
         except OSError as error:
             where = f"{error.filename}: " if error.filename else ""
+            if error.errno == errno.ENOSPC and not where:
+                where = "the output cannot be written: "
             self._end(f"{where}{error.strerror or error}", 1)
 
     def invoke(self, ctx: click.Context) -> Any:

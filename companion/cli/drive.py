@@ -123,7 +123,11 @@ def drive(
     if not final_status.applied and interrupted:
         raise InterruptedByUser("interrupted; nothing was applied")
     if not final_status.applied:
-        raise UserError("nothing was applied: no beams, or the device rejected them all")
+        faults = {"device": driven.device_error, "service": driven.service_error}
+        known = "; ".join(f"{what}: {why}" for what, why in faults.items() if why)
+        raise UserError(
+            f"nothing was applied: {known or 'no beams, or the device rejected them all'}"
+        )
 
 
 def _text(final_status: "DriveStatus") -> str:

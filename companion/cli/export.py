@@ -16,7 +16,7 @@ from companion.cli.console import (
     InterruptedByUser,
     Progress,
     log_progress,
-    print_vehicles,
+    print_log_notices,
     say,
 )
 from companion.cli.export_beams import beams
@@ -87,7 +87,7 @@ def export(
     progress.clear()
     if settings.center.source is None:
         click.echo("no --center: array placed at the position of the first report", err=True)
-    print_vehicles(logs)
+    print_log_notices(logs)
     show = log_progress(progress, replaying.length_s(logs))
     try:
         if form == "rerun":

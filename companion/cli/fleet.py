@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from companion.cli.console import JSON_LINES, SECONDS, Progress, log_progress, say
+from companion.cli.console import JSON_LINES, SECONDS, Progress, log_progress, print_truncated, say
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -135,6 +135,7 @@ def replay(logs: Sequence[Path], as_json: bool) -> None:
     """
     from companion.node.fleet import replaying
 
+    print_truncated(logs)
     progress = Progress()
     found = replaying.replay(logs, log_progress(progress, None))
     progress.clear()

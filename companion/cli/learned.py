@@ -23,12 +23,13 @@ def train(out: Path, seed: int, epochs: int, flights: int, as_json: bool) -> Non
 
     Example: companion study train --out lrnet.pt
     """
+    from companion.recording.folders import make_folder
     from companion.values.extras import needs
 
     progress = Progress()
     with needs("torch", "learned", "this"):
         from companion.studies.prediction import learned
-    out.parent.mkdir(parents=True, exist_ok=True)
+    make_folder(out.parent, "--out")
     held, loss_m = learned.train(seed, epochs, flights, progress.show)
     learned.save(held, out)
     progress.clear()

@@ -32,7 +32,7 @@ from companion.cli.console import (
     OneLineErrors,
     Progress,
     log_progress,
-    print_vehicles,
+    print_log_notices,
     say,
 )
 from companion.cli.design import design
@@ -215,7 +215,7 @@ def replay(
     progress.clear()
     if settings.center.source is None:
         click.echo("no --center: array placed at the position of the first report", err=True)
-    print_vehicles(logs)
+    print_log_notices(logs)
     begun: list[Writer] = []
 
     def record() -> "Writer":

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, LOGS, Progress
+from companion.cli.console import CENTER, CONFIG, LOGS, Progress, print_truncated
 from companion.cli.study_output import Studied, study_output
 
 
@@ -47,6 +47,7 @@ def beams(
     from companion.studies.beams import report
     from companion.studies.beams.flight import BeamStudy, study
 
+    print_truncated(logs)
     flown = tuple(flights(logs))
     settings = tuple(settings_for(each, config, center) for each in flown)
     over = tuple(name for name in links.split(",") if name)

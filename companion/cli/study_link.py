@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, SEED, Progress
+from companion.cli.console import CENTER, CONFIG, SEED, Progress, print_truncated
 from companion.cli.study_output import Studied, study_output
 
 
@@ -88,6 +88,7 @@ def link(
     from companion.studies.link.level import LinkStudy, study
     from companion.studies.link.scenario import Reports
 
+    print_truncated(logs)
     if not logs and center is not None:
         raise click.UsageError("--center needs a LOG: the paper's circles surround the array")
     setting = LinkStudy(

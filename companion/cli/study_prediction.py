@@ -6,7 +6,7 @@ from typing import Any
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, LOGS, SEED, Progress, say
+from companion.cli.console import CENTER, CONFIG, LOGS, SEED, Progress, print_truncated, say
 from companion.cli.design import numbers
 from companion.cli.study_output import Studied, study_output
 
@@ -114,6 +114,7 @@ def prediction(
     setting = PredictionStudy(**asked, radio=radio, settings=load(config), config=name)
     if setting.center is None:
         click.echo("no --center: array placed at the position of the first report", err=True)
+    print_truncated(setting.logs)
     answer, found = study(setting, progress.show)
 
     def at_end() -> None:

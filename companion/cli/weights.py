@@ -7,7 +7,7 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, LATENCY, LOGS, Progress, print_vehicles
+from companion.cli.console import CENTER, CONFIG, LATENCY, LOGS, Progress, print_log_notices
 from companion.values import WeightFormat
 
 
@@ -72,7 +72,7 @@ def weights(
     progress.show(f"reading {', '.join(log.name for log in logs)}")
     settings = settings_for(logs, config, center)
     progress.clear()
-    print_vehicles(logs)
+    print_log_notices(logs)
     equipment = assembly.equipment(settings, assembly.array(settings))
     pipeline, update = moment.look(
         logs,

@@ -6,7 +6,8 @@ from pathlib import Path
 from typing import Any, Final
 
 import companion
-from companion.node.replay import Run, log_events, missing, vehicle_logs
+from companion.node.replay import Run, log_events, log_notes
+from companion.recording.folders import make_folder
 from companion.recording.reader import utc_offset_ns
 from companion.recording.scene import Scene
 from companion.recording.space_file import SpaceFile
@@ -49,7 +50,7 @@ def export(
             if time.monotonic() >= due_s:
                 due_s += SHOW_EVERY_S
                 progress(run.pipeline.frames, run.at_s, run.took_s)
-        summary = run.finish() | {"logs": vehicle_logs(logs), "missing": missing(logs)}
+        summary = run.finish() | log_notes(logs)
         del summary["recording"]
         summary["rows"] = dict(folder.rows)
         said = {"companion": companion.__version__, "from": [log.name for log in logs]}
@@ -71,7 +72,7 @@ def export_space(
     events = log_events(logs, settings, latency_s)
     run = Run(settings, None)
     due_s = time.monotonic()
-    where.mkdir(parents=True, exist_ok=True)
+    make_folder(where, "--out")
     whole = where / SPACE
     made = whole.with_name(SPACE + ACTIVE)
     scene = Scene(run.pipeline.array, settings.recording.scene_hz)
@@ -87,6 +88,6 @@ def export_space(
         made.rename(whole)
     finally:
         made.unlink(missing_ok=True)
-    summary = run.finish() | {"logs": vehicle_logs(logs), "missing": missing(logs)}
+    summary = run.finish() | log_notes(logs)
     del summary["recording"]
     return summary | {"rows": {"clouds": file.clouds}, "files": [str(whole)]}

@@ -11,6 +11,7 @@ from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.recording import ends, parts
+from companion.recording.folders import DIRECTORY_OPTION, make_recording_folder
 from companion.recording.parts import RecordingInfo
 from companion.recording.reader import (
     LogError,
@@ -23,6 +24,7 @@ from companion.recording.reader import (
     vehicles,
 )
 from companion.recording.scene import Scene
+from companion.recording.truncated import truncated
 from companion.recording.writer import Writer
 from companion.settings.files import embedded, layered
 from companion.settings.model import Settings
@@ -69,6 +71,7 @@ def writer_for(logs: Sequence[Path], settings: Settings, out: Path | None) -> Wr
     complete, kept = embedded(settings), settings.recording
     first_ns = next(read_flight(logs)).t_ns
     where = out or Path(kept.directory or "recordings")
+    make_recording_folder(where, DIRECTORY_OPTION if out is None else "--out")
     weights_hz = None if kept.weights_hz == "all" else kept.weights_hz
     scene = Scene(assembly.array(settings), kept.scene_hz)
     versions = {"companion": companion.__version__}
@@ -154,9 +157,8 @@ def replay(
         progress  called occasionally with frames, seconds of log, and seconds since the start
         latency_s time from a sample to its arrival, for onboard logs, which contain no arrivals
 
-    In the summary, ``logs`` are the vehicles whose onboard logs were read, ``missing`` is what the
-    parts lack. Raises ``LogError`` for an unusable log, ``OSError`` if the recording cannot be
-    written.
+    The summary includes ``log_notes``. Raises ``LogError`` for an unusable log, ``OSError`` if the
+    recording cannot be written.
     """
     events = log_events(logs, settings, latency_s)
     writer = record() if record else None
@@ -170,7 +172,7 @@ def replay(
                 writer.flush()
             if progress:
                 progress(run.pipeline.frames, run.at_s, run.took_s)
-    return run.finish() | {"logs": vehicle_logs(logs), "missing": missing(logs)}
+    return run.finish() | log_notes(logs)
 
 
 def length_s(logs: Sequence[Path]) -> float | None:
@@ -191,6 +193,19 @@ def length_s(logs: Sequence[Path]) -> float | None:
 def vehicle_logs(logs: Sequence[Path]) -> list[dict[str, Any]]:
     """Return the vehicles whose onboard logs are among some logs, as JSON. Raises ``LogError``."""
     return [one.as_json() for one in vehicles(logs)]
+
+
+def log_notes(logs: Sequence[Path]) -> dict[str, Any]:
+    """Return what a summary says of its logs: ``logs``, ``missing`` and ``truncated``.
+
+    ``logs`` are the vehicles whose onboard logs were read, ``missing`` is what the parts of a
+    recording lack, ``truncated`` the logs that end early. Raises ``LogError``.
+    """
+    return {
+        "logs": vehicle_logs(logs),
+        "missing": missing(logs),
+        "truncated": [log.as_json() for log in truncated(logs)],
+    }
 
 
 def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0) -> Iterator[Event]:

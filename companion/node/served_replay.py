@@ -25,7 +25,7 @@ from companion.mavlink.links.peers import Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.trust.dedupe import LINKS_MAX
 from companion.mavlink.voice.rate_watch import MessageRate
-from companion.node.replay import FLUSH_EVERY_S, Run, log_events, missing, vehicle_logs
+from companion.node.replay import FLUSH_EVERY_S, Run, log_events, log_notes
 from companion.node.serving import (
     NOTICES_KEPT,
     RateMeter,
@@ -109,7 +109,7 @@ class ServedReplay:
         self.origins = asked.origins
         self.equipment = assembly.equipment(settings, self.pipeline.array)
         self.name = ", ".join(log.name for log in logs)
-        self._missing = {"logs": vehicle_logs(logs), "missing": missing(logs)}
+        self._missing = log_notes(logs)
         self._measured = (islice(log_events(logs, settings, asked.latency_s), 1, None), first.t_ns)
         self._events = chain((first,), events)
         self._now_ns = first.t_ns

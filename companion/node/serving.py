@@ -15,6 +15,7 @@ from typing import Any, Final, TypeVar
 
 import uvicorn
 
+from companion.node.signals import interrupts_held, release_interrupts
 from companion.server.app import create_app
 from companion.server.connections import BoundedProtocol
 from companion.server.request_queue import RequestQueue
@@ -139,7 +140,8 @@ def run_until_stopped(
     finish.
     """
     _configure_interpreter()
-    with asyncio.Runner(loop_factory=_loop_factory()) as runner:
+    # Held until the loop has handlers: an exception would leave the loop half started.
+    with interrupts_held(), asyncio.Runner(loop_factory=_loop_factory()) as runner:
         return runner.run(_stopped_by_signal(main, seconds))
 
 
@@ -155,6 +157,7 @@ async def _stopped_by_signal(
 
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, stop, number)
+    release_interrupts()
     if seconds is not None:
         loop.call_later(seconds, until.set)
     await main(until)

@@ -6,11 +6,13 @@ import socket
 import webbrowser
 from collections.abc import Callable, Coroutine
 from functools import partial
+from pathlib import Path
 from typing import Any, Final, Protocol
 
 from companion.node import systemd
 from companion.node.service import Service, require_center
 from companion.node.serving import address, run_until_stopped
+from companion.recording.folders import DIRECTORY_OPTION, make_recording_folder
 from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
@@ -60,6 +62,8 @@ def run(
     require_center(settings)
     if not settings.links.urls:
         raise UserError("links.urls is empty; give --link udpin:0.0.0.0:14550")
+    if settings.recording.directory is not None:
+        make_recording_folder(Path(settings.recording.directory), DIRECTORY_OPTION)
     manager = systemd.manager(os.environ)
     http = bind(settings.server.listen, token=token, insecure=insecure)
     with http:
@@ -77,10 +81,17 @@ def run(
         run_until_stopped(serve, seconds)
 
 
-async def _keep_shown(service: Service, voice: Console) -> None:
-    while True:
-        await asyncio.sleep(STATUS_EVERY_S)
-        voice.show(service)
+async def _keep_shown(
+    service: Service, voice: Console, until: asyncio.Event, lost: list[OSError]
+) -> None:
+    """Show the status every second. Without its output the service ends in order."""
+    try:
+        while True:
+            await asyncio.sleep(STATUS_EVERY_S)
+            voice.show(service)
+    except OSError as error:  # a full disk, or a pipe whose reader has ended
+        lost.append(error)
+        until.set()
 
 
 async def _serve(
@@ -94,7 +105,8 @@ async def _serve(
     manager: systemd.Manager | None,
     open_page: bool,
 ) -> None:
-    others = [_keep_shown(service, voice)]
+    lost: list[OSError] = []
+    others = [_keep_shown(service, voice, until, lost)]
     others += [traffic(service.links()[0].url)] if traffic else []
     if manager:
         others.append(systemd.keep_informed(manager, service, voice.say, until))
@@ -105,6 +117,8 @@ async def _serve(
     if open_page:
         webbrowser.open(page)
     await service.run(http, token, until, *others)
+    if lost:
+        raise lost[0]
     recording = service.recording()
     if recording.file:
         voice.serves(f"recording {recording.file}: {recording.messages} messages")

@@ -100,6 +100,7 @@ class Walk:
         self.channels: dict[int, Channel] = {}
         self.complete = False  # whether the file has its end, so was closed properly
         self.lost_bytes = 0  # bytes outside of readable records
+        self.incomplete_bytes = 0  # those after the last complete record of a file without end
         self.path = path
         self._topics = topics
         self._described_bytes = 0
@@ -145,6 +146,7 @@ class Walk:
             yield opcode, length
             file.seek(stop)
             at = stop
+        self.incomplete_bytes = size - at
         self.lost_bytes += size - at
 
     def _is_wanted(self, opcode: int) -> bool:

@@ -18,13 +18,13 @@ from typing import Final, Self
 
 from companion.recording import schemas
 from companion.recording.entries import Encoder, Geodetic
+from companion.recording.folders import RECORDING_MODE
 from companion.recording.mcap_file import McapFile
 from companion.recording.parts import HOLE, PART, Hole, Part
 from companion.recording.scene import Scene
 from companion.values import Event, Output
 
 FILE_MODE: Final = 0o640
-FOLDER_MODE: Final = 0o750
 ACTIVE: Final = ".active"
 SETTINGS: Final = "settings.toml"
 NO_FILES: Final[Mapping[str, bytes]] = MappingProxyType({})
@@ -244,7 +244,10 @@ def open_alone(path: Path) -> BufferedWriter:
     """
     file = opened(path, os.O_APPEND)
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise BlockingIOError(error.errno, "in use by another process", str(path)) from None
         file.truncate(0)
         file.seek(0)
     except OSError:
@@ -261,7 +264,7 @@ def opened(path: Path, flags: int) -> BufferedWriter:
 
 def _reserve(folder: Path, started_ns: int) -> Path:
     """Return a name that no finished or open recording has; create its ``.active`` file."""
-    folder.mkdir(FOLDER_MODE, parents=True, exist_ok=True)
+    folder.mkdir(RECORDING_MODE, parents=True, exist_ok=True)
     started = datetime.fromtimestamp(started_ns // 1_000_000_000, tz=UTC)
     name, number = f"companion-{started:%Y%m%dT%H%M%SZ}", 0
     while True:

@@ -1,6 +1,9 @@
 """Binary records read by the C header: built by gcc, compared with numpy."""
 
+import contextlib
+import select
 import shutil
+import socket
 import struct
 import subprocess
 import time
@@ -9,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import HANG_S, ROOT, line_of, started
+from support import HANG_S, ROOT, free_port, line_of, started
 
 from companion.node.ring import LARGEST_RECORD, Ring
 from companion.values import Beam, BeamSet, Method, Normalisation, UserError
@@ -98,6 +101,22 @@ def test_c_reader_reads_a_thousand_records_unchanged(printer: Path) -> None:
             read = np.array(numbers, dtype=np.float32).view(np.complex64)
             np.testing.assert_array_equal(read, one.weights[:, i].astype(np.complex64))
     assert next(lines, None) is None
+
+
+def test_c_reader_prints_datagrams(printer: Path) -> None:
+    rng = np.random.default_rng(5)
+    body = b"".join(records.encode(beam_set(rng, 4, 2), 7, [None, None]))
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+        sender.bind(("127.0.0.1", 0))
+        port = free_port(socket.SOCK_DGRAM)
+        with started([printer, str(port)], stdout=subprocess.PIPE, text=True) as process:
+            sender.connect(("127.0.0.1", port))
+            ends_s = time.monotonic() + HANG_S
+            while not select.select([process.stdout], [], [], 0.02)[0]:
+                assert time.monotonic() < ends_s
+                with contextlib.suppress(ConnectionRefusedError):  # it has not bound the port yet
+                    sender.send(body)
+            assert line_of(process, process.stdout).split()[:2] == ["record", "7"]
 
 
 def test_damaged_record_is_rejected_at_every_byte(printer: Path) -> None:

@@ -19,6 +19,7 @@ from companion.node.drive.loop import (
     require,
 )
 from companion.values import IntArray, UserError
+from companion.values.extras import needs
 
 RX_GAIN: Final = 0x10
 RX_MODULATOR: Final = 0x14
@@ -46,10 +47,8 @@ class Chips:
 
     def open(self) -> None:
         """Open the SPI devices. Raises ``UserError`` without spidev."""
-        try:
+        with needs("spidev", "spi", "adar1000:"):
             import spidev
-        except ImportError as error:
-            raise UserError(f"ADAR1000 over SPI needs spidev: {error}") from error
         try:
             for bus, number in self._places:
                 line = spidev.SpiDev()

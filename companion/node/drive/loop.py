@@ -3,6 +3,8 @@
 It runs on its own thread and requests beams for the time at which the device will have applied
 them. The lead is the recent median time from request to application, or the lag that a mount
 reports.
+
+Over 300 lines: the loop, and the interfaces of what it connects.
 """
 
 import statistics
@@ -150,6 +152,8 @@ class Drive:
         self._open = False
         self._again_ns = 0
         self._resting: str | None = None
+        self.device_error: str | None = None  # why the device does not work
+        self.service_error: str | None = None  # why the service gives no beams
         self._took_ns: deque[int] = deque(maxlen=REMEMBERED)
         self._at_ns: deque[int] = deque(maxlen=REMEMBERED)
         self._applied = self._late = self._skipped = self._failures = 0
@@ -202,7 +206,9 @@ class Drive:
                 self._waits = began_ns, "the service"
                 command = self._source.ask(self.lead_s)
                 self._waits = self._now_ns(), "the device"
+                self.service_error = None
             except SourceLostError as error:
+                self.service_error = str(error)
                 self._rest(f"no answer from the service: {error}")
                 return
             if command.unfit is not None:
@@ -271,6 +277,7 @@ class Drive:
         if not self._open and self._now_ns() >= self._again_ns:
             self._device.open()
             self._open = True
+            self.device_error = None
             self._say("the device is connected")
         return self._open
 
@@ -278,10 +285,23 @@ class Drive:
         if self._open or not self._failures:
             self._say(f"the device failed: {error}")
         self._failures += 1
+        self.device_error = str(error)
+        self._ask_anyway()
         self._resting = None  # its state after a reconnection is unknown
         self._device.close()
         self._open = False
         self._again_ns = self._now_ns() + RETRY_NS
+
+    def _ask_anyway(self) -> None:
+        """Report a service that does not answer either, so that both faults are known at once."""
+        before = self.service_error
+        try:
+            self._source.ask(0.0)
+            self.service_error = None
+        except SourceLostError as error:
+            self.service_error = str(error)
+            if before != self.service_error:
+                self._say(f"no answer from the service: {error}")
 
     def _rest(self, why: str) -> None:
         if self._resting != why:

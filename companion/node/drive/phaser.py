@@ -21,6 +21,7 @@ from companion.node.drive.loop import (
     require,
 )
 from companion.values import IntArray, UserError
+from companion.values.extras import needs
 
 ELEMENTS: Final = 8
 DEGREES: Final = 360 / 128
@@ -46,9 +47,13 @@ class Phaser:
     def open(self) -> None:
         """Connect to the Phaser and switch to receive. Raises ``UserError`` without pyadi-iio."""
         try:
-            from adi import CN0566
-        except (ImportError, AttributeError, OSError) as error:  # OSError: libiio is missing
-            raise UserError(f"a Phaser needs pyadi-iio and libiio: {error}") from error
+            with needs("adi", "phaser", "phaser:"):
+                from adi import CN0566
+        except (ImportError, AttributeError, OSError) as error:  # libiio is missing
+            raise UserError(
+                "phaser: needs the system library libiio (Debian: apt install libiio0):"
+                f" {error or type(error).__name__}"
+            ) from error
         with self._access():
             self._phaser = CN0566(uri=self._uri)
             self._phaser.configure(device_mode="rx")

@@ -66,6 +66,7 @@ def read(data: Bytes) -> Onboard:
         armed=_armed(tables["ARM"]),
         clock=clock,
         lost=lost,
+        incomplete_bytes=walked.rest,
         notes=tuple(notes),
     )
 

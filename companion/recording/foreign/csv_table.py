@@ -15,6 +15,7 @@ import io
 import math
 from array import array
 from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from datetime import datetime
 from functools import partial
 from typing import Any, Final
@@ -75,7 +76,10 @@ def read(text: bytes | Bytes) -> Onboard:
     table = dict(zip([name for _, name in used], rows.T, strict=True))
     lost = {Reason.MALFORMED: bad} if bad else {}
     notes = [f"column not used: {name}" for name in names if name and name not in COLUMNS]
-    return _onboard(table, timed, said, lost, notes)
+    found = _onboard(table, timed, said, lost, notes)
+    rest = bytes(text[-_LINE_MAX:]).splitlines(keepends=True)[-1:]
+    is_cut = bool(rest) and not rest[0].endswith((b"\n", b"\r"))
+    return replace(found, incomplete_bytes=len(rest[0]) if is_cut else 0)
 
 
 class _Reading(io.RawIOBase):

@@ -58,12 +58,14 @@ class DataflashIndex(NamedTuple):
              only every n-th
     lost     bytes outside of messages
     refused  invalid descriptions of messages: inconsistent length, or repeated with a difference
+    rest     bytes of a message in which the file ends
     """
 
     formats: dict[int, Format]
     at: dict[int, IntArray]
     lost: int
     refused: int
+    rest: int
 
 
 class DataflashTable:
@@ -125,13 +127,22 @@ def walk(data: Bytes, wanted: Collection[str]) -> DataflashIndex:
     for number, layout in formats.items():
         lengths[number], asked[number] = layout.length, layout.name in wanted
     found = {n: Thinned(array("q")) for n in formats if asked[n]}
-    covered = 0
+    covered = end = 0
     for at, types in _chains(data, lengths):
         covered += int(lengths[types].sum())
+        if len(at):
+            end = int(at[-1] + lengths[types[-1]])
         for number in np.unique(types[asked[types]]).tolist():
             found[number].extend(at[types == number].tolist())
     places = {number: np.array(each.kept, dtype=np.int64) for number, each in found.items()}
-    return DataflashIndex(formats=formats, at=places, lost=data.size - covered, refused=refused)
+    is_message = bytes(data[end : end + 2]) == MAGIC[: data.size - end]
+    return DataflashIndex(
+        formats=formats,
+        at=places,
+        lost=data.size - covered,
+        refused=refused,
+        rest=data.size - end if is_message else 0,
+    )
 
 
 def table(data: Bytes, walked: DataflashIndex, name: str) -> DataflashTable:

@@ -118,6 +118,7 @@ class Onboard:
     armed: tuple[tuple[int, bool], ...] = ()  # boot times and whether it was armed from then on
     clock: GpsTime | None = None  # its boot clock on GPS time; None if the log has no GPS time
     lost: Mapping[Reason, int] = field(default_factory=dict)  # unusable parts of the file
+    incomplete_bytes: int = 0  # of a record in which the file ends
     notes: tuple[str, ...] = ()  # substitutions for missing data, for the user
 
 

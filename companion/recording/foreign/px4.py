@@ -79,6 +79,7 @@ def read(data: Bytes) -> Onboard:
         armed=_armed(status),
         clock=clock,
         lost=lost,
+        incomplete_bytes=walked.rest,
         notes=tuple(notes),
     )
 

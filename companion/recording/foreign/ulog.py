@@ -64,6 +64,7 @@ class UlogIndex:
     topics: list[UlogTopic] = field(default_factory=list)  # wanted topics
     parameters: dict[str, float] = field(default_factory=dict)  # values at the start
     lost: int = 0  # bytes outside of messages
+    rest: int = 0  # those at the end of the file
     refused: int = 0  # inconsistent descriptions and samples
     dropouts: int = 0  # number of dropouts of the logger itself
     unknown: bool = False  # whether the file has unknown incompatibility flags
@@ -181,8 +182,10 @@ class _Walker:
                 continue
             resume = self._resume(at + 1, end)
             self._found.lost += resume - at
+            self._found.rest = resume - at if resume == end else 0
             at = resume
         self._found.lost += end - at
+        self._found.rest = end - at or self._found.rest
 
     def _fits(self, at: int, end: int) -> int:
         """Return the end of a message at ``at``, if a message there is plausible; else 0."""

@@ -13,6 +13,7 @@ from io import BufferedWriter
 from pathlib import Path
 from typing import IO, Any, Final, Protocol, Self
 
+from companion.recording.folders import make_folder
 from companion.recording.tables.columns import Table, Value
 from companion.recording.tables.csv_file import CsvFile
 from companion.recording.tables.parquet_file import ParquetFile
@@ -52,7 +53,7 @@ class TableFolder:
         self._tables = {table.name: table for table in tables}
         self._open: dict[str, BufferedWriter] = {}
         self._files: dict[str, TableFile] = {}
-        where.mkdir(parents=True, exist_ok=True)
+        make_folder(where, "--out")
         try:
             for table in tables:
                 file = self._open[table.name] = open_alone(self._active(self._name(table.name)))

@@ -18,6 +18,7 @@ from concurrent.futures import Future, ProcessPoolExecutor, as_completed
 from contextlib import contextmanager
 from typing import Any, Final, TypeVar
 
+from companion.node.signals import ENDS, interrupts_held
 from companion.values import UserError
 from companion.values.extras import needs
 
@@ -25,7 +26,6 @@ Asked = TypeVar("Asked")
 Answer = TypeVar("Answer")
 Progress = Callable[[int], None]  # called with the number of finished pieces
 
-ENDS: Final = (signal.SIGINT, signal.SIGTERM)
 CLUSTER_ANSWERS_S: Final = 10
 ADDRESS: Final = re.compile(r"(tcp|tls)://([\w.-]+|\[[0-9a-fA-F:.]+\]):\d{1,5}")
 BLAS_THREADS: Final = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
@@ -47,7 +47,7 @@ def on_cores(
         ProcessPoolExecutor(count, mp_context=context, initializer=_left_to_parent) as pool,
     ):
         try:
-            with _interrupts_held():  # each call may start a process
+            with interrupts_held():  # each call may start a worker, which an interrupt would break
                 futures = [pool.submit(work, each) for each in asked]
             return _gathered(futures, told)
         except KeyboardInterrupt:
@@ -75,20 +75,6 @@ def _left_to_parent() -> None:
     """Ignore Ctrl-C in a worker: a terminal sends it to every process, the parent handles it."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDS)
-
-
-@contextmanager
-def _interrupts_held() -> Iterator[None]:
-    """Context in which Ctrl-C and SIGTERM wait, also in processes started in it.
-
-    A worker that receives one while its interpreter starts, or whose parent is interrupted while it
-    starts the worker, would print a traceback. The alarm is a postponed interrupt.
-    """
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, [*ENDS, signal.SIGALRM])
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextmanager

@@ -1,0 +1,25 @@
+"""Signals that end a process, held back while a handler cannot be called."""
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Final
+
+ENDS: Final = (signal.SIGINT, signal.SIGTERM)
+HELD: Final = (*ENDS, signal.SIGALRM)
+"""The alarm is a postponed interrupt (``companion.cli.interrupts``)."""
+
+
+@contextmanager
+def interrupts_held() -> Iterator[None]:
+    """Context in which Ctrl-C and SIGTERM wait, also in processes started in it."""
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, HELD)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def release_interrupts() -> None:
+    """Deliver the signals that waited."""
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, HELD)

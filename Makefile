@@ -19,7 +19,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Two workers. Tests that start services run on one of them, one after the other.
 WORKERS = -n 2 --dist loadgroup
 
-.PHONY: demo test test-all check site bench soak fuzz messages format lock clean FORCE
+.PHONY: demo test test-all check site bench soak fuzz messages dist format lock clean FORCE
 
 demo: .venv/.runtime
 	$(BIN)/companion demo
@@ -71,6 +71,15 @@ messages: .venv/.dev
 	rm -f build/texts.jsonl && mkdir -p build
 	-COLLECT_TEXTS=build/texts.jsonl $(PYTEST) -q $(WORKERS) -m "not full and not benchmark and not soak"
 	$(BIN)/python docs/list_texts.py --collected build/texts.jsonl
+
+# What is installed by name: wheel, source archive and, with dpkg-deb, the Debian package of this
+# machine's architecture. The date of the newest commit makes builds identical.
+dist: .venv/.dev
+	rm -rf dist
+	export SOURCE_DATE_EPOCH=$$(git log -1 --format=%ct); \
+	$(BIN)/python -m hatchling build -d dist && \
+	if command -v dpkg-deb >/dev/null; then $(BIN)/python deploy/build_deb.py --out dist; \
+	else echo "no dpkg-deb here: no Debian package"; fi
 
 format: .venv/.dev
 	$(BIN)/ruff format .

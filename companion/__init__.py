@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from companion.settings.model import Settings
     from companion.values import Beam, Estimate, Frame, RoundTrip, Source, Tick, Track, UserError
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"
 __all__ = [
     "Beam",
     "Estimate",

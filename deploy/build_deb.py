@@ -2,9 +2,9 @@
 
     python deploy/build_deb.py [--out DIR] [--arch amd64|arm64] [--python 3.11] [--no-packages]
 
-The packages of requirements.lock are unpacked from wheels into /opt/companion/lib, so that an
-installation needs no network. They are chosen for the architecture and the Python of Debian 12,
-whatever the building machine is; nothing is compiled or run. The unit is the one of
+The packages of requirements.lock are unpacked from wheels into /usr/lib/uav-companion-beams, so
+that an installation needs no network. They are chosen for the architecture and the Python of Debian
+12, whatever the building machine is; nothing is compiled or run. The unit is the one of
 docs/deployment.md, with a system user of its own. ``--no-packages`` leaves the locked packages out,
 for tests. Needs dpkg-deb. With SOURCE_DATE_EPOCH, two builds are identical.
 """
@@ -17,6 +17,8 @@ import shutil
 import subprocess
 import sys
 import tempfile
+from datetime import UTC, datetime
+from email.utils import format_datetime
 from pathlib import Path
 from typing import Final
 
@@ -52,7 +54,7 @@ def _own_arch() -> str:
 
 
 def _fill(tree: Path, arch: str, python: str, packages: bool) -> None:
-    lib = tree / "opt/companion/lib"
+    lib = tree / "usr/lib/uav-companion-beams"
     wheel = _wheel(tree.parent)
     if packages:
         _install(lib, "--require-hashes", "-r", str(_lock(tree.parent)), arch=arch, python=python)
@@ -81,8 +83,10 @@ def _fill(tree: Path, arch: str, python: str, packages: bool) -> None:
     ):
         _write(tree / target, (FILES / source).read_text(encoding="utf-8"))
     shutil.copy(ROOT / "NOTICE", tree / f"usr/share/doc/{NAME}/NOTICE")
-    log = (ROOT / "CHANGELOG.md").read_bytes()
-    (tree / f"usr/share/doc/{NAME}/changelog.gz").write_bytes(gzip.compress(log, 9, mtime=0))
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    for name, text in (("changelog", _debian_changelog()), ("CHANGELOG.md", changes)):
+        packed = gzip.compress(text.encode(), 9, mtime=0)
+        (tree / f"usr/share/doc/{NAME}/{name}.gz").write_bytes(packed)
     _write_control(tree, arch if packages else "all", python)
 
 
@@ -144,14 +148,35 @@ def _write(path: Path, text: str, mode: int = 0o644) -> None:
     path.chmod(mode)
 
 
-def _write_control(tree: Path, arch: str, python: str) -> None:
+def _debian_changelog() -> str:
+    (maintainer,) = re.findall("^Maintainer: (.+)$", _control(), re.MULTILINE)
+    date = format_datetime(datetime.fromtimestamp(_epoch(), UTC))
+    return (
+        f"{NAME} ({_version()}) stable; urgency=medium\n\n"
+        f"  * See CHANGELOG.md.gz.\n\n -- {maintainer}  {date}\n"
+    )
+
+
+def _control() -> str:
+    return (FILES / "control").read_text(encoding="utf-8")
+
+
+def _version() -> str:
     init = (ROOT / "companion" / "__init__.py").read_text(encoding="utf-8")
     (version,) = re.findall(r'^__version__ = "(.+)"', init, re.MULTILINE)
+    return str(version)
+
+
+def _epoch() -> int:
+    return int(os.environ.get("SOURCE_DATE_EPOCH", EPOCH_DEFAULT))
+
+
+def _write_control(tree: Path, arch: str, python: str) -> None:
     major, minor = map(int, python.split("."))
     kib = sum(path.stat().st_size for path in tree.rglob("*") if path.is_file()) // 1024
-    text = (FILES / "control").read_text(encoding="utf-8")
+    text = _control()
     for key, value in (
-        ("VERSION", version),
+        ("VERSION", _version()),
         ("ARCH", arch),
         ("PYTHON", python),
         ("NEXT", f"{major}.{minor + 1}"),
@@ -165,7 +190,7 @@ def _write_control(tree: Path, arch: str, python: str) -> None:
 
 
 def _packed(tree: Path, out: Path) -> str:
-    epoch = int(os.environ.get("SOURCE_DATE_EPOCH", EPOCH_DEFAULT))
+    epoch = _epoch()
     for path in [tree, *tree.rglob("*")]:
         if path.is_dir():
             path.chmod(0o755)

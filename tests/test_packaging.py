@@ -209,10 +209,12 @@ def test_debian_package_is_well_formed(package: Path, unpacked: Path) -> None:
         mode, owner, *_, name = line.split()
         assert owner == "root/root"
         assert mode in ("drwxr-xr-x", "-rwxr-xr-x", "-rw-r--r--"), line
-        assert name.startswith(("./etc", "./opt", "./usr")) or name == "./"
+        assert name.startswith(("./etc", "./usr")) or name == "./"
         assert "__pycache__" not in name
     doc = unpacked / "usr/share/doc/uav-companion-beams"
-    assert {path.name for path in doc.iterdir()} == {"copyright", "changelog.gz", "NOTICE"}
+    assert {path.name for path in doc.iterdir()} == {
+        *("copyright", "changelog.gz", "CHANGELOG.md.gz", "NOTICE")
+    }
 
 
 def test_debian_unit_is_valid(unpacked: Path) -> None:
@@ -248,7 +250,7 @@ def launched(unpacked: Path) -> Iterator[Path]:
     for path in (unpacked / "usr/bin").iterdir():
         text = path.read_text().replace("/usr/bin/python3", sys.executable)
         path.write_text(text)
-    packages = unpacked / "opt/companion/lib/dependencies.pth"
+    packages = unpacked / "usr/lib/uav-companion-beams/dependencies.pth"
     packages.write_text(f"{sysconfig.get_path('purelib')}\n")
     yield unpacked
     packages.unlink()
@@ -287,7 +289,7 @@ def test_debian_package_has_all_packages_for_its_architecture(arch: str, tmp_pat
     assert machines == {62 if arch == "amd64" else 183}  # ELF's numbers of the machines
     lock = (ROOT / "requirements.lock").read_text(encoding="utf-8")
     assert "numpy==" in lock
-    assert list((folder / "opt/companion/lib").glob("numpy-*.dist-info"))
+    assert list((folder / "usr/lib/uav-companion-beams").glob("numpy-*.dist-info"))
 
 
 # --- the image ------------------------------------------------------------------------------------

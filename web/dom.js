@@ -27,6 +27,15 @@ export function make(tag, attributes = {}, ...children) {
   return element;
 }
 
+/** Call `choose` with the `data-id` of a clicked row. A double click, and the end of a selection of text, choose nothing. */
+export function onRow(body, choose) {
+  body.addEventListener("click", ({ target, detail }) => {
+    const id = target.closest("[data-id]")?.dataset.id;
+    if (id === undefined || detail > 1 || globalThis.getSelection?.()?.type === "Range") return;
+    choose(id);
+  });
+}
+
 /** Set the children of a list, unless `key`, which identifies its contents, is unchanged. */
 export function setChildren(list, key, build) {
   const wanted = JSON.stringify(key);

@@ -1,7 +1,7 @@
 // The fleet, if this node is in one: its nodes, the UAVs that each serves, the offers of each node,
 // and the newest handovers.
 
-import { $, make, setAttribute, setChildren, setText, toggleAttribute } from "./dom.js";
+import { $, make, onRow, setAttribute, setChildren, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
 import { byId } from "./health.js";
 import { labelOf, meaningOf } from "./meanings.js";
@@ -104,8 +104,9 @@ const ORDERS = {
 
 export class FleetView {
   constructor(onSelect) {
-    Object.assign(this, { onSelect, rows: new Map(), nodes: null, order: "served", last: null });
+    Object.assign(this, { rows: new Map(), nodes: null, order: "served", last: null });
     [this.head, this.body] = [$("fleet-uavs").tHead.rows[0], $("fleet-uavs").tBodies[0]];
+    onRow(this.body, onSelect);
     this.head.addEventListener("click", (event) => {
       const key = event.target.closest("th")?.dataset.key;
       if (!(key in ORDERS)) return;
@@ -165,11 +166,10 @@ export class FleetView {
 
   addRow(id, names) {
     const button = make("button", { type: "button", class: "pick" }, id);
-    button.addEventListener("click", () => this.onSelect(id));
     const cells = ["Served by", ...names].map((label, index) => make("td", {
       role: "cell", "data-label": label, "data-key": index ? "offer" : "served",
     }, make("span", {}, "")));
-    const line = make("tr", { role: "row" },
+    const line = make("tr", { role: "row", "data-id": id },
       make("th", { scope: "row", role: "rowheader" }, button), ...cells);
     const row = { line, button, cells };
     this.rows.set(id, row);

@@ -7,6 +7,7 @@ import { labelOf, meaningOf } from "./meanings.js";
 import { authorised, hasToken } from "./token.js";
 
 const EVENTS_SHOWN = 60;
+const FEW = 8; // components of a link that are listed
 export const SEVERITY_LEVEL = { info: "", warning: "warn", error: "bad" };
 
 const LINK_VALUES = [
@@ -33,9 +34,13 @@ function linkItem(link) {
   const facts = LINK_VALUES.map(([of, name, show]) => make(
     "div", { title: meaningOf(of, name) }, make("dt", {}, labelOf(of, name)), make("dd", {}, show(link)),
   ));
-  const heard = (link.components ?? []).map((one) => one.id).join(" ");
+  const heard = (link.components ?? []).map((one) => one.id);
   const item = make("li", {}, head, make("dl", { class: "link-facts" }, ...facts));
-  if (heard) item.append(make("p", { class: "muted" }, `receives ${heard}`));
+  if (heard.length) {
+    const more = heard.length > FEW ? ` and ${heard.length - FEW} more` : "";
+    item.append(make("p", { class: "muted", title: heard.join(" ") },
+      `receives ${heard.slice(0, FEW).join(" ")}${more}`));
+  }
   return item;
 }
 

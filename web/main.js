@@ -8,6 +8,7 @@ import { $, setText, toggleAttribute } from "./dom.js";
 import { Drawer } from "./drawer.js";
 import { csvOf, save } from "./export.js";
 import { Focus } from "./focus.js";
+import { Folds, isOpen } from "./folds.js";
 import { FleetView, nodesAround, slimFleet } from "./fleet.js";
 import * as format from "./format.js";
 import { headlineOf, showHeadline, showTroubles, worstFirst } from "./health.js";
@@ -54,7 +55,8 @@ const timebar = new TimeBar(history, refresh);
 const alarm = new Alarm();
 const charts = new Charts((at) => timebar.showAt(at));
 const feeds = startPolling(() => ({
-  beamed: beamedUav(feeds.beams.data), inFleet: Boolean(feeds.status.data?.node),
+  beamed: isOpen("fold-focus") ? beamedUav(feeds.beams.data) : null,
+  inFleet: Boolean(feeds.status.data?.node),
 }), take);
 
 // --- display -----------------------------------------------------------------------------------
@@ -161,6 +163,7 @@ function showAll(link, now) {
   const carrier = carrierOf(found.status);
   const middle = last.middle(carrier, found.uavs);
   const uavs = found.uavs.map((uav) => placedBy(uav, middle));
+  folds.makeRoom(uavs.length);
   const view = { ...found, carrier, middle, uavs };
   if (selected !== null && !view.uavs.some((uav) => uav.id === selected)) selected = null;
   const { status } = feeds;
@@ -173,7 +176,7 @@ function showAll(link, now) {
   showMoment(view, link, now);
   showPlan(view, link, now);
   const pastAt = timebar.shown?.at ?? null;
-  charts.show(history, view.uavs, { selected, pastAt, now });
+  if (isOpen("fold-charts")) charts.show(history, view.uavs, { selected, pastAt, now });
   nameThePage(view, link);
 }
 
@@ -206,7 +209,7 @@ function showMoment(view, link, now) {
     sinceS: timebar.isLive ? feeds.uavs.silenceS(now) : 0,
     selected,
   });
-  showFocus(view, link, now);
+  if (isOpen("fold-focus")) showFocus(view, link, now);
   drawer.show(view, timebar.isLive, now);
 }
 
@@ -291,11 +294,12 @@ function choose(id) {
   refresh();
 }
 
-/** Select with the pointer: opens the UAV's drawer, or closes it if it is deselected. */
+/** Select with the pointer: opens the UAV's drawer; if it is open, closes it and deselects. */
 function pick(id) {
-  choose(id);
-  if (selected === null) drawer.close();
-  else drawer.open(selected);
+  const isShown = id === null || drawer.id === id;
+  if (isShown ? selected !== null : selected !== id) choose(isShown ? selected : id);
+  if (isShown) drawer.close();
+  else drawer.open(id);
   refresh();
 }
 
@@ -365,6 +369,12 @@ $("save-png").addEventListener("click", () => {
 
 // On small screens the legend is folded.
 if (window.matchMedia("(max-width: 1180px)").matches) $("legend").removeAttribute("open");
+
+const folds = new Folds((id) => {
+  if (id === "fold-focus") for (const name of ["pattern", "weights"]) feeds[name].wake();
+  charts.changeUnits(); // drawn again when next shown
+  refresh();
+});
 
 const toggleTheme = setUpTheme($("theme"), () => {
   for (const picture of [plan, focus, charts, ground]) picture.recolour();

@@ -1,6 +1,6 @@
 // The table of UAVs: one row per UAV, kept between updates so that focus and selection stay.
 
-import { $, make, setAttribute, setText, toggleAttribute } from "./dom.js";
+import { $, make, onRow, setAttribute, setText, toggleAttribute } from "./dom.js";
 import * as format from "./format.js";
 import { elsewhere, explain, rankOf } from "./health.js";
 import { labelOf, meaningOf } from "./meanings.js";
@@ -110,7 +110,7 @@ const nameCell = (cell, { value, short = labelOf(...value) }) =>
 export class UavTable {
   constructor(table, onSelect, onOrder = () => {}) {
     this.body = table.tBodies[0];
-    this.onSelect = onSelect;
+    onRow(this.body, onSelect);
     this.rows = new Map();
     const head = table.tHead.rows[0];
     this.heads = HEADS.map(({ key }) => {
@@ -170,11 +170,10 @@ export class UavTable {
   }
 
   addRow(id) {
-    const line = make("tr", { role: "row" });
+    const line = make("tr", { role: "row", "data-id": id });
     const head = make("th", { scope: "row", role: "rowheader", "data-feed": "uavs" });
     const button = make("button", { type: "button", class: "pick" });
     button.textContent = id;
-    button.addEventListener("click", () => this.onSelect(id));
     head.append(button);
     line.append(head);
     const cells = COLUMNS.map((column) => {

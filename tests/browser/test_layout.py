@@ -2,6 +2,7 @@
 
 import functools
 from typing import Any
+from urllib.parse import urlsplit
 
 import pytest
 from support import HANG_MS, Node
@@ -15,7 +16,8 @@ SIZES = {
 }
 OVERLAPS = """() => {
     const groups = ["header > *, header .facts div", ".zoom, .legend-fold", ".time > *",
-        ".focus h2, .focus canvas, .focus dl", ".side section", ".charts figure, #series-key",
+        ".focus summary, .focus h3, .focus canvas, .focus dl", ".side section",
+        ".charts figure, #series-key",
         "thead th", "tbody tr:nth-child(-n+12) :is(td, th):not(:first-child)", ".events li",
         ".find > *", "main > *:not(.side, .time), .side section", "#fleet-nodes *",
         "#fleet-uavs tr:nth-child(-n+4) :is(td, th)", ".fleet > div"];
@@ -93,6 +95,68 @@ def test_no_element_overlaps_or_is_cut_off(
     assert page.evaluate(OVERLAPS) == []
     assert page.evaluate(CUT) == []
     assert page.evaluate("document.documentElement.scrollWidth - innerWidth") == 0
+
+
+ROOM = """() => {
+    const share = one => {
+        const { width, top, bottom } = one.getBoundingClientRect();
+        return width * (Math.min(bottom, innerHeight) - top) / innerWidth / innerHeight;
+    };
+    const [plan, table] = [document.querySelector(".plan"), document.querySelector(".scroll")];
+    const end = Math.min(table.getBoundingClientRect().bottom, innerHeight);
+    const rows = [...document.querySelectorAll("#uavs tbody tr")]
+        .filter(row => row.getBoundingClientRect().bottom <= end + 1);
+    return { plan: share(plan), rows: rows.length };
+}"""
+"""Share of the window that the plan takes, and the number of rows in sight."""
+
+
+def test_plan_and_table_get_the_room_when_there_are_many_uavs(demo: Node, open_page: Any) -> None:
+    page = open_page("about:blank", SIZES["desktop"], loses_service=True)
+    many(demo, page, 20)
+    page.goto(demo.url)
+    page.locator("tbody tr").nth(19).wait_for(state="attached", timeout=HANG_MS)
+    page.locator("#fold-charts:not([open])").wait_for(state="attached", timeout=HANG_MS)
+    room = page.evaluate(ROOM)
+    assert room["rows"] == 20 and room["plan"] >= 0.3, room
+
+
+def test_fold_is_remembered_and_what_it_hides_is_not_requested(demo: Node, open_page: Any) -> None:
+    page = open_page(demo.url, SIZES["desktop"])
+    page.locator("#pattern-facts [data-fact=peak]").get_by_text("dB").wait_for(timeout=HANG_MS)
+    page.locator("#fold-focus summary").click()
+    page.locator("#fold-focus:not([open])").wait_for(state="attached", timeout=HANG_MS)
+    paths: list[str] = []
+    page.on("request", lambda request: paths.append(urlsplit(request.url).path))
+    page.reload()
+    page.locator("tbody tr").nth(3).wait_for(state="attached", timeout=HANG_MS)
+    for _ in range(4):  # beats, of which each would bring a pattern
+        page.wait_for_event("response", lambda one: one.url.endswith("/v1/beams"))
+    assert page.locator("#fold-focus:not([open])").count() == 1
+    assert not {"/v1/pattern", "/v1/beams/weights"} & set(paths)
+    page.locator("#fold-focus summary").click()
+    page.locator("#pattern-facts [data-fact=peak]").get_by_text("dB").wait_for(timeout=HANG_MS)
+
+
+@pytest.mark.parametrize("size", SIZES)
+def test_click_anywhere_on_a_row_opens_the_drawer(demo: Node, open_page: Any, size: str) -> None:
+    page = open_page(demo.url, SIZES[size])
+    page.locator("tbody tr").nth(3).wait_for(state="attached", timeout=HANG_MS)
+    page.locator("#uavs th[data-key=id] button").evaluate("one => one.click()")  # a fixed order
+    row = page.locator("#uavs tbody tr[data-id='2:1']")
+    cells = row.locator("td").evaluate_all(
+        "all => all.filter(one => one.checkVisibility()).map(one => one.dataset.key)"
+    )
+    for key in cells:
+        row.locator(f"td[data-key={key}]").click()
+        page.locator("#drawer-title").get_by_text("2:1").wait_for(timeout=HANG_MS)
+        page.locator("#drawer-close").click()
+        page.locator("#drawer").wait_for(state="hidden", timeout=HANG_MS)
+    row.locator(".pick").click()
+    page.locator("#drawer").wait_for(timeout=HANG_MS)
+    row.locator(".pick").click()
+    page.locator("#drawer").wait_for(state="hidden", timeout=HANG_MS)
+    assert page.locator(".pick[aria-pressed=true]").count() == 0
 
 
 COLUMNS_IN_SIGHT = """() => {

@@ -78,7 +78,7 @@ test("the pattern is that of the selected UAV at once, or of the first with a be
   await page.time.advance(10);
   assert.equal(decodeURIComponent(asked()), "10:1");
   const names = page.document.querySelectorAll(".focus-uav").map(({ textContent }) => textContent);
-  assert.deepEqual(names, ["10:1", "10:1"]);
+  assert.deepEqual(names, ["10:1"]);
   page.press("1"); // selected, but without a beam
   await page.time.advance(10);
   assert.equal(decodeURIComponent(asked()), "2:1");

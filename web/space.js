@@ -1,6 +1,7 @@
-// The 3D view, on the plan view's own canvas and with its gestures: the carrier and its array, beams
-// as cones, UAVs with their bounds, rings at the carrier's height. Loaded on first use. The
-// projection is orthographic: lengths are to scale at every distance.
+// The 3D view, on the plan view's own canvas and with its gestures: a perspective of the ground with
+// its grid, the carrier and its array, beams as cones, UAVs with their bounds, and a line from each
+// UAV down to the ground. Loaded on first use. No terrain is known: the ground is a level plane
+// below the lowest UAV and the carrier, and the picture says how far below the carrier it is.
 
 import * as format from "./format.js";
 import { drawLabels } from "./labels.js";
@@ -10,13 +11,17 @@ const RADIANS = Math.PI / 180;
 const TURN_DEG_PER_PX = 0.4;
 const STEPS = 36; // of a circle
 const ARRAY_PX = 26; // a line of elements, not to scale
+const MARK_PX = 9; // half the length of a UAV's mark, not to scale
 const [LOWEST_DEG, HIGHEST_DEG] = [5, 90];
 const WIDEST_DEG = 60; // limit on half a cone's angle: a wider one would hide everything else
+const AWAY = 2.6; // distance of the eye from the centre, in radii of the outermost ring
+const NEAREST = 0.05; // distance from the eye within which nothing is drawn, as a part of that
+const GROUND_STEPS = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000, 2000, 5000];
 
 /** The viewpoint: bearing of the view, and elevation above the horizon. */
 export class Space {
   constructor() {
-    Object.assign(this, { bearingDeg: 20, aboveDeg: 30 });
+    Object.assign(this, { bearingDeg: 20, aboveDeg: 25, groundM: 0 });
   }
 
   turn(dxPx, dyPx) {
@@ -25,65 +30,144 @@ export class Space {
     this.aboveDeg = Math.max(LOWEST_DEG, Math.min(HIGHEST_DEG, above));
   }
 
-  /** Projection of an offset from the carrier: right and down in pixels, depth in metres. */
-  offset([northM, eastM, downM], pxPerM) {
+  /** A position relative to the centre as seen by the eye: right, up and away from it, metres. */
+  seen([northM, eastM, downM]) {
     const [sin, cos] = [Math.sin(this.bearingDeg * RADIANS), Math.cos(this.bearingDeg * RADIANS)];
-    const above = this.aboveDeg * RADIANS;
-    const [rightM, aheadM] = [eastM * cos - northM * sin, northM * cos + eastM * sin];
-    return [rightM * pxPerM,
-      (downM * Math.cos(above) - aheadM * Math.sin(above)) * pxPerM, aheadM];
+    const [tilt, level] = [Math.sin(this.aboveDeg * RADIANS), Math.cos(this.aboveDeg * RADIANS)];
+    const aheadM = northM * cos + eastM * sin;
+    return [eastM * cos - northM * sin, aheadM * tilt - downM * level,
+      this.eyeM + aheadM * level + downM * tilt];
+  }
+
+  /** Choose the centre and the ground, for the UAVs of `view`, a plan view. */
+  aim(view, uavs) {
+    const followed = uavs.find(({ id }) => id === view.followed);
+    this.middle = followed ? placeOf(followed) : [0, 0, 0];
+    this.eyeM = AWAY * view.scale.radiusM;
+    this.focalPx = this.eyeM * view.pxPerM; // the plan's scale at the centre
+    view.centre = [view.width / 2, view.height / 2];
+    this.centre = view.centre;
+    const lowestM = Math.max(0, ...uavs.map((uav) => placeOf(uav)[2]));
+    const stepM = GROUND_STEPS.find((metres) => metres >= view.scale.radiusM / 40) ?? 10_000;
+    this.groundM = Math.ceil(lowestM / stepM - 1e-9) * stepM;
+  }
+
+  eyed(ned) {
+    return this.seen(ned.map((part, i) => part - this.middle[i]));
+  }
+
+  drawnAt([right, up, away]) {
+    const scale = this.focalPx / away;
+    return [this.centre[0] + right * scale, this.centre[1] - up * scale];
+  }
+
+  /** Position in the picture; of what is behind the eye, far below. */
+  at(ned) {
+    const [right, up, away] = this.eyed(ned);
+    return this.drawnAt([right, up, Math.max(away, NEAREST * this.eyeM)]);
+  }
+
+  /** Positions in the picture of those in front of the eye. */
+  pictured(points) {
+    return points.map((ned) => this.eyed(ned)).filter(([, , away]) => away > NEAREST * this.eyeM)
+      .map((point) => this.drawnAt(point));
+  }
+
+  /** Stroke a line through positions, as far as it is in front of the eye. */
+  line(context, points, colour, width) {
+    const nearestM = NEAREST * this.eyeM;
+    const eyed = points.map((ned) => this.eyed(ned));
+    context.strokeStyle = colour;
+    context.lineWidth = width;
+    context.beginPath();
+    let isDrawing = false;
+    eyed.slice(1).forEach((to, i) => {
+      const from = eyed[i];
+      const isEnd = to[2] > nearestM;
+      if (from[2] > nearestM || isEnd) {
+        const cut = () => mix(from, to, (nearestM - from[2]) / (to[2] - from[2]));
+        if (!isDrawing) context.moveTo(...this.drawnAt(from[2] > nearestM ? from : cut()));
+        context.lineTo(...this.drawnAt(isEnd ? to : cut()));
+      }
+      isDrawing = isEnd;
+    });
+    context.stroke();
   }
 
   /** Draw `view`, a plan view, and set the positions at which its UAVs can be selected. */
   draw(view) {
     const uavs = view.scene.uavs.filter(placed);
-    this.middle(view, uavs);
-    this.at = (ned) => {
-      const [right, down] = this.offset(ned, view.pxPerM);
-      return [view.centre[0] + right, view.centre[1] + down];
-    };
-    this.drawRings(view);
+    this.aim(view, uavs);
+    this.drawGround(view);
+    const far = new Map(uavs.map((uav) => [uav, this.eyed(placeOf(uav))[2]]));
+    const ahead = uavs.filter((uav) => far.get(uav) > NEAREST * this.eyeM)
+      .sort((a, b) => far.get(b) - far.get(a));
+    ahead.forEach((uav) => this.drawDrop(view, uav));
     this.drawBoresight(view);
     const byId = new Map(uavs.map((uav) => [uav.id, uav]));
     for (const beam of view.scene.beams) this.drawBeam(view, beam, byId.get(beam.uav));
-    const far = (uav) => this.offset(placeOf(uav), 1)[2];
-    uavs.sort((a, b) => far(b) - far(a));
-    uavs.forEach((uav) => this.drawBound(view, uav));
+    ahead.forEach((uav) => this.drawBound(view, uav));
     this.drawNodes(view);
     this.drawCarrier(view);
-    view.hits = uavs.map((uav) => this.drawUav(view, uav));
+    view.hits = ahead.map((uav) => this.drawUav(view, uav));
     drawLabels(view, []);
-  }
-
-  /** Centre on the followed UAV, or else on the carrier. */
-  middle(view, uavs) {
-    const followed = uavs.find(({ id }) => id === view.followed);
-    const [right, down] = followed ? this.offset(placeOf(followed), view.pxPerM) : [0, 0];
-    view.centre = [view.width / 2 - right, view.height / 2 - down];
   }
 
   // --- ground -----------------------------------------------------------------------------------
 
   circle([north, east, down], radiusM) {
-    return Array.from({ length: STEPS }, (_, i) => {
+    return Array.from({ length: STEPS + 1 }, (_, i) => {
       const angle = (2 * Math.PI * i) / STEPS;
-      return this.at([north + radiusM * Math.cos(angle), east + radiusM * Math.sin(angle), down]);
+      return [north + radiusM * Math.cos(angle), east + radiusM * Math.sin(angle), down];
     });
   }
 
-  drawRings(view) {
+  /** A grid on a level plane, the outermost ring of the plan, and the quarters. */
+  drawGround(view) {
     const { context } = view;
-    const [radiusM, stepM] = view.scale.rings;
-    for (let m = stepM; m <= radiusM * 1.001; m += stepM) {
-      stroke(context, this.circle([0, 0, 0], m), view.colour.grid, m >= radiusM ? 1.6 : 1, true);
-      const [x, y] = this.at([-m * Math.SQRT1_2, -m * Math.SQRT1_2, 0]);
-      view.write(format.length(m), x, y, { colour: "gridtext", size: 11, align: "center" });
+    const [radiusM, ringM] = view.scale.rings;
+    const stepM = radiusM / ringM > 4 ? ringM : ringM / 2;
+    const steps = Math.ceil(radiusM / stepM - 1e-9);
+    const edgeM = steps * stepM;
+    const down = this.groundM;
+    context.fillStyle = withAlpha(view.colour.grid, 0.22);
+    context.beginPath();
+    outline(context, this.pictured([[edgeM, edgeM, down], [edgeM, -edgeM, down],
+      [-edgeM, -edgeM, down], [-edgeM, edgeM, down]]));
+    context.fill();
+    context.globalAlpha = 0.6;
+    for (let i = -steps; i <= steps; i += 1) {
+      const width = i === 0 ? 1.4 : 0.7;
+      const m = i * stepM;
+      this.line(context, [[m, -edgeM, down], [m, edgeM, down]], view.colour.grid, width);
+      this.line(context, [[-edgeM, m, down], [edgeM, m, down]], view.colour.grid, width);
     }
+    context.globalAlpha = 1;
+    this.line(context, this.circle([0, 0, down], radiusM), view.colour.grid, 1.6);
     for (const [name, deg] of [["N", 0], ["E", 90], ["S", 180], ["W", 270]]) {
-      const [x, y] = this.at(polar(deg, 0, radiusM * 1.09));
+      const [north, east] = polar(deg, 0, edgeM * 1.06);
+      const [x, y] = this.at([north, east, down]);
       view.write(name, x, y, { colour: name === "N" ? "text" : "gridtext", size: 14, weight: 700,
         align: "center" });
     }
+    const below = down > 0 ? `${format.length(down)} below the carrier` : "at the carrier's height";
+    view.write(`Grid ${format.length(stepM)}, ${below}`, view.width - 12, view.height - 16,
+      { colour: "gridtext", size: 12, align: "right" });
+  }
+
+  /** The line from a UAV down to the ground, and its foot there. */
+  drawDrop(view, uav) {
+    const { context } = view;
+    const [north, east, down] = placeOf(uav);
+    const foot = [north, east, this.groundM];
+    const colour = view.colourOf(uav);
+    context.globalAlpha = 0.7;
+    this.line(context, [[north, east, down], foot], colour, 1);
+    context.fillStyle = withAlpha(colour, 0.5);
+    context.beginPath();
+    outline(context, this.pictured(this.circle(foot, 4 / view.pxPerM)));
+    context.fill();
+    context.globalAlpha = 1;
   }
 
   drawBoresight(view) {
@@ -92,32 +176,38 @@ export class Space {
     const colour = beamsLive && !carrier?.unfit ? view.colour.bore : view.colour.stale;
     const deg = array.boresight_bearing_deg;
     view.context.setLineDash([2, 6]);
-    stroke(view.context, [this.at([0, 0, 0]), this.at(polar(deg, 0, view.scale.radiusM))], colour,
-      1.2);
+    this.line(view.context, [[0, 0, 0], polar(deg, 0, view.scale.radiusM)], colour, 1.2);
     view.context.setLineDash([]);
     const half = ARRAY_PX / 2 / view.pxPerM; // the array lies across it
-    stroke(view.context, [-90, 90].map((side) => this.at(polar(deg + side, 0, half))), colour, 4);
+    this.line(view.context, [-90, 90].map((side) => polar(deg + side, 0, half)), colour, 4);
   }
 
   drawCarrier(view) {
     const { context } = view;
     const { carrier, uavsLive } = view.scene;
     if (carrier?.unseen) return;
+    const colour = uavsLive && !carrier?.unfit ? view.colour.text : view.colour.stale;
+    this.line(context, [[0, 0, 0], [0, 0, this.groundM]], colour, 1.6);
+    this.line(context, this.circle([0, 0, this.groundM], 6 / view.pxPerM), colour, 1.2);
     const [x, y] = this.at([0, 0, 0]);
     context.beginPath();
     context.arc(x, y, 5, 0, 2 * Math.PI);
-    context.fillStyle = uavsLive && !carrier?.unfit ? view.colour.text : view.colour.stale;
+    context.fillStyle = colour;
     context.fill();
     if (!format.known(carrier?.heading_deg)) return;
-    const tip = this.at(polar(carrier.heading_deg, 0, 18 / view.pxPerM));
-    stroke(context, [[x, y], tip], context.fillStyle, 2.5);
+    this.line(context, [[0, 0, 0], polar(carrier.heading_deg, 0, 18 / view.pxPerM)], colour, 2.5);
   }
 
   drawNodes(view) {
+    const { context } = view;
     for (const { north_m: north, east_m: east, node } of view.scene.nodes ?? []) {
+      const sizeM = 6 / view.pxPerM;
+      if (this.pictured([[north, east, 0]]).length === 0) continue;
+      this.line(context, [[north, east, 0], [north, east, this.groundM]], view.colour.muted, 1);
+      this.line(context, [[north + sizeM, east, 0], [north, east + sizeM, 0],
+        [north - sizeM, east, 0], [north, east - sizeM, 0], [north + sizeM, east, 0]],
+      view.colour.muted, 2);
       const [x, y] = this.at([north, east, 0]);
-      stroke(view.context, [[x, y - 6], [x + 6, y], [x, y + 6], [x - 6, y]], view.colour.muted, 2,
-        true);
       view.write(node, x + 10, y, { colour: "muted", size: 12, weight: 700 });
     }
   }
@@ -137,10 +227,10 @@ export class Space {
     context.globalAlpha = view.scene.selected === null || chosen ? 1 : 0.45;
     context.fillStyle = withAlpha(colour, Math.max(0.06, Math.min(0.3, 2 / view.scene.beams.length)));
     context.beginPath();
-    outline(context, hull([this.at([0, 0, 0]), ...rim]));
+    outline(context, hull(this.pictured([[0, 0, 0], ...rim])));
     context.fill();
-    stroke(context, rim, colour, 1, true);
-    stroke(context, [this.at([0, 0, 0]), this.at(end)], colour, chosen ? 2 : 1.1);
+    this.line(context, [...rim, rim[0]], colour, 1);
+    this.line(context, [[0, 0, 0], end], colour, chosen ? 2 : 1.1);
     context.globalAlpha = 1;
   }
 
@@ -154,7 +244,7 @@ export class Space {
     return Array.from({ length: STEPS }, (_, i) => {
       const angle = (2 * Math.PI * i) / STEPS;
       const [a, b] = [radiusM * Math.cos(angle), radiusM * Math.sin(angle)];
-      return this.at(end.map((part, k) => part + a * aside[k] + b * other[k]));
+      return end.map((part, k) => part + a * aside[k] + b * other[k]);
     });
   }
 
@@ -173,33 +263,43 @@ export class Space {
     const colour = view.colourOf(uav);
     context.fillStyle = withAlpha(colour, 0.12);
     context.beginPath();
-    outline(context, hull(ends.flat()));
+    outline(context, hull(this.pictured(ends.flat())));
     context.fill();
-    for (const rim of ends) stroke(context, rim, colour, 1, true);
+    for (const rim of ends) this.line(context, rim, colour, 1);
   }
 
-  /** Its mark, and a vertical line to the height of the carrier. */
+  /** Its mark: a level arrow head along its course, or a ball if it hovers; nearer ones are larger. */
   drawUav(view, uav) {
     const { context } = view;
     const ned = placeOf(uav);
     const [x, y] = this.at(ned);
+    const nearness = this.eyeM / this.eyed(ned)[2];
     const colour = view.colourOf(uav);
-    context.setLineDash([2, 3]);
-    stroke(context, [[x, y], this.at([ned[0], ned[1], 0])], view.colour.muted, 1);
-    context.setLineDash([]);
     const velocity = uav.velocity_ned_mps;
-    if (velocity && uav.state !== "lost") {
-      stroke(context, [[x, y], this.at(ned.map((part, i) => part + 2 * velocity[i]))], colour, 1.2);
-    }
+    const isMoving = velocity && Math.hypot(velocity[0], velocity[1]) > 0.3 && uav.state !== "lost";
     context.beginPath();
-    context.arc(x, y, 6, 0, 2 * Math.PI);
+    if (isMoving) {
+      this.line(context, [ned, ned.map((part, i) => part + 2 * velocity[i])], colour, 1.2);
+      const course = Math.atan2(velocity[1], velocity[0]) / RADIANS;
+      const sizeM = MARK_PX * Math.max(0.7, Math.min(1.4, nearness)) / nearness / view.pxPerM;
+      const corners = [[0, 1.3], [140, 1.2], [180, 0.5], [-140, 1.2]].map(([deg, size]) =>
+        polar(course + deg, 0, sizeM * size).map((part, i) => part + ned[i]));
+      context.beginPath();
+      outline(context, this.pictured(corners));
+    } else {
+      context.arc(x, y, 6 * Math.max(0.7, Math.min(1.4, nearness)), 0, 2 * Math.PI);
+    }
     context.fillStyle = uav.state === "live" ? colour : view.colour.plan;
     context.fill();
     context.strokeStyle = colour;
     context.lineWidth = 2;
     context.stroke();
     if (view.scene.selected === uav.id) {
-      stroke(context, ring([x, y], 12), view.colour.text, 1.5, true);
+      context.strokeStyle = view.colour.text;
+      context.lineWidth = 1.5;
+      context.beginPath();
+      context.arc(x, y, 14, 0, 2 * Math.PI);
+      context.stroke();
     }
     return { uav, x, y, beyond: false };
   }
@@ -207,6 +307,8 @@ export class Space {
 
 const placed = (uav) => format.known(uav.north_m) && format.known(uav.east_m);
 const placeOf = (uav) => [uav.north_m, uav.east_m, uav.down_m ?? 0];
+
+const mix = (from, to, share) => from.map((part, i) => part + share * (to[i] - part));
 
 /** Half angle of a cone: the likely error, or the bound if that is unknown. */
 function likelyDeg({ pointing_p95_deg: likely, pointing_bound_deg: bound }) {
@@ -227,10 +329,6 @@ function unit(vector) {
   return vector.map((part) => part / length);
 }
 
-const ring = ([x, y], px) => Array.from({ length: STEPS }, (_, i) => [
-  x + px * Math.cos((2 * Math.PI * i) / STEPS), y + px * Math.sin((2 * Math.PI * i) / STEPS),
-]);
-
 /** The convex hull of points in the picture (Andrew's monotone chain). */
 export function hull(points) {
   const sorted = [...points].sort((a, b) => a[0] - b[0] || a[1] - b[1]);
@@ -249,12 +347,4 @@ export function hull(points) {
 function outline(context, points, closed = true) {
   points.forEach(([x, y], i) => (i ? context.lineTo(x, y) : context.moveTo(x, y)));
   if (closed) context.closePath();
-}
-
-function stroke(context, points, colour, width, closed = false) {
-  context.strokeStyle = colour;
-  context.lineWidth = width;
-  context.beginPath();
-  outline(context, points, closed);
-  context.stroke();
 }

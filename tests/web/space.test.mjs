@@ -1,4 +1,4 @@
-// The scene in space: to scale in every direction, on the plan's canvas, loaded when it is asked for.
+// The scene in space: a perspective with a ground, on the plan's canvas, loaded when it is asked for.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
@@ -20,15 +20,33 @@ async function openSpace(fields = {}) {
 const HIGH = uav("1:1", { north_m: 30, east_m: 40, down_m: -50 });
 const points = ({ path }) => path.filter(({ op }) => op === "move" || op === "line");
 
-test("from above it equals the plan; from the side heights are to scale", () => {
-  const space = Object.assign(new Space(), { bearingDeg: 0, aboveDeg: 90 });
-  const [right, down] = space.offset([30, 40, -50], 2);
-  near(right, 80);
-  near(down, -60);
+test("it is a perspective: to scale at the centre, smaller further away", async () => {
+  const view = await openSpace({ bearingDeg: 0, aboveDeg: 90 });
+  view.show({ uavs: [HIGH] });
+  const { plan: { pxPerM }, space } = view;
+  const offset = (ned) => {
+    const [x, y] = space.at(ned);
+    return [x - CENTRE.x, y - CENTRE.y];
+  };
+  near(offset([30, 40, 0])[0], 40 * pxPerM); // from above, at the carrier's height: the plan
+  near(offset([30, 40, 0])[1], -30 * pxPerM);
+  assert.ok(offset([30, 40, -50])[0] > 40 * pxPerM); // nearer to the eye
+  assert.ok(offset([30, 40, 50])[0] < 40 * pxPerM);
   space.aboveDeg = 0;
-  near(space.offset([30, 40, -50], 2)[1], -100);
+  near(offset([0, 0, -50])[1], -50 * pxPerM);
+  assert.ok(offset([100, 0, -50])[1] > offset([0, 0, -50])[1]);
   space.bearingDeg = 90; // looking east, south is on the right
-  near(space.offset([-30, 0, 0], 1)[0], 30);
+  near(offset([-30, 0, 0])[0], 30 * pxPerM);
+});
+
+test("what is behind the eye is not drawn", async () => {
+  const view = await openSpace({ bearingDeg: 0, aboveDeg: 5 });
+  const behind = uav("2:1", { north_m: -5000, east_m: 0, down_m: -50 });
+  view.plan.zoom(1); // no longer fitted to all UAVs
+  const picture = view.show({ uavs: [HIGH, behind] });
+  assert.deepEqual(view.plan.hits.map((hit) => hit.uav.id), ["1:1"]);
+  assert.ok(picture.drawn.every(({ path = [] }) => path.every(({ x = 0, y = 0 }) =>
+    Number.isFinite(x) && Number.isFinite(y))));
 });
 
 test("a drag orbits the view, never below ground; on the plan it pans", async () => {
@@ -45,17 +63,22 @@ test("a drag orbits the view, never below ground; on the plan it pans", async ()
   assert.deepEqual(plan.pan, [5, 6]);
 });
 
-test("a UAV is drawn above its ground point, selectable and labelled", async () => {
+test("a UAV has a line down to the ground, is selectable and labelled", async () => {
   const view = await openSpace({ bearingDeg: 0, aboveDeg: 30 });
-  const picture = view.show({ uavs: [HIGH] });
-  const { pxPerM } = view.plan;
-  const [hit] = view.plan.hits;
-  near(hit.x, CENTRE.x + 40 * pxPerM);
-  near(hit.y, CENTRE.y - (30 * 0.5 + 50 * Math.cos(Math.PI / 6)) * pxPerM);
-  const stem = picture.of("stroke", (one) => one.dash.join() === "2,3").map(points)[0];
-  near(stem[0].x, stem[1].x);
-  near(stem[1].y - stem[0].y, 50 * Math.cos(Math.PI / 6) * pxPerM);
+  const picture = view.show({ uavs: [HIGH, uav("2:1", { down_m: 7 })] });
+  const { space } = view;
+  const hit = view.plan.hits.find(({ uav: { id } }) => id === "1:1");
+  const [x, y] = space.at([30, 40, -50]);
+  near(hit.x, x);
+  near(hit.y, y);
+  assert.ok(space.groundM >= 7); // below the lowest UAV
+  const [footX, footY] = space.at([30, 40, space.groundM]);
+  assert.ok(footY > y);
+  const drops = picture.of("stroke", (one) => one.path.length === 2).map(points);
+  const isDrop = ([from, to]) => Math.hypot(from.x - x, from.y - y, to.x - footX, to.y - footY);
+  assert.ok(drops.some((line) => isDrop(line) < 1e-6));
   picture.text("1:1");
+  picture.text(`Grid 25.0\u00a0m, ${space.groundM.toFixed(1)}\u00a0m below the carrier`);
   assert.equal(view.plan.nearest({ offsetX: hit.x + 3, offsetY: hit.y }), "1:1");
 });
 
@@ -68,8 +91,10 @@ test("a beam is a cone of the p95 angle, or of the bound without one", async () 
       && one.path.length > 10).map(points)[0];
     return (Math.max(...rim.map(({ x }) => x)) - CENTRE.x) / view.plan.pxPerM;
   };
-  near(halfWidthM({ pointing_p95_deg: 5, pointing_bound_deg: 20 }), 100 * Math.tan(Math.PI / 36));
-  near(halfWidthM({ pointing_p95_deg: null, pointing_bound_deg: 20 }), 100 * Math.tan(Math.PI / 9));
+  const isNear = (metres, degrees) => // the upper half of the rim is nearer to the eye
+    Math.abs(metres / (100 * Math.tan(degrees * Math.PI / 180)) - 1) < 0.01;
+  assert.ok(isNear(halfWidthM({ pointing_p95_deg: 5, pointing_bound_deg: 20 }), 5));
+  assert.ok(isNear(halfWidthM({ pointing_p95_deg: null, pointing_bound_deg: 20 }), 20));
 });
 
 test("outdated values are grey, and unknown ones cause no error", async () => {

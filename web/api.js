@@ -4,9 +4,9 @@
 //
 // All feeds poll on multiples of BEAT_MS. Values that are drawn together (UAVs, beams, pattern) are
 // requested at the same moment; otherwise a fast UAV would appear beside its own beam. In total
-// this is five requests a second, six in a fleet.
+// this is less than five requests a second, six in a fleet.
 
-import { authorised, setUpToken } from "./token.js";
+import { authorised, isLocked, setUpToken, unlocked } from "./token.js";
 
 const BEAT_MS = 850;
 const TIMEOUT_MS = 2000;
@@ -49,11 +49,6 @@ const FEEDS = {
     path: "/v1/status", beats: 4, what: "status",
     stamp: (data) => data.time, accepts: (data) => typeof data?.version === "string",
   },
-  readyz: {
-    path: "/readyz", beats: 3, what: "readiness",
-    // "Not ready" is an answer, not a failure.
-    statuses: [503], accepts: (data) => typeof data?.ready === "boolean",
-  },
   links: {
     path: "/v1/links", beats: 6, offset: 2, what: "links",
     accepts: (data) => isListOf(data?.links, "url"),
@@ -89,6 +84,8 @@ export class Feed {
   }
 
   async run() {
+    await unlocked();
+    this.startedAt = performance.now();
     for (;;) {
       await this.poll();
       await this.pause(this.failures === 0 ? this.untilBeatMs()
@@ -129,7 +126,7 @@ export class Feed {
       const response = await authorised(path, {
         signal: abort.signal, cache: "no-store", headers: { Accept: "application/json" },
       });
-      if (!response.ok && !this.statuses?.includes(response.status)) {
+      if (!response.ok) {
         throw new Error(response.status === 401 ? NO_TOKEN
           : `the service answered ${response.status}`);
       }
@@ -216,8 +213,12 @@ export async function askOnce(path) {
 
 /** The state of the connection as one word and, if it is bad, details for the operator. */
 export function connection(feeds, now = performance.now()) {
+  if (isLocked()) return { state: "token" };
   const all = Object.values(feeds).filter((feed) => feed.health(now) !== "idle");
   const having = (...states) => all.filter((feed) => states.includes(feed.health(now)));
+  if (feeds.uavs.problem === NO_TOKEN && all.every(({ problem }) => ["", NO_TOKEN].includes(problem))) {
+    return { state: "token" };
+  }
   const silentS = Math.min(...all.map((feed) => feed.silenceS(now)));
   if (silentS * 1000 > LOST_MS) {
     const never = all.every((feed) => feed.answeredAt === null);
@@ -225,7 +226,6 @@ export function connection(feeds, now = performance.now()) {
   }
   const lost = having("lost");
   const frozen = having("frozen");
-  if (lost.length && lost.every((feed) => feed.problem === NO_TOKEN)) return { state: "token" };
   const names = (list) => list.map((feed) => feed.what).join(", ");
   if (lost.length) return { state: "partial", what: names(lost), problem: lost[0].problem };
   if (frozen.length) return { state: "frozen", what: names(frozen) };

@@ -54,14 +54,14 @@ export class Drawer {
     if (id === this.id) this.messages = messages;
   }
 
-  show({ uavs, events }, isLive, now) {
+  show({ uavs, events, links }, isLive, now) {
     if (!this.isOpen) return;
     const uav = uavs.find(({ id }) => id === this.id);
     if (!uav) {
       this.close();
       return;
     }
-    if (isLive) this.ask(now);
+    if (isLive && isHeard(uav.id, links)) this.ask(now);
     setText($("drawer-title"), [uav.id, uav.callsign].filter(Boolean).join(" "));
     showVerdict(uav);
     const coordinates = coordinatesOf(uav);
@@ -75,6 +75,10 @@ export class Drawer {
     showLines($("drawer-events"), eventsOf(uav, events));
   }
 }
+
+/** Whether a component is received here, and not only by another node. */
+const isHeard = (uav, answer) => (answer?.links ?? [])
+  .some(({ components }) => components?.some(({ id }) => id === uav));
 
 function showVerdict(uav) {
   const { reason, remedy } = uav.health ?? {};

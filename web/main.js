@@ -21,6 +21,7 @@ import {
 } from "./panels.js";
 import { Ground } from "./ground.js";
 import { loadMeanings } from "./meanings.js";
+import { Outage } from "./outage.js";
 import { PlanView } from "./plan.js";
 import { showSettings } from "./settings.js";
 import { UavTable } from "./table.js";
@@ -53,6 +54,7 @@ const focus = new Focus();
 const rejections = new Rejections();
 const timebar = new TimeBar(history, refresh);
 const alarm = new Alarm();
+const outage = new Outage();
 const charts = new Charts((at) => timebar.showAt(at));
 const feeds = startPolling(() => ({
   beamed: isOpen("fold-focus") ? beamedUav(feeds.beams.data) : null,
@@ -109,6 +111,8 @@ function take(name) {
   if (name === "uavs" && !isFilled) fillCharts();
   const now = performance.now();
   const { uavs, beams } = feeds;
+  if (name === "uavs" && uavs.data.valid_at) outage.noteUavs(uavs.data.valid_at, now);
+  if (name === "status") outage.noteStatus(feeds.status.data, now);
   const together = Math.abs(uavs.answeredAt - (beams.answeredAt ?? -Infinity)) < SAME_BEAT_MS;
   const isFresh = uavs.answeredAt !== null && uavs.answeredAt > (history.newest?.at ?? -1);
   if (isFresh && (together || !beams.isTrusted(now))) {
@@ -123,7 +127,7 @@ function take(name) {
 function markAges(now, all = false) {
   const root = document.documentElement;
   for (const feed of Object.values(feeds)) {
-    const past = !timebar.isLive && feed.name !== "readyz" && feed.name !== "recordings";
+    const past = !timebar.isLive && feed.name !== "recordings";
     const lost = all || (feed.data !== null && !feed.isTrusted(now));
     toggleAttribute(root, `data-${feed.name}-lost`, lost && !past);
     toggleAttribute(root, `data-${feed.name}-late`, feed.health(now) === "late" && !past);
@@ -169,7 +173,6 @@ function showAll(link, now) {
   const { status } = feeds;
   showConnection(link, feeds.uavs.data?.valid_at,
     status.isTrusted(now) ? status.data.health?.behind : null);
-  showReadiness(feeds.readyz.data);
   showRecordings(feeds.recordings.data);
   alarm.watch(feeds.uavs.data?.uavs ?? [], link.state === "lost" && !link.never, now);
   timebar.draw(now);
@@ -195,6 +198,7 @@ function believed(feed, link, now) {
 function showMoment(view, link, now) {
   if (feeds.status.data) rejections.note(feeds.status.data.rejected ?? {}, now);
   showStatus(view.status);
+  showReadiness(view.status);
   rejections.show(view.status?.rejected, timebar.isLive ? now : view.at);
   showBeams(view.answer);
   showLinks(view.links);

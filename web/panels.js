@@ -66,13 +66,12 @@ export function showConnection(link, lastStamp, behind = null) {
   else $("banner").hidden = true;
 }
 
-export function showReadiness(answer) {
-  const reasons = (answer?.reasons ?? []).join("; ");
-  if (!answer) setChip($("readiness"), "wait", `readiness ${format.UNKNOWN}`);
-  else if (answer.ready) setChip($("readiness"), "good", "ready");
-  else setChip($("readiness"), "warn", "not ready");
-  setNotice($("reasons"), answer && !answer.ready
-    ? `Not ready: ${reasons || "no reason given"}` : "");
+export function showReadiness(status) {
+  const reasons = status?.not_ready ?? [];
+  if (!status) setChip($("readiness"), "wait", `readiness ${format.UNKNOWN}`);
+  else if (reasons.length) setChip($("readiness"), "warn", "not ready");
+  else setChip($("readiness"), "good", "ready");
+  setNotice($("reasons"), reasons.length ? `Not ready: ${reasons.join("; ")}` : "");
 }
 
 // --- status -------------------------------------------------------------------------------------

@@ -73,7 +73,7 @@ export class TimeBar {
     setText($("time-mode"), isLive ? "now" : `−${format.duration(agoS)}`);
     $("past").hidden = isLive;
     if (isLive) return;
-    setText($("past-detail"), `Everything except connection and readiness is from `
+    setText($("past-detail"), `Everything except the connection is from `
       + `${format.clock(this.shown.stamp)}, ${format.duration(agoS)} ago. Space: back to live.`);
   }
 }

@@ -6,6 +6,8 @@ import { $, setText } from "./dom.js";
 const KEY = "companion-token";
 let token = stored();
 let awake = () => {};
+let asked = null; // promise of the answer to whether a token is needed
+let lock = null; // function that lets requests be sent; null: they may be
 
 /** Set up the dialog; `wake` is called when a token was entered. */
 export function setUpToken(wake) {
@@ -18,12 +20,39 @@ export function setUpToken(wake) {
     keep(given);
     $("token-input").value = "";
     $("token").close();
+    lock?.();
     awake();
   });
 }
 
+/** Whether the service needs a token and none was entered yet. */
+export const isLocked = () => lock !== null;
+
+/** Wait until requests may be sent: an open path says whether they need a token. */
+export function unlocked() {
+  asked ??= ask();
+  return asked;
+}
+
+async function ask() {
+  let needed = false;
+  try {
+    const answer = await fetch("/healthz", { cache: "no-store" });
+    needed = answer.ok && (await answer.json()).needs_token === true;
+  } catch {
+    // the service cannot be reached: the requests that follow find that out
+  }
+  if (!needed || token !== null) return;
+  await new Promise((resolve) => {
+    lock = resolve;
+    demand(false);
+  });
+  lock = null;
+}
+
 /** `fetch` with the token, if there is one. A 401 opens the dialog with the problem. */
 export async function authorised(path, options = {}) {
+  await unlocked();
   const tried = token;
   const headers = { ...options.headers };
   if (tried) headers.Authorization = `Bearer ${tried}`;

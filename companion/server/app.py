@@ -79,7 +79,8 @@ def create_app(
     large = LargeAnswers(node, work_slots)
     stream, page = Stream(node, large), PageFiles(web_directory())
     wrong_tokens = WrongTokens(node)
-    _health_routes(app, node, large, NodeMetrics(node, stream, wrong_tokens))
+    node_metrics = NodeMetrics(node, stream, wrong_tokens)
+    _health_routes(app, node, large, node_metrics, needs_token=bool(token))
     _state_routes(app, node, large)
     beam_routes.add(app, node, work_slots)
     file_routes.add(app, node, large)
@@ -112,11 +113,11 @@ def create_app(
 
 
 def _health_routes(
-    app: FastAPI, node: Node, large: LargeAnswers, node_metrics: NodeMetrics
+    app: FastAPI, node: Node, large: LargeAnswers, node_metrics: NodeMetrics, *, needs_token: bool
 ) -> None:
     @app.get("/healthz", summary="Liveness of the process", responses=answers(models.Health))
     async def healthz() -> Response:
-        return answer({"status": "ok"})
+        return answer({"status": "ok", "needs_token": needs_token})
 
     @app.get(
         "/register_service",

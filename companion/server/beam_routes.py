@@ -75,10 +75,13 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
     async def pattern(
         cut: Cut = "azimuth", points: Points = 361, uav: Only = None, lead_ms: LeadMs = 0.0
     ) -> Response:
+        # A UAV that has lost its beam a moment ago is no mistake of the client.
+        is_tracked = uav is not None and uav in pipeline.tracker.uavs
+
         def make(update: Update) -> bytes:
             served = update.beams.uavs
-            if uav is not None and uav not in served:
-                raise HTTPException(404, f"no beam for {uav!r}")
+            if uav is not None and uav not in served and not is_tracked:
+                raise HTTPException(404, f"no UAV {uav!r} is tracked")
             shown = 1 if uav is not None else len(served)
             if shown * points > ANGLES_MAX:
                 wanted = f"{shown} beams at {points} angles"

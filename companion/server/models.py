@@ -40,6 +40,7 @@ class Health:
     """Liveness of the process."""
 
     status: Annotated[Literal["ok"], Meaning("ok: the process answers")]
+    needs_token: Annotated[bool, Meaning("whether other paths need a bearer token")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -74,6 +74,10 @@ class Status:
     uptime_s: Annotated[float, Meaning("time since the start")]
     center: Annotated[Center, Meaning("the carrier of the array")]
     health: Annotated[Headline, Meaning("number of good, weak and missing links")]
+    not_ready: Annotated[
+        list[str],
+        Meaning("why the service is not ready; empty if it is", example=["no link is up"]),
+    ]
     links: Annotated[list[LinkState], Meaning("the links, in the order of the settings")]
     recording: Annotated[RecordingStatus, Meaning("the recording that is being written")]
     arrival_lag: Annotated[
@@ -160,6 +164,7 @@ def status(node: Node, version: str) -> Json:
         uptime_s=node.uptime_s(),
         center=center_state.center(pipeline, now_ns),
         health=summary(node, now_ns),
+        not_ready=node.unfit(),
         links=[link_state.link(one, senders.link_share(one.url), now_ns) for one in node.links()],
         recording=node.recording(),
         arrival_lag=node.arrival_lag.seen(now_ns),

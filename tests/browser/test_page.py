@@ -247,10 +247,37 @@ def test_lost_service_is_marked_and_recovers(open_page: Any, start_own_demo: Any
     page.get_by_text("CONNECTION LOST", exact=True).wait_for(timeout=HANG_MS)
     assert time.monotonic() - killed < 4
     assert page.evaluate(style.format("textDecorationLine")) == "line-through"
+    headline = "getComputedStyle(document.querySelector('#headline')).textDecorationLine"
+    assert page.evaluate(headline) == "line-through"
+    last = page.evaluate("document.querySelector('#banner-detail').textContent")
     start_own_demo(port=int(node.url.rpartition(":")[2]))
     page.locator("#banner").wait_for(state="hidden", timeout=HANG_MS)
+    page.get_by_text("SERVICE RESTARTED").wait_for(timeout=HANG_MS)
+    said = re.search(r"No data from (\S+) to \S+ UTC \((\d+)\ss\)", page.inner_text("#outage"))
+    assert said and said[1] in last and int(said[2]) >= 3
+    page.locator("#outage-seen").click()
+    page.locator("#outage").wait_for(state="hidden", timeout=HANG_MS)
+    assert page.evaluate(headline) == "none"
     page.get_by_text("connected", exact=True).wait_for(timeout=HANG_MS)
     wait_for_value(page, style.format("textDecorationLine"), "none")
+
+
+def test_console_is_clean_while_the_service_starts(open_page: Any, tmp_path: Path) -> None:
+    """Without a carrier the service is not ready and has no beams, which is no error."""
+    options = ("--center", "99:1", "--listen", "127.0.0.1:0", "--record", str(tmp_path))
+    node = Node("run", "--link", "udpin:127.0.0.1:0", *options)
+    try:
+        page = open_page("about:blank", DESKTOP)
+        failed: list[str] = []
+        page.on("response", lambda one: one.ok or failed.append(f"{one.status} {one.url}"))
+        page.goto(node.url)
+        page.get_by_text("not ready", exact=True).wait_for()
+        page.get_by_text("No UAV has reported a position.").wait_for()
+        for path in ("/v1/links", "/v1/events", "/v1/status"):
+            page.wait_for_event("response", lambda one, path=path: one.url.endswith(path))
+        assert failed == []
+    finally:
+        end(node.process)
 
 
 def test_page_asks_for_the_token_and_stores_it(
@@ -266,6 +293,11 @@ def test_page_asks_for_the_token_and_stores_it(
         page = open_page(url, DESKTOP, loses_service=True)
         field = page.get_by_label("Bearer token")
         field.wait_for()
+        page.get_by_text("token needed", exact=True).wait_for()
+        statuses = page.evaluate(
+            "performance.getEntriesByType('resource').map(one => one.responseStatus)"
+        )
+        assert statuses and max(statuses) < 400  # nothing is refused before a token is entered
         assert not page.locator("#token-problem").is_visible()
         field.fill("wrong")
         page.get_by_role("button", name="Connect").click()

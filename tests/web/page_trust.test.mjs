@@ -8,7 +8,7 @@ import { readPage } from "./browser.mjs";
 import { uav } from "./service.mjs";
 import { BEAT_MS, openPage } from "./whole_page.mjs";
 
-const FEEDS = ["beams", "events", "fleet", "links", "pattern", "readyz", "status", "uavs", "weights"];
+const FEEDS = ["beams", "events", "fleet", "links", "pattern", "status", "uavs", "weights"];
 
 test("while the service responds, nothing is marked and no banner is shown", async () => {
   const page = await openPage();

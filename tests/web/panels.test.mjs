@@ -72,10 +72,9 @@ test("a fault of the page itself is reported", () => {
 test("readiness is shown, with the reason if not ready", () => {
   const { text, level } = openPanels();
   for (const [answer, chip, wanted, reasons] of [
-    [null, "readiness –", "wait", null], [{ ready: true, reasons: [] }, "ready", "good", null],
-    [{ ready: false, reasons: ["no link is up", "no carrier"] }, "not ready", "warn",
+    [null, "readiness –", "wait", null], [{ not_ready: [] }, "ready", "good", null],
+    [{ not_ready: ["no link is up", "no carrier"] }, "not ready", "warn",
       "Not ready: no link is up; no carrier"],
-    [{ ready: false }, "not ready", "warn", "Not ready: no reason given"],
   ]) {
     panels.showReadiness(answer);
     assert.deepEqual([text("readiness"), level("readiness"), text("reasons")],

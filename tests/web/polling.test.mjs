@@ -28,14 +28,14 @@ const timesOf = (service, place) =>
 
 test("all feeds are requested at once, then each at its rate, five per second in all", async () => {
   const { time, service, answered } = await startPage();
-  assert.deepEqual(answered.sort(), ["beams", "events", "links", "pattern", "readyz",
-    "recordings", "status", "uavs", "weights"]);
+  assert.deepEqual(answered.sort(), ["beams", "events", "links", "pattern", "recordings",
+    "status", "uavs", "weights"]);
   await time.advance(60 * BEAT_MS); // until every feed is at its own rate
   const since = time.now;
   await time.advance(60 * BEAT_MS);
   const counts = ["/v1/uavs", "/v1/beams", "/v1/pattern", "/v1/beams/weights", "/v1/status",
-    "/readyz", "/v1/links", "/v1/events", "/v1/recordings"].map((place) => service.count(place, since + 1));
-  assert.deepEqual(counts, [60, 60, 60, 15, 15, 20, 10, 10, 3]);
+    "/v1/links", "/v1/events", "/v1/recordings"].map((place) => service.count(place, since + 1));
+  assert.deepEqual(counts, [60, 60, 60, 15, 15, 10, 10, 3]);
   const all = counts.reduce((sum, one) => sum + one);
   assert.ok(all / (60 * BEAT_MS / 1000) <= 5);
 });
@@ -109,13 +109,6 @@ test("an empty list is a valid response, a missing one is not", async () => {
   service.answers["/v1/uavs"] = { valid_at: "2026-11-20T13:00:09Z" };
   await time.advance(BEAT_MS);
   assert.equal(feeds.uavs.failures, 1);
-});
-
-test("not being ready is a valid response", async () => {
-  const { feeds } = await startPage({
-    answers: { "/readyz": { status: 503, body: '{"ready": false, "reasons": ["no link"]}' } },
-  });
-  assert.deepEqual(feeds.readyz.data, { ready: false, reasons: ["no link"] });
 });
 
 test("an absent service is polled every two seconds only", async () => {

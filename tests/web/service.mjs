@@ -66,6 +66,7 @@ export const statusAnswer = (fields = {}) => ({
   center: { source: "5:1", fixed: false, lat_deg: LAT, lon_deg: LON, alt_m: 450, heading_deg: 90,
     attitude_deg: null, age_s: 0.1, bound_m: 1, unfit: null, last_known: null },
   health: { good: 1, weak: 0, none: 0, headline: "1 of 1 links good", behind: null },
+  not_ready: [],
   links: [], recording: { state: "off", file: null, bytes: 0, messages: 0, dropped: 0 },
   arrival_lag: { newest_s: 0.0002, p95_s: 0.001, max_s: 0.004, behind: false },
   rates: { frames_hz: 120, updates_hz: 20 }, frames: 1000, updates: 100, rejected: {},
@@ -145,11 +146,11 @@ export class Service {
         return { uavs: ids, re: [ids.map(() => 1), ids.map(() => 0)],
           im: [ids.map(() => 0), ids.map(() => 1)] };
       case "/v1/status": return { ...this.status, time: stamp };
-      case "/readyz": return { ready: true, reasons: [] };
-      case "/v1/links": return { valid_at: stamp, links: [linkAnswer()] };
+      case "/v1/links": return { valid_at: stamp, links: [linkAnswer({ components: this.uavs })] };
       case "/v1/events":
         return { events: [{ at: stampAt(0), severity: "info", text: "1:1 is live" }] };
       case "/v1/recordings": return { recordings: [] };
+      case "/healthz": return { status: "ok", needs_token: false };
       default: return { status: 404, body: "{}" };
     }
   }

@@ -29,11 +29,11 @@ const isListOf = (list, key) =>
  */
 const FEEDS = {
   uavs: {
-    path: "/v1/uavs", beats: 1, what: "UAVs",
+    path: "/v1/uavs?rounded=true", beats: 1, what: "UAVs",
     stamp: (data) => data.valid_at, accepts: (data) => isListOf(data?.uavs, "id"),
   },
   beams: {
-    path: "/v1/beams", beats: 1, what: "beams",
+    path: "/v1/beams?rounded=true", beats: 1, what: "beams",
     stamp: (data) => data.valid_at, accepts: (data) => isListOf(data?.beams, "uav"),
   },
   pattern: {
@@ -41,7 +41,7 @@ const FEEDS = {
     beats: 1, what: "pattern", accepts: (data) => Array.isArray(data?.patterns),
   },
   weights: {
-    path: ({ beamed }) => beamed && "/v1/beams/weights",
+    path: ({ beamed }) => beamed && `/v1/beams/weights?uav=${encodeURIComponent(beamed)}`,
     beats: 4, offset: 1, what: "weights",
     accepts: (data) => Array.isArray(data?.re) && Array.isArray(data?.im),
   },

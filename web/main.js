@@ -24,6 +24,7 @@ import { loadMeanings } from "./meanings.js";
 import { Outage } from "./outage.js";
 import { PlanView } from "./plan.js";
 import { showSettings } from "./settings.js";
+import { Space } from "./space.js";
 import { UavTable } from "./table.js";
 import { setUpTheme } from "./theme.js";
 import { TimeBar } from "./timebar.js";
@@ -339,12 +340,11 @@ const fitAll = () => control(() => plan.fitAll());
 const TURN_PX = 40; // rotation of the 3D view by a key, as pixels of a drag
 const turn = (dx, dy) => control(() => plan.turn(dx * TURN_PX, dy * TURN_PX));
 
-/** Switch between plan and 3D view; the 3D code is loaded on first use. */
-async function toggleSpace() {
+/** Switch between plan and 3D view. */
+function toggleSpace() {
   if (plan.space) {
     plan.lookFrom(null);
   } else {
-    const { Space } = await import("./space.js");
     plan.lookFrom(new Space());
   }
   refresh();

@@ -1,6 +1,6 @@
 // The 3D view, on the plan view's own canvas and with its gestures: a perspective of the ground with
 // its grid, the carrier and its array, beams as cones, UAVs with their bounds, and a line from each
-// UAV down to the ground. Loaded on first use. No terrain is known: the ground is a level plane
+// UAV down to the ground. No terrain is known: the ground is a level plane
 // below the lowest UAV and the carrier, and the picture says how far below the carrier it is.
 
 import * as format from "./format.js";

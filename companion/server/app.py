@@ -40,6 +40,7 @@ from companion.views.state import Node
 CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
 DRAWN_POLICY: Final = CONTENT_POLICY + b"; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
 """Content security policy of ``/docs``: Swagger UI uses embedded images and inline styles."""
+Rounded = beam_routes.Rounded
 UavId = Annotated[str, PathParameter(description=UAV_FORMS)]
 DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
 
@@ -164,9 +165,11 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     async def status() -> Response:
         return answer(state.status(node, companion.__version__))
 
-    @app.get("/v1/uavs", summary="Every UAV as it is now", responses=answers(uav_state.Uavs, 503))
-    async def uavs() -> Response:
-        return json_response((await large.uavs()).whole)
+    @app.get(
+        "/v1/uavs", summary="Every UAV as it is now", responses=answers(uav_state.Uavs, 422, 503)
+    )
+    async def uavs(rounded: Rounded = False) -> Response:
+        return json_response((await large.uavs(is_rounded=rounded)).whole)
 
     @app.get(
         "/v1/uavs/{uav}",
@@ -278,12 +281,14 @@ class _Edge:
 
         async def with_policy(message: Message) -> None:
             if message["type"] == "http.response.start":
-                message["headers"] = [
+                headers = [
                     *message.get("headers", []),
                     (b"content-security-policy", policy),
                     (b"x-content-type-options", b"nosniff"),
-                    (b"cache-control", b"no-cache"),
                 ]
+                if not any(name == b"cache-control" for name, _ in headers):
+                    headers.append((b"cache-control", b"no-cache"))
+                message["headers"] = headers
             await send(message)
 
         await self._app(scope, receive, with_policy)

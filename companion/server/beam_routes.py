@@ -1,6 +1,7 @@
 """The routes ``/v1/beams``, ``/v1/beams/weights`` and ``/v1/pattern``, computed on request."""
 
 import re
+from dataclasses import replace
 from typing import Annotated, Any, Final
 
 from fastapi import FastAPI, HTTPException, Query, Request
@@ -10,8 +11,8 @@ from companion.server import models
 from companion.server.moments import Moments
 from companion.server.responses import BodyResponse, answers, encode, json_response, refusals
 from companion.server.work_slots import WorkSlots
-from companion.values import Update, UserError, WeightFormat
-from companion.views import beam_state, weight_formats
+from companion.values import BeamSet, Update, UserError, WeightFormat
+from companion.views import as_json, beam_state, weight_formats
 from companion.views import pattern as pattern_view
 from companion.views.state import Node
 
@@ -23,6 +24,9 @@ Cut = Annotated[
 ]
 Points = Annotated[int, Query(ge=2, le=3601, description="angles along the cut")]
 Only = Annotated[str | None, Query(description="SYSID:COMPID; default: every beam")]
+Rounded = Annotated[
+    bool, Query(description="round for a display: coordinates to 7 decimals, other numbers to 3")
+]
 _JSON = {"schema": {"$ref": "#/components/schemas/Weights"}}
 _BINARY: dict[str, Any] = {"schema": {"type": "string", "format": "binary"}}
 
@@ -37,11 +41,13 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
         summary="The beams, applied lead_ms from now",
         responses=answers(beam_state.Beams, 422, 503),
     )
-    async def beams(lead_ms: LeadMs = 0.0) -> Response:
+    async def beams(lead_ms: LeadMs = 0.0, rounded: Rounded = False) -> Response:
         def make(update: Update) -> bytes:
-            return encode(beam_state.beams(pipeline, equipment, update, 0.0, lead_ms))
+            shown = beam_state.beams(pipeline, equipment, update, 0.0, lead_ms)
+            return encode(as_json.rounded(shown) if rounded else shown)
 
-        return json_response(await moments.made(lead_ms, "beams", make, is_usual=True))
+        what = "beams", rounded
+        return json_response(await moments.made(lead_ms, what, make, is_usual=True))
 
     @app.get(
         "/v1/beams/weights",
@@ -49,7 +55,7 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
         response_class=Response,
         responses=_weight_answers(),
     )
-    async def weights(request: Request, lead_ms: LeadMs = 0.0) -> Response:
+    async def weights(request: Request, lead_ms: LeadMs = 0.0, uav: Only = None) -> Response:
         form = accepted(request.headers.get("accept", "*/*"))
         if form is None:
             raise HTTPException(
@@ -57,12 +63,13 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
             )
 
         def make(update: Update) -> tuple[bytes, dict[str, str]]:
-            made = update.beams
+            made = update.beams if uav is None else _only(update.beams, uav)
             body = weight_formats.encode(form, made, pipeline, equipment, lead_ms)
             return body, {**weight_formats.headers(pipeline, made), "vary": "accept"}
 
         try:
-            body, headers = await moments.made(lead_ms, form, make, is_usual=True)
+            what, is_usual = (form, uav), uav is None
+            body, headers = await moments.made(lead_ms, what, make, is_usual=is_usual)
         except UserError as error:  # the device cannot apply the current beams
             raise HTTPException(409, str(error)) from error
         return BodyResponse(body, media_type=form.media_type, headers=headers)
@@ -93,6 +100,12 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
             )
 
         return json_response(await moments.made(lead_ms, (cut, points, uav), make))
+
+
+def _only(made: BeamSet, uav: str) -> BeamSet:
+    kept = [i for i, one in enumerate(made.uavs) if one == uav]
+    beams = tuple(made.beams[i] for i in kept)
+    return replace(made, beams=beams, weights=made.weights[:, kept])
 
 
 def _weight_answers() -> dict[int | str, dict[str, Any]]:

@@ -18,7 +18,7 @@ from companion.server.shared_work import SharedWork
 from companion.server.threads import in_thread
 from companion.server.work_slots import WorkSlots
 from companion.views import uav_state
-from companion.views.as_json import Json, Utc, as_json, rfc3339
+from companion.views.as_json import Json, Utc, as_json, rfc3339, rounded
 from companion.views.state import Node
 from companion.views.uav_state import KnownUav, Overview
 
@@ -89,10 +89,12 @@ class LargeAnswers:
 
         return await self._shared.run(what, work)
 
-    async def uavs(self) -> UavParts:
-        """Return the answer of ``/v1/uavs``, encoded."""
-        utc_ns = self._node.pipeline.utc_ns
-        return await self.of_uavs("uavs", lambda overview: partial(_parts, overview, utc_ns))
+    async def uavs(self, *, is_rounded: bool = False) -> UavParts:
+        """Return the answer of ``/v1/uavs``, encoded; ``is_rounded`` as in ``rounded``."""
+        utc_ns, show = self._node.pipeline.utc_ns, rounded if is_rounded else _as_is
+        return await self.of_uavs(
+            ("uavs", is_rounded), lambda overview: partial(_parts, overview, utc_ns, show=show)
+        )
 
     def _makes_beams(self) -> bool:
         return self._node.pipeline.aiming is not None
@@ -112,9 +114,15 @@ class LargeAnswers:
                 return uav_state.overview(self._node, known, self._node.now_ns())
 
 
-def _parts(overview: Overview, utc_ns: Utc, way: GivingWay) -> UavParts:
+def _as_is(content: Json) -> Json:
+    return content
+
+
+def _parts(
+    overview: Overview, utc_ns: Utc, way: GivingWay, show: Callable[[Json], Json] = _as_is
+) -> UavParts:
     states = way.between(overview.states())
-    parts = {one.id: encode(as_json(one, utc_ns)) for one in states}
+    parts = {one.id: encode(show(as_json(one, utc_ns))) for one in states}
     made = UavParts(rfc3339(utc_ns(overview.now_ns)), parts)
     assert made.whole  # joined here: that is megabytes
     return made

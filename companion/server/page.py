@@ -1,5 +1,8 @@
 """The dashboard's files: each is read once, and answered from memory.
 
+The page itself, its script and its style sheet are joined (``page_bundle``). Their names change
+with their content, so a browser keeps them; every other file is asked for again, by its ETag.
+
 Files that are read for each request, on threads, would let any client delay the beams: no token is
 needed for them.
 """
@@ -17,8 +20,11 @@ from starlette.types import Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 import companion
+from companion.server.page_bundle import bundled
+from companion.server.responses import BodyResponse
 
 INDEX: Final = "/index.html"
+FOR_EVER: Final = "public, max-age=31536000, immutable"
 
 
 def web_directory() -> Path:
@@ -34,6 +40,12 @@ class _File:
     media_type: str | None
     etag: str
 
+    @classmethod
+    def of(cls, path: str, content: bytes) -> "_File":
+        """Return a file with its type by its name, and the tag of its content."""
+        digest = hashlib.sha256(content).hexdigest()[:32]
+        return cls(content, mimetypes.guess_type(path)[0], f'W/"{digest}"')
+
 
 class PageFiles:
     """ASGI application that answers GET with a file; ``paths`` are those of all files."""
@@ -44,8 +56,10 @@ class PageFiles:
             for file in root.rglob("*")
             if file.is_file()
         }
-        self._read: dict[str, _File] = {}
-        self.paths = frozenset({"/", *self._files})
+        joined = bundled(root)
+        self._read = {path: _File.of(path, content) for path, content in joined.items()}
+        self._kept = frozenset(joined) - {INDEX}
+        self.paths = frozenset({"/", *self._files, *joined})
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
@@ -61,16 +75,13 @@ class PageFiles:
             raise HTTPException(405, headers={"allow": "GET, HEAD"})
         found = self._find(INDEX if path == "/" else path)
         headers = {"etag": found.etag}
+        if path in self._kept:
+            headers["cache-control"] = FOR_EVER
         if found.etag in Headers(scope=scope).get("if-none-match", ""):
             return Response(status_code=304, headers=headers)
-        return Response(found.content, media_type=found.media_type, headers=headers)
+        return BodyResponse(found.content, media_type=found.media_type, headers=headers)
 
     def _find(self, path: str) -> _File:
         if path not in self._read:
-            content = self._files[path].read_bytes()
-            self._read[path] = _File(
-                content,
-                mimetypes.guess_type(path)[0],
-                f'"{hashlib.sha256(content).hexdigest()[:32]}"',
-            )
+            self._read[path] = _File.of(path, self._files[path].read_bytes())
         return self._read[path]

@@ -13,10 +13,12 @@ from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.openapi.utils import get_openapi
 from fastapi.responses import JSONResponse, Response
+from starlette.datastructures import Headers
 from starlette.exceptions import HTTPException
 from starlette.types import Receive, Scope, Send
 
 from companion.server import models
+from companion.server.compression import LEAST_BYTES, SharedCompression, is_text, preferred
 from companion.server.giving_way import GivingWay
 from companion.views.as_json import Json
 
@@ -64,11 +66,12 @@ class BodyResponse(Response):
     """Response whose body is sent a piece at a time, as fast as the client takes it.
 
     One call with a megabyte takes milliseconds in the kernel, and copies what the client does not
-    take at once.
+    take at once. Texts are compressed if the client accepts that.
     """
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the response; see ASGI."""
+        await self._compress(Headers(scope=scope).get("accept-encoding", ""))
         body = memoryview(self.body)
         if len(body) <= PIECE_BYTES:
             await super().__call__(scope, receive, send)
@@ -79,6 +82,19 @@ class BodyResponse(Response):
             piece, more = bytes(body[start : start + PIECE_BYTES]), start + PIECE_BYTES < len(body)
             await send({"type": "http.response.body", "body": piece, "more_body": more})
             await asyncio.sleep(0)
+
+    async def _compress(self, accepted: str) -> None:
+        if len(self.body) < LEAST_BYTES or not is_text(self.media_type):
+            return
+        self.headers.add_vary_header("accept-encoding")
+        encoding = preferred(accepted)
+        if encoding is not None:
+            self.body = await _compression.of(bytes(self.body), encoding)
+            self.headers["content-encoding"] = encoding
+            self.headers["content-length"] = str(len(self.body))
+
+
+_compression: Final = SharedCompression()
 
 
 def answer(content: object, status: int = 200) -> Response:

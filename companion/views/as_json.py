@@ -49,6 +49,24 @@ def as_json(item: Any, utc_ns: Utc) -> Json:
     return shown
 
 
+COORDINATE_DIGITS: Final = 7  # decimals of a rounded latitude or longitude, about a centimetre
+DIGITS: Final = 3  # decimals of any other rounded number
+
+
+def rounded(content: Any, digits: int = DIGITS) -> Any:
+    """Return JSON with numbers rounded to what a display can show: they compress to a third."""
+    if isinstance(content, float):
+        return round(content, digits)
+    if isinstance(content, dict):
+        return {
+            key: rounded(one, COORDINATE_DIGITS if key in ("lat_deg", "lon_deg") else digits)
+            for key, one in content.items()
+        }
+    if isinstance(content, list):
+        return [rounded(one, digits) for one in content]
+    return content
+
+
 def name_in_json(name: str) -> str:
     """Return the name of a value in the API, from its name and unit inside the program."""
     return "at" if name == "t_ns" else in_degrees(name).removesuffix("_ns")

@@ -56,7 +56,7 @@ def join(node: Node, page: Any) -> None:
         route.fulfill(json=answer)
 
     ids = [uav["id"] for uav in node.json("/v1/uavs")["uavs"]]
-    page.route("**/v1/uavs", uavs)
+    page.route("**/v1/uavs?*", uavs)
     page.route("**/v1/fleet", lambda way: way.fulfill(json=fleet(node.json("/v1/fleet"), ids)))
     page.route("**/v1/status", lambda way: way.fulfill(
         json=node.json("/v1/status") | {"node": "north"}))  # fmt: skip

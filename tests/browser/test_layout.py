@@ -76,7 +76,7 @@ def many(node: Node, page: Any, number: int) -> None:
         route.fulfill(json=crowd(node.json(path), key, name, number))
 
     for path, key, name in (("/v1/uavs", "uavs", "id"), ("/v1/beams", "beams", "uav")):
-        page.route(f"**{path}", functools.partial(fulfil, path, key, name))
+        page.route(f"**{path}?rounded=true", functools.partial(fulfil, path, key, name))
 
 
 @pytest.mark.parametrize(
@@ -131,7 +131,7 @@ def test_fold_is_remembered_and_what_it_hides_is_not_requested(demo: Node, open_
     page.reload()
     page.locator("tbody tr").nth(3).wait_for(state="attached", timeout=HANG_MS)
     for _ in range(4):  # beats, of which each would bring a pattern
-        page.wait_for_event("response", lambda one: one.url.endswith("/v1/beams"))
+        page.wait_for_event("response", lambda one: "/v1/beams?" in one.url)
     assert page.locator("#fold-focus:not([open])").count() == 1
     assert not {"/v1/pattern", "/v1/beams/weights"} & set(paths)
     page.locator("#fold-focus summary").click()
@@ -192,7 +192,7 @@ def test_every_column_is_visible_on_a_desktop_in_any_state(demo: Node, open_page
         route.fulfill(json=answer)
 
     page = open_page("about:blank", SIZES["desktop"], loses_service=True)
-    page.route("**/v1/uavs", fulfil)
+    page.route("**/v1/uavs?*", fulfil)
     page.goto(demo.url)
     page.locator("tr[data-state=coasting]").nth(3).wait_for(state="attached", timeout=HANG_MS)
     columns = page.evaluate(

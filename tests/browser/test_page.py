@@ -276,6 +276,7 @@ def test_console_is_clean_while_the_service_starts(open_page: Any, tmp_path: Pat
         for path in ("/v1/links", "/v1/events", "/v1/status"):
             page.wait_for_event("response", lambda one, path=path: one.url.endswith(path))
         assert failed == []
+        page.close()  # before the service ends
     finally:
         end(node.process)
 
@@ -330,3 +331,34 @@ def test_replay_is_labelled_on_the_page(open_page: Any, cut_log: Path) -> None:
         wait_for_uavs(page)
         process.terminate()
         process.communicate(timeout=HANG_S)
+
+
+FIRST_LOAD_REQUESTS = 20
+FIRST_LOAD_BYTES = 120_000
+
+
+def test_first_load_takes_few_requests_and_bytes(demo: Node, open_page: Any) -> None:
+    page = open_page("about:blank", DESKTOP)
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(demo.url)
+    wait_for_uavs(page)
+    page.locator("#recordings-panel").wait_for(timeout=HANG_MS)
+    page.locator("#series-key li").nth(3).wait_for(timeout=HANG_MS)
+    files = [url for url in asked if "/v1/" not in url]
+    firsts = {url.partition("?")[0] for url in asked}
+    assert len(files) <= 8 and len(firsts) <= FIRST_LOAD_REQUESTS, asked
+    took = page.evaluate(
+        "performance.getEntriesByType('resource').map(one => [one.name, one.encodedBodySize])"
+    )
+    sizes = {url.partition("?")[0]: size for url, size in took}
+    assert sum(sizes.values()) <= FIRST_LOAD_BYTES, sizes
+    before = len(asked)
+    page.reload()
+    wait_for_uavs(page)
+    again = [url for url in asked[before:] if re.search(r"/page-\w+\.(css|js)$", url)]
+    kept = page.evaluate(
+        "performance.getEntriesByType('resource').filter(one => /page-/.test(one.name))"
+        ".map(one => one.transferSize)"
+    )
+    assert len(again) == 2 and kept == [0, 0]  # from the browser's cache

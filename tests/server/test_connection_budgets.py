@@ -55,7 +55,7 @@ async def answered(client: Client) -> bool:
     writer.write(get("/healthz"))
     with contextlib.suppress(asyncio.IncompleteReadError, ConnectionError):
         head = await asyncio.wait_for(reader.readuntil(b"\r\n\r\n"), HANG_S)
-        await reader.readexactly(len(b'{"status":"ok"}'))
+        await reader.readexactly(len(b'{"status":"ok","needs_token":false}'))
         return head.startswith(b"HTTP/1.1 200 OK")
     return False
 

@@ -1,9 +1,9 @@
-// The scene in space: a perspective with a ground, on the plan's canvas, loaded when it is asked for.
+// The scene in space: a perspective with a ground, on the plan's canvas.
 
 import assert from "node:assert/strict";
 import { test } from "node:test";
 
-import { load, readPage } from "./browser.mjs";
+import { load } from "./browser.mjs";
 import { near } from "./near.mjs";
 import { CENTRE, openPlan } from "./plan_picture.mjs";
 import { array, beam, otherNode, uav } from "./service.mjs";
@@ -127,10 +127,4 @@ test("the convex hull contains all points and has no other corners", () => {
   const corners = [[0, 0], [4, 0], [4, 3], [0, 3]];
   assert.deepEqual(new Set(hull([[2, 1], ...corners, [1, 2], [2, 0]]).map(String)),
     new Set(corners.map(String)));
-});
-
-test("the 3D view is loaded on request and is small", () => {
-  assert.doesNotMatch(readPage("main.js"), /^import .*space\.js/m);
-  assert.match(readPage("main.js"), /await import\("\.\/space\.js"\)/);
-  assert.ok(readPage("space.js").length < 20_000);
 });

@@ -40,19 +40,6 @@ def node() -> str:
     return found
 
 
-def test_every_module_is_preloaded() -> None:
-    """Otherwise the browser discovers each module only after reading its importer."""
-    needed, asked = set[str](), ["main.js"]
-    while asked:
-        if (module := asked.pop()) not in needed:
-            needed.add(module)
-            text = (ROOT / "web" / module).read_text("utf-8")
-            asked += re.findall(r'^(?:import|export)\b[^;]*?"\./(\w+\.js)"', text, re.MULTILINE)
-    page = (ROOT / "web" / "index.html").read_text("utf-8")
-    told = re.findall(r'<link rel="modulepreload" href="(\w+\.js)">', page)
-    assert sorted(told) == sorted(needed - {"main.js"})
-
-
 @pytest.mark.timeout(600)  # for a hanging test
 def test_page_module_tests_pass(tmp_path: Path) -> None:
     tests = sorted(HERE.glob("*.test.mjs"))

@@ -49,7 +49,7 @@ export function turnBeams(service) {
   const { answer } = service;
   service.answer = (path) => {
     const found = answer.call(service, path);
-    for (const one of path === "/v1/beams" ? found.beams ?? [] : []) {
+    for (const one of path.split("?")[0] === "/v1/beams" ? found.beams ?? [] : []) {
       one.azimuth_deg = Math.round(service.seconds * 100) / 10;
     }
     return found;

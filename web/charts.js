@@ -52,7 +52,6 @@ function columns(moments, ids, of, now) {
 export class Charts {
   constructor(onPick) {
     Object.assign(this, { onPick, plots: [], ids: null, selected: null, drawnAt: -Infinity, pastAt: null });
-    this.past = []; // moments before this page was opened
     [this.spanS] = SPANS_S;
     for (const { id } of CHARTS) {
       new ResizeObserver(() => this.fit()).observe($(`chart-${id}`));
@@ -68,19 +67,6 @@ export class Charts {
 
   changeUnits() {
     setText($("innovation-unit"), units.length.name);
-    this.drawnAt = -Infinity;
-  }
-
-  /** Add the service's samples from before; `now`: arrival of its answer. */
-  fill(answer, now) {
-    const uavs = Object.entries(answer.uavs);
-    this.past = answer.at.map((stamp, i) => ({
-      at: now - (Date.parse(answer.valid_at) - Date.parse(stamp)),
-      byId: new Map(uavs.map(([id, of]) => [id,
-        { innovation_m: of.innovation_m[i], latency_s: of.latency_s[i] }])),
-      beams: uavs.map(([uav, of]) => ({ uav, pointing_bound_deg: of.pointing_bound_deg[i],
-        guaranteed_gain_db: of.guaranteed_gain_db[i] })),
-    }));
     this.drawnAt = -Infinity;
   }
 
@@ -100,11 +86,9 @@ export class Charts {
     Object.assign(this, { selected, pastAt, drawnAt: now, now });
     if (changed) this.build(ids, uavs.length);
     const begins = history.moments[0]?.at ?? Infinity;
-    const before = this.past.filter(({ at }) => at < begins);
-    const oldestS = (now - Math.min(now, before[0]?.at ?? begins)) / 1000;
+    const oldestS = (now - Math.min(now, begins)) / 1000;
     this.spanS = SPANS_S.find((spanS) => spanS >= oldestS) ?? SPANS_S.at(-1);
-    const moments = [...before, ...history.between(now - this.spanS * 1000, now)]
-      .filter(({ at }) => at >= now - this.spanS * 1000);
+    const moments = history.between(now - this.spanS * 1000, now);
     CHARTS.forEach(({ of }, i) => this.plots[i].plot.setData(columns(moments, ids, of, now)));
   }
 

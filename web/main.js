@@ -12,7 +12,7 @@ import { Folds, isOpen } from "./folds.js";
 import { FleetView, nodesAround, slimFleet } from "./fleet.js";
 import * as format from "./format.js";
 import { headlineOf, showHeadline, showTroubles, worstFirst } from "./health.js";
-import { History } from "./history.js";
+import { History, momentsOf } from "./history.js";
 import { setUpKeys } from "./keys.js";
 import { LastKnown, carrierOf, placedBy } from "./last_known.js";
 import { showEvents, showLinks, showRecordings } from "./lists.js";
@@ -40,7 +40,7 @@ const KEPT = ["beams", "pattern", "weights", "links", "events", "status", "fleet
 
 let selected = null;
 let faulted = false;
-let isFilled = false; // whether the charts have the samples from before
+let isFilled = false; // whether the samples from before were requested
 let gathering = null; // timer of the next refresh
 let shown = { at: -Infinity, healths: "" }; // time of the last refresh, and the feeds' state then
 
@@ -55,7 +55,7 @@ const focus = new Focus();
 const rejections = new Rejections();
 const timebar = new TimeBar(history, refresh);
 const alarm = new Alarm();
-const outage = new Outage();
+const outage = new Outage(fillHistory);
 const charts = new Charts((at) => timebar.showAt(at));
 const feeds = startPolling(() => ({
   beamed: isOpen("fold-focus") ? beamedUav(feeds.beams.data) : null,
@@ -96,20 +96,27 @@ function beamsAt(stamp) {
     .reduce((best, one) => (best && distance(best) <= distance(one) ? best : one), null);
 }
 
-/** Fill the charts with the service's samples from before this page was opened. */
-async function fillCharts() {
+/** Fill the history with the service's samples from before this page was opened, or of a gap. */
+async function fillHistory() {
+  const answer = await askOnce("/v1/history?rounded=true");
+  if (!Array.isArray(answer?.at) || !answer.carrier) return;
+  history.fill(momentsOf(answer, performance.now()));
+  charts.changeUnits(); // drawn again
+  refresh();
+}
+
+function begin() {
   isFilled = true;
   loadMeanings().then(() => {
     table.showLabels();
     refresh();
   });
-  const answer = await askOnce("/v1/history");
-  if (Array.isArray(answer?.at)) charts.fill(answer, performance.now());
+  fillHistory();
 }
 
 /** Process an answer. UAVs and beams of one beat are a moment of the history. */
 function take(name) {
-  if (name === "uavs" && !isFilled) fillCharts();
+  if (name === "uavs" && !isFilled) begin();
   const now = performance.now();
   const { uavs, beams } = feeds;
   if (name === "uavs" && uavs.data.valid_at) outage.noteUavs(uavs.data.valid_at, now);
@@ -165,7 +172,7 @@ function refresh() {
 
 function showAll(link, now) {
   const found = timebar.shown ?? liveView(now);
-  const carrier = carrierOf(found.status);
+  const carrier = found.carrier ?? carrierOf(found.status);
   const middle = last.middle(carrier, found.uavs);
   const uavs = found.uavs.map((uav) => placedBy(uav, middle));
   folds.makeRoom(uavs.length);

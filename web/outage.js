@@ -8,7 +8,9 @@ import * as format from "./format.js";
 const RESTART_MS = 2000; // a start that is later than the known one by more is another start
 
 export class Outage {
-  constructor() {
+  /** `onGap` is called when answers arrive again. */
+  constructor(onGap = () => {}) {
+    this.onGap = onGap;
     Object.assign(this, { last: null, startedAt: null, statusStamp: null, gap: null, since: null,
       hasRun: "" });
     $("outage-seen").addEventListener("click", () => {
@@ -21,6 +23,7 @@ export class Outage {
   noteUavs(stamp, now) {
     if (this.last !== null && now - this.last.at > LOST_MS) {
       Object.assign(this, { gap: { from: this.last.stamp, to: stamp }, since: null, hasRun: "" });
+      this.onGap();
     }
     this.last = { at: now, stamp };
     this.draw();

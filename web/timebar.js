@@ -73,7 +73,9 @@ export class TimeBar {
     setText($("time-mode"), isLive ? "now" : `−${format.duration(agoS)}`);
     $("past").hidden = isLive;
     if (isLive) return;
-    setText($("past-detail"), `Everything except the connection is from `
-      + `${format.clock(this.shown.stamp)}, ${format.duration(agoS)} ago. Space: back to live.`);
+    const what = this.shown.isSampled ? "From the service's samples of positions and links, one per"
+      + " second:" : "Everything except the connection is from";
+    setText($("past-detail"), `${what} ${format.clock(this.shown.stamp)}, ${
+      format.duration(agoS)} ago. Space: back to live.`);
   }
 }

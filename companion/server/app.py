@@ -216,15 +216,20 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
 
     @app.get(
         "/v1/history",
-        summary="Samples of the charts, one per second of the last five minutes",
-        responses=answers(series.History, 503),
+        summary="Samples of UAVs and carrier, one per second of the last five minutes",
+        responses=answers(series.History, 422, 503),
     )
-    async def history() -> Response:
+    async def history(rounded: Rounded = False) -> Response:
         def prepare() -> Make[bytes]:
             samples, now_ns = node.series.samples(), node.now_ns()
-            return lambda way: encode_in_parts(series.show(samples, now_ns, pipeline.utc_ns), way)
 
-        return json_response(await large.made("history", prepare))
+            def make(way: GivingWay) -> bytes:
+                shown = series.show(samples, now_ns, pipeline.utc_ns, is_rounded=rounded)
+                return encode_in_parts(shown, way, depth=3)
+
+            return make
+
+        return json_response(await large.made(("history", rounded), prepare))
 
     @app.get(
         "/v1/settings",

@@ -1,19 +1,25 @@
-"""Samples for the charts: one per second of every UAV, over the last minutes.
+"""Samples of the last minutes, for looking back: one per second of every UAV.
 
 An open page collects its own samples; these are for a page that has just been opened.
 """
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Any, Final
+
+import numpy as np
 
 from companion.pipeline.fold import Pipeline
+from companion.tracking.geodesy import LocalFrame
+from companion.values import FloatArray, Update
 from companion.values.described import Meaning, members
-from companion.views.as_json import Json, Utc, degrees, rfc3339
+from companion.views.as_json import COORDINATE_DIGITS, DIGITS, Json, Utc, degrees, rfc3339
 
 EVERY_NS: Final = 1_000_000_000  # least time between two samples
 SAMPLES: Final = 300  # samples kept: five minutes
 Column = list[float | None]
+Words = list[str | None]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -26,24 +32,57 @@ class UavHistory:
     innovation_m: Annotated[Column, Meaning("distance from the prediction to the newest report")]
     latency_s: Annotated[Column, Meaning("age of the newest report at its arrival")]
     guaranteed_gain_db: Annotated[Column, Meaning("least array gain wherever the UAV can be")]
+    state: Annotated[Words, Meaning("state of the track, by the age of its newest report")]
+    verdict: Annotated[Words, Meaning("whether the UAV's beam has the gain that the link needs")]
+    age_s: Annotated[Column, Meaning("age of the newest accepted report")]
+    horizontal_bound_m: Annotated[Column, Meaning("bound on the horizontal error")]
+    azimuth_deg: Annotated[Column, Meaning("direction in the array's frame")]
+    gain_db: Annotated[Column, Meaning("array gain towards the predicted direction")]
+    lat_deg: Annotated[Column, Meaning("latitude, WGS84")]
+    lon_deg: Annotated[Column, Meaning("longitude, WGS84")]
+    alt_m: Annotated[Column, Meaning("altitude above the datum of its reports")]
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CarrierHistory:
+    """Samples of the array's carrier; null where it was unknown."""
+
+    lat_deg: Annotated[Column, Meaning("latitude, WGS84")]
+    lon_deg: Annotated[Column, Meaning("longitude, WGS84")]
+    alt_m: Annotated[Column, Meaning("altitude above the datum of its reports")]
+    heading_deg: Annotated[Column, Meaning("bearing of the nose from true north")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class History:
     """Samples of the last minutes, one per second, oldest first."""
 
     valid_at_ns: Annotated[int, Meaning("the instant for which the values hold")]
     at: Annotated[list[str], Meaning("when each sample was taken")]
+    carrier: Annotated[CarrierHistory, Meaning("the samples of the array's carrier")]
     uavs: Annotated[dict[str, UavHistory], Meaning("the samples of each UAV")]
 
 
 FIELDS: Final = tuple(member.name for member in members(UavHistory))
-Sample = tuple[int, dict[str, tuple[float | None, ...]]]
-"""Sample of an update: its time, ns, and the values of ``FIELDS`` for each UAV."""
+PLACE: Final = ("lat_deg", "lon_deg", "alt_m")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Moment:
+    """State at one sample: values of each UAV as in ``FIELDS``, its place in the local frame."""
+
+    local: LocalFrame | None
+    heading_deg: float | None  # None: the carrier is unknown
+    uavs: dict[str, tuple[Any, ...]]
+    positions_ned_m: FloatArray  # (N + 1, 3): the UAVs, and then the carrier
+
+
+Sample = tuple[int, Moment]
+"""Sample of an update, and its time in nanoseconds."""
 
 
 class Series:
-    """Samples for the charts. ``add`` is called after every tick."""
+    """Samples for looking back. ``add`` is called after every tick."""
 
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque(maxlen=SAMPLES)
@@ -53,36 +92,75 @@ class Series:
         update = pipeline.last_update
         if update is None or (self._samples and 0 <= update.t_ns - self._samples[-1][0] < EVERY_NS):
             return
-        bounds = {beam.uav: beam.pointing_bound_rad for beam in update.beams.beams}
-        verdicts = pipeline.health.verdicts
-        sample = dict[str, tuple[float | None, ...]]()
-        for track in update.tracks:
-            found = verdicts.get(track.uav)
-            sample[track.uav] = (
-                degrees(bounds.get(track.uav)),
-                track.innovation_m,
-                track.latency_s,
-                None if found is None else found.guaranteed_gain_db,
-            )
-        self._samples.append((update.t_ns, sample))
+        self._samples.append((update.t_ns, moment(pipeline, update)))
 
     def samples(self) -> list[Sample]:
         """Return the samples so far, oldest first; they are immutable."""
         return list(self._samples)
 
 
-def show(samples: list[Sample], now_ns: int, utc_ns: Utc) -> Json:
+def moment(pipeline: Pipeline, update: Update) -> Moment:
+    """Return a sample of an update; its places are converted by ``show``."""
+    beams = {beam.uav: beam for beam in update.beams.beams}
+    verdicts = pipeline.health.verdicts
+    uavs = dict[str, tuple[Any, ...]]()
+    for track in update.tracks:
+        found, beam = verdicts.get(track.uav), beams.get(track.uav)
+        uavs[track.uav] = (
+            None if beam is None else degrees(beam.pointing_bound_rad),
+            track.innovation_m,
+            track.latency_s,
+            None if found is None else found.guaranteed_gain_db,
+            str(track.state),
+            None if found is None else str(found.level),
+            track.age_s,
+            track.horizontal_bound_m,
+            None if beam is None else degrees(beam.azimuth_rad),
+            None if beam is None else beam.gain_db,
+        )
+    carrier = update.carrier
+    here = np.zeros(3) if carrier is None else carrier.position_ned_m
+    return Moment(
+        local=pipeline.local,
+        heading_deg=None if carrier is None else (degrees(carrier.yaw_rad) or 0.0) % 360,
+        uavs=uavs,
+        positions_ned_m=np.array([*(track.position_ned_m for track in update.tracks), here]),
+    )
+
+
+def show(samples: list[Sample], now_ns: int, utc_ns: Utc, *, is_rounded: bool = False) -> Json:
     """Return the answer of ``/v1/history``, in columns. Runs on any thread."""
-    uavs = dict.fromkeys(uav for _, sample in samples for uav in sample)
+    shown = [_rows(one, is_rounded=is_rounded) for _, one in samples]
+    uavs = dict.fromkeys(uav for rows in shown for uav in rows if uav)
     nothing = (None,) * len(FIELDS)
     return {
         "valid_at": rfc3339(utc_ns(now_ns)),
         "at": [rfc3339(utc_ns(t_ns)) for t_ns, _ in samples],
-        "uavs": {
-            uav: {
-                name: [sample.get(uav, nothing)[i] for _, sample in samples]
-                for i, name in enumerate(FIELDS)
-            }
-            for uav in uavs
-        },
+        "carrier": _columns((*PLACE, "heading_deg"), (rows[""] for rows in shown)),
+        "uavs": {uav: _columns(FIELDS, (rows.get(uav, nothing) for rows in shown)) for uav in uavs},
     }
+
+
+def _columns(names: tuple[str, ...], rows: Iterable[tuple[Any, ...]]) -> Json:
+    columns = [list(column) for column in zip(*rows, strict=True)] or [[] for _ in names]
+    return dict(zip(names, columns, strict=True))
+
+
+def _rows(one: Moment, *, is_rounded: bool) -> dict[str, tuple[Any, ...]]:
+    """Return the values of each UAV in the order of ``FIELDS``, and of the carrier as ""."""
+    places = [(None,) * len(PLACE)] * len(one.positions_ned_m)
+    if one.local is not None:
+        lat, lon, alt = one.local.geodetic(one.positions_ned_m)
+        if is_rounded:
+            lat, lon = lat.round(COORDINATE_DIGITS), lon.round(COORDINATE_DIGITS)
+            alt = alt.round(DIGITS)
+        places = list(zip(lat.tolist(), lon.tolist(), alt.tolist(), strict=True))
+    rows = dict[str, tuple[Any, ...]]()
+    for (uav, values), place in zip(one.uavs.items(), places[:-1], strict=True):
+        kept = values
+        if is_rounded:
+            kept = tuple(round(v, DIGITS) if isinstance(v, float) else v for v in values)
+        rows[uav] = (*kept, *place)
+    is_known = one.heading_deg is not None
+    rows[""] = (*(places[-1] if is_known else (None,) * len(PLACE)), one.heading_deg)
+    return rows

@@ -36,7 +36,7 @@ def wait_for_uavs(page: Any) -> None:
         page.locator("#uavs").get_by_text(uav, exact=True).wait_for(timeout=HANG_MS)
 
 
-def wait_for_value(page: Any, expression: str, wanted: str) -> None:
+def wait_for_value(page: Any, expression: str, wanted: object) -> None:
     """Wait until an expression has a value. (Playwright's own method evaluates text in the page,
     which the content policy forbids.)"""
     end = time.monotonic() + HANG_S
@@ -362,3 +362,24 @@ def test_first_load_takes_few_requests_and_bytes(demo: Node, open_page: Any) -> 
         ".map(one => one.transferSize)"
     )
     assert len(again) == 2 and kept == [0, 0]  # from the browser's cache
+
+
+def test_page_just_opened_looks_back_over_what_the_service_keeps(
+    demo: Node, open_page: Any
+) -> None:
+    demo.wait_until("/v1/history", lambda answer: len(answer["at"]) >= 20)
+    page = open_page(demo.url, DESKTOP)
+    wait_for_uavs(page)
+    reach = "Number(document.querySelector('#scrub').min) <= -15"
+    wait_for_value(page, reach, True)
+    page.locator("#scrub").fill("-12")
+    page.locator("#past-detail").get_by_text("From the service's samples").wait_for()
+    assert page.locator("tbody tr[data-verdict]").count() == len(UAVS)
+    azimuths = page.evaluate(AZIMUTHS)
+    ranges = page.locator("td[data-key=range]").all_inner_texts()
+    assert "–" not in azimuths and all(text.endswith("m") for text in ranges)
+    page.locator("#scrub").blur()  # which takes arrow keys itself
+    page.keyboard.press("ArrowLeft")
+    assert page.evaluate(AZIMUTHS) != azimuths
+    page.keyboard.press("End")
+    page.locator("#past").wait_for(state="hidden")

@@ -391,6 +391,7 @@ def test_history_holds_the_charted_values(make_node: Any) -> None:
         node.series.add(node.pipeline)
     with TestClient(create_app(node)) as client:
         history = client.get("/v1/history").json()
+        center = client.get("/v1/status").json()["center"]
         uavs = client.get("/v1/uavs").json()["uavs"]
     holds(series.History, history)
     times = [datetime.fromisoformat(at).timestamp() for at in history["at"]]
@@ -404,6 +405,10 @@ def test_history_holds_the_charted_values(make_node: Any) -> None:
             assert uav["health"]["guaranteed_gain_db"] in (last_db, None)  # None: no beam since
             assert columns["innovation_m"][-1] is not None
             assert columns["pointing_bound_deg"][-1] > 0
+            assert (columns["state"][-1], columns["verdict"][-1]) == (uav["state"], uav["verdict"])
+            near = [columns[name][-1] for name in ("lat_deg", "lon_deg", "alt_m")]
+            assert near == pytest.approx([uav["lat_deg"], uav["lon_deg"], uav["alt_m"]], rel=1e-3)
+    assert history["carrier"]["lat_deg"][-1] == pytest.approx(center["lat_deg"], rel=1e-3)
 
 
 def test_verdicts_are_in_responses_and_metrics(make_node: Any) -> None:

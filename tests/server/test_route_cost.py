@@ -93,7 +93,7 @@ def crowded(uavs: int, directory: Path) -> StandIn:
     for number in range(200):
         node.say(f"notice {number}")
     node.tick()
-    sampled = SimpleNamespace(health=node.pipeline.health)
+    sampled = SimpleNamespace(health=node.pipeline.health, local=node.pipeline.local)
     update = node.pipeline.last_update
     assert update is not None
     for number in range(SAMPLES):

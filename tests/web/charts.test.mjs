@@ -49,17 +49,6 @@ test("each UAV has its own line, and unknown values are gaps, not 0", () => {
   assert.deepEqual(plots().gain.data, [[-2, -1], [null, null], [null, null]]);
 });
 
-test("service history fills the time before the page was opened only", () => {
-  const { add, show, plots, charts } = openCharts();
-  add(9000, [uav("1:1", { innovation_m: 3 })]);
-  const [nothing, at] = [[null, null, null], [stampAt(0), stampAt(1), stampAt(3)]];
-  charts.fill({ valid_at: stampAt(3.5), at, uavs: { "1:1": { innovation_m: [1, 2, 9],
-    latency_s: nothing, pointing_bound_deg: nothing, guaranteed_gain_db: [5, null, 7] } } }, 10_000);
-  show();
-  assert.deepEqual(plots().innovation.data, [[-3.5, -2.5, -1], [1, 2, 3]]);
-  assert.deepEqual(plots().gain.data[1], [5, null, null]);
-});
-
 test("innovation uses the selected unit from the next redraw on", async () => {
   const { use } = await load("units.js");
   const { add, show, plots, charts } = openCharts();

@@ -4,9 +4,9 @@ import assert from "node:assert/strict";
 import { test } from "node:test";
 
 import { load } from "./browser.mjs";
-import { uav } from "./service.mjs";
+import { stampAt, uav } from "./service.mjs";
 
-const { History, KEEP_MS } = await load("history.js");
+const { History, KEEP_MS, momentsOf } = await load("history.js");
 
 function historyAt(...times) {
   const history = new History();
@@ -26,13 +26,13 @@ test("entries are kept for five minutes", () => {
 test("with many UAVs the history is shorter but always holds the newest", () => {
   const history = new History();
   const many = Array.from({ length: 10_000 }, (_, i) => uav(`${i}:1`));
-  for (const at of [1, 2, 3]) history.add({ at, uavs: many });
-  assert.deepEqual(timesOf(history.moments), [2, 3]);
-  history.add({ at: 4, uavs: [...many, ...many, ...many] });
-  assert.deepEqual(timesOf(history.moments), [4]);
-  history.add({ at: 5, uavs: [] });
-  history.add({ at: 6, uavs: many });
-  assert.deepEqual(timesOf(history.moments), [5, 6]);
+  for (const at of [1, 2, 3, 4]) history.add({ at, uavs: many });
+  assert.deepEqual(timesOf(history.moments), [2, 3, 4]);
+  history.add({ at: 5, uavs: [...many, ...many, ...many, ...many] });
+  assert.deepEqual(timesOf(history.moments), [5]);
+  history.add({ at: 6, uavs: [] });
+  history.add({ at: 7, uavs: many });
+  assert.deepEqual(timesOf(history.moments), [6, 7]);
 });
 
 test("a time selects the newest entry not after it, or the oldest", () => {
@@ -80,4 +80,39 @@ test("an entry holds its UAVs by id, without values that are never shown", () =>
   assert.equal(beams, "b");
   for (const name of ["rejected", "recent_rejections", "clock"]) assert.ok(!(name in uavs[0]));
   assert.ok("fix" in uavs[0] && "velocity_ned_mps" in uavs[0]);
+});
+
+const sampled = (seconds, fields = {}) => {
+  const column = (value) => seconds.map(() => value);
+  return {
+    valid_at: stampAt(seconds.at(-1) + 0.5), at: seconds.map(stampAt),
+    carrier: { lat_deg: column(47), lon_deg: column(8), alt_m: column(450), heading_deg: column(90) },
+    uavs: { "1:1": {
+      state: column("live"), verdict: column("weak"), lat_deg: column(47.001), lon_deg: column(8),
+      alt_m: column(500), age_s: column(0.2), innovation_m: column(1), latency_s: column(0.03),
+      horizontal_bound_m: column(3), azimuth_deg: column(12), pointing_bound_deg: column(2),
+      guaranteed_gain_db: column(null), gain_db: column(17), ...fields,
+    } },
+  };
+};
+
+test("samples of the service fill the time before, and gaps", () => {
+  const history = historyAt(10_000, 11_000, 20_000);
+  history.fill(momentsOf(sampled([1, 2, 10.2, 14, 19.5]), 20_500));
+  // The newest sample is half a second old when it arrives: 19.5 s is this page's 20 s.
+  assert.deepEqual(timesOf(history.moments), [1500, 2500, 10_000, 11_000, 14_500, 20_000]);
+  const [{ uavs: [{ id, verdict, target }], beams: [beam], carrier, isSampled }] = history.moments;
+  assert.deepEqual([id, verdict, target, isSampled], ["1:1", "weak", true, true]);
+  assert.deepEqual([beam.uav, beam.azimuth_deg, beam.pointing_bound_deg], ["1:1", 12, 2]);
+  assert.deepEqual([carrier.lat_deg, carrier.unfit], [47, null]);
+});
+
+test("a UAV is only in the samples in which it was tracked, and has a beam only if it had one", () => {
+  const [before, after] = momentsOf(sampled([1, 2], {
+    state: [null, "stale"], azimuth_deg: [null, null],
+  }), 3000);
+  assert.deepEqual([before.uavs.length, after.uavs.length, after.beams], [0, 1, []]);
+  const unknown = sampled([1]);
+  unknown.carrier.lat_deg = [null];
+  assert.ok(momentsOf(unknown, 3000)[0].carrier.unseen);
 });

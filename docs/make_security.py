@@ -25,6 +25,7 @@ from companion.recording.foreign import thinned
 from companion.server import (
     access,
     connections,
+    playback,
     request_queue,
     stream,
     websocket_connections,
@@ -166,6 +167,15 @@ WAYS: Final = (
         work=LOOP,
         over="as of the connection",
         test=f"{HOSTILE}::test_client_that_takes_nothing_of_an_answer_is_disconnected",
+    ),
+    WayIn(
+        name="recordings played on the page",
+        covers=("route:/v1/recordings/{name}/history",),
+        size=f"{kb(playback.LINE_MAX_BYTES)} of samples",
+        items="1 recording at a time",
+        work=f"a process of its own at the lowest priority, at most {playback.READ_MAX_S:.0f} s",
+        over=f"409; ended after {playback.IDLE_S:.0f} s without a request",
+        test="tests/server/test_playback.py::test_one_recording_is_read_at_a_time",
     ),
     WayIn(
         name="WebSocket `/v1/stream`",

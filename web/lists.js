@@ -62,7 +62,7 @@ export function showEvents(answer) {
     ? events.map(eventItem) : [make("li", { class: "muted" }, answer ? "none" : format.UNKNOWN)]));
 }
 
-function recordingItem({ name, bytes, state }) {
+function recordingItem({ name, bytes, state }, onPlay) {
   const href = `/v1/recordings/${encodeURIComponent(name)}`;
   const link = make("a", { href, download: "" }, name);
   link.addEventListener("click", (event) => {
@@ -70,7 +70,10 @@ function recordingItem({ name, bytes, state }) {
     event.preventDefault();
     download(href, name);
   });
-  return make("li", {}, link, make("span", {}, [format.bytes(bytes), state].join(" · ")));
+  const play = make("button", { type: "button", class: "button small", "aria-label": `Play ${name}` }, "▶");
+  play.addEventListener("click", () => onPlay(name));
+  if (state === "recording") play.setAttribute("disabled", "");
+  return make("li", {}, link, make("span", {}, [format.bytes(bytes), state].join(" · ")), play);
 }
 
 /** A plain link sends no token, so a file that needs one is fetched first and then saved. */
@@ -81,10 +84,10 @@ async function download(href, name) {
 }
 
 /** Hidden if the service has none. */
-export function showRecordings(answer) {
+export function showRecordings(answer, onPlay) {
   const recordings = answer?.recordings ?? null;
   $("recordings-panel").hidden = !recordings?.length;
   if (recordings === null) return;
   setText($("recordings-count"), String(recordings.length));
-  setChildren($("recordings"), recordings, () => recordings.map(recordingItem));
+  setChildren($("recordings"), recordings, () => recordings.map((one) => recordingItem(one, onPlay)));
 }

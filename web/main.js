@@ -23,6 +23,7 @@ import { Ground } from "./ground.js";
 import { loadMeanings } from "./meanings.js";
 import { Outage } from "./outage.js";
 import { PlanView } from "./plan.js";
+import { Player } from "./player.js";
 import { showSettings } from "./settings.js";
 import { Space } from "./space.js";
 import { UavTable } from "./table.js";
@@ -54,6 +55,7 @@ const fleet = new FleetView(pick);
 const focus = new Focus();
 const rejections = new Rejections();
 const timebar = new TimeBar(history, refresh);
+const player = new Player(timebar, () => refresh());
 const alarm = new Alarm();
 const outage = new Outage(fillHistory);
 const charts = new Charts((at) => timebar.showAt(at));
@@ -181,13 +183,17 @@ function showAll(link, now) {
   const { status } = feeds;
   showConnection(link, feeds.uavs.data?.valid_at,
     status.isTrusted(now) ? status.data.health?.behind : null);
-  showRecordings(feeds.recordings.data);
+  showRecordings(feeds.recordings.data, (name) => player.open(name));
   alarm.watch(feeds.uavs.data?.uavs ?? [], link.state === "lost" && !link.never, now);
   timebar.draw(now);
   showMoment(view, link, now);
+  plan.history = timebar.history;
   showPlan(view, link, now);
   const pastAt = timebar.shown?.at ?? null;
-  if (isOpen("fold-charts")) charts.show(history, view.uavs, { selected, pastAt, now });
+  if (isOpen("fold-charts")) {
+    const until = timebar.recording ? view.at : now;
+    charts.show(timebar.history, view.uavs, { selected, pastAt, now: until });
+  }
   nameThePage(view, link);
 }
 
@@ -250,6 +256,7 @@ function showCount(uavs) {
 
 /** Message in the plan view while it is not live; empty while it is. */
 function planMessage(view, link, now) {
+  if (timebar.recording) return `RECORDING – ${format.clock(timebar.shown.stamp)}`;
   if (!timebar.isLive) {
     return `NOT LIVE – ${format.duration((now - timebar.shown.at) / 1000)} ago`;
   }
@@ -286,7 +293,7 @@ function showPlan(view, link, now) {
 /** Set the tab's title and the picture's name to the state, also for screen readers. */
 function nameThePage({ uavs, beams, status }, link) {
   const trouble = { lost: "CONNECTION LOST", partial: "CONNECTION FAILING", token: "TOKEN", frozen: "STOPPED" };
-  const state = trouble[link.state] ?? (timebar.isLive ? "" : "PAUSED");
+  const state = trouble[link.state] ?? (timebar.isLive ? "" : timebar.recording ? "RECORDING" : "PAUSED");
   setText($("node-name"), status?.node ?? "");
   const title = [state || headlineOf(uavs).text, status?.node, "companion"].filter(Boolean)
     .join(" · ");

@@ -6,9 +6,10 @@ from typing import Annotated
 from fastapi import FastAPI, Header, HTTPException, Path
 from fastapi.responses import Response, StreamingResponse
 
-from companion.server import recordings
+from companion.server import models, recordings
 from companion.server.giving_way import GivingWay
 from companion.server.large_answers import LargeAnswers, Make
+from companion.server.playback import BusyError, Playback, PlaybackError, Reading
 from companion.server.responses import (
     answer,
     answers,
@@ -19,7 +20,8 @@ from companion.server.responses import (
 )
 from companion.server.threads import in_thread
 from companion.values import Source
-from companion.views import mavlink_messages
+from companion.views import mavlink_messages, series
+from companion.views.as_json import as_json
 from companion.views.last_messages import Kept, by_sender
 from companion.views.state import Node
 
@@ -33,6 +35,7 @@ Range = Annotated[str | None, Header(alias="range", description="bytes=FIRST-LAS
 def add(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     """Add the routes to the application."""
     _recordings(app, node)
+    _playback(app, node)
     _mavlink(app, node, large)
 
 
@@ -86,6 +89,34 @@ def _recordings(app: FastAPI, node: Node) -> None:
             headers=headers,
             media_type=recordings.MEDIA_TYPE,
         )
+
+
+def _playback(app: FastAPI, node: Node) -> None:
+    where, playback = node.pipeline.settings.recording.directory, Playback()
+
+    @app.get(
+        "/v1/recordings/{name}/history",
+        summary="Samples of a whole recording, as in /v1/history; 202 while it is being read",
+        responses={
+            **answers(series.History, 404, 409, 422),
+            202: {"model": models.outward(Reading), "description": "Progress; ask again"},
+        },
+    )
+    async def history(name: RecordingName) -> Response:
+        path = await in_thread(recordings.find, where, name)
+        if path is None:
+            raise HTTPException(404, f"no recording {name!r}")
+        if name == node.recording().file:
+            raise HTTPException(409, "this recording is still being written")
+        try:
+            found = await playback.samples(path)
+        except BusyError:
+            raise HTTPException(409, "another recording is being read; try again later") from None
+        except PlaybackError as error:
+            raise HTTPException(409, f"the recording cannot be read: {error}") from error
+        if isinstance(found, Reading):
+            return answer(as_json(found, node.pipeline.utc_ns), 202)
+        return json_response(found)
 
 
 def _mavlink(app: FastAPI, node: Node, large: LargeAnswers) -> None:

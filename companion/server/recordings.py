@@ -108,16 +108,21 @@ def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, in
 
     The open file remains the same if its name changes afterwards.
     """
-    found = next((entry for entry in _entries(where) if entry.name == name), None)
+    found = find(where, name)
     if found is None:
         return None
     try:
-        descriptor = os.open(found.path, os.O_RDONLY | os.O_NOFOLLOW)
+        descriptor = os.open(found, os.O_RDONLY | os.O_NOFOLLOW)
     except OSError:
         return None
     file = os.fdopen(descriptor, "rb")
     size = os.fstat(descriptor).st_size
     return file, min(size, current.bytes) if name == current.name else size
+
+
+def find(where: str | None, name: str) -> Path | None:
+    """Return the path of a recording; None if the name is unknown."""
+    return next((Path(entry.path) for entry in _entries(where) if entry.name == name), None)
 
 
 def span(header: str | None, size: int) -> tuple[int, int] | None:

@@ -7,6 +7,7 @@ import functools
 import io
 import os
 import re
+import shutil
 import signal
 import subprocess
 import time
@@ -16,6 +17,8 @@ from typing import Any
 import pytest
 from PIL import Image
 from support import BIN, HANG_MS, HANG_S, ROOT, Node, end, line_of, started
+
+from .test_accessibility import violations
 
 pytestmark = pytest.mark.browser
 
@@ -383,3 +386,34 @@ def test_page_just_opened_looks_back_over_what_the_service_keeps(
     assert page.evaluate(AZIMUTHS) != azimuths
     page.keyboard.press("End")
     page.locator("#past").wait_for(state="hidden")
+
+
+def test_recording_is_played_on_the_page_and_marked(open_page: Any, tmp_path: Path) -> None:
+    shutil.copy(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog", tmp_path / "flight.mcap")
+    options = ("--center", "99:1", "--listen", "127.0.0.1:0", "--record", str(tmp_path))
+    node = Node("run", "--link", "udpin:127.0.0.1:0", *options)
+    try:
+        page = open_page(node.url, DESKTOP)
+        page.get_by_text("No UAV has reported a position.").wait_for()
+        page.locator("#recordings-panel summary").click()
+        page.get_by_role("button", name="Play flight.mcap").click()
+        page.get_by_text("RECORDING – NOT LIVE").wait_for()
+        page.locator("tbody tr").nth(3).wait_for()
+        assert page.title().startswith("RECORDING")
+        first = page.inner_text("#past-detail")
+        assert first.startswith("flight.mcap: ")
+        page.locator("#speed").click()
+        wait_for_value(
+            page, f"document.querySelector('#past-detail').innerText !== {first!r}", True
+        )
+        page.get_by_role("button", name="Pause").click()
+        page.get_by_role("button", name="▶ Play").wait_for()
+        page.locator("#scrub").fill("-1")
+        assert page.inner_text("#past-detail") != first
+        assert violations(page) == []
+        page.get_by_role("button", name="Back to live").click()
+        page.locator("#past").wait_for(state="hidden")
+        page.get_by_text("No UAV has reported a position.").wait_for()
+        page.close()
+    finally:
+        end(node.process)

@@ -124,7 +124,8 @@ def test_every_openapi_path_is_checked_against_its_model(client: TestClient) -> 
     document = client.get("/openapi.json").json()
     shown = {path.split("?")[0] for path in PATHS}
     named = {path.format(uav="1:1", sys=1, comp=1, name="HEARTBEAT") for path in document["paths"]}
-    assert named == shown | {"/metrics", "/v1/map/tiles", "/v1/recordings/HEARTBEAT"}
+    recording = "/v1/recordings/HEARTBEAT"
+    assert named == shown | {"/metrics", "/v1/map/tiles", recording, f"{recording}/history"}
 
 
 def test_openapi_document_is_built_off_the_event_loop(

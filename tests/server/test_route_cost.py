@@ -44,6 +44,7 @@ FILLED = {
     "/v1/uavs/{uav}": "/v1/uavs/10:1",
     "/v1/pattern": "/v1/pattern?uav=10:1",  # of all beams at once it is refused
     "/v1/recordings/{name}": f"/v1/recordings/{RECORDED}",
+    "/v1/recordings/{name}/history": f"/v1/recordings/{RECORDED}/history",
     "/v1/mavlink/vehicles/{sys}/components/{comp}/messages": (
         "/v1/mavlink/vehicles/10/components/1/messages"
     ),
@@ -52,7 +53,10 @@ FILLED = {
     ),
 }
 """Paths that are asked for, where those of the document are not."""
-STATUSES = {"/v1/map/tiles": 404}  # there is no map
+STATUSES = {
+    "/v1/map/tiles": 404,  # there is no map
+    "/v1/recordings/{name}/history": 409,  # the file is no recording
+}
 
 
 def document_paths() -> list[str]:

@@ -126,3 +126,28 @@ test("looking back is disabled before any data", () => {
   draw();
   assert.equal(browser.element("scrub").min, "0");
 });
+
+test("a recording is played to its end, paused, played again, and left for the live page", () => {
+  const { browser, bar, draw } = openBar();
+  const history = new History();
+  const endAt = browser.time.now + 9_000_000; // far from the moments of the page
+  history.moments = [0, 1, 2].map((i) => ({ at: endAt - 2000 + i * 1000, stamp: stampAt(i), uavs: [] }));
+  bar.openRecording({ name: "a.mcap", history, endAt });
+  bar.advance(1500);
+  draw();
+  assert.equal(bar.shown, history.moments[1]);
+  assert.equal(browser.text("past-title"), "RECORDING – NOT LIVE");
+  assert.match(browser.text("past-detail"), /^a\.mcap: 2026-11-20 13:00:01 UTC/);
+  assert.deepEqual([browser.element("scrub").min, browser.element("scrub").value], ["-2", "-1"]);
+  bar.toggle();
+  assert.equal(bar.recording.isPlaying, false);
+  bar.toggle();
+  bar.advance(60_000);
+  assert.deepEqual([bar.shown, bar.recording.isPlaying], [history.moments[2], false]);
+  bar.toggle(); // from the beginning
+  bar.advance(0);
+  assert.equal(bar.shown, history.moments[0]);
+  bar.goLive();
+  draw();
+  assert.ok(bar.isLive && bar.recording === null && browser.element("past").hidden);
+});

@@ -1,0 +1,1 @@
+"""Bridge from a companion service to ROS 2."""

@@ -22,7 +22,7 @@ export class Outage {
   /** Process an answer with the UAVs; `stamp` is the service's time, `now` that of this page. */
   noteUavs(stamp, now) {
     if (this.last !== null && now - this.last.at > LOST_MS) {
-      Object.assign(this, { gap: { from: this.last.stamp, to: stamp }, since: null, hasRun: "" });
+      Object.assign(this, { gap: { from: this.last.stamp, to: stamp }, hasRun: "" });
       this.onGap();
     }
     this.last = { at: now, stamp };

@@ -244,6 +244,22 @@ def test_debian_unit_is_valid(unpacked: Path) -> None:
     assert [line for line in done.stderr.splitlines() if "companion.service" in line] == []
 
 
+def test_debian_system_user_can_be_created(unpacked: Path, tmp_path: Path) -> None:
+    """An error of this file would end the installation."""
+    if shutil.which("systemd-sysusers") is None:
+        pytest.skip("no systemd-sysusers on this machine")
+    users = unpacked / "usr/lib/sysusers.d/companion.conf"
+    done = subprocess.run(
+        ["systemd-sysusers", f"--root={tmp_path}", users],
+        capture_output=True,
+        text=True,
+        timeout=HANG_S,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "companion:x:" in (tmp_path / "etc/passwd").read_text()
+
+
 @pytest.fixture
 def launched(unpacked: Path) -> Iterator[Path]:
     """The unpacked package, started with this Python and its packages."""

@@ -248,6 +248,7 @@ def test_debian_system_user_can_be_created(unpacked: Path, tmp_path: Path) -> No
     """An error of this file would end the installation."""
     if shutil.which("systemd-sysusers") is None:
         pytest.skip("no systemd-sysusers on this machine")
+    (tmp_path / "etc").mkdir()
     users = unpacked / "usr/lib/sysusers.d/companion.conf"
     done = subprocess.run(
         ["systemd-sysusers", f"--root={tmp_path}", users],

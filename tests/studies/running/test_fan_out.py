@@ -55,6 +55,17 @@ def test_workers_use_one_blas_thread_and_ignore_sigint(monkeypatch: pytest.Monke
     assert fan_out.on_cores(signal.getsignal, [signal.SIGINT], 1, id) == [signal.SIG_IGN]
 
 
+def blocked_signals(_number: int) -> list[int]:
+    return sorted(signal.pthread_sigmask(signal.SIG_BLOCK, ()))
+
+
+def test_workers_start_with_interrupts_held() -> None:
+    """One that arrives while a worker starts would print its traceback; it may be ended later."""
+    (blocked,) = fan_out.on_cores(blocked_signals, [0], 1, lambda _: None)
+    assert signal.SIGALRM in blocked  # as the parent had it when it started the worker
+    assert not {signal.SIGINT, signal.SIGTERM} & set(blocked)
+
+
 def test_first_error_in_input_order_is_raised() -> None:
     asked = ["__import__('time').sleep(0.5) or int('first')", "int('second')", "1"]
     with pytest.raises(ValueError, match="'first'"):

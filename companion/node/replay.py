@@ -217,10 +217,22 @@ def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0)
     if len(logs) == 1 and log_kind(logs[0]) == TICKED:
         return read_log(logs[0])
     ordered = in_order(logs)
+    if ordered is None:
+        logs = _with_events(logs)
+        ordered = in_order(logs)
     if ordered is not None:
         return read_parts(ordered)
     merged = (event for event in read_flight(logs, latency_s) if not isinstance(event, Tick | Tock))
     return with_ticks(merged, settings.beams.update_hz)
+
+
+def _with_events(logs: Sequence[Path]) -> Sequence[Path]:
+    """Leave out recordings without an event, such as a part that a power loss cut as it began.
+
+    All logs are returned if none of them has an event.
+    """
+    full = [log for log in logs if log_kind(log) != TICKED or any(True for _ in read_parts([log]))]
+    return full or logs
 
 
 def in_order(logs: Sequence[Path]) -> list[Path] | None:

@@ -68,6 +68,18 @@ def test_shuffled_parts_replay_to_the_digest_of_the_run(
     assert replay(logs[1:], Settings())["digest"] != digest
 
 
+def test_part_that_was_cut_as_it_began_is_left_out(
+    run_of_three_parts: tuple[list[Path], list[Event], str], tmp_path: Path
+) -> None:
+    """It has no event and no position in the run."""
+    logs, events, digest = run_of_three_parts
+    cut = write(tmp_path / "e.mcap", None, [])
+    assert list(log_events([*logs, cut], Settings())) == events
+    assert replay([cut, *logs], Settings())["digest"] == digest
+    with pytest.raises(LogError, match="no MAVLink frame in it"):
+        list(log_events([cut], Settings()))
+
+
 def test_recovered_part_keeps_its_position_in_the_run(
     run_of_three_parts: tuple[list[Path], list[Event], str], tmp_path: Path
 ) -> None:

@@ -20,10 +20,11 @@ function pointingBound({ beam, array }) {
     : `More than half the beamwidth (${format.degrees(limit, 2)}): the beam may miss` };
 }
 
-/** The guaranteed gain, or why there is none. */
-function guaranteedGain({ beam }) {
-  const text = format.decibels(beam?.guaranteed_gain_db);
-  if (!beam || format.known(beam.guaranteed_gain_db)) return { text };
+/** The guaranteed gain that the verdict compares with the need, or why there is none. */
+function guaranteedGain({ uav, beam }) {
+  const gain = uav.health?.guaranteed_gain_db;
+  const text = format.decibels(gain);
+  if (!beam || format.known(gain)) return { text };
   return { text, title: "No guarantee: within its bound the UAV may be in a null, or out of"
     + " coverage" };
 }
@@ -98,8 +99,8 @@ const COLUMNS = [
   { key: "gain", value: ["BeamState", "gain_db"], feed: "beams",
     by: ({ beam }) => beam?.gain_db,
     show: ({ beam }) => ({ text: format.decibels(beam?.gain_db) }) },
-  { key: "guaranteed", value: ["BeamState", "guaranteed_gain_db"], short: "Guaranteed", feed: "beams", by: ({ beam }) => beam?.guaranteed_gain_db,
-    show: guaranteedGain },
+  { key: "guaranteed", value: ["LinkHealth", "guaranteed_gain_db"], short: "Guaranteed",
+    by: ({ uav }) => uav.health?.guaranteed_gain_db, show: guaranteedGain },
 ];
 
 const HEADS = [{ key: "id", value: ["UavState", "uav"] }, ...COLUMNS];

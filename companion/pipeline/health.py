@@ -44,7 +44,7 @@ AT_ONCE: Final = 16
 """Least number of links assessed per update; more if the round would take too long."""
 FALLEN_AT_ONCE: Final = 32  # most links assessed per update because their beams got worse
 HOLD_BETTER_NS: Final = 3_000_000_000  # hold time before a verdict gets better
-MARGIN_DB: Final = 1.0
+MARGIN_DB: Final = 0.25
 """Gain above the need that a link must have for its level to rise, dB."""
 SLACK_RATIO: Final = 1.02  # growth of a bound for which a link is not assessed again at once
 SLACK_DB: Final = 0.1  # the same for a loss of gain

@@ -17,6 +17,7 @@ from companion.pipeline.health import (
     AT_ONCE,
     COASTING_S,
     FALLEN_AT_ONCE,
+    MARGIN_DB,
     SLACK_DB,
     HealthMonitor,
     Site,
@@ -195,8 +196,8 @@ def test_improvement_must_last_three_seconds_without_interruption() -> None:
     assert seen == [*["weak"] * 6, "good"]
 
 
-def test_level_rises_with_a_margin_of_one_decibel() -> None:
-    """A level falls with the gain below the need, and rises 1 dB above it."""
+def test_level_rises_with_a_margin() -> None:
+    """A level falls with the gain below the need, and rises with a margin above it."""
     watch = Watch()
     watch.see(0, [track("1:1", *SURE)])
     sure_db = watch.health.verdicts["1:1"].guaranteed_gain_db
@@ -204,7 +205,7 @@ def test_level_rises_with_a_margin_of_one_decibel() -> None:
     for spare_db, is_good in ((-0.1, False), (0.1, True)):
         watch = Watch(needed_db=sure_db - spare_db)
         assert (watch.see(0, [track("1:1", *SURE)]) == "good") is is_good
-    for spare_db, is_good in ((0.9, False), (1.1, True)):
+    for spare_db, is_good in ((0.9 * MARGIN_DB, False), (1.1 * MARGIN_DB, True)):
         watch = Watch(needed_db=sure_db - spare_db)
         watch.see(0, [track("1:1", *USUAL)])
         levels = [watch.see(t_s, [track("1:1", *SURE)]) for t_s in range(1, 6)]

@@ -1,11 +1,12 @@
 """Entry point of the console command ``companion``, and of ``python -m companion``."""
 
-from companion.cli.interrupts import interrupts_end
+from companion.cli.interrupts import interrupts_end, name_process
 
 
 def main() -> None:
     """Load and run the command; Ctrl-C ends it with one line, even while it loads."""
     with interrupts_end("companion"):
+        name_process("companion")
         from companion.cli.main import main as command
 
         command(prog_name="companion")

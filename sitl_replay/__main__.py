@@ -1,11 +1,12 @@
 """Entry point of the console command ``sitl-replay``, and of ``python -m sitl_replay``."""
 
-from companion.cli.interrupts import interrupts_end
+from companion.cli.interrupts import interrupts_end, name_process
 
 
 def main() -> None:
     """Load and run the command; Ctrl-C ends it with one line, even during loading."""
     with interrupts_end("sitl-replay"):
+        name_process("sitl-replay")
         from sitl_replay.cli import main as command
 
         command(prog_name="sitl-replay")

@@ -201,9 +201,16 @@ def forwarded(words: list[str], where: Path, start_node: Started) -> None:
         assert option.split("=")[0] in done.stdout, option
 
 
+def demonstrated(words: list[str], where: Path, start_node: Started) -> None:
+    """Check that the demo runs and records."""
+    run([*words, "--port", "0", "--seconds", "1"], where)
+    assert list((where / "recordings").glob("*.mcap"))
+
+
 RUNNERS: dict[str, Callable[[list[str], Path, Any], None]] = {
     "make": make,
     "curl": curl,
+    "companion demo": demonstrated,
     "companion replay": to_its_end,
     "companion replay --serve": served,
     "companion recover": to_its_end,

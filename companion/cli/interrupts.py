@@ -10,7 +10,7 @@ import signal
 import sys
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from types import FrameType
 from typing import Final
 
@@ -43,6 +43,14 @@ def interrupts_end(name: str) -> Iterator[None]:
     finally:
         for number in SIGNALS:
             signal.signal(number, end)
+
+
+def name_process(name: str) -> None:
+    """Name this process for ``ps`` and ``top``, which would show the interpreter's name."""
+    with suppress(OSError):  # a system without this file
+        descriptor = os.open("/proc/self/comm", os.O_WRONLY)
+        os.write(descriptor, name.encode())
+        os.close(descriptor)
 
 
 def _ignore() -> None:

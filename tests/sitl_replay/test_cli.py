@@ -244,9 +244,9 @@ def test_log_without_frames_is_a_one_line_error(content: bytes, tmp_path: Path) 
 
 
 def test_log_error_during_playback_is_a_one_line_error(
-    receiver: socket.socket, monkeypatch: pytest.MonkeyPatch
+    receiver: socket.socket, monkeypatch: pytest.MonkeyPatch, cut_log: Path
 ) -> None:
-    # Behaviour of a reader on a truncated file: some frames, then its error.
+    # Behaviour of a reader on a damaged file: some frames, then its error.
     raw = next(schedule(scenario.hover())).raw
 
     def torn() -> Iterator[Frame]:
@@ -254,7 +254,7 @@ def test_log_error_during_playback_is_a_one_line_error(
         raise LogError("torn.tlog: cut short")
 
     monkeypatch.setattr("sitl_replay.cli.frames_of", lambda *_: torn())
-    result = CliRunner().invoke(main, ["play", __file__, "--to", url_of(receiver)])
+    result = CliRunner().invoke(main, ["play", str(cut_log), "--to", url_of(receiver)])
     assert (result.exit_code, result.stderr) == (1, "sitl-replay: torn.tlog: cut short\n")
     assert receiver.recv(300) == raw
 

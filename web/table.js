@@ -99,7 +99,7 @@ const COLUMNS = [
   { key: "gain", value: ["BeamState", "gain_db"], feed: "beams",
     by: ({ beam }) => beam?.gain_db,
     show: ({ beam }) => ({ text: format.decibels(beam?.gain_db) }) },
-  { key: "guaranteed", value: ["LinkHealth", "guaranteed_gain_db"], short: "Guaranteed",
+  { key: "guaranteed", value: ["LinkHealth", "guaranteed_gain_db"], short: "Guaranteed", feed: "uavs",
     by: ({ uav }) => uav.health?.guaranteed_gain_db, show: guaranteedGain },
 ];
 

@@ -56,13 +56,14 @@ test("every column has a header, and cells name their feed", () => {
   const cells = rows()[0].children.map((cell) => cell.dataset.key ?? "id");
   assert.deepEqual(heads, cells);
   const onBeams = rows()[0].querySelectorAll("[data-feed=beams]").map(({ dataset }) => dataset.key);
-  assert.deepEqual(onBeams, ["azimuth", "elevation", "pointing", "gain", "guaranteed"]);
-  assert.equal(rows()[0].querySelectorAll("[data-feed=uavs]").length, cells.length - 5);
+  assert.deepEqual(onBeams, ["azimuth", "elevation", "pointing", "gain"]);
+  assert.equal(rows()[0].querySelectorAll("[data-feed=uavs]").length, cells.length - 4);
 });
 
 test("unknown values are dashes: without a beam, without a position", () => {
   const { show, texts } = openTable();
-  show([uav("1:1", { north_m: null, speed_mps: null, age_s: null, dt_s: null, latency_s: null })]);
+  show([uav("1:1", { north_m: null, speed_mps: null, age_s: null, dt_s: null, latency_s: null,
+    health: null })]);
   assert.deepEqual(texts(), {
     verdict: "good", state: "live", range: "–", azimuth: "–", elevation: "–", speed: "–", age: "–", dt: "–",
     latency: "–", bound: "4.2 m", usual: "–", pointing: "–", gain: "–", guaranteed: "–",
@@ -106,10 +107,11 @@ test("a pointing bound above half the beamwidth is explained", () => {
 
 test("a beam without any guaranteed gain is explained", () => {
   const { show, cell } = openTable();
-  show([uav("1:1")], { beams: [beam("1:1", { guaranteed_gain_db: null })] });
+  const unsure = { health: { needed_gain_db: 0, guaranteed_gain_db: null, likely_gain_db: 17 } };
+  show([uav("1:1", unsure)], { beams: [beam("1:1")] });
   assert.equal(cell("guaranteed").textContent, "–");
   assert.match(cell("guaranteed").title, /No guarantee/);
-  show([uav("1:1")]);
+  show([uav("1:1", unsure)]);
   assert.deepEqual([cell("guaranteed").textContent, cell("guaranteed").title], ["–", ""]);
 });
 

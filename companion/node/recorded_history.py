@@ -36,7 +36,7 @@ def lines(recording: Path) -> Iterator[Json]:
     of_s = length_s([recording])
     run = Run(settings, None)
     samples, every_ns, due_s = list[Sample](), series.EVERY_NS, time.monotonic()
-    newest_ns = 0
+    newest_ns = count = 0  # count of samples, times UAVs
     for event in log_events([recording], settings):
         newest_ns = max(newest_ns, event.t_ns)
         for output in run.step(event):
@@ -45,8 +45,10 @@ def lines(recording: Path) -> Iterator[Json]:
             if samples and output.t_ns - samples[-1][0] < every_ns:
                 continue
             samples.append((output.t_ns, series.moment(run.pipeline, output)))
-            if sum(len(one.uavs) for _, one in samples) > UAV_SAMPLES_MAX:
+            count += len(samples[-1][1].uavs)
+            if count > UAV_SAMPLES_MAX:
                 samples, every_ns = samples[::2], 2 * every_ns
+                count = sum(len(one.uavs) for _, one in samples)
         if time.monotonic() >= due_s:
             due_s = time.monotonic() + PROGRESS_EVERY_S
             yield {"at_s": run.at_s, "of_s": of_s}

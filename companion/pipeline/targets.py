@@ -98,7 +98,7 @@ class Targets:
                 t_ns=now_ns,
                 severity=Severity.INFO,
                 subject=uav,
-                text=f"{uav} is dropped: no report for {self._dropped_s:.0f} s",
+                text=f"{uav} is dropped: no usable report for {self._dropped_s:.0f} s",
             )
             for uav in self.among(silent)
         ]

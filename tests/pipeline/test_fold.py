@@ -910,7 +910,7 @@ def test_long_silent_uav_is_dropped_and_returns_as_new() -> None:
     said = [one.text for one in outputs if isinstance(one, Notice) and one.subject == "1:1"]
     assert said == [
         *(f"1:1 is {state}" for state in ("live", "coasting", "stale", "lost")),
-        "1:1 is dropped: no report for 8 s",
+        "1:1 is dropped: no usable report for 8 s",
     ]
     now_ns = START_NS + 30 * S
     assert [track.uav for track in pipeline.tracks(now_ns, now_ns)] == ["2:1"]

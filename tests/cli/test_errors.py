@@ -103,7 +103,8 @@ def test_every_user_facing_error_is_a_user_error() -> None:
         "ServiceError",  # client side: the service's error response
         "InterruptedByUser",  # Ctrl-C
         "HungUpError",  # an orderly end of a connection: the link retries or ends
-        "TooLongError",  # the parser refuses the request with a 400
+        "BusyError",  # a request is refused with a 409
+        "PlaybackError",  # the same
         "DamagedChunkError",  # the chunk is passed over and counted
         "NoTableError",  # becomes the UserError of a file that is no log
         "UnknownFlagsError",  # the same

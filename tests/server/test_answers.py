@@ -38,6 +38,7 @@ from companion.views import (
 
 PATHS: dict[str, Any] = {
     "/healthz": models.Health,
+    "/register_service": models.Registration,
     "/readyz": models.Readiness,
     "/v1/status": state.Status,
     "/v1/uavs": uav_state.Uavs,

@@ -54,8 +54,8 @@ FILLED = {
 }
 """Paths that are asked for, where those of the document are not."""
 STATUSES = {
-    "/v1/map/tiles": 404,  # there is no map
-    "/v1/recordings/{name}/history": 409,  # the file is no recording
+    "/v1/map/tiles": {404},  # there is no map
+    "/v1/recordings/{name}/history": {202, 409},  # being read; the file is no recording
 }
 
 
@@ -188,7 +188,11 @@ async def ask(port: int, path: str) -> int:
 
 
 def held_by_route(
-    serving: Serving, path: str, status: int, monkeypatch: pytest.MonkeyPatch, rounds: int = ROUNDS
+    serving: Serving,
+    path: str,
+    statuses: set[int],
+    monkeypatch: pytest.MonkeyPatch,
+    rounds: int = ROUNDS,
 ) -> float:
     """Return the longest callback while eight clients ask for a path: the median of rounds."""
     longest_s = []
@@ -200,7 +204,7 @@ def held_by_route(
         # Another moment than in the last round, but the same flight in all.
         serving.node.advance(-0.02 if number % 2 else 0.02)
         with Held(serving.thread.ident, monkeypatch) as held:
-            assert run_async(all_ask()) == [status] * CLIENTS, path
+            assert set(run_async(all_ask())) <= statuses, path
             time.sleep(0.002)  # the last callback may still run
         longest_s.append(max(held.took_s))
     return statistics.median(longest_s)
@@ -268,7 +272,7 @@ def test_no_route_holds_the_event_loop(
     assert len(both[1].node.pipeline.tracker) == UAVS
 
     def held(serving: Serving, path: str) -> float:
-        return held_by_route(serving, filled(path), STATUSES.get(path, 200), monkeypatch)
+        return held_by_route(serving, filled(path), STATUSES.get(path, {200}), monkeypatch)
 
     assert offenders(both, held, document_paths()) == {}
 
@@ -292,7 +296,7 @@ def test_routes_on_the_event_loop_are_found(
         back.setattr("companion.server.app.FEW_ITEMS", 10 * UAVS)
 
         def held(serving: Serving, path: str) -> float:
-            return held_by_route(serving, path, 200, monkeypatch, rounds=1)
+            return held_by_route(serving, path, {200}, monkeypatch, rounds=1)
 
         assert list(offenders(both, held, routes)) == routes
 

@@ -4,6 +4,7 @@ Messages are packed by pymavlink's generated dialect. The model (``Model``) keep
 and derives each result from all of them.
 """
 
+import gc
 import tracemalloc
 from collections import Counter
 from collections.abc import Callable
@@ -371,7 +372,11 @@ def test_message_older_than_two_minutes_is_out_of_order(tslc: int) -> None:
 
 
 def traced_bytes() -> int:
-    """Return the memory that these modules hold; other tests' threads may allocate meanwhile."""
+    """Return the memory that these modules hold; other tests' threads may allocate meanwhile.
+
+    Commands that ran in this process before may have made garbage collection rare.
+    """
+    gc.collect()
     modules = [
         tracemalloc.Filter(True, f"*/{part}/*.py") for part in ("mavlink", "trust", "values")
     ]

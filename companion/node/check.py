@@ -22,6 +22,8 @@ from companion.settings.model import Settings
 from companion.settings.outlets import DriveSettings, RecordSettings
 from companion.values import Level, UserError, Verdict, kind_of
 from companion.views import uav_state
+from companion.views.health import shown_verdicts
+from companion.views.state import overload
 
 TIMED_UPDATES: Final = 5  # number of timed computations of beams
 BUSY: Final = 0.3
@@ -217,7 +219,7 @@ def _silent(url: str) -> str:
 
 
 def _uavs(service: Service) -> Iterator[Finding]:
-    verdicts = service.pipeline.health.verdicts
+    verdicts = shown_verdicts(service.pipeline.health, overload(service, service.now_ns()))
     shown = [one for one in uav_state.states(service, service.now_ns()) if one.target]
     if not shown:
         remedy = "wait for a position fix; see `rejected` in /v1/status"

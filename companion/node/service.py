@@ -39,7 +39,19 @@ from companion.server import area_map
 from companion.settings.files import embedded
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
-from companion.values import ClockSet, Event, Frame, Notice, Output, Severity, Tick, Tock, UserError
+from companion.values import (
+    Blame,
+    ClockSet,
+    Event,
+    Frame,
+    Notice,
+    Output,
+    Severity,
+    Tick,
+    Tock,
+    UserError,
+)
+from companion.views.health import shown_verdicts
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
@@ -275,9 +287,8 @@ class Service:
                 Notice(t_ns=self.now_ns(), severity=severity, subject="recording", text=text)
             )
 
-    def _notify_overload(self) -> None:
+    def _notify_overload(self, machine: Blame | None) -> None:
         """Publish a notice when this machine becomes overloaded, and when it recovers."""
-        machine = overload(self, self.now_ns())
         if (machine is not None) is self._is_behind:
             return
         self._is_behind = machine is not None
@@ -312,12 +323,12 @@ class Service:
             self._rates.count(self.now_ns(), self.pipeline.frames, self.pipeline.updates)
             if self._recorder:
                 self._notify_recorder_state(self._recorder)
+            machine = overload(self, self.now_ns())
             if self._traffic.has_component:
-                self._traffic.speak(
-                    not self.unfit(), self.pipeline.reporters(), self.pipeline.health.verdicts
-                )
-            self._notify_overload()
-            self.series.add(self.pipeline)
+                verdicts = shown_verdicts(self.pipeline.health, machine)
+                self._traffic.speak(not self.unfit(), self.pipeline.reporters(), verdicts)
+            self._notify_overload(machine)
+            self.series.add(self.pipeline, machine)
             self._ticked.set()  # wakes all current waiters;
             self._ticked.clear()  # later ones wait for the next tick
             ended_s = loop.time()

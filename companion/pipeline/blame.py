@@ -28,23 +28,33 @@ CHECK_LINK: Final = "check its MAVLink link: power, range, antenna"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class CarrierEvidence:
+    """Facts about the carrier in addition to its pose; a station has none.
+
+    attitude        parts of the bound on its attitude
+    attitude_age_s  age of its newest attitude; None without one
+    clock_assumed   the constant part of its latency is only assumed
+    """
+
+    attitude: AttitudeParts = field(default_factory=AttitudeParts)
+    attitude_age_s: float | None = None
+    clock_assumed: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LinkEvidence:
     """Facts about a UAV's link in addition to its track.
 
-    clock_assumed    the constant part of its latency is only assumed
-    refused          why its newest reports were rejected; None: they were used
-    waited_s         time for which frames may have waited for this machine
-    attitude         parts of the bound on the carrier's attitude
-    attitude_age_s   age of the carrier's newest attitude; None without one
-    carrier_assumed  the constant part of the carrier's latency is only assumed
+    clock_assumed  the constant part of its latency is only assumed
+    refused        why its newest reports were rejected; None: they were used
+    waited_s       time for which frames may have waited for this machine
+    carrier        facts about the carrier
     """
 
     clock_assumed: bool
     refused: Reason | None
     waited_s: float = 0.0
-    attitude: AttitudeParts = field(default_factory=AttitudeParts)
-    attitude_age_s: float | None = None
-    carrier_assumed: bool = False
+    carrier: CarrierEvidence = field(default_factory=CarrierEvidence)
 
 
 def of_machine(waited_s: float) -> Blame:
@@ -154,7 +164,7 @@ def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence)
                 " `[center] attitude_bound_deg`"
             )
         case ErrorSource.ATTITUDE_AGE:
-            age_s = (evidence.attitude_age_s or 0.0) - evidence.waited_s
+            age_s = (evidence.carrier.attitude_age_s or 0.0) - evidence.waited_s
             if age_s > SILENT_S:
                 reason = f"no attitude from the carrier for {age_s:.1f} s"
                 return Blame(Cause.CARRIER, reason, CHECK_LINK)
@@ -165,7 +175,7 @@ def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence)
                 "check that only one component sends the carrier's ATTITUDE, and its gyroscopes"
             )
         case _:
-            better = TIMESYNC if evidence.carrier_assumed else STEADIER_LINK
+            better = TIMESYNC if evidence.carrier.clock_assumed else STEADIER_LINK
             remedy = f"improve the carrier's clock: {better}"
     return Blame(Cause.CARRIER, reason, remedy)
 

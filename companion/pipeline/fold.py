@@ -29,16 +29,16 @@ from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Guaran
 from companion.mavlink.wire.decode import DECODED
 from companion.mavlink.wire.stamps import STAMPED
 from companion.pipeline import assembly, assumptions
-from companion.pipeline.blame import LinkEvidence
+from companion.pipeline.blame import CarrierEvidence, LinkEvidence
 from companion.pipeline.center import CarrierTracker
 from companion.pipeline.digest import Digest
-from companion.pipeline.health import HealthMonitor, LinkBatch, Site
+from companion.pipeline.health import HealthMonitor, LinkBatch
+from companion.pipeline.link_gains import Site
 from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import Refusals
 from companion.pipeline.senders import NO_OUTCOME, PlacedAttitude, PlacedReport, Senders, Timeline
 from companion.pipeline.targets import Targets
 from companion.settings.model import Settings
-from companion.tracking.carrier import AttitudeParts
 from companion.tracking.geodesy import LocalFrame
 from companion.tracking.track_snapshot import TrackSnapshot
 from companion.values import (
@@ -278,7 +278,8 @@ class Pipeline:
             state = self.tracker.state(self.center.vehicle, now)
             states |= {} if state is None else {self.center.vehicle: state}
         said = self.targets.changes(now_ns, states)
-        judged = self.health.judge(self.last_update, weighed, partial(self._evidence, now_ns))
+        evidence = partial(self._evidence, now_ns, cache(partial(self._carrier_evidence, now_ns)))
+        judged = self.health.judge(self.last_update, weighed, evidence)
         changed = self._clock_notices.due(now_ns)
         return [*said, *judged, *([changed] if changed else ()), self.last_update]
 
@@ -291,21 +292,26 @@ class Pipeline:
 
         return made
 
-    def _evidence(self, now_ns: int, uav: str) -> LinkEvidence:
-        vehicle = self.center.vehicle
-        age_s, attitude = None, AttitudeParts()
-        if vehicle is not None:
-            at = self.senders.time(vehicle, now_ns)
-            age_s = self.center.attitude_age_s(at)
-            turn_degps2 = self.senders.assumed(vehicle).turn_degps2
-            attitude = self.center.attitude_parts(at, turn_degps2, self._waited_s)
+    def _evidence(
+        self, now_ns: int, carrier: Callable[[], CarrierEvidence], uav: str
+    ) -> LinkEvidence:
         return LinkEvidence(
             clock_assumed=self._is_assumed(uav),
             refused=self.refusals.current_rejection(uav, now_ns),
             waited_s=self._waited_s,
-            attitude=attitude,
-            attitude_age_s=age_s,
-            carrier_assumed=vehicle is not None and self._is_assumed(vehicle),
+            carrier=carrier(),
+        )
+
+    def _carrier_evidence(self, now_ns: int) -> CarrierEvidence:
+        vehicle = self.center.vehicle
+        if vehicle is None:
+            return CarrierEvidence()
+        at = self.senders.time(vehicle, now_ns)
+        turn_degps2 = self.senders.assumed(vehicle).turn_degps2
+        return CarrierEvidence(
+            attitude=self.center.attitude_parts(at, turn_degps2, self._waited_s),
+            attitude_age_s=self.center.attitude_age_s(at),
+            clock_assumed=self._is_assumed(vehicle),
         )
 
     def _is_assumed(self, sender: str) -> bool:

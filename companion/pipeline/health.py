@@ -1,42 +1,24 @@
-"""Verdicts on the links to all UAVs, and notices when they change.
+"""Verdicts on the links to all UAVs; ``verdict_notices`` announces their changes.
 
 Once a second, the guaranteed and the likely gain of each beam are compared with the gain that the
 link needs. Links are assessed in batches, one per update, so that no update is delayed; those whose
 beam has got worse since are assessed at once. A verdict falls at once, and rises after a hold time
 and with a gain margin, so that it does not flap.
-
-Over 300 lines: assessment, hold times and notices are the life of one verdict.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections import defaultdict
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
-import numpy as np
-
-from companion.beams.aim import directions
-from companion.beams.array.coverage import Coverage
-from companion.beams.array.geometry import Array
-from companion.beams.worth import guarantee, link_budget
-from companion.beams.worth.link_budget import LinkBudget
 from companion.pipeline import blame
 from companion.pipeline.angle_parts import AngleParts, angle_parts
 from companion.pipeline.blame import LinkEvidence
+from companion.pipeline.link_gains import GainMeter, LinkGains, Site
+from companion.pipeline.verdict_notices import VerdictNotices
 from companion.settings.beams import NeedSettings
-from companion.values import (
-    Beam,
-    BeamSet,
-    Cause,
-    FloatArray,
-    Level,
-    Notice,
-    Severity,
-    Track,
-    TrackState,
-    Update,
-    Verdict,
-)
+from companion.values import Beam, Cause, Level, Notice, Track, TrackState, Update, Verdict
 
 EVERY_NS: Final = 1_000_000_000
 """Interval between two assessments of a link; a round through all links takes as long."""
@@ -52,29 +34,6 @@ GOOD_KEPT_NS: Final = 30_000_000_000
 """Time for which the smallest bound of a good link is kept, to find what has grown since."""
 COASTING_S: Final = 2.0
 """Age of the newest report of a coasting UAV beyond which its link is not good, seconds."""
-ANNOUNCED_AFTER_NS: Final = 1_000_000_000
-"""Time for which a link must have another level than the last announced one for a notice."""
-NAMED: Final = 6  # largest number of UAVs named in one notice
-RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}  # levels from the worst to the best
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Site:
-    """Properties common to all beams: the array, its coverage, its radio."""
-
-    array: Array
-    coverage: Coverage
-    budget: LinkBudget
-    uav_antennas: int
-
-
-class _Link(NamedTuple):
-    """Link to assess: beam, needed gain, guaranteed and likely gain (None: no such gain)."""
-
-    beam: Beam
-    needed_db: float
-    guaranteed_db: float | None
-    likely_db: float | None
 
 
 class LinkBatch(NamedTuple):
@@ -89,7 +48,7 @@ class LinkBatch(NamedTuple):
     begins: bool
     waiting: list[str]
     early: frozenset[str]
-    links: list[_Link]
+    links: list[LinkGains]
 
 
 class _Assessed(NamedTuple):
@@ -108,22 +67,31 @@ class _Assessed(NamedTuple):
         )
 
 
+@dataclass(slots=True)
+class _LinkRecord:
+    """What is kept of a link between its assessments.
+
+    assessed         the worst of its beams since its turn in the round
+    better_since_ns  since when it has been better than its level
+    good             time and parts of the smallest bound with which it was good of late
+    """
+
+    assessed: _Assessed | None = None
+    better_since_ns: int | None = None
+    good: tuple[int, AngleParts] | None = None
+
+
 class HealthMonitor:
     """Monitor of the links. ``verdicts`` holds the current verdict of each target, by its id."""
 
     def __init__(self, need: NeedSettings, site: Site) -> None:
         self.verdicts: dict[str, Verdict] = {}
-        self._need = need
-        self._site = site
+        self._meter = GainMeter(need, site)
         self._round_start_ns: int | None = None  # start of the current round
         self._last_ns: int | None = None  # time of the previous update
         self._waiting: list[str] = []  # UAVs still queued in this round
-        self._noticed: dict[str, Verdict] = {}  # verdicts at the last notice
-        self._changed_ns: dict[str, int] = {}  # since when a level is not the announced one
-        self._better_since_ns: dict[str, int] = {}  # since when a link has been better
-        self._assessed: dict[str, _Assessed] = {}  # the worst beam since the last round
-        self._when_good: dict[str, tuple[int, AngleParts]] = {}  # smallest bound while good
-        self._unfit: str | None = None
+        self._links_kept: defaultdict[str, _LinkRecord] = defaultdict(_LinkRecord)
+        self._notices = VerdictNotices()
 
     def next_batch(self, update: Update) -> LinkBatch | None:
         """Return the next batch of links to assess, with their gains; None if none is due.
@@ -143,36 +111,23 @@ class HealthMonitor:
         due = frozenset(waiting[:many])
         early = frozenset(fallen) - due
         which = [i for i, beam in enumerate(beams) if beam.uav in due or beam.uav in early]
-        links = [] if update.carrier is None or not which else self._links(update.beams, which)
+        links = (
+            [] if update.carrier is None or not which else self._meter.gains(update.beams, which)
+        )
         return LinkBatch(begins=begins, waiting=waiting[many:], early=early, links=links)
 
     def _may_have_fallen(self, beam: Beam) -> bool:
-        held, before = self.verdicts.get(beam.uav), self._assessed.get(beam.uav)
-        if held is None or before is None or held.level is Level.NONE:
+        held, kept = self.verdicts.get(beam.uav), self._links_kept.get(beam.uav)
+        if held is None or held.level is Level.NONE or kept is None or kept.assessed is None:
             return False
-        return before.is_worse(beam)
-
-    def _links(self, beam_set: BeamSet, which: Sequence[int]) -> list[_Link]:
-        towards = directions(beam_set)
-        needed_db = _needed_db(self._need, self._site, beam_set, towards)
-        least_db = self._least_db(beam_set, towards, which)
-        return [
-            _Link(
-                beam=beam_set.beams[i],
-                needed_db=needed_db[i],
-                guaranteed_db=sure_db,
-                likely_db=likely_db,
-            )
-            for i, sure_db, likely_db in zip(which, *least_db, strict=True)
-        ]
+        return kept.assessed.is_worse(beam)
 
     def judge(
         self, update: Update, weighed: LinkBatch | None, evidence: Callable[[str], LinkEvidence]
     ) -> list[Notice]:
         """Assess one batch of links; return notices of changes at the end of a round.
 
-        ``evidence`` returns what is known about a UAV in addition to its track; it is called for
-        UAVs whose link is not good.
+        ``evidence`` returns what is known about a UAV in addition to its track.
         """
         self._last_ns = update.t_ns
         begins = weighed is not None and weighed.begins
@@ -193,29 +148,32 @@ class HealthMonitor:
         names = dict.fromkeys((*tracks, *(out.uav for out in update.beams.left_out)))
         self.verdicts = {uav: held[uav] for uav in names if uav in held}
         if begins:
-            for kept in (self._better_since_ns, self._assessed, self._when_good):
-                for uav in [uav for uav in kept if uav not in tracks]:
-                    del kept[uav]
-        return [] if self._waiting else self._notices(update)
+            for uav in [uav for uav in self._links_kept if uav not in tracks]:
+                del self._links_kept[uav]
+        if self._waiting:
+            return []
+        rising = {uav for uav, one in self._links_kept.items() if one.better_since_ns is not None}
+        return self._notices.due(update, self.verdicts, rising)
 
     def _note_beam(self, beam: Beam, *, is_early: bool) -> None:
         """Note how uncertain the beam of an assessed link was; the worst of a round counts."""
         now = _Assessed(
             _or_inf(beam.pointing_bound_rad), _or_inf(beam.pointing_p95_rad), beam.gain_db
         )
-        before = self._assessed.get(beam.uav)
+        record = self._links_kept[beam.uav]
+        before = record.assessed
         if before is not None and is_early:
             now = _Assessed(
                 max(before.bound_rad, now.bound_rad),
                 max(before.p95_rad, now.p95_rad),
                 min(before.gain_db, now.gain_db),
             )
-        self._assessed[beam.uav] = now
+        record.assessed = now
 
     def _judge_link(
         self,
         update: Update,
-        link: _Link,
+        link: LinkGains,
         tracks: dict[str, Track],
         evidence: Callable[[str], LinkEvidence],
     ) -> Verdict:
@@ -224,13 +182,13 @@ class HealthMonitor:
         why = None
         if carrier is not None:
             track, known = tracks[uav], evidence(uav)
-            parts = angle_parts(link.beam, track, carrier, known.attitude, known.waited_s)
+            parts = angle_parts(link.beam, track, carrier, known.carrier.attitude, known.waited_s)
             coasting = track.state is TrackState.COASTING and track.age_s > COASTING_S
             held = self.verdicts.get(uav)
             if level is not Level.GOOD and held and held.blame and _is_enough(link):
                 why = held.blame  # only the margin is missing
             elif level is not Level.GOOD:
-                when_good = self._when_good.get(uav)
+                good = self._links_kept[uav].good
                 why = blame.of_beam(
                     link.beam,
                     track,
@@ -238,7 +196,7 @@ class HealthMonitor:
                     known,
                     parts,
                     carrier=carrier,
-                    when_good=None if when_good is None else when_good[1],
+                    when_good=None if good is None else good[1],
                 )
             elif coasting:
                 level, why = Level.WEAK, blame.of_coasting(track, known)
@@ -256,33 +214,23 @@ class HealthMonitor:
 
     def _note_good(self, uav: str, t_ns: int, parts: AngleParts) -> None:
         """Note the parts of the bound of a good link: the smallest bound of the last while."""
-        before = self._when_good.get(uav)
-        is_old = before is None or t_ns - before[0] > GOOD_KEPT_NS
-        if before is None or is_old or sum(parts.values()) <= sum(before[1].values()):
-            self._when_good[uav] = (t_ns, parts)
-
-    def _least_db(
-        self, beam_set: BeamSet, towards: FloatArray, which: Sequence[int]
-    ) -> tuple[Sequence[float | None], Sequence[float | None]]:
-        """Return each beam's least gain within its UAV's bound, and within the usual error."""
-        array, beams = self._site.array, [beam_set.beams[i] for i in which]
-        both = np.tile(towards[which], (2, 1))
-        angles = [beam.pointing_bound_rad for beam in beams]
-        angles += [beam.pointing_p95_rad for beam in beams]
-        bounds = guarantee.covered_bounds(array, self._site.coverage, both, angles)
-        weights = np.tile(beam_set.weights[:, which], 2)
-        gains = guarantee.guaranteed_gains_db(array, both, bounds, weights)
-        return gains[: len(beams)], gains[len(beams) :]
+        record = self._links_kept[uav]
+        if (
+            record.good is None
+            or t_ns - record.good[0] > GOOD_KEPT_NS
+            or sum(parts.values()) <= sum(record.good[1].values())
+        ):
+            record.good = (t_ns, parts)
 
     def _level(
         self, uav: str, needed_db: float, sure_db: float | None, likely_db: float | None
     ) -> Level:
         """Return a link's level by its gains; a level rises only with ``MARGIN_DB``."""
         held = self.verdicts.get(uav)
-        rank = RANK[held.level] if held else RANK[Level.GOOD]
+        rank = held.level.rank if held else Level.GOOD.rank
 
         def enough(gain_db: float | None, level: Level) -> bool:
-            margin_db = 0.0 if rank >= RANK[level] else MARGIN_DB
+            margin_db = 0.0 if rank >= level.rank else MARGIN_DB
             return gain_db is not None and gain_db >= needed_db + margin_db
 
         if enough(sure_db, Level.GOOD):
@@ -291,13 +239,14 @@ class HealthMonitor:
 
     def _with_hold_time(self, fresh: Verdict) -> Verdict:
         """Return the new verdict; with the current level until a better one has been held."""
-        uav, held = fresh.uav, self.verdicts.get(fresh.uav)
-        if held is not None and RANK[fresh.level] > RANK[held.level]:
-            since_ns = self._better_since_ns.setdefault(uav, fresh.since_ns)
-            if fresh.since_ns - since_ns < HOLD_BETTER_NS:
+        held, record = self.verdicts.get(fresh.uav), self._links_kept[fresh.uav]
+        if held is not None and fresh.level.rank > held.level.rank:
+            if record.better_since_ns is None:
+                record.better_since_ns = fresh.since_ns
+            if fresh.since_ns - record.better_since_ns < HOLD_BETTER_NS:
                 why = fresh.blame or held.blame
                 return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
-        self._better_since_ns.pop(uav, None)
+        record.better_since_ns = None
         if held is None or fresh.level is not held.level:
             return fresh
         if fresh.needed_gain_db is held.needed_gain_db is None and fresh.blame == held.blame:
@@ -328,73 +277,10 @@ class HealthMonitor:
             )
         return found
 
-    def _notices(self, update: Update) -> list[Notice]:
-        """Return notices of changed verdicts; one for all links if the carrier is the cause.
 
-        A change is announced once it has lasted for ``ANNOUNCED_AFTER_NS``, unless the link is
-        better again and only its hold time keeps the level.
-        """
-        was, self._unfit = self._unfit, update.unfit
-        if update.unfit is not None:
-            text = f"no links: {update.unfit}"
-            news = self._noticed and was is None
-            self._noticed, self._changed_ns = self.verdicts, {}
-            return (
-                [Notice(t_ns=update.t_ns, severity=Severity.WARNING, subject="beams", text=text)]
-                if news
-                else []
-            )
-        before, self._noticed = self._noticed, dict(self.verdicts)
-        changed_ns, self._changed_ns = self._changed_ns, {}
-        changed = dict[tuple[Level, Cause | None], list[Verdict]]()
-        for uav, verdict in self.verdicts.items():
-            held = before.get(uav)
-            if held is None or held.level is verdict.level:
-                continue
-            since_ns = changed_ns.get(uav, update.t_ns)
-            is_brief = update.t_ns - since_ns < ANNOUNCED_AFTER_NS or uav in self._better_since_ns
-            if verdict.needed_gain_db is not None and is_brief:
-                self._noticed[uav], self._changed_ns[uav] = held, since_ns
-                continue
-            cause = verdict.blame.cause if verdict.blame else None
-            # A UAV that is stale or lost, and therefore without a beam, has its own notice.
-            if cause is not Cause.SILENT or verdict.needed_gain_db is not None:
-                changed.setdefault((verdict.level, cause), []).append(verdict)
-        return [_notice(update.t_ns, alike) for alike in changed.values()]
-
-
-def _notice(t_ns: int, alike: Sequence[Verdict]) -> Notice:
-    """Return one notice for all links that changed to the same level for the same cause."""
-    names = ", ".join(verdict.uav for verdict in alike[:NAMED])
-    rest = f" and {len(alike) - NAMED} more" if len(alike) > NAMED else ""
-    one, links = alike[0], "links" if len(alike) > 1 else "link"
-    text = f"{links} to {names}{rest}: {one.level}"
-    if one.blame is None:
-        return Notice(t_ns=t_ns, severity=Severity.INFO, subject=one.uav, text=text)
-    text += f" – {one.blame.reason}; {one.blame.remedy}"
-    return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=one.uav, text=text)
-
-
-def _is_enough(link: _Link) -> bool:
+def _is_enough(link: LinkGains) -> bool:
     return link.guaranteed_db is not None and link.guaranteed_db >= link.needed_db
 
 
 def _or_inf(angle_rad: float | None) -> float:
     return math.inf if angle_rad is None else angle_rad
-
-
-def _needed_db(
-    need: NeedSettings, site: Site, beam_set: BeamSet, towards: FloatArray
-) -> list[float]:
-    """Return the array gain that each link needs, dB.
-
-    With ``needed_sinr_db`` that is the beam's gain less the excess of its SINR.
-    """
-    beams = beam_set.beams
-    if need.needed_sinr_db is None:
-        return [need.needed_db] * len(beams)
-    sinr_db = link_budget.sinr_of_beams_db(
-        site.array, beam_set, towards, site.budget, site.uav_antennas
-    )
-    spare_db = sinr_db - need.needed_sinr_db
-    return [beam.gain_db - spare for beam, spare in zip(beams, spare_db.tolist(), strict=True)]

@@ -26,7 +26,8 @@ from companion.server.large_answers import Make
 from companion.server.stream import Stream
 from companion.values import BeamSet, Level, Track, Verdict
 from companion.values.described import meaning
-from companion.views.state import Node, RecordingStatus
+from companion.views.health import shown_verdicts
+from companion.views.state import Node, RecordingStatus, overload
 from companion.views.uav_state import Overview
 
 LINK_COUNTS: Final = (
@@ -63,7 +64,10 @@ class NodeMetrics:
     def prepare(self, overview: Overview) -> Make[bytes]:
         """Read the node; return a function that writes its metrics, on any thread."""
         before = [*self._service(), *self._arrival_lag(), *self._links()]
-        beams, verdicts = list(self._beams()), list(self._node.pipeline.health.verdicts.values())
+        node = self._node
+        machine = overload(node, node.now_ns())
+        beams = list(self._beams())
+        verdicts = list(shown_verdicts(node.pipeline.health, machine).values())
         after = [*fleet_metrics(self._node), *self._recording()]
 
         def made(way: GivingWay) -> bytes:

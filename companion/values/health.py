@@ -1,7 +1,7 @@
 """Verdict on a UAV's link: its level, the cause, and the remedy."""
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Final
 
 from companion.values.described import DescribedEnum, Meaning
 
@@ -12,6 +12,14 @@ class Level(DescribedEnum):
     GOOD = "good", "its beam has the gain that the link needs, guaranteed"
     WEAK = "weak", "its beam usually has the gain that the link needs"
     NONE = "none", "its beam lacks the gain that the link needs, or there is no beam"
+
+    @property
+    def rank(self) -> int:
+        """Place in the order from the worst level, 0, to the best."""
+        return _RANKS[self]
+
+
+_RANKS: Final = {level: rank for rank, level in enumerate(reversed(Level))}
 
 
 class Cause(DescribedEnum):
@@ -64,3 +72,10 @@ class Verdict:
     likely_gain_db: Annotated[
         float | None, Meaning("least array gain within the usual pointing error; null: none")
     ] = None
+
+    @property
+    def spare_gain_db(self) -> float | None:
+        """Guaranteed gain beyond the needed one; None without a guarantee or a beam."""
+        if self.guaranteed_gain_db is None or self.needed_gain_db is None:
+            return None
+        return self.guaranteed_gain_db - self.needed_gain_db

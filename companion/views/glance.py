@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 from companion.pipeline.fold import Pipeline
-from companion.values import Blame, Level, Notice, Verdict, kind_of
+from companion.values import Level, Notice, Verdict, kind_of
 from companion.values.described import Meaning
 from companion.views import health
 from companion.views.as_json import Json, as_json, rfc3339
@@ -18,8 +18,8 @@ NAMED: Final = 2  # largest number of UAVs in the status line
 def glance(node: Node) -> Json:
     """Return the short status: links, UAVs with their verdicts, recording and headline."""
     pipeline, now_ns = node.pipeline, node.now_ns()
-    verdicts, update = pipeline.health.verdicts, pipeline.last_update
-    machine = overload(node, now_ns)
+    machine, update = overload(node, now_ns), pipeline.last_update
+    verdicts = health.shown_verdicts(pipeline.health, machine)
     recording = node.recording()
     return {
         "at": rfc3339(pipeline.utc_ns(now_ns)),
@@ -31,7 +31,7 @@ def glance(node: Node) -> Json:
         "uavs": [
             {"id": track.uav, "state": str(track.state), "age_s": track.age_s}
             | {"bound_m": track.bound_m}
-            | _verdict(pipeline, verdicts.get(track.uav), machine)
+            | _verdict(pipeline, verdicts.get(track.uav))
             for track in (update.tracks if update else ())
             if kind_of(track.uav).reports_itself
         ],
@@ -44,7 +44,7 @@ def glance(node: Node) -> Json:
 
 def line(node: Node) -> str:
     """Return the short status as one line, with the worst links."""
-    now_ns, verdicts = node.now_ns(), node.pipeline.health.verdicts
+    now_ns = node.now_ns()
     up = sum(link.state == "up" for link in node.links())
     frames_hz = node.rates().get("frames_hz")
     parts = [f"{up} of {len(node.links())} links up"]
@@ -57,7 +57,8 @@ def line(node: Node) -> str:
     elif node.unfit():
         parts.append(node.unfit()[0])
     else:
-        parts += [_worst(verdict) for verdict in _worst_first(list(verdicts.values()))[:NAMED]]
+        verdicts = list(node.pipeline.health.verdicts.values())
+        parts += [_worst(verdict) for verdict in _worst_first(verdicts)[:NAMED]]
     recording = node.recording()
     if recording.state != "off":
         parts.append(f"{recording.state} {recording.bytes / 1e6:.1f} MB")
@@ -82,23 +83,18 @@ def as_events(node: Node, notices: Sequence[Notice]) -> list[Json]:
     return [as_json(notice, node.pipeline.utc_ns) for notice in notices]
 
 
-def _verdict(pipeline: Pipeline, found: Verdict | None, machine: Blame | None) -> Json:
-    level, why = health.verdict(found, machine)
+def _verdict(pipeline: Pipeline, found: Verdict | None) -> Json:
+    level, why = health.verdict(found, None)
     shown = None if why is None else as_json(why, pipeline.utc_ns)
     return {"verdict": None if level is None else str(level), "health": shown}
 
 
 def _worst_first(verdicts: list[Verdict]) -> list[Verdict]:
-    ranks = {Level.NONE: 0, Level.WEAK: 1}
-    poor = [verdict for verdict in verdicts if verdict.level in ranks]
-    return sorted(poor, key=lambda verdict: (ranks[verdict.level], _spare_db(verdict)))
+    def place(verdict: Verdict) -> tuple[int, float]:
+        spare_db = verdict.spare_gain_db
+        return verdict.level.rank, -math.inf if spare_db is None else spare_db
 
-
-def _spare_db(verdict: Verdict) -> float:
-    """Return the guaranteed gain less the needed one; -inf without one."""
-    if verdict.guaranteed_gain_db is None or verdict.needed_gain_db is None:
-        return -math.inf
-    return verdict.guaranteed_gain_db - verdict.needed_gain_db
+    return sorted((one for one in verdicts if one.level is not Level.GOOD), key=place)
 
 
 def _worst(verdict: Verdict) -> str:

@@ -5,12 +5,13 @@ longer than planned.
 """
 
 from collections import Counter
-from collections.abc import Iterable
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from typing import Annotated, Final
 
 from companion.mavlink.links.lag import LagSeen
 from companion.pipeline.blame import of_machine
+from companion.pipeline.health import HealthMonitor
 from companion.values import Blame, Cause, Level, Verdict
 from companion.values.described import Inline, Meaning
 
@@ -55,9 +56,18 @@ def behind(seen: LagSeen, update_age_s: float | None, update_hz: float) -> Blame
     )
 
 
-def level_of(found: Verdict, machine: Blame | None) -> Level:
-    """Return the level shown: no link is good while this machine is overloaded."""
-    return Level.WEAK if found.level is Level.GOOD and machine is not None else found.level
+def shown(found: Verdict, machine: Blame | None) -> Verdict:
+    """Return a verdict as it is shown: no link is good while this machine is overloaded."""
+    if machine is None or found.level is not Level.GOOD:
+        return found
+    return replace(found, level=Level.WEAK, blame=machine)
+
+
+def shown_verdicts(monitor: HealthMonitor, machine: Blame | None) -> Mapping[str, Verdict]:
+    """Return the verdicts as they are shown, by UAV."""
+    if machine is None:
+        return monitor.verdicts
+    return {uav: shown(one, machine) for uav, one in monitor.verdicts.items()}
 
 
 def verdict(
@@ -71,8 +81,8 @@ def verdict(
         return Level.NONE, LinkHealth(machine or unserved, None)
     if found is None:
         return None, None
-    why = machine if found.level is Level.GOOD else found.blame
-    return level_of(found, machine), LinkHealth(why, found)
+    found = shown(found, machine)
+    return found.level, LinkHealth(found.blame, found)
 
 
 def summary(
@@ -80,9 +90,12 @@ def summary(
 ) -> Headline:
     """Return the number of links of each level, also as text.
 
-    ``unserved`` UAVs have no node of the fleet; ``elsewhere`` counts those that other nodes serve.
+    verdicts   those shown
+    machine    cause of weak links by overload; None without overload
+    unserved   number of UAVs that no node of the fleet serves
+    elsewhere  number of UAVs that other nodes serve
     """
-    counts = Counter(level_of(found, machine) for found in verdicts)
+    counts = Counter(found.level for found in verdicts)
     counts[Level.NONE] += unserved
     good, total = counts[Level.GOOD], counts.total()
     parts = [f"{good} of {total} links good"] if total else []

@@ -11,10 +11,11 @@ from typing import Annotated, Any, Final
 import numpy as np
 
 from companion.pipeline.fold import Pipeline
-from companion.tracking.geodesy import LocalFrame
-from companion.values import FloatArray, Update
-from companion.values.described import Meaning, members
+from companion.tracking.geodesy import LocalFrame, Place
+from companion.values import Beam, Blame, FloatArray, Track, Update, Verdict
+from companion.values.described import Meaning, meaning, members
 from companion.views.as_json import COORDINATE_DIGITS, DIGITS, Json, Utc, degrees, rfc3339
+from companion.views.health import shown_verdicts
 
 EVERY_NS: Final = 1_000_000_000  # least time between two samples
 SAMPLES: Final = 300  # samples kept: five minutes
@@ -22,34 +23,37 @@ Column = list[float | None]
 Words = list[str | None]
 
 
+def _same(described: type, name: str) -> Meaning:
+    """Return the meaning of a value that is sampled here."""
+    return Meaning(meaning(described, name).text)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UavHistory:
     """Samples of one UAV, one per time in ``at``; null where a value was unknown."""
 
-    pointing_bound_deg: Annotated[
-        Column, Meaning("largest angle between the predicted and the true direction")
-    ]
-    innovation_m: Annotated[Column, Meaning("distance from the prediction to the newest report")]
-    latency_s: Annotated[Column, Meaning("age of the newest report at its arrival")]
-    guaranteed_gain_db: Annotated[Column, Meaning("least array gain wherever the UAV can be")]
-    state: Annotated[Words, Meaning("state of the track, by the age of its newest report")]
+    pointing_bound_deg: Annotated[Column, _same(Beam, "pointing_bound_rad")]
+    innovation_m: Annotated[Column, _same(Track, "innovation_m")]
+    latency_s: Annotated[Column, _same(Track, "latency_s")]
+    guaranteed_gain_db: Annotated[Column, _same(Verdict, "guaranteed_gain_db")]
+    state: Annotated[Words, _same(Track, "state")]
     verdict: Annotated[Words, Meaning("whether the UAV's beam has the gain that the link needs")]
-    age_s: Annotated[Column, Meaning("age of the newest accepted report")]
-    horizontal_bound_m: Annotated[Column, Meaning("bound on the horizontal error")]
-    azimuth_deg: Annotated[Column, Meaning("direction in the array's frame")]
-    gain_db: Annotated[Column, Meaning("array gain towards the predicted direction")]
-    lat_deg: Annotated[Column, Meaning("latitude, WGS84")]
-    lon_deg: Annotated[Column, Meaning("longitude, WGS84")]
-    alt_m: Annotated[Column, Meaning("altitude above the datum of its reports")]
+    age_s: Annotated[Column, _same(Track, "age_s")]
+    horizontal_bound_m: Annotated[Column, _same(Track, "horizontal_bound_m")]
+    azimuth_deg: Annotated[Column, _same(Beam, "azimuth_rad")]
+    gain_db: Annotated[Column, _same(Beam, "gain_db")]
+    lat_deg: Annotated[Column, _same(Place, "lat_deg")]
+    lon_deg: Annotated[Column, _same(Place, "lon_deg")]
+    alt_m: Annotated[Column, _same(Place, "alt_m")]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CarrierHistory:
     """Samples of the array's carrier; null where it was unknown."""
 
-    lat_deg: Annotated[Column, Meaning("latitude, WGS84")]
-    lon_deg: Annotated[Column, Meaning("longitude, WGS84")]
-    alt_m: Annotated[Column, Meaning("altitude above the datum of its reports")]
+    lat_deg: Annotated[Column, _same(Place, "lat_deg")]
+    lon_deg: Annotated[Column, _same(Place, "lon_deg")]
+    alt_m: Annotated[Column, _same(Place, "alt_m")]
     heading_deg: Annotated[Column, Meaning("bearing of the nose from true north")]
 
 
@@ -87,22 +91,25 @@ class Series:
     def __init__(self) -> None:
         self._samples: deque[Sample] = deque(maxlen=SAMPLES)
 
-    def add(self, pipeline: Pipeline) -> None:
-        """Sample the newest update if a sample is due."""
+    def add(self, pipeline: Pipeline, machine: Blame | None = None) -> None:
+        """Sample the newest update if a sample is due; ``machine`` as for ``moment``."""
         update = pipeline.last_update
         if update is None or (self._samples and 0 <= update.t_ns - self._samples[-1][0] < EVERY_NS):
             return
-        self._samples.append((update.t_ns, moment(pipeline, update)))
+        self._samples.append((update.t_ns, moment(pipeline, update, machine)))
 
     def samples(self) -> list[Sample]:
         """Return the samples so far, oldest first; they are immutable."""
         return list(self._samples)
 
 
-def moment(pipeline: Pipeline, update: Update) -> Moment:
-    """Return a sample of an update; its places are converted by ``show``."""
+def moment(pipeline: Pipeline, update: Update, machine: Blame | None = None) -> Moment:
+    """Return a sample of an update; its places are converted by ``show``.
+
+    ``machine`` is the cause of weak links by overload; None without overload.
+    """
     beams = {beam.uav: beam for beam in update.beams.beams}
-    verdicts = pipeline.health.verdicts
+    verdicts = shown_verdicts(pipeline.health, machine)
     uavs = dict[str, tuple[Any, ...]]()
     for track in update.tracks:
         found, beam = verdicts.get(track.uav), beams.get(track.uav)

@@ -192,7 +192,8 @@ def summary(node: Node, now_ns: int) -> Headline:
     """Return the headline on the links, including UAVs that no node of a fleet serves."""
     pipeline = node.pipeline
     served = served_uavs(pipeline, node.fleet_status(), now_ns)
-    verdicts, machine = pipeline.health.verdicts, overload(node, now_ns)
+    machine = overload(node, now_ns)
+    verdicts = health.shown_verdicts(pipeline.health, machine)
     if served is None:
         return health.summary(verdicts.values(), machine)
     here = [one for uav, one in verdicts.items() if served.is_here(uav)]

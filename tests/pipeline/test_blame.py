@@ -8,7 +8,7 @@ import tracks
 
 from companion.pipeline import blame
 from companion.pipeline.angle_parts import AngleParts, angle_parts
-from companion.pipeline.blame import LinkEvidence
+from companion.pipeline.blame import CarrierEvidence, LinkEvidence
 from companion.tracking.carrier import AttitudeParts
 from companion.values import Beam, Carrier, Cause, LeftOut, Limits, Reason, Track, TrackState
 
@@ -55,7 +55,7 @@ def blamed(
     evidence: LinkEvidence = FINE,
     when_good: AngleParts | None = None,
 ) -> tuple[Cause, str, str]:
-    parts = angle_parts(beam, track, carrier, evidence.attitude, evidence.waited_s)
+    parts = angle_parts(beam, track, carrier, evidence.carrier.attitude, evidence.waited_s)
     found = blame.of_beam(beam, track, 10.0, evidence, parts, carrier=carrier, when_good=when_good)
     return found.cause, found.reason, found.remedy
 
@@ -114,7 +114,7 @@ def test_unmeasured_clock_remedy_is_timesync() -> None:
         (AttitudeParts(age_rad=0.19), {"attitude_age_s": 1.4}, "no attitude from the carrier",
          "power"),
         (AttitudeParts(error_rad=0.18, age_rad=0.01), {}, "is uncertain by 11°", "compass"),
-        (AttitudeParts(clock_rad=0.19), {"carrier_assumed": True}, "uncertain by 11°", "TIMESYNC"),
+        (AttitudeParts(clock_rad=0.19), {"clock_assumed": True}, "uncertain by 11°", "TIMESYNC"),
         (AttitudeParts(clock_rad=0.19), {}, "attitude is uncertain by 11°", "steadier"),
         (AttitudeParts(conflict_rad=0.19), {}, "contradict each other", "only one component"),
     ],
@@ -122,7 +122,7 @@ def test_unmeasured_clock_remedy_is_timesync() -> None:
 def test_carrier_is_blamed_for_its_attitude(
     attitude: AttitudeParts, evidence: dict[str, float], reason: str, remedy: str
 ) -> None:
-    known = replace(FINE, attitude=attitude, **evidence)  # type: ignore[arg-type]
+    known = replace(FINE, carrier=CarrierEvidence(attitude=attitude, **evidence))  # type: ignore[arg-type]
     found = blamed(carrier=replace(CARRIER, attitude_bound_rad=0.2), evidence=known)
     assert found[0] is Cause.CARRIER
     assert reason in found[1]
@@ -139,7 +139,8 @@ def test_carrier_is_blamed_for_its_position() -> None:
 def test_wait_for_this_machine_is_blamed_on_it() -> None:
     """All of the age comes from this machine: neither the link nor the compass is at fault."""
     old = replace(TRACK, age_s=0.9, bound_m=5.0)
-    waiting = replace(FINE, waited_s=0.8, attitude=AttitudeParts(waiting_rad=0.02))
+    aged = CarrierEvidence(attitude=AttitudeParts(waiting_rad=0.02))
+    waiting = replace(FINE, waited_s=0.8, carrier=aged)
     turned = replace(CARRIER, attitude_bound_rad=0.03)
     found = blamed(old, turned, evidence=waiting)
     assert found[:2] == (Cause.MACHINE, "this machine is overloaded: frames wait up to 0.8 s")
@@ -156,9 +157,9 @@ def test_what_grew_since_the_link_was_good_is_the_cause_even_if_another_part_is_
         (AttitudeParts(error_rad=0.05, clock_rad=0.03), "steadier"),
         (AttitudeParts(error_rad=0.055), "compass"),  # within the tolerance: the largest part
     ):
-        found = blamed(carrier=turned, evidence=replace(FINE, attitude=more), when_good=good)
-        assert word in found[2]
-        assert "compass" in blamed(carrier=turned, evidence=replace(FINE, attitude=more))[2]
+        evidence = replace(FINE, carrier=CarrierEvidence(attitude=more))
+        assert word in blamed(carrier=turned, evidence=evidence, when_good=good)[2]
+        assert "compass" in blamed(carrier=turned, evidence=evidence)[2]
 
 
 def test_steady_delay_is_late_not_silent() -> None:

@@ -20,8 +20,8 @@ from companion.pipeline.health import (
     MARGIN_DB,
     SLACK_DB,
     HealthMonitor,
-    Site,
 )
+from companion.pipeline.link_gains import GainMeter, Site
 from companion.settings.beams import NeedSettings
 from companion.values import Carrier, Level, Notice, Severity, Track, TrackState, Update
 
@@ -69,11 +69,14 @@ def update(t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -
     return Update(t_ns=t_ns, carrier=carrier, unfit=unfit, tracks=tuple(tracks), beams=beams)
 
 
+NEED = NeedSettings(needed_db=10.0)
+
+
 class Watch:
     """Link assessment that requires 10 dB, with its notices."""
 
     def __init__(self, **need: float) -> None:
-        self.health = HealthMonitor(NeedSettings(**(need or {"needed_db": 10.0})), SITE)
+        self.health = HealthMonitor(NeedSettings(**need) if need else NEED, SITE)
         self.said: list[Notice] = []
 
     def see(self, t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> str:
@@ -161,7 +164,7 @@ def test_no_good_verdict_lies_below_its_need() -> None:
         seen.add(watch.see(step / 30, news))
         verdict = watch.health.verdicts["1:1"]
         if verdict.level is Level.GOOD:
-            now = watch.health._links(update(step / 30, news).beams, [0])[0]
+            now = GainMeter(NEED, SITE).gains(update(step / 30, news).beams, [0])[0]
             assert now.guaranteed_db is not None
             assert now.guaranteed_db >= now.needed_db - SLACK_DB
     assert seen >= {"good", "weak"}

@@ -3,6 +3,7 @@
 import asyncio
 import io
 import json
+import re
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from datetime import datetime
@@ -19,7 +20,7 @@ from companion.server import area_map, models, recordings, responses
 from companion.server.app import create_app
 from companion.server.beam_routes import accepted
 from companion.tracking.design import answers
-from companion.values import Frame, Source
+from companion.values import Frame, Level, Source
 from companion.values.described import unit
 from companion.views import (
     beam_state,
@@ -367,6 +368,36 @@ def test_arrival_lag_is_reported(make_node: Any) -> None:
     for name in ("", "_p95", "_max"):
         assert f"\ncompanion_arrival_lag{name}_seconds 0.7000000" in metrics
     assert '\ncompanion_link_misstamped_total{link="udpin:127.0.0.1:14550"} 0.0' in metrics
+
+
+def test_no_way_out_calls_a_link_good_while_the_machine_is_overloaded(make_node: Any) -> None:
+    node = make_node(link={"needed_db": -60.0})
+    for _ in range(3):
+        node.tick()
+    assert Level.GOOD in {one.level for one in node.pipeline.health.verdicts.values()}
+
+    def levels() -> dict[str, set[str]]:
+        with TestClient(create_app(node)) as client:
+            uavs = [one for one in client.get("/v1/uavs").json()["uavs"] if one["target"]]
+            history = client.get("/v1/history").json()["uavs"].values()
+            metrics = client.get("/metrics").text
+            counts = client.get("/v1/status").json()["health"]
+        return {
+            "uavs": {one["verdict"] for one in uavs},
+            "status": {level for level in ("good", "weak", "none") if counts[level]},
+            "metrics": set(re.findall(r'verdict="(\w+)"} 1\.0', metrics)),
+            "glance": {one["verdict"] for one in glance.glance(node)["uavs"] if one["verdict"]},
+            "history": {words["verdict"][-1] for words in history} - {None},
+        }
+
+    node.series.add(node.pipeline, state.overload(node, node.now_ns()))
+    assert all("good" in found for found in levels().values())
+    node.arrival_lag.held_up(node.now_ns(), 700_000_000)
+    node.series = series.Series()
+    node.tick()
+    assert Level.GOOD in {one.level for one in node.pipeline.health.verdicts.values()}
+    node.series.add(node.pipeline, state.overload(node, node.now_ns()))
+    assert not any("good" in found for found in levels().values())
 
 
 def test_lost_carrier_is_shown_at_its_last_known_position(make_node: Any) -> None:

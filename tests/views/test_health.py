@@ -59,7 +59,9 @@ def test_no_link_is_good_while_the_machine_is_overloaded() -> None:
     assert held is not None and (held["verdict"], held["cause"]) == ("weak", "machine")
     fine = shown(good)
     assert fine is not None and (fine["verdict"], fine["reason"]) == ("good", None)
-    assert health.summary([good, WEAK], machine).headline == "0 of 2 links good"
+    assert health.shown(good, machine).level is Level.WEAK
+    assert health.shown(WEAK, machine) is WEAK
+    assert health.shown(good, None) is good
 
 
 def test_old_beams_are_the_machine_fault() -> None:

@@ -17,7 +17,6 @@ VALUES_MOST: Final = 16  # UAVs whose gain is sent in a round, the worst first
 NAMED: Final = 3  # UAVs named in one text
 SEVERITY: Final = {Level.NONE: 3, Level.WEAK: 4, Level.GOOD: 6}
 """MAV_SEVERITY: error, warning, info."""
-RANK: Final = {Level.NONE: 0, Level.WEAK: 1, Level.GOOD: 2}
 
 
 class VerdictReports:
@@ -55,7 +54,7 @@ class VerdictReports:
         ]
         if not changed:
             return None
-        first = min(changed, key=lambda one: RANK[one.level])
+        first = min(changed, key=lambda one: one.level.rank)
         cause = None if first.blame is None else first.blame.cause
         alike = [
             one
@@ -74,9 +73,7 @@ class VerdictReports:
         boot_ms = now_ns // 1_000_000 % 2**32
         good = sum(one.level is Level.GOOD for one in verdicts.values())
         spare_db = {
-            uav: one.guaranteed_gain_db - one.needed_gain_db
-            for uav, one in verdicts.items()
-            if one.guaranteed_gain_db is not None and one.needed_gain_db is not None
+            uav: spare for uav, one in verdicts.items() if (spare := one.spare_gain_db) is not None
         }
         worst = sorted(spare_db, key=spare_db.__getitem__)[:VALUES_MOST]
         values = [("linksgood", float(good)), *((f"dB{uav}", spare_db[uav]) for uav in worst)]

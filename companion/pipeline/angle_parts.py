@@ -35,17 +35,18 @@ AngleParts = Mapping[ErrorSource, float]
 """Parts of a pointing bound, rad; their sum is about the bound."""
 
 
-def largest(parts: AngleParts, when_good: AngleParts | None = None) -> ErrorSource:
-    """Return the largest part, or the part that grew since the link was good.
+def grown(parts: AngleParts, when_good: AngleParts) -> ErrorSource | None:
+    """Return the part that grew most since the link was good; None if none grew.
 
-    ``when_good`` holds the parts when the link was last good: what has grown since then is what
-    made it worse, even if another part is larger.
+    What has grown is what made the link worse, even if another part is larger.
     """
-    if when_good is not None:
-        grown = {part: parts[part] - when_good[part] for part in ErrorSource}
-        most = max(grown, key=grown.__getitem__)
-        if grown[most] > GROWN * sum(parts.values()):
-            return most
+    growth = {part: parts[part] - when_good[part] for part in ErrorSource}
+    most = max(growth, key=growth.__getitem__)
+    return most if growth[most] > GROWN * sum(parts.values()) else None
+
+
+def largest(parts: AngleParts) -> ErrorSource:
+    """Return the largest part."""
     return max(parts, key=parts.__getitem__)
 
 

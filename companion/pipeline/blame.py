@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.pipeline.angle_parts import AngleParts, ErrorSource, largest
+from companion.pipeline.angle_parts import AngleParts, ErrorSource, grown, largest
 from companion.tracking.carrier import AttitudeParts
 from companion.values import Beam, Blame, Carrier, Cause, LeftOut, Reason, Track, TrackState
 
@@ -123,10 +123,14 @@ def of_beam(
     *,
     carrier: Carrier,
     when_good: AngleParts | None = None,
+    before: Blame | None = None,
 ) -> Blame:
     """Return why a beam may lack, or likely lacks, the gain that its link needs.
 
-    ``parts`` are those of its pointing bound; ``when_good`` those when the link was last good.
+    parts      parts of its pointing bound
+    when_good  those when the link was last good; None: it never was
+    before     cause given so far, which stays if no part has grown since: beams follow their bounds
+        with a delay, and a level rises only with a margin
     """
     silence = _silence(track, evidence)
     if silence is not None:
@@ -134,7 +138,10 @@ def of_beam(
     # A widened beam has less gain because of its bound, not because of other UAVs.
     if not beam.widened and (beam.gain_db < needed_db or beam.loss_db > CLOSE_UAVS_DB):
         return _short_of_gain(beam, needed_db)
-    match largest(parts, when_good):
+    source = None if when_good is None else grown(parts, when_good)
+    if source is None and when_good is not None and before is not None:
+        return before
+    match source or largest(parts):
         case ErrorSource.MACHINE:
             return of_machine(evidence.waited_s)
         case ErrorSource.CARRIER_POSITION:

@@ -1,9 +1,9 @@
 """Verdicts on the links to all UAVs; ``verdict_notices`` announces their changes.
 
 Once a second, the guaranteed and the likely gain of each beam are compared with the gain that the
-link needs. Links are assessed in batches, one per update, so that no update is delayed; those whose
-beam has got worse since are assessed at once. A verdict falls at once, and rises after a hold time
-and with a gain margin, so that it does not flap.
+link needs. Links are assessed in batches, one per update, so that no update is delayed; those that
+fell below their need are assessed at once. A verdict falls at once, and rises after a hold time and
+with a gain margin, so that it does not flap.
 """
 
 import math
@@ -18,18 +18,18 @@ from companion.pipeline.blame import LinkEvidence
 from companion.pipeline.link_gains import GainMeter, LinkGains, Site
 from companion.pipeline.verdict_notices import VerdictNotices
 from companion.settings.beams import NeedSettings
-from companion.values import Beam, Cause, Level, Notice, Track, TrackState, Update, Verdict
+from companion.values import BeamSet, Cause, Level, Notice, Track, TrackState, Update, Verdict
 
 EVERY_NS: Final = 1_000_000_000
 """Interval between two assessments of a link; a round through all links takes as long."""
 AT_ONCE: Final = 16
 """Least number of links assessed per update; more if the round would take too long."""
-FALLEN_AT_ONCE: Final = 32  # most links assessed per update because their beams got worse
+LOOK_NS: Final = 90_000_000
+"""Least time between two searches for links that fell below their need: each update at 10 Hz."""
+FALLEN_AT_ONCE: Final = 32  # most links assessed per update because they fell below their need
 HOLD_BETTER_NS: Final = 3_000_000_000  # hold time before a verdict gets better
 MARGIN_DB: Final = 0.25
 """Gain above the need that a link must have for its level to rise, dB."""
-SLACK_RATIO: Final = 1.02  # growth of a bound for which a link is not assessed again at once
-SLACK_DB: Final = 0.1  # the same for a loss of gain
 GOOD_KEPT_NS: Final = 30_000_000_000
 """Time for which the smallest bound of a good link is kept, to find what has grown since."""
 COASTING_S: Final = 2.0
@@ -40,43 +40,25 @@ class LinkBatch(NamedTuple):
     """Batch of links to assess.
 
     begins   whether it starts a round
+    looks    whether links were searched for those that fell below their need
     waiting  UAVs still queued in the round
-    early    UAVs assessed out of order, because their beams got worse
     links    the links, with their gains
     """
 
     begins: bool
+    looks: bool
     waiting: list[str]
-    early: frozenset[str]
     links: list[LinkGains]
-
-
-class _Assessed(NamedTuple):
-    """Beam as it was when its link was assessed: errors of its direction, and its gain."""
-
-    bound_rad: float
-    p95_rad: float
-    gain_db: float
-
-    def is_worse(self, beam: Beam) -> bool:
-        """Return whether a beam is worse than this one by more than the slack."""
-        return (
-            _or_inf(beam.pointing_bound_rad) > SLACK_RATIO * self.bound_rad
-            or _or_inf(beam.pointing_p95_rad) > SLACK_RATIO * self.p95_rad
-            or beam.gain_db < self.gain_db - SLACK_DB
-        )
 
 
 @dataclass(slots=True)
 class _LinkRecord:
     """What is kept of a link between its assessments.
 
-    assessed         the worst of its beams since its turn in the round
     better_since_ns  since when it has been better than its level
     good             time and parts of the smallest bound with which it was good of late
     """
 
-    assessed: _Assessed | None = None
     better_since_ns: int | None = None
     good: tuple[int, AngleParts] | None = None
 
@@ -88,6 +70,7 @@ class HealthMonitor:
         self.verdicts: dict[str, Verdict] = {}
         self._meter = GainMeter(need, site)
         self._round_start_ns: int | None = None  # start of the current round
+        self._looked_ns: int | None = None  # when links were last searched for fallen ones
         self._last_ns: int | None = None  # time of the previous update
         self._waiting: list[str] = []  # UAVs still queued in this round
         self._links_kept: defaultdict[str, _LinkRecord] = defaultdict(_LinkRecord)
@@ -102,25 +85,31 @@ class HealthMonitor:
         begun_ns, last_ns = self._round_start_ns, self._last_ns
         begins = begun_ns is None or not 0 <= update.t_ns - begun_ns < EVERY_NS
         waiting = [beam.uav for beam in beams] if begins else self._waiting
-        fallen = [beam.uav for beam in beams if self._may_have_fallen(beam)][:FALLEN_AT_ONCE]
-        if not begins and not waiting and not fallen:
+        looked_ns = self._looked_ns
+        looks = looked_ns is None or not 0 <= update.t_ns - looked_ns < LOOK_NS
+        looks &= update.carrier is not None
+        fallen = self._fallen(update.beams)[:FALLEN_AT_ONCE] if looks else []
+        if not begins and not waiting and not looks:
             return None
         elapsed_ns = 0 if last_ns is None else update.t_ns - last_ns
         share = len(beams) * min(max(elapsed_ns / EVERY_NS, 0.0), 1.0)
         many = max(AT_ONCE, math.ceil(share))
-        due = frozenset(waiting[:many])
-        early = frozenset(fallen) - due
-        which = [i for i, beam in enumerate(beams) if beam.uav in due or beam.uav in early]
+        chosen = frozenset((*waiting[:many], *fallen))
+        which = [i for i, beam in enumerate(beams) if beam.uav in chosen]
         links = (
             [] if update.carrier is None or not which else self._meter.gains(update.beams, which)
         )
-        return LinkBatch(begins=begins, waiting=waiting[many:], early=early, links=links)
+        return LinkBatch(begins=begins, looks=looks, waiting=waiting[many:], links=links)
 
-    def _may_have_fallen(self, beam: Beam) -> bool:
-        held, kept = self.verdicts.get(beam.uav), self._links_kept.get(beam.uav)
-        if held is None or held.level is Level.NONE or kept is None or kept.assessed is None:
-            return False
-        return kept.assessed.is_worse(beam)
+    def _fallen(self, beam_set: BeamSet) -> list[str]:
+        """Return UAVs whose gain is now below the need of their level."""
+        held = [self.verdicts.get(beam.uav) for beam in beam_set.beams]
+        which = [i for i, one in enumerate(held) if one is not None and one.level is not Level.NONE]
+        if not which:
+            return []
+        usual = [one is not None and one.level is Level.WEAK for one in held]
+        is_short = self._meter.is_short(beam_set, which, [usual[i] for i in which])
+        return [beam_set.beams[i].uav for i, short in zip(which, is_short, strict=True) if short]
 
     def judge(
         self, update: Update, weighed: LinkBatch | None, evidence: Callable[[str], LinkEvidence]
@@ -138,10 +127,11 @@ class HealthMonitor:
         if weighed is not None:
             self._waiting = weighed.waiting
             for link in weighed.links:
-                self._note_beam(link.beam, is_early=link.beam.uav in weighed.early)
                 fresh[link.beam.uav] = self._judge_link(update, link, tracks, evidence)
         if begins:
             self._round_start_ns = update.t_ns
+        if weighed is not None and weighed.looks:
+            self._looked_ns = update.t_ns
         held = self.verdicts | {
             uav: self._with_hold_time(verdict) for uav, verdict in fresh.items()
         }
@@ -154,21 +144,6 @@ class HealthMonitor:
             return []
         rising = {uav for uav, one in self._links_kept.items() if one.better_since_ns is not None}
         return self._notices.due(update, self.verdicts, rising)
-
-    def _note_beam(self, beam: Beam, *, is_early: bool) -> None:
-        """Note how uncertain the beam of an assessed link was; the worst of a round counts."""
-        now = _Assessed(
-            _or_inf(beam.pointing_bound_rad), _or_inf(beam.pointing_p95_rad), beam.gain_db
-        )
-        record = self._links_kept[beam.uav]
-        before = record.assessed
-        if before is not None and is_early:
-            now = _Assessed(
-                max(before.bound_rad, now.bound_rad),
-                max(before.p95_rad, now.p95_rad),
-                min(before.gain_db, now.gain_db),
-            )
-        record.assessed = now
 
     def _judge_link(
         self,
@@ -185,9 +160,7 @@ class HealthMonitor:
             parts = angle_parts(link.beam, track, carrier, known.carrier.attitude, known.waited_s)
             coasting = track.state is TrackState.COASTING and track.age_s > COASTING_S
             held = self.verdicts.get(uav)
-            if level is not Level.GOOD and held and held.blame and _is_enough(link):
-                why = held.blame  # only the margin is missing
-            elif level is not Level.GOOD:
+            if level is not Level.GOOD:
                 good = self._links_kept[uav].good
                 why = blame.of_beam(
                     link.beam,
@@ -197,6 +170,7 @@ class HealthMonitor:
                     parts,
                     carrier=carrier,
                     when_good=None if good is None else good[1],
+                    before=None if held is None else held.blame,
                 )
             elif coasting:
                 level, why = Level.WEAK, blame.of_coasting(track, known)
@@ -276,11 +250,3 @@ class HealthMonitor:
                 since_ns=update.t_ns,
             )
         return found
-
-
-def _is_enough(link: LinkGains) -> bool:
-    return link.guaranteed_db is not None and link.guaranteed_db >= link.needed_db
-
-
-def _or_inf(angle_rad: float | None) -> float:
-    return math.inf if angle_rad is None else angle_rad

@@ -189,9 +189,9 @@ def round_trips(seconds: float) -> Iterator[RoundTrip]:
             )
 
 
-def flown(disturbances: list[Disturbance]) -> list[Event]:
+def flown(disturbances: list[Disturbance], lasts_s: float = LASTS_S) -> list[Event]:
     """Return the events: frames and round trips as this machine reads them, and its ticks."""
-    seconds = GOOD_S + LASTS_S
+    seconds = GOOD_S + lasts_s
     arriving = list[Event](round_trips(seconds))
     for at_s, frame in honest(seconds):
         kept: Frame | None = frame
@@ -267,6 +267,16 @@ def held_to(names: tuple[str, ...]) -> None:
         ]
         assert seen, f"{uav} stays good"
         assert len(right) >= SHARE * len(seen), (uav, [one for one in seen if one not in right][:3])
+
+
+def test_frozen_uav_is_rejected_not_silent_when_it_has_lost_its_beam() -> None:
+    pipeline = Pipeline(SETTINGS)
+    for event in flown([DISTURBANCES["frozen"]], 20.0):
+        pipeline.step(event)
+    verdict = pipeline.health.verdicts["4:1"]
+    assert verdict.needed_gain_db is None  # no beam
+    assert verdict.blame is not None
+    assert verdict.blame.cause is Cause.REFUSED
 
 
 @pytest.mark.parametrize("name", DISTURBANCES)

@@ -15,7 +15,7 @@ from typing import Final
 import numpy as np
 
 from companion.beams.array import steering
-from companion.beams.array.coverage import Coverage, margin_rad
+from companion.beams.array.coverage import EVERYWHERE, Coverage, margin_rad
 from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import Array
 from companion.beams.worth import cone
@@ -210,6 +210,8 @@ def covered_bounds(
 
     A UAV may then be outside the coverage, and nothing is guaranteed.
     """
+    if coverage == EVERYWHERE:
+        return list(pointing_bounds_rad)
     margins = margin_rad(coverage, directions, directions @ array.array_from_body)
     return [
         bound if bound is not None and bound <= margin else None

@@ -79,6 +79,15 @@ def many(node: Node, page: Any, number: int) -> None:
         page.route(f"**{path}?rounded=true", functools.partial(fulfil, path, key, name))
 
 
+def open_with_twenty(demo: Node, open_page: Any, size: str) -> Any:
+    """Open the page of a demo with twenty UAVs."""
+    page = open_page("about:blank", SIZES[size], loses_service=True)
+    many(demo, page, 20)
+    page.goto(demo.url)
+    page.locator("tbody tr").nth(19).wait_for(state="attached", timeout=HANG_MS)
+    return page
+
+
 @pytest.mark.parametrize(
     "number", [*(pytest.param(n, marks=pytest.mark.full) for n in (1, 4, 20)), 100]
 )
@@ -112,10 +121,7 @@ ROOM = """() => {
 
 
 def test_plan_and_table_get_the_room_when_there_are_many_uavs(demo: Node, open_page: Any) -> None:
-    page = open_page("about:blank", SIZES["desktop"], loses_service=True)
-    many(demo, page, 20)
-    page.goto(demo.url)
-    page.locator("tbody tr").nth(19).wait_for(state="attached", timeout=HANG_MS)
+    page = open_with_twenty(demo, open_page, "desktop")
     page.locator("#fold-charts:not([open])").wait_for(state="attached", timeout=HANG_MS)
     room = page.evaluate(ROOM)
     assert room["rows"] == 20 and room["plan"] >= 0.3, room
@@ -168,10 +174,7 @@ COLUMNS_IN_SIGHT = """() => {
 
 
 def test_actionable_columns_are_visible_on_a_tablet(demo: Node, open_page: Any) -> None:
-    page = open_page("about:blank", SIZES["tablet"], loses_service=True)
-    many(demo, page, 20)
-    page.goto(demo.url)
-    page.locator("tbody tr").nth(19).wait_for(state="attached", timeout=HANG_MS)
+    page = open_with_twenty(demo, open_page, "tablet")
     wanted = ["id", "verdict", "state", "range", "azimuth", "age", "gain", "guaranteed"]
     assert page.evaluate(COLUMNS_IN_SIGHT) == wanted
     page.get_by_role("button", name="All columns").click()

@@ -17,7 +17,7 @@ The library interface for notebooks and programs; everything else is internal an
 ``Pipeline``: ``step(event)`` processes events in chronological order; ``look(now_ns, lead_s)``
 returns targets and beams, ``tracks(now_ns, valid_at_ns)`` every tracked UAV,
 ``clock_estimate(uav)`` the state of its clock, ``local`` the local frame. ``Frame``, ``Tick``,
-``RoundTrip``: events, from a ``Source``. ``Estimate``, ``Track``, ``Beam``: what comes out: an
+``RoundTrip``: events, from a ``Source``; ``Observation``: a measurement of the array's receiver. ``Estimate``, ``Track``, ``Beam``: what comes out: an
 accepted report, the predicted state of a UAV, the beam of a UAV. ``read_log(path)``: the events of
 any kind of log.
 ``UserError``: raised for a user's mistakes.
@@ -30,13 +30,24 @@ if TYPE_CHECKING:
     from companion.pipeline.fold import Pipeline
     from companion.recording.reader import read_log
     from companion.settings.model import Settings
-    from companion.values import Beam, Estimate, Frame, RoundTrip, Source, Tick, Track, UserError
+    from companion.values import (
+        Beam,
+        Estimate,
+        Frame,
+        Observation,
+        RoundTrip,
+        Source,
+        Tick,
+        Track,
+        UserError,
+    )
 
 __version__ = "1.0.0"
 __all__ = [
     "Beam",
     "Estimate",
     "Frame",
+    "Observation",
     "Pipeline",
     "RoundTrip",
     "Settings",

@@ -53,6 +53,7 @@ from companion.values import (
     Frame,
     LeftOut,
     Notice,
+    Observation,
     Output,
     Reason,
     Rejection,
@@ -154,6 +155,8 @@ class Pipeline:
             self.targets.duty, outputs = event, []
         elif isinstance(event, ClockSet):
             outputs = self._clock_set(event)
+        elif isinstance(event, Observation):
+            outputs = []
         else:
             change = self.senders.round_trip(event)
             source = str(event.source)

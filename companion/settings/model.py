@@ -29,6 +29,7 @@ from companion.settings.mavlink import (
     SigningSettings,
     TrackSettings,
 )
+from companion.settings.observations import ObservationSettings
 from companion.settings.outlets import (
     DriveSettings,
     PageSettings,
@@ -46,7 +47,7 @@ MIN_SIMILARITY: Final = 0.7
 REPLAYED_SECTIONS: Final = frozenset(
     (
         "center", "clocks", "observer", "tracks", "array", "beams", "codebook", "hardware", "radio",
-        "link",
+        "link", "observations",
     )
 )  # fmt: skip
 """Sections that determine estimates and beams: a replay takes them from the recording."""
@@ -87,6 +88,7 @@ class Settings(Section):
     clocks: ClockSettings = ClockSettings()
     observer: ObserverSettings = ObserverSettings()
     tracks: TrackSettings = TrackSettings()
+    observations: ObservationSettings = ObservationSettings()
     array: ArraySettings = ArraySettings()
     beams: BeamSettings = BeamSettings()
     codebook: CodebookSettings = CodebookSettings()

@@ -32,6 +32,7 @@ from companion.values.fleet import Offer, Shared, SharedFrame, Standing
 from companion.values.health import Blame, Cause, Level, Verdict
 from companion.values.names import UAV_FORMS, Source, UavKind, kind_of
 from companion.values.numbers import BoolArray, ComplexArray, FloatArray, IntArray, Vector, vector
+from companion.values.observed import READINGS_MAX, Observation
 from companion.values.outputs import Notice, Output, Severity, Update
 from companion.values.received import (
     Accuracy,
@@ -64,6 +65,7 @@ from companion.values.tracked import (
 
 __all__ = [
     "DUTY_MAX",
+    "READINGS_MAX",
     "UAV_FORMS",
     "Accuracy",
     "AdsbVehicle",
@@ -95,6 +97,7 @@ __all__ = [
     "Method",
     "Normalisation",
     "Notice",
+    "Observation",
     "Offer",
     "Output",
     "Policy",

@@ -6,6 +6,7 @@ from typing import Annotated, Final
 from companion.values.clock import ClockSet
 from companion.values.described import Meaning
 from companion.values.names import Source
+from companion.values.observed import Observation
 from companion.values.received import Frame
 from companion.values.rejections import Rejection
 
@@ -70,7 +71,7 @@ class Duty:
     ] = ()
 
 
-Event = Frame | Tick | Tock | Rejection | RoundTrip | ClockSet | Duty
+Event = Frame | Tick | Tock | Rejection | RoundTrip | ClockSet | Duty | Observation
 """Any event that drives the pipeline, in the order of processing.
 
 Events are in order of time, with one exception: a frame's time is its arrival. If the node was
@@ -79,5 +80,5 @@ busy, a tick with a later time may precede the frame.
 Framing emits rejections as events: the bytes are discarded, but their arrival must be recorded. A
 round trip is an event because only the service knows its own requests. ``ClockSet`` is an event so
 that a replay prints the same times as the service. A duty is an event because other nodes take part
-in the decision.
+in the decision. An observation comes from a receiver that is no part of the program.
 """

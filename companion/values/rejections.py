@@ -35,6 +35,14 @@ class Reason(DescribedEnum):
     DUPLICATE = "duplicate", "copies of a report received before"
     NO_FIX = "no-fix", "first reports sent before the receiver had a fix"
     OUT_OF_ORDER = "out-of-order", "reports older than the window for late reports"
+    UNKNOWN_UAV = "unknown-uav", "observations of a UAV that is not tracked"
+    NO_POSE = "no-pose", "observations while the array's position or attitude is unknown"
+    WRONG_TIME = "wrong-time", "observations made too long ago, or in the future"
+    OUTLIER = "outlier", "observations that contradict the others of their UAV"
+    CONTRADICTED_BY_ARRAY = (
+        "contradicted-by-array",
+        "observations of a UAV that the array sees elsewhere than it reports",
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

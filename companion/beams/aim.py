@@ -1,8 +1,9 @@
 """Computation of beams from tracks: which UAVs get a beam, its direction, and all weights."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from types import MappingProxyType
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -27,6 +28,7 @@ from companion.beams.worth import link_budget
 from companion.values import (
     Beam,
     BeamSet,
+    Cap,
     Carrier,
     Cause,
     FloatArray,
@@ -47,8 +49,23 @@ UNKNOWN_SHARE: Final = 0.25
 
 In the logs it is 1/20 for positions, and 1/10 to 1/5 for attitudes.
 """
+USUAL_SIGHT: Final = 0.5
+"""Ratio of the 95th percentile of a seen direction's error to its bound."""
 MIN_AMPLITUDE: Final = 1e-3
 """Element amplitude below which there is no beam: 60 dB below an isotropic element."""
+
+
+class Sight(NamedTuple):
+    """Directions in which the array sees a UAV, array frame.
+
+    is_alone  whether its reported position is not used
+    """
+
+    cap: Cap
+    is_alone: bool = False
+
+
+NO_SIGHTS: Final[Mapping[str, Sight]] = MappingProxyType({})
 
 
 def aim(
@@ -61,6 +78,7 @@ def aim(
     precoder: Precoder,
     coverage: Coverage = EVERYWHERE,
     before: Hysteresis | None = None,
+    sights: Mapping[str, Sight] = NO_SIGHTS,
 ) -> BeamSet:
     """Compute one beam for every eligible track, with nulls on the others.
 
@@ -72,6 +90,7 @@ def aim(
         precoder     how weights are computed
         coverage     directions in which beams may point
         before       state of the last beams, for hysteresis; None: no hysteresis
+        sights       directions in which the array sees UAVs, by UAV
 
     The columns of the weights are in the order of ``tracks``. UAVs without a beam are listed with
     the reason.
@@ -83,11 +102,19 @@ def aim(
     made = None
     if carrier is not None and seen:
         ranges_m, directions = line_of_sight.directions(seen, carrier, array)
+        errors = _errors(seen, ranges_m, carrier, array)
+        if sights:
+            directions, errors = _by_sight(seen, directions, errors, sights)
         hidden = _out_of_reach(directions, array, coverage)
         refused |= {track.uav: why for track, why in zip(seen, hidden, strict=True)}
         inside = [i for i, why in enumerate(hidden) if why is None]
         if inside:
-            aimed = _Aimed([seen[i] for i in inside], ranges_m[inside], directions[inside])
+            aimed = _Aimed(
+                [seen[i] for i in inside],
+                ranges_m[inside],
+                directions[inside],
+                [errors[i] for i in inside],
+            )
             beams, made, dropped = _beams(
                 aimed, carrier, array, precoder=precoder, before=before, valid_at_ns=valid_at_ns
             )
@@ -133,11 +160,15 @@ def directions(beam_set: BeamSet) -> FloatArray:
 
 
 class _Aimed(NamedTuple):
-    """Tracks that get beams, with ranges (N,) and unit directions (N, 3) in the array frame."""
+    """Tracks that get beams, with ranges (N,) and unit directions (N, 3) in the array frame.
+
+    errors  the bound on each direction's error, or None, and its usual error, rad
+    """
 
     tracks: list[Track]
     ranges_m: FloatArray
     directions: FloatArray
+    errors: list[tuple[float | None, float]]
 
 
 def _beams(
@@ -150,15 +181,9 @@ def _beams(
     valid_at_ns: int,
 ) -> tuple[tuple[Beam, ...], Precoding, dict[str, str]]:
     """Return the beams, their weights, and the UAVs that the policy left out, with the reason."""
-    tracks, ranges_m, directions = aimed
+    tracks, ranges_m, directions, errors = aimed
     uavs = [track.uav for track in tracks]
-    each = list(zip(tracks, ranges_m.tolist(), strict=True))
-    lever_m = float(np.linalg.norm(array.lever_arm_m))
-    bounds = [_pointing_bound_rad(track, carrier, lever_m, range_m) for track, range_m in each]
-    usual = [
-        _usual_rad(track, carrier, lever_m, range_m, bound)
-        for (track, range_m), bound in zip(each, bounds, strict=True)
-    ]
+    bounds, usual = [bound for bound, _ in errors], [usual for _, usual in errors]
     wanted = [(0.0, 0.0) if b is None else (u, b) for u, b in zip(usual, bounds, strict=True)]
     natural_rad = array.wavelength_m / max(float(shapes.aperture(array).lengths_m.max()), 1e-9)
     sure_plane = precoder.widen is Widen.GUARANTEE and array.axis is None
@@ -217,6 +242,41 @@ def _beams(
         for column, i in enumerate(made.served.tolist())
     )
     return beams, made, {uavs[user]: why for user, why in made.dropped.items()}
+
+
+def _errors(
+    tracks: Sequence[Track], ranges_m: FloatArray, carrier: Carrier, array: Array
+) -> list[tuple[float | None, float]]:
+    """Return the bound on each predicted direction's error, or None, and its usual error."""
+    lever_m = float(np.linalg.norm(array.lever_arm_m))
+    found = []
+    for track, range_m in zip(tracks, ranges_m.tolist(), strict=True):
+        bound = _pointing_bound_rad(track, carrier, lever_m, range_m)
+        found.append((bound, _usual_rad(track, carrier, lever_m, range_m, bound)))
+    return found
+
+
+def _by_sight(
+    tracks: Sequence[Track],
+    directions: FloatArray,
+    errors: list[tuple[float | None, float]],
+    sights: Mapping[str, Sight],
+) -> tuple[FloatArray, list[tuple[float | None, float]]]:
+    """Return directions and errors confined to those in which the array sees the UAVs.
+
+    A prediction and a sight that exclude each other leave the prediction.
+    """
+    directions, errors = directions.copy(), list(errors)
+    for i, track in enumerate(tracks):
+        sight = sights.get(track.uav)
+        if sight is None:
+            continue
+        bound, usual = errors[i]
+        if bound is None or sight.cap.radius_rad < bound or sight.is_alone:
+            directions[i] = sight.cap.center
+            likely = USUAL_SIGHT * sight.cap.radius_rad
+            errors[i] = sight.cap.radius_rad, likely if sight.is_alone else min(usual, likely)
+    return directions, errors
 
 
 def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:

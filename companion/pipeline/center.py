@@ -74,6 +74,7 @@ class CarrierTracker:
         self.vehicle = str(self.place) if isinstance(self.place, VehicleCenter) else None
         self._home_from: tuple[str, int] | None = None  # UAV and time of the first report
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
+        self._before: tuple[int, Attitude] | None = None  # the previous one
         self._contradicted: Contradiction | None = (
             None  # between the newest attitude and the previous one
         )
@@ -153,7 +154,7 @@ class CarrierTracker:
             self._attitude = None
         self._older_run = None
         self._contradicted = self._contradicts(placed, turn_degps2)
-        self._attitude = placed.sender_ns, placed.attitude
+        self._before, self._attitude = self._attitude, (placed.sender_ns, placed.attitude)
         return self._angular_acceleration.look(placed.attitude, placed.sender_ns, turn_degps2)
 
     def _contradicts(self, placed: PlacedAttitude, turn_degps2: float) -> Contradiction | None:
@@ -244,7 +245,7 @@ class CarrierTracker:
     def restarted(self, uav: str) -> None:
         """Discard the carrier's attitude if the carrier rebooted, since its stamps start again."""
         if uav == self.vehicle:
-            self._attitude = None
+            self._attitude = self._before = None
             self._contradicted = None
             self._estimators.clear()
             self._older_run = None
@@ -280,6 +281,46 @@ class CarrierTracker:
 
     def _begin(self, at: FixedCenter) -> None:
         self.local = LocalFrame(at.lat_deg, at.lon_deg, at.alt_m)
+
+    @property
+    def is_contradicted(self) -> bool:
+        """Whether the newest attitude contradicts the previous one."""
+        return self._contradicted is not None
+
+    def newest_attitude_ns(self, now: SenderTime) -> int | None:
+        """Return when the newest attitude was measured, node time; None without one."""
+        if self.vehicle is None:
+            return now.node_ns
+        return None if self._attitude is None else self._attitude[0] + now.node_ns - now.sender_ns
+
+    def fixed_pose(self, at_ns: int) -> carrier.Pose | None:
+        """Return the attitude of a fixed station; None while its place is unknown."""
+        found = self.station(at_ns)
+        return None if isinstance(found, str) else carrier.fixed_pose(found.body_from_local)
+
+    def pose(
+        self, newest: Fix | None, at: SenderTime, turn_degps2: float, *, nearest: bool
+    ) -> carrier.Pose | None:
+        """Return the reported attitude at a time on the vehicle's timeline; None if unknown.
+
+        ``nearest``: by whichever of the two newest reports is nearer; else by the newest.
+        """
+        if self.local is None or self._attitude is None or newest is None:
+            return None
+        made_ns, attitude = self._attitude
+        against = self._contradicted
+        if nearest and self._before is not None:
+            before_ns = self._before[0]
+            if abs(at.sender_ns - before_ns) < abs(at.sender_ns - made_ns):
+                made_ns, attitude = self._before
+        return carrier.pose(
+            attitude,
+            age_s=(at.sender_ns - made_ns) * 1e-9,
+            doubt_s=at.bound_s,
+            bounds=self._attitude_bounds(at.sender_ns, turn_degps2),
+            contradicted=against,
+            local_from_ned=self.local.local_from_ned(newest.report.lat_deg, newest.report.lon_deg),
+        )
 
     # --- pose of the array ------------------------------------------------------------------
 

@@ -34,13 +34,14 @@ from companion.pipeline.center import CarrierTracker
 from companion.pipeline.digest import Digest
 from companion.pipeline.health import HealthMonitor, LinkBatch
 from companion.pipeline.link_gains import Site
+from companion.pipeline.observing import Observing
 from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import Refusals
-from companion.pipeline.senders import NO_OUTCOME, PlacedAttitude, PlacedReport, Senders, Timeline
+from companion.pipeline.senders import NO_OUTCOME, PlacedAttitude, PlacedReport, Senders
+from companion.pipeline.snapshots import UavSnapshot
 from companion.pipeline.targets import Targets
 from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
-from companion.tracking.track_snapshot import TrackSnapshot
 from companion.values import (
     Carrier,
     Cause,
@@ -88,17 +89,6 @@ class Aiming(NamedTuple):
     local: LocalFrame | None
 
 
-class UavSnapshot(NamedTuple):
-    """One UAV after all events so far: its track and its clock, for any thread."""
-
-    track: TrackSnapshot
-    timeline: Timeline
-
-    def at(self, now_ns: int, valid_at_ns: int) -> Track:
-        """Predict the UAV to ``valid_at_ns``; its state is that at ``now_ns``."""
-        return self.track.at(now_ns, self.timeline.time(valid_at_ns))
-
-
 class Pipeline:
     """State of the program, from which events produce outputs.
 
@@ -138,6 +128,14 @@ class Pipeline:
         budget, antennas = assembly.radio(settings)
         site = Site(array=self.array, coverage=self.coverage, budget=budget, uav_antennas=antennas)
         self.health = HealthMonitor(settings.link, site)
+        self.observing = Observing(
+            settings,
+            array=self.array,
+            center=self.center,
+            senders=self.senders,
+            tracker=self.tracker,
+            records=self.records,
+        )
 
     # --- the fold ---------------------------------------------------------------------------
 
@@ -156,7 +154,7 @@ class Pipeline:
         elif isinstance(event, ClockSet):
             outputs = self._clock_set(event)
         elif isinstance(event, Observation):
-            outputs = []
+            outputs = self.observing.add(event)
         else:
             change = self.senders.round_trip(event)
             source = str(event.source)
@@ -201,6 +199,7 @@ class Pipeline:
             turn_degps2 = self.senders.assumed(str(frame.source)).turn_degps2
             refuted = self.center.turn(heard.message, turn_degps2)
             said += assumptions.notices(self.records, refuted)
+            said += self.observing.attitude_reported(frame.t_ns)
         elif isinstance(heard.message, EstimatorStatus):
             said += assumptions.notices(self.records, self.center.trust(heard.message))
         return said
@@ -253,13 +252,16 @@ class Pipeline:
     def _restart(self, uav: str) -> None:
         self.records.pop(uav, None)
         self.tracker.forget(uav)
+        self.observing.forget(uav)
         self.center.restarted(uav)
 
     def _tick(self, tick: Tick) -> list[Output]:
         self._waited_s = tick.waited_ns * 1e-9
         dropped = self._drop_silent(tick.t_ns) if (self.updates + 1) % DROP_EVERY == 0 else []
+        seen = self.observing.update(tick.t_ns)
         self.aiming = Aiming(cache(self._aimed_of(self.prepare_update(tick.t_ns))), self.local)
-        return [*dropped] if tick.in_two else [*dropped, *self._finish_update(tick.t_ns)]
+        said = [*dropped, *seen]
+        return said if tick.in_two else [*said, *self._finish_update(tick.t_ns)]
 
     def _finish_update(self, now_ns: int) -> list[Output]:
         """Adopt the computed beams of the last tick, and assess the links.
@@ -309,7 +311,7 @@ class Pipeline:
         vehicle = self.center.vehicle
         if vehicle is None:
             return CarrierEvidence()
-        at = self.senders.time(vehicle, now_ns)
+        at = self.senders.stamp_time(vehicle, now_ns)
         turn_degps2 = self.senders.assumed(vehicle).turn_degps2
         return CarrierEvidence(
             attitude=self.center.attitude_parts(at, turn_degps2, self._waited_s),
@@ -346,8 +348,13 @@ class Pipeline:
         valid_at_ns = now_ns + round(delay_s * 1e9)
         selected, others = self._selected(now_ns)
         snapshots = self.snapshots(selected)
-        found = self.carrier(now_ns, valid_at_ns)
-        known, unfit = (None, found) if isinstance(found, str) else (found, None)
+        found = self.observing.reported(now_ns, valid_at_ns)
+        known, unfit = None, None
+        if isinstance(found, str):
+            unfit = found
+        else:
+            known = self.observing.compass.corrected(found.carrier)
+        sights = self.observing.sights(snapshots, valid_at_ns, found)
         before = self._hysteresis
         spared = self.snapshots(self.targets.protected(self.tracker.uavs))
 
@@ -363,6 +370,7 @@ class Pipeline:
                 precoder=self.precoder,
                 coverage=self.coverage,
                 before=before,
+                sights={} if sights is None else sights(tracks),
             )
             if protected:
                 beams = without(beams, {track.uav for track in protected})
@@ -420,14 +428,7 @@ class Pipeline:
 
     def carrier(self, now_ns: int, valid_at_ns: int) -> Carrier | str:
         """Return position and attitude of the array, or the reason why they are unknown."""
-        vehicle = self.center.vehicle
-        if vehicle is None:
-            return self.center.station(valid_at_ns)
-        at = self.senders.time(vehicle, valid_at_ns)
-        track = self.tracker.track(vehicle, now_ns, at)
-        now = self.senders.time(vehicle, now_ns)
-        turn_degps2 = self.senders.assumed(vehicle).turn_degps2
-        return self.center.on_vehicle(track, self.tracker.newest(vehicle), now, at, turn_degps2)
+        return self.observing.carrier(now_ns, valid_at_ns)
 
     def utc_ns(self, t_ns: int) -> UtcNs:
         """Convert a time of the node's timeline to UTC, by the current wall clock."""

@@ -452,6 +452,14 @@ class Senders:
         """Convert a node time to a UAV's own timeline; a relayed aircraft's is the node's."""
         return self.timeline(uav).time(node_ns)
 
+    def stamp_time(self, vehicle: str, node_ns: int) -> SenderTime:
+        """Convert a node time to a vehicle's own timeline, as its messages are stamped.
+
+        Positions lag behind their stamps; attitudes do not.
+        """
+        sender = self._senders.get(vehicle)
+        return Timeline(sender.clock.reading() if sender else None, 0.0).time(node_ns)
+
     def timeline(self, uav: str) -> Timeline:
         """Return a UAV's own timeline as it is known now."""
         sender = self._senders.get(uav)

@@ -25,6 +25,7 @@ from companion.values.aimed import (
     WeightFormat,
     Widen,
 )
+from companion.values.caps import Cap, angle_rad
 from companion.values.clock import ClockSet, UtcNs
 from companion.values.errors import UserError, printable, shown
 from companion.values.events import DUTY_MAX, Duty, Event, RoundTrip, Tick, Tock
@@ -76,6 +77,7 @@ __all__ = [
     "BeamSet",
     "Blame",
     "BoolArray",
+    "Cap",
     "Carrier",
     "Cause",
     "ClockSet",
@@ -129,6 +131,7 @@ __all__ = [
     "Verdict",
     "WeightFormat",
     "Widen",
+    "angle_rad",
     "kind_of",
     "printable",
     "read_toml",

@@ -212,6 +212,7 @@ class Carrier:
 
     error_p95_m       estimated 95th percentile of the position error; None if unknown
     attitude_p95_rad  estimated 95th percentile of the attitude error; None if unknown
+    extrapolation_rad part of ``attitude_bound_rad`` by the extrapolation of the newest attitude
     """
 
     valid_at_ns: int
@@ -228,6 +229,7 @@ class Carrier:
     ]
     error_p95_m: float | None = None
     attitude_p95_rad: float | None = None
+    extrapolation_rad: float = 0.0
 
     @property
     def roll_rad(self) -> Annotated[float, Meaning("roll, right side down positive")]:

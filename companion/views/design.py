@@ -8,7 +8,7 @@ from typing import Annotated, Final, Literal, NamedTuple
 import numpy as np
 
 from companion.pipeline import assembly
-from companion.pipeline.fold import UavSnapshot
+from companion.pipeline.snapshots import UavSnapshot
 from companion.settings.files import kinematic_design
 from companion.settings.model import Settings
 from companion.settings.tracking import ObserverSettings

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from typing import Annotated, Final
 
 from companion.mavlink.clock.estimates import ClockEstimate
-from companion.pipeline.fold import Pipeline, UavSnapshot
+from companion.pipeline.fold import Pipeline
+from companion.pipeline.snapshots import UavSnapshot
 from companion.tracking.geodesy import LocalFrame, Place
 from companion.values import (
     AltitudeDatum,

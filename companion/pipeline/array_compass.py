@@ -1,0 +1,218 @@
+"""The array as a compass: directions in which UAVs are seen confine the carrier's attitude.
+
+The set of the attitude's errors is kept by evidence alone, so that a wrong
+``center.attitude_bound_deg`` is never blamed on a UAV; its part within that bound is what beams
+use. See docs/math.md 5.8.
+"""
+
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+
+from companion.pipeline.sighted_uavs import Look, SightedUavs
+from companion.settings.observations import ObservationSettings
+from companion.tracking import compass
+from companion.tracking.carrier import USUAL_ATTITUDE
+from companion.tracking.compass import ErrorSet, Misalignment, Seen
+from companion.values import Cap, Carrier, FloatArray, Notice, Reason, Refuted, Severity, angle_rad
+
+UPDATE_NS: Final = 90_000_000  # least time between two estimates of the attitude's error
+FRESH_NS: Final = 1_000_000_000  # age of a UAV's sightings beyond which they say nothing
+PERSISTENT_NS: Final = 1_000_000_000
+"""Time for which a UAV must be seen elsewhere than it reports until its position is refuted."""
+WIDEST_RAD: Final = math.radians(30.0)  # largest error of reported attitudes that is considered
+REFINEMENTS: Final = 3  # times that a set is cut by the same evidence, about a better centre
+
+
+class ArrayCompass:
+    """Error of the carrier's reported attitudes, and UAVs whose reported positions are false.
+
+    uavs       what the array saw of each UAV
+    bound_rad  bound on the error by the settings, or larger if evidence refuted it
+    """
+
+    def __init__(self, settings: ObservationSettings, uavs: SightedUavs, bound_rad: float) -> None:
+        self._settings = settings
+        self._drift_radps = math.radians(settings.drift_max_degps)
+        self._uavs = uavs
+        self._raised_rad = 0.0
+        self.bound_rad = bound_rad
+        self._by_evidence = ErrorSet.within(WIDEST_RAD)
+        self._updated: tuple[int, FloatArray] | None = None  # when, and body_from_local
+        self._tolerates = 0
+        self.error: Misalignment | None = None  # None: nothing is known but the bound
+
+    def forget(self) -> None:
+        """Forget the error: the reported attitude has jumped."""
+        self._by_evidence, self.error = ErrorSet.within(WIDEST_RAD), None
+        self._updated = None
+
+    @property
+    def largest_rad(self) -> float:
+        """Largest angle of the error of reported attitudes."""
+        return self.bound_rad if self.error is None else min(self.error.largest_rad, self.bound_rad)
+
+    # --- the attitude's error ---------------------------------------------------------------
+
+    def update(self, now_ns: int, carrier: Carrier, bound_rad: float) -> list[Notice | Refuted]:
+        """Confine the error of the reported attitude by what was seen of all UAVs.
+
+        carrier    the reported pose
+        bound_rad  bound on the error of reported attitudes by the settings
+        """
+        if self._updated is not None and now_ns - self._updated[0] < UPDATE_NS:
+            return []
+        self.bound_rad = max(bound_rad, self._raised_rad)
+        seen = self._seen(now_ns)
+        tolerates = self._settings.false_uavs if len(seen) >= compass.MAJORITY else 0
+        if seen and tolerates != self._tolerates:
+            self._tolerates = tolerates  # a set by fewer UAVs may be wrong by one false position
+            self.forget()
+        known = self._by_evidence
+        if self._updated is not None:
+            before_ns, before = self._updated
+            turned = compass.rotation_angle_rad(before @ carrier.body_from_local.T)
+            drifted = self._drift_radps * (now_ns - before_ns) * 1e-9
+            known = known.grown(drifted + turned * self.largest_rad)
+        self._updated = now_ns, carrier.body_from_local
+        self._by_evidence = self._confined(known, seen)
+        self._uavs.likely.solve()
+        return [*self._judge(now_ns, seen), *self._bounded(now_ns)]
+
+    def _seen(self, now_ns: int) -> list[Seen]:
+        found = []
+        for uav, record in self._uavs:
+            sightings, latest = record.sightings, record.latest
+            if sightings is None or latest is None or now_ns - sightings.t_ns > FRESH_NS:
+                continue
+            possible = sightings.possible(self._settings.outliers)
+            if possible is None:
+                record.sightings = record.latest = None
+                continue
+            near, aged_s = latest[0], (now_ns - sightings.t_ns) * 1e-9
+            changed = self._drift_radps * aged_s + near.turned_rad(aged_s) * self.largest_rad
+            radius = min(possible.radius_rad + changed, math.pi)
+            found.append(Seen(uav, near.reported, Cap(possible.center, radius)))
+        return found
+
+    def _confined(self, known: ErrorSet, seen: Sequence[Seen]) -> ErrorSet:
+        """Return the errors that evidence allows; if that excludes all known ones, it alone."""
+        if not seen:
+            return known
+        for start in (known, ErrorSet.within(WIDEST_RAD)):
+            cut = _refined(start, seen, self._tolerates)
+            if cut is not None:
+                return cut
+        return ErrorSet.within(WIDEST_RAD)
+
+    def _judge(self, now_ns: int, seen: Sequence[Seen]) -> list[Notice]:
+        """Find UAVs that are seen elsewhere than they report, whatever the attitude's error."""
+        error = self._by_evidence.misalignment()
+        apart = {one.uav for one in seen if compass.contradicts(error, one)}
+        if len(apart) > self._tolerates:  # more than may be false: the set is wrong
+            self._by_evidence = ErrorSet.within(WIDEST_RAD)
+            apart = set()
+        said = []
+        for one in seen:
+            record = self._uavs.get(one.uav)
+            assert record is not None
+            if one.uav in apart:
+                record.agrees_ns = None
+                since_ns = record.contradicted_ns or now_ns
+                record.contradicted_ns = since_ns
+                if not record.is_refuted and now_ns - since_ns >= PERSISTENT_NS:
+                    record.is_refuted = True
+                    said.append(_refuted(now_ns, one, error))
+                continue
+            since_ns = record.agrees_ns or now_ns
+            record.agrees_ns, record.contradicted_ns = since_ns, None
+            if record.is_refuted and now_ns - since_ns >= PERSISTENT_NS:
+                record.is_refuted = False
+                said.append(_agrees_again(now_ns, one.uav))
+        return said
+
+    def _bounded(self, now_ns: int) -> list[Refuted]:
+        """Set the error within the bound by the settings, which is raised if it is refuted."""
+        self.error = self._by_evidence.within_ball(self.bound_rad)
+        if self.error is not None:
+            return []
+        limit_rad = self.bound_rad
+        self.error = self._by_evidence.misalignment()
+        center_rad = compass.rotation_angle_rad(self.error.center)
+        self.bound_rad = self._raised_rad = self.error.largest_rad
+        return [
+            Refuted(
+                t_ns=now_ns,
+                uav="array",
+                setting="center.attitude_bound_deg",
+                limit=math.degrees(limit_rad),
+                proven=math.degrees(max(center_rad - self.error.bound_rad, limit_rad)),
+                raised_to=math.degrees(self._raised_rad),
+            )
+        ]
+
+    # --- looks ------------------------------------------------------------------------------
+
+    def look(self, uav: str, body_from_local: FloatArray) -> Look | None:
+        """Return a snapshot of what was seen of a UAV, at an attitude; None without any."""
+        record = self._uavs.get(uav)
+        if record is None or (record.sightings is None and not record.pending):
+            return None
+        return Look(
+            sightings=record.sightings,
+            pending=record.pending,
+            is_refuted=record.is_refuted,
+            error=self.error or Misalignment(np.eye(3), self.bound_rad),
+            bound_rad=self.largest_rad,
+            likely=self._uavs.likely.vector_rad(body_from_local),
+        )
+
+    def corrected(self, carrier: Carrier) -> Carrier:
+        """Return the reported pose of the array with its error corrected, as far as it is known."""
+        error = self.error
+        if error is None:
+            return carrier
+        bound_rad = min(error.bound_rad + carrier.extrapolation_rad, math.pi)
+        raised = self._raised_rad > 0.0
+        if bound_rad >= carrier.attitude_bound_rad and not raised:
+            return carrier
+        return replace(
+            carrier,
+            body_from_local=carrier.body_from_local @ error.center,
+            attitude_bound_rad=bound_rad,
+            attitude_p95_rad=USUAL_ATTITUDE * error.bound_rad,
+        )
+
+    @property
+    def refuted(self) -> list[str]:
+        """UAVs whose reported position the array refutes."""
+        return [uav for uav, record in self._uavs if record.is_refuted]
+
+
+def _refined(known: ErrorSet, seen: Sequence[Seen], tolerates: int) -> ErrorSet | None:
+    """Return the errors that are possible by what is seen; None if there are none."""
+    for _ in range(REFINEMENTS):
+        known = known.cut(compass.confined(known, seen, tolerates))
+        if known.is_empty:
+            return None
+        known = known.recentred()
+    return known
+
+
+def _refuted(now_ns: int, one: Seen, error: Misalignment) -> Notice:
+    expected = error.center @ one.reported.center
+    off = math.degrees(angle_rad(expected, one.seen.center))
+    text = (
+        f"{one.uav}: the array sees it {off:.1f}° from its reported position"
+        f" ({Reason.CONTRADICTED_BY_ARRAY}); check it for GNSS spoofing, a forged sender or a wrong"
+        " datum"
+    )
+    return Notice(t_ns=now_ns, severity=Severity.ERROR, subject=one.uav, text=text)
+
+
+def _agrees_again(now_ns: int, uav: str) -> Notice:
+    text = f"{uav}: the array sees it again where it reports to be"
+    return Notice(t_ns=now_ns, severity=Severity.INFO, subject=uav, text=text)

@@ -1,0 +1,216 @@
+"""Measurements of the array's receiver, on their way from events to beams.
+
+Joins what the other parts know - the carrier's pose, the UAVs' tracks, their clocks - with what the
+array sees. Raises nothing: a measurement that cannot be used is a rejection with its reason.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from functools import partial
+
+import numpy as np
+
+from companion.beams.aim import Sight
+from companion.beams.array import steering
+from companion.beams.array.geometry import Array
+from companion.pipeline import assumptions
+from companion.pipeline.array_compass import ArrayCompass
+from companion.pipeline.center import CarrierTracker
+from companion.pipeline.records import UavRecords
+from companion.pipeline.senders import Senders
+from companion.pipeline.sighted_uavs import Measured, SightedUavs
+from companion.pipeline.snapshots import ReportedCarrier, UavSnapshot
+from companion.settings.model import Settings
+from companion.tracking.carrier import Pose
+from companion.tracking.relative import Relative, relative
+from companion.tracking.tracker import Tracker
+from companion.values import Carrier, Observation, Output, Reason, Refuted, Rejection, Track
+
+Sights = Callable[[Sequence[Track]], dict[str, Sight]]
+"""Function from the UAVs' tracks at the time of use to the directions in which UAVs are seen."""
+
+
+class Observing:
+    """Measurements of the array's receiver, and what follows from them.
+
+    Over 5 parts, because it is where they meet.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        *,
+        array: Array,
+        center: CarrierTracker,
+        senders: Senders,
+        tracker: Tracker,
+        records: UavRecords,
+    ) -> None:
+        self._settings = settings.observations
+        self._array = array
+        self._center = center
+        self._senders = senders
+        self._tracker = tracker
+        self._records = records
+        self.uavs = SightedUavs(settings.observations, array.array_from_body)
+        bound_rad = 0.0 if center.vehicle is None else center.attitude_bound_rad
+        self.compass = ArrayCompass(settings.observations, self.uavs, bound_rad)
+
+    # --- input ------------------------------------------------------------------------------
+
+    def add(self, event: Observation) -> list[Output]:
+        """Process a measurement."""
+        why = self._unusable(event)
+        if why is not None:
+            return [Rejection(t_ns=event.t_ns, source=event.uav, reason=why)]
+        assert event.azimuth_rad is not None and event.elevation_rad is not None
+        assert event.bound_rad is not None
+        (towards,) = steering.unit_directions(
+            np.array([event.azimuth_rad]), np.array([event.elevation_rad])
+        )
+        bound_s = event.time_bound_ns * 1e-9
+        self.uavs.add(event.uav, Measured(event.measured_ns, towards, event.bound_rad, bound_s))
+        return self._settle(event.t_ns)
+
+    def _unusable(self, event: Observation) -> Reason | None:
+        oldest_ns = round(self._settings.oldest_s * 1e9)
+        if not -event.time_bound_ns <= event.t_ns - event.measured_ns <= oldest_ns:
+            return Reason.WRONG_TIME
+        if event.uav == self._center.vehicle or event.uav not in self._tracker:
+            return Reason.UNKNOWN_UAV
+        if self._pose(event.measured_ns, nearest=False) is None:
+            return Reason.NO_POSE
+        return None
+
+    def attitude_reported(self, now_ns: int) -> list[Output]:
+        """Place measurements by a new attitude of the carrier."""
+        if not self.uavs:
+            return []
+        if self._center.is_contradicted:
+            self.forget_all()
+            return []
+        return self._settle(now_ns)
+
+    def forget(self, uav: str) -> None:
+        """Forget a UAV whose track is dropped or restarted; all of them, if it is the carrier."""
+        if uav == self._center.vehicle:
+            self.forget_all()
+        self.uavs.forget(uav)
+
+    def forget_all(self) -> None:
+        """Forget everything: the error of reported attitudes may have jumped."""
+        self.uavs.clear()
+        self.compass.forget()
+
+    def _settle(self, now_ns: int) -> list[Output]:
+        now = self._senders.stamp_time(self._center.vehicle or "", now_ns)
+        newest_ns = self._center.newest_attitude_ns(now)
+        if newest_ns is None:
+            return []
+        wrong = self.uavs.settle(
+            newest_ns,
+            pose=partial(self._pose, nearest=True),
+            place=partial(self._place, now_ns),
+            bound_rad=self.compass.largest_rad,
+        )
+        return [Rejection(t_ns=now_ns, source=uav, reason=Reason.OUTLIER) for uav in wrong]
+
+    def update(self, now_ns: int) -> list[Output]:
+        """Estimate the error of the carrier's attitude, and judge the UAVs' positions."""
+        found = self.reported(now_ns, now_ns)
+        if not self.uavs or isinstance(found, str):
+            return []
+        bound_rad = found.carrier.attitude_bound_rad - found.carrier.extrapolation_rad
+        said: list[Output] = []
+        for one in self.compass.update(now_ns, found.carrier, bound_rad):
+            if isinstance(one, Refuted):
+                said += assumptions.notices(self._records, one)
+            else:
+                said.append(one)
+        return said
+
+    # --- the carrier ------------------------------------------------------------------------
+
+    def carrier(self, now_ns: int, valid_at_ns: int) -> Carrier | str:
+        """Return position and attitude of the array, or the reason why they are unknown."""
+        found = self.reported(now_ns, valid_at_ns)
+        return found if isinstance(found, str) else self.compass.corrected(found.carrier)
+
+    def reported(self, now_ns: int, valid_at_ns: int) -> ReportedCarrier | str:
+        """Return the carrier as it reports itself, or the reason why its pose is unknown."""
+        vehicle = self._center.vehicle
+        if vehicle is None:
+            found = self._center.station(valid_at_ns)
+            return found if isinstance(found, str) else ReportedCarrier(found)
+        track = self._tracker.track(vehicle, now_ns, self._senders.time(vehicle, valid_at_ns))
+        now, at = (self._senders.stamp_time(vehicle, t_ns) for t_ns in (now_ns, valid_at_ns))
+        newest, turn_degps2 = self._tracker.newest(vehicle), self._turn_degps2(vehicle)
+        found = self._center.on_vehicle(track, newest, now, at, turn_degps2)
+        if isinstance(found, str):
+            return found
+        return ReportedCarrier(found, track, newest, math.radians(turn_degps2))
+
+    def _turn_degps2(self, vehicle: str) -> float:
+        return self._senders.assumed(vehicle).turn_degps2
+
+    def _pose(self, at_ns: int, *, nearest: bool) -> Pose | None:
+        vehicle = self._center.vehicle
+        if vehicle is None:
+            return self._center.fixed_pose(at_ns)
+        newest, at = self._tracker.newest(vehicle), self._senders.stamp_time(vehicle, at_ns)
+        return self._center.pose(newest, at, self._turn_degps2(vehicle), nearest=nearest)
+
+    def _place(self, now_ns: int, uav: str, at_ns: int) -> Relative | None:
+        """Return a UAV's position relative to the array; None if either is unknown."""
+        track, reported = self._tracker.snapshot(uav), self.reported(now_ns, at_ns)
+        if track is None or isinstance(reported, str):
+            return None
+        snapshot = UavSnapshot(track, self._senders.timeline(uav))
+        return self._relative(snapshot, snapshot.at(now_ns, at_ns), reported)
+
+    def _relative(
+        self, snapshot: UavSnapshot, track: Track, reported: ReportedCarrier
+    ) -> Relative | None:
+        return relative(
+            track,
+            snapshot.track.fix,
+            carrier=reported.carrier,
+            carrier_track=reported.track,
+            carrier_fix=reported.fix,
+            lever_ned_m=reported.carrier.body_from_local.T @ self._array.lever_arm_m,
+            turn_acceleration_radps2=reported.turn_acceleration_radps2,
+        )
+
+    # --- looks ------------------------------------------------------------------------------
+
+    def sights(
+        self, snapshots: Sequence[UavSnapshot], valid_at_ns: int, reported: ReportedCarrier | str
+    ) -> Sights | None:
+        """Return where the array sees UAVs at a time, as a function for any thread.
+
+        None if it sees none.
+        """
+        if not self.uavs or isinstance(reported, str):
+            return None
+        body_from_local = reported.carrier.body_from_local
+        looks = [self.compass.look(one.track.fix.uav, body_from_local) for one in snapshots]
+        times = {one.t_ns for look in looks if look is not None for one in look.pending}
+        poses = {t_ns: self._pose(t_ns, nearest=False) for t_ns in (*times, valid_at_ns)}
+        pose, follows = poses[valid_at_ns], self._settings.follow
+
+        def sights(tracks: Sequence[Track]) -> dict[str, Sight]:
+            found = {}
+            for snapshot, look, track in zip(snapshots, looks, tracks, strict=True):
+                if look is None or pose is None or (look.is_refuted and not follows):
+                    continue
+                near = self._relative(snapshot, track, reported)
+                if near is None:
+                    continue
+                cap = self.uavs.direction(
+                    look, near, pose=pose, pose_at=poses.get, is_alone=look.is_refuted
+                )
+                if cap is not None:
+                    found[track.uav] = Sight(cap, look.is_refuted)
+            return found
+
+        return sights

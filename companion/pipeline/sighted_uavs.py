@@ -1,0 +1,235 @@
+"""What the array's receiver measured of each UAV, and in which directions UAVs may be by it.
+
+Measurements are pending until an attitude is reported that was measured after them; then they are
+placed by the nearest attitude and join their UAV's ``Sightings``. Between two attitudes the carrier
+turns by its reported rates, within its largest angular acceleration. See docs/math.md 5.7.
+"""
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from companion.settings.observations import ObservationSettings
+from companion.tracking.carrier import Pose
+from companion.tracking.compass import Misalignment, rotation
+from companion.tracking.likely_error import LikelyError
+from companion.tracking.relative import Relative
+from companion.tracking.sightings import WINDOW, Motion, Sightings
+from companion.values import Cap, FloatArray
+
+PENDING_MAX: Final = WINDOW  # most measurements of a UAV that wait for an attitude
+
+
+class Measured(NamedTuple):
+    """Measured direction that waits for an attitude: when, where in the array frame, how exact."""
+
+    t_ns: int
+    direction: FloatArray
+    bound_rad: float
+    time_bound_s: float
+
+
+@dataclass(slots=True, kw_only=True)
+class SightedUav:
+    """What the array saw of one UAV; the values in it are immutable.
+
+    latest           its position relative to the array, and the attitude, at the newest sighting
+    contradicted_ns  since when it is seen elsewhere than it reports; None: it is not
+    agrees_ns        since when it is not
+    """
+
+    sightings: Sightings | None = None
+    latest: tuple[Relative, Pose] | None = None
+    pending: tuple[Measured, ...] = ()
+    contradicted_ns: int | None = None
+    agrees_ns: int | None = None
+    is_refuted: bool = False
+
+
+class Look(NamedTuple):
+    """Snapshot of what the array saw of one UAV, for any thread.
+
+    error      error of reported attitudes
+    bound_rad  bound on its angle
+    likely     its likely rotation vector (3,), local frame
+    """
+
+    sightings: Sightings | None
+    pending: tuple[Measured, ...]
+    is_refuted: bool
+    error: Misalignment
+    bound_rad: float
+    likely: FloatArray
+
+
+PoseAt = Callable[[int], Pose | None]
+"""Attitude at a time; None if it is unknown."""
+
+
+class SightedUavs:
+    """What the array saw of all UAVs.
+
+    array_from_body  mount of the array, (3, 3)
+    """
+
+    def __init__(self, settings: ObservationSettings, array_from_body: FloatArray) -> None:
+        self._outliers = settings.outliers
+        self._drift_radps = math.radians(settings.drift_max_degps)
+        self._array_from_body = array_from_body
+        self._uavs: dict[str, SightedUav] = {}
+        self.likely = LikelyError()
+        self.used = 0  # measurements that agreed with the others of their UAV
+
+    def __bool__(self) -> bool:
+        return bool(self._uavs)
+
+    def __iter__(self) -> Iterator[tuple[str, SightedUav]]:
+        return iter(self._uavs.items())
+
+    def get(self, uav: str) -> SightedUav | None:
+        """Return what was seen of a UAV; None if nothing was."""
+        return self._uavs.get(uav)
+
+    def forget(self, uav: str) -> None:
+        """Forget a UAV whose track is dropped or restarted."""
+        self._uavs.pop(uav, None)
+
+    def clear(self) -> None:
+        """Forget all UAVs."""
+        self._uavs.clear()
+        self.likely = LikelyError()
+
+    def add(self, uav: str, measured: Measured) -> None:
+        """Add a measurement of a UAV."""
+        record = self._uavs.get(uav)
+        if record is None:
+            record = self._uavs.setdefault(uav, SightedUav())
+        record.pending = (*record.pending[1 - PENDING_MAX :], measured)
+
+    def settle(
+        self,
+        newest_ns: int,
+        *,
+        pose: PoseAt,
+        place: Callable[[str, int], Relative | None],
+        bound_rad: float,
+    ) -> list[str]:
+        """Place all measurements that are older than the newest attitude, of ``newest_ns``.
+
+            pose       the carrier's attitude at a time
+            place      a UAV's position relative to the array at a time
+            bound_rad  bound on the error of reported attitudes
+
+        Returns the UAV of each measurement that contradicts the others of that UAV.
+        """
+        wrong: list[str] = []
+        for uav, record in self._uavs.items():
+            if not record.pending or record.pending[0].t_ns > newest_ns:
+                continue
+            ready = [one for one in record.pending if one.t_ns <= newest_ns]
+            record.pending = tuple(one for one in record.pending if one.t_ns > newest_ns)
+            for one in ready:
+                at, near = pose(one.t_ns), place(uav, one.t_ns)
+                if at is None or near is None:
+                    continue
+                if not self._join(record, one, at, near, bound_rad):
+                    wrong.append(uav)
+        return wrong
+
+    def _join(
+        self, record: SightedUav, one: Measured, pose: Pose, near: Relative, bound_rad: float
+    ) -> bool:
+        """Add a measurement to a UAV's sightings. Returns whether it agrees with them."""
+        cap = self._placed(one, pose, near, pose.extrapolation_rad)
+        before, latest = record.sightings, record.latest
+        if before is None or latest is None:
+            record.sightings, record.latest = Sightings.of(one.t_ns, cap), (near, pose)
+            return True
+        turned_rad = pose.turned_from(latest[1])
+        forward = one.t_ns >= before.t_ns
+        first_ns, last_ns = (before.t_ns, one.t_ns) if forward else (one.t_ns, before.t_ns)
+        motion = self._motion(near, first_ns, last_ns, bound_rad, turned_rad)
+        if forward:
+            before = before.moved(one.t_ns, motion)
+            record.latest = near, pose
+        else:
+            later = Sightings.of(one.t_ns, cap).moved(before.t_ns, motion)
+            cap = Cap(later.centers[0], float(later.radii_rad[0]))
+        if before.contradicts(cap, self._outliers):
+            record.sightings = before.against(cap)
+            return False
+        self.used += 1
+        record.sightings = before.with_cap(cap)
+        if forward and record.contradicted_ns is None:
+            self.likely.add(
+                one.t_ns,
+                body_from_local=pose.body_from_local,
+                reported=near.reported.center,
+                seen=cap.center,
+                bound_rad=cap.radius_rad,
+            )
+        return True
+
+    def _placed(self, one: Measured, pose: Pose, near: Relative, extrapolation_rad: float) -> Cap:
+        """Return a measurement as directions in the local frame."""
+        local_from_array = (self._array_from_body @ pose.body_from_local).T
+        radius = one.bound_rad + extrapolation_rad + near.swept_rad(one.time_bound_s)
+        return Cap(local_from_array @ one.direction, min(radius, math.pi))
+
+    def _motion(
+        self, near: Relative, from_ns: int, to_ns: int, bound_rad: float, turned_rad: float
+    ) -> Motion:
+        drifted = self._drift_radps * abs(to_ns - from_ns) * 1e-9
+        return near.motion(
+            from_ns=from_ns,
+            to_ns=to_ns,
+            turned_rad=turned_rad,
+            misalignment_rad=bound_rad,
+            drifted_rad=drifted,
+        )
+
+    def direction(
+        self, look: Look, near: Relative, *, pose: Pose, pose_at: PoseAt, is_alone: bool
+    ) -> Cap | None:
+        """Return the directions in which a UAV is, array frame.
+
+            near      the UAV's position relative to the array at the time of the beam
+            pose      the reported attitude then
+            pose_at   that of another time, by the same report
+            is_alone  whether its reported position is not used
+
+        None if the measurements contradict one another, or the reported position.
+        """
+        to_ns, parts = near.t_ns, []
+        if look.sightings is not None:
+            before = look.sightings
+            turned_rad = near.turned_rad((to_ns - before.t_ns) * 1e-9)
+            motion = self._motion(near, before.t_ns, to_ns, look.bound_rad, turned_rad)
+            moved = before.moved(to_ns, motion)
+            parts.append((moved.centers, moved.radii_rad + pose.extrapolation_rad))
+        for one in look.pending:
+            at = pose_at(one.t_ns)
+            if at is None:
+                continue
+            cap = self._placed(one, at, near, pose.extrapolated_since(at))
+            turned_rad = pose.turned_from(at) + pose.extrapolated_since(at)
+            motion = self._motion(near, one.t_ns, to_ns, look.bound_rad, turned_rad)
+            later = Sightings.of(one.t_ns, cap).moved(to_ns, motion)
+            parts.append((later.centers, later.radii_rad))
+        if not parts:
+            return None
+        centers = np.concatenate([part[0] for part in parts])[-WINDOW:]
+        radii = np.minimum(np.concatenate([part[1] for part in parts])[-WINDOW:], math.pi)
+        within, likely, reported = None, None, near.reported
+        if not is_alone:
+            spread = reported.radius_rad + look.error.bound_rad + pose.extrapolation_rad
+            within = Cap(look.error.center @ reported.center, min(spread, math.pi))
+            likely = rotation(look.likely) @ reported.center
+        found = Sightings(to_ns, centers, radii).possible(self._outliers, within, likely)
+        if found is None or found.radius_rad >= math.pi / 2:
+            return None
+        array_from_local = self._array_from_body @ pose.body_from_local
+        return Cap(array_from_local @ found.center, found.radius_rad)

@@ -24,7 +24,6 @@ FRESH_NS: Final = 1_000_000_000  # age of a UAV's sightings beyond which they sa
 PERSISTENT_NS: Final = 1_000_000_000
 """Time for which a UAV must be seen elsewhere than it reports until its position is refuted."""
 WIDEST_RAD: Final = math.radians(30.0)  # largest error of reported attitudes that is considered
-REFINEMENTS: Final = 3  # times that a set is cut by the same evidence, about a better centre
 
 
 class ArrayCompass:
@@ -103,7 +102,7 @@ class ArrayCompass:
         if not seen:
             return known
         for start in (known, ErrorSet.within(WIDEST_RAD)):
-            cut = _refined(start, seen, self._tolerates)
+            cut = compass.refined(start, seen, self._tolerates)
             if cut is not None:
                 return cut
         return ErrorSet.within(WIDEST_RAD)
@@ -190,16 +189,6 @@ class ArrayCompass:
     def refuted(self) -> list[str]:
         """UAVs whose reported position the array refutes."""
         return [uav for uav, record in self._uavs if record.is_refuted]
-
-
-def _refined(known: ErrorSet, seen: Sequence[Seen], tolerates: int) -> ErrorSet | None:
-    """Return the errors that are possible by what is seen; None if there are none."""
-    for _ in range(REFINEMENTS):
-        known = known.cut(compass.confined(known, seen, tolerates))
-        if known.is_empty:
-            return None
-        known = known.recentred()
-    return known
 
 
 def _refuted(now_ns: int, one: Seen, error: Misalignment) -> Notice:

@@ -32,5 +32,5 @@ class ObservationSettings(Section):
     oldest_s: Annotated[float, Field(gt=0, le=10)] = 1.0
     drift_max_degps: Annotated[float, Field(ge=0, le=90)] = 0.3
     outliers: Annotated[int, Field(ge=0, le=4)] = 0
-    false_uavs: Annotated[int, Field(ge=0, le=10)] = 1
+    false_uavs: Annotated[int, Field(ge=0, le=1)] = 1
     follow: bool = False

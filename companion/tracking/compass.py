@@ -16,10 +16,13 @@ from typing import Final, NamedTuple
 import numpy as np
 from scipy.spatial import ConvexHull
 
-from companion.values import Cap, FloatArray, angle_rad
+from companion.values import Cap, FloatArray, IntArray, angle_rad, lens
 
+MOST_UAVS: Final = 12  # UAVs that confine the error most are used
 MAJORITY: Final = 3  # least number of observed UAVs of which some may be false
-RECENTRE_RAD: Final = math.radians(0.3)  # distance of the polytope's centre at which V follows it
+REFINEMENTS: Final = 12  # most times that a set is cut by the same evidence
+LEAST_GAIN: Final = 0.97  # ratio of radii above which another cut is not worth its time
+RECENTRE_RAD: Final = math.radians(0.3)  # distance of the set's centre at which V follows it
 
 
 def _normals() -> FloatArray:
@@ -128,40 +131,33 @@ class ErrorSet:
     def within_ball(self, bound_rad: float) -> "Misalignment | None":
         """Return the error if its angle is at most ``bound_rad``; None if that excludes it.
 
-        The smallest ball around what two balls share.
+        Rotations are points of the sphere in four dimensions, at half their angle.
         """
         inside = self.cut(prior(bound_rad, self.center))
-        offset = _vector(self.center)
-        at, radius = inside.ball()
-        size = math.sqrt(offset @ offset)
-        at, radius = at + offset, radius + (size + math.sqrt(at @ at) + radius) * size
-        apart = math.sqrt(at @ at)
-        if inside.is_empty or apart > radius + bound_rad:
+        if inside.is_empty:
             return None
-        if apart + radius <= bound_rad:
-            return Misalignment(rotation(at), radius)
-        along = 0.0
-        if apart > 0.0:
-            along = (apart * apart + bound_rad * bound_rad - radius * radius) / (2.0 * apart)
-        if along <= 0.0:
-            return Misalignment(np.eye(3), bound_rad)
-        if along >= apart:
-            return Misalignment(rotation(at), radius)
-        half = math.sqrt(max(bound_rad * bound_rad - along * along, 0.0))
-        return Misalignment(rotation(at * (along / apart)), half)
+        found = inside.misalignment()
+        apart = rotation_angle_rad(found.center)
+        shared = lens(apart / 2.0, bound_rad / 2.0, found.bound_rad / 2.0)
+        if shared is None:
+            return None
+        along, radius = shared
+        share = 0.0 if apart == 0.0 else 2.0 * along / apart
+        return Misalignment(rotation(_vector(found.center) * share), 2.0 * radius)
 
     def recentred(self) -> "ErrorSet":
-        """Return the set with V near its centre.
+        """Return the set with V near its centre a, if that is exact enough.
 
-        exp([w]) exp([-a]) is exp([x]) with |x - (w - a)| at most (|w| + |a|) |a|, as the inverse
-        Jacobian differs from 1 by less than |x| for angles below 1 rad.
+        W V'^T = exp([w]) exp([-a]) = exp([x]), where x follows w from a by the Jacobian J(w) and
+        the inverse of J(x). They differ from 1 by at most 0.6 |w| and 0.6 |x| for angles below
+        0.5 rad, hence |x - (w - a)| is at most 0.6 (|w| + |x|) |w - a|.
         """
         at, radius = self.ball()
         moved = math.sqrt(at @ at)
-        if moved < RECENTRE_RAD or moved + radius > 1.0:
+        slack = 0.6 * (moved + 2.5 * radius) * radius
+        if moved < RECENTRE_RAD or moved + radius > 0.5 or slack > moved * moved:
             return self
-        extents = self.extents - DIRECTIONS @ at + (2.0 * moved + radius) * moved
-        return ErrorSet(rotation(at) @ self.center, extents)
+        return ErrorSet(rotation(at) @ self.center, self.extents - DIRECTIONS @ at + slack)
 
     def cut(self, extents: FloatArray) -> "ErrorSet":
         """Return the set within further extents (26,), about the same centre."""
@@ -169,36 +165,120 @@ class ErrorSet:
 
 
 def prior(bound_rad: float, center: FloatArray) -> FloatArray:
-    """Return extents (26,) about ``center`` of all errors of at most ``bound_rad``."""
+    """Return extents (26,) about ``center`` of all errors of at most ``bound_rad``.
+
+    log(exp([z]) exp([-x])) differs from z - x by at most 0.6 |z| |x| for |z| + |x| below 0.6 rad
+    (Baker, Campbell and Hausdorff).
+    """
     x = _vector(center)
     size = math.sqrt(x @ x)
-    if bound_rad + size > 1.0:
+    if bound_rad + size > 0.6:
         return np.full(len(DIRECTIONS), bound_rad + size)
-    return bound_rad - DIRECTIONS @ x + (bound_rad + size) * size
+    return bound_rad - DIRECTIONS @ x + 0.6 * bound_rad * size
 
 
 def confined(known: ErrorSet, seen: Sequence[Seen], false_uavs: int) -> FloatArray:
     """Return extents (26,) about the set's centre by what UAVs are seen, some of them false.
 
-    For a unit vector n: n.w = (n - (n.u) u).w + (n.u) (u.w). The first part is what the array sees;
-    of the second only the set itself is known.
+    UAV i confines w to a cylinder about its axis a_i, hence n_i.w for every n_i across the axis.
+    With n = n_i + n_j, two UAVs confine n.w for every n; one does with the part of n along its axis
+    left to the set itself.
     """
-    tolerated = false_uavs if len(seen) >= MAJORITY else 0
-    corners = known.corners
+    tolerates = false_uavs > 0 and len(seen) >= MAJORITY
+    cylinders = sorted((_cylinder(known, one) for one in seen), key=lambda one: one.radius)
+    cylinders = cylinders[:MOST_UAVS]
+    corners, count = known.corners, len(cylinders)
+    axes = np.array([one.axis for one in cylinders])
+    offsets = np.array([one.offset for one in cylinders])
+    radii = np.array([one.radius for one in cylinders])
+    along, on_axis = DIRECTIONS @ axes.T, corners @ axes.T
+    ends = np.where(along > 0.0, along * on_axis.max(axis=0), along * on_axis.min(axis=0))
+    alone = (
+        DIRECTIONS @ offsets.T + np.sqrt(np.maximum(1.0 - along * along, 0.0)) * radii + ends
+    ).T
+    first, second = np.triu_indices(count, 1)
+    pairs = np.empty((0, len(DIRECTIONS)))
+    if len(first):
+        pairs = _by_pairs(axes, offsets, radii, first, second)
+    bounds = np.concatenate([alone, pairs])
+    if not tolerates:
+        extents: FloatArray = bounds.min(axis=0)
+        return extents
+    one_of = np.concatenate([np.arange(count), first])
+    other_of = np.concatenate([np.arange(count), second])
+    without = [bounds[(one_of != i) & (other_of != i)].min(axis=0) for i in range(count)]
+    worst: FloatArray = np.max(without, axis=0)
+    return worst
+
+
+class _Cylinder(NamedTuple):
+    """Errors w whose part across a unit axis (3,) is within a radius of an offset (3,)."""
+
+    axis: FloatArray
+    offset: FloatArray
+    radius: float
+
+
+def _cylinder(known: ErrorSet, one: Seen) -> _Cylinder:
+    """Return what one UAV says of the error.
+
+    With a the axis, exp([w]) a differs from a + w x a by at most r = |w| |w x a| / 2. The array
+    sees w x a within r and the two bounds of an offset, so that |w x a| is at most their sum.
+    """
+    axis, corners = known.center @ one.reported.center, known.corners
     size = math.sqrt(float((corners * corners).sum(axis=1).max()))
-    rows = np.empty((len(seen), len(DIRECTIONS)))
-    for row, one in zip(rows, seen, strict=True):
-        axis = known.center @ one.reported.center
-        across = _cross(axis, one.seen.center - axis)
-        radius = _chord(one.seen.radius_rad) + _chord(one.reported.radius_rad) + size * size / 2.0
-        along = DIRECTIONS @ axis
-        on_axis = corners @ axis
-        ends = np.where(along > 0.0, along * on_axis.max(), along * on_axis.min())
-        row[:] = DIRECTIONS @ across + np.sqrt(np.maximum(1.0 - along * along, 0.0)) * radius + ends
-    if len(rows) <= tolerated:
-        return np.full(len(DIRECTIONS), math.inf)
-    extents: FloatArray = np.partition(rows, tolerated, axis=0)[tolerated]
-    return extents
+    turned = np.cross(corners, axis)
+    aside = math.sqrt(float((turned * turned).sum(axis=1).max()))
+    radius = _chord(one.seen.radius_rad) + _chord(one.reported.radius_rad)
+    offset = np.cross(axis, one.seen.center - axis)
+    if size < 1.0:
+        seen = one.seen.center - axis
+        aside = min(aside, (math.sqrt(seen @ seen) + radius) / (1.0 - size / 2.0))
+    return _Cylinder(axis, offset, radius + size * aside / 2.0)
+
+
+def _by_pairs(
+    axes: FloatArray, offsets: FloatArray, radii: FloatArray, first: IntArray, second: IntArray
+) -> FloatArray:
+    """Return extents (P, 26) by pairs of cylinders.
+
+    n is split so that the sum of |n_i|^2 radius_i^2 is least: n_i = P_i M^-1 n / radius_i^2, with
+    P_i the projection across the axis and M the sum of P_i / radius_i^2.
+    """
+    across = (np.eye(3) - axes[:, :, np.newaxis] * axes[:, np.newaxis, :]) / (
+        radii[:, np.newaxis, np.newaxis] ** 2
+    )
+    both = across[first] + across[second]
+    apart = 1.0 - (axes[first] * axes[second]).sum(axis=1) ** 2
+    usable = apart > 1e-6
+    bounds = np.full((len(first), len(DIRECTIONS)), math.inf)
+    if usable.any():
+        split = np.linalg.inv(both[usable]) @ DIRECTIONS.T  # (P, 3, 26)
+        found = np.zeros((int(usable.sum()), len(DIRECTIONS)))
+        for of in (first[usable], second[usable]):
+            part = across[of] @ split
+            found += np.einsum("pdn,pd->pn", part, offsets[of])
+            found += np.sqrt((part * part).sum(axis=1)) * radii[of, np.newaxis]
+        bounds[usable] = found
+    return bounds
+
+
+def refined(known: ErrorSet, seen: Sequence[Seen], false_uavs: int) -> ErrorSet | None:
+    """Return the errors that are possible by what is seen; None if there are none.
+
+    A smaller set is more nearly linear, so it is cut again while it shrinks.
+    """
+    _, before = known.ball()
+    for _ in range(REFINEMENTS):
+        known = known.cut(confined(known, seen, false_uavs))
+        if known.is_empty:
+            return None
+        known = known.recentred()
+        _, radius = known.ball()
+        if radius > LEAST_GAIN * before:
+            break
+        before = radius
+    return known
 
 
 def contradicts(error: Misalignment, one: Seen) -> bool:
@@ -210,11 +290,6 @@ def contradicts(error: Misalignment, one: Seen) -> bool:
 
 def _chord(angle: float) -> float:
     return 2.0 * math.sin(min(angle, math.pi) / 2.0)
-
-
-def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
-    (x, y, z), (a, b, c) = one.tolist(), other.tolist()
-    return np.array([y * c - z * b, z * a - x * c, x * b - y * a])
 
 
 def _vector(matrix: FloatArray) -> FloatArray:

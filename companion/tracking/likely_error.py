@@ -23,7 +23,7 @@ class LikelyError:
         self._normal = np.zeros((6, 6))
         self._sum = np.zeros(6)
         self._t_ns: int | None = None
-        self._parts: FloatArray = np.zeros(6)
+        self._parts: FloatArray = np.zeros(6, dtype=float)
 
     def add(
         self,
@@ -43,7 +43,7 @@ class LikelyError:
             self._normal *= kept
             self._sum *= kept
         self._t_ns = t_ns
-        rows = np.empty((3, 6))
+        rows: FloatArray = np.empty((3, 6))
         rows[:, 3:] = np.eye(3) - reported[:, np.newaxis] * reported
         rows[:, :3] = rows[:, 3:] @ body_from_local.T
         x, y, z = reported.tolist()
@@ -51,14 +51,13 @@ class LikelyError:
         across = np.array([y * c - z * b, z * a - x * c, x * b - y * a])
         off = across - rows @ self._parts
         size = math.sqrt(off @ off)
-        weighted = rows if size <= bound_rad else rows * (bound_rad / size)
+        weighted = rows * min(1.0, bound_rad / max(size, 1e-12))
         self._normal += weighted.T @ rows
         self._sum += weighted.T @ across
 
     def solve(self) -> None:
         """Update the estimate by all measurements so far."""
-        parts: FloatArray = np.linalg.solve(self._normal + PRIOR * np.eye(6), self._sum)
-        self._parts = parts
+        self._parts = np.asarray(np.linalg.solve(self._normal + PRIOR * np.eye(6), self._sum))
 
     def vector_rad(self, body_from_local: FloatArray) -> FloatArray:
         """Return the rotation vector (3,) of the error at an attitude, local frame."""

@@ -16,7 +16,7 @@ from typing import Final, Self
 
 import numpy as np
 
-from companion.values import Cap, FloatArray
+from companion.values import Cap, FloatArray, angle_rad
 
 WINDOW: Final = 10  # newest measurements of a UAV that are kept
 FACETS: Final = 16  # sides of the polygon around the possible directions
@@ -134,15 +134,17 @@ class Sightings:
         """
         if len(self.radii_rad) <= outliers:
             return Cap(self.centers[-1], math.pi) if within is None else within
-        middle = self.centers.sum(axis=0)
-        size = math.sqrt(middle @ middle)
-        middle = self.centers[-1] if size < 1e-6 else middle / size
+        middle = (self.centers / (self.radii_rad[:, np.newaxis] + 1e-6)).sum(axis=0)
+        middle /= max(math.sqrt(middle @ middle), 1e-9)
+        reach = np.arccos(np.clip(self.centers @ middle, -1.0, 1.0)) + self.radii_rad
+        farthest = float(np.partition(reach, outliers)[outliers])
+        if within is not None:
+            farthest = min(farthest, angle_rad(within.center, middle) + within.radius_rad)
+        if farthest >= math.pi / 2:  # the tangent plane shows half of all directions
+            return Cap(middle, math.pi)
         axes, extents = self._extents(middle, outliers)
         if within is not None:
-            along = np.arcsin(np.clip(_FACETS @ (axes @ within.center), -1.0, 1.0))
-            if within.center @ middle > 0.0:
-                ends = np.sin(np.minimum(along + within.radius_rad, math.pi / 2))
-                extents = np.minimum(extents, ends)
+            extents = np.minimum(extents, _ends(axes @ within.center, within.radius_rad))
         return _enclosed(middle, axes, extents, about)
 
     def _extents(self, middle: FloatArray, outliers: int) -> tuple[FloatArray, FloatArray]:
@@ -155,12 +157,18 @@ class Sightings:
         first = least - middle[int(np.argmin(np.abs(middle)))] * middle
         first /= math.sqrt(first @ first)
         axes = np.stack([first, _cross(middle, first)])
-        along = np.arcsin(np.clip((self.centers @ axes.T) @ _FACETS.T, -1.0, 1.0))
-        ends = np.sin(np.minimum(along + self.radii_rad[:, np.newaxis], math.pi / 2))
+        ends = _ends(self.centers @ axes.T, self.radii_rad[:, np.newaxis])
         if outliers:
             return axes, np.partition(ends, outliers, axis=0)[outliers]
         extents: FloatArray = ends.min(axis=0)
         return axes, extents
+
+
+def _ends(centers: FloatArray, radii_rad: FloatArray | float) -> FloatArray:
+    """Return extents of caps along all normals, from their centres in the plane, (..., 2)."""
+    along = np.arcsin(np.clip(centers @ _FACETS.T, -1.0, 1.0))
+    ends: FloatArray = np.sin(np.minimum(along + radii_rad, math.pi / 2))
+    return ends
 
 
 def _enclosed(

@@ -25,7 +25,7 @@ from companion.values.aimed import (
     WeightFormat,
     Widen,
 )
-from companion.values.caps import Cap, angle_rad
+from companion.values.caps import Cap, angle_rad, lens
 from companion.values.clock import ClockSet, UtcNs
 from companion.values.errors import UserError, printable, shown
 from companion.values.events import DUTY_MAX, Duty, Event, RoundTrip, Tick, Tock
@@ -133,6 +133,7 @@ __all__ = [
     "Widen",
     "angle_rad",
     "kind_of",
+    "lens",
     "printable",
     "read_toml",
     "shown",

@@ -16,22 +16,33 @@ class Cap(NamedTuple):
         """Return whether no direction is in both caps."""
         return angle_rad(self.center, other.center) > self.radius_rad + other.radius_rad
 
-    def common(self, other: "Cap") -> "Cap | None":
-        """Return the smallest cap around what both share; None if they share nothing."""
-        small, large = (self, other) if self.radius_rad <= other.radius_rad else (other, self)
-        apart = angle_rad(small.center, large.center)
-        if apart > small.radius_rad + large.radius_rad:
-            return None
-        if apart + small.radius_rad <= large.radius_rad or large.radius_rad >= math.pi / 2:
-            return small
-        # The edges meet ``along`` from the smaller centre, on the arc between the centres.
-        cos_small, cos_large = math.cos(small.radius_rad), math.cos(large.radius_rad)
-        along = math.atan2(cos_large - cos_small * math.cos(apart), cos_small * math.sin(apart))
-        if along <= 0.0:  # the common chord is beyond the smaller centre
-            return small
-        radius = math.acos(min(1.0, cos_small / math.cos(along)))
-        center = math.sin(apart - along) * small.center + math.sin(along) * large.center
-        return Cap(center / math.sqrt(center @ center), radius)
+
+def lens(apart: float, one: float, other: float) -> tuple[float, float] | None:
+    """Return place and radius of the smallest cap around what two caps of a sphere share.
+
+        apart       angle between their centres, rad
+        one, other  their radii, rad
+
+    The place is the angle from the first centre towards the second. None if they share nothing.
+    Valid on spheres of any dimension.
+    """
+    if apart > one + other:
+        return None
+    if apart + one <= other:
+        return 0.0, one
+    if apart + other <= one:
+        return apart, other
+    if max(one, other) >= math.pi / 2:
+        return (0.0, one) if one <= other else (apart, other)
+    # The edges meet on the plane that crosses the arc between the centres at ``along``.
+    along = math.atan2(
+        math.cos(other) - math.cos(one) * math.cos(apart), math.cos(one) * math.sin(apart)
+    )
+    if along <= 0.0:
+        return 0.0, one
+    if along >= apart:
+        return apart, other
+    return along, math.acos(min(1.0, math.cos(one) / math.cos(along)))
 
 
 def angle_rad(one: FloatArray, other: FloatArray) -> float:

@@ -17,10 +17,9 @@ The library interface for notebooks and programs; everything else is internal an
 ``Pipeline``: ``step(event)`` processes events in chronological order; ``look(now_ns, lead_s)``
 returns targets and beams, ``tracks(now_ns, valid_at_ns)`` every tracked UAV,
 ``clock_estimate(uav)`` the state of its clock, ``local`` the local frame. ``Frame``, ``Tick``,
-``RoundTrip``: events, from a ``Source``; ``Observation``: what the array's receiver measured.
-``Estimate``, ``Track``, ``Beam``: what comes out: an
-accepted report, the predicted state of a UAV, the beam of a UAV. ``read_log(path)``: the events of
-any kind of log.
+``RoundTrip``: events, from a ``Source``; ``Observation``: a measurement of the array's receiver.
+``Estimate``, ``Track``, ``Beam``: what comes out: an accepted report, the predicted state of a UAV,
+the beam of a UAV. ``read_log(path)``: the events of any kind of log.
 ``UserError``: raised for a user's mistakes.
 
 Names are loaded on first use, so that importing this package is fast.

@@ -33,7 +33,7 @@ from companion.values.fleet import Offer, Shared, SharedFrame, Standing
 from companion.values.health import Blame, Cause, Level, Verdict
 from companion.values.names import UAV_FORMS, Source, UavKind, kind_of
 from companion.values.numbers import BoolArray, ComplexArray, FloatArray, IntArray, Vector, vector
-from companion.values.observed import READINGS_MAX, Observation
+from companion.values.observed import READINGS_MAX, Observation, reason_invalid
 from companion.values.outputs import Notice, Output, Severity, Update
 from companion.values.received import (
     Accuracy,
@@ -136,6 +136,7 @@ __all__ = [
     "lens",
     "printable",
     "read_toml",
+    "reason_invalid",
     "shown",
     "vector",
 ]

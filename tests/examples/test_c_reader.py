@@ -2,7 +2,6 @@
 
 import contextlib
 import select
-import shutil
 import socket
 import struct
 import subprocess
@@ -12,24 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support import HANG_S, ROOT, free_port, line_of, started
+from c_programs import built
+from support import HANG_S, free_port, line_of, started
 
 from companion.node.ring import LARGEST_RECORD, Ring
 from companion.values import Beam, BeamSet, Method, Normalisation, UserError
 from companion.views import records
-
-SOURCES = ROOT / "examples" / "c"
-STRICT = ("-O2", "-Wall", "-Wextra", "-Werror")
-
-
-def built(folder: Path, compiler: str, standard: str, source: str) -> Path:
-    """An example compiled with warnings as errors."""
-    if shutil.which(compiler) is None:
-        pytest.skip(f"no {compiler} on this machine")
-    out = folder / Path(source).stem
-    command = [compiler, standard, *STRICT, "-o", out, SOURCES / source]
-    subprocess.run(command, check=True, timeout=HANG_S)
-    return out
 
 
 @pytest.fixture(scope="module")

@@ -11,11 +11,13 @@ from companion.values import (
     Fix,
     Frame,
     Notice,
+    Observation,
     Rejection,
     RoundTrip,
     Severity,
     Source,
     Track,
+    reason_invalid,
 )
 
 FRAME_ID: Final = "wgs84"
@@ -131,6 +133,15 @@ def to_clock_set(data: bytes) -> ClockSet:
     found = fields.value_of(ClockSet, schemas.ClockSetMessage.FromString(data))
     if abs(found.utc_offset_ns) > OFFSET_MAX_NS:
         raise ValueError("UTC offset out of range")
+    return found
+
+
+def to_observation(data: bytes) -> Observation:
+    """Decode an observation. Raises ``DecodeError``, or ``ValueError`` if it is invalid."""
+    found = fields.value_of(Observation, schemas.ObservationMessage.FromString(data))
+    reason = reason_invalid(found)
+    if reason is not None:
+        raise ValueError(f"invalid observation: {reason}")
     return found
 
 

@@ -21,6 +21,7 @@ from companion.values import (
     FloatArray,
     Frame,
     Notice,
+    Observation,
     Output,
     Rejection,
     RoundTrip,
@@ -111,6 +112,9 @@ class Encoder:
             case ClockSet():
                 data = schemas.encode("ClockSet", event)
                 self._emit(schemas.CLOCK_TOPIC, schemas.CLOCK_SET, event.t_ns, data)
+            case Observation():
+                data = schemas.encode("Observation", event)
+                self._emit(schemas.OBSERVATIONS_TOPIC, schemas.OBSERVATION, event.t_ns, data)
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
         """Send an output, except a rejection that is itself the last event sent.

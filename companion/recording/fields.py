@@ -19,6 +19,7 @@ from companion.values import (
     Duty,
     Frame,
     LeftOut,
+    Observation,
     Offer,
     Rejection,
     RoundTrip,
@@ -92,6 +93,7 @@ CLASSES: Final[dict[str, type]] = {
     "Duty": Duty,
     "Offer": Offer,
     "ClockSet": ClockSet,
+    "Observation": Observation,
 }
 """Classes of the values that recordings contain, by the name of their message."""
 

@@ -50,6 +50,7 @@ _EVENT_TOPICS: Final = frozenset(
         schemas.ROUND_TRIPS_TOPIC,
         schemas.DUTIES_TOPIC,
         schemas.CLOCK_TOPIC,
+        schemas.OBSERVATIONS_TOPIC,
     )
 )
 
@@ -323,4 +324,6 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
         return codec.to_duty(data)
     if topic == schemas.CLOCK_TOPIC:
         return codec.to_clock_set(data)
+    if topic == schemas.OBSERVATIONS_TOPIC:
+        return codec.to_observation(data)
     return codec.to_rejection(data)

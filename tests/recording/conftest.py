@@ -1,11 +1,13 @@
 """Small synthetic recordings and frames, and the location of the large logs if present."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import tracks
+from observed import DIRECTION, POWER
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.recording.writer import Writer
@@ -77,7 +79,7 @@ def geodetic() -> Callable[[FloatArray], tuple[FloatArray, FloatArray, FloatArra
 
 @pytest.fixture(scope="session")
 def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
-    """``events(n)``: frames, ticks, framing rejections, round trips; times may step back."""
+    """``events(n)``: frames, ticks, rejections, observations, round trips; times may step back."""
 
     def make(count: int) -> list[Event]:
         made: list[Event] = []
@@ -94,6 +96,9 @@ def events(wire: Callable[..., list[bytes]]) -> Callable[[int], list[Event]]:
                 made.append(
                     Rejection(t_ns=t_ns, source=link, reason=Reason.GARBAGE, count=3 + number)
                 )
+            if number % 19 == 0:
+                measured = DIRECTION if number % 2 else POWER
+                made.append(replace(measured, t_ns=t_ns, measured_ns=t_ns - 30_000_000))
             if number % 23 == 0:
                 remote_ns = (-1) ** number * 1_000_000 * number
                 made.append(

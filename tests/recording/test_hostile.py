@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 import zstandard
 from mcap.records import Attachment, Metadata
+from observed import wrong
 from support import HANG_S
 
 from companion.recording import schemas
@@ -383,9 +384,28 @@ def test_event_time_out_of_range_is_rejected(tmp_path: Path) -> None:
             schemas.DutyMessage(t_ns=1, serves=["1"] * 1_000_000).SerializeToString(),
             "event is longer than 2097152 bytes",
         ),
+        (
+            schemas.OBSERVATIONS_TOPIC,
+            schemas.encode("Observation", wrong("azimuth NaN")),
+            "invalid observation: azimuth: is not within -180 and 180 degrees",
+        ),
+        (
+            schemas.OBSERVATIONS_TOPIC,
+            schemas.ObservationMessage(t_ns=1, uav="1:1", beams=range(300_000)).SerializeToString(),
+            "invalid observation: beams: 300000 beams and 0 powers",
+        ),
+        (schemas.OBSERVATIONS_TOPIC, b"", "invalid observation: uav: '' is not SYSID:COMPID"),
         (schemas.FRAMES_TOPIC, no_frame(FRAME) * 200_000, "event is longer than 2097152 bytes"),
     ],
-    ids=["ids", "names", "names without end", "twice and again"],
+    ids=[
+        "ids",
+        "names",
+        "names without end",
+        "observation",
+        "beams",
+        "no observation",
+        "twice and again",
+    ],
 )
 def test_malformed_event_is_rejected(tmp_path: Path, topic: str, data: bytes, said: str) -> None:
     path = tmp_path / "x.mcap"

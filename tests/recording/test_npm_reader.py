@@ -93,7 +93,7 @@ def test_npm_reader_finds_every_message(
     for log, end in ((path, {"summary": {"digest": "d"}}), (recover(cut).path, {})):
         found = read_with_npm(packages, log)
         assert found["topics"] == read_with_python(log)
-        assert len(found["topics"]) == 10
+        assert len(found["topics"]) == 11
         assert found["attachments"] == {"settings.toml": '[a]\nb = "é"\n'}
         assert found["metadata"] == {
             "versions": told, "part": part.metadata(), "hole": hole, **end,

@@ -1,12 +1,14 @@
 """Hand-packed messages equal those of the generated classes; round trips are lossless."""
 
+import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from hypothesis import example, given
 from hypothesis import strategies as st
+from observed import OBSERVATIONS, WRONG, wrong
 
 from companion.recording import codec, fields, schemas
-from companion.values import Frame, Reason, Rejection, Source
+from companion.values import Frame, Observation, Reason, Rejection, Source
 
 TIMES = st.integers(0, 2**63 - 1)
 BYTE = st.integers(0, 255)
@@ -70,8 +72,28 @@ def test_rejection_round_trip_is_lossless(rejection: Rejection) -> None:
     assert codec.to_rejection(output) is None
 
 
+@given(OBSERVATIONS)
+def test_observation_round_trip_is_lossless(observation: Observation) -> None:
+    assert codec.to_observation(schemas.encode("Observation", observation)) == observation
+
+
+NOT_REPRESENTABLE = {
+    "early arrival", "early measurement", "time bound below 0", "beam below 0", "update below 0",
+    "update",
+}  # fmt: skip
+"""Invalid values that the unsigned fields of the message cannot hold."""
+
+
+@pytest.mark.parametrize("name", sorted(WRONG.keys() - NOT_REPRESENTABLE))
+def test_invalid_observation_is_rejected(name: str) -> None:
+    observation = wrong(name)
+    with pytest.raises(ValueError, match="invalid observation: "):
+        codec.to_observation(schemas.encode("Observation", observation))
+
+
 def test_every_schema_is_self_contained() -> None:
     for schema in (schemas.FRAME, schemas.TICK, schemas.REJECTION, schemas.TRACK,
+                   schemas.OBSERVATION,
                    schemas.WEIGHTS, schemas.LOCATION_FIX, schemas.LOG):  # fmt: skip
         pool = DescriptorPool()
         for file in FileDescriptorSet.FromString(schema.descriptor_set).file:
@@ -138,6 +160,10 @@ NUMBERS = {
     "Duty": ("t_ns=1 serves=2 spares=3"),
     "Offer": ("uav=1 sure_db=2 likely_db=3 sinr_db=4 heard_s=5"),
     "ClockSet": ("t_ns=1 utc_offset_ns=2"),
+    "Observation": (
+        "t_ns=1 measured_ns=2 time_bound_ns=3 uav=4 azimuth_rad=5 elevation_rad=6 bound_rad=7 "
+        "update=8 beams=9 powers_db=10 power_bound_db=11"
+    ),
 }
 """The number of each field that a version has written. A number keeps its meaning for good."""
 

@@ -15,13 +15,17 @@ import pytest
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message_factory import GetMessageClass
+from hypothesis import HealthCheck, given
+from hypothesis import settings as run_with
+from hypothesis import strategies as st
 from mcap.reader import make_reader
+from observed import OBSERVATIONS
 from support import read_metadata
 
 from companion.recording.reader import log_kind, read_log, read_settings
 from companion.recording.recover import recover
 from companion.recording.writer import Writer
-from companion.values import Estimate, Event, Frame, Rejection, Source, Tick, Update
+from companion.values import Estimate, Event, Frame, Observation, Rejection, Source, Tick, Update
 
 START_NS = 1_700_000_000_000_000_000
 Record = Callable[..., list[Event]]
@@ -61,6 +65,19 @@ def test_written_events_are_read_back_unchanged(tmp_path: Path, record: Record) 
     path = writer.close({})
     assert log_kind(path) == "mcap"
     assert list(read_log(path)) == driven
+
+
+@run_with(deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(observations=st.lists(OBSERVATIONS, max_size=5))
+def test_any_observation_is_read_back_unchanged(
+    tmp_path: Path, observations: list[Observation]
+) -> None:
+    writer, begins = open_writer(tmp_path), Tick(1)
+    for event in (begins, *observations):
+        writer.event(event)
+    path = writer.close({})
+    assert list(read_log(path)) == [begins, *observations]
+    path.unlink()
 
 
 @pytest.mark.parametrize(
@@ -156,6 +173,7 @@ def test_every_channel_decodes_from_the_file_alone(tmp_path: Path, record: Recor
         "/ticks": "companion.Tick",
         "/rejections": "companion.Rejection",
         "/timesync": "companion.RoundTrip",
+        "/observations": "companion.Observation",
         "/uav/1:1/fix": "foxglove.LocationFix",
         "/uav/1:1/predicted": "foxglove.LocationFix",
         "/uav/icao:4CA7B3/predicted": "foxglove.LocationFix",

@@ -6,6 +6,8 @@
         ...
 
 Synchronous; needs only the standard library, numpy and websockets. For use by one thread.
+
+Over 300 lines: the whole API in one module, beside which a program needs no other.
 """
 
 import base64
@@ -16,11 +18,11 @@ import time
 import tokenize
 import urllib.error
 import urllib.request
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from http.client import HTTPException, HTTPResponse, IncompleteRead
-from typing import Any, Final
+from typing import Any, Final, Required, TypedDict
 from urllib.parse import quote, urlencode, urlsplit
 
 import numpy as np
@@ -72,6 +74,28 @@ class Weights:
     matrix: ComplexArray
     valid_at_ns: int
     groups: tuple[int, ...] = ()
+
+
+class Measurement(TypedDict, total=False):
+    """One measurement of an array's receiver, with the fields of ``POST /v1/observations``.
+
+    Give ``measured_at`` (RFC 3339, UTC) or ``age_s``. For a direction give ``azimuth_deg``,
+    ``elevation_deg`` and ``bound_deg``; for powers ``beams``, ``powers_db`` and
+    ``power_bound_db``, and ``update`` if the weights of an update were used. docs/api.md describes
+    each field.
+    """
+
+    uav: Required[str]
+    measured_at: str
+    age_s: float
+    time_bound_s: float
+    azimuth_deg: float
+    elevation_deg: float
+    bound_deg: float
+    update: int
+    beams: Sequence[int]
+    powers_db: Sequence[float]
+    power_bound_db: float
 
 
 class Client:
@@ -130,11 +154,29 @@ class Client:
         with self._open(f"/v1/beams/weights?{query}", media_type) as answer:
             return _read(answer, self._timeout_s).decode(errors="replace")
 
+    def observe(self, measured: Measurement | Sequence[Measurement]) -> Json:
+        """Give measurements of the array's receiver: one, or a list of at most 400.
+
+            client.observe({"uav": "3:1", "age_s": 0.01,
+                            "azimuth_deg": 12.5, "elevation_deg": -3.0, "bound_deg": 2.0})
+
+        Returns the numbers of ``accepted`` and ``dropped`` ones, and ``errors``: the ``item`` and
+        the reason of each invalid one. If none is accepted, ``ServiceError`` has the first reason.
+        """
+        try:
+            body = json.dumps(measured, allow_nan=False, default=_plain).encode()
+        except (ValueError, TypeError) as error:
+            raise UserError(f"observation: {error}") from error
+        with self._open("/v1/observations", "application/json", body) as answer:
+            return self._object(_read(answer, self._timeout_s))
+
     def get(self, path: str, **query: object) -> Json:
         """Return the answer of any path of the API that returns a JSON object."""
         address = quote(path) + ("?" + urlencode(query, doseq=True) if query else "")
         with self._open(address, "application/json") as answer:
-            body = _read(answer, self._timeout_s)
+            return self._object(_read(answer, self._timeout_s))
+
+    def _object(self, body: bytes) -> Json:
         try:
             found = json.loads(body)
         except (ValueError, RecursionError) as error:
@@ -192,11 +234,14 @@ class Client:
         except (OSError, WebSocketException) as error:
             raise ServiceError(None, f"{self._url}: {error}") from error
 
-    def _open(self, address: str, accept: str) -> HTTPResponse:
+    def _open(self, address: str, accept: str, body: bytes | None = None) -> HTTPResponse:
+        """Send a request, with POST if it has a body of JSON."""
         headers = {"accept": accept}
+        if body is not None:
+            headers["content-type"] = "application/json"
         if self._token is not None:
             headers["authorization"] = f"Bearer {self._token}"
-        request = urllib.request.Request(self._url + address, headers=headers)
+        request = urllib.request.Request(self._url + address, data=body, headers=headers)
         try:
             found: HTTPResponse = urllib.request.urlopen(request, timeout=self._timeout_s)
         except urllib.error.HTTPError as error:
@@ -205,6 +250,13 @@ class Client:
         except (OSError, HTTPException) as error:
             raise ServiceError(None, f"{self._url}: {_reason(error)}") from error
         return found
+
+
+def _plain(value: Any) -> Any:
+    """Return a number or an array of numpy as JSON has it. Raises ``TypeError`` for others."""
+    if isinstance(value, np.ndarray | np.generic):
+        return value.tolist()
+    raise TypeError(f"{type(value).__name__} is not JSON")
 
 
 def _is_address(url: str) -> bool:

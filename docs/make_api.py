@@ -70,13 +70,17 @@ def page(found: Json) -> str:
     """The page in Markdown."""
     parts = [HEAD, found["info"]["description"].strip(), "\n\n## Paths\n"]
     for path, operations in found["paths"].items():
-        shown = operations["get"]
-        parts.append(f"\n### GET {path}\n\n{shown['summary']}.\n")
+        ((method, shown),) = operations.items()
+        parts.append(f"\n### {method.upper()} {path}\n\n{shown['summary']}.\n")
         if shown.get("parameters"):
             parts.append("\n| parameter | type | meaning |\n|---|---|---|\n")
             for one in shown["parameters"]:
                 means = f"{kind(one['schema'])} | {cell(one.get('description', ''))}"
                 parts.append(f"| `{one['name']}` | {means} |\n")
+        if "requestBody" in shown:
+            body = shown["requestBody"]
+            ((media, content),) = body["content"].items()
+            parts.append(f"\nBody `{media}`: {kind(content['schema'])} ({body['description']}).\n")
         answers = [
             f"{status}: " + ", ".join(
                 f"`{media}`" + (f" {kind(body['schema'])}" if body.get("schema") else "")
@@ -85,7 +89,7 @@ def page(found: Json) -> str:
             for status, answer in shown["responses"].items()
         ]  # fmt: skip
         parts.append("\nAnswers " + "; ".join(answers) + ".\n")
-    parts.append("\n## Answers\n")
+    parts.append("\n## Answers and bodies\n")
     for name, schema in sorted(found["components"]["schemas"].items()):
         parts.append(f"\n### {name}\n\n{cell(schema.get('description', ''))}\n")
         if schema.get("properties"):

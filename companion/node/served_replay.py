@@ -40,7 +40,7 @@ from companion.server import area_map
 from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
-from companion.values import Event, Frame, Notice, Rejection, Update, printable
+from companion.values import Event, Frame, Notice, Observation, Rejection, Update, printable
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
@@ -266,6 +266,16 @@ class ServedReplay:
     def message_rates(self) -> list[MessageRate]:
         """Return nothing: a replay sends no requests."""
         return []
+
+    def observations(self) -> None:
+        """Return None: the observations of a replay are in its log."""
+
+    def may_observe(self) -> bool:
+        """Return False: a replay takes no observations."""
+        return False
+
+    def observe(self, found: Observation | str) -> None:
+        """Do nothing: a replay takes no observations."""
 
     def notify(self, notice: Notice) -> None:
         """Publish a notice of the server, which is not part of the log."""

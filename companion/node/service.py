@@ -23,6 +23,7 @@ from companion.node.drive.running import run_in_thread
 from companion.node.drive.sources import BeamRequest, LocalSource, stored_registers
 from companion.node.fleet.live import LiveFleetNode
 from companion.node.gateway import Gateway
+from companion.node.observations import ObservationIntake
 from companion.node.outlet import Outlet
 from companion.node.push import Push
 from companion.node.serving import NOTICES_KEPT, RateMeter, Server, in_daemon_thread
@@ -45,6 +46,7 @@ from companion.values import (
     Event,
     Frame,
     Notice,
+    Observation,
     Output,
     Severity,
     Tick,
@@ -56,7 +58,7 @@ from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
 from companion.views.served import FleetStatus
-from companion.views.state import RecordingStatus, overload
+from companion.views.state import ObservationCounts, RecordingStatus, overload
 
 HELD_UP_S: Final = 0.02  # lateness of a tick from which links are read before it
 READ_FIRST_S: Final = 0.1  # longest time for that
@@ -127,7 +129,15 @@ class Service:
             notify=self.notify,
             now_ns=now_ns,
         )
+        self._intake = ObservationIntake(
+            settings=settings.observations,
+            step=self._step,
+            notify=self.notify,
+            now_ns=now_ns,
+            utc_offset_ns=lambda: self.pipeline.utc_offset_ns,
+        )
         self._traffic.open()
+        self._intake.open()
         self._outlet.open()
         self._push.open()
         if self.fleet is not None:
@@ -155,6 +165,7 @@ class Service:
             async with asyncio.TaskGroup() as group:
                 tasks = [group.create_task(self._tick(), name="ticks")]
                 tasks.append(group.create_task(self._traffic.run(), name="links"))
+                tasks.append(group.create_task(self._intake.run(), name="observations"))
                 tasks.append(group.create_task(self._outlet.run(), name="out"))
                 tasks.append(group.create_task(self._push.run(), name="records"))
                 tasks.append(group.create_task(self._run_drive(), name="drive"))
@@ -405,6 +416,18 @@ class Service:
     def message_rates(self) -> list[MessageRate]:
         """Return the requested message rates and their state."""
         return self._traffic.rates()
+
+    def observations(self) -> ObservationCounts:
+        """Return the counts of observations since the start."""
+        return self._intake.counts
+
+    def may_observe(self) -> bool:
+        """Spend the budget of one observation; False if none is left."""
+        return self._intake.has_room()
+
+    def observe(self, found: Observation | str) -> None:
+        """Process an observation, or count one that is invalid for the given reason."""
+        self._intake.take(found)
 
     def rates(self) -> dict[str, float | None]:
         """Return frames and updates per second over the last seconds."""

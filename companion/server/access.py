@@ -10,6 +10,7 @@ import socket
 import sys
 from collections.abc import Collection
 from typing import Final
+from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
@@ -150,6 +151,18 @@ def _is_address(name: str) -> bool:
     except ValueError:
         return False
     return True
+
+
+def is_same_site(origin: str | None, host: str | None) -> bool:
+    """Return whether a request comes from this site's own page, or from no page.
+
+    Browsers let any page open a WebSocket to any address, and send simple requests to it. They send
+    the page's site in ``Origin``.
+    """
+    try:
+        return origin is None or urlsplit(origin).netloc == host
+    except ValueError:  # malformed
+        return False
 
 
 class WrongTokens:

@@ -1,4 +1,4 @@
-"""The HTTP API and the dashboard's files for a running node; read-only."""
+"""The HTTP API and the dashboard's files; read-only, except for ``observation_routes``."""
 
 import asyncio
 from pathlib import Path
@@ -15,6 +15,7 @@ from companion.server.access import OPEN_PATHS, BearerToken, KnownHosts, WrongTo
 from companion.server.giving_way import GivingWay
 from companion.server.large_answers import FEW_ITEMS, LargeAnswers, Make
 from companion.server.metrics import NodeMetrics
+from companion.server.observation_routes import add_observations
 from companion.server.page import PageFiles, web_directory
 from companion.server.responses import (
     BodyResponse,
@@ -42,7 +43,7 @@ DRAWN_POLICY: Final = CONTENT_POLICY + b"; style-src 'self' 'unsafe-inline'; img
 """Content security policy of ``/docs``: Swagger UI uses embedded images and inline styles."""
 Rounded = beam_routes.Rounded
 UavId = Annotated[str, PathParameter(description=UAV_FORMS)]
-DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only.
+DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only, except observations.
 
 Angles in degrees, distances in metres; null means unknown, never 0. Estimates are computed for
 the time of the request, given as `valid_at`, so answers have no ETag. Errors are
@@ -85,8 +86,8 @@ def create_app(
     _state_routes(app, node, large)
     beam_routes.add(app, node, work_slots)
     file_routes.add(app, node, large)
+    add_observations(app, node)
     area_map.add(app, area)
-
     described = list["asyncio.Task[bytes]"]()
 
     @app.get("/openapi.json", include_in_schema=False)

@@ -18,7 +18,7 @@ from companion.values.budget import Budget
 HEAD_BYTES: Final = 16_384
 """Limit on the bytes of a request line and headers; browsers send one or two thousand."""
 HEADERS_MOST: Final = 100  # limit on a request's headers; each takes microseconds
-BODY_BYTES: Final = 65_536  # limit on a request's body; no route uses one
+BODY_BYTES: Final = 65_536  # limit on a request's body; /v1/observations has one
 HEAD_S: Final = 10.0
 """Time limit for a complete head, from connecting or from the last answer, seconds."""
 STALL_TIMEOUT_S: Final = 10.0  # time limit for a client that takes nothing of an answer

@@ -27,7 +27,7 @@ from companion.server.stream import Stream
 from companion.values import BeamSet, Level, Track, Verdict
 from companion.values.described import meaning
 from companion.views.health import shown_verdicts
-from companion.views.state import Node, RecordingStatus, overload
+from companion.views.state import Node, ObservationCounts, RecordingStatus, overload
 from companion.views.uav_state import Overview
 
 LINK_COUNTS: Final = (
@@ -114,6 +114,18 @@ class NodeMetrics:
             buckets=node.lateness.buckets(),
             sum_value=node.lateness.sum_s,
         )
+        counts = self._node.observations()
+        for name, suffix in (
+            ("received", ""),
+            ("malformed", "_malformed"),
+            ("dropped", "_dropped"),
+        ):
+            if counts is not None:
+                yield CounterMetricFamily(
+                    f"companion_observations{suffix}",
+                    _help(ObservationCounts, name),
+                    value=getattr(counts, name),
+                )
         yield GaugeMetricFamily(
             "companion_stream_clients", "Clients of /v1/stream", value=self._stream.clients
         )

@@ -20,17 +20,21 @@ from starlette.types import Receive, Scope, Send
 from companion.server import models
 from companion.server.compression import LEAST_BYTES, SharedCompression, is_text, preferred
 from companion.server.giving_way import GivingWay
+from companion.server.observation_model import ObservationInput
 from companion.views.as_json import Json
 
 PIECE_BYTES: Final = 65_536  # bytes of a body that are sent in one iteration of the event loop
 PROBLEM_TYPE: Final = "application/problem+json"
 _MEANINGS: Final = {
+    403: "Not accepted from this client, or by the settings; the title says why",
     404: "Not found",
     406: "No supported media type is accepted",
     409: "Not possible in the current state; the title says why",
+    413: "The request is too long",
+    415: "The body is not application/json",
     416: "The range begins beyond the end of the file",
     503: "Too many requests at once",
-    422: "A parameter is missing or invalid",
+    422: "A parameter, or the body, is missing or invalid",
 }
 
 
@@ -164,6 +168,8 @@ def _document(app: FastAPI) -> dict[str, Any]:
                     schema = content.get("application/json", {}).get("schema", {})
                     if schema.get("$ref", "").endswith("/Problem"):
                         shown["content"] = {PROBLEM_TYPE: content["application/json"]}
-        models.describe_enumerations(made["components"]["schemas"])
+        schemas = made["components"]["schemas"]
+        schemas[ObservationInput.__name__] = ObservationInput.model_json_schema()
+        models.describe_enumerations(schemas)
         app.openapi_schema = made
     return app.openapi_schema

@@ -25,14 +25,13 @@ from collections.abc import Coroutine
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, Final, TypeVar
-from urllib.parse import urlsplit
 
 from starlette.datastructures import QueryParams
 from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from companion.server import topics
-from companion.server.access import SUBPROTOCOL
+from companion.server.access import SUBPROTOCOL, is_same_site
 from companion.server.large_answers import LargeAnswers
 from companion.server.shared_work import seen
 from companion.server.topics import Body, Topic
@@ -131,7 +130,8 @@ class Stream:
         """Serve one client until it disconnects or violates the protocol."""
         offered = websocket.scope.get("subprotocols", [])
         await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
-        if not _is_from_here(websocket):
+        headers = websocket.headers
+        if not is_same_site(headers.get("origin"), headers.get("host")):
             await websocket.close(ELSEWHERE, "pages of other sites may not connect")
             return
         if self.clients >= CLIENTS_MAX and not self._makes_room(websocket):
@@ -255,18 +255,6 @@ def _connection(websocket: WebSocket) -> BoundedWebSocket | None:
 
 def _host(websocket: WebSocket) -> str | None:
     return websocket.client.host if websocket.client else None
-
-
-def _is_from_here(websocket: WebSocket) -> bool:
-    """Return whether the WebSocket was opened by this site's own page, or by no page.
-
-    Browsers let any page open a WebSocket to any address, and send the page's site in Origin.
-    """
-    origin = websocket.headers.get("origin")
-    try:
-        return origin is None or urlsplit(origin).netloc == websocket.headers.get("host")
-    except ValueError:  # malformed
-        return False
 
 
 def _short(reason: str) -> str:

@@ -4,6 +4,7 @@ Names in the API follow by rule from those inside the program (``companion.value
 """
 
 import functools
+import re
 import typing
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
@@ -12,7 +13,7 @@ from typing import Any, Final, Literal
 
 import numpy as np
 
-from companion.values import UtcNs
+from companion.values import UtcNs, shown
 from companion.values.described import (
     Member,
     in_degrees,
@@ -49,6 +50,10 @@ def as_json(item: Any, utc_ns: Utc) -> Json:
     return shown
 
 
+_EPOCH: Final = datetime(1970, 1, 1, tzinfo=UTC)
+_RFC3339: Final = re.compile(
+    r"([0-9]{4}-[0-9]{2}-[0-9]{2}T[0-9]{2}:[0-9]{2}:[0-9]{2})(?:\.([0-9]{1,9}))?(?:Z|\+00:00)"
+)
 COORDINATE_DIGITS: Final = 7  # decimals of a rounded latitude or longitude, about a centimetre
 DIGITS: Final = 3  # decimals of any other rounded number
 
@@ -82,6 +87,19 @@ def rfc3339(t_ns: UtcNs) -> str:
 def _to_the_second(seconds: int) -> str:
     """Return date and time to the second; cached, as answers have many times within seconds."""
     return f"{datetime.fromtimestamp(seconds, UTC):%Y-%m-%dT%H:%M:%S}"
+
+
+def parse_rfc3339(text: str) -> UtcNs:
+    """Parse a time in UTC, with up to nine decimals of a second. Raises ``ValueError``."""
+    found = _RFC3339.fullmatch(text)
+    if found is None:
+        raise ValueError(f"{shown(text)} is not a time in UTC, such as 2026-11-20T13:00:00.123Z")
+    try:
+        whole = datetime.fromisoformat(f"{found[1]}+00:00") - _EPOCH
+    except ValueError as error:  # such as month 13
+        raise ValueError(f"{shown(text)} is not a time: {error}") from error
+    seconds = whole.days * 86_400 + whole.seconds
+    return UtcNs(seconds * 1_000_000_000 + int((found[2] or "0").ljust(9, "0")))
 
 
 def degrees(angle_rad: float | None) -> float | None:

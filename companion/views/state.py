@@ -10,7 +10,7 @@ from companion.mavlink.voice.rate_watch import MessageRate
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.settings.origins import Origins
-from companion.values import Blame, Notice
+from companion.values import Blame, Notice, Observation
 from companion.values.described import Meaning
 from companion.views import center_state, health, link_state
 from companion.views.as_json import Json, as_json
@@ -54,6 +54,17 @@ class ReplayStatus:
     ]
 
 
+@dataclass(slots=True, kw_only=True)
+class ObservationCounts:
+    """Observations of the array's own receiver since the start, over UDP and HTTP."""
+
+    received: Annotated[int, Meaning("valid observations received")] = 0
+    malformed: Annotated[int, Meaning("malformed observations received")] = 0
+    dropped: Annotated[
+        int, Meaning("observations dropped, because more arrived than are processed")
+    ] = 0
+
+
 @dataclass(frozen=True, slots=True)
 class Throughput:
     """Rates of frames and updates over the last seconds."""
@@ -83,6 +94,10 @@ class Status:
     arrival_lag: Annotated[
         LagSeen, Meaning("time from the arrival of frames at this computer until they were read")
     ]
+    observations: Annotated[
+        ObservationCounts | None,
+        Meaning("observations of the array's own receiver; null in a replay"),
+    ]
     rates: Annotated[Throughput, Meaning("rates over the last seconds")]
     frames: Annotated[int, Meaning("MAVLink frames processed since the start")]
     updates: Annotated[int, Meaning("beam updates so far")]
@@ -97,7 +112,9 @@ class Status:
 class Node(Protocol):
     """Interface that the server reads: the running service, a replay, or a test double.
 
-    ``replay`` returns None in a live service, ``fleet_status`` without a fleet.
+    ``replay`` returns None in a live service, ``fleet_status`` without a fleet. ``may_observe``
+    spends the budget of one observation, and returns False if none is left. ``observe`` then
+    processes a valid observation, or counts one that is invalid for the given reason.
     """
 
     pipeline: Pipeline
@@ -116,6 +133,9 @@ class Node(Protocol):
     def rates(self) -> Mapping[str, float | None]: ...
     def unfit(self) -> list[str]: ...
     def message_rates(self) -> list[MessageRate]: ...
+    def observations(self) -> ObservationCounts | None: ...
+    def may_observe(self) -> bool: ...
+    def observe(self, found: Observation | str) -> None: ...
     def events(self) -> list[Notice]: ...
     def notify(self, notice: Notice) -> None: ...
     def replay(self) -> ReplayStatus | None: ...
@@ -168,6 +188,7 @@ def status(node: Node, version: str) -> Json:
         links=[link_state.link(one, senders.link_share(one.url), now_ns) for one in node.links()],
         recording=node.recording(),
         arrival_lag=node.arrival_lag.seen(now_ns),
+        observations=node.observations(),
         rates=Throughput(**node.rates()),
         frames=pipeline.frames,
         updates=pipeline.updates,

@@ -18,12 +18,12 @@ from companion.server.access import bind
 from companion.server.app import create_app
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
-from companion.values import Frame, Notice, Severity, Source, Tick
+from companion.values import Frame, Notice, Observation, Severity, Source, Tick
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
 from companion.views.served import FleetStatus
-from companion.views.state import RecordingStatus, ReplayStatus
+from companion.views.state import ObservationCounts, RecordingStatus, ReplayStatus
 
 LOG = Path(__file__).parents[1] / "data" / "sitl_4circle_cut.tlog"
 FLOWN_S = 6.0
@@ -44,6 +44,9 @@ class StandIn:
         self.current = RecordingStatus(state="off", file=None, bytes=0, messages=0, dropped=0)
         self.replayed: ReplayStatus | None = None
         self.fleet: FleetStatus | None = None
+        self.counts = ObservationCounts(received=3, malformed=2, dropped=1)
+        self.budget = 1_000_000
+        self.observed: list[Observation | str] = []
         self._ticked = asyncio.Event()
         self._now_ns = 1_800_000_000_000_000_000
         if flown:
@@ -153,6 +156,21 @@ class StandIn:
     def events(self) -> list[Notice]:
         """Return the published notices."""
         return list(self.notices)
+
+    def observations(self) -> ObservationCounts:
+        """Return the counts that the test set."""
+        return self.counts
+
+    def may_observe(self) -> bool:
+        """Return whether the budget that the test set is left."""
+        self.budget -= 1
+        return self.budget >= 0
+
+    def observe(self, found: Observation | str) -> None:
+        """Keep what was passed on."""
+        self.observed.append(found)
+        if isinstance(found, Observation):
+            self.pipeline.step(found)
 
     def fleet_status(self) -> FleetStatus | None:
         """Return the fleet status set by the test."""

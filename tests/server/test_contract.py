@@ -18,7 +18,7 @@ from support import examples
 from companion.server.app import create_app
 from companion.server.responses import PROBLEM_TYPE
 
-OPERATIONS = 24
+OPERATIONS = 26
 WITH_RULES = {"/v1/beams", "/v1/beams/weights", "/v1/pattern"}
 EXAMPLES = 12
 EXAMPLES_SOAK = 1500

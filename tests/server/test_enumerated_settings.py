@@ -89,7 +89,7 @@ def check_every_answer(client: TestClient) -> int:
     document, checked = strict(client.get("/openapi.json").json()), 0
     for path, operations in document["paths"].items():
         asked = PATHS.get(path, path)
-        if asked is None:
+        if asked is None or "get" not in operations:
             continue
         answer = client.get(asked)
         content = operations["get"]["responses"][str(answer.status_code)]["content"]

@@ -18,6 +18,7 @@ from companion.beams.hardware import codebooks, phaser_pickles
 from companion.mavlink.links import http_poll, tcp, to_loop, transport, udp, zenoh_config
 from companion.mavlink.trust import known_peers, newcomers
 from companion.mavlink.wire import aircraft_json, cot_link, rid_json, sbs
+from companion.node import observations
 from companion.node.drive import gimbal, rotctld
 from companion.node.fleet import messages
 from companion.recording import background
@@ -25,6 +26,7 @@ from companion.recording.foreign import thinned
 from companion.server import (
     access,
     connections,
+    observation_routes,
     playback,
     request_queue,
     stream,
@@ -32,6 +34,7 @@ from companion.server import (
     work_slots,
 )
 from companion.settings import files
+from companion.views import observation_records
 
 PAGE: Final = Path(__file__).resolve().parent / "security.md"
 BEGIN, END = "<!-- ways in: written by docs/make_security.py -->", "<!-- end of ways in -->"
@@ -70,6 +73,10 @@ LOOP: Final = (
     f"{request_queue.AT_ONCE} started in an iteration; less than 2 ms each on the event loop"
 )
 SLOTS: Final = f"{work_slots.AT_ONCE} at a time on threads, {work_slots.WAITING} waiting"
+BUDGET: Final = (
+    f"{observations.OBSERVATIONS_PER_S:.0f} observations/s,"
+    f" {observations.OBSERVATIONS_SAVED:.0f} at once"
+)
 SIEGE: Final = "tests/live/test_siege.py::test_attack_costs_no_beam_and_no_bound"
 LISTEN: Final = "tests/mavlink/links/test_listen_only.py"
 HOSTILE: Final = "tests/server/test_connection_budgets.py"
@@ -158,6 +165,24 @@ WAYS: Final = (
         work=SLOTS,
         over="503, before any work",
         test="tests/server/test_hostile_clients.py::test_excess_work_is_rejected_with_503",
+    ),
+    WayIn(
+        name="observations over HTTP",
+        covers=("route:/v1/observations",),
+        size=f"{kb(connections.BODY_BYTES)} of body",
+        items=f"{observation_routes.OBSERVATIONS_MAX} observations in a request; {BUDGET}",
+        work=f"slices of {1e3 * observation_routes.SLICE_S:.0f} ms on the event loop",
+        over="413; dropped before validation, counted (`too-frequent`), 503",
+        test="tests/server/test_observations.py::test_observations_beyond_the_budget_are_dropped",
+    ),
+    WayIn(
+        name="observations over UDP",
+        covers=("observations",),
+        size=f"{kb(udp.RECEIVE_BUFFER_BYTES)} in the kernel, at most {udp.STALE_NS / 1e9:.0f} s old; {observation_records.LARGEST_RECORD} bytes a record",
+        items=f"{BUDGET}, over UDP and HTTP together",
+        work=f"{udp.READ_AT_ONCE} datagrams, or {1e3 * to_loop.SLICE_S:.0f} ms, in an iteration",
+        over="dropped before decoding, counted (`too-frequent`, `socket-overflow`)",
+        test="tests/node/test_observations.py::test_flood_is_limited_by_the_budget_and_counted",
     ),
     WayIn(
         name="files over HTTP",

@@ -3,6 +3,7 @@
 import contextlib
 import itertools
 import json
+import math
 import socket
 import socketserver
 import struct
@@ -12,12 +13,13 @@ from collections.abc import Iterator
 from contextlib import closing
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from support import HANG_S, Node, end
 
-from companion.client import Client, ServiceError
+from companion.client import Client, Measurement, ServiceError
 from companion.values import UserError
 from companion.views.records import HEADER
 
@@ -42,11 +44,13 @@ def flying(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
 
 
 @pytest.fixture(scope="module")
-def guarded() -> Iterator[Node]:
-    """Run a demo that requires a token."""
+def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Node]:
+    """Run a service that requires a token and takes observations."""
+    settings = tmp_path_factory.mktemp("guarded") / "settings.toml"
+    settings.write_text("[observations]\nenabled = true\n")
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("COMPANION_TOKEN", TOKEN)
-        node = Node(*RUN)
+        node = Node(*RUN, "--config", str(settings))
     yield node
     end(node.process)
 
@@ -135,6 +139,50 @@ def test_correct_token_is_accepted(guarded: Node) -> None:
     assert client.status()["version"]
     with closing(client.stream(topics=["status"])) as stream:
         assert next(stream)["topic"] == "status"
+
+
+DIRECTION: Measurement = {
+    "uav": "3:1", "age_s": 0.01, "azimuth_deg": 12.5, "elevation_deg": -3.0, "bound_deg": 2.0,
+}  # fmt: skip
+
+
+def test_observations_are_given_to_the_service(guarded: Node) -> None:
+    """One or many, with numbers and arrays of numpy; errors are returned, or raised if all fail."""
+    client = Client(guarded.url, TOKEN)
+    before = client.status()["observations"]
+    assert client.observe(DIRECTION) == {"accepted": 1, "dropped": 0, "errors": []}
+    powers: Measurement = {
+        "uav": "3:1",
+        "measured_at": "2026-11-20T13:00:00.123Z",
+        "beams": np.arange(3),
+        "powers_db": np.linspace(-70, -60, 3),
+        "power_bound_db": np.float64(1.5),
+    }
+    wrong: Measurement = {**DIRECTION, "uav": "x"}
+    found = client.observe([DIRECTION, wrong, powers])
+    assert (found["accepted"], [error["item"] for error in found["errors"]]) == (2, [1])
+    after = client.status()["observations"]
+    assert {key: after[key] - before[key] for key in after} == {
+        "received": 3, "malformed": 1, "dropped": 0,
+    }  # fmt: skip
+    with pytest.raises(ServiceError, match="422: item 0: uav: 'x' is not") as raised:
+        client.observe(wrong)
+    assert raised.value.status == 422
+    with pytest.raises(ServiceError, match="413: 401 observations; send at most 400"):
+        client.observe([DIRECTION] * 401)
+    with pytest.raises(ServiceError, match="401: a bearer token is needed"):
+        Client(guarded.url).observe(DIRECTION)
+
+
+@pytest.mark.parametrize("azimuth_deg", [math.nan, object()], ids=["NaN", "no number"])
+def test_observation_that_is_not_json_is_not_sent(azimuth_deg: Any) -> None:
+    with pytest.raises(UserError, match="observation: "):
+        Client("http://127.0.0.1:9").observe({**DIRECTION, "azimuth_deg": azimuth_deg})
+
+
+def test_service_without_observations_says_what_to_do(flying: Node) -> None:
+    with pytest.raises(ServiceError, match=r"403: .*set `\[observations\] enabled = true`"):
+        Client(flying.url).observe(DIRECTION)
 
 
 def test_unreachable_service_raises_service_error() -> None:

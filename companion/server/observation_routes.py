@@ -61,7 +61,8 @@ def add_observations(app: FastAPI, node: Node) -> None:
                 "model": models.model(ObservationsAccepted),
                 "description": "At least one observation was accepted",
             },
-            **refusals(403, 409, 413, 415, 422, 503),
+            **refusals(403, 409, 413),
+            **refusals(415, 422, 503),
         },
         openapi_extra={"requestBody": BODY},
     )

@@ -3,6 +3,7 @@
 import asyncio
 import json
 import math
+from fractions import Fraction
 from typing import Any, get_type_hints
 
 import pytest
@@ -21,9 +22,9 @@ from companion.server.connections import BODY_BYTES
 from companion.server.observation_model import ObservationInput, ObservationsAccepted
 from companion.server.observation_routes import OBSERVATIONS_MAX, PATH
 from companion.server.responses import PROBLEM_TYPE
-from companion.values import Observation, reason_invalid
+from companion.values import Observation, UtcNs, reason_invalid
 from companion.values.described import members
-from companion.views.as_json import name_in_json
+from companion.views.as_json import name_in_json, parse_rfc3339, rfc3339
 
 DIRECTION: dict[str, Any] = {
     "uav": "1:1",
@@ -92,6 +93,14 @@ def test_time_is_converted_from_utc(client: TestClient, node: Any) -> None:
         power_bound_db=1.5,
         update=7,
     )
+
+
+@given(st.integers(0, 4_000_000_000), st.text("0123456789", max_size=9))
+def test_times_are_read_to_the_nanosecond(seconds: int, digits: str) -> None:
+    whole = rfc3339(UtcNs(seconds * 1_000_000_000)).removesuffix(".000Z")
+    fraction_ns = int(Fraction(f"0.{digits or 0}") * 1_000_000_000)
+    text = f"{whole}.{digits}Z" if digits else f"{whole}+00:00"
+    assert parse_rfc3339(text) == seconds * 1_000_000_000 + fraction_ns
 
 
 def test_invalid_items_of_a_list_are_named(client: TestClient, node: Any) -> None:

@@ -155,8 +155,23 @@ class ArrayCompass:
 
     # --- looks ------------------------------------------------------------------------------
 
-    def look(self, uav: str, body_from_local: FloatArray) -> Look | None:
-        """Return a snapshot of what was seen of a UAV, at an attitude; None without any."""
+    def error_at(self, carrier: Carrier) -> Misalignment:
+        """Return the error of the reported attitude at the time of a pose."""
+        if self.error is None or self._updated is None:
+            return Misalignment(np.eye(3), self.bound_rad)
+        updated_ns, before = self._updated
+        drifted = self._drift_radps * abs(carrier.valid_at_ns - updated_ns) * 1e-9
+        turned = compass.rotation_angle_rad(before @ carrier.body_from_local.T)
+        grown = self.error.bound_rad + drifted + turned * self.largest_rad
+        if grown >= self.bound_rad:
+            return Misalignment(np.eye(3), self.bound_rad)
+        return Misalignment(self.error.center, grown)
+
+    def look(self, uav: str, carrier: Carrier) -> Look | None:
+        """Return a snapshot of what was seen of a UAV; ``carrier`` is the reported pose.
+
+        None without any.
+        """
         record = self._uavs.get(uav)
         if record is None or (record.sightings is None and not record.pending):
             return None
@@ -164,19 +179,18 @@ class ArrayCompass:
             sightings=record.sightings,
             pending=record.pending,
             is_refuted=record.is_refuted,
-            error=self.error or Misalignment(np.eye(3), self.bound_rad),
+            error=self.error_at(carrier),
             bound_rad=self.largest_rad,
-            likely=self._uavs.likely.vector_rad(body_from_local),
+            likely=self._uavs.likely.vector_rad(carrier.body_from_local),
         )
 
     def corrected(self, carrier: Carrier) -> Carrier:
         """Return the reported pose of the array with its error corrected, as far as it is known."""
-        error = self.error
-        if error is None:
+        if self.error is None:
             return carrier
+        error = self.error_at(carrier)
         bound_rad = min(error.bound_rad + carrier.extrapolation_rad, math.pi)
-        raised = self._raised_rad > 0.0
-        if bound_rad >= carrier.attitude_bound_rad and not raised:
+        if bound_rad == carrier.attitude_bound_rad:
             return carrier
         return replace(
             carrier,

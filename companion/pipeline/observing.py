@@ -117,8 +117,10 @@ class Observing:
 
     def update(self, now_ns: int) -> list[Output]:
         """Estimate the error of the carrier's attitude, and judge the UAVs' positions."""
+        if not self.uavs and self.compass.error is None:
+            return []
         found = self.reported(now_ns, now_ns)
-        if not self.uavs or isinstance(found, str):
+        if isinstance(found, str):
             return []
         bound_rad = found.carrier.attitude_bound_rad - found.carrier.extrapolation_rad
         said: list[Output] = []
@@ -192,8 +194,8 @@ class Observing:
         """
         if not self.uavs or isinstance(reported, str):
             return None
-        body_from_local = reported.carrier.body_from_local
-        looks = [self.compass.look(one.track.fix.uav, body_from_local) for one in snapshots]
+        carrier = reported.carrier
+        looks = [self.compass.look(one.track.fix.uav, carrier) for one in snapshots]
         times = {one.t_ns for look in looks if look is not None for one in look.pending}
         poses = {t_ns: self._pose(t_ns, nearest=False) for t_ns in (*times, valid_at_ns)}
         pose, follows = poses[valid_at_ns], self._settings.follow

@@ -143,7 +143,7 @@ class SightedUavs:
         self, record: SightedUav, one: Measured, pose: Pose, near: Relative, bound_rad: float
     ) -> bool:
         """Add a measurement to a UAV's sightings. Returns whether it agrees with them."""
-        cap = self._placed(one, pose, near, pose.extrapolation_rad)
+        cap = self._placed(one, pose, near, self.aged_rad(pose))
         before, latest = record.sightings, record.latest
         if before is None or latest is None:
             record.sightings, record.latest = Sightings.of(one.t_ns, cap), (near, pose)
@@ -172,6 +172,10 @@ class SightedUavs:
                 bound_rad=cap.radius_rad,
             )
         return True
+
+    def aged_rad(self, pose: Pose) -> float:
+        """Return the bound on what a reported attitude's age adds to its error."""
+        return pose.extrapolation_rad + self._drift_radps * abs(pose.age_s)
 
     def _placed(self, one: Measured, pose: Pose, near: Relative, extrapolation_rad: float) -> Cap:
         """Return a measurement as directions in the local frame."""
@@ -209,7 +213,7 @@ class SightedUavs:
             turned_rad = near.turned_rad((to_ns - before.t_ns) * 1e-9)
             motion = self._motion(near, before.t_ns, to_ns, look.bound_rad, turned_rad)
             moved = before.moved(to_ns, motion)
-            parts.append((moved.centers, moved.radii_rad + pose.extrapolation_rad))
+            parts.append((moved.centers, moved.radii_rad + self.aged_rad(pose)))
         for one in look.pending:
             at = pose_at(one.t_ns)
             if at is None:
@@ -225,7 +229,7 @@ class SightedUavs:
         radii = np.minimum(np.concatenate([part[1] for part in parts])[-WINDOW:], math.pi)
         within, likely, reported = None, None, near.reported
         if not is_alone:
-            spread = reported.radius_rad + look.error.bound_rad + pose.extrapolation_rad
+            spread = reported.radius_rad + look.error.bound_rad + self.aged_rad(pose)
             within = Cap(look.error.center @ reported.center, min(spread, math.pi))
             likely = rotation(look.likely) @ reported.center
         found = Sightings(to_ns, centers, radii).possible(self._outliers, within, likely)

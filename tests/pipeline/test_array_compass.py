@@ -1,5 +1,6 @@
 """Whatever errors reports and measurements have within their bounds, no bound is exceeded."""
 
+import math
 from collections import Counter
 from functools import partial
 
@@ -90,7 +91,10 @@ class Run:
         error = self.compass.error
         assert error is not None
         self.bounds.append(error.bound_rad)
-        off = rotation_angle_rad(error.center.T @ self.world.error)
+        made_ns, attitude, _ = self.world.attitudes[-1]
+        aged = math.radians(self.world.settings.drift_max_degps)
+        aged *= (self.world.t_ns - made_ns) * 1e-9
+        off = rotation_angle_rad(error.center.T @ self.world.error) - aged
         self.count["errors"] += 1
         self.count["errors beyond"] += off > error.bound_rad + 1e-9
 
@@ -99,7 +103,7 @@ class Run:
         pose = world.pose(now, nearest=False)
         assert pose is not None
         for name in world.uavs:
-            look = self.compass.look(name, pose.body_from_local)
+            look = self.compass.look(name, self.carrier())
             near = world.relative(name, now)
             if look is None or near is None:
                 continue

@@ -4,6 +4,7 @@ import click
 
 from companion.cli.learned import train
 from companion.cli.study_beams import beams
+from companion.cli.study_compass import compass
 from companion.cli.study_deepsense import deepsense
 from companion.cli.study_fleet import fleet
 from companion.cli.study_link import link
@@ -19,5 +20,5 @@ def study() -> None:
     """
 
 
-for command in (prediction, beams, link, paper, dt, deepsense, fleet, train):
+for command in (prediction, beams, compass, link, paper, dt, deepsense, fleet, train):
     study.add_command(command)

@@ -105,7 +105,7 @@ def deliver(
         for at, arrived in zip(sends.frame[rows].tolist(), arrival_ns.tolist(), strict=True)
         if at >= 0
     ]
-    trips += _known(flight) if link.known_delay else ()
+    trips += known_round_trips(flight) if link.known_delay else ()
     everything = sorted([*events, *trips], key=lambda event: event.t_ns)
     return Delivery(
         observed=observed,
@@ -192,7 +192,7 @@ def _thinned_each(sends: _Sends, rows: IntArray, rate_hz: float) -> IntArray:
     return kept
 
 
-def _known(flight: Flight) -> tuple[RoundTrip, ...]:
+def known_round_trips(flight: Flight) -> tuple[RoundTrip, ...]:
     """Return the round trips that the service would have measured over the log's own link."""
     found: list[RoundTrip] = []
     source = Source.parse(flight.uav)

@@ -5,6 +5,7 @@ attitude. Only then is a whole pointing bound tested: both positions and the att
 SIM_STATE of the carrier, its predicted pose counts as true; study reports state this.
 """
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -64,12 +65,31 @@ class ArrayTruth:
     def _carrier(self, predicted: Carrier, at_ns: Times) -> Carrier:
         if self.carrier is None:
             return predicted
-        position = self.carrier.flight.truth.at(at_ns)[0][0]
-        spline = self.carrier.ned_from_body
-        at_s = np.clip((at_ns[0] - self.carrier.from_ns) * 1e-9, spline.times[0], spline.times[-1])
+        position, body_from_local = self._pose(self.carrier, at_ns)
+        return replace(predicted, position_ned_m=position, body_from_local=body_from_local)
+
+    def _pose(self, carrier: CarrierTruth, at_ns: Times) -> tuple[FloatArray, FloatArray]:
+        """Return the carrier's true position (3,) and body_from_local (3, 3)."""
+        position = carrier.flight.truth.at(at_ns)[0][0]
+        spline = carrier.ned_from_body
+        at_s = np.clip((at_ns[0] - carrier.from_ns) * 1e-9, spline.times[0], spline.times[-1])
         (lat_deg,), (lon_deg,), _ = self.local.geodetic(position[np.newaxis])
         local_from_body = self.local.local_from_ned(lat_deg, lon_deg) @ spline(at_s).as_matrix()
-        return replace(predicted, position_ned_m=position, body_from_local=local_from_body.T)
+        return position, local_from_body.T
+
+    def direction(self, uav: str, at_ns: int, array: Array) -> FloatArray | None:
+        """Return a UAV's true unit direction (3,), array frame; None if it is unknown."""
+        flight = self.flights.get(uav)
+        if flight is None or self.carrier is None:
+            return None
+        at = np.array([at_ns])
+        position, body_from_local = self._pose(self.carrier, at)
+        lever_m = body_from_local.T @ array.lever_arm_m
+        offset_m = flight.truth.at(at)[0][0] - position - lever_m
+        if np.isnan(offset_m).any():
+            return None
+        towards: FloatArray = array.array_from_body @ body_from_local @ offset_m
+        return towards / math.sqrt(towards @ towards)
 
 
 def known_directions(

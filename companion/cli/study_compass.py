@@ -1,0 +1,62 @@
+"""The command ``companion study compass``: what the array's measurements say of the attitude."""
+
+from pathlib import Path
+
+import click
+
+from companion.cli.console import CENTER, CONFIG, LOGS, SEED, Progress, print_truncated
+from companion.cli.study_output import Studied, study_output
+
+
+@click.command()
+@LOGS
+@CONFIG
+@CENTER
+@click.option(
+    "--seconds", type=float, default=60.0, help="Seconds of each flight that are studied."
+)
+@click.option(
+    "--jobs", type=click.IntRange(1, 64), default=1, help="Number of cases that run in parallel."
+)
+@SEED
+@study_output("compass")
+def compass(
+    *,
+    logs: tuple[Path, ...],
+    config: Path | None,
+    center: str | None,
+    seconds: float,
+    jobs: int,
+    seed: int,
+    progress: Progress,
+) -> Studied:
+    """Measure what an array's receiver tells about the carrier's attitude.
+
+    A model of the receiver measures UAVs of a flight within a bound, for several receivers, errors
+    of the mount and numbers of UAVs. Compares beams with these measurements, beams without, a
+    Kalman filter and the truth. Needs SIM_STATE of the carrier and of UAVs. Writes
+    DIR/compass.json, DIR/compass.html and the figures as PNG and SVG. Takes minutes.
+
+    Example: companion study compass flight.tlog --center 5:1 --out report
+    """
+    from companion.node.replay import settings_for
+    from companion.recording.reader import flights
+    from companion.studies.compass import report, study
+
+    print_truncated(logs)
+    flown = tuple(flights(logs))
+    asked = study.CompassStudy(
+        flights=flown,
+        settings=tuple(settings_for(each, config, center) for each in flown),
+        seconds=seconds,
+        seed=seed,
+        jobs=jobs,
+        center=center,
+        config=str(config) if config else None,
+    )
+    answer = study.study(asked, progress.show)
+    return Studied(
+        answer=answer,
+        report=lambda: report.files(answer, progress.show),
+        text=lambda: study.text(answer),
+    )

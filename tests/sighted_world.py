@@ -11,8 +11,9 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from companion.settings.observations import ObservationSettings
-from companion.tracking.carrier import Pose, later_body_from_body
+from companion.tracking.carrier import later_body_from_body
 from companion.tracking.compass import rotation
+from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.relative import Relative, ReportedVelocity
 from companion.values import Cap, FloatArray, Vector, angle_rad
 
@@ -63,7 +64,11 @@ class Body:
     def report(self, t_ns: int) -> None:
         velocity = self.velocity_mps + self.bias
         self.reported = ReportedVelocity(
-            t_ns, tuple(velocity.tolist()), self.noise_mps, self.acceleration_max_mps2, 0.0
+            t_ns=t_ns,
+            velocity_ned_mps=vector(velocity),
+            noise_mps=self.noise_mps,
+            acceleration_max_mps2=self.acceleration_max_mps2,
+            time_bound_s=0.0,
         )
 
 
@@ -130,7 +135,7 @@ class World:
         rates = rotation(self.mount_error).T @ self.rates_radps
         self.attitudes = [*self.attitudes[-1:], (self.t_ns, reported, rates)]
 
-    def pose(self, t_ns: int, *, nearest: bool) -> Pose | None:
+    def pose(self, t_ns: int, *, nearest: bool) -> ExtrapolatedAttitude | None:
         """Return the attitude at a time, extrapolated from a report."""
         if not self.attitudes:
             return None
@@ -138,7 +143,7 @@ class World:
         if nearest:
             made_ns, attitude, rates = min(self.attitudes, key=lambda one: abs(one[0] - t_ns))
         age_s = (t_ns - made_ns) * 1e-9
-        return Pose(
+        return ExtrapolatedAttitude(
             body_from_local=later_body_from_body(rates, age_s) @ attitude,
             age_s=age_s,
             doubt_s=0.0,

@@ -1,4 +1,7 @@
-"""Computation of beams from tracks: which UAVs get a beam, its direction, and all weights."""
+"""Computation of beams from tracks: which UAVs get a beam, its direction, and all weights.
+
+Over 300 lines: the way from tracks to weights, in one direction.
+"""
 
 import math
 from collections.abc import Collection, Mapping, Sequence
@@ -55,17 +58,19 @@ MIN_AMPLITUDE: Final = 1e-3
 """Element amplitude below which there is no beam: 60 dB below an isotropic element."""
 
 
-class Sight(NamedTuple):
+class SeenDirection(NamedTuple):
     """Directions in which the array sees a UAV, array frame.
 
+    cap       those directions; None: it is elsewhere than it reports, so that nothing bounds the
+              error of its direction
     is_alone  whether its reported position is not used
     """
 
-    cap: Cap
+    cap: Cap | None
     is_alone: bool = False
 
 
-NO_SIGHTS: Final[Mapping[str, Sight]] = MappingProxyType({})
+NO_SIGHTS: Final[Mapping[str, SeenDirection]] = MappingProxyType({})
 
 
 def aim(
@@ -78,7 +83,7 @@ def aim(
     precoder: Precoder,
     coverage: Coverage = EVERYWHERE,
     before: Hysteresis | None = None,
-    sights: Mapping[str, Sight] = NO_SIGHTS,
+    sights: Mapping[str, SeenDirection] = NO_SIGHTS,
 ) -> BeamSet:
     """Compute one beam for every eligible track, with nulls on the others.
 
@@ -110,10 +115,10 @@ def aim(
         inside = [i for i, why in enumerate(hidden) if why is None]
         if inside:
             aimed = _Aimed(
-                [seen[i] for i in inside],
-                ranges_m[inside],
-                directions[inside],
-                [errors[i] for i in inside],
+                tracks=[seen[i] for i in inside],
+                ranges_m=ranges_m[inside],
+                directions=directions[inside],
+                errors=[errors[i] for i in inside],
             )
             beams, made, dropped = _beams(
                 aimed, carrier, array, precoder=precoder, before=before, valid_at_ns=valid_at_ns
@@ -260,19 +265,18 @@ def _by_sight(
     tracks: Sequence[Track],
     directions: FloatArray,
     errors: list[tuple[float | None, float]],
-    sights: Mapping[str, Sight],
+    sights: Mapping[str, SeenDirection],
 ) -> tuple[FloatArray, list[tuple[float | None, float]]]:
-    """Return directions and errors confined to those in which the array sees the UAVs.
-
-    A prediction and a sight that exclude each other leave the prediction.
-    """
+    """Return directions and errors confined to those in which the array sees the UAVs."""
     directions, errors = directions.copy(), list(errors)
     for i, track in enumerate(tracks):
         sight = sights.get(track.uav)
         if sight is None:
             continue
         bound, usual = errors[i]
-        if bound is None or sight.cap.radius_rad < bound or sight.is_alone:
+        if sight.cap is None:
+            errors[i] = None, usual
+        elif bound is None or sight.cap.radius_rad < bound or sight.is_alone:
             directions[i] = sight.cap.center
             likely = USUAL_SIGHT * sight.cap.radius_rad
             errors[i] = sight.cap.radius_rad, likely if sight.is_alone else min(usual, likely)

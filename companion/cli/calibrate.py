@@ -1,14 +1,37 @@
-"""The command ``companion calibrate``: compute a ``[hardware] calibration`` from measurements."""
+"""The command ``companion calibrate``: the channels of an array, or its mount."""
 
+import json
 from pathlib import Path
+from typing import Final
 
 import click
 
-from companion.cli.console import CONFIG
+from companion.cli.console import CENTER, CONFIG, JSON, LOGS, Progress, print_truncated
 from companion.values import UserError
 
+CHANNELS: Final = "channels"
 
-@click.command()
+
+class _Calibrations(click.Group):
+    """Group whose first command may be left out: ``calibrate FILE`` is ``calibrate channels``."""
+
+    def parse_args(self, ctx: click.Context, args: list[str]) -> list[str]:
+        if args and args[0] not in (*self.commands, "--help"):
+            args = [CHANNELS, *args]
+        return super().parse_args(ctx, args)
+
+
+@click.group(cls=_Calibrations)
+def calibrate() -> None:
+    """Compute a calibration: of an array's channels, or of its mount.
+
+    `companion calibrate MEASURED` is short for `companion calibrate channels MEASURED`.
+
+    Example: companion calibrate mount recordings/flight.mcap
+    """
+
+
+@calibrate.command(CHANNELS)
 @click.argument("measured", type=click.Path(path_type=Path, exists=True))
 @click.option(
     "--out",
@@ -17,7 +40,7 @@ from companion.values import UserError
     help="Calibration file to write.",
 )
 @CONFIG
-def calibrate(measured: Path, out: Path, config: Path | None) -> None:
+def channels(measured: Path, out: Path, config: Path | None) -> None:
     """Compute a calibration from measured responses, or convert a Phaser's calibration files.
 
     MEASURED is a CSV file of azimuth_deg,elevation_deg,channel,phase_deg,gain_db: the response of
@@ -25,7 +48,7 @@ def calibrate(measured: Path, out: Path, config: Path | None) -> None:
     the array and the element of each channel. MEASURED may also be the folder with a Phaser's
     phase_cal_val.pkl and gain_cal_val.pkl.
 
-    Example: companion calibrate responses.csv --config phaser.toml --out measured.csv
+    Example: companion calibrate channels responses.csv --config phaser.toml --out measured.csv
     """
     from companion.beams.hardware import measured as measuring
     from companion.beams.hardware import phaser_pickles
@@ -53,3 +76,29 @@ def calibrate(measured: Path, out: Path, config: Path | None) -> None:
         f" {fit.phase_deg:.2f} degrees and {fit.gain_db:.2f} dB, which reduces the guaranteed gain"
         f" of a matched beam by {fit.cost_db:.2f} dB"
     )
+
+
+@calibrate.command()
+@LOGS
+@CONFIG
+@CENTER
+@JSON
+def mount(
+    *, logs: tuple[Path, ...], config: Path | None, center: str | None, as_json: bool
+) -> None:
+    """Suggest the mount of an array from what its receiver measured in a flight.
+
+    RECORDING contains observations (`[observations]`). While the carrier flies with different
+    headings, the mount's part of the error is told from the compass's. A person compares the
+    suggestion with the array and writes it into the settings.
+
+    Example: companion calibrate mount recordings/flight.mcap
+    """
+    from companion.node import mount_calibration
+    from companion.node.replay import settings_for
+
+    print_truncated(logs)
+    progress = Progress()
+    found = mount_calibration.suggest(logs, settings_for(logs, config, center), progress.show)
+    progress.clear()
+    click.echo(json.dumps(found) if as_json else mount_calibration.text(found))

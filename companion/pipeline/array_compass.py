@@ -12,6 +12,7 @@ from typing import Final
 
 import numpy as np
 
+from companion.pipeline.assumptions import ARRAY
 from companion.pipeline.sighted_uavs import Look, SightedUavs
 from companion.settings.observations import ObservationSettings
 from companion.tracking import compass
@@ -23,6 +24,7 @@ UPDATE_NS: Final = 90_000_000  # least time between two estimates of the attitud
 FRESH_NS: Final = 1_000_000_000  # age of a UAV's sightings beyond which they say nothing
 PERSISTENT_NS: Final = 1_000_000_000
 """Time for which a UAV must be seen elsewhere than it reports until its position is refuted."""
+RAISED: Final = 1.25  # multiple of a refuted bound, and of a proven error, that is assumed then
 WIDEST_RAD: Final = math.radians(30.0)  # largest error of reported attitudes that is considered
 
 
@@ -42,6 +44,7 @@ class ArrayCompass:
         self._by_evidence = ErrorSet.within(WIDEST_RAD)
         self._updated: tuple[int, FloatArray] | None = None  # when, and body_from_local
         self._tolerates = 0
+        self.observed = 0  # UAVs that confined the error at the last update
         self.error: Misalignment | None = None  # None: nothing is known but the bound
 
     def forget(self) -> None:
@@ -66,6 +69,7 @@ class ArrayCompass:
             return []
         self.bound_rad = max(bound_rad, self._raised_rad)
         seen = self._seen(now_ns)
+        self.observed = len(seen)
         tolerates = self._settings.false_uavs if len(seen) >= compass.MAJORITY else 0
         if seen and tolerates != self._tolerates:
             self._tolerates = tolerates  # a set by fewer UAVs may be wrong by one false position
@@ -79,7 +83,17 @@ class ArrayCompass:
         self._updated = now_ns, carrier.body_from_local
         self._by_evidence = self._confined(known, seen)
         self._uavs.likely.solve()
-        return [*self._judge(now_ns, seen), *self._bounded(now_ns)]
+        return [*self._judge(now_ns, seen), *self._bounded(now_ns, self._least_rad(seen))]
+
+    def _least_rad(self, seen: Sequence[Seen]) -> float:
+        """Return the least error that evidence proves, if no more UAVs are false than may be."""
+        least = sorted(
+            angle_rad(one.reported.center, one.seen.center)
+            - one.reported.radius_rad
+            - one.seen.radius_rad
+            for one in seen
+        )
+        return least[-1 - self._tolerates] if len(least) > self._tolerates else 0.0
 
     def _seen(self, now_ns: int) -> list[Seen]:
         found = []
@@ -133,22 +147,28 @@ class ArrayCompass:
                 said.append(_agrees_again(now_ns, one.uav))
         return said
 
-    def _bounded(self, now_ns: int) -> list[Refuted]:
-        """Set the error within the bound by the settings, which is raised if it is refuted."""
-        self.error = self._by_evidence.within_ball(self.bound_rad)
-        if self.error is not None:
-            return []
+    def _bounded(self, now_ns: int, least_rad: float) -> list[Refuted]:
+        """Set the error within the bound by the settings, which is raised if it is refuted.
+
+        ``least_rad`` is the least error that evidence proves.
+        """
         limit_rad = self.bound_rad
-        self.error = self._by_evidence.misalignment()
-        center_rad = compass.rotation_angle_rad(self.error.center)
-        self.bound_rad = self._raised_rad = self.error.largest_rad
+        if least_rad <= limit_rad:
+            self.error = self._by_evidence.within_ball(limit_rad)
+            if self.error is not None:
+                return []
+        found = self._by_evidence.misalignment()
+        center_rad = compass.rotation_angle_rad(found.center)
+        least_rad = max(least_rad, center_rad - found.bound_rad, limit_rad)
+        self.bound_rad = self._raised_rad = RAISED * least_rad
+        self.error = self._by_evidence.within_ball(self.bound_rad) or found
         return [
             Refuted(
                 t_ns=now_ns,
-                uav="array",
+                uav=ARRAY,
                 setting="center.attitude_bound_deg",
                 limit=math.degrees(limit_rad),
-                proven=math.degrees(max(center_rad - self.error.bound_rad, limit_rad)),
+                proven=math.degrees(least_rad),
                 raised_to=math.degrees(self._raised_rad),
             )
         ]

@@ -15,6 +15,7 @@ _UNITS: Final = {
     "center.turn_acceleration_max_degps2": "°/s²",
     "center.attitude_bound_deg": "°",
 }
+ARRAY: Final = "array"  # subject of what the array's own measurements refute
 NOTICED_STEP_S: Final = 0.02
 """Least change of a clock or link for a notice: 0.4 m at 20 m/s, which the bound covers."""
 WARNED_STEP_S: Final = 0.1  # change from which the notice is a warning
@@ -139,6 +140,12 @@ def _refutation_text(one: Refuted) -> str:
             f"{one.uav}: receiver states an accuracy of {one.limit:.2g} m, but deviates by"
             f" {one.proven:.2g} m from its velocities ({one.setting});"
             f" {one.raised_to:.2g} m is assumed now"
+        )
+    if one.setting == "center.attitude_bound_deg" and one.uav == ARRAY:
+        return (
+            f"the array sees UAVs at least {one.proven:.1f}° from where the carrier's attitude puts"
+            f" them, beyond {one.setting} ({one.limit:.3g}°); up to {one.raised_to:.0f}° is assumed"
+            " now: check the array's mount and the compass"
         )
     if one.setting == "center.attitude_bound_deg":
         return (

@@ -49,10 +49,12 @@ class LinkEvidence:
     refused        why its newest reports were rejected; None: they were used
     waited_s       time for which frames may have waited for this machine
     carrier        facts about the carrier
+    is_contradicted  whether the array sees it elsewhere than it reports
     """
 
     clock_assumed: bool
     refused: Reason | None
+    is_contradicted: bool = False
     waited_s: float = 0.0
     carrier: CarrierEvidence = field(default_factory=CarrierEvidence)
 
@@ -132,6 +134,8 @@ def of_beam(
     before     cause given so far, which stays if no part has grown since: beams follow their bounds
         with a delay, and a level rises only with a margin
     """
+    if evidence.is_contradicted:
+        return of_contradicted()
     silence = _silence(track, evidence)
     if silence is not None:
         return silence
@@ -158,6 +162,16 @@ def of_beam(
             )
         case part:
             return _attitude_cause(part, carrier, evidence)
+
+
+def of_contradicted() -> Blame:
+    """Return why the link of a UAV that the array sees elsewhere than it reports is not good."""
+    return Blame(
+        Cause.CONTRADICTED,
+        f"{Reason.CONTRADICTED_BY_ARRAY}: the array sees it elsewhere than it reports",
+        "check it for GNSS spoofing, a forged sender or a wrong datum; `[observations] follow ="
+        " true` points its beam at the direction that is seen",
+    )
 
 
 def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence) -> Blame:

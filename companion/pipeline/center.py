@@ -18,8 +18,9 @@ from companion.settings.center import (
     parse_center,
 )
 from companion.settings.model import Settings
-from companion.tracking import carrier, noise
+from companion.tracking import carrier, extrapolated, noise
 from companion.tracking.carrier import Contradiction
+from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.geodesy import LocalFrame
 from companion.values import (
     AltitudeDatum,
@@ -293,14 +294,14 @@ class CarrierTracker:
             return now.node_ns
         return None if self._attitude is None else self._attitude[0] + now.node_ns - now.sender_ns
 
-    def fixed_pose(self, at_ns: int) -> carrier.Pose | None:
+    def fixed_pose(self, at_ns: int) -> ExtrapolatedAttitude | None:
         """Return the attitude of a fixed station; None while its place is unknown."""
         found = self.station(at_ns)
-        return None if isinstance(found, str) else carrier.fixed_pose(found.body_from_local)
+        return None if isinstance(found, str) else extrapolated.of_station(found.body_from_local)
 
     def pose(
         self, newest: Fix | None, at: SenderTime, turn_degps2: float, *, nearest: bool
-    ) -> carrier.Pose | None:
+    ) -> ExtrapolatedAttitude | None:
         """Return the reported attitude at a time on the vehicle's timeline; None if unknown.
 
         ``nearest``: by whichever of the two newest reports is nearer; else by the newest.
@@ -313,7 +314,7 @@ class CarrierTracker:
             before_ns = self._before[0]
             if abs(at.sender_ns - before_ns) < abs(at.sender_ns - made_ns):
                 made_ns, attitude = self._before
-        return carrier.pose(
+        return extrapolated.extrapolated(
             attitude,
             age_s=(at.sender_ns - made_ns) * 1e-9,
             doubt_s=at.bound_s,

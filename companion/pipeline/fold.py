@@ -129,7 +129,7 @@ class Pipeline:
         site = Site(array=self.array, coverage=self.coverage, budget=budget, uav_antennas=antennas)
         self.health = HealthMonitor(settings.link, site)
         self.observing = Observing(
-            settings,
+            settings=settings,
             array=self.array,
             center=self.center,
             senders=self.senders,
@@ -305,6 +305,7 @@ class Pipeline:
             refused=self.refusals.current_rejection(uav, now_ns),
             waited_s=self._waited_s,
             carrier=carrier(),
+            is_contradicted=self.observing.is_refuted(uav),
         )
 
     def _carrier_evidence(self, now_ns: int) -> CarrierEvidence:
@@ -313,8 +314,13 @@ class Pipeline:
             return CarrierEvidence()
         at = self.senders.stamp_time(vehicle, now_ns)
         turn_degps2 = self.senders.assumed(vehicle).turn_degps2
+        attitude = self.center.attitude_parts(at, turn_degps2, self._waited_s)
+        carrier = self.last_update.carrier if self.last_update is not None else None
+        if carrier is not None and self.observing.compass.error is not None:
+            error_rad = carrier.attitude_bound_rad - carrier.extrapolation_rad
+            attitude = replace(attitude, error_rad=error_rad)
         return CarrierEvidence(
-            attitude=self.center.attitude_parts(at, turn_degps2, self._waited_s),
+            attitude=attitude,
             attitude_age_s=self.center.attitude_age_s(at),
             clock_assumed=self._is_assumed(vehicle),
         )

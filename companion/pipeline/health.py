@@ -172,6 +172,8 @@ class HealthMonitor:
                     when_good=None if good is None else good[1],
                     before=None if held is None else held.blame,
                 )
+            elif known.is_contradicted:
+                level, why = Level.WEAK, blame.of_contradicted()
             elif coasting:
                 level, why = Level.WEAK, blame.of_coasting(track, known)
             else:

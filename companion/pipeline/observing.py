@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from companion.beams.aim import Sight
+from companion.beams.aim import SeenDirection
 from companion.beams.array import steering
 from companion.beams.array.geometry import Array
 from companion.pipeline import assumptions
@@ -21,25 +21,22 @@ from companion.pipeline.senders import Senders
 from companion.pipeline.sighted_uavs import Measured, SightedUavs
 from companion.pipeline.snapshots import ReportedCarrier, UavSnapshot
 from companion.settings.model import Settings
-from companion.tracking.carrier import Pose
+from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.relative import Relative, relative
 from companion.tracking.tracker import Tracker
 from companion.values import Carrier, Observation, Output, Reason, Refuted, Rejection, Track
 
-Sights = Callable[[Sequence[Track]], dict[str, Sight]]
+Sights = Callable[[Sequence[Track]], dict[str, SeenDirection]]
 """Function from the UAVs' tracks at the time of use to the directions in which UAVs are seen."""
 
 
 class Observing:
-    """Measurements of the array's receiver, and what follows from them.
-
-    Over 5 parts, because it is where they meet.
-    """
+    """Measurements of the array's receiver, and what follows from them."""
 
     def __init__(
         self,
-        settings: Settings,
         *,
+        settings: Settings,
         array: Array,
         center: CarrierTracker,
         senders: Senders,
@@ -69,7 +66,15 @@ class Observing:
             np.array([event.azimuth_rad]), np.array([event.elevation_rad])
         )
         bound_s = event.time_bound_ns * 1e-9
-        self.uavs.add(event.uav, Measured(event.measured_ns, towards, event.bound_rad, bound_s))
+        self.uavs.add(
+            event.uav,
+            Measured(
+                t_ns=event.measured_ns,
+                direction=towards,
+                bound_rad=event.bound_rad,
+                time_bound_s=bound_s,
+            ),
+        )
         return self._settle(event.t_ns)
 
     def _unusable(self, event: Observation) -> Reason | None:
@@ -131,6 +136,11 @@ class Observing:
                 said.append(one)
         return said
 
+    def is_refuted(self, uav: str) -> bool:
+        """Return whether the array sees a UAV elsewhere than it reports."""
+        record = self.uavs.get(uav)
+        return record is not None and record.is_refuted
+
     # --- the carrier ------------------------------------------------------------------------
 
     def carrier(self, now_ns: int, valid_at_ns: int) -> Carrier | str:
@@ -143,19 +153,24 @@ class Observing:
         vehicle = self._center.vehicle
         if vehicle is None:
             found = self._center.station(valid_at_ns)
-            return found if isinstance(found, str) else ReportedCarrier(found)
+            return found if isinstance(found, str) else ReportedCarrier(carrier=found)
         track = self._tracker.track(vehicle, now_ns, self._senders.time(vehicle, valid_at_ns))
         now, at = (self._senders.stamp_time(vehicle, t_ns) for t_ns in (now_ns, valid_at_ns))
         newest, turn_degps2 = self._tracker.newest(vehicle), self._turn_degps2(vehicle)
         found = self._center.on_vehicle(track, newest, now, at, turn_degps2)
         if isinstance(found, str):
             return found
-        return ReportedCarrier(found, track, newest, math.radians(turn_degps2))
+        return ReportedCarrier(
+            carrier=found,
+            track=track,
+            fix=newest,
+            turn_acceleration_radps2=math.radians(turn_degps2),
+        )
 
     def _turn_degps2(self, vehicle: str) -> float:
         return self._senders.assumed(vehicle).turn_degps2
 
-    def _pose(self, at_ns: int, *, nearest: bool) -> Pose | None:
+    def _pose(self, at_ns: int, *, nearest: bool) -> ExtrapolatedAttitude | None:
         vehicle = self._center.vehicle
         if vehicle is None:
             return self._center.fixed_pose(at_ns)
@@ -200,19 +215,22 @@ class Observing:
         poses = {t_ns: self._pose(t_ns, nearest=False) for t_ns in (*times, valid_at_ns)}
         pose, follows = poses[valid_at_ns], self._settings.follow
 
-        def sights(tracks: Sequence[Track]) -> dict[str, Sight]:
+        def sights(tracks: Sequence[Track]) -> dict[str, SeenDirection]:
             found = {}
             for snapshot, look, track in zip(snapshots, looks, tracks, strict=True):
-                if look is None or pose is None or (look.is_refuted and not follows):
+                if look is None or pose is None:
+                    continue
+                if look.is_refuted and not follows:
+                    found[track.uav] = SeenDirection(None)
                     continue
                 near = self._relative(snapshot, track, reported)
                 if near is None:
                     continue
-                cap = self.uavs.direction(
+                seen = self.uavs.direction(
                     look, near, pose=pose, pose_at=poses.get, is_alone=look.is_refuted
                 )
-                if cap is not None:
-                    found[track.uav] = Sight(cap, look.is_refuted)
+                if seen is not None:
+                    found[track.uav] = seen
             return found
 
         return sights

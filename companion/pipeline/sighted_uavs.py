@@ -12,14 +12,16 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from companion.beams.aim import SeenDirection
 from companion.settings.observations import ObservationSettings
-from companion.tracking.carrier import Pose
 from companion.tracking.compass import Misalignment, rotation
+from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.likely_error import LikelyError
 from companion.tracking.relative import Relative
 from companion.tracking.sightings import WINDOW, Motion, Sightings
 from companion.values import Cap, FloatArray
 
+MEMORY_S: Final = 3.0  # time constant with which measurements of the likely error are forgotten
 PENDING_MAX: Final = WINDOW  # most measurements of a UAV that wait for an attitude
 
 
@@ -42,7 +44,7 @@ class SightedUav:
     """
 
     sightings: Sightings | None = None
-    latest: tuple[Relative, Pose] | None = None
+    latest: tuple[Relative, ExtrapolatedAttitude] | None = None
     pending: tuple[Measured, ...] = ()
     contradicted_ns: int | None = None
     agrees_ns: int | None = None
@@ -65,7 +67,7 @@ class Look(NamedTuple):
     likely: FloatArray
 
 
-PoseAt = Callable[[int], Pose | None]
+PoseAt = Callable[[int], ExtrapolatedAttitude | None]
 """Attitude at a time; None if it is unknown."""
 
 
@@ -80,7 +82,7 @@ class SightedUavs:
         self._drift_radps = math.radians(settings.drift_max_degps)
         self._array_from_body = array_from_body
         self._uavs: dict[str, SightedUav] = {}
-        self.likely = LikelyError()
+        self.likely = LikelyError(MEMORY_S)
         self.used = 0  # measurements that agreed with the others of their UAV
 
     def __bool__(self) -> bool:
@@ -100,7 +102,7 @@ class SightedUavs:
     def clear(self) -> None:
         """Forget all UAVs."""
         self._uavs.clear()
-        self.likely = LikelyError()
+        self.likely = LikelyError(MEMORY_S)
 
     def add(self, uav: str, measured: Measured) -> None:
         """Add a measurement of a UAV."""
@@ -140,7 +142,12 @@ class SightedUavs:
         return wrong
 
     def _join(
-        self, record: SightedUav, one: Measured, pose: Pose, near: Relative, bound_rad: float
+        self,
+        record: SightedUav,
+        one: Measured,
+        pose: ExtrapolatedAttitude,
+        near: Relative,
+        bound_rad: float,
     ) -> bool:
         """Add a measurement to a UAV's sightings. Returns whether it agrees with them."""
         cap = self._placed(one, pose, near, self.aged_rad(pose))
@@ -173,11 +180,13 @@ class SightedUavs:
             )
         return True
 
-    def aged_rad(self, pose: Pose) -> float:
+    def aged_rad(self, pose: ExtrapolatedAttitude) -> float:
         """Return the bound on what a reported attitude's age adds to its error."""
         return pose.extrapolation_rad + self._drift_radps * abs(pose.age_s)
 
-    def _placed(self, one: Measured, pose: Pose, near: Relative, extrapolation_rad: float) -> Cap:
+    def _placed(
+        self, one: Measured, pose: ExtrapolatedAttitude, near: Relative, extrapolation_rad: float
+    ) -> Cap:
         """Return a measurement as directions in the local frame."""
         local_from_array = (self._array_from_body @ pose.body_from_local).T
         radius = one.bound_rad + extrapolation_rad + near.swept_rad(one.time_bound_s)
@@ -196,8 +205,14 @@ class SightedUavs:
         )
 
     def direction(
-        self, look: Look, near: Relative, *, pose: Pose, pose_at: PoseAt, is_alone: bool
-    ) -> Cap | None:
+        self,
+        look: Look,
+        near: Relative,
+        *,
+        pose: ExtrapolatedAttitude,
+        pose_at: PoseAt,
+        is_alone: bool,
+    ) -> SeenDirection | None:
         """Return the directions in which a UAV is, array frame.
 
             near      the UAV's position relative to the array at the time of the beam
@@ -205,7 +220,8 @@ class SightedUavs:
             pose_at   that of another time, by the same report
             is_alone  whether its reported position is not used
 
-        None if the measurements contradict one another, or the reported position.
+        None if the measurements say nothing. Without a cap, nothing bounds the error: they
+        contradict one another, or the reported position.
         """
         to_ns, parts = near.t_ns, []
         if look.sightings is not None:
@@ -232,8 +248,12 @@ class SightedUavs:
             spread = reported.radius_rad + look.error.bound_rad + self.aged_rad(pose)
             within = Cap(look.error.center @ reported.center, min(spread, math.pi))
             likely = rotation(look.likely) @ reported.center
-        found = Sightings(to_ns, centers, radii).possible(self._outliers, within, likely)
-        if found is None or found.radius_rad >= math.pi / 2:
+        found = Sightings(t_ns=to_ns, centers=centers, radii_rad=radii).possible(
+            self._outliers, within, likely
+        )
+        if found is None:
+            return SeenDirection(None)
+        if found.radius_rad >= math.pi / 2:
             return None
         array_from_local = self._array_from_body @ pose.body_from_local
-        return Cap(array_from_local @ found.center, found.radius_rad)
+        return SeenDirection(Cap(array_from_local @ found.center, found.radius_rad), is_alone)

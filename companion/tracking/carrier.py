@@ -32,6 +32,13 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArr
     )
 
 
+def roll_pitch_yaw_rad(body_from_ned: FloatArray) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of a rotation (3, 3): the inverse of ``body_from_ned``."""
+    roll = math.atan2(body_from_ned[1, 2], body_from_ned[2, 2])
+    pitch = math.asin(min(max(-float(body_from_ned[0, 2]), -1.0), 1.0))
+    return roll, pitch, math.atan2(body_from_ned[0, 1], body_from_ned[0, 0])
+
+
 def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> FloatArray:
     """Return the rotation (3, 3) from body axes now to body axes ``interval_s`` later.
 
@@ -133,39 +140,6 @@ class AttitudeBounds:
         )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Pose:
-    """Attitude at a time, extrapolated from one report.
-
-    body_from_local      (3, 3) rotation matrix
-    age_s                time since the report; negative: it is a later one
-    doubt_s              bound on the error of that age
-    extrapolation_rad    bound on the error that the extrapolation adds to that of the report
-    acceleration_radps2  greatest angular acceleration
-    """
-
-    body_from_local: FloatArray
-    age_s: float
-    doubt_s: float
-    extrapolation_rad: float
-    acceleration_radps2: float
-
-    def turned_from(self, other: "Pose") -> float:
-        """Return a bound on the rotation between two poses."""
-        off = self.body_from_local - other.body_from_local
-        angle = 2.0 * math.asin(min(1.0, math.sqrt(float((off * off).sum()) / 8.0)))
-        return angle + self.extrapolation_rad + other.extrapolation_rad
-
-    def extrapolated_since(self, earlier: "Pose") -> float:
-        """Return the bound on the error that the extrapolation adds since an earlier pose.
-
-        Both are from the same report, whose rates may be wrong by the acceleration since then.
-        """
-        elapsed_s = abs(self.age_s - earlier.age_s)
-        from_s = min(abs(self.age_s), abs(earlier.age_s)) + self.doubt_s
-        return self.acceleration_radps2 * (from_s + elapsed_s / 2.0) * elapsed_s
-
-
 @dataclass(frozen=True, slots=True)
 class Contradiction:
     """Two attitudes of which at least one is wrong: neither follows from the other at its rates."""
@@ -196,15 +170,16 @@ def contradiction(
         return None
     first = body_from_ned(before.roll_rad, before.pitch_rad, before.yaw_rad)
     second = body_from_ned(after.roll_rad, after.pitch_rad, after.yaw_rad)
-    forward = later_body_from_body(_rates(before), apart_s) @ first @ second.T
-    back = later_body_from_body(_rates(after), -apart_s) @ second @ first.T
+    forward = later_body_from_body(body_rates(before), apart_s) @ first @ second.T
+    back = later_body_from_body(body_rates(after), -apart_s) @ second @ first.T
     apart_rad = max(_angle(forward), _angle(back))
     if apart_rad <= bounds.at(0.0, apart_s, STAMP_S) + bounds.attitude_rad:
         return None
     return Contradiction(apart_rad, apart_s)
 
 
-def _rates(attitude: Attitude) -> FloatArray:
+def body_rates(attitude: Attitude) -> FloatArray:
+    """Return the angular rates of an attitude about the body axes, rad/s."""
     return np.array([attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps])
 
 
@@ -275,47 +250,6 @@ class AngularAcceleration:
         )
 
 
-def fixed_pose(body_from_local: FloatArray) -> Pose:
-    """Return the pose of a fixed station."""
-    return Pose(
-        body_from_local=body_from_local,
-        age_s=0.0,
-        doubt_s=0.0,
-        extrapolation_rad=0.0,
-        acceleration_radps2=0.0,
-    )
-
-
-def pose(
-    attitude: Attitude,
-    *,
-    age_s: float,
-    doubt_s: float,
-    bounds: AttitudeBounds,
-    contradicted: Contradiction | None,
-    local_from_ned: FloatArray,
-) -> Pose:
-    """Return an attitude extrapolated at its body rates over its age, known to ``doubt_s``.
-
-    bounds          bounds on the attitude and on its acceleration
-    contradicted    contradiction with the previous attitude, if any
-    local_from_ned  rotation from north-east-down at the carrier to the local frame
-    """
-    rates = _rates(attitude)
-    rate_radps = math.hypot(*rates.tolist())
-    extrapolation = bounds.at(rate_radps, age_s, doubt_s) - bounds.attitude_rad
-    if contradicted is not None:
-        extrapolation += contradicted.at(abs(age_s) + doubt_s)
-    then = body_from_ned(attitude.roll_rad, attitude.pitch_rad, attitude.yaw_rad)
-    return Pose(
-        body_from_local=later_body_from_body(rates, age_s) @ then @ local_from_ned.T,
-        age_s=age_s,
-        doubt_s=doubt_s,
-        extrapolation_rad=extrapolation,
-        acceleration_radps2=bounds.acceleration_radps2,
-    )
-
-
 def moving(
     local: LocalFrame,
     track: Track,
@@ -337,7 +271,7 @@ def moving(
     bounds        bounds on the attitude and on its acceleration
     contradicted  contradiction with the previous attitude, if any
     """
-    rates = _rates(attitude)
+    rates = body_rates(attitude)
     age_s = since_ns * 1e-9
     bound_rad = bounds.at(math.hypot(*rates.tolist()), age_s, doubt_s)
     if contradicted is not None:

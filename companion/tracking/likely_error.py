@@ -7,7 +7,6 @@ import numpy as np
 
 from companion.values import FloatArray
 
-MEMORY_S: Final = 3.0  # time constant with which measurements are forgotten
 PRIOR: Final = 0.1  # weight of no error, in measurements
 
 
@@ -17,9 +16,12 @@ class LikelyError:
     A UAV at u that is seen at u + d has an error w with u x d = (1 - u u') w, w = B' b + c: B is
     body_from_local, b the error of the mount, c that of the compass. While the carrier does not
     turn only their sum is known.
+
+    memory_s  time constant with which measurements are forgotten
     """
 
-    def __init__(self) -> None:
+    def __init__(self, memory_s: float) -> None:
+        self._memory_s = memory_s
         self._normal = np.zeros((6, 6))
         self._sum = np.zeros(6)
         self._t_ns: int | None = None
@@ -39,7 +41,7 @@ class LikelyError:
         A deviation beyond ``bound_rad`` counts less, by Huber's weight.
         """
         if self._t_ns is not None:
-            kept = math.exp(-abs(t_ns - self._t_ns) * 1e-9 / MEMORY_S)
+            kept = math.exp(-abs(t_ns - self._t_ns) * 1e-9 / self._memory_s)
             self._normal *= kept
             self._sum *= kept
         self._t_ns = t_ns
@@ -63,8 +65,3 @@ class LikelyError:
         """Return the rotation vector (3,) of the error at an attitude, local frame."""
         found: FloatArray = body_from_local.T @ self._parts[:3] + self._parts[3:]
         return found
-
-    @property
-    def mount_rad(self) -> FloatArray:
-        """Rotation vector (3,) of the part that is fixed in the body, body frame."""
-        return self._parts[:3]

@@ -38,11 +38,11 @@ def reported_velocity(fix: Fix, track: Track) -> ReportedVelocity | None:
     if fix.velocity_ned_mps is None:
         return None
     return ReportedVelocity(
-        fix.t_ns,
-        fix.velocity_ned_mps,
-        fix.noise.velocity_mps,
-        track.limits.acceleration_max_mps2,
-        track.clock_bound_s,
+        t_ns=fix.t_ns,
+        velocity_ned_mps=fix.velocity_ned_mps,
+        noise_mps=fix.noise.velocity_mps,
+        acceleration_max_mps2=track.limits.acceleration_max_mps2,
+        time_bound_s=track.clock_bound_s,
     )
 
 

@@ -11,7 +11,7 @@ result. See docs/math.md 5.7.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final, Self
 
 import numpy as np
@@ -72,7 +72,7 @@ def _moved(
     return later, np.minimum(spread + grown, math.pi)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sightings:
     """Newest caps of one UAV, all moved to the time ``t_ns``; immutable.
 
@@ -88,19 +88,19 @@ class Sightings:
     @classmethod
     def of(cls, t_ns: int, cap: Cap) -> Self:
         """Return the set with one cap."""
-        return cls(t_ns, cap.center[np.newaxis], np.array([cap.radius_rad]))
+        return cls(t_ns=t_ns, centers=cap.center[np.newaxis], radii_rad=np.array([cap.radius_rad]))
 
     def moved(self, t_ns: int, motion: Motion) -> "Sightings":
         """Return the caps at a later time."""
         centers, radii = _moved(self.centers, self.radii_rad, motion)
         contrary = None if self.contrary is None else self.contrary.moved(t_ns, motion)
-        return Sightings(t_ns, centers, radii, contrary)
+        return Sightings(t_ns=t_ns, centers=centers, radii_rad=radii, contrary=contrary)
 
     def with_cap(self, cap: Cap) -> "Sightings":
         """Return the caps with a newer one, which agrees with them; drops the oldest."""
         centers = np.concatenate([self.centers[1 - WINDOW :], cap.center[np.newaxis]])
         radii = np.append(self.radii_rad[1 - WINDOW :], cap.radius_rad)
-        return Sightings(self.t_ns, centers, radii)
+        return Sightings(t_ns=self.t_ns, centers=centers, radii_rad=radii)
 
     def contradicts(self, cap: Cap, outliers: int) -> bool:
         """Return whether a cap is apart from more caps than may be wrong."""
@@ -120,7 +120,7 @@ class Sightings:
             other = self.contrary.with_cap(cap) if agrees else other
         if len(other.radii_rad) >= RESTART:
             return other
-        return Sightings(self.t_ns, self.centers, self.radii_rad, other)
+        return replace(self, contrary=other)
 
     def possible(
         self, outliers: int, within: Cap | None = None, about: FloatArray | None = None

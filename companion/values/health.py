@@ -32,6 +32,7 @@ class Cause(DescribedEnum):
     LATE = "late", "its reports arrive late"
     AGILE = "agile", "it can change its velocity quickly"
     CLOCK = "clock", "its clock is too uncertain"
+    CONTRADICTED = "contradicted", "the array sees it elsewhere than it reports"
     POSITION = "position", "its reported positions are too inaccurate at this range"
     CROWDED = "crowded", "other UAVs are in the same direction, or the policy leaves it out"
     COVERAGE = "coverage", "the array does not cover its direction"

@@ -1,10 +1,13 @@
 """Position and attitude of the array's carrier, as shown by the API."""
 
+import math
 from dataclasses import dataclass
 from typing import Annotated
 
 from companion.pipeline.fold import Pipeline
 from companion.settings.center import FixedCenter
+from companion.tracking.carrier import roll_pitch_yaw_rad
+from companion.tracking.compass import rotation
 from companion.tracking.geodesy import Place
 from companion.values import Carrier
 from companion.values.described import Inline, Meaning
@@ -48,6 +51,24 @@ class LastPose:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class ObservedAttitude:
+    """What the array's own measurements of UAVs say of the carrier's attitude.
+
+    The suggested mount explains the whole error that is seen; the compass's error is part of it.
+    """
+
+    uavs: Annotated[int, Meaning("UAVs whose directions the array measured in the last second")]
+    measurements: Annotated[int, Meaning("measurements used since the start")]
+    error_rad: Annotated[float, Meaning("likely error of the reported attitude, as an angle")]
+    error_bound_rad: Annotated[
+        float, Meaning("bound on the error of the attitude after its correction")
+    ]
+    mount_roll_rad: Annotated[float, Meaning("roll of the mount that explains what is seen")]
+    mount_pitch_rad: Annotated[float, Meaning("pitch of the mount that explains what is seen")]
+    mount_yaw_rad: Annotated[float, Meaning("yaw of the mount that explains what is seen")]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Center:
     """Carrier of the array; position and attitude are null while unknown."""
 
@@ -58,6 +79,10 @@ class Center:
     pose: Annotated[Pose | None, Inline()] = None
     unfit: Annotated[
         str | None, Meaning("why the carrier's position is unknown; null: it is known")
+    ] = None
+    observed: Annotated[
+        ObservedAttitude | None,
+        Meaning("what the array's own measurements say of the attitude; null without any"),
     ] = None
     last_known: Annotated[
         LastPose | None, Meaning("last known position, while the present one is unknown")
@@ -70,7 +95,12 @@ def center(pipeline: Pipeline, now_ns: int) -> Center:
     source, fixed = str(place), isinstance(place, FixedCenter)
     found = pipeline.carrier(now_ns, now_ns)
     if not isinstance(found, str):
-        return Center(source=source, fixed=fixed, pose=_pose(pipeline, found))
+        return Center(
+            source=source,
+            fixed=fixed,
+            pose=_pose(pipeline, found),
+            observed=_observed(pipeline, now_ns),
+        )
     last = pipeline.last_carrier
     known = None if last is None else LastPose(last.valid_at_ns, _pose(pipeline, last))
     return Center(source=source, fixed=fixed, unfit=found, last_known=known)
@@ -79,3 +109,22 @@ def center(pipeline: Pipeline, now_ns: int) -> Center:
 def _pose(pipeline: Pipeline, carrier: Carrier) -> Pose:
     assert pipeline.local is not None
     return Pose(pipeline.local.place(*carrier.position_ned_m.tolist()), carrier)
+
+
+def _observed(pipeline: Pipeline, now_ns: int) -> ObservedAttitude | None:
+    observing, reported = pipeline.observing, pipeline.observing.reported(now_ns, now_ns)
+    if observing.compass.error is None or isinstance(reported, str):
+        return None
+    body_from_local = reported.carrier.body_from_local
+    likely = observing.uavs.likely.vector_rad(body_from_local)
+    mount = pipeline.array.array_from_body @ rotation(body_from_local @ likely)
+    roll, pitch, yaw = roll_pitch_yaw_rad(mount)
+    return ObservedAttitude(
+        uavs=observing.compass.observed,
+        measurements=observing.uavs.used,
+        error_rad=math.sqrt(likely @ likely),
+        error_bound_rad=observing.compass.error_at(reported.carrier).bound_rad,
+        mount_roll_rad=roll,
+        mount_pitch_rad=pitch,
+        mount_yaw_rad=yaw,
+    )

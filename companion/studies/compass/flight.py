@@ -7,7 +7,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.beams.aim import Sight, aim, directions
+from companion.beams.aim import SeenDirection, aim, directions
 from companion.beams.array import steering
 from companion.beams.array.geometry import Array
 from companion.node.replay import log_events
@@ -15,7 +15,7 @@ from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.studies.beams.worth import given, percentile
 from companion.studies.compass.kalman import POSITION_SHARE, ErrorFilter
-from companion.studies.compass.receiver import Receiver, observations
+from companion.studies.compass.receiver import ArrayReceiver, observations
 from companion.studies.prediction.delivery import known_round_trips
 from companion.studies.truth import array_truth, vehicles
 from companion.studies.truth.array_truth import ArrayTruth
@@ -59,7 +59,7 @@ class Case:
 
     logs: tuple[Path, ...]
     settings: Settings
-    receiver: Receiver
+    receiver: ArrayReceiver
     mount_deg: float
     uavs: int | None = None
     seconds: float = 60.0
@@ -67,7 +67,7 @@ class Case:
     seed: int = 0
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Score:
     """What one method answered at the looks."""
 
@@ -258,7 +258,9 @@ def _reported(track: Track, update: Update) -> tuple[FloatArray, float]:
     return offset_m / range_m, (track.bound_m + update.carrier.bound_m) / range_m
 
 
-def _filter(rival: ErrorFilter, pipeline: Pipeline, event: Observation, receiver: Receiver) -> None:
+def _filter(
+    rival: ErrorFilter, pipeline: Pipeline, event: Observation, receiver: ArrayReceiver
+) -> None:
     """Pass a measurement to the filter, with what is reported at its time."""
     tracks = pipeline.tracks(event.t_ns, event.measured_ns, [event.uav])
     carrier = pipeline.carrier(event.t_ns, event.measured_ns)
@@ -288,7 +290,9 @@ def _aimed(
         array=pipeline.array,
         precoder=replace(pipeline.precoder, widen=widen),
         coverage=pipeline.coverage,
-        sights={uav: Sight(Cap(found, 1e-6), is_alone=True) for uav, found in towards.items()},
+        sights={
+            uav: SeenDirection(Cap(found, 1e-6), is_alone=True) for uav, found in towards.items()
+        },
     )
 
 

@@ -13,8 +13,8 @@ import numpy as np
 from companion.tracking.compass import rotation
 from companion.values import FloatArray
 
-SURE: Final = 0.997  # share of errors that the ellipse should contain
-_CHI2_2D: Final = -2.0 * math.log(1.0 - SURE)  # two degrees of freedom, in closed form
+CONFIDENCE: Final = 0.997  # share of errors that the ellipse should contain
+_CHI2_2D: Final = -2.0 * math.log(1.0 - CONFIDENCE)  # two degrees of freedom, in closed form
 POSITION_SHARE: Final = 1.0 / 3.0  # standard deviation of a position as a share of its bound
 
 
@@ -52,7 +52,7 @@ class ErrorFilter:
         return found
 
     def contains(self, reported: FloatArray, true: FloatArray, position_rad: float) -> bool:
-        """Return whether the ellipse of ``SURE`` contains a true direction."""
+        """Return whether the ellipse of ``CONFIDENCE`` contains a true direction."""
         expected = self._error @ reported
         axes = _tangent(expected)
         rows = axes @ -_cross_matrix(expected)

@@ -14,8 +14,8 @@ LATENCY_NS: Final = 20_000_000  # from a measurement to its arrival
 ROUNDING: Final = 1.0 + 1e-6  # of stated bounds, for the rounding of angles
 
 
-@dataclass(frozen=True, slots=True)
-class Receiver:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ArrayReceiver:
     """Receiver that measures each UAV at a rate.
 
     Errors are uniform over the cap of the bound; outliers are as far as a reflection, up to a
@@ -29,11 +29,11 @@ class Receiver:
 
 
 RECEIVERS: Final = (
-    Receiver("0.3 degrees", 0.3),
-    Receiver("0.5 degrees", 0.5),
-    Receiver("5 degrees", 5.0),
-    Receiver("0.5 degrees, 10 % outliers", 0.5, 0.1),
-    Receiver("5 degrees, 10 % outliers", 5.0, 0.1),
+    ArrayReceiver(name="0.3 degrees", bound_deg=0.3),
+    ArrayReceiver(name="0.5 degrees", bound_deg=0.5),
+    ArrayReceiver(name="5 degrees", bound_deg=5.0),
+    ArrayReceiver(name="0.5 degrees, 10 % outliers", bound_deg=0.5, outliers=0.1),
+    ArrayReceiver(name="5 degrees, 10 % outliers", bound_deg=5.0, outliers=0.1),
 )
 
 Truth = Callable[[str, int], FloatArray | None]
@@ -41,7 +41,11 @@ Truth = Callable[[str, int], FloatArray | None]
 
 
 def observations(
-    receiver: Receiver, uav: str, span_ns: tuple[int, int], truth: Truth, rng: np.random.Generator
+    receiver: ArrayReceiver,
+    uav: str,
+    span_ns: tuple[int, int],
+    truth: Truth,
+    rng: np.random.Generator,
 ) -> Iterator[Observation]:
     """Yield measurements of a UAV within a span, in order of time."""
     period_ns = 1e9 / receiver.rate_hz
@@ -56,7 +60,7 @@ def observations(
         off_rad = bound_rad * math.sqrt(rng.random())
         if rng.random() < receiver.outliers:
             off_rad = bound_rad + float(rng.uniform(0.0, 1.0))
-        seen = _aside(rng, true, off_rad)
+        seen = _tilted(rng, true, off_rad)
         (azimuth,), (elevation,) = steering.angles_rad(seen[np.newaxis])
         yield Observation(
             t_ns=at_ns + LATENCY_NS,
@@ -68,7 +72,7 @@ def observations(
         )
 
 
-def _aside(rng: np.random.Generator, towards: FloatArray, by_rad: float) -> FloatArray:
+def _tilted(rng: np.random.Generator, towards: FloatArray, by_rad: float) -> FloatArray:
     """Return a unit vector at an angle from another, in a random plane."""
     aside = np.cross(towards, rng.standard_normal(3))
     aside /= np.linalg.norm(aside)

@@ -9,7 +9,7 @@ from typing import Any, Final
 from companion.settings.model import Settings
 from companion.studies.compass import flight
 from companion.studies.compass.flight import ARRAY, KALMAN, METHODS, Case, Row
-from companion.studies.compass.receiver import RECEIVERS, Receiver
+from companion.studies.compass.receiver import RECEIVERS, ArrayReceiver
 from companion.studies.figures.text_tables import text_table
 from companion.studies.origin import command_line, versions
 from companion.studies.running import fan_out
@@ -54,7 +54,7 @@ class CompassStudy:
 
     def cases(self) -> list[Case]:
         """Return all cases: one thing varies at a time about the usual case."""
-        variants: list[tuple[Receiver, float, int | None]] = [
+        variants: list[tuple[ArrayReceiver, float, int | None]] = [
             (USUAL, MOUNT_DEG, None),
             *((one, MOUNT_DEG, None) for one in RECEIVERS if one is not USUAL),
             *((USUAL, mount, None) for mount in MOUNTS_DEG if mount != MOUNT_DEG),
@@ -82,10 +82,10 @@ def study(asked: CompassStudy, progress: Callable[[str], None]) -> dict[str, Any
     """
     cases = asked.cases()
 
-    def told(done: int) -> None:
+    def show(done: int) -> None:
         progress(f"{done} of {len(cases)} cases")
 
-    rows: list[Row] = list(chain(*fan_out.on_cores(flight.run, cases, asked.jobs, told)))
+    rows: list[Row] = list(chain(*fan_out.on_cores(flight.run, cases, asked.jobs, show)))
     return {
         "command": command_line(
             "compass",

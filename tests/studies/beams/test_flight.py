@@ -637,7 +637,7 @@ def test_command_writes_the_files_it_reports(short: Path, tmp_path: Path) -> Non
 def test_two_logs_are_tabulated_and_plotted_separately(short: Path, tmp_path: Path) -> None:
     done = run(short, short, "--center", "5:1", "--hz", "0.5", "--out", tmp_path)
     assert done.exit_code == 0, done.stderr
-    assert done.stdout.count("truly less than guaranteed") == 2
+    assert done.stdout.count("true gain below guaranteed") == 2
     answer = json.loads((tmp_path / "beams.json").read_text())
     assert len(answer["rows"]) == 8
     assert len(answer["logs"]) == 2

@@ -26,6 +26,7 @@ from companion.pipeline import elements
 from companion.settings.files import kinematic_design, matrix_of, text_of
 from companion.settings.model import CALIBRATION, CODEBOOK, COUPLING, UNIT, Settings
 from companion.settings.section import ConfigError
+from companion.tracking.attitude_evidence import AttitudeAssumptions
 from companion.tracking.gate import GateSettings
 from companion.tracking.limits import LIMITS, Airframe, airframe, lag_s
 from companion.tracking.noise import NoiseSettings
@@ -229,6 +230,17 @@ def noise(settings: Settings) -> NoiseSettings:
         velocity_mps=given.velocity_noise_mps,
     )
     return NoiseSettings(default, given.accuracy_factor if given.follow_accuracy else None)
+
+
+def attitude_assumptions(settings: Settings) -> AttitudeAssumptions:
+    """Return the assumptions about the errors of the carrier's reported attitudes."""
+    given = settings.center
+    return AttitudeAssumptions(
+        bound_rad=math.radians(given.attitude_bound_deg),
+        factor=settings.observer.accuracy_factor,
+        follows_accuracy=given.follow_attitude_accuracy,
+        mount_rad=math.radians(given.mount_bound_deg),
+    )
 
 
 @dataclass(frozen=True, slots=True)

@@ -150,8 +150,8 @@ def _refutation_text(one: Refuted) -> str:
     if one.setting == "center.attitude_bound_deg":
         return (
             f"{one.uav}: an attitude error of up to {one.raised_to:.0f}° is assumed now, not"
-            f" {one.limit:.3g}° ({one.setting}): its estimator reports a problem with its attitude"
-            " or compass"
+            f" {one.limit:.3g}° ({one.setting}): its estimator or compass has a problem, or a GNSS"
+            " heading or second attitude contradicts it"
         )
     return (
         f"{one.uav}: {one.proven:.3g} {_UNITS[one.setting]} exceeds {one.setting}"

@@ -19,15 +19,16 @@ from companion.settings.center import (
 )
 from companion.settings.model import Settings
 from companion.tracking import carrier, extrapolated, noise
+from companion.tracking.attitude_evidence import AttitudeTrust
 from companion.tracking.carrier import Contradiction
 from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.geodesy import LocalFrame
 from companion.values import (
     AltitudeDatum,
     Attitude,
+    AttitudeEvidence,
     Carrier,
     Estimate,
-    EstimatorStatus,
     Fix,
     Notice,
     Refuted,
@@ -40,8 +41,6 @@ from companion.values import (
 HOME_SETTLING_S: Final = 120.0
 """Time after a track's first report in which its restart may move ``home``, seconds."""
 HOME_HEIGHT_M: Final = 20.0  # least error of the first height for which ``home`` moves
-STATUS_KEPT_NS: Final = 5_000_000_000
-"""Time for which an estimator status counts beside newer ones of other links."""
 NOTICE_RATIO: Final = 1.25
 """Ratio to the attitude bound last reported above which the bound is reported again."""
 MIN_CONSISTENT_SAMPLES: Final = 4  # older-stamped attitudes in a row that replace the newest
@@ -82,7 +81,7 @@ class CarrierTracker:
         self._angular_acceleration = carrier.AngularAcceleration()
         self._older_run: _AttitudeRun | None = None  # attitudes stamped earlier than the newest
         self._least_bound_rad = math.radians(settings.center.attitude_bound_deg)
-        self._estimators: dict[str, EstimatorStatus] = {}  # newest status over each link
+        self._trust = AttitudeTrust(assembly.attitude_assumptions(settings))
         self._doubted_rad = self._least_bound_rad  # largest bound reported so far
         self._attitude_kept_s = settings.tracks.coasting_s
         self._accuracy_factor = assembly.noise(settings).factor
@@ -156,6 +155,7 @@ class CarrierTracker:
         self._older_run = None
         self._contradicted = self._contradicts(placed, turn_degps2)
         self._before, self._attitude = self._attitude, (placed.sender_ns, placed.attitude)
+        self._trust.turned(placed.attitude)
         return self._angular_acceleration.look(placed.attitude, placed.sender_ns, turn_degps2)
 
     def _contradicts(self, placed: PlacedAttitude, turn_degps2: float) -> Contradiction | None:
@@ -174,11 +174,7 @@ class CarrierTracker:
     @property
     def attitude_bound_rad(self) -> float:
         """Bound on the error of the carrier's reported attitudes."""
-        bounds = (
-            carrier.reported_bound_rad(one, self._least_bound_rad)
-            for one in self._estimators.values()
-        )
-        return max(bounds, default=self._least_bound_rad)
+        return self._trust.bound_rad
 
     def attitude_age_s(self, now: SenderTime) -> float | None:
         """Return the age of the carrier's newest attitude; None if there is none."""
@@ -205,22 +201,20 @@ class CarrierTracker:
             conflict_rad=0.0 if against is None else against.at(abs(age_s) + at.bound_s),
         )
 
-    def trust(self, status: EstimatorStatus) -> Refuted | None:
-        """Process the carrier's estimator status. Returns a refutation if the bound grew.
+    def trust(self, said: AttitudeEvidence) -> Refuted | None:
+        """Process evidence of the error of the carrier's attitudes.
 
-        A status has no stamp: over another, slower link it may be older. The worst one counts.
+        Returns a refutation if the bound grew.
         """
-        kept, after_ns = self._estimators, status.t_ns - STATUS_KEPT_NS
-        kept = {link: one for link, one in kept.items() if one.t_ns > after_ns}
-        self._estimators = kept | {status.link: status}
+        self._trust.add(said)
         if self.attitude_bound_rad <= NOTICE_RATIO * self._doubted_rad:
             return None
         self._doubted_rad = self.attitude_bound_rad
         least_deg, doubted_deg = map(math.degrees, (self._least_bound_rad, self._doubted_rad))
         name = "center.attitude_bound_deg"
         return Refuted(
-            t_ns=status.t_ns,
-            uav=str(status.source),
+            t_ns=said.t_ns,
+            uav=str(said.source),
             setting=name,
             limit=least_deg,
             proven=doubted_deg,
@@ -248,7 +242,7 @@ class CarrierTracker:
         if uav == self.vehicle:
             self._attitude = self._before = None
             self._contradicted = None
-            self._estimators.clear()
+            self._trust.clear()
             self._older_run = None
             self._angular_acceleration = carrier.AngularAcceleration()
 

@@ -43,12 +43,12 @@ from companion.pipeline.targets import Targets
 from companion.settings.model import Settings
 from companion.tracking.geodesy import LocalFrame
 from companion.values import (
+    AttitudeEvidence,
     Carrier,
     Cause,
     ClockSet,
     Duty,
     Estimate,
-    EstimatorStatus,
     Event,
     FloatArray,
     Frame,
@@ -200,7 +200,7 @@ class Pipeline:
             refuted = self.center.turn(heard.message, turn_degps2)
             said += assumptions.notices(self.records, refuted)
             said += self.observing.attitude_reported(frame.t_ns)
-        elif isinstance(heard.message, EstimatorStatus):
+        elif isinstance(heard.message, AttitudeEvidence):
             said += assumptions.notices(self.records, self.center.trust(heard.message))
         return said
 

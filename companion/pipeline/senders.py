@@ -22,6 +22,7 @@ from companion.mavlink.trust.admission import admission
 from companion.mavlink.trust.adsb import Aircraft
 from companion.mavlink.trust.dedupe import Dedupe, LinkShare
 from companion.mavlink.trust.remote_id import RemoteIds
+from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, gnss_heading
 from companion.mavlink.wire.decode import ATTITUDE, decode
 from companion.mavlink.wire.stamps import boot_ms
 from companion.pipeline import assembly
@@ -32,8 +33,10 @@ from companion.values import (
     Accuracy,
     AdsbVehicle,
     Attitude,
+    AttitudeEvidence,
     EstimatorStatus,
     Frame,
+    GnssHeading,
     GnssStatus,
     Limits,
     Notice,
@@ -47,6 +50,7 @@ from companion.values import (
     SenderTime,
     Severity,
     Source,
+    StatedAttitude,
     SystemTime,
     kind_of,
 )
@@ -106,12 +110,13 @@ class FrameOutcome:
     change     change of the sender's clock that the frame showed; None without one
     """
 
-    message: PlacedReport | PlacedAttitude | EstimatorStatus | None = None
+    message: PlacedReport | PlacedAttitude | AttitudeEvidence | None = None
     outputs: tuple[Notice | Rejection, ...] = ()
     restarted: str | None = None
     change: ClockChange | None = None
 
 
+_OF_CARRIER: Final = ABOUT_ATTITUDE | {ATTITUDE}  # messages used only of the carrier
 NO_OUTCOME: Final = FrameOutcome()  # outcome of a frame without further effect
 
 
@@ -203,8 +208,8 @@ class Senders:
 
     def hear(self, frame: Frame) -> FrameOutcome:
         """Process one frame of a message that is decoded (``decode.DECODED``)."""
-        if frame.msgid == ATTITUDE and frame.source != self._carrier_source:
-            change = self.add_stamp(frame)
+        if frame.msgid in _OF_CARRIER and frame.source != self._carrier_source:
+            change = self.add_stamp(frame) if frame.msgid == ATTITUDE else None
             return NO_OUTCOME if change is None else FrameOutcome(change=change)
         message = decode(frame)
         match message:
@@ -224,7 +229,7 @@ class Senders:
                 return self._remote_id(frame, message)
             case Attitude():
                 return self._attitude(message)
-            case EstimatorStatus():
+            case EstimatorStatus() | GnssHeading() | StatedAttitude():
                 carries = message.source == self._carrier_source
                 return FrameOutcome(message=message) if carries else NO_OUTCOME
             case None:
@@ -245,6 +250,8 @@ class Senders:
                     component.stated_us = stated_us
                     component.noise = noise.reported(message, self._noise_settings)
                     component.receiver = message
+                heading = gnss_heading(frame) if message.source == self._carrier_source else None
+                return NO_OUTCOME if heading is None else FrameOutcome(message=heading)
             case SystemTime():
                 change = self.add_stamp(frame)
                 if message.unix_us is not None:

@@ -90,12 +90,17 @@ class CenterSettings(Section):
 
     ``attitude_bound_deg`` bounds the angular error of a vehicle's attitude, mounting included. It
     is raised while the vehicle's estimator contradicts its compass or reports its attitude as
-    invalid. ``turn_acceleration_max_degps2`` bounds its angular acceleration since its newest
-    attitude. If unset it follows from the vehicle type (HEARTBEAT); it is raised if reported rates
-    refute it. Autopilots' headings have errors of a degree or more (simulated: 1.1 degrees in the
-    median; docs/field-notes.md 1).
+    invalid, while a GNSS heading or a second attitude contradicts the reported one, and by a larger
+    stated covariance. If ``follow_attitude_accuracy`` is set, a smaller stated covariance lowers
+    it; ``mount_bound_deg``, the largest error of the array's mounting, is then added.
+    ``turn_acceleration_max_degps2`` bounds its angular acceleration since its newest attitude. If
+    unset it follows from the vehicle type (HEARTBEAT); it is raised if reported rates refute it.
+    Autopilots' headings have errors of a degree or more (simulated: 1.1 degrees in the median;
+    docs/field-notes.md 1).
     """
 
     source: Annotated[str, AfterValidator(_center_text)] | None = None
     attitude_bound_deg: Annotated[float, Field(ge=0, le=180)] = 3.0
+    follow_attitude_accuracy: bool = False
+    mount_bound_deg: Annotated[float, Field(ge=0, le=180)] = 1.0
     turn_acceleration_max_degps2: Annotated[float, Field(ge=0, le=10_000)] | None = None

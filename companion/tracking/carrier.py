@@ -172,7 +172,7 @@ def contradiction(
     second = body_from_ned(after.roll_rad, after.pitch_rad, after.yaw_rad)
     forward = later_body_from_body(body_rates(before), apart_s) @ first @ second.T
     back = later_body_from_body(body_rates(after), -apart_s) @ second @ first.T
-    apart_rad = max(_angle(forward), _angle(back))
+    apart_rad = max(turn_angle_rad(forward), turn_angle_rad(back))
     if apart_rad <= bounds.at(0.0, apart_s, STAMP_S) + bounds.attitude_rad:
         return None
     return Contradiction(apart_rad, apart_s)
@@ -183,7 +183,8 @@ def body_rates(attitude: Attitude) -> FloatArray:
     return np.array([attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps])
 
 
-def _angle(rotation: FloatArray) -> float:
+def turn_angle_rad(rotation: FloatArray) -> float:
+    """Return the angle of a rotation matrix (3, 3), rad."""
     return math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1.0) / 2.0)))
 
 

@@ -229,6 +229,45 @@ class EstimatorStatus:
     compass_ratio: float
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GnssHeading:
+    """Heading that a GNSS receiver with two antennas measures (GPS_RAW_INT, GPS2_RAW).
+
+    link          link over which it came
+    receiver      1 or 2
+    heading_rad   from true north, clockwise
+    accuracy_rad  stated standard deviation; None: not stated
+    """
+
+    t_ns: int
+    source: Source
+    link: str
+    receiver: int
+    heading_rad: float
+    accuracy_rad: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StatedAttitude:
+    """Attitude that a vehicle sends beside ATTITUDE (ATTITUDE_QUATERNION_COV, ODOMETRY).
+
+    link            link over which it came
+    msgid           message that held it
+    ned_from_body   unit quaternion (w, x, y, z); None: the estimate has failed
+    deviations_rad  standard deviations of roll, pitch and yaw; None: unknown
+    """
+
+    t_ns: int
+    source: Source
+    link: str
+    msgid: int
+    ned_from_body: tuple[float, float, float, float] | None
+    deviations_rad: tuple[float, float, float] | None
+
+
+AttitudeEvidence = EstimatorStatus | GnssHeading | StatedAttitude
+"""What a vehicle sends about the error of its attitude."""
+
 Message = (
     Report
     | AdsbVehicle
@@ -238,4 +277,6 @@ Message = (
     | GnssStatus
     | SystemTime
     | EstimatorStatus
+    | GnssHeading
+    | StatedAttitude
 )

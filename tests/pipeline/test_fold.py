@@ -27,6 +27,7 @@ from companion.values import (
     Notice,
     Output,
     Reason,
+    Refuted,
     Rejection,
     RoundTrip,
     Severity,
@@ -344,6 +345,64 @@ def test_attitude_bound_follows_the_estimator_status() -> None:
         assert bound_deg(estimator(at_s, 0.0, flags)) == 180.0
     assert len(notices) == 2
     assert bound_deg(estimator(at_s, 0.0)) == pytest.approx(3.0)
+
+
+def test_gnss_heading_of_the_carrier_that_contradicts_its_attitude_raises_the_bound() -> None:
+    """Other vehicles' headings are not used; neither is a heading before any attitude."""
+
+    def heading(t_s: float, deg: float, source: str = "5:1", receiver: int = 1) -> Frame:
+        if receiver == 2:
+            second = dialect.MAVLink_gps2_raw_message(
+                1, 3, 2, 3, 4, 5, 6, 7, 8, 9, 0, 0, round(100 * deg), 0, 1, 1, 1, 100_000
+            )
+            return sent(t_s, source, second)
+        first = dialect.MAVLink_gps_raw_int_message(
+            1, 3, 2, 3, 4, 5, 6, 7, 8, 9, 0, 1, 1, 1, 100_000, round(100 * deg)
+        )
+        return sent(t_s, source, first)
+
+    for receiver in (1, 2):
+        pipeline = Pipeline(settings())
+        run(pipeline, [heading(0.0, 90, receiver=receiver), attitude(0.1, "5:1")])
+        run(pipeline, [heading(0.2, 90, "1:1", receiver), heading(0.2, 360, receiver=receiver)])
+        assert pipeline.center.attitude_bound_rad == pytest.approx(math.radians(3.0))
+        said = run(pipeline, [heading(0.3, 90, receiver=receiver)])
+        assert pipeline.center.attitude_bound_rad == pytest.approx(math.radians(96.0))
+        (notice,) = (one for one in said if isinstance(one, Notice))
+        assert "96°" in notice.text and "GNSS heading" in notice.text
+        (refuted,) = (one for one in said if isinstance(one, Refuted))
+        assert refuted.setting == "center.attitude_bound_deg"
+        run(pipeline, [heading(0.4, 1, receiver=receiver)])
+        assert pipeline.center.attitude_bound_rad == pytest.approx(math.radians(3.0))
+
+
+def test_what_other_vehicles_say_of_their_attitude_is_not_decoded() -> None:
+    pipeline = Pipeline(settings())
+    invalid = dialect.MAVLink_attitude_quaternion_cov_message(1, (0.0,) * 4, 0, 0, 0, [0.0] * 9)
+    assert run(pipeline, [sent(0.1, "1:1", invalid)]) == []
+    (rejected,) = run(pipeline, [sent(0.1, "5:1", invalid)])
+    assert isinstance(rejected, Rejection)
+    assert rejected.reason is Reason.MALFORMED
+
+
+def test_stated_covariance_raises_the_bound_and_lowers_it_only_if_set() -> None:
+    def stated(variance: float, source: str = "5:1") -> Frame:
+        message = dialect.MAVLink_attitude_quaternion_cov_message(
+            1, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, [variance] * 9
+        )
+        return sent(0.2, source, message)
+
+    for follows, least_rad in ((False, math.radians(3.0)), (True, 0.009 + math.radians(2.0))):
+        center = {"source": "5:1", "follow_attitude_accuracy": follows, "mount_bound_deg": 2.0}
+        pipeline = Pipeline(settings().override(center=center))
+        run(pipeline, [attitude(0.1, "5:1"), stated(0.01, "1:1"), stated(1e-6)])
+        assert pipeline.center.attitude_bound_rad == pytest.approx(least_rad)
+        run(pipeline, [stated(0.01)])
+        added_rad = math.radians(2.0) if follows else 0.0
+        assert pipeline.center.attitude_bound_rad == pytest.approx(0.9 + added_rad)
+        run(pipeline, [position(t_s, "5:1") for t_s in np.arange(0.5, 5, 0.5)])
+        run(pipeline, [position(t_s, "5:1", boot_s=t_s - 3) for t_s in np.arange(5, 8, 0.5)])
+        assert pipeline.center.attitude_bound_rad == pytest.approx(math.radians(3.0))
 
 
 def test_the_carrier_is_never_its_own_target() -> None:

@@ -17,8 +17,8 @@ name is believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
-position or attitude, any message with a time stamp, TIMESYNC, HEARTBEAT, GPS_RAW_INT and
-EKF_STATUS_REPORT.
+position or attitude, any message with a time stamp, TIMESYNC, HEARTBEAT, GPS_RAW_INT, GPS2_RAW
+and EKF_STATUS_REPORT.
 """
 
 import math
@@ -29,6 +29,7 @@ from typing import Final
 
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
 from companion.mavlink.trust.paths import SLACK_M, Path
+from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE
 from companion.mavlink.wire.decode import DECODED, EKF_STATUS_REPORT, GPS_RAW_INT, HEARTBEAT, POSE
 from companion.mavlink.wire.encode import TIMESYNC
 from companion.mavlink.wire.positions import OWN, OwnPosition, read
@@ -51,7 +52,7 @@ NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one se
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
 _ABOUT_SENDER: Final = frozenset(
-    {*STAMPED, *POSE, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT}
+    {*STAMPED, *POSE, *ABOUT_ATTITUDE, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT}
 )
 JUDGED: Final = DECODED | _ABOUT_SENDER
 """Messages that ``refusal`` judges; it accepts all others."""

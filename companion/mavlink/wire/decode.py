@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable
 from typing import Final
 
-from companion.mavlink.wire import accuracy, cot_link, positions, remote_id
+from companion.mavlink.wire import accuracy, attitudes, cot_link, positions, remote_id
 from companion.mavlink.wire.payload import unpack
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, SENDER
 from companion.values import (
@@ -19,6 +19,7 @@ from companion.values import (
     Attitude,
     EstimatorStatus,
     Frame,
+    GnssHeading,
     GnssStatus,
     Message,
     Presence,
@@ -26,12 +27,13 @@ from companion.values import (
     Rejection,
     RemoteId,
     Report,
+    StatedAttitude,
     SystemTime,
 )
 
 HEARTBEAT: Final = 0
 SYSTEM_TIME: Final = 2
-GPS_RAW_INT: Final = 24
+GPS_RAW_INT: Final = attitudes.GPS_RAW_INT
 ATTITUDE: Final = 30
 EKF_STATUS_REPORT: Final = 193
 
@@ -200,7 +202,6 @@ def _heartbeat(frame: Frame) -> Presence:
 
 
 _UNKNOWN: Final = 0xFFFF_FFFF
-_GPS_RAW_INT = struct.Struct("<QiiiHHHHBBiIIIIH")
 
 
 def _accuracy(thousandths: int) -> float | None:
@@ -210,7 +211,7 @@ def _accuracy(thousandths: int) -> float | None:
 
 def _gps_raw_int(frame: Frame) -> GnssStatus:
     """Decode fix type and accuracies; the latter are extension fields, 0 if not sent."""
-    fields = unpack(frame, _GPS_RAW_INT)
+    fields = unpack(frame, attitudes.GPS_RAW_INT_FIELDS)
     h_acc, v_acc, vel_acc = fields[11:14]
     return GnssStatus(
         t_ns=frame.t_ns,
@@ -264,6 +265,13 @@ def _remote_id(frame: Frame) -> RemoteId | None:
         raise _RefusedError(Reason.MALFORMED, str(why)) from why
 
 
+def _about_attitude(frame: Frame) -> GnssHeading | StatedAttitude | None:
+    try:
+        return attitudes.about_attitude(frame)
+    except ValueError as why:
+        raise _RefusedError(Reason.MALFORMED, str(why)) from why
+
+
 def _tunnel(frame: Frame) -> Report | None:
     try:
         return cot_link.report(frame)
@@ -278,6 +286,7 @@ _DECODERS: Final[dict[int, Callable[[Frame], Message | None]]] = {
     ATTITUDE: _attitude,
     **dict.fromkeys(positions.OWN, _own_position),
     EKF_STATUS_REPORT: _ekf_status_report,
+    **dict.fromkeys(attitudes.ABOUT_ATTITUDE, _about_attitude),
     ADSB_VEHICLE: _adsb_vehicle,
     cot_link.TUNNEL: _tunnel,
     **dict.fromkeys(remote_id.READ, _remote_id),

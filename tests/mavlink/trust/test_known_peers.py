@@ -11,6 +11,7 @@ from peer_streams import HOME, LINK, OTHER, Place, S, Stream, beside, circle, he
 from companion.mavlink.trust import known_peers, paths
 from companion.mavlink.trust.duplicate_ids import KEPT_NS
 from companion.mavlink.trust.known_peers import PROBATION_NS, STRANGER, KnownPeers
+from companion.mavlink.wire.attitudes import ATTITUDE_QUATERNION_COV, GPS2_RAW, ODOMETRY
 from companion.mavlink.wire.decode import EKF_STATUS_REPORT, GPS_RAW_INT, HEARTBEAT, SYSTEM_TIME
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, heartbeat, pack
 from companion.mavlink.wire.framing import Splitter
@@ -94,6 +95,9 @@ def test_messages_about_other_aircraft_are_accepted_if_the_known_peer_brings_non
         (GPS_RAW_INT, bytes(29) + b"\1"),
         (HIGH_LATENCY2, bytes(41) + b"\1"),
         (EKF_STATUS_REPORT, bytes(20) + b"\1\4"),
+        (GPS2_RAW, bytes(34) + b"\1"),
+        (ATTITUDE_QUATERNION_COV, bytes(71) + b"\1"),
+        (ODOMETRY, bytes(230) + b"\1"),
     ],
 )
 def test_clocks_and_bounds_are_not_moved_by_strangers(msgid: int, payload: bytes) -> None:

@@ -623,4 +623,4 @@ def test_heartbeat_gives_type_and_autopilot() -> None:
 
 def test_other_messages_are_not_decoded() -> None:
     assert decode(sent(dialect.MAVLink_ping_message(1, 2, 3, 4))) is None
-    assert {0, 2, 24, 30, 33, 193, 235, 246, 385} | REMOTE_ID == DECODED
+    assert {0, 2, 24, 30, 33, 61, 124, 193, 235, 246, 331, 385} | REMOTE_ID == DECODED

@@ -8,6 +8,7 @@ import contextlib
 import itertools
 import json
 import math
+import os
 import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
@@ -21,10 +22,13 @@ from companion.cli.console import OneLineErrors, print_truncated
 from companion.mavlink.links.urls import MAVLINK, LinkUrl, parse_link
 from companion.node.signals import interrupts_held, release_interrupts
 from companion.values import Event, Frame, Reason, Rejection, UserError
-from sitl_replay.faults.asked import Fault, described, in_order
+from sitl_replay.faults.asked import KINDS, Fault, described, in_order
 from sitl_replay.faults.traffic import HELD_MAX, OVERFLOW
 from sitl_replay.flight import scenario
+from sitl_replay.receiver.asked import OPTIONS, receiver_help, receiver_model
+from sitl_replay.receiver.model import ReceiverModel
 from sitl_replay.traffic import player, recorder
+from sitl_replay.traffic.observations import ReceiverPlan, check_url
 
 PROGRESS_EVERY_S = 0.5
 
@@ -55,6 +59,24 @@ def as_duration(_: click.Context, __: click.Parameter, value: str | None) -> flo
 def as_speed(_: click.Context, __: click.Parameter, value: str) -> float | None:
     """Parse a speed factor; None for "max", which sends without waiting."""
     return None if value == "max" else _positive(value, "a positive number or 'max'")
+
+
+def as_receiver(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> ReceiverModel:
+    """Parse the values of ``--receive``. Usage error if one is invalid."""
+    try:
+        return receiver_model(values)
+    except UserError as error:
+        raise click.BadParameter(str(error)) from error
+
+
+def as_service(_: click.Context, __: click.Parameter, value: str | None) -> str | None:
+    """Check the address of a service that takes measurements. Usage error if it is invalid."""
+    try:
+        if value is not None:
+            check_url(value)
+    except UserError as error:
+        raise click.BadParameter(str(error)) from error
+    return value
 
 
 def _url(text: str) -> LinkUrl:
@@ -111,7 +133,7 @@ duration_option = click.option(
     help="Stop after this many seconds.",
 )
 FAULTS = f"""Faults, in the order in which they are applied (the order of the options has no
-effect). The first four belong to the sender and are the same on every link: frames are rewritten
+effect). The first six belong to the sender and are the same on every link: frames are rewritten
 with a valid checksum, and signatures are removed. The others are drawn for each link separately.
 The same --seed and input give the same bytes at the same times. Times are seconds since the start
 (of the log: at --speed 2 they pass twice as fast).
@@ -119,6 +141,15 @@ The same --seed and input give the same bytes at the same times. Times are secon
 {described()}
 
 At most {HELD_MAX} frames are delayed at a time; further ones are lost and counted as {OVERFLOW}."""
+
+
+RECEIVER = f"""With --receiver, a receiver behind the carrier's array measures the direction of each
+UAV. Its measurements (observations) are sent to a running service, which must have
+[observations] enabled = true and, for UDP, the address as [observations] udp. Options:
+
+{receiver_help()}
+
+An error of the carrier's compass and a UAV with a false position are faults: compass and spoof."""
 
 
 @click.group(name="sitl-replay", cls=OneLineErrors)
@@ -130,7 +161,7 @@ def main() -> None:
     """
 
 
-@main.command(epilog=FAULTS)
+@main.command(epilog=f"{FAULTS}\n\n{RECEIVER}")
 @click.argument("name", metavar="SCENARIO", type=click.Choice(list(scenario.BUILDERS)))
 @sending_options
 @click.option(
@@ -153,6 +184,27 @@ def main() -> None:
     type=click.Path(dir_okay=False, writable=True, path_type=Path),
     help="Also write the frames to this tlog (overwritten if it exists).",
 )
+@click.option(
+    "--receiver",
+    metavar="URL",
+    callback=as_service,
+    help="Service that takes the measurements of the carrier's array: http://HOST:PORT or"
+    " udp:HOST:PORT.",
+)
+@click.option(
+    "--receive",
+    "model",
+    metavar="NAME=VALUE",
+    multiple=True,
+    callback=as_receiver,
+    help="Property or error of that receiver (see below). Can be repeated.",
+)
+@click.option(
+    "--token",
+    metavar="FILE",
+    type=click.Path(exists=True, dir_okay=False, readable=True, path_type=Path),
+    help="File with the bearer token for HTTP; without it, COMPANION_TOKEN in the environment.",
+)
 def fly(
     *,
     name: str,
@@ -161,6 +213,9 @@ def fly(
     duration_s: float | None,
     seed: int,
     record: Path | None,
+    receiver: str | None,
+    model: ReceiverModel,
+    token: Path | None,
     faults: list[Fault],
     as_json: bool,
 ) -> None:
@@ -169,15 +224,30 @@ def fly(
     Ends after --duration, or on SIGINT or SIGTERM.
 
     Example: sitl-replay fly paper --to udpout:127.0.0.1:14550 --duration 60 --record paper.tlog
+
+    Example: sitl-replay fly racetrack --to udpout:127.0.0.1:14550 --receiver
+    http://127.0.0.1:8080 --receive bound=2 --receive outliers=0.05 --fault compass@5:1=8
     """
     tally = player.Tally()
+    plan = None if receiver is None else _plan(receiver, model, token)
     urls = [str(url) for url in links]
     try:
         flight = scenario.BUILDERS[name](uavs, seed)
     except UserError as error:
         raise click.BadParameter(f"{name}: {error}", param_hint="'--uavs'") from error
-    run(player.fly(flight, urls, duration_s, seed, record, faults=faults, tally=tally), tally)
+    flying = player.fly(
+        flight, urls, duration_s, seed, record, faults=faults, receiver=plan, tally=tally
+    )
+    run(flying, tally)
     conclude(tally, "sent", as_json)
+
+
+def _plan(url: str, model: ReceiverModel, token: Path | None) -> ReceiverPlan:
+    try:
+        found = os.environ.get("COMPANION_TOKEN") if token is None else token.read_text().strip()
+    except (OSError, ValueError) as error:
+        raise click.BadParameter(f"{token}: {error}", param_hint="'--token'") from error
+    return ReceiverPlan(url=url, token=found, model=model)
 
 
 @main.command(epilog=FAULTS)
@@ -266,7 +336,7 @@ def record(url: LinkUrl, out: Path, duration_s: float | None, as_json: bool) -> 
 @main.command("list")
 @json_option
 def list_scenarios(as_json: bool) -> None:
-    """List the scenarios of `sitl-replay fly`.
+    """List the scenarios of `sitl-replay fly`, and the names of its faults and receiver options.
 
     Example: sitl-replay list
     """
@@ -278,6 +348,11 @@ def list_scenarios(as_json: bool) -> None:
         return
     for one in built:
         click.echo(f"{one.name:9} {one.description}")
+    click.echo(
+        "\nWith --receiver URL the carrier's array measures the directions of the UAVs, with the"
+        f" errors of --receive: {', '.join(OPTIONS)}.\nFaults of senders and links (--fault):"
+        f" {', '.join(KINDS)}.\n`sitl-replay fly --help` describes them."
+    )
 
 
 def frames_of(logs: Sequence[Path], tally: player.Tally) -> Iterator[Frame]:
@@ -349,6 +424,7 @@ def conclude(count: player.Tally | recorder.RecordingTally, done: str, as_json: 
             unusable.append(f", {count.dropped} dropped")
         if isinstance(count, player.Tally):
             unusable += [f", {name}: {number}" for name, number in count.faults.items()]
+            unusable += [f", observations {name}: {n}" for name, n in count.observed.items()]
         sizes = f"{count.frames} frames, {count.octets} bytes in {count.duration_s:.1f} s"
         click.echo(f"{done} {sizes}{''.join(unusable)}")
     if isinstance(count, player.Tally) and count.lost:
@@ -370,5 +446,6 @@ def summary_of(count: player.Tally | recorder.RecordingTally) -> dict[str, Any]:
         "dropped": count.dropped,
         "clamped": count.clamped,
         "faults": dict(count.faults),
+        "observations": dict(count.observed),
         "lost": count.lost,
     }

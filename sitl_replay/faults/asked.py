@@ -12,9 +12,12 @@ from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
 from companion.values import Source, UserError
-from companion.values.errors import shown
+from companion.values.errors import printable, shown
 
 Sender = tuple[int, int]  # system and component id
+
+
+NAME_SHOWN_MAX: Final = 24  # characters of an unknown name in its error, beside all known names
 
 
 class FaultError(UserError):
@@ -97,6 +100,26 @@ KINDS: Final = {
             ),
             meaning="from T s on, the next N GLOBAL_POSITION_INT (default 1) are M metres off",
             example="glitch=30:25:4",
+            is_event=True,
+        ),
+        Kind(
+            name="spoof",
+            bounds=(
+                _FROM,
+                Bound(letter="MPS", low=0.0, high=300.0),
+                Bound(letter="DEG", low=0.0, high=360.0, default=90.0),
+            ),
+            meaning="from T s on, reported positions and velocities drift away at MPS m/s towards"
+            " DEG degrees from north (default 90)",
+            example="spoof@3:1=20:2",
+            is_event=True,
+        ),
+        Kind(
+            name="compass",
+            bounds=(Bound(letter="DEG", low=-180.0, high=180.0), _FROM._replace(default=0.0)),
+            meaning="from T s on (default 0), reported headings (ATTITUDE, GLOBAL_POSITION_INT) are"
+            " DEG degrees too far clockwise",
+            example="compass@5:1=8",
             is_event=True,
         ),
         Kind(
@@ -189,7 +212,8 @@ class Fault:
         name, at, system = left.partition("@")
         kind = KINDS.get(name)
         if kind is None:
-            raise FaultError(f"{shown(name)} is not a fault; give {', '.join(KINDS)}")
+            brief = shown(printable(name)[:NAME_SHOWN_MAX])
+            raise FaultError(f"{brief} is not a fault; give {', '.join(KINDS)}")
         numbers = value.split(":")
         required = sum(bound.default is None for bound in kind.bounds)
         if not required <= len(numbers) <= len(kind.bounds):

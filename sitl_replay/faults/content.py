@@ -6,6 +6,7 @@ payload are truncated). A frame that a fault does not change keeps its bytes. A 
 loses its signature, since there is no key to sign it again.
 """
 
+import math
 import random
 import struct
 from typing import Final
@@ -17,6 +18,7 @@ from companion.mavlink.wire.crc_extra import CRC_EXTRA
 from companion.mavlink.wire.framing import MAGIC_V2, SIGNED
 from sitl_replay.faults.asked import Sender
 
+ATTITUDE: Final = 30
 GLOBAL_POSITION_INT: Final = 33
 
 # fmt: off
@@ -32,6 +34,12 @@ TIME_BOOT_MS_AT: Final[dict[int, int]] = {
 
 _POSITION_AT: Final = 4
 _POSITION: Final = struct.Struct("<iiii")  # lat, lon (degE7), alt, relative_alt (mm)
+_VELOCITY_AT: Final = 20
+_VELOCITY: Final = struct.Struct("<hh")  # vx, vy (cm/s)
+_HEADING_AT: Final = 26  # hdg (cdeg)
+_NO_HEADING: Final = 0xFFFF
+_YAW_AT: Final = 12
+_YAW: Final = struct.Struct("<f")  # yaw in ATTITUDE (rad)
 _WRAP_MS: Final = 1 << 32
 
 
@@ -190,15 +198,75 @@ class Glitch:
         return rewritten(raw, _POSITION_AT, self._beside(position, sender))
 
     def _beside(self, position: bytes, sender: Sender) -> bytes:
-        lat_e7, lon_e7, *altitudes_mm = _POSITION.unpack(position)
         bearing_deg = random.Random(f"{self._seed} {sender}").uniform(0.0, 360.0)
-        lat_deg, lon_deg, _ = pymap3d.aer2geodetic(
-            bearing_deg, el=0.0, srange=self._metres, lat0=lat_e7 / 1e7, lon0=lon_e7 / 1e7, h0=0.0
-        )
-        return _POSITION.pack(round(lat_deg * 1e7), round(lon_deg * 1e7), *altitudes_mm)
+        return moved(position, self._metres, bearing_deg)
 
 
-ContentFault = Drift | Reboot | Frozen | Glitch
+class Spoof:
+    """Fault that makes reports drift away at ``speed_mps`` towards ``course_deg`` from ``at_s`` on.
+
+    Position and velocity agree, as in those of a receiver that follows a forged GNSS signal.
+    Altitudes and headings are unchanged.
+    """
+
+    def __init__(self, at_s: float, speed_mps: float, course_deg: float) -> None:
+        self._at_s = at_s
+        self._speed_mps = speed_mps
+        self._course_deg = course_deg
+
+    def __call__(self, t_s: float, raw: bytes) -> bytes:
+        """Return the frame as sent at ``t_s`` with this fault."""
+        position = _position_of(raw)
+        whole = payload_of(raw, _VELOCITY_AT + _VELOCITY.size)
+        if t_s < self._at_s or position is None or len(whole) < _VELOCITY_AT + _VELOCITY.size:
+            return raw
+        course_rad = math.radians(self._course_deg)
+        north_cmps, east_cmps = _VELOCITY.unpack(whole[_VELOCITY_AT:])
+        north_cmps += 100.0 * self._speed_mps * math.cos(course_rad)
+        east_cmps += 100.0 * self._speed_mps * math.sin(course_rad)
+        metres = (t_s - self._at_s) * self._speed_mps
+        raw = rewritten(raw, _POSITION_AT, moved(position, metres, self._course_deg))
+        return rewritten(raw, _VELOCITY_AT, _VELOCITY.pack(_int16(north_cmps), _int16(east_cmps)))
+
+
+class Compass:
+    """Fault that turns reported headings by ``error_deg``, clockwise positive, from ``at_s`` on."""
+
+    def __init__(self, error_deg: float, at_s: float) -> None:
+        self._error_deg = error_deg
+        self._at_s = at_s
+
+    def __call__(self, t_s: float, raw: bytes) -> bytes:
+        """Return the frame as sent at ``t_s`` with this fault."""
+        if t_s < self._at_s:
+            return raw
+        if msgid_of(raw) == ATTITUDE and len(whole := payload_of(raw, _YAW_AT + 4)) == _YAW_AT + 4:
+            (yaw_rad,) = _YAW.unpack(whole[_YAW_AT:])
+            turned_rad = math.remainder(yaw_rad + math.radians(self._error_deg), math.tau)
+            return rewritten(raw, _YAW_AT, _YAW.pack(turned_rad))
+        if _position_of(raw) is None or len(whole := payload_of(raw, _HEADING_AT + 2)) < 28:
+            return raw
+        heading_cdeg = int.from_bytes(whole[_HEADING_AT:], "little")
+        if heading_cdeg == _NO_HEADING:
+            return raw
+        turned_cdeg = round(heading_cdeg + 100.0 * self._error_deg) % 36_000
+        return rewritten(raw, _HEADING_AT, turned_cdeg.to_bytes(2, "little"))
+
+
+ContentFault = Drift | Reboot | Frozen | Glitch | Spoof | Compass
+
+
+def moved(position: bytes, metres: float, course_deg: float) -> bytes:
+    """Return the position fields of GLOBAL_POSITION_INT, moved horizontally."""
+    lat_e7, lon_e7, *altitudes_mm = _POSITION.unpack(position)
+    lat_deg, lon_deg, _ = pymap3d.aer2geodetic(
+        course_deg, el=0.0, srange=metres, lat0=lat_e7 / 1e7, lon0=lon_e7 / 1e7, h0=0.0
+    )
+    return _POSITION.pack(round(lat_deg * 1e7), round(lon_deg * 1e7), *altitudes_mm)
+
+
+def _int16(value: float) -> int:
+    return max(-32_768, min(32_767, round(value)))
 
 
 def _position_of(raw: bytes) -> bytes | None:

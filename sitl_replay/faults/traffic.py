@@ -14,7 +14,16 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Final, NamedTuple
 
 from sitl_replay.faults.asked import Fault, FaultError, Sender, in_order
-from sitl_replay.faults.content import ContentFault, Drift, Frozen, Glitch, Reboot, sender_of
+from sitl_replay.faults.content import (
+    Compass,
+    ContentFault,
+    Drift,
+    Frozen,
+    Glitch,
+    Reboot,
+    Spoof,
+    sender_of,
+)
 from sitl_replay.faults.link import (
     BitErrors,
     Burst,
@@ -30,7 +39,7 @@ from sitl_replay.faults.link import (
 
 HELD_MAX: Final = 100_000  # maximum of delayed frames over all links; further ones are lost
 OVERFLOW: Final = "overflow"  # name under which these are counted
-CONTENT: Final = frozenset(("drift", "reboot", "frozen", "glitch"))
+CONTENT: Final = frozenset(("drift", "reboot", "frozen", "glitch", "spoof", "compass"))
 """Names of the faults that apply to senders."""
 
 
@@ -161,6 +170,10 @@ def _content(fault: Fault, seed: int) -> ContentFault:
             return Glitch(
                 at_s=at_s, metres=metres, reports=int(reports), seed=f"{seed} {fault} {at_s}"
             )
+        case "spoof", (at_s, speed_mps, course_deg):
+            return Spoof(at_s, speed_mps, course_deg)
+        case "compass", (error_deg, at_s):
+            return Compass(error_deg, at_s)
     raise FaultError(f"{fault} with {len(fault.values)} numbers is not a fault of senders")
 
 

@@ -19,7 +19,9 @@ from sitl_replay.faults.content import msgid_of
 from sitl_replay.faults.traffic import Delivery, Network, Senders
 from sitl_replay.flight.scenario import Scenario
 from sitl_replay.flight.vehicles import schedule
+from sitl_replay.receiver.model import Measured, measurements
 from sitl_replay.traffic.links import TrafficLink, open_link
+from sitl_replay.traffic.observations import ReceiverPlan, observe, open_outlet
 from sitl_replay.traffic.recorder import TlogWriter
 
 log = logging.getLogger(__name__)
@@ -42,6 +44,7 @@ class Tally:
     rejected    unusable data of a log, by reason
     faults      over all links: frames affected by each requested fault
     lost        links that have ended, with the reason
+    observed    measurements of a simulated receiver, sent and failed
     """
 
     frames: int = 0
@@ -53,6 +56,7 @@ class Tally:
     rejected: Counter[str] = field(default_factory=Counter)
     faults: Counter[str] = field(default_factory=Counter)
     lost: list[str] = field(default_factory=list)
+    observed: Counter[str] = field(default_factory=Counter)
 
     def count(self, raw: bytes) -> None:
         """Count one sent frame."""
@@ -75,6 +79,7 @@ async def fly(
     record: Path | None = None,
     *,
     faults: Sequence[Fault] = (),
+    receiver: ReceiverPlan | None = None,
     tally: Tally | None = None,
 ) -> Tally:
     """Send a scenario over ``links`` (see module ``links``), until ``duration_s`` or cancelled.
@@ -86,11 +91,13 @@ async def fly(
         record      tlog of every frame at its scheduled time, with the faults of senders, but not
                     those of links
         faults      faults to inject
+        receiver    receiver behind the carrier's array, whose measurements are sent as well
         tally       counts to update, so that they can be read meanwhile and after a cancellation
 
     Sending starts when every listening link has a peer. Links and tlog are always closed. Raises
     ``LinkError`` for an invalid URL, if a link cannot be opened, or when all links have ended;
-    ``FaultError`` for faults that cannot be combined; ``OSError`` if the tlog cannot be written.
+    ``FaultError`` for faults that cannot be combined; ``UserError`` for an invalid receiver;
+    ``OSError`` if the tlog cannot be written.
     """
     tally = Tally() if tally is None else tally
     senders = Senders(faults, seed, tally.faults)
@@ -107,9 +114,16 @@ async def fly(
                     if writer is not None:  # resumed for the next one, so this one is sent
                         writer.write(epoch_ns + round(t_s * 1e9), raw)
 
-            await _Sending(endpoints=endpoints, network=network, speed=1.0, tally=tally).send_all(
-                due()
+            sending = _Sending(endpoints=endpoints, network=network, speed=1.0, tally=tally)
+            items = (
+                ()
+                if receiver is None
+                else measurements(
+                    scenario, receiver.model, seed, epoch_ns=epoch_ns, duration_s=duration_s
+                )
             )
+            async with _observing(receiver, items, sending.start_s, tally):
+                await sending.send_all(due())
     return tally
 
 
@@ -184,8 +198,26 @@ async def _opened(urls: Sequence[LinkUrl], tally: Tally) -> AsyncIterator[list[T
             await endpoint.close()
 
 
+@contextlib.asynccontextmanager
+async def _observing(
+    plan: ReceiverPlan | None, items: Iterable[Measured], start_s: float, tally: Tally
+) -> AsyncIterator[None]:
+    """Send the measurements of a receiver, if there is one, during a flight and to their end."""
+    if plan is None:
+        yield
+        return
+    outlet = open_outlet(plan, tally.observed)
+    task = asyncio.ensure_future(observe(items, outlet, start_s))
+    try:
+        yield
+        await task
+    finally:
+        task.cancel()
+        await outlet.close()
+
+
 class _Sending:
-    """Run over open links, timed from one start time, so that errors do not accumulate."""
+    """Run over open links, timed from ``start_s``, so that errors do not accumulate."""
 
     def __init__(
         self, *, endpoints: list[TrafficLink], network: Network, speed: float | None, tally: Tally
@@ -196,7 +228,7 @@ class _Sending:
         self._speed = speed
         self._tally = tally
         self._loop = asyncio.get_running_loop()
-        self._start_s = self._loop.time()
+        self.start_s = self._loop.time()
         self._steps = 0
 
     async def send_all(self, items: Iterable[tuple[float, bytes]]) -> None:
@@ -220,7 +252,7 @@ class _Sending:
     async def _until(self, t_s: float) -> None:
         """Wait until a time; even without a wait, let other tasks run."""
         speed = self._speed
-        wait_s = 0.0 if speed is None else self._start_s + t_s / speed - self._loop.time()
+        wait_s = 0.0 if speed is None else self.start_s + t_s / speed - self._loop.time()
         if wait_s > 0.0 or self._steps % BATCH == 0:
             await asyncio.sleep(max(0.0, wait_s))
         self._steps += 1

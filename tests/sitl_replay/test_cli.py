@@ -27,6 +27,8 @@ from sitl_replay.faults.content import sender_of
 from sitl_replay.faults.traffic import Network
 from sitl_replay.flight import scenario
 from sitl_replay.flight.vehicles import schedule
+from sitl_replay.receiver.asked import OPTIONS
+from sitl_replay.traffic.observations import ReceiverPlan
 from sitl_replay.traffic.recorder import TlogWriter
 
 COMMAND = [sys.executable, "-c", "from sitl_replay.cli import main; main()"]
@@ -66,6 +68,9 @@ def url_of(bound: socket.socket, scheme: str = "udpout") -> str:
             ["fly", "paper", "--to", SOMEWHERE, "--fault", "loss=0", "--fault", "loss=1"],
             "loss is given 2 times",
         ),
+        (["fly", "paper", "--to", SOMEWHERE, "--receiver", "9100"], "is not the address of a"),
+        (["fly", "paper", "--to", SOMEWHERE, "--receive", "bias=9"], "'bias=9': allowed: at most"),
+        (["fly", "paper", "--to", SOMEWHERE, "--token", "no-such"], "'no-such' does not exist"),
         (["fly", "paper", "--to", "udpout:127.0.0.1:99999"], "is not a port"),
         (["fly", "paper", "--to", "udpout:no-such-host.invalid:9"], "no-such-host.invalid"),
         (["fly", "paper", "--to", SOMEWHERE, "--uavs", "1001"], "1<=x<=1000"),
@@ -310,6 +315,44 @@ def test_help_describes_every_fault(command: str) -> None:
     text = " ".join(CliRunner().invoke(main, [command, "--help"]).stdout.split())
     for kind in KINDS.values():
         assert f"{kind.form}: {kind.meaning}. Example: {kind.example}" in text
+
+
+def test_fly_sends_the_measurements_of_a_receiver(receiver: socket.socket, tmp_path: Path) -> None:
+    token = tmp_path / "token"
+    token.write_text("0123456789abcdef\n")
+    arguments = ["fly", "hover", "--uavs", "2", "--to", SOMEWHERE, "--duration", "0.3", "--json"]
+    arguments += ["--receiver", url_of(receiver, "udp"), "--receive", "rate=50"]
+    result = CliRunner().invoke(main, [*arguments, "--receive", "lost=0.5", "--token", str(token)])
+    assert result.exit_code == 0
+    sent = json.loads(result.stdout)["observations"]["sent"]
+    assert 2 < sent < 28
+    assert {receiver.recv(4096)[:8] for _ in range(sent)} == {b"UAVOBSRV"}
+
+
+def test_token_is_that_of_the_file_or_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plans = []
+
+    async def fly(*_: object, receiver: ReceiverPlan, **__: object) -> None:
+        plans.append(receiver)
+
+    monkeypatch.setattr("sitl_replay.traffic.player.fly", fly)
+    token = tmp_path / "token"
+    token.write_text("of-the-file\n")
+    monkeypatch.setenv("COMPANION_TOKEN", "of-the-environment")
+    words = ["fly", "hover", "--to", SOMEWHERE, "--receiver", "http://127.0.0.1:9"]
+    for more in ([], ["--token", str(token)]):
+        assert CliRunner().invoke(main, [*words, *more]).exit_code == 0
+    assert [plan.token for plan in plans] == ["of-the-environment", "of-the-file"]
+
+
+def test_help_and_list_name_every_option_of_the_receiver() -> None:
+    text = " ".join(CliRunner().invoke(main, ["fly", "--help"]).stdout.split())
+    listed = CliRunner().invoke(main, ["list"]).stdout
+    for kind in OPTIONS.values():
+        assert f"{kind.form}: {kind.meaning}. Example: {kind.example}" in text
+        assert kind.name in listed
 
 
 def written_as(kind: str, folder: Path, stamps_s: list[float]) -> tuple[Path, list[bytes]]:

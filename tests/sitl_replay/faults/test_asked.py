@@ -19,6 +19,8 @@ from sitl_replay.faults.asked import KINDS, Fault, FaultError, described, in_ord
         ("frozen@3:1=20:5", Fault(name="frozen", values=(20.0, 5.0), sysid=3, compid=1)),
         ("glitch=30:25", Fault(name="glitch", values=(30.0, 25.0, 1.0))),
         ("glitch@0:0=30:25:4", Fault(name="glitch", values=(30.0, 25.0, 4.0), sysid=0, compid=0)),
+        ("spoof=20:2", Fault(name="spoof", values=(20.0, 2.0, 90.0))),
+        ("compass@5:1=-8", Fault(name="compass", values=(-8.0, 0.0), sysid=5, compid=1)),
         ("bit-errors=1e-5", Fault(name="bit-errors", values=(1e-5,))),
     ],
 )
@@ -37,7 +39,7 @@ def test_every_fault_example_parses_and_is_described(kind: object) -> None:
 @pytest.mark.parametrize(
     ("text", "complaint"),
     [
-        ("", "'' is not a fault; give drift, reboot, frozen, glitch, loss, duplication,"),
+        ("", "'' is not a fault; give drift, reboot, frozen, glitch, spoof, compass, loss,"),
         ("los=0.1", "'los' is not a fault; give "),
         ("loss", "'loss': P is '', allowed: 0 to 1; for example loss=0.1"),
         ("loss=1.1", "'loss=1.1': P is '1.1', allowed: 0 to 1; for example loss=0.1"),

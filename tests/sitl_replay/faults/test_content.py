@@ -13,10 +13,12 @@ from support import examples
 
 from sitl_replay.faults.content import (
     TIME_BOOT_MS_AT,
+    Compass,
     Drift,
     Frozen,
     Glitch,
     Reboot,
+    Spoof,
     boot_ms_of,
     msgid_of,
     rewritten,
@@ -268,3 +270,67 @@ def test_message_id_sender_and_sequence_of_both_versions() -> None:
     for v1 in (False, True):
         raw = message.pack(sending(), force_mavlink1=v1)
         assert (msgid_of(raw), sender_of(raw), seq_of(raw)) == (30, (9, 4), 7)
+
+
+@given(
+    speed_mps=st.floats(0.0, 50.0),
+    course_deg=st.floats(0.0, 360.0),
+    since_s=st.floats(0.0, 100.0),
+    velocity=st.tuples(st.integers(-3000, 3000), st.integers(-3000, 3000)),
+)
+@settings(max_examples=examples(60))
+def test_spoofed_positions_and_velocities_drift_alike(
+    speed_mps: float, course_deg: float, since_s: float, velocity: tuple[int, int]
+) -> None:
+    spoof = Spoof(10.0, speed_mps, course_deg)
+    raw = dialect.MAVLink_global_position_int_message(
+        1000, 473_977_419, 85_455_938, 5000, 6000, *velocity, 3, 4
+    ).pack(sending())
+    assert spoof(9.999, raw) is raw
+    got, was = read(spoof(10.0 + since_s, raw)), read(raw)
+    away_m, bearing_deg = vdist(was.lat / 1e7, was.lon / 1e7, got.lat / 1e7, got.lon / 1e7)
+    assert float(away_m) == pytest.approx(speed_mps * since_s, abs=0.02, rel=1e-5)
+    if away_m > 10.0:
+        assert abs(math.remainder(float(bearing_deg) - course_deg, 360.0)) < 0.2
+    course_rad = math.radians(course_deg)
+    assert got.vx - was.vx == pytest.approx(100 * speed_mps * math.cos(course_rad), abs=0.51)
+    assert got.vy - was.vy == pytest.approx(100 * speed_mps * math.sin(course_rad), abs=0.51)
+    unmoved = {name: repr(getattr(got, name)) for name in ("lat", "lon", "vx", "vy")}
+    assert fields(spoof(10.0 + since_s, raw)) == fields(raw) | unmoved
+
+
+def test_spoofed_velocity_stays_in_its_range() -> None:
+    raw = dialect.MAVLink_global_position_int_message(1, 2, 3, 4, 5, 32_000, -32_000, 6, 7).pack(
+        sending()
+    )
+    got = read(Spoof(0.0, 300.0, 315.0)(1.0, raw))
+    assert (got.vx, got.vy) == (32_767, -32_768)
+
+
+@given(error_deg=st.floats(-180.0, 180.0), yaw_rad=st.floats(-math.pi, math.pi))
+def test_compass_turns_attitude_and_heading(error_deg: float, yaw_rad: float) -> None:
+    compass = Compass(error_deg, 5.0)
+    raw = dialect.MAVLink_attitude_message(1, 0.1, 0.2, yaw_rad, 0.3, 0.4, 0.5).pack(sending())
+    assert compass(4.999, raw) is raw
+    turned = compass(5.0, raw)
+    got = read(turned)
+    apart_rad = math.remainder(got.yaw - yaw_rad - math.radians(error_deg), math.tau)
+    assert apart_rad == pytest.approx(0.0, abs=1e-6)
+    assert abs(got.yaw) <= math.pi + 1e-6
+    assert fields(turned) == fields(raw) | {"yaw": repr(got.yaw)}
+    heading_cdeg = round(math.degrees(yaw_rad) * 100) % 36_000
+    where = dialect.MAVLink_global_position_int_message(1, 2, 3, 4, 5, 6, 7, 8, heading_cdeg)
+    raw = where.pack(sending())
+    got = read(compass(5.0, raw))
+    apart_cdeg = math.remainder(got.hdg - heading_cdeg - 100 * error_deg, 36_000)
+    assert abs(apart_cdeg) < 1.0
+    assert got.hdg < 36_000
+    assert fields(compass(5.0, raw)) == fields(raw) | {"hdg": repr(got.hdg)}
+
+
+def test_compass_leaves_unknown_headings_and_other_messages() -> None:
+    compass = Compass(10.0, 0.0)
+    unknown = dialect.MAVLink_global_position_int_message(1, 2, 3, 4, 5, 6, 7, 8, 65_535)
+    for message in (unknown, dialect.MAVLink_heartbeat_message(2, 3, 4, 5, 6, 3)):
+        raw = message.pack(sending())
+        assert compass(1.0, raw) is raw

@@ -58,7 +58,7 @@ def test_without_faults_all_frames_pass_undelayed_on_every_link() -> None:
 def test_faults_are_determined_by_the_seed(text: str) -> None:
     faults = parsed(text)
     assert through(faults, 2, seed=4) == through(faults, 2, seed=4)
-    if faults[0].name in {"drift", "reboot", "frozen", "delay"}:
+    if faults[0].name in {"drift", "reboot", "frozen", "spoof", "compass", "delay"}:
         assert through(faults, seed=5) == through(faults, seed=4)
     elif faults[0].name not in {"glitch", "bit-errors"}:  # 30 s in; too few
         assert through(faults, seed=5)[0] != through(faults, seed=4)[0]
@@ -167,7 +167,7 @@ def test_bit_errors_keep_frame_sizes_and_times() -> None:
 
 @pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: str(kind.name))
 def test_fault_for_one_system_leaves_the_others_unchanged(kind: object) -> None:
-    events = {"reboot": "5", "frozen": "5:5", "glitch": "5:100:3"}
+    events = {"reboot": "5", "frozen": "5:5", "glitch": "5:100:3", "spoof": "5:2", "compass": "8"}
     chances = {"drift": "9000", "delay": "1", "jitter": "1", "burst": "0.5:1", "bit-errors": "0.1"}
     name = kind.name  # type: ignore[attr-defined]
     value = (events | chances).get(name, "0.5")

@@ -78,6 +78,12 @@ export function showReadiness(status) {
 
 const RECORDING_LEVEL = { recording: "good", off: "", degraded: "bad" };
 
+function mountText(observed) {
+  const angle = (name) => `${name} ${observed[`mount_${name}_deg`].toFixed(1)}°`;
+  const error = `The array sees an attitude error of ${observed.error_deg.toFixed(1)}°`;
+  return `${error}. It is corrected. Mount that explains it: ${["roll", "pitch", "yaw"].map(angle).join(", ")}`;
+}
+
 function showCenter(center, behind) {
   const element = $("center");
   if (!center) {
@@ -92,6 +98,12 @@ function showCenter(center, behind) {
     parts.push(where, format.length(center.alt_m), `heading ${format.bearing(center.heading_deg)}`);
   }
   if (format.known(center.age_s)) parts.push(`${format.seconds(center.age_s)} old`);
+  if (format.known(center.attitude_bound_deg) && !center.fixed) {
+    const seen = center.observed?.uavs;
+    const by = seen ? ` by ${seen} observed UAV${seen === 1 ? "" : "s"}` : "";
+    parts.push(`attitude ± ${center.attitude_bound_deg.toFixed(1)}°${by}`);
+  }
+  element.title = center.observed ? mountText(center.observed) : "";
   const old = format.known(center.age_s) && center.age_s > 3;
   element.dataset.level = where === format.UNKNOWN || old ? "warn" : "";
   setText(element, parts.join(" · "));

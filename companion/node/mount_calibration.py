@@ -29,7 +29,7 @@ def suggest(
     without observations.
     """
     pipeline = Pipeline(settings)
-    normal, total = np.zeros((6, 6)), np.zeros(6)
+    normal, total, whole = np.zeros((6, 6)), np.zeros(6), np.zeros(3)
     bounds: list[float] = []
     for event in log_events(logs, settings):
         pipeline.step(event)
@@ -44,6 +44,7 @@ def suggest(
         rows = np.hstack([np.eye(3), body_from_local])
         normal += rows.T @ rows
         total += rows.T @ seen
+        whole += seen
         bounds.append(error.bound_rad)
         if len(bounds) % PROGRESS_EVERY == 0:
             progress(f"{len(bounds)} updates with observations")
@@ -52,17 +53,20 @@ def suggest(
             f"{logs[0]}: no observations of UAVs; record a flight with `[observations] enabled ="
             " true`"
         )
-    parts: FloatArray = np.asarray(np.linalg.solve(normal + 1e-6 * np.eye(6), total), dtype=float)
     values = np.linalg.eigvalsh(normal)
+    is_separate = bool(values[0] > SEPARATE * values[-1])
+    parts: FloatArray = np.concatenate([whole / len(bounds), np.zeros(3)])
+    if is_separate:
+        parts = np.asarray(np.linalg.solve(normal, total), dtype=np.float64)
     before = pipeline.array.array_from_body
     after = before @ rotation(parts[:3])
     return {
         "updates": len(bounds),
         "mount_deg": dict(zip(_NAMES, np.degrees(roll_pitch_yaw_rad(after)).tolist(), strict=True)),
         "change_deg": math.degrees(float(np.linalg.norm(parts[:3]))),
-        "compass_deg": math.degrees(float(np.linalg.norm(parts[3:]))),
+        "compass_deg": math.degrees(float(np.linalg.norm(parts[3:]))) if is_separate else None,
         "bound_deg": math.degrees(float(np.median(bounds))),
-        "separate": bool(values[0] > SEPARATE * values[-1]),
+        "separate": is_separate,
     }
 
 
@@ -72,18 +76,20 @@ _NAMES: Final = ("roll", "pitch", "yaw")
 def text(found: dict[str, Any]) -> str:
     """Return the suggestion as lines for a person, to be copied into the settings."""
     mount = found["mount_deg"]
-    lines = [
-        f"{found['updates']} updates with observations; the mount differs by"
-        f" {found['change_deg']:.2f} degrees from the settings, the compass by"
-        f" {found['compass_deg']:.2f}; the error of the attitude is known within"
-        f" {found['bound_deg']:.2f} degrees (median)",
-        "[array]",
-        *(f"mount_{name}_deg = {mount[name]:.2f}" for name in _NAMES),
-    ]
-    if not found["separate"]:
-        lines.insert(
-            1,
-            "mount and compass are not told apart: the carrier hardly turned; fly with headings of"
-            " all directions",
+    change = f"{found['change_deg']:.2f} degrees"
+    if found["separate"]:
+        parts = f"mount: {change} from the settings; compass: {found['compass_deg']:.2f} degrees"
+    else:
+        parts = (
+            f"mount and compass together: {change}; the carrier hardly turned, so fly with headings"
+            " of all directions to tell them apart"
         )
-    return "\n".join(lines)
+    return "\n".join(
+        (
+            f"{found['updates']} updates with observations; the error of the attitude is known"
+            f" within {found['bound_deg']:.2f} degrees (median)",
+            parts,
+            "[array]",
+            *(f"mount_{name}_deg = {mount[name]:.2f}" for name in _NAMES),
+        )
+    )

@@ -169,8 +169,7 @@ def of_contradicted() -> Blame:
     return Blame(
         Cause.CONTRADICTED,
         f"{Reason.CONTRADICTED_BY_ARRAY}: the array sees it elsewhere than it reports",
-        "check it for GNSS spoofing, a forged sender or a wrong datum; `[observations] follow ="
-        " true` points its beam at the direction that is seen",
+        "check it for GNSS spoofing, a forged sender or a wrong datum",
     )
 
 

@@ -160,6 +160,9 @@ class HealthMonitor:
             parts = angle_parts(link.beam, track, carrier, known.carrier.attitude, known.waited_s)
             coasting = track.state is TrackState.COASTING and track.age_s > COASTING_S
             held = self.verdicts.get(uav)
+            if known.is_contradicted:
+                follows = link.beam.pointing_bound_rad is not None  # the direction that is seen
+                level = min(level, Level.WEAK if follows else Level.NONE, key=lambda one: one.rank)
             if level is not Level.GOOD:
                 good = self._links_kept[uav].good
                 why = blame.of_beam(
@@ -172,8 +175,6 @@ class HealthMonitor:
                     when_good=None if good is None else good[1],
                     before=None if held is None else held.blame,
                 )
-            elif known.is_contradicted:
-                level, why = Level.WEAK, blame.of_contradicted()
             elif coasting:
                 level, why = Level.WEAK, blame.of_coasting(track, known)
             else:

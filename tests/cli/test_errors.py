@@ -112,6 +112,7 @@ def test_every_user_facing_error_is_a_user_error() -> None:
         "SourceLostError",  # the same
         "StalledError",  # the link connects again, announced once
         "_FormatError",  # becomes a Rejection where it is raised
+        "ObservationRecordError",  # becomes a counted Rejection where the record is received
         "FleetMessageError",  # becomes a counted rejected sample
     }
     run = (

@@ -24,6 +24,7 @@ import yaml
 from support import BIN, HANG_S, ROOT, Node, end, line_of, started
 
 from companion.settings.model import Settings
+from tests.cli.test_calibrate_mount import recorded
 
 GUIDES = ("commands", "first-flight", "integrator")
 PAGES = [ROOT / "README.md", *(ROOT / "docs" / f"{name}.md" for name in GUIDES)]
@@ -194,6 +195,13 @@ def checked(words: list[str], where: Path, start_node: Started) -> None:
     assert "nothing received" in done.stdout
 
 
+def calibrated(words: list[str], where: Path, start_node: Started) -> None:
+    """Suggest the mount of a recorded flight with observations."""
+    folder = where / "observed"
+    folder.mkdir()
+    assert "mount_yaw_deg" in run([*words[:-1], str(recorded(folder))], where).stdout
+
+
 def forwarded(words: list[str], where: Path, start_node: Started) -> None:
     """Check MAVProxy's options; MAVProxy itself runs in tests/live."""
     done = run([words[0], "--help"], where)
@@ -215,6 +223,7 @@ RUNNERS: dict[str, Callable[[list[str], Path, Any], None]] = {
     "companion replay --serve": served,
     "companion recover": to_its_end,
     "companion check": checked,
+    "companion calibrate": calibrated,
     "mavproxy.py": forwarded,
     "companion weights": to_its_end,
     "companion export": to_its_end,

@@ -1,139 +1,19 @@
 """Measurements of the array's receiver in the whole pipeline, from frames to beams."""
 
 import math
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from companion.beams.aim import directions
-from companion.beams.array import steering
-from companion.pipeline.fold import Pipeline
-from companion.settings.model import Settings
-from companion.tracking.compass import rotation
-from companion.values import (
-    Cause,
-    Estimate,
-    Event,
-    FloatArray,
-    Level,
-    Notice,
-    Observation,
-    Output,
-    Reason,
-    Rejection,
-    RoundTrip,
-    Severity,
-    Source,
-    Tick,
-    angle_rad,
-)
-from tests.sent_frames import START_NS, attitude, position
-
-STEP_NS = 100_000_000
-BOUND_RAD = math.radians(0.5)
-
-
-class Flight:
-    """A carrier at the origin and UAVs around it, all hovering, with a receiver.
-
-    mount_rad  error of the array's mount, a rotation vector in the body frame
-    false_m    displacement of the reported position of 1:1, north
-    """
-
-    def __init__(
-        self,
-        *,
-        uavs: int = 4,
-        range_m: float = 300.0,
-        mount_rad: FloatArray | None = None,
-        false_m: float = 0.0,
-        **observations: object,
-    ) -> None:
-        self.pipeline = Pipeline(
-            Settings().override(center={"source": "9:1"}, observations=dict(observations))
-        )
-        self.mount = rotation(np.zeros(3) if mount_rad is None else mount_rad)
-        self.range_m = range_m
-        self.false_m = false_m
-        self.uavs = [f"{i}:1" for i in range(1, uavs + 1)]
-        self.t_ns = START_NS
-        self.said: list[Output] = []
-        self.rng = np.random.default_rng(0)
-        self.measures = True
-
-    def offset_ned_m(self, uav: str) -> FloatArray:
-        """Return the true position of a UAV relative to the array."""
-        number = int(uav.partition(":")[0])
-        angle = 2 * math.pi * number / 5
-        return self.range_m * np.array([math.cos(angle), math.sin(angle), -0.3])
-
-    def true_direction(self, uav: str) -> FloatArray:
-        """Return the true direction of a UAV in the frame of the array as it is mounted."""
-        offset = self.offset_ned_m(uav)
-        return np.asarray(self.mount @ offset / np.linalg.norm(offset))
-
-    def observation(self, uav: str) -> Observation:
-        """Return a measurement of now that is off by less than its bound."""
-        aside = np.cross(self.true_direction(uav), self.rng.standard_normal(3))
-        aside *= 0.9 * BOUND_RAD * self.rng.random() / np.linalg.norm(aside)
-        seen = self.true_direction(uav) + aside
-        (azimuth,), (elevation,) = steering.angles_rad((seen / np.linalg.norm(seen))[np.newaxis])
-        return Observation(
-            t_ns=self.t_ns,
-            measured_ns=self.t_ns,
-            uav=uav,
-            azimuth_rad=float(azimuth),
-            elevation_rad=float(elevation),
-            bound_rad=BOUND_RAD,
-        )
-
-    def events(self, seconds: float) -> Iterator[Event]:
-        """Yield the events of a time."""
-        for _ in range(round(seconds * 10)):
-            self.t_ns += STEP_NS
-            at_s = (self.t_ns - START_NS) * 1e-9
-            for uav in ("9:1", *self.uavs):
-                yield RoundTrip(
-                    t_ns=self.t_ns,
-                    source=Source.parse(uav),
-                    sent_ns=self.t_ns - 2_000_000,
-                    remote_ns=self.t_ns - START_NS + 100_000_000_000 - 1_000_000,
-                )
-                lie_m = self.false_m if uav == "1:1" else 0.0
-                offset = np.zeros(3) if uav == "9:1" else self.offset_ned_m(uav)
-                north, east, down = offset.tolist()
-                yield position(at_s, uav, (north + lie_m, east, down))
-            if self.measures:
-                for uav in self.uavs:
-                    yield self.observation(uav)
-            yield attitude(at_s, "9:1")
-            yield Tick(self.t_ns)
-
-    def fly(self, seconds: float) -> None:
-        for event in self.events(seconds):
-            self.said += self.pipeline.step(event)
-
-    def errors_deg(self) -> dict[str, float]:
-        """Return by how much each beam misses its UAV now, and check its bound."""
-        update = self.pipeline.look(self.t_ns)
-        found = {}
-        for beam, towards in zip(update.beams.beams, directions(update.beams), strict=True):
-            off = angle_rad(towards, self.true_direction(beam.uav))
-            assert beam.pointing_bound_rad is None or off <= beam.pointing_bound_rad
-            found[beam.uav] = math.degrees(off)
-        return found
-
-    def notices(self) -> list[Notice]:
-        return [one for one in self.said if isinstance(one, Notice)]
-
+from companion.values import Cause, Estimate, FloatArray, Level, Reason, Rejection, Severity
+from tests.observed_flight import ObservedFlight
 
 MOUNT = np.radians([0.5, -1.0, 1.5])
 
 
 def test_beams_point_at_uavs_although_the_mount_is_wrong() -> None:
-    without, flight = Flight(mount_rad=MOUNT), Flight(mount_rad=MOUNT)
+    without, flight = ObservedFlight(mount_rad=MOUNT), ObservedFlight(mount_rad=MOUNT)
     without.measures = False
     without.fly(5.0)
     flight.fly(5.0)
@@ -146,7 +26,7 @@ def test_beams_point_at_uavs_although_the_mount_is_wrong() -> None:
 
 
 def test_attitude_is_corrected_by_what_is_seen() -> None:
-    flight = Flight(mount_rad=MOUNT, range_m=2000.0)
+    flight = ObservedFlight(mount_rad=MOUNT, range_m=2000.0)
     flight.fly(5.0)
     carrier = flight.pipeline.carrier(flight.t_ns, flight.t_ns)
     assert not isinstance(carrier, str)
@@ -162,7 +42,7 @@ def compass_error_rad(body_from_local: FloatArray, mount: FloatArray) -> float:
 
 
 def test_attitude_is_as_before_once_measurements_have_ended() -> None:
-    flight = Flight(mount_rad=MOUNT, range_m=2000.0)
+    flight = ObservedFlight(mount_rad=MOUNT, range_m=2000.0)
     flight.fly(5.0)
     drift = math.radians(flight.pipeline.settings.observations.drift_max_degps)
     flight.measures = False
@@ -181,7 +61,7 @@ def test_attitude_is_as_before_once_measurements_have_ended() -> None:
 
 
 def test_false_position_is_named_and_the_compass_does_not_move() -> None:
-    flight = Flight(mount_rad=MOUNT)
+    flight = ObservedFlight(mount_rad=MOUNT)
     flight.fly(5.0)
     flight.false_m = 60.0
     flight.said.clear()
@@ -204,7 +84,7 @@ def test_false_position_is_named_and_the_compass_does_not_move() -> None:
 
 
 def test_beam_follows_what_is_seen_if_asked() -> None:
-    flight = Flight(follow=True)
+    flight = ObservedFlight(follow=True)
     flight.fly(4.0)
     flight.false_m = 60.0
     flight.fly(5.0)
@@ -217,7 +97,7 @@ def test_beam_follows_what_is_seen_if_asked() -> None:
 
 @pytest.mark.parametrize("uavs", [1, 2, 4])
 def test_error_beyond_the_bound_is_announced_and_never_blamed_on_a_uav(uavs: int) -> None:
-    flight = Flight(uavs=uavs, range_m=1000.0, mount_rad=np.radians([0.0, 0.0, 8.0]))
+    flight = ObservedFlight(uavs=uavs, range_m=1000.0, mount_rad=np.radians([0.0, 0.0, 8.0]))
     flight.fly(5.0)
     told = [one.text for one in flight.notices() if "center.attitude_bound_deg" in one.text]
     assert told and "the array sees UAVs" in told[0]
@@ -237,7 +117,7 @@ def test_error_beyond_the_bound_is_announced_and_never_blamed_on_a_uav(uavs: int
 def test_measurement_that_cannot_be_used_is_rejected(
     change: dict[str, object], reason: Reason
 ) -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.fly(2.0)
     event = replace(flight.observation("1:1"), **change)  # type: ignore[arg-type]
     (found,) = flight.pipeline.step(event)
@@ -245,7 +125,7 @@ def test_measurement_that_cannot_be_used_is_rejected(
 
 
 def test_measurement_is_rejected_while_the_attitude_is_unknown() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.measures = False
     for event in flight.events(1.0):
         if not (hasattr(event, "msgid") and event.msgid == 30):
@@ -255,7 +135,7 @@ def test_measurement_is_rejected_while_the_attitude_is_unknown() -> None:
 
 
 def test_outliers_are_counted_and_change_nothing() -> None:
-    flight = Flight()
+    flight = ObservedFlight()
     flight.fly(3.0)
     before = flight.errors_deg()
     flight.said.clear()
@@ -271,19 +151,19 @@ def test_outliers_are_counted_and_change_nothing() -> None:
 
 
 def test_estimates_do_not_depend_on_measurements() -> None:
-    with_them, without = Flight(), Flight()
+    with_them, without = ObservedFlight(), ObservedFlight()
     without.measures = False
     with_them.fly(2.0)
     without.fly(2.0)
 
-    def positions(flight: Flight) -> list[object]:
+    def positions(flight: ObservedFlight) -> list[object]:
         return [one.position_ned_m for one in flight.said if isinstance(one, Estimate)]
 
     assert positions(with_them) == positions(without)
 
 
 def test_looks_change_nothing() -> None:
-    flight, watched = Flight(mount_rad=MOUNT), Flight(mount_rad=MOUNT)
+    flight, watched = ObservedFlight(mount_rad=MOUNT), ObservedFlight(mount_rad=MOUNT)
     for event, same in zip(flight.events(3.0), watched.events(3.0), strict=True):
         flight.pipeline.step(event)
         watched.pipeline.step(same)

@@ -20,7 +20,7 @@ from companion.tracking.carrier import USUAL_ATTITUDE
 from companion.tracking.compass import ErrorSet, Misalignment, Seen
 from companion.values import Cap, Carrier, FloatArray, Notice, Reason, Refuted, Severity, angle_rad
 
-UPDATE_NS: Final = 90_000_000  # least time between two estimates of the attitude's error
+UPDATE_NS: Final = 190_000_000  # least time between two estimates of the attitude's error
 FRESH_NS: Final = 1_000_000_000  # age of a UAV's sightings beyond which they say nothing
 PERSISTENT_NS: Final = 1_000_000_000
 """Time for which a UAV must be seen elsewhere than it reports until its position is refuted."""

@@ -278,6 +278,11 @@ class CarrierTracker:
         self.local = LocalFrame(at.lat_deg, at.lon_deg, at.alt_m)
 
     @property
+    def has_attitude(self) -> bool:
+        """Whether an attitude was reported."""
+        return self._attitude is not None
+
+    @property
     def is_contradicted(self) -> bool:
         """Whether the newest attitude contradicts the previous one."""
         return self._contradicted is not None

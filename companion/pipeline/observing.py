@@ -6,7 +6,7 @@ array sees. Raises nothing: a measurement that cannot be used is a rejection wit
 
 import math
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 
 import numpy as np
 
@@ -83,9 +83,14 @@ class Observing:
             return Reason.WRONG_TIME
         if event.uav == self._center.vehicle or event.uav not in self._tracker:
             return Reason.UNKNOWN_UAV
-        if self._pose(event.measured_ns, nearest=False) is None:
-            return Reason.NO_POSE
-        return None
+        return None if self._has_pose else Reason.NO_POSE
+
+    @property
+    def _has_pose(self) -> bool:
+        vehicle = self._center.vehicle
+        if vehicle is None:
+            return self._center.local is not None
+        return self._center.has_attitude and self._tracker.newest(vehicle) is not None
 
     def attitude_reported(self, now_ns: int) -> list[Output]:
         """Place measurements by a new attitude of the carrier."""
@@ -112,10 +117,11 @@ class Observing:
         newest_ns = self._center.newest_attitude_ns(now)
         if newest_ns is None:
             return []
+        reported = cache(partial(self.reported, now_ns))  # a receiver measures several UAVs at once
         wrong = self.uavs.settle(
             newest_ns,
-            pose=partial(self._pose, nearest=True),
-            place=partial(self._place, now_ns),
+            pose=cache(partial(self._pose, nearest=True)),
+            place=lambda uav, at_ns: self._place(uav, now_ns, at_ns, reported(at_ns)),
             bound_rad=self.compass.largest_rad,
         )
         return [Rejection(t_ns=now_ns, source=uav, reason=Reason.OUTLIER) for uav in wrong]
@@ -177,9 +183,11 @@ class Observing:
         newest, at = self._tracker.newest(vehicle), self._senders.stamp_time(vehicle, at_ns)
         return self._center.pose(newest, at, self._turn_degps2(vehicle), nearest=nearest)
 
-    def _place(self, now_ns: int, uav: str, at_ns: int) -> Relative | None:
+    def _place(
+        self, uav: str, now_ns: int, at_ns: int, reported: ReportedCarrier | str
+    ) -> Relative | None:
         """Return a UAV's position relative to the array; None if either is unknown."""
-        track, reported = self._tracker.snapshot(uav), self.reported(now_ns, at_ns)
+        track = self._tracker.snapshot(uav)
         if track is None or isinstance(reported, str):
             return None
         snapshot = UavSnapshot(track, self._senders.timeline(uav))

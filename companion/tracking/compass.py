@@ -199,9 +199,10 @@ def confined(known: ErrorSet, seen: Sequence[Seen], false_uavs: int) -> FloatArr
     left to the set itself.
     """
     tolerates = false_uavs > 0 and len(seen) >= MAJORITY
-    cylinders = sorted((_cylinder(known, one) for one in seen), key=lambda one: one.radius)
-    cylinders = cylinders[:MOST_UAVS]
-    corners, count = known.corners, len(cylinders)
+    corners = known.corners
+    near = sorted(seen, key=lambda one: one.seen.radius_rad + one.reported.radius_rad)[:MOST_UAVS]
+    cylinders = [_cylinder(known.center, corners, one) for one in near]
+    count = len(cylinders)
     axes = np.array([one.axis for one in cylinders])
     offsets = np.array([one.offset for one in cylinders])
     radii = np.array([one.radius for one in cylinders])
@@ -233,18 +234,19 @@ class _Cylinder(NamedTuple):
     radius: float
 
 
-def _cylinder(known: ErrorSet, one: Seen) -> _Cylinder:
+def _cylinder(center: FloatArray, corners: FloatArray, one: Seen) -> _Cylinder:
     """Return what one UAV says of the error.
 
     With a the axis, exp([w]) a differs from a + w x a by at most r = |w| |w x a| / 2. The array
     sees w x a within r and the two bounds of an offset, so that |w x a| is at most their sum.
     """
-    axis, corners = known.center @ one.reported.center, known.corners
-    size = math.sqrt(float((corners * corners).sum(axis=1).max()))
-    turned = np.cross(corners, axis)
-    aside = math.sqrt(float((turned * turned).sum(axis=1).max()))
+    axis = center @ one.reported.center
+    squares, along = np.einsum("ti,ti->t", corners, corners), corners @ axis
+    size = math.sqrt(squares.max())
+    aside = math.sqrt(max((squares - along * along).max(), 0.0))
     radius = _chord(one.seen.radius_rad) + _chord(one.reported.radius_rad)
-    offset = np.cross(axis, one.seen.center - axis)
+    (x, y, z), (a, b, c) = axis.tolist(), one.seen.center.tolist()
+    offset = np.array([y * c - z * b, z * a - x * c, x * b - y * a])
     if size < 1.0:
         seen = one.seen.center - axis
         aside = min(aside, (math.sqrt(seen @ seen) + radius) / (1.0 - size / 2.0))

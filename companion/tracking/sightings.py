@@ -23,6 +23,8 @@ FACETS: Final = 16  # sides of the polygon around the possible directions
 RESTART: Final = 6  # measurements that agree with one another, and not with the set, restart it
 _ANGLES: Final = np.arange(FACETS) * (2 * math.pi / FACETS)
 _FACETS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # (FACETS, 2), normals
+_AHEAD: Final = np.roll(np.arange(FACETS), -1)
+_BEHIND: Final = np.roll(np.arange(FACETS), 1)
 _BETWEEN: Final = 1.0 / math.sin(2 * math.pi / FACETS)
 _CORNER: Final = 1.0 / (2 * math.cos(2 * math.pi / FACETS))
 
@@ -179,8 +181,7 @@ def _enclosed(
     A point of the polygon in direction n from a point o has n between two neighbouring normals, so
     it is no farther from o than the corner of these two sides.
     """
-    ahead, behind = np.roll(extents, -1), np.roll(extents, 1)
-    extents = np.minimum(extents, (ahead + behind) * _CORNER)
+    extents = np.minimum(extents, (extents[_AHEAD] + extents[_BEHIND]) * _CORNER)
     if (extents[: FACETS // 2] + extents[FACETS // 2 :]).min() < 0.0:
         return None
     at = (2.0 / FACETS) * (extents @ _FACETS)
@@ -190,7 +191,7 @@ def _enclosed(
         span = float((extents - _FACETS @ at).max())
         at = wanted if outside <= 0.0 else at + (wanted - at) * span / max(span + outside, 1e-12)
     rest = extents - _FACETS @ at
-    following = np.roll(rest, -1)
+    following = rest[_AHEAD]
     cosine = math.cos(2 * math.pi / FACETS)
     corners = (rest * rest + following * following - 2 * cosine * rest * following).max()
     radius = math.sqrt(corners) * _BETWEEN

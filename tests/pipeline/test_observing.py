@@ -78,7 +78,7 @@ def test_false_position_is_named_and_the_compass_does_not_move() -> None:
     beam = next(b for b in flight.pipeline.look(flight.t_ns).beams.beams if b.uav == "1:1")
     assert beam.pointing_bound_rad is None
     flight.false_m = 0.0
-    flight.fly(6.0)
+    flight.fly(8.0)
     assert flight.pipeline.observing.compass.refuted == []
     assert flight.pipeline.health.verdicts["1:1"].level is not Level.NONE
 

@@ -21,6 +21,7 @@ from companion.mavlink.wire import aircraft_json, cot_link, rid_json, sbs
 from companion.node import observations
 from companion.node.drive import gimbal, rotctld
 from companion.node.fleet import messages
+from companion.pipeline import power_beams
 from companion.recording import background
 from companion.recording.foreign import thinned
 from companion.server import (
@@ -183,6 +184,15 @@ WAYS: Final = (
         work=f"{udp.READ_AT_ONCE} datagrams, or {1e3 * to_loop.SLICE_S:.0f} ms, in an iteration",
         over="dropped before decoding, counted (`too-frequent`, `socket-overflow`)",
         test="tests/node/test_observations.py::test_flood_is_limited_by_the_budget_and_counted",
+    ),
+    WayIn(
+        name="powers in observations",
+        covers=(),
+        size=f"weights of the newest {power_beams.UPDATES_KEPT} updates, at most {16 * power_beams.ENTRIES_KEPT >> 20} MB",
+        items=f"{power_beams.POWERS_PER_S:.0f} observations/s, {power_beams.POWERS_SAVED:.0f} at once",
+        work="one search with a work limit, some milliseconds",
+        over="rejected and counted (`too-frequent`)",
+        test="tests/pipeline/test_power_observations.py::test_powers_beyond_the_budget_are_rejected",
     ),
     WayIn(
         name="files over HTTP",

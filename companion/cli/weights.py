@@ -86,7 +86,7 @@ def weights(
     if update.unfit is not None:
         raise click.ClickException(f"no beams at {at}: {update.unfit}")
     if form == "json":
-        summary = beam_state.beams(pipeline, equipment, update, 0.0, lead_ms)
+        summary = beam_state.beams(pipeline, equipment, update, age_s=0.0, lead_ms=lead_ms)
         body = (
             json.dumps(summary | beam_state.weights(pipeline, update.beams, lead_ms)).encode()
             + b"\n"

@@ -22,6 +22,7 @@ from companion.values import Cap, Carrier, FloatArray, Notice, Reason, Refuted, 
 
 UPDATE_NS: Final = 190_000_000  # least time between two estimates of the attitude's error
 FRESH_NS: Final = 1_000_000_000  # age of a UAV's sightings beyond which they say nothing
+FORGOTTEN_NS: Final = 10_000_000_000  # age of sightings beyond which nothing follows from them
 PERSISTENT_NS: Final = 1_000_000_000
 """Time for which a UAV must be seen elsewhere than it reports until its position is refuted."""
 RAISED: Final = 1.25  # multiple of a refuted bound, and of a proven error, that is assumed then
@@ -100,6 +101,8 @@ class ArrayCompass:
         for uav, record in self._uavs:
             sightings, latest = record.sightings, record.latest
             if sightings is None or latest is None or now_ns - sightings.t_ns > FRESH_NS:
+                if sightings is not None and now_ns - sightings.t_ns > FORGOTTEN_NS:
+                    record.sightings, record.contradicted_ns, record.is_refuted = None, None, False
                 continue
             possible = sightings.possible(self._settings.outliers)
             if possible is None:

@@ -151,22 +151,29 @@ class Equipment:
     unit_gains: UnitGains = RELATIVE  # possible gains of a TMYTEK unit's channels
 
 
+def codebook(settings: Settings, antenna: geometry.Array) -> Codebook | None:
+    """Return the codebook that the settings describe; reads its file. None if there is none.
+
+    Raises ``ConfigError``.
+    """
+    kept = settings.codebook
+    try:
+        if kept.kind == "dft":
+            return codebooks.dft(antenna, kept.oversampling)
+        listed = matrix_of(settings, CODEBOOK)
+        return None if listed is None else codebooks.listed(listed, antenna)
+    except ConfigError:
+        raise
+    except UserError as error:
+        raise ConfigError(f"codebook: {error}") from error
+
+
 def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
     """Return the equipment that the settings describe; reads the files that they name.
 
     Raises ``ConfigError``.
     """
-    kept = settings.codebook
-    codebook = None
-    try:
-        if kept.kind == "dft":
-            codebook = codebooks.dft(antenna, kept.oversampling)
-        elif (listed := matrix_of(settings, CODEBOOK)) is not None:
-            codebook = codebooks.listed(listed, antenna)
-    except ConfigError:
-        raise
-    except UserError as error:
-        raise ConfigError(f"codebook: {error}") from error
+    stored = codebook(settings, antenna)
     device = None if settings.hardware.device is None else Beamformer(settings.hardware.device)
     text = text_of(settings, UNIT)
     try:
@@ -176,7 +183,7 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
     channels = calibration(settings, antenna.size)
     budget, antennas = radio(settings)
     return Equipment(
-        codebook=codebook,
+        codebook=stored,
         calibration=channels,
         budget=budget,
         uav_antennas=antennas,

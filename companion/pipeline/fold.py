@@ -275,6 +275,7 @@ class Pipeline:
         is_old = aiming.local is not self.local
         made = self._aimed_of(self.prepare_update(now_ns)) if is_old else aiming.made
         self.last_update, weighed = made()
+        self.observing.power_beams.add_update(self.updates - 1, self.last_update.beams.weights)
         self.last_carrier = self.last_update.carrier or self.last_carrier
         self._hysteresis = hysteresis.updated(self._hysteresis, self.last_update.beams)
         states = {track.uav: track.state for track in self.last_update.tracks}
@@ -339,6 +340,11 @@ class Pipeline:
         return dropped
 
     # --- queries ----------------------------------------------------------------------------
+
+    @property
+    def newest_number(self) -> int | None:
+        """Number of ``last_update``: updates are counted from 0; None before the first."""
+        return self.updates - 1 if self.updates else None
 
     def look(self, now_ns: int, lead_s: float = 0.0) -> Update:
         """Return targets and beams for ``lead_s`` plus the actuation delay. Changes nothing."""

@@ -13,9 +13,11 @@ import numpy as np
 from companion.beams.aim import SeenDirection
 from companion.beams.array import steering
 from companion.beams.array.geometry import Array
+from companion.beams.worth.directions_by_power import possible_directions
 from companion.pipeline import assumptions
 from companion.pipeline.array_compass import ArrayCompass
 from companion.pipeline.center import CarrierTracker
+from companion.pipeline.power_beams import POWERS_PER_S, PowerBeams
 from companion.pipeline.records import UavRecords
 from companion.pipeline.senders import Senders
 from companion.pipeline.sighted_uavs import Measured, SightedUavs
@@ -24,7 +26,7 @@ from companion.settings.model import Settings
 from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.relative import Relative, relative
 from companion.tracking.tracker import Tracker
-from companion.values import Carrier, Observation, Output, Reason, Refuted, Rejection, Track
+from companion.values import Cap, Carrier, Observation, Output, Reason, Refuted, Rejection, Track
 
 Sights = Callable[[Sequence[Track]], dict[str, SeenDirection]]
 """Function from the UAVs' tracks at the time of use to the directions in which UAVs are seen."""
@@ -49,6 +51,7 @@ class Observing:
         self._senders = senders
         self._tracker = tracker
         self._records = records
+        self.power_beams = PowerBeams(settings, array)
         self.uavs = SightedUavs(settings.observations, array.array_from_body)
         bound_rad = 0.0 if center.vehicle is None else center.attitude_bound_rad
         self.compass = ArrayCompass(settings.observations, self.uavs, bound_rad)
@@ -60,22 +63,85 @@ class Observing:
         why = self._unusable(event)
         if why is not None:
             return [Rejection(t_ns=event.t_ns, source=event.uav, reason=why)]
+        found = self._measured(event) if event.is_direction else self._measured_by_powers(event)
+        if found is None:
+            return []
+        if isinstance(found, Rejection):
+            return [found]
+        self.uavs.add(event.uav, found)
+        return self._settle(event.t_ns)
+
+    @staticmethod
+    def _measured(event: Observation) -> Measured:
         assert event.azimuth_rad is not None and event.elevation_rad is not None
         assert event.bound_rad is not None
         (towards,) = steering.unit_directions(
             np.array([event.azimuth_rad]), np.array([event.elevation_rad])
         )
-        bound_s = event.time_bound_ns * 1e-9
-        self.uavs.add(
-            event.uav,
-            Measured(
-                t_ns=event.measured_ns,
-                direction=towards,
-                bound_rad=event.bound_rad,
-                time_bound_s=bound_s,
-            ),
+        return Measured(
+            t_ns=event.measured_ns,
+            direction=towards,
+            bound_rad=event.bound_rad,
+            time_bound_s=event.time_bound_ns * 1e-9,
         )
-        return self._settle(event.t_ns)
+
+    def _measured_by_powers(self, event: Observation) -> Measured | Rejection | None:
+        """Return the direction that powers show; None if they show no more than is known.
+
+        Only directions in which the reported positions, within their bounds, allow the UAV to be
+        are considered.
+        """
+        rejected = partial(Rejection, t_ns=event.t_ns, source=event.uav)
+        weights = self.power_beams.weights(event)
+        if isinstance(weights, str):
+            return rejected(reason=Reason.MALFORMED, detail=weights)
+        record = self.uavs.get(event.uav)
+        if record is not None and record.is_refuted:
+            return rejected(reason=Reason.CONTRADICTED_BY_ARRAY)
+        within = self._reported_directions(event)
+        if within is None:
+            return None
+        if not self.power_beams.has_room(event.t_ns):
+            limit = f"more than {POWERS_PER_S:.0f} observations of powers a second"
+            return rejected(reason=Reason.TOO_FREQUENT, detail=limit)
+        assert event.power_bound_db is not None
+        cap = possible_directions(
+            self._array,
+            within,
+            weights=weights,
+            powers_db=np.array(event.powers_db),
+            bound_db=event.power_bound_db,
+        )
+        if cap is None:
+            degrees = math.degrees(within.radius_rad)
+            why = f"no direction within {degrees:.1f}° of the reported one explains the powers"
+            return rejected(reason=Reason.OUTLIER, detail=why)
+        if cap.radius_rad >= within.radius_rad:
+            return None
+        return Measured(
+            t_ns=event.measured_ns,
+            direction=cap.center,
+            bound_rad=cap.radius_rad,
+            time_bound_s=event.time_bound_ns * 1e-9,
+        )
+
+    def _reported_directions(self, event: Observation) -> Cap | None:
+        """Return the directions in which a UAV can be by its report at a measurement, array frame.
+
+        By the reported attitude without corrections, which measurements have not changed, and the
+        whole bound on its error. None if the report says nothing.
+        """
+        reported = self.reported(event.t_ns, event.measured_ns)
+        near = self._place(event.uav, event.t_ns, event.measured_ns, reported)
+        pose = self._pose(event.measured_ns, nearest=False)
+        if near is None or pose is None or isinstance(reported, str):
+            return None
+        carrier = reported.carrier
+        misaligned = carrier.attitude_bound_rad - carrier.extrapolation_rad
+        spread = max(misaligned, self.compass.bound_rad) + self.uavs.aged_rad(pose)
+        spread += near.reported.radius_rad + near.swept_rad(event.time_bound_ns * 1e-9)
+        array_from_local = self._array.array_from_body @ pose.body_from_local
+        return Cap(array_from_local @ near.reported.center, min(spread, math.pi))
 
     def _unusable(self, event: Observation) -> Reason | None:
         oldest_ns = round(self._settings.oldest_s * 1e9)

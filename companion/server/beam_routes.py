@@ -43,7 +43,7 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
     )
     async def beams(lead_ms: LeadMs = 0.0, rounded: Rounded = False) -> Response:
         def make(update: Update) -> bytes:
-            shown = beam_state.beams(pipeline, equipment, update, 0.0, lead_ms)
+            shown = beam_state.beams(pipeline, equipment, update, age_s=0.0, lead_ms=lead_ms)
             return encode(as_json.rounded(shown) if rounded else shown)
 
         what = "beams", rounded

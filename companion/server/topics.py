@@ -108,18 +108,21 @@ def _only(topic: Topic, body: Json, uavs: frozenset[str]) -> Json:
 def _beams(node: Node) -> Make[Json]:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
     age_s = (node.now_ns() - update.t_ns) * 1e-9
-    pipeline, equipment = node.pipeline, node.equipment
-    return lambda _: beam_state.beams(pipeline, equipment, update, age_s, 0.0)
+    pipeline, equipment, number = node.pipeline, node.equipment, node.pipeline.newest_number
+    return lambda _: beam_state.beams(
+        pipeline, equipment, update, age_s=age_s, lead_ms=0.0, number=number
+    )
 
 
 def _weights(node: Node) -> Make[Json]:
     update = node.pipeline.last_update or node.pipeline.look(node.now_ns())
-    return lambda _: beam_state.weights(node.pipeline, update.beams, 0.0)
+    number = node.pipeline.newest_number
+    return lambda _: beam_state.weights(node.pipeline, update.beams, 0.0, number)
 
 
 def _records(node: Node) -> Make[RecordBody]:
     pipeline = node.pipeline
-    update, number = pipeline.last_update, max(pipeline.updates - 1, 0)
+    update, number = pipeline.last_update, pipeline.newest_number or 0
     update = update or pipeline.look(node.now_ns())
 
     def made(_way: GivingWay) -> RecordBody:

@@ -39,7 +39,10 @@ class Reason(DescribedEnum):
     UNKNOWN_UAV = "unknown-uav", "observations of a UAV that is not tracked"
     NO_POSE = "no-pose", "observations while the array's position or attitude is unknown"
     WRONG_TIME = "wrong-time", "observations made too long ago, or in the future"
-    OUTLIER = "outlier", "observations that contradict the others of their UAV"
+    OUTLIER = (
+        "outlier",
+        "observations that contradict the others of their UAV, or that no direction explains",
+    )
     CONTRADICTED_BY_ARRAY = (
         "contradicted-by-array",
         "observations of a UAV that the array sees elsewhere than it reports",

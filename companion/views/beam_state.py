@@ -30,6 +30,10 @@ RESPONSE_SAMPLES_MIN: Final = 32  # smallest number, however large the codebook
 RESPONSES_MAX: Final = 2**28
 """Limit on samples times codebook beams times elements, over all UAVs of one answer."""
 FULL_WORK_UAVS: Final = 8  # number of UAVs up to which each gets the full work limit
+NUMBER: Final = (
+    "number of the update that these beams are of, from 0, as in records and for observations of "
+    "powers; null: computed for this answer"
+)
 LEAD: Final = "requested lead: valid_at is this long after the request, or up to 10 ms more"
 
 
@@ -105,6 +109,7 @@ class Beams:
     """The beams that are applied at ``valid_at``."""
 
     made: Annotated[BeamSet, Inline()]
+    update: Annotated[int | None, Meaning(NUMBER)]
     age_s: Annotated[float, Meaning("time since the beams were computed")]
     lead_ms: Annotated[float, Meaning(LEAD)]
     beams: Annotated[list[BeamState], Meaning("the beams, in the order of the weights' columns")]
@@ -122,6 +127,7 @@ class Weights:
     """Complex weights, M rows; columns in the order of ``uavs``."""
 
     made: Annotated[BeamSet, Inline(omit=("groups", "regularised"))]
+    update: Annotated[int | None, Meaning(NUMBER)]
     lead_ms: Annotated[float, Meaning(LEAD)]
     uavs: Annotated[list[str], Meaning("the UAV of each column")]
     groups: Annotated[list[int], Meaning("the time slot of each column, from 0")]
@@ -136,9 +142,15 @@ class Weights:
 
 
 def beams(
-    pipeline: Pipeline, equipment: Equipment, update: Update, age_s: float, lead_ms: float
+    pipeline: Pipeline,
+    equipment: Equipment,
+    update: Update,
+    *,
+    age_s: float,
+    lead_ms: float,
+    number: int | None = None,
 ) -> Json:
-    """Return the answer of ``/v1/beams`` for one update."""
+    """Return the answer of ``/v1/beams`` for one update; ``number`` is None for a look."""
     beam_set, array, unfit = update.beams, pipeline.array, update.unfit
     boresight_deg = None
     if update.carrier is not None:
@@ -147,6 +159,7 @@ def beams(
     azimuth_width, elevation_width = _beamwidths_rad(array)
     shown = Beams(
         made=beam_set,
+        update=number,
         age_s=age_s,
         lead_ms=lead_ms,
         beams=list(_entries(pipeline, equipment, update)),
@@ -260,10 +273,16 @@ def _next_best(
     return codebooks.next_best(codebook, array, directions_at, HORIZON_S, step_s)
 
 
-def weights(pipeline: Pipeline, beam_set: BeamSet, lead_ms: float) -> Json:
-    """Return the answer of ``/v1/beams/weights``: M rows, columns in the order of ``uavs``."""
+def weights(
+    pipeline: Pipeline, beam_set: BeamSet, lead_ms: float, number: int | None = None
+) -> Json:
+    """Return the answer of ``/v1/beams/weights``: M rows, columns in the order of ``uavs``.
+
+    ``number`` is that of the update; None for a look.
+    """
     shown = Weights(
         made=beam_set,
+        update=number,
         lead_ms=lead_ms,
         uavs=list(beam_set.uavs),
         groups=beam_set.slots.tolist(),

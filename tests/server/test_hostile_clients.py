@@ -254,7 +254,7 @@ def test_codebook_work_is_bounded(
 
 def _codebook_answers(node: Any) -> list[dict[str, Any]]:
     update = node.pipeline.last_update
-    shown = beam_state.beams(node.pipeline, node.equipment, update, 0.0, 0.0)
+    shown = beam_state.beams(node.pipeline, node.equipment, update, age_s=0.0, lead_ms=0.0)
     return [beam["codebook"] for beam in shown["beams"]]
 
 

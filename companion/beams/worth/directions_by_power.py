@@ -18,6 +18,9 @@ from companion.beams.worth.cone import ROUNDING_RAD, Boxes, Cells, DirectionCone
 from companion.values import BoolArray, Cap, ComplexArray, FloatArray
 
 BEAMS_MAX: Final = 32  # most powers that are used, the largest ones
+ENTRIES_MAX: Final = 2**14
+"""Limit on beams times elements, which reduces the beams of arrays above 512 elements."""
+BEAMS_MIN: Final = 3  # powers that are used whatever the size of the array
 TOLERANCE: Final = 0.06
 """Size of a cell, relative to the radius of the result, from which it is not split further."""
 RIM: Final = 0.15  # share of that radius, from its edge inward, in which cells are split
@@ -59,7 +62,8 @@ def possible_directions(
     if not 0 <= bound_db < np.inf:
         raise ValueError(f"bound is {bound_db} dB; give a finite one, 0 or more")
     live = np.flatnonzero(array.fed(weights).any(axis=0))
-    used = live[np.argsort(-powers_db[live], kind="stable")[:BEAMS_MAX]]
+    count = min(BEAMS_MAX, max(BEAMS_MIN, ENTRIES_MAX // array.size))
+    used = live[np.argsort(-powers_db[live], kind="stable")[:count]]
     if len(used) < 2:
         return within
     fed = array.fed(weights[:, used])

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from companion.beams.array.elements import ISOTROPIC, Element, ElementPattern
-from companion.beams.array.geometry import Array, uniform_circular
+from companion.beams.array.geometry import Array, listed, uniform_circular
 from companion.beams.array.geometry import uniform_linear as line
 from companion.beams.array.geometry import uniform_rectangular as grid
 from companion.beams.hardware import codebooks
@@ -53,6 +53,14 @@ ARRAYS = {
     "patches": square(8, GPP),
     "dead": broken(square(8)),
     "coupled": coupled(broken(square(4, GPP))),
+    "narrow elements": listed(
+        np.random.default_rng(7).uniform(-0.002, 0.002, (6, 3)),
+        30e9,
+        array_from_body=EYE,
+        element=Element(ElementPattern.COSINE, 12.0),
+        lever_arm_m=None,
+        outward=np.random.default_rng(8).standard_normal((6, 3)) * [0, 1, 1] + [1, 0, 0],
+    ),
     "circle": uniform_circular(16, 30e9, spacing_wavelengths=0.5, array_from_body=EYE, element=GPP),
 }
 ERROR = 0.05  # largest error of a channel's factor

@@ -287,7 +287,7 @@ def test_phaser_memory_holds_the_codebook_and_updates_select_a_beam(
     stored = stored_registers(pipeline.array, equipment)
     wanted = BeamRequest(uavs=("3:1",), any_uav=False, takes=DeviceInput.STORED, stored_beams=32)
     shot = command_of(pipeline, equipment, update, wanted)
-    told = beam_state.beams(pipeline, equipment, update, 0.0, 0.0)
+    told = beam_state.beams(pipeline, equipment, update, age_s=0.0, lead_ms=0.0)
     (beam,) = [one for one in told["beams"] if one["uav"] == "3:1"]
     assert shot.stored == beam["codebook"]["best"]
     assert command_for(told, None, wanted, 0).stored == shot.stored  # the same over HTTP
@@ -356,7 +356,7 @@ def test_mount_points_at_the_centre_of_several_uavs(flown: tuple[DeviceCommand, 
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], EIGHT, "3")
     equipment = assembly.equipment(EIGHT, pipeline.array)
-    told = beam_state.beams(pipeline, equipment, update, 0.0, 0.0)
+    told = beam_state.beams(pipeline, equipment, update, age_s=0.0, lead_ms=0.0)
     two = [beam for beam in told["beams"] if beam["uav"] in ("1:1", "2:1")]
     angles = [np.radians([beam["bearing_deg"], beam["above_horizon_deg"]]) for beam in two]
     mean = sum(

@@ -2,6 +2,8 @@
 
 Joins what the other parts know - the carrier's pose, the UAVs' tracks, their clocks - with what the
 array sees. Raises nothing: a measurement that cannot be used is a rejection with its reason.
+
+Over 300 lines: the way of a measurement, from the event to the beam.
 """
 
 import math

@@ -90,8 +90,7 @@ class Run:
         self.count["outliers"] += len(wrong)
 
     def check_error(self) -> None:
-        error = self.compass.error
-        assert error is not None
+        error = self.compass.error_at(self.carrier())
         self.bounds.append(error.bound_rad)
         made_ns, _, _ = self.world.attitudes[-1]
         aged = math.radians(self.world.settings.drift_max_degps)

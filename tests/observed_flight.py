@@ -9,7 +9,7 @@ from companion.beams.aim import directions
 from companion.beams.array import steering
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
-from companion.tracking.compass import rotation
+from companion.tracking.rotations import rotation
 from companion.values import (
     Event,
     FloatArray,

@@ -12,9 +12,9 @@ import numpy as np
 
 from companion.settings.observations import ObservationSettings
 from companion.tracking.carrier import later_body_from_body
-from companion.tracking.compass import rotation
 from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.relative import Relative, ReportedVelocity
+from companion.tracking.rotations import rotation
 from companion.values import Cap, FloatArray, Vector, angle_rad
 
 STEP_S = 0.005

@@ -52,8 +52,11 @@ UNKNOWN_SHARE: Final = 0.25
 
 In the logs it is 1/20 for positions, and 1/10 to 1/5 for attitudes.
 """
-USUAL_SIGHT: Final = 0.5
-"""Ratio of the 95th percentile of a seen direction's error to its bound."""
+USUAL_SEEN: Final = 0.5
+"""Estimated ratio of the usual (95 %) error of a seen direction to its bound.
+
+In the logs it is 0.1 with a receiver of 0.5 degrees, and 0.4 to 0.6 with one of 5 degrees.
+"""
 MIN_AMPLITUDE: Final = 1e-3
 """Element amplitude below which there is no beam: 60 dB below an isotropic element."""
 
@@ -70,7 +73,7 @@ class SeenDirection(NamedTuple):
     is_alone: bool = False
 
 
-NO_SIGHTS: Final[Mapping[str, SeenDirection]] = MappingProxyType({})
+NO_SEEN_DIRECTIONS: Final[Mapping[str, SeenDirection]] = MappingProxyType({})
 
 
 def aim(
@@ -83,7 +86,7 @@ def aim(
     precoder: Precoder,
     coverage: Coverage = EVERYWHERE,
     before: Hysteresis | None = None,
-    sights: Mapping[str, SeenDirection] = NO_SIGHTS,
+    seen_directions: Mapping[str, SeenDirection] = NO_SEEN_DIRECTIONS,
 ) -> BeamSet:
     """Compute one beam for every eligible track, with nulls on the others.
 
@@ -95,7 +98,7 @@ def aim(
         precoder     how weights are computed
         coverage     directions in which beams may point
         before       state of the last beams, for hysteresis; None: no hysteresis
-        sights       directions in which the array sees UAVs, by UAV
+        seen_directions       directions in which the array sees UAVs, by UAV
 
     The columns of the weights are in the order of ``tracks``. UAVs without a beam are listed with
     the reason.
@@ -108,8 +111,8 @@ def aim(
     if carrier is not None and seen:
         ranges_m, directions = line_of_sight.directions(seen, carrier, array)
         errors = _errors(seen, ranges_m, carrier, array)
-        if sights:
-            directions, errors = _by_sight(seen, directions, errors, sights)
+        if seen_directions:
+            directions, errors = _seen_by_array(seen, directions, errors, seen_directions)
         hidden = _out_of_reach(directions, array, coverage)
         refused |= {track.uav: why for track, why in zip(seen, hidden, strict=True)}
         inside = [i for i, why in enumerate(hidden) if why is None]
@@ -261,25 +264,25 @@ def _errors(
     return found
 
 
-def _by_sight(
+def _seen_by_array(
     tracks: Sequence[Track],
     directions: FloatArray,
     errors: list[tuple[float | None, float]],
-    sights: Mapping[str, SeenDirection],
+    seen_directions: Mapping[str, SeenDirection],
 ) -> tuple[FloatArray, list[tuple[float | None, float]]]:
     """Return directions and errors confined to those in which the array sees the UAVs."""
     directions, errors = directions.copy(), list(errors)
     for i, track in enumerate(tracks):
-        sight = sights.get(track.uav)
-        if sight is None:
+        one = seen_directions.get(track.uav)
+        if one is None:
             continue
         bound, usual = errors[i]
-        if sight.cap is None:
+        if one.cap is None:
             errors[i] = None, usual
-        elif bound is None or sight.cap.radius_rad < bound or sight.is_alone:
-            directions[i] = sight.cap.center
-            likely = USUAL_SIGHT * sight.cap.radius_rad
-            errors[i] = sight.cap.radius_rad, likely if sight.is_alone else min(usual, likely)
+        elif bound is None or one.cap.radius_rad < bound or one.is_alone:
+            directions[i] = one.cap.center
+            likely = USUAL_SEEN * one.cap.radius_rad
+            errors[i] = one.cap.radius_rad, likely if one.is_alone else min(usual, likely)
     return directions, errors
 
 

@@ -10,9 +10,8 @@ import numpy as np
 from companion.node.replay import log_events
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
-from companion.tracking.carrier import roll_pitch_yaw_rad
-from companion.tracking.compass import rotation
-from companion.values import FloatArray, Tick, UserError
+from companion.tracking.rotations import rotation
+from companion.values import FloatArray, Tick, UserError, roll_pitch_yaw_rad
 
 SEPARATE: Final = 0.1
 """Least ratio of eigenvalues at which the parts of mount and compass are told apart."""

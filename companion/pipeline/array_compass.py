@@ -18,6 +18,7 @@ from companion.settings.observations import ObservationSettings
 from companion.tracking import compass
 from companion.tracking.carrier import USUAL_ATTITUDE
 from companion.tracking.compass import ErrorSet, Misalignment, Seen
+from companion.tracking.rotations import angle_between_rad, rotation_angle_rad
 from companion.values import Cap, Carrier, FloatArray, Notice, Reason, Refuted, Severity, angle_rad
 
 UPDATE_NS: Final = 190_000_000  # least time between two estimates of the attitude's error
@@ -78,7 +79,7 @@ class ArrayCompass:
         known = self._by_evidence
         if self._updated is not None:
             before_ns, before = self._updated
-            turned = compass.rotation_angle_rad(before @ carrier.body_from_local.T)
+            turned = angle_between_rad(before, carrier.body_from_local)
             drifted = self._drift_radps * (now_ns - before_ns) * 1e-9
             known = known.grown(drifted + turned * self.largest_rad)
         self._updated = now_ns, carrier.body_from_local
@@ -108,7 +109,7 @@ class ArrayCompass:
             if possible is None:
                 record.sightings = record.latest = None
                 continue
-            near, aged_s = latest[0], (now_ns - sightings.t_ns) * 1e-9
+            near, aged_s = latest[0], abs(now_ns - sightings.t_ns) * 1e-9
             changed = self._drift_radps * aged_s + near.turned_rad(aged_s) * self.largest_rad
             radius = min(possible.radius_rad + changed, math.pi)
             found.append(Seen(uav, near.reported, Cap(possible.center, radius)))
@@ -161,7 +162,7 @@ class ArrayCompass:
             if self.error is not None:
                 return []
         found = self._by_evidence.misalignment()
-        center_rad = compass.rotation_angle_rad(found.center)
+        center_rad = rotation_angle_rad(found.center)
         least_rad = max(least_rad, center_rad - found.bound_rad, limit_rad)
         self.bound_rad = self._raised_rad = RAISED * least_rad
         self.error = self._by_evidence.within_ball(self.bound_rad) or found
@@ -184,7 +185,7 @@ class ArrayCompass:
             return Misalignment(np.eye(3), self.bound_rad)
         updated_ns, before = self._updated
         drifted = self._drift_radps * abs(carrier.valid_at_ns - updated_ns) * 1e-9
-        turned = compass.rotation_angle_rad(before @ carrier.body_from_local.T)
+        turned = angle_between_rad(before, carrier.body_from_local)
         grown = self.error.bound_rad + drifted + turned * self.largest_rad
         if grown >= self.bound_rad:
             return Misalignment(np.eye(3), self.bound_rad)

@@ -366,7 +366,7 @@ class Pipeline:
             unfit = found
         else:
             known = self.observing.compass.corrected(found.carrier)
-        sights = self.observing.sights(snapshots, valid_at_ns, found)
+        seen_directions = self.observing.seen_directions(snapshots, valid_at_ns, found)
         before = self._hysteresis
         spared = self.snapshots(self.targets.protected(self.tracker.uavs))
 
@@ -382,7 +382,7 @@ class Pipeline:
                 precoder=self.precoder,
                 coverage=self.coverage,
                 before=before,
-                sights={} if sights is None else sights(tracks),
+                seen_directions={} if seen_directions is None else seen_directions(tracks),
             )
             if protected:
                 beams = without(beams, {track.uav for track in protected})

@@ -30,7 +30,7 @@ from companion.tracking.relative import Relative, relative
 from companion.tracking.tracker import Tracker
 from companion.values import Cap, Carrier, Observation, Output, Reason, Refuted, Rejection, Track
 
-Sights = Callable[[Sequence[Track]], dict[str, SeenDirection]]
+SeenDirections = Callable[[Sequence[Track]], dict[str, SeenDirection]]
 """Function from the UAVs' tracks at the time of use to the directions in which UAVs are seen."""
 
 
@@ -71,7 +71,7 @@ class Observing:
         if isinstance(found, Rejection):
             return [found]
         self.uavs.add(event.uav, found)
-        return self._settle(event.t_ns)
+        return self._settle(event.t_ns, only=event.uav)
 
     @staticmethod
     def _measured(event: Observation) -> Measured:
@@ -180,7 +180,8 @@ class Observing:
         self.uavs.clear()
         self.compass.forget()
 
-    def _settle(self, now_ns: int) -> list[Output]:
+    def _settle(self, now_ns: int, only: str | None = None) -> list[Output]:
+        """Place measurements by the newest attitude: of all UAVs, or of one."""
         now = self._senders.stamp_time(self._center.vehicle or "", now_ns)
         newest_ns = self._center.newest_attitude_ns(now)
         if newest_ns is None:
@@ -188,6 +189,7 @@ class Observing:
         reported = cache(partial(self.reported, now_ns))  # a receiver measures several UAVs at once
         wrong = self.uavs.settle(
             newest_ns,
+            uavs=None if only is None else (only,),
             pose=cache(partial(self._pose, nearest=True)),
             place=lambda uav, at_ns: self._place(uav, now_ns, at_ns, reported(at_ns)),
             bound_rad=self.compass.largest_rad,
@@ -276,9 +278,9 @@ class Observing:
 
     # --- looks ------------------------------------------------------------------------------
 
-    def sights(
+    def seen_directions(
         self, snapshots: Sequence[UavSnapshot], valid_at_ns: int, reported: ReportedCarrier | str
-    ) -> Sights | None:
+    ) -> SeenDirections | None:
         """Return where the array sees UAVs at a time, as a function for any thread.
 
         None if it sees none.
@@ -291,7 +293,7 @@ class Observing:
         poses = {t_ns: self._pose(t_ns, nearest=False) for t_ns in (*times, valid_at_ns)}
         pose, follows = poses[valid_at_ns], self._settings.follow
 
-        def sights(tracks: Sequence[Track]) -> dict[str, SeenDirection]:
+        def seen_directions(tracks: Sequence[Track]) -> dict[str, SeenDirection]:
             found = {}
             for snapshot, look, track in zip(snapshots, looks, tracks, strict=True):
                 if look is None or pose is None:
@@ -309,4 +311,4 @@ class Observing:
                     found[track.uav] = seen
             return found
 
-        return sights
+        return seen_directions

@@ -6,7 +6,7 @@ turns by its reported rates, within its largest angular acceleration. See docs/m
 """
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Collection, Iterator
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -14,10 +14,11 @@ import numpy as np
 
 from companion.beams.aim import SeenDirection
 from companion.settings.observations import ObservationSettings
-from companion.tracking.compass import Misalignment, rotation
+from companion.tracking.compass import Misalignment
 from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.likely_error import LikelyError
 from companion.tracking.relative import Relative
+from companion.tracking.rotations import rotation
 from companion.tracking.sightings import WINDOW, Motion, Sightings
 from companion.values import Cap, FloatArray
 
@@ -115,12 +116,14 @@ class SightedUavs:
         self,
         newest_ns: int,
         *,
+        uavs: Collection[str] | None = None,
         pose: PoseAt,
         place: Callable[[str, int], Relative | None],
         bound_rad: float,
     ) -> list[str]:
         """Place all measurements that are older than the newest attitude, of ``newest_ns``.
 
+            uavs       UAVs whose measurements are placed; None: all
             pose       the carrier's attitude at a time
             place      a UAV's position relative to the array at a time
             bound_rad  bound on the error of reported attitudes
@@ -128,7 +131,8 @@ class SightedUavs:
         Returns the UAV of each measurement that contradicts the others of that UAV.
         """
         wrong: list[str] = []
-        for uav, record in self._uavs.items():
+        for uav in self._uavs if uavs is None else uavs:
+            record = self._uavs[uav]
             if not record.pending or record.pending[0].t_ns > newest_ns:
                 continue
             ready = [one for one in record.pending if one.t_ns <= newest_ns]
@@ -226,7 +230,7 @@ class SightedUavs:
         to_ns, parts = near.t_ns, []
         if look.sightings is not None:
             before = look.sightings
-            turned_rad = near.turned_rad((to_ns - before.t_ns) * 1e-9)
+            turned_rad = near.turned_rad(abs(to_ns - before.t_ns) * 1e-9)
             motion = self._motion(near, before.t_ns, to_ns, look.bound_rad, turned_rad)
             moved = before.moved(to_ns, motion)
             parts.append((moved.centers, moved.radii_rad + self.aged_rad(pose)))

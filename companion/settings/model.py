@@ -52,6 +52,9 @@ REPLAYED_SECTIONS: Final = frozenset(
 )  # fmt: skip
 """Sections that determine estimates and beams: a replay takes them from the recording."""
 
+ADDRESSES: Final = (("observations", "udp"),)
+"""Keys of these sections that name an address; a replay ignores them."""
+
 
 class NamedFile(NamedTuple):
     """File that a setting names; recordings contain it as an attachment."""
@@ -125,6 +128,8 @@ class Settings(Section):
         found = {
             name: kept for name, kept in sections(text, where).items() if name in REPLAYED_SECTIONS
         }
+        for section, key in ADDRESSES:
+            _table(found, section).pop(key, None)
         attached = {**attached, **_former_files(found, where)}
         files = {}
         for file in NAMED_FILES:

@@ -11,7 +11,8 @@ from typing import Final
 
 import numpy as np
 
-from companion.tracking.carrier import body_from_ned, reported_bound_rad, turn_angle_rad
+from companion.tracking.carrier import body_from_ned, reported_bound_rad
+from companion.tracking.rotations import rotation_angle_rad
 from companion.values import (
     Attitude,
     AttitudeEvidence,
@@ -171,7 +172,7 @@ class AttitudeTrust:
         if stated_rad is not None and assumed.follows_accuracy:
             error_rad = min(error_rad, stated_rad + assumed.mount_rad)
         reported = body_from_ned(newest.roll_rad, newest.pitch_rad, newest.yaw_rad)
-        apart_rad = turn_angle_rad(reported @ _rotation(said.ned_from_body))
+        apart_rad = rotation_angle_rad(reported @ _rotation(said.ned_from_body))
         if apart_rad <= error_rad + own_rad:
             return _Worth(said.t_ns, 0.0, stated_rad)
         return _Worth(said.t_ns, min(math.pi, assumed.bound_rad + apart_rad + own_rad))

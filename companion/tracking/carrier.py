@@ -11,6 +11,7 @@ import numpy as np
 
 from companion.tracking.geodesy import LocalFrame
 from companion.tracking.limits import MAX_PLAUSIBLE_RATIO, RaisedLimit
+from companion.tracking.rotations import rotation, rotation_angle_rad
 from companion.values import Attitude, Carrier, EstimatorStatus, Fix, FloatArray, Refuted, Track
 
 
@@ -32,13 +33,6 @@ def body_from_ned(roll_rad: float, pitch_rad: float, yaw_rad: float) -> FloatArr
     )
 
 
-def roll_pitch_yaw_rad(body_from_ned: FloatArray) -> tuple[float, float, float]:
-    """Return roll, pitch and yaw of a rotation (3, 3): the inverse of ``body_from_ned``."""
-    roll = math.atan2(body_from_ned[1, 2], body_from_ned[2, 2])
-    pitch = math.asin(min(max(-float(body_from_ned[0, 2]), -1.0), 1.0))
-    return roll, pitch, math.atan2(body_from_ned[0, 1], body_from_ned[0, 0])
-
-
 def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> FloatArray:
     """Return the rotation (3, 3) from body axes now to body axes ``interval_s`` later.
 
@@ -46,19 +40,7 @@ def later_body_from_body(body_rates_radps: FloatArray, interval_s: float) -> Flo
     rotation vector -rates * interval; the sign is negative because coordinates rotate opposite to
     the body.
     """
-    x, y, z = (-rate * interval_s for rate in body_rates_radps.tolist())
-    angle = math.sqrt(x * x + y * y + z * z)
-    if angle == 0.0:
-        return np.eye(3)
-    x, y, z = x / angle, y / angle, z / angle
-    sine, rest = math.sin(angle), 1 - math.cos(angle)
-    return np.array(
-        [
-            [1 - rest * (y * y + z * z), rest * x * y - sine * z, rest * x * z + sine * y],
-            [rest * x * y + sine * z, 1 - rest * (x * x + z * z), rest * y * z - sine * x],
-            [rest * x * z - sine * y, rest * y * z + sine * x, 1 - rest * (x * x + y * y)],
-        ]
-    )
+    return rotation(-interval_s * body_rates_radps)
 
 
 USUAL_ATTITUDE: Final = 0.45
@@ -172,7 +154,7 @@ def contradiction(
     second = body_from_ned(after.roll_rad, after.pitch_rad, after.yaw_rad)
     forward = later_body_from_body(body_rates(before), apart_s) @ first @ second.T
     back = later_body_from_body(body_rates(after), -apart_s) @ second @ first.T
-    apart_rad = max(turn_angle_rad(forward), turn_angle_rad(back))
+    apart_rad = max(rotation_angle_rad(forward), rotation_angle_rad(back))
     if apart_rad <= bounds.at(0.0, apart_s, STAMP_S) + bounds.attitude_rad:
         return None
     return Contradiction(apart_rad, apart_s)
@@ -181,11 +163,6 @@ def contradiction(
 def body_rates(attitude: Attitude) -> FloatArray:
     """Return the angular rates of an attitude about the body axes, rad/s."""
     return np.array([attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps])
-
-
-def turn_angle_rad(rotation: FloatArray) -> float:
-    """Return the angle of a rotation matrix (3, 3), rad."""
-    return math.acos(min(1.0, max(-1.0, (float(np.trace(rotation)) - 1.0) / 2.0)))
 
 
 STAMP_S: Final = 1e-3  # largest error of a stamp in whole milliseconds

@@ -2,11 +2,10 @@
 
 The error is a rotation W in the local frame, constant but for a stated rate: the direction u of a
 UAV is seen as W u. It is written as W = exp([w]) V, with V the centre and w, a rotation vector, in
-a polytope that ``DIRECTIONS`` extents describe. A UAV at u, known to ``position_rad``, and seen
-within a cap confines w to a cylinder with the axis V u. At most ``false_uavs`` UAVs may report
-false positions: in each direction all but so many cylinders contain w. See docs/math.md 5.8.
-
-Over 300 lines: the set, and what confines it.
+a polytope that its extents along ``DIRECTIONS`` describe. A UAV that reports to be within one cap,
+and that is seen within another one, confines w to a cylinder about the axis V u. One UAV of three
+or more may report a false position: for each UAV the extents are computed without it, and the
+largest count. See docs/math.md 5.8.
 """
 
 import itertools
@@ -17,6 +16,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from companion.tracking.rotations import cross, rotation, rotation_angle_rad, rotation_vector
 from companion.values import Cap, FloatArray, IntArray, angle_rad, lens
 
 MOST_UAVS: Final = 12  # UAVs that confine the error most are used
@@ -57,23 +57,6 @@ class Seen(NamedTuple):
     uav: str
     reported: Cap  # by its position
     seen: Cap  # by the array, as the reported attitude shows it
-
-
-def rotation(vector_rad: FloatArray) -> FloatArray:
-    """Return exp([w]), (3, 3): the rotation by a rotation vector (3,), Rodrigues' formula."""
-    x, y, z = vector_rad.tolist()
-    angle = math.sqrt(x * x + y * y + z * z)
-    if angle == 0.0:
-        return np.eye(3)
-    cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]]) / angle
-    turned: FloatArray = np.eye(3) + math.sin(angle) * cross
-    return turned + (1.0 - math.cos(angle)) * cross @ cross
-
-
-def rotation_angle_rad(matrix: FloatArray) -> float:
-    """Return the angle of a rotation (3, 3)."""
-    off = matrix - np.eye(3)
-    return 2.0 * math.asin(min(1.0, math.sqrt(float((off * off).sum()) / 8.0)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -157,7 +140,7 @@ class ErrorSet:
             return None
         along, radius = shared
         share = 0.0 if apart == 0.0 else 2.0 * along / apart
-        return Misalignment(rotation(_vector(found.center) * share), 2.0 * radius)
+        return Misalignment(rotation(rotation_vector(found.center) * share), 2.0 * radius)
 
     def recentred(self) -> "ErrorSet":
         """Return the set with V near its centre a, if that is exact enough.
@@ -184,7 +167,7 @@ def prior(bound_rad: float, center: FloatArray) -> FloatArray:
     log(exp([z]) exp([-x])) differs from z - x by at most 0.6 |z| |x| for |z| + |x| below 0.6 rad
     (Baker, Campbell and Hausdorff).
     """
-    x = _vector(center)
+    x = rotation_vector(center)
     size = math.sqrt(x @ x)
     if bound_rad + size > 0.6:
         return np.full(len(DIRECTIONS), bound_rad + size)
@@ -245,8 +228,7 @@ def _cylinder(center: FloatArray, corners: FloatArray, one: Seen) -> _Cylinder:
     size = math.sqrt(squares.max())
     aside = math.sqrt(max((squares - along * along).max(), 0.0))
     radius = _chord(one.seen.radius_rad) + _chord(one.reported.radius_rad)
-    (x, y, z), (a, b, c) = axis.tolist(), one.seen.center.tolist()
-    offset = np.array([y * c - z * b, z * a - x * c, x * b - y * a])
+    offset = cross(axis, one.seen.center)
     if size < 1.0:
         seen = one.seen.center - axis
         aside = min(aside, (math.sqrt(seen @ seen) + radius) / (1.0 - size / 2.0))
@@ -306,11 +288,3 @@ def contradicts(error: Misalignment, one: Seen) -> bool:
 
 def _chord(angle: float) -> float:
     return 2.0 * math.sin(min(angle, math.pi) / 2.0)
-
-
-def _vector(matrix: FloatArray) -> FloatArray:
-    """Return the rotation vector (3,) of a rotation (3, 3) of less than pi/2."""
-    off = matrix - matrix.T
-    sine = np.array([off[2, 1], off[0, 2], off[1, 0]]) / 2.0
-    size = math.sqrt(sine @ sine)
-    return sine if size < 1e-12 else sine * (math.asin(min(1.0, size)) / size)

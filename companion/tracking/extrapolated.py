@@ -10,6 +10,7 @@ from companion.tracking.carrier import (
     body_rates,
     later_body_from_body,
 )
+from companion.tracking.rotations import angle_between_rad
 from companion.values import Attitude, FloatArray
 
 
@@ -32,8 +33,7 @@ class ExtrapolatedAttitude:
 
     def turned_from(self, other: "ExtrapolatedAttitude") -> float:
         """Return a bound on the rotation between two poses."""
-        off = self.body_from_local - other.body_from_local
-        angle = 2.0 * math.asin(min(1.0, math.sqrt(float((off * off).sum()) / 8.0)))
+        angle = angle_between_rad(self.body_from_local, other.body_from_local)
         return angle + self.extrapolation_rad + other.extrapolation_rad
 
     def extrapolated_since(self, earlier: "ExtrapolatedAttitude") -> float:

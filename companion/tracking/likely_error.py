@@ -5,6 +5,7 @@ from typing import Final
 
 import numpy as np
 
+from companion.tracking.rotations import cross
 from companion.values import FloatArray
 
 PRIOR: Final = 0.1  # weight of no error, in measurements
@@ -48,9 +49,7 @@ class LikelyError:
         rows: FloatArray = np.empty((3, 6))
         rows[:, 3:] = np.eye(3) - reported[:, np.newaxis] * reported
         rows[:, :3] = rows[:, 3:] @ body_from_local.T
-        x, y, z = reported.tolist()
-        a, b, c = seen.tolist()
-        across = np.array([y * c - z * b, z * a - x * c, x * b - y * a])
+        across = cross(reported, seen)
         off = across - rows @ self._parts
         size = math.sqrt(off @ off)
         weighted = rows * min(1.0, bound_rad / max(size, 1e-12))

@@ -16,6 +16,7 @@ from typing import Final, Self
 
 import numpy as np
 
+from companion.tracking.rotations import cross
 from companion.values import Cap, FloatArray, angle_rad
 
 WINDOW: Final = 10  # newest measurements of a UAV that are kept
@@ -158,7 +159,7 @@ class Sightings:
         least[int(np.argmin(np.abs(middle)))] = 1.0
         first = least - middle[int(np.argmin(np.abs(middle)))] * middle
         first /= math.sqrt(first @ first)
-        axes = np.stack([first, _cross(middle, first)])
+        axes = np.stack([first, cross(middle, first)])
         ends = _ends(self.centers @ axes.T, self.radii_rad[:, np.newaxis])
         if outliers:
             return axes, np.partition(ends, outliers, axis=0)[outliers]
@@ -201,8 +202,3 @@ def _enclosed(
     center = at @ axes + math.sqrt(1.0 - from_middle**2) * middle
     slope = math.sqrt(1.0 - (from_middle + radius) ** 2)
     return Cap(center, 2.0 * math.asin(min(1.0, radius / (2.0 * slope))))
-
-
-def _cross(one: FloatArray, other: FloatArray) -> FloatArray:
-    (x, y, z), (a, b, c) = one.tolist(), other.tolist()
-    return np.array([y * c - z * b, z * a - x * c, x * b - y * a])

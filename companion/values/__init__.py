@@ -65,6 +65,7 @@ from companion.values.tracked import (
     SenderTime,
     Track,
     TrackState,
+    roll_pitch_yaw_rad,
 )
 
 __all__ = [
@@ -143,6 +144,7 @@ __all__ = [
     "printable",
     "read_toml",
     "reason_invalid",
+    "roll_pitch_yaw_rad",
     "shown",
     "vector",
 ]

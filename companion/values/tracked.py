@@ -233,12 +233,19 @@ class Carrier:
 
     @property
     def roll_rad(self) -> Annotated[float, Meaning("roll, right side down positive")]:
-        return math.atan2(self.body_from_local[1, 2], self.body_from_local[2, 2])
+        return roll_pitch_yaw_rad(self.body_from_local)[0]
 
     @property
     def pitch_rad(self) -> Annotated[float, Meaning("pitch, nose up positive")]:
-        return math.asin(min(max(-self.body_from_local[0, 2], -1.0), 1.0))
+        return roll_pitch_yaw_rad(self.body_from_local)[1]
 
     @property
     def yaw_rad(self) -> Annotated[float, Meaning("yaw of the nose, from true north, clockwise")]:
-        return math.atan2(self.body_from_local[0, 1], self.body_from_local[0, 0])
+        return roll_pitch_yaw_rad(self.body_from_local)[2]
+
+
+def roll_pitch_yaw_rad(rotated_from: FloatArray) -> tuple[float, float, float]:
+    """Return roll, pitch and yaw of a frame by its rotation (3, 3) from another frame."""
+    (ahead, right, down), (_, _, side), (_, _, below) = rotated_from.tolist()
+    pitch = math.asin(min(max(-down, -1.0), 1.0))
+    return math.atan2(side, below), pitch, math.atan2(right, ahead)

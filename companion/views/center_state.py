@@ -6,10 +6,9 @@ from typing import Annotated
 
 from companion.pipeline.fold import Pipeline
 from companion.settings.center import FixedCenter
-from companion.tracking.carrier import roll_pitch_yaw_rad
-from companion.tracking.compass import rotation
 from companion.tracking.geodesy import Place
-from companion.values import Carrier
+from companion.tracking.rotations import rotation
+from companion.values import Carrier, roll_pitch_yaw_rad
 from companion.values.described import Inline, Meaning
 from companion.views.as_json import degrees
 

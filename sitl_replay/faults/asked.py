@@ -7,7 +7,7 @@ depend on the order of the options. ``traffic`` applies them.
 
 import math
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
 
@@ -63,6 +63,21 @@ class Kind(NamedTuple):
         letters = [bound.letter for bound in self.bounds if bound.default is None]
         optional = [f"[:{bound.letter}]" for bound in self.bounds if bound.default is not None]
         return f"{self.name}={':'.join(letters)}{''.join(optional)}"
+
+    def read(self, text: str) -> tuple[float, ...]:
+        """Parse ``NAME=VALUE``. Raises ``FaultError`` with the cause and what is allowed."""
+        numbers = text.partition("=")[2].split(":")
+        required = sum(bound.default is None for bound in self.bounds)
+        if not required <= len(numbers) <= len(self.bounds):
+            raise FaultError(f"{text!r} is not {self.form}, for example {self.example}")
+        try:
+            given = [
+                bound.read(number) for bound, number in zip(self.bounds, numbers, strict=False)
+            ]
+        except FaultError as error:
+            raise FaultError(f"{text!r}: {error}; for example {self.example}") from None
+        defaults = [b.default for b in self.bounds[len(given) :] if b.default is not None]
+        return (*given, *defaults)
 
 
 _SHARE: Final = Bound(letter="P", low=0.0, high=1.0)
@@ -208,25 +223,16 @@ class Fault:
 
         Raises ``FaultError`` with the cause and what is allowed.
         """
-        left, _, value = text.partition("=")
-        name, at, system = left.partition("@")
+        name, at, system = text.partition("=")[0].partition("@")
         kind = KINDS.get(name)
         if kind is None:
             brief = shown(printable(name)[:NAME_SHOWN_MAX])
             raise FaultError(f"{brief} is not a fault; give {', '.join(KINDS)}")
-        numbers = value.split(":")
-        required = sum(bound.default is None for bound in kind.bounds)
-        if not required <= len(numbers) <= len(kind.bounds):
-            raise FaultError(f"{text!r} is not {kind.form}, for example {kind.example}")
         try:
             sysid, compid = _system(system) if at else (None, None)
-            given = [
-                bound.read(number) for bound, number in zip(kind.bounds, numbers, strict=False)
-            ]
         except FaultError as error:
             raise FaultError(f"{text!r}: {error}; for example {kind.example}") from None
-        defaults = [b.default for b in kind.bounds[len(given) :] if b.default is not None]
-        return cls(name=name, values=(*given, *defaults), sysid=sysid, compid=compid)
+        return cls(name=name, values=kind.read(text), sysid=sysid, compid=compid)
 
     def concerns(self, sender: Sender) -> bool:
         """Return whether the fault applies to the frames of a system and component."""
@@ -248,9 +254,9 @@ def in_order(faults: Sequence[Fault]) -> list[Fault]:
     return [fault for _, fault in sorted(zip(whose, faults, strict=True), key=lambda pair: pair[0])]
 
 
-def described() -> str:
-    """Return the help text of all faults, a paragraph each, in the order of application."""
-    return "\n\n".join(f"{k.form}: {k.meaning}. Example: {k.example}" for k in KINDS.values())
+def described(kinds: Iterable[Kind] = KINDS.values()) -> str:
+    """Return the help text of kinds of faults, a paragraph each."""
+    return "\n\n".join(f"{k.form}: {k.meaning}. Example: {k.example}" for k in kinds)
 
 
 def _system(text: str) -> tuple[int, int | None]:

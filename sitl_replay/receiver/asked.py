@@ -7,7 +7,7 @@ from typing import Any, Final
 
 from companion.values import UserError
 from companion.values.errors import shown
-from sitl_replay.faults.asked import Bound, FaultError, Kind
+from sitl_replay.faults.asked import Bound, Kind, described
 from sitl_replay.receiver.model import ReceiverModel
 
 _SHARE: Final = Bound(letter="P", low=0.0, high=1.0)
@@ -114,22 +114,15 @@ def receiver_model(texts: Sequence[str]) -> ReceiverModel:
 
 def receiver_help() -> str:
     """Return the help text of all options, a paragraph each."""
-    return "\n\n".join(f"{k.form}: {k.meaning}. Example: {k.example}" for k in OPTIONS.values())
+    return described(OPTIONS.values())
 
 
 def _parsed(text: str) -> tuple[str, tuple[float, ...]]:
-    name, _, value = text.partition("=")
+    name = text.partition("=")[0]
     kind = OPTIONS.get(name)
     if kind is None:
         raise UserError(f"{shown(name)} is not an option; give {', '.join(OPTIONS)}")
-    numbers = value.split(":")
-    if len(numbers) != len(kind.bounds):
-        raise UserError(f"{text!r} is not {kind.form}, for example {kind.example}")
-    try:
-        pairs = zip(kind.bounds, numbers, strict=True)
-        return name, tuple(bound.read(number) for bound, number in pairs)
-    except FaultError as error:
-        raise UserError(f"{text!r}: {error}; for example {kind.example}") from None
+    return name, kind.read(text)
 
 
 def _field(name: str, values: tuple[float, ...]) -> dict[str, Any]:

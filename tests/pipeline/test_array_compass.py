@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from companion.pipeline.array_compass import ArrayCompass
 from companion.pipeline.sighted_uavs import Measured, SightedUavs
-from companion.tracking.compass import rotation_angle_rad
+from companion.tracking.rotations import rotation_angle_rad
 from companion.values import Carrier, Notice, Refuted
 from tests import sighted_world
 from tests.sighted_world import World

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from companion.tracking import compass
 from companion.tracking.compass import ErrorSet, Misalignment, Seen
+from companion.tracking.rotations import rotation, rotation_angle_rad
 from companion.values import Cap, FloatArray
 from tests.sighted_world import direction, tilted
 
@@ -18,7 +19,7 @@ SEEDS = st.integers(0, 2**32 - 1)
 
 def off_rad(error: Misalignment, true: FloatArray) -> float:
     """Return the angle between an estimated and the true error."""
-    return compass.rotation_angle_rad(error.center.T @ true)
+    return rotation_angle_rad(error.center.T @ true)
 
 
 def seen(rng: np.random.Generator, true: FloatArray, *, position: float, bound: float) -> Seen:
@@ -35,9 +36,9 @@ def test_rotation_is_that_of_scipy() -> None:
     rng = np.random.default_rng(0)
     for size in (0.0, 1e-9, 0.1, 1.0, 3.0):
         vector = direction(rng) * size
-        found = compass.rotation(vector)
+        found = rotation(vector)
         np.testing.assert_allclose(found, Rotation.from_rotvec(vector).as_matrix(), atol=1e-14)
-        assert math.isclose(compass.rotation_angle_rad(found), size, abs_tol=1e-8)
+        assert math.isclose(rotation_angle_rad(found), size, abs_tol=1e-8)
 
 
 @settings(max_examples=200)
@@ -45,7 +46,7 @@ def test_rotation_is_that_of_scipy() -> None:
 def test_true_error_is_in_the_set(seed: int, uavs: int) -> None:
     rng = np.random.default_rng(seed)
     most = float(rng.uniform(0.01, 0.5))
-    true = compass.rotation(direction(rng) * most * float(rng.uniform(0.5, 1)))
+    true = rotation(direction(rng) * most * float(rng.uniform(0.5, 1)))
     known = ErrorSet.within(most)
     for _ in range(4):
         evidence = [
@@ -64,7 +65,7 @@ def test_true_error_is_in_the_set(seed: int, uavs: int) -> None:
         assert off_rad(within, true) <= within.bound_rad + 1e-9
         assert within.bound_rad <= most + 1e-12
         changed = float(rng.uniform(0, 0.05))
-        true = compass.rotation(direction(rng) * changed) @ true
+        true = rotation(direction(rng) * changed) @ true
         known, most = known.grown(changed), most + changed
 
 
@@ -73,9 +74,9 @@ def test_set_grows_by_the_change_of_the_error(size: float) -> None:
     rng = np.random.default_rng(0)
     for _ in range(200):
         axis = direction(rng)
-        known = ErrorSet(compass.rotation(direction(rng) * 0.3), compass.DIRECTIONS @ axis * size)
-        true = compass.rotation(axis * size) @ known.center
-        after = compass.rotation(direction(rng) * 0.1) @ true
+        known = ErrorSet(rotation(direction(rng) * 0.3), compass.DIRECTIONS @ axis * size)
+        true = rotation(axis * size) @ known.center
+        after = rotation(direction(rng) * 0.1) @ true
         error = known.grown(0.1).misalignment()
         assert off_rad(error, after) <= error.bound_rad + 1e-9
         still = known.misalignment()
@@ -84,7 +85,7 @@ def test_set_grows_by_the_change_of_the_error(size: float) -> None:
 
 def test_error_is_known_by_two_uavs() -> None:
     rng = np.random.default_rng(0)
-    true = compass.rotation(np.radians([1.0, -2.0, 0.5]))
+    true = rotation(np.radians([1.0, -2.0, 0.5]))
     known = ErrorSet.within(math.radians(5))
     ahead, aside = np.eye(3)[0], np.eye(3)[1]
     one = [
@@ -112,7 +113,7 @@ def test_error_about_the_line_of_sight_stays_unknown() -> None:
 @given(SEEDS, st.integers(3, 8))
 def test_one_false_uav_never_moves_the_error_out_of_the_set(seed: int, uavs: int) -> None:
     rng = np.random.default_rng(seed)
-    true = compass.rotation(direction(rng) * 0.05)
+    true = rotation(direction(rng) * 0.05)
     known = ErrorSet.within(0.3)
     at = [direction(rng) for _ in range(uavs)]
     for step in range(10):
@@ -137,7 +138,7 @@ def test_one_false_uav_never_moves_the_error_out_of_the_set(seed: int, uavs: int
 
 def test_false_position_contradicts_the_others() -> None:
     rng = np.random.default_rng(0)
-    true = compass.rotation(np.array([0.0, 0.0, 0.05]))
+    true = rotation(np.array([0.0, 0.0, 0.05]))
     known = ErrorSet.within(0.3)
     evidence = [
         Seen(f"{i}:1", Cap(at, 0.01), Cap(tilted(rng, true @ at, 0.009), 0.01))
@@ -153,7 +154,7 @@ def test_false_position_contradicts_the_others() -> None:
 
 def test_error_beyond_the_bound_is_excluded() -> None:
     rng = np.random.default_rng(0)
-    true = compass.rotation(np.array([0.0, 0.0, 0.2]))
+    true = rotation(np.array([0.0, 0.0, 0.2]))
     known = ErrorSet.within(0.5)
     evidence = [seen(rng, true, position=0.01, bound=0.01) for _ in range(4)]
     found = compass.refined(known, evidence, 0)

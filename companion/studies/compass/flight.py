@@ -19,7 +19,7 @@ from companion.studies.compass.receiver import ArrayReceiver, observations
 from companion.studies.prediction.delivery import known_round_trips
 from companion.studies.truth import array_truth, vehicles
 from companion.studies.truth.array_truth import ArrayTruth
-from companion.tracking.compass import rotation
+from companion.tracking.rotations import rotation
 from companion.values import (
     BeamSet,
     Cap,
@@ -290,7 +290,7 @@ def _aimed(
         array=pipeline.array,
         precoder=replace(pipeline.precoder, widen=widen),
         coverage=pipeline.coverage,
-        sights={
+        seen_directions={
             uav: SeenDirection(Cap(found, 1e-6), is_alone=True) for uav, found in towards.items()
         },
     )

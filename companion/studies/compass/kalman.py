@@ -10,7 +10,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.tracking.compass import rotation
+from companion.tracking.rotations import rotation
 from companion.values import FloatArray
 
 CONFIDENCE: Final = 0.997  # share of errors that the ellipse should contain

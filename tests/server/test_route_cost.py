@@ -41,6 +41,8 @@ UAVS = 2000
 CLIENTS = 8
 ROUNDS = 5
 RECORDED = "companion-20261120T130000Z.mcap"
+ACCESSORIES = (*range(100, 106), 154, *range(171, 176), *range(191, 195))
+"""Components beside the autopilots of a system: cameras, gimbals, onboard computers."""
 FILLED = {
     "/v1/uavs/{uav}": "/v1/uavs/10:1",
     "/v1/pattern": "/v1/pattern?uav=10:1",  # of all beams at once it is refused
@@ -87,7 +89,10 @@ def crowded(uavs: int, directory: Path) -> StandIn:
         node.advance(0.1)
         for index in range(uavs):
             source = Source(*ids(index))
-            heard[source] = ComponentStatus(frames=7, gaps=1, heard_ns=node.now_ns(), mavlink=2)
+            for compid in (source.compid, *ACCESSORIES):
+                heard[Source(source.sysid, compid)] = ComponentStatus(
+                    frames=7, gaps=1, heard_ns=node.now_ns(), mavlink=2
+                )
             raws = [(GLOBAL_POSITION_INT, report(index, number, 100_000 + 100 * number))]
             raws += [(HEARTBEAT, heartbeat(index, 0))] if number == 0 else []
             for msgid, raw in raws:

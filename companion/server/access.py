@@ -9,6 +9,7 @@ import math
 import socket
 import sys
 from collections.abc import Collection
+from functools import lru_cache
 from typing import Final
 from urllib.parse import urlsplit
 
@@ -137,6 +138,7 @@ class KnownHosts:
         return all(name in self._names or _is_address(name) for name in names)
 
 
+@lru_cache(maxsize=64)
 def _host_name(host: str) -> str:
     """Return name or address of a Host header, without port, brackets and trailing dot."""
     name = host.strip().lower()
@@ -145,6 +147,7 @@ def _host_name(host: str) -> str:
     return name.partition(":")[0].removesuffix(".")
 
 
+@lru_cache(maxsize=64)
 def _is_address(name: str) -> bool:
     try:
         ipaddress.ip_address(name)

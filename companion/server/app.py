@@ -7,7 +7,7 @@ from typing import Annotated, Final
 from fastapi import FastAPI, HTTPException, Request, WebSocket
 from fastapi import Path as PathParameter
 from fastapi.responses import Response
-from starlette.types import ASGIApp, Message, Receive, Scope, Send
+from starlette.types import ASGIApp
 
 import companion
 from companion.server import area_map, beam_routes, file_routes, models, responses
@@ -17,6 +17,7 @@ from companion.server.large_answers import FEW_ITEMS, LargeAnswers, Make
 from companion.server.metrics import NodeMetrics
 from companion.server.observation_routes import add_observations
 from companion.server.page import PageFiles, web_directory
+from companion.server.repeated_answers import RepeatedAnswers
 from companion.server.responses import (
     BodyResponse,
     answer,
@@ -27,6 +28,7 @@ from companion.server.responses import (
     json_response,
     refusals,
 )
+from companion.server.security_headers import SecurityHeaders
 from companion.server.stream import Stream
 from companion.server.threads import in_thread
 from companion.server.work_slots import WorkSlots
@@ -38,17 +40,15 @@ from companion.views.design import Design, DesignView
 from companion.views.link_state import Links
 from companion.views.state import Node
 
-CONTENT_POLICY: Final = b"default-src 'self'; frame-ancestors 'none'"
-DRAWN_POLICY: Final = CONTENT_POLICY + b"; style-src 'self' 'unsafe-inline'; img-src 'self' data:"
-"""Content security policy of ``/docs``: Swagger UI uses embedded images and inline styles."""
 Rounded = beam_routes.Rounded
 UavId = Annotated[str, PathParameter(description=UAV_FORMS)]
 DESCRIPTION: Final = """Location-aware beamforming from MAVLink. Read only, except observations.
 
 Angles in degrees, distances in metres; null means unknown, never 0. Estimates are computed for
-the time of the request, given as `valid_at`, so answers have no ETag. Errors are
-`application/problem+json` (RFC 9457). `WS /v1/stream?uav=…&topic=…&rate_hz=…` sends `uavs`,
-`beams`, `weights`, `status`, `links`, `fleet` and `events` as they change, and `records` in binary.
+the time of the request, within 10 ms, given as `valid_at`. Short answers have an ETag, for
+conditional requests. Errors are `application/problem+json` (RFC 9457).
+`WS /v1/stream?uav=…&topic=…&rate_hz=…` sends `uavs`, `beams`, `weights`, `status`, `links`,
+`fleet` and `events` as they change, and `records` in binary.
 """
 
 
@@ -107,7 +107,7 @@ def create_app(
 
     # Not mounted: a mount at / would match paths with a wrong method first, and hide the 405.
     app.router.default = page
-    secured: ASGIApp = _Edge(app)
+    secured: ASGIApp = RepeatedAnswers(SecurityHeaders(app), node)
     if token:
         open_paths = OPEN_PATHS | page.paths
         secured = BearerToken(app=secured, token=token, open_paths=open_paths, wrong=wrong_tokens)
@@ -265,36 +265,3 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
             return make
 
         return json_response(await large.of_uavs("design", prepare))
-
-
-class _Edge:
-    """ASGI middleware that handles HEAD requests and adds security headers.
-
-    HEAD is handled as GET, and the server omits the body. The headers allow a page to load nothing
-    from elsewhere.
-    """
-
-    def __init__(self, app: ASGIApp) -> None:
-        self._app = app
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http":
-            await self._app(scope, receive, send)
-            return
-        if scope["method"] == "HEAD":
-            scope = {**scope, "method": "GET"}
-        policy = DRAWN_POLICY if scope["path"] == "/docs" else CONTENT_POLICY
-
-        async def with_policy(message: Message) -> None:
-            if message["type"] == "http.response.start":
-                headers = [
-                    *message.get("headers", []),
-                    (b"content-security-policy", policy),
-                    (b"x-content-type-options", b"nosniff"),
-                ]
-                if not any(name == b"cache-control" for name, _ in headers):
-                    headers.append((b"cache-control", b"no-cache"))
-                message["headers"] = headers
-            await send(message)
-
-        await self._app(scope, receive, with_policy)

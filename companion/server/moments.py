@@ -20,6 +20,11 @@ EVERY_NS: Final = 10_000_000  # time between two moments
 T = TypeVar("T")
 
 
+def moment_of(now_ns: int) -> int:
+    """Return the number of the next moment."""
+    return -(-now_ns // EVERY_NS)
+
+
 class Moments:
     """Answers of one node for the current moment, used on its event loop."""
 
@@ -40,7 +45,7 @@ class Moments:
         Raises what ``make`` raises, and ``HTTPException`` 503 if the work slots are full.
         """
         now_ns = self._node.now_ns()
-        moment = -(-now_ns // EVERY_NS)
+        moment = moment_of(now_ns)
         if moment != self._moment:
             self._moment = moment
             self._reads.clear()

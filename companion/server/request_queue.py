@@ -17,6 +17,8 @@ REQUESTS_PER_S: Final = 500.0  # requests of all connections, before those over 
 REQUESTS_SAVED: Final = 1000.0
 BESIDE_WORK_S: Final = 0.005
 """Time between two requests over a budget while a thread computes, seconds."""
+LOOK_AGAIN_S: Final = 0.001
+"""Time between two checks whether the threads still compute, seconds."""
 
 Start = Callable[[], None]
 
@@ -50,22 +52,22 @@ class RequestQueue:
         while left and self._prompt:
             self._prompt.popleft()()
             left -= 1
-        now_s = asyncio.get_running_loop().time()
-        while left and self._late and now_s >= self._late_from_s:
+        while left and self._late and self._may_start_late():
             if self._is_busy():
-                self._late_from_s = now_s + BESIDE_WORK_S
+                self._late_from_s = asyncio.get_running_loop().time() + BESIDE_WORK_S
             self._late.popleft()()
             left -= 1
         self._schedule()
 
+    def _may_start_late(self) -> bool:
+        return not self._is_busy() or asyncio.get_running_loop().time() >= self._late_from_s
+
     def _schedule(self) -> None:
-        """Continue in the next iteration, or when the next request over a budget may start."""
+        """Continue in the next iteration if a request may start, else look again soon."""
         loop = asyncio.get_running_loop()
-        wait_s = 0.0 if self._prompt else self._late_from_s - loop.time()
-        if self._wakes is not None:
-            self._wakes.cancel()
-            self._wakes = None
-        if self._prompt or (self._late and wait_s <= 0):
+        if self._prompt or (self._late and self._may_start_late()):
+            if self._wakes is not None:
+                self._wakes.cancel()
             self._wakes = loop.call_soon(self._start_some)
-        elif self._late:
-            self._wakes = loop.call_later(wait_s, self._start_some)
+        elif self._late and self._wakes is None:
+            self._wakes = loop.call_later(LOOK_AGAIN_S, self._start_some)

@@ -46,7 +46,7 @@ from companion.views.lateness import Lateness
 from companion.views.series import Series
 from companion.views.state import RecordingStatus, ReplayStatus
 
-SLICE_S: Final = 0.005
+SLICE_S: Final = 0.001
 """Longest time that the replay blocks the event loop."""
 MEASURED_AT_ONCE: Final = 20_000
 """Events read between two checks for a stop, while the log's length is measured."""

@@ -22,7 +22,7 @@ from companion.views.as_json import Json, Utc, as_json, rfc3339, rounded
 from companion.views.state import Node
 from companion.views.uav_state import KnownUav, Overview
 
-FEW_UAVS: Final = 24  # UAVs up to which the event loop answers at once, within 2 ms
+FEW_UAVS: Final = 12  # UAVs up to which the event loop answers at once, within 1 ms
 FEW_ITEMS: Final = 100  # the same for smaller items: components, offers
 SLICE: Final = 64  # UAVs read in one iteration of the event loop
 

@@ -2,8 +2,7 @@
 
 Measured is the processor time of the event loop's thread in each callback, which neither other
 threads nor other processes add to. It is compared with that of the same route with a few UAVs, and
-with the time of an answer about ``FEW_UAVS``, which the loop computes itself: many UAVs may add
-three times that.
+with the time of an answer about ``UNIT_UAVS``: many UAVs may add three times that.
 """
 
 import asyncio
@@ -28,7 +27,6 @@ from companion.mavlink.links.status import ComponentStatus, LinkStatus
 from companion.server import large_answers
 from companion.server.app import create_app
 from companion.server.giving_way import NEVER
-from companion.server.large_answers import FEW_UAVS
 from companion.server.observation_routes import PATH as OBSERVATIONS
 from companion.server.topics import Topic
 from companion.values import Frame, Source
@@ -38,6 +36,7 @@ from companion.views.series import EVERY_NS, SAMPLES
 from .conftest import StandIn, settings
 
 UAVS = 2000
+UNIT_UAVS = 24
 CLIENTS = 8
 ROUNDS = 5
 RECORDED = "companion-20261120T130000Z.mcap"
@@ -240,8 +239,8 @@ def held_by_topic(serving: Serving, topic: Topic, monkeypatch: pytest.MonkeyPatc
 
 
 def answer_s(node: StandIn) -> float:
-    """Return how long the event loop is held by an answer about ``FEW_UAVS`` UAVs."""
-    names, took_s = node.pipeline.tracker.uavs[:FEW_UAVS], []
+    """Return how long an answer about ``UNIT_UAVS`` UAVs takes."""
+    names, took_s = node.pipeline.tracker.uavs[:UNIT_UAVS], []
     for _ in range(ROUNDS):
         begun_s = time.thread_time()
         known = uav_state.known_uavs(node.pipeline, names)

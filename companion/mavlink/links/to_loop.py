@@ -11,7 +11,7 @@ QUEUE_MAX: Final = 20_000
 """Most calls that may wait for the event loop; more are dropped and counted."""
 BYTES_MAX: Final = 64 << 20
 """Most bytes that the waiting calls may hold; calls beyond it are dropped and counted."""
-SLICE_S: Final = 0.003  # time slice, after which other work of the event loop runs
+SLICE_S: Final = 0.001  # time slice, after which other work of the event loop runs
 
 
 class ToLoop:

@@ -130,12 +130,13 @@ class Run:
 
         Raises ``OSError`` if the recording cannot be written.
         """
-        digest = self.pipeline.digest.hexdigest()
-        recording = self.writer.close({"digest": digest}) if self.writer else None
+        found = self.pipeline.digest
+        digests = {"digest": found.hexdigest(), "digest_estimates": found.of_estimates()}
+        recording = self.writer.close(digests) if self.writer else None
         return summary(self.pipeline, self.tally) | {
             "wall_s": self.took_s,
             "recording": str(recording) if recording else None,
-            "digest": digest,
+            **digests,
         }
 
 

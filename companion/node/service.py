@@ -192,7 +192,8 @@ class Service:
         if self._live:
             await asyncio.to_thread(self._live.stop)
         if self._recorder:
-            metadata = {"digest": self.pipeline.digest.hexdigest()}
+            found = self.pipeline.digest
+            metadata = {"digest": found.hexdigest(), "digest_estimates": found.of_estimates()}
             await asyncio.to_thread(self._recorder.stop, metadata)
             self._notify_recorder_state(self._recorder)
 

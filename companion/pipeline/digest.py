@@ -11,10 +11,15 @@ _NUMBERS: Final = struct.Struct("<q4d")
 
 
 class Digest:
-    """SHA-256 over all estimates and weights, in order."""
+    """SHA-256 over all estimates and weights, in order; and over the estimates alone.
+
+    Weights depend on the order of sums and on instructions such as fused multiplication and
+    addition, which differ between kinds of processors. Estimates and predictions do not.
+    """
 
     def __init__(self) -> None:
         self._hash = hashlib.sha256()
+        self._estimates = hashlib.sha256()
 
     def add(self, output: Estimate | Update) -> None:
         """Add one output to the digest: little-endian doubles and integers, names in UTF-8."""
@@ -30,8 +35,14 @@ class Digest:
     def _estimate(
         self, uav: str, t_ns: int, position_ned_m: Sequence[float], bound_m: float
     ) -> None:
-        self._hash.update(uav.encode() + _NUMBERS.pack(t_ns, *position_ned_m, bound_m))
+        data = uav.encode() + _NUMBERS.pack(t_ns, *position_ned_m, bound_m)
+        self._hash.update(data)
+        self._estimates.update(data)
 
     def hexdigest(self) -> str:
-        """Return the digest so far."""
+        """Return the digest so far, equal for equal events on processors of one kind."""
         return self._hash.hexdigest()
+
+    def of_estimates(self) -> str:
+        """Return the digest of estimates and predictions, equal on all processors."""
+        return self._estimates.hexdigest()

@@ -4,6 +4,7 @@ Over 300 lines: it connects all parts of the running service.
 """
 
 import asyncio
+import math
 import socket
 import time
 from collections import deque
@@ -43,6 +44,7 @@ from companion.settings.origins import Origins
 from companion.values import (
     Blame,
     ClockSet,
+    Estimate,
     Event,
     Frame,
     Notice,
@@ -61,6 +63,7 @@ from companion.views.served import FleetStatus
 from companion.views.state import ObservationCounts, RecordingStatus, overload
 
 HELD_UP_S: Final = 0.02  # lateness of a tick from which links are read before it
+QUICK_S: Final = 0.001  # duration of updates that the event loop computes, with update = "report"
 READ_FIRST_S: Final = 0.1  # longest time for that
 READ_ROUNDS: Final = 3  # least number of iterations of the event loop for that
 WAIT_NS: Final = 20_000_000  # wait for this machine that does not matter for beams
@@ -94,9 +97,13 @@ class Service:
         self.series = Series()
         self._area = area_map.find(settings.page.map)
         self._ticked = asyncio.Event()
+        self._reported = asyncio.Event()  # one of these has reported since the last update:
+        self._awaited = frozenset[str]()
+        self._update_s = math.inf  # time that the last update took
         self._is_behind = False
         self._aimer = ThreadPoolExecutor(1, "beams")
         self._settings = settings
+        self._by_reports = settings.beams.update == "report"
         self._say = say
         self._timeline = clock or NodeClock()
         self._started_ns = self._timeline.now_ns()
@@ -229,6 +236,8 @@ class Service:
         for output in outputs:
             if isinstance(output, Notice):
                 self._show(output)
+            elif isinstance(output, Estimate) and output.fix.uav in self._awaited:
+                self._reported.set()
 
     def _follow_wall_clock(self) -> None:
         offset_ns = self._timeline.set_to_ns()
@@ -318,8 +327,9 @@ class Service:
         """Tick at the update rate; ticks missed while the loop was blocked are skipped.
 
         Beams are computed on a separate thread, so that events and requests are processed
-        meanwhile. Updates take at most half of the time: with too many UAVs for the rate there are
-        fewer updates, and no frame is lost.
+        meanwhile; beams of a few UAVs are computed directly, which takes less time than a thread.
+        Updates take at most half of the time: with too many UAVs for the rate there are fewer
+        updates, and no frame is lost.
         """
         loop = asyncio.get_running_loop()
         period_s = 1 / self._settings.beams.update_hz
@@ -344,13 +354,27 @@ class Service:
             self._ticked.set()  # wakes all current waiters;
             self._ticked.clear()  # later ones wait for the next tick
             ended_s = loop.time()
-            due_s = max(due_s + period_s, ended_s + spent_s + (ended_s - began_s))
+            rested_s = ended_s + spent_s + (ended_s - began_s)
+            due_s = max(due_s + period_s, rested_s)
+            if self._by_reports and await self._reported_before(due_s, rested_s):
+                due_s = loop.time()
+                continue
             await asyncio.sleep(due_s - loop.time())
             late_s = loop.time() - due_s
             self.lateness.observe(late_s)
             if late_s > HELD_UP_S:
                 self.arrival_lag.held_up(self.now_ns(), round(late_s * 1e9))
                 await self._read_first()
+
+    async def _reported_before(self, due_s: float, rested_s: float) -> bool:
+        """Wait for a report, from ``rested_s`` on; return whether there is one before ``due_s``."""
+        await asyncio.sleep(rested_s - asyncio.get_running_loop().time())
+        try:
+            async with asyncio.timeout_at(due_s):
+                await self._reported.wait()
+        except TimeoutError:
+            return False
+        return True
 
     async def _read_first(self) -> None:
         """Let the links read what arrived while the event loop was held up.
@@ -365,7 +389,7 @@ class Service:
             await asyncio.sleep(0)
 
     async def _update(self) -> float:
-        """Predict the UAVs, and compute the beams on a thread; the first beams directly.
+        """Predict the UAVs, and compute the beams on a thread; quick and first beams directly.
 
         The first request must already find an update. Returns the seconds used, on the loop and of
         the processor.
@@ -373,10 +397,11 @@ class Service:
         loop, now_ns = asyncio.get_running_loop(), self._timeline.now_ns
         began_s = loop.time()
         waited_ns = self.arrival_lag.waiting_ns(now_ns())
+        self._reported.clear()
         self._step(
             Tick(
                 now_ns(),
-                in_two=self.pipeline.updates > 0,
+                in_two=self.pipeline.updates > 0 and not self._is_quick(),
                 waited_ns=waited_ns if waited_ns > WAIT_NS else 0,
             )
         )
@@ -386,7 +411,14 @@ class Service:
             began_s = loop.time()
             self._step(Tock(now_ns()))
             spent_s += loop.time() - began_s
+        if self._by_reports and self.pipeline.last_update is not None:
+            self._awaited = frozenset(self.pipeline.last_update.beams.uavs)
+        self._update_s = spent_s
         return spent_s
+
+    def _is_quick(self) -> bool:
+        """Return whether beams may be computed directly: a thread would take longer."""
+        return self._by_reports and self._update_s < QUICK_S
 
     # --- interface of the server ------------------------------------------------------------
 

@@ -101,6 +101,8 @@ class BeamSettings(Section):
 
         update_hz          rate at which weights are computed for recordings and the dashboard; for
                            an HTTP request, weights are computed for the time that it asks for
+        update             what starts an update: the "timer" of ``update_hz``, or besides it each
+                           "report" of a UAV with a beam, for the least delay of pushed weights
         actuation_delay_s  time from computing weights to applying them
         targets            which tracks get beams
         most               largest number of UAVs with beams: those of ``priority`` first, then
@@ -132,6 +134,7 @@ class BeamSettings(Section):
     """
 
     update_hz: Annotated[float, Field(ge=1e-3, le=1000)] = 10.0
+    update: Literal["timer", "report"] = "timer"
     actuation_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.01
     targets: Literal["telemetry", "all"] = "telemetry"
     most: Annotated[int, Field(ge=1, le=4096)] = 256

@@ -9,6 +9,7 @@ the digests, the last beams, and their weights as hexadecimal numbers.
 
 import json
 import math
+import socket
 import struct
 import sys
 from collections.abc import Iterator
@@ -50,6 +51,13 @@ def frames(index: int, number: int) -> bytes:
     if number % FRAMES_HZ == 1:
         return frame(ids, number % 256, HEARTBEAT, struct.pack("<IBBBBB", 4, 2, 3, 217, 4, 3))
     return frame(ids, number % 256, RAW_IMU, bytes(SIZES[RAW_IMU] - 1) + b"\1")
+
+
+def socket_to(port: int) -> socket.socket:
+    """Return a socket that sends datagrams to a port of this machine."""
+    sender = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sender.connect(("127.0.0.1", port))
+    return sender
 
 
 def arrivals(uavs: int, seconds: float) -> Iterator[tuple[int, int, bytes]]:

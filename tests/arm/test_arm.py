@@ -11,7 +11,7 @@ from typing import Any, Final
 
 import pytest
 from arm import flight
-from support import ROOT, shared_log
+from support import HANG_S, ROOT, shared_log
 
 from companion.node.replay import replay, settings_for
 
@@ -20,6 +20,7 @@ pytestmark = [
     pytest.mark.full,
     pytest.mark.skipif(not PYTHON.exists(), reason="no arm64: tests/arm/make_root.sh makes it"),
 ]
+EMULATED: Final = 20  # slowness of an emulated processor
 WEIGHTS_TO: Final = 1e-11
 """Largest difference of a weight of unit norm: both processors round sums in another order."""
 
@@ -27,7 +28,8 @@ WEIGHTS_TO: Final = 1e-11
 def on_arm(*arguments: object) -> Any:
     """What a command of the arm64 interpreter prints, from JSON."""
     command = [str(PYTHON), *map(str, arguments)]
-    return json.loads(subprocess.run(command, capture_output=True, check=True).stdout)
+    done = subprocess.run(command, capture_output=True, check=True, timeout=EMULATED * HANG_S)
+    return json.loads(done.stdout)
 
 
 def test_a_flight_has_the_same_estimates_and_weights() -> None:
@@ -61,6 +63,7 @@ def test_instructions_are_counted() -> None:
         capture_output=True,
         text=True,
         check=True,
+        timeout=HANG_S,
     )
     found = re.search(r"instructions (\d+)", counted.stderr)
     assert found is not None

@@ -14,6 +14,7 @@ from typing import Final
 
 import numpy as np
 
+from companion.beams.array.elements import ElementPattern
 from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.weights.shapes import Aperture
@@ -28,16 +29,18 @@ MOST_INCLINED: Final = 0.95
 RINGS: Final = 4  # rings of directions in which other arrays are sampled
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ApertureCones:
     """Cones of K sizes about N directions, as cosines to the axes of an aperture.
 
     lowest, highest  (K, N, D), the ends of the interval
+    furthest         (K, N, D), distance from the predicted direction to the further end
     """
 
     seen: FloatArray  # (N, D), of the predicted direction
     lowest: FloatArray
     highest: FloatArray
+    furthest: FloatArray
 
     @property
     def middles(self) -> FloatArray:
@@ -59,11 +62,6 @@ class ApertureCones:
         inclined: FloatArray = np.clip(-y * z / level, -MOST_INCLINED, MOST_INCLINED)
         return inclined
 
-    @property
-    def furthest(self) -> FloatArray:
-        """Distance from the predicted direction to the further end of the interval."""
-        return np.maximum(self.highest - self.seen, self.seen - self.lowest)
-
 
 def cones_on_aperture(
     across: Aperture, directions: FloatArray, angles_rad: FloatArray
@@ -71,9 +69,10 @@ def cones_on_aperture(
     """Return the cones within angles (K, N) of unit directions (N, 3), as an aperture sees them."""
     cosines = np.minimum(np.maximum(directions @ across.axes.T, -1.0), 1.0)
     angle, wide = np.arccos(cosines), angles_rad[:, :, np.newaxis]
-    lowest = np.cos(np.minimum(angle + wide, np.pi))
-    highest = np.cos(np.maximum(angle - wide, 0.0))
-    return ApertureCones(cosines, np.minimum(lowest, cosines), np.maximum(highest, cosines))
+    lowest = np.minimum(np.cos(np.minimum(angle + wide, np.pi)), cosines)
+    highest = np.maximum(np.cos(np.maximum(angle - wide, 0.0)), cosines)
+    furthest = np.maximum(highest - cosines, cosines - lowest)
+    return ApertureCones(seen=cosines, lowest=lowest, highest=highest, furthest=furthest)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -132,7 +131,9 @@ def cones(
     if array.grid is None or has_distinct_patterns(array) or array.coupling is not None:
         return _ring_samples(array, across, directions, seen)
     waves, counts = _grid_samples(across, seen, array.grid, array.wavelength_m)
-    turns = centres / np.maximum(np.abs(centres).max(axis=0), 1e-300)
+    turns = centres
+    if array.element.pattern is not ElementPattern.ISOTROPIC:
+        turns = centres / np.maximum(np.abs(centres).max(axis=0), 1e-300)
     nothing: ComplexArray = np.empty((0, 0, 0), dtype=complex)
     return ConeSamples(turns=turns, waves=tuple(waves), vectors=nothing, counts=counts)
 
@@ -229,5 +230,7 @@ def outside(
     cosines = (around @ across.axes.T)[:, np.newaxis]
     beyond = np.maximum(np.maximum(seen.lowest[0] - cosines, cosines - seen.highest[0]), 0.0)
     beyond *= across.lengths_m / wavelength_m
+    if len(across.axes) == 1:
+        return np.asarray(beyond[:, :, 0])
     found: FloatArray = np.sqrt(np.einsum("pnd,pnd->pn", beyond, beyond))
     return found

@@ -26,4 +26,5 @@ def _routines(package: str, compiled: str) -> Any:
 
 
 _blas, _lapack = _routines("blas", "_fblas"), _routines("lapack", "_flapack")
-zgemm, zherk, zposv = _blas.zgemm, _blas.zherk, _lapack.zposv
+zgemm, zherk = _blas.zgemm, _blas.zherk
+zheevd, zposv = _lapack.zheevd, _lapack.zposv

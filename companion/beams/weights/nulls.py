@@ -23,6 +23,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
+from companion.beams.weights.lapack import zposv
 from companion.beams.weights.widening import Spread
 from companion.values import BoolArray, ComplexArray, FloatArray
 
@@ -71,11 +72,11 @@ def with_nulls(spread: Spread, noise: FloatArray | None = None, exact: bool = Fa
     if users == 1:
         return NulledBeams(spread.beams.copy(), np.ones(1, dtype=bool))
     fields, counts = spread.cones.fields(spread.beams), spread.cones.counts
-    power = _power(spread.beams)
-    gains = _squared(fields) / power[:, np.newaxis]
+    received = _squared(fields)
+    gains = received / spread.powers[:, np.newaxis]
     asked = np.where(counts > 0, gains / np.maximum(counts, NEGLIGIBLE_GAIN), np.inf)
     kept = _protected_gains(asked.min(axis=2), spread.worth)
-    shares = _shares(spread, kept[0], power)
+    shares = _shares(spread, kept[0])
     if exact:
         shares[::each] = 1.0
     own = np.arange(users)
@@ -88,18 +89,13 @@ def with_nulls(spread: Spread, noise: FloatArray | None = None, exact: bool = Fa
     if exact:
         return NulledBeams(spread.beams - taken, whole)
     least = (counts * kept[:, :, np.newaxis]).max(axis=0)
-    back = _allowed_share(spread, taken, (fields, power), least)
+    back = _allowed_share(spread, taken, (fields, received), least)
     return NulledBeams(spread.beams - back * taken, whole & (back >= 1.0))
 
 
 def _squared(values: ComplexArray) -> FloatArray:
     squared: FloatArray = values.real**2 + values.imag**2
     return squared
-
-
-def _power(columns: ComplexArray) -> FloatArray:
-    power: FloatArray = _squared(columns).sum(axis=0)
-    return power
 
 
 def _protected_gains(least: FloatArray, worth: float) -> FloatArray:
@@ -111,19 +107,19 @@ def _protected_gains(least: FloatArray, worth: float) -> FloatArray:
     return kept
 
 
-def _shares(spread: Spread, kept: FloatArray, power: FloatArray) -> FloatArray:
+def _shares(spread: Spread, kept: FloatArray) -> FloatArray:
     """Return the share of a beam's field that is removed at each point, (N K, N)."""
-    reached = np.abs(spread.reached)
+    squared = _squared(spread.reached)
     lengths = spread.gram.diagonal().real
-    lengths = np.maximum(lengths, 1e-12 * lengths.max())
-    centres = lengths[:: spread.each]
-    alike = np.abs(spread.gram[:, :: spread.each]) ** 2 / np.outer(lengths, centres)
-    cost = reached**2 / np.outer(lengths, power) / np.maximum(1.0 - alike, 1e-12)
+    lengths = np.maximum(lengths, 1e-12 * lengths.max())[:, np.newaxis]
+    alike = _squared(spread.gram[:, :: spread.each]) / (lengths * lengths[:: spread.each, 0])
+    apart = 1.0 - alike
+    cost = squared / (lengths * spread.powers) / np.maximum(apart, 1e-12)
     priced = np.sqrt(MAX_NULL_COST / np.maximum(cost, MAX_NULL_COST))
-    priced *= np.minimum((1.0 - alike) / FULL_COST_DISTANCE, 1.0)
-    near = np.clip(1.0 - spread.outside / NULL_WIDTHS, 0.0, 1.0) ** 2
-    left = np.sqrt(kept * power) * near
-    floored = 1.0 - np.minimum(left / np.maximum(reached, 1e-300), 1.0)
+    priced *= np.minimum(apart / FULL_COST_DISTANCE, 1.0)
+    near = np.maximum(1.0 - spread.outside / NULL_WIDTHS, 0.0) ** 2
+    left = np.sqrt(kept * spread.powers) * near
+    floored = 1.0 - np.minimum(left / np.maximum(np.sqrt(squared), 1e-300), 1.0)
     shares: FloatArray = np.minimum(priced, floored)
     return shares
 
@@ -140,14 +136,23 @@ def _correction(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) 
         # More points than elements: the smaller matrix, by S* (G + X)^-1 = (S* X^-1 S^T + 1)^-1 S*
         # X^-1.
         scaled = points.conj() / loads
-        few = scaled @ points.T
-        few.flat[:: len(few) + 1] += 1.0
-        found: ComplexArray = np.linalg.solve(few, scaled @ wanted)
-        return found
-    loaded = gram.copy()
-    loaded.flat[:: len(loaded) + 1] += loads
-    taken: ComplexArray = points.conj() @ np.linalg.solve(loaded, wanted)
+        return _solved(_with_loading(scaled @ points.T, 1.0), scaled @ wanted)
+    taken: ComplexArray = points.conj() @ _solved(_with_loading(gram, loads), wanted)
     return taken
+
+
+def _with_loading(gram: ComplexArray, loads: FloatArray | float) -> ComplexArray:
+    loaded = gram.copy()
+    loaded.ravel()[:: len(loaded) + 1] += loads
+    return loaded
+
+
+def _solved(matrix: ComplexArray, wanted: ComplexArray) -> ComplexArray:
+    """Return X with matrix X = wanted, for a Hermitian matrix that is positive definite."""
+    _, found, info = zposv(matrix, wanted)
+    if info:  # not positive definite to rounding
+        found = np.linalg.solve(matrix, wanted)
+    return np.asarray(found)
 
 
 def _allowed_share(
@@ -162,14 +167,17 @@ def _allowed_share(
         |v - t z|^2 / |f - t d|^2     v, z: fields of beam f and correction d there
 
     and at the least gain, a t^2 - 2 b t + c = 0. ``known`` is the fields of the beams at the
-    places, and their squared lengths.
+    places, and their squares.
     """
-    beams, (fields, power) = spread.beams, known
+    beams, (fields, received) = spread.beams, known
     less = spread.cones.fields(taken)
-    crossed = (beams.real * taken.real + beams.imag * taken.imag).sum(axis=0)
-    a = _squared(less) - least * _power(taken)[:, np.newaxis]
+    crossed = np.vecdot(beams.T, taken.T).real
+    power = np.vecdot(taken.T, taken.T).real
+    a = _squared(less) - least * power[:, np.newaxis]
     b = fields.real * less.real + fields.imag * less.imag - least * crossed[:, np.newaxis]
-    c = np.maximum(_squared(fields) - least * power[:, np.newaxis], 0.0)
+    c = np.maximum(received - least * spread.powers[:, np.newaxis], 0.0)
+    if ((c + np.minimum(a, 0.0) >= 2.0 * np.maximum(b, 0.0)) | (least <= 0)).all():
+        return np.ones(len(fields))  # no root before t = 1
     # Without nulls the gain suffices: c >= 0. This form of the first root above 0 never cancels.
     depth = b * b - a * c
     inside = np.sqrt(np.maximum(depth, 0.0))

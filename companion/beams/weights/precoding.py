@@ -30,6 +30,7 @@ import numpy as np
 
 from companion.beams.weights import grouping, powers, zero_forcing
 from companion.beams.weights.grouping import PreviousSlots
+from companion.beams.weights.lapack import zheevd
 from companion.beams.weights.nulls import with_nulls
 from companion.beams.weights.widening import Spread, power_gains
 from companion.beams.worth.link_budget import LinkBudget
@@ -145,9 +146,8 @@ def precode(
     where one is needed.
     """
     size, users = steering.shape
-    power = np.einsum("mn,mn->n", steering.real, steering.real)
-    power += np.einsum("mn,mn->n", steering.imag, steering.imag)
-    if not (np.isfinite(power).all() and (power > 0).all()):
+    power = np.vecdot(steering.T, steering.T).real
+    if users and not 0.0 < power.min() <= power.max() < math.inf:
         raise ValueError("a steering vector is 0 or not finite")
     everyone = np.arange(users)
     if users == 0:
@@ -163,26 +163,37 @@ def precode(
         )
     groups, dropped = _slots(steering, settings, priorities, before)
     made = [_columns(steering, settings, spread, radio, group) for group in groups]
-    served = np.sort(np.concatenate(groups))
-    weights: ComplexArray = np.empty((size, len(served)), dtype=complex)
-    slots = np.zeros(users, dtype=np.int64)
-    for slot, (group, one) in enumerate(zip(groups, made, strict=True)):
-        slots[group] = slot
-        shared = _with_power_allocation(steering[:, group], one.weights, settings, radio, group)
-        weights[:, np.searchsorted(served, group)] = shared
+    shared = [
+        _with_power_allocation(steering[:, group], one.weights, settings, radio, group)
+        for group, one in zip(groups, made, strict=True)
+    ]
+    if len(groups) == 1 and len(groups[0]) == users:
+        served, slots = everyone, np.zeros(users, dtype=np.int64)
+        weights = np.ascontiguousarray(shared[0])
+    else:
+        served, slots, weights = _joined(groups, shared)
     method = max((one.method for one in made), key=_METHODS.index)
-    condition = max(one.condition_number for one in made)
-    normalise(weights, settings.normalisation, slots[served])
+    normalise(weights, settings.normalisation, slots)
     return Precoding(
         weights=weights,
         method=method,
         normalisation=settings.normalisation,
-        condition_number=condition,
+        condition_number=max(one.condition_number for one in made),
         served=served,
-        groups=slots[served],
+        groups=slots,
         dropped=dropped,
         exact=method is Method.ZERO_FORCING,
     )
+
+
+def _joined(
+    groups: list[IntArray], columns: list[ComplexArray]
+) -> tuple[IntArray, IntArray, ComplexArray]:
+    """Return the users of all groups (K,), ascending, their slots (K,), and weights (M, K)."""
+    together = np.concatenate(groups)
+    order = np.argsort(together)
+    slots = np.repeat(np.arange(len(groups)), [len(group) for group in groups])
+    return together[order], slots[order], np.concatenate(columns, axis=1)[:, order]
 
 
 _METHODS: Final = (Method.ZERO_FORCING, Method.REGULARISED, Method.MMSE, Method.MATCHED)
@@ -241,17 +252,16 @@ def _columns(
     users: IntArray,
 ) -> _Columns:
     a = steering if len(users) == steering.shape[1] else steering[:, users]
-    lengths = np.linalg.norm(a, axis=0)
-    even: ComplexArray = a / lengths
-    gram = even.T @ even.conj()
-    condition = _condition_number(even, gram)
     wide = None if spread is None else spread.of(users)
+    gram = a.T @ a.conj() if wide is None else wide.gram[:: wide.each, :: wide.each]
+    lengths = np.sqrt(gram.diagonal().real)
+    even_gram: ComplexArray = gram / (lengths[:, np.newaxis] * lengths)
+    condition = _condition_number(a, even_gram)
     match settings.method:
         case Method.MATCHED:
             own = a.conj() if wide is None else wide.beams
             return _Columns(_unit_response(a, own), Method.MATCHED, condition)
         case Method.REGULARISED | Method.MMSE:
-            gram = a.T @ a.conj()
             least = LEAST_LOADING * float(gram.trace().real)
             loading = np.full(len(users), max(settings.regularisation * len(a), least))
             if settings.method is Method.MMSE:
@@ -259,10 +269,9 @@ def _columns(
             found = _loaded(a, gram, loading) if wide is None else with_nulls(wide, loading).weights
             return _Columns(_unit_response(a, found), settings.method, condition)
         case Method.ZERO_FORCING:
-            made = _zero_forcing(even, gram, condition, settings) if wide is None else None
-            if made is None:
-                assert wide is not None
+            if wide is not None:
                 return _wide_zero_forcing(a, wide, condition, settings)
+            made = _zero_forcing(a / lengths, even_gram, condition, settings)
             return replace(made, weights=made.weights / lengths)
 
 
@@ -349,7 +358,7 @@ def _exactly(a: ComplexArray, found: ComplexArray) -> ComplexArray:
 
 def _unit_response(a: ComplexArray, weights: ComplexArray) -> ComplexArray:
     """Scale columns so that each UAV receives 1 from its own column."""
-    scaled: ComplexArray = weights / np.einsum("mn,mn->n", a, weights)
+    scaled: ComplexArray = weights / np.vecdot(a.conj().T, weights.T)
     return scaled
 
 
@@ -376,9 +385,11 @@ def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:
     rounding = len(gram) * float(np.finfo(float).eps)
     if len(gram) > len(a):
         return 1.0 / math.sqrt(rounding)
-    eigenvalues = np.linalg.eigvalsh(gram)
-    least, most = eigenvalues[0], eigenvalues[-1]
-    return float(np.sqrt(most / max(least, most * rounding)))
+    eigenvalues, _, info = zheevd(gram, compute_v=0)
+    if info:
+        raise np.linalg.LinAlgError("the eigenvalues of a Gram matrix do not converge")
+    least, most = float(eigenvalues[0]), float(eigenvalues[-1])
+    return math.sqrt(most / max(least, most * rounding))
 
 
 def _spectrum(a: ComplexArray, gram: ComplexArray) -> tuple[FloatArray, FloatArray]:

@@ -10,7 +10,6 @@ grid is too coarse for wide beams: there a plane uses the sum of two lines. See 
 import functools
 import io
 import math
-from collections.abc import Sequence
 from importlib import resources
 from typing import Final, NamedTuple
 
@@ -40,7 +39,7 @@ class Shapes(NamedTuple):
     least_db  (W,), that gain over the number of elements, at the least: losses count from there
     losses    (L,), loss of the floor over the cone from the largest least gain, dB
 
-    Widths, losses, cones and ratios are natural logarithms.
+    Widths, losses, cones and ratios are natural logarithms; all but the losses are evenly spaced.
     """
 
     places: FloatArray
@@ -51,6 +50,9 @@ class Shapes(NamedTuple):
     cones: FloatArray  # (C,), ascending
     ratios: FloatArray  # (R,), the cone's width over the likely one, ascending from 1
     likely: FloatArray  # (L C R, K), phases of the largest mean likely gain above that floor
+    last: IntArray  # (3, 1), the last but one of the losses, of the cones and of the ratios
+    strides: IntArray  # (3,), rows of ``likely`` from one of each to the next
+    corners: IntArray  # (8,), rows from the first to all corners of a cell; the ratio runs fastest
 
 
 @functools.cache
@@ -59,6 +61,8 @@ def _table(name: str) -> Shapes:
     even = _even(count) if axes == 1 else np.kron(_even(count), _even(count))
     file = resources.files(__package__) / TABLES
     with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as held:
+        counts = [len(held[f"{name}_{axis}"]) for axis in ("losses_db", "cones", "ratios")]
+        strides = np.array([counts[1] * counts[2], counts[2], 1])
         return Shapes(
             places=(np.arange(count) - (count - 1) / 2) / count,
             widths=np.log(held[f"{name}_widths"]),
@@ -69,6 +73,9 @@ def _table(name: str) -> Shapes:
             ratios=-np.log(held[f"{name}_ratios"]),
             likely=held[f"{name}_likely"].astype(float).reshape(-1, count**axes // 2**axes)
             @ even.T,
+            last=np.array(counts)[:, np.newaxis] - 2,
+            strides=strides,
+            corners=CORNERS @ strides,
         )
 
 
@@ -191,15 +198,17 @@ def _psi(
 ) -> list[FloatArray]:
     """Return the table's phases psi (N, K) for each column of widths (N, D), to be summed."""
     columns = range(cones.shape[1])
+    wide = np.log(np.maximum(cones, 1e-300))
     if likely is None:
-        return [_guaranteed_phases(shapes, cones[:, d]) for d in columns]
-    best_db = np.interp(np.log(np.maximum(cones, 1e-9)), shapes.widths, shapes.least_db).sum(axis=1)
+        return [_guaranteed_phases(shapes, wide[:, d]) for d in columns]
+    narrow = np.log(np.maximum(likely, 1e-300))
+    best_db = np.interp(wide, shapes.widths, shapes.least_db).sum(axis=1)
     best_db += 10 * math.log10(elements)
     least_db = len(columns) * math.exp(shapes.losses[0])
     lacking_db = np.maximum(worth_db + SPARE_DB + least_db - best_db, 0.0)
     loss_db = np.maximum(best_db - floor_db, least_db) + LOSS_PER_MISSING_DB * lacking_db
-    loss_db /= len(columns)
-    return [_likely_phases(shapes, cones[:, d], likely[:, d], loss_db) for d in columns]
+    losses = np.log(loss_db / len(columns))
+    return [_likely_phases(shapes, losses, wide[:, d], narrow[:, d]) for d in columns]
 
 
 def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -208,22 +217,18 @@ def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
     return before, (at - knots[before]) / (knots[before + 1] - knots[before])
 
 
-def _on_axes(axes: Sequence[FloatArray], at: Sequence[FloatArray]) -> tuple[IntArray, FloatArray]:
-    """Return the knots (A, N) before N points on A axes, and the next knots' weights; clipped."""
-    places = np.stack(
-        [
-            np.interp(where, knots, np.arange(len(knots)))
-            for knots, where in zip(axes, at, strict=True)
-        ]
-    )
-    last = np.array([[len(knots) - 2] for knots in axes])
-    before = np.minimum(places.astype(np.int64), last)
-    return before, places - before
+def _on_even_axis(knots: FloatArray, at: FloatArray) -> FloatArray:
+    """Return the places of points (N,) on an axis of even knots, in knots from the first."""
+    last = len(knots) - 1
+    places = (at - knots[0]) * (last / (knots[-1] - knots[0]))
+    return np.asarray(np.minimum(np.maximum(places, 0.0), last))
 
 
 def _guaranteed_phases(shapes: Shapes, widths: FloatArray) -> FloatArray:
-    (before,), (share,) = _on_axes([shapes.widths], [np.log(np.maximum(widths, 1e-300))])
-    part = share[:, np.newaxis]
+    """Return the phases (N, K) of the largest least gain; widths (N,) as logarithms."""
+    places = _on_even_axis(shapes.widths, widths)
+    before = np.minimum(places.astype(np.int64), len(shapes.widths) - 2)
+    part = (places - before)[:, np.newaxis]
     found: FloatArray = (1 - part) * shapes.guaranteed[before] + part * shapes.guaranteed[
         before + 1
     ]
@@ -231,17 +236,22 @@ def _guaranteed_phases(shapes: Shapes, widths: FloatArray) -> FloatArray:
 
 
 def _likely_phases(
-    shapes: Shapes, cones: FloatArray, likely: FloatArray, losses_db: FloatArray
+    shapes: Shapes, losses: FloatArray, cones: FloatArray, likely: FloatArray
 ) -> FloatArray:
-    loss, cone, wide = np.log(np.maximum(np.stack([losses_db, cones, likely]), 1e-300))
-    axes = shapes.losses, shapes.cones, shapes.ratios
-    before, share = _on_axes(axes, (loss, cone, cone - wide))
-    strides = np.array([len(axes[1]) * len(axes[2]), len(axes[2]), 1])
-    # The eight corners of each cell.
-    corners = (strides @ before)[:, np.newaxis] + CORNERS @ strides
-    parts = np.stack([1 - share, share])
-    shares = parts[CORNERS[:, 0], 0] * parts[CORNERS[:, 1], 1] * parts[CORNERS[:, 2], 2]
-    return np.asarray((shares.T[:, np.newaxis] @ shapes.likely[corners])[:, 0])
+    """Return the phases (N, K) of the largest likely gain; all arguments (N,) are logarithms."""
+    places: FloatArray = np.empty((3, len(losses)))
+    places[0] = np.interp(losses, shapes.losses, np.arange(len(shapes.losses)))
+    places[1] = _on_even_axis(shapes.cones, cones)
+    places[2] = _on_even_axis(shapes.ratios, cones - likely)
+    before = np.minimum(places.astype(np.int64), shapes.last)
+    # The eight corners of each cell, and their shares.
+    share: FloatArray = np.empty((2, *places.shape))
+    np.subtract(places, before, out=share[1])
+    np.subtract(1.0, share[1], out=share[0])
+    shares = share[:, np.newaxis, np.newaxis, 0] * share[:, np.newaxis, 1] * share[:, 2]
+    corners = (shapes.strides @ before)[:, np.newaxis] + shapes.corners
+    phases = shares.reshape(8, -1).T[:, np.newaxis] @ shapes.likely[corners]
+    return np.asarray(phases[:, 0])
 
 
 def _on_line(shapes: Shapes, psi: FloatArray, placed: FloatArray) -> FloatArray:

@@ -12,7 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.beams.array.geometry import Array
-from companion.beams.array.steering import steering_matrix
+from companion.beams.array.steering import phasors, steering_matrix
 from companion.beams.weights import cones, shapes
 from companion.beams.weights.cones import ApertureCones, ConeSamples
 from companion.values import BoolArray, ComplexArray, FloatArray, IntArray, Widen
@@ -45,6 +45,7 @@ class Spread:
     """
 
     beams: ComplexArray  # (M, N), the shaped beams by themselves
+    powers: FloatArray  # (N,), squared lengths of these beams
     broadened: BoolArray  # (N,), which of them are broadened
     points: ComplexArray
     gram: ComplexArray  # (N K, N K), S^T S* of the points S
@@ -70,6 +71,7 @@ class Spread:
         rows = (users[:, np.newaxis] * self.each + np.arange(self.each)).ravel()
         return Spread(
             beams=self.beams[:, users],
+            powers=self.powers[users],
             broadened=self.broadened[users],
             points=self.points[:, rows],
             gram=self.gram[np.ix_(rows, rows)],
@@ -89,7 +91,7 @@ def spread(
     across = shapes.aperture(array)
     angles_rad = np.minimum(np.array([known.bounds_rad, known.likely_rad]), WIDEST_RAD)
     seen = cones.cones_on_aperture(across, directions, angles_rad)
-    around = _around(array, across, directions, angles_rad[1])
+    around = _around(array, across, directions, seen.seen[:, :1], angles_rad[1])
     each = around.shape[1]
     around = around.reshape(-1, 3)
     points = steering_matrix(array, around)
@@ -98,13 +100,15 @@ def spread(
         phases = shapes.phases_rad(across, cone, usual, known.floor_db, known.worth_db)
     else:
         phases = _for_the_bound_rad(array, across, seen)
-    turned, centres = np.exp(1j * phases.T), points[:, ::each]
+    turned, centres = phasors(phases).T, points[:, ::each]
     beams = centres.conj() * turned
+    gram = points.T @ points.conj()
     return Spread(
         beams=beams,
-        broadened=np.abs(turned.mean(axis=0)) ** 2 < BROADENED,
+        powers=gram.diagonal().real[::each],  # phases alone shape a beam
+        broadened=np.abs(turned.sum(axis=0) / array.size) ** 2 < BROADENED,
         points=points,
-        gram=points.T @ points.conj(),
+        gram=gram,
         reached=points.T @ beams,
         outside=cones.outside(across, seen, around, array.wavelength_m),
         cones=cones.cones(array, across, directions, seen, centres),
@@ -125,25 +129,29 @@ def power_gains(steering: ComplexArray, weights: ComplexArray) -> FloatArray:
 
     0 for a zero column.
     """
-    towards = np.einsum("mn,mn->n", steering, weights)
-    power = np.einsum("mn,mn->n", weights, weights.conj()).real
+    towards = np.vecdot(steering.conj().T, weights.T)
+    power = np.vecdot(weights.T, weights.T).real
     gains: FloatArray = (towards.real**2 + towards.imag**2) / np.maximum(power, 1e-300)
     return gains
 
 
 def _around(
-    array: Array, across: shapes.Aperture, directions: FloatArray, likely_rad: FloatArray
+    array: Array,
+    across: shapes.Aperture,
+    directions: FloatArray,
+    along: FloatArray,
+    likely_rad: FloatArray,
 ) -> FloatArray:
     """Return directions (N, K, 3): each user's own, then points about it on each array axis.
 
-    Each point needs a null, so none are added if the array lacks degrees of freedom.
+    ``along`` (N, 1) are the cosines of the directions to the first axis. Each point needs a null,
+    so none are added if the array lacks degrees of freedom.
     """
     users, axes = len(directions), across.axes
     spare = (array.size - users) // users if users > 1 else 0
-    if spare < 2 * len(axes) or not (likely_rad > LEAST_RAD).any():
+    if spare < 2 * len(axes) or not likely_rad.max() > LEAST_RAD:
         return directions[:, np.newaxis]
     turned_rad = NULLED_AT * likely_rad[:, np.newaxis]
-    along = (directions @ axes[0])[:, np.newaxis]
     first = axes[0] - along * directions
     first /= np.maximum(np.sqrt(np.maximum(1.0 - along * along, 0.0)), 1e-9)
     sides = [first] if len(axes) == 1 else [first, np.cross(directions, first)]

@@ -73,6 +73,9 @@ class SeenDirection(NamedTuple):
     is_alone: bool = False
 
 
+Refusal = tuple[Cause, str]
+"""Cause and reason in words for which a UAV gets no beam."""
+NO_POSE: Final[Refusal] = (Cause.CARRIER, "the carrier's position or attitude is unknown")
 NO_SEEN_DIRECTIONS: Final[Mapping[str, SeenDirection]] = MappingProxyType({})
 
 
@@ -103,30 +106,31 @@ def aim(
     The columns of the weights are in the order of ``tracks``. UAVs without a beam are listed with
     the reason.
     """
-    place = None if carrier is None else line_of_sight.place_ned_m(carrier, array)
-    refused = {track.uav: _refusal(track, place) for track in tracks}
-    seen = [track for track in tracks if refused[track.uav] is None]
+    why_not: list[Refusal | None] = [NO_POSE] * len(tracks)
     beams: tuple[Beam, ...] = ()
-    made = None
-    if carrier is not None and seen:
-        ranges_m, directions = line_of_sight.directions(seen, carrier, array)
-        errors = _errors(seen, ranges_m, carrier, array)
-        if seen_directions:
-            directions, errors = _seen_by_array(seen, directions, errors, seen_directions)
-        hidden = _out_of_reach(directions, array, coverage)
-        refused |= {track.uav: why for track, why in zip(seen, hidden, strict=True)}
-        inside = [i for i, why in enumerate(hidden) if why is None]
-        if inside:
-            aimed = _Aimed(
-                tracks=[seen[i] for i in inside],
-                ranges_m=ranges_m[inside],
-                directions=directions[inside],
-                errors=[errors[i] for i in inside],
-            )
-            beams, made, dropped = _beams(
-                aimed, carrier, array, precoder=precoder, before=before, valid_at_ns=valid_at_ns
-            )
-            refused |= {uav: (Cause.CROWDED, why) for uav, why in dropped.items()}
+    made, dropped = None, dict[str, str]()
+    if carrier is not None:
+        offsets_m = line_of_sight.offsets_ned_m(tracks, carrier, array)
+        why_not = _refusals(tracks, offsets_m)
+        seen = [i for i, why in enumerate(why_not) if why is None]
+        if seen:
+            aimed = _aimed([tracks[i] for i in seen], offsets_m[seen], carrier, array)
+            if seen_directions:
+                aimed = _seen_by_array(aimed, seen_directions)
+            for i, why in zip(seen, _out_of_reach(aimed.directions, array, coverage), strict=True):
+                why_not[i] = why
+            inside = [n for n, i in enumerate(seen) if why_not[i] is None]
+            if inside:
+                beams, made, dropped = _beams(
+                    aimed.of(inside),
+                    carrier,
+                    array,
+                    precoder=precoder,
+                    before=before,
+                    valid_at_ns=valid_at_ns,
+                )
+    refused = {track.uav: why for track, why in zip(tracks, why_not, strict=True)}
+    refused |= {uav: (Cause.CROWDED, why) for uav, why in dropped.items()}
     if made is None:
         made = precode(np.empty((array.size, 0), dtype=complex), precoder)
     left_out = tuple(LeftOut(uav, *why) for uav, why in refused.items() if why is not None)
@@ -178,6 +182,24 @@ class _Aimed(NamedTuple):
     directions: FloatArray
     errors: list[tuple[float | None, float]]
 
+    def of(self, which: list[int]) -> "_Aimed":
+        """Return the part for some of the tracks."""
+        if len(which) == len(self.tracks):
+            return self
+        return _Aimed(
+            tracks=[self.tracks[i] for i in which],
+            ranges_m=self.ranges_m[which],
+            directions=self.directions[which],
+            errors=[self.errors[i] for i in which],
+        )
+
+
+def _aimed(tracks: list[Track], offsets_m: FloatArray, carrier: Carrier, array: Array) -> _Aimed:
+    """Return tracks at offsets (N, 3) from the array, local frame, by the reported positions."""
+    ranges_m, directions = line_of_sight.directions_of(offsets_m, carrier, array)
+    errors = _errors(tracks, ranges_m, carrier, array)
+    return _Aimed(tracks=tracks, ranges_m=ranges_m, directions=directions, errors=errors)
+
 
 def _beams(
     aimed: _Aimed,
@@ -191,13 +213,15 @@ def _beams(
     """Return the beams, their weights, and the UAVs that the policy left out, with the reason."""
     tracks, ranges_m, directions, errors = aimed
     uavs = [track.uav for track in tracks]
-    bounds, usual = [bound for bound, _ in errors], [usual for _, usual in errors]
-    wanted = [(0.0, 0.0) if b is None else (u, b) for u, b in zip(usual, bounds, strict=True)]
-    natural_rad = array.wavelength_m / max(float(shapes.aperture(array).lengths_m.max()), 1e-9)
+    wanted = [(0.0, 0.0) if bound is None else (usual, bound) for bound, usual in errors]
     sure_plane = precoder.widen is Widen.GUARANTEE and array.axis is None
-    pace = hysteresis.GUARANTEE_PLANE_SHARE if sure_plane else 1.0
     shaped = hysteresis.rate_limited_rad(
-        before, valid_at_ns, uavs, wanted_rad=np.array(wanted), natural_rad=natural_rad, pace=pace
+        before,
+        valid_at_ns,
+        uavs,
+        wanted_rad=np.array(wanted),
+        natural_rad=shapes.aperture(array).natural_rad,
+        pace=hysteresis.GUARANTEE_PLANE_SHARE if sure_plane else 1.0,
     )
     spread = widening.spread(
         array,
@@ -211,68 +235,88 @@ def _beams(
         precoder.widen,
     )
     matrix = steering.steering_matrix(array, directions) if spread is None else spread.centres
-    rate_weights = np.array([precoder.rate_weights.get(uav, 1.0) for uav in uavs])
     made = precode(
         matrix,
         precoder,
         spread,
         priorities=_priorities(tracks, precoder.priority),
-        radio=Radio(
-            link_budget.isotropic_snr(ranges_m, array, precoder.budget, precoder.uav_antennas),
-            rate_weights,
-        ),
+        radio=_radio(uavs, ranges_m, array, precoder) if precoder.needs_radio else None,
         before=hysteresis.previous_slots(before, valid_at_ns, uavs),
     )
-    azimuths, elevations = steering.angles_rad(directions)
-    served = matrix[:, made.served]
-    gains = gain_db(served, made.weights).tolist()
-    power = np.einsum("mn,mn->n", served, served.conj()).real
-    alone = (10 * np.log10(power)).tolist()
+    azimuths, elevations = (angles.tolist() for angles in steering.angles_rad(directions))
+    served = matrix if len(made.served) == len(uavs) else matrix[:, made.served]
+    gains = gain_db(served, made.weights)
+    losses = (10 * np.log10(np.vecdot(served.T, served.T).real) - gains).tolist()
+    ranges, likely, bounds = ranges_m.tolist(), shaped[:, 0].tolist(), shaped[:, 1].tolist()
     rates = line_of_sight.rates(tracks, carrier, array, ranges_m, directions)
+    widened = [False] * len(uavs) if spread is None else spread.broadened.tolist()
+    users, slots = made.served.tolist(), made.groups.tolist()
     beams = tuple(
         Beam(
             uav=uavs[i],
-            azimuth_rad=float(azimuths[i]),
-            elevation_rad=float(elevations[i]),
-            range_m=float(ranges_m[i]),
+            azimuth_rad=azimuths[i],
+            elevation_rad=elevations[i],
+            range_m=ranges[i],
             azimuth_rate_radps=rates[i][0],
             elevation_rate_radps=rates[i][1],
             range_rate_mps=rates[i][2],
-            pointing_bound_rad=bounds[i],
-            gain_db=gains[column],
-            loss_db=alone[column] - gains[column],
-            group=int(made.groups[column]),
-            widened=spread is not None and bool(spread.broadened[i]),
-            pointing_p95_rad=usual[i],
-            shaped_likely_rad=float(shaped[i, 0]),
-            shaped_bound_rad=float(shaped[i, 1]),
+            pointing_bound_rad=errors[i][0],
+            gain_db=gain,
+            loss_db=loss,
+            group=slot,
+            widened=widened[i],
+            pointing_p95_rad=errors[i][1],
+            shaped_likely_rad=likely[i],
+            shaped_bound_rad=bounds[i],
         )
-        for column, i in enumerate(made.served.tolist())
+        for i, slot, gain, loss in zip(users, slots, gains.tolist(), losses, strict=True)
     )
     return beams, made, {uavs[user]: why for user, why in made.dropped.items()}
+
+
+def _radio(uavs: list[str], ranges_m: FloatArray, array: Array, precoder: Precoder) -> Radio:
+    """Return the radio parameters of UAVs at ranges (N,)."""
+    return Radio(
+        link_budget.isotropic_snr(ranges_m, array, precoder.budget, precoder.uav_antennas),
+        np.array([precoder.rate_weights.get(uav, 1.0) for uav in uavs]),
+    )
 
 
 def _errors(
     tracks: Sequence[Track], ranges_m: FloatArray, carrier: Carrier, array: Array
 ) -> list[tuple[float | None, float]]:
-    """Return the bound on each predicted direction's error, or None, and its usual error."""
-    lever_m = float(np.linalg.norm(array.lever_arm_m))
-    found = []
+    """Return the bound on each predicted direction's error, or None, and its usual error.
+
+    The bound is the sum of: the errors of both positions as seen from the array; the displacement
+    of the array by the attitude error, through the lever arm; and the attitude error itself.
+
+    The usual error is the estimated 95th percentile. Errors of positions and of the attitude are
+    independent, so they add as squares (docs/math.md 5.3).
+    """
+    lever_m = math.hypot(*array.lever_arm_m.tolist())
+    attitude_rad, own_m = carrier.attitude_bound_rad, carrier.bound_m
+    swung_m = 2.0 * math.sin(min(attitude_rad, math.pi) / 2.0) * lever_m
+    usual_rad = _usual(carrier.attitude_p95_rad, attitude_rad)
+    usual_own_m, usual_swung_m = _usual(carrier.error_p95_m, own_m), usual_rad * lever_m
+    found = list[tuple[float | None, float]]()
     for track, range_m in zip(tracks, ranges_m.tolist(), strict=True):
-        bound = _pointing_bound_rad(track, carrier, lever_m, range_m)
-        found.append((bound, _usual_rad(track, carrier, lever_m, range_m, bound)))
+        seen = steering.pointing_bound_rad(track.bound_m + own_m + swung_m, range_m)
+        bound = None if seen is None else min(seen + attitude_rad, math.pi)
+        off_m = math.hypot(_usual(track.error_p95_m, track.bound_m), usual_own_m, usual_swung_m)
+        usual = math.hypot(math.asin(min(off_m / range_m, 1.0)), usual_rad)
+        found.append((bound, min(usual, math.pi if bound is None else bound)))
     return found
 
 
-def _seen_by_array(
-    tracks: Sequence[Track],
-    directions: FloatArray,
-    errors: list[tuple[float | None, float]],
-    seen_directions: Mapping[str, SeenDirection],
-) -> tuple[FloatArray, list[tuple[float | None, float]]]:
+def _usual(known: float | None, bound: float) -> float:
+    """Return a usual (95 %) error: ``UNKNOWN_SHARE`` of its bound if it is unknown."""
+    return UNKNOWN_SHARE * bound if known is None else min(known, bound)
+
+
+def _seen_by_array(aimed: _Aimed, seen_directions: Mapping[str, SeenDirection]) -> _Aimed:
     """Return directions and errors confined to those in which the array sees the UAVs."""
-    directions, errors = directions.copy(), list(errors)
-    for i, track in enumerate(tracks):
+    directions, errors = aimed.directions.copy(), list(aimed.errors)
+    for i, track in enumerate(aimed.tracks):
         one = seen_directions.get(track.uav)
         if one is None:
             continue
@@ -283,18 +327,19 @@ def _seen_by_array(
             directions[i] = one.cap.center
             likely = USUAL_SEEN * one.cap.radius_rad
             errors[i] = one.cap.radius_rad, likely if one.is_alone else min(usual, likely)
-    return directions, errors
+    return aimed._replace(directions=directions, errors=errors)
 
 
-def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> list[int]:
+def _priorities(tracks: Sequence[Track], priority: Sequence[str]) -> Sequence[int]:
     """Return indices of the tracks by descending priority: those in ``priority`` first."""
+    everyone = range(len(tracks))
+    if not priority:
+        return everyone
     ranks = {uav: rank for rank, uav in enumerate(priority)}
-    return sorted(range(len(tracks)), key=lambda i: ranks.get(tracks[i].uav, len(ranks)))
+    return sorted(everyone, key=lambda i: ranks.get(tracks[i].uav, len(ranks)))
 
 
-def _out_of_reach(
-    directions: FloatArray, array: Array, coverage: Coverage
-) -> list[tuple[Cause, str] | None]:
+def _out_of_reach(directions: FloatArray, array: Array, coverage: Coverage) -> list[Refusal | None]:
     """Return for each direction why no beam can point there; None if a beam can."""
     reasons: list[str | None] = [None] * len(directions)
     if coverage != EVERYWHERE:
@@ -311,50 +356,14 @@ def _out_of_reach(
     return [None if why is None else (Cause.COVERAGE, why) for why in reasons]
 
 
-def _pointing_bound_rad(
-    track: Track, carrier: Carrier, lever_m: float, range_m: float
-) -> float | None:
-    """Return the bound on the angle between predicted and true direction; None: unbounded.
-
-    The sum of: the errors of both positions as seen from the array; the displacement of the array
-    by the attitude error, through the lever arm; and the attitude error itself (docs/math.md 5.3).
-    """
-    swing = 2.0 * math.sin(min(carrier.attitude_bound_rad, math.pi) / 2.0)
-    swung_m = swing * lever_m
-    seen = steering.pointing_bound_rad(track.bound_m + carrier.bound_m + swung_m, range_m)
-    return None if seen is None else min(seen + carrier.attitude_bound_rad, math.pi)
-
-
-def _usual_rad(
-    track: Track, carrier: Carrier, lever_m: float, range_m: float, bound_rad: float | None
-) -> float:
-    """Return the estimated 95th percentile of the direction error.
-
-    Errors of positions and of the attitude are independent, so they add as squares. An unknown
-    error is estimated as ``UNKNOWN_SHARE`` of its bound (docs/math.md 5.3).
-    """
-
-    def usual(known: float | None, bound: float) -> float:
-        return UNKNOWN_SHARE * bound if known is None else min(known, bound)
-
-    attitude = usual(carrier.attitude_p95_rad, carrier.attitude_bound_rad)
-    swung_m = attitude * lever_m
-    off_m = math.hypot(
-        usual(track.error_p95_m, track.bound_m),
-        usual(carrier.error_p95_m, carrier.bound_m),
-        swung_m,
-    )
-    seen = math.asin(min(off_m / range_m, 1.0))
-    return min(math.hypot(seen, attitude), math.pi if bound_rad is None else bound_rad)
-
-
-def _refusal(track: Track, place_ned_m: FloatArray | None) -> tuple[Cause, str] | None:
-    """Return why a track gets no beam from an array at this position; None if it gets one."""
-    if place_ned_m is None:
-        return Cause.CARRIER, "the carrier's position or attitude is unknown"
-    if track.state not in AIMABLE:
-        return Cause.SILENT, f"its track is {track.state}"
-    offset_m = track.position_ned_m - place_ned_m
-    if offset_m @ offset_m < NEAREST_M**2:
-        return Cause.COVERAGE, f"it is within {NEAREST_M:g} m of the array"
-    return None
+def _refusals(tracks: Sequence[Track], offsets_m: FloatArray) -> list[Refusal | None]:
+    """Return why tracks at offsets (N, 3) from the array get no beam; None for one that may."""
+    near = np.vecdot(offsets_m, offsets_m) < NEAREST_M**2
+    return [
+        (Cause.SILENT, f"its track is {track.state}")
+        if track.state not in AIMABLE
+        else (Cause.COVERAGE, f"it is within {NEAREST_M:g} m of the array")
+        if is_near
+        else None
+        for track, is_near in zip(tracks, near.tolist(), strict=True)
+    ]

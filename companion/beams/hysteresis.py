@@ -105,17 +105,15 @@ def rate_limited_rad(
     last = np.array([before.shaped.get(uav, (np.nan, np.nan)) for uav in uavs])
     begin = np.maximum(last, MIN_WIDTHS * natural_rad)
     widths_rad = natural_rad * passed_s
-    further = (
-        begin
-        - last
-        + np.minimum(begin * (MAX_RATIO_PER_S**passed_s - 1), MAX_WIDENING * widths_rad)
-    )
-    nearer = np.minimum(last * (1 - MAX_RATIO_PER_S**-passed_s), MAX_NARROWING * widths_rad)
+    factor = MAX_RATIO_PER_S**passed_s
+    further = begin - last + np.minimum(begin * (factor - 1), MAX_WIDENING * widths_rad)
     held = [abs(valid_at_ns - before.filled_ns.get(uav, valid_at_ns)) < HELD_NS for uav in uavs]
-    nearer[held, 1] = np.minimum(nearer[held, 1], MAX_HELD_NARROWING * widths_rad)
-    followed: FloatArray = np.where(
-        np.isnan(last), wanted_rad, np.clip(wanted_rad, last - nearer, last + further)
+    narrowing = np.array(
+        [(MAX_NARROWING, MAX_HELD_NARROWING if is_held else MAX_NARROWING) for is_held in held]
     )
+    nearer = np.minimum(last * (1 - MAX_RATIO_PER_S**-passed_s), narrowing * widths_rad)
+    limited = np.minimum(np.maximum(wanted_rad, last - nearer), last + further)
+    followed: FloatArray = np.where(np.isnan(last), wanted_rad, limited)
     return followed
 
 

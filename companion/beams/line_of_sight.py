@@ -24,10 +24,22 @@ def directions(
     tracks: Sequence[Track], carrier: Carrier, array: Array
 ) -> tuple[FloatArray, FloatArray]:
     """Return ranges (N,), metres, and unit directions (N, 3), array frame, from array to UAVs."""
-    offsets_m = np.array([track.position_ned_m for track in tracks]) - place_ned_m(carrier, array)
-    ranges_m = np.sqrt(np.einsum("nk,nk->n", offsets_m, offsets_m))
+    return directions_of(offsets_ned_m(tracks, carrier, array), carrier, array)
+
+
+def offsets_ned_m(tracks: Sequence[Track], carrier: Carrier, array: Array) -> FloatArray:
+    """Return the UAVs' positions from the array, (N, 3), local frame."""
+    places = np.array([track.position_ned_m for track in tracks])
+    return np.asarray(places.reshape(-1, 3) - place_ned_m(carrier, array))
+
+
+def directions_of(
+    offsets_ned_m: FloatArray, carrier: Carrier, array: Array
+) -> tuple[FloatArray, FloatArray]:
+    """Return ranges (N,), metres, and unit directions (N, 3), array frame, of offsets (N, 3)."""
+    ranges_m = np.sqrt(np.vecdot(offsets_ned_m, offsets_ned_m))
     array_from_local = array.array_from_body @ carrier.body_from_local
-    return ranges_m, (offsets_m / ranges_m[:, np.newaxis]) @ array_from_local.T
+    return ranges_m, (offsets_ned_m / ranges_m[:, np.newaxis]) @ array_from_local.T
 
 
 LineOfSightRates = tuple[float | None, float | None, float | None]
@@ -49,32 +61,31 @@ def rates(
     moved = carrier.velocity_ned_mps
     if moved is None:
         return [unknown] * len(tracks)
-    known = [track.velocity_ned_mps is not None for track in tracks]
-    velocities = [moved if v is None else v for v in (t.velocity_ned_mps for t in tracks)]
+    velocities = [track.velocity_ned_mps for track in tracks]
+    known = [velocity is not None for velocity in velocities]
+    moving_ned_mps = np.array([moved if v is None else v for v in velocities])
     array_from_local = array.array_from_body @ carrier.body_from_local
     if array.lever_arm_m.any():
         swung = np.cross(carrier.body_rates_radps, array.lever_arm_m)
         moved = moved + swung @ carrier.body_from_local
-    moving = (np.array(velocities) - moved) @ array_from_local.T
-    range_rates = np.einsum("nk,nk->n", moving, directions)
+    moving = (moving_ned_mps - moved) @ array_from_local.T
+    range_rates = np.vecdot(moving, directions)
     across = (moving - range_rates[:, np.newaxis] * directions) / ranges_m[:, np.newaxis]
     w1, w2, w3 = (array.array_from_body @ carrier.body_rates_radps).tolist()
+    rows = zip(known, directions.tolist(), across.tolist(), range_rates.tolist(), strict=True)
     found: list[LineOfSightRates] = []
-    for i, (x, y, z) in enumerate(directions.tolist()):
-        x_rate, y_rate, z_rate = across[i].tolist()
-        x_rate, y_rate, z_rate = (
-            x_rate - (w2 * z - w3 * y),
-            y_rate - (w3 * x - w1 * z),
-            z_rate - (w1 * y - w2 * x),
-        )
+    for is_known, (x, y, z), (x_moves, y_moves, z_moves), range_rate in rows:
+        x_rate = x_moves - (w2 * z - w3 * y)
+        y_rate = y_moves - (w3 * x - w1 * z)
+        z_rate = z_moves - (w1 * y - w2 * x)
         level = x * x + y * y
-        if not known[i]:
+        if not is_known:
             found.append(unknown)
         elif level < 1e-12:
-            found.append((None, None, float(range_rates[i])))
+            found.append((None, None, range_rate))
         else:
             azimuth = (x * y_rate - y * x_rate) / level
-            found.append((azimuth, -z_rate / math.sqrt(level), float(range_rates[i])))
+            found.append((azimuth, -z_rate / math.sqrt(level), range_rate))
     return found
 
 

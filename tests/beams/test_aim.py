@@ -738,7 +738,7 @@ def test_precoding_receives_snr_and_rate_weight_of_each_uav(
         return precode(*arguments, radio=radio, **more)
 
     monkeypatch.setattr("companion.beams.aim.precode", precoded)
-    how = Precoder(rate_weights={"b": 4.0})
+    how = Precoder(method=Method.MMSE, rate_weights={"b": 4.0})
     tracks = [track("a", (100, 0, 0)), track("b", (0, 200, 0))]
     coverage = Coverage()
     aim(

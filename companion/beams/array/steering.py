@@ -27,7 +27,7 @@ MIN_ENTRIES_FOR_POWERS: Final = 1000
 def angles_rad(directions: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Return azimuth and elevation, (N,) each, of unit directions (N, 3) in the array frame."""
     azimuth = np.arctan2(directions[:, 1], directions[:, 0])
-    return azimuth, np.arcsin(np.clip(-directions[:, 2], -1.0, 1.0))
+    return azimuth, np.arcsin(np.minimum(np.maximum(-directions[:, 2], -1.0), 1.0))
 
 
 def unit_directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> FloatArray:

@@ -176,8 +176,6 @@ def _allowed_share(
     a = _squared(less) - least * power[:, np.newaxis]
     b = fields.real * less.real + fields.imag * less.imag - least * crossed[:, np.newaxis]
     c = np.maximum(received - least * spread.powers[:, np.newaxis], 0.0)
-    if ((c + np.minimum(a, 0.0) >= 2.0 * np.maximum(b, 0.0)) | (least <= 0)).all():
-        return np.ones(len(fields))  # no root before t = 1
     # Without nulls the gain suffices: c >= 0. This form of the first root above 0 never cancels.
     depth = b * b - a * c
     inside = np.sqrt(np.maximum(depth, 0.0))

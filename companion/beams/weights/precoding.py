@@ -85,6 +85,11 @@ class Precoder:
     uav_antennas: int = 4
     worth_db: float = 0.0
 
+    @property
+    def needs_radio(self) -> bool:
+        """Whether the weights depend on the radio parameters of the users."""
+        return self.method is Method.MMSE or self.power not in (None, Power.EQUAL)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Precoding:

@@ -94,6 +94,7 @@ class Aperture(NamedTuple):
     shapes: Shapes  # the tables
     axes: FloatArray  # (D, 3), the line, or the two axes of the plane, array frame
     lengths_m: FloatArray  # (D,), those of uniform apertures with the same variance
+    natural_rad: float  # natural width of the longer axis
     most: FloatArray  # (D,), the widest possible beam in natural widths, by the element spacing
     placed: FloatArray  # (M, D), the elements in apertures from the middle
     knots: FloatArray
@@ -125,6 +126,7 @@ def aperture(array: Array) -> Aperture:
         shapes=shapes,
         axes=axes,
         lengths_m=lengths_m,
+        natural_rad=array.wavelength_m / max(float(lengths_m.max()), 1e-9),
         most=WIDEST_PER_ELEMENT * counts,
         placed=placed,
         knots=knots,

@@ -21,7 +21,8 @@ Over 300 lines: one proof: the cells of a cone, the bound over a cell, and the s
 """
 
 from dataclasses import dataclass
-from typing import Final
+from functools import cache, lru_cache
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -40,6 +41,9 @@ DISC_PHASE_RAD: Final = 0.25  # elsewhere
 
 Half of its square is the error of the bounds, relative to the largest possible response.
 """
+LINE_QUARTERS: Final = np.array([4, 1]), np.array([(0, 0), (1, 0), (2, 0), (3, 0)])
+"""Parts of a split box in angle and rotation, and the place of each quarter among them."""
+DISC_QUARTERS: Final = np.array([2, 2]), np.array([(0, 0), (0, 1), (1, 0), (1, 1)])
 ROUNDING_RAD: Final = 1e-12
 """Margin for rounding, added to the angle within which a pattern is bounded, radians."""
 
@@ -105,7 +109,7 @@ def unit_directions(directions: FloatArray, bounds_rad: FloatArray) -> FloatArra
     """
     if directions.ndim != 2 or directions.shape[1] != 3:
         raise ValueError(f"directions have shape {directions.shape}; give rows of three")
-    lengths = np.sqrt(np.einsum("nk,nk->n", directions, directions))
+    lengths = np.sqrt(np.vecdot(directions, directions))
     if not (np.abs(lengths - 1) < 1e-6).all():
         raise ValueError("directions must be unit vectors")
     if bounds_rad.shape != lengths.shape or not (bounds_rad >= 0).all():
@@ -146,27 +150,16 @@ def cones_around(
 
     The cones apply to responses of weights that are at most ``magnitudes`` (M, N).
     """
-    centred = array.centred_m
-    far = centred[np.argmax(np.einsum("mk,mk->m", centred, centred))]
-    extent_m = float(np.sqrt(far @ far))
-    along = far / max(extent_m, 1e-300)
-    aside_m = float(np.abs(centred - np.outer(centred @ along, along)).max())
-    aligned = extent_m > 0 and aside_m <= SAME_PLACE_WAVELENGTHS * array.wavelength_m
-    line = aligned and not has_distinct_patterns(array)
+    layout = _layout(array)
     if has_distinct_patterns(array):
         towards = steering.element_directions(array, directions)
         magnitudes = magnitudes * array.element.amplitude_range(towards, bounds_rad)[1]
-    columns = np.flatnonzero(np.abs(centred).max(axis=0) > 0)
-    positions = centred[:, columns]
+    positions = layout.positions_m
     ceilings = np.maximum(magnitudes.sum(axis=0), 1e-300)  # 0: no element radiates there
     centres = magnitudes.T @ positions / ceilings[:, np.newaxis]
-    moments = np.einsum("mn,mi,mj->nij", magnitudes, positions, positions)
-    moments -= ceilings[:, np.newaxis, np.newaxis] * np.einsum("ni,nj->nij", centres, centres)
-    wavenumber = array.wavenumber_radpm
-    phase = wavenumber * float(np.abs(array.elements_m).max())
-    unsure = (array.size + 16 + 8 * phase) * np.finfo(float).eps
-    unsure += 4 * wavenumber * aside_m if line else 0.0
-    poles = np.broadcast_to(along, directions.shape) if line else directions
+    moments = (magnitudes.T @ layout.products_m2).reshape(len(ceilings), *positions.shape[1:] * 2)
+    moments -= (ceilings[:, np.newaxis] * centres)[:, :, np.newaxis] * centres[:, np.newaxis]
+    poles = np.broadcast_to(layout.along, directions.shape) if layout.line else directions
     frames, tilts = _frames(poles, directions)
     return DirectionCones(
         array=array,
@@ -174,12 +167,54 @@ def cones_around(
         tilts_rad=tilts,
         bounds_rad=np.minimum(bounds_rad, np.pi),
         positions_m=positions,
-        columns=columns,
+        columns=layout.columns,
         centres_m=centres,
-        curvatures=wavenumber**2 * moments,
+        curvatures=array.wavenumber_radpm**2 * moments,
         ceilings=ceilings,
-        rounding=unsure * ceilings,
+        rounding=layout.unsure * ceilings,
+        line=layout.line,
+    )
+
+
+class _Layout(NamedTuple):
+    """Elements of an array as cones see them; see ``DirectionCones``.
+
+    along        (3,), direction of the outermost element
+    products_m2  (M, B B), products of the positions' columns
+    unsure       bound on floating-point error, relative to the largest response
+    """
+
+    along: FloatArray
+    line: bool
+    columns: IntArray
+    positions_m: FloatArray
+    products_m2: FloatArray
+    unsure: float
+
+
+@lru_cache(maxsize=8)
+def _layout(array: Array) -> _Layout:
+    centred = array.centred_m
+    far = centred[np.argmax(np.vecdot(centred, centred))]
+    extent_m = float(np.sqrt(far @ far))
+    along = far / max(extent_m, 1e-300)
+    aside_m = float(np.abs(centred - np.outer(centred @ along, along)).max())
+    aligned = extent_m > 0 and aside_m <= SAME_PLACE_WAVELENGTHS * array.wavelength_m
+    line = aligned and not has_distinct_patterns(array)
+    columns = np.flatnonzero(np.abs(centred).max(axis=0) > 0)
+    positions = centred[:, columns]
+    wavenumber = array.wavenumber_radpm
+    phase = wavenumber * float(np.abs(array.elements_m).max())
+    unsure = (array.size + 16 + 8 * phase) * float(np.finfo(float).eps)
+    unsure += 4 * wavenumber * aside_m if line else 0.0
+    products = (positions[:, :, np.newaxis] * positions[:, np.newaxis]).reshape(array.size, -1)
+    return _Layout(
+        along=along,
         line=line,
+        columns=columns,
+        positions_m=positions,
+        products_m2=products,
+        unsure=unsure,
     )
 
 
@@ -188,50 +223,61 @@ def _frames(poles: FloatArray, towards: FloatArray) -> tuple[FloatArray, FloatAr
 
     e1 is on the side of ``towards`` if that differs from the pole.
     """
-    cosines = np.einsum("nk,nk->n", poles, towards)
+    cosines = np.vecdot(poles, towards)
     aside = towards - cosines[:, np.newaxis] * poles
-    sines = np.sqrt(np.einsum("nk,nk->n", aside, aside))
-    least = np.eye(3)[np.argmin(np.abs(poles), axis=1)]
-    e1 = np.where((sines > 1e-15)[:, np.newaxis], aside, least)
+    sines = np.sqrt(np.vecdot(aside, aside))
+    e1 = aside
+    if not sines.min(initial=1.0) > 1e-15:
+        least = np.eye(3)[np.argmin(np.abs(poles), axis=1)]
+        e1 = np.where((sines > 1e-15)[:, np.newaxis], aside, least)
     for _ in range(2):  # twice: for a short vector the residual along the pole is not small
-        e1 /= np.sqrt(np.einsum("nk,nk->n", e1, e1))[:, np.newaxis]
-        e1 -= np.einsum("nk,nk->n", e1, poles)[:, np.newaxis] * poles
-    e1 /= np.sqrt(np.einsum("nk,nk->n", e1, e1))[:, np.newaxis]
-    return np.stack([poles, e1, np.cross(poles, e1)], axis=1), np.arctan2(sines, cosines)
+        e1 = e1 / np.sqrt(np.vecdot(e1, e1))[:, np.newaxis]
+        e1 = e1 - np.vecdot(e1, poles)[:, np.newaxis] * poles
+    e1 = e1 / np.sqrt(np.vecdot(e1, e1))[:, np.newaxis]
+    frames: FloatArray = np.empty((len(poles), 3, 3))
+    frames[:, 0], frames[:, 1] = poles, e1
+    later, last = [1, 2, 0], [2, 0, 1]
+    frames[:, 2] = poles[:, later] * e1[:, last] - poles[:, last] * e1[:, later]
+    return frames, np.arctan2(sines, cosines)
 
 
 def first_boxes(cones: DirectionCones) -> Boxes:
     """Return boxes that cover every cone, finer where the phases of the elements change faster."""
-    spread = np.einsum("nii->ni", cones.curvatures).max(axis=1, initial=0.0) / cones.ceilings
+    curvatures = cones.curvatures.diagonal(axis1=1, axis2=2)
+    spread = curvatures.max(axis=1, initial=0.0) / cones.ceilings
     turned_rad = np.sqrt(np.maximum(spread, 0.0)) * cones.bounds_rad
     if cones.line:
-        wanted = np.clip(turned_rad / LINE_PHASE_RAD, 1, MOST_INTERVALS)
+        wanted, most = turned_rad / LINE_PHASE_RAD, MOST_INTERVALS
     else:
-        wanted = np.clip(turned_rad / (2 * DISC_PHASE_RAD), 1, MOST_RINGS)
+        wanted, most = turned_rad / (2 * DISC_PHASE_RAD), MOST_RINGS
+    wanted = np.minimum(np.maximum(wanted, 1), most)
     counts = 2 ** np.ceil(np.log2(wanted)).astype(np.int64)  # few different counts
-    found = []
-    for count in np.unique(counts):
-        low, high = _intervals(count) if cones.line else _sectors(count)
-        which = np.repeat(np.flatnonzero(counts == count), len(low))
-        tiles = len(which) // len(low)
-        found.append(Boxes(which, np.tile(low, (tiles, 1)), np.tile(high, (tiles, 1))))
-    cone = np.concatenate([boxes.cone for boxes in found])
-    order = np.argsort(cone, kind="stable")
-    cone = cone[order]
-    low = np.concatenate([boxes.low for boxes in found])[order]
-    high = np.concatenate([boxes.high for boxes in found])[order]
-    tilt, bound = cones.tilts_rad[cone], cones.bounds_rad[cone]
-    for ends in (low, high):
-        ends[:, 0] = np.clip(tilt + bound * ends[:, 0], 0.0, np.pi)
+    boxes = _intervals(counts) if cones.line else _discs(counts)
+    tilt, bound = cones.tilts_rad[boxes.cone], cones.bounds_rad[boxes.cone]
+    for ends in (boxes.low, boxes.high):
+        ends[:, 0] = np.minimum(np.maximum(tilt + bound * ends[:, 0], 0.0), np.pi)
+    return boxes
+
+
+def _intervals(counts: IntArray) -> Boxes:
+    """Return -1 to 1 in ``counts`` (N,) equal parts for each cone; the rotation is unused."""
+    cone = np.repeat(np.arange(len(counts)), counts)
+    number = np.arange(len(cone)) - (np.cumsum(counts) - counts)[cone]
+    width = 2.0 / counts[cone]
+    low, high = np.zeros((2, len(cone), 2))
+    low[:, 0], high[:, 0] = number * width - 1.0, (number + 1) * width - 1.0
     return Boxes(cone, low, high)
 
 
-def _intervals(count: int) -> tuple[FloatArray, FloatArray]:
-    """Return the ends of ``count`` equal parts of -1 to 1; the rotation is unused."""
-    ends = np.stack([np.linspace(-1.0, 1.0, count + 1), np.zeros(count + 1)], axis=1)
-    return ends[:-1], ends[1:]
+def _discs(counts: IntArray) -> Boxes:
+    """Return the unit disc in ``counts`` (N,) rings for each cone."""
+    parts = [_sectors(count) for count in counts.tolist()]
+    cone = np.repeat(np.arange(len(counts)), [len(low) for low, _ in parts])
+    low, high = (np.concatenate(ends) for ends in zip(*parts, strict=True))
+    return Boxes(cone, low, high)
 
 
+@cache
 def _sectors(rings: int) -> tuple[FloatArray, FloatArray]:
     """Return cells of the unit disc: ring n has 6n sectors about as long as they are wide."""
     parts = 6 * np.arange(1, rings + 1)
@@ -244,13 +290,10 @@ def _sectors(rings: int) -> tuple[FloatArray, FloatArray]:
 
 def split(cones: DirectionCones, boxes: Boxes) -> Boxes:
     """Split each box in four: quarters of the angle on a line, else halves on both axes."""
-    angles, turns = (4, 1) if cones.line else (2, 2)
-    quarter = np.stack(np.divmod(np.arange(angles * turns), turns), axis=1)
-    size = ((boxes.high - boxes.low) / [angles, turns])[:, np.newaxis]
+    parts, quarter = LINE_QUARTERS if cones.line else DISC_QUARTERS
+    size = ((boxes.high - boxes.low) / parts)[:, np.newaxis]
     low = boxes.low[:, np.newaxis] + size * quarter
-    return Boxes(
-        np.repeat(boxes.cone, len(quarter)), low.reshape(-1, 2), (low + size).reshape(-1, 2)
-    )
+    return Boxes(boxes.cone.repeat(len(quarter)), low.reshape(-1, 2), (low + size).reshape(-1, 2))
 
 
 def cells(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
@@ -270,8 +313,19 @@ def _strips(cones: DirectionCones, boxes: Boxes, caps: int) -> Cells:
     # |cos r - cos r_s| at either end, without the cancellation.
     ends = np.sin((low + angle) / 2), np.sin((high + angle) / 2)
     reach = 2 * np.sin(half / 2) * np.maximum(*ends)
-    widest = _turn_rad(cones, boxes) if caps > 1 else np.zeros_like(angle)
-    turn = widest[:, np.newaxis] / caps
+    if caps == 1:
+        middles = np.cos(angle)[:, np.newaxis] * frames[:, 0]
+        middles += np.sin(angle)[:, np.newaxis] * frames[:, 1]
+        return Cells(
+            cone=boxes.cone,
+            middles=middles,
+            axes=frames[:, :1, cones.columns],
+            reach=reach[:, np.newaxis],
+            caps=middles[:, np.newaxis],
+            caps_rad=half[:, np.newaxis] + ROUNDING_RAD,
+            in_cone=np.ones((len(half), 1), dtype=bool),
+        )
+    turn = _turn_rad(cones, boxes)[:, np.newaxis] / caps
     around = _polar(frames, angle[:, np.newaxis], turn * (2 * np.arange(caps) + 1 - caps))
     caps_rad = _angle_rad(_inward(boxes, turn))
     tilt = cones.tilts_rad[boxes.cone, np.newaxis]
@@ -395,7 +449,7 @@ def response_range(
                c_m
     """
     size = np.abs(responses)
-    turned = np.where(size > 0, responses.conj() / np.where(size > 0, size, 1.0), 1.0)
+    turned = np.where(size > 0, responses.conj() / np.maximum(size, 1e-300), 1.0)
     slopes = np.zeros((2, *size.shape))
     about = cones.centres_m[pieces.cone].T
     balanced = [(m - about[b] * responses) * turned for b, m in enumerate(moments)]
@@ -406,6 +460,6 @@ def response_range(
         slopes[1] += np.abs(np.real(slope)) * pieces.reach[:, d]
     slopes *= cones.array.wavenumber_radpm
     curved = pieces.axes @ cones.curvatures[pieces.cone] @ pieces.axes.transpose(0, 2, 1)
-    bent = np.einsum("ci,cij,cj->c", pieces.reach, np.abs(curved), pieces.reach) / 2
+    bent = np.vecdot(pieces.reach, (np.abs(curved) @ pieces.reach[:, :, np.newaxis])[:, :, 0]) / 2
     bent += cones.rounding[pieces.cone]
     return size - slopes[0] - bent, np.hypot(size + slopes[0], slopes[1]) + bent

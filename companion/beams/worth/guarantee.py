@@ -9,7 +9,6 @@ true largest. See docs/math.md 5.4 and 7.
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -156,6 +155,8 @@ def _over_boxes(
     """Return for each box a lower bound (C,) of the least response, and an attained value."""
     step = max(1, BLOCK // max(cones.array.size, caps))
     starts = range(0, len(boxes.cone), step)
+    if step >= len(boxes.cone):
+        return _over_cells(cones, cone.cells(cones, boxes, caps), weights, most)
     parts = [
         _over_cells(cones, cone.cells(cones, boxes.take(slice(at, at + step)), caps), weights, most)
         for at in starts
@@ -174,6 +175,8 @@ def _over_cells(
     if unsure is not None:
         slack = np.einsum("mc,mc->c", np.abs(weights)[:, cells.cone], unsure)
         return (-high - slack, -seen) if most else (low - slack, seen)
+    if cones.array.element.pattern is ElementPattern.ISOTROPIC:
+        return (-high, -seen) if most else (low, seen)
     least, largest = cones.array.element.amplitude_range(cells.caps, cells.caps_rad)
     amplitude = cones.array.element.amplitude(cells.caps)
     if most:
@@ -186,17 +189,11 @@ def _over_cells(
 def _by_cone(
     cones: DirectionCones, weights: ComplexArray, received: ComplexArray, cone_of: IntArray
 ) -> ComplexArray:
-    """Return for each cell its weights' response and moments by position, (1 + B, C).
-
-    Cells are in the order of their cones, so that each cone needs one matrix product.
-    """
-    parts = np.vstack([np.ones(len(weights)), cones.positions_m.T])
-    first = int(cone_of[0])
-    edges = np.searchsorted(cone_of, np.arange(first, int(cone_of[-1]) + 2)).tolist()
-    found: ComplexArray = np.empty((len(parts), len(cone_of)), dtype=complex)
-    for n, (begin, end) in enumerate(pairwise(edges), first):
-        if begin < end:
-            found[:, begin:end] = (parts * weights[:, n]) @ received[:, begin:end]
+    """Return for each cell its weights' response and moments by position, (1 + B, C)."""
+    received = received * weights[:, cone_of]
+    found: ComplexArray = np.empty((1 + cones.positions_m.shape[1], len(cone_of)), dtype=complex)
+    found[0] = received.sum(axis=0)
+    found[1:] = cones.positions_m.T @ received
     return found
 
 

@@ -16,9 +16,11 @@ from companion.beams.worth.link_budget import LinkBudget
 from companion.settings.beams import NeedSettings
 from companion.values import Beam, BeamSet, FloatArray
 
-ROUND: Final = np.array([(math.cos(k * math.pi / 4), math.sin(k * math.pi / 4)) for k in range(8)])
-"""Samples on each ring of a cone, as cosine and sine of the angle around its axis."""
-RINGS: Final = np.array([0.5, 1.0])  # radii of the rings over that of the cone
+RINGS: Final = np.repeat([0.0, 0.5, 1.0], [1, 8, 8])
+"""Samples of a cone, (K,): on its axis and on two rings, as radii over that of the cone."""
+ROUND: Final = np.arange(-1, 16) * (math.pi / 4)  # their angles about its axis, (K,)
+ACROSS: Final = np.cos(ROUND)
+ALONG: Final = np.sin(ROUND)
 NOTHING: Final = 1e-12  # least gain or power that is told from zero
 
 
@@ -50,9 +52,8 @@ class GainMeter:
 
     def gains(self, beam_set: BeamSet, which: Sequence[int]) -> list[LinkGains]:
         """Return the gains of the beams of these numbers."""
-        towards = directions(beam_set)
-        needed_db = _needed_db(self._need, self._site, beam_set, towards)
-        least_db = self._least_db(beam_set, towards, which)
+        needed_db = self._needed_db(beam_set)
+        least_db = self._least_db(beam_set, which)
         return [
             LinkGains(
                 beam=beam_set.beams[i],
@@ -76,63 +77,67 @@ class GainMeter:
             beam.pointing_p95_rad if within else beam.pointing_bound_rad
             for beam, within in zip(beams, usual, strict=True)
         ]
-        towards = directions(beam_set)
-        units = towards[list(which)]
-        bounds = guarantee.covered_bounds(array, self._site.coverage, units, angles)
+        frames = _frames(beams)
+        bounds = guarantee.covered_bounds(array, self._site.coverage, frames[:, 0], angles)
         radii = np.array([0.0 if bound is None else bound for bound in bounds])
-        samples = _samples(units, radii)
+        samples = _samples(frames, radii)
         steered = steering.steering_matrix(array, samples.reshape(-1, 3))
-        weights = array.fed(beam_set.weights[:, list(which)]).T[:, :, np.newaxis]
+        weights = array.fed(beam_set.weights[:, list(which)]).T
         shape = (array.size, *samples.shape[:2])
-        fields = np.matmul(steered.reshape(shape).transpose(1, 2, 0), weights)[:, :, 0]
-        powers = np.sum(np.abs(weights[:, :, 0]) ** 2, axis=1)
-        gains = np.min(np.abs(fields), axis=1) ** 2 / np.maximum(powers, NOTHING)
-        least_db = 10 * np.log10(np.maximum(gains, NOTHING))
-        needed_db = _needed_db(self._need, self._site, beam_set, towards)
+        fields = (steered.reshape(shape).transpose(1, 2, 0) @ weights[:, :, np.newaxis])[:, :, 0]
+        squares = (fields.real**2 + fields.imag**2).min(axis=1)
+        gains = squares / np.maximum(np.vecdot(weights, weights).real, NOTHING)
+        least_db = (10 * np.log10(np.maximum(gains, NOTHING))).tolist()
+        needed_db = self._needed_db(beam_set)
         return [
             bound is None or least < needed_db[i]
-            for i, bound, least in zip(which, bounds, least_db.tolist(), strict=True)
+            for i, bound, least in zip(which, bounds, least_db, strict=True)
         ]
 
     def _least_db(
-        self, beam_set: BeamSet, towards: FloatArray, which: Sequence[int]
+        self, beam_set: BeamSet, which: Sequence[int]
     ) -> tuple[Sequence[float | None], Sequence[float | None]]:
         """Return each beam's least gain within its UAV's bound, and within the usual error."""
         array, beams = self._site.array, [beam_set.beams[i] for i in which]
-        both = np.tile(towards[which], (2, 1))
+        towards = _frames(beams)[:, 0]
+        both = np.concatenate((towards, towards))
         angles = [beam.pointing_bound_rad for beam in beams]
         angles += [beam.pointing_p95_rad for beam in beams]
         bounds = guarantee.covered_bounds(array, self._site.coverage, both, angles)
-        weights = np.tile(beam_set.weights[:, which], 2)
+        weights = beam_set.weights[:, [*which, *which]]
         gains = guarantee.guaranteed_gains_db(array, both, bounds, weights)
         return gains[: len(beams)], gains[len(beams) :]
 
+    def _needed_db(self, beam_set: BeamSet) -> list[float]:
+        """Return the array gain that each link needs, dB.
 
-def _samples(units: FloatArray, radii_rad: FloatArray) -> FloatArray:
-    """Return directions (N, K, 3) in cones around unit directions (N, 3): the axis and rings."""
-    x, y, z = units.T
-    level = np.maximum(np.hypot(x, y), 1e-9)
-    across = np.stack((-y / level, x / level, np.zeros(len(units))), axis=-1)[:, None, None]
-    along = np.stack((-z * x / level, -z * y / level, level), axis=-1)[:, None, None]
-    angles = radii_rad[:, None, None, None] * RINGS[:, None, None]
-    rings = np.cos(angles) * units[:, None, None] + np.sin(angles) * (
-        ROUND[:, :1] * across + ROUND[:, 1:] * along
-    )
-    return np.concatenate((units[:, None], rings.reshape(len(units), -1, 3)), axis=1)
+        With ``needed_sinr_db`` that is the beam's gain less the excess of its SINR.
+        """
+        need, site, beams = self._need, self._site, beam_set.beams
+        if need.needed_sinr_db is None:
+            return [need.needed_db] * len(beams)
+        sinr_db = link_budget.sinr_of_beams_db(
+            site.array, beam_set, directions(beam_set), site.budget, site.uav_antennas
+        )
+        spare_db = sinr_db - need.needed_sinr_db
+        return [beam.gain_db - spare for beam, spare in zip(beams, spare_db.tolist(), strict=True)]
 
 
-def _needed_db(
-    need: NeedSettings, site: Site, beam_set: BeamSet, towards: FloatArray
-) -> list[float]:
-    """Return the array gain that each link needs, dB.
+def _frames(beams: Sequence[Beam]) -> FloatArray:
+    """Return each beam's direction, and two axes across it, (N, 3, 3), as rows."""
+    angles = np.array([(beam.azimuth_rad, beam.elevation_rad) for beam in beams]).T
+    (east, level), (right, up) = np.cos(angles), np.sin(angles)
+    frames: FloatArray = np.empty((len(beams), 3, 3))
+    frames[:, 0, 0], frames[:, 0, 1], frames[:, 0, 2] = level * east, level * right, -up
+    frames[:, 1, 0], frames[:, 1, 1], frames[:, 1, 2] = -right, east, 0.0
+    frames[:, 2, 0], frames[:, 2, 1], frames[:, 2, 2] = up * east, up * right, level
+    return frames
 
-    With ``needed_sinr_db`` that is the beam's gain less the excess of its SINR.
-    """
-    beams = beam_set.beams
-    if need.needed_sinr_db is None:
-        return [need.needed_db] * len(beams)
-    sinr_db = link_budget.sinr_of_beams_db(
-        site.array, beam_set, towards, site.budget, site.uav_antennas
-    )
-    spare_db = sinr_db - need.needed_sinr_db
-    return [beam.gain_db - spare for beam, spare in zip(beams, spare_db.tolist(), strict=True)]
+
+def _samples(frames: FloatArray, radii_rad: FloatArray) -> FloatArray:
+    """Return directions (N, K, 3) in cones around the first rows of frames (N, 3, 3)."""
+    angles = radii_rad[:, np.newaxis] * RINGS
+    aside = np.sin(angles)
+    parts: FloatArray = np.empty((*angles.shape, 3))
+    parts[:, :, 0], parts[:, :, 1], parts[:, :, 2] = np.cos(angles), aside * ACROSS, aside * ALONG
+    return np.asarray(parts @ frames)

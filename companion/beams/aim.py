@@ -293,7 +293,7 @@ def _errors(
     The usual error is the estimated 95th percentile. Errors of positions and of the attitude are
     independent, so they add as squares (docs/math.md 5.3).
     """
-    lever_m = math.hypot(*array.lever_arm_m.tolist())
+    lever_m = array.lever_m
     attitude_rad, own_m = carrier.attitude_bound_rad, carrier.bound_m
     swung_m = 2.0 * math.sin(min(attitude_rad, math.pi) / 2.0) * lever_m
     usual_rad = _usual(carrier.attitude_p95_rad, attitude_rad)

@@ -14,7 +14,7 @@ from companion.values import Carrier, FloatArray, Track
 
 def place_ned_m(carrier: Carrier, array: Array) -> FloatArray:
     """Return the array's position, (3,), local frame: the carrier's position plus the lever arm."""
-    if not array.lever_arm_m.any():
+    if not array.lever_m:
         return carrier.position_ned_m
     place: FloatArray = carrier.position_ned_m + carrier.body_from_local.T @ array.lever_arm_m
     return place
@@ -65,7 +65,7 @@ def rates(
     known = [velocity is not None for velocity in velocities]
     moving_ned_mps = np.array([moved if v is None else v for v in velocities])
     array_from_local = array.array_from_body @ carrier.body_from_local
-    if array.lever_arm_m.any():
+    if array.lever_m:
         swung = np.cross(carrier.body_rates_radps, array.lever_arm_m)
         moved = moved + swung @ carrier.body_from_local
     moving = (moving_ned_mps - moved) @ array_from_local.T

@@ -284,7 +284,12 @@ class Pipeline:
             state = self.tracker.state(self.center.vehicle, now)
             states |= {} if state is None else {self.center.vehicle: state}
         said = self.targets.changes(now_ns, states)
-        evidence = partial(self._evidence, now_ns, cache(partial(self._carrier_evidence, now_ns)))
+
+        @cache
+        def carrier() -> CarrierEvidence:
+            return self._carrier_evidence(now_ns)
+
+        evidence = partial(self._evidence, now_ns, carrier)
         judged = self.health.judge(self.last_update, weighed, evidence)
         changed = self._clock_notices.due(now_ns)
         return [*said, *judged, *([changed] if changed else ()), self.last_update]

@@ -88,12 +88,13 @@ class HealthMonitor:
         looked_ns = self._looked_ns
         looks = looked_ns is None or not 0 <= update.t_ns - looked_ns < LOOK_NS
         looks &= update.carrier is not None
-        fallen = self._fallen(update.beams)[:FALLEN_AT_ONCE] if looks else []
         if not begins and not waiting and not looks:
             return None
         elapsed_ns = 0 if last_ns is None else update.t_ns - last_ns
         share = len(beams) * min(max(elapsed_ns / EVERY_NS, 0.0), 1.0)
         many = max(AT_ONCE, math.ceil(share))
+        whole = begins and many >= len(beams)  # all links are assessed, fallen or not
+        fallen = self._fallen(update.beams)[:FALLEN_AT_ONCE] if looks and not whole else []
         chosen = frozenset((*waiting[:many], *fallen))
         which = [i for i, beam in enumerate(beams) if beam.uav in chosen]
         links = (

@@ -44,6 +44,7 @@ class Array:
         centred_m           (M, 3), positions relative to their centroid
         variance_m2         (3, 3), mean of their outer products
         axis                (3,), the line through all elements; None if they are not on a line
+        lever_m             length of the lever arm
     """
 
     kind: ArrayKind
@@ -60,6 +61,7 @@ class Array:
     centred_m: FloatArray = field(init=False)
     variance_m2: FloatArray = field(init=False)
     axis: FloatArray | None = field(init=False)
+    lever_m: float = field(init=False)
 
     def __post_init__(self) -> None:
         centred_m = self.elements_m - self.elements_m.mean(axis=0)
@@ -69,6 +71,7 @@ class Array:
         on_a_line = values[1] <= (LINE_WAVELENGTHS * self.wavelength_m) ** 2
         object.__setattr__(self, "variance_m2", variance_m2)
         object.__setattr__(self, "axis", vectors[:, 2] if on_a_line else None)
+        object.__setattr__(self, "lever_m", math.hypot(*self.lever_arm_m.tolist()))
 
     @property
     def size(self) -> int:

@@ -50,7 +50,9 @@ class Shapes(NamedTuple):
     cones: FloatArray  # (C,), ascending
     ratios: FloatArray  # (R,), the cone's width over the likely one, ascending from 1
     likely: FloatArray  # (L C R, K), phases of the largest mean likely gain above that floor
-    last: IntArray  # (3, 1), the last but one of the losses, of the cones and of the ratios
+    first: FloatArray  # (3, 1), start of the axes: 0 for losses, by number; cones; ratios
+    knots_per_unit: FloatArray  # (3, 1), 1 for losses; cones; ratios
+    last: IntArray  # (3, 1), the last but one of each
     strides: IntArray  # (3,), rows of ``likely`` from one of each to the next
     corners: IntArray  # (8,), rows from the first to all corners of a cell; the ratio runs fastest
 
@@ -63,16 +65,20 @@ def _table(name: str) -> Shapes:
     with np.load(io.BytesIO(file.read_bytes()), allow_pickle=False) as held:
         counts = [len(held[f"{name}_{axis}"]) for axis in ("losses_db", "cones", "ratios")]
         strides = np.array([counts[1] * counts[2], counts[2], 1])
+        cones, ratios = np.log(held[f"{name}_cones"]), -np.log(held[f"{name}_ratios"])
+        lengths = np.array([counts[0] - 1, cones[-1] - cones[0], ratios[-1] - ratios[0]])
         return Shapes(
             places=(np.arange(count) - (count - 1) / 2) / count,
             widths=np.log(held[f"{name}_widths"]),
             guaranteed=held[f"{name}_sure"].astype(float),
             least_db=held[f"{name}_least_db"],
             losses=np.log(held[f"{name}_losses_db"]),
-            cones=np.log(held[f"{name}_cones"]),
-            ratios=-np.log(held[f"{name}_ratios"]),
+            cones=cones,
+            ratios=ratios,
             likely=held[f"{name}_likely"].astype(float).reshape(-1, count**axes // 2**axes)
             @ even.T,
+            first=np.array([[0.0], [cones[0]], [ratios[0]]]),
+            knots_per_unit=((np.array(counts) - 1) / lengths)[:, np.newaxis],
             last=np.array(counts)[:, np.newaxis] - 2,
             strides=strides,
             corners=CORNERS @ strides,
@@ -209,7 +215,8 @@ def _psi(
     least_db = len(columns) * math.exp(shapes.losses[0])
     lacking_db = np.maximum(worth_db + SPARE_DB + least_db - best_db, 0.0)
     loss_db = np.maximum(best_db - floor_db, least_db) + LOSS_PER_MISSING_DB * lacking_db
-    losses = np.log(loss_db / len(columns))
+    numbers = np.arange(len(shapes.losses))
+    losses = np.interp(np.log(loss_db / len(columns)), shapes.losses, numbers)
     return [_likely_phases(shapes, losses, wide[:, d], narrow[:, d]) for d in columns]
 
 
@@ -219,17 +226,12 @@ def _between(knots: FloatArray, at: FloatArray) -> tuple[IntArray, FloatArray]:
     return before, (at - knots[before]) / (knots[before + 1] - knots[before])
 
 
-def _on_even_axis(knots: FloatArray, at: FloatArray) -> FloatArray:
-    """Return the places of points (N,) on an axis of even knots, in knots from the first."""
-    last = len(knots) - 1
-    places = (at - knots[0]) * (last / (knots[-1] - knots[0]))
-    return np.asarray(np.minimum(np.maximum(places, 0.0), last))
-
-
 def _guaranteed_phases(shapes: Shapes, widths: FloatArray) -> FloatArray:
     """Return the phases (N, K) of the largest least gain; widths (N,) as logarithms."""
-    places = _on_even_axis(shapes.widths, widths)
-    before = np.minimum(places.astype(np.int64), len(shapes.widths) - 2)
+    last = len(shapes.widths) - 1
+    places = (widths - shapes.widths[0]) * (last / (shapes.widths[-1] - shapes.widths[0]))
+    places = np.minimum(np.maximum(places, 0.0), last)
+    before = np.minimum(places.astype(np.int64), last - 1)
     part = (places - before)[:, np.newaxis]
     found: FloatArray = (1 - part) * shapes.guaranteed[before] + part * shapes.guaranteed[
         before + 1
@@ -240,11 +242,15 @@ def _guaranteed_phases(shapes: Shapes, widths: FloatArray) -> FloatArray:
 def _likely_phases(
     shapes: Shapes, losses: FloatArray, cones: FloatArray, likely: FloatArray
 ) -> FloatArray:
-    """Return the phases (N, K) of the largest likely gain; all arguments (N,) are logarithms."""
+    """Return the phases (N, K) of the largest likely gain.
+
+    Cones and likely widths (N,) are logarithms; losses (N,) are places on their axis, in knots.
+    """
     places: FloatArray = np.empty((3, len(losses)))
-    places[0] = np.interp(losses, shapes.losses, np.arange(len(shapes.losses)))
-    places[1] = _on_even_axis(shapes.cones, cones)
-    places[2] = _on_even_axis(shapes.ratios, cones - likely)
+    places[0], places[1] = losses, cones
+    np.subtract(cones, likely, out=places[2])
+    places = (places - shapes.first) * shapes.knots_per_unit
+    places = np.minimum(np.maximum(places, 0.0), shapes.last + 1)
     before = np.minimum(places.astype(np.int64), shapes.last)
     # The eight corners of each cell, and their shares.
     share: FloatArray = np.empty((2, *places.shape))

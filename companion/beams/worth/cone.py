@@ -159,7 +159,7 @@ def cones_around(
     centres = magnitudes.T @ positions / ceilings[:, np.newaxis]
     moments = (magnitudes.T @ layout.products_m2).reshape(len(ceilings), *positions.shape[1:] * 2)
     moments -= (ceilings[:, np.newaxis] * centres)[:, :, np.newaxis] * centres[:, np.newaxis]
-    poles = np.broadcast_to(layout.along, directions.shape) if layout.line else directions
+    poles = layout.along[np.newaxis].repeat(len(directions), 0) if layout.line else directions
     frames, tilts = _frames(poles, directions)
     return DirectionCones(
         array=array,

@@ -139,11 +139,14 @@ def _extremes(
         size = np.abs(attained)
         enough = attained - TOLERANCE * np.maximum(size, nothing)
         going = most | (size > nothing)
-        in_doubt = (bound < enough[boxes.cone]) & going[boxes.cone] & (level + 1 < LEVELS)
-        spent += (1 + caps // CAPS) * np.bincount(boxes.cone[in_doubt], minlength=len(unit))
-        in_doubt &= (spent <= MOST_SPLIT)[boxes.cone]
-        np.minimum.at(proven, boxes.cone[~in_doubt], bound[~in_doubt])
-        if not in_doubt.any():
+        going &= level + 1 < LEVELS
+        in_doubt = bound < np.where(going, enough, -np.inf)[boxes.cone]
+        if in_doubt.any():
+            spent += (1 + caps // CAPS) * np.bincount(boxes.cone[in_doubt], minlength=len(unit))
+            in_doubt &= (spent <= MOST_SPLIT)[boxes.cone]
+        done = ~in_doubt
+        np.minimum.at(proven, boxes.cone[done], bound[done])
+        if done.all():
             break
         boxes = cone.split(cones, boxes.take(in_doubt))
     return proven

@@ -159,7 +159,8 @@ def _grid_samples(
         sides.append(aside)
     off = np.abs(sides[0]) if len(sides) == 1 else _off_ellipses(sides[0], sides[1], seen.inclined)
     # A ramp one sample wide at the edge, so that weights change continuously.
-    steps = np.maximum(halves.min(axis=2) * finer + EDGE, 0.5)[:, :, np.newaxis]
+    narrower = halves[:, :, :1] if len(sides) == 1 else halves.min(axis=2, keepdims=True)
+    steps = np.maximum(narrower * finer + EDGE, 0.5)
     counts = np.minimum(np.maximum(0.5 + steps * (1.0 - off), 0.0), 1.0)
     counts /= np.maximum(counts.max(axis=2, keepdims=True), 1e-9)
     return waves, counts

@@ -22,6 +22,7 @@ Over 300 lines: the methods are fallbacks of one another.
 """
 
 import math
+import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Final
@@ -168,10 +169,12 @@ def precode(
         )
     groups, dropped = _slots(steering, settings, priorities, before)
     made = [_columns(steering, settings, spread, radio, group) for group in groups]
-    shared = [
-        _with_power_allocation(steering[:, group], one.weights, settings, radio, group)
-        for group, one in zip(groups, made, strict=True)
-    ]
+    shared = [one.weights for one in made]
+    if settings.power is not None:
+        shared = [
+            _with_power_allocation(steering[:, group], columns, settings, radio, group)
+            for group, columns in zip(groups, shared, strict=True)
+        ]
     if len(groups) == 1 and len(groups[0]) == users:
         served, slots = everyone, np.zeros(users, dtype=np.int64)
         weights = np.ascontiguousarray(shared[0])
@@ -302,9 +305,7 @@ def _mmse_loading(
 def _with_power_allocation(
     a: ComplexArray, weights: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
 ) -> ComplexArray:
-    """Return columns (M, K) of a slot with power allocated as the settings say; else unchanged."""
-    if settings.power is None:
-        return weights
+    """Return columns (M, K) of a slot with power allocated as the settings say."""
     unit: ComplexArray = weights / np.linalg.norm(weights, axis=0)
     if settings.power is Power.EQUAL:
         return unit
@@ -387,7 +388,7 @@ def _condition_number(a: ComplexArray, gram: ComplexArray) -> float:
     Always finite: past about 1e7 rounding hides the smallest eigenvalue, and the result stays
     there. With more users than elements the smallest is 0, and only rounding determines the result.
     """
-    rounding = len(gram) * float(np.finfo(float).eps)
+    rounding = len(gram) * sys.float_info.epsilon
     if len(gram) > len(a):
         return 1.0 / math.sqrt(rounding)
     eigenvalues, _, info = zheevd(gram, compute_v=0)

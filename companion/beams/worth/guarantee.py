@@ -9,6 +9,7 @@ true largest. See docs/math.md 5.4 and 7.
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -192,11 +193,17 @@ def _over_cells(
 def _by_cone(
     cones: DirectionCones, weights: ComplexArray, received: ComplexArray, cone_of: IntArray
 ) -> ComplexArray:
-    """Return for each cell its weights' response and moments by position, (1 + B, C)."""
-    received = received * weights[:, cone_of]
-    found: ComplexArray = np.empty((1 + cones.positions_m.shape[1], len(cone_of)), dtype=complex)
-    found[0] = received.sum(axis=0)
-    found[1:] = cones.positions_m.T @ received
+    """Return for each cell its weights' response and moments by position, (1 + B, C).
+
+    Cells are in the order of their cones, so that each cone needs one matrix product.
+    """
+    parts = np.vstack([np.ones(len(weights)), cones.positions_m.T])
+    placed = weights.T[:, np.newaxis] * parts  # (N, 1 + B, M)
+    edges = np.searchsorted(cone_of, np.arange(weights.shape[1] + 1)).tolist()
+    found: ComplexArray = np.empty((len(parts), len(cone_of)), dtype=complex)
+    for one, (begin, end) in zip(placed, pairwise(edges), strict=True):
+        if begin < end:
+            np.matmul(one, received[:, begin:end], out=found[:, begin:end])
     return found
 
 

@@ -259,7 +259,8 @@ class Pipeline:
         self._waited_s = tick.waited_ns * 1e-9
         dropped = self._drop_silent(tick.t_ns) if (self.updates + 1) % DROP_EVERY == 0 else []
         seen = self.observing.update(tick.t_ns)
-        self.aiming = Aiming(cache(self._aimed_of(self.prepare_update(tick.t_ns))), self.local)
+        made = self._aimed_of(self.prepare_update(tick.t_ns))
+        self.aiming = Aiming(cache(made) if tick.in_two else made, self.local)
         said = [*dropped, *seen]
         return said if tick.in_two else [*said, *self._finish_update(tick.t_ns)]
 

@@ -55,7 +55,9 @@ class Targets:
 
     def protected(self, uavs: Iterable[str]) -> list[str]:
         """Return the UAVs of other nodes to be protected by nulls, in the order given."""
-        spares = frozenset(self.duty.spares if self.duty else ())
+        if self.duty is None or not self.duty.spares:
+            return []
+        spares = frozenset(self.duty.spares)
         return [uav for uav in uavs if uav in spares and self.wants(uav)]
 
     def better_known(self, uav: str, others: Iterable[str]) -> list[str]:

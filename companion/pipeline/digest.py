@@ -24,20 +24,19 @@ class Digest:
     def add(self, output: Estimate | Update) -> None:
         """Add one output to the digest: little-endian doubles and integers, names in UTF-8."""
         if isinstance(output, Estimate):
-            self._estimate(output.fix.uav, output.fix.t_ns, output.position_ned_m, output.bound_m)
+            fix = output.fix
+            data = _estimate(fix.uav, fix.t_ns, output.position_ned_m, output.bound_m)
+            self._hash.update(data)
+            self._estimates.update(data)
             return
-        for track in output.tracks:
-            position = track.position_ned_m.tolist()
-            self._estimate(track.uav, track.valid_at_ns, position, track.bound_m)
-        self._hash.update("\0".join(output.beams.uavs).encode())
-        self._hash.update(output.beams.weights.astype("<c16", copy=False).tobytes())
-
-    def _estimate(
-        self, uav: str, t_ns: int, position_ned_m: Sequence[float], bound_m: float
-    ) -> None:
-        data = uav.encode() + _NUMBERS.pack(t_ns, *position_ned_m, bound_m)
-        self._hash.update(data)
-        self._estimates.update(data)
+        tracks = b"".join(
+            _estimate(track.uav, track.valid_at_ns, track.position_ned_m.tolist(), track.bound_m)
+            for track in output.tracks
+        )
+        self._estimates.update(tracks)
+        uavs = "\0".join(output.beams.uavs).encode()
+        weights = output.beams.weights.astype("<c16", copy=False).tobytes()
+        self._hash.update(b"".join((tracks, uavs, weights)))
 
     def hexdigest(self) -> str:
         """Return the digest so far, equal for equal events on processors of one kind."""
@@ -46,3 +45,7 @@ class Digest:
     def of_estimates(self) -> str:
         """Return the digest of estimates and predictions, equal on all processors."""
         return self._estimates.hexdigest()
+
+
+def _estimate(uav: str, t_ns: int, position_ned_m: Sequence[float], bound_m: float) -> bytes:
+    return uav.encode() + _NUMBERS.pack(t_ns, *position_ned_m, bound_m)

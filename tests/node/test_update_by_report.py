@@ -1,5 +1,6 @@
 """``[beams] update = "report"``: a report starts an update; a recording of it replays."""
 
+import asyncio
 import contextlib
 import json
 import subprocess
@@ -42,20 +43,18 @@ async def updates_by_reports(node: Any) -> list[int]:
             while not json.loads(await stream.recv())["beams"]:
                 sock.send(flight.frames(0, 5 * number))
                 number += 1
-            for _ in range(REPORTS):
-                time.sleep(0.1)
-                sock.send(flight.frames(0, 5 * number))
-                number += 1
-                found.append(json.loads(await stream.recv())["update"])
+            async with asyncio.timeout(REPORTS * PERIOD_S / 2):
+                for _ in range(REPORTS):
+                    time.sleep(0.1)
+                    sock.send(flight.frames(0, 5 * number))
+                    number += 1
+                    found.append(json.loads(await stream.recv())["update"])
     return found
 
 
 def test_each_report_starts_an_update(start_node: Any, tmp_path: Path) -> None:
     with service(start_node, tmp_path) as node:
-        begun_s = time.monotonic()
-        found = run_async(updates_by_reports(node))
-        assert len(found) == REPORTS
-        assert time.monotonic() - begun_s < HANG_S
+        assert len(run_async(updates_by_reports(node))) == REPORTS
         assert node.stop()[0] == 0
     (recording,) = tmp_path.glob("*.mcap")
     replayed = subprocess.run(

@@ -123,7 +123,7 @@ class BootLine:
         if self._previous is not None and self._is_straggler(arrival_ns, boot_ms, late_ns):
             return None
         if abs(late_ns) <= self._late_max_ns:
-            return self._place_near(arrival_ns, boot_ms, x_ns)
+            return self._place_near(arrival_ns, boot_ms, x_ns, late_ns)
         if late_ns > 0 and x_ns > self.newest_ns:
             return self._place_delayed(arrival_ns, boot_ms, x_ns)
         advances = self._run.add(arrival_ns, boot_ms, self._late_max_ns)
@@ -168,11 +168,12 @@ class BootLine:
         self.newest_ns = max(self.newest_ns, x_ns)
         return PlacedStamp(x_ns=x_ns)
 
-    def _place_near(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp | None:
+    def _place_near(
+        self, arrival_ns: int, boot_ms: int, x_ns: int, late_ns: int
+    ) -> PlacedStamp | None:
         """Place a stamp near the line: in order, late, or early in a second boot."""
         if x_ns > self.newest_ns:
-            early = self.late_ns(arrival_ns, x_ns) < _EARLY_NS
-            if early and self.floor.count >= _ESTABLISHED:
+            if late_ns < _EARLY_NS and self.floor.count >= _ESTABLISHED:
                 return self._place_ahead(arrival_ns, boot_ms)
             self._run.stamps.clear()
         elif (

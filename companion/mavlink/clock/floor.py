@@ -21,10 +21,9 @@ queue can be that long. Before that, the least height of the last few frames is 
 the offset is below it regardless of earlier clock changes.
 """
 
+import math
 from collections import deque
 from typing import Final, NamedTuple
-
-import numpy as np
 
 from companion.mavlink.clock.latencies import RESOLUTION_NS, Latencies
 from companion.mavlink.clock.lateness import CHANGE, LEAST_CHANGE_NS, LateSpell, SenderLateness
@@ -103,7 +102,7 @@ class Floor:
         self._level: _Level | None = None  # floor if the apparent drift is a queue
         self._bound_set_ns = 0  # x of the stamp that set ``upper_bound``
         self._since_ns = 0  # x of the line's last restart
-        self._risen = -np.inf  # height of the last few frames, if they are suspiciously late
+        self._risen = -math.inf  # height of the last few frames, if they are suspiciously late
         self._recent: deque[tuple[int, float]] = deque(maxlen=RECENT)
         self._lateness = SenderLateness(drift_max)
         self._visible = Latencies(window_ns, drift_max)
@@ -124,9 +123,9 @@ class Floor:
             self.newest_ns, self._first_arrival_ns = x_ns, x_ns + y_ns
         self.count += 1
         height = self._height(x_ns, y_ns)
-        ahead_ns = x_ns - self.newest_ns
-        if self._level is not None:
-            self._level.add(x_ns, y_ns - self._base[1], ahead_ns, self._drift_max)
+        ahead_ns, level = x_ns - self.newest_ns, self._level
+        if level is not None:
+            level.add(x_ns, y_ns - self._base[1], ahead_ns, self._drift_max)
         if ahead_ns > 0:
             self.newest_ns = x_ns
             self._upper_bound += self._drift_max * ahead_ns
@@ -137,19 +136,21 @@ class Floor:
         if as_of_now <= self._upper_bound:
             self._upper_bound, self._bound_set_ns = as_of_now, x_ns
         gap = as_of_now - self._line
-        self._line = min(self._line, as_of_now)
+        if gap < 0.0:
+            self._line = as_of_now
         self._recent.append((x_ns, height))
-        late = gap > LEAST_CHANGE_NS and gap > CHANGE / RECENT * self._spread
-        self._risen = self._late_height() if late else -np.inf
+        # Usual height of a frame above the line.
+        spread = self._visible.median_ns + RESOLUTION_NS
+        late = gap > LEAST_CHANGE_NS and gap > CHANGE / RECENT * spread
+        self._risen = self._late_height(spread) if late else -math.inf
         self._visible.add(x_ns, height)
         if ahead_ns > 0:
-            late_spell = self._lateness.add(x_ns, height, gap, self._spread)
+            late_spell = self._lateness.add(x_ns, height, gap, spread)
             if late_spell is not None:
                 self._all_late(late_spell)
         if self._line - self._upper_bound > WORST_LATENCY_NS:
             # No frame is that late: the clock changed.
             self._upper_bound, self._bound_set_ns = self._line, x_ns
-        level = self._level
         if level is not None and self._tilted(self._line) - level.upper_bound > WORST_LATENCY_NS:
             self._level = None  # no queue is that long: the clock drifts
         if (
@@ -159,16 +160,11 @@ class Floor:
         ):
             self._measure()
 
-    @property
-    def _spread(self) -> float:
-        """Usual height of a frame above the line, ns."""
-        return self._visible.median_ns + RESOLUTION_NS
-
     def _height(self, x_ns: int, y_ns: int) -> float:
         x0_ns, y0_ns = self._base
         return y_ns - y0_ns - self.drift * (x_ns - x0_ns)
 
-    def _late_height(self) -> float:
+    def _late_height(self, spread: float) -> float:
         """Return the least height of the last few frames if all are improbably late; else -inf."""
         heights = [
             height + self._drift_max * (self.newest_ns - at_ns) for at_ns, height in self._recent
@@ -176,11 +172,11 @@ class Floor:
         for count in range(FEWEST, len(heights) + 1):
             least = min(heights[-count:])
             if (
-                count * (least - self._line) > CHANGE * self._spread
+                count * (least - self._line) > CHANGE * spread
                 and least - self._line > LEAST_CHANGE_NS
             ):
                 return least
-        return -np.inf
+        return -math.inf
 
     def _all_late(self, spell: LateSpell) -> None:
         """Report a spell of late frames once; restart the line at their height if it lasts."""
@@ -222,10 +218,10 @@ class Floor:
     def heights(self, x_ns: int) -> Heights:
         """Return the bounds on the clock offset at a sender time."""
         drift_max, newest_ns = self._drift_max, self.newest_ns
-        base_ns = self._base[1]
+        base_x_ns, base_ns = self._base
         sure, line, recent = self._upper_bound, self._line, self._risen
         slack = drift_max * abs(x_ns - newest_ns)
-        moved = self.drift * (x_ns - self._base[0])
+        moved = self.drift * (x_ns - base_x_ns)
         if len(self._recent) == RECENT:
             least = min([h + drift_max * (newest_ns - at_ns) for at_ns, h in self._recent])
             recent = max(recent, least)
@@ -285,6 +281,6 @@ class Floor:
         self._upper_bound = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
         self._level = None
         self._since_ns = self._bound_set_ns = x_ns
-        self._risen = -np.inf
+        self._risen = -math.inf
         self._lateness.clear()
         self._recent.clear()

@@ -69,16 +69,15 @@ class Latencies:
 
     def measure(self, newest_ns: int, since_ns: int) -> None:
         """Measure the latencies of the stamps since a sender time, each above its own floor."""
-        samples = [
-            (x_ns - newest_ns, height) for x_ns, height, _ in self._samples if x_ns >= since_ns
-        ]
-        pieces = [
-            (at_ns - newest_ns, least) for _, at_ns, least in self._pieces if at_ns >= since_ns
-        ]
+        samples = [one for one in self._samples if one[0] >= since_ns]
+        pieces = [one for one in self._pieces if one[1] >= since_ns]
         if not samples or not pieces:
             return
-        x, heights = np.array(samples).T
-        at, floors = np.array(pieces).T[:, :, np.newaxis]
+        # Apart: an array of pairs takes twice as long to make as two arrays.
+        x = np.array([x_ns - newest_ns for x_ns, _, _ in samples], dtype=float)
+        heights = np.array([height for _, height, _ in samples])
+        at = np.array([[at_ns - newest_ns] for _, at_ns, _ in pieces], dtype=float)
+        floors = np.array([[least] for _, _, least in pieces])
         below = (floors + self._drift_max * np.abs(x - at)).min(axis=0)
         gaps = np.maximum(0.0, heights - below)
         self.mean_ns = float(gaps.mean())

@@ -65,6 +65,7 @@ class SenderClock:
         )
         self._timesync = OffsetEvidence(drift_max)
         self._gnss = OffsetEvidence(drift_max)
+        self._evidence = ((ClockKind.TIMESYNC, self._timesync), (ClockKind.GNSS, self._gnss))
         self._gnss_plausible = 0
         self._latency_s = 0.0
         self._doubt_ns = 0  # largest doubt of all stamps
@@ -86,24 +87,26 @@ class SenderClock:
         if placed.new_line:
             self._timesync.clear()
             self.forget_gnss()
-        self._note_change(placed.jump_ns)
-        latency_s = max(0.0, (arrival_ns - self.node_ns(placed.x_ns)) * 1e-9)
-        if placed.x_ns == self._line.newest_ns:
+        line, x_ns = self._line, placed.x_ns
+        if placed.jump_ns or line.floor.rise_ns:
+            self._note_change(placed.jump_ns)
+        latency_s = max(0.0, (arrival_ns - self.node_ns(x_ns)) * 1e-9)
+        if x_ns == line.newest_ns:
             self._latency_s = latency_s
-        return Stamp(placed.x_ns, latency_s, placed.rebooted)
+        return Stamp(x_ns, latency_s, placed.rebooted)
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> None:
         """Add the stamp of any other message, if it lies on the line of the reports."""
         self.change = self._known = self._reading = None
-        if self._line.add_stamp(arrival_ns, boot_ms):
+        line = self._line
+        if line.add_stamp(arrival_ns, boot_ms) and line.floor.rise_ns:
             self._note_change()
 
     def _note_change(self, jump_ns: int = 0) -> None:
         rise_ns = jump_ns or self._line.floor.rise_ns
-        if rise_ns:
-            self.change = ClockChange(
-                proven=False, step_s=rise_ns * 1e-9, drift_ppm=math.inf, leapt=jump_ns != 0
-            )
+        self.change = ClockChange(
+            proven=False, step_s=rise_ns * 1e-9, drift_ppm=math.inf, leapt=jump_ns != 0
+        )
 
     def is_shared(self, arrival_ns: int) -> bool:
         """Return whether two clocks run side by side: two senders then share this id."""
@@ -265,7 +268,7 @@ class SenderClock:
         high_ns: float = sure_ns - delay_ns
         likely_ns = line_ns - delay_ns - INVISIBLE_RATIO * max(0.0, median_ns - delay_ns)
         rise_ns = highest_ns - sure_ns
-        for kind, evidence in ((ClockKind.TIMESYNC, self._timesync), (ClockKind.GNSS, self._gnss)):
+        for kind, evidence in self._evidence:
             known = evidence.at(x_ns)
             if known is None or (kind is ClockKind.GNSS and self._gnss_plausible < _GNSS_CHECKS):
                 continue

@@ -89,7 +89,8 @@ class ReportHistory(Generic[State]):
         longest_s, fewest = windows[0]
         for entry in self.entries[::-stride]:
             fix = entry.fix
-            if fix.velocity_ned_mps is None:
+            velocity = fix.velocity_ned_mps
+            if velocity is None:
                 break
             t = (fix.sender_ns - newest_ns) * 1e-9
             while -t > longest_s and n >= fewest:
@@ -98,7 +99,7 @@ class ReportHistory(Generic[State]):
                 if due == len(windows):
                     return found
                 longest_s, fewest = windows[due]
-            north, east, down = fix.velocity_ned_mps
+            north, east, down = velocity
             n += 1.0
             t1 += t
             t2 += t * t

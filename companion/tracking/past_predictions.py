@@ -11,10 +11,9 @@ Over 300 lines: the errors, what is chosen by them and what they tell are one su
 """
 
 import math
-from bisect import insort
-from collections.abc import Sequence
+from bisect import bisect_left, insort
 from dataclasses import dataclass, field
-from itertools import chain, pairwise
+from itertools import pairwise
 from typing import Final
 
 from companion.values import Fix, Vector
@@ -51,6 +50,7 @@ WINDOWS: Final = sorted(
     {(model.window_s, model.min_velocities) for model in ACCELERATION_MODELS if model.window_s}
 )
 """Distinct windows of the acceleration models, each with the velocities needed, ascending."""
+_DECAYS_S: Final = frozenset(model.decay_s for model in ACCELERATION_MODELS if model.window_s)
 TURNING_MPS: Final = 1.0  # horizontal speed below which the course is undefined
 SMOOTHING_SHARE: Final = 0.35  # share of the newest report in a smoothed position
 SMOOTHING_GAP_S: Final = 5.0  # gap between reports over which positions are not smoothed
@@ -89,30 +89,45 @@ class _PastPrediction:
 
         Models are numbered as in ``ACCELERATION_MODELS``, then once more over smoothed positions.
         """
-        (reported_m,), (smoothed_m,) = self.errors_m(
-            (model % len(ACCELERATION_MODELS),), there, ahead_s
-        )
-        return reported_m if model < len(ACCELERATION_MODELS) else smoothed_m
+        number = model % len(ACCELERATION_MODELS)
+        offset = ZERO if model == number else self.smoothing_offset
+        (n, e, d), (vn, ve, vd), (tn, te, td) = self.position, self.velocity, there
+        n, e, d = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
+        given = self.accelerations[number]
+        if given is not None:
+            way = fed_forward(ACCELERATION_MODELS[number], given, self.velocity, ahead_s)[0]
+            n, e, d = n + way[0], e + way[1], d + way[2]
+        n, e, d = n + offset[0], e + offset[1], d + offset[2]
+        return math.sqrt(n * n + e * e + d * d)
 
-    def errors_m(
-        self, models: Sequence[int], there: Vector, ahead_s: float
-    ) -> tuple[list[float], list[float]]:
-        """Return the errors of several models: over reported positions, and over smoothed ones."""
+    def square_errors_m2(self, there: Vector, ahead_s: float) -> list[float]:
+        """Return the squares of ``error_m`` for all models, in one pass.
+
+        Models differ in few numbers: what several of them need is computed once.
+        """
         (n, e, d), (vn, ve, vd), (tn, te, td) = self.position, self.velocity, there
         n, e, d = n + vn * ahead_s - tn, e + ve * ahead_s - te, d + vd * ahead_s - td
         aside_n, aside_e, aside_d = self.smoothing_offset
+        level = vn * vn + ve * ve
+        ways_s2 = {s: fading_response(ahead_s, s)[0] for s in _DECAYS_S}
         reported, smoothed = [], []
-        for model in models:
-            given, north, east, down = self.accelerations[model], n, e, d
+        for model, given in zip(ACCELERATION_MODELS, self.accelerations, strict=True):
+            north, east, down = n, e, d
             if given is not None:
-                (by_n, by_e, by_d), _ = fed_forward(
-                    ACCELERATION_MODELS[model], given, self.velocity, ahead_s
-                )
-                north, east, down = north + by_n, east + by_e, down + by_d
-            reported.append(math.sqrt(north * north + east * east + down * down))
+                a, b, c = given
+                way_s2 = ways_s2[model.decay_s]
+                if model.turns and level >= TURNING_MPS**2:
+                    less, aside = _turned((vn * b - ve * a) / level * ahead_s, ahead_s)
+                    north += less * vn - aside * ve
+                    east += less * ve + aside * vn
+                else:
+                    north += way_s2 * a
+                    east += way_s2 * b
+                down += way_s2 * c
+            reported.append(north * north + east * east + down * down)
             north, east, down = north + aside_n, east + aside_e, down + aside_d
-            smoothed.append(math.sqrt(north * north + east * east + down * down))
-        return reported, smoothed
+            smoothed.append(north * north + east * east + down * down)
+        return reported + smoothed
 
 
 @dataclass(slots=True, kw_only=True)
@@ -127,7 +142,7 @@ class _Errors:
 
     def add(self, error_m: float, age_s: float) -> None:
         if len(self.in_order) == ERRORS_KEPT:
-            self.sorted_m.remove(self.in_order[0])
+            del self.sorted_m[bisect_left(self.sorted_m, self.in_order[0])]
         self.in_order.append(error_m)
         insort(self.sorted_m, error_m)
         n = len(self.sorted_m)
@@ -232,18 +247,18 @@ class PastPredictions:
             return
         memory = math.exp(-(made.sender_ns - self._compared_ns) * 1e-9 / MEMORY_S)
         self._compared_ns = made.sender_ns
-        self._costs = [memory * cost for cost in self._costs]
+        costs = [memory * cost for cost in self._costs]
         for one in (made, self._older(sender_ns, COMPARED_AGES_S[1])):
             if one is not None:
-                ahead_s = (sender_ns - one.sender_ns) * 1e-9
-                off_m = chain(*one.errors_m(range(len(ACCELERATION_MODELS)), there, ahead_s))
-                self._costs = [c + m * m for c, m in zip(self._costs, off_m, strict=True)]
+                squares_m2 = one.square_errors_m2(there, (sender_ns - one.sender_ns) * 1e-9)
+                costs = [c + m2 for c, m2 in zip(costs, squares_m2, strict=True)]
+        self._costs = costs
         self._comparisons += 1
         if self._comparisons < SWITCH_AFTER:
             return
-        best = min(range(len(self._costs)), key=self._costs.__getitem__)
-        if self._costs[best] < SWITCH_RATIO * self._costs[self._model]:
-            self._model = best
+        least = min(costs)
+        if least < SWITCH_RATIO * costs[self._model]:
+            self._model = costs.index(least)
 
     @property
     def usual_errors(self) -> UsualErrors:
@@ -290,16 +305,24 @@ def fed_forward(
             gain_s * b,
             gain_s * c,
         )
-    rate = (north * b - east * a) / level
-    angle = min(max(rate * ahead_s, -math.pi), math.pi)
+    angle = min(max((north * b - east * a) / level * ahead_s, -math.pi), math.pi)
+    less, aside = _turned(angle, ahead_s)
     along, across = math.sin(angle), 1.0 - math.cos(angle)
-    # Series for small angles: (sin x / x - 1) t and (1 - cos x) / x t.
-    less = ahead_s * (along / angle - 1.0 if abs(angle) > 1e-3 else -angle * angle / 6.0)
-    aside = ahead_s * (across / angle if abs(angle) > 1e-3 else angle / 2.0)
     return (
         (less * north - aside * east, less * east + aside * north, displacement_s2 * c),
         (-across * north - along * east, -across * east + along * north, gain_s * c),
     )
+
+
+def _turned(angle: float, ahead_s: float) -> tuple[float, float]:
+    """Return the displacement by a turn of an angle, along and across a unit velocity; seconds."""
+    angle = min(max(angle, -math.pi), math.pi)
+    if abs(angle) > 1e-3:
+        return ahead_s * (math.sin(angle) / angle - 1.0), ahead_s * (
+            (1.0 - math.cos(angle)) / angle
+        )
+    # Series for small angles: (sin x / x - 1) t and (1 - cos x) / x t.
+    return ahead_s * (-angle * angle / 6.0), ahead_s * (angle / 2.0)
 
 
 def fading_response(ahead_s: float, decay_s: float) -> tuple[float, float]:

@@ -23,32 +23,33 @@ class ReportTiming:
         self._intervals_s: Newest[float] = Newest(KEPT)
         self._latencies_s: Newest[float] = Newest(KEPT)
         self._ages_s: Newest[float] = Newest(KEPT)
-        self._newest: Fix | None = None
-        self._silence_s = 0.0
+        self._newest_ns: int | None = None
 
     def add(self, fix: Fix) -> None:
         """Add an accepted report, in order of arrival."""
         latency_s = (fix.arrival_ns - fix.t_ns) * 1e-9
         self._latencies_s.append(latency_s)
-        before = self._newest
-        if before is not None and fix.sender_ns > before.sender_ns:
-            self._intervals_s.append((fix.sender_ns - before.sender_ns) * 1e-9)
+        newest_ns = self._newest_ns
+        if newest_ns is not None:
+            if fix.sender_ns <= newest_ns:
+                return
+            interval_s = (fix.sender_ns - newest_ns) * 1e-9
+            self._intervals_s.append(interval_s)
             # Age of the previous report when this one arrived.
-            self._ages_s.append(self._intervals_s[-1] + latency_s)
-        if before is None or fix.sender_ns > before.sender_ns:
-            self._newest = fix
-        self._silence_s = self._measured_s()
-
-    def _measured_s(self) -> float:
-        if len(self._intervals_s) < 3:
-            return 0.0
-        spread_s = max(self._latencies_s) - min(self._latencies_s)
-        in_order = sorted(self._intervals_s)
-        n = len(in_order)
-        median_s = (in_order[(n - 1) // 2] + in_order[n // 2]) / 2.0
-        usual_s = INTERVALS * median_s + spread_s
-        return max(usual_s, SILENCES * sorted(self._ages_s)[-2])
+            self._ages_s.append(interval_s + latency_s)
+        self._newest_ns = fix.sender_ns
 
     def silence_s(self, least_s: float, most_s: float) -> float:
         """Return the age of the newest report above which a track coasts, seconds; limited."""
-        return min(max(least_s, self._silence_s), most_s)
+        intervals_s, ages_s = self._intervals_s, self._ages_s
+        if len(intervals_s) < 3:
+            return min(least_s, most_s)
+        spread_s = max(self._latencies_s) - min(self._latencies_s)
+        # On most links even the longest interval and silence are short: nothing is sorted then.
+        if max(INTERVALS * max(intervals_s) + spread_s, SILENCES * max(ages_s)) <= least_s:
+            return min(least_s, most_s)
+        in_order = sorted(intervals_s)
+        n = len(in_order)
+        median_s = (in_order[(n - 1) // 2] + in_order[n // 2]) / 2.0
+        usual_s = INTERVALS * median_s + spread_s
+        return min(max(least_s, usual_s, SILENCES * sorted(ages_s)[-2]), most_s)

@@ -21,4 +21,4 @@ class Newest(list[T], Generic[T]):
         """Add a value, and drop the oldest one beyond the limit."""
         if len(self) >= self.most:
             del self[0]
-        super().append(value)
+        list.append(self, value)

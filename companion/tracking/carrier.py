@@ -150,14 +150,33 @@ def contradiction(
     """
     if apart_s > APART_MAX_S:
         return None
+    limit_rad = bounds.at(0.0, apart_s, STAMP_S) + bounds.attitude_rad
+    if _most_apart_rad(before, after, apart_s) <= limit_rad:
+        return None  # nearly always, without a matrix
     first = body_from_ned(before.roll_rad, before.pitch_rad, before.yaw_rad)
     second = body_from_ned(after.roll_rad, after.pitch_rad, after.yaw_rad)
     forward = later_body_from_body(body_rates(before), apart_s) @ first @ second.T
     back = later_body_from_body(body_rates(after), -apart_s) @ second @ first.T
     apart_rad = max(rotation_angle_rad(forward), rotation_angle_rad(back))
-    if apart_rad <= bounds.at(0.0, apart_s, STAMP_S) + bounds.attitude_rad:
-        return None
-    return Contradiction(apart_rad, apart_s)
+    return Contradiction(apart_rad, apart_s) if apart_rad > limit_rad else None
+
+
+def _most_apart_rad(before: Attitude, after: Attitude, apart_s: float) -> float:
+    """Return an upper bound on the rotation between two attitudes that their rates leave open.
+
+    A rotation is at most the sum of the three successive ones that make it up, and of the two
+    between which it is a difference.
+    """
+    steps_rad = (
+        abs(math.remainder(after.roll_rad - before.roll_rad, math.tau))
+        + abs(math.remainder(after.pitch_rad - before.pitch_rad, math.tau))
+        + abs(math.remainder(after.yaw_rad - before.yaw_rad, math.tau))
+    )
+    fastest_radps = max(
+        math.hypot(one.rollspeed_radps, one.pitchspeed_radps, one.yawspeed_radps)
+        for one in (before, after)
+    )
+    return steps_rad + fastest_radps * apart_s
 
 
 def body_rates(attitude: Attitude) -> FloatArray:

@@ -129,6 +129,8 @@ class Refutations:
 
     def limits(self, base: Limits, sender_ns: int) -> Limits:
         """Return the limits that apply at a sender time."""
+        if self.speed.to == self.acceleration.to == 0.0:
+            return base  # never refuted
         speed = self.speed.at(base.speed_max_mps, sender_ns)
         acceleration = self.acceleration.at(base.acceleration_max_mps2, sender_ns)
         if speed == base.speed_max_mps and acceleration == base.acceleration_max_mps2:
@@ -140,39 +142,46 @@ class Refutations:
         base, velocity = fix.limits, fix.velocity_ned_mps
         if base is None or velocity is None:
             return []
-        found = []
+        found: list[Refuted] = []
         north, east, down = velocity
-        noise_mps = fix.noise.velocity_mps
+        sender_ns, noise_mps = fix.sender_ns, fix.noise.velocity_mps
         speed = math.sqrt(north * north + east * east + down * down) - noise_mps
-        limit = self.speed.at(base.speed_max_mps, fix.sender_ns)
-        if limit < speed < MAX_PLAUSIBLE_RATIO * base.speed_max_mps:
-            found.append(self._raise(self.speed, fix, "observer.speed_max_mps", limit, speed))
+        if speed > base.speed_max_mps:
+            limit = self.speed.at(base.speed_max_mps, sender_ns)
+            if limit < speed < MAX_PLAUSIBLE_RATIO * base.speed_max_mps:
+                found.append(self._raise(self.speed, fix, "observer.speed_max_mps", limit, speed))
         proven = self._proven(fix, north, east, down)
-        limit = self.acceleration.at(base.acceleration_max_mps2, fix.sender_ns)
-        if limit < proven < MAX_PLAUSIBLE_RATIO * base.acceleration_max_mps2:
-            name = "observer.acceleration_max_mps2"
-            found.append(self._raise(self.acceleration, fix, name, limit, proven))
-        if not self._times_ns or fix.sender_ns > self._times_ns[-1]:
-            self._times_ns.append(fix.sender_ns)
+        if proven > base.acceleration_max_mps2:
+            limit = self.acceleration.at(base.acceleration_max_mps2, sender_ns)
+            if limit < proven < MAX_PLAUSIBLE_RATIO * base.acceleration_max_mps2:
+                name = "observer.acceleration_max_mps2"
+                found.append(self._raise(self.acceleration, fix, name, limit, proven))
+        times_ns = self._times_ns
+        if not times_ns or sender_ns > times_ns[-1]:
+            times_ns.append(sender_ns)
             self._velocities.append((north, east, down, noise_mps, fix.noise.time_s))
-            if len(self._times_ns) > 2 * _KEPT:
-                del self._times_ns[:_KEPT], self._velocities[:_KEPT]
+            if len(times_ns) > 2 * _KEPT:
+                del times_ns[:_KEPT], self._velocities[:_KEPT]
         return found
 
     def _proven(self, fix: Fix, north: float, east: float, down: float) -> float:
         """Return the largest mean acceleration proven by a velocity and earlier ones, m/s²."""
-        most, noise = 0.0, fix.noise
-        times_ns, end = self._times_ns, len(self._times_ns)
+        most, sender_ns = 0.0, fix.sender_ns
+        own_mps, own_s = fix.noise.velocity_mps, fix.noise.time_s
+        times_ns, velocities, end = self._times_ns, self._velocities, len(self._times_ns)
         for least_ns in _PAIRS_NS:
-            end = bisect_right(times_ns, fix.sender_ns - least_ns, 0, end)
+            end = bisect_right(times_ns, sender_ns - least_ns, 0, end)
             if not end:
                 break
-            n, e, d, noise_mps, time_s = self._velocities[end - 1]
+            n, e, d, noise_mps, time_s = velocities[end - 1]
             n, e, d = north - n, east - e, down - d
-            changed = math.sqrt(n * n + e * e + d * d)
+            changed_mps = math.sqrt(n * n + e * e + d * d) - noise_mps - own_mps
+            if changed_mps <= 0.0:
+                continue  # within the noise: proves nothing
             # Stamps are whole milliseconds: the interval may be one longer.
-            apart_s = (fix.sender_ns - times_ns[end - 1]) * 1e-9 + 1e-3 + time_s + noise.time_s
-            most = max(most, (changed - noise_mps - noise.velocity_mps) / apart_s)
+            apart_s = (sender_ns - times_ns[end - 1]) * 1e-9 + 1e-3 + time_s + own_s
+            proven = changed_mps / apart_s
+            most = proven if proven > most else most
         return most
 
     def _raise(

@@ -114,6 +114,8 @@ class Run:
         self.tally.event(event)
         if self.writer:
             self.writer.event(event)
+        if not outputs:  # most frames
+            return outputs
         for output in outputs:
             if isinstance(output, Estimate):
                 self.tally.estimate(output)
@@ -223,8 +225,10 @@ def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0)
         ordered = in_order(logs)
     if ordered is not None:
         return read_parts(ordered)
-    merged = (event for event in read_flight(logs, latency_s) if not isinstance(event, Tick | Tock))
-    return with_ticks(merged, settings.beams.update_hz)
+    events = read_flight(logs, latency_s)
+    if len(logs) > 1:  # one may be a recording, which has ticks
+        events = (event for event in events if not isinstance(event, Tick | Tock))
+    return with_ticks(events, settings.beams.update_hz)
 
 
 def _with_events(logs: Sequence[Path]) -> Sequence[Path]:

@@ -28,9 +28,11 @@ class Tally:
 
     def event(self, event: Event) -> None:
         """Extend the time span of the replay by an event."""
+        t_ns = event.t_ns
         if self.first_ns is None:
-            self.first_ns = event.t_ns
-        self.last_ns = max(self.last_ns, event.t_ns)  # a frame may be processed after a later tick
+            self.first_ns = t_ns
+        # A frame may be processed after a later tick.
+        self.last_ns = t_ns if t_ns > self.last_ns else self.last_ns
 
     def estimate(self, estimate: Estimate) -> None:
         """Count an accepted report."""

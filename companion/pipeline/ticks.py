@@ -21,14 +21,16 @@ def with_ticks(events: Iterable[Event], update_hz: float) -> Iterator[Event]:
     due_ns: int | None = None
     paused_ns = 0
     for event in events:
+        t_ns = event.t_ns
         if due_ns is None:
-            due_ns = event.t_ns + period_ns
-        pause_ns = event.t_ns - due_ns
-        if pause_ns > PAUSE_NS:
-            paused_ns += min(pause_ns, PAUSE_MAX_NS)
-            if pause_ns > PAUSE_MAX_NS or paused_ns > TOTAL_PAUSE_NS:
-                due_ns = event.t_ns
-        while due_ns <= event.t_ns:
-            yield Tick(due_ns)
-            due_ns += period_ns
+            due_ns = t_ns + period_ns
+        if due_ns <= t_ns:
+            pause_ns = t_ns - due_ns
+            if pause_ns > PAUSE_NS:
+                paused_ns += min(pause_ns, PAUSE_MAX_NS)
+                if pause_ns > PAUSE_MAX_NS or paused_ns > TOTAL_PAUSE_NS:
+                    due_ns = t_ns
+            while due_ns <= t_ns:
+                yield Tick(due_ns)
+                due_ns += period_ns
         yield event

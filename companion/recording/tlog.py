@@ -5,6 +5,7 @@ big-endian. Raw MAVLink has no stamps; the sender's boot clock replaces them.
 """
 
 import re
+import struct
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import islice
@@ -29,6 +30,7 @@ _PAIRS_MIN: Final = 50
 _SEARCHED_BYTES: Final = 1 << 26  # bytes of a file that are searched for MAVLink
 _TIMED: Final = frozenset((33, 30, 2))
 """Messages whose boot stamps date raw MAVLink: GLOBAL_POSITION_INT, ATTITUDE, SYSTEM_TIME."""
+_stamp_us = struct.Struct(">Q").unpack_from
 _magics = re.compile(b"[\xfd\xfe]").finditer
 
 
@@ -88,25 +90,23 @@ def read_tlog(data: bytes, link: str) -> Iterator[Event]:
     A rejection has the time of the following frame. A frame with a bad stamp is still returned,
     after a rejection for the stamp.
     """
-    ahead = _stamped_frames(data)
-    first = list(islice(ahead, 3))
-    timeline = RepairedStamps([one[0] for one in first if one[0] is not None])
-    for group in (first, ahead):
-        for stamp_ns, frame, lost in group:
-            off_ns = None if stamp_ns is None else timeline.place(stamp_ns)
-            if lost:  # seldom
-                for reason, count in lost.items():
-                    yield Rejection(t_ns=timeline.t_ns, source=link, reason=reason, count=count)
-            if frame is None:
-                return
-            if off_ns is not None:
-                yield _bad_stamp(timeline.t_ns, link, off_ns)
-            elif stamp_ns is None:
-                yield Rejection(
-                    t_ns=timeline.t_ns, source=link, reason=Reason.BAD_STAMP, detail="no stamp"
-                )
-            source, msgid, raw = frame
-            yield Frame(t_ns=timeline.t_ns, link=link, source=source, msgid=msgid, raw=raw)
+    first = [one[0] for one in islice(_stamped_frames(data), 3) if one[0] is not None]
+    timeline = RepairedStamps(first)
+    place = timeline.place
+    for stamp_ns, frame, lost in _stamped_frames(data):
+        off_ns = None if stamp_ns is None else place(stamp_ns)
+        t_ns = timeline.t_ns
+        if lost:  # seldom
+            for reason, count in lost.items():
+                yield Rejection(t_ns=t_ns, source=link, reason=reason, count=count)
+        if frame is None:
+            return
+        if off_ns is not None:
+            yield _bad_stamp(t_ns, link, off_ns)
+        elif stamp_ns is None:
+            yield Rejection(t_ns=t_ns, source=link, reason=Reason.BAD_STAMP, detail="no stamp")
+        source, msgid, raw = frame
+        yield Frame(t_ns=t_ns, link=link, source=source, msgid=msgid, raw=raw)
 
 
 def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
@@ -123,18 +123,22 @@ def _stamped_frames(data: bytes) -> Iterator[_StampedFrame]:
     at, end = 0, len(data)
     frame_at = Checker().at
     while at < end:
-        start, lost = at + STAMP, _NOTHING
+        start = at + STAMP
         found = frame_at(data, start, end) if start < end else 0
+        if not isinstance(found, int):
+            yield _stamp_us(data, at)[0] * 1000, found, _NOTHING
+            at = start + len(found[2])
+            continue
+        start, length = _next_frame(data, at, end)
+        stop = max(at, start - STAMP) if length else end
+        lost = _skipped(data, at, stop)
+        found = frame_at(data, start, end) if length else 0
         if isinstance(found, int):
-            start, length = _next_frame(data, at, end)
-            stop = max(at, start - STAMP) if length else end
-            lost = _skipped(data, at, stop)
-            found = frame_at(data, start, end) if length else 0
-        frame = None if isinstance(found, int) else found
-        stamped = frame is not None and start - STAMP >= at
-        stamp_ns = int.from_bytes(data[start - STAMP : start], "big") * 1000 if stamped else None
-        yield stamp_ns, frame, lost
-        at = end if frame is None else start + len(frame[2])
+            yield None, None, lost
+            return
+        stamped = start - STAMP >= at
+        yield _stamp_us(data, start - STAMP)[0] * 1000 if stamped else None, found, lost
+        at = start + len(found[2])
 
 
 def _skipped(data: bytes, at: int, stop: int) -> dict[Reason, int]:

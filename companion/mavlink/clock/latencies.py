@@ -6,11 +6,14 @@ least height of each piece of the window gives the floor at its time, and reveal
 lasts for the whole window.
 """
 
+from array import array
 from collections import deque
 from itertools import pairwise
 from typing import Final
 
 import numpy as np
+
+from companion.values import FloatArray, IntArray
 
 PIECES: Final = 16  # pieces of the window whose least heights are kept
 SAMPLES: Final = 256
@@ -34,7 +37,7 @@ class Latencies:
         self._piece_ns = max(1, window_ns // PIECES)
         self._drift_max = drift_max
         self._pieces: deque[tuple[int, int, float]] = deque()  # index, x, least height
-        self._samples: deque[tuple[int, float, int]] = deque()  # x, height, lot
+        self._samples = _Samples()
         self._one_of = 1
         self._lot = 0
         self._kept_median_ns = 0.0
@@ -54,12 +57,11 @@ class Latencies:
         self._lot = (1664525 * self._lot + 1013904223) % _LOTS
         if self._lot * self._one_of >= _LOTS:
             return
-        samples.append((x_ns, height, self._lot))
-        while samples[0][0] < x_ns - self._window_ns:
-            samples.popleft()
+        samples.add(x_ns, height, self._lot)
+        samples.drop_before(x_ns - self._window_ns)
         if len(samples) > SAMPLES:
             self._one_of *= 2
-            self._samples = deque(one for one in samples if one[2] * self._one_of < _LOTS)
+            samples.keep(self._one_of)
         elif self._one_of > 1 and len(samples) < SAMPLES // 8:
             self._one_of //= 2
 
@@ -69,13 +71,12 @@ class Latencies:
 
     def measure(self, newest_ns: int, since_ns: int) -> None:
         """Measure the latencies of the stamps since a sender time, each above its own floor."""
-        samples = [one for one in self._samples if one[0] >= since_ns]
         pieces = [one for one in self._pieces if one[1] >= since_ns]
-        if not samples or not pieces:
+        x_ns, heights = self._samples.arrays()
+        is_new = x_ns >= since_ns
+        if not pieces or not is_new.any():
             return
-        # Apart: an array of pairs takes twice as long to make as two arrays.
-        x = np.array([x_ns - newest_ns for x_ns, _, _ in samples], dtype=float)
-        heights = np.array([height for _, height, _ in samples])
+        x, heights = (x_ns[is_new] - newest_ns).astype(float), heights[is_new]
         at = np.array([[at_ns - newest_ns] for _, at_ns, _ in pieces], dtype=float)
         floors = np.array([[least] for _, _, least in pieces])
         below = (floors + self._drift_max * np.abs(x - at)).min(axis=0)
@@ -97,8 +98,8 @@ class Latencies:
         first_ns, last_ns = self._pieces[0][1], self._pieces[-1][1]
         if last_ns - first_ns < self._window_ns * (PIECES - 2) / PIECES:
             return 0.0
-        x = np.array([one[0] - newest_ns for one in self._samples], dtype=float)
-        heights = np.array([one[1] for one in self._samples])
+        x_ns, heights = self._samples.arrays()
+        x = (x_ns - newest_ns).astype(float)
         points = [(float(at_ns - newest_ns), height) for _, at_ns, height in self._pieces]
         slope = _slope_over(points, float(np.mean(x)))
         if abs(slope) <= self._drift_max:
@@ -117,6 +118,52 @@ class Latencies:
         )
         self._samples.clear()
         return [(at_ns, height) for _, at_ns, height in self._pieces]
+
+
+class _Samples:
+    """Sampled stamps in order of arrival: sender time, height and lot.
+
+    Three arrays of numbers, which are measured without a copy and take a sixth of the memory of
+    tuples.
+    """
+
+    __slots__ = ("_heights", "_lots", "_x_ns")
+
+    def __init__(self) -> None:
+        self._x_ns = array("q")
+        self._heights = array("d")
+        self._lots = array("q")
+
+    def __len__(self) -> int:
+        return len(self._x_ns)
+
+    def add(self, x_ns: int, height: float, lot: int) -> None:
+        self._x_ns.append(x_ns)
+        self._heights.append(height)
+        self._lots.append(lot)
+
+    def drop_before(self, x_ns: int) -> None:
+        """Drop the first stamps as long as they are older."""
+        old, times_ns = 0, self._x_ns
+        while times_ns[old] < x_ns:
+            old += 1
+        if old:
+            del times_ns[:old], self._heights[:old], self._lots[:old]
+
+    def keep(self, one_of: int) -> None:
+        """Keep the stamps whose lot is among the lowest of ``one_of`` parts."""
+        kept = [n for n, lot in enumerate(self._lots) if lot * one_of < _LOTS]
+        self._x_ns = array("q", [self._x_ns[n] for n in kept])
+        self._heights = array("d", [self._heights[n] for n in kept])
+        self._lots = array("q", [self._lots[n] for n in kept])
+
+    def arrays(self) -> tuple[IntArray, FloatArray]:
+        """Return sender times and heights, valid until the next change."""
+        return np.array(self._x_ns), np.array(self._heights)
+
+    def clear(self) -> None:
+        """Drop all stamps."""
+        del self._x_ns[:], self._heights[:], self._lots[:]
 
 
 def _slope_over(points: list[tuple[float, float]], x: float) -> float:

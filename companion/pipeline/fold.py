@@ -165,7 +165,7 @@ class Pipeline:
         for output in outputs:
             if isinstance(output, Rejection):
                 told.append(self.refusals.add(output))
-            elif isinstance(output, Estimate | Update):
+            elif isinstance(output, (Estimate, Update)):
                 self.digest.add(output)
         return [*outputs, *filter(None, told)] if told else outputs
 
@@ -220,7 +220,9 @@ class Pipeline:
             return [Rejection(t_ns=report.t_ns, source=report.uav, reason=Reason.NO_FIX)]
         fix, begun = self.center.fix(placed)
         accepted, refuted = self.tracker.accept(fix)
-        said: list[Output] = [*begun, *assumptions.notices(self.records, *refuted)]
+        said: list[Output] = [*begun]
+        if refuted:
+            said += assumptions.notices(self.records, *refuted)
         if isinstance(accepted, Rejection):
             return [*said, accepted]
         fix = accepted.fix  # with bounds that reports have raised

@@ -342,20 +342,24 @@ class Senders:
 
         ``time_s`` is the largest error of the report's time.
         """
-        component = self._components.get(report.source)
-        if component is None or component.noise is None or component.receiver is None:
-            return self._stated_accuracy(
-                report, replace(self._noise_settings.default, time_s=time_s)
-            )
-        apart_m = 0.0
-        if component.receiver.fix_type >= FIX_3D:
-            apart_m2, before = (report.alt_m - component.receiver.alt_m) ** 2, component.apart_m2
-            if before is not None:
-                apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
-            component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
-        return self._stated_accuracy(
-            report, replace(component.noise, time_s=time_s, apart_m=apart_m)
+        component, known, apart_m = self._components.get(report.source), None, 0.0
+        if component is not None and component.receiver is not None:
+            known, receiver = component.noise, component.receiver
+            if known is not None and receiver.fix_type >= FIX_3D:
+                apart_m2, before = (report.alt_m - receiver.alt_m) ** 2, component.apart_m2
+                if before is not None:
+                    apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
+                component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
+        known = known or self._noise_settings.default
+        made = ReportNoise(
+            horizontal_m=known.horizontal_m,
+            vertical_m=known.vertical_m,
+            position_m=known.position_m,
+            velocity_mps=known.velocity_mps,
+            time_s=time_s,
+            apart_m=apart_m,
         )
+        return self._stated_accuracy(report, made)
 
     def _stated_accuracy(self, report: Report, noise: ReportNoise) -> ReportNoise:
         """Widen bounds by what the message itself states: accuracy, and steps of height."""

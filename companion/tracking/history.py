@@ -44,9 +44,10 @@ class ReportHistory(Generic[State]):
 
     def index(self, sender_ns: int) -> int | None:
         """Return the index at which to insert a report; None if it is too old to be used."""
-        if sender_ns > self.newest.fix.sender_ns:
+        newest_ns = self.entries[-1].fix.sender_ns
+        if sender_ns > newest_ns:
             return len(self.entries)
-        if sender_ns < self.newest.fix.sender_ns - self._window_ns:
+        if sender_ns < newest_ns - self._window_ns:
             return None
         return bisect_left(self.entries, sender_ns, key=lambda entry: entry.fix.sender_ns)
 
@@ -55,16 +56,17 @@ class ReportHistory(Generic[State]):
 
         ``predicted`` is the previous entry's prediction for the report, if already computed.
         """
-        if predicted is not None and index == len(self.entries):
-            state = self._observer.after(self.newest.state, predicted, fix)
-            self.entries.append(Entry(fix, state, predicted))
+        entries = self.entries
+        if predicted is not None and index == len(entries):
+            state = self._observer.after(entries[-1].state, predicted, fix)
+            entries.append(Entry(fix, state, predicted))
         else:
-            self.entries.insert(index, Entry(fix, self.newest.state, None))
-            for at in range(index, len(self.entries)):
-                self.entries[at] = self._estimated(at)
-        oldest_ns = self.newest.fix.sender_ns - self._window_ns
-        while len(self.entries) > 1 and self.entries[1].fix.sender_ns <= oldest_ns:
-            del self.entries[0]
+            entries.insert(index, Entry(fix, entries[-1].state, None))
+            for at in range(index, len(entries)):
+                entries[at] = self._estimated(at)
+        oldest_ns = entries[-1].fix.sender_ns - self._window_ns
+        while len(entries) > 1 and entries[1].fix.sender_ns <= oldest_ns:
+            del entries[0]
 
     def _estimated(self, at: int) -> Entry[State]:
         fix = self.entries[at].fix

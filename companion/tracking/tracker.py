@@ -223,27 +223,28 @@ class Tracker:
         history.insert(index, fix, predicted)
         tracked.past.pace.add(fix)
         tracked.reports += 1
-        if history.newest.fix is fix:
+        entries = history.entries
+        is_newest = entries[-1].fix is fix
+        if is_newest:
             self._evaluate_past(tracked, fix)
-        tracked.newest = self._estimate(tracked, len(history.entries) - 1)
+        tracked.newest = self._estimate(tracked, len(entries) - 1)
         tracked.unknown_input = _unknown_input(history)
-        if tracked.newest.fix is fix:
+        if is_newest:
             return tracked.newest
-        at = next(i for i, entry in enumerate(history.entries) if entry.fix is fix)
+        at = next(i for i, entry in enumerate(entries) if entry.fix is fix)
         return self._estimate(tracked, at)
 
     def _estimate(self, tracked: _Tracked, at: int) -> Estimate:
-        entry = tracked.history.entries[at]
-        predicted = entry.predicted
+        entries = tracked.history.entries
+        fix, predicted = entries[at].fix, entries[at].predicted
         if predicted is None:
-            return _initial_estimate(entry.fix)
+            return _initial_estimate(fix)
         if predicted.mu_s2 is not None:
             tracked.mu_max_s2 = max(predicted.mu_s2, tracked.mu_max_s2 or 0.0)
-        before_ns = tracked.history.entries[at - 1].fix.sender_ns if at else None
-        dt_s = None if before_ns is None else (entry.fix.sender_ns - before_ns) * 1e-9
-        innovation_m = math.dist(entry.fix.position_ned_m, predicted.position_ned_m)
+        dt_s = (fix.sender_ns - entries[at - 1].fix.sender_ns) * 1e-9 if at else None
+        innovation_m = math.dist(fix.position_ned_m, predicted.position_ned_m)
         return Estimate(
-            fix=entry.fix,
+            fix=fix,
             position_ned_m=predicted.position_ned_m,
             bound_m=predicted.bound_m,
             innovation_m=innovation_m,

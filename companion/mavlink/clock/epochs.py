@@ -119,7 +119,7 @@ class BootLine:
         if not self.floor.count:
             return self._accept(arrival_ns, boot_ms * _NS_PER_MS)
         x_ns = _unwrap(boot_ms, self.newest_ns)
-        late_ns = self.late_ns(arrival_ns, x_ns)
+        late_ns = arrival_ns - x_ns - self.floor.at(x_ns)
         if self._previous is not None and self._is_straggler(arrival_ns, boot_ms, late_ns):
             return None
         if abs(late_ns) <= self._late_max_ns:
@@ -136,10 +136,11 @@ class BootLine:
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> bool:
         """Add a stamp that cannot start a line. Return whether it lies on the current line."""
-        if not self.floor.count:
+        floor = self.floor
+        if not floor.count:
             return False
         x_ns = _unwrap(boot_ms, self.newest_ns)
-        if abs(self.late_ns(arrival_ns, x_ns)) > self._late_max_ns // 2:
+        if abs(arrival_ns - x_ns - floor.at(x_ns)) > self._late_max_ns // 2:
             return False
         self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = max(self.newest_ns, x_ns)
@@ -147,6 +148,8 @@ class BootLine:
 
     def is_shared(self, arrival_ns: int) -> bool:
         """Return whether a second clock runs beside the line: two senders then share one id."""
+        if not self._rival.stamps:  # nearly always
+            return False
         self._rival.forget(arrival_ns)
         stamps = self._rival.stamps
         return len(stamps) >= 5 and stamps[-1][0] - self._rival.begun_ns >= _RIVAL_LASTS_NS
@@ -155,13 +158,10 @@ class BootLine:
         """Convert boot milliseconds to ns, unwrapped to the value nearest to the newest stamp."""
         return _unwrap(boot_ms, self.newest_ns)
 
-    def late_ns(self, arrival_ns: int, x_ns: int) -> int:
-        """Return how far a stamp is above the line, ns; negative below the line."""
-        return arrival_ns - x_ns - self.floor.at(x_ns)
-
     def fits(self, arrival_ns: int, x_ns: int) -> bool:
         """Return whether a stamp can belong to the line."""
-        return bool(self.floor) and abs(self.late_ns(arrival_ns, x_ns)) <= self._late_max_ns
+        floor = self.floor
+        return bool(floor) and abs(arrival_ns - x_ns - floor.at(x_ns)) <= self._late_max_ns
 
     def _accept(self, arrival_ns: int, x_ns: int) -> PlacedStamp:
         self.floor.add(x_ns, arrival_ns - x_ns)

@@ -122,10 +122,11 @@ class Floor:
             self._since_ns = self._bound_set_ns = x_ns
             self.newest_ns, self._first_arrival_ns = x_ns, x_ns + y_ns
         self.count += 1
-        height = self._height(x_ns, y_ns)
+        base_x_ns, base_y_ns = self._base
+        height = y_ns - base_y_ns - self.drift * (x_ns - base_x_ns)
         ahead_ns, level = x_ns - self.newest_ns, self._level
         if level is not None:
-            level.add(x_ns, y_ns - self._base[1], ahead_ns, self._drift_max)
+            level.add(x_ns, y_ns - base_y_ns, ahead_ns, self._drift_max)
         if ahead_ns > 0:
             self.newest_ns = x_ns
             self._upper_bound += self._drift_max * ahead_ns
@@ -159,10 +160,6 @@ class Floor:
             or gap < -RESOLUTION_NS
         ):
             self._measure()
-
-    def _height(self, x_ns: int, y_ns: int) -> float:
-        x0_ns, y0_ns = self._base
-        return y_ns - y0_ns - self.drift * (x_ns - x0_ns)
 
     def _late_height(self, spread: float) -> float:
         """Return the least height of the last few frames if all are improbably late; else -inf."""
@@ -277,7 +274,8 @@ class Floor:
 
     def restart_at(self, height_ns: int, x_ns: int) -> None:
         """Restart at a height that was measured at a sender time, because the clock changed."""
-        measured = self._height(x_ns, height_ns)
+        base_x_ns, base_y_ns = self._base
+        measured = height_ns - base_y_ns - self.drift * (x_ns - base_x_ns)
         self._upper_bound = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
         self._level = None
         self._since_ns = self._bound_set_ns = x_ns

@@ -90,7 +90,8 @@ class SenderClock:
         line, x_ns = self._line, placed.x_ns
         if placed.jump_ns or line.floor.rise_ns:
             self._note_change(placed.jump_ns)
-        latency_s = max(0.0, (arrival_ns - self.node_ns(x_ns)) * 1e-9)
+        node_ns = x_ns + self._now()[3] + line.floor.drifted_ns(x_ns)
+        latency_s = max(0.0, (arrival_ns - node_ns) * 1e-9)
         if x_ns == line.newest_ns:
             self._latency_s = latency_s
         return Stamp(x_ns, latency_s, placed.rebooted)
@@ -259,12 +260,9 @@ class SenderClock:
         """
         floor = self._line.floor
         sure_ns, highest_ns, line_ns, least_ns = floor.heights(x_ns)
-        median_ns = floor.median_ns
-        delay_ns = self._constant_delay_ns
-        best = ClockKind.ENVELOPE
+        median_ns, delay_ns, best = floor.median_ns, self._constant_delay_ns, ClockKind.ENVELOPE
         low_ns = least_ns - max(delay_ns, median_ns, MIN_INVISIBLE_NS) - floor.residual_ns()
-        low_ns -= self._doubt_ns
-        low_ns = max(low_ns, sure_ns - _MAX_DEPTH_NS)
+        low_ns = max(low_ns - self._doubt_ns, sure_ns - _MAX_DEPTH_NS)
         high_ns: float = sure_ns - delay_ns
         likely_ns = line_ns - delay_ns - INVISIBLE_RATIO * max(0.0, median_ns - delay_ns)
         rise_ns = highest_ns - sure_ns

@@ -20,6 +20,7 @@ is paper eq. (8) with A(T) - L for Q.
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 from companion.tracking.design.gain_table import KinematicDesign, correction
 from companion.tracking.observers.estimates import Prediction
@@ -34,6 +35,7 @@ VELOCITY_SHARE = 0.5
 
 Over equal intervals the error then has the eigenvalues 0 and 1 - share.
 """
+GAINS_KEPT = 1024  # newest gains that are kept, by their interval
 MIN_DIFFERENCE_S = 0.1
 """Least interval for a velocity from positions, whose noise would mean km/s below it."""
 
@@ -91,6 +93,8 @@ class KinematicObserver:
 
     def __init__(self, model: KinematicModel) -> None:
         self.model = model
+        # Stamps are whole milliseconds, so that intervals between reports recur.
+        self._gain_over = lru_cache(GAINS_KEPT)(model.gain)
 
     def begin(self, fix: Fix) -> KinematicState:
         """Return the state of a track that has one report, whose values are the estimate.
@@ -168,7 +172,7 @@ class KinematicObserver:
     def _gain(self, state: KinematicState, t: float) -> Gain:
         """Return the scheduled gain; without velocity, A(t) [1; share / previous interval]."""
         if state.fix.velocity_ned_mps is not None:
-            return self.model.gain(t)
+            return self._gain_over(t)
         if state.interval_s is None:
             return 1.0, 0.0, 0.0, 0.0
         rate = VELOCITY_SHARE / max(state.interval_s, MIN_DIFFERENCE_S)

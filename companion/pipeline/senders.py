@@ -202,6 +202,8 @@ class Senders:
         self._dedupe = Dedupe()  # by content, over all links
         self._admits = admission(settings.tracks.allow, settings.tracks.deny)
         self._assumed = lru_cache(RECORDS_MAX)(partial(assembly.assumed, settings))
+        # By UAV, until the types of any component change.
+        self._assumed_of: dict[str, assembly.AircraftAssumptions] = {}
         self._utc_offset_ns = 0  # UTC less the node's timeline
 
     # --- messages ---------------------------------------------------------------------------
@@ -265,6 +267,7 @@ class Senders:
                 if component.types[-1:] != (newest,):
                     others = [one for one in component.types if one != newest]
                     component.types = (*others[1 - TYPES_MAX :], newest)
+                    self._assumed_of.clear()
         return NO_OUTCOME
 
     def _component(self, message: GnssStatus | Presence) -> ComponentState:
@@ -488,13 +491,16 @@ class Senders:
         An aircraft that changes its type, as one that takes off vertically and then flies as an
         aeroplane, is between both for a while: the assumptions contain those of all its types.
         """
-        source = _source(uav)
-        component = None if source is None else self._components.get(source)
-        if component is None or not component.types:
-            return self._assumed(uav, None, None)
-        if len(component.types) == 1:
-            return self._assumed(uav, *component.types[0])
-        return assembly.widest([self._assumed(uav, *one) for one in component.types])
+        known = self._assumed_of.get(uav)
+        if known is None:
+            if len(self._assumed_of) >= RECORDS_MAX:
+                self._assumed_of.clear()  # a cache; ids may be forged
+            source = _source(uav)
+            component = None if source is None else self._components.get(source)
+            types = component.types if component is not None else ()
+            each = [self._assumed(uav, *one) for one in types or ((None, None),)]
+            known = self._assumed_of[uav] = assembly.widest(each)
+        return known
 
     # --- memory -----------------------------------------------------------------------------
 
@@ -513,6 +519,7 @@ class Senders:
         for source in {*gone, *islice(components, too_many)}:
             if not self._is_kept(str(source)):
                 del components[source]
+                self._assumed_of.pop(str(source), None)
 
     def _is_kept(self, name: str) -> bool:
         return name in self._tracked or name == self._carrier

@@ -11,7 +11,7 @@ Over 300 lines: the errors, what is chosen by them and what they tell are one su
 """
 
 import math
-from bisect import bisect_left, insort
+from bisect import bisect_left, bisect_right, insort
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final
@@ -152,10 +152,15 @@ class _Errors:
 
 
 class PastPredictions:
-    """Past predictions of one UAV. ``add`` takes reports in order of the sender's time."""
+    """Past predictions of one UAV. ``add`` takes reports in order of the sender's time.
+
+    ``usual_errors``: see ``UsualErrors``; ages ascending.
+    """
 
     def __init__(self) -> None:
+        self.usual_errors: UsualErrors = ()
         self._states: Newest[_PastPrediction] = Newest(_KEPT)
+        self._times_ns: Newest[int] = Newest(_KEPT)  # of these states
         self._costs = [0.0] * (2 * len(ACCELERATION_MODELS))
         self._comparisons = 0
         self._compared_ns = 0
@@ -200,7 +205,7 @@ class PastPredictions:
 
     def is_due(self, sender_ns: int) -> bool:
         """Return whether a report at this time must be added."""
-        return not self._states or sender_ns - self._states[-1].sender_ns >= SPACING_S * 1e9
+        return not self._times_ns or sender_ns - self._times_ns[-1] >= SPACING_S * 1e9
 
     def add(self, fix: Fix, accelerations: tuple[Vector | None, ...]) -> None:
         """Evaluate earlier predictions by a report; store the state to predict from it.
@@ -220,7 +225,15 @@ class PastPredictions:
                 errors.judged_ns = made.sender_ns
                 age_s = (fix.sender_ns - made.sender_ns) * 1e-9
                 errors.add(made.error_m(self._model, there, age_s), age_s)
+        self.usual_errors = tuple(
+            [
+                (one.age_s, one.error_p95_m)
+                for one in map(self._errors.get, AGES_S)
+                if one is not None and one.error_p95_m is not None
+            ]
+        )
         if fix.velocity_ned_mps is not None:
+            self._times_ns.append(fix.sender_ns)
             velocity, aside = fix.velocity_ned_mps, self._smoothing_offset
             self._states.append(
                 _PastPrediction(
@@ -234,12 +247,10 @@ class PastPredictions:
 
     def _older(self, sender_ns: int, least_s: float) -> _PastPrediction | None:
         """Return the newest stored state at least this old; None beyond 2 s + twice that age."""
-        newest_ns = sender_ns - round(least_s * 1e9)
-        for made in reversed(self._states):
-            if made.sender_ns <= newest_ns:
-                age_s = (sender_ns - made.sender_ns) * 1e-9
-                return made if age_s < 2.0 * least_s + 2.0 else None
-        return None
+        at = bisect_right(self._times_ns, sender_ns - round(least_s * 1e9)) - 1
+        if at < 0 or (sender_ns - self._times_ns[at]) * 1e-9 >= 2.0 * least_s + 2.0:
+            return None
+        return self._states[at]
 
     def _compare(self, sender_ns: int, there: Vector) -> None:
         made = self._older(sender_ns, COMPARED_AGES_S[0])
@@ -259,15 +270,6 @@ class PastPredictions:
         least = min(costs)
         if least < SWITCH_RATIO * costs[self._model]:
             self._model = costs.index(least)
-
-    @property
-    def usual_errors(self) -> UsualErrors:
-        """Observed ages of predictions, ascending, each with the 95th percentile of its errors."""
-        return tuple(
-            (one.age_s, one.error_p95_m)
-            for one in map(self._errors.get, AGES_S)
-            if one is not None and one.error_p95_m is not None
-        )
 
 
 def usual_error_m(known: UsualErrors, age_s: float) -> float | None:

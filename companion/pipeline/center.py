@@ -4,7 +4,7 @@ Over 300 lines: position, attitude and frame of the carrier change together.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from companion.beams.aim import AIMABLE
@@ -140,7 +140,7 @@ class CarrierTracker:
         if self._geoid_m is None or report.alt_datum is not AltitudeDatum.GEOMETRIC:
             return report
         above_sea_m = report.alt_m - self._geoid_m
-        return replace(report, alt_m=above_sea_m, alt_datum=AltitudeDatum.MSL)
+        return report._replace(alt_m=above_sea_m, alt_datum=AltitudeDatum.MSL)
 
     def turn(self, placed: PlacedAttitude, turn_degps2: float) -> Refuted | None:
         """Process an attitude of the carrier, unless it is older than the newest one.

@@ -10,7 +10,7 @@ Over 300 lines: every kind of message passes through here.
 import math
 from collections import defaultdict
 from collections.abc import Container
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache, partial
 from itertools import islice
 from typing import Final, NamedTuple
@@ -77,8 +77,7 @@ HEIGHT_FILTER_WEIGHT: Final = (
 )
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class PlacedReport:
+class PlacedReport(NamedTuple):
     """Report with its time on the sender's and the node's timeline.
 
     noise      bounds on its errors; None for a relayed aircraft, whose errors depend on its
@@ -92,16 +91,14 @@ class PlacedReport:
     limits: Limits  # assumed limits of the aircraft
 
 
-@dataclass(frozen=True, slots=True)
-class PlacedAttitude:
+class PlacedAttitude(NamedTuple):
     """Attitude of the carrier with its time on the carrier's timeline."""
 
     attitude: Attitude
     sender_ns: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class FrameOutcome:
+class FrameOutcome(NamedTuple):
     """Outcome of processing one frame.
 
     message    a message with its time; None if nothing remains to be done
@@ -371,8 +368,7 @@ class Senders:
         said, factor = report.accuracy or Accuracy(), self._noise_settings.factor or 0.0
         horizontal_m = max(noise.horizontal_m, factor * (said.horizontal_m or 0.0))
         vertical_m = max(noise.vertical_m, factor * (said.vertical_m or 0.0)) + report.alt_step_m
-        return replace(
-            noise,
+        return noise._replace(
             horizontal_m=horizontal_m,
             vertical_m=vertical_m,
             position_m=max(noise.position_m, math.hypot(horizontal_m, vertical_m)),

@@ -14,7 +14,7 @@ import math
 from bisect import bisect_left, bisect_right, insort
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 from companion.values import Fix, Vector
 from companion.values.newest import Newest
@@ -74,8 +74,7 @@ UsualErrors = tuple[tuple[float, float], ...]
 """Ages of past predictions, s, each with the 95th percentile of their errors, m."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class _PastPrediction:
+class _PastPrediction(NamedTuple):
     """State at a past report, from which all models' predictions can be repeated."""
 
     sender_ns: int

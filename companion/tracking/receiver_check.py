@@ -10,7 +10,6 @@ becomes that of a receiver without a stated accuracy, or more if the deviation w
 """
 
 import math
-from dataclasses import replace
 from typing import Final
 
 from companion.tracking.noise import NoiseSettings
@@ -116,8 +115,8 @@ class ReceiverCheck:
         level_m = max(self._settings.default.horizontal_m, factor * self._deviation_m)
         if level_m <= stated.horizontal_m:
             return stated
-        return replace(
-            stated, horizontal_m=level_m, position_m=math.hypot(level_m, stated.vertical_m)
+        return stated._replace(
+            horizontal_m=level_m, position_m=math.hypot(level_m, stated.vertical_m)
         )
 
     def common_error_m(self, noise: ReportNoise) -> float:

@@ -128,7 +128,7 @@ class Tracker:
     def _with_raised_limits(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
         """Return a report with its raised bounds, and the refutations by this report."""
         given = self._limits(fix)
-        found = past.refutations.look(fix if fix.limits else replace(fix, limits=given))
+        found = past.refutations.look(fix if fix.limits else fix._replace(limits=given))
         limits, noise = past.refutations.limits(given, fix.sender_ns), fix.noise
         if past.receiver_check is not None:
             refuted = past.receiver_check.look(fix, limits.acceleration_max_mps2)
@@ -136,7 +136,7 @@ class Tracker:
             found += [] if refuted is None else [refuted]
         if limits is given and noise is fix.noise:
             return fix, found
-        return replace(fix, limits=limits, noise=noise), found
+        return fix._replace(limits=limits, noise=noise), found
 
     def _accepted(self, tracked: _Tracked, fix: Fix) -> Estimate | Rejection:
         index = tracked.history.index(fix.sender_ns)

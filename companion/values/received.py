@@ -68,9 +68,10 @@ class Accuracy(NamedTuple):
     time_s: float | None = None
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Report:
+class Report(NamedTuple):
     """Position that a UAV sent of itself, or that a receiver relayed of it.
+
+    The class is a tuple for speed, as others here of which one is made for every message.
 
         t_ns               arrival, node time
         lat_deg, lon_deg   WGS84
@@ -156,8 +157,7 @@ class RemoteId:
     is_flat: bool = False  # whether a position came without a height
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Attitude:
+class Attitude(NamedTuple):
     """Body attitude and body rates (ATTITUDE).
 
     Roll, pitch and yaw, in radians, rotate the NED frame into the FRD body frame; the rates, in
@@ -185,8 +185,7 @@ class Presence:
     autopilot: int
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class GnssStatus:
+class GnssStatus(NamedTuple):
     """Fix type, height and stated accuracies of a GNSS receiver (GPS_RAW_INT).
 
     ``fix_type`` is MAVLink's GPS_FIX_TYPE, ``alt_m`` above mean sea level; accuracies are in metres

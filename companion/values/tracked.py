@@ -2,16 +2,15 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated, Final
+from typing import Annotated, Final, NamedTuple
 
 from companion.values.described import DescribedEnum, Inline, Meaning
 from companion.values.numbers import FloatArray, Vector
 from companion.values.received import Report
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class ReportNoise:
-    """Bounds on the errors of one report.
+class ReportNoise(NamedTuple):
+    """Bounds on the errors of one report. The class is a tuple for speed.
 
     apart_m  difference between the receiver's own altitudes and the recently reported ones, while
              it is unknown which is wrong; 0 if they agree
@@ -58,9 +57,10 @@ class Refuted:
     raised_to: Annotated[float, Meaning("value assumed from then on; it decays over minutes")]
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Fix:
+class Fix(NamedTuple):
     """Report with its time on the node's timeline and its position in the local frame.
+
+    The class is a tuple for speed.
 
     sender_ns  when the position was true, on the sender's timeline; intervals between reports are
                computed from it, since link delay does not affect it

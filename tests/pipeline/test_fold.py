@@ -812,8 +812,8 @@ def test_digest_covers_every_field_of_an_estimate() -> None:
     (seen,) = Pipeline(settings("47.4,8.55,500")).step(position(0.0, "1:1", (3.0, 4.0, 5.0)))
     assert isinstance(seen, Estimate)
     others = [
-        replace(seen, fix=replace(seen.fix, uav="1:2")),
-        replace(seen, fix=replace(seen.fix, t_ns=seen.fix.t_ns + 1)),
+        replace(seen, fix=seen.fix._replace(uav="1:2")),
+        replace(seen, fix=seen.fix._replace(t_ns=seen.fix.t_ns + 1)),
         replace(seen, bound_m=seen.bound_m + 1e-9),
         *(replace(seen, position_ned_m=seen.position_ned_m + axis) for axis in 1e-9 * np.eye(3)),
     ]

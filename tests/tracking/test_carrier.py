@@ -167,7 +167,7 @@ def test_carrier_attitude_is_predicted_to_the_time_of_use(fix: Callable[..., Fix
 
 def _at(make: Callable[..., Fix], lat_deg: float, lon_deg: float) -> Fix:
     made = make(0, [0, 0, 0])
-    return replace(made, report=replace(made.report, lat_deg=lat_deg, lon_deg=lon_deg))
+    return made._replace(report=made.report._replace(lat_deg=lat_deg, lon_deg=lon_deg))
 
 
 @settings(max_examples=rounds(30, 300))
@@ -252,7 +252,7 @@ def test_possible_or_implausible_rates_do_not_raise_the_limit() -> None:
 def test_contradiction_compares_angle_with_elapsed_time() -> None:
     """Two level attitudes without rates, 90 degrees apart within half a second."""
     before, after = (
-        replace(turning(0.0), t_ns=at_ns, yaw_rad=yaw_rad)
+        turning(0.0)._replace(t_ns=at_ns, yaw_rad=yaw_rad)
         for at_ns, yaw_rad in ((0, 0.0), (S // 2, math.pi / 2))
     )
     found = carrier.contradiction(before, after, 0.5, HELD)

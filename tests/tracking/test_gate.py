@@ -1,6 +1,5 @@
 """The gate: rejection of impossible reports, and reacquisition from rejected ones."""
 
-import dataclasses
 import math
 from collections.abc import Callable
 
@@ -181,11 +180,11 @@ def test_fast_reports_reacquire_as_soon_as_slow_ones(fix: MakeFix, rate_hz: int)
 
 def test_time_uncertainty_adds_distance_at_the_reported_speed(fix: MakeFix) -> None:
     """At 40 m/s, 2 s apart: one millisecond, the drift over 2 s, and the velocity error."""
-    noise = dataclasses.replace(NOISE, velocity_mps=0.5, time_s=0.0)
+    noise = NOISE._replace(velocity_mps=0.5, time_s=0.0)
     before, after = (fix(at * S, (80 * at, 0, -50), (40.0, 0, 0), noise=noise) for at in (0, 2))
     settings = GateSettings(drift_max=1e-3)
     assert settings.slack_m(before, after) == pytest.approx(40.5 * (1e-3 + 2e-3), rel=1e-3)
-    late = dataclasses.replace(after, noise=dataclasses.replace(noise, time_s=0.02))
+    late = after._replace(noise=noise._replace(time_s=0.02))
     assert settings.slack_m(before, late) == pytest.approx(40.5 * 0.023, rel=0.02)
-    still = dataclasses.replace(after, velocity_ned_mps=None)
+    still = after._replace(velocity_ned_mps=None)
     assert GateSettings(lead_m=3.0).slack_m(still, still) == 3.0

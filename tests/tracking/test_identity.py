@@ -1,7 +1,6 @@
 """Telemetry and ADS-B of one aircraft are merged; two aircraft that pass each other are not."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -127,10 +126,10 @@ def test_reported_accuracies_can_be_ignored() -> None:
 )
 def test_reported_accuracy_is_limited_by_the_fix_type(fix_type: int, least_m: float) -> None:
     """Some receivers state 1 mm when they do not know; 30 cm of an RTK fix is accepted."""
-    claimed = replace(status(0.001, 0.001, None), fix_type=fix_type)
+    claimed = status(0.001, 0.001, None)._replace(fix_type=fix_type)
     found = noise.reported(claimed, noise.NoiseSettings(DEFAULT, 3.0))
     assert (found.horizontal_m, found.vertical_m) == pytest.approx((least_m, least_m))
-    honest = replace(claimed, h_acc_m=0.3)
+    honest = claimed._replace(h_acc_m=0.3)
     assert noise.reported(honest, noise.NoiseSettings(DEFAULT, 3.0)).horizontal_m == pytest.approx(
         0.9
     )
@@ -155,6 +154,6 @@ def test_invented_ids_use_bounded_memory(fix: MakeFix) -> None:
         identities.observe(relayed(fix, n, here), [track("1:1", here)])
     assert identities.same_as(AIRCRAFT) == "1:1"
     for number in range(RELAYED_MAX):
-        identities.observe(replace(relayed(fix, 9, here), uav=f"cot:{number}"), [])
+        identities.observe(relayed(fix, 9, here)._replace(uav=f"cot:{number}"), [])
     assert len(identities._relayed) == RELAYED_MAX
     assert identities.same_as(AIRCRAFT) is None

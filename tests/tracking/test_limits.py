@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -30,7 +29,7 @@ NOISE = ReportNoise(horizontal_m=1.0, vertical_m=1.0, position_m=1.4, velocity_m
 
 def told(fix: Callable[..., Fix], t_s: float, velocity: object, limits: Limits = COPTER) -> Fix:
     made = fix(round(t_s * S), [0, 0, 0], velocity, noise=NOISE)
-    return replace(made, limits=limits)
+    return made._replace(limits=limits)
 
 
 @pytest.mark.parametrize(

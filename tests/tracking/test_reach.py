@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -80,7 +79,7 @@ def test_reachable_bound_and_ball_are_minimal(
     fix: Callable[..., Fix], age_s: float, before_s: float, after_s: float
 ) -> None:
     """Against the farthest possible position and the smallest ball around all of them."""
-    noise = replace(NOISE, horizontal_m=1.5, vertical_m=1.5)
+    noise = NOISE._replace(horizontal_m=1.5, vertical_m=1.5)
     velocity = np.array([8.0, 3.0, 0.0])
     made = fix(0, [0, 0, 0], velocity, noise=noise)
     at = SenderTime(node_ns=0, sender_ns=round(age_s * S), before_s=before_s, after_s=after_s)

@@ -332,7 +332,7 @@ def test_repeated_positions_are_rejected_as_frozen(fix: MakeFix) -> None:
     for number, one in enumerate(made):
         frozen = 50 <= number < 65
         place = made[49] if frozen else one
-        told = replace(one, position_ned_m=place.position_ned_m, report=place.report)
+        told = one._replace(position_ned_m=place.position_ned_m, report=place.report)
         outcomes.append(tracker.accept(told)[0])
         holds(seen(tracker, number / 5 + 0.1), circling(number / 5 + 0.1)[0])
     assert reasons(outcomes) == {None: 85, Reason.FROZEN: 15}
@@ -345,7 +345,7 @@ def test_repeated_position_after_reacquisition_is_rejected_as_frozen(fix: MakeFi
         outcome = tracker.accept(one)[0]
         if isinstance(outcome, Estimate) and outcome.reacquired:
             break
-    again = tracker.accept(replace(one, sender_ns=one.sender_ns + S // 5))[0]
+    again = tracker.accept(one._replace(sender_ns=one.sender_ns + S // 5))[0]
     assert isinstance(again, Rejection)
     assert again.reason is Reason.FROZEN
 
@@ -452,7 +452,7 @@ def test_feedforward_displacement_is_included_in_the_bound(fix: MakeFix) -> None
 
 def test_feedforward_acceleration_is_limited(fix: MakeFix) -> None:
     """Such noisy velocities refute nothing and raise no limit."""
-    tracker, noise = tracking(3.0), replace(NOISE, velocity_mps=20.0)
+    tracker, noise = tracking(3.0), NOISE._replace(velocity_mps=20.0)
     for n in range(31):  # 5 m/s^2
         t_s = n / 5
         place = [0, 1.5 * t_s * t_s, 2.0 * t_s * t_s]
@@ -511,7 +511,7 @@ def test_clock_uncertainty_covers_acceleration(fix: MakeFix) -> None:
     """
     tracker = tracking()
     tracker.accept(
-        fix(0, [0, 0, 0], [0, 0, 0], noise=replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6))
+        fix(0, [0, 0, 0], [0, 0, 0], noise=NOISE._replace(horizontal_m=1e-6, velocity_mps=1e-6))
     )[0]
     for ahead_s in (0.0, 0.5, 2.0):
         true_s = ahead_s + 1.0
@@ -521,7 +521,7 @@ def test_clock_uncertainty_covers_acceleration(fix: MakeFix) -> None:
 def test_clock_uncertainty_covers_a_change_of_acceleration(fix: MakeFix) -> None:
     """It brakes at 4 m/s^2, which is fed forward, and accelerates at 5 m/s^2 after the last report.
     The prediction for 3.0 s must still hold at 3.4 s."""
-    tracker, exact = tracking(5.0), replace(NOISE, horizontal_m=1e-6, velocity_mps=1e-6)
+    tracker, exact = tracking(5.0), NOISE._replace(horizontal_m=1e-6, velocity_mps=1e-6)
     for n in range(11):
         t_s = 0.2 * n
         place = [20 * t_s - 2 * t_s**2, 0, 0]

@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 from companion.values.described import DescribedEnum, Meaning
 
@@ -46,8 +46,7 @@ class ClockAssumptions:
             raise ValueError(f"drift_max_ppm is {self.drift_max_ppm}, allowed: 0 to 20000")
 
 
-@dataclass(frozen=True, slots=True)
-class Stamp:
+class Stamp(NamedTuple):
     """Stamp placed on the sender's and the node's timelines.
 
     sender_ns  the sender's time since boot, unwrapped past its 32-bit milliseconds; starts again

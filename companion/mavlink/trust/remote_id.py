@@ -7,7 +7,7 @@ position of a single one.
 """
 
 from collections import OrderedDict
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
 
 from companion.values import AltitudeDatum, Reason, Rejection, RemoteId, Report, Source, UavKind
@@ -59,7 +59,7 @@ class RemoteIds:
         if known.datum not in (None, report.alt_datum) and fresh:
             return _rejected(message, uav, Reason.NO_ALTITUDE, f"datum was {known.datum} before")
         known.datum, known.placed_ns = report.alt_datum, message.t_ns
-        return replace(report, uav=uav)
+        return report._replace(uav=uav)
 
     def _learned(self, message: RemoteId) -> _AddressRecord:
         key = message.source, message.heard_as

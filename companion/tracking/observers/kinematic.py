@@ -21,6 +21,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 from companion.tracking.design.gain_table import KinematicDesign, correction
 from companion.tracking.observers.estimates import Prediction
@@ -67,9 +68,10 @@ class KinematicModel:
     gain: GainSchedule = deadbeat
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class KinematicState:
+class KinematicState(NamedTuple):
     """Estimate at a report's time before the report is used, its bounds, and the report.
+
+    The class is a tuple for speed.
 
     position_ned_m, velocity_ned_mps
                   the estimate, local frame

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Final
 
 import numpy as np
@@ -152,7 +152,7 @@ def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:
     said = decode(frame)
     if isinstance(said, RemoteId):  # the rejection names the aircraft if it is known
         report, named = said.report, None if refused is None else refused.source
-        said = replace(report, uav=named) if report is not None and named is not None else report
+        said = report._replace(uav=named) if report is not None and named is not None else report
     if refused is None and said is None:  # this message may contain a report, but did not
         return None
     return Heard(

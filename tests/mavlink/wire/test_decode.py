@@ -4,7 +4,6 @@ import math
 import struct
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 from hypothesis import given, settings
@@ -535,7 +534,7 @@ def test_version_1_has_no_extension_fields() -> None:
     assert isinstance(found, GnssStatus)
     accuracies = (found.h_acc_m, found.v_acc_m, found.vel_acc_mps)
     assert accuracies == pytest.approx((1.5, 2.5, 0.3))
-    bare = replace(found, h_acc_m=None, v_acc_m=None, vel_acc_mps=None)
+    bare = found._replace(h_acc_m=None, v_acc_m=None, vel_acc_mps=None)
     assert decode(sent_v1(message, 30)) == bare
 
 

@@ -147,7 +147,9 @@ class Tracker:
         if wrong is not None:
             return _rejected(fix, *wrong)
         predicted = self._observer.predict(before.state, fix.sender_ns)
-        impossible = refusal(predicted, fix, self._settings.gate.slack_m(before.fix, fix))
+        impossible = refusal(predicted, fix)
+        if impossible is not None:  # seldom: errors of the times may still explain it
+            impossible = refusal(predicted, fix, self._settings.gate.slack_m(before.fix, fix))
         if impossible is not None:
             return self._suspect(tracked, fix, impossible)
         tracked.believable_ns = max(tracked.believable_ns, fix.sender_ns)

@@ -44,16 +44,18 @@ class Dedupe:
     def __init__(self) -> None:
         self.shares: dict[str, LinkShare] = {}
         self._seen: OrderedDict[bytes, _First] = OrderedDict()  # in order of arrival
+        self._newest: _First | None = None  # of these
 
     def is_repeat(self, frame: Frame) -> bool:
         """Count a frame; return True if the same content arrived before it, within the window."""
-        while self._seen and next(iter(self._seen.values())).t_ns < frame.t_ns - WINDOW_NS:
-            self._seen.popitem(last=False)
+        seen, t_ns = self._seen, frame.t_ns
+        while seen and next(iter(seen.values())).t_ns < t_ns - WINDOW_NS:
+            seen.popitem(last=False)
         share = self._share(frame.link)
         key = content(frame.raw)
-        first = self._seen.get(key)
+        first = seen.get(key)
         if first is None:
-            self._seen[key] = _First(frame.t_ns, frame.link)
+            seen[key] = self._newest = _First(t_ns, frame.link)
             share.first += 1
             return False
         share.repeats += 1
@@ -63,7 +65,8 @@ class Dedupe:
 
     def set_latency(self, latency_s: float) -> None:
         """Set the latency, in seconds, of the last new report."""
-        first = next(reversed(self._seen.values()))
+        first = self._newest
+        assert first is not None
         first.latency_s = latency_s
         self._share(first.link).latencies_s.append(latency_s)
 

@@ -63,7 +63,7 @@ STATUS_REORDER_MAX_US: Final = 30_000_000
 Equal to the time for which reports are remembered (``dedupe``).
 """
 KEPT_NS: Final = 3_600_000_000_000
-"""Time for which a silent sender without a track is kept; each clock takes some 50 kB."""
+"""Time for which a silent sender without a track is kept; each clock takes some 20 kB."""
 FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX; better fixes have larger numbers
 NEAR_HEIGHT_M: Final = 50.0
 """Largest difference between the heights of receiver and autopilot in a valid report.

@@ -259,3 +259,30 @@ def test_contradiction_compares_angle_with_elapsed_time() -> None:
     assert found is not None
     assert (found.apart_rad, found.apart_s) == pytest.approx((math.pi / 2, 0.5))
     assert found.at(0.25) == pytest.approx(0.75 * math.pi)
+
+
+@given(st.tuples(ANGLES, ANGLES, ANGLES), st.tuples(*[st.floats(-0.2, 0.2)] * 3), RATES, RATES)
+def test_every_contradiction_is_found(
+    angles_rad: tuple[float, float, float],
+    steps_rad: tuple[float, float, float],
+    rates_before: tuple[float, float, float],
+    rates_after: tuple[float, float, float],
+) -> None:
+    """Angles and rates that need no matrix never hide a rotation beyond the errors."""
+    made = []
+    for steps, rates in (((0.0, 0.0, 0.0), rates_before), (steps_rad, rates_after)):
+        roll, pitch, yaw = (angle + step for angle, step in zip(angles_rad, steps, strict=True))
+        x, y, z = rates
+        one = turning(0.0)._replace(roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw)
+        made.append(one._replace(rollspeed_radps=x, pitchspeed_radps=y, yawspeed_radps=z))
+    before, after = made
+    apart_s, bounds = 0.05, carrier.AttitudeBounds(0.1, 0.0)
+    first, second = (oracle(one.roll_rad, one.pitch_rad, one.yaw_rad) for one in made)
+    turned = [
+        Rotation.from_rotvec(-apart_s * np.array(rates_before)).as_matrix() @ first @ second.T,
+        Rotation.from_rotvec(apart_s * np.array(rates_after)).as_matrix() @ second @ first.T,
+    ]
+    apart_rad = max(Rotation.from_matrix(one).magnitude() for one in turned)
+    found = carrier.contradiction(before, after, apart_s, bounds)
+    if abs(apart_rad - 0.2) > 1e-9:
+        assert (found is not None) == (apart_rad > 0.2)

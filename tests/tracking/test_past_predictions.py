@@ -17,6 +17,7 @@ from companion.tracking.past_predictions import (
     WINDOWS,
     AccelerationModel,
     PastPredictions,
+    _PastPrediction,
     fading_response,
     fed_forward,
     usual_error_m,
@@ -201,6 +202,29 @@ def test_decaying_acceleration_matches_its_integral(decay_s: float) -> None:
     way, gain = fading_response(2.0, decay_s)
     assert gain == pytest.approx(speeds[-1], rel=1e-6)
     assert way == pytest.approx(float(np.trapezoid(speeds, times)), rel=1e-6)
+
+
+VECTORS = st.tuples(*[st.floats(-20.0, 20.0)] * 3)
+
+
+@given(st.lists(st.none() | VECTORS, min_size=7, max_size=7), VECTORS, VECTORS, st.floats(0.1, 5.0))
+def test_errors_of_all_models_at_once_are_those_of_each(
+    accelerations: list[tuple[float, float, float] | None],
+    velocity: tuple[float, float, float],
+    offset: tuple[float, float, float],
+    ahead_s: float,
+) -> None:
+    made = _PastPrediction(
+        sender_ns=0,
+        position=(1.0, 2.0, 3.0),
+        velocity=velocity,
+        accelerations=(None, *accelerations),  # the first model has none
+        smoothing_offset=offset,
+    )
+    there = (30.0, -20.0, 10.0)
+    squares_m2 = made.square_errors_m2(there, ahead_s)
+    each_m = [made.error_m(model, there, ahead_s) for model in range(2 * len(ACCELERATION_MODELS))]
+    assert [math.sqrt(one) for one in squares_m2] == pytest.approx(each_m)
 
 
 def test_newest_values_are_kept_up_to_the_limit() -> None:

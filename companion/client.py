@@ -110,7 +110,7 @@ class Client:
 
     def __init__(self, url: str, token: str | None = None, timeout_s: float = 10.0) -> None:
         if not _is_address(url):
-            raise UserError(f"{url!r} is not http://HOST:PORT")
+            raise UserError(f"{shown(url)} is not http://HOST:PORT")
         self._url = url.rstrip("/")
         self._token = token
         self._timeout_s = timeout_s

@@ -21,7 +21,7 @@ from companion import __version__
 from companion.cli.console import OneLineErrors, print_truncated
 from companion.mavlink.links.urls import MAVLINK, LinkUrl, parse_link
 from companion.node.signals import interrupts_held, release_interrupts
-from companion.values import Event, Frame, Reason, Rejection, UserError
+from companion.values import Event, Frame, Reason, Rejection, UserError, shown
 from sitl_replay.faults.asked import KINDS, Fault, described, in_order
 from sitl_replay.faults.traffic import HELD_MAX, OVERFLOW
 from sitl_replay.flight import scenario
@@ -92,7 +92,7 @@ def _positive(text: str, what: str) -> float:
     except ValueError:
         number = math.nan
     if not 0.0 < number < math.inf:
-        raise click.BadParameter(f"{text!r} is not {what}")
+        raise click.BadParameter(f"{shown(text)} is not {what}")
     return number
 
 

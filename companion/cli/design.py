@@ -6,6 +6,7 @@ from pathlib import Path
 import click
 
 from companion.cli.console import JSON
+from companion.values import shown
 
 
 def numbers(text: str) -> list[float]:
@@ -13,7 +14,9 @@ def numbers(text: str) -> list[float]:
     try:
         return [float(part) for part in text.split(",")]
     except ValueError as error:
-        raise click.BadParameter(f"{text!r} is not a list of numbers such as 0.1,0.5") from error
+        raise click.BadParameter(
+            f"{shown(text)} is not a list of numbers such as 0.1,0.5"
+        ) from error
 
 
 def _alpha(text: str) -> float | None:
@@ -22,7 +25,7 @@ def _alpha(text: str) -> float | None:
     try:
         return float(text)
     except ValueError as error:
-        raise click.BadParameter(f"alpha {text!r} is neither 'auto' nor a number") from error
+        raise click.BadParameter(f"alpha {shown(text)} is neither 'auto' nor a number") from error
 
 
 @click.command()

@@ -43,7 +43,7 @@ from companion.cli.fleet import replay as replay_fleet
 from companion.cli.recover import recover
 from companion.cli.study import study
 from companion.cli.weights import weights
-from companion.values import UserError
+from companion.values import UserError, shown
 
 if TYPE_CHECKING:
     from companion.node.start import Console
@@ -277,7 +277,7 @@ def _speed(text: str) -> float | None:
     except ValueError:
         factor = 0.0
     if not 0 < factor < float("inf"):
-        raise click.BadParameter(f"{text!r} is neither max nor a positive number")
+        raise click.BadParameter(f"{shown(text)} is neither max nor a positive number")
     return factor
 
 

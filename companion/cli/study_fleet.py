@@ -6,6 +6,7 @@ import click
 
 from companion.cli.console import SEED, Progress
 from companion.cli.study_output import Studied, study_output
+from companion.values import shown
 
 
 def _span(_context: click.Context, _option: click.Parameter, text: str) -> tuple[int, int]:
@@ -13,9 +14,9 @@ def _span(_context: click.Context, _option: click.Parameter, text: str) -> tuple
     try:
         found = int(first), int(last if dots else first)
     except ValueError as error:
-        raise click.BadParameter(f"{text!r} is not FROM..TO, such as 3..100") from error
+        raise click.BadParameter(f"{shown(text)} is not FROM..TO, such as 3..100") from error
     if not 1 <= found[0] <= found[1] <= 62_500:
-        raise click.BadParameter(f"{text!r} is outside 1..62500, or the smaller is not first")
+        raise click.BadParameter(f"{shown(text)} is outside 1..62500, or the smaller is not first")
     return found
 
 

@@ -7,6 +7,7 @@ import click
 
 from companion.cli.console import CENTER, CONFIG, SEED, Progress, print_truncated
 from companion.cli.study_output import Studied, study_output
+from companion.values import shown
 
 
 def _range(
@@ -15,7 +16,9 @@ def _range(
     try:
         first, last, step = (float(part) for part in text.split(":"))
     except ValueError as error:
-        raise click.BadParameter(f"{text!r} is not FROM:TO:STEP in dB, such as 0:20:2") from error
+        raise click.BadParameter(
+            f"{shown(text)} is not FROM:TO:STEP in dB, such as 0:20:2"
+        ) from error
     return first, last, step
 
 

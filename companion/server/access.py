@@ -18,7 +18,7 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket
 
 from companion.server.responses import problem
-from companion.values import Notice, Severity, UserError
+from companion.values import Notice, Severity, UserError, shown
 from companion.values.budget import Budget
 from companion.views.state import Node
 
@@ -55,7 +55,7 @@ def parse_listen(text: str) -> tuple[str, int]:
     host, _, port = text.rpartition(":")
     host = host.removeprefix("[").removesuffix("]")
     if not host or not port.isdecimal() or int(port) > 65535:
-        raise ListenError(f"{text!r} is not HOST:PORT, such as 127.0.0.1:8080")
+        raise ListenError(f"{shown(text)} is not HOST:PORT, such as 127.0.0.1:8080")
     return host, int(port)
 
 

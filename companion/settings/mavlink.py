@@ -7,7 +7,7 @@ from pydantic import AfterValidator, Field, ValidationInfo, field_validator, mod
 
 from companion.mavlink.links.urls import Scheme, parse_link
 from companion.settings.section import Section
-from companion.values import UAV_FORMS, UserError
+from companion.values import UAV_FORMS, UserError, shown
 
 
 def _link(text: str) -> str:
@@ -93,7 +93,7 @@ _OUT: Final[tuple[Scheme, ...]] = ("udpout", "tcp", "tcpin", "serial", "zenoh", 
 
 def _uav_pattern(text: str) -> str:
     if not _UAV_PATTERN.fullmatch(text):
-        raise UserError(f"{text!r} is not {UAV_FORMS}; * matches anything")
+        raise UserError(f"{shown(text)} is not {UAV_FORMS}; * matches anything")
     return text
 
 
@@ -104,7 +104,7 @@ UavPattern = Annotated[str, AfterValidator(_uav_pattern)]
 def _out_link(text: str) -> str:
     url = parse_link(text, _OUT)
     if url.port == 0:
-        raise UserError(f"{text!r}: port 0 is invalid as a destination; give 1 to 65535")
+        raise UserError(f"{shown(text)}: port 0 is invalid as a destination; give 1 to 65535")
     return text
 
 

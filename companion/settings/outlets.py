@@ -7,7 +7,7 @@ from typing import Annotated, Final, Literal
 from pydantic import AfterValidator, Field
 
 from companion.settings.section import Section
-from companion.values import UserError
+from companion.values import UserError, shown
 
 _ADDRESS: Final = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([0-9.]+)):([0-9]{1,5})")
 
@@ -20,7 +20,7 @@ def host_and_port(text: str) -> tuple[str, int]:
     except ValueError:
         host = ""
     if not host or not found or not 1 <= int(found[3]) <= 65535:
-        raise UserError(f"{text!r} is not IP:PORT, such as 127.0.0.1:9000 or [::1]:9000")
+        raise UserError(f"{shown(text)} is not IP:PORT, such as 127.0.0.1:9000 or [::1]:9000")
     return host, int(found[3])
 
 

@@ -45,7 +45,8 @@ class Bound(NamedTuple):
         if self.low <= number <= self.high and not (self.whole and number % 1.0):
             return number
         kind = "a whole number, " if self.whole else ""
-        raise FaultError(f"{self.letter} is {text!r}, allowed: {kind}{self.low:g} to {self.high:g}")
+        allowed = f"{kind}{self.low:g} to {self.high:g}"
+        raise FaultError(f"{self.letter} is {shown(text)}, allowed: {allowed}")
 
 
 class Kind(NamedTuple):
@@ -69,13 +70,13 @@ class Kind(NamedTuple):
         numbers = text.partition("=")[2].split(":")
         required = sum(bound.default is None for bound in self.bounds)
         if not required <= len(numbers) <= len(self.bounds):
-            raise FaultError(f"{text!r} is not {self.form}, for example {self.example}")
+            raise FaultError(f"{shown(text)} is not {self.form}, for example {self.example}")
         try:
             given = [
                 bound.read(number) for bound, number in zip(self.bounds, numbers, strict=False)
             ]
         except FaultError as error:
-            raise FaultError(f"{text!r}: {error}; for example {self.example}") from None
+            raise FaultError(f"{shown(text)}: {error}; for example {self.example}") from None
         defaults = [b.default for b in self.bounds[len(given) :] if b.default is not None]
         return (*given, *defaults)
 
@@ -231,7 +232,7 @@ class Fault:
         try:
             sysid, compid = _system(system) if at else (None, None)
         except FaultError as error:
-            raise FaultError(f"{text!r}: {error}; for example {kind.example}") from None
+            raise FaultError(f"{shown(text)}: {error}; for example {kind.example}") from None
         return cls(name=name, values=kind.read(text), sysid=sysid, compid=compid)
 
     def concerns(self, sender: Sender) -> bool:
@@ -263,5 +264,5 @@ def _system(text: str) -> tuple[int, int | None]:
     try:
         source = Source.parse(text if ":" in text else f"{text}:0")
     except ValueError:
-        raise FaultError(f"{text!r} is not SYSID or SYSID:COMPID, each 0 to 255") from None
+        raise FaultError(f"{shown(text)} is not SYSID or SYSID:COMPID, each 0 to 255") from None
     return source.sysid, source.compid if ":" in text else None

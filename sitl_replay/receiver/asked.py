@@ -101,7 +101,7 @@ def receiver_model(texts: Sequence[str]) -> ReceiverModel:
         if name == "silent":
             silent_s.append((values[0], values[1]))
         elif name in found:
-            raise UserError(f"{text!r}: {name} is given twice; allowed: once")
+            raise UserError(f"{shown(text)}: {name} is given twice; allowed: once")
         found[name] = values
     made = ReceiverModel(silent_s=tuple(silent_s))
     for name, values in found.items():

@@ -150,7 +150,7 @@ def _zenoh(text: str, address: str) -> LinkUrl:
 
 def _serial(text: str, device: str, baud: int) -> LinkUrl:
     if not device.isprintable():
-        raise LinkError(f"{shown(text)}: {device!r} is not a valid device name")
+        raise LinkError(f"{shown(text)}: {shown(device)} is not a valid device name")
     if not 1 <= baud <= _BAUD_MAX:
         raise LinkError(f"{shown(text)}: {baud} is not a baud rate, 1 to {_BAUD_MAX}")
     return LinkUrl(scheme="serial", host=device, port=baud)

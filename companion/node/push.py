@@ -64,22 +64,28 @@ class Push:
             self._ring = Ring(Path(self._settings.shared_memory))
 
     def newest(self, update: Update, number: int) -> None:
-        """Queue this update as the next to push; updates are numbered from 0."""
-        if self._sockets or self._ring:
+        """Push this update, at once or as soon as its guaranteed gains are computed.
+
+        Updates are numbered from 0.
+        """
+        if not (self._sockets or self._ring):
+            return
+        if self._settings.guaranteed:
             self._newest = update, number
             self._fresh.set()
+        else:
+            self._send(update, number, None)
 
     async def run(self) -> None:
-        """Push updates to the outputs until cancelled."""
+        """Push updates with guaranteed gains until cancelled."""
         while True:
             await self._fresh.wait()
             self._fresh.clear()
             assert self._newest is not None
-            (update, number), sure = self._newest, None
-            if self._settings.guaranteed:
-                sure = await in_daemon_thread(
-                    partial(guaranteed_gain.gains_db, self._pipeline, self._equipment, update)
-                )
+            update, number = self._newest
+            sure = await in_daemon_thread(
+                partial(guaranteed_gain.gains_db, self._pipeline, self._equipment, update)
+            )
             self._send(update, number, sure)
 
     def _send(self, update: Update, number: int, sure: list[float | None] | None) -> None:

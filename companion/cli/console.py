@@ -12,7 +12,7 @@ from typing import Any, Final, NoReturn
 
 import click
 
-from companion.cli.interrupts import INTERRUPTED, interrupts_raised
+from companion.cli.interrupts import INTERRUPTED, command_ended, interrupts_raised
 from companion.values import UserError, printable
 
 LOG_EVERY_S: Final = 10.0  # time between two progress lines without a terminal
@@ -157,6 +157,7 @@ class OneLineErrors(click.Group):
             raise InterruptedByUser from None
 
     def _end(self, said: str, status: int) -> NoReturn:
+        command_ended()
         say(f"{self.name}: {' '.join(said.split())}", err=True)
         sys.exit(status)
 

@@ -19,6 +19,14 @@ SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 RETRY_S: Final = 0.02  # delay before an interrupt that could not be raised is tried again
 
 
+_has_ended: Final = threading.Event()
+
+
+def command_ended() -> None:
+    """Note that the command ends with a line of its own: an interrupt now changes nothing."""
+    _has_ended.set()
+
+
 @contextmanager
 def interrupts_end(name: str) -> Iterator[None]:
     """Context in which an interrupt ends the process at once, with one line under this name.
@@ -31,6 +39,8 @@ def interrupts_end(name: str) -> Iterator[None]:
     """
 
     def end(_number: int, _frame: object) -> None:
+        if _has_ended.is_set():
+            return
         os.write(2, f"{name}: interrupted\n".encode())
         os._exit(INTERRUPTED)
 

@@ -93,15 +93,15 @@ def aim(
 ) -> BeamSet:
     """Compute one beam for every eligible track, with nulls on the others.
 
-        now_ns       when the beams are computed, node time
-        valid_at_ns  when they are applied, node time
-        tracks       UAVs predicted to ``valid_at_ns``
-        carrier      position and attitude of the array then; None: unknown, and no beams
-        array        the array on its mount
-        precoder     how weights are computed
-        coverage     directions in which beams may point
-        before       state of the last beams, for hysteresis; None: no hysteresis
-        seen_directions       directions in which the array sees UAVs, by UAV
+        now_ns           when the beams are computed, node time
+        valid_at_ns      when they are applied, node time
+        tracks           UAVs predicted to ``valid_at_ns``
+        carrier          position and attitude of the array then; None: unknown, and no beams
+        array            the array on its mount
+        precoder         how weights are computed
+        coverage         directions in which beams may point
+        before           state of the last beams, for hysteresis; None: no hysteresis
+        seen_directions  directions in which the array sees UAVs, by UAV
 
     The columns of the weights are in the order of ``tracks``. UAVs without a beam are listed with
     the reason.

@@ -18,12 +18,11 @@ INTERRUPTED: Final = 130  # exit status
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 RETRY_S: Final = 0.02  # delay before an interrupt that could not be raised is tried again
 
-
 _has_ended: Final = threading.Event()
 
 
 def command_ended() -> None:
-    """Note that the command ends with a line of its own: an interrupt now changes nothing."""
+    """Note that the command ends with a line of its own, so that an interrupt adds no other."""
     _has_ended.set()
 
 
@@ -34,8 +33,8 @@ def interrupts_end(name: str) -> Iterator[None]:
     An exception raised by the signal could surface inside a package's import, which may turn it
     into another error. Nothing is open yet, so the process can simply end. Signals that the script
     has blocked since its start (``scripts/companion``) are delivered now. After the context the
-    same applies, until the interpreter is being torn down: then the command has ended, and an
-    interrupt changes nothing.
+    same applies, until the command has ended (``command_ended``, or the interpreter is being torn
+    down): then an interrupt changes nothing.
     """
 
     def end(_number: int, _frame: object) -> None:

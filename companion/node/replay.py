@@ -132,8 +132,7 @@ class Run:
 
         Raises ``OSError`` if the recording cannot be written.
         """
-        found = self.pipeline.digest
-        digests = {"digest": found.hexdigest(), "digest_estimates": found.of_estimates()}
+        digests = self.pipeline.digest.both()
         recording = self.writer.close(digests) if self.writer else None
         return summary(self.pipeline, self.tally) | {
             "wall_s": self.took_s,

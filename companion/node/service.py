@@ -97,8 +97,8 @@ class Service:
         self.series = Series()
         self._area = area_map.find(settings.page.map)
         self._ticked = asyncio.Event()
-        self._reported = asyncio.Event()  # one of these has reported since the last update:
-        self._awaited = frozenset[str]()
+        self._awaited = frozenset[str]()  # UAVs whose report starts an update
+        self._reported = asyncio.Event()  # set: one of them has reported since the last update
         self._update_s = math.inf  # time that the last update took
         self._is_behind = False
         self._aimer = ThreadPoolExecutor(1, "beams")
@@ -199,9 +199,7 @@ class Service:
         if self._live:
             await asyncio.to_thread(self._live.stop)
         if self._recorder:
-            found = self.pipeline.digest
-            metadata = {"digest": found.hexdigest(), "digest_estimates": found.of_estimates()}
-            await asyncio.to_thread(self._recorder.stop, metadata)
+            await asyncio.to_thread(self._recorder.stop, self.pipeline.digest.both())
             self._notify_recorder_state(self._recorder)
 
     def _fleet_node(self, settings: Settings) -> LiveFleetNode | None:
@@ -327,9 +325,11 @@ class Service:
         """Tick at the update rate; ticks missed while the loop was blocked are skipped.
 
         Beams are computed on a separate thread, so that events and requests are processed
-        meanwhile; beams of a few UAVs are computed directly, which takes less time than a thread.
-        Updates take at most half of the time: with too many UAVs for the rate there are fewer
-        updates, and no frame is lost.
+        meanwhile. Updates take at most half of the time: with too many UAVs for the rate there are
+        fewer updates, and no frame is lost.
+
+        With ``[beams] update = "report"`` a report starts an update too, and quick updates are
+        computed on the event loop, since a thread would delay them.
         """
         loop = asyncio.get_running_loop()
         period_s = 1 / self._settings.beams.update_hz

@@ -46,6 +46,10 @@ class Digest:
         """Return the digest of estimates and predictions, equal on all processors."""
         return self._estimates.hexdigest()
 
+    def both(self) -> dict[str, str]:
+        """Return both digests so far, as summaries and recordings name them."""
+        return {"digest": self.hexdigest(), "digest_estimates": self.of_estimates()}
+
 
 def _estimate(uav: str, t_ns: int, position_ned_m: Sequence[float], bound_m: float) -> bytes:
     return uav.encode() + _NUMBERS.pack(t_ns, *position_ned_m, bound_m)

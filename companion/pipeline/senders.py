@@ -198,9 +198,7 @@ class Senders:
         self._noise_settings = assembly.noise(settings)
         self._dedupe = Dedupe()  # by content, over all links
         self._admits = admission(settings.tracks.allow, settings.tracks.deny)
-        self._assumed = lru_cache(RECORDS_MAX)(partial(assembly.assumed, settings))
-        # By UAV, until the types of any component change.
-        self._assumed_of: dict[str, assembly.AircraftAssumptions] = {}
+        self._assumed = lru_cache(RECORDS_MAX)(partial(_assumed, settings))
         self._utc_offset_ns = 0  # UTC less the node's timeline
 
     # --- messages ---------------------------------------------------------------------------
@@ -264,7 +262,6 @@ class Senders:
                 if component.types[-1:] != (newest,):
                     others = [one for one in component.types if one != newest]
                     component.types = (*others[1 - TYPES_MAX :], newest)
-                    self._assumed_of.clear()
         return NO_OUTCOME
 
     def _component(self, message: GnssStatus | Presence) -> ComponentState:
@@ -487,16 +484,9 @@ class Senders:
         An aircraft that changes its type, as one that takes off vertically and then flies as an
         aeroplane, is between both for a while: the assumptions contain those of all its types.
         """
-        known = self._assumed_of.get(uav)
-        if known is None:
-            if len(self._assumed_of) >= RECORDS_MAX:
-                self._assumed_of.clear()  # a cache; ids may be forged
-            source = _source(uav)
-            component = None if source is None else self._components.get(source)
-            types = component.types if component is not None else ()
-            each = [self._assumed(uav, *one) for one in types or ((None, None),)]
-            known = self._assumed_of[uav] = assembly.widest(each)
-        return known
+        source = _source(uav)
+        component = None if source is None else self._components.get(source)
+        return self._assumed(uav, () if component is None else component.types)
 
     # --- memory -----------------------------------------------------------------------------
 
@@ -515,7 +505,6 @@ class Senders:
         for source in {*gone, *islice(components, too_many)}:
             if not self._is_kept(str(source)):
                 del components[source]
-                self._assumed_of.pop(str(source), None)
 
     def _is_kept(self, name: str) -> bool:
         return name in self._tracked or name == self._carrier
@@ -523,6 +512,15 @@ class Senders:
     def link_share(self, link: str) -> LinkShare:
         """Return the contribution of a link to the reports so far."""
         return self._dedupe.shares.get(link) or LinkShare()
+
+
+def _assumed(
+    settings: Settings, uav: str, types: tuple[tuple[int, int], ...]
+) -> assembly.AircraftAssumptions:
+    """Return the assumptions about a UAV whose heartbeats stated these types and autopilots."""
+    return assembly.widest(
+        [assembly.assumed(settings, uav, *one) for one in types or ((None, None),)]
+    )
 
 
 @lru_cache(RECORDS_MAX)

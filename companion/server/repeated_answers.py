@@ -52,9 +52,10 @@ class _TaggedAnswer:
 
 
 class RepeatedAnswers:
-    """ASGI middleware for GET requests that are already admitted; see the module's docstring.
+    """ASGI middleware for GET and HEAD requests that are admitted; see the module's docstring.
 
-    An answer in several pieces, or with an ETag of its own, is passed on as it is.
+    HEAD gets the answer of GET, of which the server sends the head alone. An answer in several
+    pieces, or with an ETag of its own, is passed on as it is.
     """
 
     def __init__(self, app: ASGIApp, node: Node) -> None:
@@ -64,7 +65,7 @@ class RepeatedAnswers:
         self._answers: dict[Key, _TaggedAnswer] = {}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        if scope["type"] != "http" or scope["method"] != "GET":
+        if scope["type"] != "http" or scope["method"] not in ("GET", "HEAD"):
             await self._app(scope, receive, send)
             return
         known = b",".join(value for name, value in scope["headers"] if name == b"if-none-match")

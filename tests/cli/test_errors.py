@@ -176,6 +176,21 @@ def test_interrupt_while_loading_is_one_line(
     assert lines[0] in (f"{package.replace('_', '-')}: interrupted", ended)
 
 
+def test_interrupt_after_the_last_line_adds_no_other() -> None:
+    code = (
+        "import os, signal\n"
+        "from companion.cli.interrupts import command_ended, interrupts_end\n"
+        "with interrupts_end('x'):\n"
+        "    command_ended()\n"
+        "    os.kill(os.getpid(), signal.SIGINT)\n"
+        "    os.kill(os.getpid(), signal.SIGTERM)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], check=True, capture_output=True, timeout=HANG_S, cwd=ROOT
+    )
+    assert done.stderr == b""
+
+
 def test_script_and_module_entry_points_are_equal() -> None:
     by_name = subprocess.run(
         [BIN / "companion", "--version"], capture_output=True, check=True, timeout=HANG_S

@@ -77,10 +77,11 @@ def test_a_known_answer_is_not_sent_again(node: Any) -> None:
             assert (other.status_code, other.content) == (200, whole.content)
 
 
-def test_head_is_answered_without_a_body(node: Any) -> None:
+def test_head_has_the_headers_of_get(node: Any) -> None:
     client = TestClient(create_app(node), SITE)
-    found = client.head("/v1/beams")
-    assert (found.status_code, found.content) == (200, b"")
+    for path in (*PATHS, "/v1/settings"):
+        assert client.head(path).headers == client.get(path).headers
+    assert node.routed.count("/v1/beams") == 1
 
 
 def test_errors_are_not_repeated(node: Any) -> None:

@@ -198,8 +198,9 @@ def _by_cone(
     Cells are in the order of their cones, so that each cone needs one matrix product.
     """
     parts = np.vstack([np.ones(len(weights)), cones.positions_m.T])
-    placed = weights.T[:, np.newaxis] * parts  # (N, 1 + B, M)
-    edges = np.searchsorted(cone_of, np.arange(weights.shape[1] + 1)).tolist()
+    first, end_cone = int(cone_of[0]), int(cone_of[-1]) + 1
+    placed = weights.T[first:end_cone, np.newaxis] * parts  # (cones, 1 + B, M)
+    edges = np.searchsorted(cone_of, np.arange(first, end_cone + 1)).tolist()
     found: ComplexArray = np.empty((len(parts), len(cone_of)), dtype=complex)
     for one, (begin, end) in zip(placed, pairwise(edges), strict=True):
         if begin < end:

@@ -29,6 +29,7 @@ from companion.pipeline import assembly
 from companion.pipeline.records import RECORDS_MAX, Records, UavRecords
 from companion.settings.model import Settings
 from companion.tracking import noise
+from companion.tracking.noise import StatedNoise
 from companion.values import (
     Accuracy,
     AdsbVehicle,
@@ -163,7 +164,7 @@ class ComponentState:
     types: tuple[tuple[int, int], ...] = ()  # types and autopilots of its heartbeats, newest last
     receiver: GnssStatus | None = None  # its newest GNSS status
     stated_us: int = 0
-    noise: ReportNoise | None = None  # bounds on the noise of its reports, from that status
+    noise: StatedNoise  # of its reports, by these statuses
     apart_m2: float | None = None
 
 
@@ -194,8 +195,10 @@ class Senders:
         self._records = records
         self._tracked = tracked
         self._senders = Records(lambda: Sender(assembly.clock(settings)), self._is_kept)
-        self._components: defaultdict[Source, ComponentState] = defaultdict(ComponentState)
         self._noise_settings = assembly.noise(settings)
+        self._components: defaultdict[Source, ComponentState] = defaultdict(
+            lambda: ComponentState(noise=StatedNoise(self._noise_settings.default))
+        )
         self._dedupe = Dedupe()  # by content, over all links
         self._admits = admission(settings.tracks.allow, settings.tracks.deny)
         self._assumed = lru_cache(RECORDS_MAX)(partial(_assumed, settings))
@@ -243,9 +246,11 @@ class Senders:
                 component = self._component(message)
                 stated_us, newest_us = message.time_us, component.stated_us
                 # An older status comes over a second, slower link.
-                if not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US:
+                is_newest = not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US
+                stated = noise.reported(message, self._noise_settings)
+                component.noise.add(message.t_ns, stated, is_newest=is_newest)
+                if is_newest:
                     component.stated_us = stated_us
-                    component.noise = noise.reported(message, self._noise_settings)
                     component.receiver = message
                 heading = gnss_heading(frame) if message.source == self._carrier_source else None
                 return NO_OUTCOME if heading is None else FrameOutcome(message=heading)
@@ -321,7 +326,8 @@ class Senders:
         self._dedupe.set_latency(stamp.latency_s)
         assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
-        errors = self._errors(report, assumed.lag_rest_s) if is_own else None
+        made_ns = stamp.oldest_ns - lag_ns
+        errors = self._errors(report, made_ns, assumed.lag_rest_s) if is_own else None
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
         placed = PlacedReport(
             report=report,
@@ -334,15 +340,16 @@ class Senders:
             message=placed, outputs=said, restarted=restarted, change=sender.clock.change
         )
 
-    def _errors(self, report: Report, time_s: float) -> ReportNoise:
+    def _errors(self, report: Report, made_ns: int, time_s: float) -> ReportNoise:
         """Return bounds on a report's errors, with the receiver's recent height difference.
 
-        ``time_s`` is the largest error of the report's time.
+        ``made_ns`` is the earliest node time of its measurement, ``time_s`` the largest error of
+        the time that is assumed.
         """
         component, known, apart_m = self._components.get(report.source), None, 0.0
         if component is not None and component.receiver is not None:
-            known, receiver = component.noise, component.receiver
-            if known is not None and receiver.fix_type >= FIX_3D:
+            known, receiver = component.noise.since(made_ns), component.receiver
+            if receiver.fix_type >= FIX_3D:
                 apart_m2, before = (report.alt_m - receiver.alt_m) ** 2, component.apart_m2
                 if before is not None:
                     apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)

@@ -1,6 +1,7 @@
 """Bounds on the errors of a report, from stated accuracies or, for relayed aircraft, their kind."""
 
 import math
+from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
@@ -24,6 +25,8 @@ The bound exceeds what most transponders guarantee (NACp 8: 93 m) and the steps 
 altitude.
 """
 ADSB_VELOCITY_NOISE_MPS: Final = 10.0  # bound on the velocity error of an ADS-B report (NACv 1)
+OVERTAKEN_NS: Final = 10_000_000_000  # time for which a replaced statement is kept
+STATEMENTS_MAX: Final = 64  # most of them
 GEOID_M: Final = 107.0
 """Largest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 
@@ -58,6 +61,58 @@ def reported(status: GnssStatus, settings: NoiseSettings) -> ReportNoise:
         vertical_m=vertical_m,
         position_m=math.hypot(horizontal_m, vertical_m),
         velocity_mps=_bound(status.vel_acc_mps, factor, default.velocity_mps),
+    )
+
+
+class StatedNoise:
+    """Noise bounds that a receiver has stated, by when each statement arrived.
+
+    Statements and reports overtake each other. The statement in force when a report was made is
+    the newest one before that time, or one that arrived since. ``default`` is in force before the
+    first.
+    """
+
+    __slots__ = ("_earlier", "_newest")
+
+    def __init__(self, default: ReportNoise) -> None:
+        self._newest = default
+        self._earlier: deque[tuple[int, ReportNoise]] = deque()  # until when each was the newest
+
+    def add(self, arrival_ns: int, stated: ReportNoise, *, is_newest: bool = True) -> None:
+        """Add a statement in order of arrival; ``is_newest`` is False if it was overtaken."""
+        earlier = self._earlier
+        while earlier and arrival_ns - earlier[0][0] > OVERTAKEN_NS:
+            earlier.popleft()
+        if len(earlier) >= STATEMENTS_MAX:
+            _, oldest = earlier.popleft()
+            earlier[0] = earlier[0][0], _larger(earlier[0][1], oldest)
+        before = self._newest
+        earlier.append((arrival_ns, before if is_newest else _larger(before, stated)))
+        if is_newest:
+            self._newest = stated
+
+    def since(self, made_ns: int) -> ReportNoise:
+        """Return bounds for a report that was made no earlier than this.
+
+        They are the largest of all statements that may have been in force when it was made.
+        """
+        found = self._newest
+        for until_ns, stated in reversed(self._earlier):
+            if until_ns < made_ns:
+                break
+            found = _larger(found, stated)
+        return found
+
+
+def _larger(one: ReportNoise, other: ReportNoise) -> ReportNoise:
+    """Return the larger bound of each kind."""
+    if one == other:
+        return one
+    return ReportNoise(
+        horizontal_m=max(one.horizontal_m, other.horizontal_m),
+        vertical_m=max(one.vertical_m, other.vertical_m),
+        position_m=max(one.position_m, other.position_m),
+        velocity_mps=max(one.velocity_mps, other.velocity_mps),
     )
 
 

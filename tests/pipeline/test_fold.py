@@ -554,27 +554,65 @@ def noise_of(pipeline: Pipeline, uav: str) -> tuple[float, float, float]:
 def test_reported_accuracy_is_used_when_enabled(
     follow: bool, accuracies: tuple[float, float, float], expected: tuple[float, float, float]
 ) -> None:
-    """From the next report of that sender on, times the factor; missing values use the default."""
+    """From the first report that was made after it, times the factor; missing values use the
+    default."""
     given = {
         "position_noise_m": 6.0, "velocity_noise_mps": 0.7,
         "accuracy_factor": 2.5, "follow_accuracy": follow,
     }  # fmt: skip
     pipeline = Pipeline(settings("home", observer=given))
-    pipeline.step(position(0.0, "1:1"))
+    run(pipeline, steady("1:1"))
     assert noise_of(pipeline, "1:1") == (6.0, 6.0, 0.7)
-    pipeline.step(accuracy(0.1, "1:1", *accuracies))
-    run(pipeline, [position(0.2, "1:1"), position(0.2, "2:1", (50, 0, 0))])
+    pipeline.step(accuracy(STEADY_S, "1:1", *accuracies))
+    run(pipeline, [position(STEADY_S + 0.1, "1:1"), position(STEADY_S + 0.1, "2:1", (50, 0, 0))])
     assert noise_of(pipeline, "1:1") == pytest.approx(expected)
     assert noise_of(pipeline, "2:1") == (6.0, 6.0, 0.7)
-    pipeline.step(accuracy(0.3, "1:1", 0, 0, 0))  # no longer sent
-    pipeline.step(position(0.4, "1:1"))
+    pipeline.step(accuracy(STEADY_S + 0.2, "1:1", 0, 0, 0))  # no longer sent
+    pipeline.step(position(STEADY_S + 0.3, "1:1"))
     assert noise_of(pipeline, "1:1") == (6.0, 6.0, 0.7)
+
+
+STEADY_S = 5.0
+"""Time after which the clock of a sender of ``steady`` reports is known to 0.1 s."""
+
+
+def steady(uav: str) -> list[Frame]:
+    return [position(0.1 * n, uav) for n in range(round(10 * STEADY_S))]
+
+
+@pytest.mark.parametrize("late_s", [0.05, 0.4, 1.5])
+def test_report_overtaken_by_a_better_accuracy_keeps_the_worse_one(late_s: float) -> None:
+    """The status says 0.5 m after 5 m; a report made between the two arrives after both."""
+    pipeline = Pipeline(settings("home"))
+    run(pipeline, [*steady("1:1"), accuracy(STEADY_S, "1:1", 5.0, 5.0, 0.2)])
+    made_s = STEADY_S + 0.1
+    late = position(made_s + late_s, "1:1", boot_s=100 + made_s)
+    run(pipeline, [accuracy(made_s + 0.01, "1:1", 0.5, 0.5, 0.1), late])
+    assert noise_of(pipeline, "1:1") == pytest.approx((15.0, 15.0, 0.6))
+    run(pipeline, [position(made_s + 2.0, "1:1")])
+    assert noise_of(pipeline, "1:1") == pytest.approx((1.5, 1.5, 0.3))
+
+
+def test_worse_accuracy_that_was_overtaken_holds_for_reports_made_before_it_arrived() -> None:
+    """A better status overtook it, and so did the report that it concerns."""
+    pipeline = Pipeline(settings("home"))
+    run(pipeline, [*steady("1:1"), accuracy(STEADY_S, "1:1", 0.5, 0.5, 0.1)])
+    run(pipeline, [accuracy(STEADY_S + 0.4, "1:1", 0.5, 0.5, 0.1)])
+    overtaken = accuracy(STEADY_S + 0.2, "1:1", 5.0, 5.0, 0.2)._replace(
+        t_ns=START_NS + round((STEADY_S + 0.5) * S)
+    )
+    late = position(STEADY_S + 0.6, "1:1", boot_s=100 + STEADY_S + 0.3)
+    run(pipeline, [overtaken, late])
+    assert noise_of(pipeline, "1:1") == pytest.approx((15.0, 15.0, 0.6))
+    run(pipeline, [position(STEADY_S + 1.0, "1:1")])
+    assert noise_of(pipeline, "1:1") == pytest.approx((1.5, 1.5, 0.3))
 
 
 def test_outdated_receiver_status_is_ignored() -> None:
     """A slower second link repeats it; a much earlier time belongs to another boot."""
     pipeline = Pipeline(settings("home"))
-    run(pipeline, [position(49.9, "1:1"), accuracy(50.0, "1:1", 0.5, 0.5, 0.1)])
+    run(pipeline, [position(0.1 * n, "1:1") for n in range(450, 500)])
+    run(pipeline, [accuracy(50.0, "1:1", 0.5, 0.5, 0.1)])
     run(pipeline, [accuracy(51.0, "1:1", 5.0, 5.0, 0.2), position(51.1, "1:1")])
     assert noise_of(pipeline, "1:1") == pytest.approx((15.0, 15.0, 0.6))
     late = accuracy(50.0, "1:1", 0.5, 0.5, 0.1)

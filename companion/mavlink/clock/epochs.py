@@ -225,7 +225,7 @@ class BootLine:
         self._rival.stamps.clear()
         before = self.floor
         self._previous = (before, stamps[0][0])
-        self.floor = Floor(*self._shape)
+        self.floor = Floor(*self._shape, before.largest_ns)
         x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self.newest_ns
         for arrival_ns, boot_ms in stamps:
             x_ns = _unwrap(boot_ms, x_ns)

@@ -53,11 +53,13 @@ class Stamp(NamedTuple):
                after a reboot
     latency_s  estimated age of the stamp on arrival, at least 0
     rebooted   True once, at the stamp that confirms a reboot
+    oldest_ns  earliest time at which it may have been made, node time
     """
 
     sender_ns: int
     latency_s: float
     rebooted: bool
+    oldest_ns: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -80,6 +80,7 @@ class Floor:
 
         window_ns   time over which latencies are sampled and a steady drift is detected
         drift_max   largest drift assumed, a ratio
+        usual_ns    largest visible latency of the line before this one; 0 without one
 
     Attributes:
 
@@ -89,8 +90,10 @@ class Floor:
         rise_ns     rise of the line at the newest stamp beyond ``drift_max``; 0 unless it restarted
     """
 
-    def __init__(self, window_ns: int, drift_max: float) -> None:
+    def __init__(self, window_ns: int, drift_max: float, usual_ns: float = 0.0) -> None:
+        self._window_ns = window_ns
         self._drift_max = drift_max
+        self._usual_ns = usual_ns
         self._likely_drift = min(LIKELY_DRIFT, drift_max)
         self.drift = 0.0
         self.count = 0
@@ -242,6 +245,12 @@ class Floor:
         return height + self.drift * (self.newest_ns - self._base[0])
 
     @property
+    def largest_ns(self) -> float:
+        """Largest visible part of the latency, or that of the line before, for a window."""
+        before_ns = self._usual_ns if self._heard_ns <= self._window_ns else 0.0
+        return max(self._visible.largest_ns, before_ns)
+
+    @property
     def median_ns(self) -> float:
         """Median of the visible part of the latency, over an even sample of the window."""
         return self._visible.median_ns
@@ -255,13 +264,18 @@ class Floor:
         """Return how late the fastest frame so far may have been, as few frames were observed.
 
         The least of n exponential latencies is above their minimum by up to 7 means / n; and the
-        first frames may all have been slow.
+        first frames may all have been slow. On a line that follows another, frames are assumed to
+        be no later than they were before, for a window (docs/math.md 6).
         """
-        heard_ns = self._newest_arrival_ns - self._first_arrival_ns
-        spells = max(1.0, heard_ns / START_NS)
+        spells = max(1.0, self._heard_ns / START_NS)
         n = min(self.count, spells)
         slow = WORST_LATENCY_NS / (spells * spells) + WORST_LATENCY_NS / self.count**1.5
-        return float(_RARE * self._visible.mean_ns / n + slow)
+        few = float(_RARE * self._visible.mean_ns / n + slow)
+        return max(few, self.largest_ns - self._visible.largest_ns)
+
+    @property
+    def _heard_ns(self) -> int:
+        return self._newest_arrival_ns - self._first_arrival_ns
 
     def drifted_ns(self, x_ns: int) -> int:
         """Return the change of the floor from its newest stamp by the detected drift, ns."""

@@ -30,6 +30,7 @@ class Latencies:
     drift_max   largest drift assumed, a ratio
     median_ns   attribute: median of the visible latencies at the last ``measure``
     mean_ns     attribute: mean of the visible latencies
+    largest_ns  attribute: largest of them
     """
 
     def __init__(self, window_ns: int, drift_max: float) -> None:
@@ -41,7 +42,7 @@ class Latencies:
         self._one_of = 1
         self._lot = 0
         self._kept_median_ns = 0.0
-        self.median_ns = self.mean_ns = 0.0
+        self.median_ns = self.mean_ns = self.largest_ns = 0.0
 
     def add(self, x_ns: int, height: float) -> None:
         """Add a stamp: its sender time and its height, ns."""
@@ -83,7 +84,7 @@ class Latencies:
         gaps = np.maximum(0.0, heights - below)
         self.mean_ns = float(gaps.mean())
         gaps.sort()  # np.median would dominate the run time
-        n = len(gaps)
+        n, self.largest_ns = len(gaps), float(gaps[-1])
         self.median_ns = float(gaps[(n - 1) // 2] + gaps[n // 2]) / 2.0
         if n < SAMPLES // 4:
             self.median_ns = max(self.median_ns, self._kept_median_ns)

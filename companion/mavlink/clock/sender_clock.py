@@ -90,11 +90,17 @@ class SenderClock:
         line, x_ns = self._line, placed.x_ns
         if placed.jump_ns or line.floor.rise_ns:
             self._note_change(placed.jump_ns)
-        node_ns = x_ns + self._now()[3] + line.floor.drifted_ns(x_ns)
-        latency_s = max(0.0, (arrival_ns - node_ns) * 1e-9)
+        _, low_ns, _, likely_ns = self._now()
+        at_ns = x_ns + line.floor.drifted_ns(x_ns)
+        latency_s = max(0.0, (arrival_ns - at_ns - likely_ns) * 1e-9)
         if x_ns == line.newest_ns:
             self._latency_s = latency_s
-        return Stamp(x_ns, latency_s, placed.rebooted)
+        return Stamp(
+            sender_ns=x_ns,
+            latency_s=latency_s,
+            rebooted=placed.rebooted,
+            oldest_ns=at_ns + low_ns,
+        )
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> None:
         """Add the stamp of any other message, if it lies on the line of the reports."""

@@ -93,6 +93,32 @@ def test_reboot_is_detected_once_and_starts_a_new_epoch(back_ms: int, boot_ms: i
         assert stamp.latency_s == 0.0  # the old offset is gone
 
 
+@settings(max_examples=examples(60))
+@given(
+    latency_max_ms=st.integers(300, 3_000), after=st.lists(st.floats(0, 1), min_size=1, max_size=8)
+)
+def test_clock_after_a_reboot_is_in_its_interval_if_frames_are_no_later_than_before(
+    latency_max_ms: int, after: list[float]
+) -> None:
+    """All frames of the first seconds may be slow; then only those of before show by how much."""
+    before = [
+        (at + latency_max_ms * ((7 * n) % 11) // 10, boot)
+        for n, (at, boot) in enumerate(run(0, 300_000, 150))
+    ]
+    clock = SenderClock()
+    observe_all(sorted(before), clock)
+    begins_ms = 40_000
+    for n, (at, boot) in enumerate(run(begins_ms, 0, 150)):
+        share = after[min(n // 15, len(after) - 1)]
+        arrival_ns = EPOCH_NS + (at + round(latency_max_ms * share)) * MS
+        if clock.observe(arrival_ns, boot) is None:
+            continue
+        known = clock.estimate()
+        assert known is not None
+        off_s = (EPOCH_NS + begins_ms * MS - known.offset_ns) * 1e-9
+        assert -known.after_s - 2e-3 <= off_s <= known.before_s + 2e-3
+
+
 @pytest.mark.parametrize("uptime_ms", [4_000, 9_000])
 @pytest.mark.parametrize("late_ms", [0, 400])
 def test_reboot_shortly_after_boot_is_detected(uptime_ms: int, late_ms: int) -> None:

@@ -42,9 +42,11 @@ def runner(loop: str) -> Run:
     return run
 
 
-def frame(number: int, sysid: int = 1, version: int = 2, seq: int | None = None) -> bytes:
+def frame(
+    number: int, sysid: int = 1, version: int = 2, seq: int | None = None, *, compid: int = 1
+) -> bytes:
     """A report that no other number gives."""
-    mav = (dialect if version == 2 else dialect_v1).MAVLink(None, sysid, 1)
+    mav = (dialect if version == 2 else dialect_v1).MAVLink(None, sysid, compid)
     mav.seq = number % 256 if seq is None else seq
     module = dialect if version == 2 else dialect_v1
     message = module.MAVLink_global_position_int_message(

@@ -73,9 +73,7 @@ class Gateway:
         self._timestamps: Timestamps | None = None
         signed = set(settings.signing.keys) - set(settings.signing.allow_unsigned)
         self._known_peers = KnownPeers({*settings.links.routers, *signed})
-        tracks = settings.tracks
-        named = admission(tracks.allow, tracks.deny) if tracks.allow else None
-        self._newcomers = Newcomers(named) if named else Newcomers()
+        self._newcomers = Newcomers(_named(settings))
         self._refusal_notice_ns = -NOTICE_EVERY_NS
         self._settings = settings
         self.links: list[Link] = []
@@ -249,6 +247,14 @@ class Gateway:
     def rates(self) -> list[MessageRate]:
         """Return the requested message rates and the state of each request."""
         return self._component.rates() if self._component else []
+
+
+def _named(settings: Settings) -> Callable[[str], bool]:
+    """Return a function that says whether the settings name a vehicle: the carrier, or allowed."""
+    place, tracks = parse_center(settings.center.source or "home"), settings.tracks
+    carrier = str(place.source) if isinstance(place, VehicleCenter) else None
+    allows = admission(tracks.allow, tracks.deny) if tracks.allow else None
+    return lambda uav: uav == carrier or (allows is not None and allows(uav))
 
 
 def component(settings: Settings) -> ServiceComponent | None:

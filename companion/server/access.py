@@ -44,6 +44,11 @@ UNSENT_BYTES: Final = 16_384
 
 The default is megabytes, so a slow reader of a stream would receive outdated data.
 """
+UNREAD_BYTES: Final = 16_384
+"""Limit on bytes of a client that wait in the kernel, and so on what is read at once; inherited.
+
+The default is 128 kB and more: pipelined requests that are read together wait in this process.
+"""
 
 
 class ListenError(UserError):
@@ -95,6 +100,7 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
     bound = socket.socket(family, kind, proto)
     try:
         bound.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, UNREAD_BYTES)
         if sys.platform == "linux":
             bound.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
         bound.bind(address)

@@ -27,7 +27,7 @@ CASES: dict[str, Case] = {
     "one pipelining connection": Case(attacks.pipelined(1)),
     "50 pipelining connections": Case(attacks.pipelined(50)),
     "300 connections that read nothing of the page": Case(
-        attacks.pipelined(300, "/main.js", reads=False), 60.0
+        attacks.pipelined(300, "/main.js", reads=False), 45.0
     ),
     "a new connection for each request, 8 at once": Case(attacks.requests(8), 80.0),
     "distinct requests, 20 at once": Case(attacks.distinct_requests(20)),

@@ -10,6 +10,7 @@ from link_support import frame, port_of, runner, until_true
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.links.urls import LinkError
+from companion.mavlink.trust.newcomers import NEW_SAVED
 from companion.mavlink.wire.encode import COMMAND_LONG, HEARTBEAT
 from companion.node.gateway import Gateway
 from companion.settings.model import Settings
@@ -51,6 +52,37 @@ def test_signing_key_is_dropped_and_counted() -> None:
     assert [before.raw, after.raw] == [sent[0], sent[2]]
     assert refused == Rejection(t_ns=before.t_ns, source="255:190", reason=Reason.SECRET, msgid=256)
     assert repr(SECRET)[2:-1] not in repr(stepped)
+
+
+def test_carrier_is_admitted_during_a_flood_of_invented_ids() -> None:
+    """Named in the settings as the array's carrier, it needs no place among the first senders."""
+    stepped: list[Event] = []
+    invented = [frame(1, sysid=1 + n // 200, compid=1 + n % 200) for n in range(600)]
+
+    async def test() -> None:
+        settings = Settings().override(
+            links={"urls": ["udpin:127.0.0.1:0"]}, center={"source": "9:1"}
+        )
+        gateway = Gateway(
+            settings=settings, step=stepped.append, notify=lambda _: None, now_ns=lambda: 5
+        )
+        gateway.open()
+        serving = asyncio.create_task(gateway.run())
+        with socket.socket(type=socket.SOCK_DGRAM) as sender:
+            for raw in (*invented, frame(1, sysid=9, compid=2), frame(1, sysid=9, compid=1)):
+                sender.sendto(raw, ("127.0.0.1", port_of(gateway.links[0])))
+            carrier = Source(9, 1)
+            await until_true(
+                lambda: any(isinstance(one, Frame) and one.source == carrier for one in stepped)
+            )
+        serving.cancel()
+        await asyncio.wait([serving])
+        gateway.close()
+
+    runner("asyncio")(test())
+    sources = {one.source for one in stepped if isinstance(one, Frame)}
+    assert len(sources) == round(NEW_SAVED) + 1
+    assert Source(9, 2) not in sources
 
 
 def test_timestamps_that_cannot_be_saved_are_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,7 +3,8 @@
 Anybody that reaches a link's port can invent senders. Each takes a clock, a track and beams, so the
 number of new ones is limited. When frames take more than ``BUSY`` of the time and are read late or
 lost, those of strangers (``known_peers``) are dropped before they are decoded, then those of the
-newest senders, until the rest are in time: who was here first keeps being served.
+newest senders, until the rest are in time: who was here first keeps being served. No more senders
+are dropped than took the work that is too much: a flood of one sender costs no other its place.
 """
 
 from bisect import bisect_left
@@ -31,7 +32,7 @@ class Newcomers:
 
     What ``admits`` says of a sender holds while ``generation`` stays the same. That changes from
     time to time, so that ``admits`` learns which senders are active. ``worked_s`` is the time that
-    frames took since the last call of ``adapt``, due from ``adapts_ns``.
+    frames took since the last call of ``adapt``, due from ``adapts_ns``; ``worked`` adds to it.
 
     ``is_named`` says whether the settings name a vehicle: those are always admitted, so that a
     service that starts during a flood serves them.
@@ -43,6 +44,7 @@ class Newcomers:
         self.generation = 0
         self.worked_s = 0.0
         self.adapts_ns = 0
+        self._worked_s = dict[Source, float]()  # of each sender that is served
         self._numbers: OrderedDict[Source, int] = OrderedDict()  # by the newest frame
         self._budget = Budget(per_s=NEW_PER_S, most=NEW_SAVED)
         self._count = 0
@@ -85,15 +87,22 @@ class Newcomers:
         """Note that frames were read late, or lost before they were read."""
         self._is_late = True
 
+    def worked(self, source: Source | None, spent_s: float) -> None:
+        """Note the time that frames of a sender took; None: of one that is not served."""
+        self.worked_s += spent_s
+        if source is not None:
+            self._worked_s[source] = self._worked_s.get(source, 0.0) + spent_s
+
     def adapt(self, now_ns: int, used_s: float) -> None:
         """Adapt who is served to the share of the time that frames took.
 
         ``used_s`` is the processor time that the calling thread has used so far: a process that is
         stopped, or waits for a processor, is late without any fault of its senders.
         """
-        passed_ns = max(1, now_ns - self._began_ns)
-        worked_s = min(self.worked_s, used_s - self._used_s)
-        share, self.worked_s, self._used_s = worked_s / (passed_ns * 1e-9), 0.0, used_s
+        passed_s = max(1, now_ns - self._began_ns) * 1e-9
+        worked_s, by_served = self.worked_s, self._worked_s
+        share = min(worked_s, used_s - self._used_s) / passed_s
+        self.worked_s, self._worked_s, self._used_s = 0.0, {}, used_s
         self._began_ns, self.adapts_ns = now_ns, now_ns + WINDOW_NS
         if now_ns - self._changed_ns > KEPT_NS:
             self.generation += 1
@@ -104,16 +113,25 @@ class Newcomers:
             self._strangers_from_ns = now_ns + STRANGERS_WAIT_NS
             if were_served and self._had_strangers:
                 self._had_strangers = False
-                return
-            self._serve(lambda served: min(served - 1, int(served * BUSY / share)))
+            else:
+                self._drop(by_served, worked_s * BUSY / share)
         elif share < IDLE and self._served_below is not None:
-            self._serve(lambda served: max(served + 8, served * 5 // 4))
+            numbers = sorted(self._numbers.values())
+            served = bisect_left(numbers, self._served_below)
+            self._serve(numbers, max(served + 8, served * 5 // 4))
 
-    def _serve(self, wanted: Callable[[int], int]) -> None:
-        """Change the number of served senders, which are the oldest; at least one is served."""
-        numbers = sorted(self._numbers.values())
-        below = self._served_below
-        served = len(numbers) if below is None else bisect_left(numbers, below)
-        most = max(1, wanted(served))
+    def _drop(self, worked_s: dict[Source, float], most_s: float) -> None:
+        """Serve the oldest senders whose frames took at most ``most_s`` together; one at least."""
+        numbers = sorted((number, source) for source, number in self._numbers.items())
+        if self._served_below is not None:
+            del numbers[bisect_left(numbers, (self._served_below,)) :]
+        total_s, most = sum(worked_s.values()), len(numbers)
+        while most > 1 and total_s > most_s:
+            most -= 1
+            total_s -= worked_s.get(numbers[most][1], 0.0)
+        self._serve(sorted(self._numbers.values()), most)
+
+    def _serve(self, numbers: list[int], most: int) -> None:
+        """Serve this many of the senders with these numbers, the oldest."""
         self.generation += 1
         self._served_below = None if most >= len(numbers) else numbers[most]

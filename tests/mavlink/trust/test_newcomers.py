@@ -27,8 +27,13 @@ def served(senders: Newcomers, most: int, now_ns: int) -> list[int]:
 def window(
     senders: Newcomers, number: int, share: float, is_late: bool = False, used: float = 1.0
 ) -> None:
-    """Note a window of time of which frames took a share, and the thread used a share."""
-    senders.worked_s += share * WINDOW_NS * 1e-9
+    """Note a window of time of which frames took a share, and the thread used a share.
+
+    All senders that are served took the same time.
+    """
+    now = served(senders, 100, (number - 1) * WINDOW_NS)
+    for one in now:
+        senders.worked(source(one), share * WINDOW_NS * 1e-9 / len(now))
     if is_late:
         senders.late()
     senders.adapt(number * WINDOW_NS, used * number * WINDOW_NS * 1e-9)
@@ -100,6 +105,21 @@ def test_newest_senders_are_dropped_while_frames_are_late() -> None:
     for number in range(6, 20):
         window(senders, number, 0.1)
     assert len(served(senders, 100, 0)) == 100
+
+
+def test_flood_of_one_sender_costs_no_other_its_place() -> None:
+    """Also if the bytes of the flood still take nearly all of the time once it is dropped."""
+    senders = Newcomers()
+    assert len(served(senders, 6, 0)) == 6
+    for number in range(1, 20):
+        now = served(senders, 6, number * WINDOW_NS)
+        flood = source(5) if 5 in now else None
+        for one in range(5):
+            senders.worked(source(one), 0.01 * WINDOW_NS * 1e-9)
+        senders.worked(flood, 0.9 * WINDOW_NS * 1e-9)
+        senders.late()
+        senders.adapt(number * WINDOW_NS, number * WINDOW_NS * 1e-9)
+    assert served(senders, 6, 20 * WINDOW_NS) == [0, 1, 2, 3, 4]
 
 
 def test_strangers_are_dropped_before_any_sender_while_frames_are_late() -> None:

@@ -25,6 +25,7 @@ from companion.beams.weights.precoding import (
     gain_db,
     normalise,
     precode,
+    renewed_column,
 )
 from companion.beams.weights.widening import DirectionErrors
 from companion.beams.worth import link_budget
@@ -34,8 +35,10 @@ from companion.values import (
     Cap,
     Carrier,
     Cause,
+    ComplexArray,
     FloatArray,
     LeftOut,
+    Normalisation,
     Track,
     TrackState,
     Widen,
@@ -147,6 +150,131 @@ def aim(
     )
 
 
+class RenewedBeam(NamedTuple):
+    """Beam of one UAV, aimed again between two updates.
+
+    column  its place among the beams of the update
+    one     that beam alone, with its weights (M, 1)
+    """
+
+    column: int
+    one: BeamSet
+
+
+def renewed(
+    made: BeamSet,
+    track: Track,
+    *,
+    now_ns: int,
+    valid_at_ns: int,
+    carrier: Carrier,
+    array: Array,
+    precoder: Precoder,
+    coverage: Coverage = EVERYWHERE,
+    before: Hysteresis | None = None,
+    seen_directions: Mapping[str, SeenDirection] = NO_SEEN_DIRECTIONS,
+) -> RenewedBeam | None:
+    """Aim the beam of one UAV again, with nulls on the others of its time slot.
+
+        made    the newest update; its other beams are kept
+        track   the UAV predicted to ``valid_at_ns``
+
+    The other arguments are those of ``aim``. The others are where their rates of change take them
+    from the update. Their beams still have their nulls where the UAV was then, so the result is not
+    exact. Its column has the power that it had, or unit response. None if the UAV cannot have a
+    beam, or had none in the update.
+    """
+    index = next((i for i, beam in enumerate(made.beams) if beam.uav == track.uav), None)
+    if index is None:
+        return None
+    offsets_m = line_of_sight.offsets_ned_m([track], carrier, array)
+    if _refusals([track], offsets_m) != [None]:
+        return None
+    aimed = _aimed([track], offsets_m, carrier, array)
+    if seen_directions:
+        aimed = _seen_by_array(aimed, seen_directions)
+    if _out_of_reach(aimed.directions, array, coverage) != [None]:
+        return None
+    slot = made.beams[index].group
+    members = [i for i, beam in enumerate(made.beams) if beam.group == slot]
+    user, beams = members.index(index), [made.beams[i] for i in members]
+    own = _shaped_rad([track.uav], aimed.errors, array, precoder, (before, valid_at_ns))
+    towards, shaped = _moved(beams, (valid_at_ns - made.valid_at_ns) * 1e-9)
+    towards[user], shaped[user] = aimed.directions[0], own[0]
+    spread = widening.spread(array, towards, _shapes(shaped, precoder), precoder.widen, user)
+    matrix = steering.steering_matrix(array, towards) if spread is None else spread.centres
+    radio = None
+    if precoder.needs_radio:
+        ranges_m = np.array([beam.range_m for beam in beams])
+        radio = _radio([beam.uav for beam in beams], ranges_m, array, precoder)
+    column = renewed_column(matrix, precoder, spread, user, radio)
+    weights = _at_its_power(column, made, members, index)[:, np.newaxis]
+    rates = line_of_sight.rates([track], carrier, array, aimed.ranges_m, aimed.directions)
+    described = _described(
+        aimed,
+        rates=rates,
+        shaped_rad=own,
+        widened=[spread is not None and bool(spread.broadened[0])],
+        users=[0],
+        slots=[slot],
+        steering_vectors=matrix[:, [user]],
+        weights=weights,
+    )
+    one = replace(
+        made,
+        t_ns=now_ns,
+        valid_at_ns=valid_at_ns,
+        beams=described,
+        weights=weights,
+        left_out=(),
+        exact=False,
+    )
+    return RenewedBeam(index, one)
+
+
+def _moved(beams: Sequence[Beam], seconds: float) -> tuple[FloatArray, FloatArray]:
+    """Return unit directions (N, 3) of beams after a time, by their rates, and shapes (N, 2)."""
+    rows = np.array(
+        [
+            (
+                beam.azimuth_rad,
+                beam.elevation_rad,
+                beam.azimuth_rate_radps or 0.0,
+                beam.elevation_rate_radps or 0.0,
+                beam.shaped_likely_rad,
+                beam.shaped_bound_rad,
+            )
+            for beam in beams
+        ]
+    )
+    azimuths, elevations = (rows[:, :2] + seconds * rows[:, 2:4]).T
+    return steering.unit_directions(azimuths, elevations), rows[:, 4:]
+
+
+def _at_its_power(
+    column: ComplexArray, made: BeamSet, members: list[int], index: int
+) -> ComplexArray:
+    """Return a new column (M,) of unit response at the scale of the one that it replaces.
+
+    members  columns of its time slot, ``index`` among them
+
+    Where the busiest element limits the power, no element has more than that.
+    """
+    if made.normalisation is Normalisation.UNIT_RESPONSE:
+        return column
+    old = made.weights[:, index]
+    scaled: ComplexArray = column * math.sqrt(
+        np.vecdot(old, old).real / np.vecdot(column, column).real
+    )
+    if made.normalisation is Normalisation.ANTENNA:
+        slot, taken = made.weights[:, members], np.abs(scaled) ** 2
+        used = np.abs(slot) ** 2
+        left = used.sum(axis=1).max() - used.sum(axis=1) + np.abs(old) ** 2
+        share = np.min(left / np.maximum(taken, 1e-300))
+        scaled *= math.sqrt(min(1.0, max(float(share), 0.0)))
+    return scaled
+
+
 def without(beam_set: BeamSet, uavs: Collection[str]) -> BeamSet:
     """Remove the beams of some UAVs; the nulls towards these UAVs stay.
 
@@ -213,27 +341,8 @@ def _beams(
     """Return the beams, their weights, and the UAVs that the policy left out, with the reason."""
     tracks, ranges_m, directions, errors = aimed
     uavs = [track.uav for track in tracks]
-    wanted = [(0.0, 0.0) if bound is None else (usual, bound) for bound, usual in errors]
-    sure_plane = precoder.widen is Widen.GUARANTEE and array.axis is None
-    shaped = hysteresis.rate_limited_rad(
-        before,
-        valid_at_ns,
-        uavs,
-        wanted_rad=np.array(wanted),
-        natural_rad=shapes.aperture(array).natural_rad,
-        pace=hysteresis.GUARANTEE_PLANE_SHARE if sure_plane else 1.0,
-    )
-    spread = widening.spread(
-        array,
-        directions,
-        DirectionErrors(
-            likely_rad=shaped[:, 0],
-            bounds_rad=shaped[:, 1],
-            floor_db=precoder.floor_db,
-            worth_db=precoder.worth_db,
-        ),
-        precoder.widen,
-    )
+    shaped = _shaped_rad(uavs, errors, array, precoder, (before, valid_at_ns))
+    spread = widening.spread(array, directions, _shapes(shaped, precoder), precoder.widen)
     matrix = steering.steering_matrix(array, directions) if spread is None else spread.centres
     made = precode(
         matrix,
@@ -243,17 +352,76 @@ def _beams(
         radio=_radio(uavs, ranges_m, array, precoder) if precoder.needs_radio else None,
         before=hysteresis.previous_slots(before, valid_at_ns, uavs),
     )
-    azimuths, elevations = (angles.tolist() for angles in steering.angles_rad(directions))
     served = matrix if len(made.served) == len(uavs) else matrix[:, made.served]
-    gains = gain_db(served, made.weights)
-    losses = (10 * np.log10(np.vecdot(served.T, served.T).real) - gains).tolist()
-    ranges, likely, bounds = ranges_m.tolist(), shaped[:, 0].tolist(), shaped[:, 1].tolist()
-    rates = line_of_sight.rates(tracks, carrier, array, ranges_m, directions)
-    widened = [False] * len(uavs) if spread is None else spread.broadened.tolist()
-    users, slots = made.served.tolist(), made.groups.tolist()
-    beams = tuple(
+    beams = _described(
+        aimed,
+        rates=line_of_sight.rates(tracks, carrier, array, ranges_m, directions),
+        shaped_rad=shaped,
+        widened=[False] * len(uavs) if spread is None else spread.broadened.tolist(),
+        users=made.served.tolist(),
+        slots=made.groups.tolist(),
+        steering_vectors=served,
+        weights=made.weights,
+    )
+    return beams, made, {uavs[user]: why for user, why in made.dropped.items()}
+
+
+def _shaped_rad(
+    uavs: list[str],
+    errors: list[tuple[float | None, float]],
+    array: Array,
+    precoder: Precoder,
+    at: tuple[Hysteresis | None, int],
+) -> FloatArray:
+    """Return the angles (N, 2) for which beams are shaped: the likely ones, and the bounds.
+
+    ``at`` is the state of the last beams, and when the new ones are applied.
+    """
+    wanted = [(0.0, 0.0) if bound is None else (usual, bound) for bound, usual in errors]
+    sure_plane = precoder.widen is Widen.GUARANTEE and array.axis is None
+    return hysteresis.rate_limited_rad(
+        *at,
+        uavs,
+        wanted_rad=np.array(wanted),
+        natural_rad=shapes.aperture(array).natural_rad,
+        pace=hysteresis.GUARANTEE_PLANE_SHARE if sure_plane else 1.0,
+    )
+
+
+def _shapes(shaped_rad: FloatArray, precoder: Precoder) -> DirectionErrors:
+    return DirectionErrors(
+        likely_rad=shaped_rad[:, 0],
+        bounds_rad=shaped_rad[:, 1],
+        floor_db=precoder.floor_db,
+        worth_db=precoder.worth_db,
+    )
+
+
+def _described(
+    aimed: _Aimed,
+    *,
+    rates: list[line_of_sight.LineOfSightRates],
+    shaped_rad: FloatArray,
+    widened: list[bool],
+    users: list[int],
+    slots: list[int],
+    steering_vectors: ComplexArray,
+    weights: ComplexArray,
+) -> tuple[Beam, ...]:
+    """Return the beams of ``users`` (K), indices into the aimed tracks.
+
+    slots                     the time slot of each
+    steering_vectors, weights (M, K), of each
+    """
+    gains = gain_db(steering_vectors, weights)
+    lengths = np.vecdot(steering_vectors.T, steering_vectors.T).real
+    losses = (10 * np.log10(lengths) - gains).tolist()
+    azimuths, elevations = (angles.tolist() for angles in steering.angles_rad(aimed.directions))
+    ranges, errors = aimed.ranges_m.tolist(), aimed.errors
+    likely, bounds = shaped_rad[:, 0].tolist(), shaped_rad[:, 1].tolist()
+    return tuple(
         Beam(
-            uav=uavs[i],
+            uav=aimed.tracks[i].uav,
             azimuth_rad=azimuths[i],
             elevation_rad=elevations[i],
             range_m=ranges[i],
@@ -271,7 +439,6 @@ def _beams(
         )
         for i, slot, gain, loss in zip(users, slots, gains.tolist(), losses, strict=True)
     )
-    return beams, made, {uavs[user]: why for user, why in made.dropped.items()}
 
 
 def _radio(uavs: list[str], ranges_m: FloatArray, array: Array, precoder: Precoder) -> Radio:

@@ -12,6 +12,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from companion.beams.aim import RenewedBeam
 from companion.node.ring import LARGEST_RECORD, Ring
 from companion.node.serving import in_daemon_thread
 from companion.pipeline.assembly import Equipment
@@ -47,6 +48,7 @@ class Push:
         self._refused: dict[str, int] = {}  # datagrams since the last refusal
         self._ring: Ring | None = None
         self._newest: tuple[Update, int] | None = None
+        self._revised, self._revision = -1, 0  # the update whose beams were renewed, and how many
         self._fresh = asyncio.Event()
 
     def open(self) -> None:
@@ -76,6 +78,22 @@ class Push:
         else:
             self._send(update, number, None)
 
+    @property
+    def takes_renewed(self) -> bool:
+        """Whether beams that reports renew are pushed: guaranteed gains would come too late."""
+        settings = self._settings
+        return bool(settings.udp or settings.shared_memory) and not settings.guaranteed
+
+    def renewed(self, beam: RenewedBeam, number: int, all_beams: int) -> None:
+        """Push one beam of an update that a report has renewed."""
+        self._revision = self._revision + 1 if number == self._revised else 1
+        self._revised = number
+        in_utc = beam._replace(one=records.in_utc(self._pipeline, beam.one))
+        record = records.encode_renewed(in_utc, number, all_beams, self._revision)
+        if self._ring:
+            self._ring.put(record)
+        self._send_to_all(record)
+
     async def run(self) -> None:
         """Push updates with guaranteed gains until cancelled."""
         while True:
@@ -95,8 +113,11 @@ class Push:
             for record in encode(LARGEST_RECORD):
                 self._ring.put(record)
         for record in encode(LARGEST_DATAGRAM) if self._sockets else ():
-            for text, sock in self._sockets.items():
-                self._say(text, sock, record)
+            self._send_to_all(record)
+
+    def _send_to_all(self, record: bytes) -> None:
+        for text, sock in self._sockets.items():
+            self._say(text, sock, record)
 
     def _say(self, text: str, sock: socket.socket, record: bytes) -> None:
         try:

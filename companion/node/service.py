@@ -4,7 +4,6 @@ Over 300 lines: it connects all parts of the running service.
 """
 
 import asyncio
-import math
 import socket
 import time
 from collections import deque
@@ -27,6 +26,7 @@ from companion.node.gateway import Gateway
 from companion.node.observations import ObservationIntake
 from companion.node.outlet import Outlet
 from companion.node.push import Push
+from companion.node.renewals import Renewals
 from companion.node.serving import NOTICES_KEPT, RateMeter, Server, in_daemon_thread
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
@@ -63,7 +63,6 @@ from companion.views.served import FleetStatus
 from companion.views.state import ObservationCounts, RecordingStatus, overload
 
 HELD_UP_S: Final = 0.02  # lateness of a tick from which links are read before it
-QUICK_S: Final = 0.0015  # duration of updates that the event loop computes, with update = "report"
 READ_FIRST_S: Final = 0.1  # longest time for that
 READ_ROUNDS: Final = 3  # least number of iterations of the event loop for that
 WAIT_NS: Final = 20_000_000  # wait for this machine that does not matter for beams
@@ -97,13 +96,9 @@ class Service:
         self.series = Series()
         self._area = area_map.find(settings.page.map)
         self._ticked = asyncio.Event()
-        self._awaited = frozenset[str]()  # UAVs whose report starts an update
-        self._reported = asyncio.Event()  # set: one of them has reported since the last update
-        self._update_s = math.inf  # time that the last update took
         self._is_behind = False
         self._aimer = ThreadPoolExecutor(1, "beams")
         self._settings = settings
-        self._by_reports = settings.beams.update == "report"
         self._say = say
         self._timeline = clock or NodeClock()
         self._started_ns = self._timeline.now_ns()
@@ -136,6 +131,14 @@ class Service:
             notify=self.notify,
             now_ns=now_ns,
         )
+        self._renewals: Renewals | None = None
+        if settings.beams.update == "report" and self._push.takes_renewed:
+            self._renewals = Renewals(
+                pipeline=self.pipeline,
+                push=self._push,
+                period_s=1 / settings.beams.update_hz,
+                now_ns=now_ns,
+            )
         self._intake = ObservationIntake(
             settings=settings.observations,
             step=self._step,
@@ -175,6 +178,8 @@ class Service:
                 tasks.append(group.create_task(self._intake.run(), name="observations"))
                 tasks.append(group.create_task(self._outlet.run(), name="out"))
                 tasks.append(group.create_task(self._push.run(), name="records"))
+                if self._renewals is not None:
+                    tasks.append(group.create_task(self._renewals.run(), name="renewals"))
                 tasks.append(group.create_task(self._run_drive(), name="drive"))
                 if self.fleet is not None:
                     tasks.append(group.create_task(self.fleet.run(), name="fleet"))
@@ -234,8 +239,8 @@ class Service:
         for output in outputs:
             if isinstance(output, Notice):
                 self._show(output)
-            elif isinstance(output, Estimate) and output.fix.uav in self._awaited:
-                self._reported.set()
+            elif isinstance(output, Estimate) and self._renewals is not None:
+                self._renewals.reported(output.fix.uav)
 
     def _follow_wall_clock(self) -> None:
         offset_ns = self._timeline.set_to_ns()
@@ -327,9 +332,6 @@ class Service:
         Beams are computed on a separate thread, so that events and requests are processed
         meanwhile. Updates take at most half of the time: with too many UAVs for the rate there are
         fewer updates, and no frame is lost.
-
-        With ``[beams] update = "report"`` a report starts an update too, and quick updates are
-        computed on the event loop, since a thread would delay them.
         """
         loop = asyncio.get_running_loop()
         period_s = 1 / self._settings.beams.update_hz
@@ -356,25 +358,16 @@ class Service:
             ended_s = loop.time()
             rested_s = ended_s + spent_s + (ended_s - began_s)
             due_s = max(due_s + period_s, rested_s)
-            if self._by_reports and await self._reported_before(due_s, rested_s):
-                due_s = loop.time()
-                continue
+            if self._renewals is not None:
+                await asyncio.sleep(rested_s - loop.time())
+                await self._renewals.wait_until(due_s)
+                due_s = min(due_s, loop.time())
             await asyncio.sleep(due_s - loop.time())
             late_s = loop.time() - due_s
             self.lateness.observe(late_s)
             if late_s > HELD_UP_S:
                 self.arrival_lag.held_up(self.now_ns(), round(late_s * 1e9))
                 await self._read_first()
-
-    async def _reported_before(self, due_s: float, rested_s: float) -> bool:
-        """Wait for a report, from ``rested_s`` on; return whether there is one before ``due_s``."""
-        await asyncio.sleep(rested_s - asyncio.get_running_loop().time())
-        try:
-            async with asyncio.timeout_at(due_s):
-                await self._reported.wait()
-        except TimeoutError:
-            return False
-        return True
 
     async def _read_first(self) -> None:
         """Let the links read what arrived while the event loop was held up.
@@ -389,7 +382,7 @@ class Service:
             await asyncio.sleep(0)
 
     async def _update(self) -> float:
-        """Predict the UAVs, and compute the beams on a thread; quick and first beams directly.
+        """Predict the UAVs, and compute the beams on a thread; the first beams directly.
 
         The first request must already find an update. Returns the seconds used, on the loop and of
         the processor.
@@ -397,11 +390,12 @@ class Service:
         loop, now_ns = asyncio.get_running_loop(), self._timeline.now_ns
         began_s = time.perf_counter()  # the loop's own time has steps of a millisecond
         waited_ns = self.arrival_lag.waiting_ns(now_ns())
-        self._reported.clear()
+        if self._renewals is not None:
+            self._renewals.update_begins()
         self._step(
             Tick(
                 now_ns(),
-                in_two=self.pipeline.updates > 0 and not self._is_quick(),
+                in_two=self.pipeline.updates > 0,
                 waited_ns=waited_ns if waited_ns > WAIT_NS else 0,
             )
         )
@@ -411,14 +405,9 @@ class Service:
             began_s = time.perf_counter()
             self._step(Tock(now_ns()))
             spent_s += time.perf_counter() - began_s
-        if self._by_reports and self.pipeline.last_update is not None:
-            self._awaited = frozenset(self.pipeline.last_update.beams.uavs)
-        self._update_s = spent_s
+        if self._renewals is not None:
+            self._renewals.update_is_made(spent_s)
         return spent_s
-
-    def _is_quick(self) -> bool:
-        """Return whether beams may be computed directly: a thread would take longer."""
-        return self._by_reports and self._update_s < QUICK_S
 
     # --- interface of the server ------------------------------------------------------------
 

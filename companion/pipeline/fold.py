@@ -23,7 +23,7 @@ from functools import cache, partial
 from typing import Final, NamedTuple
 
 from companion.beams import hysteresis
-from companion.beams.aim import aim, without
+from companion.beams.aim import RenewedBeam, aim, renewed, without
 from companion.beams.hysteresis import Hysteresis
 from companion.mavlink.clock.estimates import ClockChange, ClockEstimate, Guarantee
 from companion.mavlink.wire.decode import DECODED
@@ -357,6 +357,34 @@ class Pipeline:
     def look(self, now_ns: int, lead_s: float = 0.0) -> Update:
         """Return targets and beams for ``lead_s`` plus the actuation delay. Changes nothing."""
         return self.prepare_update(now_ns, lead_s)()
+
+    def renewed(self, uav: str, now_ns: int) -> RenewedBeam | None:
+        """Aim the beam of one UAV of ``last_update`` again. Changes nothing.
+
+        None if that is not possible: then the next update decides.
+        """
+        update = self.last_update
+        if update is None or uav not in self.tracker or self.targets.protected(self.tracker.uavs):
+            return None
+        valid_at_ns = now_ns + round(self.settings.beams.actuation_delay_s * 1e9)
+        found = self.observing.reported(now_ns, valid_at_ns)
+        if isinstance(found, str):
+            return None
+        snapshots = self.snapshots([uav])
+        seen = self.observing.seen_directions(snapshots, valid_at_ns, found)
+        tracks = [one.at(now_ns, valid_at_ns) for one in snapshots]
+        return renewed(
+            update.beams,
+            tracks[0],
+            now_ns=now_ns,
+            valid_at_ns=valid_at_ns,
+            carrier=self.observing.compass.corrected(found.carrier),
+            array=self.array,
+            precoder=self.precoder,
+            coverage=self.coverage,
+            before=self._hysteresis,
+            seen_directions={} if seen is None else seen(tracks),
+        )
 
     def prepare_update(self, now_ns: int, lead_s: float = 0.0) -> Callable[[], Update]:
         """Select the UAVs now, and return a function that computes the beams of ``look``.

@@ -3,6 +3,7 @@
 A record is a header, an entry for each beam, and the weights: beam after beam, complex64 by
 element. ``examples/c/uav_beams.h`` reads the same layout. Unknown values are NaN. An update that
 exceeds the size limit of its transport is split into several records, each with some of the beams.
+A beam that a report renews is a record of its own, which replaces that beam of the same update.
 """
 
 import math
@@ -14,6 +15,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.beams.aim import RenewedBeam
 from companion.pipeline.fold import Pipeline
 from companion.values import BeamSet, Normalisation
 
@@ -46,7 +48,7 @@ HEADER: Final = np.dtype(
         ("weights_at", "<u4"),  # offset of the weights
         ("normalisation", "<u4"),
         ("flags", "<u4"),
-        ("reserved", "<u8"),
+        ("revision", "<u8"),  # 0: part of a whole update; else counts its renewed beams from 1
     ]
 )
 BEAM: Final = np.dtype(
@@ -93,11 +95,31 @@ def encode(
     fit = max(count, 1) if most_bytes is None else (most_bytes - HEADER.itemsize) // each
     if fit < 1:
         raise ValueError(f"a beam of {size} elements does not fit into {most_bytes} bytes")
+    header = _header(beam_set, sequence)
+    header["all_beams"] = count
     entries = _entries(beam_set, guaranteed_db)
-    weights = beam_set.weights.T.astype("<c8", order="C")
+    weights = _by_beam(beam_set)
     for first in range(0, max(count, 1), fit):
         part = slice(first, first + fit)
-        yield _record(beam_set, sequence, first, entries[part], weights[part])
+        header["first_beam"] = first
+        yield _record(header, entries[part], weights[part])
+
+
+def encode_renewed(renewed: RenewedBeam, sequence: int, all_beams: int, revision: int) -> bytes:
+    """Return the record of one beam of an update that a report has renewed.
+
+    sequence   number of the update
+    all_beams  number of its beams
+    revision   number of renewed beams of that update so far, this one included
+    """
+    header = _header(renewed.one, sequence)
+    header["all_beams"], header["first_beam"] = all_beams, renewed.column
+    header["revision"] = revision
+    return _record(header, _entries(renewed.one, None), _by_beam(renewed.one))
+
+
+def _by_beam(beam_set: BeamSet) -> NDArray[Any]:
+    return beam_set.weights.T.astype("<c8", order="C")
 
 
 def _entries(beam_set: BeamSet, guaranteed_db: Sequence[float | None] | None) -> NDArray[Any]:
@@ -121,21 +143,24 @@ def _entries(beam_set: BeamSet, guaranteed_db: Sequence[float | None] | None) ->
     return np.array(rows, dtype=BEAM)
 
 
-def _record(
-    beam_set: BeamSet, sequence: int, first: int, entries: NDArray[Any], weights: NDArray[Any]
-) -> bytes:
+def _header(beam_set: BeamSet, sequence: int) -> NDArray[Any]:
+    """Return a header without what differs between the records of an update."""
     header = np.zeros((), dtype=HEADER)
     header["magic"], header["version"] = MAGIC, VERSION
     header["sequence"] = sequence
     header["made_at_ns"], header["valid_at_ns"] = beam_set.t_ns, beam_set.valid_at_ns
-    header["elements"], header["all_beams"] = beam_set.weights.shape
-    header["beams"], header["first_beam"] = len(entries), first
+    header["elements"] = len(beam_set.weights)
     header["dtype"], header["beam_bytes"] = COMPLEX64, BEAM.itemsize
     header["header_bytes"] = header["beams_at"] = HEADER.itemsize
-    header["weights_at"] = HEADER.itemsize + entries.nbytes
-    header["bytes"] = HEADER.itemsize + entries.nbytes + weights.nbytes
     header["normalisation"] = NORMALISATIONS.index(beam_set.normalisation)
     header["flags"] = EXACT if beam_set.exact else 0
+    return header
+
+
+def _record(header: NDArray[Any], entries: NDArray[Any], weights: NDArray[Any]) -> bytes:
+    header["beams"] = len(entries)
+    header["weights_at"] = HEADER.itemsize + entries.nbytes
+    header["bytes"] = HEADER.itemsize + entries.nbytes + weights.nbytes
     body = header.tobytes() + entries.tobytes() + weights.tobytes()
     crc = zlib.crc32(memoryview(body)[CHECKED_FROM:])
     return body[:16] + crc.to_bytes(4, "little") + body[CHECKED_FROM:]

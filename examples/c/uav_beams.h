@@ -40,7 +40,7 @@ struct uavb_header {
     uint32_t elements, beams, first_beam, all_beams;
     uint32_t dtype, beam_bytes, beams_at, weights_at;
     uint32_t normalisation, flags;
-    uint64_t reserved;
+    uint64_t revision; /* 0: part of a whole update; else a beam renewed since, from 1 */
 };
 
 struct uavb_beam {

@@ -1,7 +1,8 @@
 """From the arrival of a report to new weights in shared memory, for each report: ``make bench``.
 
 A thread sends the reports of all UAVs, evenly over time; another one watches the shared memory. A
-report's latency ends when a record is there that was made after the report was sent.
+report's latency ends when a record with that UAV's beam is there that was made after the report was
+sent.
 """
 
 import contextlib
@@ -31,19 +32,23 @@ BEFORE: Final = 30  # reports of each UAV until all have beams, and the service 
 MEASURED: Final = 100
 WRITTEN_AT: Final = 24  # where a ring says how many records it has
 MADE_AT: Final = HEADER.fields["made_at_ns"][1]  # type: ignore[index]
+REVISION_AT: Final = HEADER.fields["revision"][1]  # type: ignore[index]
 POLL_S: Final = 20e-6
 BUSY: Final = "while True: pass"
 
 
 class Watched:
-    """Records of a ring, with the time at which each was seen and at which it was made, UTC."""
+    """Records of a ring: when each was made and seen, UTC, and the UAV of a beam that was renewed.
+
+    An empty name stands for all UAVs.
+    """
 
     def __init__(self, path: Path) -> None:
         with path.open("rb") as file:
             self._map = mmap.mmap(
                 file.fileno(), os.fstat(file.fileno()).st_size, prot=mmap.PROT_READ
             )
-        self.seen = list[tuple[int, int]]()
+        self.seen = list[tuple[int, int, bytes]]()
         self._end = threading.Event()
         self._thread = threading.Thread(target=self._watch, daemon=True)
 
@@ -54,10 +59,14 @@ class Watched:
             if written == known:
                 time.sleep(POLL_S)
                 continue
-            now_ns, known = time.time_ns(), written
-            at = HEAD_BYTES + (written - 1) % SLOTS * SLOT_BYTES + SLOT_HEAD_BYTES
-            (made_ns,) = struct.unpack_from("<q", self._map, at + MADE_AT)
-            self.seen.append((made_ns, now_ns))
+            now_ns = time.time_ns()
+            for number in range(known, written):
+                at = HEAD_BYTES + number % SLOTS * SLOT_BYTES + SLOT_HEAD_BYTES
+                (made_ns,) = struct.unpack_from("<q", self._map, at + MADE_AT)
+                (revision,) = struct.unpack_from("<Q", self._map, at + REVISION_AT)
+                uav = self._map[at + HEADER.itemsize :][:72].rstrip(b"\0") if revision else b""
+                self.seen.append((made_ns, now_ns, uav))
+            known = written
 
     def __enter__(self) -> "Watched":
         self._thread.start()
@@ -68,9 +77,9 @@ class Watched:
         self._thread.join()
 
 
-def fly(port: int, uavs: int, reports: int) -> list[int]:
-    """Send so many reports of UAVs in circles; return when each was sent, UTC."""
-    sent_ns, begun_s = list[int](), time.monotonic()
+def fly(port: int, uavs: int, reports: int) -> list[tuple[int, bytes]]:
+    """Send so many reports of UAVs in circles; return when each was sent, UTC, and its UAV."""
+    sent, begun_s = list[tuple[int, bytes]](), time.monotonic()
     with flight.socket_to(port) as sock:
         for number in range(reports):
             for index in range(uavs):
@@ -81,20 +90,22 @@ def fly(port: int, uavs: int, reports: int) -> list[int]:
                     sock.send(flight.frames(index, number * 5 + 1))  # a heartbeat
                 data = flight.frames(index, number * 5)
                 assert data[7] == GLOBAL_POSITION_INT
-                sent_ns.append(time.time_ns())
+                sent.append((time.time_ns(), b"%d:%d" % (data[5], data[6])))
                 sock.send(data)
-    return sent_ns
+    return sent
 
 
-def latencies_ms(sent_ns: list[int], seen: list[tuple[int, int]]) -> list[float]:
-    """From each report to the first record that was made after it."""
-    made_ns = [made for made, _ in seen]
-    places = [bisect_left(made_ns, sent) for sent in sent_ns]
-    return [
-        (seen[at][1] - sent) * 1e-6
-        for at, sent in zip(places, sent_ns, strict=True)
-        if at < len(seen)
-    ]
+def latencies_ms(sent: list[tuple[int, bytes]], seen: list[tuple[int, int, bytes]]) -> list[float]:
+    """From each report to the first record with its UAV that was made after it."""
+    found = []
+    for uav in {uav for _, uav in sent}:
+        records = [(made, at) for made, at, of in seen if of in (b"", uav)]
+        made_ns = [made for made, _ in records]
+        for sent_ns in [at for at, of in sent if of == uav]:
+            place = bisect_left(made_ns, sent_ns)
+            if place < len(records):
+                found.append((records[place][1] - sent_ns) * 1e-6)
+    return found
 
 
 @pytest.mark.parametrize("busy", [False, True])
@@ -114,11 +125,11 @@ def test_from_a_report_to_weights_in_shared_memory(
         with Watched(ring) as watched, contextlib.ExitStack() as load:
             for _ in range(2 * busy):
                 load.enter_context(started(["nice", "python3", "-c", BUSY]))
-            sent_ns = fly(node.udp_port, uavs, BEFORE + MEASURED)[BEFORE * uavs :]
+            sent = fly(node.udp_port, uavs, BEFORE + MEASURED)[BEFORE * uavs :]
             time.sleep(0.5)
         node.stop()
-        took_ms = latencies_ms(sent_ns, watched.seen)
-        assert len(took_ms) > 0.9 * len(sent_ns)
+        took_ms = latencies_ms(sent, watched.seen)
+        assert len(took_ms) > 0.9 * len(sent)
         name = f"report to shared memory, {uavs} UAVs, {update}{', busy' if busy else ''}"
         medians[update] = figures.note(f"{name}, median", statistics.median(took_ms), "ms", "less")
         figures.note(f"{name}, p99", float(np.percentile(took_ms, 99)), "ms", "less")

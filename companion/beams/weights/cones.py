@@ -42,6 +42,15 @@ class ApertureCones:
     highest: FloatArray
     furthest: FloatArray
 
+    def of(self, users: list[int]) -> "ApertureCones":
+        """Return the cones about some of the directions."""
+        return ApertureCones(
+            seen=self.seen[users],
+            lowest=self.lowest[:, users],
+            highest=self.highest[:, users],
+            furthest=self.furthest[:, users],
+        )
+
     @property
     def middles(self) -> FloatArray:
         return (self.lowest + self.highest) / 2

@@ -55,7 +55,7 @@ ROUNDING: Final = 1e-10
 
 
 class NulledBeams(NamedTuple):
-    """Beams (M, N) with nulls, and whether every null of a beam is exact (N,)."""
+    """Beams (M, B) with nulls, and whether every null of a beam is exact (B,)."""
 
     weights: ComplexArray
     exact: BoolArray
@@ -68,7 +68,8 @@ def with_nulls(spread: Spread, noise: FloatArray | None = None, exact: bool = Fa
     noise   (N,), loading of each predicted direction, for the least mean square error; None: 0
     exact   null predicted directions completely, at any cost
     """
-    users, each = spread.beams.shape[1], spread.each
+    own, each = spread.owners, spread.each
+    beams, users = np.arange(len(own)), spread.points.shape[1] // each
     if users == 1:
         return NulledBeams(spread.beams.copy(), np.ones(1, dtype=bool))
     fields, counts = spread.cones.fields(spread.beams), spread.cones.counts
@@ -79,12 +80,11 @@ def with_nulls(spread: Spread, noise: FloatArray | None = None, exact: bool = Fa
     shares = _shares(spread, kept[0])
     if exact:
         shares[::each] = 1.0
-    own = np.arange(users)
-    wanted = (spread.reached * shares).reshape(users, each, users)
-    wanted[own, :, own] = 0.0
-    taken = _correction(spread, wanted.reshape(-1, users), noise)
+    wanted = (spread.reached * shares).reshape(users, each, len(own))
+    wanted[own, :, beams] = 0.0
+    taken = _correction(spread, wanted.reshape(-1, len(own)), noise)
     dark = shares[::each] >= 1.0
-    dark[own, own] = True
+    dark[own, beams] = True
     whole = np.asarray(dark.all(axis=0))
     if exact:
         return NulledBeams(spread.beams - taken, whole)
@@ -108,11 +108,10 @@ def _protected_gains(least: FloatArray, worth: float) -> FloatArray:
 
 
 def _shares(spread: Spread, kept: FloatArray) -> FloatArray:
-    """Return the share of a beam's field that is removed at each point, (N K, N)."""
-    squared = _squared(spread.reached)
-    lengths = spread.gram.diagonal().real
-    lengths = np.maximum(lengths, 1e-12 * lengths.max())[:, np.newaxis]
-    alike = _squared(spread.gram[:, :: spread.each]) / (lengths * lengths[:: spread.each, 0])
+    """Return the share of a beam's field that is removed at each point, (N K, B)."""
+    squared, own = _squared(spread.reached), spread.owners * spread.each
+    lengths = np.maximum(spread.lengths, 1e-12 * spread.lengths.max())[:, np.newaxis]
+    alike = _squared(spread.crossed) / (lengths * lengths[own, 0])
     apart = 1.0 - alike
     cost = squared / (lengths * spread.powers) / np.maximum(apart, 1e-12)
     priced = np.sqrt(MAX_NULL_COST / np.maximum(cost, MAX_NULL_COST))
@@ -125,14 +124,13 @@ def _shares(spread: Spread, kept: FloatArray) -> FloatArray:
 
 
 def _correction(spread: Spread, wanted: ComplexArray, noise: FloatArray | None) -> ComplexArray:
-    """Return the least change (M, N) of beams that removes ``wanted`` (N K, N) at the points."""
-    points, gram, each = spread.points, spread.gram, spread.each
-    power = gram.diagonal().real
+    """Return the least change (M, B) of beams that removes ``wanted`` (N K, B) at the points."""
+    points, gram, each, power = spread.points, spread.gram, spread.each, spread.lengths
     loads = np.maximum(NULL_LOADING * power, ROUNDING * power.max())
     loads[::each] = ROUNDING * power.max()
     if noise is not None:
         loads[::each] += noise
-    if len(loads) > len(points):
+    if gram is None or len(loads) > len(points):
         # More points than elements: the smaller matrix, by S* (G + X)^-1 = (S* X^-1 S^T + 1)^-1 S*
         # X^-1.
         scaled = points.conj() / loads
@@ -158,9 +156,9 @@ def _solved(matrix: ComplexArray, wanted: ComplexArray) -> ComplexArray:
 def _allowed_share(
     spread: Spread, taken: ComplexArray, known: tuple[ComplexArray, FloatArray], least: FloatArray
 ) -> FloatArray:
-    """Return the largest share (N,) of the correction that leaves each place its least gain.
+    """Return the largest share (B,) of the correction that leaves each place its least gain.
 
-    least  (N, P), least gains; 0 does not limit
+    least  (B, P), least gains; 0 does not limit
 
     With the share t of the correction, the gain at a place is a ratio of two quadratics in t,
 

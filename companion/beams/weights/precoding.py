@@ -194,6 +194,44 @@ def precode(
     )
 
 
+def renewed_column(
+    steering: ComplexArray,
+    settings: Precoder,
+    spread: Spread | None,
+    user: int,
+    radio: Radio | None = None,
+) -> ComplexArray:
+    """Compute the column (M,) of one of the users of a slot alone, with unit response.
+
+        steering  A, (M, N), the steering vectors of all users of the slot
+        spread    widening of that user's beam and of the nulls on all; None: none
+        radio     needed if the method is MMSE
+
+    The other columns are not computed, so that it costs less than ``precode``. Raises
+    ``ValueError`` as ``precode`` does.
+    """
+    everyone = np.arange(steering.shape[1])
+    if spread is None:
+        return _columns(steering, settings, None, radio, everyone).weights[:, user]
+    match settings.method:
+        case Method.MATCHED:
+            column = spread.beams[:, 0]
+        case Method.REGULARISED | Method.MMSE:
+            gram = steering.T @ steering.conj()
+            loading = _loading(steering, gram, settings, radio, everyone)
+            column = with_nulls(spread, loading).weights[:, 0]
+        case Method.ZERO_FORCING:
+            exact = settings.policy is not Policy.REGULARISE
+            if exact:
+                gram = steering.T @ steering.conj()
+                lengths = np.sqrt(gram.diagonal().real)
+                condition = _condition_number(steering, gram / (lengths[:, np.newaxis] * lengths))
+                exact = condition <= settings.condition_limit
+            column = with_nulls(spread, exact=exact).weights[:, 0]
+    scaled: ComplexArray = column / (steering[:, user] @ column)
+    return scaled
+
+
 def _joined(
     groups: list[IntArray], columns: list[ComplexArray]
 ) -> tuple[IntArray, IntArray, ComplexArray]:
@@ -261,7 +299,7 @@ def _columns(
 ) -> _Columns:
     a = steering if len(users) == steering.shape[1] else steering[:, users]
     wide = None if spread is None else spread.of(users)
-    gram = a.T @ a.conj() if wide is None else wide.gram[:: wide.each, :: wide.each]
+    gram = a.T @ a.conj() if wide is None else wide.crossed[:: wide.each]
     lengths = np.sqrt(gram.diagonal().real)
     even_gram: ComplexArray = gram / (lengths[:, np.newaxis] * lengths)
     condition = _condition_number(a, even_gram)
@@ -270,10 +308,7 @@ def _columns(
             own = a.conj() if wide is None else wide.beams
             return _Columns(_unit_response(a, own), Method.MATCHED, condition)
         case Method.REGULARISED | Method.MMSE:
-            least = LEAST_LOADING * float(gram.trace().real)
-            loading = np.full(len(users), max(settings.regularisation * len(a), least))
-            if settings.method is Method.MMSE:
-                loading = np.maximum(_mmse_loading(gram, settings, radio, users), least)
+            loading = _loading(a, gram, settings, radio, users)
             found = _loaded(a, gram, loading) if wide is None else with_nulls(wide, loading).weights
             return _Columns(_unit_response(a, found), settings.method, condition)
         case Method.ZERO_FORCING:
@@ -281,6 +316,16 @@ def _columns(
                 return _wide_zero_forcing(a, wide, condition, settings)
             made = _zero_forcing(a / lengths, even_gram, condition, settings)
             return replace(made, weights=made.weights / lengths)
+
+
+def _loading(
+    a: ComplexArray, gram: ComplexArray, settings: Precoder, radio: Radio | None, users: IntArray
+) -> FloatArray:
+    """Return the loading of each user for the regularised methods."""
+    least = LEAST_LOADING * float(gram.trace().real)
+    if settings.method is Method.MMSE:
+        return np.maximum(_mmse_loading(gram, settings, radio, users), least)
+    return np.full(len(users), max(settings.regularisation * len(a), least))
 
 
 def _mmse_loading(

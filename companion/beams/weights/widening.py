@@ -37,27 +37,28 @@ class DirectionErrors:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Spread:
-    """Widened beams and nulls of N users.
+    """Widened beams of B of N users, and the nulls of all.
 
+    owners     (B,), the user of each beam, ascending: usually all
+    each       K, the number of points per user
     points     (M, N K), steering vectors, K per user in the order of the users: the predicted
                direction, then those around it that are nulled as well
-    outside    (N K, N), distance of each point outside each user's cone, natural widths; 0 within
+    outside    (N K, B), distance of each point outside each owner's cone, natural widths; 0 within
     """
 
-    beams: ComplexArray  # (M, N), the shaped beams by themselves
-    powers: FloatArray  # (N,), squared lengths of these beams
-    broadened: BoolArray  # (N,), which of them are broadened
+    owners: IntArray
+    each: int
+    beams: ComplexArray  # (M, B), the shaped beams by themselves
+    powers: FloatArray  # (B,), squared lengths of these beams
+    broadened: BoolArray  # (B,), which of them are broadened
     points: ComplexArray
-    gram: ComplexArray  # (N K, N K), S^T S* of the points S
-    reached: ComplexArray  # (N K, N), fields of the beams at the points
+    lengths: FloatArray  # (N K,), squared lengths of the points S
+    crossed: ComplexArray  # (N K, B), S^T S*, its columns for the owners' predicted directions
+    gram: ComplexArray | None  # (N K, N K), S^T S*; None where no more than that is needed
+    reached: ComplexArray  # (N K, B), fields of the beams at the points
     outside: FloatArray
     cones: ConeSamples  # samples for the least gain of each beam
     worth: float  # least useful gain
-
-    @property
-    def each(self) -> int:
-        """K, the number of points per user."""
-        return int(self.points.shape[1] // self.beams.shape[1])
 
     @property
     def centres(self) -> ComplexArray:
@@ -65,16 +66,20 @@ class Spread:
         return self.points[:, :: self.each]
 
     def of(self, users: IntArray) -> "Spread":
-        """Return the part for some of the users, in the given order."""
+        """Return the part for some of the users, in the given order; all must have beams."""
         if len(users) == self.beams.shape[1]:
             return self
         rows = (users[:, np.newaxis] * self.each + np.arange(self.each)).ravel()
         return Spread(
+            owners=np.arange(len(users)),
+            each=self.each,
             beams=self.beams[:, users],
             powers=self.powers[users],
             broadened=self.broadened[users],
             points=self.points[:, rows],
-            gram=self.gram[np.ix_(rows, rows)],
+            lengths=self.lengths[rows],
+            crossed=self.crossed[np.ix_(rows, users)],
+            gram=None if self.gram is None else self.gram[np.ix_(rows, rows)],
             reached=self.reached[np.ix_(rows, users)],
             outside=self.outside[np.ix_(rows, users)],
             cones=self.cones.of(users),
@@ -83,9 +88,16 @@ class Spread:
 
 
 def spread(
-    array: Array, directions: FloatArray, known: DirectionErrors, widen: Widen
+    array: Array,
+    directions: FloatArray,
+    known: DirectionErrors,
+    widen: Widen,
+    only: int | None = None,
 ) -> Spread | None:
-    """Widen beams for unit directions (N, 3) in the array frame; None without widening."""
+    """Widen beams for unit directions (N, 3) in the array frame; None without widening.
+
+    ``only`` is the one user whose beam is made; None: all have beams.
+    """
     if widen is Widen.NO:
         return None
     across = shapes.aperture(array)
@@ -95,19 +107,33 @@ def spread(
     each = around.shape[1]
     around = around.reshape(-1, 3)
     points = steering_matrix(array, around)
+    owners, centres = np.arange(len(directions)), points[:, ::each]
+    gram: ComplexArray | None = None
+    if only is None:
+        gram = points.T @ points.conj()
+        lengths, crossed = gram.diagonal().real, gram[:, ::each]
+    else:
+        owners, seen, directions = owners[[only]], seen.of([only]), directions[[only]]
+        centres = centres[:, [only]]
+        if points.shape[1] <= len(points):
+            gram = points.T @ points.conj()
+        lengths, crossed = np.vecdot(points.T, points.T).real, points.T @ centres.conj()
     if widen is Widen.LIKELY:
         cone, usual = seen.furthest * (across.lengths_m / array.wavelength_m)
         phases = shapes.phases_rad(across, cone, usual, known.floor_db, known.worth_db)
     else:
         phases = _for_the_bound_rad(array, across, seen)
-    turned, centres = phasors(phases).T, points[:, ::each]
+    turned = phasors(phases).T
     beams = centres.conj() * turned
-    gram = points.T @ points.conj()
     return Spread(
+        owners=owners,
+        each=each,
         beams=beams,
-        powers=gram.diagonal().real[::each],  # phases alone shape a beam
+        powers=lengths[owners * each],  # phases alone shape a beam
         broadened=np.abs(turned.sum(axis=0) / array.size) ** 2 < BROADENED,
         points=points,
+        lengths=lengths,
+        crossed=crossed,
         gram=gram,
         reached=points.T @ beams,
         outside=cones.outside(across, seen, around, array.wavelength_m),

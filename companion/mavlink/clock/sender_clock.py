@@ -96,10 +96,7 @@ class SenderClock:
         if x_ns == line.newest_ns:
             self._latency_s = latency_s
         return Stamp(
-            sender_ns=x_ns,
-            latency_s=latency_s,
-            rebooted=placed.rebooted,
-            oldest_ns=at_ns + low_ns,
+            sender_ns=x_ns, latency_s=latency_s, rebooted=placed.rebooted, oldest_ns=at_ns + low_ns
         )
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> None:

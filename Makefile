@@ -57,8 +57,14 @@ site: .venv/.dev
 bench: .venv/.dev
 	$(PYTEST) -q -s -m benchmark
 
+# At most 25 minutes. Floods and attacks run alone, all others two at a time.
+SOAK_BESIDE = $(addprefix tests/,live/test_all_together.py live/test_recording.py \
+    mavlink/wire/test_framing_fuzz.py server/test_contract.py pipeline/test_day.py)
 soak: .venv/.dev
-	$(PYTEST) -q -s -m soak --timeout=0
+	failed=; \
+	$(PYTEST) -q -rP -n 2 --dist worksteal -m soak --timeout=0 $(SOAK_BESIDE) || failed=1; \
+	$(PYTEST) -q -s -m soak --timeout=0 $(addprefix --ignore=,$(SOAK_BESIDE)) || failed=1; \
+	test -z "$$failed"
 
 # Failing inputs are in build/fuzz/TARGET/crash-…; inputs that reach new code join the corpus.
 FUZZ_SECONDS = 600

@@ -8,9 +8,10 @@ from typing import Final
 
 from companion.node.push import Push
 from companion.pipeline.fold import Pipeline
+from companion.values.budget import Budget
 
 SHARE: Final = 0.5
-"""Largest share of the time between two updates. Later reports wait for the next update."""
+"""Largest share of the time. Reports beyond it wait for the next update."""
 
 
 class Renewals:
@@ -25,13 +26,12 @@ class Renewals:
     ) -> None:
         self._pipeline = pipeline
         self._push = push
-        self._limit_s = SHARE * period_s
+        self._budget = Budget(per_s=SHARE, most=SHARE * period_s)
         self._now_ns = now_ns
         self._awaited = frozenset[str]()  # UAVs with a beam
         self._due = dict[str, None]()  # those that have reported, the newest last
         self._wake = asyncio.Event()
         self._are_many = asyncio.Event()  # set: an update takes less time than the due beams
-        self._spent_s = 0.0  # since the last update
         self._one_s = 0.0  # time that the last beam took
         self._update_s = 0.0  # time that the last update took
 
@@ -48,7 +48,6 @@ class Renewals:
         """Take note that an update begins, which takes in all reports so far."""
         self._due.clear()
         self._are_many.clear()
-        self._spent_s = 0.0
 
     def update_is_made(self, took_s: float) -> None:
         """Take note of a new update; reports since its beginning are taken in now."""
@@ -68,11 +67,12 @@ class Renewals:
         while True:
             await self._wake.wait()
             self._wake.clear()
-            while self._due and self._spent_s < self._limit_s and self._pipeline.aiming is None:
+            while self._due and self._pipeline.aiming is None:
                 began_s = time.perf_counter()
+                if not self._budget.spend(self._one_s, began_s):
+                    break
                 self._renew(self._due.popitem()[0])
                 self._one_s = time.perf_counter() - began_s
-                self._spent_s += self._one_s
                 await asyncio.sleep(0)  # links and clients are served in between
 
     def _renew(self, uav: str) -> None:

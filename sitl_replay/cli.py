@@ -119,11 +119,11 @@ json_option = click.option(
 fault_option = click.option(
     "--fault",
     "faults",
-    metavar="NAME[@SYSID[:COMPID]]=VALUE",
+    metavar="NAME[@SYSID[:COMPID]]=VALUE[/FROM-TO]",
     multiple=True,
     callback=as_faults,
-    help="Inject a fault (see below), for all systems or for one system or component. Can be"
-    " repeated.",
+    help="Inject a fault (see below), for all systems or for one system or component, always"
+    " or for frames sent from FROM to TO s. Can be repeated.",
 )
 duration_option = click.option(
     "--duration",
@@ -136,7 +136,9 @@ FAULTS = f"""Faults, in the order in which they are applied (the order of the op
 effect). The first six belong to the sender and are the same on every link: frames are rewritten
 with a valid checksum, and signatures are removed. The others are drawn for each link separately.
 The same --seed and input give the same bytes at the same times. Times are seconds since the start
-(of the log: at --speed 2 they pass twice as fast).
+(of the log: at --speed 2 they pass twice as fast). Each fault can be limited to a time:
+loss@3=1/20-50 is a loss of all frames that system 3 sends from 20 to 50 s. Afterwards its effect
+ends: a clock or a position that it changed goes back.
 
 {described()}
 

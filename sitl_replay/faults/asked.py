@@ -1,12 +1,12 @@
 """Requested faults: the values of ``--fault``. Pure.
 
 Syntax: ``NAME=VALUE``, or for one system or component ``NAME@SYSID=VALUE`` or
-``NAME@SYSID:COMPID=VALUE``. ``KINDS`` lists all kinds in the order of application, which does not
-depend on the order of the options. ``traffic`` applies them.
+``NAME@SYSID:COMPID=VALUE``; ``/FROM-TO`` after it limits any fault to a time. ``KINDS`` lists all
+kinds in the order of application, which does not depend on the order of the options. ``traffic``
+applies them.
 """
 
 import math
-from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Final, NamedTuple, Self
@@ -81,6 +81,7 @@ class Kind(NamedTuple):
         return (*given, *defaults)
 
 
+ALWAYS: Final = (0.0, math.inf)
 _SHARE: Final = Bound(letter="P", low=0.0, high=1.0)
 _FROM: Final = Bound(letter="T", low=0.0, high=1e6)
 
@@ -206,12 +207,17 @@ _ORDER: Final = {name: place for place, name in enumerate(KINDS)}
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """Requested fault: name, numbers, and the system and component it applies to (None: all)."""
+    """Requested fault: name, numbers, and what it applies to.
+
+    sysid, compid  system and component; None: all
+    during_s  start and end of the time in which frames are concerned (s); the end is excluded
+    """
 
     name: str
     values: tuple[float, ...]
     sysid: int | None = None
     compid: int | None = None
+    during_s: tuple[float, float] = ALWAYS
 
     def __str__(self) -> str:
         """Return the name and the system of a fault, as in ``frozen@3:1``."""
@@ -224,19 +230,24 @@ class Fault:
 
         Raises ``FaultError`` with the cause and what is allowed.
         """
-        name, at, system = text.partition("=")[0].partition("@")
+        request, slash, window = text.partition("/")
+        name, at, system = request.partition("=")[0].partition("@")
         kind = KINDS.get(name)
         if kind is None:
             brief = shown(printable(name)[:NAME_SHOWN_MAX])
             raise FaultError(f"{brief} is not a fault; give {', '.join(KINDS)}")
         try:
             sysid, compid = _system(system) if at else (None, None)
+            during_s = _window(window) if slash else ALWAYS
         except FaultError as error:
             raise FaultError(f"{shown(text)}: {error}; for example {kind.example}") from None
-        return cls(name=name, values=kind.read(text), sysid=sysid, compid=compid)
+        values = kind.read(request)
+        return cls(name=name, values=values, sysid=sysid, compid=compid, during_s=during_s)
 
-    def concerns(self, sender: Sender) -> bool:
-        """Return whether the fault applies to the frames of a system and component."""
+    def concerns(self, sender: Sender, t_s: float) -> bool:
+        """Return whether the fault applies to a frame that a system and component send then."""
+        if not self.during_s[0] <= t_s < self.during_s[1]:
+            return False
         if self.sysid is None:
             return True
         return self.sysid == sender[0] and self.compid in (None, sender[1])
@@ -247,17 +258,33 @@ def in_order(faults: Sequence[Fault]) -> list[Fault]:
 
     Raises ``FaultError`` if a fault that is not an event is given twice for the same frames.
     """
-    given = Counter(str(fault) for fault in faults if not KINDS[fault.name].is_event)
-    for label, times in given.items():
+    lasting = [fault for fault in faults if not KINDS[fault.name].is_event]
+    for fault in lasting:
+        times = sum(str(f) == str(fault) and _overlap(f.during_s, fault.during_s) for f in lasting)
         if times > 1:
-            raise FaultError(f"{label} is given {times} times; allowed: once per system")
-    whose = ((_ORDER[f.name], f.sysid or 0, f.compid or 0, f.values) for f in faults)
+            raise FaultError(f"{fault} is given {times} times; allowed: once per system and time")
+    whose = ((_ORDER[f.name], f.sysid or 0, f.compid or 0, f.values, f.during_s) for f in faults)
     return [fault for _, fault in sorted(zip(whose, faults, strict=True), key=lambda pair: pair[0])]
 
 
 def described(kinds: Iterable[Kind] = KINDS.values()) -> str:
     """Return the help text of kinds of faults, a paragraph each."""
     return "\n\n".join(f"{k.form}: {k.meaning}. Example: {k.example}" for k in kinds)
+
+
+def _overlap(first_s: tuple[float, float], second_s: tuple[float, float]) -> bool:
+    return max(first_s[0], second_s[0]) < min(first_s[1], second_s[1])
+
+
+def _window(text: str) -> tuple[float, float]:
+    start, dash, end = text.partition("-")
+    try:
+        found_s = _FROM.read(start), _FROM.read(end)
+    except FaultError:
+        found_s = (0.0, 0.0)
+    if not dash or found_s[0] >= found_s[1]:
+        raise FaultError(f"{shown(text)} is not FROM-TO, in seconds, such as 20-50")
+    return found_s
 
 
 def _system(text: str) -> tuple[int, int | None]:

@@ -58,7 +58,7 @@ class Senders:
     def altered(self, t_s: float, raw: bytes) -> bytes:
         """Return a frame as its sender sends it at ``t_s``, with the faults."""
         for fault, effect in self._faults:
-            if fault.concerns(sender_of(raw)):
+            if fault.concerns(sender_of(raw), t_s):
                 before, raw = raw, effect(t_s, raw)
                 self._touched[str(fault)] += raw is not before
         return raw
@@ -127,32 +127,32 @@ class _Link:
         """Return what arrives of a frame sent at ``now_s``, with the times of arrival."""
         sender = sender_of(raw)
         for fault, loss in self._loss:
-            if fault.concerns(sender) and loss.loses():
+            if fault.concerns(sender, now_s) and loss.loses():
                 self._touched[str(fault)] += 1
                 return
         times_s = [self._released_s(now_s, sender)]
         for fault, doubling in self._doubling:
-            if fault.concerns(sender) and (lag_s := doubling.lag_s()) is not None:
+            if fault.concerns(sender, now_s) and (lag_s := doubling.lag_s()) is not None:
                 self._touched[str(fault)] += 1
                 times_s.append(times_s[0] + lag_s)
         for t_s in times_s:
-            yield from ((t_s, piece) for piece in self._damaged(raw, sender))
+            yield from ((t_s, piece) for piece in self._damaged(raw, sender, now_s))
 
     def _released_s(self, now_s: float, sender: Sender) -> float:
         t_s = now_s
         for fault, timing in self._timing:
-            if fault.concerns(sender):
+            if fault.concerns(sender, now_s):
                 before_s, t_s = t_s, timing.release_s(now_s, t_s, sender)
                 self._touched[str(fault)] += t_s > before_s
         return t_s
 
-    def _damaged(self, raw: bytes, sender: Sender) -> Iterator[bytes]:
+    def _damaged(self, raw: bytes, sender: Sender, now_s: float) -> Iterator[bytes]:
         for fault, garbage in self._garbage:
-            if fault.concerns(sender) and (noise := garbage.noise()):
+            if fault.concerns(sender, now_s) and (noise := garbage.noise()):
                 self._touched[str(fault)] += 1
                 yield noise
         for fault, damage in self._damage:
-            if fault.concerns(sender):
+            if fault.concerns(sender, now_s):
                 before, raw = raw, damage.damaged(raw)
                 self._touched[str(fault)] += raw != before
         yield raw

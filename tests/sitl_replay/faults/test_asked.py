@@ -22,6 +22,7 @@ from sitl_replay.faults.asked import KINDS, Fault, FaultError, described, in_ord
         ("spoof=20:2", Fault(name="spoof", values=(20.0, 2.0, 90.0))),
         ("compass@5:1=-8", Fault(name="compass", values=(-8.0, 0.0), sysid=5, compid=1)),
         ("bit-errors=1e-5", Fault(name="bit-errors", values=(1e-5,))),
+        ("loss@3=1/20-50", Fault(name="loss", values=(1.0,), sysid=3, during_s=(20.0, 50.0))),
     ],
 )
 def test_fault_option_is_parsed(text: str, expected: Fault) -> None:
@@ -57,6 +58,10 @@ def test_every_fault_example_parses_and_is_described(kind: object) -> None:
         ("loss@300=0.1", "'300' is not SYSID or SYSID:COMPID, each 0 to 255; for example loss=0.1"),
         ("loss@3:=0.1", "'3:' is not SYSID"),
         ("loss@x:1=0.1", "'x:1' is not SYSID"),
+        ("loss=0.1/20", "'20' is not FROM-TO, in seconds, such as 20-50; for example loss=0.1"),
+        ("loss=0.1/", "'' is not FROM-TO"),
+        ("loss=0.1/50-20", "'50-20' is not FROM-TO"),
+        ("loss=0.1/nan-20", "'nan-20' is not FROM-TO"),
     ],
 )
 def test_invalid_fault_is_a_one_line_error_with_allowed_values(text: str, complaint: str) -> None:
@@ -98,4 +103,19 @@ def test_fault_applies_to_the_selected_senders() -> None:
         ("loss@3=0", senders[:2]),
         ("loss@3:1=0", senders[:1]),
     ]:
-        assert [one for one in senders if Fault.parse(text).concerns(one)] == expected
+        assert [one for one in senders if Fault.parse(text).concerns(one, 0.0)] == expected
+
+
+@pytest.mark.parametrize("kind", KINDS.values(), ids=lambda kind: str(kind.name))
+def test_every_fault_can_be_limited_to_a_time(kind: object) -> None:
+    fault = Fault.parse(f"{kind.example}/20-50")  # type: ignore[attr-defined]
+    sender = (fault.sysid or 1, 1)
+    times_s = (0.0, 19.9, 20.0, 49.9, 50.0)
+    assert [fault.concerns(sender, t_s) for t_s in times_s] == [False, False, True, True, False]
+
+
+def test_a_fault_can_be_repeated_at_another_time() -> None:
+    apart = [Fault.parse("loss=0.1/20-50"), Fault.parse("loss=0.2/50-60")]
+    assert in_order(apart) == apart
+    with pytest.raises(FaultError, match="loss is given 2 times; allowed: once per system and t"):
+        in_order([*apart, Fault.parse("loss=1/59-70")])

@@ -1,12 +1,12 @@
 """Build the Debian package: the service with all locked packages, for one architecture.
 
-    python deploy/build_deb.py [--out DIR] [--arch amd64|arm64] [--python 3.11] [--no-packages]
+    python deploy/build_deb.py [--out DIR] [--arch amd64|arm64] [--python 3.N] [--no-packages]
 
 The packages of requirements.lock are unpacked from wheels into /usr/lib/uav-companion-beams, so
-that an installation needs no network. They are chosen for the architecture and the Python of Debian
-12, whatever the building machine is; nothing is compiled or run. The unit is the one of
-docs/deployment.md, with a system user of its own. ``--no-packages`` leaves the locked packages out,
-for tests. Needs dpkg-deb. With SOURCE_DATE_EPOCH, two builds are identical.
+that an installation needs no network. They are chosen for the architecture and the version of
+Python, that of the building interpreter unless given; nothing is compiled or run. The unit is the
+one of docs/deployment.md, with a system user of its own. ``--no-packages`` leaves the locked
+packages out, for tests. Needs dpkg-deb. With SOURCE_DATE_EPOCH, two builds are identical.
 """
 
 import argparse
@@ -17,6 +17,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
+import tomllib
 from datetime import UTC, datetime
 from email.utils import format_datetime
 from pathlib import Path
@@ -38,7 +39,7 @@ def main() -> None:
     asked = argparse.ArgumentParser(description=__doc__, usage=argparse.SUPPRESS)
     asked.add_argument("--out", type=Path, default=ROOT / "dist")
     asked.add_argument("--arch", choices=WHEELS, default=_own_arch())
-    asked.add_argument("--python", default="3.11")
+    asked.add_argument("--python", default=f"{sys.version_info.major}.{sys.version_info.minor}")
     asked.add_argument("--no-packages", action="store_true")
     given = asked.parse_args()
     with tempfile.TemporaryDirectory() as folder:
@@ -149,16 +150,18 @@ def _write(path: Path, text: str, mode: int = 0o644) -> None:
 
 
 def _debian_changelog() -> str:
-    (maintainer,) = re.findall("^Maintainer: (.+)$", _control(), re.MULTILINE)
     date = format_datetime(datetime.fromtimestamp(_epoch(), UTC))
     return (
         f"{NAME} ({_version()}) stable; urgency=medium\n\n"
-        f"  * See CHANGELOG.md.gz.\n\n -- {maintainer}  {date}\n"
+        f"  * See CHANGELOG.md.gz.\n\n -- {_maintainer()}  {date}\n"
     )
 
 
-def _control() -> str:
-    return (FILES / "control").read_text(encoding="utf-8")
+def _maintainer() -> str:
+    """Return the first author in pyproject.toml."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    author = project["authors"][0]
+    return f"{author['name']} <{author['email']}>"
 
 
 def _version() -> str:
@@ -174,10 +177,11 @@ def _epoch() -> int:
 def _write_control(tree: Path, arch: str, python: str) -> None:
     major, minor = map(int, python.split("."))
     kib = sum(path.stat().st_size for path in tree.rglob("*") if path.is_file()) // 1024
-    text = _control()
+    text = (FILES / "control").read_text(encoding="utf-8")
     for key, value in (
         ("VERSION", _version()),
         ("ARCH", arch),
+        ("MAINTAINER", _maintainer()),
         ("PYTHON", python),
         ("NEXT", f"{major}.{minor + 1}"),
         ("SIZE", str(kib)),

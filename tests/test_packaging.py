@@ -2,6 +2,7 @@
 
 import configparser
 import email.parser
+import gzip
 import json
 import os
 import re
@@ -10,6 +11,7 @@ import subprocess
 import sys
 import sysconfig
 import tarfile
+import tomllib
 import urllib.request
 import venv
 import zipfile
@@ -24,6 +26,7 @@ from support import HANG_S, ROOT, line_of, started
 import companion
 
 EPOCH = {"SOURCE_DATE_EPOCH": "1700000000"}
+DOC = "usr/share/doc/uav-companion-beams"
 FORBIDDEN = "/Build", "/tests/", ".pyc", "/.venv", ".mcap"
 
 
@@ -82,6 +85,7 @@ def test_metadata_is_valid_for_an_index(wheel: Path, archive: Path) -> None:
     assert found.description_content_type == "text/markdown"
     assert found.description and found.description.startswith("# companion")
     assert found.license_expression == "Apache-2.0"
+    assert found.author_email == maintainer()
 
 
 def test_wheel_contains_the_page_and_nothing_else(wheel: Path) -> None:
@@ -186,6 +190,19 @@ def unpacked(package: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+def maintainer() -> str:
+    """The first author of pyproject.toml."""
+    author = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["authors"][0]
+    return f"{author['name']} <{author['email']}>"
+
+
+def test_debian_package_can_be_for_another_python(tmp_path: Path) -> None:
+    built = deb(tmp_path, "--no-packages", "--python", "3.13")
+    command = ["dpkg-deb", "--field", built, "Depends"]
+    found = subprocess.run(command, capture_output=True, text=True, check=True, timeout=HANG_S)
+    assert found.stdout.startswith("python3 (>= 3.13), python3 (<< 3.14~), ")
+
+
 def test_debian_package_is_reproducible(package: Path, tmp_path: Path) -> None:
     assert deb(tmp_path, "--no-packages").read_bytes() == package.read_bytes()
 
@@ -195,7 +212,11 @@ def test_debian_package_is_well_formed(package: Path, unpacked: Path) -> None:
     fields = email.parser.Parser().parsestr((unpacked / "DEBIAN/control").read_text())
     assert fields["Version"] == companion.__version__
     assert fields["Architecture"] == "all"  # without the packages; else that of their wheels
-    assert "python3 (>= 3.11), python3 (<< 3.12~)" in fields["Depends"]
+    major, minor = sys.version_info[:2]
+    assert f"python3 (>= {major}.{minor}), python3 (<< {major}.{minor + 1}~)" in fields["Depends"]
+    assert fields["Maintainer"] == maintainer()
+    changes = gzip.decompress((unpacked / DOC / "changelog.gz").read_bytes()).decode()
+    assert f"\n -- {maintainer()}  " in changes
     assert set(fields) >= {"Maintainer", "Section", "Priority", "Description", "Installed-Size"}
     assert (unpacked / "DEBIAN/conffiles").read_text() == "/etc/companion.toml\n"
     for script in ("postinst", "prerm", "postrm"):
@@ -211,8 +232,7 @@ def test_debian_package_is_well_formed(package: Path, unpacked: Path) -> None:
         assert mode in ("drwxr-xr-x", "-rwxr-xr-x", "-rw-r--r--"), line
         assert name.startswith(("./etc", "./usr")) or name == "./"
         assert "__pycache__" not in name
-    doc = unpacked / "usr/share/doc/uav-companion-beams"
-    assert {path.name for path in doc.iterdir()} == {
+    assert {path.name for path in (unpacked / DOC).iterdir()} == {
         *("copyright", "changelog.gz", "CHANGELOG.md.gz", "NOTICE")
     }
 

@@ -6,7 +6,7 @@ position, the UAV's reports, a clock, or this machine.
 """
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from companion.pipeline.angle_parts import AngleParts, ErrorSource, grown, largest
@@ -34,11 +34,13 @@ class CarrierEvidence:
     attitude        parts of the bound on its attitude
     attitude_age_s  age of its newest attitude; None without one
     clock_assumed   the constant part of its latency is only assumed
+    refused         why its newest positions were rejected; None: they were used
     """
 
     attitude: AttitudeParts = field(default_factory=AttitudeParts)
     attitude_age_s: float | None = None
     clock_assumed: bool = False
+    refused: Reason | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -66,6 +68,11 @@ def of_machine(waited_s: float) -> Blame:
         f"this machine is overloaded: frames wait up to {waited_s:.1f} s",
         "close other programs and pages, or lower `[beams] update_hz`",
     )
+
+
+def of_past(why: Blame) -> Blame:
+    """Return the cause of a link that is good again, but has not been for long."""
+    return replace(why, reason=f"good again, for less than 3 s; before: {why.reason}")
 
 
 def of_left_out(
@@ -202,6 +209,10 @@ def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence)
 
 def _carrier_position_cause(carrier: Carrier, evidence: LinkEvidence) -> Blame:
     age_s = (carrier.age_s or 0.0) - evidence.waited_s
+    if age_s > SILENT_S and evidence.carrier.refused is not None:
+        reason = f"the carrier's positions are rejected: {evidence.carrier.refused}"
+        remedy = "read the carrier's rejections in the notices, and check its GNSS receiver and id"
+        return Blame(Cause.CARRIER, reason, remedy)
     if age_s > SILENT_S:
         reason = f"no position from the carrier for {age_s:.1f} s"
         return Blame(Cause.CARRIER, reason, CHECK_LINK)

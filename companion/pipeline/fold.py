@@ -332,6 +332,7 @@ class Pipeline:
             attitude=attitude,
             attitude_age_s=self.center.attitude_age_s(at),
             clock_assumed=self._is_assumed(vehicle),
+            refused=self.refusals.current_rejection(vehicle, now_ns),
         )
 
     def _is_assumed(self, sender: str) -> bool:

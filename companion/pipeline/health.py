@@ -18,7 +18,17 @@ from companion.pipeline.blame import LinkEvidence
 from companion.pipeline.link_gains import GainMeter, LinkGains, Site
 from companion.pipeline.verdict_notices import VerdictNotices
 from companion.settings.beams import NeedSettings
-from companion.values import BeamSet, Cause, Level, Notice, Track, TrackState, Update, Verdict
+from companion.values import (
+    BeamSet,
+    Blame,
+    Cause,
+    Level,
+    Notice,
+    Track,
+    TrackState,
+    Update,
+    Verdict,
+)
 
 EVERY_NS: Final = 1_000_000_000
 """Interval between two assessments of a link; a round through all links takes as long."""
@@ -57,10 +67,12 @@ class _LinkRecord:
 
     better_since_ns  since when it has been better than its level
     good             time and parts of the smallest bound with which it was good of late
+    why              cause of its newest assessment that was not good
     """
 
     better_since_ns: int | None = None
     good: tuple[int, AngleParts] | None = None
+    why: Blame | None = None
 
 
 class HealthMonitor:
@@ -174,7 +186,7 @@ class HealthMonitor:
                     parts,
                     carrier=carrier,
                     when_good=None if good is None else good[1],
-                    before=None if held is None else held.blame,
+                    before=(held and held.blame) and self._links_kept[uav].why,
                 )
             elif coasting:
                 level, why = Level.WEAK, blame.of_coasting(track, known)
@@ -218,11 +230,12 @@ class HealthMonitor:
     def _with_hold_time(self, fresh: Verdict) -> Verdict:
         """Return the new verdict; with the current level until a better one has been held."""
         held, record = self.verdicts.get(fresh.uav), self._links_kept[fresh.uav]
+        record.why = fresh.blame or record.why
         if held is not None and fresh.level.rank > held.level.rank:
             if record.better_since_ns is None:
                 record.better_since_ns = fresh.since_ns
             if fresh.since_ns - record.better_since_ns < HOLD_BETTER_NS:
-                why = fresh.blame or held.blame
+                why = fresh.blame or (record.why and blame.of_past(record.why))
                 return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
         record.better_since_ns = None
         if held is None or fresh.level is not held.level:

@@ -279,6 +279,20 @@ def test_frozen_uav_is_rejected_not_silent_when_it_has_lost_its_beam() -> None:
     assert verdict.blame.cause is Cause.REFUSED
 
 
+def test_rejected_carrier_is_not_called_silent() -> None:
+    def scattered(at_s: float, frame: Frame) -> Frame:
+        if not _is_of(frame, CARRIER, "GLOBAL_POSITION_INT"):
+            return frame
+        east_m = 1000.0 * (2 + round(at_s * HZ) % 7)
+        return replace_position(at_s, CARRIER, (0.0, east_m, 0.0), (0.0, 0.0, 0.0))
+
+    struck = Disturbance(change=scattered, struck=ALL, cause=Cause.CARRIER)
+    _, found = causes([struck])
+    late = [text for at_s, text in found["1:1"] if at_s >= GOOD_S + WITHIN_S]
+    assert "carrier: the carrier's positions are rejected: unreachable" in late
+    assert not [text for text in late if "no position" in text]
+
+
 @pytest.mark.parametrize("name", DISTURBANCES)
 def test_disturbed_input_is_named(name: str) -> None:
     held_to((name,))

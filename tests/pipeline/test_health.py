@@ -164,14 +164,20 @@ def test_no_good_verdict_lies_below_its_need() -> None:
 
 
 def test_held_level_gives_its_current_reason() -> None:
+    """A good link has no reason of its own: that of before is given as such."""
     watch = Watch()
-    assert watch.see(0, [replace(track("1:1", *WILD), age_s=2.0)]) == "none"
-    assert watch.see(1, [replace(track("1:1", *USUAL), age_s=3.0)]) == "none"
-    why = watch.health.verdicts["1:1"].blame
-    assert why is not None
-    assert why.reason == "no report for 3.0 s"
-    assert watch.see(2, [track("1:1", *SURE)]) == "none"
-    assert watch.health.verdicts["1:1"].blame == why  # a good link has no other reason
+
+    def reason(t_s: float, news: Track) -> str:
+        assert watch.see(t_s, [news]) == "none"
+        why = watch.health.verdicts["1:1"].blame
+        assert why is not None
+        return why.reason
+
+    assert reason(0, replace(track("1:1", *WILD), age_s=2.0)) == "no report for 2.0 s"
+    past = "good again, for less than 3 s; before: no report for 2.0 s"
+    assert reason(1, track("1:1", *SURE)) == past
+    assert reason(2, track("1:1", *SURE)) == past
+    assert reason(3, replace(track("1:1", *USUAL), age_s=3.0)) == "no report for 3.0 s"
 
 
 def test_brief_changes_are_not_announced() -> None:

@@ -186,7 +186,7 @@ class HealthMonitor:
                     parts,
                     carrier=carrier,
                     when_good=None if good is None else good[1],
-                    before=(held and held.blame) and self._links_kept[uav].why,
+                    before=self._links_kept[uav].why if held and held.blame else None,
                 )
             elif coasting:
                 level, why = Level.WEAK, blame.of_coasting(track, known)

@@ -72,7 +72,7 @@ def test_two_builds_are_identical(built: list[Path], tmp_path: Path) -> None:
 
 
 def test_metadata_is_valid_for_an_index(wheel: Path, archive: Path) -> None:
-    """What ``twine check`` checks: the metadata, and a long description that renders."""
+    """What ``twine check`` checks: the metadata, and a long description that is declared."""
     with zipfile.ZipFile(wheel) as zipped:
         (name,) = (name for name in zipped.namelist() if name.endswith("/METADATA"))
         raw = zipped.read(name)

@@ -179,13 +179,13 @@ def renewed(
         made    the newest update; its other beams are kept
         track   the UAV predicted to ``valid_at_ns``
 
-    The other arguments are those of ``aim``. The others are where their rates of change take them
-    from the update. Their beams still have their nulls where the UAV was then, so the result is not
-    exact. Its column has the power that it had, or unit response. None if the UAV cannot have a
-    beam, or had none in the update.
+    The other arguments are those of ``aim``. The other UAVs are assumed where their rates of change
+    take them from the update. Their beams keep their nulls where this UAV was then, so the result
+    is not exact. The new column has the power of the one that it replaces, or unit response. None
+    if the UAV cannot have a beam, or had none in the update.
     """
-    index = next((i for i, beam in enumerate(made.beams) if beam.uav == track.uav), None)
-    if index is None:
+    column = next((i for i, beam in enumerate(made.beams) if beam.uav == track.uav), None)
+    if column is None:
         return None
     offsets_m = line_of_sight.offsets_ned_m([track], carrier, array)
     if _refusals([track], offsets_m) != [None]:
@@ -195,24 +195,21 @@ def renewed(
         aimed = _seen_by_array(aimed, seen_directions)
     if _out_of_reach(aimed.directions, array, coverage) != [None]:
         return None
-    slot = made.beams[index].group
+    slot = made.beams[column].group
     members = [i for i, beam in enumerate(made.beams) if beam.group == slot]
-    user, beams = members.index(index), [made.beams[i] for i in members]
+    user, beams = members.index(column), [made.beams[i] for i in members]
     own = _shaped_rad([track.uav], aimed.errors, array, precoder, (before, valid_at_ns))
     towards, shaped = _moved(beams, (valid_at_ns - made.valid_at_ns) * 1e-9)
     towards[user], shaped[user] = aimed.directions[0], own[0]
     spread = widening.spread(array, towards, _shapes(shaped, precoder), precoder.widen, user)
     matrix = steering.steering_matrix(array, towards) if spread is None else spread.centres
-    radio = None
-    if precoder.needs_radio:
-        ranges_m = np.array([beam.range_m for beam in beams])
-        radio = _radio([beam.uav for beam in beams], ranges_m, array, precoder)
-    column = renewed_column(matrix, precoder, spread, user, radio)
-    weights = _at_its_power(column, made, members, index)[:, np.newaxis]
-    rates = line_of_sight.rates([track], carrier, array, aimed.ranges_m, aimed.directions)
+    uavs, ranges_m = [beam.uav for beam in beams], made.ranges_m[members]
+    radio = _radio(uavs, ranges_m, array, precoder) if precoder.needs_radio else None
+    new = renewed_column(matrix, precoder, spread, user, radio)
+    weights = _at_its_power(new, made, members, column)[:, np.newaxis]
     described = _described(
         aimed,
-        rates=rates,
+        rates=line_of_sight.rates([track], carrier, array, aimed.ranges_m, aimed.directions),
         shaped_rad=own,
         widened=[spread is not None and bool(spread.broadened[0])],
         users=[0],
@@ -229,7 +226,7 @@ def renewed(
         left_out=(),
         exact=False,
     )
-    return RenewedBeam(index, one)
+    return RenewedBeam(column, one)
 
 
 def _moved(beams: Sequence[Beam], seconds: float) -> tuple[FloatArray, FloatArray]:
@@ -252,26 +249,24 @@ def _moved(beams: Sequence[Beam], seconds: float) -> tuple[FloatArray, FloatArra
 
 
 def _at_its_power(
-    column: ComplexArray, made: BeamSet, members: list[int], index: int
+    new: ComplexArray, made: BeamSet, members: list[int], column: int
 ) -> ComplexArray:
     """Return a new column (M,) of unit response at the scale of the one that it replaces.
 
-    members  columns of its time slot, ``index`` among them
+    members  columns of its time slot, ``column`` among them
 
-    Where the busiest element limits the power, no element has more than that.
+    Where the busiest element limits the power, no element has more than that, though all of these
+    columns are replaced: each may use an equal part of what is left.
     """
     if made.normalisation is Normalisation.UNIT_RESPONSE:
-        return column
-    old = made.weights[:, index]
-    scaled: ComplexArray = column * math.sqrt(
-        np.vecdot(old, old).real / np.vecdot(column, column).real
-    )
+        return new
+    old = made.weights[:, column]
+    scaled: ComplexArray = new * math.sqrt(np.vecdot(old, old).real / np.vecdot(new, new).real)
     if made.normalisation is Normalisation.ANTENNA:
-        slot, taken = made.weights[:, members], np.abs(scaled) ** 2
-        used = np.abs(slot) ** 2
-        left = used.sum(axis=1).max() - used.sum(axis=1) + np.abs(old) ** 2
-        share = np.min(left / np.maximum(taken, 1e-300))
-        scaled *= math.sqrt(min(1.0, max(float(share), 0.0)))
+        used = (np.abs(made.weights[:, members]) ** 2).sum(axis=1)
+        left = np.abs(old) ** 2 + (used.max() - used) / len(members)
+        share = float((left / np.maximum(np.abs(scaled) ** 2, 1e-300)).min())
+        scaled *= math.sqrt(min(1.0, share))
     return scaled
 
 

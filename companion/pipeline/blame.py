@@ -70,9 +70,9 @@ def of_machine(waited_s: float) -> Blame:
     )
 
 
-def of_past(why: Blame) -> Blame:
-    """Return the cause of a link that is good again, but has not been for long."""
-    return replace(why, reason=f"good again, for less than 3 s; before: {why.reason}")
+def of_past(why: Blame, seconds: float) -> Blame:
+    """Return the cause of a link that is good again, but has not been for so long."""
+    return replace(why, reason=f"good again, for less than {seconds:g} s; before: {why.reason}")
 
 
 def of_left_out(

@@ -235,7 +235,9 @@ class HealthMonitor:
             if record.better_since_ns is None:
                 record.better_since_ns = fresh.since_ns
             if fresh.since_ns - record.better_since_ns < HOLD_BETTER_NS:
-                why = fresh.blame or (record.why and blame.of_past(record.why))
+                why = fresh.blame or (
+                    record.why and blame.of_past(record.why, HOLD_BETTER_NS * 1e-9)
+                )
                 return replace(fresh, level=held.level, blame=why, since_ns=held.since_ns)
         record.better_since_ns = None
         if held is None or fresh.level is not held.level:

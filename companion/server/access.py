@@ -45,9 +45,10 @@ UNSENT_BYTES: Final = 16_384
 The default is megabytes, so a slow reader of a stream would receive outdated data.
 """
 UNREAD_BYTES: Final = 16_384
-"""Limit on bytes of a client that wait in the kernel, and so on what is read at once; inherited.
+"""Room in the kernel for bytes of a client, inherited by its connections. Linux fits in 24 kB.
 
-The default is 128 kB and more: pipelined requests that are read together wait in this process.
+That limits what is read at once, which waits in this process while requests are answered. The
+default is 128 kB and more.
 """
 
 

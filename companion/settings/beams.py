@@ -102,7 +102,8 @@ class BeamSettings(Section):
         update_hz          rate at which weights are computed for recordings and the dashboard; for
                            an HTTP request, weights are computed for the time that it asks for
         update             what renews the weights of ``[records]``: the "timer" of ``update_hz``
-                           alone, or besides it each "report", for the beam of its UAV
+                           alone, or besides it each "report", for the beam of its UAV (unless
+                           they contain guaranteed gains)
         actuation_delay_s  time from computing weights to applying them
         targets            which tracks get beams
         most               largest number of UAVs with beams: those of ``priority`` first, then

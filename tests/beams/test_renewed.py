@@ -88,10 +88,10 @@ def test_no_element_exceeds_its_power_with_a_renewed_beam() -> None:
     assert pipeline.last_update is not None
     kept = pipeline.last_update.beams
     assert kept.normalisation is Normalisation.ANTENNA
-    for uav in kept.uavs:
-        found = pipeline.renewed(uav, now_ns)
+    weights = kept.weights.copy()
+    for uav in kept.uavs:  # one after the other, as reports come
+        found = pipeline.renewed(uav, now_ns + 5 * UPDATE_NS)
         assert found is not None
-        weights = kept.weights.copy()
         weights[:, found.column] = found.one.weights[:, 0]
         assert (np.abs(weights) ** 2).sum(axis=1).max() <= (1 + 1e-9) / len(weights)
 

@@ -80,7 +80,7 @@ class Floor:
 
         window_ns   time over which latencies are sampled and a steady drift is detected
         drift_max   largest drift assumed, a ratio
-        usual_ns    largest visible latency of the line before this one; 0 without one
+        before_ns   largest visible latency of the line before this one; 0 without one
 
     Attributes:
 
@@ -90,10 +90,10 @@ class Floor:
         rise_ns     rise of the line at the newest stamp beyond ``drift_max``; 0 unless it restarted
     """
 
-    def __init__(self, window_ns: int, drift_max: float, usual_ns: float = 0.0) -> None:
+    def __init__(self, window_ns: int, drift_max: float, before_ns: float = 0.0) -> None:
         self._window_ns = window_ns
         self._drift_max = drift_max
-        self._usual_ns = usual_ns
+        self._before_ns = before_ns
         self._likely_drift = min(LIKELY_DRIFT, drift_max)
         self.drift = 0.0
         self.count = 0
@@ -247,7 +247,7 @@ class Floor:
     @property
     def largest_ns(self) -> float:
         """Largest visible part of the latency, or that of the line before, for a window."""
-        before_ns = self._usual_ns if self._heard_ns <= self._window_ns else 0.0
+        before_ns = self._before_ns if self._heard_ns <= self._window_ns else 0.0
         return max(self._visible.largest_ns, before_ns)
 
     @property

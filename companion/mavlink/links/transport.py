@@ -182,8 +182,11 @@ class Link:
         spent_s = time.perf_counter() - began_s
         if len(found) != 1 or isinstance(found[0], Rejection):
             spent_s *= _share_of_frames(found, len(data))
-        first = found[0].source if found and isinstance(found[0], Frame) else None
-        newcomers.worked(first if first in peer.served else None, spent_s)
+        newcomers.worked_s += spent_s
+        if found:
+            frames = [item.source for item in found if isinstance(item, Frame)]
+            served = [source for source in frames if source in peer.served]
+            newcomers.worked(served, spent_s / len(found))
         if now_ns >= newcomers.adapts_ns:
             newcomers.adapt(now_ns, time.thread_time())
         if isinstance(peer.splitter, ForeignSplitter) and not self.url.listens:

@@ -9,7 +9,7 @@ are dropped than took the work that is too much: a flood of one sender costs no 
 
 from bisect import bisect_left
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Final
 
 from companion.values import Source
@@ -32,7 +32,7 @@ class Newcomers:
 
     What ``admits`` says of a sender holds while ``generation`` stays the same. That changes from
     time to time, so that ``admits`` learns which senders are active. ``worked_s`` is the time that
-    frames took since the last call of ``adapt``, due from ``adapts_ns``; ``worked`` adds to it.
+    frames took since the last call of ``adapt``, due from ``adapts_ns``; ``worked`` says whose.
 
     ``is_named`` says whether the settings name a vehicle: those are always admitted, so that a
     service that starts during a flood serves them.
@@ -87,11 +87,14 @@ class Newcomers:
         """Note that frames were read late, or lost before they were read."""
         self._is_late = True
 
-    def worked(self, source: Source | None, spent_s: float) -> None:
-        """Note the time that frames of a sender took; None: of one that is not served."""
-        self.worked_s += spent_s
-        if source is not None:
-            self._worked_s[source] = self._worked_s.get(source, 0.0) + spent_s
+    def worked(self, sources: Sequence[Source], each_s: float) -> None:
+        """Note the time that each of some frames took, by the sender of each.
+
+        Only senders that are served are charged; ``worked_s`` has the time of all.
+        """
+        charged = self._worked_s
+        for source in sources:
+            charged[source] = charged.get(source, 0.0) + each_s
 
     def adapt(self, now_ns: int, used_s: float) -> None:
         """Adapt who is served to the share of the time that frames took.

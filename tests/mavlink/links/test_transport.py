@@ -1057,6 +1057,22 @@ def test_connections_are_processed_in_turn_a_piece_at_a_time(run: Run) -> None:
     run(test())
 
 
+def test_work_is_charged_to_the_sender_of_each_frame(run: Run) -> None:
+    """A router passes on several senders, and garbage may come first."""
+
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, _):
+            await until_true(lambda: link.status.state == "up")
+            link._newcomers.adapts_ns = 1 << 62  # the work is not taken into account meanwhile
+            frames = [frame(number, sysid=7) for number in range(2, 41)]
+            link.take(("127.0.0.1", 9), b"\xfd\x09garbage" + frame(1) + b"".join(frames))
+            charged = link._newcomers._worked_s
+            assert charged[Source(7, 1)] == pytest.approx(39 * charged[Source(1, 1)])
+            assert sum(charged.values()) == pytest.approx(link._newcomers.worked_s, rel=0.1)
+
+    run(test())
+
+
 def test_work_on_garbage_is_not_charged_to_senders(run: Run) -> None:
     """Otherwise a flood of random bytes would have frames of honest senders dropped."""
 

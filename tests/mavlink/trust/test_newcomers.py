@@ -32,8 +32,9 @@ def window(
     All senders that are served took the same time.
     """
     now = served(senders, 100, (number - 1) * WINDOW_NS)
-    for one in now:
-        senders.worked(source(one), share * WINDOW_NS * 1e-9 / len(now))
+    spent_s = share * WINDOW_NS * 1e-9
+    senders.worked_s += spent_s
+    senders.worked([source(one) for one in now], spent_s / len(now))
     if is_late:
         senders.late()
     senders.adapt(number * WINDOW_NS, used * number * WINDOW_NS * 1e-9)
@@ -113,10 +114,10 @@ def test_flood_of_one_sender_costs_no_other_its_place() -> None:
     assert len(served(senders, 6, 0)) == 6
     for number in range(1, 20):
         now = served(senders, 6, number * WINDOW_NS)
-        flood = source(5) if 5 in now else None
-        for one in range(5):
-            senders.worked(source(one), 0.01 * WINDOW_NS * 1e-9)
-        senders.worked(flood, 0.9 * WINDOW_NS * 1e-9)
+        senders.worked_s += 0.95 * WINDOW_NS * 1e-9
+        senders.worked([source(one) for one in range(5)], 0.01 * WINDOW_NS * 1e-9)
+        if 5 in now:
+            senders.worked([source(5)], 0.9 * WINDOW_NS * 1e-9)
         senders.late()
         senders.adapt(number * WINDOW_NS, number * WINDOW_NS * 1e-9)
     assert served(senders, 6, 20 * WINDOW_NS) == [0, 1, 2, 3, 4]

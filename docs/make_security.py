@@ -26,6 +26,7 @@ from companion.recording import background
 from companion.recording.foreign import thinned
 from companion.server import (
     access,
+    byte_ranges,
     connections,
     observation_routes,
     playback,
@@ -197,7 +198,7 @@ WAYS: Final = (
     WayIn(
         name="files over HTTP",
         covers=("route:/v1/recordings", "route:/v1/recordings/{name}", "route:/v1/map/tiles", "page"),
-        size=f"{kb(connections.BUFFER_BYTES)} of a file in memory; the page's files are read once",
+        size=f"{kb(byte_ranges.PIECE_BYTES)} of a file in memory; the page's files are read once",
         items="as of the connection",
         work=LOOP,
         over="as of the connection",
@@ -225,7 +226,8 @@ WAYS: Final = (
         name="bearer tokens",
         covers=("tokens",),
         size=f"at least {access.TOKEN_MIN} characters",
-        items=f"{access.WRONG_MAX} wrong ones of an address, then {access.WRONG_PER_S:g}/s",
+        items=f"{access.WRONG_MAX} wrong ones of an address, then {access.WRONG_PER_S:g}/s;"
+        f" {access.WRONG_ALL_MAX} of all, then {access.WRONG_ALL_PER_S:g}/s",
         work="-",
         over=f"answered {access.WRONG_DELAY_S:.0f} s later, counted, with a notice",
         test=f"{HOSTILE}::test_wrong_tokens_are_counted_told_and_answered_late",

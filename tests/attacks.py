@@ -5,16 +5,18 @@ They know what a stranger can know: the ports, the ids and where the UAVs are.
 
 import contextlib
 import itertools
+import math
 import random
 import socket
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterator
 
 from load_sender import ATTITUDE, GLOBAL_POSITION_INT, frame
 from siege import tcp
-from siege_flight import CARRIER, UAVS, boot_ms, place, report
+from siege_flight import CARRIER, UAVS, YAW_RAD, boot_ms, place, report
 from support import Node
 
 Attack = Callable[[Node, threading.Event], None]
@@ -144,6 +146,26 @@ def distinct_requests(threads: int) -> Attack:
     return attack
 
 
+def handshakes(per_s: float) -> Attack:
+    """New WebSockets, each closed by its client a moment later."""
+
+    def attack(node: Node, until: threading.Event) -> None:
+        begun_s, made = time.monotonic(), 0
+        opened = deque[socket.socket]()
+        while not until.wait(0.002):
+            while made < per_s * (time.monotonic() - begun_s):
+                made += 1
+                with contextlib.suppress(OSError):
+                    opened.append(tcp(node))
+                    opened[-1].send(UPGRADE)
+            while len(opened) > per_s / 10:
+                opened.popleft().close()
+        for one in opened:
+            one.close()
+
+    return attack
+
+
 # --- MAVLink --------------------------------------------------------------------------------------
 
 
@@ -208,6 +230,44 @@ def drifting(
                     one.send(frame((sysid, 1), number % 256, GLOBAL_POSITION_INT, payload))
                 if until.wait(1 / hz):
                     return
+
+    return attack
+
+
+def turning(rate_radps: float, hz: float, ahead_s: float, exact_s: float) -> Attack:
+    """Attitudes of the carrier that turn away, after ``exact_s`` seconds of its true position."""
+
+    def attack(node: Node, until: threading.Event) -> None:
+        with _sockets(node) as another:
+            one, begun_s = another(), time.monotonic()
+            for number in itertools.count():
+                at_s = time.time()
+                boot = boot_ms(at_s + ahead_s, CARRIER)
+                turned_rad = rate_radps * (time.monotonic() - begun_s - exact_s)
+                if number % 10 == 0:
+                    raw = report(CARRIER, boot_ms(at_s, CARRIER), at_s)
+                    one.send(frame((CARRIER, 1), number % 256, GLOBAL_POSITION_INT, raw))
+                if turned_rad > 0.0:
+                    yaw_rad = math.remainder(YAW_RAD + turned_rad, math.tau)
+                    raw = struct.pack("<I6f", boot, 0.01, 0.02, yaw_rad, 0.01, 0.01, rate_radps)
+                    one.send(frame((CARRIER, 1), number % 256, ATTITUDE, raw))
+                if until.wait(1 / hz):
+                    return
+
+    return attack
+
+
+def garbage(per_s: float, raw: bytes) -> Attack:
+    """Datagrams that hold no frame."""
+
+    def attack(node: Node, until: threading.Event) -> None:
+        with _sockets(node) as another:
+            one, begun_s, sent = another(), time.monotonic(), 0
+            while not until.wait(0.002):
+                while sent < per_s * (time.monotonic() - begun_s):
+                    with contextlib.suppress(OSError):
+                        one.send(raw)
+                    sent += 1
 
     return attack
 

@@ -12,6 +12,7 @@ import socket
 import struct
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Final
@@ -208,6 +209,7 @@ class LyingServer:
         self._lies = [lie(rng, now_s) for _ in range(20_000)]
         self._per_s = per_s
         self._listener = socket.create_server(("127.0.0.1", 0))
+        weakref.finalize(self, self._listener.close)  # the attack runs in another process
         self.port = int(self._listener.getsockname()[1])
 
     def attack(self, _: Node, until: threading.Event) -> None:

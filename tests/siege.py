@@ -6,12 +6,15 @@ thread, as an operator's page would, while an attack runs.
 
 import contextlib
 import json
+import math
+import multiprocessing
 import socket
 import subprocess
 import sys
 import threading
 import time
 import urllib.request
+import warnings
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from datetime import datetime
@@ -19,7 +22,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from siege_flight import CARRIER, UAVS, degrees, place
+from siege_flight import CARRIER, UAVS, YAW_RAD, degrees, place
 from support import HANG_S, ROOT, Node, end
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
@@ -27,6 +30,7 @@ LOOK_S = 0.1
 RECENT_S = 5.0  # a warning older than this announces no broken bound
 HONEST = frozenset(f"{sysid}:1" for sysid in UAVS)
 PAGE_MB = 4096 / 1e6
+LEVEL_DEG = 1.0
 M_PER_DEG_LAT = 111_195.0
 
 
@@ -124,7 +128,15 @@ class Looking(threading.Thread):
         status = _ask(url + "/v1/status", self._token)
         if status["rates"]["updates_hz"] is not None:
             seen.rates_hz.append(status["rates"]["updates_hz"])
+        self._check_attitude(status["center"])
         self._check_bounds()
+
+    def _check_attitude(self, center: Any) -> None:
+        """Look at the carrier, whose heading is ``YAW_RAD`` and which is level to a degree."""
+        off_deg = abs(math.remainder(center["yaw_deg"] - math.degrees(YAW_RAD), 360.0))
+        if off_deg > center["attitude_bound_deg"] + LEVEL_DEG:
+            bound_deg = center["attitude_bound_deg"]
+            self.seen.broken.append(f"heading off by {off_deg:.1f}, bound {bound_deg:.1f} degrees")
 
     def _check_bounds(self) -> None:
         for uav in HONEST:
@@ -212,14 +224,20 @@ def looking(node: Node, token: str | None = None) -> Iterator[Looks]:
 
 
 def attacked(attack: Callable[[Node, threading.Event], None], node: Node, seconds: float) -> Looks:
-    """Run an attack on a thread for some seconds, and return what was seen meanwhile."""
-    until = threading.Event()
-    attacker = threading.Thread(target=attack, args=(node, until), daemon=True)
+    """Run an attack for some seconds in a process of its own, and return what was seen meanwhile.
+
+    On a thread it would delay the looks, which share its interpreter.
+    """
+    context = multiprocessing.get_context("fork")
+    until = context.Event()
+    attacker = context.Process(target=attack, args=(node, until), daemon=True)
+    with warnings.catch_warnings(action="ignore", category=DeprecationWarning):
+        attacker.start()  # Python 3.12 warns of threads; the looks have none yet
     with looking(node) as seen:
-        attacker.start()
         time.sleep(seconds)  # the length of the attack, which nothing ends earlier
     until.set()
     attacker.join(HANG_S)
+    assert attacker.exitcode == 0
     return seen
 
 

@@ -25,6 +25,7 @@ from companion.mavlink.wire.crc_extra import CRC_EXTRA
 HZ = 10
 CARRIER = 5
 UAVS = (1, 2, 3, 4)
+YAW_RAD = 0.5  # heading of all, which are nearly level
 LAT0, LON0, ALT0_M = 47.3977, 8.5456, 550.0
 RADIUS_M, RATE_RADPS = 60.0, 0.1
 M_PER_DEG = 111_195.0
@@ -108,7 +109,7 @@ class Vehicle:
         at_s = time.time()
         boot = boot_ms(at_s, self.sysid)
         self.send(GLOBAL_POSITION_INT, report(self.sysid, boot, at_s))
-        self.send(ATTITUDE, struct.pack("<Iffffff", boot, 0.01, 0.02, 0.5, 0.01, 0.01, 0.01))
+        self.send(ATTITUDE, struct.pack("<Iffffff", boot, 0.01, 0.02, YAW_RAD, 0.01, 0.01, 0.01))
         if number % HZ == 0:
             kind = 2 if self.sysid != CARRIER else 10
             self.send(HEARTBEAT, struct.pack("<IBBBBB", 4, kind, 3, 217, 4, 3))

@@ -36,6 +36,8 @@ UNAUTHORISED: Final = 4401  # close code of a WebSocket without a valid token
 TOKEN_MIN: Final = 16  # characters of a token that other machines may try to guess
 WRONG_MAX: Final = 10  # wrong tokens of an address that are answered at once
 WRONG_PER_S: Final = 0.1
+WRONG_ALL_MAX: Final = 100  # the same of all addresses, as an attacker may have many
+WRONG_ALL_PER_S: Final = 1.0
 WRONG_DELAY_S: Final = 1.0  # delay of the answer to a further one
 NOTICE_EVERY_S: Final = 60.0  # shortest time between two notices of wrong tokens
 ADDRESSES_MAX: Final = 1024  # addresses whose wrong tokens are remembered
@@ -178,8 +180,9 @@ def is_same_site(origin: str | None, host: str | None) -> bool:
 class WrongTokens:
     """Wrong tokens by the address that sent them: counted, reported, and answered late.
 
-    An address may be wrong ``WRONG_MAX`` times, and regains ``WRONG_PER_S`` a second. After that
-    each wrong token is answered ``WRONG_DELAY_S`` later, and a notice is published, at most once in
+    An address may be wrong ``WRONG_MAX`` times, and regains ``WRONG_PER_S`` a second; all of them
+    together ``WRONG_ALL_MAX`` times and ``WRONG_ALL_PER_S``. After that each wrong token is
+    answered ``WRONG_DELAY_S`` later, and a notice is published, at most once in
     ``NOTICE_EVERY_S``. A correct token is never delayed: others may share the address.
     """
 
@@ -187,6 +190,7 @@ class WrongTokens:
         self.count = 0
         self._node = node
         self._budgets: dict[str, Budget] = {}
+        self._all = Budget(per_s=WRONG_ALL_PER_S, most=WRONG_ALL_MAX)
         self._notified_s = -math.inf
 
     def delay_s(self, address: str, now_s: float) -> float:
@@ -196,7 +200,7 @@ class WrongTokens:
         self._budgets[address] = budget
         if len(self._budgets) > ADDRESSES_MAX:
             del self._budgets[next(iter(self._budgets))]
-        if budget.spend(1, now_s):
+        if budget.spend(1, now_s) and self._all.spend(1, now_s):
             return 0.0
         if now_s >= self._notified_s + NOTICE_EVERY_S:
             self._notified_s = now_s

@@ -4,14 +4,17 @@ Format: PMTiles, version 3 (github.com/protomaps/PMTiles). The file's path comes
 settings, never from a recording: the author of a recording must not choose which files are served.
 """
 
+import os
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Final
 
 from fastapi import FastAPI, HTTPException
-from fastapi.responses import FileResponse, Response
+from fastapi.responses import Response
 
+from companion.server.byte_ranges import Range, file_answer, open_regular
 from companion.server.responses import answer, answers, refusals
+from companion.server.threads import in_file_thread
 from companion.values import UserError
 from companion.values.described import Meaning
 
@@ -60,10 +63,16 @@ def add(app: FastAPI, file: Path | None) -> None:
         responses={
             200: {"content": {MEDIA_TYPE: {}}},
             206: {"content": {MEDIA_TYPE: {}}, "description": "The bytes of Range"},
-            **refusals(404, 416),
+            **refusals(404, 416, 422),
         },
     )
-    async def tiles() -> Response:
-        if file is None or not file.is_file():
+    async def tiles(wanted: Range = None) -> Response:
+        found = None
+        if file is not None:
+            found = await in_file_thread(open_regular, file, follow_links=True)
+        if found is None:
             raise HTTPException(404, "no map; name one in [page] map")
-        return FileResponse(file, media_type=MEDIA_TYPE)
+        status = os.fstat(found.fileno())
+        # A page that reads parts of two files learns from the tag that they do not belong together.
+        headers = {"etag": f'"{status.st_mtime_ns:x}-{status.st_size:x}"'}
+        return file_answer(found, status.st_size, wanted, MEDIA_TYPE, headers)

@@ -16,6 +16,7 @@ from companion.views import as_json, beam_state, weight_formats
 from companion.views import pattern as pattern_view
 from companion.views.state import Node
 
+ACCEPTED_MOST: Final = 32  # media types of an Accept header that are read
 ANGLES_MAX: Final = 20_000
 """Limit on beams times angles in one answer, which then takes half a second."""
 LeadMs = Annotated[float, Query(ge=0, le=10_000, description="milliseconds ahead of now")]
@@ -121,10 +122,12 @@ def _weight_answers() -> dict[int | str, dict[str, Any]]:
 def accepted(accept: str) -> WeightFormat | None:
     """Return the weight format that an Accept header prefers; None if it accepts none.
 
-    By RFC 9110, the format with the highest q is preferred, the first of equal ones.
+    By RFC 9110, the format with the highest q is preferred, the first of equal ones. Of a longer
+    list only the first ``ACCEPTED_MOST`` are read.
     """
     forms = {form.media_type: form for form in WeightFormat}
-    parts = [part.lower().replace(" ", "") for part in accept.split(",")]
+    parts = [part.lower().replace(" ", "") for part in accept.split(",", ACCEPTED_MOST)]
+    del parts[ACCEPTED_MOST:]
     for part in sorted(parts, key=_quality, reverse=True):
         wanted = part.split(";")[0]
         if _quality(part) <= 0:

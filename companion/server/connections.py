@@ -18,6 +18,7 @@ from companion.values.budget import Budget
 HEAD_BYTES: Final = 16_384
 """Limit on the bytes of a request line and headers; browsers send one or two thousand."""
 HEADERS_MOST: Final = 100  # limit on a request's headers; each takes microseconds
+PARAMETERS_MAX: Final = 300  # limit on a query's parameters; 256 UAVs may be named
 BODY_BYTES: Final = 65_536  # limit on a request's body; /v1/observations has one
 HEAD_S: Final = 10.0
 """Time limit for a complete head, from connecting or from the last answer, seconds."""
@@ -136,7 +137,11 @@ class BoundedProtocol(HttpToolsProtocol):
             self._parsed_bytes += len(piece)
             super().data_received(piece)
             most = HEAD_BYTES if self._in_head else HEAD_BYTES + BODY_BYTES
-            is_long = self._parsed_bytes > most or len(self.headers or ()) > HEADERS_MOST
+            is_long = (
+                self._parsed_bytes > most
+                or len(self.headers or ()) > HEADERS_MOST
+                or (self.url or b"").count(b"&") >= PARAMETERS_MAX
+            )
             if is_long and not self.transport.is_closing():
                 self.send_400_response("The request is too long.")
         self.flow.hold(bool(self._unparsed))  # type: ignore[attr-defined]

@@ -3,10 +3,11 @@
 from functools import partial
 from typing import Annotated
 
-from fastapi import FastAPI, Header, HTTPException, Path
-from fastapi.responses import Response, StreamingResponse
+from fastapi import FastAPI, HTTPException, Path
+from fastapi.responses import Response
 
 from companion.server import models, recordings
+from companion.server.byte_ranges import Range, file_answer
 from companion.server.giving_way import GivingWay
 from companion.server.large_answers import LargeAnswers, Make
 from companion.server.playback import BusyError, Playback, PlaybackError, Reading
@@ -18,10 +19,11 @@ from companion.server.responses import (
     json_response,
     refusals,
 )
-from companion.server.threads import in_thread
+from companion.server.shared_work import SharedWork
+from companion.server.threads import in_file_thread, in_thread
 from companion.values import Source
 from companion.views import mavlink_messages, series
-from companion.views.as_json import as_json
+from companion.views.as_json import Json, as_json
 from companion.views.last_messages import Kept, by_sender
 from companion.views.state import Node
 
@@ -29,7 +31,6 @@ SystemId = Annotated[int, Path(ge=0, le=255, description="MAVLink system id")]
 ComponentId = Annotated[int, Path(ge=0, le=255, description="MAVLink component id")]
 RecordingName = Annotated[str, Path(description="name of the file, as in /v1/recordings")]
 MessageName = Annotated[str, Path(description="MAVLink name, such as GLOBAL_POSITION_INT")]
-Range = Annotated[str | None, Header(alias="range", description="bytes=FIRST-LAST")]
 
 
 def add(app: FastAPI, node: Node, large: LargeAnswers) -> None:
@@ -40,7 +41,7 @@ def add(app: FastAPI, node: Node, large: LargeAnswers) -> None:
 
 
 def _recordings(app: FastAPI, node: Node) -> None:
-    where = node.pipeline.settings.recording.directory
+    where, listings = node.pipeline.settings.recording.directory, SharedWork()
 
     def current() -> recordings.Current:
         status = node.recording()
@@ -52,7 +53,10 @@ def _recordings(app: FastAPI, node: Node) -> None:
         responses=answers(recordings.Recordings),
     )
     async def listing() -> Response:
-        return answer({"recordings": await in_thread(recordings.listed, where, current())})
+        async def read() -> list[Json]:
+            return await in_file_thread(recordings.listed, where, current())
+
+        return answer({"recordings": await listings.run("recordings", read)})
 
     @app.get(
         "/v1/recordings/{name}",
@@ -65,30 +69,12 @@ def _recordings(app: FastAPI, node: Node) -> None:
         },
     )
     async def download(name: RecordingName, wanted: Range = None) -> Response:
-        found = await in_thread(recordings.opened, where, name, current())
+        found = await in_file_thread(recordings.opened, where, name, current())
         if found is None:
             raise HTTPException(404, f"no recording {name!r}")
         file, size = found
-        try:
-            part = recordings.span(wanted, size)
-        except recordings.UnsatisfiableRangeError as error:
-            file.close()
-            headers = {"content-range": f"bytes */{size}"}
-            raise HTTPException(416, str(error), headers) from error
-        start, stop = part or (0, size)
-        headers = {
-            "accept-ranges": "bytes",
-            "content-length": str(stop - start),
-            "content-disposition": f'attachment; filename="{name}"',
-        }
-        if part is not None:
-            headers["content-range"] = f"bytes {start}-{stop - 1}/{size}"
-        return StreamingResponse(
-            recordings.pieces(file, start, stop),
-            status_code=200 if part is None else 206,
-            headers=headers,
-            media_type=recordings.MEDIA_TYPE,
-        )
+        headers = {"content-disposition": f'attachment; filename="{name}"'}
+        return file_answer(file, size, wanted, recordings.MEDIA_TYPE, headers)
 
 
 def _playback(app: FastAPI, node: Node) -> None:
@@ -103,7 +89,7 @@ def _playback(app: FastAPI, node: Node) -> None:
         },
     )
     async def history(name: RecordingName) -> Response:
-        path = await in_thread(recordings.find, where, name)
+        path = await in_file_thread(recordings.find, where, name)
         if path is None:
             raise HTTPException(404, f"no recording {name!r}")
         if name == node.recording().file:

@@ -15,6 +15,7 @@ from typing import Annotated, Final
 
 import orjson
 
+from companion.server.shared_work import seen
 from companion.server.threads import in_thread
 from companion.values.described import Meaning
 
@@ -56,29 +57,38 @@ class Playback:
         ``PlaybackError``.
         """
         now_s = asyncio.get_running_loop().time()
-        task = self._task
+        task, previous = self._task, None
         if path != self._path and task is not None:
             if not task.done() and now_s - self._asked_s < IDLE_S:
                 raise BusyError
             task.cancel()
-            await asyncio.wait([task])
-            task = None
+            task, previous = None, task
         self._asked_s = now_s
         if task is None:
             self._path, self._reading = path, Reading()
-            self._task = task = asyncio.create_task(self._read(path, self._reading))
+            self._task = task = asyncio.create_task(self._read(path, self._reading, previous))
+            task.add_done_callback(seen)
+        reading = self._reading
         await asyncio.wait([task], timeout=1.0)  # a short recording is answered at once
         if not task.done():
-            return self._reading
+            return reading
         if task.cancelled() or task.exception() is not None:
-            self._path = self._task = None  # the next request tries again
+            if self._task is task:
+                self._path = self._task = None  # the next request tries again
             raise PlaybackError("reading it was ended" if task.cancelled() else task.exception())
         return task.result()
 
-    async def _read(self, path: Path, reading: Reading) -> bytes:
-        """Start the process, and end it when it takes too long or nobody asks any more."""
+    async def _read(
+        self, path: Path, reading: Reading, previous: "asyncio.Task[bytes] | None"
+    ) -> bytes:
+        """Start the process, and end it when it takes too long or nobody asks any more.
+
+        It starts once the process of the ``previous`` recording has ended.
+        """
+        if previous is not None:
+            await asyncio.wait([previous])
         loop = asyncio.get_running_loop()
-        begun_s, process = loop.time(), await in_thread(_started, path)
+        begun_s, process = loop.time(), await _started(path)
         following = asyncio.create_task(in_thread(_last_line, process, reading))
         try:
             while loop.time() - begun_s < READ_MAX_S and loop.time() - self._asked_s < IDLE_S:
@@ -95,7 +105,19 @@ class Playback:
         raise PlaybackError("reading it took too long, or was ended")
 
 
-def _started(path: Path) -> "subprocess.Popen[bytes]":
+async def _started(path: Path) -> "subprocess.Popen[bytes]":
+    """Start the process on a thread; end it if the caller is cancelled meanwhile."""
+    starting = asyncio.create_task(in_thread(_start, path))
+    try:
+        return await asyncio.shield(starting)
+    except asyncio.CancelledError:
+        process = await starting
+        process.kill()
+        await in_thread(_last_line, process, Reading())
+        raise
+
+
+def _start(path: Path) -> "subprocess.Popen[bytes]":
     return subprocess.Popen(
         [sys.executable, "-m", MODULE, str(path)],
         stdin=subprocess.PIPE,

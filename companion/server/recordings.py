@@ -1,4 +1,4 @@
-"""Files of ``/v1/recordings``, and their bytes, whole or in part.
+"""Files of ``/v1/recordings``.
 
 Served are only files directly in the recording directory that are named like a recording: no
 folders, no symbolic links. A recording in progress can be read up to its last flush: every reader
@@ -7,14 +7,14 @@ that accepts truncated files can open it, and ``companion recover`` completes it
 
 import os
 import re
-from collections.abc import AsyncIterator, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, BinaryIO, Final, Literal
 
 from companion.recording.writer import ACTIVE
-from companion.server.threads import in_thread
+from companion.server.byte_ranges import open_regular
 from companion.values import UtcNs
 from companion.values.described import Meaning
 from companion.views.as_json import Json, rfc3339
@@ -22,12 +22,6 @@ from companion.views.as_json import Json, rfc3339
 MEDIA_TYPE: Final = "application/x-mcap"
 _NAME: Final = re.compile(r"[A-Za-z0-9][\w.-]*\.mcap(\.active)?", re.ASCII)
 _STARTED: Final = re.compile(r"companion-(\d{8}T\d{6}Z)")
-_RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
-_PIECE_BYTES: Final = 1 << 18
-
-
-class UnsatisfiableRangeError(ValueError):
-    """Error of a byte range that begins beyond the end of the file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,47 +105,13 @@ def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, in
     found = find(where, name)
     if found is None:
         return None
-    try:
-        descriptor = os.open(found, os.O_RDONLY | os.O_NOFOLLOW)
-    except OSError:
+    file = open_regular(found)
+    if file is None:
         return None
-    file = os.fdopen(descriptor, "rb")
-    size = os.fstat(descriptor).st_size
+    size = os.fstat(file.fileno()).st_size
     return file, min(size, current.bytes) if name == current.name else size
 
 
 def find(where: str | None, name: str) -> Path | None:
     """Return the path of a recording; None if the name is unknown."""
     return next((Path(entry.path) for entry in _entries(where) if entry.name == name), None)
-
-
-def span(header: str | None, size: int) -> tuple[int, int] | None:
-    """Return a Range header's first byte and the byte after its last; None for the whole file.
-
-    RFC 9110, 14.2: a malformed header, or one with several ranges, may be ignored. Raises
-    ``UnsatisfiableRangeError`` for a range beyond the end.
-    """
-    found = _RANGE.fullmatch((header or "").replace(" ", ""))
-    if found is None or not (found[1] or found[2]):
-        return None
-    if not found[1]:
-        start, stop = max(0, size - int(found[2])), size
-    else:
-        start, stop = int(found[1]), min(size, int(found[2]) + 1 if found[2] else size)
-        if found[2] and int(found[2]) < int(found[1]):
-            return None
-    if start >= size or start >= stop:
-        raise UnsatisfiableRangeError(f"the file has {size} bytes")
-    return start, stop
-
-
-async def pieces(file: BinaryIO, start: int, stop: int) -> AsyncIterator[bytes]:
-    """Yield a file's bytes from ``start`` to ``stop``, off the event loop; close the file."""
-    with file:
-        await in_thread(file.seek, start)
-        while start < stop:
-            piece = await in_thread(file.read, min(_PIECE_BYTES, stop - start))
-            if not piece:
-                return
-            start += len(piece)
-            yield piece

@@ -33,9 +33,17 @@ CASES: dict[str, Case] = {
     "distinct requests, 20 at once": Case(attacks.distinct_requests(20)),
     "pings over one WebSocket": Case(attacks.pings(1)),
     "pings over 20 WebSockets": Case(attacks.pings(20)),
+    "500 WebSocket handshakes/s": Case(attacks.handshakes(500.0), 60.0),
     "256 streams that read nothing": Case(attacks.unread_streams(256), 60.0),
     "positions of the carrier from another port": Case(attacks.forged_carrier(1.0)),
     "attitudes of the carrier from another port": Case(attacks.forged_carrier(0.2, msgid=ATTITUDE)),
+    "attitudes of the carrier that turn, from a peer whose positions agreed": Case(
+        attacks.turning(0.35, 100.0, 0.09, SHORT_S + 1.0)
+    ),
+    "2500 datagrams/s of starts of frames": Case(attacks.garbage(2500.0, b"\xfe\x01" * 736)),
+    "80 datagrams/s of 64 kB of starts of frames": Case(
+        attacks.garbage(80.0, b"\xfe\x00\xfd" * 21_600)
+    ),
     "drifting positions from fresh ports": Case(attacks.drifting(2.0, 10.0, fresh_ports=True)),
     "drifting positions ahead of time": Case(
         attacks.drifting(3.0, 10.0, fresh_ports=True, ahead_s=0.05)

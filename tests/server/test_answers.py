@@ -18,7 +18,7 @@ from starlette.testclient import TestClient
 from companion.mavlink.wire.encode import HEARTBEAT, heartbeat, pack
 from companion.server import area_map, models, recordings, responses
 from companion.server.app import create_app
-from companion.server.beam_routes import accepted
+from companion.server.beam_routes import ACCEPTED_MOST, accepted
 from companion.tracking.design import answers
 from companion.values import Frame, Level, Source
 from companion.values.described import unit
@@ -245,6 +245,12 @@ def test_head_equals_get_without_a_body(client: TestClient) -> None:
 )
 def test_response_format_follows_the_accept_header(accept: str, form: str | None) -> None:
     assert accepted(accept) == form
+
+
+def test_only_the_first_media_types_are_read() -> None:
+    """Each costs microseconds, and a header has room for thousands."""
+    assert accepted("text/html," * (ACCEPTED_MOST - 1) + "application/x-npy") == "npy"
+    assert accepted("text/html," * ACCEPTED_MOST + "application/x-npy") is None
 
 
 def test_raw_weights_match_their_headers_and_npy_is_c_ordered(client: TestClient) -> None:

@@ -27,7 +27,18 @@ def test_map_file_is_served_by_ranges(shared_node: Any, area: Path) -> None:
         assert (asked.status_code, asked.content) == (206, whole[5:18])
         assert client.get("/v1/map/tiles").content == whole
         beyond = client.get("/v1/map/tiles", headers={"range": "bytes=9999-"})
-        assert beyond.status_code == 416
+        assert (beyond.status_code, beyond.headers["content-range"]) == (416, "bytes */208")
+
+
+def test_map_that_becomes_a_pipe_is_not_opened(shared_node: Any, area: Path) -> None:
+    """Opening a pipe for reading waits for a writer, on a thread that others need."""
+    with TestClient(create_app(shared_node, area=area)) as client:
+        tag = client.get("/v1/map/tiles").headers["etag"]
+        area.write_bytes(b"PMTiles\x03" + bytes(300))
+        assert client.get("/v1/map/tiles").headers["etag"] != tag
+        area.unlink()
+        os.mkfifo(area)
+        assert client.get("/v1/map/tiles").status_code == 404
 
 
 def test_no_map_is_served_when_none_is_configured(shared_node: Any) -> None:

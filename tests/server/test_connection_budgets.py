@@ -369,6 +369,15 @@ def test_addresses_of_wrong_tokens_are_bounded(make_node: Any) -> None:
     assert wrong.count == access.ADDRESSES_MAX + 10
 
 
+def test_wrong_tokens_of_many_addresses_are_limited_together(make_node: Any) -> None:
+    """Whoever has many addresses must not have ten prompt answers for each of them."""
+    wrong = access.WrongTokens(make_node(flown=False))
+    delays = [wrong.delay_s(f"2001:db8::{number:x}", number / 1000) for number in range(5000)]
+    prompt = delays.count(0.0)
+    assert access.WRONG_ALL_MAX <= prompt <= access.WRONG_ALL_MAX + 5 * access.WRONG_ALL_PER_S
+    assert wrong.delay_s("192.0.2.1", 60.0) == 0.0  # after a minute some are prompt again
+
+
 def test_page_files_are_cached_by_etag(make_node: Any) -> None:
     client = TestClient(create_app(make_node(flown=False)), "http://localhost")
     page = client.get("/")

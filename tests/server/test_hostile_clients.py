@@ -34,6 +34,7 @@ def test_endless_request_head_is_cut_off(make_node: Any) -> None:
         b"GET / HTTP/1.1\r\n" + b"x: y\r\n" * (1 << 22),
         b"GET / HTTP/1.1\r\n" + b"a:\r\n" * (connections.HEADERS_MOST + 1) + b"z" * (1 << 25),
         b"GET / HTTP/1.1\r\nx: " + b"y" * (1 << 25),
+        b"GET /?" + b"a&" * (1 << 24),
         b"GET / HTTP/1.1\r\n" + b"z" * (1 << 25),
         b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Length: 99999999\r\n\r\n"
         + b"z" * (1 << 25),

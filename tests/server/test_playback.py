@@ -1,5 +1,6 @@
 """Samples of a whole recording: read by a process of its own, one recording at a time."""
 
+import asyncio
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -69,6 +70,35 @@ def test_one_recording_is_read_at_a_time(
     assert client.get("/v1/recordings/two.mcap/history").status_code in (202, 409)
     monkeypatch.undo()
     assert whole(client, "one.mcap").status_code == 200
+
+
+def test_simultaneous_requests_for_many_recordings_start_one_process(
+    folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each process takes seconds of the machine's time."""
+    started, start = list[Path](), playback._start
+
+    def counted(path: Path) -> Any:
+        started.append(path)
+        return start(path)
+
+    async def ask(player: playback.Playback, path: Path) -> bool:
+        try:
+            await player.samples(path)
+        except playback.BusyError:
+            return False
+        return True
+
+    async def burst() -> list[bool]:
+        player = playback.Playback()
+        while not isinstance(await player.samples(folder / "one.mcap"), bytes):
+            pass
+        monkeypatch.setattr(playback, "_start", counted)
+        paths = [folder / "two.mcap", folder / "bad.mcap"] * 20
+        return await asyncio.gather(*(ask(player, path) for path in paths))
+
+    assert asyncio.run(burst()) == [True, False] * 20
+    assert started == [folder / "two.mcap"]
 
 
 def test_unreadable_and_unknown_recordings_are_refused(client: TestClient) -> None:

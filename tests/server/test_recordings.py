@@ -10,7 +10,7 @@ import pytest
 from starlette.testclient import TestClient
 
 from companion.server.app import create_app
-from companion.server.recordings import UnsatisfiableRangeError, span
+from companion.server.byte_ranges import UnsatisfiableRangeError, span
 
 FINISHED = "companion-20261120T130000Z.mcap"
 CURRENT = "companion-20261120T140000Z.mcap.active"

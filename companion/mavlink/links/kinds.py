@@ -15,7 +15,7 @@ from companion.mavlink.links.zenoh_link import ZenohLink
 from companion.mavlink.wire.aircraft_json import AircraftJson
 from companion.mavlink.wire.beast import BeastSplitter
 from companion.mavlink.wire.cot_link import CotSplitter
-from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.framing import Splitter, search_budget
 from companion.mavlink.wire.rid_json import RidJson
 from companion.mavlink.wire.sbs import SbsSplitter
 
@@ -32,7 +32,8 @@ def splitter(url: LinkUrl) -> Callable[[str], Splits]:
         case "cot":
             return CotSplitter
         case _:
-            return Splitter
+            search = search_budget()
+            return lambda link: Splitter(link, search=search)
 
 
 def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:

@@ -116,7 +116,8 @@ class Peers:
     """Peers of one link, bounded in number. Their frames are counted in ``status``.
 
     ``on_evict`` is called with each peer that is evicted, before its removal; ``splitter`` builds a
-    peer's splitter from the link's name.
+    peer's splitter from the link's name. ``is_first`` says whether missing frames of a sender count
+    for it: those of a stranger in its name do not.
     """
 
     def __init__(
@@ -124,8 +125,10 @@ class Peers:
         status: LinkStatus,
         on_evict: Callable[[Peer], None],
         splitter: Callable[[str], Splits] = Splitter,
+        is_first: Callable[[Peer, Source, int], bool] = lambda *_: True,
     ) -> None:
         self._status = status
+        self._is_first = is_first
         self._splitter = splitter
         self._on_evict = on_evict
         self._peers: OrderedDict[Hashable, Peer] = OrderedDict()
@@ -217,30 +220,34 @@ class Peers:
                 sender.due = (number + 1) & 0xFF
                 sender.run = 0
             else:
-                self._out_of_order(sender, number)
+                missing = self._out_of_order(sender, number)
+                if missing and self._is_first(peer, source, t_ns):
+                    counts.gaps += missing
 
     def count_rejection(self, refused: Rejection) -> None:
         """Count a rejection of bytes or frames of this link."""
         lost = self._status.lost
         lost[refused.reason] = lost.get(refused.reason, 0) + refused.count
 
-    def _out_of_order(self, sender: _PeerSender, number: int) -> None:
-        step = (number - sender.due + 1) & 0xFF
+    def _out_of_order(self, sender: _PeerSender, number: int) -> int:
+        """Process an unexpected sequence number; return how many frames are missing before it."""
+        step, missing = (number - sender.due + 1) & 0xFF, 0
         if step == 0:
             self._status.repeats += 1
-            return
+            return 0
         if step < _HALF_ROUND:
-            self._status.gaps += step - 1
-            sender.component.status.gaps += step - 1
+            missing = step - 1
+            self._status.gaps += missing
         else:
             self._status.late += 1
             continues = sender.run > 0 and 0 < (number - sender.late) & 0xFF < _HALF_ROUND
             sender.run = sender.run + 1 if continues else 1
             sender.late = number
             if sender.run < RESTART_RUN:
-                return
+                return 0
         sender.due = (number + 1) & 0xFF
         sender.run = 0
+        return missing
 
     def _add_source(self, peer: Peer, frame: Frame) -> _PeerSender:
         """Start to follow a source of this peer; its first sequence number counts as expected."""

@@ -111,7 +111,7 @@ class Link:
         self._newcomers = newcomers or Newcomers()
         self._refused = 0  # frames of newcomers not reported yet
         self._refused_ns = 0
-        self._peers = Peers(self.status, self._finish, splitter(url))
+        self._peers = Peers(self.status, self._finish, splitter(url), self._is_first)
         upcalls = Upcalls(
             up=self._up,
             take=self.take,
@@ -242,6 +242,10 @@ class Link:
         if admitted and not strange:
             peer.served.add(source)
         return admitted
+
+    def _is_first(self, peer: Peer, source: Source, now_ns: int) -> bool:
+        """Return whether a peer is the one that is believed about a sender."""
+        return self._known_peers.is_first(peer.address or self._name, source, now_ns)
 
     def _report_refused(self, items: list[Received]) -> None:
         """Add a rejection with the number of newcomers' frames, if one is due."""

@@ -11,14 +11,18 @@ agree with its path to ``AGREEMENT_M``. A stranger becomes known
 * at once if the settings name it as a router.
 
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
-again; its positions are used only as far as they agree with those of the other. So the vehicle that
-was here first stays believed, and a stranger costs it nothing; whoever sends first in a vehicle's
-name is believed until it falls silent.
+again; its positions are used only as far as they agree with those of the other. Its attitudes and
+what else moves a bound are used only where the other has not brought the same message shortly
+before: positions that agree prove nothing about these. So the vehicle that was here first stays
+believed, and a stranger costs it nothing; whoever sends first in a vehicle's name is believed until
+it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
 position or attitude, any message with a time stamp, TIMESYNC, HEARTBEAT, GPS_RAW_INT, GPS2_RAW
 and EKF_STATUS_REPORT.
+
+Over 300 lines: who is known, and what is used of each peer, depend on each other.
 """
 
 import math
@@ -30,7 +34,14 @@ from typing import Final
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
 from companion.mavlink.trust.paths import SLACK_M, Path
 from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE
-from companion.mavlink.wire.decode import DECODED, EKF_STATUS_REPORT, GPS_RAW_INT, HEARTBEAT, POSE
+from companion.mavlink.wire.decode import (
+    ATTITUDE,
+    DECODED,
+    EKF_STATUS_REPORT,
+    GPS_RAW_INT,
+    HEARTBEAT,
+    POSE,
+)
 from companion.mavlink.wire.encode import TIMESYNC
 from companion.mavlink.wire.positions import OWN, OwnPosition, read
 from companion.mavlink.wire.stamps import STAMPED
@@ -51,6 +62,12 @@ COMPARED_PER_S: Final = 30.0  # positions of strangers compared per sender and s
 NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one sender
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
+BROUGHT: Final = "the same message of this sender comes from the peer that was known first"
+BROUGHT_NS: Final = {
+    ATTITUDE: 300_000_000,
+    **dict.fromkeys((*ABOUT_ATTITUDE, GPS_RAW_INT, EKF_STATUS_REPORT, HEARTBEAT), 5_000_000_000),
+}
+"""Messages that move bounds, and the time for which one excludes those of peers known later."""
 _ABOUT_SENDER: Final = frozenset(
     {*STAMPED, *POSE, *ABOUT_ATTITUDE, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT}
 )
@@ -66,7 +83,7 @@ class _Peer:
     since_ns: int
     heard_ns: int
     messages: int = 1  # positions and attitudes since then
-    msgids: set[int] = field(default_factory=set)
+    newest: dict[int, Frame] = field(default_factory=dict)  # of each message since then
     path: Path = field(default_factory=Path)
     agreements: int = 0
     agrees_since_ns: int = 0
@@ -136,10 +153,11 @@ class KnownPeers:
             sender = self._follow(frame)
         known = sender.known.get(peer)
         if known is not None:
-            known.msgids.add(msgid)
-            if msgid not in POSE:
-                return None
-            known.hear(frame.t_ns)
+            known.newest[msgid] = frame
+            if msgid in POSE:
+                known.hear(frame.t_ns)
+            if msgid in BROUGHT_NS and len(sender.known) > 1:
+                return BROUGHT if _is_brought(sender, known, frame) else None
             if msgid not in OWN or (len(sender.known) == 1 and not sender.strangers):
                 return None
             return self._compare_known(sender, peer, known, frame)
@@ -149,7 +167,7 @@ class KnownPeers:
             if msgid in POSE:
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
             return None
-        if msgid not in _ABOUT_SENDER and not any(msgid in one.msgids for one in current):
+        if msgid not in _ABOUT_SENDER and not any(msgid in one.newest for one in current):
             return None
         if msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
             agrees = self._agrees(sender, peer, frame)
@@ -162,6 +180,19 @@ class KnownPeers:
         if sender is None or peer in sender.known or self._is_router(link, peer):
             return False
         return any(one.is_current(now_ns) for one in sender.known.values())
+
+    def is_first(self, peer: str, source: Source, now_ns: int) -> bool:
+        """Return whether no other current peer of a sender was known earlier."""
+        sender = self._senders.get(source)
+        if sender is None:
+            return True
+        known = sender.known.get(peer)
+        return not any(
+            one is not known
+            and one.is_current(now_ns)
+            and (known is None or _standing(one) > _standing(known))
+            for one in sender.known.values()
+        )
 
     # --- known peers --------------------------------------------------------------------------
 
@@ -202,7 +233,7 @@ class KnownPeers:
             del sender.known[old]
         sender.strangers.pop(name, None)
         peer.since_ns = frame.t_ns
-        peer.msgids.add(frame.msgid)
+        peer.newest[frame.msgid] = frame
         peer.messages, peer.heard_ns = 1, frame.t_ns
         self._add(sender.known, name, peer, frame.t_ns)
 
@@ -280,6 +311,22 @@ class KnownPeers:
         if len(self._senders) >= SENDERS_MAX:
             del self._senders[min(self._senders, key=lambda one: self._senders[one].heard_ns)]
         return self._senders.setdefault(frame.source, _Sender())
+
+
+def _is_brought(sender: _Sender, known: _Peer, frame: Frame) -> bool:
+    """Return whether a peer that was known earlier brought the same message shortly before.
+
+    Copies of its messages count as not brought: they are found as duplicates.
+    """
+    if known.is_router:
+        return False
+    newest = [
+        one.newest[frame.msgid]
+        for one in sender.known.values()
+        if _standing(one) > _standing(known) and frame.msgid in one.newest
+    ]
+    newest = [one for one in newest if frame.t_ns - one.t_ns <= BROUGHT_NS[frame.msgid]]
+    return bool(newest) and all(one.payload != frame.payload for one in newest)
 
 
 def _excess_m(known: _Peer, other: _Peer, before: OwnPosition | None, said: OwnPosition) -> float:

@@ -20,6 +20,7 @@ from fastcrc import crc16
 
 from companion.mavlink.wire.crc_extra import CRC_EXTRA, LONGEST
 from companion.values import Frame, Reason, Rejection, Source
+from companion.values.budget import Budget
 
 MAGIC_V1: Final = 0xFE
 MAGIC_V2: Final = 0xFD
@@ -28,6 +29,14 @@ SIGNED: Final = 0x01  # the only incompatibility flag defined; frames with any o
 SHORTEST: Final = 8  # bytes of a MAVLink 1 frame without a payload
 KNOWN_MAX: Final = 8192
 """Most distinct pairs of sender and message that a stream caches."""
+
+FALSE_STARTS_PER_S: Final = 20_000.0
+"""False starts of frames that a link examines per second, each in a microsecond or two.
+
+Random bytes have one in 130; a stranger's bytes may have one in two.
+"""
+FALSE_STARTS_SAVED: Final = 2000.0
+SKIPPED_AS_ONE: Final = 5  # magic bytes skipped unexamined in the time of a false start
 
 INCOMPLETE: Final = 0
 NOT_A_FRAME: Final = -1
@@ -98,20 +107,22 @@ def next_magic(buffer: bytes, at: int, end: int) -> int:
     return found.start() if found else end
 
 
-def _next_start(buffer: bytes, at: int, end: int, claimed_to: int) -> int:
-    """Return the index from ``at`` on where a frame can begin; ``end`` without one.
+def _next_start(buffer: bytes, at: int, end: int, claimed_to: int) -> tuple[int, int]:
+    """Return the index from ``at`` on where a frame can begin, and the magic bytes skipped.
 
-    It skips bytes that cannot start a frame if that does not change the counts: undefined flags
-    anywhere, and, within the claim of a failed frame, lengths that no MAVLink 1 message has. A
-    flood of magic bytes then costs no more than frames do.
+    The index is ``end`` without one. It skips bytes that cannot start a frame if that does not
+    change the counts: undefined flags anywhere, and, within the claim of a failed frame, lengths
+    that no MAVLink 1 message has. A flood of magic bytes then costs no more than frames do.
     """
+    skipped = 0
     while found := _find_start(buffer, at, end):
         at = found.start()
         inside = at + 5 < end and at < claimed_to and buffer[at] == MAGIC_V1
         if not inside or buffer[at + 1] <= LONGEST[buffer[at + 5]]:
-            return at
+            return at, skipped
         at += 1
-    return end
+        skipped += 1
+    return end, skipped
 
 
 Checked = tuple[Source, int, bytes]
@@ -159,17 +170,26 @@ class Checker:
         return source, msgid, raw
 
 
+def search_budget() -> Budget:
+    """Return the budget of false starts for the peers of one link."""
+    return Budget(per_s=FALSE_STARTS_PER_S, most=FALSE_STARTS_SAVED)
+
+
 class Splitter:
     """Incremental splitter of one peer's bytes into frames.
 
     ``wanted`` holds the message ids that are returned (None: all); other frames are only counted.
-    At most one unfinished frame is held between calls.
+    At most one unfinished frame is held between calls. ``search`` limits the false starts that are
+    examined; beyond it, the bytes of a call after a false start are garbage (None: no limit).
     """
 
-    def __init__(self, link: str, wanted: frozenset[int] | None = None) -> None:
+    def __init__(
+        self, link: str, wanted: frozenset[int] | None = None, search: Budget | None = None
+    ) -> None:
         self.link = link
         self.frames = 0  # frames with a correct checksum, wanted or not
         self._wanted = wanted
+        self._search = search
         self._pending = b""
         self._claimed = 0  # following bytes within the claimed length of a failed frame
         self._checker = Checker()
@@ -201,6 +221,7 @@ class Splitter:
         out: list[Frame | Rejection] = []
         lost: dict[Reason, int] = {}
         link, wanted, frame_at = self.link, self._wanted, self._checker.at
+        search, now_s = self._search, t_ns * 1e-9
         at, end, claimed_to = 0, len(buffer), self._claimed
         while at < end:
             found = frame_at(buffer, at, end)
@@ -218,7 +239,11 @@ class Splitter:
                 claims_to = at + claimed_length(buffer, at, end)
             else:
                 claims_to = claimed_to
-            resume = _next_start(buffer, at + 1, end, claims_to)
+            resume = end
+            if search is None or search.spend(1, now_s):
+                resume, skipped = _next_start(buffer, at + 1, end, claims_to)
+                if search is not None and skipped:
+                    search.spend(min(skipped / SKIPPED_AS_ONE, search.left), now_s)
             claimed_to = self._count(
                 lost, found, at=at, resume=resume, claimed_to=claimed_to, buffer=buffer
             )

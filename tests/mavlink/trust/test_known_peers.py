@@ -10,9 +10,15 @@ from peer_streams import HOME, LINK, OTHER, Place, S, Stream, beside, circle, he
 
 from companion.mavlink.trust import known_peers, paths
 from companion.mavlink.trust.duplicate_ids import KEPT_NS
-from companion.mavlink.trust.known_peers import PROBATION_NS, STRANGER, KnownPeers
+from companion.mavlink.trust.known_peers import BROUGHT, PROBATION_NS, STRANGER, KnownPeers
 from companion.mavlink.wire.attitudes import ATTITUDE_QUATERNION_COV, GPS2_RAW, ODOMETRY
-from companion.mavlink.wire.decode import EKF_STATUS_REPORT, GPS_RAW_INT, HEARTBEAT, SYSTEM_TIME
+from companion.mavlink.wire.decode import (
+    ATTITUDE,
+    EKF_STATUS_REPORT,
+    GPS_RAW_INT,
+    HEARTBEAT,
+    SYSTEM_TIME,
+)
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, heartbeat, pack
 from companion.mavlink.wire.framing import Splitter
 from companion.mavlink.wire.positions import HIGH_LATENCY2
@@ -107,6 +113,52 @@ def test_clocks_and_bounds_are_not_moved_by_strangers(msgid: int, payload: bytes
     answer = message(10.0, Outgoing(Source(1, 1), msgid, payload))
     assert peers.refusal(LINK, OTHER, answer) == STRANGER
     assert peers.refusal(LINK, HOME, answer) is None
+
+
+def attitude(t_s: float, yaw_rad: float) -> Frame:
+    payload = struct.pack("<I6f", round(t_s * 1000), 0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0)
+    return message(t_s, Outgoing(Source(1, 1), ATTITUDE, payload))
+
+
+def with_two_known_peers() -> KnownPeers:
+    """Peers after twenty seconds in which a second peer agreed about the position."""
+    peers = KnownPeers()
+    found = rejected(peers, heard(HOME, 10, lasts_s=20), heard(OTHER, 10, begins_s=5, lasts_s=15))
+    assert max(found[OTHER]) < 15
+    return peers
+
+
+def test_attitude_of_a_peer_whose_positions_agreed_is_not_used_beside_that_of_the_first() -> None:
+    """A stranger that repeats a parked carrier's position must not turn its array."""
+    peers = with_two_known_peers()
+    for number in range(100):
+        t_s = 20 + number / 100
+        if number % 10 == 0:
+            assert peers.refusal(LINK, HOME, attitude(t_s, 0.5)) is None
+        assert peers.refusal(LINK, OTHER, attitude(t_s + 0.09, 0.5 + t_s - 20)) == BROUGHT
+    copy = attitude(21.0, 0.5)
+    assert peers.refusal(LINK, HOME, copy) is None
+    assert peers.refusal(LINK, OTHER, copy) is None  # a duplicate, which is found as such
+
+
+def test_second_peer_brings_attitudes_while_the_first_brings_none_or_few() -> None:
+    peers = with_two_known_peers()
+    assert peers.refusal(LINK, OTHER, attitude(20.0, 0.5)) is None
+    assert peers.refusal(LINK, HOME, attitude(20.1, 0.5)) is None
+    taken = [peers.refusal(LINK, OTHER, attitude(20.1 + n / 50, 0.6)) is None for n in range(1, 50)]
+    assert not any(taken[:14])  # up to 0.3 s later
+    assert all(taken[16:])
+
+
+@pytest.mark.parametrize("msgid", [GPS_RAW_INT, GPS2_RAW, ODOMETRY, EKF_STATUS_REPORT, HEARTBEAT])
+def test_bounds_follow_the_peer_that_was_known_first(msgid: int) -> None:
+    peers = with_two_known_peers()
+    true, lie = (Outgoing(Source(1, 1), msgid, bytes([7]) * n) for n in (20, 21))
+    assert peers.refusal(LINK, OTHER, message(20.0, lie)) is None  # the first brought none yet
+    assert peers.refusal(LINK, HOME, message(20.1, true)) is None
+    assert peers.refusal(LINK, OTHER, message(24.9, lie)) == BROUGHT
+    assert peers.refusal(LINK, OTHER, message(25.2, lie)) is None
+    assert peers.refusal(LINK, HOME, message(25.3, lie)) is None  # the first is always used
 
 
 def test_stranger_is_a_peer_in_the_name_of_a_sender_with_a_current_known_peer() -> None:

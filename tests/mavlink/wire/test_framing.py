@@ -14,10 +14,11 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 from support import LONGEST_FRAME, examples, rounds
 
-from companion.mavlink.wire import encode
+from companion.mavlink.wire import encode, framing
 from companion.mavlink.wire.crc_extra import CRC_EXTRA
 from companion.mavlink.wire.framing import KNOWN_MAX, Splitter
 from companion.values import Frame, Reason, Rejection, Source
+from companion.values.budget import Budget
 
 Scan = Callable[[bytes], list[bytes]]
 Found = tuple[list[Frame], Counter[Reason]]
@@ -448,3 +449,38 @@ def test_more_senders_than_the_cache_holds_are_all_received() -> None:
     for _ in range(2):
         heard = [splitter.feed(0, encode.pack(encode.heartbeat(source), 0))[0] for source in sent]
         assert [frame.source for frame in heard if isinstance(frame, Frame)] == sent
+
+
+# --- work on bytes that are no frames -------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "start", [b"\xfe\x01", b"\xfe\x00\xfd", b"\xfe", b"\xfd\xff\0\0\1\1\1\4\0\0"]
+)
+def test_false_starts_are_examined_within_a_budget(
+    start: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Bytes of which every second one may start a frame must not take the time of others."""
+    examined, examine = 0, framing.examine
+
+    def counting(buffer: bytes, at: int, end: int) -> int:
+        nonlocal examined
+        examined += 1
+        return examine(buffer, at, end)
+
+    monkeypatch.setattr(framing, "examine", counting)
+    splitter = Splitter("x", search=framing.search_budget())
+    flood = start * (60_000 // len(start))
+    for number in range(100):
+        splitter.feed(number * 10_000_000, flood)  # 6 MB in a second
+    assert 0 < examined <= framing.FALSE_STARTS_SAVED + framing.FALSE_STARTS_PER_S + 100
+    frames = traffic(7)
+    found = splitter.feed(1_000_000_000, b"".join(frames) + flood)
+    assert [one.raw for one in found if isinstance(one, Frame)] == frames
+
+
+def test_bytes_beyond_the_budget_are_counted_as_garbage() -> None:
+    splitter = Splitter("x", search=Budget(per_s=0.0, most=1.0))
+    sent = b"\x55" * 1000
+    found = [one for _ in range(3) for one in splitter.feed(0, sent)]
+    assert sum(one.count for one in found if isinstance(one, Rejection)) == 3000

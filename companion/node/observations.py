@@ -120,15 +120,16 @@ class ObservationIntake:
             self.counts.received += 1
             self._step(found)
 
-    def _receive(self, _peer: Hashable, datagram: bytes, _age_ns: int | None) -> None:
+    def _receive(self, _peer: Hashable, datagram: bytes, _age_ns: int | None) -> bool:
         if not self.has_room(self._udp):
-            return
+            return False
         try:
             # The time of reading: events must stay in order, and the record has its own time.
             found: Observation | str = decode(datagram, self._now_ns(), self._utc_offset_ns())
         except ObservationRecordError as error:
             found = str(error)
         self.take(found, self._udp)
+        return False
 
     def _overflow(self, count: int) -> None:
         self.counts.dropped += count

@@ -13,6 +13,7 @@ from typing import Annotated, BinaryIO, Final
 from fastapi import Header, HTTPException
 from fastapi.responses import StreamingResponse
 
+from companion.server.connections import CutShortError
 from companion.server.threads import in_file_thread
 
 _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
@@ -84,12 +85,15 @@ def span(header: str | None, size: int) -> tuple[int, int] | None:
 
 
 async def _pieces(file: BinaryIO, start: int, stop: int) -> AsyncIterator[bytes]:
-    """Yield a file's bytes from ``start`` to ``stop``, off the event loop; close the file."""
+    """Yield a file's bytes from ``start`` to ``stop``, off the event loop; close the file.
+
+    Raises ``CutShortError`` if the file has become shorter.
+    """
     with file:
         await in_file_thread(file.seek, start)
         while start < stop:
             piece = await in_file_thread(file.read, min(PIECE_BYTES, stop - start))
             if not piece:
-                return
+                raise CutShortError
             start += len(piece)
             yield piece

@@ -9,6 +9,7 @@ import asyncio
 import resource
 from typing import Any, Final
 
+from starlette.requests import ClientDisconnect
 from uvicorn.protocols.http.flow_control import FlowControl
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
@@ -44,6 +45,10 @@ def most_connections() -> int:
     if soft == resource.RLIM_INFINITY:
         return CONNECTIONS_MAX
     return max(8, min(CONNECTIONS_MAX, soft - RESERVED))
+
+
+class CutShortError(Exception):
+    """Error of an answer that has begun and cannot be completed."""
 
 
 class _HoldingFlow(FlowControl):
@@ -198,7 +203,12 @@ class BoundedProtocol(HttpToolsProtocol):
                     cycle.disconnected = True
                 await send(message)
 
-            await app(scope, receive, send_if_open)
+            try:
+                await app(scope, receive, send_if_open)
+            except (asyncio.CancelledError, ClientDisconnect, CutShortError):
+                # The service ends, the client is gone, or a file is shorter than its answer.
+                cycle.disconnected = True
+                self.transport.abort()
 
         def start() -> None:
             if not self.transport.is_closing():

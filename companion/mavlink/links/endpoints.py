@@ -22,12 +22,13 @@ class Upcalls(NamedTuple):
     """Callbacks by which an endpoint reports events to its link.
 
     take      a peer sent bytes: its key, the bytes, and their age by the system's time stamp, ns
-              (None without a stamp); raises ``StalledError`` to end the connection
+              (None without a stamp); returns whether there is more, with which a call without
+              bytes continues; raises ``StalledError`` to end the connection
     stale     bytes of a peer that waited too long to be used
     """
 
     up: Callable[[], None]  # connected
-    take: Callable[[Hashable, bytes, int | None], None]
+    take: Callable[[Hashable, bytes, int | None], bool]
     stale: Callable[[Hashable, bytes], None]
     on_peer_gone: Callable[[Hashable], None]  # that peer is gone
     overflow: Callable[[int], None]  # the system dropped this many more datagrams

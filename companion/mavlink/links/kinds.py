@@ -1,6 +1,7 @@
 """Endpoint and splitter of each link scheme."""
 
 from collections.abc import Callable
+from typing import Final
 
 from companion.mavlink.links.endpoints import Endpoint, Upcalls
 from companion.mavlink.links.http_poll import HttpPoll
@@ -19,6 +20,10 @@ from companion.mavlink.wire.framing import Splitter, search_budget
 from companion.mavlink.wire.rid_json import RidJson
 from companion.mavlink.wire.sbs import SbsSplitter
 
+FRAMES_AT_ONCE: Final = 16  # frames processed before other work runs; one may take 0.3 ms
+_CONTINUED: Final = ("udpin", "udpout", "tcp", "tcpin")
+"""Schemes whose endpoints continue with the rest of what they read; the others read little."""
+
 
 def splitter(url: LinkUrl) -> Callable[[str], Splits]:
     """Return the factory of a link's splitters; each peer has its own."""
@@ -33,7 +38,8 @@ def splitter(url: LinkUrl) -> Callable[[str], Splits]:
             return CotSplitter
         case _:
             search = search_budget()
-            return lambda link: Splitter(link, search=search)
+            at_once = FRAMES_AT_ONCE if url.scheme in _CONTINUED else None
+            return lambda link: Splitter(link, search=search, at_once=at_once)
 
 
 def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:

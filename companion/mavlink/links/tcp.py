@@ -183,6 +183,7 @@ class _Stream(asyncio.BufferedProtocol):
         self._held_up: StaleBytes | None = None
         self._buffer = bytearray(PIECE_BYTES)
         self._piece: bytes | None = None  # read, and not processed yet
+        self._has_more = False  # frames of a processed piece wait in the splitter
         self._lost: Exception | None = None
         self._fault: Exception | None = None  # raised by the processing of a piece
 
@@ -211,11 +212,14 @@ class _Stream(asyncio.BufferedProtocol):
             self._order.add(self)
 
     def process(self) -> None:
-        """Process the piece that was read; then read the next one, or end."""
+        """Process the piece that was read, or more of it; then read the next one, or end."""
         piece, self._piece = self._piece, None
         try:
-            if piece:
-                self._upcalls.take(self, piece, None)
+            if (piece or self._has_more) and self._upcalls.take(self, piece or b"", None):
+                self._has_more, self._piece = True, b""
+                self._order.add(self)
+                return
+            self._has_more = False
         except Exception as fault:  # a defect must end the link, not disappear
             self._fault = fault
             self.abort()
@@ -259,6 +263,7 @@ class _Stream(asyncio.BufferedProtocol):
     def abort(self) -> None:
         """Close the connection and discard all bytes; if not yet made, close it on connect."""
         self._is_accepted = False
+        self._has_more = False
         if self._piece is not None:
             self._piece = b""
         if self._transport is not None:

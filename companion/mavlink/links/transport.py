@@ -160,11 +160,12 @@ class Link:
 
     # --- receiving --------------------------------------------------------------------------
 
-    def take(self, key: Hashable, data: bytes, age_ns: int | None = None) -> None:
+    def take(self, key: Hashable, data: bytes, age_ns: int | None = None) -> bool:
         """Split the bytes that a peer sent into frames, and pass them on.
 
         ``age_ns`` is the time since their arrival; None if unknown: they count as arrived now.
-        Raises ``StalledError`` if a server of another format completes no message.
+        Returns whether there is more: then a call without bytes continues. Raises ``StalledError``
+        if a server of another format completes no message.
         """
         began_s = time.perf_counter()
         peer = self._peers.at(key)
@@ -193,11 +194,15 @@ class Link:
             began_ns = peer.splitter.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
                 raise StalledError(f"no complete message in the bytes of {UNFINISHED_S} s")
+        return peer.splitter.has_more
 
     def _count_stale(self, key: Hashable, data: bytes) -> None:
         """Count the frames in stale bytes, and keep the splitter synchronised with the stream."""
         self.status.bytes += len(data)
-        found = self._peers.at(key).splitter.feed(self._now_ns(), data)
+        splitter, now_ns = self._peers.at(key).splitter, self._now_ns()
+        found = splitter.feed(now_ns, data)
+        while splitter.has_more:
+            found += splitter.feed(now_ns, b"")
         frames = sum(isinstance(item, Frame) for item in found)
         if frames:
             self.status.overflowed = (self.status.overflowed or 0) + frames

@@ -207,6 +207,8 @@ class _Datagrams:
         self._unfit = False
         self._lost: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
         self._wall_clock = kernel_time.SetWatch()
+        self._unfinished: tuple[Hashable, int | None] | None = None  # whose datagram, and when
+        self._continues: asyncio.Handle | None = None
         self._dropped = 0
         self._stale = 0
         self._unchecked = 0
@@ -248,6 +250,8 @@ class _Datagrams:
     def _read(self) -> None:
         was_set = self._wall_clock.was_set()
         until_s = time.monotonic() + SLICE_S
+        if self._unfinished is not None and not self._finish(*self._unfinished, until_s):
+            return
         for _ in range(READ_AT_ONCE):
             if time.monotonic() > until_s:
                 return
@@ -265,14 +269,41 @@ class _Datagrams:
             if age_ns is not None and age_ns > STALE_NS:
                 self._stale += 1
                 continue
-            try:
-                self._upcalls.take(None if self._connected else address, data, age_ns)
-            except Exception as fault:  # a defect must end the link, not disappear
-                settle(self._lost, fault)
+            key = None if self._connected else address
+            arrived_ns = None if age_ns is None else time.monotonic_ns() - age_ns
+            if self._take(key, data, age_ns) and not self._finish(key, arrived_ns, until_s):
+                return
+            if self._lost.done():
                 return
             self._unchecked += 1
             if self._unchecked >= OVERFLOW_CHECK_DATAGRAMS:
                 self._count_dropped()
+
+    def _take(self, key: Hashable, data: bytes, age_ns: int | None) -> bool:
+        """Pass bytes on; return whether the datagram has more frames."""
+        try:
+            return self._upcalls.take(key, data, age_ns)
+        except Exception as fault:  # a defect must end the link, not disappear
+            settle(self._lost, fault)
+            return False
+
+    def _finish(self, key: Hashable, arrived_ns: int | None, until_s: float) -> bool:
+        """Pass on the rest of a datagram, until a time; return whether that was all."""
+        while time.monotonic() <= until_s:
+            age_ns = None if arrived_ns is None else time.monotonic_ns() - arrived_ns
+            if not self._take(key, b"", age_ns):
+                self._unfinished = None
+                return True
+        self._unfinished = key, arrived_ns
+        if self._continues is None:
+            self._continues = asyncio.get_running_loop().call_soon(self._continue)
+        return False
+
+    def _continue(self) -> None:
+        """Go on with an unfinished datagram, also if no further one arrives."""
+        self._continues = None
+        if self._unfinished is not None and self._socket.fileno() >= 0:
+            self._read()
 
     def _age_ns(self, ancillary: kernel_time.Ancillary, was_set: bool) -> int | None:
         """Return how long a datagram has waited, ns; None without a valid time stamp."""

@@ -47,6 +47,9 @@ class ZenohLink:
         """Check that Zenoh is installed and accepts the endpoints. Raises ``UserError`` if not."""
         check(self._config)
 
+    def _take(self, _key: str, raw: bytes) -> None:
+        self._upcalls.take(None, raw, None)
+
     async def serve(self) -> None:
         """Serve until there is no neighbour left; then raise ``OSError``."""
         bus = Bus(self._config, asyncio.get_running_loop())
@@ -60,7 +63,7 @@ class ZenohLink:
         try:
             async with asyncio.timeout(OPEN_S):
                 await asyncio.to_thread(bus.open)
-            bus.subscribe(self._heard_key, lambda _, raw: self._upcalls.take(None, raw, None))
+            bus.subscribe(self._heard_key, self._take)
             bus.neighbours(joined)
             self._bus = bus
             self._upcalls.up()

@@ -17,7 +17,10 @@ class ForeignSplitter:
 
     ``unfinished_ns`` is the arrival time of the first bytes since the last complete message; None
     if there are none. A subclass counts each complete message in ``_complete``, unusable ones too.
+    ``has_more``: a message holds more than one call should process; ``feed`` without bytes goes on.
     """
+
+    has_more = False
 
     def __init__(self, link: str) -> None:
         self.link = link

@@ -13,6 +13,7 @@ after it: a damaged length byte would otherwise discard good frames. The claimed
 so that false starts inside it are not counted as further failures.
 """
 
+import math
 import re
 from typing import Final
 
@@ -180,14 +181,22 @@ class Splitter:
 
     ``wanted`` holds the message ids that are returned (None: all); other frames are only counted.
     At most one unfinished frame is held between calls. ``search`` limits the false starts that are
-    examined; beyond it, the bytes of a call after a false start are garbage (None: no limit).
+    examined; beyond it, the bytes of a call after a false start are garbage (None: no limit). A
+    call returns at most ``at_once`` frames (None: all); ``has_more`` says that a call without bytes
+    continues with the same ones.
     """
 
     def __init__(
-        self, link: str, wanted: frozenset[int] | None = None, search: Budget | None = None
+        self,
+        link: str,
+        wanted: frozenset[int] | None = None,
+        search: Budget | None = None,
+        at_once: int | None = None,
     ) -> None:
         self.link = link
         self.frames = 0  # frames with a correct checksum, wanted or not
+        self.has_more = False
+        self._at_once = math.inf if at_once is None else at_once
         self._wanted = wanted
         self._search = search
         self._pending = b""
@@ -222,6 +231,7 @@ class Splitter:
         lost: dict[Reason, int] = {}
         link, wanted, frame_at = self.link, self._wanted, self._checker.at
         search, now_s = self._search, t_ns * 1e-9
+        most = math.inf if last else self._at_once
         at, end, claimed_to = 0, len(buffer), self._claimed
         while at < end:
             found = frame_at(buffer, at, end)
@@ -232,6 +242,8 @@ class Splitter:
                     out.append(Frame(t_ns=t_ns, link=link, source=source, msgid=msgid, raw=raw))
                 at += len(raw)
                 claimed_to = at
+                if len(out) >= most:
+                    break
                 continue
             if found == INCOMPLETE and not last:
                 break
@@ -249,6 +261,7 @@ class Splitter:
             )
             at = resume
         self._pending = buffer[at:]
+        self.has_more = len(out) >= most and at < end
         self._claimed = max(0, claimed_to - at)
         out.extend(
             Rejection(t_ns=t_ns, source=self.link, reason=why, count=count)

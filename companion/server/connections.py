@@ -35,6 +35,8 @@ REQUESTS_PER_S: Final = 50.0  # requests of a connection that are started before
 REQUESTS_SAVED: Final = 200.0
 SETTLED_S: Final = 2.0
 """Time for a new connection's request, and for an answer, before it makes room for another."""
+USUAL_PATHS: Final = frozenset({"/healthz", "/v1/beams", "/v1/beams/weights"})
+"""Paths whose answer of the moment is made once; without a query they are started first."""
 CONNECTIONS_MAX: Final = 512
 RESERVED: Final = 96  # descriptors for links, recordings and files
 
@@ -215,7 +217,12 @@ class BoundedProtocol(HttpToolsProtocol):
                 self._answered = cycle
                 super(BoundedProtocol, self)._start_asgi_task(cycle, until_closed)
 
-        self._queue.add(start, within_budget=not self._over_budget)
+        path, query = cycle.scope["path"], cycle.scope["query_string"]
+        self._queue.add(
+            start,
+            within_budget=not self._over_budget,
+            is_usual=path in USUAL_PATHS and not query,
+        )
 
     # --- waiting ------------------------------------------------------------------------------
 

@@ -27,21 +27,23 @@ class RequestQueue:
     """Requests of all connections that are not started yet.
 
     Requests within the budget of their connection, and of all connections together, are started
-    first. The others wait for threads that compute: ``is_busy`` says whether one does.
+    first; of these, requests that many programs repeat and that cost least, such as for health and
+    beams. The others wait for threads that compute: ``is_busy`` says whether one does.
     """
 
     def __init__(self, is_busy: Callable[[], bool]) -> None:
         self._is_busy = is_busy
         self._budget = Budget(per_s=REQUESTS_PER_S, most=REQUESTS_SAVED)
+        self._usual: deque[Start] = deque()
         self._prompt: deque[Start] = deque()
         self._late: deque[Start] = deque()
         self._late_from_s = 0.0  # no request over a budget starts before this time
         self._wakes: asyncio.Handle | None = None
 
-    def add(self, start: Start, *, within_budget: bool) -> None:
+    def add(self, start: Start, *, within_budget: bool, is_usual: bool = False) -> None:
         """Start a request in an iteration to come. ``start`` must not raise."""
         if within_budget and self._budget.spend(1, asyncio.get_running_loop().time()):
-            self._prompt.append(start)
+            (self._usual if is_usual else self._prompt).append(start)
         else:
             self._late.append(start)
         self._schedule()
@@ -49,9 +51,10 @@ class RequestQueue:
     def _start_some(self) -> None:
         self._wakes = None
         left = AT_ONCE
-        while left and self._prompt:
-            self._prompt.popleft()()
-            left -= 1
+        for waiting in (self._usual, self._prompt):
+            while left and waiting:
+                waiting.popleft()()
+                left -= 1
         while left and self._late and self._may_start_late():
             if self._is_busy():
                 self._late_from_s = asyncio.get_running_loop().time() + BESIDE_WORK_S
@@ -65,7 +68,7 @@ class RequestQueue:
     def _schedule(self) -> None:
         """Continue in the next iteration if a request may start, else look again soon."""
         loop = asyncio.get_running_loop()
-        if self._prompt or (self._late and self._may_start_late()):
+        if self._usual or self._prompt or (self._late and self._may_start_late()):
             if self._wakes is not None:
                 self._wakes.cancel()
             self._wakes = loop.call_soon(self._start_some)

@@ -164,12 +164,14 @@ def test_requests_over_a_budget_wait_for_others_and_for_threads() -> None:
         count()
         for _ in range(10):
             queue.add(start("late"), within_budget=False)
-        for _ in range(20):
+        for _ in range(18):
             queue.add(start("prompt"), within_budget=True)
+        for _ in range(2):
+            queue.add(start("usual"), within_budget=True, is_usual=True)
         await asyncio.sleep(0)
         while len(started) < 22:  # one at a time while threads compute
             await asyncio.sleep(0)
-        assert started[:20] == ["prompt"] * 20
+        assert started[:20] == ["usual"] * 2 + ["prompt"] * 18
         assert iteration[0] >= 20 / AT_ONCE
         busy = False
         await done.wait()
@@ -376,6 +378,28 @@ def test_wrong_tokens_of_many_addresses_are_limited_together(make_node: Any) -> 
     prompt = delays.count(0.0)
     assert access.WRONG_ALL_MAX <= prompt <= access.WRONG_ALL_MAX + 5 * access.WRONG_ALL_PER_S
     assert wrong.delay_s("192.0.2.1", 60.0) == 0.0  # after a minute some are prompt again
+
+
+def test_health_is_answered_before_a_burst_of_other_requests(make_node: Any) -> None:
+    """Its monitor must not take a service for dead that answers hundreds of others first."""
+
+    async def burst() -> None:
+        async with served(make_node(flown=False)) as port:
+            clients = [await connected(port) for _ in range(60)]
+            asks = [b"GET /v1/status HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"] * 59
+            asks.append(b"GET /healthz HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            answered = list[int]()
+
+            async def answer(number: int) -> None:
+                await clients[number][0].readline()
+                answered.append(number)
+
+            for (_, writer), ask in zip(clients, asks, strict=True):
+                writer.write(ask)
+            await asyncio.gather(*(answer(number) for number in range(60)))
+            assert answered.index(59) < 30
+
+    run_async(burst())
 
 
 def test_page_files_are_cached_by_etag(make_node: Any) -> None:

@@ -285,6 +285,24 @@ def test_body_beyond_the_limit_of_the_connection_is_rejected(node: Any) -> None:
     run_async(test())
 
 
+def test_client_that_leaves_within_its_body_writes_nothing_to_the_log(
+    node: Any, capfd: pytest.CaptureFixture[str]
+) -> None:
+    head = f"POST {PATH} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
+
+    async def left() -> None:
+        async with served(node) as port:
+            for _ in range(3):
+                _, writer = await connected(port)
+                writer.write(f"{head}Content-Length: 100\r\n\r\n[".encode())
+                assert await asked(await connected(port)) == b"HTTP/1.1 200 OK\r\n"
+                writer.transport.abort()
+            assert await asked(await connected(port)) == b"HTTP/1.1 200 OK\r\n"
+
+    run_async(left())
+    assert capfd.readouterr().err == ""
+
+
 def test_names_derive_from_the_event() -> None:
     """Every value of the event is given under its name in JSON; times have names of their own."""
     expected = {name_in_json(one.name) for one in members(Observation) if one.name != "t_ns"}

@@ -22,7 +22,7 @@ from companion.mavlink.links.peers import PEERS_MAX
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
 from companion.mavlink.wire.encode import Outgoing, heartbeat, pack, timesync
-from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.framing import FALSE_STARTS_SAVED, Splitter
 from companion.values import Frame, Reason, Rejection, Severity, Source
 
 OURS = Source(5, 191)
@@ -1095,6 +1095,23 @@ def test_large_datagram_is_processed_a_few_frames_at_a_time(run: Run) -> None:
                     grown.append(len(inbox.frames) - before)
             assert [one.raw for one in inbox.frames] == frames
             assert sum(count > 0 for count in grown) > 1  # not all of them in one iteration
+
+    run(test())
+
+
+def test_peers_of_a_link_share_its_budget_of_false_starts(run: Run) -> None:
+    """Whoever has many ports must not have a budget for each."""
+
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            await until_true(lambda: link.status.state == "up")
+            flood = b"\xfe\x01" * 700
+            for port in range(40):
+                link.take(("127.0.0.1", 1000 + port), flood)
+            failed = sum(one.count for one in inbox.rejections if one.reason is Reason.BAD_CRC)
+            assert 0 < failed < FALSE_STARTS_SAVED
+            (garbage,) = [one for one in inbox.items[-1:] if isinstance(one, Rejection)]
+            assert (garbage.reason, garbage.count) == (Reason.GARBAGE, len(flood) - 9)
 
     run(test())
 

@@ -84,3 +84,15 @@ def test_answer_from_a_long_silent_peer_is_rejected(taken: Taken) -> None:
 def test_timesync_request_is_not_treated_as_an_answer(taken: Taken) -> None:
     assert isinstance(taken.take(ELSEWHERE, answer(0)), Frame)
     assert Splitter("x").feed(0, answer(0))
+
+
+def test_sequence_numbers_of_strangers_count_for_no_vehicle(taken: Taken) -> None:
+    """They would show a vehicle as lossy that loses nothing."""
+    for number in range(50):
+        taken.now_ns += 100_000_000
+        taken.take(HOME, frame(100 * number, seq=number))
+        taken.take(ELSEWHERE, frame(100 * number + 7, sysid=1, seq=50 * number % 256))
+    status = taken.link.status.components[VEHICLE]
+    assert status.gaps == 0
+    taken.take(HOME, frame(6000, seq=59))
+    assert status.gaps == 9

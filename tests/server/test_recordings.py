@@ -1,14 +1,20 @@
 """Recordings over HTTP: listed, complete, by range, and while being written; no other files."""
 
+import asyncio
+import contextlib
 import dataclasses
 import os
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from http_support import asked, connected, served
 from starlette.testclient import TestClient
+from support import HANG_S
 
+from companion.server import recordings
 from companion.server.app import create_app
 from companion.server.byte_ranges import UnsatisfiableRangeError, span
 
@@ -146,3 +152,55 @@ def test_only_the_named_recording_file_is_listed(make_node: Any, folder: Path) -
     with TestClient(create_app(node)) as client:
         (only,) = client.get("/v1/recordings").json()["recordings"]
     assert only["name"] == FINISHED
+
+
+def test_recording_cut_short_while_it_is_read_ends_the_answer(
+    make_node: Any, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / FINISHED
+    path.write_bytes(bytes(1 << 24))
+    ask = f"GET /v1/recordings/{FINISHED} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()
+
+    async def cut() -> int:
+        node = make_node(flown=False, recording={"directory": str(tmp_path)})
+        async with served(node) as port:
+            reader, writer = await connected(port)
+            writer.write(ask)
+            await reader.readuntil(b"\r\n\r\n")
+            os.truncate(path, 1 << 20)
+            with contextlib.suppress(ConnectionError):
+                return len(await reader.read())
+            return 0
+
+    assert asyncio.run(cut()) < 1 << 24
+    assert capfd.readouterr().err == ""
+
+
+def test_listings_are_shared_and_delay_no_other_answer(
+    make_node: Any, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Reading a large folder takes long; all who ask meanwhile share the next reading."""
+    may_end, calls = threading.Event(), list[str | None]()
+
+    def slow(where: str | None, current: Any) -> list[Any]:
+        calls.append(where)
+        may_end.wait(HANG_S)
+        return []
+
+    monkeypatch.setattr(recordings, "listed", slow)
+    listing, beams = (f"GET {path} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode()
+                      for path in ("/v1/recordings", "/v1/pattern"))  # fmt: skip
+
+    async def ask() -> None:
+        node = make_node(recording={"directory": str(folder)})
+        async with served(node) as port:
+            clients = [await connected(port) for _ in range(30)]
+            answers = [asyncio.create_task(asked(one, listing)) for one in clients]
+            await asyncio.sleep(0)
+            assert await asked(await connected(port), beams) == b"HTTP/1.1 200 OK\r\n"
+            assert not any(one.done() for one in answers)
+            may_end.set()
+            assert set(await asyncio.gather(*answers)) == {b"HTTP/1.1 200 OK\r\n"}
+
+    asyncio.run(ask())
+    assert len(calls) <= 3

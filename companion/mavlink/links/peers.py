@@ -41,11 +41,15 @@ _HALF_ROUND: Final = 128
 class Splits(Protocol):
     """Parser of a peer's bytes: MAVLink's splitter, or one of another format.
 
-    While ``has_more``, a call of ``feed`` without bytes returns more of what was received.
+    While ``has_more``, a call of ``feed`` without bytes returns more of what was received, of which
+    ``waiting_bytes`` are left.
     """
 
     @property
     def has_more(self) -> bool: ...
+
+    @property
+    def waiting_bytes(self) -> int: ...
 
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
         """Parse bytes that arrived at ``t_ns``; return the complete frames and the rejections."""

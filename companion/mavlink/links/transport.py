@@ -47,6 +47,8 @@ STEADY_S: Final = 1.0
 """Seconds for which a connection must last before it is reported as restored."""
 REFUSED_EVERY_NS: Final = 500_000_000
 """Least time between two rejections of newcomers, each with the number of their frames."""
+WAITING_MAX_BYTES: Final = 1 << 16
+"""Bytes of a peer that may wait while other work runs; more are dropped and counted."""
 UNFINISHED_S: Final = 10
 """Seconds of received bytes without a complete message after which a connection is closed."""
 PEER_ACTIVE_S: Final = 10.0
@@ -174,6 +176,9 @@ class Link:
         if age_ns is not None:
             self._lag.observe(t_ns, age_ns)
             t_ns -= age_ns
+        if data and peer.splitter.waiting_bytes > WAITING_MAX_BYTES:
+            self._overflow(1)
+            return False  # a call is due already
         found = peer.splitter.feed(t_ns, data)
         if found:
             self._pass_on(peer, found)

@@ -11,6 +11,7 @@ import socket
 import struct
 import sys
 import time
+from collections import deque
 from collections.abc import Collection, Hashable, Iterator
 from dataclasses import replace
 from typing import Final, cast
@@ -34,6 +35,7 @@ STALE_NS: Final = 2_000_000_000
 READ_AT_ONCE: Final = 32
 """Most datagrams read before other work runs, as in libuv; ``SLICE_S`` limits them too."""
 DATAGRAM_BYTES: Final = 1 << 16  # more than any datagram has
+UNFINISHED_MAX: Final = 64  # datagrams with more frames than one call processes
 
 _SO_MEMINFO: Final = 55  # Linux, include/uapi/asm-generic/socket.h
 _SK_MEMINFO_BYTES: Final = 36  # nine 32-bit numbers, include/uapi/linux/sock_diag.h
@@ -207,7 +209,7 @@ class _Datagrams:
         self._unfit = False
         self._lost: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
         self._wall_clock = kernel_time.SetWatch()
-        self._unfinished: tuple[Hashable, int | None] | None = None  # whose datagram, and when
+        self._unfinished: deque[tuple[Hashable, int | None]] = deque()  # peer, time of arrival
         self._continues: asyncio.Handle | None = None
         self._dropped = 0
         self._stale = 0
@@ -250,9 +252,7 @@ class _Datagrams:
     def _read(self) -> None:
         was_set = self._wall_clock.was_set()
         until_s = time.monotonic() + SLICE_S
-        if self._unfinished is not None and not self._finish(*self._unfinished, until_s):
-            return
-        for _ in range(READ_AT_ONCE):
+        for _ in range(READ_AT_ONCE if len(self._unfinished) < UNFINISHED_MAX else 0):
             if time.monotonic() > until_s:
                 return
             try:
@@ -271,8 +271,9 @@ class _Datagrams:
                 continue
             key = None if self._connected else address
             arrived_ns = None if age_ns is None else time.monotonic_ns() - age_ns
-            if self._take(key, data, age_ns) and not self._finish(key, arrived_ns, until_s):
-                return
+            if self._take(key, data, age_ns):
+                self._unfinished.append((key, arrived_ns))
+                self._continue_soon()
             if self._lost.done():
                 return
             self._unchecked += 1
@@ -287,23 +288,23 @@ class _Datagrams:
             settle(self._lost, fault)
             return False
 
-    def _finish(self, key: Hashable, arrived_ns: int | None, until_s: float) -> bool:
-        """Pass on the rest of a datagram, until a time; return whether that was all."""
-        while time.monotonic() <= until_s:
-            age_ns = None if arrived_ns is None else time.monotonic_ns() - arrived_ns
-            if not self._take(key, b"", age_ns):
-                self._unfinished = None
-                return True
-        self._unfinished = key, arrived_ns
+    def _continue_soon(self) -> None:
         if self._continues is None:
             self._continues = asyncio.get_running_loop().call_soon(self._continue)
-        return False
 
     def _continue(self) -> None:
-        """Go on with an unfinished datagram, also if no further one arrives."""
+        """Pass on more of the unfinished datagrams, each in turn; new ones are read in between."""
         self._continues = None
-        if self._unfinished is not None and self._socket.fileno() >= 0:
-            self._read()
+        if self._socket.fileno() < 0 or self._lost.done():
+            return
+        until_s = time.monotonic() + SLICE_S
+        while self._unfinished and time.monotonic() <= until_s:
+            key, arrived_ns = self._unfinished.popleft()
+            age_ns = None if arrived_ns is None else time.monotonic_ns() - arrived_ns
+            if self._take(key, b"", age_ns):
+                self._unfinished.append((key, arrived_ns))
+        if self._unfinished:
+            self._continue_soon()
 
     def _age_ns(self, ancillary: kernel_time.Ancillary, was_set: bool) -> int | None:
         """Return how long a datagram has waited, ns; None without a valid time stamp."""

@@ -21,6 +21,7 @@ class ForeignSplitter:
     """
 
     has_more = False
+    waiting_bytes = 0
 
     def __init__(self, link: str) -> None:
         self.link = link

@@ -203,6 +203,11 @@ class Splitter:
         self._claimed = 0  # following bytes within the claimed length of a failed frame
         self._checker = Checker()
 
+    @property
+    def waiting_bytes(self) -> int:
+        """Number of bytes that are not processed yet; of an unfinished frame without more."""
+        return len(self._pending)
+
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
         """Parse bytes that arrived at ``t_ns``; return the frames that these bytes complete.
 

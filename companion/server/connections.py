@@ -20,6 +20,7 @@ HEAD_BYTES: Final = 16_384
 """Limit on the bytes of a request line and headers; browsers send one or two thousand."""
 HEADERS_MOST: Final = 100  # limit on a request's headers; each takes microseconds
 PARAMETERS_MAX: Final = 300  # limit on a query's parameters; 256 UAVs may be named
+CHUNKS_MAX: Final = 512  # limit on the parts of a request's body, each of which takes microseconds
 BODY_BYTES: Final = 65_536  # limit on a request's body; /v1/observations has one
 HEAD_S: Final = 10.0
 """Time limit for a complete head, from connecting or from the last answer, seconds."""
@@ -84,6 +85,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._unparsed = bytearray()
         self._in_head = True
         self._parsed_bytes = 0  # since the last complete request, framing of its body included
+        self._chunks = 0  # parts of the body that is being received
         self._deadline: asyncio.TimerHandle | None = None
         self._stalled: asyncio.TimerHandle | None = None
         self._since_s = 0.0  # time of the connection, of the last head, or of the last answer
@@ -148,6 +150,7 @@ class BoundedProtocol(HttpToolsProtocol):
                 self._parsed_bytes > most
                 or len(self.headers or ()) > HEADERS_MOST
                 or (self.url or b"").count(b"&") >= PARAMETERS_MAX
+                or self._chunks > CHUNKS_MAX
             )
             if is_long and not self.transport.is_closing():
                 self.send_400_response("The request is too long.")
@@ -166,9 +169,14 @@ class BoundedProtocol(HttpToolsProtocol):
         self._since_s = self.loop.time()
         super().on_headers_complete()
 
+    def on_body(self, body: bytes) -> None:
+        """Count a part of the body; a piece of 256 bytes may have forty."""
+        self._chunks += 1
+        super().on_body(body)
+
     def on_message_complete(self) -> None:
         """End a request; further bytes belong to the next head."""
-        self._in_head, self._parsed_bytes = True, 0
+        self._in_head, self._parsed_bytes, self._chunks = True, 0, 0
         super().on_message_complete()
 
     def handle_websocket_upgrade(self) -> None:

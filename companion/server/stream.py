@@ -3,7 +3,8 @@
     ?uav=1:1&uav=2:1     only these UAVs (default: all)
     &topic=uavs          uavs, beams, weights, records, status, links, fleet, events (default:
                          uavs and beams)
-    &rate_hz=10          largest rate of each topic, limited by the update rate
+    &rate_hz=10          largest rate of each topic, limited by the update rate, and by 2000
+                         messages per second to all clients
 
 Every message is a JSON object: the answer of the path of that name, with ``topic`` and
 ``valid_at``. ``records`` are the exception: binary messages, each the whole record of an update
@@ -56,6 +57,8 @@ QUIET_S: Final = 5.0
 
 It is longer than the time between two pings.
 """
+MESSAGES_PER_S: Final = 2000.0
+"""Messages per second to all clients; with more topics in all, each is sent less often."""
 SLOTS: Final = 32
 """Number of slots over which clients' messages are spread after an update.
 
@@ -119,6 +122,7 @@ class Stream:
         self._node = node
         self._snapshot = Snapshot(-1)
         self._in_slot = [0] * SLOTS
+        self._topics = 0  # of all clients together
         self._slot_s = 0.5 / SLOTS / node.pipeline.settings.beams.update_hz
 
     @property
@@ -144,6 +148,7 @@ class Stream:
             return
         slot = self._in_slot.index(min(self._in_slot))
         self._in_slot[slot] += 1
+        self._topics += len(asked.topics)
         self._open.append(websocket)
         try:
             await self._attend(websocket, asked, slot * self._slot_s)
@@ -153,6 +158,7 @@ class Stream:
             if websocket in self._open:
                 self._open.remove(websocket)
             self._in_slot[slot] -= 1
+            self._topics -= len(asked.topics)
 
     def _makes_room(self, newcomer: WebSocket) -> bool:
         """Close a stream in favour of another client, and return whether there is one to close.
@@ -191,10 +197,13 @@ class Stream:
 
     async def _send(self, websocket: WebSocket, asked: Wanted, turn_s: float) -> None:
         """Send changes at each due update, ``turn_s`` after it, until cancelled."""
-        loop, period_s = asyncio.get_running_loop(), 1 / asked.rate_hz
-        due_s, said = loop.time(), dict[Topic, object]()
+        loop, said = asyncio.get_running_loop(), dict[Topic, object]()
+        due_s = loop.time()
         while True:
+            if turn_s:
+                await asyncio.sleep(turn_s)
             updates = self._node.pipeline.updates
+            period_s = max(1 / asked.rate_hz, self._topics / MESSAGES_PER_S)
             if loop.time() >= due_s - _EARLY * period_s:
                 due_s = max(due_s + period_s, loop.time())
                 for topic in asked.topics:
@@ -213,8 +222,6 @@ class Stream:
             # A change during the sending to a slow client does not wait for another tick.
             if self._node.pipeline.updates == updates:
                 await self._node.ticked()
-            if turn_s:
-                await asyncio.sleep(turn_s)
 
     def _version(self, topic: Topic) -> object:
         """Return a value of a topic that changes whenever there is something new to send."""
@@ -228,6 +235,8 @@ class Stream:
         if self._snapshot.number != self._node.pipeline.updates:
             self._snapshot = Snapshot(self._node.pipeline.updates)
         messages = self._snapshot.messages
+        if topic not in topics.OF_UAVS:
+            uavs = frozenset()  # the same message for all clients
         if (topic, uavs) not in messages:
             messages[topic, uavs] = _task(self._encoded(self._snapshot, topic, uavs))
         return await asyncio.shield(messages[topic, uavs])  # other clients may wait for it too

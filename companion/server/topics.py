@@ -38,6 +38,9 @@ class RecordBody:
     guaranteed_db: list[float | None] | None
 
 
+OF_UAVS: Final = frozenset({Topic.UAVS, Topic.BEAMS, Topic.WEIGHTS, Topic.RECORDS})
+"""Topics whose messages depend on the UAVs that a client names."""
+
 Body = Json | RecordBody | UavParts
 
 FEW_WEIGHTS: Final = 2048  # weights up to which the event loop encodes at once

@@ -139,6 +139,25 @@ def test_request_framing_without_end_is_cut_off(make_node: Any) -> None:
     run_async(flooded())
 
 
+def test_body_of_tiny_chunks_is_cut_off(make_node: Any) -> None:
+    head = b"POST / HTTP/1.1\r\nHost: 127.0.0.1\r\nTransfer-Encoding: chunked\r\n\r\n"
+
+    async def flooded() -> None:
+        async with served(make_node(flown=False), TOKEN) as port:
+            client = await connected(port)
+            client[1].write(head + b"1\r\na\r\n" * (1 << 21))
+            assert await ends(client)
+            assert client[1].transport.get_write_buffer_size() > 1 << 22 or (
+                client[1].transport.is_closing()
+            )
+            whole = b"100\r\n" + b"a" * 256 + b"\r\n"
+            allowed = head + whole * 16 + b"0\r\n\r\n"
+            answer = await asked(await connected(port), allowed)
+            assert answer == b"HTTP/1.1 405 Method Not Allowed\r\n"
+
+    run_async(flooded())
+
+
 def test_requests_over_a_budget_wait_for_others_and_for_threads() -> None:
     async def queued() -> None:
         busy = True

@@ -151,6 +151,27 @@ def test_stream_respects_the_requested_rate(make_node: Any, serving: Any) -> Non
     run_async(check())
 
 
+def test_many_streams_share_a_rate(
+    make_node: Any, serving: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(stream, "MESSAGES_PER_S", 10.0)  # for two topics of one client: 5 Hz
+
+    async def check() -> None:
+        node = make_node()
+        query = "topic=status&topic=events&rate_hz=100"
+        loop = asyncio.get_running_loop()
+        async with serving(node) as at, connect(f"ws://{at}/v1/stream?{query}") as websocket:
+            await said(websocket)
+            begun_s = loop.time()
+            while loop.time() < begun_s + 0.7:
+                node.tick(0.01)
+                await asyncio.sleep(0.005)
+            topics = [json.loads(one.data)["topic"] for one in websocket.recv_messages.frames.queue]
+        assert 2 <= topics.count("status") <= 4
+
+    run_async(check())
+
+
 def test_identical_subscriptions_share_one_message(make_node: Any, serving: Any) -> None:
     """All receive the same bytes, although the clock has advanced."""
 

@@ -19,7 +19,9 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import hcl2
 import pytest
+from hcl2 import SerializationOptions
 from packaging.metadata import Metadata
 from support import HANG_S, ROOT, line_of, started
 
@@ -332,10 +334,48 @@ def test_debian_package_has_all_packages_for_its_architecture(arch: str, tmp_pat
 # --- the image ------------------------------------------------------------------------------------
 
 
-def test_bake_definition_builds_both_architectures() -> None:
+def bake_targets() -> dict[str, Any]:
+    """The targets of docker-bake.hcl, with variables as written."""
     text = (ROOT / "docker-bake.hcl").read_text(encoding="utf-8")
-    assert 'platforms  = ["linux/amd64", "linux/arm64"]' in text
-    assert f'default = "{companion.__version__}"' in text
-    (dockerfile,) = re.findall(r'dockerfile = "(.+)"', text)
-    assert (ROOT / dockerfile).is_file()
-    assert text.count("{") == text.count("}")
+    options = SerializationOptions(
+        with_comments=False, explicit_blocks=False, strip_string_quotes=True
+    )
+    found = hcl2.loads(text, serialization_options=options)
+    (version,) = (one["TAG"]["default"] for one in found["variable"] if "TAG" in one)
+    assert version == companion.__version__
+    assert found["group"] == [{"default": {"targets": ["companion"]}}]
+    return {name: target for one in found["target"] for name, target in one.items()}
+
+
+def test_bake_definition_builds_both_architectures() -> None:
+    targets = bake_targets()
+    assert targets.keys() == {"companion", "blueos"}
+    for target in targets.values():
+        assert target["platforms"] == ["linux/amd64", "linux/arm64"]
+        assert (ROOT / target["context"] / target["dockerfile"]).is_file()
+        assert all("${TAG}" in tag or tag.endswith(":latest") for tag in target["tags"])
+    # `FROM ${IMAGE}` is the image of the first target, not one of a registry.
+    extension = targets["blueos"]
+    assert extension["contexts"] == {extension["args"]["IMAGE"]: "target:companion"}
+    assert "\nFROM ${IMAGE}\n" in (ROOT / "examples/blueos/Dockerfile").read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(shutil.which("buildx") is None, reason="no buildx on the PATH")
+def test_buildx_reads_the_bake_definition(tmp_path: Path) -> None:
+    """Also the compose file, which buildx reads besides it and merges with targets of one name."""
+    command = ["buildx", "bake", "--print", "--progress=quiet", "companion", "blueos"]
+    environment = os.environ | {"DOCKER_CONFIG": str(tmp_path), "REGISTRY": "registry.example/"}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True,
+        timeout=HANG_S,
+    )  # fmt: skip
+    printed = json.loads(done.stdout)["target"]
+    for name, target in bake_targets().items():
+        assert printed[name]["platforms"] == target["platforms"]
+        assert printed[name]["context"] == target["context"]
+    version = companion.__version__
+    assert printed["blueos"]["tags"] == [f"registry.example/companion-blueos:{version}"]
+    assert printed["blueos"]["args"] == {"IMAGE": "companion", "VERSION": version}
+    assert set(printed["companion"]["tags"]) == {
+        f"registry.example/uav-companion-beams:{tag}" for tag in (version, "latest")
+    }

@@ -15,13 +15,15 @@ import tomllib
 import urllib.request
 import venv
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import hcl2
 import pytest
 from hcl2 import SerializationOptions
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
 from packaging.metadata import Metadata
 from support import HANG_S, ROOT, line_of, started
 
@@ -29,6 +31,7 @@ import companion
 
 EPOCH = {"SOURCE_DATE_EPOCH": "1700000000"}
 DOC = "usr/share/doc/uav-companion-beams"
+DESCRIPTION = (ROOT / "deploy" / "description.md").read_text(encoding="utf-8")
 FORBIDDEN = "/Build", "/tests/", ".pyc", "/.venv", ".mcap"
 
 
@@ -85,9 +88,56 @@ def test_metadata_is_valid_for_an_index(wheel: Path, archive: Path) -> None:
     found = Metadata.from_email(raw, validate=True)
     assert (found.name, str(found.version)) == ("uav-companion-beams", companion.__version__)
     assert found.description_content_type == "text/markdown"
-    assert found.description and found.description.startswith("# companion")
+    assert found.description == DESCRIPTION
     assert found.license_expression == "Apache-2.0"
     assert found.author_email == maintainer()
+
+
+def targets_of(tokens: Sequence[Token]) -> list[str]:
+    """The targets of all links and images in a Markdown document."""
+    found = [
+        str(token.attrs[name])
+        for token in tokens
+        for name in ("href", "src")
+        if name in token.attrs
+    ]
+    return found + [target for token in tokens for target in targets_of(token.children or [])]
+
+
+def test_description_needs_nothing_beside_it(archive: Path) -> None:
+    """An index shows it alone: no relative link or image, no command of the repository."""
+    assert targets_of(MarkdownIt().parse("[a](docs/a.md) ![b](b.png)")) == ["docs/a.md", "b.png"]
+    targets = targets_of(MarkdownIt().enable("table").parse(DESCRIPTION))
+    assert [target for target in targets if not target.startswith("https://")] == []
+    assert not re.search(r"^    make |`make ", DESCRIPTION, re.MULTILINE)
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    cells = re.findall(r"^\| (`.+?) \|", DESCRIPTION, re.MULTILINE)
+    assert set(re.findall(r"`(\w+)`", " ".join(cells))) == extras.keys() - {"dev"}
+    mentioned = set(re.findall(r"`(docs/[\w.-]+)`", DESCRIPTION))
+    with tarfile.open(archive) as tar:
+        names = {name.partition("/")[2] for name in tar.getnames()}
+    assert mentioned and mentioned <= names
+
+
+def test_description_says_what_the_readme_says(archive: Path) -> None:
+    """The same words, apart from the picture and the links, which work in the source archive."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    plain = re.sub(
+        r"(?<!!)\[([^]]*)\]\([^)]*\)", r"\1", re.sub(r"^!\[.*\n\n", "", readme, flags=re.M)
+    )
+    introduction = plain.partition("\n## ")[0]
+    assert len(introduction) > 1000 and DESCRIPTION.startswith(introduction)
+    library = (
+        "`companion` is also a library." + plain.partition("`companion` is also a library.")[2]
+    )
+    snippet = library.partition("Licence:")[0]
+    assert snippet.count("\n") > 5 and snippet in DESCRIPTION
+    with tarfile.open(archive) as tar:
+        names = {name.partition("/")[2] for name in tar.getnames()}
+    links = set(re.findall(r"\]\(([\w./-]+)\)", readme))
+    assert "docs/links.md" in links and links <= names
 
 
 def test_wheel_contains_the_page_and_nothing_else(wheel: Path) -> None:

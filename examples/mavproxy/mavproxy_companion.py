@@ -4,7 +4,7 @@ Load it where MAVProxy finds it, in the environment in which ``companion`` is in
 
     PYTHONPATH=examples/mavproxy mavproxy.py --master=udpin:127.0.0.1:14551 \
         --out=udpout:127.0.0.1:14550
-    module load map                      for the labels; needs wxPython and OpenCV
+    module load map                      for the labels; needs wxPython, OpenCV and Matplotlib
     module load mavproxy_companion
     companion http://127.0.0.1:8080      the address of the service, if it is another one
     companion                            prints all links

@@ -6,6 +6,7 @@ needs, and websockets, which the client of the service needs.
 
 import os
 import re
+import shlex
 import shutil
 import socket
 import struct
@@ -40,15 +41,19 @@ for text in sys.argv[2:]:
 """Prints each text that the map has not drawn in the pixels of one colour. MAVProxy draws it."""
 
 
-def interpreter_with_map() -> Path | None:
-    """The Python of the ``mavproxy.py`` on the PATH, if MAVProxy's map and the client run there."""
+def interpreter_with_map() -> list[str]:
+    """The Python of the ``mavproxy.py`` on the PATH, as its first line names it; empty unless
+    MAVProxy's map and the client run there.
+    """
     program = shutil.which("mavproxy.py")
     if program is None:
-        return None
-    python = Path(Path(program).read_text(encoding="utf-8").splitlines()[0].removeprefix("#!"))
-    command = [python, "-c", "import cv2, matplotlib, websockets, wx"]
+        return []
+    python = shlex.split(
+        Path(program).read_text(encoding="utf-8").splitlines()[0].removeprefix("#!")
+    )
+    command = [*python, "-c", "import cv2, matplotlib, websockets, wx"]
     done = subprocess.run(command, capture_output=True, check=False, timeout=HANG_S)
-    return None if done.returncode else python
+    return [] if done.returncode else python
 
 
 @pytest.fixture
@@ -109,7 +114,7 @@ def with_map(
 def test_verdicts_are_labels_on_the_map(start_node: Any, tmp_path: Path, screen: str) -> None:
     """Labels appear, with their texts, and go with the module and with the service."""
     python = interpreter_with_map()
-    if python is None:
+    if not python:
         pytest.skip("no mavproxy.py with wxPython, OpenCV, matplotlib and websockets on the PATH")
     (tmp_path / "settings.toml").write_text("[link]\nneeded_db = 60.0\n")
     node = start_node(
@@ -118,7 +123,7 @@ def test_verdicts_are_labels_on_the_map(start_node: Any, tmp_path: Path, screen:
     )  # fmt: skip
     master, log = free_port(socket.SOCK_DGRAM), tmp_path / "mavproxy.txt"
     command = [
-        python, str(shutil.which("mavproxy.py")), f"--master=udpin:127.0.0.1:{master}",
+        *python, str(shutil.which("mavproxy.py")), f"--master=udpin:127.0.0.1:{master}",
         f"--out=udpout:127.0.0.1:{node.udp_port}", "--streamrate=-1",
         f"--state-basedir={tmp_path}", "--default-modules=output,link", "--cmd=module load map",
     ]  # fmt: skip
@@ -140,7 +145,7 @@ def test_verdicts_are_labels_on_the_map(start_node: Any, tmp_path: Path, screen:
         np.save(tmp_path / "coloured.npy", coloured(tmp_path, NONE_RGB))
         texts = [*(f"{number}:1 none" for number in range(1, 5)), " dB"]
         return subprocess.run(
-            [python, "-c", MATCHES, tmp_path / "coloured.npy", *texts],
+            [*python, "-c", MATCHES, tmp_path / "coloured.npy", *texts],
             capture_output=True, check=True, text=True, timeout=HANG_S,
         ).stdout  # fmt: skip
 

@@ -41,7 +41,7 @@ check: .venv/.dev
 	$(BIN)/mypy --strict companion sitl_replay
 	$(BIN)/python tests/dead_code.py
 	$(BIN)/lint-imports
-	$(BIN)/hadolint Dockerfile
+	$(BIN)/hadolint Dockerfile examples/blueos/Dockerfile
 	$(BIN)/check-jsonschema --builtin-schema vendor.compose-spec docker-compose.yml
 	@if docker compose version >/dev/null 2>&1; then docker compose --profile demo config --quiet; \
 	else echo "no docker compose here: docker-compose.yml is held against its schema alone"; fi

@@ -12,18 +12,21 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import pytest
 import yaml
-from support import BIN, HANG_S, ROOT, Node, end, started
+from support import BIN, HANG_S, ROOT, Node, end, free_port, started
 
 USER = 10001
 """The user of the image."""
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
 RECORDINGS = "/recordings"
 MEMORY_UNITS = {"m": 2**20, "g": 2**30}
+
+NO_FILES: Mapping[str, Path] = {}
+BLUEOS = ROOT / "examples" / "blueos"
 
 Sandbox = Callable[..., list[str]]
 
@@ -53,20 +56,23 @@ def sandbox(recordings: Path) -> Sandbox:
             command += ["--perms", "0755", "--dir", str(parent)] if parent != Path("/") else []
         command += ["--ro-bind-try", str(path), str(path)]
     command += ["--bind", str(recordings), RECORDINGS, "--chdir", "/tmp"]
-    command += ["--remount-ro", "/", "--remount-ro", "/dev", "--clearenv", "--cap-drop", "ALL"]
-    command += ["--setenv", "PATH", f"{BIN}:/usr/bin:/bin", "--setenv", "OPENBLAS_NUM_THREADS", "1"]
-    if os.getuid() == 0:
-        # The user changes in the sandbox, where the folders above are readable for all users.
-        command += [
-            word for one in ("SETUID", "SETGID", "SETPCAP") for word in ("--cap-add", f"CAP_{one}")
-        ]
-        command += ["setpriv", f"--reuid={USER}", f"--regid={USER}", "--clear-groups"]
-        command += ["--inh-caps=-all", "--bounding-set=-all", "--no-new-privs"]
-    else:
-        command += ["--unshare-user", "--uid", str(USER), "--gid", str(USER)]
 
-    def within(*words: object) -> list[str]:
-        return [*command, *map(str, words)]
+    def within(*words: object, user: int = USER, files: Mapping[str, Path] = NO_FILES) -> list[str]:
+        inside = [*command]
+        for place, file in files.items():
+            inside += ["--ro-bind", str(file), place]
+        inside += ["--remount-ro", "/", "--remount-ro", "/dev", "--clearenv", "--cap-drop", "ALL"]
+        inside += ["--setenv", "PATH", f"{BIN}:/usr/bin:/bin"]
+        inside += ["--setenv", "OPENBLAS_NUM_THREADS", "1"]
+        if os.getuid() == 0:
+            # The user changes in the sandbox, where the folders above are readable for all users.
+            for one in ("SETUID", "SETGID", "SETPCAP"):
+                inside += ["--cap-add", f"CAP_{one}"]
+            inside += ["setpriv", f"--reuid={user}", f"--regid={user}", "--clear-groups"]
+            inside += ["--inh-caps=-all", "--bounding-set=-all", "--no-new-privs"]
+        else:
+            inside += ["--unshare-user", "--uid", str(user), "--gid", str(user)]
+        return [*inside, *map(str, words)]
 
     trial = within("true")
     done = subprocess.run(trial, capture_output=True, text=True, check=False, timeout=HANG_S)
@@ -168,3 +174,39 @@ def test_sandbox_refuses_what_the_container_refuses(sandbox: Sandbox) -> None:
     assert done.returncode == 0, done.stderr
     expected = [*map(str, places[:-2]), "setuid", "raw socket", "chroot"]
     assert done.stdout.strip().split(", ") == expected
+
+
+def test_extension_of_blueos_starts_as_its_image_says(
+    sandbox: Sandbox, recordings: Path, tmp_path: Path
+) -> None:
+    """Its command and user: it records in a folder that Docker created, and MAVLink comes by TCP.
+
+    Only the ports differ.
+    """
+    text = (BLUEOS / "Dockerfile").read_text(encoding="utf-8")
+    ((user,), (words,)) = (
+        re.findall(pattern, text, re.MULTILINE) for pattern in (r"^USER (\d+):\d+$", r"^CMD (.+)$")
+    )
+    command = json.loads(words)
+    port = free_port()
+    for before, after in (
+        ("tcp:127.0.0.1:5777", f"tcp:127.0.0.1:{port}"),
+        ("0.0.0.0:8080", "127.0.0.1:0"),
+    ):
+        command[command.index(before)] = after
+    if os.getuid() == 0:
+        os.chown(recordings, 0, 0)
+    recordings.chmod(0o755)
+    files = {"/config/companion.toml": BLUEOS / "companion.toml"}
+    to = f"tcpin:127.0.0.1:{port}"
+    with started([BIN / "sitl-replay", "fly", "paper", "--to", to], stdout=subprocess.DEVNULL):
+        inside = sandbox(BIN / "companion", *command, user=int(user), files=files)
+        with confined(inside) as (node, service):
+            node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
+            assert node.json("/v1/status")["center"]["source"] == "1:1"
+            kernel = status(service)
+            assert int(kernel["CapEff"], 16) == int(kernel["CapBnd"], 16) == 0
+            os.kill(service, signal.SIGTERM)
+            node.process.communicate(timeout=HANG_S)
+            assert node.process.returncode == 0, node.errors()
+    assert len([*recordings.glob("*.mcap")]) == 1

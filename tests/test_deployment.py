@@ -177,6 +177,7 @@ def context(target: Path) -> None:
         if source.is_dir():
             shutil.copytree(source, target / name, ignore=shutil.ignore_patterns(*drop))
         else:
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy(source, target / name)
     assert not any(fnmatch.fnmatch(path.name, "*.pyc") for path in target.rglob("*"))
 

@@ -15,11 +15,15 @@ import tomllib
 import urllib.request
 import venv
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+import hcl2
 import pytest
+from hcl2 import SerializationOptions
+from markdown_it import MarkdownIt
+from markdown_it.token import Token
 from packaging.metadata import Metadata
 from support import HANG_S, ROOT, line_of, started
 
@@ -27,6 +31,7 @@ import companion
 
 EPOCH = {"SOURCE_DATE_EPOCH": "1700000000"}
 DOC = "usr/share/doc/uav-companion-beams"
+DESCRIPTION = (ROOT / "deploy" / "description.md").read_text(encoding="utf-8")
 FORBIDDEN = "/Build", "/tests/", ".pyc", "/.venv", ".mcap"
 
 
@@ -83,9 +88,56 @@ def test_metadata_is_valid_for_an_index(wheel: Path, archive: Path) -> None:
     found = Metadata.from_email(raw, validate=True)
     assert (found.name, str(found.version)) == ("uav-companion-beams", companion.__version__)
     assert found.description_content_type == "text/markdown"
-    assert found.description and found.description.startswith("# companion")
+    assert found.description == DESCRIPTION
     assert found.license_expression == "Apache-2.0"
     assert found.author_email == maintainer()
+
+
+def targets_of(tokens: Sequence[Token]) -> list[str]:
+    """The targets of all links and images in a Markdown document."""
+    found = [
+        str(token.attrs[name])
+        for token in tokens
+        for name in ("href", "src")
+        if name in token.attrs
+    ]
+    return found + [target for token in tokens for target in targets_of(token.children or [])]
+
+
+def test_description_needs_nothing_beside_it(archive: Path) -> None:
+    """An index shows it alone: no relative link or image, no command of the repository."""
+    assert targets_of(MarkdownIt().parse("[a](docs/a.md) ![b](b.png)")) == ["docs/a.md", "b.png"]
+    targets = targets_of(MarkdownIt().enable("table").parse(DESCRIPTION))
+    assert [target for target in targets if not target.startswith("https://")] == []
+    assert not re.search(r"^    make |`make ", DESCRIPTION, re.MULTILINE)
+    extras = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"][
+        "optional-dependencies"
+    ]
+    cells = re.findall(r"^\| (`.+?) \|", DESCRIPTION, re.MULTILINE)
+    assert set(re.findall(r"`(\w+)`", " ".join(cells))) == extras.keys() - {"dev"}
+    mentioned = set(re.findall(r"`(docs/[\w.-]+)`", DESCRIPTION))
+    with tarfile.open(archive) as tar:
+        names = {name.partition("/")[2] for name in tar.getnames()}
+    assert mentioned and mentioned <= names
+
+
+def test_description_says_what_the_readme_says(archive: Path) -> None:
+    """The same words, apart from the picture and the links, which work in the source archive."""
+    readme = (ROOT / "README.md").read_text(encoding="utf-8")
+    plain = re.sub(
+        r"(?<!!)\[([^]]*)\]\([^)]*\)", r"\1", re.sub(r"^!\[.*\n\n", "", readme, flags=re.M)
+    )
+    introduction = plain.partition("\n## ")[0]
+    assert len(introduction) > 1000 and DESCRIPTION.startswith(introduction)
+    library = (
+        "`companion` is also a library." + plain.partition("`companion` is also a library.")[2]
+    )
+    snippet = library.partition("Licence:")[0]
+    assert snippet.count("\n") > 5 and snippet in DESCRIPTION
+    with tarfile.open(archive) as tar:
+        names = {name.partition("/")[2] for name in tar.getnames()}
+    links = set(re.findall(r"\]\(([\w./-]+)\)", readme))
+    assert "docs/links.md" in links and links <= names
 
 
 def test_wheel_contains_the_page_and_nothing_else(wheel: Path) -> None:
@@ -332,10 +384,48 @@ def test_debian_package_has_all_packages_for_its_architecture(arch: str, tmp_pat
 # --- the image ------------------------------------------------------------------------------------
 
 
-def test_bake_definition_builds_both_architectures() -> None:
+def bake_targets() -> dict[str, Any]:
+    """The targets of docker-bake.hcl, with variables as written."""
     text = (ROOT / "docker-bake.hcl").read_text(encoding="utf-8")
-    assert 'platforms  = ["linux/amd64", "linux/arm64"]' in text
-    assert f'default = "{companion.__version__}"' in text
-    (dockerfile,) = re.findall(r'dockerfile = "(.+)"', text)
-    assert (ROOT / dockerfile).is_file()
-    assert text.count("{") == text.count("}")
+    options = SerializationOptions(
+        with_comments=False, explicit_blocks=False, strip_string_quotes=True
+    )
+    found = hcl2.loads(text, serialization_options=options)
+    (version,) = (one["TAG"]["default"] for one in found["variable"] if "TAG" in one)
+    assert version == companion.__version__
+    assert found["group"] == [{"default": {"targets": ["companion"]}}]
+    return {name: target for one in found["target"] for name, target in one.items()}
+
+
+def test_bake_definition_builds_both_architectures() -> None:
+    targets = bake_targets()
+    assert targets.keys() == {"companion", "blueos"}
+    for target in targets.values():
+        assert target["platforms"] == ["linux/amd64", "linux/arm64"]
+        assert (ROOT / target["context"] / target["dockerfile"]).is_file()
+        assert all("${TAG}" in tag or tag.endswith(":latest") for tag in target["tags"])
+    # `FROM ${IMAGE}` is the image of the first target, not one of a registry.
+    extension = targets["blueos"]
+    assert extension["contexts"] == {extension["args"]["IMAGE"]: "target:companion"}
+    assert "\nFROM ${IMAGE}\n" in (ROOT / "examples/blueos/Dockerfile").read_text(encoding="utf-8")
+
+
+@pytest.mark.skipif(shutil.which("buildx") is None, reason="no buildx on the PATH")
+def test_buildx_reads_the_bake_definition(tmp_path: Path) -> None:
+    """Also the compose file, which buildx reads besides it and merges with targets of one name."""
+    command = ["buildx", "bake", "--print", "--progress=quiet", "companion", "blueos"]
+    environment = os.environ | {"DOCKER_CONFIG": str(tmp_path), "REGISTRY": "registry.example/"}
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, check=True,
+        timeout=HANG_S,
+    )  # fmt: skip
+    printed = json.loads(done.stdout)["target"]
+    for name, target in bake_targets().items():
+        assert printed[name]["platforms"] == target["platforms"]
+        assert printed[name]["context"] == target["context"]
+    version = companion.__version__
+    assert printed["blueos"]["tags"] == [f"registry.example/companion-blueos:{version}"]
+    assert printed["blueos"]["args"] == {"IMAGE": "companion", "VERSION": version}
+    assert set(printed["companion"]["tags"]) == {
+        f"registry.example/uav-companion-beams:{tag}" for tag in (version, "latest")
+    }

@@ -57,6 +57,9 @@ class Registration:
     version: Annotated[str, Meaning("version of the program")]
     webpage: Annotated[str, Meaning("path of the documentation")]
     api: Annotated[str, Meaning("path of the OpenAPI document")]
+    avoid_iframes: Annotated[
+        bool, Meaning("true: BlueOS opens the page in a tab, because no page may frame it")
+    ]
 
 
 REGISTRATION: Final = Registration(
@@ -67,6 +70,7 @@ REGISTRATION: Final = Registration(
     version=companion.__version__,
     webpage="/docs",
     api="/openapi.json",
+    avoid_iframes=True,
 )
 
 

@@ -4,11 +4,14 @@ Load it where MAVProxy finds it, in the environment in which ``companion`` is in
 
     PYTHONPATH=examples/mavproxy mavproxy.py --master=udpin:127.0.0.1:14551 \
         --out=udpout:127.0.0.1:14550
+    module load map                      for the labels; needs wxPython, OpenCV and Matplotlib
     module load mavproxy_companion
     companion http://127.0.0.1:8080      the address of the service, if it is another one
     companion                            prints all links
 
-The environment variable COMPANION_TOKEN holds the bearer token, if the service requires one.
+A label shows the UAV, its verdict and its guaranteed gain. It is removed when the UAV is no longer
+a target, and when the service does not answer. The environment variable COMPANION_TOKEN holds the
+bearer token, if the service requires one.
 """
 
 import os
@@ -19,9 +22,12 @@ from MAVProxy.modules.lib import mp_module
 
 from companion.client import Client, ServiceError
 
+Uav = dict[str, Any]
+
 URL = "http://127.0.0.1:8080"
 EVERY_S = 1.0
-COLOURS = {"good": (0, 160, 60), "weak": (220, 150, 0), "none": (210, 40, 40)}
+LAYER = "companion"
+COLOURS = {"good": (80, 255, 120), "weak": (255, 190, 0), "none": (255, 90, 90)}  # RGB
 
 
 class CompanionModule(mp_module.MPModule):  # type: ignore[misc]
@@ -31,30 +37,33 @@ class CompanionModule(mp_module.MPModule):  # type: ignore[misc]
         super().__init__(mpstate, "companion", "verdicts on links")
         self.add_command("companion", self.command, "verdicts on links", ["<URL>"])
         self._url = URL
-        self._uavs: list[dict[str, Any]] = []
-        self._failure: str | None = None
+        self._answer: tuple[list[Uav], str | None] = ([], None)  # UAVs, and why there are none
+        self._read = 0  # answers so far
+        self._drawn = 0
         self._told: dict[str, str] = {}
         self._told_failure: str | None = None
-        self._drawn = 0
-        self._read = 0  # answers so far
+        self._labelled: set[str] = set()
         self._ends = threading.Event()
         threading.Thread(target=self._ask, name="companion", daemon=True).start()
 
     def unload(self) -> None:
-        """End the thread."""
+        """End the thread, and remove the labels."""
         self._ends.set()
+        self._draw([])
+        super().unload()
 
     def command(self, arguments: list[str]) -> None:
         """Print all links, or change the address of the service."""
         if arguments:
             self._url = arguments[0]
             return
-        for uav in self._uavs:
-            print(_line(uav))
+        uavs, failure = self._answer
+        for line in [f"companion: {failure}"] if failure else map(_line, uavs):
+            print(line)
 
     def idle_task(self) -> None:
-        """Print changed verdicts, and draw labels if a map is loaded."""
-        uavs, failure = self._uavs, self._failure
+        """Print changed verdicts, and renew the labels after each answer."""
+        uavs, failure = self._answer
         if failure != self._told_failure:
             self._told_failure = failure
             print(f"companion: {failure or 'connected'}")
@@ -71,32 +80,34 @@ class CompanionModule(mp_module.MPModule):  # type: ignore[misc]
         token = os.environ.get("COMPANION_TOKEN")
         while not self._ends.wait(EVERY_S):
             try:
-                self._uavs = [uav for uav in Client(self._url, token).uavs() if uav["target"]]
-                self._failure = None
+                answer = Client(self._url, token).uavs()
+                self._answer = ([uav for uav in answer if uav["target"]], None)
             except ServiceError as error:
-                self._failure = str(error)
+                self._answer = ([], str(error))
             self._read += 1
 
-    def _draw(self, uavs: list[dict[str, Any]]) -> None:
-        map_module = self.module("map")
-        if map_module is None:
-            return
-        from MAVProxy.modules.mavproxy_map import mp_slipmap  # needs OpenCV, as the map does
+    def _draw(self, uavs: list[Uav]) -> None:
+        """Draw a label for each UAV with a verdict on every map, and remove all others."""
+        labelled = {f"{LAYER} {uav['id']}": uav for uav in uavs if uav["verdict"] is not None}
+        for module in self.module_matching("map*"):
+            from MAVProxy.modules.mavproxy_map import mp_slipmap  # needs OpenCV, as the map does
 
-        for uav in uavs:
-            if uav["verdict"] is None:
-                continue
-            label = mp_slipmap.SlipLabel(
-                f"companion {uav['id']}",
-                (uav["lat_deg"], uav["lon_deg"]),
-                f"{uav['id']} {uav['verdict']}",
-                layer="companion",
-                colour=COLOURS[uav["verdict"]],
-            )
-            map_module.map.add_object(label)
+            for key in self._labelled - labelled.keys():
+                module.map.remove_object(key)
+            for key, uav in labelled.items():
+                point, colour = (uav["lat_deg"], uav["lon_deg"]), COLOURS[uav["verdict"]]
+                module.map.add_object(
+                    mp_slipmap.SlipLabel(key, point, _label(uav), layer=LAYER, colour=colour)
+                )
+        self._labelled = set(labelled)
 
 
-def _line(uav: dict[str, Any]) -> str:
+def _label(uav: Uav) -> str:
+    gain_db = (uav["health"] or {}).get("guaranteed_gain_db")
+    return f"{uav['id']} {uav['verdict']}" + ("" if gain_db is None else f" {gain_db:.1f} dB")
+
+
+def _line(uav: Uav) -> str:
     health = uav["health"] or {}
     why = f": {health['reason']}; {health['remedy']}" if health.get("reason") else ""
     return f"companion: {uav['id']} {uav['verdict'] or 'not assessed'}{why}"

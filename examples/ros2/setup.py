@@ -10,6 +10,7 @@ setup(
         ("share/ament_index/resource_index/packages", ["resource/companion_bridge"]),
         ("share/companion_bridge", ["package.xml"]),
     ],
-    install_requires=["companion"],
+    install_requires=["uav-companion-beams"],
+    zip_safe=True,
     entry_points={"console_scripts": ["bridge = companion_bridge.bridge:main"]},
 )

@@ -12,16 +12,9 @@ from typing import Any
 import pytest
 from mav_vehicle import Vehicle
 from pymavlink import mavutil
-from support import BIN, HANG_S, ROOT, end, read_metadata
+from support import BIN, HANG_S, ROOT, end, free_port, read_metadata
 
 Router = Callable[..., None]
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        port: int = probe.getsockname()[1]
-        return port
 
 
 @pytest.fixture

@@ -4,9 +4,13 @@
 """
 
 import ast
+import configparser
+import re
 import sys
+import tomllib
 import types as python_types
 from typing import Any
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -122,6 +126,44 @@ def test_verdicts_are_diagnostics(messages: Any, answers: Any) -> None:
         assert {pair.key for pair in one.values} >= {"cause", "remedy", "bound_m"}
 
 
+def test_topics_have_valid_names(messages: Any) -> None:
+    """For every kind of id: rclpy refuses other characters, double underscores, and one at the end.
+
+    Source: https://design.ros2.org/articles/topic_and_service_names.html
+    """
+    assert messages.topic("3:1") == "uav_3_1/odometry"
+    for uav in ("icao:4CA7B3", "rid:1581F5.a-7_", "cot:ANDROID-35._x.", "cot:a__b"):
+        name = messages.topic(uav)
+        assert re.fullmatch(r"uav_[A-Za-z0-9_]*[A-Za-z0-9]/odometry", name), name
+        assert "__" not in name
+
+
+def node_types() -> set[str]:
+    """The message types that the node imports."""
+    tree = ast.parse((PACKAGE / "companion_bridge" / "bridge.py").read_text())
+    (names,) = (
+        ast.literal_eval(node.value)
+        for node in tree.body
+        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "NAMES"
+    )
+    return set(names)
+
+
+def test_package_installs_where_ros_looks_for_it() -> None:
+    """Programs in lib/PACKAGE, as `ros2 run` expects; and what they import is declared."""
+    setup = configparser.ConfigParser(interpolation=None)
+    setup.read(PACKAGE / "setup.cfg")
+    folder = "$base/lib/companion_bridge"
+    assert setup["develop"]["script_dir"] == setup["install"]["install_scripts"] == folder
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    (required,) = re.findall(r"install_requires=(\[.*\])", (PACKAGE / "setup.py").read_text())
+    assert ast.literal_eval(required) == [project["name"]]
+    manifest = ElementTree.parse(PACKAGE / "package.xml")
+    assert manifest.findtext("license") == project["license"]
+    declared = {str(one.text) for one in manifest.iter("exec_depend")}
+    assert declared == {name.split("/")[0] for name in node_types()} | {"rclpy"}
+
+
 def test_node_builds_all_types_that_the_messages_need(messages: Any) -> None:
     """The list of names in the node is that of the constructors called."""
     text = (PACKAGE / "companion_bridge" / "messages.py").read_text()
@@ -133,11 +175,5 @@ def test_node_builds_all_types_that_the_messages_need(messages: Any) -> None:
         and node.value.id == "types"
         and isinstance(node.slice, ast.Constant)
     } - {"byte", "array"}
-    tree = ast.parse((PACKAGE / "companion_bridge" / "bridge.py").read_text())
-    (names,) = (
-        ast.literal_eval(node.value)
-        for node in tree.body
-        if isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "NAMES"
-    )
-    assert {name.replace("/", "/msg/") for name in names} == used
+    assert {name.replace("/", "/msg/") for name in node_types()} == used
     assert isinstance(messages, python_types.ModuleType)

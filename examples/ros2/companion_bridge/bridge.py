@@ -70,9 +70,8 @@ class Bridge(Node):  # type: ignore[misc]
 
     def _track(self, uav: str) -> Any:
         if uav not in self._tracks:
-            topic = f"uav_{uav.replace(':', '_').replace('-', '_')}/odometry"
             kind = self._types["nav_msgs/msg/Odometry"]
-            self._tracks[uav] = self.create_publisher(kind, topic, 5)
+            self._tracks[uav] = self.create_publisher(kind, messages.topic(uav), 5)
         return self._tracks[uav]
 
 

@@ -11,6 +11,7 @@ long as no error is known.
 """
 
 import math
+import re
 from collections.abc import Callable, Mapping
 from datetime import datetime
 from typing import Any, Final
@@ -28,6 +29,15 @@ BEAM_M: Final = 50.0  # shown length of a beam
 Json = Mapping[str, Any]
 Types = Mapping[str, Callable[..., Any]]
 """Constructors by ROS name, such as ``nav_msgs/msg/Odometry``; ``byte`` and ``array`` convert."""
+
+
+def topic(uav: str) -> str:
+    """Return the topic of a UAV's track; ids may contain characters that names of topics may not.
+
+    Source: https://design.ros2.org/articles/topic_and_service_names.html
+    """
+    name = re.sub("__+", "_", re.sub("[^A-Za-z0-9]", "_", uav)).strip("_")
+    return f"uav_{name}/odometry"
 
 
 def odometry(types: Types, uav: Json) -> Any | None:

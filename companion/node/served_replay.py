@@ -308,7 +308,7 @@ class _ReplayedLink:
 
     def __init__(self, url: str) -> None:
         self.status = LinkStatus(url=url)
-        self._peers = Peers(self.status, lambda _peer: None)
+        self._peers = Peers(status=self.status, on_evict=lambda _peer: None)
         self._peer = self._peers.at(url)
 
     def take(self, item: Frame | Rejection) -> None:

@@ -227,9 +227,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
         path, query = cycle.scope["path"], cycle.scope["query_string"]
         self._queue.add(
-            start,
-            within_budget=not self._over_budget,
-            is_usual=path in USUAL_PATHS and not query,
+            start, within_budget=not self._over_budget, is_usual=path in USUAL_PATHS and not query
         )
 
     # --- waiting ------------------------------------------------------------------------------

@@ -239,7 +239,8 @@ def test_mirror_directions_are_regularised() -> None:
 
 
 def assert_same_beams(a: BeamSet, b: BeamSet) -> None:
-    assert a.weights == pytest.approx(b.weights, abs=1e-9)
+    # Nulls between nearly equal directions lose digits.
+    assert a.weights == pytest.approx(b.weights, abs=1e-7)
     for one, other in zip(a.beams, b.beams, strict=True):
         assert one.azimuth_rad == pytest.approx(other.azimuth_rad, abs=1e-9)
         assert one.elevation_rad == pytest.approx(other.elevation_rad, abs=1e-9)

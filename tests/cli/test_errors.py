@@ -100,6 +100,7 @@ def test_every_user_facing_error_is_a_user_error() -> None:
     inside = {
         "_RefusedError",  # becomes a Rejection where it is raised
         "UnsatisfiableRangeError",  # becomes a 416
+        "CutShortError",  # ends the connection: the answer has begun
         "ServiceError",  # client side: the service's error response
         "InterruptedByUser",  # Ctrl-C
         "HungUpError",  # an orderly end of a connection: the link retries or ends

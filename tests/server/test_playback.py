@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from starlette.testclient import TestClient
-from support import ROOT
+from support import ROOT, run_async
 
 from companion.node.recorded_history import lines
 from companion.server import playback
@@ -89,15 +89,18 @@ def test_simultaneous_requests_for_many_recordings_start_one_process(
             return False
         return True
 
-    async def burst() -> list[bool]:
+    answers = list[bool]()
+
+    async def burst() -> None:
         player = playback.Playback()
         while not isinstance(await player.samples(folder / "one.mcap"), bytes):
             pass
         monkeypatch.setattr(playback, "_start", counted)
         paths = [folder / "two.mcap", folder / "bad.mcap"] * 20
-        return await asyncio.gather(*(ask(player, path) for path in paths))
+        answers.extend(await asyncio.gather(*(ask(player, path) for path in paths)))
 
-    assert asyncio.run(burst()) == [True, False] * 20
+    run_async(burst())
+    assert answers == [True, False] * 20
     assert started == [folder / "two.mcap"]
 
 

@@ -1,5 +1,6 @@
 """Endpoint and splitter of each link scheme."""
 
+import math
 from collections.abc import Callable
 from typing import Final
 
@@ -16,7 +17,7 @@ from companion.mavlink.links.zenoh_link import ZenohLink
 from companion.mavlink.wire.aircraft_json import AircraftJson
 from companion.mavlink.wire.beast import BeastSplitter
 from companion.mavlink.wire.cot_link import CotSplitter
-from companion.mavlink.wire.framing import Splitter, search_budget
+from companion.mavlink.wire.framing import SplitLimits, Splitter, search_budget
 from companion.mavlink.wire.rid_json import RidJson
 from companion.mavlink.wire.sbs import SbsSplitter
 
@@ -38,8 +39,9 @@ def splitter(url: LinkUrl) -> Callable[[str], Splits]:
             return CotSplitter
         case _:
             search = search_budget()
-            at_once = FRAMES_AT_ONCE if url.scheme in _CONTINUED else None
-            return lambda link: Splitter(link, search=search, at_once=at_once)
+            at_once = FRAMES_AT_ONCE if url.scheme in _CONTINUED else math.inf
+            limits = SplitLimits(search=search, at_once=at_once)
+            return lambda link: Splitter(link, limits=limits)
 
 
 def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:

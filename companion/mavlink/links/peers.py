@@ -132,6 +132,7 @@ class Peers:
 
     def __init__(
         self,
+        *,
         status: LinkStatus,
         on_evict: Callable[[Peer], None],
         splitter: Callable[[str], Splits] = Splitter,

@@ -113,7 +113,12 @@ class Link:
         self._newcomers = newcomers or Newcomers()
         self._refused = 0  # frames of newcomers not reported yet
         self._refused_ns = 0
-        self._peers = Peers(self.status, self._finish, splitter(url), self._is_first)
+        self._peers = Peers(
+            status=self.status,
+            on_evict=self._finish,
+            splitter=splitter(url),
+            is_first=self._is_first,
+        )
         upcalls = Upcalls(
             up=self._up,
             take=self.take,

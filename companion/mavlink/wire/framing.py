@@ -11,11 +11,13 @@ The checksum is CRC-16/MCRF4XX over all but the magic byte, then over one seed b
 After a failed frame the search resumes at the next magic byte *inside* its claimed length, never
 after it: a damaged length byte would otherwise discard good frames. The claimed length is kept only
 so that false starts inside it are not counted as further failures.
+
+Over 300 lines: the search, its limits and what it counts are one algorithm.
 """
 
 import math
 import re
-from typing import Final
+from typing import Final, NamedTuple
 
 from fastcrc import crc16
 
@@ -176,29 +178,37 @@ def search_budget() -> Budget:
     return Budget(per_s=FALSE_STARTS_PER_S, most=FALSE_STARTS_SAVED)
 
 
+class SplitLimits(NamedTuple):
+    """Limits on the work for one call of a ``Splitter``.
+
+    search   budget of false starts that are examined; beyond it, the bytes of a call after a false
+             start are garbage (None: no limit)
+    at_once  frames that a call returns; a call without bytes continues with the same ones
+    """
+
+    search: Budget | None = None
+    at_once: float = math.inf
+
+
+NO_LIMITS: Final = SplitLimits()
+
+
 class Splitter:
     """Incremental splitter of one peer's bytes into frames.
 
     ``wanted`` holds the message ids that are returned (None: all); other frames are only counted.
-    At most one unfinished frame is held between calls. ``search`` limits the false starts that are
-    examined; beyond it, the bytes of a call after a false start are garbage (None: no limit). A
-    call returns at most ``at_once`` frames (None: all); ``has_more`` says that a call without bytes
-    continues with the same ones.
+    At most one unfinished frame is held between calls, and what ``limits`` leave for the next
+    call; ``has_more`` says that there is such.
     """
 
     def __init__(
-        self,
-        link: str,
-        wanted: frozenset[int] | None = None,
-        search: Budget | None = None,
-        at_once: int | None = None,
+        self, link: str, wanted: frozenset[int] | None = None, limits: SplitLimits = NO_LIMITS
     ) -> None:
         self.link = link
         self.frames = 0  # frames with a correct checksum, wanted or not
         self.has_more = False
-        self._at_once = math.inf if at_once is None else at_once
         self._wanted = wanted
-        self._search = search
+        self._limits = limits
         self._pending = b""
         self._claimed = 0  # following bytes within the claimed length of a failed frame
         self._checker = Checker()
@@ -235,8 +245,8 @@ class Splitter:
         out: list[Frame | Rejection] = []
         lost: dict[Reason, int] = {}
         link, wanted, frame_at = self.link, self._wanted, self._checker.at
-        search, now_s = self._search, t_ns * 1e-9
-        most = math.inf if last else self._at_once
+        search, now_s = self._limits.search, t_ns * 1e-9
+        most = math.inf if last else self._limits.at_once
         at, end, claimed_to = 0, len(buffer), self._claimed
         while at < end:
             found = frame_at(buffer, at, end)

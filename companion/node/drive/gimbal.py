@@ -17,7 +17,7 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.mavlink.wire.encode import Outgoing, pack
-from companion.mavlink.wire.framing import Splitter, search_budget
+from companion.mavlink.wire.framing import SplitLimits, Splitter, search_budget
 from companion.node.drive.lag import MountLag
 from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
 from companion.values import Frame, Reason, Rejection, Source
@@ -49,7 +49,9 @@ class Gimbal:
         self._now_ns = now_ns
         self._lag = MountLag()
         self._socket: socket.socket | None = None
-        self._splitter = Splitter("gimbal", frozenset((ATTITUDE_STATUS,)), search_budget())
+        self._splitter = Splitter(
+            "gimbal", frozenset((ATTITUDE_STATUS,)), SplitLimits(search=search_budget())
+        )
         self.rejected: Counter[str] = Counter()
         self._sequence = 0
         self._last_rad = self._seen_rad = 0.0

@@ -34,7 +34,7 @@ class Heard:
     def __init__(self) -> None:
         self.status = LinkStatus(url=LINK)
         self.farewells: list[Peer] = []
-        self.peers = Peers(self.status, self.farewells.append)
+        self.peers = Peers(status=self.status, on_evict=self.farewells.append)
 
     def hear(
         self, numbers: Iterable[int], key: str = "a", source: Source = UAV, t_ns: int = 0

@@ -16,7 +16,7 @@ from support import LONGEST_FRAME, examples, rounds
 
 from companion.mavlink.wire import encode, framing
 from companion.mavlink.wire.crc_extra import CRC_EXTRA
-from companion.mavlink.wire.framing import KNOWN_MAX, Splitter
+from companion.mavlink.wire.framing import KNOWN_MAX, SplitLimits, Splitter
 from companion.values import Frame, Reason, Rejection, Source
 from companion.values.budget import Budget
 
@@ -469,7 +469,7 @@ def test_false_starts_are_examined_within_a_budget(
         return examine(buffer, at, end)
 
     monkeypatch.setattr(framing, "examine", counting)
-    splitter = Splitter("x", search=framing.search_budget())
+    splitter = Splitter("x", limits=SplitLimits(search=framing.search_budget()))
     flood = start * (60_000 // len(start))
     for number in range(100):
         splitter.feed(number * 10_000_000, flood)  # 6 MB in a second
@@ -480,7 +480,7 @@ def test_false_starts_are_examined_within_a_budget(
 
 
 def test_bytes_beyond_the_budget_are_counted_as_garbage() -> None:
-    splitter = Splitter("x", search=Budget(per_s=0.0, most=1.0))
+    splitter = Splitter("x", limits=SplitLimits(search=Budget(per_s=0.0, most=1.0)))
     sent = b"\x55" * 1000
     found = [one for _ in range(3) for one in splitter.feed(0, sent)]
     assert sum(one.count for one in found if isinstance(one, Rejection)) == 3000

@@ -50,6 +50,7 @@ BODY: Final[dict[str, Any]] = {
 
 def add_observations(app: FastAPI, node: Node) -> None:
     """Add the route to the application."""
+    one_at_a_time = asyncio.Lock()  # the slices of many requests would add up
 
     @app.post(
         PATH,
@@ -69,7 +70,9 @@ def add_observations(app: FastAPI, node: Node) -> None:
     async def observations(request: Request) -> Response:
         arrival_ns = node.now_ns()
         _check_allowed(request, node)
-        found = await _process(node, _items(await _body(request)), arrival_ns)
+        items = _items(await _body(request))
+        async with one_at_a_time:
+            found = await _process(node, items, arrival_ns)
         if found.accepted == 0 and found.errors:
             first = found.errors[0]
             raise HTTPException(422, f"item {first.item}: {first.title}")

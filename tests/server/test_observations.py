@@ -264,6 +264,40 @@ def test_long_list_lets_other_work_run(node: Any, monkeypatch: pytest.MonkeyPatc
     assert set(range(1, 50)) <= set(others)
 
 
+def test_long_lists_of_many_clients_are_processed_one_after_the_other(
+    node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Otherwise their slices would add up, and other work would wait for all of them."""
+    monkeypatch.setattr(observation_routes, "SLICE_S", -1.0)  # each item has its own slice
+    running = most = 0
+    process = observation_routes._process
+
+    async def counted(*arguments: Any) -> Any:
+        nonlocal running, most
+        running += 1
+        most = max(most, running)
+        try:
+            return await process(*arguments)
+        finally:
+            running -= 1
+
+    monkeypatch.setattr(observation_routes, "_process", counted)
+    body = json.dumps([DIRECTION] * 50).encode()
+    head = (
+        f"POST {PATH} HTTP/1.1\r\nHost: 127.0.0.1\r\nContent-Type: application/json\r\n"
+        f"Content-Length: {len(body)}\r\n\r\n"
+    ).encode()
+
+    async def test() -> None:
+        async with served(node) as port:
+            clients = [await connected(port) for _ in range(5)]
+            answers = await asyncio.gather(*(asked(one, head + body) for one in clients))
+            assert {line.split()[1] for line in answers} == {b"202"}
+
+    run_async(test())
+    assert most == 1
+
+
 def test_body_beyond_the_limit_of_the_connection_is_rejected(node: Any) -> None:
     async def test() -> None:
         async with served(node) as port:

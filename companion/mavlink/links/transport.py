@@ -46,7 +46,7 @@ RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 STEADY_S: Final = 1.0
 """Seconds for which a connection must last before it is reported as restored."""
 REFUSED_EVERY_NS: Final = 500_000_000
-"""Least time between two rejections of newcomers, each with the number of their frames."""
+"""Least time between two rejections that count the frames of newcomers, or dropped datagrams."""
 WAITING_MAX_BYTES: Final = 1 << 16
 """Bytes of a peer that may wait while other work runs; more are dropped and counted."""
 UNFINISHED_S: Final = 10
@@ -113,6 +113,8 @@ class Link:
         self._newcomers = newcomers or Newcomers()
         self._refused = 0  # frames of newcomers not reported yet
         self._refused_ns = 0
+        self._crowded = 0  # pieces of peers with too much waiting, not reported yet
+        self._crowded_ns = 0
         self._peers = Peers(
             status=self.status,
             on_evict=self._finish,
@@ -182,7 +184,8 @@ class Link:
             self._lag.observe(t_ns, age_ns)
             t_ns -= age_ns
         if data and peer.splitter.waiting_bytes > WAITING_MAX_BYTES:
-            self._overflow(1)
+            self._crowded += 1
+            self._report_crowded(now_ns)
             return False  # a call is due already
         found = peer.splitter.feed(t_ns, data)
         if found:
@@ -200,11 +203,18 @@ class Link:
             newcomers.worked(served, spent_s / len(found))
         if now_ns >= newcomers.adapts_ns:
             newcomers.adapt(now_ns, time.thread_time())
+            self._report_crowded(now_ns)
         if isinstance(peer.splitter, ForeignSplitter) and not self.url.listens:
             began_ns = peer.splitter.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
                 raise StalledError(f"no complete message in the bytes of {UNFINISHED_S} s")
         return peer.splitter.has_more
+
+    def _report_crowded(self, now_ns: int) -> None:
+        """Count what peers sent that have too much waiting, if that is due."""
+        if self._crowded and now_ns - self._crowded_ns >= REFUSED_EVERY_NS:
+            self._overflow(self._crowded)
+            self._crowded, self._crowded_ns = 0, now_ns
 
     def _count_stale(self, key: Hashable, data: bytes) -> None:
         """Count the frames in stale bytes, and keep the splitter synchronised with the stream."""

@@ -1099,6 +1099,30 @@ def test_large_datagram_is_processed_a_few_frames_at_a_time(run: Run) -> None:
     run(test())
 
 
+def test_peer_with_too_much_waiting_is_not_read_and_counted_rarely(run: Run) -> None:
+    """Rejections are events, which a flood must not multiply."""
+
+    async def test() -> None:
+        now_ns = [time.time_ns()]
+        async with running("udpin:127.0.0.1:0", now_ns=lambda: now_ns[0]) as (link, inbox):
+            await until_true(lambda: link.status.state == "up")
+            key = ("127.0.0.1", 9)
+            many = b"".join(frame(number, sysid=7) for number in range(2000))
+            assert link.take(key, many)
+            for _ in range(1000):
+                now_ns[0] += 1_000_000
+                assert not link.take(key, frame(1))
+            dropped = [one for one in inbox.rejections if one.reason is Reason.SOCKET_OVERFLOW]
+            assert [one.count for one in dropped] == [1, 500]
+            now_ns[0] += 1_000_000_000
+            while link.take(key, b""):
+                pass
+            assert len(inbox.frames) == 2000
+            assert sum(one.count for one in inbox.rejections) == 1000
+
+    run(test())
+
+
 def test_peers_of_a_link_share_its_budget_of_false_starts(run: Run) -> None:
     """Whoever has many ports must not have a budget for each."""
 

@@ -28,7 +28,8 @@ class LinkSettings(Section):
 
     ``routers`` are trusted peers: if peers contradict each other about the position of a vehicle,
     the position by ``routers`` is used. A peer is a link as in ``urls``, HOST, or HOST:PORT. Two
-    peers that agree about a vehicle need no entry.
+    peers that agree about a vehicle need no entry; with one, attitudes and TIMESYNC answers of
+    both are used.
     """
 
     urls: tuple[LinkText, ...] = ()

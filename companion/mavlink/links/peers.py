@@ -126,8 +126,8 @@ class Peers:
     """Peers of one link, bounded in number. Their frames are counted in ``status``.
 
     ``on_evict`` is called with each peer that is evicted, before its removal; ``splitter`` builds a
-    peer's splitter from the link's name. ``is_first`` says whether missing frames of a sender count
-    for it: those of a stranger in its name do not.
+    peer's splitter from the link's name. ``is_first`` says whether a peer is believed about a
+    sender: gaps of others do not count, and messages do not go to them.
     """
 
     def __init__(
@@ -184,7 +184,10 @@ class Peers:
         return [p for p in self._peers.values() if p.heard_ns is not None and p.heard_ns >= t_ns]
 
     def last_of(self, source: Source) -> Peer | None:
-        """Return the peer over which a source was last received; None if it is disconnected."""
+        """Return the peer to which messages to a source go; None if it is disconnected.
+
+        It is the peer over which the source was last received, or the one that was first.
+        """
         component = self._components.get(source)
         if component is None or self._peers.get(component.peer.key) is not component.peer:
             return None
@@ -216,8 +219,8 @@ class Peers:
                 sender = self._add_source(peer, item)
             component = sender.component
             is_accepted = kept is item
-            if is_accepted:
-                component.peer = peer
+            if is_accepted and component.peer is not peer:
+                self._prefer(component, peer, source, t_ns)
             counts = component.status
             counts.frames += 1
             counts.heard_ns = t_ns
@@ -234,6 +237,12 @@ class Peers:
                 missing = self._out_of_order(sender, number)
                 if missing and self._is_first(peer, source, t_ns):
                     counts.gaps += missing
+
+    def _prefer(self, component: _Component, peer: Peer, source: Source, t_ns: int) -> None:
+        """Send messages to this peer from now on, unless the other is believed and connected."""
+        is_gone = self._peers.get(component.peer.key) is not component.peer
+        if is_gone or self._is_first(peer, source, t_ns):
+            component.peer = peer
 
     def count_rejection(self, refused: Rejection) -> None:
         """Count a rejection of bytes or frames of this link."""

@@ -254,7 +254,7 @@ class Link:
             checked.append(kept)
         self._peers.count(peer, counted, checked)
         if has_timesync:
-            checked = [_checked_timesync(peer, item) for item in checked]
+            checked = [self._checked_timesync(peer, item) for item in checked]
         if self._refused:
             self._report_refused(checked)
         self._receive(checked)
@@ -302,6 +302,28 @@ class Link:
             source=str(frame.source),
             reason=reason,
             msgid=frame.msgid,
+            detail=detail,
+        )
+
+    def _checked_timesync(self, peer: Peer, item: Received) -> Received:
+        """Return the item; a rejection for a TIMESYNC that may be another program's.
+
+        Its peer must bring its sender's stamps, and be the first that did. Any program that reaches
+        the socket could otherwise shift a clock. Routers deliver both.
+        """
+        if isinstance(item, Rejection) or item.msgid != TIMESYNC:
+            return item
+        if item.payload[:8].strip(b"\0") == b"":
+            return item  # a request is no evidence
+        is_first = self._is_first(peer, item.source, item.t_ns)
+        if is_first and peer.brings_stamps(item.source, item.t_ns):
+            return item
+        detail = "TIMESYNC: answer came from another peer than this sender's positions"
+        return Rejection(
+            t_ns=item.t_ns,
+            source=str(item.source),
+            reason=Reason.UNPLACED_STAMP,
+            msgid=TIMESYNC,
             detail=detail,
         )
 
@@ -410,22 +432,6 @@ class Link:
         if self._steady is not None:
             self._steady.cancel()
             self._steady = None
-
-
-def _checked_timesync(peer: Peer, item: Frame | Rejection) -> Frame | Rejection:
-    """Return the item; a rejection for a TIMESYNC from a peer without its sender's stamps.
-
-    Any program that reaches the socket could otherwise shift a clock. Routers deliver both.
-    """
-    if isinstance(item, Rejection) or item.msgid != TIMESYNC:
-        return item
-    if peer.brings_stamps(item.source, item.t_ns) or item.payload[:8].strip(b"\0") == b"":
-        return item  # a request is no evidence
-    detail = "TIMESYNC: answer came from another peer than this sender's positions"
-    who = str(item.source)
-    return Rejection(
-        t_ns=item.t_ns, source=who, reason=Reason.UNPLACED_STAMP, msgid=TIMESYNC, detail=detail
-    )
 
 
 def _checked_by_guard(guard: MessageSigning, item: Frame | Rejection) -> Frame | Rejection:

@@ -182,11 +182,13 @@ class KnownPeers:
         return any(one.is_current(now_ns) for one in sender.known.values())
 
     def is_first(self, peer: str, source: Source, now_ns: int) -> bool:
-        """Return whether no other current peer of a sender was known earlier."""
+        """Return whether a peer is trusted, or no other current peer of a sender was known earlier."""
         sender = self._senders.get(source)
         if sender is None:
             return True
         known = sender.known.get(peer)
+        if known is not None and known.is_router:
+            return True
         return not any(
             one is not known
             and one.is_current(now_ns)

@@ -6,6 +6,7 @@ from link_support import frame
 from companion.mavlink.links.peers import STAMPS_KEPT_NS
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import parse_link
+from companion.mavlink.trust.known_peers import KnownPeers
 from companion.mavlink.wire.encode import TIMESYNC, pack, timesync
 from companion.mavlink.wire.framing import Splitter
 from companion.values import Frame, Reason, Rejection, Source
@@ -17,11 +18,13 @@ HOME, ELSEWHERE = ("10.0.0.1", 14550), ("10.0.0.66", 4000)
 class Taken:
     """A link fed by hand, and its last output."""
 
-    def __init__(self) -> None:
+    def __init__(self, known_peers: KnownPeers | None = None) -> None:
         self.found: list[Frame | Rejection] = []
         self.now_ns = 1_000_000_000
         link = parse_link("udpin:127.0.0.1:0")
-        self.link = Link(url=link, receive=self.found.extend, now_ns=lambda: self.now_ns)
+        self.link = Link(
+            url=link, receive=self.found.extend, now_ns=lambda: self.now_ns, known_peers=known_peers
+        )
 
     def take(self, peer: object, raw: bytes) -> Frame | Rejection:
         """Return the result for a frame."""
@@ -59,14 +62,32 @@ def test_answer_without_positions_from_anywhere_is_rejected(taken: Taken) -> Non
     assert forged.reason is Reason.UNPLACED_STAMP
 
 
-def test_answers_are_accepted_from_every_known_peer(taken: Taken) -> None:
-    """A second route is known after its positions have agreed for some seconds."""
+def test_answers_are_accepted_from_the_peer_that_was_first(taken: Taken) -> None:
+    """A stranger whose positions agree for some seconds must not move the clock."""
     for number in range(80):
         taken.now_ns += 100_000_000
         for way in (HOME, ELSEWHERE):
             taken.take(way, frame(100 * number))
-        if number == 20:
-            assert isinstance(taken.take(ELSEWHERE, answer()), Rejection)
+    assert isinstance(taken.take(HOME, answer()), Frame)
+    forged = taken.take(ELSEWHERE, answer())
+    assert isinstance(forged, Rejection)
+    assert forged.reason is Reason.UNPLACED_STAMP
+    asked = taken.link._peers.last_of(VEHICLE)
+    assert asked is not None and asked.key == HOME
+    for number in range(80, 110):  # the first falls silent
+        taken.now_ns += 100_000_000
+        taken.take(ELSEWHERE, frame(100 * number))
+    assert isinstance(taken.take(ELSEWHERE, answer()), Frame)
+    asked = taken.link._peers.last_of(VEHICLE)
+    assert asked is not None and asked.key == ELSEWHERE
+
+
+def test_answers_are_accepted_from_every_router() -> None:
+    taken = Taken(KnownPeers(("10.0.0.1", "10.0.0.66")))
+    for number in range(3):
+        taken.now_ns += 100_000_000
+        for way in (HOME, ELSEWHERE):
+            taken.take(way, frame(100 * number))
     assert all(isinstance(taken.take(way, answer()), Frame) for way in (HOME, ELSEWHERE))
 
 

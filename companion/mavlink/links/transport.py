@@ -183,11 +183,12 @@ class Link:
         if age_ns is not None:
             self._lag.observe(t_ns, age_ns)
             t_ns -= age_ns
-        if data and peer.splitter.waiting_bytes > WAITING_MAX_BYTES:
+        splitter = peer.splitter
+        if splitter.has_more and data and splitter.waiting_bytes > WAITING_MAX_BYTES:
             self._crowded += 1
             self._report_crowded(now_ns)
             return False  # a call is due already
-        found = peer.splitter.feed(t_ns, data)
+        found = splitter.feed(t_ns, data)
         if found:
             self._pass_on(peer, found)
         newcomers = self._newcomers
@@ -204,11 +205,11 @@ class Link:
         if now_ns >= newcomers.adapts_ns:
             newcomers.adapt(now_ns, time.thread_time())
             self._report_crowded(now_ns)
-        if isinstance(peer.splitter, ForeignSplitter) and not self.url.listens:
-            began_ns = peer.splitter.unfinished_ns
+        if isinstance(splitter, ForeignSplitter) and not self.url.listens:
+            began_ns = splitter.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
                 raise StalledError(f"no complete message in the bytes of {UNFINISHED_S} s")
-        return peer.splitter.has_more
+        return splitter.has_more
 
     def _report_crowded(self, now_ns: int) -> None:
         """Count what peers sent that have too much waiting, if that is due."""

@@ -182,7 +182,7 @@ class KnownPeers:
         return any(one.is_current(now_ns) for one in sender.known.values())
 
     def is_first(self, peer: str, source: Source, now_ns: int) -> bool:
-        """Return whether a peer is trusted, or no other current peer of a sender was known earlier."""
+        """Return whether a peer is a router, or no other current peer was known earlier."""
         sender = self._senders.get(source)
         if sender is None:
             return True

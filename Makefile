@@ -57,7 +57,7 @@ site: .venv/.dev
 bench: .venv/.dev
 	$(PYTEST) -q -s -m benchmark
 
-# Some 27 minutes. Floods and attacks run alone, all others two at a time.
+# Some 25 minutes. Floods and attacks run alone, all others two at a time.
 SOAK_BESIDE = $(addprefix tests/,live/test_all_together.py live/test_recording.py \
     mavlink/wire/test_framing_fuzz.py server/test_contract.py pipeline/test_day.py)
 soak: .venv/.dev

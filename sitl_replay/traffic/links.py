@@ -151,7 +151,7 @@ class TrafficLink:
     def _max_fullness(self) -> float:
         return max((self._endpoint.fullness(key) for key in self.peers()), default=0.0)
 
-    def _take(self, key: Hashable, data: bytes, _age_ns: int | None) -> None:
+    def _take(self, key: Hashable, data: bytes, _age_ns: int | None) -> bool:
         if self.url.scheme == "udpin":
             self._heard.pop(key, None)
             self._heard[key] = None
@@ -159,6 +159,7 @@ class TrafficLink:
                 del self._heard[next(iter(self._heard))]
         if data:
             self._receive(key, data)
+        return False
 
     def _hang_up(self, key: Hashable) -> None:
         self._receive(key, b"")

@@ -342,7 +342,7 @@ class Link:
 
     def _overflow(self, count: int) -> None:
         """Count dropped datagrams or frames; their senders are unknown."""
-        self._newcomers.late()
+        self._newcomers.late(is_lossy=True)
         lost = self.status.lost
         lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
         reject = Rejection(

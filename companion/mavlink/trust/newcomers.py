@@ -1,10 +1,11 @@
 """Admission of new senders: so many a second, and none beside known ones on a busy machine.
 
 Anybody that reaches a link's port can invent senders. Each takes a clock, a track and beams, so the
-number of new ones is limited. When frames take more than ``BUSY`` of the time and are read late or
-lost, those of strangers (``known_peers``) are dropped before they are decoded, then those of the
-newest senders, until the rest are in time: who was here first keeps being served. No more senders
-are dropped than took the work that is too much: a flood of one sender costs no other its place.
+number of new ones is limited. When frames take more than ``BUSY`` of the time and are lost, or read
+late in two windows, those of strangers (``known_peers``) are dropped before they are decoded, then
+those of the newest senders, until the rest are in time: who was here first keeps being served. No
+more senders are dropped than took the work that is too much: a flood of one sender costs no other
+its place.
 """
 
 from bisect import bisect_left
@@ -54,7 +55,7 @@ class Newcomers:
         self._began_ns = 0
         self._used_s = 0.0
         self._changed_ns = 0
-        self._is_late = False
+        self._is_late = self._was_late = self._is_lossy = False
 
     def admits(self, source: Source, now_ns: int, *, is_stranger: bool = False) -> bool:
         """Return whether a frame of a sender may be used; count it if not.
@@ -83,9 +84,10 @@ class Newcomers:
         self.refused += 1
         return False
 
-    def late(self) -> None:
-        """Note that frames were read late, or lost before they were read."""
+    def late(self, *, is_lossy: bool = False) -> None:
+        """Note that frames were read late; ``is_lossy``: or lost before they were read."""
         self._is_late = True
+        self._is_lossy |= is_lossy
 
     def worked(self, sources: Sequence[Source], each_s: float) -> None:
         """Note the time that each of some frames took, by the sender of each.
@@ -110,7 +112,9 @@ class Newcomers:
         if now_ns - self._changed_ns > KEPT_NS:
             self.generation += 1
             self._changed_ns = now_ns
-        is_late, self._is_late = self._is_late, False
+        # Once late may be a long update; a flood is late again.
+        is_late = self._is_lossy or (self._is_late and self._was_late)
+        self._was_late, self._is_late, self._is_lossy = self._is_late, False, False
         if share > BUSY and is_late:
             were_served = now_ns >= self._strangers_from_ns
             self._strangers_from_ns = now_ns + STRANGERS_WAIT_NS

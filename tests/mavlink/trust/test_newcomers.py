@@ -36,7 +36,7 @@ def window(
     senders.worked_s += spent_s
     senders.worked([source(one) for one in now], spent_s / len(now))
     if is_late:
-        senders.late()
+        senders.late(is_lossy=True)
     senders.adapt(number * WINDOW_NS, used * number * WINDOW_NS * 1e-9)
 
 
@@ -118,7 +118,7 @@ def test_flood_of_one_sender_costs_no_other_its_place() -> None:
         senders.worked([source(one) for one in range(5)], 0.01 * WINDOW_NS * 1e-9)
         if 5 in now:
             senders.worked([source(5)], 0.9 * WINDOW_NS * 1e-9)
-        senders.late()
+        senders.late(is_lossy=True)
         senders.adapt(number * WINDOW_NS, number * WINDOW_NS * 1e-9)
     assert served(senders, 6, 20 * WINDOW_NS) == [0, 1, 2, 3, 4]
 
@@ -147,3 +147,19 @@ def test_oldest_sender_is_always_served(loads: list[tuple[float, bool]]) -> None
         now = served(senders, 50, 0)
         assert now == list(range(len(now)))
         assert now
+
+
+def test_one_late_window_costs_nobody_a_place() -> None:
+    """A long update makes frames late once; a flood, or frames that are lost, do not stop."""
+    senders = Newcomers()
+    window(senders, 0, 0.9)
+    assert all(senders.admits(source(number), 0) for number in range(100))
+    for number in range(1, 9):
+        if number % 2:
+            senders.late()
+        window(senders, number, 0.9)
+        assert all(senders.admits(source(one), number * WINDOW_NS) for one in range(100))
+    for number in (9, 10):
+        senders.late()
+        window(senders, number, 0.9)
+    assert not senders.admits(source(99), 10 * WINDOW_NS)

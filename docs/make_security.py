@@ -88,7 +88,8 @@ WAYS: Final = (
     WayIn(
         name="MAVLink over UDP",
         covers=("link:udpin", "link:udpout"),
-        size=f"{kb(udp.RECEIVE_BUFFER_BYTES)} in the kernel, at most {udp.STALE_NS / 1e9:.0f} s old",
+        size=f"{kb(udp.RECEIVE_BUFFER_BYTES)} in the kernel, at most {udp.STALE_NS / 1e9:.0f} s old;"
+        f" {kb(udp.WAITING_MAX_BYTES)} of a peer behind a large datagram",
         items=f"{NEW}; {STRANGERS}",
         work=OLDEST,
         over="dropped before decoding, counted (`newcomer`, `stranger`, `socket-overflow`)",

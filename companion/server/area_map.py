@@ -75,4 +75,6 @@ def add(app: FastAPI, file: Path | None) -> None:
         status = os.fstat(found.fileno())
         # A page that reads parts of two files learns from the tag that they do not belong together.
         headers = {"etag": f'"{status.st_mtime_ns:x}-{status.st_size:x}"'}
-        return file_answer(found, status.st_size, wanted, MEDIA_TYPE, headers)
+        return file_answer(
+            found, status.st_size, wanted=wanted, media_type=MEDIA_TYPE, headers=headers
+        )

@@ -40,7 +40,7 @@ def open_regular(path: Path, *, follow_links: bool = False) -> BinaryIO | None:
 
 
 def file_answer(
-    file: BinaryIO, size: int, wanted: str | None, media_type: str, headers: dict[str, str]
+    file: BinaryIO, size: int, *, wanted: str | None, media_type: str, headers: dict[str, str]
 ) -> StreamingResponse:
     """Return the answer with the first ``size`` bytes of an open file, or the part of ``wanted``.
 

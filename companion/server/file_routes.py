@@ -74,7 +74,9 @@ def _recordings(app: FastAPI, node: Node) -> None:
             raise HTTPException(404, f"no recording {name!r}")
         file, size = found
         headers = {"content-disposition": f'attachment; filename="{name}"'}
-        return file_answer(file, size, wanted, recordings.MEDIA_TYPE, headers)
+        return file_answer(
+            file, size, wanted=wanted, media_type=recordings.MEDIA_TYPE, headers=headers
+        )
 
 
 def _playback(app: FastAPI, node: Node) -> None:

@@ -239,8 +239,9 @@ def test_mirror_directions_are_regularised() -> None:
 
 
 def assert_same_beams(a: BeamSet, b: BeamSet) -> None:
-    # Nulls between nearly equal directions lose digits.
-    assert a.weights == pytest.approx(b.weights, abs=1e-7)
+    # Nulls between nearly equal directions lose digits: 3e-9 at a condition number of 29 000.
+    exact = max(1e-9, 1e-12 * (a.condition_number or 0.0))
+    assert a.weights == pytest.approx(b.weights, abs=exact)
     for one, other in zip(a.beams, b.beams, strict=True):
         assert one.azimuth_rad == pytest.approx(other.azimuth_rad, abs=1e-9)
         assert one.elevation_rad == pytest.approx(other.elevation_rad, abs=1e-9)

@@ -23,7 +23,10 @@ from companion.mavlink.wire.sbs import SbsSplitter
 
 FRAMES_AT_ONCE: Final = 16  # frames processed before other work runs; one may take 0.3 ms
 _CONTINUED: Final = ("udpin", "udpout", "tcp", "tcpin")
-"""Schemes whose endpoints continue with the rest of what they read; the others read little."""
+"""Schemes whose endpoints continue with the rest of what they read.
+
+A serial port reads little at once; a sample of Zenoh is processed whole.
+"""
 
 
 def splitter(url: LinkUrl) -> Callable[[str], Splits]:

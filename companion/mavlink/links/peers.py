@@ -41,15 +41,11 @@ _HALF_ROUND: Final = 128
 class Splits(Protocol):
     """Parser of a peer's bytes: MAVLink's splitter, or one of another format.
 
-    While ``has_more``, a call of ``feed`` without bytes returns more of what was received, of which
-    ``waiting_bytes`` are left.
+    While ``has_more``, a call of ``feed`` without bytes returns more of what was received.
     """
 
     @property
     def has_more(self) -> bool: ...
-
-    @property
-    def waiting_bytes(self) -> int: ...
 
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
         """Parse bytes that arrived at ``t_ns``; return the complete frames and the rejections."""
@@ -183,10 +179,11 @@ class Peers:
         """Return the peers from which a frame arrived at ``t_ns`` or later."""
         return [p for p in self._peers.values() if p.heard_ns is not None and p.heard_ns >= t_ns]
 
-    def last_of(self, source: Source) -> Peer | None:
+    def route_to(self, source: Source) -> Peer | None:
         """Return the peer to which messages to a source go; None if it is disconnected.
 
-        It is the peer over which the source was last received, or the one that was first.
+        It is the first known peer of the source while that is current, and otherwise the one over
+        which the source was last received.
         """
         component = self._components.get(source)
         if component is None or self._peers.get(component.peer.key) is not component.peer:

@@ -46,9 +46,7 @@ RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 STEADY_S: Final = 1.0
 """Seconds for which a connection must last before it is reported as restored."""
 REFUSED_EVERY_NS: Final = 500_000_000
-"""Least time between two rejections that count the frames of newcomers, or dropped datagrams."""
-WAITING_MAX_BYTES: Final = 1 << 16
-"""Bytes of a peer that may wait while other work runs; more are dropped and counted."""
+"""Least time between two rejections of newcomers, each with the number of their frames."""
 UNFINISHED_S: Final = 10
 """Seconds of received bytes without a complete message after which a connection is closed."""
 PEER_ACTIVE_S: Final = 10.0
@@ -113,8 +111,6 @@ class Link:
         self._newcomers = newcomers or Newcomers()
         self._refused = 0  # frames of newcomers not reported yet
         self._refused_ns = 0
-        self._crowded = 0  # pieces of peers with too much waiting, not reported yet
-        self._crowded_ns = 0
         self._peers = Peers(
             status=self.status,
             on_evict=self._finish,
@@ -184,10 +180,6 @@ class Link:
             self._lag.observe(t_ns, age_ns)
             t_ns -= age_ns
         splitter = peer.splitter
-        if splitter.has_more and data and splitter.waiting_bytes > WAITING_MAX_BYTES:
-            self._crowded += 1
-            self._report_crowded(now_ns)
-            return False  # a call is due already
         found = splitter.feed(t_ns, data)
         if found:
             self._pass_on(peer, found)
@@ -195,7 +187,8 @@ class Link:
         if age_ns is not None and age_ns > LATE_NS:
             newcomers.late()
         spent_s = time.perf_counter() - began_s
-        if len(found) != 1 or isinstance(found[0], Rejection):
+        is_mixed = len(found) != 1 or isinstance(found[0], Rejection)
+        if is_mixed and not splitter.has_more:
             spent_s *= _share_of_frames(found, len(data))
         newcomers.worked_s += spent_s
         if found:
@@ -204,18 +197,11 @@ class Link:
             newcomers.worked(served, spent_s / len(found))
         if now_ns >= newcomers.adapts_ns:
             newcomers.adapt(now_ns, time.thread_time())
-            self._report_crowded(now_ns)
         if isinstance(splitter, ForeignSplitter) and not self.url.listens:
             began_ns = splitter.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
                 raise StalledError(f"no complete message in the bytes of {UNFINISHED_S} s")
         return splitter.has_more
-
-    def _report_crowded(self, now_ns: int) -> None:
-        """Count what peers sent that have too much waiting, if that is due."""
-        if self._crowded and now_ns - self._crowded_ns >= REFUSED_EVERY_NS:
-            self._overflow(self._crowded)
-            self._crowded, self._crowded_ns = 0, now_ns
 
     def _count_stale(self, key: Hashable, data: bytes) -> None:
         """Count the frames in stale bytes, and keep the splitter synchronised with the stream."""
@@ -378,7 +364,7 @@ class Link:
 
         Returns False if there is none, it has hung up, or it does not accept the frame.
         """
-        peer = self._peers.last_of(target)
+        peer = self._peers.route_to(target)
         return peer is not None and self._send(peer, message)
 
     def _send(self, peer: Peer, message: Outgoing) -> bool:

@@ -11,9 +11,9 @@ import socket
 import struct
 import sys
 import time
-from collections import deque
+from collections import OrderedDict, deque
 from collections.abc import Collection, Hashable, Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, cast
 
 from companion.mavlink.links import kernel_time
@@ -35,7 +35,8 @@ STALE_NS: Final = 2_000_000_000
 READ_AT_ONCE: Final = 32
 """Most datagrams read before other work runs, as in libuv; ``SLICE_S`` limits them too."""
 DATAGRAM_BYTES: Final = 1 << 16  # more than any datagram has
-UNFINISHED_MAX: Final = 64  # datagrams with more frames than one call processes
+WAITING_PEERS_MAX: Final = 64  # peers whose datagrams wait; with more, nothing is read
+WAITING_MAX_BYTES: Final = 1 << 18  # bytes of a peer that wait; datagrams beyond it are dropped
 
 _SO_MEMINFO: Final = 55  # Linux, include/uapi/asm-generic/socket.h
 _SK_MEMINFO_BYTES: Final = 36  # nine 32-bit numbers, include/uapi/linux/sock_diag.h
@@ -193,6 +194,17 @@ class UdpOut:
         return 0.0 if self._datagrams is None else self._datagrams.fullness()
 
 
+@dataclass(slots=True)
+class _Waiting:
+    """Datagrams of a peer that wait, each with its arrival on the monotonic clock, ns.
+
+    Empty bytes stand for the rest of a datagram that the peer's splitter holds.
+    """
+
+    datagrams: deque[tuple[bytes, int | None]]
+    bytes: int = 0
+
+
 class _Datagrams:
     """UDP socket, read by the loop's own readers and written to directly.
 
@@ -209,7 +221,7 @@ class _Datagrams:
         self._unfit = False
         self._lost: asyncio.Future[Exception] = asyncio.get_running_loop().create_future()
         self._wall_clock = kernel_time.SetWatch()
-        self._unfinished: deque[tuple[Hashable, int | None]] = deque()  # peer, time of arrival
+        self._waiting: OrderedDict[Hashable, _Waiting] = OrderedDict()
         self._continues: asyncio.Handle | None = None
         self._dropped = 0
         self._stale = 0
@@ -252,7 +264,7 @@ class _Datagrams:
     def _read(self) -> None:
         was_set = self._wall_clock.was_set()
         until_s = time.monotonic() + SLICE_S
-        for _ in range(READ_AT_ONCE if len(self._unfinished) < UNFINISHED_MAX else 0):
+        for _ in range(READ_AT_ONCE if len(self._waiting) < WAITING_PEERS_MAX else 0):
             if time.monotonic() > until_s:
                 return
             try:
@@ -269,16 +281,26 @@ class _Datagrams:
             if age_ns is not None and age_ns > STALE_NS:
                 self._stale += 1
                 continue
-            key = None if self._connected else address
-            arrived_ns = None if age_ns is None else time.monotonic_ns() - age_ns
-            if self._take(key, data, age_ns):
-                self._unfinished.append((key, arrived_ns))
-                self._continue_soon()
+            self._process(None if self._connected else address, data, age_ns)
             if self._lost.done():
                 return
             self._unchecked += 1
             if self._unchecked >= OVERFLOW_CHECK_DATAGRAMS:
                 self._count_dropped()
+
+    def _process(self, key: Hashable, data: bytes, age_ns: int | None) -> None:
+        """Pass a datagram on; it waits behind earlier ones of its peer, with its arrival time."""
+        arrived_ns = None if age_ns is None else time.monotonic_ns() - age_ns
+        waiting = self._waiting.get(key)
+        if waiting is None:
+            if self._take(key, data, age_ns):
+                self._waiting[key] = _Waiting(deque([(b"", arrived_ns)]))
+                self._continue_soon()
+        elif waiting.bytes + len(data) > WAITING_MAX_BYTES:
+            self._stale += 1
+        else:
+            waiting.datagrams.append((data, arrived_ns))
+            waiting.bytes += len(data)
 
     def _take(self, key: Hashable, data: bytes, age_ns: int | None) -> bool:
         """Pass bytes on; return whether the datagram has more frames."""
@@ -293,17 +315,23 @@ class _Datagrams:
             self._continues = asyncio.get_running_loop().call_soon(self._continue)
 
     def _continue(self) -> None:
-        """Pass on more of the unfinished datagrams, each in turn; new ones are read in between."""
+        """Process datagrams that wait, of each peer in turn; new ones are read in between."""
         self._continues = None
         if self._socket.fileno() < 0 or self._lost.done():
             return
         until_s = time.monotonic() + SLICE_S
-        while self._unfinished and time.monotonic() <= until_s:
-            key, arrived_ns = self._unfinished.popleft()
+        while self._waiting and time.monotonic() <= until_s:
+            key, waiting = self._waiting.popitem(last=False)
+            data, arrived_ns = waiting.datagrams.popleft()
+            waiting.bytes -= len(data)
             age_ns = None if arrived_ns is None else time.monotonic_ns() - arrived_ns
-            if self._take(key, b"", age_ns):
-                self._unfinished.append((key, arrived_ns))
-        if self._unfinished:
+            if data and age_ns is not None and age_ns > STALE_NS:
+                self._stale += 1
+            elif self._take(key, data, age_ns):
+                waiting.datagrams.appendleft((b"", arrived_ns))
+            if waiting.datagrams:
+                self._waiting[key] = waiting
+        if self._waiting:
             self._continue_soon()
 
     def _age_ns(self, ancillary: kernel_time.Ancillary, was_set: bool) -> int | None:

@@ -29,28 +29,30 @@ _NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s
 class AircraftJson(ForeignSplitter):
     """Converter of documents to frames; ``feed`` takes a whole one and returns what changed.
 
-    It returns ``AT_ONCE`` aircraft, and each call without bytes the next ones.
+    It returns ``AT_ONCE`` aircraft, and each call without bytes the next ones. All have the arrival
+    time of their document.
     """
 
     def __init__(self, link: str) -> None:
         super().__init__(link)
-        self._written: float | None = None
+        self._written = -math.inf  # when the newest document was written, Unix time in seconds
+        self._arrived_ns = 0
         self._rest = list[object]()  # aircraft of the newest document, the next one last
         self._true_at: OrderedDict[int, float] = OrderedDict()  # by ICAO address
 
     @property
-    def has_more(self) -> bool:  # type: ignore[override]
+    def has_more(self) -> bool:
         """Whether aircraft of the newest document are not processed yet."""
         return bool(self._rest)
 
     def _parse(self, t_ns: int, data: bytes) -> Items:
-        if not (self._rest and not data):
+        if data or not self._rest:
             refused = self._read(t_ns, data)
             if refused:
                 return refused
         items: Items = []
         for _ in range(min(AT_ONCE, len(self._rest))):
-            items += self._one(t_ns, self._rest.pop(), self._written or 0.0)
+            items += self._one(self._arrived_ns, self._rest.pop(), self._written)
         return items
 
     def _read(self, t_ns: int, data: bytes) -> Items:
@@ -70,7 +72,7 @@ class AircraftJson(ForeignSplitter):
             return self._garbage(t_ns, len(data) or 1)
         self._complete += 1
         if written != self._written:  # else the same document as before
-            self._written = written
+            self._written, self._arrived_ns = written, t_ns
             self._rest = aircraft[AIRCRAFT_MAX - 1 :: -1]
         return []
 

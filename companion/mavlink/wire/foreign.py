@@ -17,11 +17,7 @@ class ForeignSplitter:
 
     ``unfinished_ns`` is the arrival time of the first bytes since the last complete message; None
     if there are none. A subclass counts each complete message in ``_complete``, unusable ones too.
-    ``has_more``: a message holds more than one call should process; ``feed`` without bytes goes on.
     """
-
-    has_more = False
-    waiting_bytes = 0
 
     def __init__(self, link: str) -> None:
         self.link = link
@@ -36,11 +32,18 @@ class ForeignSplitter:
         """Whether bytes arrived, but no complete message yet."""
         return self.unfinished_ns is not None and not self._complete
 
+    @property
+    def has_more(self) -> bool:
+        """Whether ``feed`` without bytes returns more of the same message."""
+        return False
+
     def feed(self, t_ns: int, data: bytes) -> Items:
         """Parse bytes that arrived at ``t_ns``.
 
         Return the frames and rejections of their messages.
         """
+        if not data and self.has_more:
+            return self._parse(t_ns, data)
         complete = self._complete
         items = self._parse(t_ns, data)
         is_partial = bool(self._pending) or self._overlong

@@ -197,8 +197,8 @@ class Splitter:
     """Incremental splitter of one peer's bytes into frames.
 
     ``wanted`` holds the message ids that are returned (None: all); other frames are only counted.
-    At most one unfinished frame is held between calls, and what ``limits`` leave for the next
-    call; ``has_more`` says that there is such.
+    Held between calls are one unfinished frame, or what ``limits`` leave for the next call, which
+    ``has_more`` announces.
     """
 
     def __init__(
@@ -212,11 +212,6 @@ class Splitter:
         self._pending = b""
         self._claimed = 0  # following bytes within the claimed length of a failed frame
         self._checker = Checker()
-
-    @property
-    def waiting_bytes(self) -> int:
-        """Number of bytes that are not processed yet; of an unfinished frame without more."""
-        return len(self._pending)
 
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
         """Parse bytes that arrived at ``t_ns``; return the frames that these bytes complete.

@@ -169,15 +169,15 @@ def test_rejections_are_counted_by_reason_without_other_effect() -> None:
 def test_source_is_located_at_the_peer_last_received_from() -> None:
     heard = Heard().hear([1], "a").hear([1], "b").hear([1], "c", Source(2, 1))
     peers = heard.peers
-    assert peers.last_of(UAV) is peers.find("b")
+    assert peers.route_to(UAV) is peers.find("b")
     heard.hear([2], "a")
-    assert peers.last_of(UAV) is peers.find("a")
-    assert peers.last_of(Source(2, 1)) is peers.find("c")
-    assert peers.last_of(Source(3, 1)) is None
+    assert peers.route_to(UAV) is peers.find("a")
+    assert peers.route_to(Source(2, 1)) is peers.find("c")
+    assert peers.route_to(Source(3, 1)) is None
     peers.forget(peers.at("a"))
-    assert peers.last_of(UAV) is None
+    assert peers.route_to(UAV) is None
     peers.at("a")  # a new peer at the old address has not been received yet
-    assert peers.last_of(UAV) is None
+    assert peers.route_to(UAV) is None
 
 
 def test_recently_received_peers_are_active() -> None:

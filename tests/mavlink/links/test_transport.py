@@ -17,6 +17,7 @@ from link_support import LIMIT_S, LOOPS, Run, frame, port_of, runner, running, u
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.links import kernel_time, tcp, transport, udp
+from companion.mavlink.links.endpoints import Upcalls
 from companion.mavlink.links.kinds import FRAMES_AT_ONCE
 from companion.mavlink.links.peers import PEERS_MAX
 from companion.mavlink.links.transport import Link
@@ -1099,26 +1100,52 @@ def test_large_datagram_is_processed_a_few_frames_at_a_time(run: Run) -> None:
     run(test())
 
 
-def test_peer_with_too_much_waiting_is_not_read_and_counted_rarely(run: Run) -> None:
-    """Rejections are events, which a flood must not multiply."""
+def test_datagrams_behind_a_large_one_keep_their_arrival_and_order(run: Run) -> None:
+    """A frame that seems to arrive before it was sent makes a clock and a bound wrong."""
 
     async def test() -> None:
-        now_ns = [time.time_ns()]
-        async with running("udpin:127.0.0.1:0", now_ns=lambda: now_ns[0]) as (link, inbox):
+        unread = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        async with running("udpin:127.0.0.1:0", now_ns=time.monotonic_ns) as (link, inbox):
+            upcalls = Upcalls(
+                up=lambda: None,
+                take=link.take,
+                stale=lambda *_: None,
+                on_peer_gone=lambda _: None,
+                overflow=lambda _: None,
+            )
+            datagrams = udp._Datagrams(
+                sock=unread, status=link.status, upcalls=upcalls, connected=False
+            )
+            large = b"".join(frame(number, sysid=7) for number in range(100))
+            datagrams._process("a", large, 900_000_000)
+            datagrams._process("a", frame(100, sysid=7), 500_000_000)
+            datagrams._process("a", frame(101, sysid=7), 100_000_000)
+            datagrams._process("b", frame(5, sysid=9), 0)  # another peer does not wait
+            assert inbox.frames[-1].source == Source(9, 1)
+            now_ns = time.monotonic_ns()
+            await inbox.until(103)
+            of_a = [one for one in inbox.frames if one.source == Source(7, 1)]
+            assert [one.raw for one in of_a] == [frame(number, sysid=7) for number in range(102)]
+            ages_s = [round((now_ns - one.t_ns) * 1e-9, 1) for one in of_a]
+            assert ages_s == [0.9] * 100 + [0.5, 0.1]
+        unread.close()
+
+    run(test())
+
+
+def test_peer_with_too_much_waiting_is_not_read(run: Run) -> None:
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
             await until_true(lambda: link.status.state == "up")
-            key = ("127.0.0.1", 9)
-            many = b"".join(frame(number, sysid=7) for number in range(2000))
-            assert link.take(key, many)
-            for _ in range(1000):
-                now_ns[0] += 1_000_000
-                assert not link.take(key, frame(1))
-            dropped = [one for one in inbox.rejections if one.reason is Reason.SOCKET_OVERFLOW]
-            assert [one.count for one in dropped] == [1, 500]
-            now_ns[0] += 1_000_000_000
-            while link.take(key, b""):
-                pass
-            assert len(inbox.frames) == 2000
-            assert sum(one.count for one in inbox.rejections) == 1000
+            large = b"".join(frame(number, sysid=7) for number in range(1500))
+            most = 1 + udp.WAITING_MAX_BYTES // len(large)
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
+                sender.connect(("127.0.0.1", port_of(link)))
+                for _ in range(most + 5):
+                    sender.send(large)
+                await inbox.until_true(lambda: bool(inbox.rejections))
+            assert inbox.rejections[0].reason is Reason.SOCKET_OVERFLOW
+            assert len(inbox.frames) >= 1500
 
     run(test())
 

@@ -72,13 +72,13 @@ def test_answers_are_accepted_from_the_peer_that_was_first(taken: Taken) -> None
     forged = taken.take(ELSEWHERE, answer())
     assert isinstance(forged, Rejection)
     assert forged.reason is Reason.UNPLACED_STAMP
-    asked = taken.link._peers.last_of(VEHICLE)
+    asked = taken.link._peers.route_to(VEHICLE)
     assert asked is not None and asked.key == HOME
     for number in range(80, 110):  # the first falls silent
         taken.now_ns += 100_000_000
         taken.take(ELSEWHERE, frame(100 * number))
     assert isinstance(taken.take(ELSEWHERE, answer()), Frame)
-    asked = taken.link._peers.last_of(VEHICLE)
+    asked = taken.link._peers.route_to(VEHICLE)
     assert asked is not None and asked.key == ELSEWHERE
 
 

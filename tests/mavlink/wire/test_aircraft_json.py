@@ -143,9 +143,10 @@ def test_too_many_aircraft_use_bounded_memory() -> None:
         found = poll.feed(7, document(*many, now=start))
         assert poll.has_more
         while poll.has_more:
-            more = poll.feed(7, b"")
+            more = poll.feed(99, b"")
             assert 0 < len(more) <= AT_ONCE
             found += more
+        assert {one.t_ns for one in found} == {7}  # they arrived with their document
         assert len(found) == AIRCRAFT_MAX
     assert len(poll._true_at) == AIRCRAFT_MAX
 

@@ -6,19 +6,21 @@ use. See docs/math.md 5.8.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from typing import Final
 
 import numpy as np
 
 from companion.pipeline.assumptions import ARRAY
-from companion.pipeline.sighted_uavs import Look, SightedUavs
+from companion.pipeline.sighted_uavs import Look, Looks, SightedUavs
 from companion.settings.observations import ObservationSettings
 from companion.tracking import compass
 from companion.tracking.carrier import USUAL_ATTITUDE
 from companion.tracking.compass import ErrorSet, Misalignment, Seen
-from companion.tracking.rotations import angle_between_rad, rotation_angle_rad
+from companion.tracking.relative import Relative
+from companion.tracking.rotations import angle_between_rad, rotation, rotation_angle_rad
+from companion.tracking.sightings import Sightings, possible
 from companion.values import Cap, Carrier, FloatArray, Notice, Reason, Refuted, Severity, angle_rad
 
 UPDATE_NS: Final = 190_000_000  # least time between two estimates of the attitude's error
@@ -98,21 +100,26 @@ class ArrayCompass:
         return least[-1 - self._tolerates] if len(least) > self._tolerates else 0.0
 
     def _seen(self, now_ns: int) -> list[Seen]:
-        found = []
+        fresh = dict[str, tuple[Sightings, Relative]]()
         for uav, record in self._uavs:
             sightings, latest = record.sightings, record.latest
             if sightings is None or latest is None or now_ns - sightings.t_ns > FRESH_NS:
                 if sightings is not None and now_ns - sightings.t_ns > FORGOTTEN_NS:
                     record.sightings, record.contradicted_ns, record.is_refuted = None, None, False
                 continue
-            possible = sightings.possible(self._settings.outliers)
-            if possible is None:
-                record.sightings = record.latest = None
+            fresh[uav] = sightings, latest[0]
+        caps = possible(
+            [sightings.caps for sightings, _ in fresh.values()], self._settings.outliers
+        )
+        found, largest_rad = [], self.largest_rad
+        for (uav, (sightings, near)), cap in zip(fresh.items(), caps, strict=True):
+            if cap is None:
+                self._uavs.discard(uav)
                 continue
-            near, aged_s = latest[0], abs(now_ns - sightings.t_ns) * 1e-9
-            changed = self._drift_radps * aged_s + near.turned_rad(aged_s) * self.largest_rad
-            radius = min(possible.radius_rad + changed, math.pi)
-            found.append(Seen(uav, near.reported, Cap(possible.center, radius)))
+            aged_s = abs(now_ns - sightings.t_ns) * 1e-9
+            changed = self._drift_radps * aged_s + near.turned_rad(aged_s) * largest_rad
+            radius = min(cap.radius_rad + changed, math.pi)
+            found.append(Seen(uav, near.reported, Cap(cap.center, radius)))
         return found
 
     def _confined(self, known: ErrorSet, seen: Sequence[Seen]) -> ErrorSet:
@@ -191,21 +198,19 @@ class ArrayCompass:
             return Misalignment(np.eye(3), self.bound_rad)
         return Misalignment(self.error.center, grown)
 
-    def look(self, uav: str, carrier: Carrier) -> Look | None:
-        """Return a snapshot of what was seen of a UAV; ``carrier`` is the reported pose.
-
-        None without any.
-        """
-        record = self._uavs.get(uav)
-        if record is None or (record.sightings is None and not record.pending):
-            return None
-        return Look(
-            sightings=record.sightings,
-            pending=record.pending,
-            is_refuted=record.is_refuted,
+    def looks(self, uavs: Iterable[str], carrier: Carrier) -> Looks:
+        """Return a snapshot of what was seen of those UAVs that were; at the reported pose."""
+        each = {
+            uav: Look(record.sightings, record.pending, record.is_refuted)
+            for uav in uavs
+            if (record := self._uavs.get(uav)) is not None
+            and (record.sightings is not None or record.pending)
+        }
+        return Looks(
+            each=each,
             error=self.error_at(carrier),
             bound_rad=self.largest_rad,
-            likely=self._uavs.likely.vector_rad(carrier.body_from_local),
+            likely=rotation(self._uavs.likely.vector_rad(carrier.body_from_local)),
         )
 
     def corrected(self, carrier: Carrier) -> Carrier:

@@ -287,28 +287,25 @@ class Observing:
         """
         if not self.uavs or isinstance(reported, str):
             return None
-        carrier = reported.carrier
-        looks = [self.compass.look(one.track.fix.uav, carrier) for one in snapshots]
-        times = {one.t_ns for look in looks if look is not None for one in look.pending}
+        looks = self.compass.looks((one.track.fix.uav for one in snapshots), reported.carrier)
+        times = {one.t_ns for look in looks.each.values() for one in look.pending}
         poses = {t_ns: self._pose(t_ns, nearest=False) for t_ns in (*times, valid_at_ns)}
         pose, follows = poses[valid_at_ns], self._settings.follow
 
         def seen_directions(tracks: Sequence[Track]) -> dict[str, SeenDirection]:
-            found = {}
-            for snapshot, look, track in zip(snapshots, looks, tracks, strict=True):
+            near, unbounded = dict[str, Relative](), dict[str, SeenDirection]()
+            for snapshot, track in zip(snapshots, tracks, strict=True):
+                look = looks.each.get(track.uav)
                 if look is None or pose is None:
                     continue
                 if look.is_refuted and not follows:
-                    found[track.uav] = SeenDirection(None)
+                    unbounded[track.uav] = SeenDirection(None)
                     continue
-                near = self._relative(snapshot, track, reported)
-                if near is None:
-                    continue
-                seen = self.uavs.direction(
-                    look, near, pose=pose, pose_at=poses.get, is_alone=look.is_refuted
-                )
-                if seen is not None:
-                    found[track.uav] = seen
-            return found
+                at = self._relative(snapshot, track, reported)
+                if at is not None:
+                    near[track.uav] = at
+            if pose is None or not near:
+                return unbounded
+            return unbounded | self.uavs.directions(looks, near, pose=pose, pose_at=poses.get)
 
         return seen_directions

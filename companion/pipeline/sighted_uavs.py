@@ -6,11 +6,9 @@ turns by its reported rates, within its largest angular acceleration. See docs/m
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
-
-import numpy as np
 
 from companion.beams.aim import SeenDirection
 from companion.settings.observations import ObservationSettings
@@ -18,8 +16,15 @@ from companion.tracking.compass import Misalignment
 from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.likely_error import LikelyError
 from companion.tracking.relative import Relative
-from companion.tracking.rotations import rotation
-from companion.tracking.sightings import WINDOW, Motion, Sightings
+from companion.tracking.sightings import (
+    WINDOW,
+    Caps,
+    Guide,
+    Motion,
+    Sightings,
+    moved_caps,
+    possible,
+)
 from companion.values import Cap, FloatArray
 
 MEMORY_S: Final = 3.0  # time constant with which measurements of the likely error are forgotten
@@ -53,16 +58,23 @@ class SightedUav:
 
 
 class Look(NamedTuple):
-    """Snapshot of what the array saw of one UAV, for any thread.
-
-    error      error of reported attitudes
-    bound_rad  bound on its angle
-    likely     its likely rotation vector (3,), local frame
-    """
+    """Snapshot of what the array saw of one UAV, for any thread."""
 
     sightings: Sightings | None
     pending: tuple[Measured, ...]
     is_refuted: bool
+
+
+class Looks(NamedTuple):
+    """Snapshot of what the array saw of some UAVs, for any thread.
+
+    each       by UAV
+    error      error of reported attitudes
+    bound_rad  bound on its angle
+    likely     its likely rotation, (3, 3), local frame
+    """
+
+    each: dict[str, Look]
     error: Misalignment
     bound_rad: float
     likely: FloatArray
@@ -99,6 +111,11 @@ class SightedUavs:
     def forget(self, uav: str) -> None:
         """Forget a UAV whose track is dropped or restarted."""
         self._uavs.pop(uav, None)
+
+    def discard(self, uav: str) -> None:
+        """Forget the directions in which a UAV was seen, which contradict one another."""
+        record = self._uavs[uav]
+        record.sightings = record.latest = None
 
     def clear(self) -> None:
         """Forget all UAVs."""
@@ -168,7 +185,7 @@ class SightedUavs:
             record.latest = near, pose
         else:
             later = Sightings.of(one.t_ns, cap).moved(before.t_ns, motion)
-            cap = Cap(later.centers[0], float(later.radii_rad[0]))
+            cap = Cap(later.caps.centers[0], float(later.caps.radii_rad[0]))
         if before.contradicts(cap, self._outliers):
             record.sightings = before.against(cap)
             return False
@@ -208,56 +225,72 @@ class SightedUavs:
             drifted_rad=drifted,
         )
 
-    def direction(
+    def directions(
         self,
-        look: Look,
-        near: Relative,
+        looks: Looks,
+        near: Mapping[str, Relative],
         *,
         pose: ExtrapolatedAttitude,
         pose_at: PoseAt,
-        is_alone: bool,
-    ) -> SeenDirection | None:
-        """Return the directions in which a UAV is, array frame.
+    ) -> dict[str, SeenDirection]:
+        """Return the directions in which UAVs are, array frame, by UAV.
 
-            near      the UAV's position relative to the array at the time of the beam
+            near      positions of UAVs relative to the array at the time of the beam
             pose      the reported attitude then
             pose_at   that of another time, by the same report
-            is_alone  whether its reported position is not used
 
-        None if the measurements say nothing. Without a cap, nothing bounds the error: they
-        contradict one another, or the reported position.
+        A UAV is missing if its measurements say nothing. Without a cap, nothing bounds the error:
+        they contradict one another, or the reported position.
         """
-        to_ns, parts = near.t_ns, []
+        carried = {
+            uav: parts
+            for uav, at in near.items()
+            if (parts := list(self._carried(looks, uav, at, pose=pose, pose_at=pose_at)))
+        }
+        if not carried:
+            return {}
+        every = [part for parts in carried.values() for part in parts]
+        centers, radii = moved_caps([caps for caps, _ in every], [motion for _, motion in every])
+        many, guides, last = list[Caps](), list[Guide | None](), 0
+        for uav, parts in carried.items():
+            first, last = last, last + sum(len(caps.radii_rad) for caps, _ in parts)
+            kept = slice(max(first, last - WINDOW), last)
+            many.append(Caps(centers[kept], radii[kept]))
+            guides.append(self._guide(looks, uav, near[uav].reported, self.aged_rad(pose)))
+        array_from_local = self._array_from_body @ pose.body_from_local
+        found = dict[str, SeenDirection]()
+        for uav, cap in zip(carried, possible(many, self._outliers, guides), strict=True):
+            if cap is None:
+                found[uav] = SeenDirection(None)
+            elif cap.radius_rad < math.pi / 2:
+                seen = Cap(array_from_local @ cap.center, cap.radius_rad)
+                found[uav] = SeenDirection(seen, looks.each[uav].is_refuted)
+        return found
+
+    @staticmethod
+    def _guide(looks: Looks, uav: str, reported: Cap, aged_rad: float) -> Guide | None:
+        """Return where a UAV may be by its reported position; None if that is not used."""
+        if looks.each[uav].is_refuted:
+            return None
+        spread = min(reported.radius_rad + looks.error.bound_rad + aged_rad, math.pi)
+        within = Cap(looks.error.center @ reported.center, spread)
+        return Guide(within, looks.likely @ reported.center)
+
+    def _carried(
+        self, looks: Looks, uav: str, near: Relative, *, pose: ExtrapolatedAttitude, pose_at: PoseAt
+    ) -> Iterator[tuple[Caps, Motion]]:
+        """Yield caps of a UAV, oldest first, and their motion to the time of a beam."""
+        to_ns, look = near.t_ns, looks.each[uav]
         if look.sightings is not None:
             before = look.sightings
             turned_rad = near.turned_rad(abs(to_ns - before.t_ns) * 1e-9)
-            motion = self._motion(near, before.t_ns, to_ns, look.bound_rad, turned_rad)
-            moved = before.moved(to_ns, motion)
-            parts.append((moved.centers, moved.radii_rad + self.aged_rad(pose)))
+            motion = self._motion(near, before.t_ns, to_ns, looks.bound_rad, turned_rad)
+            yield before.caps, replace(motion, turned_rad=motion.turned_rad + self.aged_rad(pose))
         for one in look.pending:
             at = pose_at(one.t_ns)
             if at is None:
                 continue
             cap = self._placed(one, at, near, pose.extrapolated_since(at))
             turned_rad = pose.turned_from(at) + pose.extrapolated_since(at)
-            motion = self._motion(near, one.t_ns, to_ns, look.bound_rad, turned_rad)
-            later = Sightings.of(one.t_ns, cap).moved(to_ns, motion)
-            parts.append((later.centers, later.radii_rad))
-        if not parts:
-            return None
-        centers = np.concatenate([part[0] for part in parts])[-WINDOW:]
-        radii = np.minimum(np.concatenate([part[1] for part in parts])[-WINDOW:], math.pi)
-        within, likely, reported = None, None, near.reported
-        if not is_alone:
-            spread = reported.radius_rad + look.error.bound_rad + self.aged_rad(pose)
-            within = Cap(look.error.center @ reported.center, min(spread, math.pi))
-            likely = rotation(look.likely) @ reported.center
-        found = Sightings(t_ns=to_ns, centers=centers, radii_rad=radii).possible(
-            self._outliers, within, likely
-        )
-        if found is None:
-            return SeenDirection(None)
-        if found.radius_rad >= math.pi / 2:
-            return None
-        array_from_local = self._array_from_body @ pose.body_from_local
-        return SeenDirection(Cap(array_from_local @ found.center, found.radius_rad), is_alone)
+            motion = self._motion(near, one.t_ns, to_ns, looks.bound_rad, turned_rad)
+            yield Caps.of(cap), motion

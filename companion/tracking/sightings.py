@@ -11,13 +11,13 @@ result. See docs/math.md 5.7.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 
-from companion.tracking.rotations import cross
-from companion.values import Cap, FloatArray, angle_rad
+from companion.values import Cap, FloatArray
 
 WINDOW: Final = 10  # newest measurements of a UAV that are kept
 FACETS: Final = 16  # sides of the polygon around the possible directions
@@ -27,7 +27,8 @@ _FACETS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # (FACETS
 _AHEAD: Final = np.roll(np.arange(FACETS), -1)
 _BEHIND: Final = np.roll(np.arange(FACETS), 1)
 _BETWEEN: Final = 1.0 / math.sin(2 * math.pi / FACETS)
-_CORNER: Final = 1.0 / (2 * math.cos(2 * math.pi / FACETS))
+_TWICE_COS: Final = 2 * math.cos(2 * math.pi / FACETS)
+_CORNER: Final = 1.0 / _TWICE_COS
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -49,67 +50,94 @@ class Motion:
     misalignment_rad: float
     turned_rad: float
 
+    @property
+    def growth(self) -> tuple[float, float] | None:
+        """By what the chord of a cap's radius is multiplied, and then its radius increased, rad.
 
-def _moved(
-    centers: FloatArray, radii_rad: FloatArray, motion: Motion
-) -> tuple[FloatArray, FloatArray]:
-    """Return caps (K, 3), (K,) after a motion.
+        With r the true and r' the predicted range, the true direction becomes that of r s + W d +
+        e, and the centre that of r' c + d: W is the misalignment and e the error of the
+        displacement d. None: the direction may become any.
+        """
+        way_m = math.sqrt(self.moved_ned_m @ self.moved_ned_m)
+        least_m = self.range_m - self.range_error_m - way_m - self.error_m
+        if least_m <= 0.0:
+            return None
+        off_m = self.error_m + way_m * (self.misalignment_rad + self.range_error_m / self.range_m)
+        if off_m >= least_m:
+            return None
+        grown_rad = math.asin(off_m / least_m) + self.turned_rad
+        return self.range_m / (self.range_m - way_m), grown_rad
 
-    With r the true and r' the predicted range, the true direction becomes that of r s + W d + e,
-    and the centre that of r' c + d: W is the misalignment and e the error of the displacement d.
-    """
-    way_m = math.sqrt(motion.moved_ned_m @ motion.moved_ned_m)
-    least_m = motion.range_m - motion.range_error_m - way_m - motion.error_m
-    if least_m <= 0.0:
-        return centers, np.full(len(radii_rad), math.pi)
-    off_m = motion.error_m + way_m * (
-        motion.misalignment_rad + motion.range_error_m / motion.range_m
-    )
-    if off_m >= least_m:
-        return centers, np.full(len(radii_rad), math.pi)
-    grown = math.asin(off_m / least_m) + motion.turned_rad
-    scale = motion.range_m / (motion.range_m - way_m)
-    later = centers * motion.range_m + motion.moved_ned_m
-    later /= np.sqrt(np.einsum("kc,kc->k", later, later))[:, np.newaxis]
-    spread = 2.0 * np.arcsin(np.minimum(1.0, scale * np.sin(np.minimum(radii_rad, math.pi) / 2.0)))
-    return later, np.minimum(spread + grown, math.pi)
+
+class Caps(NamedTuple):
+    """Caps of possible directions: centres (K, 3), oldest first, and radii (K,)."""
+
+    centers: FloatArray
+    radii_rad: FloatArray
+
+    @classmethod
+    def of(cls, cap: Cap) -> "Caps":
+        """Return one cap."""
+        return cls(cap.center[np.newaxis], np.array([cap.radius_rad]))
+
+
+def moved_caps(parts: Sequence[Caps], motions: Sequence[Motion]) -> Caps:
+    """Return the caps of all parts, each part after its motion."""
+    rows = []
+    for motion in motions:
+        growth = motion.growth
+        if growth is None:
+            rows.append((1.0, 0.0, 0.0, 0.0, 0.0, math.pi))
+        else:
+            rows.append((motion.range_m, *motion.moved_ned_m.tolist(), *growth))
+    table = np.array(rows)
+    if len(rows) > 1:
+        table = table.repeat([len(part.radii_rad) for part in parts], axis=0)
+    centers, radii = parts[0]
+    if len(parts) > 1:
+        centers = np.concatenate([part.centers for part in parts])
+        radii = np.concatenate([part.radii_rad for part in parts])
+    later = centers * table[:, :1] + table[:, 1:4]
+    later /= np.sqrt(np.vecdot(later, later))[:, np.newaxis]
+    chords = table[:, 4] * np.sin(np.minimum(radii, math.pi) / 2.0)
+    spread = 2.0 * np.arcsin(np.minimum(1.0, chords)) + table[:, 5]
+    return Caps(later, np.minimum(spread, math.pi))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class Sightings:
     """Newest caps of one UAV, all moved to the time ``t_ns``; immutable.
 
-    centers, radii_rad  (K, 3) and (K,), oldest first
-    contrary            caps that contradict the set, likewise, since the last one that agreed
+    contrary  caps that contradict the set, likewise, since the last one that agreed
     """
 
     t_ns: int
-    centers: FloatArray
-    radii_rad: FloatArray
+    caps: Caps
     contrary: "Sightings | None" = None
 
     @classmethod
     def of(cls, t_ns: int, cap: Cap) -> Self:
         """Return the set with one cap."""
-        return cls(t_ns=t_ns, centers=cap.center[np.newaxis], radii_rad=np.array([cap.radius_rad]))
+        return cls(t_ns=t_ns, caps=Caps.of(cap))
 
     def moved(self, t_ns: int, motion: Motion) -> "Sightings":
         """Return the caps at a later time."""
-        centers, radii = _moved(self.centers, self.radii_rad, motion)
+        caps = moved_caps([self.caps], [motion])
         contrary = None if self.contrary is None else self.contrary.moved(t_ns, motion)
-        return Sightings(t_ns=t_ns, centers=centers, radii_rad=radii, contrary=contrary)
+        return Sightings(t_ns=t_ns, caps=caps, contrary=contrary)
 
     def with_cap(self, cap: Cap) -> "Sightings":
         """Return the caps with a newer one, which agrees with them; drops the oldest."""
-        centers = np.concatenate([self.centers[1 - WINDOW :], cap.center[np.newaxis]])
-        radii = np.append(self.radii_rad[1 - WINDOW :], cap.radius_rad)
-        return Sightings(t_ns=self.t_ns, centers=centers, radii_rad=radii)
+        centers = np.concatenate([self.caps.centers[1 - WINDOW :], cap.center[np.newaxis]])
+        radii = np.append(self.caps.radii_rad[1 - WINDOW :], cap.radius_rad)
+        return Sightings(t_ns=self.t_ns, caps=Caps(centers, radii))
 
     def contradicts(self, cap: Cap, outliers: int) -> bool:
         """Return whether a cap is apart from more caps than may be wrong."""
-        cosines = np.cos(np.minimum(self.radii_rad + cap.radius_rad, math.pi))
-        apart = np.count_nonzero(self.centers @ cap.center < cosines - 1e-12)
-        return int(apart) > min(outliers, len(self.radii_rad) - 1)
+        centers, radii = self.caps
+        cosines = np.cos(np.minimum(radii + cap.radius_rad, math.pi))
+        apart = np.count_nonzero(centers @ cap.center < cosines - 1e-12)
+        return int(apart) > min(outliers, len(radii) - 1)
 
     def against(self, cap: Cap) -> "Sightings":
         """Return the caps after one that contradicts them.
@@ -118,87 +146,149 @@ class Sightings:
         """
         other = Sightings.of(self.t_ns, cap)
         if self.contrary is not None:
-            known = self.contrary.possible(0)
+            (known,) = possible([self.contrary.caps], 0)
             agrees = known is not None and not known.is_apart_from(cap)
             other = self.contrary.with_cap(cap) if agrees else other
-        if len(other.radii_rad) >= RESTART:
+        if len(other.caps.radii_rad) >= RESTART:
             return other
         return replace(self, contrary=other)
 
-    def possible(
-        self, outliers: int, within: Cap | None = None, about: FloatArray | None = None
-    ) -> Cap | None:
-        """Return a cap with every possible direction, if at most ``outliers`` caps are wrong.
 
-            within  a cap that is right; None: none is known
-            about   where the centre should be, (3,); None: in the middle
+class Guide(NamedTuple):
+    """What else is known of a UAV's direction.
 
-        None if more than that are wrong: no direction is possible.
-        """
-        if len(self.radii_rad) <= outliers:
-            return Cap(self.centers[-1], math.pi) if within is None else within
-        middle = (self.centers / (self.radii_rad[:, np.newaxis] + 1e-6)).sum(axis=0)
-        middle /= max(math.sqrt(middle @ middle), 1e-9)
-        reach = np.arccos(np.clip(self.centers @ middle, -1.0, 1.0)) + self.radii_rad
-        farthest = float(np.partition(reach, outliers)[outliers])
-        if within is not None:
-            farthest = min(farthest, angle_rad(within.center, middle) + within.radius_rad)
-        if farthest >= math.pi / 2:  # the tangent plane shows half of all directions
-            return Cap(middle, math.pi)
-        axes, extents = self._extents(middle, outliers)
-        if within is not None:
-            extents = np.minimum(extents, _ends(axes @ within.center, within.radius_rad))
-        return _enclosed(middle, axes, extents, about)
+    within  a cap that is right
+    likely  where the direction probably is, (3,)
+    """
 
-    def _extents(self, middle: FloatArray, outliers: int) -> tuple[FloatArray, FloatArray]:
-        """Return the tangent plane's axes (2, 3) at ``middle``, and extents (FACETS,) on it.
-
-        A cap about c of radius r extends along h to sin(asin(h.c) + r).
-        """
-        least = np.zeros(3)
-        least[int(np.argmin(np.abs(middle)))] = 1.0
-        first = least - middle[int(np.argmin(np.abs(middle)))] * middle
-        first /= math.sqrt(first @ first)
-        axes = np.stack([first, cross(middle, first)])
-        ends = _ends(self.centers @ axes.T, self.radii_rad[:, np.newaxis])
-        if outliers:
-            return axes, np.partition(ends, outliers, axis=0)[outliers]
-        extents: FloatArray = ends.min(axis=0)
-        return axes, extents
+    within: Cap
+    likely: FloatArray
 
 
-def _ends(centers: FloatArray, radii_rad: FloatArray | float) -> FloatArray:
-    """Return extents of caps along all normals, from their centres in the plane, (..., 2)."""
+def possible(
+    many: Sequence[Caps], outliers: int, guides: Sequence[Guide | None] | None = None
+) -> list[Cap | None]:
+    """Return for each of many UAVs a cap with every possible direction.
+
+        many      caps of each UAV: centres (K, 3), oldest first, and radii (K,)
+        outliers  most caps of a UAV that may be wrong
+        guides    what else is known of each; None: nothing
+
+    None if more caps are wrong than may be: no direction is possible. The centre of a result is in
+    the middle of the possible directions, or near the likely one.
+    """
+    known = list(guides or [None] * len(many))
+    found: list[Cap | None] = [
+        Cap(centers[-1], math.pi) if guide is None else guide.within
+        for (centers, _), guide in zip(many, known, strict=True)
+    ]
+    enough = [i for i, (_, radii) in enumerate(many) if len(radii) > outliers]
+    if enough:
+        shared = _shared([many[i] for i in enough], outliers, [known[i] for i in enough])
+        for i, cap in zip(enough, shared, strict=True):
+            found[i] = cap
+    return found
+
+
+def _shared(
+    many: Sequence[Caps], outliers: int, guides: Sequence[Guide | None]
+) -> list[Cap | None]:
+    """Return the possible directions of UAVs with more caps than may be wrong."""
+    centers, radii = _stacked(many)
+    middles = (centers / (radii + 1e-6)[:, :, np.newaxis]).sum(axis=1)
+    middles /= np.maximum(np.sqrt(np.vecdot(middles, middles)), 1e-9)[:, np.newaxis]
+    cosines = np.vecdot(centers, middles[:, np.newaxis])
+    reach = np.arccos(np.clip(cosines, -1.0, 1.0)) + radii
+    farthest = np.partition(reach, outliers, axis=1)[:, outliers]
+    axes = _axes(middles)
+    ends = _ends(centers @ axes.transpose(0, 2, 1), radii)
+    extents = np.partition(ends, outliers, axis=1)[:, outliers] if outliers else ends.min(axis=1)
+    guided = [i for i, guide in enumerate(guides) if guide is not None]
+    likely = np.full((len(many), 2), math.nan)
+    if guided:
+        sure = [guide for guide in guides if guide is not None]
+        within = np.array([guide.within.center for guide in sure])
+        spread = np.array([guide.within.radius_rad for guide in sure])
+        apart = within - middles[guided]
+        off = 2.0 * np.arcsin(np.minimum(np.sqrt(np.vecdot(apart, apart)) / 2.0, 1.0))
+        farthest[guided] = np.minimum(farthest[guided], off + spread)
+        in_plane = np.stack([within, np.array([guide.likely for guide in sure])], axis=1)
+        in_plane = in_plane @ axes[guided].transpose(0, 2, 1)
+        outer = _ends(in_plane[:, :1], spread[:, np.newaxis])[:, 0]
+        extents[guided] = np.minimum(extents[guided], outer)
+        likely[guided] = in_plane[:, 1]
+    around = _enclosed(middles, axes, extents, likely)
+    # The tangent plane shows half of all directions.
+    return [
+        Cap(middle, math.pi) if far >= math.pi / 2 else cap
+        for middle, far, cap in zip(middles, farthest.tolist(), around, strict=True)
+    ]
+
+
+def _stacked(many: Sequence[Caps]) -> tuple[FloatArray, FloatArray]:
+    """Return caps of N UAVs as centres (N, K, 3) and radii (N, K); what is missing has no end."""
+    counts = [len(radii) for _, radii in many]
+    most = max(counts)
+    if min(counts) == most:
+        return np.array([one.centers for one in many]), np.array([one.radii_rad for one in many])
+    centers, radii = np.zeros((len(many), most, 3)), np.full((len(many), most), math.inf)
+    for i, (count, caps) in enumerate(zip(counts, many, strict=True)):
+        centers[i, :count], radii[i, :count] = caps
+    return centers, radii
+
+
+def _axes(middles: FloatArray) -> FloatArray:
+    """Return two axes (N, 2, 3) of the tangent planes at unit vectors (N, 3)."""
+    every, least = np.arange(len(middles)), np.abs(middles).argmin(axis=1)
+    first = -middles[every, least, np.newaxis] * middles
+    first[every, least] += 1.0
+    first /= np.sqrt(np.vecdot(first, first))[:, np.newaxis]
+    return np.stack([first, np.cross(middles, first)], axis=1)
+
+
+def _ends(centers: FloatArray, radii_rad: FloatArray) -> FloatArray:
+    """Return extents (N, K, FACETS) of caps along all normals, from centres (N, K, 2) in the plane.
+
+    A cap about c of radius r extends along h to sin(asin(h.c) + r).
+    """
     along = np.arcsin(np.clip(centers @ _FACETS.T, -1.0, 1.0))
-    ends: FloatArray = np.sin(np.minimum(along + radii_rad, math.pi / 2))
+    ends: FloatArray = np.sin(np.minimum(along + radii_rad[:, :, np.newaxis], math.pi / 2))
     return ends
 
 
 def _enclosed(
-    middle: FloatArray, axes: FloatArray, extents: FloatArray, about: FloatArray | None
-) -> Cap | None:
-    """Return a cap around the directions within the extents; None if there are none.
+    middles: FloatArray, axes: FloatArray, extents: FloatArray, likely: FloatArray
+) -> list[Cap | None]:
+    """Return a cap around the directions within each extents (N, FACETS); None if there are none.
+
+    likely  (N, 2), where the centre should be, in the plane; nan: in the middle
 
     A point of the polygon in direction n from a point o has n between two neighbouring normals, so
     it is no farther from o than the corner of these two sides.
     """
-    extents = np.minimum(extents, (extents[_AHEAD] + extents[_BEHIND]) * _CORNER)
-    if (extents[: FACETS // 2] + extents[FACETS // 2 :]).min() < 0.0:
-        return None
+    extents = np.minimum(extents, (extents[:, _AHEAD] + extents[:, _BEHIND]) * _CORNER)
+    empty = (extents[:, : FACETS // 2] + extents[:, FACETS // 2 :]).min(axis=1) < 0.0
     at = (2.0 / FACETS) * (extents @ _FACETS)
-    if about is not None:
-        wanted = axes @ about
-        outside = float((_FACETS @ wanted - extents).max())
-        span = float((extents - _FACETS @ at).max())
-        at = wanted if outside <= 0.0 else at + (wanted - at) * span / max(span + outside, 1e-12)
-    rest = extents - _FACETS @ at
-    following = rest[_AHEAD]
-    cosine = math.cos(2 * math.pi / FACETS)
-    corners = (rest * rest + following * following - 2 * cosine * rest * following).max()
-    radius = math.sqrt(corners) * _BETWEEN
-    from_middle = math.sqrt(at @ at)
-    if from_middle + radius >= 1.0:
-        return Cap(middle, math.pi)
-    center = at @ axes + math.sqrt(1.0 - from_middle**2) * middle
-    slope = math.sqrt(1.0 - (from_middle + radius) ** 2)
-    return Cap(center, 2.0 * math.asin(min(1.0, radius / (2.0 * slope))))
+    outside = (likely @ _FACETS.T - extents).max(axis=1)
+    span = (extents - at @ _FACETS.T).max(axis=1)
+    share = np.where(outside <= 0.0, 1.0, span / np.maximum(span + outside, 1e-12))
+    wanted = at + (likely - at) * share[:, np.newaxis]
+    at = np.where(np.isnan(likely), at, wanted)
+    rest = extents - at @ _FACETS.T
+    following = rest[:, _AHEAD]
+    corners = (rest * rest + following * following - _TWICE_COS * rest * following).max(axis=1)
+    found = list[Cap | None]()
+    in_plane = (at[:, np.newaxis] @ axes)[:, 0]
+    rows = zip(empty.tolist(), np.sqrt(np.vecdot(at, at)).tolist(), corners.tolist(), strict=True)
+    for i, (is_empty, from_middle, corner) in enumerate(rows):
+        if is_empty:
+            found.append(None)
+            continue
+        radius = math.sqrt(corner) * _BETWEEN
+        if from_middle + radius >= 1.0:
+            found.append(Cap(middles[i], math.pi))
+            continue
+        center = in_plane[i] + math.sqrt(1.0 - from_middle**2) * middles[i]
+        slope = math.sqrt(1.0 - (from_middle + radius) ** 2)
+        found.append(Cap(center, 2.0 * math.asin(min(1.0, radius / (2.0 * slope)))))
+    return found

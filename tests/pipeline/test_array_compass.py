@@ -103,18 +103,13 @@ class Run:
         world, now = self.world, self.world.t_ns
         pose = world.pose(now, nearest=False)
         assert pose is not None
-        for name in world.uavs:
-            look = self.compass.look(name, self.carrier())
-            near = world.relative(name, now)
-            if look is None or near is None:
-                continue
-            seen = self.uavs.direction(
-                look,
-                near,
-                pose=pose,
-                pose_at=partial(world.pose, nearest=False),
-                is_alone=look.is_refuted,
-            )
+        looks = self.compass.looks(world.uavs, self.carrier())
+        near = {name: at for name in looks.each if (at := world.relative(name, now)) is not None}
+        found = self.uavs.directions(
+            looks, near, pose=pose, pose_at=partial(world.pose, nearest=False)
+        )
+        for name in near:
+            seen = found.get(name)
             if seen is None:
                 self.count["none"] += 1
                 continue

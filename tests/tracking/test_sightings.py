@@ -6,7 +6,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.tracking.sightings import RESTART, WINDOW, Motion, Sightings
+from companion.tracking.sightings import RESTART, WINDOW, Guide, Motion, Sightings, possible
 from companion.values import Cap, FloatArray, angle_rad
 from tests.sighted_world import direction, tilted
 
@@ -56,8 +56,8 @@ def test_moved_cap_contains_the_true_direction(seed: int, what: str) -> None:
         truly_m = turned(moved_m, axis, misalignment) + direction(rng) * error_m
         after = seen * (range_m + sign * range_error_m) + truly_m
         after = tilted(rng, after / np.linalg.norm(after), changed)
-        off = angle_rad(after, later.centers[0])
-        assert off <= later.radii_rad[0] + 1e-9
+        off = angle_rad(after, later.caps.centers[0])
+        assert off <= later.caps.radii_rad[0] + 1e-9
 
 
 def test_each_error_of_a_motion_counts() -> None:
@@ -74,7 +74,7 @@ def test_each_error_of_a_motion_counts() -> None:
             "misalignment_rad": 0.0,
             "turned_rad": 0.0,
         } | errors
-        return float(known.moved(1, Motion(**motion)).radii_rad[0])  # type: ignore[arg-type]
+        return float(known.moved(1, Motion(**motion)).caps.radii_rad[0])  # type: ignore[arg-type]
 
     assert grown() == 0.0
     assert grown(error_m=1.0) >= math.atan2(11, 100) - math.atan2(10, 100)
@@ -97,12 +97,12 @@ def test_true_direction_is_possible_although_some_caps_are_wrong(seed: int, wron
         cap = Cap(tilted(rng, true, off), bound)
         known = Sightings.of(0, cap) if known is None else known.with_cap(cap)
     assert known is not None
-    found = known.possible(wrong)
+    (found,) = possible([known.caps], wrong)
     assert found is not None
     assert angle_rad(found.center, true) <= found.radius_rad + 1e-9
     within = Cap(tilted(rng, true, bound / 2), bound)
-    for about in (None, tilted(rng, true, bound / 2), direction(rng)):
-        found = known.possible(wrong, within, about)
+    for likely in (tilted(rng, true, bound / 2), direction(rng)):
+        (found,) = possible([known.caps], wrong, [Guide(within, likely)])
         assert found is not None
         assert angle_rad(found.center, true) <= found.radius_rad + 1e-9
 
@@ -116,7 +116,7 @@ def test_possible_directions_are_fewer_than_those_of_one_cap() -> None:
         known = Sightings.of(0, caps[0])
         for cap in caps[1:]:
             known = known.with_cap(cap)
-        found = known.possible(0)
+        (found,) = possible([known.caps], 0)
         assert found is not None
         radii.append(found.radius_rad / bound)
     assert np.median(radii) < 0.6
@@ -125,7 +125,7 @@ def test_possible_directions_are_fewer_than_those_of_one_cap() -> None:
 def test_none_is_possible_if_caps_exclude_each_other() -> None:
     ahead, aside = np.array([1.0, 0.0, 0.0]), np.array([0.0, 1.0, 0.0])
     known = Sightings.of(0, Cap(ahead, 0.1)).with_cap(Cap(tilted_to(ahead, aside, 0.3), 0.1))
-    assert known.possible(0) is None
+    assert possible([known.caps], 0) == [None]
 
 
 def tilted_to(one: FloatArray, other: FloatArray, angle: float) -> FloatArray:
@@ -153,7 +153,7 @@ def test_measurement_apart_from_the_others_is_an_outlier_until_more_agree_with_i
     for count in range(1, RESTART + 1):
         assert known.contradicts(Cap(aside, 0.1), 0)
         known = known.against(Cap(aside, 0.1))
-        found = known.possible(0)
+        (found,) = possible([known.caps], 0)
         assert found is not None
         new = angle_rad(found.center, aside) < 0.01
         assert new == (count == RESTART)
@@ -167,7 +167,7 @@ def test_scattered_outliers_never_replace_the_set() -> None:
         known = known.with_cap(Cap(ahead, 0.02))
     for _ in range(50):
         known = known.against(Cap(tilted(rng, ahead, float(rng.uniform(0.2, 3.0))), 0.02))
-    found = known.possible(0)
+    (found,) = possible([known.caps], 0)
     assert found is not None and angle_rad(found.center, ahead) < 0.01
 
 
@@ -181,11 +181,34 @@ def test_nothing_is_known_of_a_uav_at_the_array() -> None:
         turned_rad=0.0,
     )
     later = Sightings.of(0, Cap(np.array([0.0, 1.0, 0.0]), 0.1)).moved(1, motion)
-    assert later.radii_rad[0] == math.pi
+    assert later.caps.radii_rad[0] == math.pi
 
 
 def test_caps_stay_in_place_while_nothing_moves() -> None:
     cap = Cap(np.array([0.0, 1.0, 0.0]), 0.1)
     later = Sightings.of(0, cap).moved(1, STILL)
-    np.testing.assert_allclose(later.centers[0], cap.center, atol=1e-15)
-    assert math.isclose(later.radii_rad[0], 0.1, rel_tol=1e-12)
+    np.testing.assert_allclose(later.caps.centers[0], cap.center, atol=1e-15)
+    assert math.isclose(later.caps.radii_rad[0], 0.1, rel_tol=1e-12)
+
+
+@settings(max_examples=100)
+@given(SEEDS, st.integers(0, 3))
+def test_many_uavs_at_once_are_each_as_alone(seed: int, wrong: int) -> None:
+    rng = np.random.default_rng(seed)
+    many, guides = [], []
+    for _ in range(int(rng.integers(1, 6))):
+        true, bound = direction(rng), float(rng.uniform(0.001, 0.9))
+        known = Sightings.of(0, Cap(tilted(rng, true, bound), bound))
+        for _ in range(int(rng.integers(0, WINDOW))):
+            known = known.with_cap(
+                Cap(tilted(rng, true, bound * float(rng.uniform(0, 1.2))), bound)
+            )
+        many.append(known.caps)
+        within = Cap(tilted(rng, true, bound / 2), bound)
+        guides.append(Guide(within, direction(rng)) if rng.random() < 0.7 else None)
+    for cap, caps, guide in zip(possible(many, wrong, guides), many, guides, strict=True):
+        (alone,) = possible([caps], wrong, [guide])
+        assert (cap is None) == (alone is None)
+        if cap is not None and alone is not None:
+            np.testing.assert_allclose(cap.center, alone.center, atol=1e-9)
+            assert math.isclose(cap.radius_rad, alone.radius_rad, rel_tol=1e-6, abs_tol=1e-9)

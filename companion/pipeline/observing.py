@@ -8,7 +8,7 @@ Over 300 lines: the way of a measurement, from the event to the beam.
 
 import math
 from collections.abc import Callable, Sequence
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
@@ -77,9 +77,7 @@ class Observing:
     def _measured(event: Observation) -> Measured:
         assert event.azimuth_rad is not None and event.elevation_rad is not None
         assert event.bound_rad is not None
-        (towards,) = steering.unit_directions(
-            np.array([event.azimuth_rad]), np.array([event.elevation_rad])
-        )
+        towards = steering.unit_direction(event.azimuth_rad, event.elevation_rad)
         return Measured(
             t_ns=event.measured_ns,
             direction=towards,
@@ -186,15 +184,21 @@ class Observing:
         newest_ns = self._center.newest_attitude_ns(now)
         if newest_ns is None:
             return []
-        reported = cache(partial(self.reported, now_ns))  # a receiver measures several UAVs at once
-        wrong = self.uavs.settle(
-            newest_ns,
-            uavs=None if only is None else (only,),
-            pose=cache(partial(self._pose, nearest=True)),
-            place=lambda uav, at_ns: self._place(uav, now_ns, at_ns, reported(at_ns)),
-            bound_rad=self.compass.largest_rad,
-        )
-        return [Rejection(t_ns=now_ns, source=uav, reason=Reason.OUTLIER) for uav in wrong]
+        ready = self.uavs.ready(newest_ns, only)
+        if not ready:
+            return []
+        times = dict.fromkeys(one.t_ns for _, one in ready)  # a receiver measures several UAVs
+        poses = {at_ns: self._pose(at_ns, nearest=True) for at_ns in times}
+        reported = {at_ns: self.reported(now_ns, at_ns) for at_ns in times}
+        said: list[Output] = []
+        for uav, one in ready:
+            near = self._place(uav, now_ns, one.t_ns, reported[one.t_ns])
+            pose, bound_rad = poses[one.t_ns], self.compass.largest_rad
+            if near is None or pose is None:
+                continue
+            if not self.uavs.join(uav, one, pose=pose, near=near, bound_rad=bound_rad):
+                said.append(Rejection(t_ns=now_ns, source=uav, reason=Reason.OUTLIER))
+        return said
 
     def update(self, now_ns: int) -> list[Output]:
         """Estimate the error of the carrier's attitude, and judge the UAVs' positions."""

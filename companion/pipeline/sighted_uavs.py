@@ -6,7 +6,7 @@ turns by its reported rates, within its largest angular acceleration. See docs/m
 """
 
 import math
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
@@ -129,48 +129,36 @@ class SightedUavs:
             record = self._uavs.setdefault(uav, SightedUav())
         record.pending = (*record.pending[1 - PENDING_MAX :], measured)
 
-    def settle(
-        self,
-        newest_ns: int,
-        *,
-        uavs: Collection[str] | None = None,
-        pose: PoseAt,
-        place: Callable[[str, int], Relative | None],
-        bound_rad: float,
-    ) -> list[str]:
-        """Place all measurements that are older than the newest attitude, of ``newest_ns``.
+    def ready(self, newest_ns: int, uav: str | None = None) -> list[tuple[str, Measured]]:
+        """Remove and return the measurements that an attitude of ``newest_ns`` can place.
 
-            uavs       UAVs whose measurements are placed; None: all
-            pose       the carrier's attitude at a time
-            place      a UAV's position relative to the array at a time
-            bound_rad  bound on the error of reported attitudes
-
-        Returns the UAV of each measurement that contradicts the others of that UAV.
+        uav  whose measurements; None: of all UAVs
         """
-        wrong: list[str] = []
-        for uav in self._uavs if uavs is None else uavs:
-            record = self._uavs[uav]
+        found = list[tuple[str, Measured]]()
+        for name in self._uavs if uav is None else (uav,):
+            record = self._uavs[name]
             if not record.pending or record.pending[0].t_ns > newest_ns:
                 continue
-            ready = [one for one in record.pending if one.t_ns <= newest_ns]
+            found += [(name, one) for one in record.pending if one.t_ns <= newest_ns]
             record.pending = tuple(one for one in record.pending if one.t_ns > newest_ns)
-            for one in ready:
-                at, near = pose(one.t_ns), place(uav, one.t_ns)
-                if at is None or near is None:
-                    continue
-                if not self._join(record, one, at, near, bound_rad):
-                    wrong.append(uav)
-        return wrong
+        return found
 
-    def _join(
+    def join(
         self,
-        record: SightedUav,
+        uav: str,
         one: Measured,
+        *,
         pose: ExtrapolatedAttitude,
         near: Relative,
         bound_rad: float,
     ) -> bool:
-        """Add a measurement to a UAV's sightings. Returns whether it agrees with them."""
+        """Add a measurement to a UAV's sightings. Returns whether it agrees with them.
+
+        pose       the carrier's attitude at that time
+        near       the UAV's position relative to the array then
+        bound_rad  bound on the error of reported attitudes
+        """
+        record = self._uavs[uav]
         cap = self._placed(one, pose, near, self.aged_rad(pose))
         before, latest = record.sightings, record.latest
         if before is None or latest is None:

@@ -12,6 +12,7 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -59,14 +60,14 @@ class Seen(NamedTuple):
     seen: Cap  # by the array, as the reported attitude shows it
 
 
-@dataclass(frozen=True, slots=True, eq=False)
+@dataclass(frozen=True, eq=False)
 class Misalignment:
     """Error W of the reported attitude: within ``bound_rad`` of ``center``, (3, 3)."""
 
     center: FloatArray
     bound_rad: float
 
-    @property
+    @cached_property
     def largest_rad(self) -> float:
         """Largest angle of the error."""
         return min(math.pi, rotation_angle_rad(self.center) + self.bound_rad)

@@ -1,10 +1,13 @@
 """Rotations: matrices (3, 3), rotation vectors (3,) in rad, and angles."""
 
 import math
+from typing import Final
 
 import numpy as np
 
 from companion.values import FloatArray
+
+_NO_ROTATION: Final = np.eye(3)
 
 
 def rotation(vector_rad: FloatArray) -> FloatArray:
@@ -34,13 +37,13 @@ def rotation_vector(matrix: FloatArray) -> FloatArray:
 
 def angle_between_rad(one: FloatArray, other: FloatArray) -> float:
     """Return the angle of the rotation between two rotations (3, 3); exact also if small."""
-    off = one - other
-    return 2.0 * math.asin(min(1.0, math.sqrt(float((off * off).sum()) / 8.0)))
+    off = (one - other).ravel()
+    return 2.0 * math.asin(min(1.0, math.sqrt(float(off @ off) / 8.0)))
 
 
 def rotation_angle_rad(matrix: FloatArray) -> float:
     """Return the angle of a rotation (3, 3)."""
-    return angle_between_rad(matrix, np.eye(3))
+    return angle_between_rad(matrix, _NO_ROTATION)
 
 
 def cross(one: FloatArray, other: FloatArray) -> FloatArray:

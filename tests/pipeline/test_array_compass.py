@@ -81,13 +81,13 @@ class Run:
         )
 
     def settle(self) -> None:
-        wrong = self.uavs.settle(
-            self.world.attitudes[-1][0],
-            pose=partial(self.world.pose, nearest=True),
-            place=self.world.relative,
-            bound_rad=self.compass.largest_rad,
-        )
-        self.count["outliers"] += len(wrong)
+        for uav, one in self.uavs.ready(self.world.attitudes[-1][0]):
+            pose, near = self.world.pose(one.t_ns, nearest=True), self.world.relative(uav, one.t_ns)
+            assert pose is not None and near is not None
+            agrees = self.uavs.join(
+                uav, one, pose=pose, near=near, bound_rad=self.compass.largest_rad
+            )
+            self.count["outliers"] += not agrees
 
     def check_error(self) -> None:
         error = self.compass.error_at(self.carrier())

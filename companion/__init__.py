@@ -22,7 +22,9 @@ returns targets and beams, ``tracks(now_ns, valid_at_ns)`` every tracked UAV,
 the beam of a UAV. ``read_log(path)``: the events of any kind of log.
 ``UserError``: raised for a user's mistakes.
 
-Names are loaded on first use, so that importing this package is fast.
+Names are loaded on first use, so that importing this package is fast. Set OPENBLAS_NUM_THREADS=1
+before numpy loads: with two BLAS threads an update for 100 UAVs takes two to three times as long,
+and weights differ in the last digits, so that the digest does too.
 """
 
 TYPE_CHECKING = False  # for type checkers only: importing `typing` would take longer than all this

@@ -133,6 +133,8 @@ class Looking(threading.Thread):
 
     def _check_attitude(self, center: Any) -> None:
         """Look at the carrier, whose heading is ``YAW_RAD`` and which is level to a degree."""
+        if center["yaw_deg"] is None:
+            return  # nothing is stated; without an attitude there are no beams, which a look counts
         off_deg = abs(math.remainder(center["yaw_deg"] - math.degrees(YAW_RAD), 360.0))
         if off_deg > center["attitude_bound_deg"] + LEVEL_DEG:
             bound_deg = center["attitude_bound_deg"]

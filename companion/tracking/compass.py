@@ -88,7 +88,7 @@ class ErrorSet:
     @property
     def corners(self) -> FloatArray:
         """Points (T, 3) whose hull contains the polytope."""
-        found: FloatArray = np.einsum("tij,tj->ti", _CORNERS, self.extents[_TRIANGLES])
+        found: FloatArray = (_CORNERS @ self.extents[_TRIANGLES][:, :, np.newaxis])[:, :, 0]
         return found
 
     @property
@@ -225,7 +225,7 @@ def _cylinder(center: FloatArray, corners: FloatArray, one: Seen) -> _Cylinder:
     sees w x a within r and the two bounds of an offset, so that |w x a| is at most their sum.
     """
     axis = center @ one.reported.center
-    squares, along = np.einsum("ti,ti->t", corners, corners), corners @ axis
+    squares, along = np.vecdot(corners, corners), corners @ axis
     size = math.sqrt(squares.max())
     aside = math.sqrt(max((squares - along * along).max(), 0.0))
     radius = _chord(one.seen.radius_rad) + _chord(one.reported.radius_rad)
@@ -256,7 +256,7 @@ def _by_pairs(
         found = np.zeros((int(usable.sum()), len(DIRECTIONS)))
         for of in (first[usable], second[usable]):
             part = across[of] @ split
-            found += np.einsum("pdn,pd->pn", part, offsets[of])
+            found += (offsets[of][:, np.newaxis] @ part)[:, 0]
             found += np.sqrt((part * part).sum(axis=1)) * radii[of, np.newaxis]
         bounds[usable] = found
     return bounds

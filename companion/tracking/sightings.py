@@ -24,6 +24,7 @@ FACETS: Final = 16  # sides of the polygon around the possible directions
 RESTART: Final = 6  # measurements that agree with one another, and not with the set, restart it
 _ANGLES: Final = np.arange(FACETS) * (2 * math.pi / FACETS)
 _FACETS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # (FACETS, 2), normals
+_NEXT, _LAST = [1, 2, 0], [2, 0, 1]  # of a cross product
 _AHEAD: Final = np.roll(np.arange(FACETS), -1)
 _BEHIND: Final = np.roll(np.arange(FACETS), 1)
 _BETWEEN: Final = 1.0 / math.sin(2 * math.pi / FACETS)
@@ -243,7 +244,10 @@ def _axes(middles: FloatArray) -> FloatArray:
     first = -middles[every, least, np.newaxis] * middles
     first[every, least] += 1.0
     first /= np.sqrt(np.vecdot(first, first))[:, np.newaxis]
-    return np.stack([first, np.cross(middles, first)], axis=1)
+    axes: FloatArray = np.empty((len(middles), 2, 3))
+    axes[:, 0] = first
+    axes[:, 1] = middles[:, _NEXT] * first[:, _LAST] - middles[:, _LAST] * first[:, _NEXT]
+    return axes
 
 
 def _ends(centers: FloatArray, radii_rad: FloatArray) -> FloatArray:

@@ -66,11 +66,12 @@ class AttitudeTrust:
 
     ``turned`` takes each new attitude, ``add`` what else the carrier sends. Statements have no time
     stamp on the sender's clock: over another, slower link they may be older. Of each kind the worst
-    of the newest over each link counts.
+    of the newest over each link counts. ``bound_rad`` is the bound now, as an angle.
     """
 
     def __init__(self, assumed: AttitudeAssumptions) -> None:
         self._assumed = assumed
+        self.bound_rad = assumed.bound_rad
         self._worth: dict[tuple[str, str], _Worth] = {}  # by kind and link
         self._newest: Attitude | None = None
         self._rates: deque[tuple[int, float]] = deque(maxlen=RATES_MAX)  # arrival, rad/s
@@ -80,6 +81,7 @@ class AttitudeTrust:
         self._worth.clear()
         self._rates.clear()
         self._newest = None
+        self.bound_rad = self._bound_rad()
 
     def turned(self, attitude: Attitude) -> None:
         """Process the newest attitude."""
@@ -87,6 +89,7 @@ class AttitudeTrust:
         rates.append((t_ns, _rate_radps(attitude)))
         while t_ns - rates[0][0] > (LAG_S + APART_MAX_S) * 1e9:
             rates.popleft()
+        self.bound_rad = self._bound_rad()
 
     def add(self, said: AttitudeEvidence) -> None:
         """Process what the carrier sent about the error of its attitude."""
@@ -104,10 +107,9 @@ class AttitudeTrust:
         self._worth = {
             key: one for key, one in self._worth.items() if key[0] != kind or one.t_ns > oldest_ns
         } | {(kind, said.link): worth}
+        self.bound_rad = self._bound_rad()
 
-    @property
-    def bound_rad(self) -> float:
-        """Bound on the error of reported attitudes, as an angle."""
+    def _bound_rad(self) -> float:
         if not self._worth:
             return self._assumed.bound_rad
         least_rad = max(one.least_rad for one in self._worth.values())

@@ -1,6 +1,5 @@
 """Endpoint and splitter of each link scheme."""
 
-import math
 from collections.abc import Callable
 from typing import Final
 
@@ -22,11 +21,6 @@ from companion.mavlink.wire.rid_json import RidJson
 from companion.mavlink.wire.sbs import SbsSplitter
 
 FRAMES_AT_ONCE: Final = 16  # frames processed before other work runs; one may take 0.3 ms
-_CONTINUED: Final = ("udpin", "udpout", "tcp", "tcpin")
-"""Schemes whose endpoints continue with the rest of what they read.
-
-A serial port reads little at once; a sample of Zenoh is processed whole.
-"""
 
 
 def splitter(url: LinkUrl) -> Callable[[str], Splits]:
@@ -41,9 +35,7 @@ def splitter(url: LinkUrl) -> Callable[[str], Splits]:
         case "cot":
             return CotSplitter
         case _:
-            search = search_budget()
-            at_once = FRAMES_AT_ONCE if url.scheme in _CONTINUED else math.inf
-            limits = SplitLimits(search=search, at_once=at_once)
+            limits = SplitLimits(search=search_budget(), at_once=FRAMES_AT_ONCE)
             return lambda link: Splitter(link, limits=limits)
 
 

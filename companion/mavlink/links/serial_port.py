@@ -91,13 +91,26 @@ class SerialPort:
             return
         assert self._held_up is not None
         stale = self._held_up.stale(data)
+        if stale:
+            self._upcalls.stale(None, data[:stale])
+        if len(data) > stale:
+            self._process(descriptor, data[stale:])
+
+    def _process(self, descriptor: int, data: bytes) -> None:
+        """Process what was read; read on when all of it is processed."""
+        if descriptor != self._descriptor:
+            return
+        loop = asyncio.get_running_loop()
         try:
-            if stale:
-                self._upcalls.stale(None, data[:stale])
-            if len(data) > stale:
-                self._upcalls.take(None, data[stale:], None)
+            has_more = self._upcalls.take(None, data, None)
         except Exception as fault:  # a defect must end the link, not disappear
             self._lose(fault)
+            return
+        if has_more:
+            loop.remove_reader(descriptor)
+            loop.call_soon(self._process, descriptor, b"")
+        elif not data:
+            loop.add_reader(descriptor, self._read, descriptor)
 
     def _write_on(self, descriptor: int) -> None:
         try:

@@ -26,14 +26,17 @@ class ToLoop:
         self.dropped = 0
         self._loop = loop
         self._lock = threading.Lock()
-        self._waiting: deque[tuple[Callable[[], None], int]] = deque()
+        self._waiting: deque[tuple[Callable[[], object], int]] = deque()
         self._bytes = 0
         self._is_woken = False
         self._is_over = False
         self._fault: asyncio.Future[None] = loop.create_future()
 
-    def post(self, call: Callable[[], None], size: int = 0) -> None:
-        """Queue a call for the event loop, which holds this many bytes; on any thread."""
+    def post(self, call: Callable[[], object], size: int = 0) -> None:
+        """Queue a call for the event loop, which holds this many bytes; on any thread.
+
+        A call that returns True is made again, before all others.
+        """
         with self._lock:
             if self._is_over:
                 return
@@ -74,12 +77,17 @@ class ToLoop:
                 if not self._waiting:
                     self._is_woken = False
                     return
-                call, size = self._waiting.popleft()
-                self._bytes -= size
+                call, size = self._waiting[0]
             try:
-                call()
+                has_more = call() is True
             except Exception as fault:
                 self.fail(fault)
                 return
+            if has_more:
+                continue
             self.handed_over += 1
+            with self._lock:
+                if self._waiting:  # not ended by the call
+                    self._waiting.popleft()
+                    self._bytes -= size
         self._loop.call_soon(self._hand_over)

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
+from itertools import chain, repeat
 from typing import TYPE_CHECKING, Any, Final
 
 from companion.mavlink.links.to_loop import ToLoop
@@ -186,9 +187,10 @@ class Bus:
 
     # --- subscriptions and answers -----------------------------------------------------------
 
-    def subscribe(self, key_expr: str, take: Callable[[str, bytes], None]) -> Callable[[], None]:
+    def subscribe(self, key_expr: str, take: Callable[[str, bytes], object]) -> Callable[[], None]:
         """Call ``take`` with the key and the payload of every sample from others.
 
+        While it returns True, there is more to do, and it is called again without a payload.
         Returns the function that ends the subscription: samples already queued are still handed
         over.
         """
@@ -197,7 +199,8 @@ class Bus:
         def heard(sample: "zenoh.Sample") -> None:
             if sample.kind == zenoh.SampleKind.PUT:
                 key, payload = str(sample.key_expr), sample.payload.to_bytes()
-                self._to_loop.post(lambda: take(key, payload), len(payload))
+                pieces = chain((payload,), repeat(b""))
+                self._to_loop.post(lambda: take(key, next(pieces)), len(payload))
 
         subscriber = self._opened().declare_subscriber(
             key_expr,

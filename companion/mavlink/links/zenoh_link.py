@@ -47,8 +47,8 @@ class ZenohLink:
         """Check that Zenoh is installed and accepts the endpoints. Raises ``UserError`` if not."""
         check(self._config)
 
-    def _take(self, _key: str, raw: bytes) -> None:
-        self._upcalls.take(None, raw, None)
+    def _take(self, _key: str, raw: bytes) -> bool:
+        return self._upcalls.take(None, raw, None)
 
     async def serve(self) -> None:
         """Serve until there is no neighbour left; then raise ``OSError``."""

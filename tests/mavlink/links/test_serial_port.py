@@ -19,6 +19,7 @@ from pymavlink.dialects.v20 import all as dialect
 from support import HANG_S
 
 from companion.mavlink.links import serial_port, transport
+from companion.mavlink.links.kinds import FRAMES_AT_ONCE
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import parse_link
 from companion.mavlink.wire.encode import Outgoing, heartbeat
@@ -273,3 +274,18 @@ def test_pyserial_is_imported_only_for_serial_links() -> None:
         (sys.executable, "-c", run), capture_output=True, check=False, timeout=HANG_S
     )
     assert done.returncode == 0, done.stderr.decode() or "pyserial was loaded"
+
+
+def test_frames_read_at_once_are_processed_a_few_at_a_time(run: Run) -> None:
+    async def test() -> None:
+        with cable() as at:
+            async with running(f"serial:{at.path}:57600") as (link, inbox):
+                await until_true(lambda: link.status.state == "up")
+                raws = [frame(number, seq=number) for number in range(60)]
+                for begin in (0, 30):  # reading goes on after what was processed in parts
+                    os.write(at.end, b"".join(raws[begin : begin + 30]))
+                    await inbox.until(begin + 30)
+                assert inbox.raws == raws
+                assert max(inbox.batches) <= FRAMES_AT_ONCE
+
+    run(test())

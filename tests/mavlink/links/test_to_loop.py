@@ -74,3 +74,32 @@ def test_queued_bytes_are_bounded() -> None:
 
     run_async(test())
     assert made == [0, 1, 2, 3] * 2
+
+
+def test_unfinished_call_is_made_again_while_other_work_runs() -> None:
+    made: list[int] = []
+    seen: set[int] = set()
+
+    async def test() -> None:
+        calls = ToLoop(asyncio.get_running_loop())
+        over = asyncio.Event()
+
+        def unfinished() -> bool:
+            time.sleep(to_loop.SLICE_S)
+            made.append(len(made))
+            return len(made) < CALLS
+
+        calls.post(unfinished)
+        calls.post(over.set)
+
+        async def beside() -> None:
+            while not over.is_set():
+                seen.add(len(made))
+                await asyncio.sleep(0)
+
+        await asyncio.gather(beside(), over.wait())
+        assert calls.handed_over == 2
+
+    run_async(test())
+    assert len(made) == CALLS
+    assert len(seen) > CALLS / 2

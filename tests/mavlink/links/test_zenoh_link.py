@@ -8,6 +8,7 @@ from link_support import LOOPS, Run, frame, runner, running, until_true
 from support import free_port
 
 from companion.mavlink.links import zenoh_link
+from companion.mavlink.links.kinds import FRAMES_AT_ONCE
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import parse_link
 from companion.mavlink.wire.encode import heartbeat
@@ -46,6 +47,19 @@ def test_frames_pass_both_ways(run: Run, links: tuple[str, str]) -> None:
             await at_hub.until(1)
             assert at_hub.frames[0].source == Source(5, 191)
             assert (link.status.state, link.status.arrival) == ("up", "read")
+
+    run(test())
+
+
+def test_large_sample_is_processed_a_few_frames_at_a_time(run: Run, links: tuple[str, str]) -> None:
+    async def test() -> None:
+        async with running(links[0]) as (hub, _), running(links[1]) as (link, heard):
+            await until_true(lambda: listened_to(hub) and listened_to(link))
+            frames = [frame(number, seq=number % 256) for number in range(1000)]
+            hub.send_raw(b"".join(frames))
+            await heard.until(len(frames))
+            assert heard.raws == frames
+            assert max(heard.batches) <= FRAMES_AT_ONCE
 
     run(test())
 

@@ -90,8 +90,7 @@ class DataflashTable:
 
     def raw(self, column: str) -> Column:
         """Return a column with the values as in the file, (N,)."""
-        found: Column = self._records[column]
-        return found
+        return self._records[column]
 
     def numbers(self, column: str) -> NDArray[np.float64]:
         """Return a column as numbers, (N,), in the units of the log; NaN if missing."""
@@ -108,8 +107,7 @@ class DataflashTable:
         values = self._records[column]
         if values.dtype == np.uint64:  # impossible times become 0
             values = np.where(values < np.uint64(1 << 62), values, np.uint64(0)).astype(np.int64)
-        found: IntArray = values.astype(np.int64)
-        return found
+        return values.astype(np.int64)
 
     def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "DataflashTable":
         """Return the table with only some of its messages."""

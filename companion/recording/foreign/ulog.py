@@ -94,8 +94,7 @@ class UlogTable:
         values = self._records[column]
         if values.dtype.kind not in "iuf" or values.shape != shape:
             return np.full(shape, np.nan)
-        found: FloatArray = values.astype(np.float64)
-        return found
+        return values.astype(np.float64)
 
     def integers(self, column: str) -> IntArray | None:
         """Return a column of integers, (N,); None if missing. Impossible times become 0."""
@@ -106,8 +105,7 @@ class UlogTable:
             return None
         if values.dtype == np.uint64:
             values = np.where(values < np.uint64(1 << 62), values, np.uint64(0))
-        found: IntArray = values.astype(np.int64)
-        return found
+        return values.astype(np.int64)
 
     def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "UlogTable":
         """Return the table with only some of its samples."""

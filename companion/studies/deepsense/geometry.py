@@ -129,8 +129,7 @@ def _fitted(
         )
 
     def off(values: FloatArray) -> FloatArray:
-        found: FloatArray = made(values)._at(there) - beam[learned]
-        return found
+        return made(values)._at(there) - beam[learned]
 
     bounds = (low[:free], high[:free])
     found = least_squares(off, np.clip(first[:free], *bounds), loss="soft_l1", bounds=bounds)

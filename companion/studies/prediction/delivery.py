@@ -188,8 +188,7 @@ def _thinned_each(sends: _Sends, rows: IntArray, rate_hz: float) -> IntArray:
     period = np.floor((sends.sent_ns[rows] - sends.sent_ns.min()) * (rate_hz * 1e-9))
     kinds = np.stack([sends.kind[rows].astype(float), period], axis=1)
     _, first = np.unique(kinds, axis=0, return_index=True)
-    kept: IntArray = rows[np.sort(first)]
-    return kept
+    return rows[np.sort(first)]
 
 
 def known_round_trips(flight: Flight) -> tuple[RoundTrip, ...]:

@@ -50,8 +50,7 @@ def announced(asked: Questions, given: Answers) -> BoolArray:
     """Return whether an assumption about the UAV was refuted before each question, (K,)."""
     if not given.refuted_ns:
         return np.zeros(len(asked.now_ns), dtype=bool)
-    found: BoolArray = asked.now_ns + SAME_SECOND_NS >= min(given.refuted_ns)
-    return found
+    return asked.now_ns + SAME_SECOND_NS >= min(given.refuted_ns)
 
 
 def _by_regime(

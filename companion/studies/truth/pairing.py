@@ -117,8 +117,7 @@ def _times_between_s(position_ned_m: FloatArray, velocity_ned_mps: FloatArray) -
     along2 = np.sum(gained * mean, axis=1) ** 2 / speed2
     turned2 = np.clip((np.sum(gained * gained, axis=1) - along2) / speed2, 0.0, 1.0)
     way = np.sum(np.diff(position_ned_m, axis=0) * mean, axis=1)
-    found: FloatArray = np.where(fast, way / speed2 / (1 + turned2 / 12), np.nan)
-    return found
+    return np.where(fast, way / speed2 / (1 + turned2 / 12), np.nan)
 
 
 def _determined_ns(brackets: Brackets) -> FloatArray:

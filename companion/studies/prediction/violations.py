@@ -10,8 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from companion.studies.origin import Row
 from companion.studies.prediction import hostile_link
-from companion.studies.prediction.pointing import Answers, Questions, Row
+from companion.studies.prediction.pointing import Answers, Questions
 from companion.values import BoolArray
 
 SAME_SECOND_NS: Final = 1_000_000_000

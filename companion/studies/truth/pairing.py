@@ -13,7 +13,7 @@ therefore share one time shift, which the best evidence nearby sets:
    sometimes sends a truth message together with the message before it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -52,14 +52,7 @@ class Brackets:
 
     def rows(self, chosen: NDArray[np.bool_]) -> "Brackets":
         """Return the brackets of selected messages."""
-        return Brackets(
-            arrival_ns=self.arrival_ns[chosen],
-            before_ns=self.before_ns[chosen],
-            after_ns=self.after_ns[chosen],
-            before_arrival_ns=self.before_arrival_ns[chosen],
-            after_arrival_ns=self.after_arrival_ns[chosen],
-            life=self.life[chosen],
-        )
+        return Brackets(**{one.name: getattr(self, one.name)[chosen] for one in fields(self)})
 
 
 def boot_times_ns(

@@ -171,7 +171,7 @@ class LiveFleetNode:
     def _declare(self, bus: Bus) -> None:
         base = f"{PREFIX}/{self.settings.site}"
         bus.serve(self._key("time"), self._time)
-        bus.serve(self._key("schema"), lambda key, payload: schemas.SHARED.descriptor_set)
+        bus.serve(self._key("schema"), lambda key, payload: schemas.schema("Shared").descriptor_set)
         bus.subscribe(f"{base}/*/standing", self._valid_only(self._stands))
         heard, offered = self._valid_only(self._shared), self._valid_only(self._offered)
         self._listening = Listening(bus=bus, base=base, heard=heard, offered=offered)
@@ -258,7 +258,7 @@ class LiveFleetNode:
             and self._bus is not None
             and self._bus.is_wanted(self._key("tracks"), PRIORITY)
         ):
-            said = schemas.TracksMessage(
+            said = schemas.message_class("Tracks")(
                 track=[
                     schemas.message("Track", fields.RecordedTrack(one, update.t_ns))
                     for one in update.tracks

@@ -140,7 +140,7 @@ class Outcome:
     def recorded(self) -> dict[str, list[Any]]:
         """What the recording holds of rejections and notices, by topic."""
         kinds = {
-            schemas.REJECTIONS_TOPIC: schemas.RejectionMessage,
+            schemas.REJECTIONS_TOPIC: schemas.message_class("Rejection"),
             schemas.LOG_TOPIC: schemas.LogMessage,
         }
         found: dict[str, list[Any]] = {topic: [] for topic in kinds}

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, LOGS, Progress, print_truncated
-from companion.cli.study_output import Studied, study_output
+from companion.cli.console import CENTER, CONFIG, LOGS, Progress
+from companion.cli.study_output import Studied, studied_flights, study_output
 
 
 @click.command()
@@ -42,24 +42,12 @@ def beams(
 
     Example: companion study beams flight.tlog --center 5:1 --links clean,radio --out report
     """
-    from companion.node.replay import settings_for
-    from companion.recording.reader import flights
     from companion.studies.beams import report
     from companion.studies.beams.flight import BeamStudy, study
 
-    print_truncated(logs)
-    flown = tuple(flights(logs))
-    settings = tuple(settings_for(each, config, center) for each in flown)
     over = tuple(name for name in links.split(",") if name)
-    setting = BeamStudy(
-        flights=flown,
-        settings=settings,
-        hz=hz,
-        center=center,
-        config=str(config) if config else None,
-        links=over,
-    )
-    if any(each.center.source is None for each in settings):
+    setting = BeamStudy(**studied_flights(logs, config, center), hz=hz, links=over)
+    if any(each.center.source is None for each in setting.settings):
         click.echo("no --center: array placed at the position of the first report", err=True)
     answer, found = study(setting, progress.show)
     return Studied(

@@ -4,8 +4,8 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, LOGS, SEED, Progress, print_truncated
-from companion.cli.study_output import Studied, study_output
+from companion.cli.console import CENTER, CONFIG, LOGS, SEED, Progress
+from companion.cli.study_output import Studied, studied_flights, study_output
 
 
 @click.command()
@@ -39,21 +39,10 @@ def compass(
 
     Example: companion study compass flight.tlog --center 5:1 --out report
     """
-    from companion.node.replay import settings_for
-    from companion.recording.reader import flights
     from companion.studies.compass import report, study
 
-    print_truncated(logs)
-    flown = tuple(flights(logs))
-    asked = study.CompassStudy(
-        flights=flown,
-        settings=tuple(settings_for(each, config, center) for each in flown),
-        seconds=seconds,
-        seed=seed,
-        jobs=jobs,
-        center=center,
-        config=str(config) if config else None,
-    )
+    logged = studied_flights(logs, config, center)
+    asked = study.CompassStudy(**logged, seconds=seconds, seed=seed, jobs=jobs)
     answer = study.study(asked, progress.show)
     return Studied(
         answer=answer,

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from companion.cli.console import JSON, Progress, make_folder
+from companion.cli.console import JSON, Progress, make_folder, print_truncated
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -47,3 +47,20 @@ def study_output(name: str) -> Callable[[Callable[..., Studied]], Callable[..., 
         return command
 
     return decorate
+
+
+def studied_flights(
+    logs: tuple[Path, ...], config: Path | None, center: str | None
+) -> dict[str, Any]:
+    """Return the fields of ``StudiedLogs`` for the logs of a command, which may be truncated."""
+    from companion.node.replay import settings_for
+    from companion.recording.reader import flights
+
+    print_truncated(logs)
+    flown = tuple(flights(logs))
+    return {
+        "flights": flown,
+        "settings": tuple(settings_for(each, config, center) for each in flown),
+        "center": center,
+        "config": str(config) if config else None,
+    }

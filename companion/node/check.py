@@ -61,11 +61,8 @@ def check(
     yield _capacity(settings)
     urls = [url for url in settings.links.urls if url not in faulty]
     if not settings.links.urls:
-        yield Finding(
-            subject="links",
-            grade=Grade.FAULT,
-            text="none",
-            remedy="give --link udpin:0.0.0.0:14550, or set `[links] urls`",
+        yield Finding.fault(
+            "links", "none", "give --link udpin:0.0.0.0:14550, or set `[links] urls`"
         )
     if urls and seconds > 0:
         show(f"listening for {seconds:g} s")
@@ -78,11 +75,8 @@ def _capacity(settings: Settings) -> Finding:
         share = machine.processor_share()
         found = capacity.measure(embedded(settings), processor=share)
     except UserError as error:
-        return Finding(
-            subject="settings",
-            grade=Grade.FAULT,
-            text=str(error),
-            remedy="correct this setting, or the file that it names",
+        return Finding.fault(
+            "settings", str(error), "correct this setting, or the file that it names"
         )
     most = f"more than {capacity.MOST}" if found.uavs is None else f"about {found.uavs}"
     text = (
@@ -93,10 +87,8 @@ def _capacity(settings: Settings) -> Finding:
     if share < 1:
         text += f"; this process may use {share * 100:.0f} % of a processor"
     if found.uavs is not None and found.uavs < capacity.FEW:
-        return Finding(
-            subject="capacity", grade=Grade.DOUBT, text=text, remedy="lower `[beams] update_hz`"
-        )
-    return Finding(subject="capacity", grade=Grade.OK, text=text)
+        return Finding.doubt("capacity", text, "lower `[beams] update_hz`")
+    return Finding.ok("capacity", text)
 
 
 def _listening_settings(settings: Settings, urls: list[str]) -> Settings:
@@ -133,12 +125,7 @@ def _reception(service: Service, settings: Settings) -> Iterator[Finding]:
     if settings.center.source is None:
         heard = f"; received: {', '.join(own[:NAMED_MAX])}" if own else ""
         remedy = f"give --center SYSID:COMPID or LAT,LON,ALT{heard}"
-        yield Finding(
-            subject="carrier",
-            grade=Grade.FAULT,
-            text="the carrier of the array is not set",
-            remedy=remedy,
-        )
+        yield Finding.fault("carrier", "the carrier of the array is not set", remedy)
         return
     subject = f"carrier {settings.center.source}"
     if update is None or update.unfit is not None:
@@ -148,9 +135,9 @@ def _reception(service: Service, settings: Settings) -> Iterator[Finding]:
             if own
             else "check the links: no vehicle is received"
         )
-        yield Finding(subject=subject, grade=Grade.FAULT, text=unfit, remedy=remedy)
+        yield Finding.fault(subject, unfit, remedy)
     else:
-        yield Finding(subject=subject, grade=Grade.OK, text="its position and attitude are known")
+        yield Finding.ok(subject, "its position and attitude are known")
     yield from _uavs(service)
     yield from _speed(service, settings.beams.update_hz)
 
@@ -165,44 +152,26 @@ def _links(service: Service) -> Iterator[Finding]:
             yield _not_understood(subject, scheme, link)
         elif link.frames == 0 and link.bytes > 0:
             remedy = "check the baud rate, the signing key, and that the sender speaks MAVLink"
-            yield Finding(
-                subject=subject,
-                grade=Grade.FAULT,
-                text=f"{link.bytes} bytes without a valid MAVLink frame",
-                remedy=remedy,
+            yield Finding.fault(
+                subject, f"{link.bytes} bytes without a valid MAVLink frame", remedy
             )
         elif link.frames == 0:
-            yield Finding(
-                subject=subject,
-                grade=Grade.FAULT,
-                text="nothing received",
-                remedy=_silent(link.url),
-            )
+            yield Finding.fault(subject, "nothing received", _silent(link.url))
         elif bad > NOISY * link.frames:
-            yield Finding(
-                subject=subject,
-                grade=Grade.DOUBT,
-                text=f"{said}; {bad} with a wrong checksum",
-                remedy="check the line for noise",
+            yield Finding.doubt(
+                subject, f"{said}; {bad} with a wrong checksum", "check the line for noise"
             )
         else:
-            yield Finding(subject=subject, grade=Grade.OK, text=said)
+            yield Finding.ok(subject, said)
 
 
 def _not_understood(subject: str, scheme: str, link: LinkStatus) -> Finding:
     """Return the finding for a receiver that sent bytes, but no readable position."""
     refused = ", ".join(f"{count} {reason}" for reason, count in link.lost.items())
     if not refused:
-        return Finding(
-            subject=subject, grade=Grade.DOUBT, text=f"{link.bytes} bytes, no aircraft yet"
-        )
+        return Finding.doubt(subject, f"{link.bytes} bytes, no aircraft yet")
     said = f"{link.bytes} bytes without usable data ({refused})"
-    return Finding(
-        subject=subject,
-        grade=Grade.FAULT,
-        text=said,
-        remedy=f"check that this port sends {FORMATS[scheme]}",
-    )
+    return Finding.fault(subject, said, f"check that this port sends {FORMATS[scheme]}")
 
 
 def _silent(url: str) -> str:
@@ -223,12 +192,7 @@ def _uavs(service: Service) -> Iterator[Finding]:
     shown = [one for one in uav_state.states(service, service.now_ns()) if one.target]
     if not shown:
         remedy = "wait for a position fix; see `rejected` in /v1/status"
-        yield Finding(
-            subject="UAVs",
-            grade=Grade.FAULT,
-            text="no UAV for which a beam is wanted was received",
-            remedy=remedy,
-        )
+        yield Finding.fault("UAVs", "no UAV for which a beam is wanted was received", remedy)
     for one in shown:
         track = one.track
         name, dt_s = track.uav, track.dt_s
@@ -238,7 +202,7 @@ def _uavs(service: Service) -> Iterator[Finding]:
 
 
 def _assessed(name: str, text: str, verdict: Verdict | None) -> Finding:
-    found = Finding(subject=f"UAV {name}", grade=Grade.OK, text=text)
+    found = Finding.ok(f"UAV {name}", text)
     if verdict is None:
         return replace(found, grade=Grade.DOUBT, text=f"not assessed: {text}")
     text = f"{verdict.level}: {text}"
@@ -255,11 +219,9 @@ def _speed(service: Service, update_hz: float) -> Iterator[Finding]:
     share = took_s * update_hz
     text = f"beams take {took_s * 1e3:.1f} ms, {share:.0%} of the update interval"
     if share > BUSY:
-        yield Finding(
-            subject="this machine", grade=Grade.DOUBT, text=text, remedy="lower `[beams] update_hz`"
-        )
+        yield Finding.doubt("this machine", text, "lower `[beams] update_hz`")
     else:
-        yield Finding(subject="this machine", grade=Grade.OK, text=text)
+        yield Finding.ok("this machine", text)
 
 
 def _update_time_s(pipeline: Pipeline, now_ns: int) -> float:

@@ -1,12 +1,11 @@
 """Export: logs through the same pipeline as a replay, written as tables."""
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final
 
 import companion
-from companion.node.replay import Run, log_events, log_notes
+from companion.node.replay import Progress, Run, log_events, log_notes
 from companion.recording.folders import make_folder
 from companion.recording.reader import utc_offset_ns
 from companion.recording.scene import Scene
@@ -18,7 +17,6 @@ from companion.values import Update
 from companion.views.tables.said import TABLES, rows
 
 SPACE: Final = "space.mcap"  # the file of an export for Rerun
-SHOW_EVERY_S: Final = 0.5  # time between two calls of progress
 
 
 def export(
@@ -27,7 +25,7 @@ def export(
     where: Path,
     *,
     form: str,
-    progress: Callable[[int, float, float], None],
+    progress: Progress,
     latency_s: float = 0.0,
 ) -> dict[str, Any]:
     """Write the tables of some logs to a folder; return the summary of a replay, and the files.
@@ -41,15 +39,10 @@ def export(
     """
     events = log_events(logs, settings, latency_s)
     run, offset_ns = Run(settings, None), utc_offset_ns(logs)
-    due_s = time.monotonic()
     with TableFolder(where, form, TABLES) as folder:
-        for event in events:
-            outputs = run.step(event)
+        for event, outputs in run.steps(events, progress):
             for table, item in rows(event, outputs, run.pipeline.local):
                 folder.add(table, item, offset_ns)
-            if time.monotonic() >= due_s:
-                due_s += SHOW_EVERY_S
-                progress(run.pipeline.frames, run.at_s, run.took_s)
         summary = run.finish() | log_notes(logs)
         del summary["recording"]
         summary["rows"] = dict(folder.rows)
@@ -62,7 +55,7 @@ def export_space(
     logs: Sequence[Path],
     settings: Settings,
     where: Path,
-    progress: Callable[[int, float, float], None],
+    progress: Progress,
     latency_s: float = 0.0,
 ) -> dict[str, Any]:
     """Write tracks and beams in 3D to a file in a folder, for Rerun; return a summary.
@@ -71,20 +64,16 @@ def export_space(
     """
     events = log_events(logs, settings, latency_s)
     run = Run(settings, None)
-    due_s = time.monotonic()
     make_folder(where, "--out")
     whole = where / SPACE
     made = whole.with_name(SPACE + ACTIVE)
     scene = Scene(run.pipeline.array, settings.recording.scene_hz)
     try:
         with SpaceFile(made, scene) as file:
-            for event in events:
-                for output in run.step(event):
+            for _, outputs in run.steps(events, progress):
+                for output in outputs:
                     if isinstance(output, Update):
                         file.add(output, run.pipeline.local)
-                if time.monotonic() >= due_s:
-                    due_s += SHOW_EVERY_S
-                    progress(run.pipeline.frames, run.at_s, run.took_s)
         made.rename(whole)
     finally:
         made.unlink(missing_ok=True)

@@ -95,11 +95,9 @@ class Gateway:
             link.open()
             self.links.append(link)
             if link.url.scheme == "udpout" and self._component is None:
-                text = (
-                    f"{url} sends nothing, so no peer can answer: set `[presence] enabled = true`"
-                )
-                self._notify(
-                    Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=url, text=text)
+                self._warn(
+                    url,
+                    f"{url} sends nothing, so no peer can answer: set `[presence] enabled = true`",
                 )
 
     def _link(self, number: int, url: str) -> Link:
@@ -110,9 +108,7 @@ class Gateway:
             key, now_ns = load_key(path), self._now_ns()
             warning = key_warning(path)
             if warning:
-                self._notify(
-                    Notice(t_ns=now_ns, severity=Severity.WARNING, subject=url, text=warning)
-                )
+                self._warn(url, warning)
             unsigned = url in signing.allow_unsigned
             guard = self._timestamps.guard(url, key, number % 256, now_ns, allow_unsigned=unsigned)
         return Link(
@@ -156,14 +152,7 @@ class Gateway:
                 await asyncio.to_thread(timestamps.write, timestamps.snapshot(self._now_ns()))
             except LinkError as error:
                 if not failing:
-                    self._notify(
-                        Notice(
-                            t_ns=self._now_ns(),
-                            severity=Severity.ERROR,
-                            subject="signing",
-                            text=str(error),
-                        )
-                    )
+                    self._warn("signing", str(error), Severity.ERROR)
                 failing = True
             else:
                 failing = False
@@ -188,12 +177,10 @@ class Gateway:
 
     def _notify_strangers(self) -> None:
         for who, stranger, known in self._known_peers.contradicted:
-            text = (
+            self._warn(
+                who,
                 f"{who}: reports from {stranger} contradict those from {' and '.join(known)} and"
-                " are rejected; add the trusted peer to `[links] routers`"
-            )
-            self._notify(
-                Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=who, text=text)
+                " are rejected; add the trusted peer to `[links] routers`",
             )
         self._known_peers.contradicted.clear()
 
@@ -203,11 +190,14 @@ class Gateway:
         if self._newcomers.refused and now_ns - self._refusal_notice_ns >= NOTICE_EVERY_NS:
             self._refusal_notice_ns = now_ns
             self._newcomers.refused = 0
-            text = (
+            self._warn(
+                "links",
                 "more frames of new senders arrive than are served, and some are rejected;"
-                " name the vehicles in `[tracks] allow`, or sign the links"
+                " name the vehicles in `[tracks] allow`, or sign the links",
             )
-            self._notify(Notice(t_ns=now_ns, severity=Severity.WARNING, subject="links", text=text))
+
+    def _warn(self, subject: str, text: str, severity: Severity = Severity.WARNING) -> None:
+        self._notify(Notice(t_ns=self._now_ns(), severity=severity, subject=subject, text=text))
 
     @property
     def has_component(self) -> bool:

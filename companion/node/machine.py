@@ -45,6 +45,21 @@ class Finding:
     text: str
     remedy: str = ""
 
+    @classmethod
+    def ok(cls, subject: str, text: str) -> "Finding":
+        """Return a finding that is in order."""
+        return cls(subject=subject, grade=Grade.OK, text=text)
+
+    @classmethod
+    def doubt(cls, subject: str, text: str, remedy: str = "") -> "Finding":
+        """Return a doubtful finding."""
+        return cls(subject=subject, grade=Grade.DOUBT, text=text, remedy=remedy)
+
+    @classmethod
+    def fault(cls, subject: str, text: str, remedy: str = "") -> "Finding":
+        """Return a finding that prevents a run."""
+        return cls(subject=subject, grade=Grade.FAULT, text=text, remedy=remedy)
+
 
 def look(settings: Settings, *, token: str | None, insecure: bool) -> Iterator[Finding]:
     """Yield findings about this machine's ports, devices, disk and clock; keeps nothing open."""
@@ -65,8 +80,8 @@ def _served(listen: str, *, token: str | None, insecure: bool) -> Finding:
     except UserError as error:
         busy = os.strerror(errno.EADDRINUSE) in str(error)
         remedy = "stop the other program, or give --listen 127.0.0.1:8081" if busy else ""
-        return Finding(subject=subject, grade=Grade.FAULT, text=str(error), remedy=remedy)
-    return Finding(subject=subject, grade=Grade.OK, text="available for the page and the API")
+        return Finding.fault(subject, str(error), remedy)
+    return Finding.ok(subject, "available for the page and the API")
 
 
 def _link(url: LinkUrl) -> Finding:
@@ -76,7 +91,7 @@ def _link(url: LinkUrl) -> Finding:
     if url.scheme == "zenoh":
         return _zenoh(subject, url)
     if not url.listens:
-        return Finding(subject=subject, grade=Grade.OK, text="connects to its peer")
+        return Finding.ok(subject, "connects to its peer")
     kind = socket.SOCK_STREAM if url.scheme == "tcpin" else socket.SOCK_DGRAM
     try:
         bound(url, kind).close()
@@ -84,18 +99,16 @@ def _link(url: LinkUrl) -> Finding:
         remedy = "stop the program that uses it, or choose another port"
         if error.errno != errno.EADDRINUSE:
             remedy = "give an address of this machine, such as 0.0.0.0"
-        return Finding(subject=subject, grade=Grade.FAULT, text=reason(error), remedy=remedy)
-    return Finding(subject=subject, grade=Grade.OK, text="available for listening")
+        return Finding.fault(subject, reason(error), remedy)
+    return Finding.ok(subject, "available for listening")
 
 
 def _zenoh(subject: str, url: LinkUrl) -> Finding:
     try:
         zenoh_bus.check(zenoh_link.configuration(url))
     except UserError as error:
-        return Finding(subject=subject, grade=Grade.FAULT, text=str(error))
-    return Finding(
-        subject=subject, grade=Grade.OK, text="Zenoh is installed, and its endpoints are valid"
-    )
+        return Finding.fault(subject, str(error))
+    return Finding.ok(subject, "Zenoh is installed, and its endpoints are valid")
 
 
 def _device(subject: str, device: Path) -> Finding:
@@ -104,16 +117,12 @@ def _device(subject: str, device: Path) -> Finding:
         remedy = "check that it is plugged in"
         if there:
             remedy += f"; devices: {', '.join(there)}"
-        return Finding(
-            subject=subject, grade=Grade.FAULT, text="device does not exist", remedy=remedy
-        )
+        return Finding.fault(subject, "device does not exist", remedy)
     if not os.access(device, os.R_OK | os.W_OK):
         group = grp.getgrgid(device.stat().st_gid).gr_name
         remedy = f"sudo usermod -a -G {group} $USER, then log in again"
-        return Finding(
-            subject=subject, grade=Grade.FAULT, text="no permission to open it", remedy=remedy
-        )
-    return Finding(subject=subject, grade=Grade.OK, text="device exists and can be opened")
+        return Finding.fault(subject, "no permission to open it", remedy)
+    return Finding.ok(subject, "device exists and can be opened")
 
 
 def _buffers() -> Iterator[Finding]:
@@ -124,9 +133,9 @@ def _buffers() -> Iterator[Finding]:
     text = f"the system allows UDP links {granted / 1e3:.0f} kB"
     if granted < BUFFER_BYTES:
         remedy = f"for thousands of frames a second: sysctl -w net.core.rmem_max={4 * BUFFER_BYTES}"
-        yield Finding(subject="receive buffer", grade=Grade.DOUBT, text=text, remedy=remedy)
+        yield Finding.doubt("receive buffer", text, remedy)
     else:
-        yield Finding(subject="receive buffer", grade=Grade.OK, text=text)
+        yield Finding.ok("receive buffer", text)
 
 
 def _disk(folder: Path) -> Finding:
@@ -138,21 +147,13 @@ def _disk(folder: Path) -> Finding:
         with tempfile.TemporaryFile(dir=where):
             free = shutil.disk_usage(where).free
     except OSError as error:
-        return Finding(
-            subject=subject,
-            grade=Grade.FAULT,
-            text=reason(error),
-            remedy="choose a writable folder in `[recording] directory`",
+        return Finding.fault(
+            subject, reason(error), "choose a writable folder in `[recording] directory`"
         )
     text = f"{free / 1e9:.1f} GB free"
     if free < LOW_DISK_BYTES:
-        return Finding(
-            subject=subject,
-            grade=Grade.DOUBT,
-            text=text,
-            remedy="free some space: a full disk ends a recording",
-        )
-    return Finding(subject=subject, grade=Grade.OK, text=text)
+        return Finding.doubt(subject, text, "free some space: a full disk ends a recording")
+    return Finding.ok(subject, text)
 
 
 def processor_share(root: Path = Path("/")) -> float:
@@ -198,11 +199,6 @@ def _clock() -> Iterator[Finding]:
         return  # not Linux
     if state == UNSYNCHRONISED_STATE:
         text = "the clock is not synchronised: times in recordings may be wrong"
-        yield Finding(
-            subject="wall clock",
-            grade=Grade.DOUBT,
-            text=text,
-            remedy="run chrony or systemd-timesyncd",
-        )
+        yield Finding.doubt("wall clock", text, "run chrony or systemd-timesyncd")
     elif state >= 0:
-        yield Finding(subject="wall clock", grade=Grade.OK, text="synchronised")
+        yield Finding.ok("wall clock", "synchronised")

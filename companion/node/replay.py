@@ -32,6 +32,8 @@ from companion.settings.origins import Origin, Origins, changed, of_options
 from companion.values import Estimate, Event, Output, Refuted, Tick, Tock, Update
 
 FLUSH_EVERY_S: Final = 1.0  # time between two flushes of the recording
+Progress = Callable[[int, float, float], None]
+"""Shows the progress: frames, seconds of log, and wall-clock seconds since the start."""
 TICKED: Final = "mcap"  # kind of log that contains the ticks of its run
 
 
@@ -127,6 +129,24 @@ class Run:
                 self.writer.output(output, self.pipeline.geodetic)
         return outputs
 
+    def steps(
+        self, events: Iterable[Event], progress: Progress | None = None
+    ) -> Iterator[tuple[Event, list[Output]]]:
+        """Process events; yield each with its outputs.
+
+        Each ``FLUSH_EVERY_S`` the recording is flushed and ``progress`` called. Raises ``OSError``
+        if an event cannot be recorded.
+        """
+        due_s = time.monotonic() + FLUSH_EVERY_S
+        for event in events:
+            yield event, self.step(event)
+            if time.monotonic() >= due_s:
+                due_s += FLUSH_EVERY_S
+                if self.writer:
+                    self.writer.flush()
+                if progress:
+                    progress(self.pipeline.frames, self.at_s, self.took_s)
+
     def finish(self) -> dict[str, Any]:
         """Close the recording and return the summary.
 
@@ -147,7 +167,7 @@ def replay(
     record: Callable[[], Writer] | None = None,
     *,
     speed: float | None = None,
-    progress: Callable[[int, float, float], None] | None = None,
+    progress: Progress | None = None,
     latency_s: float = 0.0,
 ) -> dict[str, Any]:
     """Run logs through a pipeline and return the summary that ``companion replay --json`` prints.
@@ -156,24 +176,16 @@ def replay(
         settings  settings of the pipeline
         record    creates the recording, once the logs are open; None: no recording
         speed     multiple of the log's own speed; None: as fast as possible
-        progress  called occasionally with frames, seconds of log, and seconds since the start
+        progress  called once per second
         latency_s time from a sample to its arrival, for onboard logs, which contain no arrivals
 
     The summary includes ``log_notes``. Raises ``LogError`` for an unusable log, ``OSError`` if the
     recording cannot be written.
     """
     events = log_events(logs, settings, latency_s)
-    writer = record() if record else None
-    run = Run(settings, writer)
-    flush_due_s = time.monotonic() + FLUSH_EVERY_S
-    for event in events if speed is None else _paced(events, speed):
-        run.step(event)
-        if time.monotonic() >= flush_due_s:
-            flush_due_s += FLUSH_EVERY_S
-            if writer:
-                writer.flush()
-            if progress:
-                progress(run.pipeline.frames, run.at_s, run.took_s)
+    run = Run(settings, record() if record else None)
+    for _ in run.steps(events if speed is None else _paced(events, speed), progress):
+        pass
     return run.finish() | log_notes(logs)
 
 
@@ -192,11 +204,6 @@ def length_s(logs: Sequence[Path]) -> float | None:
     return (max(last for _, last in spans_us) - min(first for first, _ in spans_us)) * 1e-6
 
 
-def vehicle_logs(logs: Sequence[Path]) -> list[dict[str, Any]]:
-    """Return the vehicles whose onboard logs are among some logs, as JSON. Raises ``LogError``."""
-    return [one.as_json() for one in vehicles(logs)]
-
-
 def log_notes(logs: Sequence[Path]) -> dict[str, Any]:
     """Return what a summary says of its logs: ``logs``, ``missing`` and ``truncated``.
 
@@ -204,7 +211,7 @@ def log_notes(logs: Sequence[Path]) -> dict[str, Any]:
     recording lack, ``truncated`` the logs that end early. Raises ``LogError``.
     """
     return {
-        "logs": vehicle_logs(logs),
+        "logs": [one.as_json() for one in vehicles(logs)],
         "missing": missing(logs),
         "truncated": [log.as_json() for log in truncated(logs)],
     }

@@ -255,8 +255,7 @@ class Service:
         uavs = kept.drive.uavs or kept.beams.priority
 
         def say(text: str) -> None:
-            notice = Notice(t_ns=self.now_ns(), severity=Severity.INFO, subject="drive", text=text)
-            loop.call_soon_threadsafe(self.notify, notice)
+            loop.call_soon_threadsafe(self._report, Severity.INFO, "drive", text)
 
         try:
             centre = kept.drive.aim == "centre"
@@ -281,10 +280,7 @@ class Service:
             )
             await run_in_thread(drive)
         except UserError as error:
-            text = f"driving of the device has ended: {error}"
-            self.notify(
-                Notice(t_ns=self.now_ns(), severity=Severity.ERROR, subject="drive", text=text)
-            )
+            self._report(Severity.ERROR, "drive", f"driving of the device has ended: {error}")
 
     async def _end_on_defect(self) -> None:
         """Raise a defect of the pipeline, which ends the service.
@@ -305,11 +301,12 @@ class Service:
         self._hand_over(None, [notice])
         self._show(notice)
 
+    def _report(self, severity: Severity, subject: str, text: str) -> None:
+        self.notify(Notice(t_ns=self.now_ns(), severity=severity, subject=subject, text=text))
+
     def _notify_recorder_state(self, recorder: BackgroundRecorder) -> None:
         for severity, text in recorder.news():
-            self.notify(
-                Notice(t_ns=self.now_ns(), severity=severity, subject="recording", text=text)
-            )
+            self._report(severity, "recording", text)
 
     def _notify_overload(self, machine: Blame | None) -> None:
         """Publish a notice when this machine becomes overloaded, and when it recovers."""
@@ -320,7 +317,7 @@ class Service:
             text, severity = "this machine is no longer overloaded", Severity.INFO
         else:
             text, severity = f"{machine.reason}; {machine.remedy}", Severity.WARNING
-        self.notify(Notice(t_ns=self.now_ns(), severity=severity, subject="machine", text=text))
+        self._report(severity, "machine", text)
 
     def _show(self, notice: Notice) -> None:
         self.notices.append(notice)

@@ -8,6 +8,7 @@ from companion.values import (
     DUTY_MAX,
     ClockSet,
     Duty,
+    Event,
     Fix,
     Frame,
     Notice,
@@ -16,6 +17,8 @@ from companion.values import (
     RoundTrip,
     Severity,
     Source,
+    Tick,
+    Tock,
     Track,
     reason_invalid,
 )
@@ -24,6 +27,7 @@ FRAME_ID: Final = "wgs84"
 """Frame of reference of every LocationFix: Earth-fixed, x through 0° E, z to the north pole."""
 OFFSET_MAX_NS: Final = 1 << 62
 """Limit on UTC less the node's timeline, 146 years, so that results are valid dates."""
+FrameMessage: Final = schemas.message_class("Frame")
 _LEVEL: Final = {
     Severity.INFO: schemas.LogMessage.INFO,
     Severity.WARNING: schemas.LogMessage.WARNING,
@@ -99,7 +103,7 @@ def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
 
     ``sources`` caches the senders seen so far, so that each has one value.
     """
-    message = schemas.FrameMessage.FromString(data)
+    message = FrameMessage.FromString(data)
     ids = (message.sysid, message.compid)
     source = sources.get(ids)
     if source is None:
@@ -115,39 +119,38 @@ def to_frame(data: bytes, sources: dict[tuple[int, int], Source]) -> Frame:
     )
 
 
-def to_round_trip(data: bytes) -> RoundTrip:
-    """Decode a round trip. Raises ``DecodeError`` for malformed bytes."""
-    return fields.value_of(RoundTrip, schemas.RoundTripMessage.FromString(data))
+EVENTS: Final[dict[str, type[Event]]] = {
+    schemas.TOPICS[kind.__name__]: kind
+    for kind in (Tick, Tock, Rejection, RoundTrip, Duty, ClockSet, Observation)
+}
+"""Classes of events other than frames, by topic."""
 
 
-def to_duty(data: bytes) -> Duty:
-    """Decode a duty. Raises ``DecodeError``, or ``ValueError`` if it names too many UAVs."""
-    found = fields.value_of(Duty, schemas.DutyMessage.FromString(data))
-    if max(len(found.serves), len(found.spares)) > DUTY_MAX:
-        raise ValueError(f"duty of more than {DUTY_MAX} UAVs")
-    return found
+def to_event(topic: str, data: bytes) -> Event | None:
+    """Decode an event other than a frame; None for a rejection by the pipeline itself.
 
-
-def to_clock_set(data: bytes) -> ClockSet:
-    """Decode a step of the wall clock. Raises ``DecodeError``, or ``ValueError`` out of range."""
-    found = fields.value_of(ClockSet, schemas.ClockSetMessage.FromString(data))
-    if abs(found.utc_offset_ns) > OFFSET_MAX_NS:
-        raise ValueError("UTC offset out of range")
-    return found
-
-
-def to_observation(data: bytes) -> Observation:
-    """Decode an observation. Raises ``DecodeError``, or ``ValueError`` if it is invalid."""
-    found = fields.value_of(Observation, schemas.ObservationMessage.FromString(data))
-    reason = reason_invalid(found)
-    if reason is not None:
-        raise ValueError(f"invalid observation: {reason}")
-    return found
-
-
-def to_rejection(data: bytes) -> Rejection | None:
-    """Decode a rejection; None for the pipeline's own rejections, which a replay repeats."""
-    message = schemas.RejectionMessage.FromString(data)
-    if not message.is_event:
+    A replay repeats those rejections. Raises ``DecodeError`` for malformed bytes, ``ValueError``
+    for an invalid event.
+    """
+    kind = EVENTS[topic]
+    message = schemas.message_class(kind.__name__).FromString(data)
+    if kind is Rejection and not message.is_event:
         return None
-    return fields.value_of(Rejection, message)
+    event: Event = fields.value_of(kind, message)
+    reason = _reason_invalid(event)
+    if reason is not None:
+        raise ValueError(reason)
+    return event
+
+
+def _reason_invalid(event: Event) -> str | None:
+    match event:
+        case RoundTrip() if max(event.source) > 255:
+            return "round trip with an invalid source"
+        case Duty() if max(len(event.serves), len(event.spares)) > DUTY_MAX:
+            return f"duty of more than {DUTY_MAX} UAVs"
+        case ClockSet() if abs(event.utc_offset_ns) > OFFSET_MAX_NS:
+            return "UTC offset out of range"
+        case Observation() if (reason := reason_invalid(event)) is not None:
+            return f"invalid observation: {reason}"
+    return None

@@ -5,7 +5,7 @@ tracks, weights and the scene are sent at a limited rate, since a replay compute
 """
 
 from collections.abc import Callable
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
@@ -13,20 +13,13 @@ from companion.recording import codec, fields, schemas
 from companion.recording.scene import Scene
 from companion.recording.schemas import Schema
 from companion.values import (
-    BeamSet,
-    ClockSet,
-    Duty,
     Estimate,
     Event,
     FloatArray,
     Frame,
     Notice,
-    Observation,
     Output,
     Rejection,
-    RoundTrip,
-    Tick,
-    Tock,
     Track,
     Update,
 )
@@ -41,16 +34,16 @@ Emit = Callable[[str, Schema, int, bytes], None]
 """Function to which topic, schema, time in nanoseconds and the message's bytes are passed."""
 
 NAMED: Final = (
-    (schemas.FRAMES_TOPIC, schemas.FRAME),
-    (schemas.TICKS_TOPIC, schemas.TICK),
-    (schemas.REJECTIONS_TOPIC, schemas.REJECTION),
-    (schemas.TRACKS_TOPIC, schemas.TRACK),
-    (schemas.WEIGHTS_TOPIC, schemas.WEIGHTS),
+    *(
+        (schemas.TOPICS[name], schemas.schema(name))
+        for name in ("Frame", "Tick", "Rejection", "Track", "Weights")
+    ),
     (schemas.TF_TOPIC, schemas.FRAME_TRANSFORM),
     (schemas.SCENE_TOPIC, schemas.SCENE_UPDATE),
     (schemas.LOG_TOPIC, schemas.LOG),
 )
 """Topics that exist in every run; a UAV's topics are added with the UAV."""
+FRAME: Final = schemas.schema("Frame")
 
 
 class RateLimit:
@@ -90,31 +83,17 @@ class Encoder:
     def event(self, event: Event) -> None:
         """Send an event that drives the pipeline: in the order of calls, before its outputs."""
         self._last_event = event
-        if isinstance(event, Frame):  # before the match: nearly all events are frames
-            data = self._frame_bytes(event)
-            self._emit(schemas.FRAMES_TOPIC, schemas.FRAME, event.t_ns, data)
-            return
-        match event:
-            case Tick():
-                data = schemas.encode("Tick", event)
-                self._emit(schemas.TICKS_TOPIC, schemas.TICK, event.t_ns, data)
-            case Tock():
-                data = schemas.encode("Tock", event)
-                self._emit(schemas.TOCKS_TOPIC, schemas.TOCK, event.t_ns, data)
-            case Rejection():
-                self._rejection(event, is_event=True)
-            case RoundTrip():
-                data = schemas.encode("RoundTrip", event)
-                self._emit(schemas.ROUND_TRIPS_TOPIC, schemas.ROUND_TRIP, event.t_ns, data)
-            case Duty():
-                data = schemas.encode("Duty", event)
-                self._emit(schemas.DUTIES_TOPIC, schemas.DUTY, event.t_ns, data)
-            case ClockSet():
-                data = schemas.encode("ClockSet", event)
-                self._emit(schemas.CLOCK_TOPIC, schemas.CLOCK_SET, event.t_ns, data)
-            case Observation():
-                data = schemas.encode("Observation", event)
-                self._emit(schemas.OBSERVATIONS_TOPIC, schemas.OBSERVATION, event.t_ns, data)
+        if isinstance(event, Frame):  # first, since nearly all events are frames
+            self._emit(schemas.FRAMES_TOPIC, FRAME, event.t_ns, self._frame_bytes(event))
+        elif isinstance(event, Rejection):
+            self._rejection(event, is_event=True)
+        else:
+            self._described(type(event).__name__, event.t_ns, event)
+
+    def _described(self, name: str, t_ns: int, value: Any) -> None:
+        """Send a described value as the message of this name."""
+        data = schemas.encode(name, value)
+        self._emit(schemas.TOPICS[name], schemas.schema(name), t_ns, data)
 
     def output(self, output: Output, geodetic: Geodetic) -> None:
         """Send an output, except a rejection that is itself the last event sent.
@@ -129,7 +108,8 @@ class Encoder:
             case Update():
                 if self._weights.is_due(output.t_ns):
                     self._tracks(output.t_ns, output.tracks, geodetic)
-                    self._beams(output.beams)
+                    weights = fields.RecordedWeights(output.beams)
+                    self._described("Weights", weights.made.t_ns, weights)
                 if self._scene and self._scenes.is_due(output.t_ns):
                     self._draw(self._scene, output, geodetic)
             case Rejection():
@@ -140,8 +120,8 @@ class Encoder:
                 self._emit(schemas.LOG_TOPIC, schemas.LOG, output.t_ns, data)
 
     def _rejection(self, rejection: Rejection, *, is_event: bool) -> None:
-        data = schemas.encode("Rejection", fields.RecordedRejection(rejection, is_event))
-        self._emit(schemas.REJECTIONS_TOPIC, schemas.REJECTION, rejection.t_ns, data)
+        recorded = fields.RecordedRejection(rejection, is_event)
+        self._described("Rejection", rejection.t_ns, recorded)
 
     def _tracks(self, t_ns: int, tracks: tuple[Track, ...], geodetic: Geodetic) -> None:
         if not tracks:
@@ -151,12 +131,7 @@ class Encoder:
             where = codec.predicted(track, float(lat_deg), float(lon_deg), float(alt_m))
             topic = f"/uav/{track.uav}/predicted"
             self._emit(topic, schemas.LOCATION_FIX, t_ns, where.SerializeToString())
-            data = schemas.encode("Track", fields.RecordedTrack(track, t_ns))
-            self._emit(schemas.TRACKS_TOPIC, schemas.TRACK, t_ns, data)
-
-    def _beams(self, beams: BeamSet) -> None:
-        data = schemas.encode("Weights", fields.RecordedWeights(beams))
-        self._emit(schemas.WEIGHTS_TOPIC, schemas.WEIGHTS, beams.t_ns, data)
+            self._described("Track", t_ns, fields.RecordedTrack(track, t_ns))
 
     def _draw(self, scene: Scene, update: Update, geodetic: Geodetic) -> None:
         transforms = scene.transforms(update)

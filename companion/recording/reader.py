@@ -26,7 +26,7 @@ from companion.recording.foreign import capture, kinds, together
 from companion.recording.foreign.together import Vehicle
 from companion.recording.writer import SETTINGS, SUMMARY
 from companion.settings.model import NAMED_FILES
-from companion.values import Event, Frame, Reason, Rejection, Source, Tick, Tock
+from companion.values import ClockSet, Event, Frame, Reason, Rejection, Source
 
 __all__ = ["LogError", "LogKind", "center_of", "flights", "log_kind", "read_flight", "read_log",
            "read_parts", "read_settings", "utc_offset_ns", "vehicles"]  # fmt: skip
@@ -41,18 +41,7 @@ LARGEST_EVENT: Final = 1 << 21
 """Limit on the bytes of an event: a duty with the largest number of names."""
 _UNCERTAINTY_MAX_NS: Final = 3_600_000_000_000
 """Largest uncertainty of a frame's arrival: results computed from it fit into 63 bits."""
-_EVENT_TOPICS: Final = frozenset(
-    (
-        schemas.FRAMES_TOPIC,
-        schemas.TICKS_TOPIC,
-        schemas.TOCKS_TOPIC,
-        schemas.REJECTIONS_TOPIC,
-        schemas.ROUND_TRIPS_TOPIC,
-        schemas.DUTIES_TOPIC,
-        schemas.CLOCK_TOPIC,
-        schemas.OBSERVATIONS_TOPIC,
-    )
-)
+_EVENT_TOPICS: Final = frozenset((schemas.FRAMES_TOPIC, *codec.EVENTS))
 
 
 def log_kind(path: Path) -> LogKind:
@@ -206,9 +195,11 @@ def utc_offset_ns(paths: Sequence[Path]) -> int:
 
 def _offset_ns(path: Path, data: bytes) -> int:
     try:
-        return codec.to_clock_set(data).utc_offset_ns
+        found = codec.to_event(schemas.CLOCK_TOPIC, data)
     except (DecodeError, ValueError) as error:
         raise LogError(f"{path}: not a recording of this program: {error}") from None
+    assert isinstance(found, ClockSet)
+    return found.utc_offset_ns
 
 
 def _open(path: Path) -> tuple[LogKind, bytes]:
@@ -310,20 +301,4 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
         ):
             raise ValueError("malformed frame")
         return frame
-    if topic == schemas.TICKS_TOPIC:
-        tick = schemas.TickMessage.FromString(data)
-        return Tick(tick.t_ns, tick.in_two, max(0, tick.waited_ns))
-    if topic == schemas.TOCKS_TOPIC:
-        return Tock(schemas.TockMessage.FromString(data).t_ns)
-    if topic == schemas.ROUND_TRIPS_TOPIC:
-        trip = codec.to_round_trip(data)
-        if max(trip.source) > 255:
-            raise ValueError("round trip with an invalid source")
-        return trip
-    if topic == schemas.DUTIES_TOPIC:
-        return codec.to_duty(data)
-    if topic == schemas.CLOCK_TOPIC:
-        return codec.to_clock_set(data)
-    if topic == schemas.OBSERVATIONS_TOPIC:
-        return codec.to_observation(data)
-    return codec.to_rejection(data)
+    return codec.to_event(topic, data)

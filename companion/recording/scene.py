@@ -158,13 +158,11 @@ def _across(towards: FloatArray) -> FloatArray:
     right_x, right_y = np.where(upright, 0.0, -y / lengths), np.where(upright, 1.0, x / lengths)
     right = [right_x, right_y, np.zeros_like(x)]
     down = [-z * right_y, z * right_x, x * right_y - y * right_x]
-    found: FloatArray = np.array([right, down, [x, y, z]]).transpose(2, 1, 0)
-    return found
+    return np.array([right, down, [x, y, z]]).transpose(2, 1, 0)
 
 
 def _map_from_carrier(carrier: Carrier) -> FloatArray:
-    turned: FloatArray = ENU_FROM_NED @ carrier.body_from_local.T @ _UP
-    return turned
+    return ENU_FROM_NED @ carrier.body_from_local.T @ _UP
 
 
 def _transform(at: Any, parent: str, child: str, place: FloatArray, turned: FloatArray) -> Any:

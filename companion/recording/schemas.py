@@ -65,7 +65,7 @@ _TYPES: Final = {
 
 def message(name: str, value: Any) -> Any:
     """Return a described value as a protobuf message of this name."""
-    return _message(name)(**fields.values(name, value))
+    return message_class(name)(**fields.values(name, value))
 
 
 def encode(name: str, value: Any) -> bytes:
@@ -114,24 +114,11 @@ _POOL.Add(_describe())
 
 
 @functools.cache
-def _message(name: str) -> Any:
+def message_class(name: str) -> Any:
+    """Return the class of a protobuf message of this program."""
     return GetMessageClass(_POOL.FindMessageTypeByName(f"companion.{name}"))
 
 
-FrameMessage: Final = _message("Frame")
-TickMessage: Final = _message("Tick")
-TockMessage: Final = _message("Tock")
-RejectionMessage: Final = _message("Rejection")
-RoundTripMessage: Final = _message("RoundTrip")
-DutyMessage: Final = _message("Duty")
-SharedMessage: Final = _message("Shared")
-StandingMessage: Final = _message("Standing")
-OffersMessage: Final = _message("Offers")
-TracksMessage: Final = _message("Tracks")
-ClockSetMessage: Final = _message("ClockSet")
-ObservationMessage: Final = _message("Observation")
-TrackMessage: Final = _message("Track")
-WeightsMessage: Final = _message("Weights")
 LocationFixMessage: Final[Any] = LocationFix
 LogMessage: Final[Any] = Log
 FrameTransformMessage: Final[Any] = FrameTransform
@@ -164,17 +151,12 @@ def _with_dependencies(message: Any) -> Schema:
     return Schema(message.DESCRIPTOR.full_name, files.SerializeToString())
 
 
-FRAME: Final = _with_dependencies(FrameMessage)
-TICK: Final = _with_dependencies(TickMessage)
-TOCK: Final = _with_dependencies(TockMessage)
-REJECTION: Final = _with_dependencies(RejectionMessage)
-ROUND_TRIP: Final = _with_dependencies(RoundTripMessage)
-DUTY: Final = _with_dependencies(DutyMessage)
-SHARED: Final = _with_dependencies(SharedMessage)
-CLOCK_SET: Final = _with_dependencies(ClockSetMessage)
-OBSERVATION: Final = _with_dependencies(ObservationMessage)
-TRACK: Final = _with_dependencies(TrackMessage)
-WEIGHTS: Final = _with_dependencies(WeightsMessage)
+@functools.cache
+def schema(name: str) -> Schema:
+    """Return the schema of a message of this program."""
+    return _with_dependencies(message_class(name))
+
+
 LOCATION_FIX: Final = _with_dependencies(LocationFixMessage)
 LOG: Final = _with_dependencies(LogMessage)
 FRAME_TRANSFORM: Final = _with_dependencies(FrameTransformMessage)
@@ -194,6 +176,14 @@ WEIGHTS_TOPIC: Final = "/beams/weights"
 LOG_TOPIC: Final = "/log"
 TF_TOPIC: Final = "/tf"
 SCENE_TOPIC: Final = "/scene"
+
+TOPICS: Final = {
+    "Frame": FRAMES_TOPIC, "Tick": TICKS_TOPIC, "Tock": TOCKS_TOPIC,
+    "Rejection": REJECTIONS_TOPIC, "RoundTrip": ROUND_TRIPS_TOPIC, "Duty": DUTIES_TOPIC,
+    "ClockSet": CLOCK_TOPIC, "Observation": OBSERVATIONS_TOPIC, "Track": TRACKS_TOPIC,
+    "Weights": WEIGHTS_TOPIC,
+}  # fmt: skip
+"""Topic of each message of this program that is recorded."""
 
 # Tag bytes: field number << 3 | wire type (0 varint, 1 eight bytes, 2 length-delimited).
 RAW_MAX: Final = 280

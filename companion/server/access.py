@@ -243,12 +243,17 @@ class BearerToken:
             await asyncio.sleep(self._wrong.delay_s(address, now_s))
         if scope["type"] == "websocket":
             websocket = WebSocket(scope, receive, send)
-            offered = scope.get("subprotocols", [])
-            await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
+            await accept(websocket)
             await websocket.close(UNAUTHORISED, "a bearer token is needed")
         else:
             title, headers = "a bearer token is needed", {"www-authenticate": "Bearer"}
             await problem(401, title, headers)(scope, receive, send)
+
+
+async def accept(websocket: WebSocket) -> None:
+    """Accept a WebSocket, with ``SUBPROTOCOL`` if the client offers it."""
+    offered = websocket.scope.get("subprotocols", [])
+    await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
 
 
 def _tokens(scope: Scope) -> list[bytes]:

@@ -12,8 +12,8 @@ from typing import Annotated, Final
 from fastapi import FastAPI, HTTPException
 from fastapi.responses import Response
 
-from companion.server.byte_ranges import Range, file_answer, open_regular
-from companion.server.responses import answer, answers, refusals
+from companion.server.byte_ranges import Range, file_answer, file_answers, open_regular
+from companion.server.responses import answer, answers
 from companion.server.threads import in_file_thread
 from companion.values import UserError
 from companion.values.described import Meaning
@@ -60,11 +60,7 @@ def add(app: FastAPI, file: Path | None) -> None:
         "/v1/map/tiles",
         summary="Tiles of the map, by Range",
         response_class=Response,
-        responses={
-            200: {"content": {MEDIA_TYPE: {}}},
-            206: {"content": {MEDIA_TYPE: {}}, "description": "The bytes of Range"},
-            **refusals(404, 416, 422),
-        },
+        responses=file_answers(MEDIA_TYPE),
     )
     async def tiles(wanted: Range = None) -> Response:
         found = None

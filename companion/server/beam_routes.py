@@ -1,7 +1,6 @@
 """The routes ``/v1/beams``, ``/v1/beams/weights`` and ``/v1/pattern``, computed on request."""
 
 import re
-from dataclasses import replace
 from typing import Annotated, Any, Final
 
 from fastapi import FastAPI, HTTPException, Query, Request
@@ -11,7 +10,7 @@ from companion.server import models
 from companion.server.moments import Moments
 from companion.server.responses import BodyResponse, answers, encode, json_response, refusals
 from companion.server.work_slots import WorkSlots
-from companion.values import BeamSet, Update, UserError, WeightFormat
+from companion.values import Update, UserError, WeightFormat
 from companion.views import as_json, beam_state, weight_formats
 from companion.views import pattern as pattern_view
 from companion.views.state import Node
@@ -64,7 +63,9 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
             )
 
         def make(update: Update) -> tuple[bytes, dict[str, str]]:
-            made = update.beams if uav is None else _only(update.beams, uav)
+            made = update.beams
+            if uav is not None:
+                made = made.of([i for i, one in enumerate(made.uavs) if one == uav])
             body = weight_formats.encode(form, made, pipeline, equipment, lead_ms)
             return body, {**weight_formats.headers(pipeline, made), "vary": "accept"}
 
@@ -101,12 +102,6 @@ def add(app: FastAPI, node: Node, work_slots: WorkSlots) -> None:
             )
 
         return json_response(await moments.made(lead_ms, (cut, points, uav), make))
-
-
-def _only(made: BeamSet, uav: str) -> BeamSet:
-    kept = [i for i, one in enumerate(made.uavs) if one == uav]
-    beams = tuple(made.beams[i] for i in kept)
-    return replace(made, beams=beams, weights=made.weights[:, kept])
 
 
 def _weight_answers() -> dict[int | str, dict[str, Any]]:

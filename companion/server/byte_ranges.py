@@ -8,12 +8,13 @@ import re
 import stat
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Annotated, BinaryIO, Final
+from typing import Annotated, Any, BinaryIO, Final
 
 from fastapi import Header, HTTPException
 from fastapi.responses import StreamingResponse
 
 from companion.server.connections import CutShortError
+from companion.server.responses import refusals
 from companion.server.threads import in_file_thread
 
 _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
@@ -62,6 +63,16 @@ def file_answer(
         headers=headers,
         media_type=media_type,
     )
+
+
+def file_answers(media_type: str) -> dict[int | str, dict[str, Any]]:
+    """Return the responses of an operation that answers with a file, for the OpenAPI document."""
+    content: dict[str, Any] = {"content": {media_type: {}}}
+    return {
+        200: content,
+        206: content | {"description": "The bytes of Range"},
+        **refusals(404, 416, 422),
+    }
 
 
 def span(header: str | None, size: int) -> tuple[int, int] | None:

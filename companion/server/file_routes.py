@@ -7,18 +7,11 @@ from fastapi import FastAPI, HTTPException, Path
 from fastapi.responses import Response
 
 from companion.server import models, recordings
-from companion.server.byte_ranges import Range, file_answer
+from companion.server.byte_ranges import Range, file_answer, file_answers
 from companion.server.giving_way import GivingWay
 from companion.server.large_answers import LargeAnswers, Make
 from companion.server.playback import BusyError, Playback, PlaybackError, Reading
-from companion.server.responses import (
-    answer,
-    answers,
-    encode,
-    encode_in_parts,
-    json_response,
-    refusals,
-)
+from companion.server.responses import answer, answers, encode, encode_in_parts, json_response
 from companion.server.shared_work import SharedWork
 from companion.server.threads import in_file_thread, in_thread
 from companion.values import Source
@@ -62,11 +55,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
         "/v1/recordings/{name}",
         summary="A recording, or a range of its bytes; an unfinished one up to the last flush",
         response_class=Response,
-        responses={
-            200: {"content": {recordings.MEDIA_TYPE: {}}},
-            206: {"content": {recordings.MEDIA_TYPE: {}}, "description": "The bytes of Range"},
-            **refusals(404, 416, 422),
-        },
+        responses=file_answers(recordings.MEDIA_TYPE),
     )
     async def download(name: RecordingName, wanted: Range = None) -> Response:
         found = await in_file_thread(recordings.opened, where, name, current())

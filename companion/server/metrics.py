@@ -4,7 +4,7 @@ Names follow Prometheus: base units, ``_total`` for counters. The process's own 
 CPU, open files) come from the client library.
 """
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any, Final
 
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
@@ -17,17 +17,16 @@ from prometheus_client.core import (
 from prometheus_client.registry import Collector
 
 import companion
-from companion.mavlink.links.lag import LagSeen
 from companion.mavlink.links.status import LinkStatus
 from companion.server.access import WrongTokens
 from companion.server.fleet_metrics import fleet_metrics
 from companion.server.giving_way import GivingWay
 from companion.server.large_answers import Make
 from companion.server.stream import Stream
-from companion.values import BeamSet, Level, Track, Verdict
+from companion.values import Level, Track, Verdict
 from companion.values.described import meaning
 from companion.views.health import shown_verdicts
-from companion.views.state import Node, ObservationCounts, RecordingStatus, overload
+from companion.views.state import Node, overload
 from companion.views.uav_state import Overview
 
 LINK_COUNTS: Final = (
@@ -39,6 +38,24 @@ GAINS: Final = ("needed", "guaranteed", "likely")
 def _help(described: Any, name: str) -> str:
     text = meaning(described, name).text
     return text[0].upper() + text[1:]
+
+
+def _gauges(value: Any, **names: str) -> Iterator[Metric]:
+    """Yield a gauge for each of the fields in ``names`` that is known."""
+    return _described(GaugeMetricFamily, value, names)
+
+
+def _counters(value: Any, **names: str) -> Iterator[Metric]:
+    return _described(CounterMetricFamily, value, names)
+
+
+def _described(
+    family: Callable[..., Metric], value: Any, names: dict[str, str]
+) -> Iterator[Metric]:
+    for field, name in names.items():
+        number = getattr(value, field)
+        if number is not None:
+            yield family(name, _help(type(value), field), value=number)
 
 
 class _Given(Collector):
@@ -115,17 +132,13 @@ class NodeMetrics:
             sum_value=node.lateness.sum_s,
         )
         counts = self._node.observations()
-        for name, suffix in (
-            ("received", ""),
-            ("malformed", "_malformed"),
-            ("dropped", "_dropped"),
-        ):
-            if counts is not None:
-                yield CounterMetricFamily(
-                    f"companion_observations{suffix}",
-                    _help(ObservationCounts, name),
-                    value=getattr(counts, name),
-                )
+        if counts is not None:
+            yield from _counters(
+                counts,
+                received="companion_observations",
+                malformed="companion_observations_malformed",
+                dropped="companion_observations_dropped",
+            )
         yield GaugeMetricFamily(
             "companion_stream_clients", "Clients of /v1/stream", value=self._stream.clients
         )
@@ -139,13 +152,12 @@ class NodeMetrics:
         )
 
     def _arrival_lag(self) -> Iterator[Metric]:
-        seen = self._node.arrival_lag.seen(self._node.now_ns())
-        for name, field in (("", "newest_s"), ("_p95", "p95_s"), ("_max", "max_s")):
-            value_s = getattr(seen, field)
-            if value_s is not None:
-                yield GaugeMetricFamily(
-                    f"companion_arrival_lag{name}_seconds", _help(LagSeen, field), value=value_s
-                )
+        yield from _gauges(
+            self._node.arrival_lag.seen(self._node.now_ns()),
+            newest_s="companion_arrival_lag_seconds",
+            p95_s="companion_arrival_lag_p95_seconds",
+            max_s="companion_arrival_lag_max_seconds",
+        )
 
     def _links(self) -> Iterator[Metric]:
         up = GaugeMetricFamily("companion_link_up", "1 if the link is up", labels=["link"])
@@ -175,12 +187,7 @@ class NodeMetrics:
         if update is not None:
             beams = update.beams
             yield GaugeMetricFamily("companion_beams", "Beams formed", value=len(beams.beams))
-            if beams.condition_number is not None:
-                yield GaugeMetricFamily(
-                    "companion_condition_number",
-                    _help(BeamSet, "condition_number"),
-                    value=beams.condition_number,
-                )
+            yield from _gauges(beams, condition_number="companion_condition_number")
 
     def _recording(self) -> Iterator[Metric]:
         recording = self._node.recording()
@@ -189,23 +196,13 @@ class NodeMetrics:
             "1 if everything is recorded",
             value=float(recording.state == "recording"),
         )
-        yield GaugeMetricFamily(
-            "companion_recording_bytes", _help(RecordingStatus, "bytes"), value=recording.bytes
+        yield from _gauges(
+            recording,
+            bytes="companion_recording_bytes",
+            queued="companion_recording_queue",
+            lag_s="companion_recording_lag_seconds",
         )
-        yield GaugeMetricFamily(
-            "companion_recording_queue", _help(RecordingStatus, "queued"), value=recording.queued
-        )
-        if recording.lag_s is not None:
-            yield GaugeMetricFamily(
-                "companion_recording_lag_seconds",
-                _help(RecordingStatus, "lag_s"),
-                value=recording.lag_s,
-            )
-        yield CounterMetricFamily(
-            "companion_recording_dropped",
-            _help(RecordingStatus, "dropped"),
-            value=recording.dropped,
-        )
+        yield from _counters(recording, dropped="companion_recording_dropped")
 
 
 def _uavs(tracks: Iterable[Track]) -> Iterator[Metric]:

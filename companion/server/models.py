@@ -95,10 +95,9 @@ def model(described: type) -> type[BaseModel]:
         kind, _ = fields[new]
         fields[old] = (kind, Field(description=f"deprecated: use `{new}`", deprecated=True))
     doc = described.__doc__
-    made: type[BaseModel] = create_model(
+    return create_model(
         described.__name__, __doc__=doc, __config__=ConfigDict(protected_namespaces=()), **fields
     )
-    return made
 
 
 def _field(member: Member) -> tuple[Any, Any]:

@@ -60,8 +60,7 @@ class Moments:
             )
             task.add_done_callback(seen)
             self._answers[lead_ms, what] = task
-        found: T = await asyncio.shield(task)  # a client that leaves must not cancel it for others
-        return found
+        return await asyncio.shield(task)  # a client that leaves must not cancel it for others
 
     def _read(self, now_ns: int, until_ns: int, lead_ms: float) -> Callable[[], Update]:
         """Return the function that computes the beams for ``lead_ms``, shared by all answers."""

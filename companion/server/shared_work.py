@@ -25,8 +25,7 @@ class SharedWork:
         if task is None:
             task = self._next[what] = asyncio.create_task(self._after_the_last(what, work))
             task.add_done_callback(seen)
-        found: T = await asyncio.shield(task)  # a client that leaves must not cancel it for others
-        return found
+        return await asyncio.shield(task)  # a client that leaves must not cancel it for others
 
     async def _after_the_last(self, what: Hashable, work: Callable[[], Awaitable[T]]) -> T:
         last = self._running.get(what)

@@ -32,7 +32,7 @@ from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
 from companion.server import topics
-from companion.server.access import SUBPROTOCOL, is_same_site
+from companion.server.access import accept, is_same_site
 from companion.server.large_answers import LargeAnswers
 from companion.server.shared_work import seen
 from companion.server.topics import Body, Topic
@@ -132,8 +132,7 @@ class Stream:
 
     async def serve(self, websocket: WebSocket) -> None:
         """Serve one client until it disconnects or violates the protocol."""
-        offered = websocket.scope.get("subprotocols", [])
-        await websocket.accept(SUBPROTOCOL if SUBPROTOCOL in offered else None)
+        await accept(websocket)
         headers = websocket.headers
         if not is_same_site(headers.get("origin"), headers.get("host")):
             await websocket.close(ELSEWHERE, "pages of other sites may not connect")

@@ -1,6 +1,6 @@
 """Messages of ``/v1/stream``: a body for each topic, and the part of it that a client requested."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import partial
 from typing import Final
@@ -81,9 +81,8 @@ def is_large(topic: Topic, body: Body, uavs: frozenset[str]) -> bool:
 def _record(body: RecordBody, uavs: frozenset[str]) -> bytes:
     made, sure = body.beams, body.guaranteed_db
     kept = [i for i, uav in enumerate(made.uavs) if not uavs or uav in uavs]
-    shown = replace(made, beams=tuple(made.beams[i] for i in kept), weights=made.weights[:, kept])
     held = None if sure is None else [sure[i] for i in kept]
-    (whole,) = records.encode(shown, body.sequence, held)
+    (whole,) = records.encode(made.of(kept), body.sequence, held)
     return whole
 
 

@@ -77,8 +77,7 @@ def numbers_file(key: str, name: str, columns: int) -> FloatArray:
     found = _npy_file(key, name, "fiu") if name.endswith(".npy") else _text_file(key, name)
     if found.ndim != 2 or found.shape[1] < columns or not np.isfinite(found).all():
         raise ConfigError(f"{key} = {name!r}: each row must have {columns} or more finite numbers")
-    rows: FloatArray = found.astype(np.float64)
-    return rows
+    return found.astype(np.float64)
 
 
 def _text_file(key: str, name: str) -> NDArray[Any]:
@@ -124,8 +123,7 @@ def matrix_of(settings: Settings, file: NamedFile) -> ComplexArray | None:
     found = _npy(where, data, "fciu")
     if found.ndim != 2:
         raise ConfigError(f"{where}: not a matrix: shape {found.shape}; save a 2-dimensional array")
-    matrix: ComplexArray = found.astype(np.complex128)
-    return matrix
+    return found.astype(np.complex128)
 
 
 def text_of(settings: Settings, file: NamedFile) -> str | None:

@@ -1,14 +1,51 @@
-"""Provenance of a study's answer: the command line and the versions of the programs."""
+"""What all studies share: logs of flights, command line and versions of an answer, progress."""
 
 import platform
 import shlex
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from importlib.metadata import version
+from itertools import chain
+from pathlib import Path
 from typing import Any, Final
 
 import companion
+from companion.settings.model import Settings
 
+Row = dict[str, Any]
+Progress = Callable[[str], None]
 PACKAGES: Final = ("numpy",)  # packages that every study uses
+
+
+def silent(_text: str) -> None:
+    """Show no progress."""
+
+
+def by_log(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """Return rows by their log, in the order of first appearance."""
+    found: dict[str, list[Row]] = {}
+    for row in rows:
+        found.setdefault(row["log"], []).append(row)
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StudiedLogs:
+    """Logs of the flights to study, with the settings of each flight."""
+
+    flights: tuple[tuple[Path, ...], ...]  # the logs, by flight
+    settings: tuple[Settings, ...]  # those of each flight
+    center: str | None = None  # as on the command line
+    config: str | None = None  # as on the command line
+
+    def by_flight(self) -> Iterator[tuple[tuple[Path, ...], Settings]]:
+        """Yield the logs and the settings of each flight."""
+        return zip(self.flights, self.settings, strict=True)
+
+    def command_line(self, study: str, **options: Any) -> str:
+        """Return the command line of a study of these logs."""
+        logs = chain.from_iterable(self.flights)
+        return command_line(study, *logs, center=self.center, config=self.config, **options)
 
 
 def command_line(study: str, *arguments: object, **options: Any) -> str:

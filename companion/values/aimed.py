@@ -1,6 +1,7 @@
 """Output of the beam stage: beams, the UAVs left out, and the weights of one update."""
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from typing import Annotated, Self
 
@@ -170,6 +171,11 @@ class BeamSet:
     @property
     def uavs(self) -> tuple[str, ...]:
         return tuple(beam.uav for beam in self.beams)
+
+    def of(self, columns: Sequence[int]) -> Self:
+        """Return the same beams without those of other columns."""
+        beams = tuple(self.beams[i] for i in columns)
+        return replace(self, beams=beams, weights=self.weights[:, columns])
 
     @property
     def slots(self) -> IntArray:

@@ -60,7 +60,6 @@ def test_table_is_read_and_replayed_with_progress(
     """Its reading is announced, and its replay states the time that is left."""
     monkeypatch.setattr(console, "LOG_EVERY_S", 0.0)
     monkeypatch.setattr(replaying, "FLUSH_EVERY_S", 0.0)
-    monkeypatch.setattr("companion.node.export.PROGRESS_EVERY", 10, raising=False)
     monkeypatch.setattr("companion.node.moment.PROGRESS_EVERY", 10)
     shown: list[str] = []
     monkeypatch.setattr(Progress, "show", lambda self, text: shown.append(text))

@@ -167,4 +167,4 @@ def test_older_reader_without_tocks_reads_ticks() -> None:
     """It meets one additional field, and a topic that it does not subscribe to."""
     data = schemas.encode("Tick", Tick(5, in_two=True))
     assert data.startswith(schemas.encode("Tick", Tick(5)))
-    assert schemas.TickMessage.FromString(data).t_ns == 5
+    assert schemas.message_class("Tick").FromString(data).t_ns == 5

@@ -65,7 +65,7 @@ def zeros_zstd(size: int, claims: int | None = None) -> bytes:
 
 
 def no_frame(raw: bytes, t_ns: int = 1) -> bytes:
-    return schemas.FrameMessage(t_ns=t_ns, sysid=1, compid=1, raw=raw).SerializeToString()
+    return schemas.message_class("Frame")(t_ns=t_ns, sysid=1, compid=1, raw=raw).SerializeToString()
 
 
 # --- unfinished files ---------------------------------------------------------------------------
@@ -371,17 +371,19 @@ def test_event_time_out_of_range_is_rejected(tmp_path: Path) -> None:
     [
         (
             schemas.ROUND_TRIPS_TOPIC,
-            schemas.RoundTripMessage(t_ns=1, sysid=1, compid=2**32 - 1).SerializeToString(),
+            schemas.message_class("RoundTrip")(
+                t_ns=1, sysid=1, compid=2**32 - 1
+            ).SerializeToString(),
             "round trip with an invalid source",
         ),
         (
             schemas.DUTIES_TOPIC,
-            schemas.DutyMessage(t_ns=1, serves=["1:1"] * 10_001).SerializeToString(),
+            schemas.message_class("Duty")(t_ns=1, serves=["1:1"] * 10_001).SerializeToString(),
             "duty of more than 10000 UAVs",
         ),
         (
             schemas.DUTIES_TOPIC,
-            schemas.DutyMessage(t_ns=1, serves=["1"] * 1_000_000).SerializeToString(),
+            schemas.message_class("Duty")(t_ns=1, serves=["1"] * 1_000_000).SerializeToString(),
             "event is longer than 2097152 bytes",
         ),
         (
@@ -391,7 +393,9 @@ def test_event_time_out_of_range_is_rejected(tmp_path: Path) -> None:
         ),
         (
             schemas.OBSERVATIONS_TOPIC,
-            schemas.ObservationMessage(t_ns=1, uav="1:1", beams=range(300_000)).SerializeToString(),
+            schemas.message_class("Observation")(
+                t_ns=1, uav="1:1", beams=range(300_000)
+            ).SerializeToString(),
             "invalid observation: beams: 300000 beams and 0 powers",
         ),
         (schemas.OBSERVATIONS_TOPIC, b"", "invalid observation: uav: '' is not SYSID:COMPID"),
@@ -416,7 +420,8 @@ def test_malformed_event_is_rejected(tmp_path: Path, topic: str, data: bytes, sa
 
 
 @pytest.mark.parametrize(
-    "data", [b"\xff\xff", schemas.ClockSetMessage(utc_offset_ns=2**63 - 1).SerializeToString()]
+    "data",
+    [b"\xff\xff", schemas.message_class("ClockSet")(utc_offset_ns=2**63 - 1).SerializeToString()],
 )
 def test_invalid_clock_event_is_rejected_by_every_reader(tmp_path: Path, data: bytes) -> None:
     path = tmp_path / "x.mcap"

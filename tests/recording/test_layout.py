@@ -39,13 +39,13 @@ def test_layout_names_only_existing_topics_fields_and_frames() -> None:
     assert {topics[topic] for topic in panels["3D!beams"]["topics"]} == {schemas.SCENE_UPDATE}
     assert panels["3D!beams"]["followTf"] == CARRIER
     assert panels["3D!beams"]["layers"]["grid"]["frameId"] == MAP
-    fields = schemas.TrackMessage.DESCRIPTOR.fields_by_name
+    fields = schemas.message_class("Track").DESCRIPTOR.fields_by_name
     paths = [path["value"] for name in panels for path in panels[name].get("paths", [])]
     assert len(paths) == 8
     for path in paths:
         found = re.fullmatch(r'(/\w+)\{(\w+)=="\d+:\d+"\}\.(\w+)', path)
         assert found is not None, path
-        assert topics[found[1]] is schemas.TRACK
+        assert topics[found[1]] is schemas.schema("Track")
         assert found[2] in fields and found[3] in fields
 
 
@@ -74,7 +74,8 @@ def test_panels_find_what_they_support_in_a_recording(
     mapped = {topic for topic, schema in recorded if schema == "foxglove.LocationFix"}
     assert {f"/uav/{number}:1/fix" for number in range(1, 6)} <= mapped
     tracks = [
-        schemas.TrackMessage.FromString(data) for data in recorded["/tracks", "companion.Track"]
+        schemas.message_class("Track").FromString(data)
+        for data in recorded["/tracks", "companion.Track"]
     ]
     for path in (path["value"] for panel in panels.values() for path in panel.get("paths", [])):
         (uav, field) = re.findall(r'"(.+)"\}\.(\w+)$', path)[0]

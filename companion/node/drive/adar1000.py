@@ -10,14 +10,7 @@ modulo 4. Never tested on hardware: the tests check the resulting register value
 from typing import Any, Final
 
 from companion.beams.hardware.devices import ADAR1000_CHANNELS, vector_modulator
-from companion.node.drive.loop import (
-    NO_REPLIES,
-    DeviceCommand,
-    DeviceError,
-    DeviceInput,
-    SafeState,
-    require,
-)
+from companion.node.drive.loop import Device, DeviceCommand, DeviceError, DeviceInput, SafeState
 from companion.values import IntArray, UserError
 from companion.values.extras import needs
 
@@ -30,20 +23,15 @@ FULL_GAIN: Final = BYPASSED | 127
 CLOCK_HZ: Final = 10_000_000
 
 
-class Chips:
+class Chips(Device):
     """ADAR1000 chips by SPI bus and device number, in the order of the table's chips."""
 
+    name = "an ADAR1000"
     takes = DeviceInput.REGISTERS
-    rejected = NO_REPLIES
-    lead_s = None
 
     def __init__(self, places: list[tuple[int, int]]) -> None:
         self._places = places
         self._lines: list[Any] = []
-
-    def check(self, safe: SafeState) -> None:
-        """Accept every safe state."""
-        require(safe, tuple(SafeState), "an ADAR1000")
 
     def open(self) -> None:
         """Open the SPI devices. Raises ``UserError`` without spidev."""

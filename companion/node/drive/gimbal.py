@@ -19,7 +19,7 @@ from typing import Final
 from companion.mavlink.wire.encode import Outgoing, pack
 from companion.mavlink.wire.framing import SplitLimits, Splitter, search_budget
 from companion.node.drive.lag import MountLag
-from companion.node.drive.loop import DeviceCommand, DeviceError, DeviceInput, SafeState, require
+from companion.node.drive.loop import Device, DeviceCommand, DeviceError, DeviceInput, SafeState
 from companion.values import Frame, Reason, Rejection, Source
 
 COMMAND_INT: Final = 75
@@ -36,10 +36,12 @@ RECEIVED_MAX: Final = 1000  # datagrams read in one update; more are a failure o
 UNIT_ERROR_MAX: Final = 0.1  # largest deviation of an attitude's quaternion from length 1
 
 
-class Gimbal:
+class Gimbal(Device):
     """Gimbal as a device; its boresight is north and level."""
 
+    name = "a gimbal"
     takes = DeviceInput.POINTING
+    safe_states = (SafeState.HOLD, SafeState.BORESIGHT)  # a gimbal does not radiate
 
     def __init__(
         self, *, host: str, port: int, target: Source, now_ns: Callable[[], int] = time.monotonic_ns
@@ -60,10 +62,6 @@ class Gimbal:
     def lead_s(self) -> float:
         """Lag estimated from the gimbal's attitude reports; 0 without reports."""
         return self._lag.lag_s
-
-    def check(self, safe: SafeState) -> None:
-        """Reject muting: a gimbal does not radiate."""
-        require(safe, (SafeState.HOLD, SafeState.BORESIGHT), "a gimbal")
 
     def open(self) -> None:
         """Open a UDP socket; the gimbal may be absent."""

@@ -9,10 +9,12 @@ Over 300 lines: the loop, and the interfaces of what it connects.
 
 import statistics
 import threading
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
+from types import MappingProxyType
 from typing import Final, Protocol
 
 import numpy as np
@@ -24,7 +26,6 @@ LEAD_UPDATES: Final = 51  # updates whose median time is the next lead
 RETRY_NS: Final = 1_000_000_000  # time between two attempts to open a device
 SLOW_NS: Final = 5_000_000_000  # duration of an update after which it is reported
 TEXT_MAX: Final = 200  # longest text that is reported, characters
-NO_REPLIES: Final[Mapping[str, int]] = {}  # rejected replies of a device that never rejects one
 LATE_SHARE: Final = 0.1
 """Fraction of the update interval by which an update may be late."""
 
@@ -80,28 +81,41 @@ class BeamSource(Protocol):
         """Return the device command for ``lead_s`` seconds from now. Raises ``SourceLostError``."""
 
 
-class Device(Protocol):
+class Device(ABC):
     """Device to which beams are applied. Every method may raise ``DeviceError``.
 
-    lead_s    lag that the device itself shows; None: only the time to apply counts
     rejected  replies that could not be used but were not needed, by reason
     """
 
+    name = "a device"  # in messages
     takes: DeviceInput  # required content of a command
+    safe_states: tuple[SafeState, ...] = tuple(SafeState)  # those that it supports
+    rejected: Mapping[str, int] = MappingProxyType({})
 
     @property
-    def rejected(self) -> Mapping[str, int]: ...
+    def lead_s(self) -> float | None:
+        """Lag that the device itself shows; None: only the time to apply counts."""
+        return None
 
-    @property
-    def lead_s(self) -> float | None: ...
     def check(self, safe: SafeState) -> None:
         """Raise ``UserError`` for a safe state that the device does not support."""
+        if safe not in self.safe_states:
+            choice = " or ".join(self.safe_states)
+            raise UserError(f"{self.name} does not support {safe}; choose {choice}")
 
-    def open(self) -> None: ...
-    def apply(self, command: DeviceCommand) -> None: ...
+    @abstractmethod
+    def open(self) -> None:
+        """Connect to the device."""
+
+    @abstractmethod
+    def apply(self, command: DeviceCommand) -> None:
+        """Apply a command."""
+
+    @abstractmethod
     def rest(self, safe: SafeState) -> None:
         """Put the device into a safe state."""
 
+    @abstractmethod
     def close(self) -> None:
         """Close the device; raises nothing."""
 
@@ -309,9 +323,3 @@ class Drive:
                 self._device.rest(self._safe)
             self._resting = why
             self._say(f"{self._safe}: {why}")
-
-
-def require(safe: SafeState, allowed: tuple[SafeState, ...], device: str) -> None:
-    """Raise ``UserError`` for a safe state that a device does not support."""
-    if safe not in allowed:
-        raise UserError(f"{device} does not support {safe}; choose {' or '.join(allowed)}")

@@ -12,37 +12,27 @@ import contextlib
 from collections.abc import Iterator
 from typing import Any, Final
 
-from companion.node.drive.loop import (
-    NO_REPLIES,
-    DeviceCommand,
-    DeviceError,
-    DeviceInput,
-    SafeState,
-    require,
-)
+from companion.node.drive.loop import Device, DeviceCommand, DeviceError, DeviceInput, SafeState
 from companion.values import IntArray, UserError
 from companion.values.extras import needs
 
 ELEMENTS: Final = 8
 DEGREES: Final = 360 / 128
 FULL_GAIN: Final = 127
+RESTING: Final = {SafeState.BORESIGHT: (0, FULL_GAIN, 0), SafeState.MUTE: (0, 0, 1)}
+"""Phase code, gain code and attenuator of every element in a safe state."""
 
 
-class Phaser:
+class Phaser(Device):
     """Phaser as a device, at a libiio URI."""
 
+    name = "a Phaser"
     takes = DeviceInput.REGISTERS
-    rejected = NO_REPLIES
-    lead_s = None
 
     def __init__(self, uri: str) -> None:
         self._uri = uri
         self._phaser: Any = None
         self._shown: dict[int, tuple[int, int, int]] = {}
-
-    def check(self, safe: SafeState) -> None:
-        """Accept every safe state."""
-        require(safe, tuple(SafeState), "a Phaser")
 
     def open(self) -> None:
         """Connect to the Phaser and switch to receive. Raises ``UserError`` without pyadi-iio."""
@@ -74,13 +64,8 @@ class Phaser:
 
     def rest(self, safe: SafeState) -> None:
         """Hold the state, point to boresight, or mute every element."""
-        match safe:
-            case SafeState.BORESIGHT:
-                self._set(dict.fromkeys(range(ELEMENTS), (0, FULL_GAIN, 0)))
-            case SafeState.MUTE:
-                self._set(dict.fromkeys(range(ELEMENTS), (0, 0, 1)))
-            case SafeState.HOLD:
-                pass
+        if safe is not SafeState.HOLD:
+            self._set(dict.fromkeys(range(ELEMENTS), RESTING[safe]))
 
     def close(self) -> None:
         """Release the connection to the Phaser."""

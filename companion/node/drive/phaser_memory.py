@@ -10,12 +10,12 @@ from collections.abc import Sequence
 from typing import Final
 
 from companion.node.drive.loop import DeviceCommand, DeviceInput, SafeState
-from companion.node.drive.phaser import DEGREES, ELEMENTS, FULL_GAIN, Phaser
+from companion.node.drive.phaser import DEGREES, ELEMENTS, RESTING, Phaser
 from companion.values import IntArray, UserError
 
 POSITIONS: Final = 121  # beams that an ADAR1000 stores for reception
-BORESIGHT: Final = POSITIONS - 2
-MUTE: Final = POSITIONS - 1
+BEAMS_MAX: Final = POSITIONS - 2  # the last positions are those of the safe states
+POSITION_OF: Final = {SafeState.BORESIGHT: POSITIONS - 2, SafeState.MUTE: POSITIONS - 1}
 
 
 class PhaserMemory(Phaser):
@@ -25,8 +25,8 @@ class PhaserMemory(Phaser):
 
     def __init__(self, uri: str, codebook: Sequence[IntArray]) -> None:
         super().__init__(uri)
-        if len(codebook) > BORESIGHT:
-            raise UserError(f"a Phaser stores {BORESIGHT} beams, the codebook has {len(codebook)}")
+        if len(codebook) > BEAMS_MAX:
+            raise UserError(f"a Phaser stores {BEAMS_MAX} beams, the codebook has {len(codebook)}")
         self._beams = [self.settings_of(registers) for registers in codebook]
         self._position: int | None = None
 
@@ -34,8 +34,8 @@ class PhaserMemory(Phaser):
         """Connect, store the codebook and switch the channels to the memory."""
         super().open()
         kept = dict(enumerate(self._beams))
-        kept[BORESIGHT] = dict.fromkeys(range(ELEMENTS), (0, FULL_GAIN, 0))
-        kept[MUTE] = dict.fromkeys(range(ELEMENTS), (0, 0, 1))
+        for safe, position in POSITION_OF.items():
+            kept[position] = dict.fromkeys(range(ELEMENTS), RESTING[safe])
         with self._access():
             for position, settings in kept.items():
                 for element, (phase, gain, attenuated) in settings.items():
@@ -53,7 +53,7 @@ class PhaserMemory(Phaser):
     def rest(self, safe: SafeState) -> None:
         """Hold the state, point to boresight, or mute every element."""
         if safe is not SafeState.HOLD:
-            self._use(BORESIGHT if safe is SafeState.BORESIGHT else MUTE)
+            self._use(POSITION_OF[safe])
 
     def _use(self, position: int) -> None:
         selected, self._position = self._position, None  # unknown after a failure

@@ -12,14 +12,7 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.node.drive.lag import MountLag
-from companion.node.drive.loop import (
-    NO_REPLIES,
-    DeviceCommand,
-    DeviceError,
-    DeviceInput,
-    SafeState,
-    require,
-)
+from companion.node.drive.loop import Device, DeviceCommand, DeviceError, DeviceInput, SafeState
 from companion.values import shown
 
 TIMEOUT_S: Final = 2.0  # for a whole answer
@@ -27,14 +20,15 @@ ANSWER_MAX_BYTES: Final = 65_536
 _NUMBER: Final = r"(-?\d{1,6}(?:\.\d{0,12})?)(?![\d.])"
 
 
-class Rotator:
+class Rotator(Device):
     """Rotator as a device, led by its own lag and kept within its limits.
 
     Its boresight is azimuth and elevation 0.
     """
 
+    name = "a rotator"
     takes = DeviceInput.POINTING
-    rejected = NO_REPLIES
+    safe_states = (SafeState.HOLD, SafeState.BORESIGHT)  # a rotator does not radiate
 
     def __init__(self, host: str, port: int, now_ns: Callable[[], int] = time.monotonic_ns) -> None:
         self._address = host, port
@@ -49,10 +43,6 @@ class Rotator:
     def lead_s(self) -> float:
         """Lag estimated from the rotator's reports; 0 before it has moved."""
         return self._lag.lag_s
-
-    def check(self, safe: SafeState) -> None:
-        """Reject muting: a rotator does not radiate."""
-        require(safe, (SafeState.HOLD, SafeState.BORESIGHT), "a rotator")
 
     def open(self) -> None:
         """Connect to rotctld, and read the rotator's limits."""

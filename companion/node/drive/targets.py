@@ -20,7 +20,7 @@ import re
 from collections.abc import Callable, Sequence
 from typing import Final
 
-from companion.node.drive.loop import NO_REPLIES, Device, DeviceCommand, DeviceInput, SafeState
+from companion.node.drive.loop import Device, DeviceCommand, DeviceInput, SafeState
 from companion.values import IntArray, Source, UserError
 from companion.values.errors import shown
 
@@ -83,18 +83,12 @@ def device(
     raise UserError(f"{shown(target)} is not a device; give one of {known}{meant}")
 
 
-class DryRun:
+class DryRun(Device):
     """Device of a dry run: accepts and prints every command."""
-
-    lead_s = None
-    rejected = NO_REPLIES
 
     def __init__(self, takes: DeviceInput, say: Callable[[str], None]) -> None:
         self.takes = takes
         self._say = say
-
-    def check(self, safe: SafeState) -> None:
-        """Accept every safe state."""
 
     def open(self) -> None:
         """Do nothing: there is no device."""

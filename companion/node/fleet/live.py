@@ -110,14 +110,7 @@ class LiveFleetNode:
                 await self._take_part()
                 has_taken_part = True
             except UserError as error:
-                self._notify(
-                    Notice(
-                        t_ns=self._now_ns(),
-                        severity=Severity.ERROR,
-                        subject="fleet",
-                        text=f"no fleet: {error}",
-                    )
-                )
+                self._report(Severity.ERROR, "fleet", f"no fleet: {error}")
                 if not has_taken_part:
                     return
                 await asyncio.sleep(RETRY_S)  # this node's former endpoints are free by then
@@ -160,7 +153,7 @@ class LiveFleetNode:
         unresponsive = self._unanswered.unresponsive(now_ns, heard_ns)
         if unresponsive:
             text = f"no answer from {', '.join(unresponsive)}; reconnecting to all nodes"
-            self._notify(Notice(t_ns=now_ns, severity=Severity.WARNING, subject="fleet", text=text))
+            self._report(Severity.WARNING, "fleet", text)
         return bool(unresponsive)
 
     async def _repeat(self, period_s: float, what: Callable[[int], None]) -> None:
@@ -178,7 +171,7 @@ class LiveFleetNode:
     def _declare(self, bus: Bus) -> None:
         base = f"{PREFIX}/{self.settings.site}"
         bus.serve(self._key("time"), self._time)
-        bus.serve(self._key("schema"), lambda key, payload: schemas.SHARED.descriptor_set)
+        bus.serve(self._key("schema"), lambda key, payload: schemas.schema("Shared").descriptor_set)
         bus.subscribe(f"{base}/*/standing", self._valid_only(self._stands))
         heard, offered = self._valid_only(self._shared), self._valid_only(self._offered)
         self._listening = Listening(bus=bus, base=base, heard=heard, offered=offered)
@@ -265,7 +258,7 @@ class LiveFleetNode:
             and self._bus is not None
             and self._bus.is_wanted(self._key("tracks"), PRIORITY)
         ):
-            said = schemas.TracksMessage(
+            said = schemas.message_class("Tracks")(
                 track=[
                     schemas.message("Track", fields.RecordedTrack(one, update.t_ns))
                     for one in update.tracks
@@ -363,14 +356,7 @@ class LiveFleetNode:
             return
         self._unanswered.alive.add(node)
         if is_new:
-            self._notify(
-                Notice(
-                    t_ns=self._now_ns(),
-                    severity=Severity.INFO,
-                    subject=f"node {node}",
-                    text=f"node {node} connected",
-                )
-            )
+            self._report(Severity.INFO, f"node {node}", f"node {node} connected")
 
     def _notify_malformed(self, node: str, why: str) -> None:
         """Report a node's first malformed message."""
@@ -382,18 +368,17 @@ class LiveFleetNode:
         if subject in self._warned or len(self._warned) > NODES_MAX:
             return
         self._warned.add(subject)
-        self._notify(
-            Notice(t_ns=self._now_ns(), severity=Severity.WARNING, subject=subject, text=text)
-        )
+        self._report(Severity.WARNING, subject, text)
 
     def _notify_duplicate(self) -> None:
         if self._has_duplicate:
             return
         self._has_duplicate = True
         text = f"another node is also named {self.name}; set a unique `[fleet] node` on each"
-        self._notify(
-            Notice(t_ns=self._now_ns(), severity=Severity.ERROR, subject="fleet", text=text)
-        )
+        self._report(Severity.ERROR, "fleet", text)
+
+    def _report(self, severity: Severity, subject: str, text: str) -> None:
+        self._notify(Notice(t_ns=self._now_ns(), severity=severity, subject=subject, text=text))
 
     def _notify_all(self, notices: list[Notice]) -> None:
         for notice in notices:

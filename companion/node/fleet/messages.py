@@ -34,7 +34,7 @@ class FleetMessageError(ValueError):
 
 def shared(said: Shared) -> bytes:
     """Encode recently received frames. Frames have nanoseconds since the first one."""
-    message = schemas.SharedMessage()
+    message = schemas.message_class("Shared")()
     first_ns = min((frame.heard_ns for frame in said.frames), default=0)
     message.first_ns, message.told_ns = first_ns, said.told_ns
     for frame in said.frames:
@@ -46,7 +46,7 @@ def shared(said: Shared) -> bytes:
 
 def to_shared(data: bytes) -> Shared:
     """Decode another node's frames. Raises ``FleetMessageError``."""
-    message = _parsed(schemas.SharedMessage, data, "message of frames")
+    message = _parsed(schemas.message_class("Shared"), data, "message of frames")
     if len(message.frame) > FRAMES_MAX or len(message.trip) > FRAMES_MAX:
         raise FleetMessageError("too many frames in one message")
     first_ns = message.first_ns
@@ -59,7 +59,7 @@ def to_shared(data: bytes) -> Shared:
 
 def standing(said: Standing) -> bytes:
     """Encode a node's status message (``Standing``)."""
-    message = schemas.StandingMessage(
+    message = schemas.message_class("Standing")(
         node=said.node, place=said.place or (), reach_m=said.reach_m, most=said.most
     )
     for uav, worth_db in said.serves:
@@ -72,7 +72,7 @@ def standing(said: Standing) -> bytes:
 
 def to_standing(data: bytes, node: str) -> Standing:
     """Decode a node's ``Standing``, received under its own key. Raises ``FleetMessageError``."""
-    message = _parsed(schemas.StandingMessage, data, "standing")
+    message = _parsed(schemas.message_class("Standing"), data, "standing")
     if message.node != node:
         raise FleetMessageError(f"name in the message differs: {shown(message.node)}")
     if len(message.serves) > OFFERS_MAX or len(message.handing) > OFFERS_MAX:
@@ -94,7 +94,7 @@ def to_standing(data: bytes, node: str) -> Standing:
 
 def offers(said: dict[str, Offer]) -> bytes:
     """Encode all offers of a node to UAVs."""
-    message = schemas.OffersMessage()
+    message = schemas.message_class("Offers")()
     message.offer.extend(schemas.message("Offer", one) for one in said.values())
     found: bytes = message.SerializeToString()
     return found
@@ -102,7 +102,7 @@ def offers(said: dict[str, Offer]) -> bytes:
 
 def to_offers(data: bytes) -> tuple[Offer, ...]:
     """Decode another node's offers. Raises ``FleetMessageError``."""
-    message = _parsed(schemas.OffersMessage, data, "message of offers")
+    message = _parsed(schemas.message_class("Offers"), data, "message of offers")
     if len(message.offer) > OFFERS_MAX:
         raise FleetMessageError("too many offers in one message")
     limits = {"sure_db": DB_MAX, "likely_db": DB_MAX, "sinr_db": DB_MAX, "heard_s": NUMBER_MAX}

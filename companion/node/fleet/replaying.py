@@ -5,18 +5,18 @@ replayed by itself. The assignment of UAVs to nodes is compared on the nodes' ow
 """
 
 from bisect import bisect_right
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
 from companion.node import replay as replaying
+from companion.node.replay import Progress
 from companion.recording.reader import LogError, digest_of, read_settings
 from companion.settings.model import sections
 from companion.settings.section import ConfigError
 from companion.values import Duty, Frame
 
-PROGRESS_EVERY: Final = 20_000  # frames between two calls of progress
 SAMPLE_NS: Final = 100_000_000  # sampling interval of the assignment
 
 
@@ -40,9 +40,7 @@ class NodeRun:
         return self.duties[past - 1].serves if past else ()
 
 
-def replay(
-    logs: Sequence[Path], progress: Callable[[int, float, float], None] | None = None
-) -> dict[str, Any]:
+def replay(logs: Sequence[Path], progress: Progress | None = None) -> dict[str, Any]:
     """Replay each node's recording; return the summary of ``companion replay --fleet --json``.
 
     Several recordings of a node are the parts of one run. ``progress`` is as for
@@ -93,20 +91,15 @@ def _one_run(name: str, logs: list[Path]) -> list[Path]:
     return ordered
 
 
-def _run(
-    name: str, logs: list[Path], progress: Callable[[int, float, float], None] | None
-) -> NodeRun:
+def _run(name: str, logs: list[Path], progress: Progress | None) -> NodeRun:
     settings = replaying.settings_for(logs, None, None)
     found = NodeRun(node=name, logs=logs, recorded=digest_of(logs[-1]))
     run = replaying.Run(settings, None)
-    for event in replaying.log_events(logs, settings):
-        run.step(event)
+    for event, _ in run.steps(replaying.log_events(logs, settings), progress):
         if isinstance(event, Duty):
             found.duties.append(event)
         elif isinstance(event, Frame):
             found.told += event.link.startswith("fleet:")
-            if progress and run.pipeline.frames % PROGRESS_EVERY == 0:
-                progress(run.pipeline.frames, run.at_s, run.took_s)
     found.digest = run.pipeline.digest.hexdigest()
     found.frames = run.pipeline.frames
     found.first_ns, found.last_ns = run.tally.first_ns or 0, run.tally.last_ns

@@ -9,7 +9,8 @@ from typing import Final
 
 import numpy as np
 
-from companion.recording.foreign.dataflash import Bytes, DataflashTable, table, walk
+from companion.recording.foreign.columns import Bytes
+from companion.recording.foreign.dataflash import DataflashTable, table, walk
 from companion.recording.foreign.onboard import (
     NEAR_US,
     Attitudes,

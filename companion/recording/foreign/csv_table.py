@@ -22,7 +22,7 @@ from typing import Any, Final
 
 import numpy as np
 
-from companion.recording.foreign.dataflash import Bytes
+from companion.recording.foreign.columns import Bytes
 from companion.recording.foreign.gps_time import FIRST_UNIX_US, LAST_UNIX_US, GpsTime
 from companion.recording.foreign.onboard import (
     Attitudes,

@@ -17,6 +17,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.recording.foreign.columns import Bytes, Columns
 from companion.recording.foreign.thinned import Thinned
 from companion.values import IntArray
 
@@ -37,7 +38,6 @@ _HUNDREDTHS: Final = frozenset("cCeE")
 _NAME: Final = re.compile(rb"[A-Z0-9_]{1,4}\0*\Z")
 _formats = re.compile(re.escape(MAGIC + bytes([FORMAT]))).finditer
 
-Bytes = NDArray[np.uint8]
 Column = NDArray[np.generic]
 
 
@@ -68,30 +68,16 @@ class DataflashIndex(NamedTuple):
     rest: int
 
 
-class DataflashTable:
+class DataflashTable(Columns):
     """Messages of one type in a DataFlash log, as columns; empty if the log has none."""
 
     def __init__(self, data: Bytes, layout: Format | None, at: IntArray) -> None:
+        super().__init__(data, None if layout is None else layout.fields, at + _HEAD)
         self._layout = layout
-        self._at = at
-        if layout is None or not len(at):
-            self._records: NDArray[np.void] = np.zeros(0, dtype=[])
-            return
-        # A view with a record at every byte of the file, from which the actual ones are taken.
-        room = data.size - _HEAD - layout.fields.itemsize + 1
-        everywhere = np.ndarray((room,), layout.fields, data, _HEAD, (1,))
-        self._records = everywhere[at]
-
-    def __len__(self) -> int:
-        return len(self._records)
-
-    def __contains__(self, column: object) -> bool:
-        return self._records.dtype.names is not None and column in self._records.dtype.names
 
     def raw(self, column: str) -> Column:
         """Return a column with the values as in the file, (N,)."""
-        found: Column = self._records[column]
-        return found
+        return self._records[column]
 
     def numbers(self, column: str) -> NDArray[np.float64]:
         """Return a column as numbers, (N,), in the units of the log; NaN if missing."""
@@ -100,23 +86,6 @@ class DataflashTable:
         assert self._layout is not None
         values = self._records[column].astype(np.float64)
         return values / 100.0 if column in self._layout.hundredths else values
-
-    def integers(self, column: str) -> IntArray | None:
-        """Return a column of integers, (N,); None if missing."""
-        if column not in self or self._records[column].dtype.kind not in "iu":
-            return None
-        values = self._records[column]
-        if values.dtype == np.uint64:  # impossible times become 0
-            values = np.where(values < np.uint64(1 << 62), values, np.uint64(0)).astype(np.int64)
-        found: IntArray = values.astype(np.int64)
-        return found
-
-    def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "DataflashTable":
-        """Return the table with only some of its messages."""
-        picked = DataflashTable.__new__(DataflashTable)
-        picked._layout, picked._at = self._layout, self._at[chosen]
-        picked._records = self._records[chosen]
-        return picked
 
 
 def walk(data: Bytes, wanted: Collection[str]) -> DataflashIndex:

@@ -66,10 +66,7 @@ class Fixes:
     def velocity_mps(self) -> FloatArray:
         """Velocities over ground (N, 2), north and east."""
         course = np.radians(self.course_deg)
-        velocity: FloatArray = (
-            np.stack([np.cos(course), np.sin(course)], axis=1) * self.speed_mps[:, None]
-        )
-        return velocity
+        return np.stack([np.cos(course), np.sin(course)], axis=1) * self.speed_mps[:, None]
 
     def fixed(self) -> "Fixes | None":
         """Return the fixes that have a position; None without any."""
@@ -160,8 +157,7 @@ def on_earth(lat_1e7: IntArray, lon_1e7: IntArray, *others: FloatArray) -> BoolA
 
 def sound_rows(values: FloatArray, most: float) -> BoolArray:
     """Return a mask of the rows (N, K) whose numbers are all finite and smaller than ``most``."""
-    sound: BoolArray = np.array((np.abs(values) < most).all(axis=1))  # false for NaN
-    return sound
+    return np.array((np.abs(values) < most).all(axis=1))  # false for NaN
 
 
 def vectors_between(

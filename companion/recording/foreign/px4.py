@@ -10,7 +10,7 @@ from typing import Final
 import numpy as np
 
 from companion.recording.foreign import gps_time, ulog
-from companion.recording.foreign.dataflash import Bytes
+from companion.recording.foreign.columns import Bytes
 from companion.recording.foreign.gps_time import GpsTime
 from companion.recording.foreign.onboard import (
     NEAR_US,

@@ -117,8 +117,7 @@ def _in_order(kinds: list[_Said]) -> tuple[IntArray, IntArray]:
 
 
 def _lives(boot_us: IntArray) -> IntArray:
-    found: IntArray = np.cumsum(np.diff(boot_us, prepend=boot_us[:1]) < 0)
-    return found
+    return np.cumsum(np.diff(boot_us, prepend=boot_us[:1]) < 0)
 
 
 def _kinds(log: Onboard) -> list[_Said]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from companion.recording.errors import LogError
 from companion.recording.foreign import ardupilot, csv_table, px4, said
-from companion.recording.foreign.dataflash import Bytes
+from companion.recording.foreign.columns import Bytes
 from companion.recording.foreign.gps_time import RECEIVER_LAG_S
 from companion.recording.foreign.onboard import Onboard
 from companion.recording.stamps import LARGEST_LEAP_NS

@@ -13,11 +13,10 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from companion.recording.foreign.dataflash import Bytes
+from companion.recording.foreign.columns import Bytes, Columns
 from companion.recording.foreign.thinned import Thinned
-from companion.values import FloatArray, IntArray
+from companion.values import FloatArray
 
 MAGIC: Final = b"ULog\x01\x12\x35"
 _HEADER: Final = 16
@@ -70,21 +69,12 @@ class UlogIndex:
     unknown: bool = False  # whether the file has unknown incompatibility flags
 
 
-class UlogTable:
+class UlogTable(Columns):
     """Samples of a ULog topic, as columns; empty if the log has none."""
 
     def __init__(self, data: Bytes, topic: UlogTopic | None) -> None:
-        self._records: NDArray[np.void] = np.zeros(0, dtype=[])
-        if topic is not None and len(topic.at):
-            room = data.size - topic.fields.itemsize + 1
-            everywhere = np.ndarray((room,), topic.fields, data, 0, (1,))
-            self._records = everywhere[np.frombuffer(topic.at, dtype=np.int64)]
-
-    def __len__(self) -> int:
-        return len(self._records)
-
-    def __contains__(self, column: object) -> bool:
-        return self._records.dtype.names is not None and column in self._records.dtype.names
+        at = np.array([] if topic is None else topic.at, dtype=np.int64)
+        super().__init__(data, None if topic is None else topic.fields, at)
 
     def numbers(self, column: str, width: int = 1) -> FloatArray:
         """Return a column as numbers: (N,), or (N, ``width``) for an array; NaN if missing."""
@@ -94,26 +84,7 @@ class UlogTable:
         values = self._records[column]
         if values.dtype.kind not in "iuf" or values.shape != shape:
             return np.full(shape, np.nan)
-        found: FloatArray = values.astype(np.float64)
-        return found
-
-    def integers(self, column: str) -> IntArray | None:
-        """Return a column of integers, (N,); None if missing. Impossible times become 0."""
-        if column not in self:
-            return None
-        values = self._records[column]
-        if values.dtype.kind not in "iu" or values.ndim != 1:
-            return None
-        if values.dtype == np.uint64:
-            values = np.where(values < np.uint64(1 << 62), values, np.uint64(0))
-        found: IntArray = values.astype(np.int64)
-        return found
-
-    def rows(self, chosen: IntArray | NDArray[np.bool_]) -> "UlogTable":
-        """Return the table with only some of its samples."""
-        picked = UlogTable.__new__(UlogTable)
-        picked._records = self._records[chosen]
-        return picked
+        return values.astype(np.float64)
 
 
 def table(data: Bytes, walked: UlogIndex, *names: str) -> UlogTable:

@@ -6,20 +6,17 @@ bound, and, if the log has the simulator's truth, the true gain. The beams of th
 compared with those of ``[beams] widen = false`` for the same tracks, which shows the cost and the
 benefit of widening. With a codebook (that of the settings, else a DFT's if the elements are on a
 grid) it also computes the share that must be swept to include the best stored beam.
-
-Over 300 lines: one study: its settings, its samples, its answer.
 """
 
 import math
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, fields, replace
-from itertools import chain
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
-from companion.beams.aim import aim, directions
+from companion.beams.aim import directions
 from companion.beams.hardware import codebooks
 from companion.beams.hardware.codebooks import Codebook
 from companion.beams.worth import link_budget
@@ -29,8 +26,8 @@ from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.studies.beams import modes
-from companion.studies.beams.worth import Row, Sample, Worth, given, summed_up
-from companion.studies.origin import command_line, versions
+from companion.studies.beams.worth import Sample, Worth, aimed, given, summed_up
+from companion.studies.origin import Progress, Row, StudiedLogs, silent, versions
 from companion.studies.prediction.radio_link import LINKS
 from companion.studies.truth import array_truth
 from companion.studies.truth.array_truth import ArrayTruth
@@ -41,7 +38,7 @@ PROGRESS_EVERY: Final = 20  # looks between two progress messages
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class BeamStudy:
+class BeamStudy(StudiedLogs):
     """Parameters of the beam study.
 
         links     names of the links over which widths and predictors are compared; may be empty
@@ -49,11 +46,7 @@ class BeamStudy:
     Raises ``UserError`` for a rate out of range.
     """
 
-    flights: tuple[tuple[Path, ...], ...]  # the logs, by flight
-    settings: tuple[Settings, ...]  # those of each flight
     hz: float = 5.0  # looks per second of log
-    center: str | None = None  # as on the command line
-    config: str | None = None  # as on the command line
     links: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
@@ -62,13 +55,6 @@ class BeamStudy:
             raise UserError(f"--links {','.join(self.links)}: give some of {', '.join(known)}")
         if not 0 < self.hz <= 1000:
             raise UserError(f"--hz {self.hz:g}: give looks per second, above 0 and at most 1000")
-
-    @property
-    def command(self) -> str:
-        """Command line that runs the study."""
-        logs = chain.from_iterable(self.flights)
-        given = {"center": self.center, "config": self.config, "links": self.links, "hz": self.hz}
-        return command_line("beams", *logs, **given)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -175,15 +161,7 @@ def look(seen: Sight, update: Update, truth: ArrayTruth | None, t_s: float) -> l
     as_set = update.beams
     sharp = as_set
     if pipeline.precoder.widen is not Widen.NO:
-        sharp = aim(
-            update.t_ns,
-            valid_at_ns=as_set.valid_at_ns,
-            tracks=update.tracks,
-            carrier=carrier,
-            array=pipeline.array,
-            precoder=replace(pipeline.precoder, widen=Widen.NO),
-            coverage=pipeline.coverage,
-        )
+        sharp = aimed(pipeline, update, Widen.NO)
     worths = [seen.worths(beam_set, carrier, truly) for beam_set in (as_set, sharp)]
     beams = {
         beam.uav: (beam.pointing_bound_rad, towards)
@@ -244,10 +222,7 @@ def updates(logs: Sequence[Path], pipeline: Pipeline, hz: float) -> Iterator[tup
 
 
 def watch(
-    logs: Sequence[Path],
-    settings: Settings,
-    hz: float,
-    progress: Callable[[str], None] = lambda _text: None,
+    logs: Sequence[Path], settings: Settings, hz: float, progress: Progress = silent
 ) -> StudiedFlight:
     """Study the logs of one flight through the pipeline.
 
@@ -281,16 +256,13 @@ def watch(
 
 
 def study(
-    setting: BeamStudy, progress: Callable[[str], None] = lambda _text: None
+    setting: BeamStudy, progress: Progress = silent
 ) -> tuple[dict[str, Any], list[StudiedFlight]]:
     """Return the answer as written to ``beams.json``, and the data of the report.
 
     Raises ``UserError``, ``LogError`` or ``ConfigError`` for a log without any beam.
     """
-    found = [
-        watch(logs, settings, setting.hz, progress)
-        for logs, settings in zip(setting.flights, setting.settings, strict=True)
-    ]
+    found = [watch(logs, settings, setting.hz, progress) for logs, settings in setting.by_flight()]
     rows: list[Row] = [
         {"log": watched.log, "uav": uav, **summed_up(samples), "truth": watched.truth}
         for watched in found
@@ -298,7 +270,7 @@ def study(
     ]
     modes_found = [
         row
-        for logs, settings in zip(setting.flights, setting.settings, strict=True)
+        for logs, settings in setting.by_flight()
         for link in LINKS
         if link.name in setting.links
         for row in modes.compare(logs, settings, link, progress)
@@ -311,7 +283,7 @@ def study(
             {field.name: getattr(watched, field.name) for field in fields(StudiedFlight)[:-1]}
             for watched in found  # without its samples
         ],
-        "command": setting.command,
+        "command": setting.command_line("beams", links=setting.links, hz=setting.hz),
         "versions": versions(),
         "hz": setting.hz,
     }, found

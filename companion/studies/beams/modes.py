@@ -16,7 +16,7 @@ from typing import Any, Final
 import numpy as np
 
 from companion.beams import hysteresis
-from companion.beams.aim import aim, directions
+from companion.beams.aim import directions
 from companion.beams.array.steering import steering_matrix
 from companion.beams.hysteresis import Hysteresis
 from companion.beams.worth import link_budget
@@ -26,8 +26,9 @@ from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.recording.reader import read_flight
 from companion.settings.model import Settings
-from companion.studies.beams.worth import Row, given, mean, percentile, share
+from companion.studies.beams.worth import aimed, cell, given, mean, percentile, share
 from companion.studies.figures.text_tables import text_table
+from companion.studies.origin import Progress, Row, silent
 from companion.studies.prediction.baselines import ObservedReport, Predictor
 from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.kalman import Kalman
@@ -149,10 +150,7 @@ class _OtherPredictor:
 
 
 def compare(
-    logs: Sequence[Path],
-    settings: Settings,
-    link: RadioLink,
-    progress: Callable[[str], None] = lambda _text: None,
+    logs: Sequence[Path], settings: Settings, link: RadioLink, progress: Progress = silent
 ) -> list[Row]:
     """Return a row for each width and predictor, over one link."""
     pipeline = Pipeline(settings)
@@ -196,16 +194,7 @@ def _make(
 ) -> None:
     """Compute the beams of one beam width or predictor, and record their performance."""
     assert update.carrier is not None
-    made = aim(
-        update.t_ns,
-        valid_at_ns=update.beams.valid_at_ns,
-        tracks=tracks,
-        carrier=update.carrier,
-        array=pipeline.array,
-        precoder=replace(pipeline.precoder, widen=way.widen),
-        coverage=pipeline.coverage,
-        before=way.state,
-    )
+    made = aimed(pipeline, update, way.widen, tracks=tracks, before=way.state)
     way.state = hysteresis.updated(way.state, made)
     steering = steering_matrix(pipeline.array, directions(made))
     shapes = made.weights * steering
@@ -255,16 +244,7 @@ COLUMNS: Final = (
 
 def cells(row: Row) -> list[str]:
     """Format a row of the table of beam widths and predictors."""
-    found = []
-    for _, key in COLUMNS:
-        value = row[key]
-        if value is None:
-            found.append("-")
-        elif isinstance(value, float):
-            found.append(f"{value:.1%}" if key.endswith("share") else f"{value:.2f}")
-        else:
-            found.append(str(value))
-    return found
+    return [cell(key, row[key]) for _, key in COLUMNS]
 
 
 def text(rows: Sequence[Row]) -> str:

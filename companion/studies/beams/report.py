@@ -1,14 +1,15 @@
 """Reports of the beam study: a table as text, one self-contained HTML page, and figures."""
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, Final
 
 from companion.studies.beams import modes
 from companion.studies.beams.charts import charts
 from companion.studies.beams.flight import StudiedFlight
-from companion.studies.beams.worth import SHARP, Row, summed_up
+from companion.studies.beams.worth import SHARP, cell, summed_up
 from companion.studies.figures import plotting
 from companion.studies.figures.text_tables import text_table
+from companion.studies.origin import Progress, Row, by_log
 
 COMPARED: Final = (
     ("predicted gain, dB: 5 % / median", ("gain_p5_db", "gain_median_db")),
@@ -54,7 +55,7 @@ _CAPTIONS: Final = {
 
 
 def files(
-    answer: dict[str, Any], found: Sequence[StudiedFlight], progress: Callable[[str], None]
+    answer: dict[str, Any], found: Sequence[StudiedFlight], progress: Progress
 ) -> dict[str, bytes]:
     """Return the page and every figure as SVG and PNG, by file name.
 
@@ -78,12 +79,10 @@ def files(
 def text(found: Sequence[StudiedFlight], compared: Sequence[Row] = ()) -> str:
     """Return the tables of the study as text, all UAVs of a log together."""
     parts = [_text(watched) for watched in found]
-    for log in dict.fromkeys(row["log"] for row in compared):
-        of_this_log = [row for row in compared if row["log"] == log]
-        parts.append(
-            f"{log}, three widths and three other predictors, gains in dB:\n"
-            f"{modes.text(of_this_log)}"
-        )
+    parts += [
+        f"{log}, three widths and three other predictors, gains in dB:\n{modes.text(rows)}"
+        for log, rows in by_log(compared).items()
+    ]
     return "\n\n".join(parts)
 
 
@@ -108,7 +107,7 @@ def _section(watched: StudiedFlight, figures: Iterable[str]) -> dict[str, Any]:
         "figures": list(figures),
         "uavs": ["", *by_uav],
         "by_uav": [
-            [key, *(_cell(key, found[key]) for found in by_uav.values())]
+            [key, *(cell(key, found[key]) for found in by_uav.values())]
             for key in next(iter(by_uav.values()))
         ],
     }
@@ -125,12 +124,4 @@ def _describe(watched: StudiedFlight) -> str:
 
 
 def _cells(row: Row, keys: Sequence[str], prefix: str) -> str:
-    return " / ".join(_cell(key, row[prefix + key]) for key in keys)
-
-
-def _cell(key: str, value: float | None) -> str:
-    if value is None:
-        return "-"
-    if "share" in key:
-        return f"{value:.1%}"
-    return str(value) if isinstance(value, int) else f"{value:.2f}"
+    return " / ".join(cell(key, row[prefix + key]) for key in keys)

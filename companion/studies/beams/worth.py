@@ -2,18 +2,18 @@
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Final
 
 import numpy as np
 
-from companion.beams.aim import directions
+from companion.beams.aim import aim, directions
 from companion.beams.array.steering import steering_matrix
 from companion.beams.worth import guarantee
 from companion.pipeline.fold import Pipeline
-from companion.values import BeamSet, FloatArray, Method
+from companion.studies.origin import Row
+from companion.values import BeamSet, FloatArray, Method, Update, Widen
 
-Row = dict[str, Any]
 ROUNDING_DB: Final = 1e-9  # rounding tolerance between true and guaranteed gain
 SHARP: Final = "sharp_"
 """Prefix of keys for beams with ``[beams] widen = false``; other keys are for beams as set."""
@@ -87,9 +87,9 @@ def summed_up(samples: Sequence[Sample]) -> Row:
     return {
         "without_beam": len(samples) - len(served),
         "n_true": len(known),
-        "pointing_bound_median_deg": _degrees(percentile(bounds, 50)),
-        "pointing_bound_p95_deg": _degrees(percentile(bounds, 95)),
-        "pointing_error_p95_deg": _degrees(percentile([_or(s.off_rad, 0) for s in known], 95)),
+        "pointing_bound_median_deg": degrees(percentile(bounds, 50)),
+        "pointing_bound_p95_deg": degrees(percentile(bounds, 95)),
+        "pointing_error_p95_deg": degrees(percentile([_or(s.off_rad, 0) for s in known], 95)),
         "bound_violations": sum(sample.beyond for sample in known) if known else None,
         "sweep_share_mean": float(np.mean(shares)) if shares else None,
         "sweep_share_p95": percentile(shares, 95),
@@ -152,6 +152,19 @@ def given(
     return guaranteed, true_gains
 
 
+def aimed(pipeline: Pipeline, update: Update, widen: Widen, **given: Any) -> BeamSet:
+    """Return the beams of an update in another width; ``given`` as for ``aim``."""
+    return aim(
+        update.t_ns,
+        valid_at_ns=update.beams.valid_at_ns,
+        carrier=update.carrier,
+        array=pipeline.array,
+        precoder=replace(pipeline.precoder, widen=widen),
+        coverage=pipeline.coverage,
+        **{"tracks": update.tracks, **given},
+    )
+
+
 def percentile(values: Sequence[float], percent: float) -> float | None:
     """Return the least of some values that is not below ``percent`` of all of them.
 
@@ -173,8 +186,16 @@ def share(marks: Iterable[bool]) -> float | None:
     return mean([float(mark) for mark in marks])
 
 
-def _degrees(angle_rad: float | None) -> float | None:
+def degrees(angle_rad: float | None) -> float | None:
+    """Convert radians to degrees; None stays None."""
     return None if angle_rad is None else math.degrees(angle_rad)
+
+
+def cell(key: str, value: float | str | None) -> str:
+    """Format a figure for a table: shares in per cent, a dash for None."""
+    if isinstance(value, float):
+        return f"{value:.1%}" if "share" in key else f"{value:.2f}"
+    return "-" if value is None else str(value)
 
 
 def _or(value: float | None, otherwise: float) -> float:

@@ -3,19 +3,20 @@
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
-from companion.beams.aim import SeenDirection, aim, directions
+from companion.beams.aim import SeenDirection, directions
 from companion.beams.array import steering
 from companion.beams.array.geometry import Array
 from companion.node.replay import log_events
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
-from companion.studies.beams.worth import given, percentile
+from companion.studies.beams.worth import aimed, degrees, given, percentile
 from companion.studies.compass.kalman import POSITION_SHARE, ErrorFilter
 from companion.studies.compass.receiver import ArrayReceiver, observations
+from companion.studies.origin import Row
 from companion.studies.prediction.delivery import known_round_trips
 from companion.studies.truth import array_truth, vehicles
 from companion.studies.truth.array_truth import ArrayTruth
@@ -23,6 +24,7 @@ from companion.tracking.rotations import rotation
 from companion.values import (
     BeamSet,
     Cap,
+    Carrier,
     Event,
     FloatArray,
     Observation,
@@ -44,8 +46,6 @@ METHODS: Final = (NONE, ARRAY, KALMAN, ORACLE)
 WARM_UP_S: Final = 40.0  # part of the log before the first measurement that is replayed
 LOOK_HZ: Final = 5.0  # looks a second, at random times
 UPDATE_NS: Final = 100_000_000  # period of ticks
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -81,9 +81,9 @@ class _Score:
         """Return the figures for a table."""
         return {
             "n": len(self.errors_rad),
-            "pointing_bound_median_deg": _degrees(percentile(self.bounds_rad, 50)),
-            "pointing_error_p95_deg": _degrees(percentile(self.errors_rad, 95)),
-            "pointing_error_max_deg": _degrees(max(self.errors_rad, default=None)),
+            "pointing_bound_median_deg": degrees(percentile(self.bounds_rad, 50)),
+            "pointing_error_p95_deg": degrees(percentile(self.errors_rad, 95)),
+            "pointing_error_max_deg": degrees(max(self.errors_rad, default=None)),
             "beyond": self.missed,
             "beyond_share": self.missed / len(self.errors_rad) if self.errors_rad else None,
             "guaranteed_gain_median_db": percentile(self.guaranteed_db, 50),
@@ -143,8 +143,7 @@ def run(case: Case) -> list[Row]:
             _add(scores[NONE], without, plain.beams, truly)
             _add(scores[ARRAY], with_array, found.beams, truly)
             _add_rival(scores[KALMAN], without, plain, truly, rival)
-            ideal = _aimed(without, plain, truly, Widen.NO)
-            _add(scores[ORACLE], without, ideal, truly)
+            _add(scores[ORACLE], without, _aimed(without, plain, truly), truly)
         if isinstance(event, Observation):
             _filter(rival, without, event, case.receiver)
         else:
@@ -161,7 +160,7 @@ def run(case: Case) -> list[Row]:
         if row["method"] in (KALMAN, ORACLE):  # they state no bound
             row["pointing_bound_median_deg"] = row["guaranteed_gain_median_db"] = None
     of_array = rows[METHODS.index(ARRAY)]
-    of_array["attitude_bound_median_deg"] = _degrees(percentile(attitude_rad, 50))
+    of_array["attitude_bound_median_deg"] = degrees(percentile(attitude_rad, 50))
     of_array["refuted"] = with_array.observing.compass.refuted
     return rows
 
@@ -242,20 +241,19 @@ def _add_rival(
     for track in plain.tracks:
         if track.uav not in truly:
             continue
-        reported, position_rad = _reported(track, plain)
+        reported, position_rad = _reported(track, plain.carrier)
         expected[track.uav] = array_from_local @ rival.direction(reported)
         there = array_from_local.T @ truly[track.uav]
         before += not rival.contains(reported, there, position_rad * POSITION_SHARE)
-    _add(score, pipeline, _aimed(pipeline, plain, expected, Widen.NO), truly)
+    _add(score, pipeline, _aimed(pipeline, plain, expected), truly)
     score.missed = before
 
 
-def _reported(track: Track, update: Update) -> tuple[FloatArray, float]:
+def _reported(track: Track, carrier: Carrier) -> tuple[FloatArray, float]:
     """Return a UAV's reported direction, local frame, and the bound that positions give it."""
-    assert update.carrier is not None
-    offset_m = track.position_ned_m - update.carrier.position_ned_m
+    offset_m = track.position_ned_m - carrier.position_ned_m
     range_m = math.sqrt(offset_m @ offset_m)
-    return offset_m / range_m, (track.bound_m + update.carrier.bound_m) / range_m
+    return offset_m / range_m, (track.bound_m + carrier.bound_m) / range_m
 
 
 def _filter(
@@ -270,31 +268,13 @@ def _filter(
     (seen,) = steering.unit_directions(
         np.array([event.azimuth_rad]), np.array([event.elevation_rad])
     )
-    offset_m = tracks[0].position_ned_m - carrier.position_ned_m
-    range_m = math.sqrt(offset_m @ offset_m)
-    position_rad = (tracks[0].bound_m + carrier.bound_m) / range_m * POSITION_SHARE
-    deviation = math.hypot(math.radians(receiver.bound_deg) / 2.0, position_rad)
+    reported, position_rad = _reported(tracks[0], carrier)
+    deviation = math.hypot(math.radians(receiver.bound_deg) / 2.0, position_rad * POSITION_SHARE)
     local_from_array = (pipeline.array.array_from_body @ carrier.body_from_local).T
-    rival.add(event.measured_ns, offset_m / range_m, local_from_array @ seen, deviation)
+    rival.add(event.measured_ns, reported, local_from_array @ seen, deviation)
 
 
-def _aimed(
-    pipeline: Pipeline, update: Update, towards: dict[str, FloatArray], widen: Widen
-) -> BeamSet:
-    """Return the beams of an update aimed at given directions."""
-    return aim(
-        update.t_ns,
-        valid_at_ns=update.beams.valid_at_ns,
-        tracks=update.tracks,
-        carrier=update.carrier,
-        array=pipeline.array,
-        precoder=replace(pipeline.precoder, widen=widen),
-        coverage=pipeline.coverage,
-        seen_directions={
-            uav: SeenDirection(Cap(found, 1e-6), is_alone=True) for uav, found in towards.items()
-        },
-    )
-
-
-def _degrees(angle_rad: float | None) -> float | None:
-    return None if angle_rad is None else math.degrees(angle_rad)
+def _aimed(pipeline: Pipeline, update: Update, towards: dict[str, FloatArray]) -> BeamSet:
+    """Return sharp beams of an update aimed at given directions."""
+    seen = {uav: SeenDirection(Cap(found, 1e-6), is_alone=True) for uav, found in towards.items()}
+    return aimed(pipeline, update, Widen.NO, seen_directions=seen)

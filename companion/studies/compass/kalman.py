@@ -48,8 +48,7 @@ class ErrorFilter:
 
     def direction(self, reported: FloatArray) -> FloatArray:
         """Return where a UAV is seen, by the estimate."""
-        found: FloatArray = self._error @ reported
-        return found
+        return self._error @ reported
 
     def contains(self, reported: FloatArray, true: FloatArray, position_rad: float) -> bool:
         """Return whether the ellipse of ``CONFIDENCE`` contains a true direction."""

@@ -76,5 +76,4 @@ def _tilted(rng: np.random.Generator, towards: FloatArray, by_rad: float) -> Flo
     """Return a unit vector at an angle from another, in a random plane."""
     aside = np.cross(towards, rng.standard_normal(3))
     aside /= np.linalg.norm(aside)
-    found: FloatArray = math.cos(by_rad) * towards + math.sin(by_rad) * aside
-    return found
+    return math.cos(by_rad) * towards + math.sin(by_rad) * aside

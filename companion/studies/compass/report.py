@@ -1,13 +1,14 @@
 """Report of the compass study: one self-contained HTML page, and its figures."""
 
-from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from companion.studies.compass.flight import ARRAY, KALMAN, METHODS, NONE, ORACLE, Row
+from companion.studies.compass.flight import ARRAY, KALMAN, METHODS, NONE, ORACLE
 from companion.studies.compass.study import HEAD, cells
 from companion.studies.figures import plotting
+from companion.studies.origin import Progress, Row, by_log
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -20,25 +21,20 @@ _NAMES: Final = {
 }
 
 
-def files(answer: dict[str, Any], progress: Callable[[str], None]) -> dict[str, bytes]:
+def files(answer: dict[str, Any], progress: Progress) -> dict[str, bytes]:
     """Return the page and its figures as PNG and SVG, by file name."""
-    logs = list(dict.fromkeys(row["log"] for row in answer["rows"]))
     drawings: dict[str, tuple[str, plotting.Draw]] = {}
-    for number, log in enumerate(logs, 1):
-        rows = [row for row in answer["rows"] if row["log"] == log]
+    tables = []
+    for number, (log, rows) in enumerate(by_log(answer["rows"]).items(), 1):
         suffix = "" if number == 1 else f"_{number}"
         drawings[f"compass_errors{suffix}"] = (
             f"{log}: 95th percentile of the pointing error by case, and the median of the bound"
             " where a method states one.",
-            _drawing(rows),
+            partial(_errors, rows),
         )
-    tables = [(log, [cells(row) for row in answer["rows"] if row["log"] == log]) for log in logs]
+        tables.append((log, list(map(cells, rows))))
     values = {"answer": answer, "head": HEAD, "tables": tables}
     return plotting.files("compass", "compass/report.html.j2", drawings, values, progress)
-
-
-def _drawing(rows: list[Row]) -> plotting.Draw:
-    return lambda: _errors(rows)
 
 
 def _errors(rows: list[Row]) -> "Figure":

@@ -1,17 +1,14 @@
 """The cases of the compass study, and their results."""
 
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import chain
-from pathlib import Path
 from typing import Any, Final
 
-from companion.settings.model import Settings
 from companion.studies.compass import flight
-from companion.studies.compass.flight import ARRAY, KALMAN, METHODS, Case, Row
+from companion.studies.compass.flight import ARRAY, KALMAN, METHODS, Case
 from companion.studies.compass.receiver import RECEIVERS, ArrayReceiver
-from companion.studies.figures.text_tables import text_table
-from companion.studies.origin import command_line, versions
+from companion.studies.figures.text_tables import decimal, text_table
+from companion.studies.origin import Progress, Row, StudiedLogs, by_log, versions
 from companion.studies.running import fan_out
 from companion.values import UserError
 
@@ -31,7 +28,7 @@ HEAD: Final = (
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class CompassStudy:
+class CompassStudy(StudiedLogs):
     """Parameters of the compass study.
 
     seconds  part of each flight that is studied
@@ -40,13 +37,9 @@ class CompassStudy:
     Raises ``UserError`` for a time out of range.
     """
 
-    flights: tuple[tuple[Path, ...], ...]
-    settings: tuple[Settings, ...]
     seconds: float = 60.0
     seed: int = 0
     jobs: int = 1
-    center: str | None = None
-    config: str | None = None
 
     def __post_init__(self) -> None:
         if not 15 <= self.seconds <= 3600:
@@ -70,12 +63,12 @@ class CompassStudy:
                 seconds=self.seconds,
                 seed=self.seed,
             )
-            for logs, settings in zip(self.flights, self.settings, strict=True)
+            for logs, settings in self.by_flight()
             for receiver, mount, uavs in variants
         ]
 
 
-def study(asked: CompassStudy, progress: Callable[[str], None]) -> dict[str, Any]:
+def study(asked: CompassStudy, progress: Progress) -> dict[str, Any]:
     """Return the answer as written to ``compass.json``.
 
     Raises ``UserError`` for a flight without the truth of its carrier.
@@ -87,14 +80,7 @@ def study(asked: CompassStudy, progress: Callable[[str], None]) -> dict[str, Any
 
     rows: list[Row] = list(chain(*fan_out.on_cores(flight.run, cases, asked.jobs, show)))
     return {
-        "command": command_line(
-            "compass",
-            *chain.from_iterable(asked.flights),
-            center=asked.center,
-            config=asked.config,
-            seconds=asked.seconds,
-            seed=asked.seed,
-        ),
+        "command": asked.command_line("compass", seconds=asked.seconds, seed=asked.seed),
         "seconds": asked.seconds,
         "seed": asked.seed,
         "methods": list(METHODS),
@@ -112,25 +98,20 @@ def cells(row: Row) -> tuple[str, ...]:
         beyond = f"{row['beyond_share']:.1%}"
     return (
         label,
-        _cell(row["pointing_bound_median_deg"]),
-        _cell(row["pointing_error_p95_deg"]),
+        decimal(row["pointing_bound_median_deg"]),
+        decimal(row["pointing_error_p95_deg"]),
         beyond,
-        _cell(row["guaranteed_gain_median_db"]),
-        _cell(row["true_gain_median_db"]),
+        decimal(row["guaranteed_gain_median_db"]),
+        decimal(row["true_gain_median_db"]),
     )
 
 
 def text(answer: dict[str, Any]) -> str:
     """Return the tables of the study as text, one for each flight."""
-    rows: Sequence[Row] = answer["rows"]
-    parts = []
-    for log in dict.fromkeys(row["log"] for row in rows):
-        table = [HEAD, *(cells(row) for row in rows if row["log"] == log)]
-        parts.append(f"{log}\n{text_table(table)}")
-    known = [row for row in rows if row["method"] == ARRAY and row["refuted"]]
+    parts = [
+        f"{log}\n{text_table([HEAD, *map(cells, rows)])}"
+        for log, rows in by_log(answer["rows"]).items()
+    ]
+    known = [row for row in answer["rows"] if row["method"] == ARRAY and row["refuted"]]
     parts += [f"{row['log']}: positions refuted of {', '.join(row['refuted'])}" for row in known]
     return "\n\n".join(parts)
-
-
-def _cell(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2f}"

@@ -110,28 +110,24 @@ def _fitted(
     If the height is 0, it is not fitted.
     """
     there = delayed(place, begin.lag)[learned]
-    first = [begin.x, begin.y, begin.stretch, begin.yaw, begin.middle, begin.slope, begin.height]
-    low = [-4.0, -4.0, -2.0, -10.0, -np.inf, -_WIDEST_SLOPE * beams, 0.0]
-    high = [4.0, 4.0, 2.0, 10.0, np.inf, _WIDEST_SLOPE * beams, _HIGHEST]
-    free = len(first) if begin.height > 0 else len(first) - 1
+    limits = {
+        "x": (-4.0, 4.0),
+        "y": (-4.0, 4.0),
+        "stretch": (-2.0, 2.0),
+        "yaw": (-10.0, 10.0),
+        "middle": (-np.inf, np.inf),
+        "slope": (-_WIDEST_SLOPE * beams, _WIDEST_SLOPE * beams),
+    }
+    if begin.height > 0:
+        limits["height"] = 0.0, _HIGHEST
 
     def made(values: FloatArray) -> Geometry:
-        x, y, stretch, yaw, middle, slope, *height = (float(value) for value in values)
-        return Geometry(
-            x=x,
-            y=y,
-            stretch=stretch,
-            yaw=yaw,
-            middle=middle,
-            slope=slope,
-            height=sum(height),
-            lag=begin.lag,
-        )
+        return replace(begin, **dict(zip(limits, values.tolist(), strict=True)))
 
     def off(values: FloatArray) -> FloatArray:
-        found: FloatArray = made(values)._at(there) - beam[learned]
-        return found
+        return made(values)._at(there) - beam[learned]
 
-    bounds = (low[:free], high[:free])
-    found = least_squares(off, np.clip(first[:free], *bounds), loss="soft_l1", bounds=bounds)
+    low, high = np.array(list(limits.values())).T
+    first = np.clip([getattr(begin, name) for name in limits], low, high)
+    found = least_squares(off, first, loss="soft_l1", bounds=(low, high))
     return float(found.cost), made(found.x)

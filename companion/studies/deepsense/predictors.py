@@ -139,5 +139,4 @@ def density(
 def _beside(samples: Samples, expected: FloatArray, scale: float) -> FloatArray:
     """Return a decay with the distance (N, beams) from the expected beam, in ``scale`` beams."""
     off = np.abs(np.arange(samples.beams) - expected[:, None])
-    found: FloatArray = np.exp(-off / scale)
-    return found
+    return np.exp(-off / scale)

@@ -1,17 +1,18 @@
 """Report of measured beams: one self-contained HTML page, and its figure."""
 
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from companion.studies.figures import plotting
+from companion.studies.figures.text_tables import decimal
+from companion.studies.origin import Progress
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-def files(answer: dict[str, Any], progress: Callable[[str], None]) -> dict[str, bytes]:
+def files(answer: dict[str, Any], progress: Progress) -> dict[str, bytes]:
     """Return the page and its figure as PNG and SVG, by file name."""
     drawings = {
         "deepsense_tops": (
@@ -26,14 +27,13 @@ def files(answer: dict[str, Any], progress: Callable[[str], None]) -> dict[str, 
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    lost_db = row["power_lost_db"]
     return (
         row["split"],
         row["predictor"],
         *(f"{row[f'top_{top}']:.1f}" for top in (1, 3, 5, 8)),
         f"{row['set_size_mean']:.1f}",
         f"{100 * row['set_coverage']:.1f}",
-        "-" if lost_db is None else f"{lost_db:.2f}",
+        decimal(row["power_lost_db"]),
     )
 
 

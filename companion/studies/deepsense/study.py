@@ -1,6 +1,5 @@
 """Prediction of the best beam from a position, on contiguous blocks and on a random split."""
 
-from collections.abc import Callable
 from typing import Any, Final
 
 import numpy as np
@@ -9,7 +8,7 @@ from companion.studies.deepsense import predictors
 from companion.studies.deepsense.predictors import Fitted, Predictor, own, rank_of
 from companion.studies.deepsense.samples import Samples, blocks, inner, shuffled
 from companion.studies.figures.text_tables import text_table
-from companion.studies.origin import command_line, versions
+from companion.studies.origin import Progress, command_line, silent, versions
 from companion.values import BoolArray, FloatArray, IntArray
 
 BLOCKS: Final = 20
@@ -27,9 +26,7 @@ _TARGET_COVERAGE: Final = 1 - 0.75 * (1 - COVERAGE)
 """Coverage aimed at: a quarter of the allowed misses is reserved for harder blocks."""
 
 
-def study(
-    samples: Samples, seed: int, progress: Callable[[str], None] = lambda _text: None
-) -> dict[str, Any]:
+def study(samples: Samples, seed: int, progress: Progress = silent) -> dict[str, Any]:
     """Return the answer of the study, as written to ``deepsense.json``."""
     count = len(samples.beam)
     splits = {"blocks": blocks(count, BLOCKS, FOLDS), "shuffled": shuffled(count, FOLDS, seed)}

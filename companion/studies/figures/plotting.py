@@ -12,6 +12,7 @@ from io import BytesIO
 from typing import TYPE_CHECKING, Any, Final
 
 from companion.studies.figures import pages
+from companion.studies.origin import Progress
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -79,9 +80,12 @@ def marked(number: int) -> dict[str, Any]:
     return line(number) | {"marker": MARKS[number % len(MARKS)]}
 
 
-def below(figure: "Figure", axes: "Axes", columns: int) -> None:
-    """Place one legend for all panels of a figure below them, with the entries of one panel."""
+def below(figure: "Figure", axes: "Axes", columns: int, *others: "Axes") -> None:
+    """Place one legend for all panels of a figure below them, with the entries of some panels."""
     handles, labels = axes.get_legend_handles_labels()
+    for other in others:
+        more_handles, more_labels = other.get_legend_handles_labels()
+        handles, labels = handles + more_handles, labels + more_labels
     figure.legend(handles, labels, loc="outside lower center", ncols=columns)
 
 
@@ -106,7 +110,7 @@ def files(
     template: str,
     drawings: Mapping[str, tuple[str, Draw]],
     values: Mapping[str, Any],
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> dict[str, bytes]:
     """Return every figure as SVG and PNG, and the page ``name``.html, by file name.
 

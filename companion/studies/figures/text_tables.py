@@ -11,3 +11,8 @@ def text_table(rows: Sequence[Sequence[str]]) -> str:
         cells = (cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True))
         lines.append("  ".join(["", first.ljust(widths[0]), *cells]).rstrip())
     return "\n".join(lines)
+
+
+def decimal(value: float | None, digits: int = 2) -> str:
+    """Format a figure; a dash without one."""
+    return "-" if value is None else f"{value:.{digits}f}"

@@ -1,13 +1,14 @@
 """Reports of the fleet study: a plain-text table, one HTML page, and figures."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, Final
 
 from companion.studies.figures import plotting
-from companion.studies.figures.text_tables import text_table
+from companion.studies.figures.text_tables import decimal, text_table
 from companion.studies.fleet.sky import Sky
 from companion.studies.fleet.study import FleetSize, FleetStudy
+from companion.studies.origin import Progress
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -35,7 +36,7 @@ def cells(one: FleetSize) -> list[str]:
         f"{sum(one.told_kbps.values()):.0f}",
         f"{one.link_kbps:.0f}",
         f"{one.cpu_share:.1%}",
-        "-" if one.takeover_s is None else f"{one.takeover_s:.1f}",
+        decimal(one.takeover_s, 1),
         f"{one.parted_none:.3%}",
         f"{one.heal_s:.1f}",
     ]
@@ -47,10 +48,7 @@ def text(found: Sequence[FleetSize]) -> str:
 
 
 def files(
-    asked: FleetStudy,
-    found: Sequence[FleetSize],
-    answer: dict[str, Any],
-    progress: Callable[[str], None],
+    asked: FleetStudy, found: Sequence[FleetSize], answer: dict[str, Any], progress: Progress
 ) -> dict[str, bytes]:
     """Return the page and every figure as SVG and PNG, by file name."""
     drawings = {

@@ -7,7 +7,7 @@ from typing import Any
 from companion.settings.fleet import FleetSettings
 from companion.studies.fleet.sky import Sky
 from companion.studies.fleet.world import FleetCounts, World
-from companion.studies.origin import versions
+from companion.studies.origin import Progress, silent, versions
 
 SETTLE_S = 8.0  # virtual time for a fleet to settle its assignment
 AFTER_S = 4.0  # observed virtual time after a node has died
@@ -55,9 +55,7 @@ class FleetStudy:
 
 
 def run(
-    asked: FleetStudy,
-    cpu_s: Callable[[], float],
-    progress: Callable[[str], None] = lambda text: None,
+    asked: FleetStudy, cpu_s: Callable[[], float], progress: Progress = silent
 ) -> Iterator[FleetSize]:
     """Simulate the fleet at each size; ``cpu_s`` returns the processor time used."""
     for nodes, uavs in asked.sizes:

@@ -12,8 +12,7 @@ import numpy as np
 
 from companion.studies.figures import plotting
 from companion.studies.figures.text_tables import text_table
-from companion.studies.origin import command_line, versions
-from companion.studies.paper.experiments import Progress
+from companion.studies.origin import Progress, command_line, versions
 from companion.tracking.design import closed_form
 from companion.values import FloatArray
 

@@ -121,8 +121,7 @@ def responses(rows: ComplexArray, sent: ComplexArray, alone: FloatArray) -> Comp
     sent   (M, N), the weights
     alone  (N,), amplitude of an exact beam on a UAV, scaled to 1
     """
-    heard: ComplexArray = (rows @ sent) / alone[:, np.newaxis]
-    return heard
+    return (rows @ sent) / alone[:, np.newaxis]
 
 
 def alone(array: Array, uav_array: Array, truly: FloatArray) -> FloatArray:

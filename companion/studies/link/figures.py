@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from companion.studies.figures import plotting
-from companion.studies.link.rows import Row
+from companion.studies.origin import Row
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -14,7 +14,7 @@ Uncoded and coded results come from the same transmissions: hard decisions on th
 the performance without a code, in blocks of 936 payload bits.
 """
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
@@ -28,9 +28,9 @@ from companion.settings.model import Settings
 from companion.studies.link import blocks, channel, modulation, ofdm
 from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, BlockErrors, Estimation
 from companion.studies.link.channel import SAMPLE_RATE_HZ, Scattering
-from companion.studies.link.rows import Row, crossing_db, row
+from companion.studies.link.rows import crossing_db, row
 from companion.studies.link.scenario import PositionSource, Reports, Scenario, circles, from_logs
-from companion.studies.origin import command_line, versions
+from companion.studies.origin import Progress, Row, command_line, silent, versions
 from companion.studies.prediction.pointing import angles_deg
 from companion.values import ComplexArray, UserError
 
@@ -121,9 +121,7 @@ def uav_array(settings: Settings) -> Array:
     )
 
 
-def simulate(
-    setting: LinkStudy, scenario: Scenario, progress: Callable[[str], None] = lambda _text: None
-) -> Counts:
+def simulate(setting: LinkStudy, scenario: Scenario, progress: Progress = silent) -> Counts:
     """Send every block of every instant; each instant has its own random generator."""
     counts: Counts = {}
     array, own = scenario.array, uav_array(setting.settings)
@@ -162,9 +160,7 @@ def exchange(
             yield ((kind, snr_db), blocks.receive(sent, heard, noise_power, taps, estimation))
 
 
-def study(
-    setting: LinkStudy, progress: Callable[[str], None] = lambda _text: None
-) -> dict[str, Any]:
+def study(setting: LinkStudy, progress: Progress = silent) -> dict[str, Any]:
     """Return the answer of the study, the content of ``link.json``.
 
     Raises ``UserError``, ``LogError`` or ``ConfigError`` if there is nothing to study.

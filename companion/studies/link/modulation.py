@@ -58,5 +58,4 @@ def bit_error_rate(snr: ArrayLike) -> FloatArray:
     modulations", IEEE Trans. Communications 50(7), 2002.
     """
     step = np.sqrt(np.asarray(snr, dtype=float) / 10)
-    rate: FloatArray = 3 / 8 * erfc(step) + 1 / 4 * erfc(3 * step) - 1 / 8 * erfc(5 * step)
-    return rate
+    return 3 / 8 * erfc(step) + 1 / 4 * erfc(3 * step) - 1 / 8 * erfc(5 * step)

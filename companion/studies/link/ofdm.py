@@ -38,20 +38,17 @@ def carriers(data: ComplexArray, pilots: FloatArray) -> ComplexArray:
 def samples(placed: ComplexArray) -> ComplexArray:
     """Return the time samples (..., 320) of carriers (..., 256), prefix first."""
     body = np.fft.ifft(np.fft.ifftshift(placed, axes=-1), norm="ortho")
-    sent: ComplexArray = np.concatenate([body[..., -PREFIX:], body], axis=-1)
-    return sent
+    return np.concatenate([body[..., -PREFIX:], body], axis=-1)
 
 
 def received_carriers(heard: ComplexArray) -> ComplexArray:
     """Return the carriers (..., 256) of time samples (..., 320), prefix removed."""
-    found: ComplexArray = np.fft.fftshift(np.fft.fft(heard[..., PREFIX:], norm="ortho"), axes=-1)
-    return found
+    return np.fft.fftshift(np.fft.fft(heard[..., PREFIX:], norm="ortho"), axes=-1)
 
 
 def frequency_response(taps: ComplexArray) -> ComplexArray:
     """Return the response (256, ...) at each carrier of taps (T, ...), one sample apart."""
-    found: ComplexArray = np.fft.fftshift(np.fft.fft(taps, CARRIERS, axis=0), axes=0)
-    return found
+    return np.fft.fftshift(np.fft.fft(taps, CARRIERS, axis=0), axes=0)
 
 
 def flat_estimate(heard: ComplexArray, pilots: FloatArray) -> ComplexArray:

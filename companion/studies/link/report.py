@@ -1,15 +1,14 @@
 """Reports of the link study: a plain-text table, one self-contained HTML page, and figures."""
 
-from collections.abc import Callable
 from typing import Any
 
 from companion.studies.figures import plotting
-from companion.studies.figures.text_tables import text_table
+from companion.studies.figures.text_tables import decimal, text_table
 from companion.studies.link import figures
-from companion.studies.link.rows import Row
+from companion.studies.origin import Progress, Row
 
 
-def files(answer: dict[str, Any], progress: Callable[[str], None]) -> dict[str, bytes]:
+def files(answer: dict[str, Any], progress: Progress) -> dict[str, bytes]:
     """Return the page and every figure as PNG and SVG, by file name."""
     values = {"answer": answer, "rows": [_cells(row) for row in answer["summary"]]}
     return plotting.files("link", "link/report.html.j2", figures.drawings(answer), values, progress)
@@ -27,7 +26,7 @@ def _cells(row: Row) -> list[str]:
     return [
         row["positions"],
         "rate 1/3" if row["coded"] else "none",
-        "-" if needed is None else f"{needed:.2f}",
+        decimal(needed),
         f"{row['ber_at_highest_snr']:.1e}",
         f"{row['rate_at_highest_snr_bps'] / 1e6:.1f}",
         "-" if off is None else f"{off:.2f} / {row['pointing_error_p95_deg']:.2f}",

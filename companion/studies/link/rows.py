@@ -2,14 +2,14 @@
 
 import math
 from collections.abc import Sequence
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
 from companion.studies.link.blocks import BLOCK_BITS, CODED_BITS, BlockErrors
+from companion.studies.origin import Row
 from companion.values import FloatArray
 
-Row = dict[str, Any]
 Z95: Final = 1.959963984540054  # half-width of a 95 per cent interval, in standard deviations
 
 

@@ -5,7 +5,7 @@ reports, ``held`` the last report. A scenario is the paper's circles, or a log w
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
@@ -22,6 +22,7 @@ from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.studies.beams.flight import updates
 from companion.studies.link.track_predictor import TrackPredictor
+from companion.studies.origin import Progress
 from companion.studies.prediction.baselines import Hold, ObservedReport, Predictor
 from companion.studies.truth import array_truth
 from companion.studies.truth.vehicles import named
@@ -237,7 +238,7 @@ def from_logs(
     settings: Settings,
     instants: int,
     rng: np.random.Generator,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> Scenario:
     """Draw instants of a flight, from ``LOOKS_HZ`` samples per second of the pipeline.
 

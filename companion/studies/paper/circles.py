@@ -49,8 +49,7 @@ class PaperFlight:
     @property
     def time_s(self) -> FloatArray:
         """Times of the positions, (K + 1,), seconds."""
-        times: FloatArray = np.arange(len(self.position_m)) * np.float64(self.scenario.dt_s)
-        return times
+        return np.arange(len(self.position_m)) * np.float64(self.scenario.dt_s)
 
     @property
     def largest_input_mps(self) -> float:
@@ -96,8 +95,7 @@ def fly(scenario: PaperScenario) -> PaperFlight:
 
 def _heading(angle_rad: FloatArray) -> FloatArray:
     """Return unit vectors [cos, -sin], (..., 2), of angles (...)."""
-    heading: FloatArray = np.stack([np.cos(angle_rad), -np.sin(angle_rad)], axis=-1)
-    return heading
+    return np.stack([np.cos(angle_rad), -np.sin(angle_rad)], axis=-1)
 
 
 def track(flight: PaperFlight, gain: float, start_m: FloatArray | None = None) -> Tracked:

@@ -6,7 +6,6 @@ everything else is computed. Blockages, echoes and irregular intervals are rando
 Over 300 lines: it is a list, an experiment a function.
 """
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from itertools import pairwise
 from typing import Any, Final
@@ -17,7 +16,7 @@ from companion.beams.array.geometry import Array
 from companion.beams.array.steering import steering_matrix
 from companion.beams.hardware import quantise
 from companion.beams.worth import patterns
-from companion.studies.origin import command_line, versions
+from companion.studies.origin import Progress, command_line, versions
 from companion.studies.paper import circles as published_scenario
 from companion.studies.paper import link, mavlink, published, shown
 from companion.studies.paper.circles import PaperFlight, PaperScenario, Tracked
@@ -43,7 +42,6 @@ STEADY_STEPS: Final = 2000  # steps to measure a steady error
 BLOCKAGES_PER_MINUTE: Final = (0.0, 6.0, 15.0, 30.0, 60.0)
 DRAWS: Final = 2
 OPTIMUM: Final = "optimum"
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)

@@ -1,15 +1,13 @@
-"""Figures of the published experiments: flight, observer, limits and rates.
+"""Figures of the published experiments: flight, observer, limits and rates."""
 
-Over 300 lines: it is a list, a figure a function.
-"""
-
-from collections.abc import Callable
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from companion.studies.figures import plotting
 from companion.studies.paper import circles, published
+from companion.studies.paper.circles import Tracked
 from companion.studies.paper.experiments import OPTIMUM, PAPER_LEVELS, Material, level_name
 from companion.studies.paper.patterns import cuts, polar, surfaces
 from companion.tracking.design import closed_form
@@ -24,7 +22,7 @@ TITLES = tuple(f"{level_name(gain)}, μ ≤ {mu:g} s²" for mu, gain in PAPER_LE
 FIGURE_SPAN_S = 13.0  # time span of figures: slightly over one turn
 
 
-def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, Callable[[], "Figure"]]]:
+def drawings(answer: Answer, material: Material) -> dict[str, tuple[str, plotting.Draw]]:
     """Return caption and drawing of each figure of the paper by name, in the paper's order."""
     return {
         "paths": (
@@ -141,81 +139,58 @@ def _errors(answer: Answer, material: Material) -> "Figure":
 
 
 def _unknown_input(answer: Answer, material: Material) -> "Figure":
-    figure, panels = plotting.new(2, 3, (9.6, 5.2), sharex=True, sharey="row")
-    flight = material.flight
-    shown = flight.time_s[:-1] <= FIGURE_SPAN_S
-    time_s = flight.time_s[:-1][shown]
-    for column, name in enumerate(LEVELS):
-        one, above, under = material.tracked[name], panels[column], panels[3 + column]
-        above.plot(
-            time_s, flight.input_mps[shown, 0, 0], color=plotting.INK, lw=1.8, label="W, actual"
-        )
-        above.plot(time_s, one.input_b0_mps[shown, 0, 0], label="Ŵ, G = [B; 0]", **plotting.line(1))
-        _draw_input_errors(under, one, material, answer["unknown_input"][name])
-        under.set_xlabel("time, s")
-        under.set_xlim(0, FIGURE_SPAN_S)
-    panels[0].set_ylabel("north, UAV 1, m/s")
-    panels[3].set_ylabel("norm of the error, m/s")
-    panels[3].set_ylim(0, None)
-    plotting.title_panels(panels[:3], TITLES)
-    handles = [axes.get_legend_handles_labels() for axes in (panels[0], panels[3])]
-    figure.legend(
-        handles[0][0] + handles[1][0],
-        handles[0][1] + handles[1][1],
-        loc="outside lower center",
-        ncols=3,
-    )
-    return figure
-
-
-def _draw_input_errors(axes: Any, one: Any, material: Material, numbers: dict[str, float]) -> None:
-    flight = material.flight
-    shown = flight.time_s[:-1] <= FIGURE_SPAN_S
-    time_s, largest = flight.time_s[:-1][shown], flight.largest_input_mps
-    for number, (kept, label) in enumerate(
-        ((one.input_b0_mps, "error, [B; 0]"), (one.input_bd_mps, "error, [B; D]"))
-    ):
-        miss = circles.stacked(kept - flight.input_mps)[shown]
-        axes.plot(time_s, miss, label=label, **plotting.line(2 * number))
-    axes.axhline(numbers["b0_peak"] * largest, label="exact peak, [B; 0]", **plotting.line(3))
-    axes.axhline(
-        numbers["published_3_gamma"] * largest, label="published 3γ sup‖W‖", **plotting.line(4)
-    )
+    columns = []
+    for name in LEVELS:
+        one, numbers = material.tracked[name], answer["unknown_input"][name]
+        errors = {"[B; 0]": one.input_b0_mps, "[B; D]": one.input_bd_mps}
+        bounds = {
+            "exact peak, [B; 0]": numbers["b0_peak"],
+            "published 3γ sup‖W‖": numbers["published_3_gamma"],
+        }
+        columns.append((one, errors, bounds))
+    return _input_figure(material, 5.2, TITLES, columns)
 
 
 def _alphas(material: Material) -> "Figure":
-    figure, panels = plotting.new(2, 3, (9.6, 5.0), sharex=True, sharey="row")
+    scenario, titles, columns = material.flight.scenario, [], []
+    for alpha, one in material.alphas.items():
+        _, peak = published.unknown_input_peak(scenario.dt_s, scenario.feedthrough_s, one.gain)
+        titles.append(f"α = {alpha:g}, L = {one.gain:.3f}")
+        columns.append((one, {"[B; 0]": one.input_b0_mps}, {"exact peak, [B; 0]": peak}))
+    return _input_figure(material, 5.0, titles, columns)
+
+
+def _input_figure(
+    material: Material,
+    height_in: float,
+    titles: Sequence[str],
+    columns: Sequence[tuple[Tracked, dict[str, FloatArray], dict[str, float]]],
+) -> "Figure":
+    """Draw the unknown input of three observers, and the norm of its error below.
+
+    ``columns`` holds the estimates whose errors are drawn, and bounds over sup‖W‖, by their labels.
+    """
+    figure, panels = plotting.new(2, 3, (9.6, height_in), sharex=True, sharey="row")
     flight = material.flight
     shown = flight.time_s[:-1] <= FIGURE_SPAN_S
     time_s = flight.time_s[:-1][shown]
-    titles = []
-    for column, (alpha, one) in enumerate(material.alphas.items()):
-        above, under = panels[column], panels[3 + column]
+    for above, under, (one, errors, bounds) in zip(panels[:3], panels[3:], columns, strict=True):
         above.plot(
             time_s, flight.input_mps[shown, 0, 0], color=plotting.INK, lw=1.8, label="W, actual"
         )
         above.plot(time_s, one.input_b0_mps[shown, 0, 0], label="Ŵ, G = [B; 0]", **plotting.line(1))
-        scenario = flight.scenario
-        peak = published.unknown_input_peak(scenario.dt_s, scenario.feedthrough_s, one.gain)[1]
-        miss = circles.stacked(one.input_b0_mps - flight.input_mps)[shown]
-        under.plot(time_s, miss, label="error, [B; 0]", **plotting.line(0))
-        under.axhline(
-            peak * flight.largest_input_mps, label="exact peak, [B; 0]", **plotting.line(3)
-        )
+        for number, (label, estimate) in enumerate(errors.items()):
+            miss = circles.stacked(estimate - flight.input_mps)[shown]
+            under.plot(time_s, miss, label=f"error, {label}", **plotting.line(2 * number))
+        for number, (label, bound) in enumerate(bounds.items(), 3):
+            under.axhline(bound * flight.largest_input_mps, label=label, **plotting.line(number))
         under.set_xlabel("time, s")
         under.set_xlim(0, FIGURE_SPAN_S)
-        titles.append(f"α = {alpha:g}, L = {one.gain:.3f}")
     panels[0].set_ylabel("north, UAV 1, m/s")
     panels[3].set_ylabel("norm of the error, m/s")
     panels[3].set_ylim(0, None)
     plotting.title_panels(panels[:3], titles)
-    handles = [axes.get_legend_handles_labels() for axes in (panels[0], panels[3])]
-    figure.legend(
-        handles[0][0] + handles[1][0],
-        handles[0][1] + handles[1][1],
-        loc="outside lower center",
-        ncols=4,
-    )
+    plotting.below(figure, panels[0], 4 if len(columns[0][1]) == 1 else 3, panels[3])
     return figure
 
 
@@ -285,17 +260,13 @@ def _binned(azimuth_deg: FloatArray, values: FloatArray, edges: FloatArray) -> F
 def _blockage(material: Material) -> "Figure":
     figure, (axes,) = plotting.new(1, 1, (6.4, 3.8))
     compared = material.compared
-    marks = ("o", "s", "^", "D", "v")
     order = ("echo probing", OPTIMUM, *LEVELS)
     for number, name in enumerate(order):
         label = {"echo probing": name, OPTIMUM: "location-aware, L = 0.30 (optimum)"}.get(
             name, f"location-aware, {name}"
         )
-        axes.plot(
-            compared.blockages_per_minute,
-            compared.schemes[name],
-            marker=marks[number], ms=4, label=label, **plotting.line(number),
-        )  # fmt: skip
+        rates, efficiency = compared.blockages_per_minute, compared.schemes[name]
+        axes.plot(rates, efficiency, ms=4, label=label, **plotting.marked(number))
     axes.set_ylim(0, None)
     axes.set_xlim(0, None)
     axes.set_xlabel("blockages per minute and UAV")

@@ -5,7 +5,6 @@ cost a UAV more than 3 dB (a line array cannot separate a direction from its mir
 space; no scattering.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final
 
@@ -17,6 +16,7 @@ from companion.beams.weights import zero_forcing
 from companion.beams.weights.precoding import Precoder, precode
 from companion.beams.worth import channel, link_budget
 from companion.beams.worth.link_budget import LinkBudget
+from companion.studies.origin import Progress
 from companion.studies.paper import probing
 from companion.studies.paper.circles import PaperFlight
 from companion.studies.paper.probing import EchoProbing
@@ -121,7 +121,7 @@ def under_blockage(
     *,
     draws: int,
     rng: np.random.Generator,
-    progress: Callable[[str], None],
+    progress: Progress,
 ) -> BlockageComparison:
     """Compare location-aware beams, aimed at estimates (K + 1, N, 2), to echo probing.
 

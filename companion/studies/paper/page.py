@@ -1,18 +1,16 @@
 """Reports of the reproduction: one self-contained HTML page, figures, and claims as text."""
 
-from collections.abc import Callable
 from typing import Any
 
 from companion.studies.figures import plotting
+from companion.studies.origin import Progress
 from companion.studies.paper import figures
 from companion.studies.paper.experiments import Material
 
 Rows = list[tuple[str, ...]]
 
 
-def paper_files(
-    answer: dict[str, Any], material: Material, progress: Callable[[str], None]
-) -> dict[str, bytes]:
+def paper_files(answer: dict[str, Any], material: Material, progress: Progress) -> dict[str, bytes]:
     """Return the page ``paper.html`` and its figures."""
     values = {
         "answer": answer,

@@ -29,8 +29,7 @@ def weights(array: Array, position_m: FloatArray) -> ComplexArray:
 
 def azimuths_rad(position_m: FloatArray) -> FloatArray:
     """Return azimuths (N,) of positions (N, 2) as seen from the array."""
-    angles: FloatArray = np.arctan2(position_m[:, 1], position_m[:, 0])
-    return angles
+    return np.arctan2(position_m[:, 1], position_m[:, 0])
 
 
 def _cases(material: Material) -> list[tuple[Array, FloatArray, str]]:

@@ -43,8 +43,8 @@ class Predicted(NamedTuple):
     """
 
     position_ned_m: FloatArray
-    velocity_ned_mps: FloatArray | None
-    bound_m: float | None
+    velocity_ned_mps: FloatArray | None = None
+    bound_m: float | None = None
     usual_m: float | None = None
 
 
@@ -75,12 +75,10 @@ class Hold:
         """Return the position of the held report, at any time."""
         if self._last is None:
             return None
-        return Predicted(
-            position_ned_m=self._last.position_ned_m, velocity_ned_mps=None, bound_m=None
-        )
+        return Predicted(position_ned_m=self._last.position_ned_m)
 
 
-class DeadReckoningOnArrival:
+class DeadReckoningOnArrival(Hold):
     """Dead reckoning from the last report as if it was made on arrival: AntennaTracker's method.
 
     If nothing arrived for 5 s the estimate stops moving. One fault of the original is corrected: it
@@ -88,13 +86,6 @@ class DeadReckoningOnArrival:
     extrapolated as well. Source: ArduPilot, AntennaTracker/tracking.cpp,
     ``update_vehicle_pos_estimate``.
     """
-
-    def __init__(self) -> None:
-        self._last: ObservedReport | None = None
-
-    def report(self, report: ObservedReport) -> None:
-        """Keep the last report to arrive, however old it is."""
-        self._last = report
 
     def predict(self, now_ns: int, at_ns: int) -> Predicted | None:
         """Return position plus velocity times the time since arrival plus the lead."""
@@ -130,9 +121,6 @@ def _straight_on(report: ObservedReport, interval_ns: int) -> Predicted:
     """Extrapolate at constant velocity; without a reported velocity, hold the position."""
     velocity = report.velocity_ned_mps
     if velocity is None:
-        return Predicted(position_ned_m=report.position_ned_m, velocity_ned_mps=None, bound_m=None)
-    return Predicted(
-        position_ned_m=report.position_ned_m + velocity * (interval_ns * _S_PER_NS),
-        velocity_ned_mps=velocity,
-        bound_m=None,
-    )
+        return Predicted(position_ned_m=report.position_ned_m)
+    position = report.position_ned_m + velocity * (interval_ns * _S_PER_NS)
+    return Predicted(position_ned_m=position, velocity_ned_mps=velocity)

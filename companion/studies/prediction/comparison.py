@@ -14,7 +14,7 @@ assumes the noise of the settings, and is never tuned.
 Each log over each link is a separate piece of work: see ``companion.studies.running.fan_out``.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from itertools import product as product_of
 from pathlib import Path
@@ -24,13 +24,12 @@ from companion.mavlink.clock.sender_clock import SenderClock
 from companion.pipeline import assembly
 from companion.recording.reader import center_of, flights
 from companion.settings.model import Settings
-from companion.studies.origin import command_line, versions
+from companion.studies.origin import Progress, Row, command_line, silent, versions
 from companion.studies.prediction import radio_link, violations
 from companion.studies.prediction.delivery import deliver
 from companion.studies.prediction.kalman import Kalman, Tuning
 from companion.studies.prediction.pointing import (
     Receiver,
-    Row,
     answers,
     product_answers,
     questions,
@@ -131,10 +130,7 @@ class LogComparison:
 
 
 def compare(
-    flown: Flown,
-    link: RadioLink,
-    setting: PredictionStudy,
-    progress: Callable[[str], None] = lambda _text: None,
+    flown: Flown, link: RadioLink, setting: PredictionStudy, progress: Progress = silent
 ) -> LogComparison:
     """Run every predictor on every UAV of a log over one link. No rows if no UAV flies."""
     cases: list[Case] = []
@@ -205,7 +201,7 @@ class Piece:
     link: RadioLink
 
 
-def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> LogComparison:
+def work(piece: Piece, progress: Progress = silent) -> LogComparison:
     """Read a log and compare; ``UserError`` or ``LogError`` if it has nothing to study."""
     progress(f"reading {vehicles.named(piece.logs)}")
     flown = vehicles.load(piece.logs, center_of(piece.logs, piece.setting.center))
@@ -213,7 +209,7 @@ def work(piece: Piece, progress: Callable[[str], None] = lambda _text: None) -> 
 
 
 def study(
-    setting: PredictionStudy, progress: Callable[[str], None] = lambda _text: None
+    setting: PredictionStudy, progress: Progress = silent
 ) -> tuple[dict[str, Any], list[LogComparison]]:
     """Return the answer as written to ``prediction.json``, and the data of the report.
 
@@ -248,7 +244,7 @@ def study(
 
 
 def _compared(
-    setting: PredictionStudy, pieces: Sequence[Piece], progress: Callable[[str], None]
+    setting: PredictionStudy, pieces: Sequence[Piece], progress: Progress
 ) -> list[LogComparison]:
     def progressed(done: int) -> None:
         progress(f"{done} of {len(pieces)} done (a log over a link each)")

@@ -9,7 +9,7 @@ import math
 import zlib
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -75,23 +75,15 @@ def deliver(
     observed = tuple(
         ObservedReport(
             arrival_ns=arrived,
-            sent_ns=sent,
-            sender_ns=made,
+            sent_ns=at.sent_ns,
+            sender_ns=at.sender_ns,
             position_ned_m=flight.position_ned_m[row] + noise.position_ned_m[row],
             velocity_ned_mps=_reported(flight.velocity_ned_mps[row] + noise.velocity_ned_mps[row]),
-            clock_bound_s=bound,
+            clock_bound_s=at.bound_s,
             gnss=flight.gnss[row],
         )
-        for row, arrived, made, sent, bound, known in zip(
-            rows.tolist(),
-            arrival_ns.tolist(),
-            placed.sender_ns.tolist(),
-            placed.sent_ns.tolist(),
-            placed.bound_s.tolist(),
-            placed.known.tolist(),
-            strict=True,
-        )
-        if known and row < reports
+        for row, arrived, at in zip(rows.tolist(), arrival_ns.tolist(), placed, strict=True)
+        if at is not None
     )
     rate_hz, latency_s = link.rate_hz, link.latency_s and link.latency_s[0]
     if rate_hz is None:
@@ -188,8 +180,7 @@ def _thinned_each(sends: _Sends, rows: IntArray, rate_hz: float) -> IntArray:
     period = np.floor((sends.sent_ns[rows] - sends.sent_ns.min()) * (rate_hz * 1e-9))
     kinds = np.stack([sends.kind[rows].astype(float), period], axis=1)
     _, first = np.unique(kinds, axis=0, return_index=True)
-    kept: IntArray = rows[np.sort(first)]
-    return kept
+    return rows[np.sort(first)]
 
 
 def known_round_trips(flight: Flight) -> tuple[RoundTrip, ...]:
@@ -211,18 +202,16 @@ def known_round_trips(flight: Flight) -> tuple[RoundTrip, ...]:
     return tuple(found)
 
 
-@dataclass(frozen=True, slots=True, eq=False, kw_only=True)
-class PlacedMessages:
-    """Messages placed in time by the product's clock, (n,) each.
+class StampedReport(NamedTuple):
+    """Report placed in time by the product's clock.
 
     sender_ns  on the sender's timeline, which starts when its clock is first placed, and again
                after a restart
     """
 
-    sender_ns: Times
-    sent_ns: Times  # on the node's timeline, as estimated on arrival
-    bound_s: FloatArray  # bound on the error of that
-    known: BoolArray  # whether it is a report with a placed stamp
+    sender_ns: int
+    sent_ns: int  # on the node's timeline, as estimated on arrival
+    bound_s: float  # bound on the error of that
 
 
 def on_sender_clock(
@@ -230,15 +219,16 @@ def on_sender_clock(
     arrival_ns: Times,
     boot_ms: Times,
     is_report: BoolArray,
-    trips: tuple[RoundTrip, ...] = (),
-) -> PlacedMessages:
+    trips: tuple[RoundTrip, ...],
+) -> list[StampedReport | None]:
     """Place reports, among messages (n,), in time by the product's clock; stamp -1: none.
 
-    The clock also receives the other messages, and ``trips``, as in the pipeline.
+    The clock also receives the other messages, and ``trips``, as in the pipeline. None for other
+    messages, and for reports without a placed stamp.
     """
     start_ns: int | None = None
     waiting = list(reversed(trips))
-    rows: list[tuple[int, int, float, bool]] = [(0, 0, 0.0, False)] * len(arrival_ns)
+    placed: list[StampedReport | None] = [None] * len(arrival_ns)
     for row in np.argsort(arrival_ns, kind="stable").tolist():
         arrived_ns, stamp_ms = int(arrival_ns[row]), int(boot_ms[row])
         while waiting and waiting[-1].t_ns < arrived_ns:
@@ -255,14 +245,8 @@ def on_sender_clock(
         sent_ns = arrived_ns - round(stamp.latency_s * 1e9)
         if start_ns is None or stamp.rebooted:
             start_ns = sent_ns - stamp.sender_ns
-        rows[row] = (start_ns + stamp.sender_ns, sent_ns, estimate.uncertainty_s, True)
-    sender, sent, bound_s, placed = zip(*rows, strict=True) if rows else ((), (), (), ())
-    return PlacedMessages(
-        sender_ns=np.array(sender, dtype=np.int64),
-        sent_ns=np.array(sent, dtype=np.int64),
-        bound_s=np.array(bound_s, dtype=float),
-        known=np.array(placed, dtype=bool),
-    )
+        placed[row] = StampedReport(start_ns + stamp.sender_ns, sent_ns, estimate.uncertainty_s)
+    return placed
 
 
 def _reported(velocity: FloatArray) -> FloatArray | None:

@@ -109,8 +109,7 @@ ROUND_NS: Final = int(_STARTS_NS[-1])
 def regimes_at(t_ns: Times, begins_ns: int) -> IntArray:
     """Return the index of the regime, in ``REGIMES``, at each time (n,)."""
     into_ns = (t_ns - begins_ns) % ROUND_NS
-    found: IntArray = np.searchsorted(_STARTS_NS, into_ns, side="right") - 1
-    return found
+    return np.searchsorted(_STARTS_NS, into_ns, side="right") - 1
 
 
 def arrivals_ns(

@@ -97,7 +97,7 @@ class Kalman:
             acceleration = mean[..., 2, :]
             position = position + acceleration * (interval_s * interval_s / 2)
             velocity = velocity + acceleration * interval_s
-        return Predicted(position_ned_m=position, velocity_ned_mps=velocity, bound_m=None)
+        return Predicted(position_ned_m=position, velocity_ned_mps=velocity)
 
     def _after(self, before: _Filtered | None, report: ObservedReport) -> _Filtered:
         if before is None:

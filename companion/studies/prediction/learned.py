@@ -22,6 +22,7 @@ import numpy as np
 import torch
 from torch import nn
 
+from companion.studies.origin import Progress, silent
 from companion.studies.prediction import made_up
 from companion.studies.prediction.baselines import ObservedReport, Predicted, Predictor
 from companion.studies.prediction.delivery import deliver
@@ -85,11 +86,8 @@ class Learned:
         # Past the largest lead: straight flight at the velocity reached there.
         bend = acceleration * (lead_s * lead_s / 2 + lead_s * (max(since_s, lead_s) - lead_s))
         position = window.position_ned_m + window.velocity_ned_mps * since_s + bend
-        return Predicted(
-            position_ned_m=position,
-            velocity_ned_mps=window.velocity_ned_mps + acceleration * lead_s,
-            bound_m=None,
-        )
+        velocity = window.velocity_ned_mps + acceleration * lead_s
+        return Predicted(position_ned_m=position, velocity_ned_mps=velocity)
 
 
 def load(path: Path) -> Callable[[], Predictor]:
@@ -116,7 +114,7 @@ def load(path: Path) -> Callable[[], Predictor]:
 
 
 def examples(
-    seed: int, flights: int, progress: Callable[[str], None]
+    seed: int, flights: int, progress: Progress
 ) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Return training examples: windows of K reports with a known future.
 
@@ -156,10 +154,7 @@ def examples(
 
 
 def train(
-    seed: int = 1,
-    epochs: int = 30,
-    flights: int = FLIGHTS,
-    progress: Callable[[str], None] = lambda _text: None,
+    seed: int = 1, epochs: int = 30, flights: int = FLIGHTS, progress: Progress = silent
 ) -> tuple[dict[str, Any], float]:
     """Train a network: return the input of ``save``, and the loss of the last epoch (Huber, m).
 

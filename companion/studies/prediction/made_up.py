@@ -103,5 +103,4 @@ def _wander(
         values[k] = keep * values[k - 1] + fresh * drawn[k]
     width = round(0.5 / STEP_S)
     padded = np.concatenate([np.full(width - 1, values[0]), values])
-    smooth: FloatArray = about + np.convolve(padded, np.full(width, 1 / width), mode="valid")
-    return smooth
+    return about + np.convolve(padded, np.full(width, 1 / width), mode="valid")

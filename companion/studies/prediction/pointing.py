@@ -2,12 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Final, TypeVar
+from typing import Final, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from companion.beams.array.geometry import Array
+from companion.studies.origin import Row
 from companion.studies.prediction import hostile_link
 from companion.studies.prediction.baselines import ObservedReport, Predicted, Predictor
 from companion.studies.prediction.predictors import Product
@@ -19,8 +20,6 @@ from companion.values import FloatArray, Frame, IntArray, RoundTrip
 ASK_HZ: Final = 20
 HALF_BEAMWIDTH_DEG: Final = 0.79
 """Half-power half-width of 64 elements half a wavelength apart, broadside (docs/math.md 8.1)."""
-
-Row = dict[str, Any]
 
 
 @dataclass(frozen=True, slots=True, eq=False, kw_only=True)
@@ -41,9 +40,9 @@ class Questions:
 
     def every(self, step: int) -> "Questions":
         """Return every ``step``-th of the questions."""
-        return Questions(
+        return replace(
+            self,
             now_ns=self.now_ns[::step],
-            leads_ns=self.leads_ns,
             truth_ned_m=self.truth_ned_m[:, ::step],
             array_ned_m=self.array_ned_m[:, ::step],
             counts=self.counts[:, ::step],

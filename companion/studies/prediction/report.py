@@ -2,11 +2,13 @@
 
 import math
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from companion.studies.figures import plotting
+from companion.studies.figures.text_tables import decimal
+from companion.studies.origin import Progress
 from companion.studies.prediction import summary
 from companion.studies.prediction.comparison import LogComparison
 from companion.studies.prediction.pointing import HALF_BEAMWIDTH_DEG
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
 
 
 def files(
-    answer: dict[str, Any], found: Sequence[LogComparison], progress: Callable[[str], None]
+    answer: dict[str, Any], found: Sequence[LogComparison], progress: Progress
 ) -> dict[str, bytes]:
     """Return the page, and figures ``angle_`` and link name as SVG and PNG, by file name.
 
@@ -97,7 +99,7 @@ def _table(compared: LogComparison, measure: Measure) -> dict[str, Any]:
         (
             name,
             [
-                (summary.number(cell), cell is not None and cell == top)
+                (decimal(cell, 3), cell is not None and cell == top)
                 for cell, top in zip(row, best, strict=True)
             ],
         )

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 from enum import StrEnum
 from typing import Final
 
+from companion.studies.origin import Row
 from companion.studies.prediction.comparison import LogComparison
-from companion.studies.prediction.pointing import HALF_BEAMWIDTH_DEG, Row
+from companion.studies.prediction.pointing import HALF_BEAMWIDTH_DEG
 
 
 class Pool(StrEnum):
@@ -144,8 +145,3 @@ def broken(compared: LogComparison, predictor: str) -> str:
         return "no bound"
     keys = ("answers", "violations", "announced")
     return _beyond({key: sum(row[key] for row in rows) for key in keys})
-
-
-def number(value: float | None) -> str:
-    """Format a figure to three decimals; a dash without one."""
-    return "-" if value is None else f"{value:.3f}"

@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from companion.studies.figures.text_tables import text_table
+from companion.studies.figures.text_tables import decimal, text_table
 from companion.studies.prediction import summary
 from companion.studies.prediction.comparison import LogComparison
 from companion.studies.prediction.summary import MEASURES, pooled
@@ -21,7 +21,7 @@ def _text_table(compared: LogComparison) -> str:
     leads, predictors = summary.axes_of(compared)
     rows = [["", *(f"{lead_s:g} s" for lead_s in leads), "beyond bound"]]
     for name in predictors:
-        cells = [summary.number(pooled(compared.rows, name, lead_s)) for lead_s in leads]
+        cells = [decimal(pooled(compared.rows, name, lead_s), 3) for lead_s in leads]
         rows.append([name, *cells, summary.broken(compared, name)])
     title = f"{summary.title(compared)}: RMS angle error, degrees, at a lead of"
     return "\n".join(
@@ -35,7 +35,7 @@ def _text_measures(compared: LogComparison) -> str:
     rows = [["", *(measure.short for measure in MEASURES)]]
     for name in predictors:
         cells = (pooled(compared.rows, name, lead_s, measure) for measure in MEASURES)
-        rows.append([name, *map(summary.number, cells)])
+        rows.append([name, *(decimal(cell, 3) for cell in cells)])
     title = f"{summary.title(compared)}: at a lead of {lead_s:g} s; p95 and max of the worst UAV"
     return f"{title}\n{text_table(rows)}"
 

@@ -68,5 +68,4 @@ def _squares(
             if predicted is not None:
                 error = predicted.position_ned_m - few.truth_ned_m[lead, k]
                 found[lead, k] = np.sum(error * error, axis=-1)
-    squares: FloatArray = found[few.counts]
-    return squares
+    return found[few.counts]

@@ -10,8 +10,9 @@ from typing import Any, Final
 
 import numpy as np
 
+from companion.studies.origin import Row
 from companion.studies.prediction import hostile_link
-from companion.studies.prediction.pointing import Answers, Questions, Row
+from companion.studies.prediction.pointing import Answers, Questions
 from companion.values import BoolArray
 
 SAME_SECOND_NS: Final = 1_000_000_000
@@ -50,8 +51,7 @@ def announced(asked: Questions, given: Answers) -> BoolArray:
     """Return whether an assumption about the UAV was refuted before each question, (K,)."""
     if not given.refuted_ns:
         return np.zeros(len(asked.now_ns), dtype=bool)
-    found: BoolArray = asked.now_ns + SAME_SECOND_NS >= min(given.refuted_ns)
-    return found
+    return asked.now_ns + SAME_SECOND_NS >= min(given.refuted_ns)
 
 
 def _by_regime(

@@ -72,8 +72,7 @@ def lives(boot_ns: Times) -> IntArray:
     """Return the number of reboots before each stamp, (N,), found by backward steps."""
     if len(boot_ns) == 0:
         return np.zeros(0, dtype=np.int64)
-    found: IntArray = np.cumsum(np.diff(boot_ns, prepend=boot_ns[0]) < -REBOOT_STEP_NS)
-    return found
+    return np.cumsum(np.diff(boot_ns, prepend=boot_ns[0]) < -REBOOT_STEP_NS)
 
 
 def least(values: Times, starts: IntArray, stops: IntArray) -> Times:

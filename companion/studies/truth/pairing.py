@@ -13,7 +13,7 @@ therefore share one time shift, which the best evidence nearby sets:
    sometimes sends a truth message together with the message before it.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Final
 
 import numpy as np
@@ -52,14 +52,7 @@ class Brackets:
 
     def rows(self, chosen: NDArray[np.bool_]) -> "Brackets":
         """Return the brackets of selected messages."""
-        return Brackets(
-            arrival_ns=self.arrival_ns[chosen],
-            before_ns=self.before_ns[chosen],
-            after_ns=self.after_ns[chosen],
-            before_arrival_ns=self.before_arrival_ns[chosen],
-            after_arrival_ns=self.after_arrival_ns[chosen],
-            life=self.life[chosen],
-        )
+        return Brackets(**{one.name: getattr(self, one.name)[chosen] for one in fields(self)})
 
 
 def boot_times_ns(
@@ -117,8 +110,7 @@ def _times_between_s(position_ned_m: FloatArray, velocity_ned_mps: FloatArray) -
     along2 = np.sum(gained * mean, axis=1) ** 2 / speed2
     turned2 = np.clip((np.sum(gained * gained, axis=1) - along2) / speed2, 0.0, 1.0)
     way = np.sum(np.diff(position_ned_m, axis=0) * mean, axis=1)
-    found: FloatArray = np.where(fast, way / speed2 / (1 + turned2 / 12), np.nan)
-    return found
+    return np.where(fast, way / speed2 / (1 + turned2 / 12), np.nan)
 
 
 def _determined_ns(brackets: Brackets) -> FloatArray:

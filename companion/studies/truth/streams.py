@@ -5,8 +5,10 @@ Truth messages come from the simulator: SIM_STATE, and ArduPilot's older SIMSTAT
 """
 
 import struct
-from collections.abc import Iterator, Sequence
+from collections import defaultdict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import compress
 from pathlib import Path
 from typing import Final
 
@@ -23,8 +25,8 @@ from companion.values import Frame, GnssStatus, Report, RoundTrip
 
 SIM_STATE: Final = 108
 SIMSTATE: Final = 164
-_SIM_STATE = struct.Struct("<21fii")
-_SIMSTATE = struct.Struct("<9fii")
+_LAYOUTS: Final = {SIM_STATE: struct.Struct("<21fii"), SIMSTATE: struct.Struct("<9fii")}
+"""Fields of both: latitude and longitude in 1e-7 degrees last, in SIM_STATE a quaternion first."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +70,7 @@ class VehicleStream:
         default_factory=lambda: {SIM_STATE: [], SIMSTATE: []}
     )
     _newest: GnssStatus | None = None
-    _links: dict[str, _Order] = field(default_factory=dict)
+    _links: dict[str, _Order] = field(default_factory=lambda: defaultdict(_Order))
 
     def clock(self) -> BootClock:
         """Estimate the vehicle's boot clock from all stamps."""
@@ -77,9 +79,7 @@ class VehicleStream:
 
     def take(self, frame: Frame, dedupe: Dedupe) -> None:
         """Add a frame of the vehicle; ``dedupe`` holds the reports of all vehicles."""
-        order = self._links.get(frame.link)
-        if order is None:
-            order = self._links.setdefault(frame.link, _Order())
+        order = self._links[frame.link]
         if frame.msgid in self.said:
             if order.last is not None:
                 order.waiting.append((frame.msgid, frame.t_ns, frame.payload))
@@ -114,10 +114,10 @@ class VehicleStream:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TruthMessages:
-    """Truth messages of one kind in stream order: brackets and payloads."""
+    """Truth messages of one kind in stream order: brackets and fields."""
 
     brackets: Brackets
-    payloads: tuple[bytes, ...]
+    fields: list[tuple[float, ...]]
 
 
 def truth_messages(stream: VehicleStream, msgid: int, clock: BootClock) -> TruthMessages:
@@ -134,37 +134,21 @@ def truth_messages(stream: VehicleStream, msgid: int, clock: BootClock) -> Truth
         life=clock.life[before],
     )
     kept = (clock.life[before] == clock.life[after]) & (found.after_ns >= found.before_ns)
-    payloads = tuple(each.payload for each, keep in zip(said, kept.tolist(), strict=True) if keep)
-    return TruthMessages(found.rows(kept), payloads)
-
-
-def sim_state(payload: bytes) -> tuple[float, ...]:
-    """Decode a SIM_STATE: quaternion (4) first, latitude and longitude (1e-7 degrees) last."""
-    return _SIM_STATE.unpack(payload.ljust(_SIM_STATE.size, b"\0")[: _SIM_STATE.size])
-
-
-def simstate(payload: bytes) -> tuple[float, ...]:
-    """Decode a SIMSTATE; latitude and longitude in 1e-7 degrees come last."""
-    return _SIMSTATE.unpack(payload.ljust(_SIMSTATE.size, b"\0")[: _SIMSTATE.size])
+    layout = _LAYOUTS[msgid]
+    decoded = [
+        layout.unpack(each.payload.ljust(layout.size, b"\0")[: layout.size])
+        for each in compress(said, kept.tolist())
+    ]
+    return TruthMessages(found.rows(kept), decoded)
 
 
 def gather(logs: Sequence[Path]) -> dict[str, VehicleStream]:
     """Return the streams of a flight's logs, by vehicle that reports a position."""
-    found: dict[str, VehicleStream] = {}
+    found: dict[str, VehicleStream] = defaultdict(VehicleStream)
     dedupe = Dedupe()
-    for event in _events(logs):
-        name = str(event.source)
-        stream = found.get(name)
-        if stream is None:
-            stream = found.setdefault(name, VehicleStream())
-        if isinstance(event, RoundTrip):
-            stream.round_trips.append(event)
-        else:
-            stream.take(event, dedupe)
-    return {name: stream for name, stream in found.items() if stream.reports}
-
-
-def _events(logs: Sequence[Path]) -> Iterator[Frame | RoundTrip]:
     for event in read_flight(logs):
-        if isinstance(event, Frame | RoundTrip):
-            yield event
+        if isinstance(event, RoundTrip):
+            found[str(event.source)].round_trips.append(event)
+        elif isinstance(event, Frame):
+            found[str(event.source)].take(event, dedupe)
+    return {name: stream for name, stream in found.items() if stream.reports}

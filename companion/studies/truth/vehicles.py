@@ -23,8 +23,6 @@ from companion.studies.truth.streams import (
     SIMSTATE,
     VehicleStream,
     gather,
-    sim_state,
-    simstate,
     truth_messages,
 )
 from companion.studies.truth.trajectory import Times, Trajectory, ascending
@@ -168,7 +166,9 @@ def _flight(
     reports = stream.reports
     arrival_ns = np.array([report.t_ns for report in reports])
     boot_ms = np.array([report.boot_ms for report in reports])
-    position = np.array([_place(local, r.lat_deg, r.lon_deg, r.alt_m or 0.0) for r in reports])
+    position = np.array(
+        [local.position_ned_m(r.lat_deg, r.lon_deg, r.alt_m or 0.0) for r in reports]
+    )
     velocity = np.array([_velocity(local, report) for report in reports])
     height = np.array([np.nan if r.relative_alt_m is None else r.relative_alt_m for r in reports])
     clock = stream.clock()
@@ -176,18 +176,11 @@ def _flight(
     rows = {stamp: row for row, stamp in enumerate(stream.stamps)}
     numbers = [rows[r.t_ns, (r.boot_ms or 0) * 1_000_000] for r in reports]
     made_ns = clock.made_ns[numbers]
-    truth = _simulated(stream, clock, local)
-    if truth is None:
-        truth = _placed(
-            stream,
-            clock,
-            local,
-            made_ns=made_ns,
-            position_ned_m=position,
-            velocity_ned_mps=velocity,
-        )
-    if truth is None:
-        truth = ascending("reports", made_ns, position, velocity)
+    truth = (
+        _simulated(stream, clock, local)
+        or _placed(stream, clock, local, made_ns=made_ns, velocity_ned_mps=velocity)
+        or ascending("reports", made_ns, position, velocity)
+    )
     return Flight(
         uav=uav,
         arrival_ns=arrival_ns,
@@ -205,10 +198,6 @@ def _flight(
     )
 
 
-def _place(local: LocalFrame, lat_deg: float, lon_deg: float, alt_m: float) -> FloatArray:
-    return local.position_ned_m(lat_deg, lon_deg, alt_m)
-
-
 def _velocity(local: LocalFrame, report: Report) -> FloatArray:
     if report.velocity_ne_mps is None or report.velocity_down_mps is None:
         return np.full(3, np.nan)
@@ -221,8 +210,7 @@ def _simulated(stream: VehicleStream, clock: BootClock, local: LocalFrame) -> Tr
     """Return the trajectory by SIM_STATE messages; None without a valid position or time."""
     said = truth_messages(stream, SIM_STATE, clock)
     points, attitudes, kept = [], [], []
-    for payload in said.payloads:
-        fields = sim_state(payload)
+    for fields in said.fields:
         lat_deg, lon_deg, alt_m = fields[13:16]
         lat_1e7, lon_1e7 = fields[21:23]
         if lat_1e7 or lon_1e7:  # single precision resolves only half a metre
@@ -230,7 +218,7 @@ def _simulated(stream: VehicleStream, clock: BootClock, local: LocalFrame) -> Tr
         kept.append(bool(lat_deg or lon_deg))
         if kept[-1]:
             velocity = local.local_from_ned(lat_deg, lon_deg) @ np.array(fields[18:21])
-            points.append((_place(local, lat_deg, lon_deg, alt_m), velocity))
+            points.append((local.position_ned_m(lat_deg, lon_deg, alt_m), velocity))
             attitudes.append(fields[:4])
     if len(points) < 2:
         return None
@@ -248,7 +236,6 @@ def _placed(
     local: LocalFrame,
     *,
     made_ns: Times,
-    position_ned_m: FloatArray,
     velocity_ned_mps: FloatArray,
 ) -> Trajectory | None:
     """Return the trajectory by SIMSTATE, at the heights of the reports created at ``made_ns``.
@@ -257,7 +244,7 @@ def _placed(
     time.
     """
     said = truth_messages(stream, SIMSTATE, clock)
-    places = np.array([simstate(payload)[9:11] for payload in said.payloads]).reshape(-1, 2)
+    places = np.array([fields[9:11] for fields in said.fields]).reshape(-1, 2)
     kept: BoolArray = np.array(places.any(axis=1))
     if kept.sum() < 2:
         return None
@@ -273,7 +260,7 @@ def _placed(
     def track(at_ns: Times) -> FloatArray:
         heights_m = reported(alt_m, at_ns)
         rows = zip((places[kept] * 1e-7).tolist(), heights_m.tolist(), strict=True)
-        return np.array([_place(local, lat, lon, high_m) for (lat, lon), high_m in rows])
+        return np.array([local.position_ned_m(lat, lon, high_m) for (lat, lon), high_m in rows])
 
     roughly_ns = clock.node_ns(brackets.before_ns, brackets.life)
     level = track(roughly_ns)

@@ -137,8 +137,7 @@ class Heard:
         return None if self.estimate is None else self.estimate.fix.noise
 
     def _number(self, name: str) -> float | None:
-        found: float | None = getattr(self.said, name, None)
-        return found
+        return getattr(self.said, name, None)
 
 
 def heard(frame: Frame, outputs: Sequence[Output]) -> Heard | None:

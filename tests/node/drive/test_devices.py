@@ -11,7 +11,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import replace
 from types import SimpleNamespace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -29,7 +29,6 @@ from companion.node.drive import targets
 from companion.node.drive.adar1000 import Chips
 from companion.node.drive.gimbal import Gimbal, RoiGimbal
 from companion.node.drive.loop import (
-    NO_REPLIES,
     DeviceCommand,
     DeviceError,
     DeviceInput,
@@ -425,7 +424,7 @@ class Recorder:
 
     takes = DeviceInput.POINTING
     lead_s = None
-    rejected = NO_REPLIES
+    rejected: ClassVar = {}
 
     def __init__(self, clock: Ticking, takes_s: float = 0.0) -> None:
         self.did: list[str] = []

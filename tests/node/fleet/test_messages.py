@@ -89,7 +89,7 @@ def test_arbitrary_bytes_are_decoded_or_rejected(data: bytes) -> None:
 
 def test_implausible_messages_are_rejected() -> None:
     def standing(**fields: object) -> bytes:
-        made: bytes = schemas.StandingMessage(node="north", **fields).SerializeToString()
+        made: bytes = schemas.message_class("Standing")(node="north", **fields).SerializeToString()
         return made
 
     assert messages.to_standing(standing(), "north").serves == ()
@@ -109,13 +109,15 @@ def test_implausible_messages_are_rejected() -> None:
     ):
         with pytest.raises(FleetMessageError):
             messages.to_standing(wrong, node)
-    many = schemas.SharedMessage(frame=[{}] * (messages.FRAMES_MAX + 1)).SerializeToString()
+    many = schemas.message_class("Shared")(
+        frame=[{}] * (messages.FRAMES_MAX + 1)
+    ).SerializeToString()
     with pytest.raises(FleetMessageError, match="too many frames in one message"):
         messages.to_shared(many)
 
 
 def test_time_field_of_older_nodes_is_ignored() -> None:
-    now = schemas.StandingMessage(node="north", most=3).SerializeToString()
+    now = schemas.message_class("Standing")(node="north", most=3).SerializeToString()
     older = b"\x11" + b"\x01" * 8 + b"\x19" + b"\x02" * 8 + now
     assert messages.to_standing(older, "north") == messages.to_standing(now, "north")
 
@@ -125,7 +127,7 @@ def test_message_schema_is_published_and_documented() -> None:
     page = (Path(__file__).parents[3] / "docs" / "fleet.md").read_text(encoding="utf-8")
     for name in ("Shared", "Standing", "Offers", "Tracks"):
         assert f"companion.{name}" in page
-        assert name.encode() in schemas.SHARED.descriptor_set
+        assert name.encode() in schemas.schema("Shared").descriptor_set
 
 
 LARGE = {"shared": messages.to_shared, "offers": messages.to_offers}
@@ -143,9 +145,8 @@ def test_message_beyond_the_limit_is_not_parsed(name: str, monkeypatch: pytest.M
     largest = {"offers": messages.offers(offers), "shared": messages.shared(Shared(0, frames, ()))}
     LARGE[name](largest[name])
     parsed: list[int] = []
-    kind = {"shared": "SharedMessage", "offers": "OffersMessage"}[name]
     counting = type("Counting", (), {"FromString": lambda data: parsed.append(len(data))})
-    monkeypatch.setattr(schemas, kind, counting)
+    monkeypatch.setattr(schemas, "message_class", lambda _name: counting)
     with pytest.raises(FleetMessageError, match="has more than 2097152 bytes"):
         LARGE[name](bytes(messages.MESSAGE_MAX + 1))
     assert not parsed

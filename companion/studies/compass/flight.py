@@ -176,7 +176,7 @@ def _looks(case: Case, span_ns: tuple[int, int], rng: np.random.Generator) -> li
 def _flight(case: Case) -> _Flown:
     """Return a flight; without round trips in its logs, with those that would have been measured.
 
-    Raises ``UserError`` without the truth of the carrier and of a UAV.
+    Raises ``UserError`` without the truth of the carrier and of a UAV, and for a short flight.
     """
     events: list[Event] = []
     pipeline = Pipeline(case.settings)
@@ -198,6 +198,12 @@ def _flight(case: Case) -> _Flown:
             begins.append(int(flight.arrival_ns[flies[0]]))
     begins_ns = max(begins, default=events[0].t_ns) + round(WARM_UP_S * 1e9)
     ends_ns = min(begins_ns + round(case.seconds * 1e9), events[-1].t_ns)
+    if ends_ns - begins_ns <= case.settle_s * 1e9:
+        least_s = WARM_UP_S + case.settle_s
+        raise UserError(
+            f"{vehicles.named(case.logs)}: less than {least_s:.0f} s with all vehicles in the air;"
+            " give a longer flight"
+        )
     trips: list[RoundTrip] = []
     if not any(isinstance(event, RoundTrip) for event in events):
         for flight in flights:

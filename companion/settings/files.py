@@ -21,6 +21,10 @@ from companion.values import ComplexArray, FloatArray, UserError
 DEFAULT_DESIGN: Final = "kinematic_default.json"
 LARGEST_BYTES: Final = 1 << 24
 """Largest file that is read, bytes: a codebook of 1024 elements and as many beams."""
+_HEADER_ERRORS: Final = (
+    ValueError, TypeError, SyntaxError, RecursionError, OverflowError, TokenError,
+)  # fmt: skip
+"""What numpy raises for an invalid .npy header, which it reads as Python text."""
 
 
 def load(path: Path | None) -> Settings:
@@ -103,7 +107,7 @@ def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
         found = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
     except MemoryError as error:
         raise ConfigError(f"{where}: array is too large for the memory: {error}") from error
-    except (ValueError, TokenError) as error:  # the header is read as Python text
+    except _HEADER_ERRORS as error:
         first = str(error).splitlines()[0]
         raise ConfigError(f"{where}: not a .npy file of numbers: {first}") from error
     if found.dtype.kind not in kinds:

@@ -31,20 +31,31 @@ _DEEP: Final = re.compile(r"(?:\.[^.=,\n]*){16}")
 
 
 def read_toml(text: str, largest: int = LARGEST) -> dict[str, Any]:
-    """Parse TOML text. Raises ``UserError`` if the text is invalid or too large.
+    """Parse TOML text. Raises ``UserError`` if it is invalid, too large, or has a NUL character.
 
     ``largest`` is the limit on characters without strings and comments.
     """
     if not _is_readable(text, largest):
         raise UserError("TOML is too large or nested too deeply")
     try:
-        return tomllib.loads(text)
+        found = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise UserError(f"not TOML: {error}") from error
     except RecursionError as error:
         raise UserError("TOML is too large or nested too deeply") from error
     except ValueError as error:  # Python's limit on the digits of an integer
         raise UserError("TOML has a number of thousands of digits") from error
+    if _has_nul(found):
+        raise UserError("TOML has a NUL character; remove it")
+    return found
+
+
+def _has_nul(value: object) -> bool:
+    if isinstance(value, dict):
+        return any(_has_nul(key) or _has_nul(one) for key, one in value.items())
+    if isinstance(value, list):
+        return any(map(_has_nul, value))
+    return isinstance(value, str) and "\0" in value
 
 
 def _is_readable(text: str, largest: int) -> bool:

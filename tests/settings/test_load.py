@@ -17,8 +17,8 @@ from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
 from companion.pipeline import assembly
 from companion.settings.center import FixedCenter, HomeCenter, VehicleCenter, parse_center
-from companion.settings.files import load
-from companion.settings.model import BeamSettings, Settings
+from companion.settings.files import load, matrix_of
+from companion.settings.model import CODEBOOK, COUPLING, BeamSettings, Settings
 from companion.settings.section import ConfigError
 from companion.settings.tracking import ObserverSettings
 from companion.values import Normalisation, Power, Source, Widen, toml
@@ -212,6 +212,19 @@ def test_invalid_toml_is_reported(text: str) -> None:
     assert refusal(text).startswith("not TOML: ")
 
 
+@pytest.mark.parametrize(
+    "text",
+    [
+        '[array]\ncoupling = "a\\u0000b"',
+        '[signing]\nkeys = {"udpin:\\u0000" = "key"}',
+        '[links]\nrouters = ["\\U00000000"]',
+        '[recording]\ndirectory = "\\u0000"',
+    ],
+)
+def test_nul_character_is_rejected_before_it_names_a_file(text: str) -> None:
+    assert refusal(text) == "TOML has a NUL character; remove it"
+
+
 @pytest.mark.parametrize("text", ["[tracks]\ncoasting_s = 100\n", "[tracks]\nlost_s = 10\n"])
 def test_track_timeouts_out_of_order_are_rejected(text: str) -> None:
     """coasting_s <= stale_s <= lost_s; otherwise a state would be unreachable."""
@@ -252,7 +265,7 @@ def test_unreadable_settings_file_is_named(tmp_path: Path) -> None:
 # --- TOML round trip ----------------------------------------------------------------------------
 
 LINKS = ["udpin:[::]:14550", "tcp:ground.example:5760", 'serial:/dev/"tty" = 1:57600']
-SCALAR = st.characters(exclude_categories=["Cs"])
+SCALAR = st.characters(exclude_categories=["Cs"], exclude_characters="\0")
 
 
 @given(
@@ -387,6 +400,34 @@ def test_element_positions_are_read_into_the_settings(
     assert found.array.positions_m == tuple(map(tuple, rows))
     assert Settings.from_toml(found.to_toml(), "again") == found
     assert assembly.array(found).elements_m == pytest.approx(np.array(rows))
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "-" * 5000 + "1",
+        "{[]: 1}",
+        "{}\n  x\n y",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (%d, 3)}" % 2**70,
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (%d, 3)}" % 2**61,
+        "{'descr': '|O', 'fortran_order': False, 'shape': (1, 3)}",
+        "(" * 3000,
+    ],
+    ids=["nested", "unhashable", "indented", "beyond 64 bits", "exabytes", "objects", "brackets"],
+)
+@pytest.mark.parametrize("key", ["array.coupling", "array.positions", "codebook.file"])
+def test_hostile_npy_header_is_rejected_in_one_line(tmp_path: Path, key: str, header: str) -> None:
+    file = tmp_path / "hostile.npy"
+    file.write_bytes(b"\x93NUMPY\1\0" + len(header).to_bytes(2, "little") + header.encode())
+    section, _, name = key.partition(".")
+    kind = {"positions": 'kind = "list"', "file": 'kind = "file"'}.get(name, "")
+    config = tmp_path / "settings.toml"
+    config.write_text(f'[{section}]\n{kind}\n{name} = "{file}"\n', encoding="utf-8")
+    with pytest.raises(ConfigError, match="npy") as raised:
+        found = load(config)
+        for one in (COUPLING, CODEBOOK):
+            matrix_of(found, one)
+    assert "\n" not in str(raised.value)
 
 
 @pytest.mark.parametrize(

@@ -8,8 +8,10 @@ Over 300 lines: all messages meet here, between the pipeline and Zenoh's keys.
 import asyncio
 import time
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Final
 
+from companion.mavlink.links.to_loop import ToLoop
 from companion.mavlink.links.zenoh_bus import Bus, open_peer
 from companion.node.fleet import messages
 from companion.node.fleet.answering import Unanswered
@@ -23,7 +25,8 @@ from companion.pipeline.fleet.surroundings import Surroundings
 from companion.pipeline.fold import Pipeline
 from companion.recording import fields, schemas
 from companion.settings.fleet import FleetSettings, is_node_name
-from companion.values import Event, Frame, Notice, RoundTrip, Severity, UserError
+from companion.values import Event, Frame, Notice, RoundTrip, Severity, Shared, UserError
+from companion.values.budget import Budget
 from companion.views.served import FleetStatus
 
 PREFIX: Final = "companion"
@@ -37,6 +40,10 @@ RETRY_S: Final = 2.0  # time between two attempts to reopen a session
 PATIENCE_LEASES: Final = 4.0  # the same limit in leases
 LOOK_S: Final = 0.3
 """Time between two batches of offers, not a multiple of the update interval."""
+NODE_BYTES_PER_S: Final = 500_000  # bytes of messages of one node that are parsed
+PIECE: Final = 16  # frames of a message that are processed in one piece
+WAITING_MAX: Final = 1000
+"""Frames of other nodes that wait; while more do, further messages are discarded and counted."""
 OFFERED_S: Final = 1.0  # time between two messages of offers, and of tracks
 
 
@@ -87,7 +94,10 @@ class LiveFleetNode:
         self._flush_ns = 0  # due time of the flush
         self._has_duplicate = False
         self._warned: set[str] = set()
+        self._budgets: dict[str, Budget] = {}
         self._listening: Listening | None = None
+        self._slices: ToLoop | None = None  # pieces of messages of frames
+        self._waiting = 0  # frames in them
         patience_s = max(PATIENCE_S, PATIENCE_LEASES * settings.lease_s)
         self._unanswered = Unanswered(round(patience_s * 1e9))
 
@@ -118,14 +128,17 @@ class LiveFleetNode:
     async def _take_part(self) -> None:
         """Run in the fleet with one session, until it must be renewed (``answering.py``)."""
         bus = Bus(self._config, asyncio.get_running_loop(), self._session)
+        slices = ToLoop(asyncio.get_running_loop())
         try:
             if self._session is None:
                 await asyncio.to_thread(bus.open)
             self._bus = bus
+            self._slices, self._waiting = slices, 0
             self._declare(bus)
             async with asyncio.TaskGroup() as group:
                 tasks = [
                     group.create_task(bus.run(), name="zenoh"),
+                    group.create_task(slices.run(), name="frames"),
                     group.create_task(
                         self._repeat(STANDING_S, self._publish_standing), name="standing"
                     ),
@@ -138,7 +151,8 @@ class LiveFleetNode:
                 for task in tasks:
                     task.cancel()
         finally:
-            self._bus = self._listening = self._session = None
+            slices.end()
+            self._bus = self._listening = self._session = self._slices = None
             self._unanswered.alive.clear()
             if self._flushing is not None:
                 self._flushing.cancel()
@@ -313,6 +327,7 @@ class LiveFleetNode:
             self._heard.bytes += len(payload)
             try:
                 if node is not None:
+                    self._spend(node, len(payload))
                     take(node, payload)
             except FleetMessageError as error:
                 self.damaged += 1
@@ -320,9 +335,43 @@ class LiveFleetNode:
 
         return taken
 
+    def _spend(self, node: str, size: int) -> None:
+        """Use a node's budget of bytes; names beyond ``NODES_MAX`` share one.
+
+        Raises ``FleetMessageError`` if it is exhausted.
+        """
+        known = node if node in self._budgets or len(self._budgets) < NODES_MAX else ""
+        budget = self._budgets.setdefault(
+            known, Budget(per_s=NODE_BYTES_PER_S, most=messages.MESSAGE_MAX)
+        )
+        if not budget.spend(size, self._now_ns() * 1e-9):
+            raise FleetMessageError(f"more than {NODE_BYTES_PER_S // 1000} kB/s of messages")
+
     def _shared(self, node: str, payload: bytes) -> None:
+        """Process a few frames at once, and the others in slices, in the order of arrival."""
+        said = messages.to_shared(payload)
+        if self._waiting > WAITING_MAX:
+            self.member.reception.unusable += len(said.frames)
+            return
+        starts = range(0, max(len(said.frames), 1), PIECE)
+        pieces = [
+            Shared(said.told_ns, said.frames[at : at + PIECE], () if at else said.trips)
+            for at in starts
+        ]
+        if not self._waiting:
+            self._take_piece(node, pieces.pop(0))
+        if self._slices is not None:
+            for piece in pieces:
+                self._waiting += len(piece.frames)
+                self._slices.post(partial(self._take_waiting, node, piece))
+
+    def _take_waiting(self, node: str, piece: Shared) -> None:
+        self._waiting -= len(piece.frames)
+        self._take_piece(node, piece)
+
+    def _take_piece(self, node: str, piece: Shared) -> None:
         now_ns = self._now_ns()
-        events, notices = self.member.take_shared(now_ns, node, messages.to_shared(payload))
+        events, notices = self.member.take_shared(now_ns, node, piece)
         for event in events:
             self._step(event)
         self._notify_all(notices)

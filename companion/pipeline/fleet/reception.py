@@ -74,7 +74,7 @@ class Reception:
     ``behind_ns`` is the age of this node's newest frame when it was read: a vehicle whose reports
     are still queued here is not silent. Otherwise an overloaded node would also use all shared
     frames, and be more overloaded. ``unusable`` counts shared frames and round trips that
-    are damaged, or older than ``OLDEST_NS``.
+    are damaged, older than ``OLDEST_NS``, or more than this node can process.
     """
 
     def __init__(self) -> None:

@@ -14,6 +14,7 @@ from link_support import LOOPS, runner
 from pymavlink.dialects.v20 import common
 from support import HANG_S, examples, free_port, run_async
 
+from companion.mavlink.links.to_loop import ToLoop
 from companion.mavlink.links.zenoh_bus import open_peer
 from companion.mavlink.links.zenoh_config import BusConfig
 from companion.node.fleet import live, messages
@@ -35,6 +36,7 @@ from companion.values import (
     RoundTrip,
     Severity,
     Shared,
+    SharedFrame,
     Source,
     Standing,
     UserError,
@@ -346,6 +348,42 @@ def test_malformed_samples_are_counted_and_reported_once_for_each_node() -> None
         " counted",
     ]
     assert {one.severity for one in notices} == {Severity.WARNING}
+
+
+def test_message_of_many_frames_is_processed_in_slices() -> None:
+    """While many frames wait, further messages are discarded and counted."""
+    taken: list[int] = []
+
+    async def receive() -> LiveFleetNode:
+        member = node(mode="client", connect=["tcp/127.0.0.1:1"])
+        member._slices = ToLoop(asyncio.get_running_loop())
+        member._take_piece = lambda _, piece: taken.append(len(piece.frames))  # type: ignore[method-assign]
+        many = messages.shared(Shared(S, (SharedFrame(S, bytes(20)),) * messages.FRAMES_MAX))
+        member._shared("south", many)
+        assert taken == [live.PIECE]
+        member._shared("south", many)
+        assert member.member.reception.unusable == messages.FRAMES_MAX
+        while member._waiting:
+            await asyncio.sleep(0)
+        return member
+
+    run_async(receive())
+    assert sum(taken) == messages.FRAMES_MAX
+    assert max(taken) == live.PIECE
+
+
+def test_messages_of_a_node_beyond_its_budget_are_not_parsed() -> None:
+    """Other nodes do not notice."""
+    notices: list[Notice] = []
+    taken: list[str] = []
+    member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
+    take = member._valid_only(lambda who, _: taken.append(who))
+    for _ in range(10):
+        take("companion/site/south/offers", bytes(messages.MESSAGE_MAX // 4))
+    take("companion/site/west/offers", b"")
+    assert taken == ["south"] * 4 + ["west"]
+    assert member.damaged == 6
+    assert ["more than 500 kB/s of messages" in one.text for one in notices] == [True]
 
 
 def test_malformed_clock_answer_is_counted_and_reported() -> None:

@@ -88,9 +88,9 @@ def mount(
 ) -> None:
     """Suggest the mount of an array from what its receiver measured in a flight.
 
-    RECORDING contains observations (`[observations]`). While the carrier flies with different
-    headings, the mount's part of the error is told from the compass's. A person compares the
-    suggestion with the array and writes it into the settings.
+    LOG is a recording with observations (`[observations]`). If the carrier flies with different
+    headings, the error of the mount can be separated from that of the compass. Compare the
+    suggestion with the array before you write it into the settings.
 
     Example: companion calibrate mount recordings/flight.mcap
     """

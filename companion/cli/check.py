@@ -38,8 +38,9 @@ def check(
 ) -> None:
     """Check whether `companion run` would work here with the same options.
 
-    Checks settings, ports, devices, disk and clock, then listens for traffic. Exit status 1 if a
-    fault would stop a run or leave it without beams.
+    Checks settings, ports, devices, disk and clock, then listens for traffic; it sends what
+    [presence] in the settings enables. Each line begins with ok, doubt (a run works, but not as
+    well as it could) or fault. Exit status 1: a fault would stop a run or leave it without beams.
 
     Example: companion check --config settings.toml
     """

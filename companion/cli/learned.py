@@ -13,8 +13,10 @@ from companion.cli.console import JSON, SEED, Progress
     "--out", type=click.Path(path_type=Path, dir_okay=False), metavar="FILE", required=True
 )
 @SEED
-@click.option("--epochs", type=click.IntRange(min=1), default=30)
-@click.option("--flights", type=click.IntRange(min=1), default=240)
+@click.option("--epochs", type=click.IntRange(min=1), default=30, help="Number of training epochs.")
+@click.option(
+    "--flights", type=click.IntRange(min=1), default=240, help="Number of synthetic flights."
+)
 @JSON
 def train(out: Path, seed: int, epochs: int, flights: int, as_json: bool) -> None:
     """Train the LSTM predictor on random synthetic flights. Needs PyTorch: the extra [learned].

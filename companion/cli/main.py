@@ -118,7 +118,9 @@ def _output(as_json: bool) -> "Console":
 
 @main.command()
 @SECONDS
-@click.option("--port", type=click.IntRange(0, 65535), default=8080)
+@click.option(
+    "--port", type=click.IntRange(0, 65535), default=8080, help="Port of the page; 0: any free one."
+)
 @click.option("--open", "open_page", is_flag=True, help="Open the page in a browser.")
 @JSON_LINES
 def demo(seconds: float | None, port: int, open_page: bool, as_json: bool) -> None:
@@ -277,7 +279,9 @@ def _speed(text: str) -> float | None:
     except ValueError:
         factor = 0.0
     if not 0 < factor < float("inf"):
-        raise click.BadParameter(f"{shown(text)} is neither max nor a positive number")
+        raise click.BadParameter(
+            f"{shown(text)} is neither max nor a positive number", param_hint="'--speed'"
+        )
     return factor
 
 

@@ -30,11 +30,11 @@ def compass(
     seed: int,
     progress: Progress,
 ) -> Studied:
-    """Measure what an array's receiver tells about the carrier's attitude.
+    """Evaluate how well an array's receiver determines the carrier's attitude.
 
-    A model of the receiver measures UAVs of a flight within a bound, for several receivers, errors
-    of the mount and numbers of UAVs. Compares beams with these measurements, beams without, a
-    Kalman filter and the truth. Needs SIM_STATE of the carrier and of UAVs. Writes
+    Simulates a receiver that measures the UAVs of a flight within a bound. Varies the receiver,
+    the error of the mount and the number of UAVs. Compares beams with these measurements, beams
+    without them, a Kalman filter and the truth. Needs SIM_STATE of the carrier and of UAVs. Writes
     DIR/compass.json, DIR/compass.html and the figures as PNG and SVG. Takes minutes.
 
     Example: companion study compass flight.tlog --center 5:1 --out report

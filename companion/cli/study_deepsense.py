@@ -15,8 +15,9 @@ from companion.cli.study_output import Studied, study_output
 def deepsense(where: Path, seed: int, progress: Progress) -> Studied:
     """Predict the best beam from the position, on a scenario of DeepSense 6G.
 
-    Splits the samples into contiguous blocks and, for comparison, at random, which leaks. Writes
-    DIR/deepsense.json, DIR/deepsense.html and the figure as PNG and SVG. Takes minutes.
+    Splits the samples into training and test sets by contiguous blocks. For comparison, also splits
+    them at random, which leaks training data into the test set. Writes DIR/deepsense.json,
+    DIR/deepsense.html and the figure as PNG and SVG. Takes minutes.
 
     Example: companion study deepsense scenario23_pos_beam.csv --out report
     """

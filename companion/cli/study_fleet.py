@@ -29,8 +29,20 @@ def _steps(span: tuple[int, int], steps: int) -> list[int]:
 
 
 @click.command()
-@click.option("--nodes", callback=_span, metavar="FROM..TO", default="3..30")
-@click.option("--uavs", callback=_span, metavar="FROM..TO", default="100..1000")
+@click.option(
+    "--nodes",
+    callback=_span,
+    metavar="FROM..TO",
+    default="3..30",
+    help="Number of nodes of the smallest and of the largest fleet.",
+)
+@click.option(
+    "--uavs",
+    callback=_span,
+    metavar="FROM..TO",
+    default="100..1000",
+    help="Number of UAVs of the smallest and of the largest fleet.",
+)
 @click.option(
     "--steps",
     type=click.IntRange(1, 20),

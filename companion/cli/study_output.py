@@ -29,7 +29,13 @@ def study_output(name: str) -> Callable[[Callable[..., Studied]], Callable[..., 
     """
 
     def decorate(study: Callable[..., Studied]) -> Callable[..., None]:
-        @click.option("--out", type=click.Path(path_type=Path), metavar="DIR", required=True)
+        @click.option(
+            "--out",
+            type=click.Path(path_type=Path),
+            metavar="DIR",
+            required=True,
+            help="Folder for the results.",
+        )
         @JSON
         @wraps(study)
         def command(*, out: Path, as_json: bool, **options: Any) -> None:

@@ -62,7 +62,7 @@ def check(
     urls = [url for url in settings.links.urls if url not in faulty]
     if not settings.links.urls:
         yield Finding.fault(
-            "links", "none", "give --link udpin:0.0.0.0:14550, or set `[links] urls`"
+            "links", "none is set", "give --link udpin:0.0.0.0:14550, or set `[links] urls`"
         )
     if urls and seconds > 0:
         show(f"listening for {seconds:g} s")
@@ -191,8 +191,8 @@ def _uavs(service: Service) -> Iterator[Finding]:
     verdicts = shown_verdicts(service.pipeline.health, overload(service, service.now_ns()))
     shown = [one for one in uav_state.states(service, service.now_ns()) if one.target]
     if not shown:
-        remedy = "wait for a position fix; see `rejected` in /v1/status"
-        yield Finding.fault("UAVs", "no UAV for which a beam is wanted was received", remedy)
+        remedy = "check that the UAVs have a GNSS fix, and that `[tracks]` allows them"
+        yield Finding.fault("UAVs", "no report of a UAV that is a target of beams", remedy)
     for one in shown:
         track = one.track
         name, dt_s = track.uav, track.dt_s

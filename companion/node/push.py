@@ -131,7 +131,7 @@ class Push:
                 self._refused[text] += 1
                 if self._refused[text] >= RECOVERED_AFTER:
                     del self._refused[text]
-                    self._notify_state(Severity.INFO, f"records to {text} are sent again")
+                    self._notify_state(Severity.INFO, f"records to {text} can be sent again")
 
     def _notify_state(self, severity: Severity, text: str) -> None:
         self._notify(Notice(t_ns=self._now_ns(), severity=severity, subject="records", text=text))

@@ -43,6 +43,13 @@ from companion.values import UserError, read_toml, shown
 
 MIN_SIMILARITY: Final = 0.7
 """Least similarity (difflib's ratio) of a setting that is suggested for an unknown one."""
+_ALLOWED: Final = {
+    "dict_type": "give a table",
+    "missing": "too few values",
+    "model_type": "give a table",
+    "tuple_type": "give a list",
+}
+"""Allowed values in TOML's words, by the type of an error that Pydantic words for Python."""
 
 REPLAYED_SECTIONS: Final = frozenset(
     (
@@ -260,6 +267,8 @@ def _first(error: ValidationError) -> str:
     key = ".".join(map(str, place))
     if errors[0]["type"] == "extra_forbidden":
         return f"{key} is not a setting{_suggestion(place)}"
-    said = [wrong["msg"] for wrong in errors if wrong["loc"][:2] == place]
+    said = [
+        _ALLOWED.get(wrong["type"], wrong["msg"]) for wrong in errors if wrong["loc"][:2] == place
+    ]
     allowed = dict.fromkeys(text.removeprefix("Value error, ") for text in said)
     return f"{key} = {shown(errors[0]['input'])}: {', or '.join(allowed)}"

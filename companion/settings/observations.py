@@ -16,7 +16,7 @@ def _address(text: str) -> str:
 class ObservationSettings(Section):
     """Measurements of the array's own receiver, which confine the carrier's attitude.
 
-    enabled         accept observations over HTTP (a token is needed) and UDP
+    enabled         accept observations over HTTP (with the token, if one is set) and UDP
     udp             address (IP:PORT) at which binary observations are received; None: none
     oldest_s        largest age of an observation on arrival, seconds
     drift_max_degps largest rate at which the error of reported attitudes changes, degrees per

@@ -48,7 +48,7 @@ class Normalisation(DescribedEnum):
     UNIT_RESPONSE = ("unit-response", "each UAV receives 1 from its own column, as in the paper")
     STREAM = "stream", "each column has unit power"
     TOTAL = "total", "all columns together have unit power, by one common factor"
-    ANTENNA = "antenna", "the busiest element has power 1/M, by one common factor"
+    ANTENNA = "antenna", "the element with the most power has 1/M, by one common factor"
 
 
 class Policy(DescribedEnum):
@@ -117,7 +117,7 @@ class Beam:
         ),
     ]
     gain_db: Annotated[
-        float, Meaning("array gain towards the predicted direction, over one element", 6)
+        float, Meaning("array gain towards the predicted direction, over an isotropic element", 6)
     ]
     loss_db: Annotated[float, Meaning("gain lost against a beam for this UAV alone", 10)]
     group: Annotated[int, Meaning("time slot in which the beam is applied, from 0", 11)] = 0

@@ -24,14 +24,16 @@ class BeamPattern:
     uav: Annotated[str, Meaning("UAV of the beam", example="3:1")]
     at_deg: Annotated[float, Meaning("the other angle of the cut, which is constant")]
     target_deg: Annotated[float, Meaning("the UAV's own angle along the cut")]
-    response_db: Annotated[list[float], Meaning("response at each angle, over one element")]
+    response_db: Annotated[
+        list[float], Meaning("response at each angle, over an isotropic element")
+    ]
     peak_azimuth_deg: Annotated[float, Meaning("azimuth of the peak")]
     peak_elevation_deg: Annotated[float, Meaning("elevation of the peak")]
-    peak_db: Annotated[float, Meaning("response at the peak, over one element")]
+    peak_db: Annotated[float, Meaning("response at the peak, over an isotropic element")]
     half_power_beamwidth_deg: Annotated[float | None, Meaning("width 3 dB below the peak")]
     side_lobe_db: Annotated[float | None, Meaning("largest side lobe below the peak")]
     null_depths_db: Annotated[
-        dict[str, float], Meaning("response towards each other UAV, over one element")
+        dict[str, float], Meaning("response towards each other UAV, over an isotropic element")
     ]
 
 

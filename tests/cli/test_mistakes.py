@@ -119,7 +119,7 @@ SAYS: list[tuple[str, int, str]] = [
     ("run --center 5:1 --link serial:/dev/ttyUSB0", 1, "a baud rate is missing"),
     ("run --center 5:1 --link tcp:localhost", 1, "did you mean tcp:localhost:14550?"),
     ("run --center 5:1 --link udpin:0.0.0.0:99999", 1, "99999 is not a port"),
-    ("run --center 5:1 --link udpin:::1:14550", 1, "put the IPv6 host in brackets"),
+    ("run --center 5:1 --link udpin:::1:14550", 1, "put an IPv6 host, and no other, in brackets"),
     ("run --center 5:1 --link udpin:0.0.0.0:0 --listen 8080", 1, "is not HOST:PORT"),
     ("run --center 5:1 --link udpin:0.0.0.0:0 --listen 0.0.0.0:0", 1, "set COMPANION_TOKEN"),
     ("demo --seconds 0", 2, "0.0 is not in the range"),

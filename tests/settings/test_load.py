@@ -41,7 +41,7 @@ WRONG = [
     ("center", "source", '"300:1"', "300:1", "at most 255"),
     ("center", "source", '"91,0,0"', "91,0,0", "latitude must be -90..90"),
     ("center", "source", "5", "5", "string"),
-    ("links", "urls", '"udpin:0.0.0.0:1"', "udpin", "tuple"),
+    ("links", "urls", '"udpin:0.0.0.0:1"', "udpin", "list"),
     ("links", "urls", "[7]", "7", "string"),
     ("links", "urls", '["udpin:x"]', "udpin:x", "udpin:HOST:PORT"),
     ("presence", "enabled", '"always"', "always", "boolean"),
@@ -93,7 +93,7 @@ WRONG = [
     ("array", "spacing_m", "0", "0", "greater than 0"),
     ("array", "element", '"dipole"', "dipole", "'isotropic', 'cosine' or '3gpp'"),
     ("array", "element_exponent", "-1", "-1", "greater than or equal to 0"),
-    ("array", "lever_arm_m", "[1, 2]", "1, 2", "required"),
+    ("array", "lever_arm_m", "[1, 2]", "1, 2", "too few"),
     ("array", "field_of_view_deg", "361", "361", "less than or equal to 360"),
     ("array", "azimuth_limits_deg", "[30, -30]", "30, -30", "from < to"),
     ("array", "dead", "[-1]", "-1", "greater than or equal to 0"),
@@ -157,6 +157,19 @@ def test_weights_hz_accepts_all_or_positive(value: str) -> None:
     ],
 )
 def test_unknown_key_is_named(text: str, said: str) -> None:
+    assert refusal(text) == said
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("links = 3\n", "links = 3: give a table"),
+        ("[tracks]\nallow = '3:1'\n", "tracks.allow = '3:1': give a list"),
+        ("[observer]\nuav = 3\n", "observer.uav = 3: give a table"),
+        ("[array]\nhidden_deg = [[1, 2, 3]]\n", "array.hidden_deg = [1, 2, 3]: too few values"),
+    ],
+)
+def test_wrong_type_is_described_in_the_words_of_toml(text: str, said: str) -> None:
     assert refusal(text) == said
 
 

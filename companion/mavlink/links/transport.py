@@ -200,7 +200,7 @@ class Link:
         if isinstance(splitter, ForeignSplitter) and not self.url.listens:
             began_ns = splitter.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
-                raise StalledError(f"no complete message in the bytes of {UNFINISHED_S} s")
+                raise StalledError(f"no complete message in {UNFINISHED_S} s of data")
         return splitter.has_more
 
     def _count_stale(self, key: Hashable, data: bytes) -> None:

@@ -117,7 +117,9 @@ def parse_link(text: str, schemes: Collection[Scheme] = SCHEMES) -> LinkUrl:
     bracketed = host.startswith("[") and host.endswith("]")
     host = host[1:-1] if bracketed else host
     if (":" in host) is not bracketed:
-        raise LinkError(f"{shown(text)}: put the IPv6 host in brackets, as in udpin:[::]:14550")
+        raise LinkError(
+            f"{shown(text)}: put an IPv6 host, and no other, in brackets: udpin:[::]:14550"
+        )
     if not (_is_ipv6(host) if bracketed else _may_be_a_name(host)):
         raise LinkError(f"{shown(text)}: {shown(host)} is not a valid host name or address")
     url = LinkUrl(scheme=cast(Scheme, scheme), host=host, port=int(port), way=way, path=path)
@@ -179,6 +181,9 @@ def _suggestion(text: str) -> str:
     near = difflib.get_close_matches(scheme, SCHEMES, 1, 0.5)
     if near and scheme not in SCHEMES:
         return f"; did you mean {near[0]}:?"
+    if scheme in SCHEMES and address.isdecimal():
+        host = "0.0.0.0" if scheme in ("udpin", "tcpin") else "HOST"
+        return f"; did you mean {scheme}:{host}:{address}?"
     if scheme in SCHEMES and address and ":" not in address:
         return f"; did you mean {scheme}:{address}:{_USUAL_PORTS.get(scheme, 14550)}?"
     return ""

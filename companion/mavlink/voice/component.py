@@ -112,7 +112,7 @@ class ComponentSpec:
                 " an onboard computer is 191"
             )
         if self.carrier == self.source:
-            raise UserError(f"carrier is {self.carrier}, the source itself; allowed: another one")
+            raise UserError(f"carrier {self.carrier} has this service's own id; name another one")
         for name, rate_hz in (("position_hz", self.position_hz), ("attitude_hz", self.attitude_hz)):
             if rate_hz is not None and not _RATES_HZ[0] <= rate_hz <= _RATES_HZ[1]:
                 raise UserError(f"{name} is {rate_hz}, allowed: 0.1 to 100")

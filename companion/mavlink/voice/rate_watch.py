@@ -271,7 +271,7 @@ class Watch:
     ) -> list[Notice]:
         """Handle a rate that stays slow: it changed, or the last request did not help."""
         comes = "is not sent" if observed_hz is None else f"is sent at {observed_hz:.2g} Hz"
-        text = f"{self.uav}: {_NAMES[self.msgid]} {comes}, not at {self.wanted_hz:g} Hz: "
+        text = f"{self.uav}: {_NAMES[self.msgid]} {comes}, requested at {self.wanted_hz:g} Hz: "
         if self._was_in_order:
             self._was_in_order = False
             self.changed_by = self._cause_of_change(since_ns, others)

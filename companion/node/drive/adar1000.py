@@ -69,7 +69,9 @@ class Chips(Device):
         chips: list[list[tuple[int, int, int]]] = [[] for _ in self._places]
         if registers[:, 0].max() >= len(chips):
             needed = registers[:, 0].max() + 1
-            raise UserError(f"adar1000: {len(chips)} chips given, the array has {needed}; list all")
+            raise UserError(
+                f"adar1000: {len(chips)} chips given, the array needs {needed}; list all"
+            )
         for chip, _, _, _, gain, attenuated, i, q in registers.tolist():
             chips[chip].append((gain | (0 if attenuated else BYPASSED), i, q))
         self._send(chips)

@@ -28,7 +28,7 @@ class ColumnKind(StrEnum):
     NUMBER = "number"
     TIME = "time"
     INTEGER = "integer"
-    TRUTH = "truth"
+    TRUTH = "boolean"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

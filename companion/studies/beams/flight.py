@@ -54,7 +54,7 @@ class BeamStudy(StudiedLogs):
         if not set(self.links) <= set(known):
             raise UserError(f"--links {','.join(self.links)}: give some of {', '.join(known)}")
         if not 0 < self.hz <= 1000:
-            raise UserError(f"--hz {self.hz:g}: give looks per second, above 0 and at most 1000")
+            raise UserError(f"--hz {self.hz:g}: give updates per second, above 0 and at most 1000")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

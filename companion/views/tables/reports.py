@@ -81,7 +81,7 @@ class Heard:
         return None if self.estimate is None else self.estimate.fix.t_ns
 
     @property
-    def latency_s(self) -> Annotated[float | None, Meaning("time from `true` to the arrival")]:
+    def latency_s(self) -> Annotated[float | None, Meaning("time from `true_utc` to the arrival")]:
         return None if self.true_ns is None else (self.frame.t_ns - self.true_ns) * 1e-9
 
     @property

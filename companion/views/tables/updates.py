@@ -37,7 +37,7 @@ class UpdateRow(_OfUpdate):
         return self.update.unfit
 
     @property
-    def tracks(self) -> Annotated[int, Meaning("UAVs to point at")]:
+    def tracks(self) -> Annotated[int, Meaning("UAVs that are targets of beams")]:
         return len(self.update.tracks)
 
     @property
@@ -94,7 +94,7 @@ UPDATES: Final = Table(
 )
 TRACKS: Final = Table(
     name="tracks",
-    row_is="a UAV to point at, at an update, as it is when beams are applied",
+    row_is="a UAV that is a target of beams, at an update, predicted to the time of its beam",
     row_class=TrackRow,
     former_names={
         "north_m": "position_north_m",

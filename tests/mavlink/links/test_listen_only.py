@@ -213,7 +213,7 @@ def test_server_that_drips_bytes_is_announced_once_and_reconnected(
         ):
             for _ in range(2):
                 await drip(link, await accepted.get())
-            why = "no complete message in the bytes of 10 s"
+            why = "no complete message in 10 s of data"
             connection = await accepted.get()
             assert inbox.texts == [f"link {url} is down: {why}; trying again"]
             assert sum(one.count for one in inbox.rejections) == 2 * 12
@@ -252,7 +252,7 @@ def test_server_of_another_protocol_is_announced_and_counted(
                     assert len(peer.splitter._pending) <= 32_768  # type: ignore[attr-defined]
                 clock.t_ns += 1_000_000_000
             await inbox.until_said(1)
-            assert "no complete message in the bytes of 10 s" in inbox.texts[0]
+            assert "no complete message in 10 s of data" in inbox.texts[0]
             await accepted.get()
             # White space between events is no garbage, and pieces may end in it.
             garbage = link.status.lost[Reason.GARBAGE]
@@ -296,7 +296,7 @@ def test_web_server_without_valid_documents_is_announced(
         answer = b"HTTP/1.0 200 OK\r\n\r\n<html>"
         async with answering(answer) as (url, _), running(url, lambda: next(clock)) as (_, inbox):
             await inbox.until_said(1)
-            assert "no complete message in the bytes of 10 s" in inbox.texts[0]
+            assert "no complete message in 10 s of data" in inbox.texts[0]
             seen = len(inbox.items)
             await inbox.until_true(lambda: len(inbox.items) > seen + 3)  # it is still polled
             assert len(inbox.texts) == 1

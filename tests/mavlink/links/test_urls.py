@@ -126,6 +126,8 @@ def test_invalid_link_url_is_reported_in_one_line(text: str) -> None:
         ("reedsb:radar.lan:30005", "readsb:?"),
         ("cot:tak.lan:8087", "cot:udp:tak.lan:8087, which listens, or cot:tcp:tak.lan:8087?"),
         ("udp:14550", "udpin:0.0.0.0:14550, which listens?"),
+        ("udpin:14550", "udpin:0.0.0.0:14550?"),
+        ("tcp:5760", "tcp:HOST:5760?"),
     ],
 )
 def test_link_url_error_suggests_a_correction(text: str, meant: str) -> None:

@@ -173,7 +173,7 @@ def test_too_few_chips_are_rejected(
         now_ns=Ticking().now_ns,
         say=print,
     )
-    with pytest.raises(UserError, match="1 chips given, the array has 2"):
+    with pytest.raises(UserError, match="1 chips given, the array needs 2"):
         drive.run(threading.Event())
 
 

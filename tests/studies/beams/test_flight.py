@@ -648,8 +648,8 @@ def test_two_logs_are_tabulated_and_plotted_separately(short: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--hz", "0"], "--hz 0: give looks per second, above 0"),
-        (["--hz", "nan"], "--hz nan: give looks per second"),
+        (["--hz", "0"], "--hz 0: give updates per second, above 0"),
+        (["--hz", "nan"], "--hz nan: give updates per second"),
         (["--hz", "x"], "'x'"),
         (["--center", "9:1"], "no UAV gets a beam while"),
         (["--center", "nowhere"], "'nowhere' is not SYSID:COMPID"),

@@ -88,8 +88,8 @@ def of_left_out(
         return Blame(
             Cause.CARRIER,
             unfit,
-            "check the carrier: powered, connected, with a position fix, and its id in"
-            " `[center] source`",
+            "check that the carrier is powered, connected and has a position fix, and that"
+            " `[center] source` is its id",
         )
     match out.cause:
         case Cause.CROWDED:

@@ -9,7 +9,7 @@ from companion.values.described import DescribedEnum, Meaning
 class Level(DescribedEnum):
     """Quality of the link to a UAV."""
 
-    GOOD = "good", "its beam has the gain that the link needs, guaranteed"
+    GOOD = "good", "its beam is guaranteed to have the gain that the link needs"
     WEAK = "weak", "its beam usually has the gain that the link needs"
     NONE = "none", "its beam lacks the gain that the link needs, or there is no beam"
 

@@ -15,7 +15,7 @@ class Reason(DescribedEnum):
     BAD_STAMP = "bad-stamp", "time stamps of a log that step back or jump; the step was clamped"
     MALFORMED = "malformed", "messages with impossible field values"
     UNREACHABLE = "unreachable", "reports farther from the track than the aircraft can have flown"
-    ALTITUDE_JUMP = "altitude-jump", "reports at an unreachable height: the datum has changed"
+    ALTITUDE_JUMP = "altitude-jump", "reports at an unreachable height, as after a change of datum"
     FROZEN = "frozen", "new time stamps on an old position, although the reported velocity is not 0"
     SHARED_ID = "shared-id", "reports of two vehicles under one id"
     STRANGER = "stranger", "frames of a peer in the name of a UAV that a known peer reports"

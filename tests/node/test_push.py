@@ -46,7 +46,9 @@ def test_refused_udp_push_and_recovery_are_announced_once() -> None:
         with socket.socket(type=socket.SOCK_DGRAM) as listener:
             listener.bind(to)
             await pushed(RECOVERED_AFTER + 1)
-        assert [one.text for one in notices[1:]] == [f"records to {to[0]}:{to[1]} can be sent again"]
+        assert [one.text for one in notices[1:]] == [
+            f"records to {to[0]}:{to[1]} can be sent again"
+        ]
         task.cancel()
 
     push.open()

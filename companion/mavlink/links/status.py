@@ -19,7 +19,7 @@ class ComponentStatus:
     """One component as received over one link; ``heard_ns`` is the time of its last frame."""
 
     frames: Annotated[int, Meaning("frames received")]
-    gaps: Annotated[int, Meaning("frames missing by sequence number, at least")]
+    gaps: Annotated[int, Meaning("least number of missing frames, by sequence number")]
     heard_ns: int
     mavlink: Annotated[int, Meaning("MAVLink version of its last frame")]
 
@@ -43,7 +43,7 @@ class LinkStatus:
     lost: Annotated[dict[str, int], Meaning("unusable frames, by reason; garbage in bytes")] = (
         field(default_factory=dict)
     )
-    gaps: Annotated[int, Meaning("frames missing by sequence number, at least")] = 0
+    gaps: Annotated[int, Meaning("least number of missing frames, by sequence number")] = 0
     late: Annotated[int, Meaning("frames with an earlier sequence number: late or copies")] = 0
     repeats: Annotated[int, Meaning("frames with the previous frame's sequence number")] = 0
     sent: Annotated[int, Meaning("frames sent")] = 0

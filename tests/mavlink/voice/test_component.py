@@ -96,7 +96,7 @@ def request(node: ServiceComponent, now_ns: int) -> int:
         ({"source": Source(5, 1)}, "source is 5:1, allowed component ids"),
         ({"source": Source(5, 190)}, "source is 5:190, allowed component ids"),
         ({"source": Source(5, 256)}, "source is 5:256, allowed component ids"),
-        ({"carrier": OURS}, "carrier is 5:191"),
+        ({"carrier": OURS}, "carrier 5:191"),
         ({"position_hz": 0.0}, "position_hz is 0.0, allowed: 0.1 to 100"),
         ({"position_hz": float("nan")}, "position_hz is nan"),
         ({"attitude_hz": 101.0}, "attitude_hz is 101.0"),

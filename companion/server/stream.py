@@ -20,7 +20,6 @@ reason has details.
 """
 
 import asyncio
-import re
 from collections import Counter
 from collections.abc import Coroutine
 from dataclasses import dataclass, field
@@ -37,7 +36,7 @@ from companion.server.large_answers import LargeAnswers
 from companion.server.shared_work import seen
 from companion.server.topics import Body, Topic
 from companion.server.websocket_connections import BoundedWebSocket
-from companion.values import UAV_FORMS, UavKind, UserError
+from companion.values import UAV_FORMS, UserError, is_uav_id
 from companion.views.state import Node
 
 T = TypeVar("T")
@@ -49,7 +48,6 @@ BAD_ARGUMENTS: Final = 4422
 
 RATE_HZ: Final = 10.0
 LEAST_HZ, MOST_HZ = 0.1, 100.0
-_UAV: Final = re.compile("|".join(kind.pattern for kind in UavKind), re.ASCII)
 CLIENTS_MAX: Final = 256
 """Limit on streams: half of the connections; the other half is left for requests."""
 QUIET_S: Final = 5.0
@@ -84,7 +82,7 @@ def wanted(query: QueryParams) -> Wanted:
     if unknown:
         raise UserError(f"unknown argument {min(unknown)[:40]!r}; use uav, topic, rate_hz")
     for uav in query.getlist("uav"):
-        if not _UAV.fullmatch(uav):
+        if not is_uav_id(uav):
             raise UserError(f"uav: {uav[:40]!r} is not {UAV_FORMS}")
     text = query.get("rate_hz", str(RATE_HZ))
     try:

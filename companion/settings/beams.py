@@ -4,7 +4,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import AfterValidator, BeforeValidator, Field, model_validator
 
-from companion.settings.section import Section
+from companion.settings.section import Section, UavName
 from companion.values import ArrayKind, Method, Normalisation, Policy, Power, UserError, Widen
 
 Metres = Annotated[float, Field(ge=-1e4, le=1e4)]
@@ -145,11 +145,11 @@ class BeamSettings(Section):
     condition_limit: Annotated[float, Field(gt=1, le=1e3)] = 100.0
     regularisation: Annotated[float, Field(gt=0, le=1e6)] = 0.01
     normalisation: Normalisation = Normalisation.UNIT_RESPONSE
-    priority: Annotated[tuple[str, ...], AfterValidator(_unique)] = ()
+    priority: Annotated[tuple[UavName, ...], AfterValidator(_unique)] = ()
     widen: Annotated[Widen, BeforeValidator(_named_width)] = Widen.LIKELY
     floor_db: Annotated[float, Field(ge=-60, le=60)] | None = None
     power: Power | None = None
-    rate_weights: dict[str, Annotated[float, Field(gt=0, le=1e6)]] = Field(default_factory=dict)
+    rate_weights: dict[UavName, Annotated[float, Field(gt=0, le=1e6)]] = Field(default_factory=dict)
 
     @model_validator(mode="before")
     @classmethod

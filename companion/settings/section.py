@@ -1,8 +1,10 @@
 """Base class of all sections of the settings, and the error for unusable settings."""
 
-from pydantic import BaseModel, ConfigDict
+from typing import Annotated
 
-from companion.values import UserError
+from pydantic import AfterValidator, BaseModel, ConfigDict
+
+from companion.values import UAV_FORMS, UserError, is_uav_id
 
 
 class ConfigError(UserError):
@@ -13,3 +15,13 @@ class Section(BaseModel):
     """Base of a settings section: frozen; unknown keys are errors."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
+
+
+def _uav_id(text: str) -> str:
+    if not is_uav_id(text):
+        raise UserError(f"not the id of a UAV; give {UAV_FORMS}")
+    return text
+
+
+UavName = Annotated[str, AfterValidator(_uav_id)]
+"""Id of one UAV in settings; a name that no UAV can have would have no effect."""

@@ -4,7 +4,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, FiniteFloat, model_validator
 
-from companion.settings.section import Section
+from companion.settings.section import Section, UavName
 from companion.values import UserError
 
 
@@ -30,7 +30,7 @@ class ClockSettings(Section):
     window_s: Annotated[float, Field(ge=5, le=3600)] = 60.0
     trust_gnss: bool = False
     node_utc_error_s: Annotated[float, Field(ge=0, le=10)] | None = None
-    apart_s: dict[str, Annotated[float, Field(ge=0, le=10)]] = Field(default_factory=dict)
+    apart_s: dict[UavName, Annotated[float, Field(ge=0, le=10)]] = Field(default_factory=dict)
 
 
 Lag = tuple[
@@ -98,7 +98,7 @@ class ObserverSettings(LimitSettings):
     feed_forward: bool = True
     design: str | None = None
     types: dict[AirframeName, LimitSettings] = Field(default_factory=dict)
-    uav: dict[str, LimitSettings] = Field(default_factory=dict)
+    uav: dict[UavName, LimitSettings] = Field(default_factory=dict)
     position_noise_m: Annotated[float, Field(gt=0, le=1e5)] = 3.0
     velocity_noise_mps: Annotated[float, Field(gt=0, le=1e4)] = 0.5
     follow_accuracy: bool = True

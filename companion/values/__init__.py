@@ -31,7 +31,7 @@ from companion.values.errors import UserError, printable, shown
 from companion.values.events import DUTY_MAX, Duty, Event, RoundTrip, Tick, Tock
 from companion.values.fleet import Offer, Shared, SharedFrame, Standing
 from companion.values.health import Blame, Cause, Level, Verdict
-from companion.values.names import UAV_FORMS, Source, UavKind, kind_of
+from companion.values.names import UAV_FORMS, Source, UavKind, is_uav_id, kind_of
 from companion.values.numbers import BoolArray, ComplexArray, FloatArray, IntArray, Vector, vector
 from companion.values.observed import READINGS_MAX, Observation, reason_invalid
 from companion.values.outputs import Notice, Output, Severity, Update
@@ -139,6 +139,7 @@ __all__ = [
     "WeightFormat",
     "Widen",
     "angle_rad",
+    "is_uav_id",
     "kind_of",
     "lens",
     "printable",

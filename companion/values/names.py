@@ -1,5 +1,6 @@
 """Identifiers: ids of frame senders and of UAVs."""
 
+import re
 import sys
 from enum import Enum
 from functools import lru_cache
@@ -73,6 +74,14 @@ class UavKind(Enum):
 _KINDS: Final = {kind.prefix: kind for kind in UavKind}
 UAV_FORMS: Final = "SYSID:COMPID, icao:HEX, rid:ID or cot:UID"
 """Formats of UAV ids of all kinds."""
+
+
+_UAV: Final = re.compile("|".join(kind.pattern for kind in UavKind), re.ASCII)
+
+
+def is_uav_id(text: str) -> bool:
+    """Return whether a text is the id of a UAV of any kind."""
+    return _UAV.fullmatch(text) is not None
 
 
 def kind_of(uav: str) -> UavKind:

@@ -1,13 +1,12 @@
 """Measurements of the array's own receiver: the direction of a UAV, or powers through beams."""
 
 import math
-import re
 from dataclasses import dataclass
 from typing import Annotated, Final
 
 from companion.values.described import Meaning
 from companion.values.errors import shown
-from companion.values.names import UAV_FORMS, UavKind
+from companion.values.names import UAV_FORMS, is_uav_id
 
 READINGS_MIN: Final = 2  # least powers of one observation: only their differences are used
 READINGS_MAX: Final = 256  # most powers of one observation
@@ -18,7 +17,6 @@ BEAMS_MAX: Final = 1 << 16  # indices of beams are below this
 UPDATES_MAX: Final = 1 << 32  # numbers of updates are below this: ten a second for 13 years
 _LATEST_NS: Final = 1 << 62
 """Latest time, the year 2116: results computed from times fit into 63 bits."""
-_UAV: Final = re.compile("|".join(kind.pattern for kind in UavKind), re.ASCII)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -92,7 +90,7 @@ def reason_invalid(observation: Observation) -> str | None:
 
 
 def _is_uav(uav: str) -> bool:
-    if not _UAV.fullmatch(uav):
+    if not is_uav_id(uav):
         return False
     is_vehicle = uav[0].isdigit()
     return not is_vehicle or max(map(int, uav.split(":"))) <= 255  # system and component id

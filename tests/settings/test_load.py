@@ -173,6 +173,20 @@ def test_wrong_type_is_described_in_the_words_of_toml(text: str, said: str) -> N
     assert refusal(text) == said
 
 
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("[observer.uav.3]\nlag_s = [0, 1]\n", "observer.uav = '3'"),
+        ("[clocks.apart_s]\na = 1\n", "clocks.apart_s = 'a'"),
+        ('[beams]\npriority = ["1:1", "b"]\n', "beams.priority = 'b'"),
+        ("[beams.rate_weights]\nb = 1\n", "beams.rate_weights = 'b'"),
+    ],
+)
+def test_name_that_no_uav_can_have_is_rejected(text: str, name: str) -> None:
+    ids = "SYSID:COMPID, icao:HEX, rid:ID or cot:UID"
+    assert refusal(text) == f"{name}: not the id of a UAV; give {ids}"
+
+
 DIGITS = "9" * 5000
 HEX = "0x" + "f" * 5000
 

@@ -15,7 +15,6 @@ import io
 import json
 import math
 import time
-import tokenize
 import urllib.error
 import urllib.request
 from collections.abc import Generator, Iterable, Iterator, Sequence
@@ -30,17 +29,13 @@ from websockets.exceptions import ConnectionClosed, WebSocketException
 from websockets.sync.client import connect
 
 from companion.values import ComplexArray, UserError, shown
+from companion.values.numbers import NPY_ERRORS
 
 Json = dict[str, Any]
 
 SUBPROTOCOL: Final = "companion.v1"
 ANSWER_MAX: Final = 1 << 28  # longest answer, bytes; 4 million weights take a quarter of it
 PIECE_BYTES: Final = 1 << 16
-_UNREADABLE: Final = (
-    ValueError, TypeError, LookupError, OverflowError, MemoryError, SyntaxError, RecursionError,
-    tokenize.TokenError,
-)  # fmt: skip
-"""What numpy raises for a malformed header; it does not list them."""
 _READ_HEADER: Final = {
     (1, 0): np.lib.format.read_array_header_1_0,
     (2, 0): np.lib.format.read_array_header_2_0,
@@ -144,7 +139,7 @@ class Client:
                 valid_at_ns=int(headers.get("x-valid-at-ns", "")),
                 groups=tuple(int(slot) for slot in headers.get("x-groups", "").split(",") if slot),
             )
-        except _UNREADABLE as error:
+        except NPY_ERRORS as error:
             reason = f"the weights are malformed: {shown(str(error))}"
             raise ServiceError(None, reason) from error
 

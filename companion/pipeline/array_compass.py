@@ -114,7 +114,7 @@ class ArrayCompass:
         found, largest_rad = [], self.largest_rad
         for (uav, (sightings, near)), cap in zip(fresh.items(), caps, strict=True):
             if cap is None:
-                self._uavs.discard(uav)
+                self._uavs.forget_directions(uav)
                 continue
             aged_s = abs(now_ns - sightings.t_ns) * 1e-9
             changed = self._drift_radps * aged_s + near.turned_rad(aged_s) * largest_rad
@@ -199,7 +199,10 @@ class ArrayCompass:
         return Misalignment(self.error.center, grown)
 
     def looks(self, uavs: Iterable[str], carrier: Carrier) -> Looks:
-        """Return a snapshot of what was seen of those UAVs that were; at the reported pose."""
+        """Return a snapshot of what was seen of UAVs, without those of which nothing was.
+
+        carrier  the reported pose
+        """
         each = {
             uav: Look(record.sightings, record.pending, record.is_refuted)
             for uav in uavs

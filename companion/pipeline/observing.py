@@ -77,7 +77,9 @@ class Observing:
     def _measured(event: Observation) -> Measured:
         assert event.azimuth_rad is not None and event.elevation_rad is not None
         assert event.bound_rad is not None
-        towards = steering.unit_direction(event.azimuth_rad, event.elevation_rad)
+        (towards,) = steering.unit_directions(
+            np.array([event.azimuth_rad]), np.array([event.elevation_rad])
+        )
         return Measured(
             t_ns=event.measured_ns,
             direction=towards,
@@ -190,10 +192,10 @@ class Observing:
         times = dict.fromkeys(one.t_ns for _, one in ready)  # a receiver measures several UAVs
         poses = {at_ns: self._pose(at_ns, nearest=True) for at_ns in times}
         reported = {at_ns: self.reported(now_ns, at_ns) for at_ns in times}
-        said: list[Output] = []
+        said, bound_rad = list[Output](), self.compass.largest_rad
         for uav, one in ready:
             near = self._place(uav, now_ns, one.t_ns, reported[one.t_ns])
-            pose, bound_rad = poses[one.t_ns], self.compass.largest_rad
+            pose = poses[one.t_ns]
             if near is None or pose is None:
                 continue
             if not self.uavs.join(uav, one, pose=pose, near=near, bound_rad=bound_rad):
@@ -298,9 +300,11 @@ class Observing:
 
         def seen_directions(tracks: Sequence[Track]) -> dict[str, SeenDirection]:
             near, unbounded = dict[str, Relative](), dict[str, SeenDirection]()
+            if pose is None:
+                return unbounded
             for snapshot, track in zip(snapshots, tracks, strict=True):
                 look = looks.each.get(track.uav)
-                if look is None or pose is None:
+                if look is None:
                     continue
                 if look.is_refuted and not follows:
                     unbounded[track.uav] = SeenDirection(None)
@@ -308,8 +312,6 @@ class Observing:
                 at = self._relative(snapshot, track, reported)
                 if at is not None:
                     near[track.uav] = at
-            if pose is None or not near:
-                return unbounded
             return unbounded | self.uavs.directions(looks, near, pose=pose, pose_at=poses.get)
 
         return seen_directions

@@ -112,7 +112,7 @@ class SightedUavs:
         """Forget a UAV whose track is dropped or restarted."""
         self._uavs.pop(uav, None)
 
-    def discard(self, uav: str) -> None:
+    def forget_directions(self, uav: str) -> None:
         """Forget the directions in which a UAV was seen, which contradict one another."""
         record = self._uavs[uav]
         record.sightings = record.latest = None

@@ -5,7 +5,6 @@ from collections.abc import Mapping
 from importlib import resources
 from io import BytesIO
 from pathlib import Path
-from tokenize import TokenError
 from typing import Any, Final
 
 import numpy as np
@@ -17,14 +16,11 @@ from companion.settings.origins import Origin, Origins, given, of_options
 from companion.settings.section import ConfigError
 from companion.tracking.design.gain_table import KinematicDesign
 from companion.values import ComplexArray, FloatArray, UserError
+from companion.values.numbers import NPY_ERRORS
 
 DEFAULT_DESIGN: Final = "kinematic_default.json"
 LARGEST_BYTES: Final = 1 << 24
 """Largest file that is read, bytes: a codebook of 1024 elements and as many beams."""
-_HEADER_ERRORS: Final = (
-    ValueError, TypeError, SyntaxError, RecursionError, OverflowError, TokenError,
-)  # fmt: skip
-"""What numpy raises for an invalid .npy header, which it reads as Python text."""
 
 
 def load(path: Path | None) -> Settings:
@@ -107,7 +103,7 @@ def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
         found = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
     except MemoryError as error:
         raise ConfigError(f"{where}: array is too large for the memory: {error}") from error
-    except _HEADER_ERRORS as error:
+    except NPY_ERRORS as error:
         first = str(error).splitlines()[0]
         raise ConfigError(f"{where}: not a .npy file of numbers: {first}") from error
     if found.dtype.kind not in kinds:

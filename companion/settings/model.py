@@ -39,7 +39,7 @@ from companion.settings.outlets import (
 )
 from companion.settings.section import ConfigError, Section
 from companion.settings.tracking import ClockSettings, ObserverSettings
-from companion.values import UserError, read_toml, shown
+from companion.values import UserError, is_uav_id, read_toml, shown
 
 MIN_SIMILARITY: Final = 0.7
 """Least similarity (difflib's ratio) of a setting that is suggested for an unknown one."""
@@ -61,6 +61,10 @@ REPLAYED_SECTIONS: Final = frozenset(
 
 ADDRESSES: Final = (("observations", "udp"),)
 """Keys of these sections that name an address; a replay ignores them."""
+UAV_NAMED: Final = (
+    ("observer", "uav"), ("clocks", "apart_s"), ("beams", "priority"), ("beams", "rate_weights"),
+)  # fmt: skip
+"""Keys of these sections that name UAVs."""
 
 
 class NamedFile(NamedTuple):
@@ -145,6 +149,7 @@ class Settings(Section):
                     raise _missing_file_error(where, file.setting)
                 keys[file.key] = file.attachment
                 files[file.attachment] = attached[file.attachment]
+        _drop_impossible_uavs(found)
         if "positions" in _table(found, "array"):  # recordings have ``positions_m`` instead
             raise _missing_file_error(where, "array.positions")
         return cls._from_sections(found, where).with_files(files)
@@ -220,6 +225,17 @@ def _former_files(found: dict[str, Any], where: str) -> dict[str, bytes]:
 def _table(found: dict[str, Any], section: str) -> dict[str, Any]:
     keys = found.get(section)
     return keys if isinstance(keys, dict) else {}
+
+
+def _drop_impossible_uavs(found: dict[str, Any]) -> None:
+    """Remove names that no UAV can have, which earlier versions accepted, to no effect."""
+    for section, key in UAV_NAMED:
+        keys = _table(found, section)
+        match keys.get(key):
+            case dict() as named:
+                keys[key] = {uav: one for uav, one in named.items() if is_uav_id(uav)}
+            case list() as named:
+                keys[key] = [uav for uav in named if not isinstance(uav, str) or is_uav_id(uav)]
 
 
 def _missing_file_error(where: str, setting: str) -> ConfigError:

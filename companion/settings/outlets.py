@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field
 
-from companion.settings.section import Section
+from companion.settings.section import Section, UavName
 from companion.values import UserError, shown
 
 _ADDRESS: Final = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([0-9.]+)):([0-9]{1,5})")
@@ -74,7 +74,7 @@ class DriveSettings(Section):
     """
 
     target: str | None = None
-    uavs: Annotated[tuple[str, ...], Field(max_length=1000)] = ()
+    uavs: Annotated[tuple[UavName, ...], Field(max_length=1000)] = ()
     aim: Literal["first", "centre"] = "first"
     on_stale: Literal["hold", "boresight", "mute"] = "hold"
 

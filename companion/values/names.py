@@ -74,16 +74,16 @@ class UavKind(Enum):
 _KINDS: Final = {kind.prefix: kind for kind in UavKind}
 UAV_FORMS: Final = "SYSID:COMPID, icao:HEX, rid:ID or cot:UID"
 """Formats of UAV ids of all kinds."""
-
-
 _UAV: Final = re.compile("|".join(kind.pattern for kind in UavKind), re.ASCII)
-
-
-def is_uav_id(text: str) -> bool:
-    """Return whether a text is the id of a UAV of any kind."""
-    return _UAV.fullmatch(text) is not None
 
 
 def kind_of(uav: str) -> UavKind:
     """Return the kind of a UAV id."""
     return _KINDS.get(uav.partition(":")[0], UavKind.VEHICLE)
+
+
+def is_uav_id(text: str) -> bool:
+    """Return whether a text is the id of a UAV of any kind."""
+    if not _UAV.fullmatch(text):
+        return False
+    return not kind_of(text).reports_itself or max(map(int, text.split(":"))) <= 255

@@ -1,5 +1,8 @@
 """Types of vectors and numpy arrays. Arrays in values are never written to."""
 
+from tokenize import TokenError
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -9,6 +12,12 @@ FloatArray = NDArray[np.float64]
 ComplexArray = NDArray[np.complex128]
 IntArray = NDArray[np.int64]
 BoolArray = NDArray[np.bool_]
+NPY_ERRORS: Final = (
+    ValueError, TypeError, LookupError, OverflowError, MemoryError, SyntaxError, RecursionError,
+    TokenError,
+)  # fmt: skip
+"""What numpy raises for an invalid .npy header, which it reads as Python text; its documentation
+does not list them."""
 
 
 def vector(array: FloatArray) -> Vector:

@@ -71,7 +71,7 @@ def reason_invalid(observation: Observation) -> str | None:
 
     Every way in uses these rules: HTTP, UDP and recordings.
     """
-    if not _is_uav(observation.uav):
+    if not is_uav_id(observation.uav):
         return f"uav: {shown(observation.uav)} is not {UAV_FORMS}"
     for name, t_ns in (("arrival", observation.t_ns), ("measured_at", observation.measured_ns)):
         if not 0 <= t_ns < _LATEST_NS:
@@ -87,13 +87,6 @@ def reason_invalid(observation: Observation) -> str | None:
     if has_powers or observation.power_bound_db is not None or observation.update is not None:
         return "both a direction and powers are given; give one of them"
     return _reason_invalid_direction(*angles)
-
-
-def _is_uav(uav: str) -> bool:
-    if not is_uav_id(uav):
-        return False
-    is_vehicle = uav[0].isdigit()
-    return not is_vehicle or max(map(int, uav.split(":"))) <= 255  # system and component id
 
 
 def _reason_invalid_direction(

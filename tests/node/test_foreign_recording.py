@@ -234,6 +234,19 @@ def test_attachments_not_named_in_settings_are_discarded(cut_log: Path, tmp_path
     assert given.override(codebook={"file": "new.npy"}).files.keys() == given.files.keys() - files
 
 
+def test_names_that_no_uav_can_have_are_dropped_from_a_recording() -> None:
+    """Earlier versions accepted them, to no effect."""
+    text = (
+        '[observer.uav]\n3 = {lag_s = [0, 1]}\n"3:1" = {lag_s = [0, 1]}\n'
+        '[clocks.apart_s]\na = 1\n"3:1" = 1\n[beams]\npriority = ["b", "3:1", "300:1"]\n'
+    )
+    found = Settings.from_recording(text, "x", {})
+    assert list(found.observer.uav) == list(found.clocks.apart_s) == ["3:1"]
+    assert found.beams.priority == ("3:1",)
+    with pytest.raises(ConfigError):
+        Settings.from_toml(text, "x")
+
+
 def test_every_file_setting_is_registered() -> None:
     """A new key must name its attachment or be excluded from a replay."""
     paths = {

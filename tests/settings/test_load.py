@@ -180,6 +180,7 @@ def test_wrong_type_is_described_in_the_words_of_toml(text: str, said: str) -> N
         ("[clocks.apart_s]\na = 1\n", "clocks.apart_s = 'a'"),
         ('[beams]\npriority = ["1:1", "b"]\n', "beams.priority = 'b'"),
         ("[beams.rate_weights]\nb = 1\n", "beams.rate_weights = 'b'"),
+        ('[drive]\nuavs = ["300:1"]\n', "drive.uavs = '300:1'"),
     ],
 )
 def test_name_that_no_uav_can_have_is_rejected(text: str, name: str) -> None:

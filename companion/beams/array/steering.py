@@ -38,14 +38,6 @@ def unit_directions(azimuth_rad: FloatArray, elevation_rad: FloatArray) -> Float
     )
 
 
-def unit_direction(azimuth_rad: float, elevation_rad: float) -> FloatArray:
-    """Return the unit direction (3,) in the array frame for one azimuth and elevation."""
-    level = math.cos(elevation_rad)
-    return np.array(
-        [level * math.cos(azimuth_rad), level * math.sin(azimuth_rad), -math.sin(elevation_rad)]
-    )
-
-
 def steering_matrix(array: Array, directions: FloatArray) -> ComplexArray:
     """Return A, (M, N): one steering vector per column, for unit directions (N, 3)."""
     matrix = phase_factors(array, directions)

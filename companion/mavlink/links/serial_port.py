@@ -90,19 +90,21 @@ class SerialPort:
             self._lose(OSError(errno.ENODEV, os.strerror(errno.ENODEV)))
             return
         assert self._held_up is not None
-        stale = self._held_up.stale(data)
-        if stale:
-            self._upcalls.stale(None, data[:stale])
-        if len(data) > stale:
-            self._process(descriptor, data[stale:])
+        self._process(descriptor, data, self._held_up.stale(data))
 
-    def _process(self, descriptor: int, data: bytes) -> None:
-        """Process what was read; read on when all of it is processed."""
+    def _process(self, descriptor: int, data: bytes, stale: int = 0) -> None:
+        """Process what was read, or more of it; read on when all of it is processed.
+
+        stale  bytes at its beginning that waited too long to be used
+        """
         if descriptor != self._descriptor:
             return
         loop = asyncio.get_running_loop()
         try:
-            has_more = self._upcalls.take(None, data, None)
+            if stale:
+                self._upcalls.stale(None, data[:stale])
+            is_used = not data or len(data) > stale
+            has_more = is_used and self._upcalls.take(None, data[stale:], None)
         except Exception as fault:  # a defect must end the link, not disappear
             self._lose(fault)
             return

@@ -170,23 +170,33 @@ def _suggestion(text: str) -> str:
     if scheme in _HTTP_PORTS and address.rpartition("/")[2] == "aircraft.json":
         return f"; did you mean readsb:{text}?"
     if scheme == "cot" and address:
-        return f"; did you mean cot:udp:{address}, which listens, or cot:tcp:{address}?"
+        way, _, place = address.partition(":")
+        if way in ("udp", "tcp"):
+            return f"; did you mean cot:{way}:{_with_host(place, way == 'udp')}?"
+        udp, tcp = _with_host(address, True), _with_host(address, False)
+        return f"; did you mean cot:udp:{udp}, which listens, or cot:tcp:{tcp}?"
     if scheme in ("beast", "dump1090", "adsb"):
         return f"; did you mean readsb:{address or 'HOST:30005'}?"
     if scheme == "udp":
-        address = f"0.0.0.0:{address}" if address.isdecimal() else address or "0.0.0.0:14550"
-        return f"; did you mean udpin:{address}, which listens?"
+        place = _with_host(address or "14550", True)
+        return f"; did you mean udpin:{place}, which listens?"
     if text.isdecimal():
-        return f"; did you mean udpin:0.0.0.0:{text}?"
+        return f"; did you mean udpin:{_with_host(text, True)}?"
     near = difflib.get_close_matches(scheme, SCHEMES, 1, 0.5)
     if near and scheme not in SCHEMES:
         return f"; did you mean {near[0]}:?"
     if scheme in SCHEMES and address.isdecimal():
-        host = "0.0.0.0" if scheme in ("udpin", "tcpin") else "HOST"
-        return f"; did you mean {scheme}:{host}:{address}?"
+        return f"; did you mean {scheme}:{_with_host(address, scheme in ('udpin', 'tcpin'))}?"
     if scheme in SCHEMES and address and ":" not in address:
         return f"; did you mean {scheme}:{address}:{_USUAL_PORTS.get(scheme, 14550)}?"
     return ""
+
+
+def _with_host(place: str, listens: bool) -> str:
+    """Return a place with a host, if it is a port alone: all addresses for a link that listens."""
+    if not place.isdecimal():
+        return place
+    return f"{'0.0.0.0' if listens else 'HOST'}:{place}"
 
 
 def _form(scheme: str, schemes: Collection[Scheme]) -> str:

@@ -1,5 +1,7 @@
 """Link URLs: parsed and formatted consistently, with one-line errors."""
 
+import re
+
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
@@ -128,12 +130,20 @@ def test_invalid_link_url_is_reported_in_one_line(text: str) -> None:
         ("udp:14550", "udpin:0.0.0.0:14550, which listens?"),
         ("udpin:14550", "udpin:0.0.0.0:14550?"),
         ("tcp:5760", "tcp:HOST:5760?"),
+        ("14550", "udpin:0.0.0.0:14550?"),
+        ("cot:4242", "cot:udp:0.0.0.0:4242, which listens, or cot:tcp:HOST:4242?"),
+        ("cot:udp:4242", "cot:udp:0.0.0.0:4242?"),
+        ("cot:tcp:8087", "cot:tcp:HOST:8087?"),
     ],
 )
 def test_link_url_error_suggests_a_correction(text: str, meant: str) -> None:
     with pytest.raises(LinkError) as caught:
         parse_link(text)
     assert str(caught.value).endswith(f"did you mean {meant}")
+    links = re.findall(r"[a-z]+:[^ ,?]+", meant.replace("HOST", "host"))
+    assert links or meant == "readsb:?"
+    for link in links:
+        parse_link(link)
 
 
 def test_only_allowed_schemes_are_accepted() -> None:

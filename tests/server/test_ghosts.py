@@ -64,11 +64,14 @@ class Clients:
 
 
 def invade(node: Node) -> None:
-    """Let ``GHOSTS`` vehicles appear."""
+    """Let ``GHOSTS`` vehicles appear; while the service is late, it drops newcomers' frames."""
     sender = [sys.executable, str(ROOT / "tests" / "crowd.py"), str(node.udp_port), str(GHOSTS)]
-    subprocess.run(sender, check=True, env={"PYTHONPATH": str(ROOT)}, timeout=HANG_S)
-    uavs = node.json("/v1/uavs")["uavs"]
-    assert len(uavs) > GHOSTS / 4  # while other load delays the service, it drops newcomers' frames
+    for _ in range(ROUNDS):
+        subprocess.run(sender, check=True, env={"PYTHONPATH": str(ROOT)}, timeout=HANG_S)
+        appeared = len(node.json("/v1/uavs")["uavs"])
+        if appeared > GHOSTS / 4:
+            return
+    pytest.fail(f"{appeared} of {GHOSTS} vehicles appeared")
 
 
 def updates_hz(node: Node, seconds: float) -> float:

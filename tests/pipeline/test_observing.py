@@ -105,6 +105,23 @@ def test_error_beyond_the_bound_is_announced_and_never_blamed_on_a_uav(uavs: int
     assert max(flight.errors_deg().values()) < 1.0
 
 
+@pytest.mark.parametrize("uavs", [1, 4])
+def test_first_measurement_says_nothing_of_the_attitude_before_it_is_confirmed(uavs: int) -> None:
+    """It may be a reflection; there is no other one yet that would contradict it."""
+    flight = ObservedFlight(uavs=uavs)
+    flight.measures = False
+    flight.fly(2.0)
+    first = flight.observation("1:1")
+    azimuth_rad = (first.azimuth_rad or 0.0) + 1.0
+    flight.said += flight.pipeline.step(replace(first, azimuth_rad=azimuth_rad))
+    flight.fly(0.5)
+    flight.measures = True
+    flight.fly(2.0)
+    assert not [one.text for one in flight.notices() if "attitude_bound_deg" in one.text]
+    assert flight.pipeline.observing.compass.bound_rad == pytest.approx(math.radians(3.0))
+    assert max(flight.errors_deg().values()) < 0.3
+
+
 @pytest.mark.parametrize(
     ("change", "reason"),
     [

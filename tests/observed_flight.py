@@ -19,6 +19,7 @@ from companion.values import (
     RoundTrip,
     Source,
     Tick,
+    Update,
     angle_rad,
 )
 from tests.sent_frames import START_NS, attitude, position
@@ -119,3 +120,9 @@ class ObservedFlight:
 
     def notices(self) -> list[Notice]:
         return [one for one in self.said if isinstance(one, Notice)]
+
+    def unbounded(self) -> int:
+        """Return how many beams of all updates had no bound, including those of a look now."""
+        updates = [one for one in self.said if isinstance(one, Update)]
+        updates.append(self.pipeline.look(self.t_ns))
+        return sum(b.pointing_bound_rad is None for one in updates for b in one.beams.beams)

@@ -25,11 +25,6 @@ from companion.values import Cap, Carrier, FloatArray, Notice, Reason, Refuted, 
 
 UPDATE_NS: Final = 190_000_000  # least time between two estimates of the attitude's error
 FRESH_NS: Final = 1_000_000_000  # age of a UAV's sightings beyond which they say nothing
-CONFIRMED: Final = 2
-"""Measurements of a UAV that must agree before they say anything of the attitude.
-
-The first one may be a reflection, or of another UAV; there is no other to contradict it.
-"""
 FORGOTTEN_NS: Final = 10_000_000_000  # age of sightings beyond which nothing follows from them
 PERSISTENT_NS: Final = 1_000_000_000
 """Time for which a UAV must be seen elsewhere than it reports until its position is refuted."""
@@ -112,7 +107,7 @@ class ArrayCompass:
                 if sightings is not None and now_ns - sightings.t_ns > FORGOTTEN_NS:
                     record.sightings, record.contradicted_ns, record.is_refuted = None, None, False
                 continue
-            if len(sightings.caps.radii_rad) >= CONFIRMED:
+            if sightings.is_confirmed:
                 fresh[uav] = sightings, latest[0]
         caps = possible(
             [sightings.caps for sightings, _ in fresh.values()], self._settings.outliers

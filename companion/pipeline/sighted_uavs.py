@@ -10,24 +10,20 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Final, NamedTuple
 
+import numpy as np
+
 from companion.beams.aim import SeenDirection
 from companion.settings.observations import ObservationSettings
 from companion.tracking.compass import Misalignment
 from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.likely_error import LikelyError
+from companion.tracking.moved_caps import Caps, Motion, moved_caps
 from companion.tracking.relative import Relative
-from companion.tracking.sightings import (
-    WINDOW,
-    Caps,
-    Guide,
-    Motion,
-    Sightings,
-    moved_caps,
-    possible,
-)
+from companion.tracking.sightings import CONFIRMED, WINDOW, Guide, Sightings, possible
 from companion.values import Cap, FloatArray
 
 MEMORY_S: Final = 3.0  # time constant with which measurements of the likely error are forgotten
+ANY_DIRECTION: Final = Cap(np.array([1.0, 0.0, 0.0]), math.pi)
 PENDING_MAX: Final = WINDOW  # most measurements of a UAV that wait for an attitude
 
 
@@ -227,8 +223,9 @@ class SightedUavs:
             pose      the reported attitude then
             pose_at   that of another time, by the same report
 
-        A UAV is missing if its measurements say nothing. Without a cap, nothing bounds the error:
-        they contradict one another, or the reported position.
+        A UAV is missing if its measurements say nothing, or if those that were not placed yet or
+        have no other beside them contradict the rest. Without a cap, nothing bounds the error: the
+        others contradict one another, or the reported position.
         """
         carried = {
             uav: parts
@@ -247,13 +244,26 @@ class SightedUavs:
             guides.append(self._guide(looks, uav, near[uav].reported, self.aged_rad(pose)))
         array_from_local = self._array_from_body @ pose.body_from_local
         found = dict[str, SeenDirection]()
-        for uav, cap in zip(carried, possible(many, self._outliers, guides), strict=True):
-            if cap is None:
+        around = possible(many, self._outliers, guides)
+        for uav, caps, guide, cap in zip(carried, many, guides, around, strict=True):
+            waiting = len(carried[uav]) - (looks.each[uav].sightings is not None)
+            seen = cap or self._possible_by_placed(caps.without_newest(waiting), guide)
+            if seen is None:
                 found[uav] = SeenDirection(None)
-            elif cap.radius_rad < math.pi / 2:
-                seen = Cap(array_from_local @ cap.center, cap.radius_rad)
-                found[uav] = SeenDirection(seen, looks.each[uav].is_refuted)
+            elif seen.radius_rad < math.pi / 2:
+                in_array = Cap(array_from_local @ seen.center, seen.radius_rad)
+                found[uav] = SeenDirection(in_array, looks.each[uav].is_refuted)
         return found
+
+    def _possible_by_placed(self, caps: Caps, guide: Guide | None) -> Cap | None:
+        """Return the possible directions by caps that were compared with one another.
+
+        Any direction, if there are too few to contradict anything.
+        """
+        if len(caps.radii_rad) < CONFIRMED:
+            return ANY_DIRECTION
+        (cap,) = possible([caps], self._outliers, [guide])
+        return cap
 
     @staticmethod
     def _guide(looks: Looks, uav: str, reported: Cap, aged_rad: float) -> Guide | None:

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.tracking.sightings import Motion
+from companion.tracking.moved_caps import Motion
 from companion.values import Cap, Carrier, Fix, FloatArray, Track, Vector
 
 

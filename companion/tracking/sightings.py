@@ -17,10 +17,16 @@ from typing import Final, NamedTuple, Self
 
 import numpy as np
 
+from companion.tracking.moved_caps import Caps, Motion, moved_caps
 from companion.values import Cap, FloatArray
 
 WINDOW: Final = 10  # newest measurements of a UAV that are kept
 FACETS: Final = 16  # sides of the polygon around the possible directions
+CONFIRMED: Final = 2
+"""Measurements of a UAV that must agree before they are evidence against anything else.
+
+The first one may be a reflection, or of another UAV; there is no other to contradict it.
+"""
 RESTART: Final = 6  # measurements that agree with one another, and not with the set, restart it
 _ANGLES: Final = np.arange(FACETS) * (2 * math.pi / FACETS)
 _FACETS: Final = np.stack([np.cos(_ANGLES), np.sin(_ANGLES)], axis=1)  # (FACETS, 2), normals
@@ -30,79 +36,6 @@ _BEHIND: Final = np.roll(np.arange(FACETS), 1)
 _BETWEEN: Final = 1.0 / math.sin(2 * math.pi / FACETS)
 _TWICE_COS: Final = 2 * math.cos(2 * math.pi / FACETS)
 _CORNER: Final = 1.0 / _TWICE_COS
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class Motion:
-    """Motion of a UAV relative to the array between two times, with its bounds.
-
-    moved_ned_m       predicted displacement, (3,), local frame
-    error_m           bound on the error of that displacement
-    range_m           predicted range at the earlier time
-    range_error_m     bound on the error of that range, and of the later one
-    misalignment_rad  bound on the error of the reported attitude, as an angle
-    turned_rad        bound on the change of that error between the times
-    """
-
-    moved_ned_m: FloatArray
-    error_m: float
-    range_m: float
-    range_error_m: float
-    misalignment_rad: float
-    turned_rad: float
-
-    @property
-    def growth(self) -> tuple[float, float] | None:
-        """By what the chord of a cap's radius is multiplied, and then its radius increased, rad.
-
-        With r the true and r' the predicted range, the true direction becomes that of r s + W d +
-        e, and the centre that of r' c + d: W is the misalignment and e the error of the
-        displacement d. None: the direction may become any.
-        """
-        way_m = math.sqrt(self.moved_ned_m @ self.moved_ned_m)
-        least_m = self.range_m - self.range_error_m - way_m - self.error_m
-        if least_m <= 0.0:
-            return None
-        off_m = self.error_m + way_m * (self.misalignment_rad + self.range_error_m / self.range_m)
-        if off_m >= least_m:
-            return None
-        grown_rad = math.asin(off_m / least_m) + self.turned_rad
-        return self.range_m / (self.range_m - way_m), grown_rad
-
-
-class Caps(NamedTuple):
-    """Caps of possible directions: centres (K, 3), oldest first, and radii (K,)."""
-
-    centers: FloatArray
-    radii_rad: FloatArray
-
-    @classmethod
-    def of(cls, cap: Cap) -> "Caps":
-        """Return one cap."""
-        return cls(cap.center[np.newaxis], np.array([cap.radius_rad]))
-
-
-def moved_caps(parts: Sequence[Caps], motions: Sequence[Motion]) -> Caps:
-    """Return the caps of all parts, each part after its motion."""
-    rows = []
-    for motion in motions:
-        growth = motion.growth
-        if growth is None:
-            rows.append((1.0, 0.0, 0.0, 0.0, 0.0, math.pi))
-        else:
-            rows.append((motion.range_m, *motion.moved_ned_m.tolist(), *growth))
-    table = np.array(rows)
-    if len(rows) > 1:
-        table = table.repeat([len(part.radii_rad) for part in parts], axis=0)
-    centers, radii = parts[0]
-    if len(parts) > 1:
-        centers = np.concatenate([part.centers for part in parts])
-        radii = np.concatenate([part.radii_rad for part in parts])
-    later = centers * table[:, :1] + table[:, 1:4]
-    later /= np.sqrt(np.vecdot(later, later))[:, np.newaxis]
-    chords = table[:, 4] * np.sin(np.minimum(radii, math.pi) / 2.0)
-    spread = 2.0 * np.arcsin(np.minimum(1.0, chords)) + table[:, 5]
-    return Caps(later, np.minimum(spread, math.pi))
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -120,6 +53,11 @@ class Sightings:
     def of(cls, t_ns: int, cap: Cap) -> Self:
         """Return the set with one cap."""
         return cls(t_ns=t_ns, caps=Caps.of(cap))
+
+    @property
+    def is_confirmed(self) -> bool:
+        """Whether as many caps agree as are evidence."""
+        return len(self.caps.radii_rad) >= CONFIRMED
 
     def moved(self, t_ns: int, motion: Motion) -> "Sightings":
         """Return the caps at a later time."""
@@ -143,8 +81,11 @@ class Sightings:
     def against(self, cap: Cap) -> "Sightings":
         """Return the caps after one that contradicts them.
 
-        ``RESTART`` of these in a row that have a direction in common replace the set.
+        ``RESTART`` of these in a row that have a direction in common replace the set; one alone
+        replaces another one.
         """
+        if not self.is_confirmed:
+            return Sightings.of(self.t_ns, cap)
         other = Sightings.of(self.t_ns, cap)
         if self.contrary is not None:
             (known,) = possible([self.contrary.caps], 0)

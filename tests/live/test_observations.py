@@ -1,6 +1,7 @@
 """Observations of a running service: recorded and replayed in order, and a flood of them."""
 
 import json
+import multiprocessing
 import socket
 import subprocess
 import threading
@@ -23,19 +24,18 @@ PER_S = 10_000
 FLOOD_S = 4.0
 
 
-def flood(port: int, per_s: float, until: threading.Event) -> int:
-    """Send observations of changing UAVs, every fourth one malformed; return their number."""
+def flood(port: int, per_s: float, until: threading.Event, sent: Any) -> None:
+    """Send observations of changing UAVs, every fourth one malformed; add their number."""
     records = [encode(replace(POWER, uav=f"{n}:1")) for n in range(250)]
     records[::4] = [record[:-1] for record in records[::4]]
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
         sender.connect(("127.0.0.1", port))
-        begun_s, sent = time.monotonic(), 0
+        begun_s = time.monotonic()
         while not until.is_set():
-            while sent < per_s * (time.monotonic() - begun_s):
-                sender.send(records[sent % len(records)])
-                sent += 1
+            while sent.value < per_s * (time.monotonic() - begun_s):
+                sender.send(records[sent.value % len(records)])
+                sent.value += 1
             until.wait(0.002)
-    return sent
 
 
 @pytest.mark.full
@@ -46,14 +46,14 @@ def test_flood_of_observations_costs_no_beam_and_all_are_recorded_in_order(
     settings.write_text(f'[observations]\nenabled = true\nudp = "127.0.0.1:{port}"\n')
     words = ("--config", str(settings), "--record", str(tmp_path / "recordings"))
     with besieged(start_node, *words) as node:
-        sent: list[int] = []
-        seen = attacked(lambda _, until: sent.append(flood(port, PER_S, until)), node, FLOOD_S)
+        sent = multiprocessing.RawValue("q", 0)  # the attack runs in a process of its own
+        seen = attacked(lambda _, until: flood(port, PER_S, until, sent), node, FLOOD_S)
         assert seen.looks
         assert seen.without_beams == []
         assert seen.broken == []
         assert seen.grown_mb < 60.0
         answer = node.wait_until(  # each datagram is counted once, even if the kernel dropped it
-            "/v1/status", lambda answer: sum(answer["observations"].values()) == sent[0]
+            "/v1/status", lambda answer: sum(answer["observations"].values()) == sent.value
         )
         assert min(answer["observations"].values()) > 0, answer  # received, malformed and dropped
         found = Client(node.url).observe(

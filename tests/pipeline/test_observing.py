@@ -6,7 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from companion.values import Cause, Estimate, FloatArray, Level, Reason, Rejection, Severity
+from companion.values import (
+    Cause,
+    Estimate,
+    FloatArray,
+    Level,
+    Observation,
+    Reason,
+    Rejection,
+    Severity,
+    Tick,
+)
 from tests.observed_flight import ObservedFlight
 
 MOUNT = np.radians([0.5, -1.0, 1.5])
@@ -106,20 +116,38 @@ def test_error_beyond_the_bound_is_announced_and_never_blamed_on_a_uav(uavs: int
 
 
 @pytest.mark.parametrize("uavs", [1, 4])
-def test_first_measurement_says_nothing_of_the_attitude_before_it_is_confirmed(uavs: int) -> None:
+def test_first_measurement_changes_nothing_before_it_is_confirmed(uavs: int) -> None:
     """It may be a reflection; there is no other one yet that would contradict it."""
     flight = ObservedFlight(uavs=uavs)
     flight.measures = False
     flight.fly(2.0)
-    first = flight.observation("1:1")
-    azimuth_rad = (first.azimuth_rad or 0.0) + 1.0
-    flight.said += flight.pipeline.step(replace(first, azimuth_rad=azimuth_rad))
+    flight.said.clear()
+    flight.said += flight.pipeline.step(aside(flight.observation("1:1"), 1.0))
     flight.fly(0.5)
     flight.measures = True
     flight.fly(2.0)
     assert not [one.text for one in flight.notices() if "attitude_bound_deg" in one.text]
     assert flight.pipeline.observing.compass.bound_rad == pytest.approx(math.radians(3.0))
+    assert flight.unbounded() == 0
     assert max(flight.errors_deg().values()) < 0.3
+
+
+def aside(measured: Observation, by_rad: float) -> Observation:
+    """Return a measurement with a false azimuth."""
+    assert measured.azimuth_rad is not None
+    return replace(measured, azimuth_rad=measured.azimuth_rad + by_rad)
+
+
+def test_false_measurement_changes_nothing_while_it_waits_for_an_attitude() -> None:
+    flight = ObservedFlight()
+    flight.fly(3.0)
+    flight.said.clear()
+    flight.t_ns += 50_000_000
+    flight.said += flight.pipeline.step(aside(flight.observation("1:1"), 1.0))
+    flight.said += flight.pipeline.step(Tick(flight.t_ns))
+    assert flight.pipeline.look(flight.t_ns).beams.beams
+    assert flight.unbounded() == 0
+    flight.errors_deg()
 
 
 @pytest.mark.parametrize(
@@ -156,10 +184,7 @@ def test_outliers_are_counted_and_change_nothing() -> None:
     flight.fly(3.0)
     before = flight.errors_deg()
     flight.said.clear()
-    outlier = flight.observation("1:1")
-    flight.said += flight.pipeline.step(
-        replace(outlier, azimuth_rad=(outlier.azimuth_rad or 0.0) + 0.5)
-    )
+    flight.said += flight.pipeline.step(aside(flight.observation("1:1"), 0.5))
     flight.fly(0.3)
     reasons = [one.reason for one in flight.said if isinstance(one, Rejection)]
     assert reasons == [Reason.OUTLIER]

@@ -6,7 +6,8 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from companion.tracking.sightings import RESTART, WINDOW, Guide, Motion, Sightings, possible
+from companion.tracking.moved_caps import Motion
+from companion.tracking.sightings import RESTART, WINDOW, Guide, Sightings, possible
 from companion.values import Cap, FloatArray, angle_rad
 from tests.sighted_world import direction, tilted
 

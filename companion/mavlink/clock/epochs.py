@@ -15,8 +15,8 @@ line while it is less than ``late_max_ns`` off it:
 - Stamps off the line that lie on a line of their own for three seconds, while the first line
   advances between them, belong to a second clock: two senders share one id.
 - A stamp that is more than a second early on a line of 20 implies that all earlier ones were
-  late. It counts once three stamps over at least half a second agree; until then they have no
-  time.
+  late. It counts once three stamps of reports over at least half a second agree; until then they
+  have no time.
 - Frames of the previous line that arrive within ``late_max_ns`` after it was left have no time.
 
 A reboot is therefore reported once, at the stamp that confirms it. One case is ambiguous: a
@@ -28,12 +28,11 @@ from dataclasses import dataclass, field
 from typing import Final, NamedTuple
 
 from companion.mavlink.clock.floor import Floor
+from companion.mavlink.wire.stamps import WRAP_MS, unwrapped_ns
 
 _NS: Final = 1_000_000_000
 _NS_PER_MS: Final = 1_000_000
-_WRAP_MS: Final = 1 << 32
-WRAP_NS: Final = _WRAP_MS * _NS_PER_MS
-"""Period of a boot clock: its 32-bit milliseconds wrap after 49.7 days."""
+WRAP_NS: Final = WRAP_MS * _NS_PER_MS
 _EARLY_NS: Final = -_NS
 """Least lateness of a stamp that fits an established line: -1 s, so 1 s early still fits."""
 _ESTABLISHED: Final = 20  # stamps of a line that a single early stamp can no longer move
@@ -118,7 +117,7 @@ class BootLine:
         """
         if not self.floor.count:
             return self._accept(arrival_ns, boot_ms * _NS_PER_MS)
-        x_ns = _unwrap(boot_ms, self.newest_ns)
+        x_ns = unwrapped_ns(boot_ms, self.newest_ns)
         late_ns = arrival_ns - x_ns - self.floor.at(x_ns)
         if self._previous is not None and self._is_straggler(arrival_ns, boot_ms, late_ns):
             return None
@@ -131,7 +130,7 @@ class BootLine:
         self._rival.add(arrival_ns, boot_ms, self._late_max_ns)
         if not (advances and self._run.lasts(3, _NS // 2)):
             return None
-        stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % _WRAP_MS
+        stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % WRAP_MS
         return self._begin_new_line(rebooted=stepped_back)
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> bool:
@@ -139,8 +138,11 @@ class BootLine:
         floor = self.floor
         if not floor.count:
             return False
-        x_ns = _unwrap(boot_ms, self.newest_ns)
-        if abs(arrival_ns - x_ns - floor.at(x_ns)) > self._late_max_ns // 2:
+        x_ns = unwrapped_ns(boot_ms, self.newest_ns)
+        late_ns = arrival_ns - x_ns - floor.at(x_ns)
+        if abs(late_ns) > self._late_max_ns // 2:
+            return False
+        if late_ns < _EARLY_NS and floor.count >= _ESTABLISHED:
             return False
         self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = max(self.newest_ns, x_ns)
@@ -156,7 +158,7 @@ class BootLine:
 
     def unwrap(self, boot_ms: int) -> int:
         """Convert boot milliseconds to ns, unwrapped to the value nearest to the newest stamp."""
-        return _unwrap(boot_ms, self.newest_ns)
+        return unwrapped_ns(boot_ms, self.newest_ns)
 
     def fits(self, arrival_ns: int, x_ns: int) -> bool:
         """Return whether a stamp can belong to the line."""
@@ -193,10 +195,10 @@ class BootLine:
         if not (self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(3, _NS // 2)):
             return None
         for at_ns, stamp_ms in self._run.stamps[:-1]:
-            x_ns = _unwrap(stamp_ms, self.newest_ns)
+            x_ns = unwrapped_ns(stamp_ms, self.newest_ns)
             self.floor.add(x_ns, at_ns - x_ns)
         self._run.stamps.clear()
-        return self._accept(arrival_ns, _unwrap(boot_ms, self.newest_ns))
+        return self._accept(arrival_ns, unwrapped_ns(boot_ms, self.newest_ns))
 
     def _place_delayed(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp:
         """Place a stamp in order but too late: the link stalled, or the clock stalled."""
@@ -213,7 +215,7 @@ class BootLine:
         if arrival_ns - left_ns > self._late_max_ns:
             self._previous = None
             return False
-        x_ns = _unwrap(boot_ms, before.newest_ns)
+        x_ns = unwrapped_ns(boot_ms, before.newest_ns)
         was_late_ns = arrival_ns - x_ns - before.at(x_ns)
         fits_before = _EARLY_NS <= was_late_ns <= self._late_max_ns
         return fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
@@ -228,15 +230,8 @@ class BootLine:
         self.floor = Floor(*self._shape, before.largest_ns)
         x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self.newest_ns
         for arrival_ns, boot_ms in stamps:
-            x_ns = _unwrap(boot_ms, x_ns)
+            x_ns = unwrapped_ns(boot_ms, x_ns)
             self.floor.add(x_ns, arrival_ns - x_ns)
         self.newest_ns = x_ns
         jump_ns = 0 if rebooted else self.floor.at(x_ns) - before.at(x_ns)
         return PlacedStamp(x_ns=x_ns, new_line=True, rebooted=rebooted, jump_ns=jump_ns)
-
-
-def _unwrap(boot_ms: int, newest_ns: int) -> int:
-    """Convert boot milliseconds to ns, unwrapped to the value nearest to ``newest_ns``."""
-    newest_ms = newest_ns // _NS_PER_MS
-    step_ms = (boot_ms - newest_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
-    return (newest_ms + step_ms) * _NS_PER_MS

@@ -13,9 +13,10 @@ agree with its path to ``AGREEMENT_M``. A stranger becomes known
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
 again; its positions are used only as far as they agree with those of the other. Its attitudes and
 what else moves a bound are used only where the other has not brought the same message shortly
-before: positions that agree prove nothing about these. So the vehicle that was here first stays
-believed, and a stranger costs it nothing; whoever sends first in a vehicle's name is believed until
-it falls silent.
+before: positions that agree prove nothing about these. Its stamps are used only if they are of the
+other's clock: a clock of its own would look like a restart, or like a second vehicle. So the
+vehicle that was here first stays believed, and a stranger costs it nothing; whoever sends first in
+a vehicle's name is believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
@@ -44,7 +45,7 @@ from companion.mavlink.wire.decode import (
 )
 from companion.mavlink.wire.encode import TIMESYNC
 from companion.mavlink.wire.positions import OWN, OwnPosition, read
-from companion.mavlink.wire.stamps import STAMPED
+from companion.mavlink.wire.stamps import STAMPED, boot_ms, unwrapped_ns
 from companion.values import Frame, Source
 from companion.values.budget import Budget
 
@@ -59,6 +60,8 @@ CURRENT_INTERVALS: Final = 3.0  # that time in intervals between its messages
 SENDERS_MAX: Final = 4096  # senders followed; those of known peers are forgotten last
 PEERS_MAX: Final = 4  # known peers of a sender, and strangers compared with them
 COMPARED_PER_S: Final = 30.0  # positions of strangers compared per sender and second
+CLOCK_NS: Final = 10_000_000_000
+"""Most by which stamps of two peers may differ, as one of the links may be slow."""
 NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one sender
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
@@ -84,6 +87,7 @@ class _Peer:
     heard_ns: int
     messages: int = 1  # positions and attitudes since then
     newest: dict[int, Frame] = field(default_factory=dict)  # of each message since then
+    stamped: Frame | None = None  # newest with a stamp, while other peers are known too
     path: Path = field(default_factory=Path)
     agreements: int = 0
     agrees_since_ns: int = 0
@@ -153,14 +157,7 @@ class KnownPeers:
             sender = self._follow(frame)
         known = sender.known.get(peer)
         if known is not None:
-            known.newest[msgid] = frame
-            if msgid in POSE:
-                known.hear(frame.t_ns)
-            if msgid in BROUGHT_NS and len(sender.known) > 1:
-                return BROUGHT if _is_brought(sender, known, frame) else None
-            if msgid not in OWN or (len(sender.known) == 1 and not sender.strangers):
-                return None
-            return self._compare_known(sender, peer, known, frame)
+            return self._refusal_of_known(sender, peer, known, frame)
         current = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
         is_router = self._is_router(link, peer)
         if not current or is_router:
@@ -198,12 +195,31 @@ class KnownPeers:
 
     # --- known peers --------------------------------------------------------------------------
 
+    def _refusal_of_known(
+        self, sender: _Sender, peer: str, known: _Peer, frame: Frame
+    ) -> str | None:
+        msgid, is_only = frame.msgid, len(sender.known) == 1
+        known.newest[msgid] = frame
+        if msgid in POSE:
+            known.hear(frame.t_ns)
+        if not is_only and (msgid in STAMPED or msgid in OWN):
+            if _is_of_another_clock(sender, known, frame):
+                return STRANGER
+            known.stamped = frame
+        if msgid in BROUGHT_NS and not is_only:
+            return BROUGHT if _is_brought(sender, known, frame) else None
+        if msgid not in OWN or (is_only and not sender.strangers):
+            return None
+        return self._compare_known(sender, peer, known, frame)
+
     def _compare_known(self, sender: _Sender, peer: str, known: _Peer, frame: Frame) -> str | None:
         """Compare a known peer's position with those of all other peers of its sender."""
         said = read(frame)
         before = known.path.newest
         if not known.path.add(said):
-            return None
+            earlier = _current_earlier(sender, known, frame.t_ns)
+            excesses = [known.path.excess_m(one.path, None, said) for one in earlier]
+            return None if all(_agrees(excess) for excess in excesses) else STRANGER
         for name, stranger in list(sender.strangers.items()):
             if frame.t_ns - stranger.heard_ns > KEPT_NS:
                 del sender.strangers[name]
@@ -329,6 +345,35 @@ def _is_brought(sender: _Sender, known: _Peer, frame: Frame) -> bool:
     ]
     newest = [one for one in newest if frame.t_ns - one.t_ns <= BROUGHT_NS[frame.msgid]]
     return bool(newest) and all(one.payload != frame.payload for one in newest)
+
+
+def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
+    """Return the current peers that were known earlier; none for a router."""
+    if known.is_router:
+        return []
+    standing = _standing(known)
+    return [
+        one for one in sender.known.values() if _standing(one) > standing and one.is_current(now_ns)
+    ]
+
+
+def _is_of_another_clock(sender: _Sender, known: _Peer, frame: Frame) -> bool:
+    """Return whether a stamp cannot be of the clock that a peer known earlier reports."""
+    for one in _current_earlier(sender, known, frame.t_ns):
+        if one.stamped is not None:
+            expected_ns = _stamp_ms(one.stamped) * 1_000_000 + frame.t_ns - one.stamped.t_ns
+            off_ns = unwrapped_ns(_stamp_ms(frame), expected_ns) - expected_ns
+            if abs(off_ns) > CLOCK_NS:
+                return True
+    return False
+
+
+def _stamp_ms(frame: Frame) -> int:
+    return boot_ms(frame) if frame.msgid in STAMPED else read(frame).boot_ms
+
+
+def _agrees(excess_m: float | None) -> bool:
+    return excess_m is not None and excess_m <= AGREEMENT_M
 
 
 def _excess_m(known: _Peer, other: _Peer, before: OwnPosition | None, said: OwnPosition) -> float:

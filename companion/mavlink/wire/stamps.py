@@ -21,6 +21,9 @@ STAMPED: Final[dict[int, int]] = {
     283: 8,
 }
 """Offset of ``time_boot_ms`` in the payload, bytes, by message id."""
+WRAP_MS: Final = 1 << 32
+"""Period of a boot clock: its 32-bit milliseconds wrap after 49.7 days."""
+_NS_PER_MS: Final = 1_000_000
 
 
 def boot_ms(frame: Frame) -> int:
@@ -32,3 +35,10 @@ def boot_ms(frame: Frame) -> int:
     start = 10 if raw[0] == 0xFD else 6
     at = start + STAMPED[frame.msgid]
     return int.from_bytes(raw[at : min(at + 4, start + raw[1])], "little")
+
+
+def unwrapped_ns(boot_ms: int, near_ns: int) -> int:
+    """Convert boot milliseconds to ns, unwrapped to the value nearest to ``near_ns``."""
+    near_ms = near_ns // _NS_PER_MS
+    step_ms = (boot_ms - near_ms + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
+    return (near_ms + step_ms) * _NS_PER_MS

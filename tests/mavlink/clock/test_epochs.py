@@ -70,6 +70,20 @@ def test_future_stamps_do_not_move_the_clock(ahead_ms: int, again_ms: int) -> No
     assert after.offset_ns == pytest.approx(before.offset_ns, abs=2 * MS)
 
 
+@pytest.mark.parametrize(("ahead_ms", "moves"), [(900, True), (1_100, False), (4_900, False)])
+def test_future_stamp_of_another_message_does_not_move_the_clock(
+    ahead_ms: int, moves: bool
+) -> None:
+    """Reports alone can show that all earlier stamps were late."""
+    clock = SenderClock()
+    observe_all(run(0, 300_000, 50), clock)
+    before_ns = clock.node_ns(310_000 * MS)
+    clock.add_stamp(EPOCH_NS + 10_050 * MS, 310_050 + ahead_ms)
+    assert (clock.node_ns(310_000 * MS) != before_ns) == moves
+    (after,) = observe_all([(10_100, 310_100)], clock)
+    assert after is not None and (after.latency_s > 0.5) == moves
+
+
 def test_clock_follows_a_link_whose_delay_falls() -> None:
     """All frames of half a minute were 3 s late; the clock follows after half a second."""
     late, prompt = run(3_000, 300_000, 150), run(33_000, 333_000, 20)

@@ -116,7 +116,7 @@ def test_clocks_and_bounds_are_not_moved_by_strangers(msgid: int, payload: bytes
 
 
 def attitude(t_s: float, yaw_rad: float) -> Frame:
-    payload = struct.pack("<I6f", round(t_s * 1000), 0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0)
+    payload = struct.pack("<I6f", round((100 + t_s) * 1000), 0.0, 0.0, yaw_rad, 0.0, 0.0, 0.0)
     return message(t_s, Outgoing(Source(1, 1), ATTITUDE, payload))
 
 
@@ -208,6 +208,59 @@ def test_fresh_ports_evict_no_known_peer_and_are_never_believed() -> None:
     late = [t_s for times in found.values() for t_s in times if t_s > 10.1 + within_slack_s]
     assert len(late) >= 40 * (50 - within_slack_s) - 2
     assert [one[0] for one in peers.contradicted] == ["1:1"]
+
+
+@pytest.mark.parametrize("off_s", [-3600.0, 3600.0, -30.0, 30.0, 2.0**31 / 1000])
+def test_true_place_with_a_stamp_of_another_clock_is_never_used(off_s: float) -> None:
+    """Half of the stamps are right, so that the stranger becomes known."""
+    forged = (
+        (at_s, (boot_s + off_s * (number % 2)) % (2**32 / 1000), peer, place)
+        for number, (at_s, boot_s, peer, place) in enumerate(heard(OTHER, 10, begins_s=10.03))
+    )
+    found = rejected(KnownPeers(), heard(HOME, 10), forged)
+    assert found[HOME] == []
+    lies = {round(10.08 + number / 10, 3) for number in range(1, 500, 2)}
+    assert lies <= {round(t_s, 3) for t_s in found[OTHER]}
+
+
+@pytest.mark.parametrize("off_ms", [-3_600_000, 3_600_000])
+def test_no_stamp_of_another_clock_is_used_of_a_peer_that_became_known(off_ms: int) -> None:
+    peers = with_two_known_peers()
+    for number in range(20):
+        t_s = 20 + number / 10
+        assert peers.refusal(LINK, HOME, report(round(t_s * S), 100 + t_s, circle(t_s))) is None
+        for lie, verdict in ((off_ms, STRANGER), (0, None)):
+            boot_ms = (round((100 + t_s) * 1000) + lie) % 2**32
+            said = Outgoing(Source(1, 1), SYSTEM_TIME, struct.pack("<QI", 7, boot_ms))
+            assert peers.refusal(LINK, OTHER, message(t_s + 0.01, said)) == verdict
+
+
+def test_late_reports_of_a_second_route_are_used_if_they_agree() -> None:
+    """Also if they arrive after newer ones of the same route."""
+
+    def swapped(told: Callable[[float], Place]) -> Stream:
+        for number, (at_s, boot_s, peer, _) in enumerate(heard(OTHER, 10, begins_s=5)):
+            earlier_s = 0.35 if number % 3 == 0 else 0.0
+            place = told(boot_s - 100 - earlier_s) if earlier_s else circle(boot_s - 100)
+            yield at_s, boot_s - earlier_s, peer, place
+
+    found = rejected(KnownPeers(), heard(HOME, 10), swapped(circle))
+    assert found[HOME] == [] and max(found[OTHER]) < 15
+    false = rejected(KnownPeers(), heard(HOME, 10), swapped(beside(8.0)))
+    assert false[HOME] == []
+    assert len([t_s for t_s in false[OTHER] if t_s > 20]) >= 10 * 40 / 3 - 1
+
+
+def test_vehicle_that_restarts_is_used_over_both_of_its_routes() -> None:
+    def restarted(stream: Stream) -> Stream:
+        return (
+            (at, boot - 95 if at > 30 else boot, peer, place) for at, boot, peer, place in stream
+        )
+
+    streams = (heard(HOME, 10), heard(OTHER, 10, begins_s=5.03, delay_s=lambda: 0.02))
+    found = rejected(KnownPeers(), *(restarted(one) for one in streams))
+    assert found[HOME] == []
+    assert len([t_s for t_s in found[OTHER] if t_s > 20]) <= 3
 
 
 def test_right_place_ahead_of_time_with_a_wrong_velocity_is_not_used() -> None:

@@ -15,7 +15,7 @@ from urllib.parse import urlsplit
 
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
-from starlette.websockets import WebSocket
+from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketDisconnected
 
 from companion.server.responses import problem
 from companion.values import Notice, Severity, UserError, shown
@@ -211,6 +211,20 @@ class WrongTokens:
                 )
             )
         return WRONG_DELAY_S
+
+
+class UntilGone:
+    """ASGI middleware: a WebSocket ends without an error if its client leaves at any moment."""
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await self._app(scope, receive, send)
+        except (WebSocketDisconnect, WebSocketDisconnected):
+            if scope["type"] != "websocket":
+                raise
 
 
 class BearerToken:

@@ -11,7 +11,7 @@ from starlette.types import ASGIApp
 
 import companion
 from companion.server import area_map, beam_routes, file_routes, models, responses
-from companion.server.access import OPEN_PATHS, BearerToken, KnownHosts, WrongTokens
+from companion.server.access import OPEN_PATHS, BearerToken, KnownHosts, UntilGone, WrongTokens
 from companion.server.giving_way import GivingWay
 from companion.server.large_answers import FEW_ITEMS, LargeAnswers, Make
 from companion.server.metrics import NodeMetrics
@@ -111,7 +111,7 @@ def create_app(
     if token:
         open_paths = OPEN_PATHS | page.paths
         secured = BearerToken(app=secured, token=token, open_paths=open_paths, wrong=wrong_tokens)
-    return KnownHosts(secured, node.pipeline.settings.server.hosts)
+    return UntilGone(KnownHosts(secured, node.pipeline.settings.server.hosts))
 
 
 def _health_routes(

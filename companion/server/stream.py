@@ -28,7 +28,7 @@ from typing import Any, Final, TypeVar
 
 from starlette.datastructures import QueryParams
 from starlette.exceptions import HTTPException
-from starlette.websockets import WebSocket, WebSocketDisconnect
+from starlette.websockets import WebSocket
 
 from companion.server import topics
 from companion.server.access import accept, is_same_site
@@ -149,8 +149,6 @@ class Stream:
         self._open.append(websocket)
         try:
             await self._attend(websocket, asked, slot * self._slot_s)
-        except WebSocketDisconnect:
-            pass  # disconnected while a message was sent
         finally:
             if websocket in self._open:
                 self._open.remove(websocket)

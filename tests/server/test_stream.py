@@ -241,6 +241,34 @@ def test_client_message_closes_the_stream(shared_node: Any, serving: Any) -> Non
     run_async(check())
 
 
+@pytest.mark.parametrize("token", [None, "s3cret"])
+@pytest.mark.parametrize("leaves", ["closes", "resets"])
+def test_client_that_sends_and_leaves_at_once_causes_no_error(
+    shared_node: Any, serving: Any, capfd: Any, leaves: str, token: str | None
+) -> None:
+    text, close = b"\x81\x81\0\0\0\0x", b"\x88\x82\0\0\0\0\x03\xe8"  # masked with zeros
+
+    async def leave(at: str) -> None:
+        websocket = await connect(
+            f"ws://{at}/v1/stream", subprotocols=[Subprotocol("companion.v1")]
+        )
+        websocket.transport.write(text + (close if leaves == "closes" else b""))
+        if leaves == "closes":
+            await asyncio.wait_for(websocket.wait_closed(), SOON_S)
+        else:
+            websocket.transport.abort()
+
+    async def check() -> None:
+        async with serving(shared_node, token) as at:
+            await asyncio.gather(*(leave(at) for _ in range(30)))
+            async with asyncio.timeout(SOON_S):
+                while any("run_asgi" in repr(task) for task in asyncio.all_tasks()):
+                    await asyncio.sleep(0.01)
+
+    run_async(check())
+    assert "Traceback" not in capfd.readouterr().err
+
+
 def test_foreign_origin_is_rejected(shared_node: Any, serving: Any) -> None:
     async def check() -> None:
         async with serving(shared_node) as at:

@@ -15,6 +15,7 @@ from typing import Any, Final, TypeVar
 
 import uvicorn
 
+from companion.mavlink.links.descriptors import raise_limit
 from companion.node.signals import interrupts_held, release_interrupts
 from companion.server.app import create_app
 from companion.server.connections import BoundedProtocol
@@ -140,6 +141,7 @@ def run_until_stopped(
     finish.
     """
     _configure_interpreter()
+    raise_limit()
     # Held until the loop has handlers: an exception would leave the loop half started.
     with interrupts_held(), asyncio.Runner(loop_factory=_loop_factory()) as runner:
         return runner.run(_stopped_by_signal(main, seconds))

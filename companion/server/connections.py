@@ -6,13 +6,13 @@ before any token is checked.
 """
 
 import asyncio
-import resource
 from typing import Any, Final
 
 from starlette.requests import ClientDisconnect
 from uvicorn.protocols.http.flow_control import FlowControl
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
+from companion.mavlink.links.descriptors import share
 from companion.server.request_queue import RequestQueue
 from companion.values.budget import Budget
 
@@ -39,15 +39,12 @@ SETTLED_S: Final = 2.0
 USUAL_PATHS: Final = frozenset({"/healthz", "/v1/beams", "/v1/beams/weights"})
 """Paths whose answer of the moment is made once; without a query they are started first."""
 CONNECTIONS_MAX: Final = 512
-RESERVED: Final = 96  # descriptors for links, recordings and files
+DESCRIPTORS: Final = 0.5  # ratio of the descriptors that connections may take
 
 
 def most_connections() -> int:
     """Return the limit on connections that leaves descriptors for links and recordings."""
-    soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
-    if soft == resource.RLIM_INFINITY:
-        return CONNECTIONS_MAX
-    return max(8, min(CONNECTIONS_MAX, soft - RESERVED))
+    return share(CONNECTIONS_MAX, DESCRIPTORS)
 
 
 class CutShortError(Exception):

@@ -96,12 +96,6 @@ def test_idle_connections_do_not_block_new_ones(
     run_async(crowded())
 
 
-def test_connection_limit_leaves_spare_file_descriptors(monkeypatch: pytest.MonkeyPatch) -> None:
-    for soft, most in ((1024, 512), (256, 160), (90, 8), (-1, 512)):
-        monkeypatch.setattr(connections.resource, "getrlimit", lambda _, soft=soft: (soft, soft))
-        assert connections.most_connections() == most
-
-
 # --- host names -----------------------------------------------------------------------------------
 
 

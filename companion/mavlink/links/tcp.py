@@ -12,6 +12,7 @@ from collections.abc import Callable, Collection, Hashable
 from dataclasses import replace
 from typing import Final, cast
 
+from companion.mavlink.links.descriptors import share
 from companion.mavlink.links.endpoints import (
     HungUpError,
     Upcalls,
@@ -28,7 +29,8 @@ WRITE_BUFFER_BYTES: Final = 64 << 10
 CONNECT_S: Final = 5.0
 """Timeout of a connection attempt; the system's own is two minutes, with ever longer pauses."""
 CONNECTIONS_MAX: Final = 256
-"""Most connections of a listening link (each takes a file descriptor); more are closed at once."""
+"""Most connections of a listening link; more are closed at once."""
+DESCRIPTORS: Final = 0.1  # ratio of the descriptors that the connections of a link may take
 PIECE_BYTES: Final = 4096
 """Bytes that are read and processed before other work runs; some hundred frames.
 
@@ -131,7 +133,7 @@ class TcpIn:
             if not isinstance(why, OSError):
                 settle(fault, why)
 
-        if len(self._streams) >= CONNECTIONS_MAX:
+        if len(self._streams) >= share(CONNECTIONS_MAX, DESCRIPTORS):
             return _Stream(
                 upcalls=self._upcalls, on_close=on_close, order=self._order, is_accepted=False
             )

@@ -16,7 +16,6 @@ from companion.beams.array.geometry import Array
 from companion.beams.hardware import codebooks
 from companion.pipeline import assembly
 from companion.server import connections
-from companion.server.access import KnownHosts
 from companion.server.app import create_app
 from companion.server.work_slots import WorkSlots
 from companion.settings.model import Settings
@@ -161,7 +160,8 @@ def test_bearer_scheme_is_case_insensitive(make_node: Any, scheme: str) -> None:
 
 
 def test_host_name_is_checked_before_the_token(make_node: Any) -> None:
-    assert isinstance(create_app(make_node(flown=False), "secret"), KnownHosts)
+    client = TestClient(create_app(make_node(flown=False), "secret"), "http://evil.example")
+    assert client.get("/v1/uavs").status_code == 421
 
 
 # --- requests -------------------------------------------------------------------------------------

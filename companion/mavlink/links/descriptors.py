@@ -26,4 +26,4 @@ def share(most: int, ratio: float) -> int:
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY:
         return most
-    return max(LEAST, min(most, int(ratio * (soft - RESERVED))))
+    return min(most, max(LEAST, int(ratio * (soft - RESERVED))))

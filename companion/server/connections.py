@@ -88,6 +88,7 @@ class BoundedProtocol(HttpToolsProtocol):
         self._since_s = 0.0  # time of the connection, of the last head, or of the last answer
         self._over_budget = False
         self._is_lost = False
+        self._is_upgrading = False  # becomes a WebSocket, and what it sends until then is ignored
         self._answered: Any = None  # the request that is being answered, or the last one
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
@@ -114,7 +115,7 @@ class BoundedProtocol(HttpToolsProtocol):
 
     def data_received(self, data: bytes) -> None:
         """Process bytes of a client; see ``asyncio.Protocol``."""
-        if self.transport is None or self.transport.is_closing():
+        if self.transport is None or self.transport.is_closing() or self._is_upgrading:
             return
         self._unparsed += data
         self._parse()
@@ -177,11 +178,17 @@ class BoundedProtocol(HttpToolsProtocol):
         super().on_message_complete()
 
     def handle_websocket_upgrade(self) -> None:
-        """Hand the connection over; see ``BoundedWebSocket``."""
-        self._cancel()
+        """Hand the connection over, as soon as its turn comes; see ``BoundedWebSocket``."""
+        self._is_upgrading = True
         self._unparsed.clear()  # a client must wait for the answer
-        self._read_again()
-        super().handle_websocket_upgrade()
+        self._abort_after(HEAD_S)
+
+        def start() -> None:
+            self._cancel()
+            self._read_again()
+            super(BoundedProtocol, self).handle_websocket_upgrade()
+
+        self._queue.add_stream(start, lambda: not self._is_lost and not self.transport.is_closing())
 
     def on_response_complete(self) -> None:
         """Note the end of an answer, and parse the next request."""

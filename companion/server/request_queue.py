@@ -17,10 +17,13 @@ REQUESTS_PER_S: Final = 500.0  # requests of all connections, before those over 
 REQUESTS_SAVED: Final = 1000.0
 BESIDE_WORK_S: Final = 0.005
 """Time between two requests over a budget while a thread computes, seconds."""
+STREAMS_PER_S: Final = 50.0  # WebSockets of all connections that are opened
+STREAMS_SAVED: Final = 20.0
 LOOK_AGAIN_S: Final = 0.001
 """Time between two checks whether the threads still compute, seconds."""
 
 Start = Callable[[], None]
+IsWanted = Callable[[], bool]
 
 
 class RequestQueue:
@@ -39,6 +42,26 @@ class RequestQueue:
         self._late: deque[Start] = deque()
         self._late_from_s = 0.0  # no request over a budget starts before this time
         self._wakes: asyncio.Handle | None = None
+        self._streams: deque[tuple[Start, IsWanted]] = deque()
+        self._streams_budget = Budget(per_s=STREAMS_PER_S, most=STREAMS_SAVED)
+        self._opens: asyncio.Handle | None = None
+
+    def add_stream(self, start: Start, is_wanted: IsWanted) -> None:
+        """Open a WebSocket when the budget permits, unless its client has left by then."""
+        self._streams.append((start, is_wanted))
+        if self._opens is None:
+            self._open_streams()
+
+    def _open_streams(self) -> None:
+        self._opens, loop = None, asyncio.get_running_loop()
+        while self._streams:
+            start, is_wanted = self._streams[0]
+            if is_wanted() and not self._streams_budget.spend(1, loop.time()):
+                self._opens = loop.call_later(1.0 / STREAMS_PER_S, self._open_streams)
+                return
+            self._streams.popleft()
+            if is_wanted():
+                start()
 
     def add(self, start: Start, *, within_budget: bool, is_usual: bool = False) -> None:
         """Start a request in an iteration to come. ``start`` must not raise."""

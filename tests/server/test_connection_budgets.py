@@ -4,6 +4,7 @@ import asyncio
 import contextlib
 import os
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import pytest
@@ -14,7 +15,7 @@ from starlette.testclient import TestClient
 from support import HANG_S, run_async
 
 from companion.node import serving
-from companion.server import access, connections, stream, websocket_connections
+from companion.server import access, connections, request_queue, stream, websocket_connections
 from companion.server.app import create_app
 from companion.server.request_queue import AT_ONCE, RequestQueue
 from companion.values import Severity
@@ -197,6 +198,29 @@ def test_requests_over_a_budget_wait_for_others_and_for_threads() -> None:
         assert started[20:] == ["late"] * 10
 
     run_async(queued())
+
+
+def test_streams_are_opened_at_a_limited_rate_unless_their_clients_have_left() -> None:
+    async def opened() -> None:
+        loop, queue, done = asyncio.get_running_loop(), RequestQueue(lambda: False), asyncio.Event()
+        started, saved = list[tuple[int, float]](), round(request_queue.STREAMS_SAVED)
+        begun_s = loop.time()
+
+        def start(number: int) -> None:
+            started.append((number, loop.time() - begun_s))
+            if number == saved + 9:
+                done.set()
+
+        for number in range(saved + 10):
+            queue.add_stream(partial(start, number), lambda number=number: number != saved + 3)
+        assert len(started) == saved
+        await asyncio.wait_for(done.wait(), HANG_S)
+        assert [number for number, _ in started if number >= saved] == [
+            number for number in range(saved, saved + 10) if number != saved + 3
+        ]
+        assert started[-1][1] >= 8 / request_queue.STREAMS_PER_S
+
+    run_async(opened())
 
 
 def test_new_clients_replace_those_that_do_not_read(

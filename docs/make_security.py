@@ -218,7 +218,8 @@ WAYS: Final = (
         name="WebSocket `/v1/stream`",
         covers=("route:/v1/stream",),
         size=f"{websocket_connections.BYTES_PER_S:.0f} bytes/s from a client, {kb(int(websocket_connections.BYTES_SAVED))} at once; nothing is queued for it",
-        items=f"{stream.CLIENTS_MAX} clients; {stream.MESSAGES_PER_S:.0f} messages/s to all",
+        items=f"{stream.CLIENTS_MAX} clients, {request_queue.STREAMS_PER_S:.0f} new ones/s;"
+        f" {stream.MESSAGES_PER_S:.0f} messages/s to all",
         work="a message is encoded once for all",
         over="closed and not read",
         test=f"{HOSTILE}::test_flood_of_pings_closes_the_websocket",

@@ -123,7 +123,10 @@ def test_time_jump_is_clamped_and_reported(log: Onboard) -> None:
 
 def test_heartbeats_follow_the_latest_arming(log: Onboard) -> None:
     """Times step back at a reboot: of the states that begin by then, the last in the log counts."""
-    changes = ((5_000_000, True), (9_000_000, False), (7_000_000, True), (12_000_000, True))
+    assert log.positions is not None
+    begin_us = int(log.positions.boot_us[0])
+    after_s = ((2, True), (9, False), (5, True), (13, False), (16, True))
+    changes = tuple((begin_us + s * 1_000_000 + 500_000, armed) for s, armed in after_s)
     changed = replace(log, armed=changes)
     found = by_peer(list(said.frames(changed, "x", Source(1, 1), 0.0)))
     seconds = [each.time_boot_ms for each in found["SYSTEM_TIME"]]

@@ -23,7 +23,7 @@ from companion.node.drive import gimbal, rotctld
 from companion.node.fleet import live, messages
 from companion.pipeline import power_beams
 from companion.recording import background
-from companion.recording.foreign import thinned
+from companion.recording.foreign import capture, thinned
 from companion.server import (
     access,
     byte_ranges,
@@ -237,8 +237,10 @@ WAYS: Final = (
     WayIn(
         name="recordings and logs",
         covers=("file:mcap", "file:tlog", "file:dataflash", "file:ulog", "file:capture", "file:csv"),
-        size="lengths are checked against the file before unpacking; below 300 MB",
-        items=f"{thinned.SAMPLES_MAX} samples of a kind",
+        size="lengths are checked against the file before unpacking; below 300 MB, besides the pages"
+        " of a large file",
+        items=f"{thinned.SAMPLES_MAX} samples of a kind; {kb(capture.WAITING_BYTES)} of TCP segments"
+        " that wait",
         work="linear in the file, with progress",
         over="damage is skipped and counted",
         test=f"{LOGS}::test_decompression_bombs_are_read_in_bounded_memory",

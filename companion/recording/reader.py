@@ -10,7 +10,7 @@ Over 300 lines: all kinds of logs become the same events.
 import heapq
 import mmap
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import chain
 from pathlib import Path
 from typing import IO, Final, Literal, NamedTuple, cast
@@ -66,20 +66,22 @@ def read_log(log: Path | str, latency_s: float = 0.0) -> Iterator[Event]:
     if kind in together.READERS:
         return together.events(together.opened([(path, kind)]), latency_s)
     if kind == "mcap":
-        return _begun(path, _recorded(path), "an MCAP file", object)
+        return _begun(path, _recorded, "an MCAP file", object)
     if kind == "capture":
-        return _begun(path, capture.read_capture(path), "a capture", Frame)
-    return _begun(path, capture.read_mcap(path), "an MCAP file", Frame)
+        return _begun(path, capture.read_capture, "a capture", Frame)
+    return _begun(path, capture.read_mcap, "an MCAP file", Frame)
 
 
-def _begun(path: Path, events: Iterator[Event], what: str, *kinds: type) -> Iterator[Event]:
-    """Return the events, read up to the first of ``kinds``, so that errors are raised at once."""
-    before: list[Event] = []
+def _begun(
+    path: Path, read: Callable[[Path], Iterator[Event]], what: str, kind: type
+) -> Iterator[Event]:
+    """Return the events of a file, so that errors before the first of a kind are raised at once.
+
+    The file is read again from its start: any number of rejections may precede that event.
+    """
     try:
-        for event in events:
-            before.append(event)
-            if isinstance(event, kinds):
-                return chain(before, events)
+        if any(isinstance(event, kind) for event in read(path)):
+            return read(path)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     raise LogError(f"{path}: {what}, but no MAVLink frame in it")

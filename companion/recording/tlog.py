@@ -186,9 +186,14 @@ def read_raw(data: bytes, link: str) -> Iterator[Event]:
 
 def _split(data: bytes, link: str) -> Iterator[Frame | Rejection]:
     splitter = Splitter(link)
-    for at in range(0, len(data), _PIECE):
-        yield from splitter.feed(0, data[at : at + _PIECE])
+    yield from feed_in_pieces(splitter, 0, data)
     yield from splitter.finish(0)
+
+
+def feed_in_pieces(splitter: Splitter, t_ns: int, data: bytes) -> Iterator[Frame | Rejection]:
+    """Yield what a splitter finds in bytes, in pieces: frames take 20 times their memory."""
+    for at in range(0, len(data), _PIECE):
+        yield from splitter.feed(t_ns, data[at : at + _PIECE])
 
 
 def _at(event: Event, t_ns: int) -> Event:

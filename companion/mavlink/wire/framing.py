@@ -211,7 +211,7 @@ class Splitter:
         self._limits = limits
         self._pending = b""
         self._claimed = 0  # following bytes within the claimed length of a failed frame
-        self._checker = Checker()
+        self.checker = Checker()  # several splitters may share one, and its cache
 
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
         """Parse bytes that arrived at ``t_ns``; return the frames that these bytes complete.
@@ -219,7 +219,7 @@ class Splitter:
         Other bytes are returned as rejections, one per reason.
         """
         if not self._pending:
-            found = self._checker.at(data, 0, len(data)) if data else INCOMPLETE
+            found = self.checker.at(data, 0, len(data)) if data else INCOMPLETE
             if not isinstance(found, int) and len(found[2]) == len(data):  # nearly every datagram
                 self.frames += 1
                 self._claimed = 0
@@ -239,7 +239,7 @@ class Splitter:
     def _split(self, t_ns: int, buffer: bytes, *, last: bool) -> list[Frame | Rejection]:
         out: list[Frame | Rejection] = []
         lost: dict[Reason, int] = {}
-        link, wanted, frame_at = self.link, self._wanted, self._checker.at
+        link, wanted, frame_at = self.link, self._wanted, self.checker.at
         search, now_s = self._limits.search, t_ns * 1e-9
         most = math.inf if last else self._limits.at_once
         at, end, claimed_to = 0, len(buffer), self._claimed

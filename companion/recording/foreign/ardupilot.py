@@ -84,6 +84,7 @@ def _timed(of: DataflashTable, lost: dict[Reason, int]) -> DataflashTable:
         rows, wild = time_ordered(boot_us)
         count(lost, Reason.BAD_STAMP, wild)
         return of.rows(rows)
+    number = number & 0xFF  # cores and receivers are bytes
     parts = []
     for each in np.unique(number).tolist():
         (mine,) = np.nonzero(number == each)
@@ -99,8 +100,9 @@ def _timed(of: DataflashTable, lost: dict[Reason, int]) -> DataflashTable:
 def _identity(parameters: DataflashTable, versions: DataflashTable) -> tuple[int | None, int]:
     """Return system id (None: unknown) and MAV_TYPE (0, generic: unknown)."""
     values: dict[bytes, float] = {}
-    if "Name" in parameters and "Value" in parameters:
-        names = np.char.rstrip(parameters.raw("Name").astype("S16"), b"\0")
+    said = parameters.values("Name", "S")
+    if said is not None and "Value" in parameters:
+        names = np.char.rstrip(said.astype("S16"), b"\0")
         numbers = parameters.numbers("Value")
         for name in (*_IDS, b"FRAME_CLASS", b"Q_ENABLE"):
             (rows,) = np.nonzero(names == name)

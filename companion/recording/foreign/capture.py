@@ -10,16 +10,19 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Final
 
-from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.framing import Checker, Splitter
 from companion.recording.container import Message, Walk
 from companion.recording.foreign.packets import Segment, Skipped, packets, segment
 from companion.recording.stamps import STEP_HOLD_NS, RepairedStamps
+from companion.recording.tlog import feed_in_pieces
 from companion.values import Event, Frame, Reason, Rejection
 
 _FLOWS_MAX: Final = 512
 """Limit on concurrent flows of packets; beyond it, the least recently active flow is ended."""
 _AHEAD_MAX: Final = 64
 """Limit on TCP segments that wait for a missing one, which then counts as lost."""
+WAITING_BYTES: Final = 1 << 25
+"""Limit on all segments that wait; beyond it, the least recently active flow is ended."""
 _MAGICS: Final = (b"\xfd", b"\xfe")
 
 
@@ -30,6 +33,8 @@ def read_capture(path: Path) -> Iterator[Event]:
     nothing. Raises ``OSError`` if the file cannot be read.
     """
     flows: OrderedDict[str, _Flow] = OrderedDict()
+    waiting_bytes = 0
+    checker = Checker()
     timeline: RepairedStamps | None = None
     with path.open("rb") as file:
         for packet in packets(file):
@@ -47,49 +52,69 @@ def read_capture(path: Path) -> Iterator[Event]:
             off_ns = timeline.place(packet.t_ns)
             flow = flows.get(found.flow)
             if flow is None:
-                flow = flows.setdefault(found.flow, _Flow(found.flow))
-                if len(flows) > _FLOWS_MAX:
-                    _, oldest = flows.popitem(last=False)
-                    yield from oldest.finish(timeline.t_ns)
+                flow = flows.setdefault(found.flow, _Flow(found.flow, checker))
             flows.move_to_end(found.flow)
-            events = flow.take(timeline.t_ns, found)
-            if events and off_ns is not None and abs(off_ns) > STEP_HOLD_NS:
-                way = "before" if off_ns < 0 else "after"
-                detail = f"{abs(off_ns) / 1e9:.6g} s {way} the log's time; the log's time is used"
-                yield Rejection(
-                    t_ns=timeline.t_ns, source=found.flow, reason=Reason.BAD_STAMP, detail=detail
-                )
-            yield from events
+            waiting_bytes -= flow.waiting_bytes
+            data = flow.in_order(found)
+            waiting_bytes += flow.waiting_bytes
+            while len(flows) > _FLOWS_MAX or waiting_bytes > WAITING_BYTES:
+                _, oldest = flows.popitem(last=False)
+                waiting_bytes -= oldest.waiting_bytes
+                yield from oldest.finish(timeline.t_ns)
+            for event in flow.frames(timeline.t_ns, data):
+                if off_ns is not None and abs(off_ns) > STEP_HOLD_NS:
+                    yield _bad_stamp(timeline.t_ns, found.flow, off_ns)
+                off_ns = None
+                yield event
     for flow in flows.values():
         yield from flow.finish(0 if timeline is None else timeline.t_ns)
+
+
+def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
+    way = "before" if off_ns < 0 else "after"
+    detail = f"{abs(off_ns) / 1e9:.6g} s {way} the log's time; the log's time is used"
+    return Rejection(t_ns=t_ns, source=link, reason=Reason.BAD_STAMP, detail=detail)
+
+
+def _splitter(link: str, checker: Checker) -> Splitter:
+    """Return a splitter with the cache of senders that all splitters of a file share."""
+    splitter = Splitter(link)
+    splitter.checker = checker
+    return splitter
 
 
 class _Flow:
     """Flow of packets, and the MAVLink frames in it; nothing is returned before its first frame."""
 
-    def __init__(self, name: str) -> None:
-        self._splitter = Splitter(name)
+    def __init__(self, name: str, checker: Checker) -> None:
+        self._splitter = _splitter(name, checker)
         self._next: int | None = None
         self._ahead: dict[int, bytes] = {}
 
-    def take(self, t_ns: int, found: Segment) -> list[Frame | Rejection]:
-        """Return the frames that end in a packet of this flow."""
-        if found.tcp_seq is None:
-            whole = self._splitter.feed(t_ns, found.payload)
-            return self._frames_only(whole)
-        return self._frames_only(self._splitter.feed(t_ns, self._in_order(found, found.tcp_seq)))
+    @property
+    def waiting_bytes(self) -> int:
+        """Size of the segments that wait for a missing one."""
+        return sum(map(len, self._ahead.values()))
 
-    def finish(self, t_ns: int) -> list[Frame | Rejection]:
-        """Return the remaining frames when the flow ends."""
-        rest = b"".join(self._ahead[seq] for seq in sorted(self._ahead))
-        self._ahead.clear()
-        return self._frames_only([*self._splitter.feed(t_ns, rest), *self._splitter.finish(t_ns)])
+    def frames(self, t_ns: int, data: bytes) -> Iterator[Frame | Rejection]:
+        """Yield the frames that end in some bytes of this flow."""
+        for event in feed_in_pieces(self._splitter, t_ns, data):
+            if self._splitter.frames:
+                yield event
 
-    def _frames_only(self, events: list[Frame | Rejection]) -> list[Frame | Rejection]:
-        return events if self._splitter.frames else []
+    def finish(self, t_ns: int) -> Iterator[Frame | Rejection]:
+        """Yield the remaining frames when the flow ends."""
+        for seq in sorted(self._ahead):
+            yield from self.frames(t_ns, self._ahead.pop(seq))
+        last = self._splitter.finish(t_ns)
+        if self._splitter.frames:
+            yield from last
 
-    def _in_order(self, found: Segment, seq: int) -> bytes:
+    def in_order(self, found: Segment) -> bytes:
         """Return the next bytes in TCP order: repeated ones are dropped, later ones wait."""
+        seq = found.tcp_seq
+        if seq is None:
+            return found.payload
         if found.tcp_syn:
             self._next = (seq + 1) & 0xFFFF_FFFF
             self._ahead.clear()
@@ -127,6 +152,7 @@ def read_mcap(path: Path) -> Iterator[Event]:
     """
     timeline: RepairedStamps | None = None
     splitters: dict[int, Splitter | None] = {}
+    checker = Checker()
     walk = Walk(path)
     for content in walk:
         if not isinstance(content, Message):
@@ -136,20 +162,23 @@ def read_mcap(path: Path) -> Iterator[Event]:
             schema = walk.schemas.get(channel.schema_id)
             said = (channel.topic, channel.message_encoding, schema.name if schema else "")
             speaks = any("mavlink" in word.lower() for word in said)
-            splitters[channel.id] = Splitter(channel.topic) if speaks else None
+            splitters[channel.id] = _splitter(channel.topic, checker) if speaks else None
         splitter = splitters[channel.id]
         if splitter is None or not any(magic in content.data for magic in _MAGICS):
             continue
         if timeline is None:
             timeline = RepairedStamps([content.log_time_ns])
         timeline.place(content.log_time_ns)
-        found = [*splitter.feed(timeline.t_ns, content.data), *splitter.finish(timeline.t_ns)]
-        yield from (event for event in found if isinstance(event, Frame) or _is_frame(event))
+        found = feed_in_pieces(splitter, timeline.t_ns, content.data)
+        yield from filter(_is_frame, found)
+        yield from filter(_is_frame, splitter.finish(timeline.t_ns))
     if walk.lost_bytes:
         t_ns = 0 if timeline is None else timeline.t_ns
         yield Rejection(t_ns=t_ns, source=path.name, reason=Reason.GARBAGE, count=walk.lost_bytes)
 
 
-def _is_frame(refused: Rejection) -> bool:
-    """Return whether rejected bytes were a MAVLink frame, rather than bytes around one."""
-    return refused.reason in (Reason.BAD_CRC, Reason.UNKNOWN_MESSAGE)
+def _is_frame(event: Frame | Rejection) -> bool:
+    """Return whether an event is a frame, valid or not, rather than bytes around one."""
+    if isinstance(event, Frame):
+        return True
+    return event.reason in (Reason.BAD_CRC, Reason.UNKNOWN_MESSAGE)

@@ -38,8 +38,6 @@ _HUNDREDTHS: Final = frozenset("cCeE")
 _NAME: Final = re.compile(rb"[A-Z0-9_]{1,4}\0*\Z")
 _formats = re.compile(re.escape(MAGIC + bytes([FORMAT]))).finditer
 
-Column = NDArray[np.generic]
-
 
 class Format(NamedTuple):
     """Layout of one type of DataFlash message: its fields, and which are in hundredths."""
@@ -75,26 +73,27 @@ class DataflashTable(Columns):
         super().__init__(data, None if layout is None else layout.fields, at + _HEAD)
         self._layout = layout
 
-    def raw(self, column: str) -> Column:
-        """Return a column with the values as in the file, (N,)."""
-        return self._records[column]
-
     def numbers(self, column: str) -> NDArray[np.float64]:
         """Return a column as numbers, (N,), in the units of the log; NaN if missing."""
-        if column not in self or self._records[column].dtype.kind not in "iuf":
+        found = self.values(column, "iuf")
+        if found is None or self._layout is None:
             return np.full(len(self), np.nan)
-        assert self._layout is not None
-        values = self._records[column].astype(np.float64)
+        values = found.astype(np.float64)
         return values / 100.0 if column in self._layout.hundredths else values
 
 
 def walk(data: Bytes, wanted: Collection[str]) -> DataflashIndex:
-    """Index the messages of a log, with the offsets of those named in ``wanted``."""
+    """Index the messages of a log, with the offsets of those named in ``wanted``.
+
+    If several types have one name, the first counts.
+    """
     formats, refused = _describe(data)
+    first = {layout.name: number for number, layout in reversed(formats.items())}
     lengths = np.zeros(256, dtype=np.int64)
     asked = np.zeros(256, dtype=bool)
     for number, layout in formats.items():
-        lengths[number], asked[number] = layout.length, layout.name in wanted
+        lengths[number] = layout.length
+        asked[number] = layout.name in wanted and first[layout.name] == number
     found = {n: Thinned(array("q")) for n in formats if asked[n]}
     covered = end = 0
     for at, types in _chains(data, lengths):

@@ -5,6 +5,7 @@ https://www.tcpdump.org/linktypes.html. Truncated packets and fragments return t
 or nothing; no length in a packet is trusted.
 """
 
+import os
 import struct
 from collections.abc import Iterator
 from typing import IO, Final, NamedTuple
@@ -17,7 +18,11 @@ PCAP: Final = {
 }
 """First bytes of a pcap file, with its byte order and the nanoseconds per unit of its stamps."""
 PCAPNG: Final = b"\x0a\x0d\x0d\x0a"
-_LARGEST: Final = 1 << 18  # limit on a packet or block, bytes: more than any link carries
+_LARGEST: Final = 1 << 18
+"""Limit on a packet or block, bytes: what tcpdump captures of a packet.
+
+Segments may have more than 64 kB where the network card splits them (BIG TCP).
+"""
 _INTERFACES_MAX: Final = 1024
 _SECTION, _INTERFACE, _SIMPLE, _ENHANCED = 0x0A0D0D0A, 1, 3, 6
 _NANOSECONDS_OPTION: Final = 9
@@ -72,7 +77,7 @@ def _records(file: IO[bytes], order: str, unit_ns: int) -> Iterator[Packet | Ski
     while len(head := file.read(record.size)) == record.size:
         seconds, part, length, _ = record.unpack(head)
         if length > _LARGEST:
-            yield Skipped(record.size + _rest(file))
+            yield Skipped(record.size + _skip_rest(file))
             return
         data = file.read(length)
         yield Packet(seconds * 1_000_000_000 + part * unit_ns, link_type, data)
@@ -80,11 +85,9 @@ def _records(file: IO[bytes], order: str, unit_ns: int) -> Iterator[Packet | Ski
         yield Skipped(len(head))
 
 
-def _rest(file: IO[bytes]) -> int:
-    size = 0
-    while piece := file.read(1 << 20):
-        size += len(piece)
-    return size
+def _skip_rest(file: IO[bytes]) -> int:
+    at = file.tell()
+    return file.seek(0, os.SEEK_END) - at
 
 
 class _Interface(NamedTuple):
@@ -109,7 +112,7 @@ def _blocks(file: IO[bytes]) -> Iterator[Packet | Skipped]:
         kind, length = struct.unpack(f"{order}2I", head)
         taken = 12 if kind == _SECTION else 8
         if not taken + 4 <= length <= _LARGEST:
-            yield Skipped(taken + _rest(file))
+            yield Skipped(taken + _skip_rest(file))
             return
         body = file.read(length - taken)
         if len(body) < length - taken:

@@ -161,8 +161,12 @@ def _heartbeats(log: Onboard, boot_us: IntArray) -> Payloads:
     made = np.zeros(len(boot_us), dtype=_HEARTBEAT)
     made["type"], made["autopilot"] = log.mav_type, log.autopilot
     made["state"], made["version"] = _ACTIVE, 3
-    for from_us, armed in log.armed:
-        made["base"][boot_us >= from_us] = _ARMED if armed else 0
+    if log.armed:
+        from_us, armed = np.array(log.armed, dtype=np.int64).T
+        order = np.argsort(from_us, kind="stable")
+        latest = np.maximum.accumulate(order)  # after a reboot, times of the last boot count
+        begun = np.searchsorted(from_us[order], boot_us, side="right")
+        made["base"] = np.where((begun > 0) & (armed[latest[begun - 1]] != 0), _ARMED, 0)
     return made
 
 

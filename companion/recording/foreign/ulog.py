@@ -8,6 +8,7 @@ checksum: invalid bytes are skipped up to three consecutive valid messages.
 import re
 import struct
 from array import array
+from collections import Counter
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass, field
 from typing import Final, NamedTuple
@@ -38,6 +39,15 @@ _FLAG_BITS: Final = ord("B")
 _DROPOUT: Final = ord("O")
 _LONGEST: Final = 65535
 _NESTED_MAX: Final = 8
+_FORMATS_BYTES: Final = 1 << 24
+"""Limit on all descriptions of topics, in which each has ``_ENTRY`` bytes more than its text.
+
+PX4 writes some 200, of 100 kB in all.
+"""
+_ENTRY: Final = 256
+_PARAMETERS_MAX: Final = 20_000  # PX4 has some 2000
+_INSTANCES_MAX: Final = 4
+"""Limit on the subscriptions of one topic whose samples are indexed, as the lowest is used."""
 _IN_A_ROW: Final = 3
 _APPENDED: Final = 0x01
 _candidates = re.compile(rb"(?=[\s\S]{2}[BFIMPQARDLCSO])").finditer
@@ -78,12 +88,9 @@ class UlogTable(Columns):
 
     def numbers(self, column: str, width: int = 1) -> FloatArray:
         """Return a column as numbers: (N,), or (N, ``width``) for an array; NaN if missing."""
-        shape = (len(self),) if width == 1 else (len(self), width)
-        if column not in self:
-            return np.full(shape, np.nan)
-        values = self._records[column]
-        if values.dtype.kind not in "iuf" or values.shape != shape:
-            return np.full(shape, np.nan)
+        values = self.values(column, "iuf", width)
+        if values is None:
+            return np.full((len(self),) if width == 1 else (len(self), width), np.nan)
         return values.astype(np.float64)
 
 
@@ -109,9 +116,11 @@ class _Walker:
         self._wanted = wanted
         self._found = UlogIndex()
         self._formats: dict[str, str] = {}
+        self._formats_bytes = 0
+        self._sizes_by_name: dict[str, tuple[int, int]] = {}
         self._topics: dict[int, UlogTopic | None] = {}
+        self._indexed: Counter[str] = Counter()  # subscriptions of each topic
         self._sizes: dict[int, tuple[int, int]] = {}
-        self._ends: list[int] = []
 
     def walk(self) -> UlogIndex:
         begin = _HEADER
@@ -189,8 +198,8 @@ class _Walker:
     def _take(self, kind: int, body: bytes) -> None:
         if kind == _FORMAT:
             name, colon, fields = body.decode("latin-1").partition(":")
-            if colon and self._formats.setdefault(name, fields) != fields:
-                self._found.refused += 1
+            if colon:
+                self._found.refused += self._described(name, fields) != fields
         elif kind == _SUBSCRIBED:
             self._subscribe(body[0], body[1] | body[2] << 8, body[3:].decode("latin-1"))
         elif kind == _PARAMETER:
@@ -198,17 +207,27 @@ class _Walker:
         elif kind == _DROPOUT:
             self._found.dropouts += 1
 
+    def _described(self, name: str, fields: str) -> str | None:
+        """Store a topic's fields; return those that count, which are the first."""
+        if name not in self._formats:
+            self._formats_bytes += len(name) + len(fields) + _ENTRY
+            if self._formats_bytes <= _FORMATS_BYTES:
+                self._formats[name] = fields
+        return self._formats.get(name)
+
     def _subscribe(self, instance: int, number: int, name: str) -> None:
-        fields = self._formats.get(name)
         if number in self._topics:
             return  # the first counts: its samples were parsed with it
         least, most = self._size(name, 0)
-        if fields is None or least == 0:
+        if least == 0:
             self._found.refused += 1
             return
         self._sizes[number] = least + 2, most + 2
-        layout = _layout(fields) if name in self._wanted else None
-        self._found.refused += name in self._wanted and layout is None
+        layout = None
+        if name in self._wanted and self._indexed[name] < _INSTANCES_MAX:
+            layout = _layout(self._formats[name])
+            self._found.refused += layout is None
+            self._indexed[name] += 1
         at = array("q")
         topic = (
             None
@@ -218,11 +237,22 @@ class _Walker:
         self._topics[number] = topic
 
     def _size(self, name: str, depth: int) -> tuple[int, int]:
-        """Return a topic's least size (without final padding) and largest size; 0 if unknown."""
+        """Return a topic's least size (without final padding) and largest size; 0 if unknown.
+
+        Each is computed once, however often it is nested in others or subscribed.
+        """
+        fields = self._formats.get(name)
+        if fields is None or depth > _NESTED_MAX:
+            return 0, 0
+        if name not in self._sizes_by_name:
+            self._sizes_by_name[name] = self._sum(fields, depth)
+        return self._sizes_by_name[name]
+
+    def _sum(self, fields: str, depth: int) -> tuple[int, int]:
         least = most = 0
-        for each in filter(None, self._formats.get(name, "").split(";")):
+        for each in filter(None, fields.split(";")):
             match = _FIELD.match(each)
-            if match is None or depth > _NESTED_MAX or most > _LONGEST:
+            if match is None or most > _LONGEST:
                 return 0, 0
             kind, count, called = match.groups()
             one = (
@@ -230,9 +260,10 @@ class _Walker:
                 if kind in _TYPES
                 else self._size(kind, depth + 1)[1]
             )
-            if not one:
+            size = one * int(count or 1)
+            if not size:
                 return 0, 0
-            most += one * int(count or 1)
+            most += size
             if not called.startswith("_padding"):
                 least = most
         return (least, most) if most <= _LONGEST else (0, 0)
@@ -240,6 +271,8 @@ class _Walker:
     def _parameter(self, body: bytes) -> None:
         kind, blank, name = body[1 : 1 + body[0]].decode("latin-1").partition(" ")
         value = body[1 + body[0] :]
+        if len(self._found.parameters) >= _PARAMETERS_MAX:
+            return
         if blank and kind in ("int32_t", "float") and len(value) == 4:
             (number,) = struct.unpack("<i" if kind == "int32_t" else "<f", value)
             self._found.parameters.setdefault(name, float(number))

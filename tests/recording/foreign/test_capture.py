@@ -1,14 +1,16 @@
 """MAVLink in packet captures: captured on loopback, synthetic of every kind, and hostile."""
 
 import contextlib
+import os
 import random
 import socket
 import struct
 import tempfile
 import threading
 import time
-from collections.abc import Iterator
-from itertools import pairwise
+import tracemalloc
+from collections.abc import Iterable, Iterator
+from itertools import islice, pairwise
 from pathlib import Path
 
 import pytest
@@ -28,7 +30,7 @@ START_NS = 1_795_000_000_000_000_000
 STEP_NS = 20_000_000
 
 
-def raws(events: list[Event] | Iterator[Event]) -> list[bytes]:
+def raws(events: Iterable[Event]) -> list[bytes]:
     return [event.raw for event in events if isinstance(event, Frame)]
 
 
@@ -247,6 +249,103 @@ def test_damaged_captures_yield_only_sent_frames_in_time_order(
 def test_flows_beyond_the_tracking_limit_lose_no_frame(tmp_path: Path) -> None:
     many = [(START_NS + n, LINKS[1](v4(udp(FRAMES[n % 60], (n + 1, 14550))))) for n in range(3000)]
     assert len(raws(events_of(pcap(many), tmp_path))) == 3000
+
+
+# --- bounded memory ------------------------------------------------------------------------------
+
+SHORT = bytes.fromhex("fd010000000101000000010d35")
+
+
+@contextlib.contextmanager
+def memory_below(most_mb: float) -> Iterator[None]:
+    """Measure the allocations of a block."""
+    tracemalloc.start()
+    try:
+        yield
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < most_mb * 1e6
+
+
+def test_segments_of_many_flows_that_wait_take_bounded_memory(tmp_path: Path) -> None:
+    """Each flow lacks a segment; the file itself is sparse."""
+    path, size = tmp_path / "net", (1 << 18) - 40
+    with path.open("wb") as file:
+        file.write(pcap([], 101))
+        for flow in range(8):
+            for n in range(-1, 60):
+                length = 1 if n < 0 else size
+                ports = struct.pack(">2H", flow, 50_000)
+                head = v4(ports + tcp(b"", 100 if n < 0 else 1_000_000 + n * size)[4:], 6)
+                head = head[:2] + bytes(2) + head[4:]  # of any length
+                file.write(struct.pack("<4I", 0, 0, len(head) + length, 0) + head)
+                file.seek(length, os.SEEK_CUR)
+        file.truncate(file.tell())
+    with memory_below(45):  # of 126 MB
+        assert not list(read_capture(path))
+
+
+def test_frames_of_segments_that_waited_take_bounded_memory(tmp_path: Path) -> None:
+    """Segments of 12 MB wait for the first one, and hold 900 000 frames."""
+    whole = SHORT * 15_000
+    parts = [(1 + n * len(whole), whole) for n in range(1, 60)]
+    sent = [tcp(b"", 0, 0x02), *(tcp(part, seq) for seq, part in parts), tcp(whole, 1)]
+    path = tmp_path / "net"
+    path.write_bytes(pcap([(START_NS, big(each)) for each in sent], 101))
+    with memory_below(45):
+        assert len(raws(islice(read_capture(path), 100))) == 100
+
+
+def big(segment: bytes) -> bytes:
+    """IP packet above 64 kB, whose length is 0."""
+    head = v4(segment[:20], 6)
+    return head[:2] + bytes(2) + head[4:] + segment[20:]
+
+
+def test_segments_above_64_kb_are_read(tmp_path: Path) -> None:
+    """Linux offloads them to the network card (BIG TCP)."""
+    stream = b"".join(FRAMES * 400)
+    cuts = range(0, len(stream), 190_000)
+    rows = [(START_NS, big(tcp(stream[at : at + 190_000], 7 + at))) for at in cuts]
+    assert raws(events_of(pcap(rows, 101), tmp_path)) == FRAMES * 400
+
+
+def mavlink_mcap(path: Path, message: bytes, count: int) -> None:
+    """MCAP of another program, all in one chunk."""
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 26, compression=CompressionType.ZSTD)
+        writer.start("", "another")
+        channel = writer.register_channel("/mavlink", "mavlink", 0)
+        for _ in range(count):
+            writer.add_message(channel, START_NS, message, START_NS)
+        writer.finish()
+
+
+def test_large_message_of_an_mcap_is_read_in_pieces(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    mavlink_mcap(path, SHORT * 1_200_000, 2)
+    with memory_below(110):
+        assert len(raws(islice(read_log(path), 100))) == 100
+
+
+def test_invalid_frames_before_the_first_valid_one_take_bounded_memory(tmp_path: Path) -> None:
+    path = tmp_path / "x.mcap"
+    mavlink_mcap(path, SHORT[:-1] + b"x", 15_000)
+    with memory_below(1.5), pytest.raises(LogError, match="no MAVLink frame in it"):
+        read_log(path)
+
+
+def test_all_flows_share_one_cache_of_senders(tmp_path: Path) -> None:
+    """It has 2 MB in each stream of 8192 senders and messages."""
+    sent = [pack(heartbeat(Source(1 + n % 250, 1 + n // 250)), 0) for n in range(2000)]
+    rows = [
+        (START_NS, LINKS[101](v4(udp(b"".join(sent), (1 + flow, 14550))))) for flow in range(20)
+    ]
+    path = tmp_path / "net"
+    path.write_bytes(pcap(rows, 101))
+    with memory_below(3 + 400e-6 * len(sent)):
+        assert sum(1 for _ in read_capture(path)) == 20 * len(sent)
 
 
 # --- captured packets --------------------------------------------------------------------------

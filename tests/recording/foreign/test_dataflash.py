@@ -210,3 +210,16 @@ def test_inserted_garbage_loses_at_most_adjacent_messages(garbage: bytes, at: in
     whole = messages(CUT)
     assert messages(CUT[:at] + garbage + CUT[at:]) >= whole - 2 - len(garbage) // 3
     assert 0 <= found.lost <= lost
+
+
+def test_first_of_several_types_with_one_name_counts() -> None:
+    head = b"\xa3\x95\x80"
+    types = range(200, 240)
+    made = b"".join(
+        head + struct.pack("<BB4s16s64s", n, 11, b"POS", b"Q", b"TimeUS") for n in types
+    )
+    made += b"".join(b"\xa3\x95%c" % n + n.to_bytes(8, "little") for n in [*types] * 30)
+    walked = walk(as_bytes(made), ("POS",))
+    assert {number: len(at) for number, at in walked.at.items()} == {200: 30}
+    assert walked.lost == 0
+    assert table(as_bytes(made), walked, "POS").numbers("TimeUS").tolist() == [200.0] * 30

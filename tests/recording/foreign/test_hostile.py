@@ -89,6 +89,11 @@ def test_damaged_files_are_read_within_the_time_limit(kind: str, tmp_path: Path)
     assert used > tried / 4  # most damaged files still yield frames
 
 
+def described(number: int, length: int, name: bytes, letters: bytes, columns: bytes) -> bytes:
+    """Description of a type of DataFlash message."""
+    return b"\xa3\x95\x80" + struct.pack("<BB4s16s64s", number, length, name, letters, columns)
+
+
 def many_heads() -> bytes:
     return CUT[:18_000] + b"\xa3\x95\x80" * rounds(50_000, 200_000)
 
@@ -108,6 +113,33 @@ def deep_topics() -> bytes:
     return head + described + struct.pack("<HB", len(asked), ord("A")) + asked
 
 
+def ulog(formats: list[bytes], asked: list[bytes]) -> bytes:
+    """ULog with descriptions, and with subscriptions of topics."""
+    bodies = [b"F" + each for each in formats]
+    bodies += [b"A" + struct.pack("<BH", 0, n & 0xFFFF) + each for n, each in enumerate(asked)]
+    return flight(seconds=1).data[:59] + b"".join(
+        struct.pack("<H", len(body) - 1) + body for body in bodies
+    )
+
+
+def empty_arrays() -> bytes:
+    """Types of no bytes, nested 8 deep and 7 times in each."""
+    inner = [b"".join(b"t%d[0] x%d;" % (n + 1, k) for k in range(7)) for n in range(8)]
+    formats = [b"t%d:uint8_t b;%b" % (n, each) for n, each in enumerate([*inner, b""])]
+    return ulog(formats, [b"t0"])
+
+
+def invalid_topics() -> bytes:
+    """A topic that turns out to be invalid after 9000 fields, subscribed 1000 times."""
+    return ulog([b"t:" + b"char a;" * 9000 + b"?"], [b"t"] * 1000)
+
+
+def wide_topics() -> bytes:
+    """A wanted topic of 5000 fields, subscribed 5000 times."""
+    name = b"vehicle_global_position"
+    return ulog([name + b":" + b"".join(b"char a%d;" % n for n in range(5000))], [name] * 5000)
+
+
 def noise_behind() -> bytes:
     return flight(seconds=2).data + random.Random(1).randbytes(2_000_000)
 
@@ -121,7 +153,18 @@ def quotes() -> bytes:
 
 
 @pytest.mark.parametrize(
-    "make", [many_heads, many_topics, deep_topics, noise_behind, one_line, quotes]
+    "make",
+    [
+        many_heads,
+        many_topics,
+        deep_topics,
+        empty_arrays,
+        invalid_topics,
+        wide_topics,
+        noise_behind,
+        one_line,
+        quotes,
+    ],
 )
 def test_absurd_files_are_read_in_bounded_time_and_memory(
     make: Callable[[], bytes], tmp_path: Path
@@ -138,6 +181,41 @@ def test_absurd_files_are_read_in_bounded_time_and_memory(
         tracemalloc.stop()
     assert time.monotonic() - begin < SLOWEST_S
     assert peak < 60_000_000 + 8 * len(data)
+
+
+def alternating(name: bytes, columns: bytes, layout: str, value: Callable[[int], int]) -> bytes:
+    """DataFlash log of positions and messages of another kind: a time and a value."""
+    head = described(1, 27, b"POS", b"QLLff", b"TimeUS,Lat,Lng,Alt,RelHomeAlt")
+    made = struct.Struct(f"<Q{layout}")
+    head += described(2, 3 + made.size, name, f"Q{layout}".encode(), columns)
+    place = struct.pack("<iiff", 473977419, 85455938, 488.0, 10.0)
+    return head + b"".join(
+        b"\xa3\x95\1%b%b\xa3\x95\2%b"
+        % ((n * 1_000_000).to_bytes(8, "little"), place, made.pack(n * 1_000_000, value(n)))
+        for n in range(200_000)
+    )
+
+
+def armings() -> bytes:
+    """As many changes of the arming state as heartbeats."""
+    return alternating(b"ARM", b"TimeUS,ArmState", "B", lambda n: n & 1)
+
+
+def cores() -> bytes:
+    """Each sample is of another core of the estimator."""
+    return alternating(b"XKF1", b"TimeUS,C", "I", lambda n: n)
+
+
+@pytest.mark.parametrize("make", [armings, cores])
+def test_reading_takes_time_linear_in_the_samples(
+    make: Callable[[], bytes], tmp_path: Path
+) -> None:
+    path = tmp_path / "x.bin"
+    path.write_bytes(make())
+    begin = time.monotonic()
+    first = next(read_log(path))
+    assert isinstance(first, Frame)
+    assert time.monotonic() - begin < SLOWEST_S
 
 
 # --- huge sample counts ---------------------------------------------------------------------------
@@ -162,12 +240,8 @@ def many_lines() -> bytes:
 
 
 def many_messages() -> bytes:
-    def described(number: int, name: bytes, letters: bytes, columns: bytes) -> bytes:
-        body = struct.pack("<BB4s16s64s", number, 23, name, letters, columns)
-        return b"\xa3\x95\x80" + body
-
-    head = described(65, b"ATT", b"Qfff", b"TimeUS,Roll,Pitch,Yaw")
-    head += described(66, b"POS", b"QLLf", b"TimeUS,Lat,Lng,Alt")
+    head = described(65, 23, b"ATT", b"Qfff", b"TimeUS,Roll,Pitch,Yaw")
+    head += described(66, 23, b"POS", b"QLLf", b"TimeUS,Lat,Lng,Alt")
     place = struct.pack("<iif", 473977419, 85455938, 488.0)
     turned = struct.pack("<fff", 1.0, 2.0, 3.0)
     return head + b"".join(

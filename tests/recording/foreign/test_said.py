@@ -119,3 +119,21 @@ def test_time_jump_is_clamped_and_reported(log: Onboard) -> None:
     refused = [event for event in events if isinstance(event, Rejection)]
     assert refused and refused[0].detail.endswith("s after the log's time; the log's time is used")
     assert events[-1].t_ns - events[0].t_ns < 30e9
+
+
+def test_heartbeats_follow_the_latest_arming(log: Onboard) -> None:
+    """Times step back at a reboot: of the states that begin by then, the last in the log counts."""
+    assert log.positions is not None
+    begin_us = int(log.positions.boot_us[0])
+    after_s = ((2, True), (9, False), (5, True), (13, False), (16, True))
+    changes = tuple((begin_us + s * 1_000_000 + 500_000, armed) for s, armed in after_s)
+    changed = replace(log, armed=changes)
+    found = by_peer(list(said.frames(changed, "x", Source(1, 1), 0.0)))
+    seconds = [each.time_boot_ms for each in found["SYSTEM_TIME"]]
+    expected = [0] * len(seconds)
+    for from_us, armed in changes:
+        expected = [
+            128 * armed if ms * 1000 >= from_us else before
+            for ms, before in zip(seconds, expected, strict=True)
+        ]
+    assert [each.base_mode for each in found["HEARTBEAT"]] == expected

@@ -1,6 +1,7 @@
 """ULog: every value against pyulog; damage, nested topics and absurd counts."""
 
 import struct
+import tracemalloc
 from pathlib import Path
 
 import numpy as np
@@ -120,6 +121,7 @@ def test_unknown_incompatible_flags_are_rejected() -> None:
     [
         "uint64_t timestamp;double[99999] lat;double lon;float alt;",
         "uint64_t timestamp;double[99999999999] lat;",
+        "uint64_t timestamp;double[0] x;double lat;double lon;float alt;",
         "vehicle_global_position lat;",  # nested in itself
         "uint64_t timestamp;uint64_t timestamp;",
         "uint64_t timestamp;nothing lat;",
@@ -147,3 +149,47 @@ def test_lone_message_inside_garbage_is_ignored() -> None:
 def test_receiver_without_fix_yields_no_clock() -> None:
     assert px4.read(as_bytes(flight().data)).clock is not None
     assert px4.read(as_bytes(flight(fix_type=2).data)).clock is None
+
+
+def test_descriptions_beyond_the_limit_are_rejected_and_counted() -> None:
+    made = HEADER + message("B", bytes(40))
+    topics = [message("F", b"t%d:" % n + b"char a;" * 9000) for n in range(300)]
+    walked = ulog.walk(as_bytes(made + b"".join(topics)), ())
+    assert 20 < walked.refused < 50  # beyond 16 MB
+
+
+def test_parameters_beyond_the_limit_are_ignored() -> None:
+    made = flight().data
+    many = [message("P", b"\x09float %03x" % n + bytes(4)) for n in range(4096)]
+    more = [message("P", b"\x0afloat %04x" % n + bytes(4)) for n in range(30_000)]
+    walked = ulog.walk(as_bytes(made + b"".join(many + more)), ())
+    assert len(walked.parameters) == 20_000 and walked.parameters["MAV_SYS_ID"] == 7
+
+
+def test_few_instances_of_a_topic_are_indexed() -> None:
+    made = Written()
+    for _ in range(50):
+        made.topic("vehicle_attitude", "uint64_t timestamp;", "Q", [(1,)] * 20)
+    walked = ulog.walk(as_bytes(made.data), ("vehicle_attitude",))
+    assert [len(topic.at) for topic in walked.topics] == [20] * 4
+    assert walked.lost == 0
+
+
+def test_only_columns_that_are_asked_for_are_copied() -> None:
+    """Records may have 64 kB each: all of them are as large as the file."""
+    made = Written()
+    rows = [(float(n),) for n in range(200)]
+    fields = "double timestamp;uint8_t[60000] x;"
+    made.topic("vehicle_attitude", fields, "d60000x", rows)
+    data = as_bytes(made.data)
+    walked = ulog.walk(data, ("vehicle_attitude",))
+    tracemalloc.start()
+    try:
+        found = ulog.table(data, walked, "vehicle_attitude").rows(np.arange(150))
+        assert found.numbers("timestamp").tolist() == [*range(150)]
+        assert np.isnan(found.numbers("x")).all()  # another width
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 200_000
+    assert found.numbers("x", 60_000).shape == (150, 60_000)

@@ -78,7 +78,10 @@ RECEIVER: Final = (
 LOOP: Final = (
     f"{request_queue.AT_ONCE} started in an iteration; less than 2 ms each on the event loop"
 )
-SLOTS: Final = f"{work_slots.AT_ONCE} at a time on threads, {work_slots.WAITING} waiting"
+SLOTS: Final = (
+    f"{work_slots.AT_ONCE} at a time on threads, {work_slots.WAITING} waiting; after more than"
+    f" {1e3 * work_slots.RESTS_FROM_S:.0f} ms a rest of {work_slots.REST:g} times as long"
+)
 BUDGET: Final = (
     f"{observations.OBSERVATIONS_PER_S:.0f} observations/s,"
     f" {observations.OBSERVATIONS_SAVED:.0f} at once"

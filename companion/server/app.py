@@ -215,6 +215,8 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     async def events() -> Response:
         return answer(glance.events(node))
 
+    histories = dict[bool, tuple[series.Sample | None, bytes]]()  # until the next sample
+
     @app.get(
         "/v1/history",
         summary="Samples of UAVs and carrier, one per second of the last five minutes",
@@ -225,12 +227,24 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
             samples, now_ns = node.series.samples(), node.now_ns()
 
             def make(way: GivingWay) -> bytes:
-                shown = series.show(samples, now_ns, pipeline.utc_ns, is_rounded=rounded)
+                shown = series.show(
+                    samples,
+                    now_ns,
+                    pipeline.utc_ns,
+                    is_rounded=rounded,
+                    most=series.UAVS_MAX,
+                    between=way.between,
+                )
                 return encode_in_parts(shown, way, depth=3)
 
             return make
 
-        return json_response(await large.made(("history", rounded), prepare))
+        newest, body = histories.get(rounded, (None, b""))
+        if newest is None or newest is not node.series.newest:
+            newest = node.series.newest
+            body = await large.made(("history", rounded), prepare)
+            histories[rounded] = newest, body
+        return json_response(body)
 
     @app.get(
         "/v1/settings",

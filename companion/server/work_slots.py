@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator, Callable
 from typing import Final, TypeVar
 
@@ -11,6 +12,13 @@ from companion.server.threads import in_thread
 
 AT_ONCE: Final = 2
 """Number of requests that compute at once; each takes interpreter time from the links."""
+REST: Final = 3.0
+"""Time for which a slot stays empty after work, as a multiple of the work's time.
+
+All threads share one interpreter. Beside threads that compute without a pause, each call of the
+event loop to the system waits a millisecond for it, so that few frames are read.
+"""
+RESTS_FROM_S: Final = 0.02  # shorter work needs no rest: a few UAVs take some milliseconds
 WAITING: Final = 64  # requests that wait for a slot; one second of work
 SHARED_WAITING: Final = 16  # answers for all that wait for the slot of their own
 
@@ -53,12 +61,22 @@ class WorkSlots:
         slots = self._shared if is_shared and self._shared.room else self._usual
         slots.room -= 1
         try:
-            async with self._no_long if is_long else contextlib.nullcontext(), slots.free:
+            held = [self._no_long, slots.free] if is_long else [slots.free]
+            async with contextlib.AsyncExitStack() as stack:
+                for one in held:
+                    await one.acquire()
+                    stack.callback(one.release)
                 self.running += 1
+                began_s = time.monotonic()
                 try:
                     yield
                 finally:
                     self.running -= 1
+                    worked_s = time.monotonic() - began_s
+                    if worked_s >= RESTS_FROM_S and slots is self._usual:
+                        stack.pop_all()
+                        for one in held:
+                            asyncio.get_running_loop().call_later(REST * worked_s, one.release)
         finally:
             slots.room += 1
 

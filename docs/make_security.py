@@ -80,7 +80,7 @@ LOOP: Final = (
 )
 SLOTS: Final = (
     f"{work_slots.AT_ONCE} at a time on threads, {work_slots.WAITING} waiting; after more than"
-    f" {1e3 * work_slots.RESTS_FROM_S:.0f} ms a rest of {work_slots.REST:g} times as long"
+    f" {1e3 * work_slots.RESTS_FROM_S:.0f} ms a rest of {work_slots.REST:g} times as long, at most {work_slots.REST_MAX_S:g} s"
 )
 BUDGET: Final = (
     f"{observations.OBSERVATIONS_PER_S:.0f} observations/s,"

@@ -78,6 +78,7 @@ def create_app(
     app.router.redirect_slashes = False
     responses.install(app)
     work_slots = work_slots or WorkSlots()
+    work_slots.is_overloaded = lambda: state.overload(node, node.now_ns()) is not None
     large = LargeAnswers(node, work_slots)
     stream, page = Stream(node, large), PageFiles(web_directory())
     wrong_tokens = WrongTokens(node)

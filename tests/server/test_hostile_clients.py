@@ -343,7 +343,7 @@ def test_history_is_made_once_for_each_sample(
 def test_slot_rests_after_long_work_only() -> None:
     """Else threads that compute take the interpreter from the links all the time."""
 
-    async def ask(work_s: float) -> float:
+    async def ask(work_s: float, *, is_shared: bool = False, is_overloaded: bool = False) -> float:
         loop = asyncio.get_running_loop()
         slots, ended_s, begun_s = work_slots.WorkSlots(at_once=1), list[float](), list[float]()
 
@@ -352,16 +352,22 @@ def test_slot_rests_after_long_work_only() -> None:
             time.sleep(work_s)
             ended_s.append(loop.time())
 
-        await slots.run(work)
-        async with slots.slot(is_long=True):
+        slots.is_overloaded = lambda: is_overloaded
+        await slots.run(work, is_shared=is_shared)
+        async with slots.slot(is_long=not is_shared, is_shared=is_shared):
             begun_s.append(loop.time())
         assert slots.running == 0
         return begun_s[1] - ended_s[0]
 
     long_s = work_slots.RESTS_FROM_S * 2
     assert run_async(ask(long_s)) >= work_slots.REST * long_s * 0.99
+    assert run_async(ask(long_s, is_shared=True)) >= work_slots.REST_SHARED * long_s * 0.99
+    rest_s = run_async(ask(long_s, is_shared=True, is_overloaded=True))
+    assert rest_s >= work_slots.REST * long_s * 0.99
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(work_slots, "REST", 1e6)
+        patch.setattr(work_slots, "REST_MAX_S", 2 * long_s)
+        assert run_async(ask(long_s)) < HANG_S
         patch.setattr(work_slots, "RESTS_FROM_S", HANG_S)
         assert run_async(ask(0.0)) < HANG_S
 

@@ -71,10 +71,17 @@ STRANGERS: Final = (
     f"{known_peers.COMPARED_PER_S:.0f} positions/s of strangers are compared for each sender"
 )
 OLDEST: Final = f"the oldest senders first, above {100 * newcomers.BUSY:.0f} % of the time"
+RECEIVER: Final = (
+    f"{100 * transport.RECEIVER_SHARE:.0f} % of the time for a link,"
+    f" {transport.RECEIVER_SAVED_S:g} s at once"
+)
 LOOP: Final = (
     f"{request_queue.AT_ONCE} started in an iteration; less than 2 ms each on the event loop"
 )
-SLOTS: Final = f"{work_slots.AT_ONCE} at a time on threads, {work_slots.WAITING} waiting"
+SLOTS: Final = (
+    f"{work_slots.AT_ONCE} at a time on threads, {work_slots.WAITING} waiting; after more than"
+    f" {1e3 * work_slots.RESTS_FROM_S:.0f} ms a rest of {work_slots.REST:g} times as long, at most {work_slots.REST_MAX_S:g} s"
+)
 BUDGET: Final = (
     f"{observations.OBSERVATIONS_PER_S:.0f} observations/s,"
     f" {observations.OBSERVATIONS_SAVED:.0f} at once"
@@ -118,17 +125,17 @@ WAYS: Final = (
         covers=("link:sbs", "link:readsb", "link:rid", "link:cot"),
         size=f"{kb(sbs.LINE_MAX)} a line, {kb(rid_json.OBJECT_MAX)} an object, {kb(cot_link.EVENT_MAX)} an event",
         items=f"{aircraft_json.AIRCRAFT_MAX} aircraft",
-        work=OLDEST,
-        over=f"garbage; a server without a complete message in {transport.UNFINISHED_S} s is disconnected",
-        test=f"{LISTEN}::test_server_that_drips_bytes_is_announced_once_and_reconnected",
+        work=f"{RECEIVER}, behind vehicles",
+        over=f"skipped before parsing, counted (`too-frequent`); a server without a complete message in {transport.UNFINISHED_S} s is disconnected",
+        test=f"{LISTEN}::test_receiver_beyond_its_share_of_the_time_is_skipped_and_counted",
     ),
     WayIn(
         name="aircraft.json over HTTP",
         covers=("link:readsb:http",),
         size=f"{kb(http_poll.HEAD_MAX)} of headers, {kb(http_poll.BODY_MAX)} of body",
         items=f"{aircraft_json.AIRCRAFT_MAX} aircraft",
-        work="one request at a time",
-        over="the poll fails, with a notice",
+        work=f"one request at a time; {RECEIVER}",
+        over="the poll fails, with a notice; aircraft are skipped, counted (`too-frequent`)",
         test="tests/mavlink/wire/test_aircraft_json.py::test_too_many_aircraft_use_bounded_memory",
     ),
     WayIn(

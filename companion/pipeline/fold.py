@@ -228,7 +228,8 @@ class Pipeline:
         fix = accepted.fix  # with bounds that reports have raised
         self.refusals.used(fix.uav)
         if not kind_of(fix.uav).reports_itself:
-            near = self.targets.better_known(fix.uav, self.tracker.near(fix.position_ned_m, NEAR_M))
+            better = self.tracker.near(fix.position_ned_m, NEAR_M, better_than=fix.uav)
+            near = self.targets.unmerged(better)
             tracks = [one.at(fix.t_ns, fix.t_ns) for one in self.snapshots(near)]
             self.targets.identities.observe(fix, tracks)
         if accepted.reacquired:

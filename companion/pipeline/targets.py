@@ -60,15 +60,9 @@ class Targets:
         spares = frozenset(self.duty.spares)
         return [uav for uav in uavs if uav in spares and self.wants(uav)]
 
-    def better_known(self, uav: str, others: Iterable[str]) -> list[str]:
-        """Return those of some UAVs whose ids are preferred to a relayed aircraft's.
-
-        Preferred are telemetry, then Remote ID, ADS-B and Cursor on Target. Tracks already merged
-        into another one are excluded.
-        """
-        own = kind_of(uav).rank
-        same_as = self.identities.same_as
-        return [one for one in others if kind_of(one).rank < own and same_as(one) is None]
+    def unmerged(self, uavs: Iterable[str]) -> list[str]:
+        """Return those of some UAVs that are not merged into a better track."""
+        return [uav for uav in uavs if uav not in self.identities.merged]
 
     def forget(self, uav: str) -> None:
         """Forget a dropped UAV: its state, and its comparisons if it is relayed."""

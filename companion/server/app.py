@@ -78,6 +78,7 @@ def create_app(
     app.router.redirect_slashes = False
     responses.install(app)
     work_slots = work_slots or WorkSlots()
+    work_slots.is_overloaded = lambda: state.overload(node, node.now_ns()) is not None
     large = LargeAnswers(node, work_slots)
     stream, page = Stream(node, large), PageFiles(web_directory())
     wrong_tokens = WrongTokens(node)
@@ -215,6 +216,8 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
     async def events() -> Response:
         return answer(glance.events(node))
 
+    histories = dict[bool, tuple[series.Sample | None, bytes]]()  # until the next sample
+
     @app.get(
         "/v1/history",
         summary="Samples of UAVs and carrier, one per second of the last five minutes",
@@ -225,12 +228,24 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
             samples, now_ns = node.series.samples(), node.now_ns()
 
             def make(way: GivingWay) -> bytes:
-                shown = series.show(samples, now_ns, pipeline.utc_ns, is_rounded=rounded)
+                shown = series.show(
+                    samples,
+                    now_ns,
+                    pipeline.utc_ns,
+                    is_rounded=rounded,
+                    most=series.UAVS_MAX,
+                    between=way.between,
+                )
                 return encode_in_parts(shown, way, depth=3)
 
             return make
 
-        return json_response(await large.made(("history", rounded), prepare))
+        newest, body = histories.get(rounded, (None, b""))
+        if newest is None or newest is not node.series.newest:
+            newest = node.series.newest
+            body = await large.made(("history", rounded), prepare)
+            histories[rounded] = newest, body
+        return json_response(body)
 
     @app.get(
         "/v1/settings",

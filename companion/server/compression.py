@@ -17,6 +17,7 @@ from companion.server.threads import in_thread
 LEAST_BYTES: Final = 1024  # a smaller body fits into one packet as it is
 AT_ONCE_BYTES: Final = 16_384  # largest body that is compressed on the event loop, within 1 ms
 KEPT: Final = 32  # compressed bodies that are kept for the next client
+KEPT_BYTES: Final = 16 << 20  # most bytes of these before compression; one larger body is kept
 GZIP_LEVEL, ZSTD_LEVEL = 6, 6
 _GZIP_WINDOW: Final = 31  # zlib's largest window, with the head of gzip
 _TEXTS: Final = ("text/", "application/json", "application/javascript", "image/svg+xml")
@@ -56,6 +57,7 @@ class SharedCompression:
     def __init__(self) -> None:
         # The body is kept with its task: another one may not get its identity meanwhile.
         self._made: dict[tuple[int, str], tuple[bytes, asyncio.Task[bytes]]] = {}
+        self._made_bytes = 0
 
     async def of(self, body: bytes, encoding: str) -> bytes:
         """Return a body in an encoding of ``preferred``."""
@@ -67,6 +69,8 @@ class SharedCompression:
             task = asyncio.create_task(in_thread(compressed, body, encoding))
             task.add_done_callback(seen)
             found = self._made[key] = body, task
-            if len(self._made) > KEPT:
-                del self._made[next(iter(self._made))]
+            self._made_bytes += len(body)
+            while len(self._made) > KEPT or (self._made_bytes > KEPT_BYTES and len(self._made) > 1):
+                oldest, _ = self._made.pop(next(iter(self._made)))
+                self._made_bytes -= len(oldest)
         return await asyncio.shield(found[1])  # a client that leaves must not cancel it for others

@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import time
 from collections.abc import AsyncIterator, Callable
 from typing import Final, TypeVar
 
@@ -11,6 +12,15 @@ from companion.server.threads import in_thread
 
 AT_ONCE: Final = 2
 """Number of requests that compute at once; each takes interpreter time from the links."""
+REST: Final = 3.0
+"""Time for which a slot stays empty after work, as a multiple of the work's time.
+
+All threads share one interpreter. Beside threads that compute without a pause, each call of the
+event loop to the system waits a millisecond for it, so that few frames are read.
+"""
+REST_SHARED: Final = 1.0  # the same after work whose answer all clients get, without overload
+REST_MAX_S: Final = 1.0  # longest rest: answers about thousands of UAVs follow one another
+RESTS_FROM_S: Final = 0.02  # shorter work needs no rest: a few UAVs take some milliseconds
 WAITING: Final = 64  # requests that wait for a slot; one second of work
 SHARED_WAITING: Final = 16  # answers for all that wait for the slot of their own
 
@@ -28,11 +38,13 @@ class _Slots:
 class WorkSlots:
     """Work slots of one node. A request beyond the queue is rejected with status 503.
 
-    ``running`` is the number of requests that compute now.
+    ``running`` is the number of requests that compute now; ``is_overloaded`` says whether the links
+    need more of the time.
     """
 
     def __init__(self, at_once: int = AT_ONCE, waiting: int = WAITING) -> None:
         self.running = 0
+        self.is_overloaded: Callable[[], bool] = lambda: False
         self._usual = _Slots(at_once, waiting)
         self._shared = _Slots(1, SHARED_WAITING - 1)
         self._no_long = asyncio.Semaphore(1)
@@ -53,14 +65,29 @@ class WorkSlots:
         slots = self._shared if is_shared and self._shared.room else self._usual
         slots.room -= 1
         try:
-            async with self._no_long if is_long else contextlib.nullcontext(), slots.free:
+            held = [self._no_long, slots.free] if is_long else [slots.free]
+            async with contextlib.AsyncExitStack() as stack:
+                for one in held:
+                    await one.acquire()
+                    stack.callback(one.release)
                 self.running += 1
+                began_s = time.monotonic()
                 try:
                     yield
                 finally:
                     self.running -= 1
+                    worked_s = time.monotonic() - began_s
+                    if worked_s >= RESTS_FROM_S:
+                        stack.pop_all()
+                        rest_s = self._rest_s(worked_s, is_shared=slots is self._shared)
+                        for one in held:
+                            asyncio.get_running_loop().call_later(rest_s, one.release)
         finally:
             slots.room += 1
+
+    def _rest_s(self, worked_s: float, *, is_shared: bool) -> float:
+        rest = REST_SHARED if is_shared and not self.is_overloaded() else REST
+        return min(REST_MAX_S, rest * worked_s)
 
     async def run(self, work: Callable[[], T], *, is_shared: bool = False) -> T:
         """Run work on another thread when a slot is free. Raises ``HTTPException`` 503."""

@@ -14,6 +14,7 @@ from typing import Any, Final
 from companion.tracking.gate import GateSettings, Suspects, is_frozen, refusal
 from companion.tracking.history import ReportHistory
 from companion.tracking.limits import Refutations
+from companion.tracking.newest_positions import NewestPositions
 from companion.tracking.noise import NoiseSettings
 from companion.tracking.observers.estimates import Observer, Prediction
 from companion.tracking.pace import ReportTiming
@@ -31,6 +32,7 @@ from companion.values import (
     Track,
     TrackState,
     Vector,
+    kind_of,
 )
 
 ESTABLISHED: Final = 50
@@ -98,6 +100,7 @@ class Tracker:
         self._observer = observer
         self._settings = settings
         self._tracked: dict[str, _Tracked] = {}
+        self._positions = NewestPositions()
         self._established: set[str] = set()  # dropped UAVs that had many reports
 
     # --- input: reports ---------------------------------------------------------------------
@@ -118,8 +121,13 @@ class Tracker:
             why = f"limit of {self._settings.most} tracks reached"
             return _rejected(fix, Reason.TOO_MANY, why), refuted
         if tracked is None or self._is_lost(tracked, fix):
-            return self._begin(fix, past), refuted
-        return self._accepted(tracked, fix), refuted
+            found: Estimate | Rejection = self._begin(fix, past)
+        else:
+            found = self._accepted(tracked, fix)
+        if isinstance(found, Estimate):
+            newest = self._tracked[fix.uav].history.newest.fix
+            self._positions.put(fix.uav, newest.position_ned_m)
+        return found, refuted
 
     def _new_past(self) -> _Past:
         noise = self._settings.noise
@@ -275,6 +283,7 @@ class Tracker:
     def forget(self, uav: str) -> None:
         """Forget a track, because its sender restarted or no longer sends."""
         tracked = self._tracked.pop(uav, None)
+        self._positions.forget(uav)
         room = len(self._established) < self._settings.most  # earlier UAVs take precedence
         if room and tracked is not None and tracked.reports >= ESTABLISHED:
             self._established.add(uav)
@@ -347,13 +356,15 @@ class Tracker:
         coasting_s = tracked.past.pace.silence_s(ages.coasting_s, ages.stale_s)
         return ages.state((now.sender_ns - newest.sender_ns) * 1e-9, coasting_s)
 
-    def near(self, position_ned_m: Vector, within_m: float) -> list[str]:
-        """Return the UAVs whose newest accepted report is within a distance of a local position."""
-        return [
-            uav
-            for uav, tracked in self._tracked.items()
-            if math.dist(tracked.history.newest.fix.position_ned_m, position_ned_m) < within_m
-        ]
+    def near(
+        self, position_ned_m: Vector, within_m: float, better_than: str | None = None
+    ) -> list[str]:
+        """Return the UAVs whose newest accepted report is within a distance of a local position.
+
+        ``better_than`` limits them to kinds that identify an aircraft better than this UAV's.
+        """
+        rank = math.inf if better_than is None else kind_of(better_than).rank
+        return self._positions.near(position_ned_m, within_m, rank)
 
 
 def _initial_estimate(fix: Fix) -> Estimate:

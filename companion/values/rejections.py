@@ -35,7 +35,10 @@ class Reason(DescribedEnum):
     DUPLICATE = "duplicate", "copies of a report received before"
     NO_FIX = "no-fix", "first reports sent before the receiver had a fix"
     OUT_OF_ORDER = "out-of-order", "reports older than the window for late reports"
-    TOO_FREQUENT = "too-frequent", "observations beyond the number per second that is processed"
+    TOO_FREQUENT = (
+        "too-frequent",
+        "observations, or messages of a receiver, beyond what is processed per second",
+    )
     UNKNOWN_UAV = "unknown-uav", "observations of a UAV that is not tracked"
     NO_POSE = "no-pose", "observations while the array's position or attitude is unknown"
     WRONG_TIME = "wrong-time", "observations made too long ago, or in the future"

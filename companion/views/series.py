@@ -3,8 +3,8 @@
 An open page collects its own samples; these are for a page that has just been opened.
 """
 
-from collections import deque
-from collections.abc import Iterable
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any, Final
 
@@ -19,6 +19,12 @@ from companion.views.health import shown_verdicts
 
 EVERY_NS: Final = 1_000_000_000  # least time between two samples
 SAMPLES: Final = 300  # samples kept: five minutes
+UAVS_MAX: Final = 120
+"""Most UAVs of a sample, those with beams first, and of an answer, those with most samples first.
+
+All samples together take 12 MB, and their answer 7 MB.
+"""
+Between = Callable[[Iterable[Any]], Iterable[Any]]
 Column = list[float | None]
 Words = list[str | None]
 
@@ -96,22 +102,31 @@ class Series:
         update = pipeline.last_update
         if update is None or (self._samples and 0 <= update.t_ns - self._samples[-1][0] < EVERY_NS):
             return
-        self._samples.append((update.t_ns, moment(pipeline, update, machine)))
+        self._samples.append((update.t_ns, moment(pipeline, update, machine, UAVS_MAX)))
+
+    @property
+    def newest(self) -> Sample | None:
+        """Newest sample; None before the first one."""
+        return self._samples[-1] if self._samples else None
 
     def samples(self) -> list[Sample]:
         """Return the samples so far, oldest first; they are immutable."""
         return list(self._samples)
 
 
-def moment(pipeline: Pipeline, update: Update, machine: Blame | None = None) -> Moment:
+def moment(
+    pipeline: Pipeline, update: Update, machine: Blame | None = None, most: int | None = None
+) -> Moment:
     """Return a sample of an update; its places are converted by ``show``.
 
-    ``machine`` is the cause of weak links by overload; None without overload.
+    ``machine`` is the cause of weak links by overload; None without overload. ``most`` limits the
+    number of UAVs; None: all.
     """
     beams = {beam.uav: beam for beam in update.beams.beams}
     verdicts = shown_verdicts(pipeline.health, machine)
     uavs = dict[str, tuple[Any, ...]]()
-    for track in update.tracks:
+    tracks = update.tracks if most is None else _sampled(update.tracks, beams, most)
+    for track in tracks:
         found, beam = verdicts.get(track.uav), beams.get(track.uav)
         uavs[track.uav] = (
             None if beam is None else degrees(beam.pointing_bound_rad),
@@ -131,20 +146,42 @@ def moment(pipeline: Pipeline, update: Update, machine: Blame | None = None) -> 
         local=pipeline.local,
         heading_deg=None if carrier is None else (degrees(carrier.yaw_rad) or 0.0) % 360,
         uavs=uavs,
-        positions_ned_m=np.array([*(track.position_ned_m for track in update.tracks), here]),
+        positions_ned_m=np.array([*(track.position_ned_m for track in tracks), here]),
     )
 
 
-def show(samples: list[Sample], now_ns: int, utc_ns: Utc, *, is_rounded: bool = False) -> Json:
-    """Return the answer of ``/v1/history``, in columns. Runs on any thread."""
-    shown = [_rows(one, is_rounded=is_rounded) for _, one in samples]
-    uavs = dict.fromkeys(uav for rows in shown for uav in rows if uav)
+def _sampled(tracks: Sequence[Track], beams: Mapping[str, Beam], most: int) -> Sequence[Track]:
+    """Return the tracks that are sampled; those with beams take precedence."""
+    if len(tracks) <= most:
+        return tracks
+    return sorted(tracks, key=lambda track: track.uav not in beams)[:most]
+
+
+def show(
+    samples: list[Sample],
+    now_ns: int,
+    utc_ns: Utc,
+    *,
+    is_rounded: bool = False,
+    most: int | None = None,
+    between: Between = iter,
+) -> Json:
+    """Return the answer of ``/v1/history``, in columns. Runs on any thread.
+
+    ``most`` limits the number of UAVs; None: all. ``between`` iterates with pauses for other work.
+    """
+    shown = [_rows(one, is_rounded=is_rounded) for _, one in between(samples)]
+    counts = Counter(uav for _, one in samples for uav in one.uavs)
+    uavs = [uav for uav, _ in counts.most_common(most)]
     nothing = (None,) * len(FIELDS)
     return {
         "valid_at": rfc3339(utc_ns(now_ns)),
         "at": [rfc3339(utc_ns(t_ns)) for t_ns, _ in samples],
         "carrier": _columns((*PLACE, "heading_deg"), (rows[""] for rows in shown)),
-        "uavs": {uav: _columns(FIELDS, (rows.get(uav, nothing) for rows in shown)) for uav in uavs},
+        "uavs": {
+            uav: _columns(FIELDS, (rows.get(uav, nothing) for rows in shown))
+            for uav in between(uavs)
+        },
     }
 
 

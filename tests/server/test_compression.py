@@ -53,6 +53,28 @@ def test_small_answer_is_sent_as_it_is(make_node: Any) -> None:
     assert "content-encoding" not in made.headers
 
 
+def test_bodies_are_kept_up_to_a_number_of_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Else 32 answers about two thousand UAVs take a gigabyte."""
+    made = list[int]()
+
+    def observed(body: bytes, _encoding: str) -> bytes:
+        made.append(body[0])
+        return body[:1]
+
+    monkeypatch.setattr(compression, "compressed", observed)
+    monkeypatch.setattr(compression, "KEPT_BYTES", 3 * AT_ONCE_BYTES)
+    bodies = [bytes([number]) * (AT_ONCE_BYTES + 1) for number in range(3)]
+
+    async def ask() -> None:
+        shared = SharedCompression()
+        for body in (*bodies, bodies[2], bodies[1], bodies[0], bodies[2], 9 * bodies[1]):
+            assert await shared.of(body, "gzip") == body[:1]
+        assert len(shared._made) == 1
+
+    run_async(ask())
+    assert made == [0, 1, 2, 0, 1]
+
+
 def test_large_answer_is_compressed_once_and_off_the_event_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -2,7 +2,9 @@
 
 import asyncio
 import socket
+import time
 from collections.abc import AsyncIterator, Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +17,7 @@ from support import HANG_S, run_async
 from companion.beams.array.geometry import Array
 from companion.beams.hardware import codebooks
 from companion.pipeline import assembly
-from companion.server import connections
+from companion.server import connections, work_slots
 from companion.server.app import create_app
 from companion.server.work_slots import WorkSlots
 from companion.settings.model import Settings
@@ -284,6 +286,84 @@ def test_history_is_limited_to_five_minutes(make_node: Any) -> None:
     assert columns and all(len(column) == SAMPLES for column in columns)
     values = [value for column in columns for value in column if isinstance(value, float)]
     assert values and np.isfinite(values).all()
+
+
+def test_history_of_many_uavs_is_limited_to_those_with_beams_first(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(series, "UAVS_MAX", 2)
+    node = make_node()
+    node.tick()
+    update = node.pipeline.last_update
+    kept, (*rest, last) = Series(), update.beams.beams
+    assert len(rest) >= 2
+    monkeypatch.setattr(
+        node.pipeline, "last_update", replace(update, beams=replace(update.beams, beams=(last,)))
+    )
+    kept.add(node.pipeline)
+    ((_, sample),) = kept.samples()
+    assert len(sample.uavs) == 2 and next(iter(sample.uavs)) == last.uav
+    assert len(sample.positions_ned_m) == 3
+    positions = {one.uav: one.position_ned_m for one in update.tracks}
+    assert sample.positions_ned_m[0] == pytest.approx(positions[last.uav])
+    monkeypatch.undo()
+    node.tick(1.0)
+    kept.add(node.pipeline)
+    shown = series.show(kept.samples(), 0, UtcNs, most=3)
+    assert len(shown["uavs"]) == 3 and set(sample.uavs) < set(shown["uavs"])
+
+
+def test_history_is_made_once_for_each_sample(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made, show = [], series.show
+
+    def counted(*given: Any, **named: Any) -> Any:
+        made.append(None)
+        return show(*given, **named)
+
+    monkeypatch.setattr("companion.views.series.show", counted)
+    node = make_node()
+    node.series.add(node.pipeline)
+    with TestClient(create_app(node)) as client:
+        first = client.get("/v1/history").json()
+        assert client.get("/v1/history").json() == first and len(made) == 1
+        assert client.get("/v1/history?rounded=true").json() != first and len(made) == 2
+        node.tick(1.0)
+        node.series.add(node.pipeline)
+        assert len(client.get("/v1/history").json()["at"]) == len(first["at"]) + 1
+
+
+def test_slot_rests_after_long_work_only() -> None:
+    """Else threads that compute take the interpreter from the links all the time."""
+
+    async def ask(work_s: float, *, is_shared: bool = False, is_overloaded: bool = False) -> float:
+        loop = asyncio.get_running_loop()
+        slots, ended_s, begun_s = work_slots.WorkSlots(at_once=1), list[float](), list[float]()
+
+        def work() -> None:
+            begun_s.append(loop.time())
+            time.sleep(work_s)
+            ended_s.append(loop.time())
+
+        slots.is_overloaded = lambda: is_overloaded
+        await slots.run(work, is_shared=is_shared)
+        async with slots.slot(is_long=not is_shared, is_shared=is_shared):
+            begun_s.append(loop.time())
+        assert slots.running == 0
+        return begun_s[1] - ended_s[0]
+
+    long_s = work_slots.RESTS_FROM_S * 2
+    assert run_async(ask(long_s)) >= work_slots.REST * long_s * 0.99
+    assert run_async(ask(long_s, is_shared=True)) >= work_slots.REST_SHARED * long_s * 0.99
+    rest_s = run_async(ask(long_s, is_shared=True, is_overloaded=True))
+    assert rest_s >= work_slots.REST * long_s * 0.99
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(work_slots, "REST", 1e6)
+        patch.setattr(work_slots, "REST_MAX_S", 2 * long_s)
+        assert run_async(ask(long_s)) < HANG_S
+        patch.setattr(work_slots, "RESTS_FROM_S", HANG_S)
+        assert run_async(ask(0.0)) < HANG_S
 
 
 def test_history_is_built_off_the_event_loop(

@@ -88,6 +88,31 @@ async def test_usual_answer_does_not_wait_for_others(shared_node: Any) -> None:
             await full.made(lead_ms, "other", lambda update: update, is_usual=is_usual)
 
 
+async def test_requests_that_wait_for_a_slot_share_one_answer_of_a_later_moment(
+    moments: Moments, shared_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else each moment queued work of its own, and answers came ever later."""
+    begun, go_on, made = asyncio.Event(), threading.Event(), []
+    loop, now_ns = asyncio.get_running_loop(), shared_node.now_ns()
+    monkeypatch.setattr(shared_node, "now_ns", lambda: now_ns)
+
+    def make(update: Update) -> int:
+        made.append(update.beams.valid_at_ns)
+        loop.call_soon_threadsafe(begun.set)
+        assert go_on.wait(60)
+        return update.beams.valid_at_ns
+
+    asked = [asyncio.create_task(moments.made(0.0, "beams", make, is_usual=True))]
+    await asyncio.wait_for(begun.wait(), 60)
+    for _ in range(5):
+        now_ns += EVERY_NS
+        asked.append(asyncio.create_task(moments.made(0.0, "beams", make, is_usual=True)))
+        await asyncio.sleep(0)
+    go_on.set()
+    first, *rest = await asyncio.gather(*asked)
+    assert made == [first, first + 5 * EVERY_NS] and set(rest) == {first + 5 * EVERY_NS}
+
+
 async def test_cancelled_request_does_not_cancel_shared_work(moments: Moments) -> None:
     begun, go_on = asyncio.Event(), threading.Event()
     loop = asyncio.get_running_loop()

@@ -544,6 +544,28 @@ def test_nearby_uavs_are_found_by_their_newest_reports(fix: MakeFix) -> None:
     assert tracker.near(place, 3001.0) == ["1:1", "2:1", "3:1"]
     tracker.accept(fix(10 * S, [700, 0, 0], uav="1:1"))
     assert tracker.near(place, 150.0) == ["2:1"]
+    tracker.forget("2:1")
+    assert tracker.near(place, 150.0) == []
+    tracker.accept(fix(0, [1000, 0, 0], uav="4:1"))
+    assert tracker.near(place, 150.0) == ["4:1"]
+
+
+def test_late_report_does_not_move_a_nearby_uav(fix: MakeFix) -> None:
+    tracker = tracking()
+    tracker.accept(fix(2 * S, [1000, 0, 0]))
+    tracker.accept(fix(S, [990, 0, 0]))
+    assert tracker.near(np.array([1000.0, 0, 0]), 5.0) == ["1:1"]
+
+
+def test_nearby_uavs_are_limited_to_kinds_with_a_better_identification(fix: MakeFix) -> None:
+    tracker, place = tracking(), np.array([0.0, 0, 0])
+    ids = ["cot:A", "icao:4CA7B3", "rid:X", "1:1"]
+    for uav in ids + [f"icao:{number:06X}" for number in range(200)]:
+        tracker.accept(fix(0, [5000 if uav.startswith("icao:0") else 1, 0, 0], uav=uav))
+    assert sorted(tracker.near(place, 9.0, better_than="cot:B")) == sorted(ids[1:])
+    assert sorted(tracker.near(place, 9.0, better_than="icao:0")) == ["1:1", "rid:X"]
+    assert tracker.near(place, 9.0, better_than="rid:Y") == ["1:1"]
+    assert tracker.near(place, 9.0, better_than="2:1") == []
 
 
 def test_clock_uncertainty_without_velocity_uses_the_speed_limit(fix: MakeFix) -> None:

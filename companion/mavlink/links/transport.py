@@ -38,6 +38,7 @@ from companion.mavlink.wire import cot_link
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
+from companion.values.budget import Budget
 
 __all__ = ["Link", "LinkStatus", "MessageSigning", "Notify", "Receive", "endpoint"]
 
@@ -46,7 +47,14 @@ RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 STEADY_S: Final = 1.0
 """Seconds for which a connection must last before it is reported as restored."""
 REFUSED_EVERY_NS: Final = 500_000_000
-"""Least time between two rejections of newcomers, each with the number of their frames."""
+"""Least time between two rejections of newcomers, or of a receiver; each has their number."""
+RECEIVER_SHARE: Final = 0.3
+"""Share of the time that messages of a receiver may take; further ones are skipped unparsed.
+
+A receiver reports any number of aircraft under one sender id, so ``newcomers`` cannot limit them.
+One aircraft's position takes 0.1 to 0.3 ms: a thousand a second fit, as in a dense sky.
+"""
+RECEIVER_SAVED_S: Final = 0.5  # time that a receiver may take at once, as for a large document
 UNFINISHED_S: Final = 10
 """Seconds of received bytes without a complete message after which a connection is closed."""
 PEER_ACTIVE_S: Final = 10.0
@@ -111,6 +119,9 @@ class Link:
         self._newcomers = newcomers or Newcomers()
         self._refused = 0  # frames of newcomers not reported yet
         self._refused_ns = 0
+        self._receiver_s = Budget(per_s=RECEIVER_SHARE, most=RECEIVER_SAVED_S)
+        self._skipped = 0  # messages of receivers not reported yet
+        self._skipped_ns = 0
         self._peers = Peers(
             status=self.status,
             on_evict=self._finish,
@@ -180,7 +191,12 @@ class Link:
             self._lag.observe(t_ns, age_ns)
             t_ns -= age_ns
         splitter = peer.splitter
-        found = splitter.feed(t_ns, data)
+        receiver = splitter if isinstance(splitter, ForeignSplitter) else None
+        if receiver is not None:
+            began_cpu_s = time.thread_time()
+            found = self._receive_within_budget(receiver, t_ns, data)
+        else:
+            found = splitter.feed(t_ns, data)
         if found:
             self._pass_on(peer, found)
         newcomers = self._newcomers
@@ -188,7 +204,9 @@ class Link:
             newcomers.late()
         spent_s = time.perf_counter() - began_s
         is_mixed = len(found) != 1 or isinstance(found[0], Rejection)
-        if is_mixed and not splitter.has_more:
+        if receiver is not None:
+            self._receiver_s.left -= time.thread_time() - began_cpu_s
+        elif is_mixed and not splitter.has_more:
             spent_s *= _share_of_frames(found, len(data))
         newcomers.worked_s += spent_s
         if found:
@@ -197,11 +215,30 @@ class Link:
             newcomers.worked(served, spent_s / len(found))
         if now_ns >= newcomers.adapts_ns:
             newcomers.adapt(now_ns, time.thread_time())
-        if isinstance(splitter, ForeignSplitter) and not self.url.listens:
-            began_ns = splitter.unfinished_ns
+        if receiver is not None and not self.url.listens:
+            began_ns = receiver.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
                 raise StalledError(f"no complete message in {UNFINISHED_S} s of data")
         return splitter.has_more
+
+    def _receive_within_budget(
+        self, receiver: ForeignSplitter, t_ns: int, data: bytes
+    ) -> list[Received]:
+        """Parse bytes of a receiver; skip their messages while its budget is used up."""
+        receiver.skips = not self._receiver_s.spend(0.0, t_ns * 1e-9)
+        found = receiver.feed(t_ns, data)
+        self._skipped, receiver.skipped = self._skipped + receiver.skipped, 0
+        if self._skipped and t_ns - self._skipped_ns >= REFUSED_EVERY_NS:
+            found.append(
+                Rejection(
+                    t_ns=t_ns,
+                    source=self.status.url,
+                    reason=Reason.TOO_FREQUENT,
+                    count=self._skipped,
+                )
+            )
+            self._skipped, self._skipped_ns = 0, t_ns
+        return found
 
     def _count_stale(self, key: Hashable, data: bytes) -> None:
         """Count the frames in stale bytes, and keep the splitter synchronised with the stream."""

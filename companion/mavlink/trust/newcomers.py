@@ -5,7 +5,7 @@ number of new ones is limited. When frames take more than ``BUSY`` of the time a
 late in two windows, those of strangers (``known_peers``) are dropped before they are decoded, then
 those of the newest senders, until the rest are in time: who was here first keeps being served. No
 more senders are dropped than took the work that is too much: a flood of one sender costs no other
-its place.
+its place. Receivers rank behind vehicles, whichever came first.
 """
 
 from bisect import bisect_left
@@ -13,11 +13,18 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Final
 
+from companion.mavlink.wire import cot_link, rid_json, transponder
 from companion.values import Source
 from companion.values.budget import Budget
 
+RECEIVERS: Final = frozenset((cot_link.SENDER, rid_json.SENDER, transponder.SENDER))
 NEW_PER_S: Final = 50.0  # new senders a second
 NEW_SAVED: Final = 500.0  # new senders at once, as when a fleet is switched on
+RECEIVERS_AFTER: Final = 256
+"""Senders admitted after a receiver that precede it, so that it costs no vehicle its place.
+
+More do not, or a flood of invented senders would cost the receiver its place.
+"""
 SENDERS_MAX: Final = 4096
 """Most senders remembered; beyond it the one silent for longest is new again."""
 BUSY: Final = 0.5  # share of the time above which frames of the newest senders are dropped
@@ -73,7 +80,7 @@ class Newcomers:
             if not self._budget.spend(1, now_ns * 1e-9):
                 self.refused += 1
                 return False
-            number = self._numbers[source] = self._count
+            number = self._numbers[source] = self._count + RECEIVERS_AFTER * (source in RECEIVERS)
             self._count += 1
             if len(self._numbers) > SENDERS_MAX:
                 self._numbers.popitem(last=False)

@@ -50,6 +50,9 @@ class AircraftJson(ForeignSplitter):
             refused = self._read(t_ns, data)
             if refused:
                 return refused
+        if self._rest and self._is_skipped(len(self._rest)):
+            self._rest.clear()
+            return []
         items: Items = []
         for _ in range(min(AT_ONCE, len(self._rest))):
             items += self._one(self._arrived_ns, self._rest.pop(), self._written)

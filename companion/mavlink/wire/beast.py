@@ -62,6 +62,8 @@ class BeastSplitter(ForeignSplitter):
     def _message(self, t_ns: int, kind: int, body: bytes) -> Items:
         if kind != 0x33:  # too short to hold a position, or not of an aircraft
             return []
+        if self._is_skipped():
+            return []
         if body.startswith(_MLAT):
             return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, MLAT)
         late_ns = self._lateness.observe(t_ns, int.from_bytes(body[:6], "big"))

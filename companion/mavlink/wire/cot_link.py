@@ -74,6 +74,8 @@ class CotSplitter(ForeignSplitter):
         return out + self._garbage(t_ns, garbage)
 
     def _event(self, t_ns: int, raw: bytes) -> Items:
+        if self._is_skipped():
+            return []
         try:
             event = _tak(raw) if raw[0] == _MAGIC else from_xml(raw)
         except (ValueError, OverflowError) as why:

@@ -17,11 +17,14 @@ class ForeignSplitter:
 
     ``unfinished_ns`` is the arrival time of the first bytes since the last complete message; None
     if there are none. A subclass counts each complete message in ``_complete``, unusable ones too.
+    While ``skips`` is set, messages are counted in ``skipped`` and not parsed.
     """
 
     def __init__(self, link: str) -> None:
         self.link = link
         self.unfinished_ns: int | None = None
+        self.skips = False
+        self.skipped = 0
         self._complete = 0
         self._pending = b""  # unfinished message
         self._overlong = False  # whether the rest of a too long line is being skipped
@@ -55,6 +58,12 @@ class ForeignSplitter:
 
     def _parse(self, t_ns: int, data: bytes) -> Items:
         raise NotImplementedError
+
+    def _is_skipped(self, messages: int = 1) -> bool:
+        """Return whether messages must be skipped, before any work; count them then."""
+        if self.skips:
+            self.skipped += messages
+        return self.skips
 
     def finish(self, t_ns: int) -> Items:
         """End the stream: an unfinished message counts as garbage."""

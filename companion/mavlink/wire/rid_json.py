@@ -56,6 +56,9 @@ class RidJson(ForeignSplitter):
         return out + self._garbage(t_ns, garbage + self._drop_overlong(OBJECT_MAX))
 
     def _object(self, t_ns: int, text: bytes) -> Items:
+        if self._is_skipped():
+            self._complete += 1
+            return []
         found = _parsed(text)
         if found is None:
             return self._garbage(t_ns, len(text) + 1)

@@ -42,6 +42,8 @@ class SbsSplitter(ForeignSplitter):
         return out + self._garbage(t_ns, garbage + self._drop_overlong(LINE_MAX))
 
     def _line(self, t_ns: int, line: bytes, kind: bytes) -> Items:
+        if self._is_skipped():
+            return []
         if kind == b"MLAT":
             return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, MLAT)
         try:

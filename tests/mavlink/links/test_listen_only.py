@@ -57,6 +57,37 @@ async def answering(*pieces: bytes, hangs: bool = False) -> AsyncIterator[tuple[
         server.close()
 
 
+def test_receiver_beyond_its_share_of_the_time_is_skipped_and_counted(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All peers of a link share the time, whichever port they use, and its work is charged."""
+    monkeypatch.setattr(transport, "RECEIVER_SAVED_S", 0.0)
+    now_ns = 1_000_000_000
+
+    async def test() -> None:
+        nonlocal now_ns
+        async with running("cot:udp:127.0.0.1:0", now_ns=lambda: now_ns) as (link, inbox):
+            await until_true(lambda: link.status.state == "up")
+            link._newcomers.adapts_ns = 1 << 62  # the work is not taken into account meanwhile
+            link.take(("127.0.0.1", 1), 8 * EVENT)
+            assert len(inbox.frames) == 8
+            charged = link._newcomers._worked_s
+            assert sum(charged.values()) == pytest.approx(link._newcomers.worked_s)
+            assert link._newcomers.worked_s > 0.9 * -link._receiver_s.left > 0.0
+            for port in range(2, 30):
+                link.take(("127.0.0.1", port), EVENT)
+            assert len(inbox.frames) == 8
+            (skipped,) = inbox.rejections
+            assert (skipped.reason, skipped.count) == (Reason.TOO_FREQUENT, 1)
+            now_ns += 60_000_000_000
+            link.take(("127.0.0.1", 40), EVENT)
+            assert len(inbox.frames) == 9
+            assert sum(one.count for one in inbox.rejections) == 28
+            assert link.status.lost == {Reason.TOO_FREQUENT: 28}
+
+    run(test())
+
+
 @pytest.mark.parametrize("status", [b"HTTP/1.0 200 OK\r\n", b"HTTP/1.1 200 fine\r\nA: b\r\n"])
 def test_http_document_becomes_frames(run: Run, status: bytes) -> None:
     async def test() -> None:

@@ -11,6 +11,7 @@ import sys
 import time
 import warnings
 from collections.abc import AsyncIterator, Iterator
+from itertools import count
 
 import pytest
 from link_support import LIMIT_S, LOOPS, Run, frame, port_of, runner, running, until_true
@@ -1075,6 +1076,30 @@ def test_work_is_charged_to_the_sender_of_each_frame(run: Run) -> None:
             charged = link._newcomers._worked_s
             assert charged[Source(7, 1)] > 10 * charged[Source(1, 1)]
             assert sum(charged.values()) == pytest.approx(link._newcomers.worked_s, rel=0.1)
+
+    run(test())
+
+
+def test_waits_for_the_interpreter_do_not_end_a_batch_of_datagrams(
+    run: Run, unstamped: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Threads that compute make each call to the system wait: few datagrams were read."""
+    iterations, waited_s = 0, count()
+    monkeypatch.setattr(time, "thread_time", lambda: 0.0)
+
+    async def test() -> None:
+        nonlocal iterations
+        async with running("udpin:127.0.0.1:0", now_ns=lambda: iterations) as (link, inbox):
+            await until_true(lambda: link.status.state == "up")
+            monkeypatch.setattr(udp.time, "monotonic", lambda: next(waited_s))
+            with senders(1) as (sender,):
+                for number in range(10):
+                    sender.sendto(frame(number), ("127.0.0.1", port_of(link)))
+            while len(inbox.frames) < 10:
+                iterations += 1
+                await asyncio.sleep(0)
+            assert len({one.t_ns for one in inbox.frames}) == 1
+            monkeypatch.undo()
 
     run(test())
 

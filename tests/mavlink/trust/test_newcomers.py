@@ -1,5 +1,6 @@
 """Admission of new senders: bounded in number, and the oldest are served first."""
 
+import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -121,6 +122,20 @@ def test_flood_of_one_sender_costs_no_other_its_place() -> None:
         senders.late(is_lossy=True)
         senders.adapt(number * WINDOW_NS, number * WINDOW_NS * 1e-9)
     assert served(senders, 6, 20 * WINDOW_NS) == [0, 1, 2, 3, 4]
+
+
+@pytest.mark.parametrize("receiver", sorted(newcomers.RECEIVERS))
+def test_receiver_ranks_behind_vehicles_but_not_behind_a_flood(receiver: Source) -> None:
+    for vehicles, receiver_stays in ((20, False), (newcomers.RECEIVERS_AFTER + 100, True)):
+        senders = Newcomers()
+        assert senders.admits(receiver, 0)
+        now = served(senders, vehicles, 0)
+        spent_s = 0.55 * WINDOW_NS * 1e-9
+        senders.worked_s += spent_s
+        senders.worked([*(source(one) for one in now), receiver], spent_s / (1 + len(now)))
+        senders.late(is_lossy=True)
+        senders.adapt(WINDOW_NS, WINDOW_NS * 1e-9)
+        assert senders.admits(receiver, WINDOW_NS) is receiver_stays
 
 
 def test_strangers_are_dropped_before_any_sender_while_frames_are_late() -> None:

@@ -135,6 +135,28 @@ def test_complete_messages_without_an_aircraft_are_no_unfinished_bytes(
 
 
 @pytest.mark.parametrize("name", FORMATS)
+def test_skipped_messages_are_counted_and_the_stream_stays_in_step(name: str) -> None:
+    of, valid = FORMATS[name]
+    splitter, cut = of("x"), len(valid) // 2
+    if name == "json":
+        splitter.skips = True
+        assert splitter.feed(1, valid) == [] and not splitter.has_more
+        valid = valid.replace(b"1.5", b"3.5")
+    else:
+        splitter.feed(1, valid[:cut])
+        splitter.skips = True
+        assert splitter.feed(2, valid[cut:] + valid + valid[:cut]) == []
+        assert splitter.skipped == 2
+        splitter.skips, splitter.skipped = False, 1
+        found = splitter.feed(3, valid[cut:])
+        assert [type(one) for one in found] == [Frame] * len(found) and found
+    splitter.skips = False
+    assert any(isinstance(one, Frame) for one in splitter.feed(4, valid))
+    assert splitter.skipped == 1
+    assert splitter.unfinished_ns is None
+
+
+@pytest.mark.parametrize("name", FORMATS)
 def test_garbage_alone_is_unfinished(name: str) -> None:
     splitter = FORMATS[name][0]("x")
     (found,) = splitter.feed(1, b"x" * 20_000)

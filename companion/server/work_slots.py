@@ -2,6 +2,7 @@
 
 import asyncio
 import contextlib
+import heapq
 import time
 from collections.abc import AsyncIterator, Callable
 from typing import Final, TypeVar
@@ -28,11 +29,33 @@ T = TypeVar("T")
 
 
 class _Slots:
-    """Slots of one kind, and the room for requests that wait for them."""
+    """Slots of one kind, and the room for requests that wait for them.
 
-    def __init__(self, at_once: int, waiting: int) -> None:
-        self.free = asyncio.Semaphore(at_once)
+    A slot that rests is given to the next request, which waits until the rest is over.
+    """
+
+    def __init__(self, at_once: int, waiting: int = 0) -> None:
         self.room = at_once + waiting
+        self._free = asyncio.Semaphore(at_once)
+        self._rested_s = [0.0] * at_once  # when each free slot has rested, a heap
+
+    async def acquire(self) -> None:
+        """Wait until a slot is free and has rested, and take it."""
+        await self._free.acquire()
+        rested_s = heapq.heappop(self._rested_s)
+        try:
+            await asyncio.sleep(max(0.0, rested_s - time.monotonic()))
+        except BaseException:
+            self._give_back(rested_s)
+            raise
+
+    def release(self, rest_s: float = 0.0) -> None:
+        """Return a slot, which rests."""
+        self._give_back(time.monotonic() + rest_s)
+
+    def _give_back(self, rested_s: float) -> None:
+        heapq.heappush(self._rested_s, rested_s)
+        self._free.release()
 
 
 class WorkSlots:
@@ -47,7 +70,7 @@ class WorkSlots:
         self.is_overloaded: Callable[[], bool] = lambda: False
         self._usual = _Slots(at_once, waiting)
         self._shared = _Slots(1, SHARED_WAITING - 1)
-        self._no_long = asyncio.Semaphore(1)
+        self._no_long = _Slots(1)
 
     def refuse_if_full(self, *, is_shared: bool = False) -> None:
         """Raise ``HTTPException`` 503 if the queue of waiting requests is full."""
@@ -64,25 +87,23 @@ class WorkSlots:
         self.refuse_if_full(is_shared=is_shared)
         slots = self._shared if is_shared and self._shared.room else self._usual
         slots.room -= 1
+        held, rest_s = list[_Slots](), 0.0
         try:
-            held = [self._no_long, slots.free] if is_long else [slots.free]
-            async with contextlib.AsyncExitStack() as stack:
-                for one in held:
-                    await one.acquire()
-                    stack.callback(one.release)
-                self.running += 1
-                began_s = time.monotonic()
-                try:
-                    yield
-                finally:
-                    self.running -= 1
-                    worked_s = time.monotonic() - began_s
-                    if worked_s >= RESTS_FROM_S:
-                        stack.pop_all()
-                        rest_s = self._rest_s(worked_s, is_shared=slots is self._shared)
-                        for one in held:
-                            asyncio.get_running_loop().call_later(rest_s, one.release)
+            for one in [self._no_long, slots] if is_long else [slots]:
+                await one.acquire()
+                held.append(one)
+            self.running += 1
+            began_s = time.monotonic()
+            try:
+                yield
+            finally:
+                self.running -= 1
+                worked_s = time.monotonic() - began_s
+                if worked_s >= RESTS_FROM_S:
+                    rest_s = self._rest_s(worked_s, is_shared=slots is self._shared)
         finally:
+            for one in held:
+                one.release(rest_s)
             slots.room += 1
 
     def _rest_s(self, worked_s: float, *, is_shared: bool) -> float:

@@ -1,6 +1,7 @@
 """Hostile clients: no request head, connection, host name or request delays the others."""
 
 import asyncio
+import contextlib
 import socket
 import time
 from collections.abc import AsyncIterator, Callable
@@ -364,6 +365,24 @@ def test_slot_rests_after_long_work_only() -> None:
         assert run_async(ask(long_s)) < HANG_S
         patch.setattr(work_slots, "RESTS_FROM_S", HANG_S)
         assert run_async(ask(0.0)) < HANG_S
+
+
+def test_slot_that_rests_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Neither with the event loop of its work, nor with a request that stops waiting for it."""
+    monkeypatch.setattr(work_slots, "RESTS_FROM_S", 0.0)
+    monkeypatch.setattr(work_slots, "REST", 1e6)
+    monkeypatch.setattr(work_slots, "REST_MAX_S", 0.3)
+    slots = work_slots.WorkSlots(at_once=1)
+
+    async def impatient() -> None:
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(slots.run(lambda: None), 0.01)
+
+    run_async(slots.run(lambda: None))
+    run_async(impatient())
+    begun_s = time.monotonic()
+    run_async(asyncio.wait_for(slots.run(lambda: None), HANG_S))
+    assert time.monotonic() - begun_s > 0.2
 
 
 def test_history_is_built_off_the_event_loop(

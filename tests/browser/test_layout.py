@@ -107,9 +107,10 @@ def test_no_element_overlaps_or_is_cut_off(
 
 
 ROOM = """() => {
+    const room = innerHeight - document.getElementById("alerts").offsetHeight;
     const share = one => {
         const { width, top, bottom } = one.getBoundingClientRect();
-        return width * (Math.min(bottom, innerHeight) - top) / innerWidth / innerHeight;
+        return width * (Math.min(bottom, innerHeight) - top) / innerWidth / room;
     };
     const [plan, table] = [document.querySelector(".plan"), document.querySelector(".scroll")];
     const end = Math.min(table.getBoundingClientRect().bottom, innerHeight);
@@ -117,7 +118,10 @@ ROOM = """() => {
         .filter(row => row.getBoundingClientRect().bottom <= end + 1);
     return { plan: share(plan), rows: rows.length };
 }"""
-"""Share of the window that the plan takes, and the number of rows in sight."""
+"""Share of the window below alerts that the plan takes, and the number of rows in sight.
+
+A busy machine is an alert.
+"""
 
 
 def test_plan_and_table_get_the_room_when_there_are_many_uavs(demo: Node, open_page: Any) -> None:

@@ -107,7 +107,7 @@ def test_no_element_overlaps_or_is_cut_off(
 
 
 ROOM = """() => {
-    const room = innerHeight - document.getElementById("alerts").offsetHeight;
+    const room = innerHeight - document.querySelector(".alerts").offsetHeight;
     const share = one => {
         const { width, top, bottom } = one.getBoundingClientRect();
         return width * (Math.min(bottom, innerHeight) - top) / innerWidth / room;

@@ -24,7 +24,7 @@ from support import HANG_S, run_async
 from websockets.asyncio.client import connect
 
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
-from companion.server import large_answers
+from companion.server import large_answers, work_slots
 from companion.server.app import create_app
 from companion.server.giving_way import NEVER
 from companion.server.observation_routes import PATH as OBSERVATIONS
@@ -59,6 +59,12 @@ STATUSES = {
     "/v1/map/tiles": {404},  # there is no map
     "/v1/recordings/{name}/history": {202, 409},  # being read; the file is no recording
 }
+
+
+@pytest.fixture(autouse=True)
+def _without_rests(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rests between two answers of a slot take no time of the event loop, but most of a minute."""
+    monkeypatch.setattr(work_slots, "REST_MAX_S", 0.0)
 
 
 def document_paths() -> list[str]:

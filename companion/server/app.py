@@ -220,7 +220,8 @@ def _state_routes(app: FastAPI, node: Node, large: LargeAnswers) -> None:
 
     @app.get(
         "/v1/history",
-        summary="Samples of UAVs and carrier, one per second of the last five minutes",
+        summary=f"Samples of at most {series.UAVS_MAX} UAVs, those with beams first, and of the"
+        " carrier, one per second of the last five minutes",
         responses=answers(series.History, 422, 503),
     )
     async def history(rounded: Rounded = False) -> Response:

@@ -356,15 +356,12 @@ class Tracker:
         coasting_s = tracked.past.pace.silence_s(ages.coasting_s, ages.stale_s)
         return ages.state((now.sender_ns - newest.sender_ns) * 1e-9, coasting_s)
 
-    def near(
-        self, position_ned_m: Vector, within_m: float, better_than: str | None = None
-    ) -> list[str]:
+    def near(self, position_ned_m: Vector, within_m: float, better_than: str) -> list[str]:
         """Return the UAVs whose newest accepted report is within a distance of a local position.
 
-        ``better_than`` limits them to kinds that identify an aircraft better than this UAV's.
+        Only those of kinds that identify an aircraft better than that of the UAV ``better_than``.
         """
-        rank = math.inf if better_than is None else kind_of(better_than).rank
-        return self._positions.near(position_ned_m, within_m, rank)
+        return self._positions.near(position_ned_m, within_m, kind_of(better_than).rank)
 
 
 def _initial_estimate(fix: Fix) -> Estimate:

@@ -29,3 +29,7 @@ class Budget:
             return False
         self.left -= amount
         return True
+
+    def charge(self, amount: float) -> None:
+        """Use units that were needed, also if fewer were left: the source then waits for them."""
+        self.left -= amount

@@ -37,7 +37,7 @@ class Reason(DescribedEnum):
     OUT_OF_ORDER = "out-of-order", "reports older than the window for late reports"
     TOO_FREQUENT = (
         "too-frequent",
-        "observations, or messages of a receiver, beyond what is processed per second",
+        "observations, or messages about other aircraft, beyond what is processed per second",
     )
     UNKNOWN_UAV = "unknown-uav", "observations of a UAV that is not tracked"
     NO_POSE = "no-pose", "observations while the array's position or attitude is unknown"

@@ -539,22 +539,22 @@ def test_nearby_uavs_are_found_by_their_newest_reports(fix: MakeFix) -> None:
     tracker.accept(fix(0, [1000, 60, -80], uav="2:1"))
     tracker.accept(fix(0, [4000, 0, 0], uav="3:1"))
     place = np.array([1000.0, 0, 0])
-    assert tracker.near(place, 99.9) == []
-    assert tracker.near(place, 100.1) == ["1:1", "2:1"]
-    assert tracker.near(place, 3001.0) == ["1:1", "2:1", "3:1"]
+    assert tracker.near(place, 99.9, better_than="cot:A") == []
+    assert tracker.near(place, 100.1, better_than="cot:A") == ["1:1", "2:1"]
+    assert tracker.near(place, 3001.0, better_than="cot:A") == ["1:1", "2:1", "3:1"]
     tracker.accept(fix(10 * S, [700, 0, 0], uav="1:1"))
-    assert tracker.near(place, 150.0) == ["2:1"]
+    assert tracker.near(place, 150.0, better_than="cot:A") == ["2:1"]
     tracker.forget("2:1")
-    assert tracker.near(place, 150.0) == []
+    assert tracker.near(place, 150.0, better_than="cot:A") == []
     tracker.accept(fix(0, [1000, 0, 0], uav="4:1"))
-    assert tracker.near(place, 150.0) == ["4:1"]
+    assert tracker.near(place, 150.0, better_than="cot:A") == ["4:1"]
 
 
 def test_late_report_does_not_move_a_nearby_uav(fix: MakeFix) -> None:
     tracker = tracking()
     tracker.accept(fix(2 * S, [1000, 0, 0]))
     tracker.accept(fix(S, [990, 0, 0]))
-    assert tracker.near(np.array([1000.0, 0, 0]), 5.0) == ["1:1"]
+    assert tracker.near(np.array([1000.0, 0, 0]), 5.0, better_than="cot:A") == ["1:1"]
 
 
 def test_nearby_uavs_are_limited_to_kinds_with_a_better_identification(fix: MakeFix) -> None:

@@ -205,7 +205,7 @@ class Link:
         spent_s = time.perf_counter() - began_s
         is_mixed = len(found) != 1 or isinstance(found[0], Rejection)
         if receiver is not None:
-            self._receiver_s.left -= time.thread_time() - began_cpu_s
+            self._receiver_s.charge(time.thread_time() - began_cpu_s)
         elif is_mixed and not splitter.has_more:
             spent_s *= _share_of_frames(found, len(data))
         newcomers.worked_s += spent_s

@@ -33,7 +33,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
-from companion.mavlink.trust.paths import SLACK_M, Path
+from companion.mavlink.trust.paths import RESTARTED_MS, SLACK_M, Path
 from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE
 from companion.mavlink.wire.decode import (
     ATTITUDE,
@@ -45,7 +45,7 @@ from companion.mavlink.wire.decode import (
 )
 from companion.mavlink.wire.encode import TIMESYNC
 from companion.mavlink.wire.positions import OWN, OwnPosition, read
-from companion.mavlink.wire.stamps import STAMPED, boot_ms, unwrapped_ns
+from companion.mavlink.wire.stamps import STAMPED, boot_ms, step_ms
 from companion.values import Frame, Source
 from companion.values.budget import Budget
 
@@ -60,8 +60,6 @@ CURRENT_INTERVALS: Final = 3.0  # that time in intervals between its messages
 SENDERS_MAX: Final = 4096  # senders followed; those of known peers are forgotten last
 PEERS_MAX: Final = 4  # known peers of a sender, and strangers compared with them
 COMPARED_PER_S: Final = 30.0  # positions of strangers compared per sender and second
-CLOCK_NS: Final = 10_000_000_000
-"""Most by which stamps of two peers may differ, as one of the links may be slow."""
 NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one sender
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
@@ -358,12 +356,12 @@ def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
 
 
 def _is_of_another_clock(sender: _Sender, known: _Peer, frame: Frame) -> bool:
-    """Return whether a stamp cannot be of the clock that a peer known earlier reports."""
+    """Return whether a stamp is too far off those of a peer known earlier to be of one clock."""
     for one in _current_earlier(sender, known, frame.t_ns):
         if one.stamped is not None:
-            expected_ns = _stamp_ms(one.stamped) * 1_000_000 + frame.t_ns - one.stamped.t_ns
-            off_ns = unwrapped_ns(_stamp_ms(frame), expected_ns) - expected_ns
-            if abs(off_ns) > CLOCK_NS:
+            passed_ms = (frame.t_ns - one.stamped.t_ns) // 1_000_000
+            expected_ms = _stamp_ms(one.stamped) + passed_ms
+            if abs(step_ms(_stamp_ms(frame), expected_ms)) > RESTARTED_MS:
                 return True
     return False
 

@@ -25,7 +25,7 @@ ACCELERATION_MPS2: Final = 20.0
 STRETCH_MS: Final = 2000
 """Longest time between two reports of a peer that a third report is compared with."""
 AHEAD_MS: Final = 250  # longest time by which a report is compared with an older one
-RESTARTED_MS: Final = 10_000  # a stamp that steps back further is from another boot
+RESTARTED_MS: Final = 10_000  # a stamp that is further off is from another boot, or clock
 REPORTS_KEPT: Final = 32  # newest reports kept of a peer
 
 _METRES: Final = 111_195.0 * 1e-7  # metres in 1e-7 degrees of latitude

@@ -35,6 +35,7 @@ from typing import Annotated, Final, NamedTuple
 from companion.mavlink.wire.decode import ATTITUDE
 from companion.mavlink.wire.encode import Outgoing, request_data_stream, set_message_interval
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
+from companion.mavlink.wire.stamps import step_ms
 from companion.values import Notice, Severity, Source
 from companion.values.described import DescribedEnum, Meaning
 
@@ -57,7 +58,6 @@ _LATE_MS: Final = 30_000
 """Largest step back of a stamp that counts as a late frame; a larger one is a restart."""
 _STAMPS: Final = 12  # newest stamps kept per message
 _ENOUGH: Final = 5  # intervals needed to measure a rate or to settle
-_WRAP_MS: Final = 1 << 32
 
 _NAMES: Final = {GLOBAL_POSITION_INT: "GLOBAL_POSITION_INT", ATTITUDE: "ATTITUDE"}
 STREAM: Final = {GLOBAL_POSITION_INT: 6, ATTITUDE: 10}
@@ -121,16 +121,16 @@ class ObservedRate:
     def add(self, t_ns: int, boot_ms: int) -> None:
         """Add one message. A late stamp is sorted in; a repeated stamp is ignored."""
         newest_ms = boot_ms if self._newest_ms is None else self._newest_ms
-        step_ms = (boot_ms - newest_ms + _WRAP_MS // 2) % _WRAP_MS - _WRAP_MS // 2
-        if step_ms <= -_LATE_MS:
+        ahead_ms = step_ms(boot_ms, newest_ms)
+        if ahead_ms <= -_LATE_MS:
             self.restarted_ns = t_ns
             self.stamps_ms.clear()
-        elif step_ms <= 0 and newest_ms + step_ms in self.stamps_ms:
+        elif ahead_ms <= 0 and newest_ms + ahead_ms in self.stamps_ms:
             return
-        if step_ms > 0 or not self.stamps_ms:
-            self._newest_ms = newest_ms + step_ms
+        if ahead_ms > 0 or not self.stamps_ms:
+            self._newest_ms = newest_ms + ahead_ms
             self.last_ns = t_ns
-        insort(self.stamps_ms, newest_ms + step_ms)
+        insort(self.stamps_ms, newest_ms + ahead_ms)
         del self.stamps_ms[:-_STAMPS]
 
     def median_ns(self) -> int | None:

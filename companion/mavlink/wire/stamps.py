@@ -37,8 +37,12 @@ def boot_ms(frame: Frame) -> int:
     return int.from_bytes(raw[at : min(at + 4, start + raw[1])], "little")
 
 
+def step_ms(boot_ms: int, before_ms: int) -> int:
+    """Return how far a stamp is ahead of another one, ms, by the shorter way around the wrap."""
+    return (boot_ms - before_ms + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
+
+
 def unwrapped_ns(boot_ms: int, near_ns: int) -> int:
     """Convert boot milliseconds to ns, unwrapped to the value nearest to ``near_ns``."""
     near_ms = near_ns // _NS_PER_MS
-    step_ms = (boot_ms - near_ms + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
-    return (near_ms + step_ms) * _NS_PER_MS
+    return (near_ms + step_ms(boot_ms, near_ms)) * _NS_PER_MS

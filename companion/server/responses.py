@@ -20,6 +20,7 @@ from starlette.types import Receive, Scope, Send
 from companion.server import models
 from companion.server.compression import LEAST_BYTES, SharedCompression, is_text, preferred
 from companion.server.giving_way import GivingWay
+from companion.server.held_bodies import HeldBodies
 from companion.server.observation_model import ObservationInput
 from companion.views.as_json import Json
 
@@ -76,11 +77,14 @@ class BodyResponse(Response):
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Send the response; see ASGI."""
         await self._compress(Headers(scope=scope).get("accept-encoding", ""))
-        body = memoryview(self.body)
-        if len(body) <= PIECE_BYTES:
+        if len(self.body) <= PIECE_BYTES:
             await super().__call__(scope, receive, send)
             return
-        headers = self.raw_headers
+        with _held.hold(bytes(self.body)):
+            await self._send_pieces(send)
+
+    async def _send_pieces(self, send: Send) -> None:
+        body, headers = memoryview(self.body), self.raw_headers
         await send({"type": "http.response.start", "status": self.status_code, "headers": headers})
         for start in range(0, len(body), PIECE_BYTES):
             piece, more = bytes(body[start : start + PIECE_BYTES]), start + PIECE_BYTES < len(body)
@@ -99,6 +103,7 @@ class BodyResponse(Response):
 
 
 _compression: Final = SharedCompression()
+_held: Final = HeldBodies()
 
 
 def answer(content: object, status: int = 200) -> Response:

@@ -2,18 +2,22 @@
 
 Links deliver late and out of order. A late report within the window is inserted in its place, and
 all later states are estimated again, so that the result equals that of reports in order. A report
-older than the window is not used. Nearly always a report is the newest, and costs one step.
+older than the window is not used. Nearly always a report is the newest, and costs one step. The
+number of reports is limited: a sender of thousands a second, out of order, would cost as many
+steps for each.
 """
 
 from bisect import bisect_left
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Generic
+from typing import Final, Generic
 
 from companion.tracking.observers.estimates import Observer, Prediction, State
 from companion.values import Fix, Vector
 
-ACCELERATION_REPORTS_MAX = 25
+REPORTS_MAX: Final = 512
+"""Most reports of a UAV that are kept: those of 5 s at 100 Hz; of faster ones the newest."""
+ACCELERATION_REPORTS_MAX: Final = 25
 """Most velocities used for an acceleration; of more, every n-th over the whole window."""
 
 
@@ -27,7 +31,7 @@ class Entry(Generic[State]):
 
 
 class ReportHistory(Generic[State]):
-    """Recent reports of one UAV, within the window.
+    """Recent reports of one UAV, within the window, and at most ``REPORTS_MAX``.
 
     ``entries`` are in order of the sender's time, and never empty.
     """
@@ -49,7 +53,8 @@ class ReportHistory(Generic[State]):
             return len(self.entries)
         if sender_ns < newest_ns - self._window_ns:
             return None
-        return bisect_left(self.entries, sender_ns, key=lambda entry: entry.fix.sender_ns)
+        at = bisect_left(self.entries, sender_ns, key=lambda entry: entry.fix.sender_ns)
+        return None if at == 0 and len(self.entries) >= REPORTS_MAX else at
 
     def insert(self, index: int, fix: Fix, predicted: Prediction | None = None) -> None:
         """Insert a report and estimate all later states again.
@@ -65,7 +70,9 @@ class ReportHistory(Generic[State]):
             for at in range(index, len(entries)):
                 entries[at] = self._estimated(at)
         oldest_ns = entries[-1].fix.sender_ns - self._window_ns
-        while len(entries) > 1 and entries[1].fix.sender_ns <= oldest_ns:
+        while len(entries) > 1 and (
+            entries[1].fix.sender_ns <= oldest_ns or len(entries) > REPORTS_MAX
+        ):
             del entries[0]
 
     def _estimated(self, at: int) -> Entry[State]:

@@ -5,6 +5,7 @@ import contextlib
 import os
 from collections.abc import Callable
 from functools import partial
+from socket import SO_RCVBUF, SOL_SOCKET
 from typing import Any
 
 import pytest
@@ -15,7 +16,15 @@ from starlette.testclient import TestClient
 from support import HANG_S, run_async
 
 from companion.node import serving
-from companion.server import access, connections, request_queue, stream, websocket_connections
+from companion.server import (
+    access,
+    connections,
+    held_bodies,
+    request_queue,
+    responses,
+    stream,
+    websocket_connections,
+)
 from companion.server.app import create_app
 from companion.server.request_queue import AT_ONCE, RequestQueue
 from companion.values import Severity
@@ -260,6 +269,39 @@ def test_client_that_takes_nothing_of_an_answer_is_disconnected(
                     await asyncio.sleep(0.05)  # between two attempts to send
 
     run_async(stalled())
+
+
+@pytest.mark.parametrize(("other", "expected"), [("gzip", "closed"), ("identity", "open")])
+def test_bodies_held_for_slow_clients_are_limited_in_all(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch, other: str, expected: str
+) -> None:
+    """The oldest answer is abandoned for another body, but not for another client of its own."""
+    monkeypatch.setattr(held_bodies, "BYTES_MAX", 50_000)  # one body has more
+    monkeypatch.setattr(responses, "PIECE_BYTES", 4096)
+    monkeypatch.setattr(connections, "BUFFER_BYTES", 4096)
+
+    async def asked_twice() -> str:
+        async with served(make_node()) as port:
+            slow, quick = await connected(port), await connected(port)
+            slow[1].transport.get_extra_info("socket").setsockopt(SOL_SOCKET, SO_RCVBUF, 2048)
+            slow[0]._transport.pause_reading()  # type: ignore[attr-defined]
+            slow[1].write(get("/openapi.json"))
+            while not responses._held.bytes:
+                await asyncio.sleep(0.001)
+            quick[1].write(get("/openapi.json", f"Accept-Encoding: {other}", "Connection: close"))
+            assert (await asyncio.wait_for(quick[0].read(), HANG_S)).startswith(b"HTTP/1.1 200 OK")
+            slow[0]._transport.resume_reading()  # type: ignore[attr-defined]
+            head = await asyncio.wait_for(slow[0].readuntil(b"\r\n\r\n"), HANG_S)
+            size = int(head.lower().partition(b"content-length: ")[2].partition(b"\r")[0])
+            assert size > 50_000
+            try:
+                await asyncio.wait_for(slow[0].readexactly(size), HANG_S)
+            except (asyncio.IncompleteReadError, ConnectionError):
+                return "closed"
+            return "open"
+
+    assert run_async(asked_twice()) == expected
+    assert responses._held.bytes == 0
 
 
 # --- WebSockets -----------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import examples
 
-from companion.tracking.history import ReportHistory
+from companion.tracking.history import REPORTS_MAX, ReportHistory
 from companion.tracking.observers.kinematic import KinematicModel, KinematicObserver, KinematicState
 from companion.tracking.observers.position import PositionModel, PositionObserver
 from companion.values import Fix
@@ -140,6 +140,21 @@ def test_history_is_bounded_by_its_window(fix: MakeFix) -> None:
         assert len(times) <= 52
         assert times[0] >= times[-1] - WINDOW_NS - S // 10
     assert len(history.entries) >= 51
+
+
+def test_history_of_a_fast_sender_is_bounded_by_the_number_of_reports(fix: MakeFix) -> None:
+    """Reports older than all that are kept would be dropped again: they are too old."""
+    step = S // 1000
+    history = told(KINEMATIC, [fix(n * step, [0, 0, 0]) for n in range(0, 1200, 2)])
+    assert len(history.entries) == REPORTS_MAX
+    first_ns = history.entries[0].fix.sender_ns
+    assert first_ns == (1198 - 2 * (REPORTS_MAX - 1)) * step
+    assert history.index(first_ns - step) is None
+    late = first_ns + step
+    assert history.index(late) == 1
+    history.insert(1, fix(late, [0, 0, 0]))
+    assert [entry.fix.sender_ns for entry in history.entries[:2]] == [late, first_ns + 2 * step]
+    assert len(history.entries) == REPORTS_MAX
 
 
 def test_late_report_is_used_after_a_gap_longer_than_the_window(fix: MakeFix) -> None:

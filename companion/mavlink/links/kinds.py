@@ -16,7 +16,7 @@ from companion.mavlink.links.zenoh_link import ZenohLink
 from companion.mavlink.wire.aircraft_json import AircraftJson
 from companion.mavlink.wire.beast import BeastSplitter
 from companion.mavlink.wire.cot_link import CotSplitter
-from companion.mavlink.wire.framing import SplitLimits, Splitter, search_budget
+from companion.mavlink.wire.framing import Checker, SplitLimits, Splitter, search_budget
 from companion.mavlink.wire.rid_json import RidJson
 from companion.mavlink.wire.sbs import SbsSplitter
 
@@ -24,7 +24,7 @@ FRAMES_AT_ONCE: Final = 16  # frames processed before other work runs; one may t
 
 
 def splitter(url: LinkUrl) -> Callable[[str], Splits]:
-    """Return the factory of a link's splitters; each peer has its own."""
+    """Return the factory of a link's splitters; each peer has its own, and all share a cache."""
     match url.scheme:
         case "sbs":
             return SbsSplitter
@@ -36,7 +36,8 @@ def splitter(url: LinkUrl) -> Callable[[str], Splits]:
             return CotSplitter
         case _:
             limits = SplitLimits(search=search_budget(), at_once=FRAMES_AT_ONCE)
-            return lambda link: Splitter(link, limits=limits)
+            checker = Checker()
+            return lambda link: Splitter.sharing(checker, link, limits)
 
 
 def endpoint(url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> Endpoint:

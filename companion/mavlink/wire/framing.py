@@ -17,7 +17,7 @@ Over 300 lines: the search, its limits and what it counts are one algorithm.
 
 import math
 import re
-from typing import Final, NamedTuple
+from typing import Final, NamedTuple, Self
 
 from fastcrc import crc16
 
@@ -31,7 +31,7 @@ SIGNED: Final = 0x01  # the only incompatibility flag defined; frames with any o
 
 SHORTEST: Final = 8  # bytes of a MAVLink 1 frame without a payload
 KNOWN_MAX: Final = 8192
-"""Most distinct pairs of sender and message that a stream caches."""
+"""Most distinct pairs of sender and message that are cached, about 2 MB."""
 
 FALSE_STARTS_PER_S: Final = 20_000.0
 """False starts of frames that a link examines per second, each in a microsecond or two.
@@ -133,7 +133,7 @@ Checked = tuple[Source, int, bytes]
 
 
 class Checker:
-    """Finder of whole frames in one stream, with a cache per sender and message.
+    """Finder of whole frames in streams, with a cache per sender and message.
 
     ``at`` handles nearly every MAVLink 2 frame in one step: it looks up the five bytes of sender
     and message together. ``examine`` handles the others.
@@ -211,7 +211,14 @@ class Splitter:
         self._limits = limits
         self._pending = b""
         self._claimed = 0  # following bytes within the claimed length of a failed frame
-        self.checker = Checker()  # several splitters may share one, and its cache
+        self._checker = Checker()
+
+    @classmethod
+    def sharing(cls, checker: Checker, link: str, limits: SplitLimits = NO_LIMITS) -> Self:
+        """Return a splitter that shares a cache of senders, of up to 2 MB, with others."""
+        made = cls(link, limits=limits)
+        made._checker = checker
+        return made
 
     def feed(self, t_ns: int, data: bytes) -> list[Frame | Rejection]:
         """Parse bytes that arrived at ``t_ns``; return the frames that these bytes complete.
@@ -219,7 +226,7 @@ class Splitter:
         Other bytes are returned as rejections, one per reason.
         """
         if not self._pending:
-            found = self.checker.at(data, 0, len(data)) if data else INCOMPLETE
+            found = self._checker.at(data, 0, len(data)) if data else INCOMPLETE
             if not isinstance(found, int) and len(found[2]) == len(data):  # nearly every datagram
                 self.frames += 1
                 self._claimed = 0
@@ -239,7 +246,7 @@ class Splitter:
     def _split(self, t_ns: int, buffer: bytes, *, last: bool) -> list[Frame | Rejection]:
         out: list[Frame | Rejection] = []
         lost: dict[Reason, int] = {}
-        link, wanted, frame_at = self.link, self._wanted, self.checker.at
+        link, wanted, frame_at = self.link, self._wanted, self._checker.at
         search, now_s = self._limits.search, t_ns * 1e-9
         most = math.inf if last else self._limits.at_once
         at, end, claimed_to = 0, len(buffer), self._claimed

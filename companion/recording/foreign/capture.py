@@ -76,18 +76,11 @@ def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
     return Rejection(t_ns=t_ns, source=link, reason=Reason.BAD_STAMP, detail=detail)
 
 
-def _splitter(link: str, checker: Checker) -> Splitter:
-    """Return a splitter with the cache of senders that all splitters of a file share."""
-    splitter = Splitter(link)
-    splitter.checker = checker
-    return splitter
-
-
 class _Flow:
     """Flow of packets, and the MAVLink frames in it; nothing is returned before its first frame."""
 
     def __init__(self, name: str, checker: Checker) -> None:
-        self._splitter = _splitter(name, checker)
+        self._splitter = Splitter.sharing(checker, name)
         self._next: int | None = None
         self._ahead: dict[int, bytes] = {}
 
@@ -162,7 +155,7 @@ def read_mcap(path: Path) -> Iterator[Event]:
             schema = walk.schemas.get(channel.schema_id)
             said = (channel.topic, channel.message_encoding, schema.name if schema else "")
             speaks = any("mavlink" in word.lower() for word in said)
-            splitters[channel.id] = _splitter(channel.topic, checker) if speaks else None
+            splitters[channel.id] = Splitter.sharing(checker, channel.topic) if speaks else None
         splitter = splitters[channel.id]
         if splitter is None or not any(magic in content.data for magic in _MAGICS):
             continue

@@ -9,6 +9,7 @@ import gc
 import socket
 import sys
 import time
+import tracemalloc
 import warnings
 from collections.abc import AsyncIterator, Iterator
 from itertools import count
@@ -23,6 +24,7 @@ from companion.mavlink.links.kinds import FRAMES_AT_ONCE
 from companion.mavlink.links.peers import PEERS_MAX
 from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import LinkError, parse_link
+from companion.mavlink.trust.newcomers import NEW_SAVED
 from companion.mavlink.wire.encode import Outgoing, heartbeat, pack, timesync
 from companion.mavlink.wire.framing import FALSE_STARTS_SAVED, Splitter
 from companion.values import Frame, Reason, Rejection, Severity, Source
@@ -183,6 +185,21 @@ def test_port_scan_uses_bounded_memory() -> None:
     assert len(link._peers) == PEERS_MAX
     assert link.status.peers == 2 * PEERS_MAX + 3
     assert link.status.lost["garbage"] > 2 * PEERS_MAX  # of evicted peers: their bytes still count
+
+
+def test_peers_of_a_link_share_one_cache_of_senders() -> None:
+    """It has 2 MB for 8192 senders and messages, and a link may have 256 peers."""
+    link = Link(url=parse_link("tcpin:127.0.0.1:0"), receive=lambda _: None, now_ns=lambda: 0)
+    sent = [pack(heartbeat(Source(1 + n % 250, 1 + n // 250)), 0) for n in range(2000)]
+    tracemalloc.start()
+    try:
+        for peer in range(20):
+            for start in range(0, len(sent), 16):
+                link.take(peer, b"".join(sent[start : start + 16]))
+        assert link.status.frames == 20 * NEW_SAVED  # all are cached, before the others are dropped
+        assert tracemalloc.get_traced_memory()[1] < 4e6
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("scheme", ["udpin", "tcpin"])

@@ -218,7 +218,10 @@ class BootLine:
         x_ns = unwrapped_ns(boot_ms, before.newest_ns)
         was_late_ns = arrival_ns - x_ns - before.at(x_ns)
         fits_before = _EARLY_NS <= was_late_ns <= self._late_max_ns
-        return fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
+        is_one = fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
+        if is_one:
+            self.floor.was_late(was_late_ns)
+        return is_one
 
     def _begin_new_line(self, *, rebooted: bool) -> PlacedStamp:
         """Make the run of stamps the new line. After a reboot the sender's timeline restarts."""

@@ -246,9 +246,25 @@ class Floor:
 
     @property
     def largest_ns(self) -> float:
-        """Largest visible part of the latency, or that of the line before, for a window."""
-        before_ns = self._before_ns if self._heard_ns <= self._window_ns else 0.0
-        return max(self._visible.largest_ns, before_ns)
+        """Largest visible latency of a window, or that assumed after the line before, ns.
+
+        Above the lowest explanation of all stamps; no stamp of the window is left out.
+        """
+        if not self.count:
+            return 0.0
+        lowest = self._upper_bound
+        if self._level is not None:
+            lowest = min(lowest, self._level.upper_bound - self._tilted(0.0))
+        return max(self._visible.greatest(self.newest_ns) - lowest, self._assumed_ns)
+
+    @property
+    def _assumed_ns(self) -> float:
+        """Largest visible latency of the line before, for a window; then 0."""
+        return self._before_ns if self._heard_ns <= self._window_ns else 0.0
+
+    def was_late(self, latency_ns: float) -> None:
+        """Note the visible latency of a frame of the line before, which arrived after this one."""
+        self._before_ns = max(self._before_ns, latency_ns)
 
     @property
     def median_ns(self) -> float:
@@ -271,7 +287,7 @@ class Floor:
         n = min(self.count, spells)
         slow = WORST_LATENCY_NS / (spells * spells) + WORST_LATENCY_NS / self.count**1.5
         few = float(_RARE * self._visible.mean_ns / n + slow)
-        return max(few, self.largest_ns - self._visible.largest_ns)
+        return max(few, self._assumed_ns - self._visible.largest_ns)
 
     @property
     def _heard_ns(self) -> int:
@@ -290,7 +306,9 @@ class Floor:
         """Restart at a height that was measured at a sender time, because the clock changed."""
         base_x_ns, base_y_ns = self._base
         measured = height_ns - base_y_ns - self.drift * (x_ns - base_x_ns)
-        self._upper_bound = self._line = measured + self._drift_max * abs(self.newest_ns - x_ns)
+        measured += self._drift_max * abs(self.newest_ns - x_ns)
+        self._visible.raise_greatest(measured - self._upper_bound)
+        self._upper_bound = self._line = measured
         self._level = None
         self._since_ns = self._bound_set_ns = x_ns
         self._risen = -math.inf

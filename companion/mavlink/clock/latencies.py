@@ -37,7 +37,8 @@ class Latencies:
         self._window_ns = window_ns
         self._piece_ns = max(1, window_ns // PIECES)
         self._drift_max = drift_max
-        self._pieces: deque[tuple[int, int, float]] = deque()  # index, x, least height
+        # index, x of the least height, least and greatest height
+        self._pieces: deque[tuple[int, int, float, float]] = deque()
         self._samples = _Samples()
         self._one_of = 1
         self._lot = 0
@@ -49,11 +50,13 @@ class Latencies:
         index = x_ns // self._piece_ns
         pieces, samples = self._pieces, self._samples
         if not pieces or index > pieces[-1][0]:
-            pieces.append((index, x_ns, height))
+            pieces.append((index, x_ns, height, height))
             while len(pieces) > PIECES:
                 pieces.popleft()
         elif height < pieces[-1][2]:
-            pieces[-1] = (pieces[-1][0], x_ns, height)
+            pieces[-1] = (pieces[-1][0], x_ns, height, pieces[-1][3])
+        elif height > pieces[-1][3]:
+            pieces[-1] = (*pieces[-1][:3], height)
         # A linear congruential generator (Numerical Recipes): sampling is reproducible.
         self._lot = (1664525 * self._lot + 1013904223) % _LOTS
         if self._lot * self._one_of >= _LOTS:
@@ -78,8 +81,8 @@ class Latencies:
         if not pieces or not is_new.any():
             return
         x, heights = (x_ns[is_new] - newest_ns).astype(float), heights[is_new]
-        at = np.array([[at_ns - newest_ns] for _, at_ns, _ in pieces], dtype=float)
-        floors = np.array([[least] for _, _, least in pieces])
+        at = np.array([[at_ns - newest_ns] for _, at_ns, _, _ in pieces], dtype=float)
+        floors = np.array([[least] for _, _, least, _ in pieces])
         below = (floors + self._drift_max * np.abs(x - at)).min(axis=0)
         gaps = np.maximum(0.0, heights - below)
         self.mean_ns = float(gaps.mean())
@@ -88,6 +91,20 @@ class Latencies:
         self.median_ns = float(gaps[(n - 1) // 2] + gaps[n // 2]) / 2.0
         if n < SAMPLES // 4:
             self.median_ns = max(self.median_ns, self._kept_median_ns)
+
+    def greatest(self, newest_ns: int) -> float:
+        """Return the greatest height of the window, of any stamp, as of the newest one."""
+        return max(
+            greatest + self._drift_max * (newest_ns - index * self._piece_ns)
+            for index, _, _, greatest in self._pieces
+        )
+
+    def raise_greatest(self, by_ns: float) -> None:
+        """Move the greatest heights with the floor, whose clock changed."""
+        self._pieces = deque(
+            (index, at_ns, least, greatest + by_ns)
+            for index, at_ns, least, greatest in self._pieces
+        )
 
     def steady_drift(self, newest_ns: int) -> float:
         """Return the steady drift of the floor over a window, a ratio; 0 unless above the limit.
@@ -101,7 +118,7 @@ class Latencies:
             return 0.0
         x_ns, heights = self._samples.arrays()
         x = (x_ns - newest_ns).astype(float)
-        points = [(float(at_ns - newest_ns), height) for _, at_ns, height in self._pieces]
+        points = [(float(at_ns - newest_ns), height) for _, at_ns, height, _ in self._pieces]
         slope = _slope_over(points, float(np.mean(x)))
         if abs(slope) <= self._drift_max:
             return 0.0
@@ -113,12 +130,13 @@ class Latencies:
 
     def tilt(self, drift: float, newest_ns: int, level: float) -> list[tuple[int, float]]:
         """Subtract drift and level from all heights; return the least ones: sender time, height."""
-        self._pieces = deque(
-            (index, at_ns, height - drift * (at_ns - newest_ns) - level)
-            for index, at_ns, height in self._pieces
-        )
+        tilted = deque[tuple[int, int, float, float]]()
+        for index, at_ns, least, greatest in self._pieces:
+            moved = drift * (at_ns - newest_ns) + level
+            tilted.append((index, at_ns, least - moved, greatest - moved))
+        self._pieces = tilted
         self._samples.clear()
-        return [(at_ns, height) for _, at_ns, height in self._pieces]
+        return [(at_ns, least) for _, at_ns, least, _ in self._pieces]
 
 
 class _Samples:

@@ -3,7 +3,7 @@
 from itertools import pairwise
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support import examples
 
@@ -107,30 +107,54 @@ def test_reboot_is_detected_once_and_starts_a_new_epoch(back_ms: int, boot_ms: i
         assert stamp.latency_s == 0.0  # the old offset is gone
 
 
-@settings(max_examples=examples(60))
+def delivered(boots: list[int], lates: list[int], begins_ms: int) -> Seen:
+    """Return stamps of a boot that began at a time, in order of arrival: no frame overtakes."""
+    times, last = list[int](), 0
+    for boot, late in zip(boots, lates, strict=True):
+        last = max(last + 1, begins_ms + boot + late)
+        times.append(last)
+    return list(zip(times, boots, strict=True))
+
+
+@settings(max_examples=examples(100))
 @given(
-    latency_max_ms=st.integers(300, 3_000), after=st.lists(st.floats(0, 1), min_size=1, max_size=8)
+    latency_max_ms=st.integers(300, 3_000),
+    every_ms=st.sampled_from([100, 200, 250, 500, 1_000]),
+    slow=st.tuples(st.floats(0, 1), st.integers(1, 40)),
+    after=st.lists(st.floats(0, 1), min_size=1, max_size=8),
 )
+@example(1_500, 250, (1.0, 16), [1.0])
+@example(1_500, 1_000, (0.9, 1), [1.0])
 def test_clock_after_a_reboot_is_in_its_interval_if_frames_are_no_later_than_before(
-    latency_max_ms: int, after: list[float]
+    latency_max_ms: int, every_ms: int, slow: tuple[float, int], after: list[float]
 ) -> None:
-    """All frames of the first seconds may be slow; then only those of before show by how much."""
-    before = [
-        (at + latency_max_ms * ((7 * n) % 11) // 10, boot)
-        for n, (at, boot) in enumerate(run(0, 300_000, 150))
-    ]
+    """All frames after it may be as slow as the slowest of a few anywhere in the minute before."""
+    boots = list(range(300_000, 345_000, every_ms))
+    first = round(slow[0] * (len(boots) - 1 - slow[1]))
+    is_slow = [first <= n <= first + slow[1] for n in range(len(boots))]
+    lates = [latency_max_ms if one else 7 * n % 11 for n, one in enumerate(is_slow)]
     clock = SenderClock()
-    observe_all(sorted(before), clock)
-    begins_ms = 40_000
-    for n, (at, boot) in enumerate(run(begins_ms, 0, 150)):
-        share = after[min(n // 15, len(after) - 1)]
-        arrival_ns = EPOCH_NS + (at + round(latency_max_ms * share)) * MS
-        if clock.observe(arrival_ns, boot) is None:
+    observe_all(delivered(boots, lates, -300_000), clock)
+    begins_ms, boots = 48_000, list(range(0, 30_000, every_ms))
+    lates = [round(latency_max_ms * after[n * len(after) // len(boots)]) for n in range(len(boots))]
+    for at, boot in delivered(boots, lates, begins_ms):
+        if clock.observe(EPOCH_NS + at * MS, boot) is None:
             continue
         known = clock.estimate()
         assert known is not None
         off_s = (EPOCH_NS + begins_ms * MS - known.offset_ns) * 1e-9
         assert -known.after_s - 2e-3 <= off_s <= known.before_s + 2e-3
+
+
+def test_frame_of_the_last_boot_that_arrives_later_shows_how_late_frames_may_be() -> None:
+    """The frames of the new boot may all be as late, until one is not."""
+    clock = SenderClock()
+    observe_all(run(0, 300_000, 150), clock)
+    observe_all(run(40_000 + 2_000, 0, 10), clock)
+    assert observe_all([(44_000, 342_000)], clock) == [None]  # sent 2 s before
+    known = clock.estimate()
+    assert known is not None
+    assert (known.offset_ns - EPOCH_NS) * 1e-9 - known.after_s <= 40.0
 
 
 @pytest.mark.parametrize("uptime_ms", [4_000, 9_000])

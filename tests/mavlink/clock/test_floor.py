@@ -255,10 +255,15 @@ def test_slow_round_trips_do_not_override_good_stamps() -> None:
 def test_upper_bound_lies_between_offset_and_every_stamp(
     steps: list[tuple[int, int]], drift: float
 ) -> None:
-    """For any latency the truth is below the bound, and no aged stamp is."""
+    """For any latency the truth is below the bound, and no aged stamp is.
+
+    The largest latency of a minute is known but for the part that no stamp shows.
+    """
     floor, x_ns = Floor(60 * S, 250e-6), 10 * S
+    latencies: list[tuple[int, int]] = []
     for step_ns, latency_ns in steps:
         x_ns += step_ns
+        latencies.append((x_ns, latency_ns))
         offset_ns = 5 * S + drift * x_ns
         floor.add(x_ns, round(offset_ns + latency_ns))
         seen = floor.heights(x_ns)
@@ -266,6 +271,18 @@ def test_upper_bound_lies_between_offset_and_every_stamp(
         assert seen.upper_bound <= offset_ns + latency_ns + 2
         assert seen.highest >= seen.upper_bound
         assert floor.at(x_ns) <= offset_ns + latency_ns + 2
+        largest_ns = max(one for at_ns, one in latencies if at_ns > x_ns - 56 * S)
+        assert floor.largest_ns >= largest_ns - (seen.upper_bound - offset_ns) - 5
+
+
+@pytest.mark.parametrize("by_ns", [0, S // 2, 3 * S])
+def test_largest_latency_outlasts_a_step_of_the_clock(by_ns: int) -> None:
+    floor = Floor(60 * S, 250e-6)
+    for n in range(100):
+        floor.add(n * S // 10, 5 * S + (S if n == 50 else 0))
+    floor.restart_at(5 * S + by_ns, 10 * S)
+    floor.add(10 * S, 5 * S + by_ns)
+    assert floor.largest_ns == pytest.approx(S, abs=3 * MS)
 
 
 def test_memory_is_bounded() -> None:

@@ -98,6 +98,7 @@ class BootLine:
                  as for ``Floor``
     late_max_ns  greatest lateness of any frame
     newest_ns    attribute: newest sender time on the line
+    since_ns     attribute: arrival of its first stamp if it replaced another line; else None
     """
 
     def __init__(self, window_ns: int, drift_max: float, late_max_ns: int) -> None:
@@ -105,6 +106,7 @@ class BootLine:
         self._late_max_ns = late_max_ns
         self.floor = Floor(*self._shape)
         self.newest_ns = 0
+        self.since_ns: int | None = None
         self._run = _RivalLine()
         self._rival = _RivalLine()
         self._previous: tuple[Floor, int] | None = None  # the previous line, and when it was left
@@ -229,7 +231,8 @@ class BootLine:
         self._run.stamps.clear()
         self._rival.stamps.clear()
         before = self.floor
-        self._previous = (before, stamps[0][0])
+        self.since_ns = stamps[0][0]
+        self._previous = (before, self.since_ns)
         self.floor = Floor(*self._shape, before.largest_ns)
         x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self.newest_ns
         for arrival_ns, boot_ms in stamps:

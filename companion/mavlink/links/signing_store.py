@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from companion.mavlink.links.urls import LinkError
-from companion.mavlink.trust.signing import KEY_BYTES, LinkSigning, State, fingerprint
+from companion.mavlink.trust.signing import KEY_BYTES, LinkSigning, Senders, State, fingerprint
 
 SAVE_NS: Final = 1_000_000_000  # shortest time between two writes
 REFRESH_NS: Final = 3_000_000_000
@@ -113,6 +113,7 @@ class Timestamps:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._guards: dict[_LinkKey, LinkSigning] = {}
+        self._senders: dict[str, Senders] = {}  # by the fingerprint of the key
         self._number = 0
         self._snapshot_ns = 0
         self._moves = 0
@@ -127,6 +128,8 @@ class Timestamps:
         except LinkError:
             os.close(self._lock)
             raise
+        for link, kept in self._kept.items():
+            self._senders.setdefault(link.key, Senders()).note_all(kept.state)
 
     def guard(
         self, url: str, key: bytes, link_id: int, now_ns: int, *, allow_unsigned: bool = False
@@ -141,7 +144,13 @@ class Timestamps:
             raise LinkError(f"{url}: two links have the same address and key")
         kept = self._kept.get(link, _Kept(State(), clean=True))
         state = kept.state if kept.clean else kept.state.after_crash()
-        guard = LinkSigning(key=key, link_id=link_id, allow_unsigned=allow_unsigned, state=state)
+        guard = LinkSigning(
+            key=key,
+            link_id=link_id,
+            allow_unsigned=allow_unsigned,
+            state=state,
+            senders=self._senders.setdefault(link.key, Senders()),
+        )
         self._guards[link] = guard
         self.write(self.snapshot(now_ns))
         return guard

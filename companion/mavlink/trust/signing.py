@@ -14,11 +14,11 @@ since it cannot be distinguished from a replay. Only accepted frames change any 
 without the key cannot block a stream by a bad signature with a high timestamp. SETUP_SIGNING is
 handled like any other message: keys cannot be changed over the air.
 
-**Links are independent.** Guards share nothing, even with one key. A router delivers the same
-signed frame over two links, and the link id in it is the sender's: shared state would reject the
-later copy, and everything that a slow link delivers after a fast one. The cost is that a frame
-received on one link can be replayed once into another. It is genuine, its report is dropped as a
-duplicate, and from then on that link rejects it.
+**Several links with one key.** Each link has streams of its own: a router delivers the same signed
+frame over two links, with the link id of its sender, and a slow link delivers after a fast one. So
+a frame received on one link can be replayed once into another. To be harmless, it must be at most
+``BEHIND_MAX`` behind the newest frame of its sender on all of these links: then a report that was
+received is dropped as a duplicate, and one that was not is merely late. Links share nothing else.
 
 **Frames of this node** are also a stream of the link. Otherwise, with one key for all, such a frame
 sent back to the node would carry a valid signature.
@@ -52,6 +52,11 @@ EPOCH_NS: Final = 1_420_070_400_000_000_000
 UNIT_NS: Final = 10_000  # nanoseconds per unit of a timestamp
 SECOND: Final = 100_000  # units of a timestamp in a second
 MINUTE: Final = 60 * SECOND
+BEHIND_MAX: Final = 10 * SECOND
+"""Largest lag of a frame behind its sender's newest one on any link of the key.
+
+Reports that are later have no use, and duplicates are recognised for longer.
+"""
 STREAMS_MAX: Final = 4096  # streams remembered per link
 LATEST: Final = (1 << 48) - 1  # largest timestamp of 48 bits
 FOLLOWED_MAX: Final = LATEST - 3650 * 24 * 60 * MINUTE
@@ -117,6 +122,26 @@ class State:
 START: Final = State()  # nothing received and nothing sent
 
 
+class Senders:
+    """Newest timestamp of each sender, over any link of one key and any link of the sender."""
+
+    def __init__(self) -> None:
+        self._newest: dict[tuple[int, int], int] = {}  # by system id and component id
+
+    def note(self, stream: Stream, stamp: int) -> bool:
+        """Note an accepted timestamp; return False if it is too far behind the newest one."""
+        sender = stream[:2]
+        newest = self._newest.get(sender, stamp)
+        self._newest[sender] = max(newest, stamp)
+        return stamp >= newest - BEHIND_MAX
+
+    def note_all(self, state: State) -> None:
+        """Note the received streams of an earlier run."""
+        for stream, (newest, lead) in state.streams.items():
+            if lead is not None:
+                self.note(stream, newest)
+
+
 def fingerprint(key: bytes) -> str:
     """Return eight hex digits that identify a key and do not reveal it."""
     return sha256(sha256(key).digest()).hexdigest()[:8]
@@ -130,12 +155,19 @@ class LinkSigning:
     allow_unsigned  accept frames without a signature, including MAVLink 1; signatures must still
                     be valid
     state           the state of an earlier run
+    senders         newest timestamp of each sender, which all links with this key share
 
     Raises ``UserError`` for a key of another length, ``ValueError`` for another link id.
     """
 
     def __init__(
-        self, *, key: bytes, link_id: int, allow_unsigned: bool = False, state: State = START
+        self,
+        *,
+        key: bytes,
+        link_id: int,
+        allow_unsigned: bool = False,
+        state: State = START,
+        senders: Senders | None = None,
     ) -> None:
         if len(key) != KEY_BYTES:
             raise UserError(f"signing key has {len(key)} bytes; give {KEY_BYTES}")
@@ -149,6 +181,8 @@ class LinkSigning:
         self._sent = state.sent
         self._floor = state.floor
         self._streams = dict(state.streams)
+        self._senders = Senders() if senders is None else senders
+        self._senders.note_all(state)
 
     def refusal(self, frame: Frame) -> Reason | None:
         """Return the rejection of a frame: UNSIGNED, BAD_SIGNATURE, REPLAYED; None to accept it.
@@ -166,6 +200,8 @@ class LinkSigning:
         stream = (raw[5], raw[6], raw[-13])
         heard = self._streams.get(stream)
         if stamp <= (heard[0] if heard else self._too_old(clock)):
+            return Reason.REPLAYED
+        if not self._senders.note(stream, stamp):
             return Reason.REPLAYED
         self._remember(stream, (stamp, stamp - clock))
         self._local = max(self._local, min(stamp, FOLLOWED_MAX))

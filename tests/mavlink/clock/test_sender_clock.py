@@ -451,6 +451,20 @@ def test_reboot_resets_the_clock() -> None:
     assert known(clock).offset_ns == pytest.approx(EPOCH_NS + 15 * S, abs=MS)
 
 
+def test_timesync_request_of_the_boot_before_is_not_used() -> None:
+    """Its answer may have been on the way for seconds, with a boot time of about as much."""
+    clock = fed([(EPOCH_NS + n * 100 * MS, 105_000 + n * 100) for n in range(100)])
+    for n in range(20):
+        clock.observe(EPOCH_NS + (15_000 + n * 100) * MS, n * 100)
+    before = EPOCH_NS + 14_999 * MS
+    assert clock.timesync(before, before + 2_100 * MS, 4 * S) == (
+        "request was sent before the sender's clock was restarted"
+    )
+    assert known(clock).kind is ClockKind.ENVELOPE
+    assert clock.timesync(EPOCH_NS + 15_000 * MS, EPOCH_NS + 15_010 * MS, 5 * MS) is None
+    assert known(clock).kind is ClockKind.TIMESYNC
+
+
 def test_timesync_past_the_wrap() -> None:
     """The remote clock does not wrap; a node that starts later knows only its 32 bits."""
     wrap_ns = (1 << 32) * MS

@@ -195,6 +195,21 @@ def test_new_link_or_key_starts_fresh_and_keeps_the_old_one(path: Path) -> None:
     assert known == 3
 
 
+def test_links_with_one_key_share_the_newest_timestamps_of_senders(path: Path) -> None:
+    """Also with a link of an earlier run; another key has its own."""
+    timestamps = Timestamps(path)
+    one, other = (timestamps.guard(url, KEY, 0, NOW_NS) for url in (URL, "tcp:h:1"))
+    apart = timestamps.guard("tcp:h:2", OTHER_KEY, 0, NOW_NS)
+    assert one.refusal(sent(NOW_NS)) is None
+    behind_ns = NOW_NS - 11 * S
+    assert other.refusal(sent(behind_ns)) is Reason.REPLAYED
+    assert apart.refusal(sent(behind_ns, OTHER_KEY)) is None
+    timestamps.close(NOW_NS)
+    later = Timestamps(path)
+    assert later.guard("tcp:h:3", KEY, 0, NOW_NS).refusal(sent(behind_ns)) is Reason.REPLAYED
+    later.close(NOW_NS)
+
+
 def test_signing_settings_are_passed_to_each_link(path: Path) -> None:
     timestamps = Timestamps(path)
     strict = timestamps.guard(URL, KEY, 7, NOW_NS)

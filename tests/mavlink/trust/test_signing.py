@@ -16,6 +16,7 @@ from companion.mavlink.trust.signing import (
     LATEST,
     STREAMS_MAX,
     LinkSigning,
+    Senders,
     State,
     fingerprint,
 )
@@ -229,7 +230,7 @@ def test_new_stream_may_be_at_most_one_minute_behind_own_clock() -> None:
 def test_new_stream_may_be_at_most_one_minute_behind_accepted_frames() -> None:
     ours = guard()
     assert ours.refusal(sent(NOW + 100 * UNITS)) is None
-    newcomer = (1, 1, 1)  # the same sender over another link id
+    newcomer = (2, 1, 0)
     assert ours.refusal(sent(NOW + 40 * UNITS - 1, stream=newcomer)) is Reason.REPLAYED
     assert ours.refusal(sent(NOW + 40 * UNITS, stream=newcomer)) is None
 
@@ -266,6 +267,23 @@ def test_each_link_accepts_the_same_frame_once() -> None:
     for n in range(3):
         assert [link.refusal(sent(NOW + n)) for link in (a, b)] == [None, None]
         assert [link.refusal(sent(NOW + n)) for link in (a, b)] == [Reason.REPLAYED] * 2
+
+
+@pytest.mark.parametrize("link_id", [0, 1])
+def test_frame_far_behind_its_sender_is_no_frame_of_another_link(link_id: int) -> None:
+    """One that was received on a link must not move the sender back in time on another one.
+
+    Nor may one that the sender sent over another of its own links, which nobody received.
+    """
+    senders = Senders()
+    a, b = guard(senders=senders), guard(link_id=1, senders=senders)
+    assert a.refusal(sent(NOW)) is None
+    behind = (1, 1, link_id)
+    assert b.refusal(sent(NOW - 10 * UNITS - 1, stream=behind)) is Reason.REPLAYED
+    assert b.refusal(sent(NOW - 10 * UNITS, stream=behind)) is None
+    assert b.refusal(sent(NOW - 10 * UNITS - 1, stream=(2, 1, 0))) is None  # another sender
+    assert a.refusal(sent(NOW + 5 * UNITS)) is None
+    assert b.refusal(sent(NOW - 6 * UNITS, stream=behind)) is Reason.REPLAYED  # falls behind
 
 
 def test_own_signed_frames_are_rejected_as_replayed() -> None:
@@ -360,7 +378,13 @@ def test_evicted_streams_stay_rejected() -> None:
 
 STREAMS = st.tuples(st.integers(1, 3), st.just(1), st.integers(0, 1))
 STAMPS = st.integers(-70, 70).map(lambda s: NOW + s * UNITS) | st.integers(NOW - 3, NOW + 3)
-HEARD = st.tuples(st.just("hear"), STREAMS, STAMPS, st.sampled_from([KEY, KEY, KEY, OTHER_KEY]))
+HEARD = st.tuples(
+    st.just("hear"),
+    st.integers(0, 1),  # link
+    STREAMS,
+    STAMPS,
+    st.sampled_from([KEY, KEY, KEY, OTHER_KEY]),
+)
 SEQUENCES = st.lists(
     HEARD
     | st.tuples(st.just("wait"), st.integers(0, 40))
@@ -373,8 +397,10 @@ SEQUENCES = st.lists(
 @settings(max_examples=examples(300))
 @given(SEQUENCES)
 def test_timestamp_rules_match_brute_force(sequence: list[tuple]) -> None:  # type: ignore[type-arg]
-    ours, now_ns = guard(), NOW_NS
-    taken: list[tuple[tuple[int, int, int], int]] = []
+    now_ns, senders = NOW_NS, Senders()
+    links = [guard(senders=senders), guard(link_id=8, senders=senders)]
+    ours = links[0]
+    heard: list[tuple[int, tuple[int, int, int], int]] = []
     our_stamps = [-1]
     for step in sequence:
         match step:
@@ -385,20 +411,25 @@ def test_timestamp_rules_match_brute_force(sequence: list[tuple]) -> None:  # ty
             case ("send",):
                 raw = ours.sign(encode.pack(encode.heartbeat(OURS), 0), now_ns)
                 our_stamps.append(stamp_of(raw))
-                newest = max([our_stamps[-2], *(stamp for _, stamp in taken)])
+                newest = max([our_stamps[-2], *(stamp for on, _, stamp in heard if on == 0)])
                 assert our_stamps[-1] == max(units(now_ns), newest + 1)
-            case "hear", stream, stamp, key:
+            case "hear", link, stream, stamp, key:
+                taken = [(other, newest) for on, other, newest in heard if on == link]
                 of_stream = [newest for other, newest in taken if other == stream]
+                of_sender = [newest for _, other, newest in heard if other[:2] == stream[:2]]
                 local = max([units(now_ns), *(newest for _, newest in taken)])
                 if key is not KEY:
                     due = Reason.BAD_SIGNATURE
+                elif stamp < max(of_sender, default=0) - 10 * UNITS:
+                    due = Reason.REPLAYED
                 elif of_stream:
                     due = None if stamp > max(of_stream) else Reason.REPLAYED
                 else:
                     due = None if local - stamp <= 60 * UNITS else Reason.REPLAYED
-                assert ours.refusal(sent(stamp, stream=stream, key=key, t_ns=now_ns)) is due
+                frame = sent(stamp, stream=stream, key=key, t_ns=now_ns)
+                assert links[link].refusal(frame) is due
                 if due is None:
-                    taken.append((stream, stamp))
+                    heard.append((link, stream, stamp))
 
 
 # --- crashes ------------------------------------------------------------------------------------

@@ -53,11 +53,11 @@ def channels(measured: Path, out: Path, config: Path | None) -> None:
     from companion.beams.hardware import measured as measuring
     from companion.beams.hardware import phaser_pickles
     from companion.pipeline import assembly
-    from companion.settings.files import load
+    from companion.settings.files import load, read_file
 
     if measured.is_dir():
         kept = [measured / f"{name}_cal_val.pkl" for name in ("phase", "gain")]
-        found = phaser_pickles.calibration(*(path.read_bytes() for path in kept))
+        found = phaser_pickles.calibration(*(read_file(path) for path in kept))
         out.write_text(measuring.as_text(found), encoding="utf-8")
         click.echo(f"{out}: {len(found.order)} channels; their errors are unknown")
         return
@@ -66,7 +66,7 @@ def channels(measured: Path, out: Path, config: Path | None) -> None:
     before = assembly.calibration(settings, array.size)
     order = range(array.size) if before is None else before.order
     try:
-        text = measured.read_text(encoding="utf-8")
+        text = read_file(measured).decode()
     except UnicodeDecodeError as error:
         raise UserError(f"{measured}: not UTF-8 text") from error
     fit = measuring.fitted(measuring.parse_responses(text), array, order)

@@ -31,7 +31,7 @@ def load(path: Path | None) -> Settings:
     if path is None:
         return Settings()
     try:
-        text = _read(path).decode()
+        text = read_file(path).decode()
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -161,16 +161,19 @@ def _where(settings: Settings, file: NamedFile) -> str:
 
 def _bytes(key: str, name: str) -> bytes:
     try:
-        return _read(Path(name))
+        return read_file(Path(name))
     except OSError as error:
         raise ConfigError(f"{key} = {name!r}: {error.strerror}") from error
 
 
-def _read(path: Path) -> bytes:
+def read_file(path: Path) -> bytes:
+    """Return the content of a file. Raises ``OSError``, also for a pipe, which could block."""
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise OSError(errno.EINVAL, "not a file", str(path))
     with path.open("rb") as file:
         data = file.read(LARGEST_BYTES + 1)
     if len(data) > LARGEST_BYTES:
-        raise OSError(errno.EFBIG, f"larger than {LARGEST_BYTES >> 20} MiB")
+        raise OSError(errno.EFBIG, f"larger than {LARGEST_BYTES >> 20} MiB", str(path))
     return data
 
 

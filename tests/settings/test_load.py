@@ -1,5 +1,6 @@
 """Settings: accepted values, rejected values, and their error messages."""
 
+import os
 import re
 import time
 import tomllib
@@ -428,6 +429,16 @@ def test_element_positions_are_read_into_the_settings(
     assert found.array.positions_m == tuple(map(tuple, rows))
     assert Settings.from_toml(found.to_toml(), "again") == found
     assert assembly.array(found).elements_m == pytest.approx(np.array(rows))
+
+
+def test_pipe_in_place_of_settings_is_not_opened(tmp_path: Path) -> None:
+    """It would be waited for without end, and silently. Nor is one that the settings name."""
+    pipe, good = tmp_path / "pipe", tmp_path / "good.toml"
+    os.mkfifo(pipe)
+    good.write_text(f'[array]\nkind = "list"\npositions = "{pipe}"\n')
+    for path in (pipe, good):
+        with pytest.raises(ConfigError, match=r"pipe'?: not a file$"):
+            load(path)
 
 
 @pytest.mark.parametrize(

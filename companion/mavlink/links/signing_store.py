@@ -37,6 +37,8 @@ def load_key(path: Path) -> bytes:
     Planner and MAVProxy use the SHA-256 of a passphrase (``MAVAuthKeys.AddKey``, UTF-8;
     ``passphrase_to_key`` of the module ``signing``, ASCII).
     """
+    if path.exists() and not (path.is_file() or path.is_dir()):
+        raise LinkError(f"{path}: cannot read the signing key: not a file")  # a pipe could block
     try:
         with path.open("rb") as file:
             data = file.read(_READ_MAX)

@@ -107,6 +107,13 @@ def test_invalid_key_file_is_rejected_without_leaking_it(tmp_path: Path, data: b
     assert KEY.hex()[2:60] not in text
 
 
+def test_pipe_in_place_of_a_key_is_not_opened(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "key")
+    with pytest.raises(LinkError) as error:
+        load_key(tmp_path / "key")
+    assert one_line(error, tmp_path / "key").endswith("not a file")
+
+
 @pytest.mark.parametrize("name", ["missing", "."])
 def test_unreadable_key_file_is_reported(tmp_path: Path, name: str) -> None:
     with pytest.raises(LinkError, match="cannot read") as error:

@@ -30,6 +30,12 @@ RATE_WINDOW_S: Final = 2.0  # time over which frames and updates per second are 
 NOTICES_KEPT: Final = 200
 STREAM_TAKES_BYTES: Final = 1024  # largest message accepted from a WebSocket client
 BACKLOG: Final = 512  # connections that wait to be accepted; one beyond it is repeated after 1 s
+ACCEPTS: Final = 16
+"""Connections accepted in one iteration of the event loop.
+
+uvloop accepts one for each listening descriptor. New connections would wait, first come, first
+served, behind all others and their answers, before anything is known of what they request.
+"""
 CLOSE_TIMEOUT_S: Final = 2
 """Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
 
@@ -67,7 +73,7 @@ class Server(uvicorn.Server):
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Start to accept requests; see ``uvicorn.Server.startup``."""
-        await super().startup(sockets)
+        await super().startup(sockets and [one.dup() for one in sockets for _ in range(ACCEPTS)])
         self._answering.set()
 
     @contextlib.contextmanager

@@ -13,7 +13,7 @@ from uvicorn.protocols.http.flow_control import FlowControl
 from uvicorn.protocols.http.httptools_impl import HttpToolsProtocol
 
 from companion.mavlink.links.descriptors import share
-from companion.server.request_queue import RequestQueue
+from companion.server.request_queue import Rank, RequestQueue
 from companion.values.budget import Budget
 
 HEAD_BYTES: Final = 16_384
@@ -36,8 +36,8 @@ REQUESTS_PER_S: Final = 50.0  # requests of a connection that are started before
 REQUESTS_SAVED: Final = 200.0
 SETTLED_S: Final = 2.0
 """Time for a new connection's request, and for an answer, before it makes room for another."""
-USUAL_PATHS: Final = frozenset({"/healthz", "/v1/beams", "/v1/beams/weights"})
-"""Paths whose answer of the moment is made once; without a query they are started first."""
+RANKS: Final = {"/healthz": Rank.HEALTH, "/v1/beams": Rank.BEAMS, "/v1/beams/weights": Rank.BEAMS}
+"""Ranks of paths without a query; all others have the last one."""
 CONNECTIONS_MAX: Final = 512
 DESCRIPTORS: Final = 0.5  # ratio of the descriptors that connections may take
 
@@ -230,9 +230,8 @@ class BoundedProtocol(HttpToolsProtocol):
                 super(BoundedProtocol, self)._start_asgi_task(cycle, until_closed)
 
         path, query = cycle.scope["path"], cycle.scope["query_string"]
-        self._queue.add(
-            start, within_budget=not self._over_budget, is_usual=path in USUAL_PATHS and not query
-        )
+        rank = Rank.OTHER if query else RANKS.get(path, Rank.OTHER)
+        self._queue.add(start, within_budget=not self._over_budget, rank=rank)
 
     # --- waiting ------------------------------------------------------------------------------
 

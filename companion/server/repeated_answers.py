@@ -15,7 +15,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from companion.server.moments import moment_of
 from companion.views.state import Node
 
-OF_A_MOMENT: Final = frozenset({"/v1/beams", "/v1/beams/weights", "/v1/uavs"})
+OF_A_MOMENT: Final = frozenset({"/metrics", "/v1/beams", "/v1/beams/weights", "/v1/uavs"})
 """Paths whose answers are kept until the moment ends."""
 KEPT: Final = 64  # answers of one moment that are kept: leads and formats differ between clients
 _VARYING: Final = frozenset({b"accept", b"accept-encoding"})

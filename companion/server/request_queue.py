@@ -8,11 +8,15 @@ threads that compute beams: each waits for the interpreter some hundred times.
 import asyncio
 from collections import deque
 from collections.abc import Callable
+from enum import IntEnum
+from itertools import count
 from typing import Final
 
 from companion.values.budget import Budget
 
 AT_ONCE: Final = 4  # requests started in one iteration of the event loop
+LONG_S: Final = 0.01
+"""Time of an iteration after which the next one starts a single request, seconds."""
 REQUESTS_PER_S: Final = 500.0  # requests of all connections, before those over a budget
 REQUESTS_SAVED: Final = 1000.0
 BESIDE_WORK_S: Final = 0.005
@@ -22,24 +26,36 @@ STREAMS_SAVED: Final = 20.0
 LOOK_AGAIN_S: Final = 0.001
 """Time between two checks whether the threads still compute, seconds."""
 
+
+class Rank(IntEnum):
+    """Order in which requests within their budgets are started."""
+
+    HEALTH = 0  # costs least, and monitors judge the service by it
+    BEAMS = 1  # of the moment: many programs repeat them, and the answer is made once
+    OTHER = 2
+
+
 Start = Callable[[], None]
 IsWanted = Callable[[], bool]
+Waiting = deque[tuple[int, Start]]
+"""Requests that wait, each with its number in the order of arrival."""
 
 
 class RequestQueue:
     """Requests of all connections that are not started yet.
 
-    Requests within the budget of their connection, and of all connections together, are started
-    first; of these, requests that many programs repeat and that cost least, such as for health and
-    beams. The others wait for threads that compute: ``is_busy`` says whether one does.
+    Up to ``REQUESTS_PER_S``, requests within the budget of their connection are started first, in
+    the order of their ``Rank``. Beyond it all wait for threads that compute, and the oldest is
+    started first: ``is_busy`` says whether a thread computes.
     """
 
     def __init__(self, is_busy: Callable[[], bool]) -> None:
         self._is_busy = is_busy
         self._budget = Budget(per_s=REQUESTS_PER_S, most=REQUESTS_SAVED)
-        self._usual: deque[Start] = deque()
-        self._prompt: deque[Start] = deque()
-        self._late: deque[Start] = deque()
+        self._added = count()
+        self._ready: dict[Rank, Waiting] = {rank: deque() for rank in Rank}
+        self._late: Waiting = deque()  # over the budget of their connection
+        self._began_s = 0.0  # time of the last iteration that started requests
         self._late_from_s = 0.0  # no request over a budget starts before this time
         self._wakes: asyncio.Handle | None = None
         self._streams: deque[tuple[Start, IsWanted]] = deque()
@@ -63,37 +79,44 @@ class RequestQueue:
             if is_wanted():
                 start()
 
-    def add(self, start: Start, *, within_budget: bool, is_usual: bool = False) -> None:
+    def add(self, start: Start, *, within_budget: bool, rank: Rank = Rank.OTHER) -> None:
         """Start a request in an iteration to come. ``start`` must not raise."""
-        if within_budget and self._budget.spend(1, asyncio.get_running_loop().time()):
-            (self._usual if is_usual else self._prompt).append(start)
-        else:
-            self._late.append(start)
+        waiting = self._ready[rank] if within_budget else self._late
+        waiting.append((next(self._added), start))
         self._schedule()
 
     def _start_some(self) -> None:
         self._wakes = None
-        left = AT_ONCE
-        for waiting in (self._usual, self._prompt):
-            while left and waiting:
-                waiting.popleft()()
-                left -= 1
-        while left and self._late and self._may_start_late():
-            if self._is_busy():
-                self._late_from_s = asyncio.get_running_loop().time() + BESIDE_WORK_S
-            self._late.popleft()()
+        now_s = asyncio.get_running_loop().time()
+        left = AT_ONCE if now_s - self._began_s <= LONG_S else 1
+        self._began_s = now_s
+        while left and (start := self._next(now_s)) is not None:
+            start()
             left -= 1
         self._schedule()
 
-    def _may_start_late(self) -> bool:
-        return not self._is_busy() or asyncio.get_running_loop().time() >= self._late_from_s
+    def _next(self, now_s: float) -> Start | None:
+        """Return the request that is due; None if all must wait."""
+        waiting = [one for one in (*self._ready.values(), self._late) if one]
+        if waiting and waiting[0] is not self._late and self._budget.spend(1, now_s):
+            return waiting[0].popleft()[1]
+        if not waiting or not self._may_start_late(now_s):
+            return None
+        if self._is_busy():
+            self._late_from_s = now_s + BESIDE_WORK_S
+        return min(waiting, key=lambda one: one[0][0]).popleft()[1]
+
+    def _may_start_late(self, now_s: float) -> bool:
+        return not self._is_busy() or now_s >= self._late_from_s
 
     def _schedule(self) -> None:
         """Continue in the next iteration if a request may start, else look again soon."""
         loop = asyncio.get_running_loop()
-        if self._usual or self._prompt or (self._late and self._may_start_late()):
+        is_ready, now_s = any(self._ready.values()), loop.time()
+        is_late = is_ready or bool(self._late)
+        if (is_ready and self._budget.has(1, now_s)) or (is_late and self._may_start_late(now_s)):
             if self._wakes is not None:
                 self._wakes.cancel()
             self._wakes = loop.call_soon(self._start_some)
-        elif self._late and self._wakes is None:
+        elif is_late and self._wakes is None:
             self._wakes = loop.call_later(LOOK_AGAIN_S, self._start_some)

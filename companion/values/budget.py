@@ -30,6 +30,11 @@ class Budget:
         self.left -= amount
         return True
 
+    def has(self, amount: float, now_s: float) -> bool:
+        """Return whether ``amount`` units are left."""
+        self.spend(0.0, now_s)
+        return amount <= self.left
+
     def charge(self, amount: float) -> None:
         """Use units that were needed, also if fewer were left: the source then waits for them."""
         self.left -= amount

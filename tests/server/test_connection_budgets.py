@@ -3,6 +3,8 @@
 import asyncio
 import contextlib
 import os
+import socket
+import time
 from collections.abc import Callable
 from functools import partial
 from socket import SO_RCVBUF, SOL_SOCKET
@@ -26,7 +28,7 @@ from companion.server import (
     websocket_connections,
 )
 from companion.server.app import create_app
-from companion.server.request_queue import AT_ONCE, RequestQueue
+from companion.server.request_queue import AT_ONCE, Rank, RequestQueue
 from companion.values import Severity
 from companion.values.budget import Budget
 
@@ -193,20 +195,101 @@ def test_requests_over_a_budget_wait_for_others_and_for_threads() -> None:
         count()
         for _ in range(10):
             queue.add(start("late"), within_budget=False)
-        for _ in range(18):
+        for _ in range(17):
             queue.add(start("prompt"), within_budget=True)
         for _ in range(2):
-            queue.add(start("usual"), within_budget=True, is_usual=True)
+            queue.add(start("beams"), within_budget=True, rank=Rank.BEAMS)
+        queue.add(start("health"), within_budget=True, rank=Rank.HEALTH)
         await asyncio.sleep(0)
         while len(started) < 22:  # one at a time while threads compute
             await asyncio.sleep(0)
-        assert started[:20] == ["usual"] * 2 + ["prompt"] * 18
+        assert len(started) == 22
+        assert started[:20] == ["health"] + ["beams"] * 2 + ["prompt"] * 17
         assert iteration[0] >= 20 / AT_ONCE
         busy = False
         await done.wait()
         assert started[20:] == ["late"] * 10
 
     run_async(queued())
+
+
+def test_oldest_request_is_started_first_beyond_the_budget_of_all(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Requests that many programs repeat must not keep all others waiting."""
+    monkeypatch.setattr(request_queue, "REQUESTS_SAVED", 3.0)
+    monkeypatch.setattr(request_queue, "REQUESTS_PER_S", 0.0)
+
+    async def queued() -> None:
+        queue, started = RequestQueue(lambda: False), list[str]()
+        for n in range(3):
+            queue.add(partial(started.append, f"other {n}"), within_budget=True)
+            queue.add(partial(started.append, f"late {n}"), within_budget=False)
+            for m in range(2):
+                health = partial(started.append, f"health {2 * n + m}")
+                queue.add(health, within_budget=True, rank=Rank.HEALTH)
+        while len(started) < 12:
+            await asyncio.sleep(0)
+        assert started == [
+            "health 0", "health 1", "health 2", "other 0", "late 0", "other 1", "late 1",
+            "health 3", "other 2", "late 2", "health 4", "health 5",
+        ]  # fmt: skip
+
+    run_async(queued())
+
+
+def test_iteration_after_a_long_one_starts_a_single_request(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(request_queue, "LONG_S", 0.05)
+
+    async def queued() -> None:
+        queue, started, at_once = RequestQueue(lambda: False), list[int](), list[int]()
+
+        def start(number: int) -> None:
+            started.append(number)
+            if number == 7:
+                time.sleep(0.06)
+
+        for number in range(16):
+            queue.add(partial(start, number), within_budget=True)
+        while len(started) < 16:
+            before = len(started)
+            await asyncio.sleep(0)
+            at_once.append(len(started) - before)
+        assert 1 in [count for count in at_once if count]
+
+    run_async(queued())
+
+
+@pytest.mark.parametrize("loop", LOOPS, ids=["asyncio", "uvloop"])
+def test_health_is_answered_before_requests_over_connections_that_wait(
+    make_node: Any, loop: Any
+) -> None:
+    """Each client opens a connection for a request: the monitor's is accepted after theirs."""
+
+    def asking(port: int, path: str) -> socket.socket:
+        client = socket.create_connection(("127.0.0.1", port), HANG_S)
+        client.sendall(get(path))
+        client.setblocking(False)
+        return client
+
+    async def burst() -> None:
+        async with served(make_node(flown=False)) as port:
+            paths = ["/v1/status"] * 100 + ["/healthz"]
+            with contextlib.ExitStack() as opened:
+                clients = [opened.enter_context(asking(port, path)) for path in paths]
+                answered = list[int]()
+
+                async def answer(number: int) -> None:
+                    await asyncio.get_running_loop().sock_recv(clients[number], 64)
+                    answered.append(number)
+
+                waiting = asyncio.gather(*(answer(number) for number in range(len(paths))))
+                await asyncio.wait_for(waiting, HANG_S)
+            assert answered.index(100) < 60
+
+    run_async(burst(), loop)
 
 
 def test_streams_are_opened_at_a_limited_rate_unless_their_clients_have_left() -> None:

@@ -71,7 +71,7 @@ class LargeAnswers:
 
         async def work() -> T:
             async with self._work_slots.slot(is_long=True):
-                return await in_thread(prepare(), GivingWay(self._makes_beams))
+                return await in_thread(prepare(), self._way())
 
         return await self._shared.run(what, work)
 
@@ -85,7 +85,7 @@ class LargeAnswers:
         async def work() -> T:
             async with self._work_slots.slot(is_long=True):
                 make = prepare(await self._overview())
-                return await in_thread(make, GivingWay(self._makes_beams))
+                return await in_thread(make, self._way())
 
         return await self._shared.run(what, work)
 
@@ -95,6 +95,9 @@ class LargeAnswers:
         return await self.of_uavs(
             ("uavs", is_rounded), lambda overview: partial(_parts, overview, utc_ns, show=show)
         )
+
+    def _way(self) -> GivingWay:
+        return GivingWay(self._makes_beams, is_overloaded=self._work_slots.is_overloaded())
 
     def _makes_beams(self) -> bool:
         return self._node.pipeline.aiming is not None

@@ -21,6 +21,7 @@ event loop to the system waits a millisecond for it, so that few frames are read
 """
 REST_SHARED: Final = 1.0  # the same after work whose answer all clients get, without overload
 REST_MAX_S: Final = 1.0  # longest rest: answers about thousands of UAVs follow one another
+OVERLOADED_REST_MAX_S: Final = 5.0  # the same while the links need more of the time
 RESTS_FROM_S: Final = 0.02  # shorter work needs no rest: a few UAVs take some milliseconds
 WAITING: Final = 64  # requests that wait for a slot; one second of work
 SHARED_WAITING: Final = 16  # answers for all that wait for the slot of their own
@@ -107,8 +108,9 @@ class WorkSlots:
             slots.room += 1
 
     def _rest_s(self, worked_s: float, *, is_shared: bool) -> float:
-        rest = REST_SHARED if is_shared and not self.is_overloaded() else REST
-        return min(REST_MAX_S, rest * worked_s)
+        if self.is_overloaded():
+            return min(OVERLOADED_REST_MAX_S, REST * worked_s)
+        return min(REST_MAX_S, (REST_SHARED if is_shared else REST) * worked_s)
 
     async def run(self, work: Callable[[], T], *, is_shared: bool = False) -> T:
         """Run work on another thread when a slot is free. Raises ``HTTPException`` 503."""

@@ -22,6 +22,8 @@ SET_NS: Final = 1_000_000  # least step of the wall clock that matters
 _BOOTTIME: Final[int] = getattr(time, "CLOCK_BOOTTIME", time.CLOCK_MONOTONIC)
 """Linux's clock that continues during suspend; on other systems, one that stops."""
 _TIMESPEC: Final = struct.Struct("@ll")
+_HEAD: Final = struct.Struct("@Nii")  # struct cmsghdr: length, level, type
+_STAMP_AT: Final[int] = socket.CMSG_LEN(0)
 ANCILLARY_BYTES: Final[int] = socket.CMSG_SPACE(_TIMESPEC.size)
 """Buffer size that ``recvmsg`` needs for the stamp."""
 
@@ -50,6 +52,15 @@ def stamp_ns(ancillary: Ancillary) -> int | None:
             seconds, ns = _TIMESPEC.unpack_from(data)
             return int(seconds * 1_000_000_000 + ns)
     return None
+
+
+def stamp_in(control: bytearray) -> int | None:
+    """Return the stamp in the buffer of a single control message, as ``stamp_ns``."""
+    _, level, kind = _HEAD.unpack_from(control)
+    if kind != SO_TIMESTAMPNS or level != socket.SOL_SOCKET:
+        return None
+    seconds, ns = _TIMESPEC.unpack_from(control, _STAMP_AT)
+    return int(seconds * 1_000_000_000 + ns)
 
 
 def since_boot_ns() -> int:

@@ -16,7 +16,7 @@ from collections.abc import Collection, Hashable, Iterator
 from dataclasses import dataclass, replace
 from typing import Final, cast
 
-from companion.mavlink.links import kernel_time
+from companion.mavlink.links import datagrams, kernel_time
 from companion.mavlink.links.endpoints import Address, Upcalls, bound, resolved, settle
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.to_loop import SLICE_S
@@ -34,7 +34,6 @@ STALE_NS: Final = 2_000_000_000
 """Age at which a datagram is discarded: a busy machine then processes new data, not a backlog."""
 READ_AT_ONCE: Final = 32
 """Most datagrams read before other work runs, as in libuv; ``SLICE_S`` limits them too."""
-DATAGRAM_BYTES: Final = 1 << 16  # more than any datagram has
 WAITING_PEERS_MAX: Final = 64  # peers whose datagrams wait; with more, nothing is read
 WAITING_MAX_BYTES: Final = 1 << 18  # bytes of a peer that wait; datagrams beyond it are dropped
 
@@ -215,6 +214,7 @@ class _Datagrams:
         self, *, sock: socket.socket, status: LinkStatus, upcalls: Upcalls, connected: bool
     ) -> None:
         self._socket = sock
+        self._next = datagrams.reader(sock)
         self._status = status
         self._upcalls = upcalls
         self._connected = connected
@@ -268,16 +268,14 @@ class _Datagrams:
             if time.thread_time() > until_s:
                 return
             try:
-                data, ancillary, _, address = self._socket.recvmsg(
-                    DATAGRAM_BYTES, kernel_time.ANCILLARY_BYTES
-                )
+                data, stamp_ns, address = self._next()
             except (BlockingIOError, InterruptedError):
                 self._wall_clock.note()
                 return
             except OSError as error:
                 self._note_error(error)
                 return
-            age_ns = self._age_ns(ancillary, was_set)
+            age_ns = self._age_ns(stamp_ns, was_set)
             if age_ns is not None and age_ns > STALE_NS:
                 self._stale += 1
                 continue
@@ -334,9 +332,8 @@ class _Datagrams:
         if self._waiting:
             self._continue_soon()
 
-    def _age_ns(self, ancillary: kernel_time.Ancillary, was_set: bool) -> int | None:
+    def _age_ns(self, stamp_ns: int | None, was_set: bool) -> int | None:
         """Return how long a datagram has waited, ns; None without a valid time stamp."""
-        stamp_ns = kernel_time.stamp_ns(ancillary)
         if stamp_ns is None:
             self._status.arrival = "read"
             return None

@@ -28,6 +28,7 @@ from companion.server import (
     access,
     byte_ranges,
     connections,
+    giving_way,
     held_bodies,
     observation_routes,
     playback,
@@ -80,8 +81,9 @@ LOOP: Final = (
     f"{request_queue.AT_ONCE} started in an iteration; less than 2 ms each on the event loop"
 )
 SLOTS: Final = (
-    f"{work_slots.AT_ONCE} at a time on threads, {work_slots.WAITING} waiting; after more than"
-    f" {1e3 * work_slots.RESTS_FROM_S:.0f} ms a rest of {work_slots.REST:g} times as long, at most {work_slots.REST_MAX_S:g} s"
+    f"{work_slots.AT_ONCE} at a time on threads, in turns of {1e3 * giving_way.TURN_S:.0f} ms,"
+    f" {work_slots.WAITING} waiting; after more than"
+    f" {1e3 * work_slots.RESTS_FROM_S:.0f} ms a rest of {work_slots.REST:g} times as long, at most {work_slots.REST_MAX_S:g} s, or {work_slots.OVERLOADED_REST_MAX_S:g} s while the machine is overloaded"
 )
 BUDGET: Final = (
     f"{observations.OBSERVATIONS_PER_S:.0f} observations/s,"

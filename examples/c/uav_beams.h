@@ -44,7 +44,7 @@ struct uavb_header {
 };
 
 struct uavb_beam {
-    char uav[72];
+    char uav[72]; /* ends with at least one 0 */
     uint32_t group, flags;
     double azimuth_rad, elevation_rad, azimuth_rate_radps, elevation_rate_radps;
     double range_m, pointing_bound_rad, gain_db, guaranteed_gain_db;
@@ -77,6 +77,7 @@ static inline int uavb_parse(const void *bytes, size_t size, struct uavb_record 
 {
     const struct uavb_header *h = (const struct uavb_header *)bytes;
     uint64_t beams_end, weights_end;
+    uint32_t n;
     if (size < sizeof *h)
         return UAVB_SHORT;
     if (memcmp(h->magic, "UAVBEAMS", 8) != 0)
@@ -92,6 +93,12 @@ static inline int uavb_parse(const void *bytes, size_t size, struct uavb_record 
         beams_end > h->weights_at || weights_end > h->bytes ||
         uavb_crc32((const unsigned char *)bytes + 20, h->bytes - 20) != h->crc32)
         return UAVB_DAMAGED;
+    for (n = 0; n < h->beams; n++) {
+        const void *at = (const char *)bytes + h->beams_at + (size_t)n * h->beam_bytes;
+        const struct uavb_beam *beam = (const struct uavb_beam *)at;
+        if (beam->uav[sizeof beam->uav - 1] != 0)
+            return UAVB_DAMAGED;
+    }
     record->header = h;
     record->bytes = (const unsigned char *)bytes;
     return UAVB_OK;

@@ -39,7 +39,7 @@ class Beams(gr.sync_block):
     def work(self, input_items, output_items):
         """Multiply the samples by the weights."""
         self._hear()
-        if time.monotonic() - self._heard_s > self._stale_s:
+        if self._is_stale():
             self._weights[:] = 0
         sent = self._weights @ np.stack(input_items)
         for m, out in enumerate(output_items):
@@ -51,6 +51,9 @@ class Beams(gr.sync_block):
         self._socket.close()
         return True
 
+    def _is_stale(self):
+        return time.monotonic() - self._heard_s > self._stale_s
+
     def _hear(self):
         while True:
             try:
@@ -60,7 +63,7 @@ class Beams(gr.sync_block):
             self._take(record)
 
     def _take(self, record):
-        """Use a record; ignore invalid ones, and those of another array."""
+        """Use a record; ignore invalid and late ones, and those of another array."""
         if len(record) < HEADER.size:
             return
         magic, version, size, crc, _, sequence, _, _, *rest = HEADER.unpack_from(record)
@@ -69,9 +72,14 @@ class Beams(gr.sync_block):
             return
         if zlib.crc32(record[20:]) != crc or elements != len(self._weights):
             return
+        if weights_at + 8 * beams * elements > size or beams_at + beams * entry > weights_at:
+            return
+        weights = np.frombuffer(record, "<c8", beams * elements, weights_at)
+        is_late = sequence < self._sequence and not self._is_stale()  # not a restarted service
+        if is_late or not np.isfinite(weights).all():
+            return
         if sequence != self._sequence:  # one update may come in several records
             self._weights[:] = 0
-        weights = np.frombuffer(record, "<c8", beams * elements, weights_at)
         for n, column in enumerate(weights.reshape(beams, elements)):
             name = record[beams_at + n * entry :][:NAME_BYTES].rstrip(b"\0")
             if name in self._uavs:

@@ -6,6 +6,7 @@ import socket
 import struct
 import subprocess
 import time
+import zlib
 from pathlib import Path
 from typing import Any
 
@@ -114,6 +115,16 @@ def test_damaged_record_is_rejected_at_every_byte(printer: Path) -> None:
     assert len(said) == 2 * len(whole)
     assert {words[0] for words in said} == {"error"}
     assert printed(printer, [whole + b"more"])[0][0] == "record"
+
+
+def test_record_whose_name_has_no_end_is_rejected(printer: Path) -> None:
+    """Its checksum is correct; a program that prints the name would read beyond it."""
+    (whole,) = records.encode(beam_set(np.random.default_rng(1), 5, 2), 3)
+    at = int(np.frombuffer(whole, records.HEADER, 1)[0]["beams_at"])
+    bad = bytearray(whole)
+    bad[at : at + records.ID_BYTES] = b"A" * records.ID_BYTES
+    bad[16:20] = struct.pack("<I", zlib.crc32(bad[records.CHECKED_FROM :]))
+    assert printed(printer, [bytes(bad)])[0][0] == "error"
 
 
 def test_large_record_is_split_into_complete_parts() -> None:

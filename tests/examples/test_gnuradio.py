@@ -2,7 +2,10 @@
 
 import shutil
 import socket
+import struct
 import subprocess
+import sys
+import zlib
 from pathlib import Path
 
 import numpy as np
@@ -110,6 +113,50 @@ def test_streams_use_the_newest_weights(python: str, tmp_path: Path, uavs: list[
         process.stdin.close()
         assert process.stdout.read() == b""
         assert process.wait(HANG_S) == 0
+
+
+def test_invalid_and_late_records_are_ignored() -> None:
+    """Also with a correct checksum. Only the block's own code runs: GNU Radio has a stand-in."""
+    weights = noise(np.random.default_rng(1), 2, 1)
+    at = records.HEADER.fields
+    assert at is not None
+
+    def changed(**values: int) -> bytes:
+        bad = bytearray(record(12, ["1:1"], weights))
+        for name, value in values.items():
+            struct.pack_into("<I", bad, at[name][1], value)
+        struct.pack_into("<I", bad, 16, zlib.crc32(bad[records.CHECKED_FROM :]))
+        return bytes(bad)
+
+    ignored = [
+        changed(weights_at=1 << 30), changed(beams=1 << 31), changed(beam_bytes=1 << 31),
+        record(12, ["1:1"], np.full((2, 1), np.nan + 0j)), record(9, ["1:1"], 2 * weights),
+    ]  # fmt: skip
+    sent = [record(10, ["1:1"], weights), *ignored, record(11, ["1:1"], 3 * weights)]
+    done = subprocess.run(
+        [sys.executable, "-c", TAKEN, str(FOLDER), *(one.hex() for one in sent)],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=HANG_S,
+    )
+    first = float(weights[0, 0].real)
+    assert [float(one) for one in done.stdout.split()] == pytest.approx(
+        [first] * 6 + [3 * first]
+    ), done.stderr
+
+
+TAKEN = """
+import sys, types
+base = type("sync_block", (), {"__init__": lambda self, *_: None})
+sys.modules["gnuradio"] = types.SimpleNamespace(gr=types.SimpleNamespace(sync_block=base))
+sys.path.insert(0, sys.argv[1])
+from uav_beams import Beams
+block = Beams(["1:1"], 2, 0)
+for one in sys.argv[2:]:
+    block._take(bytes.fromhex(one))
+    print(block._weights[0, 0].real)
+"""
 
 
 @pytest.mark.full

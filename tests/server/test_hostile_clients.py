@@ -360,6 +360,8 @@ def test_slot_rests_after_long_work_only() -> None:
     rest_s = run_async(ask(long_s, is_shared=True, is_overloaded=True))
     assert rest_s >= work_slots.REST * long_s * 0.99
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(work_slots, "REST_MAX_S", 0.0)
+        assert run_async(ask(long_s, is_overloaded=True)) >= work_slots.REST * long_s * 0.99
         patch.setattr(work_slots, "REST", 1e6)
         patch.setattr(work_slots, "REST_MAX_S", 2 * long_s)
         assert run_async(ask(long_s)) < HANG_S

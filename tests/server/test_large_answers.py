@@ -198,8 +198,24 @@ async def test_error_reaches_all_who_share_work_and_no_one_later() -> None:
 def test_thread_pauses_while_beams_are_computed(monkeypatch: pytest.MonkeyPatch) -> None:
     busy, slept = [True] * 3 + [False], list[float]()
     monkeypatch.setattr(giving_way.time, "sleep", slept.append)
+    monkeypatch.setattr(giving_way, "TURN_S", HANG_S)
     way = GivingWay(lambda: busy.pop(0) if len(busy) > 1 else busy[0])
     assert list(way.between("ab")) == ["a", "b"]
-    assert len(slept) == 3
+    assert slept == [giving_way.TURN_PAUSE_S] + [giving_way.PAUSE_S] * 3
+    slept.clear()
     GivingWay(lambda: True).pause()  # beams that never end stop no answer
-    assert len(slept) == 3 + PAUSES_MAX
+    assert slept.count(giving_way.PAUSE_S) == PAUSES_MAX
+
+
+@pytest.mark.parametrize(("is_overloaded", "longer"), [(False, 1), (True, giving_way.OVERLOADED)])
+def test_answer_is_computed_in_turns(
+    monkeypatch: pytest.MonkeyPatch, is_overloaded: bool, longer: int
+) -> None:
+    """A thread pauses after each turn, for the event loop; longer while the links are late."""
+    slept, now_s = list[float](), [0.0]
+    monkeypatch.setattr(giving_way.time, "sleep", slept.append)
+    monkeypatch.setattr(giving_way.time, "thread_time", lambda: now_s[0])
+    way = GivingWay(lambda: False, is_overloaded=is_overloaded)
+    for _ in way.between(range(100)):
+        now_s[0] += giving_way.TURN_S / 10
+    assert slept == [giving_way.TURN_PAUSE_S * longer] * 10

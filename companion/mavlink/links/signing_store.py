@@ -4,6 +4,8 @@ Without the timestamps of the last run, any recorded frame could be replayed to 
 a kill or a power loss the file lags behind: it is written every second, or every three while no
 frame is received or sent, and a write may take two more. The sum is ``signing.MARGIN``, by which
 the next run starts later. A link that was closed properly resumes where it ended.
+
+Over 300 lines: all that is kept of signing on disk.
 """
 
 import contextlib
@@ -18,7 +20,13 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from companion.mavlink.links.urls import LinkError
-from companion.mavlink.trust.signing import KEY_BYTES, LinkSigning, Senders, State, fingerprint
+from companion.mavlink.trust.signing import (
+    KEY_BYTES,
+    LinkSigning,
+    NewestTimestamps,
+    State,
+    fingerprint,
+)
 
 SAVE_NS: Final = 1_000_000_000  # shortest time between two writes
 REFRESH_NS: Final = 3_000_000_000
@@ -115,7 +123,7 @@ class Timestamps:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._guards: dict[_LinkKey, LinkSigning] = {}
-        self._senders: dict[str, Senders] = {}  # by the fingerprint of the key
+        self._senders: dict[str, NewestTimestamps] = {}  # by the fingerprint of the key
         self._number = 0
         self._snapshot_ns = 0
         self._moves = 0
@@ -131,7 +139,7 @@ class Timestamps:
             os.close(self._lock)
             raise
         for link, kept in self._kept.items():
-            self._senders.setdefault(link.key, Senders()).note_all(kept.state)
+            self._senders.setdefault(link.key, NewestTimestamps()).note_all(kept.state)
 
     def guard(
         self, url: str, key: bytes, link_id: int, now_ns: int, *, allow_unsigned: bool = False
@@ -151,7 +159,7 @@ class Timestamps:
             link_id=link_id,
             allow_unsigned=allow_unsigned,
             state=state,
-            senders=self._senders.setdefault(link.key, Senders()),
+            senders=self._senders.setdefault(link.key, NewestTimestamps()),
         )
         self._guards[link] = guard
         self.write(self.snapshot(now_ns))

@@ -122,7 +122,7 @@ class State:
 START: Final = State()  # nothing received and nothing sent
 
 
-class Senders:
+class NewestTimestamps:
     """Newest timestamp of each sender, over any link of one key and any link of the sender."""
 
     def __init__(self) -> None:
@@ -167,7 +167,7 @@ class LinkSigning:
         link_id: int,
         allow_unsigned: bool = False,
         state: State = START,
-        senders: Senders | None = None,
+        senders: NewestTimestamps | None = None,
     ) -> None:
         if len(key) != KEY_BYTES:
             raise UserError(f"signing key has {len(key)} bytes; give {KEY_BYTES}")
@@ -181,7 +181,7 @@ class LinkSigning:
         self._sent = state.sent
         self._floor = state.floor
         self._streams = dict(state.streams)
-        self._senders = Senders() if senders is None else senders
+        self._senders = NewestTimestamps() if senders is None else senders
         self._senders.note_all(state)
 
     def refusal(self, frame: Frame) -> Reason | None:

@@ -16,7 +16,7 @@ from companion.mavlink.trust.signing import (
     LATEST,
     STREAMS_MAX,
     LinkSigning,
-    Senders,
+    NewestTimestamps,
     State,
     fingerprint,
 )
@@ -275,7 +275,7 @@ def test_frame_far_behind_its_sender_is_no_frame_of_another_link(link_id: int) -
 
     Nor may one that the sender sent over another of its own links, which nobody received.
     """
-    senders = Senders()
+    senders = NewestTimestamps()
     a, b = guard(senders=senders), guard(link_id=1, senders=senders)
     assert a.refusal(sent(NOW)) is None
     behind = (1, 1, link_id)
@@ -397,7 +397,7 @@ SEQUENCES = st.lists(
 @settings(max_examples=examples(300))
 @given(SEQUENCES)
 def test_timestamp_rules_match_brute_force(sequence: list[tuple]) -> None:  # type: ignore[type-arg]
-    now_ns, senders = NOW_NS, Senders()
+    now_ns, senders = NOW_NS, NewestTimestamps()
     links = [guard(senders=senders), guard(link_id=8, senders=senders)]
     ours = links[0]
     heard: list[tuple[int, tuple[int, int, int], int]] = []

@@ -289,9 +289,12 @@ def test_largest_array_is_accepted_in_recorded_settings() -> None:
 
 
 def test_unbounded_file_is_rejected(tmp_path: Path) -> None:
-    config = tmp_path / "settings.toml"
-    config.write_text("[observer]\ndesign = '/dev/zero'\n")
-    with pytest.raises(ConfigError, match=r"/dev/zero.*larger than 16 MiB"):
-        load(config)
-    with pytest.raises(ConfigError, match="larger than 16 MiB"):
-        load(Path("/dev/zero"))
+    config, large = tmp_path / "settings.toml", tmp_path / "large"
+    with large.open("wb") as file:
+        file.truncate(1 << 40)
+    for name, why in ((large, "larger than 16 MiB"), ("/dev/zero", "not a file")):
+        config.write_text(f"[observer]\ndesign = '{name}'\n")
+        with pytest.raises(ConfigError, match=f"{name}.*{why}"):
+            load(config)
+        with pytest.raises(ConfigError, match=why):
+            load(Path(name))

@@ -3,8 +3,8 @@
 Links deliver late and out of order. A late report within the window is inserted in its place, and
 all later states are estimated again, so that the result equals that of reports in order. A report
 older than the window is not used. Nearly always a report is the newest, and costs one step. The
-number of reports is limited: a sender of thousands a second, out of order, would cost as many
-steps for each.
+number of reports is limited: a sender of a thousand reports a second, out of order, would
+otherwise cost thousands of steps for each.
 """
 
 from bisect import bisect_left

@@ -121,8 +121,11 @@ class BootLine:
             return self._accept(arrival_ns, boot_ms * _NS_PER_MS)
         x_ns = unwrapped_ns(boot_ms, self.newest_ns)
         late_ns = arrival_ns - x_ns - self.floor.at(x_ns)
-        if self._previous is not None and self._is_straggler(arrival_ns, boot_ms, late_ns):
-            return None
+        if self._previous is not None:
+            latency_ns = self._straggler_latency_ns(arrival_ns, boot_ms, late_ns)
+            if latency_ns is not None:
+                self.floor.note_latency_before(latency_ns)
+                return None
         if abs(late_ns) <= self._late_max_ns:
             return self._place_near(arrival_ns, boot_ms, x_ns, late_ns)
         if late_ns > 0 and x_ns > self.newest_ns:
@@ -209,21 +212,18 @@ class BootLine:
         self.newest_ns = x_ns
         return PlacedStamp(x_ns=x_ns)
 
-    def _is_straggler(self, arrival_ns: int, boot_ms: int, late_ns: int) -> bool:
-        """Return whether a stamp fits the previous line and not the current line."""
-        if self._previous is None:
-            return False
+    def _straggler_latency_ns(self, arrival_ns: int, boot_ms: int, late_ns: int) -> int | None:
+        """Return the latency of a stamp that fits the previous line alone; None for any other."""
+        assert self._previous is not None
         before, left_ns = self._previous
         if arrival_ns - left_ns > self._late_max_ns:
             self._previous = None
-            return False
+            return None
         x_ns = unwrapped_ns(boot_ms, before.newest_ns)
-        was_late_ns = arrival_ns - x_ns - before.at(x_ns)
-        fits_before = _EARLY_NS <= was_late_ns <= self._late_max_ns
-        is_one = fits_before and not _EARLY_NS <= late_ns <= self._late_max_ns
-        if is_one:
-            self.floor.was_late(was_late_ns)
-        return is_one
+        latency_ns = arrival_ns - x_ns - before.at(x_ns)
+        fits_before = _EARLY_NS <= latency_ns <= self._late_max_ns
+        fits_now = _EARLY_NS <= late_ns <= self._late_max_ns
+        return latency_ns if fits_before and not fits_now else None
 
     def _begin_new_line(self, *, rebooted: bool) -> PlacedStamp:
         """Make the run of stamps the new line. After a reboot the sender's timeline restarts."""

@@ -264,7 +264,7 @@ class Floor:
         """Largest visible latency of the line before, for a window; then 0."""
         return self._before_ns if self._heard_ns <= self._window_ns else 0.0
 
-    def was_late(self, latency_ns: float) -> None:
+    def note_latency_before(self, latency_ns: float) -> None:
         """Note the visible latency of a frame of the line before, which arrived after this one."""
         self._before_ns = max(self._before_ns, latency_ns)
 

@@ -9,7 +9,7 @@ lasts for the whole window.
 from array import array
 from collections import deque
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -21,6 +21,19 @@ RESOLUTION_NS: Final = 1e6  # resolution of the stamps
 _LOTS: Final = 1 << 32
 _STEADY: Final = 0.1
 """Largest ratio of a sloped line's mean gap to a level line's that shows a steady drift."""
+
+
+class _Piece(NamedTuple):
+    """Heights of the stamps in a piece of the window, ns.
+
+    number      of the piece, by sender time
+    least_x_ns  sender time of the least height
+    """
+
+    number: int
+    least_x_ns: int
+    least: float
+    greatest: float
 
 
 class Latencies:
@@ -37,8 +50,7 @@ class Latencies:
         self._window_ns = window_ns
         self._piece_ns = max(1, window_ns // PIECES)
         self._drift_max = drift_max
-        # index, x of the least height, least and greatest height
-        self._pieces: deque[tuple[int, int, float, float]] = deque()
+        self._pieces: deque[_Piece] = deque()
         self._samples = _Samples()
         self._one_of = 1
         self._lot = 0
@@ -47,16 +59,16 @@ class Latencies:
 
     def add(self, x_ns: int, height: float) -> None:
         """Add a stamp: its sender time and its height, ns."""
-        index = x_ns // self._piece_ns
+        number = x_ns // self._piece_ns
         pieces, samples = self._pieces, self._samples
-        if not pieces or index > pieces[-1][0]:
-            pieces.append((index, x_ns, height, height))
+        if not pieces or number > pieces[-1].number:
+            pieces.append(_Piece(number=number, least_x_ns=x_ns, least=height, greatest=height))
             while len(pieces) > PIECES:
                 pieces.popleft()
-        elif height < pieces[-1][2]:
-            pieces[-1] = (pieces[-1][0], x_ns, height, pieces[-1][3])
-        elif height > pieces[-1][3]:
-            pieces[-1] = (*pieces[-1][:3], height)
+        elif height < pieces[-1].least:
+            pieces[-1] = pieces[-1]._replace(least_x_ns=x_ns, least=height)
+        elif height > pieces[-1].greatest:
+            pieces[-1] = pieces[-1]._replace(greatest=height)
         # A linear congruential generator (Numerical Recipes): sampling is reproducible.
         self._lot = (1664525 * self._lot + 1013904223) % _LOTS
         if self._lot * self._one_of >= _LOTS:
@@ -75,14 +87,14 @@ class Latencies:
 
     def measure(self, newest_ns: int, since_ns: int) -> None:
         """Measure the latencies of the stamps since a sender time, each above its own floor."""
-        pieces = [one for one in self._pieces if one[1] >= since_ns]
+        pieces = [one for one in self._pieces if one.least_x_ns >= since_ns]
         x_ns, heights = self._samples.arrays()
         is_new = x_ns >= since_ns
         if not pieces or not is_new.any():
             return
         x, heights = (x_ns[is_new] - newest_ns).astype(float), heights[is_new]
-        at = np.array([[at_ns - newest_ns] for _, at_ns, _, _ in pieces], dtype=float)
-        floors = np.array([[least] for _, _, least, _ in pieces])
+        at = np.array([[one.least_x_ns - newest_ns] for one in pieces], dtype=float)
+        floors = np.array([[one.least] for one in pieces])
         below = (floors + self._drift_max * np.abs(x - at)).min(axis=0)
         gaps = np.maximum(0.0, heights - below)
         self.mean_ns = float(gaps.mean())
@@ -95,16 +107,13 @@ class Latencies:
     def greatest(self, newest_ns: int) -> float:
         """Return the greatest height of the window, of any stamp, as of the newest one."""
         return max(
-            greatest + self._drift_max * (newest_ns - index * self._piece_ns)
-            for index, _, _, greatest in self._pieces
+            one.greatest + self._drift_max * (newest_ns - one.number * self._piece_ns)
+            for one in self._pieces
         )
 
     def raise_greatest(self, by_ns: float) -> None:
         """Move the greatest heights with the floor, whose clock changed."""
-        self._pieces = deque(
-            (index, at_ns, least, greatest + by_ns)
-            for index, at_ns, least, greatest in self._pieces
-        )
+        self._pieces = deque(one._replace(greatest=one.greatest + by_ns) for one in self._pieces)
 
     def steady_drift(self, newest_ns: int) -> float:
         """Return the steady drift of the floor over a window, a ratio; 0 unless above the limit.
@@ -113,12 +122,12 @@ class Latencies:
         1999). It must remove nearly all of the level line's gaps: a queue that fills for a while,
         or a clock that stalls for a moment, leaves more.
         """
-        first_ns, last_ns = self._pieces[0][1], self._pieces[-1][1]
+        first_ns, last_ns = self._pieces[0].least_x_ns, self._pieces[-1].least_x_ns
         if last_ns - first_ns < self._window_ns * (PIECES - 2) / PIECES:
             return 0.0
         x_ns, heights = self._samples.arrays()
         x = (x_ns - newest_ns).astype(float)
-        points = [(float(at_ns - newest_ns), height) for _, at_ns, height, _ in self._pieces]
+        points = [(float(one.least_x_ns - newest_ns), one.least) for one in self._pieces]
         slope = _slope_over(points, float(np.mean(x)))
         if abs(slope) <= self._drift_max:
             return 0.0
@@ -130,13 +139,13 @@ class Latencies:
 
     def tilt(self, drift: float, newest_ns: int, level: float) -> list[tuple[int, float]]:
         """Subtract drift and level from all heights; return the least ones: sender time, height."""
-        tilted = deque[tuple[int, int, float, float]]()
-        for index, at_ns, least, greatest in self._pieces:
-            moved = drift * (at_ns - newest_ns) + level
-            tilted.append((index, at_ns, least - moved, greatest - moved))
+        tilted = deque[_Piece]()
+        for one in self._pieces:
+            moved = drift * (one.least_x_ns - newest_ns) + level
+            tilted.append(one._replace(least=one.least - moved, greatest=one.greatest - moved))
         self._pieces = tilted
         self._samples.clear()
-        return [(at_ns, least) for _, at_ns, least, _ in self._pieces]
+        return [(one.least_x_ns, one.least) for one in self._pieces]
 
 
 class _Samples:

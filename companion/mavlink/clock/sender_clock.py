@@ -134,7 +134,7 @@ class SenderClock:
             return "answer was received before its request was sent"
         since_ns = self._line.since_ns
         if since_ns is not None and sent_ns < since_ns:
-            return "request was sent before the sender's clock was restarted"
+            return "request was sent before the sender's clock restarted or jumped"
         x_ns = remote_ns + round((self._line.newest_ns - remote_ns) / WRAP_NS) * WRAP_NS
         return self._add(self._timesync, Interval(x_ns, sent_ns - x_ns, received_ns - x_ns))
 

@@ -129,7 +129,7 @@ class NewestTimestamps:
         self._newest: dict[tuple[int, int], int] = {}  # by system id and component id
 
     def note(self, stream: Stream, stamp: int) -> bool:
-        """Note an accepted timestamp; return False if it is too far behind the newest one."""
+        """Note a timestamp; return whether it is at most ``BEHIND_MAX`` behind the newest one."""
         sender = stream[:2]
         newest = self._newest.get(sender, stamp)
         self._newest[sender] = max(newest, stamp)

@@ -458,7 +458,7 @@ def test_timesync_request_of_the_boot_before_is_not_used() -> None:
         clock.observe(EPOCH_NS + (15_000 + n * 100) * MS, n * 100)
     before = EPOCH_NS + 14_999 * MS
     assert clock.timesync(before, before + 2_100 * MS, 4 * S) == (
-        "request was sent before the sender's clock was restarted"
+        "request was sent before the sender's clock restarted or jumped"
     )
     assert known(clock).kind is ClockKind.ENVELOPE
     assert clock.timesync(EPOCH_NS + 15_000 * MS, EPOCH_NS + 15_010 * MS, 5 * MS) is None

@@ -65,7 +65,7 @@ def of_machine(waited_s: float) -> Blame:
     """Return this machine as the cause: frames waited so long to be read."""
     return Blame(
         Cause.MACHINE,
-        f"this machine is overloaded: frames wait up to {waited_s:.1f} s",
+        f"this machine is overloaded: frames wait up to {_duration(waited_s)}",
         "close other programs and pages, or lower `[beams] update_hz`",
     )
 
@@ -162,9 +162,10 @@ def of_beam(
         case ErrorSource.CLOCK:
             return _clock(track, evidence)
         case ErrorSource.POSITION:
+            bound = f"its position is uncertain by {_rounded(track.bound_m)} m"
             return Blame(
                 Cause.POSITION,
-                f"at {beam.range_m:.0f} m, its position is uncertain by {track.bound_m:.0f} m",
+                f"at {beam.range_m:.0f} m, {bound}",
                 "fly farther from the array, or fit a better GNSS receiver to the UAV",
             )
         case part:
@@ -182,7 +183,7 @@ def of_contradicted() -> Blame:
 
 def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence) -> Blame:
     """Return why the carrier's attitude is uncertain, by the part of its bound."""
-    known = f"{math.degrees(carrier.attitude_bound_rad):.0f}°"
+    known = f"{_rounded(math.degrees(carrier.attitude_bound_rad))}°"
     reason = f"the carrier's attitude is uncertain by {known}"
     match part:
         case ErrorSource.ATTITUDE:
@@ -193,14 +194,12 @@ def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence)
         case ErrorSource.ATTITUDE_AGE:
             age_s = (evidence.carrier.attitude_age_s or 0.0) - evidence.waited_s
             if age_s > SILENT_S:
-                reason = f"no attitude from the carrier for {age_s:.1f} s"
+                reason = f"no attitude from the carrier for {_duration(age_s)}"
                 return Blame(Cause.CARRIER, reason, CHECK_LINK)
             remedy = "request ATTITUDE from the carrier at 10 Hz: set `[presence] attitude_hz = 10`"
         case ErrorSource.ATTITUDE_CONFLICT:
             reason = f"attitudes of the carrier contradict each other by {known}"
-            remedy = (
-                "check that only one component sends the carrier's ATTITUDE, and its gyroscopes"
-            )
+            remedy = "check its gyroscopes, and that only one component sends its ATTITUDE"
         case _:
             better = TIMESYNC if evidence.carrier.clock_assumed else STEADIER_LINK
             remedy = f"improve the carrier's clock: {better}"
@@ -214,17 +213,16 @@ def _carrier_position_cause(carrier: Carrier, evidence: LinkEvidence) -> Blame:
         remedy = "read the carrier's rejections in the notices, and check its GNSS receiver and id"
         return Blame(Cause.CARRIER, reason, remedy)
     if age_s > SILENT_S:
-        reason = f"no position from the carrier for {age_s:.1f} s"
+        reason = f"no position from the carrier for {_duration(age_s)}"
         return Blame(Cause.CARRIER, reason, CHECK_LINK)
-    reason = f"the carrier's position is uncertain by {carrier.bound_m:.0f} m"
+    reason = f"the carrier's position is uncertain by {_rounded(carrier.bound_m)} m"
     return Blame(Cause.CARRIER, reason, "fit a better GNSS receiver to the carrier")
 
 
 def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
     if beam.loss_db > CLOSE_UAVS_DB:
-        return Blame(
-            Cause.CROWDED, f"other UAVs in its direction cost it {beam.loss_db:.0f} dB", FLY_APART
-        )
+        reason = f"other UAVs in its direction cost it {beam.loss_db:.0f} dB"
+        return Blame(Cause.CROWDED, reason, FLY_APART)
     return Blame(
         Cause.RANGE,
         f"at {beam.range_m:.0f} m it needs {needed_db:.0f} dB, but the array gives"
@@ -236,9 +234,7 @@ def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
 def _silence(track: Track, evidence: LinkEvidence) -> Blame | None:
     if evidence.refused is not None:
         return _refused_cause(evidence.refused)
-    if _is_silent(track, evidence.waited_s):
-        return _silence_cause(track)
-    return None
+    return _silence_cause(track) if _is_silent(track, evidence.waited_s) else None
 
 
 def of_coasting(track: Track, evidence: LinkEvidence) -> Blame:
@@ -261,7 +257,7 @@ def _refused_cause(refused: Reason) -> Blame:
 
 
 def _silence_cause(track: Track) -> Blame:
-    return Blame(Cause.SILENT, f"no report for {track.age_s:.1f} s", CHECK_LINK)
+    return Blame(Cause.SILENT, f"no report for {_duration(track.age_s)}", CHECK_LINK)
 
 
 def _age_cause(track: Track) -> Blame:
@@ -269,7 +265,7 @@ def _age_cause(track: Track) -> Blame:
     late_s = track.latency_s or 0.0
     if track.dt_s is not None and track.dt_s >= max(SPARSE_S, late_s):
         remedy = "request reports at 10 Hz: set `[presence] position_hz = 10`"
-        return Blame(Cause.RATE, f"reports {track.dt_s:.1f} s apart", remedy)
+        return Blame(Cause.RATE, f"reports {_duration(track.dt_s)} apart", remedy)
     if late_s >= LATE_S:
         return _late(late_s)
     return Blame(
@@ -281,14 +277,24 @@ def _age_cause(track: Track) -> Blame:
 
 
 def _late(late_s: float) -> Blame:
-    return Blame(Cause.LATE, f"reports arrive {late_s:.1f} s late", "use a faster MAVLink link")
+    reason = f"reports arrive {_duration(late_s)} late"
+    return Blame(Cause.LATE, reason, "use a faster MAVLink link")
 
 
 def _clock(track: Track, evidence: LinkEvidence) -> Blame:
     doubt_s, late_s = track.clock_bound_s, track.latency_s or 0.0
     if not evidence.clock_assumed and late_s >= max(LATE_S, doubt_s / 2):
         return _late(late_s)  # the link's delay is what makes the clock uncertain
-    known = f"{doubt_s * 1e3:.0f} ms" if doubt_s < 1.0 else f"{doubt_s:.1f} s"
+    known = f"uncertain by {_duration(doubt_s)}"
     if evidence.clock_assumed:
-        return Blame(Cause.CLOCK, f"its clock is unmeasured, uncertain by {known}", TIMESYNC)
-    return Blame(Cause.CLOCK, f"its clock is uncertain by {known}", STEADIER_LINK)
+        return Blame(Cause.CLOCK, f"its clock is unmeasured, {known}", TIMESYNC)
+    return Blame(Cause.CLOCK, f"its clock is {known}", STEADIER_LINK)
+
+
+def _duration(seconds: float) -> str:
+    return f"{seconds * 1e3:.0f} ms" if seconds < 1.0 else f"{seconds:.1f} s"
+
+
+def _rounded(value: float) -> str:
+    """Return a number without decimals; a small one with two digits, never as 0."""
+    return f"{value:.0f}" if value >= 2.0 else f"{value:.2g}"

@@ -66,7 +66,7 @@ def blamed(
         ({}, Cause.POSITION, "at 100 m, its position is uncertain by 3 m"),
         ({"dt_s": 1.1, "age_s": 1.1, "bound_m": 5.0}, Cause.RATE, "reports 1.1 s apart"),
         ({"age_s": 0.9, "latency_s": 0.6, "dt_s": 0.2, "bound_m": 3.0}, Cause.LATE,
-         "reports arrive 0.6 s late"),
+         "reports arrive 600 ms late"),
         ({"limits": Limits(60.0, 190.0), "age_s": 0.2, "bound_m": 5.0}, Cause.AGILE,
          "it may accelerate by up to 190 m/s²"),
         ({"clock_bound_s": 0.1}, Cause.CLOCK, "its clock is uncertain by 100 ms"),
@@ -143,9 +143,29 @@ def test_wait_for_this_machine_is_blamed_on_it() -> None:
     waiting = replace(FINE, waited_s=0.8, carrier=aged)
     turned = replace(CARRIER, attitude_bound_rad=0.03)
     found = blamed(old, turned, evidence=waiting)
-    assert found[:2] == (Cause.MACHINE, "this machine is overloaded: frames wait up to 0.8 s")
+    assert found[:2] == (Cause.MACHINE, "this machine is overloaded: frames wait up to 800 ms")
     assert blamed(replace(old, age_s=1.7), turned, evidence=waiting)[0] is Cause.MACHINE
     assert blamed(replace(old, age_s=2.7), turned, evidence=waiting)[0] is Cause.SILENT
+
+
+@pytest.mark.parametrize(
+    ("seconds", "text"),
+    [(0.004, "4 ms"), (0.03, "30 ms"), (0.8, "800 ms"), (1.0, "1.0 s"), (7.02, "7.0 s")],
+)
+def test_no_wait_is_rounded_to_zero(seconds: float, text: str) -> None:
+    assert (
+        blame.of_machine(seconds).reason == f"this machine is overloaded: frames wait up to {text}"
+    )
+
+
+@pytest.mark.parametrize(("bound_rad", "text"), [(0.0042, "0.24°"), (0.02, "1.1°"), (0.2, "11°")])
+def test_no_uncertainty_is_rounded_to_zero(bound_rad: float, text: str) -> None:
+    """The pointing bound of a large array may be a fraction of a degree."""
+    turned = replace(CARRIER, attitude_bound_rad=bound_rad, bound_m=0.01)
+    evidence = replace(FINE, carrier=CarrierEvidence(attitude=AttitudeParts(error_rad=bound_rad)))
+    near = replace(TRACK, bound_m=0.01)
+    reason = blamed(near, turned, evidence=evidence)[1]
+    assert reason == f"the carrier's attitude is uncertain by {text}"
 
 
 def test_what_grew_since_the_link_was_good_is_the_cause_even_if_another_part_is_larger() -> None:

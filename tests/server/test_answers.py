@@ -373,7 +373,7 @@ def test_arrival_lag_is_reported(make_node: Any) -> None:
             "longest_s": 0.700000019,
         }  # fmt: skip
         assert status["arrival_lag"] == pytest.approx(lag, abs=1e-10)
-        assert status["health"]["behind"] == "this machine is overloaded: frames wait up to 0.7 s"
+        assert status["health"]["behind"] == "this machine is overloaded: frames wait up to 700 ms"
         metrics = client.get("/metrics").text
     for name in ("", "_p95", "_max"):
         assert f"\ncompanion_arrival_lag{name}_seconds 0.7000000" in metrics

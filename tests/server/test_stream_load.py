@@ -46,15 +46,20 @@ def metric(node: Node, name: str) -> float:
     return float(found[1])
 
 
-async def read(address: str, until_s: float, ages_s: list[float], quiet_s: float) -> int:
-    """Read to the end; record the age of each message on arrival, after an initial period."""
+async def read(address: str, all_open: asyncio.Barrier, seconds: float, ages_s: list[float]) -> int:
+    """Read for a time from when all are open; record the age of each message on arrival.
+
+    Ages of the first second are not recorded: they include messages that waited meanwhile.
+    """
     heard = 0
     async with connect(address, max_queue=4, compression=None) as websocket:
-        while time.time() < until_s:
+        await asyncio.wait_for(all_open.wait(), HANG_S)
+        begun_s = now_s = time.time()
+        while now_s < begun_s + seconds:
             text = await asyncio.wait_for(websocket.recv(), HANG_S)
             now_s = time.time()
             heard += 1
-            if now_s > quiet_s:
+            if now_s > begun_s + 1.0:
                 stamp = re.search(r'"valid_at":"(.*?)"', str(text))
                 assert stamp is not None
                 ages_s.append(now_s - datetime.fromisoformat(stamp[1]).timestamp())
@@ -69,9 +74,10 @@ async def crowd(node: Node, readers: int, deaf: int, seconds: float) -> tuple[li
         await connect(address, max_queue=1, compression=None, ping_interval=None)
         for _ in range(deaf)
     ]
-    begun_s = time.time()
-    until_s, quiet_s = begun_s + seconds, begun_s + 1.0
-    heard = await asyncio.gather(*[read(address, until_s, ages_s, quiet_s) for _ in range(readers)])
+    all_open = asyncio.Barrier(readers)
+    heard = await asyncio.gather(
+        *[read(address, all_open, seconds, ages_s) for _ in range(readers)]
+    )
     for one in silent:
         one.transport.abort()
     return heard, ages_s

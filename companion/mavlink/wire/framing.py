@@ -11,11 +11,8 @@ The checksum is CRC-16/MCRF4XX over all but the magic byte, then over one seed b
 After a failed frame the search resumes at the next magic byte *inside* its claimed length, never
 after it: a damaged length byte would otherwise discard good frames. The claimed length is kept only
 so that false starts inside it are not counted as further failures.
-
-Over 300 lines: the search, its limits and what it counts are one algorithm.
 """
 
-import math
 import re
 from typing import Final, NamedTuple, Self
 
@@ -120,7 +117,7 @@ def _next_start(buffer: bytes, at: int, end: int, claimed_to: int) -> tuple[int,
     skipped = 0
     while found := _find_start(buffer, at, end):
         at = found.start()
-        inside = at + 5 < end and at < claimed_to and buffer[at] == MAGIC_V1
+        inside = at < claimed_to and at + 5 < end and buffer[at] == MAGIC_V1
         if not inside or buffer[at + 1] <= LONGEST[buffer[at + 5]]:
             return at, skipped
         at += 1
@@ -184,10 +181,11 @@ class SplitLimits(NamedTuple):
     search   budget of false starts that are examined; beyond it, the bytes of a call after a false
              start are garbage (None: no limit)
     at_once  frames that a call returns; a call without bytes continues with the same ones
+             (None: no limit)
     """
 
     search: Budget | None = None
-    at_once: float = math.inf
+    at_once: int | None = None
 
 
 NO_LIMITS: Final = SplitLimits()
@@ -248,63 +246,41 @@ class Splitter:
         lost: dict[Reason, int] = {}
         link, wanted, frame_at = self.link, self._wanted, self._checker.at
         search, now_s = self._limits.search, t_ns * 1e-9
-        most = math.inf if last else self._limits.at_once
-        at, end, claimed_to = 0, len(buffer), self._claimed
+        most = None if last else self._limits.at_once
+        at, end, claimed_to, frames, garbage = 0, len(buffer), self._claimed, 0, 0
         while at < end:
             found = frame_at(buffer, at, end)
             if not isinstance(found, int):
                 source, msgid, raw = found
-                self.frames += 1
-                if wanted is None or msgid in wanted:
-                    out.append(Frame(t_ns=t_ns, link=link, source=source, msgid=msgid, raw=raw))
+                frames += 1
                 at += len(raw)
                 claimed_to = at
-                if len(out) >= most:
-                    break
+                if wanted is None or msgid in wanted:
+                    out.append(Frame(t_ns=t_ns, link=link, source=source, msgid=msgid, raw=raw))
+                    if most is not None and len(out) >= most:
+                        break
                 continue
             if found == INCOMPLETE and not last:
                 break
             if found in REASONS and at >= claimed_to:
-                claims_to = at + claimed_length(buffer, at, end)
-            else:
-                claims_to = claimed_to
+                reason = REASONS[found]
+                lost[reason] = lost.get(reason, 0) + 1
+                claimed_to = at + claimed_length(buffer, at, end)
             resume = end
             if search is None or search.spend(1, now_s):
-                resume, skipped = _next_start(buffer, at + 1, end, claims_to)
+                resume, skipped = _next_start(buffer, at + 1, end, claimed_to)
                 if search is not None and skipped:
                     search.spend(min(skipped / SKIPPED_AS_ONE, search.left), now_s)
-            claimed_to = self._count(
-                lost, found, at=at, resume=resume, claimed_to=claimed_to, buffer=buffer
-            )
+            garbage += max(0, resume - max(at, claimed_to))
             at = resume
         self._pending = buffer[at:]
-        self.has_more = len(out) >= most and at < end
+        self.frames += frames
+        self.has_more = most is not None and len(out) >= most and at < end
         self._claimed = max(0, claimed_to - at)
+        if garbage:
+            lost[Reason.GARBAGE] = garbage
         out.extend(
             Rejection(t_ns=t_ns, source=self.link, reason=why, count=count)
             for why, count in lost.items()
         )
         return out
-
-    @staticmethod
-    def _count(
-        lost: dict[Reason, int],
-        verdict: int,
-        *,
-        at: int,
-        resume: int,
-        claimed_to: int,
-        buffer: bytes,
-    ) -> int:
-        """Count the bytes skipped between two indexes, as failed frames and garbage.
-
-        Returns the end of the lengths claimed by failed frames.
-        """
-        reason = REASONS.get(verdict)
-        if reason is not None and at >= claimed_to:
-            lost[reason] = lost.get(reason, 0) + 1
-            claimed_to = at + claimed_length(buffer, at, len(buffer))
-        stray = resume - max(at, claimed_to)
-        if stray > 0:
-            lost[Reason.GARBAGE] = lost.get(Reason.GARBAGE, 0) + stray
-        return claimed_to

@@ -19,6 +19,7 @@ import click
 
 from companion import __version__
 from companion.cli.console import OneLineErrors, print_truncated
+from companion.mavlink.links.regular_file import open_regular
 from companion.mavlink.links.urls import MAVLINK, LinkUrl, parse_link
 from companion.node.signals import interrupts_held, release_interrupts
 from companion.values import Event, Frame, Reason, Rejection, UserError, shown
@@ -31,6 +32,7 @@ from sitl_replay.traffic import player, recorder
 from sitl_replay.traffic.observations import ReceiverPlan, check_url
 
 PROGRESS_EVERY_S = 0.5
+TOKEN_MAX = 4096  # bytes of a token's file that are read
 
 
 def as_links(_: click.Context, __: click.Parameter, values: tuple[str, ...]) -> tuple[LinkUrl, ...]:
@@ -244,11 +246,19 @@ def fly(
     conclude(tally, "sent", as_json)
 
 
+def _text(path: Path) -> str:
+    with open_regular(path) as file:
+        return file.read(TOKEN_MAX).decode().strip()
+
+
 def _plan(url: str, model: ReceiverModel, token: Path | None) -> ReceiverPlan:
     try:
-        found = os.environ.get("COMPANION_TOKEN") if token is None else token.read_text().strip()
-    except (OSError, ValueError) as error:
-        raise click.BadParameter(f"{token}: {error}", param_hint="'--token'") from error
+        given = None if token is None else _text(token)
+    except OSError as error:
+        raise click.BadParameter(f"{token}: {error.strerror}", param_hint="'--token'") from error
+    except UnicodeDecodeError as error:
+        raise click.BadParameter(f"{token}: not UTF-8 text", param_hint="'--token'") from error
+    found = os.environ.get("COMPANION_TOKEN") if given is None else given
     return ReceiverPlan(url=url, token=found, model=model)
 
 

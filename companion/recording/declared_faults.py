@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
+from companion.mavlink.links.regular_file import open_regular
 from companion.recording.reader import LogError
 
 SUFFIX: Final = ".events.json"
@@ -35,9 +36,12 @@ def declared_faults(log: Path) -> tuple[DeclaredFault, ...]:
     """
     path = log.with_name(log.name + SUFFIX)
     try:
-        text = path.read_text(encoding="utf-8")
+        with open_regular(path) as file:
+            text = file.read()
     except FileNotFoundError:
         return ()
+    except OSError as error:
+        raise LogError(f"{path}: cannot be read: {error.strerror}") from None
     try:
         events = [
             (round(float(each["unix"]) * 1e9), int(each["sysid"]), str(each["event"]))

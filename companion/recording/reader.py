@@ -18,6 +18,7 @@ from typing import IO, Final, Literal, NamedTuple, cast
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
+from companion.mavlink.links.regular_file import open_regular
 from companion.mavlink.wire.framing import is_shaped
 from companion.recording import codec, schemas, tlog
 from companion.recording.container import MAGIC, Damage, Message, Walk
@@ -207,9 +208,7 @@ def _offset_ns(path: Path, data: bytes) -> int:
 def _open(path: Path) -> tuple[LogKind, bytes]:
     """Return the kind of a log, and its bytes unless they are read piece by piece."""
     try:
-        if not (path.is_file() or path.is_dir()) and path.exists():
-            raise LogError(f"{path}: not a file")
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             head = file.read(kinds.HEAD_BYTES)
             if head.startswith(MAGIC):
                 return ("mcap" if _ours(path) else "foreign-mcap"), b""

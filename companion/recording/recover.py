@@ -14,6 +14,7 @@ from typing import Final
 
 from mcap.records import Attachment, Metadata
 
+from companion.mavlink.links.regular_file import NotRegularError, open_regular
 from companion.recording.container import MAGIC, Content, Damage, Message, Walk
 from companion.recording.mcap_file import McapFile
 from companion.recording.reader import LogError
@@ -96,9 +97,11 @@ def _keep_damaged(path: Path, why: str) -> LogError:
 
 
 def _recover(path: Path) -> Recovered:
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise UnreadableError(f"{path}: not a file")
-    with path.open("rb") as file:
+    try:
+        file = open_regular(path)
+    except NotRegularError as error:
+        raise UnreadableError(f"{path}: {error.strerror}") from None
+    with file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

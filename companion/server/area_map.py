@@ -12,7 +12,8 @@ from typing import Annotated, Final
 from fastapi import FastAPI, HTTPException
 from fastapi.responses import Response
 
-from companion.server.byte_ranges import Range, file_answer, file_answers, open_regular
+from companion.mavlink.links.regular_file import open_regular
+from companion.server.byte_ranges import Range, file_answer, file_answers
 from companion.server.responses import answer, answers
 from companion.server.threads import in_file_thread
 from companion.values import UserError
@@ -33,10 +34,8 @@ def find(named: str | None) -> Path | None:
     """Return the map file of ``[page] map``. Raises ``UserError`` if it is not PMTiles."""
     if named is None:
         return None
-    if Path(named).exists() and not (Path(named).is_file() or Path(named).is_dir()):
-        raise UserError(f"page.map = {named!r}: a pipe or a device; give a PMTiles file")
     try:
-        with Path(named).open("rb") as file:
+        with open_regular(Path(named)) as file:
             head = file.read(len(MAGIC))
     except OSError as error:
         raise UserError(f"page.map = {named!r}: {error.strerror}") from error
@@ -63,11 +62,12 @@ def add(app: FastAPI, file: Path | None) -> None:
         responses=file_answers(MEDIA_TYPE),
     )
     async def tiles(wanted: Range = None) -> Response:
-        found = None
-        if file is not None:
-            found = await in_file_thread(open_regular, file, follow_links=True)
-        if found is None:
+        if file is None:
             raise HTTPException(404, "no map; name one in [page] map")
+        try:
+            found = await in_file_thread(open_regular, file)
+        except OSError as error:
+            raise HTTPException(404, f"the map cannot be read: {error.strerror}") from error
         status = os.fstat(found.fileno())
         # A page that reads parts of two files learns from the tag that they do not belong together.
         headers = {"etag": f'"{status.st_mtime_ns:x}-{status.st_size:x}"'}

@@ -3,11 +3,8 @@
 Files are read on threads, a piece at a time, as fast as the client takes them.
 """
 
-import os
 import re
-import stat
 from collections.abc import AsyncIterator
-from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Final
 
 from fastapi import Header, HTTPException
@@ -25,19 +22,6 @@ Range = Annotated[str | None, Header(alias="range", description="bytes=FIRST-LAS
 
 class UnsatisfiableRangeError(ValueError):
     """Error of a byte range that begins beyond the end of the file."""
-
-
-def open_regular(path: Path, *, follow_links: bool = False) -> BinaryIO | None:
-    """Return an open regular file; None for anything else, such as a pipe, which would block."""
-    links = 0 if follow_links else os.O_NOFOLLOW
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | links)
-    except OSError:
-        return None
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        return None
-    return os.fdopen(descriptor, "rb")
 
 
 def file_answer(

@@ -13,8 +13,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, BinaryIO, Final, Literal
 
+from companion.mavlink.links.regular_file import open_regular
 from companion.recording.writer import ACTIVE
-from companion.server.byte_ranges import open_regular
 from companion.values import UtcNs
 from companion.values.described import Meaning
 from companion.views.as_json import Json, rfc3339
@@ -98,15 +98,16 @@ def _utc_ns(text: str) -> UtcNs:
 
 
 def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, int] | None:
-    """Return an open recording, and how many bytes may be read; None if the name is unknown.
+    """Return an open recording, and how many bytes may be read; None if it cannot be opened.
 
     The open file remains the same if its name changes afterwards.
     """
     found = find(where, name)
     if found is None:
         return None
-    file = open_regular(found)
-    if file is None:
+    try:
+        file = open_regular(found, follow_links=False)
+    except OSError:
         return None
     size = os.fstat(file.fileno()).st_size
     return file, min(size, current.bytes) if name == current.name else size

@@ -10,6 +10,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
+from companion.mavlink.links.regular_file import open_regular
 from companion.settings.beams import ArraySettings
 from companion.settings.model import DESIGN, NAMED_FILES, NamedFile, Settings
 from companion.settings.origins import Origin, Origins, given, of_options
@@ -167,10 +168,8 @@ def _bytes(key: str, name: str) -> bytes:
 
 
 def read_file(path: Path) -> bytes:
-    """Return the content of a file. Raises ``OSError``, also for a pipe, which could block."""
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise OSError(errno.EINVAL, "not a file", str(path))
-    with path.open("rb") as file:
+    """Return the content of a regular file. Raises ``OSError``, also if it is too large."""
+    with open_regular(path) as file:
         data = file.read(LARGEST_BYTES + 1)
     if len(data) > LARGEST_BYTES:
         raise OSError(errno.EFBIG, f"larger than {LARGEST_BYTES >> 20} MiB", str(path))

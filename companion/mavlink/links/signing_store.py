@@ -19,6 +19,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
+from companion.mavlink.links.regular_file import open_regular
 from companion.mavlink.links.urls import LinkError
 from companion.mavlink.trust.signing import (
     KEY_BYTES,
@@ -45,10 +46,8 @@ def load_key(path: Path) -> bytes:
     Planner and MAVProxy use the SHA-256 of a passphrase (``MAVAuthKeys.AddKey``, UTF-8;
     ``passphrase_to_key`` of the module ``signing``, ASCII).
     """
-    if path.exists() and not (path.is_file() or path.is_dir()):
-        raise LinkError(f"{path}: cannot read the signing key: not a file")  # a pipe could block
     try:
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             data = file.read(_READ_MAX)
     except OSError as error:
         raise LinkError(f"{path}: cannot read the signing key: {error.strerror}") from None
@@ -225,7 +224,8 @@ def _locked(path: Path) -> int:
 def _read(path: Path) -> dict[_LinkKey, _Kept]:
     """Return the content of the timestamps file; empty if there is no file yet."""
     try:
-        data = path.read_bytes()
+        with open_regular(path) as file:
+            data = file.read()
     except FileNotFoundError:
         return {}
     except OSError as error:

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal, get_args
 
+from companion.mavlink.links.regular_file import open_regular
 from companion.values import UserError
 
 QUEUED: Final = 16
@@ -110,9 +111,12 @@ def sections(config: BusConfig) -> dict[str, str]:
     texts = {place: json.dumps(value) for place, value in made.items()}
     if config.access_control is not None:
         try:
-            texts["access_control"] = config.access_control.read_text("utf-8")
-        except (OSError, UnicodeDecodeError) as error:
-            raise UserError(f"{config.access_control}: {error}") from error
+            with open_regular(config.access_control) as file:
+                texts["access_control"] = file.read().decode()
+        except OSError as error:
+            raise UserError(f"{config.access_control}: {error.strerror}") from error
+        except UnicodeDecodeError as error:
+            raise UserError(f"{config.access_control}: not UTF-8 text") from error
     return texts
 
 

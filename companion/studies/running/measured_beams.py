@@ -10,11 +10,13 @@ import csv
 import math
 import re
 from collections.abc import Mapping
+from io import TextIOWrapper
 from pathlib import Path
 from typing import Final
 
 import numpy as np
 
+from companion.mavlink.links.regular_file import open_regular
 from companion.studies.deepsense.samples import Samples
 from companion.values import UserError
 
@@ -35,7 +37,7 @@ def read(where: Path) -> Samples:
     beams: list[int] = []
     powers: list[list[float]] = []
     try:
-        with table.open(newline="", encoding="utf-8-sig") as file:
+        with TextIOWrapper(open_regular(table), "utf-8-sig", newline="") as file:
             rows = csv.DictReader(file)
             place, beam, power = (
                 next((name for name in names if name in (rows.fieldnames or ())), None)
@@ -68,7 +70,8 @@ def _values(row: Mapping[str, str], column: str, folder: Path) -> list[float]:
     """Return the numbers in a cell, or in the text file that it names."""
     cell = row[column].strip()
     if cell.endswith(".txt"):
-        cell = (folder / cell).read_text(encoding="utf-8")
+        with open_regular(folder / cell) as file:
+            cell = file.read().decode()
     return [float(number) for number in _numbers(cell)]
 
 

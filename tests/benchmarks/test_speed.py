@@ -6,6 +6,7 @@ import subprocess
 import time
 from collections.abc import Callable
 from functools import partial
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -16,14 +17,19 @@ from support import BIN, HANG_S, shared_log
 
 from companion.beams.array import geometry, steering
 from companion.beams.weights import zero_forcing
+from companion.mavlink.links.peers import Peer
+from companion.mavlink.links.transport import Link, Received
+from companion.mavlink.links.urls import parse_link
 from companion.mavlink.wire.framing import Splitter
 from companion.pipeline import assembly
+from companion.pipeline.fold import Pipeline
 from companion.recording.reader import read_log
 from companion.settings.model import Settings
 from companion.values import (
     AltitudeDatum,
     ComplexArray,
     Fix,
+    Frame,
     Report,
     ReportNoise,
     SenderTime,
@@ -34,14 +40,18 @@ pytestmark = pytest.mark.benchmark
 ROUNDS = 5
 
 
-def interleaved(*works: Callable[[], object], rounds: int = ROUNDS) -> list[list[float]]:
+def interleaved(
+    *works: Callable[[], object],
+    rounds: int = ROUNDS,
+    clock: Callable[[], float] = time.perf_counter,
+) -> list[list[float]]:
     """Seconds of each per round, interleaved, so that a slow phase affects all."""
     took: list[list[float]] = [[] for _ in works]
     for _ in range(rounds):
         for times, work in zip(took, works, strict=True):
-            begin = time.perf_counter()
+            begin = clock()
             work()
-            times.append(time.perf_counter() - begin)
+            times.append(clock() - begin)
     return took
 
 
@@ -99,6 +109,41 @@ def test_splitting_against_pymavlink(figures: Figures) -> None:
     )
     figures.ratio("reading a log, recv_match() over ours", all_s, ours_s, "more")
     figures.ratio("reading a log, recv_match(type=...) over ours", some_s, ours_s, "more")
+
+
+class Unlimited(Link):
+    """Link that admits every sender, and charges none for its frames."""
+
+    def _charge(self, peer: Peer, found: list[Received], spent_s: float, now_ns: int) -> None:
+        pass
+
+    def _is_admitted(self, peer: Peer, source: Source, now_ns: int) -> bool:
+        peer.served.add(source)
+        return True
+
+
+def test_admission_of_a_frame_against_its_processing(figures: Figures) -> None:
+    """A datagram of each frame, from a port of each vehicle, through a link and the fold."""
+    log = read_log(shared_log("sitl_4circle.tlog"))
+    frames = list(islice((event for event in log if isinstance(event, Frame)), 30_000))
+    settings = Settings().override(center={"source": "5:1"})
+
+    def serve(kind: type[Link]) -> None:
+        pipeline, t_ns = Pipeline(settings), 0
+
+        def receive(items: list[Received]) -> None:
+            for item in items:
+                pipeline.step(item)
+
+        link = kind(url=parse_link("udpin:127.0.0.1:1"), receive=receive, now_ns=lambda: t_ns)
+        for frame in frames:
+            t_ns = frame.t_ns
+            link.take(("127.0.0.1", 10_000 + frame.source.sysid), frame.raw, 0)
+        assert link.status.frames == len(frames)
+
+    links = (partial(serve, Link), partial(serve, Unlimited))
+    with_s, without_s = interleaved(*links, rounds=9, clock=time.thread_time)
+    assert figures.ratio("a frame with admission over one without", with_s, without_s) < 1.05
 
 
 def users_of_a_line(elements: int, users: int) -> ComplexArray:

@@ -199,27 +199,30 @@ class Link:
             found = splitter.feed(t_ns, data)
         if found:
             self._pass_on(peer, found)
-        newcomers = self._newcomers
         if age_ns is not None and age_ns > LATE_NS:
-            newcomers.late()
+            self._newcomers.late()
         spent_s = time.perf_counter() - began_s
         is_mixed = len(found) != 1 or isinstance(found[0], Rejection)
         if receiver is not None:
             self._receiver_s.charge(time.thread_time() - began_cpu_s)
         elif is_mixed and not splitter.has_more:
             spent_s *= _share_of_frames(found, len(data))
-        newcomers.worked_s += spent_s
-        if found:
-            frames = [item.source for item in found if isinstance(item, Frame)]
-            served = [source for source in frames if source in peer.served]
-            newcomers.worked(served, spent_s / len(found))
-        if now_ns >= newcomers.adapts_ns:
-            newcomers.adapt(now_ns, time.thread_time())
+        self._charge(peer, found, spent_s, now_ns)
         if receiver is not None and not self.url.listens:
             began_ns = receiver.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
                 raise StalledError(f"no complete message in {UNFINISHED_S} s of data")
         return splitter.has_more
+
+    def _charge(self, peer: Peer, found: list[Received], spent_s: float, now_ns: int) -> None:
+        """Charge the time that bytes took to the senders of their frames."""
+        newcomers = self._newcomers
+        newcomers.worked_s += spent_s
+        for item in found:
+            if isinstance(item, Frame) and item.source in peer.served:
+                newcomers.worked(item.source, spent_s / len(found))
+        if now_ns >= newcomers.adapts_ns:
+            newcomers.adapt(now_ns, time.thread_time())
 
     def _receive_within_budget(
         self, receiver: ForeignSplitter, t_ns: int, data: bytes

@@ -10,7 +10,7 @@ its place. Receivers rank behind vehicles, whichever came first.
 
 from bisect import bisect_left
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Final
 
 from companion.mavlink.wire import cot_link, rid_json, transponder
@@ -96,14 +96,12 @@ class Newcomers:
         self._is_late = True
         self._is_lossy |= is_lossy
 
-    def worked(self, sources: Sequence[Source], each_s: float) -> None:
-        """Note the time that each of some frames took, by the sender of each.
+    def worked(self, source: Source, spent_s: float) -> None:
+        """Note the time that a frame of a sender took.
 
         Only senders that are served are charged; ``worked_s`` has the time of all.
         """
-        charged = self._worked_s
-        for source in sources:
-            charged[source] = charged.get(source, 0.0) + each_s
+        self._worked_s[source] = self._worked_s.get(source, 0.0) + spent_s
 
     def adapt(self, now_ns: int, used_s: float) -> None:
         """Adapt who is served to the share of the time that frames took.

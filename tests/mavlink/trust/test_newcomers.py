@@ -35,7 +35,8 @@ def window(
     now = served(senders, 100, (number - 1) * WINDOW_NS)
     spent_s = share * WINDOW_NS * 1e-9
     senders.worked_s += spent_s
-    senders.worked([source(one) for one in now], spent_s / len(now))
+    for one in now:
+        senders.worked(source(one), spent_s / len(now))
     if is_late:
         senders.late(is_lossy=True)
     senders.adapt(number * WINDOW_NS, used * number * WINDOW_NS * 1e-9)
@@ -116,9 +117,10 @@ def test_flood_of_one_sender_costs_no_other_its_place() -> None:
     for number in range(1, 20):
         now = served(senders, 6, number * WINDOW_NS)
         senders.worked_s += 0.95 * WINDOW_NS * 1e-9
-        senders.worked([source(one) for one in range(5)], 0.01 * WINDOW_NS * 1e-9)
+        for one in range(5):
+            senders.worked(source(one), 0.01 * WINDOW_NS * 1e-9)
         if 5 in now:
-            senders.worked([source(5)], 0.9 * WINDOW_NS * 1e-9)
+            senders.worked(source(5), 0.9 * WINDOW_NS * 1e-9)
         senders.late(is_lossy=True)
         senders.adapt(number * WINDOW_NS, number * WINDOW_NS * 1e-9)
     assert served(senders, 6, 20 * WINDOW_NS) == [0, 1, 2, 3, 4]
@@ -132,7 +134,8 @@ def test_receiver_ranks_behind_vehicles_but_not_behind_a_flood(receiver: Source)
         now = served(senders, vehicles, 0)
         spent_s = 0.55 * WINDOW_NS * 1e-9
         senders.worked_s += spent_s
-        senders.worked([*(source(one) for one in now), receiver], spent_s / (1 + len(now)))
+        for one in (*map(source, now), receiver):
+            senders.worked(one, spent_s / (1 + len(now)))
         senders.late(is_lossy=True)
         senders.adapt(WINDOW_NS, WINDOW_NS * 1e-9)
         assert senders.admits(receiver, WINDOW_NS) is receiver_stays

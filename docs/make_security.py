@@ -20,7 +20,7 @@ from companion.mavlink.trust import known_peers, newcomers
 from companion.mavlink.wire import aircraft_json, cot_link, rid_json, sbs
 from companion.node import observations
 from companion.node.drive import gimbal, rotctld
-from companion.node.fleet import live, messages
+from companion.node.fleet import budgets, messages
 from companion.pipeline import power_beams
 from companion.recording import background
 from companion.recording.foreign import capture, thinned
@@ -119,7 +119,7 @@ WAYS: Final = (
         covers=("link:zenoh",),
         size=f"{kb(zenoh_config.MESSAGE_MAX)} a sample, {kb(to_loop.BYTES_MAX)} waiting; {kb(messages.MESSAGE_MAX)} a message",
         items=f"{to_loop.QUEUE_MAX} samples waiting; {messages.FRAMES_MAX} frames and {messages.OFFERS_MAX} offers in a message",
-        work=f"slices of {1e3 * to_loop.SLICE_S:.0f} ms, {kinds.FRAMES_AT_ONCE} frames at once; {live.NODE_BYTES_PER_S // 1000} kB/s of a node of a fleet",
+        work=f"slices of {1e3 * to_loop.SLICE_S:.0f} ms, {kinds.FRAMES_AT_ONCE} frames at once; {budgets.NODE_BYTES_PER_S // 1000} kB/s of a node of a fleet, {budgets.ALL_BYTES_PER_S // 1000} kB/s of all beyond {budgets.GUARANTEED_BYTES_PER_S // 1000} kB/s each",
         over="dropped and counted",
         test="tests/mavlink/links/test_zenoh_bus.py::test_receive_queue_is_bounded",
     ),

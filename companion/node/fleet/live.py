@@ -15,18 +15,18 @@ from companion.mavlink.links.to_loop import ToLoop
 from companion.mavlink.links.zenoh_bus import Bus, open_peer
 from companion.node.fleet import messages
 from companion.node.fleet.answering import Unanswered
+from companion.node.fleet.budgets import NodeBudgets
 from companion.node.fleet.config import bus_config
 from companion.node.fleet.listening import Listening
 from companion.node.fleet.messages import FleetMessageError
 from companion.node.fleet.traffic import Rate
-from companion.pipeline.fleet.member import NODES_MAX, FleetMember
+from companion.pipeline.fleet.member import NODES_MAX, UAVS_MAX, FleetMember
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
 from companion.pipeline.fold import Pipeline
 from companion.recording import fields, schemas
 from companion.settings.fleet import FleetSettings, is_node_name
 from companion.values import Event, Frame, Notice, RoundTrip, Severity, Shared, UserError
-from companion.values.budget import Budget
 from companion.views.served import FleetStatus
 
 PREFIX: Final = "companion"
@@ -40,10 +40,11 @@ RETRY_S: Final = 2.0  # time between two attempts to reopen a session
 PATIENCE_LEASES: Final = 4.0  # the same limit in leases
 LOOK_S: Final = 0.3
 """Time between two batches of offers, not a multiple of the update interval."""
-NODE_BYTES_PER_S: Final = 500_000  # bytes of messages of one node that are parsed
 PIECE: Final = 16  # frames of a message that are processed in one piece
 WAITING_MAX: Final = 1000
 """Frames of other nodes that wait; while more do, further messages are discarded and counted."""
+DECIDED_NS: Final = 50_000_000
+"""Least time between two decisions that another node's claim causes; each update decides too."""
 OFFERED_S: Final = 1.0  # time between two messages of offers, and of tracks
 
 
@@ -94,7 +95,8 @@ class LiveFleetNode:
         self._flush_ns = 0  # due time of the flush
         self._has_duplicate = False
         self._warned: set[str] = set()
-        self._budgets: dict[str, Budget] = {}
+        self._budgets = NodeBudgets()
+        self._decided_ns = self._started_ns  # when a standing last caused a decision
         self._listening: Listening | None = None
         self._slices: ToLoop | None = None  # pieces of messages of frames
         self._waiting = 0  # frames in them
@@ -163,7 +165,9 @@ class LiveFleetNode:
         """Return whether a present node does not answer; remove nodes that left."""
         heard_ns = {node: known.heard_ns for node, known in self.member.neighbours.items()}
         for node in self._unanswered.gone(now_ns, heard_ns):
-            self._notify_all(self.member.node_left(now_ns, node))
+            left = self.member.node_left(now_ns, node)
+            if self._budgets.is_presence_processed(now_ns * 1e-9):
+                self._notify_all(left)
         unresponsive = self._unanswered.unresponsive(now_ns, heard_ns)
         if unresponsive:
             text = f"no answer from {', '.join(unresponsive)}; reconnecting to all nodes"
@@ -327,25 +331,13 @@ class LiveFleetNode:
             self._heard.bytes += len(payload)
             try:
                 if node is not None:
-                    self._spend(node, len(payload))
+                    self._budgets.spend(node, len(payload), self._now_ns() * 1e-9)
                     take(node, payload)
             except FleetMessageError as error:
                 self.damaged += 1
                 self._notify_malformed(str(node), str(error))
 
         return taken
-
-    def _spend(self, node: str, size: int) -> None:
-        """Use a node's budget of bytes; names beyond ``NODES_MAX`` share one.
-
-        Raises ``FleetMessageError`` if it is exhausted.
-        """
-        known = node if node in self._budgets or len(self._budgets) < NODES_MAX else ""
-        budget = self._budgets.setdefault(
-            known, Budget(per_s=NODE_BYTES_PER_S, most=messages.MESSAGE_MAX)
-        )
-        if not budget.spend(size, self._now_ns() * 1e-9):
-            raise FleetMessageError(f"more than {NODE_BYTES_PER_S // 1000} kB/s of messages")
 
     def _shared(self, node: str, payload: bytes) -> None:
         """Process a few frames at once, and the others in slices, in the order of arrival."""
@@ -382,17 +374,32 @@ class LiveFleetNode:
             self._notify_duplicate()
             return
         now_ns = self._now_ns()
-        self.member.take_standing(now_ns, said)
+        self._check_room(self.member.take_standing(now_ns, said))
         serves = self.member.duties.serves
-        if self.member.trust.is_trusted(node) and any(uav in serves for uav, _ in said.serves):
+        if (
+            now_ns - self._decided_ns >= DECIDED_NS
+            and self.member.trust.is_trusted(node)
+            and any(uav in serves for uav, _ in said.serves)
+        ):
+            self._decided_ns = now_ns
             self.ticked(now_ns)  # one of both nodes must drop it
 
     def _offered(self, node: str, payload: bytes) -> None:
-        self.member.take_offers(self._now_ns(), node, messages.to_offers(payload))
+        offers = messages.to_offers(payload)
+        self._check_room(self.member.take_offers(self._now_ns(), node, offers))
+
+    @staticmethod
+    def _check_room(has_room: bool) -> None:
+        if not has_room:
+            raise FleetMessageError(f"more than {UAVS_MAX} UAVs in the messages of all nodes")
 
     def _seen(self, key: str, is_alive: bool) -> None:
         node = self._node(key)
         if node is None or node == self.name:
+            return
+        if not self._budgets.is_presence_processed(self._now_ns() * 1e-9):
+            text = "nodes come and go too often; their messages show which are present"
+            self._notify_once("presence", text)
             return
         if not is_alive:
             self._unanswered.alive.discard(node)

@@ -15,7 +15,13 @@ from companion.mavlink.wire.positions import OWN
 from companion.pipeline.fleet.assignment import offer_values_db
 from companion.pipeline.fleet.duties import Duties, Handover
 from companion.pipeline.fleet.nearness import Place, near
-from companion.pipeline.fleet.neighbours import NOTICED_OFFSET_NS, Neighbour, NeighbourClock, here
+from companion.pipeline.fleet.neighbours import (
+    NOTICED_OFFSET_NS,
+    Neighbour,
+    NeighbourClock,
+    here,
+    uavs_in,
+)
 from companion.pipeline.fleet.reception import SHARED, Reception
 from companion.pipeline.fleet.sharing import Sharing
 from companion.pipeline.fleet.trust import Trust, UnconfirmedVehicle, Witness
@@ -34,6 +40,9 @@ from companion.values import (
 )
 
 NODES_MAX: Final = 256  # limit on other nodes; further ones are ignored
+UAVS_MAX: Final = 50_000
+"""Most UAVs in the newest messages of all other nodes: 20 that all receive 2000 UAVs need 42 000."""
+UAVS_GUARANTEED: Final = 64  # UAVs in a message that are taken from any node
 HANDOVERS_KEPT: Final = 500
 OFFERS_KEPT_NS: Final = 10_000_000_000
 """Time for which a node's offers are valid."""
@@ -195,19 +204,34 @@ class FleetMember:
         self.reception.contradicted.clear()
         return notices
 
-    def take_standing(self, now_ns: int, said: Standing) -> None:
-        """Process the ``Standing`` of another node."""
+    def take_standing(self, now_ns: int, said: Standing) -> bool:
+        """Process the ``Standing`` of another node; return False if it exceeds ``UAVS_MAX``."""
         known = self._neighbour(now_ns, said.node)
-        if known is not None:
-            known.standing = said
-            self.duties.hear(now_ns, said)
+        if known is None:
+            return True
+        if not self._has_room(known.standing_uavs, uavs_in(said)):
+            return False
+        known.standing = said
+        self.duties.hear(now_ns, said)
+        return True
 
-    def take_offers(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> None:
-        """Process all offers of another node."""
+    def take_offers(self, now_ns: int, node: str, offers: tuple[Offer, ...]) -> bool:
+        """Process all offers of another node; return False if they exceed ``UAVS_MAX``."""
         known = self._neighbour(now_ns, node)
-        if known is not None:
-            known.offers = {offer.uav: offer for offer in offers}
-            known.offered_ns = now_ns
+        if known is None:
+            return True
+        if not self._has_room(known.offered_uavs, len(offers)):
+            return False
+        known.offers = {offer.uav: offer for offer in offers}
+        known.offered_ns = now_ns
+        return True
+
+    def _has_room(self, before: int, now: int) -> bool:
+        """Return whether a message with so many UAVs may replace one."""
+        if now <= max(before, UAVS_GUARANTEED):
+            return True
+        held = sum(one.standing_uavs + one.offered_uavs for one in self.neighbours.values())
+        return held - before + now <= UAVS_MAX
 
     # --- decisions --------------------------------------------------------------------------
 

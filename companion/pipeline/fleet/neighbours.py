@@ -93,6 +93,16 @@ class Neighbour:
     apart_told: bool = False
     _delays_ns: deque[tuple[int, int]] = field(default_factory=lambda: deque(maxlen=DELAYS_KEPT))
 
+    @property
+    def standing_uavs(self) -> int:
+        """Number of UAVs in its standing."""
+        return 0 if self.standing is None else uavs_in(self.standing)
+
+    @property
+    def offered_uavs(self) -> int:
+        """Number of UAVs in its offers."""
+        return 0 if self.offers is None else len(self.offers)
+
     def note_delay(self, now_ns: int, way_ns: int) -> None:
         """Note the largest possible delay of a report from the other node."""
         self._delays_ns.append((now_ns, way_ns))
@@ -101,6 +111,11 @@ class Neighbour:
         """Return the largest possible delays of recent reports."""
         oldest_ns = now_ns - DELAYS_WINDOW_NS
         return [way_ns for came_ns, way_ns in self._delays_ns if came_ns > oldest_ns]
+
+
+def uavs_in(said: Standing) -> int:
+    """Return the number of UAVs in a node's standing; those handed over count twice."""
+    return len(said.serves) + len(said.handing)
 
 
 def here(now_ns: int, trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | None:

@@ -59,6 +59,12 @@ def node(
     )
 
 
+def standing(node: str, serves: tuple[tuple[str, float], ...] = ()) -> bytes:
+    """Return a node's standing, encoded."""
+    said = Standing(node=node, place=None, reach_m=None, most=16, serves=serves)
+    return messages.standing(said)
+
+
 @pytest.mark.parametrize(
     ("settings", "said"),
     [
@@ -386,6 +392,35 @@ def test_messages_of_a_node_beyond_its_budget_are_not_parsed() -> None:
     assert ["more than 500 kB/s of messages" in one.text for one in notices] == [True]
 
 
+def test_nodes_that_come_and_go_cost_a_bounded_number_of_notices() -> None:
+    """Each is a line on stderr, an event and a message to every page."""
+    notices: list[Notice] = []
+    member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
+    for n in range(3000):
+        member._seen(f"companion/site/n{n}/alive", True)
+        member._seen(f"companion/site/n{n}/alive", False)
+    assert len(notices) < 600
+    member._stands("west", standing("west"))
+    assert "west" in member.member.neighbours  # by its messages, without a token
+
+
+def test_claims_cause_decisions_at_a_limited_rate() -> None:
+    """A claim to a UAV that this node serves is decided at once, but not again and again."""
+    decided: list[int] = []
+    now_ns = S
+    member = node(mode="client", connect=["tcp/127.0.0.1:1"], now=lambda: now_ns)
+    now_ns += live.DECIDED_NS
+    member.ticked = decided.append  # type: ignore[method-assign]
+    member.member.duties.serves["1:1"] = 5.0
+    claim = standing("west", (("1:1", 9.0),))
+    for _ in range(100):
+        member._stands("west", claim)
+    assert len(decided) == 1
+    now_ns += live.DECIDED_NS
+    member._stands("west", claim)
+    assert len(decided) == 2
+
+
 def test_malformed_clock_answer_is_counted_and_reported() -> None:
     notices: list[Notice] = []
     member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
@@ -404,8 +439,10 @@ def test_names_of_absent_nodes_are_bounded_and_reported_once() -> None:
         member._seen(f"companion/site/n{n}/alive", True)
     assert len(member.member.neighbours) == len(member._unanswered.alive) == NODES_MAX
     texts = [one.text for one in notices]
-    assert len(texts) == NODES_MAX + 1
-    assert texts[-1] == "more than 256 nodes; further ones are ignored"
+    assert texts[NODES_MAX:] == [
+        "more than 256 nodes; further ones are ignored",
+        "nodes come and go too often; their messages show which are present",
+    ]
     for n in range(10 * NODES_MAX):
         member._valid_only(member._offered)(f"companion/site/n{n}/offers", b"\xff")
     assert len(member._warned) <= NODES_MAX + 1

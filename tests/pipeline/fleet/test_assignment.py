@@ -3,6 +3,7 @@ offers."""
 
 import itertools
 import math
+import random
 from collections import Counter
 
 import pytest
@@ -10,8 +11,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support import examples
 
+from companion.pipeline.fleet import assignment
 from companion.pipeline.fleet.assignment import LIKELY_PENALTY_DB, assign, offer_value_db
-from companion.values import Offer
+from companion.values import FloatArray, Offer
 
 NODES = ("a", "b", "c")
 OFFERS = st.fixed_dictionaries(
@@ -103,6 +105,38 @@ def test_assignment_does_not_depend_on_offer_order(
 def test_assignment_is_stable(offers: dict[str, dict[str, float]]) -> None:
     found = assign(offers, {}, ROOM, 0.0)
     assert assign(offers, found, ROOM, 0.0) == found
+
+
+def test_work_of_a_decision_is_bounded_and_the_next_one_continues(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Names of nodes are free: 256 of them offer the UAVs of one, and more than it can give."""
+    rng = random.Random(1)
+    uavs = [f"{number}:1" for number in range(12)]
+    offers = {f"n{node}": {uav: rng.uniform(0.0, 30.0) for uav in uavs} for node in range(256)}
+    room = dict.fromkeys(offers, 64)
+    rounds: list[int] = []
+    search = assignment._positive_cycle
+
+    def counted(edges: FloatArray) -> tuple[list[tuple[int, int]], int]:
+        found = search(edges)
+        rounds.append(found[1] * edges.size)
+        return found
+
+    monkeypatch.setattr(assignment, "_positive_cycle", counted)
+    served = dict.fromkeys(uavs, "n0")
+    decisions = 0
+    while decisions < 30:
+        decisions += 1
+        rounds.clear()
+        before, served = served, assign(offers, served, room, 0.0)
+        assert sum(rounds) < 2 * assignment.WORK_MAX
+        if served == before:
+            break
+    assert decisions > 2
+    monkeypatch.setattr(assignment, "WORK_MAX", 1 << 60)
+    optimum = assign(offers, dict.fromkeys(uavs, "n0"), room, 0.0)
+    assert total_db(served, offers) == pytest.approx(total_db(optimum, offers))
 
 
 def test_uav_moves_only_for_more_than_the_margin() -> None:

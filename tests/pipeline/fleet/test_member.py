@@ -4,7 +4,14 @@ import struct
 
 from pymavlink.dialects.v20 import common
 
-from companion.pipeline.fleet.member import FORGET_NS, GONE_MAX, NODES_MAX, FleetMember
+from companion.pipeline.fleet.member import (
+    FORGET_NS,
+    GONE_MAX,
+    NODES_MAX,
+    UAVS_MAX,
+    UAVS_GUARANTEED,
+    FleetMember,
+)
 from companion.pipeline.fleet.trust import CONTRADICTIONS, PHANTOM_AFTER_NS, Witness
 from companion.settings.fleet import FleetSettings
 from companion.values import Offer, Shared, SharedFrame, Standing
@@ -89,6 +96,24 @@ def test_invented_nodes_expire() -> None:
     node.decide(START_NS + 2 * FORGET_NS)
     node.take_standing(START_NS + 2 * FORGET_NS, standing("b"))
     assert list(node.neighbours) == ["b"]
+
+
+def test_uavs_in_the_messages_of_all_nodes_are_bounded() -> None:
+    """A node may publish under many names. What others published before is kept."""
+    node = member()
+    many = tuple(f"{number}:1" for number in range(UAVS_MAX // 4))
+    for name in "cdef":
+        assert node.take_standing(START_NS, standing(name, many))
+    assert not node.take_standing(START_NS, standing("g", many))
+    assert node.take_standing(START_NS, standing("g", many[:UAVS_GUARANTEED]))
+    offers = tuple(
+        Offer(uav=uav, sure_db=None, likely_db=None, sinr_db=None, heard_s=0.1) for uav in many
+    )
+    assert not node.take_offers(START_NS, "c", offers)
+    assert node.take_offers(START_NS, "c", offers[:UAVS_GUARANTEED])
+    assert node.take_standing(START_NS, standing("c", many))  # replaces one as large
+    node.node_left(START_NS, "d")
+    assert node.take_offers(START_NS, "c", offers[: UAVS_MAX // 8])
 
 
 def test_first_clock_answers_do_not_suffice_to_use_frames() -> None:

@@ -1,0 +1,52 @@
+"""Budgets of the other nodes of a fleet: whatever one of them sends, the others are processed.
+
+Names are free: who may publish at all can publish under hundreds of them. So a node is always
+processed at the small rate that it needs, and what is more comes out of one budget for all.
+"""
+
+from typing import Final
+
+from companion.node.fleet import messages
+from companion.node.fleet.messages import FleetMessageError
+from companion.pipeline.fleet.member import NODES_MAX
+from companion.values.budget import Budget
+
+GUARANTEED_BYTES_PER_S: Final = 20_000
+"""Bytes per second of a node that are always parsed: the standing and offers of 100 UAVs."""
+GUARANTEED_BYTES: Final = 100_000  # bytes at once
+NODE_BYTES_PER_S: Final = 500_000  # bytes of messages of one node that are parsed
+ALL_BYTES_PER_S: Final = 1_000_000  # bytes of all nodes beyond those that are always parsed
+PRESENCE_PER_S: Final = 5.0
+"""Changes per second in who is present that are processed. Messages show the same, later."""
+PRESENCE_SAVED: Final = 2.0 * NODES_MAX
+
+
+class NodeBudgets:
+    """Budgets of bytes by node, names beyond ``NODES_MAX`` sharing one; and that of presence."""
+
+    def __init__(self) -> None:
+        self._guaranteed: dict[str, Budget] = {}
+        self._more: dict[str, Budget] = {}
+        self._all = Budget(per_s=ALL_BYTES_PER_S, most=messages.MESSAGE_MAX)
+        self._presence = Budget(per_s=PRESENCE_PER_S, most=PRESENCE_SAVED)
+
+    def spend(self, node: str, size: int, now_s: float) -> None:
+        """Use the budgets for a message. Raises ``FleetMessageError`` if they are exhausted."""
+        known = node if node in self._guaranteed or len(self._guaranteed) < NODES_MAX else ""
+        own = self._guaranteed.get(known)
+        if own is None:
+            own = Budget(per_s=GUARANTEED_BYTES_PER_S, most=GUARANTEED_BYTES)
+            self._guaranteed[known] = own
+            self._more[known] = Budget(per_s=NODE_BYTES_PER_S, most=messages.MESSAGE_MAX)
+        if own.spend(size, now_s):
+            return
+        if not self._more[known].spend(size, now_s):
+            raise FleetMessageError(f"more than {NODE_BYTES_PER_S // 1000} kB/s of messages")
+        if not self._all.spend(size, now_s):
+            raise FleetMessageError(
+                f"more than {ALL_BYTES_PER_S // 1000} kB/s of messages of all nodes"
+            )
+
+    def is_presence_processed(self, now_s: float) -> bool:
+        """Use the budget for one node that comes or goes; return whether it was left."""
+        return self._presence.spend(1.0, now_s)

@@ -41,7 +41,7 @@ from companion.values import (
 
 NODES_MAX: Final = 256  # limit on other nodes; further ones are ignored
 UAVS_MAX: Final = 50_000
-"""Most UAVs in the newest messages of all other nodes: 20 that all receive 2000 UAVs need 42 000."""
+"""Most UAVs in the newest messages of all other nodes; 20 that all receive 2000 need 42 000."""
 UAVS_GUARANTEED: Final = 64  # UAVs in a message that are taken from any node
 HANDOVERS_KEPT: Final = 500
 OFFERS_KEPT_NS: Final = 10_000_000_000

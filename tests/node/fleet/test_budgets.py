@@ -4,10 +4,10 @@ import pytest
 
 from companion.node.fleet.budgets import (
     ALL_BYTES_PER_S,
+    GUARANTEED_BYTES_PER_S,
     NODE_BYTES_PER_S,
     PRESENCE_PER_S,
     PRESENCE_SAVED,
-    GUARANTEED_BYTES_PER_S,
     NodeBudgets,
 )
 from companion.node.fleet.messages import MESSAGE_MAX, FleetMessageError

@@ -8,8 +8,8 @@ from companion.pipeline.fleet.member import (
     FORGET_NS,
     GONE_MAX,
     NODES_MAX,
-    UAVS_MAX,
     UAVS_GUARANTEED,
+    UAVS_MAX,
     FleetMember,
 )
 from companion.pipeline.fleet.trust import CONTRADICTIONS, PHANTOM_AFTER_NS, Witness

@@ -16,12 +16,15 @@ SET_NS: Final = 10_000_000
 """Least step of the wall clock that is followed; both clocks are disciplined alike."""
 READ_NS: Final = 1_000_000
 """Longest time for reading both clocks if the two readings are to be compared."""
+WALL_MAX_NS: Final = 4_102_444_800_000_000_000
+"""Latest time of the wall clock that is followed, the year 2100: recordings end in 2116."""
 
 
 class NodeClock:
     """Timeline of a node, ns, which starts at the wall clock's time since the Unix epoch.
 
-    ``wall_ns`` and ``since_boot_ns`` are the clocks of the machine.
+    ``wall_ns`` and ``since_boot_ns`` are the clocks of the machine. A wall clock beyond
+    ``WALL_MAX_NS`` is wrong: the timeline starts there, and it is not followed.
     """
 
     def __init__(
@@ -31,7 +34,7 @@ class NodeClock:
     ) -> None:
         self._wall_ns = wall_ns
         self._since_boot_ns = since_boot_ns
-        self._start_ns = wall_ns() - since_boot_ns()
+        self._start_ns = min(wall_ns(), WALL_MAX_NS) - since_boot_ns()
         self._offset_ns = 0
 
     def now_ns(self) -> int:
@@ -42,7 +45,7 @@ class NodeClock:
         """Return UTC less the timeline if the wall clock was set since the last call; else None."""
         before_ns = self.now_ns()
         wall_ns = self._wall_ns()
-        if self.now_ns() - before_ns > READ_NS:
+        if wall_ns > WALL_MAX_NS or self.now_ns() - before_ns > READ_NS:
             return None  # this process was interrupted: the next call detects a step
         offset_ns = wall_ns - before_ns
         if abs(offset_ns - self._offset_ns) < SET_NS:

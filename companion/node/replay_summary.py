@@ -93,7 +93,7 @@ def summary(pipeline: Pipeline, tally: Tally) -> dict[str, Any]:
             "regularised": tally.regularised,
         },
         "unaimed": _unaimed(pipeline, tally),
-        "duration_s": (now_ns - (tally.first_ns or now_ns)) * 1e-9,
+        "duration_s": 0.0 if tally.first_ns is None else (now_ns - tally.first_ns) * 1e-9,
     }
 
 

@@ -16,6 +16,7 @@ from typing import Final
 
 import numpy as np
 
+from companion.mavlink.links.regular_file import open_regular
 from companion.values import UserError
 
 MAGIC: Final = b"UAVBRING"
@@ -32,7 +33,7 @@ LIVE: Final = 1  # state of a ring with a writer; 0: its writer has ended
 def _require_ring(path: Path) -> None:
     """Raise ``UserError`` if a file exists that is not a ring buffer."""
     if path.exists():
-        with path.open("rb") as file:
+        with open_regular(path) as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise UserError(f"{path} exists and is not a ring of records; choose another name")
 

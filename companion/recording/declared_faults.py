@@ -14,6 +14,7 @@ from typing import Any, Final
 from companion.mavlink.links.regular_file import open_regular
 from companion.recording.reader import LogError
 
+LARGEST_BYTES: Final = 1 << 20  # largest list that is read, bytes: thousands of entries
 SUFFIX: Final = ".events.json"
 _LASTS: Final = re.compile(r"(\d+(?:\.\d+)?)s$")
 _END_NS: Final = 2**62
@@ -37,11 +38,13 @@ def declared_faults(log: Path) -> tuple[DeclaredFault, ...]:
     path = log.with_name(log.name + SUFFIX)
     try:
         with open_regular(path) as file:
-            text = file.read()
+            text = file.read(LARGEST_BYTES + 1)
     except FileNotFoundError:
         return ()
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+    if len(text) > LARGEST_BYTES:
+        raise LogError(f"{path}: larger than {LARGEST_BYTES >> 20} MiB")
     try:
         events = [
             (round(float(each["unix"]) * 1e9), int(each["sysid"]), str(each["event"]))

@@ -125,9 +125,13 @@ def flights(logs: Sequence[Path]) -> list[tuple[Path, ...]]:
 def center_of(logs: Sequence[Path], center: str | None) -> str | None:
     """Return the carrier of the array: as given, or the vehicle whose onboard log is named.
 
-    Raises ``LogError`` if the named log contains several vehicles.
+    Raises ``LogError`` if the named log contains several vehicles, or is not one of ``logs``.
     """
-    named = [log for log in logs if center is not None and center in (str(log), log.name)]
+    if center is None:
+        return None
+    named = [log for log in logs if center in (str(log), log.name)]
+    if not named and Path(center).is_file():
+        raise LogError(f"{center}: name the carrier's log among the logs, too")
     if not named:
         return center
     for one in vehicles(logs):

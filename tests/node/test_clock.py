@@ -4,10 +4,11 @@ import asyncio
 import csv
 from pathlib import Path
 
+import pytest
 from support import run_async
 
 from companion import __version__
-from companion.node.clock import NodeClock
+from companion.node.clock import WALL_MAX_NS, NodeClock
 from companion.node.export import export
 from companion.node.moment import look
 from companion.node.served_replay import ReplayRequest, ServedReplay
@@ -51,6 +52,23 @@ def test_timeline_continues_across_a_clock_set_with_one_notice() -> None:
     assert [(at, offset) for at, offset in enumerate(told) if offset is not None] == [
         (10, 1_700_000_000 * S), (50, -3600 * S),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("at_start", [False, True])
+def test_wall_clock_of_another_century_is_not_followed(at_start: bool) -> None:
+    """A recording of such times could not be read back. Once the clock is right, it is followed."""
+    machine = Machine()
+    if at_start:
+        machine.set_ns = 2 * WALL_MAX_NS
+    clock = machine.clock()
+    began_ns = clock.now_ns()
+    assert began_ns == (WALL_MAX_NS if at_start else 1_000 * S)
+    for second in range(1, 10):
+        machine.ns, machine.set_ns = second * S, 2 * WALL_MAX_NS
+        assert clock.now_ns() == began_ns + second * S
+        assert clock.set_to_ns() is None
+    machine.set_ns = 1_800_000_000 * S
+    assert clock.set_to_ns() == machine.wall_ns() - clock.now_ns()
 
 
 def test_suspended_machine_does_not_count_as_clock_set() -> None:

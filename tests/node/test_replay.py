@@ -1,6 +1,7 @@
 """``companion replay``: third-party logs through the whole program."""
 
 import json
+import struct
 import subprocess
 from collections import Counter
 from pathlib import Path
@@ -14,6 +15,7 @@ from support import BIN, HANG_S, shared_log
 
 from companion.beams.array.steering import steering_matrix
 from companion.cli.main import main
+from companion.mavlink.wire.framing import claimed_length
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.recording.reader import read_log
@@ -157,3 +159,22 @@ def test_invalid_log_is_reported_in_one_line(make: Any, command: str, tmp_path: 
     assert len(errors) == 1
     assert str(path) in errors[0]
     assert "Traceback" not in done.stderr
+
+
+def test_log_that_begins_at_zero_has_a_duration(cut_log: Path, tmp_path: Path) -> None:
+    """Stamps of a tlog may count from its start."""
+    data = bytearray(cut_log.read_bytes())
+    at, (first_us,) = 0, struct.unpack_from(">Q", data)
+    while at < len(data):
+        (stamp_us,) = struct.unpack_from(">Q", data, at)
+        struct.pack_into(">Q", data, at, stamp_us - first_us)
+        at += 8 + claimed_length(data, at + 8, len(data))
+    (tmp_path / "a.tlog").write_bytes(data)
+    found = []
+    for log in (cut_log, tmp_path / "a.tlog"):
+        done = CliRunner().invoke(
+            main, ["replay", str(log), "--center", "5:1", "--no-record", "--json"]
+        )
+        found.append(json.loads(done.stdout)["duration_s"])
+    assert found[0] == pytest.approx(found[1])
+    assert found[1] > 1

@@ -64,3 +64,17 @@ def test_faults_of_a_simulated_flight_are_read() -> None:
     assert {uav: len(each) for uav, each in lasts_s.items()} == dict.fromkeys(lasts_s, 1)
     expected = {"1:1": 10.0, "2:1": 11.0, "3:1": 13.6, "4:1": 18.0}
     assert {uav: each[0] for uav, each in lasts_s.items()} == pytest.approx(expected, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (b"\xff\xfe[", "must be a list of entries"),
+        (b"[" + b"[]," * 10**6 + b"[]]", "larger than 1 MiB"),
+    ],
+    ids=["not-utf-8", "large"],
+)
+def test_unreadable_fault_list_is_rejected(tmp_path: Path, content: bytes, why: str) -> None:
+    (tmp_path / "a.tlog.events.json").write_bytes(content)
+    with pytest.raises(LogError, match=why):
+        declared_faults(tmp_path / "a.tlog")

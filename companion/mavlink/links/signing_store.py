@@ -23,6 +23,7 @@ from companion.mavlink.links.regular_file import open_regular
 from companion.mavlink.links.urls import LinkError
 from companion.mavlink.trust.signing import (
     KEY_BYTES,
+    LATEST,
     LinkSigning,
     NewestTimestamps,
     State,
@@ -34,6 +35,8 @@ REFRESH_NS: Final = 3_000_000_000
 """Longest time between two writes: the clock of a silent link advances too."""
 _VERSION: Final = 1
 _READ_MAX: Final = 4096  # most bytes read of a key file
+_FILE_MAX: Final = 1 << 23
+"""Most bytes read of a timestamps file: 30 links with as many streams as are remembered."""
 
 
 # --- keys ---------------------------------------------------------------------------------------
@@ -225,43 +228,52 @@ def _read(path: Path) -> dict[_LinkKey, _Kept]:
     """Return the content of the timestamps file; empty if there is no file yet."""
     try:
         with open_regular(path) as file:
-            data = file.read()
+            data = file.read(_FILE_MAX + 1)
     except FileNotFoundError:
         return {}
     except OSError as error:
         raise LinkError(f"{path}: cannot read the signing timestamps: {error.strerror}") from None
-    links = _checked_links(data)
-    if links is None:
+    kept = None if len(data) > _FILE_MAX else _checked(data)
+    if kept is None:
         raise LinkError(
             f"{path}: signing timestamps are damaged; restore a copy, or remove the file: frames "
             "of the minute before could then be replayed once"
         )
-    return {_LinkKey(link["url"], link["key"]): _kept(link) for link in links}
+    return kept
 
 
-def _checked_links(data: bytes) -> list[dict[str, Any]] | None:
-    """Return the links in a timestamps file; None if its digest does not match."""
+def _checked(data: bytes) -> dict[_LinkKey, _Kept] | None:
+    """Return the content of a timestamps file; None if it is damaged."""
     with contextlib.suppress(ValueError, RecursionError, TypeError, KeyError):
         content = json.loads(data)
         if content["version"] == _VERSION and content["sha256"] == _digest(content["links"]):
-            links: list[dict[str, Any]] = content["links"]
-            return links
+            links = content["links"]
+            return {_LinkKey(str(one["url"]), str(one["key"])): _kept(one) for one in links}
     return None
 
 
 def _kept(link: Mapping[str, Any]) -> _Kept:
     streams = {
-        (sysid, compid, link_id): (newest, lead)
+        (_whole(sysid), _whole(compid), _whole(link_id)): (
+            _whole(newest),
+            None if lead is None else _whole(lead),
+        )
         for sysid, compid, link_id, newest, lead in link["streams"]
     }
     state = State(
-        clock=link["clock"],
-        local=link["local"],
-        sent=link["sent"],
-        floor=link["floor"],
+        clock=_whole(link["clock"]),
+        local=_whole(link["local"]),
+        sent=_whole(link["sent"]),
+        floor=_whole(link["floor"]),
         streams=streams,
     )
-    return _Kept(state, link["clean"])
+    return _Kept(state, bool(link["clean"]))
+
+
+def _whole(value: object) -> int:
+    if not isinstance(value, int) or abs(value) > LATEST:
+        raise ValueError
+    return value
 
 
 def _encoded(links: Mapping[_LinkKey, _Kept]) -> bytes:

@@ -35,6 +35,7 @@ from companion.recording.foreign.onboard import (
     velocities_of,
 )
 from companion.recording.foreign.thinned import Thinned
+from companion.recording.stamps import LARGEST_LEAP_NS
 from companion.values import FloatArray, IntArray, Reason
 
 TIMES: Final = ("unix_s", "time", "t_s")
@@ -49,6 +50,7 @@ _ID_LIMITS: Final = {"sysid": 255, "compid": 255, "mav_type": 255}
 _AUTOPILOT_GENERIC: Final = 0
 _LINE_MAX: Final = 1 << 16
 _NOTICES_MAX: Final = 100
+_FIRST: Final = 9  # samples whose median tells whether the first stamps are plausible
 _RESOLUTION_S: Final = 1e-3
 
 
@@ -224,7 +226,7 @@ def _onboard(
 def _times(seconds: FloatArray, timed: str) -> tuple[IntArray, GpsTime | None]:
     sound = np.abs(seconds) < LAST_UNIX_US * 1e-6
     whole_us = np.round(np.where(sound, seconds, -1.0) * 1e6).astype(np.int64)
-    begin_us = int(np.median(whole_us[:9])) if len(whole_us) else 0
+    begin_us = _begin_us(whole_us[:_FIRST])
     boot_us = np.where(sound, whole_us - begin_us + 1_000_000, -1)
     if timed == "t_s" or begin_us < FIRST_UNIX_US:
         return boot_us, None
@@ -232,6 +234,14 @@ def _times(seconds: FloatArray, timed: str) -> tuple[IntArray, GpsTime | None]:
     return boot_us, GpsTime(
         offset_us=offset_us, drift=0.0, at_us=0, uncertainty_s=_RESOLUTION_S, fixes=len(boot_us)
     )
+
+
+def _begin_us(first_us: IntArray) -> int:
+    """Return the earliest of the first stamps, but none that is far from most of them."""
+    if not len(first_us):
+        return 0
+    middle_us = np.median(first_us)
+    return int(first_us[np.abs(first_us - middle_us) <= LARGEST_LEAP_NS / 1000].min())
 
 
 Place = tuple[IntArray, IntArray, FloatArray]

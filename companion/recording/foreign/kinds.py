@@ -22,7 +22,10 @@ _KINDS: Final[tuple[tuple[bytes, str], ...]] = (
     (b"%PDF-", "a PDF document"),
     (b"\x89PNG", "a picture"),
     (b"\x7fELF", "a program"),
+    (b"\xff\xfe", "text in UTF-16: save it as UTF-8"),
+    (b"\xfe\xff", "text in UTF-16: save it as UTF-8"),
 )
+REPLACED: Final = "\ufffd"  # what stands for a byte that is not UTF-8
 HEAD_BYTES: Final = max(len(magic) for magic, _ in _KINDS)
 
 
@@ -37,11 +40,11 @@ def named(head: bytes) -> str | None:
 
 
 def looks_like_text(head: bytes) -> bool:
-    """Return whether the first bytes of a file are text, such as a table or settings."""
-    try:
-        text = head.decode("utf-8")
-    except UnicodeDecodeError as error:
-        if error.start < len(head) - 3:
-            return False
-        text = head[: error.start].decode("utf-8")
-    return bool(text) and all(char.isprintable() or char in "\t\r\n" for char in text)
+    """Return whether the first bytes of a file are text, such as a table or settings.
+
+    A tenth of it may be letters of another encoding than UTF-8: a table needs only ASCII.
+    """
+    text = head.decode("utf-8-sig", errors="replace")
+    return text.count(REPLACED) < 0.1 * len(text) and all(
+        char.isprintable() or char in "\t\r\n" for char in text
+    )

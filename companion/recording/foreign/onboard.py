@@ -18,7 +18,10 @@ NEAR_US: Final = 500_000
 """Largest time between a position and the velocity or heading that is combined with it."""
 _NEAR: Final = 4
 _STAMP_JUMP_US: Final = 120_000_000
-"""Largest deviation of a stamp from its neighbours' median in the file; else an outlier."""
+"""Largest deviation of a stamp from its neighbours' median in the file; else an outlier.
+
+In a log with minutes between its samples, the deviation may be as large as four intervals.
+"""
 METRES_PER_DEGREE: Final = 111_195.0
 
 
@@ -131,13 +134,15 @@ def time_ordered(boot_us: IntArray) -> tuple[IntArray, int]:
     """
     if not len(boot_us):
         return np.zeros(0, dtype=np.int64), 0
-    padded = np.pad(boot_us, _NEAR, mode="edge")
+    padded = np.pad(boot_us, _NEAR, mode="symmetric")  # so that the first stamp may be one, too
     around = np.lib.stride_tricks.sliding_window_view(padded, 2 * _NEAR + 1)
     middle = np.sort(around, axis=1)[:, _NEAR]
     apart = np.maximum(boot_us, middle).astype(np.uint64) - np.minimum(boot_us, middle).astype(
         np.uint64
     )
-    sound = (apart <= np.uint64(_STAMP_JUMP_US)) & (boot_us >= 0)
+    spacing_us = int(np.median(np.abs(np.diff(middle)))) if len(middle) > 1 else 0
+    most_us = max(_STAMP_JUMP_US, _NEAR * spacing_us)
+    sound = (apart <= np.uint64(most_us)) & (boot_us >= 0)
     rows: IntArray = np.flatnonzero(sound)
     life = np.cumsum(np.diff(middle[rows], prepend=middle[rows][:1]) < -REBOOT_US)
     order = np.lexsort((boot_us[rows], life))
@@ -203,7 +208,8 @@ def velocities_of(
     t_s = _ascending_s(boot_us)
     scale = METRES_PER_DEGREE * 1e-7
     north = (lat_1e7 - lat_1e7[0]) * scale
-    east = (lon_1e7 - lon_1e7[0]) * scale * np.cos(np.radians(lat_1e7 * 1e-7))
+    east_1e7 = np.unwrap(lon_1e7 - lon_1e7[0], period=3_600_000_000)  # over the antimeridian too
+    east = east_1e7 * scale * np.cos(np.radians(lat_1e7 * 1e-7))
     place = np.stack([north, east, -(alt_m - alt_m[0])], axis=1)
     velocity: FloatArray = np.gradient(place, t_s, axis=0)
     return velocity

@@ -10,6 +10,7 @@ from click.testing import CliRunner
 from companion.mavlink.links.regular_file import open_regular
 from companion.mavlink.links.signing_store import Timestamps
 from companion.mavlink.links.zenoh_config import BusConfig, sections
+from companion.node.ring import Ring
 from companion.recording.declared_faults import declared_faults
 from companion.studies.running import measured_beams
 from companion.values import UserError
@@ -43,6 +44,10 @@ def _access_control(pipe: Path) -> None:
     sections(BusConfig(access_control=pipe))
 
 
+def _ring(pipe: Path) -> None:
+    Ring(pipe)
+
+
 def _faults(pipe: Path) -> None:
     log = pipe.with_name("a.tlog")
     pipe.rename(pipe.with_name("a.tlog.events.json"))
@@ -63,7 +68,7 @@ def _token(pipe: Path) -> None:
     raise UserError(result.stderr)
 
 
-@pytest.mark.parametrize("read", [_timestamps, _access_control, _faults, measured_beams.read,
+@pytest.mark.parametrize("read", [_timestamps, _access_control, _ring, _faults, measured_beams.read,
                                   _powers, _token])  # fmt: skip
 def test_pipe_is_an_error_wherever_it_is_named(
     read: Callable[[Path], object], tmp_path: Path

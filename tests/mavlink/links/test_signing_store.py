@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
@@ -459,6 +460,50 @@ def test_damaged_timestamp_file_is_rejected(path: Path) -> None:
 def test_foreign_file_is_rejected(path: Path, text: str) -> None:
     path.parent.mkdir()
     path.write_bytes(text.encode(errors="surrogateescape"))
+    refuses(path, "damaged")
+
+
+LINK: dict[str, object] = {
+    "url": URL, "key": "0123456789abcdef", "clean": True,
+    "clock": 1, "local": 1, "sent": 1, "floor": -1, "streams": [[1, 1, 0, 5, 0]],
+}  # fmt: skip
+
+
+def written(path: Path, links: object) -> None:
+    """Write a timestamps file with the right digest."""
+    digest = sha256(json.dumps(links, separators=(",", ":")).encode()).hexdigest()
+    path.parent.mkdir(exist_ok=True)
+    content = {"version": 1, "sha256": digest, "links": links}
+    path.write_text(json.dumps(content, separators=(",", ":")))
+
+
+@pytest.mark.parametrize(
+    "links",
+    [
+        {"a": 1},
+        "abc",
+        [{}],
+        [7],
+        [LINK | {"streams": None}],
+        [LINK | {"streams": [[1, 1, 1]]}],
+        [LINK | {"streams": [[1, 1, 1, "a", "b"]]}],
+        [LINK | {"clock": "x"}],
+        [LINK | {"clock": 1.5}],
+        [LINK | {"sent": 10**40}],
+    ],
+    ids=range(10),
+)
+def test_wrong_content_with_the_right_digest_is_damage(path: Path, links: object) -> None:
+    written(path, [LINK])
+    Timestamps(path).close(NOW_NS)
+    written(path, links)
+    refuses(path, "damaged")
+
+
+def test_large_file_is_not_read_whole(path: Path) -> None:
+    path.parent.mkdir()
+    with path.open("wb") as file:
+        file.truncate(1 << 34)
     refuses(path, "damaged")
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from companion.recording.foreign import csv_table
 from companion.recording.foreign.csv_table import NoTableError
-from companion.recording.reader import read_log, vehicles
+from companion.recording.reader import LogError, read_log, vehicles
 from companion.values import Frame, Reason
 
 HEAD = "unix_s,lat_deg,lon_deg,alt_m"
@@ -36,6 +36,49 @@ def test_csv_positions_and_times_are_read_and_velocities_derived() -> None:
     assert at.lat_1e7.tolist() == [470_000_000 + n * 100 for n in range(50)]
     assert at.velocity_ned_mps == pytest.approx(np.tile((11.1195, 0, -10.0), (50, 1)), rel=1e-3)
     assert log.notes == ("missing velocities are computed from the positions",)
+
+
+@pytest.mark.parametrize("dt_s", [0.01, 1.0, 2.5, 59.0, 300.0])
+@pytest.mark.parametrize("timed", ["t_s", "unix_s"])
+def test_no_line_of_a_slow_table_is_lost(dt_s: float, timed: str) -> None:
+    """The first line begins the time, also where the first few span minutes."""
+    begin = 0 if timed == "t_s" else 1_795_000_000
+    rows = (f"{begin + n * dt_s:.3f},47,8.5,{500 + n}\n" for n in range(20))
+    log = read(f"{timed},lat_deg,lon_deg,alt_m\n" + "".join(rows))
+    assert log.lost == {}
+    assert log.positions is not None and len(log.positions.boot_us) == 20
+
+
+@pytest.mark.parametrize("wild", ["-99999", "1e9"])
+def test_a_wild_first_stamp_alone_is_lost(wild: str) -> None:
+    rows = "".join(f"{n},47,8.5,{500 + n}\n" for n in range(1, 20))
+    log = read(f"t_s,lat_deg,lon_deg,alt_m\n{wild},47,8.5,499\n{rows}")
+    assert log.lost == {Reason.BAD_STAMP: 1}
+    assert log.positions is not None and len(log.positions.boot_us) == 19
+
+
+def test_velocities_are_derived_across_the_antimeridian() -> None:
+    degrees = 20 / 111_195 / np.cos(np.radians(47))  # 20 m/s eastwards
+    longitudes = [(179.999 + n * degrees + 180) % 360 - 180 for n in range(20)]
+    rows = "".join(f"{n},47,{lon:.9f},500\n" for n, lon in enumerate(longitudes))
+    at = read(f"t_s,lat_deg,lon_deg,alt_m\n{rows}").positions
+    assert at is not None
+    assert at.velocity_ned_mps == pytest.approx(np.tile((0.0, 20.0, 0.0), (20, 1)), rel=1e-2)
+
+
+@pytest.mark.parametrize("before", [b"\xef\xbb\xbf", b"# temperature in \xb0C\n"])
+def test_table_with_a_mark_or_other_encoding_is_recognised(before: bytes, tmp_path: Path) -> None:
+    """A spreadsheet writes the mark. Names of columns are ASCII; other letters do not matter."""
+    log = tmp_path / "table.csv"
+    log.write_bytes(before + f"{HEAD}\n{ROWS}\n".encode())
+    assert sum(isinstance(event, Frame) for event in read_log(log)) > 50
+
+
+def test_table_in_utf_16_is_rejected_with_the_remedy(tmp_path: Path) -> None:
+    log = tmp_path / "table.csv"
+    log.write_bytes(f"{HEAD}\n{ROWS}\n".encode("utf-16"))
+    with pytest.raises(LogError, match="text in UTF-16: save it as UTF-8"):
+        list(read_log(log))
 
 
 @pytest.mark.parametrize("divider", [",", ";", "\t"])

@@ -70,6 +70,8 @@ def test_carrier_can_be_given_as_a_log_name(aeroplane: Path, carrier: Path, cut_
     assert center_of(both, str(carrier)) == center_of(both, carrier.name) == "5:1"
     assert center_of(both, "7:1") == "7:1"
     assert center_of(both, None) is None
+    with pytest.raises(LogError, match="name the carrier's log among the logs, too"):
+        center_of(both[:1], str(both[1]))
     with pytest.raises(LogError, match="give the carrier as SYSID:COMPID"):
         center_of([cut_log], cut_log.name)
 

@@ -7,6 +7,7 @@ the seconds in its name (``link_drop12s``); without an end it lasts to the end o
 
 import json
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
@@ -15,6 +16,7 @@ from companion.mavlink.links.regular_file import open_regular
 from companion.recording.reader import LogError
 
 LARGEST_BYTES: Final = 1 << 20  # largest list that is read, bytes: thousands of entries
+NAME_MAX: Final = 64  # characters of an entry's name
 SUFFIX: Final = ".events.json"
 _LASTS: Final = re.compile(r"(\d+(?:\.\d+)?)s$")
 _END_NS: Final = 2**62
@@ -47,7 +49,7 @@ def declared_faults(log: Path) -> tuple[DeclaredFault, ...]:
         raise LogError(f"{path}: larger than {LARGEST_BYTES >> 20} MiB")
     try:
         events = [
-            (round(float(each["unix"]) * 1e9), int(each["sysid"]), str(each["event"]))
+            (round(float(each["unix"]) * 1e9), int(each["sysid"]), _name(each["event"]))
             for each in json.loads(text)
         ]
     except (ValueError, KeyError, TypeError, OverflowError, RecursionError) as error:
@@ -55,27 +57,33 @@ def declared_faults(log: Path) -> tuple[DeclaredFault, ...]:
     return tuple(_faults(sorted(events)))
 
 
+def _name(text: object) -> str:
+    if not isinstance(text, str) or len(text) > NAME_MAX:
+        raise TypeError
+    return text
+
+
 def _faults(events: list[tuple[int, int, str]]) -> list[DeclaredFault]:
+    """Return the faults by their beginning; from the last entry back, so that ends are known."""
     found = []
-    for number, (at_ns, sysid, name) in enumerate(events):
-        if _is_end(name):
+    next_ns: dict[tuple[int, str], int] = {}  # of each end, by vehicle and its entry
+    for at_ns, sysid, name in reversed(events):
+        if name.endswith(("_on", "_end")):
+            next_ns[sysid, name] = at_ns
             continue
         lasts: Any = _LASTS.search(name)
-        ends_ns = _END_NS if lasts is None else at_ns + round(float(lasts[1]) * 1e9)
-        for later_ns, other, said in events[number + 1 :]:
-            if lasts is None and other == sysid and _ends(name, said):
-                ends_ns = later_ns
-                break
-        found.append(DeclaredFault(sysid=sysid, name=name, from_ns=at_ns, to_ns=ends_ns))
-    return found
+        if lasts is None:
+            ends = (next_ns.get((sysid, end), _END_NS) for end in _ends_of(name))
+            to_ns = min(ends, default=_END_NS)
+        else:
+            to_ns = min(at_ns + round(float(lasts[1]) * 1e9), _END_NS)
+        found.append(DeclaredFault(sysid=sysid, name=name, from_ns=at_ns, to_ns=to_ns))
+    return found[::-1]
 
 
-def _is_end(name: str) -> bool:
-    return name.endswith(("_on", "_end"))
-
-
-def _ends(name: str, said: str) -> bool:
-    """Return whether an entry ends a fault: ``X_on`` ends ``X_off``, ``X_end`` all ``X...``."""
-    if said.endswith("_on"):
-        return name == f"{said.removesuffix('_on')}_off"
-    return said.endswith("_end") and name.startswith(said.removesuffix("_end"))
+def _ends_of(name: str) -> Iterator[str]:
+    """Yield the entries that end a fault: ``X_on`` ends ``X_off``, ``X_end`` all ``X...``."""
+    if name.endswith("_off"):
+        yield f"{name.removesuffix('_off')}_on"
+    for length in range(len(name) + 1):
+        yield f"{name[:length]}_end"

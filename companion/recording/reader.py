@@ -42,6 +42,7 @@ LARGEST_EVENT: Final = 1 << 21
 """Limit on the bytes of an event: a duty with the largest number of names."""
 _UNCERTAINTY_MAX_NS: Final = 3_600_000_000_000
 """Largest uncertainty of a frame's arrival: results computed from it fit into 63 bits."""
+DAMAGED: Final = "recording damaged"  # detail of a rejection for bytes of a recording
 _EVENT_TOPICS: Final = frozenset((schemas.FRAMES_TOPIC, *codec.EVENTS))
 
 
@@ -54,8 +55,8 @@ def read_log(log: Path | str, latency_s: float = 0.0) -> Iterator[Event]:
     """Return the events of a log, in order. Raises ``LogError`` at once if the file is unusable.
 
     ``Frame.link`` is the recorded link, or the file's name if the log has no links. A truncated
-    recording returns its intact events; damage before intact events becomes a ``Rejection`` of that
-    many bytes of garbage. Onboard logs have no arrivals: their frames arrive ``latency_s`` after
+    recording returns its intact events; damage in it becomes a ``Rejection`` of that many bytes of
+    garbage. Onboard logs have no arrivals: their frames arrive ``latency_s`` after
     they were true.
     """
     path = Path(log)
@@ -80,12 +81,17 @@ def _begun(
 
     The file is read again from its start: any number of rejections may precede that event.
     """
+    damaged = 0
     try:
-        if any(isinstance(event, kind) for event in read(path)):
-            return read(path)
+        for event in read(path):
+            if isinstance(event, Rejection) and event.detail == DAMAGED:
+                damaged += event.count
+            elif isinstance(event, kind):
+                return read(path)
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
-    raise LogError(f"{path}: {what}, but no MAVLink frame in it")
+    why = f": {damaged} bytes are damaged" if damaged else ""
+    raise LogError(f"{path}: {what}, but no MAVLink frame in it{why}")
 
 
 def read_flight(logs: Sequence[Path], latency_s: float = 0.0) -> Iterator[Event]:
@@ -278,20 +284,22 @@ def _recorded(path: Path) -> Iterator[Event]:
             if event.t_ns >= _LATEST_NS:
                 raise ValueError("event time out of range")
             if damaged:
-                yield Rejection(
-                    t_ns=t_ns,
-                    source=path.name,
-                    reason=Reason.GARBAGE,
-                    count=damaged,
-                    detail="recording damaged",
-                )
+                yield _damage(path, t_ns or event.t_ns, damaged)
                 damaged = 0
             t_ns = event.t_ns
             yield event
+        if damaged:
+            yield _damage(path, t_ns, damaged)
     except (DecodeError, ValueError) as error:
         raise LogError(f"{path}: not a recording of this program: {error}") from None
     except OSError as error:
         raise LogError(f"{path}: cannot be read: {error.strerror}") from None
+
+
+def _damage(path: Path, t_ns: int, count: int) -> Rejection:
+    return Rejection(
+        t_ns=t_ns, source=path.name, reason=Reason.GARBAGE, count=count, detail=DAMAGED
+    )
 
 
 def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> Event | None:

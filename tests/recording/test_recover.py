@@ -197,15 +197,32 @@ def test_damaged_first_chunk_is_lost_alone(
     said, *events = read_log(path)
     assert isinstance(said, Rejection) and said.reason is Reason.GARBAGE
     assert events == driven[flushed[1][1] :]
+    assert said.t_ns == events[0].t_ns
     result = recover(path)
     assert result.lost_bytes == said.count
     assert list(read_log(result.path)) == events
     # Without both, the remaining data cannot be decoded, and this is reported.
     path.write_bytes(broken[:-1])
-    with pytest.raises(LogError, match="no MAVLink frame"):
+    with pytest.raises(LogError, match=r"no MAVLink frame in it: \d{3,} bytes are damaged"):
         read_log(path)
     path.with_name("broken.recovered.mcap").unlink()
     assert recover(path).lost_bytes > 2 * said.count
+
+
+def test_damaged_last_chunk_is_reported(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    """No event follows it."""
+    whole, driven, flushed = recording
+    broken = bytearray(whole.read_bytes())
+    broken[flushed[-1][0] + 100] ^= 0xFF
+    path = tmp_path / "broken.mcap"
+    path.write_bytes(broken)
+    *events, said = read_log(path)
+    assert isinstance(said, Rejection) and said.reason is Reason.GARBAGE
+    assert events == driven[: flushed[-1][1]]
+    assert said.t_ns == events[-1].t_ns
+    assert recover(path).lost_bytes == said.count
 
 
 def test_recovery_reports_the_latest_time_of_all_messages(tmp_path: Path) -> None:

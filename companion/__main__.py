@@ -1,10 +1,11 @@
 """Entry point of the console command ``companion``, and of ``python -m companion``."""
 
-from companion.cli.interrupts import interrupts_end, name_process
+from companion.cli.interrupts import interrupts_end, name_process, open_missing_streams
 
 
 def main() -> None:
     """Load and run the command; Ctrl-C ends it with one line, even while it loads."""
+    open_missing_streams()
     with interrupts_end("companion"):
         name_process("companion")
         from companion.cli.main import main as command

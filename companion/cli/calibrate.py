@@ -7,6 +7,7 @@ from typing import Final
 import click
 
 from companion.cli.console import CENTER, CONFIG, JSON, LOGS, Progress, print_truncated
+from companion.cli.output import write_file
 from companion.values import UserError
 
 CHANNELS: Final = "channels"
@@ -58,7 +59,7 @@ def channels(measured: Path, out: Path, config: Path | None) -> None:
     if measured.is_dir():
         kept = [measured / f"{name}_cal_val.pkl" for name in ("phase", "gain")]
         found = phaser_pickles.calibration(*(read_file(path) for path in kept))
-        out.write_text(measuring.as_text(found), encoding="utf-8")
+        write_file(out, measuring.as_text(found))
         click.echo(f"{out}: {len(found.order)} channels; their errors are unknown")
         return
     settings = load(config)
@@ -70,7 +71,7 @@ def channels(measured: Path, out: Path, config: Path | None) -> None:
     except UnicodeDecodeError as error:
         raise UserError(f"{measured}: not UTF-8 text") from error
     fit = measuring.fitted(measuring.parse_responses(text), array, order)
-    out.write_text(measuring.as_text(fit.calibration), encoding="utf-8")
+    write_file(out, measuring.as_text(fit.calibration))
     click.echo(
         f"{out}: {array.size} channels; largest error in the measured directions"
         f" {fit.phase_deg:.2f} degrees and {fit.gain_db:.2f} dB, which reduces the guaranteed gain"

@@ -7,7 +7,17 @@ from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, INSECURE, JSON, LINKS, LISTEN, Progress, say
+from companion.cli.console import (
+    CENTER,
+    CONFIG,
+    INSECURE,
+    JSON,
+    LINKS,
+    LISTEN,
+    FiniteRange,
+    Progress,
+    say,
+)
 from companion.values import UserError
 
 
@@ -20,7 +30,7 @@ from companion.values import UserError
 @INSECURE
 @click.option(
     "--seconds",
-    type=click.FloatRange(min=0, max=3600),
+    type=FiniteRange(min=0, max=3600),
     default=10.0,
     help="Seconds to listen for traffic; 0: do not listen.",
 )

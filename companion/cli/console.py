@@ -1,6 +1,7 @@
 """Options that the commands share, one-line errors on stderr, and progress on a terminal."""
 
 import errno
+import math
 import shutil
 import sys
 import time
@@ -13,10 +14,25 @@ from typing import Any, Final, NoReturn
 import click
 
 from companion.cli.interrupts import INTERRUPTED, command_ended, interrupts_raised
-from companion.values import UserError, printable
+from companion.values import UserError, printable, shown
 
 LOG_EVERY_S: Final = 10.0  # time between two progress lines without a terminal
 CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings file (TOML).")
+
+
+class FiniteRange(click.FloatRange):
+    """Option that is a finite number in a range: ``click.FloatRange`` lets NaN pass."""
+
+    def convert(
+        self, value: Any, param: click.Parameter | None, ctx: click.Context | None
+    ) -> float:
+        """Return the number, or fail with the option's name."""
+        found = super().convert(value, param, ctx)
+        if not math.isfinite(found):
+            self.fail(f"{shown(str(value))} is not a finite number", param, ctx)
+        return float(found)
+
+
 CENTER = click.option(
     "--center",
     metavar="SRC",
@@ -30,7 +46,7 @@ SEED = click.option(
     "--seed", type=click.IntRange(min=0), default=1, help="Seed of the random numbers."
 )
 SECONDS = click.option(
-    "--seconds", type=click.FloatRange(min=0, min_open=True), help="Stop after this many seconds."
+    "--seconds", type=FiniteRange(min=0, min_open=True), help="Stop after this many seconds."
 )
 LINKS = click.option(
     "--link",
@@ -49,7 +65,7 @@ LATENCY = click.option(
     "--latency",
     "latency_s",
     metavar="S",
-    type=click.FloatRange(0, 60),
+    type=FiniteRange(0, 60),
     default=0.0,
     help="Seconds between a sample and its arrival, for onboard logs (.bin, .ulg, CSV), which"
     " contain no arrival times.",
@@ -144,7 +160,7 @@ class OneLineErrors(click.Group):
             self._end(str(error), 1)
         except OSError as error:
             where = f"{error.filename}: " if error.filename else ""
-            if error.errno == errno.ENOSPC and not where:
+            if error.errno in (errno.ENOSPC, errno.EFBIG, errno.EDQUOT) and not where:
                 where = "the output cannot be written: "
             self._end(f"{where}{error.strerror or error}", 1)
 

@@ -2,21 +2,28 @@
 
 import json
 from pathlib import Path
+from typing import Final
 
 import click
 
-from companion.cli.console import JSON
+from companion.cli.console import JSON, FiniteRange
+from companion.cli.output import write_file
 from companion.values import shown
+
+LARGEST: Final = 1e6  # largest number of an option, in its unit
 
 
 def numbers(text: str) -> list[float]:
     """Parse an option's numbers, separated by commas."""
     try:
-        return [float(part) for part in text.split(",")]
+        found = [float(part) for part in text.split(",")]
     except ValueError as error:
         raise click.BadParameter(
             f"{shown(text)} is not a list of numbers such as 0.1,0.5"
         ) from error
+    if max(map(abs, found)) > LARGEST:
+        raise click.BadParameter(f"{shown(text)}: a number is larger than {LARGEST:g}")
+    return found
 
 
 def _alpha(text: str) -> float | None:
@@ -49,7 +56,7 @@ def _alpha(text: str) -> float | None:
     help="Position model: direct effect of the velocity on a report, in seconds.",
 )
 @click.option(
-    "--mu-max", type=click.FloatRange(min=0), help="Largest accepted mu; kinematic model: in m^2."
+    "--mu-max", type=FiniteRange(min=0), help="Largest accepted mu; kinematic model: in m^2."
 )
 @click.option(
     "--method",
@@ -109,6 +116,8 @@ def design(
 
     if not dt and out is None:
         raise click.UsageError("give --dt, or --out for a gain table")
+    if max(map(abs, (feedthrough, acceleration, position_noise, velocity_noise))) > LARGEST:
+        raise click.UsageError(f"a number is larger than {LARGEST:g}")
     if model == "position":
         if out is not None:
             raise click.UsageError("--out works only with --model kinematic")
@@ -139,7 +148,7 @@ def design(
             if not out.parent.is_dir():  # reported before the long work, not after it
                 raise click.UsageError(f"{out}: directory {out.parent} does not exist; create it")
             designed = answers.table(dt_range, motion)
-            out.write_text(designed.to_json(), encoding="utf-8")
+            write_file(out, designed.to_json())
             click.echo(f"wrote {out}: {answers.described(designed)}", err=True)
     if as_json:
         click.echo(json.dumps(rows))

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from companion.cli.console import CONFIG, SECONDS, InterruptedByUser
+from companion.cli.console import CONFIG, SECONDS, FiniteRange, InterruptedByUser
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 @click.option(
     "--rate",
     "update_hz",
-    type=click.FloatRange(0.1, 1000),
+    type=FiniteRange(0.1, 1000),
     default=10.0,
     help="Updates per second sent to the device.",
 )

@@ -5,6 +5,7 @@ from pathlib import Path
 import click
 
 from companion.cli.console import CONFIG
+from companion.cli.output import write_file
 
 
 @click.command()
@@ -44,5 +45,5 @@ def beams(form: str, out: Path | None, config: Path | None) -> None:
     if out is None:
         click.echo(text, nl=False)
     else:
-        out.write_text(text, encoding="utf-8")
+        write_file(out, text)
         click.echo(f"{out}: {equipment.codebook.size} beams of {array.size} ports")

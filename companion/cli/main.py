@@ -45,6 +45,8 @@ from companion.cli.study import study
 from companion.cli.weights import weights
 from companion.values import UserError, shown
 
+SLOWEST = 0.001  # slowest replay: of a minute in 17 hours
+
 if TYPE_CHECKING:
     from companion.node.start import Console
     from companion.recording.writer import Writer
@@ -278,9 +280,10 @@ def _speed(text: str) -> float | None:
         factor = float(text)
     except ValueError:
         factor = 0.0
-    if not 0 < factor < float("inf"):
+    if not SLOWEST <= factor < float("inf"):
         raise click.BadParameter(
-            f"{shown(text)} is neither max nor a positive number", param_hint="'--speed'"
+            f"{shown(text)} is neither max nor a number of at least {SLOWEST}",
+            param_hint="'--speed'",
         )
     return factor
 

@@ -4,7 +4,7 @@ import time
 
 import click
 
-from companion.cli.console import SEED, Progress
+from companion.cli.console import SEED, FiniteRange, Progress
 from companion.cli.study_output import Studied, study_output
 from companion.values import shown
 
@@ -50,19 +50,19 @@ def _steps(span: tuple[int, int], steps: int) -> list[int]:
     help="Number of fleet sizes between FROM and TO.",
 )
 @click.option(
-    "--seconds", type=click.FloatRange(1, 3600), default=10.0,
+    "--seconds", type=FiniteRange(1, 3600), default=10.0,
     help="Simulated seconds for each fleet size.",
 )  # fmt: skip
 @click.option(
-    "--spacing", type=click.FloatRange(10, 1e5), default=1500.0,
+    "--spacing", type=FiniteRange(10, 1e5), default=1500.0,
     help="Metres between nodes on a square grid; each receives UAVs within 2500 m.",
 )  # fmt: skip
 @click.option(
-    "--delay", type=click.FloatRange(0, 5), default=0.02,
+    "--delay", type=FiniteRange(0, 5), default=0.02,
     help="Delay between two nodes, seconds.",
 )  # fmt: skip
 @click.option(
-    "--loss", type=click.FloatRange(0, 0.9), default=0.02,
+    "--loss", type=FiniteRange(0, 0.9), default=0.02,
     help="Fraction of the messages between nodes that is lost.",
 )  # fmt: skip
 @SEED

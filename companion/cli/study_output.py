@@ -10,6 +10,7 @@ from typing import Any
 import click
 
 from companion.cli.console import JSON, Progress, make_folder, print_truncated
+from companion.cli.output import write_file
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,9 +44,9 @@ def study_output(name: str) -> Callable[[Callable[..., Studied]], Callable[..., 
             make_folder(out)
             studied = study(progress=progress, **options)
             written = json.dumps(studied.answer, indent=1)
-            (out / f"{name}.json").write_text(written, encoding="utf-8")
+            write_file(out / f"{name}.json", written)
             for file, content in studied.report().items():
-                (out / file).write_bytes(content)
+                write_file(out / file, content)
             progress.clear()
             click.echo(json.dumps(studied.answer) if as_json else studied.text())
             studied.at_end()

@@ -1,13 +1,21 @@
 """The command ``companion weights``: weights at a time of a log, for a program or a device."""
 
 import json
-import math
 import sys
 from pathlib import Path
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, LATENCY, LOGS, Progress, print_log_notices
+from companion.cli.console import (
+    CENTER,
+    CONFIG,
+    LATENCY,
+    LOGS,
+    FiniteRange,
+    Progress,
+    print_log_notices,
+)
+from companion.cli.output import write_file
 from companion.values import WeightFormat
 
 
@@ -28,7 +36,7 @@ from companion.values import WeightFormat
 )
 @click.option(
     "--lead-ms",
-    type=click.FloatRange(0, 10_000),
+    type=FiniteRange(0, 10_000),
     default=0.0,
     help="Milliseconds after T for which the beams are computed.",
 )
@@ -62,8 +70,6 @@ def weights(
     from companion.pipeline import assembly
     from companion.views import beam_state, weight_formats
 
-    if math.isnan(lead_ms):
-        raise click.UsageError("--lead-ms nan: must be 0 to 10000")
     if form in ("npy", "raw") and out is None and sys.stdout.isatty():
         raise click.UsageError(f"--format {form} is binary: give --out FILE, or use a pipe")
     if out is not None and not out.parent.is_dir():
@@ -96,4 +102,4 @@ def weights(
     if out is None:
         click.echo(body, nl=False)
     else:
-        out.write_bytes(body)
+        write_file(out, body)

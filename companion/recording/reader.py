@@ -18,7 +18,7 @@ from typing import IO, Final, Literal, NamedTuple, cast
 from google.protobuf.message import DecodeError
 from mcap.records import Attachment, Metadata
 
-from companion.mavlink.links.regular_file import open_regular
+from companion.mavlink.links.regular_file import NotRegularError, open_regular
 from companion.mavlink.wire.framing import is_shaped
 from companion.recording import codec, schemas, tlog
 from companion.recording.container import MAGIC, Damage, Message, Walk
@@ -228,6 +228,8 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
             data = _whole(file)
     except FileNotFoundError:
         raise LogError(f"{path}: no such file") from None
+    except NotRegularError as error:
+        raise LogError(f"{path}: {error.strerror}") from None
     except IsADirectoryError:
         raise LogError(f"{path}: is a folder; name the logs in it") from None
     except OSError as error:

@@ -9,6 +9,7 @@ import time
 from pathlib import Path
 
 import click
+import numpy as np
 import pytest
 from click.testing import CliRunner
 from support import BIN, HANG_S, ROOT, started
@@ -103,6 +104,7 @@ def test_every_user_facing_error_is_a_user_error() -> None:
         "CutShortError",  # ends the connection: the answer has begun
         "ServiceError",  # client side: the service's error response
         "InterruptedByUser",  # Ctrl-C
+        "NotRegularError",  # an OSError: becomes the UserError that names the file
         "HungUpError",  # an orderly end of a connection: the link retries or ends
         "BusyError",  # a request is refused with a 409
         "PlaybackError",  # the same
@@ -201,3 +203,53 @@ def test_script_and_module_entry_points_are_equal() -> None:
         subprocess.run(module, capture_output=True, check=True, timeout=HANG_S).stdout
         == by_name.stdout
     )
+
+
+@pytest.mark.parametrize("closed", ["<&-", ">&-", "2>&-", "<&- >&- 2>&-"])
+def test_closed_standard_streams_are_the_null_device(
+    closed: str, cut_log: Path, tmp_path: Path
+) -> None:
+    """A file that is opened next would otherwise take a closed stream's number."""
+    out = tmp_path / "weights.npy"
+    command = f"'{BIN / 'companion'}' weights '{cut_log}' --center 5:1 --at 2 --format npy"
+    done = subprocess.run(
+        f"{command} --out '{out}' {closed} && {command} {closed}",
+        check=False,
+        shell=True,
+        capture_output=True,
+        timeout=HANG_S,
+    )
+    assert done.returncode == 0
+    assert b"Traceback" not in done.stderr
+    assert np.load(out).shape[0] == 64
+
+
+def test_earlier_file_is_kept_if_the_new_one_cannot_be_written(tmp_path: Path) -> None:
+    out = tmp_path / "design.json"
+    command = "design --model kinematic --dt-range 0.1,0.2"
+    made = f"'{BIN / 'companion'}' {command} --out '{out}'"
+    subprocess.run(made, shell=True, check=True, capture_output=True, timeout=HANG_S)
+    earlier = out.read_bytes()
+    limited = f"ulimit -f 1; trap '' XFSZ; {made} --acceleration 7"
+    done = subprocess.run(
+        ["bash", "-c", limited], check=False, capture_output=True, text=True, timeout=HANG_S
+    )
+    assert done.returncode == 1
+    assert done.stderr == f"companion: {out}: cannot be written: File too large\n"
+    assert out.read_bytes() == earlier
+    assert [one.name for one in tmp_path.iterdir()] == [out.name]
+
+
+@pytest.mark.parametrize("form", ["csv", "parquet"])
+def test_export_to_a_full_disk_is_one_line(form: str, cut_log: Path, tmp_path: Path) -> None:
+    pytest.importorskip("pyarrow")
+    export = f"export '{cut_log}' --center 5:1 --format {form} --out '{tmp_path / 'out'}'"
+    limited = f"ulimit -f 8; trap '' XFSZ; '{BIN / 'companion'}' {export}"
+    done = subprocess.run(
+        ["bash", "-c", limited], check=False, capture_output=True, text=True, timeout=HANG_S
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1:] == [
+        "companion: the output cannot be written: File too large"
+    ]
+    assert "Traceback" not in done.stderr

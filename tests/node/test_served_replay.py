@@ -210,7 +210,7 @@ def test_live_service_has_no_replay_status(start_node: Any) -> None:
     [
         (("--listen", "127.0.0.1:0"), "need --serve"),
         (("--serve", "--listen", "0.0.0.0:0"), "--insecure"),
-        (("--serve", "--speed", "0"), "'0' is neither max nor a positive number"),
+        (("--serve", "--speed", "0"), "'0' is neither max nor a number of at least 0.001"),
     ],
 )
 def test_command_error_is_one_line_and_leaves_no_files(

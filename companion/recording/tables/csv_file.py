@@ -35,6 +35,9 @@ class CsvFile:
         self._text.flush()
         self._text.detach()
 
+    def abandon(self) -> None:
+        """Write nothing more; rows that wait are dropped."""
+
 
 def utc(t_ns: Value) -> str | None:
     """Return a time as ``2026-11-20T13:00:00.123456``; None if unknown or outside the calendar."""

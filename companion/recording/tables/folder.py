@@ -27,6 +27,7 @@ class TableFile(Protocol):
 
     def add(self, row: Sequence[Value]) -> None: ...
     def finish(self) -> None: ...
+    def abandon(self) -> None: ...
 
 
 FORMATS: Final[dict[str, Callable[[IO[bytes], Table], TableFile]]] = {
@@ -96,6 +97,9 @@ class TableFolder:
 
     def abandon(self) -> None:
         """Remove the files written so far, except those already renamed."""
+        if self._open:
+            for table in self._files.values():
+                table.abandon()
         for name in self._open:
             self._active(self._name(name)).unlink(missing_ok=True)
         if self._open:

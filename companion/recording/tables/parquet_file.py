@@ -53,6 +53,10 @@ class ParquetFile:
         self._write()
         self._writer.close()
 
+    def abandon(self) -> None:
+        """Write nothing more: the writer would otherwise end its file when it is collected."""
+        self._writer.is_open = False
+
     def _write(self) -> None:
         if not self._waiting:
             return

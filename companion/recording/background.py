@@ -271,7 +271,7 @@ class BackgroundRecorder:
         large = size_bytes is not None and self.bytes >= size_bytes
         old = after_s is not None and time.monotonic() - self._begun_s >= after_s
         if self._writer.flushed and (large or old):
-            self._writer.close({})
+            self._writer.close({}, is_continued=True)
             self._open_next()
 
     def _open_next(self) -> None:

@@ -18,6 +18,7 @@ from companion.recording.container import MAGIC, Walk
 from companion.values import UserError, printable
 
 PART: Final = "part"
+CONTINUED: Final = "continued"  # record of a part after which the run continues in another
 HOLE: Final = "hole"
 HOLES_MAX: Final = 1000
 """Limit on gaps that are listed one by one; further missing events are added to the last gap."""
@@ -90,10 +91,14 @@ def _whole(text: str) -> int:
 
 
 class RecordingInfo(NamedTuple):
-    """What a log states about itself: its part, if any, and the events missing from it."""
+    """What a log states about itself: its part, if any, and the events missing from it.
+
+    ``is_continued``: the run continues in another part.
+    """
 
     part: Part | None
     holes: tuple[Hole, ...]
+    is_continued: bool = False
 
 
 def read_recording_info(path: Path) -> RecordingInfo:
@@ -106,16 +111,19 @@ def read_recording_info(path: Path) -> RecordingInfo:
             return RecordingInfo(None, ())
     part: Part | None = None
     holes: list[Hole] = []
+    is_continued = False
     for record in Walk(path, frozenset()):
         if isinstance(record, Metadata) and record.name == PART:
             part = Part.from_metadata(record.metadata)
+        elif isinstance(record, Metadata) and record.name == CONTINUED:
+            is_continued = True
         elif isinstance(record, Metadata) and record.name == HOLE:
             hole = Hole.from_metadata(record.metadata)
             if len(holes) == HOLES_MAX:
                 events = min(holes.pop().events + hole.events, EVENTS_MAX)
                 hole = hole._replace(events=events)
             holes.append(hole)
-    return RecordingInfo(part, tuple(holes))
+    return RecordingInfo(part, tuple(holes), is_continued)
 
 
 def in_order(infos: Mapping[Path, RecordingInfo]) -> list[Path] | None:
@@ -150,4 +158,6 @@ def missing(infos: Mapping[Path, RecordingInfo], ordered: Sequence[Path]) -> lis
         for hole in info.holes:
             at = datetime.fromtimestamp(hole.t_ns * 1e-9, tz=UTC).isoformat(timespec="seconds")
             lines.append(f"{path}: {hole.events} events before {at} are missing: {hole.why}")
+    if ordered and infos[ordered[-1]].is_continued:
+        lines.append(f"{ordered[-1]}: the parts of the run after it are missing")
     return lines

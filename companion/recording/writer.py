@@ -20,7 +20,7 @@ from companion.recording import schemas
 from companion.recording.entries import Encoder, Geodetic
 from companion.recording.folders import RECORDING_MODE
 from companion.recording.mcap_file import McapFile
-from companion.recording.parts import HOLE, PART, Hole, Part
+from companion.recording.parts import CONTINUED, HOLE, PART, Hole, Part
 from companion.recording.scene import Scene
 from companion.values import Event, Output
 
@@ -160,15 +160,18 @@ class Writer:
         self.size_bytes = self._file.tell()
         self.flushed = self.messages
 
-    def close(self, metadata: Mapping[str, str]) -> Path:
+    def close(self, metadata: Mapping[str, str], *, is_continued: bool = False) -> Path:
         """Finish and rename the file; write ``metadata``, if any, as its record ``summary``.
 
-        Returns the file's path. Closing twice does nothing.
+        ``is_continued``: the run continues in another part, which is noted. Returns the file's
+        path. Closing twice does nothing.
         """
         if self._finished:
             return self._final
         if metadata:
             self._mcap.metadata(SUMMARY, metadata)
+        if is_continued:
+            self._mcap.metadata(CONTINUED, {})
         self._mcap.finish()
         self._file.flush()
         os.fsync(self._file.fileno())

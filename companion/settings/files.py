@@ -9,10 +9,11 @@ from typing import Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ValidationError
 
 from companion.mavlink.links.regular_file import open_regular
 from companion.settings.beams import ArraySettings
-from companion.settings.model import DESIGN, NAMED_FILES, NamedFile, Settings
+from companion.settings.model import DESIGN, NAMED_FILES, NamedFile, Settings, first_error
 from companion.settings.origins import Origin, Origins, given, of_options
 from companion.settings.section import ConfigError
 from companion.tracking.design.gain_table import KinematicDesign
@@ -67,7 +68,10 @@ def _with_positions(settings: Settings) -> Settings:
     rows = [tuple(row) for row in numbers_file("array.positions", named, 3).tolist()]
     given = settings.array.model_dump(mode="json", exclude_unset=True, exclude={"positions"})
     array = {**given, "positions_m": rows}
-    return settings.model_copy(update={"array": ArraySettings.model_validate(array)})
+    try:
+        return settings.model_copy(update={"array": ArraySettings.model_validate(array)})
+    except ValidationError as error:
+        raise ConfigError(f"array.positions = {named!r}: {first_error(error)}") from error
 
 
 def numbers_file(key: str, name: str, columns: int) -> FloatArray:

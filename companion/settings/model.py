@@ -159,7 +159,7 @@ class Settings(Section):
         try:
             return cls.model_validate(found)
         except ValidationError as error:
-            raise ConfigError(f"{where}: {_first(error)}") from error
+            raise ConfigError(f"{where}: {first_error(error)}") from error
 
     @property
     def files(self) -> Mapping[str, bytes]:
@@ -196,7 +196,7 @@ class Settings(Section):
         try:
             return Settings.model_validate(merged).with_files(files)
         except ValidationError as error:
-            raise ConfigError(_first(error)) from error
+            raise ConfigError(first_error(error)) from error
 
 
 def _former_files(found: dict[str, Any], where: str) -> dict[str, bytes]:
@@ -273,7 +273,7 @@ def _keys(section: Section) -> list[str]:
     return list(type(section).model_fields)
 
 
-def _first(error: ValidationError) -> str:
+def first_error(error: ValidationError) -> str:
     """Return the first error of invalid settings as one line: key, value, allowed values.
 
     A key with several allowed types has one error per type; the line contains all of them.

@@ -481,5 +481,7 @@ def test_new_part_continues_where_the_previous_ends(tmp_path: Path, rotation: Ro
     assert read_metadata(logs[2])["summary"] == {"digest": "last"}
     assert "summary" not in read_metadata(logs[0])
     assert missing([logs[0], logs[2]]) == [f"{logs[2]}: part 2 of the run is missing"]
+    assert missing(logs) == []
+    assert missing(logs[:2]) == [f"{logs[1]}: the parts of the run after it are missing"]
     assert made.messages == 300 and made.news() == []
     assert all(a < b for a, b in pairwise(event.t_ns for event in events))

@@ -23,7 +23,14 @@ from companion.values import Event, Tick
 START_NS = 1_700_000_000_000_000_000
 
 
-def write(path: Path, part: Part | None, events: list[Event], hole: Hole | None = None) -> Path:
+def write(
+    path: Path,
+    part: Part | None,
+    events: list[Event],
+    hole: Hole | None = None,
+    *,
+    is_continued: bool = False,
+) -> Path:
     writer = Writer(
         where=path,
         settings_toml=Settings().to_toml(),
@@ -36,7 +43,7 @@ def write(path: Path, part: Part | None, events: list[Event], hole: Hole | None 
         writer.hole(hole)
     for event in events:
         writer.event(event)
-    return writer.close({})
+    return writer.close({}, is_continued=is_continued)
 
 
 @pytest.fixture
@@ -51,7 +58,8 @@ def run_of_three_parts(tmp_path: Path, short_log: Path) -> tuple[list[Path], lis
     third = len(events) // 3
     for name, piece in (("c", events[:third]), ("a", events[third : 2 * third]), ("b", [])):
         rest = piece or events[2 * third :]
-        logs.append(write(tmp_path / f"{name}.mcap", part, rest))
+        path = tmp_path / f"{name}.mcap"
+        logs.append(write(path, part, rest, is_continued=name != "b"))
         part = part.after(f"{name}.mcap")
     return logs, events, pipeline.digest.hexdigest()
 
@@ -86,7 +94,7 @@ def test_recovered_part_keeps_its_position_in_the_run(
     logs, events, _ = run_of_three_parts
     cut = tmp_path / "d.mcap.active"
     cut.write_bytes(logs[1].read_bytes()[:-400])
-    assert read_recording_info(recover(cut).path) == read_recording_info(logs[1])
+    assert read_recording_info(recover(cut).path).part == read_recording_info(logs[1]).part
     assert list(log_events([logs[0], tmp_path / "d.mcap", logs[2]], Settings())) == events
 
 
@@ -94,10 +102,12 @@ def test_missing_parts_are_reported(
     run_of_three_parts: tuple[list[Path], list[Event], str],
 ) -> None:
     one, two, three = run_of_three_parts[0]
-    assert missing_of([one, two]) == []  # a missing last part cannot be detected
+    assert missing_of([one, two, three]) == []
+    assert missing_of([one, two]) == [f"{two}: the parts of the run after it are missing"]
     assert missing_of([one, three]) == [f"{three}: part 2 of the run is missing"]
     assert missing_of([three]) == [f"{three}: part 1 to 2 of the run is missing"]
     assert missing_of([three, two]) == [f"{two}: part 1 of the run is missing"]
+    assert len(missing_of([two])) == 2
 
 
 def test_gap_is_reported_with_its_time_and_event_count(tmp_path: Path) -> None:

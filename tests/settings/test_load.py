@@ -431,6 +431,16 @@ def test_element_positions_are_read_into_the_settings(
     assert assembly.array(found).elements_m == pytest.approx(np.array(rows))
 
 
+@pytest.mark.parametrize("rows", ["0,0,0\n" * 5000, "0,0,1e300\n0,0,0\n"], ids=["many", "far"])
+def test_impossible_positions_in_a_file_are_one_line(rows: str, tmp_path: Path) -> None:
+    (tmp_path / "p.csv").write_text(rows)
+    config = tmp_path / "settings.toml"
+    config.write_text(f'[array]\nkind = "list"\npositions = "{tmp_path / "p.csv"}"\n')
+    with pytest.raises(ConfigError, match=r"array\.positions = '.*p\.csv'") as error:
+        load(config)
+    assert "\n" not in str(error.value) and len(str(error.value)) < 400
+
+
 def test_pipe_in_place_of_settings_is_not_opened(tmp_path: Path) -> None:
     """It would be waited for without end, and silently. Nor is one that the settings name."""
     pipe, good = tmp_path / "pipe", tmp_path / "good.toml"

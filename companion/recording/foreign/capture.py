@@ -12,7 +12,7 @@ from typing import Final
 
 from companion.mavlink.wire.framing import Checker, Splitter
 from companion.recording.container import Message, Walk
-from companion.recording.foreign.packets import Segment, Skipped, packets, segment
+from companion.recording.foreign.packets import Fragment, Segment, Skipped, packets, segment
 from companion.recording.stamps import STEP_HOLD_NS, RepairedStamps
 from companion.recording.tlog import feed_in_pieces
 from companion.values import Event, Frame, Reason, Rejection
@@ -33,7 +33,7 @@ def read_capture(path: Path) -> Iterator[Event]:
     nothing. Raises ``OSError`` if the file cannot be read.
     """
     flows: OrderedDict[str, _Flow] = OrderedDict()
-    waiting_bytes = 0
+    waiting_bytes = fragment_bytes = 0
     checker = Checker()
     timeline: RepairedStamps | None = None
     with path.open("rb") as file:
@@ -45,6 +45,9 @@ def read_capture(path: Path) -> Iterator[Event]:
                 )
                 continue
             found = segment(packet)
+            if isinstance(found, Fragment):
+                fragment_bytes += found.size_bytes
+                continue
             if found is None or not (found.payload or found.tcp_syn):
                 continue
             if timeline is None:
@@ -66,8 +69,17 @@ def read_capture(path: Path) -> Iterator[Event]:
                     yield _bad_stamp(timeline.t_ns, found.flow, off_ns)
                 off_ns = None
                 yield event
+    t_ns = 0 if timeline is None else timeline.t_ns
     for flow in flows.values():
-        yield from flow.finish(0 if timeline is None else timeline.t_ns)
+        yield from flow.finish(t_ns)
+    if fragment_bytes:
+        yield _lost(t_ns, path.name, fragment_bytes, "fragments of IP packets")
+
+
+def _lost(t_ns: int, source: str, size_bytes: int, detail: str) -> Rejection:
+    return Rejection(
+        t_ns=t_ns, source=source, reason=Reason.GARBAGE, count=size_bytes, detail=detail
+    )
 
 
 def _bad_stamp(t_ns: int, link: str, off_ns: int) -> Rejection:
@@ -83,6 +95,8 @@ class _Flow:
         self._splitter = Splitter.sharing(checker, name)
         self._next: int | None = None
         self._ahead: dict[int, bytes] = {}
+        self._name = name
+        self._missing_bytes = 0
 
     @property
     def waiting_bytes(self) -> int:
@@ -96,12 +110,17 @@ class _Flow:
                 yield event
 
     def finish(self, t_ns: int) -> Iterator[Frame | Rejection]:
-        """Yield the remaining frames when the flow ends."""
-        for seq in sorted(self._ahead):
-            yield from self.frames(t_ns, self._ahead.pop(seq))
+        """Yield the remaining frames when the flow ends, and what the capture lacks of it."""
+        for seq in sorted(self._ahead, key=self._distance):
+            self._note_gap(seq)
+            data = self._ahead.pop(seq)
+            self._next = (seq + len(data)) & 0xFFFF_FFFF
+            yield from self.frames(t_ns, data)
         last = self._splitter.finish(t_ns)
         if self._splitter.frames:
             yield from last
+            if self._missing_bytes:
+                yield _lost(t_ns, self._name, self._missing_bytes, "missing in the capture")
 
     def in_order(self, found: Segment) -> bytes:
         """Return the next bytes in TCP order: repeated ones are dropped, later ones wait."""
@@ -117,7 +136,9 @@ class _Flow:
         if len(found.payload) > len(self._ahead.get(seq, b"")):
             self._ahead[seq] = found.payload
         if len(self._ahead) > _AHEAD_MAX and not self._ready():
-            self._next = min(self._ahead, key=self._distance)
+            first = min(self._ahead, key=self._distance)
+            self._note_gap(first)
+            self._next = first
         handed = []
         while ready := self._ready():
             first = min(ready, key=self._distance)
@@ -125,6 +146,10 @@ class _Flow:
             handed.append(fresh)
             self._next = (self._next + len(fresh)) & 0xFFFF_FFFF
         return b"".join(handed)
+
+    def _note_gap(self, seq: int) -> None:
+        """Count the bytes before a segment that the capture lacks."""
+        self._missing_bytes += max(0, self._distance(seq))
 
     def _ready(self) -> list[int]:
         return [seq for seq in self._ahead if self._distance(seq) <= 0]

@@ -1,8 +1,8 @@
 """Packets of a network capture: pcap, pcapng; Ethernet and similar links; IPv4, IPv6; UDP, TCP.
 
 Formats: draft-ietf-opsawg-pcap, draft-ietf-opsawg-pcapng; link types by
-https://www.tcpdump.org/linktypes.html. Truncated packets and fragments return their available part
-or nothing; no length in a packet is trusted.
+https://www.tcpdump.org/linktypes.html. Truncated packets return their available part or nothing,
+fragments their size; no length in a packet is trusted.
 """
 
 import os
@@ -31,6 +31,7 @@ _VLANS: Final = frozenset((0x8100, 0x88A8, 0x9100))
 _UDP: Final = 17
 _TCP: Final = 6
 _V6_EXTENSIONS: Final = frozenset((0, 43, 60))
+_V6_FRAGMENT: Final = 44
 
 
 class Packet(NamedTuple):
@@ -39,6 +40,12 @@ class Packet(NamedTuple):
     t_ns: int
     link_type: int
     data: bytes
+
+
+class Fragment(NamedTuple):
+    """Fragment of an IP packet, which is not put together with the others; bytes of its payload."""
+
+    size_bytes: int
 
 
 class Segment(NamedTuple):
@@ -166,8 +173,8 @@ def _packet(
 # --- contents of a packet -------------------------------------------------------------------------
 
 
-def segment(packet: Packet) -> Segment | None:
-    """Return the UDP or TCP payload of a packet; None for anything else."""
+def segment(packet: Packet) -> Segment | Fragment | None:
+    """Return the UDP or TCP payload of a packet, or its fragment; None for anything else."""
     data, at = packet.data, _network(packet)
     if at is None or at >= len(data):
         return None
@@ -197,20 +204,22 @@ def _network(packet: Packet) -> int | None:
     return None
 
 
-def _v4(data: bytes, at: int) -> Segment | None:
+def _v4(data: bytes, at: int) -> Segment | Fragment | None:
     if len(data) < at + 20:
         return None
     header = (data[at] & 0x0F) * 4
     length = int.from_bytes(data[at + 2 : at + 4], "big")
     fragment = int.from_bytes(data[at + 6 : at + 8], "big") & 0x3FFF
-    if header < 20 or fragment:  # fragments are not reassembled
+    if header < 20:
         return None
+    if fragment:
+        return Fragment(max(0, length - header))
     end = at + length if header <= length else len(data)  # 0: set later by the network card
     source, target = (".".join(map(str, data[at + n : at + n + 4])) for n in (12, 16))
     return _transport(data[:end], at + header, data[at + 9], source, target)
 
 
-def _v6(data: bytes, at: int) -> Segment | None:
+def _v6(data: bytes, at: int) -> Segment | Fragment | None:
     if len(data) < at + 40:
         return None
     length, following = int.from_bytes(data[at + 4 : at + 6], "big"), data[at + 6]
@@ -219,6 +228,8 @@ def _v6(data: bytes, at: int) -> Segment | None:
     at += 40
     while following in _V6_EXTENSIONS and at + 8 <= len(data):
         following, at = data[at], at + 8 + data[at + 1] * 8
+    if following == _V6_FRAGMENT:
+        return Fragment(max(0, end - at - 8))
     return _transport(data[:end], at, following, source, target)
 
 

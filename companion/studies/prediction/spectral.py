@@ -39,7 +39,8 @@ def array_from_local(truly: FloatArray) -> FloatArray:
 
 def gains(array: Array, towards: FloatArray, truly: FloatArray) -> FloatArray:
     """Return g (K,) of matched beams along ``towards`` for UAVs along ``truly``, (K, 3) each."""
-    u, v = (way / np.linalg.norm(way, axis=1, keepdims=True) for way in (truly, towards))
+    with np.errstate(invalid="ignore"):  # a UAV at the array has no direction, and no gain
+        u, v = (way / np.linalg.norm(way, axis=1, keepdims=True) for way in (truly, towards))
     seen = np.einsum("kij,kj->ki", array_from_local(u), v)
     at = steering_matrix(array, np.array([[1.0, 0.0, 0.0]]))[:, 0]
     found = np.zeros(len(seen))

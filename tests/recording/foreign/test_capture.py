@@ -190,19 +190,36 @@ def test_missing_tcp_segment_loses_only_its_frames(tmp_path: Path) -> None:
     packed = [tcp(b"", 999, 0x02), *(tcp(part, 1000 + at) for at, part in parts)]
     found = events_of(pcap([(START_NS, LINKS[1](v4(each, 6))) for each in packed]), tmp_path)
     assert lost and len(FRAMES) * 20 - 12 <= len(raws(found)) < len(FRAMES) * 20
+    rejected = [event for event in found if isinstance(event, Rejection)]
+    (gap,) = [one for one in rejected if one.detail == "missing in the capture"]
+    assert gap.count == len(lost[1])
 
 
 def test_capture_without_mavlink_is_rejected(tmp_path: Path) -> None:
     rng = random.Random(5)
     others = [(START_NS, LINKS[1](v4(udp(rng.randbytes(300), (53, 4000))))) for _ in range(50)]
-    fragments = [(START_NS, LINKS[1](v4(udp(FRAMES[0]), fragment=0x2000)))] * 5
     icmp = [(START_NS, LINKS[1](v4(b"\x08" + bytes(30), kind=1)))] * 5
-    found = events_of(pcap([*others, *fragments, *icmp, *rows()]), tmp_path)
+    found = events_of(pcap([*others, *icmp, *rows()]), tmp_path)
     assert raws(found) == FRAMES and len(found) == len(FRAMES)
     path = tmp_path / "quiet"
     path.write_bytes(pcap(others))
     with pytest.raises(LogError, match="a capture, but no MAVLink frame in it"):
         read_log(path)
+
+
+@pytest.mark.parametrize("version", [4, 6])
+def test_fragments_of_packets_are_counted(version: int, tmp_path: Path) -> None:
+    """They are not put together: datagrams of frames are small, and others do not matter."""
+    body = udp(FRAMES[0])
+    if version == 4:
+        ip = v4(body, fragment=0x2000)
+    else:
+        ip = v6(struct.pack(">2BHI", 17, 0, 1, 7) + body, kind=44)
+    fragments = [(START_NS, LINKS[1](ip))] * 5
+    *frames, lost = events_of(pcap([*fragments, *rows()]), tmp_path)
+    assert raws(frames) == FRAMES
+    assert isinstance(lost, Rejection) and lost.detail == "fragments of IP packets"
+    assert (lost.reason, lost.count) == (Reason.GARBAGE, 5 * len(body))
 
 
 def test_truncated_capture_is_read_up_to_the_cut(tmp_path: Path) -> None:

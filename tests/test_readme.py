@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 import yaml
-from support import BIN, HANG_S, ROOT, Node, end, line_of, started
+from support import BIN, HANG_S, ROOT, Node, end, line_of, shared_log, started
 
 from companion.settings.model import Settings
 from tests.cli.test_calibrate_mount import recorded
@@ -67,7 +67,9 @@ def study(words: list[str], where: Path, studied: Callable[..., Path]) -> None:
     """Run a study as in the README except for the report's path; once per session."""
     *asked, out, place = words[2:]
     assert (out, place) == ("--out", "report")
-    log = str(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog")
+    short = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    # The compass is studied after 50 s in the air.
+    log = str(shared_log("sitl_4circle_wander.tlog") if asked[0] == "compass" else short)
     made = studied(*(log if word == "flight.tlog" else word for word in asked))
     assert (made / f"{asked[0]}.html").exists()
 

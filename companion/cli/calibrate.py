@@ -67,10 +67,13 @@ def channels(measured: Path, out: Path, config: Path | None) -> None:
     before = assembly.calibration(settings, array.size)
     order = range(array.size) if before is None else before.order
     try:
-        text = read_file(measured).decode()
+        text = read_file(measured).decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise UserError(f"{measured}: not UTF-8 text") from error
-    fit = measuring.fitted(measuring.parse_responses(text), array, order)
+    try:
+        fit = measuring.fitted(measuring.parse_responses(text), array, order)
+    except UserError as error:
+        raise UserError(f"{measured}: {error}") from error
     write_file(out, measuring.as_text(fit.calibration))
     click.echo(
         f"{out}: {array.size} channels; largest error in the measured directions"

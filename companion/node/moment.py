@@ -10,7 +10,7 @@ from companion.pipeline.fold import Pipeline
 from companion.recording import ends
 from companion.recording.reader import utc_offset_ns
 from companion.settings.model import Settings
-from companion.values import Update, UserError
+from companion.values import Update, UserError, shown
 
 PROGRESS_EVERY: Final = 20_000  # events between two calls of progress
 
@@ -85,7 +85,8 @@ def _time_ns(text: str, begins_ns: int, utc_offset_ns: int) -> int:
         then = datetime.fromisoformat(text)
     except ValueError as error:
         raise MomentError(
-            f"--at {text}: neither seconds from the start nor a time such as 2026-01-01T12:00:00Z"
+            f"--at {shown(text)}: neither seconds from the start nor a time such as"
+            " 2026-01-01T12:00:00Z"
         ) from error
     if then.tzinfo is None:
         raise MomentError(f"--at {text}: time zone is missing; append Z for UTC")

@@ -33,7 +33,7 @@ def load(path: Path | None) -> Settings:
     if path is None:
         return Settings()
     try:
-        text = read_file(path).decode()
+        text = read_file(path).decode("utf-8-sig")  # an editor may begin it with a mark
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -89,7 +89,8 @@ def _text_file(key: str, name: str) -> NDArray[Any]:
     data = _bytes(key, name)
     try:
         lines = (
-            line.split("#")[0].replace(",", " ").split() for line in data.decode().splitlines()
+            line.split("#")[0].replace(",", " ").split()
+            for line in data.decode("utf-8-sig").splitlines()
         )
         return np.array([[float(word) for word in line] for line in lines if line])
     except ValueError as error:
@@ -138,7 +139,7 @@ def text_of(settings: Settings, file: NamedFile) -> str | None:
     """
     data = _content(settings, file)
     try:
-        return None if data is None else data.decode()
+        return None if data is None else data.decode("utf-8-sig")
     except UnicodeDecodeError as error:
         raise ConfigError(f"{_where(settings, file)}: not UTF-8 text") from error
 

@@ -441,6 +441,12 @@ def test_impossible_positions_in_a_file_are_one_line(rows: str, tmp_path: Path) 
     assert "\n" not in str(error.value) and len(str(error.value)) < 400
 
 
+def test_mark_of_an_editor_is_no_part_of_the_settings(tmp_path: Path) -> None:
+    config = tmp_path / "settings.toml"
+    config.write_bytes(b"\xef\xbb\xbf[beams]\nupdate_hz = 7\n")
+    assert load(config).beams.update_hz == 7
+
+
 def test_pipe_in_place_of_settings_is_not_opened(tmp_path: Path) -> None:
     """It would be waited for without end, and silently. Nor is one that the settings name."""
     pipe, good = tmp_path / "pipe", tmp_path / "good.toml"

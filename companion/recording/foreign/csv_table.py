@@ -30,12 +30,12 @@ from companion.recording.foreign.onboard import (
     Onboard,
     OnboardPositions,
     body_rates_of,
+    earliest_us,
     on_earth,
     time_ordered,
     velocities_of,
 )
 from companion.recording.foreign.thinned import Thinned
-from companion.recording.stamps import LARGEST_LEAP_NS
 from companion.values import FloatArray, IntArray, Reason
 
 TIMES: Final = ("unix_s", "time", "t_s")
@@ -50,7 +50,8 @@ _ID_LIMITS: Final = {"sysid": 255, "compid": 255, "mav_type": 255}
 _AUTOPILOT_GENERIC: Final = 0
 _LINE_MAX: Final = 1 << 16
 _NOTICES_MAX: Final = 100
-_FIRST: Final = 9  # samples whose median tells whether the first stamps are plausible
+_NAME_MAX: Final = 40  # characters of the name of a column that are shown
+_NAMED_MAX: Final = 10  # columns that are not used and shown
 _RESOLUTION_S: Final = 1e-3
 
 
@@ -77,7 +78,10 @@ def read(text: bytes | Bytes) -> Onboard:
     rows, bad = _rows(lines, header, used, timed)
     table = dict(zip([name for _, name in used], rows.T, strict=True))
     lost = {Reason.MALFORMED: bad} if bad else {}
-    notes = [f"column not used: {name}" for name in names if name and name not in COLUMNS]
+    unused = [name for name in names if name and name not in COLUMNS]
+    notes = [f"column not used: {name[:_NAME_MAX]}" for name in unused[:_NAMED_MAX]]
+    if len(unused) > _NAMED_MAX:
+        notes.append(f"{len(unused) - _NAMED_MAX} more columns not used")
     found = _onboard(table, timed, said, lost, notes)
     rest = bytes(text[-_LINE_MAX:]).splitlines(keepends=True)[-1:]
     is_cut = bool(rest) and not rest[0].endswith((b"\n", b"\r"))
@@ -226,7 +230,7 @@ def _onboard(
 def _times(seconds: FloatArray, timed: str) -> tuple[IntArray, GpsTime | None]:
     sound = np.abs(seconds) < LAST_UNIX_US * 1e-6
     whole_us = np.round(np.where(sound, seconds, -1.0) * 1e6).astype(np.int64)
-    begin_us = _begin_us(whole_us[:_FIRST])
+    begin_us = earliest_us(whole_us)
     boot_us = np.where(sound, whole_us - begin_us + 1_000_000, -1)
     if timed == "t_s" or begin_us < FIRST_UNIX_US:
         return boot_us, None
@@ -234,14 +238,6 @@ def _times(seconds: FloatArray, timed: str) -> tuple[IntArray, GpsTime | None]:
     return boot_us, GpsTime(
         offset_us=offset_us, drift=0.0, at_us=0, uncertainty_s=_RESOLUTION_S, fixes=len(boot_us)
     )
-
-
-def _begin_us(first_us: IntArray) -> int:
-    """Return the earliest of the first stamps, but none that is far from most of them."""
-    if not len(first_us):
-        return 0
-    middle_us = np.median(first_us)
-    return int(first_us[np.abs(first_us - middle_us) <= LARGEST_LEAP_NS / 1000].min())
 
 
 Place = tuple[IntArray, IntArray, FloatArray]

@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 
 from companion.recording.foreign.gps_time import GpsTime
+from companion.recording.stamps import LARGEST_LEAP_NS
 from companion.values import BoolArray, FloatArray, IntArray, Reason
 
 REBOOT_US: Final = 10_000_000  # a larger step back of a boot clock is a reboot, not disorder
@@ -150,6 +151,15 @@ def time_ordered(boot_us: IntArray) -> tuple[IntArray, int]:
     fresh = np.ones(len(rows), dtype=bool)
     fresh[1:] = (np.diff(boot_us[rows]) != 0) | (np.diff(life[order]) != 0)
     return rows[fresh], int((~sound).sum())
+
+
+def earliest_us(stamps_us: IntArray) -> int:
+    """Return the earliest of the first stamps, but none that is far from most of them."""
+    first_us = stamps_us[: 2 * _NEAR + 1]
+    if not len(first_us):
+        return 0
+    apart_us = np.abs(first_us - np.median(first_us))
+    return int(first_us[apart_us <= LARGEST_LEAP_NS / 1000].min())
 
 
 def on_earth(lat_1e7: IntArray, lon_1e7: IntArray, *others: FloatArray) -> BoolArray:

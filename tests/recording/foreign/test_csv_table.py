@@ -97,6 +97,13 @@ def test_csv_separators_and_line_endings_are_accepted(
     assert "column not used: extra" in log.notes
 
 
+def test_columns_that_are_not_used_are_named_within_limits() -> None:
+    many = ",".join(f"{'x' * 90}{number}" for number in range(500))
+    log = read(f"{HEAD},{many}\n1795000000,47,8.5,500\n1795000001,47,8.5,501\n")
+    assert "490 more columns not used" in log.notes
+    assert sum(map(len, log.notes)) < 1000
+
+
 def test_iso_times_with_and_without_zone_are_parsed() -> None:
     times = ("2026-11-22T12:00:00.5+01:00", "2026-11-22T11:00:01Z", "2026-11-22T11:00:02")
     log = read("time,lat_deg,lon_deg,alt_m\n" + "".join(f"{time},47,8,5\n" for time in times))

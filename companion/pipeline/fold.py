@@ -435,20 +435,24 @@ class Pipeline:
         return made
 
     def _selected(self, now_ns: int) -> tuple[list[str], list[str]]:
-        """Return the targets that get beams, and those beyond ``[beams] most``.
-
-        Order: UAVs of ``priority``, then those with recent reports, then those tracked longest.
-        """
+        """Return the targets that get beams, and those beyond ``[beams] most``."""
         wanted, most = self.targets.among(self.tracker.uavs), self.settings.beams.most
         if len(wanted) <= most:
             return wanted, []
-        first = frozenset(self.settings.beams.priority)
-        silent = frozenset(self.tracker.silent(now_ns, self.settings.tracks.lost_s))
-        ranked = wanted
-        if first or silent:
-            ranked = sorted(wanted, key=lambda uav: (uav not in first, uav in silent))
+        ranked = self.ranked(now_ns, wanted)
         selected = frozenset(ranked[:most])
         return [uav for uav in wanted if uav in selected], ranked[most:]
+
+    def ranked(self, now_ns: int, uavs: list[str]) -> list[str]:
+        """Return UAVs in the order in which they get beams if there are too many.
+
+        Order: UAVs of ``priority``, then those with recent reports, then those tracked longest.
+        """
+        first = frozenset(self.settings.beams.priority)
+        silent = frozenset(self.tracker.silent(now_ns, self.settings.tracks.lost_s))
+        if not first and not silent:
+            return uavs
+        return sorted(uavs, key=lambda uav: (uav not in first, uav in silent))
 
     def _protected(self, tracks: list[Track], carrier: Carrier | None) -> list[Track]:
         """Return the UAVs of other nodes to protect by nulls: the nearest ones, up to a limit."""

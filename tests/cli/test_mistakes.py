@@ -108,7 +108,7 @@ SAYS: list[tuple[str, int, str]] = [
     ("weights good.tlog --at 1 --lead-ms nan", 2, "'nan' is not a finite number"),
     ("replay good.tlog --latency nan", 2, "'nan' is not a finite number"),
     ("replay good.tlog --speed 1e-300", 2, "neither max nor a number of at least 0.001"),
-    ("study beams good.tlog --out report --hz 1e-300", 2, "is not in the range"),
+    ("study beams good.tlog --out report --hz 1e-300", 1, "give updates per second, 0.001 to"),
     ("drive rotctld:127.0.0.1:1 --rate nan", 2, "'nan' is not a finite number"),
     ("design --dt 1e308", 2, "a number is larger than 1e+06"),
     ("design --dt nan", 1, "positive number of seconds"),

@@ -43,7 +43,7 @@ LOOK_S: Final = 0.3
 PIECE: Final = 16  # frames of a message that are processed in one piece
 WAITING_MAX: Final = 1000
 """Frames of other nodes that wait; while more do, further messages are discarded and counted."""
-DECIDED_NS: Final = 50_000_000
+DECIDED_NS: Final = 100_000_000
 """Least time between two decisions that another node's claim causes; each update decides too."""
 OFFERED_S: Final = 1.0  # time between two messages of offers, and of tracks
 

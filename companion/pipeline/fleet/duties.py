@@ -23,11 +23,15 @@ from typing import Annotated, Final
 
 from companion.pipeline.fleet.assignment import assign
 from companion.values import Standing
+from companion.values.budget import Budget
 from companion.values.described import Meaning
 
 CLAIM_DELAY_NS: Final = 500_000_000
 """Time without a serving node after which a UAV is claimed; longer than a message's delay."""
 ASSIGNED_NS: Final = 500_000_000  # time between two assignments while the nodes are the same
+ASSIGNMENTS_PER_S: Final = 3.0
+"""Most assignments per second, however often nodes come and go: each may take 50 ms."""
+ASSIGNMENTS_SAVED: Final = 4.0
 CLAIM_EXCESS_DB: Final = 20.0
 """Largest excess of a claim over the present offer of its node; offers change after a claim."""
 SETTLED_NS: Final = 2_000_000_000
@@ -69,6 +73,7 @@ class Duties:
         self._begun_ns: int | None = None
         self._wanted: dict[str, str] = {}
         self._assigned: tuple[int, frozenset[str]] = (0, frozenset())
+        self._assignments = Budget(per_s=ASSIGNMENTS_PER_S, most=ASSIGNMENTS_SAVED)
 
     # --- input ------------------------------------------------------------------------------
 
@@ -95,7 +100,8 @@ class Duties:
     ) -> list[Handover]:
         """Decide which UAVs this node serves. Returns the changes.
 
-        offers   value of each node's offers, dB, by node and UAV, including this node's
+        offers   value of each node's offers, dB, by node and UAV, including this node's; those in
+                 the order in which it serves UAVs if there are too many
         trusted  names of the other nodes that are trusted
         """
         if self._begun_ns is None:
@@ -105,7 +111,8 @@ class Duties:
         known = {node: given for node, given in offers.items() if node in {*standing, self._name}}
         claims = _claims(standing, known)
         at_ns, nodes = self._assigned
-        if now_ns - at_ns >= ASSIGNED_NS or nodes != standing.keys():
+        is_due = now_ns - at_ns >= ASSIGNED_NS or nodes != standing.keys()
+        if is_due and self._assignments.spend(1.0, now_ns * 1e-9):
             self._assigned = now_ns, frozenset(standing)
             self._wanted = self._assign(claims, standing, known)
         wanted = self._wanted
@@ -203,20 +210,33 @@ class Duties:
         mine = offers.get(self._name, {})
         handed = {uav for said in standing.values() for uav, to in said.handing if to == self._name}
         has_listened = self._begun_ns is not None and now_ns - self._begun_ns >= self._lease_ns
+        rank = {uav: number for number, uav in enumerate(mine)}
         for uav in mine:
-            if uav in self.serves or len(self.serves) >= self._most:
+            if uav in self.serves or not self._has_place(uav, rank):
                 continue
             if uav in claims:
                 self._free_since.pop(uav, None)
                 if uav in handed:
-                    self.serves[uav] = mine[uav]
+                    self._serve(uav, mine[uav], rank)
                 continue
             free_ns = now_ns - self._free_since.setdefault(uav, now_ns)
             late_ns = 0 if wanted.get(uav) == self._name else self._lease_ns
             if has_listened and free_ns >= CLAIM_DELAY_NS + late_ns:
-                self.serves[uav] = mine[uav]
+                self._serve(uav, mine[uav], rank)
         for uav in [uav for uav in self._free_since if uav not in mine or uav in self.serves]:
             del self._free_since[uav]
+
+    def _has_place(self, uav: str, rank: Mapping[str, int]) -> bool:
+        """Return whether this node serves fewer UAVs than it may, or one that ranks lower."""
+        if len(self.serves) < self._most:
+            return True
+        return any(rank.get(served, len(rank)) > rank[uav] for served in self.serves)
+
+    def _serve(self, uav: str, worth_db: float, rank: Mapping[str, int]) -> None:
+        """Serve a UAV; drop the one that ranks lowest if there are too many."""
+        if len(self.serves) >= self._most:
+            self._drop(max(self.serves, key=lambda served: rank.get(served, len(rank))))
+        self.serves[uav] = worth_db
 
 
 def _claims(

@@ -223,6 +223,7 @@ class FleetMember:
         if not self._has_room(known.offered_uavs, len(offers)):
             return False
         known.offers = {offer.uav: offer for offer in offers}
+        known.values_db = offer_values_db(known.offers)
         known.offered_ns = now_ns
         return True
 
@@ -247,7 +248,7 @@ class FleetMember:
         for node in trusted:
             known = self.neighbours[node]
             if known.offers is not None and now_ns - known.offered_ns < OFFERS_KEPT_NS:
-                offers[node] = offer_values_db(known.offers)
+                offers[node] = known.values_db
         changes = self.duties.decide(now_ns, offers, trusted)
         self.handovers += changes
         self.handed_over += len(changes)

@@ -88,6 +88,7 @@ class Neighbour:
     heard_ns: int = 0  # time of its newest message
     offered_ns: int = 0
     offers: dict[str, Offer] | None = None  # its offers by UAV
+    values_db: dict[str, float] = field(default_factory=dict)  # of these offers, by UAV
     frames: int = 0  # frames that it shared
     used: int = 0  # those of them that the pipeline used
     apart_told: bool = False

@@ -22,7 +22,10 @@ MIN_BATCH: Final = 2  # least number of UAVs per batch
 
 
 class Offers:
-    """Offers of one node. ``silent_s`` returns the age of a UAV's last report; None: never."""
+    """Offers of one node. ``silent_s`` returns the age of a UAV's last report; None: never.
+
+    ``made`` are in the order in which UAVs get beams if there are too many (``Pipeline.ranked``).
+    """
 
     def __init__(self, pipeline: Pipeline, silent_s: Callable[[str, int], float | None]) -> None:
         self.made: dict[str, Offer] = {}
@@ -32,6 +35,7 @@ class Offers:
             pipeline.precoder, method=Method.MATCHED, policy=Policy.REGULARISE, power=Power.EQUAL
         )
         self._waiting: list[str] = []
+        self._order: list[str] = []
         self._last_ns: int | None = None
 
     def look(self, now_ns: int) -> Callable[[], dict[str, Offer]] | None:
@@ -41,7 +45,9 @@ class Offers:
         milliseconds even for few UAVs.
         """
         pipeline = self._pipeline
-        wanted = [uav for uav in pipeline.tracker.uavs if pipeline.targets.wants(uav)]
+        targets = [uav for uav in pipeline.tracker.uavs if pipeline.targets.wants(uav)]
+        wanted = pipeline.ranked(now_ns, targets)
+        self._order = wanted
         new = [uav for uav in wanted if uav not in self.made]
         if not self._waiting or new:
             self.made = {uav: self.made[uav] for uav in wanted if uav in self.made}
@@ -55,6 +61,7 @@ class Offers:
     def take(self, made: dict[str, Offer]) -> None:
         """Store the computed offers."""
         self.made |= made
+        self.made = {uav: self.made[uav] for uav in self._order if uav in self.made}
 
     def _made_of(self, now_ns: int, uavs: list[str]) -> Callable[[], dict[str, Offer]]:
         """Read some UAVs now, and return a function that computes the offers to them."""

@@ -53,8 +53,8 @@ class BeamStudy(StudiedLogs):
         known = [link.name for link in LINKS]
         if not set(self.links) <= set(known):
             raise UserError(f"--links {','.join(self.links)}: give some of {', '.join(known)}")
-        if not 0 < self.hz <= 1000:
-            raise UserError(f"--hz {self.hz:g}: give updates per second, above 0 and at most 1000")
+        if not 0.001 <= self.hz <= 1000:
+            raise UserError(f"--hz {self.hz:g}: give updates per second, 0.001 to 1000")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -124,6 +124,7 @@ def test_work_of_a_decision_is_bounded_and_the_next_one_continues(
         return found
 
     monkeypatch.setattr(assignment, "_positive_cycle", counted)
+    monkeypatch.setattr(assignment, "WORK_MAX", 3_000_000)
     served = dict.fromkeys(uavs, "n0")
     decisions = 0
     while decisions < 30:

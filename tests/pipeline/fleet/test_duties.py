@@ -2,7 +2,17 @@
 
 from dataclasses import dataclass
 
-from companion.pipeline.fleet.duties import CLAIM_DELAY_NS, SETTLED_NS, Duties, Handover
+import pytest
+
+from companion.pipeline.fleet import duties as duties_module
+from companion.pipeline.fleet.duties import (
+    ASSIGNMENTS_PER_S,
+    ASSIGNMENTS_SAVED,
+    CLAIM_DELAY_NS,
+    SETTLED_NS,
+    Duties,
+    Handover,
+)
 from companion.values import Standing
 
 MS = 1_000_000
@@ -125,6 +135,35 @@ def test_full_node_accepts_no_more_uavs() -> None:
     pair.nodes["b"] = Duties(name="b", most=3, lease_ns=LEASE_NS, hysteresis_db=3.0)
     pair.run(6)
     assert len(pair.nodes["b"].serves) == 3
+
+
+def test_full_node_serves_the_uavs_that_come_first_in_its_offers() -> None:
+    """Those that came later displace others of a lower rank, and no others."""
+    duties = Duties(name="a", most=3, lease_ns=LEASE_NS, hysteresis_db=3.0)
+
+    def run(offers: dict[str, float], begin_s: int) -> list[str]:
+        for tick in range(60):
+            duties.decide((begin_s * 10 + tick) * 100 * MS, {"a": offers}, frozenset())
+        return sorted(duties.serves)
+
+    invented = {f"{number}:1": 30.0 for number in range(11, 21)}
+    assert run(invented, 1000) == ["11:1", "12:1", "13:1"]
+    assert run(invented | {"1:1": 10.0}, 1010) == ["11:1", "12:1", "13:1"]
+    assert run({"1:1": 10.0, **invented}, 1020) == ["11:1", "12:1", "1:1"]
+
+
+def test_assignments_are_limited_however_often_nodes_come_and_go(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    made: list[int] = []
+    monkeypatch.setattr(duties_module, "assign", lambda *_: made.append(1) or {})
+    duties = Duties(name="a", most=3, lease_ns=LEASE_NS, hysteresis_db=3.0)
+    for tick in range(300):
+        now_ns = 1000 * S + tick * 100 * MS
+        duties.hear(now_ns, said(f"n{tick}"))
+        duties.gone(now_ns, f"n{tick - 5}")
+        duties.decide(now_ns, {"a": {"1:1": 9.0}}, frozenset(f"n{n}" for n in range(300)))
+    assert len(made) <= ASSIGNMENTS_SAVED + 30 * ASSIGNMENTS_PER_S + 1
 
 
 def test_second_node_serves_what_the_assigned_node_does_not() -> None:

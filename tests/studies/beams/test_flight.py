@@ -648,7 +648,7 @@ def test_two_logs_are_tabulated_and_plotted_separately(short: Path, tmp_path: Pa
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
-        (["--hz", "0"], "--hz 0: give updates per second, above 0"),
+        (["--hz", "0"], "--hz 0: give updates per second, 0.001 to"),
         (["--hz", "nan"], "--hz nan: give updates per second"),
         (["--hz", "x"], "'x'"),
         (["--center", "9:1"], "no UAV gets a beam while"),

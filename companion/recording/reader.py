@@ -242,6 +242,8 @@ def _open(path: Path) -> tuple[LogKind, bytes]:
     kind = tlog.sniff(data)
     if kind is None and kinds.looks_like_text(data[:512]):
         return "csv", b""
+    if kind is None and kinds.is_utf_16(head):
+        raise LogError(f"{path}: no MAVLink, but text in UTF-16: save it as UTF-8")
     if kind is None:
         raise LogError(f"{path}: no MAVLink frame in it")
     return kind, data

@@ -1,5 +1,6 @@
 """Detection of files by their first bytes: onboard logs, captures, unsupported files."""
 
+from codecs import BOM_UTF16_BE, BOM_UTF16_LE
 from typing import Final, Literal
 
 from companion.recording.foreign.packets import PCAP, PCAPNG
@@ -22,8 +23,6 @@ _KINDS: Final[tuple[tuple[bytes, str], ...]] = (
     (b"%PDF-", "a PDF document"),
     (b"\x89PNG", "a picture"),
     (b"\x7fELF", "a program"),
-    (b"\xff\xfe", "text in UTF-16: save it as UTF-8"),
-    (b"\xfe\xff", "text in UTF-16: save it as UTF-8"),
 )
 REPLACED: Final = "\ufffd"  # what stands for a byte that is not UTF-8
 HEAD_BYTES: Final = max(len(magic) for magic, _ in _KINDS)
@@ -37,6 +36,11 @@ def read_piecewise(head: bytes) -> Piecewise | None:
 def named(head: bytes) -> str | None:
     """Return kind and remedy of an unsupported file with these first bytes; None if unknown."""
     return next((name for magic, name in _KINDS if head.startswith(magic)), None)
+
+
+def is_utf_16(head: bytes) -> bool:
+    """Return whether a file without a frame is text in UTF-16; FE begins a MAVLink 1 frame, too."""
+    return head.startswith((BOM_UTF16_LE, BOM_UTF16_BE))
 
 
 def looks_like_text(head: bytes) -> bool:

@@ -81,6 +81,15 @@ def test_table_in_utf_16_is_rejected_with_the_remedy(tmp_path: Path) -> None:
         list(read_log(log))
 
 
+def test_frames_after_bytes_that_mark_utf_16_are_read(cut_log: Path, tmp_path: Path) -> None:
+    """FE FF may also be the end of a MAVLink 1 frame, or the beginning of a damaged one."""
+    log = tmp_path / "raw.bin"
+    frames = [event for event in read_log(cut_log) if isinstance(event, Frame)]
+    log.write_bytes(b"\xfe\xff" + b"".join(frame.raw for frame in frames))
+    found = [event for event in read_log(log) if isinstance(event, Frame)]
+    assert len(found) == len(frames)
+
+
 @pytest.mark.parametrize("divider", [",", ";", "\t"])
 @pytest.mark.parametrize("newline", ["\n", "\r\n"])
 @pytest.mark.parametrize("mark", ["", "\ufeff"])

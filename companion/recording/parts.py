@@ -18,6 +18,9 @@ from companion.recording.container import MAGIC, Walk
 from companion.values import UserError, printable
 
 PART: Final = "part"
+UNFOLLOWED: Final = (
+    "the parts of the run after it are missing, or the service was killed as it began the next"
+)
 CONTINUED: Final = "continued"  # record of a part after which the run continues in another
 HOLE: Final = "hole"
 HOLES_MAX: Final = 1000
@@ -159,5 +162,5 @@ def missing(infos: Mapping[Path, RecordingInfo], ordered: Sequence[Path]) -> lis
             at = datetime.fromtimestamp(hole.t_ns * 1e-9, tz=UTC).isoformat(timespec="seconds")
             lines.append(f"{path}: {hole.events} events before {at} are missing: {hole.why}")
     if ordered and infos[ordered[-1]].is_continued:
-        lines.append(f"{ordered[-1]}: the parts of the run after it are missing")
+        lines.append(f"{ordered[-1]}: {UNFOLLOWED}")
     return lines

@@ -19,7 +19,7 @@ from support import BALLAST, HANG_S, ROOT, fill, read_metadata
 from companion.node.replay import log_events, missing
 from companion.recording import background
 from companion.recording.background import BackgroundRecorder, Rotation
-from companion.recording.parts import Hole, Part, read_recording_info
+from companion.recording.parts import UNFOLLOWED, Hole, Part, read_recording_info
 from companion.recording.reader import read_log, utc_offset_ns
 from companion.recording.writer import Writer
 from companion.settings.model import Settings
@@ -482,6 +482,6 @@ def test_new_part_continues_where_the_previous_ends(tmp_path: Path, rotation: Ro
     assert "summary" not in read_metadata(logs[0])
     assert missing([logs[0], logs[2]]) == [f"{logs[2]}: part 2 of the run is missing"]
     assert missing(logs) == []
-    assert missing(logs[:2]) == [f"{logs[1]}: the parts of the run after it are missing"]
+    assert missing(logs[:2]) == [f"{logs[1]}: {UNFOLLOWED}"]
     assert made.messages == 300 and made.news() == []
     assert all(a < b for a, b in pairwise(event.t_ns for event in events))

@@ -12,7 +12,7 @@ from companion.node.replay import log_events, replay, settings_for
 from companion.node.replay import missing as missing_of
 from companion.pipeline.fold import Pipeline
 from companion.pipeline.ticks import with_ticks
-from companion.recording.parts import Hole, Part, in_order, missing, read_recording_info
+from companion.recording.parts import UNFOLLOWED, Hole, Part, in_order, missing, read_recording_info
 from companion.recording.reader import LogError, read_log
 from companion.recording.recover import recover
 from companion.recording.writer import Writer
@@ -103,7 +103,7 @@ def test_missing_parts_are_reported(
 ) -> None:
     one, two, three = run_of_three_parts[0]
     assert missing_of([one, two, three]) == []
-    assert missing_of([one, two]) == [f"{two}: the parts of the run after it are missing"]
+    assert missing_of([one, two]) == [f"{two}: {UNFOLLOWED}"]
     assert missing_of([one, three]) == [f"{three}: part 2 of the run is missing"]
     assert missing_of([three]) == [f"{three}: part 1 to 2 of the run is missing"]
     assert missing_of([three, two]) == [f"{two}: part 1 of the run is missing"]

@@ -213,7 +213,7 @@ def _v4(data: bytes, at: int) -> Segment | Fragment | None:
     if header < 20:
         return None
     if fragment:
-        return Fragment(max(0, length - header))
+        return Fragment(max(0, min(length, len(data) - at) - header))
     end = at + length if header <= length else len(data)  # 0: set later by the network card
     source, target = (".".join(map(str, data[at + n : at + n + 4])) for n in (12, 16))
     return _transport(data[:end], at + header, data[at + 9], source, target)
@@ -229,7 +229,7 @@ def _v6(data: bytes, at: int) -> Segment | Fragment | None:
     while following in _V6_EXTENSIONS and at + 8 <= len(data):
         following, at = data[at], at + 8 + data[at + 1] * 8
     if following == _V6_FRAGMENT:
-        return Fragment(max(0, end - at - 8))
+        return Fragment(max(0, min(end, len(data)) - at - 8))
     return _transport(data[:end], at, following, source, target)
 
 

@@ -22,7 +22,7 @@ def numbers(text: str) -> list[float]:
             f"{shown(text)} is not a list of numbers such as 0.1,0.5"
         ) from error
     if max(map(abs, found)) > LARGEST:
-        raise click.BadParameter(f"{shown(text)}: a number is larger than {LARGEST:g}")
+        raise click.BadParameter(f"{shown(text)}: allowed: at most {LARGEST:g}")
     return found
 
 
@@ -116,8 +116,14 @@ def design(
 
     if not dt and out is None:
         raise click.UsageError("give --dt, or --out for a gain table")
-    if max(map(abs, (feedthrough, acceleration, position_noise, velocity_noise))) > LARGEST:
-        raise click.UsageError(f"a number is larger than {LARGEST:g}")
+    for option, number in (
+        ("--feedthrough", feedthrough),
+        ("--acceleration", acceleration),
+        ("--position-noise", position_noise),
+        ("--velocity-noise", velocity_noise),
+    ):
+        if abs(number) > LARGEST:
+            raise click.UsageError(f"{option} {number:g}: allowed: at most {LARGEST:g}")
     if model == "position":
         if out is not None:
             raise click.UsageError("--out works only with --model kinematic")

@@ -19,7 +19,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from companion.mavlink.links.regular_file import open_regular
+from companion.mavlink.links.regular_file import open_regular, replace_file
 from companion.mavlink.links.urls import LinkError
 from companion.mavlink.trust.signing import (
     KEY_BYTES,
@@ -187,7 +187,7 @@ class Timestamps:
             if snapshot.number <= self._written:
                 return
             try:
-                _replace(self._path, _encoded(snapshot.links))
+                replace_file(self._path, _encoded(snapshot.links), mode=0o600)
             except OSError as error:
                 raise _unwritable(self._path, error) from None
             self._written = snapshot.number
@@ -299,21 +299,6 @@ def _digest(links: object) -> str:
 
 def _dumped(value: object) -> bytes:
     return json.dumps(value, separators=(",", ":")).encode("ascii")
-
-
-def _replace(path: Path, data: bytes) -> None:
-    """Write a file atomically and durably."""
-    fresh = _beside(path, ".new")
-    with os.fdopen(os.open(fresh, os.O_WRONLY | os.O_CREAT | os.O_TRUNC, 0o600), "wb") as file:
-        file.write(data)
-        file.flush()
-        os.fsync(file.fileno())
-    fresh.replace(path)
-    folder = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
 
 
 def _beside(path: Path, ending: str) -> Path:

@@ -4,7 +4,7 @@ Names are free: who may publish at all can publish under hundreds of them. So a 
 processed at the small rate that it needs, and what is more comes out of one budget for all.
 """
 
-from typing import Final
+from typing import Final, NamedTuple
 
 from companion.node.fleet import messages
 from companion.node.fleet.messages import FleetMessageError
@@ -21,32 +21,39 @@ PRESENCE_PER_S: Final = 5.0
 PRESENCE_SAVED: Final = 2.0 * NODES_MAX
 
 
+class _NodeBudget(NamedTuple):
+    """Bytes of one node: those that are always parsed, and those beyond."""
+
+    guaranteed: Budget
+    more: Budget
+
+
 class NodeBudgets:
     """Budgets of bytes by node, names beyond ``NODES_MAX`` sharing one; and that of presence."""
 
     def __init__(self) -> None:
-        self._guaranteed: dict[str, Budget] = {}
-        self._more: dict[str, Budget] = {}
+        self._nodes: dict[str, _NodeBudget] = {}
         self._all = Budget(per_s=ALL_BYTES_PER_S, most=messages.MESSAGE_MAX)
         self._presence = Budget(per_s=PRESENCE_PER_S, most=PRESENCE_SAVED)
 
     def spend(self, node: str, size: int, now_s: float) -> None:
         """Use the budgets for a message. Raises ``FleetMessageError`` if they are exhausted."""
-        known = node if node in self._guaranteed or len(self._guaranteed) < NODES_MAX else ""
-        own = self._guaranteed.get(known)
+        known = node if node in self._nodes or len(self._nodes) < NODES_MAX else ""
+        own = self._nodes.get(known)
         if own is None:
-            own = Budget(per_s=GUARANTEED_BYTES_PER_S, most=GUARANTEED_BYTES)
-            self._guaranteed[known] = own
-            self._more[known] = Budget(per_s=NODE_BYTES_PER_S, most=messages.MESSAGE_MAX)
-        if own.spend(size, now_s):
+            own = self._nodes[known] = _NodeBudget(
+                Budget(per_s=GUARANTEED_BYTES_PER_S, most=GUARANTEED_BYTES),
+                Budget(per_s=NODE_BYTES_PER_S, most=messages.MESSAGE_MAX),
+            )
+        if own.guaranteed.spend(size, now_s):
             return
-        if not self._more[known].spend(size, now_s):
+        if not own.more.spend(size, now_s):
             raise FleetMessageError(f"more than {NODE_BYTES_PER_S // 1000} kB/s of messages")
         if not self._all.spend(size, now_s):
             raise FleetMessageError(
                 f"more than {ALL_BYTES_PER_S // 1000} kB/s of messages of all nodes"
             )
 
-    def is_presence_processed(self, now_s: float) -> bool:
+    def spend_presence(self, now_s: float) -> bool:
         """Use the budget for one node that comes or goes; return whether it was left."""
         return self._presence.spend(1.0, now_s)

@@ -166,7 +166,7 @@ class LiveFleetNode:
         heard_ns = {node: known.heard_ns for node, known in self.member.neighbours.items()}
         for node in self._unanswered.gone(now_ns, heard_ns):
             left = self.member.node_left(now_ns, node)
-            if self._budgets.is_presence_processed(now_ns * 1e-9):
+            if self._may_process_presence(now_ns):
                 self._notify_all(left)
         unresponsive = self._unanswered.unresponsive(now_ns, heard_ns)
         if unresponsive:
@@ -397,9 +397,7 @@ class LiveFleetNode:
         node = self._node(key)
         if node is None or node == self.name:
             return
-        if not self._budgets.is_presence_processed(self._now_ns() * 1e-9):
-            text = "nodes come and go too often; their messages show which are present"
-            self._notify_once("presence", text)
+        if not self._may_process_presence(self._now_ns()):
             return
         if not is_alive:
             self._unanswered.alive.discard(node)
@@ -413,6 +411,14 @@ class LiveFleetNode:
         self._unanswered.alive.add(node)
         if is_new:
             self._report(Severity.INFO, f"node {node}", f"node {node} connected")
+
+    def _may_process_presence(self, now_ns: int) -> bool:
+        """Use the budget for one node that comes or goes; report once that it is exhausted."""
+        if self._budgets.spend_presence(now_ns * 1e-9):
+            return True
+        text = "nodes come and go too often; their messages show which are present"
+        self._notify_once("presence", text)
+        return False
 
     def _notify_malformed(self, node: str, why: str) -> None:
         """Report a node's first malformed message."""

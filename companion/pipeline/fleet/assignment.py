@@ -28,7 +28,7 @@ UNSERVED_DB: Final = -1e6
 WORK_MAX: Final = 20_000_000
 """Most numbers that a search for cycles computes, some 50 ms; the next decision continues it.
 
-A fleet of 50 nodes needs less. Without a limit, 256 nodes that offer to serve 20 UAVs took 0.6 s.
+A fleet of 32 nodes and 200 UAVs needs less, even if one node served a third of them before.
 """
 LOOKED_EVERY: Final = 4  # rounds of the search after which it looks for a cycle
 OPERATION: Final = 4000  # numbers that cost as much as one operation on an array

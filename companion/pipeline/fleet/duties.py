@@ -212,8 +212,10 @@ class Duties:
         has_listened = self._begun_ns is not None and now_ns - self._begun_ns >= self._lease_ns
         rank = {uav: number for number, uav in enumerate(mine)}
         for uav in mine:
-            if uav in self.serves or not self._has_place(uav, rank):
+            if uav in self.serves:
                 continue
+            if not self._has_place(uav, rank):
+                break  # all that follow rank lower, too
             if uav in claims:
                 self._free_since.pop(uav, None)
                 if uav in handed:

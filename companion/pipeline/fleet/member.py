@@ -222,9 +222,7 @@ class FleetMember:
             return True
         if not self._has_room(known.offered_uavs, len(offers)):
             return False
-        known.offers = {offer.uav: offer for offer in offers}
-        known.values_db = offer_values_db(known.offers)
-        known.offered_ns = now_ns
+        known.take_offers(now_ns, offers)
         return True
 
     def _has_room(self, before: int, now: int) -> bool:
@@ -312,8 +310,8 @@ class FleetMember:
         self.place, self.reach_m = place, reach_m
         others = {node: known.standing for node, known in self.neighbours.items()}
         self.near = near(place, reach_m, others, self.near)
-        for node in others.keys() - self.near:  # no longer updated from now on
-            self.neighbours[node].offers = None
+        for node in others.keys() - self.near:
+            self.neighbours[node].drop_offers()
         return Standing(
             node=self.name,
             place=place,

@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.clock.evidence import DriftProven, Interval, OffsetEvidence
+from companion.pipeline.fleet.assignment import offer_values_db
 from companion.values import Offer, RoundTrip, Standing
 
 DRIFT_MAX: Final = 200e-6
@@ -103,6 +104,16 @@ class Neighbour:
     def offered_uavs(self) -> int:
         """Number of UAVs in its offers."""
         return 0 if self.offers is None else len(self.offers)
+
+    def take_offers(self, now_ns: int, offers: tuple[Offer, ...]) -> None:
+        """Replace its offers."""
+        self.offers = {offer.uav: offer for offer in offers}
+        self.values_db = offer_values_db(self.offers)
+        self.offered_ns = now_ns
+
+    def drop_offers(self) -> None:
+        """Forget its offers, which are no longer updated."""
+        self.offers, self.values_db = None, {}
 
     def note_delay(self, now_ns: int, way_ns: int) -> None:
         """Note the largest possible delay of a report from the other node."""

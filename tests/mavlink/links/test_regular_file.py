@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 from click.testing import CliRunner
 
-from companion.mavlink.links.regular_file import open_regular
+from companion.mavlink.links.regular_file import open_regular, replace_file
 from companion.mavlink.links.signing_store import Timestamps
 from companion.mavlink.links.zenoh_config import BusConfig, sections
 from companion.node.ring import Ring
@@ -77,3 +77,14 @@ def test_pipe_is_an_error_wherever_it_is_named(
     os.mkfifo(tmp_path / "pipe")
     with pytest.raises(UserError, match="not a file"):
         read(tmp_path / "pipe")
+
+
+@pytest.mark.parametrize("mode", [None, 0o600])
+def test_replaced_file_is_whole_and_has_its_permissions(mode: int | None, tmp_path: Path) -> None:
+    path = tmp_path / "result"
+    path.write_bytes(b"earlier")
+    path.chmod(0o640)
+    replace_file(path, b"new", mode=mode)
+    assert path.read_bytes() == b"new"
+    assert path.stat().st_mode & 0o777 == (mode or 0o640)
+    assert [one.name for one in tmp_path.iterdir()] == ["result"]

@@ -57,5 +57,5 @@ def test_names_beyond_the_limit_share_the_budget_of_one() -> None:
 
 def test_nodes_may_come_and_go_at_a_limited_rate() -> None:
     budgets = NodeBudgets()
-    processed = sum(budgets.is_presence_processed(at / 1000) for at in range(60_000))
+    processed = sum(budgets.spend_presence(at / 1000) for at in range(60_000))
     assert processed == pytest.approx(PRESENCE_SAVED + 60 * PRESENCE_PER_S, abs=2)

@@ -7,6 +7,7 @@ minutes. See docs/math.md 5.6.
 """
 
 import math
+from array import array
 from bisect import bisect_right
 from dataclasses import dataclass
 from enum import StrEnum
@@ -22,6 +23,7 @@ PAIR_SPANS_S: Final = (0.001, 0.2, 0.5, 1.0, 2.0)
 """Least times between two velocities that are compared: adjacent ones, and older ones."""
 _PAIRS_NS: Final = tuple(round(least_s * 1e9) for least_s in PAIR_SPANS_S)
 _KEPT: Final = 64
+_NUMBERS: Final = 5  # kept of a report's velocity
 
 
 class Airframe(StrEnum):
@@ -125,7 +127,9 @@ class Refutations:
         self.speed = RaisedLimit()
         self.acceleration = RaisedLimit()
         self._times_ns: list[int] = []
-        self._velocities: list[tuple[float, float, float, float, float]] = []
+        # Of these reports: velocity, its noise, and that of its time. Kept for each of thousands of
+        # UAVs, so that an array replaces tuples of six times its size.
+        self._velocities = array("d")
 
     def limits(self, base: Limits, sender_ns: int) -> Limits:
         """Return the limits that apply at a sender time."""
@@ -159,9 +163,9 @@ class Refutations:
         times_ns = self._times_ns
         if not times_ns or sender_ns > times_ns[-1]:
             times_ns.append(sender_ns)
-            self._velocities.append((north, east, down, noise_mps, fix.noise.time_s))
+            self._velocities.extend((north, east, down, noise_mps, fix.noise.time_s))
             if len(times_ns) > 2 * _KEPT:
-                del times_ns[:_KEPT], self._velocities[:_KEPT]
+                del times_ns[:_KEPT], self._velocities[: _NUMBERS * _KEPT]
         return found
 
     def _proven(self, fix: Fix, north: float, east: float, down: float) -> float:
@@ -173,7 +177,7 @@ class Refutations:
             end = bisect_right(times_ns, sender_ns - least_ns, 0, end)
             if not end:
                 break
-            n, e, d, noise_mps, time_s = velocities[end - 1]
+            n, e, d, noise_mps, time_s = velocities[_NUMBERS * (end - 1) : _NUMBERS * end]
             n, e, d = north - n, east - e, down - d
             changed_mps = math.sqrt(n * n + e * e + d * d) - noise_mps - own_mps
             if changed_mps <= 0.0:

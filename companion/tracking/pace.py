@@ -5,10 +5,11 @@ between reports. A track coasts only after a silence longer than three of its ow
 spread of latencies, and longer than recent silences.
 """
 
+from array import array
 from typing import Final
 
 from companion.values import Fix
-from companion.values.newest import Newest
+from companion.values.newest import append_number
 
 KEPT: Final = 16  # reports from which the timing is measured
 INTERVALS: Final = 3.0
@@ -20,23 +21,23 @@ class ReportTiming:
     """Intervals, latencies and silences of a UAV's reports. ``add`` takes accepted reports."""
 
     def __init__(self) -> None:
-        self._intervals_s: Newest[float] = Newest(KEPT)
-        self._latencies_s: Newest[float] = Newest(KEPT)
-        self._ages_s: Newest[float] = Newest(KEPT)
+        self._intervals_s = array("d")
+        self._latencies_s = array("d")
+        self._ages_s = array("d")
         self._newest_ns: int | None = None
 
     def add(self, fix: Fix) -> None:
         """Add an accepted report, in order of arrival."""
         latency_s = (fix.arrival_ns - fix.t_ns) * 1e-9
-        self._latencies_s.append(latency_s)
+        append_number(self._latencies_s, latency_s, KEPT)
         newest_ns = self._newest_ns
         if newest_ns is not None:
             if fix.sender_ns <= newest_ns:
                 return
             interval_s = (fix.sender_ns - newest_ns) * 1e-9
-            self._intervals_s.append(interval_s)
+            append_number(self._intervals_s, interval_s, KEPT)
             # Age of the previous report when this one arrived.
-            self._ages_s.append(interval_s + latency_s)
+            append_number(self._ages_s, interval_s + latency_s, KEPT)
         self._newest_ns = fix.sender_ns
 
     def silence_s(self, least_s: float, most_s: float) -> float:

@@ -11,13 +11,14 @@ Over 300 lines: the errors, what is chosen by them and what they tell are one su
 """
 
 import math
+from array import array
 from bisect import bisect_left, bisect_right, insort
 from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Final, NamedTuple
 
 from companion.values import Fix, Vector
-from companion.values.newest import Newest
+from companion.values.newest import append_number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -68,7 +69,8 @@ QUANTILE: Final = 0.95
 """Quantile of past errors that is the usual error: of n, the ceil((n + 1) QUANTILE)-th."""
 ERRORS_LEAST: Final = 20
 SPACING_S: Final = 0.3  # least time between evaluated reports; more would add no information
-_KEPT: Final = 64
+_KEPT_NS: Final = round((2.0 * AGES_S[-1] + 2.0) * 1e9)
+"""Age beyond which a state is not used: see ``PastPredictions._older``."""
 
 UsualErrors = tuple[tuple[float, float], ...]
 """Ages of past predictions, s, each with the 95th percentile of their errors, m."""
@@ -133,8 +135,8 @@ class _PastPrediction(NamedTuple):
 class _Errors:
     """Newest errors of predictions that were about equally old."""
 
-    in_order: Newest[float] = field(default_factory=lambda: Newest(ERRORS_KEPT))
-    sorted_m: list[float] = field(default_factory=list)
+    in_order: "array[float]" = field(default_factory=lambda: array("d"))
+    sorted_m: "array[float]" = field(default_factory=lambda: array("d"))
     age_s: float = 0.0
     judged_ns: int = 0
     error_p95_m: float | None = None
@@ -142,7 +144,7 @@ class _Errors:
     def add(self, error_m: float, age_s: float) -> None:
         if len(self.in_order) == ERRORS_KEPT:
             del self.sorted_m[bisect_left(self.sorted_m, self.in_order[0])]
-        self.in_order.append(error_m)
+        append_number(self.in_order, error_m, ERRORS_KEPT)
         insort(self.sorted_m, error_m)
         n = len(self.sorted_m)
         self.age_s += (age_s - self.age_s) / min(n, 20)
@@ -158,8 +160,8 @@ class PastPredictions:
 
     def __init__(self) -> None:
         self.usual_errors: UsualErrors = ()
-        self._states: Newest[_PastPrediction] = Newest(_KEPT)
-        self._times_ns: Newest[int] = Newest(_KEPT)  # of these states
+        self._states: list[_PastPrediction] = []  # oldest first, of the last ``_KEPT_NS``
+        self._times_ns: list[int] = []  # of these states
         self._costs = [0.0] * (2 * len(ACCELERATION_MODELS))
         self._comparisons = 0
         self._compared_ns = 0
@@ -243,6 +245,9 @@ class PastPredictions:
                     smoothing_offset=aside,
                 )
             )
+            unused = bisect_left(self._times_ns, fix.sender_ns - _KEPT_NS)
+            if unused:
+                del self._times_ns[:unused], self._states[:unused]
 
     def _older(self, sender_ns: int, least_s: float) -> _PastPrediction | None:
         """Return the newest stored state at least this old; None beyond 2 s + twice that age."""

@@ -1,5 +1,6 @@
-"""The newest values of a series, in a list: an empty deque takes ten times its memory."""
+"""The newest values of a series: an empty deque takes ten times the memory of a list."""
 
+from array import array
 from typing import Generic, TypeVar
 
 T = TypeVar("T")
@@ -22,3 +23,13 @@ class Newest(list[T], Generic[T]):
         if len(self) >= self.most:
             del self[0]
         list.append(self, value)
+
+
+def append_number(series: "array[float]", value: float, most: int) -> None:
+    """Add a number to a series, and drop the oldest one beyond the limit.
+
+    An array takes 8 bytes for a number, a list 32.
+    """
+    if len(series) >= most:
+        del series[0]
+    series.append(value)

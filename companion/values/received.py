@@ -139,6 +139,11 @@ class AdsbVehicle:
         """UAV id of the aircraft: ``icao:`` and six hexadecimal digits."""
         return UavKind.ADSB.uav(f"{self.icao:06X}")
 
+    @property
+    def true_ns(self) -> int:
+        """When its content was true, or up to a second earlier."""
+        return self.t_ns - self.tslc_s * 1_000_000_000
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RemoteId:

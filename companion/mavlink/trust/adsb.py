@@ -20,6 +20,7 @@ from collections import OrderedDict
 from dataclasses import dataclass, field
 from typing import Final, TypeVar
 
+from companion.mavlink.trust.reported_positions import Reported, ReportedPositions
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.values import AdsbVehicle, AltitudeDatum, Reason, Rejection, Report, Source
 
@@ -41,11 +42,6 @@ FORGOTTEN_S: Final = 120
 """Seconds without a message after which an aircraft is forgotten; older messages are discarded."""
 AIRCRAFT_MAX: Final = 2000
 """Most aircraft remembered; beyond it the one silent for longest is forgotten."""
-POSITIONS_KEPT: Final = 32
-"""Reported positions remembered per aircraft.
-
-At two a second, a relay may lag 16 s behind another; 4.8 s have been observed.
-"""
 RELAYS_KEPT: Final = 16  # relays remembered of each aircraft
 
 _T = TypeVar("_T")
@@ -62,7 +58,7 @@ class _RelayedAircraft:
     velocity_ne: _Dated[tuple[float, float]] | None = None
     velocity_down: _Dated[float] | None = None
     callsign: _Dated[str] | None = None
-    reported: dict[tuple[float, float], AdsbVehicle] = field(default_factory=dict)
+    reported: ReportedPositions = field(default_factory=ReportedPositions)
     relays: dict[Source, int] = field(default_factory=dict)  # last message, ns
 
     def hear(self, relay: Source, t_ns: int) -> None:
@@ -83,18 +79,18 @@ class _RelayedAircraft:
         self.velocity_down = _newest(self.velocity_down, true_ns, message.velocity_down_mps)
         self.callsign = _newest(self.callsign, true_ns, message.callsign)
 
-    def repeated(self, message: AdsbVehicle) -> AdsbVehicle | None:
+    def repeated(self, message: AdsbVehicle) -> Reported | None:
         """Return the reported message that a message repeats; None if it has new content."""
         assert message.position_deg is not None
         before = self.reported.get(message.position_deg)
         if before is None or _differs(before, message):
             return None
-        is_later = _true_ns(message) - _true_ns(before) >= SLACK_NS
+        is_later = message.true_ns - before.true_ns >= SLACK_NS
         return None if is_later and message.t_ns - before.t_ns > REPEATED_NS else before
 
     def altitude(self, message: AdsbVehicle) -> tuple[AltitudeDatum, float, int] | None:
         """Return datum, metres and age (ns) of the altitude that belongs to a new position."""
-        true_ns = _true_ns(message)
+        true_ns = message.true_ns
         choice = (self.datum, message.alt_datum, AltitudeDatum.GEOMETRIC, AltitudeDatum.PRESSURE)
         for datum in choice:
             if datum is not None and datum is message.alt_datum and message.alt_m is not None:
@@ -111,13 +107,10 @@ class _RelayedAircraft:
         altitude = self.altitude(message)
         if altitude is None:
             return None
-        true_ns = _true_ns(message)
+        true_ns = message.true_ns
         self.datum, alt_m, age_ns = altitude
         self.position_ns = max(true_ns, self.position_ns or true_ns)
-        self.reported.pop(at_deg, None)
-        self.reported[at_deg] = message
-        if len(self.reported) > POSITIONS_KEPT:
-            del self.reported[next(iter(self.reported))]
+        self.reported.put(at_deg, message)
         return Report(
             t_ns=message.t_ns,
             uav=message.uav,
@@ -171,9 +164,9 @@ class Aircraft:
         if message.position_deg is not None:
             before = known.repeated(message)
             if before is not None:
-                known.learn(message, _true_ns(before))
+                known.learn(message, before.true_ns)
                 return _rejected(message, Reason.DUPLICATE)
-        true_ns = _true_ns(message)
+        true_ns = message.true_ns
         known.learn(message, true_ns)
         known.news_ns = message.t_ns
         self._known.move_to_end(message.uav)
@@ -219,10 +212,6 @@ def _is_past(then_ns: int, t_ns: int) -> bool:
     return t_ns - then_ns > FORGOTTEN_S * _NS
 
 
-def _true_ns(message: AdsbVehicle) -> int:
-    return message.t_ns - message.tslc_s * _NS
-
-
 def _newest(before: _Dated[_T] | None, true_ns: int, value: _T | None) -> _Dated[_T] | None:
     """Return the newer of two values with their times: the received one or the stored one."""
     if value is None or (before is not None and true_ns < before[0]):
@@ -237,7 +226,7 @@ def _fitting(own: _T | None, known: _Dated[_T] | None, true_ns: int) -> _T | Non
     return known[1]
 
 
-def _differs(before: AdsbVehicle, message: AdsbVehicle) -> bool:
+def _differs(before: Reported, message: AdsbVehicle) -> bool:
     pairs = [
         (before.velocity_ne_mps, message.velocity_ne_mps),
         (before.velocity_down_mps, message.velocity_down_mps),

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import all as dialect
 from support import examples
 
-from companion.mavlink.trust.adsb import AIRCRAFT_MAX, POSITIONS_KEPT, RELAYS_KEPT, Aircraft
+from companion.mavlink.trust.adsb import AIRCRAFT_MAX, RELAYS_KEPT, Aircraft
+from companion.mavlink.trust.reported_positions import POSITIONS_KEPT
 from companion.mavlink.wire.decode import ADSB_VEHICLE, decode
 from companion.recording.tlog import read_tlog
 from companion.values import AdsbVehicle, AltitudeDatum, Frame, Reason, Rejection, Report, Source

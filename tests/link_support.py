@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import all as dialect
 from companion.mavlink.links import kernel_time
 from companion.mavlink.links.transport import Link, MessageSigning
 from companion.mavlink.links.urls import parse_link
+from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.values import Frame, Notice, Rejection
 
 LIMIT_S = 20.0
@@ -26,6 +27,14 @@ LOOPS: dict[str, Callable[[], asyncio.AbstractEventLoop]] = {
 """The loop that comes with Python, and the one in flight."""
 
 Run = Callable[[Coroutine[Any, Any, None]], None]
+
+
+def fed(splitter: ForeignSplitter, t_ns: int, data: bytes) -> list[Frame | Rejection]:
+    """Everything that a splitter makes of bytes, in as many calls as it takes."""
+    found = splitter.feed(t_ns, data)
+    while splitter.has_more:
+        found += splitter.feed(t_ns, b"")
+    return found
 
 
 def runner(loop: str) -> Run:

@@ -151,8 +151,10 @@ class Writer:
         """Write everything so far to the disk, where it survives a killed process.
 
         Raises ``FileNotFoundError`` if the file was removed or renamed: its contents would be lost
-        with the process.
+        with the process; or if it was truncated: what was flushed is lost already.
         """
+        if os.fstat(self._file.fileno()).st_size < self.size_bytes:
+            raise FileNotFoundError(errno.ENOENT, "the file was truncated", str(self.path))
         self._mcap.flush()
         os.fsync(self._file.fileno())
         if not self._is_in_place():
@@ -202,7 +204,7 @@ class Writer:
         try:
             with contextlib.suppress(OSError):
                 self._file.close()
-            os.ftruncate(spare, self.size_bytes)
+            os.ftruncate(spare, min(self.size_bytes, os.fstat(spare).st_size))
             if not self.flushed and self._is_in_place(spare):
                 self.path.unlink()
         except OSError:

@@ -123,18 +123,21 @@ class BoundedProtocol(HttpToolsProtocol):
     def rank(self) -> tuple[int, float] | None:
         """Return the order of replacement, lowest first; None if it is being closed.
 
-        First are idle connections, then clients over their budget or not reading, then long
-        answers, and last new connections and answers, oldest first.
+        First are idle connections, then those that wait to become a WebSocket, newest first; then
+        clients over their budget or not reading, then long answers, and last new connections and
+        answers, oldest first.
         """
         if self.transport.is_closing():
             return None
         is_idle = self.cycle is None or self.cycle.response_complete
         is_old = self.loop.time() > self._since_s + SETTLED_S
+        if self._is_upgrading:
+            return 1, -self._since_s
         if is_idle and is_old:
             return 0, self._since_s
         if not is_idle and (self._over_budget or self._stalled is not None):
-            return 1, self._since_s
-        return (2 if is_old else 3), self._since_s
+            return 2, self._since_s
+        return (3 if is_old else 4), self._since_s
 
     def _parse(self) -> None:
         """Parse pieces until the newest request waits for its answer."""

@@ -32,6 +32,7 @@ from starlette.websockets import WebSocket
 
 from companion.server import topics
 from companion.server.access import accept, is_same_site
+from companion.server.connections import most_connections
 from companion.server.large_answers import LargeAnswers
 from companion.server.shared_work import seen
 from companion.server.topics import Body, Topic
@@ -49,7 +50,7 @@ BAD_ARGUMENTS: Final = 4422
 RATE_HZ: Final = 10.0
 LEAST_HZ, MOST_HZ = 0.1, 100.0
 CLIENTS_MAX: Final = 256
-"""Limit on streams: half of the connections; the other half is left for requests."""
+"""Limit on streams, and at most half of the connections: the rest are left for requests."""
 QUIET_S: Final = 5.0
 """Time without a sign that a client reads, after which it makes room for another, seconds.
 
@@ -65,6 +66,11 @@ everything else. A few clients do not wait.
 """
 _EARLY: Final = 0.25
 """Fraction of its period by which a message may be early, as updates are not exact."""
+
+
+def most_clients() -> int:
+    """Return the limit on streams that leaves connections for requests."""
+    return min(CLIENTS_MAX, most_connections() // 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,7 +141,7 @@ class Stream:
         if not is_same_site(headers.get("origin"), headers.get("host")):
             await websocket.close(ELSEWHERE, "pages of other sites may not connect")
             return
-        if self.clients >= CLIENTS_MAX and not self._makes_room(websocket):
+        if self.clients >= most_clients() and not self._makes_room(websocket):
             await websocket.close(TOO_MANY, "too many streams are open")
             return
         try:

@@ -136,8 +136,10 @@ def _writer(member: Member) -> Write | None:
         return None
     if isinstance(kind, type) and issubclass(kind, StrEnum):
         return None  # it is a str
-    if typing.get_origin(kind) in (dict, list) and inner[-1] in _PLAIN:
-        return None
+    copy = typing.get_origin(kind)
+    if copy in (dict, list) and inner[-1] in _PLAIN:
+        # A copy, since the event loop changes it while a thread encodes.
+        return lambda items, _: None if items is None else copy(items)
     if is_vector(kind):
         return lambda array, _: None if array is None else array.tolist()
     if typing.get_origin(kind) is list and is_described(inner[0]):
@@ -152,7 +154,7 @@ def _any(value: Any, utc_ns: Utc) -> Any:
     if value is None or isinstance(value, str | int | float):
         return value
     if isinstance(value, dict):
-        return {key: _any(one, utc_ns) for key, one in value.items()}
+        return {key: _any(one, utc_ns) for key, one in list(value.items())}
     if isinstance(value, list | tuple) and not hasattr(value, "_fields"):
         return [_any(one, utc_ns) for one in value]
     return as_json(value, utc_ns) if members(type(value)) else str(value)

@@ -330,6 +330,25 @@ def test_removed_folder_is_recreated(tmp_path: Path) -> None:
     assert "the file was removed" in made.news()[0][1]
 
 
+def test_truncated_file_is_announced_and_the_run_continues_in_another(tmp_path: Path) -> None:
+    """What was recorded is lost, which nothing told; the rest is not."""
+    made = recorder(tmp_path)
+    made.start()
+    hand_over(made, ticks(1, 100))
+    wait_until(lambda: on_disk(made) == 99)
+    (path,) = tmp_path.iterdir()
+    os.truncate(path, 100)
+    kept = hand_over(made, ticks(100, 200))
+    wait_until(lambda: made.failure is not None)
+    wait_until(lambda: made.failure is None)
+    kept += hand_over(made, ticks(200, 300))
+    made.stop({})
+    assert "the file was truncated" in made.news()[0][1]
+    assert path.stat().st_size == 100
+    (rest,) = tmp_path.glob("*.mcap")
+    assert list(read_log(rest)) == kept
+
+
 def test_slow_disk_drops_events_and_reports_the_count(
     tmp_path: Path, update: Callable[[int], Update]
 ) -> None:

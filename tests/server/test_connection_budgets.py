@@ -335,6 +335,28 @@ def test_new_clients_replace_those_that_do_not_read(
     run_async(crowded())
 
 
+def test_requests_are_not_replaced_by_clients_that_wait_for_a_stream(
+    make_node: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of those the newest is: the first of them keeps its place."""
+    monkeypatch.setattr(connections, "most_connections", lambda: 20)
+    monkeypatch.setattr(connections, "SETTLED_S", HANG_S)
+    monkeypatch.setattr(request_queue.RequestQueue, "add_stream", lambda *_: None)
+
+    async def crowded() -> None:
+        async with served(make_node()) as port:
+            kept = await connected(port)
+            waiting = []
+            for _ in range(30):
+                waiting.append(await connected(port))
+                waiting[-1][1].write(UPGRADE)
+            assert await asked(kept) == b"HTTP/1.1 200 OK\r\n"
+            assert await ends(waiting[-2])
+            assert not waiting[0][0].at_eof()
+
+    run_async(crowded())
+
+
 def test_client_that_takes_nothing_of_an_answer_is_disconnected(
     make_node: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -200,7 +200,7 @@ class Link:
         if found:
             self._pass_on(peer, found)
         if age_ns is not None and age_ns > LATE_NS:
-            self._newcomers.late()
+            self._newcomers.late(age_ns)
         spent_s = time.perf_counter() - began_s
         is_mixed = len(found) != 1 or isinstance(found[0], Rejection)
         if receiver is not None:
@@ -227,9 +227,19 @@ class Link:
     def _receive_within_budget(
         self, receiver: ForeignSplitter, t_ns: int, data: bytes
     ) -> list[Received]:
-        """Parse bytes of a receiver; skip their messages while its budget is used up."""
-        receiver.skips = not self._receiver_s.spend(0.0, t_ns * 1e-9)
-        found = receiver.feed(t_ns, data)
+        """Parse bytes of a receiver; skip messages while its budget is used up, or it is dropped.
+
+        Then a datagram is dropped whole, and counts as one message. Of a stream, the messages are
+        passed over one by one: the place of the next one is known only then.
+        """
+        has_time = self._receiver_s.spend(0.0, t_ns * 1e-9)
+        receiver.skips = not has_time or self._newcomers.is_dropped(receiver.sender)
+        if receiver.skips and self.url.listens:
+            receiver.drop()
+            receiver.skipped += 1
+            found = list[Received]()
+        else:
+            found = receiver.feed(t_ns, data)
         self._skipped, receiver.skipped = self._skipped + receiver.skipped, 0
         if self._skipped and t_ns - self._skipped_ns >= REFUSED_EVERY_NS:
             found.append(
@@ -368,7 +378,7 @@ class Link:
 
     def _overflow(self, count: int) -> None:
         """Count dropped datagrams or frames; their senders are unknown."""
-        self._newcomers.late(is_lossy=True)
+        self._newcomers.late()
         lost = self.status.lost
         lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
         reject = Rejection(

@@ -6,6 +6,10 @@ late in two windows, those of strangers (``known_peers``) are dropped before the
 those of the newest senders, until the rest are in time: who was here first keeps being served. No
 more senders are dropped than took the work that is too much: a flood of one sender costs no other
 its place. Receivers rank behind vehicles, whichever came first.
+
+Where something else takes the time, such as requests or another program, frames take less than
+``BUSY`` of it. Once they have been late for a second and are lost, or too old to be of use, half of
+their work is dropped: otherwise those of all senders become two seconds late.
 """
 
 from bisect import bisect_left
@@ -31,6 +35,11 @@ BUSY: Final = 0.5  # share of the time above which frames of the newest senders 
 IDLE: Final = 0.35  # share below which more senders are served again
 STRANGERS_WAIT_NS: Final = 10_000_000_000  # time for which strangers are not served after that
 LATE_NS: Final = 50_000_000  # age of a datagram that was read late
+USELESS_NS: Final = 500_000_000  # age of a datagram that is of no use to a beam
+LATE_WINDOWS: Final = 4  # late windows in turn after which useless frames cost senders their place
+LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
+HELD_NS: Final = 5_000_000_000, 60_000_000_000
+"""Time for which no more senders are served after that: at first, and at most; it doubles."""
 KEPT_NS: Final = 5_000_000_000  # time between two looks at which senders are active
 WINDOW_NS: Final = 250_000_000  # time over which the share is measured
 
@@ -62,7 +71,9 @@ class Newcomers:
         self._began_ns = 0
         self._used_s = 0.0
         self._changed_ns = 0
-        self._is_late = self._was_late = self._is_lossy = False
+        self._is_late = self._is_lossy = self._is_useless = False
+        self._late_windows = 0  # in turn
+        self._held_ns, self._held_until_ns = HELD_NS[0], -(1 << 62)
 
     def admits(self, source: Source, now_ns: int, *, is_stranger: bool = False) -> bool:
         """Return whether a frame of a sender may be used; count it if not.
@@ -91,10 +102,21 @@ class Newcomers:
         self.refused += 1
         return False
 
-    def late(self, *, is_lossy: bool = False) -> None:
-        """Note that frames were read late; ``is_lossy``: or lost before they were read."""
+    def is_dropped(self, source: Source) -> bool:
+        """Return whether frames of a sender are dropped at present; counts nothing."""
+        number = self._numbers.get(source)
+        return (
+            number is not None
+            and self._served_below is not None
+            and number >= self._served_below
+            and not self._is_named(str(source))
+        )
+
+    def late(self, age_ns: int | None = None) -> None:
+        """Note that frames were read late, at that age; None: they were lost."""
         self._is_late = True
-        self._is_lossy |= is_lossy
+        self._is_lossy |= age_ns is None
+        self._is_useless |= age_ns is None or age_ns > USELESS_NS
 
     def worked(self, source: Source, spent_s: float) -> None:
         """Note the time that a frame of a sender took.
@@ -118,19 +140,30 @@ class Newcomers:
             self.generation += 1
             self._changed_ns = now_ns
         # Once late may be a long update; a flood is late again.
-        is_late = self._is_lossy or (self._is_late and self._was_late)
-        self._was_late, self._is_late, self._is_lossy = self._is_late, False, False
-        if share > BUSY and is_late:
+        is_late = self._is_lossy or (self._is_late and self._late_windows > 0)
+        self._late_windows = self._late_windows + 1 if self._is_late else 0
+        is_useless = self._is_useless and self._late_windows >= LATE_WINDOWS and share > LEAST
+        self._is_late = self._is_lossy = self._is_useless = False
+        if is_late and (share > BUSY or is_useless):
             were_served = now_ns >= self._strangers_from_ns
             self._strangers_from_ns = now_ns + STRANGERS_WAIT_NS
             if were_served and self._had_strangers:
                 self._had_strangers = False
             else:
-                self._drop(by_served, worked_s * BUSY / share)
-        elif share < IDLE and self._served_below is not None:
+                self._drop(by_served, worked_s * min(BUSY / share, 0.5 if is_useless else 1.0))
+            if is_useless:
+                self._hold(now_ns)
+        elif share < IDLE and self._served_below is not None and now_ns >= self._held_until_ns:
             numbers = sorted(self._numbers.values())
             served = bisect_left(numbers, self._served_below)
             self._serve(numbers, max(served + 8, served * 5 // 4))
+
+    def _hold(self, now_ns: int) -> None:
+        """Serve no more senders for a time, which doubles while frames are lost again."""
+        least_ns, most_ns = HELD_NS
+        is_again = now_ns - self._held_until_ns < most_ns
+        self._held_ns = min(2 * self._held_ns, most_ns) if is_again else least_ns
+        self._held_until_ns = now_ns + self._held_ns
 
     def _drop(self, worked_s: dict[Source, float], most_s: float) -> None:
         """Serve the oldest senders whose frames took at most ``most_s`` together; one at least."""

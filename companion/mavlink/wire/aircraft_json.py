@@ -45,11 +45,15 @@ class AircraftJson(ForeignSplitter):
         """Whether aircraft of the newest document are not processed yet."""
         return bool(self._rest)
 
+    def feed(self, t_ns: int, data: bytes) -> Items:
+        """Read a whole document, or continue with the newest one."""
+        is_continued = self._rest and not data
+        items = self._parse(t_ns, data) if is_continued else self._parsed(t_ns, data)
+        return items + self._garbage(t_ns)
+
     def _parse(self, t_ns: int, data: bytes) -> Items:
         if data or not self._rest:
-            refused = self._read(t_ns, data)
-            if refused:
-                return refused
+            self._read(t_ns, data)
         if self._rest and self._is_skipped(len(self._rest)):
             self._rest.clear()
             return []
@@ -58,8 +62,8 @@ class AircraftJson(ForeignSplitter):
             items += self._one(self._arrived_ns, self._rest.pop(), self._written)
         return items
 
-    def _read(self, t_ns: int, data: bytes) -> Items:
-        """Read a document; return why it cannot be used."""
+    def _read(self, t_ns: int, data: bytes) -> None:
+        """Read a document; an unusable one is garbage."""
         self._rest.clear()
         try:
             if len(data) > DOCUMENT_MAX or data.count(b"[") + data.count(b"{") > BRACKETS_MAX:
@@ -72,12 +76,12 @@ class AircraftJson(ForeignSplitter):
             if written is None or not isinstance(aircraft, list):
                 raise ValueError("no time, or no aircraft")
         except (ValueError, KeyError, RecursionError):
-            return self._garbage(t_ns, len(data) or 1)
+            self._stray += len(data) or 1
+            return
         self._complete += 1
         if written != self._written:  # else the same document as before
             self._written, self._arrived_ns = written, t_ns
             self._rest = aircraft[AIRCRAFT_MAX - 1 :: -1]
-        return []
 
     def _one(self, t_ns: int, entry: object, written: float) -> Items:
         try:

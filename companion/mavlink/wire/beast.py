@@ -36,28 +36,28 @@ class BeastSplitter(ForeignSplitter):
         self._lateness = _Lateness()
 
     def _parse(self, t_ns: int, data: bytes) -> Items:
-        data, at, garbage = self._pending + data, 0, 0
+        data, at = self._pending + data, 0
         out: Items = []
         while True:
             found = _START.search(data, at)
             if found is None:
                 keep = 1 if data.endswith(_ESCAPE) and at < len(data) else 0
-                garbage += len(data) - at - keep
+                self._stray += len(data) - at - keep
                 self._pending = data[len(data) - keep :]
                 break
-            garbage += found.start() - at
+            self._stray += found.start() - at
             at = found.start()
             body, end = _unescaped(data, at + 2, _SIZES[data[at + 1]])
             if body is None and end == len(data):
                 self._pending = data[at:]
                 break
             if body is None:  # another message begins within this one
-                garbage += end - at
+                self._stray += end - at
             else:
                 self._complete += 1
                 out += self._message(t_ns, data[at + 1], body)
             at = end
-        return out + self._garbage(t_ns, garbage)
+        return out
 
     def _message(self, t_ns: int, kind: int, body: bytes) -> Items:
         if kind != 0x33:  # too short to hold a position, or not of an aircraft
@@ -81,6 +81,9 @@ def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:
 
     The bytes are None if another message begins within them, or if the data end there.
     """
+    plain = data[at : at + size]
+    if _ESCAPE not in plain:
+        return (plain, at + size) if len(plain) == size else (None, len(data))
     body = bytearray()
     while len(body) < size:
         if at >= len(data):

@@ -36,7 +36,15 @@ _KIND: Final = 0xC07A
 _EVENT = struct.Struct("<Qii6f")
 _HEAD = struct.Struct("<HBBB")
 _MAGIC: Final = 0xBF
-_BEGIN: Final = re.compile(rb"<event[\s>]|\xbf")
+_BEGIN: Final = re.compile(
+    rb"<event[\s>]"
+    rb"|\xbf(?:\x01\xbf|[\x00-\x7f]|[\x80-\xff][\x00-\x7f]|[\x80-\xff]{2}[\x00\x01]"
+    rb"|[\x80-\xff]{0,2}\Z)"
+)
+"""Start of an event, or of a TAK message: 0xbf and a length of at most ``EVENT_MAX``, or nearly.
+
+Other bytes are passed over here, at a thousandth of the time of a message.
+"""
 _END: Final = re.compile(rb"</event\s*>")
 _NO_EVENT: Final = re.compile(
     rb"<\?xml[^<>]*\?>|\s"
@@ -47,31 +55,34 @@ _PLAIN: Final = re.compile(r"[A-Za-z0-9._-]{1,60}")
 class CotSplitter(ForeignSplitter):
     """Converter of the events of one peer to frames."""
 
+    sender = SENDER
+
     def _parse(self, t_ns: int, data: bytes) -> Items:
-        data, at, garbage = self._pending + data, 0, 0
+        data, at = self._pending + data, 0
         out: Items = []
         while True:
             begun = _BEGIN.search(data, at)
             if begun is None:
                 keep = _partial_start_bytes(data, at)
-                garbage += _count_stray_bytes(data[at : len(data) - keep])
+                self._stray += _count_stray_bytes(data[at : len(data) - keep])
                 at = len(data) - keep
                 break
-            garbage += _count_stray_bytes(data[at : begun.start()])
+            self._stray += _count_stray_bytes(data[at : begun.start()])
             at = begun.start()
-            end = _tak_end(data, at) if data[at] == _MAGIC else _xml_end(data, at)
+            is_tak = data[at] == _MAGIC
+            end = _tak_end(data, at, self._is_end) if is_tak else _xml_end(data, at)
             if end is None and len(data) - at <= EVENT_MAX:
                 break
             if end is None or end - at > EVENT_MAX:
-                beyond = at + 1 if data[at] == _MAGIC else end or len(data)
-                garbage += beyond - at
+                beyond = at + 1 if is_tak else end or len(data)
+                self._stray += beyond - at
                 at = beyond
                 continue
             self._complete += 1
             out += self._event(t_ns, data[at:end])
             at = end
         self._pending = data[at:]
-        return out + self._garbage(t_ns, garbage)
+        return out
 
     def _event(self, t_ns: int, raw: bytes) -> Items:
         if self._is_skipped():
@@ -116,13 +127,14 @@ def _xml_end(data: bytes, at: int) -> int | None:
     return found.end() if found else None
 
 
-def _tak_end(data: bytes, at: int) -> int | None:
+def _tak_end(data: bytes, at: int, is_whole: bool) -> int | None:
     """Return the index after a TAK message; None if it is incomplete.
 
-    A datagram has no length: its message extends to the end.
+    A datagram has no length: its message extends to the end. ``is_whole``: nothing follows ``data``
+    of what was received.
     """
     if data[at + 1 : at + 3] == b"\x01\xbf":
-        return len(data)
+        return len(data) if is_whole else None
     if len(data) < at + 3:
         return None
     try:

@@ -44,16 +44,21 @@ class _FormatError(Exception):
 class RidJson(ForeignSplitter):
     """Converter of the objects of one peer to frames."""
 
+    sender = SENDER
+
     def _parse(self, t_ns: int, data: bytes) -> Items:
         *lines, self._pending = (self._pending + data).replace(b"\0", b"\n").split(b"\n")
-        kept, garbage = self._lines(lines, OBJECT_MAX)
+        kept = self._lines(lines, OBJECT_MAX)
         out = [item for line in kept if line.strip() for item in self._object(t_ns, line)]
-        if self._pending.rstrip().endswith(b"}") and not self._overlong:  # no new line in datagrams
+        # A datagram ends without a new line.
+        is_end = self._is_end and not self._overlong
+        if is_end and self._pending.rstrip().endswith(b"}"):
             whole = _parsed(self._pending)
             if whole is not None:
                 out += self._object(t_ns, self._pending)
                 self._pending = b""
-        return out + self._garbage(t_ns, garbage + self._drop_overlong(OBJECT_MAX))
+        self._drop_overlong(OBJECT_MAX)
+        return out
 
     def _object(self, t_ns: int, text: bytes) -> Items:
         if self._is_skipped():
@@ -61,7 +66,8 @@ class RidJson(ForeignSplitter):
             return []
         found = _parsed(text)
         if found is None:
-            return self._garbage(t_ns, len(text) + 1)
+            self._stray += len(text) + 1
+            return []
         self._complete += 1
         try:
             return [self._frame(t_ns, Outgoing(SENDER, *one)) for one in list(_messages(found))]

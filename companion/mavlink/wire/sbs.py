@@ -29,17 +29,17 @@ class SbsSplitter(ForeignSplitter):
 
     def _parse(self, t_ns: int, data: bytes) -> Items:
         *lines, self._pending = (self._pending + data).split(b"\n")
-        kept, garbage = self._lines(lines, LINE_MAX)
         out: Items = []
-        for line in kept:
+        for line in self._lines(lines, LINE_MAX):
             kind = line.partition(b",")[0].strip()
             if kind in (b"MSG", b"MLAT"):
                 out += self._line(t_ns, line, kind)
             elif line.strip() and kind not in _SILENT:
-                garbage += len(line) + 1
+                self._stray += len(line) + 1
                 continue
             self._complete += 1  # an empty line is the heartbeat of readsb
-        return out + self._garbage(t_ns, garbage + self._drop_overlong(LINE_MAX))
+        self._drop_overlong(LINE_MAX)
+        return out
 
     def _line(self, t_ns: int, line: bytes, kind: bytes) -> Items:
         if self._is_skipped():

@@ -32,7 +32,7 @@ class MountLag:
     def note_report(self, at_ns: int, azimuth_rad: float) -> None:
         """Note a reported direction, and update the lag estimate."""
         self._reports.append((at_ns * 1e-9, azimuth_rad))
-        if len(self._reports) >= SAMPLES_MIN:
+        if self._commands and len(self._reports) >= SAMPLES_MIN:
             self._estimate(np.array(self._commands).T, np.array(self._reports).T)
 
     def _estimate(self, told: FloatArray, seen: FloatArray) -> None:

@@ -88,6 +88,28 @@ def test_receiver_beyond_its_share_of_the_time_is_skipped_and_counted(
     run(test())
 
 
+def test_datagram_beyond_the_share_is_dropped_whole(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its garbage cost as much as its messages: 64 kB of it 0.7 s."""
+    monkeypatch.setattr(transport, "RECEIVER_SAVED_S", 0.0)
+    now_ns = 1_000_000_000
+
+    async def test() -> None:
+        nonlocal now_ns
+        async with running("cot:udp:127.0.0.1:0", now_ns=lambda: now_ns) as (link, inbox):
+            await until_true(lambda: link.status.state == "up")
+            assert link.take(("127.0.0.1", 1), 20 * EVENT)
+            assert not link.take(("127.0.0.1", 1), b"")  # the rest is dropped
+            assert not link.take(("127.0.0.1", 2), b"\xbf" * 60_000)
+            now_ns += 60_000_000_000
+            link.take(("127.0.0.1", 1), EVENT)  # whose half-read datagram left nothing
+            assert 8 < len(inbox.frames) < 20
+            assert link.status.lost == {Reason.TOO_FREQUENT: 2}
+
+    run(test())
+
+
 @pytest.mark.parametrize("status", [b"HTTP/1.0 200 OK\r\n", b"HTTP/1.1 200 fine\r\nA: b\r\n"])
 def test_http_document_becomes_frames(run: Run, status: bytes) -> None:
     async def test() -> None:
@@ -278,7 +300,13 @@ def test_server_of_another_protocol_is_announced_and_counted(
             for second in range(transport.UNFINISHED_S + 2):
                 connection.write(piece)
                 total = (second + 1) * len(piece)
-                await until_true(lambda total=total: link.status.bytes >= total)
+                peers = link._peers._peers
+                await until_true(
+                    lambda total=total, peers=peers: (
+                        link.status.bytes >= total
+                        and not any(peer.splitter.has_more for peer in peers.values())
+                    )
+                )
                 for peer in link._peers._peers.values():
                     assert len(peer.splitter._pending) <= 32_768  # type: ignore[attr-defined]
                 clock.t_ns += 1_000_000_000

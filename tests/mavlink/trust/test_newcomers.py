@@ -38,18 +38,75 @@ def window(
     for one in now:
         senders.worked(source(one), spent_s / len(now))
     if is_late:
-        senders.late(is_lossy=True)
+        senders.late()
     senders.adapt(number * WINDOW_NS, used * number * WINDOW_NS * 1e-9)
 
 
-def test_process_that_is_stopped_drops_no_sender() -> None:
+def test_process_that_was_stopped_drops_no_sender() -> None:
     """Frames took nearly all of the time by the clock, but little of the processor."""
     for used, all_served in ((0.3, True), (1.0, False)):
         senders = Newcomers()
         served(senders, 20, 0)
-        for number in range(1, 9):
+        for number in range(1, newcomers.LATE_WINDOWS):
             window(senders, number, 0.9, is_late=True, used=used)
         assert (len(served(senders, 20, 9 * WINDOW_NS)) == 20) is all_served
+
+
+def late_windows(senders: Newcomers, first: int, share: float, age_ns: int | None) -> None:
+    """Note windows in each of which some frames are late, and at the end of that age, or lost."""
+    for number in range(first, first + newcomers.LATE_WINDOWS):
+        senders.late(newcomers.LATE_NS + 1)
+        if number == first + newcomers.LATE_WINDOWS - 1:
+            senders.late(age_ns)
+        window(senders, number, share)
+
+
+@pytest.mark.parametrize("age_ns", [None, newcomers.USELESS_NS + 1])
+def test_newest_senders_are_dropped_where_other_work_makes_frames_useless(
+    age_ns: int | None,
+) -> None:
+    """Requests and receivers took the time: all frames became 2 s late, the carrier's as well."""
+    senders = Newcomers()
+    assert len(served(senders, 100, 0)) == 100
+    late_windows(senders, 1, 0.4, age_ns)
+    now_ns = 5 * WINDOW_NS
+    left = served(senders, 100, now_ns)
+    assert left == list(range(len(left))) and len(left) in (49, 50)
+    assert senders.is_dropped(source(50)) and not senders.is_dropped(source(48))
+    # They are not served again at once, which would repeat it.
+    end = 4 + newcomers.HELD_NS[0] // WINDOW_NS
+    for number in range(5, end):
+        window(senders, number, 0.1)
+        assert served(senders, 100, now_ns) == left
+    window(senders, end, 0.1)
+    assert len(served(senders, 100, now_ns)) > len(left)
+
+
+def test_senders_that_are_dropped_again_wait_longer() -> None:
+    senders, first, waits_ns = Newcomers(), 1, []
+    for _ in range(6):
+        late_windows(senders, first, 0.4, None)
+        end = first + newcomers.LATE_WINDOWS - 1
+        waits_ns.append(senders._held_until_ns - end * WINDOW_NS)
+        first = senders._held_until_ns // WINDOW_NS + 1
+    least_ns, most_ns = newcomers.HELD_NS
+    assert waits_ns == [min(least_ns << number, most_ns) for number in range(6)]
+
+
+@pytest.mark.parametrize(("share", "age_ns"), [(0.19, None), (0.4, newcomers.USELESS_NS)])
+def test_late_frames_that_are_few_or_of_use_cost_nobody_a_place(
+    share: float, age_ns: int | None
+) -> None:
+    senders = Newcomers()
+    late_windows(senders, 1, share, age_ns)
+    assert len(served(senders, 100, 5 * WINDOW_NS)) == 100
+
+
+def test_named_vehicles_are_not_reported_as_dropped() -> None:
+    senders = Newcomers(lambda uav: uav == str(source(98)))
+    late_windows(senders, 1, 0.4, None)
+    assert not senders.is_dropped(source(98)) and senders.is_dropped(source(97))
+    assert not senders.is_dropped(Source(250, 1))
 
 
 def test_new_senders_are_limited_and_known_ones_are_not() -> None:
@@ -121,7 +178,7 @@ def test_flood_of_one_sender_costs_no_other_its_place() -> None:
             senders.worked(source(one), 0.01 * WINDOW_NS * 1e-9)
         if 5 in now:
             senders.worked(source(5), 0.9 * WINDOW_NS * 1e-9)
-        senders.late(is_lossy=True)
+        senders.late()
         senders.adapt(number * WINDOW_NS, number * WINDOW_NS * 1e-9)
     assert served(senders, 6, 20 * WINDOW_NS) == [0, 1, 2, 3, 4]
 
@@ -136,7 +193,7 @@ def test_receiver_ranks_behind_vehicles_but_not_behind_a_flood(receiver: Source)
         senders.worked_s += spent_s
         for one in (*map(source, now), receiver):
             senders.worked(one, spent_s / (1 + len(now)))
-        senders.late(is_lossy=True)
+        senders.late()
         senders.adapt(WINDOW_NS, WINDOW_NS * 1e-9)
         assert senders.admits(receiver, WINDOW_NS) is receiver_stays
 
@@ -174,10 +231,10 @@ def test_one_late_window_costs_nobody_a_place() -> None:
     assert all(senders.admits(source(number), 0) for number in range(100))
     for number in range(1, 9):
         if number % 2:
-            senders.late()
+            senders.late(newcomers.LATE_NS + 1)
         window(senders, number, 0.9)
         assert all(senders.admits(source(one), number * WINDOW_NS) for one in range(100))
     for number in (9, 10):
-        senders.late()
+        senders.late(newcomers.LATE_NS + 1)
         window(senders, number, 0.9)
     assert not senders.admits(source(99), 10 * WINDOW_NS)

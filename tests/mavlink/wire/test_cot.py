@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 from xml.etree import ElementTree
 
+import link_support
 import pytest
 import takproto
 from hypothesis import given
@@ -35,7 +36,7 @@ def changed(old: str, new: str) -> bytes:
 
 
 def fed(data: bytes) -> list[Frame | Rejection]:
-    return CotSplitter("cot:x").feed(7, data)
+    return link_support.fed(CotSplitter("cot:x"), 7, data)
 
 
 def said(data: bytes) -> Report:
@@ -175,9 +176,9 @@ def test_split_input_gives_the_same_result(cuts: list[int]) -> None:
     at = [0, *sorted(cuts), len(STREAM)]
     splitter = CotSplitter("x")
     pieces = [STREAM[a:b] for a, b in pairwise(at)]
-    whole = CotSplitter("x").feed(7, STREAM)
+    whole = link_support.fed(CotSplitter("x"), 7, STREAM)
     assert [type(one) for one in whole] == [Frame] * 4
-    assert [one for piece in pieces for one in splitter.feed(7, piece)] == whole
+    assert [one for piece in pieces for one in link_support.fed(splitter, 7, piece)] == whole
     assert splitter.finish(8) == []
 
 
@@ -195,10 +196,10 @@ def test_endless_events_use_bounded_memory_and_time(piece: bytes) -> None:
     splitter = CotSplitter("x")
     began_s = time.process_time()
     for _ in range(100):
-        splitter.feed(7, piece * 500)
+        link_support.fed(splitter, 7, piece * 500)
         assert len(splitter._pending) <= EVENT_MAX + len(piece) * 500
     assert time.process_time() - began_s < 10  # linear: tenths of a second
-    found = splitter.feed(7, b"</event>" * 2 + XML)
+    found = link_support.fed(splitter, 7, b"</event>" * 2 + XML)
     assert isinstance(found[0], Frame | Rejection)
 
 

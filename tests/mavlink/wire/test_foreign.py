@@ -1,11 +1,13 @@
 """Every format other than MAVLink: hostile bytes in linear time, and messages that never end."""
 
+import sys
 import time
 from collections.abc import Callable
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from link_support import fed
 
 from companion.mavlink.wire.aircraft_json import AircraftJson
 from companion.mavlink.wire.beast import BeastSplitter
@@ -85,11 +87,60 @@ def test_work_grows_linearly_with_the_bytes_of_one_read(name: str, piece: bytes)
         for _ in range(3):
             splitter = FORMATS[name][0]("x")
             began = time.process_time()
-            splitter.feed(7, data)
+            fed(splitter, 7, data)
             least = min(least, time.process_time() - began)
         return least
 
     assert seconds(256 << 10) <= 24 * seconds(32 << 10) + 0.01
+
+
+@pytest.mark.parametrize(
+    ("name", "piece"), [(name, piece) for name, pieces in FLOODS.items() for piece in pieces]
+)
+def test_one_call_does_a_limited_amount_of_work(name: str, piece: bytes) -> None:
+    """64 kB of tiny messages took 0.7 s in one call, on the event loop."""
+    splitter, calls = FORMATS[name][0]("x"), 0
+
+    def count(*_: object) -> None:
+        nonlocal calls
+        calls += 1
+
+    data, most = piece * ((64 << 10) // len(piece)), 0
+    while data or splitter.has_more:
+        calls = 0
+        sys.setprofile(count)
+        try:
+            splitter.feed(7, data)
+        finally:
+            sys.setprofile(None)
+        data, most = b"", max(most, calls)
+    assert most < 10_000
+
+
+def test_lengths_that_are_too_large_are_passed_over_without_a_call() -> None:
+    """Each such byte took 10 microseconds, which 64 kB of them multiply."""
+    splitter, calls = CotSplitter("x"), 0
+
+    def count(*_: object) -> None:
+        nonlocal calls
+        calls += 1
+
+    sys.setprofile(count)
+    try:
+        found = fed(splitter, 7, b"\xbf" * (64 << 10))
+    finally:
+        sys.setprofile(None)
+    assert calls < 16_000
+    assert sum(one.count for one in found if isinstance(one, Rejection)) == (64 << 10) - 3
+
+
+def test_dropped_bytes_leave_no_half_message() -> None:
+    splitter = CotSplitter("x")
+    splitter.feed(1, 20 * COT + COT[:50])
+    assert splitter.has_more
+    splitter.drop()
+    assert not splitter.has_more
+    assert [type(one) for one in splitter.feed(2, COT)] == [Frame]
 
 
 # --- the bytes since the last complete message ----------------------------------------------------
@@ -159,9 +210,9 @@ def test_skipped_messages_are_counted_and_the_stream_stays_in_step(name: str) ->
 @pytest.mark.parametrize("name", FORMATS)
 def test_garbage_alone_is_unfinished(name: str) -> None:
     splitter = FORMATS[name][0]("x")
-    (found,) = splitter.feed(1, b"x" * 20_000)
-    assert isinstance(found, Rejection) and found.reason is Reason.GARBAGE
-    splitter.feed(2, b"x" * 20_000)
+    for found in fed(splitter, 1, b"x" * 20_000):
+        assert isinstance(found, Rejection) and found.reason is Reason.GARBAGE
+    fed(splitter, 2, b"x" * 20_000)
     assert splitter.unfinished_ns == 1 and splitter.is_incomplete
     splitter.feed(3, (b"\n" if name in ("sbs", "rid") else b"") + FORMATS[name][1])
     assert splitter.unfinished_ns is None

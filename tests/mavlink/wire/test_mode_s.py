@@ -8,6 +8,7 @@ import random
 from itertools import pairwise
 from typing import Any
 
+import link_support
 import pyModeS
 import pytest
 from hypothesis import given
@@ -290,9 +291,9 @@ def test_split_input_gives_the_same_result(cuts: list[int]) -> None:
     at = [0, *sorted(cuts), len(STREAM)]
     splitter = BeastSplitter("x")
     pieces = [STREAM[a:b] for a, b in pairwise(at)]
-    whole = BeastSplitter("x").feed(7, STREAM)
+    whole = link_support.fed(BeastSplitter("x"), 7, STREAM)
     assert len(whole) == 5
-    assert [one for piece in pieces for one in splitter.feed(7, piece)] == whole
+    assert [one for piece in pieces for one in link_support.fed(splitter, 7, piece)] == whole
 
 
 @given(st.lists(st.binary(max_size=60) | st.sampled_from([b"\x1a", b"\x1a3", STREAM[:40]])))

@@ -7,6 +7,7 @@ import struct
 from itertools import pairwise
 from typing import Any
 
+import link_support
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -55,7 +56,7 @@ def scouted(uas: bytes, **changed: Any) -> bytes:
 
 
 def fed(data: bytes) -> list[Frame | Rejection]:
-    return RidJson("rid:x").feed(7, data)
+    return link_support.fed(RidJson("rid:x"), 7, data)
 
 
 def said(data: bytes) -> RemoteId:
@@ -156,9 +157,9 @@ def test_split_input_gives_the_same_result(cuts: list[int]) -> None:
     at = [0, *sorted(cuts), len(STREAM)]
     splitter = RidJson("x")
     pieces = [STREAM[a:b] for a, b in pairwise(at)]
-    whole = RidJson("x").feed(7, STREAM)
+    whole = link_support.fed(RidJson("x"), 7, STREAM)
     assert len(whole) == 7  # two per rid_capture object, three per DroneScout object
-    assert [one for piece in pieces for one in splitter.feed(7, piece)] == whole
+    assert [one for piece in pieces for one in link_support.fed(splitter, 7, piece)] == whole
     assert splitter.finish(8) == []
 
 

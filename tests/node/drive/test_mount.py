@@ -256,6 +256,14 @@ def test_unreachable_rotator_is_a_device_error() -> None:
         Rotator("127.0.0.1", 1).open()
 
 
+def test_reports_before_the_first_command_give_no_lag() -> None:
+    """A gimbal at its boresight reports for as long as there are no beams."""
+    lag = MountLag()
+    for number in range(40):
+        lag.note_report(number * 10_000_000, 0.01 * number)
+    assert lag.lag_s == 0.0
+
+
 @pytest.mark.parametrize("lag_s", [0.05, 0.2, 0.7])
 def test_lag_is_estimated_from_position_reports(lag_s: float) -> None:
     lag, rng = MountLag(), np.random.default_rng(1)

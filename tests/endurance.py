@@ -103,6 +103,18 @@ def twins(per_s: float, icaos: int) -> Attack:
     return attack
 
 
+def datagrams(scheme: str, blob: bytes, per_s: float) -> Attack:
+    """One datagram, again and again, to the service's link with that scheme."""
+
+    def attack(node: Node, until: threading.Event) -> None:
+        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as one:
+            one.connect(("127.0.0.1", port_of(node, scheme)))
+            while not until.wait(1.0 / per_s):
+                one.send(blob)
+
+    return attack
+
+
 # --- TCP links ------------------------------------------------------------------------------------
 
 
@@ -297,3 +309,15 @@ def running(attack: Attack, node: Node) -> Iterator[None]:
     finally:
         until.set()
         thread.join(HANG_S)
+
+
+def both(*given: Attack) -> Attack:
+    """Attacks at the same time."""
+
+    def attack(node: Node, until: threading.Event) -> None:
+        with contextlib.ExitStack() as stack:
+            for one in given:
+                stack.enter_context(running(one, node))
+            until.wait()
+
+    return attack

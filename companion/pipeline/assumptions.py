@@ -4,6 +4,7 @@ from typing import Final
 
 from companion.mavlink.clock.estimates import ClockChange
 from companion.pipeline.records import UavRecord, UavRecords
+from companion.settings.tracking import ClockSettings
 from companion.values import Estimate, Notice, Refuted, Severity
 
 NOTICE_RATIO: Final = 1.25  # multiple of the value last reported above which a notice is repeated
@@ -11,6 +12,7 @@ _UNITS: Final = {
     "observer.speed_max_mps": "m/s",
     "observer.acceleration_max_mps2": "m/s²",
     "observer.position_noise_m": "m",
+    "clocks.constant_delay_s": "s",
     "clocks.drift_max_ppm": "ppm",
     "center.turn_acceleration_max_degps2": "°/s²",
     "center.attitude_bound_deg": "°",
@@ -45,17 +47,17 @@ def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Not
 
 
 def clock_changed(
-    record: UavRecord, t_ns: int, sender: str, change: ClockChange, drift_max_ppm: float
+    record: UavRecord, t_ns: int, sender: str, change: ClockChange, assumed: ClockSettings
 ) -> Refuted:
     """Return a change of a sender's clock or link as a refutation."""
     record.refuted += 1
+    setting, limit = "clocks.drift_max_ppm", assumed.drift_max_ppm
+    proven = raised_to = change.drift_ppm
+    if change.was_late:
+        setting, limit = "clocks.constant_delay_s", assumed.constant_delay_s
+        proven, raised_to = limit - change.step_s, limit  # it held for the past
     return Refuted(
-        t_ns=t_ns,
-        uav=sender,
-        setting="clocks.drift_max_ppm",
-        limit=drift_max_ppm,
-        proven=change.drift_ppm,
-        raised_to=change.drift_ppm,
+        t_ns=t_ns, uav=sender, setting=setting, limit=limit, proven=proven, raised_to=raised_to
     )
 
 
@@ -68,8 +70,11 @@ class ClockNotices:
         self._noticed_ns: int | None = None
 
     def add(self, t_ns: int, sender: str, change: ClockChange) -> Notice | None:
-        """Process a change. Returns a notice of a clock jump; other changes are gathered."""
-        if change.leapt:
+        """Process a change. Returns a notice of a clock jump, or of late positions before it.
+
+        Other changes are gathered.
+        """
+        if change.leapt or change.was_late:
             text = _clock_text(sender, change)
             return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=sender, text=text)
         if abs(change.step_s) < NOTICED_STEP_S:
@@ -111,6 +116,12 @@ def _clock_text(sender: str, change: ClockChange) -> str:
         return f"{sender}: messages arrive {step} than before; treated as a clock jump"
     if change.proven:
         return f"{sender}: clock changed by {step} more than clocks.drift_max_ppm allows"
+    if change.was_late:
+        return (
+            f"{sender}: messages arrive {-change.step_s:.1f} s earlier than before: until now its"
+            " positions were older than assumed by that time, and its bounds too small; allow"
+            " TIMESYNC, or set clocks.constant_delay_s"
+        )
     why = "clock stalled or link slowed down; the bound covers both"
     return f"{sender}: messages arrive {step} later than before: {why}"
 
@@ -140,6 +151,11 @@ def _refutation_text(one: Refuted) -> str:
             f"{one.uav}: receiver states an accuracy of {one.limit:.2g} m, but deviates by"
             f" {one.proven:.2g} m from its velocities ({one.setting});"
             f" {one.raised_to:.2g} m is assumed now"
+        )
+    if one.setting == "observer.velocity_noise_mps":
+        return (
+            f"{one.uav}: its positions contradict its velocities by {one.proven:.2g} m/s, beyond"
+            f" {one.setting} ({one.limit:.2g}); {one.raised_to:.2g} m/s is assumed now"
         )
     if one.setting == "center.attitude_bound_deg" and one.uav == ARRAY:
         return (

@@ -207,9 +207,8 @@ class Pipeline:
     def _changed(self, t_ns: int, sender: str, change: ClockChange) -> list[Output]:
         if sender not in self.tracker:
             return []
-        drift_max_ppm = self.settings.clocks.drift_max_ppm
-        record = self.records[sender]
-        refuted = assumptions.clock_changed(record, t_ns, sender, change, drift_max_ppm)
+        record, assumed = self.records[sender], self.settings.clocks
+        refuted = assumptions.clock_changed(record, t_ns, sender, change, assumed)
         jump = self._clock_notices.add(t_ns, sender, change)
         return [refuted] if jump is None else [refuted, jump]
 

@@ -64,7 +64,7 @@ class ReceiverCheck:
             return None
         stated_m = fix.noise.horizontal_m / factor
         lag_m = 2.0 * fix.noise.time_s * math.hypot(*velocity)
-        north_m, east_m, unseen_m = _step_deviation(before, fix, acceleration_mps2)
+        north_m, east_m, unseen_m = step_deviation(before, fix, acceleration_mps2)
         if math.hypot(north_m, east_m) > 2.0 * fix.noise.horizontal_m + lag_m + unseen_m:
             self._begin(fix)  # a jump, which the gate handles
             return None
@@ -97,7 +97,7 @@ class ReceiverCheck:
     ) -> tuple[float, float]:
         """Return the deviation over the last seconds, and the possible unseen displacement; metres.
 
-        The arguments are the results of ``_step_deviation`` for the newest report.
+        The arguments are the results of ``step_deviation`` for the newest report.
         """
         seen = self._seen
         _, north, east, unseen_m2 = seen[-1]
@@ -126,7 +126,7 @@ class ReceiverCheck:
         return min(noise.apart_m, noise.vertical_m) or COMMON_ERROR * noise.position_m
 
 
-def _step_deviation(before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float, float]:
+def step_deviation(before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float, float]:
     """Return the deviation of a position from dead reckoning, north and east, metres.
 
     The third value bounds the possible unseen displacement between the two reports. Only horizontal

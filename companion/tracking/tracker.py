@@ -21,6 +21,7 @@ from companion.tracking.pace import ReportTiming
 from companion.tracking.past_predictions import ACCELERATION_MODELS, WINDOWS, PastPredictions
 from companion.tracking.receiver_check import ReceiverCheck
 from companion.tracking.track_snapshot import Ages, TrackSnapshot
+from companion.tracking.velocity_check import VelocityCheck
 from companion.values import (
     Estimate,
     Fix,
@@ -56,7 +57,7 @@ class TrackerSettings:
     noise: NoiseSettings | None = None
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _Past:
     """State of a UAV that survives a restart of its track.
 
@@ -65,6 +66,7 @@ class _Past:
 
     refutations: Refutations
     receiver_check: ReceiverCheck | None
+    velocity_check: VelocityCheck
     pace: ReportTiming
 
 
@@ -127,11 +129,19 @@ class Tracker:
         if isinstance(found, Estimate):
             newest = self._tracked[fix.uav].history.newest.fix
             self._positions.put(fix.uav, newest.position_ned_m)
+        if isinstance(found, Estimate) or found.reason is Reason.UNREACHABLE:
+            wrong = past.velocity_check.look(fix, self._limits(fix).acceleration_max_mps2)
+            refuted += [] if wrong is None else [wrong]
         return found, refuted
 
     def _new_past(self) -> _Past:
         noise = self._settings.noise
-        return _Past(Refutations(), None if noise is None else ReceiverCheck(noise), ReportTiming())
+        return _Past(
+            refutations=Refutations(),
+            receiver_check=None if noise is None else ReceiverCheck(noise),
+            velocity_check=VelocityCheck(),
+            pace=ReportTiming(),
+        )
 
     def _with_raised_limits(self, past: _Past, fix: Fix) -> tuple[Fix, list[Refuted]]:
         """Return a report with its raised bounds, and the refutations by this report."""
@@ -142,6 +152,7 @@ class Tracker:
             refuted = past.receiver_check.look(fix, limits.acceleration_max_mps2)
             noise = past.receiver_check.noise(noise)
             found += [] if refuted is None else [refuted]
+        noise = past.velocity_check.noise(noise, fix.sender_ns)
         if limits is given and noise is fix.noise:
             return fix, found
         return fix._replace(limits=limits, noise=noise), found

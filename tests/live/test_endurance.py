@@ -35,6 +35,7 @@ GROWS_MB = 30.0
 MAP_MB = 40.0  # threads that read files, and 64 kB of each answer that is not read
 FULL_TABLE_MB = 40.0
 """For 2000 tracks, the limit of ``[tracks] most``: 10 kB each, besides what time alone takes."""
+CROWD_MB = 100.0  # of a crowd that is tracked besides, and answers that are computed
 UDP = "udpin:127.0.0.1:0"
 
 
@@ -72,6 +73,15 @@ def receiver(scheme: str, lie: Any) -> Case:
     return Case(server.attack, words, FULL_TABLE_MB)
 
 
+def receivers_and_crowd() -> Case:
+    """Five loads at once, each of which is harmless alone."""
+    servers = [LyingServer(lie, 1600.0) for lie in (endurance.sbs_lies, endurance.beast_lies)]
+    urls = zip(("sbs", "readsb"), servers, strict=True)
+    words = [word for kind, one in urls for word in ("--link", f"{kind}:127.0.0.1:{one.port}")]
+    crowd = (attacks.distinct_requests(40), attacks.ghosts(300.0, 100), attacks.frames(1500.0))
+    return Case(endurance.both(*(one.attack for one in servers), *crowd), tuple(words), CROWD_MB)
+
+
 TCPIN = ("--link", "tcpin:127.0.0.1:0")
 CASES: dict[str, Callable[[], Case]] = {
     "valid frames over 20 TCP connections": lambda: Case(
@@ -89,6 +99,13 @@ CASES: dict[str, Callable[[], Case]] = {
     "3000 reports/s of 4000 relayed aircraft around the UAVs": lambda: Case(
         endurance.twins(3000.0, 4000), grows_mb=FULL_TABLE_MB
     ),
+    "64 kB of one byte to a Cursor on Target port, 30 times a second": lambda: Case(
+        endurance.datagrams("cot", b"\xbf" * 65_000, 30.0), ("--link", "cot:udp:127.0.0.1:0")
+    ),
+    "64 kB of empty objects to a Remote ID port, 5 times a second": lambda: Case(
+        endurance.datagrams("rid", b"{}\n" * 21_000, 5.0), ("--link", "rid:udp:127.0.0.1:0")
+    ),
+    "two receivers that lie, requests, invented UAVs and a flood at once": receivers_and_crowd,
     "an SBS server that lies": lambda: receiver("sbs", endurance.sbs_lies),
     "a Beast server that lies": lambda: receiver("readsb", endurance.beast_lies),
 }
@@ -126,19 +143,7 @@ def told(table: Any, name: str, seen: Looks, grows_mb: float = GROWS_MB) -> None
 # --- senders under one id, signed and unsigned ----------------------------------------------------
 
 
-def both(*given: Attack) -> Attack:
-    """Attacks at the same time."""
-
-    def attack(node: Node, until: Any) -> None:
-        with contextlib.ExitStack() as stack:
-            for one in given:
-                stack.enter_context(endurance.running(one, node))
-            until.wait()
-
-    return attack
-
-
-FORGED = both(attacks.forged_carrier(0.1), attacks.drifting(5.0, 10.0, fresh_ports=True))
+FORGED = endurance.both(attacks.forged_carrier(0.1), attacks.drifting(5.0, 10.0, fresh_ports=True))
 
 
 @pytest.mark.parametrize("unsigned", [False, True], ids=["keyed", "allow_unsigned"])

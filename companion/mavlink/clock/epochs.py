@@ -16,7 +16,8 @@ line while it is less than ``late_max_ns`` off it:
   advances between them, belong to a second clock: two senders share one id.
 - A stamp that is more than a second early on a line of 20 implies that all earlier ones were
   late. It counts once three stamps of reports over at least half a second agree; until then they
-  have no time.
+  have no time. Late ones may arrive between them, if they are no more than twice as many: a link
+  that becomes fast still delivers what it had delayed.
 - Frames of the previous line that arrive within ``late_max_ns`` after it was left have no time.
 
 A reboot is therefore reported once, at the stamp that confirms it. One case is ambiguous: a
@@ -49,6 +50,7 @@ class PlacedStamp(NamedTuple):
     new_line: bool = False  # True for the first stamp on a new line
     rebooted: bool = False  # True if the new line was begun by a reboot
     jump_ns: int = 0  # height of a new line without reboot above the previous one; else 0
+    ahead_ns: int = 0  # by how much earlier than all before it this stamp arrived, if confirmed
 
 
 @dataclass(slots=True, kw_only=True)
@@ -108,6 +110,8 @@ class BootLine:
         self.newest_ns = 0
         self.since_ns: int | None = None
         self._run = _RivalLine()
+        self._ahead = _RivalLine()  # early stamps that are not confirmed yet
+        self._between = 0  # stamps in order that arrived since the first of them
         self._rival = _RivalLine()
         self._previous: tuple[Floor, int] | None = None  # the previous line, and when it was left
 
@@ -183,6 +187,7 @@ class BootLine:
             if late_ns < _EARLY_NS and self.floor.count >= _ESTABLISHED:
                 return self._place_ahead(arrival_ns, boot_ms)
             self._run.stamps.clear()
+            self._between += 1
         elif (
             x_ns < self.newest_ns
             and x_ns < self._late_max_ns  # soon after the boot, not after a wrap
@@ -197,13 +202,21 @@ class BootLine:
 
         A single forged stamp could otherwise move the clock by any amount.
         """
-        if not (self._run.add(arrival_ns, boot_ms, _NS) and self._run.lasts(3, _NS // 2)):
+        self._ahead.forget(arrival_ns)
+        advances = self._ahead.add(arrival_ns, boot_ms, _NS)
+        stamps = self._ahead.stamps
+        if len(stamps) == 1:
+            self._between = 0
+        if not (advances and self._ahead.lasts(3, _NS // 2)) or self._between > 2 * len(stamps):
             return None
-        for at_ns, stamp_ms in self._run.stamps[:-1]:
-            x_ns = unwrapped_ns(stamp_ms, self.newest_ns)
-            self.floor.add(x_ns, at_ns - x_ns)
-        self._run.stamps.clear()
-        return self._accept(arrival_ns, unwrapped_ns(boot_ms, self.newest_ns))
+        x_ns = unwrapped_ns(boot_ms, self.newest_ns)
+        before_ns = self.floor.at(x_ns)
+        for at_ns, stamp_ms in stamps[:-1]:
+            early_ns = unwrapped_ns(stamp_ms, self.newest_ns)
+            self.floor.add(early_ns, at_ns - early_ns)
+        stamps.clear()
+        placed = self._accept(arrival_ns, x_ns)
+        return placed._replace(ahead_ns=before_ns - self.floor.at(x_ns))
 
     def _place_delayed(self, arrival_ns: int, boot_ms: int, x_ns: int) -> PlacedStamp:
         """Place a stamp in order but too late: the link stalled, or the clock stalled."""
@@ -229,6 +242,7 @@ class BootLine:
         """Make the run of stamps the new line. After a reboot the sender's timeline restarts."""
         stamps = list(self._run.stamps)
         self._run.stamps.clear()
+        self._ahead.stamps.clear()
         self._rival.stamps.clear()
         before = self.floor
         self.since_ns = stamps[0][0]

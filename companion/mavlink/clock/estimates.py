@@ -98,7 +98,8 @@ class ClockChange:
 
     proven     whether two-way evidence proves that the clock changed; otherwise all frames are
                late by that much, because of the clock or the link
-    step_s     size of the change, seconds
+    step_s     size of the change, seconds; negative: frames arrive earlier than all before them,
+               which were late by more than was assumed
     drift_ppm  drift equivalent to the change; inf if it is too fast for a drift
     leapt      whether it exceeds the largest lateness of a frame: a clock jump, by assumption
     """
@@ -107,3 +108,8 @@ class ClockChange:
     step_s: float
     drift_ppm: float
     leapt: bool = False
+
+    @property
+    def was_late(self) -> bool:
+        """Whether frames before this change were later than assumed, and their bounds too small."""
+        return not self.proven and not self.leapt and self.step_s < 0.0

@@ -88,7 +88,9 @@ class SenderClock:
             self._timesync.clear()
             self.forget_gnss()
         line, x_ns = self._line, placed.x_ns
-        if placed.jump_ns or line.floor.rise_ns:
+        if placed.ahead_ns:
+            self._note_earlier(placed.ahead_ns)
+        elif placed.jump_ns or line.floor.rise_ns:
             self._note_change(placed.jump_ns)
         _, low_ns, _, likely_ns = self._now()
         at_ns = x_ns + line.floor.drifted_ns(x_ns)
@@ -111,6 +113,9 @@ class SenderClock:
         self.change = ClockChange(
             proven=False, step_s=rise_ns * 1e-9, drift_ppm=math.inf, leapt=jump_ns != 0
         )
+
+    def _note_earlier(self, ahead_ns: int) -> None:
+        self.change = ClockChange(proven=False, step_s=-ahead_ns * 1e-9, drift_ppm=math.inf)
 
     def is_shared(self, arrival_ns: int) -> bool:
         """Return whether two clocks run side by side: two senders then share this id."""

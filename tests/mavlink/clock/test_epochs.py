@@ -84,6 +84,35 @@ def test_future_stamp_of_another_message_does_not_move_the_clock(
     assert after is not None and (after.latency_s > 0.5) == moves
 
 
+@pytest.mark.parametrize("delay_ms", [2_000, 4_000])
+def test_clock_follows_a_fast_link_while_delayed_frames_arrive(delay_ms: int) -> None:
+    """They arrived for 4 s, during which the fast frames had no time and positions were old."""
+    late = run(delay_ms, 300_000, 150)
+    fast = run(30_050, 330_050, 40)  # while the last of the late ones arrive
+    clock, changes = SenderClock(), []
+    for arrival, boot in sorted([*late, *fast]):
+        clock.observe(EPOCH_NS + arrival * MS, boot)
+        if clock.change is not None:
+            assert clock.change.was_late
+            changes.append((arrival, clock.change.step_s))
+    ((at_ms, step_s),) = changes
+    assert at_ms <= 30_050 + 600
+    assert step_s == pytest.approx(-delay_ms / 1e3, abs=0.2)
+    clock.observe(EPOCH_NS + 40_000 * MS, 340_000)
+    assert clock.node_ns(340_000 * MS) == pytest.approx(EPOCH_NS + 40_000 * MS, abs=400 * MS)
+
+
+def test_early_stamps_that_are_few_among_others_do_not_move_the_clock() -> None:
+    """One a second, forged, among five of the vehicle."""
+    clock = SenderClock()
+    honest = run(0, 300_000, 100)
+    forged = run(10_050, 313_050, 9, every=1_000)
+    for arrival, boot in sorted([*honest, *forged]):
+        clock.observe(EPOCH_NS + arrival * MS, boot)
+        assert clock.change is None
+    assert clock.node_ns(319_800 * MS) == pytest.approx(EPOCH_NS + 19_800 * MS, abs=30 * MS)
+
+
 def test_clock_follows_a_link_whose_delay_falls() -> None:
     """All frames of half a minute were 3 s late; the clock follows after half a second."""
     late, prompt = run(3_000, 300_000, 150), run(33_000, 333_000, 20)

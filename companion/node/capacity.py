@@ -38,14 +38,22 @@ class Capacity:
 
 
 def measure(
-    settings: Settings, clock_s: Callable[[], float] = time.process_time, processor: float = 1.0
+    settings: Settings,
+    clock_s: Callable[[], float] = time.process_time,
+    *,
+    processor: float = 1.0,
+    done: Callable[[float], None] = lambda _: None,
 ) -> Capacity:
     """Simulate ``FEW`` and then ``MORE`` UAVs around an array of these settings, about a second.
 
-    ``processor`` is the fraction of one processor that this process may use.
+    ``processor`` is the fraction of one processor that this process may use. ``done`` is called
+    with the share of the work that is done: with thousands of elements it takes half a minute.
     """
     update_hz = settings.beams.update_hz
-    few, more = (_simulate(settings, number, clock_s) for number in (FEW, MORE))
+    few = _simulate(settings, FEW, clock_s, lambda share: done(share * FEW / (FEW + MORE)))
+    more = _simulate(
+        settings, MORE, clock_s, lambda share: done((FEW + share * MORE) / (FEW + MORE))
+    )
     report_s = (few.report_s + more.report_s) / 2
     each_s = max(0.0, (more.update_s - few.update_s) / (MORE - FEW))
     alone_s = max(0.0, more.update_s - MORE * each_s)
@@ -60,7 +68,9 @@ class _Times:
     update_s: float
 
 
-def _simulate(settings: Settings, number: int, clock_s: Callable[[], float]) -> _Times:
+def _simulate(
+    settings: Settings, number: int, clock_s: Callable[[], float], done: Callable[[float], None]
+) -> _Times:
     """Return the mean times of a report and of an update with this number of UAVs."""
     center = {"source": ",".join(map(str, HOME))}
     pipeline = Pipeline(settings.override(center=center, beams={"targets": "all"}))
@@ -68,6 +78,8 @@ def _simulate(settings: Settings, number: int, clock_s: Callable[[], float]) -> 
     for event in _traffic(number, settings.beams.update_hz):
         began_s = clock_s()
         pipeline.step(event)
+        if isinstance(event, Tick):
+            done((event.t_ns - _BEGIN_NS) / ((SETTLED_S + MEASURED_S) * _S))
         if event.t_ns >= _BEGIN_NS + SETTLED_S * _S:
             took_s[type(event)] += clock_s() - began_s
             counts[type(event)] += 1

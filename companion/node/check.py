@@ -57,8 +57,7 @@ def check(
         if finding.grade is Grade.FAULT:
             faulty.add(finding.subject.removeprefix("link "))
         yield finding
-    show("measuring the capacity of this machine")
-    yield _capacity(settings)
+    yield _capacity(settings, show)
     urls = [url for url in settings.links.urls if url not in faulty]
     if not settings.links.urls:
         yield Finding.fault(
@@ -70,10 +69,14 @@ def check(
         yield from _reception(service, settings)
 
 
-def _capacity(settings: Settings) -> Finding:
+def _capacity(settings: Settings, show: Callable[[str], None]) -> Finding:
+    def done(work: float) -> None:
+        show(f"measuring the capacity of this machine: {work * 100:.0f} %")
+
+    done(0.0)
     try:
         share = machine.processor_share()
-        found = capacity.measure(embedded(settings), processor=share)
+        found = capacity.measure(embedded(settings), processor=share, done=done)
     except UserError as error:
         return Finding.fault(
             "settings", str(error), "correct this setting, or the file that it names"

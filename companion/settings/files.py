@@ -13,7 +13,8 @@ from pydantic import ValidationError
 
 from companion.mavlink.links.regular_file import open_regular
 from companion.settings.beams import ArraySettings
-from companion.settings.model import DESIGN, NAMED_FILES, NamedFile, Settings, first_error
+from companion.settings.invalid import first_error
+from companion.settings.model import DESIGN, NAMED_FILES, NamedFile, Settings
 from companion.settings.origins import Origin, Origins, given, of_options
 from companion.settings.section import ConfigError
 from companion.tracking.design.gain_table import KinematicDesign
@@ -71,7 +72,9 @@ def _with_positions(settings: Settings) -> Settings:
     try:
         return settings.model_copy(update={"array": ArraySettings.model_validate(array)})
     except ValidationError as error:
-        raise ConfigError(f"array.positions = {named!r}: {first_error(error)}") from error
+        raise ConfigError(
+            f"array.positions = {named!r}: {first_error(error, Settings.model_fields)}"
+        ) from error
 
 
 def numbers_file(key: str, name: str, columns: int) -> FloatArray:

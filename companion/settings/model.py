@@ -5,7 +5,6 @@ the allowed values.
 """
 
 import base64
-import difflib
 from collections.abc import Mapping
 from typing import Any, Final, NamedTuple, Self
 
@@ -22,6 +21,7 @@ from companion.settings.beams import (
 )
 from companion.settings.center import CenterSettings
 from companion.settings.fleet import FleetSettings
+from companion.settings.invalid import first_error
 from companion.settings.mavlink import (
     LinkSettings,
     OutSettings,
@@ -40,16 +40,6 @@ from companion.settings.outlets import (
 from companion.settings.section import ConfigError, Section
 from companion.settings.tracking import ClockSettings, ObserverSettings
 from companion.values import UserError, is_uav_id, read_toml, shown
-
-MIN_SIMILARITY: Final = 0.7
-"""Least similarity (difflib's ratio) of a setting that is suggested for an unknown one."""
-_ALLOWED: Final = {
-    "dict_type": "give a table",
-    "missing": "too few values",
-    "model_type": "give a table",
-    "tuple_type": "give a list",
-}
-"""Allowed values in TOML's words, by the type of an error that Pydantic words for Python."""
 
 REPLAYED_SECTIONS: Final = frozenset(
     (
@@ -159,7 +149,7 @@ class Settings(Section):
         try:
             return cls.model_validate(found)
         except ValidationError as error:
-            raise ConfigError(f"{where}: {first_error(error)}") from error
+            raise ConfigError(f"{where}: {first_error(error, cls.model_fields, found)}") from error
 
     @property
     def files(self) -> Mapping[str, bytes]:
@@ -196,7 +186,7 @@ class Settings(Section):
         try:
             return Settings.model_validate(merged).with_files(files)
         except ValidationError as error:
-            raise ConfigError(first_error(error)) from error
+            raise ConfigError(first_error(error, Settings.model_fields, merged)) from error
 
 
 def _former_files(found: dict[str, Any], where: str) -> dict[str, bytes]:
@@ -250,41 +240,3 @@ def sections(text: str, where: str) -> dict[str, Any]:
         return read_toml(text)
     except UserError as error:
         raise ConfigError(f"{where}: {error}") from error
-
-
-def _suggestion(place: tuple[int | str, ...]) -> str:
-    """Return a suggestion of the most similar setting's name; empty if none is similar."""
-    section, *keys = map(str, place)
-    if not keys:
-        near = difflib.get_close_matches(section, Settings.model_fields, 1, MIN_SIMILARITY)
-        owners = [
-            name for name, field in Settings.model_fields.items() if section in _keys(field.default)
-        ]
-        if owners and not near:
-            return f"; did you mean {owners[0]}.{section}?"
-        return f"; did you mean {near[0]}?" if near else ""
-    near = difflib.get_close_matches(
-        keys[0], _keys(Settings.model_fields[section].default), 1, MIN_SIMILARITY
-    )
-    return f"; did you mean {section}.{near[0]}?" if near else ""
-
-
-def _keys(section: Section) -> list[str]:
-    return list(type(section).model_fields)
-
-
-def first_error(error: ValidationError) -> str:
-    """Return the first error of invalid settings as one line: key, value, allowed values.
-
-    A key with several allowed types has one error per type; the line contains all of them.
-    """
-    errors = error.errors(include_url=False)
-    place = errors[0]["loc"][:2]
-    key = ".".join(map(str, place))
-    if errors[0]["type"] == "extra_forbidden":
-        return f"{key} is not a setting{_suggestion(place)}"
-    said = [
-        _ALLOWED.get(wrong["type"], wrong["msg"]) for wrong in errors if wrong["loc"][:2] == place
-    ]
-    allowed = dict.fromkeys(text.removeprefix("Value error, ") for text in said)
-    return f"{key} = {shown(errors[0]['input'])}: {', or '.join(allowed)}"

@@ -93,3 +93,10 @@ def test_half_a_processor_has_half_the_capacity() -> None:
     found = capacity.measure(Settings(), Slow(0.0011), processor=0.5)
     spare = 0.5 * capacity.SHARE - 10 * 0.0011
     assert found.uavs == int(spare / (capacity.RATE_HZ * 0.0011))
+
+
+def test_progress_grows_to_the_end() -> None:
+    """With thousands of elements the measurement takes half a minute."""
+    done = list[float]()
+    capacity.measure(Settings(), done=done.append)
+    assert done == sorted(done) and 0.0 <= done[0] < 0.05 and 0.95 < done[-1] <= 1.0

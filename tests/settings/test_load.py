@@ -693,3 +693,28 @@ def test_center_height_and_heading_must_be_numbers(text: str) -> None:
 def test_missing_center_error_lists_all_three_kinds(text: str) -> None:
     with pytest.raises(ValueError, match=r"SYSID:COMPID.*LAT,LON,ALT.*home"):
         parse_center(text)
+
+
+@pytest.mark.parametrize(
+    ("toml", "message"),
+    [
+        (
+            '[observer.types.copter]\nspeed_max_mps = "x"\n',
+            "observer.types.copter.speed_max_mps = 'x': Input should be a valid number",
+        ),
+        (
+            '[observer.uav."1:1"]\nspeed_mx_mps = 3\n',
+            'observer.uav."1:1".speed_mx_mps is not a setting;'
+            ' did you mean observer.uav."1:1".speed_max_mps?',
+        ),
+        (
+            "[observer.types.copterx]\nspeed_max_mps = 3\n",
+            "observer.types = 'copterx': Input should",
+        ),
+        ("[observer]\nalpha = 'x'\n", "observer.alpha = 'x': Input should be 'auto', or Input"),
+        ("[observer.types]\ncopter = 5\n", "observer.types.copter = 5: give a table"),
+    ],
+)
+def test_error_in_a_table_of_a_section_names_the_whole_key(toml: str, message: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(message)):
+        Settings.from_toml(toml, "there.toml")

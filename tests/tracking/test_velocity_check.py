@@ -109,6 +109,20 @@ def test_lawful_reports_are_never_refuted(
     assert check.noise(NOISE, fixes[-1].sender_ns) is NOISE
 
 
+@pytest.mark.parametrize("step_s", [0.1, 1.0])
+def test_worst_lawful_reports_are_not_refuted(fix: MakeFix, step_s: float) -> None:
+    """All errors grow in one direction, and so do manoeuvres that no velocity shows."""
+    steps = round(5 / step_s)
+    fixes = []
+    for n in range(steps + 1):
+        unseen_m = n * A_MPS2 * step_s**2 / 4  # there and back at full acceleration
+        error_m = NOISE.horizontal_m * (2 * n / steps - 1)
+        place = np.array([unseen_m + error_m, 0.0, 0.0])
+        velocity = np.array([-NOISE.velocity_mps, 0.0, 0.0])
+        fixes.append(fix(round(n * step_s * S), place, velocity, noise=NOISE))
+    assert refuted(VelocityCheck(), fixes) == []
+
+
 @pytest.mark.parametrize("jump_m", [5.0, 50.0])
 def test_single_jump_of_the_position_is_no_wrong_velocity(fix: MakeFix, jump_m: float) -> None:
     """An estimator that is reset moves the positions once."""

@@ -222,7 +222,7 @@ class Link:
             if isinstance(item, Frame) and item.source in peer.served:
                 newcomers.worked(item.source, spent_s / len(found))
         if now_ns >= newcomers.adapts_ns:
-            newcomers.adapt(now_ns, time.thread_time())
+            newcomers.adapt(now_ns, time.thread_time(), time.process_time())
 
     def _receive_within_budget(
         self, receiver: ForeignSplitter, t_ns: int, data: bytes

@@ -3,13 +3,14 @@
 Anybody that reaches a link's port can invent senders. Each takes a clock, a track and beams, so the
 number of new ones is limited. When frames take more than ``BUSY`` of the time and are lost, or read
 late in two windows, those of strangers (``known_peers``) are dropped before they are decoded, then
-those of the newest senders, until the rest are in time: who was here first keeps being served. No
-more senders are dropped than took the work that is too much: a flood of one sender costs no other
-its place. Receivers rank behind vehicles, whichever came first.
+those of a sender that floods, then those of the newest senders, until the rest are in time: who was
+here first keeps being served. No more senders are dropped than took the work that is too much: a
+flood of one sender costs no other its place. Receivers rank behind vehicles, whichever came first.
 
-Where something else takes the time, such as requests or another program, frames take less than
-``BUSY`` of it. Once they have been late for a second and are lost, or too old to be of use, half of
-their work is dropped: otherwise those of all senders become two seconds late.
+Where something else takes the time, such as requests, frames take less than ``BUSY`` of it. Once
+they have been late for a second and are lost, or too old to be of use, half of their work is
+dropped: otherwise those of all senders become two seconds late. While the process stays busy, more
+are served only after a time that doubles.
 """
 
 from bisect import bisect_left
@@ -37,6 +38,9 @@ STRANGERS_WAIT_NS: Final = 10_000_000_000  # time for which strangers are not se
 LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 USELESS_NS: Final = 500_000_000  # age of a datagram that is of no use to a beam
 LATE_WINDOWS: Final = 4  # late windows in turn after which useless frames cost senders their place
+HEAVY: Final = 0.25  # share of the time from which on a sender floods, if others take less
+HEAVY_NS: Final = 5_000_000_000  # time for which it is not served
+FREE: Final = 0.5  # share of one processor below which nothing else takes the time
 LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
 HELD_NS: Final = 5_000_000_000, 60_000_000_000
 """Time for which no more senders are served after that: at first, and at most; it doubles."""
@@ -69,7 +73,8 @@ class Newcomers:
         self._had_strangers = False  # whether strangers were served since the machine was late
         self._strangers_from_ns = -(1 << 62)  # time from which those of strangers are served
         self._began_ns = 0
-        self._used_s = 0.0
+        self._used_s = self._process_s = 0.0
+        self._heavy = dict[Source, int]()  # senders that flood, and until when they are not served
         self._changed_ns = 0
         self._is_late = self._is_lossy = self._is_useless = False
         self._late_windows = 0  # in turn
@@ -86,6 +91,9 @@ class Newcomers:
         self._had_strangers |= is_stranger
         if self._is_named(str(source)):
             return True
+        if self._heavy.get(source, now_ns) > now_ns:
+            self.refused += 1
+            return False
         number = self._numbers.get(source)
         if number is None:
             if not self._budget.spend(1, now_ns * 1e-9):
@@ -105,12 +113,10 @@ class Newcomers:
     def is_dropped(self, source: Source) -> bool:
         """Return whether frames of a sender are dropped at present; counts nothing."""
         number = self._numbers.get(source)
-        return (
-            number is not None
-            and self._served_below is not None
-            and number >= self._served_below
-            and not self._is_named(str(source))
-        )
+        if number is None or self._is_named(str(source)):
+            return False
+        is_new = self._served_below is not None and number >= self._served_below
+        return is_new or source in self._heavy
 
     def late(self, age_ns: int | None = None) -> None:
         """Note that frames were read late, at that age; None: they were lost."""
@@ -125,38 +131,58 @@ class Newcomers:
         """
         self._worked_s[source] = self._worked_s.get(source, 0.0) + spent_s
 
-    def adapt(self, now_ns: int, used_s: float) -> None:
+    def adapt(self, now_ns: int, used_s: float, process_s: float) -> None:
         """Adapt who is served to the share of the time that frames took.
 
-        ``used_s`` is the processor time that the calling thread has used so far: a process that is
-        stopped, or waits for a processor, is late without any fault of its senders.
+        ``used_s`` and ``process_s`` are the processor times that the calling thread, and all
+        threads, have used so far: a process that is stopped, or waits for a processor, is late
+        without any fault of its senders.
         """
         passed_s = max(1, now_ns - self._began_ns) * 1e-9
         worked_s, by_served = self.worked_s, self._worked_s
         share = min(worked_s, used_s - self._used_s) / passed_s
-        self.worked_s, self._worked_s, self._used_s = 0.0, {}, used_s
+        is_free = (process_s - self._process_s) / passed_s < FREE
+        self.worked_s, self._worked_s = 0.0, {}
+        self._used_s, self._process_s = used_s, process_s
         self._began_ns, self.adapts_ns = now_ns, now_ns + WINDOW_NS
         if now_ns - self._changed_ns > KEPT_NS:
             self.generation += 1
             self._changed_ns = now_ns
+            self._heavy = {one: ns for one, ns in self._heavy.items() if ns > now_ns}
         # Once late may be a long update; a flood is late again.
         is_late = self._is_lossy or (self._is_late and self._late_windows > 0)
         self._late_windows = self._late_windows + 1 if self._is_late else 0
         is_useless = self._is_useless and self._late_windows >= LATE_WINDOWS and share > LEAST
         self._is_late = self._is_lossy = self._is_useless = False
         if is_late and (share > BUSY or is_useless):
+            heavy = self._heaviest(by_served, max(HEAVY * passed_s, worked_s / 2))
             were_served = now_ns >= self._strangers_from_ns
             self._strangers_from_ns = now_ns + STRANGERS_WAIT_NS
             if were_served and self._had_strangers:
                 self._had_strangers = False
+            elif heavy is not None:
+                self._heavy[heavy] = now_ns + HEAVY_NS
+                self.generation += 1
+            elif share > BUSY:
+                self._drop(by_served, worked_s * BUSY / share)
             else:
-                self._drop(by_served, worked_s * min(BUSY / share, 0.5 if is_useless else 1.0))
-            if is_useless:
+                self._drop(by_served, worked_s / 2)
                 self._hold(now_ns)
-        elif share < IDLE and self._served_below is not None and now_ns >= self._held_until_ns:
+        elif (
+            share < IDLE
+            and self._served_below is not None
+            and (is_free or now_ns >= self._held_until_ns)
+        ):
             numbers = sorted(self._numbers.values())
             served = bisect_left(numbers, self._served_below)
             self._serve(numbers, max(served + 8, served * 5 // 4))
+
+    def _heaviest(self, worked_s: dict[Source, float], least_s: float) -> Source | None:
+        """Return the sender whose frames took more than ``least_s``; None also if it is oldest."""
+        heavy = max(worked_s, key=lambda one: worked_s[one], default=None)
+        if heavy is None or worked_s[heavy] <= least_s:
+            return None
+        return None if self._numbers.get(heavy) == min(self._numbers.values()) else heavy
 
     def _hold(self, now_ns: int) -> None:
         """Serve no more senders for a time, which doubles while frames are lost again."""

@@ -26,9 +26,15 @@ def served(senders: Newcomers, most: int, now_ns: int) -> list[int]:
 
 
 def window(
-    senders: Newcomers, number: int, share: float, is_late: bool = False, used: float = 1.0
+    senders: Newcomers,
+    number: int,
+    share: float,
+    *,
+    is_late: bool = False,
+    used: float = 1.0,
+    busy: float = 1.0,
 ) -> None:
-    """Note a window of time of which frames took a share, and the thread used a share.
+    """Note a window of time of which frames took a share; the thread and the process used shares.
 
     All senders that are served took the same time.
     """
@@ -39,7 +45,8 @@ def window(
         senders.worked(source(one), spent_s / len(now))
     if is_late:
         senders.late()
-    senders.adapt(number * WINDOW_NS, used * number * WINDOW_NS * 1e-9)
+    process_s = busy * number * WINDOW_NS * 1e-9
+    senders.adapt(number * WINDOW_NS, used * number * WINDOW_NS * 1e-9, process_s)
 
 
 def test_process_that_was_stopped_drops_no_sender() -> None:
@@ -80,6 +87,35 @@ def test_newest_senders_are_dropped_where_other_work_makes_frames_useless(
         assert served(senders, 100, now_ns) == left
     window(senders, end, 0.1)
     assert len(served(senders, 100, now_ns)) > len(left)
+
+
+def test_senders_are_served_again_at_once_when_the_process_is_free() -> None:
+    """A burst that ended kept vehicles that joined later out for a minute."""
+    senders = Newcomers()
+    late_windows(senders, 1, 0.4, None)
+    assert len(served(senders, 100, 5 * WINDOW_NS)) < 100
+    for number in range(5, 11):
+        window(senders, number, 0.02, busy=0.3 + 4 * 0.7 / number)
+    assert len(served(senders, 120, 11 * WINDOW_NS)) == 120
+
+
+def test_flood_of_an_old_sender_costs_younger_ones_nothing() -> None:
+    """It was there before six vehicles, which were dropped with it."""
+    senders, flood = Newcomers(), source(1)
+    assert len(served(senders, 8, 0)) == 8
+    times = 0
+    for number in range(1, 101):
+        is_served = senders.admits(flood, (number - 1) * WINDOW_NS)
+        senders.worked_s += 0.7 * WINDOW_NS * 1e-9
+        times += is_served
+        if is_served:
+            senders.worked(flood, 0.65 * WINDOW_NS * 1e-9)
+        for one in (0, *range(2, 8)):
+            assert senders.admits(source(one), number * WINDOW_NS)
+            senders.worked(source(one), 0.008 * WINDOW_NS * 1e-9)
+        senders.late()
+        senders.adapt(number * WINDOW_NS, *[number * WINDOW_NS * 1e-9] * 2)
+    assert 2 <= times <= 100 * WINDOW_NS // newcomers.HEAVY_NS + 1  # tried again, now and then
 
 
 def test_senders_that_are_dropped_again_wait_longer() -> None:
@@ -179,7 +215,7 @@ def test_flood_of_one_sender_costs_no_other_its_place() -> None:
         if 5 in now:
             senders.worked(source(5), 0.9 * WINDOW_NS * 1e-9)
         senders.late()
-        senders.adapt(number * WINDOW_NS, number * WINDOW_NS * 1e-9)
+        senders.adapt(number * WINDOW_NS, number * WINDOW_NS * 1e-9, number * WINDOW_NS * 1e-9)
     assert served(senders, 6, 20 * WINDOW_NS) == [0, 1, 2, 3, 4]
 
 
@@ -194,7 +230,7 @@ def test_receiver_ranks_behind_vehicles_but_not_behind_a_flood(receiver: Source)
         for one in (*map(source, now), receiver):
             senders.worked(one, spent_s / (1 + len(now)))
         senders.late()
-        senders.adapt(WINDOW_NS, WINDOW_NS * 1e-9)
+        senders.adapt(WINDOW_NS, WINDOW_NS * 1e-9, WINDOW_NS * 1e-9)
         assert senders.admits(receiver, WINDOW_NS) is receiver_stays
 
 

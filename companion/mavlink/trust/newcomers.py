@@ -39,7 +39,7 @@ LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 USELESS_NS: Final = 500_000_000  # age of a datagram that is of no use to a beam
 LATE_WINDOWS: Final = 4  # late windows in turn after which useless frames cost senders their place
 HEAVY: Final = 0.25  # share of the time from which on a sender floods, if others take less
-HEAVY_NS: Final = 5_000_000_000  # time for which it is not served
+HEAVY_NS: Final = 5_000_000_000  # least time for which it is not served
 FREE: Final = 0.5  # share of one processor below which nothing else takes the time
 LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
 HELD_NS: Final = 5_000_000_000, 60_000_000_000
@@ -91,7 +91,7 @@ class Newcomers:
         self._had_strangers |= is_stranger
         if self._is_named(str(source)):
             return True
-        if self._heavy.get(source, now_ns) > now_ns:
+        if source in self._heavy:
             self.refused += 1
             return False
         number = self._numbers.get(source)

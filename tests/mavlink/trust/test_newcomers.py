@@ -118,6 +118,17 @@ def test_flood_of_an_old_sender_costs_younger_ones_nothing() -> None:
     assert 2 <= times <= 100 * WINDOW_NS // newcomers.HEAVY_NS + 1  # tried again, now and then
 
 
+def test_oldest_sender_is_served_although_it_floods() -> None:
+    senders = Newcomers()
+    assert len(served(senders, 8, 0)) == 8
+    for number in range(1, 5):
+        senders.worked_s += 0.7 * WINDOW_NS * 1e-9
+        senders.worked(source(0), 0.65 * WINDOW_NS * 1e-9)
+        senders.late()
+        senders.adapt(number * WINDOW_NS, *[number * WINDOW_NS * 1e-9] * 2)
+        assert senders.admits(source(0), number * WINDOW_NS)
+
+
 def test_senders_that_are_dropped_again_wait_longer() -> None:
     senders, first, waits_ns = Newcomers(), 1, []
     for _ in range(6):

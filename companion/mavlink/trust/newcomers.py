@@ -9,8 +9,9 @@ flood of one sender costs no other its place. Receivers rank behind vehicles, wh
 
 Where something else takes the time, such as requests, frames take less than ``BUSY`` of it. Once
 they have been late for a second and are lost, or too old to be of use, half of their work is
-dropped: otherwise those of all senders become two seconds late. While the process stays busy, more
-are served only after a time that doubles.
+dropped, since those of all senders become two seconds late otherwise; but none of senders that were
+there through ten seconds in time. While the process stays busy, more are served only after a time
+that doubles.
 """
 
 from bisect import bisect_left
@@ -42,8 +43,12 @@ HEAVY: Final = 0.25  # share of the time from which on a sender floods, if other
 HEAVY_NS: Final = 5_000_000_000  # least time for which it is not served
 FREE: Final = 0.5  # share of one processor below which nothing else takes the time
 LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
-HELD_NS: Final = 5_000_000_000, 60_000_000_000
+HELD_NS: Final = 5_000_000_000, 20_000_000_000
 """Time for which no more senders are served after that: at first, and at most; it doubles."""
+SETTLED_NS: Final = 2_500_000_000
+"""Time after which that is repeated: what waits in a socket is up to two seconds old."""
+CALM_NS: Final = 10_000_000_000
+"""Time without a late frame after which the senders that were there at its begin are settled."""
 KEPT_NS: Final = 5_000_000_000  # time between two looks at which senders are active
 WINDOW_NS: Final = 250_000_000  # time over which the share is measured
 
@@ -79,6 +84,9 @@ class Newcomers:
         self._is_late = self._is_lossy = self._is_useless = False
         self._late_windows = 0  # in turn
         self._held_ns, self._held_until_ns = HELD_NS[0], -(1 << 62)
+        self._dropped_ns = -(1 << 62)  # when half of the work was dropped
+        self._calm_since = 0, 0  # time, and number of the next sender then
+        self._settled_below = 0  # number of the first sender that is not settled
 
     def admits(self, source: Source, now_ns: int, *, is_stranger: bool = False) -> bool:
         """Return whether a frame of a sender may be used; count it if not.
@@ -152,7 +160,13 @@ class Newcomers:
         # Once late may be a long update; a flood is late again.
         is_late = self._is_lossy or (self._is_late and self._late_windows > 0)
         self._late_windows = self._late_windows + 1 if self._is_late else 0
-        is_useless = self._is_useless and self._late_windows >= LATE_WINDOWS and share > LEAST
+        self._note_calm(now_ns)
+        is_useless = (
+            self._is_useless
+            and self._late_windows >= LATE_WINDOWS
+            and share > LEAST
+            and now_ns - self._dropped_ns >= SETTLED_NS
+        )
         self._is_late = self._is_lossy = self._is_useless = False
         if is_late and (share > BUSY or is_useless):
             heavy = self._heaviest(by_served, max(HEAVY * passed_s, worked_s / 2))
@@ -166,7 +180,7 @@ class Newcomers:
             elif share > BUSY:
                 self._drop(by_served, worked_s * BUSY / share)
             else:
-                self._drop(by_served, worked_s / 2)
+                self._drop(by_served, worked_s / 2, self._settled_below)
                 self._hold(now_ns)
         elif (
             share < IDLE
@@ -186,18 +200,32 @@ class Newcomers:
 
     def _hold(self, now_ns: int) -> None:
         """Serve no more senders for a time, which doubles while frames are lost again."""
+        self._dropped_ns = now_ns
         least_ns, most_ns = HELD_NS
         is_again = now_ns - self._held_until_ns < most_ns
         self._held_ns = min(2 * self._held_ns, most_ns) if is_again else least_ns
         self._held_until_ns = now_ns + self._held_ns
 
-    def _drop(self, worked_s: dict[Source, float], most_s: float) -> None:
-        """Serve the oldest senders whose frames took at most ``most_s`` together; one at least."""
+    def _note_calm(self, now_ns: int) -> None:
+        """Note whether frames are in time, and which senders were there while they were."""
+        since_ns, count = self._calm_since
+        if self._is_late:
+            self._calm_since = now_ns, self._count
+        elif now_ns - since_ns >= CALM_NS:
+            self._settled_below = count
+            self._calm_since = now_ns, self._count
+
+    def _drop(self, worked_s: dict[Source, float], most_s: float, settled_below: int = 0) -> None:
+        """Serve the oldest senders whose frames took at most ``most_s`` together; one at least.
+
+        And all below ``settled_below``.
+        """
         numbers = sorted((number, source) for source, number in self._numbers.items())
         if self._served_below is not None:
             del numbers[bisect_left(numbers, (self._served_below,)) :]
         total_s, most = sum(worked_s.values()), len(numbers)
-        while most > 1 and total_s > most_s:
+        least = max(1, bisect_left(numbers, (settled_below,)))
+        while most > least and total_s > most_s:
             most -= 1
             total_s -= worked_s.get(numbers[most][1], 0.0)
         self._serve(sorted(self._numbers.values()), most)

@@ -89,6 +89,34 @@ def test_newest_senders_are_dropped_where_other_work_makes_frames_useless(
     assert len(served(senders, 100, now_ns)) > len(left)
 
 
+def test_senders_that_were_there_in_calm_times_are_not_dropped_for_other_work() -> None:
+    """Twenty vehicles were halved again and again, and kept out after the load had ended."""
+    senders, calm = Newcomers(), 2 * newcomers.CALM_NS // WINDOW_NS
+    for number in range(1, calm + 2):
+        assert len(served(senders, 20, number * WINDOW_NS)) == 20
+        senders.adapt(number * WINDOW_NS, *[number * WINDOW_NS * 1e-9] * 2)
+    end = 2 * calm + 2
+    for number in range(calm + 2, end):
+        senders.late()
+        window(senders, number, 0.4)  # of a hundred senders
+    assert served(senders, 100, end * WINDOW_NS)[:20] == list(range(20))
+    assert len(served(senders, 100, end * WINDOW_NS)) < 50
+
+
+def test_frames_that_waited_cost_no_more_senders_their_place() -> None:
+    """What waits in the socket is two seconds old, for a cause that is gone."""
+    senders = Newcomers()
+    late_windows(senders, 1, 0.4, None)
+    left = len(served(senders, 100, 5 * WINDOW_NS))
+    for number in range(5, 4 + newcomers.SETTLED_NS // WINDOW_NS):
+        senders.late()
+        window(senders, number, 0.4)
+        assert len(served(senders, 100, number * WINDOW_NS)) == left
+    senders.late()
+    window(senders, 4 + newcomers.SETTLED_NS // WINDOW_NS, 0.4)
+    assert len(served(senders, 100, 20 * WINDOW_NS)) < left
+
+
 def test_senders_are_served_again_at_once_when_the_process_is_free() -> None:
     """A burst that ended kept vehicles that joined later out for a minute."""
     senders = Newcomers()

@@ -7,6 +7,7 @@ receive). Chips that share a chip select differ by address: here the index of th
 modulo 4. Never tested on hardware: the tests check the resulting register values.
 """
 
+import contextlib
 from typing import Any, Final
 
 from companion.beams.hardware.devices import ADAR1000_CHANNELS, vector_modulator
@@ -61,9 +62,10 @@ class Chips(Device):
 
     def close(self) -> None:
         """Close the SPI devices."""
-        for line in self._lines:
-            line.close()
-        self._lines = []
+        lines, self._lines = self._lines, []
+        for line in lines:
+            with contextlib.suppress(OSError):  # an adapter that was unplugged
+                line.close()
 
     def _write(self, registers: IntArray) -> None:
         chips: list[list[tuple[int, int, int]]] = [[] for _ in self._places]

@@ -765,6 +765,21 @@ def test_any_answer_of_a_service_is_usable_or_a_lost_service(
         assert all(0 <= byte < 256 for word in words for byte in word)
 
 
+def test_chip_that_cannot_be_closed_is_forgotten() -> None:
+    """An unplugged adapter: its error ended the drive, which would have tried again."""
+    closed = list[int]()
+
+    def fails() -> None:
+        closed.append(1)
+        raise OSError(5, "Input/output error")
+
+    chips = Chips([(0, 0), (0, 1)])
+    chips._lines = [SimpleNamespace(close=fails) for _ in chips._places]
+    chips.close()
+    chips.close()
+    assert closed == [1, 1]
+
+
 def test_table_of_a_service_is_applied_and_its_repetition_is_not(
     flown: tuple[DeviceCommand, Any, str],
 ) -> None:

@@ -17,7 +17,7 @@ from typing import Final
 from companion.beams.hardware import codebooks, phaser_pickles
 from companion.mavlink.links import http_poll, kinds, tcp, to_loop, transport, udp, zenoh_config
 from companion.mavlink.trust import known_peers, newcomers
-from companion.mavlink.wire import aircraft_json, cot_link, rid_json, sbs
+from companion.mavlink.wire import aircraft_json, cot_link, foreign, rid_json, sbs
 from companion.node import observations
 from companion.node.drive import gimbal, rotctld
 from companion.node.fleet import budgets, messages
@@ -72,7 +72,10 @@ NEW: Final = f"{newcomers.NEW_PER_S:.0f} new senders/s, {newcomers.NEW_SAVED:.0f
 STRANGERS: Final = (
     f"{known_peers.COMPARED_PER_S:.0f} positions/s of strangers are compared for each sender"
 )
-OLDEST: Final = f"the oldest senders first, above {100 * newcomers.BUSY:.0f} % of the time"
+OLDEST: Final = (
+    f"the oldest senders first, above {100 * newcomers.BUSY:.0f} % of the time, or while frames are"
+    f" late by {newcomers.USELESS_NS / 1e9:g} s"
+)
 RECEIVER: Final = (
     f"{100 * transport.RECEIVER_SHARE:.0f} % of the time for a link,"
     f" {transport.RECEIVER_SAVED_S:g} s at once"
@@ -128,7 +131,8 @@ WAYS: Final = (
         covers=("link:sbs", "link:readsb", "link:rid", "link:cot"),
         size=f"{kb(sbs.LINE_MAX)} a line, {kb(rid_json.OBJECT_MAX)} an object, {kb(cot_link.EVENT_MAX)} an event",
         items=f"{aircraft_json.AIRCRAFT_MAX} aircraft",
-        work=f"{RECEIVER}, behind vehicles",
+        work=f"{RECEIVER}, behind vehicles; {kb(foreign.PIECE * foreign.PIECES)} or"
+        f" {foreign.AT_ONCE} messages before other work runs",
         over=f"skipped before parsing, counted (`too-frequent`); a server without a complete message in {transport.UNFINISHED_S} s is disconnected",
         test=f"{LISTEN}::test_receiver_beyond_its_share_of_the_time_is_skipped_and_counted",
     ),
@@ -228,7 +232,7 @@ WAYS: Final = (
         name="WebSocket `/v1/stream`",
         covers=("route:/v1/stream",),
         size=f"{websocket_connections.BYTES_PER_S:.0f} bytes/s from a client, {kb(int(websocket_connections.BYTES_SAVED))} at once; nothing is queued for it",
-        items=f"{stream.CLIENTS_MAX} clients, {request_queue.STREAMS_PER_S:.0f} new ones/s;"
+        items=f"{stream.CLIENTS_MAX} clients, at most half of the connections; {request_queue.STREAMS_PER_S:.0f} new ones/s;"
         f" {stream.MESSAGES_PER_S:.0f} messages/s to all",
         work="a message is encoded once for all",
         over="closed and not read",

@@ -104,7 +104,7 @@ def test_cache_of_senders_is_bounded(pair: Pair, monkeypatch: pytest.MonkeyPatch
 
 
 def turns_while_reading(pair: Pair, datagrams_read: int) -> int:
-    """How many turns another thread got, which waits for the interpreter, while datagrams are read."""
+    """Return how many turns a thread that waits for the interpreter got meanwhile."""
     receiving, sending = pair
     receiving.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
     read, stop, turns = datagrams.reader(receiving), threading.Event(), [0]

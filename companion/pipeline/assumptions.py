@@ -119,8 +119,8 @@ def _clock_text(sender: str, change: ClockChange) -> str:
     if change.was_late:
         return (
             f"{sender}: messages arrive {-change.step_s:.1f} s earlier than before: until now its"
-            " positions were older than assumed by that time, and its bounds too small; allow"
-            " TIMESYNC, or set clocks.constant_delay_s"
+            f" positions were {-change.step_s:.1f} s older than assumed, and its bounds too small;"
+            " allow TIMESYNC, or set clocks.constant_delay_s"
         )
     why = "clock stalled or link slowed down; the bound covers both"
     return f"{sender}: messages arrive {step} later than before: {why}"

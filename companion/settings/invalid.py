@@ -75,7 +75,7 @@ def _place(loc: Place, given: Any) -> Place:
         place.append(part)
         given = given[part]
     if "[key]" in loc:  # the key itself is the wrong value
-        del place[-1]
+        place = place[:-1]
     return tuple(place) if len(place) > 2 else loc[:2]
 
 

@@ -55,20 +55,14 @@ class VelocityCheck:
         before = self._newest
         if before is not None and fix.sender_ns <= before.sender_ns:
             return None
-        self._newest = fix
-        apart_ns = 0 if before is None else fix.sender_ns - before.sender_ns
-        if before is None or before.velocity_ned_mps is None or apart_ns > APART_NS:
+        self._newest = None if fix.velocity_ned_mps is None else fix
+        if self._newest is None:
+            return None
+        if before is None or fix.sender_ns - before.sender_ns > APART_NS:
             del self._kept[:]
             self._sums = (0.0, 0.0, 0.0)
-        if fix.velocity_ned_mps is None:
-            self._newest = None
-            return None
-        if apart_ns and before is not None and self._kept:
-            north_m, east_m, unseen_m = step_deviation(before, fix, acceleration_mps2)
-            noise_mps = max(before.noise.velocity_mps, fix.noise.velocity_mps)
-            north, east, allowed = self._sums
-            step_m = noise_mps * apart_ns * 1e-9 + unseen_m
-            self._sums = (north + north_m, east + east_m, allowed + step_m)
+        else:
+            self._add(before, fix, acceleration_mps2)
         excess_mps = self._excess_mps(fix)
         if not self._kept or fix.sender_ns - self._kept[-_NUMBERS] >= SPACING_NS:
             self._keep(fix.sender_ns)
@@ -84,6 +78,14 @@ class VelocityCheck:
             proven=proven_mps,
             raised_to=self._raised.raise_above(proven_mps, fix.sender_ns),
         )
+
+    def _add(self, before: Fix, fix: Fix, acceleration_mps2: float) -> None:
+        """Add the deviation between two reports, and what is allowed for it, to the sums."""
+        north_m, east_m, unseen_m = step_deviation(before, fix, acceleration_mps2)
+        noise_mps = max(before.noise.velocity_mps, fix.noise.velocity_mps)
+        north, east, allowed = self._sums
+        step_m = noise_mps * (fix.sender_ns - before.sender_ns) * 1e-9 + unseen_m
+        self._sums = (north + north_m, east + east_m, allowed + step_m)
 
     def _keep(self, sender_ns: int) -> None:
         kept = self._kept

@@ -302,3 +302,38 @@ def test_clock_jump_beyond_possible_latency_is_announced() -> None:
     assert told[0].t_ns < START_NS + 48 * S
     texts = [one.text for one in said if isinstance(one, Notice)]
     assert any("arrive 15.0 s later than before; treated as a clock jump" in text for text in texts)
+
+
+def test_link_that_becomes_fast_refutes_the_positions_before_it() -> None:
+    """All frames of 20 s were 4 s late, and the last of them arrive between the first fast ones."""
+    there = pipeline()
+    frames = [
+        position(0.1 * n, "7:1", (n, 0, 0), (10, 0, 0), 4.0 if n < 200 else 0.0) for n in range(300)
+    ]
+    said = run(there, sorted(frames, key=lambda frame: frame.t_ns))
+    (told,) = [one for one in said if isinstance(one, Refuted)]
+    assert (told.setting, told.limit) == ("clocks.constant_delay_s", 0.0)
+    assert told.proven == pytest.approx(4.0, abs=0.1)
+    assert told.t_ns < START_NS + 20.7 * S
+    (notice,) = [one for one in said if isinstance(one, Notice) and "earlier" in one.text]
+    assert (notice.t_ns, notice.severity) == (told.t_ns, Severity.WARNING)
+    assert "until now its positions were 4.0 s older than assumed" in notice.text
+    (track,) = there.tracks(START_NS + 30 * S, START_NS + 30 * S)
+    off_m = math.dist(track.position_ned_m, (300, 0, 0))
+    assert off_m < track.horizontal_bound_m
+
+
+def test_velocities_that_the_positions_contradict_widen_the_bound() -> None:
+    """A tracker that sends a velocity of zero: the bound broke with its last report."""
+    there = pipeline()
+    said = run(there, (position(0.1 * n, "7:1", (1.5 * n, 0, 0)) for n in range(100)))
+    told = [one for one in said if isinstance(one, Refuted)]
+    assert {one.setting for one in told} == {"observer.velocity_noise_mps"}
+    assert told[0].t_ns < START_NS + 2 * S
+    texts = [one.text for one in said if isinstance(one, Notice)]
+    assert any("positions contradict its velocities" in text for text in texts)
+    for ahead_s in (0.1, 0.5, 1.0, 2.0):
+        at_ns = START_NS + round((9.9 + ahead_s) * S)
+        (track,) = there.tracks(at_ns, at_ns)
+        off_m = math.dist(track.position_ned_m, (15 * (9.9 + ahead_s), 0, 0))
+        assert off_m < track.horizontal_bound_m

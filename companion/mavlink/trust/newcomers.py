@@ -39,16 +39,19 @@ STRANGERS_WAIT_NS: Final = 10_000_000_000  # time for which strangers are not se
 LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 USELESS_NS: Final = 500_000_000  # age of a datagram that is of no use to a beam
 LATE_WINDOWS: Final = 4  # late windows in turn after which useless frames cost senders their place
-HEAVY: Final = 0.25  # share of the time from which on a sender floods, if others take less
+HEAVY: Final = 0.25  # share of the time above which a sender floods, if all others take less
 HEAVY_NS: Final = 5_000_000_000  # least time for which it is not served
 FREE: Final = 0.5  # share of one processor below which nothing else takes the time
 LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
 HELD_NS: Final = 5_000_000_000, 20_000_000_000
-"""Time for which no more senders are served after that: at first, and at most; it doubles."""
-SETTLED_NS: Final = 2_500_000_000
-"""Time after which that is repeated: what waits in a socket is up to two seconds old."""
+"""Time for which no more senders are served after half of the work was dropped.
+
+The first such time, and the longest: it doubles if work must be dropped again.
+"""
+BACKLOG_NS: Final = 2_500_000_000
+"""Least time between two such drops: frames that wait in a socket are up to two seconds old."""
 CALM_NS: Final = 10_000_000_000
-"""Time without a late frame after which the senders that were there at its begin are settled."""
+"""Time without a late frame that settles the senders that were there when it began."""
 KEPT_NS: Final = 5_000_000_000  # time between two looks at which senders are active
 WINDOW_NS: Final = 250_000_000  # time over which the share is measured
 
@@ -165,41 +168,50 @@ class Newcomers:
             self._is_useless
             and self._late_windows >= LATE_WINDOWS
             and share > LEAST
-            and now_ns - self._dropped_ns >= SETTLED_NS
+            and now_ns - self._dropped_ns >= BACKLOG_NS
         )
         self._is_late = self._is_lossy = self._is_useless = False
         if is_late and (share > BUSY or is_useless):
-            heavy = self._heaviest(by_served, max(HEAVY * passed_s, worked_s / 2))
-            were_served = now_ns >= self._strangers_from_ns
-            self._strangers_from_ns = now_ns + STRANGERS_WAIT_NS
-            if were_served and self._had_strangers:
-                self._had_strangers = False
-            elif heavy is not None:
-                self._heavy[heavy] = now_ns + HEAVY_NS
-                self.generation += 1
-            elif share > BUSY:
+            flood_s = max(HEAVY * passed_s, worked_s / 2)
+            is_done = self._drop_strangers(now_ns) or self._drop_flood(now_ns, by_served, flood_s)
+            if not is_done and share > BUSY:
                 self._drop(by_served, worked_s * BUSY / share)
-            else:
+            elif not is_done:
                 self._drop(by_served, worked_s / 2, self._settled_below)
                 self._hold(now_ns)
-        elif (
-            share < IDLE
-            and self._served_below is not None
-            and (is_free or now_ns >= self._held_until_ns)
-        ):
+        elif share < IDLE and (is_free or now_ns >= self._held_until_ns):
+            self._serve_more()
+
+    def _drop_strangers(self, now_ns: int) -> bool:
+        """Serve no strangers for a time. Return whether that drops some that were served."""
+        drops = now_ns >= self._strangers_from_ns and self._had_strangers
+        self._strangers_from_ns = now_ns + STRANGERS_WAIT_NS
+        self._had_strangers &= not drops
+        return drops
+
+    def _drop_flood(self, now_ns: int, worked_s: dict[Source, float], least_s: float) -> bool:
+        """Drop the sender whose frames took more than ``least_s``, unless it is the oldest.
+
+        Return whether there is one.
+        """
+        heavy = max(worked_s, key=lambda one: worked_s[one], default=None)
+        if heavy is None or worked_s[heavy] <= least_s:
+            return False
+        if self._numbers.get(heavy) == min(self._numbers.values()):
+            return False
+        self._heavy[heavy] = now_ns + HEAVY_NS
+        self.generation += 1
+        return True
+
+    def _serve_more(self) -> None:
+        """Serve some more senders, the oldest of those that are dropped."""
+        if self._served_below is not None:
             numbers = sorted(self._numbers.values())
             served = bisect_left(numbers, self._served_below)
             self._serve(numbers, max(served + 8, served * 5 // 4))
 
-    def _heaviest(self, worked_s: dict[Source, float], least_s: float) -> Source | None:
-        """Return the sender whose frames took more than ``least_s``; None also if it is oldest."""
-        heavy = max(worked_s, key=lambda one: worked_s[one], default=None)
-        if heavy is None or worked_s[heavy] <= least_s:
-            return None
-        return None if self._numbers.get(heavy) == min(self._numbers.values()) else heavy
-
     def _hold(self, now_ns: int) -> None:
-        """Serve no more senders for a time, which doubles while frames are lost again."""
+        """Serve no more senders for a time; it doubles if the last such time was recent."""
         self._dropped_ns = now_ns
         least_ns, most_ns = HELD_NS
         is_again = now_ns - self._held_until_ns < most_ns
@@ -216,9 +228,9 @@ class Newcomers:
             self._calm_since = now_ns, self._count
 
     def _drop(self, worked_s: dict[Source, float], most_s: float, settled_below: int = 0) -> None:
-        """Serve the oldest senders whose frames took at most ``most_s`` together; one at least.
+        """Serve the oldest senders whose frames took at most ``most_s`` together.
 
-        And all below ``settled_below``.
+        Always one, and those with numbers below ``settled_below``.
         """
         numbers = sorted((number, source) for source, number in self._numbers.items())
         if self._served_below is not None:

@@ -1,6 +1,5 @@
 """Servers share the process's file descriptors, whatever its limit is."""
 
-import contextlib
 import resource
 import socket
 import sys
@@ -63,17 +62,3 @@ def test_page_is_reachable_while_connections_fill_all_links(start_node: Any) -> 
     assert node.get("/healthz")[0] == 200
     for one in held:
         one.close()
-
-
-def test_page_is_reachable_while_streams_fill_their_places(start_node: Any) -> None:
-    """They took all connections of a service with 220 descriptors, and then monitors none."""
-    node = start_node(*RUN, code=LIMITED)
-    host, port = node.url.removeprefix("http://").split(":")
-    ask = "GET /v1/stream HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    ask += "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\n\r\n"
-    with contextlib.ExitStack() as held:
-        for _ in range(100):
-            one = held.enter_context(socket.create_connection((host, int(port)), 5))
-            one.sendall(ask.encode())
-            assert one.recv(1)
-        assert node.get("/healthz")[0] == 200

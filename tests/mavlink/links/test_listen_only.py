@@ -62,11 +62,10 @@ def test_receiver_beyond_its_share_of_the_time_is_skipped_and_counted(
 ) -> None:
     """All peers of a link share the time, whichever port they use, and its work is charged."""
     monkeypatch.setattr(transport, "RECEIVER_SAVED_S", 0.0)
-    now_ns = 1_000_000_000
+    clock = Seconds(1_000_000_000)
 
     async def test() -> None:
-        nonlocal now_ns
-        async with running("cot:udp:127.0.0.1:0", now_ns=lambda: now_ns) as (link, inbox):
+        async with running("cot:udp:127.0.0.1:0", now_ns=clock.now_ns) as (link, inbox):
             await until_true(lambda: link.status.state == "up")
             link._newcomers.adapts_ns = 1 << 62  # the work is not taken into account meanwhile
             link.take(("127.0.0.1", 1), 8 * EVENT)
@@ -79,7 +78,7 @@ def test_receiver_beyond_its_share_of_the_time_is_skipped_and_counted(
             assert len(inbox.frames) == 8
             (skipped,) = inbox.rejections
             assert (skipped.reason, skipped.count) == (Reason.TOO_FREQUENT, 1)
-            now_ns += 60_000_000_000
+            clock.t_ns += 60_000_000_000
             link.take(("127.0.0.1", 40), EVENT)
             assert len(inbox.frames) == 9
             assert sum(one.count for one in inbox.rejections) == 28
@@ -93,16 +92,15 @@ def test_datagram_beyond_the_share_is_dropped_whole(
 ) -> None:
     """Its garbage cost as much as its messages: 64 kB of it 0.7 s."""
     monkeypatch.setattr(transport, "RECEIVER_SAVED_S", 0.0)
-    now_ns = 1_000_000_000
+    clock = Seconds(1_000_000_000)
 
     async def test() -> None:
-        nonlocal now_ns
-        async with running("cot:udp:127.0.0.1:0", now_ns=lambda: now_ns) as (link, inbox):
+        async with running("cot:udp:127.0.0.1:0", now_ns=clock.now_ns) as (link, inbox):
             await until_true(lambda: link.status.state == "up")
             assert link.take(("127.0.0.1", 1), 20 * EVENT)
             assert not link.take(("127.0.0.1", 1), b"")  # the rest is dropped
             assert not link.take(("127.0.0.1", 2), b"\xbf" * 60_000)
-            now_ns += 60_000_000_000
+            clock.t_ns += 60_000_000_000
             link.take(("127.0.0.1", 1), EVENT)  # whose half-read datagram left nothing
             assert 8 < len(inbox.frames) < 20
             assert link.status.lost == {Reason.TOO_FREQUENT: 2}
@@ -210,8 +208,8 @@ def test_multicast_group_is_joined_and_shared(run: Run) -> None:
 class Seconds:
     """A clock that the test sets."""
 
-    def __init__(self) -> None:
-        self.t_ns = 1
+    def __init__(self, t_ns: int = 1) -> None:
+        self.t_ns = t_ns
 
     def now_ns(self) -> int:
         return self.t_ns

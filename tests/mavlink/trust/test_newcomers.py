@@ -25,6 +25,12 @@ def served(senders: Newcomers, most: int, now_ns: int) -> list[int]:
     return [number for number in range(most) if senders.admits(source(number), now_ns)]
 
 
+def end_window(senders: Newcomers, number: int, *, used: float = 1.0, busy: float = 1.0) -> None:
+    """End a window: the thread used a share of the time, and the whole process another."""
+    passed_s = number * WINDOW_NS * 1e-9
+    senders.adapt(number * WINDOW_NS, used * passed_s, busy * passed_s)
+
+
 def window(
     senders: Newcomers,
     number: int,
@@ -45,8 +51,7 @@ def window(
         senders.worked(source(one), spent_s / len(now))
     if is_late:
         senders.late()
-    process_s = busy * number * WINDOW_NS * 1e-9
-    senders.adapt(number * WINDOW_NS, used * number * WINDOW_NS * 1e-9, process_s)
+    end_window(senders, number, used=used, busy=busy)
 
 
 def test_process_that_was_stopped_drops_no_sender() -> None:
@@ -94,7 +99,7 @@ def test_senders_that_were_there_in_calm_times_are_not_dropped_for_other_work() 
     senders, calm = Newcomers(), 2 * newcomers.CALM_NS // WINDOW_NS
     for number in range(1, calm + 2):
         assert len(served(senders, 20, number * WINDOW_NS)) == 20
-        senders.adapt(number * WINDOW_NS, *[number * WINDOW_NS * 1e-9] * 2)
+        end_window(senders, number)
     end = 2 * calm + 2
     for number in range(calm + 2, end):
         senders.late()
@@ -108,12 +113,12 @@ def test_frames_that_waited_cost_no_more_senders_their_place() -> None:
     senders = Newcomers()
     late_windows(senders, 1, 0.4, None)
     left = len(served(senders, 100, 5 * WINDOW_NS))
-    for number in range(5, 4 + newcomers.SETTLED_NS // WINDOW_NS):
+    for number in range(5, 4 + newcomers.BACKLOG_NS // WINDOW_NS):
         senders.late()
         window(senders, number, 0.4)
         assert len(served(senders, 100, number * WINDOW_NS)) == left
     senders.late()
-    window(senders, 4 + newcomers.SETTLED_NS // WINDOW_NS, 0.4)
+    window(senders, 4 + newcomers.BACKLOG_NS // WINDOW_NS, 0.4)
     assert len(served(senders, 100, 20 * WINDOW_NS)) < left
 
 
@@ -123,7 +128,8 @@ def test_senders_are_served_again_at_once_when_the_process_is_free() -> None:
     late_windows(senders, 1, 0.4, None)
     assert len(served(senders, 100, 5 * WINDOW_NS)) < 100
     for number in range(5, 11):
-        window(senders, number, 0.02, busy=0.3 + 4 * 0.7 / number)
+        # Until the fourth window the process used all of the time, and 0.3 of it since.
+        window(senders, number, 0.02, busy=(4 + 0.3 * (number - 4)) / number)
     assert len(served(senders, 120, 11 * WINDOW_NS)) == 120
 
 
@@ -142,7 +148,7 @@ def test_flood_of_an_old_sender_costs_younger_ones_nothing() -> None:
             assert senders.admits(source(one), number * WINDOW_NS)
             senders.worked(source(one), 0.008 * WINDOW_NS * 1e-9)
         senders.late()
-        senders.adapt(number * WINDOW_NS, *[number * WINDOW_NS * 1e-9] * 2)
+        end_window(senders, number)
     assert 2 <= times <= 100 * WINDOW_NS // newcomers.HEAVY_NS + 1  # tried again, now and then
 
 
@@ -153,7 +159,7 @@ def test_oldest_sender_is_served_although_it_floods() -> None:
         senders.worked_s += 0.7 * WINDOW_NS * 1e-9
         senders.worked(source(0), 0.65 * WINDOW_NS * 1e-9)
         senders.late()
-        senders.adapt(number * WINDOW_NS, *[number * WINDOW_NS * 1e-9] * 2)
+        end_window(senders, number)
         assert senders.admits(source(0), number * WINDOW_NS)
 
 
@@ -254,7 +260,7 @@ def test_flood_of_one_sender_costs_no_other_its_place() -> None:
         if 5 in now:
             senders.worked(source(5), 0.9 * WINDOW_NS * 1e-9)
         senders.late()
-        senders.adapt(number * WINDOW_NS, number * WINDOW_NS * 1e-9, number * WINDOW_NS * 1e-9)
+        end_window(senders, number)
     assert served(senders, 6, 20 * WINDOW_NS) == [0, 1, 2, 3, 4]
 
 
@@ -269,7 +275,7 @@ def test_receiver_ranks_behind_vehicles_but_not_behind_a_flood(receiver: Source)
         for one in (*map(source, now), receiver):
             senders.worked(one, spent_s / (1 + len(now)))
         senders.late()
-        senders.adapt(WINDOW_NS, WINDOW_NS * 1e-9, WINDOW_NS * 1e-9)
+        end_window(senders, 1)
         assert senders.admits(receiver, WINDOW_NS) is receiver_stays
 
 

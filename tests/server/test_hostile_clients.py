@@ -380,11 +380,11 @@ def test_slot_that_rests_is_not_lost(monkeypatch: pytest.MonkeyPatch) -> None:
         with contextlib.suppress(TimeoutError):
             await asyncio.wait_for(slots.run(lambda: None), 0.01)
 
+    begun_s = time.monotonic()
     run_async(slots.run(lambda: None))
     run_async(impatient())
-    begun_s = time.monotonic()
     run_async(asyncio.wait_for(slots.run(lambda: None), HANG_S))
-    assert time.monotonic() - begun_s > 0.2
+    assert time.monotonic() - begun_s > 0.3  # the rest begins with the end of the first work
 
 
 def test_history_is_built_off_the_event_loop(

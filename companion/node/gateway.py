@@ -185,15 +185,16 @@ class Gateway:
         self._known_peers.contradicted.clear()
 
     def _notify_newcomers(self) -> None:
-        """Publish a notice while frames of new senders are rejected, at most once a minute."""
+        """Publish a notice while frames are not admitted, at most once a minute."""
         now_ns = self._now_ns()
         if self._newcomers.refused and now_ns - self._refusal_notice_ns >= NOTICE_EVERY_NS:
             self._refusal_notice_ns = now_ns
             self._newcomers.refused = 0
             self._warn(
                 "links",
-                "more frames of new senders arrive than are served, and some are rejected;"
-                " name the vehicles in `[tracks] allow`, or sign the links",
+                "more frames arrive than this machine can process: those of new senders, and of"
+                " ones that flood, are dropped; name the vehicles in `[tracks] allow`, or sign the"
+                " links",
             )
 
     def _warn(self, subject: str, text: str, severity: Severity = Severity.WARNING) -> None:

@@ -3,6 +3,8 @@
 The guaranteed gain is the least gain within the pointing bound. The cause of a large bound is the
 input that, if it were ideal, would reduce it most (``angle_parts``): the carrier's attitude or
 position, the UAV's reports, a clock, or this machine.
+
+Over 300 lines: each cause takes a few, and they are read together, so that none says the same.
 """
 
 import math
@@ -249,6 +251,12 @@ def _is_silent(track: Track, waited_s: float) -> bool:
 
 
 def _refused_cause(refused: Reason) -> Blame:
+    if refused is Reason.NEWCOMER:
+        return Blame(
+            Cause.MACHINE,
+            "this machine is overloaded, and drops its reports",
+            "name it in `[tracks] allow`, or end what floods the links",
+        )
     return Blame(
         Cause.REFUSED,
         f"its reports are rejected: {refused}",

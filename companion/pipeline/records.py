@@ -25,12 +25,12 @@ class Records(dict[str, _T]):
     def __init__(self, make: Callable[[], _T], is_kept: Callable[[str], bool]) -> None:
         super().__init__()
         self._make = make
-        self._is_kept = is_kept
+        self.is_kept = is_kept
         self._most = RECORDS_MAX
 
     def __missing__(self, uav: str) -> _T:
         if len(self) >= self._most:
-            unwanted = (one for one in self if not self._is_kept(one))
+            unwanted = (one for one in self if not self.is_kept(one))
             for one in list(islice(unwanted, DROPPED_TOGETHER)):
                 del self[one]
             self._most = max(RECORDS_MAX, len(self) + DROPPED_TOGETHER)

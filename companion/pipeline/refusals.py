@@ -23,6 +23,7 @@ REPORT_REASONS: Final = frozenset(
         Reason.NO_FIX,
         Reason.OUT_OF_ORDER,
         Reason.SHARED_ID,
+        Reason.NEWCOMER,
     }
 )
 """Reasons to reject a sender's report about itself."""
@@ -62,6 +63,9 @@ class Refusals:
         uav = refused.source
         if refused.reason not in REPORT_REASONS or not kind_of(uav).reports_itself:
             return None
+        is_dropped = refused.reason is Reason.NEWCOMER
+        if is_dropped and not self._records.is_kept(uav):
+            return None  # ids can be forged in any number
         record = self._records[uav]
         if record.unused is None:
             record.unused = UnusedRun(
@@ -73,8 +77,8 @@ class Refusals:
         lasted_ns = refused.t_ns - run.since_ns
         if run.is_reported or run.reports < 2 or lasted_ns < REJECTED_AFTER_NS:
             return None
-        if refused.reason is Reason.SHARED_ID:
-            return None  # a shared id has its own notice
+        if is_dropped or refused.reason is Reason.SHARED_ID:
+            return None  # these have a notice of their own
         run.is_reported = True
         notified_ns = record.unused_notice_ns
         if notified_ns is not None and refused.t_ns - notified_ns < NOTICE_INTERVAL_NS:

@@ -25,7 +25,10 @@ class Reason(DescribedEnum):
     NO_ALTITUDE = "no-altitude", "relayed aircraft without an altitude"
     UNPLACED_STAMP = "unplaced-stamp", "reports whose time stamp fits no clock of the sender yet"
     NOT_ALLOWED = "not-allowed", "reports of senders that the allow and deny lists exclude"
-    NEWCOMER = "newcomer", "frames of new senders, beyond what this machine can serve"
+    NEWCOMER = (
+        "newcomer",
+        "frames that this machine has no time for: of new senders, or of ones that flood",
+    )
     TOO_MANY = "too-many", "reports of UAVs beyond the number that the settings allow"
     UNSIGNED = "unsigned", "frames without the signature that their link requires"
     BAD_SIGNATURE = "bad-signature", "frames signed with another key, or altered"

@@ -16,7 +16,18 @@ from sent_frames import START_NS, S, attitude, position, sent
 
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
-from companion.values import Cause, Event, Frame, Level, RoundTrip, Source, Tick, Update
+from companion.values import (
+    Cause,
+    Event,
+    Frame,
+    Level,
+    Reason,
+    Rejection,
+    RoundTrip,
+    Source,
+    Tick,
+    Update,
+)
 
 UAVS: Final = ("1:1", "2:1", "3:1", "4:1")
 CARRIER: Final = "5:1"
@@ -277,6 +288,24 @@ def test_frozen_uav_is_rejected_not_silent_when_it_has_lost_its_beam() -> None:
     assert verdict.needed_gain_db is None  # no beam
     assert verdict.blame is not None
     assert verdict.blame.cause is Cause.REFUSED
+
+
+def test_uav_whose_frames_this_machine_drops_is_not_called_silent() -> None:
+    """Its radio was named as the cause."""
+    pipeline, blames = Pipeline(SETTINGS), set[str]()
+    dropped_ns = START_NS + round(GOOD_S * S)
+    for event in flown([Disturbance(change=_lost("4:1"), struck=ALL, cause=Cause.MACHINE)], 20.0):
+        pipeline.step(event)
+        if event.t_ns - dropped_ns >= S // 2:
+            dropped_ns = event.t_ns
+            count = HZ // 2
+            pipeline.step(
+                Rejection(t_ns=dropped_ns, source="4:1", reason=Reason.NEWCOMER, count=count)
+            )
+        if event.t_ns > START_NS + (GOOD_S + WITHIN_S) * S:
+            blames.add(str(pipeline.health.verdicts["4:1"].blame))
+    (blame,) = blames
+    assert "drops its reports" in blame and "MACHINE" in blame
 
 
 def test_rejected_carrier_is_not_called_silent() -> None:

@@ -92,3 +92,14 @@ def test_shared_id_explains_silence_without_its_own_notice() -> None:
     newest_ns = shared[-1].t_ns
     assert refusals.current_rejection("3:1", newest_ns + ARRIVING_NS) is Reason.SHARED_ID
     assert refusals.current_rejection("3:1", newest_ns + ARRIVING_NS + 1) is None  # silent now
+
+
+def test_vehicles_whose_frames_are_dropped_are_remembered_only_if_they_are_tracked() -> None:
+    """Ids can be forged in any number; and dropping them has a notice of its own."""
+    refusals = Refusals(Records(UavRecord, {"3:1"}.__contains__))
+    for number in range(5):
+        for uav in ("3:1", "7:7"):
+            assert refusals.add(refused(number, uav, Reason.NEWCOMER)) is None
+    assert refusals.current_rejection("3:1", 4_000_000_000) is Reason.NEWCOMER
+    assert refusals.current_rejection("7:7", 4_000_000_000) is None
+    assert refusals.of("7:7").counts == {Reason.NEWCOMER: 5}

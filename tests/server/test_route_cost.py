@@ -7,7 +7,6 @@ with the time of an answer about ``UNIT_UAVS``: many UAVs may add three times th
 
 import asyncio
 import gc
-import statistics
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -206,7 +205,10 @@ def held_by_route(
     monkeypatch: pytest.MonkeyPatch,
     rounds: int = ROUNDS,
 ) -> float:
-    """Return the longest callback while eight clients ask for a path: the median of rounds."""
+    """Return the longest callback while eight clients ask for a path: the least of all rounds.
+
+    What the route does itself is in each round; what a busy machine adds is not.
+    """
     longest_s = []
 
     async def all_ask() -> list[int]:
@@ -219,11 +221,11 @@ def held_by_route(
             assert set(run_async(all_ask())) <= statuses, path
             time.sleep(0.002)  # the last callback may still run
         longest_s.append(max(held.took_s))
-    return statistics.median(longest_s)
+    return min(longest_s)
 
 
 def held_by_topic(serving: Serving, topic: Topic, monkeypatch: pytest.MonkeyPatch) -> float:
-    """Return the longest callback while eight clients get a topic: the median of updates."""
+    """Return the longest callback while eight clients get a topic: the least of all updates."""
     address = f"ws://127.0.0.1:{serving.port}/v1/stream?topic={topic}&rate_hz=100"
     longest_s = []
 
@@ -241,7 +243,7 @@ def held_by_topic(serving: Serving, topic: Topic, monkeypatch: pytest.MonkeyPatc
             await one.close()
 
     run_async(attend())
-    return statistics.median(longest_s)
+    return min(longest_s)
 
 
 def answer_s(node: StandIn) -> float:
@@ -253,7 +255,7 @@ def answer_s(node: StandIn) -> float:
         overview = uav_state.overview(node, known, node.now_ns())
         large_answers._parts(overview, node.pipeline.utc_ns, NEVER)
         took_s.append(time.thread_time() - begun_s)
-    return statistics.median(took_s)
+    return min(took_s)
 
 
 def too_long(few_s: float, many_s: float, node: StandIn) -> str | None:

@@ -16,8 +16,8 @@ line while it is less than ``late_max_ns`` off it:
   advances between them, belong to a second clock: two senders share one id.
 - A stamp that is more than a second early on a line of 20 implies that all earlier ones were
   late. It counts once three stamps of reports over at least half a second agree; until then they
-  have no time. Late ones may arrive between them, if they are no more than twice as many: a link
-  that becomes fast still delivers what it had delayed.
+  have no time. Late ones may arrive between them, from a slower link or one that becomes fast:
+  no frame arrives before it was sent, so these prove nothing against the early ones.
 - Frames of the previous line that arrive within ``late_max_ns`` after it was left have no time.
 
 A reboot is therefore reported once, at the stamp that confirms it. One case is ambiguous: a
@@ -111,7 +111,6 @@ class BootLine:
         self.since_ns: int | None = None
         self._run = _RivalLine()
         self._ahead = _RivalLine()  # early stamps that are not confirmed yet
-        self._between = 0  # stamps in order that arrived since the first of them
         self._rival = _RivalLine()
         self._previous: tuple[Floor, int] | None = None  # the previous line, and when it was left
 
@@ -187,7 +186,6 @@ class BootLine:
             if late_ns < _EARLY_NS and self.floor.count >= _ESTABLISHED:
                 return self._place_ahead(arrival_ns, boot_ms)
             self._run.stamps.clear()
-            self._between += 1
         elif (
             x_ns < self.newest_ns
             and x_ns < self._late_max_ns  # soon after the boot, not after a wrap
@@ -205,9 +203,7 @@ class BootLine:
         self._ahead.forget(arrival_ns)
         advances = self._ahead.add(arrival_ns, boot_ms, _NS)
         stamps = self._ahead.stamps
-        if len(stamps) == 1:
-            self._between = 0
-        if not (advances and self._ahead.lasts(3, _NS // 2)) or self._between > 2 * len(stamps):
+        if not (advances and self._ahead.lasts(3, _NS // 2)):
             return None
         x_ns = unwrapped_ns(boot_ms, self.newest_ns)
         before_ns = self.floor.at(x_ns)

@@ -21,6 +21,7 @@ from typing import Final, Protocol
 
 from companion.mavlink.links.endpoints import address_text
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
+from companion.mavlink.trust.newcomers import Account
 from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
@@ -93,7 +94,7 @@ class Peer:
         self.address = address_text(key) if isinstance(key, tuple) else str(key or "")
         self.splitter = splitter
         self.senders: dict[Source, _PeerSender] = {}
-        self.served: set[Source] = set()
+        self.served: dict[Source, Account] = {}
         """Senders whose frames from this peer are admitted without a further look."""
         self.served_generation = 0  # of ``Newcomers``, when ``served`` was emptied
         self.heard_ns: int | None = None

@@ -22,6 +22,7 @@ Over 300 lines: what a link receives, sends and reports is one class.
 
 import asyncio
 import time
+from collections import Counter
 from collections.abc import Callable, Hashable
 from dataclasses import replace
 from typing import Final, Protocol
@@ -32,8 +33,8 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
-from companion.mavlink.trust.known_peers import JUDGED, KnownPeers
-from companion.mavlink.trust.newcomers import LATE_NS, Newcomers
+from companion.mavlink.trust.known_peers import JUDGED, KnownPeers, PeerRank
+from companion.mavlink.trust.newcomers import LATE_NS, Account, Admission, Newcomers
 from companion.mavlink.wire import cot_link
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.foreign import ForeignSplitter
@@ -47,7 +48,8 @@ RETRY_S: Final = (0.2, 0.5, 1.0, 2.0, 5.0)
 STEADY_S: Final = 1.0
 """Seconds for which a connection must last before it is reported as restored."""
 REFUSED_EVERY_NS: Final = 500_000_000
-"""Least time between two rejections of newcomers, or of a receiver; each has their number."""
+"""Least time between rejections by admission, or of a receiver; each has a number of frames."""
+REFUSED_UAVS: Final = 32  # vehicles whose frames are counted apart in that time
 RECEIVER_SHARE: Final = 0.3
 """Share of the time that messages of a receiver may take; further ones are skipped unparsed.
 
@@ -117,7 +119,7 @@ class Link:
         self._lag = lag or ArrivalLag()
         self._known_peers = known_peers or KnownPeers()
         self._newcomers = newcomers or Newcomers()
-        self._refused = 0  # frames of newcomers not reported yet
+        self._refused = Counter[str]()  # frames not admitted, by vehicle or link, not reported yet
         self._refused_ns = 0
         self._receiver_s = Budget(per_s=RECEIVER_SHARE, most=RECEIVER_SAVED_S)
         self._skipped = 0  # messages of receivers not reported yet
@@ -220,7 +222,7 @@ class Link:
         newcomers.worked_s += spent_s
         for item in found:
             if isinstance(item, Frame) and item.source in peer.served:
-                newcomers.worked(item.source, spent_s / len(found))
+                newcomers.worked(peer.served[item.source], spent_s / len(found))
         if now_ns >= newcomers.adapts_ns:
             newcomers.adapt(now_ns, time.thread_time(), time.process_time())
 
@@ -233,7 +235,7 @@ class Link:
         passed over one by one: the place of the next one is known only then.
         """
         has_time = self._receiver_s.spend(0.0, t_ns * 1e-9)
-        receiver.skips = not has_time or self._newcomers.is_dropped(receiver.sender)
+        receiver.skips = not has_time or self._newcomers.is_dropped(receiver.sender, t_ns)
         if receiver.skips and self.url.listens:
             receiver.drop()
             receiver.skipped += 1
@@ -281,8 +283,7 @@ class Link:
             kept = item
             if isinstance(item, Frame):
                 _, _, source, msgid, _, _ = item
-                if source not in peer.served and not self._is_admitted(peer, source, item.t_ns):
-                    self._refused += 1
+                if source not in peer.served and not self._is_admitted(peer, item):
                     continue
                 if msgid in CHECKED:
                     kept = self._checked(peer, item)
@@ -296,29 +297,40 @@ class Link:
             self._report_refused(checked)
         self._receive(checked)
 
-    def _is_admitted(self, peer: Peer, source: Source, now_ns: int) -> bool:
-        """Return whether a sender's frame may be used; remember it of one that is served."""
-        address = peer.address or self._name
-        strange = self._known_peers.is_stranger(self._name, address, source, now_ns)
-        admitted = self._newcomers.admits(source, now_ns, is_stranger=strange)
-        if admitted and not strange:
-            peer.served.add(source)
-        return admitted
+    def _is_admitted(self, peer: Peer, frame: Frame) -> bool:
+        """Return whether a frame may be used; remember its sender if all of its frames may be."""
+        source, now_ns = frame.source, frame.t_ns
+        rank = self._rank(peer, source, now_ns)
+        matters = frame.msgid in CHECKED
+        found = self._newcomers.admits(source, now_ns, rank, matters=matters)
+        if found is Admission.ALL:
+            peer.served[source] = Account(source, rank is not PeerRank.FIRST)
+            return True
+        if found is Admission.DROPPED:
+            name, counts = str(source), self._refused
+            has_place = name in counts or len(counts) < REFUSED_UAVS
+            is_apart = rank is PeerRank.FIRST and matters and has_place
+            counts[name if is_apart else self.status.url] += 1
+        return found is Admission.ONE
+
+    def _rank(self, peer: Peer, source: Source, now_ns: int) -> PeerRank:
+        return self._known_peers.rank(self._name, peer.address or self._name, source, now_ns)
 
     def _is_first(self, peer: Peer, source: Source, now_ns: int) -> bool:
         """Return whether a peer is the one that is believed about a sender."""
-        return self._known_peers.is_first(peer.address or self._name, source, now_ns)
+        return self._rank(peer, source, now_ns) is PeerRank.FIRST
 
     def _report_refused(self, items: list[Received]) -> None:
-        """Add a rejection with the number of newcomers' frames, if one is due."""
+        """Add rejections with the numbers of frames that were not admitted, if they are due."""
         now_ns = self._now_ns()
-        if now_ns - self._refused_ns >= REFUSED_EVERY_NS:
-            refused = Rejection(
-                t_ns=now_ns, source=self.status.url, reason=Reason.NEWCOMER, count=self._refused
-            )
+        if now_ns - self._refused_ns < REFUSED_EVERY_NS:
+            return
+        for source, count in self._refused.items():
+            refused = Rejection(t_ns=now_ns, source=source, reason=Reason.NEWCOMER, count=count)
             items.append(refused)
             self._peers.count_rejection(refused)
-            self._refused, self._refused_ns = 0, now_ns
+        self._refused.clear()
+        self._refused_ns = now_ns
 
     def _checked(self, peer: Peer, frame: Frame) -> Received:
         """Return the frame, or a rejection if it is not accepted from this peer.

@@ -30,6 +30,7 @@ import math
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, field
+from enum import Enum, auto
 from typing import Final
 
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
@@ -74,6 +75,17 @@ _ABOUT_SENDER: Final = frozenset(
 )
 JUDGED: Final = DECODED | _ABOUT_SENDER
 """Messages that ``refusal`` judges; it accepts all others."""
+
+
+class PeerRank(Enum):
+    """PeerRank of a peer for one sender: believed first, known later than it, or a stranger.
+
+    Without another current peer, any peer is the first.
+    """
+
+    FIRST = auto()
+    LATER = auto()
+    STRANGER = auto()
 
 
 @dataclass(slots=True, kw_only=True)
@@ -169,27 +181,16 @@ class KnownPeers:
             return None if agrees or peer in sender.known else STRANGER
         return STRANGER
 
-    def is_stranger(self, link: str, peer: str, source: Source, now_ns: int) -> bool:
-        """Return whether a peer sends in the name of a sender with other, current known peers."""
+    def rank(self, link: str, peer: str, source: Source, now_ns: int) -> PeerRank:
+        """Return the rank of a peer for a sender. Routers are first."""
         sender = self._senders.get(source)
-        if sender is None or peer in sender.known or self._is_router(link, peer):
-            return False
-        return any(one.is_current(now_ns) for one in sender.known.values())
-
-    def is_first(self, peer: str, source: Source, now_ns: int) -> bool:
-        """Return whether a peer is a router, or no other current peer was known earlier."""
-        sender = self._senders.get(source)
-        if sender is None:
-            return True
+        if sender is None or self._is_router(link, peer):
+            return PeerRank.FIRST
         known = sender.known.get(peer)
-        if known is not None and known.is_router:
-            return True
-        return not any(
-            one is not known
-            and one.is_current(now_ns)
-            and (known is None or _standing(one) > _standing(known))
-            for one in sender.known.values()
-        )
+        if known is not None:
+            return PeerRank.LATER if _current_earlier(sender, known, now_ns) else PeerRank.FIRST
+        is_believed = any(one.is_current(now_ns) for one in sender.known.values())
+        return PeerRank.STRANGER if is_believed else PeerRank.FIRST
 
     # --- known peers --------------------------------------------------------------------------
 

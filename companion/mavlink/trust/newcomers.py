@@ -1,24 +1,29 @@
-"""Admission of new senders: so many a second, and none beside known ones on a busy machine.
+"""Admission: new senders so many a second; on a busy machine, first senders before new ones.
 
 Anybody that reaches a link's port can invent senders. Each takes a clock, a track and beams, so the
 number of new ones is limited. When frames take more than ``BUSY`` of the time and are lost, or read
-late in two windows, those of strangers (``known_peers``) are dropped before they are decoded, then
-those of a sender that floods, then those of the newest senders, until the rest are in time: who was
-here first keeps being served. No more senders are dropped than took the work that is too much: a
-flood of one sender costs no other its place. Receivers rank behind vehicles, whichever came first.
+late in two windows, those of strangers (``known_peers``) are dropped before they are decoded. Then
+senders that flood are limited (``flood_limit``). Then those of the newest senders are dropped,
+until the rest are in time: who was here first keeps being served. No more senders are dropped than
+took the work that is too much: a flood of some costs no other its place. Receivers rank behind
+vehicles, whichever came first. What later peers bring of a sender counts as a sender of its own: a
+flood in a vehicle's name costs its first peer nothing.
 
 Where something else takes the time, such as requests, frames take less than ``BUSY`` of it. Once
 they have been late for a second and are lost, or too old to be of use, half of their work is
 dropped, since those of all senders become two seconds late otherwise; but none of senders that were
 there through ten seconds in time. While the process stays busy, more are served only after a time
-that doubles.
+that doubles. Frames that are in time for ten seconds let more senders be served in any case.
 """
 
 from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Callable
-from typing import Final
+from enum import Enum, auto
+from typing import Final, NamedTuple
 
+from companion.mavlink.trust.flood_limit import FloodLimit
+from companion.mavlink.trust.known_peers import PeerRank
 from companion.mavlink.wire import cot_link, rid_json, transponder
 from companion.values import Source
 from companion.values.budget import Budget
@@ -38,9 +43,10 @@ IDLE: Final = 0.35  # share below which more senders are served again
 STRANGERS_WAIT_NS: Final = 10_000_000_000  # time for which strangers are not served after that
 LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 USELESS_NS: Final = 500_000_000  # age of a datagram that is of no use to a beam
-LATE_WINDOWS: Final = 4  # late windows in turn after which useless frames cost senders their place
-HEAVY: Final = 0.25  # share of the time above which a sender floods, if all others take less
-HEAVY_NS: Final = 5_000_000_000  # least time for which it is not served
+LATE_FOR_NS: Final = 1_000_000_000
+"""Time of late windows in turn after which useless frames cost senders their place."""
+HEAVY: Final = 0.1
+"""Share of the time above which a sender floods, where such senders take most of the work."""
 FREE: Final = 0.5  # share of one processor below which nothing else takes the time
 LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
 HELD_NS: Final = 5_000_000_000, 20_000_000_000
@@ -54,6 +60,22 @@ CALM_NS: Final = 10_000_000_000
 """Time without a late frame that settles the senders that were there when it began."""
 KEPT_NS: Final = 5_000_000_000  # time between two looks at which senders are active
 WINDOW_NS: Final = 250_000_000  # time over which the share is measured
+LOSSY_WINDOW_NS: Final = 50_000_000  # the same once frames are lost: a socket is full in 0.1 s
+
+
+class Account(NamedTuple):
+    """What frames are charged to: a sender by its first peer or, if ``is_later``, by later ones."""
+
+    source: Source
+    is_later: bool = False
+
+
+class Admission(Enum):
+    """Whether a sender's frame is used: not, this one, or all until ``generation`` changes."""
+
+    DROPPED = auto()
+    ONE = auto()
+    ALL = auto()
 
 
 class Newcomers:
@@ -64,7 +86,7 @@ class Newcomers:
     frames took since the last call of ``adapt``, due from ``adapts_ns``; ``worked`` says whose.
 
     ``is_named`` says whether the settings name a vehicle: those are always admitted, so that a
-    service that starts during a flood serves them.
+    service that starts during a flood serves them. Limits of floods hold for them too.
     """
 
     def __init__(self, is_named: Callable[[str], bool] = lambda _: False) -> None:
@@ -73,8 +95,8 @@ class Newcomers:
         self.generation = 0
         self.worked_s = 0.0
         self.adapts_ns = 0
-        self._worked_s = dict[Source, float]()  # of each sender that is served
-        self._numbers: OrderedDict[Source, int] = OrderedDict()  # by the newest frame
+        self._worked_s = dict[Account, float]()  # of each sender that is served
+        self._numbers: OrderedDict[Account, int] = OrderedDict()  # by the newest frame
         self._budget = Budget(per_s=NEW_PER_S, most=NEW_SAVED)
         self._count = 0
         self._served_below: int | None = None  # number from which senders are not served
@@ -82,65 +104,79 @@ class Newcomers:
         self._strangers_from_ns = -(1 << 62)  # time from which those of strangers are served
         self._began_ns = 0
         self._used_s = self._process_s = 0.0
-        self._heavy = dict[Source, int]()  # senders that flood, and until when they are not served
+        self._limits = dict[Account, FloodLimit]()
         self._changed_ns = 0
         self._is_late = self._is_lossy = self._is_useless = False
-        self._late_windows = 0  # in turn
+        self._late_since_ns: int | None = None  # since when each window was late
         self._held_ns, self._held_until_ns = HELD_NS[0], -(1 << 62)
         self._dropped_ns = -(1 << 62)  # when half of the work was dropped
         self._calm_since = 0, 0  # time, and number of the next sender then
         self._settled_below = 0  # number of the first sender that is not settled
 
-    def admits(self, source: Source, now_ns: int, *, is_stranger: bool = False) -> bool:
-        """Return whether a frame of a sender may be used; count it if not.
+    def admits(
+        self, source: Source, now_ns: int, rank: PeerRank = PeerRank.FIRST, *, matters: bool = True
+    ) -> Admission:
+        """Return whether a frame may be used; count it if not.
 
-        ``is_stranger``: it comes from another peer than the sender's known ones.
+        ``rank`` is that of its peer; ``matters`` says whether its message is used for more than
+        records and display.
         """
-        if is_stranger and now_ns < self._strangers_from_ns:
-            self.refused += 1
-            return False
-        self._had_strangers |= is_stranger
+        found = self._admission(source, now_ns, rank, matters)
+        self.refused += found is Admission.DROPPED
+        return found
+
+    def _admission(self, source: Source, now_ns: int, rank: PeerRank, matters: bool) -> Admission:
+        if rank is PeerRank.STRANGER:
+            if now_ns < self._strangers_from_ns:
+                return Admission.DROPPED
+            self._had_strangers = True
+        account = Account(source, rank is not PeerRank.FIRST)
+        usual = Admission.ONE if rank is PeerRank.STRANGER else Admission.ALL
+        limit = self._limits.get(account)
+        if limit is not None and limit.holds(now_ns):
+            usual = Admission.ONE
+            if not limit.admits(now_ns, matters=matters):
+                return Admission.DROPPED
         if self._is_named(str(source)):
-            return True
-        if source in self._heavy:
-            self.refused += 1
-            return False
-        number = self._numbers.get(source)
+            return usual
+        number = self._numbers.get(account)
         if number is None:
             if not self._budget.spend(1, now_ns * 1e-9):
-                self.refused += 1
-                return False
-            number = self._numbers[source] = self._count + RECEIVERS_AFTER * (source in RECEIVERS)
+                return Admission.DROPPED
+            number = self._numbers[account] = self._count + RECEIVERS_AFTER * (source in RECEIVERS)
             self._count += 1
             if len(self._numbers) > SENDERS_MAX:
                 self._numbers.popitem(last=False)
         else:
-            self._numbers.move_to_end(source)
-        if self._served_below is None or number < self._served_below:
-            return True
-        self.refused += 1
-        return False
+            self._numbers.move_to_end(account)
+        return usual if self._is_served(number) else Admission.DROPPED
 
-    def is_dropped(self, source: Source) -> bool:
-        """Return whether frames of a sender are dropped at present; counts nothing."""
-        number = self._numbers.get(source)
-        if number is None or self._is_named(str(source)):
-            return False
-        is_new = self._served_below is not None and number >= self._served_below
-        return is_new or source in self._heavy
+    def _is_served(self, number: int) -> bool:
+        return self._served_below is None or number < self._served_below
+
+    def is_dropped(self, source: Source, now_ns: int) -> bool:
+        """Return whether frames of a sender's first peer are dropped at present; counts nothing."""
+        account = Account(source)
+        limit = self._limits.get(account)
+        if limit is not None and limit.holds(now_ns):
+            return limit.is_used_up(now_ns)
+        number = self._numbers.get(account)
+        return number is not None and not (self._is_served(number) or self._is_named(str(source)))
 
     def late(self, age_ns: int | None = None) -> None:
         """Note that frames were read late, at that age; None: they were lost."""
         self._is_late = True
-        self._is_lossy |= age_ns is None
+        if age_ns is None:
+            self._is_lossy = True
+            self.adapts_ns = min(self.adapts_ns, self._began_ns + LOSSY_WINDOW_NS)
         self._is_useless |= age_ns is None or age_ns > USELESS_NS
 
-    def worked(self, source: Source, spent_s: float) -> None:
-        """Note the time that a frame of a sender took.
+    def worked(self, account: Account, spent_s: float) -> None:
+        """Note the time that a frame took.
 
-        Only senders that are served are charged; ``worked_s`` has the time of all.
+        Only accounts of which all frames are used are charged; ``worked_s`` has the time of all.
         """
-        self._worked_s[source] = self._worked_s.get(source, 0.0) + spent_s
+        self._worked_s[account] = self._worked_s.get(account, 0.0) + spent_s
 
     def adapt(self, now_ns: int, used_s: float, process_s: float) -> None:
         """Adapt who is served to the share of the time that frames took.
@@ -155,31 +191,41 @@ class Newcomers:
         is_free = (process_s - self._process_s) / passed_s < FREE
         self.worked_s, self._worked_s = 0.0, {}
         self._used_s, self._process_s = used_s, process_s
+        began_ns = self._began_ns
         self._began_ns, self.adapts_ns = now_ns, now_ns + WINDOW_NS
         if now_ns - self._changed_ns > KEPT_NS:
             self.generation += 1
             self._changed_ns = now_ns
-            self._heavy = {one: ns for one, ns in self._heavy.items() if ns > now_ns}
+            self._limits = {one: it for one, it in self._limits.items() if it.holds(now_ns)}
         # Once late may be a long update; a flood is late again.
-        is_late = self._is_lossy or (self._is_late and self._late_windows > 0)
-        self._late_windows = self._late_windows + 1 if self._is_late else 0
-        self._note_calm(now_ns)
+        is_late = self._is_lossy or (self._is_late and self._late_since_ns is not None)
+        if not self._is_late:
+            self._late_since_ns = None
+        elif self._late_since_ns is None:
+            self._late_since_ns = began_ns
+        was_calm = self._note_calm(now_ns)
         is_useless = (
             self._is_useless
-            and self._late_windows >= LATE_WINDOWS
+            and self._late_since_ns is not None
+            and now_ns - self._late_since_ns >= LATE_FOR_NS
             and share > LEAST
             and now_ns - self._dropped_ns >= BACKLOG_NS
         )
         self._is_late = self._is_lossy = self._is_useless = False
         if is_late and (share > BUSY or is_useless):
-            flood_s = max(HEAVY * passed_s, worked_s / 2)
-            is_done = self._drop_strangers(now_ns) or self._drop_flood(now_ns, by_served, flood_s)
-            if not is_done and share > BUSY:
-                self._drop(by_served, worked_s * BUSY / share)
-            elif not is_done:
-                self._drop(by_served, worked_s / 2, self._settled_below)
+            is_busy = share > BUSY
+            most_s = worked_s * BUSY / share if is_busy else worked_s / 2
+            floods = {one: s for one, s in by_served.items() if s > HEAVY * passed_s}
+            if self._drop_strangers(now_ns):
+                pass
+            elif sum(floods.values()) > worked_s / 2:
+                self._limit(now_ns, floods, sum(by_served.values()) - most_s)
+            elif is_busy:
+                self._drop(by_served, most_s)
+            else:
+                self._drop(by_served, most_s, self._settled_below)
                 self._hold(now_ns)
-        elif share < IDLE and (is_free or now_ns >= self._held_until_ns):
+        elif was_calm or (share < IDLE and (is_free or now_ns >= self._held_until_ns)):
             self._serve_more()
 
     def _drop_strangers(self, now_ns: int) -> bool:
@@ -189,19 +235,14 @@ class Newcomers:
         self._had_strangers &= not drops
         return drops
 
-    def _drop_flood(self, now_ns: int, worked_s: dict[Source, float], least_s: float) -> bool:
-        """Drop the sender whose frames took more than ``least_s``, unless it is the oldest.
-
-        Return whether there is one.
-        """
-        heavy = max(worked_s, key=lambda one: worked_s[one], default=None)
-        if heavy is None or worked_s[heavy] <= least_s:
-            return False
-        if self._numbers.get(heavy) == min(self._numbers.values()):
-            return False
-        self._heavy[heavy] = now_ns + HEAVY_NS
+    def _limit(self, now_ns: int, floods: dict[Account, float], excess_s: float) -> None:
+        """Limit senders that flood, the heaviest first, until they save ``excess_s``."""
         self.generation += 1
-        return True
+        for account in sorted(floods, key=lambda one: -floods[one]):
+            self._limits[account] = FloodLimit(now_ns)
+            excess_s -= floods[account]
+            if excess_s <= 0.0:
+                return
 
     def _serve_more(self) -> None:
         """Serve some more senders, the oldest of those that are dropped."""
@@ -218,21 +259,26 @@ class Newcomers:
         self._held_ns = min(2 * self._held_ns, most_ns) if is_again else least_ns
         self._held_until_ns = now_ns + self._held_ns
 
-    def _note_calm(self, now_ns: int) -> None:
-        """Note whether frames are in time, and which senders were there while they were."""
+    def _note_calm(self, now_ns: int) -> bool:
+        """Note which senders are there while frames are in time.
+
+        Return whether they have been for another ten seconds.
+        """
         since_ns, count = self._calm_since
         if self._is_late:
             self._calm_since = now_ns, self._count
         elif now_ns - since_ns >= CALM_NS:
             self._settled_below = count
             self._calm_since = now_ns, self._count
+            return True
+        return False
 
-    def _drop(self, worked_s: dict[Source, float], most_s: float, settled_below: int = 0) -> None:
+    def _drop(self, worked_s: dict[Account, float], most_s: float, settled_below: int = 0) -> None:
         """Serve the oldest senders whose frames took at most ``most_s`` together.
 
         Always one, and those with numbers below ``settled_below``.
         """
-        numbers = sorted((number, source) for source, number in self._numbers.items())
+        numbers = sorted((number, account) for account, number in self._numbers.items())
         if self._served_below is not None:
             del numbers[bisect_left(numbers, (self._served_below,)) :]
         total_s, most = sum(worked_s.values()), len(numbers)

@@ -22,9 +22,9 @@ from companion.mavlink.links import kernel_time, tcp, transport, udp
 from companion.mavlink.links.endpoints import Upcalls
 from companion.mavlink.links.kinds import FRAMES_AT_ONCE
 from companion.mavlink.links.peers import PEERS_MAX
-from companion.mavlink.links.transport import Link
+from companion.mavlink.links.transport import REFUSED_UAVS, Link
 from companion.mavlink.links.urls import LinkError, parse_link
-from companion.mavlink.trust.newcomers import NEW_SAVED
+from companion.mavlink.trust.newcomers import NEW_SAVED, Account
 from companion.mavlink.wire.encode import Outgoing, heartbeat, pack, timesync
 from companion.mavlink.wire.framing import FALSE_STARTS_SAVED, Splitter
 from companion.values import Frame, Reason, Rejection, Severity, Source
@@ -1091,7 +1091,7 @@ def test_work_is_charged_to_the_sender_of_each_frame(run: Run) -> None:
             while has_more:
                 has_more = link.take(key, b"")
             charged = link._newcomers._worked_s
-            assert charged[Source(7, 1)] > 10 * charged[Source(1, 1)]
+            assert charged[Account(Source(7, 1))] > 10 * charged[Account(Source(1, 1))]
             assert sum(charged.values()) == pytest.approx(link._newcomers.worked_s, rel=0.1)
 
     run(test())
@@ -1220,5 +1220,32 @@ def test_work_on_garbage_is_not_charged_to_senders(run: Run) -> None:
             assert link._newcomers.worked_s == 0.0
             link.take(("127.0.0.1", 9), frame(1))
             assert link._newcomers.worked_s > 0.0
+
+    run(test())
+
+
+def test_frames_that_are_dropped_are_counted_by_vehicle(run: Run) -> None:
+    """So that a vehicle is not called silent; invented ones are counted together."""
+
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            await until_true(lambda: link.status.state == "up")
+            link._newcomers.adapts_ns = 1 << 62
+            for sysid in range(1, 100):
+                link.take(("127.0.0.1", 9), frame(1, sysid=sysid))
+            link._newcomers._served_below = 50
+            link._newcomers.generation += 1
+            link._refused_ns = link._now_ns()
+            for sysid in range(1, 100):
+                link.take(("127.0.0.1", 9), frame(2, sysid=sysid, seq=1))
+            assert not inbox.rejections
+            link._refused_ns = -(1 << 62)
+            link.take(("127.0.0.1", 9), frame(3, sysid=60, seq=2))
+            assert len(inbox.frames) == 99 + 50
+            counts = {one.source: one.count for one in inbox.rejections}
+            assert {one.reason for one in inbox.rejections} == {Reason.NEWCOMER}
+            apart = {f"{sysid}:1": 1 + (sysid == 60) for sysid in range(51, 51 + REFUSED_UAVS)}
+            assert counts == {**apart, link.status.url: 49 - REFUSED_UAVS}
+            assert link.status.lost[Reason.NEWCOMER] == 50
 
     run(test())

@@ -10,7 +10,13 @@ from peer_streams import HOME, LINK, OTHER, Place, S, Stream, beside, circle, he
 
 from companion.mavlink.trust import known_peers, paths
 from companion.mavlink.trust.duplicate_ids import KEPT_NS
-from companion.mavlink.trust.known_peers import BROUGHT, PROBATION_NS, STRANGER, KnownPeers
+from companion.mavlink.trust.known_peers import (
+    BROUGHT,
+    PROBATION_NS,
+    STRANGER,
+    KnownPeers,
+    PeerRank,
+)
 from companion.mavlink.wire.attitudes import ATTITUDE_QUATERNION_COV, GPS2_RAW, ODOMETRY
 from companion.mavlink.wire.decode import (
     ATTITUDE,
@@ -120,9 +126,9 @@ def attitude(t_s: float, yaw_rad: float) -> Frame:
     return message(t_s, Outgoing(Source(1, 1), ATTITUDE, payload))
 
 
-def with_two_known_peers() -> KnownPeers:
+def with_two_known_peers(routers: frozenset[str] = frozenset()) -> KnownPeers:
     """Peers after twenty seconds in which a second peer agreed about the position."""
-    peers = KnownPeers()
+    peers = KnownPeers(routers)
     found = rejected(peers, heard(HOME, 10, lasts_s=20), heard(OTHER, 10, begins_s=5, lasts_s=15))
     assert max(found[OTHER]) < 15
     return peers
@@ -161,15 +167,31 @@ def test_bounds_follow_the_peer_that_was_known_first(msgid: int) -> None:
     assert peers.refusal(LINK, HOME, message(25.3, lie)) is None  # the first is always used
 
 
-def test_stranger_is_a_peer_in_the_name_of_a_sender_with_a_current_known_peer() -> None:
-    peers = KnownPeers({"10.0.0.9"})
-    assert not peers.is_stranger(LINK, OTHER, Source(1, 1), 0)
-    rejected(peers, heard(HOME, 4, lasts_s=10))
-    assert peers.is_stranger(LINK, OTHER, Source(1, 1), 10 * S)
-    assert not peers.is_stranger(LINK, HOME, Source(1, 1), 10 * S)
-    assert not peers.is_stranger(LINK, OTHER, Source(2, 1), 10 * S)
-    assert not peers.is_stranger(LINK, "10.0.0.9:7", Source(1, 1), 10 * S)
-    assert not peers.is_stranger(LINK, OTHER, Source(1, 1), 13 * S)
+def test_stamps_ahead_of_time_are_not_used_before_positions_have_agreed() -> None:
+    """They would move the clock: here by 1.5 s, with the path predicted exactly."""
+    early = heard(OTHER, 10, begins_s=10.0, lasts_s=30.0, delay_s=lambda: -1.5)
+    found = rejected(KnownPeers(), heard(HOME, 10, lasts_s=30.0), early)
+    assert found[HOME] == []
+    assert len(found[OTHER]) >= 10 * PROBATION_NS / S
+    assert max(found[OTHER]) < 17.0
+
+
+def test_rank_of_a_peer_depends_on_the_others_that_are_current() -> None:
+    peers, source = with_two_known_peers(frozenset({"10.0.0.9"})), Source(1, 1)
+    now_ns = 20 * S
+    ranks = {
+        peer: peers.rank(LINK, peer, source, now_ns)
+        for peer in (HOME, OTHER, "10.0.0.8:7", "10.0.0.9:7")
+    }
+    assert list(ranks.values()) == [
+        PeerRank.FIRST,
+        PeerRank.LATER,
+        PeerRank.STRANGER,
+        PeerRank.FIRST,
+    ]
+    assert peers.rank(LINK, "10.0.0.8:7", Source(2, 1), now_ns) is PeerRank.FIRST
+    assert peers.rank(LINK, "10.0.0.8:7", source, now_ns + 3 * S) is PeerRank.FIRST
+    assert peers.rank(LINK, OTHER, source, now_ns + 3 * S) is PeerRank.FIRST
 
 
 # --- strangers ------------------------------------------------------------------------------------

@@ -5,24 +5,39 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from companion.mavlink.trust import newcomers
+from companion.mavlink.trust.flood_limit import LIMITED_NS, LIMITED_PER_S
+from companion.mavlink.trust.known_peers import PeerRank
 from companion.mavlink.trust.newcomers import (
     NEW_PER_S,
     NEW_SAVED,
     STRANGERS_WAIT_NS,
     WINDOW_NS,
+    Account,
+    Admission,
     Newcomers,
 )
 from companion.values import Source
 
 S = 1_000_000_000
+LATE_WINDOWS = newcomers.LATE_FOR_NS // WINDOW_NS
 
 
 def source(number: int) -> Source:
     return Source(1 + number // 250, 1 + number % 250)
 
 
+def admits(
+    senders: Newcomers,
+    source: Source,
+    now_ns: int,
+    rank: PeerRank = PeerRank.FIRST,
+    matters: bool = True,
+) -> bool:
+    return senders.admits(source, now_ns, rank, matters=matters) is not Admission.DROPPED
+
+
 def served(senders: Newcomers, most: int, now_ns: int) -> list[int]:
-    return [number for number in range(most) if senders.admits(source(number), now_ns)]
+    return [number for number in range(most) if admits(senders, source(number), now_ns)]
 
 
 def end_window(senders: Newcomers, number: int, *, used: float = 1.0, busy: float = 1.0) -> None:
@@ -48,7 +63,7 @@ def window(
     spent_s = share * WINDOW_NS * 1e-9
     senders.worked_s += spent_s
     for one in now:
-        senders.worked(source(one), spent_s / len(now))
+        senders.worked(Account(source(one)), spent_s / len(now))
     if is_late:
         senders.late()
     end_window(senders, number, used=used, busy=busy)
@@ -59,16 +74,16 @@ def test_process_that_was_stopped_drops_no_sender() -> None:
     for used, all_served in ((0.3, True), (1.0, False)):
         senders = Newcomers()
         served(senders, 20, 0)
-        for number in range(1, newcomers.LATE_WINDOWS):
+        for number in range(1, LATE_WINDOWS):
             window(senders, number, 0.9, is_late=True, used=used)
         assert (len(served(senders, 20, 9 * WINDOW_NS)) == 20) is all_served
 
 
 def late_windows(senders: Newcomers, first: int, share: float, age_ns: int | None) -> None:
     """Note windows in each of which some frames are late, and at the end of that age, or lost."""
-    for number in range(first, first + newcomers.LATE_WINDOWS):
+    for number in range(first, first + LATE_WINDOWS):
         senders.late(newcomers.LATE_NS + 1)
-        if number == first + newcomers.LATE_WINDOWS - 1:
+        if number == first + LATE_WINDOWS - 1:
             senders.late(age_ns)
         window(senders, number, share)
 
@@ -84,7 +99,7 @@ def test_newest_senders_are_dropped_where_other_work_makes_frames_useless(
     now_ns = 5 * WINDOW_NS
     left = served(senders, 100, now_ns)
     assert left == list(range(len(left))) and len(left) in (49, 50)
-    assert senders.is_dropped(source(50)) and not senders.is_dropped(source(48))
+    assert senders.is_dropped(source(50), now_ns) and not senders.is_dropped(source(48), now_ns)
     # They are not served again at once, which would repeat it.
     end = 4 + newcomers.HELD_NS[0] // WINDOW_NS
     for number in range(5, end):
@@ -133,41 +148,100 @@ def test_senders_are_served_again_at_once_when_the_process_is_free() -> None:
     assert len(served(senders, 120, 11 * WINDOW_NS)) == 120
 
 
-def test_flood_of_an_old_sender_costs_younger_ones_nothing() -> None:
-    """It was there before six vehicles, which were dropped with it."""
-    senders, flood = Newcomers(), source(1)
-    assert len(served(senders, 8, 0)) == 8
-    times = 0
-    for number in range(1, 101):
-        is_served = senders.admits(flood, (number - 1) * WINDOW_NS)
-        senders.worked_s += 0.7 * WINDOW_NS * 1e-9
-        times += is_served
-        if is_served:
-            senders.worked(flood, 0.65 * WINDOW_NS * 1e-9)
-        for one in (0, *range(2, 8)):
-            assert senders.admits(source(one), number * WINDOW_NS)
-            senders.worked(source(one), 0.008 * WINDOW_NS * 1e-9)
-        senders.late()
-        end_window(senders, number)
-    assert 2 <= times <= 100 * WINDOW_NS // newcomers.HEAVY_NS + 1  # tried again, now and then
+def flooded_window(
+    senders: Newcomers, number: int, floods: list[Account], others: list[int], share: float = 0.9
+) -> list[Account]:
+    """Note a late window of which floods took a share, if they are not limited.
+
+    Return the floods of which all frames were used. All other senders are always served.
+    """
+    began_ns, window_s = (number - 1) * WINDOW_NS, WINDOW_NS * 1e-9
+    whole = []
+    for flood in floods:
+        rank = PeerRank.LATER if flood.is_later else PeerRank.FIRST
+        if senders.admits(flood.source, began_ns, rank) is Admission.ALL:
+            whole.append(flood)
+            senders.worked(flood, share / len(floods) * window_s)
+    senders.worked_s += share * window_s  # the bytes of a dropped flood take it too
+    for one in others:
+        assert senders.admits(source(one), began_ns, matters=False) is Admission.ALL
+        senders.worked(Account(source(one)), 0.008 * window_s)
+    senders.late()
+    end_window(senders, number)
+    return whole
 
 
-def test_oldest_sender_is_served_although_it_floods() -> None:
-    senders = Newcomers()
+@pytest.mark.parametrize("floods", [[7], [1], [0], [0, 1, 2]], ids=str)
+def test_floods_cost_no_other_sender_its_place(floods: list[int]) -> None:
+    """Whenever they came. One that was there before six vehicles cost these their place."""
+    senders, others = Newcomers(), sorted({*range(8)} - {*floods})
     assert len(served(senders, 8, 0)) == 8
     for number in range(1, 5):
-        senders.worked_s += 0.7 * WINDOW_NS * 1e-9
-        senders.worked(source(0), 0.65 * WINDOW_NS * 1e-9)
-        senders.late()
-        end_window(senders, number)
-        assert senders.admits(source(0), number * WINDOW_NS)
+        whole = flooded_window(senders, number, [Account(source(one)) for one in floods], others)
+    assert len(whole) < len(floods)
+    for one in others:
+        assert senders.admits(source(one), WINDOW_NS * 5, matters=False) is Admission.ALL
+
+
+def test_flood_in_the_name_of_a_vehicle_costs_its_first_peer_nothing() -> None:
+    senders, flood = Newcomers(), Account(source(0), is_later=True)
+    assert len(served(senders, 4, 0)) == 4
+    for number in range(1, 9):
+        whole = flooded_window(senders, number, [flood], [0, 1, 2, 3])
+    assert not whole
+
+
+def test_no_more_senders_are_limited_than_take_what_is_too_much() -> None:
+    senders = Newcomers()
+    assert len(served(senders, 4, 0)) == 4
+    shares = [0.12, 0.11, 0.01, 0.6]
+    for one, share in enumerate(shares):
+        senders.worked(Account(source(one)), share * WINDOW_NS * 1e-9)
+        senders.worked_s += share * WINDOW_NS * 1e-9
+    senders.late()
+    end_window(senders, 1)
+    now = [senders.admits(source(one), 3 * WINDOW_NS) for one in range(4)]
+    assert now == [Admission.ALL, Admission.ALL, Admission.ALL, Admission.ONE]
+
+
+def test_limited_sender_keeps_some_of_the_frames_that_matter() -> None:
+    """It may be a vehicle whose log is downloaded: its positions are still used."""
+    senders = Newcomers()
+    assert len(served(senders, 4, 0)) == 4
+    flooded_window(senders, 1, [Account(source(0))], [1, 2, 3])
+    frames = [
+        (matters, admits(senders, source(0), WINDOW_NS + number * S // 5000, matters=matters))
+        for number in range(5000)
+        for matters in (False, True)
+    ]
+    assert not any(used for matters, used in frames if not matters)
+    assert LIMITED_PER_S <= sum(used for _, used in frames) <= 1.3 * LIMITED_PER_S
+    assert senders.is_dropped(source(0), WINDOW_NS + S)
+    assert not senders.is_dropped(source(0), WINDOW_NS + S + S // 10)
+
+
+@pytest.mark.parametrize(("per_s", "whole"), [(2000, 0), (500, 1)])
+def test_sender_is_limited_until_its_flood_ends(per_s: int, whole: int) -> None:
+    """Each time that it was served in full again, frames of all others were lost."""
+    senders, flood, others = Newcomers(), source(1), [0, 2, 3]
+    assert len(served(senders, 4, 0)) == 4
+    assert flooded_window(senders, 1, [Account(flood)], others)
+    limited = 1 + LIMITED_NS // WINDOW_NS
+    found = [
+        senders.admits(flood, WINDOW_NS + number * S // per_s)
+        for number in range(limited * per_s * WINDOW_NS // S)
+    ]
+    assert Admission.ALL not in found[: per_s * LIMITED_NS // S]
+    assert (Admission.ALL in found) == whole
+    end_ns = 3 * LIMITED_NS
+    assert senders.admits(flood, end_ns) is Admission.ALL
 
 
 def test_senders_that_are_dropped_again_wait_longer() -> None:
     senders, first, waits_ns = Newcomers(), 1, []
     for _ in range(6):
         late_windows(senders, first, 0.4, None)
-        end = first + newcomers.LATE_WINDOWS - 1
+        end = first + LATE_WINDOWS - 1
         waits_ns.append(senders._held_until_ns - end * WINDOW_NS)
         first = senders._held_until_ns // WINDOW_NS + 1
     least_ns, most_ns = newcomers.HELD_NS
@@ -184,10 +258,10 @@ def test_late_frames_that_are_few_or_of_use_cost_nobody_a_place(
 
 
 def test_named_vehicles_are_not_reported_as_dropped() -> None:
-    senders = Newcomers(lambda uav: uav == str(source(98)))
+    senders, now_ns = Newcomers(lambda uav: uav == str(source(98))), 5 * WINDOW_NS
     late_windows(senders, 1, 0.4, None)
-    assert not senders.is_dropped(source(98)) and senders.is_dropped(source(97))
-    assert not senders.is_dropped(Source(250, 1))
+    assert not senders.is_dropped(source(98), now_ns) and senders.is_dropped(source(97), now_ns)
+    assert not senders.is_dropped(Source(250, 1), now_ns)
 
 
 def test_new_senders_are_limited_and_known_ones_are_not() -> None:
@@ -203,12 +277,12 @@ def test_new_vehicle_is_admitted_during_a_flood_of_invented_ids() -> None:
     vehicle, number = Source(255, 255), 0
     for tick in range(100):  # 3000 invented ids and ten frames of the vehicle a second
         for _ in range(300):
-            senders.admits(source(number % 60_000), tick * S // 10)
+            admits(senders, source(number % 60_000), tick * S // 10)
             number += 1
-        if tick >= 20 and senders.admits(vehicle, tick * S // 10):
+        if tick >= 20 and admits(senders, vehicle, tick * S // 10):
             break
     assert tick < 100
-    assert senders.admits(vehicle, 100 * S)
+    assert admits(senders, vehicle, 100 * S)
 
 
 def test_named_vehicles_are_admitted_during_a_flood() -> None:
@@ -216,17 +290,17 @@ def test_named_vehicles_are_admitted_during_a_flood() -> None:
     senders = Newcomers(lambda uav: uav == "255:255")
     served(senders, 2000, 0)
     window(senders, 1, 0.9, is_late=True)
-    assert senders.admits(Source(255, 255), 0)
-    assert not senders.admits(Source(255, 254), 0)
-    assert not senders.admits(Source(255, 255), WINDOW_NS, is_stranger=True)
+    assert admits(senders, Source(255, 255), 0)
+    assert not admits(senders, Source(255, 254), 0)
+    assert not admits(senders, Source(255, 255), WINDOW_NS, PeerRank.STRANGER)
 
 
 def test_active_senders_are_not_evicted_by_invented_ones() -> None:
     senders = Newcomers()
     for tick in range(2000):
-        assert senders.admits(Source(255, 255), tick * S // 10)
+        assert admits(senders, Source(255, 255), tick * S // 10)
         for number in range(10):
-            senders.admits(source(tick * 10 + number), tick * S // 10)
+            admits(senders, source(tick * 10 + number), tick * S // 10)
     assert len(senders._numbers) <= newcomers.SENDERS_MAX
 
 
@@ -248,49 +322,46 @@ def test_newest_senders_are_dropped_while_frames_are_late() -> None:
     assert len(served(senders, 100, 0)) == 100
 
 
-def test_flood_of_one_sender_costs_no_other_its_place() -> None:
-    """Also if the bytes of the flood still take nearly all of the time once it is dropped."""
-    senders = Newcomers()
-    assert len(served(senders, 6, 0)) == 6
-    for number in range(1, 20):
-        now = served(senders, 6, number * WINDOW_NS)
-        senders.worked_s += 0.95 * WINDOW_NS * 1e-9
-        for one in range(5):
-            senders.worked(source(one), 0.01 * WINDOW_NS * 1e-9)
-        if 5 in now:
-            senders.worked(source(5), 0.9 * WINDOW_NS * 1e-9)
-        senders.late()
-        end_window(senders, number)
-    assert served(senders, 6, 20 * WINDOW_NS) == [0, 1, 2, 3, 4]
-
-
 @pytest.mark.parametrize("receiver", sorted(newcomers.RECEIVERS))
 def test_receiver_ranks_behind_vehicles_but_not_behind_a_flood(receiver: Source) -> None:
     for vehicles, receiver_stays in ((20, False), (newcomers.RECEIVERS_AFTER + 100, True)):
         senders = Newcomers()
-        assert senders.admits(receiver, 0)
+        assert admits(senders, receiver, 0)
         now = served(senders, vehicles, 0)
         spent_s = 0.55 * WINDOW_NS * 1e-9
         senders.worked_s += spent_s
         for one in (*map(source, now), receiver):
-            senders.worked(one, spent_s / (1 + len(now)))
+            senders.worked(Account(one), spent_s / (1 + len(now)))
         senders.late()
         end_window(senders, 1)
-        assert senders.admits(receiver, WINDOW_NS) is receiver_stays
+        assert admits(senders, receiver, WINDOW_NS) is receiver_stays
 
 
 def test_strangers_are_dropped_before_any_sender_while_frames_are_late() -> None:
     senders, now_ns = Newcomers(), 2 * WINDOW_NS
+    assert admits(senders, source(0), 0, PeerRank.STRANGER)
     assert len(served(senders, 100, 0)) == 100
-    assert senders.admits(source(0), 0, is_stranger=True)
     window(senders, 1, 0.0)
     window(senders, 2, 0.9, is_late=True)
-    assert not senders.admits(source(0), now_ns, is_stranger=True)
+    assert not admits(senders, source(0), now_ns, PeerRank.STRANGER)
     assert len(served(senders, 100, now_ns)) == 100
     window(senders, 3, 0.9, is_late=True)  # the rest is too much too
     assert served(senders, 100, now_ns) == list(range(55))
-    assert not senders.admits(source(0), now_ns + STRANGERS_WAIT_NS, is_stranger=True)
-    assert senders.admits(source(0), now_ns + STRANGERS_WAIT_NS + WINDOW_NS, is_stranger=True)
+    assert not admits(senders, source(0), now_ns + STRANGERS_WAIT_NS, PeerRank.STRANGER)
+    assert admits(senders, source(0), now_ns + STRANGERS_WAIT_NS + WINDOW_NS, PeerRank.STRANGER)
+
+
+def test_dropped_senders_are_served_again_while_others_take_much_of_the_time() -> None:
+    """Honest vehicles took 0.4 of the time: whoever was dropped once was never served again."""
+    senders = Newcomers()
+    assert len(served(senders, 100, 0)) == 100
+    for number in (1, 2):
+        window(senders, number, 0.9, is_late=True)
+    assert len(served(senders, 100, WINDOW_NS)) < 100
+    least = newcomers.CALM_NS // WINDOW_NS
+    for number in range(3, 12 * least):
+        window(senders, number, 0.4)
+    assert len(served(senders, 100, number * WINDOW_NS)) == 100
 
 
 @given(st.lists(st.tuples(st.floats(0, 5), st.booleans()), max_size=60))
@@ -305,17 +376,28 @@ def test_oldest_sender_is_always_served(loads: list[tuple[float, bool]]) -> None
         assert now
 
 
+def test_lost_frames_are_answered_before_the_window_ends() -> None:
+    """A socket is full after a tenth of a second of a flood."""
+    senders = Newcomers()
+    window(senders, 1, 0.1)
+    assert senders.adapts_ns == 2 * WINDOW_NS
+    senders.late(newcomers.LATE_NS + 1)
+    assert senders.adapts_ns == 2 * WINDOW_NS
+    senders.late()
+    assert senders.adapts_ns == WINDOW_NS + newcomers.LOSSY_WINDOW_NS
+
+
 def test_one_late_window_costs_nobody_a_place() -> None:
     """A long update makes frames late once; a flood, or frames that are lost, do not stop."""
     senders = Newcomers()
     window(senders, 0, 0.9)
-    assert all(senders.admits(source(number), 0) for number in range(100))
+    assert all(admits(senders, source(number), 0) for number in range(100))
     for number in range(1, 9):
         if number % 2:
             senders.late(newcomers.LATE_NS + 1)
         window(senders, number, 0.9)
-        assert all(senders.admits(source(one), number * WINDOW_NS) for one in range(100))
+        assert all(admits(senders, source(one), number * WINDOW_NS) for one in range(100))
     for number in (9, 10):
         senders.late(newcomers.LATE_NS + 1)
         window(senders, number, 0.9)
-    assert not senders.admits(source(99), 10 * WINDOW_NS)
+    assert not admits(senders, source(99), 10 * WINDOW_NS)

@@ -20,6 +20,7 @@ from companion.beams.weights import zero_forcing
 from companion.mavlink.links.peers import Peer
 from companion.mavlink.links.transport import Link, Received
 from companion.mavlink.links.urls import parse_link
+from companion.mavlink.trust.fair_share import Account
 from companion.mavlink.wire.framing import Splitter
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
@@ -114,11 +115,12 @@ def test_splitting_against_pymavlink(figures: Figures) -> None:
 class Unlimited(Link):
     """Link that admits every sender, and charges none for its frames."""
 
-    def _charge(self, peer: Peer, found: list[Received], spent_s: float, now_ns: int) -> None:
+    def _charge(self, peer: Peer, used: list[Received], each_s: float) -> None:
         pass
 
-    def _is_admitted(self, peer: Peer, source: Source, now_ns: int) -> bool:
-        peer.served.add(source)
+    def _is_admitted(self, peer: Peer, frame: Frame) -> bool:
+        peer.served.add(frame.source)
+        peer.accounts[frame.source] = Account(frame.source)
         return True
 
 

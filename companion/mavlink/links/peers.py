@@ -21,7 +21,7 @@ from typing import Final, Protocol
 
 from companion.mavlink.links.endpoints import address_text
 from companion.mavlink.links.status import ComponentStatus, LinkStatus
-from companion.mavlink.trust.newcomers import Account
+from companion.mavlink.trust.fair_share import Account
 from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
@@ -37,6 +37,7 @@ RESTART_RUN: Final = 3  # late frames in a row, in increasing order, that prove 
 
 STAMPS_KEPT_NS: Final = 30_000_000_000
 _HALF_ROUND: Final = 128
+_UNKNOWN: Final = -1  # in place of the sequence number that is due
 
 
 class Splits(Protocol):
@@ -85,8 +86,8 @@ class Peer:
     """
 
     __slots__ = (
-        "_sequence", "address", "heard_ns", "key", "senders", "served", "served_generation",
-        "splitter", "versions",
+        "_sequence", "accounts", "address", "heard_ns", "key", "senders", "served",
+        "served_generation", "splitter", "versions",
     )  # fmt: skip
 
     def __init__(self, key: Hashable, splitter: Splits) -> None:
@@ -94,8 +95,9 @@ class Peer:
         self.address = address_text(key) if isinstance(key, tuple) else str(key or "")
         self.splitter = splitter
         self.senders: dict[Source, _PeerSender] = {}
-        self.served: dict[Source, Account] = {}
+        self.served: set[Source] = set()
         """Senders whose frames from this peer are admitted without a further look."""
+        self.accounts: dict[Source, Account] = {}  # what admitted frames are charged to
         self.served_generation = 0  # of ``Newcomers``, when ``served`` was emptied
         self.heard_ns: int | None = None
         self.versions = 0  # bit 0: MAVLink 1 received, bit 1: MAVLink 2 received
@@ -242,6 +244,12 @@ class Peers:
         if is_gone or self._is_first(peer, source, t_ns):
             component.peer = peer
 
+    def pass_over(self, peer: Peer, source: Source) -> None:
+        """Note that a frame of a source was dropped, uncounted: it is no gap."""
+        sender = peer.senders.get(source)
+        if sender is not None:
+            sender.due = _UNKNOWN
+
     def count_rejection(self, refused: Rejection) -> None:
         """Count a rejection of bytes or frames of this link."""
         lost = self._status.lost
@@ -250,6 +258,8 @@ class Peers:
     def _out_of_order(self, sender: _PeerSender, number: int) -> int:
         """Process an unexpected sequence number; return how many frames are missing before it."""
         step, missing = (number - sender.due + 1) & 0xFF, 0
+        if sender.due == _UNKNOWN:
+            step = 1
         if step == 0:
             self._status.repeats += 1
             return 0

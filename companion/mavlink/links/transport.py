@@ -33,8 +33,9 @@ from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peer, Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.urls import LinkError, LinkUrl
+from companion.mavlink.trust.fair_share import Account
 from companion.mavlink.trust.known_peers import JUDGED, KnownPeers, PeerRank
-from companion.mavlink.trust.newcomers import LATE_NS, Account, Admission, Newcomers
+from companion.mavlink.trust.newcomers import LATE_NS, Admission, Newcomers
 from companion.mavlink.wire import cot_link
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.foreign import ForeignSplitter
@@ -199,8 +200,7 @@ class Link:
             found = self._receive_within_budget(receiver, t_ns, data)
         else:
             found = splitter.feed(t_ns, data)
-        if found:
-            self._pass_on(peer, found)
+        used = self._pass_on(peer, found) if found else []
         if age_ns is not None and age_ns > LATE_NS:
             self._newcomers.late(age_ns)
         spent_s = time.perf_counter() - began_s
@@ -209,22 +209,21 @@ class Link:
             self._receiver_s.charge(time.thread_time() - began_cpu_s)
         elif is_mixed and not splitter.has_more:
             spent_s *= _share_of_frames(found, len(data))
-        self._charge(peer, found, spent_s, now_ns)
+        self._charge(peer, used, spent_s / max(1, len(found)))
+        self._newcomers.worked_s += spent_s
+        if now_ns >= self._newcomers.adapts_ns:
+            self._newcomers.adapt(now_ns, time.thread_time(), time.process_time())
         if receiver is not None and not self.url.listens:
             began_ns = receiver.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
                 raise StalledError(f"no complete message in {UNFINISHED_S} s of data")
         return splitter.has_more
 
-    def _charge(self, peer: Peer, found: list[Received], spent_s: float, now_ns: int) -> None:
-        """Charge the time that bytes took to the senders of their frames."""
-        newcomers = self._newcomers
-        newcomers.worked_s += spent_s
-        for item in found:
-            if isinstance(item, Frame) and item.source in peer.served:
-                newcomers.worked(peer.served[item.source], spent_s / len(found))
-        if now_ns >= newcomers.adapts_ns:
-            newcomers.adapt(now_ns, time.thread_time(), time.process_time())
+    def _charge(self, peer: Peer, used: list[Received], each_s: float) -> None:
+        """Charge the time that each used frame took to its sender."""
+        for item in used:
+            if isinstance(item, Frame):
+                self._newcomers.worked(peer.accounts[item.source], each_s)
 
     def _receive_within_budget(
         self, receiver: ForeignSplitter, t_ns: int, data: bytes
@@ -267,8 +266,10 @@ class Link:
             self.status.overflowed = (self.status.overflowed or 0) + frames
             self._overflow(frames)
 
-    def _pass_on(self, peer: Peer, found: list[Received]) -> None:
+    def _pass_on(self, peer: Peer, found: list[Received]) -> list[Received]:
         """Count what a peer sent, and pass on what is accepted from it.
+
+        Returns what was admitted.
 
         Most frames are of senders that are served, and of messages that need no check.
         """
@@ -277,6 +278,7 @@ class Link:
         newcomers, has_timesync = self._newcomers, False
         if peer.served_generation != newcomers.generation:
             peer.served.clear()
+            peer.accounts.clear()
             peer.served_generation = newcomers.generation
         counted, checked = list[Received](), list[Received]()
         for item in found:
@@ -296,6 +298,7 @@ class Link:
         if self._refused:
             self._report_refused(checked)
         self._receive(checked)
+        return counted
 
     def _is_admitted(self, peer: Peer, frame: Frame) -> bool:
         """Return whether a frame may be used; remember its sender if all of its frames may be."""
@@ -303,15 +306,17 @@ class Link:
         rank = self._rank(peer, source, now_ns)
         matters = frame.msgid in CHECKED
         found = self._newcomers.admits(source, now_ns, rank, matters=matters)
-        if found is Admission.ALL:
-            peer.served[source] = Account(source, rank is not PeerRank.FIRST)
+        if found is not Admission.DROPPED:
+            peer.accounts[source] = Account(source, rank is not PeerRank.FIRST)
+            if found is Admission.ALL:
+                peer.served.add(source)
             return True
-        if found is Admission.DROPPED:
-            name, counts = str(source), self._refused
-            has_place = name in counts or len(counts) < REFUSED_UAVS
-            is_apart = rank is PeerRank.FIRST and matters and has_place
-            counts[name if is_apart else self.status.url] += 1
-        return found is Admission.ONE
+        self._peers.pass_over(peer, source)
+        name, counts = str(source), self._refused
+        has_place = name in counts or len(counts) < REFUSED_UAVS
+        is_apart = rank is PeerRank.FIRST and matters and has_place
+        counts[name if is_apart else self.status.url] += 1
+        return False
 
     def _rank(self, peer: Peer, source: Source, now_ns: int) -> PeerRank:
         return self._known_peers.rank(self._name, peer.address or self._name, source, now_ns)

@@ -3,11 +3,11 @@
 Anybody that reaches a link's port can invent senders. Each takes a clock, a track and beams, so the
 number of new ones is limited. When frames take more than ``BUSY`` of the time and are lost, or read
 late in two windows, those of strangers (``known_peers``) are dropped before they are decoded. Then
-senders that flood are limited (``flood_limit``). Then those of the newest senders are dropped,
-until the rest are in time: who was here first keeps being served. No more senders are dropped than
-took the work that is too much: a flood of some costs no other its place. Receivers rank behind
-vehicles, whichever came first. What later peers bring of a sender counts as a sender of its own: a
-flood in a vehicle's name costs its first peer nothing.
+senders are limited to their fair share of the time (``fair_share``), so that a flood of some costs
+no other its place. If that is not enough, those of the newest senders are dropped, until the rest
+are in time: who was here first keeps being served. Receivers rank behind vehicles, whichever came
+first. What later peers bring of a sender counts as a sender of its own: a flood in a vehicle's name
+costs its first peer nothing.
 
 Where something else takes the time, such as requests, frames take less than ``BUSY`` of it. Once
 they have been late for a second and are lost, or too old to be of use, half of their work is
@@ -20,9 +20,9 @@ from bisect import bisect_left
 from collections import OrderedDict
 from collections.abc import Callable
 from enum import Enum, auto
-from typing import Final, NamedTuple
+from typing import Final
 
-from companion.mavlink.trust.flood_limit import FloodLimit
+from companion.mavlink.trust.fair_share import Account, FairShares, Work
 from companion.mavlink.trust.known_peers import PeerRank
 from companion.mavlink.wire import cot_link, rid_json, transponder
 from companion.values import Source
@@ -45,8 +45,7 @@ LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 USELESS_NS: Final = 500_000_000  # age of a datagram that is of no use to a beam
 LATE_FOR_NS: Final = 1_000_000_000
 """Time of late windows in turn after which useless frames cost senders their place."""
-HEAVY: Final = 0.1
-"""Share of the time above which a sender floods, where such senders take most of the work."""
+FITS: Final = 1.1  # how much more than fits costs none a place: windows are short
 FREE: Final = 0.5  # share of one processor below which nothing else takes the time
 LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
 HELD_NS: Final = 5_000_000_000, 20_000_000_000
@@ -61,13 +60,6 @@ CALM_NS: Final = 10_000_000_000
 KEPT_NS: Final = 5_000_000_000  # time between two looks at which senders are active
 WINDOW_NS: Final = 250_000_000  # time over which the share is measured
 LOSSY_WINDOW_NS: Final = 50_000_000  # the same once frames are lost: a socket is full in 0.1 s
-
-
-class Account(NamedTuple):
-    """What frames are charged to: a sender by its first peer or, if ``is_later``, by later ones."""
-
-    source: Source
-    is_later: bool = False
 
 
 class Admission(Enum):
@@ -86,7 +78,7 @@ class Newcomers:
     frames took since the last call of ``adapt``, due from ``adapts_ns``; ``worked`` says whose.
 
     ``is_named`` says whether the settings name a vehicle: those are always admitted, so that a
-    service that starts during a flood serves them. Limits of floods hold for them too.
+    service that starts during a flood serves them. Their fair share is larger.
     """
 
     def __init__(self, is_named: Callable[[str], bool] = lambda _: False) -> None:
@@ -95,7 +87,7 @@ class Newcomers:
         self.generation = 0
         self.worked_s = 0.0
         self.adapts_ns = 0
-        self._worked_s = dict[Account, float]()  # of each sender that is served
+        self._work = dict[Account, Work]()  # since then, of each that is served
         self._numbers: OrderedDict[Account, int] = OrderedDict()  # by the newest frame
         self._budget = Budget(per_s=NEW_PER_S, most=NEW_SAVED)
         self._count = 0
@@ -104,7 +96,7 @@ class Newcomers:
         self._strangers_from_ns = -(1 << 62)  # time from which those of strangers are served
         self._began_ns = 0
         self._used_s = self._process_s = 0.0
-        self._limits = dict[Account, FloodLimit]()
+        self._shares = FairShares()
         self._changed_ns = 0
         self._is_late = self._is_lossy = self._is_useless = False
         self._late_since_ns: int | None = None  # since when each window was late
@@ -132,10 +124,9 @@ class Newcomers:
             self._had_strangers = True
         account = Account(source, rank is not PeerRank.FIRST)
         usual = Admission.ONE if rank is PeerRank.STRANGER else Admission.ALL
-        limit = self._limits.get(account)
-        if limit is not None and limit.holds(now_ns):
+        if self._shares.is_limited(account):
             usual = Admission.ONE
-            if not limit.admits(now_ns, matters=matters):
+            if not self._shares.admits(account, now_ns, matters=matters):
                 return Admission.DROPPED
         if self._is_named(str(source)):
             return usual
@@ -157,9 +148,8 @@ class Newcomers:
     def is_dropped(self, source: Source, now_ns: int) -> bool:
         """Return whether frames of a sender's first peer are dropped at present; counts nothing."""
         account = Account(source)
-        limit = self._limits.get(account)
-        if limit is not None and limit.holds(now_ns):
-            return limit.is_used_up(now_ns)
+        if self._shares.is_limited(account):
+            return self._shares.is_used_up(account, now_ns)
         number = self._numbers.get(account)
         return number is not None and not (self._is_served(number) or self._is_named(str(source)))
 
@@ -172,11 +162,12 @@ class Newcomers:
         self._is_useless |= age_ns is None or age_ns > USELESS_NS
 
     def worked(self, account: Account, spent_s: float) -> None:
-        """Note the time that a frame took.
-
-        Only accounts of which all frames are used are charged; ``worked_s`` has the time of all.
-        """
-        self._worked_s[account] = self._worked_s.get(account, 0.0) + spent_s
+        """Note the time that a frame took, if it was used; ``worked_s`` has the time of all."""
+        work = self._work.get(account)
+        if work is None:
+            work = self._work[account] = Work()
+        work.seconds += spent_s
+        work.frames += 1
 
     def adapt(self, now_ns: int, used_s: float, process_s: float) -> None:
         """Adapt who is served to the share of the time that frames took.
@@ -186,17 +177,17 @@ class Newcomers:
         without any fault of its senders.
         """
         passed_s = max(1, now_ns - self._began_ns) * 1e-9
-        worked_s, by_served = self.worked_s, self._worked_s
+        worked_s, work = self.worked_s, self._work
         share = min(worked_s, used_s - self._used_s) / passed_s
         is_free = (process_s - self._process_s) / passed_s < FREE
-        self.worked_s, self._worked_s = 0.0, {}
+        self.worked_s, self._work = 0.0, {}
+        self._shares.note(work.values())
         self._used_s, self._process_s = used_s, process_s
         began_ns = self._began_ns
         self._began_ns, self.adapts_ns = now_ns, now_ns + WINDOW_NS
         if now_ns - self._changed_ns > KEPT_NS:
             self.generation += 1
             self._changed_ns = now_ns
-            self._limits = {one: it for one, it in self._limits.items() if it.holds(now_ns)}
         # Once late may be a long update; a flood is late again.
         is_late = self._is_lossy or (self._is_late and self._late_since_ns is not None)
         if not self._is_late:
@@ -213,20 +204,33 @@ class Newcomers:
         )
         self._is_late = self._is_lossy = self._is_useless = False
         if is_late and (share > BUSY or is_useless):
-            is_busy = share > BUSY
-            most_s = worked_s * BUSY / share if is_busy else worked_s / 2
-            floods = {one: s for one, s in by_served.items() if s > HEAVY * passed_s}
-            if self._drop_strangers(now_ns):
-                pass
-            elif sum(floods.values()) > worked_s / 2:
-                self._limit(now_ns, floods, sum(by_served.values()) - most_s)
-            elif is_busy:
-                self._drop(by_served, most_s)
-            else:
-                self._drop(by_served, most_s, self._settled_below)
-                self._hold(now_ns)
+            if not self._drop_strangers(now_ns):
+                self._save_time(now_ns, work, passed_s=passed_s, worked_s=worked_s, share=share)
         elif was_calm or (share < IDLE and (is_free or now_ns >= self._held_until_ns)):
+            self.generation += self._shares.release(now_ns, BUSY - share)
             self._serve_more()
+
+    def _save_time(
+        self,
+        now_ns: int,
+        work: dict[Account, Work],
+        *,
+        passed_s: float,
+        worked_s: float,
+        share: float,
+    ) -> None:
+        """Limit senders to their fair share; if that is not enough, drop the newest."""
+        is_busy = share > BUSY
+        most_s = worked_s * BUSY / share if is_busy else worked_s / 2
+        named = frozenset(
+            one for one in work if not one.is_later and self._is_named(str(one.source))
+        )
+        expected_s = self._shares.limit(now_ns, work, passed_s=passed_s, most_s=most_s, named=named)
+        self.generation += 1
+        if sum(expected_s.values()) > FITS * most_s:
+            self._drop(expected_s, most_s, 0 if is_busy else self._settled_below)
+            if not is_busy:
+                self._hold(now_ns)
 
     def _drop_strangers(self, now_ns: int) -> bool:
         """Serve no strangers for a time. Return whether that drops some that were served."""
@@ -234,15 +238,6 @@ class Newcomers:
         self._strangers_from_ns = now_ns + STRANGERS_WAIT_NS
         self._had_strangers &= not drops
         return drops
-
-    def _limit(self, now_ns: int, floods: dict[Account, float], excess_s: float) -> None:
-        """Limit senders that flood, the heaviest first, until they save ``excess_s``."""
-        self.generation += 1
-        for account in sorted(floods, key=lambda one: -floods[one]):
-            self._limits[account] = FloodLimit(now_ns)
-            excess_s -= floods[account]
-            if excess_s <= 0.0:
-                return
 
     def _serve_more(self) -> None:
         """Serve some more senders, the oldest of those that are dropped."""

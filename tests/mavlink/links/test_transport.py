@@ -24,7 +24,8 @@ from companion.mavlink.links.kinds import FRAMES_AT_ONCE
 from companion.mavlink.links.peers import PEERS_MAX
 from companion.mavlink.links.transport import REFUSED_UAVS, Link
 from companion.mavlink.links.urls import LinkError, parse_link
-from companion.mavlink.trust.newcomers import NEW_SAVED, Account
+from companion.mavlink.trust.fair_share import Account
+from companion.mavlink.trust.newcomers import NEW_SAVED
 from companion.mavlink.wire.encode import Outgoing, heartbeat, pack, timesync
 from companion.mavlink.wire.framing import FALSE_STARTS_SAVED, Splitter
 from companion.values import Frame, Reason, Rejection, Severity, Source
@@ -1090,9 +1091,11 @@ def test_work_is_charged_to_the_sender_of_each_frame(run: Run) -> None:
             has_more = link.take(key, b"\xfd\x09garbage" + frame(1) + b"".join(frames))
             while has_more:
                 has_more = link.take(key, b"")
-            charged = link._newcomers._worked_s
+            charged = {one: work.seconds for one, work in link._newcomers._work.items()}
             assert charged[Account(Source(7, 1))] > 10 * charged[Account(Source(1, 1))]
             assert sum(charged.values()) == pytest.approx(link._newcomers.worked_s, rel=0.1)
+            frames = [work.frames for work in link._newcomers._work.values()]
+            assert sorted(frames) == [1, 39]
 
     run(test())
 
@@ -1247,5 +1250,14 @@ def test_frames_that_are_dropped_are_counted_by_vehicle(run: Run) -> None:
             apart = {f"{sysid}:1": 1 + (sysid == 60) for sysid in range(51, 51 + REFUSED_UAVS)}
             assert counts == {**apart, link.status.url: 49 - REFUSED_UAVS}
             assert link.status.lost[Reason.NEWCOMER] == 50
+            frames = {one.source.sysid: it.frames for one, it in link._newcomers._work.items()}
+            assert frames == {sysid: 2 if sysid <= 50 else 1 for sysid in range(1, 100)}
+            # They are no gaps of the radio.
+            link._newcomers._served_below = None
+            link._newcomers.generation += 1
+            for sysid in range(1, 100):
+                link.take(("127.0.0.1", 9), frame(9, sysid=sysid, seq=9))
+            gaps = {one.sysid: counts.gaps for one, counts in link.status.components.items()}
+            assert gaps == {sysid: 7 if sysid <= 50 else 0 for sysid in range(1, 100)}
 
     run(test())

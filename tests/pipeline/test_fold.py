@@ -916,6 +916,20 @@ def test_no_events_give_no_ticks() -> None:
     assert list(with_ticks([garbage, garbage], 1000.0)) == [garbage, garbage]
 
 
+def test_relayed_aircraft_gets_its_beam_back_when_its_own_telemetry_ends() -> None:
+    """The bound of the silent track grew to kilometres, and held every aircraft for ten minutes."""
+    pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": "all"}))
+    beams = list[set[str]]()
+    for n in range(60):
+        here = (300.0 + 5 * n, 40.0, -120.0)
+        if n < 20:
+            pipeline.step(position(n, "1:1", here, (5, 0, 0)))
+        pipeline.step(adsb(n + 0.1, (here[0] + 8, 30.0, -130.0)))
+        beams.append(set(updated(pipeline, n + 0.2).beams.uavs))
+    assert beams[19] == {"1:1"}
+    assert beams[35:] == [{"icao:4CA7B3"}] * 25
+
+
 def test_own_telemetry_and_adsb_of_one_aircraft_get_one_beam() -> None:
     pipeline = Pipeline(settings("47.4,8.55,500", beams={"targets": "all"}))
     for n in range(8):

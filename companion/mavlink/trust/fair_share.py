@@ -5,7 +5,9 @@ level: who takes less keeps all of it. A sender above it floods. It is limited t
 matter, and to as many as take the share: at least ``LEAST_PER_S``, at most ``MOST_PER_S``. A
 vehicle whose log is downloaded floods too: its positions are still used, and it keeps its beam.
 
-A limit lasts until the frames that it drops would fit again.
+A limit lasts until the frames that it drops would fit again. For some seconds after there was too
+little time, nobody else may begin to flood either: known senders may use ``MOST_PER_S``, new ones
+``LEAST_PER_S``. Ids that flood in turn, each for a tenth of a second, gain nothing.
 """
 
 from collections.abc import Iterable
@@ -37,13 +39,18 @@ class Work:
 
 
 class _Limit:
-    """Limit of one account: the frames that it may use, and how many were dropped since a time."""
+    """Limit of one account: the frames that it may use, and how many were dropped since a time.
 
-    __slots__ = ("dropped", "frames", "since_ns")
+    ``of_flood``: for messages that matter, and with nothing saved.
+    """
 
-    def __init__(self, now_ns: int, per_s: float) -> None:
+    __slots__ = ("dropped", "frames", "of_flood", "since_ns")
+
+    def __init__(self, now_ns: int, per_s: float, *, of_flood: bool) -> None:
         self.frames = Budget(per_s=per_s, most=per_s / 2)
-        self.frames.spend(per_s / 2, now_ns * 1e-9)  # nothing is saved yet
+        if of_flood:
+            self.frames.spend(per_s / 2, now_ns * 1e-9)
+        self.of_flood = of_flood
         self.since_ns = now_ns
         self.dropped = 0
 
@@ -65,13 +72,20 @@ class FairShares:
     def admits(self, account: Account, now_ns: int, *, matters: bool) -> bool:
         """Return whether a frame of a limited account may be used; count it if not."""
         limit = self._limits[account]
-        is_admitted = matters and limit.frames.spend(1, now_ns * 1e-9)
+        is_usable = matters or not limit.of_flood
+        is_admitted = is_usable and limit.frames.spend(1, now_ns * 1e-9)
         limit.dropped += not is_admitted
         return is_admitted
 
     def is_used_up(self, account: Account, now_ns: int) -> bool:
         """Return whether the next frame of a limited account would be dropped."""
         return not self._limits[account].frames.has(1, now_ns * 1e-9)
+
+    def watch(self, account: Account, now_ns: int, *, is_new: bool) -> None:
+        """Limit an account that is not limited yet, so that it does not begin to flood."""
+        if account not in self._limits:
+            per_s = LEAST_PER_S if is_new else MOST_PER_S
+            self._limits[account] = _Limit(now_ns, per_s, of_flood=is_new)
 
     def note(self, work: Iterable[Work]) -> None:
         """Note the work of a window, for the mean time of a frame."""
@@ -105,7 +119,7 @@ class FairShares:
             frames = per_s * passed_s
             is_flood = done.seconds > level_s and done.frames > frames
             if is_flood:
-                self._limits[account] = _Limit(now_ns, per_s)
+                self._limits[account] = _Limit(now_ns, per_s, of_flood=True)
             expected_s[account] = frames * frame_s if is_flood else done.seconds
         return expected_s
 

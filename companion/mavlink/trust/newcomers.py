@@ -22,7 +22,7 @@ from collections.abc import Callable
 from enum import Enum, auto
 from typing import Final
 
-from companion.mavlink.trust.fair_share import Account, FairShares, Work
+from companion.mavlink.trust.fair_share import LIMITED_NS, Account, FairShares, Work
 from companion.mavlink.trust.known_peers import PeerRank
 from companion.mavlink.wire import cot_link, rid_json, transponder
 from companion.values import Source
@@ -97,6 +97,7 @@ class Newcomers:
         self._began_ns = 0
         self._used_s = self._process_s = 0.0
         self._shares = FairShares()
+        self._watched_until_ns = -(1 << 62)  # time until which nobody may begin to flood
         self._changed_ns = 0
         self._is_late = self._is_lossy = self._is_useless = False
         self._late_since_ns: int | None = None  # since when each window was late
@@ -124,13 +125,15 @@ class Newcomers:
             self._had_strangers = True
         account = Account(source, rank is not PeerRank.FIRST)
         usual = Admission.ONE if rank is PeerRank.STRANGER else Admission.ALL
+        number, is_named = self._numbers.get(account), self._is_named(str(source))
+        if now_ns < self._watched_until_ns and not is_named:
+            self._shares.watch(account, now_ns, is_new=number is None)
         if self._shares.is_limited(account):
             usual = Admission.ONE
             if not self._shares.admits(account, now_ns, matters=matters):
                 return Admission.DROPPED
-        if self._is_named(str(source)):
+        if is_named:
             return usual
-        number = self._numbers.get(account)
         if number is None:
             if not self._budget.spend(1, now_ns * 1e-9):
                 return Admission.DROPPED
@@ -148,8 +151,8 @@ class Newcomers:
     def is_dropped(self, source: Source, now_ns: int) -> bool:
         """Return whether frames of a sender's first peer are dropped at present; counts nothing."""
         account = Account(source)
-        if self._shares.is_limited(account):
-            return self._shares.is_used_up(account, now_ns)
+        if self._shares.is_limited(account) and self._shares.is_used_up(account, now_ns):
+            return True
         number = self._numbers.get(account)
         return number is not None and not (self._is_served(number) or self._is_named(str(source)))
 
@@ -227,6 +230,7 @@ class Newcomers:
         )
         expected_s = self._shares.limit(now_ns, work, passed_s=passed_s, most_s=most_s, named=named)
         self.generation += 1
+        self._watched_until_ns = now_ns + LIMITED_NS
         if sum(expected_s.values()) > FITS * most_s:
             self._drop(expected_s, most_s, 0 if is_busy else self._settled_below)
             if not is_busy:

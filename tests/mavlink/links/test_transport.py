@@ -1261,3 +1261,22 @@ def test_frames_that_are_dropped_are_counted_by_vehicle(run: Run) -> None:
             assert gaps == {sysid: 7 if sysid <= 50 else 0 for sysid in range(1, 100)}
 
     run(test())
+
+
+def test_dropped_frames_of_a_limited_sender_are_not_charged_to_it(run: Run) -> None:
+    """They are cheap: the mean time of a frame would be too small, and the flood be released."""
+
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            await until_true(lambda: link.status.state == "up")
+            link._newcomers.adapts_ns = 1 << 62
+            account = Account(Source(1, 1))
+            link._newcomers._shares.watch(account, link._now_ns(), is_new=False)
+            frames = [frame(number % 250, seq=number % 256) for number in range(1000)]
+            has_more = link.take(("127.0.0.1", 9), b"".join(frames))
+            while has_more:
+                has_more = link.take(("127.0.0.1", 9), b"")
+            assert 0 < len(inbox.frames) < 1000
+            assert link._newcomers._work[account].frames == len(inbox.frames)
+
+    run(test())

@@ -73,8 +73,8 @@ STRANGERS: Final = (
     f"{known_peers.COMPARED_PER_S:.0f} positions/s of strangers are compared for each sender"
 )
 OLDEST: Final = (
-    f"fair shares, then the oldest senders first, above {100 * newcomers.BUSY:.0f} % of the time, or while frames are"
-    f" late by {newcomers.USELESS_NS / 1e9:g} s"
+    f"fair shares, then the oldest senders first, above {100 * newcomers.BUSY:.0f} % of the time,"
+    f" or while frames are late by {newcomers.USELESS_NS / 1e9:g} s"
 )
 RECEIVER: Final = (
     f"{100 * transport.RECEIVER_SHARE:.0f} % of the time for a link,"

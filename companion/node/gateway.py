@@ -193,8 +193,8 @@ class Gateway:
             self._warn(
                 "links",
                 "more frames arrive than this machine can process: those of new senders, and of"
-                " ones that flood, are dropped; name the vehicles in `[tracks] allow`, or sign the"
-                " links",
+                " senders that flood, are dropped; name the vehicles in `[tracks] allow`, or sign"
+                " the links",
             )
 
     def _warn(self, subject: str, text: str, severity: Severity = Severity.WARNING) -> None:

@@ -4,7 +4,7 @@ The guaranteed gain is the least gain within the pointing bound. The cause of a 
 input that, if it were ideal, would reduce it most (``angle_parts``): the carrier's attitude or
 position, the UAV's reports, a clock, or this machine.
 
-Over 300 lines: each cause takes a few, and they are read together, so that none says the same.
+Over 300 lines: each cause needs a few, and side by side no two have the same text.
 """
 
 import math
@@ -255,7 +255,7 @@ def _refused_cause(refused: Reason) -> Blame:
         return Blame(
             Cause.MACHINE,
             "this machine is overloaded, and drops its reports",
-            "name it in `[tracks] allow`, or end what floods the links",
+            "name it in `[tracks] allow`, or stop the sender that floods the links",
         )
     return Blame(
         Cause.REFUSED,

@@ -63,7 +63,6 @@ from companion.values import (
     Tick,
     Tock,
     Track,
-    TrackState,
     Update,
     UtcNs,
     kind_of,
@@ -231,9 +230,7 @@ class Pipeline:
             better = self.tracker.near(fix.position_ned_m, NEAR_M, better_than=fix.uav)
             near = self.targets.unmerged(better)
             tracks = [one.at(fix.t_ns, fix.t_ns) for one in self.snapshots(near)]
-            # The bound of a track without reports grows until it holds every aircraft.
-            live = [track for track in tracks if track.state is TrackState.LIVE]
-            self.targets.identities.observe(fix, live)
+            self.targets.identities.observe(fix, tracks)
         if accepted.reacquired:
             said.append(assumptions.track_restarted(self.records[fix.uav], accepted))
             said += self._move_home(placed, accepted)

@@ -4,13 +4,17 @@ Two beams on one aircraft have nearly equal steering vectors, which ruin zero fo
 aircraft is identified with a track of a better kind (telemetry, or Remote ID before ADS-B) after
 several reports in a row that agree with it within the errors of both. It is separated again after
 as many that do not agree.
+
+The bound of a track without reports grows until it contains every aircraft around it. So only live
+tracks are compared, and a coasting one if the aircraft is already identified with it: two beams for
+each short outage of the telemetry would be as bad.
 """
 
 import math
 from dataclasses import dataclass
 from typing import Final
 
-from companion.values import Fix, Track
+from companion.values import Fix, Track, TrackState
 
 RELAYED_MAX: Final = 8192  # most relayed aircraft remembered; beyond it the oldest is forgotten
 REPORTS_TO_DECIDE: Final = 5  # reports in a row that identify, or separate, two tracks
@@ -48,10 +52,16 @@ class Identities:
 
     def observe(self, relayed: Fix, better: list[Track]) -> None:
         """Compare a relayed report with the better tracks at its time."""
-        near = [(_apart_m(relayed, track), track.uav) for track in better]
+        known = self._relayed.get(relayed.uav)
+        same_as = None if known is None else known.same_as
+        near = [
+            (_apart_m(relayed, track), track.uav)
+            for track in better
+            if track.state is TrackState.LIVE
+            or (track.state is TrackState.COASTING and track.uav == same_as)
+        ]
         nearest = min((pair for pair in near if pair[0] is not None), default=None)
         match = nearest[1] if nearest else ""
-        known = self._relayed.get(relayed.uav)
         if known is None:
             known = self._relayed[relayed.uav] = _Relayed(match)
             if len(self._relayed) > RELAYED_MAX:

@@ -27,7 +27,7 @@ class Reason(DescribedEnum):
     NOT_ALLOWED = "not-allowed", "reports of senders that the allow and deny lists exclude"
     NEWCOMER = (
         "newcomer",
-        "frames that this machine has no time for: of new senders, or of ones that flood",
+        "frames dropped by an overloaded machine: of new senders, or of senders that flood",
     )
     TOO_MANY = "too-many", "reports of UAVs beyond the number that the settings allow"
     UNSIGNED = "unsigned", "frames without the signature that their link requires"

@@ -927,7 +927,8 @@ def test_relayed_aircraft_gets_its_beam_back_when_its_own_telemetry_ends() -> No
         pipeline.step(adsb(n + 0.1, (here[0] + 8, 30.0, -130.0)))
         beams.append(set(updated(pipeline, n + 0.2).beams.uavs))
     assert beams[19] == {"1:1"}
-    assert beams[35:] == [{"icao:4CA7B3"}] * 25
+    assert beams[40:] == [{"icao:4CA7B3"}] * 20
+    assert max(map(len, beams[19:])) == 1  # two beams on one aircraft ruin zero forcing
 
 
 def test_own_telemetry_and_adsb_of_one_aircraft_get_one_beam() -> None:

@@ -1,6 +1,7 @@
 """Telemetry and ADS-B of one aircraft are merged; two aircraft that pass each other are not."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from companion.tracking import noise
 from companion.tracking.identity import RELAYED_MAX, REPORTS_TO_DECIDE, Identities
-from companion.values import Fix, GnssStatus, ReportNoise, Source, Track
+from companion.values import Fix, GnssStatus, ReportNoise, Source, Track, TrackState
 
 MakeFix = Callable[..., Fix]
 S = 1_000_000_000
@@ -48,6 +49,22 @@ def after(fix: MakeFix, offsets: list[float], *others: Track) -> str | None:
 def test_same_aircraft_under_two_ids_is_identified_after_enough_reports(fix: MakeFix) -> None:
     assert after(fix, [30.0] * (REPORTS_TO_DECIDE - 1)) is None
     assert after(fix, [30.0] * REPORTS_TO_DECIDE) == "1:1"
+
+
+@pytest.mark.parametrize("state", TrackState)
+@pytest.mark.parametrize("is_merged", [True, False])
+def test_silent_track_is_not_identified_with_the_aircraft_around_it(
+    fix: MakeFix, state: TrackState, is_merged: bool
+) -> None:
+    """A coasting one keeps an aircraft that was identified with it while it was live."""
+    identities = Identities()
+    for n in range(2 * REPORTS_TO_DECIDE):
+        now = state if n >= REPORTS_TO_DECIDE else TrackState.LIVE
+        here = [20.0 * n, 0 if is_merged or n >= REPORTS_TO_DECIDE else 5000, -300]
+        telemetry = replace(track("1:1", here), state=now)
+        identities.observe(relayed(fix, n, [20.0 * n, 30.0, -310]), [telemetry])
+    usable = {TrackState.LIVE, TrackState.COASTING} if is_merged else {TrackState.LIVE}
+    assert identities.same_as(AIRCRAFT) == ("1:1" if state in usable else None)
 
 
 def test_distant_aircraft_is_not_merged(fix: MakeFix) -> None:

@@ -1,13 +1,13 @@
-"""Fair shares of the time: senders that take more are limited, on a machine that has too little.
+"""Fair shares of an overloaded machine's time: a sender that takes more is limited.
 
-The share is the largest time that all may take without exceeding what there is, as water finds its
-level: who takes less keeps all of it. A sender above it floods. It is limited to messages that
-matter, and to as many as take the share: at least ``LEAST_PER_S``, at most ``MOST_PER_S``. A
-vehicle whose log is downloaded floods too: its positions are still used, and it keeps its beam.
+The shares are max-min fair (https://en.wikipedia.org/wiki/Max-min_fairness): a sender that takes
+less than the share keeps all of its frames. A sender that takes more floods. It is limited to
+messages that matter, and to as many as take the share, within ``LEAST_PER_S`` and ``MOST_PER_S``. A
+vehicle whose log is being downloaded floods too: its positions are still used.
 
-A limit lasts until the frames that it drops would fit again. For some seconds after there was too
-little time, nobody else may begin to flood either: known senders may use ``MOST_PER_S``, new ones
-``LEAST_PER_S``. Ids that flood in turn, each for a tenth of a second, gain nothing.
+A limit ends when the frames that it drops would fit again. For some seconds after an overload, no
+other sender may begin to flood: known ones may send ``MOST_PER_S``, new ones ``LEAST_PER_S``. Ids
+that flood in turn, each for a tenth of a second, could not be limited in time otherwise.
 """
 
 from collections.abc import Iterable
@@ -87,6 +87,10 @@ class FairShares:
             per_s = LEAST_PER_S if is_new else MOST_PER_S
             self._limits[account] = _Limit(now_ns, per_s, of_flood=is_new)
 
+    def forget(self, account: Account) -> None:
+        """Forget the limit of an account, if it has one."""
+        self._limits.pop(account, None)
+
     def note(self, work: Iterable[Work]) -> None:
         """Note the work of a window, for the mean time of a frame."""
         frames = seconds = 0.0
@@ -107,7 +111,8 @@ class FairShares:
     ) -> dict[Account, float]:
         """Limit the accounts that took more than their fair share of ``most_s``.
 
-        ``work`` is that of a window of ``passed_s``. Returns the time that each account will take.
+        ``work`` is that of a window of ``passed_s``. Returns the time that each account is expected
+        to take in the next one.
         """
         level_s = fair_share(most_s, (one.seconds for one in work.values()))
         expected_s = dict[Account, float]()
@@ -144,7 +149,7 @@ class FairShares:
 
 
 def fair_share(most: float, wanted: Iterable[float]) -> float:
-    """Return the share of each: the level up to which all that is wanted is ``most`` together.
+    """Return the max-min fair share: limited to it, what is wanted is ``most`` together.
 
     Infinite if all of it fits.
     """

@@ -78,7 +78,7 @@ JUDGED: Final = DECODED | _ABOUT_SENDER
 
 
 class PeerRank(Enum):
-    """PeerRank of a peer for one sender: believed first, known later than it, or a stranger.
+    """Rank of a peer for one sender: the one believed first, one known later, or a stranger.
 
     Without another current peer, any peer is the first.
     """

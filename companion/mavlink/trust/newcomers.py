@@ -5,7 +5,7 @@ number of new ones is limited. When frames take more than ``BUSY`` of the time a
 late in two windows, those of strangers (``known_peers``) are dropped before they are decoded. Then
 senders are limited to their fair share of the time (``fair_share``), so that a flood of some costs
 no other its place. If that is not enough, those of the newest senders are dropped, until the rest
-are in time: who was here first keeps being served. Receivers rank behind vehicles, whichever came
+are in time: the first senders keep being served. Receivers rank behind vehicles, whichever came
 first. What later peers bring of a sender counts as a sender of its own: a flood in a vehicle's name
 costs its first peer nothing.
 
@@ -45,7 +45,7 @@ LATE_NS: Final = 50_000_000  # age of a datagram that was read late
 USELESS_NS: Final = 500_000_000  # age of a datagram that is of no use to a beam
 LATE_FOR_NS: Final = 1_000_000_000
 """Time of late windows in turn after which useless frames cost senders their place."""
-FITS: Final = 1.1  # how much more than fits costs none a place: windows are short
+FITS: Final = 1.1  # ratio of expected work to what fits, up to which no sender is dropped
 FREE: Final = 0.5  # share of one processor below which nothing else takes the time
 LEAST: Final = 0.2  # share of the time below which fewer senders would make no difference
 HELD_NS: Final = 5_000_000_000, 20_000_000_000
@@ -97,7 +97,7 @@ class Newcomers:
         self._began_ns = 0
         self._used_s = self._process_s = 0.0
         self._shares = FairShares()
-        self._watched_until_ns = -(1 << 62)  # time until which nobody may begin to flood
+        self._watched_until_ns = -(1 << 62)  # time until which no sender may begin to flood
         self._changed_ns = 0
         self._is_late = self._is_lossy = self._is_useless = False
         self._late_since_ns: int | None = None  # since when each window was late
@@ -111,8 +111,8 @@ class Newcomers:
     ) -> Admission:
         """Return whether a frame may be used; count it if not.
 
-        ``rank`` is that of its peer; ``matters`` says whether its message is used for more than
-        records and display.
+        ``rank`` is that of its peer; ``matters`` says whether its message may affect a track, a
+        bound or a clock.
         """
         found = self._admission(source, now_ns, rank, matters)
         self.refused += found is Admission.DROPPED
@@ -124,26 +124,32 @@ class Newcomers:
                 return Admission.DROPPED
             self._had_strangers = True
         account = Account(source, rank is not PeerRank.FIRST)
-        usual = Admission.ONE if rank is PeerRank.STRANGER else Admission.ALL
-        number, is_named = self._numbers.get(account), self._is_named(str(source))
-        if now_ns < self._watched_until_ns and not is_named:
-            self._shares.watch(account, now_ns, is_new=number is None)
+        if not self._is_named(str(source)):
+            is_new = account not in self._numbers
+            if is_new and not self._budget.spend(1, now_ns * 1e-9):
+                return Admission.DROPPED
+            if not self._is_served(self._number(account)):
+                return Admission.DROPPED
+            if now_ns < self._watched_until_ns:
+                self._shares.watch(account, now_ns, is_new=is_new)
         if self._shares.is_limited(account):
-            usual = Admission.ONE
-            if not self._shares.admits(account, now_ns, matters=matters):
-                return Admission.DROPPED
-        if is_named:
-            return usual
-        if number is None:
-            if not self._budget.spend(1, now_ns * 1e-9):
-                return Admission.DROPPED
-            number = self._numbers[account] = self._count + RECEIVERS_AFTER * (source in RECEIVERS)
-            self._count += 1
-            if len(self._numbers) > SENDERS_MAX:
-                self._numbers.popitem(last=False)
-        else:
+            is_used = self._shares.admits(account, now_ns, matters=matters)
+            return Admission.ONE if is_used else Admission.DROPPED
+        return Admission.ONE if rank is PeerRank.STRANGER else Admission.ALL
+
+    def _number(self, account: Account) -> int:
+        """Return the place of an account in the order of admission; a new one comes last."""
+        number = self._numbers.get(account)
+        if number is not None:
             self._numbers.move_to_end(account)
-        return usual if self._is_served(number) else Admission.DROPPED
+            return number
+        number = self._count + RECEIVERS_AFTER * (account.source in RECEIVERS)
+        self._numbers[account] = number
+        self._count += 1
+        if len(self._numbers) > SENDERS_MAX:
+            silent, _ = self._numbers.popitem(last=False)
+            self._shares.forget(silent)
+        return number
 
     def _is_served(self, number: int) -> bool:
         return self._served_below is None or number < self._served_below

@@ -231,6 +231,19 @@ def test_ids_that_flood_in_turn_gain_nothing(is_new: bool) -> None:
     assert used <= turns * (5 if is_new else 150)
 
 
+def test_invented_ids_take_bounded_memory_while_floods_are_watched() -> None:
+    senders = Newcomers()
+    assert len(served(senders, 4, 0)) == 4
+    for number in range(1, 300):  # a minute and more, in all of which there is too little time
+        flooded_window(senders, number, [Account(source(4))], [0])
+        for one in range(200):
+            admits(senders, source(10 + 200 * number + one), number * WINDOW_NS)
+    assert len(senders._shares) <= NEW_SAVED + NEW_PER_S * 75 + 10
+    for one in range(2 * newcomers.SENDERS_MAX):
+        senders._number(Account(source(one), is_later=True))
+    assert not len(senders._shares)  # of senders that are remembered no more
+
+
 def test_limited_sender_keeps_some_of_the_frames_that_matter() -> None:
     """It may be a vehicle whose log is downloaded: its positions are still used."""
     senders = Newcomers()

@@ -10,7 +10,8 @@ from companion.pipeline.fold import Pipeline
 from companion.recording import ends
 from companion.recording.reader import utc_offset_ns
 from companion.settings.model import Settings
-from companion.values import Update, UserError, shown
+from companion.values import Update, UserError, UtcNs, shown
+from companion.views.as_json import rfc3339
 
 PROGRESS_EVERY: Final = 20_000  # events between two calls of progress
 
@@ -36,7 +37,7 @@ def look(
         logs      as for a replay
         settings  as for a replay
         at        seconds from the log's first event, or a date and time with zone (RFC 3339),
-                  by the node's wall clock
+                  by the node's wall clock as it was last set in the log
         lead_s    time from ``at`` until the beams are applied
         progress  called occasionally with seconds of log
         latency_s as for a replay
@@ -60,9 +61,10 @@ def look(
             progress((t_ns - begins_ns) * 1e-9)
     else:
         if at_ns is None or at_ns > t_ns:
-            raise MomentError(f"--at {at}: the log is {(t_ns - begins_ns) * 1e-9:.1f} s long")
+            raise _too_late(at, (begins_ns, t_ns), offset_ns)
     if at_ns < begins_ns:
-        raise MomentError(f"--at {at}: the log begins later")
+        raise _too_early(at, begins_ns, offset_ns)
+    pipeline.utc_offset_ns = offset_ns  # so that the answer has the time that was asked for
     return pipeline, pipeline.look(at_ns, lead_s)
 
 
@@ -71,15 +73,37 @@ def _require_within(at: str, span_ns: tuple[int, int], utc_offset_ns: int) -> No
     first_ns, last_ns = span_ns
     at_ns = _time_ns(at, first_ns, utc_offset_ns)
     if at_ns > last_ns + ENDS_NS:
-        raise MomentError(f"--at {at}: the log is {(last_ns - first_ns) * 1e-9:.1f} s long")
+        raise _too_late(at, span_ns, utc_offset_ns)
     if at_ns < first_ns - ENDS_NS:
-        raise MomentError(f"--at {at}: the log begins later")
+        raise _too_early(at, first_ns, utc_offset_ns)
+
+
+def _too_late(at: str, span_ns: tuple[int, int], utc_offset_ns: int) -> MomentError:
+    begins_ns, ends_ns = span_ns
+    start = rfc3339(UtcNs(begins_ns + utc_offset_ns))
+    begins = "" if _seconds(at) is not None else f", from {start}"
+    return MomentError(f"--at {at}: the log is {(ends_ns - begins_ns) * 1e-9:.1f} s long{begins}")
+
+
+def _too_early(at: str, begins_ns: int, utc_offset_ns: int) -> MomentError:
+    start = rfc3339(UtcNs(begins_ns + utc_offset_ns))
+    begins = "later" if _seconds(at) is not None else f"at {start}"
+    return MomentError(f"--at {at}: the log begins {begins}")
+
+
+def _seconds(text: str) -> float | None:
+    try:
+        return float(text)
+    except ValueError:
+        return None
 
 
 def _time_ns(text: str, begins_ns: int, utc_offset_ns: int) -> int:
+    seconds = _seconds(text)
     try:
-        return begins_ns + round(float(text) * 1e9)
-    except (ValueError, OverflowError):
+        if seconds is not None:
+            return begins_ns + round(seconds * 1e9)
+    except (ValueError, OverflowError):  # not a finite number
         pass
     try:
         then = datetime.fromisoformat(text)

@@ -21,6 +21,7 @@ from companion.recording.reader import (
     read_log,
     read_parts,
     read_settings,
+    require_distinct,
     vehicles,
 )
 from companion.recording.scene import Scene
@@ -220,9 +221,10 @@ def log_notes(logs: Sequence[Path]) -> dict[str, Any]:
 def log_events(logs: Sequence[Path], settings: Settings, latency_s: float = 0.0) -> Iterator[Event]:
     """Return all events in order of time, with ticks; events of parts of one run as recorded.
 
-    ``latency_s`` as for ``replay``. Raises ``LogError`` for an unusable log, or if one part of a
-    run is given twice.
+    ``latency_s`` as for ``replay``. Raises ``LogError`` for an unusable log, or if a log or a part
+    of a run is given twice.
     """
+    require_distinct(logs)
     if len(logs) == 1 and log_kind(logs[0]) == TICKED:
         return read_log(logs[0])
     ordered = in_order(logs)
@@ -261,7 +263,10 @@ def missing(logs: Sequence[Path]) -> list[str]:
     replay.
     """
     infos = _recording_infos(logs)
-    return parts.missing(infos, _in_order(infos) or logs)
+    try:
+        return parts.missing(infos)
+    except ValueError as error:
+        raise LogError(str(error)) from None
 
 
 def _recording_infos(logs: Sequence[Path]) -> dict[Path, RecordingInfo]:

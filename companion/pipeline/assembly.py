@@ -23,6 +23,7 @@ from companion.beams.worth.link_budget import LinkBudget
 from companion.mavlink.clock.estimates import ClockAssumptions
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.pipeline import elements
+from companion.settings.center import VehicleCenter, parse_center
 from companion.settings.files import kinematic_design, matrix_of, text_of
 from companion.settings.model import CALIBRATION, CODEBOOK, COUPLING, UNIT, Settings
 from companion.settings.section import ConfigError
@@ -359,6 +360,7 @@ def tracker(settings: Settings) -> Tracker:
     leads = given.model == "position"
     lead_m = abs(given.feedthrough_s) * limits.speed_max_mps if leads else 0.0
     feeds = given.model == "kinematic" and given.feed_forward
+    place = parse_center(settings.center.source or "home")
     return Tracker(
         observer(settings),
         TrackerSettings(
@@ -373,6 +375,7 @@ def tracker(settings: Settings) -> Tracker:
             window_s=kept.window_s,
             feed_forward=feeds,
             most=kept.most,
+            carrier=str(place) if isinstance(place, VehicleCenter) else None,
             noise=noise(settings),
         ),
     )

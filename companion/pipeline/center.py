@@ -41,6 +41,11 @@ from companion.values import (
 HOME_SETTLING_S: Final = 120.0
 """Time after a track's first report in which its restart may move ``home``, seconds."""
 HOME_HEIGHT_M: Final = 20.0  # least error of the first height for which ``home`` moves
+ORIGIN_MAX_M: Final = 50_000.0
+"""Largest distance of the carrier's first position from the origin.
+
+Farther away, "horizontal" in the local frame and at the carrier differ by more than 0.45 degrees.
+"""
 NOTICE_RATIO: Final = 1.25
 """Ratio to the attitude bound last reported above which the bound is reported again."""
 MIN_CONSISTENT_SAMPLES: Final = 4  # older-stamped attitudes in a row that replace the newest
@@ -257,6 +262,21 @@ class CarrierTracker:
         self.place, self._home_from = home, (report.uav, report.t_ns)
         text = f"home set to the first report of {report.uav}: {place}; level, facing north"
         return Notice(t_ns=report.t_ns, severity=Severity.INFO, subject="home", text=text)
+
+    def move_origin(self, report: Report) -> Notice | None:
+        """Move the origin to the carrier if its track begins far away; None if it stays.
+
+        The origin was the first report of anybody.
+        """
+        if self.local is None or report.uav != self.vehicle:
+            return None
+        there, _ = self.local.localise(report.lat_deg, report.lon_deg, report.alt_m, None)
+        away_m = math.hypot(*there)
+        if away_m <= ORIGIN_MAX_M:
+            return None
+        said = self._set_origin(report)
+        text = f"{said.text}, {away_m / 1e3:.0f} km from the first report; all tracks restart"
+        return Notice(t_ns=said.t_ns, severity=Severity.WARNING, subject="origin", text=text)
 
     def moved(self, placed: PlacedReport, anew: Estimate) -> Notice | None:
         """Move ``home`` if the track that set it restarts soon at a very different height.

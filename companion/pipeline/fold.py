@@ -217,9 +217,10 @@ class Pipeline:
         begins = self.center.needs_home or report.uav not in self.tracker
         if begins and not self.senders.may_begin(report, self.center.needs_home):
             return [Rejection(t_ns=report.t_ns, source=report.uav, reason=Reason.NO_FIX)]
+        said: list[Output] = self._restarted_for(self.center.move_origin(report)) if begins else []
         fix, begun = self.center.fix(placed)
         accepted, refuted = self.tracker.accept(fix)
-        said: list[Output] = [*begun]
+        said += begun
         if refuted:
             said += assumptions.notices(self.records, *refuted)
         if isinstance(accepted, Rejection):
@@ -233,7 +234,8 @@ class Pipeline:
             self.targets.identities.observe(fix, tracks)
         if accepted.reacquired:
             said.append(assumptions.track_restarted(self.records[fix.uav], accepted))
-            said += self._move_home(placed, accepted)
+            # Its height may have been wrong when it set the origin.
+            said += self._restarted_for(self.center.moved(placed, accepted))
             text = f"{fix.uav}: track restarted: its reports agree, but not with the old track"
             return [
                 *said,
@@ -242,9 +244,8 @@ class Pipeline:
             ]
         return [*said, accepted]
 
-    def _move_home(self, placed: PlacedReport, anew: Estimate) -> list[Output]:
-        """Restart the local frame if the track that set its origin had a wrong height."""
-        moved = self.center.moved(placed, anew)
+    def _restarted_for(self, moved: Notice | None) -> list[Output]:
+        """Restart all tracks if the origin of the local frame was moved."""
         if moved is None:
             return []
         for uav in self.tracker.uavs:

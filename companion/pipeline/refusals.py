@@ -13,6 +13,8 @@ REJECTED_AFTER_NS: Final = 1_000_000_000
 ARRIVING_NS: Final = 5_000_000_000
 """Time since the newest rejected report after which a sender is silent, not rejected."""
 NOTICE_INTERVAL_NS: Final = 10_000_000_000  # least time between two such notices about one sender
+FULL_INTERVAL_NS: Final = 600_000_000_000
+"""Least time between two notices that the limit on tracks is reached."""
 REPORT_REASONS: Final = frozenset(
     {
         Reason.UNREACHABLE,
@@ -53,14 +55,18 @@ class Refusals:
         self.total: Counter[Reason] = Counter()
         self._records = records
         self._senders: OrderedDict[str, SenderRejections] = OrderedDict()
+        self._full_ns = -FULL_INTERVAL_NS  # when a notice told that the limit on tracks is reached
 
     def add(self, refused: Rejection) -> Notice | None:
         """Count one rejection.
 
-        Returns a notice if no report of the sender has been accepted for a second.
+        Returns a notice if no report of the sender has been accepted for a second, or if the limit
+        on tracks is reached.
         """
         self._count(refused)
         uav = refused.source
+        if refused.reason is Reason.TOO_MANY and refused.detail:
+            return self._full(refused)
         if refused.reason not in REPORT_REASONS or not kind_of(uav).reports_itself:
             return None
         is_dropped = refused.reason is Reason.NEWCOMER
@@ -87,6 +93,13 @@ class Refusals:
         why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)
         text = f"no report of {uav} was used in the last {lasted_ns * 1e-9:.1f} s: {why}"
         return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
+
+    def _full(self, refused: Rejection) -> Notice | None:
+        if refused.t_ns - self._full_ns < FULL_INTERVAL_NS:
+            return None
+        self._full_ns = refused.t_ns
+        text = f"{refused.detail}: {refused.source} and other new UAVs are not tracked"
+        return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject="tracks", text=text)
 
     def used(self, uav: str) -> None:
         """Note that a sender's report was accepted."""

@@ -10,7 +10,7 @@ Over 300 lines: every kind of message passes through here.
 import math
 from collections import defaultdict
 from collections.abc import Container
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache, partial
 from itertools import islice
 from typing import Final, NamedTuple
@@ -31,6 +31,8 @@ from companion.settings.model import Settings
 from companion.tracking import noise
 from companion.tracking.noise import StatedNoise
 from companion.values import (
+    RELAYED_DELAY_S,
+    RELAYED_TIME_ERROR_S,
     Accuracy,
     AdsbVehicle,
     Attitude,
@@ -131,7 +133,7 @@ class Timeline(NamedTuple):
     def time(self, node_ns: int) -> SenderTime:
         """Convert a node time to this timeline."""
         if self.clock is None:
-            bound_s = noise.ADSB_TIME_BOUND_S
+            bound_s = RELAYED_TIME_ERROR_S
             return SenderTime(node_ns=node_ns, sender_ns=node_ns, before_s=bound_s, after_s=bound_s)
         offset_ns, before_s, after_s, usual_s = self.clock.time(node_ns)
         return SenderTime(
@@ -224,7 +226,7 @@ class Senders:
             case AdsbVehicle():
                 if not self._admits(message.uav):
                     return _refused(message, Reason.NOT_ALLOWED)
-                return self._relayed(message)
+                return self._relayed(frame, message)
             case RemoteId():
                 return self._remote_id(frame, message)
             case Attitude():
@@ -378,12 +380,19 @@ class Senders:
             position_m=max(noise.position_m, math.hypot(horizontal_m, vertical_m)),
         )
 
-    def _relayed(self, said: AdsbVehicle) -> FrameOutcome:
+    def _relayed(self, frame: Frame, said: AdsbVehicle) -> FrameOutcome:
         """Place in time a report of an aircraft that a receiver relays.
 
-        The track restarts when the altitude datum changes, since the difference depends on the
-        weather.
+        Where the relay's own reports come late over this link, this one is up to as late: half of
+        that is added to its age, and half to the error of the age. The track restarts when the
+        altitude datum changes, since the difference depends on the weather.
         """
+        late_s = self._dedupe.latency_s(frame)
+        if late_s > RELAYED_DELAY_S:
+            known = said.accuracy or Accuracy()
+            time_s = (known.time_s or RELAYED_TIME_ERROR_S) + late_s / 2
+            accuracy = known._replace(time_s=time_s)
+            said = replace(said, tslc_s=said.tslc_s + late_s / 2, accuracy=accuracy)
         datum = self.aircraft.datum(said.uav)
         merged = self.aircraft.merge(said)
         if isinstance(merged, Rejection):

@@ -280,6 +280,7 @@ class BackgroundRecorder:
         part = self._part.after(before.path.name) if before.flushed else self._part
         made = self._open_part(part)
         self._finished_messages += before.flushed
+        self.bytes = made.size_bytes
         self._writer, self._part, self._begun_s = made, part, time.monotonic()
 
     # --- disk errors ------------------------------------------------------------------------

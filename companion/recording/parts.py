@@ -5,7 +5,8 @@ Each part identifies itself, so that a replay can join them. Where events could 
 part has a record with their number.
 """
 
-from collections.abc import Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
@@ -134,33 +135,61 @@ def in_order(infos: Mapping[Path, RecordingInfo]) -> list[Path] | None:
 
     Raises ``UserError`` if two files are the same part.
     """
-    parts = {path: info.part for path, info in infos.items() if info.part is not None}
-    if len(parts) < max(2, len(infos)) or len({part.run for part in parts.values()}) != 1:
+    runs = _by_run(infos)
+    if len(runs) != 1 or len(infos) < 2:
         return None
-    ordered = sorted(parts, key=lambda path: parts[path].number)
-    for one, other in pairwise(ordered):
-        if parts[one].number == parts[other].number:
-            raise UserError(
-                f"{one} and {other} are both part {parts[one].number} of one run; give it once"
-            )
-    return ordered
+    (ordered,) = runs.values()
+    return ordered if len(ordered) == len(infos) else None
 
 
-def missing(infos: Mapping[Path, RecordingInfo], ordered: Sequence[Path]) -> list[str]:
-    """Return what a replay of some logs lacks, one line each; empty for a complete run."""
+def missing(infos: Mapping[Path, RecordingInfo]) -> list[str]:
+    """Return what a replay of some logs lacks, one line each; empty if all runs are complete.
+
+    The order of the logs does not matter. Raises ``UserError`` if two files are the same part.
+    """
+    runs = _by_run(infos)
     lines = []
-    before = 0
-    for path in ordered:
-        info = infos[path]
-        if info.part is not None:
-            skipped = range(before + 1, info.part.number)
+    for ordered in runs.values():
+        before = 0
+        for path in ordered:
+            number = _number(infos[path])
+            skipped = range(before + 1, number)
             if skipped:
                 which = " to ".join(dict.fromkeys((str(skipped[0]), str(skipped[-1]))))
                 lines.append(f"{path}: part {which} of the run is missing")
-            before = info.part.number
-        for hole in info.holes:
-            at = datetime.fromtimestamp(hole.t_ns * 1e-9, tz=UTC).isoformat(timespec="seconds")
-            lines.append(f"{path}: {hole.events} events before {at} are missing: {hole.why}")
-    if ordered and infos[ordered[-1]].is_continued:
-        lines.append(f"{ordered[-1]}: {UNFOLLOWED}")
+            before = number
+            lines += _holes(path, infos[path])
+        if infos[ordered[-1]].is_continued:
+            lines.append(f"{ordered[-1]}: {UNFOLLOWED}")
+    for path, info in infos.items():
+        if info.part is None:
+            lines += _holes(path, info)
     return lines
+
+
+def _by_run(infos: Mapping[Path, RecordingInfo]) -> dict[str, list[Path]]:
+    """Return the parts of each run, in the order of writing."""
+    runs = defaultdict[str, list[Path]](list)
+    for path, info in infos.items():
+        if info.part is not None:
+            runs[info.part.run].append(path)
+    for paths in runs.values():
+        paths.sort(key=lambda path: _number(infos[path]))
+        for one, other in pairwise(paths):
+            if _number(infos[one]) == _number(infos[other]):
+                raise UserError(
+                    f"{one} and {other} are both part {_number(infos[one])} of one run;"
+                    " give it once"
+                )
+    return runs
+
+
+def _number(info: RecordingInfo) -> int:
+    assert info.part is not None
+    return info.part.number
+
+
+def _holes(path: Path, info: RecordingInfo) -> Iterator[str]:
+    for hole in info.holes:
+        at = datetime.fromtimestamp(hole.t_ns * 1e-9, tz=UTC).isoformat(timespec="seconds")
+        yield f"{path}: {hole.events} events before {at} are missing: {hole.why}"

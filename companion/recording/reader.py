@@ -109,6 +109,16 @@ def read_flight(logs: Sequence[Path], latency_s: float = 0.0) -> Iterator[Event]
     return heapq.merge(*streams, key=lambda event: event.t_ns)
 
 
+def require_distinct(logs: Sequence[Path]) -> None:
+    """Raise ``LogError`` if a log is given twice."""
+    known = set[str]()
+    for log in logs:
+        place = os.path.realpath(log)
+        if place in known:
+            raise LogError(f"{log} is given twice")
+        known.add(place)
+
+
 def vehicles(logs: Sequence[Path]) -> list[Vehicle]:
     """Return the vehicles of the onboard logs among some logs; empty without onboard logs.
 
@@ -190,11 +200,11 @@ def digest_of(path: Path) -> str | None:
 
 
 def utc_offset_ns(paths: Sequence[Path]) -> int:
-    """Return UTC less the timeline of recordings, by their last value, ns; 0 without a value.
+    """Return UTC less the timeline of recordings, by the latest value in them; 0 without a value.
 
-    Raises ``LogError`` if that value is invalid.
+    Raises ``LogError`` if a value is invalid.
     """
-    offset_ns = 0
+    latest = (0, 0)  # time, offset
     for path in paths:
         walk = Walk(path, frozenset())
         next(iter(walk), None)  # the end of the file, if it exists, has all channels
@@ -202,17 +212,18 @@ def utc_offset_ns(paths: Sequence[Path]) -> int:
         if log_kind(path) == "mcap" and (not topics or schemas.CLOCK_TOPIC in topics):
             for content in Walk(path, frozenset((schemas.CLOCK_TOPIC,))):
                 if isinstance(content, Message):
-                    offset_ns = _offset_ns(path, content.data)
-    return offset_ns
+                    found = _clock_set(path, content.data)
+                    latest = max(latest, (found.t_ns, found.utc_offset_ns))
+    return latest[1]
 
 
-def _offset_ns(path: Path, data: bytes) -> int:
+def _clock_set(path: Path, data: bytes) -> ClockSet:
     try:
         found = codec.to_event(schemas.CLOCK_TOPIC, data)
     except (DecodeError, ValueError) as error:
         raise LogError(f"{path}: not a recording of this program: {error}") from None
     assert isinstance(found, ClockSet)
-    return found.utc_offset_ns
+    return found
 
 
 def _open(path: Path) -> tuple[LogKind, bytes]:

@@ -107,11 +107,14 @@ def wanted(query: QueryParams) -> Wanted:
 
 @dataclass(slots=True)
 class Snapshot:
-    """Messages of one update: each topic is looked up once, each message encoded once."""
+    """Messages of one update: each topic is looked up once, each message encoded once.
+
+    Events are an exception: they may change between two updates, and count by their version.
+    """
 
     number: int
-    bodies: dict[Topic, "asyncio.Task[Body]"] = field(default_factory=dict)
-    messages: dict[tuple[Topic, frozenset[str]], "asyncio.Task[str | bytes]"] = field(
+    bodies: dict[tuple[Topic, object], "asyncio.Task[Body]"] = field(default_factory=dict)
+    messages: dict[tuple[Topic, frozenset[str], object], "asyncio.Task[str | bytes]"] = field(
         default_factory=dict
     )
 
@@ -211,7 +214,7 @@ class Stream:
                     version = self._version(topic)
                     if said.get(topic) != version:
                         try:
-                            message = await self._message(topic, asked.uavs)
+                            message = await self._message(topic, asked.uavs, version)
                         except HTTPException:  # too many requests at once: with the next update
                             continue
                         said[topic] = version
@@ -231,23 +234,27 @@ class Stream:
             return events[-1] if events else "none yet"
         return self._node.pipeline.updates
 
-    async def _message(self, topic: Topic, uavs: frozenset[str]) -> str | bytes:
+    async def _message(self, topic: Topic, uavs: frozenset[str], version: object) -> str | bytes:
         """Return the message of a topic; encode it on first use."""
         if self._snapshot.number != self._node.pipeline.updates:
             self._snapshot = Snapshot(self._node.pipeline.updates)
         messages = self._snapshot.messages
         if topic not in topics.OF_UAVS:
             uavs = frozenset()  # the same message for all clients
-        if (topic, uavs) not in messages:
-            messages[topic, uavs] = _task(self._encoded(self._snapshot, topic, uavs))
-        return await asyncio.shield(messages[topic, uavs])  # other clients may wait for it too
+        what = (topic, uavs, version)
+        if what not in messages:
+            messages[what] = _task(self._encoded(self._snapshot, *what))
+        return await asyncio.shield(messages[what])  # other clients may wait for it too
 
-    async def _encoded(self, snapshot: Snapshot, topic: Topic, uavs: frozenset[str]) -> str | bytes:
-        if topic not in snapshot.bodies:
-            snapshot.bodies[topic] = _task(topics.body(topic, self._node, self._large))
-        body = await asyncio.shield(snapshot.bodies[topic])
+    async def _encoded(
+        self, snapshot: Snapshot, topic: Topic, uavs: frozenset[str], version: object
+    ) -> str | bytes:
+        key = (topic, version)
+        if key not in snapshot.bodies:
+            snapshot.bodies[key] = _task(topics.body(topic, self._node, self._large))
+        body = await asyncio.shield(snapshot.bodies[key])
         encode = partial(topics.message, topic, body, uavs)
-        what, many = (topic, uavs, snapshot.number), topics.is_large(topic, body, uavs)
+        what, many = (topic, uavs, version), topics.is_large(topic, body, uavs)
         return await self._large.made(what, lambda: encode, is_large=many)
 
 

@@ -134,7 +134,7 @@ class BeamSettings(Section):
     its error grows with the square of the condition number.
     """
 
-    update_hz: Annotated[float, Field(ge=1e-3, le=1000)] = 10.0
+    update_hz: Annotated[float, Field(ge=0.1, le=1000)] = 10.0
     update: Literal["timer", "report"] = "timer"
     actuation_delay_s: Annotated[float, Field(ge=0, le=10)] = 0.01
     targets: Literal["telemetry", "all"] = "telemetry"

@@ -5,7 +5,14 @@ from collections import deque
 from dataclasses import dataclass
 from typing import Final
 
-from companion.values import Accuracy, AltitudeDatum, GnssStatus, ReportNoise, Vector
+from companion.values import (
+    RELAYED_TIME_ERROR_S,
+    Accuracy,
+    AltitudeDatum,
+    GnssStatus,
+    ReportNoise,
+    Vector,
+)
 
 QUANTISATION: Final = 0.02
 """Least noise bound, m and m/s, however good the stated accuracy is.
@@ -16,8 +23,6 @@ LEAST_ACCURACY_M: Final = {4: 0.2, 5: 0.1, 6: 0.01, 7: 0.01, 8: 0.01}
 """Best credible accuracy by GPS_FIX_TYPE: differential, RTK float and fixed, static, PPP. Some
 receivers state a millimetre if they do not know their accuracy."""
 PLAIN_ACCURACY_M: Final = 0.3  # best credible accuracy of any other fix
-ADSB_TIME_BOUND_S: Final = 1.0
-"""Uncertainty of the time of an ADS-B report, whose ``tslc`` is in whole seconds."""
 ADSB_NOISE_M: Final = 100.0
 """Default bound on the position error of an ADS-B report, metres.
 
@@ -142,7 +147,9 @@ def relayed(
     was true ``alt_age_s`` apart adds the distance climbed in that time.
     """
     known = Accuracy() if accuracy is None or factor is None else accuracy
-    time_s = ADSB_TIME_BOUND_S if known.time_s is None else known.time_s
+    time_s = known.time_s
+    if time_s is None:  # or ignored, but never to make the bound smaller
+        time_s = max(RELAYED_TIME_ERROR_S, (accuracy and accuracy.time_s) or 0.0)
     way_m = time_s * (speed_max_mps if velocity_ned_mps is None else math.hypot(*velocity_ned_mps))
     horizontal_m = _bound(known.horizontal_m, factor or 0.0, ADSB_NOISE_M) + way_m
     height_m = ADSB_NOISE_M

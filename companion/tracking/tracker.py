@@ -38,6 +38,7 @@ from companion.values import (
 
 ESTABLISHED: Final = 50
 """Number of reports that establish a UAV: tracks with fewer make room for its return."""
+SWEEP_NS: Final = 1_000_000_000  # least time between two searches for tracks that make room
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -53,7 +54,8 @@ class TrackerSettings:
     gate: GateSettings = field(default_factory=GateSettings)
     window_s: float = 5.0  # how late a report may arrive and still be sorted in
     feed_forward: bool = False  # whether an estimated acceleration enters predictions
-    most: int = 2000  # largest number of tracks
+    most: int = 2000  # largest number of tracks, without that of the carrier
+    carrier: str | None = None  # vehicle that is always tracked
     noise: NoiseSettings | None = None
 
 
@@ -104,6 +106,7 @@ class Tracker:
         self._tracked: dict[str, _Tracked] = {}
         self._positions = NewestPositions()
         self._established: set[str] = set()  # dropped UAVs that had many reports
+        self._swept_ns = -SWEEP_NS
 
     # --- input: reports ---------------------------------------------------------------------
 
@@ -118,8 +121,7 @@ class Tracker:
             tracked.snapshot = None
         past = self._new_past() if tracked is None else tracked.past
         fix, refuted = self._with_raised_limits(past, fix)
-        full = tracked is None and len(self._tracked) >= self._settings.most
-        if full and not self._make_room(fix.uav):
+        if tracked is None and not self._has_room(fix.uav, fix.arrival_ns):
             why = f"limit of {self._settings.most} tracks reached"
             return _rejected(fix, Reason.TOO_MANY, why), refuted
         if tracked is None or self._is_lost(tracked, fix):
@@ -177,12 +179,38 @@ class Tracker:
             return _rejected(fix, Reason.SHARED_ID, "a second vehicle reports under this id")
         return self._use(tracked, index, fix, predicted)
 
+    def _has_room(self, uav: str, now_ns: int) -> bool:
+        """Return whether a track of a UAV may begin; others may be dropped for it."""
+        others = len(self._tracked) - (self._settings.carrier in self._tracked)
+        if uav == self._settings.carrier or others < self._settings.most:
+            return True
+        return self._make_room(uav) or self._drop_fleeting(now_ns)
+
+    def _drop_fleeting(self, now_ns: int) -> bool:
+        """Drop the unestablished tracks that are lost; return whether there was one.
+
+        They are looked for at most once a second, since invented ids can be new at any rate.
+        """
+        if now_ns - self._swept_ns < SWEEP_NS:
+            return False
+        self._swept_ns = now_ns
+        lost = self.silent(now_ns, self._settings.ages.lost_s)
+        fleeting = [uav for uav in lost if self._is_fleeting(uav)]
+        for uav in fleeting:
+            self.forget(uav)
+        return bool(fleeting)
+
+    def _is_fleeting(self, uav: str) -> bool:
+        """Return whether a UAV has few reports in all, and does not carry the array."""
+        is_known = uav in self._established or uav == self._settings.carrier
+        return not is_known and self._tracked[uav].reports < ESTABLISHED
+
     def _make_room(self, uav: str) -> bool:
         """Drop the latest unestablished track to admit an established UAV; False if impossible."""
         if uav not in self._established:
             return False
         for other in reversed(self._tracked):
-            if other not in self._established and self._tracked[other].reports < ESTABLISHED:
+            if self._is_fleeting(other):
                 self.forget(other)
                 return True
         return False

@@ -36,6 +36,8 @@ from companion.values.numbers import BoolArray, ComplexArray, FloatArray, IntArr
 from companion.values.observed import READINGS_MAX, Observation, reason_invalid
 from companion.values.outputs import Notice, Output, Severity, Update
 from companion.values.received import (
+    RELAYED_DELAY_S,
+    RELAYED_TIME_ERROR_S,
     Accuracy,
     AdsbVehicle,
     AltitudeDatum,
@@ -71,6 +73,8 @@ from companion.values.tracked import (
 __all__ = [
     "DUTY_MAX",
     "READINGS_MAX",
+    "RELAYED_DELAY_S",
+    "RELAYED_TIME_ERROR_S",
     "UAV_FORMS",
     "Accuracy",
     "AdsbVehicle",

@@ -1,7 +1,7 @@
 """Received values: frames, and the messages decoded from them."""
 
 from dataclasses import dataclass
-from typing import Annotated, NamedTuple
+from typing import Annotated, Final, NamedTuple
 
 from companion.values.described import DescribedEnum, Meaning
 from companion.values.names import Source, UavKind
@@ -110,6 +110,14 @@ class Report(NamedTuple):
     alt_step_m: float = 0.0
 
 
+RELAYED_TIME_ERROR_S: Final = 1.0
+"""Largest error of the age of a relayed aircraft's report, unless it states another.
+
+MAVLink's ``tslc`` is in whole seconds.
+"""
+RELAYED_DELAY_S: Final = 0.25  # delay of its transmission that this error includes
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AdsbVehicle:
     """Aircraft relayed by a receiver (ADSB_VEHICLE).
@@ -131,7 +139,7 @@ class AdsbVehicle:
     heading_deg: float | None  # from true north, clockwise
     velocity_ne_mps: tuple[float, float] | None
     velocity_down_mps: float | None  # positive down
-    tslc_s: int  # whole seconds since the last message of the aircraft
+    tslc_s: float  # time since the last message of the aircraft; MAVLink states whole seconds
     accuracy: Accuracy | None = None
 
     @property
@@ -141,8 +149,8 @@ class AdsbVehicle:
 
     @property
     def true_ns(self) -> int:
-        """When its content was true, or up to a second earlier."""
-        return self.t_ns - self.tslc_s * 1_000_000_000
+        """When its content was true; up to a second earlier, if ``tslc_s`` has whole seconds."""
+        return self.t_ns - round(self.tslc_s * 1e9)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

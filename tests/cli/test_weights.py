@@ -18,8 +18,10 @@ from companion.node import moment
 from companion.node.replay import log_events
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
+from companion.recording.parts import Part
+from companion.recording.writer import Writer
 from companion.settings.model import Settings
-from companion.values import Update
+from companion.values import ClockSet, Event, Update
 from companion.views import quantised
 
 AT_S = 3.0
@@ -154,13 +156,40 @@ def test_time_of_day_equals_seconds_into_the_log(cut_log: Path) -> None:
     assert shifted["re"] == told["re"]
 
 
+def test_utc_is_that_of_the_clock_as_last_set(tmp_path: Path, cut_log: Path) -> None:
+    """The time in the answer is the time that was asked for."""
+    hour_ns, settings = 3_600_000_000_000, Settings()
+    events: list[Event] = list(log_events([cut_log], settings))
+    begins_ns = events[0].t_ns
+    events.insert(len(events) // 2, ClockSet(events[len(events) // 2].t_ns, hour_ns))
+    writer = Writer(
+        where=tmp_path / "a.mcap",
+        settings_toml=settings.to_toml(),
+        versions={},
+        weights_hz=None,
+        started_ns=begins_ns,
+        part=Part.first(),
+    )
+    for event in events:
+        writer.event(event)
+    log = writer.close({})
+    for at_s in (3, 20):  # before and after the clock was set
+        at = np.datetime64((begins_ns + hour_ns) // 1_000_000, "ms") + np.timedelta64(at_s, "s")
+        told = json.loads(weights(log, "--lead-ms", "0", at=f"{at}Z"))
+        late = np.datetime64(told["valid_at"].rstrip("Z")) - at
+        assert np.timedelta64(0) <= late <= np.timedelta64(10, "ms")  # the next hundredth
+    before = np.datetime64(begins_ns // 1_000_000, "ms") + np.timedelta64(3, "s")
+    start = np.datetime64((begins_ns + hour_ns) // 1_000_000, "ms")
+    assert f"the log begins at {start}Z" in mistake(log, at=f"{before}Z")
+
+
 @pytest.mark.parametrize(
     ("at", "said"),
     [
         ("-1", "--at -1: the log begins later"),
-        ("1999-01-01T00:00:00Z", "the log begins later"),
+        ("1999-01-01T00:00:00Z", "Z: the log begins at 2026-11-20T11:55:42.520Z"),
         ("1e6", "--at 1e6: the log is 24.9 s long"),
-        ("9999-01-01T00:00:00Z", "the log is 24.9 s long"),
+        ("9999-01-01T00:00:00Z", "the log is 24.9 s long, from 2026-11-20T11:55:42.520Z"),
         ("nan", "neither seconds"),
         ("inf", "neither seconds"),
         ("noon", "neither seconds"),

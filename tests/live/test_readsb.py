@@ -72,6 +72,11 @@ def web() -> Iterator[tuple[str, dict[str, Any]]]:
         thread.join(HANG_S)
 
 
+def lost(answer: Any, url: str) -> Any:
+    """What a link of an answer of ``/v1/links`` lost."""
+    return {link["url"]: link for link in answer["links"]}[url]["lost"]
+
+
 def test_aircraft_json_is_polled_and_replays_identically(
     start_node: Any, tmp_path: Path, web: tuple[str, dict[str, Any]]
 ) -> None:
@@ -82,13 +87,16 @@ def test_aircraft_json_is_polled_and_replays_identically(
         *("run", "--link", f"{url}/data/aircraft.json", "--link", f"{url}/wrong"),
         *("--center", "47.1,-122.3,10", "--listen", "127.0.0.1:0", "--record", str(tmp_path)),
     )
+    polled = f"{url}/data/aircraft.json"
+    node.wait_until("/v1/links", lambda answer: lost(answer, polled) == {"unplaced-stamp": 1})
+    answer.update(now=100.9, aircraft=[one | {"nac_p": 9}])  # the first has an unknown age
     node.wait_until("/v1/uavs", lambda answer: answer["uavs"])
-    answer.update(now=101.0, aircraft=[one | {"lat": 47.1001, "nac_p": 9}])
+    answer.update(now=102.0, aircraft=[one | {"lat": 47.1001, "nac_p": 9}])
     node.wait_until("/v1/uavs", lambda answer: answer["uavs"][0]["reports"] == 2)
     links = {link["url"]: link for link in node.json("/v1/links")["links"]}
     status, _, errors = node.stop()
     assert status == 0, errors
-    assert links[f"{url}/data/aircraft.json"]["state"] == "up"
+    assert links[polled]["state"] == "up"
     assert links[f"{url}/wrong"]["state"] != "up"
     assert f"link {url}/wrong is down: the server answers 404" in errors
     summary = same_digest(next(tmp_path.glob("*.mcap")))

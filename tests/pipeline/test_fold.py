@@ -232,6 +232,27 @@ def test_home_is_the_first_accepted_report(center: str | None) -> None:
     assert [left.uav for left in update.beams.left_out] == ["1:1"]
 
 
+def test_local_frame_begins_at_the_carrier_wherever_the_first_report_is() -> None:
+    """Far from it, heights are partly horizontal: bounds were up to ten times as large."""
+    pipeline = Pipeline(settings())
+    stranger = dialect.MAVLink_global_position_int_message(1, *[450_000_000] * 2, 0, 0, 0, 0, 0, 0)
+    (first, _) = pipeline.step(sent(0.0, "9:1", stranger))
+    assert isinstance(first, Notice) and first.subject == "origin"
+    pipeline.step(position(0.1, "1:1", (100, 0, 0)))
+    moved, _ = pipeline.step(position(0.2, "5:1"))
+    assert isinstance(moved, Notice) and moved.severity is Severity.WARNING
+    assert moved.text == (
+        "local frame: origin set to 47.400000, 8.550000, 500.0 m, 2778 km from the first report;"
+        " all tracks restart"
+    )
+    assert pipeline.local is not None
+    there, _ = pipeline.local.localise(*PLACE, None)
+    assert there == pytest.approx((0, 0, 0), abs=0.02)
+    assert pipeline.tracker.uavs == ["5:1"]
+    away = run(pipeline, [position(0.3, "1:1", (100, 0, 0)), position(0.4, "5:1", (60e3, 0, 0))])
+    assert not [one for one in away if isinstance(one, Notice) and one.subject == "origin"]
+
+
 def test_a_fixed_station_faces_its_heading() -> None:
     pipeline = Pipeline(settings("47.4,8.55,500,90"))
     outputs = pipeline.step(position(0, "1:1", (0, 100, -100)))
@@ -665,6 +686,30 @@ def test_relayed_report_is_dated_by_its_age_field() -> None:
     assert seen.fix.arrival_ns == START_NS + 5 * S
 
 
+@pytest.mark.parametrize("is_repeated", [False, True])
+def test_relayed_report_over_a_late_link_may_be_as_late(is_repeated: bool) -> None:
+    """The relay's own reports come 3 s late over it, and perhaps sooner over another link."""
+    pipeline = Pipeline(settings("47.4,8.55,500", observer={"speed_max_mps": 90.0}))
+    for n in range(50):
+        t_s = 0.2 * n
+        late_s = 3.0 if n >= 25 else 0.0
+        if is_repeated:
+            pipeline.step(position(t_s, "5:1", boot_s=100 + t_s, link="fast"))
+        pipeline.step(position(t_s, "5:1", boot_s=100 + t_s - late_s, link="udp"))
+    (seen,) = (
+        output
+        for output in pipeline.step(adsb(10.0, (3000, 500, -800)))
+        if isinstance(output, Estimate)
+    )
+    sent_ns = seen.fix.arrival_ns - 3 * S - S  # a second is its own age
+    apart_s = (seen.fix.t_ns - sent_ns) * 1e-9
+    assert apart_s == pytest.approx(1.5, abs=0.1)
+    horizontal_m = 100.0 + 90.0 * (1.0 + apart_s)
+    assert seen.fix.noise.horizontal_m == pytest.approx(horizontal_m, abs=20.0)
+    (other,) = Pipeline(settings("47.4,8.55,500")).step(adsb(10.0, (3000, 500, -800)))
+    assert isinstance(other, Estimate) and other.fix.t_ns == other.fix.arrival_ns - S
+
+
 def test_track_restart_is_announced_once() -> None:
     """A lasting jump of 200 m."""
     pipeline = Pipeline(settings("47.4,8.55,500"))
@@ -1031,11 +1076,18 @@ def test_long_silent_uav_is_dropped_and_returns_as_new() -> None:
     assert again.dt_s is None
 
 
-def test_number_of_tracks_is_limited() -> None:
-    pipeline = Pipeline(settings("47.4,8.55,500", tracks={"most": 3}))
+@pytest.mark.parametrize("center", ["47.4,8.55,500", "11:1"])
+def test_number_of_tracks_is_limited(center: str) -> None:
+    """The carrier is tracked beyond the limit: without it, there would be no beams."""
+    pipeline, said = Pipeline(settings(center, tracks={"most": 3})), list[Output]()
     for n in range(20):
         for sysid in range(1, 11):
-            run(pipeline, [position(n / 10, f"{sysid}:1", (10.0 * sysid, 0.0, 0.0))])
+            said += run(pipeline, [position(n / 10, f"{sysid}:1", (10.0 * sysid, 0.0, 0.0))])
+        if center == "11:1":
+            run(pipeline, [position(n / 10, center)])
+    (notice,) = (one for one in said if isinstance(one, Notice) and one.subject == "tracks")
+    assert notice.text == "limit of 3 tracks reached: 4:1 and other new UAVs are not tracked"
+    assert (pipeline.tracker.newest("11:1") is not None) == (center == "11:1")
     now_ns = START_NS + 2 * S
     assert [t.uav for t in pipeline.tracks(now_ns, now_ns)] == ["1:1", "2:1", "3:1"]
     assert pipeline.refusals.total == {Reason.TOO_MANY: 7 * 20}

@@ -293,15 +293,15 @@ def test_invented_ids_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> Non
     fold = pipeline(tracks={"most": TRACKS_MAX})
     template = event(0).raw
     at = template.index(b"HAWK")
-    seen: Counter[str] = Counter()
+    seen: Counter[object] = Counter()
     for number in range(3 * RECORDS_MAX):
         raw = template[:at] + f"{number:04x}".encode() + template[at + 4 :]
         for said in fold.step(event(0)._replace(raw=raw)):
-            seen[said.reason if isinstance(said, Rejection) else "used"] += 1
+            seen[said.reason if isinstance(said, Rejection) else type(said)] += 1
     assert len(fold.senders._senders) <= RECORDS_MAX
     assert len(fold.records) <= RECORDS_MAX
     assert fold.senders._assumed.cache_info().currsize <= RECORDS_MAX
-    assert len(fold.tracker.uavs) == seen["used"] == TRACKS_MAX
+    assert len(fold.tracker.uavs) == seen[Estimate] == TRACKS_MAX
     assert seen[Reason.TOO_MANY] == 3 * RECORDS_MAX - TRACKS_MAX
 
 

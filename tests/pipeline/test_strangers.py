@@ -113,6 +113,34 @@ def test_rejected_strangers_leave_no_state(tracker: Tracker) -> None:
     assert len(tracker._tracked) == 10
 
 
+def test_lost_strangers_make_room(tracker: Tracker) -> None:
+    """Invented ids with a few reports each kept others out for ten minutes."""
+    for number in range(9):
+        flown(tracker, f"200:{number}", 2, 0.0)
+    flown(tracker, "2:1", ESTABLISHED, 0.0)
+    for t_s in (30.0, 59.0):
+        assert isinstance(tracker.accept(fix("1:1", t_s))[0], Rejection)
+    assert isinstance(tracker.accept(fix("1:1", 61.0))[0], Estimate)
+    assert tracker.uavs == ["2:1", "1:1"]
+
+
+def test_lost_tracks_are_not_searched_for_at_each_report(
+    tracker: Tracker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for number in range(10):
+        flown(tracker, f"2:{number}", 1, 0.0)
+    searched = list[int]()
+
+    def silent(now_ns: int, for_s: float) -> list[str]:
+        searched.append(now_ns)
+        return []
+
+    monkeypatch.setattr(tracker, "silent", silent)
+    for number in range(1000):
+        tracker.accept(fix(f"icao:{number:06X}", 1.0 + number * 1e-3))
+    assert len(searched) == 1
+
+
 def test_established_set_is_bounded_by_the_track_limit(tracker: Tracker) -> None:
     for number in range(30):
         flown(tracker, f"3:{number}", ESTABLISHED, 100.0 * number)

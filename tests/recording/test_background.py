@@ -479,6 +479,29 @@ def test_each_part_holds_its_utc_offset(tmp_path: Path) -> None:
     assert utc_offset_ns(logs) == utc_offset_ns(logs[1:2]) == -5
 
 
+def test_size_is_that_of_the_newest_part(tmp_path: Path) -> None:
+    """It was that of the previous part until the next flush, a second later."""
+    made = recorder(tmp_path, Rotation(1.0, None))
+    made.start()
+    hand_over(made, ticks(0, 2000))
+    wait_for_part(made, 2)
+    size = made.bytes
+    made.stop({})
+    assert 0 < size < parts_of(tmp_path)[0].stat().st_size / 2
+
+
+def test_latest_utc_offset_counts_in_any_order_of_the_parts(tmp_path: Path) -> None:
+    made = recorder(tmp_path, Rotation(1.0, None))
+    made.start()
+    hand_over(made, [ClockSet(START_NS, -5), *ticks(0, 10)])
+    wait_for_part(made, 2)
+    (first, *_) = later = ticks(10, 20)
+    hand_over(made, [ClockSet(first.t_ns, -9), *later])
+    made.stop({})
+    logs = parts_of(tmp_path)
+    assert utc_offset_ns(logs) == utc_offset_ns(logs[::-1]) == -9
+
+
 @pytest.mark.parametrize("rotation", [Rotation(1.0, None), Rotation(None, 0.5)])
 def test_new_part_continues_where_the_previous_ends(tmp_path: Path, rotation: Rotation) -> None:
     made = recorder(tmp_path, rotation)

@@ -110,6 +110,33 @@ def test_missing_parts_are_reported(
     assert len(missing_of([two])) == 2
 
 
+def test_missing_parts_of_several_runs_are_reported_in_any_order(tmp_path: Path) -> None:
+    """Of one run the last part is missing, of the other the first two."""
+    runs = []
+    for name in "ab":
+        part, logs = Part.first(), list[Path]()
+        for number in (1, 2, 3):
+            where = tmp_path / f"{name}{number}.mcap"
+            logs.append(write(where, part, [Tick(number)], is_continued=number < 3))
+            part = part.after(where.name)
+        runs.append(logs)
+    one, other = runs
+    for logs in permutations([*one, *other]):
+        assert missing_of(logs) == []
+    for logs in permutations([*one[:2], other[2]]):
+        assert set(missing_of(logs)) == {
+            f"{one[1]}: {UNFOLLOWED}",
+            f"{other[2]}: part 1 to 2 of the run is missing",
+        }
+
+
+def test_log_given_twice_is_rejected(tmp_path: Path, short_log: Path) -> None:
+    (tmp_path / "link.tlog").symlink_to(short_log)
+    for again in (short_log, short_log.parent / "." / short_log.name, tmp_path / "link.tlog"):
+        with pytest.raises(LogError, match="is given twice"):
+            log_events([short_log, again], Settings())
+
+
 def test_gap_is_reported_with_its_time_and_event_count(tmp_path: Path) -> None:
     part = Part.first()
     path = write(tmp_path / "a.mcap", part, [Tick(7)], Hole(START_NS, 12, "no room"))
@@ -126,8 +153,10 @@ def test_gap_is_reported_with_its_time_and_event_count(tmp_path: Path) -> None:
 def test_duplicate_part_is_rejected(tmp_path: Path) -> None:
     part = Part.first()
     logs = [write(tmp_path / f"{name}.mcap", part, [Tick(7)]) for name in "ab"]
-    with pytest.raises(LogError, match=r"a\.mcap and .*b\.mcap are both part 1 of one run"):
-        log_events(logs, Settings())
+    other = write(tmp_path / "other.mcap", Part.first(), [Tick(8)])
+    for given in (logs, [*logs, other]):
+        with pytest.raises(LogError, match=r"a\.mcap and .*b\.mcap are both part 1 of one run"):
+            log_events(given, Settings())
 
 
 @pytest.mark.parametrize("alone", [False, True])
@@ -150,7 +179,7 @@ def test_invalid_part_metadata_is_ignored() -> None:
     assert Part.from_metadata({"number": "1"}) is None
     part = Part.first().after("x")
     assert Part.from_metadata(part.metadata()) == part
-    assert missing({}, []) == []
+    assert missing({}) == []
 
 
 def test_recording_holds_its_observer_gains(tmp_path: Path, short_log: Path) -> None:

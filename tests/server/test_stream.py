@@ -133,6 +133,25 @@ def test_events_are_sent_when_new(make_node: Any, serving: Any) -> None:
     run_async(check())
 
 
+def test_event_between_two_updates_is_sent_to_every_client(make_node: Any, serving: Any) -> None:
+    """The second client shares the update's messages with the first, but not its events."""
+
+    async def check() -> None:
+        node = make_node()
+        node.say("before")
+        query = "topic=events&rate_hz=100"
+        async with serving(node) as at, connect(f"ws://{at}/v1/stream?{query}") as first:
+            assert (await said(first))["events"][-1]["text"] == "before"
+            node.say("something new")
+            async with connect(f"ws://{at}/v1/stream?{query}") as second:
+                assert (await said(second))["events"][-1]["text"] == "something new"
+                await asyncio.sleep(0.02)  # more than the requested period
+                node.tick()
+                assert (await said(first))["events"][-1]["text"] == "something new"
+
+    run_async(check())
+
+
 def test_stream_respects_the_requested_rate(make_node: Any, serving: Any) -> None:
     async def check() -> None:
         node = make_node()

@@ -26,6 +26,8 @@ FLOOR_DB: Final = -200.0
 BLOCK: Final = 8192  # entries of a steering matrix computed at once, so that they stay in the cache
 POINTS_PER_SIDE_LOBE: Final = 8  # points of a scan per narrowest possible lobe
 LEAST_POINTS: Final = 360  # least number of points of a scan around a circle
+SCAN_MAX: Final = 1 << 25
+"""Most points of a scan, times elements: 0.5 s. An array that needs more has unknown side lobes."""
 NEAR: Final = 64  # points examined first to either side of a peak; they nearly always suffice
 SECTIONS: Final = np.linspace(0.0, 1.0, 17)
 """Relative positions examined in an interval: each step narrows a crossing 16-fold, an extreme
@@ -112,7 +114,8 @@ class CutLobe:
         side_lobe_db          the highest maximum outside of those, less the peak
 
     The first two are None if the gain never falls to half, or first rises a decibel above the peak
-    (the flank of a stronger lobe); the third also if there is no other maximum. If all elements are
+    (the flank of a stronger lobe); the third also if there is no other maximum, or if a scan for it
+    takes too long (``SCAN_MAX``: elements many wavelengths apart). If all elements are
     in one plane across boresight and face alike, front and back look the same: the mirror lobe
     behind is not counted as a side lobe.
     """
@@ -221,6 +224,10 @@ class _Cut:
         fringes = 2 * self.array.wavenumber_radpm * float(radius_m)
         return max(LEAST_POINTS, math.ceil(POINTS_PER_SIDE_LOBE * fringes))
 
+    def most_points(self) -> int:
+        """Return the limit on the points of a scan."""
+        return max(LEAST_POINTS, SCAN_MAX // self.array.size)
+
 
 def _span(half_rad: float, points: int) -> FloatArray:
     if points < 2:
@@ -319,7 +326,7 @@ def _half_power(cut: _Cut, peak_rad: float) -> tuple[float | None, tuple[float, 
     points = cut.points()
     step = 2 * math.pi / points
     ways = np.array([[-1.0], [1.0]])
-    for count in (min(NEAR, points), points):
+    for count in (min(NEAR, points), min(points, cut.most_points())):
         offsets = step * np.arange(count + 1)
         gains = cut.gains(peak_rad + ways * offsets)
         low = gains < half
@@ -368,6 +375,8 @@ def _extremes(cut: _Cut, brackets: FloatArray, sign: float) -> tuple[FloatArray,
 def _side_lobe_db(cut: _Cut, peak_rad: float, nulls: tuple[float, float]) -> float | None:
     """Return the highest maximum outside the first nulls, less the peak, dB."""
     points = cut.points()
+    if points > cut.most_points():
+        return None
     step = 2 * math.pi / points
     offsets: FloatArray = step * np.arange(points, dtype=np.float64)
     angles: FloatArray = offsets + peak_rad

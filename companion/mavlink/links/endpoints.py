@@ -25,6 +25,7 @@ class Upcalls(NamedTuple):
               (None without a stamp); returns whether there is more, with which a call without
               bytes continues; raises ``StalledError`` to end the connection
     stale     bytes of a peer that waited too long to be used
+    request   a document is requested from the only peer
     """
 
     up: Callable[[], None]  # connected
@@ -32,6 +33,7 @@ class Upcalls(NamedTuple):
     stale: Callable[[Hashable, bytes], None]
     on_peer_gone: Callable[[Hashable], None]  # that peer is gone
     overflow: Callable[[int], None]  # the system dropped this many more datagrams
+    request: Callable[[], None] = lambda: None
 
 
 class Endpoint(Protocol):

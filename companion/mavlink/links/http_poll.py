@@ -12,6 +12,8 @@ from companion.mavlink.wire.aircraft_json import DOCUMENT_MAX
 PERIOD_S: Final = 1.0
 """Seconds from one request to the next; receivers write a document about once a second."""
 ANSWER_S: Final = 5.0  # timeout of a request
+UNCHANGED_S: Final = 15.0
+"""Seconds after which an unchanged document shows that its receiver has stopped."""
 HEAD_MAX: Final = 16 << 10
 BODY_MAX: Final = DOCUMENT_MAX
 
@@ -22,22 +24,29 @@ class HttpPoll:
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
         self._upcalls = upcalls
+        self._unchanged = b""  # document of a receiver that has stopped
 
     def open(self) -> None:
         """Do nothing: the server may start later."""
 
     async def serve(self) -> None:
-        """Poll until an answer fails, which raises ``OSError``."""
+        """Poll until an answer fails, or its document stops to change: raises ``OSError``."""
         loop = asyncio.get_running_loop()
-        is_up = False
+        is_up, newest, changed_s = False, self._unchanged, loop.time()
         while True:
             due_s = loop.time() + PERIOD_S
+            self._upcalls.request()
             try:
                 async with asyncio.timeout(ANSWER_S):
                     body = await _get(self._url)
             except (ValueError, EOFError) as error:
                 raise OSError(f"malformed HTTP answer: {error}") from error
-            if not is_up:
+            if body != newest:
+                newest, changed_s = body, loop.time()
+            elif loop.time() - changed_s > UNCHANGED_S:
+                self._unchanged = body
+                raise OSError(f"the document has not changed for {UNCHANGED_S:.0f} s")
+            if not is_up and body != self._unchanged:
                 self._upcalls.up()
                 is_up = True
             while self._upcalls.take(None, body, None):

@@ -37,6 +37,7 @@ from companion.mavlink.trust.fair_share import Account
 from companion.mavlink.trust.known_peers import JUDGED, KnownPeers, PeerRank
 from companion.mavlink.trust.newcomers import LATE_NS, Admission, Newcomers
 from companion.mavlink.wire import cot_link
+from companion.mavlink.wire.aircraft_json import AircraftJson
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
@@ -137,6 +138,7 @@ class Link:
             stale=self._count_stale,
             on_peer_gone=self._peer_gone,
             overflow=self._overflow,
+            request=self._requested,
         )
         self._endpoint = endpoint(url, self.status, upcalls)
         self._is_out = False
@@ -380,6 +382,11 @@ class Link:
             msgid=TIMESYNC,
             detail=detail,
         )
+
+    def _requested(self) -> None:
+        splitter = self._peers.at(None).splitter
+        assert isinstance(splitter, AircraftJson)
+        splitter.requested(self._now_ns())
 
     def _peer_gone(self, key: Hashable) -> None:
         peer = self._peers.find(key)

@@ -15,6 +15,8 @@ WINDOW_NS: Final = 30_000_000_000
 """How long a report is remembered: longer than the largest lag observed between links."""
 LINKS_MAX: Final = 4096  # most links counted; a log may name one for each of its frames
 LATENCIES_KEPT: Final = 256  # newest latencies kept per link
+LATENCY_KEPT_NS: Final = 10_000_000_000
+"""How long the latency of a system's newest report tells how late its other messages are."""
 
 
 @dataclass(slots=True)
@@ -29,12 +31,13 @@ class LinkShare:
     latencies_s: deque[float] = field(default_factory=lambda: deque(maxlen=LATENCIES_KEPT))
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _First:
     """First arrival of a report; its latency is None until known."""
 
     t_ns: int
     link: str
+    sysid: int
     latency_s: float | None = None
 
 
@@ -45,6 +48,8 @@ class Dedupe:
         self.shares: dict[str, LinkShare] = {}
         self._seen: OrderedDict[bytes, _First] = OrderedDict()  # in order of arrival
         self._newest: _First | None = None  # of these
+        self._latest: dict[tuple[str, int], tuple[int, float]] = {}
+        """Arrival and latency of the newest report, by link and system."""
 
     def is_repeat(self, frame: Frame) -> bool:
         """Count a frame; return True if the same content arrived before it, within the window."""
@@ -55,12 +60,14 @@ class Dedupe:
         key = content(frame.raw)
         first = seen.get(key)
         if first is None:
-            seen[key] = self._newest = _First(t_ns, frame.link)
+            seen[key] = self._newest = _First(t_ns=t_ns, link=frame.link, sysid=frame.source.sysid)
             share.first += 1
             return False
         share.repeats += 1
         if first.latency_s is not None:
-            share.latencies_s.append(first.latency_s + (frame.t_ns - first.t_ns) * 1e-9)
+            latency_s = first.latency_s + (t_ns - first.t_ns) * 1e-9
+            share.latencies_s.append(latency_s)
+            self._note((frame.link, first.sysid), t_ns, latency_s)
         return True
 
     def set_latency(self, latency_s: float) -> None:
@@ -69,6 +76,21 @@ class Dedupe:
         assert first is not None
         first.latency_s = latency_s
         self._share(first.link).latencies_s.append(latency_s)
+        self._note((first.link, first.sysid), first.t_ns, latency_s)
+
+    def latency_s(self, frame: Frame) -> float:
+        """Return the latency of the newest report of a frame's system over its link.
+
+        0 if there was none in the last ``LATENCY_KEPT_NS``.
+        """
+        t_ns, latency_s = self._latest.get(
+            (frame.link, frame.source.sysid), (-LATENCY_KEPT_NS, 0.0)
+        )
+        return latency_s if frame.t_ns - t_ns <= LATENCY_KEPT_NS else 0.0
+
+    def _note(self, of: tuple[str, int], t_ns: int, latency_s: float) -> None:
+        if of in self._latest or len(self._latest) < LINKS_MAX:
+            self._latest[of] = (t_ns, latency_s)
 
     def _share(self, link: str) -> LinkShare:
         share = self.shares.get(link)

@@ -28,12 +28,13 @@ _GVA_M: Final = (None, 150.0, 45.0)
 _VERTICAL_M: Final = (*_GVA_M, 25.0, 10.0, 3.0, 1.0)
 
 
-def adsb(nac_p: int, nac_v: int, gva: int) -> Accuracy | None:
-    """Convert NACp, NACv and GVA to accuracies; None if all are unknown."""
+def adsb(nac_p: int, nac_v: int, gva: int, *, time_error_s: float = 0.0) -> Accuracy | None:
+    """Convert NACp, NACv and GVA to accuracies, with an error of the time; None if all are 0."""
     known = Accuracy(
         horizontal_m=_of(_NACP_M, nac_p),
         vertical_m=_of(_GVA_M, gva),
         velocity_mps=_of(_VELOCITY_MPS, nac_v),
+        time_s=time_error_s or None,
     )
     return known if any(known) else None
 

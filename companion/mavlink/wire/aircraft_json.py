@@ -2,25 +2,29 @@
 
 A document holds the whole state of a receiver, written about once a second; it is polled
 (``links/http_poll.py``). Its keys: ``README-json.md`` of https://github.com/wiedehopf/readsb.
+The age of its positions is known within limits (``document_times``), which the frames state.
 Rejected are aircraft whose position others computed (TIS-B, multilateration), because its accuracy
 is unknown, and addresses that are not ICAO's (``~``).
 """
 
 import json
-import math
 import re
 from collections import OrderedDict
 from typing import Any, Final
 
+from companion.mavlink.wire.document_times import DocumentTimes, Written
 from companion.mavlink.wire.foreign import ForeignSplitter, Items
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState
-from companion.values import Reason
+from companion.values import Reason, Rejection
 
 DOCUMENT_MAX: Final = 8 << 20  # largest document, bytes: some 10 000 aircraft
 AIRCRAFT_MAX: Final = 10_000  # most aircraft read from a document, and remembered
 BRACKETS_MAX: Final = 10 * AIRCRAFT_MAX
 """Most objects and lists in a document; an aircraft has four. Each takes 70 bytes when parsed."""
 AT_ONCE: Final = 8  # aircraft returned by one call; tracking one takes up to 0.3 ms
+AGE_ROUNDING_S: Final = 0.05  # largest error of an age in tenths of seconds
+TRANSPONDER_LATENCY_S: Final = 0.6
+"""Largest age of a position as it is sent (14 CFR 91.227(e), uncompensated latency)."""
 _ICAO: Final = re.compile(r"[0-9A-Fa-f]{6}")
 _NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s", "mode_ac")
 """Types of aircraft that do not report their position themselves."""
@@ -30,12 +34,14 @@ class AircraftJson(ForeignSplitter):
     """Converter of documents to frames; ``feed`` takes a whole one and returns what changed.
 
     It returns ``AT_ONCE`` aircraft, and each call without bytes the next ones. All have the arrival
-    time of their document.
+    time of their document. ``requested`` is called when a document is requested.
     """
 
     def __init__(self, link: str) -> None:
         super().__init__(link)
-        self._written = -math.inf  # when the newest document was written, Unix time in seconds
+        self._times = DocumentTimes()
+        self._stated_s = 0.0  # time of the newest document, by its server
+        self._written = Written(0, 0)
         self._arrived_ns = 0
         self._rest = list[object]()  # aircraft of the newest document, the next one last
         self._true_at: OrderedDict[int, float] = OrderedDict()  # by ICAO address
@@ -45,6 +51,10 @@ class AircraftJson(ForeignSplitter):
         """Whether aircraft of the newest document are not processed yet."""
         return bool(self._rest)
 
+    def requested(self, t_ns: int) -> None:
+        """Take note that a document is requested."""
+        self._times.requested(t_ns)
+
     def feed(self, t_ns: int, data: bytes) -> Items:
         """Read a whole document, or continue with the newest one."""
         is_continued = self._rest and not data
@@ -52,18 +62,19 @@ class AircraftJson(ForeignSplitter):
         return items + self._garbage(t_ns)
 
     def _parse(self, t_ns: int, data: bytes) -> Items:
-        if data or not self._rest:
-            self._read(t_ns, data)
+        unplaced = self._read(t_ns, data) if data or not self._rest else []
+        if unplaced:
+            return unplaced
         if self._rest and self._is_skipped(len(self._rest)):
             self._rest.clear()
             return []
         items: Items = []
         for _ in range(min(AT_ONCE, len(self._rest))):
-            items += self._one(self._arrived_ns, self._rest.pop(), self._written)
+            items += self._one(self._rest.pop())
         return items
 
-    def _read(self, t_ns: int, data: bytes) -> None:
-        """Read a document; an unusable one is garbage."""
+    def _read(self, t_ns: int, data: bytes) -> Items:
+        """Read a document; an unusable one is garbage, and one of unknown age is rejected."""
         self._rest.clear()
         try:
             if len(data) > DOCUMENT_MAX or data.count(b"[") + data.count(b"{") > BRACKETS_MAX:
@@ -71,19 +82,35 @@ class AircraftJson(ForeignSplitter):
             document = json.loads(data)
             if not isinstance(document, dict):
                 raise ValueError("not a JSON object")
-            written = _number(document, "now", 0, 1e11)
+            stated_s = _number(document, "now", 0, 1e11)
             aircraft = document["aircraft"]
-            if written is None or not isinstance(aircraft, list):
+            if stated_s is None or not isinstance(aircraft, list):
                 raise ValueError("no time, or no aircraft")
         except (ValueError, KeyError, RecursionError):
             self._stray += len(data) or 1
-            return
+            return []
         self._complete += 1
-        if written != self._written:  # else the same document as before
-            self._written, self._arrived_ns = written, t_ns
+        stated_ns = round(stated_s * 1e9)
+        is_new = self._times.is_new(stated_ns)
+        written = self._times.arrived(t_ns, stated_ns)
+        if written is not None:
+            self._stated_s, self._written, self._arrived_ns = stated_s, written, t_ns
             self._rest = aircraft[AIRCRAFT_MAX - 1 :: -1]
+        elif is_new and aircraft:
+            return [
+                Rejection(
+                    t_ns=t_ns,
+                    source=self.link,
+                    reason=Reason.UNPLACED_STAMP,
+                    msgid=ADSB_VEHICLE,
+                    count=len(aircraft),
+                    detail="age of the document is unknown",
+                )
+            ]
+        return []
 
-    def _one(self, t_ns: int, entry: object, written: float) -> Items:
+    def _one(self, entry: object) -> Items:
+        t_ns = self._arrived_ns
         try:
             message = _aircraft_state(entry)
             position_age_s = _number(entry, "seen_pos", 0, 86_400)
@@ -94,9 +121,13 @@ class AircraftJson(ForeignSplitter):
         if (
             message is None
             or position_age_s is None
-            or not self._is_news(message, written - position_age_s)
+            or not self._is_news(message, self._stated_s - position_age_s)
         ):
             return []
+        least_s = (t_ns - self._written.latest_ns) * 1e-9 + position_age_s - AGE_ROUNDING_S
+        most_s = (t_ns - self._written.earliest_ns) * 1e-9 + position_age_s + AGE_ROUNDING_S
+        age_s = max(0.0, (least_s + most_s) / 2)
+        message = message._replace(age_s=age_s, time_error_s=most_s - age_s + TRANSPONDER_LATENCY_S)
         return self._aircraft(t_ns, message)
 
     def _is_news(self, message: AircraftState, true_at: float) -> bool:
@@ -136,7 +167,6 @@ def _aircraft_state(entry: object) -> AircraftState | str | None:
     if climb_fpm is None:
         climb_fpm = _number(entry, "baro_rate", -60_000, 60_000)
     callsign = entry.get("flight", "")
-    age_s = _number(entry, "seen_pos", 0, 86_400)
     return AircraftState(
         icao=int(name, 16),
         lat_deg=lat_deg,
@@ -150,8 +180,6 @@ def _aircraft_state(entry: object) -> AircraftState | str | None:
         nac_p=int(_number(entry, "nac_p", 0, 15) or 0),
         nac_v=int(_number(entry, "nac_v", 0, 7) or 0),
         gva=int(_number(entry, "gva", 0, 3) or 0),
-        # The document itself is up to a second old: add half a second on average.
-        age_s=math.floor((age_s or 0.0) + 0.5),
     )
 
 

@@ -15,6 +15,7 @@ from typing import Final
 
 from companion.mavlink.wire.foreign import MLAT, ForeignSplitter, Items
 from companion.mavlink.wire.mode_s import SIZE, Transponders
+from companion.mavlink.wire.stream_lateness import StreamLateness
 from companion.values import Reason
 
 _ESCAPE: Final = b"\x1a"
@@ -22,9 +23,6 @@ _SIZES: Final = {0x31: 9, 0x32: 14, 0x33: 21, 0x34: 21, 0xE3: 8}  # bytes after 
 _START: Final = re.compile(rb"\x1a(?=[\x31-\x34\xe3])")
 _MLAT: Final = b"\xff\x00MLAT"
 _TICK_NS: Final = 1000 / 12
-_OLDEST_NS: Final = 120_000_000_000
-_DRIFT: Final = 100e-6
-"""Largest drift of the counter against this clock: ten times that of a good crystal."""
 
 
 class BeastSplitter(ForeignSplitter):
@@ -33,7 +31,7 @@ class BeastSplitter(ForeignSplitter):
     def __init__(self, link: str) -> None:
         super().__init__(link)
         self._transponders = Transponders()
-        self._lateness = _Lateness()
+        self._lateness = StreamLateness()
 
     def _parse(self, t_ns: int, data: bytes) -> Items:
         data, at = self._pending + data, 0
@@ -66,14 +64,15 @@ class BeastSplitter(ForeignSplitter):
             return []
         if body.startswith(_MLAT):
             return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, MLAT)
-        late_ns = self._lateness.observe(t_ns, int.from_bytes(body[:6], "big"))
+        ticks = int.from_bytes(body[:6], "big")  # 0: the counter does not run
+        late_ns = self._lateness.observe_ns(t_ns, ticks * _TICK_NS) if ticks else 0
         try:
             state = self._transponders.read(t_ns - late_ns, body[7 : 7 + SIZE])
         except ValueError:
             return self._refused(t_ns, Reason.BAD_CRC, "")
         if state is None:
             return []
-        return self._aircraft(t_ns, state._replace(age_s=late_ns // 1_000_000_000))
+        return self._aircraft(t_ns, state._replace(age_s=late_ns * 1e-9))
 
 
 def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:
@@ -97,26 +96,3 @@ def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:
         body.append(data[at])
         at += 1
     return bytes(body), at
-
-
-class _Lateness:
-    """Delay of messages beyond the least delayed message, by the receiver's counter.
-
-    A counter jump larger than the greatest delay of a message is a restart.
-    """
-
-    def __init__(self) -> None:
-        self._floor_ns: float | None = None
-        self._seen_ns = 0
-
-    def observe(self, t_ns: int, ticks: int) -> int:
-        """Return the delay of a message, nanoseconds; 0 if the counter does not run."""
-        if ticks == 0:
-            return 0
-        offset_ns = t_ns - ticks * _TICK_NS
-        if self._floor_ns is not None:
-            self._floor_ns += max(0, t_ns - self._seen_ns) * _DRIFT
-        self._seen_ns = t_ns
-        if self._floor_ns is None or not 0 <= offset_ns - self._floor_ns <= _OLDEST_NS:
-            self._floor_ns = offset_ns
-        return round(offset_ns - self._floor_ns)

@@ -126,8 +126,8 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
 
     ``ver_velocity`` is positive up; ``heading`` is the course over ground. A speed without a course
     gives no velocity, an altitude of an undefined type no altitude. An address of 0 or of more than
-    24 bits (ICAO Annex 10) is rejected. Accuracies are appended if this program wrote the message
-    (``transponder``).
+    24 bits (ICAO Annex 10) is rejected. Accuracies and a finer age are appended if this program
+    wrote the message (``transponder``).
     """
     fields = unpack(frame, _ADSB_VEHICLE)
     icao, lat, lon, alt_mm, heading_cdeg, speed_cmps, climb_cmps, flags = fields[:8]
@@ -140,6 +140,7 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
         course, speed_mps = math.radians(heading_deg), speed_cmps * 1e-2
         velocity_ne_mps = (speed_mps * math.cos(course), speed_mps * math.sin(course))
     datum = _DATUM.get(altitude_type) if flags & _ALTITUDE else None
+    appended = frame.payload[38:43].ljust(5, b"\0") if frame.source == SENDER else bytes(5)
     return AdsbVehicle(
         t_ns=frame.t_ns,
         icao=icao,
@@ -151,10 +152,8 @@ def _adsb_vehicle(frame: Frame) -> AdsbVehicle:
         heading_deg=heading_deg,
         velocity_ne_mps=velocity_ne_mps,
         velocity_down_mps=-climb_cmps * 1e-2 if flags & _VERTICAL else None,
-        tslc_s=tslc_s,
-        accuracy=accuracy.adsb(*frame.payload[38:41].ljust(3, b"\0"))
-        if frame.source == SENDER
-        else None,
+        tslc_s=tslc_s + appended[3] / 256,
+        accuracy=accuracy.adsb(*appended[:3], time_error_s=appended[4] / 10),
     )
 
 

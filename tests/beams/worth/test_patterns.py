@@ -385,6 +385,26 @@ def test_highest_of_nearly_equal_side_lobes_is_reported() -> None:
         assert found.azimuth.side_lobe_db == pytest.approx(exact_db, abs=1e-4)
 
 
+def test_scan_of_a_sparse_array_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of 64 elements a thousand wavelengths apart, the scan for side lobes took minutes."""
+    sparse, weights = line(64, 100.0), np.ones(64, complex)
+    whole = patterns.lobe(sparse, weights, BORESIGHT).azimuth
+    monkeypatch.setattr(patterns, "SCAN_MAX", 64 * 4000)
+    lobe = patterns.lobe(sparse, weights, BORESIGHT)
+    assert lobe.azimuth.half_power_width_rad == whole.half_power_width_rad
+    assert whole.side_lobe_db is not None and lobe.azimuth.side_lobe_db is None
+    scanned = list[int]()
+    gains = patterns._gains
+
+    def counted(array: Array, weights: ComplexArray, directions: FloatArray) -> FloatArray:
+        scanned.append(directions.size // 3)
+        return gains(array, weights, directions)
+
+    monkeypatch.setattr(patterns, "_gains", counted)
+    patterns.lobe(sparse, np.exp(1j * np.arange(64) ** 2), BORESIGHT)
+    assert max(scanned) <= 2 * 4001
+
+
 def test_grating_lobes_count_as_side_lobes_but_mirror_lobe_does_not() -> None:
     """Spacing of one wavelength: equally strong at endfire. A circle covers all around and has
     none."""

@@ -19,7 +19,7 @@ from companion.mavlink.wire.encode import heartbeat
 from companion.values import Reason, Source
 
 AIRCRAFT = {"hex": "a2fcf2", "lat": 47.1, "lon": -122.3, "alt_geom": 5650, "seen_pos": 0.1}
-DOCUMENT = json.dumps({"now": 100.0, "aircraft": [AIRCRAFT]}).encode()
+DOCUMENT = b'{"now": %.1f, "aircraft": [' + json.dumps(AIRCRAFT).encode() + b"]}"
 EVENT = (
     b'<event uid="A" type="a-f-A" time="2026-11-22T10:00:00Z" how="m-g">'
     b'<point lat="51.4" lon="-0.1" hae="120" ce="4" le="9"/></event>'
@@ -34,7 +34,10 @@ def run(request: pytest.FixtureRequest) -> Run:
 
 @contextlib.asynccontextmanager
 async def answering(*pieces: bytes, hangs: bool = False) -> AsyncIterator[tuple[str, list[bytes]]]:
-    """Run a server with a fixed response; yields its URL and the received requests."""
+    """Run a server with a fixed response, but for the number of the request in a document.
+
+    Yields its URL and the received requests.
+    """
     asked: list[bytes] = []
     stop = asyncio.Event()
 
@@ -42,7 +45,7 @@ async def answering(*pieces: bytes, hangs: bool = False) -> AsyncIterator[tuple[
         with contextlib.suppress(OSError, EOFError):
             asked.append(await reader.readuntil(b"\r\n\r\n"))
             for piece in pieces:
-                writer.write(piece)
+                writer.write(piece % len(asked) if b"%" in piece else piece)
                 await writer.drain()
             if hangs:
                 await stop.wait()
@@ -115,6 +118,7 @@ def test_http_document_becomes_frames(run: Run, status: bytes) -> None:
         async with answering(*pieces) as (url, asked), running(url) as (link, inbox):
             await inbox.until(1)
             assert (link.status.state, link.status.frames) == ("up", 1)
+            assert link.status.lost == {Reason.UNPLACED_STAMP: 1}  # the first document
         (first, *_) = asked
         assert first.startswith(b"GET /data/aircraft.json?a=b HTTP/1.0\r\nHost: 127.0.0.1:")
 
@@ -148,7 +152,10 @@ def test_endless_http_response_times_out(run: Run, monkeypatch: pytest.MonkeyPat
 
     async def test() -> None:
         head = b"HTTP/1.0 200 OK\r\n\r\n"
-        async with answering(head, DOCUMENT, hangs=True) as (url, _), running(url) as (_, inbox):
+        async with (
+            answering(head, DOCUMENT % 1, hangs=True) as (url, _),
+            running(url) as (_, inbox),
+        ):
             await inbox.until_said(1)
             assert "timed out" in inbox.texts[0]
             assert not inbox.items
@@ -357,6 +364,41 @@ def test_web_server_without_valid_documents_is_announced(
             seen = len(inbox.items)
             await inbox.until_true(lambda: len(inbox.items) > seen + 3)  # it is still polled
             assert len(inbox.texts) == 1
+
+    run(test())
+
+
+def test_receiver_that_stopped_is_announced(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Its web server continues; and the receiver is back."""
+    monkeypatch.setattr(http_poll, "PERIOD_S", 0.001)
+    monkeypatch.setattr(http_poll, "UNCHANGED_S", 0.02)
+    monkeypatch.setattr(transport, "RETRY_S", (0.001,))
+    monkeypatch.setattr(transport, "STEADY_S", 0.0)
+
+    async def test() -> None:
+        head = b"HTTP/1.0 200 OK\r\n\r\n"
+        body = [DOCUMENT % 100]
+
+        async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            with contextlib.suppress(OSError, EOFError):
+                await reader.readuntil(b"\r\n\r\n")
+                writer.write(head + body[0])
+                await writer.drain()
+            writer.close()
+
+        server = await asyncio.start_server(answer, "127.0.0.1", 0)
+        url = f"readsb:http://127.0.0.1:{server.sockets[0].getsockname()[1]}/aircraft.json"
+        async with server, running(url) as (link, inbox):
+            await inbox.until_said(1)
+            assert "the document has not changed for 0 s" in inbox.texts[0]
+            assert not inbox.frames and link.status.state != "up"
+            polled = link.status.bytes
+            await until_true(lambda: link.status.bytes > polled + 5 * len(body[0]))
+            assert link.status.state != "up" and len(inbox.texts) == 1
+            body[0] = DOCUMENT % 101
+            await inbox.until(1)
+            await inbox.until_said(2)
+            assert inbox.texts[1].endswith("is back")
 
     run(test())
 

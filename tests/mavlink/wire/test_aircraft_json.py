@@ -1,6 +1,7 @@
 """``aircraft.json``: its content, new positions in it, and invalid documents."""
 
 import json
+import math
 from typing import Any
 
 import pytest
@@ -13,6 +14,7 @@ from companion.mavlink.wire.aircraft_json import (
     AT_ONCE,
     BRACKETS_MAX,
     DOCUMENT_MAX,
+    TRANSPONDER_LATENCY_S,
     AircraftJson,
 )
 from companion.mavlink.wire.decode import decode
@@ -32,8 +34,15 @@ def document(*aircraft: Any, now: Any = 1_600_000_000.0) -> bytes:
     return json.dumps({"now": now, "messages": 7, "aircraft": list(aircraft)}).encode()
 
 
+def polling() -> AircraftJson:
+    """A link that has received a document without aircraft, since the first has an unknown age."""
+    poll = AircraftJson("x")
+    assert poll.feed(0, document(now=1.0)) == []
+    return poll
+
+
 def fed(*aircraft: Any) -> list[Frame | Rejection]:
-    return AircraftJson("x").feed(7, document(*aircraft))
+    return polling().feed(7, document(*aircraft))
 
 
 def said(**changed: Any) -> AdsbVehicle:
@@ -54,15 +63,15 @@ def test_aircraft_json_matches_pymavlink() -> None:
     assert theirs.altitude == round(5650 * 304.8)
     assert theirs.altitude_type == dialect.ADSB_ALTITUDE_TYPE_GEOMETRIC
     assert theirs.hor_velocity == round(250 * 1852 / 36)
-    assert (theirs.heading, theirs.ver_velocity, theirs.tslc) == (69, round(-960 * 0.508), 1)
+    assert (theirs.heading, theirs.ver_velocity, theirs.tslc) == (69, round(-960 * 0.508), 0)
 
 
 def test_accuracy_codes_are_95_percent_limits() -> None:
     told = said().accuracy
     assert told is not None
-    assert told == pytest.approx((0.617 * 10, 0.617 * 45, 0.617 * 3, None), rel=1e-3)
-    assert said(nac_p=0, nac_v=0, gva=0).accuracy is None
-    assert said(nac_p=15, nac_v=7, gva=3).accuracy is None
+    assert told[:3] == pytest.approx((0.617 * 10, 0.617 * 45, 0.617 * 3), rel=1e-3)
+    for unknown in (said(nac_p=0, nac_v=0, gva=0), said(nac_p=15, nac_v=7, gva=3)):
+        assert unknown.accuracy is not None and unknown.accuracy[:3] == (None, None, None)
 
 
 def test_missing_fields_are_unknown() -> None:
@@ -72,7 +81,7 @@ def test_missing_fields_are_unknown() -> None:
     found = decode(frame)
     assert isinstance(found, AdsbVehicle)
     assert found.alt_m is found.velocity_ne_mps is found.velocity_down_mps is found.callsign is None
-    assert found.tslc_s == 4
+    assert found.tslc_s == pytest.approx(3.9 + 0.1, abs=1 / 256)  # written up to 0.2 s ago
     assert said(alt_geom=None).alt_datum is AltitudeDatum.PRESSURE
     assert said(alt_geom=None, alt_baro="ground").alt_m is None
     for away in ("lat", "lon", "seen_pos"):
@@ -80,12 +89,45 @@ def test_missing_fields_are_unknown() -> None:
 
 
 def test_only_new_positions_are_delivered() -> None:
+    poll, s = polling(), 1_000_000_000
+    assert len(poll.feed(0, document(ONE, now=100.0))) == 1
+    assert poll.feed(1, document(ONE | {"seen_pos": 0.2}, now=100.0)) == []  # the same document
+    assert poll.feed(s, document(ONE | {"seen_pos": 1.5}, now=101.0)) == []  # the same position
+    assert len(poll.feed(2 * s, document(ONE | {"seen_pos": 0.1}, now=102.0))) == 1
+    (unplaced,) = poll.feed(3 * s, document(ONE, now=5.0))  # the server's clock was set
+    assert isinstance(unplaced, Rejection) and unplaced.reason is Reason.UNPLACED_STAMP
+    assert len(poll.feed(4 * s, document(ONE, now=6.0))) == 1
+
+
+def test_document_of_unknown_age_is_rejected() -> None:
+    """The receiver of the first may have stopped an hour ago."""
     poll = AircraftJson("x")
-    assert len(poll.feed(1, document(ONE, now=100.0))) == 1
-    assert poll.feed(2, document(ONE | {"seen_pos": 0.2}, now=100.0)) == []  # the same document
-    assert poll.feed(3, document(ONE | {"seen_pos": 1.5}, now=101.0)) == []  # the same position
-    assert len(poll.feed(4, document(ONE | {"seen_pos": 0.1}, now=102.0))) == 1
-    assert len(poll.feed(5, document(ONE, now=5.0))) == 1  # the server's clock was changed
+    (refused,) = poll.feed(7, document(ONE, ONE))
+    assert isinstance(refused, Rejection)
+    assert (refused.reason, refused.count) == (Reason.UNPLACED_STAMP, 2)
+
+
+@pytest.mark.parametrize("answers_after_s", [0.0, 0.4, 1.5, 3.0])
+@pytest.mark.parametrize("read", [0.0, 0.5, 1.0])  # when, as a share of that time
+def test_position_is_as_old_as_stated(answers_after_s: float, read: float) -> None:
+    """A server reads its document at any time between request and answer."""
+    poll, asked_s, largest_s = AircraftJson("x"), 1000.0, 0.0
+    for number in range(60):
+        poll.requested(round(asked_s * 1e9))
+        written_s = math.floor(asked_s + read * answers_after_s - 0.3) + 0.3  # once a second
+        aircraft = ONE | {"seen_pos": 0.5, "lat": number}
+        arrival_ns = round((asked_s + answers_after_s) * 1e9)
+        found = poll.feed(arrival_ns, document(aircraft, now=round(written_s, 1)))
+        asked_s += max(1.02, answers_after_s + 0.01)
+        if number and found:
+            (frame,) = found
+            assert isinstance(frame, Frame)
+            told = decode(frame)
+            assert isinstance(told, AdsbVehicle)
+            assert told.accuracy is not None and told.accuracy.time_s is not None
+            largest_s = told.accuracy.time_s - TRANSPONDER_LATENCY_S
+            assert abs(told.true_ns * 1e-9 - (written_s - 0.5)) <= largest_s
+    assert 0 < largest_s < 0.5 + answers_after_s
 
 
 @pytest.mark.parametrize(
@@ -134,13 +176,13 @@ def test_invalid_document_is_counted_in_bytes(data: bytes) -> None:
 
 
 def test_too_many_aircraft_use_bounded_memory() -> None:
-    poll = AircraftJson("x")
+    poll = polling()
     for start in (0, AIRCRAFT_MAX // 2):
         many = [
             {"hex": f"{number + 1:06x}", "lat": 1, "lon": 1, "seen_pos": 0, "alt_geom": 1}
             for number in range(start, start + AIRCRAFT_MAX + 5)
         ]
-        found = poll.feed(7, document(*many, now=start))
+        found = poll.feed(7, document(*many, now=2.0 + 0.19 * bool(start)))
         assert poll.has_more
         while poll.has_more:
             more = poll.feed(99, b"")

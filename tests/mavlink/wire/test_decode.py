@@ -210,7 +210,7 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
                 heading_deg=m.heading / 100,
                 velocity_ne_mps=(speed * math.cos(course), speed * math.sin(course)),
                 velocity_down_mps=-m.ver_velocity / 100,
-                tslc_s=m.tslc,
+                tslc_s=float(m.tslc),
             )
     return None
 
@@ -518,7 +518,7 @@ def test_adsb_payload_truncated_within_its_flags() -> None:
         heading_deg=None,
         velocity_ne_mps=None,
         velocity_down_mps=None,
-        tslc_s=0,
+        tslc_s=0.0,
     )
 
 

@@ -90,9 +90,26 @@ def test_published_sbs_stream_decodes() -> None:
 
 def test_delayed_line_has_its_age() -> None:
     assert said(LATE).tslc_s == 255  # 300 s, limited to the field's maximum
-    assert said(CALLED).tslc_s == 2
+    assert said(CALLED).tslc_s == 2.25
     assert said(line(f7="14:59:00.000")).tslc_s == 0  # from the future
     assert said(line(f6="", f7="")).tslc_s == 0
+
+
+def test_late_stream_is_in_the_age_and_its_error() -> None:
+    """A line may be 4 s late, or its writer's clock was set back by as much."""
+    splitter = SbsSplitter("x")
+    stated = [("14:58:00.500", 10), ("14:58:01.500", 11), ("14:58:02.500", 16), ("14:58:07.6", 17)]
+    found = []
+    for stamp, arrival_s in stated:
+        text = line(f6="2008/11/28", f7=stamp, f8="2008/11/28", f9=stamp)
+        (frame,) = splitter.feed(arrival_s * 1_000_000_000, text.encode() + b"\n")
+        assert isinstance(frame, Frame)
+        told = decode(frame)
+        assert isinstance(told, AdsbVehicle)
+        found.append((told.tslc_s, told.accuracy.time_s if told.accuracy else None))
+    assert found[:2] == [(0, None), (0, None)]
+    assert found[2] == (pytest.approx(2.0, abs=0.005), pytest.approx(3.0, abs=0.101))
+    assert found[3] == (0, None)
 
 
 def test_fields_missing_from_a_line_are_unknown() -> None:

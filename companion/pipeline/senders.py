@@ -24,7 +24,7 @@ from companion.mavlink.trust.dedupe import Dedupe, LinkShare
 from companion.mavlink.trust.remote_id import RemoteIds
 from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, gnss_heading
 from companion.mavlink.wire.decode import ATTITUDE, decode
-from companion.mavlink.wire.stamps import boot_ms
+from companion.mavlink.wire.stamps import boot_ms, step_ms
 from companion.pipeline import assembly
 from companion.pipeline.records import RECORDS_MAX, Records, UavRecords
 from companion.settings.model import Settings
@@ -55,9 +55,12 @@ from companion.values import (
     Source,
     StatedAttitude,
     SystemTime,
+    UavKind,
     kind_of,
 )
 
+CONFIRMED_NS: Final = 5_000_000_000
+"""Largest difference between the steps of arrivals and of stamps of two reports that agree."""
 TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 RECEIVER_WAIT_NS: Final = 10_000_000_000  # time for which a new track waits for its GNSS receiver
 STATUS_REORDER_MAX_US: Final = 30_000_000
@@ -145,13 +148,22 @@ class Timeline(NamedTuple):
         )
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class Sender:
     """Sender with a clock: a vehicle, or an aircraft that broadcasts its own stamps."""
 
     clock: SenderClock
     stamped_ns: int | None = None  # arrival of the clock's newest stamp; None: none yet
     is_shared: bool = False  # whether a notice said that two senders share this id
+    first: tuple[int, int] | None = None  # arrival and stamp of a report that none confirmed yet
+
+    def is_confirmed(self, arrival_ns: int, boot_ms: int) -> bool:
+        """Return whether the stamp of a first report agrees with that of the report before it."""
+        before, self.first = self.first, (arrival_ns, boot_ms)
+        if before is None:
+            return False
+        elapsed_ns = step_ms(boot_ms, before[1]) * 1_000_000
+        return abs(arrival_ns - before[0] - elapsed_ns) <= CONFIRMED_NS
 
 
 @dataclass(slots=True, kw_only=True)
@@ -196,7 +208,7 @@ class Senders:
         self._carrier_source = None if carrier is None else Source.parse(carrier)
         self._records = records
         self._tracked = tracked
-        self._senders = Records(lambda: Sender(assembly.clock(settings)), self._is_kept)
+        self._senders = Records(lambda: Sender(clock=assembly.clock(settings)), self._is_kept)
         self._noise_settings = assembly.noise(settings)
         self._components: defaultdict[Source, ComponentState] = defaultdict(
             lambda: ComponentState(noise=StatedNoise(self._noise_settings.default))
@@ -313,6 +325,12 @@ class Senders:
         if uav not in self._senders and len(self._senders) >= RECORDS_MAX and not is_own:
             return _refused(report, Reason.TOO_MANY)  # ids can be forged in any number
         sender = self._senders[uav]
+        if (
+            sender.stamped_ns is None
+            and kind_of(uav) is UavKind.COT
+            and not sender.is_confirmed(t_ns, report.boot_ms)
+        ):  # servers send old events to each new client
+            return _refused(report, Reason.UNPLACED_STAMP)
         stamp, said = self._stamp(sender, uav, t_ns, report.boot_ms, doubt_ns)
         restarted = uav if said else None
         if sender.clock.is_shared(t_ns):
@@ -469,6 +487,8 @@ class Senders:
         if kind_of(name).reports_itself and (source := Source.parse(name)) in self._components:
             self._components[source].stated_us = 0
         text = f"{name} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
+        if kind_of(name) is UavKind.COT:  # its events have times of day
+            text = f"{name}: track restarted: the times of its events stepped back"
         return stamp, (Notice(t_ns=arrival_ns, severity=Severity.WARNING, subject=name, text=text),)
 
     def time(self, uav: str, node_ns: int) -> SenderTime:

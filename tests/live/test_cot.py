@@ -27,11 +27,10 @@ def test_cot_events_are_received_and_replay_identically(start_node: Any, tmp_pat
         peer, _ = server.accept()
         with peer, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sender:
             sender.connect(("127.0.0.1", int(listening.rpartition(":")[2])))
-            sender.send(EVENT.format("A", 0, 0).encode())
-            peer.sendall(
-                EVENT.format("B", 0, 0).encode() + b"noise" + EVENT.format("B", 1, 1).encode()
-            )
-            sender.send(EVENT.format("A", 1, 1).encode())
+            for number in range(3):  # the first of each is not confirmed
+                sender.send(EVENT.format("A", number, number).encode())
+            b = [EVENT.format("B", number, number).encode() for number in range(3)]
+            peer.sendall(b[0] + b"noise" + b[1] + b[2])
             answer = node.wait_until(
                 "/v1/uavs",
                 lambda answer: sorted(one["reports"] for one in answer["uavs"]) == [2, 2],
@@ -48,5 +47,5 @@ def test_cot_events_are_received_and_replay_identically(start_node: Any, tmp_pat
     )  # fmt: skip
     summary = json.loads(done.stdout)
     assert summary["reports"] == {"cot:A": 2, "cot:B": 2}
-    assert summary["rejected"] == {"garbage": 5}
+    assert summary["rejected"] == {"garbage": 5, "unplaced-stamp": 2}
     assert summary["digest"] == read_metadata(recording)["summary"]["digest"]

@@ -56,7 +56,7 @@ def test_packets_ten_seconds_late_move_no_uav_backwards(start_node: Any, tmp_pat
     Forwarding every packet would move each vehicle back by ten seconds at each late one. The output
     matches the logged position at its stated time.
     """
-    truth = flown(tmp_path / "flight.tlog", 25.0)
+    truth = flown(tmp_path / "flight.tlog", 30.0)
     heard: dict[int, list[tuple[float, Any]]] = defaultdict(list)
     mav: Any = dialect.MAVLink(None)
     with bound() as far_end:
@@ -74,7 +74,9 @@ def test_packets_ten_seconds_late_move_no_uav_backwards(start_node: Any, tmp_pat
             subprocess.Popen([*player, links[1], "--fault", "delay=10"], stdout=subprocess.DEVNULL),
         ]
         try:
-            while min((len(said) for said in heard.values()), default=0) < 180:
+            while (
+                min((len(said) for said in heard.values()), default=0) < 260
+            ):  # after 20 s both links are known
                 said = mav.decode(bytearray(far_end.recv(1000)))
                 heard[said.get_srcSystem()].append((time.monotonic(), said))
         finally:

@@ -180,12 +180,25 @@ def test_work_for_a_relayed_report_does_not_grow_with_the_number_of_aircraft() -
 def test_cot_event_errors_and_delay_are_applied() -> None:
     """Three standard deviations plus the distance flown in one second."""
     fold = pipeline(tracks={"window_s": 20.0})
+    assert estimates(fold, event(-1)) == []  # the first is not confirmed
     for n in range(20):
         (heard,) = estimates(fold, event(n))
     assert heard.fix.noise.horizontal_m == pytest.approx(15 + 5, abs=0.1)
     (late,) = estimates(fold, event(9.5, late_s=10.0, ce=9_999_999))
     assert late.fix.noise.horizontal_m == pytest.approx(100 + 5, abs=0.1)
     assert late.fix.t_ns == pytest.approx(START_NS + 9.5 * S, abs=0.2 * S)
+
+
+@pytest.mark.parametrize("hours", [-1, 1])
+def test_old_event_before_others_is_not_used(hours: int) -> None:
+    """A server sends old events to each new client: the aircraft was shown where it had been."""
+    fold = pipeline()
+    wrong = event(3600 * hours, late_s=-3600 * hours)
+    assert estimates(fold, wrong) == []
+    assert estimates(fold, event(0.2)) == []
+    for n in range(1, 10):
+        (heard,) = estimates(fold, event(n))
+        assert heard.fix.t_ns == pytest.approx(START_NS + n * S, abs=0.1 * S)
 
 
 def test_distant_aircraft_keeps_its_own_track() -> None:
@@ -294,15 +307,18 @@ def test_invented_ids_use_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> Non
     template = event(0).raw
     at = template.index(b"HAWK")
     seen: Counter[object] = Counter()
-    for number in range(3 * RECORDS_MAX):
-        raw = template[:at] + f"{number:04x}".encode() + template[at + 4 :]
-        for said in fold.step(event(0)._replace(raw=raw)):
+    later = event(1).raw
+    for number in range(6 * RECORDS_MAX):
+        raw = later if number % 2 else template  # the second confirms the first
+        raw = raw[:at] + f"{number // 2:04x}".encode() + raw[at + 4 :]
+        for said in fold.step(event(number % 2)._replace(raw=raw)):
             seen[said.reason if isinstance(said, Rejection) else type(said)] += 1
     assert len(fold.senders._senders) <= RECORDS_MAX
     assert len(fold.records) <= RECORDS_MAX
     assert fold.senders._assumed.cache_info().currsize <= RECORDS_MAX
     assert len(fold.tracker.uavs) == seen[Estimate] == TRACKS_MAX
-    assert seen[Reason.TOO_MANY] == 3 * RECORDS_MAX - TRACKS_MAX
+    assert seen[Reason.UNPLACED_STAMP] <= 3 * RECORDS_MAX
+    assert seen[Reason.TOO_MANY] + seen[Reason.UNPLACED_STAMP] == 6 * RECORDS_MAX - TRACKS_MAX
 
 
 def summary(t_s: float, **given: int) -> Frame:

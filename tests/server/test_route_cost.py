@@ -283,7 +283,7 @@ def offenders(
 def test_no_route_holds_the_event_loop(
     both: tuple[Serving, Serving], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    assert len(both[1].node.pipeline.tracker) == UAVS
+    assert len(both[1].node.pipeline.tracker) >= UAVS
 
     def held(serving: Serving, path: str) -> float:
         return held_by_route(serving, filled(path), STATUSES.get(path, {200}), monkeypatch)

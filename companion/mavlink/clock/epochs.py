@@ -41,6 +41,7 @@ _RUN_KEPT: Final = 64  # stamps kept of a run
 _RIVAL_LASTS_NS: Final = 3 * _NS
 """Least duration of a second clock line under one id before it counts as a second clock."""
 _RIVAL_SILENT_NS: Final = 10 * _NS  # silence after which a second clock is forgotten
+_RIVALS_MAX: Final = 4  # other clocks under one id that are followed
 
 
 class PlacedStamp(NamedTuple):
@@ -68,9 +69,7 @@ class _RivalLine:
         Returns whether the stamp is now the newest of the run.
         """
         lag_ns = arrival_ns - boot_ms * _NS_PER_MS
-        if self.stamps and max(abs(lag_ns - self.lowest_ns), abs(lag_ns - self.highest_ns)) > (
-            spread_ns
-        ):
+        if self.stamps and not self.has_place(arrival_ns, boot_ms, spread_ns):
             self.stamps.clear()
         if not self.stamps:
             self.lowest_ns = self.highest_ns = lag_ns
@@ -83,6 +82,11 @@ class _RivalLine:
         del self.stamps[:-_RUN_KEPT]
         return True
 
+    def has_place(self, arrival_ns: int, boot_ms: int, spread_ns: int) -> bool:
+        """Return whether a stamp is at most ``spread_ns`` off the others."""
+        lag_ns = arrival_ns - boot_ms * _NS_PER_MS
+        return self.highest_ns - spread_ns <= lag_ns <= self.lowest_ns + spread_ns
+
     def forget(self, arrival_ns: int) -> None:
         """Drop all stamps if the newest is more than ``_RIVAL_SILENT_NS`` old."""
         if self.stamps and arrival_ns - self.stamps[-1][0] > _RIVAL_SILENT_NS:
@@ -91,6 +95,45 @@ class _RivalLine:
     def lasts(self, count: int, span_ns: int) -> bool:
         """Return whether the run has at least ``count`` stamps over at least ``span_ns``."""
         return len(self.stamps) >= count and self.stamps[-1][0] - self.stamps[0][0] >= span_ns
+
+
+class _RivalLines:
+    """Lines of stamps off the line: more than one where several senders share an id."""
+
+    def __init__(self) -> None:
+        self._lines: list[_RivalLine] = []
+
+    def add(self, arrival_ns: int, boot_ms: int, spread_ns: int) -> None:
+        """Add a stamp to the line on which it has a place, or begin one."""
+        self.forget(arrival_ns)
+        for line in self._lines:
+            if line.has_place(arrival_ns, boot_ms, spread_ns):
+                break
+        else:
+            line = _RivalLine()
+            self._lines.append(line)
+            del self._lines[:-_RIVALS_MAX]
+        line.add(arrival_ns, boot_ms, spread_ns)
+
+    def forget(self, arrival_ns: int) -> None:
+        """Drop the lines that are silent."""
+        for line in self._lines:
+            line.forget(arrival_ns)
+        self._lines = [line for line in self._lines if line.stamps]
+
+    def clear(self) -> None:
+        """Drop all lines."""
+        self._lines.clear()
+
+    def has_clock(self, arrival_ns: int) -> bool:
+        """Return whether one of the lines has lasted long enough to be a clock of its own."""
+        if not self._lines:  # nearly always
+            return False
+        self.forget(arrival_ns)
+        return any(
+            len(line.stamps) >= 5 and line.stamps[-1][0] - line.begun_ns >= _RIVAL_LASTS_NS
+            for line in self._lines
+        )
 
 
 class BootLine:
@@ -111,7 +154,7 @@ class BootLine:
         self.since_ns: int | None = None
         self._run = _RivalLine()
         self._ahead = _RivalLine()  # early stamps that are not confirmed yet
-        self._rival = _RivalLine()
+        self._rivals = _RivalLines()
         self._previous: tuple[Floor, int] | None = None  # the previous line, and when it was left
 
     def observe(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
@@ -134,8 +177,7 @@ class BootLine:
         if late_ns > 0 and x_ns > self.newest_ns:
             return self._place_delayed(arrival_ns, boot_ms, x_ns)
         advances = self._run.add(arrival_ns, boot_ms, self._late_max_ns)
-        self._rival.forget(arrival_ns)
-        self._rival.add(arrival_ns, boot_ms, self._late_max_ns)
+        self._rivals.add(arrival_ns, boot_ms, self._late_max_ns)
         if not (advances and self._run.lasts(3, _NS // 2)):
             return None
         stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % WRAP_MS
@@ -158,11 +200,7 @@ class BootLine:
 
     def is_shared(self, arrival_ns: int) -> bool:
         """Return whether a second clock runs beside the line: two senders then share one id."""
-        if not self._rival.stamps:  # nearly always
-            return False
-        self._rival.forget(arrival_ns)
-        stamps = self._rival.stamps
-        return len(stamps) >= 5 and stamps[-1][0] - self._rival.begun_ns >= _RIVAL_LASTS_NS
+        return self._rivals.has_clock(arrival_ns)
 
     def unwrap(self, boot_ms: int) -> int:
         """Convert boot milliseconds to ns, unwrapped to the value nearest to the newest stamp."""
@@ -239,7 +277,7 @@ class BootLine:
         stamps = list(self._run.stamps)
         self._run.stamps.clear()
         self._ahead.stamps.clear()
-        self._rival.stamps.clear()
+        self._rivals.clear()
         before = self.floor
         self.since_ns = stamps[0][0]
         self._previous = (before, self.since_ns)

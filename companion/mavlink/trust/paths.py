@@ -11,8 +11,8 @@ vehicle: ``SLACK_M``, the noise of any report, and the distance flown in ``STALE
 
 import math
 from collections import deque
-from collections.abc import Iterator
-from itertools import pairwise
+from collections.abc import Iterable, Iterator
+from itertools import chain, pairwise
 from typing import Final
 
 from companion.mavlink.wire.positions import OwnPosition
@@ -27,6 +27,8 @@ STRETCH_MS: Final = 2000
 AHEAD_MS: Final = 250  # longest time by which a report is compared with an older one
 RESTARTED_MS: Final = 10_000  # a stamp that is further off is from another boot, or clock
 REPORTS_KEPT: Final = 32  # newest reports kept of a peer
+OLDER_KEPT: Final = 32  # older ones, ``OLDER_MS`` apart: a second link may be ten seconds late
+OLDER_MS: Final = 500
 
 _METRES: Final = 111_195.0 * 1e-7  # metres in 1e-7 degrees of latitude
 
@@ -34,24 +36,34 @@ _METRES: Final = 111_195.0 * 1e-7  # metres in 1e-7 degrees of latitude
 class Path:
     """Newest reports of a sender over one peer, in the order of their stamps."""
 
-    __slots__ = ("reports",)
+    __slots__ = ("_older", "_reports")
 
     def __init__(self) -> None:
-        self.reports: deque[OwnPosition] = deque(maxlen=REPORTS_KEPT)
+        self._reports: deque[OwnPosition] = deque()
+        self._older: deque[OwnPosition] = deque(maxlen=OLDER_KEPT)
 
     @property
     def newest(self) -> OwnPosition | None:
         """The report with the latest stamp; None without reports."""
-        return self.reports[-1] if self.reports else None
+        return self._reports[-1] if self._reports else None
+
+    def newest_first(self) -> Iterator[OwnPosition]:
+        """Return the reports that are kept, the newest first."""
+        return chain(reversed(self._reports), reversed(self._older))
 
     def add(self, said: OwnPosition) -> bool:
         """Add a report, and return whether it continues the path; a restart begins another."""
         before = self.newest
         if before is not None and said.boot_ms <= before.boot_ms:
             if before.boot_ms - said.boot_ms > RESTARTED_MS:
-                self.reports.clear()
+                self._reports.clear()
+                self._older.clear()
             return False
-        self.reports.append(said)
+        self._reports.append(said)
+        if len(self._reports) > REPORTS_KEPT:
+            last = self._reports.popleft()
+            if not self._older or last.boot_ms - self._older[-1].boot_ms >= OLDER_MS:
+                self._older.append(last)
         return True
 
     def excess_m(
@@ -63,9 +75,9 @@ class Path:
         the stretch that it ends, which begins at ``before``. None: not comparable. Above
         ``SLACK_M`` the two contradict each other.
         """
-        pairs = [(said, *stretch) for stretch in around(other.reports, said.boot_ms)]
+        pairs = [(said, *stretch) for stretch in around(other.newest_first(), said.boot_ms)]
         if before is not None:
-            pairs += [(one, before, said) for one in within(other.reports, before, said)]
+            pairs += [(one, before, said) for one in within(other.newest_first(), before, said)]
         excesses = [one for one in (_excess_m(*pair) for pair in pairs) if one is not None]
         return max(excesses, default=None)
 
@@ -95,9 +107,11 @@ class Path:
         return off_m - stale_m - ACCELERATION_MPS2 * ahead_s**2 / 2
 
 
-def around(reports: deque[OwnPosition], boot_ms: int) -> Iterator[tuple[OwnPosition, OwnPosition]]:
+def around(
+    newest_first: Iterable[OwnPosition], boot_ms: int
+) -> Iterator[tuple[OwnPosition, OwnPosition]]:
     """Yield the stretches of a path that contain a stamp (one, or two that meet), newest first."""
-    for last, first in pairwise(reversed(reports)):
+    for last, first in pairwise(newest_first):
         if boot_ms > last.boot_ms:
             return
         if first.boot_ms <= boot_ms:
@@ -105,10 +119,10 @@ def around(reports: deque[OwnPosition], boot_ms: int) -> Iterator[tuple[OwnPosit
 
 
 def within(
-    reports: deque[OwnPosition], first: OwnPosition, last: OwnPosition
+    newest_first: Iterable[OwnPosition], first: OwnPosition, last: OwnPosition
 ) -> Iterator[OwnPosition]:
     """Yield the reports of a path with stamps between those of two others, the newest first."""
-    for one in reversed(reports):
+    for one in newest_first:
         if one.boot_ms < first.boot_ms:
             return
         if one.boot_ms <= last.boot_ms:

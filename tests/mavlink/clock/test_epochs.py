@@ -347,6 +347,14 @@ def test_two_concurrent_clocks_are_reported_as_a_shared_id(apart_ms: int) -> Non
     assert found == [t for t, _ in sorted([*first, *second]) if t >= found[0]]
 
 
+def test_more_than_two_concurrent_clocks_are_reported_as_a_shared_id() -> None:
+    """Each stamp of one began the run of another again, and the first was believed for ever."""
+    first = run(0, 5_000_000, 100)
+    ahead, behind = run(10_050, 8_610_000, 50), run(10_100, 1_410_000, 50)
+    found = shared_at(sorted([*first, *ahead, *behind]))
+    assert 12_500 <= found[0] <= 13_600
+
+
 def test_first_clock_is_trusted_again_after_the_second_falls_silent() -> None:
     first, second = run(0, 5_000_000, 200), run(5_050, 9_000_000, 40)
     found = shared_at(sorted([*first, *second]))

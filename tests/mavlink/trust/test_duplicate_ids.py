@@ -164,5 +164,5 @@ def test_path_search_from_the_newest_matches_a_full_search(
     first, last = said(boot_ms), said(boot_ms + later_ms)
     around = [one for one in pairwise(reports) if one[0].boot_ms <= boot_ms <= one[1].boot_ms]
     within = [one for one in reports if first.boot_ms <= one.boot_ms <= last.boot_ms]
-    assert list(paths.around(reports, boot_ms)) == around[::-1]
-    assert list(paths.within(reports, first, last)) == within[::-1]
+    assert list(paths.around(reversed(reports), boot_ms)) == around[::-1]
+    assert list(paths.within(reversed(reports), first, last)) == within[::-1]

@@ -17,7 +17,7 @@ from companion.pipeline.sighted_uavs import Look, Looks, SightedUavs
 from companion.settings.observations import ObservationSettings
 from companion.tracking import compass
 from companion.tracking.carrier import USUAL_ATTITUDE
-from companion.tracking.compass import ErrorSet, Misalignment, Seen
+from companion.tracking.compass import ErrorBounds, ErrorSet, Misalignment, Seen
 from companion.tracking.relative import Relative
 from companion.tracking.rotations import angle_between_rad, rotation, rotation_angle_rad
 from companion.tracking.sightings import Sightings, possible
@@ -61,6 +61,19 @@ class ArrayCompass:
         """Largest angle of the error of reported attitudes."""
         return self.bound_rad if self.error is None else min(self.error.largest_rad, self.bound_rad)
 
+    @property
+    def turning_rad(self) -> float:
+        """Largest part of that error that turns with the carrier: it may cancel the rest now.
+
+        Both parts together are at most ``bound_rad``, and differ by at most ``largest_rad``.
+        """
+        return (self.bound_rad + self.largest_rad) / 2
+
+    @property
+    def bounds(self) -> ErrorBounds:
+        """Bounds on the error of reported attitudes."""
+        return ErrorBounds(self.largest_rad, self.turning_rad)
+
     # --- the attitude's error ---------------------------------------------------------------
 
     def update(self, now_ns: int, carrier: Carrier, bound_rad: float) -> list[Notice | Refuted]:
@@ -83,7 +96,7 @@ class ArrayCompass:
             before_ns, before = self._updated
             turned = angle_between_rad(before, carrier.body_from_local)
             drifted = self._drift_radps * (now_ns - before_ns) * 1e-9
-            known = known.grown(drifted + turned * self.largest_rad)
+            known = known.grown(drifted + turned * self.turning_rad)
         self._updated = now_ns, carrier.body_from_local
         self._by_evidence = self._confined(known, seen)
         self._uavs.likely.solve()
@@ -112,13 +125,13 @@ class ArrayCompass:
         caps = possible(
             [sightings.caps for sightings, _ in fresh.values()], self._settings.outliers
         )
-        found, largest_rad = [], self.largest_rad
+        found, turning_rad = [], self.turning_rad
         for (uav, (sightings, near)), cap in zip(fresh.items(), caps, strict=True):
             if cap is None:
                 self._uavs.forget_directions(uav)
                 continue
             aged_s = abs(now_ns - sightings.t_ns) * 1e-9
-            changed = self._drift_radps * aged_s + near.turned_rad(aged_s) * largest_rad
+            changed = self._drift_radps * aged_s + near.turned_rad(aged_s) * turning_rad
             radius = min(cap.radius_rad + changed, math.pi)
             found.append(Seen(uav, near.reported, Cap(cap.center, radius)))
         return found
@@ -194,7 +207,7 @@ class ArrayCompass:
         updated_ns, before = self._updated
         drifted = self._drift_radps * abs(carrier.valid_at_ns - updated_ns) * 1e-9
         turned = angle_between_rad(before, carrier.body_from_local)
-        grown = self.error.bound_rad + drifted + turned * self.largest_rad
+        grown = self.error.bound_rad + drifted + turned * self.turning_rad
         if grown >= self.bound_rad:
             return Misalignment(np.eye(3), self.bound_rad)
         return Misalignment(self.error.center, grown)
@@ -213,7 +226,7 @@ class ArrayCompass:
         return Looks(
             each=each,
             error=self.error_at(carrier),
-            bound_rad=self.largest_rad,
+            bounds=self.bounds,
             likely=rotation(self._uavs.likely.vector_rad(carrier.body_from_local)),
         )
 

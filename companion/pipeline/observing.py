@@ -192,13 +192,13 @@ class Observing:
         times = dict.fromkeys(one.t_ns for _, one in ready)  # a receiver measures several UAVs
         poses = {at_ns: self._pose(at_ns, nearest=True) for at_ns in times}
         reported = {at_ns: self.reported(now_ns, at_ns) for at_ns in times}
-        said, bound_rad = list[Output](), self.compass.largest_rad
+        said, bounds = list[Output](), self.compass.bounds
         for uav, one in ready:
             near = self._place(uav, now_ns, one.t_ns, reported[one.t_ns])
             pose = poses[one.t_ns]
             if near is None or pose is None:
                 continue
-            if not self.uavs.join(uav, one, pose=pose, near=near, bound_rad=bound_rad):
+            if not self.uavs.join(uav, one, pose=pose, near=near, bounds=bounds):
                 said.append(Rejection(t_ns=now_ns, source=uav, reason=Reason.OUTLIER))
         return said
 

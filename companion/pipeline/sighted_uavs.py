@@ -14,7 +14,7 @@ import numpy as np
 
 from companion.beams.aim import SeenDirection
 from companion.settings.observations import ObservationSettings
-from companion.tracking.compass import Misalignment
+from companion.tracking.compass import ErrorBounds, Misalignment
 from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.likely_error import LikelyError
 from companion.tracking.moved_caps import Caps, Motion, moved_caps
@@ -66,13 +66,13 @@ class Looks(NamedTuple):
 
     each       by UAV
     error      error of reported attitudes
-    bound_rad  bound on its angle
+    bounds     bounds on its angle
     likely     its likely rotation, (3, 3), local frame
     """
 
     each: dict[str, Look]
     error: Misalignment
-    bound_rad: float
+    bounds: ErrorBounds
     likely: FloatArray
 
 
@@ -146,13 +146,13 @@ class SightedUavs:
         *,
         pose: ExtrapolatedAttitude,
         near: Relative,
-        bound_rad: float,
+        bounds: ErrorBounds,
     ) -> bool:
         """Add a measurement to a UAV's sightings. Returns whether it agrees with them.
 
         pose       the carrier's attitude at that time
         near       the UAV's position relative to the array then
-        bound_rad  bound on the error of reported attitudes
+        bounds     bounds on the error of reported attitudes
         """
         record = self._uavs[uav]
         cap = self._placed(one, pose, near, self.aged_rad(pose))
@@ -163,7 +163,7 @@ class SightedUavs:
         turned_rad = pose.turned_from(latest[1])
         forward = one.t_ns >= before.t_ns
         first_ns, last_ns = (before.t_ns, one.t_ns) if forward else (one.t_ns, before.t_ns)
-        motion = self._motion(near, first_ns, last_ns, bound_rad, turned_rad)
+        motion = self._motion(near, first_ns, last_ns, bounds, turned_rad)
         if forward:
             before = before.moved(one.t_ns, motion)
             record.latest = near, pose
@@ -198,14 +198,14 @@ class SightedUavs:
         return Cap(local_from_array @ one.direction, min(radius, math.pi))
 
     def _motion(
-        self, near: Relative, from_ns: int, to_ns: int, bound_rad: float, turned_rad: float
+        self, near: Relative, from_ns: int, to_ns: int, bounds: ErrorBounds, turned_rad: float
     ) -> Motion:
         drifted = self._drift_radps * abs(to_ns - from_ns) * 1e-9
         return near.motion(
             from_ns=from_ns,
             to_ns=to_ns,
             turned_rad=turned_rad,
-            misalignment_rad=bound_rad,
+            misaligned=bounds,
             drifted_rad=drifted,
         )
 
@@ -282,7 +282,7 @@ class SightedUavs:
         if look.sightings is not None:
             before = look.sightings
             turned_rad = near.turned_rad(abs(to_ns - before.t_ns) * 1e-9)
-            motion = self._motion(near, before.t_ns, to_ns, looks.bound_rad, turned_rad)
+            motion = self._motion(near, before.t_ns, to_ns, looks.bounds, turned_rad)
             yield before.caps, replace(motion, turned_rad=motion.turned_rad + self.aged_rad(pose))
         for one in look.pending:
             at = pose_at(one.t_ns)
@@ -290,5 +290,5 @@ class SightedUavs:
                 continue
             cap = self._placed(one, at, near, pose.extrapolated_since(at))
             turned_rad = pose.turned_from(at) + pose.extrapolated_since(at)
-            motion = self._motion(near, one.t_ns, to_ns, looks.bound_rad, turned_rad)
+            motion = self._motion(near, one.t_ns, to_ns, looks.bounds, turned_rad)
             yield Caps.of(cap), motion

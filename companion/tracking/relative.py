@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from companion.tracking.compass import ErrorBounds
 from companion.tracking.moved_caps import Motion
 from companion.values import Cap, Carrier, Fix, FloatArray, Track, Vector
 
@@ -104,13 +105,13 @@ class Relative:
         from_ns: int,
         to_ns: int,
         turned_rad: float,
-        misalignment_rad: float,
+        misaligned: ErrorBounds,
         drifted_rad: float,
     ) -> Motion:
         """Return the motion between two times, of which this is one.
 
             turned_rad        bound on the rotation of the carrier between them
-            misalignment_rad  bound on the error of the reported attitude
+            misaligned        bounds on the error of the reported attitude
             drifted_rad       bound on the change of that error
 
         An error that is constant in the body frame turns with the carrier in the local frame.
@@ -124,8 +125,8 @@ class Relative:
             error_m=error_m,
             range_m=math.sqrt(before_m @ before_m),
             range_error_m=self.error_m + error_m,
-            misalignment_rad=misalignment_rad,
-            turned_rad=drifted_rad + turned_rad * misalignment_rad,
+            misalignment_rad=misaligned.largest_rad,
+            turned_rad=drifted_rad + turned_rad * misaligned.turning_rad,
         )
 
 

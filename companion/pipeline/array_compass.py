@@ -17,8 +17,8 @@ from companion.pipeline.sighted_uavs import Look, Looks, SightedUavs
 from companion.settings.observations import ObservationSettings
 from companion.tracking import compass
 from companion.tracking.carrier import USUAL_ATTITUDE
-from companion.tracking.compass import ErrorBounds, ErrorSet, Misalignment, Seen
-from companion.tracking.relative import Relative
+from companion.tracking.compass import ErrorSet, Misalignment, Seen
+from companion.tracking.relative import ErrorBounds, Relative
 from companion.tracking.rotations import angle_between_rad, rotation, rotation_angle_rad
 from companion.tracking.sightings import Sightings, possible
 from companion.values import Cap, Carrier, FloatArray, Notice, Reason, Refuted, Severity, angle_rad

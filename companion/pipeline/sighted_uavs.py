@@ -14,11 +14,11 @@ import numpy as np
 
 from companion.beams.aim import SeenDirection
 from companion.settings.observations import ObservationSettings
-from companion.tracking.compass import ErrorBounds, Misalignment
+from companion.tracking.compass import Misalignment
 from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.likely_error import LikelyError
 from companion.tracking.moved_caps import Caps, Motion, moved_caps
-from companion.tracking.relative import Relative
+from companion.tracking.relative import ErrorBounds, Relative
 from companion.tracking.sightings import CONFIRMED, WINDOW, Guide, Sightings, possible
 from companion.values import Cap, FloatArray
 

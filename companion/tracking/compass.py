@@ -60,17 +60,6 @@ class Seen(NamedTuple):
     seen: Cap  # by the array, as the reported attitude shows it
 
 
-class ErrorBounds(NamedTuple):
-    """Bounds on the error W of reported attitudes.
-
-    largest_rad  largest angle of W
-    turning_rad  largest part of it that turns with the carrier, as does the error of a mount
-    """
-
-    largest_rad: float
-    turning_rad: float
-
-
 @dataclass(frozen=True, eq=False)
 class Misalignment:
     """Error W of the reported attitude: within ``bound_rad`` of ``center``, (3, 3)."""

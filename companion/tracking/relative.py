@@ -6,9 +6,19 @@ from typing import NamedTuple
 
 import numpy as np
 
-from companion.tracking.compass import ErrorBounds
 from companion.tracking.moved_caps import Motion
 from companion.values import Cap, Carrier, Fix, FloatArray, Track, Vector
+
+
+class ErrorBounds(NamedTuple):
+    """Bounds on the error W of reported attitudes.
+
+    largest_rad  largest angle of W
+    turning_rad  largest part of it that turns with the carrier, as does the error of a mount
+    """
+
+    largest_rad: float
+    turning_rad: float
 
 
 class ReportedVelocity(NamedTuple):

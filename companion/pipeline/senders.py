@@ -61,6 +61,9 @@ from companion.values import (
 
 CONFIRMED_NS: Final = 5_000_000_000
 """Largest difference between the steps of arrivals and of stamps of two reports that agree."""
+OUTDATED_MS: Final = 10_000  # age of a Cursor on Target event beside the newest of its source
+OUTDATED_FOR_NS: Final = 60_000_000_000
+"""Time after the newest event for which older ones are rejected; then its clock was set back."""
 TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 RECEIVER_WAIT_NS: Final = 10_000_000_000  # time for which a new track waits for its GNSS receiver
 STATUS_REORDER_MAX_US: Final = 30_000_000
@@ -156,6 +159,7 @@ class Sender:
     stamped_ns: int | None = None  # arrival of the clock's newest stamp; None: none yet
     is_shared: bool = False  # whether a notice said that two senders share this id
     first: tuple[int, int] | None = None  # arrival and stamp of a report that none confirmed yet
+    newest: tuple[int, int] | None = None  # the same of the newest report that was placed
 
     def is_confirmed(self, arrival_ns: int, boot_ms: int) -> bool:
         """Return whether the stamp of a first report agrees with that of the report before it."""
@@ -164,6 +168,12 @@ class Sender:
             return False
         elapsed_ns = step_ms(boot_ms, before[1]) * 1_000_000
         return abs(arrival_ns - before[0] - elapsed_ns) <= CONFIRMED_NS
+
+    def is_outdated(self, arrival_ns: int, boot_ms: int) -> bool:
+        """Return whether a stamp is too old beside the newest one that was placed."""
+        if self.newest is None or arrival_ns - self.newest[0] > OUTDATED_FOR_NS:
+            return False
+        return step_ms(boot_ms, self.newest[1]) < -OUTDATED_MS
 
 
 @dataclass(slots=True, kw_only=True)
@@ -331,6 +341,8 @@ class Senders:
             and not sender.is_confirmed(t_ns, report.boot_ms)
         ):  # servers send old events to each new client
             return _refused(report, Reason.UNPLACED_STAMP)
+        if kind_of(uav) is UavKind.COT and sender.is_outdated(t_ns, report.boot_ms):
+            return _refused(report, Reason.OUT_OF_ORDER)  # a clock of the day is not restarted
         stamp, said = self._stamp(sender, uav, t_ns, report.boot_ms, doubt_ns)
         restarted = uav if said else None
         if sender.clock.is_shared(t_ns):
@@ -344,6 +356,8 @@ class Senders:
                 restarted=restarted,
             )
         self._dedupe.set_latency(stamp.latency_s)
+        if sender.newest is None or step_ms(report.boot_ms, sender.newest[1]) > 0 or stamp.rebooted:
+            sender.newest = t_ns, report.boot_ms
         assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
         made_ns = stamp.oldest_ns - lag_ns

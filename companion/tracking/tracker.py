@@ -187,15 +187,15 @@ class Tracker:
         return self._make_room(uav) or self._drop_fleeting(now_ns)
 
     def _drop_fleeting(self, now_ns: int) -> bool:
-        """Drop the unestablished tracks that are lost; return whether there was one.
+        """Drop the unestablished tracks that are stale; return whether there was one.
 
         They are looked for at most once a second, since invented ids can be new at any rate.
         """
         if now_ns - self._swept_ns < SWEEP_NS:
             return False
         self._swept_ns = now_ns
-        lost = self.silent(now_ns, self._settings.ages.lost_s)
-        fleeting = [uav for uav in lost if self._is_fleeting(uav)]
+        stale = self.silent(now_ns, self._settings.ages.stale_s)
+        fleeting = [uav for uav in stale if self._is_fleeting(uav)]
         for uav in fleeting:
             self.forget(uav)
         return bool(fleeting)

@@ -84,9 +84,7 @@ class Run:
         for uav, one in self.uavs.ready(self.world.attitudes[-1][0]):
             pose, near = self.world.pose(one.t_ns, nearest=True), self.world.relative(uav, one.t_ns)
             assert pose is not None and near is not None
-            agrees = self.uavs.join(
-                uav, one, pose=pose, near=near, bounds=self.compass.bounds
-            )
+            agrees = self.uavs.join(uav, one, pose=pose, near=near, bounds=self.compass.bounds)
             self.count["outliers"] += not agrees
 
     def check_error(self) -> None:

@@ -201,6 +201,20 @@ def test_old_event_before_others_is_not_used(hours: int) -> None:
         assert heard.fix.t_ns == pytest.approx(START_NS + n * S, abs=0.1 * S)
 
 
+def test_late_events_among_others_are_not_used() -> None:
+    """A source that is late by 20 s, live, and late again was shown where it had been."""
+    fold = pipeline()
+    for n in range(3):
+        fold.step(event(n))
+    for n in range(3, 40):
+        late_s = 20.0 if n // 4 % 2 else 0.0
+        found = fold.step(event(n - late_s, late_s=late_s))
+        assert [type(one) for one in found] == [Rejection if late_s else Estimate]
+    for n in range(40, 140):  # late for good, as of a clock that was set back
+        found = fold.step(event(n - 20.0, late_s=20.0))
+    assert any(isinstance(one, Estimate) for one in found)
+
+
 def test_distant_aircraft_keeps_its_own_track() -> None:
     fold = pipeline()
     fold.step(naming(0))

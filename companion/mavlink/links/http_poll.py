@@ -30,7 +30,16 @@ class HttpPoll:
         """Do nothing: the server may start later."""
 
     async def serve(self) -> None:
-        """Poll until an answer fails, or its document stops to change: raises ``OSError``."""
+        """Poll until an answer fails, or its document stops to change: raises ``OSError``.
+
+        What is known of the server's clock is forgotten then.
+        """
+        try:
+            await self._poll()
+        finally:
+            self._upcalls.on_peer_gone(None)
+
+    async def _poll(self) -> None:
         loop = asyncio.get_running_loop()
         is_up, newest, changed_s = False, self._unchanged, loop.time()
         while True:

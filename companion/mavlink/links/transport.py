@@ -186,7 +186,7 @@ class Link:
 
         ``age_ns`` is the time since their arrival; None if unknown: they count as arrived now.
         Returns whether there is more: then a call without bytes continues. Raises ``StalledError``
-        if a server of another format completes no message.
+        if a server of another format completes no message, or its messages are too late.
         """
         began_s = time.perf_counter()
         peer = self._peers.at(key)
@@ -216,6 +216,8 @@ class Link:
         if now_ns >= self._newcomers.adapts_ns:
             self._newcomers.adapt(now_ns, time.thread_time(), time.process_time())
         if receiver is not None and not self.url.listens:
+            if receiver.too_late is not None:
+                raise StalledError(receiver.too_late)
             began_ns = receiver.unfinished_ns
             if began_ns is not None and t_ns - began_ns > UNFINISHED_S * 1_000_000_000:
                 raise StalledError(f"no complete message in {UNFINISHED_S} s of data")

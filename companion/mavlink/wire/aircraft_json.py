@@ -13,7 +13,7 @@ from collections import OrderedDict
 from typing import Any, Final
 
 from companion.mavlink.wire.document_times import DocumentTimes, Written
-from companion.mavlink.wire.foreign import ForeignSplitter, Items
+from companion.mavlink.wire.foreign import LATE_TEXT, ForeignSplitter, Items
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState
 from companion.values import Reason, Rejection
 
@@ -93,6 +93,8 @@ class AircraftJson(ForeignSplitter):
         stated_ns = round(stated_s * 1e9)
         is_new = self._times.is_new(stated_ns)
         written = self._times.arrived(t_ns, stated_ns)
+        if self._times.is_late:
+            self.too_late = f"documents are {LATE_TEXT}"
         if written is not None:
             self._stated_s, self._written, self._arrived_ns = stated_s, written, t_ns
             self._rest = aircraft[AIRCRAFT_MAX - 1 :: -1]

@@ -23,6 +23,7 @@ _SIZES: Final = {0x31: 9, 0x32: 14, 0x33: 21, 0x34: 21, 0xE3: 8}  # bytes after 
 _START: Final = re.compile(rb"\x1a(?=[\x31-\x34\xe3])")
 _MLAT: Final = b"\xff\x00MLAT"
 _TICK_NS: Final = 1000 / 12
+_OLDEST_NS: Final = 120_000_000_000  # a counter that is further off was restarted
 
 
 class BeastSplitter(ForeignSplitter):
@@ -31,7 +32,7 @@ class BeastSplitter(ForeignSplitter):
     def __init__(self, link: str) -> None:
         super().__init__(link)
         self._transponders = Transponders()
-        self._lateness = StreamLateness()
+        self._lateness = StreamLateness(_OLDEST_NS)
 
     def _parse(self, t_ns: int, data: bytes) -> Items:
         data, at = self._pending + data, 0
@@ -64,8 +65,7 @@ class BeastSplitter(ForeignSplitter):
             return []
         if body.startswith(_MLAT):
             return self._refused(t_ns, Reason.UNKNOWN_MESSAGE, MLAT)
-        ticks = int.from_bytes(body[:6], "big")  # 0: the counter does not run
-        late_ns = self._lateness.observe_ns(t_ns, ticks * _TICK_NS) if ticks else 0
+        late_ns = self._late_ns(t_ns, int.from_bytes(body[:6], "big") * _TICK_NS)
         try:
             state = self._transponders.read(t_ns - late_ns, body[7 : 7 + SIZE])
         except ValueError:
@@ -73,6 +73,15 @@ class BeastSplitter(ForeignSplitter):
         if state is None:
             return []
         return self._aircraft(t_ns, state._replace(age_s=late_ns * 1e-9))
+
+    def _late_ns(self, t_ns: int, counted_ns: float) -> int:
+        """Return the delay of a message; 0 if its counter does not run, or is another one."""
+        if counted_ns == 0:
+            return 0
+        late_ns = self._lateness.observe_ns(t_ns, counted_ns)
+        if self._lateness.is_late:
+            self._lateness.restart(t_ns - counted_ns)
+        return late_ns or 0
 
 
 def _unescaped(data: bytes, at: int, size: int) -> tuple[bytes | None, int]:

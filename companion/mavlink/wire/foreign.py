@@ -10,6 +10,8 @@ from companion.values import Frame, Reason, Rejection, Source
 Items = list[Frame | Rejection]
 MLAT: Final = "MLAT position: its accuracy is not stated"
 """Reason for not using a position that receivers computed from arrival times."""
+LATE_MAX_NS: Final = 10_000_000_000  # delay beyond which the messages of a stream are not used
+LATE_TEXT: Final = "over 10 s later than before, or its clock was set back"
 PIECE: Final = 256
 """Bytes parsed at once: as many objects of a few bytes as take about a millisecond."""
 PIECES: Final = 4  # most pieces parsed in one call
@@ -25,6 +27,7 @@ class ForeignSplitter:
 
     ``feed`` parses a part of many bytes. While ``has_more``, a call without bytes continues.
 
+    ``too_late`` says why the connection must begin anew: its messages are too late to be used.
     ``sender`` is the sender of the frames.
     """
 
@@ -35,6 +38,7 @@ class ForeignSplitter:
         self.unfinished_ns: int | None = None
         self.skips = False
         self.skipped = 0
+        self.too_late: str | None = None
         self._complete = 0
         self._unread = b""  # received, not parsed yet
         self._is_end = True  # whether the bytes that are parsed are the last that were received

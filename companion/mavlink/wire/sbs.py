@@ -10,14 +10,15 @@ written. Their difference is the age of the message, since some writers delay ev
 minutes. If it is negative or missing, the line counts as new. No line states an accuracy.
 
 A line that arrives later than others after it was written is late, or the writer's clock was set
-back: half of that time is added to its age, and half to the error of the age.
+back: half of that time is added to its age, and half to the error of the age. Beyond
+``LATE_MAX_NS`` the stream has to begin anew. A single line with another time is rejected.
 """
 
 import re
 from datetime import datetime, timedelta
 from typing import Final
 
-from companion.mavlink.wire.foreign import MLAT, ForeignSplitter, Items
+from companion.mavlink.wire.foreign import LATE_MAX_NS, LATE_TEXT, MLAT, ForeignSplitter, Items
 from companion.mavlink.wire.stream_lateness import StreamLateness
 from companion.mavlink.wire.transponder import ADSB_VEHICLE, AircraftState
 from companion.values import RELAYED_DELAY_S, RELAYED_TIME_ERROR_S, Reason
@@ -33,7 +34,7 @@ class SbsSplitter(ForeignSplitter):
 
     def __init__(self, link: str) -> None:
         super().__init__(link)
-        self._lateness = StreamLateness()
+        self._lateness = StreamLateness(LATE_MAX_NS)
 
     def _parse(self, t_ns: int, data: bytes) -> Items:
         *lines, self._pending = (self._pending + data).split(b"\n")
@@ -60,6 +61,11 @@ class SbsSplitter(ForeignSplitter):
             text = error.reason if isinstance(error, UnicodeDecodeError) else str(error)
             return self._refused(t_ns, Reason.MALFORMED, text, ADSB_VEHICLE)
         late_ns = 0 if written_ns is None else self._lateness.observe_ns(t_ns, written_ns)
+        if late_ns is None:
+            if self._lateness.is_late:
+                self.too_late = f"lines are {LATE_TEXT}"
+            text = "the line's time does not fit that of the others"
+            return self._refused(t_ns, Reason.UNPLACED_STAMP, text, ADSB_VEHICLE)
         half_s = 0.5e-9 * late_ns
         if 2 * half_s > RELAYED_DELAY_S:
             time_error_s = RELAYED_TIME_ERROR_S + half_s

@@ -8,6 +8,7 @@ import contextlib
 import json
 import socket
 from collections.abc import AsyncIterator
+from datetime import UTC, datetime
 from itertools import count
 from typing import cast
 
@@ -399,6 +400,77 @@ def test_receiver_that_stopped_is_announced(run: Run, monkeypatch: pytest.Monkey
             await inbox.until(1)
             await inbox.until_said(2)
             assert inbox.texts[1].endswith("is back")
+
+    run(test())
+
+
+def sbs_line(at_s: int) -> bytes:
+    """Return a line that was received and written at a time of its server."""
+    at = datetime.fromtimestamp(at_s, UTC).strftime("%Y/%m/%d,%H:%M:%S.000")
+    return f"MSG,3,1,1,4006B3,1,{at},{at},,38000,250,90,51.4,-0.1,64,,0,0,0,0\n".encode()
+
+
+def test_server_whose_lines_become_too_late_is_connected_again(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its clock may have been set back, too: a notice tells both."""
+    monkeypatch.setattr(transport, "RETRY_S", (0.001,))
+    clock = Seconds(0)
+
+    async def test() -> None:
+        async with (
+            connections("sbs") as (url, accepted),
+            running(url, clock.now_ns) as (link, inbox),
+        ):
+            connection = await accepted.get()
+            for second in range(20):
+                clock.t_ns = second * 1_000_000_000
+                before = link.status.bytes
+                connection.write(sbs_line(1000 + second - (60 if second >= 10 else 0)))
+                await until_true(lambda: link.status.bytes > before or inbox.texts)  # noqa: B023
+                if inbox.texts:
+                    break
+            assert (
+                "lines are over 10 s later than before, or its clock was set back"
+                in (inbox.texts[0])
+            )
+            assert len(inbox.frames) == 10
+            again = await accepted.get()
+            again.write(sbs_line(1000))
+            await inbox.until(11)
+
+    run(test())
+
+
+def test_documents_that_become_too_late_are_announced(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The next ones are used: the clock of their server may have been set back."""
+    monkeypatch.setattr(http_poll, "PERIOD_S", 0.001)
+    monkeypatch.setattr(transport, "RETRY_S", (0.001,))
+    clock = Seconds(0)
+
+    async def test() -> None:
+        served = count()
+
+        async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            with contextlib.suppress(OSError, EOFError):
+                await reader.readuntil(b"\r\n\r\n")
+                number = next(served)
+                clock.t_ns = number * 1_000_000_000
+                late = 60 if number >= 10 else 0
+                writer.write(b"HTTP/1.0 200 OK\r\n\r\n" + DOCUMENT % (1000 + number - late))
+                await writer.drain()
+            writer.close()
+
+        server = await asyncio.start_server(answer, "127.0.0.1", 0)
+        url = f"readsb:http://127.0.0.1:{server.sockets[0].getsockname()[1]}/aircraft.json"
+        async with server, running(url, clock.now_ns) as (_, inbox):
+            await inbox.until_said(1)
+            assert "documents are over 10 s later than before" in inbox.texts[0]
+            seen = len(inbox.frames)
+            assert seen >= 9  # all before, but the first
+            await inbox.until(seen + 3)
 
     run(test())
 

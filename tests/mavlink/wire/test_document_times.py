@@ -89,16 +89,57 @@ def told(times: DocumentTimes, t_ns: int, stated_ns: int) -> Written | None:
     return times.arrived(t_ns, stated_ns)
 
 
-def test_old_documents_have_no_time() -> None:
-    """Of a receiver that stopped, one by one or in turn; and of a clock that was set."""
+def test_document_of_a_receiver_that_stopped_has_no_time() -> None:
     times = DocumentTimes()
-    assert told(times, 0, 100 * S) is None
-    assert [told(times, n * S, 100 * S) for n in range(1, 5)] == [None] * 4
+    assert [told(times, n * S, 100 * S) for n in range(5)] == [None] * 5
     assert told(times, 5 * S, 105 * S) is not None
-    assert told(times, 6 * S, 100 * S) is None  # an older one
-    assert told(times, 7 * S, 101 * S) is not None
-    assert told(times, 8 * S, 202 * S) is None  # the clock was set forward
-    assert told(times, 9 * S, 203 * S) is not None
+
+
+def test_clock_that_is_set_forward_is_followed() -> None:
+    times = DocumentTimes()
+    for n in range(5):
+        told(times, n * S, (100 + n) * S)
+    found = [told(times, n * S, (200 + n) * S) for n in range(5, 10)]
+    assert found[:3] == [None] * 3  # one document may be wrong
+    for n, one in enumerate(found[3:], 8):
+        assert one is not None and n * S - one.earliest_ns < 2 * S
+    assert not times.is_late
+
+
+@pytest.mark.parametrize("late_s", [2, 8])
+def test_late_document_may_also_be_of_a_clock_that_was_set_back(late_s: int) -> None:
+    times = DocumentTimes()
+    for n in range(10):
+        told(times, n * S, n * S)
+    for n in range(10, 200):
+        found = told(times, n * S, (n - late_s) * S)
+        assert found is not None
+        assert found.earliest_ns <= (n - late_s) * S and found.latest_ns == n * S
+    assert not times.is_late
+
+
+def test_documents_that_are_too_late_are_not_used() -> None:
+    """Of a proxy that becomes later and later, by 0.4 s each second."""
+    times, used = DocumentTimes(), list[float]()
+    for n in range(10):
+        told(times, n * S, n * S)
+    for n in range(60):
+        late_s = 0.4 * n
+        found = told(times, (10 + n) * S, round((10 + n - late_s) * S))
+        if found is not None:
+            used.append(late_s)
+            assert found.earliest_ns <= round((10 + n - late_s) * S) <= found.latest_ns
+    assert 8.0 < max(used) < 10.0
+    assert times.is_late
+
+
+@pytest.mark.parametrize("ages_s", [(60, 120), (120, 60), (0, 30), (30, 0)])
+def test_servers_of_different_age_behind_one_address_are_late(ages_s: tuple[int, int]) -> None:
+    times = DocumentTimes()
+    found = [told(times, n * S, (1000 + n - ages_s[n % 2]) * S) for n in range(8)]
+    assert times.is_late
+    newest = 0 if ages_s[0] < ages_s[1] else 1
+    assert all(one is None for one in found[1 - newest :: 2])
 
 
 @pytest.mark.parametrize("pause_ns", [SPAN_MAX_NS // 2, 2 * SPAN_MAX_NS])

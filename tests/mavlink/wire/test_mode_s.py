@@ -237,6 +237,13 @@ def test_delayed_message_has_its_age() -> None:
     assert said(late).position_deg is not None  # sent half a second apart
     (again,) = splitter.feed(26 * S, beast(ODD, 5))  # the receiver was restarted
     assert said(again).tslc_s == 0
+    ages = []
+    for n in range(20):  # a queue of 3 s
+        late_s = 3 if n >= 15 else 0
+        ticks = 5 + 6_000_000 * n - 12_000_000 * late_s
+        (frame,) = splitter.feed(26 * S + n * S // 2, beast(EVEN, ticks & (1 << 48) - 1))
+        ages.append(said(frame).tslc_s)
+    assert ages == pytest.approx([0.0] * 15 + [3.0] * 5, abs=1 / 256)
 
 
 def test_unused_messages_are_counted() -> None:

@@ -98,7 +98,7 @@ def test_delayed_line_has_its_age() -> None:
 def test_late_stream_is_in_the_age_and_its_error() -> None:
     """A line may be 4 s late, or its writer's clock was set back by as much."""
     splitter = SbsSplitter("x")
-    stated = [("14:58:00.500", 10), ("14:58:01.500", 11), ("14:58:02.500", 16), ("14:58:07.6", 17)]
+    stated = [("14:58:00.5", 10), ("14:58:01.5", 11), ("14:58:02.5", 16), ("14:58:07.6", 17)]
     found = []
     for stamp, arrival_s in stated:
         text = line(f6="2008/11/28", f7=stamp, f8="2008/11/28", f9=stamp)
@@ -110,6 +110,28 @@ def test_late_stream_is_in_the_age_and_its_error() -> None:
     assert found[:2] == [(0, None), (0, None)]
     assert found[2] == (pytest.approx(2.0, abs=0.005), pytest.approx(3.0, abs=0.101))
     assert found[3] == (0, None)
+
+
+def stamped(splitter: SbsSplitter, arrival_s: float, stamp: str) -> list[Frame | Rejection]:
+    text = line(f6="2008/11/28", f7=stamp, f8="2008/11/28", f9=stamp)
+    return splitter.feed(round(arrival_s * 1e9), text.encode() + b"\n")
+
+
+def test_line_with_another_time_is_rejected_alone() -> None:
+    """One line 60 s ahead made all aircraft of the connection 30 s old."""
+    splitter = SbsSplitter("x")
+    for second in range(10):
+        (found,) = stamped(splitter, second, f"14:58:{second:02}.0")
+        assert isinstance(found, Frame)
+        if second == 5:
+            (refused,) = stamped(splitter, second, "14:59:05.0")
+            assert isinstance(refused, Rejection) and refused.reason is Reason.UNPLACED_STAMP
+    told = decode(found)
+    assert isinstance(told, AdsbVehicle)
+    assert told.tslc_s == 0 and told.accuracy is None and splitter.too_late is None
+    for second in range(10, 16):
+        stamped(splitter, second, f"14:57:{second:02}.0")
+    assert splitter.too_late == "lines are over 10 s later than before, or its clock was set back"
 
 
 def test_fields_missing_from_a_line_are_unknown() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.pipeline.records import UavRecords, UnusedRun
-from companion.values import Notice, Reason, Rejection, Severity, kind_of
+from companion.values import Notice, Reason, Rejection, Severity, is_uav_id, kind_of
 from companion.values.newest import Newest
 
 REJECTED_AFTER_NS: Final = 1_000_000_000
@@ -67,7 +67,8 @@ class Refusals:
         uav = refused.source
         if refused.reason is Reason.TOO_MANY and refused.detail:
             return self._full(refused)
-        if refused.reason not in REPORT_REASONS or not kind_of(uav).reports_itself:
+        is_report = refused.reason in REPORT_REASONS and is_uav_id(uav)
+        if not is_report or not kind_of(uav).reports_itself:
             return None
         is_dropped = refused.reason is Reason.NEWCOMER
         if is_dropped and not self._records.is_kept(uav):

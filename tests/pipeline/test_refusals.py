@@ -103,3 +103,11 @@ def test_vehicles_whose_frames_are_dropped_are_remembered_only_if_they_are_track
     assert refusals.current_rejection("3:1", 4_000_000_000) is Reason.NEWCOMER
     assert refusals.current_rejection("7:7", 4_000_000_000) is None
     assert refusals.of("7:7").counts == {Reason.NEWCOMER: 5}
+
+
+def test_rejections_of_a_link_are_not_announced_as_those_of_a_vehicle() -> None:
+    """A polled document of unknown age, for example."""
+    refusals, link = new_refusals(), "readsb:http://127.0.0.1:80/data/aircraft.json"
+    many = [refused(t / 4, link, Reason.UNPLACED_STAMP) for t in range(20)]
+    assert told_at(refusals, many) == []
+    assert refusals.of(link).counts == {Reason.UNPLACED_STAMP: 20}

@@ -9,8 +9,11 @@ from companion.mavlink.links.endpoints import Upcalls
 from companion.mavlink.links.urls import LinkUrl
 from companion.mavlink.wire.aircraft_json import DOCUMENT_MAX
 
-PERIOD_S: Final = 1.0
-"""Seconds from one request to the next; receivers write a document about once a second."""
+PERIOD_S: Final = 0.93
+"""Seconds from one request to the next; receivers write a document about once a second.
+
+Not a second: as the phase varies, the time of writing becomes known (``document_times``).
+"""
 ANSWER_S: Final = 5.0  # timeout of a request
 UNCHANGED_S: Final = 15.0
 """Seconds after which an unchanged document shows that its receiver has stopped."""

@@ -13,7 +13,17 @@ from typing import Final
 
 from companion.pipeline.angle_parts import AngleParts, ErrorSource, grown, largest
 from companion.tracking.carrier import AttitudeParts
-from companion.values import Beam, Blame, Carrier, Cause, LeftOut, Reason, Track, TrackState
+from companion.values import (
+    Beam,
+    Blame,
+    Carrier,
+    Cause,
+    LeftOut,
+    Reason,
+    Track,
+    TrackState,
+    kind_of,
+)
 
 CLOSE_UAVS_DB: Final = 3.0
 """Loss against a beam for one UAV alone above which the other UAVs are the cause, dB."""
@@ -27,6 +37,7 @@ TIMESYNC: Final = "allow TIMESYNC: set `[presence] enabled = true`, over a two-w
 FLY_APART: Final = 'fly them apart, or set `[beams] policy = "group"`'
 STEADIER_LINK: Final = "use a MAVLink link with a steadier delay"
 CHECK_LINK: Final = "check its MAVLink link: power, range, antenna"
+CHECK_RECEIVER: Final = "check the receiver that relays it, and the link to that receiver"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -165,11 +176,12 @@ def of_beam(
             return _clock(track, evidence)
         case ErrorSource.POSITION:
             bound = f"its position is uncertain by {_rounded(track.bound_m)} m"
-            return Blame(
-                Cause.POSITION,
-                f"at {beam.range_m:.0f} m, {bound}",
+            remedy = _remedy(
+                track,
                 "fly farther from the array, or fit a better GNSS receiver to the UAV",
+                relayed="receive its own telemetry, if it sends any: a receiver's is less accurate",
             )
+            return Blame(Cause.POSITION, f"at {beam.range_m:.0f} m, {bound}", remedy)
         case part:
             return _attitude_cause(part, carrier, evidence)
 
@@ -265,17 +277,24 @@ def _refused_cause(refused: Reason) -> Blame:
 
 
 def _silence_cause(track: Track) -> Blame:
-    return Blame(Cause.SILENT, f"no report for {_duration(track.age_s)}", CHECK_LINK)
+    reason = f"no report for {_duration(track.age_s)}"
+    return Blame(Cause.SILENT, reason, _remedy(track, CHECK_LINK))
+
+
+def _remedy(track: Track, own: str, *, relayed: str = CHECK_RECEIVER) -> str:
+    """Return the remedy for a UAV that reports itself, or for one that a receiver relays."""
+    return own if kind_of(track.uav).reports_itself else relayed
 
 
 def _age_cause(track: Track) -> Blame:
     """Return why a prediction spans a long time: sparse reports, late reports, or an agile UAV."""
     late_s = track.latency_s or 0.0
     if track.dt_s is not None and track.dt_s >= max(SPARSE_S, late_s):
-        remedy = "request reports at 10 Hz: set `[presence] position_hz = 10`"
+        own = "request reports at 10 Hz: set `[presence] position_hz = 10`"
+        remedy = _remedy(track, own)
         return Blame(Cause.RATE, f"reports {_duration(track.dt_s)} apart", remedy)
     if late_s >= LATE_S:
-        return _late(late_s)
+        return _late(track, late_s)
     return Blame(
         Cause.AGILE,
         f"it may accelerate by up to {track.limits.acceleration_max_mps2:.0f} m/s²",
@@ -284,19 +303,19 @@ def _age_cause(track: Track) -> Blame:
     )
 
 
-def _late(late_s: float) -> Blame:
+def _late(track: Track, late_s: float) -> Blame:
     reason = f"reports arrive {_duration(late_s)} late"
-    return Blame(Cause.LATE, reason, "use a faster MAVLink link")
+    return Blame(Cause.LATE, reason, _remedy(track, "use a faster MAVLink link"))
 
 
 def _clock(track: Track, evidence: LinkEvidence) -> Blame:
     doubt_s, late_s = track.clock_bound_s, track.latency_s or 0.0
     if not evidence.clock_assumed and late_s >= max(LATE_S, doubt_s / 2):
-        return _late(late_s)  # the link's delay is what makes the clock uncertain
+        return _late(track, late_s)  # the link's delay is what makes the clock uncertain
     known = f"uncertain by {_duration(doubt_s)}"
     if evidence.clock_assumed:
-        return Blame(Cause.CLOCK, f"its clock is unmeasured, {known}", TIMESYNC)
-    return Blame(Cause.CLOCK, f"its clock is {known}", STEADIER_LINK)
+        return Blame(Cause.CLOCK, f"its clock is unmeasured, {known}", _remedy(track, TIMESYNC))
+    return Blame(Cause.CLOCK, f"its clock is {known}", _remedy(track, STEADIER_LINK))
 
 
 def _duration(seconds: float) -> str:

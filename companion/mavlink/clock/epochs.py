@@ -180,7 +180,10 @@ class BootLine:
         self._rivals.add(arrival_ns, boot_ms, self._late_max_ns)
         if not (advances and self._run.lasts(3, _NS // 2)):
             return None
-        stepped_back = boot_ms < self.newest_ns // _NS_PER_MS % WRAP_MS
+        # A step ahead by more than half of the period is nearer to one back.
+        nearest_ns = self._nearest_ns(arrival_ns, boot_ms)
+        is_less = boot_ms < self.newest_ns // _NS_PER_MS % WRAP_MS
+        stepped_back = is_less or nearest_ns < self.newest_ns
         return self._begin_new_line(rebooted=stepped_back)
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> bool:
@@ -201,6 +204,10 @@ class BootLine:
     def is_shared(self, arrival_ns: int) -> bool:
         """Return whether a second clock runs beside the line: two senders then share one id."""
         return self._rivals.has_clock(arrival_ns)
+
+    def _nearest_ns(self, arrival_ns: int, boot_ms: int) -> int:
+        """Unwrap boot milliseconds to the value nearest to what the line has at an arrival."""
+        return unwrapped_ns(boot_ms, arrival_ns - self.floor.at(self.newest_ns))
 
     def unwrap(self, boot_ms: int) -> int:
         """Convert boot milliseconds to ns, unwrapped to the value nearest to the newest stamp."""
@@ -278,11 +285,11 @@ class BootLine:
         self._run.stamps.clear()
         self._ahead.stamps.clear()
         self._rivals.clear()
+        x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self._nearest_ns(*stamps[0])
         before = self.floor
         self.since_ns = stamps[0][0]
         self._previous = (before, self.since_ns)
         self.floor = Floor(*self._shape, before.largest_ns)
-        x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self.newest_ns
         for arrival_ns, boot_ms in stamps:
             x_ns = unwrapped_ns(boot_ms, x_ns)
             self.floor.add(x_ns, arrival_ns - x_ns)

@@ -50,6 +50,21 @@ def test_link_lag_of_seconds_does_not_count_as_reboot() -> None:
     assert not reboots(observe_all(fast + run(20_000, 316_000, 40)))
 
 
+@pytest.mark.parametrize("before_ms", [300_000, WRAP_MS - 60_000])
+@pytest.mark.parametrize(
+    "step_ms", [-290_000, 20_000, 500_000, WRAP_MS // 2 - 1, WRAP_MS // 2 + 1, 2_300_000_000]
+)
+def test_no_step_of_the_boot_clock_turns_time_back(before_ms: int, step_ms: int) -> None:
+    """By more than half of its period, a step ahead looks like one back: a reboot, at any rate."""
+    after_ms = (before_ms + 10_000 + step_ms) % WRAP_MS
+    stamps = observe_all([*run(0, before_ms, 50), *run(10_000, after_ms, 50)])
+    assert None not in stamps[55:]
+    before, placed = stamps[49], [one for one in stamps[50:] if one is not None]
+    assert before is not None
+    assert all(two.sender_ns > one.sender_ns for one, two in pairwise(placed))
+    assert placed[0].rebooted or placed[0].sender_ns > before.sender_ns
+
+
 @pytest.mark.parametrize("ahead_ms", [1_100, 4_900])
 @pytest.mark.parametrize("again_ms", [0, 10, 1_000])
 def test_future_stamps_do_not_move_the_clock(ahead_ms: int, again_ms: int) -> None:

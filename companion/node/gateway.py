@@ -183,6 +183,13 @@ class Gateway:
                 " are rejected; add the trusted peer to `[links] routers`",
             )
         self._known_peers.contradicted.clear()
+        for who, stranger, known in self._known_peers.replaced:
+            self._warn(
+                who,
+                f"{who}: positions are used from {stranger}, since {' and '.join(known)} sends none;"
+                " add the trusted peer to `[links] routers`",
+            )
+        self._known_peers.replaced.clear()
 
     def _notify_newcomers(self) -> None:
         """Publish a notice while frames are not admitted, at most once a minute."""

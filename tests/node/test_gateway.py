@@ -180,6 +180,32 @@ def where(north_m: float, boot_ms: int) -> bytes:
     )
 
 
+def test_positions_of_another_radio_are_announced() -> None:
+    said: list[Notice] = []
+    now_ms = 100_000
+    gateway = Gateway(
+        settings=Settings().override(links={"urls": ["udpin:127.0.0.1:0"]}),
+        step=lambda _: None,
+        notify=said.append,
+        now_ns=lambda: now_ms * 1_000_000,
+    )
+    gateway.open()
+    mav = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    try:
+        for _ in range(100):
+            now_ms += 100
+            turned = dialect.MAVLink_attitude_message(now_ms, 0, 0, 0, 0, 0, 0)
+            gateway.links[0].take(("127.0.0.1", 5), bytes(turned.pack(mav)))
+            gateway.links[0].take(("127.0.0.1", 6), where(0, now_ms))
+    finally:
+        gateway.links[0]._endpoint._socket.close()  # type: ignore[attr-defined]
+    (told,) = said
+    assert told.text == (
+        "1:1: positions are used from 127.0.0.1:6, since 127.0.0.1:5 sends none; add the trusted"
+        " peer to `[links] routers`"
+    )
+
+
 @pytest.mark.parametrize(("routers", "refused_port"), [([], 6), (["127.0.0.1:6"], 5)])
 def test_contradicting_peer_is_announced_once_and_rejected(
     routers: list[str], refused_port: int

@@ -8,6 +8,9 @@ agree with its path to ``AGREEMENT_M``. A stranger becomes known
 * when its positions have agreed with those of the current known peers for ``PROBATION_NS`` and in
   ``AGREEMENTS`` comparisons; each contradiction doubles that time,
 * at once if no known peer is current: a vehicle whose radio restarted has another address,
+* with its positions if no current known peer has brought any for ``NO_POSITION_NS``, and their
+  stamps are of the clock of those: a vehicle may send positions over one radio, attitudes over
+  another,
 * at once if the settings name it as a router.
 
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
@@ -57,6 +60,7 @@ AGREEMENT_M: Final = 1.0
 """Largest deviation, beyond what flight explains, of a stranger's position that is used."""
 CURRENT_NS: Final = (1_000_000_000, 2_000_000_000)
 """Least and largest time after a message for which a peer is current."""
+NO_POSITION_NS: Final = 5_000_000_000
 CURRENT_INTERVALS: Final = 3.0  # that time in intervals between its messages
 SENDERS_MAX: Final = 4096  # senders followed; those of known peers are forgotten last
 PEERS_MAX: Final = 4  # known peers of a sender, and strangers compared with them
@@ -112,6 +116,11 @@ class _Peer:
             max(CURRENT_INTERVALS * interval_ns, least_ns), most_ns
         )
 
+    def brings_positions(self, now_ns: int) -> bool:
+        """Return whether the peer may still bring positions."""
+        arrivals = (self.newest[msgid].t_ns for msgid in OWN if msgid in self.newest)
+        return now_ns - max(self.since_ns, *arrivals, 0) <= NO_POSITION_NS
+
     def hear(self, now_ns: int) -> None:
         """Note the arrival of a position or attitude."""
         if now_ns - self.heard_ns > KEPT_NS:
@@ -148,6 +157,8 @@ class KnownPeers:
 
     def __init__(self, routers: Collection[str] = ()) -> None:
         self.contradicted: list[tuple[str, str, tuple[str, ...]]] = []
+        self.replaced: list[tuple[str, str, tuple[str, ...]]] = []
+        """Senders whose positions are taken from a peer, since the known ones bring none."""
         self._routers = frozenset(routers)
         self._senders: dict[Source, _Sender] = {}
 
@@ -175,6 +186,8 @@ class KnownPeers:
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
             return None
         if msgid not in _ABOUT_SENDER and not any(msgid in one.newest for one in current):
+            return None
+        if msgid in OWN and self._replaces(sender, peer, current, frame):
             return None
         if msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
             agrees = self._agrees(sender, peer, frame)
@@ -253,6 +266,16 @@ class KnownPeers:
         peer.newest[frame.msgid] = frame
         peer.messages, peer.heard_ns = 1, frame.t_ns
         self._add(sender.known, name, peer, frame.t_ns)
+
+    def _replaces(self, sender: _Sender, name: str, current: list[_Peer], frame: Frame) -> bool:
+        """Make a stranger known whose positions no other peer brings; return whether it is."""
+        if any(one.brings_positions(frame.t_ns) for one in current):
+            return False
+        if any(_is_off_clock(one, frame) for one in current):
+            return False
+        self.replaced.append((str(frame.source), name, tuple(sender.known)))
+        self._make_known(sender, name, self._new(frame, False), frame)
+        return True
 
     # --- strangers ----------------------------------------------------------------------------
 
@@ -358,13 +381,16 @@ def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
 
 def _is_of_another_clock(sender: _Sender, known: _Peer, frame: Frame) -> bool:
     """Return whether a stamp is too far off those of a peer known earlier to be of one clock."""
-    for one in _current_earlier(sender, known, frame.t_ns):
-        if one.stamped is not None:
-            passed_ms = (frame.t_ns - one.stamped.t_ns) // 1_000_000
-            expected_ms = _stamp_ms(one.stamped) + passed_ms
-            if abs(step_ms(_stamp_ms(frame), expected_ms)) > RESTARTED_MS:
-                return True
-    return False
+    return any(_is_off_clock(one, frame) for one in _current_earlier(sender, known, frame.t_ns))
+
+
+def _is_off_clock(one: _Peer, frame: Frame) -> bool:
+    """Return whether a stamp is too far off the newest one of a peer to be of its clock."""
+    stamped = one.stamped or next((m for m in one.newest.values() if m.msgid in STAMPED), None)
+    if stamped is None:
+        return False
+    expected_ms = _stamp_ms(stamped) + (frame.t_ns - stamped.t_ns) // 1_000_000
+    return abs(step_ms(_stamp_ms(frame), expected_ms)) > RESTARTED_MS
 
 
 def _stamp_ms(frame: Frame) -> int:

@@ -150,6 +150,31 @@ def test_attitude_of_a_peer_whose_positions_agreed_is_not_used_beside_that_of_th
     assert peers.refusal(LINK, OTHER, copy) is None  # a duplicate, which is found as such
 
 
+@pytest.mark.parametrize("positions_until_s", [0.0, 10.0])
+@pytest.mark.parametrize("off_s", [0.0, 600.0])
+def test_positions_over_another_radio_than_attitudes_are_used(
+    positions_until_s: float, off_s: float
+) -> None:
+    """Not those of another clock. The first radio's attitudes stay in force."""
+    peers = KnownPeers()
+    used, refused = list[float](), list[float]()
+    for number in range(300):
+        t_s = number / 10
+        assert peers.refusal(LINK, HOME, attitude(t_s, 0.5)) is None
+        if t_s < positions_until_s:
+            assert peers.refusal(LINK, HOME, report(round(t_s * S), 100 + t_s, circle(t_s))) is None
+        else:
+            said = report(round(t_s * S), 100 + t_s + off_s, circle(t_s))
+            (refused if peers.refusal(LINK, OTHER, said) else used).append(t_s)
+        if number > 200:
+            assert peers.refusal(LINK, OTHER, attitude(t_s + 0.01, 1.5)) in (BROUGHT, STRANGER)
+    if off_s:
+        assert not used and not peers.replaced
+        return
+    assert refused[-1] < used[0] == pytest.approx(positions_until_s + 5.0, abs=0.3)
+    assert peers.replaced == [("1:1", OTHER, (HOME,))]
+
+
 def test_second_peer_brings_attitudes_while_the_first_brings_none_or_few() -> None:
     peers = with_two_known_peers()
     assert peers.refusal(LINK, OTHER, attitude(20.0, 0.5)) is None

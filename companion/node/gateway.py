@@ -186,8 +186,8 @@ class Gateway:
         for who, stranger, known in self._known_peers.replaced:
             self._warn(
                 who,
-                f"{who}: positions are used from {stranger}, since {' and '.join(known)} sends none;"
-                " add the trusted peer to `[links] routers`",
+                f"{who}: positions are used from {stranger}, since {' and '.join(known)} sends"
+                " none; add the trusted peer to `[links] routers`",
             )
         self._known_peers.replaced.clear()
 

@@ -1,16 +1,16 @@
 """Known peers of each sender, and strangers, whose frames are not used beside those of known ones.
 
 A sender may be received over any number of peers (routers, second radios), and anybody that
-reaches a link's port may send in its name. The first peer of a sender is known. While a known peer
+reaches a link's port may send in its name. The first peer that brings a
+sender's position is known. While a known peer
 is current, the messages that it brings are not accepted from a stranger, except positions that
 agree with its path to ``AGREEMENT_M``. A stranger becomes known
 
 * when its positions have agreed with those of the current known peers for ``PROBATION_NS`` and in
   ``AGREEMENTS`` comparisons; each contradiction doubles that time,
 * at once if no known peer is current: a vehicle whose radio restarted has another address,
-* with its positions if no current known peer has brought any for ``NO_POSITION_NS``, and their
-  stamps are of the clock of those: a vehicle may send positions over one radio, attitudes over
-  another,
+* with its positions if no current known peer has brought any for ``NO_POSITION_NS``: a vehicle may
+  send positions over one radio, attitudes over another. Those of another clock are strangers then,
 * at once if the settings name it as a router.
 
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
@@ -173,7 +173,7 @@ class KnownPeers:
             return None
         sender = self._senders.get(frame.source)
         if sender is None:
-            if msgid not in POSE:
+            if msgid not in OWN:
                 return None
             sender = self._follow(frame)
         known = sender.known.get(peer)
@@ -182,7 +182,7 @@ class KnownPeers:
         current = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
         is_router = self._is_router(link, peer)
         if not current or is_router:
-            if msgid in POSE:
+            if msgid in OWN:  # an attitude alone can be neither confirmed nor contradicted
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
             return None
         if msgid not in _ABOUT_SENDER and not any(msgid in one.newest for one in current):
@@ -268,12 +268,16 @@ class KnownPeers:
         self._add(sender.known, name, peer, frame.t_ns)
 
     def _replaces(self, sender: _Sender, name: str, current: list[_Peer], frame: Frame) -> bool:
-        """Make a stranger known whose positions no other peer brings; return whether it is."""
+        """Make a stranger known whose positions no other peer brings; return whether it is.
+
+        Peers of another clock are strangers then: one position and attitudes, forged before the
+        vehicle began, would keep it out.
+        """
         if any(one.brings_positions(frame.t_ns) for one in current):
             return False
-        if any(_is_off_clock(one, frame) for one in current):
-            return False
         self.replaced.append((str(frame.source), name, tuple(sender.known)))
+        for other in [one for one, peer in sender.known.items() if _is_off_clock(peer, frame)]:
+            self._add(sender.strangers, other, sender.known.pop(other), frame.t_ns)
         self._make_known(sender, name, self._new(frame, False), frame)
         return True
 

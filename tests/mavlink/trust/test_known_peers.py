@@ -150,29 +150,43 @@ def test_attitude_of_a_peer_whose_positions_agreed_is_not_used_beside_that_of_th
     assert peers.refusal(LINK, OTHER, copy) is None  # a duplicate, which is found as such
 
 
-@pytest.mark.parametrize("positions_until_s", [0.0, 10.0])
 @pytest.mark.parametrize("off_s", [0.0, 600.0])
-def test_positions_over_another_radio_than_attitudes_are_used(
-    positions_until_s: float, off_s: float
-) -> None:
-    """Not those of another clock. The first radio's attitudes stay in force."""
+def test_positions_over_another_radio_than_attitudes_are_used(off_s: float) -> None:
+    """The first radio's attitudes stay in force, unless their stamps are of another clock."""
     peers = KnownPeers()
     used, refused = list[float](), list[float]()
     for number in range(300):
         t_s = number / 10
-        assert peers.refusal(LINK, HOME, attitude(t_s, 0.5)) is None
-        if t_s < positions_until_s:
-            assert peers.refusal(LINK, HOME, report(round(t_s * S), 100 + t_s, circle(t_s))) is None
+        turned = peers.refusal(LINK, HOME, attitude(t_s, 0.5))
+        if number < 100:
+            place = report(round(t_s * S), 100 + t_s, circle(t_s))
+            assert peers.refusal(LINK, HOME, place) is None
         else:
             said = report(round(t_s * S), 100 + t_s + off_s, circle(t_s))
             (refused if peers.refusal(LINK, OTHER, said) else used).append(t_s)
         if number > 200:
-            assert peers.refusal(LINK, OTHER, attitude(t_s + 0.01, 1.5)) in (BROUGHT, STRANGER)
-    if off_s:
-        assert not used and not peers.replaced
-        return
-    assert refused[-1] < used[0] == pytest.approx(positions_until_s + 5.0, abs=0.3)
+            assert turned == (STRANGER if off_s else None)
+            turned = peers.refusal(LINK, OTHER, attitude(t_s + 0.01, 1.5))
+            assert turned in ((None,) if off_s else (BROUGHT, STRANGER))
+    assert refused[-1] < used[0] == pytest.approx(15.0, abs=0.3)
     assert peers.replaced == [("1:1", OTHER, (HOME,))]
+
+
+def test_stranger_that_sends_attitudes_alone_does_not_keep_the_vehicle_out() -> None:
+    """Before its first position, and while it is silent for seconds. Nor are they used then."""
+    peers = KnownPeers()
+    for number in range(400):
+        t_s = number / 10
+        turned = peers.refusal(LINK, OTHER, attitude(t_s, 1.5))
+        if number < 100 or 200 <= number < 230:
+            assert turned is None or 200 <= number < 222  # nobody else tells anything
+            continue
+        peer = HOME if number < 230 else "127.0.0.1:7"  # a restarted radio has another port
+        place = report(round(t_s * S), 100 + t_s, circle(t_s))
+        assert peers.refusal(LINK, peer, place) is None
+        assert peers.refusal(LINK, peer, attitude(t_s, 0.5)) is None
+        assert number in (100, 230) or turned == STRANGER
+    assert peers.replaced == []
 
 
 def test_second_peer_brings_attitudes_while_the_first_brings_none_or_few() -> None:

@@ -36,6 +36,10 @@ from companion.values import (
 )
 
 SETUP_SIGNING: Final = 256  # message that carries a signing key in plain; it is never recorded
+CONTRADICTED: Final = (
+    "{who}: reports from {stranger} contradict those from {known} and are rejected"
+)
+REPLACED: Final = "{who}: positions are used from {stranger}, since {known} sends none"
 NOTICE_EVERY_NS: Final = 60_000_000_000  # least time between two notices of too many senders
 SAVE_EVERY_S: Final = 0.25  # interval of checks whether signing timestamps must be saved
 
@@ -176,20 +180,14 @@ class Gateway:
         self._notify_newcomers()
 
     def _notify_strangers(self) -> None:
-        for who, stranger, known in self._known_peers.contradicted:
-            self._warn(
-                who,
-                f"{who}: reports from {stranger} contradict those from {' and '.join(known)} and"
-                " are rejected; add the trusted peer to `[links] routers`",
-            )
-        self._known_peers.contradicted.clear()
-        for who, stranger, known in self._known_peers.replaced:
-            self._warn(
-                who,
-                f"{who}: positions are used from {stranger}, since {' and '.join(known)} sends"
-                " none; add the trusted peer to `[links] routers`",
-            )
-        self._known_peers.replaced.clear()
+        for told, text in (
+            (self._known_peers.contradicted, CONTRADICTED),
+            (self._known_peers.replaced, REPLACED),
+        ):
+            for who, stranger, known in told:
+                said = text.format(who=who, stranger=stranger, known=" and ".join(known))
+                self._warn(who, f"{said}; add the trusted peer to `[links] routers`")
+            told.clear()
 
     def _notify_newcomers(self) -> None:
         """Publish a notice while frames are not admitted, at most once a minute."""

@@ -7,7 +7,7 @@ import asyncio
 import contextlib
 import json
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from datetime import UTC, datetime
 from itertools import count
 from typing import cast
@@ -369,6 +369,21 @@ def test_web_server_without_valid_documents_is_announced(
     run(test())
 
 
+@contextlib.asynccontextmanager
+async def polled(document: Callable[[], bytes]) -> AsyncIterator[str]:
+    """Run a server of a document; yields its URL."""
+
+    async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        with contextlib.suppress(OSError, EOFError):
+            await reader.readuntil(b"\r\n\r\n")
+            writer.write(b"HTTP/1.0 200 OK\r\n\r\n" + document())
+            await writer.drain()
+        writer.close()
+
+    async with await asyncio.start_server(answer, "127.0.0.1", 0) as server:
+        yield f"readsb:http://127.0.0.1:{server.sockets[0].getsockname()[1]}/aircraft.json"
+
+
 def test_receiver_that_stopped_is_announced(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its web server continues; and the receiver is back."""
     monkeypatch.setattr(http_poll, "PERIOD_S", 0.001)
@@ -377,24 +392,13 @@ def test_receiver_that_stopped_is_announced(run: Run, monkeypatch: pytest.Monkey
     monkeypatch.setattr(transport, "STEADY_S", 0.0)
 
     async def test() -> None:
-        head = b"HTTP/1.0 200 OK\r\n\r\n"
         body = [DOCUMENT % 100]
-
-        async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            with contextlib.suppress(OSError, EOFError):
-                await reader.readuntil(b"\r\n\r\n")
-                writer.write(head + body[0])
-                await writer.drain()
-            writer.close()
-
-        server = await asyncio.start_server(answer, "127.0.0.1", 0)
-        url = f"readsb:http://127.0.0.1:{server.sockets[0].getsockname()[1]}/aircraft.json"
-        async with server, running(url) as (link, inbox):
+        async with polled(lambda: body[0]) as url, running(url) as (link, inbox):
             await inbox.until_said(1)
             assert "the document has not changed for 0 s" in inbox.texts[0]
             assert not inbox.frames and link.status.state != "up"
-            polled = link.status.bytes
-            await until_true(lambda: link.status.bytes > polled + 5 * len(body[0]))
+            before = link.status.bytes
+            await until_true(lambda: link.status.bytes > before + 5 * len(body[0]))
             assert link.status.state != "up" and len(inbox.texts) == 1
             body[0] = DOCUMENT % 101
             await inbox.until(1)
@@ -453,19 +457,12 @@ def test_documents_that_become_too_late_are_announced(
     async def test() -> None:
         served = count()
 
-        async def answer(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-            with contextlib.suppress(OSError, EOFError):
-                await reader.readuntil(b"\r\n\r\n")
-                number = next(served)
-                clock.t_ns = number * 1_000_000_000
-                late = 60 if number >= 10 else 0
-                writer.write(b"HTTP/1.0 200 OK\r\n\r\n" + DOCUMENT % (1000 + number - late))
-                await writer.drain()
-            writer.close()
+        def document() -> bytes:
+            number = next(served)
+            clock.t_ns = number * 1_000_000_000
+            return DOCUMENT % (1000 + number - (60 if number >= 10 else 0))
 
-        server = await asyncio.start_server(answer, "127.0.0.1", 0)
-        url = f"readsb:http://127.0.0.1:{server.sockets[0].getsockname()[1]}/aircraft.json"
-        async with server, running(url, clock.now_ns) as (_, inbox):
+        async with polled(document) as url, running(url, clock.now_ns) as (_, inbox):
             await inbox.until_said(1)
             assert "documents are over 10 s later than before" in inbox.texts[0]
             seen = len(inbox.frames)

@@ -8,7 +8,8 @@ agree with its path to ``AGREEMENT_M``. A stranger becomes known
 
 * when its positions have agreed with those of the current known peers for ``PROBATION_NS`` and in
   ``AGREEMENTS`` comparisons; each contradiction doubles that time,
-* at once if no known peer is current: a vehicle whose radio restarted has another address,
+* at once if no known peer is current: a vehicle whose radio restarted has another address (with
+  another clock, ``REBOOT_NS`` later),
 * with its positions if no current known peer has brought any for ``NO_POSITION_NS``: a vehicle may
   send positions over one radio, attitudes over another. Those of another clock are strangers then,
 * at once if the settings name it as a router.
@@ -61,6 +62,13 @@ AGREEMENT_M: Final = 1.0
 CURRENT_NS: Final = (1_000_000_000, 2_000_000_000)
 """Least and largest time after a message for which a peer is current."""
 NO_POSITION_NS: Final = 5_000_000_000
+INCOMPARABLE_NS: Final = 5_000_000_000
+"""Time after which a stranger that cannot be compared with the known peers contradicts them."""
+REBOOT_NS: Final = 10_000_000_000
+"""Time for which a silent known peer keeps out strangers of another clock.
+
+A vehicle whose radio restarted has its clock; one that was restarted itself takes as long.
+"""
 CURRENT_INTERVALS: Final = 3.0  # that time in intervals between its messages
 SENDERS_MAX: Final = 4096  # senders followed; those of known peers are forgotten last
 PEERS_MAX: Final = 4  # known peers of a sender, and strangers compared with them
@@ -107,6 +115,7 @@ class _Peer:
     agrees_since_ns: int = 0
     probation_ns: int = PROBATION_NS
     contradicted_ns: int = -SPACED_NS
+    is_compared: bool = False  # whether a position was compared with those of a known peer
 
     def is_current(self, now_ns: int) -> bool:
         """Return whether the peer's newest message is so new that more are to be expected."""
@@ -173,7 +182,7 @@ class KnownPeers:
             return None
         sender = self._senders.get(frame.source)
         if sender is None:
-            if msgid not in OWN:
+            if msgid not in OWN or not _is_usable(frame):
                 return None
             sender = self._follow(frame)
         known = sender.known.get(peer)
@@ -182,7 +191,9 @@ class KnownPeers:
         current = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
         is_router = self._is_router(link, peer)
         if not current or is_router:
-            if msgid in OWN:  # an attitude alone can be neither confirmed nor contradicted
+            if msgid in OWN and _is_usable(frame):  # others can be neither agreed with nor refuted
+                if not is_router and _is_another_clock_too_soon(sender, frame):
+                    return STRANGER
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
             return None
         if msgid not in _ABOUT_SENDER and not any(msgid in one.newest for one in current):
@@ -211,7 +222,8 @@ class KnownPeers:
         self, sender: _Sender, peer: str, known: _Peer, frame: Frame
     ) -> str | None:
         msgid, is_only = frame.msgid, len(sender.known) == 1
-        known.newest[msgid] = frame
+        if msgid not in OWN or _is_usable(frame):
+            known.newest[msgid] = frame
         if msgid in POSE:
             known.hear(frame.t_ns)
         if not is_only and (msgid in STAMPED or msgid in OWN):
@@ -273,7 +285,7 @@ class KnownPeers:
         Peers of another clock are strangers then: one position and attitudes, forged before the
         vehicle began, would keep it out.
         """
-        if any(one.brings_positions(frame.t_ns) for one in current):
+        if any(one.brings_positions(frame.t_ns) for one in current) or not _is_usable(frame):
             return False
         self.replaced.append((str(frame.source), name, tuple(sender.known)))
         for other in [one for one, peer in sender.known.items() if _is_off_clock(peer, frame)]:
@@ -298,6 +310,9 @@ class KnownPeers:
         behind = [stranger.path.excess_m(path, before, said) for path in current]
         ahead = [path.excess_ahead_m(said) for path in current]
         excess_m = max((one for one in behind if one is not None), default=None)
+        stranger.is_compared |= excess_m is not None
+        if not stranger.is_compared and frame.t_ns - stranger.since_ns > INCOMPARABLE_NS:
+            self._note_contradiction(sender, name, frame)  # of another clock, or too rare
         self._judge(sender, name, stranger, excess_m, frame)
         found = [one for one in (*behind, *ahead) if one is not None]
         return bool(found) and max(found) <= AGREEMENT_M
@@ -390,11 +405,29 @@ def _is_of_another_clock(sender: _Sender, known: _Peer, frame: Frame) -> bool:
 
 def _is_off_clock(one: _Peer, frame: Frame) -> bool:
     """Return whether a stamp is too far off the newest one of a peer to be of its clock."""
-    stamped = one.stamped or next((m for m in one.newest.values() if m.msgid in STAMPED), None)
+    stamped = one.stamped
     if stamped is None:
-        return False
+        timed = [m for m in one.newest.values() if m.msgid in STAMPED or m.msgid in OWN]
+        if not timed:
+            return False
+        stamped = max(timed, key=lambda m: m.t_ns)
     expected_ms = _stamp_ms(stamped) + (frame.t_ns - stamped.t_ns) // 1_000_000
     return abs(step_ms(_stamp_ms(frame), expected_ms)) > RESTARTED_MS
+
+
+def _is_another_clock_too_soon(sender: _Sender, frame: Frame) -> bool:
+    """Return whether a known peer that fell silent a moment ago had another clock."""
+    return any(
+        frame.t_ns - one.heard_ns <= REBOOT_NS and _is_off_clock(one, frame)
+        for one in sender.known.values()
+    )
+
+
+def _is_usable(frame: Frame) -> bool:
+    """Return whether a frame has a position on Earth; 0, 0 is that of a receiver without a fix."""
+    said = read(frame)
+    has_place = (said.lat_1e7, said.lon_1e7) != (0, 0)
+    return has_place and abs(said.lat_1e7) <= 900_000_000 and abs(said.lon_1e7) <= 1_800_000_000
 
 
 def _stamp_ms(frame: Frame) -> int:

@@ -11,6 +11,7 @@ stations rebroadcast (TIS-B: DF18 with a control field other than 0), and the he
 
 import math
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -19,6 +20,10 @@ from companion.mavlink.wire.transponder import AircraftState
 SIZE: Final = 14  # bytes of an extended squitter
 PAIR_NS: Final = 10_000_000_000
 """Largest time between the even and the odd half of one position (DO-260B, A.1.7.7)."""
+PAIR_SLACK_M: Final = 100.0  # resolution of both halves, and of their times
+PAIR_SPEED_MPS: Final = 700.0
+"""Largest speed by which the places of two halves may differ: both must be of one aircraft."""
+_METRES_PER_DEG: Final = 111_195.0
 STATUS_NS: Final = 30_000_000_000
 """Validity of a stated accuracy, which is sent every 2.5 s (DO-260B, 2.2.3.3)."""
 AIRCRAFT_MAX: Final = 2000
@@ -119,7 +124,9 @@ def _position(
     other = heard.halves.get(1 - odd)
     place = None
     if other is not None and t_ns - other[0] <= PAIR_NS:
-        place = position_deg(heard.halves[0][1:], heard.halves[1][1:], newest_is_odd=odd == 1)
+        apart_m = PAIR_SLACK_M + PAIR_SPEED_MPS * (t_ns - other[0]) * 1e-9
+        (_, *even), (_, *last) = heard.halves[0], heard.halves[1]
+        place = position_deg(even, last, newest_is_odd=odd == 1, apart_m=apart_m)
     lat_deg, lon_deg = place or (None, None)
     if place is not None:
         heard.place = t_ns, *place
@@ -202,11 +209,12 @@ def _velocity(icao: int, me: int, knots: int) -> AircraftState:
 
 
 def position_deg(
-    even: tuple[int, ...], odd: tuple[int, ...], *, newest_is_odd: bool
+    even: Sequence[int], odd: Sequence[int], *, newest_is_odd: bool, apart_m: float = math.inf
 ) -> tuple[float, float] | None:
     """Return latitude and longitude of the newer of an even and an odd position (DO-260B, A.1.7.7).
 
-    None if their zones differ in width, or the latitude is out of range.
+    None if their zones differ in width, if the latitude is out of range, or if the two are more
+    than ``apart_m`` apart, as those of two aircraft with one address.
     """
     y = [even[0] / _CPR, odd[0] / _CPR]
     x = [even[1] / _CPR, odd[1] / _CPR]
@@ -217,10 +225,13 @@ def position_deg(
         return None
     i = int(newest_is_odd)
     wide = zones(lats[i])
-    count = max(wide - i, 1)
     band = math.floor(x[0] * (wide - 1) - x[1] * wide + 0.5)
-    lon = (360 / count) * (band % count + x[i])
-    return lats[i], (lon + 180) % 360 - 180
+    counts = (max(wide, 1), max(wide - 1, 1))
+    lons = [(360 / count) * (band % count + part) for count, part in zip(counts, x, strict=True)]
+    across = math.remainder(lons[0] - lons[1], 360) * math.cos(math.radians(lats[i]))
+    if math.hypot(lats[0] - lats[1], across) * _METRES_PER_DEG > apart_m:
+        return None
+    return lats[i], (lons[i] + 180) % 360 - 180
 
 
 def zones(lat_deg: float) -> int:

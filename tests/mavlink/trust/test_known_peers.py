@@ -27,7 +27,7 @@ from companion.mavlink.wire.decode import (
 )
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, heartbeat, pack
 from companion.mavlink.wire.framing import Splitter
-from companion.mavlink.wire.positions import HIGH_LATENCY2
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT, HIGH_LATENCY2
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.values import Frame, Source
 
@@ -170,6 +170,53 @@ def test_positions_over_another_radio_than_attitudes_are_used(off_s: float) -> N
             assert turned in ((None,) if off_s else (BROUGHT, STRANGER))
     assert refused[-1] < used[0] == pytest.approx(15.0, abs=0.3)
     assert peers.replaced == [("1:1", OTHER, (HOME,))]
+
+
+def unusable(t_s: float, lat_1e7: int) -> Frame:
+    payload = struct.pack("<IiiiihhhH", round((100 + t_s) * 1000), lat_1e7, 0, 0, 0, 0, 0, 0, 0)
+    return message(t_s, Outgoing(Source(1, 1), GLOBAL_POSITION_INT, payload))
+
+
+@pytest.mark.parametrize("lat_1e7", [0, 1_000_000_000])
+def test_peer_without_a_usable_position_does_not_keep_the_vehicle_out(lat_1e7: int) -> None:
+    peers = KnownPeers()
+    for number in range(200):
+        t_s = number / 10
+        peers.refusal(LINK, OTHER, unusable(t_s, lat_1e7))
+        if number >= 50:
+            place = report(round(t_s * S) + 1, 100 + t_s, circle(t_s))
+            assert peers.refusal(LINK, HOME, place) is None
+
+
+def test_peer_that_cannot_be_compared_is_announced() -> None:
+    """It was first, and its stamps are of another clock."""
+    peers, refused = KnownPeers(), 0
+    for number in range(300):
+        t_s = number / 10
+        if number % 10 == 0:
+            place = report(round(t_s * S), 77_000 + t_s, beside(500.0)(t_s))
+            assert peers.refusal(LINK, OTHER, place) is None
+        if number >= 50:
+            place = report(round(t_s * S) + 1, 100 + t_s, circle(t_s))
+            refused += peers.refusal(LINK, HOME, place) is not None
+    assert refused > 200
+    ((who, stranger, known),) = peers.contradicted
+    assert (who, stranger, known) == ("1:1", HOME, (OTHER,))
+
+
+def test_stranger_of_another_clock_does_not_replace_a_peer_that_is_silent_for_seconds() -> None:
+    """Its radio restarts; after ten seconds the vehicle itself may have been restarted."""
+    peers, used = KnownPeers(), list[float]()
+    for number in range(500):
+        t_s = number / 10
+        if number < 100 or 130 <= number < 300:
+            peer = HOME if number < 100 else "127.0.0.1:7"
+            place = report(round(t_s * S), 100 + t_s, circle(t_s))
+            assert peers.refusal(LINK, peer, place) is None, t_s
+        place = report(round(t_s * S) + 1, 77_000 + t_s, beside(1.0)(t_s))
+        if number > 50 and peers.refusal(LINK, OTHER, place) is None:
+            used.append(t_s)
+    assert used[0] == pytest.approx(40.0, abs=0.3)
 
 
 def test_stranger_that_sends_attitudes_alone_does_not_keep_the_vehicle_out() -> None:

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.pipeline.records import UavRecords, UnusedRun
-from companion.values import Notice, Reason, Rejection, Severity, is_uav_id, kind_of
+from companion.values import Notice, Reason, Rejection, Severity, UavKind, is_uav_id, kind_of
 from companion.values.newest import Newest
 
 REJECTED_AFTER_NS: Final = 1_000_000_000
@@ -67,6 +67,8 @@ class Refusals:
         uav = refused.source
         if refused.reason is Reason.TOO_MANY and refused.detail:
             return self._full(refused)
+        if refused.reason is Reason.SHARED_ID and kind_of(uav) is UavKind.ADSB:
+            return self._shared_address(refused)
         is_report = refused.reason in REPORT_REASONS and is_uav_id(uav)
         if not is_report or not kind_of(uav).reports_itself:
             return None
@@ -101,6 +103,18 @@ class Refusals:
         self._full_ns = refused.t_ns
         text = f"{refused.detail}: {refused.source} and other new UAVs are not tracked"
         return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject="tracks", text=text)
+
+    def _shared_address(self, refused: Rejection) -> Notice | None:
+        """Return a notice of two aircraft with one address; vehicles have one of their clocks."""
+        uav = refused.source
+        if not self._records.is_kept(uav):
+            return None
+        record = self._records[uav]
+        before_ns, record.unused_notice_ns = record.unused_notice_ns, refused.t_ns
+        if before_ns is not None and refused.t_ns - before_ns < NOTICE_INTERVAL_NS:
+            return None
+        text = f"two aircraft report under the id {uav}; the reports of both are rejected"
+        return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
 
     def used(self, uav: str) -> None:
         """Note that a sender's report was accepted."""

@@ -111,3 +111,12 @@ def test_rejections_of_a_link_are_not_announced_as_those_of_a_vehicle() -> None:
     many = [refused(t / 4, link, Reason.UNPLACED_STAMP) for t in range(20)]
     assert told_at(refusals, many) == []
     assert refusals.of(link).counts == {Reason.UNPLACED_STAMP: 20}
+
+
+def test_two_aircraft_with_one_address_are_announced_while_they_last() -> None:
+    """Of tracked ones: addresses can be invented in any number."""
+    tracked = Refusals(Records(UavRecord, {"icao:4CA7B3"}.__contains__))
+    many = [refused(t / 4, "icao:4CA7B3", Reason.SHARED_ID) for t in range(120)]
+    assert told_at(tracked, many) == [0.0]
+    assert told_at(tracked, [refused(50, "icao:4CA7B3", Reason.SHARED_ID)]) == [50.0]
+    assert told_at(tracked, [refused(51, "icao:4CA7B4", Reason.SHARED_ID)]) == []

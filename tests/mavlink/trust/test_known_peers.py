@@ -2,11 +2,13 @@
 
 import struct
 from collections.abc import Callable
+from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from peer_streams import HOME, LINK, OTHER, Place, S, Stream, beside, circle, heard, report
+from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.trust import known_peers, paths
 from companion.mavlink.trust.duplicate_ids import KEPT_NS
@@ -170,6 +172,33 @@ def test_positions_over_another_radio_than_attitudes_are_used(off_s: float) -> N
             assert turned in ((None,) if off_s else (BROUGHT, STRANGER))
     assert refused[-1] < used[0] == pytest.approx(15.0, abs=0.3)
     assert peers.replaced == [("1:1", OTHER, (HOME,))]
+
+
+def summary(t_s: float) -> Frame:
+    """Return a HIGH_LATENCY2 at rest, with accuracies of 25 m."""
+    fields: dict[str, Any] = dict.fromkeys(dialect.MAVLink_high_latency2_message.fieldnames, 0)
+    fields |= {
+        "timestamp": round((100 + t_s) * 1000), "latitude": 470_000_000,
+        "longitude": 80_000_000, "altitude": 488, "eph": 250, "epv": 250,
+    }  # fmt: skip
+    mav = dialect.MAVLink(None, srcSystem=1, srcComponent=1)
+    raw = bytes(dialect.MAVLink_high_latency2_message(**fields).pack(mav))
+    (frame,) = Splitter("x").feed(round(t_s * S), raw)
+    assert isinstance(frame, Frame)
+    return frame
+
+
+def test_accuracies_of_a_summary_from_another_peer_are_not_used() -> None:
+    """Its position agrees, but 25 m of error made the links of a carrier at rest weak."""
+    peers, at_rest = KnownPeers(), Place(0.0, 0.0, 0.0, 0.0)
+    for number in range(200):
+        t_s = number / 10
+        place = report(round(t_s * S), 100 + t_s, at_rest)
+        assert peers.refusal(LINK, HOME, place) is None
+        if number > 50:
+            assert peers.refusal(LINK, OTHER, summary(t_s + 0.03)) in (STRANGER, BROUGHT)
+    used = [peers.refusal(LINK, OTHER, summary(t_s)) is None for t_s in (20.0, 23.0, 26.0, 29.0)]
+    assert used[-1]  # the first is silent
 
 
 def unusable(t_s: float, lat_1e7: int) -> Frame:

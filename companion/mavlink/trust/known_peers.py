@@ -49,7 +49,7 @@ from companion.mavlink.wire.decode import (
     POSE,
 )
 from companion.mavlink.wire.encode import TIMESYNC
-from companion.mavlink.wire.positions import HIGH_LATENCY2, OWN, OwnPosition, read
+from companion.mavlink.wire.positions import OWN, OwnPosition, read
 from companion.mavlink.wire.stamps import STAMPED, boot_ms, step_ms
 from companion.values import Frame, Source
 from companion.values.budget import Budget
@@ -202,7 +202,7 @@ class KnownPeers:
             return None
         if msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
             agrees = self._agrees(sender, peer, frame) or peer in sender.known
-            return None if agrees and msgid != HIGH_LATENCY2 else STRANGER
+            return None if agrees and read(frame).accuracy is None else STRANGER
         return STRANGER
 
     def rank(self, link: str, peer: str, source: Source, now_ns: int) -> PeerRank:
@@ -235,7 +235,7 @@ class KnownPeers:
         if msgid not in OWN or (is_only and not sender.strangers):
             return None
         refused = self._compare_known(sender, peer, known, frame)
-        if refused is None and msgid == HIGH_LATENCY2:  # it states accuracies, which move bounds
+        if refused is None and not is_only and read(frame).accuracy is not None:  # moves bounds
             earlier = _current_earlier(sender, known, frame.t_ns)
             if any(one.brings_positions(frame.t_ns) for one in earlier):
                 return BROUGHT

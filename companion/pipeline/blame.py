@@ -295,11 +295,11 @@ def _age_cause(track: Track) -> Blame:
         return Blame(Cause.RATE, f"reports {_duration(track.dt_s)} apart", remedy)
     if late_s >= LATE_S:
         return _late(track, late_s)
+    lower = "lower `[observer] acceleration_max_mps2` to what the UAV can do"
     return Blame(
         Cause.AGILE,
         f"it may accelerate by up to {track.limits.acceleration_max_mps2:.0f} m/s²",
-        "raise `[presence] position_hz`, or lower `[observer] acceleration_max_mps2` to what the"
-        " UAV can do",
+        _remedy(track, f"raise `[presence] position_hz`, or {lower}", relayed=lower),
     )
 
 

@@ -158,22 +158,27 @@ class Sender:
     clock: SenderClock
     stamped_ns: int | None = None  # arrival of the clock's newest stamp; None: none yet
     is_shared: bool = False  # whether a notice said that two senders share this id
-    first: tuple[int, int] | None = None  # arrival and stamp of a report that none confirmed yet
-    newest: tuple[int, int] | None = None  # the same of the newest report that was placed
+    first: tuple[int, int] | None = None  # arrival and stamp of an event that none confirmed yet
+    newest: tuple[int, int] | None = None  # the same of the newest event that was placed
 
-    def is_confirmed(self, arrival_ns: int, boot_ms: int) -> bool:
-        """Return whether the stamp of a first report agrees with that of the report before it."""
-        before, self.first = self.first, (arrival_ns, boot_ms)
-        if before is None:
-            return False
-        elapsed_ns = step_ms(boot_ms, before[1]) * 1_000_000
-        return abs(arrival_ns - before[0] - elapsed_ns) <= CONFIRMED_NS
+    def refuses_event(self, arrival_ns: int, boot_ms: int) -> Reason | None:
+        """Return why a Cursor on Target event must be rejected by its time; None to use it.
 
-    def is_outdated(self, arrival_ns: int, boot_ms: int) -> bool:
-        """Return whether a stamp is too old beside the newest one that was placed."""
+        Servers send old events to each new client, so the first event of a source is not used, and
+        a second one only if as much time passed by its stamp as by its arrival. A clock of the day
+        does not start again: a stamp far below the newest is an old event, not a restart.
+        """
+        if self.stamped_ns is None:
+            before, self.first = self.first, (arrival_ns, boot_ms)
+            if before is None:
+                return Reason.UNPLACED_STAMP
+            elapsed_ns = step_ms(boot_ms, before[1]) * 1_000_000
+            agrees = abs(arrival_ns - before[0] - elapsed_ns) <= CONFIRMED_NS
+            return None if agrees else Reason.UNPLACED_STAMP
         if self.newest is None or arrival_ns - self.newest[0] > OUTDATED_FOR_NS:
-            return False
-        return step_ms(boot_ms, self.newest[1]) < -OUTDATED_MS
+            return None
+        is_old = step_ms(boot_ms, self.newest[1]) < -OUTDATED_MS
+        return Reason.OUT_OF_ORDER if is_old else None
 
 
 @dataclass(slots=True, kw_only=True)
@@ -331,18 +336,14 @@ class Senders:
         """
         assert report.boot_ms is not None
         uav, t_ns = report.uav, report.t_ns
-        is_own = kind_of(uav).reports_itself
+        kind = kind_of(uav)
+        is_own, is_event = kind.reports_itself, kind is UavKind.COT
         if uav not in self._senders and len(self._senders) >= RECORDS_MAX and not is_own:
             return _refused(report, Reason.TOO_MANY)  # ids can be forged in any number
         sender = self._senders[uav]
-        if (
-            sender.stamped_ns is None
-            and kind_of(uav) is UavKind.COT
-            and not sender.is_confirmed(t_ns, report.boot_ms)
-        ):  # servers send old events to each new client
-            return _refused(report, Reason.UNPLACED_STAMP)
-        if kind_of(uav) is UavKind.COT and sender.is_outdated(t_ns, report.boot_ms):
-            return _refused(report, Reason.OUT_OF_ORDER)  # a clock of the day is not restarted
+        refused = sender.refuses_event(t_ns, report.boot_ms) if is_event else None
+        if refused is not None:
+            return _refused(report, refused)
         stamp, said = self._stamp(sender, uav, t_ns, report.boot_ms, doubt_ns)
         restarted = uav if said else None
         if sender.clock.is_shared(t_ns):
@@ -356,7 +357,10 @@ class Senders:
                 restarted=restarted,
             )
         self._dedupe.set_latency(stamp.latency_s)
-        if sender.newest is None or step_ms(report.boot_ms, sender.newest[1]) > 0 or stamp.rebooted:
+        newest = sender.newest
+        if is_event and (
+            newest is None or step_ms(report.boot_ms, newest[1]) > 0 or stamp.rebooted
+        ):
             sender.newest = t_ns, report.boot_ms
         assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)

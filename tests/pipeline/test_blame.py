@@ -78,9 +78,8 @@ def test_cause_is_the_largest_part_of_the_track_bound(
 ) -> None:
     track = replace(TRACK, **changed)  # type: ignore[arg-type]
     assert blamed(track)[:2] == (cause, reason)
-    if cause is not Cause.AGILE:  # no receiver has a MAVLink link to it, or its GNSS receiver
-        own, relayed = blamed(track)[2], blamed(replace(track, uav="icao:4CA7B3"))[2]
-        assert own != relayed and "receiver" in relayed and "MAVLink" not in relayed
+    own, relayed = blamed(track)[2], blamed(replace(track, uav="icao:4CA7B3"))[2]
+    assert own != relayed and "MAVLink" not in relayed and "[presence]" not in relayed
 
 
 def test_clock_is_blamed_for_acceleration_within_its_uncertainty() -> None:

@@ -27,7 +27,7 @@ BLOCK: Final = 8192  # entries of a steering matrix computed at once, so that th
 POINTS_PER_SIDE_LOBE: Final = 8  # points of a scan per narrowest possible lobe
 LEAST_POINTS: Final = 360  # least number of points of a scan around a circle
 SCAN_MAX: Final = 1 << 25
-"""Most points of a scan, times elements: 0.5 s. An array that needs more has unknown side lobes."""
+"""Most points of a scan, times elements: some 0.6 s. The side lobes of other arrays are unknown."""
 NEAR: Final = 64  # points examined first to either side of a peak; they nearly always suffice
 SECTIONS: Final = np.linspace(0.0, 1.0, 17)
 """Relative positions examined in an interval: each step narrows a crossing 16-fold, an extreme

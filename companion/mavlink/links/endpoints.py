@@ -25,7 +25,7 @@ class Upcalls(NamedTuple):
               (None without a stamp); returns whether there is more, with which a call without
               bytes continues; raises ``StalledError`` to end the connection
     stale     bytes of a peer that waited too long to be used
-    request   a document is requested from the only peer
+    request   called before a document is requested from the only peer
     """
 
     up: Callable[[], None]  # connected

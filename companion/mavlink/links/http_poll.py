@@ -27,13 +27,13 @@ class HttpPoll:
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
         self._upcalls = upcalls
-        self._unchanged = b""  # document of a receiver that has stopped
+        self._unchanged = b""  # last document of a receiver that has stopped; else empty
 
     def open(self) -> None:
         """Do nothing: the server may start later."""
 
     async def serve(self) -> None:
-        """Poll until an answer fails, or its document stops to change: raises ``OSError``.
+        """Poll until an answer fails, or the document no longer changes; raises ``OSError``.
 
         What is known of the server's clock is forgotten then.
         """

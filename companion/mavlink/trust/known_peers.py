@@ -1,17 +1,17 @@
 """Known peers of each sender, and strangers, whose frames are not used beside those of known ones.
 
 A sender may be received over any number of peers (routers, second radios), and anybody that
-reaches a link's port may send in its name. The first peer that brings a
-sender's position is known. While a known peer
-is current, the messages that it brings are not accepted from a stranger, except positions that
-agree with its path to ``AGREEMENT_M``. A stranger becomes known
+reaches a link's port may send in its name. The first peer that brings a position of a sender is
+known. While a known peer is current, the messages that it brings are not accepted from a stranger,
+except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes known
 
 * when its positions have agreed with those of the current known peers for ``PROBATION_NS`` and in
   ``AGREEMENTS`` comparisons; each contradiction doubles that time,
 * at once if no known peer is current: a vehicle whose radio restarted has another address (with
   another clock, ``REBOOT_NS`` later),
 * with its positions if no current known peer has brought any for ``NO_POSITION_NS``: a vehicle may
-  send positions over one radio, attitudes over another. Those of another clock are strangers then,
+  send positions over one radio, attitudes over another. Known peers whose stamps are of another
+  clock become strangers then,
 * at once if the settings name it as a router.
 
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
@@ -62,8 +62,10 @@ AGREEMENT_M: Final = 1.0
 CURRENT_NS: Final = (1_000_000_000, 2_000_000_000)
 """Least and largest time after a message for which a peer is current."""
 NO_POSITION_NS: Final = 5_000_000_000
+"""Time without a position after which a known peer counts as one that brings none."""
 INCOMPARABLE_NS: Final = 5_000_000_000
-"""Time after which a stranger that cannot be compared with the known peers contradicts them."""
+"""Time after which a stranger of another clock contradicts the known peers."""
+LATE_LINK_MS: Final = 30_000  # stamps that are further off are not those of a late second link
 REBOOT_NS: Final = 10_000_000_000
 """Time for which a silent known peer keeps out strangers of another clock.
 
@@ -115,7 +117,6 @@ class _Peer:
     agrees_since_ns: int = 0
     probation_ns: int = PROBATION_NS
     contradicted_ns: int = -SPACED_NS
-    is_compared: bool = False  # whether a position was compared with those of a known peer
 
     def is_current(self, now_ns: int) -> bool:
         """Return whether the peer's newest message is so new that more are to be expected."""
@@ -315,9 +316,10 @@ class KnownPeers:
         behind = [stranger.path.excess_m(path, before, said) for path in current]
         ahead = [path.excess_ahead_m(said) for path in current]
         excess_m = max((one for one in behind if one is not None), default=None)
-        stranger.is_compared |= excess_m is not None
-        if not stranger.is_compared and frame.t_ns - stranger.since_ns > INCOMPARABLE_NS:
-            self._note_contradiction(sender, name, frame)  # of another clock, or too rare
+        if frame.t_ns - stranger.since_ns > INCOMPARABLE_NS and any(
+            _clock_off_ms(one, frame) > LATE_LINK_MS for one in sender.known.values()
+        ):
+            self._note_contradiction(sender, name, frame)
         self._judge(sender, name, stranger, excess_m, frame)
         found = [one for one in (*behind, *ahead) if one is not None]
         return bool(found) and max(found) <= AGREEMENT_M
@@ -410,14 +412,19 @@ def _is_of_another_clock(sender: _Sender, known: _Peer, frame: Frame) -> bool:
 
 def _is_off_clock(one: _Peer, frame: Frame) -> bool:
     """Return whether a stamp is too far off the newest one of a peer to be of its clock."""
+    return _clock_off_ms(one, frame) > RESTARTED_MS
+
+
+def _clock_off_ms(one: _Peer, frame: Frame) -> int:
+    """Return how far a stamp is off the newest one of a peer; 0 if that peer has sent none."""
     stamped = one.stamped
     if stamped is None:
         timed = [m for m in one.newest.values() if m.msgid in STAMPED or m.msgid in OWN]
         if not timed:
-            return False
+            return 0
         stamped = max(timed, key=lambda m: m.t_ns)
     expected_ms = _stamp_ms(stamped) + (frame.t_ns - stamped.t_ns) // 1_000_000
-    return abs(step_ms(_stamp_ms(frame), expected_ms)) > RESTARTED_MS
+    return abs(step_ms(_stamp_ms(frame), expected_ms))
 
 
 def _is_another_clock_too_soon(sender: _Sender, frame: Frame) -> bool:

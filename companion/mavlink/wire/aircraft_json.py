@@ -52,7 +52,7 @@ class AircraftJson(ForeignSplitter):
         return bool(self._rest)
 
     def requested(self, t_ns: int) -> None:
-        """Take note that a document is requested."""
+        """Note that a document is requested."""
         self._times.requested(t_ns)
 
     def feed(self, t_ns: int, data: bytes) -> Items:

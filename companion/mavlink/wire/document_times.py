@@ -23,7 +23,7 @@ SERVED_NS: Final = 100_000_000
 SPAN_MAX_NS: Final = LATE_MAX_NS  # widest limits of a document that is used
 DRIFT: Final = 1e-3  # largest drift of the server's clock; NTP slews by at most 5e-4
 RECENT: Final = 10  # newest documents that are counted
-LATE_MAX: Final = 3  # of these, so many may not be too late to be used
+LATE_MAX: Final = 3  # number of these that are too late, from which on the server is late
 EARLY_RUN: Final = 3  # documents in a row that begin new limits
 _UNLIMITED_NS: Final = -(1 << 80)
 
@@ -53,7 +53,7 @@ class DocumentTimes:
         return sum(self._late) >= LATE_MAX
 
     def requested(self, t_ns: int) -> None:
-        """Take note that a document is requested."""
+        """Note that a document is requested."""
         self._requested_ns = t_ns
 
     def is_new(self, stated_ns: int) -> bool:
@@ -62,8 +62,8 @@ class DocumentTimes:
 
     def arrived(self, t_ns: int, stated_ns: int) -> Written | None:
         """Return when the document that just arrived was written; None if that is unknown."""
+        is_new = self.is_new(stated_ns)
         before_ns, self._served_ns = self._served_ns, self._requested_ns
-        is_new = before_ns is None or stated_ns != self._stated_ns
         self._stated_ns = stated_ns
         if not is_new:
             return None

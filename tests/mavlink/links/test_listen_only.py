@@ -350,11 +350,15 @@ def test_slow_but_complete_messages_keep_the_connection(run: Run, scheme: str) -
     run(test())
 
 
-def test_web_server_without_valid_documents_is_announced(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.fixture
+def without_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Make links poll, and retry, at once."""
     monkeypatch.setattr(http_poll, "PERIOD_S", 0.001)
     monkeypatch.setattr(transport, "RETRY_S", (0.001,))
+
+
+@pytest.mark.usefixtures("without_pauses")
+def test_web_server_without_valid_documents_is_announced(run: Run) -> None:
     clock = count(1, 1_000_000_000)
 
     async def test() -> None:
@@ -384,11 +388,10 @@ async def polled(document: Callable[[], bytes]) -> AsyncIterator[str]:
         yield f"readsb:http://127.0.0.1:{server.sockets[0].getsockname()[1]}/aircraft.json"
 
 
+@pytest.mark.usefixtures("without_pauses")
 def test_receiver_that_stopped_is_announced(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its web server continues; and the receiver is back."""
-    monkeypatch.setattr(http_poll, "PERIOD_S", 0.001)
     monkeypatch.setattr(http_poll, "UNCHANGED_S", 0.02)
-    monkeypatch.setattr(transport, "RETRY_S", (0.001,))
     monkeypatch.setattr(transport, "STEADY_S", 0.0)
 
     async def test() -> None:
@@ -446,12 +449,9 @@ def test_server_whose_lines_become_too_late_is_connected_again(
     run(test())
 
 
-def test_documents_that_become_too_late_are_announced(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.usefixtures("without_pauses")
+def test_documents_that_become_too_late_are_announced(run: Run) -> None:
     """The next ones are used: the clock of their server may have been set back."""
-    monkeypatch.setattr(http_poll, "PERIOD_S", 0.001)
-    monkeypatch.setattr(transport, "RETRY_S", (0.001,))
     clock = Seconds(0)
 
     async def test() -> None:

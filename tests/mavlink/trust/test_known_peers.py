@@ -66,8 +66,9 @@ def test_second_route_is_used_once_it_has_agreed(hz: float, delay_s: float) -> N
 
     The path of the first is followed from the arrival of the second, and reached that much later.
     """
-    second = heard(OTHER, hz, begins_s=10.137, delay_s=lambda: delay_s)
-    found = rejected(KnownPeers(), heard(HOME, 4), second)
+    peers, second = KnownPeers(), heard(OTHER, hz, begins_s=10.137, delay_s=lambda: delay_s)
+    found = rejected(peers, heard(HOME, 4), second)
+    assert peers.contradicted == []
     assert found[HOME] == []
     assert found[OTHER]
     assert max(found[OTHER]) <= 10.137 + PROBATION_S + 2 * delay_s + max(2.0, 2 / hz)

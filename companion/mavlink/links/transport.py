@@ -394,6 +394,7 @@ class Link:
         peer = self._peers.find(key)
         if peer is not None:
             self._finish(peer)
+            self._known_peers.connection_ended(peer.address or self._name, peer.senders)
             self._peers.forget(peer)
 
     def _finish(self, peer: Peer) -> None:

@@ -7,8 +7,8 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 
 * when its positions have agreed with those of the current known peers for ``PROBATION_NS`` and in
   ``AGREEMENTS`` comparisons; each contradiction doubles that time,
-* at once if no known peer is current: a vehicle whose radio restarted has another address (with
-  another clock, ``REBOOT_NS`` later),
+* at once if no known peer is current, since they are silent or their connections have ended: a
+  vehicle whose radio restarted has another address (with another clock, ``REBOOT_NS`` later),
 * with its positions if no current known peer has brought any for ``NO_POSITION_NS``: a vehicle may
   send positions over one radio, attitudes over another. Known peers whose stamps are of another
   clock become strangers then,
@@ -32,7 +32,7 @@ Over 300 lines: who is known, and what is used of each peer, depend on each othe
 
 import math
 from collections import deque
-from collections.abc import Collection
+from collections.abc import Collection, Iterable
 from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Final
@@ -117,9 +117,12 @@ class _Peer:
     agrees_since_ns: int = 0
     probation_ns: int = PROBATION_NS
     contradicted_ns: int = -SPACED_NS
+    has_left: bool = False  # its connection ended
 
     def is_current(self, now_ns: int) -> bool:
         """Return whether the peer's newest message is so new that more are to be expected."""
+        if self.has_left:
+            return False
         least_ns, most_ns = CURRENT_NS
         interval_ns = (self.heard_ns - self.since_ns) / self.messages
         return now_ns - self.heard_ns <= min(
@@ -135,7 +138,7 @@ class _Peer:
         """Note the arrival of a position or attitude."""
         if now_ns - self.heard_ns > KEPT_NS:
             self.since_ns, self.messages = now_ns, 0
-        self.heard_ns = now_ns
+        self.heard_ns, self.has_left = now_ns, False
         self.messages += 1
 
 
@@ -216,6 +219,13 @@ class KnownPeers:
             return PeerRank.LATER if _current_earlier(sender, known, now_ns) else PeerRank.FIRST
         is_believed = any(one.is_current(now_ns) for one in sender.known.values())
         return PeerRank.STRANGER if is_believed else PeerRank.FIRST
+
+    def connection_ended(self, peer: str, sources: Iterable[Source]) -> None:
+        """Note that a peer's connection ended, over which it sent frames of these sources."""
+        for source in sources:
+            sender = self._senders.get(source)
+            if sender is not None and (known := sender.known.get(peer)) is not None:
+                known.has_left = True
 
     # --- known peers --------------------------------------------------------------------------
 

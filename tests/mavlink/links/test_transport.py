@@ -495,6 +495,25 @@ def test_connections_are_served_concurrently(run: Run, host: str) -> None:
     run(test())
 
 
+def test_sender_that_reconnects_is_used_from_its_first_frame(run: Run) -> None:
+    """Its new connection is another peer, but the known one has left."""
+
+    async def test() -> None:
+        async with running("tcpin:127.0.0.1:0") as (link, inbox), connected(link) as other:
+            async with connected(link) as first:
+                first.send(frame(1))
+                await inbox.until(1)
+                other.send(frame(2))
+                await inbox.until_true(lambda: len(inbox.rejections) == 1)
+            await until_true(lambda: link.send(heartbeat(OURS)) == 1)  # it has noticed the end
+            async with connected(link) as second:
+                second.send(frame(3))
+                await inbox.until_true(lambda: len(inbox.items) == 3)
+                assert inbox.raws == [frame(1), frame(3)]
+
+    run(test())
+
+
 def test_number_of_connections_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(tcp, "CONNECTIONS_MAX", 2)
 

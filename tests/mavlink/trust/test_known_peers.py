@@ -82,6 +82,24 @@ def test_restarted_radio_with_new_address_is_used_after_a_second() -> None:
     assert peers.contradicted == []
 
 
+def test_peer_whose_connection_ended_keeps_nobody_out() -> None:
+    """A vehicle reconnects over TCP: its new connection is used from its first frame."""
+    peers, source = KnownPeers(), Source(1, 1)
+    rejected(peers, heard(HOME, 10, lasts_s=20))
+    assert peers.rank(LINK, OTHER, source, 20 * S) is PeerRank.STRANGER
+    peers.connection_ended(HOME, [source, Source(9, 1)])
+    assert peers.rank(LINK, OTHER, source, 20 * S) is PeerRank.FIRST
+    assert rejected(peers, heard(OTHER, 10, begins_s=20.1)) == {OTHER: []}
+
+
+def test_serial_line_that_is_plugged_in_again_keeps_strangers_out() -> None:
+    peers = KnownPeers()
+    rejected(peers, heard(HOME, 10, lasts_s=20))
+    peers.connection_ended(HOME, [Source(1, 1)])
+    rejected(peers, heard(HOME, 10, begins_s=20.1, lasts_s=21))
+    assert peers.rank(LINK, OTHER, Source(1, 1), 21 * S) is PeerRank.STRANGER
+
+
 def test_position_resets_of_one_vehicle_cost_the_first_route_nothing() -> None:
     def glitches(t_s: float) -> Place:
         return beside(30.0 if t_s % 20 > 10 else 0.0)(t_s)

@@ -40,6 +40,7 @@ CONTRADICTED: Final = (
     "{who}: reports from {stranger} contradict those from {known} and are rejected"
 )
 REPLACED: Final = "{who}: positions are used from {stranger}, since {known} sends none"
+LATE: Final = "{who}: attitudes from {stranger} are newer than those from {known}, but not used"
 NOTICE_EVERY_NS: Final = 60_000_000_000  # least time between two notices of too many senders
 SAVE_EVERY_S: Final = 0.25  # interval of checks whether signing timestamps must be saved
 
@@ -183,6 +184,7 @@ class Gateway:
         for told, text in (
             (self._known_peers.contradicted, CONTRADICTED),
             (self._known_peers.replaced, REPLACED),
+            (self._known_peers.late, LATE),
         ):
             for who, stranger, known in told:
                 said = text.format(who=who, stranger=stranger, known=" and ".join(known))

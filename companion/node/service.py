@@ -30,7 +30,8 @@ from companion.node.renewals import Renewals
 from companion.node.serving import NOTICES_KEPT, RateMeter, Server, in_daemon_thread
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
-from companion.recording.background import BackgroundRecorder, Rotation
+from companion.recording.background import STOP_MAX_S, BackgroundRecorder, Rotation
+from companion.recording.folders import folder_of
 from companion.recording.foxglove import LiveChannels
 from companion.recording.parts import Part
 from companion.recording.reader import LogError
@@ -65,6 +66,7 @@ from companion.views.state import ObservationCounts, RecordingStatus, overload
 HELD_UP_S: Final = 0.02  # lateness of a tick from which links are read before it
 READ_FIRST_S: Final = 0.1  # longest time for that
 READ_ROUNDS: Final = 3  # least number of iterations of the event loop for that
+DISK_WAIT_TOLD_S: Final = 2.0  # wait for the disk at the end after which it is announced
 WAIT_NS: Final = 20_000_000  # wait for this machine that does not matter for beams
 
 
@@ -204,7 +206,12 @@ class Service:
         if self._live:
             await asyncio.to_thread(self._live.stop)
         if self._recorder:
-            await asyncio.to_thread(self._recorder.stop, self.pipeline.digest.both())
+            metadata = self.pipeline.digest.both()
+            stopping = asyncio.create_task(asyncio.to_thread(self._recorder.stop, metadata))
+            _, unfinished = await asyncio.wait([stopping], timeout=DISK_WAIT_TOLD_S)
+            if unfinished:
+                self._say(f"waiting up to {STOP_MAX_S:.0f} s for the disk to finish the recording")
+            await stopping
             self._notify_recorder_state(self._recorder)
 
     def _fleet_node(self, settings: Settings) -> LiveFleetNode | None:
@@ -512,7 +519,10 @@ class Service:
         size_bytes = None if kept.rotate_mb is None else kept.rotate_mb * 1e6
         rotation = Rotation(size_bytes, kept.rotate_s)
         return BackgroundRecorder(
-            open_part=self._open_part, geodetic=self.pipeline.geodetic, rotation=rotation
+            open_part=self._open_part,
+            folder=folder_of(Path(kept.directory)),
+            geodetic=self.pipeline.geodetic,
+            rotation=rotation,
         )
 
     def _open_live(self) -> LiveChannels | None:
@@ -535,8 +545,8 @@ class Service:
     def _open_part(self, part: Part) -> Writer:
         kept = self._settings.recording
         where = Path(kept.directory or "")
-        if part.number > 1 and where.suffix == ".mcap" and not where.is_dir():
-            where = where.parent  # a file was requested: later parts go into its folder
+        if part.number > 1:
+            where = folder_of(where)  # also if a file was requested
         return Writer(
             where=where,
             settings_toml=self._settings.to_toml(),

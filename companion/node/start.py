@@ -12,7 +12,7 @@ from typing import Any, Final, Protocol
 from companion.node import systemd
 from companion.node.service import Service, require_center
 from companion.node.serving import address, run_until_stopped
-from companion.recording.folders import DIRECTORY_OPTION, make_recording_folder
+from companion.recording.folders import make_service_folder
 from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
@@ -63,7 +63,7 @@ def run(
     if not settings.links.urls:
         raise UserError("links.urls is empty; give --link udpin:0.0.0.0:14550")
     if settings.recording.directory is not None:
-        make_recording_folder(Path(settings.recording.directory), DIRECTORY_OPTION)
+        make_service_folder(Path(settings.recording.directory))
     manager = systemd.manager(os.environ)
     http = bind(settings.server.listen, token=token, insecure=insecure)
     with http:

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from companion.pipeline.angle_parts import AngleParts, ErrorSource, grown, largest
+from companion.pipeline.refusals import SIGNATURE_REASONS
 from companion.tracking.carrier import AttitudeParts
 from companion.values import (
     Beam,
@@ -37,6 +38,11 @@ TIMESYNC: Final = "allow TIMESYNC: set `[presence] enabled = true`, over a two-w
 FLY_APART: Final = 'fly them apart, or set `[beams] policy = "group"`'
 STEADIER_LINK: Final = "use a MAVLink link with a steadier delay"
 CHECK_LINK: Final = "check its MAVLink link: power, range, antenna"
+CHECK_SIGNING: Final = "check its signing key, and that its signing clock has not stepped back"
+CHECK_CARRIER: Final = (
+    "read the carrier's rejections in the notices, and check its GNSS receiver and id"
+)
+NAME_ROUTER: Final = "add the trusted peer to `[links] routers`"
 CHECK_RECEIVER: Final = "check the receiver that relays it, and the link to that receiver"
 
 
@@ -95,15 +101,18 @@ def of_left_out(
 
     track    the UAV's track; None if there are too many UAVs to predict them all
     unfit    why no UAV can have a beam; None if UAVs can
-    refused  why its newest reports were rejected; None if they were used, or if none arrives
+    refused  why the newest reports, of the carrier if it is unfit, were rejected; None if they were
+        used, or if none arrives
     """
     if unfit is not None:
-        return Blame(
-            Cause.CARRIER,
-            unfit,
+        remedy = (
             "check that the carrier is powered, connected and has a position fix, and that"
-            " `[center] source` is its id",
+            " `[center] source` is its id"
         )
+        if refused is not None:
+            unfit = f"{unfit}: its positions are rejected ({refused})"
+            remedy = _refused_remedy(refused, CHECK_CARRIER)
+        return Blame(Cause.CARRIER, unfit, remedy)
     match out.cause:
         case Cause.CROWDED:
             remedy = FLY_APART
@@ -208,8 +217,7 @@ def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence)
         case ErrorSource.ATTITUDE_AGE:
             age_s = (evidence.carrier.attitude_age_s or 0.0) - evidence.waited_s
             if age_s > SILENT_S:
-                reason = f"no attitude from the carrier for {_duration(age_s)}"
-                return Blame(Cause.CARRIER, reason, CHECK_LINK)
+                return _carrier_silence("attitude", age_s, evidence)
             remedy = "request ATTITUDE from the carrier at 10 Hz: set `[presence] attitude_hz = 10`"
         case ErrorSource.ATTITUDE_CONFLICT:
             reason = f"attitudes of the carrier contradict each other by {known}"
@@ -222,15 +230,20 @@ def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence)
 
 def _carrier_position_cause(carrier: Carrier, evidence: LinkEvidence) -> Blame:
     age_s = (carrier.age_s or 0.0) - evidence.waited_s
-    if age_s > SILENT_S and evidence.carrier.refused is not None:
-        reason = f"the carrier's positions are rejected: {evidence.carrier.refused}"
-        remedy = "read the carrier's rejections in the notices, and check its GNSS receiver and id"
-        return Blame(Cause.CARRIER, reason, remedy)
     if age_s > SILENT_S:
-        reason = f"no position from the carrier for {_duration(age_s)}"
-        return Blame(Cause.CARRIER, reason, CHECK_LINK)
+        return _carrier_silence("position", age_s, evidence)
     reason = f"the carrier's position is uncertain by {_rounded(carrier.bound_m)} m"
     return Blame(Cause.CARRIER, reason, "fit a better GNSS receiver to the carrier")
+
+
+def _carrier_silence(missing: str, age_s: float, evidence: LinkEvidence) -> Blame:
+    """Return why no position or attitude of the carrier was used for so long."""
+    refused = evidence.carrier.refused
+    if refused is not None:
+        reason = f"the carrier's positions are rejected: {refused}"
+        return Blame(Cause.CARRIER, reason, _refused_remedy(refused, CHECK_CARRIER))
+    reason = f"no {missing} from the carrier for {_duration(age_s)}"
+    return Blame(Cause.CARRIER, reason, CHECK_LINK)
 
 
 def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
@@ -269,11 +282,14 @@ def _refused_cause(refused: Reason) -> Blame:
             "this machine is overloaded, and drops its reports",
             "name it in `[tracks] allow`, or stop the sender that floods the links",
         )
-    return Blame(
-        Cause.REFUSED,
-        f"its reports are rejected: {refused}",
-        "open the UAV's details and read its rejections",
-    )
+    remedy = _refused_remedy(refused, "open the UAV's details and read its rejections")
+    return Blame(Cause.REFUSED, f"its reports are rejected: {refused}", remedy)
+
+
+def _refused_remedy(refused: Reason, otherwise: str) -> str:
+    if refused in SIGNATURE_REASONS:
+        return CHECK_SIGNING
+    return NAME_ROUTER if refused is Reason.STRANGER else otherwise
 
 
 def _silence_cause(track: Track) -> Blame:

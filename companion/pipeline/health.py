@@ -260,8 +260,11 @@ class HealthMonitor:
             held = self.verdicts.get(out.uav)
             if not all_of_them and (held is None or held.needed_gain_db is None):
                 continue
-            silent = update.unfit is None and out.cause is Cause.SILENT
-            refused = evidence(out.uav).refused if silent else None
+            refused = None
+            if update.unfit is not None:
+                refused = evidence(out.uav).carrier.refused
+            elif out.cause is Cause.SILENT:
+                refused = evidence(out.uav).refused
             found[out.uav] = Verdict(
                 uav=out.uav,
                 level=Level.NONE,

@@ -4,6 +4,7 @@ from collections import Counter, OrderedDict
 from dataclasses import dataclass, field
 from typing import Final
 
+from companion.mavlink.wire.positions import OWN
 from companion.pipeline.records import UavRecords, UnusedRun
 from companion.values import Notice, Reason, Rejection, Severity, UavKind, is_uav_id, kind_of
 from companion.values.newest import Newest
@@ -29,6 +30,15 @@ REPORT_REASONS: Final = frozenset(
     }
 )
 """Reasons to reject a sender's report about itself."""
+SIGNATURE_REASONS: Final = frozenset({Reason.UNSIGNED, Reason.BAD_SIGNATURE, Reason.REPLAYED})
+FRAME_REASONS: Final = SIGNATURE_REASONS | {Reason.STRANGER, Reason.MALFORMED}
+"""Reasons to reject frames of any message, of which positions are reports."""
+UNPROVEN: Final = SIGNATURE_REASONS | {Reason.STRANGER, Reason.NEWCOMER}
+"""Reasons to reject frames that may be of anybody: ids can be forged in any number."""
+OTHERWISE_TOLD: Final = frozenset({Reason.NEWCOMER, Reason.SHARED_ID, Reason.STRANGER})
+"""Reasons to reject reports that have a notice of their own."""
+UNSIGNED_REPORTS: Final = 5  # reports without a valid signature after which an id is named
+UNSIGNED_INTERVAL_NS: Final = 60_000_000_000  # least time between two such notices
 RECENT: Final = 8  # recent rejections kept per sender
 SENDERS_MAX: Final = 4096
 """Most senders remembered, so that forged addresses cannot exhaust the memory.
@@ -56,6 +66,7 @@ class Refusals:
         self._records = records
         self._senders: OrderedDict[str, SenderRejections] = OrderedDict()
         self._full_ns = -FULL_INTERVAL_NS  # when a notice told that the limit on tracks is reached
+        self._unsigned_ns = -UNSIGNED_INTERVAL_NS  # when one told of an id without any valid frame
 
     def add(self, refused: Rejection) -> Notice | None:
         """Count one rejection.
@@ -69,12 +80,10 @@ class Refusals:
             return self._full(refused)
         if refused.reason is Reason.SHARED_ID and kind_of(uav) is UavKind.ADSB:
             return self._shared_address(refused)
-        is_report = refused.reason in REPORT_REASONS and is_uav_id(uav)
-        if not is_report or not kind_of(uav).reports_itself:
+        if not _is_report(refused):
             return None
-        is_dropped = refused.reason is Reason.NEWCOMER
-        if is_dropped and not self._records.is_kept(uav):
-            return None  # ids can be forged in any number
+        if refused.reason in UNPROVEN and not self._records.is_kept(uav):
+            return self._never_valid(refused)
         record = self._records[uav]
         if record.unused is None:
             record.unused = UnusedRun(
@@ -86,8 +95,8 @@ class Refusals:
         lasted_ns = refused.t_ns - run.since_ns
         if run.is_reported or run.reports < 2 or lasted_ns < REJECTED_AFTER_NS:
             return None
-        if is_dropped or refused.reason is Reason.SHARED_ID:
-            return None  # these have a notice of their own
+        if refused.reason in OTHERWISE_TOLD:
+            return None
         run.is_reported = True
         notified_ns = record.unused_notice_ns
         if notified_ns is not None and refused.t_ns - notified_ns < NOTICE_INTERVAL_NS:
@@ -95,6 +104,17 @@ class Refusals:
         record.unused_notice_ns = refused.t_ns
         why = f"{refused.reason}, {refused.detail}" if refused.detail else str(refused.reason)
         text = f"no report of {uav} was used in the last {lasted_ns * 1e-9:.1f} s: {why}"
+        return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
+
+    def _never_valid(self, refused: Rejection) -> Notice | None:
+        """Return a notice of a sender of which no signed frame was accepted, about one of all."""
+        uav, is_due = refused.source, refused.t_ns - self._unsigned_ns >= UNSIGNED_INTERVAL_NS
+        if refused.reason not in SIGNATURE_REASONS or not is_due:
+            return None
+        if self.of(uav).counts[refused.reason] < UNSIGNED_REPORTS:
+            return None
+        self._unsigned_ns = refused.t_ns
+        text = f"reports of {uav} are rejected: {refused.reason}; check its signing key and clock"
         return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
 
     def _full(self, refused: Rejection) -> Notice | None:
@@ -125,13 +145,15 @@ class Refusals:
     def current_rejection(self, uav: str, now_ns: int) -> Reason | None:
         """Return why a sender's newest reports are rejected.
 
-        None if they are accepted, or if none has arrived for ``ARRIVING_NS``.
+        None if they are accepted, or if none has arrived for ``ARRIVING_NS``; also for reasons in
+        ``UNPROVEN`` while accepted ones may still come between.
         """
         record = self._records.get(uav)
         run = None if record is None else record.unused
         if run is None or run.reports < 2 or now_ns - run.newest_ns > ARRIVING_NS:
             return None
-        return run.reason
+        is_between = run.newest_ns - run.since_ns < REJECTED_AFTER_NS
+        return None if run.reason in UNPROVEN and is_between else run.reason
 
     def _count(self, refused: Rejection) -> None:
         self.total[refused.reason] += refused.count
@@ -148,3 +170,12 @@ class Refusals:
     def of(self, sender: str) -> SenderRejections:
         """Return the rejections of one sender, to be read only; empty for an unknown one."""
         return self._senders.get(sender) or _NO_REJECTIONS
+
+
+def _is_report(refused: Rejection) -> bool:
+    """Return whether a vehicle's report about itself was rejected."""
+    uav, reason = refused.source, refused.reason
+    is_position = reason in FRAME_REASONS and refused.msgid in OWN
+    return (
+        (is_position or reason in REPORT_REASONS) and is_uav_id(uav) and kind_of(uav).reports_itself
+    )

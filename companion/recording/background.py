@@ -3,6 +3,7 @@
 The queue is bounded; events that do not fit are counted and reported. After a disk error, writing
 is retried with growing delays; on a full disk, as soon as the disk has space. Events not yet on the
 disk are kept in the queue, and the recording continues in a new file, which states what is missing.
+A disk that is full or read-only at the start is treated alike: the service must serve beams.
 
 Over 300 lines: one thread with its queue, its failures and its parts.
 """
@@ -14,9 +15,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Final, NamedTuple
 
 from companion.recording.entries import Geodetic
+from companion.recording.folders import DISK_FAULTS
 from companion.recording.parts import Hole, Part
 from companion.recording.writer import Writer
 from companion.values import ClockSet, Event, Output, Severity
@@ -38,6 +41,8 @@ RETRY_FIRST_S: Final = 1.0
 Free space on a full disk is checked without writing, at the interval of the first retry.
 """
 RETRY_MAX_S: Final = 30.0  # longest time between two retries
+STALLED_S: Final = 5.0
+"""Time without a flush after which the disk is reported not to answer."""
 STOP_MAX_S: Final = 30.0  # longest wait for an unresponsive disk at the end of the service
 RESUME_BATCH: Final = 2000
 """Events written at once when a recording continues: some hundred kilobytes."""
@@ -74,7 +79,8 @@ class BackgroundRecorder:
     """Recorder on a thread, with one ``Writer`` for each part from ``start`` to ``stop``.
 
         open_part  creates the writer of a part. The first is created at once, and its ``OSError``
-                   is raised to the caller; errors of later parts are handled here
+                   is raised to the caller if it is none of ``DISK_FAULTS``
+        folder     where the parts are written
         geodetic   converts positions, for ``Encoder.output``
         rotation   when a new part begins
         queue_max  limit on queued events
@@ -87,6 +93,7 @@ class BackgroundRecorder:
         self,
         *,
         open_part: Callable[[Part], Writer],
+        folder: Path,
         geodetic: Geodetic,
         rotation: Rotation = NEVER,
         queue_max: int = QUEUE_MAX,
@@ -99,9 +106,10 @@ class BackgroundRecorder:
         self._open_part = open_part
         self._geodetic = geodetic
         self._rotation = rotation
+        self._folder = folder
         self._part = Part.first()
-        self._writer = open_part(self._part)
-        self._begun_s = time.monotonic()
+        self._begun_s = self._flushed_s = time.monotonic()
+        self._is_stalled = False
         self._finished_messages = 0  # messages in earlier parts
         self._queue: deque[_Item] = deque()  # bounded by ``put``, which never blocks
         self._queue_max = queue_max
@@ -116,6 +124,13 @@ class BackgroundRecorder:
         self._metadata: dict[str, str] = {}
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._open: Writer | None = None
+        try:
+            self._open = open_part(self._part)
+        except OSError as error:
+            if error.errno not in DISK_FAULTS:
+                raise
+            self._fail(error)
 
     # --- called on the event loop -----------------------------------------------------------
 
@@ -155,12 +170,11 @@ class BackgroundRecorder:
         self._stopping.set()
         self._thread.join(STOP_MAX_S)
         if self._thread.is_alive():
-            self._tell(
-                Severity.ERROR, f"{self._writer.path} is incomplete: the disk does not answer"
-            )
+            self._tell(Severity.ERROR, f"{self._where} is incomplete: the disk does not answer")
 
     def news(self) -> list[tuple[Severity, str]]:
-        """Return the messages for the operator since the last call."""
+        """Return the messages for the operator since the last call. Call it regularly."""
+        self._watch_for_stall()
         told = []
         while self._news:
             told.append(self._news.popleft())
@@ -168,28 +182,49 @@ class BackgroundRecorder:
 
     @property
     def degraded(self) -> bool:
-        """Whether some events are not being recorded."""
-        return self.failure is not None or self._overrun
+        """Whether some events are not being recorded, or wait for a disk that does not answer."""
+        return self.failure is not None or self._overrun or self._is_stalled
 
     @property
-    def file(self) -> str:
-        """Name of the newest file of the recording."""
-        return self._writer.path.name
+    def file(self) -> str | None:
+        """Name of the newest file of the recording; None before the first."""
+        return None if self._open is None else self._open.path.name
 
     @property
     def messages(self) -> int:
         """Messages recorded in all parts so far."""
-        return self._finished_messages + self._writer.messages
+        return self._finished_messages + (0 if self._open is None else self._open.messages)
 
     @property
     def queued(self) -> int:
         """Number of events that wait to be written."""
         return len(self._queue)
 
+    def _watch_for_stall(self) -> None:
+        """Publish a notice when the disk does not answer, and when it does again."""
+        is_waiting = bool(self._queue or self._unflushed) and self.failure is None
+        waited_s = time.monotonic() - self._flushed_s
+        was_stalled, self._is_stalled = self._is_stalled, is_waiting and waited_s > STALLED_S
+        if self._is_stalled and not was_stalled:
+            text = f"{self._where}: the disk has not answered for {STALLED_S:.0f} s; events wait"
+            self._tell(Severity.ERROR, text)
+        elif was_stalled and not self._is_stalled and self.failure is None:
+            self._tell(Severity.INFO, "the disk answers again")
+
     # --- called on the thread ---------------------------------------------------------------
 
+    @property
+    def _writer(self) -> Writer:
+        """Writer of the newest part, once there is one."""
+        assert self._open is not None
+        return self._open
+
+    @property
+    def _where(self) -> Path:
+        return self._folder if self._open is None else self._open.path
+
     def _run(self) -> None:
-        while not self._record():
+        while self._open is None or not self._record():
             if not self._reopen():
                 return
 
@@ -258,6 +293,7 @@ class BackgroundRecorder:
         self._unflushed.clear()
         self._retry_s = RETRY_FIRST_S
         self.bytes = self._writer.size_bytes
+        self._flushed_s = time.monotonic()
 
     def _finish(self) -> None:
         if self._missed:
@@ -276,12 +312,14 @@ class BackgroundRecorder:
 
     def _open_next(self) -> None:
         """Open the next part, or the same part again if none of it is on the disk."""
-        before = self._writer
-        part = self._part.after(before.path.name) if before.flushed else self._part
+        before, part, flushed = self._open, self._part, 0
+        if before is not None and before.flushed:
+            part, flushed = part.after(before.path.name), before.flushed
         made = self._open_part(part)
-        self._finished_messages += before.flushed
+        self._finished_messages += flushed
         self.bytes = made.size_bytes
-        self._writer, self._part, self._begun_s = made, part, time.monotonic()
+        self._open, self._part = made, part
+        self._begun_s = self._flushed_s = time.monotonic()
 
     # --- disk errors ------------------------------------------------------------------------
 
@@ -289,10 +327,10 @@ class BackgroundRecorder:
         """Handle a disk error; publish a notice of the first, but not of failed retries."""
         self._why = error.strerror or str(error)
         if self.failure is None:
-            text = f"nothing is recorded: {self._writer.path}: {self._why}; trying again"
+            text = f"nothing is recorded: {self._where}: {self._why}; trying again"
             self._tell(Severity.ERROR, text)
-        self.failure = f"{self._writer.path}: {self._why}"
-        if not self._writer.salvage():
+        self.failure = f"{self._where}: {self._why}"
+        if self._open is not None and not self._open.salvage():
             self._lost += sum(item.event is not None for item in self._unflushed)
             self.dropped += len(self._unflushed)
             self._unflushed.clear()
@@ -314,7 +352,7 @@ class BackgroundRecorder:
 
     def _require_room(self) -> None:
         try:
-            found = os.statvfs(self._writer.path.parent)
+            found = os.statvfs(self._folder if self._open is None else self._open.path.parent)
         except FileNotFoundError:
             return  # the folder will be created
         if found.f_bavail * found.f_frsize < MIN_FREE_BYTES:

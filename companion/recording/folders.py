@@ -1,11 +1,14 @@
 """Output folders, with one-line errors that name the option."""
 
+import errno
 from pathlib import Path
 from typing import Final
 
 from companion.values import UserError, shown
 
 RECORDING_MODE: Final = 0o750
+DISK_FAULTS: Final = frozenset({errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EIO})
+"""Errors of a full, read-only or broken disk, which are no mistake of the user."""
 DIRECTORY_OPTION: Final = "recording.directory (--record)"
 
 
@@ -14,8 +17,24 @@ def make_recording_folder(where: Path, option: str) -> None:
 
     Raises ``UserError`` as ``make_folder``.
     """
-    is_file = where.suffix == ".mcap" and not where.is_dir()
-    make_folder(where.parent if is_file else where, option, RECORDING_MODE)
+    make_folder(folder_of(where), option, RECORDING_MODE)
+
+
+def make_service_folder(where: Path) -> None:
+    """Create the folder of a service's recordings, unless the disk is full, read-only or broken.
+
+    The recorder tries again. Raises ``UserError`` as ``make_folder``.
+    """
+    try:
+        make_recording_folder(where, DIRECTORY_OPTION)
+    except UserError as error:
+        if not isinstance(error.__cause__, OSError) or error.__cause__.errno not in DISK_FAULTS:
+            raise
+
+
+def folder_of(where: Path) -> Path:
+    """Return the folder of recordings at ``where``, a folder or a file ``.mcap`` in it."""
+    return where.parent if where.suffix == ".mcap" and not where.is_dir() else where
 
 
 def make_folder(folder: Path, option: str, mode: int = 0o777) -> list[Path]:
@@ -37,5 +56,5 @@ def make_folder(folder: Path, option: str, mode: int = 0o777) -> list[Path]:
         raise UserError(
             f"{option} {shown(str(folder))}: the folder cannot be created ({error.strerror});"
             " name one that can be written"
-        ) from None
+        ) from error
     return made

@@ -139,6 +139,27 @@ def test_carrier_is_blamed_for_its_position() -> None:
     assert silent[1] == "no position from the carrier for 1.4 s"
 
 
+@pytest.mark.parametrize(
+    ("refused", "remedy"),
+    [(Reason.REPLAYED, "signing"), (Reason.STRANGER, "routers"), (Reason.FROZEN, "receiver")],
+)
+def test_rejected_carrier_is_not_silent(refused: Reason, remedy: str) -> None:
+    """Whatever is missing: its position, its attitude, or both, so that no UAV has a beam."""
+    known = CarrierEvidence(
+        attitude=AttitudeParts(age_rad=0.19), attitude_age_s=1.4, refused=refused
+    )
+    for carrier in (
+        replace(CARRIER, bound_m=8.0, age_s=1.4),
+        replace(CARRIER, attitude_bound_rad=0.2),
+    ):
+        found = blamed(carrier=carrier, evidence=replace(FINE, carrier=known))
+        assert found[:2] == (Cause.CARRIER, f"the carrier's positions are rejected: {refused}")
+        assert remedy in found[2]
+    out = blame.of_left_out(LeftOut("3:1", Cause.CARRIER, "-"), TRACK, "no beams", refused)
+    assert out.reason == f"no beams: its positions are rejected ({refused})"
+    assert remedy in out.remedy
+
+
 def test_wait_for_this_machine_is_blamed_on_it() -> None:
     """All of the age comes from this machine: neither the link nor the compass is at fault."""
     old = replace(TRACK, age_s=0.9, bound_m=5.0)

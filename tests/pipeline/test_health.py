@@ -12,11 +12,11 @@ from companion.beams.array.coverage import EVERYWHERE
 from companion.beams.array.geometry import uniform_linear
 from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
-from companion.pipeline.blame import LinkEvidence
+from companion.pipeline.blame import CarrierEvidence, LinkEvidence
 from companion.pipeline.health import AT_ONCE, COASTING_S, FALLEN_AT_ONCE, MARGIN_DB, HealthMonitor
 from companion.pipeline.link_gains import GainMeter, Site
 from companion.settings.beams import NeedSettings
-from companion.values import Carrier, Level, Notice, Severity, Track, TrackState, Update
+from companion.values import Carrier, Level, Notice, Reason, Severity, Track, TrackState, Update
 
 S = 1_000_000_000
 ARRAY = uniform_linear(16, 30e9, spacing_wavelengths=0.5, array_from_body=np.eye(3))
@@ -69,15 +69,15 @@ class Watch:
     """Link assessment that requires 10 dB, with its notices."""
 
     def __init__(self, **need: float) -> None:
+        self.carrier = CarrierEvidence()
         self.health = HealthMonitor(NeedSettings(**need) if need else NEED, SITE)
         self.said: list[Notice] = []
 
     def see(self, t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> str:
         news = update(t_s, tracks, carrier)
         weighed = self.health.next_batch(news)
-        self.said += self.health.judge(
-            news, weighed, lambda _uav: LinkEvidence(clock_assumed=False, refused=None)
-        )
+        known = LinkEvidence(clock_assumed=False, refused=None, carrier=self.carrier)
+        self.said += self.health.judge(news, weighed, lambda _uav: known)
         return " ".join(str(one.level) for one in self.health.verdicts.values())
 
 
@@ -245,6 +245,16 @@ def test_common_cause_is_announced_once() -> None:
         "no links: the carrier is not known",
         "links to 1:1, 2:1, 3:1: good",
     ]
+
+
+def test_carrier_whose_positions_are_rejected_is_the_cause_for_all() -> None:
+    watch = Watch()
+    watch.carrier = CarrierEvidence(refused=Reason.BAD_SIGNATURE)
+    watch.see(0, [track("1:1", *SURE)])
+    assert watch.see(1, [track("1:1", *SURE)], None) == "none"
+    why = watch.health.verdicts["1:1"].blame
+    assert why is not None and why.reason.endswith("its positions are rejected (bad-signature)")
+    assert "signing key" in why.remedy
 
 
 def test_a_uav_that_is_gone_is_forgotten() -> None:

@@ -1,5 +1,9 @@
 """Rejections: counted by sender, with bounded memory under a flood of ids."""
 
+import pytest
+
+from companion.mavlink.wire.decode import HEARTBEAT
+from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.pipeline.records import Records, UavRecord
 from companion.pipeline.refusals import ARRIVING_NS, RECENT, SENDERS_MAX, Refusals
 from companion.values import Reason, Rejection
@@ -33,11 +37,17 @@ def test_flood_of_senders_evicts_the_least_recent() -> None:
     assert refusals.of("1:1").counts == {Reason.DUPLICATE: 2 * SENDERS_MAX}
 
 
-def refused(t_s: float, uav: str = "3:1", reason: Reason = Reason.UNREACHABLE) -> Rejection:
+def refused(
+    t_s: float,
+    uav: str = "3:1",
+    reason: Reason = Reason.UNREACHABLE,
+    msgid: int = GLOBAL_POSITION_INT,
+) -> Rejection:
     return Rejection(
         t_ns=round(t_s * 1e9),
         source=uav,
         reason=reason,
+        msgid=msgid,
         detail="45.0 m from the prediction, at most 4.0 m possible",
     )
 
@@ -80,8 +90,11 @@ def test_consecutive_runs_are_announced_at_most_every_ten_seconds() -> None:
 
 def test_rejections_unrelated_to_own_reports_are_not_announced() -> None:
     refusals = new_refusals()
-    for reason in (Reason.DUPLICATE, Reason.BAD_CRC, Reason.NOT_ALLOWED, Reason.UNSIGNED):
+    for reason in (Reason.DUPLICATE, Reason.BAD_CRC, Reason.NOT_ALLOWED):
         assert told_at(refusals, [refused(t, reason=reason) for t in range(9)]) == []
+    for reason in (Reason.UNSIGNED, Reason.MALFORMED):
+        others = [refused(t, reason=reason, msgid=HEARTBEAT) for t in range(9)]
+        assert told_at(refusals, others) == []
     assert told_at(refusals, [refused(t, "icao:4CA7B3") for t in range(9)]) == []
 
 
@@ -103,6 +116,50 @@ def test_vehicles_whose_frames_are_dropped_are_remembered_only_if_they_are_track
     assert refusals.current_rejection("3:1", 4_000_000_000) is Reason.NEWCOMER
     assert refusals.current_rejection("7:7", 4_000_000_000) is None
     assert refusals.of("7:7").counts == {Reason.NEWCOMER: 5}
+
+
+@pytest.mark.parametrize(
+    ("reason", "told"),
+    [
+        (Reason.UNSIGNED, [1.0]),
+        (Reason.BAD_SIGNATURE, [1.0]),
+        (Reason.REPLAYED, [1.0]),
+        (Reason.MALFORMED, [1.0]),
+        (Reason.STRANGER, []),  # which has notices of its own
+    ],
+)
+def test_tracked_vehicle_whose_positions_are_all_rejected_is_not_silent(
+    reason: Reason, told: list[float]
+) -> None:
+    refusals = Refusals(Records(UavRecord, {"3:1"}.__contains__))
+    assert told_at(refusals, [refused(t / 4, reason=reason) for t in range(20)]) == told
+    assert refusals.current_rejection("3:1", 5_000_000_000) is reason
+
+
+def test_forged_positions_between_accepted_ones_explain_nothing() -> None:
+    """Anybody may send unsigned frames in a vehicle's name, and more often than the vehicle."""
+    refusals = Refusals(Records(UavRecord, {"3:1"}.__contains__))
+    for t in range(100):
+        assert refusals.add(refused(t / 20, reason=Reason.UNSIGNED)) is None
+        assert refusals.current_rejection("3:1", t * 50_000_000) is None
+        if t % 15 == 0:
+            refusals.used("3:1")
+
+
+def test_vehicle_of_which_no_signed_frame_was_ever_accepted_is_named() -> None:
+    """One of them in a minute: ids can be forged in any number."""
+    refusals = Refusals(Records(UavRecord, set[str]().__contains__))
+    several = [
+        refused(t / 4 + k / 100, f"{k}:1", Reason.BAD_SIGNATURE)
+        for t in range(400)
+        for k in range(1, 9)
+    ]
+    assert told_at(refusals, several) == pytest.approx([1.01, 61.01])
+    said = Refusals(Records(UavRecord, set[str]().__contains__))
+    texts = {one.text for each in several if (one := said.add(each)) is not None}
+    assert texts == {"reports of 1:1 are rejected: bad-signature; check its signing key and clock"}
+    strangers = [refused(200 + t, "9:1", Reason.STRANGER) for t in range(99)]
+    assert told_at(refusals, strangers) == []
 
 
 def test_rejections_of_a_link_are_not_announced_as_those_of_a_vehicle() -> None:

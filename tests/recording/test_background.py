@@ -5,6 +5,7 @@ import os
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
@@ -19,6 +20,7 @@ from support import BALLAST, HANG_S, ROOT, fill, read_metadata
 from companion.node.replay import log_events, missing
 from companion.recording import background
 from companion.recording.background import BackgroundRecorder, Rotation
+from companion.recording.folders import make_service_folder
 from companion.recording.parts import UNFOLLOWED, Hole, Part, read_recording_info
 from companion.recording.reader import read_log, utc_offset_ns
 from companion.recording.writer import Writer
@@ -36,6 +38,7 @@ from companion.values import (
     Source,
     Tick,
     Update,
+    UserError,
 )
 
 RAW = b"\xfe\x00\x00\x01\x01\x00\x00\x00"
@@ -62,7 +65,11 @@ def recorder(folder: Path, rotation: Rotation | None = None, **more: int) -> Bac
         )
 
     return BackgroundRecorder(
-        open_part=open_part, geodetic=nowhere, rotation=rotation or Rotation(), **more
+        open_part=open_part,
+        folder=folder,
+        geodetic=nowhere,
+        rotation=rotation or Rotation(),
+        **more,
     )
 
 
@@ -180,6 +187,72 @@ def test_full_disk_leaves_no_empty_file(small_disk: Path) -> None:
             where=small_disk, settings_toml="", versions={}, weights_hz=None, started_ns=START_NS
         )
     assert [path.name for path in small_disk.iterdir()] == [BALLAST]
+
+
+def test_disk_that_is_full_at_the_start_is_recorded_to_once_it_has_space(small_disk: Path) -> None:
+    """A service that filled its disk is restarted: it has beams, and says that nothing is kept."""
+    fill(small_disk)
+    made = recorder(small_disk)
+    assert made.degraded and made.file is None and made.messages == 0
+    assert [(severity, "No space left" in text) for severity, text in made.news()] == [
+        (Severity.ERROR, True)
+    ]
+    made.start()
+    events = hand_over(made, ticks(1, 5000))
+    (small_disk / BALLAST).unlink()
+    wait_until(lambda: made.failure is None)
+    made.stop({})
+    (only,) = parts_of(small_disk)
+    assert list(log_events([only], Settings())) == events
+    assert missing([only]) == [] and made.dropped == 0
+
+
+def test_disk_that_stays_full_from_the_start_does_not_delay_the_end(small_disk: Path) -> None:
+    fill(small_disk)
+    made = recorder(small_disk)
+    made.start()
+    hand_over(made, ticks(1, 100))
+    made.stop({})
+    assert made.dropped == 99
+    assert [path.name for path in small_disk.iterdir()] == [BALLAST]
+
+
+def test_read_only_disk_does_not_keep_a_service_from_its_start(small_disk: Path) -> None:
+    remount = ["mount", "-o", "remount,ro", small_disk]
+    subprocess.run(remount, check=True, timeout=HANG_S)
+    for folder in (small_disk, small_disk / "not" / "there"):
+        make_service_folder(folder)
+        made = recorder(folder)
+        assert "Read-only" in str(made.failure) and str(folder) in str(made.failure)
+    with pytest.raises(UserError, match="is not a folder"):
+        make_service_folder(Path(__file__))
+
+
+def test_disk_that_does_not_answer_is_announced_and_that_it_does_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(background, "STALLED_S", 0.2)
+    made, answers = recorder(tmp_path), threading.Event()
+    flush = made._writer.flush
+
+    def waits() -> None:
+        assert answers.wait(HANG_S)
+        flush()
+
+    monkeypatch.setattr(made._writer, "flush", waits)
+    made.start()
+    assert made.news() == [] and not made.degraded
+    hand_over(made, ticks(1, 10))
+    news = list[tuple[Severity, str]]()
+    wait_until(lambda: bool(news.extend(made.news()) or news))
+    assert made.degraded
+    assert [severity for severity, _ in news] == [Severity.ERROR]
+    assert "has not answered" in news[0][1]
+    answers.set()
+    wait_until(lambda: bool(news.extend(made.news()) or len(news) > 1))
+    assert news[1:] == [(Severity.INFO, "the disk answers again")]
+    assert not made.degraded
+    made.stop({})
 
 
 def test_full_disk_retry_interval_does_not_grow(
@@ -371,7 +444,7 @@ def test_slow_disk_drops_events_and_reports_the_count(
             part=part,
         )
 
-    made = BackgroundRecorder(open_part=open_part, geodetic=slow, queue_max=1000)
+    made = BackgroundRecorder(open_part=open_part, folder=tmp_path, geodetic=slow, queue_max=1000)
     made.start()
     made.put(Tick(START_NS), [update(START_NS)])
     wait_until(lambda: waiting(made) == 0)
@@ -451,7 +524,7 @@ def test_write_failure_gap_counts_only_log_events(
             part=part,
         )
 
-    made = BackgroundRecorder(open_part=open_part, geodetic=nowhere, queue_max=5)
+    made = BackgroundRecorder(open_part=open_part, folder=tmp_path, geodetic=nowhere, queue_max=5)
     hand_over(made, ticks(1, 3))
     for n in range(3):
         made.put(None, said(START_NS + n))

@@ -17,10 +17,11 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
 again; its positions are used only as far as they agree with those of the other. Its attitudes and
 what else moves a bound are used only where the other has not brought the same message shortly
-before: positions that agree prove nothing about these. Its stamps are used only if they are of the
-other's clock: a clock of its own would look like a restart, or like a second vehicle. So the
-vehicle that was here first stays believed, and a stranger costs it nothing; whoever sends first in
-a vehicle's name is believed until it falls silent.
+before: positions that agree prove nothing about these. If the other has become late, by its own
+stamps, newer attitudes are used, but none newer than it could ever deliver. Its stamps are used
+only if they are of the other's clock: a clock of its own would look like a restart, or like a
+second vehicle. So the vehicle that was here first stays believed, and a stranger costs it nothing;
+whoever sends first in a vehicle's name is believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
@@ -39,6 +40,7 @@ from typing import Final
 
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
 from companion.mavlink.trust.paths import RESTARTED_MS, SLACK_M, Path
+from companion.mavlink.trust.peer_clock import PeerClock, has_stamp, stamp_ms
 from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE
 from companion.mavlink.wire.decode import (
     ATTITUDE,
@@ -84,6 +86,10 @@ BROUGHT_NS: Final = {
     **dict.fromkeys((*ABOUT_ATTITUDE, GPS_RAW_INT, EKF_STATUS_REPORT, HEARTBEAT), 5_000_000_000),
 }
 """Messages that move bounds, and the time for which one excludes those of peers known later."""
+OVERTAKEN_MS: Final = 300
+"""How much newer an attitude must be than that of a peer that was known first and became late."""
+EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
+LATE_PEER_MS: Final = 1000  # how much newer attitudes are whose rejection is announced
 _ABOUT_SENDER: Final = frozenset(
     {*STAMPED, *POSE, *ABOUT_ATTITUDE, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT}
 )
@@ -112,6 +118,7 @@ class _Peer:
     messages: int = 1  # positions and attitudes since then
     newest: dict[int, Frame] = field(default_factory=dict)  # of each message since then
     stamped: Frame | None = None  # newest with a stamp, while other peers are known too
+    clock: PeerClock = field(default_factory=PeerClock)
     path: Path = field(default_factory=Path)
     agreements: int = 0
     agrees_since_ns: int = 0
@@ -150,6 +157,7 @@ class _Sender:
     strangers: dict[str, _Peer] = field(default_factory=dict)
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
     notified_ns: int = -NOTICE_NS
+    late_notified_ns: int = -NOTICE_NS
     comparisons: Budget = field(
         default_factory=lambda: Budget(per_s=COMPARED_PER_S, most=COMPARED_PER_S)
     )
@@ -172,6 +180,8 @@ class KnownPeers:
         self.contradicted: list[tuple[str, str, tuple[str, ...]]] = []
         self.replaced: list[tuple[str, str, tuple[str, ...]]] = []
         """Senders whose positions are taken from a peer, since the known ones bring none."""
+        self.late: list[tuple[str, str, tuple[str, ...]]] = []
+        """Senders of which a peer brings newer attitudes than those that were known first."""
         self._routers = frozenset(routers)
         self._senders: dict[Source, _Sender] = {}
 
@@ -237,12 +247,14 @@ class KnownPeers:
             known.newest[msgid] = frame
         if msgid in POSE:
             known.hear(frame.t_ns)
-        if not is_only and (msgid in STAMPED or msgid in OWN):
+            if frame.t_ns >= known.clock.due_ns:
+                known.clock.observe(frame)
+        if not is_only and has_stamp(frame):
             if _is_of_another_clock(sender, known, frame):
                 return STRANGER
             known.stamped = frame
         if msgid in BROUGHT_NS and not is_only:
-            return BROUGHT if _is_brought(sender, known, frame) else None
+            return self._refusal_of_brought(sender, peer, known, frame)
         if msgid not in OWN or (is_only and not sender.strangers):
             return None
         refused = self._compare_known(sender, peer, known, frame)
@@ -251,6 +263,40 @@ class KnownPeers:
             if any(one.brings_positions(frame.t_ns) for one in earlier):
                 return BROUGHT
         return refused
+
+    def _refusal_of_brought(
+        self, sender: _Sender, peer: str, known: _Peer, frame: Frame
+    ) -> str | None:
+        """Return why a message that moves a bound must be rejected.
+
+        That is if peers that were known earlier brought it shortly before. Copies of their messages
+        count as not brought: they are found as duplicates.
+        """
+        if known.is_router:
+            return None
+        earlier = [
+            (one, one.newest[frame.msgid])
+            for one in sender.known.values()
+            if _standing(one) > _standing(known) and frame.msgid in one.newest
+        ]
+        now_ns, kept_ns = frame.t_ns, BROUGHT_NS[frame.msgid]
+        recent = [(one, same) for one, same in earlier if now_ns - same.t_ns <= kept_ns]
+        if not recent or any(same.payload == frame.payload for _, same in recent):
+            return None
+        if frame.msgid not in STAMPED:
+            return BROUGHT
+        if all(_is_overtaken(one, same, frame) for one, same in recent):
+            return None
+        if all(_ahead_ms(frame, same) > LATE_PEER_MS for _, same in recent):
+            self._note_late(sender, peer, frame)
+        return BROUGHT
+
+    def _note_late(self, sender: _Sender, peer: str, frame: Frame) -> None:
+        """Publish that the peers that were known first are late, and believed all the same."""
+        if frame.t_ns - sender.late_notified_ns >= NOTICE_NS:
+            sender.late_notified_ns = frame.t_ns
+            names = tuple(name for name in sender.known if name != peer)
+            self.late.append((str(frame.source), peer, names))
 
     def _compare_known(self, sender: _Sender, peer: str, known: _Peer, frame: Frame) -> str | None:
         """Compare a known peer's position with those of all other peers of its sender."""
@@ -389,20 +435,19 @@ class KnownPeers:
         return self._senders.setdefault(frame.source, _Sender())
 
 
-def _is_brought(sender: _Sender, known: _Peer, frame: Frame) -> bool:
-    """Return whether a peer that was known earlier brought the same message shortly before.
+def _ahead_ms(frame: Frame, other: Frame) -> int:
+    """Return how far the stamp of a message is ahead of another one of its kind."""
+    return step_ms(boot_ms(frame), boot_ms(other))
 
-    Copies of its messages count as not brought: they are found as duplicates.
+
+def _is_overtaken(earlier: _Peer, same: Frame, frame: Frame) -> bool:
+    """Return whether a peer has become late, so that another one brings newer messages.
+
+    It was faster before, so the stamp is not from the future.
     """
-    if known.is_router:
-        return False
-    newest = [
-        one.newest[frame.msgid]
-        for one in sender.known.values()
-        if _standing(one) > _standing(known) and frame.msgid in one.newest
-    ]
-    newest = [one for one in newest if frame.t_ns - one.t_ns <= BROUGHT_NS[frame.msgid]]
-    return bool(newest) and all(one.payload != frame.payload for one in newest)
+    late_ms = earlier.clock.late_ms(frame)
+    is_newer = _ahead_ms(frame, same) > OVERTAKEN_MS
+    return is_newer and late_ms is not None and late_ms > -EARLY_MS
 
 
 def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
@@ -429,12 +474,12 @@ def _clock_off_ms(one: _Peer, frame: Frame) -> int:
     """Return how far a stamp is off the newest one of a peer; 0 if that peer has sent none."""
     stamped = one.stamped
     if stamped is None:
-        timed = [m for m in one.newest.values() if m.msgid in STAMPED or m.msgid in OWN]
+        timed = [m for m in one.newest.values() if has_stamp(m)]
         if not timed:
             return 0
         stamped = max(timed, key=lambda m: m.t_ns)
-    expected_ms = _stamp_ms(stamped) + (frame.t_ns - stamped.t_ns) // 1_000_000
-    return abs(step_ms(_stamp_ms(frame), expected_ms))
+    expected_ms = stamp_ms(stamped) + (frame.t_ns - stamped.t_ns) // 1_000_000
+    return abs(step_ms(stamp_ms(frame), expected_ms))
 
 
 def _is_another_clock_too_soon(sender: _Sender, frame: Frame) -> bool:
@@ -450,10 +495,6 @@ def _is_usable(frame: Frame) -> bool:
     said = read(frame)
     has_place = (said.lat_1e7, said.lon_1e7) != (0, 0)
     return has_place and abs(said.lat_1e7) <= 900_000_000 and abs(said.lon_1e7) <= 1_800_000_000
-
-
-def _stamp_ms(frame: Frame) -> int:
-    return boot_ms(frame) if frame.msgid in STAMPED else read(frame).boot_ms
 
 
 def _agrees(excess_m: float | None) -> bool:

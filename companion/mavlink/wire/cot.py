@@ -16,6 +16,9 @@ from xml.parsers import expat
 
 DEPTH_MAX: Final = 32  # deepest nesting of elements
 UNKNOWN: Final = 9_999_999.0
+"""Height or accuracy in XML that is unknown."""
+UNKNOWN_LEAST: Final = 999_999.0
+"""Accuracy from which on it is unknown: TAK's protobuf has this value in place of ``UNKNOWN``."""
 OWN: Final = "uav-companion-beams."
 """Prefix of the ids of events that this program writes about other aircraft."""
 _TIME_MAX_MS: Final = 1 << 48
@@ -110,8 +113,8 @@ def _checked(
         lat_deg=lat_deg,
         lon_deg=lon_deg,
         hae_m=hae_m if -12_000 < hae_m < 100_000 else None,
-        ce_m=ce_m if 0 < ce_m < UNKNOWN else None,
-        le_m=le_m if 0 < le_m < UNKNOWN else None,
+        ce_m=ce_m if 0 < ce_m < UNKNOWN_LEAST else None,
+        le_m=le_m if 0 < le_m < UNKNOWN_LEAST else None,
         course_deg=course_deg if 0 <= course_deg <= 360 else None,
         speed_mps=speed_mps if 0 <= speed_mps < 1000 else None,
         slope_deg=slope_deg if -90 < slope_deg < 90 else None,

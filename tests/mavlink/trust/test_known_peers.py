@@ -171,6 +171,53 @@ def test_attitude_of_a_peer_whose_positions_agreed_is_not_used_beside_that_of_th
     assert peers.refusal(LINK, OTHER, copy) is None  # a duplicate, which is found as such
 
 
+def stamped_attitude(arrives_s: float, stamp_s: float, yaw_rad: float = 0.5) -> Frame:
+    return replace_time(attitude(stamp_s, yaw_rad), arrives_s)
+
+
+def replace_time(frame: Frame, t_s: float) -> Frame:
+    return frame._replace(t_ns=round(t_s * S))
+
+
+def test_newer_attitudes_are_used_once_the_first_peer_has_become_late() -> None:
+    """Its radio begins to buffer: the second one brings all in time."""
+    peers = with_two_known_peers()
+    used = list[float]()
+    for number in range(200):
+        t_s = 20 + number / 10
+        late_s = min(3.0, 0.5 * max(0.0, t_s - 22))
+        assert peers.refusal(LINK, HOME, stamped_attitude(t_s + 0.05, t_s - late_s)) is None
+        if peers.refusal(LINK, OTHER, stamped_attitude(t_s + 0.09, t_s, 0.6)) is None:
+            used.append(t_s)
+    assert used == [20 + number / 10 for number in range(27, 200)]
+    assert peers.late == []
+
+
+def test_attitudes_from_the_future_do_not_make_the_first_peer_late() -> None:
+    peers = with_two_known_peers()
+    for number in range(100):
+        t_s = 20 + number / 10
+        assert peers.refusal(LINK, HOME, attitude(t_s, 0.5)) is None
+        for ahead_s in (0.2, 0.35, 0.9, 5.0):
+            assert peers.refusal(LINK, OTHER, stamped_attitude(t_s, t_s + ahead_s, 0.6)) == BROUGHT
+    assert [(who, peer) for who, peer, _ in peers.late] == [("1:1", OTHER)]
+
+
+def test_first_peer_that_was_always_late_is_believed_and_named() -> None:
+    """A second peer may be the faster one, or send stamps from the future: nothing tells which."""
+    peers = KnownPeers()
+    rejected(
+        peers,
+        heard(HOME, 10, lasts_s=20, delay_s=lambda: 2.5),
+        heard(OTHER, 10, begins_s=5, lasts_s=22),
+    )
+    for number in range(900):
+        t_s = 22 + number / 10
+        assert peers.refusal(LINK, HOME, stamped_attitude(t_s, t_s - 2.5)) is None
+        assert peers.refusal(LINK, OTHER, stamped_attitude(t_s, t_s, 0.6)) == BROUGHT
+    assert peers.late == [("1:1", OTHER, (HOME,))] * 2
+
+
 @pytest.mark.parametrize("off_s", [0.0, 600.0])
 def test_positions_over_another_radio_than_attitudes_are_used(off_s: float) -> None:
     """The first radio's attitudes stay in force, unless their stamps are of another clock."""

@@ -75,7 +75,7 @@ def test_times_without_a_zone_are_utc() -> None:
 def test_slope_and_unknown_errors_are_decoded() -> None:
     sinking = said(changed('speed="12.5"', 'speed="12.5" slope="-45"'))
     assert sinking.velocity_down_mps == pytest.approx(12.5)
-    for ce in ("9999999", "9999999.0", "0", "-1", "NaN"):
+    for ce in ("9999999", "9999999.0", "999999", "0", "-1", "NaN"):
         report = said(changed('ce="4.5"', f'ce="{ce}"'))
         assert report.accuracy == (None, 9.0, None, None)
     assert said(changed('<track course="90.0" speed="12.5"/>', "")).velocity_ne_mps is None

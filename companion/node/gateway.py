@@ -6,6 +6,7 @@ sent.
 
 import asyncio
 from collections.abc import Callable, Iterable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Final
 
@@ -20,6 +21,8 @@ from companion.mavlink.voice.component import ACCEPTED_IDS, ComponentSpec, Servi
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.mavlink.voice.verdict_reports import VerdictReports
 from companion.mavlink.wire.encode import Outgoing
+from companion.node.serving import in_daemon_thread
+from companion.recording.background import STALLED_S
 from companion.settings.center import VehicleCenter, parse_center
 from companion.settings.model import Settings
 from companion.settings.section import ConfigError
@@ -41,6 +44,10 @@ CONTRADICTED: Final = (
 )
 REPLACED: Final = "{who}: positions are used from {stranger}, since {known} sends none"
 LATE: Final = "{who}: attitudes from {stranger} are newer than those from {known}, but not used"
+UNANSWERED: Final = (
+    "the signing timestamps are not saved: the disk has not answered for {:.0f} s; if the service"
+    " is killed now, frames of this time can be replayed to the next one"
+)
 NOTICE_EVERY_NS: Final = 60_000_000_000  # least time between two notices of too many senders
 SAVE_EVERY_S: Final = 0.25  # interval of checks whether signing timestamps must be saved
 
@@ -146,15 +153,21 @@ class Gateway:
     async def _save(self, timestamps: Timestamps) -> None:
         """Save signing timestamps on another thread than the event loop's.
 
-        A disk error is reported once, and saving is retried.
+        A disk error, or a disk that does not answer, is reported once, and saving is retried.
         """
         failing = False
         while True:
             await asyncio.sleep(SAVE_EVERY_S)
             if not timestamps.due(self._now_ns()):
                 continue
+            write = partial(timestamps.write, timestamps.snapshot(self._now_ns()))
+            writing = asyncio.create_task(in_daemon_thread(write))
+            _, unfinished = await asyncio.wait([writing], timeout=STALLED_S)
+            if unfinished and not failing:
+                self._warn("signing", UNANSWERED.format(STALLED_S), Severity.ERROR)
+            failing |= bool(unfinished)
             try:
-                await asyncio.to_thread(timestamps.write, timestamps.snapshot(self._now_ns()))
+                await writing
             except LinkError as error:
                 if not failing:
                     self._warn("signing", str(error), Severity.ERROR)

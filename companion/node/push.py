@@ -23,6 +23,7 @@ from companion.views import guaranteed_gain, records
 
 LARGEST_DATAGRAM: Final = 65_000
 """Limit on the bytes of a datagram, below the limits of IPv4 and IPv6."""
+RING_RETRY_NS: Final = 5_000_000_000  # time until a ring whose memory is full is tried again
 RECOVERED_AFTER: Final = 50
 """Successful datagrams in a row before recovery is reported, as errors arrive late."""
 
@@ -47,6 +48,7 @@ class Push:
         self._sockets: dict[str, socket.socket] = {}
         self._refused: dict[str, int] = {}  # datagrams since the last refusal
         self._ring: Ring | None = None
+        self._ring_due_ns = 0  # when a ring whose memory is full is tried again; 0: it is not
         self._newest: tuple[Update, int] | None = None
         self._revised, self._revision = -1, 0  # the update whose beams were renewed, and how many
         self._fresh = asyncio.Event()
@@ -62,14 +64,31 @@ class Push:
                 sock.connect((host, port))
             except OSError as error:
                 raise UserError(f"records.udp {text}: {error.strerror}") from error
-        if self._settings.shared_memory is not None:
-            self._ring = Ring(Path(self._settings.shared_memory))
+        self._open_ring()
+
+    def _open_ring(self) -> None:
+        """Open the ring, if one is requested; try again later if its memory is full."""
+        path, now_ns = self._settings.shared_memory, self._now_ns()
+        if path is None or now_ns < self._ring_due_ns:
+            return
+        try:
+            self._ring = Ring(Path(path))
+        except OSError as error:
+            if not self._ring_due_ns:
+                text = f"no records in shared memory: {path}: {error.strerror}; trying again"
+                self._notify_state(Severity.ERROR, text)
+            self._ring_due_ns = now_ns + RING_RETRY_NS
+        else:
+            if self._ring_due_ns:
+                self._notify_state(Severity.INFO, f"records in shared memory again: {path}")
 
     def newest(self, update: Update, number: int) -> None:
         """Push this update, at once or as soon as its guaranteed gains are computed.
 
         Updates are numbered from 0.
         """
+        if self._ring is None:
+            self._open_ring()
         if not (self._sockets or self._ring):
             return
         if self._settings.guaranteed:

@@ -17,13 +17,14 @@ from typing import Final
 import numpy as np
 
 from companion.mavlink.links.regular_file import open_regular
+from companion.recording.folders import DISK_FAULTS
 from companion.values import UserError
 
 MAGIC: Final = b"UAVBRING"
 VERSION: Final = 1
 SLOTS: Final = 256  # a quarter of a second at 1000 records/s, for a delayed reader
 SLOT_BYTES: Final = 1 << 16
-"""Size of a ring buffer's slot; memory is allocated on first use, for its largest record."""
+"""Size of a ring buffer's slot."""
 HEAD_BYTES: Final = 64
 SLOT_HEAD_BYTES: Final = 16
 LARGEST_RECORD: Final = SLOT_BYTES - SLOT_HEAD_BYTES
@@ -39,10 +40,13 @@ def _require_ring(path: Path) -> None:
 
 
 class Ring:
-    """Writer of a ring buffer in shared memory. Raises ``UserError`` for an unusable path.
+    """Writer of a ring buffer in shared memory.
 
-    The file replaces an earlier ring of that name, which its readers keep until they reopen it; a
-    file that is not a ring is kept. Readable by the owner and the group.
+    Raises ``UserError`` for an unusable path, ``OSError`` if its disk or memory is full, or is
+    another of ``DISK_FAULTS``. All of it is allocated at once: a write to a page that the kernel
+    cannot allocate ends the process (SIGBUS). The file replaces an earlier ring of that name, which
+    its readers keep until they reopen it; a file that is not a ring is kept. Readable by the owner
+    and the group.
     """
 
     def __init__(self, path: Path) -> None:
@@ -54,7 +58,7 @@ class Ring:
             beside.unlink(missing_ok=True)
             fd = os.open(beside, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o640)
             try:
-                os.ftruncate(fd, size)
+                os.posix_fallocate(fd, 0, size)
                 self._map = mmap.mmap(fd, size)
                 self._identity = os.fstat(fd).st_ino
             finally:
@@ -65,6 +69,10 @@ class Ring:
             self._map[: len(MAGIC)] = MAGIC
             beside.replace(path)
         except OSError as error:
+            with contextlib.suppress(OSError):
+                beside.unlink(missing_ok=True)
+            if error.errno in DISK_FAULTS:
+                raise
             raise UserError(f"{path}: {error.strerror}") from error
         self.written = 0
 

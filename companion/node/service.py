@@ -27,7 +27,7 @@ from companion.node.observations import ObservationIntake
 from companion.node.outlet import Outlet
 from companion.node.push import Push
 from companion.node.renewals import Renewals
-from companion.node.serving import NOTICES_KEPT, RateMeter, Server, in_daemon_thread
+from companion.node.serving import NOTICES_KEPT, RateMeter, Server, in_daemon_thread, saved_at_end
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.recording.background import STOP_MAX_S, BackgroundRecorder, Rotation
@@ -66,7 +66,6 @@ from companion.views.state import ObservationCounts, RecordingStatus, overload
 HELD_UP_S: Final = 0.02  # lateness of a tick from which links are read before it
 READ_FIRST_S: Final = 0.1  # longest time for that
 READ_ROUNDS: Final = 3  # least number of iterations of the event loop for that
-DISK_WAIT_TOLD_S: Final = 2.0  # wait for the disk at the end after which it is announced
 WAIT_NS: Final = 20_000_000  # wait for this machine that does not matter for beams
 
 
@@ -197,7 +196,11 @@ class Service:
         finally:
             try:
                 self._push.close()
-                self._traffic.close()
+                if not await saved_at_end(
+                    self._traffic.close, "the signing timestamps", self._say, most_s=STOP_MAX_S
+                ):
+                    text = "the signing timestamps are not saved: the disk does not answer"
+                    self._report(Severity.ERROR, "signing", text)
                 self._aimer.shutdown()
             finally:  # a failure to save timestamps must not lose the recording
                 await self._finish()
@@ -206,12 +209,8 @@ class Service:
         if self._live:
             await asyncio.to_thread(self._live.stop)
         if self._recorder:
-            metadata = self.pipeline.digest.both()
-            stopping = asyncio.create_task(asyncio.to_thread(self._recorder.stop, metadata))
-            _, unfinished = await asyncio.wait([stopping], timeout=DISK_WAIT_TOLD_S)
-            if unfinished:
-                self._say(f"waiting up to {STOP_MAX_S:.0f} s for the disk to finish the recording")
-            await stopping
+            stop = partial(self._recorder.stop, self.pipeline.digest.both())
+            await saved_at_end(stop, "the recording", self._say, most_s=None)
             self._notify_recorder_state(self._recorder)
 
     def _fleet_node(self, settings: Settings) -> LiveFleetNode | None:

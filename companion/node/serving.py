@@ -3,6 +3,7 @@
 import asyncio
 import contextlib
 import gc
+import os
 import signal
 import socket
 import sys
@@ -38,6 +39,9 @@ served, behind all others and their answers, before anything is known of what th
 """
 CLOSE_TIMEOUT_S: Final = 2
 """Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
+DISK_WAIT_TOLD_S: Final = 2.0  # wait for a disk at the end after which it is announced
+SECOND_SIGNAL_S: Final = CLOSE_TIMEOUT_S + DISK_WAIT_TOLD_S
+"""Time after a signal from which another one ends the process, without waiting for the disk."""
 
 
 class Server(uvicorn.Server):
@@ -138,13 +142,32 @@ async def in_daemon_thread(work: Callable[[], T]) -> T:
     return await done
 
 
+async def saved_at_end(
+    save: Callable[[], None], what: str, say: Callable[[str], None], *, most_s: float | None
+) -> bool:
+    """Save something on a thread, and say so if the disk lets it wait; return whether it is saved.
+
+    After ``most_s`` more seconds it is not waited for; None: ``save`` has a limit of its own.
+    """
+    saving = asyncio.create_task(in_daemon_thread(save))
+    _, unfinished = await asyncio.wait([saving], timeout=DISK_WAIT_TOLD_S)
+    if unfinished:
+        say(f"waiting for the disk to take {what}; a second signal ends at once")
+        _, unfinished = await asyncio.wait([saving], timeout=most_s)
+    if unfinished:
+        saving.cancel()
+        return False
+    await saving
+    return True
+
+
 def run_until_stopped(
     main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None = None
 ) -> bool:
     """Run ``main`` on a new event loop; return whether a signal stopped it.
 
     ``main`` gets an event that is set by SIGINT, SIGTERM, or after ``seconds``; it must then
-    finish.
+    finish. Another signal, ``SECOND_SIGNAL_S`` later, ends the process at once.
     """
     _configure_interpreter()
     raise_limit()
@@ -157,14 +180,19 @@ async def _stopped_by_signal(
     main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None
 ) -> bool:
     loop, until = asyncio.get_running_loop(), asyncio.Event()
-    received: list[int] = []
+    received: list[float] = []
 
-    def stop(number: int) -> None:
-        received.append(number)
+    def stop() -> None:
+        if received and loop.time() - received[0] > SECOND_SIGNAL_S:
+            print(
+                "companion: ended by a second signal, without waiting", file=sys.stderr, flush=True
+            )
+            os._exit(1)
+        received.append(loop.time())
         until.set()
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop, number)
+        loop.add_signal_handler(number, stop)
     release_interrupts()
     if seconds is not None:
         loop.call_later(seconds, until.set)

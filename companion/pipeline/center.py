@@ -20,7 +20,7 @@ from companion.settings.center import (
 from companion.settings.model import Settings
 from companion.tracking import carrier, extrapolated, noise
 from companion.tracking.attitude_evidence import AttitudeTrust
-from companion.tracking.carrier import Contradiction
+from companion.tracking.attitude_jumps import DOUBT_S, AttitudeJumps
 from companion.tracking.extrapolated import ExtrapolatedAttitude
 from companion.tracking.geodesy import LocalFrame
 from companion.values import (
@@ -80,9 +80,7 @@ class CarrierTracker:
         self._home_from: tuple[str, int] | None = None  # UAV and time of the first report
         self._attitude: tuple[int, Attitude] | None = None  # sender's time, attitude
         self._before: tuple[int, Attitude] | None = None  # the previous one
-        self._contradicted: Contradiction | None = (
-            None  # between the newest attitude and the previous one
-        )
+        self._jumps = AttitudeJumps()
         self._angular_acceleration = carrier.AngularAcceleration()
         self._older_run: _AttitudeRun | None = None  # attitudes stamped earlier than the newest
         self._least_bound_rad = math.radians(settings.center.attitude_bound_deg)
@@ -147,30 +145,40 @@ class CarrierTracker:
         above_sea_m = report.alt_m - self._geoid_m
         return report._replace(alt_m=above_sea_m, alt_datum=AltitudeDatum.MSL)
 
-    def turn(self, placed: PlacedAttitude, turn_degps2: float) -> Refuted | None:
+    def turn(
+        self, placed: PlacedAttitude, turn_degps2: float
+    ) -> tuple[Refuted | None, list[Notice]]:
         """Process an attitude of the carrier, unless it is older than the newest one.
 
-        Returns the refutation of ``turn_degps2``, the largest assumed angular acceleration, if any.
+        Returns the refutation of ``turn_degps2``, the largest assumed angular acceleration, if any,
+        and a notice of a jump.
         """
         if self._attitude is not None and placed.sender_ns <= self._attitude[0]:
             if not self._is_newest_stamp_wrong(placed):
-                return None
+                return None, []
             self._angular_acceleration = carrier.AngularAcceleration()
             self._attitude = None
         self._older_run = None
-        self._contradicted = self._contradicts(placed, turn_degps2)
-        self._before, self._attitude = self._attitude, (placed.sender_ns, placed.attitude)
-        self._trust.turned(placed.attitude)
-        return self._angular_acceleration.look(placed.attitude, placed.sender_ns, turn_degps2)
-
-    def _contradicts(self, placed: PlacedAttitude, turn_degps2: float) -> Contradiction | None:
-        """Return how much an attitude differs from the newest beyond the errors: one is wrong."""
-        if self._attitude is None:
-            return None
-        before_ns, before = self._attitude
+        newest = (placed.sender_ns, placed.attitude)
         bounds = self._attitude_bounds(placed.sender_ns, turn_degps2)
-        apart_s = (placed.sender_ns - before_ns) * 1e-9
-        return carrier.contradiction(before, placed.attitude, apart_s, bounds)
+        jumped_rad = self._jumps.look(self._attitude, newest, bounds)
+        self._before, self._attitude = self._attitude, newest
+        self._trust.turned(placed.attitude)
+        refuted = self._angular_acceleration.look(placed.attitude, placed.sender_ns, turn_degps2)
+        return refuted, [] if jumped_rad is None else [self._jump_notice(jumped_rad)]
+
+    def _jump_notice(self, jumped_rad: float) -> Notice:
+        assert self._attitude is not None
+        text = (
+            f"the attitude of the carrier jumped by {math.degrees(jumped_rad):.0f} deg; it is"
+            f" uncertain by as much for {DOUBT_S:.0f} s"
+        )
+        return Notice(
+            t_ns=self._attitude[1].t_ns,
+            severity=Severity.WARNING,
+            subject=self.vehicle or "",
+            text=text,
+        )
 
     def _attitude_bounds(self, sender_ns: int, turn_degps2: float) -> carrier.AttitudeBounds:
         limit_degps2 = self._angular_acceleration.limit_degps2(turn_degps2, sender_ns)
@@ -197,7 +205,7 @@ class CarrierTracker:
         made_ns, attitude = self._attitude
         age_s = (at.sender_ns - made_ns) * 1e-9
         rates = (attitude.rollspeed_radps, attitude.pitchspeed_radps, attitude.yawspeed_radps)
-        against = self._contradicted
+        against = self._jumps.against
         return self._attitude_bounds(at.sender_ns, turn_degps2).parts(
             math.hypot(*rates),
             age_s,
@@ -246,7 +254,7 @@ class CarrierTracker:
         """Discard the carrier's attitude if the carrier rebooted, since its stamps start again."""
         if uav == self.vehicle:
             self._attitude = self._before = None
-            self._contradicted = None
+            self._jumps = AttitudeJumps()
             self._trust.clear()
             self._older_run = None
             self._angular_acceleration = carrier.AngularAcceleration()
@@ -305,7 +313,7 @@ class CarrierTracker:
     @property
     def is_contradicted(self) -> bool:
         """Whether the newest attitude contradicts the previous one."""
-        return self._contradicted is not None
+        return self._jumps.newest is not None
 
     def newest_attitude_ns(self, now: SenderTime) -> int | None:
         """Return when the newest attitude was measured, node time; None without one."""
@@ -328,7 +336,7 @@ class CarrierTracker:
         if self.local is None or self._attitude is None or newest is None:
             return None
         made_ns, attitude = self._attitude
-        against = self._contradicted
+        against = self._jumps.against
         if nearest and self._before is not None:
             before_ns = self._before[0]
             if abs(at.sender_ns - before_ns) < abs(at.sender_ns - made_ns):
@@ -391,5 +399,5 @@ class CarrierTracker:
             since_ns=since_ns,
             doubt_s=at.bound_s,
             bounds=bounds,
-            contradicted=self._contradicted,
+            contradicted=self._jumps.against,
         )

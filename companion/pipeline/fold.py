@@ -197,8 +197,8 @@ class Pipeline:
             said += self._report(heard.message)
         elif isinstance(heard.message, PlacedAttitude):
             turn_degps2 = self.senders.assumed(str(frame.source)).turn_degps2
-            refuted = self.center.turn(heard.message, turn_degps2)
-            said += assumptions.notices(self.records, refuted)
+            refuted, jumped = self.center.turn(heard.message, turn_degps2)
+            said += [*assumptions.notices(self.records, refuted), *jumped]
             said += self.observing.attitude_reported(frame.t_ns)
         elif isinstance(heard.message, AttitudeEvidence):
             said += assumptions.notices(self.records, self.center.trust(heard.message))

@@ -22,7 +22,7 @@ from companion.recording.entries import Geodetic
 from companion.recording.folders import DISK_FAULTS
 from companion.recording.parts import Hole, Part
 from companion.recording.writer import Writer
-from companion.values import ClockSet, Event, Output, Severity
+from companion.values import ClockSet, Event, Output, Severity, Update
 
 QUEUE_MAX: Final = 50_000
 """Limit on events waiting to be written: some seconds of the busiest traffic.
@@ -31,6 +31,9 @@ About 60 MB if twenty UAVs report ten times a second (1.3 kB per event with its 
 """
 GATHER_S: Final = 0.02
 """Time for which events are collected: waking the thread costs as much as writing one event."""
+UPDATES_MAX_BYTES: Final = 32 << 20
+"""Limit on the updates that wait to be written; a replay computes those that do not fit."""
+TRACK_BYTES: Final = 3000  # memory that an update takes for each track, and its beam
 AT_ONCE: Final = 500  # events between two checks whether a flush is due
 FLUSH_S: Final = 1.0  # time between two flushes to disk
 FLUSH_FIRST_S: Final = 0.1
@@ -43,7 +46,8 @@ Free space on a full disk is checked without writing, at the interval of the fir
 RETRY_MAX_S: Final = 30.0  # longest time between two retries
 STALLED_S: Final = 5.0
 """Time without a flush after which the disk is reported not to answer."""
-STOP_MAX_S: Final = 30.0  # longest wait for an unresponsive disk at the end of the service
+STOP_MAX_S: Final = 10.0
+"""Longest wait at the end of the service for a disk that takes nothing, seconds."""
 RESUME_BATCH: Final = 2000
 """Events written at once when a recording continues: some hundred kilobytes."""
 MIN_FREE_BYTES: Final = 8 << 20
@@ -64,11 +68,15 @@ NEVER: Final = Rotation()  # never begin a new part
 
 
 class _Item(NamedTuple):
-    """Event with its outputs; ``missed`` events before it did not fit into the queue."""
+    """Event with its outputs; ``missed`` events before it did not fit into the queue.
+
+    ``size_bytes`` is the memory that updates among the outputs take.
+    """
 
     event: Event | None
     outputs: Sequence[Output]
     missed: int
+    size_bytes: int
 
     @property
     def t_ns(self) -> int:
@@ -113,6 +121,7 @@ class BackgroundRecorder:
         self._finished_messages = 0  # messages in earlier parts
         self._queue: deque[_Item] = deque()  # bounded by ``put``, which never blocks
         self._queue_max = queue_max
+        self._put_bytes = self._freed_bytes = 0  # of updates; each is counted on one thread
         self._missed = 0
         self._overrun = False
         self._unflushed: list[_Item] = []  # written, but not yet flushed to the disk
@@ -151,7 +160,8 @@ class BackgroundRecorder:
             self._tell(Severity.INFO, f"recording again: {self._missed} events are missing")
         if not self._overrun:
             if len(self._queue) < self._queue_max:
-                self._queue.append(_Item(event, outputs, self._missed))
+                outputs, size_bytes = self._that_fit(outputs)
+                self._queue.append(_Item(event, outputs, self._missed, size_bytes))
                 self._missed = 0
                 return
             self._overrun = True
@@ -160,15 +170,30 @@ class BackgroundRecorder:
         self.dropped += 1
         self._missed += event is not None
 
+    def _that_fit(self, outputs: Sequence[Output]) -> tuple[Sequence[Output], int]:
+        """Return the outputs without updates that do not fit, and the memory of the others."""
+        size_bytes = sum(
+            one.beams.weights.nbytes + TRACK_BYTES * len(one.tracks)
+            for one in outputs
+            if isinstance(one, Update)
+        )
+        if self._put_bytes - self._freed_bytes + size_bytes <= UPDATES_MAX_BYTES:
+            self._put_bytes += size_bytes
+            return outputs, size_bytes
+        return [one for one in outputs if not isinstance(one, Update)], 0
+
     def stop(self, metadata: dict[str, str]) -> None:
         """Write the queue, finish the file and return when it is on the disk.
 
-        After a disk error, writing is retried once; an unresponsive disk is waited for
-        ``STOP_MAX_S`` seconds.
+        After a disk error, writing is retried once. A disk that takes nothing for ``STOP_MAX_S``
+        seconds is not waited for.
         """
         self._metadata = metadata
         self._stopping.set()
-        self._thread.join(STOP_MAX_S)
+        taken = None
+        while self._thread.is_alive() and taken != (self.messages, self._flushed_s):
+            taken = (self.messages, self._flushed_s)
+            self._thread.join(STOP_MAX_S)
         if self._thread.is_alive():
             self._tell(Severity.ERROR, f"{self._where} is incomplete: the disk does not answer")
 
@@ -249,6 +274,7 @@ class BackgroundRecorder:
             for item in waiting[begin : begin + RESUME_BATCH]:
                 self._write(item)
             self._writer.flush()
+            self._free(waiting[begin : begin + RESUME_BATCH])
             self._unflushed, self._lost = waiting[begin + RESUME_BATCH :], 0
         self._flush()
         self._lost = 0
@@ -290,10 +316,14 @@ class BackgroundRecorder:
 
     def _flush(self) -> None:
         self._writer.flush()
+        self._free(self._unflushed)
         self._unflushed.clear()
         self._retry_s = RETRY_FIRST_S
         self.bytes = self._writer.size_bytes
         self._flushed_s = time.monotonic()
+
+    def _free(self, written: Sequence[_Item]) -> None:
+        self._freed_bytes += sum(item.size_bytes for item in written)
 
     def _finish(self) -> None:
         if self._missed:
@@ -333,6 +363,7 @@ class BackgroundRecorder:
         if self._open is not None and not self._open.salvage():
             self._lost += sum(item.event is not None for item in self._unflushed)
             self.dropped += len(self._unflushed)
+            self._free(self._unflushed)
             self._unflushed.clear()
 
     def _reopen(self) -> bool:

@@ -1,16 +1,20 @@
 """Ports in use and shutdown at a bad time: reported, and no data is lost."""
 
+import asyncio
 import signal
 import struct
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 from support import BIN, HANG_S
 
+from companion.node import serving
 from companion.recording import schemas
 from companion.recording.container import MAGIC
 
@@ -36,6 +40,66 @@ def test_background_process_ends_on_sigterm(tmp_path: Path) -> None:
         process.send_signal(signal.SIGTERM)
         assert process.wait(HANG_S) == 0
     assert [file.suffix for file in tmp_path.iterdir()] == [".mcap"]
+
+
+def ended(save: Callable[[], None], told: list[str], *, most_s: float | None) -> bool:
+    return asyncio.run(
+        asyncio.wait_for(
+            serving.saved_at_end(save, "the recording", told.append, most_s=most_s), HANG_S
+        )
+    )
+
+
+def test_disk_that_does_not_answer_at_the_end_is_told_and_waited_for_a_while(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(serving, "DISK_WAIT_TOLD_S", 0.05)
+    told, answers = list[str](), threading.Event()
+    assert ended(lambda: None, told, most_s=None)
+    assert told == []
+    assert not ended(lambda: [answers.wait()][0] and None, told, most_s=0.05)
+    assert told == ["waiting for the disk to take the recording; a second signal ends at once"]
+    late = threading.Timer(0.3, answers.set)
+    answers.clear()
+    late.start()
+    assert ended(lambda: [answers.wait(HANG_S)][0] and None, told, most_s=None)
+    assert len(told) == 2
+
+
+WAITS = """
+import asyncio, sys
+from companion.node import serving
+
+serving.SECOND_SIGNAL_S = 0.2
+
+async def main(until):
+    print("ready", flush=True)
+    await until.wait()
+    await asyncio.sleep(0.3)
+    print("waiting", flush=True)
+    await asyncio.sleep(%d)
+
+serving.run_until_stopped(main)
+"""
+
+
+@pytest.mark.parametrize("second", [signal.SIGTERM, signal.SIGINT])
+def test_second_signal_ends_a_service_that_waits_for_its_disk(second: signal.Signals) -> None:
+    """A wrapper may send the first one twice: that is one signal."""
+    with subprocess.Popen(
+        [sys.executable, "-c", WAITS % (10 * HANG_S)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    ) as process:
+        assert process.stdout is not None and process.stderr is not None
+        assert process.stdout.readline() == "ready\n"
+        process.send_signal(signal.SIGTERM)
+        process.send_signal(signal.SIGINT)
+        assert process.stdout.readline() == "waiting\n"
+        process.send_signal(second)
+        assert process.wait(HANG_S) == 1
+        assert process.stderr.read() == "companion: ended by a second signal, without waiting\n"
 
 
 @pytest.mark.full

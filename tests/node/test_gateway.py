@@ -2,11 +2,12 @@
 
 import asyncio
 import socket
+import threading
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from link_support import frame, port_of, runner, until_true
+from link_support import LIMIT_S, frame, port_of, runner, until_true
 from pymavlink.dialects.v20 import all as dialect
 
 from companion.mavlink.links.urls import LinkError
@@ -107,6 +108,36 @@ def test_timestamps_that_cannot_be_saved_are_reported_once(monkeypatch: pytest.M
     runner("asyncio")(test())
     text = "timestamps.bin: no space left"
     assert said == [Notice(t_ns=5, severity=Severity.ERROR, subject="signing", text=text)]
+
+
+def test_disk_that_does_not_take_the_timestamps_is_reported_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    written, said, answers = list[int](), list[Notice](), threading.Event()
+
+    def write(_: object) -> None:
+        written.append(1)
+        assert answers.wait(LIMIT_S)
+
+    monkeypatch.setattr("companion.node.gateway.SAVE_EVERY_S", 0.001)
+    monkeypatch.setattr("companion.node.gateway.STALLED_S", 0.01)
+    timestamps: Any = SimpleNamespace(due=lambda _: True, snapshot=lambda _: None, write=write)
+
+    async def test() -> None:
+        gateway = Gateway(
+            settings=Settings(), step=lambda _: None, notify=said.append, now_ns=lambda: 5
+        )
+        saving = asyncio.create_task(gateway._save(timestamps))
+        await until_true(lambda: len(said) == 1)
+        assert len(written) == 1
+        answers.set()
+        await until_true(lambda: len(written) > 3)
+        saving.cancel()
+        await asyncio.wait([saving])
+
+    runner("asyncio")(test())
+    (only,) = said
+    assert only.severity is Severity.ERROR and "has not answered" in only.text
 
 
 def beat() -> bytes:

@@ -2,31 +2,57 @@
 
 import asyncio
 import socket
+from collections.abc import Callable
+from pathlib import Path
 
-from support import ROOT, free_port, run_async
+from support import BALLAST, ROOT, fill, free_port, run_async
 
 from companion.node import moment
-from companion.node.push import RECOVERED_AFTER, Push
+from companion.node.push import RECOVERED_AFTER, RING_RETRY_NS, Push
+from companion.node.ring import SLOT_BYTES, SLOTS
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.settings.outlets import RecordSettings
-from companion.values import Notice
+from companion.values import Notice, Severity, Update
 
 
-def test_refused_udp_push_and_recovery_are_announced_once() -> None:
+def pushing(
+    way: RecordSettings, now_ns: Callable[[], int] = lambda: 0
+) -> tuple[Push, Update, list[Notice]]:
+    """Outputs that are not open yet, an update, and the list of their notices."""
     settings = Settings().override(center={"source": "5:1"})
     log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
     pipeline, update = moment.look([log], settings, "3")
     equipment, notices = assembly.equipment(settings, pipeline.array), list[Notice]()
-    to = ("127.0.0.1", free_port(socket.SOCK_DGRAM))
-    way = RecordSettings(udp=(f"{to[0]}:{to[1]}",))
     push = Push(
-        settings=way,
-        pipeline=pipeline,
-        equipment=equipment,
-        notify=notices.append,
-        now_ns=lambda: 0,
+        settings=way, pipeline=pipeline, equipment=equipment, notify=notices.append, now_ns=now_ns
     )
+    return push, update, notices
+
+
+def test_full_shared_memory_is_announced_and_tried_again(small_disk: Path) -> None:
+    """A page that cannot be allocated ends the process at its first write."""
+    path, clock = small_disk / "ring", [0]
+    push, update, notices = pushing(RecordSettings(shared_memory=str(path)), lambda: clock[0])
+    fill(small_disk)
+    push.open()
+    push.newest(update, 0)
+    assert [one.severity for one in notices] == [Severity.ERROR]
+    assert "No space left" in notices[0].text
+    assert [one.name for one in small_disk.iterdir()] == [BALLAST]
+    (small_disk / BALLAST).unlink()
+    push.newest(update, 1)
+    assert not path.exists()
+    clock[0] = RING_RETRY_NS
+    push.newest(update, 2)
+    assert [one.severity for one in notices] == [Severity.ERROR, Severity.INFO]
+    assert path.stat().st_blocks * 512 >= path.stat().st_size > SLOTS * SLOT_BYTES
+    push.close()
+
+
+def test_refused_udp_push_and_recovery_are_announced_once() -> None:
+    to = ("127.0.0.1", free_port(socket.SOCK_DGRAM))
+    push, update, notices = pushing(RecordSettings(udp=(f"{to[0]}:{to[1]}",)))
 
     async def test() -> None:
         task = asyncio.create_task(push.run())

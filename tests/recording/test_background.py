@@ -26,10 +26,13 @@ from companion.recording.reader import read_log, utc_offset_ns
 from companion.recording.writer import Writer
 from companion.settings.model import Settings
 from companion.values import (
+    BeamSet,
     ClockSet,
     Event,
     FloatArray,
     Frame,
+    Method,
+    Normalisation,
     Notice,
     Output,
     Reason,
@@ -226,6 +229,67 @@ def test_read_only_disk_does_not_keep_a_service_from_its_start(small_disk: Path)
         assert "Read-only" in str(made.failure) and str(folder) in str(made.failure)
     with pytest.raises(UserError, match="is not a folder"):
         make_service_folder(Path(__file__))
+
+
+def large_update(t_ns: int) -> Update:
+    weights = np.zeros((512, 512), dtype=complex)  # 4 MB
+    beams = BeamSet(
+        t_ns=t_ns,
+        valid_at_ns=t_ns,
+        beams=(),
+        weights=weights,
+        method=Method.ZERO_FORCING,
+        normalisation=Normalisation.STREAM,
+        condition_number=None,
+        left_out=(),
+        exact=True,
+    )
+    return Update(t_ns=t_ns, carrier=None, unfit=None, tracks=(), beams=beams)
+
+
+def test_updates_of_a_large_array_take_bounded_memory_while_the_disk_is_full(
+    small_disk: Path,
+) -> None:
+    """All events are kept: a replay computes the weights again."""
+    fill(small_disk)
+    made = recorder(small_disk)
+    made.start()
+    events = ticks(1, 101)
+    for event in events:
+        made.put(event, [large_update(event.t_ns)])
+    held = [item for item in made._queue if item.outputs]
+    assert len(held) == background.UPDATES_MAX_BYTES // (4 << 20)
+    assert made.queued == 100 and made.dropped == 0
+    (small_disk / BALLAST).unlink()
+    wait_until(lambda: made.failure is None and made.queued == 0)
+    wait_until(lambda: made._freed_bytes == made._put_bytes)
+    made.put(Tick(START_NS + 101), [large_update(START_NS + 101)])
+    assert made._put_bytes - made._freed_bytes >= 4 << 20
+    made.stop({})
+    assert list(log_events(parts_of(small_disk), Settings())) == [*events, Tick(START_NS + 101)]
+
+
+def test_end_waits_for_a_disk_as_long_as_it_takes_events(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(background, "STOP_MAX_S", 0.3)
+    made, answers = recorder(tmp_path), threading.Event()
+    write = made._writer.event
+
+    def slowly(event: Event) -> None:
+        write(event)
+        answers.wait(HANG_S if event.t_ns == START_NS + 40 else 0.05)
+
+    monkeypatch.setattr(made._writer, "event", slowly)
+    made.start()
+    hand_over(made, ticks(1, 60))
+    made.stop({})
+    assert made.messages >= 40
+    assert [text for _, text in made.news()] == [
+        f"{made._writer.path} is incomplete: the disk does not answer"
+    ]
+    answers.set()
+    made._thread.join(HANG_S)
 
 
 def test_disk_that_does_not_answer_is_announced_and_that_it_does_again(

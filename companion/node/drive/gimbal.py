@@ -33,6 +33,8 @@ YAW_FROM_NORTH: Final = 16 | 64
 """GIMBAL_DEVICE_FLAGS that show that an attitude's yaw is from north: either one."""
 ONBOARD_COMPUTER: Final = 191
 RECEIVED_MAX: Final = 1000  # datagrams read in one update; more are a failure of the gimbal
+REPORTER_SILENT_NS: Final = 2_000_000_000
+"""Silence after which another gimbal of the same system is followed."""
 UNIT_ERROR_MAX: Final = 0.1  # largest deviation of an attitude's quaternion from length 1
 
 
@@ -57,6 +59,7 @@ class Gimbal(Device):
         self.rejected: Counter[str] = Counter()
         self._sequence = 0
         self._last_rad = self._seen_rad = 0.0
+        self._reporter: Frame | None = None  # newest attitude, of the gimbal that is followed
 
     @property
     def lead_s(self) -> float:
@@ -128,9 +131,21 @@ class Gimbal(Device):
             for found in self._splitter.feed(now_ns, data) + self._splitter.finish(now_ns):
                 if isinstance(found, Rejection):
                     self.rejected[found.reason] += found.count
-                elif found.source.sysid == self.target.sysid:
+                elif found.source.sysid == self.target.sysid and self._is_followed(found):
                     self._note(found)
         raise DeviceError(f"gimbal sent more than {RECEIVED_MAX} messages between two updates")
+
+    def _is_followed(self, frame: Frame) -> bool:
+        """Return whether an attitude is of the gimbal that reported first, or of its successor."""
+        last = self._reporter
+        is_followed = (
+            last is None
+            or last.source == frame.source
+            or frame.t_ns - last.t_ns > REPORTER_SILENT_NS
+        )
+        if is_followed:
+            self._reporter = frame
+        return is_followed
 
     def _note(self, frame: Frame) -> None:
         payload = frame.raw[10 : 10 + frame.raw[1]].ljust(40, b"\0")
@@ -139,7 +154,7 @@ class Gimbal(Device):
         if not abs(math.hypot(w, x, y, z) - 1) <= UNIT_ERROR_MAX:
             self.rejected[Reason.MALFORMED] += 1
             return
-        yaw_rad = math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
+        yaw_rad = math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
         if flags & YAW_FROM_NORTH:
             self._seen_rad = _near(yaw_rad, self._seen_rad)
             self._lag.note_report(frame.t_ns, self._seen_rad)

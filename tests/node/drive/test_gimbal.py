@@ -13,7 +13,7 @@ from support import HANG_S, rounds
 from companion.node.drive import targets
 from companion.node.drive.gimbal import Gimbal
 from companion.node.drive.loop import DeviceCommand, DeviceError, Drive, SafeState
-from companion.values import Source, UserError
+from companion.values import Frame, Source, UserError
 
 
 @pytest.fixture
@@ -87,12 +87,15 @@ def test_gimbal_receives_positions_when_configured(heard: socket.socket) -> None
     gimbal.close()
 
 
-@pytest.mark.parametrize(("from_north", "sysid"), [(True, 7), (False, 7), (True, 8)])
+@pytest.mark.parametrize(
+    ("from_north", "sysid", "length"),
+    [(True, 7, 1.0), (False, 7, 1.0), (True, 8, 1.0), (True, 7, 1.09)],
+)
 def test_gimbal_lag_is_estimated_from_its_attitude(
-    heard: socket.socket, from_north: bool, sysid: int
+    heard: socket.socket, from_north: bool, sysid: int, length: float
 ) -> None:
-    """Across north, where angles wrap; attitudes relative to the vehicle or of another vehicle's
-    gimbal are ignored."""
+    """Across north, where angles wrap; attitudes relative to the vehicle, of another vehicle's
+    gimbal or of a second one are ignored. Quaternions need not have the length 1."""
     clock = [0]
     gimbal = Gimbal(
         host="127.0.0.1",
@@ -102,6 +105,8 @@ def test_gimbal_lag_is_estimated_from_its_attitude(
     )
     gimbal.open()
     mav = dialect.MAVLink(None, srcSystem=sysid, srcComponent=154)
+    second = dialect.MAVLink(None, srcSystem=7, srcComponent=155)
+    aside = second.gimbal_device_attitude_status_encode(0, 0, 0, 16, [0, 0, 0, 1], 0, 0, 0, 0)
     flags = dialect.GIMBAL_DEVICE_FLAGS_YAW_LOCK if from_north else 32
     for n in range(150):
         t_s = 0.1 * n
@@ -114,11 +119,24 @@ def test_gimbal_lag_is_estimated_from_its_attitude(
         _, sender = message(heard)
         half = math.sin(0.5 * (t_s + 0.1 - 0.3)) / 2
         told = mav.gimbal_device_attitude_status_encode(
-            0, 0, 0, flags, [math.cos(half), 0, 0, math.sin(half)], 0, 0, 0, 0
+            0, 0, 0, flags, [length * math.cos(half), 0, 0, length * math.sin(half)], 0, 0, 0, 0
         )
         heard.sendto(told.pack(mav), sender)
+        if from_north and sysid == 7:
+            heard.sendto(aside.pack(second), sender)
     assert gimbal.lead_s == pytest.approx(0.3 if from_north and sysid == 7 else 0.0, abs=0.03)
     gimbal.close()
+
+
+def test_second_gimbal_is_followed_once_the_first_is_silent() -> None:
+    gimbal = Gimbal(host="127.0.0.1", port=9, target=Source(7, 154))
+
+    def followed(t_s: float, component: int) -> bool:
+        return gimbal._is_followed(Frame(round(t_s * 1e9), "", Source(7, component), 285, b""))
+
+    assert followed(0.0, 154) and not followed(0.1, 155) and followed(1.0, 154)
+    assert not followed(2.9, 155) and followed(3.1, 155)
+    assert not followed(3.2, 154)
 
 
 def test_gimbal_does_not_support_mute() -> None:

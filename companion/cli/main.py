@@ -40,6 +40,7 @@ from companion.cli.drive import drive
 from companion.cli.export import export
 from companion.cli.fleet import fleet as fleet_commands
 from companion.cli.fleet import replay as replay_fleet
+from companion.cli.output import require_no_input
 from companion.cli.recover import recover
 from companion.cli.study import study
 from companion.cli.weights import weights
@@ -211,6 +212,8 @@ def replay(
             )
         replay_fleet(logs, as_json)
         return
+    if out is not None:
+        require_no_input(out)
     pace = _speed(speed or ("1" if serve else "max"))
     gc.set_threshold(200_000)  # millions of short-lived values without reference cycles
     progress = Progress()

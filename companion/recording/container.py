@@ -101,6 +101,7 @@ class Walk:
         self.complete = False  # whether the file has its end, so was closed properly
         self.lost_bytes = 0  # bytes outside of readable records
         self.incomplete_bytes = 0  # those after the last complete record of a file without end
+        self.bytes_after_end = 0  # those of another file that was appended
         self.path = path
         self._topics = topics
         self._described_bytes = 0
@@ -142,6 +143,8 @@ class Walk:
             if opcode == Opcode.FOOTER:
                 file.seek(stop)
                 self.complete = file.read(len(MAGIC)) == MAGIC
+                self.bytes_after_end = size - file.tell()
+                self.lost_bytes += self.bytes_after_end
                 return
             yield opcode, length
             file.seek(stop)

@@ -1,4 +1,4 @@
-"""Logs that end early: cut within a record, or never closed.
+"""Logs of which not all is read: cut within a record, never closed, or with another one appended.
 
 A reader uses everything before the cut, so only the end of the file tells. Raw MAVLink and tables
 that are cut between two records are not recognised.
@@ -24,13 +24,22 @@ _BIG_ENDIAN: Final = b"\x1a\x2b\x3c\x4d"
 
 
 class TruncatedLog(NamedTuple):
-    """Log that ends early, and the bytes after its last complete record."""
+    """Log that ends early, and the bytes after its last complete record.
+
+    ``bytes_after_end`` are those after the end of a recording that is complete.
+    """
 
     path: Path
     incomplete_bytes: int
+    bytes_after_end: int = 0
 
     def notice(self) -> str:
         """Return one line for the user."""
+        if self.bytes_after_end:
+            return (
+                f"{self.path}: {self.bytes_after_end} bytes after the end of the recording are not"
+                " used; give joined recordings as separate files"
+            )
         rest = (
             f"its last {self.incomplete_bytes} bytes are an incomplete record"
             if self.incomplete_bytes
@@ -39,31 +48,41 @@ class TruncatedLog(NamedTuple):
         return f"{self.path}: log is truncated: {rest}; everything before is used"
 
     def as_json(self) -> dict[str, object]:
-        """Return name and incomplete bytes as JSON."""
-        return {"log": self.path.name, "incomplete_bytes": self.incomplete_bytes}
+        """Return name and unused bytes as JSON."""
+        return {
+            "log": self.path.name,
+            "incomplete_bytes": self.incomplete_bytes,
+            "bytes_after_end": self.bytes_after_end,
+        }
 
 
 def truncated(logs: Sequence[Path]) -> list[TruncatedLog]:
-    """Return those logs that end early. Raises ``LogError`` for an unusable log."""
-    found = ((log, _incomplete_bytes(log)) for log in logs)
-    return [TruncatedLog(log, rest) for log, rest in found if rest is not None]
+    """Return those logs of which not all is read. Raises ``LogError`` for an unusable log."""
+    return [found for log in logs if (found := _truncated(log)) is not None]
 
 
-def _incomplete_bytes(log: Path) -> int | None:
-    """Return the bytes after the last complete record; None for a log that is complete."""
+def _truncated(log: Path) -> TruncatedLog | None:
     kind = log_kind(log)
     if kind in ("mcap", "foreign-mcap"):
         walk = Walk(log, frozenset())
         deque(walk, maxlen=0)
-        return None if walk.complete else walk.incomplete_bytes
+        if walk.complete and not walk.bytes_after_end:
+            return None
+        return TruncatedLog(log, walk.incomplete_bytes, walk.bytes_after_end)
+    rest = _incomplete_bytes(log, kind)
+    return TruncatedLog(log, rest) if rest else None
+
+
+def _incomplete_bytes(log: Path, kind: str) -> int:
+    """Return the bytes after the last complete record of a log that is no recording."""
     if kind in together.READERS:
         (vehicle,) = together.opened([(log, kind)])
-        return vehicle.log.incomplete_bytes or None
+        return vehicle.log.incomplete_bytes
     if kind == "capture":
-        return _of_capture(log) or None
+        return _of_capture(log)
     with log.open("rb") as file:
         file.seek(max(0, log.stat().st_size - _TAIL_BYTES))
-        return _after_last_frame(file.read()) or None
+        return _after_last_frame(file.read())
 
 
 def _after_last_frame(tail: bytes) -> int:

@@ -16,6 +16,7 @@ from support import BIN, HANG_S, ROOT, started
 
 from companion.cli import console, voice
 from companion.cli.console import OneLineErrors
+from companion.cli.main import main
 from companion.node import served_replay
 from companion.values import UserError
 
@@ -222,6 +223,45 @@ def test_closed_standard_streams_are_the_null_device(
     assert done.returncode == 0
     assert b"Traceback" not in done.stderr
     assert np.load(out).shape[0] == 64
+
+
+@pytest.mark.parametrize("through_link", [False, True])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("weights", "LOG", "--at", "3", "--out", "OUT"),
+        ("replay", "LOG", "--center", "1:1", "--out", "OUT"),
+        ("calibrate", "channels", "LOG", "--out", "OUT"),
+    ],
+)
+def test_output_that_is_an_input_is_refused(
+    words: tuple[str, ...], through_link: bool, short_log: Path, tmp_path: Path
+) -> None:
+    log = tmp_path / "flight.mcap"
+    log.write_bytes(short_log.read_bytes())
+    out = tmp_path / "out.mcap"
+    if through_link:
+        out.symlink_to(log)
+    else:
+        out = log
+    before = log.read_bytes()
+    given = [{"LOG": str(log), "OUT": str(out)}.get(one, one) for one in words]
+    done = CliRunner().invoke(main, given)
+    assert done.exit_code == 1
+    if words[0] != "calibrate":  # which reads its input first
+        assert done.stderr.splitlines()[-1].endswith(
+            f"{out}: is also an input of this command; name another file"
+        )
+    assert log.read_bytes() == before
+
+
+def test_loop_of_symbolic_links_is_one_line(short_log: Path, tmp_path: Path) -> None:
+    loop = tmp_path / "loop"
+    loop.symlink_to(loop)
+    words = ["weights", str(short_log), "--center", "1:1", "--at", "1", "--out", str(loop)]
+    done = CliRunner().invoke(main, words)
+    assert done.exit_code == 1
+    assert done.stderr.splitlines()[-1].endswith("it is a loop of symbolic links")
 
 
 def test_earlier_file_is_kept_if_the_new_one_cannot_be_written(tmp_path: Path) -> None:

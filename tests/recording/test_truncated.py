@@ -8,6 +8,7 @@ import pytest
 from click.testing import CliRunner
 
 from companion.cli.main import main
+from companion.recording.recover import recover
 from companion.recording.truncated import truncated
 from sitl_replay.cli import main as sitl
 
@@ -118,3 +119,17 @@ def test_recording_that_was_never_closed_is_reported(
     assert found.incomplete_bytes == 0
     assert found.notice().endswith("log is truncated: the file was never closed;"
                                    " everything before is used")  # fmt: skip
+
+
+def test_recordings_joined_in_one_file_are_reported(
+    whole: dict[str, bytes], tmp_path: Path
+) -> None:
+    """As by ``cat part1 part2``: readers of MCAP end at the first end."""
+    path, data = tmp_path / "joined.mcap", whole["flight.mcap"]
+    path.write_bytes(data + data)
+    (found,) = truncated([path])
+    assert (found.incomplete_bytes, found.bytes_after_end) == (0, len(data))
+    assert "separate files" in found.notice()
+    again = recover(path)
+    assert again.lost_bytes == len(data) and again.changed
+    assert truncated([again.path]) == []

@@ -19,6 +19,7 @@ UNKNOWN: Final = 9_999_999.0
 """Height or accuracy in XML that is unknown."""
 UNKNOWN_LEAST: Final = 999_999.0
 """Accuracy from which on it is unknown: TAK's protobuf has this value in place of ``UNKNOWN``."""
+SPEED_MAX_MPS: Final = 1000.0  # speeds from which on they count as unknown
 OWN: Final = "uav-companion-beams."
 """Prefix of the ids of events that this program writes about other aircraft."""
 _TIME_MAX_MS: Final = 1 << 48
@@ -103,6 +104,9 @@ def _checked(
         raise ValueError(f"time {time_ms} ms is out of range")
     if not uid:
         raise ValueError("uid is missing")
+    has_slope = -90 < slope_deg < 90
+    if has_slope and speed_mps * abs(math.tan(math.radians(slope_deg))) >= SPEED_MAX_MPS:
+        has_slope = False
     if not (abs(lat_deg) <= 90 and abs(lon_deg) <= 180):
         raise ValueError(f"latitude {lat_deg}, longitude {lon_deg} out of range")
     return CotEvent(
@@ -116,8 +120,8 @@ def _checked(
         ce_m=ce_m if 0 < ce_m < UNKNOWN_LEAST else None,
         le_m=le_m if 0 < le_m < UNKNOWN_LEAST else None,
         course_deg=course_deg if 0 <= course_deg <= 360 else None,
-        speed_mps=speed_mps if 0 <= speed_mps < 1000 else None,
-        slope_deg=slope_deg if -90 < slope_deg < 90 else None,
+        speed_mps=speed_mps if 0 <= speed_mps < SPEED_MAX_MPS else None,
+        slope_deg=slope_deg if has_slope else None,
     )
 
 

@@ -273,9 +273,12 @@ def _about_attitude(frame: Frame) -> GnssHeading | StatedAttitude | None:
 
 def _tunnel(frame: Frame) -> Report | None:
     try:
-        return cot_link.report(frame)
+        report = cot_link.report(frame)
     except (ValueError, struct.error) as why:
         raise _RefusedError(Reason.MALFORMED, str(why)) from why
+    if report is not None:
+        _position(round(report.lat_deg * 1e7), round(report.lon_deg * 1e7))
+    return report
 
 
 _DECODERS: Final[dict[int, Callable[[Frame], Message | None]]] = {

@@ -81,9 +81,25 @@ def test_slope_and_unknown_errors_are_decoded() -> None:
     assert said(changed('<track course="90.0" speed="12.5"/>', "")).velocity_ne_mps is None
 
 
+def test_nearly_vertical_slope_is_unknown() -> None:
+    steep = said(changed('speed="12.5"', 'speed="12.5" slope="89.99999999"'))
+    assert steep.velocity_down_mps is None and steep.velocity_ne_mps is not None
+    diving = said(changed('speed="12.5"', 'speed="12.5" slope="-89"'))
+    assert diving.velocity_down_mps == pytest.approx(12.5 * math.tan(math.radians(89)))
+
+
+def test_position_before_a_fix_is_rejected() -> None:
+    """TAK clients without a receiver state 0, 0, some with a height."""
+    text = changed('lat="51.4774" lon="-0.0015"', 'lat="0.0" lon="0.0"')
+    (frame,) = fed(text)
+    assert isinstance(frame, Frame)
+    found = decode(frame)
+    assert isinstance(found, Rejection) and found.reason is Reason.ZERO_POSITION
+
+
 @pytest.mark.parametrize(
     ("old", "new"),
-    [("", ""), ('ce="4.5"', 'ce="9999999.0"'), ("HAWK-1", "é 1"), ('lat="51.4774"', 'lat="0.0"')],
+    [("", ""), ('ce="4.5"', 'ce="9999999.0"'), ("HAWK-1", "é 1"), ('lat="51.4774"', 'lat="0.1"')],
 )
 @pytest.mark.parametrize("kind", [takproto.TAKProtoVer.MESH, takproto.TAKProtoVer.STREAM])
 def test_takproto_bytes_decode_like_the_xml(old: str, new: str, kind: Any) -> None:

@@ -291,12 +291,6 @@ def _speed(text: str) -> float | None:
     return factor
 
 
-main.add_command(calibrate)
-main.add_command(check)
-main.add_command(design)
-main.add_command(drive)
-main.add_command(export)
+for command in (calibrate, check, design, drive, export, recover, study, weights):
+    main.add_command(command)
 main.add_command(fleet_commands, "fleet")
-main.add_command(recover)
-main.add_command(study)
-main.add_command(weights)

@@ -39,8 +39,8 @@ served, behind all others and their answers, before anything is known of what th
 """
 CLOSE_TIMEOUT_S: Final = 2
 """Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
-DISK_WAIT_TOLD_S: Final = 2.0  # wait for a disk at the end after which it is announced
-SECOND_SIGNAL_S: Final = CLOSE_TIMEOUT_S + DISK_WAIT_TOLD_S
+DISK_WAIT_NOTICE_S: Final = 2.0  # wait for a disk at the end after which it is announced
+SECOND_SIGNAL_S: Final = CLOSE_TIMEOUT_S + DISK_WAIT_NOTICE_S
 """Time after a signal from which another one ends the process, without waiting for the disk."""
 
 
@@ -150,7 +150,7 @@ async def saved_at_end(
     After ``most_s`` more seconds it is not waited for; None: ``save`` has a limit of its own.
     """
     saving = asyncio.create_task(in_daemon_thread(save))
-    _, unfinished = await asyncio.wait([saving], timeout=DISK_WAIT_TOLD_S)
+    _, unfinished = await asyncio.wait([saving], timeout=DISK_WAIT_NOTICE_S)
     if unfinished:
         say(f"waiting for the disk to take {what}; a second signal ends at once")
         _, unfinished = await asyncio.wait([saving], timeout=most_s)

@@ -35,7 +35,7 @@ FRAME_REASONS: Final = SIGNATURE_REASONS | {Reason.STRANGER, Reason.MALFORMED}
 """Reasons to reject frames of any message, of which positions are reports."""
 UNPROVEN: Final = SIGNATURE_REASONS | {Reason.STRANGER, Reason.NEWCOMER}
 """Reasons to reject frames that may be of anybody: ids can be forged in any number."""
-OTHERWISE_TOLD: Final = frozenset({Reason.NEWCOMER, Reason.SHARED_ID, Reason.STRANGER})
+OTHERWISE_ANNOUNCED: Final = frozenset({Reason.NEWCOMER, Reason.SHARED_ID, Reason.STRANGER})
 """Reasons to reject reports that have a notice of their own."""
 UNSIGNED_REPORTS: Final = 5  # reports without a valid signature after which an id is named
 UNSIGNED_INTERVAL_NS: Final = 60_000_000_000  # least time between two such notices
@@ -95,7 +95,7 @@ class Refusals:
         lasted_ns = refused.t_ns - run.since_ns
         if run.is_reported or run.reports < 2 or lasted_ns < REJECTED_AFTER_NS:
             return None
-        if refused.reason in OTHERWISE_TOLD:
+        if refused.reason in OTHERWISE_ANNOUNCED:
             return None
         run.is_reported = True
         notified_ns = record.unused_notice_ns

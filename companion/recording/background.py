@@ -161,7 +161,9 @@ class BackgroundRecorder:
         if not self._overrun:
             if len(self._queue) < self._queue_max:
                 outputs, size_bytes = self._that_fit(outputs)
-                self._queue.append(_Item(event, outputs, self._missed, size_bytes))
+                self._queue.append(
+                    _Item(event=event, outputs=outputs, missed=self._missed, size_bytes=size_bytes)
+                )
                 self._missed = 0
                 return
             self._overrun = True

@@ -61,7 +61,7 @@ def add(app: FastAPI, file: Path | None) -> None:
         response_class=Response,
         responses=file_answers(MEDIA_TYPE),
     )
-    async def tiles(wanted: Range = None) -> Response:
+    async def tiles(wanted: Range) -> Response:
         if file is None:
             raise HTTPException(404, "no map; name one in [page] map")
         try:

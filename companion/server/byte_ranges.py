@@ -7,7 +7,7 @@ import re
 from collections.abc import AsyncIterator
 from typing import Annotated, Any, BinaryIO, Final
 
-from fastapi import Header, HTTPException
+from fastapi import Depends, Header, HTTPException
 from fastapi.responses import StreamingResponse
 
 from companion.server.connections import CutShortError
@@ -17,7 +17,18 @@ from companion.server.threads import in_file_thread
 _RANGE: Final = re.compile(r"bytes=(\d{0,18})-(\d{0,18})", re.ASCII)
 PIECE_BYTES: Final = 65_536  # read at a time, and held for a client that takes nothing
 
-Range = Annotated[str | None, Header(alias="range", description="bytes=FIRST-LAST")]
+
+def _wanted(
+    wanted: Annotated[str | None, Header(alias="range", description="bytes=FIRST-LAST")] = None,
+    unchanged: Annotated[
+        str | None, Header(alias="if-range", description="ignored, as is Range with it")
+    ] = None,
+) -> str | None:
+    """Return the Range header; None beside If-Range: these answers have no validator to match."""
+    return None if unchanged is not None else wanted
+
+
+Range = Annotated[str | None, Depends(_wanted)]
 
 
 class UnsatisfiableRangeError(ValueError):

@@ -57,7 +57,7 @@ def _recordings(app: FastAPI, node: Node) -> None:
         response_class=Response,
         responses=file_answers(recordings.MEDIA_TYPE),
     )
-    async def download(name: RecordingName, wanted: Range = None) -> Response:
+    async def download(name: RecordingName, wanted: Range) -> Response:
         found = await in_file_thread(recordings.opened, where, name, current())
         if found is None:
             raise HTTPException(404, f"no recording {name!r}")

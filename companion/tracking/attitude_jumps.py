@@ -3,11 +3,11 @@
 Of two attitudes that contradict each other at least one is wrong: a reset by the estimator, or a
 forged one. If the next attitude follows from the one before the jump, that in between was wrong.
 Otherwise the estimator has another opinion from now on, and either may be right: both stay in the
-bound for ``DOUBT_S``, and an operator is told.
+bound for ``DOUBT_S``, and a notice says so.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 from companion.tracking.carrier import APART_MAX_S, AttitudeBounds, Contradiction, contradiction
@@ -18,7 +18,7 @@ DOUBT_S: Final = 10.0
 SETTLED_S: Final = APART_MAX_S  # time without a return after which a jump is announced, seconds
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Jump:
     """Jump at a sender time, from the attitude ``left``; ``apart_rad`` includes earlier jumps."""
 
@@ -26,7 +26,7 @@ class _Jump:
     left_ns: int
     left: Attitude
     apart_rad: float
-    is_told: bool = False
+    is_announced: bool = False
 
 
 class AttitudeJumps:
@@ -66,15 +66,17 @@ class AttitudeJumps:
             apart_rad = self.newest.apart_rad
             if jump is not None:
                 apart_rad = min(math.pi, apart_rad + jump.apart_rad)
-            self._jump = _Jump(after[0], *before, apart_rad)
+            self._jump = _Jump(
+                at_ns=after[0], left_ns=before[0], left=before[1], apart_rad=apart_rad
+            )
             return None
         if jump is None:
             return None
         since_s = (after[0] - jump.at_ns) * 1e-9
         if since_s > DOUBT_S:
             self._jump = None
-        elif since_s > SETTLED_S and not jump.is_told:
-            self._jump = _Jump(jump.at_ns, jump.left_ns, jump.left, jump.apart_rad, is_told=True)
+        elif since_s > SETTLED_S and not jump.is_announced:
+            self._jump = replace(jump, is_announced=True)
             return jump.apart_rad
         return None
 

@@ -1,6 +1,5 @@
 """Ports in use and shutdown at a bad time: reported, and no data is lost."""
 
-import asyncio
 import signal
 import struct
 import subprocess
@@ -12,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support import BIN, HANG_S
+from support import BIN, HANG_S, run_async, started
 
 from companion.node import serving
 from companion.recording import schemas
@@ -43,22 +42,24 @@ def test_background_process_ends_on_sigterm(tmp_path: Path) -> None:
 
 
 def ended(save: Callable[[], None], told: list[str], *, most_s: float | None) -> bool:
-    return asyncio.run(
-        asyncio.wait_for(
-            serving.saved_at_end(save, "the recording", told.append, most_s=most_s), HANG_S
-        )
-    )
+    found = list[bool]()
+
+    async def test() -> None:
+        found.append(await serving.saved_at_end(save, "it", told.append, most_s=most_s))
+
+    run_async(test())
+    return found[0]
 
 
 def test_disk_that_does_not_answer_at_the_end_is_told_and_waited_for_a_while(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(serving, "DISK_WAIT_TOLD_S", 0.05)
+    monkeypatch.setattr(serving, "DISK_WAIT_NOTICE_S", 0.05)
     told, answers = list[str](), threading.Event()
     assert ended(lambda: None, told, most_s=None)
     assert told == []
     assert not ended(lambda: [answers.wait()][0] and None, told, most_s=0.05)
-    assert told == ["waiting for the disk to take the recording; a second signal ends at once"]
+    assert told == ["waiting for the disk to take it; a second signal ends at once"]
     late = threading.Timer(0.3, answers.set)
     answers.clear()
     late.start()
@@ -86,7 +87,7 @@ serving.run_until_stopped(main)
 @pytest.mark.parametrize("second", [signal.SIGTERM, signal.SIGINT])
 def test_second_signal_ends_a_service_that_waits_for_its_disk(second: signal.Signals) -> None:
     """A wrapper may send the first one twice: that is one signal."""
-    with subprocess.Popen(
+    with started(
         [sys.executable, "-c", WAITS % (10 * HANG_S)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,

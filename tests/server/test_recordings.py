@@ -102,6 +102,14 @@ def test_byte_range_beyond_the_end_is_rejected(client: TestClient) -> None:
     assert answer.headers["content-type"] == "application/problem+json"
 
 
+def test_range_of_an_earlier_version_is_answered_with_the_whole_file(client: TestClient) -> None:
+    """A download that continues: nothing tells whether the file is still the same."""
+    headers = {"range": "bytes=100-199", "if-range": '"7"'}
+    answer = client.get(f"/v1/recordings/{FINISHED}", headers=headers)
+    assert answer.status_code == 200
+    assert answer.content == BYTES
+
+
 @pytest.mark.parametrize("header", [None, "", "bytes=", "bytes=-", "bytes=5-2", "bytes=0-1,4-5"])
 def test_invalid_byte_range_is_ignored(header: str | None) -> None:
     assert span(header, 10) is None

@@ -132,7 +132,10 @@ def test_second_gimbal_is_followed_once_the_first_is_silent() -> None:
     gimbal = Gimbal(host="127.0.0.1", port=9, target=Source(7, 154))
 
     def followed(t_s: float, component: int) -> bool:
-        return gimbal._is_followed(Frame(round(t_s * 1e9), "", Source(7, component), 285, b""))
+        frame = Frame(
+            t_ns=round(t_s * 1e9), link="", source=Source(7, component), msgid=285, raw=b""
+        )
+        return gimbal._is_followed(frame)
 
     assert followed(0.0, 154) and not followed(0.1, 155) and followed(1.0, 154)
     assert not followed(2.9, 155) and followed(3.1, 155)
@@ -202,6 +205,16 @@ def test_impossible_attitude_is_counted_and_reported_once(
         assert drive.status().rejected == {"malformed": n}
     assert said == ["a reply of the device is rejected (malformed); others are only counted"]
     assert gimbal._seen_rad == 0.0 and drive.status().applied == 2
+
+
+@pytest.mark.parametrize("length", [0.92, 1.0, 1.09])
+def test_yaw_of_a_quaternion_does_not_depend_on_its_length(
+    linked: tuple[Gimbal, Any], length: float
+) -> None:
+    gimbal, send = linked
+    send(attitude(length * math.cos(1.0), 0, 0, length * math.sin(1.0)))
+    gimbal.apply(HOLD)
+    assert gimbal._seen_rad == pytest.approx(2.0)
 
 
 def test_any_datagram_of_a_gimbal_is_used_or_counted(linked: tuple[Gimbal, Any]) -> None:

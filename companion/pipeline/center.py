@@ -170,7 +170,7 @@ class CarrierTracker:
     def _jump_notice(self, jumped_rad: float) -> Notice:
         assert self._attitude is not None
         text = (
-            f"the attitude of the carrier jumped by {math.degrees(jumped_rad):.0f} deg; it is"
+            f"the attitude of the carrier jumped by {math.degrees(jumped_rad):.0f}°; it is"
             f" uncertain by as much for {DOUBT_S:.0f} s"
         )
         return Notice(

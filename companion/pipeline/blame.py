@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from companion.pipeline.angle_parts import AngleParts, ErrorSource, grown, largest
-from companion.pipeline.refusals import SIGNATURE_REASONS
+from companion.pipeline.refusals import SIGNATURE_REASONS, UNPROVEN
 from companion.tracking.carrier import AttitudeParts
 from companion.values import (
     Beam,
@@ -259,9 +259,10 @@ def _short_of_gain(beam: Beam, needed_db: float) -> Blame:
 
 
 def _silence(track: Track, evidence: LinkEvidence) -> Blame | None:
-    if evidence.refused is not None:
-        return _refused_cause(evidence.refused)
-    return _silence_cause(track) if _is_silent(track, evidence.waited_s) else None
+    refused, is_silent = evidence.refused, _is_silent(track, evidence.waited_s)
+    if refused is not None and (is_silent or refused not in UNPROVEN):
+        return _refused_cause(refused)
+    return _silence_cause(track) if is_silent else None
 
 
 def of_coasting(track: Track, evidence: LinkEvidence) -> Blame:

@@ -66,7 +66,7 @@ class Refusals:
         self._records = records
         self._senders: OrderedDict[str, SenderRejections] = OrderedDict()
         self._full_ns = -FULL_INTERVAL_NS  # when a notice told that the limit on tracks is reached
-        self._unsigned_ns = -UNSIGNED_INTERVAL_NS  # when one told of an id without any valid frame
+        self._unsigned_ns = -UNSIGNED_INTERVAL_NS  # when a notice named an id without a valid frame
 
     def add(self, refused: Rejection) -> Notice | None:
         """Count one rejection.

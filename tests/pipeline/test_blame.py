@@ -219,6 +219,14 @@ def test_rejected_reports_are_the_first_cause() -> None:
     assert found[:2] == (Cause.REFUSED, "its reports are rejected: unreachable")
 
 
+def test_forged_reports_do_not_explain_the_link_of_a_slow_vehicle() -> None:
+    """Its own reports are used, 2 s apart; anybody may send unsigned ones in between."""
+    forged = LinkEvidence(clock_assumed=False, refused=Reason.UNSIGNED)
+    slow = replace(TRACK, age_s=3.0, dt_s=2.0, bound_m=60.0)
+    assert blamed(slow, evidence=forged)[0] is not Cause.REFUSED
+    assert blamed(replace(slow, age_s=7.0), evidence=forged)[0] is Cause.REFUSED
+
+
 def test_narrow_beam_without_gain_is_crowded_or_out_of_range() -> None:
     crowded = replace(BEAM, gain_db=4.0, loss_db=14.0, widened=False)
     assert blamed(beam=crowded)[:2] == (Cause.CROWDED, "other UAVs in its direction cost it 14 dB")

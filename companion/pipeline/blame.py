@@ -39,9 +39,7 @@ FLY_APART: Final = 'fly them apart, or set `[beams] policy = "group"`'
 STEADIER_LINK: Final = "use a MAVLink link with a steadier delay"
 CHECK_LINK: Final = "check its MAVLink link: power, range, antenna"
 CHECK_SIGNING: Final = "check its signing key, and that its signing clock has not stepped back"
-CHECK_CARRIER: Final = (
-    "read the carrier's rejections in the notices, and check its GNSS receiver and id"
-)
+CHECK_CARRIER: Final = "read its rejections in the notices, and check its GNSS receiver and id"
 NAME_ROUTER: Final = "add the trusted peer to `[links] routers`"
 CHECK_RECEIVER: Final = "check the receiver that relays it, and the link to that receiver"
 
@@ -106,8 +104,7 @@ def of_left_out(
     """
     if unfit is not None:
         remedy = (
-            "check that the carrier is powered, connected and has a position fix, and that"
-            " `[center] source` is its id"
+            "check the carrier's power, link and position fix, and that `[center] source` is its id"
         )
         if refused is not None:
             unfit = f"{unfit}: its positions are rejected ({refused})"

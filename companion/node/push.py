@@ -78,6 +78,10 @@ class Push:
                 text = f"no records in shared memory: {path}: {error.strerror}; trying again"
                 self._notify_state(Severity.ERROR, text)
             self._ring_due_ns = now_ns + RING_RETRY_NS
+        except UserError:  # another file has the name now
+            if not self._ring_due_ns:
+                raise
+            self._ring_due_ns = now_ns + RING_RETRY_NS
         else:
             if self._ring_due_ns:
                 self._notify_state(Severity.INFO, f"records in shared memory again: {path}")

@@ -152,7 +152,7 @@ async def saved_at_end(
     saving = asyncio.create_task(in_daemon_thread(save))
     _, unfinished = await asyncio.wait([saving], timeout=DISK_WAIT_NOTICE_S)
     if unfinished:
-        say(f"waiting for the disk to take {what}; a second signal ends at once")
+        say(f"waiting for the disk to take {what}; a second signal ends the service at once")
         _, unfinished = await asyncio.wait([saving], timeout=most_s)
     if unfinished:
         saving.cancel()
@@ -185,7 +185,9 @@ async def _stopped_by_signal(
     def stop() -> None:
         if received and loop.time() - received[0] > SECOND_SIGNAL_S:
             print(
-                "companion: ended by a second signal, without waiting", file=sys.stderr, flush=True
+                "companion: ended by a second signal, without waiting for the disk",
+                file=sys.stderr,
+                flush=True,
             )
             os._exit(1)
         received.append(loop.time())

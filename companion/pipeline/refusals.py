@@ -32,7 +32,7 @@ REPORT_REASONS: Final = frozenset(
 """Reasons to reject a sender's report about itself."""
 SIGNATURE_REASONS: Final = frozenset({Reason.UNSIGNED, Reason.BAD_SIGNATURE, Reason.REPLAYED})
 FRAME_REASONS: Final = SIGNATURE_REASONS | {Reason.STRANGER, Reason.MALFORMED}
-"""Reasons to reject frames of any message, of which positions are reports."""
+"""Reasons to reject frames of any message; rejected positions are rejected reports."""
 UNPROVEN: Final = SIGNATURE_REASONS | {Reason.STRANGER, Reason.NEWCOMER}
 """Reasons to reject frames that may be of anybody: ids can be forged in any number."""
 OTHERWISE_ANNOUNCED: Final = frozenset({Reason.NEWCOMER, Reason.SHARED_ID, Reason.STRANGER})
@@ -107,7 +107,7 @@ class Refusals:
         return Notice(t_ns=refused.t_ns, severity=Severity.WARNING, subject=uav, text=text)
 
     def _never_valid(self, refused: Rejection) -> Notice | None:
-        """Return a notice of a sender of which no signed frame was accepted, about one of all."""
+        """Return a notice that all signatures of a sender are invalid, about any one a minute."""
         uav, is_due = refused.source, refused.t_ns - self._unsigned_ns >= UNSIGNED_INTERVAL_NS
         if refused.reason not in SIGNATURE_REASONS or not is_due:
             return None

@@ -173,7 +173,9 @@ class BackgroundRecorder:
         self._missed += event is not None
 
     def _that_fit(self, outputs: Sequence[Output]) -> tuple[Sequence[Output], int]:
-        """Return the outputs without updates that do not fit, and the memory of the others."""
+        """Return the outputs without updates that do not fit, and the bytes of those that do."""
+        if not outputs:
+            return outputs, 0
         size_bytes = sum(
             one.beams.weights.nbytes + TRACK_BYTES * len(one.tracks)
             for one in outputs
@@ -233,8 +235,8 @@ class BackgroundRecorder:
         waited_s = time.monotonic() - self._flushed_s
         was_stalled, self._is_stalled = self._is_stalled, is_waiting and waited_s > STALLED_S
         if self._is_stalled and not was_stalled:
-            text = f"{self._where}: the disk has not answered for {STALLED_S:.0f} s; events wait"
-            self._tell(Severity.ERROR, text)
+            text = f"the disk has not answered for {STALLED_S:.0f} s; events wait in memory"
+            self._tell(Severity.ERROR, f"{self._where}: {text}")
         elif was_stalled and not self._is_stalled and self.failure is None:
             self._tell(Severity.INFO, "the disk answers again")
 

@@ -21,7 +21,7 @@ PIECE_BYTES: Final = 65_536  # read at a time, and held for a client that takes 
 def _wanted(
     wanted: Annotated[str | None, Header(alias="range", description="bytes=FIRST-LAST")] = None,
     unchanged: Annotated[
-        str | None, Header(alias="if-range", description="ignored, as is Range with it")
+        str | None, Header(alias="if-range", description="if given, Range is ignored")
     ] = None,
 ) -> str | None:
     """Return the Range header; None beside If-Range: these answers have no validator to match."""

@@ -1,8 +1,10 @@
 """Events that the links pass to the pipeline and its recording, and those that are dropped."""
 
 import asyncio
+import contextlib
 import socket
 import threading
+from collections.abc import AsyncIterator, Callable
 from types import SimpleNamespace
 from typing import Any
 
@@ -86,24 +88,30 @@ def test_carrier_is_admitted_during_a_flood_of_invented_ids() -> None:
     assert Source(9, 2) not in sources
 
 
+@contextlib.asynccontextmanager
+async def saving(
+    write: Callable[[object], None], notify: Callable[[Notice], None]
+) -> AsyncIterator[None]:
+    """Save signing timestamps without a pause, with this function."""
+    timestamps: Any = SimpleNamespace(due=lambda _: True, snapshot=lambda _: None, write=write)
+    gateway = Gateway(settings=Settings(), step=lambda _: None, notify=notify, now_ns=lambda: 5)
+    task = asyncio.create_task(gateway._save(timestamps))
+    yield
+    task.cancel()
+    await asyncio.wait([task])
+
+
 def test_timestamps_that_cannot_be_saved_are_reported_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("companion.node.gateway.SAVE_EVERY_S", 0.001)
     tries, said = [], list[Notice]()
 
     def write(_: object) -> None:
         tries.append(1)
         raise LinkError("timestamps.bin: no space left")
 
-    monkeypatch.setattr("companion.node.gateway.SAVE_EVERY_S", 0.001)
-    timestamps: Any = SimpleNamespace(due=lambda _: True, snapshot=lambda _: None, write=write)
-
     async def test() -> None:
-        gateway = Gateway(
-            settings=Settings(), step=lambda _: None, notify=said.append, now_ns=lambda: 5
-        )
-        saving = asyncio.create_task(gateway._save(timestamps))
-        await until_true(lambda: len(tries) > 2)
-        saving.cancel()
-        await asyncio.wait([saving])
+        async with saving(write, said.append):
+            await until_true(lambda: len(tries) > 2)
 
     runner("asyncio")(test())
     text = "timestamps.bin: no space left"
@@ -113,27 +121,20 @@ def test_timestamps_that_cannot_be_saved_are_reported_once(monkeypatch: pytest.M
 def test_disk_that_does_not_take_the_timestamps_is_reported_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
+    monkeypatch.setattr("companion.node.gateway.SAVE_EVERY_S", 0.001)
+    monkeypatch.setattr("companion.node.gateway.STALLED_S", 0.01)
     written, said, answers = list[int](), list[Notice](), threading.Event()
 
     def write(_: object) -> None:
         written.append(1)
         assert answers.wait(LIMIT_S)
 
-    monkeypatch.setattr("companion.node.gateway.SAVE_EVERY_S", 0.001)
-    monkeypatch.setattr("companion.node.gateway.STALLED_S", 0.01)
-    timestamps: Any = SimpleNamespace(due=lambda _: True, snapshot=lambda _: None, write=write)
-
     async def test() -> None:
-        gateway = Gateway(
-            settings=Settings(), step=lambda _: None, notify=said.append, now_ns=lambda: 5
-        )
-        saving = asyncio.create_task(gateway._save(timestamps))
-        await until_true(lambda: len(said) == 1)
-        assert len(written) == 1
-        answers.set()
-        await until_true(lambda: len(written) > 3)
-        saving.cancel()
-        await asyncio.wait([saving])
+        async with saving(write, said.append):
+            await until_true(lambda: len(said) == 1)
+            assert len(written) == 1
+            answers.set()
+            await until_true(lambda: len(written) > 3)
 
     runner("asyncio")(test())
     (only,) = said

@@ -43,8 +43,13 @@ def test_full_shared_memory_is_announced_and_tried_again(small_disk: Path) -> No
     (small_disk / BALLAST).unlink()
     push.newest(update, 1)
     assert not path.exists()
+    path.write_text("of another program")
     clock[0] = RING_RETRY_NS
     push.newest(update, 2)
+    assert path.read_text() == "of another program"
+    path.unlink()
+    clock[0] = 2 * RING_RETRY_NS
+    push.newest(update, 3)
     assert [one.severity for one in notices] == [Severity.ERROR, Severity.INFO]
     assert path.stat().st_blocks * 512 >= path.stat().st_size > SLOTS * SLOT_BYTES
     push.close()

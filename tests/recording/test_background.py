@@ -272,7 +272,7 @@ def test_updates_of_a_large_array_take_bounded_memory_while_the_disk_is_full(
 def test_end_waits_for_a_disk_as_long_as_it_takes_events(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(background, "STOP_MAX_S", 0.3)
+    monkeypatch.setattr(background, "STOP_MAX_S", 1.0)
     made, answers = recorder(tmp_path), threading.Event()
     write = made._writer.event
 

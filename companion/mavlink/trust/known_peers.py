@@ -443,7 +443,7 @@ def _ahead_ms(frame: Frame, other: Frame) -> int:
 def _is_overtaken(earlier: _Peer, same: Frame, frame: Frame) -> bool:
     """Return whether a peer has become late, so that another one brings newer messages.
 
-    It was faster before, so the stamp is not from the future.
+    That peer's own fastest message shows that the newer stamp is not from the future.
     """
     late_ms = earlier.clock.late_ms(frame)
     is_newer = _ahead_ms(frame, same) > OVERTAKEN_MS

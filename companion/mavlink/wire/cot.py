@@ -16,9 +16,9 @@ from xml.parsers import expat
 
 DEPTH_MAX: Final = 32  # deepest nesting of elements
 UNKNOWN: Final = 9_999_999.0
-"""Height or accuracy in XML that is unknown."""
+"""In place of an unknown height or accuracy in XML."""
 UNKNOWN_LEAST: Final = 999_999.0
-"""Accuracy from which on it is unknown: TAK's protobuf has this value in place of ``UNKNOWN``."""
+"""The same in TAK's protobuf: an accuracy of at least this is unknown."""
 SPEED_MAX_MPS: Final = 1000.0  # speeds from which on they count as unknown
 OWN: Final = "uav-companion-beams."
 """Prefix of the ids of events that this program writes about other aircraft."""

@@ -39,6 +39,18 @@ def _require_ring(path: Path) -> None:
                 raise UserError(f"{path} exists and is not a ring of records; choose another name")
 
 
+def _allocate(fd: int, size: int, replaced: Path) -> None:
+    """Allocate all of a file; delete the ring that it replaces if there is no room for both."""
+    try:
+        os.posix_fallocate(fd, 0, size)
+    except OSError as error:
+        try:
+            replaced.unlink()  # of a service that was killed
+        except FileNotFoundError:
+            raise error from None
+        os.posix_fallocate(fd, 0, size)
+
+
 class Ring:
     """Writer of a ring buffer in shared memory.
 
@@ -58,7 +70,7 @@ class Ring:
             beside.unlink(missing_ok=True)
             fd = os.open(beside, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o640)
             try:
-                os.posix_fallocate(fd, 0, size)
+                _allocate(fd, size, path)
                 self._map = mmap.mmap(fd, size)
                 self._identity = os.fstat(fd).st_ino
             finally:

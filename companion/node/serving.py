@@ -40,8 +40,8 @@ served, behind all others and their answers, before anything is known of what th
 CLOSE_TIMEOUT_S: Final = 2
 """Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
 DISK_WAIT_NOTICE_S: Final = 2.0  # wait for a disk at the end after which it is announced
-SECOND_SIGNAL_S: Final = CLOSE_TIMEOUT_S + DISK_WAIT_NOTICE_S
-"""Time after a signal from which another one ends the process, without waiting for the disk."""
+_waits_for_disk = threading.Event()
+"""Set while the end waits for a disk: then a signal ends the process at once."""
 
 
 class Server(uvicorn.Server):
@@ -152,7 +152,8 @@ async def saved_at_end(
     saving = asyncio.create_task(in_daemon_thread(save))
     _, unfinished = await asyncio.wait([saving], timeout=DISK_WAIT_NOTICE_S)
     if unfinished:
-        say(f"waiting for the disk to take {what}; a second signal ends the service at once")
+        _waits_for_disk.set()
+        say(f"waiting for the disk to take {what}; a signal ends the service at once")
         _, unfinished = await asyncio.wait([saving], timeout=most_s)
     if unfinished:
         saving.cancel()
@@ -167,7 +168,7 @@ def run_until_stopped(
     """Run ``main`` on a new event loop; return whether a signal stopped it.
 
     ``main`` gets an event that is set by SIGINT, SIGTERM, or after ``seconds``; it must then
-    finish. Another signal, ``SECOND_SIGNAL_S`` later, ends the process at once.
+    finish. While it waits for a disk then, a signal ends the process at once.
     """
     _configure_interpreter()
     raise_limit()
@@ -180,21 +181,18 @@ async def _stopped_by_signal(
     main: Callable[[asyncio.Event], Coroutine[Any, Any, None]], seconds: float | None
 ) -> bool:
     loop, until = asyncio.get_running_loop(), asyncio.Event()
-    received: list[float] = []
+    received: list[int] = []
 
-    def stop() -> None:
-        if received and loop.time() - received[0] > SECOND_SIGNAL_S:
-            print(
-                "companion: ended by a second signal, without waiting for the disk",
-                file=sys.stderr,
-                flush=True,
-            )
+    def stop(number: int) -> None:
+        if _waits_for_disk.is_set():
+            said = "companion: ended by a signal, without waiting for the disk"
+            print(said, file=sys.stderr, flush=True)
             os._exit(1)
-        received.append(loop.time())
+        received.append(number)
         until.set()
 
     for number in (signal.SIGINT, signal.SIGTERM):
-        loop.add_signal_handler(number, stop)
+        loop.add_signal_handler(number, stop, number)
     release_interrupts()
     if seconds is not None:
         loop.call_later(seconds, until.set)

@@ -253,7 +253,12 @@ class BackgroundRecorder:
         return self._folder if self._open is None else self._open.path
 
     def _run(self) -> None:
+        tried = False  # whether writing was tried again since the stop
         while self._open is None or not self._record():
+            if tried:
+                self._give_up()
+                return
+            tried = self._stopping.is_set()
             if not self._reopen():
                 return
 

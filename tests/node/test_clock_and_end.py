@@ -59,7 +59,7 @@ def test_disk_that_does_not_answer_at_the_end_is_told_and_waited_for_a_while(
     assert ended(lambda: None, told, most_s=None)
     assert told == []
     assert not ended(lambda: [answers.wait()][0] and None, told, most_s=0.05)
-    assert told == ["waiting for the disk to take it; a second signal ends the service at once"]
+    assert told == ["waiting for the disk to take it; a signal ends the service at once"]
     late = threading.Timer(0.3, answers.set)
     answers.clear()
     late.start()
@@ -68,41 +68,45 @@ def test_disk_that_does_not_answer_at_the_end_is_told_and_waited_for_a_while(
 
 
 WAITS = """
-import asyncio, sys
+import asyncio, threading
 from companion.node import serving
 
-serving.SECOND_SIGNAL_S = 2.0
+serving.DISK_WAIT_NOTICE_S = 0.1
 
 async def main(until):
     print("ready", flush=True)
     await until.wait()
-    await asyncio.sleep(2.5)
-    print("waiting", flush=True)
-    await asyncio.sleep(%d)
+    print("ending", flush=True)
+    await asyncio.to_thread(input)
+    forever = threading.Event().wait
+    await serving.saved_at_end(forever, "it", lambda text: print(text, flush=True), most_s=None)
 
 serving.run_until_stopped(main)
 """
 
 
-def test_second_signal_ends_a_service_that_waits_for_its_disk() -> None:
-    """A wrapper may send the first one twice: that is one signal."""
+def test_signal_ends_a_service_that_waits_for_its_disk() -> None:
+    """Not one that comes before: a wrapper may send the first one twice."""
     with started(
-        [sys.executable, "-c", WAITS % (10 * HANG_S)],
+        [sys.executable, "-c", WAITS],
+        stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
     ) as process:
+        assert process.stdin is not None
         assert process.stdout is not None and process.stderr is not None
         assert process.stdout.readline() == "ready\n"
         process.send_signal(signal.SIGTERM)
+        assert process.stdout.readline() == "ending\n"
         process.send_signal(signal.SIGINT)
-        assert process.stdout.readline() == "waiting\n"
+        process.send_signal(signal.SIGTERM)
+        print(file=process.stdin, flush=True)
+        assert "waiting for the disk" in process.stdout.readline()
         process.send_signal(signal.SIGTERM)
         assert process.wait(HANG_S) == 1
-        assert (
-            process.stderr.read()
-            == "companion: ended by a second signal, without waiting for the disk\n"
-        )
+        said = process.stderr.read()
+        assert said == "companion: ended by a signal, without waiting for the disk\n"
 
 
 @pytest.mark.full

@@ -1,15 +1,18 @@
 """Weights pushed over UDP to a receiver that does not listen yet."""
 
 import asyncio
+import os
 import socket
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
-from support import BALLAST, ROOT, fill, free_port, run_async
+from support import BALLAST, HANG_S, ROOT, fill, free_port, run_async
 
 from companion.node import moment
 from companion.node.push import RECOVERED_AFTER, RING_RETRY_NS, Push
-from companion.node.ring import SLOT_BYTES, SLOTS
+from companion.node.ring import SLOT_BYTES, SLOTS, Ring
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.settings.outlets import RecordSettings
@@ -53,6 +56,17 @@ def test_full_shared_memory_is_announced_and_tried_again(small_disk: Path) -> No
     assert [one.severity for one in notices] == [Severity.ERROR, Severity.INFO]
     assert path.stat().st_blocks * 512 >= path.stat().st_size > SLOTS * SLOT_BYTES
     push.close()
+
+
+def test_ring_of_a_killed_service_makes_room_for_the_next(small_disk: Path) -> None:
+    """Memory that holds one ring holds no second one beside it."""
+    path = small_disk / "ring"
+    code = "import sys; from companion.node.ring import Ring, Path; Ring(Path(sys.argv[1]))"
+    subprocess.run([sys.executable, "-c", code, path], check=True, timeout=HANG_S)  # not closed
+    room = os.statvfs(small_disk)
+    assert room.f_bavail * room.f_frsize < SLOTS * SLOT_BYTES
+    Ring(path).close()
+    assert list(small_disk.iterdir()) == []
 
 
 def test_refused_udp_push_and_recovery_are_announced_once() -> None:

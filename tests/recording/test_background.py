@@ -449,6 +449,32 @@ def test_file_size_limit_continues_the_run_in_a_new_part(tmp_path: Path) -> None
     assert missing(logs) == []
 
 
+_NEVER_WRITTEN = """
+import resource, sys, threading
+from pathlib import Path
+sys.path[:0] = sys.argv[2:]
+from test_background import hand_over, recorder, ticks, wait_until
+made = recorder(Path(sys.argv[1]))
+made.start()
+resource.setrlimit(resource.RLIMIT_FSIZE, (2000, resource.RLIM_INFINITY))
+hand_over(made, ticks(1, 100))
+wait_until(lambda: made.failure is not None)
+made.stop({})
+print(threading.active_count(), made.dropped)
+"""
+
+
+def test_end_does_not_wait_for_a_disk_on_which_files_are_opened_but_not_written(
+    tmp_path: Path,
+) -> None:
+    """A quota: each new file can be opened, and none takes what waits."""
+    done = subprocess.run(
+        [sys.executable, "-c", _NEVER_WRITTEN, tmp_path, Path(__file__).parent, ROOT / "tests"],
+        capture_output=True, text=True, check=True, timeout=HANG_S,
+    )  # fmt: skip
+    assert done.stdout == "1 99\n"
+
+
 def test_removed_folder_is_recreated(tmp_path: Path) -> None:
     folder = tmp_path / "recordings"
     made = recorder(folder)

@@ -2,11 +2,13 @@
 
 import math
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 
-from companion.tracking.attitude_jumps import DOUBT_S, SETTLED_S, AttitudeJumps
+from companion.tracking.attitude_jumps import ANNOUNCED_EVERY_S, DOUBT_S, SETTLED_S, AttitudeJumps
 from companion.tracking.carrier import AttitudeBounds
 from companion.values import Attitude, Source
 
@@ -71,6 +73,58 @@ def test_later_jumps_add_up() -> None:
     """Of three opinions the first may be the right one."""
     found = followed([0.0] * 5 + [40.0] * 20 + [80.0] * 20)
     assert found[-1][1] == pytest.approx(80.0)
+
+
+@pytest.mark.parametrize("each_s", [1.1, 2.0, 8.0])
+def test_estimator_that_goes_back_and_forth_has_two_opinions(each_s: float) -> None:
+    """They do not add up, and are announced once a minute."""
+    each = round(10 * each_s)
+    found = followed(([0.0] * each + [20.0] * each) * (600 // each))
+    assert max(against for _, against, _ in found) == pytest.approx(20.0)
+    told_deg = [angle for *_, angle in found if angle is not None]
+    assert told_deg == pytest.approx([20.0] * len(told_deg))
+    assert len(told_deg) == found[-1][0] // ANNOUNCED_EVERY_S + 1
+
+
+def test_larger_jump_soon_after_another_is_announced_too() -> None:
+    found = followed([0.0] * 10 + [20.0] * 150 + [110.0] * 50)
+    told = [(t_s, angle) for t_s, _, angle in found if angle is not None]
+    assert told == [(2.0, pytest.approx(20.0)), (17.0, pytest.approx(90.0))]
+
+
+def test_opinions_of_a_turning_carrier_turn_alike() -> None:
+    """Rolled, pitched and turning: the error of the heading is about the vertical."""
+    jumps, before = AttitudeJumps(), None
+    against = list[float]()
+    for number in range(80):
+        t_s, turned = (
+            number / 10,
+            Rotation.from_euler("z", 30.0 * (20 <= number < 50), degrees=True),
+        )
+        body = turned * Rotation.from_euler("ZYX", [80.0, 25.0, -15.0], degrees=True)
+        body *= Rotation.from_rotvec(t_s * np.array([0.3, -0.2, 0.4]))
+        yaw, pitch, roll = body.as_euler("ZYX")
+        attitude = facing(t_s, 0.0)[1]._replace(
+            roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw,
+            rollspeed_radps=0.3, pitchspeed_radps=-0.2, yawspeed_radps=0.4,
+        )  # fmt: skip
+        after = round(t_s * S), attitude
+        jumps.look(before, after, BOUNDS)
+        against.append(0.0 if jumps.against is None else math.degrees(jumps.against.at(0.0)))
+        before = after
+    assert against[:20] == [0.0] * 20
+    assert against[20:] == pytest.approx([30.0] * 60, abs=0.1)
+
+
+def test_wrong_rate_leaves_no_doubt_about_the_angle() -> None:
+    jumps, before = AttitudeJumps(), None
+    for number in range(30):
+        t_ns, attitude = facing(number / 10, 10.0)
+        if number == 10:
+            attitude = attitude._replace(yawspeed_radps=3.0)
+        jumps.look(before, (t_ns, attitude), BOUNDS)
+        assert (jumps.against is not None) == (number in (10, 11))
+        before = t_ns, attitude
 
 
 def test_two_components_that_alternate_do_not_add_up() -> None:

@@ -87,7 +87,7 @@ BROUGHT_NS: Final = {
 }
 """Messages that move bounds, and the time for which one excludes those of peers known later."""
 OVERTAKEN_MS: Final = 300
-"""How much newer an attitude must be than that of a peer that was known first and became late."""
+"""How late a peer that was known first must have become, and how much newer other attitudes are."""
 EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
 LATE_PEER_MS: Final = 1000  # how much newer attitudes are whose rejection is announced
 _ABOUT_SENDER: Final = frozenset(
@@ -128,8 +128,10 @@ class _Peer:
 
     def is_current(self, now_ns: int) -> bool:
         """Return whether the peer's newest message is so new that more are to be expected."""
-        if self.has_left:
-            return False
+        return not self.has_left and self.is_recent(now_ns)
+
+    def is_recent(self, now_ns: int) -> bool:
+        """Return the same, whether its connection has ended or not."""
         least_ns, most_ns = CURRENT_NS
         interval_ns = (self.heard_ns - self.since_ns) / self.messages
         return now_ns - self.heard_ns <= min(
@@ -161,6 +163,15 @@ class _Sender:
     comparisons: Budget = field(
         default_factory=lambda: Budget(per_s=COMPARED_PER_S, most=COMPARED_PER_S)
     )
+
+    def has_contradicted(self, name: str, now_ns: int) -> bool:
+        """Return whether a stranger contradicted the known peers that have just left."""
+        stranger = self.strangers.get(name)
+        return (
+            stranger is not None
+            and now_ns - stranger.contradicted_ns <= KEPT_NS
+            and any(one.is_recent(now_ns) for one in self.known.values())
+        )
 
     @property
     def heard_ns(self) -> int:
@@ -204,6 +215,8 @@ class KnownPeers:
             return self._refusal_of_known(sender, peer, known, frame)
         current = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
         is_router = self._is_router(link, peer)
+        if not current and not is_router and sender.has_contradicted(peer, frame.t_ns):
+            return STRANGER
         if not current or is_router:
             if msgid in OWN and _is_usable(frame):  # others can be neither agreed with nor refuted
                 if not is_router and _is_another_clock_too_soon(sender, frame):
@@ -445,9 +458,11 @@ def _is_overtaken(earlier: _Peer, same: Frame, frame: Frame) -> bool:
 
     That peer's own fastest message shows that the newer stamp is not from the future.
     """
-    late_ms = earlier.clock.late_ms(frame)
+    delay_ms, late_ms = earlier.clock.late_ms(same), earlier.clock.late_ms(frame)
+    if delay_ms is None or late_ms is None:
+        return False
     is_newer = _ahead_ms(frame, same) > OVERTAKEN_MS
-    return is_newer and late_ms is not None and late_ms > -EARLY_MS
+    return is_newer and delay_ms > OVERTAKEN_MS and late_ms > -EARLY_MS
 
 
 def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:

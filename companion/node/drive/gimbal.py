@@ -34,7 +34,7 @@ YAW_FROM_NORTH: Final = 16 | 64
 ONBOARD_COMPUTER: Final = 191
 RECEIVED_MAX: Final = 1000  # datagrams read in one update; more are a failure of the gimbal
 REPORTER_SILENT_NS: Final = 2_000_000_000
-"""Silence after which another gimbal of the same system is followed."""
+"""Silence after which another gimbal of the target's system is followed."""
 UNIT_ERROR_MAX: Final = 0.1  # largest deviation of an attitude's quaternion from length 1
 
 
@@ -131,16 +131,16 @@ class Gimbal(Device):
             for found in self._splitter.feed(now_ns, data) + self._splitter.finish(now_ns):
                 if isinstance(found, Rejection):
                     self.rejected[found.reason] += found.count
-                elif found.source.sysid == self.target.sysid and self._is_followed(found):
+                elif found.source.sysid == self.target.sysid:
                     self._note(found)
         raise DeviceError(f"gimbal sent more than {RECEIVED_MAX} messages between two updates")
 
     def _is_followed(self, frame: Frame) -> bool:
-        """Return whether an attitude is of the gimbal that reported first, or of its successor."""
+        """Return whether an attitude is of the target, or of the gimbal that reported first."""
         last = self._reporter
         is_followed = (
             last is None
-            or last.source == frame.source
+            or frame.source in (last.source, self.target)
             or frame.t_ns - last.t_ns > REPORTER_SILENT_NS
         )
         if is_followed:
@@ -155,7 +155,7 @@ class Gimbal(Device):
             self.rejected[Reason.MALFORMED] += 1
             return
         yaw_rad = math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-        if flags & YAW_FROM_NORTH:
+        if flags & YAW_FROM_NORTH and self._is_followed(frame):
             self._seen_rad = _near(yaw_rad, self._seen_rad)
             self._lag.note_report(frame.t_ns, self._seen_rad)
 

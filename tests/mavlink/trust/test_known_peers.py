@@ -92,6 +92,18 @@ def test_peer_whose_connection_ended_keeps_nobody_out() -> None:
     assert rejected(peers, heard(OTHER, 10, begins_s=20.1)) == {OTHER: []}
 
 
+def test_stranger_that_contradicted_is_none_when_the_connection_ends() -> None:
+    peers, source = KnownPeers(), Source(1, 1)
+    rejected(peers, heard(HOME, 10, lasts_s=20), heard("x", 10, lasts_s=20, told=beside(80.0)))
+    peers.connection_ended(HOME, [source])
+    found = rejected(
+        peers,
+        heard("x", 10, begins_s=20.0, lasts_s=20.5, told=beside(80.0)),
+        heard(OTHER, 10, begins_s=20.5),
+    )
+    assert len(found["x"]) == 5 and found[OTHER] == []
+
+
 def test_serial_line_that_is_plugged_in_again_keeps_strangers_out() -> None:
     peers = KnownPeers()
     rejected(peers, heard(HOME, 10, lasts_s=20))
@@ -201,6 +213,17 @@ def test_attitudes_from_the_future_do_not_make_the_first_peer_late() -> None:
         for ahead_s in (0.2, 0.35, 0.9, 5.0):
             assert peers.refusal(LINK, OTHER, stamped_attitude(t_s, t_s + ahead_s, 0.6)) == BROUGHT
     assert [(who, peer) for who, peer, _ in peers.late] == [("1:1", OTHER)]
+
+
+def test_attitudes_between_those_of_a_slow_first_peer_are_not_used() -> None:
+    """Each is newer than the first peer's last one; that alone makes nobody late."""
+    peers = with_two_known_peers()
+    for number in range(100):
+        t_s = 20 + number / 4
+        assert peers.refusal(LINK, HOME, stamped_attitude(t_s + 0.05, t_s)) is None
+        for later_s in (0.15, 0.2, 0.25):
+            beside = stamped_attitude(t_s + 0.05 + later_s, t_s + later_s + 0.099, 0.6)
+            assert peers.refusal(LINK, OTHER, beside) == BROUGHT
 
 
 def test_first_peer_that_was_always_late_is_believed_and_named() -> None:

@@ -128,7 +128,7 @@ def test_gimbal_lag_is_estimated_from_its_attitude(
     gimbal.close()
 
 
-def test_second_gimbal_is_followed_once_the_first_is_silent() -> None:
+def test_target_is_followed_first_and_another_gimbal_once_it_is_silent() -> None:
     gimbal = Gimbal(host="127.0.0.1", port=9, target=Source(7, 154))
 
     def followed(t_s: float, component: int) -> bool:
@@ -137,9 +137,10 @@ def test_second_gimbal_is_followed_once_the_first_is_silent() -> None:
         )
         return gimbal._is_followed(frame)
 
-    assert followed(0.0, 154) and not followed(0.1, 155) and followed(1.0, 154)
+    assert followed(0.0, 155) and followed(0.1, 154)
+    assert not followed(0.2, 155) and followed(1.0, 154)
     assert not followed(2.9, 155) and followed(3.1, 155)
-    assert not followed(3.2, 154)
+    assert not followed(3.2, 156) and followed(3.3, 154)
 
 
 def test_gimbal_does_not_support_mute() -> None:

@@ -205,11 +205,12 @@ def test_newer_attitudes_are_used_once_the_first_peer_has_become_late() -> None:
     assert peers.late == []
 
 
-def test_attitudes_from_the_future_do_not_make_the_first_peer_late() -> None:
+@pytest.mark.parametrize("late_s", [0.0, 0.5])
+def test_attitudes_from_the_future_are_not_those_of_a_faster_peer(late_s: float) -> None:
     peers = with_two_known_peers()
     for number in range(100):
         t_s = 20 + number / 10
-        assert peers.refusal(LINK, HOME, attitude(t_s, 0.5)) is None
+        assert peers.refusal(LINK, HOME, stamped_attitude(t_s, t_s - late_s)) is None
         for ahead_s in (0.2, 0.35, 0.9, 5.0):
             assert peers.refusal(LINK, OTHER, stamped_attitude(t_s, t_s + ahead_s, 0.6)) == BROUGHT
     assert [(who, peer) for who, peer, _ in peers.late] == [("1:1", OTHER)]

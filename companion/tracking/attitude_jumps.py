@@ -101,7 +101,7 @@ class AttitudeJumps:
             if is_brief and one.apart_rad <= limit_rad:
                 opinions = opinions[:number]  # what came after it was wrong
                 break
-        self._left = [one for one in opinions if one.apart_rad > limit_rad]
+        self._left = opinions
 
     def _to_announce(self, now_ns: int, noise_rad: float) -> float | None:
         """Return the largest angle that has lasted, unless a like one was announced lately."""

@@ -127,7 +127,7 @@ class Pipeline:
         self.targets = Targets(settings, self.center.vehicle)
         budget, antennas = assembly.radio(settings)
         site = Site(array=self.array, coverage=self.coverage, budget=budget, uav_antennas=antennas)
-        self.health = HealthMonitor(settings.link, site)
+        self.health = HealthMonitor(settings.link, site, settings.beams.update_hz)
         self.observing = Observing(
             settings=settings,
             array=self.array,

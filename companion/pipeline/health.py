@@ -31,9 +31,9 @@ from companion.values import (
 )
 
 EVERY_NS: Final = 1_000_000_000
-"""Interval between two assessments of a link; a round through all links takes as long."""
+"""Least interval between two assessments of a link; a round through all links takes as long."""
 AT_ONCE: Final = 16
-"""Least number of links assessed per update; more if the round would take too long."""
+"""Least number of links assessed per update; more if there are more in a round."""
 LOOK_NS: Final = 90_000_000
 """Least time between two searches for links that fell below their need: each update at 10 Hz."""
 FALLEN_AT_ONCE: Final = 32  # most links assessed per update because they fell below their need
@@ -76,14 +76,18 @@ class _LinkRecord:
 
 
 class HealthMonitor:
-    """Monitor of the links. ``verdicts`` holds the current verdict of each target, by its id."""
+    """Monitor of the links. ``verdicts`` holds the current verdict of each target, by its id.
 
-    def __init__(self, need: NeedSettings, site: Site) -> None:
+    ``update_hz`` is the rate of updates at which a round takes ``EVERY_NS``. If they come later, it
+    takes longer: larger batches would delay them further.
+    """
+
+    def __init__(self, need: NeedSettings, site: Site, update_hz: float) -> None:
         self.verdicts: dict[str, Verdict] = {}
         self._meter = GainMeter(need, site)
         self._round_start_ns: int | None = None  # start of the current round
         self._looked_ns: int | None = None  # when links were last searched for fallen ones
-        self._last_ns: int | None = None  # time of the previous update
+        self._updates = max(1.0, EVERY_NS * 1e-9 * update_hz)  # in a round
         self._waiting: list[str] = []  # UAVs still queued in this round
         self._links_kept: defaultdict[str, _LinkRecord] = defaultdict(_LinkRecord)
         self._notices = VerdictNotices()
@@ -94,17 +98,16 @@ class HealthMonitor:
         Changes nothing. Takes milliseconds, and may run on any thread.
         """
         beams = update.beams.beams
-        begun_ns, last_ns = self._round_start_ns, self._last_ns
-        begins = begun_ns is None or not 0 <= update.t_ns - begun_ns < EVERY_NS
+        begun_ns = self._round_start_ns
+        is_due = begun_ns is None or not 0 <= update.t_ns - begun_ns < EVERY_NS
+        begins = is_due and not self._waiting
         waiting = [beam.uav for beam in beams] if begins else self._waiting
         looked_ns = self._looked_ns
         looks = looked_ns is None or not 0 <= update.t_ns - looked_ns < LOOK_NS
         looks &= update.carrier is not None
         if not begins and not waiting and not looks:
             return None
-        elapsed_ns = 0 if last_ns is None else update.t_ns - last_ns
-        share = len(beams) * min(max(elapsed_ns / EVERY_NS, 0.0), 1.0)
-        many = max(AT_ONCE, math.ceil(share))
+        many = max(AT_ONCE, math.ceil(len(beams) / self._updates))
         whole = begins and many >= len(beams)  # all links are assessed, fallen or not
         fallen = self._fallen(update.beams)[:FALLEN_AT_ONCE] if looks and not whole else []
         chosen = frozenset((*waiting[:many], *fallen))
@@ -131,7 +134,6 @@ class HealthMonitor:
 
         ``evidence`` returns what is known about a UAV in addition to its track.
         """
-        self._last_ns = update.t_ns
         begins = weighed is not None and weighed.begins
         tracks = {track.uav: track for track in update.tracks}
         fresh = self._of_left_out(update, tracks, evidence, all_of_them=begins)

@@ -2,8 +2,8 @@
 
 Of two attitudes that contradict each other at least one is wrong: a reset by the estimator, or a
 forged one. If the attitudes return within a second to what they were before, what was between was
-wrong. Otherwise the estimator has another opinion from now on, and either may be right: both stay
-in the bound for ``DOUBT_S``, and a notice says so.
+wrong, unless that happens again and again. Otherwise the estimator has another opinion from now on,
+and either may be right: both stay in the bound for ``DOUBT_S``, and a notice says so.
 
 Two opinions of one estimator turn alike: they follow the same gyroscopes. So the rotation between
 them, about fixed axes, stays what it was when one took the place of the other, and those of several
@@ -11,59 +11,74 @@ jumps are multiplied: an opinion that returns is no new one.
 """
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Final
+
+import numpy as np
 
 from companion.tracking.carrier import (
     APART_MAX_S,
-    STAMP_S,
     AttitudeBounds,
     Contradiction,
+    agreement_rad,
     body_from_ned,
     body_rates,
     contradiction,
     later_body_from_body,
 )
-from companion.tracking.rotations import rotation_angle_rad
+from companion.tracking.rotations import angle_between_rad
 from companion.values import Attitude, FloatArray
 
 DOUBT_S: Final = 10.0
 """Time after a jump for which the attitude before it may be the right one, seconds."""
 SETTLED_S: Final = APART_MAX_S  # time without a return after which a jump is announced, seconds
 ANNOUNCED_EVERY_S: Final = 60.0  # least time between two announcements of like jumps, seconds
+OPINIONS_MAX: Final = 12
+"""Opinions that are remembered. An estimator that has more within ``DOUBT_S`` knows nothing."""
+_FIRST: Final = np.eye(3)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(frozen=True, slots=True, eq=False)
 class _Opinion:
-    """Attitude that was left by a jump; ``from_newest`` rotates the newest one to it, NED."""
+    """Attitudes of an estimator from one jump to the next.
 
-    left_ns: int  # when the jump was reported
-    from_newest: FloatArray
+    ``rotation`` is the rotation to it from the first opinion, (3, 3), about axes in NED: the
+    product of those of the jumps. They are known to ``unsure_rad`` in all.
+    """
 
-    @property
-    def apart_rad(self) -> float:
-        return rotation_angle_rad(self.from_newest)
+    rotation: FloatArray
+    unsure_rad: float = 0.0
+
+    def apart_rad(self, other: "_Opinion") -> float:
+        """Return the largest angle that may be between attitudes of two opinions."""
+        unsure_rad = abs(other.unsure_rad - self.unsure_rad)
+        return min(math.pi, angle_between_rad(self.rotation, other.rotation) + unsure_rad)
+
+
+@dataclass(frozen=True, slots=True)
+class _Left:
+    """Opinion that was left by a jump at ``jump_ns``, with its last attitude."""
+
+    jump_ns: int
+    opinion: _Opinion
+    last: tuple[int, Attitude]
 
 
 class AttitudeJumps:
     """Contradictions between successive attitudes of a carrier.
 
-    ``newest`` is the contradiction between the newest attitude and the previous one, if any.
+    ``newest`` is how the newest attitude contradicts the previous one, None if it agrees;
+    ``against`` is what stands against the newest one: that, or the opinions before jumps.
     """
 
     def __init__(self) -> None:
         self.newest: Contradiction | None = None
-        self._left: list[_Opinion] = []  # the oldest first
+        self.against: Contradiction | None = None
+        self._opinion = _Opinion(_FIRST)
+        self._left: list[_Left] = []  # the oldest first
+        self._unknown_ns: int | None = None  # jump of the newest opinion that was not remembered
+        self._returned_ns: int | None = None
         self._announced: tuple[int, float] | None = None  # time, angle in rad
-
-    @property
-    def against(self) -> Contradiction | None:
-        """What stands against the newest attitude: the previous one, or those before jumps."""
-        if not self._left:
-            return self.newest
-        apart_rad = max(one.apart_rad for one in self._left)
-        newest = self.newest or Contradiction(0.0, math.inf)
-        return Contradiction(max(newest.apart_rad, apart_rad), newest.apart_s)
 
     def look(
         self,
@@ -71,7 +86,7 @@ class AttitudeJumps:
         after: tuple[int, Attitude],
         bounds: AttitudeBounds,
     ) -> float | None:
-        """Compare an attitude with the previous one; return the angle of a jump to be announced.
+        """Compare a new attitude with the previous one; return the angle of a jump to announce.
 
         Both with their sender times. The angle is in rad; None: there is nothing to announce.
         """
@@ -80,35 +95,79 @@ class AttitudeJumps:
         if before is not None:
             apart_s = (now_ns - before[0]) * 1e-9
             self.newest = contradiction(before[1], after[1], apart_s, bounds)
-            if self.newest is not None:
-                self._jumped(before, after, bounds)
-        self._left = [one for one in self._left if now_ns - one.left_ns <= DOUBT_S * 1e9]
-        return self._to_announce(now_ns, bounds.attitude_rad)
+            if self.newest is not None and not self._returns(after, bounds):
+                self._jump(before, after, bounds)
+        self._forget(now_ns)
+        apart_rad = self._apart_rad(now_ns, 0.0)
+        self.against = self.newest
+        if apart_rad:
+            newest = self.newest or Contradiction(0.0, math.inf)
+            self.against = Contradiction(max(newest.apart_rad, apart_rad), newest.apart_s)
+        return self._to_announce(now_ns, bounds.attitude_rad) if apart_rad else None
 
-    def _jumped(
+    def _returns(self, after: tuple[int, Attitude], bounds: AttitudeBounds) -> bool:
+        """Return whether an attitude follows from one shortly before; forget what was between.
+
+        Once in ``DOUBT_S``: who goes back and forth has two opinions.
+        """
+        now_ns = after[0]
+        if self._returned_ns is not None and now_ns - self._returned_ns <= DOUBT_S * 1e9:
+            return False
+        for number, left in enumerate(self._left):
+            apart_s = (now_ns - left.last[0]) * 1e-9
+            if apart_s <= APART_MAX_S and not contradiction(
+                left.last[1], after[1], apart_s, bounds
+            ):
+                self._opinion, self._returned_ns = left.opinion, now_ns
+                del self._left[number:]
+                return True
+        return False
+
+    def _jump(
         self, before: tuple[int, Attitude], after: tuple[int, Attitude], bounds: AttitudeBounds
     ) -> None:
-        """Add what was left, unless the newest attitude returns to what was left before."""
+        """Remember the opinion that is left; one that returned and is left again, once.
+
+        Each attitude is extrapolated to the other's time at its own rates. If one has a wrong rate,
+        the rotations differ, and either may be that of the jump.
+        """
         apart_s = (after[0] - before[0]) * 1e-9
-        limit_rad = bounds.at(0.0, apart_s, STAMP_S) + bounds.attitude_rad
-        rotation = _rotation(before[1], after[1], apart_s)
-        opinions = [
-            *(replace(one, from_newest=one.from_newest @ rotation) for one in self._left),
-            _Opinion(left_ns=after[0], from_newest=rotation),
-        ]
-        for number, one in enumerate(opinions):
-            is_brief = after[0] - one.left_ns <= APART_MAX_S * 1e9
-            if is_brief and one.apart_rad <= limit_rad:
-                opinions = opinions[:number]  # what came after it was wrong
-                break
-        self._left = opinions
+        first, second = (
+            body_from_ned(one.roll_rad, one.pitch_rad, one.yaw_rad) for one in (before[1], after[1])
+        )
+        forward = (later_body_from_body(body_rates(before[1]), apart_s) @ first).T @ second
+        back = first.T @ later_body_from_body(body_rates(after[1]), -apart_s) @ second
+        left, limit_rad = self._opinion, agreement_rad(apart_s, bounds)
+        self._left = [one for one in self._left if left.apart_rad(one.opinion) > limit_rad]
+        self._left.append(_Left(after[0], left, before))
+        self._opinion = _Opinion(
+            rotation=left.rotation @ forward,
+            unsure_rad=left.unsure_rad + angle_between_rad(forward, back),
+        )
+        if len(self._left) > OPINIONS_MAX:
+            self._unknown_ns = self._left.pop(0).jump_ns
+
+    def _forget(self, now_ns: int) -> None:
+        """Forget the opinions that were left long ago."""
+        since_ns = now_ns - round(DOUBT_S * 1e9)
+        while self._left and self._left[0].jump_ns < since_ns:
+            del self._left[0]
+        if self._unknown_ns is not None and self._unknown_ns < since_ns:
+            self._unknown_ns = None
+        if not self._left:
+            self._opinion = _Opinion(_FIRST)
+
+    def _apart_rad(self, now_ns: int, least_s: float) -> float:
+        """Return the angle to the furthest opinion that was left so long ago; 0 without one."""
+        until_ns = now_ns - round(least_s * 1e9)
+        if self._unknown_ns is not None and self._unknown_ns <= until_ns:
+            return math.pi
+        left = [one.opinion for one in self._left if one.jump_ns <= until_ns]
+        return max((self._opinion.apart_rad(one) for one in left), default=0.0)
 
     def _to_announce(self, now_ns: int, noise_rad: float) -> float | None:
         """Return the largest angle that has lasted, unless a like one was announced lately."""
-        apart_rad = max(
-            (one.apart_rad for one in self._left if now_ns - one.left_ns >= SETTLED_S * 1e9),
-            default=0.0,
-        )
+        apart_rad = self._apart_rad(now_ns, SETTLED_S)
         is_recent = (
             self._announced is not None
             and now_ns - self._announced[0] < ANNOUNCED_EVERY_S * 1e9
@@ -118,16 +177,3 @@ class AttitudeJumps:
             return None
         self._announced = now_ns, apart_rad
         return apart_rad
-
-
-def _rotation(before: Attitude, after: Attitude, apart_s: float) -> FloatArray:
-    """Return the rotation from an attitude to the previous one, about axes in NED.
-
-    Either is extrapolated to the other's time at its own rates. The smaller rotation counts: a
-    wrong rate leaves the angle right.
-    """
-    first = body_from_ned(before.roll_rad, before.pitch_rad, before.yaw_rad)
-    second = body_from_ned(after.roll_rad, after.pitch_rad, after.yaw_rad)
-    forward = (later_body_from_body(body_rates(before), apart_s) @ first).T @ second
-    back = first.T @ later_body_from_body(body_rates(after), -apart_s) @ second
-    return min(forward, back, key=rotation_angle_rad)

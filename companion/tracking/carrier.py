@@ -150,7 +150,7 @@ def contradiction(
     """
     if apart_s > APART_MAX_S:
         return None
-    limit_rad = bounds.at(0.0, apart_s, STAMP_S) + bounds.attitude_rad
+    limit_rad = agreement_rad(apart_s, bounds)
     if _most_apart_rad(before, after, apart_s) <= limit_rad:
         return None  # nearly always, without a matrix
     first = body_from_ned(before.roll_rad, before.pitch_rad, before.yaw_rad)
@@ -159,6 +159,11 @@ def contradiction(
     back = later_body_from_body(body_rates(after), -apart_s) @ second @ first.T
     apart_rad = max(rotation_angle_rad(forward), rotation_angle_rad(back))
     return Contradiction(apart_rad, apart_s) if apart_rad > limit_rad else None
+
+
+def agreement_rad(apart_s: float, bounds: AttitudeBounds) -> float:
+    """Return how far apart two right attitudes may be, extrapolated over the time between them."""
+    return bounds.at(0.0, apart_s, STAMP_S) + bounds.attitude_rad
 
 
 def _most_apart_rad(before: Attitude, after: Attitude, apart_s: float) -> float:

@@ -70,7 +70,7 @@ class Watch:
 
     def __init__(self, **need: float) -> None:
         self.carrier = CarrierEvidence()
-        self.health = HealthMonitor(NeedSettings(**need) if need else NEED, SITE)
+        self.health = HealthMonitor(NeedSettings(**need) if need else NEED, SITE, 10.0)
         self.said: list[Notice] = []
 
     def see(self, t_s: float, tracks: list[Track], carrier: Carrier | None = CARRIER) -> str:
@@ -129,6 +129,23 @@ def test_many_links_are_assessed_in_batches_and_announced_together(
     assert levels[9] == {"good"}
     assert levels[11] == {"none"}  # after two updates, a fifth of a second
     assert len(watch.said) == 1
+
+
+def test_batches_do_not_grow_when_updates_are_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They would be the later for it. A round takes longer, and is completed."""
+    many = {f"{n}:1": (200.0, 4.0 * n - 120.0, -10.0) for n in range(1, 61)}
+    monkeypatch.setattr(f"{__name__}.PLACES", many)
+    watch, tracks = Watch(needed_db=6.0), [track(uav, *SURE) for uav in many]
+    judged = []
+    for step in range(12):
+        before = {uav: id(one) for uav, one in watch.health.verdicts.items()}
+        watch.see(step / 2, tracks)
+        after = watch.health.verdicts
+        judged.append([uav for uav in after if id(after[uav]) != before.get(uav)])
+    assert max(map(len, judged)) <= AT_ONCE
+    for begun in (0, 4, 8):
+        turns = [uav for one in judged[begun : begun + 4] for uav in one]
+        assert sorted(turns) == sorted(many)
 
 
 def test_verdict_falls_at_once_and_rises_after_three_seconds() -> None:

@@ -8,8 +8,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from companion.tracking.attitude_jumps import ANNOUNCED_EVERY_S, DOUBT_S, SETTLED_S, AttitudeJumps
-from companion.tracking.carrier import AttitudeBounds
+from companion.tracking.attitude_jumps import (
+    ANNOUNCED_EVERY_S,
+    DOUBT_S,
+    OPINIONS_MAX,
+    SETTLED_S,
+    AttitudeJumps,
+)
+from companion.tracking.carrier import AttitudeBounds, agreement_rad
 from companion.values import Attitude, Source
 
 S = 1_000_000_000
@@ -86,10 +92,47 @@ def test_estimator_that_goes_back_and_forth_has_two_opinions(each_s: float) -> N
     assert len(told_deg) == found[-1][0] // ANNOUNCED_EVERY_S + 1
 
 
+def test_what_is_between_returns_again_and_again_is_no_outlier() -> None:
+    """Half a second each: either may be right."""
+    found = followed(([0.0] * 5 + [20.0] * 5) * 10)
+    assert [against for _, against, _ in found[15:]] == pytest.approx([20.0] * 85)
+
+
+def test_rates_that_lead_back_do_not_hide_a_jump() -> None:
+    jumps, before = AttitudeJumps(), None
+    for number in range(100):
+        t_ns, attitude = facing(number / 10, 0.0 if number < 10 else 60.0)
+        if number == 10:
+            attitude = attitude._replace(yawspeed_radps=math.radians(600.0))
+        jumps.look(before, (t_ns, attitude), BOUNDS)
+        before = t_ns, attitude
+        assert number < 10 or (jumps.against and jumps.against.at(0.0) >= math.radians(60.0))
+
+
+def test_estimator_of_many_opinions_knows_nothing() -> None:
+    steps = [10.0 * number for number in range(OPINIONS_MAX + 3)]
+    found = followed([*steps, *[steps[-1]] * 120])
+    assert [against for t_s, against, _ in found if 1.5 <= t_s <= DOUBT_S] == [180.0] * 86
+    assert found[-1][1] == 0.0
+
+
 def test_larger_jump_soon_after_another_is_announced_too() -> None:
     found = followed([0.0] * 10 + [20.0] * 150 + [110.0] * 50)
     told = [(t_s, angle) for t_s, _, angle in found if angle is not None]
     assert told == [(2.0, pytest.approx(20.0)), (17.0, pytest.approx(90.0))]
+
+
+def turned(t_s: float, offset: Rotation, rates: tuple[float, float, float]) -> Attitude:
+    """Return an attitude of an estimator that is off by a rotation, on a steadily turning body."""
+    body = offset * Rotation.from_euler("ZYX", [80.0, 25.0, -15.0], degrees=True)
+    yaw, pitch, roll = (body * Rotation.from_rotvec(t_s * TURN_RADPS)).as_euler("ZYX")
+    return facing(t_s, 0.0)[1]._replace(
+        roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw,
+        rollspeed_radps=rates[0], pitchspeed_radps=rates[1], yawspeed_radps=rates[2],
+    )  # fmt: skip
+
+
+TURN_RADPS = np.array([0.3, -0.2, 0.4])
 
 
 def test_opinions_of_a_turning_carrier_turn_alike() -> None:
@@ -97,23 +140,61 @@ def test_opinions_of_a_turning_carrier_turn_alike() -> None:
     jumps, before = AttitudeJumps(), None
     against = list[float]()
     for number in range(80):
-        t_s, turned = (
-            number / 10,
-            Rotation.from_euler("z", 30.0 * (20 <= number < 50), degrees=True),
-        )
-        body = turned * Rotation.from_euler("ZYX", [80.0, 25.0, -15.0], degrees=True)
-        body *= Rotation.from_rotvec(t_s * np.array([0.3, -0.2, 0.4]))
-        yaw, pitch, roll = body.as_euler("ZYX")
-        attitude = facing(t_s, 0.0)[1]._replace(
-            roll_rad=roll, pitch_rad=pitch, yaw_rad=yaw,
-            rollspeed_radps=0.3, pitchspeed_radps=-0.2, yawspeed_radps=0.4,
-        )  # fmt: skip
+        t_s = number / 10
+        offset = Rotation.from_euler("z", 30.0 * (20 <= number < 50), degrees=True)
+        attitude = turned(t_s, offset, tuple(TURN_RADPS))
         after = round(t_s * S), attitude
         jumps.look(before, after, BOUNDS)
         against.append(0.0 if jumps.against is None else math.degrees(jumps.against.at(0.0)))
         before = after
     assert against[:20] == [0.0] * 20
     assert against[20:] == pytest.approx([30.0] * 60, abs=0.1)
+
+
+OFFSETS = st.lists(st.tuples(*[st.floats(-3.0, 3.0)] * 3), min_size=3, max_size=3)
+SEGMENTS = st.lists(
+    st.tuples(st.integers(0, 2), st.sampled_from([0.1, 0.3, 0.9, 1.1, 1.5, 3.0])),
+    min_size=2,
+    max_size=25,
+)
+
+
+@given(
+    offsets=OFFSETS,
+    segments=SEGMENTS,
+    hz=st.sampled_from([5.0, 10.0, 20.0]),
+    forged=st.sets(st.integers(0, 200), max_size=10),
+)
+def test_opinion_that_lasted_stays_in_the_bound_for_ten_seconds(
+    offsets: list[tuple[float, float, float]],
+    segments: list[tuple[int, float]],
+    hz: float,
+    forged: set[int],
+) -> None:
+    """Whatever comes after it: brief returns, other opinions, forged rates.
+
+    It lasted, if it was reported for more than a second.
+    """
+    jumps, number, before = AttitudeJumps(), 0, None
+    seen: dict[int, float] = {}  # when an opinion that lasted was last reported
+    for index, lasts_s in segments:
+        count = max(1, round(lasts_s * hz))
+        began_s = number / hz
+        for _ in range(count):
+            t_s = number / hz
+            rates = (9.0, -9.0, 9.0) if number in forged else tuple(TURN_RADPS)
+            attitude = turned(t_s, Rotation.from_rotvec(offsets[index]), rates)
+            jumps.look(before, (round(t_s * S), attitude), BOUNDS)
+            before, number = (round(t_s * S), attitude), number + 1
+            if t_s - began_s > SETTLED_S:
+                seen[index] = t_s
+            allowed_rad = 0.0 if jumps.against is None else jumps.against.at(0.0)
+            for other, seen_s in seen.items():
+                if t_s - seen_s < DOUBT_S:
+                    off = Rotation.from_rotvec(offsets[other]).inv() * Rotation.from_rotvec(
+                        offsets[index]
+                    )
+                    assert off.magnitude() <= allowed_rad + agreement_rad(1 / hz, BOUNDS) + 1e-6
 
 
 def test_wrong_rate_leaves_no_doubt_about_the_angle() -> None:

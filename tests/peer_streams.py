@@ -34,11 +34,14 @@ def circle(t_s: float) -> Place:
     )
 
 
-def report(t_ns: int, boot_s: float, place: Place, sysid: int = 1) -> Frame:
+def report(
+    t_ns: int, boot_s: float, place: Place, sysid: int = 1, origin_lon_1e7: float = 8e7
+) -> Frame:
     source, payload = Source(sysid, 1), bytearray()
     degrees = place.north_m / 111_195.0, place.east_m / 111_195.0 / math.cos(math.radians(47.0))
     payload += round(boot_s * 1000).to_bytes(4, "little")
-    for value in (47e7 + degrees[0] * 1e7, 8e7 + degrees[1] * 1e7, 488_000, 25_000):
+    east_1e7 = (origin_lon_1e7 + degrees[1] * 1e7 + 180e7) % 360e7 - 180e7
+    for value in (47e7 + degrees[0] * 1e7, east_1e7, 488_000, 25_000):
         payload += round(value).to_bytes(4, "little", signed=True)
     for value in (place.north_mps * 100, place.east_mps * 100, 0):
         payload += round(value).to_bytes(2, "little", signed=True)

@@ -24,6 +24,12 @@ from companion.values import (
 
 KEPT_NS: Final = 5_000_000_000
 """Time for which a statement counts beside newer ones of the same kind over other links."""
+STATED_NS: Final = 10_000_000_000
+"""Time for which a statement counts that is not repeated.
+
+An autopilot repeats what it reports, ArduPilot once a second and more; one that was forged before
+the carrier appeared would count for ever.
+"""
 LAG_S: Final = 0.5
 """Largest difference between the delays of an attitude and of what it is compared with.
 
@@ -89,6 +95,10 @@ class AttitudeTrust:
         rates.append((t_ns, _rate_radps(attitude)))
         while t_ns - rates[0][0] > (LAG_S + APART_MAX_S) * 1e9:
             rates.popleft()
+        if any(t_ns - one.t_ns > STATED_NS for one in self._worth.values()):
+            self._worth = {
+                key: one for key, one in self._worth.items() if t_ns - one.t_ns <= STATED_NS
+            }
         self.bound_rad = self._bound_rad()
 
     def add(self, said: AttitudeEvidence) -> None:

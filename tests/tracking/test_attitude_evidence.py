@@ -312,3 +312,16 @@ def test_worst_of_all_kinds_and_links_counts() -> None:
     assert bound_deg(of) == pytest.approx(math.degrees(0.12))
     of.clear()
     assert bound_deg(of) == pytest.approx(3.0)
+
+
+def test_statement_that_is_not_repeated_counts_for_ten_seconds() -> None:
+    """One that was forged before the carrier appeared would count for ever."""
+    doubted = trust()
+    doubted.add(
+        EstimatorStatus(t_ns=0, source=SOURCE, link="a", knows_attitude=False, compass_ratio=0.0)
+    )
+    bounds = []
+    for step in range(120):
+        doubted.turned(attitude(LEVEL, step / 10))
+        bounds.append(doubted.bound_rad)
+    assert bounds == [math.pi] * 101 + [3.0 * DEG] * 19

@@ -30,6 +30,7 @@ REPORTS_KEPT: Final = 32  # newest reports kept of a peer
 OLDER_KEPT: Final = 32  # older ones, ``OLDER_MS`` apart: a second link may be ten seconds late
 OLDER_MS: Final = 500
 
+TURN_1E7: Final = 3_600_000_000  # a whole turn, in 1e-7 degrees
 _METRES: Final = 111_195.0 * 1e-7  # metres in 1e-7 degrees of latitude
 
 
@@ -98,10 +99,13 @@ class Path:
             return math.inf
         north, east, down = (ahead_s * speed for speed in last.velocity_ned_mps)
         scale_n, scale_e, _ = scales = _scales(said)
-        lat, lon, alt = _place(last)
+        lat, lon, alt = _place(last, said)
         there = (lat + north / scale_n, lon + east / scale_e, alt - down)
         off_m = math.hypot(
-            *(scale * (a - b) for scale, a, b in zip(scales, _place(said), there, strict=True))
+            *(
+                scale * (a - b)
+                for scale, a, b in zip(scales, _place(said, said), there, strict=True)
+            )
         )
         stale_m = STALE_S * math.hypot(*last.velocity_ned_mps)
         return off_m - stale_m - ACCELERATION_MPS2 * ahead_s**2 / 2
@@ -140,8 +144,8 @@ def _excess_m(said: OwnPosition, first: OwnPosition, last: OwnPosition) -> float
     share, dt_s = (said.boot_ms - first.boot_ms) / stretch_ms, stretch_ms * 1e-3
     velocities = [v for v in (one.velocity_ned_mps for one in (said, first, last)) if v is not None]
     fastest_mps = max((math.hypot(*velocity) for velocity in velocities), default=0.0)
-    between = _between(_place(first), _place(last), share)
-    places = zip(_scales(said), _place(said), between, strict=True)
+    between = _between(_place(first, said), _place(last, said), share)
+    places = zip(_scales(said), _place(said, said), between, strict=True)
     off_m = math.hypot(*(scale * (a - b) for scale, a, b in places))
     if len(velocities) == 3:
         velocity, before, after = velocities
@@ -156,8 +160,10 @@ def _scales(said: OwnPosition) -> Vector:
     return _METRES, _METRES * math.cos(math.radians(said.lat_1e7 * 1e-7)), 1.0
 
 
-def _place(said: OwnPosition) -> Vector:
-    return said.lat_1e7, said.lon_1e7, said.alt_m
+def _place(said: OwnPosition, near: OwnPosition) -> Vector:
+    """Return latitude, longitude (next to another one, also beyond 180 degrees) and height."""
+    east_1e7 = math.remainder(said.lon_1e7 - near.lon_1e7, TURN_1E7)
+    return said.lat_1e7, near.lon_1e7 + east_1e7, said.alt_m
 
 
 def _between(one: Vector, two: Vector, share: float) -> list[float]:

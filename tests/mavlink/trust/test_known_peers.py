@@ -74,6 +74,20 @@ def test_second_route_is_used_once_it_has_agreed(hz: float, delay_s: float) -> N
     assert max(found[OTHER]) <= 10.137 + PROBATION_S + 2 * delay_s + max(2.0, 2 / hz)
 
 
+def test_second_route_agrees_on_the_antimeridian() -> None:
+    peers, refused = KnownPeers(), list[float]()
+    for number in range(600):
+        t_s = number / 10
+        for peer, late_s in ((HOME, 0.0), (OTHER, 0.04)):
+            frame = report(
+                round((t_s + 0.05) * S), 100 + t_s - late_s, circle(t_s - late_s), 1, 180e7
+            )
+            if peers.refusal(LINK, peer, frame) is not None:
+                refused.append(t_s)
+                assert peer == OTHER
+    assert peers.contradicted == [] and max(refused) <= PROBATION_S + 1.0
+
+
 def test_restarted_radio_with_new_address_is_used_after_a_second() -> None:
     peers = KnownPeers()
     found = rejected(peers, heard(HOME, 10, lasts_s=20), heard(OTHER, 10, begins_s=20.1))

@@ -10,7 +10,7 @@ Over 300 lines: every kind of message passes through here.
 import math
 from collections import defaultdict
 from collections.abc import Container
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import islice
 from typing import Final, NamedTuple
@@ -65,6 +65,8 @@ OUTDATED_MS: Final = 10_000  # age of a Cursor on Target event beside the newest
 OUTDATED_FOR_NS: Final = 60_000_000_000
 """Time after the newest event for which older ones are rejected; then its clock was set back."""
 TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
+TYPE_KEPT_NS: Final = 60_000_000_000
+"""Time for which a type counts beside the newest one, so that a forged one does not last."""
 RECEIVER_WAIT_NS: Final = 10_000_000_000  # time for which a new track waits for its GNSS receiver
 STATUS_REORDER_MAX_US: Final = 30_000_000
 """Largest step back of a receiver status that is out of order; a larger one is a reboot.
@@ -190,11 +192,19 @@ class ComponentState:
     """
 
     heard_ns: int = 0  # arrival of the newest of these messages
-    types: tuple[tuple[int, int], ...] = ()  # types and autopilots of its heartbeats, newest last
+    types: dict[tuple[int, int], int] = field(default_factory=dict)
+    """Types and autopilots of its heartbeats, with the arrival of the newest of each."""
     receiver: GnssStatus | None = None  # its newest GNSS status
     stated_us: int = 0
     noise: StatedNoise  # of its reports, by these statuses
     apart_m2: float | None = None
+
+    def is_of_type(self, newest: tuple[int, int], t_ns: int) -> None:
+        """Note the type and autopilot of a heartbeat; forget those of long ago."""
+        self.types.pop(newest, None)
+        since_ns = t_ns - TYPE_KEPT_NS
+        kept = [(one, at_ns) for one, at_ns in self.types.items() if at_ns >= since_ns]
+        self.types = dict([*kept[1 - TYPES_MAX :], (newest, t_ns)])
 
 
 class Senders:
@@ -292,10 +302,7 @@ class Senders:
                 return NO_OUTCOME if change is None else FrameOutcome(change=change)
             case Presence():
                 component = self._component(message)
-                newest = (message.mav_type, message.autopilot)
-                if component.types[-1:] != (newest,):
-                    others = [one for one in component.types if one != newest]
-                    component.types = (*others[1 - TYPES_MAX :], newest)
+                component.is_of_type((message.mav_type, message.autopilot), message.t_ns)
         return NO_OUTCOME
 
     def _component(self, message: GnssStatus | Presence) -> ComponentState:
@@ -540,7 +547,7 @@ class Senders:
         """
         source = _source(uav)
         component = None if source is None else self._components.get(source)
-        return self._assumed(uav, () if component is None else component.types)
+        return self._assumed(uav, () if component is None else tuple(component.types))
 
     # --- memory -----------------------------------------------------------------------------
 

@@ -125,6 +125,17 @@ def test_aircraft_that_changes_its_type_keeps_the_wider_assumptions(types: tuple
     assert not [one for one in out if isinstance(one, Refuted) and one.t_ns > changed_ns]
 
 
+def test_type_that_is_not_repeated_ends_after_a_minute() -> None:
+    """One forged heartbeat before the vehicle appeared, or while its radio was silent."""
+    into = pipeline()
+    run(into, [heartbeat(0, "1:1", 1)])
+    seen = []
+    for second in range(1, 80):
+        run(into, [heartbeat(second, "1:1", 2), position(second, "1:1", (100, 0, 0), (0, 0, 0))])
+        seen.append(into.senders.assumed("1:1").limits.acceleration_max_mps2)
+    assert seen == [16.0] * 60 + [4.0] * 19
+
+
 @pytest.mark.parametrize(("mav_type", "lag_s"), [(2, 0.0295), (1, -0.026)])
 def test_position_lag_is_corrected(mav_type: int, lag_s: float) -> None:
     """Positions of ArduPilot copters lag their stamps, those of aeroplanes lead them."""

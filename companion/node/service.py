@@ -63,6 +63,11 @@ from companion.views.series import Series
 from companion.views.served import FleetStatus
 from companion.views.state import ObservationCounts, RecordingStatus, overload
 
+THREAD_REST: Final = 0.5
+"""Rest after an update, as a share of the processor time of its thread.
+
+Meanwhile the event loop had the interpreter half of the time.
+"""
 HELD_UP_S: Final = 0.02  # lateness of a tick from which links are read before it
 READ_FIRST_S: Final = 0.1  # longest time for that
 READ_ROUNDS: Final = 3  # least number of iterations of the event loop for that
@@ -333,7 +338,7 @@ class Service:
         """Tick at the update rate; ticks missed while the loop was blocked are skipped.
 
         Beams are computed on a separate thread, so that events and requests are processed
-        meanwhile. Updates take at most half of the time: with too many UAVs for the rate there are
+        meanwhile. Each update is followed by a rest: with too many UAVs for the rate there are
         fewer updates, and no frame is lost.
         """
         loop = asyncio.get_running_loop()
@@ -341,7 +346,7 @@ class Service:
         due_s = loop.time()
         while True:
             self._follow_wall_clock()
-            spent_s = await self._update()
+            rest_s = await self._update()
             began_s = loop.time()
             if self.fleet is not None:
                 self.fleet.ticked(self.now_ns())
@@ -359,7 +364,7 @@ class Service:
             self._ticked.set()  # wakes all current waiters;
             self._ticked.clear()  # later ones wait for the next tick
             ended_s = loop.time()
-            rested_s = ended_s + spent_s + (ended_s - began_s)
+            rested_s = ended_s + rest_s + (ended_s - began_s)
             due_s = max(due_s + period_s, rested_s)
             if self._renewals is not None:
                 await asyncio.sleep(rested_s - loop.time())
@@ -387,8 +392,8 @@ class Service:
     async def _update(self) -> float:
         """Predict the UAVs, and compute the beams on a thread; the first beams directly.
 
-        The first request must already find an update. Returns the seconds used, on the loop and of
-        the processor.
+        The first request must already find an update. Returns how long updates must rest: as long
+        as the event loop was held up, and ``THREAD_REST`` of the time of the thread.
         """
         loop, now_ns = asyncio.get_running_loop(), self._timeline.now_ns
         began_s = time.perf_counter()  # the loop's own time has steps of a millisecond
@@ -402,15 +407,15 @@ class Service:
                 waited_ns=waited_ns if waited_ns > WAIT_NS else 0,
             )
         )
-        spent_s = time.perf_counter() - began_s
+        held_s, thread_s = time.perf_counter() - began_s, 0.0
         if self.pipeline.aiming is not None:
-            spent_s += await loop.run_in_executor(self._aimer, _took_s, self.pipeline.aiming.made)
+            thread_s = await loop.run_in_executor(self._aimer, _took_s, self.pipeline.aiming.made)
             began_s = time.perf_counter()
             self._step(Tock(now_ns()))
-            spent_s += time.perf_counter() - began_s
+            held_s += time.perf_counter() - began_s
         if self._renewals is not None:
-            self._renewals.update_is_made(spent_s)
-        return spent_s
+            self._renewals.update_is_made(held_s + thread_s)
+        return held_s + THREAD_REST * thread_s
 
     # --- interface of the server ------------------------------------------------------------
 

@@ -215,7 +215,8 @@ def _attitude_cause(part: ErrorSource, carrier: Carrier, evidence: LinkEvidence)
             age_s = (evidence.carrier.attitude_age_s or 0.0) - evidence.waited_s
             if age_s > SILENT_S:
                 return _carrier_silence("attitude", age_s, evidence)
-            remedy = "request ATTITUDE from the carrier at 10 Hz: set `[presence] attitude_hz = 10`"
+            hz = 10 if age_s > SPARSE_S else 50
+            remedy = f"request its ATTITUDE at {hz} Hz: set `[presence] attitude_hz = {hz}`"
         case ErrorSource.ATTITUDE_CONFLICT:
             reason = f"attitudes of the carrier contradict each other by {known}"
             remedy = "check its gyroscopes, and that only one component sends its ATTITUDE"

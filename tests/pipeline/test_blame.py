@@ -114,6 +114,8 @@ def test_unmeasured_clock_remedy_is_timesync() -> None:
     [
         (AttitudeParts(age_rad=0.19), {"attitude_age_s": 0.9}, "attitude is uncertain by 11°",
          "10 Hz"),
+        (AttitudeParts(age_rad=0.19), {"attitude_age_s": 0.1}, "attitude is uncertain by 11°",
+         "50 Hz"),
         (AttitudeParts(age_rad=0.19), {"attitude_age_s": 1.4}, "no attitude from the carrier",
          "power"),
         (AttitudeParts(error_rad=0.18, age_rad=0.01), {}, "is uncertain by 11°", "compass"),
@@ -197,7 +199,7 @@ def test_what_grew_since_the_link_was_good_is_the_cause_even_if_another_part_is_
     good = angle_parts(BEAM, TRACK, CARRIER, compass, 0.0)
     turned = replace(CARRIER, attitude_bound_rad=0.08)
     for more, word in (
-        (AttitudeParts(error_rad=0.05, age_rad=0.03), "10 Hz"),
+        (AttitudeParts(error_rad=0.05, age_rad=0.03), "attitude_hz"),
         (AttitudeParts(error_rad=0.05, clock_rad=0.03), "steadier"),
         (AttitudeParts(error_rad=0.055), "compass"),  # within the tolerance: the largest part
     ):

@@ -9,7 +9,6 @@ import itertools
 import json
 import math
 import os
-import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -21,7 +20,7 @@ from companion import __version__
 from companion.cli.console import OneLineErrors, print_truncated
 from companion.mavlink.links.regular_file import open_regular
 from companion.mavlink.links.urls import MAVLINK, LinkUrl, parse_link
-from companion.node.signals import interrupts_held, release_interrupts
+from companion.node.signals import ENDS, interrupts_held, release_interrupts
 from companion.values import Event, Frame, Reason, Rejection, UserError, shown
 from sitl_replay.faults.asked import KINDS, Fault, described, in_order
 from sitl_replay.faults.traffic import HELD_MAX, OVERFLOW
@@ -406,7 +405,7 @@ async def _until_signal(
 ) -> None:
     loop = asyncio.get_running_loop()
     task = asyncio.ensure_future(work)
-    for known in (signal.SIGINT, signal.SIGTERM):
+    for known in ENDS:
         loop.add_signal_handler(known, task.cancel)
     release_interrupts()
     progress = asyncio.ensure_future(_progress(count)) if sys.stderr.isatty() else None

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from companion.cli.console import CONFIG, SECONDS, FiniteRange, InterruptedByUser
+from companion.cli.console import CONFIG, SECONDS, FiniteRange, InterruptedByUser, say_if_heard
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -91,7 +91,7 @@ def drive(
         stored.extend(stored_registers(array, assembly.equipment(settings, array)))
         return stored
 
-    device = targets.device(target, lambda text: click.echo(text, err=True), codebook)
+    device = targets.device(target, say_if_heard, codebook)
     if dry_run:
         device = targets.device(f"none:{device.takes}", click.echo, codebook)
     client = Client(service, os.environ.get("COMPANION_TOKEN"))
@@ -110,7 +110,7 @@ def drive(
         update_hz=update_hz,
         safe=SafeState(on_stale),
         now_ns=time.time_ns,
-        say=lambda text: click.echo(text, err=True),
+        say=say_if_heard,
     )
 
     def show(final_status: "DriveStatus") -> None:

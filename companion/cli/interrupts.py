@@ -1,6 +1,6 @@
-"""Handling of Ctrl-C and SIGTERM: while a command loads, while it runs, and after it has ended.
+"""Handling of Ctrl-C, SIGTERM and SIGHUP: while a command loads, runs, and after it has ended.
 
-Both end a command with one line and the exit status ``INTERRUPTED``. A service that runs handles
+Each ends a command with one line and the exit status ``INTERRUPTED``. A service that runs handles
 them itself (``companion.node.serving``), and ends with the status 0.
 """
 
@@ -15,8 +15,9 @@ from pathlib import Path
 from types import FrameType
 from typing import Final
 
+from companion.node.signals import ENDS
+
 INTERRUPTED: Final = 130  # exit status
-SIGNALS: Final = (signal.SIGINT, signal.SIGTERM)
 RETRY_S: Final = 0.02  # delay before an interrupt that could not be raised is tried again
 
 _has_ended: Final = threading.Event()
@@ -44,14 +45,14 @@ def interrupts_end(name: str) -> Iterator[None]:
         os.write(2, f"{name}: interrupted\n".encode())
         os._exit(INTERRUPTED)
 
-    for number in SIGNALS:
+    for number in ENDS:
         signal.signal(number, end)
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, SIGNALS)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, ENDS)
     atexit.register(_ignore)
     try:
         yield
     finally:
-        for number in SIGNALS:
+        for number in ENDS:
             signal.signal(number, end)
 
 
@@ -74,7 +75,7 @@ def name_process(name: str) -> None:
 
 
 def _ignore() -> None:
-    for number in SIGNALS:
+    for number in ENDS:
         signal.signal(number, signal.SIG_IGN)
 
 
@@ -114,7 +115,7 @@ def interrupts_raised() -> Iterator[None]:
             unraisable(error)
 
     unraisable, sys.unraisablehook = sys.unraisablehook, lost
-    before = {number: signal.signal(number, interrupt) for number in SIGNALS}
+    before = {number: signal.signal(number, interrupt) for number in ENDS}
     outside = before[signal.SIGINT]
     try:
         yield

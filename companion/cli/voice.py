@@ -1,10 +1,15 @@
-"""Output of the commands ``run`` and ``demo``: notices and a status line, or JSON."""
+"""Output of the commands ``run`` and ``demo``: notices and a status line, or JSON.
+
+A service does not end because nobody can read its notices: its terminal was closed, or the disk of
+its log file is full. The page shows them too. JSON is a program's input: without it, it ends.
+"""
 
 import json
+from contextlib import suppress
 
 import click
 
-from companion.cli.console import Progress, say
+from companion.cli.console import Progress, say, say_if_heard
 from companion.node.service import Service
 from companion.views import glance
 
@@ -17,17 +22,22 @@ class Lines:
 
     def say(self, text: str) -> None:
         """Print a line above the status line."""
-        self._progress.clear()
-        say(text, err=True)
+        self._clear()
+        say_if_heard(text)
 
     def serves(self, text: str) -> None:
         """Print a line on stdout, such as the address of the page."""
-        self._progress.clear()
+        self._clear()
         say(text)
 
     def show(self, service: Service) -> None:
         """Refresh the status line on the terminal."""
-        self._progress.show(glance.line(service))
+        with suppress(OSError):
+            self._progress.show(glance.line(service))
+
+    def _clear(self) -> None:
+        with suppress(OSError):
+            self._progress.clear()
 
 
 class JsonLines:
@@ -38,7 +48,7 @@ class JsonLines:
 
     def say(self, text: str) -> None:
         """Print a line for the operator on stderr."""
-        say(text, err=True)
+        say_if_heard(text)
 
     def serves(self, text: str) -> None:
         """Print the address or recording on stderr."""

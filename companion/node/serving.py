@@ -4,7 +4,6 @@ import asyncio
 import contextlib
 import gc
 import os
-import signal
 import socket
 import sys
 import threading
@@ -17,7 +16,7 @@ from typing import Any, Final, TypeVar
 import uvicorn
 
 from companion.mavlink.links.descriptors import raise_limit
-from companion.node.signals import interrupts_held, release_interrupts
+from companion.node.signals import ENDS, interrupts_held, release_interrupts
 from companion.server.app import create_app
 from companion.server.connections import BoundedProtocol
 from companion.server.request_queue import RequestQueue
@@ -167,7 +166,7 @@ def run_until_stopped(
 ) -> bool:
     """Run ``main`` on a new event loop; return whether a signal stopped it.
 
-    ``main`` gets an event that is set by SIGINT, SIGTERM, or after ``seconds``; it must then
+    ``main`` gets an event that is set by a signal of ``ENDS``, or after ``seconds``; it must then
     finish. While it waits for a disk then, a signal ends the process at once.
     """
     _configure_interpreter()
@@ -191,7 +190,7 @@ async def _stopped_by_signal(
         received.append(number)
         until.set()
 
-    for number in (signal.SIGINT, signal.SIGTERM):
+    for number in ENDS:
         loop.add_signal_handler(number, stop, number)
     release_interrupts()
     if seconds is not None:

@@ -5,14 +5,16 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from typing import Final
 
-ENDS: Final = (signal.SIGINT, signal.SIGTERM)
+_IS_DETACHED: Final = signal.getsignal(signal.SIGHUP) is signal.SIG_IGN  # by nohup
+ENDS: Final = (signal.SIGINT, signal.SIGTERM, *(() if _IS_DETACHED else (signal.SIGHUP,)))
+"""Signals that end a command; SIGHUP: its terminal was closed, or its SSH connection."""
 HELD: Final = (*ENDS, signal.SIGALRM)
 """The alarm is a postponed interrupt (``companion.cli.interrupts``)."""
 
 
 @contextmanager
 def interrupts_held() -> Iterator[None]:
-    """Context in which Ctrl-C and SIGTERM wait, also in processes started in it."""
+    """Context in which the signals of ``ENDS`` wait, also in processes started in it."""
     before = signal.pthread_sigmask(signal.SIG_BLOCK, HELD)
     try:
         yield

@@ -1,15 +1,18 @@
-"""Ctrl-C and SIGTERM at any moment: never a traceback, and one exit status."""
+"""Ctrl-C, SIGTERM and SIGHUP at any moment: never a traceback, and one exit status."""
 
+import json
 import os
 import shutil
 import signal
 import subprocess
 import sys
 import time
+import urllib.request
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from support import BIN, HANG_S, ROOT, rounds, started
+from support import BIN, HANG_S, ROOT, line_of, rounds, started
 
 LOG = str(ROOT / "tests" / "data" / "sitl_4circle_cut.tlog")
 CENTER = ("--center", "5:1")
@@ -44,7 +47,9 @@ def test_interrupt_is_never_a_traceback(name: str, tmp_path: Path) -> None:
     tries = rounds(3, 40)
     program, *words = COMMANDS[name]
     for attempt in range(tries):
-        number = (signal.SIGINT, signal.SIGTERM)[attempt % 4 == 3]
+        number = (signal.SIGINT, signal.SIGINT, signal.SIGHUP, signal.SIGTERM)[attempt % 4]
+        if name == "study" and number is signal.SIGHUP:
+            number = signal.SIGINT  # SIGHUP ends Python's resource tracker, which says so
         with (tmp_path / "said").open("w+") as said:
             command = [BIN / program, *words]
             where = {"cwd": tmp_path, "stdout": subprocess.DEVNULL, "stderr": said}
@@ -79,7 +84,9 @@ def test_script_starts_python_with_interrupts_blocked(name: str, tmp_path: Path)
     for command in (script, link):
         done = subprocess.run([command], capture_output=True, text=True, timeout=HANG_S, check=True)
         blocked = int(done.stdout.split()[1], 16)
-        assert all(blocked >> (number - 1) & 1 for number in (signal.SIGINT, signal.SIGTERM))
+        assert all(
+            blocked >> (number - 1) & 1 for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        )
 
 
 def test_interrupt_in_a_finalizer_is_not_lost() -> None:
@@ -101,3 +108,79 @@ def test_interrupt_in_a_finalizer_is_not_lost() -> None:
         [sys.executable, "-c", code], capture_output=True, text=True, timeout=HANG_S, check=True
     )
     assert (done.stdout, done.stderr) == ("raised\n", "")
+
+
+def without_terminal(process: "subprocess.Popen[bytes]", terminal: int) -> None:
+    """Close a process's terminal, which tells it by SIGHUP; writing to it fails from then on."""
+    os.close(terminal)
+    process.send_signal(signal.SIGHUP)
+
+
+@pytest.fixture
+def terminal() -> Iterator[tuple[int, int]]:
+    """A terminal: the side of its emulator, which a test closes, and that of a program."""
+    outside, inside = os.openpty()
+    yield outside, inside
+    os.close(inside)
+
+
+def test_closed_terminal_ends_a_service_in_order(terminal: tuple[int, int], tmp_path: Path) -> None:
+    """An SSH connection that breaks: the recording is completed."""
+    outside, inside = terminal
+    command = [BIN / "companion", "run", *CENTER, *LINK, *HTTP, "--record", tmp_path]
+    with started(command, stdout=subprocess.PIPE, stderr=inside) as process:
+        assert b"serves" in line_of(process, process.stdout)
+        without_terminal(process, outside)
+        assert process.wait(HANG_S) == 0
+    (recording,) = tmp_path.iterdir()
+    assert recording.suffix == ".mcap"
+
+
+def test_service_goes_on_without_a_terminal_for_its_notices(
+    terminal: tuple[int, int], cut_log: Path
+) -> None:
+    """Started in the background of a session that ended; stderr on a full disk is the same."""
+    outside, inside = terminal
+    command = [BIN / "companion", "run", *CENTER, *LINK, *HTTP]
+    with started(command, stdout=subprocess.PIPE, stderr=inside) as process:
+        line = line_of(process, process.stdout).decode()
+        os.close(outside)
+        port = line.rsplit(":", 1)[1].strip()
+        play = [BIN / "sitl-replay", "play", cut_log, "--to", f"udpout:127.0.0.1:{port}"]
+        subprocess.run([*play, "--speed", "5"], check=True, timeout=HANG_S, capture_output=True)
+        url = line.split()[2]
+        with urllib.request.urlopen(f"{url}/v1/events", timeout=HANG_S) as answer:
+            assert len(json.load(answer)["events"]) > 4
+        process.terminate()
+        assert process.wait(HANG_S) == 0
+
+
+def test_hangup_ends_a_drive_in_its_safe_state() -> None:
+    drive = [BIN / "companion", "drive", "none:pointing", "--service", "http://127.0.0.1:9"]
+    command = [*drive, "--on-stale", "boresight"]
+    with started(command, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        assert [line_of(process, process.stderr) for _ in range(3)][1] == "safe state: boresight\n"
+        process.send_signal(signal.SIGHUP)
+        assert process.stderr.readlines()[0] == "safe state: boresight\n"
+        assert process.wait(HANG_S) == 130
+
+
+def test_nohup_keeps_a_service_from_ending_with_its_terminal() -> None:
+    with started(
+        ["nohup", BIN / "companion", "demo", "--port", "0"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    ) as process:
+        url = line_of(process, process.stdout).decode().split()[2]
+
+        def updates() -> int:
+            with urllib.request.urlopen(f"{url}/v1/status", timeout=HANG_S) as answer:
+                return int(json.load(answer)["updates"])
+
+        process.send_signal(signal.SIGHUP)
+        before = updates()
+        while updates() < before + 10:
+            time.sleep(0.02)  # between two questions to another process
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(HANG_S) == 0

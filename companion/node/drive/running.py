@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import Final
 
 from companion.node.drive.loop import Drive, DriveStatus
+from companion.node.signals import ENDS
 
 STATUS_EVERY_S: Final = 1.0
 ENDS_S: Final = 5.0  # time limit for a device to reach its safe state at the end
@@ -16,7 +17,7 @@ ENDS_S: Final = 5.0  # time limit for a device to reach its safe state at the en
 def run_until_stopped(
     drive: Drive, show: Callable[[DriveStatus], None], seconds: float | None
 ) -> bool:
-    """Drive a device until SIGINT, SIGTERM or ``seconds`` have passed.
+    """Drive a device until a signal of ``ENDS``, or ``seconds`` have passed.
 
     ``show`` is called once a second. Return whether a signal stopped it. Raises the exception that
     ended the drive.
@@ -27,24 +28,26 @@ def run_until_stopped(
         received.append(number)
         stop.set()
 
-    for known in (signal.SIGINT, signal.SIGTERM):
+    for known in ENDS:
         signal.signal(known, interrupt)
     failed: list[BaseException] = []
     thread = threading.Thread(target=_run, args=(drive, stop, failed), name="drive", daemon=True)
     thread.start()
     left_s = seconds
-    while thread.is_alive() and not stop.is_set():
-        step_s = STATUS_EVERY_S if left_s is None else min(STATUS_EVERY_S, left_s)
-        if stop.wait(step_s):
-            break
-        drive.report_wait()
-        show(drive.status())
-        if left_s is not None:
-            left_s -= step_s
-            if left_s <= 0:
-                stop.set()
-    stop.set()
-    thread.join(ENDS_S)
+    try:
+        while thread.is_alive() and not stop.is_set():
+            step_s = STATUS_EVERY_S if left_s is None else min(STATUS_EVERY_S, left_s)
+            if stop.wait(step_s):
+                break
+            drive.report_wait()
+            show(drive.status())
+            if left_s is not None:
+                left_s -= step_s
+                if left_s <= 0:
+                    stop.set()
+    finally:  # also if nobody can be shown anything any more
+        stop.set()
+        thread.join(ENDS_S)
     if failed:
         raise failed[0]
     return bool(received)

@@ -11,7 +11,7 @@ jumps are multiplied: an opinion that returns is no new one.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
@@ -55,13 +55,22 @@ class _Opinion:
         return min(math.pi, angle_between_rad(self.rotation, other.rotation) + unsure_rad)
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class _Left:
-    """Opinion that was left by a jump at ``jump_ns``, with its last attitude."""
+    """Opinion that was left by jumps, the newest at ``jump_ns``, with its last attitude then.
 
+    If it returned, and was left again within ``DOUBT_S`` of ``first_ns``, it was within
+    ``spread_rad`` of what it was at the first jump.
+    """
+
+    first_ns: int
     jump_ns: int
     opinion: _Opinion
     last: tuple[int, Attitude]
+    spread_rad: float = 0.0
+
+    def apart_rad(self, newest: _Opinion) -> float:
+        return min(math.pi, self.opinion.apart_rad(newest) + self.spread_rad)
 
 
 class AttitudeJumps:
@@ -106,22 +115,23 @@ class AttitudeJumps:
         return self._to_announce(now_ns, bounds.attitude_rad) if apart_rad else None
 
     def _returns(self, after: tuple[int, Attitude], bounds: AttitudeBounds) -> bool:
-        """Return whether an attitude follows from one shortly before; forget what was between.
+        """Return whether an attitude follows from the one before the first jump, shortly before.
 
-        Once in ``DOUBT_S``: who goes back and forth has two opinions.
+        What was between is forgotten then, once in ``DOUBT_S``: who goes back and forth has two
+        opinions.
         """
         now_ns = after[0]
+        if not self._left or any(now_ns - one.first_ns > APART_MAX_S * 1e9 for one in self._left):
+            return False
         if self._returned_ns is not None and now_ns - self._returned_ns <= DOUBT_S * 1e9:
             return False
-        for number, left in enumerate(self._left):
-            apart_s = (now_ns - left.last[0]) * 1e-9
-            if apart_s <= APART_MAX_S and not contradiction(
-                left.last[1], after[1], apart_s, bounds
-            ):
-                self._opinion, self._returned_ns = left.opinion, now_ns
-                del self._left[number:]
-                return True
-        return False
+        first_ns, first = self._left[0].last
+        apart_s = (now_ns - first_ns) * 1e-9
+        if apart_s > APART_MAX_S or contradiction(first, after[1], apart_s, bounds):
+            return False
+        self._left.clear()
+        self._returned_ns = now_ns
+        return True
 
     def _jump(
         self, before: tuple[int, Attitude], after: tuple[int, Attitude], bounds: AttitudeBounds
@@ -137,13 +147,25 @@ class AttitudeJumps:
         )
         forward = (later_body_from_body(body_rates(before[1]), apart_s) @ first).T @ second
         back = first.T @ later_body_from_body(body_rates(after[1]), -apart_s) @ second
-        left, limit_rad = self._opinion, agreement_rad(apart_s, bounds)
-        self._left = [one for one in self._left if left.apart_rad(one.opinion) > limit_rad]
-        self._left.append(_Left(after[0], left, before))
+        left = self._opinion
+        self._leave(left, before, after[0], agreement_rad(apart_s, bounds))
         self._opinion = _Opinion(
             rotation=left.rotation @ forward,
             unsure_rad=left.unsure_rad + angle_between_rad(forward, back),
         )
+
+    def _leave(
+        self, opinion: _Opinion, last: tuple[int, Attitude], now_ns: int, limit_rad: float
+    ) -> None:
+        for number, one in enumerate(self._left):
+            apart_rad = one.opinion.apart_rad(opinion)
+            if apart_rad <= limit_rad and now_ns - one.first_ns <= DOUBT_S * 1e9:
+                del self._left[number]
+                spread_rad = max(one.spread_rad, apart_rad)
+                again = replace(one, jump_ns=now_ns, last=last, spread_rad=spread_rad)
+                self._left.append(again)
+                return
+        self._left.append(_Left(first_ns=now_ns, jump_ns=now_ns, opinion=opinion, last=last))
         if len(self._left) > OPINIONS_MAX:
             self._unknown_ns = self._left.pop(0).jump_ns
 
@@ -162,18 +184,20 @@ class AttitudeJumps:
         until_ns = now_ns - round(least_s * 1e9)
         if self._unknown_ns is not None and self._unknown_ns <= until_ns:
             return math.pi
-        left = [one.opinion for one in self._left if one.jump_ns <= until_ns]
-        return max((self._opinion.apart_rad(one) for one in left), default=0.0)
+        left = [one for one in self._left if one.first_ns <= until_ns]
+        return max((one.apart_rad(self._opinion) for one in left), default=0.0)
 
     def _to_announce(self, now_ns: int, noise_rad: float) -> float | None:
         """Return the largest angle that has lasted, unless a like one was announced lately."""
         apart_rad = self._apart_rad(now_ns, SETTLED_S)
+        if apart_rad <= 2.0 * noise_rad:
+            return None  # it is back where it was
         is_recent = (
             self._announced is not None
             and now_ns - self._announced[0] < ANNOUNCED_EVERY_S * 1e9
-            and apart_rad <= self._announced[1] + noise_rad
+            and apart_rad <= 1.5 * self._announced[1]
         )
-        if not apart_rad or is_recent:
+        if is_recent:
             return None
         self._announced = now_ns, apart_rad
         return apart_rad

@@ -98,15 +98,40 @@ def test_what_is_between_returns_again_and_again_is_no_outlier() -> None:
     assert [against for _, against, _ in found[15:]] == pytest.approx([20.0] * 85)
 
 
-def test_rates_that_lead_back_do_not_hide_a_jump() -> None:
+def test_three_opinions_in_turn_all_stay_possible() -> None:
+    found = followed(([0.0] * 3 + [40.0] * 3 + [80.0] * 3) * 30)
+    assert min(against for t_s, against, _ in found if t_s > 2.0) >= 39.9
+
+
+@pytest.mark.parametrize("forged", [9, 10])
+def test_rates_that_lead_back_do_not_hide_a_jump(forged: int) -> None:
     jumps, before = AttitudeJumps(), None
     for number in range(100):
         t_ns, attitude = facing(number / 10, 0.0 if number < 10 else 60.0)
-        if number == 10:
+        if number == forged:
             attitude = attitude._replace(yawspeed_radps=math.radians(600.0))
         jumps.look(before, (t_ns, attitude), BOUNDS)
         before = t_ns, attitude
         assert number < 10 or (jumps.against and jumps.against.at(0.0) >= math.radians(60.0))
+
+
+@pytest.mark.parametrize("dwell", [2, 5, 12])
+def test_opinions_that_drift_do_not_hide_the_first(dwell: int) -> None:
+    """Each return is near the one before, but further and further from the truth."""
+    steps = [0.0] * 20
+    for number in range(1, 8):
+        steps += [35.0 + 5.0 * number] * dwell + [5.0 * number] * dwell
+    for t_s, against, _ in followed(steps)[20 + 4 * dwell :]:
+        if t_s < 2.0 + DOUBT_S - 0.1:
+            limit = math.degrees(agreement_rad(0.1, BOUNDS))
+            assert steps[round(10 * t_s)] <= against + limit
+
+
+def test_flapping_is_announced_by_its_angle() -> None:
+    for dwell in (1, 3, 6, 9):
+        found = followed([0.0] * 20 + ([40.0] * dwell + [0.0] * dwell) * (150 // dwell))
+        told = [angle for *_, angle in found if angle is not None]
+        assert told == [pytest.approx(40.0)], dwell
 
 
 def test_estimator_of_many_opinions_knows_nothing() -> None:

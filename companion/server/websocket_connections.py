@@ -21,6 +21,7 @@ CLOSE_S: Final = 2.0  # time limit for a client to confirm that the connection i
 PING_S: Final = 4.0  # time between pings
 PONG_S: Final = STALL_TIMEOUT_S - PING_S
 """Time limit for the answer to a ping, or for another sign that the client reads, seconds."""
+BAD_HANDSHAKE: Final = b"HTTP/1.1 400 Bad Request\r\nconnection: close\r\ncontent-length: 0\r\n\r\n"
 FRAGMENT_CHARS: Final = 65_536
 """Characters of a message that are sent, and copied for its client, at a time."""
 
@@ -68,6 +69,11 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
             self._refuse()
             return
         super().data_received(data)
+        if not self.handshake_initiated and not self.transport.is_closing():
+            # A head that websockets rejects without an event: with a body, or a line too long.
+            self.transport.write(BAD_HANDSHAKE)
+            self.transport.close()
+            self._abort_later()
 
     def _refuse(self) -> None:
         """Close the connection of a client that sends too much, without reading on."""

@@ -440,6 +440,37 @@ def test_flood_of_pings_closes_the_websocket(
     assert code.to_bytes(2, "big") in said or pongs == 0
 
 
+@pytest.mark.parametrize("loop", LOOPS, ids=["asyncio", "uvloop"])
+@pytest.mark.parametrize(
+    "more",
+    [
+        b"Content-Length: 5\r\n",
+        b"Content-Length: 0\r\n",
+        b"Transfer-Encoding: chunked\r\n",
+        b"X: " + b"x" * 8200 + b"\r\n",
+        b"X: y\r\n" * 120,
+    ],
+    ids=["body", "empty body", "chunks", "long line", "many lines"],
+)
+def test_handshake_that_is_none_leaves_no_connection(
+    make_node: Any, more: bytes, loop: Any
+) -> None:
+    """The library behind it says nothing about a head that it does not accept."""
+
+    async def ended() -> None:
+        async with served(make_node()) as port:
+            reader, writer = await connected(port)
+            writer.write(UPGRADE[:-2] + more + b"\r\n")
+            status = await asyncio.wait_for(reader.readline(), HANG_S)
+            assert status.startswith((b"HTTP/1.1 4", b"HTTP/1.1 101"))
+            if b"101" in status:
+                return
+            with contextlib.suppress(ConnectionError):
+                await asyncio.wait_for(reader.read(), HANG_S)
+
+    run_async(ended(), loop)
+
+
 def test_message_to_a_client_closed_while_it_did_not_read_is_no_error() -> None:
     async def closed() -> None:
         held = websocket_connections.BoundedWebSocket.__new__(

@@ -38,6 +38,7 @@ from dataclasses import dataclass, field
 from enum import Enum, auto
 from typing import Final
 
+from companion.mavlink.trust.attitude_difference import contradict
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
 from companion.mavlink.trust.paths import RESTARTED_MS, SLACK_M, Path
 from companion.mavlink.trust.peer_clock import PeerClock, has_stamp, stamp_ms
@@ -230,6 +231,8 @@ class KnownPeers:
         if msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
             agrees = self._agrees(sender, peer, frame) or peer in sender.known
             return None if agrees and read(frame).accuracy is None else STRANGER
+        if msgid == ATTITUDE:
+            self._compare_attitudes(sender, peer, frame, current)
         return STRANGER
 
     def rank(self, link: str, peer: str, source: Source, now_ns: int) -> PeerRank:
@@ -298,11 +301,22 @@ class KnownPeers:
             return None
         if frame.msgid not in STAMPED:
             return BROUGHT
+        if frame.msgid == ATTITUDE:
+            self._compare_attitudes(sender, peer, frame, [one for one, _ in recent])
         if all(_is_overtaken(one, same, frame) for one, same in recent):
             return None
         if all(_ahead_ms(frame, same) > LATE_PEER_MS for _, same in recent):
             self._note_late(sender, peer, frame)
         return BROUGHT
+
+    def _compare_attitudes(
+        self, sender: _Sender, peer: str, frame: Frame, believed: list[_Peer]
+    ) -> None:
+        """Publish that the attitudes of a peer, which are not used, contradict those that are."""
+        if sender.comparisons.spend(1, frame.t_ns * 1e-9) and any(
+            contradict(frame, one.newest[ATTITUDE]) for one in believed if ATTITUDE in one.newest
+        ):
+            self._note_contradiction(sender, peer, frame)
 
     def _note_late(self, sender: _Sender, peer: str, frame: Frame) -> None:
         """Publish that the peers that were known first are late, and believed all the same."""

@@ -1,5 +1,6 @@
 """Known peers and strangers: who was first stays believed, a second route of one vehicle counts."""
 
+import math
 import struct
 from collections.abc import Callable
 from typing import Any
@@ -195,6 +196,29 @@ def test_attitude_of_a_peer_whose_positions_agreed_is_not_used_beside_that_of_th
     copy = attitude(21.0, 0.5)
     assert peers.refusal(LINK, HOME, copy) is None
     assert peers.refusal(LINK, OTHER, copy) is None  # a duplicate, which is found as such
+
+
+@pytest.mark.parametrize("is_stranger", [False, True])
+@pytest.mark.parametrize(("off_rad", "contradicts"), [(0.0, False), (0.05, False), (0.5, True)])
+def test_attitudes_of_two_peers_that_differ_are_announced(
+    is_stranger: bool, off_rad: float, contradicts: bool
+) -> None:
+    """The first may be the stranger that took the vehicle's place while its radio was silent."""
+    peers = with_two_known_peers()
+    other = "10.0.0.77:5" if is_stranger else OTHER
+    for number in range(60):
+        t_s, yaw_rad = 20 + number / 10, 3.0 * math.sin(number / 10)
+        assert peers.refusal(LINK, HOME, turning(t_s, yaw_rad, 3.0 * math.cos(number / 10))) is None
+        t_s, yaw_rad = t_s + 0.06, 3.0 * math.sin(number / 10 + 0.06)
+        beside = turning(t_s, yaw_rad + off_rad, 3.0 * math.cos(number / 10 + 0.06))
+        assert peers.refusal(LINK, other, beside) == (STRANGER if is_stranger else BROUGHT)
+    assert peers.contradicted == [("1:1", other, (HOME, OTHER))] * contradicts
+
+
+def turning(t_s: float, yaw_rad: float, yawspeed_radps: float) -> Frame:
+    stamp_ms = round((100 + t_s) * 1000)
+    payload = struct.pack("<I6f", stamp_ms, 0.1, -0.2, yaw_rad, 0.0, 0.0, yawspeed_radps)
+    return message(t_s, Outgoing(Source(1, 1), ATTITUDE, payload))
 
 
 def stamped_attitude(arrives_s: float, stamp_s: float, yaw_rad: float = 0.5) -> Frame:

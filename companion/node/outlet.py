@@ -13,6 +13,7 @@ from companion.mavlink.links.transport import Link
 from companion.mavlink.links.urls import parse_link
 from companion.mavlink.trust.admission import admission
 from companion.mavlink.wire.encode import pack
+from companion.mavlink.wire.positions import PASSED_ON
 from companion.pipeline.fold import Pipeline
 from companion.settings.model import Settings
 from companion.values import Notice, Source, Track
@@ -97,7 +98,7 @@ class Outlet:
             for message in self._positions.outgoing(self._pipeline, tracks):
                 number = self._sequences.get(message.source, 0)
                 self._sequences[message.source] = (number + 1) & 0xFF
-                raw = pack(message, number)
+                raw = pack(message, number, compat_flags=PASSED_ON)
                 for link in self._frames:
                     link.send_raw(raw)
         if self._events:

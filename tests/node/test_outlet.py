@@ -3,13 +3,22 @@
 import asyncio
 import socket
 from itertools import count
+from pathlib import Path
+from typing import Any
 
+import siege
 from pymavlink.dialects.v20 import common
-from support import HANG_S, ROOT, run_async
+from support import HANG_S, ROOT, free_port, run_async
 
+from companion.mavlink.wire.decode import PREDICTION
+from companion.mavlink.wire.encode import pack
+from companion.mavlink.wire.framing import Splitter
+from companion.mavlink.wire.positions import PASSED_ON
 from companion.node import moment
 from companion.node.outlet import Outlet
 from companion.settings.model import Settings
+from companion.values import Frame, Reason, Rejection
+from companion.views import passed_on
 
 
 def test_each_forwarded_vehicle_has_its_own_sequence_numbers() -> None:
@@ -41,3 +50,34 @@ def test_each_forwarded_vehicle_has_its_own_sequence_numbers() -> None:
         heard.settimeout(HANG_S)
         run_async(test(heard))
     assert numbers == [numbers[0] + n for n in range(3)]
+
+
+def test_forwarded_position_is_no_report_of_its_vehicle() -> None:
+    """Also in the log of a ground station, where it stands beside the vehicle's own."""
+    settings = Settings().override(center={"source": "5:1"})
+    log = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
+    pipeline, update = moment.look([log], settings, "3")
+    sent = passed_on.Positions(utm=False, every_s=0.1).outgoing(pipeline, list(update.tracks))
+    raw = pack(sent[0], 7, compat_flags=PASSED_ON)
+    (frame,) = Splitter("x").feed(update.t_ns + 1, raw)
+    assert isinstance(frame, Frame)
+    (rejected,) = [out for out in pipeline.step(frame) if isinstance(out, Rejection)]
+    assert (rejected.reason, rejected.detail) == (Reason.DUPLICATE, PREDICTION)
+
+
+def test_silent_vehicle_does_not_live_on_by_its_forwarded_positions(
+    tmp_path: Path, start_node: Any
+) -> None:
+    """A router forwards everything to all, so they come back over the service's own link."""
+    port, config = free_port(socket.SOCK_DGRAM), tmp_path / "out.toml"
+    config.write_text(f'[out]\nurls = ["udpout:127.0.0.1:{port}"]\nrate_hz = 10.0\n')
+    run = ("run", "--config", str(config), "--link", f"udpin:127.0.0.1:{port}")
+    node = start_node(*run, "--listen", "127.0.0.1:0", "--center", "5:1")
+    with siege.flight(port):
+        node.wait_until("/v1/uavs", lambda said: states(said) == {"live"} and len(said["uavs"]) > 3)
+        node.wait_until("/v1/links", lambda said: said["out"][0]["sent"] > 100)
+    node.wait_until("/v1/uavs", lambda said: "live" not in states(said), seconds=20)
+
+
+def states(said: Any) -> set[str]:
+    return {uav["state"] for uav in said["uavs"]}

@@ -38,8 +38,10 @@ from companion.mavlink.trust.known_peers import JUDGED, KnownPeers, PeerRank
 from companion.mavlink.trust.newcomers import LATE_NS, Admission, Newcomers
 from companion.mavlink.wire import cot_link
 from companion.mavlink.wire.aircraft_json import AircraftJson
+from companion.mavlink.wire.decode import PREDICTION
 from companion.mavlink.wire.encode import TIMESYNC, Outgoing, pack
 from companion.mavlink.wire.foreign import ForeignSplitter
+from companion.mavlink.wire.positions import OWN, is_passed_on
 from companion.values import Frame, Notice, Reason, Rejection, Severity, Source
 from companion.values.budget import Budget
 
@@ -351,6 +353,8 @@ class Link:
         if frame.msgid == cot_link.TUNNEL and frame.source == cot_link.SENDER:
             is_own = isinstance(peer.splitter, ForeignSplitter)
             reason, detail = Reason.NOT_ALLOWED, None if is_own else RESERVED
+        elif frame.msgid in OWN and is_passed_on(frame):
+            reason, detail = Reason.DUPLICATE, PREDICTION
         else:
             detail = self._known_peers.refusal(self._name, peer.address or self._name, frame)
         if detail is None:

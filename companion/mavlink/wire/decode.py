@@ -40,6 +40,7 @@ EKF_STATUS_REPORT: Final = 193
 POSE: Final = positions.OWN | {ATTITUDE}
 """Messages in which vehicles report their own position or attitude, stamped by their boot clock."""
 
+PREDICTION: Final = "a prediction that a companion passed on"
 NULL_ISLAND_RADIUS_M: Final = 5000.0
 """Distance from 0 N 0 E within which positions are rejected.
 
@@ -96,6 +97,8 @@ def _position(lat_1e7: int, lon_1e7: int) -> tuple[float, float]:
 
 
 def _own_position(frame: Frame) -> Report:
+    if positions.is_passed_on(frame):
+        raise _RefusedError(Reason.DUPLICATE, PREDICTION)
     said = positions.read(frame)
     lat_deg, lon_deg = _position(said.lat_1e7, said.lon_1e7)
     velocity = said.velocity_ned_mps

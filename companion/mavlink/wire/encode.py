@@ -42,8 +42,10 @@ class Outgoing(NamedTuple):
     payload: bytes
 
 
-def pack(message: Outgoing, seq: int, version: int = 2) -> bytes:
+def pack(message: Outgoing, seq: int, version: int = 2, compat_flags: int = 0) -> bytes:
     """Build the frame of a message: MAVLink 2, unsigned, with trailing zeros cut; or MAVLink 1.
+
+    ``compat_flags`` (MAVLink 2) are those that a receiver ignores if it does not know them.
 
     A payload with extension fields cannot be sent as MAVLink 1. Omit them from a payload that may
     be sent as either version.
@@ -54,7 +56,7 @@ def pack(message: Outgoing, seq: int, version: int = 2) -> bytes:
         magic = MAGIC_V1
     else:
         payload = message.payload.rstrip(b"\0") or b"\0"  # the first byte is never cut
-        head = bytes([len(payload), 0, 0, seq, *message.source])
+        head = bytes([len(payload), 0, compat_flags, seq, *message.source])
         body = head + message.msgid.to_bytes(3, "little") + payload
         magic = MAGIC_V2
     return bytes([magic]) + body + struct.pack("<H", crc16.mcrf4xx(body + seed))

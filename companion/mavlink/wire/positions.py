@@ -10,11 +10,17 @@ from collections.abc import Callable
 from typing import Final, NamedTuple
 
 from companion.mavlink.wire.cot_link import TUNNEL
+from companion.mavlink.wire.framing import MAGIC_V2
 from companion.mavlink.wire.payload import unpack
 from companion.mavlink.wire.remote_id import LOCATION, MESSAGE_PACK
 from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.values import Accuracy, Frame, Vector
 
+PASSED_ON: Final = 0x80
+"""Compatibility flag of a prediction that a companion sends under a vehicle's id ([out]).
+
+The MAVLink 2 guide defines no such flag; receivers ignore those that they do not know.
+"""
 GLOBAL_POSITION_INT: Final = 33
 HIGH_LATENCY2: Final = 235
 
@@ -99,6 +105,12 @@ POSITIONS: Final = {
 """Messages that carry a position, or may carry one, by id."""
 _READERS: Final = {msgid: one.read for msgid, one in POSITIONS.items() if one.read is not None}
 OWN: Final = frozenset(_READERS)  # messages in which vehicles report their own positions
+
+
+def is_passed_on(frame: Frame) -> bool:
+    """Return whether a position is a companion's prediction, which must not become new data."""
+    raw = frame.raw
+    return raw[0] == MAGIC_V2 and bool(raw[3] & PASSED_ON)
 
 
 def read(frame: Frame) -> OwnPosition:

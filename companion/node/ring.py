@@ -9,6 +9,7 @@ records it lost. The record's own checksum detects reordering by the processor.
 """
 
 import contextlib
+import fcntl
 import mmap
 import os
 from pathlib import Path
@@ -43,12 +44,21 @@ def _allocate(fd: int, size: int, replaced: Path) -> None:
     """Allocate all of a file; delete the ring that it replaces if there is no room for both."""
     try:
         os.posix_fallocate(fd, 0, size)
-    except OSError as error:
-        try:
-            replaced.unlink()  # of a service that was killed
-        except FileNotFoundError:
-            raise error from None
+    except OSError:
+        if not _is_left(replaced):
+            raise
+        replaced.unlink()
         os.posix_fallocate(fd, 0, size)
+
+
+def _is_left(path: Path) -> bool:
+    """Return whether there is a ring whose writer was killed: it holds no lock any more."""
+    try:
+        with path.open("rb") as file:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except OSError:
+        return False
+    return True
 
 
 class Ring:
@@ -70,11 +80,14 @@ class Ring:
             beside.unlink(missing_ok=True)
             fd = os.open(beside, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o640)
             try:
+                fcntl.flock(fd, fcntl.LOCK_EX)
                 _allocate(fd, size, path)
                 self._map = mmap.mmap(fd, size)
                 self._identity = os.fstat(fd).st_ino
-            finally:
+            except OSError:
                 os.close(fd)
+                raise
+            self._fd = fd  # holds the lock, which ends with the process
             self._words = np.frombuffer(self._map, dtype="<u8")  # stores of 8 bytes are atomic
             self._halves = np.frombuffer(self._map, dtype="<u4")
             self._halves[2:6] = VERSION, SLOTS, SLOT_BYTES, LIVE
@@ -104,6 +117,7 @@ class Ring:
         self._halves[5] = 0
         del self._words, self._halves
         self._map.close()
+        os.close(self._fd)
         with contextlib.suppress(OSError):
             if self._path.stat().st_ino == self._identity:
                 self._path.unlink()

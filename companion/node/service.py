@@ -37,7 +37,7 @@ from companion.recording.parts import Part
 from companion.recording.reader import LogError
 from companion.recording.recover import recover_leftovers
 from companion.recording.scene import Scene
-from companion.recording.writer import Writer
+from companion.recording.writer import Writer, holds_recording
 from companion.server import area_map
 from companion.settings.files import embedded
 from companion.settings.model import Settings
@@ -155,10 +155,10 @@ class Service:
         self._traffic.open()
         self._intake.open()
         self._outlet.open()
-        self._push.open()
         if self.fleet is not None:
             self.fleet.open()
         self._recorder = self._open_recorder()
+        self._push.open()  # last: a start that fails leaves no ring without a writer
 
     async def run(
         self,
@@ -510,7 +510,7 @@ class Service:
         directory = self._settings.recording.directory
         if directory is None:
             return
-        for found in await in_daemon_thread(partial(recover_leftovers, Path(directory))):
+        for found in await in_daemon_thread(partial(recover_leftovers, folder_of(Path(directory)))):
             if isinstance(found, LogError):
                 self._say(str(found))
             else:
@@ -549,7 +549,7 @@ class Service:
     def _open_part(self, part: Part) -> Writer:
         kept = self._settings.recording
         where = Path(kept.directory or "")
-        if part.number > 1:
+        if part.number > 1 or holds_recording(where):
             where = folder_of(where)  # also if a file was requested
         return Writer(
             where=where,

@@ -105,17 +105,17 @@ async def _serve(
     manager: systemd.Manager | None,
     open_page: bool,
 ) -> None:
-    lost: list[OSError] = []
-    others = [_keep_shown(service, voice, until, lost)]
-    others += [traffic(service.links()[0].url)] if traffic else []
-    if manager:
-        others.append(systemd.keep_informed(manager, service, voice.say, until))
     page = address(http)
     voice.serves(
         f"companion serves {page} and listens on {', '.join(link.url for link in service.links())}"
     )
     if open_page:
         webbrowser.open(page)
+    lost: list[OSError] = []
+    others = [_keep_shown(service, voice, until, lost)]
+    others += [traffic(service.links()[0].url)] if traffic else []
+    if manager:
+        others.append(systemd.keep_informed(manager, service, voice.say, until))
     await service.run(http, token, until, *others)
     if lost:
         raise lost[0]

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 
+import pytest
 from support import BALLAST, HANG_S, ROOT, fill, free_port, run_async
 
 from companion.node import moment
@@ -99,3 +100,12 @@ def test_refused_udp_push_and_recovery_are_announced_once() -> None:
     push.open()
     run_async(test())
     push.close()
+
+
+def test_ring_of_a_running_service_is_not_deleted_for_another(small_disk: Path) -> None:
+    path = small_disk / "ring"
+    running = Ring(path)
+    with pytest.raises(OSError, match="No space left"):
+        Ring(path)
+    assert list(small_disk.iterdir()) == [path]
+    running.close()

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 import pymap3d
 import pytest
+import siege
 from device_reading import parse
 from support import BIN, HANG_S, read_metadata, started
 
@@ -288,3 +289,21 @@ def test_demo_runs_without_loading_unused_modules(tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr
     (recording,) = (tmp_path / "recordings").glob("*.mcap")
     assert any(isinstance(event, Frame) for event in read_log(recording))
+
+
+def test_restart_replaces_no_recording_of_the_same_name(tmp_path: Path, start_node: Any) -> None:
+    """Neither the leftover of a killed service, which is recovered, nor a finished one."""
+    wanted = tmp_path / "flight.mcap"
+    run = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
+    node = start_node(*run, "--record", str(wanted))
+    with siege.flight(node.udp_port):
+        node.wait_until("/v1/status", lambda said: said["recording"]["bytes"] > 20_000)
+    node.process.kill()
+    node.process.wait(HANG_S)
+    left = (tmp_path / "flight.mcap.active").stat().st_size
+    for _ in range(2):
+        again = start_node(*run, "--record", str(wanted))
+        again.wait_until("/v1/status", lambda _: wanted.exists())
+        assert again.stop()[0] == 0
+    assert wanted.stat().st_size > left / 2
+    assert len(list(tmp_path.glob("companion-*.mcap"))) == 2

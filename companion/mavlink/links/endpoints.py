@@ -26,6 +26,7 @@ class Upcalls(NamedTuple):
               bytes continues; raises ``StalledError`` to end the connection
     stale     bytes of a peer that waited too long to be used
     request   called before a document is requested from the only peer
+    has_sent  returns whether a peer has sent a valid frame
     """
 
     up: Callable[[], None]  # connected
@@ -34,6 +35,7 @@ class Upcalls(NamedTuple):
     on_peer_gone: Callable[[Hashable], None]  # that peer is gone
     overflow: Callable[[int], None]  # the system dropped this many more datagrams
     request: Callable[[], None] = lambda: None
+    has_sent: Callable[[Hashable], bool] = lambda _: True
 
 
 class Endpoint(Protocol):

@@ -89,7 +89,7 @@ class TcpIn:
         self._url = url
         self._upcalls = upcalls
         self._socket: socket.socket | None = None
-        self._streams: set[_Stream] = set()
+        self._streams: dict[_Stream, None] = {}  # the oldest first
         self._order = _ReadOrder()
 
     def open(self) -> int:
@@ -129,17 +129,26 @@ class TcpIn:
 
     def _met(self, fault: asyncio.Future[Exception]) -> "_Stream":
         def on_close(stream: _Stream, why: Exception) -> None:
-            self._streams.discard(stream)
+            self._streams.pop(stream, None)
             if not isinstance(why, OSError):
                 settle(fault, why)
 
-        if len(self._streams) >= share(CONNECTIONS_MAX, DESCRIPTORS):
+        if len(self._streams) >= share(CONNECTIONS_MAX, DESCRIPTORS) and not self._make_room():
             return _Stream(
                 upcalls=self._upcalls, on_close=on_close, order=self._order, is_accepted=False
             )
         stream = _Stream(upcalls=self._upcalls, on_close=on_close, order=self._order)
-        self._streams.add(stream)
+        self._streams[stream] = None
         return stream
+
+    def _make_room(self) -> bool:
+        """Close the oldest connection over which no frame came; False if there is none."""
+        unused = next((one for one in self._streams if not self._upcalls.has_sent(one)), None)
+        if unused is None:
+            return False
+        del self._streams[unused]
+        unused.abort()
+        return True
 
 
 class _ReadOrder:

@@ -141,6 +141,7 @@ class Link:
             on_peer_gone=self._peer_gone,
             overflow=self._overflow,
             request=self._requested,
+            has_sent=self._has_sent,
         )
         self._endpoint = endpoint(url, self.status, upcalls)
         self._is_out = False
@@ -393,6 +394,10 @@ class Link:
         splitter = self._peers.at(None).splitter
         assert isinstance(splitter, AircraftJson)
         splitter.requested(self._now_ns())
+
+    def _has_sent(self, key: Hashable) -> bool:
+        peer = self._peers.find(key)
+        return peer is not None and bool(peer.senders)
 
     def _peer_gone(self, key: Hashable) -> None:
         peer = self._peers.find(key)

@@ -536,6 +536,28 @@ def test_number_of_connections_is_bounded(run: Run, monkeypatch: pytest.MonkeyPa
     run(test())
 
 
+def test_connections_without_frames_keep_nobody_out(
+    run: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """260 that sent nothing kept a vehicle out that came back, for ever."""
+    monkeypatch.setattr(tcp, "CONNECTIONS_MAX", 3)
+
+    async def test() -> None:
+        async with running("tcpin:127.0.0.1:0") as (link, inbox), contextlib.AsyncExitStack() as on:
+            first = await on.enter_async_context(connected(link))
+            first.send(frame(1))
+            await inbox.until(1)
+            for number in range(6):
+                silent = await on.enter_async_context(connected(link))
+                silent.send(b"no frame")
+                vehicle = await on.enter_async_context(connected(link))
+                vehicle.send(frame(2, sysid=2 + number % 2))
+                await inbox.until_true(lambda count=number + 2: len(inbox.raws) == count)
+                vehicle.close()
+
+    run(test())
+
+
 # --- UDP, to one peer ---------------------------------------------------------------------------
 
 

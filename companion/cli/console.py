@@ -77,13 +77,6 @@ def say(text: str, err: bool = False) -> None:
     click.echo(printable(text), err=err)
 
 
-def say_if_heard(text: str) -> None:
-    """Print a line on stderr, if that is possible: what runs goes on if its terminal was closed, or
-    the disk of its log file is full."""
-    with suppress(OSError):
-        say(text, err=True)
-
-
 def print_log_notices(logs: Sequence[Path]) -> None:
     """Print on stderr the vehicle of each onboard log, with the accuracy of its time, and each log
     that is truncated."""

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from companion.cli.console import CONFIG, SECONDS, FiniteRange, InterruptedByUser, say_if_heard
+from companion.cli.console import CONFIG, SECONDS, FiniteRange, InterruptedByUser
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -80,6 +80,7 @@ def drive(
     from companion.node.drive import running, targets
     from companion.node.drive.loop import Drive, SafeState
     from companion.node.drive.sources import BeamRequest, HttpSource, stored_registers
+    from companion.node.printing import STDERR, STDOUT, Printer
     from companion.pipeline import assembly
     from companion.settings.files import load
 
@@ -91,7 +92,8 @@ def drive(
         stored.extend(stored_registers(array, assembly.equipment(settings, array)))
         return stored
 
-    device = targets.device(target, say_if_heard, codebook)
+    printer, objects = Printer(STDERR), Printer(STDOUT)
+    device = targets.device(target, printer.line, codebook)
     if dry_run:
         device = targets.device(f"none:{device.takes}", click.echo, codebook)
     client = Client(service, os.environ.get("COMPANION_TOKEN"))
@@ -110,14 +112,19 @@ def drive(
         update_hz=update_hz,
         safe=SafeState(on_stale),
         now_ns=time.time_ns,
-        say=say_if_heard,
+        say=printer.line,
     )
 
     def show(final_status: "DriveStatus") -> None:
         if as_json:
-            click.echo(json.dumps(asdict(final_status)))
+            objects.require_reader()
+            objects.line(json.dumps(asdict(final_status)))
 
-    interrupted = running.run_until_stopped(driven, show, seconds)
+    try:
+        interrupted = running.run_until_stopped(driven, show, seconds)
+    finally:
+        objects.finish()
+        printer.finish()
     final_status = driven.status()
     click.echo(_text(final_status), err=as_json)
     if not final_status.applied and interrupted:

@@ -5,11 +5,9 @@ its log file is full. The page shows them too. JSON is a program's input: withou
 """
 
 import json
-from contextlib import suppress
 
-import click
-
-from companion.cli.console import Progress, say, say_if_heard
+from companion.cli.console import say
+from companion.node.printing import STDERR, STDOUT, Printer
 from companion.node.service import Service
 from companion.views import glance
 
@@ -18,26 +16,30 @@ class Lines:
     """Writer of notices as lines on stderr; on a terminal, with a status line below them."""
 
     def __init__(self) -> None:
-        self._progress = Progress()
+        self._printer = Printer(STDERR)
 
     def say(self, text: str) -> None:
         """Print a line above the status line."""
-        self._clear()
-        say_if_heard(text)
+        self._printer.line(text)
 
     def serves(self, text: str) -> None:
-        """Print a line on stdout, such as the address of the page."""
-        self._clear()
+        """Print the address of the page on stdout. ``OSError`` if that is not possible."""
         say(text)
+
+    def recorded(self, text: str) -> None:
+        """Print the recording on stdout."""
+        self._printer.finish()
+        last = Printer(STDOUT)
+        last.line(text)
+        last.finish()
 
     def show(self, service: Service) -> None:
         """Refresh the status line on the terminal."""
-        with suppress(OSError):
-            self._progress.show(glance.line(service))
+        self._printer.status(glance.line(service))
 
-    def _clear(self) -> None:
-        with suppress(OSError):
-            self._progress.clear()
+    def finish(self) -> None:
+        """Wait a moment for the last lines to be read."""
+        self._printer.finish()
 
 
 class JsonLines:
@@ -45,19 +47,24 @@ class JsonLines:
 
     def __init__(self) -> None:
         self._seen_ns = 0
+        self._printer = Printer(STDERR)
+        self._objects = Printer(STDOUT)
 
     def say(self, text: str) -> None:
         """Print a line for the operator on stderr."""
-        say_if_heard(text)
+        self._printer.line(text)
 
-    def serves(self, text: str) -> None:
-        """Print the address or recording on stderr."""
-        say(text, err=True)
+    serves = recorded = say
 
     def show(self, service: Service) -> None:
-        """Print the status as a JSON object."""
+        """Print the status as a JSON object. Raises ``OSError`` if that is no longer possible."""
+        self._objects.require_reader()
         fresh = [notice for notice in service.events() if notice.t_ns > self._seen_ns]
         self._seen_ns = max([self._seen_ns, *(notice.t_ns for notice in fresh)])
-        click.echo(
-            json.dumps(glance.glance(service) | {"events": glance.as_events(service, fresh)})
-        )
+        found = glance.glance(service) | {"events": glance.as_events(service, fresh)}
+        self._objects.line(json.dumps(found))
+
+    def finish(self) -> None:
+        """Wait a moment for the last lines to be read."""
+        self._objects.finish()
+        self._printer.finish()

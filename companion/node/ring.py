@@ -32,33 +32,33 @@ LARGEST_RECORD: Final = SLOT_BYTES - SLOT_HEAD_BYTES
 LIVE: Final = 1  # state of a ring with a writer; 0: its writer has ended
 
 
-def _require_ring(path: Path) -> None:
-    """Raise ``UserError`` if a file exists that is not a ring buffer."""
+def _require_free(path: Path) -> None:
+    """Raise ``UserError`` if a file exists that is not a ring buffer, or has a writer."""
     if path.exists():
         with open_regular(path) as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise UserError(f"{path} exists and is not a ring of records; choose another name")
+            try:
+                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+            except BlockingIOError:
+                raise UserError(
+                    f"{path} is in use by another process; choose another name"
+                ) from None
 
 
 def _allocate(fd: int, size: int, replaced: Path) -> None:
-    """Allocate all of a file; delete the ring that it replaces if there is no room for both."""
+    """Allocate all of a file; delete the ring that it replaces if there is no room for both.
+
+    That is of a service that was killed.
+    """
     try:
         os.posix_fallocate(fd, 0, size)
-    except OSError:
-        if not _is_left(replaced):
-            raise
-        replaced.unlink()
+    except OSError as error:
+        try:
+            replaced.unlink()
+        except FileNotFoundError:
+            raise error from None
         os.posix_fallocate(fd, 0, size)
-
-
-def _is_left(path: Path) -> bool:
-    """Return whether there is a ring whose writer was killed: it holds no lock any more."""
-    try:
-        with path.open("rb") as file:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
 
 
 class Ring:
@@ -67,8 +67,8 @@ class Ring:
     Raises ``UserError`` for an unusable path, ``OSError`` if its disk or memory is full, or is
     another of ``DISK_FAULTS``. All of it is allocated at once: a write to a page that the kernel
     cannot allocate ends the process (SIGBUS). The file replaces an earlier ring of that name, which
-    its readers keep until they reopen it; a file that is not a ring is kept. Readable by the owner
-    and the group.
+    its readers keep until they reopen it; a file that is not a ring, or whose writer runs, is kept.
+    Readable by the owner and the group.
     """
 
     def __init__(self, path: Path) -> None:
@@ -76,7 +76,7 @@ class Ring:
         beside = path.with_name(f".{path.name}.{os.getpid()}")
         size = HEAD_BYTES + SLOTS * SLOT_BYTES
         try:
-            _require_ring(path)
+            _require_free(path)
             beside.unlink(missing_ok=True)
             fd = os.open(beside, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o640)
             try:

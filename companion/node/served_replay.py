@@ -18,13 +18,12 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 
-import click
-
 from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.trust.dedupe import LINKS_MAX
 from companion.mavlink.voice.rate_watch import MessageRate
+from companion.node.printing import STDERR, Printer
 from companion.node.replay import FLUSH_EVERY_S, Run, log_events, log_notes
 from companion.node.serving import (
     NOTICES_KEPT,
@@ -40,7 +39,7 @@ from companion.server import area_map
 from companion.server.access import bind
 from companion.settings.model import Settings
 from companion.settings.origins import Origins
-from companion.values import Event, Frame, Notice, Observation, Rejection, Update, printable
+from companion.values import Event, Frame, Notice, Observation, Rejection, Update
 from companion.views.last_messages import LastMessages
 from companion.views.lateness import Lateness
 from companion.views.series import Series
@@ -83,13 +82,13 @@ def serve(
     ``ListenError`` or ``OSError`` for unusable arguments.
     """
     with bind(listen, token=token, insecure=insecure) as http:
-        node = ServedReplay(asked, _say)
-        _say(f"companion serves {address(http)} and replays {node.name}")
-        run_until_stopped(partial(node.run, http, token, show))
-
-
-def _say(text: str) -> None:
-    click.echo(printable(text), err=True)
+        printer = Printer(STDERR)
+        try:
+            node = ServedReplay(asked, printer.line)
+            printer.line(f"companion serves {address(http)} and replays {node.name}")
+            run_until_stopped(partial(node.run, http, token, show))
+        finally:
+            printer.finish()
 
 
 class ServedReplay:

@@ -3,6 +3,7 @@
 import asyncio
 import os
 import socket
+import threading
 import webbrowser
 from collections.abc import Callable, Coroutine
 from functools import partial
@@ -28,10 +29,16 @@ class Console(Protocol):
         """Print a line about an event."""
 
     def serves(self, text: str) -> None:
-        """Print the address that is served, or at the end the recording."""
+        """Print the address that is served."""
+
+    def recorded(self, text: str) -> None:
+        """Print the recording, at the end."""
 
     def show(self, service: Service) -> None:
         """Print the status of the service."""
+
+    def finish(self) -> None:
+        """Wait a moment until all is printed."""
 
 
 def run(
@@ -78,7 +85,10 @@ def run(
             manager=manager,
             open_page=open_page,
         )
-        run_until_stopped(serve, seconds)
+        try:
+            run_until_stopped(serve, seconds)
+        finally:
+            voice.finish()
 
 
 async def _keep_shown(
@@ -109,8 +119,8 @@ async def _serve(
     voice.serves(
         f"companion serves {page} and listens on {', '.join(link.url for link in service.links())}"
     )
-    if open_page:
-        webbrowser.open(page)
+    if open_page:  # on a thread: a browser of the terminal keeps its caller waiting
+        threading.Thread(target=webbrowser.open, args=(page,), daemon=True).start()
     lost: list[OSError] = []
     others = [_keep_shown(service, voice, until, lost)]
     others += [traffic(service.links()[0].url)] if traffic else []
@@ -121,4 +131,4 @@ async def _serve(
         raise lost[0]
     recording = service.recording()
     if recording.file:
-        voice.serves(f"recording {recording.file}: {recording.messages} messages")
+        voice.recorded(f"recording {recording.file}: {recording.messages} messages")

@@ -9,6 +9,7 @@ import sys
 import time
 import urllib.request
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -183,4 +184,49 @@ def test_nohup_keeps_a_service_from_ending_with_its_terminal() -> None:
         while updates() < before + 10:
             time.sleep(0.02)  # between two questions to another process
         process.send_signal(signal.SIGTERM)
+        assert process.wait(HANG_S) == 0
+
+
+@pytest.fixture
+def full_pipe() -> Iterator[int]:
+    """The writing side of a pipe that takes nothing more, since its reader is stopped."""
+    read, write = os.pipe()
+    os.set_blocking(write, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(write, bytes(4096))
+    os.set_blocking(write, True)
+    yield write
+    os.close(write)
+    os.close(read)
+
+
+def test_stopped_reader_of_the_status_stops_nothing(full_pipe: int) -> None:
+    """Ctrl-S on a terminal is the same."""
+    command = [BIN / "companion", "run", *CENTER, *LINK, *HTTP, "--json"]
+    with started(command, stdout=full_pipe, stderr=subprocess.PIPE) as process:
+        url = line_of(process, process.stderr).decode().split()[2]
+
+        def uptime_s() -> float:
+            with urllib.request.urlopen(f"{url}/v1/status", timeout=HANG_S) as answer:
+                return float(json.load(answer)["uptime_s"])
+
+        while uptime_s() < 3.0:  # two objects would have been printed
+            time.sleep(0.02)  # between two questions to another process
+        process.terminate()
+        assert process.wait(HANG_S) == 0
+
+
+def test_notices_without_a_reader_stop_nothing(full_pipe: int, cut_log: Path) -> None:
+    command = [BIN / "companion", "run", *CENTER, *LINK, *HTTP]
+    with started(command, stdout=subprocess.PIPE, stderr=full_pipe) as process:
+        line = line_of(process, process.stdout).decode()
+        play = [BIN / "sitl-replay", "play", cut_log, "--to", f"udpout:{line.split('udpin:')[1]}"]
+        subprocess.run(
+            [*map(str.strip, map(str, play)), "--speed", "5"],
+            check=True, timeout=HANG_S, capture_output=True,
+        )  # fmt: skip
+        with urllib.request.urlopen(f"{line.split()[2]}/v1/events", timeout=HANG_S) as answer:
+            assert len(json.load(answer)["events"]) > 4
+        process.terminate()
         assert process.wait(HANG_S) == 0

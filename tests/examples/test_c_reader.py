@@ -208,7 +208,6 @@ def test_file_that_is_not_a_ring_is_not_overwritten(tmp_path: Path) -> None:
     assert mine.read_text() == "years of work"
     with pytest.raises(UserError, match="No such file"):
         Ring(tmp_path / "nowhere" / "ring")
-    Ring(tmp_path / "ring")
-    second = Ring(tmp_path / "ring")  # the first was killed
+    ring = Ring(tmp_path / "ring")
     assert [path.name for path in tmp_path.iterdir() if path != mine] == ["ring"]
-    second.close()
+    ring.close()

@@ -17,7 +17,7 @@ from companion.node.ring import SLOT_BYTES, SLOTS, Ring
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.settings.outlets import RecordSettings
-from companion.values import Notice, Severity, Update
+from companion.values import Notice, Severity, Update, UserError
 
 
 def pushing(
@@ -102,10 +102,10 @@ def test_refused_udp_push_and_recovery_are_announced_once() -> None:
     push.close()
 
 
-def test_ring_of_a_running_service_is_not_deleted_for_another(small_disk: Path) -> None:
+def test_ring_of_a_running_service_is_not_replaced(small_disk: Path) -> None:
     path = small_disk / "ring"
     running = Ring(path)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(UserError, match="in use by another process"):
         Ring(path)
     assert list(small_disk.iterdir()) == [path]
     running.close()

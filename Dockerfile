@@ -46,7 +46,7 @@ VOLUME /recordings
 EXPOSE 8080/tcp 14550/udp
 # Readiness, not liveness: unhealthy without a carrier, or while beam updates are late.
 HEALTHCHECK --interval=10s --timeout=5s --start-period=15s --retries=3 \
-    CMD ["python", "-c", "import os; from urllib.request import Request, urlopen; urlopen(Request('http://127.0.0.1:8080/readyz', headers={'Authorization': 'Bearer ' + os.environ.get('COMPANION_TOKEN', '')}), timeout=4)"]
+    CMD ["python", "-c", "import os; from urllib.request import ProxyHandler, Request, build_opener; build_opener(ProxyHandler({})).open(Request('http://127.0.0.1:8080/readyz', headers={'Authorization': 'Bearer ' + os.environ.get('COMPANION_TOKEN', '').strip()}), timeout=4)"]
 ENTRYPOINT ["companion"]
 # In a container the service must listen on every address, hence --insecure. Publish the port on
 # 127.0.0.1, as docker-compose.yml does, or set a token instead.

@@ -34,6 +34,8 @@ from companion.values.numbers import NPY_ERRORS
 Json = dict[str, Any]
 
 SUBPROTOCOL: Final = "companion.v1"
+_DIRECT: Final = urllib.request.build_opener(urllib.request.ProxyHandler({}))
+"""Without the proxies of the environment: they reach no service here, and would get its token."""
 ANSWER_MAX: Final = 1 << 28  # longest answer, bytes; 4 million weights take a quarter of it
 PIECE_BYTES: Final = 1 << 16
 _READ_HEADER: Final = {
@@ -222,6 +224,7 @@ class Client:
                 max_size=None,
                 max_queue=1,
                 compression=None,
+                proxy=None,
             ) as websocket:
                 yield from websocket
         except ConnectionClosed as error:
@@ -238,7 +241,7 @@ class Client:
             headers["authorization"] = f"Bearer {self._token}"
         request = urllib.request.Request(self._url + address, data=body, headers=headers)
         try:
-            found: HTTPResponse = urllib.request.urlopen(request, timeout=self._timeout_s)
+            found: HTTPResponse = _DIRECT.open(request, timeout=self._timeout_s)
         except urllib.error.HTTPError as error:
             with error:
                 raise ServiceError(error.code, _title(error)) from error

@@ -114,7 +114,7 @@ WAYS: Final = (
         size=f"pieces of {kb(tcp.PIECE_BYTES)}",
         items=f"{tcp.CONNECTIONS_MAX} connections; {NEW}",
         work=OLDEST,
-        over="the sender waits",
+        over="the sender waits; the oldest connection without a frame makes room for another",
         test="tests/mavlink/links/test_transport.py::test_flood_over_a_connection_is_processed_in_pieces",
     ),
     WayIn(

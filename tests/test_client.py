@@ -70,6 +70,16 @@ def test_client_returns_the_service_responses(flying: Node) -> None:
     assert not np.allclose(now.matrix, later.matrix)
 
 
+def test_proxies_of_the_environment_get_no_token(
+    flying: Node, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
+    client = Client(flying.url, "a token that nobody else must get")
+    assert client.status()["version"]
+    with closing(client.stream(["1:1"], ["uavs"], rate_hz=50)) as stream:
+        next(stream)
+
+
 def test_stream_continues_until_closed(flying: Node) -> None:
     client = Client(flying.url)
     with closing(client.stream(["1:1"], ["uavs", "weights"], rate_hz=50)) as stream:

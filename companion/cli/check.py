@@ -1,7 +1,6 @@
 """The command ``companion check``: check the setup, and list what would prevent good beams."""
 
 import json
-import os
 from dataclasses import asdict
 from pathlib import Path
 
@@ -16,6 +15,7 @@ from companion.cli.console import (
     LISTEN,
     FiniteRange,
     Progress,
+    bearer_token,
     say,
 )
 from companion.values import UserError
@@ -64,7 +64,7 @@ def check(
         recording={"directory": record},
     )
     progress, found = Progress(), []
-    token = os.environ.get("COMPANION_TOKEN")
+    token = bearer_token()
     for finding in checking.check(
         settings, seconds, token=token, insecure=insecure, show=progress.show
     ):

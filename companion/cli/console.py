@@ -2,6 +2,7 @@
 
 import errno
 import math
+import os
 import shutil
 import sys
 import time
@@ -16,6 +17,7 @@ import click
 from companion.cli.interrupts import INTERRUPTED, command_ended, interrupts_raised
 from companion.values import UserError, printable, shown
 
+TOKEN: Final = "COMPANION_TOKEN"
 LOG_EVERY_S: Final = 10.0  # time between two progress lines without a terminal
 CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings file (TOML).")
 
@@ -75,6 +77,17 @@ LATENCY = click.option(
 def say(text: str, err: bool = False) -> None:
     """Print text that may come from a file or the network, with control characters escaped."""
     click.echo(printable(text), err=err)
+
+
+def bearer_token() -> str | None:
+    """Return the bearer token of the environment; a file of variables may add a line end to it.
+
+    Raises ``UserError`` if it is not one that HTTP can transmit.
+    """
+    token = os.environ.get(TOKEN, "").strip()
+    if not all(letter.isprintable() and ord(letter) < 256 for letter in token):
+        raise UserError(f"{TOKEN}: use ASCII letters, digits and signs")
+    return token or None
 
 
 def print_log_notices(logs: Sequence[Path]) -> None:

@@ -1,7 +1,6 @@
 """The command ``companion drive``: apply the beams of a running service to a device."""
 
 import json
-import os
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -9,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from companion.cli.console import CONFIG, SECONDS, FiniteRange, InterruptedByUser
+from companion.cli.console import CONFIG, SECONDS, FiniteRange, InterruptedByUser, bearer_token
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -96,7 +95,7 @@ def drive(
     device = targets.device(target, printer.line, codebook)
     if dry_run:
         device = targets.device(f"none:{device.takes}", click.echo, codebook)
-    client = Client(service, os.environ.get("COMPANION_TOKEN"))
+    client = Client(service, bearer_token())
     driven = Drive(
         source=HttpSource(
             client,

@@ -2,7 +2,6 @@
 
 import json
 import math
-import os
 import time
 from collections.abc import Sequence
 from http import HTTPStatus
@@ -11,7 +10,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import click
 
-from companion.cli.console import JSON_LINES, SECONDS, Progress, log_progress, print_truncated, say
+from companion.cli.console import (
+    JSON_LINES,
+    SECONDS,
+    Progress,
+    bearer_token,
+    log_progress,
+    print_truncated,
+    say,
+)
 from companion.values import UserError
 
 if TYPE_CHECKING:
@@ -42,7 +49,7 @@ def watch(url: str, seconds: float | None, as_json: bool) -> None:
     """
     from companion.client import Client, ServiceError
 
-    node = Client(url, os.environ.get("COMPANION_TOKEN"))
+    node = Client(url, bearer_token())
     ends_s = None if seconds is None else time.monotonic() + seconds
     answer = None
     while True:

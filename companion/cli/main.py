@@ -31,6 +31,7 @@ from companion.cli.console import (
     InterruptedByUser,
     OneLineErrors,
     Progress,
+    bearer_token,
     log_progress,
     print_log_notices,
     say,
@@ -108,7 +109,7 @@ def run(
         "server": {"listen": listen, "foxglove": foxglove},
         "recording": {"directory": record},
     }
-    voice, token = _output(as_json), os.environ.get("COMPANION_TOKEN")
+    voice, token = _output(as_json), bearer_token()
     settings, origins = layered(config, options)
     start.run(settings, voice, origins=origins, token=token, insecure=insecure)
 
@@ -247,7 +248,7 @@ def replay(
             ),
             own.server.listen,
             partial(_print_replay, as_json),
-            token=os.environ.get("COMPANION_TOKEN"),
+            token=bearer_token(),
             insecure=insecure,
         )
         return

@@ -35,9 +35,9 @@ from companion.recording.folders import folder_of
 from companion.recording.foxglove import LiveChannels
 from companion.recording.parts import Part
 from companion.recording.reader import LogError
-from companion.recording.recover import recover_leftovers
+from companion.recording.recover import holds_recording, recover_leftovers
 from companion.recording.scene import Scene
-from companion.recording.writer import Writer, holds_recording
+from companion.recording.writer import Writer
 from companion.server import area_map
 from companion.settings.files import embedded
 from companion.settings.model import Settings

@@ -347,6 +347,7 @@ class BackgroundRecorder:
         old = after_s is not None and time.monotonic() - self._begun_s >= after_s
         if self._writer.flushed and (large or old):
             self._writer.close({}, is_continued=True)
+            self.bytes = self._writer.size_bytes  # also if the next part cannot be opened
             self._open_next()
 
     def _open_next(self) -> None:

@@ -63,6 +63,21 @@ def recover(path: Path) -> Recovered:
         raise LogError(f"{path}: cannot be recovered: {error.strerror}") from None
 
 
+def holds_recording(wanted: Path) -> bool:
+    """Return whether a file is a finished recording, or the leftover of one, not to be replaced."""
+    active = wanted.with_name(wanted.name + ACTIVE)
+    return wanted.is_file() or (active.is_file() and not _is_in_use(active))
+
+
+def _is_in_use(active: Path) -> bool:
+    with active.open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
 def recover_leftovers(folder: Path) -> list[Recovered | LogError]:
     """Recover every ``*.mcap.active`` in a folder.
 

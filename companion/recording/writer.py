@@ -232,20 +232,6 @@ def _beside(final: Path) -> Path:
     return final.with_name(final.name + ACTIVE)
 
 
-def holds_recording(wanted: Path) -> bool:
-    """Return whether a file is a finished recording, or the leftover of one, not to be replaced."""
-    return wanted.is_file() or (_beside(wanted).is_file() and not _is_in_use(_beside(wanted)))
-
-
-def _is_in_use(active: Path) -> bool:
-    with active.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
-
-
 def free_name(wanted: Path) -> Path:
     """Return ``x.mcap``, or the first of ``x-1.mcap``, ``x-2.mcap`` … that does not exist."""
     candidate, number = wanted, 0

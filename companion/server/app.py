@@ -96,7 +96,11 @@ def create_app(
         if not described:  # built once: it takes most of a second of interpreter time
             making = in_thread(lambda: encode(app.openapi()))
             described.append(asyncio.create_task(making))
-        return json_response(await asyncio.shield(described[0]))
+        try:
+            return json_response(await asyncio.shield(described[0]))
+        except RuntimeError:  # no thread can be started at present
+            described.clear()
+            raise
 
     @app.get("/docs", include_in_schema=False)
     async def docs(request: Request) -> Response:

@@ -78,6 +78,7 @@ def _shown(entry: os.DirEntry[str], current: Current) -> Json:
     is_current = entry.name == current.name
     state = "unfinished" if entry.name.endswith(ACTIVE) else "finished"
     started = _STARTED.match(entry.name)
+    started_ns = _utc_ns(started[1]) if started else None
     try:
         size: int | None = (
             current.bytes if is_current else entry.stat(follow_symlinks=False).st_size
@@ -88,12 +89,16 @@ def _shown(entry: os.DirEntry[str], current: Current) -> Json:
         "name": entry.name,
         "bytes": size,
         "state": "recording" if is_current else state,
-        "started": rfc3339(_utc_ns(started[1])) if started else None,
+        "started": None if started_ns is None else rfc3339(started_ns),
     }
 
 
-def _utc_ns(text: str) -> UtcNs:
-    at = datetime.strptime(text, "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+def _utc_ns(text: str) -> UtcNs | None:
+    """Return the time in a file's name; None if it is none, such as the 99th of a month."""
+    try:
+        at = datetime.strptime(text, "%Y%m%dT%H%M%SZ").replace(tzinfo=UTC)
+    except ValueError:
+        return None
     return UtcNs(int(at.timestamp()) * 1_000_000_000)
 
 

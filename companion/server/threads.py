@@ -33,16 +33,23 @@ class Threads:
         """Call a function on one of the threads, in the order of submission."""
         future = Future[T]()
         with self._lock:
+            if self._free <= 0 and self._started < self._most:
+                self._start()
             self._free -= 1
-            starts = self._free < 0 and self._started < self._most
-            if starts:
-                self._started += 1
-                self._free += 1
         self._calls.put((future, work))
-        if starts:
-            name = f"{self._name}_{self._started}"
-            threading.Thread(target=self._serve, name=name, daemon=True).start()
         return future
+
+    def _start(self) -> None:
+        """Start a thread; without one, others do its work. ``RuntimeError`` if there is none."""
+        name = f"{self._name}_{self._started + 1}"
+        try:
+            threading.Thread(target=self._serve, name=name, daemon=True).start()
+        except RuntimeError:  # the system allows no more threads now
+            if not self._started:
+                raise
+        else:
+            self._started += 1
+            self._free += 1
 
     def _serve(self) -> None:
         while True:

@@ -11,6 +11,9 @@ from typing import Any
 import pytest
 from support import BIN, HANG_S, line_of, started
 
+from companion.cli.console import bearer_token
+from companion.values import UserError
+
 DEMO = [BIN / "companion", "demo", "--port", "0"]
 
 
@@ -56,3 +59,20 @@ def test_terminal_status_line_fits_80_columns(tmp_path: Path) -> None:
         os.close(ours)
     lines = shown.decode().split("\r")
     assert max(len(line.removeprefix("\x1b[K")) for line in lines if "links up" in line) < 80
+
+
+@pytest.mark.parametrize(
+    "token", ["line\nof_a_long_enough_token", "beyond_latin_\u0142_and_long_enough"]
+)
+def test_token_that_http_cannot_transmit_is_an_error(
+    token: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COMPANION_TOKEN", token)
+    with pytest.raises(UserError, match="ASCII letters"):
+        bearer_token()
+
+
+def test_line_end_after_a_token_is_none_of_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As from a file of variables with the line ends of Windows."""
+    monkeypatch.setenv("COMPANION_TOKEN", "sixteen_letters_x\r\n")
+    assert bearer_token() == "sixteen_letters_x"

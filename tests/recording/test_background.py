@@ -653,6 +653,23 @@ def test_size_is_that_of_the_newest_part(tmp_path: Path) -> None:
     assert 0 < size < parts_of(tmp_path)[0].stat().st_size / 2
 
 
+def test_finished_part_is_served_whole_while_the_next_cannot_be_opened(tmp_path: Path) -> None:
+    made = recorder(tmp_path, Rotation(1.0, None))
+    open_part = made._open_part
+
+    def full(part: Part) -> Writer:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    made._open_part = full
+    made.start()
+    hand_over(made, ticks(0, 2000))
+    wait_until(lambda: made.failure is not None)
+    (part,) = tmp_path.iterdir()
+    assert made.file == part.name and made.bytes == part.stat().st_size
+    made._open_part = open_part
+    made.stop({})
+
+
 def test_latest_utc_offset_counts_in_any_order_of_the_parts(tmp_path: Path) -> None:
     made = recorder(tmp_path, Rotation(1.0, None))
     made.start()

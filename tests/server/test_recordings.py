@@ -67,6 +67,14 @@ def test_only_recordings_are_listed(client: TestClient) -> None:
     ]
 
 
+def test_time_in_a_name_may_be_none(make_node: Any, tmp_path: Path) -> None:
+    (tmp_path / "companion-20261399T000000Z.mcap").write_bytes(b"")
+    node = make_node(flown=False, recording={"directory": str(tmp_path)})
+    with TestClient(create_app(node)) as client:
+        (listed,) = client.get("/v1/recordings").json()["recordings"]
+    assert listed["started"] is None
+
+
 def test_recording_is_downloaded_completely(client: TestClient) -> None:
     answer = client.get(f"/v1/recordings/{FINISHED}")
     assert answer.content == BYTES

@@ -43,6 +43,31 @@ def test_results_and_errors_reach_the_caller() -> None:
     run_async(check())
 
 
+def test_shortage_of_threads_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A limit of processes: what cannot be computed then can be afterwards."""
+
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    async def check() -> None:
+        threads = Threads(2, "test")
+        with monkeypatch.context() as patch:
+            patch.setattr(threading.Thread, "start", refuse)
+            for _ in range(3):
+                with pytest.raises(RuntimeError, match="new thread"):
+                    threads.submit(lambda: None)
+        assert await asyncio.wrap_future(threads.submit(lambda: 3)) == 3
+        gate = threading.Event()
+        held = asyncio.wrap_future(threads.submit(lambda: gate.wait(HANG_S)))
+        with monkeypatch.context() as patch:
+            patch.setattr(threading.Thread, "start", refuse)
+            later = asyncio.wrap_future(threads.submit(lambda: 4))
+        gate.set()
+        assert await later == 4 and await held
+
+    run_async(check())
+
+
 def test_calls_wait_for_a_free_thread() -> None:
     """Threads are started as needed, and used again."""
 

@@ -29,8 +29,8 @@ SET_PITCHYAW: Final = 287
 ATTITUDE_STATUS: Final = 285
 IN_EARTH_FRAME: Final = 4 | 8 | 16 | 64
 """GIMBAL_MANAGER_FLAGS of a command: roll, pitch and yaw locked, and yaw from north."""
-YAW_FROM_NORTH: Final = 16 | 64
-"""GIMBAL_DEVICE_FLAGS that show that an attitude's yaw is from north: either one."""
+YAW_LOCKED, YAW_FROM_VEHICLE, YAW_FROM_NORTH = 16, 32, 64
+"""GIMBAL_DEVICE_FLAGS. Without either frame, as in older gimbals, a locked yaw is from north."""
 ONBOARD_COMPUTER: Final = 191
 RECEIVED_MAX: Final = 1000  # datagrams read in one update; more are a failure of the gimbal
 REPORTER_SILENT_NS: Final = 2_000_000_000
@@ -155,7 +155,8 @@ class Gimbal(Device):
             self.rejected[Reason.MALFORMED] += 1
             return
         yaw_rad = math.atan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)
-        if flags & YAW_FROM_NORTH and self._is_followed(frame):
+        is_locked = flags & (YAW_LOCKED | YAW_FROM_VEHICLE) == YAW_LOCKED
+        if (is_locked or flags & YAW_FROM_NORTH) and self._is_followed(frame):
             self._seen_rad = _near(yaw_rad, self._seen_rad)
             self._lag.note_report(frame.t_ns, self._seen_rad)
 

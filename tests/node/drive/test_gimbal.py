@@ -88,11 +88,11 @@ def test_gimbal_receives_positions_when_configured(heard: socket.socket) -> None
 
 
 @pytest.mark.parametrize(
-    ("from_north", "sysid", "length"),
-    [(True, 7, 1.0), (False, 7, 1.0), (True, 8, 1.0), (True, 7, 1.09)],
+    ("flags", "sysid", "length"),
+    [(16, 7, 1.0), (64, 7, 1.0), (32, 7, 1.0), (16 | 32, 7, 1.0), (16, 8, 1.0), (16, 7, 1.09)],
 )
 def test_gimbal_lag_is_estimated_from_its_attitude(
-    heard: socket.socket, from_north: bool, sysid: int, length: float
+    heard: socket.socket, flags: int, sysid: int, length: float
 ) -> None:
     """Across north, where angles wrap; attitudes relative to the vehicle, of another vehicle's
     gimbal or of a second one are ignored. Quaternions need not have the length 1."""
@@ -107,7 +107,7 @@ def test_gimbal_lag_is_estimated_from_its_attitude(
     mav = dialect.MAVLink(None, srcSystem=sysid, srcComponent=154)
     second = dialect.MAVLink(None, srcSystem=7, srcComponent=155)
     aside = second.gimbal_device_attitude_status_encode(0, 0, 0, 16, [0, 0, 0, 1], 0, 0, 0, 0)
-    flags = dialect.GIMBAL_DEVICE_FLAGS_YAW_LOCK if from_north else 32
+    from_north = not flags & dialect.GIMBAL_DEVICE_FLAGS_YAW_IN_VEHICLE_FRAME
     for n in range(150):
         t_s = 0.1 * n
         clock[0] = round(t_s * 1e9)

@@ -130,7 +130,7 @@ class KnownHosts:
 
     def __init__(self, app: ASGIApp, names: Collection[str] = ()) -> None:
         self._app = app
-        self._names = _own_names() | {name.lower() for name in names}
+        self._names = _own_names() | {_host_name(name) for name in names}
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "lifespan" or self._are_known(Headers(scope=scope).getlist("host")):

@@ -297,6 +297,8 @@ class KnownPeers:
         ]
         now_ns, kept_ns = frame.t_ns, BROUGHT_NS[frame.msgid]
         recent = [(one, same) for one, same in earlier if now_ns - same.t_ns <= kept_ns]
+        if not recent and frame.msgid == GPS_RAW_INT and _current_earlier(sender, known, now_ns):
+            return BROUGHT  # it can lower a bound, which positions that agree do not justify
         if not recent or any(same.payload == frame.payload for _, same in recent):
             return None
         if frame.msgid not in STAMPED:

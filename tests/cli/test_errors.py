@@ -17,7 +17,6 @@ from support import BIN, HANG_S, ROOT, started
 from companion.cli import console, voice
 from companion.cli.console import OneLineErrors
 from companion.cli.main import main
-from companion.node import served_replay
 from companion.values import UserError
 
 
@@ -65,12 +64,15 @@ def test_user_error_is_one_line(what: str, status: int, said: str) -> None:
     assert (done.exit_code, done.stderr) == (status, said)
 
 
-def test_terminal_control_characters_are_stripped(capsys: pytest.CaptureFixture[str]) -> None:
+def test_terminal_control_characters_are_stripped(capfd: pytest.CaptureFixture[str]) -> None:
     """Line breaks and letters of any script are kept."""
-    for say in (console.say, voice.Lines().say, voice.JsonLines().say, served_replay._say):
+    lines, objects = voice.Lines(), voice.JsonLines()
+    for say in (console.say, lines.say, objects.say):
         say("ü 王\n\x1b[2J\x1b]0;pwned\x07\r\b\x9b")  # as a reason or a name
-    said = capsys.readouterr()
-    assert said.out + said.err == 4 * "ü 王\n[2J]0;pwned\n"
+    lines.finish()
+    objects.finish()
+    said = capfd.readouterr()
+    assert said.out + said.err == 3 * "ü 王\n[2J]0;pwned\n"
 
 
 @pytest.mark.parametrize("made_of_it", ["pass", "raise RuntimeError('no class')", "raise"])

@@ -4,9 +4,12 @@ import contextlib
 import itertools
 import json
 import math
+import os
 import socket
 import socketserver
 import struct
+import subprocess
+import sys
 import threading
 import tracemalloc
 from collections.abc import Iterator
@@ -70,14 +73,17 @@ def test_client_returns_the_service_responses(flying: Node) -> None:
     assert not np.allclose(now.matrix, later.matrix)
 
 
-def test_proxies_of_the_environment_get_no_token(
-    flying: Node, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("http_proxy", "http://127.0.0.1:9")
-    client = Client(flying.url, "a token that nobody else must get")
-    assert client.status()["version"]
-    with closing(client.stream(["1:1"], ["uavs"], rate_hz=50)) as stream:
-        next(stream)
+def test_proxies_of_the_environment_get_no_token(flying: Node) -> None:
+    code = (
+        "import sys\n"
+        "from companion.client import Client\n"
+        "client = Client(sys.argv[1], 'a token that nobody else must get')\n"
+        "client.status()\n"
+        "next(client.stream(['1:1'], ['uavs'], rate_hz=50))\n"
+    )
+    proxied = os.environ | {"http_proxy": "http://127.0.0.1:9", "no_proxy": ""}
+    command = [sys.executable, "-c", code, flying.url]
+    subprocess.run(command, check=True, timeout=HANG_S, env=proxied)
 
 
 def test_stream_continues_until_closed(flying: Node) -> None:

@@ -62,6 +62,7 @@ def test_shortage_of_threads_ends(monkeypatch: pytest.MonkeyPatch) -> None:
         with monkeypatch.context() as patch:
             patch.setattr(threading.Thread, "start", refuse)
             later = asyncio.wrap_future(threads.submit(lambda: 4))
+        assert threads._started == 1
         gate.set()
         assert await later == 4 and await held
 

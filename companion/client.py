@@ -109,7 +109,7 @@ class Client:
         if not _is_address(url):
             raise UserError(f"{shown(url)} is not http://HOST:PORT")
         self._url = url.rstrip("/")
-        self._token = token
+        self._token = None if token is None else token.strip()  # a file may add a line end
         self._timeout_s = timeout_s
 
     def fleet(self) -> Json:

@@ -8,7 +8,6 @@ import contextlib
 import itertools
 import json
 import math
-import os
 import sys
 from collections.abc import Callable, Coroutine, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -17,7 +16,7 @@ from typing import Any
 import click
 
 from companion import __version__
-from companion.cli.console import OneLineErrors, print_truncated
+from companion.cli.console import OneLineErrors, bearer_token, print_truncated
 from companion.mavlink.links.regular_file import open_regular
 from companion.mavlink.links.urls import MAVLINK, LinkUrl, parse_link
 from companion.node.signals import ENDS, interrupts_held, release_interrupts
@@ -257,7 +256,7 @@ def _plan(url: str, model: ReceiverModel, token: Path | None) -> ReceiverPlan:
         raise click.BadParameter(f"{token}: {error.strerror}", param_hint="'--token'") from error
     except UnicodeDecodeError as error:
         raise click.BadParameter(f"{token}: not UTF-8 text", param_hint="'--token'") from error
-    found = os.environ.get("COMPANION_TOKEN") if given is None else given
+    found = bearer_token() if given is None else given
     return ReceiverPlan(url=url, token=found, model=model)
 
 

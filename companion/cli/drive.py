@@ -91,7 +91,7 @@ def drive(
         stored.extend(stored_registers(array, assembly.equipment(settings, array)))
         return stored
 
-    printer, objects = Printer(STDERR), Printer(STDOUT)
+    printer, objects = Printer(STDERR), Printer(STDOUT, are_data=as_json)
     device = targets.device(target, printer.line, codebook)
     if dry_run:
         device = targets.device(f"none:{device.takes}", click.echo, codebook)
@@ -121,11 +121,12 @@ def drive(
 
     try:
         interrupted = running.run_until_stopped(driven, show, seconds)
+        final_status = driven.status()
+        (printer if as_json else objects).line(_text(final_status))
     finally:
         objects.finish()
         printer.finish()
-    final_status = driven.status()
-    click.echo(_text(final_status), err=as_json)
+    objects.require_reader()
     if not final_status.applied and interrupted:
         raise InterruptedByUser("interrupted; nothing was applied")
     if not final_status.applied:

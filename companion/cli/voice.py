@@ -48,7 +48,8 @@ class JsonLines:
     def __init__(self) -> None:
         self._seen_ns = 0
         self._printer = Printer(STDERR)
-        self._objects = Printer(STDOUT)
+        self._objects = Printer(STDOUT, are_data=True)
+        self._is_slow = False  # whether some objects found no room
 
     def say(self, text: str) -> None:
         """Print a line for the operator on stderr."""
@@ -57,8 +58,14 @@ class JsonLines:
     serves = recorded = say
 
     def show(self, service: Service) -> None:
-        """Print the status as a JSON object. Raises ``OSError`` if that is no longer possible."""
+        """Print the status as a JSON object. Raises ``OSError`` if that is no longer possible.
+
+        If nobody reads them, objects are dropped, which is said on stderr.
+        """
         self._objects.require_reader()
+        if self._objects.dropped and not self._is_slow:
+            self._is_slow = True
+            self._printer.line("some status objects are not printed: nobody reads them")
         fresh = [notice for notice in service.events() if notice.t_ns > self._seen_ns]
         self._seen_ns = max([self._seen_ns, *(notice.t_ns for notice in fresh)])
         found = glance.glance(service) | {"events": glance.as_events(service, fresh)}

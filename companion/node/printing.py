@@ -24,25 +24,30 @@ class Printer:
     """Writer of lines to a file descriptor, and of a status line below them on a terminal.
 
     ``require_reader`` raises the error that ended it; what is printed later is discarded.
+    ``dropped`` counts lines that found no room. They are reported once there is room again, unless
+    the lines ``are_data`` for a program.
     """
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, *, are_data: bool = False) -> None:
+        self.dropped = 0
+        self._are_data = are_data
         self._failure: OSError | None = None
         self._descriptor = descriptor
         self._is_terminal = os.isatty(descriptor)
         self._lines = deque[str]()
-        self._waiting = self._dropped = 0
+        self._waiting = 0  # characters of these lines
+        self._reported = 0  # dropped lines that were reported
         self._status: str | None = None
         self._is_idle = True
         self._changed = threading.Condition()
         threading.Thread(target=self._run, name="printer", daemon=True).start()
 
     def line(self, text: str) -> None:
-        """Print a line, with control characters escaped."""
+        """Print a line, without the control characters in it."""
         text = f"{CLEAR if self._is_terminal else ''}{printable(text)}\n"
         with self._changed:
             if self._waiting + len(text) > WAITING_MAX:
-                self._dropped += 1
+                self.dropped += 1
                 return
             self._lines.append(text)
             self._waiting += len(text)
@@ -73,7 +78,7 @@ class Printer:
         while True:
             data = self._next().encode()
             try:
-                while data:
+                while data and self._failure is None:
                     data = data[os.write(self._descriptor, data) :]
             except OSError as error:
                 self._failure = error
@@ -85,18 +90,18 @@ class Printer:
             self._changed.notify_all()
             self._changed.wait_for(lambda: self._lines or self._status is not None)
             self._is_idle = False
-            taken = list[str]()
-            while self._lines and (not taken or self._waiting_in(taken) < AT_ONCE):
-                taken.append(self._lines.popleft())
-            self._waiting -= self._waiting_in(taken)
-            if self._dropped and not self._lines:
-                taken.append(f"{self._dropped} lines were not printed: nobody read them\n")
-                self._dropped = 0
-            if self._status is not None and not self._lines:
-                taken.append(self._status)
+            taken = ""
+            while self._lines and len(taken) < AT_ONCE:
+                taken += self._lines.popleft()
+            self._waiting -= len(taken)
+            if not self._lines:
+                taken += self._lost() + (self._status or "")
                 self._status = None
-            return "" if self._failure else "".join(taken)
+            return taken
 
-    @staticmethod
-    def _waiting_in(taken: list[str]) -> int:
-        return sum(map(len, taken))
+    def _lost(self) -> str:
+        """Return a line about those that were dropped since the last one; empty without any."""
+        lost, self._reported = self.dropped - self._reported, self.dropped
+        if not lost or self._are_data:
+            return ""
+        return f"{lost} lines were not printed: nobody read them\n"

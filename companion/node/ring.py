@@ -17,7 +17,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.mavlink.links.regular_file import open_regular
+from companion.mavlink.links.regular_file import is_locked, open_regular
 from companion.recording.folders import DISK_FAULTS
 from companion.values import UserError
 
@@ -38,18 +38,14 @@ def _require_free(path: Path) -> None:
         with open_regular(path) as file:
             if file.read(len(MAGIC)) != MAGIC:
                 raise UserError(f"{path} exists and is not a ring of records; choose another name")
-            try:
-                fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-            except BlockingIOError:
-                raise UserError(
-                    f"{path} is in use by another process; choose another name"
-                ) from None
+            if is_locked(file):
+                raise UserError(f"{path} is in use by another process; choose another name")
 
 
 def _allocate(fd: int, size: int, replaced: Path) -> None:
-    """Allocate all of a file; delete the ring that it replaces if there is no room for both.
+    """Allocate all of a file. If there is no room beside the ring that it replaces, delete that.
 
-    That is of a service that was killed.
+    Its service was killed.
     """
     try:
         os.posix_fallocate(fd, 0, size)
@@ -82,12 +78,10 @@ class Ring:
             try:
                 fcntl.flock(fd, fcntl.LOCK_EX)
                 _allocate(fd, size, path)
-                self._map = mmap.mmap(fd, size)
+                self._map = mmap.mmap(fd, size)  # its copy of the descriptor keeps the lock
                 self._identity = os.fstat(fd).st_ino
-            except OSError:
+            finally:
                 os.close(fd)
-                raise
-            self._fd = fd  # holds the lock, which ends with the process
             self._words = np.frombuffer(self._map, dtype="<u8")  # stores of 8 bytes are atomic
             self._halves = np.frombuffer(self._map, dtype="<u4")
             self._halves[2:6] = VERSION, SLOTS, SLOT_BYTES, LIVE
@@ -117,7 +111,6 @@ class Ring:
         self._halves[5] = 0
         del self._words, self._halves
         self._map.close()
-        os.close(self._fd)
         with contextlib.suppress(OSError):
             if self._path.stat().st_ino == self._identity:
                 self._path.unlink()

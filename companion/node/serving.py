@@ -16,6 +16,7 @@ from typing import Any, Final, TypeVar
 import uvicorn
 
 from companion.mavlink.links.descriptors import raise_limit
+from companion.node.printing import STDERR, Printer
 from companion.node.signals import ENDS, interrupts_held, release_interrupts
 from companion.server.app import create_app
 from companion.server.connections import BoundedProtocol
@@ -154,6 +155,7 @@ async def saved_at_end(
         _waits_for_disk.set()
         say(f"waiting for the disk to take {what}; a signal ends the service at once")
         _, unfinished = await asyncio.wait([saving], timeout=most_s)
+        _waits_for_disk.clear()
     if unfinished:
         saving.cancel()
         return False
@@ -184,8 +186,9 @@ async def _stopped_by_signal(
 
     def stop(number: int) -> None:
         if _waits_for_disk.is_set():
-            said = "companion: ended by a signal, without waiting for the disk"
-            print(said, file=sys.stderr, flush=True)
+            last = Printer(STDERR)
+            last.line("companion: ended by a signal, without waiting for the disk")
+            last.finish()
             os._exit(1)
         received.append(number)
         until.set()

@@ -193,13 +193,13 @@ class ComponentState:
 
     heard_ns: int = 0  # arrival of the newest of these messages
     types: dict[tuple[int, int], int] = field(default_factory=dict)
-    """Types and autopilots of its heartbeats, with the arrival of the newest of each."""
+    """Types and autopilots of its heartbeats, the newest last, with their newest arrivals."""
     receiver: GnssStatus | None = None  # its newest GNSS status
     stated_us: int = 0
     noise: StatedNoise  # of its reports, by these statuses
     apart_m2: float | None = None
 
-    def is_of_type(self, newest: tuple[int, int], t_ns: int) -> None:
+    def note_type(self, newest: tuple[int, int], t_ns: int) -> None:
         """Note the type and autopilot of a heartbeat; forget those of long ago."""
         self.types.pop(newest, None)
         since_ns = t_ns - TYPE_KEPT_NS
@@ -302,7 +302,7 @@ class Senders:
                 return NO_OUTCOME if change is None else FrameOutcome(change=change)
             case Presence():
                 component = self._component(message)
-                component.is_of_type((message.mav_type, message.autopilot), message.t_ns)
+                component.note_type((message.mav_type, message.autopilot), message.t_ns)
         return NO_OUTCOME
 
     def _component(self, message: GnssStatus | Presence) -> ComponentState:

@@ -14,7 +14,7 @@ from typing import Final
 
 from mcap.records import Attachment, Metadata
 
-from companion.mavlink.links.regular_file import NotRegularError, open_regular
+from companion.mavlink.links.regular_file import NotRegularError, is_locked, open_regular
 from companion.recording.container import MAGIC, Content, Damage, Message, Walk
 from companion.recording.mcap_file import McapFile
 from companion.recording.reader import LogError
@@ -66,16 +66,10 @@ def recover(path: Path) -> Recovered:
 def holds_recording(wanted: Path) -> bool:
     """Return whether a file is a finished recording, or the leftover of one, not to be replaced."""
     active = wanted.with_name(wanted.name + ACTIVE)
-    return wanted.is_file() or (active.is_file() and not _is_in_use(active))
-
-
-def _is_in_use(active: Path) -> bool:
+    if not active.is_file():
+        return wanted.is_file()
     with active.open("rb") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
-    return False
+        return wanted.is_file() or not is_locked(file)
 
 
 def recover_leftovers(folder: Path) -> list[Recovered | LogError]:

@@ -110,10 +110,8 @@ class Writer:
         self._encoder = Encoder(self._topics.add, weights_hz, scene)
         try:
             at_ns = max(0, started_ns)
-            for name, data in {
-                **files,
-                SETTINGS: settings_toml.encode(errors="backslashreplace"),
-            }.items():
+            settings = settings_toml.encode(errors="replace")  # names need not be UTF-8
+            for name, data in {**files, SETTINGS: settings}.items():
                 self._mcap.attachment(at_ns, at_ns, name, MEDIA_TYPES[Path(name).suffix], data)
             self._write_head(versions, part)
         except OSError:

@@ -40,11 +40,14 @@ class Threads:
         return future
 
     def _start(self) -> None:
-        """Start a thread; without one, others do its work. ``RuntimeError`` if there is none."""
+        """Start a thread. If the system allows no more, those that run do its work.
+
+        Raises ``RuntimeError`` if none runs.
+        """
         name = f"{self._name}_{self._started + 1}"
         try:
             threading.Thread(target=self._serve, name=name, daemon=True).start()
-        except RuntimeError:  # the system allows no more threads now
+        except RuntimeError:
             if not self._started:
                 raise
         else:

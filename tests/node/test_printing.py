@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from contextlib import suppress
 
 import pytest
 
@@ -43,6 +44,22 @@ def test_lines_that_nobody_reads_are_dropped_and_counted(
     assert set(lines[:-1]) == {line}
     assert lines[-1] == f"{30_000 - len(lines[:-1])} lines were not printed: nobody read them"
     assert len(said) < 2 * printing.WAITING_MAX
+
+
+def test_nothing_is_printed_between_data_for_a_program(
+    pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(printing, "WAITING_MAX", 1000)
+    read, write = pipe
+    printer = Printer(write, are_data=True)
+    for _ in range(30_000):
+        printer.line("{}" + " " * 97)
+    os.set_blocking(read, False)
+    said = b""
+    while printer._waiting or not printer._is_idle:
+        with suppress(BlockingIOError):
+            said += os.read(read, 1 << 20)
+    assert printer.dropped and {line.strip() for line in said.splitlines()} == {b"{}"}
 
 
 def test_end_of_the_reader_is_an_error_for_who_needs_one(pipe: tuple[int, int]) -> None:

@@ -3,6 +3,7 @@
 import io
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -20,7 +21,7 @@ from support import BIN, HANG_S, read_metadata, started
 from companion.beams.hardware.calibration import Calibration
 from companion.beams.hardware.devices import Beamformer
 from companion.mavlink.wire.decode import decode
-from companion.recording.reader import read_log
+from companion.recording.reader import read_log, read_settings
 from companion.values import Frame, Report, WeightFormat
 
 RUN = ("run", "--link", "udpin:127.0.0.1:0", "--listen", "127.0.0.1:0", "--center", "5:1")
@@ -307,3 +308,11 @@ def test_restart_replaces_no_recording_of_the_same_name(tmp_path: Path, start_no
         assert again.stop()[0] == 0
     assert wanted.stat().st_size > left / 2
     assert len(list(tmp_path.glob("companion-*.mcap"))) == 2
+
+
+def test_folder_whose_name_is_not_utf_8_is_recorded_to(tmp_path: Path, start_node: Any) -> None:
+    folder = tmp_path / os.fsdecode(b"fl\xfcge")
+    node = start_node(*RUN, "--record", str(folder))
+    assert node.stop()[0] == 0
+    (recording,) = folder.iterdir()
+    assert "[recording]" in read_settings(recording).text

@@ -1,6 +1,7 @@
 """Reading and replacing of files that users, settings or other files name."""
 
 import errno
+import fcntl
 import os
 import stat
 from contextlib import suppress
@@ -25,6 +26,16 @@ def open_regular(path: Path, *, follow_links: bool = True) -> BinaryIO:
     if stat.S_ISDIR(mode):
         raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
     raise NotRegularError(errno.EINVAL, "not a file", str(path))
+
+
+def is_locked(file: BinaryIO) -> bool:
+    """Return whether another process has locked a file, as it does while it writes it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return True
+    fcntl.flock(file, fcntl.LOCK_UN)
+    return False
 
 
 def replace_file(path: Path, data: bytes, *, mode: int | None = None) -> None:

@@ -8,7 +8,8 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 * when its positions have agreed with those of the current known peers for ``PROBATION_NS`` and in
   ``AGREEMENTS`` comparisons; each contradiction doubles that time,
 * at once if no known peer is current, since they are silent or their connections have ended: a
-  vehicle whose radio restarted has another address (with another clock, ``REBOOT_NS`` later),
+  vehicle whose radio restarted has another address (with another clock, ``REBOOT_NS`` later; not if
+  it contradicted them shortly before their connections ended),
 * with its positions if no current known peer has brought any for ``NO_POSITION_NS``: a vehicle may
   send positions over one radio, attitudes over another. Known peers whose stamps are of another
   clock become strangers then,
@@ -17,11 +18,12 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
 again; its positions are used only as far as they agree with those of the other. Its attitudes and
 what else moves a bound are used only where the other has not brought the same message shortly
-before: positions that agree prove nothing about these. If the other has become late, by its own
-stamps, newer attitudes are used, but none newer than it could ever deliver. Its stamps are used
-only if they are of the other's clock: a clock of its own would look like a restart, or like a
-second vehicle. So the vehicle that was here first stays believed, and a stranger costs it nothing;
-whoever sends first in a vehicle's name is believed until it falls silent.
+before: positions that agree prove nothing about these. While the other is current, accuracies in
+GPS_RAW_INT are not used at all, and attitudes that contradict those of the other are announced. If
+the other has become late, by its own stamps, newer attitudes are used, but none newer than it could
+ever deliver. Stamps are used only if they are of the other's clock: another clock would look like a
+restart, or like a second vehicle. So the vehicle that was here first stays believed, and a stranger
+costs it nothing; whoever sends first in a vehicle's name is believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
@@ -132,7 +134,7 @@ class _Peer:
         return not self.has_left and self.is_recent(now_ns)
 
     def is_recent(self, now_ns: int) -> bool:
-        """Return the same, whether its connection has ended or not."""
+        """Return whether the newest message is so new, even if the connection has ended since."""
         least_ns, most_ns = CURRENT_NS
         interval_ns = (self.heard_ns - self.since_ns) / self.messages
         return now_ns - self.heard_ns <= min(

@@ -29,7 +29,9 @@ SET_PITCHYAW: Final = 287
 ATTITUDE_STATUS: Final = 285
 IN_EARTH_FRAME: Final = 4 | 8 | 16 | 64
 """GIMBAL_MANAGER_FLAGS of a command: roll, pitch and yaw locked, and yaw from north."""
-YAW_LOCKED, YAW_FROM_VEHICLE, YAW_FROM_NORTH = 16, 32, 64
+YAW_LOCKED: Final = 16
+YAW_FROM_VEHICLE: Final = 32
+YAW_FROM_NORTH: Final = 64
 """GIMBAL_DEVICE_FLAGS. Without either frame, as in older gimbals, a locked yaw is from north."""
 ONBOARD_COMPUTER: Final = 191
 RECEIVED_MAX: Final = 1000  # datagrams read in one update; more are a failure of the gimbal

@@ -75,6 +75,11 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
             self.transport.close()
             self._abort_later()
 
+    def send_500_response(self) -> None:
+        """Answer a handshake that fails; once, also if its request ends after the service."""
+        if not self.conn.eof_sent:
+            super().send_500_response()
+
     def _refuse(self) -> None:
         """Close the connection of a client that sends too much, without reading on."""
         if self.handshake_complete and not self.close_sent:

@@ -11,11 +11,13 @@ from socket import SO_RCVBUF, SOL_SOCKET
 from typing import Any
 
 import pytest
+import uvicorn
 import uvloop
 import websockets
 from http_support import Client, asked, connected, ends, served
 from starlette.testclient import TestClient
 from support import HANG_S, run_async
+from uvicorn.server import ServerState
 
 from companion.node import serving
 from companion.server import (
@@ -469,6 +471,44 @@ def test_handshake_that_is_none_leaves_no_connection(
                 await asyncio.wait_for(reader.read(), HANG_S)
 
     run_async(ended(), loop)
+
+
+def test_handshake_that_waits_at_the_end_of_the_service_is_answered_once() -> None:
+    """Its request fails afterwards: websockets refuses to answer again."""
+
+    over = asyncio.Event()
+
+    async def unanswered(scope: Any, receive: Any, send: Any) -> None:
+        await over.wait()
+
+    made = list[websocket_connections.BoundedWebSocket]()
+
+    def protocol() -> websocket_connections.BoundedWebSocket:
+        config = uvicorn.Config(unanswered, interface="asgi3")
+        made.append(
+            websocket_connections.BoundedWebSocket(
+                config=config, server_state=ServerState(), app_state={}
+            )
+        )
+        return made[0]
+
+    async def ended() -> bytes:
+        server = await asyncio.get_running_loop().create_server(protocol, "127.0.0.1", 0)
+        reader, writer = await asyncio.open_connection(
+            "127.0.0.1", server.sockets[0].getsockname()[1]
+        )
+        writer.write(UPGRADE)
+        while not (made and made[0].handshake_initiated):
+            await asyncio.sleep(0)
+        made[0].shutdown()
+        over.set()
+        await asyncio.gather(*made[0].tasks)
+        server.close()
+        answers = await reader.read()
+        writer.close()
+        return answers
+
+    assert run_async(ended()).count(b"HTTP/1.1 500") == 1
 
 
 def test_message_to_a_client_closed_while_it_did_not_read_is_no_error() -> None:

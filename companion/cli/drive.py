@@ -94,7 +94,7 @@ def drive(
     printer, objects = Printer(STDERR), Printer(STDOUT, are_data=as_json)
     device = targets.device(target, printer.line, codebook)
     if dry_run:
-        device = targets.device(f"none:{device.takes}", click.echo, codebook)
+        device = targets.device(f"none:{device.takes}", objects.line, codebook)
     client = Client(service, bearer_token())
     driven = Drive(
         source=HttpSource(
@@ -116,7 +116,7 @@ def drive(
 
     def show(final_status: "DriveStatus") -> None:
         if as_json:
-            objects.require_reader()
+            objects.require_output()
             objects.line(json.dumps(asdict(final_status)))
 
     try:
@@ -126,7 +126,7 @@ def drive(
     finally:
         objects.finish()
         printer.finish()
-    objects.require_reader()
+    objects.require_output()
     if not final_status.applied and interrupted:
         raise InterruptedByUser("interrupted; nothing was applied")
     if not final_status.applied:

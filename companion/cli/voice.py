@@ -1,12 +1,12 @@
 """Output of the commands ``run`` and ``demo``: notices and a status line, or JSON.
 
 A service does not end because nobody can read its notices: its terminal was closed, or the disk of
-its log file is full. The page shows them too. JSON is a program's input: without it, it ends.
+its log file is full. The page shows them too. JSON is a program's input: a service whose reader
+has ended ends too.
 """
 
 import json
 
-from companion.cli.console import say
 from companion.node.printing import STDERR, STDOUT, Printer
 from companion.node.service import Service
 from companion.views import glance
@@ -16,7 +16,7 @@ class Lines:
     """Writer of notices as lines on stderr; on a terminal, with a status line below them."""
 
     def __init__(self) -> None:
-        self._printer = Printer(STDERR)
+        self._printer, self._results = Printer(STDERR), Printer(STDOUT)
 
     def say(self, text: str) -> None:
         """Print a line above the status line."""
@@ -24,14 +24,15 @@ class Lines:
 
     def serves(self, text: str) -> None:
         """Print the address of the page on stdout. ``OSError`` if that is not possible."""
-        say(text)
+        self._results.line(text)
+        self._results.finish()
+        self._results.require_output()
 
     def recorded(self, text: str) -> None:
         """Print the recording on stdout."""
         self._printer.finish()
-        last = Printer(STDOUT)
-        last.line(text)
-        last.finish()
+        self._results.line(text)
+        self._results.finish()
 
     def show(self, service: Service) -> None:
         """Refresh the status line on the terminal."""
@@ -49,7 +50,7 @@ class JsonLines:
         self._seen_ns = 0
         self._printer = Printer(STDERR)
         self._objects = Printer(STDOUT, are_data=True)
-        self._is_slow = False  # whether some objects found no room
+        self._has_dropped = False
 
     def say(self, text: str) -> None:
         """Print a line for the operator on stderr."""
@@ -58,14 +59,14 @@ class JsonLines:
     serves = recorded = say
 
     def show(self, service: Service) -> None:
-        """Print the status as a JSON object. Raises ``OSError`` if that is no longer possible.
+        """Print the status as a JSON object. Raises ``OSError`` if stdout takes none.
 
-        If nobody reads them, objects are dropped, which is said on stderr.
+        Objects that nobody reads, or that a full disk does not take, are dropped; stderr says so.
         """
-        self._objects.require_reader()
-        if self._objects.dropped and not self._is_slow:
-            self._is_slow = True
-            self._printer.line("some status objects are not printed: nobody reads them")
+        self._objects.require_output()
+        if self._objects.dropped and not self._has_dropped:
+            self._has_dropped = True
+            self._printer.line(f"some status objects are not printed: {self._objects.why}")
         fresh = [notice for notice in service.events() if notice.t_ns > self._seen_ns]
         self._seen_ns = max([self._seen_ns, *(notice.t_ns for notice in fresh)])
         found = glance.glance(service) | {"events": glance.as_events(service, fresh)}

@@ -4,7 +4,9 @@ A stopped reader of a pipe, or Ctrl-S on a terminal, makes a write wait for ever
 that would stop the beams.
 """
 
+import errno
 import os
+import select
 import shutil
 import threading
 from collections import deque
@@ -17,21 +19,26 @@ STDERR: Final = 2
 LAST_S: Final = 1.0  # longest wait at the end for who reads, seconds
 WAITING_MAX: Final = 1 << 20  # characters that wait for their reader; lines beyond it are dropped
 AT_ONCE: Final = 1 << 16  # characters written at once
+UNREAD: Final = "nobody read them"
 CLEAR: Final = "\r\033[K"
+NO_READER: Final = (errno.EPIPE, errno.EBADF)  # errors that do not pass
 
 
 class Printer:
     """Writer of lines to a file descriptor, and of a status line below them on a terminal.
 
-    ``require_reader`` raises the error that ended it; what is printed later is discarded.
-    ``dropped`` counts lines that found no room. They are reported once there is room again, unless
-    the lines ``are_data`` for a program.
+    Lines that find no room, or cannot be written since a disk is full, are counted in ``dropped``,
+    and their number is printed once lines can be written again, unless these ``are_data`` for a
+    program; ``why`` says why. Once the reader has ended, all that is printed is discarded.
     """
 
     def __init__(self, descriptor: int, *, are_data: bool = False) -> None:
         self.dropped = 0
+        self.why = UNREAD
         self._are_data = are_data
-        self._failure: OSError | None = None
+        self._failure: OSError | None = None  # error of the last write, if it failed
+        self._has_written = False
+        self._is_cut = False  # whether a line was written in part
         self._descriptor = descriptor
         self._is_terminal = os.isatty(descriptor)
         self._lines = deque[str]()
@@ -61,9 +68,9 @@ class Printer:
                 self._status = f"{CLEAR}{printable(text)[:width]}"
                 self._changed.notify_all()
 
-    def require_reader(self) -> None:
-        """Raise the error that ended the output, such as that of a pipe whose reader has ended."""
-        if self._failure is not None:
+    def require_output(self) -> None:
+        """Raise the error of an output that has taken nothing yet, or whose reader has ended."""
+        if self._failure is not None and (self._has_ended() or not self._has_written):
             raise self._failure
 
     def finish(self) -> None:
@@ -74,14 +81,15 @@ class Printer:
                 lambda: self._is_idle and not self._lines and self._status is None, LAST_S
             )
 
+    def _has_ended(self) -> bool:
+        return self._failure is not None and self._failure.errno in NO_READER
+
     def _run(self) -> None:
         while True:
-            data = self._next().encode()
-            try:
-                while data and self._failure is None:
-                    data = data[os.write(self._descriptor, data) :]
-            except OSError as error:
-                self._failure = error
+            text = self._next()
+            if not self._has_ended():
+                self._write(text, text.count("\n"))
+                self._report()
 
     def _next(self) -> str:
         """Wait for something to print, and return it."""
@@ -95,13 +103,40 @@ class Printer:
                 taken += self._lines.popleft()
             self._waiting -= len(taken)
             if not self._lines:
-                taken += self._lost() + (self._status or "")
+                taken += self._status or ""
                 self._status = None
             return taken
 
-    def _lost(self) -> str:
-        """Return a line about those that were dropped since the last one; empty without any."""
-        lost, self._reported = self.dropped - self._reported, self.dropped
-        if not lost or self._are_data:
-            return ""
-        return f"{lost} lines were not printed: nobody read them\n"
+    def _report(self) -> None:
+        """Print how many lines were dropped since the last report, if any can be written."""
+        dropped = self.dropped
+        if self._lines or self._failure or self._are_data or dropped == self._reported:
+            return
+        clear = CLEAR if self._is_terminal else ""
+        if self._write(f"{clear}{dropped - self._reported} lines were not printed: {self.why}\n"):
+            self._reported, self.why = dropped, UNREAD
+
+    def _write(self, text: str, lines: int = 0) -> bool:
+        """Write text; return whether all was written. If not, count its lines as dropped."""
+        data = f"\n{text}".encode() if self._is_cut else text.encode()
+        left = data
+        try:
+            while left:
+                left = self._write_some(left)
+            self._failure = None
+        except OSError as error:
+            self._failure, self.why = error, error.strerror or str(error)
+            with self._changed:
+                self.dropped += min(lines, left.count(b"\n"))
+        if len(left) < len(data):
+            self._has_written = True
+            self._is_cut = bool(left) and not data[: -len(left)].endswith(b"\n")
+        return not left
+
+    def _write_some(self, data: bytes) -> bytes:
+        """Write what finds room, or wait for room; return what is left."""
+        try:
+            return data[os.write(self._descriptor, data) :]
+        except BlockingIOError:  # who shares the pipe or terminal has made it non-blocking
+            select.select((), (self._descriptor,), ())
+            return data

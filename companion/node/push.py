@@ -14,9 +14,9 @@ from typing import Final
 
 from companion.beams.aim import RenewedBeam
 from companion.node.ring import LARGEST_RECORD, Ring
-from companion.node.serving import in_daemon_thread
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
+from companion.server.threads import Threads
 from companion.settings.outlets import RecordSettings, host_and_port
 from companion.values import Notice, Severity, Update, UserError
 from companion.views import guaranteed_gain, records
@@ -52,6 +52,7 @@ class Push:
         self._newest: tuple[Update, int] | None = None
         self._revised, self._revision = -1, 0  # the update whose beams were renewed, and how many
         self._fresh = asyncio.Event()
+        self._threads = Threads(1, "guaranteed gains")
 
     def open(self) -> None:
         """Open all outputs. Raises ``UserError`` if one cannot be opened."""
@@ -124,10 +125,14 @@ class Push:
             self._fresh.clear()
             assert self._newest is not None
             update, number = self._newest
-            sure = await in_daemon_thread(
-                partial(guaranteed_gain.gains_db, self._pipeline, self._equipment, update)
-            )
-            self._send(update, number, sure)
+            work = partial(guaranteed_gain.gains_db, self._pipeline, self._equipment, update)
+            try:
+                computed = self._threads.submit(work)
+            except RuntimeError:  # the system allows no thread now: beams without their gains
+                self._send(update, number, None)
+            else:
+                sure = await asyncio.wrap_future(computed)
+                self._send(update, number, sure)
 
     def _send(self, update: Update, number: int, sure: list[float | None] | None) -> None:
         beams = records.in_utc(self._pipeline, update.beams)

@@ -212,7 +212,7 @@ class Service:
 
     async def _finish(self) -> None:
         if self._live:
-            await asyncio.to_thread(self._live.stop)
+            await in_daemon_thread(self._live.stop, at_once=True)
         if self._recorder:
             stop = partial(self._recorder.stop, self.pipeline.digest.both())
             await saved_at_end(stop, "the recording", self._say, most_s=None)

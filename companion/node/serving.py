@@ -39,6 +39,7 @@ served, behind all others and their answers, before anything is known of what th
 """
 CLOSE_TIMEOUT_S: Final = 2
 """Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
+THREAD_RETRY_S: Final = 0.5  # time until a thread that could not be started is tried again
 DISK_WAIT_NOTICE_S: Final = 2.0  # wait for a disk at the end after which it is announced
 _waits_for_disk = threading.Event()
 """Set while the end waits for a disk: then a signal ends the process at once."""
@@ -122,10 +123,11 @@ async def pause(until: asyncio.Event, seconds: float) -> None:
         await asyncio.wait_for(until.wait(), seconds)
 
 
-async def in_daemon_thread(work: Callable[[], T]) -> T:
+async def in_daemon_thread(work: Callable[[], T], *, at_once: bool = False) -> T:
     """Run a function on a daemon thread, which the shutdown of the service does not wait for.
 
-    The function must tolerate being cut off at any point.
+    The function must tolerate being cut off at any point. While the system allows no more threads,
+    it waits, or is called ``at_once`` on this one.
     """
     loop = asyncio.get_running_loop()
     done: asyncio.Future[T] = loop.create_future()
@@ -138,8 +140,15 @@ async def in_daemon_thread(work: Callable[[], T]) -> T:
         with contextlib.suppress(RuntimeError):  # the loop is closed: no caller is waiting
             loop.call_soon_threadsafe(lambda: None if done.done() else settle())
 
-    threading.Thread(target=run, name="background", daemon=True).start()
-    return await done
+    while True:
+        try:
+            threading.Thread(target=run, name="background", daemon=True).start()
+        except RuntimeError:  # the system allows no more threads now
+            if at_once:
+                return work()
+            await asyncio.sleep(THREAD_RETRY_S)
+        else:
+            return await done
 
 
 async def saved_at_end(
@@ -149,7 +158,7 @@ async def saved_at_end(
 
     After ``most_s`` more seconds it is not waited for; None: ``save`` has a limit of its own.
     """
-    saving = asyncio.create_task(in_daemon_thread(save))
+    saving = asyncio.create_task(in_daemon_thread(save, at_once=True))
     _, unfinished = await asyncio.wait([saving], timeout=DISK_WAIT_NOTICE_S)
     if unfinished:
         _waits_for_disk.set()
@@ -186,10 +195,12 @@ async def _stopped_by_signal(
 
     def stop(number: int) -> None:
         if _waits_for_disk.is_set():
-            last = Printer(STDERR)
-            last.line("companion: ended by a signal, without waiting for the disk")
-            last.finish()
-            os._exit(1)
+            try:
+                last = Printer(STDERR)
+                last.line("companion: ended by a signal, without waiting for the disk")
+                last.finish()
+            finally:  # also if it has no thread
+                os._exit(1)
         received.append(number)
         until.set()
 

@@ -94,12 +94,12 @@ def run(
 async def _keep_shown(
     service: Service, voice: Console, until: asyncio.Event, lost: list[OSError]
 ) -> None:
-    """Show the status every second. Without its output the service ends in order."""
+    """Show the status every second. Without its reader the service ends in order."""
     try:
         while True:
             await asyncio.sleep(STATUS_EVERY_S)
             voice.show(service)
-    except OSError as error:  # a full disk, or a pipe whose reader has ended
+    except OSError as error:  # the reader of a pipe has ended
         lost.append(error)
         until.set()
 

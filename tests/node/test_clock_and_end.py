@@ -67,6 +67,35 @@ def test_disk_that_does_not_answer_at_the_end_is_told_and_waited_for_a_while(
     assert len(told) == 2
 
 
+def no_thread(_: threading.Thread) -> None:
+    raise RuntimeError("can't start new thread")
+
+
+def test_end_needs_no_new_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Under a limit of processes a recording would be left unfinished."""
+    monkeypatch.setattr(threading.Thread, "start", no_thread)
+    monkeypatch.setattr(serving, "DISK_WAIT_NOTICE_S", 0.05)
+    told, saved = list[str](), list[int]()
+    assert ended(lambda: saved.append(1), told, most_s=0.05)
+    assert (saved, told) == ([1], [])
+
+
+def test_work_in_the_background_waits_for_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A shortage that passes ends no service."""
+    monkeypatch.setattr(serving, "THREAD_RETRY_S", 0.0)
+    start, refused = threading.Thread.start, list[int]()
+
+    def third(thread: threading.Thread) -> None:
+        if len(refused) < 2:
+            refused.append(1)
+            no_thread(thread)
+        start(thread)
+
+    monkeypatch.setattr(threading.Thread, "start", third)
+    assert run_async(serving.in_daemon_thread(threading.current_thread)).name == "background"
+    assert len(refused) == 2
+
+
 WAITS = """
 import asyncio, threading
 from companion.node import serving

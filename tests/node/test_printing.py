@@ -1,11 +1,17 @@
 """Output on a thread: in order, bounded, and without waiting for who reads it."""
 
 import os
+import resource
+import select
+import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 
 import pytest
+from support import HANG_S
 
+from companion.cli import voice
 from companion.node import printing
 from companion.node.printing import Printer
 
@@ -69,7 +75,92 @@ def test_end_of_the_reader_is_an_error_for_who_needs_one(pipe: tuple[int, int]) 
     printer.line("one")
     printer.finish()
     with pytest.raises(BrokenPipeError):
-        printer.require_reader()
+        printer.require_output()
     printer.line("two")
     printer.finish()
     os.close(write)
+
+
+def test_reader_of_a_non_blocking_pipe_may_be_slow(pipe: tuple[int, int]) -> None:
+    """The flag belongs to the pipe, so that another process may have set it."""
+    read, write = pipe
+    os.set_blocking(write, False)
+    printer = Printer(write, are_data=True)
+    for _ in range(5000):
+        printer.line("x" * 99)
+    said = b""
+    while len(said) < 500_000:
+        assert select.select((read,), (), (), HANG_S)[0]
+        said += os.read(read, 1 << 12)
+    printer.finish()
+    printer.require_output()
+    assert set(said.splitlines()) == {b"x" * 99} and not printer.dropped
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_full_disk_costs_only_the_lines_that_it_does_not_take(tmp_path: Path) -> None:
+    descriptor = os.open("/dev/full", os.O_WRONLY)
+    printer = Printer(descriptor)
+    for text in ("one", "two"):
+        printer.line(text)
+        printer.finish()
+    with pytest.raises(OSError, match="No space left"):
+        printer.require_output()
+    kept = tmp_path / "status"
+    with kept.open("wb") as file:
+        os.dup2(file.fileno(), descriptor)
+    printer.line("three")
+    printer.finish()
+    lost = "2 lines were not printed: No space left on device"
+    assert kept.read_text().splitlines() == ["three", lost]
+    with Path("/dev/full").open("wb") as full:
+        os.dup2(full.fileno(), descriptor)
+    printer.line("lost")
+    printer.finish()
+    printer.require_output()
+    with kept.open("ab") as file:
+        os.dup2(file.fileno(), descriptor)
+    printer.line("four")
+    printer.finish()
+    again = "1 lines were not printed: No space left on device"
+    assert kept.read_text().splitlines() == ["three", lost, "four", again]
+    os.close(descriptor)
+
+
+def test_line_that_a_full_disk_cuts_spoils_no_other(tmp_path: Path) -> None:
+    kept, limits = tmp_path / "status", resource.getrlimit(resource.RLIMIT_FSIZE)
+    line = "x" * 299
+    with kept.open("wb") as file:
+        printer = Printer(file.fileno(), are_data=True)
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+            for _ in range(5):
+                printer.line(line)
+                printer.finish()
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+        for _ in range(2):
+            printer.line(line)
+            printer.finish()
+    assert kept.read_text().splitlines() == [line, line, line, "x" * 100, line, line]
+    assert printer.dropped == 2
+
+
+def test_start_does_not_wait_for_who_reads_the_address(
+    pipe: tuple[int, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read, write = pipe
+    os.set_blocking(write, False)
+    with suppress(BlockingIOError):
+        while True:
+            os.write(write, bytes(1 << 16))
+    os.set_blocking(write, True)
+    monkeypatch.setattr(voice, "STDOUT", write)
+    monkeypatch.setattr(printing, "LAST_S", 0.01)
+    unread = threading.Timer(10.0, os.read, (read, 1 << 20))
+    unread.start()
+    voice.Lines().serves("companion serves")
+    assert unread.is_alive()
+    unread.cancel()
+    while b"companion serves" not in os.read(read, 1 << 20):
+        pass

@@ -5,9 +5,11 @@ import os
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pytest
 from support import BALLAST, HANG_S, ROOT, fill, free_port, run_async
 
@@ -18,6 +20,7 @@ from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.settings.outlets import RecordSettings
 from companion.values import Notice, Severity, Update, UserError
+from companion.views import records
 
 
 def pushing(
@@ -100,6 +103,42 @@ def test_refused_udp_push_and_recovery_are_announced_once() -> None:
     push.open()
     run_async(test())
     push.close()
+
+
+def test_records_are_sent_without_guaranteed_gains_while_no_thread_can_be_started(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A limit of processes, or of memory, ended the service."""
+
+    def refuse(_: threading.Thread) -> None:
+        raise RuntimeError("can't start new thread")
+
+    async def sent(push: Push, update: Update, listener: socket.socket, number: int) -> list[bool]:
+        push.newest(update, number)
+        loop, found = asyncio.get_running_loop(), list[bool]()
+        while len(found) < len(update.beams.beams):
+            record = await loop.sock_recv(listener, 1 << 16)
+            header = np.frombuffer(record, records.HEADER, 1)[0]
+            beams = np.frombuffer(record, records.BEAM, header["beams"], header["beams_at"])
+            found += np.isfinite(beams["guaranteed_gain_db"]).tolist()
+        return found
+
+    async def test(push: Push, update: Update, listener: socket.socket) -> None:
+        task = asyncio.create_task(push.run())
+        with monkeypatch.context() as patch:
+            patch.setattr(threading.Thread, "start", refuse)
+            assert not any(await sent(push, update, listener, 0))
+        assert any(await sent(push, update, listener, 1))
+        task.cancel()
+
+    with socket.socket(type=socket.SOCK_DGRAM) as listener:
+        listener.bind(("127.0.0.1", 0))
+        listener.setblocking(False)
+        to = f"127.0.0.1:{listener.getsockname()[1]}"
+        push, update, _ = pushing(RecordSettings(udp=(to,), guaranteed=True))
+        push.open()
+        run_async(test(push, update, listener))
+        push.close()
 
 
 def test_ring_of_a_running_service_is_not_replaced(small_disk: Path) -> None:

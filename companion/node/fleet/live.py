@@ -20,6 +20,7 @@ from companion.node.fleet.config import bus_config
 from companion.node.fleet.listening import Listening
 from companion.node.fleet.messages import FleetMessageError
 from companion.node.fleet.traffic import Rate
+from companion.node.serving import in_daemon_thread
 from companion.pipeline.fleet.member import NODES_MAX, UAVS_MAX, FleetMember
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
@@ -159,7 +160,7 @@ class LiveFleetNode:
             if self._flushing is not None:
                 self._flushing.cancel()
                 self._flushing = None
-            await asyncio.to_thread(bus.close)
+            await in_daemon_thread(bus.close, at_once=True)
 
     def _is_link_one_way(self, now_ns: int) -> bool:
         """Return whether a present node does not answer; remove nodes that left."""
@@ -183,7 +184,7 @@ class LiveFleetNode:
         while True:
             make = self._offers.look(self._now_ns())
             if make is not None:
-                self._offers.take(await asyncio.to_thread(make))
+                self._offers.take(await in_daemon_thread(make))
             await asyncio.sleep(LOOK_S)
 
     def _declare(self, bus: Bus) -> None:

@@ -124,12 +124,13 @@ def test_records_are_sent_without_guaranteed_gains_while_no_thread_can_be_starte
         return found
 
     async def test(push: Push, update: Update, listener: socket.socket) -> None:
-        task = asyncio.create_task(push.run())
-        with monkeypatch.context() as patch:
-            patch.setattr(threading.Thread, "start", refuse)
-            assert not any(await sent(push, update, listener, 0))
-        assert any(await sent(push, update, listener, 1))
-        task.cancel()
+        async with asyncio.TaskGroup() as group:
+            task = group.create_task(push.run())
+            with monkeypatch.context() as patch:
+                patch.setattr(threading.Thread, "start", refuse)
+                assert not any(await sent(push, update, listener, 0))
+            assert any(await sent(push, update, listener, 1))
+            task.cancel()
 
     with socket.socket(type=socket.SOCK_DGRAM) as listener:
         listener.bind(("127.0.0.1", 0))

@@ -70,11 +70,14 @@ class ZenohLink:
             await bus.run()
         except TimeoutError as error:
             raise OSError("Zenoh's router does not answer") from error
-        except UserError as error:  # an address that is not available now
+        except (UserError, RuntimeError) as error:  # an address or a thread is not available now
             raise OSError(str(error)) from error
         finally:
             self._bus = None
-            await asyncio.to_thread(bus.close)
+            try:
+                await asyncio.to_thread(bus.close)
+            except RuntimeError:  # the system allows no more threads
+                bus.close()
 
     def peers(self) -> Collection[Hashable]:
         """Return the one peer, None, while there is a subscriber to this link's key."""

@@ -134,7 +134,7 @@ class LiveFleetNode:
         slices = ToLoop(asyncio.get_running_loop())
         try:
             if self._session is None:
-                await asyncio.to_thread(bus.open)
+                await in_daemon_thread(bus.open)
             self._bus = bus
             self._slices, self._waiting = slices, 0
             self._declare(bus)

@@ -2,6 +2,7 @@
 
 import asyncio
 import sys
+from collections.abc import Callable
 
 import pytest
 from link_support import LOOPS, Run, frame, runner, running, until_true
@@ -49,6 +50,27 @@ def test_frames_pass_both_ways(run: Run, links: tuple[str, str]) -> None:
             assert (link.status.state, link.status.arrival) == ("up", "read")
 
     run(test())
+
+
+def test_link_that_finds_no_thread_is_opened_again(
+    run: Run, links: tuple[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A limit of processes: to open and to close a session, each once."""
+    in_thread, refused = asyncio.to_thread, list[str]()
+
+    async def third(work: Callable[[], None]) -> None:
+        if len(refused) < 2:
+            refused.append(work.__name__)
+            raise RuntimeError("can't start new thread")
+        await in_thread(work)
+
+    async def test() -> None:
+        async with running(links[0]) as (hub, _):
+            await until_true(lambda: hub.status.state == "up")
+
+    monkeypatch.setattr(asyncio, "to_thread", third)
+    run(test())
+    assert refused == ["open", "close"]
 
 
 def test_large_sample_is_processed_a_few_frames_at_a_time(run: Run, links: tuple[str, str]) -> None:

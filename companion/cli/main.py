@@ -247,7 +247,7 @@ def replay(
                 area_map=own.page.map,
             ),
             own.server.listen,
-            partial(_print_replay, as_json),
+            partial(_summary_text, as_json),
             token=bearer_token(),
             insecure=insecure,
         )
@@ -260,7 +260,7 @@ def replay(
     except KeyboardInterrupt:
         raise InterruptedByUser(_recovery_hint(begun)) from None
     progress.clear()
-    _print_replay(as_json, summary)
+    say(_summary_text(as_json, summary))
     if summary["unaimed"]:
         raise UserError(f"no beam was computed: {summary['unaimed']}")
 
@@ -273,8 +273,8 @@ def _recovery_hint(begun: "list[Writer]") -> str:
     return ""
 
 
-def _print_replay(as_json: bool, summary: dict[str, Any]) -> None:
-    say(json.dumps(summary) if as_json else replay_text.text(summary))
+def _summary_text(as_json: bool, summary: dict[str, Any]) -> str:
+    return json.dumps(summary) if as_json else replay_text.text(summary)
 
 
 def _speed(text: str) -> float | None:

@@ -23,13 +23,14 @@ from companion.mavlink.links.peers import Peers
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.trust.dedupe import LINKS_MAX
 from companion.mavlink.voice.rate_watch import MessageRate
-from companion.node.printing import STDERR, Printer
+from companion.node.printing import STDERR, STDOUT, Printer
 from companion.node.replay import FLUSH_EVERY_S, Run, log_events, log_notes
 from companion.node.serving import (
     NOTICES_KEPT,
     RateMeter,
     Server,
     address,
+    in_daemon_thread,
     pause,
     run_until_stopped,
 )
@@ -71,16 +72,23 @@ class ReplayRequest:
 def serve(
     asked: ReplayRequest,
     listen: str,
-    show: Callable[[dict[str, Any]], None],
+    summary_text: Callable[[dict[str, Any]], str],
     *,
     token: str | None = None,
     insecure: bool = False,
 ) -> None:
-    """Replay and serve on ``listen`` (HOST:PORT) until SIGINT or SIGTERM.
+    """Replay and serve on ``listen`` (HOST:PORT) until a signal of ``ENDS``.
 
-    ``show`` gets the summary: see ``ServedReplay.run``. Raises ``LogError``, ``ConfigError``,
-    ``ListenError`` or ``OSError`` for unusable arguments.
+    ``summary_text`` returns what is printed on stdout of the summary (``ServedReplay.run``). Raises
+    ``LogError``, ``ConfigError``, ``ListenError`` or ``OSError`` for unusable arguments.
     """
+
+    def show(summary: dict[str, Any]) -> None:
+        output = Printer(STDOUT)
+        output.line(summary_text(summary))
+        output.finish()
+        output.require_output()
+
     with bind(listen, token=token, insecure=insecure) as http:
         printer = Printer(STDERR)
         try:
@@ -148,7 +156,7 @@ class ServedReplay:
                 await answering.wait()
                 measuring = group.create_task(self._measure(), name="length")
                 await self._replay(until)
-                summary = await asyncio.to_thread(self._run.finish)
+                summary = await in_daemon_thread(self._run.finish, at_once=True)
                 show(summary | self._missing)
                 await until.wait()
                 measuring.cancel()
@@ -179,7 +187,7 @@ class ServedReplay:
                 return
             self._step(event)
             if self._run.writer and now_s - flush_s > FLUSH_EVERY_S:
-                await asyncio.to_thread(self._run.writer.flush)
+                await in_daemon_thread(self._run.writer.flush)
                 flush_s = slice_s = loop.time()
         self._finished = True
         self._of_s = self._run.at_s
@@ -214,7 +222,7 @@ class ServedReplay:
         events, first_ns = self._measured
         last_ns: int | None = first_ns
         while last_ns is not None:
-            end_ns, last_ns = last_ns, await asyncio.to_thread(_last_ns, events)
+            end_ns, last_ns = last_ns, await in_daemon_thread(partial(_last_ns, events))
         self._of_s = (end_ns - first_ns) * 1e-9
 
     # --- interface of the server ------------------------------------------------------------

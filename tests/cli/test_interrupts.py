@@ -217,6 +217,23 @@ def test_stopped_reader_of_the_status_stops_nothing(full_pipe: int) -> None:
         assert process.wait(HANG_S) == 0
 
 
+def test_stopped_reader_of_the_summary_stops_no_served_replay(
+    full_pipe: int, cut_log: Path
+) -> None:
+    command = [BIN / "companion", "replay", cut_log, *CENTER, *HTTP, "--serve", "--no-record"]
+    command += ["--speed", "max"]
+    with started(command, stdout=full_pipe, stderr=subprocess.PIPE) as process:
+        line = b""
+        while b" serves " not in line:
+            line = line_of(process, process.stderr)
+        url, is_over = line.decode().split(" serves ")[1].split()[0], False
+        while not is_over:
+            with urllib.request.urlopen(f"{url}/v1/status", timeout=HANG_S) as answer:
+                is_over = json.load(answer)["replay"]["state"] == "finished"
+        process.terminate()
+        assert process.wait(HANG_S) == 0
+
+
 def test_notices_without_a_reader_stop_nothing(full_pipe: int, cut_log: Path) -> None:
     command = [BIN / "companion", "run", *CENTER, *LINK, *HTTP]
     with started(command, stdout=subprocess.PIPE, stderr=full_pipe) as process:

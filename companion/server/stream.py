@@ -42,7 +42,6 @@ from companion.views.state import Node
 
 T = TypeVar("T")
 
-SLOW_CLIENT: Final = 1003
 TOO_MANY: Final = 1013
 ELSEWHERE: Final = 4403
 BAD_ARGUMENTS: Final = 4422
@@ -189,10 +188,7 @@ class Stream:
         hearing = asyncio.create_task(websocket.receive())
         try:
             await asyncio.wait({sending, hearing}, return_when=asyncio.FIRST_COMPLETED)
-            if hearing.done() and hearing.result()["type"] == "websocket.receive":
-                sending.cancel()
-                await websocket.close(SLOW_CLIENT, "the stream accepts no messages")
-            elif sending.done():
+            if sending.done():
                 sending.result()
         finally:
             sending.cancel()

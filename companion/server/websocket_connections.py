@@ -17,6 +17,7 @@ from companion.values.budget import Budget
 BYTES_PER_S: Final = 256.0  # bytes that a client may send; a pong every few seconds needs less
 BYTES_SAVED: Final = 2048.0
 TOO_MUCH: Final = 1008  # close code of a client that sends more
+UNSUPPORTED: Final = 1003  # close code of a client that sends a message
 CLOSE_S: Final = 2.0  # time limit for a client to confirm that the connection is closed
 PING_S: Final = 4.0  # time between pings
 PONG_S: Final = STALL_TIMEOUT_S - PING_S
@@ -64,9 +65,12 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         """Process bytes of a client; see ``asyncio.Protocol``."""
         if self.transport.is_closing():
             return
+        if self.handshake_initiated and not self.handshake_complete:
+            self.abort()  # a client waits for the answer to its request
+            return
         # The first bytes are the request's head, which is limited already.
         if self.handshake_initiated and not self._budget.spend(len(data), self.loop.time()):
-            self._refuse()
+            self._refuse(TOO_MUCH)
             return
         super().data_received(data)
         if not self.handshake_initiated and not self.transport.is_closing():
@@ -80,10 +84,23 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         if not self.conn.eof_sent:
             super().send_500_response()
 
-    def _refuse(self) -> None:
-        """Close the connection of a client that sends too much, without reading on."""
+    def handle_parser_exception(self) -> None:
+        """Close the connection, also where it is not one of WebSocket yet."""
+        if self.handshake_complete:
+            super().handle_parser_exception()
+        else:
+            self.abort()
+
+    def send_receive_event_to_app(self) -> None:
+        """Refuse a message, before it is decoded: the stream accepts none."""
+        self.frames = []
+        if not self.close_sent:
+            self._refuse(UNSUPPORTED)
+
+    def _refuse(self, code: int) -> None:
+        """Close the connection of a client that sends a message, or too much; read no more."""
         if self.handshake_complete and not self.close_sent:
-            self.conn.send_close(TOO_MUCH, "the stream accepts no messages")
+            self.conn.send_close(code, "the stream accepts no messages")
             self.handle_parser_exception()
             self._abort_later()
         else:
@@ -94,6 +111,8 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         await self.writable.wait()  # the connection may be closed meanwhile
         if self.close_sent and not self.disconnected:
             raise ClientDisconnected  # closed here, because the client sent too much
+        if not self.handshake_complete and self.transport.is_closing():
+            raise ClientDisconnected  # answered at the end of the service, or closed
         text = message.get("text") if self.handshake_complete else None
         if text is not None and len(text) > FRAGMENT_CHARS:
             await self._send_in_fragments(text)

@@ -473,13 +473,20 @@ def test_handshake_that_is_none_leaves_no_connection(
     run_async(ended(), loop)
 
 
-def test_handshake_that_waits_at_the_end_of_the_service_is_answered_once() -> None:
-    """Its request fails afterwards: websockets refuses to answer again."""
+@pytest.mark.parametrize(
+    "answers", [(), ("websocket.close",), ("websocket.accept", "websocket.close")]
+)
+def test_handshake_that_waits_at_the_end_of_the_service_is_answered_once(
+    answers: tuple[str, ...], capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Its request fails or is answered afterwards: websockets refuses to answer again."""
 
     over = asyncio.Event()
 
     async def unanswered(scope: Any, receive: Any, send: Any) -> None:
         await over.wait()
+        for answer in answers:
+            await send({"type": answer})
 
     made = list[websocket_connections.BoundedWebSocket]()
 
@@ -509,6 +516,56 @@ def test_handshake_that_waits_at_the_end_of_the_service_is_answered_once() -> No
         return answers
 
     assert run_async(ended()).count(b"HTTP/1.1 500") == 1
+    assert "Traceback" not in capfd.readouterr().err
+
+
+WRONG = UPGRADE.replace(b"Connection:", b"Authorization: Bearer wrong\r\nConnection:")
+SAID: dict[str, bytes] = {  # masked frames of a client that has nothing to say
+    "no UTF-8": b"\x81\x81\0\0\0\0\xff",
+    "fragments of no UTF-8": b"\x01\x81\0\0\0\0\xc3\x80\x81\0\0\0\0(",
+    "text": b"\x81\x82\0\0\0\0hi",
+    "continuation": b"\x80\x81\0\0\0\0x",
+    "ping in fragments": b"\x09\x81\0\0\0\0x",
+    "reserved bits": b"\xc1\x81\0\0\0\0x",
+}
+
+
+@pytest.mark.parametrize("said", SAID.values(), ids=SAID)
+@pytest.mark.parametrize("when", ["before the answer", "with the request", "after the answer"])
+def test_frames_that_the_stream_does_not_accept_write_nothing_to_the_log(
+    make_node: Any, capfd: pytest.CaptureFixture[str], said: bytes, when: str
+) -> None:
+    """A traceback for each could fill a disk. The answer to a wrong token comes late."""
+    token = "right" * 4 if when == "before the answer" else None
+
+    async def talks() -> None:
+        async with served(make_node(), token) as port:
+            for _ in range(access.WRONG_MAX if token else 0):
+                await asked(await connected(port), get("/v1/status", "Authorization: Bearer wrong"))
+            client = await connected(port)
+            at_once = said if when == "with the request" else b""
+            client[1].write((WRONG if token else UPGRADE) + at_once)
+            if when == "after the answer":
+                await client[0].readuntil(b"\r\n\r\n")
+            if when != "with the request":
+                client[1].write(said)
+            assert await ends(client)
+
+    run_async(talks())
+    assert capfd.readouterr().err == ""
+
+
+def test_message_of_a_client_closes_its_stream(make_node: Any) -> None:
+    async def talks() -> None:
+        async with (
+            served(make_node()) as port,
+            websockets.connect(f"ws://127.0.0.1:{port}/v1/stream") as talking,
+        ):
+            await talking.send("subscribe")
+            await asyncio.wait_for(talking.wait_closed(), HANG_S)
+            assert talking.close_code == websocket_connections.UNSUPPORTED
+
+    run_async(talks())
 
 
 def test_message_to_a_client_closed_while_it_did_not_read_is_no_error() -> None:

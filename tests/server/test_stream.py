@@ -248,18 +248,6 @@ def test_stream_arguments_are_parsed() -> None:
     assert asked == Wanted((Topic.BEAMS,), frozenset({"1:1", "icao:4CA7B3"}), 0.5)
 
 
-def test_client_message_closes_the_stream(shared_node: Any, serving: Any) -> None:
-    async def check() -> None:
-        async with serving(shared_node) as at, connect(f"ws://{at}/v1/stream") as websocket:
-            await websocket.send("subscribe")
-            with pytest.raises(ConnectionClosed) as raised:
-                while True:
-                    await said(websocket)
-        assert raised.value.rcvd.code == 1003
-
-    run_async(check())
-
-
 @pytest.mark.parametrize("token", [None, "s3cret"])
 @pytest.mark.parametrize("leaves", ["closes", "resets"])
 def test_client_that_sends_and_leaves_at_once_causes_no_error(

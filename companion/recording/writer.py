@@ -3,6 +3,8 @@
 While open the file is called ``….mcap.active``. After ``flush`` everything so far is on the disk
 and readable, even if the process is killed; ``close`` writes the index and removes the suffix
 ``.active``. Not for use by two threads at once.
+
+Over 300 lines: how a file begins, is flushed and ends depend on each other.
 """
 
 import contextlib
@@ -201,7 +203,10 @@ class Writer:
         """
         if self._file.closed:
             return True
-        spare = os.dup(self._file.fileno())  # closing flushes the buffer, which may fail
+        try:
+            spare = os.dup(self._file.fileno())  # closing flushes the buffer, which may fail
+        except OSError:
+            return self._close_without_spare()
         try:
             with contextlib.suppress(OSError):
                 self._file.close()
@@ -213,6 +218,17 @@ class Writer:
         finally:
             os.close(spare)
         return True
+
+    def _close_without_spare(self) -> bool:
+        """Do the same while no descriptor is free; return whether the file is removed."""
+        is_removed = False
+        with contextlib.suppress(OSError):
+            if not self.flushed and self._is_in_place():
+                self.path.unlink()
+                is_removed = True
+        with contextlib.suppress(OSError):
+            self._file.close()
+        return is_removed
 
     def _is_in_place(self, descriptor: int | None = None) -> bool:
         try:

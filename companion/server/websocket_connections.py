@@ -84,13 +84,6 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
         if not self.conn.eof_sent:
             super().send_500_response()
 
-    def handle_parser_exception(self) -> None:
-        """Close the connection, also where it is not one of WebSocket yet."""
-        if self.handshake_complete:
-            super().handle_parser_exception()
-        else:
-            self.abort()
-
     def send_receive_event_to_app(self) -> None:
         """Refuse a message, before it is decoded: the stream accepts none."""
         self.frames = []

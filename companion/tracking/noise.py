@@ -32,6 +32,9 @@ altitude.
 ADSB_VELOCITY_NOISE_MPS: Final = 10.0  # bound on the velocity error of an ADS-B report (NACv 1)
 OVERTAKEN_NS: Final = 10_000_000_000  # time for which a replaced statement is kept
 STATEMENTS_MAX: Final = 64  # most of them
+STATED_NS: Final = 10_000_000_000
+"""Time after which a statement lowers no bound any more: the receiver may have changed since."""
+FORGOTTEN_NS: Final = 60_000_000_000  # time after which it does not raise one either
 GEOID_M: Final = 107.0
 """Largest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 
@@ -74,13 +77,14 @@ class StatedNoise:
 
     Statements and reports overtake each other. The statement in force when a report was made is
     the newest one before that time, or one that arrived since. ``default`` is in force before the
-    first.
+    first, and ``FORGOTTEN_NS`` after the newest.
     """
 
-    __slots__ = ("_earlier", "_newest")
+    __slots__ = ("_default", "_earlier", "_newest", "_newest_ns")
 
     def __init__(self, default: ReportNoise) -> None:
-        self._newest = default
+        self._default = self._newest = default
+        self._newest_ns = 0
         self._earlier: deque[tuple[int, ReportNoise]] = deque()  # until when each was the newest
 
     def add(self, arrival_ns: int, stated: ReportNoise, *, is_newest: bool = True) -> None:
@@ -94,14 +98,16 @@ class StatedNoise:
         before = self._newest
         earlier.append((arrival_ns, before if is_newest else _larger(before, stated)))
         if is_newest:
-            self._newest = stated
+            self._newest, self._newest_ns = stated, arrival_ns
 
     def since(self, made_ns: int) -> ReportNoise:
         """Return bounds for a report that was made no earlier than this.
 
         They are the largest of all statements that may have been in force when it was made.
         """
-        found = self._newest
+        found, age_ns = self._newest, made_ns - self._newest_ns
+        if age_ns > STATED_NS:
+            found = self._default if age_ns > FORGOTTEN_NS else _larger(found, self._default)
         for until_ns, stated in reversed(self._earlier):
             if until_ns < made_ns:
                 break

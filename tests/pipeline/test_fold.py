@@ -14,6 +14,7 @@ from scipy.spatial.transform import Rotation
 from sent_frames import PLACE, START_NS, S, attitude, frame, position, sent
 
 from companion.mavlink.clock.estimates import ClockKind
+from companion.pipeline import senders
 from companion.pipeline.digest import Digest
 from companion.pipeline.fold import DROP_EVERY, Pipeline
 from companion.pipeline.ticks import with_ticks
@@ -644,6 +645,32 @@ def test_outdated_receiver_status_is_ignored() -> None:
     assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
 
 
+def test_accuracy_that_is_stated_no_more_ends() -> None:
+    """A receiver may have lost RTK since, and anybody may have stated it while a radio was off."""
+    pipeline = Pipeline(settings("home"))
+    run(pipeline, [position(n / 5, "1:1") for n in range(100)])
+    default = noise_of(pipeline, "1:1")
+    run(pipeline, [accuracy(20.0, "1:1", 0.1, 20.0, 0.1)])
+    run(pipeline, [position(20.0 + n / 5, "1:1") for n in range(1, 40)])
+    assert noise_of(pipeline, "1:1") == pytest.approx((0.9, 60.0, 0.3))
+    run(pipeline, [position(28.0 + n / 5, "1:1") for n in range(20)])
+    assert noise_of(pipeline, "1:1") == pytest.approx((default[0], 60.0, default[2]))
+    run(pipeline, [position(32.0 + n / 5, "1:1") for n in range(250)])
+    assert noise_of(pipeline, "1:1") == default
+
+
+def test_accuracy_before_the_first_position_counts_for_nothing(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nobody is known to speak for the vehicle yet."""
+    monkeypatch.setattr(senders, "RECEIVER_WAIT_NS", 0)  # the receiver's height is another
+    flight = [position(1.0 + n / 5, "1:1") for n in range(30)]
+    alone, after = Pipeline(settings("47.4,8.5,400")), Pipeline(settings("47.4,8.5,400"))
+    run(alone, flight)
+    run(after, [accuracy(0.0, "1:1", 0.1, 20.0, 0.1), *flight])
+    assert noise_of(after, "1:1") == noise_of(alone, "1:1")
+
+
 def test_receiver_status_after_a_reboot_replaces_the_old_one() -> None:
     """Within the lag of a second link, so that only the reboot distinguishes it from an old
     status.
@@ -654,7 +681,7 @@ def test_receiver_status_after_a_reboot_replaces_the_old_one() -> None:
     run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4)])
     anew = accuracy(3.0, "1:1", 1.0, 1.0, 0.1)
     pipeline.step(anew._replace(t_ns=START_NS + 23_500 * S // 1000))
-    run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4, 16)])
+    run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4, 13)])
     assert pipeline.restarts["1:1"] == 1
     assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
 

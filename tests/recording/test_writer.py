@@ -2,6 +2,7 @@
 
 import gc
 import os
+import resource
 import struct
 import weakref
 from collections import Counter
@@ -356,6 +357,20 @@ def test_salvaged_file_ends_at_the_last_flush(tmp_path: Path) -> None:
     assert writer.path.stat().st_size == writer.size_bytes
     empty = open_writer(tmp_path / "empty")
     assert empty.salvage() and list(empty.path.parent.iterdir()) == []
+
+
+def test_file_without_messages_is_removed_also_while_no_descriptor_is_free(tmp_path: Path) -> None:
+    """It would count as a second part with its number: the run could not be replayed."""
+    limits = resource.getrlimit(resource.RLIMIT_NOFILE)
+    empty, kept = open_writer(tmp_path / "empty"), open_writer(tmp_path / "kept")
+    kept.event(Tick(5))
+    kept.flush()
+    try:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (3, limits[1]))
+        assert empty.salvage() and not kept.salvage()
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, limits)
+    assert not empty.path.exists() and list(read_log(kept.path)) == [Tick(5)]
 
 
 @pytest.mark.parametrize("umask", [0o000, 0o022, 0o077])

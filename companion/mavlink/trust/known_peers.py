@@ -18,12 +18,13 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
 again; its positions are used only as far as they agree with those of the other. Its attitudes and
 what else moves a bound are used only where the other has not brought the same message shortly
-before: positions that agree prove nothing about these. While the other is current, accuracies in
-GPS_RAW_INT are not used at all, and attitudes that contradict those of the other are announced. If
-the other has become late, by its own stamps, newer attitudes are used, but none newer than it could
-ever deliver. Stamps are used only if they are of the other's clock: another clock would look like a
-restart, or like a second vehicle. So the vehicle that was here first stays believed, and a stranger
-costs it nothing; whoever sends first in a vehicle's name is believed until it falls silent.
+before: positions that agree prove nothing about these. Accuracies in GPS_RAW_INT are not used at
+all while the other is current, as those of a peer that has brought no position yet; attitudes that
+contradict those of the other are announced. If the other has become late, by its own stamps, newer
+attitudes are used, but none newer than it could ever deliver. Stamps are used only if they are of
+the other's clock: another clock would look like a restart, or like a second vehicle. So the vehicle
+that was here first stays believed, and a stranger costs it nothing; whoever sends first in a
+vehicle's name is believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
@@ -225,7 +226,7 @@ class KnownPeers:
                 if not is_router and _is_another_clock_too_soon(sender, frame):
                     return STRANGER
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
-            return None
+            return STRANGER if msgid == GPS_RAW_INT and not is_router else None
         if msgid not in _ABOUT_SENDER and not any(msgid in one.newest for one in current):
             return None
         if msgid in OWN and self._replaces(sender, peer, current, frame):

@@ -329,6 +329,22 @@ def test_accuracies_of_a_summary_from_another_peer_are_not_used() -> None:
     assert used[-1]  # the first is silent
 
 
+def test_accuracies_in_a_gap_of_a_radio_are_those_of_peers_with_positions() -> None:
+    peers, status = KnownPeers(), bytes(29) + b"\6"
+    for number in range(50):
+        place = report(number * S // 10, 100 + number / 10, circle(number / 10))
+        assert peers.refusal(LINK, HOME, place) is None
+
+    def refused(peer: str, t_s: float) -> str | None:
+        said = message(t_s, Outgoing(Source(1, 1), GPS_RAW_INT, status))
+        return peers.refusal(LINK, peer, said)
+
+    assert refused(OTHER, 9.0) == STRANGER
+    assert refused(HOME, 9.0) is None
+    assert peers.refusal(LINK, OTHER, report(20 * S, 120.0, circle(20.0))) is None
+    assert refused(OTHER, 20.1) is None  # the vehicle's radio has another address now
+
+
 def unusable(t_s: float, lat_1e7: int) -> Frame:
     payload = struct.pack("<IiiiihhhH", round((100 + t_s) * 1000), lat_1e7, 0, 0, 0, 0, 0, 0, 0)
     return message(t_s, Outgoing(Source(1, 1), GLOBAL_POSITION_INT, payload))

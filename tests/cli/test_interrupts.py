@@ -40,6 +40,14 @@ HOLDS = subprocess.run(
 )
 
 
+@pytest.fixture(autouse=True)
+def default_hangup() -> Iterator[None]:
+    """Commands that are started under ``nohup``, as these tests may be, ignore SIGHUP."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    yield
+    signal.signal(signal.SIGHUP, before)
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_interrupt_is_never_a_traceback(name: str, tmp_path: Path) -> None:
     """To the whole process group, as a terminal sends it; workers of a study included."""

@@ -91,10 +91,11 @@ def drive(
         stored.extend(stored_registers(array, assembly.equipment(settings, array)))
         return stored
 
-    printer, objects = Printer(STDERR), Printer(STDOUT, are_data=as_json)
+    printer, output = Printer(STDERR), Printer(STDOUT, are_data=as_json)
+    lines = printer if as_json else output  # for the operator: JSON objects have stdout alone
     device = targets.device(target, printer.line, codebook)
     if dry_run:
-        device = targets.device(f"none:{device.takes}", objects.line, codebook)
+        device = targets.device(f"none:{device.takes}", lines.line, codebook)
     client = Client(service, bearer_token())
     driven = Drive(
         source=HttpSource(
@@ -116,17 +117,17 @@ def drive(
 
     def show(final_status: "DriveStatus") -> None:
         if as_json:
-            objects.require_output()
-            objects.line(json.dumps(asdict(final_status)))
+            output.require_output()
+            output.line(json.dumps(asdict(final_status)))
 
     try:
         interrupted = running.run_until_stopped(driven, show, seconds)
         final_status = driven.status()
-        (printer if as_json else objects).line(_text(final_status))
+        lines.line(_text(final_status))
     finally:
-        objects.finish()
+        output.finish()
         printer.finish()
-    objects.require_output()
+    output.require_output()
     if not final_status.applied and interrupted:
         raise InterruptedByUser("interrupted; nothing was applied")
     if not final_status.applied:

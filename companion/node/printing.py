@@ -27,9 +27,9 @@ NO_READER: Final = (errno.EPIPE, errno.EBADF)  # errors that do not pass
 class Printer:
     """Writer of lines to a file descriptor, and of a status line below them on a terminal.
 
-    Lines that find no room, or cannot be written since a disk is full, are counted in ``dropped``,
-    and their number is printed once lines can be written again, unless these ``are_data`` for a
-    program; ``why`` says why. Once the reader has ended, all that is printed is discarded.
+    ``dropped`` counts the lines that found no room, or that a full disk did not take, for the
+    reason ``why``. Their number is printed once lines can be written again, unless the lines
+    ``are_data`` for a program. Once the reader has ended, all that is printed is discarded.
     """
 
     def __init__(self, descriptor: int, *, are_data: bool = False) -> None:
@@ -69,7 +69,7 @@ class Printer:
                 self._changed.notify_all()
 
     def require_output(self) -> None:
-        """Raise the error of an output that has taken nothing yet, or whose reader has ended."""
+        """Raise the error of an output whose reader has ended, or that has never taken a line."""
         if self._failure is not None and (self._has_ended() or not self._has_written):
             raise self._failure
 
@@ -113,7 +113,7 @@ class Printer:
         if self._lines or self._failure or self._are_data or dropped == self._reported:
             return
         clear = CLEAR if self._is_terminal else ""
-        if self._write(f"{clear}{dropped - self._reported} lines were not printed: {self.why}\n"):
+        if self._write(f"{clear}lines not printed: {dropped - self._reported} ({self.why})\n"):
             self._reported, self.why = dropped, UNREAD
 
     def _write(self, text: str, lines: int = 0) -> bool:
@@ -137,6 +137,6 @@ class Printer:
         """Write what finds room, or wait for room; return what is left."""
         try:
             return data[os.write(self._descriptor, data) :]
-        except BlockingIOError:  # who shares the pipe or terminal has made it non-blocking
+        except BlockingIOError:  # another process, which shares the pipe, set it to non-blocking
             select.select((), (self._descriptor,), ())
             return data

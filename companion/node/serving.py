@@ -127,7 +127,7 @@ async def in_daemon_thread(work: Callable[[], T], *, at_once: bool = False) -> T
     """Run a function on a daemon thread, which the shutdown of the service does not wait for.
 
     The function must tolerate being cut off at any point. While the system allows no more threads,
-    it waits, or is called ``at_once`` on this one.
+    the call waits until it does; with ``at_once``, the function runs on the event loop instead.
     """
     loop = asyncio.get_running_loop()
     done: asyncio.Future[T] = loop.create_future()

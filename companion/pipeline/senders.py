@@ -286,7 +286,8 @@ class Senders:
                 stated_us, newest_us = message.time_us, component.stated_us
                 # An older status comes over a second, slower link.
                 is_newest = not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US
-                if str(message.source) in self._senders:  # before, anybody may have sent it
+                # Before its first position, no peer is known to speak for the vehicle.
+                if str(message.source) in self._senders:
                     stated = noise.reported(message, self._noise_settings)
                     component.noise.add(message.t_ns, stated, is_newest=is_newest)
                 if is_newest:

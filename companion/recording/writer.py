@@ -220,7 +220,10 @@ class Writer:
         return True
 
     def _close_without_spare(self) -> bool:
-        """Do the same while no descriptor is free; return whether the file is removed."""
+        """Close an unwritable file that cannot be truncated, since no descriptor is free.
+
+        A file without messages is removed. Returns whether it was.
+        """
         is_removed = False
         with contextlib.suppress(OSError):
             if not self.flushed and self._is_in_place():

@@ -83,7 +83,7 @@ class ObserverSettings(LimitSettings):
     position_noise_m       largest error of a reported position, norm of a 3-vector
     velocity_noise_mps     largest error of a reported velocity, norm of a 3-vector
     follow_accuracy        if the autopilot reports its accuracy (GPS_RAW_INT), derive the noise
-                           from it
+                           from it, for 10 s after each report
     accuracy_factor        noise bound as a multiple of that accuracy
     geoid_m                height of mean sea level above the ellipsoid in the area of flight,
                            metres (the undulation, by EGM96 or EGM2008), which converts heights

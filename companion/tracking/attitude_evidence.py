@@ -12,6 +12,7 @@ from typing import Final
 import numpy as np
 
 from companion.tracking.carrier import body_from_ned, reported_bound_rad
+from companion.tracking.noise import STATED_NS
 from companion.tracking.rotations import rotation_angle_rad
 from companion.values import (
     Attitude,
@@ -24,12 +25,6 @@ from companion.values import (
 
 KEPT_NS: Final = 5_000_000_000
 """Time for which a statement counts beside newer ones of the same kind over other links."""
-STATED_NS: Final = 10_000_000_000
-"""Time for which a statement counts that is not repeated.
-
-An autopilot repeats what it reports, ArduPilot once a second and more; one that was forged before
-the carrier appeared would count for ever.
-"""
 LAG_S: Final = 0.5
 """Largest difference between the delays of an attitude and of what it is compared with.
 

@@ -33,8 +33,12 @@ ADSB_VELOCITY_NOISE_MPS: Final = 10.0  # bound on the velocity error of an ADS-B
 OVERTAKEN_NS: Final = 10_000_000_000  # time for which a replaced statement is kept
 STATEMENTS_MAX: Final = 64  # most of them
 STATED_NS: Final = 10_000_000_000
-"""Time after which a statement lowers no bound any more: the receiver may have changed since."""
-FORGOTTEN_NS: Final = 60_000_000_000  # time after which it does not raise one either
+"""Time after which what a vehicle states of itself, and does not repeat, lowers no bound.
+
+Autopilots repeat what they report, ArduPilot once a second and more. The receiver may have changed
+since, and what was forged before the vehicle appeared would count for ever.
+"""
+FORGOTTEN_NS: Final = 60_000_000_000  # time after which an accuracy does not raise a bound either
 GEOID_M: Final = 107.0
 """Largest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 
@@ -77,7 +81,7 @@ class StatedNoise:
 
     Statements and reports overtake each other. The statement in force when a report was made is
     the newest one before that time, or one that arrived since. ``default`` is in force before the
-    first, and ``FORGOTTEN_NS`` after the newest.
+    first, and ``FORGOTTEN_NS`` after the newest; from ``STATED_NS`` on, the larger of the two.
     """
 
     __slots__ = ("_default", "_earlier", "_newest", "_newest_ns")

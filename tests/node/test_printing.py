@@ -48,7 +48,7 @@ def test_lines_that_nobody_reads_are_dropped_and_counted(
         said += os.read(read, 1 << 20)
     lines = said.decode().splitlines()
     assert set(lines[:-1]) == {line}
-    assert lines[-1] == f"{30_000 - len(lines[:-1])} lines were not printed: nobody read them"
+    assert lines[-1] == f"lines not printed: {30_000 - len(lines[:-1])} (nobody read them)"
     assert len(said) < 2 * printing.WAITING_MAX
 
 
@@ -111,7 +111,7 @@ def test_full_disk_costs_only_the_lines_that_it_does_not_take(tmp_path: Path) ->
         os.dup2(file.fileno(), descriptor)
     printer.line("three")
     printer.finish()
-    lost = "2 lines were not printed: No space left on device"
+    lost = "lines not printed: 2 (No space left on device)"
     assert kept.read_text().splitlines() == ["three", lost]
     with Path("/dev/full").open("wb") as full:
         os.dup2(full.fileno(), descriptor)
@@ -122,7 +122,7 @@ def test_full_disk_costs_only_the_lines_that_it_does_not_take(tmp_path: Path) ->
         os.dup2(file.fileno(), descriptor)
     printer.line("four")
     printer.finish()
-    again = "1 lines were not printed: No space left on device"
+    again = "lines not printed: 1 (No space left on device)"
     assert kept.read_text().splitlines() == ["three", lost, "four", again]
     os.close(descriptor)
 

@@ -493,7 +493,6 @@ def test_handshake_that_waits_at_the_end_of_the_service_is_answered_once(
     answers: tuple[str, ...], caplog: pytest.LogCaptureFixture
 ) -> None:
     """Its request fails or is answered afterwards: websockets refuses to answer again."""
-
     over = asyncio.Event()
 
     async def unanswered(scope: Any, receive: Any, send: Any) -> None:
@@ -516,9 +515,9 @@ def test_handshake_that_waits_at_the_end_of_the_service_is_answered_once(
         over.set()
         await asyncio.gather(*made[0].tasks)
         server.close()
-        answers = await reader.read()
+        received = await reader.read()
         writer.close()
-        return answers
+        return received
 
     assert run_async(ended()).count(b"HTTP/1.1 500") == 1
     assert not [one for one in caplog.records if one.exc_info]

@@ -280,9 +280,12 @@ class Senders:
         self, frame: Frame, message: GnssStatus | SystemTime | Presence
     ) -> FrameOutcome:
         """Process a message other than positions: receiver, clock or vehicle status."""
+        if type(message) is SystemTime:
+            return self._system_time(frame, message)
+        component = self._components[message.source]
+        component.heard_ns = message.t_ns
         match message:
             case GnssStatus():
-                component = self._component(message)
                 stated_us, newest_us = message.time_us, component.stated_us
                 # An older status comes over a second, slower link.
                 is_newest = not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US
@@ -295,22 +298,17 @@ class Senders:
                     component.receiver = message
                 heading = gnss_heading(frame) if message.source == self._carrier_source else None
                 return NO_OUTCOME if heading is None else FrameOutcome(message=heading)
-            case SystemTime():
-                change = self.add_stamp(frame)
-                if message.unix_us is not None:
-                    clock = self._senders[str(message.source)].clock
-                    on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
-                    clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
-                return NO_OUTCOME if change is None else FrameOutcome(change=change)
             case Presence():
-                component = self._component(message)
                 component.note_type((message.mav_type, message.autopilot), message.t_ns)
         return NO_OUTCOME
 
-    def _component(self, message: GnssStatus | Presence) -> ComponentState:
-        component = self._components[message.source]
-        component.heard_ns = message.t_ns
-        return component
+    def _system_time(self, frame: Frame, message: SystemTime) -> FrameOutcome:
+        change = self.add_stamp(frame)
+        if message.unix_us is not None:
+            clock = self._senders[str(message.source)].clock
+            on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
+            clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
+        return NO_OUTCOME if change is None else FrameOutcome(change=change)
 
     def add_stamp(self, frame: Frame) -> ClockChange | None:
         """Pass the stamp of an otherwise ignored frame to its sender's clock.

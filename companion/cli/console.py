@@ -18,6 +18,7 @@ from companion.cli.interrupts import INTERRUPTED, command_ended, interrupts_rais
 from companion.values import UserError, printable, shown
 
 TOKEN: Final = "COMPANION_TOKEN"
+ERROR_MAX: Final = 5000  # longest error line, characters; paths have at most 4096
 LOG_EVERY_S: Final = 10.0  # time between two progress lines without a terminal
 CONFIG = click.option("--config", type=click.Path(path_type=Path), help="Settings file (TOML).")
 
@@ -187,7 +188,9 @@ class OneLineErrors(click.Group):
 
     def _end(self, said: str, status: int) -> NoReturn:
         command_ended()
-        say(f"{self.name}: {' '.join(said.split())}", err=True)
+        line = " ".join(said.split())
+        cut = line if len(line) <= ERROR_MAX else f"{line[:ERROR_MAX]}…"
+        say(f"{self.name}: {cut}", err=True)
         sys.exit(status)
 
 

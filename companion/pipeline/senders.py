@@ -394,7 +394,8 @@ class Senders:
         component, known, apart_m = self._components.get(report.source), None, 0.0
         if component is not None and component.receiver is not None:
             known, receiver = component.noise.since(made_ns), component.receiver
-            if receiver.fix_type >= FIX_3D:
+            is_recent = report.t_ns - receiver.t_ns <= noise.FORGOTTEN_NS
+            if is_recent and receiver.fix_type >= FIX_3D:
                 apart_m2, before = (report.alt_m - receiver.alt_m) ** 2, component.apart_m2
                 if before is not None:
                     apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
@@ -485,11 +486,14 @@ class Senders:
 
         Its sender's receiver, if one was received, must have a 3D fix near the report's height.
         After ``RECEIVER_WAIT_NS`` the track begins anyway, as heights may have different
-        datums; home waits ``always``.
+        datums; home waits ``always``. A status that was not repeated for ``FORGOTTEN_NS`` is
+        ignored: it may be forged.
         """
         component = self._components.get(report.source)
         receiver = None if component is None else component.receiver
         if receiver is None or not kind_of(report.uav).reports_itself:
+            return True
+        if report.t_ns - receiver.t_ns > noise.FORGOTTEN_NS:
             return True
         record = self._records[report.uav]
         if receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_HEIGHT_M:

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 from pydantic import AfterValidator, Field
 
 from companion.settings.section import Section
-from companion.values import UserError
+from companion.values import UserError, shown
 
 _NAME: Final = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,31}")
 
@@ -18,9 +18,8 @@ def is_node_name(text: str) -> bool:
 
 def _name(text: str) -> str:
     if not is_node_name(text):
-        raise UserError(
-            f"{text!r} is invalid: give at most 32 letters, digits, dots, dashes or underscores"
-        )
+        allowed = "give at most 32 letters, digits, dots, dashes or underscores"
+        raise UserError(f"{shown(text)} is invalid: {allowed}")
     return text
 
 

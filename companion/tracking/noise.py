@@ -38,7 +38,8 @@ STATED_NS: Final = 10_000_000_000
 Autopilots repeat what they report, ArduPilot once a second and more. The receiver may have changed
 since, and what was forged before the vehicle appeared would count for ever.
 """
-FORGOTTEN_NS: Final = 60_000_000_000  # time after which an accuracy does not raise a bound either
+FORGOTTEN_NS: Final = 60_000_000_000
+"""Time after which a statement of a receiver that it does not repeat is ignored altogether."""
 GEOID_M: Final = 107.0
 """Largest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 

@@ -34,6 +34,8 @@ def fail(what: str) -> None:
             raise UserError("the file holds\n  no log")
         case "escapes":
             raise UserError("\x1b[2J\x1b]0;pwned\x07 is not a setting\x9b")
+        case "long":
+            raise UserError("x" * 100_000)
         case "file":
             Path("/nowhere/x").read_text()
         case "value":
@@ -55,6 +57,7 @@ def fail(what: str) -> None:
     [
         ("user", 1, "prog: the file holds no log\n"),
         ("escapes", 1, "prog: [2J]0;pwned is not a setting\n"),
+        ("long", 1, f"prog: {'x' * 5000}…\n"),
         ("file", 1, "prog: /nowhere/x: No such file or directory\n"),
         ("interrupted", 130, "prog: interrupted\n"),
     ],

@@ -272,6 +272,27 @@ def test_home_waits_for_a_valid_receiver_status() -> None:
     assert update.carrier is not None
 
 
+def test_home_waits_a_minute_for_a_status_that_is_not_repeated() -> None:
+    """One forged status before the vehicle's first position; the vehicle itself sends none."""
+    into = pipeline("home")
+    run(into, [receiver(0.0, "1:1", 1, ALT_M), *(position(n, "1:1", (0, 0, 0)) for n in range(61))])
+    assert into.local is None
+    run(into, [position(61, "1:1", (0, 0, 0))])
+    assert into.local is not None
+
+
+def test_height_of_a_receiver_counts_for_a_minute() -> None:
+    """One status of another height: the usual error is not its difference for ever."""
+    there = pipeline("9:1")
+    steady = [position(n / 5, "1:1", (0, 0, 0)) for n in range(350)]
+    out = run(there, [*steady[:5], receiver(1.0, "1:1", 3, ALT_M + 500), *steady[5:]])
+    apart_m = [
+        (one.fix.t_ns - START_NS, one.fix.noise.apart_m) for one in out if isinstance(one, Estimate)
+    ]
+    assert max(apart for t_ns, apart in apart_m if t_ns < 60 * S) > 100
+    assert all(apart == 0 for t_ns, apart in apart_m if t_ns > 61.1 * S)
+
+
 def test_track_waits_for_receiver_status_at_most_ten_seconds() -> None:
     """One height is 500 m off for three seconds; another permanently."""
     into = pipeline("9:1")

@@ -23,10 +23,11 @@ class Lines:
         self._printer.line(text)
 
     def serves(self, text: str) -> None:
-        """Print the address of the page on stdout. ``OSError`` if that is not possible."""
+        """Print the address of the page on stdout; on stderr if that is not possible."""
         self._results.line(text)
         self._results.finish()
-        self._results.require_output()
+        if self._results.has_failed:
+            self._printer.line(text)
 
     def recorded(self, text: str) -> None:
         """Print the recording on stdout."""

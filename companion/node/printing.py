@@ -68,6 +68,11 @@ class Printer:
                 self._status = f"{CLEAR}{printable(text)[:width]}"
                 self._changed.notify_all()
 
+    @property
+    def has_failed(self) -> bool:
+        """Whether the last line could not be written."""
+        return self._failure is not None
+
     def require_output(self) -> None:
         """Raise the error of an output whose reader has ended, or that has never taken a line."""
         if self._failure is not None and (self._has_ended() or not self._has_written):

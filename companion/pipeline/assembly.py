@@ -39,6 +39,7 @@ from companion.values import FloatArray, Limits, LimitSource, ReportNoise, UserE
 
 FLOOR_MARGIN_DB: Final = 2.9
 """Default margin of a likely beam's gain floor above the gain that the link needs, dB."""
+COUPLED_MAX: Final = 512  # most elements with coupling; an update of 1024 takes 0.3 s
 COUPLING_MAX: Final = 1e6
 """Limit of the largest entry of a coupling matrix; its inverse is the lower limit."""
 COUPLING_CONDITION_MAX: Final = 1e6
@@ -61,6 +62,10 @@ def array(settings: Settings) -> geometry.Array:
             )
         live = np.ones(size, dtype=bool)
         live[dead] = False
+    if size > COUPLED_MAX and settings.array.coupling is not None:
+        raise ConfigError(
+            f"array.coupling: {size} elements; with coupling an array has at most {COUPLED_MAX}"
+        )
     coupling = matrix_of(settings, COUPLING)
     if coupling is not None:
         if coupling.shape != (size, size) or not np.isfinite(coupling).all():

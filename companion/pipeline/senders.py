@@ -10,6 +10,7 @@ Over 300 lines: every kind of message passes through here.
 import math
 from collections import defaultdict
 from collections.abc import Container
+from copy import deepcopy
 from dataclasses import dataclass, field, replace
 from functools import lru_cache, partial
 from itertools import islice
@@ -64,6 +65,14 @@ CONFIRMED_NS: Final = 5_000_000_000
 OUTDATED_MS: Final = 10_000  # age of a Cursor on Target event beside the newest of its source
 OUTDATED_FOR_NS: Final = 60_000_000_000
 """Time after the newest event for which older ones are rejected; then its clock was set back."""
+ANOTHER_CLOCK_NS: Final = 10_000_000_000
+"""Time after a vehicle's newest stamp here until which others must share stamps of that clock.
+
+It is also the largest lateness of such a stamp.
+"""
+ANOTHER_CLOCK_EARLY_NS: Final = 1_000_000_000  # largest earliness of such a stamp
+ANOTHER_CLOCK_LATE_NS: Final = 3_000_000_000
+"""Lateness of a stamp here, by a clock that others shared, which shows that this was another."""
 TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 TYPE_KEPT_NS: Final = 60_000_000_000
 """Time for which a type counts beside the newest one, so that a forged one does not last."""
@@ -155,13 +164,45 @@ class Timeline(NamedTuple):
 
 @dataclass(slots=True, kw_only=True)
 class Sender:
-    """Sender with a clock: a vehicle, or an aircraft that broadcasts its own stamps."""
+    """Sender with a clock: a vehicle, or an aircraft that broadcasts its own stamps.
+
+    ``received_clock`` is its clock without what other nodes said of it, while their frames are
+    used; None while they are not.
+    """
 
     clock: SenderClock
+    received_clock: SenderClock | None = None
+    received_ns: int | None = None  # arrival of its newest stamp here; None: never received
     stamped_ns: int | None = None  # arrival of the clock's newest stamp; None: none yet
     is_shared: bool = False  # whether a notice said that two senders share this id
     first: tuple[int, int] | None = None  # arrival and stamp of an event that none confirmed yet
     newest: tuple[int, int] | None = None  # the same of the newest event that was placed
+
+    @property
+    def own_clock(self) -> SenderClock:
+        """Its clock by what this node received."""
+        return self.received_clock or self.clock
+
+    def share(self, arrival_ns: int, boot_ms: int) -> bool:
+        """Switch to the clock with what other nodes share; return whether a stamp may be its own.
+
+        Until ``ANOTHER_CLOCK_NS`` after its newest stamp was received here, stamps that are not on
+        its line are another clock's.
+        """
+        if self.received_clock is None:
+            self.received_clock, self.received_ns = deepcopy(self.clock), self.stamped_ns
+        if self.received_ns is None or arrival_ns - self.received_ns > ANOTHER_CLOCK_NS:
+            return True
+        late_ns = self.received_clock.lateness_ns(arrival_ns, boot_ms)
+        return late_ns is None or -ANOTHER_CLOCK_EARLY_NS <= late_ns <= ANOTHER_CLOCK_NS
+
+    def receive(self, arrival_ns: int, boot_ms: int) -> bool:
+        """Switch back to the clock of this node; return whether others shared another clock."""
+        if self.received_clock is None:
+            return False
+        shared, self.clock, self.received_clock = self.clock, self.received_clock, None
+        late_ns = shared.lateness_ns(arrival_ns, boot_ms)
+        return late_ns is not None and not -ANOTHER_CLOCK_NS <= late_ns <= ANOTHER_CLOCK_LATE_NS
 
     def refuses_event(self, arrival_ns: int, boot_ms: int) -> Reason | None:
         """Return why a Cursor on Target event must be rejected by its time; None to use it.
@@ -279,9 +320,15 @@ class Senders:
     def _take_other(
         self, frame: Frame, message: GnssStatus | SystemTime | Presence
     ) -> FrameOutcome:
-        """Process a message other than positions: receiver, clock or vehicle status."""
+        """Process a message other than positions: receiver, clock or vehicle status.
+
+        One that another node shares counts only while positions that others share are used.
+        """
         if type(message) is SystemTime:
             return self._system_time(frame, message)
+        sender = self._senders.get(str(message.source))
+        if frame.doubt_ns and (sender is None or sender.received_clock is None):
+            return NO_OUTCOME
         component = self._components[message.source]
         component.heard_ns = message.t_ns
         match message:
@@ -290,9 +337,11 @@ class Senders:
                 # An older status comes over a second, slower link.
                 is_newest = not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US
                 # Before its first position, no peer is known to speak for the vehicle.
-                if str(message.source) in self._senders:
+                if sender is not None:
                     stated = noise.reported(message, self._noise_settings)
-                    component.noise.add(message.t_ns, stated, is_newest=is_newest)
+                    component.noise.add(
+                        message.t_ns, stated, is_newest=is_newest, is_shared=frame.doubt_ns > 0
+                    )
                 if is_newest:
                     component.stated_us = stated_us
                     component.receiver = message
@@ -305,7 +354,7 @@ class Senders:
     def _system_time(self, frame: Frame, message: SystemTime) -> FrameOutcome:
         change = self.add_stamp(frame)
         if message.unix_us is not None:
-            clock = self._senders[str(message.source)].clock
+            clock = self._senders[str(message.source)].own_clock
             on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
             clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
         return NO_OUTCOME if change is None else FrameOutcome(change=change)
@@ -318,15 +367,22 @@ class Senders:
         sender = self._senders.get(str(frame.source))
         if sender is None:
             return None
-        sender.clock.add_stamp(frame.t_ns, boot_ms(frame))
-        return sender.clock.change
+        clock = sender.own_clock
+        clock.add_stamp(frame.t_ns, boot_ms(frame))
+        return clock.change
 
     def round_trip(self, event: RoundTrip) -> ClockChange | None:
         """Pass a TIMESYNC round trip to its sender's clock.
 
-        Returns the clock change that the round trip revealed.
+        One that another node measured counts only while frames of other nodes are used. Returns the
+        clock change that the round trip revealed.
         """
-        clock = self._senders[str(event.source)].clock
+        sender = self._senders.get(str(event.source))
+        if sender is None or (event.is_shared and sender.received_clock is None):
+            return None
+        clock, received = sender.clock, sender.received_clock
+        if received is not None and not event.is_shared:
+            received.timesync(event.sent_ns, event.t_ns, event.remote_ns)
         clock.timesync(event.sent_ns, event.t_ns, event.remote_ns)
         return clock.change
 
@@ -335,11 +391,12 @@ class Senders:
         self._utc_offset_ns = offset_ns
         for sender in self._senders.values():
             sender.clock.forget_gnss()
+            sender.own_clock.forget_gnss()
 
     def _telemetry(self, report: Report, doubt_ns: int = 0) -> FrameOutcome:
         """Place a report in time by its stamp; noise bounds only for a vehicle that reports itself.
 
-        ``doubt_ns`` is the uncertainty of its frame's arrival.
+        ``doubt_ns`` is the uncertainty of its frame's arrival: not 0 if another node shared it.
         """
         assert report.boot_ms is not None
         uav, t_ns = report.uav, report.t_ns
@@ -348,10 +405,16 @@ class Senders:
         if uav not in self._senders and len(self._senders) >= RECORDS_MAX and not is_own:
             return _refused(report, Reason.TOO_MANY)  # ids can be forged in any number
         sender = self._senders[uav]
-        refused = sender.refuses_event(t_ns, report.boot_ms) if is_event else None
+        refused: Reason | None = None
+        switched: tuple[Notice, ...] = ()
+        if doubt_ns or sender.received_clock is not None:
+            refused, switched = self._switch(sender, report, is_shared=doubt_ns > 0)
+        if is_event:
+            refused = sender.refuses_event(t_ns, report.boot_ms)
         if refused is not None:
             return _refused(report, refused)
-        stamp, said = self._stamp(sender, uav, t_ns, report.boot_ms, doubt_ns)
+        stamp, said = self._stamp(sender.clock, uav, t_ns, report.boot_ms, doubt_ns)
+        sender.stamped_ns, said = t_ns, (*switched, *said)
         restarted = uav if said else None
         if sender.clock.is_shared(t_ns):
             return FrameOutcome(
@@ -384,6 +447,26 @@ class Senders:
         return FrameOutcome(
             message=placed, outputs=said, restarted=restarted, change=sender.clock.change
         )
+
+    def _switch(
+        self, sender: Sender, report: Report, *, is_shared: bool
+    ) -> tuple[Reason | None, tuple[Notice, ...]]:
+        """Switch to what this node received of a vehicle, or to what other nodes share.
+
+        What others say of its clock and accuracy counts until it is received here again. Returns
+        why the report must be rejected, and a notice if the track must restart.
+        """
+        assert report.boot_ms is not None
+        if is_shared:
+            is_own = sender.share(report.t_ns, report.boot_ms)
+            return None if is_own else Reason.UNPLACED_STAMP, ()
+        if (component := self._components.get(report.source)) is not None:
+            component.noise.expire_shared(report.t_ns)
+        if not sender.receive(report.t_ns, report.boot_ms):
+            return None, ()
+        uav = report.uav
+        text = f"{uav}: track restarted: other nodes shared reports with another clock"
+        return None, (Notice(t_ns=report.t_ns, severity=Severity.WARNING, subject=uav, text=text),)
 
     def _errors(self, report: Report, made_ns: int, time_s: float) -> ReportNoise:
         """Return bounds on a report's errors, with the receiver's recent height difference.
@@ -472,13 +555,12 @@ class Senders:
     def _attitude(self, attitude: Attitude) -> FrameOutcome:
         carrier = str(attitude.source)
         sender = self._senders[carrier]
-        stamp, said = self._stamp(sender, carrier, attitude.t_ns, attitude.boot_ms)
+        clock = sender.own_clock
+        stamp, said = self._stamp(clock, carrier, attitude.t_ns, attitude.boot_ms)
+        sender.stamped_ns = attitude.t_ns
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
         return FrameOutcome(
-            message=placed,
-            outputs=said,
-            restarted=carrier if said else None,
-            change=sender.clock.change,
+            message=placed, outputs=said, restarted=carrier if said else None, change=clock.change
         )
 
     def may_begin(self, report: Report, always: bool) -> bool:
@@ -506,11 +588,10 @@ class Senders:
     # --- times ------------------------------------------------------------------------------
 
     def _stamp(
-        self, sender: Sender, name: str, arrival_ns: int, boot_ms: int, doubt_ns: int = 0
+        self, clock: SenderClock, name: str, arrival_ns: int, boot_ms: int, doubt_ns: int = 0
     ) -> tuple[Stamp | None, tuple[Notice, ...]]:
         """Place a stamp on the sender's timeline; return a notice if the stamp shows a reboot."""
-        stamp = sender.clock.observe(arrival_ns, boot_ms, doubt_ns)
-        sender.stamped_ns = arrival_ns
+        stamp = clock.observe(arrival_ns, boot_ms, doubt_ns)
         if stamp is None or not stamp.rebooted:
             return stamp, ()
         if kind_of(name).reports_itself and (source := Source.parse(name)) in self._components:
@@ -530,7 +611,7 @@ class Senders:
         Positions lag behind their stamps; attitudes do not.
         """
         sender = self._senders.get(vehicle)
-        return Timeline(sender.clock.reading() if sender else None, 0.0).time(node_ns)
+        return Timeline(sender.own_clock.reading() if sender else None, 0.0).time(node_ns)
 
     def timeline(self, uav: str) -> Timeline:
         """Return a UAV's own timeline as it is known now."""

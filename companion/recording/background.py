@@ -400,9 +400,11 @@ class BackgroundRecorder:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     def _give_up(self) -> None:
-        self.dropped += len(self._unflushed)
-        self.dropped += len(self._queue)
+        lost = len(self._unflushed) + len(self._queue)
+        self.dropped += lost
         self._queue.clear()
+        if lost:
+            self._tell(Severity.ERROR, f"the last {lost} events are not recorded: {self._why}")
 
     def _tell(self, severity: Severity, text: str) -> None:
         self._news.append((severity, text))

@@ -80,7 +80,7 @@ class ArraySettings(Section):
     field_of_view_deg: Annotated[float, Field(gt=0, le=360)] | None = None
     azimuth_limits_deg: Annotated[Interval, AfterValidator(_ascending)] | None = None
     elevation_limits_deg: Annotated[Interval, AfterValidator(_ascending)] | None = None
-    hidden_deg: tuple[HiddenSector, ...] = ()
+    hidden_deg: Annotated[tuple[HiddenSector, ...], Field(max_length=256)] = ()
     dead: Annotated[tuple[Annotated[int, Field(ge=0, le=4095)], ...], Field(max_length=4095)] = ()
     coupling: str | None = None
 

@@ -24,6 +24,10 @@ from companion.values.numbers import NPY_ERRORS
 DEFAULT_DESIGN: Final = "kinematic_default.json"
 LARGEST_BYTES: Final = 1 << 24
 """Largest file that is read, bytes: a codebook of 1024 elements and as many beams."""
+TEXT_BYTES: Final = 1 << 21
+"""Largest text: settings, or positions of 4096 elements. Parsed, it takes 50 times as much."""
+NAMED_TEXT_BYTES: Final = 1 << 22  # the same of a text that settings name, as a calibration
+NUMBERS_MAX: Final = 1 << 22  # most numbers of an array: 64 MB as complex ones
 
 
 def load(path: Path | None) -> Settings:
@@ -34,7 +38,7 @@ def load(path: Path | None) -> Settings:
     if path is None:
         return Settings()
     try:
-        text = read_file(path).decode("utf-8-sig")  # an editor may begin it with a mark
+        text = read_file(path, TEXT_BYTES).decode("utf-8-sig")  # an editor may begin it with a mark
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
     except UnicodeDecodeError as error:
@@ -82,14 +86,17 @@ def numbers_file(key: str, name: str, columns: int) -> FloatArray:
 
     Returns (n, k) with k >= ``columns``. Raises ``ConfigError`` that names ``key``.
     """
-    found = _npy_file(key, name, "fiu") if name.endswith(".npy") else _text_file(key, name)
+    if name.endswith(".npy"):
+        found = _npy(f"{key} = {name!r}", _bytes(key, name, TEXT_BYTES), "fiu")
+    else:
+        found = _text_file(key, name)
     if found.ndim != 2 or found.shape[1] < columns or not np.isfinite(found).all():
         raise ConfigError(f"{key} = {name!r}: each row must have {columns} or more finite numbers")
     return found.astype(np.float64)
 
 
 def _text_file(key: str, name: str) -> NDArray[Any]:
-    data = _bytes(key, name)
+    data = _bytes(key, name, TEXT_BYTES)
     try:
         lines = (
             line.split("#")[0].replace(",", " ").split()
@@ -102,12 +109,8 @@ def _text_file(key: str, name: str) -> NDArray[Any]:
         ) from error
 
 
-def _npy_file(key: str, name: str, kinds: str) -> NDArray[Any]:
-    """Read the array of a .npy file whose dtype kind is one of the letters in ``kinds``."""
-    return _npy(f"{key} = {name!r}", _bytes(key, name), kinds)
-
-
 def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
+    """Return the array of a .npy file whose dtype kind is one of the letters in ``kinds``."""
     try:
         found = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
     except MemoryError as error:
@@ -117,6 +120,8 @@ def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
         raise ConfigError(f"{where}: not a .npy file of numbers: {first}") from error
     if found.dtype.kind not in kinds:
         raise ConfigError(f"{where}: unsupported dtype {found.dtype}; save it as numbers")
+    if found.size > NUMBERS_MAX:
+        raise ConfigError(f"{where}: {found.size} numbers; at most {NUMBERS_MAX} are read")
     return found
 
 
@@ -156,7 +161,11 @@ def _content(settings: Settings, file: NamedFile) -> bytes | None:
     if path is None:
         return None
     held = settings.files.get(file.attachment)
-    return _bytes(file.setting, path) if held is None else held
+    most = LARGEST_BYTES if file.attachment.endswith(".npy") else NAMED_TEXT_BYTES
+    data = _bytes(file.setting, path, most) if held is None else held
+    if len(data) > most:
+        raise ConfigError(f"{_where(settings, file)}: larger than {most >> 20} MiB")
+    return data
 
 
 def _path(settings: Settings, file: NamedFile) -> str | None:
@@ -168,19 +177,19 @@ def _where(settings: Settings, file: NamedFile) -> str:
     return f"{file.setting} = {_path(settings, file)!r}"
 
 
-def _bytes(key: str, name: str) -> bytes:
+def _bytes(key: str, name: str, most: int = LARGEST_BYTES) -> bytes:
     try:
-        return read_file(Path(name))
+        return read_file(Path(name), most)
     except OSError as error:
         raise ConfigError(f"{key} = {name!r}: {error.strerror}") from error
 
 
-def read_file(path: Path) -> bytes:
-    """Return the content of a regular file. Raises ``OSError``, also if it is too large."""
+def read_file(path: Path, most: int = LARGEST_BYTES) -> bytes:
+    """Return the content of a regular file of at most so many bytes. Raises ``OSError``."""
     with open_regular(path) as file:
-        data = file.read(LARGEST_BYTES + 1)
-    if len(data) > LARGEST_BYTES:
-        raise OSError(errno.EFBIG, f"larger than {LARGEST_BYTES >> 20} MiB", str(path))
+        data = file.read(most + 1)
+    if len(data) > most:
+        raise OSError(errno.EFBIG, f"larger than {most >> 20} MiB", str(path))
     return data
 
 

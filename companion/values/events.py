@@ -42,7 +42,7 @@ class Tock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RoundTrip:
-    """TIMESYNC request of this node, with its answer."""
+    """TIMESYNC request of this node, or of another one of its fleet, with its answer."""
 
     t_ns: Annotated[int, Meaning("when the answer was received", 1)]
     source: Annotated[Source, Meaning("component that answered", 2)]
@@ -55,6 +55,7 @@ class RoundTrip:
             wire="sfixed64",
         ),
     ]
+    is_shared: Annotated[bool, Meaning("whether another node of the fleet measured it", 6)] = False
 
 
 DUTY_MAX: Final = 10_000  # most UAVs that a duty serves, and most that it protects

@@ -7,6 +7,7 @@ from collections.abc import Callable, Container
 import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common
+from sent_frames import position
 
 from companion.mavlink.trust.admission import KNOWN_MAX, admission
 from companion.pipeline.center import CarrierTracker
@@ -28,7 +29,6 @@ from companion.values import (
     Rejection,
     Report,
     ReportNoise,
-    RoundTrip,
     Source,
     Tick,
     Update,
@@ -170,7 +170,7 @@ def test_clocks_are_evicted_except_those_of_tracks() -> None:
     senders = new_senders("255:1", tracked)
     for number in range(RECORDS_MAX + 2 * DROPPED_TOGETHER):
         source = Source(255 - number % 256, 1 + number // 256)
-        senders.round_trip(RoundTrip(t_ns=2 * S, source=source, sent_ns=S, remote_ns=1))
+        senders.hear(position(2.0, str(source)))
         assert len(senders._senders) <= RECORDS_MAX
     assert tracked | {"255:1"} <= senders._senders.keys()
     assert str(source) in senders._senders
@@ -188,11 +188,7 @@ def test_every_track_keeps_its_clock_beyond_the_limit() -> None:
     senders = new_senders(None, everyone)
     many = RECORDS_MAX + 3 * DROPPED_TOGETHER
     for number in range(many):
-        senders.round_trip(
-            RoundTrip(
-                t_ns=2 * S, source=Source(number % 256, number // 256), sent_ns=S, remote_ns=1
-            )
-        )
+        senders.hear(position(2.0, str(Source(number % 256, number // 256))))
     assert len(senders._senders) == many
     assert everyone.asked < 4 * many  # the table is not scanned for each new sender
 

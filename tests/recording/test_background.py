@@ -410,7 +410,9 @@ def test_full_disk_is_reported_once_and_does_not_delay_shutdown(small_disk: Path
     assert time.monotonic() - began_s < 5
     kept = made._finished_messages + on_disk(made)  # written before all events were queued
     assert made.dropped == 2999 - kept
-    assert len(made.news()) == 1
+    (_, failed), (_, lost) = made.news()
+    assert failed.startswith("nothing is recorded: ")
+    assert lost == f"the last {made.dropped} events are not recorded: No space left on device"
     assert kept or [path.name for path in small_disk.iterdir()] == [BALLAST]
 
 

@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from io import StringIO
 from typing import Final, Self, TypeGuard
 
 import numpy as np
@@ -121,17 +122,19 @@ def parse_calibration(text: str) -> Calibration:
 
 def fields(text: str, header: str) -> Iterator[tuple[int, list[str]]]:
     """Yield number and fields of each non-empty line of a CSV text below ``header``."""
-    lines = text.splitlines()
-    if not lines or lines[0].strip() != header:
-        first = shown(lines[0] if lines else "")
-        raise UserError(f"line 1: {first} is not the header {header!r}")
+    lines = StringIO(text, newline=None)
+    first = lines.readline().rstrip("\n")
+    if first.strip() != header:
+        raise UserError(f"line 1: {shown(first)} is not the header {header!r}")
     columns = header.count(",") + 1
-    for number, line in enumerate(lines[1:], start=2):
-        if not line.strip(", \t"):
+    for number, line in enumerate(lines, start=2):
+        if not line.strip(", \t\n"):
             continue
         found = [field.strip() for field in line.split(",")]
         if len(found) != columns:
-            raise UserError(f"line {number}: {shown(line)} has {len(found)} fields, not {columns}")
+            raise UserError(
+                f"line {number}: {shown(line.rstrip())} has {len(found)} fields, not {columns}"
+            )
         yield number, found
 
 

@@ -9,6 +9,8 @@ level. With z = y / a the least-squares s and h are the first singular vectors o
 Young). Only ratios of h can be measured: phases are relative to element 0, gains to the mean in dB.
 """
 
+import cmath
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -30,6 +32,7 @@ from companion.beams.hardware.calibration import (
 from companion.values import ComplexArray, FloatArray, UserError
 
 MEASURED_HEADER: Final = "azimuth_deg,elevation_deg,channel,phase_deg,gain_db"
+DIRECTIONS_MAX: Final = 100_000  # most directions of a file: a sphere in steps of 0.6 degrees
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -66,9 +69,11 @@ def parse_responses(text: str) -> ChannelResponses:
         phase_deg = real(number, "phase_deg", row[3], PHASE_MAX_DEG)
         gain_db = real(number, "gain_db", row[4], GAIN_MAX_DB)
         channels = found.setdefault(towards, {})
+        if len(found) > DIRECTIONS_MAX:
+            raise UserError(f"line {number}: more than {DIRECTIONS_MAX} directions")
         if channel in channels:
             raise UserError(f"line {number}: channel {channel} appears twice at {towards}")
-        channels[channel] = 10 ** (gain_db / 20) * np.exp(1j * np.radians(phase_deg))
+        channels[channel] = cmath.rect(10 ** (gain_db / 20), math.radians(phase_deg))
     size = max((len(channels) for channels in found.values()), default=0)
     for towards, channels in found.items():
         missing = set(range(size)) - set(channels)

@@ -101,6 +101,14 @@ class SenderClock:
             sender_ns=x_ns, latency_s=latency_s, rebooted=placed.rebooted, oldest_ns=at_ns + low_ns
         )
 
+    def lateness_ns(self, arrival_ns: int, boot_ms: int) -> int | None:
+        """Return how much later a stamp arrived than the earliest; None before the first."""
+        line = self._line
+        if not line.floor:
+            return None
+        x_ns = line.unwrap(boot_ms)
+        return arrival_ns - x_ns - round(line.floor.at(x_ns))
+
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> None:
         """Add the stamp of any other message, if it lies on the line of the reports."""
         self.change = self._known = self._reading = None

@@ -3,12 +3,12 @@
 A vehicle may be received over any number of peers. A router forwards the same reports, a second
 telemetry port has its own stamps, and a restarted radio has another address: all of their reports
 lie on one path (``paths.py``). An autopilot that resets its position causes one or two
-contradictions; ``CONTRADICTIONS`` within ``KEPT_NS`` prove two senders, and both are rejected until
-they have agreed for that long. Unlike boot clocks (``clock/epochs.py``) and flight limits
-(``tracking/gate.py``), the path also exposes a sender that copies the clock and stays near.
+contradictions; ``CONTRADICTIONS`` within ``KEPT_NS`` prove two senders. Which of them is true is
+not known: the peer that came later is rejected until both have agreed for that long. Unlike boot
+clocks (``clock/epochs.py``) and flight limits (``tracking/gate.py``), the path also exposes a
+sender that copies the clock and stays near.
 
-The peers of links are judged by ``known_peers.py``; here no peer was first, as among nodes of a
-fleet.
+The peers of links are judged by ``known_peers.py``; here they are nodes of a fleet.
 """
 
 from collections import deque
@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.trust.paths import SLACK_M, Path
-from companion.mavlink.wire.positions import OWN, OwnPosition, read
+from companion.mavlink.wire.positions import OWN, read
 from companion.values import Frame
 
 CONTRADICTIONS: Final = 5
@@ -30,21 +30,27 @@ PEERS_MAX: Final = 4  # peers followed per sender, the most recent
 
 @dataclass(slots=True)
 class _PeerPath:
-    """Path of a sender over one peer."""
+    """Path of a sender over one peer, and the times at which it contradicted an earlier peer.
 
-    is_trusted: bool
+    rank  order among the peers of the sender: trusted ones come first
+    """
+
+    peer: str
+    rank: tuple[bool, int]
     heard_ns: int
     path: Path = field(default_factory=Path)
+    contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
+    contradicts: str = ""  # the first of the peers that it contradicted last
+    is_duplicate: bool = False
 
 
 @dataclass(slots=True, kw_only=True)
 class _SenderPaths:
-    """Paths of a sender by peer, and the times of their contradictions."""
+    """Paths of a sender by peer; ``peers`` counts all that there were."""
 
     heard_ns: int
+    peers: int = 0
     paths: dict[str, _PeerPath] = field(default_factory=dict)
-    contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
-    is_duplicate: bool = False
 
 
 class DuplicateIds:
@@ -57,25 +63,23 @@ class DuplicateIds:
         self._trusted = frozenset(trusted)
         self._senders: dict[tuple[int, int], _SenderPaths] = {}
 
-    def rejects(self, peer: str, frame: Frame) -> bool:
-        """Process a frame of ``decode.POSE``. Return whether it must be rejected."""
+    def rejects(self, peer: str, frame: Frame) -> str | None:
+        """Process a frame of ``decode.POSE``. Return the peer because of which it is rejected."""
         sender = self._senders.get(frame.source)
         if sender is None:
             sender = self._follow(frame)
             if sender is None:
-                return False
+                return None
         sender.heard_ns = frame.t_ns
         path = sender.paths.get(peer)
         if path is None:
             path = self._add_peer(sender, peer, frame.t_ns)
         path.heard_ns = frame.t_ns
         if len(sender.paths) == 1:
-            return False
-        if frame.msgid in OWN and self._contradicts(sender, path, read(frame)):
-            when = sender.contradicted_ns
-            if not when or frame.t_ns - when[-1] >= SPACED_NS:
-                when.append(frame.t_ns)
-        return self._is_duplicate(frame, sender) and not path.is_trusted
+            return None
+        if frame.msgid in OWN:
+            self._compare(sender, path, frame)
+        return path.contradicts if self._is_duplicate(frame.t_ns, path) else None
 
     def _follow(self, frame: Frame) -> _SenderPaths | None:
         """Start to follow a sender; None if ``SENDERS_MAX`` is reached."""
@@ -92,28 +96,33 @@ class DuplicateIds:
         for name in [name for name, path in paths.items() if t_ns - path.heard_ns > KEPT_NS]:
             del paths[name]
         if len(paths) >= PEERS_MAX:
-            others = [name for name, path in paths.items() if not path.is_trusted]
-            del paths[min(others or paths, key=lambda name: paths[name].heard_ns)]
-        return paths.setdefault(peer, _PeerPath(peer in self._trusted, t_ns))
+            del paths[max(paths, key=lambda name: paths[name].rank)]
+        rank = peer not in self._trusted, sender.peers
+        sender.peers += 1
+        return paths.setdefault(peer, _PeerPath(peer, rank, t_ns))
 
-    def _contradicts(self, sender: _SenderPaths, path: _PeerPath, said: OwnPosition) -> bool:
-        """Add a report to its path. Return whether it contradicts that of another peer."""
-        before = path.path.newest
+    def _compare(self, sender: _SenderPaths, path: _PeerPath, frame: Frame) -> None:
+        """Add a report to its path; note with which other paths it is in contradiction."""
+        before, said = path.path.newest, read(frame)
         if not path.path.add(said):
-            return False
-        others = [
-            other.path
-            for other in sender.paths.values()
-            if other is not path and not (other.is_trusted and path.is_trusted)
-        ]
-        excesses = [path.path.excess_m(other, before, said) for other in others]
-        return any(excess is not None and excess > SLACK_M for excess in excesses)
+            return
+        for other in sorted(sender.paths.values(), key=lambda one: one.rank, reverse=True):
+            excess_m = None if other is path else path.path.excess_m(other.path, before, said)
+            if excess_m is None or excess_m <= SLACK_M:
+                continue
+            first, later = sorted((path, other), key=lambda one: one.rank)
+            if not later.rank[0]:  # both are trusted
+                continue
+            later.contradicts = first.peer
+            when = later.contradicted_ns
+            if not when or frame.t_ns - when[-1] >= SPACED_NS:
+                when.append(frame.t_ns)
 
-    def _is_duplicate(self, frame: Frame, sender: _SenderPaths) -> bool:
-        """Return whether a sender's peers contradict each other, and have not agreed since."""
-        when = sender.contradicted_ns
-        while when and frame.t_ns - when[0] > KEPT_NS:
+    def _is_duplicate(self, now_ns: int, path: _PeerPath) -> bool:
+        """Return whether a peer contradicts an earlier one, and has not agreed with it since."""
+        when = path.contradicted_ns
+        while when and now_ns - when[0] > KEPT_NS:
             when.popleft()
-        enough = 1 if sender.is_duplicate else CONTRADICTIONS
-        sender.is_duplicate = len(when) >= enough
-        return sender.is_duplicate
+        enough = 1 if path.is_duplicate else CONTRADICTIONS
+        path.is_duplicate = len(when) >= enough
+        return path.is_duplicate

@@ -19,12 +19,15 @@ from companion.values import Reason, Rejection
 
 DOCUMENT_MAX: Final = 8 << 20  # largest document, bytes: some 10 000 aircraft
 AIRCRAFT_MAX: Final = 10_000  # most aircraft read from a document, and remembered
-BRACKETS_MAX: Final = 10 * AIRCRAFT_MAX
-"""Most objects and lists in a document; an aircraft has four. Each takes 70 bytes when parsed."""
+HEAD_MAX: Final = 16 << 10  # most bytes of a document without its aircraft
+ENTRY_MAX: Final = 8 << 10  # most bytes of an aircraft; readsb writes up to 1.2 kB
 AT_ONCE: Final = 8  # aircraft returned by one call; tracking one takes up to 0.3 ms
 AGE_ROUNDING_S: Final = 0.05  # largest error of an age in tenths of seconds
 TRANSPONDER_LATENCY_S: Final = 0.6
 """Largest age of a position as it is sent (14 CFR 91.227(e), uncompensated latency)."""
+_LIST: Final = re.compile(rb'"aircraft"\s*:\s*\[\s*')
+_BETWEEN: Final = re.compile(rb"\s*(?:,\s*|\Z)")
+_DECODER: Final = json.JSONDecoder()
 _ICAO: Final = re.compile(r"[0-9A-Fa-f]{6}")
 _NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s", "mode_ac")
 """Types of aircraft that do not report their position themselves."""
@@ -33,8 +36,9 @@ _NOT_SEEN: Final = ("mlat", "tisb_icao", "tisb_trackfile", "tisb_other", "mode_s
 class AircraftJson(ForeignSplitter):
     """Converter of documents to frames; ``feed`` takes a whole one and returns what changed.
 
-    It returns ``AT_ONCE`` aircraft, and each call without bytes the next ones. All have the arrival
-    time of their document. ``requested`` is called when a document is requested.
+    It parses ``AT_ONCE`` aircraft, and each call without bytes the next ones, since a document of
+    8 MB may take a second. All have the arrival time of their document. ``requested`` is called
+    when a document is requested.
     """
 
     def __init__(self, link: str) -> None:
@@ -43,7 +47,8 @@ class AircraftJson(ForeignSplitter):
         self._stated_s = 0.0  # time of the newest document, by its server
         self._written = Written(0, 0)
         self._arrived_ns = 0
-        self._rest = list[object]()  # aircraft of the newest document, the next one last
+        self._rest = b""  # list of the newest document's aircraft
+        self._at = self._read = 0  # bytes and aircraft of it that are parsed
         self._true_at: OrderedDict[int, float] = OrderedDict()  # by ICAO address
 
     @property
@@ -62,31 +67,46 @@ class AircraftJson(ForeignSplitter):
         return items + self._garbage(t_ns)
 
     def _parse(self, t_ns: int, data: bytes) -> Items:
-        unplaced = self._read(t_ns, data) if data or not self._rest else []
+        unplaced = self._begin(t_ns, data) if data or not self._rest else []
         if unplaced:
             return unplaced
-        if self._rest and self._is_skipped(len(self._rest)):
-            self._rest.clear()
+        if self._rest and self._is_skipped(self._left()):
+            self._rest = b""
             return []
         items: Items = []
-        for _ in range(min(AT_ONCE, len(self._rest))):
-            items += self._one(self._rest.pop())
+        for _ in range(AT_ONCE):
+            if not self._rest:
+                break
+            items += self._next()
         return items
 
-    def _read(self, t_ns: int, data: bytes) -> Items:
-        """Read a document; an unusable one is garbage, and one of unknown age is rejected."""
-        self._rest.clear()
+    def _left(self) -> int:
+        """Return the number of aircraft that are not parsed yet."""
+        return min(self._rest.count(b'"hex"', self._at), AIRCRAFT_MAX - self._read)
+
+    def _next(self) -> Items:
+        """Parse one aircraft; what follows a malformed or endless one is garbage."""
+        piece = self._rest[self._at : self._at + ENTRY_MAX]
         try:
-            if len(data) > DOCUMENT_MAX or data.count(b"[") + data.count(b"{") > BRACKETS_MAX:
-                raise ValueError(f"{len(data)} bytes")
-            document = json.loads(data)
-            if not isinstance(document, dict):
-                raise ValueError("not a JSON object")
-            stated_s = _number(document, "now", 0, 1e11)
-            aircraft = document["aircraft"]
-            if stated_s is None or not isinstance(aircraft, list):
-                raise ValueError("no time, or no aircraft")
-        except (ValueError, KeyError, RecursionError):
+            entry, size = _DECODER.raw_decode(piece.decode("latin-1"))  # a character a byte
+            between = _BETWEEN.match(self._rest, self._at + size)
+            if between is None:
+                raise ValueError("no comma")
+        except (ValueError, RecursionError):
+            self._stray += len(self._rest) - self._at
+            self._rest = b""
+            return []
+        self._at, self._read = between.end(), self._read + 1
+        if self._at == len(self._rest) or self._read == AIRCRAFT_MAX:
+            self._rest = b""
+        return self._one(entry)
+
+    def _begin(self, t_ns: int, data: bytes) -> Items:
+        """Read a document; an unusable one is garbage, and one of unknown age is rejected."""
+        self._rest, self._at, self._read = b"", 0, 0
+        try:
+            stated_s, aircraft = _split(data)
+        except (ValueError, RecursionError):
             self._stray += len(data) or 1
             return []
         self._complete += 1
@@ -97,15 +117,17 @@ class AircraftJson(ForeignSplitter):
             self.too_late = f"documents are {LATE_TEXT}"
         if written is not None:
             self._stated_s, self._written, self._arrived_ns = stated_s, written, t_ns
-            self._rest = aircraft[AIRCRAFT_MAX - 1 :: -1]
+            self._rest = aircraft
         elif is_new and aircraft:
+            self._rest = aircraft
+            count, self._rest = max(1, self._left()), b""
             return [
                 Rejection(
                     t_ns=t_ns,
                     source=self.link,
                     reason=Reason.UNPLACED_STAMP,
                     msgid=ADSB_VEHICLE,
-                    count=len(aircraft),
+                    count=count,
                     detail="age of the document is unknown",
                 )
             ]
@@ -139,6 +161,26 @@ class AircraftJson(ForeignSplitter):
         if len(self._true_at) > AIRCRAFT_MAX:
             self._true_at.popitem(last=False)
         return before is None or not before - 60 < true_at <= before + 0.15
+
+
+def _split(data: bytes) -> tuple[float, bytes]:
+    """Return a document's time, and the text of the list of its aircraft.
+
+    Raises ``ValueError`` or ``RecursionError`` for anything else.
+    """
+    found = _LIST.search(data)
+    end = data.rfind(b"]")
+    if found is None or end < found.end() or len(data) > DOCUMENT_MAX:
+        raise ValueError("no aircraft")
+    if found.end() + len(data) - end > HEAD_MAX:
+        raise ValueError("too long without its aircraft")
+    document = json.loads(data[: found.end()] + data[end:])
+    if not isinstance(document, dict) or document.get("aircraft") != []:
+        raise ValueError("not an object with a list of aircraft")
+    stated_s = _number(document, "now", 0, 1e11)
+    if stated_s is None:
+        raise ValueError("no time")
+    return stated_s, data[found.end() : end]
 
 
 def _aircraft_state(entry: object) -> AircraftState | str | None:

@@ -164,6 +164,7 @@ class Drive:
         self._now_ns = now_ns
         self._report = say
         self._open = False
+        self._stop = threading.Event()
         self._again_ns = 0
         self._resting: str | None = None
         self.device_error: str | None = None  # why the device does not work
@@ -177,7 +178,7 @@ class Drive:
 
     def run(self, stop: threading.Event) -> None:
         """Apply updates until ``stop`` is set; then put the device into its safe state."""
-        due_ns = self._now_ns()
+        due_ns, self._stop = self._now_ns(), stop
         try:
             while not stop.is_set():
                 self.step()
@@ -228,6 +229,8 @@ class Drive:
             if command.unfit is not None:
                 self._rest(command.unfit)
                 return
+            if self._stop.is_set():
+                return
             self._device.apply(command)
         except DeviceError as error:
             self._handle_failure(error)
@@ -245,6 +248,10 @@ class Drive:
             self._resting = None
             self._say("beams are applied")
 
+    def report_unsafe(self) -> None:
+        """Report that the device was left as it is; for calls on another thread."""
+        self._say("the device has not answered: it may not be in its safe state")
+
     def end(self) -> None:
         """Put the device into its safe state, and close it."""
         if self._open:
@@ -254,6 +261,8 @@ class Drive:
                 self._say(f"the device did not go to its safe state: {error}")
             self._device.close()
             self._open = False
+        elif self.device_error is not None:
+            self._say(f"the device did not go to its safe state: {self.device_error}")
 
     @property
     def lead_s(self) -> float:

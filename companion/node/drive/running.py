@@ -11,7 +11,7 @@ from companion.node.drive.loop import Drive, DriveStatus
 from companion.node.signals import ENDS
 
 STATUS_EVERY_S: Final = 1.0
-ENDS_S: Final = 5.0  # time limit for a device to reach its safe state at the end
+ENDS_S: Final = 4.0  # time limit for a device to reach its safe state at the end
 
 
 def run_until_stopped(
@@ -48,6 +48,8 @@ def run_until_stopped(
     finally:  # also if nobody can be shown anything any more
         stop.set()
         thread.join(ENDS_S)
+        if thread.is_alive():
+            drive.report_unsafe()
     if failed:
         raise failed[0]
     return bool(received)
@@ -72,6 +74,8 @@ async def run_in_thread(drive: Drive) -> None:
     finally:
         stop.set()
         await asyncio.to_thread(thread.join, ENDS_S)
+        if thread.is_alive():
+            drive.report_unsafe()
     if failed:
         raise failed[0]
 

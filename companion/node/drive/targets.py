@@ -48,14 +48,14 @@ def device(
     match kind:
         case "rotctld":
             host, _, port = where.rpartition(":")
-            if host and port.isdecimal() and 0 < int(port) < 65536:
+            if _is_host(host) and port.isdecimal() and 0 < int(port) < 65536:
                 from companion.node.drive.rotctld import Rotator
 
                 return Rotator(host.strip("[]"), int(port))
         case "gimbal" | "gimbal-roi":
             found = _GIMBAL.fullmatch(where)
             numbers = [int(one) for one in found.groups()[1:]] if found else []
-            if found and 0 < numbers[0] < 65536 and max(numbers[1:]) < 256:
+            if found and _is_host(found[1]) and 0 < numbers[0] < 65536 and max(numbers[1:]) < 256:
                 from companion.node.drive.gimbal import Gimbal, RoiGimbal
 
                 made = Gimbal if kind == "gimbal" else RoiGimbal
@@ -81,6 +81,15 @@ def device(
     meant = f"; did you mean {FORMS[near[0]]}?" if near else ""
     known = ", ".join(f"{one}:" for one in FORMS)
     raise UserError(f"{shown(target)} is not a device; give one of {known}{meant}")
+
+
+def _is_host(name: str) -> bool:
+    """Return whether the resolver takes a name; others would be a defect of the thread."""
+    try:
+        name.encode("idna")
+    except UnicodeError:
+        return False
+    return bool(name)
 
 
 class DryRun(Device):

@@ -100,7 +100,7 @@ class LiveFleetNode:
         self._decided_ns = self._started_ns  # when a standing last caused a decision
         self._listening: Listening | None = None
         self._slices: ToLoop | None = None  # pieces of messages of frames
-        self._waiting = 0  # frames in them
+        self._waiting = 0  # frames and round trips in them
         patience_s = max(PATIENCE_S, PATIENCE_LEASES * settings.lease_s)
         self._unanswered = Unanswered(round(patience_s * 1e9))
 
@@ -341,25 +341,25 @@ class LiveFleetNode:
         return taken
 
     def _shared(self, node: str, payload: bytes) -> None:
-        """Process a few frames at once, and the others in slices, in the order of arrival."""
+        """Process a few items at once, and the others in slices, in the order of arrival."""
         said = messages.to_shared(payload)
+        frames, trips = said.frames, said.trips
         if self._waiting > WAITING_MAX:
-            self.member.reception.unusable += len(said.frames)
+            self.member.reception.unusable += len(frames) + len(trips)
             return
-        starts = range(0, max(len(said.frames), 1), PIECE)
         pieces = [
-            Shared(said.told_ns, said.frames[at : at + PIECE], () if at else said.trips)
-            for at in starts
+            Shared(said.told_ns, frames[at : at + PIECE], trips[at : at + PIECE])
+            for at in range(0, max(len(frames), len(trips), 1), PIECE)
         ]
         if not self._waiting:
             self._take_piece(node, pieces.pop(0))
         if self._slices is not None:
             for piece in pieces:
-                self._waiting += len(piece.frames)
+                self._waiting += len(piece.frames) + len(piece.trips)
                 self._slices.post(partial(self._take_waiting, node, piece))
 
     def _take_waiting(self, node: str, piece: Shared) -> None:
-        self._waiting -= len(piece.frames)
+        self._waiting -= len(piece.frames) + len(piece.trips)
         self._take_piece(node, piece)
 
     def _take_piece(self, node: str, piece: Shared) -> None:

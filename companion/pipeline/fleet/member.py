@@ -179,8 +179,7 @@ class FleetMember:
                 self.sharing.note_shared(now_ns, node, frame.source, key, way_ns)
             events += self.reception.take_shared(now_ns, node, frame, key)
         for trip in said.trips:
-            silent_s = self.reception.silent_s(str(trip.source), now_ns - self.reception.behind_ns)
-            if silent_s is not None and silent_s <= 1.0:
+            if not self.reception.uses_trip(now_ns, trip.source):
                 continue
             placed = here(now_ns, trip, known.clock)
             if placed is None:
@@ -198,10 +197,13 @@ class FleetMember:
             )
         for node in self.reception.contradicted:
             notices += self.trust.note_contradiction(
-                now_ns, node, "shares reports that contradict those of other nodes"
+                now_ns, node, "shares reports that contradict those received here"
             )
+        for uav, node, first in self.reception.disputed:
+            notices += self.trust.note_dispute(now_ns, uav, node, first)
         self.reception.early.clear()
         self.reception.contradicted.clear()
+        self.reception.disputed.clear()
         return notices
 
     def take_standing(self, now_ns: int, said: Standing) -> bool:

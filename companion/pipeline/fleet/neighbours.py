@@ -12,7 +12,7 @@ limit.
 
 import math
 from collections import deque
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Final
 
 from companion.mavlink.clock.evidence import DriftProven, Interval, OffsetEvidence
@@ -141,4 +141,4 @@ def here(now_ns: int, trip: RoundTrip, clock: NeighbourClock) -> RoundTrip | Non
     t_ns, sent_ns = trip.t_ns + received.high_ns, trip.sent_ns + sent.low_ns
     if min(sent_ns, t_ns) < max(now_ns - OLDEST_NS, 0) or max(sent_ns, t_ns) > now_ns + OLDEST_NS:
         return None
-    return RoundTrip(t_ns=t_ns, source=trip.source, sent_ns=sent_ns, remote_ns=trip.remote_ns)
+    return replace(trip, t_ns=t_ns, sent_ns=sent_ns, is_shared=True)

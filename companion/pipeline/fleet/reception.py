@@ -25,6 +25,7 @@ SILENT_INTERVALS: Final = 2.5
 """Report intervals without a report after which a vehicle is silent at this node."""
 SILENT_NS: Final = (200_000_000, 2_000_000_000)  # least and largest time for that
 MISSED: Final = 64  # shared reports kept per vehicle that were not received here
+TRIPS_NS: Final = 250_000_000  # least time between two round trips of a vehicle that are used
 VEHICLES_MAX: Final = 4096
 """Limit on vehicles with a record; beyond it, shared reports are used without a check."""
 FUTURE_NS: Final = 1_000_000
@@ -69,8 +70,9 @@ class _VehicleReception:
 class Reception:
     """Reception of frames, and selection of the shared frames for the pipeline.
 
-    ``contradicted`` and ``early`` contain names of nodes whose frames contradict those of this or
-    another node, or arrive before they can have been received; the reader clears them.
+    ``contradicted`` and ``early`` contain names of nodes whose frames contradict those of this
+    node, or arrive before they can have been received; ``disputed`` the vehicles about which a node
+    contradicts another one, with both names, the later one first. The reader clears them.
     ``behind_ns`` is the age of this node's newest frame when it was read: a vehicle whose reports
     are still queued here is not silent. Otherwise an overloaded node would also use all shared
     frames, and be more overloaded. ``unusable`` counts shared frames and round trips that
@@ -79,6 +81,7 @@ class Reception:
 
     def __init__(self) -> None:
         self.contradicted: list[str] = []
+        self.disputed: list[tuple[str, str, str]] = []
         self.early: list[str] = []
         self.behind_ns = 0
         self.unusable = 0
@@ -86,6 +89,7 @@ class Reception:
         self._shared = RecentFrames()
         self._vehicles: dict[Source, _VehicleReception] = {}
         self._duplicate_ids = DuplicateIds({OWN_NODE})
+        self._trips_ns: dict[Source, int] = {}  # newest used, of vehicles whose reports are shared
 
     def take_received(self, frame: Frame) -> bytes:
         """Process a frame, of a message in ``SHARED``, received here. Returns its content."""
@@ -93,6 +97,7 @@ class Reception:
         if frame.msgid not in OWN:
             return key
         self._heard.note(frame.t_ns, key)
+        self._trips_ns.pop(frame.source, None)
         self._duplicate_ids.rejects(OWN_NODE, frame)
         vehicle = self._vehicles.get(frame.source)
         if vehicle is None:
@@ -140,7 +145,7 @@ class Reception:
             source=source,
             msgid=msgid,
             raw=raw,
-            doubt_ns=t_ns - least_ns,
+            doubt_ns=max(1, t_ns - least_ns),  # 0 would be a frame of this node
         )
 
     def was_shared(self, key: bytes) -> bool:
@@ -158,19 +163,38 @@ class Reception:
         is_new = self._shared.note(now_ns, key)
         if key in self._heard or not is_new:
             return []
-        is_refused = self._duplicate_ids.rejects(node, frame)
-        if is_refused:
+        contradicts = self._duplicate_ids.rejects(node, frame)
+        if contradicts == OWN_NODE:
             self.contradicted.append(node)
+            return []
+        if contradicts is not None:
+            self.disputed.append((str(frame.source), node, contradicts))
             return []
         vehicle = self._vehicles.get(frame.source)
         if vehicle is None:
+            self._note_use(frame.source)
             return [frame]
         vehicle.missed.append(frame)
         if not vehicle.is_silent(now_ns - self.behind_ns):
             return []
         missed = [one for one in vehicle.missed if one.t_ns > vehicle.heard_ns]
         vehicle.missed.clear()
+        if missed:
+            self._note_use(frame.source)
         return missed
+
+    def _note_use(self, source: Source) -> None:
+        """Note that a shared report of a vehicle is used."""
+        if source in self._trips_ns or len(self._trips_ns) < VEHICLES_MAX:
+            self._trips_ns.setdefault(source, 0)
+
+    def uses_trip(self, now_ns: int, source: Source) -> bool:
+        """Return whether a shared round trip of a vehicle is used: if its shared reports are."""
+        newest_ns = self._trips_ns.get(source)
+        if newest_ns is None or now_ns - newest_ns < TRIPS_NS:
+            return False
+        self._trips_ns[source] = now_ns
+        return True
 
     def silent_s(self, uav: str, now_ns: int) -> float | None:
         """Return the age of a vehicle's last report received by this node; None: never received."""
@@ -179,4 +203,5 @@ class Reception:
 
     def forget(self, now_ns: int, after_ns: int) -> None:
         """Forget vehicles that this node has not received for a given time."""
+        self._trips_ns.clear()  # a vehicle whose reports are still shared is noted again
         self._vehicles = {k: v for k, v in self._vehicles.items() if now_ns - v.heard_ns < after_ns}

@@ -4,10 +4,13 @@ A node is excluded if it
 
 - shares frames before they can have been received, by the bounds on its clock;
 - has an inconsistent clock: repeated round trips that no drift explains;
-- shares reports that contradict those received here or by other nodes;
+- shares reports that contradict those received here;
 - shares vehicles that only it receives, at positions where others receive everything: at least
   ``PHANTOMS_MIN`` of them for ``PHANTOM_AFTER_NS``, and most of what it receives. A few such
   vehicles may be hidden by an obstacle: they cause a notice and stay unconfirmed.
+
+Two nodes that contradict each other, about a vehicle that is not received here, are not excluded:
+either may be wrong. The one whose reports came first is used, with a notice.
 """
 
 import math
@@ -25,6 +28,7 @@ EXCLUDED_NS: Final = 300_000_000_000  # duration of an exclusion
 PHANTOMS_MIN: Final = 2  # number of phantom vehicles from which on their node is excluded
 PHANTOM_AFTER_NS: Final = 8_000_000_000
 """Time without reception elsewhere after which a vehicle counts as a phantom."""
+DISPUTED_NS: Final = 60_000_000_000  # least time between two notices about a vehicle's dispute
 REACH_SHARE: Final = 0.7
 """Fraction of a node's range within which it receives every vehicle."""
 
@@ -54,6 +58,7 @@ class Trust:
         self._times: dict[tuple[str, str], deque[int]] = {}
         self._unconfirmed_since: dict[str, tuple[str, int]] = {}
         self._notified: set[str] = set()
+        self._disputed_ns: dict[str, int] = {}  # newest notice about a vehicle
 
     def is_trusted(self, node: str) -> bool:
         """Return whether the messages of a node are used."""
@@ -66,6 +71,14 @@ class Trust:
         if len(times) < CONTRADICTIONS or now_ns - times[0] > CONTRADICTION_WINDOW_NS:
             return []
         return self._exclude(now_ns, node, what)
+
+    def note_dispute(self, now_ns: int, uav: str, node: str, first: str) -> list[Notice]:
+        """Note that reports of a node contradict those of the first node that shared a vehicle."""
+        if now_ns - self._disputed_ns.get(uav, -DISPUTED_NS) < DISPUTED_NS:
+            return []
+        self._disputed_ns[uav] = now_ns
+        what = f"contradicts node {first} about {uav}; {first} shared it first, and is believed"
+        return [_notice(now_ns, node, what, Severity.WARNING)]
 
     def check_vehicles(
         self,
@@ -117,6 +130,10 @@ class Trust:
         """Forget contradictions that have expired."""
         before_ns = now_ns - CONTRADICTION_WINDOW_NS
         self._times = {what: times for what, times in self._times.items() if times[-1] > before_ns}
+        before_ns = now_ns - DISPUTED_NS
+        self._disputed_ns = {
+            k: at_ns for k, at_ns in self._disputed_ns.items() if at_ns > before_ns
+        }
 
     def readmit(self, now_ns: int) -> list[Notice]:
         """Trust nodes again whose exclusion has expired."""

@@ -2,6 +2,7 @@
 
 import json
 import math
+import time
 from typing import Any
 
 import pytest
@@ -12,8 +13,9 @@ from pymavlink.dialects.v20 import all as dialect
 from companion.mavlink.wire.aircraft_json import (
     AIRCRAFT_MAX,
     AT_ONCE,
-    BRACKETS_MAX,
     DOCUMENT_MAX,
+    ENTRY_MAX,
+    HEAD_MAX,
     TRANSPONDER_LATENCY_S,
     AircraftJson,
 )
@@ -166,13 +168,40 @@ def test_malformed_aircraft_is_rejected_and_others_are_read(changed: Any) -> Non
         b"", b"<html>", b"[]", b"{}", b'{"now": 1}', b'{"now": 1, "aircraft": 5}', b"\xff\xfe",
         b"[" * 100_000, b'{"now": ' + b"9" * 5000 + b"}", b'{"now": NaN, "aircraft": []}',
         b'{"now": true, "aircraft": []}', b"null", b" " * (DOCUMENT_MAX + 1),
-        b'{"now": 1, "aircraft": [' + b"{}," * BRACKETS_MAX + b"{}]}",
+        b'{"now": 1, "x": "' + b"x" * HEAD_MAX + b'", "aircraft": []}',
+        b'{"now": 1, "aircraft": [{}',
     ],
-    ids=range(14),
+    ids=range(15),
 )  # fmt: skip
 def test_invalid_document_is_counted_in_bytes(data: bytes) -> None:
     (found,) = AircraftJson("x").feed(7, data)
     assert found == Rejection(t_ns=7, source="x", reason=Reason.GARBAGE, count=len(data) or 1)
+
+
+@pytest.mark.parametrize(
+    "entry",
+    [
+        b'{"hex":"' + b"x" * ENTRY_MAX + b'"}',
+        b'{"0":1,' + b'"1":1,' * 800_000 + b'"1":1}',
+        b"[" * 100_000,
+        b"5x",
+        b"{} {}",
+        b"",
+    ],
+    ids=["long", "many keys", "nested", "no comma", "two", "none"],
+)
+def test_aircraft_after_a_malformed_one_are_garbage(entry: bytes) -> None:
+    """It is not parsed whole: 8 MB of keys took a second, in which no beam was computed."""
+    poll, one = polling(), json.dumps(ONE).encode()
+    data = b'{"now": 1.1, "aircraft": [%b, %b, %b]}' % (one, entry, one)
+    started_s = time.process_time()
+    found = poll.feed(7, data)
+    while poll.has_more:
+        found += poll.feed(7, b"")
+    assert time.process_time() - started_s < 0.2
+    frame, *rest = found
+    assert isinstance(frame, Frame)
+    assert [one.reason for one in rest if isinstance(one, Rejection)][-1:] == [Reason.GARBAGE]
 
 
 def test_too_many_aircraft_use_bounded_memory() -> None:

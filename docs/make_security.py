@@ -262,7 +262,7 @@ WAYS: Final = (
     WayIn(
         name="settings and calibrations",
         covers=("file:toml", "file:json", "file:calibration", "file:npz", "file:pickle"),
-        size=f"{kb(files.LARGEST_BYTES)} of settings; {kb(phaser_pickles.LARGEST_BYTES)} of a pickle",
+        size=f"{kb(files.TEXT_BYTES)} of settings, {kb(files.NAMED_TEXT_BYTES)} of another text, {kb(files.LARGEST_BYTES)} of an array; {kb(phaser_pickles.LARGEST_BYTES)} of a pickle",
         items=f"{codebooks.ENTRIES_MAX} weights of a codebook",
         work="linear in the text",
         over="rejected in one line",

@@ -18,7 +18,7 @@ from companion.beams.weights.precoding import Precoder
 from companion.beams.worth.link_budget import LinkBudget
 from companion.pipeline import assembly
 from companion.settings.center import FixedCenter, HomeCenter, VehicleCenter, parse_center
-from companion.settings.files import load, matrix_of
+from companion.settings.files import embedded, load, matrix_of
 from companion.settings.model import CODEBOOK, COUPLING, BeamSettings, Settings
 from companion.settings.section import ConfigError
 from companion.settings.tracking import ObserverSettings
@@ -445,6 +445,29 @@ def test_mark_of_an_editor_is_no_part_of_the_settings(tmp_path: Path) -> None:
     config = tmp_path / "settings.toml"
     config.write_bytes(b"\xef\xbb\xbf[beams]\nupdate_hz = 7\n")
     assert load(config).beams.update_hz == 7
+
+
+@pytest.mark.parametrize(
+    ("text", "content", "said"),
+    [
+        ("[array]\nkind = 'list'\npositions = 'x.csv'", b"1 1 1\n" * 400_000, "larger than 2 MiB"),
+        ("[array]\nkind = 'list'\npositions = 'x.npy'", bytes(3 << 20), "larger than 2 MiB"),
+        ("[hardware]\ncalibration = 'x.csv'", b"\n" * (5 << 20), "larger than 4 MiB"),
+        ("[observer]\ndesign = 'x.json'", b"[" * (5 << 20), "larger than 4 MiB"),
+        ("[array]\nelements = 513\ncoupling = 'x.npy'", b"", "at most 512"),
+    ],
+    ids=["rows", "array", "calibration", "design", "coupling"],
+)
+def test_large_files_are_rejected_before_they_are_parsed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str, content: bytes, said: str
+) -> None:
+    """Positions of 16 MB took 1.6 GB, and the condition of a large coupling matrix a minute."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / re.search(r"x\.\w+", text)[0]).write_bytes(content)  # type: ignore[index]
+    (tmp_path / "settings.toml").write_text(text)
+    with pytest.raises(ConfigError, match=said) as error:
+        assembly.array(embedded(load(tmp_path / "settings.toml")))
+    assert "\n" not in str(error.value)
 
 
 def test_pipe_in_place_of_settings_is_not_opened(tmp_path: Path) -> None:

@@ -103,11 +103,8 @@ class SenderClock:
 
     def lateness_ns(self, arrival_ns: int, boot_ms: int) -> int | None:
         """Return how much later a stamp arrived than the earliest; None before the first."""
-        line = self._line
-        if not line.floor:
-            return None
-        x_ns = line.unwrap(boot_ms)
-        return arrival_ns - x_ns - round(line.floor.at(x_ns))
+        x_ns, floor = self._line.unwrap(boot_ms), self._line.floor
+        return arrival_ns - x_ns - round(floor.at(x_ns)) if floor else None
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> None:
         """Add the stamp of any other message, if it lies on the line of the reports."""

@@ -28,7 +28,7 @@ SENDERS_MAX: Final = 4096  # senders followed; new ones beyond it are not follow
 PEERS_MAX: Final = 4  # peers followed per sender, the most recent
 
 
-@dataclass(slots=True)
+@dataclass(slots=True, kw_only=True)
 class _PeerPath:
     """Path of a sender over one peer, and the times at which it contradicted an earlier peer.
 
@@ -99,7 +99,7 @@ class DuplicateIds:
             del paths[max(paths, key=lambda name: paths[name].rank)]
         rank = peer not in self._trusted, sender.peers
         sender.peers += 1
-        return paths.setdefault(peer, _PeerPath(peer, rank, t_ns))
+        return paths.setdefault(peer, _PeerPath(peer=peer, rank=rank, heard_ns=t_ns))
 
     def _compare(self, sender: _SenderPaths, path: _PeerPath, frame: Frame) -> None:
         """Add a report to its path; note with which other paths it is in contradiction."""

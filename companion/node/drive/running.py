@@ -62,7 +62,8 @@ async def run_in_thread(drive: Drive) -> None:
 
     def run() -> None:
         _run(drive, stop, failed)
-        loop.call_soon_threadsafe(ended.set)
+        with contextlib.suppress(RuntimeError):  # nobody waited for the device, and the loop ended
+            loop.call_soon_threadsafe(ended.set)
 
     thread = threading.Thread(target=run, name="drive", daemon=True)
     thread.start()

@@ -108,6 +108,10 @@ def test_residual_calibration_error_is_bounded_and_reported() -> None:
             "line 2: gain_db '-1e6' is not between -1000 and 1000",
         ),
         (f"{MEASURED_HEADER}\n1e300,0,0,0,0\n", "azimuth_deg '1e300' is not between"),
+        (
+            "\n".join([MEASURED_HEADER, *(f"{n},0,0,0,0" for n in range(-50_000, 50_001))]),
+            "more than 100000 directions",
+        ),
     ],
 )
 def test_invalid_responses_are_rejected(text: str, said: str) -> None:

@@ -709,6 +709,78 @@ def test_running_drive_reports_a_device_that_hangs(monkeypatch: pytest.MonkeyPat
     assert reported.is_set()
 
 
+@pytest.mark.parametrize("beside", [False, True], ids=["drive", "run"])
+def test_device_that_is_left_as_it_is_is_reported(
+    monkeypatch: pytest.MonkeyPatch, beside: bool
+) -> None:
+    """It does not answer within the time of the end. Once it does, its update is not applied."""
+    monkeypatch.setattr(driving, "ENDS_S", 0.05)
+    asked, answers, closed = threading.Event(), threading.Event(), threading.Event()
+    said = list[str]()
+
+    class Closing(Recorder):
+        def close(self) -> None:
+            closed.set()
+
+    class Slow(Always):
+        def ask(self, lead_s: float) -> DeviceCommand:
+            asked.set()
+            assert answers.wait(HANG_S)
+            return super().ask(lead_s)
+
+    drive = Drive(
+        source=Slow(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
+        device=Closing(Ticking()),
+        update_hz=10.0,
+        safe=SafeState.HOLD,
+        now_ns=time.monotonic_ns,
+        say=said.append,
+    )
+
+    async def run() -> None:
+        task = asyncio.create_task(driving.run_in_thread(drive))
+        await asyncio.to_thread(asked.wait, HANG_S)
+        task.cancel()
+        with contextlib.suppress(asyncio.CancelledError):
+            await task
+
+    if beside:
+        run_async(run())
+    else:
+        driving.run_until_stopped(drive, lambda _: None, 0.05)
+    assert said[-1] == "the device has not answered: it may not be in its safe state"
+    answers.set()
+    assert closed.wait(HANG_S)
+    assert drive.status().applied == 0
+
+
+def test_device_that_failed_before_the_end_is_reported() -> None:
+    said = list[str]()
+
+    class Failing(Recorder):
+        def apply(self, shot: DeviceCommand) -> None:
+            raise DeviceError("no answer")
+
+    drive = Drive(
+        source=Always(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
+        device=Failing(Ticking()),
+        update_hz=10.0,
+        safe=SafeState.HOLD,
+        now_ns=time.monotonic_ns,
+        say=said.append,
+    )
+    drive.step()
+    drive.end()
+    assert said[-1] == "the device did not go to its safe state: no answer"
+
+
+@pytest.mark.parametrize("host", ["a..b", "x" * 64, "\udcff"])
+@pytest.mark.parametrize("target", ["rotctld:{}:4533", "gimbal:{}:14550:1:154"])
+def test_host_that_the_resolver_does_not_take_is_rejected(host: str, target: str) -> None:
+    with pytest.raises(UserError, match=r"is not (rotctld|gimbal):HOST:PORT"):
+        targets.device(target.format(host), lambda _: None, lambda: [])
+
+
 BEAM = {"uav": "1:1", "bearing_deg": 10.0, "above_horizon_deg": 5.0, "lat_deg": 47.0,
         "lon_deg": 8.0, "alt_m": 500.0, "codebook": {"best": 3}}  # fmt: skip
 ODD = [None, True, "", "x", "\x1b[2J\n", -1, 1e300, 10**400, math.nan, math.inf, [], [[]], {}]

@@ -59,6 +59,7 @@ def test_shared_round_trip_is_not_shortened() -> None:
     assert placed.t_ns >= 1500 * MS
     assert placed.t_ns - placed.sent_ns <= 100 * MS + 10 * MS + 4 * DRIFT_MAX * 500 * MS
     assert placed.remote_ns == 77
+    assert placed.is_shared and not trip.is_shared
 
 
 def test_round_trips_that_cannot_be_recorded_are_not_used() -> None:

@@ -132,6 +132,19 @@ def test_false_frames_of_a_received_vehicle_are_detected() -> None:
     assert len(hearing.contradicted) >= 3
 
 
+def test_nodes_that_contradict_each_other_are_both_kept() -> None:
+    """The one that shared the vehicle first is believed: neither is known to be true."""
+    hearing, used = Reception(), list[int]()
+    for number in range(80):
+        now_ns = 11 * S + number * 100 * MS
+        used.append(len(tell(hearing, now_ns, raw(1000 + 100 * number), now_ns - 5 * MS, "b")))
+        false = raw(1000 + 100 * number + 40, 300.0)
+        tell(hearing, now_ns + 50 * MS, false, now_ns + 40 * MS, "c")
+    assert used == [1] * 80
+    assert hearing.contradicted == []
+    assert set(hearing.disputed) == {("1:1", "c", "b")}
+
+
 def test_damaged_shared_frames_are_discarded() -> None:
     hearing = Reception()
     whole = raw(1000)

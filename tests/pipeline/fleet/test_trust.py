@@ -10,6 +10,7 @@ from companion.pipeline.fleet.trust import (
     UnconfirmedVehicle,
     Witness,
 )
+from companion.values import Notice
 
 S = 1_000_000_000
 HERE = Witness((0.0, 0.0, 0.0), 1000.0, frozenset({"1:1"}))
@@ -47,6 +48,19 @@ def test_node_is_excluded_after_several_contradictions() -> None:
     (again,) = trust.readmit(110 * S + EXCLUDED_NS)
     assert "trusted again" in again.text
     assert trust.is_trusted("b")
+
+
+def test_dispute_of_two_nodes_is_told_once_a_minute_and_excludes_neither() -> None:
+    trust, said = Trust(), list[Notice]()
+    for number in range(100):
+        said += trust.note_dispute(number * S, "6:1", "c", "b")
+    assert [one.t_ns for one in said] == [0, 60 * S]
+    assert said[0].text == (
+        "node c contradicts node b about 6:1; b shared it first, and is believed"
+    )
+    assert trust.is_trusted("b") and trust.is_trusted("c")
+    trust.forget(200 * S)
+    assert trust._disputed_ns == {}
 
 
 def test_node_sharing_only_unconfirmed_vehicles_is_excluded() -> None:

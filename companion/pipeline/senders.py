@@ -453,7 +453,7 @@ class Senders:
     def _attitude(self, attitude: Attitude) -> FrameOutcome:
         carrier = str(attitude.source)
         sender = self._senders[carrier]
-        clock = sender.own_clock
+        clock = sender.received_clock or sender.clock  # others share no attitudes
         stamp, said = self._stamp(clock, carrier, attitude.t_ns, attitude.boot_ms)
         sender.stamped_ns = attitude.t_ns
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)

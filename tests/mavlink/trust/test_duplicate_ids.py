@@ -102,9 +102,11 @@ def test_early_and_late_stamps_are_compared_with_the_path() -> None:
         assert [peer for peer, times in found.items() if times] == [later]
 
 
-def test_trusted_peer_is_believed_over_the_other_one() -> None:
+@pytest.mark.parametrize("begins_s", [(0.0, 10.1), (10.1, 0.0)])
+def test_trusted_peer_is_believed_over_the_other_one(begins_s: tuple[float, float]) -> None:
     judge = DuplicateIds([HOME])
-    found = refused(judge, heard(HOME, 4), heard(OTHER, 4, begins_s=10.1, told=beside(20)))
+    trusted = heard(HOME, 4, begins_s=begins_s[0])
+    found = refused(judge, trusted, heard(OTHER, 4, begins_s=begins_s[1], told=beside(20)))
     assert found[HOME] == []
     assert len(found[OTHER]) > 150
 

@@ -225,9 +225,12 @@ class Senders:
         if type(message) is SystemTime:
             return self._system_time(frame, message)
         sender = self._senders.get(str(message.source))
-        if frame.doubt_ns and (sender is None or sender.received_clock is None):
+        if not frame.doubt_ns:
+            component = self._components[message.source]
+        elif sender is not None and sender.shared is not None:
+            component = sender.shared.component
+        else:
             return NO_OUTCOME
-        component = self._components[message.source]
         component.heard_ns = message.t_ns
         match message:
             case GnssStatus():
@@ -237,9 +240,7 @@ class Senders:
                 # Before its first position, no peer is known to speak for the vehicle.
                 if sender is not None:
                     stated = noise.reported(message, self._noise_settings)
-                    component.noise.add(
-                        message.t_ns, stated, is_newest=is_newest, is_shared=frame.doubt_ns > 0
-                    )
+                    component.noise.add(message.t_ns, stated, is_newest=is_newest)
                 if is_newest:
                     component.stated_us = stated_us
                     component.receiver = message
@@ -252,7 +253,7 @@ class Senders:
     def _system_time(self, frame: Frame, message: SystemTime) -> FrameOutcome:
         change = self.add_stamp(frame)
         if message.unix_us is not None:
-            clock = self._senders[str(message.source)].own_clock
+            clock = self._senders[str(message.source)].clock
             on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
             clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
         return NO_OUTCOME if change is None else FrameOutcome(change=change)
@@ -265,31 +266,33 @@ class Senders:
         sender = self._senders.get(str(frame.source))
         if sender is None:
             return None
-        clock = sender.own_clock
-        clock.add_stamp(frame.t_ns, boot_ms(frame))
-        return clock.change
+        sender.clock.add_stamp(frame.t_ns, boot_ms(frame))
+        return sender.clock.change
 
     def round_trip(self, event: RoundTrip) -> ClockChange | None:
         """Pass a TIMESYNC round trip to its sender's clock.
 
-        One that another node measured counts only while frames of other nodes are used. Returns the
-        clock change that the round trip revealed.
+        One that another node measured counts only while frames of other nodes are used, and the
+        clock is not known here. Returns the clock change that the round trip revealed.
         """
         sender = self._senders.get(str(event.source))
-        if sender is None or (event.is_shared and sender.received_clock is None):
+        if sender is None:
             return None
-        clock, received = sender.clock, sender.received_clock
-        if received is not None and not event.is_shared:
-            received.timesync(event.sent_ns, event.t_ns, event.remote_ns)
-        clock.timesync(event.sent_ns, event.t_ns, event.remote_ns)
-        return clock.change
+        if event.is_shared and (sender.shared is None or sender.is_known(event.t_ns)):
+            return None
+        trip = event.sent_ns, event.t_ns, event.remote_ns
+        if sender.shared is not None:
+            sender.shared.clock.timesync(*trip)
+        if not event.is_shared:
+            sender.clock.timesync(*trip)
+        return (sender.shared or sender).clock.change
 
     def utc_is(self, offset_ns: int) -> None:
         """Set the difference between UTC and the node's timeline, valid from now on."""
         self._utc_offset_ns = offset_ns
         for sender in self._senders.values():
             sender.clock.forget_gnss()
-            sender.own_clock.forget_gnss()
+            (sender.shared or sender).clock.forget_gnss()
 
     def _telemetry(self, report: Report, doubt_ns: int = 0) -> FrameOutcome:
         """Place a report in time by its stamp; noise bounds only for a vehicle that reports itself.
@@ -305,16 +308,19 @@ class Senders:
         sender = self._senders[uav]
         refused: Reason | None = None
         switched: tuple[Notice, ...] = ()
-        if doubt_ns or sender.received_clock is not None:
+        if doubt_ns or sender.shared is not None:
             refused, switched = self._switch(sender, report, is_shared=doubt_ns > 0)
         if is_event:
             refused = sender.refuses_event(t_ns, report.boot_ms)
         if refused is not None:
             return _refused(report, refused)
-        stamp, said = self._stamp(sender.clock, uav, t_ns, report.boot_ms, doubt_ns)
-        sender.stamped_ns, said = t_ns, (*switched, *said)
+        clock = (sender.shared or sender).clock
+        stamp, said = self._stamp(clock, uav, t_ns, report.boot_ms, doubt_ns)
+        said = (*switched, *said)
+        if not doubt_ns:
+            sender.stamped_ns = t_ns
         restarted = uav if said else None
-        if sender.clock.is_shared(t_ns):
+        if clock.is_shared(t_ns):
             return FrameOutcome(
                 outputs=(*said, *_shared_id(sender, uav, t_ns)), restarted=restarted
             )
@@ -342,29 +348,27 @@ class Senders:
             noise=errors,
             limits=assumed.limits,
         )
-        return FrameOutcome(
-            message=placed, outputs=said, restarted=restarted, change=sender.clock.change
-        )
+        return FrameOutcome(message=placed, outputs=said, restarted=restarted, change=clock.change)
 
     def _switch(
         self, sender: Sender, report: Report, *, is_shared: bool
     ) -> tuple[Reason | None, tuple[Notice, ...]]:
-        """Switch to what this node received of a vehicle, or to what other nodes share.
+        """Use what other nodes share of a vehicle, or again only what this node receives.
 
-        What others say of its clock and accuracy counts until it is received here again. Returns
-        why the report must be rejected, and a notice if the track must restart.
+        Returns why the report must be rejected, and a notice if the track must restart.
         """
         assert report.boot_ms is not None
         if is_shared:
-            is_own = sender.share(report.t_ns, report.boot_ms)
+            component = self._components.get(report.source)
+            known = component or ComponentState(noise=StatedNoise(self._noise_settings.default))
+            is_own = sender.share(known, report.t_ns, report.boot_ms)
             return None if is_own else Reason.UNPLACED_STAMP, ()
-        if (component := self._components.get(report.source)) is not None:
-            component.noise.expire_shared(report.t_ns)
         if not sender.receive(report.t_ns, report.boot_ms):
             return None, ()
         uav = report.uav
         text = f"{uav}: track restarted: other nodes shared reports with another clock"
-        return None, (Notice(t_ns=report.t_ns, severity=Severity.WARNING, subject=uav, text=text),)
+        told = Notice(t_ns=report.t_ns, severity=Severity.WARNING, subject=uav, text=text)
+        return None, (told,)
 
     def _errors(self, report: Report, made_ns: int, time_s: float) -> ReportNoise:
         """Return bounds on a report's errors, with the receiver's recent height difference.
@@ -372,7 +376,7 @@ class Senders:
         ``made_ns`` is the earliest node time of its measurement, ``time_s`` the largest error of
         the time that is assumed.
         """
-        component, known, apart_m = self._components.get(report.source), None, 0.0
+        component, known, apart_m = self._component(report.uav, report.source), None, 0.0
         if component is not None and component.receiver is not None:
             known, receiver = component.noise.since(made_ns), component.receiver
             is_recent = report.t_ns - receiver.t_ns <= noise.FORGOTTEN_NS
@@ -453,12 +457,14 @@ class Senders:
     def _attitude(self, attitude: Attitude) -> FrameOutcome:
         carrier = str(attitude.source)
         sender = self._senders[carrier]
-        clock = sender.received_clock or sender.clock  # others share no attitudes
-        stamp, said = self._stamp(clock, carrier, attitude.t_ns, attitude.boot_ms)
+        stamp, said = self._stamp(sender.clock, carrier, attitude.t_ns, attitude.boot_ms)
         sender.stamped_ns = attitude.t_ns
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
         return FrameOutcome(
-            message=placed, outputs=said, restarted=carrier if said else None, change=clock.change
+            message=placed,
+            outputs=said,
+            restarted=carrier if said else None,
+            change=sender.clock.change,
         )
 
     def may_begin(self, report: Report, always: bool) -> bool:
@@ -469,7 +475,7 @@ class Senders:
         datums; home waits ``always``. A status that was not repeated for ``FORGOTTEN_NS`` is
         ignored: it may be forged.
         """
-        component = self._components.get(report.source)
+        component = self._component(report.uav, report.source)
         receiver = None if component is None else component.receiver
         if receiver is None or not kind_of(report.uav).reports_itself:
             return True
@@ -492,8 +498,10 @@ class Senders:
         stamp = clock.observe(arrival_ns, boot_ms, doubt_ns)
         if stamp is None or not stamp.rebooted:
             return stamp, ()
-        if kind_of(name).reports_itself and (source := Source.parse(name)) in self._components:
-            self._components[source].stated_us = 0
+        if kind_of(name).reports_itself:
+            component = self._component(name, Source.parse(name))
+            if component is not None:
+                component.stated_us = 0
         text = f"{name} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
         if kind_of(name) is UavKind.COT:  # its events have times of day
             text = f"{name}: track restarted: the times of its events stepped back"
@@ -509,18 +517,18 @@ class Senders:
         Positions lag behind their stamps; attitudes do not.
         """
         sender = self._senders.get(vehicle)
-        return Timeline(sender.own_clock.reading() if sender else None, 0.0).time(node_ns)
+        return Timeline(sender.clock.reading() if sender else None, 0.0).time(node_ns)
 
     def timeline(self, uav: str) -> Timeline:
         """Return a UAV's own timeline as it is known now."""
         sender = self._senders.get(uav)
-        reading = sender.clock.reading() if sender else None
+        reading = (sender.shared or sender).clock.reading() if sender else None
         return Timeline(reading, 0.0 if reading is None else self.assumed(uav).lag_rest_s)
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """Return the state of a UAV's clock; None if no clock is known."""
         sender = self._senders.get(uav)
-        return sender.clock.estimate() if sender else None
+        return (sender.shared or sender).clock.estimate() if sender else None
 
     def assumed(self, uav: str) -> assembly.AircraftAssumptions:
         """Return the assumptions about a UAV, by the types in its heartbeats.
@@ -529,8 +537,15 @@ class Senders:
         aeroplane, is between both for a while: the assumptions contain those of all its types.
         """
         source = _source(uav)
-        component = None if source is None else self._components.get(source)
+        component = None if source is None else self._component(uav, source)
         return self._assumed(uav, () if component is None else tuple(component.types))
+
+    def _component(self, uav: str, source: Source) -> ComponentState | None:
+        """Return what is in force of a vehicle's messages other than positions."""
+        sender = self._senders.get(uav)
+        if sender is not None and sender.shared is not None:
+            return sender.shared.component
+        return self._components.get(source)
 
     # --- memory -----------------------------------------------------------------------------
 

@@ -83,34 +83,17 @@ class StatedNoise:
     Statements and reports overtake each other. The statement in force when a report was made is
     the newest one before that time, or one that arrived since. ``default`` is in force before the
     first, and ``FORGOTTEN_NS`` after the newest; from ``STATED_NS`` on, the larger of the two.
-
-    A statement that another node shared replaces one that was received here only after
-    ``STATED_NS``, and lowers no bound of reports that are received here.
     """
 
-    __slots__ = ("_default", "_earlier", "_is_shared", "_newest", "_newest_ns")
+    __slots__ = ("_default", "_earlier", "_newest", "_newest_ns")
 
     def __init__(self, default: ReportNoise) -> None:
         self._default = self._newest = default
         self._newest_ns = 0
-        self._is_shared = True  # whether another node shared the newest; there is none yet
         self._earlier: deque[tuple[int, ReportNoise]] = deque()  # until when each was the newest
 
-    def add(
-        self,
-        arrival_ns: int,
-        stated: ReportNoise,
-        *,
-        is_newest: bool = True,
-        is_shared: bool = False,
-    ) -> None:
-        """Add a statement in order of arrival.
-
-        is_newest  whether it was not overtaken
-        is_shared  whether another node of the fleet shared it
-        """
-        if is_shared and not self._is_shared:
-            is_newest &= arrival_ns - self._newest_ns > STATED_NS
+    def add(self, arrival_ns: int, stated: ReportNoise, *, is_newest: bool = True) -> None:
+        """Add a statement in order of arrival; ``is_newest`` is False if it was overtaken."""
         earlier = self._earlier
         while earlier and arrival_ns - earlier[0][0] > OVERTAKEN_NS:
             earlier.popleft()
@@ -120,12 +103,7 @@ class StatedNoise:
         before = self._newest
         earlier.append((arrival_ns, before if is_newest else _larger(before, stated)))
         if is_newest:
-            self._newest, self._newest_ns, self._is_shared = stated, arrival_ns, is_shared
-
-    def expire_shared(self, now_ns: int) -> None:
-        """Let the newest statement lower no bound from now on, if another node shared it."""
-        if self._is_shared:
-            self._newest_ns = min(self._newest_ns, now_ns - STATED_NS - 1)
+            self._newest, self._newest_ns = stated, arrival_ns
 
     def since(self, made_ns: int) -> ReportNoise:
         """Return bounds for a report that was made no earlier than this.

@@ -14,7 +14,7 @@ The peers of links are judged by ``known_peers.py``; here they are nodes of a fl
 from collections import deque
 from collections.abc import Collection
 from dataclasses import dataclass, field
-from typing import Final
+from typing import Final, NamedTuple
 
 from companion.mavlink.trust.paths import SLACK_M, Path
 from companion.mavlink.wire.positions import OWN, read
@@ -26,6 +26,13 @@ SPACED_NS: Final = 500_000_000
 KEPT_NS: Final = 30_000_000_000  # how long a peer and a contradiction are remembered
 SENDERS_MAX: Final = 4096  # senders followed; new ones beyond it are not followed
 PEERS_MAX: Final = 4  # peers followed per sender, the most recent
+
+
+class Contradiction(NamedTuple):
+    """Peer that a rejected peer contradicts, and whether it was the first of both."""
+
+    peer: str
+    is_first: bool
 
 
 @dataclass(slots=True, kw_only=True)
@@ -40,7 +47,7 @@ class _PeerPath:
     heard_ns: int
     path: Path = field(default_factory=Path)
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
-    contradicts: str = ""  # the first of the peers that it contradicted last
+    contradicts: Contradiction | None = None  # the first of the peers that it contradicted last
     is_duplicate: bool = False
 
 
@@ -63,8 +70,8 @@ class DuplicateIds:
         self._trusted = frozenset(trusted)
         self._senders: dict[tuple[int, int], _SenderPaths] = {}
 
-    def rejects(self, peer: str, frame: Frame) -> str | None:
-        """Process a frame of ``decode.POSE``. Return the peer because of which it is rejected."""
+    def rejects(self, peer: str, frame: Frame) -> Contradiction | None:
+        """Process a frame of ``decode.POSE``. Return why it must be rejected; None to use it."""
         sender = self._senders.get(frame.source)
         if sender is None:
             sender = self._follow(frame)
@@ -113,7 +120,7 @@ class DuplicateIds:
             first, later = sorted((path, other), key=lambda one: one.rank)
             if not later.rank[0]:  # both are trusted
                 continue
-            later.contradicts = first.peer
+            later.contradicts = Contradiction(first.peer, first.rank[1] < later.rank[1])
             when = later.contradicted_ns
             if not when or frame.t_ns - when[-1] >= SPACED_NS:
                 when.append(frame.t_ns)

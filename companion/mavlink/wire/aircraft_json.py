@@ -70,7 +70,7 @@ class AircraftJson(ForeignSplitter):
         unplaced = self._begin(t_ns, data) if data or not self._rest else []
         if unplaced:
             return unplaced
-        if self._rest and self._is_skipped(self._left()):
+        if self._rest and self.skips and self._is_skipped(self._left()):  # counted only then
             self._rest = b""
             return []
         items: Items = []

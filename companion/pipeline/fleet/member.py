@@ -195,12 +195,10 @@ class FleetMember:
             notices += self.trust.note_contradiction(
                 now_ns, node, "shares frames before they can have been received"
             )
-        for node in self.reception.contradicted:
-            notices += self.trust.note_contradiction(
-                now_ns, node, "shares reports that contradict those received here"
-            )
-        for uav, node, first in self.reception.disputed:
-            notices += self.trust.note_dispute(now_ns, uav, node, first)
+        for uav, node, _ in self.reception.contradicted:
+            notices += self.trust.note_false_report(now_ns, uav, node)
+        for uav, node, believed in self.reception.contradicted + self.reception.disputed:
+            notices += self.trust.note_dispute(now_ns, uav, node, believed)
         self.reception.early.clear()
         self.reception.contradicted.clear()
         self.reception.disputed.clear()

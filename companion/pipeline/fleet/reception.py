@@ -16,6 +16,7 @@ from companion.mavlink.wire.decode import GPS_RAW_INT, HEARTBEAT
 from companion.mavlink.wire.framing import MAGIC_V2, SHORTEST, examine
 from companion.mavlink.wire.positions import OWN
 from companion.pipeline.fleet.neighbours import OLDEST_NS, NeighbourClock
+from companion.pipeline.fleet.trust import OWN_NODE
 from companion.values import Frame, SharedFrame, Source
 
 SHARED: Final = OWN | {HEARTBEAT, GPS_RAW_INT}
@@ -30,7 +31,6 @@ VEHICLES_MAX: Final = 4096
 """Limit on vehicles with a record; beyond it, shared reports are used without a check."""
 FUTURE_NS: Final = 1_000_000
 """Tolerance for shared frames that seem received in the future, by the clock bounds."""
-OWN_NODE: Final = "here"
 
 
 class RecentFrames:
@@ -70,9 +70,10 @@ class _VehicleReception:
 class Reception:
     """Reception of frames, and selection of the shared frames for the pipeline.
 
-    ``contradicted`` and ``early`` contain names of nodes whose frames contradict those of this
-    node, or arrive before they can have been received; ``disputed`` the vehicles about which a node
-    contradicts another one, with both names, the later one first. The reader clears them.
+    ``early`` contains the names of nodes whose frames arrive before they can have been received;
+    ``contradicted`` the vehicles about which a node contradicts what this node received before that
+    node shared it, and ``disputed`` those about which it contradicts anything else; with its name,
+    and that of the node that is believed. The reader clears them.
     ``behind_ns`` is the age of this node's newest frame when it was read: a vehicle whose reports
     are still queued here is not silent. Otherwise an overloaded node would also use all shared
     frames, and be more overloaded. ``unusable`` counts shared frames and round trips that
@@ -80,7 +81,7 @@ class Reception:
     """
 
     def __init__(self) -> None:
-        self.contradicted: list[str] = []
+        self.contradicted: list[tuple[str, str, str]] = []
         self.disputed: list[tuple[str, str, str]] = []
         self.early: list[str] = []
         self.behind_ns = 0
@@ -164,11 +165,10 @@ class Reception:
         if key in self._heard or not is_new:
             return []
         contradicts = self._duplicate_ids.rejects(node, frame)
-        if contradicts == OWN_NODE:
-            self.contradicted.append(node)
-            return []
         if contradicts is not None:
-            self.disputed.append((str(frame.source), node, contradicts))
+            is_false = contradicts == (OWN_NODE, True)
+            found = self.contradicted if is_false else self.disputed
+            found.append((str(frame.source), node, contradicts.peer))
             return []
         vehicle = self._vehicles.get(frame.source)
         if vehicle is None:

@@ -4,13 +4,14 @@ A node is excluded if it
 
 - shares frames before they can have been received, by the bounds on its clock;
 - has an inconsistent clock: repeated round trips that no drift explains;
-- shares reports that contradict those received here;
+- shares reports of ``FALSE_MIN`` vehicles or more that contradict those received here, which began
+  before that node shared the vehicle: of one vehicle, the sender here may be the false one;
 - shares vehicles that only it receives, at positions where others receive everything: at least
   ``PHANTOMS_MIN`` of them for ``PHANTOM_AFTER_NS``, and most of what it receives. A few such
   vehicles may be hidden by an obstacle: they cause a notice and stay unconfirmed.
 
-Two nodes that contradict each other, about a vehicle that is not received here, are not excluded:
-either may be wrong. The one whose reports came first is used, with a notice.
+Of other contradictions, either side may be wrong. The reports that are received here are used, or
+those of the node that shared the vehicle first, with a notice.
 """
 
 import math
@@ -20,6 +21,7 @@ from typing import Final, NamedTuple
 
 from companion.values import Notice, Severity
 
+OWN_NODE: Final = "this node"  # has a blank, so that no node has this name
 CONTRADICTIONS: Final = (
     3  # contradictions within CONTRADICTION_WINDOW_NS after which a node is excluded
 )
@@ -28,6 +30,7 @@ EXCLUDED_NS: Final = 300_000_000_000  # duration of an exclusion
 PHANTOMS_MIN: Final = 2  # number of phantom vehicles from which on their node is excluded
 PHANTOM_AFTER_NS: Final = 8_000_000_000
 """Time without reception elsewhere after which a vehicle counts as a phantom."""
+FALSE_MIN: Final = 2  # vehicles with false reports from which on their node is excluded
 DISPUTED_NS: Final = 60_000_000_000  # least time between two notices about a vehicle's dispute
 REACH_SHARE: Final = 0.7
 """Fraction of a node's range within which it receives every vehicle."""
@@ -59,6 +62,7 @@ class Trust:
         self._unconfirmed_since: dict[str, tuple[str, int]] = {}
         self._notified: set[str] = set()
         self._disputed_ns: dict[str, int] = {}  # newest notice about a vehicle
+        self._false_ns: dict[str, dict[str, int]] = {}  # newest false report, by node and vehicle
 
     def is_trusted(self, node: str) -> bool:
         """Return whether the messages of a node are used."""
@@ -72,12 +76,24 @@ class Trust:
             return []
         return self._exclude(now_ns, node, what)
 
-    def note_dispute(self, now_ns: int, uav: str, node: str, first: str) -> list[Notice]:
-        """Note that reports of a node contradict those of the first node that shared a vehicle."""
+    def note_false_report(self, now_ns: int, uav: str, node: str) -> list[Notice]:
+        """Note that a node's report of a vehicle contradicts what this node received before it."""
+        false_ns = self._false_ns.setdefault(node, {})
+        false_ns[uav] = now_ns
+        before_ns = now_ns - CONTRADICTION_WINDOW_NS
+        if sum(at_ns > before_ns for at_ns in false_ns.values()) < FALSE_MIN:
+            return []
+        return self.note_contradiction(
+            now_ns, node, "shares reports that contradict those received here"
+        )
+
+    def note_dispute(self, now_ns: int, uav: str, node: str, believed: str) -> list[Notice]:
+        """Note that reports of a vehicle that a node shares contradict those that are believed."""
         if now_ns - self._disputed_ns.get(uav, -DISPUTED_NS) < DISPUTED_NS:
             return []
         self._disputed_ns[uav] = now_ns
-        what = f"contradicts node {first} about {uav}; {first} shared it first, and is believed"
+        name = believed if believed == OWN_NODE else f"node {believed}"
+        what = f"contradicts {name} about {uav}; {name} is believed"
         return [_notice(now_ns, node, what, Severity.WARNING)]
 
     def check_vehicles(
@@ -130,6 +146,11 @@ class Trust:
         """Forget contradictions that have expired."""
         before_ns = now_ns - CONTRADICTION_WINDOW_NS
         self._times = {what: times for what, times in self._times.items() if times[-1] > before_ns}
+        for node, false_ns in list(self._false_ns.items()):
+            recent = {uav: at_ns for uav, at_ns in false_ns.items() if at_ns > before_ns}
+            self._false_ns[node] = recent
+            if not recent:
+                del self._false_ns[node]
         before_ns = now_ns - DISPUTED_NS
         self._disputed_ns = {
             k: at_ns for k, at_ns in self._disputed_ns.items() if at_ns > before_ns

@@ -6,6 +6,8 @@ from companion.mavlink.trust.dedupe import content
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
 from companion.pipeline.fleet.neighbours import NeighbourClock
 from companion.pipeline.fleet.reception import Reception
+from companion.pipeline.fleet.trust import OWN_NODE
+from companion.settings.fleet import is_node_name
 from companion.values import Frame, SharedFrame, Source
 
 MS = 1_000_000
@@ -52,9 +54,10 @@ def test_shared_frame_keeps_its_sender_in_both_mavlink_versions() -> None:
         assert (frame.source, frame.msgid) == (Source(7, 9), GLOBAL_POSITION_INT)
 
 
-def hear(hearing: Reception, now_ns: int, boot_ms: int) -> None:
+def hear(hearing: Reception, now_ns: int, boot_ms: int, north_m: float = 0.0) -> None:
+    data = raw(boot_ms, north_m)
     hearing.take_received(
-        Frame(t_ns=now_ns, link="udp", source=UAV, msgid=GLOBAL_POSITION_INT, raw=raw(boot_ms))
+        Frame(t_ns=now_ns, link="udp", source=UAV, msgid=GLOBAL_POSITION_INT, raw=data)
     )
 
 
@@ -128,7 +131,7 @@ def test_false_frames_of_a_received_vehicle_are_detected() -> None:
         hear(hearing, now_ns, 1000 + 100 * number)
         false = raw(1000 + 100 * number + 40, 300.0)
         assert tell(hearing, now_ns + 50 * MS, false, now_ns + 40 * MS) == []
-    assert set(hearing.contradicted) == {"b"}
+    assert set(hearing.contradicted) == {("1:1", "b", OWN_NODE)}
     assert len(hearing.contradicted) >= 3
 
 
@@ -143,6 +146,22 @@ def test_nodes_that_contradict_each_other_are_both_kept() -> None:
     assert used == [1] * 80
     assert hearing.contradicted == []
     assert set(hearing.disputed) == {("1:1", "c", "b")}
+
+
+def test_node_that_shared_a_vehicle_first_is_not_contradicted_by_a_stranger_here() -> None:
+    """Whoever sends in a vehicle's name here is believed, but it proves nothing against others."""
+    hearing = Reception()
+    for number in range(80):
+        now_ns = 11 * S + number * 100 * MS
+        tell(hearing, now_ns, raw(1000 + 100 * number), now_ns - 5 * MS, "b")
+        if number > 10:
+            hear(hearing, now_ns + 40 * MS, 1040 + 100 * number, 300.0)
+    assert hearing.contradicted == []
+    assert set(hearing.disputed) == {("1:1", "b", OWN_NODE)}
+
+
+def test_node_with_the_name_of_a_place_is_not_this_node() -> None:
+    assert not is_node_name(OWN_NODE)
 
 
 def test_damaged_shared_frames_are_discarded() -> None:

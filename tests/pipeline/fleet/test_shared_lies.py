@@ -43,10 +43,10 @@ def trip(t_s: float, ahead_s: float) -> RoundTrip:
     )
 
 
-def accuracy(t_s: float) -> Frame:
-    """Return the status of a receiver that states a millimetre."""
+def accuracy(t_s: float, stated_mm: int = 1) -> Frame:
+    """Return the status of a receiver that states an accuracy."""
     message = dialect.MAVLink_gps_raw_int_message(
-        round(t_s * 1e6), 6, 474000000, 85500000, 550_000, 50, 50, 0, 0, 20, 0, 1, 1, 1
+        round(t_s * 1e6), 6, 474000000, 85500000, 550_000, 50, 50, 0, 0, 20, 0, *[stated_mm] * 3
     )
     return sent(t_s, UAV, message)
 
@@ -79,8 +79,8 @@ def test_round_trips_of_others_do_not_outlast_a_gap(ahead_s: float, reports: boo
 
 def test_round_trips_of_others_count_while_their_reports_are_used() -> None:
     """Several, since frames agree with each only up to their own latency."""
-    lies = [each for n in range(20) for each in (shared(own(10 + n / 10)), trip(10.05 + n / 10, 0))]
-    with_them, without = (flown(*some, gap_s=(10, 12), end_s=12)[0] for some in (lies, lies[::2]))
+    lies = [each for n in range(150) for each in (shared(own(5 + n / 10)), trip(5.05 + n / 10, 0))]
+    with_them, without = (flown(*some, gap_s=(5, 20), end_s=20)[0] for some in (lies, lies[::2]))
     widths = [clock(one).before_s + clock(one).after_s for one in (with_them, without)]
     assert widths[0] < 0.01 < widths[1]
 
@@ -96,6 +96,27 @@ def test_accuracies_of_others_lower_no_bound_of_own_reports(reports: bool) -> No
         one.fix for one in outputs if isinstance(one, Estimate) and one.fix.t_ns > START_NS + 11 * S
     ]
     assert min(fix.noise.position_m for fix in after) > 1.0
+
+
+def test_receivers_own_accuracies_are_not_overtaken_by_shared_ones() -> None:
+    """A receiver's time 20 s ahead: the vehicle's own 20 m no longer counted, 7 m off at 3 m."""
+    ahead = dialect.MAVLink_gps_raw_int_message(
+        35_000_000, 6, 474000000, 85500000, 550_000, 50, 50, 0, 0, 20, 0, 1, 1, 1
+    )
+    lies = [shared(own(10.15 + n / 10)) for n in range(7)] + [shared(sent(10.3, UAV, ahead))]
+    stated = [accuracy(float(n), 20_000) for n in range(40)]
+    _, outputs = flown(*lies, *stated, end_s=40.0)
+    after = [
+        one.fix for one in outputs if isinstance(one, Estimate) and one.fix.t_ns > START_NS + 11 * S
+    ]
+    assert min(fix.noise.horizontal_m for fix in after) > 20
+
+
+@pytest.mark.parametrize("ahead_s", [0.5, 0.9])
+def test_reports_of_others_ahead_of_the_clock_known_here_are_rejected(ahead_s: float) -> None:
+    lies = [shared(own(10.05 + n / 10, ahead_s)) for n in range(9)]
+    _, outputs = flown(*lies)
+    assert len([one for one in outputs if isinstance(one, Rejection)]) == len(lies)
 
 
 def test_accuracies_of_others_count_after_own_ones_have_ended() -> None:

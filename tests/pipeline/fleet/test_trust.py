@@ -55,12 +55,23 @@ def test_dispute_of_two_nodes_is_told_once_a_minute_and_excludes_neither() -> No
     for number in range(100):
         said += trust.note_dispute(number * S, "6:1", "c", "b")
     assert [one.t_ns for one in said] == [0, 60 * S]
-    assert said[0].text == (
-        "node c contradicts node b about 6:1; b shared it first, and is believed"
-    )
+    assert said[0].text == ("node c contradicts node b about 6:1; node b is believed")
     assert trust.is_trusted("b") and trust.is_trusted("c")
     trust.forget(200 * S)
     assert trust._disputed_ns == {}
+
+
+def test_false_reports_of_one_vehicle_exclude_nobody() -> None:
+    """The sender here may be a stranger: the node's other vehicles would lose their beams."""
+    trust = Trust()
+    for number in range(20):
+        assert trust.note_false_report(number * S, "6:1", "b") == []
+    said = [n for t in range(20, 23) for n in trust.note_false_report(t * S, "7:1", "b")]
+    assert [one.text for one in said] == [
+        "node b is excluded for 5 minutes: it shares reports that contradict those received here"
+    ]
+    trust.forget(100 * S)
+    assert trust._false_ns == {}
 
 
 def test_node_sharing_only_unconfirmed_vehicles_is_excluded() -> None:

@@ -237,6 +237,10 @@ class Senders:
                 stated_us, newest_us = message.time_us, component.stated_us
                 # An older status comes over a second, slower link.
                 is_newest = not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US
+                if (
+                    frame.doubt_ns and sender is not None
+                ):  # others may only raise what is known here
+                    is_newest &= not sender.is_known(message.t_ns)
                 # Before its first position, no peer is known to speak for the vehicle.
                 if sender is not None:
                     stated = noise.reported(message, self._noise_settings)

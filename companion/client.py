@@ -14,13 +14,14 @@ import base64
 import io
 import json
 import math
+import socket
 import time
 import urllib.error
 import urllib.request
 from collections.abc import Generator, Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from http.client import HTTPException, HTTPResponse, IncompleteRead
+from http.client import HTTPConnection, HTTPException, HTTPResponse, HTTPSConnection, IncompleteRead
 from typing import Any, Final, Required, TypedDict
 from urllib.parse import quote, urlencode, urlsplit
 
@@ -34,9 +35,9 @@ from companion.values.numbers import NPY_ERRORS
 Json = dict[str, Any]
 
 SUBPROTOCOL: Final = "companion.v1"
-_DIRECT: Final = urllib.request.build_opener(urllib.request.ProxyHandler({}))
-"""Without the proxies of the environment: they reach no service here, and would get its token."""
 ANSWER_MAX: Final = 1 << 28  # longest answer, bytes; 4 million weights take a quarter of it
+TEXT_MAX: Final = 1 << 25  # longest answer that is text, bytes
+VALUES_MAX: Final = 1 << 20  # most values, or lines, of such an answer; each takes 100 bytes
 PIECE_BYTES: Final = 1 << 16
 _READ_HEADER: Final = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -149,7 +150,10 @@ class Client:
         """Return the weights to apply in ``lead_ms`` milliseconds, as text for a device."""
         query = urlencode({"lead_ms": lead_ms})
         with self._open(f"/v1/beams/weights?{query}", media_type) as answer:
-            return _read(answer, self._timeout_s).decode(errors="replace")
+            body = _read(answer, self._timeout_s, TEXT_MAX)
+        if body.count(b"\n") > VALUES_MAX:
+            raise ServiceError(None, f"the answer exceeds {VALUES_MAX} lines")
+        return body.decode(errors="replace")
 
     def observe(self, measured: Measurement | Sequence[Measurement]) -> Json:
         """Give measurements of the array's receiver: one, or a list of at most 400.
@@ -165,15 +169,17 @@ class Client:
         except (ValueError, TypeError) as error:
             raise UserError(f"observation: {error}") from error
         with self._open("/v1/observations", "application/json", body) as answer:
-            return self._object(_read(answer, self._timeout_s))
+            return self._object(_read(answer, self._timeout_s, TEXT_MAX))
 
     def get(self, path: str, **query: object) -> Json:
         """Return the answer of any path of the API that returns a JSON object."""
         address = quote(path) + ("?" + urlencode(query, doseq=True) if query else "")
         with self._open(address, "application/json") as answer:
-            return self._object(_read(answer, self._timeout_s))
+            return self._object(_read(answer, self._timeout_s, TEXT_MAX))
 
     def _object(self, body: bytes) -> Json:
+        if sum(map(body.count, (b",", b"[", b"{"))) > VALUES_MAX:
+            raise ServiceError(None, f"the answer exceeds {VALUES_MAX} values")
         try:
             found = json.loads(body)
         except (ValueError, RecursionError) as error:
@@ -241,7 +247,7 @@ class Client:
             headers["authorization"] = f"Bearer {self._token}"
         request = urllib.request.Request(self._url + address, data=body, headers=headers)
         try:
-            found: HTTPResponse = _DIRECT.open(request, timeout=self._timeout_s)
+            found: HTTPResponse = _OPENER.open(request, timeout=self._timeout_s)
         except urllib.error.HTTPError as error:
             with error:
                 raise ServiceError(error.code, _title(error)) from error
@@ -266,14 +272,17 @@ def _is_address(url: str) -> bool:
     return found.scheme in ("http", "https") and bool(found.hostname) and port != 0
 
 
-def _read(answer: HTTPResponse, timeout_s: float) -> bytes:
-    """Return the body of an answer. Every piece has a timeout, and the whole body has one too."""
-    ends_s, body = time.monotonic() + timeout_s, bytearray()
+def _read(answer: HTTPResponse, timeout_s: float, most: int | None = None) -> bytes:
+    """Return the body of an answer of at most so many bytes (``ANSWER_MAX``).
+
+    Every piece has a timeout, and the whole body has one too.
+    """
+    ends_s, body, most = time.monotonic() + timeout_s, bytearray(), most or ANSWER_MAX
     try:
         while piece := answer.read1(PIECE_BYTES):
             body += piece
-            if len(body) > ANSWER_MAX:
-                raise ServiceError(None, f"the answer exceeds {ANSWER_MAX} bytes")
+            if len(body) > most:
+                raise ServiceError(None, f"the answer exceeds {most} bytes")
             if time.monotonic() > ends_s:
                 raise ServiceError(None, f"the answer takes longer than {timeout_s:g} s")
         if answer.length:
@@ -314,3 +323,76 @@ def _closed(error: ConnectionClosed) -> ServiceError:
     if error.rcvd is None:
         return ServiceError(None, "the connection was lost")
     return ServiceError(error.rcvd.code, error.rcvd.reason or "the stream was closed")
+
+
+# --- HTTP with a time limit for the head of an answer; each byte is in time for a socket ---------
+
+
+class _TimedFile(io.RawIOBase):
+    """Unbuffered file of a socket; reading fails at ``ends_s``."""
+
+    def __init__(self, sock: socket.socket, ends_s: float) -> None:
+        super().__init__()
+        self.ends_s = ends_s
+        self._sock = sock
+        self._timeout_s = sock.gettimeout()
+        self._file = sock.makefile("rb", buffering=0)  # keeps the socket open
+
+    def readable(self) -> bool:
+        return True
+
+    def readinto(self, buffer: Any) -> int | None:
+        left_s = self.ends_s - time.monotonic()
+        if left_s <= 0:
+            raise TimeoutError("timed out")
+        limits = [one for one in (left_s, self._timeout_s) if one is not None]
+        self._sock.settimeout(min(limits) if math.isfinite(min(limits)) else None)
+        return self._file.readinto(buffer)
+
+    def close(self) -> None:
+        if not self.closed:
+            self._file.close()
+        super().close()
+
+
+class _TimedResponse(HTTPResponse):
+    """Answer whose head must be complete within the timeout of its connection."""
+
+    def __init__(self, sock: socket.socket, *args: Any, **kwargs: Any) -> None:
+        super().__init__(sock, *args, **kwargs)
+        self.fp.close()
+        self._timed = _TimedFile(sock, time.monotonic() + (sock.gettimeout() or math.inf))
+        self.fp = io.BufferedReader(self._timed)
+
+    def begin(self) -> None:
+        super().begin()
+        self._timed.ends_s = math.inf  # the reader of the body limits its time
+
+
+class _Connection(HTTPConnection):
+    response_class = _TimedResponse
+
+
+class _TlsConnection(HTTPSConnection):
+    response_class = _TimedResponse
+
+
+class _Handler(urllib.request.HTTPHandler):
+    def http_open(self, req: urllib.request.Request) -> HTTPResponse:
+        return self.do_open(_Connection, req)
+
+
+class _TlsHandler(urllib.request.HTTPSHandler):
+    def https_open(self, req: urllib.request.Request) -> HTTPResponse:
+        return self.do_open(_TlsConnection, req)
+
+
+class _NoRedirect(urllib.request.HTTPRedirectHandler):
+    def redirect_request(self, *_: Any) -> None:
+        """Follow none: the token is for one service."""
+
+
+_OPENER: Final = urllib.request.build_opener(
+    urllib.request.ProxyHandler({}), _Handler(), _TlsHandler(), _NoRedirect()
+)
+"""Without the proxies of the environment: they reach no service here, and would get its token."""

@@ -286,13 +286,68 @@ def test_answer_that_drips_is_given_up(head: bytes) -> None:
         Client(url, timeout_s=0.3).status()
 
 
+@pytest.mark.parametrize(
+    ("head", "piece"),
+    [(b"HTTP/1.1 200 OK\r\n", b"x: y\r\n"), (b"HTTP/1.1 ", b"2"), (b"", b"HTTP/1.1 100 C\r\n\r\n")],
+    ids=["headers", "status", "continue"],
+)
+def test_head_that_drips_is_given_up(head: bytes, piece: bytes) -> None:
+    """Each byte arrives in time: a drive held its device's last command for hours."""
+    gone = threading.Event()
+
+    def drip(server: socket.socket) -> None:
+        with server, contextlib.suppress(OSError):
+            connection, _ = server.accept()
+            with connection:
+                connection.sendall(head)
+                while not gone.wait(0.02):
+                    connection.sendall(piece)
+
+    server = socket.create_server(("127.0.0.1", 0))
+    thread = threading.Thread(target=drip, args=(server,), daemon=True)
+    thread.start()
+    try:
+        with pytest.raises(ServiceError):
+            Client(f"http://127.0.0.1:{server.getsockname()[1]}", timeout_s=0.3).status()
+    finally:
+        gone.set()
+        thread.join(HANG_S)
+    assert not thread.is_alive()
+
+
+def test_redirects_are_not_followed() -> None:
+    with (
+        _answering(b"302 Found\r\nLocation: http://127.0.0.1:1/\r\nContent-Length: 0", b"") as url,
+        pytest.raises(ServiceError) as error,
+    ):
+        Client(url).status()
+    assert error.value.status == 302
+
+
 def test_endless_answer_uses_bounded_memory(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("companion.client.ANSWER_MAX", 200_000)
+    monkeypatch.setattr("companion.client.TEXT_MAX", 200_000)
     with (
         _answering(HEADS[0], bytes(65_536)) as url,
         pytest.raises(ServiceError, match="the answer exceeds 200000 bytes"),
     ):
         Client(url).status()
+
+
+@pytest.mark.parametrize("text", [b"[],", b"{},", b"1,"])
+def test_answer_of_millions_of_values_is_not_parsed(text: bytes) -> None:
+    """60 MB of empty lists took 0.7 GB, and a drive did not end for 10 s."""
+    body = b'{"beams":[' + text * 1_200_000 + b"1]}"
+    head = b"200 OK\r\nContent-Length: %d" % len(body)
+    with (
+        _answering(head, body) as url,
+        pytest.raises(ServiceError, match="the answer exceeds 1048576 values"),
+    ):
+        Client(url).beams()
+    with (
+        _answering(b"200 OK\r\nContent-Length: 1200000", b"\n" * 1_200_000) as url,
+        pytest.raises(ServiceError, match="the answer exceeds 1048576 lines"),
+    ):
+        Client(url).table("text/csv")
 
 
 def test_deeply_nested_answer_is_no_json() -> None:

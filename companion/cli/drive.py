@@ -4,7 +4,7 @@ import json
 import time
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Final
 
 import click
 
@@ -14,6 +14,8 @@ from companion.values import UserError
 if TYPE_CHECKING:
     from companion.node.drive.loop import DriveStatus
     from companion.values import IntArray
+
+ANSWER_S: Final = 3.0  # timeout of the service; then the device goes to its safe state
 
 
 @click.command()
@@ -96,7 +98,7 @@ def drive(
     device = targets.device(target, printer.line, codebook)
     if dry_run:
         device = targets.device(f"none:{device.takes}", lines.line, codebook)
-    client = Client(service, bearer_token())
+    client = Client(service, bearer_token(), ANSWER_S)
     driven = Drive(
         source=HttpSource(
             client,

@@ -88,9 +88,8 @@ class Sender:
         """Forget what other nodes shared; return whether they shared another clock."""
         if self.shared is None:
             return False
-        late_ns = self.shared.clock.lateness_ns(arrival_ns, boot_ms)
-        self.shared = None
-        return late_ns is not None and not -ANOTHER_CLOCK_NS <= late_ns <= ANOTHER_CLOCK_LATE_NS
+        clock, self.shared = self.shared.clock, None
+        return not clock.may_be_own(arrival_ns, boot_ms, ANOTHER_CLOCK_LATE_NS)
 
     def refuses_event(self, arrival_ns: int, boot_ms: int) -> Reason | None:
         """Return why a Cursor on Target event must be rejected by its time; None to use it.

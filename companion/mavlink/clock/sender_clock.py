@@ -101,21 +101,13 @@ class SenderClock:
             sender_ns=x_ns, latency_s=latency_s, rebooted=placed.rebooted, oldest_ns=at_ns + low_ns
         )
 
-    def may_be_own(self, arrival_ns: int, boot_ms: int) -> bool:
-        """Return whether a stamp that another node shares may be of this clock.
-
-        ``arrival_ns`` is the latest time at which it may have arrived there.
-        """
+    def may_be_own(self, arrival_ns: int, boot_ms: int, late_ns: int = _MAX_DEPTH_NS) -> bool:
+        """Return whether a stamp, which arrived until ``arrival_ns``, may be of this clock."""
         if not self._line.floor:
             return True
         x_ns = self._line.unwrap(boot_ms)
         _, low_ns, _, _ = self._interval(x_ns)
-        return low_ns - _NS_PER_MS <= arrival_ns - x_ns <= low_ns + _MAX_DEPTH_NS
-
-    def lateness_ns(self, arrival_ns: int, boot_ms: int) -> int | None:
-        """Return how much later a stamp arrived than the earliest; None before the first."""
-        x_ns, floor = self._line.unwrap(boot_ms), self._line.floor
-        return arrival_ns - x_ns - round(floor.at(x_ns)) if floor else None
+        return low_ns - _NS_PER_MS <= arrival_ns - x_ns <= low_ns + late_ns
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> None:
         """Add the stamp of any other message, if it lies on the line of the reports."""

@@ -25,14 +25,17 @@ SPACED_NS: Final = 500_000_000
 """Time within which contradictions count once: a position reset causes several."""
 KEPT_NS: Final = 30_000_000_000  # how long a peer and a contradiction are remembered
 SENDERS_MAX: Final = 4096  # senders followed; new ones beyond it are not followed
-PEERS_MAX: Final = 4  # peers followed per sender, the most recent
+PEERS_MAX: Final = 4  # peers followed per sender, the first; others are rejected
 
 
-class Contradiction(NamedTuple):
+class Contradicted(NamedTuple):
     """Peer that a rejected peer contradicts, and whether it was the first of both."""
 
     peer: str
     is_first: bool
+
+
+NO_PLACE: Final = Contradicted("", is_first=False)  # of a peer beyond ``PEERS_MAX``
 
 
 @dataclass(slots=True, kw_only=True)
@@ -47,7 +50,7 @@ class _PeerPath:
     heard_ns: int
     path: Path = field(default_factory=Path)
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
-    contradicts: Contradiction | None = None  # the first of the peers that it contradicted last
+    contradicts: Contradicted | None = None  # the first of the peers that it contradicted last
     is_duplicate: bool = False
 
 
@@ -70,7 +73,7 @@ class DuplicateIds:
         self._trusted = frozenset(trusted)
         self._senders: dict[tuple[int, int], _SenderPaths] = {}
 
-    def rejects(self, peer: str, frame: Frame) -> Contradiction | None:
+    def rejects(self, peer: str, frame: Frame) -> Contradicted | None:
         """Process a frame of ``decode.POSE``. Return why it must be rejected; None to use it."""
         sender = self._senders.get(frame.source)
         if sender is None:
@@ -78,9 +81,9 @@ class DuplicateIds:
             if sender is None:
                 return None
         sender.heard_ns = frame.t_ns
-        path = sender.paths.get(peer)
+        path = sender.paths.get(peer) or self._add_peer(sender, peer, frame.t_ns)
         if path is None:
-            path = self._add_peer(sender, peer, frame.t_ns)
+            return NO_PLACE
         path.heard_ns = frame.t_ns
         if len(sender.paths) == 1:
             return None
@@ -97,12 +100,14 @@ class DuplicateIds:
                 return None
         return self._senders.setdefault(frame.source, _SenderPaths(heard_ns=frame.t_ns))
 
-    def _add_peer(self, sender: _SenderPaths, peer: str, t_ns: int) -> _PeerPath:
-        """Start to follow a peer of a sender; forget silent peers."""
+    def _add_peer(self, sender: _SenderPaths, peer: str, t_ns: int) -> _PeerPath | None:
+        """Start to follow a peer of a sender; forget silent peers. None if there is no place."""
         paths = sender.paths
         for name in [name for name, path in paths.items() if t_ns - path.heard_ns > KEPT_NS]:
             del paths[name]
         if len(paths) >= PEERS_MAX:
+            if peer not in self._trusted:  # in place of another one it could never be contradicted
+                return None
             del paths[max(paths, key=lambda name: paths[name].rank)]
         rank = peer not in self._trusted, sender.peers
         sender.peers += 1
@@ -120,7 +125,7 @@ class DuplicateIds:
             first, later = sorted((path, other), key=lambda one: one.rank)
             if not later.rank[0]:  # both are trusted
                 continue
-            later.contradicts = Contradiction(first.peer, first.rank[1] < later.rank[1])
+            later.contradicts = Contradicted(first.peer, first.rank[1] < later.rank[1])
             when = later.contradicted_ns
             if not when or frame.t_ns - when[-1] >= SPACED_NS:
                 when.append(frame.t_ns)

@@ -363,11 +363,15 @@ class LiveFleetNode:
         self._take_piece(node, piece)
 
     def _take_piece(self, node: str, piece: Shared) -> None:
-        now_ns = self._now_ns()
+        now_ns, began_s = self._now_ns(), time.thread_time()
+        if not self._budgets.has_time(node, now_ns * 1e-9):
+            self.member.reception.unusable += len(piece.frames) + len(piece.trips)
+            return
         events, notices = self.member.take_shared(now_ns, node, piece)
         for event in events:
             self._step(event)
         self._notify_all(notices)
+        self._budgets.charge_time(node, time.thread_time() - began_s)
 
     def _stands(self, node: str, payload: bytes) -> None:
         said = messages.to_standing(payload, node)

@@ -19,6 +19,8 @@ from companion.values import BeamSet, Method, Offer, Policy, Power
 
 ROUND_NS: Final = 2_000_000_000  # time in which all offers are renewed
 MIN_BATCH: Final = 2  # least number of UAVs per batch
+MAX_BATCH: Final = 64
+"""Largest number of UAVs per batch. Late looks would compute those of thousands at once."""
 
 
 class Offers:
@@ -54,7 +56,7 @@ class Offers:
             self._waiting = new + [uav for uav in self._waiting or wanted if uav in self.made]
         share = 0.0 if self._last_ns is None else (now_ns - self._last_ns) / ROUND_NS
         self._last_ns = now_ns
-        many = max(MIN_BATCH, math.ceil(share * len(self.made)))
+        many = min(max(MIN_BATCH, math.ceil(share * len(self.made))), MAX_BATCH)
         chosen, self._waiting = self._waiting[:many], self._waiting[many:]
         return self._made_of(now_ns, chosen) if chosen else None
 

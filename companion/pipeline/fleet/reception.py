@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.trust.dedupe import content
-from companion.mavlink.trust.duplicate_ids import DuplicateIds
+from companion.mavlink.trust.duplicate_ids import NO_PLACE, DuplicateIds
 from companion.mavlink.wire.decode import GPS_RAW_INT, HEARTBEAT
 from companion.mavlink.wire.framing import MAGIC_V2, SHORTEST, examine
 from companion.mavlink.wire.positions import OWN
@@ -165,6 +165,9 @@ class Reception:
         if key in self._heard or not is_new:
             return []
         contradicts = self._duplicate_ids.rejects(node, frame)
+        if contradicts is NO_PLACE:
+            self.unusable += 1
+            return []
         if contradicts is not None:
             is_false = contradicts == (OWN_NODE, True)
             found = self.contradicted if is_false else self.disputed

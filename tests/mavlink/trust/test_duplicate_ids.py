@@ -123,6 +123,15 @@ def test_agreeing_peers_are_trusted_again_until_a_new_conflict() -> None:
     assert [t_s for t_s in found[OTHER] if 60 < t_s < 70]
 
 
+def test_peers_beyond_the_limit_are_rejected_until_an_earlier_one_is_silent() -> None:
+    """One peer under five names was never followed long enough to be contradicted."""
+    judge = DuplicateIds()
+    names = [f"10.0.0.{n}:9" for n in range(duplicate_ids.PEERS_MAX + 2)]
+    first = [judge.rejects(name, report(S, 1, circle(1))) for name in names]
+    assert first == [None] * duplicate_ids.PEERS_MAX + [duplicate_ids.NO_PLACE] * 2
+    assert judge.rejects(names[-1], report(2 * S + KEPT_NS, 60, circle(60))) is None
+
+
 def test_first_peer_stays_believed_however_many_contradict_it() -> None:
     judge, found = DuplicateIds(), set[str]()
     streams = [

@@ -8,6 +8,7 @@ from support import ROOT
 
 from companion.beams.worth import link_budget
 from companion.node.replay import log_events
+from companion.pipeline.fleet import offers as batches
 from companion.pipeline.fleet.member import FleetMember
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings
@@ -61,6 +62,22 @@ def test_offered_sinr_matches_gain_and_range(flown: tuple[Pipeline, FleetMember,
         gain_db = offer.likely_db if offer.sure_db is None else offer.sure_db
         assert gain_db is not None
         assert offer.sinr_db == pytest.approx(10 * math.log10(snr) + gain_db, abs=0.4)
+
+
+def test_offers_are_made_in_batches_of_limited_size(
+    flown: tuple[Pipeline, FleetMember, int], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A look that was late computed those of 2000 UAVs at once: 570 MB."""
+    pipeline, member, now_ns = flown
+    monkeypatch.setattr(batches, "MAX_BATCH", 3)
+    offers = Offers(pipeline, member.reception.silent_s)
+    for late_s in (0, 0, 100):
+        make = offers.look(now_ns + late_s * S)
+        assert make is not None
+        made = make()
+        assert 0 < len(made) <= 3
+        offers.take(made)
+    assert len(offers.made) >= 4
 
 
 def test_reach_is_the_range_of_the_farthest_received_uav(

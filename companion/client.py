@@ -227,7 +227,7 @@ class Client:
                 address,
                 subprotocols=protocols,
                 open_timeout=self._timeout_s,
-                max_size=None,
+                max_size=TEXT_MAX,
                 max_queue=1,
                 compression=None,
                 proxy=None,

@@ -106,8 +106,7 @@ class SenderClock:
         if not self._line.floor:
             return True
         x_ns = self._line.unwrap(boot_ms)
-        _, low_ns, _, _ = self._interval(x_ns)
-        return low_ns - _NS_PER_MS <= arrival_ns - x_ns <= low_ns + late_ns
+        return -_NS_PER_MS <= arrival_ns - x_ns - self._interval(x_ns)[1] <= late_ns
 
     def add_stamp(self, arrival_ns: int, boot_ms: int) -> None:
         """Add the stamp of any other message, if it lies on the line of the reports."""

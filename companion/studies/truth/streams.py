@@ -21,8 +21,11 @@ from companion.recording.reader import read_flight
 from companion.studies.truth import stamps
 from companion.studies.truth.hindsight import BootClock, boot_clock
 from companion.studies.truth.pairing import Brackets
-from companion.values import Frame, GnssStatus, Report, RoundTrip
+from companion.values import Frame, GnssStatus, Report, RoundTrip, UserError
 
+_HOUR_NS: Final = 3_600_000_000_000
+DURATION_MAX_NS: Final = 12 * _HOUR_NS
+"""Longest flight that is studied: studies hold all of it, every update of pauses included."""
 SIM_STATE: Final = 108
 SIMSTATE: Final = 164
 _LAYOUTS: Final = {SIM_STATE: struct.Struct("<21fii"), SIMSTATE: struct.Struct("<9fii")}
@@ -143,10 +146,16 @@ def truth_messages(stream: VehicleStream, msgid: int, clock: BootClock) -> Truth
 
 
 def gather(logs: Sequence[Path]) -> dict[str, VehicleStream]:
-    """Return the streams of a flight's logs, by vehicle that reports a position."""
+    """Return the streams of a flight's logs, by vehicle that reports a position.
+
+    Raises ``UserError`` for logs of more than ``DURATION_MAX_NS``.
+    """
     found: dict[str, VehicleStream] = defaultdict(VehicleStream)
-    dedupe = Dedupe()
+    dedupe, first_ns = Dedupe(), None
     for event in read_flight(logs):
+        first_ns = event.t_ns if first_ns is None else first_ns
+        if event.t_ns - first_ns > DURATION_MAX_NS:
+            raise UserError(f"{logs[0]}: more than {DURATION_MAX_NS // _HOUR_NS} hours; cut it")
         if isinstance(event, RoundTrip):
             found[str(event.source)].round_trips.append(event)
         elif isinstance(event, Frame):

@@ -11,9 +11,11 @@ from support import ROOT, shared_log
 
 from companion.studies.truth import vehicles
 from companion.studies.truth.hindsight import boot_clock
+from companion.studies.truth.streams import gather
 from companion.studies.truth.trajectory import Trajectory
 from companion.studies.truth.vehicles import Flight
 from companion.tracking.geodesy import LocalFrame
+from companion.values import UserError
 
 S = 1_000_000_000
 
@@ -40,6 +42,16 @@ def test_interpolation_is_exact_for_a_cubic() -> None:
     expected = cubic(asked_s)
     assert position == pytest.approx(expected[0])
     assert velocity == pytest.approx(expected[1])
+
+
+def test_flight_of_more_than_twelve_hours_is_rejected(tmp_path: Path) -> None:
+    """A table of 252 kB, with a line a minute over 82 hours, took gigabytes."""
+    table = tmp_path / "days.csv"
+    head = "unix_s,id,lat_deg,lon_deg,alt_m"
+    lines = [f"{1_795_314_424 + 59 * n},1,47,8,{400 + n % 7}" for n in range(800)]
+    table.write_text("\n".join([head, *lines]))
+    with pytest.raises(UserError, match=r"days\.csv: more than 12 hours; cut it"):
+        gather([table])
 
 
 def test_trajectory_is_unknown_outside_and_in_gaps() -> None:

@@ -53,6 +53,7 @@ class SharedState:
 
     clock: SenderClock
     component: ComponentState
+    stamped_ns: int = 0  # arrival of the newest stamp that was shared
 
 
 @dataclass(slots=True, kw_only=True)
@@ -82,6 +83,7 @@ class Sender:
         """
         if self.shared is None:
             self.shared = SharedState(clock=deepcopy(self.clock), component=deepcopy(component))
+        self.shared.stamped_ns = arrival_ns
         return not self.is_known(arrival_ns) or self.clock.may_be_own(arrival_ns, boot_ms)
 
     def receive(self, arrival_ns: int, boot_ms: int) -> bool:

@@ -560,7 +560,8 @@ class Senders:
         are dropped too.
         """
         silent_ns, senders, components = now_ns - KEPT_NS, self._senders, self._components
-        for name in [n for n, one in senders.items() if (one.stamped_ns or now_ns) < silent_ns]:
+        newest_ns = ((n, (one.shared or one).stamped_ns) for n, one in senders.items())
+        for name in [n for n, stamped_ns in newest_ns if (stamped_ns or now_ns) < silent_ns]:
             if not self._is_kept(name):
                 del senders[name]
         gone = [source for source, one in components.items() if one.heard_ns < silent_ns]

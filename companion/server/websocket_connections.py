@@ -93,11 +93,19 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
     def _refuse(self, code: int) -> None:
         """Close the connection of a client that sends a message, or too much; read no more."""
         if self.handshake_complete and not self.close_sent:
-            self.conn.send_close(code, "the stream accepts no messages")
-            self.handle_parser_exception()
+            self._close(code, "the stream accepts no messages")
             self._abort_later()
         else:
             self.abort()
+
+    def _close(self, code: int, reason: str) -> None:
+        """Send a close frame, unless the service has sent one at its end."""
+        try:
+            self.conn.send_close(code, reason)
+        except InvalidState:
+            self.abort()
+        else:
+            self.handle_parser_exception()
 
     async def send(self, message: Any) -> None:
         """Send a message of the application; see ASGI."""
@@ -132,8 +140,7 @@ class BoundedWebSocket(WebSocketsSansIOProtocol):
     def replace(self, code: int, reason: str) -> None:
         """Close the connection in favour of another client."""
         if not self.close_sent and not self.transport.is_closing():
-            self.conn.send_close(code, reason)
-            self.handle_parser_exception()
+            self._close(code, reason)
         if self._stalled is not None:
             self.abort()
         else:

@@ -523,6 +523,32 @@ def test_handshake_that_waits_at_the_end_of_the_service_is_answered_once(
     assert not [one for one in caplog.records if one.exc_info]
 
 
+def test_message_at_the_end_of_the_service_is_refused_without_an_error() -> None:
+    """The service has sent its close frame; a second one is an error of websockets."""
+    made = list[websocket_connections.BoundedWebSocket]()
+
+    async def accepts(scope: Any, receive: Any, send: Any) -> None:
+        await send({"type": "websocket.accept"})
+        await receive()
+        await receive()
+
+    async def ended() -> None:
+        loop = asyncio.get_running_loop()
+        server = await loop.create_server(lambda: answering(accepts, made), "127.0.0.1", 0)
+        reader, writer = await asyncio.open_connection(
+            "127.0.0.1", server.sockets[0].getsockname()[1]
+        )
+        writer.write(UPGRADE)
+        assert b"101" in await reader.readline()
+        made[0].shutdown()
+        made[0]._refuse(websocket_connections.UNSUPPORTED)
+        server.close()
+        await reader.read()
+        writer.close()
+
+    run_async(ended())
+
+
 SAID: dict[str, bytes] = {  # masked frames of a client that has nothing to say
     "no UTF-8": b"\x81\x81\0\0\0\0\xff",
     "fragments of no UTF-8": b"\x01\x81\0\0\0\0\xc3\x80\x81\0\0\0\0(",

@@ -11,6 +11,7 @@ from sent_frames import START_NS, position, sent
 from companion import Frame, Pipeline, RoundTrip, Settings, Source
 from companion.mavlink.clock.estimates import ClockEstimate
 from companion.pipeline.fleet.reception import TRIPS_NS, Reception
+from companion.pipeline.senders import KEPT_NS
 from companion.tracking.noise import STATED_NS
 from companion.values import Estimate, Event, Notice, Output, Reason, Rejection
 
@@ -153,6 +154,16 @@ def test_track_restarts_if_others_shared_another_clock_meanwhile() -> None:
     assert len(told) == 1
     newest = [one for one in outputs if isinstance(one, Estimate)][-1]
     assert newest.fix.t_ns > START_NS + 32.5 * S
+
+
+def test_vehicle_that_others_shared_is_forgotten_once_nobody_shares_it() -> None:
+    into = flown(*(shared(own(n / 10)) for n in range(20)), gap_s=(0, 20), end_s=2)[0]
+    senders = into.senders
+    senders._tracked = ()
+    senders.forget_silent(START_NS + KEPT_NS)
+    assert UAV in senders._senders
+    senders.forget_silent(START_NS + KEPT_NS + 3 * S)
+    assert UAV not in senders._senders
 
 
 def test_round_trips_of_unknown_senders_use_no_memory() -> None:

@@ -340,10 +340,10 @@ class Senders:
             newest is None or step_ms(report.boot_ms, newest[1]) > 0 or stamp.rebooted
         ):
             sender.newest = t_ns, report.boot_ms
-        assumed = self.assumed(uav)
+        assumed = self.assumed(uav, sender)
         lag_ns = round(assumed.lag_middle_s * 1e9)
         made_ns = stamp.oldest_ns - lag_ns
-        errors = self._errors(report, made_ns, assumed.lag_rest_s) if is_own else None
+        errors = self._errors(sender, report, made_ns, assumed.lag_rest_s) if is_own else None
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
         placed = PlacedReport(
             report=report,
@@ -374,13 +374,14 @@ class Senders:
         told = Notice(t_ns=report.t_ns, severity=Severity.WARNING, subject=uav, text=text)
         return None, (told,)
 
-    def _errors(self, report: Report, made_ns: int, time_s: float) -> ReportNoise:
+    def _errors(self, sender: Sender, report: Report, made_ns: int, time_s: float) -> ReportNoise:
         """Return bounds on a report's errors, with the receiver's recent height difference.
 
         ``made_ns`` is the earliest node time of its measurement, ``time_s`` the largest error of
         the time that is assumed.
         """
-        component, known, apart_m = self._component(report.uav, report.source), None, 0.0
+        shared, known, apart_m = sender.shared, None, 0.0
+        component = shared.component if shared else self._components.get(report.source)
         if component is not None and component.receiver is not None:
             known, receiver = component.noise.since(made_ns), component.receiver
             is_recent = report.t_ns - receiver.t_ns <= noise.FORGOTTEN_NS
@@ -527,21 +528,24 @@ class Senders:
         """Return a UAV's own timeline as it is known now."""
         sender = self._senders.get(uav)
         reading = (sender.shared or sender).clock.reading() if sender else None
-        return Timeline(reading, 0.0 if reading is None else self.assumed(uav).lag_rest_s)
+        return Timeline(reading, 0.0 if reading is None else self.assumed(uav, sender).lag_rest_s)
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """Return the state of a UAV's clock; None if no clock is known."""
         sender = self._senders.get(uav)
         return (sender.shared or sender).clock.estimate() if sender else None
 
-    def assumed(self, uav: str) -> assembly.AircraftAssumptions:
+    def assumed(self, uav: str, sender: Sender | None = None) -> assembly.AircraftAssumptions:
         """Return the assumptions about a UAV, by the types in its heartbeats.
 
         An aircraft that changes its type, as one that takes off vertically and then flies as an
         aeroplane, is between both for a while: the assumptions contain those of all its types.
+        ``sender`` is its record, if it is at hand.
         """
-        source = _source(uav)
-        component = None if source is None else self._component(uav, source)
+        source, sender = _source(uav), sender or self._senders.get(uav)
+        component = None if source is None else self._components.get(source)
+        if sender is not None and sender.shared is not None:
+            component = sender.shared.component
         return self._assumed(uav, () if component is None else tuple(component.types))
 
     def _component(self, uav: str, source: Source) -> ComponentState | None:

@@ -134,7 +134,7 @@ class Client:
         """Return the weights to apply in ``lead_ms`` milliseconds."""
         query = urlencode({"lead_ms": lead_ms})
         with self._open(f"/v1/beams/weights?{query}", "application/x-npy") as answer:
-            body, headers = _read(answer, self._timeout_s), answer.headers
+            body, headers = _read(answer, self._timeout_s, ANSWER_MAX), answer.headers
         try:
             return Weights(
                 uavs=tuple(name for name in headers.get("x-uavs", "").split(",") if name),
@@ -272,12 +272,12 @@ def _is_address(url: str) -> bool:
     return found.scheme in ("http", "https") and bool(found.hostname) and port != 0
 
 
-def _read(answer: HTTPResponse, timeout_s: float, most: int | None = None) -> bytes:
-    """Return the body of an answer of at most so many bytes (``ANSWER_MAX``).
+def _read(answer: HTTPResponse, timeout_s: float, most: int) -> bytes:
+    """Return the body of an answer of at most so many bytes.
 
     Every piece has a timeout, and the whole body has one too.
     """
-    ends_s, body, most = time.monotonic() + timeout_s, bytearray(), most or ANSWER_MAX
+    ends_s, body = time.monotonic() + timeout_s, bytearray()
     try:
         while piece := answer.read1(PIECE_BYTES):
             body += piece
@@ -329,13 +329,15 @@ def _closed(error: ConnectionClosed) -> ServiceError:
 
 
 class _TimedFile(io.RawIOBase):
-    """Unbuffered file of a socket; reading fails at ``ends_s``."""
+    """Unbuffered file of a socket with a timeout; all reading fails at ``ends_s``."""
 
-    def __init__(self, sock: socket.socket, ends_s: float) -> None:
+    def __init__(self, sock: socket.socket) -> None:
         super().__init__()
-        self.ends_s = ends_s
+        timeout_s = sock.gettimeout()
+        assert timeout_s is not None
+        self._timeout_s = timeout_s
+        self.ends_s = time.monotonic() + timeout_s
         self._sock = sock
-        self._timeout_s = sock.gettimeout()
         self._file = sock.makefile("rb", buffering=0)  # keeps the socket open
 
     def readable(self) -> bool:
@@ -345,8 +347,7 @@ class _TimedFile(io.RawIOBase):
         left_s = self.ends_s - time.monotonic()
         if left_s <= 0:
             raise TimeoutError("timed out")
-        limits = [one for one in (left_s, self._timeout_s) if one is not None]
-        self._sock.settimeout(min(limits) if math.isfinite(min(limits)) else None)
+        self._sock.settimeout(min(left_s, self._timeout_s))
         return self._file.readinto(buffer)
 
     def close(self) -> None:
@@ -361,7 +362,7 @@ class _TimedResponse(HTTPResponse):
     def __init__(self, sock: socket.socket, *args: Any, **kwargs: Any) -> None:
         super().__init__(sock, *args, **kwargs)
         self.fp.close()
-        self._timed = _TimedFile(sock, time.monotonic() + (sock.gettimeout() or math.inf))
+        self._timed = _TimedFile(sock)
         self.fp = io.BufferedReader(self._timed)
 
     def begin(self) -> None:
@@ -384,7 +385,7 @@ class _Handler(urllib.request.HTTPHandler):
 
 class _TlsHandler(urllib.request.HTTPSHandler):
     def https_open(self, req: urllib.request.Request) -> HTTPResponse:
-        return self.do_open(_TlsConnection, req)
+        return self.do_open(_TlsConnection, req, context=self._context)  # type: ignore[attr-defined]
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):

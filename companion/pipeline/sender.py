@@ -1,6 +1,5 @@
 """State of one sender of frames, and of one MAVLink component."""
 
-from copy import deepcopy
 from dataclasses import dataclass, field
 from typing import Final
 
@@ -49,19 +48,24 @@ class ComponentState:
 
 @dataclass(slots=True, kw_only=True)
 class SharedState:
-    """What is known of a sender with what other nodes share, beginning with what is known here."""
+    """State of a sender whose reports other nodes share; it begins with what is known here.
+
+    received    what this node itself received of its component, which is in force again once it
+                receives a report
+    stamped_ns  arrival of the newest stamp that was shared
+    """
 
     clock: SenderClock
-    component: ComponentState
-    stamped_ns: int = 0  # arrival of the newest stamp that was shared
+    received: ComponentState
+    stamped_ns: int
 
 
 @dataclass(slots=True, kw_only=True)
 class Sender:
     """Sender with a clock: a vehicle, or an aircraft that broadcasts its own stamps.
 
-    ``shared`` is its state with what other nodes of a fleet share, while their reports are used.
-    ``(sender.shared or sender).clock`` is the clock in use.
+    ``shared`` is its state while reports that other nodes of a fleet share are used; then
+    ``shared.clock`` is in force, and ``clock`` is its clock by what this node received.
     """
 
     clock: SenderClock
@@ -75,23 +79,9 @@ class Sender:
         """Return whether its clock is known here: from stamps of at most ``ANOTHER_CLOCK_NS``."""
         return self.stamped_ns is not None and now_ns - self.stamped_ns <= ANOTHER_CLOCK_NS
 
-    def share(self, component: ComponentState, arrival_ns: int, boot_ms: int) -> bool:
-        """Use what other nodes share, until ``receive``; ``component`` is known of it here.
-
-        Return whether a stamp that they share may be the sender's own: while its clock is known
-        here, those that do not agree with it are another clock's.
-        """
-        if self.shared is None:
-            self.shared = SharedState(clock=deepcopy(self.clock), component=deepcopy(component))
-        self.shared.stamped_ns = arrival_ns
+    def agrees(self, arrival_ns: int, boot_ms: int) -> bool:
+        """Return whether a stamp that another node shares may be of its clock, if that is known."""
         return not self.is_known(arrival_ns) or self.clock.may_be_own(arrival_ns, boot_ms)
-
-    def receive(self, arrival_ns: int, boot_ms: int) -> bool:
-        """Forget what other nodes shared; return whether they shared another clock."""
-        if self.shared is None:
-            return False
-        clock, self.shared = self.shared.clock, None
-        return not clock.may_be_own(arrival_ns, boot_ms, ANOTHER_CLOCK_LATE_NS)
 
     def refuses_event(self, arrival_ns: int, boot_ms: int) -> Reason | None:
         """Return why a Cursor on Target event must be rejected by its time; None to use it.

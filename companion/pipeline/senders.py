@@ -10,6 +10,7 @@ Over 300 lines: every kind of message passes through here.
 import math
 from collections import defaultdict
 from collections.abc import Container
+from copy import deepcopy
 from dataclasses import replace
 from functools import lru_cache, partial
 from itertools import islice
@@ -27,7 +28,7 @@ from companion.mavlink.wire.decode import ATTITUDE, decode
 from companion.mavlink.wire.stamps import boot_ms, step_ms
 from companion.pipeline import assembly
 from companion.pipeline.records import RECORDS_MAX, Records, UavRecords
-from companion.pipeline.sender import ComponentState, Sender
+from companion.pipeline.sender import ANOTHER_CLOCK_LATE_NS, ComponentState, Sender, SharedState
 from companion.settings.model import Settings
 from companion.tracking import noise
 from companion.tracking.noise import StatedNoise
@@ -224,25 +225,25 @@ class Senders:
         """
         if type(message) is SystemTime:
             return self._system_time(frame, message)
-        sender = self._senders.get(str(message.source))
-        if not frame.doubt_ns:
-            component = self._components[message.source]
-        elif sender is not None and sender.shared is not None:
-            component = sender.shared.component
-        else:
+        name = str(message.source)
+        sender = self._senders[name] if name in self._senders else None  # noqa: SIM401 - one call less
+        shared = None if sender is None else sender.shared
+        if frame.doubt_ns and shared is None:
             return NO_OUTCOME
+        if frame.doubt_ns or shared is None:
+            component = self._components[message.source]
+        else:
+            component = shared.received
         component.heard_ns = message.t_ns
         match message:
             case GnssStatus():
                 stated_us, newest_us = message.time_us, component.stated_us
                 # An older status comes over a second, slower link.
                 is_newest = not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US
-                if (
-                    frame.doubt_ns and sender is not None
-                ):  # others may only raise what is known here
-                    is_newest &= not sender.is_known(message.t_ns)
                 # Before its first position, no peer is known to speak for the vehicle.
                 if sender is not None:
+                    if frame.doubt_ns:  # others may only raise what is known here
+                        is_newest &= not sender.is_known(message.t_ns)
                     stated = noise.reported(message, self._noise_settings)
                     component.noise.add(message.t_ns, stated, is_newest=is_newest)
                 if is_newest:
@@ -277,19 +278,19 @@ class Senders:
         """Pass a TIMESYNC round trip to its sender's clock.
 
         One that another node measured counts only while frames of other nodes are used, and the
-        clock is not known here. Returns the clock change that the round trip revealed.
+        clock is not known here. Returns the change of the clock in force that it revealed.
         """
         sender = self._senders.get(str(event.source))
         if sender is None:
             return None
         if event.is_shared and (sender.shared is None or sender.is_known(event.t_ns)):
             return None
-        trip = event.sent_ns, event.t_ns, event.remote_ns
-        if sender.shared is not None:
-            sender.shared.clock.timesync(*trip)
-        if not event.is_shared:
-            sender.clock.timesync(*trip)
-        return (sender.shared or sender).clock.change
+        in_force = (sender.shared or sender).clock
+        for clock in (
+            (in_force,) if event.is_shared or not sender.shared else (in_force, sender.clock)
+        ):
+            clock.timesync(event.sent_ns, event.t_ns, event.remote_ns)
+        return in_force.change
 
     def utc_is(self, offset_ns: int) -> None:
         """Set the difference between UTC and the node's timeline, valid from now on."""
@@ -314,7 +315,7 @@ class Senders:
         switched: tuple[Notice, ...] = ()
         if doubt_ns or sender.shared is not None:
             refused, switched = self._switch(sender, report, is_shared=doubt_ns > 0)
-        if is_event:
+        elif is_event:
             refused = sender.refuses_event(t_ns, report.boot_ms)
         if refused is not None:
             return _refused(report, refused)
@@ -340,10 +341,10 @@ class Senders:
             newest is None or step_ms(report.boot_ms, newest[1]) > 0 or stamp.rebooted
         ):
             sender.newest = t_ns, report.boot_ms
-        assumed = self.assumed(uav, sender)
+        assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
         made_ns = stamp.oldest_ns - lag_ns
-        errors = self._errors(sender, report, made_ns, assumed.lag_rest_s) if is_own else None
+        errors = self._errors(report, made_ns, assumed.lag_rest_s) if is_own else None
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
         placed = PlacedReport(
             report=report,
@@ -357,31 +358,38 @@ class Senders:
     def _switch(
         self, sender: Sender, report: Report, *, is_shared: bool
     ) -> tuple[Reason | None, tuple[Notice, ...]]:
-        """Use what other nodes share of a vehicle, or again only what this node receives.
+        """Put in force what other nodes share of a vehicle, or again what this node received.
 
         Returns why the report must be rejected, and a notice if the track must restart.
         """
         assert report.boot_ms is not None
+        uav, source, shared = report.uav, report.source, sender.shared
         if is_shared:
-            component = self._components.get(report.source)
-            known = component or ComponentState(noise=StatedNoise(self._noise_settings.default))
-            is_own = sender.share(known, report.t_ns, report.boot_ms)
-            return None if is_own else Reason.UNPLACED_STAMP, ()
-        if not sender.receive(report.t_ns, report.boot_ms):
+            if shared is None:
+                received = self._components[source]
+                shared = sender.shared = SharedState(
+                    clock=deepcopy(sender.clock), received=received, stamped_ns=report.t_ns
+                )
+                self._components[source] = deepcopy(received)
+            shared.stamped_ns = report.t_ns
+            agrees = sender.agrees(report.t_ns, report.boot_ms)
+            return None if agrees else Reason.UNPLACED_STAMP, ()
+        if shared is None:
             return None, ()
-        uav = report.uav
+        self._components[source], sender.shared = shared.received, None
+        if shared.clock.may_be_own(report.t_ns, report.boot_ms, ANOTHER_CLOCK_LATE_NS):
+            return None, ()
         text = f"{uav}: track restarted: other nodes shared reports with another clock"
         told = Notice(t_ns=report.t_ns, severity=Severity.WARNING, subject=uav, text=text)
         return None, (told,)
 
-    def _errors(self, sender: Sender, report: Report, made_ns: int, time_s: float) -> ReportNoise:
+    def _errors(self, report: Report, made_ns: int, time_s: float) -> ReportNoise:
         """Return bounds on a report's errors, with the receiver's recent height difference.
 
         ``made_ns`` is the earliest node time of its measurement, ``time_s`` the largest error of
         the time that is assumed.
         """
-        shared, known, apart_m = sender.shared, None, 0.0
-        component = shared.component if shared else self._components.get(report.source)
+        component, known, apart_m = self._components.get(report.source), None, 0.0
         if component is not None and component.receiver is not None:
             known, receiver = component.noise.since(made_ns), component.receiver
             is_recent = report.t_ns - receiver.t_ns <= noise.FORGOTTEN_NS
@@ -480,7 +488,7 @@ class Senders:
         datums; home waits ``always``. A status that was not repeated for ``FORGOTTEN_NS`` is
         ignored: it may be forged.
         """
-        component = self._component(report.uav, report.source)
+        component = self._components.get(report.source)
         receiver = None if component is None else component.receiver
         if receiver is None or not kind_of(report.uav).reports_itself:
             return True
@@ -503,10 +511,8 @@ class Senders:
         stamp = clock.observe(arrival_ns, boot_ms, doubt_ns)
         if stamp is None or not stamp.rebooted:
             return stamp, ()
-        if kind_of(name).reports_itself:
-            component = self._component(name, Source.parse(name))
-            if component is not None:
-                component.stated_us = 0
+        if kind_of(name).reports_itself and (source := Source.parse(name)) in self._components:
+            self._components[source].stated_us = 0
         text = f"{name} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
         if kind_of(name) is UavKind.COT:  # its events have times of day
             text = f"{name}: track restarted: the times of its events stepped back"
@@ -528,32 +534,22 @@ class Senders:
         """Return a UAV's own timeline as it is known now."""
         sender = self._senders.get(uav)
         reading = (sender.shared or sender).clock.reading() if sender else None
-        return Timeline(reading, 0.0 if reading is None else self.assumed(uav, sender).lag_rest_s)
+        return Timeline(reading, 0.0 if reading is None else self.assumed(uav).lag_rest_s)
 
     def clock_estimate(self, uav: str) -> ClockEstimate | None:
         """Return the state of a UAV's clock; None if no clock is known."""
         sender = self._senders.get(uav)
         return (sender.shared or sender).clock.estimate() if sender else None
 
-    def assumed(self, uav: str, sender: Sender | None = None) -> assembly.AircraftAssumptions:
+    def assumed(self, uav: str) -> assembly.AircraftAssumptions:
         """Return the assumptions about a UAV, by the types in its heartbeats.
 
         An aircraft that changes its type, as one that takes off vertically and then flies as an
         aeroplane, is between both for a while: the assumptions contain those of all its types.
-        ``sender`` is its record, if it is at hand.
         """
-        source, sender = _source(uav), sender or self._senders.get(uav)
+        source = _source(uav)
         component = None if source is None else self._components.get(source)
-        if sender is not None and sender.shared is not None:
-            component = sender.shared.component
         return self._assumed(uav, () if component is None else tuple(component.types))
-
-    def _component(self, uav: str, source: Source) -> ComponentState | None:
-        """Return what is in force of a vehicle's messages other than positions."""
-        sender = self._senders.get(uav)
-        if sender is not None and sender.shared is not None:
-            return sender.shared.component
-        return self._components.get(source)
 
     # --- memory -----------------------------------------------------------------------------
 

@@ -25,8 +25,8 @@ DEFAULT_DESIGN: Final = "kinematic_default.json"
 LARGEST_BYTES: Final = 1 << 24
 """Largest file that is read, bytes: a codebook of 1024 elements and as many beams."""
 TEXT_BYTES: Final = 1 << 21
-"""Largest text: settings, or positions of 4096 elements. Parsed, it takes 50 times as much."""
-NAMED_TEXT_BYTES: Final = 1 << 22  # the same of a text that settings name, as a calibration
+"""Largest settings, and positions of elements. Parsed, they take 50 times as much memory."""
+NAMED_TEXT_BYTES: Final = 1 << 22  # largest other text that the settings name, as a calibration
 NUMBERS_MAX: Final = 1 << 22  # most numbers of an array: 64 MB as complex ones
 
 

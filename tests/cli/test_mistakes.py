@@ -1,15 +1,17 @@
 """Command-line errors: one line with a hint, the correct exit status, and no files left behind."""
 
 import os
+import re
 import struct
 import subprocess
+import urllib.request
 from pathlib import Path
 from typing import IO
 
 import pytest
 from click.testing import CliRunner
 from pymavlink.dialects.v20 import all as dialect
-from support import BIN, HANG_S
+from support import BIN, HANG_S, started
 
 from companion.cli.main import main
 from companion.recording.foreign import kinds
@@ -366,6 +368,7 @@ def test_command_error_is_one_line(folder: Path, given: str, status: int, says: 
     assert sorted(folder.rglob("*")) == before
 
 
+ADDRESS = re.compile(r"http://127\.0\.0\.1:\d+")
 OUTPUTS = [
     "companion --help",
     "companion design --dt 0.1",
@@ -390,12 +393,43 @@ def test_output_that_cannot_be_written_ends_the_command(
         f"{program}: the output cannot be written: No space left on device",
     )
     assert "Traceback" not in done.stderr
-    read, write = os.pipe()
-    os.close(read)
-    with os.fdopen(write, "w") as pipe:
+    with without_reader() as pipe:
         done = run(program, words, pipe)
     assert done.returncode == 1
     assert "Traceback" not in done.stderr and "Error" not in done.stderr
+
+
+@pytest.mark.parametrize("is_full", [True, False], ids=["full disk", "no reader"])
+def test_service_whose_stdout_takes_nothing_serves_and_says_where(
+    is_full: bool, folder: Path
+) -> None:
+    words = [
+        "run",
+        "--link",
+        "udpin:127.0.0.1:0",
+        "--listen",
+        "127.0.0.1:0",
+        "--center",
+        "47,8,400",
+    ]
+    with (
+        Path("/dev/full").open("w") if is_full else without_reader() as out,
+        started(
+            [BIN / "companion", *words], stdout=out, stderr=subprocess.PIPE, text=True, cwd=folder
+        ) as process,
+    ):
+        address = next(found[0] for line in process.stderr if (found := ADDRESS.search(line)))
+        with urllib.request.urlopen(f"{address}/healthz", timeout=HANG_S) as answer:
+            assert answer.status == 200
+        process.terminate()
+        assert process.wait(HANG_S) == 0
+
+
+def without_reader() -> IO[str]:
+    """Return a pipe whose reader has ended."""
+    read, write = os.pipe()
+    os.close(read)
+    return os.fdopen(write, "w")
 
 
 def run(program: str, words: list[str], out: IO[str]) -> "subprocess.CompletedProcess[str]":

@@ -486,6 +486,17 @@ def answering(
     return made[-1]
 
 
+async def asking(
+    app: Any, made: list[websocket_connections.BoundedWebSocket]
+) -> tuple[asyncio.Server, asyncio.StreamReader, asyncio.StreamWriter]:
+    """Serve an application, and ask it for a WebSocket."""
+    loop = asyncio.get_running_loop()
+    server = await loop.create_server(lambda: answering(app, made), "127.0.0.1", 0)
+    reader, writer = await asyncio.open_connection("127.0.0.1", server.sockets[0].getsockname()[1])
+    writer.write(UPGRADE)
+    return server, reader, writer
+
+
 @pytest.mark.parametrize(
     "answers", [(), ("websocket.close",), ("websocket.accept", "websocket.close")]
 )
@@ -503,12 +514,7 @@ def test_handshake_that_waits_at_the_end_of_the_service_is_answered_once(
     made = list[websocket_connections.BoundedWebSocket]()
 
     async def ended() -> bytes:
-        loop = asyncio.get_running_loop()
-        server = await loop.create_server(lambda: answering(unanswered, made), "127.0.0.1", 0)
-        reader, writer = await asyncio.open_connection(
-            "127.0.0.1", server.sockets[0].getsockname()[1]
-        )
-        writer.write(UPGRADE)
+        server, reader, writer = await asking(unanswered, made)
         while not (made and made[0].handshake_initiated):
             await asyncio.sleep(0)
         made[0].shutdown()
@@ -533,12 +539,7 @@ def test_message_at_the_end_of_the_service_is_refused_without_an_error() -> None
         await receive()
 
     async def ended() -> None:
-        loop = asyncio.get_running_loop()
-        server = await loop.create_server(lambda: answering(accepts, made), "127.0.0.1", 0)
-        reader, writer = await asyncio.open_connection(
-            "127.0.0.1", server.sockets[0].getsockname()[1]
-        )
-        writer.write(UPGRADE)
+        server, reader, writer = await asking(accepts, made)
         assert b"101" in await reader.readline()
         made[0].shutdown()
         made[0]._refuse(websocket_connections.UNSUPPORTED)

@@ -102,7 +102,7 @@ class SenderClock:
         )
 
     def may_be_own(self, arrival_ns: int, boot_ms: int, late_ns: int = _MAX_DEPTH_NS) -> bool:
-        """Return whether a stamp, which arrived until ``arrival_ns``, may be of this clock."""
+        """Return whether a stamp that arrived by ``arrival_ns`` may be this clock's, so late."""
         if not self._line.floor:
             return True
         x_ns = self._line.unwrap(boot_ms)

@@ -70,7 +70,8 @@ class AircraftJson(ForeignSplitter):
         unplaced = self._begin(t_ns, data) if data or not self._rest else []
         if unplaced:
             return unplaced
-        if self._rest and self.skips and self._is_skipped(self._left()):  # counted only then
+        if self._rest and self.skips:  # only then are they counted: it takes milliseconds
+            self._is_skipped(_aircraft_in(self._rest, self._at))
             self._rest = b""
             return []
         items: Items = []
@@ -79,10 +80,6 @@ class AircraftJson(ForeignSplitter):
                 break
             items += self._next()
         return items
-
-    def _left(self) -> int:
-        """Return the number of aircraft that are not parsed yet."""
-        return min(self._rest.count(b'"hex"', self._at), AIRCRAFT_MAX - self._read)
 
     def _next(self) -> Items:
         """Parse one aircraft; what follows a malformed or endless one is garbage."""
@@ -119,15 +116,13 @@ class AircraftJson(ForeignSplitter):
             self._stated_s, self._written, self._arrived_ns = stated_s, written, t_ns
             self._rest = aircraft
         elif is_new and aircraft:
-            self._rest = aircraft
-            count, self._rest = max(1, self._left()), b""
             return [
                 Rejection(
                     t_ns=t_ns,
                     source=self.link,
                     reason=Reason.UNPLACED_STAMP,
                     msgid=ADSB_VEHICLE,
-                    count=count,
+                    count=max(1, _aircraft_in(aircraft)),
                     detail="age of the document is unknown",
                 )
             ]
@@ -181,6 +176,11 @@ def _split(data: bytes) -> tuple[float, bytes]:
     if stated_s is None:
         raise ValueError("no time")
     return stated_s, data[found.end() : end]
+
+
+def _aircraft_in(entries: bytes, at: int = 0) -> int:
+    """Return the number of aircraft from an index on, without parsing them."""
+    return min(entries.count(b'"hex"', at), AIRCRAFT_MAX)
 
 
 def _aircraft_state(entry: object) -> AircraftState | str | None:

@@ -1,9 +1,9 @@
 """Reception of frames by this node, and of frames shared by other nodes; its own have priority.
 
 A shared report is used only if its vehicle is silent here. A node that sends wrong reports under a
-vehicle's id then cannot affect vehicles that this node receives. Shared reports of a vehicle that
-is received here are compared with its own reports (``mavlink/trust/duplicate_ids.py``); those
-missed here are used once the vehicle falls silent.
+vehicle's id then affects no vehicle that this node receives, except in gaps of its reception.
+Shared reports of a vehicle that is received here are compared with its own reports
+(``mavlink/trust/duplicate_ids.py``); those missed here are used once the vehicle falls silent.
 """
 
 from collections import OrderedDict, deque
@@ -192,7 +192,10 @@ class Reception:
             self._trips_ns.setdefault(source, 0)
 
     def uses_trip(self, now_ns: int, source: Source) -> bool:
-        """Return whether a shared round trip of a vehicle is used: if its shared reports are."""
+        """Return whether to use a shared round trip now; only if shared reports are used.
+
+        Time is noted: the next one is used ``TRIPS_NS`` later.
+        """
         newest_ns = self._trips_ns.get(source)
         if newest_ns is None or now_ns - newest_ns < TRIPS_NS:
             return False

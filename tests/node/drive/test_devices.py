@@ -8,7 +8,7 @@ import sys
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any, ClassVar
@@ -29,6 +29,8 @@ from companion.node.drive import targets
 from companion.node.drive.adar1000 import Chips
 from companion.node.drive.gimbal import Gimbal, RoiGimbal
 from companion.node.drive.loop import (
+    BeamSource,
+    Device,
     DeviceCommand,
     DeviceError,
     DeviceInput,
@@ -452,10 +454,7 @@ class Recorder:
 def test_device_rests_once_without_beams_and_at_the_end() -> None:
     clock = Ticking()
     device, said = Recorder(clock), list[str]()
-    fit, stale = (
-        DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1"),
-        DeviceCommand(valid_at_ns=0, unfit="its attitude is too old"),
-    )
+    fit, stale = (BEAM_NOW, DeviceCommand(valid_at_ns=0, unfit="its attitude is too old"))
     source = Always(fit, stale, stale, None, None, fit, fit)
     drive = Drive(
         source=source,
@@ -479,18 +478,8 @@ def test_device_rests_once_without_beams_and_at_the_end() -> None:
 
 def test_lead_is_the_measured_device_time_and_late_updates_are_counted() -> None:
     clock = Ticking()
-    device, source = (
-        Recorder(clock, 0.03),
-        Always(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
-    )
-    drive = Drive(
-        source=source,
-        device=device,
-        update_hz=10.0,
-        safe=SafeState.HOLD,
-        now_ns=clock.now_ns,
-        say=print,
-    )
+    device, source = (Recorder(clock, 0.03), Always(BEAM_NOW))
+    drive = driven(source, device, print, now_ns=clock.now_ns)
     for _ in range(5):
         drive.step()
     assert source.leads_s == pytest.approx([0.0, 0.03, 0.03, 0.03, 0.03])
@@ -504,7 +493,7 @@ def test_failed_device_is_reopened_and_rests_again() -> None:
     device, said = Recorder(clock), list[str]()
     source = Always(
         DeviceCommand(valid_at_ns=0, unfit="no carrier"),
-        DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1"),
+        BEAM_NOW,
         DeviceCommand(valid_at_ns=0, unfit="no carrier"),
     )
     drive = Drive(
@@ -593,14 +582,7 @@ def test_any_error_of_pyadi_iio_is_a_device_error(
     assert registers is not None
     device = targets.device(target, print, lambda: [registers] * 3)
     clock, said = Ticking(), list[str]()
-    drive = Drive(
-        source=Always(replace(flown[0], stored=1)),
-        device=device,
-        update_hz=10.0,
-        safe=SafeState.HOLD,
-        now_ns=clock.now_ns,
-        say=said.append,
-    )
+    drive = driven(Always(replace(flown[0], stored=1)), device, said.append, now_ns=clock.now_ns)
     drive.step()
     phaser = device._phaser  # type: ignore[attr-defined]
     device._phaser = SimpleNamespace(  # type: ignore[attr-defined]
@@ -641,6 +623,30 @@ def test_failed_write_to_a_phaser_is_repeated(
     assert Counter(name for _, name, _ in iio[written:])[name] == 8
 
 
+BEAM_NOW = DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")
+
+
+def driven(
+    source: BeamSource,
+    device: Device,
+    say: Callable[[str], None],
+    *,
+    now_ns: Callable[[], int] = time.monotonic_ns,
+) -> Drive:
+    return Drive(
+        source=source, device=device, update_hz=10.0, safe=SafeState.HOLD, now_ns=now_ns, say=say
+    )
+
+
+async def cancelled_after(event: threading.Event, drive: Drive) -> None:
+    """Run a drive on its thread, and cancel it after an event."""
+    task = asyncio.create_task(driving.run_in_thread(drive))
+    await asyncio.to_thread(event.wait, HANG_S)
+    task.cancel()
+    with contextlib.suppress(asyncio.CancelledError):
+        await task
+
+
 def test_device_that_never_answers_is_reported_once() -> None:
     """From another thread, while the update waits."""
     clock, said = Ticking(), list[str]()
@@ -658,14 +664,7 @@ def test_device_that_never_answers_is_reported_once() -> None:
             drive.report_wait()
             return super().ask(lead_s)
 
-    drive = Drive(
-        source=Slow(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
-        device=Hanging(clock),
-        update_hz=10.0,
-        safe=SafeState.HOLD,
-        now_ns=clock.now_ns,
-        say=said.append,
-    )
+    drive = driven(Slow(BEAM_NOW), Hanging(clock), said.append, now_ns=clock.now_ns)
     drive.step()
     drive.report_wait()
     assert said == [
@@ -689,23 +688,9 @@ def test_running_drive_reports_a_device_that_hangs(monkeypatch: pytest.MonkeyPat
         if "has not answered" in text:
             reported.set()
 
-    drive = Drive(
-        source=Always(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
-        device=Hanging(Ticking()),
-        update_hz=10.0,
-        safe=SafeState.HOLD,
-        now_ns=time.monotonic_ns,
-        say=say,
-    )
+    drive = driven(Always(BEAM_NOW), Hanging(Ticking()), say)
 
-    async def run() -> None:
-        task = asyncio.create_task(driving.run_in_thread(drive))
-        await asyncio.to_thread(reported.wait, HANG_S)
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
-
-    run_async(run())
+    run_async(cancelled_after(reported, drive))
     assert reported.is_set()
 
 
@@ -728,24 +713,10 @@ def test_device_that_is_left_as_it_is_is_reported(
             assert answers.wait(HANG_S)
             return super().ask(lead_s)
 
-    drive = Drive(
-        source=Slow(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
-        device=Closing(Ticking()),
-        update_hz=10.0,
-        safe=SafeState.HOLD,
-        now_ns=time.monotonic_ns,
-        say=said.append,
-    )
-
-    async def run() -> None:
-        task = asyncio.create_task(driving.run_in_thread(drive))
-        await asyncio.to_thread(asked.wait, HANG_S)
-        task.cancel()
-        with contextlib.suppress(asyncio.CancelledError):
-            await task
+    drive = driven(Slow(BEAM_NOW), Closing(Ticking()), said.append)
 
     if beside:
-        run_async(run())
+        run_async(cancelled_after(asked, drive))
     else:
         driving.run_until_stopped(drive, lambda _: None, 0.05)
     assert said[-1] == "the device has not answered: it may not be in its safe state"
@@ -761,14 +732,7 @@ def test_device_that_failed_before_the_end_is_reported() -> None:
         def apply(self, shot: DeviceCommand) -> None:
             raise DeviceError("no answer")
 
-    drive = Drive(
-        source=Always(DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")),
-        device=Failing(Ticking()),
-        update_hz=10.0,
-        safe=SafeState.HOLD,
-        now_ns=time.monotonic_ns,
-        say=said.append,
-    )
+    drive = driven(Always(BEAM_NOW), Failing(Ticking()), said.append)
     drive.step()
     drive.end()
     assert said[-1] == "the device did not go to its safe state: no answer"
@@ -868,13 +832,11 @@ def test_table_of_a_service_is_applied_and_its_repetition_is_not(
 def test_texts_of_a_service_are_reported_in_one_printable_line() -> None:
     said = list[str]()
     unfit = "\x1b[2Jfar\n" + "x" * 5000
-    drive = Drive(
-        source=Always(DeviceCommand(valid_at_ns=0, unfit=unfit)),
-        device=Recorder(Ticking()),
-        update_hz=10.0,
-        safe=SafeState.HOLD,
+    drive = driven(
+        Always(DeviceCommand(valid_at_ns=0, unfit=unfit)),
+        Recorder(Ticking()),
+        said.append,
         now_ns=Ticking().now_ns,
-        say=said.append,
     )
     drive.step()
     assert said[1].startswith("hold: [2Jfar xxx")

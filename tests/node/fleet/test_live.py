@@ -358,41 +358,29 @@ def test_malformed_samples_are_counted_and_reported_once_for_each_node() -> None
     assert {one.severity for one in notices} == {Severity.WARNING}
 
 
-def test_message_of_many_frames_is_processed_in_slices() -> None:
-    """While many frames wait, further messages are discarded and counted."""
+TRIP = RoundTrip(t_ns=S, source=Source(1, 1), sent_ns=S, remote_ns=1)
+
+
+@pytest.mark.parametrize(
+    "many",
+    [
+        Shared(S, (SharedFrame(S, bytes(20)),) * messages.FRAMES_MAX),
+        Shared(S, (), (TRIP,) * messages.FRAMES_MAX),
+    ],
+    ids=["frames", "round trips"],
+)
+def test_message_of_many_items_is_processed_in_slices(many: Shared) -> None:
+    """While many items wait, further messages are discarded and counted."""
     taken: list[int] = []
-
-    async def receive() -> LiveFleetNode:
-        member = node(mode="client", connect=["tcp/127.0.0.1:1"])
-        member._slices = ToLoop(asyncio.get_running_loop())
-        member._take_piece = lambda _, piece: taken.append(len(piece.frames))  # type: ignore[method-assign]
-        many = messages.shared(Shared(S, (SharedFrame(S, bytes(20)),) * messages.FRAMES_MAX))
-        member._shared("south", many)
-        assert taken == [live.PIECE]
-        member._shared("south", many)
-        assert member.member.reception.unusable == messages.FRAMES_MAX
-        while member._waiting:
-            await asyncio.sleep(0)
-        return member
-
-    run_async(receive())
-    assert sum(taken) == messages.FRAMES_MAX
-    assert max(taken) == live.PIECE
-
-
-def test_message_of_many_round_trips_is_processed_in_slices() -> None:
-    """All of 4000 were processed at once: no beams, and 90 % of the frames lost."""
-    taken: list[int] = []
-    trip = RoundTrip(t_ns=S, source=Source(1, 1), sent_ns=S, remote_ns=1)
 
     async def receive() -> None:
         member = node(mode="client", connect=["tcp/127.0.0.1:1"])
         member._slices = ToLoop(asyncio.get_running_loop())
-        member._take_piece = lambda _, piece: taken.append(len(piece.trips))  # type: ignore[method-assign]
-        many = messages.shared(Shared(S, (), (trip,) * messages.FRAMES_MAX))
-        member._shared("south", many)
+        member._take_piece = lambda _, piece: taken.append(len(piece.frames + piece.trips))  # type: ignore[method-assign]
+        payload = messages.shared(many)
+        member._shared("south", payload)
         assert taken == [live.PIECE]
-        member._shared("south", many)
+        member._shared("south", payload)
         assert member.member.reception.unusable == messages.FRAMES_MAX
         while member._waiting:
             await asyncio.sleep(0)

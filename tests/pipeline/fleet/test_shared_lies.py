@@ -118,6 +118,15 @@ def test_receivers_own_accuracies_are_not_overtaken_by_shared_ones() -> None:
     assert min(fix.noise.horizontal_m for fix in after) > 20
 
 
+def test_accuracy_that_is_received_in_a_gap_counts_after_it() -> None:
+    """The vehicle's own statement arrives while its positions do not."""
+    lies = [shared(own(10.15 + n / 10)) for n in range(15)]
+    _, outputs = flown(*lies, accuracy(10.9, 20_000), gap_s=(10, 12))
+    fixes = [one.fix for one in outputs if isinstance(one, Estimate)]
+    after = [fix.noise.horizontal_m for fix in fixes if fix.t_ns > START_NS + 12 * S]
+    assert min(after) > 20
+
+
 @pytest.mark.parametrize("ahead_s", [0.5, 0.9])
 def test_reports_of_others_ahead_of_the_clock_known_here_are_rejected(ahead_s: float) -> None:
     lies = [shared(own(10.05 + n / 10, ahead_s)) for n in range(9)]

@@ -379,7 +379,7 @@ class Senders:
         self._components[source], sender.shared = shared.received, None
         if shared.clock.may_be_own(report.t_ns, report.boot_ms, ANOTHER_CLOCK_LATE_NS):
             return None, ()
-        text = f"{uav}: track restarted: other nodes shared reports with another clock"
+        text = f"{uav}: track restarted: the reports that other nodes shared had another clock"
         told = Notice(t_ns=report.t_ns, severity=Severity.WARNING, subject=uav, text=text)
         return None, (told,)
 

@@ -121,7 +121,7 @@ def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
     if found.dtype.kind not in kinds:
         raise ConfigError(f"{where}: unsupported dtype {found.dtype}; save it as numbers")
     if found.size > NUMBERS_MAX:
-        raise ConfigError(f"{where}: {found.size} numbers; at most {NUMBERS_MAX} are read")
+        raise ConfigError(f"{where}: has {found.size} numbers; the limit is {NUMBERS_MAX}")
     return found
 
 

@@ -93,7 +93,7 @@ class Trust:
             return []
         self._disputed_ns[uav] = now_ns
         name = believed if believed == OWN_NODE else f"node {believed}"
-        what = f"contradicts {name} about {uav}; {name} is believed"
+        what = f"shares other positions of {uav} than {name}, which is believed"
         return [_notice(now_ns, node, what, Severity.WARNING)]
 
     def check_vehicles(

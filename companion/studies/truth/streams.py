@@ -155,7 +155,8 @@ def gather(logs: Sequence[Path]) -> dict[str, VehicleStream]:
     for event in read_flight(logs):
         first_ns = event.t_ns if first_ns is None else first_ns
         if event.t_ns - first_ns > DURATION_MAX_NS:
-            raise UserError(f"{logs[0]}: more than {DURATION_MAX_NS // _HOUR_NS} hours; cut it")
+            limit = f"{DURATION_MAX_NS // _HOUR_NS} hours, the limit of studies"
+            raise UserError(f"{logs[0]}: the flight is longer than {limit}; give a part of it")
         if isinstance(event, RoundTrip):
             found[str(event.source)].round_trips.append(event)
         elif isinstance(event, Frame):

@@ -55,7 +55,7 @@ def test_dispute_of_two_nodes_is_told_once_a_minute_and_excludes_neither() -> No
     for number in range(100):
         said += trust.note_dispute(number * S, "6:1", "c", "b")
     assert [one.t_ns for one in said] == [0, 60 * S]
-    assert said[0].text == ("node c contradicts node b about 6:1; node b is believed")
+    assert said[0].text == ("node c shares other positions of 6:1 than node b, which is believed")
     assert trust.is_trusted("b") and trust.is_trusted("c")
     trust.forget(200 * S)
     assert trust._disputed_ns == {}

@@ -50,7 +50,7 @@ def test_flight_of_more_than_twelve_hours_is_rejected(tmp_path: Path) -> None:
     head = "unix_s,id,lat_deg,lon_deg,alt_m"
     lines = [f"{1_795_314_424 + 59 * n},1,47,8,{400 + n % 7}" for n in range(800)]
     table.write_text("\n".join([head, *lines]))
-    with pytest.raises(UserError, match=r"days\.csv: more than 12 hours; cut it"):
+    with pytest.raises(UserError, match=r"days\.csv: the flight is longer than 12 hours"):
         gather([table])
 
 

@@ -104,6 +104,14 @@ def test_accuracies_of_others_lower_no_bound_in_a_gap_or_after_it(reports: bool)
     assert min(fix.noise.position_m for fix in fixes) > 1.0
 
 
+def test_accuracies_of_others_without_their_reports_count_for_nothing() -> None:
+    """Not even once the vehicle has been silent for so long that its clock is not known here."""
+    lies = [shared(accuracy(21 + n / 10)) for n in range(9)]
+    _, outputs = flown(*lies, gap_s=(10, 22), end_s=25)
+    fixes = [one.fix for one in outputs if isinstance(one, Estimate)]
+    assert min(fix.noise.position_m for fix in fixes) > 1.0
+
+
 def test_receivers_own_accuracies_are_not_overtaken_by_shared_ones() -> None:
     """A receiver's time 20 s ahead: the vehicle's own 20 m no longer counted, 7 m off at 3 m."""
     ahead = dialect.MAVLink_gps_raw_int_message(

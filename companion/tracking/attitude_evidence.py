@@ -153,12 +153,16 @@ class AttitudeTrust:
             return None
         level = math.cos(newest.pitch_rad)
         error_rad = self._unopposed_rad()
-        if error_rad >= math.pi / 2 or math.sin(error_rad) >= level:
-            return None  # the nose may point straight up or down
+        off_rad = error_rad + turned_rad
+        if off_rad >= math.pi / 2 or math.sin(off_rad) >= level:
+            return None  # the nose may point straight up or down, or have done so since
         stated_rad = said.accuracy_rad or HEADING_UNSTATED_RAD
-        own_rad = assumed.factor * max(stated_rad, HEADING_LEAST_RAD) + turned_rad / level
+        # A nose that is off by an angle is off by asin(sin(angle) / level) in azimuth, at most.
+        error_rad = math.asin(math.sin(error_rad) / level)
+        own_rad = assumed.factor * max(stated_rad, HEADING_LEAST_RAD)
+        own_rad += math.asin(math.sin(off_rad) / level) - error_rad
         apart_rad = abs(math.remainder(said.heading_rad - newest.yaw_rad, math.tau))
-        if apart_rad <= math.asin(math.sin(error_rad) / level) + own_rad:
+        if apart_rad <= error_rad + own_rad:
             return _Worth(said.t_ns, 0.0)
         return _Worth(said.t_ns, min(math.pi, assumed.bound_rad + apart_rad + own_rad))
 

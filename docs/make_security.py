@@ -120,7 +120,7 @@ WAYS: Final = (
     WayIn(
         name="Zenoh: MAVLink and fleets",
         covers=("link:zenoh",),
-        size=f"{kb(zenoh_config.MESSAGE_MAX)} a sample, {kb(to_loop.BYTES_MAX)} waiting; {kb(messages.MESSAGE_MAX)} a message",
+        size=f"{kb(zenoh_config.MESSAGE_MAX)} a sample, {kb(to_loop.BYTES_MAX)} waiting",
         items=f"{to_loop.QUEUE_MAX} samples waiting; {messages.FRAMES_MAX} frames and {messages.OFFERS_MAX} offers in a message",
         work=f"slices of {1e3 * to_loop.SLICE_S:.0f} ms, {kinds.FRAMES_AT_ONCE} frames at once; {budgets.NODE_BYTES_PER_S // 1000} kB/s of a node of a fleet, {budgets.ALL_BYTES_PER_S // 1000} kB/s of all beyond {budgets.GUARANTEED_BYTES_PER_S // 1000} kB/s each",
         over="dropped and counted",

@@ -43,7 +43,7 @@ CONTRADICTED: Final = (
     "{who}: reports from {stranger} contradict those from {known} and are rejected"
 )
 REPLACED: Final = "{who}: positions are used from {stranger}, since {known} sends none"
-LATE: Final = "{who}: attitudes from {stranger} are newer than those from {known}, but not used"
+LATE: Final = "{who}: messages from {stranger} are newer than those from {known}, but not used"
 UNANSWERED: Final = (
     "the signing timestamps are not saved: the disk has not answered for {:.0f} s; if the service"
     " is killed now, frames of this time can be replayed to the next one"

@@ -165,12 +165,12 @@ class Service:
         http: socket.socket,
         token: str | None,
         until: asyncio.Event,
-        *others: Coroutine[Any, Any, None],
+        *others: Callable[[], Coroutine[Any, Any, None]],
     ) -> None:
         """Serve until ``until`` is set, then finish the recording.
 
-        ``others`` are coroutines that run alongside, as for the demo; they are cancelled at the
-        end.
+        ``others`` return coroutines that run alongside, as for the demo; they are cancelled at
+        the end.
         """
         server = Server(node=self, token=token, answering=self.answering, area=self._area)
         if self._recorder:
@@ -191,7 +191,7 @@ class Service:
                     tasks.append(group.create_task(self.fleet.run(), name="fleet"))
                 tasks.append(group.create_task(self._recover_leftovers(), name="recovery"))
                 tasks.append(group.create_task(self._end_on_defect(), name="defects"))
-                tasks += [group.create_task(other, name="beside") for other in others]
+                tasks += [group.create_task(other(), name="beside") for other in others]
                 serving = group.create_task(server.serve(sockets=[http]), name="http")
                 await until.wait()
                 server.should_exit = True

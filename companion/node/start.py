@@ -122,10 +122,10 @@ async def _serve(
     if open_page:  # on a thread: a browser of the terminal keeps its caller waiting
         threading.Thread(target=webbrowser.open, args=(page,), daemon=True).start()
     lost: list[OSError] = []
-    others = [_keep_shown(service, voice, until, lost)]
-    others += [traffic(service.links()[0].url)] if traffic else []
+    others = [partial(_keep_shown, service, voice, until, lost)]
+    others += [partial(traffic, service.links()[0].url)] if traffic else []
     if manager:
-        others.append(systemd.keep_informed(manager, service, voice.say, until))
+        others.append(partial(systemd.keep_informed, manager, service, voice.say, until))
     await service.run(http, token, until, *others)
     if lost:
         raise lost[0]

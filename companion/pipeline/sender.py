@@ -5,8 +5,8 @@ from typing import Final
 
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.wire.stamps import step_ms
-from companion.tracking.noise import StatedNoise
-from companion.values import GnssStatus, Reason
+from companion.tracking.noise import FORGOTTEN_NS, SETTLED_NS, STATED_NS, StatedNoise
+from companion.values import FIX_3D, GnssStatus, Reason
 
 CONFIRMED_NS: Final = 5_000_000_000
 """Largest difference between the steps of arrivals and of stamps of two reports that agree."""
@@ -17,6 +17,8 @@ ANOTHER_CLOCK_NS: Final = 10_000_000_000
 """Time for which a clock is known from its newest stamp here, whatever other nodes share."""
 ANOTHER_CLOCK_LATE_NS: Final = 3_000_000_000
 """Lateness of a stamp here, by a clock that others shared, which shows that this was another."""
+SECOND_RECEIVER_NS: Final = 5_000_000_000
+"""Time after a status of a second receiver with a fix in which the first one needs none."""
 TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 TYPE_KEPT_NS: Final = 60_000_000_000
 """Time for which a type counts beside the newest one, so that a forged one does not last."""
@@ -28,6 +30,12 @@ class ComponentState:
 
     stated_us  the receiver's own time of that status; 0 if unknown or from before a reboot
     apart_m2   mean square of the receiver's height less the autopilot's, m²
+    fixed_ns, second_fixed_ns
+               arrivals of the newest statuses with a 3D fix, of its two receivers
+    lost_ns    arrival of the last one before both had none; None: they never lost it
+    again_ns   arrival of the first one since; None: none yet
+    no_position_ns
+               arrival of the estimator's newest status, if it knows no position; else None
     """
 
     heard_ns: int = 0  # arrival of the newest of these messages
@@ -37,6 +45,60 @@ class ComponentState:
     stated_us: int = 0
     noise: StatedNoise  # of its reports, by these statuses
     apart_m2: float | None = None
+    fixed_ns: int | None = None
+    second_fixed_ns: int | None = None
+    lost_ns: int | None = None
+    again_ns: int | None = None
+    no_position_ns: int | None = None
+
+    def note_fix(self, *, has_fix: bool, t_ns: int) -> bool:
+        """Note whether the first receiver has a 3D fix; return whether it has lost it now.
+
+        A vehicle that never had a fix navigates by other means.
+        """
+        second_ns = self.second_fixed_ns
+        if has_fix or (second_ns is not None and t_ns - second_ns <= SECOND_RECEIVER_NS):
+            self.fixed_ns = t_ns
+            if self.lost_ns is not None and self.again_ns is None:
+                self.again_ns = t_ns
+            return False
+        if self.fixed_ns is None or (self.lost_ns is not None and self.again_ns is None):
+            return False
+        is_new = self.again_ns is None or t_ns - self.again_ns > SETTLED_NS
+        if is_new:
+            self.lost_ns = self.fixed_ns
+        self.again_ns = None
+        return is_new
+
+    def restarted(self) -> None:
+        """Forget the receiver's clock and fixes: the vehicle was restarted."""
+        self.stated_us = 0
+        self.fixed_ns = self.second_fixed_ns = self.lost_ns = self.again_ns = None
+
+    def adrift_s(self, t_ns: int) -> float:
+        """Return for how long the position has been continued without a fix; 0: there is one.
+
+        A while after the fix is there again, its position may still be as wrong.
+        """
+        if self.lost_ns is None or self.receiver is None:
+            return 0.0
+        if t_ns - self.receiver.t_ns > FORGOTTEN_NS:
+            return 0.0
+        if self.again_ns is None:
+            return (t_ns - self.lost_ns) * 1e-9
+        if t_ns - self.again_ns > SETTLED_NS:
+            self.lost_ns = self.again_ns = None
+            return 0.0
+        return (self.again_ns - self.lost_ns) * 1e-9
+
+    def knows_position(self, t_ns: int) -> bool:
+        """Return False if the estimator states that it knows none, and the receiver has no fix.
+
+        With a fix, estimators state so on the ground, until they are ready or while disarmed.
+        """
+        if self.no_position_ns is None or t_ns - self.no_position_ns > STATED_NS:
+            return True
+        return self.receiver is None or self.receiver.fix_type >= FIX_3D
 
     def note_type(self, newest: tuple[int, int], t_ns: int) -> None:
         """Note the type and autopilot of a heartbeat; forget those of long ago."""

@@ -23,7 +23,7 @@ from companion.mavlink.trust.admission import admission
 from companion.mavlink.trust.adsb import Aircraft
 from companion.mavlink.trust.dedupe import Dedupe, LinkShare
 from companion.mavlink.trust.remote_id import RemoteIds
-from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, gnss_heading
+from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, GPS2_RAW, gnss_heading, second_has_fix
 from companion.mavlink.wire.decode import ATTITUDE, decode
 from companion.mavlink.wire.stamps import boot_ms, step_ms
 from companion.pipeline import assembly
@@ -33,6 +33,7 @@ from companion.settings.model import Settings
 from companion.tracking import noise
 from companion.tracking.noise import StatedNoise
 from companion.values import (
+    FIX_3D,
     RELAYED_DELAY_S,
     RELAYED_TIME_ERROR_S,
     Accuracy,
@@ -69,7 +70,6 @@ Equal to the time for which reports are remembered (``dedupe``).
 """
 KEPT_NS: Final = 3_600_000_000_000
 """Time for which a silent sender without a track is kept; each clock takes some 20 kB."""
-FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX; better fixes have larger numbers
 NEAR_HEIGHT_M: Final = 50.0
 """Largest difference between the heights of receiver and autopilot in a valid report.
 
@@ -118,6 +118,7 @@ class FrameOutcome(NamedTuple):
     change: ClockChange | None = None
 
 
+NO_ESTIMATE: Final = "its autopilot states that it knows no position"
 _OF_CARRIER: Final = ABOUT_ATTITUDE | {ATTITUDE}  # messages used only of the carrier
 NO_OUTCOME: Final = FrameOutcome()  # outcome of a frame without further effect
 
@@ -185,8 +186,10 @@ class Senders:
 
     # --- messages ---------------------------------------------------------------------------
 
-    def hear(self, frame: Frame) -> FrameOutcome:
+    def hear(self, frame: Frame) -> FrameOutcome:  # noqa: PLR0912 - one for each kind of message
         """Process one frame of a message that is decoded (``decode.DECODED``)."""
+        if frame.msgid == GPS2_RAW and frame.source in self._components and second_has_fix(frame):
+            self._components[frame.source].second_fixed_ns = frame.t_ns
         if frame.msgid in _OF_CARRIER and frame.source != self._carrier_source:
             change = self.add_stamp(frame) if frame.msgid == ATTITUDE else None
             return NO_OUTCOME if change is None else FrameOutcome(change=change)
@@ -208,7 +211,7 @@ class Senders:
                 return self._remote_id(frame, message)
             case Attitude():
                 return self._attitude(message)
-            case EstimatorStatus() | GnssHeading() | StatedAttitude():
+            case GnssHeading() | StatedAttitude():
                 carries = message.source == self._carrier_source
                 return FrameOutcome(message=message) if carries else NO_OUTCOME
             case None:
@@ -216,10 +219,10 @@ class Senders:
             case _:
                 return self._take_other(frame, message)
 
-    def _take_other(
-        self, frame: Frame, message: GnssStatus | SystemTime | Presence
+    def _take_other(  # noqa: PLR0912 - one call less for each of them
+        self, frame: Frame, message: GnssStatus | SystemTime | Presence | EstimatorStatus
     ) -> FrameOutcome:
-        """Process a message other than positions: receiver, clock or vehicle status.
+        """Process a message other than positions: receiver, clock, vehicle or estimator status.
 
         One that another node shares counts only while positions that others share are used.
         """
@@ -246,11 +249,22 @@ class Senders:
                         is_newest &= not sender.is_known(message.t_ns)
                     stated = noise.reported(message, self._noise_settings)
                     component.noise.add(message.t_ns, stated, is_newest=is_newest)
+                said: tuple[Notice, ...] = ()
                 if is_newest:
                     component.stated_us = stated_us
                     component.receiver = message
+                    if component.lost_ns is None and message.fix_type >= FIX_3D:  # nearly always
+                        component.fixed_ns = message.t_ns
+                    elif name in self._tracked:
+                        said = _fix_noted(component, message, name)
                 heading = gnss_heading(frame) if message.source == self._carrier_source else None
-                return NO_OUTCOME if heading is None else FrameOutcome(message=heading)
+                if heading is None and not said:
+                    return NO_OUTCOME
+                return FrameOutcome(message=heading, outputs=said)
+            case EstimatorStatus():
+                component.no_position_ns = None if message.knows_position else message.t_ns
+                if message.source == self._carrier_source:
+                    return FrameOutcome(message=message)
             case Presence():
                 component.note_type((message.mav_type, message.autopilot), message.t_ns)
         return NO_OUTCOME
@@ -344,7 +358,19 @@ class Senders:
         assumed = self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
         made_ns = stamp.oldest_ns - lag_ns
-        errors = self._errors(report, made_ns, assumed.lag_rest_s) if is_own else None
+        errors: ReportNoise | None = None
+        if is_own:
+            component = self._components.get(report.source)
+            if (
+                component is not None
+                and component.no_position_ns is not None
+                and not component.knows_position(t_ns)
+            ):
+                unused = Rejection(t_ns=t_ns, source=uav, reason=Reason.NO_FIX, detail=NO_ESTIMATE)
+                return FrameOutcome(
+                    outputs=(*said, unused), restarted=restarted, change=clock.change
+                )
+            errors = self._errors(report, component, made_ns, assumed.lag_rest_s)
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
         placed = PlacedReport(
             report=report,
@@ -383,13 +409,15 @@ class Senders:
         told = Notice(t_ns=report.t_ns, severity=Severity.WARNING, subject=uav, text=text)
         return None, (told,)
 
-    def _errors(self, report: Report, made_ns: int, time_s: float) -> ReportNoise:
+    def _errors(
+        self, report: Report, component: ComponentState | None, made_ns: int, time_s: float
+    ) -> ReportNoise:
         """Return bounds on a report's errors, with the receiver's recent height difference.
 
         ``made_ns`` is the earliest node time of its measurement, ``time_s`` the largest error of
         the time that is assumed.
         """
-        component, known, apart_m = self._components.get(report.source), None, 0.0
+        known, apart_m = None, 0.0
         if component is not None and component.receiver is not None:
             known, receiver = component.noise.since(made_ns), component.receiver
             is_recent = report.t_ns - receiver.t_ns <= noise.FORGOTTEN_NS
@@ -399,6 +427,8 @@ class Senders:
                     apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
                 component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
         known = known or self._noise_settings.default
+        if component is not None and component.lost_ns is not None:
+            known = noise.adrift(known, component.adrift_s(report.t_ns))
         made = ReportNoise(
             horizontal_m=known.horizontal_m,
             vertical_m=known.vertical_m,
@@ -512,7 +542,7 @@ class Senders:
         if stamp is None or not stamp.rebooted:
             return stamp, ()
         if kind_of(name).reports_itself and (source := Source.parse(name)) in self._components:
-            self._components[source].stated_us = 0
+            self._components[source].restarted()
         text = f"{name} was restarted: its boot clock stepped back to {boot_ms / 1e3:.1f} s"
         if kind_of(name) is UavKind.COT:  # its events have times of day
             text = f"{name}: track restarted: the times of its events stepped back"
@@ -591,6 +621,14 @@ def _assumed(
 def _source(uav: str) -> Source | None:
     """Return the MAVLink source of a UAV; None for a relayed aircraft, which has none."""
     return Source.parse(uav) if kind_of(uav).reports_itself else None
+
+
+def _fix_noted(component: ComponentState, status: GnssStatus, uav: str) -> tuple[Notice, ...]:
+    """Note whether a tracked vehicle's receiver has a fix; return a notice if it has lost it."""
+    if not component.note_fix(has_fix=status.fix_type >= FIX_3D, t_ns=status.t_ns):
+        return ()
+    text = f"{uav} has lost its GNSS fix: the bound of its position grows until it has one"
+    return (Notice(t_ns=status.t_ns, severity=Severity.WARNING, subject=uav, text=text),)
 
 
 def _refused(message: Report | AdsbVehicle, reason: Reason) -> FrameOutcome:

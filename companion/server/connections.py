@@ -79,6 +79,7 @@ class BoundedProtocol(HttpToolsProtocol):
         super().__init__(*args, **kwargs)
         self._queue = queue
         self._budget = Budget(per_s=REQUESTS_PER_S, most=REQUESTS_SAVED)
+        self.url = b""  # uvicorn has none before the first byte of a request line
         self._unparsed = bytearray()
         self._in_head = True
         self._parsed_bytes = 0  # since the last complete request, framing of its body included
@@ -150,7 +151,7 @@ class BoundedProtocol(HttpToolsProtocol):
             is_long = (
                 self._parsed_bytes > most
                 or len(self.headers or ()) > HEADERS_MOST
-                or (self.url or b"").count(b"&") >= PARAMETERS_MAX
+                or self.url.count(b"&") >= PARAMETERS_MAX
                 or self._chunks > CHUNKS_MAX
             )
             if is_long and not self.transport.is_closing():

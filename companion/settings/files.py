@@ -27,7 +27,8 @@ LARGEST_BYTES: Final = 1 << 24
 TEXT_BYTES: Final = 1 << 21
 """Largest settings, and positions of elements. Parsed, they take 50 times as much memory."""
 NAMED_TEXT_BYTES: Final = 1 << 22  # largest other text that the settings name, as a calibration
-NUMBERS_MAX: Final = 1 << 22  # most numbers of an array: 64 MB as complex ones
+NUMBERS_MAX: Final = 1 << 22  # most numbers of an array
+MATRIX_MAX: Final = 1 << 20  # most numbers of a complex matrix, of which several copies are made
 
 
 def load(path: Path | None) -> Settings:
@@ -135,6 +136,8 @@ def matrix_of(settings: Settings, file: NamedFile) -> ComplexArray | None:
         return None
     where = _where(settings, file)
     found = _npy(where, data, "fciu")
+    if found.size > MATRIX_MAX:
+        raise ConfigError(f"{where}: has {found.size} numbers; the limit is {MATRIX_MAX}")
     if found.ndim != 2:
         raise ConfigError(f"{where}: not a matrix: shape {found.shape}; save a 2-dimensional array")
     return found.astype(np.complex128)

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Final
 
 from companion.values import (
+    FIX_3D,
     RELAYED_TIME_ERROR_S,
     Accuracy,
     AltitudeDatum,
@@ -40,6 +41,13 @@ since, and what was forged before the vehicle appeared would count for ever.
 """
 FORGOTTEN_NS: Final = 60_000_000_000
 """Time after which a statement of a receiver that it does not repeat is ignored altogether."""
+ADRIFT_MPS2: Final = 0.5
+"""Largest error of the acceleration by which an autopilot continues its position without a fix.
+
+That is an error of its tilt of 3 degrees, or of its accelerometers of 0.05 g.
+"""
+SETTLED_NS: Final = 5_000_000_000
+"""Time with a fix after which the autopilot's position is that of its receiver again."""
 GEOID_M: Final = 107.0
 """Largest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 
@@ -64,7 +72,7 @@ class NoiseSettings:
 def reported(status: GnssStatus, settings: NoiseSettings) -> ReportNoise:
     """Return the noise bounds from GPS_RAW_INT, with defaults for fields that are not sent."""
     default, factor = settings.default, settings.factor
-    if factor is None:
+    if factor is None or status.fix_type < FIX_3D:  # without a fix, accuracies are old ones
         return default
     least_m = LEAST_ACCURACY_M.get(status.fix_type, PLAIN_ACCURACY_M)
     horizontal_m = _bound(status.h_acc_m, factor, default.horizontal_m, least_m)
@@ -74,6 +82,19 @@ def reported(status: GnssStatus, settings: NoiseSettings) -> ReportNoise:
         vertical_m=vertical_m,
         position_m=math.hypot(horizontal_m, vertical_m),
         velocity_mps=_bound(status.vel_acc_mps, factor, default.velocity_mps),
+    )
+
+
+def adrift(known: ReportNoise, seconds: float) -> ReportNoise:
+    """Return the bounds of a report of an autopilot whose receiver had no fix for so long.
+
+    It continues its position by its accelerometers, and its height by the barometer.
+    """
+    horizontal_m = known.horizontal_m + ADRIFT_MPS2 / 2 * seconds * seconds
+    return known._replace(
+        horizontal_m=horizontal_m,
+        position_m=math.hypot(horizontal_m, known.vertical_m),
+        velocity_mps=known.velocity_mps + ADRIFT_MPS2 * seconds,
     )
 
 

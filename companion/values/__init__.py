@@ -36,6 +36,7 @@ from companion.values.numbers import BoolArray, ComplexArray, FloatArray, IntArr
 from companion.values.observed import READINGS_MAX, Observation, reason_invalid
 from companion.values.outputs import Notice, Output, Severity, Update
 from companion.values.received import (
+    FIX_3D,
     RELAYED_DELAY_S,
     RELAYED_TIME_ERROR_S,
     Accuracy,
@@ -72,6 +73,7 @@ from companion.values.tracked import (
 
 __all__ = [
     "DUTY_MAX",
+    "FIX_3D",
     "READINGS_MAX",
     "RELAYED_DELAY_S",
     "RELAYED_TIME_ERROR_S",

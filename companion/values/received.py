@@ -198,6 +198,9 @@ class Presence:
     autopilot: int
 
 
+FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX; better fixes have larger numbers
+
+
 class GnssStatus(NamedTuple):
     """Fix type, height and stated accuracies of a GNSS receiver (GPS_RAW_INT).
 
@@ -227,10 +230,10 @@ class SystemTime:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EstimatorStatus:
-    """Status of an autopilot's attitude estimator (EKF_STATUS_REPORT).
+    """Status of an autopilot's estimator (EKF_STATUS_REPORT).
 
     link            link over which it came
-    knows_attitude  whether the estimator reports its attitude as valid
+    knows_attitude, knows_position  whether it reports its attitude or horizontal position as valid
     compass_ratio   compass innovation over the estimator's gate: above 1 it rejects the compass
     """
 
@@ -238,6 +241,7 @@ class EstimatorStatus:
     source: Source
     link: str
     knows_attitude: bool
+    knows_position: bool
     compass_ratio: float
 
 

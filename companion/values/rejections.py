@@ -36,7 +36,10 @@ class Reason(DescribedEnum):
     SECRET = "secret", "frames that carry a signing key: neither used nor recorded"
     SOCKET_OVERFLOW = "socket-overflow", "frames lost before they were read: buffer full or too old"
     DUPLICATE = "duplicate", "copies of a report received before"
-    NO_FIX = "no-fix", "first reports sent before the receiver had a fix"
+    NO_FIX = (
+        "no-fix",
+        "reports before the receiver had a fix, or while the autopilot knows no position",
+    )
     OUT_OF_ORDER = "out-of-order", "reports older than the window for late reports"
     TOO_FREQUENT = (
         "too-frequent",

@@ -107,7 +107,7 @@ def fly(folder: Path, course: Callable[[Flight], Coroutine[Any, Any, None]]) -> 
                     until.set()
 
             try:
-                await service.run(http, None, until, beside())
+                await service.run(http, None, until, beside)
             finally:
                 flight.close()
             return flight

@@ -400,6 +400,21 @@ def test_event_time_out_of_range_is_rejected(tmp_path: Path) -> None:
         ),
         (schemas.OBSERVATIONS_TOPIC, b"", "invalid observation: uav: '' is not SYSID:COMPID"),
         (schemas.FRAMES_TOPIC, no_frame(FRAME) * 200_000, "event is longer than 2097152 bytes"),
+        (
+            schemas.FRAMES_TOPIC,
+            schemas.message_class("Frame")(t_ns=1, link="x" * 501, raw=FRAME).SerializeToString(),
+            "malformed frame",
+        ),
+        *(
+            (
+                schemas.REJECTIONS_TOPIC,
+                schemas.message_class("Rejection")(
+                    t_ns=1, reason="garbage", is_event=True, **{field: "x" * 501}
+                ).SerializeToString(),
+                "rejection with a longer text than this program writes",
+            )
+            for field in ("source", "detail")
+        ),
     ],
     ids=[
         "ids",
@@ -409,6 +424,9 @@ def test_event_time_out_of_range_is_rejected(tmp_path: Path) -> None:
         "beams",
         "no observation",
         "twice and again",
+        "link",
+        "source",
+        "detail",
     ],
 )
 def test_malformed_event_is_rejected(tmp_path: Path, topic: str, data: bytes, said: str) -> None:

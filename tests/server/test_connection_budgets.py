@@ -650,6 +650,9 @@ def test_malformed_requests_write_nothing_to_the_log(
             for _ in range(5):
                 _, writer = await connected(port)
                 writer.write(b"no request at all\r\n\r\n")
+                reader, writer = await connected(port)
+                writer.write(b"\r\n" * 9000)
+                assert (await reader.readline()).startswith(b"HTTP/1.1 400")
             assert await asked(await connected(port)) == b"HTTP/1.1 200 OK\r\n"
 
     run_async(flooded())

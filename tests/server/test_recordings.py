@@ -67,6 +67,15 @@ def test_only_recordings_are_listed(client: TestClient) -> None:
     ]
 
 
+def test_file_that_cannot_be_examined_has_no_size(folder: Path) -> None:
+    """Here its folder was replaced by a file since it was read; or it may not be searched."""
+    (entry,) = (entry for entry in os.scandir(folder) if entry.name == FINISHED)
+    folder.rename(folder.with_name("moved"))
+    folder.write_bytes(b"")
+    shown = recordings._shown(entry, recordings.Current(None, 0))
+    assert (shown["name"], shown["bytes"]) == (FINISHED, None)
+
+
 def test_time_in_a_name_may_be_none(make_node: Any, tmp_path: Path) -> None:
     (tmp_path / "companion-20261399T000000Z.mcap").write_bytes(b"")
     node = make_node(flown=False, recording={"directory": str(tmp_path)})

@@ -310,7 +310,7 @@ def test_worst_of_all_kinds_and_links_counts() -> None:
     of = trust()
     of.turned(attitude(LEVEL))
     status = EstimatorStatus(
-        t_ns=0, source=SOURCE, link="a", knows_attitude=True, compass_ratio=0.2
+        t_ns=0, source=SOURCE, link="a", knows_attitude=True, knows_position=True, compass_ratio=0.2
     )
     of.add(status)
     of.add(heading(20.0))
@@ -327,7 +327,14 @@ def test_statement_that_is_not_repeated_counts_for_ten_seconds() -> None:
     """One that was forged before the carrier appeared would count for ever."""
     doubted = trust()
     doubted.add(
-        EstimatorStatus(t_ns=0, source=SOURCE, link="a", knows_attitude=False, compass_ratio=0.0)
+        EstimatorStatus(
+            t_ns=0,
+            source=SOURCE,
+            link="a",
+            knows_attitude=False,
+            knows_position=True,
+            compass_ratio=0.0,
+        )
     )
     bounds = []
     for step in range(120):

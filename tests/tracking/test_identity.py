@@ -139,17 +139,16 @@ def test_reported_accuracies_can_be_ignored() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fix_type", "least_m"), [(2, 0.9), (3, 0.9), (4, 0.6), (5, 0.3), (6, 0.03), (8, 0.03)]
+    ("fix_type", "least_m"), [(2, 3.0), (3, 0.9), (4, 0.6), (5, 0.3), (6, 0.03), (8, 0.03)]
 )
 def test_reported_accuracy_is_limited_by_the_fix_type(fix_type: int, least_m: float) -> None:
-    """Some receivers state 1 mm when they do not know; 30 cm of an RTK fix is accepted."""
+    """Some receivers state 1 mm when they do not know, or what was true before the fix was lost."""
     claimed = status(0.001, 0.001, None)._replace(fix_type=fix_type)
     found = noise.reported(claimed, noise.NoiseSettings(DEFAULT, 3.0))
     assert (found.horizontal_m, found.vertical_m) == pytest.approx((least_m, least_m))
     honest = claimed._replace(h_acc_m=0.3)
-    assert noise.reported(honest, noise.NoiseSettings(DEFAULT, 3.0)).horizontal_m == pytest.approx(
-        0.9
-    )
+    found = noise.reported(honest, noise.NoiseSettings(DEFAULT, 3.0))
+    assert found.horizontal_m == pytest.approx(0.9 if fix_type >= 3 else 3.0)
 
 
 def test_forgotten_aircraft_is_compared_again(fix: MakeFix) -> None:

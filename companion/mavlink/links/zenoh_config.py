@@ -13,7 +13,12 @@ QUEUED: Final = 16
 
 With Zenoh's default of 2, and without waiting, only 2 of 5 express samples in a row arrive.
 """
-MESSAGE_MAX: Final = 4 << 20  # longest sample, bytes; Zenoh's default is a gigabyte
+MESSAGE_MAX: Final = 1 << 18
+"""Longest sample, bytes; Zenoh's default is a gigabyte.
+
+Each neighbour may begin one of each of eight priorities, reliable and not, and never end it.
+"""
+SESSIONS_MAX: Final = 64  # neighbours that are connected directly; Zenoh's default is 1000
 LINKS_MAX: Final = 4  # links to one neighbour: two of each kind, where both connect to each other
 
 Priority = Literal[
@@ -95,6 +100,7 @@ def sections(config: BusConfig) -> dict[str, str]:
         },
         "scouting/multicast/enabled": config.scouting,
         "scouting/delay": 0,  # open a session before its neighbours are found
+        "transport/unicast/max_sessions": SESSIONS_MAX,
         "transport/unicast/max_links": LINKS_MAX if has_unreliable else 1,
         # Otherwise an attempt hangs with ever longer TCP retries after the network is back.
         "transport/unicast/open_timeout": round(config.attempt_s * 1000),

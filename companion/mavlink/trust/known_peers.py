@@ -92,8 +92,14 @@ BROUGHT_NS: Final = {
 """Messages that move bounds, and the time for which one excludes those of peers known later."""
 OVERTAKEN_MS: Final = 300
 """How late a peer that was known first must have become, and how much newer other attitudes are."""
+AHEAD_MS: Final = 1000
+"""How far ahead of the fastest ones of a peer that was known first a stamp may be.
+
+A clock follows an early stamp only within a second at once, and otherwise if several agree.
+"""
 EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
 LATE_PEER_MS: Final = 1000  # how much newer attitudes are whose rejection is announced
+_OF_POSITION: Final = frozenset({GPS_RAW_INT, EKF_STATUS_REPORT})  # move bounds of positions
 _ABOUT_SENDER: Final = frozenset(
     {*STAMPED, *POSE, *ABOUT_ATTITUDE, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT}
 )
@@ -226,7 +232,7 @@ class KnownPeers:
                 if not is_router and _is_another_clock_too_soon(sender, frame):
                     return STRANGER
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
-            return STRANGER if msgid == GPS_RAW_INT and not is_router else None
+            return STRANGER if msgid in _OF_POSITION and not is_router else None
         if msgid not in _ABOUT_SENDER and not any(msgid in one.newest for one in current):
             return None
         if msgid in OWN and self._replaces(sender, peer, current, frame):
@@ -269,7 +275,11 @@ class KnownPeers:
             if frame.t_ns >= known.clock.due_ns:
                 known.clock.observe(frame)
         if not is_only and has_stamp(frame):
-            if _is_of_another_clock(sender, known, frame):
+            earlier = _current_earlier(sender, known, frame.t_ns)
+            if any(_is_off_clock(one, frame) for one in earlier):
+                return STRANGER
+            if any(_is_ahead(one, frame) for one in earlier):
+                self._note_late(sender, peer, frame)
                 return STRANGER
             known.stamped = frame
         if msgid in BROUGHT_NS and not is_only:
@@ -300,8 +310,10 @@ class KnownPeers:
         ]
         now_ns, kept_ns = frame.t_ns, BROUGHT_NS[frame.msgid]
         recent = [(one, same) for one, same in earlier if now_ns - same.t_ns <= kept_ns]
-        if not recent and frame.msgid == GPS_RAW_INT and _current_earlier(sender, known, now_ns):
-            return BROUGHT  # it can lower a bound, which positions that agree do not justify
+        if not recent and frame.msgid in _OF_POSITION and _current_earlier(sender, known, now_ns):
+            return (
+                BROUGHT  # it moves bounds of positions, which positions that agree do not justify
+            )
         if not recent or any(same.payload == frame.payload for _, same in recent):
             return None
         if frame.msgid not in STAMPED:
@@ -391,6 +403,11 @@ class KnownPeers:
 
     def _agrees(self, sender: _Sender, name: str, frame: Frame) -> bool:
         """Compare a stranger's position with the known peers; return whether it agrees with one."""
+        if any(
+            _is_ahead(one, frame) for one in sender.known.values() if one.is_current(frame.t_ns)
+        ):
+            self._note_late(sender, name, frame)
+            return False
         stranger = sender.strangers.get(name)
         if stranger is None:
             stranger = self._new(frame, False)
@@ -494,9 +511,10 @@ def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
     ]
 
 
-def _is_of_another_clock(sender: _Sender, known: _Peer, frame: Frame) -> bool:
-    """Return whether a stamp is too far off those of a peer known earlier to be of one clock."""
-    return any(_is_off_clock(one, frame) for one in _current_earlier(sender, known, frame.t_ns))
+def _is_ahead(one: _Peer, frame: Frame) -> bool:
+    """Return whether a stamp is much earlier than any that a peer has delivered."""
+    late_ms = one.clock.late_ms(frame)
+    return late_ms is not None and late_ms < -AHEAD_MS
 
 
 def _is_off_clock(one: _Peer, frame: Frame) -> bool:

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from typing import Final
 
 from companion.mavlink.wire.payload import unpack
-from companion.values import Frame, GnssHeading, StatedAttitude
+from companion.values import FIX_3D, Frame, GnssHeading, StatedAttitude
 
 GPS_RAW_INT: Final = 24
 ATTITUDE_QUATERNION_COV: Final = 61
@@ -26,7 +26,6 @@ GPS_RAW_INT_FIELDS: Final = struct.Struct("<QiiiHHHHBBiIIIIH")
 _GPS2_RAW = struct.Struct("<QiiiIHHHHBBBHiIIII")
 _NORTH_CDEG: Final = 36_000  # yaw 0 means "not available"; larger values are invalid or unknown
 _UNKNOWN: Final = 0xFFFF_FFFF
-_FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX
 
 
 def about_attitude(frame: Frame) -> GnssHeading | StatedAttitude | None:
@@ -34,6 +33,11 @@ def about_attitude(frame: Frame) -> GnssHeading | StatedAttitude | None:
     if frame.msgid == GPS2_RAW:
         return gnss_heading(frame)
     return odometry(frame) if frame.msgid == ODOMETRY else attitude_quaternion_cov(frame)
+
+
+def second_has_fix(frame: Frame) -> bool:
+    """Return whether a vehicle's second receiver has a 3D fix (GPS2_RAW)."""
+    return bool(unpack(frame, _GPS2_RAW)[9] >= FIX_3D)
 
 
 def gnss_heading(frame: Frame) -> GnssHeading | None:
@@ -47,7 +51,7 @@ def gnss_heading(frame: Frame) -> GnssHeading | None:
     else:
         fields = unpack(frame, _GPS2_RAW)
         fix_type, accuracy_1e5, yaw_cdeg = fields[9], fields[17], fields[12]
-    if not 0 < yaw_cdeg <= _NORTH_CDEG or fix_type < _FIX_3D:
+    if not 0 < yaw_cdeg <= _NORTH_CDEG or fix_type < FIX_3D:
         return None
     known = accuracy_1e5 not in (0, _UNKNOWN)
     return GnssHeading(

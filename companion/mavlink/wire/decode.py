@@ -231,10 +231,7 @@ _SYSTEM_TIME = struct.Struct("<QI")
 
 
 def _system_time(frame: Frame) -> SystemTime:
-    """Decode Unix time and boot time, unchecked; Unix time 0 means that the sender has none.
-
-    Neither is checked.
-    """
+    """Decode Unix time and boot time, unchecked; Unix time 0 means that the sender has none."""
     unix_us, boot_ms = unpack(frame, _SYSTEM_TIME)
     return SystemTime(
         t_ns=frame.t_ns, source=frame.source, unix_us=unix_us or None, boot_ms=boot_ms
@@ -242,7 +239,7 @@ def _system_time(frame: Frame) -> SystemTime:
 
 
 _EKF_STATUS_REPORT = struct.Struct("<fffffH")
-_KNOWS_ATTITUDE, _UNINITIALIZED = 1, 1024
+_KNOWS_ATTITUDE, _KNOWS_POSITION, _KEEPS_POSITION, _UNINITIALIZED = 1, 8 | 16, 128, 1024
 
 
 def _ekf_status_report(frame: Frame) -> EstimatorStatus:
@@ -250,12 +247,13 @@ def _ekf_status_report(frame: Frame) -> EstimatorStatus:
     *_, compass_ratio, _, flags = unpack(frame, _EKF_STATUS_REPORT)
     if not math.isfinite(compass_ratio) or compass_ratio < 0.0:
         raise _RefusedError(Reason.MALFORMED, "compass ratio is negative or not finite")
-    knows = bool(flags & _KNOWS_ATTITUDE) and not flags & _UNINITIALIZED
+    has_position = bool(flags & _KNOWS_POSITION) and not flags & _KEEPS_POSITION
     return EstimatorStatus(
         t_ns=frame.t_ns,
         source=frame.source,
         link=frame.link,
-        knows_attitude=knows,
+        knows_attitude=flags & (_KNOWS_ATTITUDE | _UNINITIALIZED) == _KNOWS_ATTITUDE,
+        knows_position=has_position and not flags & _UNINITIALIZED,
         compass_ratio=compass_ratio,
     )
 

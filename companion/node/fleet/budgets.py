@@ -6,7 +6,6 @@ processed at the small rate that it needs, and what is more comes out of one bud
 
 from typing import Final, NamedTuple
 
-from companion.node.fleet import messages
 from companion.node.fleet.messages import FleetMessageError
 from companion.pipeline.fleet.member import NODES_MAX
 from companion.values.budget import Budget
@@ -16,6 +15,7 @@ GUARANTEED_BYTES_PER_S: Final = 20_000
 GUARANTEED_BYTES: Final = 100_000  # bytes at once
 NODE_BYTES_PER_S: Final = 500_000  # bytes of messages of one node that are parsed
 ALL_BYTES_PER_S: Final = 1_000_000  # bytes of all nodes beyond those that are always parsed
+BYTES_SAVED: Final = 2_000_000  # bytes at once, of one node and of all
 NODE_TIME: Final = 0.2  # share of the time that the frames of one node may take
 ALL_TIME: Final = 0.3  # share of the time that those of all nodes may take
 TIME_SAVED_S: Final = 0.5  # time that they may take at once
@@ -37,7 +37,7 @@ class NodeBudgets:
 
     def __init__(self) -> None:
         self._nodes: dict[str, _NodeBudget] = {}
-        self._all = Budget(per_s=ALL_BYTES_PER_S, most=messages.MESSAGE_MAX)
+        self._all = Budget(per_s=ALL_BYTES_PER_S, most=BYTES_SAVED)
         self._time = Budget(per_s=ALL_TIME, most=TIME_SAVED_S)
         self._presence = Budget(per_s=PRESENCE_PER_S, most=PRESENCE_SAVED)
 
@@ -59,7 +59,7 @@ class NodeBudgets:
         if own is None:
             own = self._nodes[known] = _NodeBudget(
                 Budget(per_s=GUARANTEED_BYTES_PER_S, most=GUARANTEED_BYTES),
-                Budget(per_s=NODE_BYTES_PER_S, most=messages.MESSAGE_MAX),
+                Budget(per_s=NODE_BYTES_PER_S, most=BYTES_SAVED),
                 Budget(per_s=NODE_TIME, most=TIME_SAVED_S),
             )
         return own

@@ -9,8 +9,10 @@ import asyncio
 import time
 from collections.abc import Callable
 from functools import partial
+from itertools import islice
 from typing import Any, Final
 
+from companion.mavlink.links.descriptors import are_scarce
 from companion.mavlink.links.to_loop import ToLoop
 from companion.mavlink.links.zenoh_bus import Bus, open_peer
 from companion.node.fleet import messages
@@ -38,6 +40,11 @@ ANSWERED_S: Final = 3.0  # timeout of an answer
 PATIENCE_S: Final = 6.0
 """Least time without answers from a present node after which the session is renewed."""
 RETRY_S: Final = 2.0  # time between two attempts to reopen a session
+AWAY_S: Final = 30.0
+"""Time for which a node leaves the fleet whose connections take the descriptors of all others.
+
+Zenoh limits neither connections nor handshakes, and frees one after another.
+"""
 PATIENCE_LEASES: Final = 4.0  # the same limit in leases
 LOOK_S: Final = 0.3
 """Time between two batches of offers, not a multiple of the update interval."""
@@ -120,16 +127,23 @@ class LiveFleetNode:
         has_taken_part = False
         while True:
             try:
-                await self._take_part()
+                is_crowded = await self._take_part()
                 has_taken_part = True
+                if is_crowded:
+                    text = f"too many connections; this node leaves the fleet for {AWAY_S:.0f} s"
+                    self._report(Severity.ERROR, "fleet", text)
+                    await asyncio.sleep(AWAY_S)
             except UserError as error:
                 self._report(Severity.ERROR, "fleet", f"no fleet: {error}")
                 if not has_taken_part:
                     return
                 await asyncio.sleep(RETRY_S)  # this node's former endpoints are free by then
 
-    async def _take_part(self) -> None:
-        """Run in the fleet with one session, until it must be renewed (``answering.py``)."""
+    async def _take_part(self) -> bool:
+        """Run in the fleet with one session, until it must be renewed (``answering.py``).
+
+        Returns whether it must rest, since connections take all descriptors.
+        """
         bus = Bus(self._config, asyncio.get_running_loop(), self._session)
         slices = ToLoop(asyncio.get_running_loop())
         try:
@@ -149,7 +163,9 @@ class LiveFleetNode:
                     group.create_task(self._repeat(OFFERED_S, self._publish_offers), name="offers"),
                     group.create_task(self._make_offers(), name="looks"),
                 ]
-                while not self._is_link_one_way(self._now_ns()):
+                while not (is_crowded := are_scarce()) and not self._is_link_one_way(
+                    self._now_ns()
+                ):
                     await asyncio.sleep(1.0)
                 for task in tasks:
                     task.cancel()
@@ -161,6 +177,7 @@ class LiveFleetNode:
                 self._flushing.cancel()
                 self._flushing = None
             await in_daemon_thread(bus.close, at_once=True)
+        return is_crowded
 
     def _is_link_one_way(self, now_ns: int) -> bool:
         """Return whether a present node does not answer; remove nodes that left."""
@@ -268,7 +285,7 @@ class LiveFleetNode:
 
     def _publish_offers(self, now_ns: int) -> None:
         """Publish this node's offers and the tracks that it serves, and check for phantoms."""
-        offers = dict(self._offers.made)
+        offers = dict(islice(self._offers.made.items(), messages.OFFERS_MAX))
         self.member.set_offers(offers)
         self._put("offers", messages.offers(offers))
         update = self._pipeline.last_update

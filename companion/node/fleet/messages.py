@@ -14,13 +14,11 @@ from google.protobuf.message import DecodeError
 from companion.recording import fields, schemas
 from companion.values import Offer, RoundTrip, Shared, SharedFrame, Standing, shown
 
-FRAMES_MAX: Final = 4096  # limit on frames, and on round trips, in one message
+FRAMES_MAX: Final = 800  # limit on frames, and on round trips, in one message
 CLOCK: Final = struct.Struct("<qq")
 """Format of an answer to a clock request: start of the node, and its present time; ns."""
-OFFERS_MAX: Final = 10_000
+OFFERS_MAX: Final = 2400  # the largest number of frames or offers fits into a sample
 NAME_MAX: Final = 64
-MESSAGE_MAX: Final = 2 << 20
-"""Longest message that is parsed, bytes: the largest number of frames or UAVs fits into it."""
 PLACE_MAX: Final = (90.0, 180.0, 1e6)  # latitude and longitude in degrees, height in metres
 NUMBER_MAX: Final = 1e9  # largest magnitude of other numbers
 DB_MAX: Final = 300.0
@@ -119,8 +117,6 @@ def to_offers(data: bytes) -> tuple[Offer, ...]:
 
 
 def _parsed(kind: Any, data: bytes, what: str) -> Any:
-    if len(data) > MESSAGE_MAX:
-        raise FleetMessageError(f"{what} has more than {MESSAGE_MAX} bytes")
     try:
         return kind.FromString(data)
     except DecodeError as error:

@@ -1,13 +1,16 @@
 """Servers share the process's file descriptors, whatever its limit is."""
 
+import os
 import resource
 import socket
+import subprocess
 import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 from siege import RUN
+from support import BIN
 
 from companion.mavlink.links import descriptors, tcp
 from companion.server import connections, stream
@@ -38,6 +41,33 @@ def test_without_a_limit_there_are_as_many_connections_as_usual(
     none = resource.RLIM_INFINITY
     monkeypatch.setattr(descriptors.resource, "getrlimit", lambda _: (none, none))
     assert connections.most_connections() == connections.CONNECTIONS_MAX
+
+
+def test_service_does_not_start_with_too_few_descriptors() -> None:
+    command = f"ulimit -n 24; '{BIN / 'companion'}' run --link udpin:127.0.0.1:0 --center 5:1"
+    found = subprocess.run(
+        ["sh", "-c", f"{command} --listen 127.0.0.1:0"],
+        check=False,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    said = "companion: the system allows 24 open files, needed: 64 (`ulimit -n`)"
+    assert (found.returncode, found.stderr.splitlines()[-1]) == (1, said)
+    assert "Traceback" not in found.stderr
+
+
+def test_descriptors_are_scarce_when_nearly_all_are_in_use(monkeypatch: pytest.MonkeyPatch) -> None:
+    soft = 1 + max(int(one.name) for one in Path("/proc/self/fd").iterdir())
+    monkeypatch.setattr(descriptors.resource, "getrlimit", lambda _: (10 * soft, 10 * soft))
+    assert not descriptors.are_scarce()
+    held = [os.open(os.devnull, os.O_RDONLY) for _ in range(9 * soft)]
+    try:
+        assert descriptors.are_scarce()
+    finally:
+        for one in held:
+            os.close(one)
+    assert not descriptors.are_scarce()
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads the limit in /proc")

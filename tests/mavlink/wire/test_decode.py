@@ -159,11 +159,14 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
             )
         case "EKF_STATUS_REPORT":
             knows = m.flags & dialect.EKF_ATTITUDE != 0
+            either = dialect.EKF_POS_HORIZ_REL | dialect.EKF_POS_HORIZ_ABS
+            places = m.flags & either != 0 and m.flags & dialect.EKF_CONST_POS_MODE == 0
             return EstimatorStatus(
                 t_ns=t_ns,
                 source=source,
                 link=link,
                 knows_attitude=knows,
+                knows_position=places,
                 compass_ratio=m.compass_variance,
             )
         case "GPS_RAW_INT":

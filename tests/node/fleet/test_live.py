@@ -19,7 +19,7 @@ from companion.mavlink.links.to_loop import ToLoop
 from companion.mavlink.links.zenoh_bus import open_peer
 from companion.mavlink.links.zenoh_config import BusConfig
 from companion.node.fleet import live, messages
-from companion.node.fleet.budgets import NodeBudgets
+from companion.node.fleet.budgets import BYTES_SAVED, NodeBudgets
 from companion.node.fleet.config import bus_config
 from companion.node.fleet.live import LiveFleetNode
 from companion.node.fleet.traffic import Rate
@@ -324,6 +324,38 @@ def test_unresponsive_neighbour_triggers_reconnection() -> None:
     assert "no answer from south; reconnecting to all nodes" in notices
 
 
+def test_node_leaves_the_fleet_while_its_connections_take_all_descriptors(
+    wire: Wire, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Zenoh limits no connections that never become a session."""
+    notices: list[str] = []
+    answers = iter([False, True])
+    monkeypatch.setattr(live, "are_scarce", lambda: next(answers, False))
+    monkeypatch.setattr(live, "AWAY_S", 0.05)
+    ends: list[float] = []
+    wire.close = lambda: ends.append(time.monotonic())  # type: ignore[method-assign]
+
+    async def test() -> None:
+        member = node(
+            mode="client",
+            connect=["tcp/127.0.0.1:1"],
+            notify=lambda notice: notices.append(notice.text),
+            now=time.monotonic_ns,
+        )
+        task = asyncio.create_task(member.run())
+        while not ends:
+            await asyncio.sleep(0)
+        wire.is_asked.clear()
+        await asyncio.wait_for(wire.is_asked.wait(), HANG_S)
+        assert time.monotonic() - ends[0] >= 0.05
+        task.cancel()
+        with pytest.raises(asyncio.CancelledError):
+            await task
+
+    run_async(test())
+    assert "too many connections; this node leaves the fleet for 0 s" in notices
+
+
 def test_rates_are_in_bits_per_second() -> None:
     rate = Rate()
     rate.look(0)
@@ -381,12 +413,13 @@ def test_message_of_many_items_is_processed_in_slices(many: Shared) -> None:
         member._shared("south", payload)
         assert taken == [live.PIECE]
         member._shared("south", payload)
+        member._shared("south", payload)
         assert member.member.reception.unusable == messages.FRAMES_MAX
         while member._waiting:
             await asyncio.sleep(0)
 
     run_async(receive())
-    assert sum(taken) == messages.FRAMES_MAX
+    assert sum(taken) == 2 * messages.FRAMES_MAX
     assert max(taken) == live.PIECE
 
 
@@ -424,7 +457,7 @@ def test_messages_of_a_node_beyond_its_budget_are_not_parsed() -> None:
     member = node(mode="client", connect=["tcp/127.0.0.1:1"], notify=notices.append)
     take = member._valid_only(lambda who, _: taken.append(who))
     for _ in range(10):
-        take("companion/site/south/offers", bytes(messages.MESSAGE_MAX // 4))
+        take("companion/site/south/offers", bytes(BYTES_SAVED // 4))
     take("companion/site/west/offers", b"")
     assert taken == ["south"] * 4 + ["west"]
     assert member.damaged == 6

@@ -188,8 +188,8 @@ class Senders:
 
     def hear(self, frame: Frame) -> FrameOutcome:  # noqa: PLR0912 - one for each kind of message
         """Process one frame of a message that is decoded (``decode.DECODED``)."""
-        if frame.msgid == GPS2_RAW and frame.source in self._components and second_has_fix(frame):
-            self._components[frame.source].second_fixed_ns = frame.t_ns
+        if frame.msgid == GPS2_RAW and not frame.doubt_ns:
+            self._note_second_receiver(frame)
         if frame.msgid in _OF_CARRIER and frame.source != self._carrier_source:
             change = self.add_stamp(frame) if frame.msgid == ATTITUDE else None
             return NO_OUTCOME if change is None else FrameOutcome(change=change)
@@ -218,6 +218,11 @@ class Senders:
                 return NO_OUTCOME
             case _:
                 return self._take_other(frame, message)
+
+    def _note_second_receiver(self, frame: Frame) -> None:
+        component = self._components.get(frame.source)
+        if component is not None and second_has_fix(frame):
+            component.second_fixed_ns = frame.t_ns
 
     def _take_other(  # noqa: PLR0912 - one call less for each of them
         self, frame: Frame, message: GnssStatus | SystemTime | Presence | EstimatorStatus

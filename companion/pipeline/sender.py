@@ -61,6 +61,8 @@ class ComponentState:
             self.fixed_ns = t_ns
             if self.lost_ns is not None and self.again_ns is None:
                 self.again_ns = t_ns
+            elif self.again_ns is not None and t_ns - self.again_ns > SETTLED_NS:
+                self.lost_ns = self.again_ns = None
             return False
         if self.fixed_ns is None or (self.lost_ns is not None and self.again_ns is None):
             return False
@@ -86,10 +88,8 @@ class ComponentState:
             return 0.0
         if self.again_ns is None:
             return (t_ns - self.lost_ns) * 1e-9
-        if t_ns - self.again_ns > SETTLED_NS:
-            self.lost_ns = self.again_ns = None
-            return 0.0
-        return (self.again_ns - self.lost_ns) * 1e-9
+        is_settled = t_ns - self.again_ns > SETTLED_NS
+        return 0.0 if is_settled else (self.again_ns - self.lost_ns) * 1e-9
 
     def knows_position(self, t_ns: int) -> bool:
         """Return False if the estimator states that it knows none, and the receiver has no fix.

@@ -576,6 +576,12 @@ class Senders:
         sender = self._senders.get(uav)
         return (sender.shared or sender).clock.estimate() if sender else None
 
+    def adrift_s(self, uav: str, now_ns: int) -> float:
+        """Return for how long a vehicle has had no GNSS fix; 0 if it has one, or never had."""
+        source = _source(uav)
+        component = None if source is None else self._components.get(source)
+        return 0.0 if component is None else component.adrift_s(now_ns)
+
     def assumed(self, uav: str) -> assembly.AircraftAssumptions:
         """Return the assumptions about a UAV, by the types in its heartbeats.
 

@@ -1,6 +1,7 @@
 """A vehicle whose GNSS receiver loses its fix in flight: its autopilot continues its position."""
 
 import math
+import re
 from collections.abc import Iterator
 
 import pymavlink.dialects.v20.all as dialect
@@ -81,7 +82,7 @@ def largest_m(found: dict[float, tuple[float, float]], from_s: float, to_s: floa
 
 
 def notices(outputs: list[Output]) -> list[Notice]:
-    return [one for one in outputs if isinstance(one, Notice) and "GNSS fix" in one.text]
+    return [one for one in outputs if isinstance(one, Notice) and "has lost" in one.text]
 
 
 @pytest.mark.parametrize("drift_mps2", [0.0, 0.15, 0.4, 0.5])
@@ -104,6 +105,13 @@ def test_unnoticed_drift_would_exceed_the_bound() -> None:
     outputs, found = flown(flight(0.5, told=False))
     assert any(error_m > bound_m for error_m, bound_m in found.values())
     assert notices(outputs) == []
+
+
+def test_link_that_suffers_names_the_lost_fix() -> None:
+    outputs, _ = flown(flight(0.15))
+    told = [one.text for one in outputs if isinstance(one, Notice) and one.text.startswith("link")]
+    why = r"weak . its position is uncertain by \d+ m, after \d\.\d s without a GNSS fix; check its"
+    assert [bool(re.search(why, text)) for text in told] == [False, True, False]
 
 
 def test_second_receiver_with_a_fix_replaces_the_first() -> None:

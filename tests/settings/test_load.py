@@ -470,6 +470,15 @@ def test_large_files_are_rejected_before_they_are_parsed(
     assert "\n" not in str(error.value)
 
 
+def test_matrix_of_more_than_a_million_numbers_is_rejected(tmp_path: Path) -> None:
+    """One of four million bytes took 500 MB: each number becomes complex, in several copies."""
+    np.save(tmp_path / "c.npy", np.ones((64, 16_385), dtype=np.int8))
+    config = tmp_path / "settings.toml"
+    config.write_text(f'[codebook]\nkind = "file"\nfile = "{tmp_path / "c.npy"}"\n')
+    with pytest.raises(ConfigError, match=r"has 1048640 numbers; the limit is 1048576$"):
+        matrix_of(load(config), CODEBOOK)
+
+
 def test_pipe_in_place_of_settings_is_not_opened(tmp_path: Path) -> None:
     """It would be waited for without end, and silently. Nor is one that the settings name."""
     pipe, good = tmp_path / "pipe", tmp_path / "good.toml"

@@ -5,13 +5,15 @@ import { LOST_MS } from "./api.js";
 import { $, setText } from "./dom.js";
 import * as format from "./format.js";
 
-const RESTART_MS = 2000; // a start that is later than the known one by more is another start
+// A start that is later than the known one by more is another start, if both clocks show it: this
+// page's, by which late answers seem to be of a later start, and the service's, which may be set.
+const RESTART_MS = 2000;
 
 export class Outage {
   /** `onGap` is called when answers arrive again. */
   constructor(onGap = () => {}) {
     this.onGap = onGap;
-    Object.assign(this, { last: null, startedAt: null, statusStamp: null, gap: null, since: null,
+    Object.assign(this, { last: null, started: null, statusStamp: null, gap: null, since: null,
       hasRun: "" });
     $("outage-seen").addEventListener("click", () => {
       Object.assign(this, { gap: null, since: null });
@@ -31,16 +33,18 @@ export class Outage {
 
   /** Process an answer with the status. */
   noteStatus({ time, uptime_s: uptimeS, replay }, now) {
-    const startedAt = now - uptimeS * 1000;
-    if (this.startedAt !== null && startedAt > this.startedAt + RESTART_MS) {
-      const stamp = new Date(Date.parse(time) - uptimeS * 1000).toISOString();
-      this.since = replay ? null : stamp; // the time of a replay is that of its log
+    // The time of a replay is that of its log.
+    const clocks = replay ? [now] : [now, Date.parse(time)];
+    const started = clocks.map(clock => clock - uptimeS * 1000);
+    const isLater = (at, n) => at > (this.started?.[n] ?? Infinity) + RESTART_MS;
+    if (started.every(isLater)) {
+      this.since = replay ? null : new Date(started[1]).toISOString();
       // A restart may be shorter than what counts as a lost connection.
       this.gap ??= { from: this.statusStamp, to: time };
     }
     // Until the status is known, nothing is said of a restart.
     const hasRun = this.since ? "Tracks and counts began again." : "The service did not restart.";
-    Object.assign(this, { startedAt, statusStamp: time, hasRun });
+    Object.assign(this, { started, statusStamp: time, hasRun });
     this.draw();
   }
 

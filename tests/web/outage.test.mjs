@@ -18,6 +18,10 @@ function openOutage() {
       outage.noteUavs(stampAt(second), second * 1000);
       outage.noteStatus({ time: stampAt(second), uptime_s: uptimeS, ...fields }, second * 1000);
     },
+    /** Answers with the status alone, at another time of the page. */
+    status(second, uptimeS, pageSecond) {
+      outage.noteStatus({ time: stampAt(second), uptime_s: uptimeS }, pageSecond * 1000);
+    },
     shown: () => [text("outage-title"), text("outage-detail").replaceAll("\u00a0", " ")],
   };
 }
@@ -50,4 +54,15 @@ test("a restart is named with its time, also a quick one", () => {
   quick.answer(1, 101);
   quick.answer(3, 1);
   assert.equal(quick.shown()[0], "SERVICE RESTARTED at 13:00:02 UTC");
+});
+
+test("answers that come late, and a clock that is set, are no restart", () => {
+  const { element, status, shown } = openOutage();
+  status(1, 101, 1);
+  status(2, 102, 5); // over a slow link
+  status(6, 106, 6);
+  status(67, 107, 7); // the service's clock was set
+  assert.ok(element("outage").hidden);
+  status(97, 10, 37);
+  assert.equal(shown()[0], "SERVICE RESTARTED at 13:01:27 UTC");
 });

@@ -258,7 +258,9 @@ class Senders:
                 if is_newest:
                     component.stated_us = stated_us
                     component.receiver = message
-                    if component.lost_ns is None and message.fix_type >= FIX_3D:  # nearly always
+                    has_fix = message.fix_type >= FIX_3D
+                    # One from before the vehicle's first position may be anybody's.
+                    if has_fix and component.lost_ns is None and sender is not None:
                         component.fixed_ns = message.t_ns
                     elif name in self._tracked:
                         said = _fix_noted(component, message, name)

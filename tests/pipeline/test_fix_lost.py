@@ -124,6 +124,7 @@ def test_position_of_a_vehicle_that_never_had_a_fix_is_used() -> None:
     """It navigates by other means."""
 
     def indoors() -> Iterator[Frame | Tick]:
+        yield receiver(0.0, True)  # before its first position: it may be anybody's
         for event in flight(0.0, told=False):
             is_status = isinstance(event, Frame) and event.msgid == 24
             yield receiver((event.t_ns - START_NS) / S, False) if is_status else event

@@ -22,9 +22,10 @@ before: positions that agree prove nothing about these. Accuracies in GPS_RAW_IN
 all while the other is current, as those of a peer that has brought no position yet; attitudes that
 contradict those of the other are announced. If the other has become late, by its own stamps, newer
 attitudes are used, but none newer than it could ever deliver. Stamps are used only if they are of
-the other's clock: another clock would look like a restart, or like a second vehicle. So the vehicle
-that was here first stays believed, and a stranger costs it nothing; whoever sends first in a
-vehicle's name is believed until it falls silent.
+the other's clock: another clock would look like a restart, or like a second vehicle. They may be
+ahead of the fastest of the other by a second: those of a standing vehicle anybody can predict. So
+the vehicle that was here first stays believed, and a stranger costs it nothing but a metre; whoever
+sends first in a vehicle's name is believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
@@ -310,10 +311,9 @@ class KnownPeers:
         ]
         now_ns, kept_ns = frame.t_ns, BROUGHT_NS[frame.msgid]
         recent = [(one, same) for one, same in earlier if now_ns - same.t_ns <= kept_ns]
+        # It moves bounds of positions, which positions that agree do not justify.
         if not recent and frame.msgid in _OF_POSITION and _current_earlier(sender, known, now_ns):
-            return (
-                BROUGHT  # it moves bounds of positions, which positions that agree do not justify
-            )
+            return BROUGHT
         if not recent or any(same.payload == frame.payload for _, same in recent):
             return None
         if frame.msgid not in STAMPED:

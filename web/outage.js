@@ -5,8 +5,8 @@ import { LOST_MS } from "./api.js";
 import { $, setText } from "./dom.js";
 import * as format from "./format.js";
 
-// A start that is later than the known one by more is another start, if both clocks show it: this
-// page's, by which late answers seem to be of a later start, and the service's, which may be set.
+// A restart moves the start by more than this on both clocks. A late answer moves it on the page's
+// clock alone, and setting the service's clock on that one alone.
 const RESTART_MS = 2000;
 
 export class Outage {

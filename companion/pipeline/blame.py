@@ -40,7 +40,7 @@ STEADIER_LINK: Final = "use a MAVLink link with a steadier delay"
 CHECK_LINK: Final = "check its MAVLink link: power, range, antenna"
 CHECK_SIGNING: Final = "check its signing key, and that its signing clock has not stepped back"
 CHECK_CARRIER: Final = "read its rejections in the notices, and check its GNSS receiver and id"
-CHECK_GNSS: Final = "check its GNSS receiver and antenna, and for interference"
+CHECK_GNSS: Final = "check its GNSS receiver and antenna, and look for interference"
 NAME_ROUTER: Final = "add the trusted peer to `[links] routers`"
 CHECK_RECEIVER: Final = "check the receiver that relays it, and the link to that receiver"
 
@@ -53,14 +53,14 @@ class CarrierEvidence:
     attitude_age_s  age of its newest attitude; None without one
     clock_assumed   the constant part of its latency is only assumed
     refused         why its newest positions were rejected; None: they were used
-    adrift_s        time for which its receiver has had no fix
+    dead_reckoning_s  time for which its receiver has had no fix
     """
 
     attitude: AttitudeParts = field(default_factory=AttitudeParts)
     attitude_age_s: float | None = None
     clock_assumed: bool = False
     refused: Reason | None = None
-    adrift_s: float = 0.0
+    dead_reckoning_s: float = 0.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -72,13 +72,13 @@ class LinkEvidence:
     waited_s       time for which frames may have waited for this machine
     carrier        facts about the carrier
     is_contradicted  whether the array sees it elsewhere than it reports
-    adrift_s       time for which its receiver has had no fix
+    dead_reckoning_s  time for which its receiver has had no fix
     """
 
     clock_assumed: bool
     refused: Reason | None
     is_contradicted: bool = False
-    adrift_s: float = 0.0
+    dead_reckoning_s: float = 0.0
     waited_s: float = 0.0
     carrier: CarrierEvidence = field(default_factory=CarrierEvidence)
 
@@ -187,8 +187,10 @@ def of_beam(
             return _clock(track, evidence)
         case ErrorSource.POSITION:
             bound = f"its position is uncertain by {_rounded(track.bound_m)} m"
-            if evidence.adrift_s:
-                return Blame(Cause.POSITION, _without_fix(bound, evidence.adrift_s), CHECK_GNSS)
+            if evidence.dead_reckoning_s:
+                return Blame(
+                    Cause.POSITION, _without_fix(bound, evidence.dead_reckoning_s), CHECK_GNSS
+                )
             remedy = _remedy(
                 track,
                 "fly farther from the array, or fit a better GNSS receiver to the UAV",
@@ -238,8 +240,10 @@ def _carrier_position_cause(carrier: Carrier, evidence: LinkEvidence) -> Blame:
     if age_s > SILENT_S:
         return _carrier_silence("position", age_s, evidence)
     reason = f"the carrier's position is uncertain by {_rounded(carrier.bound_m)} m"
-    if evidence.carrier.adrift_s:
-        return Blame(Cause.CARRIER, _without_fix(reason, evidence.carrier.adrift_s), CHECK_GNSS)
+    if evidence.carrier.dead_reckoning_s:
+        return Blame(
+            Cause.CARRIER, _without_fix(reason, evidence.carrier.dead_reckoning_s), CHECK_GNSS
+        )
     return Blame(Cause.CARRIER, reason, "fit a better GNSS receiver to the carrier")
 
 

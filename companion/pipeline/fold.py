@@ -316,7 +316,7 @@ class Pipeline:
             waited_s=self._waited_s,
             carrier=carrier(),
             is_contradicted=self.observing.is_refuted(uav),
-            adrift_s=self.senders.adrift_s(uav, now_ns),
+            dead_reckoning_s=self.senders.dead_reckoning_s(uav, now_ns),
         )
 
     def _carrier_evidence(self, now_ns: int) -> CarrierEvidence:
@@ -335,7 +335,7 @@ class Pipeline:
             attitude_age_s=self.center.attitude_age_s(at),
             clock_assumed=self._is_assumed(vehicle),
             refused=self.refusals.current_rejection(vehicle, now_ns),
-            adrift_s=self.senders.adrift_s(vehicle, now_ns),
+            dead_reckoning_s=self.senders.dead_reckoning_s(vehicle, now_ns),
         )
 
     def _is_assumed(self, sender: str) -> bool:

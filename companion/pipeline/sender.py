@@ -32,8 +32,8 @@ class ComponentState:
     apart_m2   mean square of the receiver's height less the autopilot's, m²
     fixed_ns, second_fixed_ns
                arrivals of the newest statuses with a 3D fix, of its two receivers
-    lost_ns    arrival of the last one before both had none; None: they never lost it
-    again_ns   arrival of the first one since; None: none yet
+    fix_lost_ns    arrival of the last one before both had none; None: they never lost it
+    fix_regained_ns   arrival of the first one since; None: none yet
     no_position_ns
                arrival of the estimator's newest status, if it knows no position; else None
     """
@@ -47,8 +47,8 @@ class ComponentState:
     apart_m2: float | None = None
     fixed_ns: int | None = None
     second_fixed_ns: int | None = None
-    lost_ns: int | None = None
-    again_ns: int | None = None
+    fix_lost_ns: int | None = None
+    fix_regained_ns: int | None = None
     no_position_ns: int | None = None
 
     def note_fix(self, *, has_fix: bool, t_ns: int) -> bool:
@@ -59,37 +59,37 @@ class ComponentState:
         second_ns = self.second_fixed_ns
         if has_fix or (second_ns is not None and t_ns - second_ns <= SECOND_RECEIVER_NS):
             self.fixed_ns = t_ns
-            if self.lost_ns is not None and self.again_ns is None:
-                self.again_ns = t_ns
-            elif self.again_ns is not None and t_ns - self.again_ns > SETTLED_NS:
-                self.lost_ns = self.again_ns = None
+            if self.fix_lost_ns is not None and self.fix_regained_ns is None:
+                self.fix_regained_ns = t_ns
+            elif self.fix_regained_ns is not None and t_ns - self.fix_regained_ns > SETTLED_NS:
+                self.fix_lost_ns = self.fix_regained_ns = None
             return False
-        if self.fixed_ns is None or (self.lost_ns is not None and self.again_ns is None):
+        if self.fixed_ns is None or (self.fix_lost_ns is not None and self.fix_regained_ns is None):
             return False
-        is_new = self.again_ns is None or t_ns - self.again_ns > SETTLED_NS
+        is_new = self.fix_regained_ns is None or t_ns - self.fix_regained_ns > SETTLED_NS
         if is_new:
-            self.lost_ns = self.fixed_ns
-        self.again_ns = None
+            self.fix_lost_ns = self.fixed_ns
+        self.fix_regained_ns = None
         return is_new
 
     def restarted(self) -> None:
         """Forget the receiver's clock and fixes: the vehicle was restarted."""
         self.stated_us = 0
-        self.fixed_ns = self.second_fixed_ns = self.lost_ns = self.again_ns = None
+        self.fixed_ns = self.second_fixed_ns = self.fix_lost_ns = self.fix_regained_ns = None
 
-    def adrift_s(self, t_ns: int) -> float:
-        """Return for how long the position has been continued without a fix; 0: there is one.
+    def dead_reckoning_s(self, t_ns: int) -> float:
+        """Return for how long the position has been dead reckoned; 0 with a GNSS fix.
 
-        A while after the fix is there again, its position may still be as wrong.
+        For ``SETTLED_NS`` after the fix returned, the position may still be as wrong.
         """
-        if self.lost_ns is None or self.receiver is None:
+        if self.fix_lost_ns is None or self.receiver is None:
             return 0.0
         if t_ns - self.receiver.t_ns > FORGOTTEN_NS:
             return 0.0
-        if self.again_ns is None:
-            return (t_ns - self.lost_ns) * 1e-9
-        is_settled = t_ns - self.again_ns > SETTLED_NS
-        return 0.0 if is_settled else (self.again_ns - self.lost_ns) * 1e-9
+        if self.fix_regained_ns is None:
+            return (t_ns - self.fix_lost_ns) * 1e-9
+        is_settled = t_ns - self.fix_regained_ns > SETTLED_NS
+        return 0.0 if is_settled else (self.fix_regained_ns - self.fix_lost_ns) * 1e-9
 
     def knows_position(self, t_ns: int) -> bool:
         """Return False if the estimator states that it knows none, and the receiver has no fix.

@@ -118,7 +118,7 @@ class FrameOutcome(NamedTuple):
     change: ClockChange | None = None
 
 
-NO_ESTIMATE: Final = "its autopilot states that it knows no position"
+NO_ESTIMATE: Final = "its estimator reports no valid position"
 _OF_CARRIER: Final = ABOUT_ATTITUDE | {ATTITUDE}  # messages used only of the carrier
 NO_OUTCOME: Final = FrameOutcome()  # outcome of a frame without further effect
 
@@ -259,11 +259,11 @@ class Senders:
                     component.stated_us = stated_us
                     component.receiver = message
                     has_fix = message.fix_type >= FIX_3D
-                    # One from before the vehicle's first position may be anybody's.
-                    if has_fix and component.lost_ns is None and sender is not None:
+                    # Before its first position, anybody may have sent it.
+                    if has_fix and component.fix_lost_ns is None and sender is not None:
                         component.fixed_ns = message.t_ns
                     elif name in self._tracked:
-                        said = _fix_noted(component, message, name)
+                        said = _note_fix(component, message, name)
                 heading = gnss_heading(frame) if message.source == self._carrier_source else None
                 if heading is None and not said:
                     return NO_OUTCOME
@@ -434,8 +434,8 @@ class Senders:
                     apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
                 component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
         known = known or self._noise_settings.default
-        if component is not None and component.lost_ns is not None:
-            known = noise.adrift(known, component.adrift_s(report.t_ns))
+        if component is not None and component.fix_lost_ns is not None:
+            known = noise.dead_reckoned(known, component.dead_reckoning_s(report.t_ns))
         made = ReportNoise(
             horizontal_m=known.horizontal_m,
             vertical_m=known.vertical_m,
@@ -578,11 +578,11 @@ class Senders:
         sender = self._senders.get(uav)
         return (sender.shared or sender).clock.estimate() if sender else None
 
-    def adrift_s(self, uav: str, now_ns: int) -> float:
+    def dead_reckoning_s(self, uav: str, now_ns: int) -> float:
         """Return for how long a vehicle has had no GNSS fix; 0 if it has one, or never had."""
         source = _source(uav)
         component = None if source is None else self._components.get(source)
-        return 0.0 if component is None else component.adrift_s(now_ns)
+        return 0.0 if component is None else component.dead_reckoning_s(now_ns)
 
     def assumed(self, uav: str) -> assembly.AircraftAssumptions:
         """Return the assumptions about a UAV, by the types in its heartbeats.
@@ -636,11 +636,11 @@ def _source(uav: str) -> Source | None:
     return Source.parse(uav) if kind_of(uav).reports_itself else None
 
 
-def _fix_noted(component: ComponentState, status: GnssStatus, uav: str) -> tuple[Notice, ...]:
+def _note_fix(component: ComponentState, status: GnssStatus, uav: str) -> tuple[Notice, ...]:
     """Note whether a tracked vehicle's receiver has a fix; return a notice if it has lost it."""
     if not component.note_fix(has_fix=status.fix_type >= FIX_3D, t_ns=status.t_ns):
         return ()
-    text = f"{uav} has lost its GNSS fix: the bound of its position grows until it has one"
+    text = f"{uav}: GNSS fix lost; its position bound grows until the fix returns"
     return (Notice(t_ns=status.t_ns, severity=Severity.WARNING, subject=uav, text=text),)
 
 

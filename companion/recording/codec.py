@@ -27,6 +27,7 @@ FRAME_ID: Final = "wgs84"
 """Frame of reference of every LocationFix: Earth-fixed, x through 0° E, z to the north pole."""
 OFFSET_MAX_NS: Final = 1 << 62
 """Limit on UTC less the node's timeline, 146 years, so that results are valid dates."""
+TEXT_MAX: Final = 500  # limit on characters of links, senders and details, which are kept by name
 FrameMessage: Final = schemas.message_class("Frame")
 _LEVEL: Final = {
     Severity.INFO: schemas.LogMessage.INFO,
@@ -149,6 +150,8 @@ def _reason_invalid(event: Event) -> str | None:
             return "round trip with an invalid source"
         case Duty() if max(len(event.serves), len(event.spares)) > DUTY_MAX:
             return f"duty of more than {DUTY_MAX} UAVs"
+        case Rejection() if max(len(event.source), len(event.detail)) > TEXT_MAX:
+            return f"rejection: source or detail has more than {TEXT_MAX} characters"
         case ClockSet() if abs(event.utc_offset_ns) > OFFSET_MAX_NS:
             return "UTC offset out of range"
         case Observation() if (reason := reason_invalid(event)) is not None:

@@ -40,8 +40,6 @@ _LATEST_NS: Final = 1 << 62
 """Latest time of an event, the year 2116: results computed from times fit into 63 bits."""
 LARGEST_EVENT: Final = 1 << 21
 """Limit on the bytes of an event: a duty with the largest number of names."""
-TEXT_MAX: Final = 500
-"""Longest name of a link or sender, and longest detail of a rejection, that is kept by name."""
 _UNCERTAINTY_MAX_NS: Final = 3_600_000_000_000
 """Largest uncertainty of a frame's arrival: results computed from it fit into 63 bits."""
 DAMAGED: Final = "recording damaged"  # detail of a rejection for bytes of a recording
@@ -328,11 +326,8 @@ def _event(topic: str, data: bytes, sources: dict[tuple[int, int], Source]) -> E
             not is_shaped(frame.raw)
             or max(frame.source) > 255
             or frame.doubt_ns > _UNCERTAINTY_MAX_NS
-            or len(frame.link) > TEXT_MAX
+            or len(frame.link) > codec.TEXT_MAX
         ):
             raise ValueError("malformed frame")
         return frame
-    event = codec.to_event(topic, data)
-    if isinstance(event, Rejection) and max(len(event.source), len(event.detail)) > TEXT_MAX:
-        raise ValueError("rejection with a longer text than this program writes")
-    return event
+    return codec.to_event(topic, data)

@@ -79,7 +79,7 @@ class BoundedProtocol(HttpToolsProtocol):
         super().__init__(*args, **kwargs)
         self._queue = queue
         self._budget = Budget(per_s=REQUESTS_PER_S, most=REQUESTS_SAVED)
-        self.url = b""  # uvicorn has none before the first byte of a request line
+        self.url = b""  # uvicorn sets it when a request line begins
         self._unparsed = bytearray()
         self._in_head = True
         self._parsed_bytes = 0  # since the last complete request, framing of its body included

@@ -83,7 +83,7 @@ def _shown(entry: os.DirEntry[str], current: Current) -> Json:
         size: int | None = (
             current.bytes if is_current else entry.stat(follow_symlinks=False).st_size
         )
-    except OSError:  # renamed or deleted since the folder was read, or not readable for us
+    except OSError:  # renamed or deleted since the folder was read, or not permitted
         size = None
     return {
         "name": entry.name,

@@ -41,10 +41,10 @@ since, and what was forged before the vehicle appeared would count for ever.
 """
 FORGOTTEN_NS: Final = 60_000_000_000
 """Time after which a statement of a receiver that it does not repeat is ignored altogether."""
-ADRIFT_MPS2: Final = 0.5
-"""Largest error of the acceleration by which an autopilot continues its position without a fix.
+DEAD_RECKONING_MPS2: Final = 0.5
+"""Largest error of the acceleration that an autopilot integrates without a fix.
 
-That is an error of its tilt of 3 degrees, or of its accelerometers of 0.05 g.
+A tilt error of 3 degrees has this effect, and an accelerometer error of 0.05 g.
 """
 SETTLED_NS: Final = 5_000_000_000
 """Time with a fix after which the autopilot's position is that of its receiver again."""
@@ -85,16 +85,16 @@ def reported(status: GnssStatus, settings: NoiseSettings) -> ReportNoise:
     )
 
 
-def adrift(known: ReportNoise, seconds: float) -> ReportNoise:
-    """Return the bounds of a report of an autopilot whose receiver had no fix for so long.
+def dead_reckoned(known: ReportNoise, seconds: float) -> ReportNoise:
+    """Return the bounds of a report by dead reckoning, ``seconds`` after the last GNSS fix.
 
-    It continues its position by its accelerometers, and its height by the barometer.
+    The autopilot integrates its accelerometers; its height is the barometer's.
     """
-    horizontal_m = known.horizontal_m + ADRIFT_MPS2 / 2 * seconds * seconds
+    horizontal_m = known.horizontal_m + DEAD_RECKONING_MPS2 / 2 * seconds * seconds
     return known._replace(
         horizontal_m=horizontal_m,
         position_m=math.hypot(horizontal_m, known.vertical_m),
-        velocity_mps=known.velocity_mps + ADRIFT_MPS2 * seconds,
+        velocity_mps=known.velocity_mps + DEAD_RECKONING_MPS2 * seconds,
     )
 
 

@@ -38,7 +38,7 @@ class Reason(DescribedEnum):
     DUPLICATE = "duplicate", "copies of a report received before"
     NO_FIX = (
         "no-fix",
-        "reports before the receiver had a fix, or while the autopilot knows no position",
+        "reports sent before the receiver had a fix, or while the estimator has no position",
     )
     OUT_OF_ORDER = "out-of-order", "reports older than the window for late reports"
     TOO_FREQUENT = (

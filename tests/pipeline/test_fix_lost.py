@@ -46,11 +46,11 @@ def flight(drift_mps2: float, *, second: bool = False, told: bool = True) -> Ite
     """Return a circle at 10 Hz. From the loss of the fix on the position drifts to the north."""
     for n in range(round(ENDS_S * 10)):
         t_s = n / 10
-        adrift_s = min(max(0.0, t_s - LOST_S), AGAIN_S - LOST_S)
+        dead_reckoning_s = min(max(0.0, t_s - LOST_S), AGAIN_S - LOST_S)
         # The estimator returns within two seconds.
-        off_m = drift_mps2 / 2 * adrift_s**2 * min(1.0, max(0.0, 1 - (t_s - AGAIN_S) / 2))
+        off_m = drift_mps2 / 2 * dead_reckoning_s**2 * min(1.0, max(0.0, 1 - (t_s - AGAIN_S) / 2))
         (north_m, east_m), angle = true_m(t_s), SPEED_MPS / RADIUS_M * t_s
-        off_mps = drift_mps2 * adrift_s if t_s < AGAIN_S else 0.0
+        off_mps = drift_mps2 * dead_reckoning_s if t_s < AGAIN_S else 0.0
         speed = -SPEED_MPS * math.sin(angle) + off_mps, SPEED_MPS * math.cos(angle), 0.0
         yield position(t_s, UAV, (north_m + off_m, east_m, -60.0), speed, late_s=0.02)
         if n % 5 == 0:
@@ -82,7 +82,7 @@ def largest_m(found: dict[float, tuple[float, float]], from_s: float, to_s: floa
 
 
 def notices(outputs: list[Output]) -> list[Notice]:
-    return [one for one in outputs if isinstance(one, Notice) and "has lost" in one.text]
+    return [one for one in outputs if isinstance(one, Notice) and "fix lost" in one.text]
 
 
 @pytest.mark.parametrize("drift_mps2", [0.0, 0.15, 0.4, 0.5])
@@ -93,9 +93,7 @@ def test_bound_holds_while_the_position_drifts_without_a_fix(drift_mps2: float) 
     assert 16.0 < largest_m(found, LOST_S, AGAIN_S) < 25.0
     assert largest_m(found, AGAIN_S + 8.0, ENDS_S) < 4.0
     (told,) = notices(outputs)
-    assert (
-        told.text == "1:1 has lost its GNSS fix: the bound of its position grows until it has one"
-    )
+    assert told.text == "1:1: GNSS fix lost; its position bound grows until the fix returns"
     assert told.severity is Severity.WARNING
     assert 0.0 <= (told.t_ns - START_NS) / S - LOST_S < 0.6
 
@@ -150,7 +148,7 @@ def test_positions_are_rejected_while_the_estimator_knows_none() -> None:
     refused = [one for one in outputs if isinstance(one, Rejection)]
     assert 18 <= len(refused) <= 21  # until it has a fix again
     assert {one.reason for one in refused} == {Reason.NO_FIX}
-    assert {one.detail for one in refused} == {"its autopilot states that it knows no position"}
+    assert {one.detail for one in refused} == {"its estimator reports no valid position"}
     assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
     texts = [one.text for one in outputs if isinstance(one, Notice)]
     assert any(text.startswith("no report of 1:1 was used in the last") for text in texts)

@@ -411,7 +411,7 @@ def test_event_time_out_of_range_is_rejected(tmp_path: Path) -> None:
                 schemas.message_class("Rejection")(
                     t_ns=1, reason="garbage", is_event=True, **{field: "x" * 501}
                 ).SerializeToString(),
-                "rejection with a longer text than this program writes",
+                "rejection: source or detail has more than 500 characters",
             )
             for field in ("source", "detail")
         ),

@@ -13,8 +13,8 @@ from companion.values import UserError
 WANTED: Final = 4096  # enough for all servers at their largest
 RESERVED: Final = 96  # descriptors for links, recordings and files
 LEAST: Final = 8  # connections of any server
-NEEDED: Final = 64  # descriptors without which no service starts
-SCARCE: Final = 0.8  # ratio of them in use from which the fleet is left
+NEEDED: Final = 64  # least limit with which a service starts
+SCARCE: Final = 0.8  # ratio of descriptors in use above which they are scarce
 
 
 def raise_limit() -> None:
@@ -24,7 +24,8 @@ def raise_limit() -> None:
     """
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < NEEDED:
-        raise UserError(f"the system allows {hard} open files, needed: {NEEDED} (`ulimit -n`)")
+        given = f"file descriptor limit is {hard}, the service needs {NEEDED}"
+        raise UserError(f"{given}; raise it with `ulimit -n`")
     wanted = WANTED if hard == resource.RLIM_INFINITY else min(WANTED, hard)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         with contextlib.suppress(OSError, ValueError):
@@ -32,7 +33,10 @@ def raise_limit() -> None:
 
 
 def are_scarce() -> bool:
-    """Return whether nearly all descriptors are in use: a new one has the lowest free number."""
+    """Return whether nearly all descriptors are in use.
+
+    A new one has the lowest free number.
+    """
     soft, _ = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft == resource.RLIM_INFINITY:
         return False

@@ -18,14 +18,15 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
 again; its positions are used only as far as they agree with those of the other. Its attitudes and
 what else moves a bound are used only where the other has not brought the same message shortly
-before: positions that agree prove nothing about these. Accuracies in GPS_RAW_INT are not used at
-all while the other is current, as those of a peer that has brought no position yet; attitudes that
-contradict those of the other are announced. If the other has become late, by its own stamps, newer
-attitudes are used, but none newer than it could ever deliver. Stamps are used only if they are of
-the other's clock: another clock would look like a restart, or like a second vehicle. They may be
-ahead of the fastest of the other by a second: those of a standing vehicle anybody can predict. So
-the vehicle that was here first stays believed, and a stranger costs it nothing but a metre; whoever
-sends first in a vehicle's name is believed until it falls silent.
+before: positions that agree prove nothing about these. GPS_RAW_INT and EKF_STATUS_REPORT are not
+used at all while the other is current, as those of a peer that has brought no position yet;
+attitudes that contradict those of the other are announced. If the other has become late, by its own
+stamps, newer attitudes are used, but none newer than it could ever deliver. Stamps are used only if
+they are of the other's clock: another clock would look like a restart, or like a second vehicle.
+Those that are more than a second ahead of the fastest that the other has delivered are rejected:
+anybody can predict the positions of a standing vehicle. So the vehicle that was here first stays
+believed, and a stranger costs it at most a metre; whoever sends first in a vehicle's name is
+believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
@@ -94,9 +95,9 @@ BROUGHT_NS: Final = {
 OVERTAKEN_MS: Final = 300
 """How late a peer that was known first must have become, and how much newer other attitudes are."""
 AHEAD_MS: Final = 1000
-"""How far ahead of the fastest ones of a peer that was known first a stamp may be.
+"""Largest lead of a stamp over the fastest that a peer known earlier has delivered.
 
-A clock follows an early stamp only within a second at once, and otherwise if several agree.
+A clock follows a smaller lead at once, and would follow a larger one once several stamps agree.
 """
 EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
 LATE_PEER_MS: Final = 1000  # how much newer attitudes are whose rejection is announced
@@ -203,7 +204,7 @@ class KnownPeers:
         self.replaced: list[tuple[str, str, tuple[str, ...]]] = []
         """Senders whose positions are taken from a peer, since the known ones bring none."""
         self.late: list[tuple[str, str, tuple[str, ...]]] = []
-        """Senders of which a peer brings newer attitudes than those that were known first."""
+        """Senders of which a peer brings newer messages than those that were known first."""
         self._routers = frozenset(routers)
         self._senders: dict[Source, _Sender] = {}
 

@@ -41,9 +41,10 @@ PATIENCE_S: Final = 6.0
 """Least time without answers from a present node after which the session is renewed."""
 RETRY_S: Final = 2.0  # time between two attempts to reopen a session
 AWAY_S: Final = 30.0
-"""Time for which a node leaves the fleet whose connections take the descriptors of all others.
+"""Time for which a node leaves the fleet when file descriptors are scarce.
 
-Zenoh limits neither connections nor handshakes, and frees one after another.
+Zenoh limits no connections that are not sessions yet, and closes them one at a time. The end of its
+session closes all.
 """
 PATIENCE_LEASES: Final = 4.0  # the same limit in leases
 LOOK_S: Final = 0.3
@@ -127,11 +128,11 @@ class LiveFleetNode:
         has_taken_part = False
         while True:
             try:
-                is_crowded = await self._take_part()
+                has_no_room = await self._take_part()
                 has_taken_part = True
-                if is_crowded:
-                    text = f"too many connections; this node leaves the fleet for {AWAY_S:.0f} s"
-                    self._report(Severity.ERROR, "fleet", text)
+                if has_no_room:
+                    text = "nearly all file descriptors are in use; this node leaves the fleet"
+                    self._report(Severity.ERROR, "fleet", f"{text} for {AWAY_S:.0f} s")
                     await asyncio.sleep(AWAY_S)
             except UserError as error:
                 self._report(Severity.ERROR, "fleet", f"no fleet: {error}")
@@ -142,8 +143,9 @@ class LiveFleetNode:
     async def _take_part(self) -> bool:
         """Run in the fleet with one session, until it must be renewed (``answering.py``).
 
-        Returns whether it must rest, since connections take all descriptors.
+        Returns whether the session ended because file descriptors were scarce.
         """
+        has_no_room = False
         bus = Bus(self._config, asyncio.get_running_loop(), self._session)
         slices = ToLoop(asyncio.get_running_loop())
         try:
@@ -163,10 +165,9 @@ class LiveFleetNode:
                     group.create_task(self._repeat(OFFERED_S, self._publish_offers), name="offers"),
                     group.create_task(self._make_offers(), name="looks"),
                 ]
-                while not (is_crowded := are_scarce()) and not self._is_link_one_way(
-                    self._now_ns()
-                ):
+                while not (has_no_room or self._is_link_one_way(self._now_ns())):
                     await asyncio.sleep(1.0)
+                    has_no_room = are_scarce()
                 for task in tasks:
                     task.cancel()
         finally:
@@ -177,7 +178,7 @@ class LiveFleetNode:
                 self._flushing.cancel()
                 self._flushing = None
             await in_daemon_thread(bus.close, at_once=True)
-        return is_crowded
+        return has_no_room
 
     def _is_link_one_way(self, now_ns: int) -> bool:
         """Return whether a present node does not answer; remove nodes that left."""

@@ -302,13 +302,13 @@ def test_new_boot_keeps_the_uncertainty_of_its_first_stamps() -> None:
     """A new boot is accepted after some stamps. The earlier ones, shared by another node, are in
     its floor too and may have arrived earlier than placed."""
     clock = fed([(EPOCH_NS + n * 100 * MS, 500_000 + n * 100) for n in range(100)])
-    again_ns = EPOCH_NS + 20 * S
+    fix_regained_ns = EPOCH_NS + 20 * S
     for n in range(
         40
     ):  # three that arrived together with an uncertainty of 300 ms; others took 310 ms
         late_ms, doubt_ms = (300, 400) if n < 3 else (310, 0)
-        clock.observe(again_ns + (n * 100 + late_ms) * MS, 1_000 + n * 100, doubt_ms * MS)
-    offset_ns = again_ns - 1_000 * MS
+        clock.observe(fix_regained_ns + (n * 100 + late_ms) * MS, 1_000 + n * 100, doubt_ms * MS)
+    offset_ns = fix_regained_ns - 1_000 * MS
     found = known(clock)
     assert found.offset_ns - found.after_s * S <= offset_ns <= found.offset_ns + found.before_s * S
 

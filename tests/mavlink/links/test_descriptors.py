@@ -52,7 +52,7 @@ def test_service_does_not_start_with_too_few_descriptors() -> None:
         text=True,
         timeout=60,
     )
-    said = "companion: the system allows 24 open files, needed: 64 (`ulimit -n`)"
+    said = "companion: file descriptor limit is 24, the service needs 64; raise it with `ulimit -n`"
     assert (found.returncode, found.stderr.splitlines()[-1]) == (1, said)
     assert "Traceback" not in found.stderr
 

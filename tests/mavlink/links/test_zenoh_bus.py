@@ -217,6 +217,32 @@ def test_receive_queue_is_bounded(run: Run, monkeypatch: pytest.MonkeyPatch) -> 
     run(test())
 
 
+def test_sessions_beyond_the_limit_are_rejected(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each may hold unfinished samples in memory."""
+    monkeypatch.setattr(zenoh_config, "SESSIONS_MAX", 1)
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+
+    async def test() -> None:
+        async with (
+            opened(BusConfig(listen=(endpoint,))) as one,
+            opened(BusConfig(connect=(endpoint,))) as first,
+            opened(BusConfig(connect=(endpoint,))) as second,
+        ):
+            heard = Heard()
+            one.subscribe("site/*", heard.take)
+            joining = [asyncio.create_task(joined(each, one)) for each in (first, second)]
+            _, waiting = await asyncio.wait(joining, return_when=asyncio.FIRST_COMPLETED)
+            for task in waiting:
+                task.cancel()
+            for _ in range(20):
+                first.put("site/first", b"")
+                second.put("site/second", b"")
+                await asyncio.sleep(0.05)
+            assert len({key for key, _ in heard}) == 1
+
+    run(test())
+
+
 def test_samples_beyond_the_limit_are_not_received(
     run: Run, monkeypatch: pytest.MonkeyPatch
 ) -> None:

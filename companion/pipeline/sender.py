@@ -32,10 +32,12 @@ class ComponentState:
     apart_m2   mean square of the receiver's height less the autopilot's, m²
     fixed_ns, second_fixed_ns
                arrivals of the newest statuses with a 3D fix, of its two receivers
-    fix_lost_ns    arrival of the last one before both had none; None: they never lost it
-    fix_regained_ns   arrival of the first one since; None: none yet
+    fix_lost_ns
+               arrival of the last one before the fix was lost; None: it never was
+    fix_regained_ns
+               arrival of the first one after that; None: none yet
     no_position_ns
-               arrival of the estimator's newest status, if it knows no position; else None
+               arrival of the estimator's newest status, if it has no valid position; else None
     """
 
     heard_ns: int = 0  # arrival of the newest of these messages

@@ -266,10 +266,11 @@ def _plain(value: Any) -> Any:
 def _is_address(url: str) -> bool:
     try:
         found = urlsplit(url)
-        port = found.port
-    except ValueError:  # such as a port beyond 65535
+        port, host = found.port, found.hostname or ""
+        host.encode("idna")
+    except ValueError:  # such as a port beyond 65535, or a label of 64 letters
         return False
-    return found.scheme in ("http", "https") and bool(found.hostname) and port != 0
+    return found.scheme in ("http", "https") and bool(host) and port != 0
 
 
 def _read(answer: HTTPResponse, timeout_s: float, most: int) -> bytes:

@@ -9,6 +9,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -19,6 +20,11 @@ from companion.node.signals import ENDS
 
 INTERRUPTED: Final = 130  # exit status
 RETRY_S: Final = 0.02  # delay before an interrupt that could not be raised is tried again
+IMPORTS_S: Final = 3.0
+"""Time after which running imports no longer delay an interrupt: a busy machine takes far longer.
+
+What is recorded by then is recovered at the next start, as after SIGKILL.
+"""
 
 _has_ended: Final = threading.Event()
 
@@ -83,6 +89,7 @@ def _ignore() -> None:
 def interrupts_raised() -> Iterator[None]:
     """Context in which an interrupt raises ``KeyboardInterrupt``, once running imports have ended.
 
+    If they take longer than ``IMPORTS_S``, it has the effect that it had outside the context.
     Commands import modules while they run. A package may turn an exception raised during its import
     into another error, or suppress it; so does the interpreter in a finalizer. A second interrupt
     has the effect that it had outside the context.
@@ -90,11 +97,14 @@ def interrupts_raised() -> Iterator[None]:
     if threading.current_thread() is not threading.main_thread():
         yield  # only the main thread may set signal handlers
         return
-    raised = False
+    raised, began_s = False, 0.0
 
     def interrupt(number: int, at: FrameType | None) -> None:
-        nonlocal raised
+        nonlocal raised, began_s
         if _imports(at):
+            began_s = began_s or time.monotonic()
+            if time.monotonic() - began_s > IMPORTS_S and not isinstance(outside, int | None):
+                outside(number, at)
             retry()
             return
         if raised and not isinstance(outside, int | None):

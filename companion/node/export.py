@@ -11,7 +11,6 @@ from companion.recording.reader import utc_offset_ns
 from companion.recording.scene import Scene
 from companion.recording.space_file import SpaceFile
 from companion.recording.tables.folder import TableFolder
-from companion.recording.writer import ACTIVE
 from companion.settings.model import Settings
 from companion.values import Update
 from companion.views.tables.said import TABLES, rows
@@ -66,17 +65,12 @@ def export_space(
     run = Run(settings, None)
     make_folder(where, "--out")
     whole = where / SPACE
-    made = whole.with_name(SPACE + ACTIVE)
     scene = Scene(run.pipeline.array, settings.recording.scene_hz)
-    try:
-        with SpaceFile(made, scene) as file:
-            for _, outputs in run.steps(events, progress):
-                for output in outputs:
-                    if isinstance(output, Update):
-                        file.add(output, run.pipeline.local)
-        made.rename(whole)
-    finally:
-        made.unlink(missing_ok=True)
+    with SpaceFile(whole, scene) as file:
+        for _, outputs in run.steps(events, progress):
+            for output in outputs:
+                if isinstance(output, Update):
+                    file.add(output, run.pipeline.local)
     summary = run.finish() | log_notes(logs)
     del summary["recording"]
     return summary | {"rows": {"clouds": file.clouds}, "files": [str(whole)]}

@@ -44,6 +44,9 @@ CONTRADICTED: Final = (
 )
 REPLACED: Final = "{who}: positions are used from {stranger}, since {known} sends none"
 LATE: Final = "{who}: messages from {stranger} are newer than those from {known}, but not used"
+FASTER: Final = (
+    "{who}: messages from {stranger} arrive earlier than those from {known}, and set its clock"
+)
 UNANSWERED: Final = (
     "the signing timestamps are not saved: the disk has not answered for {:.0f} s; if the service"
     " is killed now, frames of this time can be replayed to the next one"
@@ -198,6 +201,7 @@ class Gateway:
             (self._known_peers.contradicted, CONTRADICTED),
             (self._known_peers.replaced, REPLACED),
             (self._known_peers.late, LATE),
+            (self._known_peers.faster, FASTER),
         ):
             for who, stranger, known in told:
                 said = text.format(who=who, stranger=stranger, known=" and ".join(known))

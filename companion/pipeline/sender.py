@@ -5,7 +5,8 @@ from typing import Final
 
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.wire.stamps import step_ms
-from companion.tracking.noise import FORGOTTEN_NS, SETTLED_NS, STATED_NS, StatedNoise
+from companion.pipeline.gnss_fix import GnssFix
+from companion.tracking.noise import STATED_NS, StatedNoise
 from companion.values import FIX_3D, GnssStatus, Reason
 
 CONFIRMED_NS: Final = 5_000_000_000
@@ -17,8 +18,6 @@ ANOTHER_CLOCK_NS: Final = 10_000_000_000
 """Time for which a clock is known from its newest stamp here, whatever other nodes share."""
 ANOTHER_CLOCK_LATE_NS: Final = 3_000_000_000
 """Lateness of a stamp here, by a clock that others shared, which shows that this was another."""
-SECOND_RECEIVER_NS: Final = 5_000_000_000
-"""Time after a status of a second receiver with a fix in which the first one needs none."""
 TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 TYPE_KEPT_NS: Final = 60_000_000_000
 """Time for which a type counts beside the newest one, so that a forged one does not last."""
@@ -30,12 +29,6 @@ class ComponentState:
 
     stated_us  the receiver's own time of that status; 0 if unknown or from before a reboot
     apart_m2   mean square of the receiver's height less the autopilot's, m²
-    fixed_ns, second_fixed_ns
-               arrivals of the newest statuses with a 3D fix, of its two receivers
-    fix_lost_ns
-               arrival of the last one before the fix was lost; None: it never was
-    fix_regained_ns
-               arrival of the first one after that; None: none yet
     no_position_ns
                arrival of the estimator's newest status, if it has no valid position; else None
     """
@@ -47,51 +40,13 @@ class ComponentState:
     stated_us: int = 0
     noise: StatedNoise  # of its reports, by these statuses
     apart_m2: float | None = None
-    fixed_ns: int | None = None
-    second_fixed_ns: int | None = None
-    fix_lost_ns: int | None = None
-    fix_regained_ns: int | None = None
+    fix: GnssFix = field(default_factory=GnssFix)
     no_position_ns: int | None = None
-
-    def note_fix(self, *, has_fix: bool, t_ns: int) -> bool:
-        """Note whether the first receiver has a 3D fix; return whether it has lost it now.
-
-        A vehicle that never had a fix navigates by other means.
-        """
-        second_ns = self.second_fixed_ns
-        if has_fix or (second_ns is not None and t_ns - second_ns <= SECOND_RECEIVER_NS):
-            self.fixed_ns = t_ns
-            if self.fix_lost_ns is not None and self.fix_regained_ns is None:
-                self.fix_regained_ns = t_ns
-            elif self.fix_regained_ns is not None and t_ns - self.fix_regained_ns > SETTLED_NS:
-                self.fix_lost_ns = self.fix_regained_ns = None
-            return False
-        if self.fixed_ns is None or (self.fix_lost_ns is not None and self.fix_regained_ns is None):
-            return False
-        is_new = self.fix_regained_ns is None or t_ns - self.fix_regained_ns > SETTLED_NS
-        if is_new:
-            self.fix_lost_ns = self.fixed_ns
-        self.fix_regained_ns = None
-        return is_new
 
     def restarted(self) -> None:
         """Forget the receiver's clock and fixes: the vehicle was restarted."""
         self.stated_us = 0
-        self.fixed_ns = self.second_fixed_ns = self.fix_lost_ns = self.fix_regained_ns = None
-
-    def dead_reckoning_s(self, t_ns: int) -> float:
-        """Return for how long the position has been dead reckoned; 0 with a GNSS fix.
-
-        For ``SETTLED_NS`` after the fix returned, the position may still be as wrong.
-        """
-        if self.fix_lost_ns is None or self.receiver is None:
-            return 0.0
-        if t_ns - self.receiver.t_ns > FORGOTTEN_NS:
-            return 0.0
-        if self.fix_regained_ns is None:
-            return (t_ns - self.fix_lost_ns) * 1e-9
-        is_settled = t_ns - self.fix_regained_ns > SETTLED_NS
-        return 0.0 if is_settled else (self.fix_regained_ns - self.fix_lost_ns) * 1e-9
+        self.fix.restarted()
 
     def knows_position(self, t_ns: int) -> bool:
         """Return False if the estimator states that it knows none, and the receiver has no fix.

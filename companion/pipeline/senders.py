@@ -188,8 +188,8 @@ class Senders:
 
     def hear(self, frame: Frame) -> FrameOutcome:  # noqa: PLR0912 - one for each kind of message
         """Process one frame of a message that is decoded (``decode.DECODED``)."""
-        if frame.msgid == GPS2_RAW and not frame.doubt_ns:
-            self._note_second_receiver(frame)
+        if frame.msgid == GPS2_RAW:
+            return self._second_receiver(frame)
         if frame.msgid in _OF_CARRIER and frame.source != self._carrier_source:
             change = self.add_stamp(frame) if frame.msgid == ATTITUDE else None
             return NO_OUTCOME if change is None else FrameOutcome(change=change)
@@ -219,10 +219,28 @@ class Senders:
             case _:
                 return self._take_other(frame, message)
 
-    def _note_second_receiver(self, frame: Frame) -> None:
-        component = self._components.get(frame.source)
-        if component is not None and second_has_fix(frame):
-            component.second_fixed_ns = frame.t_ns
+    def _second_receiver(self, frame: Frame) -> FrameOutcome:
+        """Note the fix of a vehicle's second receiver; decode the heading of the carrier's."""
+        component, uav = self._components.get(frame.source), str(frame.source)
+        said: tuple[Notice, ...] = ()
+        if (
+            component is not None
+            and uav in self._senders
+            and not frame.doubt_ns
+            and component.fix.note_second(has_fix=second_has_fix(frame), t_ns=frame.t_ns)
+        ):
+            said = self._fix_lost(uav, frame.t_ns)
+        heading = gnss_heading(frame) if frame.source == self._carrier_source else None
+        if heading is None and not said:
+            return NO_OUTCOME
+        return FrameOutcome(message=heading, outputs=said)
+
+    def _fix_lost(self, uav: str, t_ns: int) -> tuple[Notice, ...]:
+        """Return the notice that a tracked vehicle has no fix any more."""
+        if uav not in self._tracked:
+            return ()
+        text = f"{uav}: GNSS fix lost; its position bound grows until the fix returns"
+        return (Notice(t_ns=t_ns, severity=Severity.WARNING, subject=uav, text=text),)
 
     def _take_other(  # noqa: PLR0912 - one call less for each of them
         self, frame: Frame, message: GnssStatus | SystemTime | Presence | EstimatorStatus
@@ -260,10 +278,10 @@ class Senders:
                     component.receiver = message
                     has_fix = message.fix_type >= FIX_3D
                     # Before its first position, anybody may have sent it.
-                    if has_fix and component.fix_lost_ns is None and sender is not None:
-                        component.fixed_ns = message.t_ns
-                    elif name in self._tracked:
-                        said = _note_fix(component, message, name)
+                    if sender is not None and component.fix.note_first(
+                        has_fix=has_fix, t_ns=message.t_ns
+                    ):
+                        said = self._fix_lost(name, message.t_ns)
                 heading = gnss_heading(frame) if message.source == self._carrier_source else None
                 if heading is None and not said:
                     return NO_OUTCOME
@@ -282,6 +300,7 @@ class Senders:
             clock = self._senders[str(message.source)].clock
             on_timeline_us = message.unix_us - self._utc_offset_ns // 1000
             clock.system_time(message.t_ns, on_timeline_us, message.boot_ms)
+            change = clock.change or change
         return NO_OUTCOME if change is None else FrameOutcome(change=change)
 
     def add_stamp(self, frame: Frame) -> ClockChange | None:
@@ -434,8 +453,8 @@ class Senders:
                     apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
                 component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
         known = known or self._noise_settings.default
-        if component is not None and component.fix_lost_ns is not None:
-            known = noise.dead_reckoned(known, component.dead_reckoning_s(report.t_ns))
+        if component is not None and not component.fix.is_certain:
+            known = noise.dead_reckoned(known, component.fix.dead_reckoning_s(report.t_ns))
         made = ReportNoise(
             horizontal_m=known.horizontal_m,
             vertical_m=known.vertical_m,
@@ -582,7 +601,7 @@ class Senders:
         """Return for how long a vehicle has had no GNSS fix; 0 if it has one, or never had."""
         source = _source(uav)
         component = None if source is None else self._components.get(source)
-        return 0.0 if component is None else component.dead_reckoning_s(now_ns)
+        return 0.0 if component is None else component.fix.dead_reckoning_s(now_ns)
 
     def assumed(self, uav: str) -> assembly.AircraftAssumptions:
         """Return the assumptions about a UAV, by the types in its heartbeats.
@@ -634,14 +653,6 @@ def _assumed(
 def _source(uav: str) -> Source | None:
     """Return the MAVLink source of a UAV; None for a relayed aircraft, which has none."""
     return Source.parse(uav) if kind_of(uav).reports_itself else None
-
-
-def _note_fix(component: ComponentState, status: GnssStatus, uav: str) -> tuple[Notice, ...]:
-    """Note whether a tracked vehicle's receiver has a fix; return a notice if it has lost it."""
-    if not component.note_fix(has_fix=status.fix_type >= FIX_3D, t_ns=status.t_ns):
-        return ()
-    text = f"{uav}: GNSS fix lost; its position bound grows until the fix returns"
-    return (Notice(t_ns=status.t_ns, severity=Severity.WARNING, subject=uav, text=text),)
 
 
 def _refused(message: Report | AdsbVehicle, reason: Reason) -> FrameOutcome:

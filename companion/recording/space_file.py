@@ -18,6 +18,7 @@ from companion.beams.aim import directions
 from companion.recording import schemas
 from companion.recording.codec import timestamp
 from companion.recording.scene import COLOURS, ENU_FROM_NED, MAP, Scene
+from companion.recording.writer import ACTIVE, open_beside
 from companion.tracking.geodesy import LocalFrame
 from companion.values import FloatArray, Update
 
@@ -35,13 +36,15 @@ _FIELDS: Final = (
 class SpaceFile:
     """File of point clouds, open for writing; a context manager.
 
-    Raises ``OSError`` if it cannot be written.
+    It gets its name when it is complete. Raises ``OSError`` if it cannot be written,
+    ``BlockingIOError`` if another process is writing it.
     """
 
     def __init__(self, path: Path, scene: Scene) -> None:
         self.clouds = 0
         self._scene = scene
-        self._file = path.open("wb")
+        self._path, self._made = path, path.with_name(path.name + ACTIVE)
+        self._file = open_beside(path)
         self._writer: Any = Writer(self._file)
         self._writer.start(library="companion")
         self._channels: dict[str, int] = {}
@@ -57,9 +60,15 @@ class SpaceFile:
     def __enter__(self) -> "SpaceFile":
         return self
 
-    def __exit__(self, *_: object) -> None:
-        self._writer.finish()
-        self._file.close()
+    def __exit__(self, failed: object, *_: object) -> None:
+        with self._file:  # nobody else opens the file before it has its name, or is removed
+            try:
+                if failed is None:
+                    self._writer.finish()
+                    self._file.flush()
+                    self._made.rename(self._path)
+            finally:
+                self._made.unlink(missing_ok=True)
 
     def add(self, update: Update, local: LocalFrame | None) -> None:
         """Draw an update, at most at the rate of the scene."""

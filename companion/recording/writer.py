@@ -261,29 +261,58 @@ def free_name(wanted: Path) -> Path:
     return candidate
 
 
+def open_beside(final: Path) -> BufferedWriter:
+    """Open the file that gets a name when it is complete, as ``open_alone``.
+
+    Raises ``IsADirectoryError`` if a folder has that name.
+    """
+    if final.is_dir():
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(final))
+    return open_alone(_beside(final))
+
+
 def open_alone(path: Path) -> BufferedWriter:
     """Open and truncate a file, unless another process is recording to it.
 
     Raises ``BlockingIOError`` if another process is. The lock ends with the process, so it also
     distinguishes leftovers from files in use.
     """
-    file = opened(path, os.O_APPEND)
-    try:
+    while True:
+        file = opened(path, os.O_APPEND)
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if _is_at(path, file):
+                file.truncate(0)
+                file.seek(0)
+                return file
         except BlockingIOError as error:
+            file.close()
             raise BlockingIOError(error.errno, "in use by another process", str(path)) from None
-        file.truncate(0)
-        file.seek(0)
-    except OSError:
-        file.close()
-        raise
-    return file
+        except OSError as error:
+            file.close()
+            raise OSError(error.errno, error.strerror, str(path)) from None
+        file.close()  # another process finished and renamed it, before it was locked
+
+
+def _is_at(path: Path, file: BufferedWriter) -> bool:
+    try:
+        return os.path.samestat(path.stat(), os.fstat(file.fileno()))
+    except FileNotFoundError:
+        return False
 
 
 def opened(path: Path, flags: int) -> BufferedWriter:
-    """Open a file for writing; create it, if missing, not readable by all users."""
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | flags, FILE_MODE)
+    """Open a file for writing; create it, if missing, not readable by all users.
+
+    Raises ``OSError`` for a pipe, which would otherwise wait for a reader.
+    """
+    flags |= os.O_WRONLY | os.O_CREAT | os.O_CLOEXEC | os.O_NONBLOCK
+    try:
+        descriptor = os.open(path, flags, FILE_MODE)
+    except OSError as error:
+        if error.errno == errno.ENXIO:
+            raise OSError(error.errno, "is a pipe, not a file", str(path)) from None
+        raise
     return os.fdopen(descriptor, "ab" if flags & os.O_APPEND else "wb")
 
 

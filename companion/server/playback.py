@@ -23,6 +23,7 @@ IDLE_S: Final = 10.0  # time without a request after which another recording may
 READ_MAX_S: Final = 900.0  # longest time for one recording
 LINE_MAX_BYTES: Final = 1 << 25  # largest answer of the process
 MODULE: Final = "companion.node.recorded_history"
+_Version = tuple[Path, int, int, int]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -45,7 +46,7 @@ class Playback:
     """Samples of the recording that was requested last, used on the event loop."""
 
     def __init__(self) -> None:
-        self._path: Path | None = None
+        self._version: _Version | None = None
         self._task: asyncio.Task[bytes] | None = None
         self._reading = Reading()
         self._asked_s = 0.0
@@ -56,16 +57,20 @@ class Playback:
         Raises ``BusyError`` while another recording is being read for a client that still asks, and
         ``PlaybackError``.
         """
+        try:
+            version = await in_thread(_version, path)
+        except OSError as error:
+            raise PlaybackError(error.strerror) from error
         now_s = asyncio.get_running_loop().time()
         task, previous = self._task, None
-        if path != self._path and task is not None:
+        if version != self._version and task is not None:
             if not task.done() and now_s - self._asked_s < IDLE_S:
                 raise BusyError
             task.cancel()
             task, previous = None, task
         self._asked_s = now_s
         if task is None:
-            self._path, self._reading = path, Reading()
+            self._version, self._reading = version, Reading()
             self._task = task = asyncio.create_task(self._read(path, self._reading, previous))
             task.add_done_callback(seen)
         reading = self._reading
@@ -74,7 +79,7 @@ class Playback:
             return reading
         if task.cancelled() or task.exception() is not None:
             if self._task is task:
-                self._path = self._task = None  # the next request tries again
+                self._version = self._task = None  # the next request tries again
             raise PlaybackError("reading it was ended" if task.cancelled() else task.exception())
         return task.result()
 
@@ -103,6 +108,12 @@ class Playback:
         if line.startswith(b'{"problem"'):
             raise PlaybackError(orjson.loads(line)["problem"])
         raise PlaybackError("reading it took too long, or was ended")
+
+
+def _version(path: Path) -> _Version:
+    """Return what differs between a recording and another one that replaced it."""
+    status = path.stat()
+    return path, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 async def _started(path: Path) -> "subprocess.Popen[bytes]":

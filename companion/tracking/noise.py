@@ -90,10 +90,10 @@ def dead_reckoned(known: ReportNoise, seconds: float) -> ReportNoise:
 
     The autopilot integrates its accelerometers; its height is the barometer's.
     """
-    horizontal_m = known.horizontal_m + DEAD_RECKONING_MPS2 / 2 * seconds * seconds
+    drift_m = DEAD_RECKONING_MPS2 / 2 * seconds * seconds
     return known._replace(
-        horizontal_m=horizontal_m,
-        position_m=math.hypot(horizontal_m, known.vertical_m),
+        horizontal_m=known.horizontal_m + drift_m,
+        position_m=known.position_m + drift_m,
         velocity_mps=known.velocity_mps + DEAD_RECKONING_MPS2 * seconds,
     )
 

@@ -24,6 +24,7 @@ from companion.node.replay import log_events
 from companion.pipeline.fold import Pipeline
 from companion.recording.tables import folder, parquet_file
 from companion.recording.tables.columns import ColumnKind, Table
+from companion.recording.writer import open_alone
 from companion.settings.model import Settings
 from companion.values import Estimate, Notice, Output, Refuted, Rejection, Update
 from companion.views.tables.said import TABLES
@@ -277,6 +278,34 @@ def test_space_export_of_an_unreadable_log_leaves_no_files(tmp_path: Path) -> No
     done = export(tmp_path / "x.tlog", "--out", tmp_path / "space", "--format", "rerun")
     assert done.exit_code != 0
     assert not list(tmp_path.glob("space/*"))
+
+
+def test_space_export_leaves_the_file_of_another_export_alone(tmp_path: Path) -> None:
+    other = tmp_path / "space.mcap.active"
+    with open_alone(other) as file:
+        file.write(b"points of the other export")
+        file.flush()
+        done = export(LOG, "--out", tmp_path, "--format", "rerun", *CENTER)
+        assert done.exit_code == 1
+        assert "space.mcap.active: in use by another process" in done.stderr
+        assert other.read_bytes() == b"points of the other export"
+
+
+@pytest.mark.parametrize(("form", "name"), [("csv", "reports.csv"), ("rerun", "space.mcap")])
+def test_folder_in_place_of_a_file_is_named_at_once(tmp_path: Path, form: str, name: str) -> None:
+    (tmp_path / name).mkdir()
+    done = export(LOG, "--out", tmp_path, "--format", form, *CENTER)
+    assert done.exit_code == 1
+    assert f"{name}: Is a directory" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == [name]
+
+
+@pytest.mark.parametrize("name", ["reports.csv.active", "export.json.active"])
+def test_pipe_in_place_of_a_file_is_an_error(tmp_path: Path, name: str) -> None:
+    os.mkfifo(tmp_path / name)
+    done = export(LOG, "--out", tmp_path, "--format", "csv", *CENTER)
+    assert done.exit_code == 1
+    assert f"{name}: is a pipe, not a file" in done.stderr
 
 
 def test_recording_exports_the_same_tables(tmp_path: Path, short_log: Path) -> None:

@@ -255,3 +255,22 @@ def test_notices_without_a_reader_stop_nothing(full_pipe: int, cut_log: Path) ->
             assert len(json.load(answer)["events"]) > 4
         process.terminate()
         assert process.wait(HANG_S) == 0
+
+
+def test_import_delays_an_interrupt_only_for_seconds(tmp_path: Path) -> None:
+    """On a busy machine, the imports of a starting service take far longer."""
+    (tmp_path / "slow.py").write_text(
+        "import time\nprint('imports', flush=True)\ntime.sleep(600)\n"
+    )
+    code = (
+        "from companion.cli.interrupts import interrupts_end, interrupts_raised\n"
+        "with interrupts_end('companion'), interrupts_raised():\n"
+        "    import slow\n"
+    )
+    env = os.environ | {"PYTHONPATH": f"{tmp_path}:{ROOT}"}
+    pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    with started([sys.executable, "-c", code], env=env, **pipes) as process:
+        assert process.stdout.readline() == "imports\n"
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(HANG_S) == 130
+        assert process.stderr.read() == "companion: interrupted\n"

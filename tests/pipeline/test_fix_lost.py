@@ -2,7 +2,8 @@
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import Any
 
 import pymavlink.dialects.v20.all as dialect
 import pytest
@@ -26,9 +27,10 @@ def receiver(t_s: float, has_fix: bool) -> Frame:
     return sent(t_s, UAV, message)
 
 
-def second_receiver(t_s: float) -> Frame:
+def second_receiver(t_s: float, has_fix: bool = True) -> Frame:
+    fix_type = 3 if has_fix else 1
     message = dialect.MAVLink_gps2_raw_message(
-        round(t_s * 1e6), 3, 474_000_000, 85_500_000, 560_000, 100, 100, 0, 0, 12, 0, 0
+        round(t_s * 1e6), fix_type, 474_000_000, 85_500_000, 560_000, 100, 100, 0, 0, 12, 0, 0
     )
     return sent(t_s, UAV, message)
 
@@ -116,6 +118,74 @@ def test_second_receiver_with_a_fix_replaces_the_first() -> None:
     outputs, found = flown(flight(0.0, second=True))
     assert largest_m(found, LOST_S - 5.0, ENDS_S) < 4.0
     assert notices(outputs) == []
+
+
+def with_statuses(drift_mps2: float, *has_fix: Callable[[float], bool | None]) -> Iterator[Any]:
+    """Return the flight with other statuses of its receivers; None: none is sent."""
+    for event in flight(drift_mps2):
+        if not (isinstance(event, Frame) and event.msgid == 24):
+            yield event
+            continue
+        t_s = (event.t_ns - START_NS) / S
+        for one, fixed in zip((receiver, second_receiver), has_fix, strict=False):
+            if (said := fixed(t_s)) is not None:
+                yield one(t_s, said)
+
+
+def is_fixed(t_s: float) -> bool:
+    return not LOST_S <= t_s < AGAIN_S
+
+
+def test_bound_holds_if_both_receivers_lose_the_fix() -> None:
+    outputs, found = flown(with_statuses(0.45, is_fixed, is_fixed))
+    assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
+    (told,) = notices(outputs)
+    assert (told.t_ns - START_NS) / S - LOST_S < 0.6
+
+
+def test_bound_holds_if_the_second_receiver_falls_silent_when_the_first_loses_the_fix() -> None:
+    outputs, found = flown(with_statuses(0.45, is_fixed, lambda t: True if t < LOST_S else None))
+    assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
+    (told,) = notices(outputs)
+    assert (told.t_ns - START_NS) / S - LOST_S < 2.6
+
+
+def test_bound_grows_without_a_fix_if_the_receiver_falls_silent() -> None:
+    pause_s = 60.0 + ENDS_S
+
+    def silent() -> Iterator[Any]:
+        yield from with_statuses(0.0, lambda t: t < LOST_S if t < AGAIN_S else None)
+        yield position(pause_s, UAV, (200.0, 0.0, -60.0), (0.0, 0.0, 0.0), late_s=0.02)
+        yield position(pause_s + 0.1, UAV, (200.0, 0.0, -60.0), (0.0, 0.0, 0.0), late_s=0.02)
+        yield Tick(START_NS + round((pause_s + 0.15) * S))
+
+    _, found = flown(silent())
+    t_s, (_, bound_m) = max(found.items())
+    assert bound_m > 0.25 * (t_s - LOST_S) ** 2
+
+
+def test_loss_of_a_fix_that_was_stated_once_is_forgotten() -> None:
+    """A stranger in a gap of the vehicle's radio may have stated both."""
+
+    def once() -> Iterator[Any]:
+        yield from with_statuses(0.0, lambda t: {10.0: True, 10.5: False}.get(t - 0.03))
+        for n in range(round(ENDS_S * 10), round((ENDS_S + 30.0) * 10)):
+            north_m, east_m = true_m(n / 10)
+            angle = SPEED_MPS / RADIUS_M * n / 10
+            speed = -SPEED_MPS * math.sin(angle), SPEED_MPS * math.cos(angle), 0.0
+            yield position(n / 10, UAV, (north_m, east_m, -60.0), speed, late_s=0.02)
+            yield Tick(START_NS + round((n / 10 + 0.05) * S))
+
+    _, found = flown(once())
+    assert largest_m(found, 30.0, ENDS_S) > 100.0
+    assert largest_m(found, 75.0, ENDS_S + 30.0) < 7.0
+
+
+def test_losses_of_a_moment_do_not_add_up() -> None:
+    """The receiver has no fix in one of its statuses in four seconds."""
+    outputs, found = flown(with_statuses(0.0, lambda t: t < 10.0 or t % 4 > 0.5))
+    assert largest_m(found, 10.0, ENDS_S) < 6.0
+    assert len(notices(outputs)) == 1
 
 
 def test_position_of_a_vehicle_that_never_had_a_fix_is_used() -> None:

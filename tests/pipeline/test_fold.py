@@ -369,6 +369,22 @@ def test_attitude_bound_follows_the_estimator_status() -> None:
     assert bound_deg(estimator(at_s, 0.0)) == pytest.approx(3.0)
 
 
+def test_step_that_system_time_proves_is_announced() -> None:
+    """From one of its messages on, a vehicle states another time of day: one of both is wrong."""
+    trusting = settings().override(clocks={"trust_gnss": True, "node_utc_error_s": 0.01})
+    pipeline, said = Pipeline(trusting), list[Output]()
+    for n in range(200):
+        t_s = n / 10
+        said += run(pipeline, [position(t_s, "1:1")])
+        if n % 10 == 0:
+            unix_us = (START_NS + round((t_s - (1.0 if t_s >= 15.0 else 0.0)) * S)) // 1000
+            stamp = dialect.MAVLink_system_time_message(unix_us, round((100 + t_s) * 1000))
+            said += run(pipeline, [sent(t_s + 0.02, "1:1", stamp)])
+    (refuted,) = (one for one in said if isinstance(one, Refuted))
+    assert refuted.setting == "clocks.drift_max_ppm"
+    assert (refuted.t_ns - START_NS) / S == pytest.approx(15.02)
+
+
 def test_gnss_heading_of_the_carrier_that_contradicts_its_attitude_raises_the_bound() -> None:
     """Other vehicles' headings are not used; neither is a heading before any attitude."""
 

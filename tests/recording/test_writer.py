@@ -1,5 +1,6 @@
 """Recordings are read back in order by this program and by any MCAP reader."""
 
+import fcntl
 import gc
 import os
 import resource
@@ -23,6 +24,7 @@ from mcap.reader import make_reader
 from observed import OBSERVATIONS
 from support import read_metadata
 
+from companion.recording import writer
 from companion.recording.reader import log_kind, read_log, read_settings
 from companion.recording.recover import recover
 from companion.recording.writer import Writer
@@ -392,3 +394,29 @@ def test_recordings_are_not_world_readable(tmp_path: Path, umask: int) -> None:
     found = [folder.stat().st_mode & 0o777, opened]
     found += [file.stat().st_mode & 0o777 for file in (kept, recovered)]
     assert found == [mode & ~umask for mode in wanted]
+
+
+def test_file_that_was_renamed_before_it_is_locked_is_left_alone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Another process finished it in between."""
+    active, whole = tmp_path / "x.active", tmp_path / "x"
+    active.write_bytes(b"finished")
+    lock = fcntl.flock
+
+    def late_lock(*args: Any) -> None:
+        if not whole.exists():
+            active.rename(whole)
+        lock(*args)
+
+    monkeypatch.setattr(writer.fcntl, "flock", late_lock)
+    with writer.open_alone(active) as file:
+        file.write(b"new")
+    assert (whole.read_bytes(), active.read_bytes()) == (b"finished", b"new")
+
+
+def test_pipe_in_place_of_a_file_is_an_error(tmp_path: Path) -> None:
+    """Opening it would wait for a reader."""
+    os.mkfifo(tmp_path / "x.active")
+    with pytest.raises(OSError, match="is a pipe, not a file"):
+        writer.open_alone(tmp_path / "x.active")

@@ -1,6 +1,7 @@
 """Samples of a whole recording: read by a process of its own, one recording at a time."""
 
 import asyncio
+import os
 import shutil
 from collections.abc import Iterator
 from pathlib import Path
@@ -102,6 +103,16 @@ def test_simultaneous_requests_for_many_recordings_start_one_process(
     run_async(burst())
     assert answers == [True, False] * 20
     assert started == [folder / "two.mcap"]
+
+
+def test_recording_that_was_replaced_is_read_again(client: TestClient, folder: Path) -> None:
+    before = whole(client, "one.mcap").json()
+    other = folder / "other"
+    with (folder / "one.mcap").open("rb") as file:
+        other.write_bytes(file.read(os.fstat(file.fileno()).st_size // 2))
+    other.rename(folder / "one.mcap")
+    after = whole(client, "one.mcap").json()
+    assert 0 < len(after["at"]) < len(before["at"])
 
 
 def test_unreadable_and_unknown_recordings_are_refused(client: TestClient) -> None:

@@ -18,15 +18,16 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
 again; its positions are used only as far as they agree with those of the other. Its attitudes and
 what else moves a bound are used only where the other has not brought the same message shortly
-before: positions that agree prove nothing about these. GPS_RAW_INT and EKF_STATUS_REPORT are not
-used at all while the other is current, as those of a peer that has brought no position yet;
-attitudes that contradict those of the other are announced. If the other has become late, by its own
-stamps, newer attitudes are used, but none newer than it could ever deliver. Stamps are used only if
-they are of the other's clock: another clock would look like a restart, or like a second vehicle.
-Those that are more than a second ahead of the fastest that the other has delivered are rejected:
-anybody can predict the positions of a standing vehicle. So the vehicle that was here first stays
-believed, and a stranger costs it at most a metre; whoever sends first in a vehicle's name is
-believed until it falls silent.
+before: positions that agree prove nothing about these. GPS_RAW_INT, GPS2_RAW, EKF_STATUS_REPORT and
+SYSTEM_TIME are not used at all while the other is current, as those of a peer that has brought no
+position yet; attitudes that contradict those of the other are announced. If the other has become
+late, by its own stamps, newer attitudes are used, but none newer than it could ever deliver. Stamps
+are used only if they are of the other's clock: another clock would look like a restart, or like a
+second vehicle. Those that are more than a second ahead of the fastest that the other has delivered
+are rejected: anybody can predict the positions of a standing vehicle. Those that are less ahead set
+the clock, as those of a faster second radio must, and are announced. So the vehicle that was here
+first stays believed, and a stranger costs it at most a metre; whoever sends first in a vehicle's
+name is believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
@@ -47,7 +48,7 @@ from companion.mavlink.trust.attitude_difference import contradict
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
 from companion.mavlink.trust.paths import RESTARTED_MS, SLACK_M, Path
 from companion.mavlink.trust.peer_clock import PeerClock, has_stamp, stamp_ms
-from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE
+from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, GPS2_RAW
 from companion.mavlink.wire.decode import (
     ATTITUDE,
     DECODED,
@@ -55,6 +56,7 @@ from companion.mavlink.wire.decode import (
     GPS_RAW_INT,
     HEARTBEAT,
     POSE,
+    SYSTEM_TIME,
 )
 from companion.mavlink.wire.encode import TIMESYNC
 from companion.mavlink.wire.positions import OWN, OwnPosition, read
@@ -89,7 +91,9 @@ STRANGER: Final = "another peer than the known one of this sender; not used unti
 BROUGHT: Final = "the same message of this sender comes from the peer that was known first"
 BROUGHT_NS: Final = {
     ATTITUDE: 300_000_000,
-    **dict.fromkeys((*ABOUT_ATTITUDE, GPS_RAW_INT, EKF_STATUS_REPORT, HEARTBEAT), 5_000_000_000),
+    **dict.fromkeys(
+        (*ABOUT_ATTITUDE, GPS_RAW_INT, EKF_STATUS_REPORT, SYSTEM_TIME, HEARTBEAT), 5_000_000_000
+    ),
 }
 """Messages that move bounds, and the time for which one excludes those of peers known later."""
 OVERTAKEN_MS: Final = 300
@@ -100,8 +104,10 @@ AHEAD_MS: Final = 1000
 A clock follows a smaller lead at once, and would follow a larger one once several stamps agree.
 """
 EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
+LEAD_NS: Final = 10_000_000_000  # time after which a peer's fastest stamps are known well enough
 LATE_PEER_MS: Final = 1000  # how much newer attitudes are whose rejection is announced
-_OF_POSITION: Final = frozenset({GPS_RAW_INT, EKF_STATUS_REPORT})  # move bounds of positions
+_OF_FIRST: Final = frozenset({GPS_RAW_INT, GPS2_RAW, EKF_STATUS_REPORT, SYSTEM_TIME})
+"""Messages that count only from the peer believed first: nothing else confirms them."""
 _ABOUT_SENDER: Final = frozenset(
     {*STAMPED, *POSE, *ABOUT_ATTITUDE, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT}
 )
@@ -137,6 +143,7 @@ class _Peer:
     probation_ns: int = PROBATION_NS
     contradicted_ns: int = -SPACED_NS
     has_left: bool = False  # its connection ended
+    has_led: bool = False  # whether a notice said that its stamps are ahead of those of others
 
     def is_current(self, now_ns: int) -> bool:
         """Return whether the peer's newest message is so new that more are to be expected."""
@@ -205,6 +212,8 @@ class KnownPeers:
         """Senders whose positions are taken from a peer, since the known ones bring none."""
         self.late: list[tuple[str, str, tuple[str, ...]]] = []
         """Senders of which a peer brings newer messages than those that were known first."""
+        self.faster: list[tuple[str, str, tuple[str, ...]]] = []
+        """The same, where the newer messages are used: they set the sender's clock."""
         self._routers = frozenset(routers)
         self._senders: dict[Source, _Sender] = {}
 
@@ -234,7 +243,7 @@ class KnownPeers:
                 if not is_router and _is_another_clock_too_soon(sender, frame):
                     return STRANGER
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
-            return STRANGER if msgid in _OF_POSITION and not is_router else None
+            return STRANGER if msgid in _OF_FIRST and not is_router else None
         if msgid not in _ABOUT_SENDER and not any(msgid in one.newest for one in current):
             return None
         if msgid in OWN and self._replaces(sender, peer, current, frame):
@@ -283,6 +292,7 @@ class KnownPeers:
             if any(_is_ahead(one, frame) for one in earlier):
                 self._note_late(sender, peer, frame)
                 return STRANGER
+            self._note_lead(sender, peer, known, frame, earlier)
             known.stamped = frame
         if msgid in BROUGHT_NS and not is_only:
             return self._refusal_of_brought(sender, peer, known, frame)
@@ -312,8 +322,8 @@ class KnownPeers:
         ]
         now_ns, kept_ns = frame.t_ns, BROUGHT_NS[frame.msgid]
         recent = [(one, same) for one, same in earlier if now_ns - same.t_ns <= kept_ns]
-        # It moves bounds of positions, which positions that agree do not justify.
-        if not recent and frame.msgid in _OF_POSITION and _current_earlier(sender, known, now_ns):
+        # Positions that agree do not justify it.
+        if frame.msgid in _OF_FIRST and _current_earlier(sender, known, now_ns):
             return BROUGHT
         if not recent or any(same.payload == frame.payload for _, same in recent):
             return None
@@ -342,6 +352,19 @@ class KnownPeers:
             sender.late_notified_ns = frame.t_ns
             names = tuple(name for name in sender.known if name != peer)
             self.late.append((str(frame.source), peer, names))
+
+    def _note_lead(
+        self, sender: _Sender, name: str, peer: _Peer, frame: Frame, earlier: list[_Peer]
+    ) -> None:
+        """Publish once that the stamps of a peer are ahead of those of the ones known earlier.
+
+        Its link is faster, or somebody predicts the path: stamps do not tell which.
+        """
+        if peer.has_led or not any(_leads(one, frame) for one in earlier):
+            return
+        peer.has_led = True
+        names = tuple(one for one in sender.known if one != name)
+        self.faster.append((str(frame.source), name, names))
 
     def _compare_known(self, sender: _Sender, peer: str, known: _Peer, frame: Frame) -> str | None:
         """Compare a known peer's position with those of all other peers of its sender."""
@@ -428,7 +451,11 @@ class KnownPeers:
             self._note_contradiction(sender, name, frame)
         self._judge(sender, name, stranger, excess_m, frame)
         found = [one for one in (*behind, *ahead) if one is not None]
-        return bool(found) and max(found) <= AGREEMENT_M
+        agrees = bool(found) and max(found) <= AGREEMENT_M
+        if agrees:
+            believed = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
+            self._note_lead(sender, name, stranger, frame, believed)
+        return agrees
 
     def _judge(
         self, sender: _Sender, name: str, stranger: _Peer, excess_m: float | None, frame: Frame
@@ -516,6 +543,14 @@ def _is_ahead(one: _Peer, frame: Frame) -> bool:
     """Return whether a stamp is much earlier than any that a peer has delivered."""
     late_ms = one.clock.late_ms(frame)
     return late_ms is not None and late_ms < -AHEAD_MS
+
+
+def _leads(one: _Peer, frame: Frame) -> bool:
+    """Return whether a stamp is ahead of the fastest that a peer has delivered for long."""
+    if frame.t_ns - one.since_ns < LEAD_NS:
+        return False
+    late_ms = one.clock.late_ms(frame)
+    return late_ms is not None and late_ms < -EARLY_MS
 
 
 def _is_off_clock(one: _Peer, frame: Frame) -> bool:

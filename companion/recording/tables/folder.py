@@ -17,7 +17,7 @@ from companion.recording.folders import make_folder
 from companion.recording.tables.columns import Table, Value
 from companion.recording.tables.csv_file import CsvFile
 from companion.recording.tables.parquet_file import ParquetFile
-from companion.recording.writer import ACTIVE, open_alone, sync_folder
+from companion.recording.writer import ACTIVE, open_beside, opened, sync_folder
 
 CONTENTS: Final = "export.json"  # contents of an export; written last
 
@@ -57,7 +57,7 @@ class TableFolder:
         make_folder(where, "--out")
         try:
             for table in tables:
-                file = self._open[table.name] = open_alone(self._active(self._name(table.name)))
+                file = self._open[table.name] = open_beside(where / self._name(table.name))
                 self._files[table.name] = FORMATS[form](file, table)
         except BaseException:
             self.abandon()
@@ -85,7 +85,8 @@ class TableFolder:
         told = {names[table]: rows for table, rows in self.rows.items()}
         contents = {**said, "format": self._form, "rows": told}
         made = self._active(CONTENTS)
-        made.write_text(json.dumps(contents, indent=1) + "\n", encoding="utf-8")
+        with opened(made, os.O_TRUNC) as file:
+            file.write(json.dumps(contents, indent=1).encode() + b"\n")
         (self._where / CONTENTS).unlink(missing_ok=True)
         for name in names.values():
             self._active(name).rename(self._where / name)

@@ -35,6 +35,7 @@ from companion.mavlink.wire.transponder import ADSB_VEHICLE
 from companion.values import Frame, Source
 
 PROBATION_S = PROBATION_NS / S
+LOCAL_POSITION_NED = 32
 
 
 def rejected(peers: KnownPeers, *streams: Stream) -> dict[str, list[float]]:
@@ -420,11 +421,18 @@ def test_second_peer_brings_attitudes_while_the_first_brings_none_or_few() -> No
     assert all(taken[16:])
 
 
-@pytest.mark.parametrize("msgid", [GPS_RAW_INT, GPS2_RAW, ODOMETRY, EKF_STATUS_REPORT, HEARTBEAT])
+def told(msgid: int, number: int) -> bytes:
+    stamp_ms = (100 + 20) * 1000
+    return struct.pack("<QI", number, stamp_ms) if msgid == SYSTEM_TIME else bytes([7]) * number
+
+
+@pytest.mark.parametrize(
+    "msgid", [GPS_RAW_INT, GPS2_RAW, ODOMETRY, EKF_STATUS_REPORT, SYSTEM_TIME, HEARTBEAT]
+)
 def test_bounds_follow_the_peer_that_was_known_first(msgid: int) -> None:
     peers = with_two_known_peers()
-    true, lie = (Outgoing(Source(1, 1), msgid, bytes([7]) * n) for n in (20, 21))
-    moves = msgid in (GPS_RAW_INT, EKF_STATUS_REPORT)  # bounds of positions
+    true, lie = (Outgoing(Source(1, 1), msgid, told(msgid, n)) for n in (20, 21))
+    moves = msgid not in (ODOMETRY, HEARTBEAT)  # bounds of positions, or the clock
     first = peers.refusal(LINK, OTHER, message(20.0, lie))  # the known one brought none yet
     assert first == (BROUGHT if moves else None)
     assert peers.refusal(LINK, HOME, message(20.1, true)) is None
@@ -453,6 +461,25 @@ def test_known_peer_with_stamps_ahead_of_time_is_not_used(ahead_s: float) -> Non
         assert peers.refusal(LINK, OTHER, early) == STRANGER
         assert peers.refusal(LINK, OTHER, stamped_attitude(t_s + 0.03, t_s + ahead_s)) is not None
     assert [(who, peer) for who, peer, _ in peers.late] == [("1:1", OTHER)]
+
+
+@pytest.mark.parametrize(("ahead_s", "is_told"), [(0.0, False), (0.2, True), (0.5, True)])
+def test_peer_whose_stamps_set_the_clock_is_told_once(ahead_s: float, is_told: bool) -> None:
+    """Its radio is faster, or it predicts the path: then the track is ahead of the vehicle."""
+    peers = KnownPeers()
+    early = heard(OTHER, 10, begins_s=12.0, lasts_s=60.0, delay_s=lambda: -ahead_s)
+    found = rejected(peers, heard(HOME, 10, lasts_s=60.0), early)
+    assert len(found[OTHER]) < 60  # used, once known
+    assert peers.faster == [("1:1", OTHER, (HOME,))] * is_told
+
+
+def test_peer_is_ahead_only_of_one_whose_fastest_messages_are_known() -> None:
+    """The first messages of a peer may all be late."""
+    delays_s = iter([0.5] * 20)
+    slow = heard(HOME, 10, lasts_s=20.0, delay_s=lambda: next(delays_s, 0.0))
+    peers = KnownPeers()
+    rejected(peers, slow, heard(OTHER, 10, begins_s=1.0, lasts_s=20.0))
+    assert peers.faster == []
 
 
 def test_rank_of_a_peer_depends_on_the_others_that_are_current() -> None:
@@ -532,7 +559,7 @@ def test_no_stamp_of_another_clock_is_used_of_a_peer_that_became_known(off_ms: i
         assert peers.refusal(LINK, HOME, report(round(t_s * S), 100 + t_s, circle(t_s))) is None
         for lie, verdict in ((off_ms, STRANGER), (0, None)):
             boot_ms = (round((100 + t_s) * 1000) + lie) % 2**32
-            said = Outgoing(Source(1, 1), SYSTEM_TIME, struct.pack("<QI", 7, boot_ms))
+            said = Outgoing(Source(1, 1), LOCAL_POSITION_NED, struct.pack("<I", boot_ms))
             assert peers.refusal(LINK, OTHER, message(t_s + 0.01, said)) == verdict
 
 

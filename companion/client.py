@@ -268,6 +268,7 @@ def _is_address(url: str) -> bool:
         found = urlsplit(url)
         port, host = found.port, found.hostname or ""
         host.encode("idna")
+        host.encode("latin-1")  # as headers are
     except ValueError:  # such as a port beyond 65535, or a label of 64 letters
         return False
     return found.scheme in ("http", "https") and bool(host) and port != 0

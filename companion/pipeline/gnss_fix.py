@@ -15,6 +15,11 @@ TRUSTED_NS: Final = 10_000_000_000
 
 What was forged in a gap of a vehicle's radio would last for ever otherwise.
 """
+MOMENT_NS: Final = 1_200_000_000
+"""Time between two statuses with a fix, in which one without a fix is of no account.
+
+The position drifts by 0.36 m in it, and the receiver corrects that.
+"""
 NOTICE_NS: Final = 60_000_000_000  # least time between two notices of one vehicle
 
 
@@ -94,7 +99,7 @@ class GnssFix:
     def _note_fix(self, t_ns: int) -> None:
         if self.since_ns is None:
             self.since_ns = t_ns
-        elif self._is_lost(t_ns):
+        elif self._is_lost(t_ns) and t_ns - self.fixed_ns > MOMENT_NS:
             self.before_s = self.dead_reckoning_s(t_ns)
             self.regained_ns = t_ns
         elif self.before_s and not self._unsettled_s(t_ns):

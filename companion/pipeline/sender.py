@@ -36,6 +36,7 @@ class ComponentState:
     heard_ns: int = 0  # arrival of the newest of these messages
     types: dict[tuple[int, int], int] = field(default_factory=dict)
     """Types and autopilots of its heartbeats, the newest last, with their newest arrivals."""
+    is_armed: bool = False  # by its newest heartbeat
     receiver: GnssStatus | None = None  # its newest GNSS status
     stated_us: int = 0
     noise: StatedNoise  # of its reports, by these statuses
@@ -49,12 +50,14 @@ class ComponentState:
         self.fix.restarted()
 
     def knows_position(self, t_ns: int) -> bool:
-        """Return False if the estimator states that it knows none, and the receiver has no fix.
+        """Return False if the estimator states that it knows none, in flight or without a fix.
 
-        With a fix, estimators state so on the ground, until they are ready or while disarmed.
+        While disarmed, with a fix, estimators state so until they are ready, or until take-off.
         """
         if self.no_position_ns is None or t_ns - self.no_position_ns > STATED_NS:
             return True
+        if self.is_armed:
+            return False
         return self.receiver is None or self.receiver.fix_type >= FIX_3D
 
     def note_type(self, newest: tuple[int, int], t_ns: int) -> None:

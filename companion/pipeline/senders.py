@@ -291,6 +291,7 @@ class Senders:
                 if message.source == self._carrier_source:
                     return FrameOutcome(message=message)
             case Presence():
+                component.is_armed = message.is_armed
                 component.note_type((message.mav_type, message.autopilot), message.t_ns)
         return NO_OUTCOME
 

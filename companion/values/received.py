@@ -196,6 +196,7 @@ class Presence:
     source: Source
     mav_type: int
     autopilot: int
+    is_armed: bool
 
 
 FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX; better fixes have larger numbers

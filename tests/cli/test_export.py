@@ -300,6 +300,15 @@ def test_folder_in_place_of_a_file_is_named_at_once(tmp_path: Path, form: str, n
     assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
+def test_exports_of_two_forms_share_no_folder(tmp_path: Path) -> None:
+    """Both would write one export.json."""
+    with open_alone(tmp_path / "export.json.active"):
+        done = export(LOG, "--out", tmp_path, "--format", "csv", *CENTER)
+    assert done.exit_code == 1
+    assert "export.json.active: in use by another process" in done.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["export.json.active"]
+
+
 @pytest.mark.parametrize("name", ["reports.csv.active", "export.json.active"])
 def test_pipe_in_place_of_a_file_is_an_error(tmp_path: Path, name: str) -> None:
     os.mkfifo(tmp_path / name)

@@ -155,6 +155,7 @@ SAYS: list[tuple[str, int, str]] = [
     ("fleet watch nowhere", 1, "'nowhere' is not http://HOST:PORT"),
     ("fleet watch http://127.0.0.1:99999", 1, "is not http://HOST:PORT"),
     ("fleet watch http://a..b", 1, "'http://a..b' is not http://HOST:PORT"),
+    ("fleet watch http://٠", 1, "is not http://HOST:PORT"),
     (f"fleet watch http://{'a' * 64}:80", 1, "is not http://HOST:PORT"),
     ("fleet watch http://127.0.0.1:1", 1, "http://127.0.0.1:1: "),
     ("fleet watch --seconds 0", 2, "0.0 is not in the range x>0"),

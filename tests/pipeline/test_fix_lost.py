@@ -181,9 +181,11 @@ def test_loss_of_a_fix_that_was_stated_once_is_forgotten() -> None:
     assert largest_m(found, 75.0, ENDS_S + 30.0) < 7.0
 
 
-def test_losses_of_a_moment_do_not_add_up() -> None:
-    """The receiver has no fix in one of its statuses in four seconds."""
-    outputs, found = flown(with_statuses(0.0, lambda t: t < 10.0 or t % 4 > 0.5))
+@pytest.mark.parametrize("every_s", [1.0, 4.0])
+def test_losses_of_a_moment_do_not_add_up(every_s: float) -> None:
+    """The receiver has no fix in one of its statuses in one or four seconds."""
+    fixed = lambda t_s: t_s < 10.0 or t_s % every_s > 0.5  # noqa: E731
+    outputs, found = flown(with_statuses(0.0, fixed))
     assert largest_m(found, 10.0, ENDS_S) < 6.0
     assert len(notices(outputs)) == 1
 
@@ -222,6 +224,25 @@ def test_positions_are_rejected_while_the_estimator_knows_none() -> None:
     assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
     texts = [one.text for one in outputs if isinstance(one, Notice)]
     assert any(text.startswith("no report of 1:1 was used in the last") for text in texts)
+
+
+@pytest.mark.parametrize("is_armed", [False, True])
+def test_positions_in_flight_are_rejected_while_the_estimator_knows_none(is_armed: bool) -> None:
+    """Its receiver has a fix, which the estimator does not believe."""
+
+    def blind() -> Iterator[Any]:
+        for event in flight(0.0, told=False):
+            yield event
+            t_s = (event.t_ns - START_NS) / S
+            if isinstance(event, Frame) and event.msgid == 24:
+                yield estimator(t_s, KNOWS_NO_POSITION if 26.0 <= t_s < 30.0 else KNOWS_ALL)
+                mode = 128 if is_armed else 0
+                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3))
+
+    outputs, _ = flown(blind())
+    refused = [one for one in outputs if isinstance(one, Rejection)]
+    assert len(refused) == (40 if is_armed else 0)
+    assert {one.reason for one in refused} <= {Reason.NO_FIX}
 
 
 def test_statement_of_an_estimator_that_is_not_repeated_counts_for_ten_seconds() -> None:

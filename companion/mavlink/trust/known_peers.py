@@ -17,9 +17,9 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
 again; its positions are used only as far as they agree with those of the other. Its attitudes and
-what else moves a bound are used only where the other has not brought the same message shortly
-before: positions that agree prove nothing about these. GPS_RAW_INT, GPS2_RAW, EKF_STATUS_REPORT and
-SYSTEM_TIME are not used at all while the other is current, as those of a peer that has brought no
+type are used only where the other has not brought the same message shortly before: positions that
+agree prove nothing about these. What states accuracies, fixes or the time of day (``_OF_FIRST``) is
+not used at all while the other is current, as that of a peer that has brought no
 position yet; attitudes that contradict those of the other are announced. If the other has become
 late, by its own stamps, newer attitudes are used, but none newer than it could ever deliver. Stamps
 are used only if they are of the other's clock: another clock would look like a restart, or like a
@@ -48,7 +48,7 @@ from companion.mavlink.trust.attitude_difference import contradict
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
 from companion.mavlink.trust.paths import RESTARTED_MS, SLACK_M, Path
 from companion.mavlink.trust.peer_clock import PeerClock, has_stamp, stamp_ms
-from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, GPS2_RAW
+from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE
 from companion.mavlink.wire.decode import (
     ATTITUDE,
     DECODED,
@@ -106,7 +106,7 @@ A clock follows a smaller lead at once, and would follow a larger one once sever
 EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
 LEAD_NS: Final = 10_000_000_000  # time after which a peer's fastest stamps are known well enough
 LATE_PEER_MS: Final = 1000  # how much newer attitudes are whose rejection is announced
-_OF_FIRST: Final = frozenset({GPS_RAW_INT, GPS2_RAW, EKF_STATUS_REPORT, SYSTEM_TIME})
+_OF_FIRST: Final = ABOUT_ATTITUDE | {GPS_RAW_INT, EKF_STATUS_REPORT, SYSTEM_TIME}
 """Messages that count only from the peer believed first: nothing else confirms them."""
 _ABOUT_SENDER: Final = frozenset(
     {*STAMPED, *POSE, *ABOUT_ATTITUDE, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT}

@@ -17,7 +17,7 @@ from companion.recording.folders import make_folder
 from companion.recording.tables.columns import Table, Value
 from companion.recording.tables.csv_file import CsvFile
 from companion.recording.tables.parquet_file import ParquetFile
-from companion.recording.writer import ACTIVE, open_beside, opened, sync_folder
+from companion.recording.writer import ACTIVE, open_beside, sync_folder
 
 CONTENTS: Final = "export.json"  # contents of an export; written last
 
@@ -55,6 +55,7 @@ class TableFolder:
         self._open: dict[str, BufferedWriter] = {}
         self._files: dict[str, TableFile] = {}
         make_folder(where, "--out")
+        self._contents = open_beside(where / CONTENTS)  # tables of one form and of another too
         try:
             for table in tables:
                 file = self._open[table.name] = open_beside(where / self._name(table.name))
@@ -85,8 +86,8 @@ class TableFolder:
         told = {names[table]: rows for table, rows in self.rows.items()}
         contents = {**said, "format": self._form, "rows": told}
         made = self._active(CONTENTS)
-        with opened(made, os.O_TRUNC) as file:
-            file.write(json.dumps(contents, indent=1).encode() + b"\n")
+        self._contents.write(json.dumps(contents, indent=1).encode() + b"\n")
+        self._contents.flush()
         (self._where / CONTENTS).unlink(missing_ok=True)
         for name in names.values():
             self._active(name).rename(self._where / name)
@@ -103,12 +104,12 @@ class TableFolder:
                 table.abandon()
         for name in self._open:
             self._active(self._name(name)).unlink(missing_ok=True)
-        if self._open:
+        if not self._contents.closed:
             self._active(CONTENTS).unlink(missing_ok=True)
         self._shut()
 
     def _shut(self) -> None:
-        for file in self._open.values():
+        for file in (*self._open.values(), self._contents):
             with contextlib.suppress(OSError):  # a full disk: the file is removed anyway
                 file.close()
         self._open.clear()

@@ -432,7 +432,7 @@ def told(msgid: int, number: int) -> bytes:
 def test_bounds_follow_the_peer_that_was_known_first(msgid: int) -> None:
     peers = with_two_known_peers()
     true, lie = (Outgoing(Source(1, 1), msgid, told(msgid, n)) for n in (20, 21))
-    moves = msgid not in (ODOMETRY, HEARTBEAT)  # bounds of positions, or the clock
+    moves = msgid != HEARTBEAT  # bounds, or the clock
     first = peers.refusal(LINK, OTHER, message(20.0, lie))  # the known one brought none yet
     assert first == (BROUGHT if moves else None)
     assert peers.refusal(LINK, HOME, message(20.1, true)) is None

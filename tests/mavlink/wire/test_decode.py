@@ -140,7 +140,13 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
     source = Source(m.get_srcSystem(), m.get_srcComponent())
     match m.get_type():
         case "HEARTBEAT":
-            return Presence(t_ns=t_ns, source=source, mav_type=m.type, autopilot=m.autopilot)
+            return Presence(
+                t_ns=t_ns,
+                source=source,
+                mav_type=m.type,
+                autopilot=m.autopilot,
+                is_armed=bool(m.base_mode & 128),
+            )
         case "SYSTEM_TIME":
             return SystemTime(
                 t_ns=t_ns, source=source, unix_us=m.time_unix_usec or None, boot_ms=m.time_boot_ms
@@ -487,7 +493,9 @@ def test_one_byte_payload_is_decoded() -> None:
         yawspeed_radps=0,
     )
     frame = sent(dialect.MAVLink_heartbeat_message(0, 0, 0, 0, 0, 0))
-    assert decode(frame) == Presence(t_ns=T_NS, source=Source(7, 3), mav_type=0, autopilot=0)
+    assert decode(frame) == Presence(
+        t_ns=T_NS, source=Source(7, 3), mav_type=0, autopilot=0, is_armed=False
+    )
     assert rejected(sent(dialect.MAVLink_adsb_vehicle_message(
         0, 0, 0, 0, 0, 0, 0, 0, b"", 0, 0, 0, 0
     ))) is Reason.MALFORMED  # fmt: skip
@@ -620,7 +628,7 @@ def test_attitude_fields_keep_their_order() -> None:
 
 def test_heartbeat_gives_type_and_autopilot() -> None:
     found = decode(sent(dialect.MAVLink_heartbeat_message(2, 3, 128, 99, 4, 3)))
-    assert found == Presence(t_ns=T_NS, source=Source(7, 3), mav_type=2, autopilot=3)
+    assert found == Presence(t_ns=T_NS, source=Source(7, 3), mav_type=2, autopilot=3, is_armed=True)
 
 
 def test_other_messages_are_not_decoded() -> None:

@@ -322,10 +322,11 @@ class KnownPeers:
         ]
         now_ns, kept_ns = frame.t_ns, BROUGHT_NS[frame.msgid]
         recent = [(one, same) for one, same in earlier if now_ns - same.t_ns <= kept_ns]
-        # Positions that agree do not justify it.
+        if any(same.payload == frame.payload for _, same in recent):
+            return None
         if frame.msgid in _OF_FIRST and _current_earlier(sender, known, now_ns):
-            return BROUGHT
-        if not recent or any(same.payload == frame.payload for _, same in recent):
+            return BROUGHT  # positions that agree do not justify it
+        if not recent:
             return None
         if frame.msgid not in STAMPED:
             return BROUGHT

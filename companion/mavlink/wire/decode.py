@@ -196,17 +196,13 @@ def _attitude(frame: Frame) -> Attitude:
 
 
 _HEARTBEAT = struct.Struct("<IBBBBB")
-_SAFETY_ARMED: Final = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 
 
 def _heartbeat(frame: Frame) -> Presence:
     _, mav_type, autopilot, base_mode, *_ = unpack(frame, _HEARTBEAT)
+    armed = bool(base_mode & 128)  # MAV_MODE_FLAG_SAFETY_ARMED
     return Presence(
-        t_ns=frame.t_ns,
-        source=frame.source,
-        mav_type=mav_type,
-        autopilot=autopilot,
-        is_armed=bool(base_mode & _SAFETY_ARMED),
+        t_ns=frame.t_ns, source=frame.source, mav_type=mav_type, autopilot=autopilot, is_armed=armed
     )
 
 

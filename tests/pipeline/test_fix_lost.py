@@ -181,10 +181,10 @@ def test_loss_of_a_fix_that_was_stated_once_is_forgotten() -> None:
     assert largest_m(found, 75.0, ENDS_S + 30.0) < 7.0
 
 
-@pytest.mark.parametrize("every_s", [1.0, 4.0])
-def test_losses_of_a_moment_do_not_add_up(every_s: float) -> None:
-    """The receiver has no fix in one of its statuses in one or four seconds."""
-    fixed = lambda t_s: t_s < 10.0 or t_s % every_s > 0.5  # noqa: E731
+@pytest.mark.parametrize(("every_s", "lasts_s"), [(1.0, 0.5), (4.0, 0.5), (6.0, 0.6)])
+def test_losses_of_a_moment_do_not_add_up(every_s: float, lasts_s: float) -> None:
+    """The receiver has no fix in one or two of its statuses, every few seconds."""
+    fixed = lambda t_s: t_s < 10.0 or t_s % every_s > lasts_s  # noqa: E731
     outputs, found = flown(with_statuses(0.0, fixed))
     assert largest_m(found, 10.0, ENDS_S) < 6.0
     assert len(notices(outputs)) == 1

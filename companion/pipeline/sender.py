@@ -18,6 +18,7 @@ ANOTHER_CLOCK_NS: Final = 10_000_000_000
 """Time for which a clock is known from its newest stamp here, whatever other nodes share."""
 ANOTHER_CLOCK_LATE_NS: Final = 3_000_000_000
 """Lateness of a stamp here, by a clock that others shared, which shows that this was another."""
+REGULAR_NS: Final = 5_000_000_000  # longest time between regular statuses of an estimator
 TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 TYPE_KEPT_NS: Final = 60_000_000_000
 """Time for which a type counts beside the newest one, so that a forged one does not last."""
@@ -31,6 +32,8 @@ class ComponentState:
     apart_m2   mean square of the receiver's height less the autopilot's, m²
     no_position_ns
                arrival of the estimator's newest status, if it has no valid position; else None
+    position_ns, position_since_ns
+               arrival of the newest one with a valid position, and since when they were regular
     """
 
     heard_ns: int = 0  # arrival of the newest of these messages
@@ -43,20 +46,36 @@ class ComponentState:
     apart_m2: float | None = None
     fix: GnssFix = field(default_factory=GnssFix)
     no_position_ns: int | None = None
+    position_ns: int | None = None
+    position_since_ns: int = 0
 
     def restarted(self) -> None:
         """Forget the receiver's clock and fixes: the vehicle was restarted."""
         self.stated_us = 0
         self.fix.restarted()
 
+    def note_estimator(self, *, knows_position: bool, t_ns: int) -> None:
+        """Note a status of the estimator."""
+        if not knows_position:
+            self.no_position_ns = t_ns
+            return
+        if self.position_ns is None or t_ns - self.position_ns > REGULAR_NS:
+            self.position_since_ns = t_ns
+        self.position_ns, self.no_position_ns = t_ns, None
+
     def knows_position(self, t_ns: int) -> bool:
         """Return False if the estimator states that it knows none, in flight or without a fix.
 
-        While disarmed, with a fix, estimators state so until they are ready, or until take-off.
+        While disarmed, with a fix, estimators state so until they are ready, or until take-off. In
+        flight it counts of a vehicle that stated positions regularly before: a stranger in a gap of
+        the radio of one that sends no such statuses could state it for ever.
         """
         if self.no_position_ns is None or t_ns - self.no_position_ns > STATED_NS:
             return True
-        if self.is_armed:
+        was_regular = (
+            self.position_ns is not None and self.position_ns - self.position_since_ns >= STATED_NS
+        )
+        if self.is_armed and was_regular:
             return False
         return self.receiver is None or self.receiver.fix_type >= FIX_3D
 

@@ -287,7 +287,7 @@ class Senders:
                     return NO_OUTCOME
                 return FrameOutcome(message=heading, outputs=said)
             case EstimatorStatus():
-                component.no_position_ns = None if message.knows_position else message.t_ns
+                component.note_estimator(knows_position=message.knows_position, t_ns=message.t_ns)
                 if message.source == self._carrier_source:
                     return FrameOutcome(message=message)
             case Presence():

@@ -245,6 +245,23 @@ def test_positions_in_flight_are_rejected_while_the_estimator_knows_none(is_arme
     assert {one.reason for one in refused} <= {Reason.NO_FIX}
 
 
+def test_stranger_in_a_gap_is_no_estimator_of_a_vehicle_that_has_a_fix() -> None:
+    """As of PX4, which sends no such statuses."""
+
+    def forged() -> Iterator[Any]:
+        for event in flight(0.0, told=False):
+            yield event
+            t_s = (event.t_ns - START_NS) / S
+            if isinstance(event, Frame) and event.msgid == 24:
+                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 12, 128, 0, 4, 3))
+                if round(t_s % 10) == 1:
+                    yield estimator(t_s, KNOWS_ALL)
+                    yield estimator(t_s, KNOWS_NO_POSITION)
+
+    outputs, _ = flown(forged())
+    assert not [one for one in outputs if isinstance(one, Rejection)]
+
+
 def test_statement_of_an_estimator_that_is_not_repeated_counts_for_ten_seconds() -> None:
     def once() -> Iterator[Frame | Tick]:
         for event in flight(0.0, told=False):

@@ -179,6 +179,7 @@ class _Sender:
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
     notified_ns: int = -NOTICE_NS
     late_notified_ns: int = -NOTICE_NS
+    lead_notified_ns: int = -NOTICE_NS
     comparisons: Budget = field(
         default_factory=lambda: Budget(per_s=COMPARED_PER_S, most=COMPARED_PER_S)
     )
@@ -364,6 +365,9 @@ class KnownPeers:
         if peer.has_led or not any(_leads(one, frame) for one in earlier):
             return
         peer.has_led = True
+        if frame.t_ns - sender.lead_notified_ns < NOTICE_NS:
+            return
+        sender.lead_notified_ns = frame.t_ns
         names = tuple(one for one in sender.known if one != name)
         self.faster.append((str(frame.source), name, names))
 

@@ -473,6 +473,18 @@ def test_peer_whose_stamps_set_the_clock_is_told_once(ahead_s: float, is_told: b
     assert peers.faster == [("1:1", OTHER, (HOME,))] * is_told
 
 
+def test_leads_of_ever_new_peers_are_told_once_a_minute() -> None:
+    peers = KnownPeers()
+    early = [
+        (at_s, boot_s, f"10.0.0.66:{number}", place)
+        for number, (at_s, boot_s, _, place) in enumerate(
+            heard(OTHER, 10, begins_s=12.0, lasts_s=60.0, delay_s=lambda: -0.1)
+        )
+    ]
+    rejected(peers, heard(HOME, 10, lasts_s=60.0), early)
+    assert len(peers.faster) == 1
+
+
 def test_peer_is_ahead_only_of_one_whose_fastest_messages_are_known() -> None:
     """The first messages of a peer may all be late."""
     delays_s = iter([0.5] * 20)

@@ -39,14 +39,14 @@ import mmap, struct, sys, time
 from companion.mavlink.links import kernel_time
 file = open(sys.argv.pop(1), "r+b")
 step = mmap.mmap(file.fileno(), 8)
-wall_ns, wall_s, stamp_ns = time.time_ns, time.time, kernel_time.stamp_ns
+wall_ns, wall_s, stamp_in = time.time_ns, time.time, kernel_time.stamp_in
 offset_ns = lambda: struct.unpack("<q", step[:8])[0]
 time.time_ns = lambda: wall_ns() + offset_ns()
 time.time = lambda: wall_s() + offset_ns() * 1e-9
-def stamped(ancillary):
-    found = stamp_ns(ancillary)
+def stamped(control):
+    found = stamp_in(control)
     return None if found is None else found + offset_ns()
-kernel_time.stamp_ns = stamped
+kernel_time.stamp_in = stamped
 from companion.cli.main import main
 main()
 """

@@ -5,20 +5,20 @@ from typing import Final
 
 from companion.tracking.noise import FORGOTTEN_NS, SETTLED_NS
 
-SECOND_RECEIVER_NS: Final = 1_000_000_000
-"""Time after a status of a second receiver with a fix in which the first one needs none.
+MOMENT_NS: Final = 1_200_000_000
+"""Time after a status with a fix for which the vehicle counts as having one.
 
-The position drifts by 0.25 m in it.
+The position drifts by at most 0.36 m in it.
+"""
+SECOND_SILENT_NS: Final = 5_000_000_000
+"""Longest time between two statuses of the second receiver, both with a fix, that is no loss.
+
+The bound grows in it all the same; afterwards the loss is announced.
 """
 TRUSTED_NS: Final = 10_000_000_000
 """Time for which a vehicle must have stated a fix, so that its loss lasts until the next fix.
 
 What was forged in a gap of a vehicle's radio would last for ever otherwise.
-"""
-MOMENT_NS: Final = 1_200_000_000
-"""Time between two statuses with a fix, in which one without a fix is of no account.
-
-The position drifts by 0.36 m in it, and the receiver corrects that.
 """
 NOTICE_NS: Final = 60_000_000_000  # least time between two notices of one vehicle
 
@@ -29,17 +29,19 @@ class GnssFix:
 
     A vehicle that never had a fix navigates by other means: it loses none.
 
+    is_certain   whether the position is that of a receiver with a fix
     since_ns     arrival of the first status with a fix; None: there was none
     fixed_ns     arrival of the newest one, of either receiver
     second_ns    arrival of the second receiver's newest status, if that has a fix; else None
     has_first    whether the first receiver's newest status has a fix
-    before_s     time of dead reckoning before the fix returned, in several losses without a fix
-                 between them that lasted as long
-    regained_ns  arrival of the status with which it returned
+    before_s     time of dead reckoning before the fix returned, if it may still matter; of earlier
+                 losses too, if the fix between them was too short to settle the position
+    regained_ns  arrival of the status with which the fix returned
     heard_ns     arrival of the newest status of the first receiver
     notified_ns  when its loss was announced
     """
 
+    is_certain: bool = True
     since_ns: int | None = None
     fixed_ns: int = 0
     second_ns: int | None = None
@@ -49,36 +51,35 @@ class GnssFix:
     heard_ns: int = 0
     notified_ns: int = -NOTICE_NS
 
-    @property
-    def is_certain(self) -> bool:
-        """Whether the position is that of a receiver with a fix; cheap, and asked most often."""
-        return self.has_first and not self.before_s
-
     def note_first(self, *, has_fix: bool, t_ns: int) -> bool:
         """Note a status of the first receiver; return whether a loss must be announced."""
         self.heard_ns = t_ns
+        if has_fix and self.is_certain and self.since_ns is not None:  # nearly always
+            self.fixed_ns = t_ns
+            return False
         if has_fix:
             self._note_fix(t_ns)
-            self.has_first = True
+            self.has_first, self.is_certain = True, not self.before_s
             return False
         if self.since_ns is None:
             return False
-        self.has_first = False
-        return self._is_news(t_ns)
+        self.has_first = self.is_certain = False
+        return self._must_announce(t_ns)
 
     def note_second(self, *, has_fix: bool, t_ns: int) -> bool:
         """Note a status of the second receiver; return whether a loss must be announced."""
-        if has_fix:
+        if not has_fix:
+            self.second_ns = None
+            return self._must_announce(t_ns)
+        if self.second_ns is None or t_ns - self.second_ns > SECOND_SILENT_NS:
             self._note_fix(t_ns)
-            self.second_ns = t_ns
-            return False
-        self.second_ns = None
-        return self._is_news(t_ns)
+        self.fixed_ns = self.second_ns = t_ns
+        return False
 
     def restarted(self) -> None:
         """Forget all fixes: the vehicle was restarted."""
         self.since_ns = self.second_ns = None
-        self.has_first, self.before_s = True, 0.0
+        self.has_first, self.is_certain, self.before_s = True, True, 0.0
 
     def dead_reckoning_s(self, t_ns: int) -> float:
         """Return for how long the position has been dead reckoned; 0 with a fix.
@@ -106,18 +107,19 @@ class GnssFix:
             self.before_s = 0.0
         self.fixed_ns = t_ns
 
-    def _is_lost(self, t_ns: int) -> bool:
+    def _is_lost(self, t_ns: int, silent_ns: int = MOMENT_NS) -> bool:
+        """Return whether neither receiver has a fix, if the second one was silent for so long."""
         if self.has_first:
             return False
-        return self.second_ns is None or t_ns - self.second_ns > SECOND_RECEIVER_NS
+        return self.second_ns is None or t_ns - self.second_ns > silent_ns
 
     def _unsettled_s(self, t_ns: int) -> float:
         """Return the dead reckoning before the fix that has been there until now; 0 if settled."""
         lasts_ns = min(SETTLED_NS, round(self.before_s * 1e9))
         return 0.0 if t_ns - self.regained_ns >= lasts_ns else self.before_s
 
-    def _is_news(self, t_ns: int) -> bool:
-        if not self._is_lost(t_ns) or t_ns - self.notified_ns < NOTICE_NS:
+    def _must_announce(self, t_ns: int) -> bool:
+        if not self._is_lost(t_ns, SECOND_SILENT_NS) or t_ns - self.notified_ns < NOTICE_NS:
             return False
         self.notified_ns = t_ns
         return True

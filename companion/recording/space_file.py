@@ -7,6 +7,7 @@ cloud without points.
 """
 
 from collections import deque
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any, Final
 
@@ -61,14 +62,13 @@ class SpaceFile:
         return self
 
     def __exit__(self, failed: object, *_: object) -> None:
-        with self._file:  # nobody else opens the file before it has its name, or is removed
-            try:
-                if failed is None:
-                    self._writer.finish()
-                    self._file.flush()
-                    self._made.rename(self._path)
-            finally:
-                self._made.unlink(missing_ok=True)
+        with self._file, ExitStack() as undo:  # locked until it has its name, or is removed
+            undo.callback(self._made.unlink, missing_ok=True)
+            if failed is None:
+                self._writer.finish()
+                self._file.flush()
+                self._made.rename(self._path)
+                undo.pop_all()
 
     def add(self, update: Update, local: LocalFrame | None) -> None:
         """Draw an update, at most at the rate of the scene."""

@@ -154,7 +154,7 @@ def _larger(one: ReportNoise, other: ReportNoise) -> ReportNoise:
 
 
 def _bound(accuracy: float | None, factor: float, default: float, least: float = 0.0) -> float:
-    return default if accuracy is None else max(QUANTISATION, factor * max(accuracy, least))
+    return default if accuracy is None else max(QUANTISATION, factor * accuracy, factor * least)
 
 
 def relayed(

@@ -19,6 +19,8 @@ PIECES: Final = 16  # pieces of the window whose least heights are kept
 SAMPLES: Final = 256
 RESOLUTION_NS: Final = 1e6  # resolution of the stamps
 _LOTS: Final = 1 << 32
+LEAST_SLOPE: Final = -0.99
+"""Slope below which arrivals stand still or run backwards: the log's times are wrong."""
 _STEADY: Final = 0.1
 """Largest ratio of a sloped line's mean gap to a level line's that shows a steady drift."""
 
@@ -129,7 +131,7 @@ class Latencies:
         x = (x_ns - newest_ns).astype(float)
         points = [(float(one.least_x_ns - newest_ns), one.least) for one in self._pieces]
         slope = _slope_over(points, float(np.mean(x)))
-        if abs(slope) <= self._drift_max:
+        if abs(slope) <= self._drift_max or slope < LEAST_SLOPE:
             return 0.0
         mean = float(np.mean(heights))
         level = mean - min(height for _, height in points)

@@ -18,16 +18,17 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
 again; its positions are used only as far as they agree with those of the other. Its attitudes and
 type are used only where the other has not brought the same message shortly before: positions that
-agree prove nothing about these. What states accuracies, fixes or the time of day (``_OF_FIRST``) is
-not used at all while the other is current, as that of a peer that has brought no
-position yet; attitudes that contradict those of the other are announced. If the other has become
-late, by its own stamps, newer attitudes are used, but none newer than it could ever deliver. Stamps
-are used only if they are of the other's clock: another clock would look like a restart, or like a
-second vehicle. Those that are more than a second ahead of the fastest that the other has delivered
-are rejected: anybody can predict the positions of a standing vehicle. Those that are less ahead set
-the clock, as those of a faster second radio must, and are announced. So the vehicle that was here
-first stays believed, and a stranger costs it at most a metre; whoever sends first in a vehicle's
-name is believed until it falls silent.
+agree prove nothing about these. Attitudes that contradict those of the other are announced. If the
+other has become late, by its own stamps, newer attitudes are used, but none newer than it could
+ever deliver. Messages that state accuracies, fixes or the time of day (``_OF_FIRST``) are not used
+at all while the other is current, nor from a peer that has brought no position yet.
+
+Stamps are used only if they are of the other's clock: another clock would look like a restart, or
+like a second vehicle. Those that are more than a second ahead of the fastest that the other has
+delivered are rejected: anybody can predict the positions of a standing vehicle. Those that are less
+ahead set the clock, as those of a faster second radio must, and are announced. So the vehicle
+that was here first stays believed, and a stranger costs it at most a metre; whoever sends first in
+a vehicle's name is believed until it falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
@@ -89,12 +90,9 @@ NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one se
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
 BROUGHT: Final = "the same message of this sender comes from the peer that was known first"
-BROUGHT_NS: Final = {
-    ATTITUDE: 300_000_000,
-    **dict.fromkeys(
-        (*ABOUT_ATTITUDE, GPS_RAW_INT, EKF_STATUS_REPORT, SYSTEM_TIME, HEARTBEAT), 5_000_000_000
-    ),
-}
+_OF_FIRST: Final = ABOUT_ATTITUDE | {GPS_RAW_INT, EKF_STATUS_REPORT, SYSTEM_TIME}
+"""Messages that count only from the peer believed first: nothing else confirms them."""
+BROUGHT_NS: Final = {ATTITUDE: 300_000_000, **dict.fromkeys((*_OF_FIRST, HEARTBEAT), 5_000_000_000)}
 """Messages that move bounds, and the time for which one excludes those of peers known later."""
 OVERTAKEN_MS: Final = 300
 """How late a peer that was known first must have become, and how much newer other attitudes are."""
@@ -104,13 +102,9 @@ AHEAD_MS: Final = 1000
 A clock follows a smaller lead at once, and would follow a larger one once several stamps agree.
 """
 EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
-LEAD_NS: Final = 10_000_000_000  # time after which a peer's fastest stamps are known well enough
+LEAD_NS: Final = 10_000_000_000  # time after which leads over a peer's fastest stamps are announced
 LATE_PEER_MS: Final = 1000  # how much newer attitudes are whose rejection is announced
-_OF_FIRST: Final = ABOUT_ATTITUDE | {GPS_RAW_INT, EKF_STATUS_REPORT, SYSTEM_TIME}
-"""Messages that count only from the peer believed first: nothing else confirms them."""
-_ABOUT_SENDER: Final = frozenset(
-    {*STAMPED, *POSE, *ABOUT_ATTITUDE, TIMESYNC, HEARTBEAT, GPS_RAW_INT, EKF_STATUS_REPORT}
-)
+_ABOUT_SENDER: Final = frozenset({*STAMPED, *POSE, *_OF_FIRST, TIMESYNC, HEARTBEAT})
 JUDGED: Final = DECODED | _ABOUT_SENDER
 """Messages that ``refusal`` judges; it accepts all others."""
 
@@ -143,7 +137,7 @@ class _Peer:
     probation_ns: int = PROBATION_NS
     contradicted_ns: int = -SPACED_NS
     has_left: bool = False  # its connection ended
-    has_led: bool = False  # whether a notice said that its stamps are ahead of those of others
+    has_led: bool = False  # whether its stamps were ahead of those of peers known earlier
 
     def is_current(self, now_ns: int) -> bool:
         """Return whether the peer's newest message is so new that more are to be expected."""
@@ -358,11 +352,14 @@ class KnownPeers:
     def _note_lead(
         self, sender: _Sender, name: str, peer: _Peer, frame: Frame, earlier: list[_Peer]
     ) -> None:
-        """Publish once that the stamps of a peer are ahead of those of the ones known earlier.
+        """Publish once that the stamps of a peer are ahead of those of peers known earlier.
 
         Its link is faster, or somebody predicts the path: stamps do not tell which.
         """
-        if peer.has_led or not any(_leads(one, frame) for one in earlier):
+        if peer.has_led or not any(
+            frame.t_ns - one.since_ns >= LEAD_NS and _is_ahead(one, frame, EARLY_MS)
+            for one in earlier
+        ):
             return
         peer.has_led = True
         if frame.t_ns - sender.lead_notified_ns < NOTICE_NS:
@@ -432,9 +429,8 @@ class KnownPeers:
 
     def _agrees(self, sender: _Sender, name: str, frame: Frame) -> bool:
         """Compare a stranger's position with the known peers; return whether it agrees with one."""
-        if any(
-            _is_ahead(one, frame) for one in sender.known.values() if one.is_current(frame.t_ns)
-        ):
+        believed = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
+        if any(_is_ahead(one, frame) for one in believed):
             self._note_late(sender, name, frame)
             return False
         stranger = sender.strangers.get(name)
@@ -446,9 +442,8 @@ class KnownPeers:
         before = stranger.path.newest
         if not stranger.path.add(said):
             return False
-        current = [one.path for one in sender.known.values() if one.is_current(frame.t_ns)]
-        behind = [stranger.path.excess_m(path, before, said) for path in current]
-        ahead = [path.excess_ahead_m(said) for path in current]
+        behind = [stranger.path.excess_m(one.path, before, said) for one in believed]
+        ahead = [one.path.excess_ahead_m(said) for one in believed]
         excess_m = max((one for one in behind if one is not None), default=None)
         if frame.t_ns - stranger.since_ns > INCOMPARABLE_NS and any(
             _clock_off_ms(one, frame) > LATE_LINK_MS for one in sender.known.values()
@@ -458,7 +453,6 @@ class KnownPeers:
         found = [one for one in (*behind, *ahead) if one is not None]
         agrees = bool(found) and max(found) <= AGREEMENT_M
         if agrees:
-            believed = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
             self._note_lead(sender, name, stranger, frame, believed)
         return agrees
 
@@ -544,18 +538,10 @@ def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
     ]
 
 
-def _is_ahead(one: _Peer, frame: Frame) -> bool:
-    """Return whether a stamp is much earlier than any that a peer has delivered."""
+def _is_ahead(one: _Peer, frame: Frame, by_ms: int = AHEAD_MS) -> bool:
+    """Return whether a stamp is so much ahead of the fastest that a peer has delivered."""
     late_ms = one.clock.late_ms(frame)
-    return late_ms is not None and late_ms < -AHEAD_MS
-
-
-def _leads(one: _Peer, frame: Frame) -> bool:
-    """Return whether a stamp is ahead of the fastest that a peer has delivered for long."""
-    if frame.t_ns - one.since_ns < LEAD_NS:
-        return False
-    late_ms = one.clock.late_ms(frame)
-    return late_ms is not None and late_ms < -EARLY_MS
+    return late_ms is not None and late_ms < -by_ms
 
 
 def _is_off_clock(one: _Peer, frame: Frame) -> bool:

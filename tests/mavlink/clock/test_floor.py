@@ -292,3 +292,15 @@ def test_memory_is_bounded() -> None:
     assert len(floor._visible._samples) <= 257
     assert len(floor._visible._pieces) <= 16
     assert len(floor._recent) == RECENT
+
+
+@pytest.mark.parametrize("rate", [0.0, -0.5])
+def test_clock_of_a_log_whose_arrivals_stand_still_can_be_read(rate: float) -> None:
+    """Or run backwards: no line of arrivals over stamps has that slope."""
+    clock = SenderClock()
+    for n in range(900):
+        clock.observe(EPOCH_NS + round(rate * n * S / 10), 100_000 + 100 * n)
+    assert clock.sender_ns(EPOCH_NS + S) > 0
+    reading = clock.reading()
+    assert reading is not None and reading.drift == 0.0
+    assert reading.time(EPOCH_NS + S)[1] > 0.0

@@ -80,13 +80,13 @@ def _playback(app: FastAPI, node: Node) -> None:
         },
     )
     async def history(name: RecordingName) -> Response:
-        path = await in_file_thread(recordings.find, where, name)
-        if path is None:
+        version = await in_file_thread(recordings.version, where, name)
+        if version is None:
             raise HTTPException(404, f"no recording {name!r}")
         if name == node.recording().file:
             raise HTTPException(409, "this recording is still being written")
         try:
-            found = await playback.samples(path)
+            found = await playback.samples(version)
         except BusyError:
             raise HTTPException(409, "another recording is being read; try again later") from None
         except PlaybackError as error:

@@ -15,6 +15,7 @@ from typing import Annotated, Final
 
 import orjson
 
+from companion.server.recordings import Version
 from companion.server.shared_work import seen
 from companion.server.threads import in_thread
 from companion.values.described import Meaning
@@ -23,7 +24,6 @@ IDLE_S: Final = 10.0  # time without a request after which another recording may
 READ_MAX_S: Final = 900.0  # longest time for one recording
 LINE_MAX_BYTES: Final = 1 << 25  # largest answer of the process
 MODULE: Final = "companion.node.recorded_history"
-_Version = tuple[Path, int, int, int]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -46,21 +46,17 @@ class Playback:
     """Samples of the recording that was requested last, used on the event loop."""
 
     def __init__(self) -> None:
-        self._version: _Version | None = None
+        self._version: Version | None = None
         self._task: asyncio.Task[bytes] | None = None
         self._reading = Reading()
         self._asked_s = 0.0
 
-    async def samples(self, path: Path) -> bytes | Reading:
+    async def samples(self, version: Version) -> bytes | Reading:
         """Return the samples of a recording as JSON, or the progress while it is being read.
 
         Raises ``BusyError`` while another recording is being read for a client that still asks, and
         ``PlaybackError``.
         """
-        try:
-            version = await in_thread(_version, path)
-        except OSError as error:
-            raise PlaybackError(error.strerror) from error
         now_s = asyncio.get_running_loop().time()
         task, previous = self._task, None
         if version != self._version and task is not None:
@@ -71,7 +67,9 @@ class Playback:
         self._asked_s = now_s
         if task is None:
             self._version, self._reading = version, Reading()
-            self._task = task = asyncio.create_task(self._read(path, self._reading, previous))
+            self._task = task = asyncio.create_task(
+                self._read(version.path, self._reading, previous)
+            )
             task.add_done_callback(seen)
         reading = self._reading
         await asyncio.wait([task], timeout=1.0)  # a short recording is answered at once
@@ -108,12 +106,6 @@ class Playback:
         if line.startswith(b'{"problem"'):
             raise PlaybackError(orjson.loads(line)["problem"])
         raise PlaybackError("reading it took too long, or was ended")
-
-
-def _version(path: Path) -> _Version:
-    """Return what differs between a recording and another one that replaced it."""
-    status = path.stat()
-    return path, status.st_ino, status.st_size, status.st_mtime_ns
 
 
 async def _started(path: Path) -> "subprocess.Popen[bytes]":

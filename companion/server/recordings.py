@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, BinaryIO, Final, Literal
+from typing import Annotated, BinaryIO, Final, Literal, NamedTuple
 
 from companion.mavlink.links.regular_file import open_regular
 from companion.recording.writer import ACTIVE
@@ -30,6 +30,15 @@ class Current:
 
     name: str | None
     bytes: int
+
+
+class Version(NamedTuple):
+    """File of a recording as it is now; another file that replaced it differs."""
+
+    path: Path
+    inode: int
+    bytes: int
+    modified_ns: int
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -121,3 +130,17 @@ def opened(where: str | None, name: str, current: Current) -> tuple[BinaryIO, in
 def find(where: str | None, name: str) -> Path | None:
     """Return the path of a recording; None if the name is unknown."""
     return next((Path(entry.path) for entry in _entries(where) if entry.name == name), None)
+
+
+def version(where: str | None, name: str) -> Version | None:
+    """Return which file a recording is at present; None if the name is unknown."""
+    path = find(where, name)
+    if path is None:
+        return None
+    try:
+        status = path.stat()
+    except FileNotFoundError:  # removed a moment ago
+        return None
+    return Version(
+        path=path, inode=status.st_ino, bytes=status.st_size, modified_ns=status.st_mtime_ns
+    )

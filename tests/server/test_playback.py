@@ -14,6 +14,7 @@ from support import ROOT, run_async
 from companion.node.recorded_history import lines
 from companion.server import playback
 from companion.server.app import create_app
+from companion.server.recordings import Version, version
 
 LOG = ROOT / "tests" / "data" / "sitl_4circle_cut.tlog"
 
@@ -83,22 +84,27 @@ def test_simultaneous_requests_for_many_recordings_start_one_process(
         started.append(path)
         return start(path)
 
-    async def ask(player: playback.Playback, path: Path) -> bool:
+    async def ask(player: playback.Playback, name: str) -> bool:
         try:
-            await player.samples(path)
+            await player.samples(file(name))
         except playback.BusyError:
             return False
         return True
 
     answers = list[bool]()
 
+    def file(name: str) -> Version:
+        found = version(str(folder), name)
+        assert found is not None
+        return found
+
     async def burst() -> None:
         player = playback.Playback()
-        while not isinstance(await player.samples(folder / "one.mcap"), bytes):
+        while not isinstance(await player.samples(file("one.mcap")), bytes):
             pass
         monkeypatch.setattr(playback, "_start", counted)
-        paths = [folder / "two.mcap", folder / "bad.mcap"] * 20
-        answers.extend(await asyncio.gather(*(ask(player, path) for path in paths)))
+        names = ["two.mcap", "bad.mcap"] * 20
+        answers.extend(await asyncio.gather(*(ask(player, name) for name in names)))
 
     run_async(burst())
     assert answers == [True, False] * 20

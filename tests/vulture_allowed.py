@@ -14,6 +14,7 @@ Severity.publish_time_ns  # the layout of a record of MCAP
 Beamformer.RX, Normalisation.ANTENNA, Policy.DROP  # members chosen by their value in the settings
 sample.codebook_best  # written to the study's JSON by its fields
 numbers.find_class  # pickle asks by it
+version.inode, version.modified_ns  # compared with those of another version
 status.resting  # written to JSON by its fields
 line.max_speed_hz  # spidev's line looks at it
 one.rx_phase, one.rx_gain, one.rx_attenuator  # pyadi-iio writes them to the chip

@@ -30,7 +30,7 @@ from companion.recording.reader import read_parts
 from companion.recording.recover import recover_leftovers
 from companion.values import Frame
 
-SHORT_S, LONG_S = 5.0, 20.0
+SHORT_S, LONG_S = 5.0, 15.0
 GROWS_MB = 30.0
 MAP_MB = 40.0  # threads that read files, and 64 kB of each answer that is not read
 FULL_TABLE_MB = 40.0

@@ -12,7 +12,7 @@ from attacks import Attack
 from load_sender import ATTITUDE
 from siege import Looks, attacked, besieged, honest_losses
 
-SHORT_S, LONG_S = 5.0, 14.0
+SHORT_S, LONG_S = 5.0, 12.0
 
 
 class Case(NamedTuple):

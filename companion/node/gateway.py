@@ -39,14 +39,6 @@ from companion.values import (
 )
 
 SETUP_SIGNING: Final = 256  # message that carries a signing key in plain; it is never recorded
-CONTRADICTED: Final = (
-    "{who}: reports from {stranger} contradict those from {known} and are rejected"
-)
-REPLACED: Final = "{who}: positions are used from {stranger}, since {known} sends none"
-LATE: Final = "{who}: messages from {stranger} are newer than those from {known}, but not used"
-FASTER: Final = (
-    "{who}: messages from {stranger} arrive earlier than those from {known}, and set its clock"
-)
 UNANSWERED: Final = (
     "the signing timestamps are not saved: the disk has not answered for {:.0f} s; if the service"
     " is killed now, frames of this time can be replayed to the next one"
@@ -197,16 +189,9 @@ class Gateway:
         self._notify_newcomers()
 
     def _notify_strangers(self) -> None:
-        for told, text in (
-            (self._known_peers.contradicted, CONTRADICTED),
-            (self._known_peers.replaced, REPLACED),
-            (self._known_peers.late, LATE),
-            (self._known_peers.faster, FASTER),
-        ):
-            for who, stranger, known in told:
-                said = text.format(who=who, stranger=stranger, known=" and ".join(known))
-                self._warn(who, f"{said}; add the trusted peer to `[links] routers`")
-            told.clear()
+        for one in self._known_peers.notices:
+            self._warn(one.who, one.text)
+        self._known_peers.notices.clear()
 
     def _notify_newcomers(self) -> None:
         """Publish a notice while frames are not admitted, at most once a minute."""

@@ -40,6 +40,7 @@ from companion.values import FloatArray, Limits, LimitSource, ReportNoise, UserE
 FLOOR_MARGIN_DB: Final = 2.9
 """Default margin of a likely beam's gain floor above the gain that the link needs, dB."""
 COUPLED_MAX: Final = 512  # most elements with coupling; an update of 1024 takes 0.3 s
+DEVICE_ELEMENTS_MAX: Final = 1024  # with a device: the search takes time and memory
 COUPLING_MAX: Final = 1e6
 """Limit of the largest entry of a coupling matrix; its inverse is the lower limit."""
 COUPLING_CONDITION_MAX: Final = 1e6
@@ -181,6 +182,11 @@ def equipment(settings: Settings, antenna: geometry.Array) -> Equipment:
     """
     stored = codebook(settings, antenna)
     device = None if settings.hardware.device is None else Beamformer(settings.hardware.device)
+    if device is not None and antenna.size > DEVICE_ELEMENTS_MAX:
+        raise ConfigError(
+            f"hardware.device: the array has {antenna.size} elements; weights are quantised for at"
+            f" most {DEVICE_ELEMENTS_MAX}"
+        )
     text = text_of(settings, UNIT)
     try:
         gains = RELATIVE if text is None else parse_unit_gains(text)

@@ -111,9 +111,13 @@ class ClockNotices:
 def _clock_text(sender: str, change: ClockChange) -> str:
     step = f"{change.step_s * 1e3:.0f} ms"
     if change.leapt:
-        way = "later" if change.step_s > 0 else "earlier"
-        step = f"{abs(change.step_s):.1f} s {way}"
-        return f"{sender}: messages arrive {step} than before; treated as a clock jump"
+        step = f"{abs(change.step_s):.1f} s"
+        if change.step_s < 0:
+            return f"{sender}: messages arrive {step} earlier than before; treated as a clock jump"
+        return (
+            f"{sender}: messages arrive {step} later than before; treated as a clock jump: if its"
+            " link became slower, its positions are that much older than assumed; allow TIMESYNC"
+        )
     if change.proven:
         return f"{sender}: clock changed by {step} more than clocks.drift_max_ppm allows"
     if change.was_late:

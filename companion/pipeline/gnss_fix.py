@@ -1,6 +1,7 @@
 """Whether a vehicle has a GNSS fix, and for how long its position has been dead reckoned."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from enum import Enum
 from typing import Final
 
 from companion.tracking.noise import FORGOTTEN_NS, SETTLED_NS
@@ -20,7 +21,22 @@ TRUSTED_NS: Final = 10_000_000_000
 
 What was forged in a gap of a vehicle's radio would last for ever otherwise.
 """
-NOTICE_NS: Final = 60_000_000_000  # least time between two notices of one vehicle
+NOTICE_NS: Final = 60_000_000_000  # least time between two notices of a kind about one vehicle
+SILENT_NS: Final = 10_000_000_000
+"""Time without GPS_RAW_INT, of a vehicle that stated fixes regularly, that is announced."""
+REGULAR_NS: Final = 5_000_000_000  # longest time between two regular statuses
+NEVER_NS: Final = 2**63 - 1
+
+
+class FixNotice(Enum):
+    """What must be announced about the fix of a vehicle."""
+
+    LOST = "GNSS fix lost; its position bound grows until the fix returns"
+    FIRST_LOST = (
+        "first GNSS receiver lost its fix; the bound assumes that the autopilot uses the second one"
+    )
+    DEAD_RECKONING = "navigates without GNSS; its position bound grows until it uses GNSS again"
+    SILENT = "no GPS_RAW_INT for 10 s; until it returns, a lost GNSS fix would not be noticed"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -38,7 +54,9 @@ class GnssFix:
                  losses too, if the fix between them was too short to settle the position
     regained_ns  arrival of the status with which the fix returned
     heard_ns     arrival of the newest status of the first receiver
-    notified_ns  when its loss was announced
+    relative_ns  arrival of the estimator's newest status, if that states a position without GNSS
+    silent_ns    from when on a silent first receiver must be announced
+    notified_ns  when each kind of notice was given last
     """
 
     is_certain: bool = True
@@ -49,35 +67,72 @@ class GnssFix:
     before_s: float = 0.0
     regained_ns: int = 0
     heard_ns: int = 0
-    notified_ns: int = -NOTICE_NS
+    relative_ns: int | None = None
+    silent_ns: int = NEVER_NS
+    notified_ns: dict[FixNotice, int] = field(default_factory=dict)
 
-    def note_first(self, *, has_fix: bool, t_ns: int) -> bool:
-        """Note a status of the first receiver; return whether a loss must be announced."""
+    def note_first(self, *, has_fix: bool, t_ns: int) -> FixNotice | None:
+        """Note a status of the first receiver; return what must be announced."""
+        if t_ns - self.heard_ns <= REGULAR_NS:
+            self.silent_ns = t_ns + SILENT_NS
         self.heard_ns = t_ns
+        if self.relative_ns is not None and has_fix:
+            has_fix = t_ns - self.relative_ns > TRUSTED_NS
         if has_fix and self.is_certain and self.since_ns is not None:  # nearly always
             self.fixed_ns = t_ns
-            return False
+            return None
         if has_fix:
             self._note_fix(t_ns)
             self.has_first, self.is_certain = True, not self.before_s
-            return False
+            return None
         if self.since_ns is None:
-            return False
+            return None
         self.has_first = self.is_certain = False
-        return self._must_announce(t_ns)
+        return self._loss(t_ns)
 
-    def note_second(self, *, has_fix: bool, t_ns: int) -> bool:
-        """Note a status of the second receiver; return whether a loss must be announced."""
-        if not has_fix:
+    def note_second(self, *, has_fix: bool, t_ns: int) -> FixNotice | None:
+        """Note a status of the second receiver; return what must be announced."""
+        if not has_fix or self.relative_ns is not None:
             self.second_ns = None
-            return self._must_announce(t_ns)
+            return self._loss(t_ns)
         if self.second_ns is None or t_ns - self.second_ns > SECOND_SILENT_NS:
             self._note_fix(t_ns)
         self.fixed_ns = self.second_ns = t_ns
-        return False
+        return None
 
-    def restarted(self) -> None:
-        """Forget all fixes: the vehicle was restarted."""
+    def note_estimator(self, *, is_absolute: bool, t_ns: int) -> FixNotice | None:
+        """Note whether the estimator uses GNSS in flight; return what must be announced.
+
+        Without, a fix of the receivers counts for nothing. A statement lasts ``TRUSTED_NS``.
+        """
+        self.relative_ns = None if is_absolute else t_ns
+        if is_absolute or self.since_ns is None:
+            return None
+        self.has_first = self.is_certain = False
+        self.second_ns = None
+        return self._loss(t_ns)
+
+    def note_silence(self, t_ns: int, before_ns: int | None) -> FixNotice | None:
+        """Note a position after ``silent_ns``; return what must be announced.
+
+        ``before_ns`` is the arrival of the position before it: after a gap of the whole link,
+        statuses may still follow.
+        """
+        if before_ns is None or t_ns - before_ns > REGULAR_NS:
+            self.silent_ns = t_ns + SILENT_NS
+            return None
+        self.silent_ns = NEVER_NS
+        is_known = self.since_ns is not None and self.is_certain
+        return self._notice(FixNotice.SILENT, t_ns) if is_known else None
+
+    def restarted(self, *, is_armed: bool) -> None:
+        """Forget all fixes: the vehicle was restarted. In flight a loss lasts until the next fix.
+
+        A redundant autopilot may have taken over.
+        """
+        self.relative_ns, self.silent_ns = None, NEVER_NS
+        if is_armed and not self.has_first and self.second_ns is None:
+            return
         self.since_ns = self.second_ns = None
         self.has_first, self.is_certain, self.before_s = True, True, 0.0
 
@@ -118,8 +173,16 @@ class GnssFix:
         lasts_ns = min(SETTLED_NS, round(self.before_s * 1e9))
         return 0.0 if t_ns - self.regained_ns >= lasts_ns else self.before_s
 
-    def _must_announce(self, t_ns: int) -> bool:
-        if not self._is_lost(t_ns, SECOND_SILENT_NS) or t_ns - self.notified_ns < NOTICE_NS:
-            return False
-        self.notified_ns = t_ns
-        return True
+    def _loss(self, t_ns: int) -> FixNotice | None:
+        if self.has_first:
+            return None
+        if self.relative_ns is not None:
+            return self._notice(FixNotice.DEAD_RECKONING, t_ns)
+        is_lost = self._is_lost(t_ns, SECOND_SILENT_NS)
+        return self._notice(FixNotice.LOST if is_lost else FixNotice.FIRST_LOST, t_ns)
+
+    def _notice(self, what: FixNotice, t_ns: int) -> FixNotice | None:
+        if t_ns - self.notified_ns.get(what, -NOTICE_NS) < NOTICE_NS:
+            return None
+        self.notified_ns[what] = t_ns
+        return what

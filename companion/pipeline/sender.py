@@ -7,7 +7,7 @@ from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.wire.stamps import step_ms
 from companion.pipeline.gnss_fix import GnssFix
 from companion.tracking.noise import STATED_NS, StatedNoise
-from companion.values import FIX_3D, GnssStatus, Reason
+from companion.values import FIX_3D, GnssStatus, Reason, Report
 
 CONFIRMED_NS: Final = 5_000_000_000
 """Largest difference between the steps of arrivals and of stamps of two reports that agree."""
@@ -19,6 +19,15 @@ ANOTHER_CLOCK_NS: Final = 10_000_000_000
 ANOTHER_CLOCK_LATE_NS: Final = 3_000_000_000
 """Lateness of a stamp here, by a clock that others shared, which shows that this was another."""
 REGULAR_NS: Final = 5_000_000_000  # longest time between regular statuses of an estimator
+NEAR_HEIGHT_M: Final = 50.0
+"""Largest difference between the heights of receiver and autopilot in a valid report.
+
+Before an autopilot's height is valid it may be off by hundreds of metres (docs/field-notes.md 1).
+"""
+HEIGHT_OFF_M: Final = 3.0
+"""Least difference of the heights of autopilot and receiver that is announced."""
+HEIGHT_NOTICE_RATIO: Final = 2.0  # increase after which it is announced again
+NO_AUTOPILOT: Final = 8  # MAV_AUTOPILOT_INVALID
 TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 TYPE_KEPT_NS: Final = 60_000_000_000
 """Time for which a type counts beside the newest one, so that a forged one does not last."""
@@ -30,29 +39,43 @@ class ComponentState:
 
     stated_us  the receiver's own time of that status; 0 if unknown or from before a reboot
     apart_m2   mean square of the receiver's height less the autopilot's, m²
+    compared, apart_from_receiver_m
+               newest status of the receiver whose height was compared, and the difference
+    height_off_m
+               the part of the bound on heights that the difference needs
+    height_noticed_m
+               difference that was announced last
     no_position_ns
                arrival of the estimator's newest status, if it has no valid position; else None
     position_ns, position_since_ns
                arrival of the newest one with a valid position, and since when they were regular
+    has_estimator
+               whether they were regular for long enough, since the vehicle started
     """
 
     heard_ns: int = 0  # arrival of the newest of these messages
     types: dict[tuple[int, int], int] = field(default_factory=dict)
     """Types and autopilots of its heartbeats, the newest last, with their newest arrivals."""
-    is_armed: bool = False  # by its newest heartbeat
+    is_armed: bool | None = None  # by its autopilot's newest heartbeat; None: none yet
     receiver: GnssStatus | None = None  # its newest GNSS status
     stated_us: int = 0
     noise: StatedNoise  # of its reports, by these statuses
     apart_m2: float | None = None
+    compared: GnssStatus | None = None
+    apart_from_receiver_m: float = 0.0
+    height_off_m: float = 0.0
+    height_noticed_m: float = HEIGHT_OFF_M
     fix: GnssFix = field(default_factory=GnssFix)
     no_position_ns: int | None = None
     position_ns: int | None = None
     position_since_ns: int = 0
+    has_estimator: bool = False
 
     def restarted(self) -> None:
         """Forget the receiver's clock and fixes: the vehicle was restarted."""
         self.stated_us = 0
-        self.fix.restarted()
+        self.has_estimator, self.position_ns = False, None
+        self.fix.restarted(is_armed=bool(self.is_armed))
 
     def note_estimator(self, *, knows_position: bool, t_ns: int) -> None:
         """Note a status of the estimator."""
@@ -61,23 +84,50 @@ class ComponentState:
             return
         if self.position_ns is None or t_ns - self.position_ns > REGULAR_NS:
             self.position_since_ns = t_ns
+        elif t_ns - self.position_since_ns >= STATED_NS:
+            self.has_estimator = True
         self.position_ns, self.no_position_ns = t_ns, None
+
+    @property
+    def estimates_in_flight(self) -> bool:
+        """Whether its estimator's word counts for more than its receivers': in flight.
+
+        It must have stated positions regularly once: a stranger in a gap of the radio of a vehicle
+        that sends no such statuses could state anything.
+        """
+        return self.has_estimator and self.is_armed is not False
 
     def knows_position(self, t_ns: int) -> bool:
         """Return False if the estimator states that it knows none, in flight or without a fix.
 
-        While disarmed, with a fix, estimators state so until they are ready, or until take-off. In
-        flight it counts of a vehicle that stated positions regularly before: a stranger in a gap of
-        the radio of one that sends no such statuses could state it for ever.
+        While disarmed, with a fix, estimators state so until they are ready, or until take-off.
         """
         if self.no_position_ns is None or t_ns - self.no_position_ns > STATED_NS:
             return True
-        was_regular = (
-            self.position_ns is not None and self.position_ns - self.position_since_ns >= STATED_NS
-        )
-        if self.is_armed and was_regular:
+        if self.estimates_in_flight:
             return False
         return self.receiver is None or self.receiver.fix_type >= FIX_3D
+
+    def compare_height(self, report: Report) -> None:
+        """Compare the height of a report with that of the newest status of the receiver.
+
+        The receiver's error is bounded, that of the autopilot's barometer is not.
+        """
+        status = self.compared = self.receiver
+        if status is None or status.fix_type < FIX_3D:
+            return
+        descent_mps = report.velocity_down_mps or 0.0
+        fell_m = descent_mps * (report.t_ns - status.t_ns) * 1e-9
+        above_m = report.alt_m - (status.alt_m - fell_m)
+        apart_m = self.apart_from_receiver_m = above_m if above_m > 0.0 else -above_m
+        self.height_off_m = apart_m if apart_m < NEAR_HEIGHT_M else 0.0
+
+    def note_heights(self) -> str:
+        """Note that their difference is announced; return the text."""
+        apart_m = self.apart_from_receiver_m
+        self.height_noticed_m = HEIGHT_NOTICE_RATIO * apart_m
+        covers = "its bound covers it" if self.height_off_m else "one of them is invalid"
+        return f"its altitude and its GNSS receiver's differ by {apart_m:.0f} m; {covers}"
 
     def note_type(self, newest: tuple[int, int], t_ns: int) -> None:
         """Note the type and autopilot of a heartbeat; forget those of long ago."""
@@ -113,6 +163,7 @@ class Sender:
     shared: SharedState | None = None
     stamped_ns: int | None = None  # arrival of the clock's newest stamp; None: none yet
     is_shared: bool = False  # whether a notice said that two senders share this id
+    has_late_copies: bool = False  # whether a notice said so
     first: tuple[int, int] | None = None  # arrival and stamp of an event that none confirmed yet
     newest: tuple[int, int] | None = None  # the same of the newest event that was placed
 

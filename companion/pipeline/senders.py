@@ -27,8 +27,16 @@ from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, GPS2_RAW, gnss_head
 from companion.mavlink.wire.decode import ATTITUDE, decode
 from companion.mavlink.wire.stamps import boot_ms, step_ms
 from companion.pipeline import assembly
+from companion.pipeline.gnss_fix import FixNotice
 from companion.pipeline.records import RECORDS_MAX, Records, UavRecords
-from companion.pipeline.sender import ANOTHER_CLOCK_LATE_NS, ComponentState, Sender, SharedState
+from companion.pipeline.sender import (
+    ANOTHER_CLOCK_LATE_NS,
+    NEAR_HEIGHT_M,
+    NO_AUTOPILOT,
+    ComponentState,
+    Sender,
+    SharedState,
+)
 from companion.settings.model import Settings
 from companion.tracking import noise
 from companion.tracking.noise import StatedNoise
@@ -70,13 +78,6 @@ Equal to the time for which reports are remembered (``dedupe``).
 """
 KEPT_NS: Final = 3_600_000_000_000
 """Time for which a silent sender without a track is kept; each clock takes some 20 kB."""
-NEAR_HEIGHT_M: Final = 50.0
-"""Largest difference between the heights of receiver and autopilot in a valid report.
-
-Before an autopilot's height is valid it may be off by hundreds of metres (docs/field-notes.md 1).
-"""
-
-
 HEIGHT_FILTER_WEIGHT: Final = (
     0.1  # weight of the newest report in the mean square height difference
 )
@@ -223,24 +224,33 @@ class Senders:
         """Note the fix of a vehicle's second receiver; decode the heading of the carrier's."""
         component, uav = self._components.get(frame.source), str(frame.source)
         said: tuple[Notice, ...] = ()
-        if (
-            component is not None
-            and uav in self._senders
-            and not frame.doubt_ns
-            and component.fix.note_second(has_fix=second_has_fix(frame), t_ns=frame.t_ns)
-        ):
-            said = self._fix_lost(uav, frame.t_ns)
+        if component is not None and uav in self._senders and not frame.doubt_ns:
+            has_fix, t_ns = second_has_fix(frame), frame.t_ns
+            said = self._about_fix(uav, component.fix.note_second(has_fix=has_fix, t_ns=t_ns), t_ns)
         heading = gnss_heading(frame) if frame.source == self._carrier_source else None
         if heading is None and not said:
             return NO_OUTCOME
         return FrameOutcome(message=heading, outputs=said)
 
-    def _fix_lost(self, uav: str, t_ns: int) -> tuple[Notice, ...]:
-        """Return the notice that a tracked vehicle has no fix any more."""
-        if uav not in self._tracked:
+    def _about_fix(self, uav: str, what: FixNotice | None, t_ns: int) -> tuple[Notice, ...]:
+        """Return the notice about the fix of a tracked vehicle."""
+        if what is None or uav not in self._tracked:
             return ()
-        text = f"{uav}: GNSS fix lost; its position bound grows until the fix returns"
+        text = f"{uav}: {what.value}"
         return (Notice(t_ns=t_ns, severity=Severity.WARNING, subject=uav, text=text),)
+
+    def _about_receiver(
+        self, uav: str, component: ComponentState, t_ns: int, before_ns: int | None
+    ) -> tuple[Notice, ...]:
+        """Return the notices that a vehicle's receiver is silent, or its height another one."""
+        said: tuple[Notice, ...] = ()
+        if t_ns > component.fix.silent_ns:
+            said = self._about_fix(uav, component.fix.note_silence(t_ns, before_ns), t_ns)
+        if component.apart_from_receiver_m > component.height_noticed_m and uav in self._tracked:
+            text = f"{uav}: {component.note_heights()}"
+            notice = Notice(t_ns=t_ns, severity=Severity.INFO, subject=uav, text=text)
+            said = (*said, notice)
+        return said
 
     def _take_other(  # noqa: PLR0912 - one call less for each of them
         self, frame: Frame, message: GnssStatus | SystemTime | Presence | EstimatorStatus
@@ -278,20 +288,28 @@ class Senders:
                     component.receiver = message
                     has_fix = message.fix_type >= FIX_3D
                     # Before its first position, anybody may have sent it.
-                    if sender is not None and component.fix.note_first(
-                        has_fix=has_fix, t_ns=message.t_ns
-                    ):
-                        said = self._fix_lost(name, message.t_ns)
+                    if sender is not None:
+                        what = component.fix.note_first(has_fix=has_fix, t_ns=message.t_ns)
+                        if what is not None:
+                            said = self._about_fix(name, what, message.t_ns)
                 heading = gnss_heading(frame) if message.source == self._carrier_source else None
                 if heading is None and not said:
                     return NO_OUTCOME
                 return FrameOutcome(message=heading, outputs=said)
             case EstimatorStatus():
                 component.note_estimator(knows_position=message.knows_position, t_ns=message.t_ns)
-                if message.source == self._carrier_source:
-                    return FrameOutcome(message=message)
+                said = ()
+                if component.estimates_in_flight:
+                    what = component.fix.note_estimator(
+                        is_absolute=message.is_absolute, t_ns=message.t_ns
+                    )
+                    said = self._about_fix(name, what, message.t_ns)
+                is_carrier = message.source == self._carrier_source
+                if is_carrier or said:
+                    return FrameOutcome(message=message if is_carrier else None, outputs=said)
             case Presence():
-                component.is_armed = message.is_armed
+                if message.autopilot != NO_AUTOPILOT:
+                    component.is_armed = message.is_armed
                 component.note_type((message.mav_type, message.autopilot), message.t_ns)
         return NO_OUTCOME
 
@@ -363,6 +381,7 @@ class Senders:
         clock = (sender.shared or sender).clock
         stamp, said = self._stamp(clock, uav, t_ns, report.boot_ms, doubt_ns)
         said = (*switched, *said)
+        before_ns = sender.stamped_ns
         if not doubt_ns:
             sender.stamped_ns = t_ns
         restarted = uav if said else None
@@ -372,6 +391,7 @@ class Senders:
             )
         sender.is_shared = False
         if stamp is None:
+            said = (*said, *_late_copies(sender, clock, uav, t_ns))
             return FrameOutcome(
                 outputs=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
                 restarted=restarted,
@@ -398,6 +418,11 @@ class Senders:
                     outputs=(*said, unused), restarted=restarted, change=clock.change
                 )
             errors = self._errors(report, component, made_ns, assumed.lag_rest_s)
+            if component is not None and (
+                t_ns > component.fix.silent_ns
+                or component.apart_from_receiver_m > component.height_noticed_m
+            ):
+                said = (*said, *self._about_receiver(uav, component, t_ns, before_ns))
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
         placed = PlacedReport(
             report=report,
@@ -441,10 +466,13 @@ class Senders:
     ) -> ReportNoise:
         """Return bounds on a report's errors, with the receiver's recent height difference.
 
+        An autopilot's height is mainly its barometer's, which drifts with the weather. Only the
+        error of the receiver's is bounded.
+
         ``made_ns`` is the earliest node time of its measurement, ``time_s`` the largest error of
         the time that is assumed.
         """
-        known, apart_m = None, 0.0
+        known, apart_m, off_m = None, 0.0, 0.0
         if component is not None and component.receiver is not None:
             known, receiver = component.noise.since(made_ns), component.receiver
             is_recent = report.t_ns - receiver.t_ns <= noise.FORGOTTEN_NS
@@ -452,14 +480,18 @@ class Senders:
                 apart_m2, before = (report.alt_m - receiver.alt_m) ** 2, component.apart_m2
                 if before is not None:
                     apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
-                component.apart_m2, apart_m = apart_m2, math.sqrt(apart_m2)
+                component.apart_m2, apart_m = apart_m2, apart_m2**0.5
+            if is_recent:
+                if receiver is not component.compared:
+                    component.compare_height(report)
+                off_m = component.height_off_m
         known = known or self._noise_settings.default
         if component is not None and not component.fix.is_certain:
             known = noise.dead_reckoned(known, component.fix.dead_reckoning_s(report.t_ns))
         made = ReportNoise(
             horizontal_m=known.horizontal_m,
-            vertical_m=known.vertical_m,
-            position_m=known.position_m,
+            vertical_m=known.vertical_m + off_m,
+            position_m=known.position_m + off_m,
             velocity_mps=known.velocity_mps,
             time_s=time_s,
             apart_m=apart_m,
@@ -658,6 +690,18 @@ def _source(uav: str) -> Source | None:
 
 def _refused(message: Report | AdsbVehicle, reason: Reason) -> FrameOutcome:
     return FrameOutcome(outputs=(Rejection(t_ns=message.t_ns, source=message.uav, reason=reason),))
+
+
+def _late_copies(sender: Sender, clock: SenderClock, uav: str, t_ns: int) -> tuple[Notice, ...]:
+    """Return a notice, once, that reports arrive too late to have a time, beside newer ones."""
+    if sender.has_late_copies or not clock.has_late_copies(t_ns):
+        return ()
+    sender.has_late_copies = True
+    text = (
+        f"{uav}: reports more than 10 s old arrive beside newer ones and are rejected: by a slow"
+        " route, or from a second vehicle with this id"
+    )
+    return (Notice(t_ns=t_ns, severity=Severity.WARNING, subject=uav, text=text),)
 
 
 def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:

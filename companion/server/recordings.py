@@ -71,9 +71,9 @@ def _entries(where: str | None) -> Iterator[os.DirEntry[str]]:
     if where is None:
         return
     path = Path(where)
-    only_file = path.suffix == ".mcap" and not path.is_dir()
-    names = {path.name, path.name + ACTIVE} if only_file else None
     try:
+        only_file = path.suffix == ".mcap" and not path.is_dir()
+        names = {path.name, path.name + ACTIVE} if only_file else None
         with os.scandir(path.parent if only_file else path) as found:
             for entry in found:
                 is_file = entry.is_file(follow_symlinks=False)
@@ -139,7 +139,7 @@ def version(where: str | None, name: str) -> Version | None:
         return None
     try:
         status = path.stat()
-    except FileNotFoundError:  # removed a moment ago
+    except OSError:  # removed a moment ago, or in a folder that may not be searched
         return None
     return Version(
         path=path, inode=status.st_ino, bytes=status.st_size, modified_ns=status.st_mtime_ns

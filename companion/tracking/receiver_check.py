@@ -7,6 +7,8 @@ by more than two independent errors of the stated size would, the statement is r
 reports the velocity is assumed to change linearly, with an allowance for other manoeuvres. This is
 no proof, for velocities may also be wrong for long; so no report is rejected by it. The bound
 becomes that of a receiver without a stated accuracy, or more if the deviation was larger.
+
+Only horizontal positions are checked: heights come from a barometer.
 """
 
 import math
@@ -64,7 +66,7 @@ class ReceiverCheck:
             return None
         stated_m = fix.noise.horizontal_m / factor
         lag_m = 2.0 * fix.noise.time_s * math.hypot(*velocity)
-        north_m, east_m, unseen_m = step_deviation(before, fix, acceleration_mps2)
+        north_m, east_m, _, unseen_m = step_deviation(before, fix, acceleration_mps2)
         if math.hypot(north_m, east_m) > 2.0 * fix.noise.horizontal_m + lag_m + unseen_m:
             self._begin(fix)  # a jump, which the gate handles
             return None
@@ -126,18 +128,22 @@ class ReceiverCheck:
         return min(noise.apart_m, noise.vertical_m) or COMMON_ERROR * noise.position_m
 
 
-def step_deviation(before: Fix, fix: Fix, acceleration_mps2: float) -> tuple[float, float, float]:
-    """Return the deviation of a position from dead reckoning, north and east, metres.
+def step_deviation(
+    before: Fix, fix: Fix, acceleration_mps2: float
+) -> tuple[float, float, float, float]:
+    """Return the deviation of a position from dead reckoning, north, east and down, metres.
 
-    The third value bounds the possible unseen displacement between the two reports. Only horizontal
-    positions are checked: heights come from a barometer.
+    The last value bounds the possible unseen displacement between the two reports.
     """
     assert before.velocity_ned_mps is not None and fix.velocity_ned_mps is not None
     half_s = (fix.sender_ns - before.sender_ns) * 0.5e-9
-    (north, east, _), (from_north, from_east, _) = fix.position_ned_m, before.position_ned_m
-    (v_north, v_east, _), (was_north, was_east, _) = fix.velocity_ned_mps, before.velocity_ned_mps
+    north, east, down = fix.position_ned_m
+    from_north, from_east, from_down = before.position_ned_m
+    v_north, v_east, v_down = fix.velocity_ned_mps
+    was_north, was_east, was_down = before.velocity_ned_mps
     return (
         north - from_north - half_s * (v_north + was_north),
         east - from_east - half_s * (v_east + was_east),
+        down - from_down - half_s * (v_down + was_down),
         acceleration_mps2 * half_s**2,  # out and back at full acceleration
     )

@@ -1,8 +1,8 @@
 """Check of reported velocities: over seconds, positions must move by their integral.
 
-Let two positions of a UAV be off by at most h each, the velocities between them by at most n, and
-let the velocity change by at most a per second. Then the positions' difference deviates from the
-integral of the velocities (trapezoids) by at most
+Let two positions of a UAV be off by at most h each, horizontally or vertically, the velocities
+between them by at most n, and let the velocity change by at most a per second. Then the positions'
+difference deviates from the integral of the velocities (trapezoids) by at most
 
     2 h + sum of (n dt + a dt²/4)
 
@@ -26,7 +26,8 @@ APART_NS: Final = 2_000_000_000  # longest interval between two reports
 SPACING_NS: Final = 250_000_000  # least time between two sums that are kept
 STAMP_S: Final = 1e-3  # stamps are whole milliseconds
 SETTING: Final = "observer.velocity_noise_mps"
-_NUMBERS: Final = 4  # kept of a sum: sender time, deviation north and east, allowance
+_NUMBERS: Final = 5  # kept of a sum: sender time, deviation north, east and down, allowance
+_NONE: Final = (0.0, 0.0, 0.0, 0.0)
 
 
 class VelocityCheck:
@@ -38,7 +39,7 @@ class VelocityCheck:
     def __init__(self) -> None:
         self._raised = RaisedLimit()
         self._newest: Fix | None = None
-        self._sums = (0.0, 0.0, 0.0)  # deviation north and east, and its allowance; metres
+        self._sums = _NONE  # deviation north, east and down, and its allowance; metres
         self._kept = array("d")  # earlier sums, oldest first
 
     def noise(self, stated: ReportNoise, sender_ns: int) -> ReportNoise:
@@ -60,7 +61,7 @@ class VelocityCheck:
             return None
         if before is None or fix.sender_ns - before.sender_ns > APART_NS:
             del self._kept[:]
-            self._sums = (0.0, 0.0, 0.0)
+            self._sums = _NONE
         else:
             self._add(before, fix, acceleration_mps2)
         excess_mps = self._excess_mps(fix)
@@ -81,11 +82,11 @@ class VelocityCheck:
 
     def _add(self, before: Fix, fix: Fix, acceleration_mps2: float) -> None:
         """Add the deviation between two reports, and what is allowed for it, to the sums."""
-        north_m, east_m, unseen_m = step_deviation(before, fix, acceleration_mps2)
+        north_m, east_m, down_m, unseen_m = step_deviation(before, fix, acceleration_mps2)
         noise_mps = max(before.noise.velocity_mps, fix.noise.velocity_mps)
-        north, east, allowed = self._sums
+        north, east, down, allowed = self._sums
         step_m = noise_mps * (fix.sender_ns - before.sender_ns) * 1e-9 + unseen_m
-        self._sums = (north + north_m, east + east_m, allowed + step_m)
+        self._sums = (north + north_m, east + east_m, down + down_m, allowed + step_m)
 
     def _keep(self, sender_ns: int) -> None:
         kept = self._kept
@@ -101,14 +102,23 @@ class VelocityCheck:
         kept = self._kept
         if not kept or fix.sender_ns - kept[0] < LEAST_NS:
             return 0.0
-        north, east, allowed = self._sums
-        then_ns, north_0, east_0, allowed_0 = kept[:_NUMBERS]
-        deviation_m = math.hypot(north - north_0, east - east_0)
+        north, east, down, allowed = self._sums
+        then_ns, north_0, east_0, down_0, allowed_0 = kept[:_NUMBERS]
         flown_m = math.hypot(*fix.velocity_ned_mps or ()) * (fix.noise.time_s + STAMP_S)
-        allowed_m = 2.0 * (fix.noise.horizontal_m + flown_m) + allowed - allowed_0
-        excess_m = deviation_m - allowed_m
-        if excess_m <= 0.0:
+        allowed_m = 2.0 * flown_m + allowed - allowed_0
+        across_m = math.hypot(north - north_0, east - east_0)
+        across_m -= allowed_m + 2.0 * fix.noise.horizontal_m
+        along_m = down - down_0 if down > down_0 else down_0 - down
+        along_m -= allowed_m + 2.0 * fix.noise.vertical_m
+        if across_m <= 0.0 and along_m <= 0.0:  # nearly always
             return 0.0
-        places = [*zip(kept[1::_NUMBERS], kept[2::_NUMBERS], strict=True), (north, east)]
-        excess_m -= max(map(math.dist, places, places[1:]))
-        return max(0.0, excess_m / ((fix.sender_ns - then_ns) * 1e-9))
+        if across_m > 0.0:
+            norths, easts = kept[1::_NUMBERS], kept[2::_NUMBERS]
+            across_m -= _largest_step_m([*zip(norths, easts, strict=True), (north, east)])
+        if along_m > 0.0:
+            along_m -= _largest_step_m([*zip(kept[3::_NUMBERS], strict=True), (down,)])
+        return max(0.0, across_m, along_m) / ((fix.sender_ns - then_ns) * 1e-9)
+
+
+def _largest_step_m(places: list[tuple[float, ...]]) -> float:
+    return max(map(math.dist, places, places[1:]))

@@ -235,6 +235,7 @@ class EstimatorStatus:
 
     link            link over which it came
     knows_attitude, knows_position  whether it reports its attitude or horizontal position as valid
+    is_absolute     whether that position is by GNSS, and not dead reckoning or by a camera
     compass_ratio   compass innovation over the estimator's gate: above 1 it rejects the compass
     """
 
@@ -243,6 +244,7 @@ class EstimatorStatus:
     link: str
     knows_attitude: bool
     knows_position: bool
+    is_absolute: bool
     compass_ratio: float
 
 

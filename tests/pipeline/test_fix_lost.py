@@ -84,7 +84,11 @@ def largest_m(found: dict[float, tuple[float, float]], from_s: float, to_s: floa
 
 
 def notices(outputs: list[Output]) -> list[Notice]:
-    return [one for one in outputs if isinstance(one, Notice) and "fix lost" in one.text]
+    return about(outputs, "fix lost")
+
+
+def about(outputs: list[Output], text: str) -> list[Notice]:
+    return [one for one in outputs if isinstance(one, Notice) and text in one.text]
 
 
 @pytest.mark.parametrize("drift_mps2", [0.0, 0.15, 0.4, 0.5])
@@ -118,6 +122,8 @@ def test_second_receiver_with_a_fix_replaces_the_first() -> None:
     outputs, found = flown(flight(0.0, second=True))
     assert largest_m(found, LOST_S - 5.0, ENDS_S) < 4.0
     assert notices(outputs) == []
+    (told,) = about(outputs, "second one")  # it is assumed that the autopilot uses it
+    assert 0.0 <= (told.t_ns - START_NS) / S - LOST_S < 0.6
 
 
 def with_statuses(drift_mps2: float, *has_fix: Callable[[float], bool | None]) -> Iterator[Any]:
@@ -148,6 +154,28 @@ def test_bound_holds_if_the_second_receiver_falls_silent_when_the_first_loses_th
     assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
     (told,) = notices(outputs)
     assert (told.t_ns - START_NS) / S - LOST_S < 5.6
+
+
+def test_receiver_that_falls_silent_with_a_fix_is_announced_once() -> None:
+    outputs, found = flown(with_statuses(0.0, lambda t_s: True if t_s < LOST_S else None))
+    assert largest_m(found, LOST_S, ENDS_S) < 4.0
+    (told,) = about(outputs, "GPS_RAW_INT")
+    assert 9.5 <= (told.t_ns - START_NS) / S - LOST_S < 10.0  # 10 s after the last one
+
+
+def test_gap_of_a_whole_link_is_no_silent_receiver() -> None:
+    events = (
+        event
+        for event in with_statuses(0.0, lambda _: True)
+        if isinstance(event, Tick) or not 0.0 < (event.t_ns - START_NS) / S - LOST_S < 11.0
+    )
+    outputs, _ = flown(events)
+    assert about(outputs, "GPS_RAW_INT") == []
+
+
+def test_rare_statuses_of_a_first_receiver_are_no_silence() -> None:
+    outputs, _ = flown(with_statuses(0.0, lambda t_s: True if round(t_s * 10) % 120 == 0 else None))
+    assert about(outputs, "GPS_RAW_INT") == []
 
 
 def test_rare_statuses_of_a_second_receiver_with_a_fix_are_no_losses() -> None:
@@ -224,6 +252,7 @@ def test_positions_are_rejected_while_the_estimator_knows_none() -> None:
             if isinstance(event, Frame) and event.msgid == 24:
                 blind = 26.0 <= t_s < 30.0
                 yield estimator(t_s, KNOWS_NO_POSITION if blind else KNOWS_ALL)
+                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
 
     outputs, found = flown(blind())
     refused = [one for one in outputs if isinstance(one, Rejection)]
@@ -310,3 +339,142 @@ def booted(t_s: float, n: int) -> Frame:
         1000 + 100 * n, 474_000_000, 85_526_500, 500_000, 0, 0, 0, 0, 65535
     )
     return sent(t_s + 0.02, UAV, message)
+
+
+# --- what the estimator states in flight ----------------------------------------------------------
+
+BY_FLOW, REJECTS_GNSS = 0b0000101111, 0b1100111111 | 1 << 15
+
+
+def with_estimator(
+    drift_mps2: float, flags: Callable[[float], int], *, mode: int | None = 128
+) -> Iterator[Any]:
+    """Return the flight with a fix all the time, and statuses of its estimator."""
+    for event in flight(drift_mps2, told=False):
+        yield event
+        if isinstance(event, Frame) and event.msgid == 24:
+            t_s = (event.t_ns - START_NS) / S
+            yield estimator(t_s, flags(t_s))
+            if mode is not None:
+                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, mode, 0, 4, 3))
+
+
+@pytest.mark.parametrize("flags", [BY_FLOW, REJECTS_GNSS])
+def test_bound_holds_while_the_estimator_does_not_use_gnss(flags: int) -> None:
+    """The receiver states a fix all the time."""
+    outputs, found = flown(with_estimator(0.45, lambda t: KNOWS_ALL if is_fixed(t) else flags))
+    assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
+    assert largest_m(found, AGAIN_S + 8.0, ENDS_S) < 4.0
+    (told,) = about(outputs, "navigates without GNSS")
+    assert 0.0 <= (told.t_ns - START_NS) / S - LOST_S < 0.6
+
+
+def test_vehicle_that_always_navigated_without_gnss_keeps_its_bound() -> None:
+    events = with_statuses(0.0, lambda _: False)
+    without = (
+        (event, estimator((event.t_ns - START_NS) / S, BY_FLOW))
+        if isinstance(event, Frame) and event.msgid == 24
+        else (event,)
+        for event in events
+    )
+    outputs, found = flown(one for pair in without for one in pair)
+    assert largest_m(found, 5.0, ENDS_S) < 4.0
+    assert about(outputs, "GNSS") == []
+
+
+def test_estimator_without_gnss_on_the_ground_loses_no_fix() -> None:
+    flags = with_estimator(0.0, lambda t: KNOWS_ALL if is_fixed(t) else BY_FLOW, mode=0)
+    outputs, found = flown(flags)
+    assert largest_m(found, LOST_S - 5.0, ENDS_S) < 4.0
+    assert about(outputs, "navigates without GNSS") == []
+
+
+@pytest.mark.parametrize("mode", [None, 128])
+def test_estimator_counts_in_flight_after_gaps_of_its_statuses(mode: int | None) -> None:
+    """Its router may forward no HEARTBEAT, and another component may send unarmed ones."""
+
+    def events() -> Iterator[Any]:
+        for event in with_estimator(
+            0.0, lambda t: KNOWS_ALL if is_fixed(t) else 0b100101, mode=mode
+        ):
+            t_s = (event.t_ns - START_NS) / S if isinstance(event, Frame) else 0.0
+            if not 12.0 < t_s < 18.0:  # a gap of the radio
+                yield event
+            if isinstance(event, Frame) and event.msgid == 0:
+                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3))
+
+    outputs, _ = flown(events())
+    refused = [one for one in outputs if isinstance(one, Rejection)]
+    assert {one.reason for one in refused} == {Reason.NO_FIX}
+    assert len(refused) == round(10 * (AGAIN_S - LOST_S))
+
+
+@pytest.mark.parametrize("back_s", [15.0, 40.0])
+def test_bound_grows_on_if_the_vehicle_restarts_without_a_fix(back_s: float) -> None:
+    """A redundant autopilot takes over: its clock is another one."""
+
+    def restarted() -> Iterator[Any]:
+        for event in flight(0.45):
+            t_s = (event.t_ns - START_NS) / S if isinstance(event, Frame) else 0.0
+            if isinstance(event, Frame) and event.msgid == 24:
+                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3))
+            if isinstance(event, Frame) and event.msgid == 33 and t_s > 24.0:
+                message = dialect.MAVLink(None).decode(bytearray(event.raw))
+                message.time_boot_ms -= round(back_s * 1000)
+                event = sent(t_s, UAV, message)  # noqa: PLW2901
+            yield event
+
+    outputs, found = flown(restarted())
+    assert about(outputs, "restarted")
+    assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
+
+
+# --- heights --------------------------------------------------------------------------------------
+
+
+def drifting_heights(rate_mps: float, climb_m: float = 0.0) -> Iterator[Any]:
+    """Return a vehicle that climbs and descends; its barometer drifts from ``LOST_S`` on."""
+    for n in range(round(ENDS_S * 10)):
+        t_s = n / 10
+        height_m = 60.0 + climb_m * math.sin(t_s / 3)
+        off_m = rate_mps * max(0.0, t_s - LOST_S)
+        down_mps = -climb_m / 3 * math.cos(t_s / 3)
+        yield position(t_s, UAV, (200.0, 0.0, -height_m - off_m), (0, 0, down_mps), late_s=0.02)
+        if n % 5 == 0:
+            message = dialect.MAVLink_gps_raw_int_message(
+                round(t_s * 1e6), 3, 474_000_000, 85_500_000, round((500.0 + height_m) * 1e3),
+                100, 100, 0, 0, 12, 0, 500, 500, 200, 0, 0,
+            )  # fmt: skip
+            yield sent(t_s + 0.03, UAV, message)
+        yield Tick(START_NS + round((t_s + 0.05) * S))
+
+
+def heights_m(events: Iterator[Any], climb_m: float) -> list[tuple[float, float]]:
+    """Return error and bound of the heights of the track."""
+    pipeline = Pipeline(Settings().override(center={"source": ",".join(map(str, HERE))}))
+    found = []
+    for event in events:
+        for output in pipeline.step(event):
+            if isinstance(output, Update) and output.tracks:
+                (track,) = output.tracks
+                t_s = (track.valid_at_ns - START_NS) * 1e-9
+                true_m = 60.0 + climb_m * math.sin(t_s / 3)
+                found.append((abs(-track.position_ned_m[2] - true_m), track.vertical_bound_m))
+    return found
+
+
+@pytest.mark.parametrize("climb_m", [0.0, 9.0])
+def test_bound_on_the_height_covers_a_barometer_that_drifts(climb_m: float) -> None:
+    """The receiver's height shows it; the bound on the receiver's error is 1.5 m."""
+    found = heights_m(drifting_heights(0.25, climb_m), climb_m)
+    assert [one for one in found[10:] if one[0] > one[1]] == []
+    assert found[-1][0] > 5.0
+    outputs, _ = flown(drifting_heights(0.25, climb_m))
+    texts = [one.text for one in about(outputs, "differ by")]
+    assert len(texts) == 2
+    assert texts[0].endswith("receiver's differ by 3 m; its bound covers it")
+
+
+def test_heights_that_agree_cost_nothing_while_the_vehicle_climbs() -> None:
+    found = heights_m(drifting_heights(0.0, 9.0), 9.0)
+    assert max(bound_m for _, bound_m in found[20:]) < 3.0

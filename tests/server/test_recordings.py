@@ -4,6 +4,8 @@ import asyncio
 import contextlib
 import dataclasses
 import os
+import subprocess
+import sys
 import threading
 from collections.abc import Iterator
 from pathlib import Path
@@ -74,6 +76,30 @@ def test_file_that_cannot_be_examined_has_no_size(folder: Path) -> None:
     folder.write_bytes(b"")
     shown = recordings._shown(entry, recordings.Current(None, 0))
     assert (shown["name"], shown["bytes"]) == (FINISHED, None)
+
+
+WITHOUT_RIGHTS = """
+import os, sys
+from companion.server import recordings
+where, name, folder = sys.argv[1:]
+os.chmod(folder, 0o444)
+entries = recordings.listed(where, recordings.Current(None, 0))
+print([one["name"] for one in entries], recordings.version(where, name))
+"""
+
+
+@pytest.mark.parametrize("is_file", [False, True])
+def test_folder_that_may_not_be_searched_has_no_versions(folder: Path, is_file: bool) -> None:
+    """As a user without root's rights, in a service that runs."""
+    where = str(folder / FINISHED) if is_file else str(folder)
+    command = [sys.executable, "-c", WITHOUT_RIGHTS, where, FINISHED, str(folder)]
+    if os.geteuid() == 0:
+        rights = "-dac_override,-dac_read_search"
+        command = ["setpriv", f"--bounding-set={rights}", *command]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    folder.chmod(0o755)
+    assert done.stderr == ""
+    assert done.stdout.endswith("None\n")
 
 
 def test_time_in_a_name_may_be_none(make_node: Any, tmp_path: Path) -> None:

@@ -470,6 +470,15 @@ def test_large_files_are_rejected_before_they_are_parsed(
     assert "\n" not in str(error.value)
 
 
+def test_device_of_more_than_1024_elements_is_rejected() -> None:
+    """The search of its settings took 20 s and 650 MB for 4096."""
+    given = Settings().override(array={"elements": 1025}, hardware={"device": "adar1000"})
+    with pytest.raises(
+        ConfigError, match=r"^hardware\.device: the array has 1025 .* at most 1024$"
+    ):
+        assembly.equipment(given, assembly.array(given))
+
+
 def test_matrix_of_more_than_a_million_numbers_is_rejected(tmp_path: Path) -> None:
     """One of four million bytes took 500 MB: each number becomes complex, in several copies."""
     np.save(tmp_path / "c.npy", np.ones((64, 16_385), dtype=np.int8))

@@ -310,7 +310,13 @@ def test_worst_of_all_kinds_and_links_counts() -> None:
     of = trust()
     of.turned(attitude(LEVEL))
     status = EstimatorStatus(
-        t_ns=0, source=SOURCE, link="a", knows_attitude=True, knows_position=True, compass_ratio=0.2
+        t_ns=0,
+        source=SOURCE,
+        link="a",
+        knows_attitude=True,
+        knows_position=True,
+        is_absolute=True,
+        compass_ratio=0.2,
     )
     of.add(status)
     of.add(heading(20.0))
@@ -333,6 +339,7 @@ def test_statement_that_is_not_repeated_counts_for_ten_seconds() -> None:
             link="a",
             knows_attitude=False,
             knows_position=True,
+            is_absolute=True,
             compass_ratio=0.0,
         )
     )

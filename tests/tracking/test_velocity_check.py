@@ -69,6 +69,21 @@ def test_wrong_velocities_are_refuted_within_seconds(
     assert NOISE.velocity_mps < later < 0.1 * raised
 
 
+@pytest.mark.parametrize("step_s", [0.1, 1.0])
+@pytest.mark.parametrize("factor", [-1.0, 0.0])
+def test_wrong_climb_rates_are_refuted(fix: MakeFix, factor: float, step_s: float) -> None:
+    check = VelocityCheck()
+    fixes = []
+    for n in range(round(30 / step_s)):
+        phase = n * step_s / 5
+        down_m, down_mps = 20 * math.sin(phase), 4 * math.cos(phase)
+        place, velocity = [3 * n * step_s, 0, down_m], [3, 0, factor * down_mps]
+        fixes.append(fix(round(n * step_s * S), place, velocity, noise=NOISE))
+    found = refuted(check, fixes)
+    assert found[0][0] <= 5.0
+    assert NOISE.velocity_mps < check.noise(NOISE, fixes[-1].sender_ns).velocity_mps < 20.0
+
+
 def test_bound_is_raised_once_if_it_is_enough(fix: MakeFix) -> None:
     check, notices = VelocityCheck(), 0
     for one in circle(fix, WRONG["reversed"]):
@@ -79,7 +94,11 @@ def test_bound_is_raised_once_if_it_is_enough(fix: MakeFix) -> None:
 
 @st.composite
 def honest(draw: st.DrawFn) -> list[tuple[float, FloatArray, FloatArray]]:
-    """Times, positions and velocities of a lawful flight: each error as large as is allowed."""
+    """Times, positions and velocities of a lawful flight: each error as large as is allowed.
+
+    It flies in a horizontal plane, or in a vertical line.
+    """
+    is_vertical = draw(st.booleans())
     rng = np.random.default_rng(draw(st.integers(0, 2**32)))
     steps_s = draw(st.lists(st.sampled_from([0.05, 0.1, 0.3, 1.0, 1.9]), min_size=3, max_size=80))
     place, velocity, at_s, out = np.zeros(3), np.array([draw(st.floats(-60, 60)), 0, 0]), 0.0, []
@@ -94,7 +113,9 @@ def honest(draw: st.DrawFn) -> list[tuple[float, FloatArray, FloatArray]]:
         at_s += step_s
         off = off if same else rng.uniform(-1, 1, 2)
         unit = np.array([*off, 0.0]) / np.linalg.norm(off)
-        out.append((at_s, place + unit * NOISE.horizontal_m, velocity + unit * NOISE.velocity_mps))
+        there = place + unit * NOISE.horizontal_m, velocity + unit * NOISE.velocity_mps
+        turned = [one[[1, 2, 0]] * [0, 0, 1] if is_vertical else one for one in there]
+        out.append((at_s, turned[0], turned[1]))
     return out
 
 

@@ -38,6 +38,8 @@ ROTATIONS: Final = 16  # common rotations that are tried, over one step of phase
 STARTS: Final = 4  # best rotations from which the descent starts
 SWEEPS: Final = 100
 """Most sweeps of the coordinate descent; it usually ends after three to eight."""
+MOVES: Final = 2048
+"""Most elements that the descent moves, about a third of a millisecond each, or one sweep."""
 REACH: Final = 2  # steps of phase, gain, I or Q that one move may take
 NEAR: Final = np.array([(i, j) for i in range(-REACH, REACH + 1) for j in range(-REACH, REACH + 1)])
 """All moves between codes within ``REACH``, as pairs of steps."""
@@ -288,7 +290,7 @@ def _descend(
     least = np.zeros(set_to.shape)
     least[:, strongest] = np.abs(set_to[:, strongest]) * (1 - 1e-12)
     aim, each = metric @ weights, np.arange(len(codes))
-    for _ in range(SWEEPS):
+    for _ in range(min(SWEEPS, max(1, MOVES // len(weights)))):
         radiated = factors * set_to
         pull = radiated @ metric.T  # recomputed, so that rounding does not accumulate
         p = radiated.conj() @ aim

@@ -13,7 +13,8 @@ line while it is less than ``late_max_ns`` off it:
   equally late (to a second), are a reboot. A stalled clock is late in the same way, but by more
   than ``late_max_ns``, and its stamps advance.
 - Stamps off the line that lie on a line of their own for three seconds, while the first line
-  advances between them, belong to a second clock: two senders share one id.
+  advances between them, belong to a second clock: two senders share one id. Those that are at most
+  half a minute late may be copies over a slow route, and have no time.
 - A stamp that is more than a second early on a line of 20 implies that all earlier ones were
   late. It counts once three stamps of reports over at least half a second agree; until then they
   have no time. Late ones may arrive between them, from a slower link or one that becomes fast:
@@ -23,6 +24,8 @@ line while it is less than ``late_max_ns`` off it:
 A reboot is therefore reported once, at the stamp that confirms it. One case is ambiguous: a
 second link that lags by seconds, and is the only one left within the first ``late_max_ns`` of a
 boot, looks like a reboot.
+
+Over 300 lines: one state, which each stamp moves.
 """
 
 from dataclasses import dataclass, field
@@ -41,6 +44,7 @@ _RUN_KEPT: Final = 64  # stamps kept of a run
 _RIVAL_LASTS_NS: Final = 3 * _NS
 """Least duration of a second clock line under one id before it counts as a second clock."""
 _RIVAL_SILENT_NS: Final = 10 * _NS  # silence after which a second clock is forgotten
+_COPY_LATE_NS: Final = 30 * _NS  # largest lateness of a frame that took a slow route
 _RIVALS_MAX: Final = 4  # other clocks under one id that are followed
 
 
@@ -155,6 +159,7 @@ class BootLine:
         self._run = _RivalLine()
         self._ahead = _RivalLine()  # early stamps that are not confirmed yet
         self._rivals = _RivalLines()
+        self._copies = _RivalLines()  # stamps so late that they may be copies
         self._previous: tuple[Floor, int] | None = None  # the previous line, and when it was left
 
     def observe(self, arrival_ns: int, boot_ms: int) -> PlacedStamp | None:
@@ -177,7 +182,8 @@ class BootLine:
         if late_ns > 0 and x_ns > self.newest_ns:
             return self._place_delayed(arrival_ns, boot_ms, x_ns)
         advances = self._run.add(arrival_ns, boot_ms, self._late_max_ns)
-        self._rivals.add(arrival_ns, boot_ms, self._late_max_ns)
+        others = self._copies if 0 < late_ns <= _COPY_LATE_NS else self._rivals
+        others.add(arrival_ns, boot_ms, self._late_max_ns)
         if not (advances and self._run.lasts(3, _NS // 2)):
             return None
         # A step ahead by more than half of the period is nearer to one back.
@@ -204,6 +210,10 @@ class BootLine:
     def is_shared(self, arrival_ns: int) -> bool:
         """Return whether a second clock runs beside the line: two senders then share one id."""
         return self._rivals.has_clock(arrival_ns)
+
+    def has_late_copies(self, arrival_ns: int) -> bool:
+        """Return whether stamps without a time arrive beside newer ones: copies, or of another."""
+        return self._copies.has_clock(arrival_ns)
 
     def _nearest_ns(self, arrival_ns: int, boot_ms: int) -> int:
         """Unwrap boot milliseconds to the value nearest to what the line has at an arrival."""
@@ -285,6 +295,7 @@ class BootLine:
         self._run.stamps.clear()
         self._ahead.stamps.clear()
         self._rivals.clear()
+        self._copies.clear()
         x_ns = stamps[0][1] * _NS_PER_MS if rebooted else self._nearest_ns(*stamps[0])
         before = self.floor
         self.since_ns = stamps[0][0]

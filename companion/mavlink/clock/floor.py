@@ -90,6 +90,7 @@ class Floor:
         drift       detected steady drift, a ratio; 0 unless it exceeds ``drift_max``
         count       stamps so far
         rise_ns     rise of the line at the newest stamp beyond ``drift_max``; 0 unless it restarted
+        jump_ns     rise that no latency explains, at the newest stamp; 0 unless it was found there
     """
 
     def __init__(self, window_ns: int, drift_max: float, before_ns: float = 0.0) -> None:
@@ -100,7 +101,7 @@ class Floor:
         self.drift = 0.0
         self.count = 0
         self.newest_ns = 0
-        self.rise_ns = 0.0
+        self.rise_ns = self.jump_ns = 0.0
         self._first_arrival_ns = self._newest_arrival_ns = 0
         self._base = (0, 0)  # x, y: heights are relative to base y + drift * (x - base x)
         self._upper_bound = self._line = 0.0  # heights at newest_ns
@@ -120,7 +121,7 @@ class Floor:
 
     def add(self, x_ns: int, y_ns: int) -> None:
         """Add a stamp: its sender time, and its arrival less its sender time."""
-        self.rise_ns = 0.0
+        self.rise_ns = self.jump_ns = 0.0
         self._newest_arrival_ns = x_ns + y_ns
         if not self.count:
             self._base = (x_ns, y_ns)
@@ -156,6 +157,7 @@ class Floor:
                 self._all_late(late_spell)
         if self._line - self._upper_bound > WORST_LATENCY_NS:
             # No frame is that late: the clock changed.
+            self.jump_ns = self._line - self._upper_bound
             self._upper_bound, self._bound_set_ns = self._line, x_ns
         if level is not None and self._tilted(self._line) - level.upper_bound > WORST_LATENCY_NS:
             self._level = None  # no queue is that long: the clock drifts

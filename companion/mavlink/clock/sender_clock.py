@@ -14,6 +14,8 @@ known as an interval, which every stamp and every answer narrows:
 The interval is valid at the time asked for, and widens while nothing arrives. No report is ever
 placed later than it arrived. See docs/math.md 6. ``epochs.py`` decides which stamps are on one
 line.
+
+Over 300 lines: one clock, of which each kind of evidence moves the same interval.
 """
 
 import math
@@ -90,8 +92,8 @@ class SenderClock:
         line, x_ns = self._line, placed.x_ns
         if placed.ahead_ns:
             self._note_earlier(placed.ahead_ns)
-        elif placed.jump_ns or line.floor.rise_ns:
-            self._note_change(placed.jump_ns)
+        elif placed.jump_ns or line.floor.rise_ns or line.floor.jump_ns:
+            self._note_change(placed.jump_ns or round(line.floor.jump_ns))
         _, low_ns, _, likely_ns = self._now()
         at_ns = x_ns + line.floor.drifted_ns(x_ns)
         latency_s = max(0.0, (arrival_ns - at_ns - likely_ns) * 1e-9)
@@ -112,10 +114,10 @@ class SenderClock:
         """Add the stamp of any other message, if it lies on the line of the reports."""
         self.change = self._known = self._reading = None
         line = self._line
-        if line.add_stamp(arrival_ns, boot_ms) and line.floor.rise_ns:
-            self._note_change()
+        if line.add_stamp(arrival_ns, boot_ms) and (line.floor.rise_ns or line.floor.jump_ns):
+            self._note_change(round(line.floor.jump_ns))
 
-    def _note_change(self, jump_ns: int = 0) -> None:
+    def _note_change(self, jump_ns: int) -> None:
         rise_ns = jump_ns or self._line.floor.rise_ns
         self.change = ClockChange(
             proven=False, step_s=rise_ns * 1e-9, drift_ppm=math.inf, leapt=jump_ns != 0
@@ -127,6 +129,10 @@ class SenderClock:
     def is_shared(self, arrival_ns: int) -> bool:
         """Return whether two clocks run side by side: two senders then share this id."""
         return self._line.is_shared(arrival_ns)
+
+    def has_late_copies(self, arrival_ns: int) -> bool:
+        """Return whether stamps arrive that are too late to have a time, beside newer ones."""
+        return self._line.has_late_copies(arrival_ns)
 
     # --- two-way evidence -------------------------------------------------------------------
 

@@ -24,11 +24,13 @@ ever deliver. Messages that state accuracies, fixes or the time of day (``_OF_FI
 at all while the other is current, nor from a peer that has brought no position yet.
 
 Stamps are used only if they are of the other's clock: another clock would look like a restart, or
-like a second vehicle. Those that are more than a second ahead of the fastest that the other has
-delivered are rejected: anybody can predict the positions of a standing vehicle. Those that are less
-ahead set the clock, as those of a faster second radio must, and are announced. So the vehicle
-that was here first stays believed, and a stranger costs it at most a metre; whoever sends first in
-a vehicle's name is believed until it falls silent.
+like a second vehicle. A peer that becomes more than ten seconds late is a stranger from then on, if
+its positions agree with where another peer had the vehicle by these stamps. Stamps that are more
+than a second ahead of the fastest that the other has delivered are rejected: anybody can predict
+the positions of a standing vehicle. Those that are less ahead set the clock, as those of a faster
+second radio must, and are announced. So the vehicle that was here first stays believed, and a
+stranger costs it at most a metre; whoever sends first in a vehicle's name is believed until it
+falls silent.
 
 What a known peer does not bring about other aircraft is accepted from any peer: a receiver may send
 in a vehicle's name. Messages that move the sender itself, its clock or its bounds are not: any
@@ -49,7 +51,8 @@ from companion.mavlink.trust.attitude_difference import contradict
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
 from companion.mavlink.trust.paths import RESTARTED_MS, SLACK_M, Path
 from companion.mavlink.trust.peer_clock import PeerClock, has_stamp, stamp_ms
-from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE
+from companion.mavlink.trust.peer_notices import NOTICE_NS, Disagreement, PeerNotice
+from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, first_has_fix
 from companion.mavlink.wire.decode import (
     ATTITUDE,
     DECODED,
@@ -86,7 +89,6 @@ CURRENT_INTERVALS: Final = 3.0  # that time in intervals between its messages
 SENDERS_MAX: Final = 4096  # senders followed; those of known peers are forgotten last
 PEERS_MAX: Final = 4  # known peers of a sender, and strangers compared with them
 COMPARED_PER_S: Final = 30.0  # positions of strangers compared per sender and second
-NOTICE_NS: Final = 60_000_000_000  # least time between two notices about one sender
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
 BROUGHT: Final = "the same message of this sender comes from the peer that was known first"
@@ -101,6 +103,7 @@ AHEAD_MS: Final = 1000
 
 A clock follows a smaller lead at once, and would follow a larger one once several stamps agree.
 """
+LATE_MS: Final = 1000  # largest delay of a stranger's position that is used
 EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
 LEAD_NS: Final = 10_000_000_000  # time after which leads over a peer's fastest stamps are announced
 LATE_PEER_MS: Final = 1000  # how much newer attitudes are whose rejection is announced
@@ -171,9 +174,7 @@ class _Sender:
     known: dict[str, _Peer] = field(default_factory=dict)
     strangers: dict[str, _Peer] = field(default_factory=dict)
     contradicted_ns: deque[int] = field(default_factory=lambda: deque(maxlen=CONTRADICTIONS))
-    notified_ns: int = -NOTICE_NS
-    late_notified_ns: int = -NOTICE_NS
-    lead_notified_ns: int = -NOTICE_NS
+    notified_ns: dict[Disagreement, int] = field(default_factory=dict)
     comparisons: Budget = field(
         default_factory=lambda: Budget(per_s=COMPARED_PER_S, most=COMPARED_PER_S)
     )
@@ -196,19 +197,12 @@ class _Sender:
 class KnownPeers:
     """Known peers and strangers of all senders.
 
-    ``routers`` names trusted peers: a link as in the settings, HOST or HOST:PORT. ``contradicted``
-    holds the senders in whose name a stranger reports another path, with stranger and known peers,
-    since it was last emptied.
+    ``routers`` names trusted peers: a link as in the settings, HOST or HOST:PORT. ``notices``
+    holds the disagreements since it was last emptied.
     """
 
     def __init__(self, routers: Collection[str] = ()) -> None:
-        self.contradicted: list[tuple[str, str, tuple[str, ...]]] = []
-        self.replaced: list[tuple[str, str, tuple[str, ...]]] = []
-        """Senders whose positions are taken from a peer, since the known ones bring none."""
-        self.late: list[tuple[str, str, tuple[str, ...]]] = []
-        """Senders of which a peer brings newer messages than those that were known first."""
-        self.faster: list[tuple[str, str, tuple[str, ...]]] = []
-        """The same, where the newer messages are used: they set the sender's clock."""
+        self.notices: list[PeerNotice] = []
         self._routers = frozenset(routers)
         self._senders: dict[Source, _Sender] = {}
 
@@ -244,10 +238,11 @@ class KnownPeers:
         if msgid in OWN and self._replaces(sender, peer, current, frame):
             return None
         if msgid in OWN and sender.comparisons.spend(1, frame.t_ns * 1e-9):
-            agrees = self._agrees(sender, peer, frame) or peer in sender.known
+            agrees = self._agrees(sender, peer, frame)
             return None if agrees and read(frame).accuracy is None else STRANGER
         if msgid == ATTITUDE:
             self._compare_attitudes(sender, peer, frame, current)
+        self._note_no_fix(sender, peer, frame, current)
         return STRANGER
 
     def rank(self, link: str, peer: str, source: Source, now_ns: int) -> PeerRank:
@@ -285,7 +280,7 @@ class KnownPeers:
             if any(_is_off_clock(one, frame) for one in earlier):
                 return STRANGER
             if any(_is_ahead(one, frame) for one in earlier):
-                self._note_late(sender, peer, frame)
+                self._notify(sender, Disagreement.IS_NEWER, peer, frame)
                 return STRANGER
             self._note_lead(sender, peer, known, frame, earlier)
             known.stamped = frame
@@ -293,6 +288,8 @@ class KnownPeers:
             return self._refusal_of_brought(sender, peer, known, frame)
         if msgid not in OWN or (is_only and not sender.strangers):
             return None
+        if not is_only and self._falls_behind(sender, peer, known, frame):
+            return STRANGER
         refused = self._compare_known(sender, peer, known, frame)
         if refused is None and not is_only and read(frame).accuracy is not None:  # moves bounds
             earlier = _current_earlier(sender, known, frame.t_ns)
@@ -319,7 +316,8 @@ class KnownPeers:
         recent = [(one, same) for one, same in earlier if now_ns - same.t_ns <= kept_ns]
         if any(same.payload == frame.payload for _, same in recent):
             return None
-        if frame.msgid in _OF_FIRST and _current_earlier(sender, known, now_ns):
+        if frame.msgid in _OF_FIRST and (before := _current_earlier(sender, known, now_ns)):
+            self._note_no_fix(sender, peer, frame, before)
             return BROUGHT  # positions that agree do not justify it
         if not recent:
             return None
@@ -330,7 +328,7 @@ class KnownPeers:
         if all(_is_overtaken(one, same, frame) for one, same in recent):
             return None
         if all(_ahead_ms(frame, same) > LATE_PEER_MS for _, same in recent):
-            self._note_late(sender, peer, frame)
+            self._notify(sender, Disagreement.IS_NEWER, peer, frame)
         return BROUGHT
 
     def _compare_attitudes(
@@ -342,12 +340,18 @@ class KnownPeers:
         ):
             self._note_contradiction(sender, peer, frame)
 
-    def _note_late(self, sender: _Sender, peer: str, frame: Frame) -> None:
-        """Publish that the peers that were known first are late, and believed all the same."""
-        if frame.t_ns - sender.late_notified_ns >= NOTICE_NS:
-            sender.late_notified_ns = frame.t_ns
-            names = tuple(name for name in sender.known if name != peer)
-            self.late.append((str(frame.source), peer, names))
+    def _note_no_fix(self, sender: _Sender, name: str, frame: Frame, believed: list[_Peer]) -> None:
+        """Publish that a peer states a lost fix, of which those that are believed bring nothing."""
+        if (
+            frame.msgid == GPS_RAW_INT
+            and not first_has_fix(frame)
+            and not any(
+                GPS_RAW_INT in one.newest
+                and frame.t_ns - one.newest[GPS_RAW_INT].t_ns <= BROUGHT_NS[GPS_RAW_INT]
+                for one in believed
+            )
+        ):
+            self._notify(sender, Disagreement.HAS_NO_FIX, name, frame)
 
     def _note_lead(
         self, sender: _Sender, name: str, peer: _Peer, frame: Frame, earlier: list[_Peer]
@@ -362,11 +366,7 @@ class KnownPeers:
         ):
             return
         peer.has_led = True
-        if frame.t_ns - sender.lead_notified_ns < NOTICE_NS:
-            return
-        sender.lead_notified_ns = frame.t_ns
-        names = tuple(one for one in sender.known if one != name)
-        self.faster.append((str(frame.source), name, names))
+        self._notify(sender, Disagreement.LEADS, name, frame)
 
     def _compare_known(self, sender: _Sender, peer: str, known: _Peer, frame: Frame) -> str | None:
         """Compare a known peer's position with those of all other peers of its sender."""
@@ -396,6 +396,27 @@ class KnownPeers:
                     self._demote(sender, later, frame)
         return None if peer in sender.known and worst_m <= AGREEMENT_M else STRANGER
 
+    def _falls_behind(self, sender: _Sender, peer: str, known: _Peer, frame: Frame) -> bool:
+        """Make a peer a stranger that became so late that its stamps look like another clock.
+
+        They are of the same clock if its position agrees with where another peer had the vehicle by
+        these stamps.
+        """
+        if known.is_router:
+            return False
+        said = read(frame)
+        for other in sender.known.values():
+            if other is known or other.is_router or not other.is_recent(frame.t_ns):
+                continue
+            newest = other.path.newest
+            if newest is None or step_ms(newest.boot_ms, said.boot_ms) <= RESTARTED_MS:
+                continue
+            if _agrees(known.path.excess_m(other.path, None, said)):
+                self._notify(sender, Disagreement.FALLS_BEHIND, peer, frame)
+                self._add(sender.strangers, peer, sender.known.pop(peer), frame.t_ns)
+                return True
+        return False
+
     def _demote(self, sender: _Sender, name: str, frame: Frame) -> None:
         """Make a known peer a stranger, since it contradicts one that was known earlier."""
         peer = sender.known.pop(name)
@@ -419,7 +440,7 @@ class KnownPeers:
         """
         if any(one.brings_positions(frame.t_ns) for one in current) or not _is_usable(frame):
             return False
-        self.replaced.append((str(frame.source), name, tuple(sender.known)))
+        self._notify(sender, Disagreement.REPLACES, name, frame)
         for other in [one for one, peer in sender.known.items() if _is_off_clock(peer, frame)]:
             self._add(sender.strangers, other, sender.known.pop(other), frame.t_ns)
         self._make_known(sender, name, self._new(frame, False), frame)
@@ -431,8 +452,9 @@ class KnownPeers:
         """Compare a stranger's position with the known peers; return whether it agrees with one."""
         believed = [one for one in sender.known.values() if one.is_current(frame.t_ns)]
         if any(_is_ahead(one, frame) for one in believed):
-            self._note_late(sender, name, frame)
+            self._notify(sender, Disagreement.IS_NEWER, name, frame)
             return False
+        is_late = any(_is_off_clock(one, frame) or _is_late(one, frame) for one in believed)
         stranger = sender.strangers.get(name)
         if stranger is None:
             stranger = self._new(frame, False)
@@ -452,9 +474,9 @@ class KnownPeers:
         self._judge(sender, name, stranger, excess_m, frame)
         found = [one for one in (*behind, *ahead) if one is not None]
         agrees = bool(found) and max(found) <= AGREEMENT_M
-        if agrees:
+        if agrees and not is_late:
             self._note_lead(sender, name, stranger, frame, believed)
-        return agrees
+        return (agrees or name in sender.known) and not is_late
 
     def _judge(
         self, sender: _Sender, name: str, stranger: _Peer, excess_m: float | None, frame: Frame
@@ -483,9 +505,16 @@ class KnownPeers:
             when.popleft()
         if not when or frame.t_ns - when[-1] >= SPACED_NS:
             when.append(frame.t_ns)
-        if len(when) >= CONTRADICTIONS and frame.t_ns - sender.notified_ns >= NOTICE_NS:
-            sender.notified_ns = frame.t_ns
-            self.contradicted.append((str(frame.source), name, tuple(sender.known)))
+        if len(when) >= CONTRADICTIONS:
+            self._notify(sender, Disagreement.CONTRADICTS, name, frame)
+
+    def _notify(self, sender: _Sender, what: Disagreement, name: str, frame: Frame) -> None:
+        """Publish a disagreement of a peer with the known ones."""
+        if frame.t_ns - sender.notified_ns.get(what, -NOTICE_NS) < NOTICE_NS:
+            return
+        sender.notified_ns[what] = frame.t_ns
+        known = tuple(one for one in sender.known if one != name)
+        self.notices.append(PeerNotice(what=what, who=str(frame.source), peer=name, known=known))
 
     # --- tables -------------------------------------------------------------------------------
 
@@ -542,6 +571,12 @@ def _is_ahead(one: _Peer, frame: Frame, by_ms: int = AHEAD_MS) -> bool:
     """Return whether a stamp is so much ahead of the fastest that a peer has delivered."""
     late_ms = one.clock.late_ms(frame)
     return late_ms is not None and late_ms < -by_ms
+
+
+def _is_late(one: _Peer, frame: Frame) -> bool:
+    """Return whether a stamp is so late beside the fastest of a peer that it adds nothing."""
+    late_ms = one.clock.late_ms(frame)
+    return late_ms is not None and late_ms > LATE_MS
 
 
 def _is_off_clock(one: _Peer, frame: Frame) -> bool:

@@ -27,7 +27,7 @@ STRETCH_MS: Final = 2000
 AHEAD_MS: Final = 250  # longest time by which a report is compared with an older one
 RESTARTED_MS: Final = 10_000  # a stamp that is further off is from another boot, or clock
 REPORTS_KEPT: Final = 32  # newest reports kept of a peer
-OLDER_KEPT: Final = 32  # older ones, ``OLDER_MS`` apart: a second link may be ten seconds late
+OLDER_KEPT: Final = 64  # older ones, ``OLDER_MS`` apart: another link may be half a minute late
 OLDER_MS: Final = 500
 
 TURN_1E7: Final = 3_600_000_000  # a whole turn, in 1e-7 degrees

@@ -35,6 +35,11 @@ def about_attitude(frame: Frame) -> GnssHeading | StatedAttitude | None:
     return odometry(frame) if frame.msgid == ODOMETRY else attitude_quaternion_cov(frame)
 
 
+def first_has_fix(frame: Frame) -> bool:
+    """Return whether a vehicle's first receiver has a 3D fix (GPS_RAW_INT)."""
+    return bool(unpack(frame, GPS_RAW_INT_FIELDS)[8] >= FIX_3D)
+
+
 def second_has_fix(frame: Frame) -> bool:
     """Return whether a vehicle's second receiver has a 3D fix (GPS2_RAW)."""
     return bool(unpack(frame, _GPS2_RAW)[9] >= FIX_3D)

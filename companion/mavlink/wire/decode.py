@@ -3,6 +3,8 @@
 Sources: the message definitions of https://mavlink.io/en/messages/common.html. MAVLink 2 truncates
 trailing zero bytes of a payload, and a version 1 frame has no extension fields: both are read as
 zeros, as the standard requires. Where zero means "not sent" the value is None.
+
+Over 300 lines: one short function for each message.
 """
 
 import math
@@ -242,7 +244,8 @@ def _system_time(frame: Frame) -> SystemTime:
 
 
 _EKF_STATUS_REPORT = struct.Struct("<fffffH")
-_KNOWS_ATTITUDE, _KNOWS_POSITION, _KEEPS_POSITION, _UNINITIALIZED = 1, 8 | 16, 128, 1024
+_KNOWS_ATTITUDE, _IS_RELATIVE, _IS_ABSOLUTE, _KEEPS_POSITION = 1, 8, 16, 128
+_UNINITIALIZED, _REJECTS_GNSS = 1024, 1 << 15
 
 
 def _ekf_status_report(frame: Frame) -> EstimatorStatus:
@@ -250,13 +253,14 @@ def _ekf_status_report(frame: Frame) -> EstimatorStatus:
     *_, compass_ratio, _, flags = unpack(frame, _EKF_STATUS_REPORT)
     if not math.isfinite(compass_ratio) or compass_ratio < 0.0:
         raise _RefusedError(Reason.MALFORMED, "compass ratio is negative or not finite")
-    has_position = bool(flags & _KNOWS_POSITION) and not flags & _KEEPS_POSITION
+    has_position = bool(flags & (_IS_RELATIVE | _IS_ABSOLUTE)) and not flags & _KEEPS_POSITION
     return EstimatorStatus(
         t_ns=frame.t_ns,
         source=frame.source,
         link=frame.link,
         knows_attitude=flags & (_KNOWS_ATTITUDE | _UNINITIALIZED) == _KNOWS_ATTITUDE,
         knows_position=has_position and not flags & _UNINITIALIZED,
+        is_absolute=flags & (_IS_ABSOLUTE | _REJECTS_GNSS) == _IS_ABSOLUTE,
         compass_ratio=compass_ratio,
     )
 

@@ -10,6 +10,7 @@ from support import examples, rounds
 
 from companion.beams.hardware.quantise import (
     EMPHASIS,
+    MOVES,
     Quadrature,
     Resolution,
     SettableStates,
@@ -200,6 +201,26 @@ def test_changing_one_element_does_not_lower_the_cost(
             weaker = np.abs(sent[strongest]) < np.abs(found.weights[strongest]) - 1e-12
             if not (m == strongest and weaker):
                 assert cost(sent, weights, towards) > found.cost - 1e-9
+
+
+class Counted(Resolution):
+    """Settings that count the elements that the search moves."""
+
+    moves = 0
+
+    def around(self, codes: IntArray) -> IntArray:
+        Counted.moves += 1
+        return super().around(codes)
+
+
+@pytest.mark.parametrize("elements", [300, 1000])
+def test_search_moves_a_limited_number_of_elements(elements: int) -> None:
+    Counted.moves, rng = 0, np.random.default_rng(1)
+    weights, towards = drawn(rng, elements), line(list(rng.uniform(-1, 1, 6)), elements)
+    kind = Counted(64, (1.0, 0.9, 0.8))
+    found = quantise(weights, kind, towards)
+    assert elements <= Counted.moves <= MOVES
+    assert found.cost < cost(rounded(weights, kind), weights, towards)
 
 
 def test_search_result_is_near_the_exhaustive_optimum() -> None:

@@ -362,6 +362,23 @@ def test_two_concurrent_clocks_are_reported_as_a_shared_id(apart_ms: int) -> Non
     assert found == [t for t, _ in sorted([*first, *second]) if t >= found[0]]
 
 
+@pytest.mark.parametrize("late_ms", [12_000, 29_000])
+def test_late_copies_beside_newer_stamps_are_no_second_vehicle(late_ms: int) -> None:
+    """A router that merges two routes: what the fast one loses comes over the slow one."""
+    first, lost = run(0, 5_000_000, 150), run(0, 5_000_050, 150)
+    late = [(arrival + late_ms, boot) for arrival, boot in lost if arrival + late_ms < 30_000]
+    assert shared_at(sorted([*first, *late])) == []
+    clock = SenderClock()
+    copies = [
+        arrival
+        for arrival, boot in sorted([*first, *late])
+        if clock.observe(EPOCH_NS + arrival * MS, boot) is None
+        and clock.has_late_copies(EPOCH_NS + arrival * MS)
+    ]
+    assert bool(copies) == (late_ms == 12_000)  # they must arrive for three seconds
+    assert not copies or late_ms + 3_000 <= copies[0] <= late_ms + 3_500
+
+
 def test_more_than_two_concurrent_clocks_are_reported_as_a_shared_id() -> None:
     """Each stamp of one began the run of another again, and the first was believed for ever."""
     first = run(0, 5_000_000, 100)

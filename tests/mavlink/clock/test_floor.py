@@ -294,6 +294,21 @@ def test_memory_is_bounded() -> None:
     assert len(floor._recent) == RECENT
 
 
+@pytest.mark.parametrize(("late_s", "is_jump"), [(4.0, False), (6.0, True), (9.0, True)])
+def test_delay_that_no_frame_can_have_is_reported_as_a_jump(late_s: float, is_jump: bool) -> None:
+    """From then on the bound does not cover that the link became slower."""
+    clock, jumps = SenderClock(), []
+    for n in range(600):
+        t_s = n / 10
+        clock.observe(round((t_s + (late_s if t_s > 20 else 0.02)) * S), 5000 + n * 100)
+        if clock.change is not None and clock.change.leapt:
+            jumps.append((t_s, clock.change.step_s))
+    assert len(jumps) == is_jump
+    for t_s, step_s in jumps:
+        assert 30.0 < t_s + late_s < 55.0
+        assert step_s == pytest.approx(late_s, abs=0.1)
+
+
 @pytest.mark.parametrize("rate", [0.0, -0.5])
 def test_clock_of_a_log_whose_arrivals_stand_still_can_be_read(rate: float) -> None:
     """Or run backwards: no line of arrivals over stamps has that slope."""

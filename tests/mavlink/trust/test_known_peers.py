@@ -20,6 +20,7 @@ from companion.mavlink.trust.known_peers import (
     KnownPeers,
     PeerRank,
 )
+from companion.mavlink.trust.peer_notices import Disagreement
 from companion.mavlink.wire.attitudes import ATTITUDE_QUATERNION_COV, GPS2_RAW, ODOMETRY
 from companion.mavlink.wire.decode import (
     ATTITUDE,
@@ -48,6 +49,10 @@ def rejected(peers: KnownPeers, *streams: Stream) -> dict[str, list[float]]:
     return found
 
 
+def notices(peers: KnownPeers, what: Disagreement) -> list[tuple[str, str, tuple[str, ...]]]:
+    return [(who, peer, known) for kind, who, peer, known in peers.notices if kind is what]
+
+
 def message(t_s: float, out: Outgoing) -> Frame:
     (frame,) = Splitter("x").feed(round(t_s * S), pack(out, 0, 2))
     assert isinstance(frame, Frame)
@@ -70,7 +75,7 @@ def test_second_route_is_used_once_it_has_agreed(hz: float, delay_s: float) -> N
     """
     peers, second = KnownPeers(), heard(OTHER, hz, begins_s=10.137, delay_s=lambda: delay_s)
     found = rejected(peers, heard(HOME, 4), second)
-    assert peers.contradicted == []
+    assert notices(peers, Disagreement.CONTRADICTS) == []
     assert found[HOME] == []
     assert found[OTHER]
     assert max(found[OTHER]) <= 10.137 + PROBATION_S + 2 * delay_s + max(2.0, 2 / hz)
@@ -87,7 +92,7 @@ def test_second_route_agrees_on_the_antimeridian() -> None:
             if peers.refusal(LINK, peer, frame) is not None:
                 refused.append(t_s)
                 assert peer == OTHER
-    assert peers.contradicted == [] and max(refused) <= PROBATION_S + 1.0
+    assert notices(peers, Disagreement.CONTRADICTS) == [] and max(refused) <= PROBATION_S + 1.0
 
 
 def test_restarted_radio_with_new_address_is_used_after_a_second() -> None:
@@ -95,7 +100,7 @@ def test_restarted_radio_with_new_address_is_used_after_a_second() -> None:
     found = rejected(peers, heard(HOME, 10, lasts_s=20), heard(OTHER, 10, begins_s=20.1))
     assert found[HOME] == []
     assert all(t_s < 21.1 for t_s in found[OTHER])
-    assert peers.contradicted == []
+    assert notices(peers, Disagreement.CONTRADICTS) == []
 
 
 def test_peer_whose_connection_ended_keeps_nobody_out() -> None:
@@ -135,7 +140,7 @@ def test_position_resets_of_one_vehicle_cost_the_first_route_nothing() -> None:
     peers = KnownPeers()
     found = rejected(peers, heard(HOME, 4, told=glitches), heard(OTHER, 5, told=glitches))
     assert found[HOME] == []
-    assert peers.contradicted == []
+    assert notices(peers, Disagreement.CONTRADICTS) == []
 
 
 def test_messages_about_other_aircraft_are_accepted_if_the_known_peer_brings_none() -> None:
@@ -213,7 +218,8 @@ def test_attitudes_of_two_peers_that_differ_are_announced(
         t_s, yaw_rad = t_s + 0.06, 3.0 * math.sin(number / 10 + 0.06)
         beside = turning(t_s, yaw_rad + off_rad, 3.0 * math.cos(number / 10 + 0.06))
         assert peers.refusal(LINK, other, beside) == (STRANGER if is_stranger else BROUGHT)
-    assert peers.contradicted == [("1:1", other, (HOME, OTHER))] * contradicts
+    known = (HOME, OTHER) if is_stranger else (HOME,)
+    assert notices(peers, Disagreement.CONTRADICTS) == [("1:1", other, known)] * contradicts
 
 
 def turning(t_s: float, yaw_rad: float, yawspeed_radps: float) -> Frame:
@@ -241,7 +247,7 @@ def test_newer_attitudes_are_used_once_the_first_peer_has_become_late() -> None:
         if peers.refusal(LINK, OTHER, stamped_attitude(t_s + 0.09, t_s, 0.6)) is None:
             used.append(t_s)
     assert used == [20 + number / 10 for number in range(27, 200)]
-    assert peers.late == []
+    assert notices(peers, Disagreement.IS_NEWER) == []
 
 
 @pytest.mark.parametrize("late_s", [0.0, 0.5])
@@ -252,7 +258,7 @@ def test_attitudes_from_the_future_are_not_those_of_a_faster_peer(late_s: float)
         assert peers.refusal(LINK, HOME, stamped_attitude(t_s, t_s - late_s)) is None
         for ahead_s in (0.2, 0.35, 0.9):
             assert peers.refusal(LINK, OTHER, stamped_attitude(t_s, t_s + ahead_s, 0.6)) == BROUGHT
-    named = [(who, peer) for who, peer, _ in peers.late]
+    named = [(who, peer) for who, peer, _ in notices(peers, Disagreement.IS_NEWER)]
     assert named == ([("1:1", OTHER)] if late_s else [])
 
 
@@ -280,7 +286,7 @@ def test_first_peer_that_was_always_late_is_believed_and_named() -> None:
         assert peers.refusal(LINK, HOME, stamped_attitude(t_s, t_s - 2.5)) is None
         early = stamped_attitude(t_s, t_s, 0.6)
         assert peers.refusal(LINK, OTHER, early) in (BROUGHT, STRANGER)
-    assert peers.late == [("1:1", OTHER, (HOME,))]
+    assert notices(peers, Disagreement.IS_NEWER) == [("1:1", OTHER, (HOME,))]
 
 
 @pytest.mark.parametrize("off_s", [0.0, 600.0])
@@ -302,7 +308,7 @@ def test_positions_over_another_radio_than_attitudes_are_used(off_s: float) -> N
             turned = peers.refusal(LINK, OTHER, attitude(t_s + 0.01, 1.5))
             assert turned in ((None,) if off_s else (BROUGHT, STRANGER))
     assert refused[-1] < used[0] == pytest.approx(15.0, abs=0.3)
-    assert peers.replaced == [("1:1", OTHER, (HOME,))]
+    assert notices(peers, Disagreement.REPLACES) == [("1:1", OTHER, (HOME,))]
 
 
 def summary(t_s: float) -> Frame:
@@ -376,7 +382,7 @@ def test_peer_that_cannot_be_compared_is_announced() -> None:
             place = report(round(t_s * S) + 1, 100 + t_s, circle(t_s))
             refused += peers.refusal(LINK, HOME, place) is not None
     assert refused > 200
-    ((who, stranger, known),) = peers.contradicted
+    ((who, stranger, known),) = notices(peers, Disagreement.CONTRADICTS)
     assert (who, stranger, known) == ("1:1", HOME, (OTHER,))
 
 
@@ -409,7 +415,7 @@ def test_stranger_that_sends_attitudes_alone_does_not_keep_the_vehicle_out() -> 
         assert peers.refusal(LINK, peer, place) is None
         assert peers.refusal(LINK, peer, attitude(t_s, 0.5)) is None
         assert number in (100, 230) or turned == STRANGER
-    assert peers.replaced == []
+    assert notices(peers, Disagreement.REPLACES) == []
 
 
 def test_second_peer_brings_attitudes_while_the_first_brings_none_or_few() -> None:
@@ -441,6 +447,32 @@ def test_bounds_follow_the_peer_that_was_known_first(msgid: int) -> None:
     assert peers.refusal(LINK, HOME, message(25.3, lie)) is None  # the first is always used
 
 
+@pytest.mark.parametrize("is_stranger", [False, True])
+@pytest.mark.parametrize("first_states_fix", [False, True])
+@pytest.mark.parametrize("fix_type", [1, 3])
+def test_lost_fix_that_the_first_peer_does_not_report_is_announced(
+    is_stranger: bool, first_states_fix: bool, fix_type: int
+) -> None:
+    """It is not used: a stranger that repeats positions could widen all bounds."""
+    peers, other = with_two_known_peers(), "10.0.0.77:5" if is_stranger else OTHER
+
+    def stated(peer: str, t_s: float, fix: int) -> str | None:
+        payload = struct.pack("<QiiiHHHHBB", round(t_s * 1e6), *[0] * 7, fix, 9)
+        return peers.refusal(LINK, peer, message(t_s, Outgoing(Source(1, 1), GPS_RAW_INT, payload)))
+
+    if first_states_fix:
+        assert stated(HOME, 20.0, 3) is None
+    for number in range(30):
+        place = report(
+            round((20.05 + number / 10) * S), 120.05 + number / 10, circle(20.05 + number / 10)
+        )
+        assert peers.refusal(LINK, HOME, place) is None
+        assert stated(other, 20.1 + number / 10, fix_type) == (STRANGER if is_stranger else BROUGHT)
+    known = (HOME, OTHER) if is_stranger else (HOME,)
+    is_told = fix_type == 1 and not first_states_fix
+    assert notices(peers, Disagreement.HAS_NO_FIX) == [("1:1", other, known)] * is_told
+
+
 def test_stamps_ahead_of_time_are_never_used() -> None:
     """They would move the clock: here by 1.5 s, with the path predicted exactly."""
     early = heard(OTHER, 10, begins_s=10.0, lasts_s=30.0, delay_s=lambda: -1.5)
@@ -460,7 +492,9 @@ def test_known_peer_with_stamps_ahead_of_time_is_not_used(ahead_s: float) -> Non
         assert peers.refusal(LINK, HOME, here) is None
         assert peers.refusal(LINK, OTHER, early) == STRANGER
         assert peers.refusal(LINK, OTHER, stamped_attitude(t_s + 0.03, t_s + ahead_s)) is not None
-    assert [(who, peer) for who, peer, _ in peers.late] == [("1:1", OTHER)]
+    assert [(who, peer) for who, peer, _ in notices(peers, Disagreement.IS_NEWER)] == [
+        ("1:1", OTHER)
+    ]
 
 
 @pytest.mark.parametrize(("ahead_s", "is_told"), [(0.0, False), (0.2, True), (0.5, True)])
@@ -470,7 +504,7 @@ def test_peer_whose_stamps_set_the_clock_is_told_once(ahead_s: float, is_told: b
     early = heard(OTHER, 10, begins_s=12.0, lasts_s=60.0, delay_s=lambda: -ahead_s)
     found = rejected(peers, heard(HOME, 10, lasts_s=60.0), early)
     assert len(found[OTHER]) < 60  # used, once known
-    assert peers.faster == [("1:1", OTHER, (HOME,))] * is_told
+    assert notices(peers, Disagreement.LEADS) == [("1:1", OTHER, (HOME,))] * is_told
 
 
 def test_leads_of_ever_new_peers_are_told_once_a_minute() -> None:
@@ -482,7 +516,7 @@ def test_leads_of_ever_new_peers_are_told_once_a_minute() -> None:
         )
     ]
     rejected(peers, heard(HOME, 10, lasts_s=60.0), early)
-    assert len(peers.faster) == 1
+    assert len(notices(peers, Disagreement.LEADS)) == 1
 
 
 def test_peer_is_ahead_only_of_one_whose_fastest_messages_are_known() -> None:
@@ -491,7 +525,46 @@ def test_peer_is_ahead_only_of_one_whose_fastest_messages_are_known() -> None:
     slow = heard(HOME, 10, lasts_s=20.0, delay_s=lambda: next(delays_s, 0.0))
     peers = KnownPeers()
     rejected(peers, slow, heard(OTHER, 10, begins_s=1.0, lasts_s=20.0))
-    assert peers.faster == []
+    assert notices(peers, Disagreement.LEADS) == []
+
+
+@pytest.mark.parametrize("late_s", [2.0, 9.0, 14.0])
+def test_positions_of_strangers_that_are_late_are_not_used(late_s: float) -> None:
+    """Anybody can repeat a vehicle's path; over ten seconds late it looks like a second vehicle."""
+    peers = KnownPeers()
+    late = [
+        (at_s, boot_s, f"10.0.0.66:{number // 8}", place)
+        for number, (at_s, boot_s, _, place) in enumerate(
+            heard(OTHER, 2, begins_s=5.03, lasts_s=60.0, delay_s=lambda: late_s)
+        )
+    ]
+    found = rejected(peers, heard(HOME, 10, lasts_s=80.0), late)
+    assert found.pop(HOME) == []
+    assert sum(map(len, found.values())) == len(late)
+
+
+@pytest.mark.parametrize("late_s", [11.0, 15.0, 25.0])
+def test_first_peer_that_falls_behind_gives_way_to_one_in_time(late_s: float) -> None:
+    """Its stamps look like another clock's; its positions were the other's at these stamps."""
+    peers = KnownPeers()
+    late = [(at_s + (late_s if at_s > 30 else 0.0), *rest) for at_s, *rest in heard(HOME, 10)]
+    found = rejected(peers, late, heard(OTHER, 10, begins_s=10.0, lasts_s=90.0))
+    assert [t_s for t_s in found[OTHER] if t_s > 20.0] == []
+    assert found[HOME] == [at_s for at_s, *_ in late if at_s > 30.2]
+    assert notices(peers, Disagreement.FALLS_BEHIND) == [("1:1", HOME, (OTHER,))]
+
+
+def test_first_peer_whose_vehicle_was_restarted_stays_believed() -> None:
+    """A stranger continues the former clock and path."""
+    peers = KnownPeers()
+    first = [*heard(HOME, 10, lasts_s=30.0)]
+    first += [
+        (at_s, boot_s - 129.0, peer, place)
+        for at_s, boot_s, peer, place in heard(HOME, 10, begins_s=31.0)
+    ]
+    found = rejected(peers, first, heard(OTHER, 10, begins_s=10.0))
+    assert found[HOME] == []
+    assert len([t_s for t_s in found[OTHER] if t_s > 33.0]) > 260
 
 
 def test_rank_of_a_peer_depends_on_the_others_that_are_current() -> None:
@@ -530,7 +603,7 @@ def test_vehicle_that_was_first_stays_believed(forged_hz: float, metres: float) 
         assert found[HOME] == []
         assert len(found[OTHER]) == round((60 - 10.03) * forged_hz)
         if forged_hz >= 1:
-            assert peers.contradicted == [("1:1", OTHER, (HOME,))]
+            assert notices(peers, Disagreement.CONTRADICTS) == [("1:1", OTHER, (HOME,))]
 
 
 def test_fresh_ports_evict_no_known_peer_and_are_never_believed() -> None:
@@ -547,7 +620,7 @@ def test_fresh_ports_evict_no_known_peer_and_are_never_believed() -> None:
     within_slack_s = (known_peers.AGREEMENT_M + 0.1 * 20.0 + 0.7) / 2.0
     late = [t_s for times in found.values() for t_s in times if t_s > 10.1 + within_slack_s]
     assert len(late) >= 40 * (50 - within_slack_s) - 2
-    assert [one[0] for one in peers.contradicted] == ["1:1"]
+    assert [one[0] for one in notices(peers, Disagreement.CONTRADICTS)] == ["1:1"]
 
 
 @pytest.mark.parametrize("off_s", [-3600.0, 3600.0, -30.0, 30.0, 2.0**31 / 1000])

@@ -173,6 +173,8 @@ def expected(m: dialect.MAVLink_message, t_ns: int, link: str) -> Message | None
                 link=link,
                 knows_attitude=knows,
                 knows_position=places,
+                is_absolute=m.flags & dialect.EKF_POS_HORIZ_ABS != 0
+                and m.flags & dialect.EKF_GPS_GLITCHING == 0,
                 compass_ratio=m.compass_variance,
             )
         case "GPS_RAW_INT":

@@ -233,10 +233,9 @@ class SystemTime:
 class EstimatorStatus:
     """Status of an autopilot's estimator (EKF_STATUS_REPORT).
 
-    link            link over which it came
-    knows_attitude, knows_position  whether it reports its attitude or horizontal position as valid
-    is_absolute     whether that position is by GNSS, and not dead reckoning or by a camera
-    compass_ratio   compass innovation over the estimator's gate: above 1 it rejects the compass
+    knows_…        whether its attitude or horizontal position is valid
+    is_absolute    whether that position is by GNSS
+    compass_ratio  compass innovation over its gate: above 1 the compass is rejected
     """
 
     t_ns: int

@@ -1,5 +1,6 @@
 """Requirements of a run on this machine: ports, devices, disk, time."""
 
+import contextlib
 import ctypes
 import errno
 import grp
@@ -141,9 +142,11 @@ def _buffers() -> Iterator[Finding]:
 def _disk(folder: Path) -> Finding:
     subject = f"recordings {folder}"
     where = folder.parent if folder.suffix == ".mcap" else folder
-    while not where.exists() and where != where.parent:
-        where = where.parent  # created when the first recording begins
     try:
+        with contextlib.suppress(FileNotFoundError):
+            folder.lstat()  # fails for a name that is too long
+        while not where.exists() and not where.is_symlink() and where != where.parent:
+            where = where.parent  # created when the first recording begins
         with tempfile.TemporaryFile(dir=where):
             free = shutil.disk_usage(where).free
     except OSError as error:

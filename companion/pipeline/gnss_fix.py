@@ -77,7 +77,7 @@ class GnssFix:
             self.silent_ns = t_ns + SILENT_NS
         self.heard_ns = t_ns
         if self.relative_ns is not None and has_fix:
-            has_fix = t_ns - self.relative_ns > TRUSTED_NS
+            has_fix = not self._is_relative(t_ns)
         if has_fix and self.is_certain and self.since_ns is not None:  # nearly always
             self.fixed_ns = t_ns
             return None
@@ -92,7 +92,7 @@ class GnssFix:
 
     def note_second(self, *, has_fix: bool, t_ns: int) -> FixNotice | None:
         """Note a status of the second receiver; return what must be announced."""
-        if not has_fix or self.relative_ns is not None:
+        if not has_fix or self._is_relative(t_ns):
             self.second_ns = None
             return self._loss(t_ns)
         if self.second_ns is None or t_ns - self.second_ns > SECOND_SILENT_NS:
@@ -168,6 +168,10 @@ class GnssFix:
             return False
         return self.second_ns is None or t_ns - self.second_ns > silent_ns
 
+    def _is_relative(self, t_ns: int) -> bool:
+        """Return whether the estimator states a position without GNSS."""
+        return self.relative_ns is not None and t_ns - self.relative_ns <= TRUSTED_NS
+
     def _unsettled_s(self, t_ns: int) -> float:
         """Return the dead reckoning before the fix that has been there until now; 0 if settled."""
         lasts_ns = min(SETTLED_NS, round(self.before_s * 1e9))
@@ -176,7 +180,7 @@ class GnssFix:
     def _loss(self, t_ns: int) -> FixNotice | None:
         if self.has_first:
             return None
-        if self.relative_ns is not None:
+        if self._is_relative(t_ns):
             return self._notice(FixNotice.DEAD_RECKONING, t_ns)
         is_lost = self._is_lost(t_ns, SECOND_SILENT_NS)
         return self._notice(FixNotice.LOST if is_lost else FixNotice.FIRST_LOST, t_ns)

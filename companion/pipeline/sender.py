@@ -111,7 +111,8 @@ class ComponentState:
     def compare_height(self, report: Report) -> None:
         """Compare the height of a report with that of the newest status of the receiver.
 
-        The receiver's error is bounded, that of the autopilot's barometer is not.
+        The receiver's error is bounded, that of the autopilot's barometer is not. A difference that
+        begins with more than ``NEAR_HEIGHT_M`` is no drift.
         """
         status = self.compared = self.receiver
         if status is None or status.fix_type < FIX_3D:
@@ -120,7 +121,8 @@ class ComponentState:
         fell_m = descent_mps * (report.t_ns - status.t_ns) * 1e-9
         above_m = report.alt_m - (status.alt_m - fell_m)
         apart_m = self.apart_from_receiver_m = above_m if above_m > 0.0 else -above_m
-        self.height_off_m = apart_m if apart_m < NEAR_HEIGHT_M else 0.0
+        is_drift = apart_m < NEAR_HEIGHT_M or self.height_off_m > NEAR_HEIGHT_M / 2
+        self.height_off_m = apart_m if is_drift else 0.0
 
     def note_heights(self) -> str:
         """Note that their difference is announced; return the text."""

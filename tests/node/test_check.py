@@ -66,8 +66,11 @@ def test_recording_folder_is_checked(tmp_path: Path) -> None:
     assert looked(recording={"directory": str(folder)})[f"recordings {folder}"].grade is Grade.OK
     assert not folder.exists()
     (tmp_path / "file").write_text("")
-    inside = tmp_path / "file" / "recordings"
-    assert looked(recording={"directory": str(inside)})[f"recordings {inside}"].grade is Grade.FAULT
+    (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    for name in ("file/recordings", "loop", "loop/x", "n" * 300 + ".mcap"):
+        there = tmp_path / name
+        said = looked(recording={"directory": str(there)})[f"recordings {there}"]
+        assert said.grade is Grade.FAULT
 
 
 def test_silent_link_and_missing_carrier_are_reported(tmp_path: Path) -> None:

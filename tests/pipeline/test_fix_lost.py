@@ -475,6 +475,13 @@ def test_bound_on_the_height_covers_a_barometer_that_drifts(climb_m: float) -> N
     assert texts[0].endswith("receiver's differ by 3 m; its bound covers it")
 
 
+def test_bound_on_the_height_covers_a_drift_of_any_size() -> None:
+    """A difference that begins with more than 50 m is that of an invalid height."""
+    found = heights_m(drifting_heights(2.2), 0.0)
+    assert [one for one in found[10:] if one[0] > one[1]] == []
+    assert found[-1][0] > 60.0
+
+
 def test_heights_that_agree_cost_nothing_while_the_vehicle_climbs() -> None:
     found = heights_m(drifting_heights(0.0, 9.0), 9.0)
     assert max(bound_m for _, bound_m in found[20:]) < 3.0

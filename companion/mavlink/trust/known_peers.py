@@ -8,8 +8,9 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 * when its positions have agreed with those of the current known peers for ``PROBATION_NS`` and in
   ``AGREEMENTS`` comparisons; each contradiction doubles that time,
 * at once if no known peer is current, since they are silent or their connections have ended: a
-  vehicle whose radio restarted has another address (with another clock, ``REBOOT_NS`` later; not if
-  it contradicted them shortly before their connections ended),
+  vehicle whose radio restarted has another address (with another clock, or stamps more than a
+  second ahead, ``REBOOT_NS`` later; not if it contradicted them shortly before their connections
+  ended),
 * with its positions if no current known peer has brought any for ``NO_POSITION_NS``: a vehicle may
   send positions over one radio, attitudes over another. Known peers whose stamps are of another
   clock become strangers then,
@@ -597,9 +598,13 @@ def _clock_off_ms(one: _Peer, frame: Frame) -> int:
 
 
 def _is_another_clock_too_soon(sender: _Sender, frame: Frame) -> bool:
-    """Return whether a known peer that fell silent a moment ago had another clock."""
+    """Return whether a known peer that fell silent a moment ago had another clock.
+
+    Stamps ahead of the fastest that it delivered are another clock's too: several would move it.
+    """
     return any(
-        frame.t_ns - one.heard_ns <= REBOOT_NS and _is_off_clock(one, frame)
+        frame.t_ns - one.heard_ns <= REBOOT_NS
+        and (_is_off_clock(one, frame) or _is_ahead(one, frame))
         for one in sender.known.values()
     )
 

@@ -567,6 +567,21 @@ def test_first_peer_whose_vehicle_was_restarted_stays_believed() -> None:
     assert len([t_s for t_s in found[OTHER] if t_s > 33.0]) > 260
 
 
+@pytest.mark.parametrize("ahead_s", [1.2, 4.0, 9.0])
+def test_stamps_ahead_of_time_in_gaps_of_a_radio_are_not_used(ahead_s: float) -> None:
+    """A datagram in each gap moved the clock of a standing carrier: anybody knows its place."""
+    peers, at_rest, used = KnownPeers(), Place(0.0, 0.0, 0.0, 0.0), []
+    for number in range(600):
+        t_s = number / 10
+        if t_s % 8 < 6.7:
+            assert peers.refusal(LINK, HOME, report(round(t_s * S), 100 + t_s, at_rest)) is None
+        elif t_s % 8 > 7.8:
+            forged = report(round(t_s * S), 100 + t_s + ahead_s, at_rest)
+            used.append(peers.refusal(LINK, f"10.0.0.66:{number}", forged) is None)
+    assert len(used) > 5
+    assert not any(used)
+
+
 def test_rank_of_a_peer_depends_on_the_others_that_are_current() -> None:
     peers, source = with_two_known_peers(frozenset({"10.0.0.9"})), Source(1, 1)
     now_ns = 20 * S

@@ -51,7 +51,7 @@ from typing import Final
 from companion.mavlink.trust.attitude_difference import contradict
 from companion.mavlink.trust.duplicate_ids import CONTRADICTIONS, KEPT_NS, SPACED_NS
 from companion.mavlink.trust.paths import RESTARTED_MS, SLACK_M, Path
-from companion.mavlink.trust.peer_clock import PeerClock, has_stamp, stamp_ms
+from companion.mavlink.trust.peer_clock import AHEAD_MS, PeerClock, has_stamp, stamp_ms
 from companion.mavlink.trust.peer_notices import NOTICE_NS, Disagreement, PeerNotice
 from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, first_has_fix
 from companion.mavlink.wire.decode import (
@@ -99,11 +99,6 @@ BROUGHT_NS: Final = {ATTITUDE: 300_000_000, **dict.fromkeys((*_OF_FIRST, HEARTBE
 """Messages that move bounds, and the time for which one excludes those of peers known later."""
 OVERTAKEN_MS: Final = 300
 """How late a peer that was known first must have become, and how much newer other attitudes are."""
-AHEAD_MS: Final = 1000
-"""Largest lead of a stamp over the fastest that a peer known earlier has delivered.
-
-A clock follows a smaller lead at once, and would follow a larger one once several stamps agree.
-"""
 LATE_MS: Final = 1000  # largest delay of a stranger's position that is used
 EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
 LEAD_NS: Final = 10_000_000_000  # time after which leads over a peer's fastest stamps are announced
@@ -277,7 +272,7 @@ class KnownPeers:
             if frame.t_ns >= known.clock.due_ns:
                 known.clock.observe(frame)
         if not is_only and has_stamp(frame):
-            earlier = _current_earlier(sender, known, frame.t_ns)
+            earlier = _earlier(sender, known, frame.t_ns)
             if any(_is_off_clock(one, frame) for one in earlier):
                 return STRANGER
             if any(_is_ahead(one, frame) for one in earlier):
@@ -401,7 +396,7 @@ class KnownPeers:
         """Make a peer a stranger that became so late that its stamps look like another clock.
 
         They are of the same clock if its position agrees with where another peer had the vehicle by
-        these stamps.
+        these stamps, and that peer's stamps are of the clock that the late one had before.
         """
         if known.is_router:
             return False
@@ -411,6 +406,8 @@ class KnownPeers:
                 continue
             newest = other.path.newest
             if newest is None or step_ms(newest.boot_ms, said.boot_ms) <= RESTARTED_MS:
+                continue
+            if other.stamped is None or not known.clock.had(other.stamped):
                 continue
             if _agrees(known.path.excess_m(other.path, None, said)):
                 self._notify(sender, Disagreement.FALLS_BEHIND, peer, frame)
@@ -558,14 +555,21 @@ def _is_overtaken(earlier: _Peer, same: Frame, frame: Frame) -> bool:
     return is_newer and delay_ms > OVERTAKEN_MS and late_ms > -EARLY_MS
 
 
-def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
-    """Return the current peers that were known earlier; none for a router."""
+def _earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
+    """Return the peers that were known earlier and are not silent for long; none for a router."""
     if known.is_router:
         return []
     standing = _standing(known)
     return [
-        one for one in sender.known.values() if _standing(one) > standing and one.is_current(now_ns)
+        one
+        for one in sender.known.values()
+        if _standing(one) > standing and now_ns - one.heard_ns <= REBOOT_NS
     ]
+
+
+def _current_earlier(sender: _Sender, known: _Peer, now_ns: int) -> list[_Peer]:
+    """Return the current peers that were known earlier; none for a router."""
+    return [one for one in _earlier(sender, known, now_ns) if one.is_current(now_ns)]
 
 
 def _is_ahead(one: _Peer, frame: Frame, by_ms: int = AHEAD_MS) -> bool:

@@ -8,37 +8,59 @@ from companion.mavlink.wire.stamps import STAMPED, boot_ms, step_ms
 from companion.values import Frame
 
 DRIFT: Final = 100e-6  # largest drift of a boot clock, ten times that of a good crystal
+AHEAD_MS: Final = 1000
+"""Largest lead of a stamp over the fastest that a peer known earlier has delivered.
+
+A clock follows a smaller lead at once, and would follow a larger one once several stamps agree.
+"""
 SAMPLE_NS: Final = 1_000_000_000  # time between two messages that are compared with the fastest
 
 
 class PeerClock:
     """The fastest message of a peer, and the delay of others beyond it.
 
+    Messages that are more than ``RESTARTED_MS`` late begin anew; those before are kept too, for the
+    peer may have become late.
+
     ``due_ns`` is when the next message is to be observed: the delay need not be followed by each.
     """
 
-    __slots__ = ("_fastest", "due_ns")
+    __slots__ = ("_fastest", "_former", "due_ns")
 
     def __init__(self) -> None:
         self.due_ns = 0
         self._fastest: Frame | None = None
+        self._former: Frame | None = None  # the fastest one before it began anew
 
     def observe(self, frame: Frame) -> None:
         """Note a message with a stamp. One of another boot clock begins anew."""
         self.due_ns = frame.t_ns + SAMPLE_NS
         late_ms = self.late_ms(frame)
-        if late_ms is None or late_ms <= 0.0 or late_ms > RESTARTED_MS:
+        if late_ms is None or late_ms <= 0.0:
             self._fastest = frame
+        elif late_ms > RESTARTED_MS:
+            self._former, self._fastest = self._fastest, frame
 
     def late_ms(self, frame: Frame) -> float | None:
         """Return the delay of a message beyond the fastest one; None without one.
 
         Negative for a stamp that this peer could not have delivered as early.
         """
-        if self._fastest is None:
-            return None
-        elapsed_ms = (frame.t_ns - self._fastest.t_ns) * 1e-6
-        return elapsed_ms * (1.0 - DRIFT) - step_ms(stamp_ms(frame), stamp_ms(self._fastest))
+        return None if self._fastest is None else _late_ms(self._fastest, frame)
+
+    def had(self, frame: Frame) -> bool:
+        """Return whether a stamp is of the clock that it had before it began anew, and no later.
+
+        As late as ``RESTARTED_MS`` at most, and ahead of its fastest message by a second at most.
+        """
+        if self._former is None:
+            return False
+        return -AHEAD_MS <= _late_ms(self._former, frame) <= RESTARTED_MS
+
+
+def _late_ms(fastest: Frame, frame: Frame) -> float:
+    elapsed_ms = (frame.t_ns - fastest.t_ns) * 1e-6
+    return elapsed_ms * (1.0 - DRIFT) - step_ms(stamp_ms(frame), stamp_ms(fastest))
 
 
 def stamp_ms(frame: Frame) -> int:

@@ -14,7 +14,8 @@ nothing.
   decide between equal values. If a third node is taking the UAV over meanwhile, the three can yield
   in a circle: it is free then, and claimed after ``CLAIM_DELAY_NS``.
 - A claim counts only while its node's own offer supports it: a node cannot take UAVs by claiming
-  more than it offers.
+  more than it offers. Nor can it keep them by offering little: what is assigned to another node and
+  not handed over for ``WITHHELD_NS`` is taken.
 """
 
 from collections.abc import Mapping
@@ -36,6 +37,8 @@ CLAIM_EXCESS_DB: Final = 20.0
 """Largest excess of a claim over the present offer of its node; offers change after a claim."""
 SETTLED_NS: Final = 2_000_000_000
 """Time for which a UAV must be assigned elsewhere before it is handed over."""
+WITHHELD_NS: Final = 6_000_000_000
+"""Time for which a UAV must be assigned here and not be handed over before it is taken."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -70,6 +73,7 @@ class Duties:
         self._others: dict[str, tuple[int, Standing]] = {}  # with the time of reception
         self._free_since: dict[str, int] = {}
         self._elsewhere: dict[str, tuple[str, int]] = {}
+        self._withheld_since: dict[str, int] = {}
         self._begun_ns: int | None = None
         self._wanted: dict[str, str] = {}
         self._assigned: tuple[int, frozenset[str]] = (0, frozenset())
@@ -218,8 +222,11 @@ class Duties:
                 break  # all that follow rank lower, too
             if uav in claims:
                 self._free_since.pop(uav, None)
-                if uav in handed:
+                is_mine = wanted.get(uav) == self._name
+                if uav in handed or (is_mine and self._is_withheld(now_ns, uav, claims, mine)):
                     self._serve(uav, mine[uav], rank)
+                elif not is_mine:
+                    self._withheld_since.pop(uav, None)
                 continue
             free_ns = now_ns - self._free_since.setdefault(uav, now_ns)
             late_ns = 0 if wanted.get(uav) == self._name else self._lease_ns
@@ -227,6 +234,20 @@ class Duties:
                 self._serve(uav, mine[uav], rank)
         for uav in [uav for uav in self._free_since if uav not in mine or uav in self.serves]:
             del self._free_since[uav]
+        for uav in [uav for uav in self._withheld_since if uav not in claims or uav in self.serves]:
+            del self._withheld_since[uav]
+
+    def _is_withheld(
+        self,
+        now_ns: int,
+        uav: str,
+        claims: Mapping[str, Mapping[str, float]],
+        mine: Mapping[str, float],
+    ) -> bool:
+        """Return whether others hold a UAV that is assigned here, by worse claims, for so long."""
+        if max(claims[uav].values()) >= mine[uav]:
+            return False
+        return now_ns - self._withheld_since.setdefault(uav, now_ns) >= WITHHELD_NS
 
     def _has_place(self, uav: str, rank: Mapping[str, int]) -> bool:
         """Return whether this node serves fewer UAVs than it may, or one that ranks lower."""

@@ -582,6 +582,26 @@ def test_stamps_ahead_of_time_in_gaps_of_a_radio_are_not_used(ahead_s: float) ->
     assert not any(used)
 
 
+def test_first_peer_is_believed_after_a_gap_in_which_another_ran_ahead() -> None:
+    """Beside stamps that run ahead within the gap, those of the first peer look late."""
+    peers, at_rest = KnownPeers(), Place(0.0, 0.0, 0.0, 0.0)
+
+    def refused(peer: str, t_s: float, ahead_s: float = 0.0) -> str | None:
+        return peers.refusal(LINK, peer, report(round(t_s * S), 100 + t_s + ahead_s, at_rest))
+
+    for number in range(120):
+        assert refused(HOME, number / 10) is None
+    ahead_s = [0.0, *(1.4 * number for number in range(10)), 13.0]
+    in_gap = [refused(OTHER, 13.1 + number / 100, by_s) for number, by_s in enumerate(ahead_s)]
+    assert in_gap[0] is None  # the vehicle's radio may have another address
+    for number in range(300):
+        t_s = 13.3 + number / 10
+        assert refused(HOME, t_s) is None
+        if number % 5 == 0:
+            assert refused(OTHER, t_s + 0.05, 13.0) == STRANGER
+    assert notices(peers, Disagreement.FALLS_BEHIND) == []
+
+
 def test_rank_of_a_peer_depends_on_the_others_that_are_current() -> None:
     peers, source = with_two_known_peers(frozenset({"10.0.0.9"})), Source(1, 1)
     now_ns = 20 * S

@@ -10,6 +10,7 @@ from companion.pipeline.fleet.duties import (
     ASSIGNMENTS_SAVED,
     CLAIM_DELAY_NS,
     SETTLED_NS,
+    WITHHELD_NS,
     Duties,
     Handover,
 )
@@ -252,4 +253,22 @@ def test_equal_claims_are_kept_by_the_first_node_by_name() -> None:
     node.run(1, said("b", ("1:1", 20.0)))
     assert list(node.duties.serves) == ["1:1"]
     node.run(0.1, said("b", ("1:1", 20.1)))
+    assert not node.duties.serves
+
+
+def test_uav_that_a_worse_node_keeps_is_taken() -> None:
+    """It claimed the UAV before any other node received it, and offers next to nothing."""
+    node = Alone(b=-290.0)
+    node.run(4, said("b", ("1:1", -290.0)))
+    node.worth["a"] = 20.0
+    node.run(WITHHELD_NS / S - 0.5, said("b", ("1:1", -290.0)))
+    assert not node.duties.serves
+    node.run(2, said("b", ("1:1", -290.0)))
+    assert list(node.duties.serves) == ["1:1"]
+
+
+@pytest.mark.parametrize("worth", [18.0, 20.0, 25.0])
+def test_uav_that_a_similar_node_keeps_is_left_to_it(worth: float) -> None:
+    node = Alone(a=20.0, b=worth)
+    node.run(20, said("b", ("1:1", worth)))
     assert not node.duties.serves

@@ -40,6 +40,7 @@ STEADIER_LINK: Final = "use a MAVLink link with a steadier delay"
 CHECK_LINK: Final = "check its MAVLink link: power, range, antenna"
 CHECK_SIGNING: Final = "check its signing key, and that its signing clock has not stepped back"
 CHECK_CARRIER: Final = "read its rejections in the notices, and check its GNSS receiver and id"
+CHECK_HEIGHT: Final = "check its barometer, and that both heights are above mean sea level"
 CHECK_GNSS: Final = "check its GNSS receiver and antenna, and look for interference"
 NAME_ROUTER: Final = "add the trusted peer to `[links] routers`"
 CHECK_RECEIVER: Final = "check the receiver that relays it, and the link to that receiver"
@@ -73,12 +74,14 @@ class LinkEvidence:
     carrier        facts about the carrier
     is_contradicted  whether the array sees it elsewhere than it reports
     dead_reckoning_s  time for which its receiver has had no fix
+    height_off_m   difference of its height and its receiver's
     """
 
     clock_assumed: bool
     refused: Reason | None
     is_contradicted: bool = False
     dead_reckoning_s: float = 0.0
+    height_off_m: float = 0.0
     waited_s: float = 0.0
     carrier: CarrierEvidence = field(default_factory=CarrierEvidence)
 
@@ -191,6 +194,11 @@ def of_beam(
                 return Blame(
                     Cause.POSITION, _without_fix(bound, evidence.dead_reckoning_s), CHECK_GNSS
                 )
+            if evidence.height_off_m > track.bound_m / 2:
+                off = (
+                    f"its altitude and its GNSS receiver's differ by {evidence.height_off_m:.0f} m"
+                )
+                return Blame(Cause.POSITION, f"{bound}: {off}", CHECK_HEIGHT)
             remedy = _remedy(
                 track,
                 "fly farther from the array, or fit a better GNSS receiver to the UAV",

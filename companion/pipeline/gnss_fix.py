@@ -136,6 +136,11 @@ class GnssFix:
         self.since_ns = self.second_ns = None
         self.has_first, self.is_certain, self.before_s = True, True, 0.0
 
+    @property
+    def is_trusted(self) -> bool:
+        """Whether it stated a fix for so long that it was no stranger in a gap of its radio."""
+        return self.since_ns is not None and self.fixed_ns - self.since_ns >= TRUSTED_NS
+
     def dead_reckoning_s(self, t_ns: int) -> float:
         """Return for how long the position has been dead reckoned; 0 with a fix.
 
@@ -146,9 +151,7 @@ class GnssFix:
             return 0.0
         if not self._is_lost(t_ns):
             return self._unsettled_s(t_ns)
-        assert self.since_ns is not None
-        is_trusted = self.fixed_ns - self.since_ns >= TRUSTED_NS
-        if not is_trusted and t_ns - self.heard_ns > FORGOTTEN_NS:
+        if not self.is_trusted and t_ns - self.heard_ns > FORGOTTEN_NS:
             return 0.0
         return self._unsettled_s(self.fixed_ns) + max(0, t_ns - self.fixed_ns) * 1e-9
 

@@ -481,9 +481,9 @@ class Senders:
                 if before is not None:
                     apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
                 component.apart_m2, apart_m = apart_m2, apart_m2**0.5
-            if is_recent:
-                if receiver is not component.compared:
-                    component.compare_height(report)
+            if receiver is not component.compared:
+                component.compare_height(report)
+            if is_recent or component.fix.is_trusted:
                 off_m = component.height_off_m
         known = known or self._noise_settings.default
         if component is not None and not component.fix.is_certain:
@@ -629,6 +629,12 @@ class Senders:
         """Return the state of a UAV's clock; None if no clock is known."""
         sender = self._senders.get(uav)
         return (sender.shared or sender).clock.estimate() if sender else None
+
+    def height_off_m(self, uav: str) -> float:
+        """Return by how much a vehicle's height differs from its receiver's, as its bound does."""
+        source = _source(uav)
+        component = None if source is None else self._components.get(source)
+        return 0.0 if component is None else component.height_off_m
 
     def dead_reckoning_s(self, uav: str, now_ns: int) -> float:
         """Return for how long a vehicle has had no GNSS fix; 0 if it has one, or never had."""

@@ -482,6 +482,28 @@ def test_bound_on_the_height_covers_a_drift_of_any_size() -> None:
     assert found[-1][0] > 60.0
 
 
+def test_difference_of_heights_outlasts_the_statuses_of_the_receiver() -> None:
+    def silent(events: Iterator[Any]) -> Iterator[Any]:
+        for event in events:
+            is_status = isinstance(event, Frame) and event.msgid == 24
+            if not (is_status and event.t_ns - START_NS > 45 * S):
+                yield event
+        for n in range(800):  # more than a minute without a status
+            t_s = ENDS_S + n / 10
+            yield position(t_s, UAV, (200.0, 0.0, -68.0), late_s=0.02)
+            yield Tick(START_NS + round((t_s + 0.05) * S))
+
+    found = heights_m(silent(drifting_heights(0.3)), 0.0)
+    assert len(found) > 1200
+    assert all(bound_m > 8.0 for _, bound_m in found[-200:])
+
+
+def test_link_that_suffers_names_the_heights_that_differ() -> None:
+    outputs, _ = flown(drifting_heights(2.0))
+    texts = [one.text for one in about(outputs, "link to")]
+    assert any("its altitude and its GNSS receiver's differ by" in text for text in texts), texts
+
+
 def test_heights_that_agree_cost_nothing_while_the_vehicle_climbs() -> None:
     found = heights_m(drifting_heights(0.0, 9.0), 9.0)
     assert max(bound_m for _, bound_m in found[20:]) < 3.0

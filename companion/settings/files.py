@@ -1,6 +1,7 @@
 """Reading of settings from a TOML file, and of the files that these settings name."""
 
 import errno
+import warnings
 from collections.abc import Mapping
 from importlib import resources
 from io import BytesIO
@@ -113,7 +114,8 @@ def _text_file(key: str, name: str) -> NDArray[Any]:
 def _npy(where: str, data: bytes, kinds: str) -> NDArray[Any]:
     """Return the array of a .npy file whose dtype kind is one of the letters in ``kinds``."""
     try:
-        found = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
+        with warnings.catch_warnings(action="ignore"):  # of headers that Python 2 wrote
+            found = np.lib.format.read_array(BytesIO(data), allow_pickle=False)
     except MemoryError as error:
         raise ConfigError(f"{where}: array is too large for the memory: {error}") from error
     except NPY_ERRORS as error:

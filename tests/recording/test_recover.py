@@ -9,9 +9,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from click.testing import CliRunner
 from mcap.reader import make_reader
 from support import HANG_S, line_of, read_metadata, rounds, started
 
+from companion.cli.main import main
 from companion.recording.reader import LogError, read_log, read_settings
 from companion.recording.recover import Recovered, recover, recover_leftovers
 from companion.recording.writer import Writer
@@ -326,3 +328,22 @@ def test_killed_process_loses_no_flushed_event(tmp_path: Path) -> None:
     assert len(events) >= flushed
     assert result.messages == {"/mavlink/frames": len(events)}
     assert read_settings(result.path) == ("[a]", {})
+
+
+def test_command_completes_all_files_that_can_be(
+    tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]]
+) -> None:
+    data = recording[0].read_bytes()
+    for name in ("one", "two"):
+        (tmp_path / f"{name}.mcap.active").write_bytes(data[: len(data) // 2])
+    (tmp_path / "no.mcap.active").write_bytes(b"no recording")
+    names = ["one.mcap.active", "no.mcap.active", "missing", "two.mcap.active"]
+    done = CliRunner().invoke(main, ["recover", *(str(tmp_path / name) for name in names)])
+    assert done.exit_code == 1
+    assert [line.split(":")[0] for line in done.stdout.splitlines()] == [
+        str(tmp_path / "one.mcap"),
+        str(tmp_path / "two.mcap"),
+    ]
+    lines = done.stderr.splitlines()
+    assert len(lines) == 2
+    assert "no.mcap.active" in lines[0] and "missing" in lines[1]

@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from companion.client import ServiceError
 
 EVERY_S: Final = 1.0  # time between two requests
+NAME_MAX: Final = 64  # largest width of the column of names
 
 
 @click.group()
@@ -55,7 +56,7 @@ def watch(url: str, seconds: float | None, as_json: bool) -> None:
     while True:
         try:
             answer = _fleet_answer(node.fleet(), url)
-            say(json.dumps(answer) if as_json else _text(answer))
+            say(json.dumps(answer) if as_json else _text(answer, url))
         except ServiceError as error:
             if answer is None:
                 raise UserError(_error_text(url, error)) from error
@@ -82,9 +83,16 @@ def _error_text(url: str, error: "ServiceError") -> str:
     return f"{url}: {error}{hint}"
 
 
-def _text(answer: dict[str, Any]) -> str:
+def _text(answer: dict[str, Any], url: str) -> str:
+    try:
+        return _table(answer)
+    except (AttributeError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{url}: malformed answer of /v1/fleet; check the address") from error
+
+
+def _table(answer: dict[str, Any]) -> str:
     lines = [f"{answer['valid_at']}  fleet {answer['site']}, seen from {answer['node']}"]
-    width = max(len(node["node"]) for node in answer["nodes"])
+    width = min(NAME_MAX, max(len(node["node"]) for node in answer["nodes"]))
     for node in answer["nodes"]:
         if node["state"] == "gone":
             lines.append(f"  {node['node']:{width}} gone, {node['heard_s']:.0f} s ago")

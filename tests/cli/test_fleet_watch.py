@@ -103,6 +103,15 @@ def test_fleet_watch_lists_serving_nodes_and_warnings(service: Service) -> None:
     assert "1:1 is" not in said
 
 
+def test_long_names_of_nodes_make_no_wide_table(service: Service) -> None:
+    """Each of 1500 names was padded to one of 500 kB: 3.8 GB."""
+    nodes = [FLEET["nodes"][-1] | {"node": name} for name in ["n" * 500_000, *map(str, range(300))]]
+    service.answers = [(200, json.dumps(FLEET | {"nodes": nodes}))]
+    done = watch(service.url, "--seconds", "0.001")
+    assert done.exit_code == 0, done.stderr
+    assert len(done.stdout) < 1_000_000
+
+
 def test_fleet_watch_json_prints_one_line_per_response(service: Service) -> None:
     done = watch(service.url, "--seconds", "0.001", "--json")
     for line in done.stdout.splitlines():
@@ -115,6 +124,7 @@ def test_fleet_watch_json_prints_one_line_per_response(service: Service) -> None
     [
         (200, json.dumps(FLEET | {"node": None}), ": node is not in a fleet; set its [fleet] node"),
         (200, "{}", ": not a companion: no node in /v1/fleet; check the address"),
+        (200, '{"node": "north"}', ": malformed answer of /v1/fleet; check the address"),
         (200, "[1]", "the answer is not a JSON object"),
         (200, "<html>", "the answer is not JSON"),
         (404, "", "404: Not Found"),

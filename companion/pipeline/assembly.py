@@ -40,6 +40,8 @@ from companion.values import FloatArray, Limits, LimitSource, ReportNoise, UserE
 FLOOR_MARGIN_DB: Final = 2.9
 """Default margin of a likely beam's gain floor above the gain that the link needs, dB."""
 COUPLED_MAX: Final = 512  # most elements with coupling; an update of 1024 takes 0.3 s
+EXTENT_WAVELENGTHS_MAX: Final = 20_000
+"""Largest extent of an array: patterns are sampled at each side lobe."""
 DEVICE_ELEMENTS_MAX: Final = 1024  # with a device: the search takes time and memory
 COUPLING_MAX: Final = 1e6
 """Limit of the largest entry of a coupling matrix; its inverse is the lower limit."""
@@ -53,6 +55,12 @@ def array(settings: Settings) -> geometry.Array:
     Raises ``ConfigError``.
     """
     placed = elements.placed(settings)
+    extent = 2.0 * np.linalg.norm(placed.centred_m, axis=1).max() / placed.wavelength_m
+    if extent > EXTENT_WAVELENGTHS_MAX:
+        raise ConfigError(
+            f"array: elements are up to {extent:.3g} wavelengths apart, the limit is"
+            f" {EXTENT_WAVELENGTHS_MAX}; check their positions, in metres, and `frequency_hz`"
+        )
     size, dead = placed.size, sorted(set(settings.array.dead))
     live = None
     if dead:

@@ -470,6 +470,17 @@ def test_large_files_are_rejected_before_they_are_parsed(
     assert "\n" not in str(error.value)
 
 
+def test_elements_that_are_too_far_apart_are_rejected(tmp_path: Path) -> None:
+    """Three of them, 20 km apart, took 1.7 GB: patterns are sampled at each side lobe."""
+    (tmp_path / "x.csv").write_text("10000,0,0\n0,10000,0\n-10000,0,0\n")
+    config = tmp_path / "settings.toml"
+    config.write_text(f"[array]\nkind = 'list'\npositions = '{tmp_path / 'x.csv'}'\n")
+    with pytest.raises(
+        ConfigError, match=r"up to 2\.\d+e\+06 wavelengths apart, the limit is 20000"
+    ):
+        assembly.array(embedded(load(config)))
+
+
 def test_device_of_more_than_1024_elements_is_rejected() -> None:
     """The search of its settings took 20 s and 650 MB for 4096."""
     given = Settings().override(array={"elements": 1025}, hardware={"device": "adar1000"})

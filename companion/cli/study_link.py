@@ -5,7 +5,7 @@ from typing import Any
 
 import click
 
-from companion.cli.console import CENTER, CONFIG, SEED, FiniteRange, Progress, print_truncated
+from companion.cli.console import CENTER, CONFIG, SEED, Progress, print_truncated
 from companion.cli.study_output import Studied, study_output
 from companion.values import shown
 
@@ -46,12 +46,8 @@ def _range(
     default="pilots",
     help="Channel estimation at the receiver.",
 )
-@click.option(
-    "--interval", type=FiniteRange(0.01, 60), default=0.15, help="Seconds between reports."
-)
-@click.option(
-    "--latency", type=FiniteRange(0, 60), default=0.05, help="Latency of a report, seconds."
-)
+@click.option("--interval", type=float, default=0.15, help="Seconds between reports.")
+@click.option("--latency", type=float, default=0.05, help="Latency of a report, seconds.")
 @click.option(
     "--rician-k",
     type=float,

@@ -81,8 +81,8 @@ class Reports:
     latency_s: float = 0.05
 
     def __post_init__(self) -> None:
-        if not 0 < self.interval_s <= 2:
-            raise UserError(f"--interval {self.interval_s:g}: give seconds above 0 and at most 2")
+        if not 0.01 <= self.interval_s <= 2:
+            raise UserError(f"--interval {self.interval_s:g}: give seconds from 0.01 to 2")
         if not 0 <= self.latency_s <= 2:
             raise UserError(f"--latency {self.latency_s:g}: give seconds from 0 to 2")
 

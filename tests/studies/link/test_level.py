@@ -149,6 +149,7 @@ def test_link_study_reads_a_log_through_the_pipeline(tmp_path: Path) -> None:
         (("--instants", 0), "--instants 0: give 1 to 10000"),
         (("--blocks", 5000), "--blocks 5000: give 1 to 1000"),
         (("--interval", 0), "--interval 0: give seconds"),
+        (("--interval", 1e-12), "--interval 1e-12: give seconds from 0.01 to 2"),
         (("--latency", -1), "--latency -1: give seconds"),
         (("--center", "5:1"), "--center needs a LOG"),
         (("nowhere.tlog",), "nowhere.tlog"),

@@ -17,7 +17,7 @@ from companion.values import UserError
 def recover(files: tuple[Path, ...], as_json: bool) -> None:
     """Complete recordings that were cut short, and print how much was lost.
 
-    Exit status 1: a file is no recording; the others are completed.
+    Exit status 1: a file cannot be completed; the others are.
 
     Example: companion recover recordings/companion-20260101T120000Z.mcap.active
     """

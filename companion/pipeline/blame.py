@@ -195,9 +195,7 @@ def of_beam(
                     Cause.POSITION, _without_fix(bound, evidence.dead_reckoning_s), CHECK_GNSS
                 )
             if evidence.height_off_m > track.bound_m / 2:
-                off = (
-                    f"its altitude and its GNSS receiver's differ by {evidence.height_off_m:.0f} m"
-                )
+                off = f"its altitude differs by {evidence.height_off_m:.0f} m from its receiver's"
                 return Blame(Cause.POSITION, f"{bound}: {off}", CHECK_HEIGHT)
             remedy = _remedy(
                 track,

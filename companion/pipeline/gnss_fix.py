@@ -24,7 +24,8 @@ What was forged in a gap of a vehicle's radio would last for ever otherwise.
 NOTICE_NS: Final = 60_000_000_000  # least time between two notices of a kind about one vehicle
 SILENT_NS: Final = 10_000_000_000
 """Time without GPS_RAW_INT, of a vehicle that stated fixes regularly, that is announced."""
-REGULAR_NS: Final = 5_000_000_000  # longest time between two regular statuses
+REGULAR_NS: Final = 5_000_000_000
+"""Longest time between two regular statuses, of a receiver or an estimator."""
 NEVER_NS: Final = 2**63 - 1
 
 

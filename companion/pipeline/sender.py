@@ -5,7 +5,7 @@ from typing import Final
 
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.wire.stamps import step_ms
-from companion.pipeline.gnss_fix import GnssFix
+from companion.pipeline.gnss_fix import REGULAR_NS, GnssFix
 from companion.tracking.noise import STATED_NS, StatedNoise
 from companion.values import FIX_3D, GnssStatus, Reason, Report
 
@@ -18,7 +18,6 @@ ANOTHER_CLOCK_NS: Final = 10_000_000_000
 """Time for which a clock is known from its newest stamp here, whatever other nodes share."""
 ANOTHER_CLOCK_LATE_NS: Final = 3_000_000_000
 """Lateness of a stamp here, by a clock that others shared, which shows that this was another."""
-REGULAR_NS: Final = 5_000_000_000  # longest time between regular statuses of an estimator
 NEAR_HEIGHT_M: Final = 50.0
 """Largest difference between the heights of receiver and autopilot in a valid report.
 
@@ -120,6 +119,7 @@ class ComponentState:
         descent_mps = report.velocity_down_mps or 0.0
         fell_m = descent_mps * (report.t_ns - status.t_ns) * 1e-9
         above_m = report.alt_m - (status.alt_m - fell_m)
+        # Without `abs`: one call less for each report.
         apart_m = self.apart_from_receiver_m = above_m if above_m > 0.0 else -above_m
         is_drift = apart_m < NEAR_HEIGHT_M or self.height_off_m > NEAR_HEIGHT_M / 2
         self.height_off_m = apart_m if is_drift else 0.0
@@ -128,8 +128,9 @@ class ComponentState:
         """Note that their difference is announced; return the text."""
         apart_m = self.apart_from_receiver_m
         self.height_noticed_m = HEIGHT_NOTICE_RATIO * apart_m
-        covers = "its bound covers it" if self.height_off_m else "one of them is invalid"
-        return f"its altitude and its GNSS receiver's differ by {apart_m:.0f} m; {covers}"
+        covered = "the position bound covers the difference"
+        then = covered if self.height_off_m else "one of the two is invalid"
+        return f"its altitude differs by {apart_m:.0f} m from its GNSS receiver's; {then}"
 
     def note_type(self, newest: tuple[int, int], t_ns: int) -> None:
         """Note the type and autopilot of a heartbeat; forget those of long ago."""
@@ -165,7 +166,7 @@ class Sender:
     shared: SharedState | None = None
     stamped_ns: int | None = None  # arrival of the clock's newest stamp; None: none yet
     is_shared: bool = False  # whether a notice said that two senders share this id
-    has_late_copies: bool = False  # whether a notice said so
+    has_late_copies: bool = False  # whether a notice said that reports over 10 s old arrive
     first: tuple[int, int] | None = None  # arrival and stamp of an event that none confirmed yet
     newest: tuple[int, int] | None = None  # the same of the newest event that was placed
 

@@ -106,18 +106,18 @@ class VelocityCheck:
         then_ns, north_0, east_0, down_0, allowed_0 = kept[:_NUMBERS]
         flown_m = math.hypot(*fix.velocity_ned_mps or ()) * (fix.noise.time_s + STAMP_S)
         allowed_m = 2.0 * flown_m + allowed - allowed_0
-        across_m = math.hypot(north - north_0, east - east_0)
-        across_m -= allowed_m + 2.0 * fix.noise.horizontal_m
-        along_m = down - down_0 if down > down_0 else down_0 - down
-        along_m -= allowed_m + 2.0 * fix.noise.vertical_m
-        if across_m <= 0.0 and along_m <= 0.0:  # nearly always
+        horizontal_m = math.hypot(north - north_0, east - east_0)
+        horizontal_m -= allowed_m + 2.0 * fix.noise.horizontal_m
+        vertical_m = down - down_0 if down > down_0 else down_0 - down
+        vertical_m -= allowed_m + 2.0 * fix.noise.vertical_m
+        if horizontal_m <= 0.0 and vertical_m <= 0.0:  # nearly always
             return 0.0
-        if across_m > 0.0:
+        if horizontal_m > 0.0:
             norths, easts = kept[1::_NUMBERS], kept[2::_NUMBERS]
-            across_m -= _largest_step_m([*zip(norths, easts, strict=True), (north, east)])
-        if along_m > 0.0:
-            along_m -= _largest_step_m([*zip(kept[3::_NUMBERS], strict=True), (down,)])
-        return max(0.0, across_m, along_m) / ((fix.sender_ns - then_ns) * 1e-9)
+            horizontal_m -= _largest_step_m([*zip(norths, easts, strict=True), (north, east)])
+        if vertical_m > 0.0:
+            vertical_m -= _largest_step_m([*zip(kept[3::_NUMBERS], strict=True), (down,)])
+        return max(0.0, horizontal_m, vertical_m) / ((fix.sender_ns - then_ns) * 1e-9)
 
 
 def _largest_step_m(places: list[tuple[float, ...]]) -> float:

@@ -39,7 +39,7 @@ STARTS: Final = 4  # best rotations from which the descent starts
 SWEEPS: Final = 100
 """Most sweeps of the coordinate descent; it usually ends after three to eight."""
 MOVES: Final = 2048
-"""Most elements that the descent moves, about a third of a millisecond each, or one sweep."""
+"""Most moves of the descent, each of a third of a millisecond; one sweep is always made."""
 REACH: Final = 2  # steps of phase, gain, I or Q that one move may take
 NEAR: Final = np.array([(i, j) for i in range(-REACH, REACH + 1) for j in range(-REACH, REACH + 1)])
 """All moves between codes within ``REACH``, as pairs of steps."""

@@ -212,7 +212,7 @@ class BootLine:
         return self._rivals.has_clock(arrival_ns)
 
     def has_late_copies(self, arrival_ns: int) -> bool:
-        """Return whether stamps without a time arrive beside newer ones: copies, or of another."""
+        """Return whether stamps arrive that have no time, as copies over a slow route have none."""
         return self._copies.has_clock(arrival_ns)
 
     def _nearest_ns(self, arrival_ns: int, boot_ms: int) -> int:

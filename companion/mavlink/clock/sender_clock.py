@@ -131,7 +131,7 @@ class SenderClock:
         return self._line.is_shared(arrival_ns)
 
     def has_late_copies(self, arrival_ns: int) -> bool:
-        """Return whether stamps arrive that are too late to have a time, beside newer ones."""
+        """Return whether stamps arrive that have no time, as copies over a slow route have none."""
         return self._line.has_late_copies(arrival_ns)
 
     # --- two-way evidence -------------------------------------------------------------------

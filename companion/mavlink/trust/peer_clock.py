@@ -49,9 +49,10 @@ class PeerClock:
         return None if self._fastest is None else _late_ms(self._fastest, frame)
 
     def had(self, frame: Frame) -> bool:
-        """Return whether a stamp is of the clock that it had before it began anew, and no later.
+        """Return whether a stamp is of the clock that the peer had before it began anew.
 
-        As late as ``RESTARTED_MS`` at most, and ahead of its fastest message by a second at most.
+        It is at most ``RESTARTED_MS`` later than the fastest message of that clock, and at most
+        ``AHEAD_MS`` ahead of it.
         """
         if self._former is None:
             return False

@@ -222,11 +222,9 @@ class Duties:
                 break  # all that follow rank lower, too
             if uav in claims:
                 self._free_since.pop(uav, None)
-                is_mine = wanted.get(uav) == self._name
-                if uav in handed or (is_mine and self._is_withheld(now_ns, uav, claims, mine)):
+                is_better = wanted.get(uav) == self._name and max(claims[uav].values()) < mine[uav]
+                if uav in handed or self._is_withheld(now_ns, uav, is_better):
                     self._serve(uav, mine[uav], rank)
-                elif not is_mine:
-                    self._withheld_since.pop(uav, None)
                 continue
             free_ns = now_ns - self._free_since.setdefault(uav, now_ns)
             late_ns = 0 if wanted.get(uav) == self._name else self._lease_ns
@@ -237,15 +235,10 @@ class Duties:
         for uav in [uav for uav in self._withheld_since if uav not in claims or uav in self.serves]:
             del self._withheld_since[uav]
 
-    def _is_withheld(
-        self,
-        now_ns: int,
-        uav: str,
-        claims: Mapping[str, Mapping[str, float]],
-        mine: Mapping[str, float],
-    ) -> bool:
-        """Return whether others hold a UAV that is assigned here, by worse claims, for so long."""
-        if max(claims[uav].values()) >= mine[uav]:
+    def _is_withheld(self, now_ns: int, uav: str, is_better: bool) -> bool:
+        """Return whether this node has been the better one for long, but is not given the UAV."""
+        if not is_better:
+            self._withheld_since.pop(uav, None)
             return False
         return now_ns - self._withheld_since.setdefault(uav, now_ns) >= WITHHELD_NS
 

@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 
-from companion.pipeline.assumptions import ARRAY
+from companion.pipeline.assumptions import ARRAY, ATTITUDE_BOUND
 from companion.pipeline.sighted_uavs import Look, Looks, SightedUavs
 from companion.settings.observations import ObservationSettings
 from companion.tracking import compass
@@ -28,6 +28,8 @@ FRESH_NS: Final = 1_000_000_000  # age of a UAV's sightings beyond which they sa
 FORGOTTEN_NS: Final = 10_000_000_000  # age of sightings beyond which nothing follows from them
 PERSISTENT_NS: Final = 1_000_000_000
 """Time for which a UAV must be seen elsewhere than it reports until its position is refuted."""
+RESTORED_NS: Final = 5_000_000_000
+"""Time for which evidence must confine the error to a refuted bound until that is assumed again."""
 RAISED: Final = 1.25  # multiple of a refuted bound, and of a proven error, that is assumed then
 WIDEST_RAD: Final = math.radians(30.0)  # largest error of reported attitudes that is considered
 
@@ -44,6 +46,8 @@ class ArrayCompass:
         self._drift_radps = math.radians(settings.drift_max_degps)
         self._uavs = uavs
         self._raised_rad = 0.0
+        self._raised_by = 0  # UAVs whose directions refuted the bound
+        self._holds_since_ns: int | None = None  # since when it holds by at least as many
         self.bound_rad = bound_rad
         self._by_evidence = ErrorSet.within(WIDEST_RAD)
         self._updated: tuple[int, FloatArray] | None = None  # when, and body_from_local
@@ -100,7 +104,25 @@ class ArrayCompass:
         self._updated = now_ns, carrier.body_from_local
         self._by_evidence = self._confined(known, seen)
         self._uavs.likely.solve()
-        return [*self._judge(now_ns, seen), *self._bounded(now_ns, self._least_rad(seen))]
+        found: list[Notice | Refuted] = [*self._judge(now_ns, seen)]
+        found += self._bounded(now_ns, self._least_rad(seen))
+        self._restore(now_ns, bound_rad)
+        return found
+
+    @property
+    def is_raised(self) -> bool:
+        """Whether evidence refuted the bound by the settings, and has not confirmed it since."""
+        return self._raised_rad > 0.0
+
+    def _restore(self, now_ns: int, bound_rad: float) -> None:
+        """Assume the bound by the settings again once evidence confines the error to it."""
+        is_small = self.error is not None and self.error.largest_rad <= bound_rad
+        if not (self._raised_rad and is_small and self.observed >= self._raised_by):
+            self._holds_since_ns = None
+        elif self._holds_since_ns is None:
+            self._holds_since_ns = now_ns
+        elif now_ns - self._holds_since_ns >= RESTORED_NS:
+            self._raised_rad = 0.0
 
     def _least_rad(self, seen: Sequence[Seen]) -> float:
         """Return the least error that evidence proves, if no more UAVs are false than may be."""
@@ -186,12 +208,13 @@ class ArrayCompass:
         center_rad = rotation_angle_rad(found.center)
         least_rad = max(least_rad, center_rad - found.bound_rad, limit_rad)
         self.bound_rad = self._raised_rad = RAISED * least_rad
+        self._raised_by = self.observed
         self.error = self._by_evidence.within_ball(self.bound_rad) or found
         return [
             Refuted(
                 t_ns=now_ns,
                 uav=ARRAY,
-                setting="center.attitude_bound_deg",
+                setting=ATTITUDE_BOUND,
                 limit=math.degrees(limit_rad),
                 proven=math.degrees(least_rad),
                 raised_to=math.degrees(self._raised_rad),

@@ -1,5 +1,6 @@
 """Refuted assumptions, each with the setting that contains it. Each is reported once."""
 
+import math
 from typing import Final
 
 from companion.mavlink.clock.estimates import ClockChange
@@ -7,6 +8,7 @@ from companion.pipeline.records import UavRecord, UavRecords
 from companion.settings.tracking import ClockSettings
 from companion.values import Estimate, Notice, Refuted, Severity
 
+ATTITUDE_BOUND: Final = "center.attitude_bound_deg"
 NOTICE_RATIO: Final = 1.25  # multiple of the value last reported above which a notice is repeated
 _UNITS: Final = {
     "observer.speed_max_mps": "m/s",
@@ -15,7 +17,7 @@ _UNITS: Final = {
     "clocks.constant_delay_s": "s",
     "clocks.drift_max_ppm": "ppm",
     "center.turn_acceleration_max_degps2": "°/s²",
-    "center.attitude_bound_deg": "°",
+    ATTITUDE_BOUND: "°",
 }
 ARRAY: Final = "array"  # subject of what the array's own measurements refute
 NOTICED_STEP_S: Final = 0.02
@@ -44,6 +46,19 @@ def notices(records: UavRecords, *refuted: Refuted | None) -> list[Refuted | Not
                 )
             )
     return out
+
+
+def attitude_bound_restored(records: UavRecords, t_ns: int, bound_rad: float) -> Notice:
+    """Return the notice that the array confirms the bound on attitudes that it had refuted.
+
+    A new refutation is announced again.
+    """
+    records[ARRAY].proven.pop(ATTITUDE_BOUND, None)
+    text = (
+        "the array sees UAVs again where the carrier's attitude puts them; an attitude error of up"
+        f" to {math.degrees(bound_rad):.2g}° is assumed again"
+    )
+    return Notice(t_ns=t_ns, severity=Severity.INFO, subject=ARRAY, text=text)
 
 
 def clock_changed(
@@ -161,13 +176,13 @@ def _refutation_text(one: Refuted) -> str:
             f"{one.uav}: its positions contradict its velocities by {one.proven:.2g} m/s, beyond"
             f" {one.setting} ({one.limit:.2g}); {one.raised_to:.2g} m/s is assumed now"
         )
-    if one.setting == "center.attitude_bound_deg" and one.uav == ARRAY:
+    if one.setting == ATTITUDE_BOUND and one.uav == ARRAY:
         return (
             f"the array sees UAVs at least {one.proven:.1f}° from where the carrier's attitude puts"
             f" them, beyond {one.setting} ({one.limit:.3g}°); up to {one.raised_to:.0f}° is assumed"
             " now: check the array's mount and the compass"
         )
-    if one.setting == "center.attitude_bound_deg":
+    if one.setting == ATTITUDE_BOUND:
         return (
             f"{one.uav}: an attitude error of up to {one.raised_to:.0f}° is assumed now, not"
             f" {one.limit:.3g}° ({one.setting}): its estimator or compass has a problem, or a GNSS"

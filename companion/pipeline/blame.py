@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 from typing import Final
 
 from companion.pipeline.angle_parts import AngleParts, ErrorSource, grown, largest
+from companion.pipeline.receiver_difference import ReceiverDifference
 from companion.pipeline.refusals import SIGNATURE_REASONS, UNPROVEN
 from companion.tracking.carrier import AttitudeParts
 from companion.values import (
@@ -41,6 +42,7 @@ CHECK_LINK: Final = "check its MAVLink link: power, range, antenna"
 CHECK_SIGNING: Final = "check its signing key, and that its signing clock has not stepped back"
 CHECK_CARRIER: Final = "read its rejections in the notices, and check its GNSS receiver and id"
 CHECK_HEIGHT: Final = "check its barometer, and that both heights are above mean sea level"
+CHECK_ESTIMATOR: Final = "check its GNSS receiver, and whether its estimator uses it"
 CHECK_GNSS: Final = "check its GNSS receiver and antenna, and look for interference"
 NAME_ROUTER: Final = "add the trusted peer to `[links] routers`"
 CHECK_RECEIVER: Final = "check the receiver that relays it, and the link to that receiver"
@@ -74,14 +76,14 @@ class LinkEvidence:
     carrier        facts about the carrier
     is_contradicted  whether the array sees it elsewhere than it reports
     dead_reckoning_s  time for which its receiver has had no fix
-    height_off_m   difference of its height and its receiver's
+    receiver_difference  difference of its position and its receiver's
     """
 
     clock_assumed: bool
     refused: Reason | None
     is_contradicted: bool = False
     dead_reckoning_s: float = 0.0
-    height_off_m: float = 0.0
+    receiver_difference: ReceiverDifference = field(default_factory=ReceiverDifference)
     waited_s: float = 0.0
     carrier: CarrierEvidence = field(default_factory=CarrierEvidence)
 
@@ -194,9 +196,11 @@ def of_beam(
                 return Blame(
                     Cause.POSITION, _without_fix(bound, evidence.dead_reckoning_s), CHECK_GNSS
                 )
-            if evidence.height_off_m > track.bound_m / 2:
-                off = f"its altitude differs by {evidence.height_off_m:.0f} m from its receiver's"
-                return Blame(Cause.POSITION, f"{bound}: {off}", CHECK_HEIGHT)
+            off = evidence.receiver_difference.larger
+            if off.covered_m > track.bound_m / 2:
+                check = CHECK_HEIGHT if off.what == "altitude" else CHECK_ESTIMATOR
+                off_text = off.text(f"up to {off.covered_m:.0f}")
+                return Blame(Cause.POSITION, f"{bound}: {off_text}", check)
             remedy = _remedy(
                 track,
                 "fly farther from the array, or fit a better GNSS receiver to the UAV",

@@ -317,7 +317,7 @@ class Pipeline:
             carrier=carrier(),
             is_contradicted=self.observing.is_refuted(uav),
             dead_reckoning_s=self.senders.dead_reckoning_s(uav, now_ns),
-            height_off_m=self.senders.height_off_m(uav),
+            receiver_difference=self.senders.receiver_difference(uav),
         )
 
     def _carrier_evidence(self, now_ns: int) -> CarrierEvidence:

@@ -126,13 +126,13 @@ class GnssFix:
         is_known = self.since_ns is not None and self.is_certain
         return self._notice(FixNotice.SILENT, t_ns) if is_known else None
 
-    def restarted(self, *, is_armed: bool) -> None:
-        """Forget all fixes: the vehicle was restarted. In flight a loss lasts until the next fix.
+    def restarted(self, *, is_in_flight: bool) -> None:
+        """Forget all fixes: the vehicle was restarted, on the ground.
 
-        A redundant autopilot may have taken over.
+        In flight a redundant autopilot took over: whether it has a fix, its statuses will show.
         """
         self.relative_ns, self.silent_ns = None, NEVER_NS
-        if is_armed and not self.has_first and self.second_ns is None:
+        if is_in_flight:
             return
         self.since_ns = self.second_ns = None
         self.has_first, self.is_certain, self.before_s = True, True, 0.0

@@ -211,11 +211,14 @@ class Observing:
             return []
         bound_rad = found.carrier.attitude_bound_rad - found.carrier.extrapolation_rad
         said: list[Output] = []
+        was_raised = self.compass.is_raised
         for one in self.compass.update(now_ns, found.carrier, bound_rad):
             if isinstance(one, Refuted):
                 said += assumptions.notices(self._records, one)
             else:
                 said.append(one)
+        if was_raised and not self.compass.is_raised:
+            said.append(assumptions.attitude_bound_restored(self._records, now_ns, bound_rad))
         return said
 
     def is_refuted(self, uav: str) -> bool:

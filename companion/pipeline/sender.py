@@ -6,8 +6,9 @@ from typing import Final
 from companion.mavlink.clock.sender_clock import SenderClock
 from companion.mavlink.wire.stamps import step_ms
 from companion.pipeline.gnss_fix import REGULAR_NS, GnssFix
+from companion.pipeline.receiver_difference import ReceiverDifference
 from companion.tracking.noise import STATED_NS, StatedNoise
-from companion.values import FIX_3D, GnssStatus, Reason, Report
+from companion.values import FIX_3D, GnssStatus, Reason
 
 CONFIRMED_NS: Final = 5_000_000_000
 """Largest difference between the steps of arrivals and of stamps of two reports that agree."""
@@ -18,15 +19,10 @@ ANOTHER_CLOCK_NS: Final = 10_000_000_000
 """Time for which a clock is known from its newest stamp here, whatever other nodes share."""
 ANOTHER_CLOCK_LATE_NS: Final = 3_000_000_000
 """Lateness of a stamp here, by a clock that others shared, which shows that this was another."""
-NEAR_HEIGHT_M: Final = 50.0
-"""Largest difference between the heights of receiver and autopilot in a valid report.
-
-Before an autopilot's height is valid it may be off by hundreds of metres (docs/field-notes.md 1).
-"""
-HEIGHT_OFF_M: Final = 3.0
-"""Least difference of the heights of autopilot and receiver that is announced."""
-HEIGHT_NOTICE_RATIO: Final = 2.0  # increase after which it is announced again
 NO_AUTOPILOT: Final = 8  # MAV_AUTOPILOT_INVALID
+AircraftType = tuple[int | None, int | None]
+"""Type and autopilot of a vehicle, as MAVLink numbers them."""
+UNKNOWN_TYPE: Final[AircraftType] = None, None
 TYPES_MAX: Final = 4  # newest types of a vehicle that are remembered
 TYPE_KEPT_NS: Final = 60_000_000_000
 """Time for which a type counts beside the newest one, so that a forged one does not last."""
@@ -38,12 +34,6 @@ class ComponentState:
 
     stated_us  the receiver's own time of that status; 0 if unknown or from before a reboot
     apart_m2   mean square of the receiver's height less the autopilot's, m²
-    compared, apart_from_receiver_m
-               newest status of the receiver whose height was compared, and the difference
-    height_off_m
-               the part of the bound on heights that the difference needs
-    height_noticed_m
-               difference that was announced last
     no_position_ns
                arrival of the estimator's newest status, if it has no valid position; else None
     position_ns, position_since_ns
@@ -53,17 +43,14 @@ class ComponentState:
     """
 
     heard_ns: int = 0  # arrival of the newest of these messages
-    types: dict[tuple[int, int], int] = field(default_factory=dict)
-    """Types and autopilots of its heartbeats, the newest last, with their newest arrivals."""
+    types: dict[AircraftType, int] = field(default_factory=dict)
+    """Types of its heartbeats, the newest last, with their newest arrivals."""
     is_armed: bool | None = None  # by its autopilot's newest heartbeat; None: none yet
     receiver: GnssStatus | None = None  # its newest GNSS status
     stated_us: int = 0
     noise: StatedNoise  # of its reports, by these statuses
     apart_m2: float | None = None
-    compared: GnssStatus | None = None
-    apart_from_receiver_m: float = 0.0
-    height_off_m: float = 0.0
-    height_noticed_m: float = HEIGHT_OFF_M
+    difference: ReceiverDifference = field(default_factory=ReceiverDifference)
     fix: GnssFix = field(default_factory=GnssFix)
     no_position_ns: int | None = None
     position_ns: int | None = None
@@ -74,7 +61,7 @@ class ComponentState:
         """Forget the receiver's clock and fixes: the vehicle was restarted."""
         self.stated_us = 0
         self.has_estimator, self.position_ns = False, None
-        self.fix.restarted(is_armed=bool(self.is_armed))
+        self.fix.restarted(is_in_flight=self.is_armed is not False)
 
     def note_estimator(self, *, knows_position: bool, t_ns: int) -> None:
         """Note a status of the estimator."""
@@ -107,37 +94,20 @@ class ComponentState:
             return False
         return self.receiver is None or self.receiver.fix_type >= FIX_3D
 
-    def compare_height(self, report: Report) -> None:
-        """Compare the height of a report with that of the newest status of the receiver.
+    def note_type(self, newest: AircraftType, t_ns: int, *, is_known: bool) -> None:
+        """Note the type of a heartbeat; forget those of long ago.
 
-        The receiver's error is bounded, that of the autopilot's barometer is not. A difference that
-        begins with more than ``NEAR_HEIGHT_M`` is no drift.
+        Unless the vehicle ``is_known`` by a position, anybody may have sent it, and it may be of
+        any other type.
         """
-        status = self.compared = self.receiver
-        if status is None or status.fix_type < FIX_3D:
-            return
-        descent_mps = report.velocity_down_mps or 0.0
-        fell_m = descent_mps * (report.t_ns - status.t_ns) * 1e-9
-        above_m = report.alt_m - (status.alt_m - fell_m)
-        # Without `abs`: one call less for each report.
-        apart_m = self.apart_from_receiver_m = above_m if above_m > 0.0 else -above_m
-        is_drift = apart_m < NEAR_HEIGHT_M or self.height_off_m > NEAR_HEIGHT_M / 2
-        self.height_off_m = apart_m if is_drift else 0.0
-
-    def note_heights(self) -> str:
-        """Note that their difference is announced; return the text."""
-        apart_m = self.apart_from_receiver_m
-        self.height_noticed_m = HEIGHT_NOTICE_RATIO * apart_m
-        covered = "the position bound covers the difference"
-        then = covered if self.height_off_m else "one of the two is invalid"
-        return f"its altitude differs by {apart_m:.0f} m from its GNSS receiver's; {then}"
-
-    def note_type(self, newest: tuple[int, int], t_ns: int) -> None:
-        """Note the type and autopilot of a heartbeat; forget those of long ago."""
-        self.types.pop(newest, None)
         since_ns = t_ns - TYPE_KEPT_NS
-        kept = [(one, at_ns) for one, at_ns in self.types.items() if at_ns >= since_ns]
-        self.types = dict([*kept[1 - TYPES_MAX :], (newest, t_ns)])
+        kept = [
+            (one, at_ns)
+            for one, at_ns in self.types.items()
+            if at_ns >= since_ns and one not in (newest, UNKNOWN_TYPE)
+        ]
+        unknown = [] if is_known else [(UNKNOWN_TYPE, t_ns)]
+        self.types = dict([*unknown, *kept[1 - TYPES_MAX :], (newest, t_ns)])
 
 
 @dataclass(slots=True, kw_only=True)

@@ -28,11 +28,13 @@ from companion.mavlink.wire.decode import ATTITUDE, decode
 from companion.mavlink.wire.stamps import boot_ms, step_ms
 from companion.pipeline import assembly
 from companion.pipeline.gnss_fix import FixNotice
+from companion.pipeline.receiver_difference import NEAR_M, ReceiverDifference
 from companion.pipeline.records import RECORDS_MAX, Records, UavRecords
 from companion.pipeline.sender import (
     ANOTHER_CLOCK_LATE_NS,
-    NEAR_HEIGHT_M,
     NO_AUTOPILOT,
+    UNKNOWN_TYPE,
+    AircraftType,
     ComponentState,
     Sender,
     SharedState,
@@ -242,14 +244,15 @@ class Senders:
     def _about_receiver(
         self, uav: str, component: ComponentState, t_ns: int, before_ns: int | None
     ) -> tuple[Notice, ...]:
-        """Return the notices that a vehicle's receiver is silent, or its height another one."""
+        """Return the notices that a vehicle's receiver is silent, or its position another one."""
         said: tuple[Notice, ...] = ()
         if t_ns > component.fix.silent_ns:
             said = self._about_fix(uav, component.fix.note_silence(t_ns, before_ns), t_ns)
-        if component.apart_from_receiver_m > component.height_noticed_m and uav in self._tracked:
-            text = f"{uav}: {component.note_heights()}"
-            notice = Notice(t_ns=t_ns, severity=Severity.INFO, subject=uav, text=text)
-            said = (*said, notice)
+        if component.difference.is_news and uav in self._tracked:
+            for told in component.difference.announce():
+                text = f"{uav}: {told}"
+                notice = Notice(t_ns=t_ns, severity=Severity.INFO, subject=uav, text=text)
+                said = (*said, notice)
         return said
 
     def _take_other(  # noqa: PLR0912 - one call less for each of them
@@ -310,7 +313,9 @@ class Senders:
             case Presence():
                 if message.autopilot != NO_AUTOPILOT:
                     component.is_armed = message.is_armed
-                component.note_type((message.mav_type, message.autopilot), message.t_ns)
+                component.note_type(
+                    (message.mav_type, message.autopilot), message.t_ns, is_known=sender is not None
+                )
         return NO_OUTCOME
 
     def _system_time(self, frame: Frame, message: SystemTime) -> FrameOutcome:
@@ -419,8 +424,7 @@ class Senders:
                 )
             errors = self._errors(report, component, made_ns, assumed.lag_rest_s)
             if component is not None and (
-                t_ns > component.fix.silent_ns
-                or component.apart_from_receiver_m > component.height_noticed_m
+                t_ns > component.fix.silent_ns or component.difference.is_news
             ):
                 said = (*said, *self._about_receiver(uav, component, t_ns, before_ns))
         true_ns = t_ns - round(stamp.latency_s * 1e9) - lag_ns
@@ -464,15 +468,12 @@ class Senders:
     def _errors(
         self, report: Report, component: ComponentState | None, made_ns: int, time_s: float
     ) -> ReportNoise:
-        """Return bounds on a report's errors, with the receiver's recent height difference.
-
-        An autopilot's height is mainly its barometer's, which drifts with the weather. Only the
-        error of the receiver's is bounded.
+        """Return bounds on a report's errors, with its difference from the receiver's position.
 
         ``made_ns`` is the earliest node time of its measurement, ``time_s`` the largest error of
         the time that is assumed.
         """
-        known, apart_m, off_m = None, 0.0, 0.0
+        known, apart_m, off_m, height_off_m = None, 0.0, 0.0, 0.0
         if component is not None and component.receiver is not None:
             known, receiver = component.noise.since(made_ns), component.receiver
             is_recent = report.t_ns - receiver.t_ns <= noise.FORGOTTEN_NS
@@ -481,17 +482,19 @@ class Senders:
                 if before is not None:
                     apart_m2 = before + HEIGHT_FILTER_WEIGHT * (apart_m2 - before)
                 component.apart_m2, apart_m = apart_m2, apart_m2**0.5
-            if receiver is not component.compared:
-                component.compare_height(report)
+            difference = component.difference
+            if receiver is not difference.compared:
+                difference.compare(receiver, report, (report.t_ns - made_ns) * 1e-9)
             if is_recent or component.fix.is_trusted:
-                off_m = component.height_off_m
+                off_m = difference.horizontal.covered_m
+                height_off_m = difference.height.covered_m
         known = known or self._noise_settings.default
         if component is not None and not component.fix.is_certain:
             known = noise.dead_reckoned(known, component.fix.dead_reckoning_s(report.t_ns))
         made = ReportNoise(
-            horizontal_m=known.horizontal_m,
-            vertical_m=known.vertical_m + off_m,
-            position_m=known.position_m + off_m,
+            horizontal_m=known.horizontal_m + off_m,
+            vertical_m=known.vertical_m + height_off_m,
+            position_m=known.position_m + (off_m * off_m + height_off_m * height_off_m) ** 0.5,
             velocity_mps=known.velocity_mps,
             time_s=time_s,
             apart_m=apart_m,
@@ -584,7 +587,7 @@ class Senders:
         if report.t_ns - receiver.t_ns > noise.FORGOTTEN_NS:
             return True
         record = self._records[report.uav]
-        if receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_HEIGHT_M:
+        if receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_M:
             record.waits_ns = None
             return True
         if record.waits_ns is None:
@@ -630,11 +633,11 @@ class Senders:
         sender = self._senders.get(uav)
         return (sender.shared or sender).clock.estimate() if sender else None
 
-    def height_off_m(self, uav: str) -> float:
-        """Return by how much a vehicle's height differs from its receiver's, as its bound does."""
+    def receiver_difference(self, uav: str) -> ReceiverDifference:
+        """Return by how much a vehicle's position differs from its receiver's."""
         source = _source(uav)
         component = None if source is None else self._components.get(source)
-        return 0.0 if component is None else component.height_off_m
+        return ReceiverDifference() if component is None else component.difference
 
     def dead_reckoning_s(self, uav: str, now_ns: int) -> float:
         """Return for how long a vehicle has had no GNSS fix; 0 if it has one, or never had."""
@@ -680,11 +683,11 @@ class Senders:
 
 
 def _assumed(
-    settings: Settings, uav: str, types: tuple[tuple[int, int], ...]
+    settings: Settings, uav: str, types: tuple[AircraftType, ...]
 ) -> assembly.AircraftAssumptions:
     """Return the assumptions about a UAV whose heartbeats stated these types and autopilots."""
     return assembly.widest(
-        [assembly.assumed(settings, uav, *one) for one in types or ((None, None),)]
+        [assembly.assumed(settings, uav, *one) for one in types or (UNKNOWN_TYPE,)]
     )
 
 

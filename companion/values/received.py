@@ -203,10 +203,11 @@ FIX_3D: Final = 3  # GPS_FIX_TYPE_3D_FIX; better fixes have larger numbers
 
 
 class GnssStatus(NamedTuple):
-    """Fix type, height and stated accuracies of a GNSS receiver (GPS_RAW_INT).
+    """Fix type, position and stated accuracies of a GNSS receiver (GPS_RAW_INT).
 
     ``fix_type`` is MAVLink's GPS_FIX_TYPE, ``alt_m`` above mean sea level; accuracies are in metres
     and m/s, None if not sent. ``time_us`` counts since boot or since 1970; 0 if unknown.
+    ``position_deg`` is latitude and longitude, WGS84; None if both are 0.
     """
 
     t_ns: int
@@ -217,6 +218,7 @@ class GnssStatus(NamedTuple):
     v_acc_m: float | None
     vel_acc_mps: float | None
     time_us: int = 0
+    position_deg: tuple[float, float] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

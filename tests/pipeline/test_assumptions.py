@@ -82,7 +82,8 @@ def turning(
 
 def test_turn_beyond_type_limit_is_announced_once_and_widens_the_bound() -> None:
     into = pipeline()
-    out = run(into, [heartbeat(0, "1:1", 2), *turning("1:1", 10)])
+    first, *others = turning("1:1", 10)
+    out = run(into, [first, heartbeat(0, "1:1", 2), *others])
     refuted = [one for one in out if isinstance(one, Refuted)]
     notices = [one for one in out if isinstance(one, Notice) and "acceleration" in one.text]
     assert refuted and refuted[0].t_ns - START_NS < S
@@ -136,12 +137,22 @@ def test_type_that_is_not_repeated_ends_after_a_minute() -> None:
     assert seen == [16.0] * 60 + [4.0] * 19
 
 
+def test_type_before_the_first_position_narrows_nothing() -> None:
+    """Anybody may have stated it: the vehicle may be of any type until it states its own."""
+    into = pipeline()
+    run(into, [heartbeat(0, "1:1", 2), *turning("1:1", 3)])
+    assert into.senders.assumed("1:1") == into.senders.assumed("1:2")
+    run(into, [heartbeat(3, "1:1", 2)])
+    assert into.senders.assumed("1:1").limits.acceleration_max_mps2 == 4.0
+
+
 @pytest.mark.parametrize(("mav_type", "lag_s"), [(2, 0.0295), (1, -0.026)])
 def test_position_lag_is_corrected(mav_type: int, lag_s: float) -> None:
     """Positions of ArduPilot copters lag their stamps, those of aeroplanes lead them."""
     into = pipeline()
-    out = run(into, [heartbeat(0, "1:1", mav_type), position(1, "1:1", (100, 0, 0), (10, 0, 0))])
-    (estimate,) = (one for one in out if isinstance(one, Estimate))
+    first, second = (position(t_s, "1:1", (90 + 10 * t_s, 0, 0), (10, 0, 0)) for t_s in (0, 1))
+    out = run(into, [first, heartbeat(0.5, "1:1", mav_type), second])
+    (_, estimate) = (one for one in out if isinstance(one, Estimate))
     assert (START_NS + S - estimate.fix.t_ns) / S == pytest.approx(lag_s, abs=1e-3)
     assert (101 * S - estimate.fix.sender_ns) / S == pytest.approx(lag_s, abs=1e-9)
 

@@ -10,7 +10,7 @@ import pytest
 
 from companion import Frame, Pipeline, Settings, Tick
 from companion.values import Notice, Output, Reason, Rejection, Severity, Update
-from tests.pipeline.test_assumptions import START_NS, S, position, sent
+from tests.pipeline.test_assumptions import LAT, LON, M_PER_DEG, START_NS, S, position, sent
 
 UAV = "1:1"
 HERE = (47.4, 8.55, 500.0)
@@ -19,9 +19,14 @@ SPEED_MPS, RADIUS_M = 8.0, 60.0
 KNOWS_ALL, KNOWS_NO_POSITION = 0b1100111111, 0b100101  # as ArduPilot sends them
 
 
-def receiver(t_s: float, has_fix: bool) -> Frame:
+def receiver(t_s: float, has_fix: bool, place_m: tuple[float, float] | None = None) -> Frame:
+    """Return a status; of a receiver that states no position, if none is given."""
+    lat_1e7 = lon_1e7 = 0
+    if place_m is not None:
+        lat_1e7 = round((LAT + place_m[0] / M_PER_DEG) * 1e7)
+        lon_1e7 = round((LON + place_m[1] / M_PER_DEG / math.cos(math.radians(LAT))) * 1e7)
     message = dialect.MAVLink_gps_raw_int_message(
-        round(t_s * 1e6), 6 if has_fix else 1, 474_000_000, 85_500_000, 560_000,
+        round((100 + t_s) * 1e6), 6 if has_fix else 1, lat_1e7, lon_1e7, 560_000,
         100, 100, 0, 0, 12, 0, 300, 300, 300, 0, 0,
     )  # fmt: skip
     return sent(t_s, UAV, message)
@@ -314,15 +319,17 @@ def test_statement_of_an_estimator_that_is_not_repeated_counts_for_ten_seconds()
     assert max(refused) <= START_NS + 30.1 * S
 
 
-def test_bound_of_a_restarted_vehicle_does_not_grow() -> None:
-    """It waits for its first one, on the ground."""
+def test_bound_of_a_restarted_vehicle_on_the_ground_does_not_grow() -> None:
+    """It waits for its first fix."""
 
     def restarted() -> Iterator[Frame | Tick]:
         yield from flight(0.0, told=False)
+        yield sent(ENDS_S, UAV, dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
         for n in range(300):
             t_s = ENDS_S + 15.0 + n / 10
             yield booted(t_s, n)
             if n % 5 == 0:
+                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, 0, 0, 4, 3))
                 yield receiver(t_s + 0.03, False)
             yield Tick(START_NS + round((t_s + 0.05) * S))
 
@@ -339,6 +346,36 @@ def booted(t_s: float, n: int) -> Frame:
         1000 + 100 * n, 474_000_000, 85_526_500, 500_000, 0, 0, 0, 0, 65535
     )
     return sent(t_s + 0.02, UAV, message)
+
+
+@pytest.mark.parametrize("first_status_s", [0.1, 1.2, 3.0])
+def test_bound_grows_if_the_vehicle_restarts_in_flight_and_states_no_fix_later(
+    first_status_s: float,
+) -> None:
+    """A redundant autopilot takes over; nothing was lost before that."""
+    restarts_s = 24.0
+
+    def restarted() -> Iterator[Any]:
+        for event in flight(0.45):
+            t_s = (event.t_ns - START_NS) / S if isinstance(event, Frame) else 0.0
+            if isinstance(event, Frame) and event.msgid == 24:
+                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3))
+                if t_s > restarts_s + first_status_s:
+                    yield receiver(t_s, False)
+                elif t_s < restarts_s:
+                    yield receiver(t_s, True)
+                continue
+            if isinstance(event, Frame) and event.msgid == 33 and t_s > restarts_s:
+                message = dialect.MAVLink(None).decode(bytearray(event.raw))
+                message.time_boot_ms -= 90_000
+                event = sent(t_s, UAV, message)  # noqa: PLW2901
+            yield event
+
+    outputs, found = flown(restarted())
+    assert about(outputs, "restarted")
+    (told,) = notices(outputs)
+    assert told.t_ns - START_NS < (restarts_s + first_status_s + 0.6) * S
+    assert largest_m(found, ENDS_S - 5.0, ENDS_S) > 100.0
 
 
 # --- what the estimator states in flight ----------------------------------------------------------
@@ -429,6 +466,45 @@ def test_bound_grows_on_if_the_vehicle_restarts_without_a_fix(back_s: float) -> 
     assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
 
 
+# --- an estimator that does not follow its receiver ----------------------------------------------
+
+
+def drifting_estimator(rate_mps: float, *, told: bool = True) -> Iterator[Frame | Tick]:
+    """Return ``flight`` whose position drifts from ``LOST_S`` on while the receiver has a fix."""
+    for n in range(round(ENDS_S * 10)):
+        t_s = n / 10
+        (north_m, east_m), angle = true_m(t_s), SPEED_MPS / RADIUS_M * t_s
+        off_m = rate_mps * max(0.0, t_s - LOST_S)
+        speed = -SPEED_MPS * math.sin(angle), SPEED_MPS * math.cos(angle), 0.0
+        yield position(t_s, UAV, (north_m + off_m, east_m, -60.0), speed, late_s=0.02)
+        if n % 5 == 0 and told:
+            yield receiver(t_s + 0.03, True, true_m(t_s - 0.2))
+        yield Tick(START_NS + round((t_s + 0.05) * S))
+
+
+@pytest.mark.parametrize("rate_mps", [0.05, 0.3, 2.0])
+def test_bound_covers_an_estimator_that_drifts_from_its_receiver(rate_mps: float) -> None:
+    outputs, found = flown(drifting_estimator(rate_mps))
+    assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
+    assert largest_m(found, 5.0, LOST_S) < 4.0
+    texts = [one.text for one in about(outputs, "1:1: its position differs by")]
+    assert bool(texts) is (rate_mps > 0.1)
+    assert all("covers the difference" in text for text in texts)
+
+
+def test_estimator_that_drifts_unseen_would_exceed_the_bound() -> None:
+    """So the test above can fail."""
+    outputs, found = flown(drifting_estimator(0.3, told=False))
+    assert any(error_m > bound_m for error_m, bound_m in found.values())
+    assert about(outputs, "its position differs by") == []
+
+
+def test_link_that_suffers_names_the_position_that_differs() -> None:
+    outputs, _ = flown(drifting_estimator(2.0))
+    texts = [one.text for one in about(outputs, "link to")]
+    assert any("its position differs by" in text for text in texts), texts
+
+
 # --- heights --------------------------------------------------------------------------------------
 
 
@@ -442,7 +518,7 @@ def drifting_heights(rate_mps: float, climb_m: float = 0.0) -> Iterator[Any]:
         yield position(t_s, UAV, (200.0, 0.0, -height_m - off_m), (0, 0, down_mps), late_s=0.02)
         if n % 5 == 0:
             message = dialect.MAVLink_gps_raw_int_message(
-                round(t_s * 1e6), 3, 474_000_000, 85_500_000, round((500.0 + height_m) * 1e3),
+                round(t_s * 1e6), 3, 0, 0, round((500.0 + height_m) * 1e3),
                 100, 100, 0, 0, 12, 0, 500, 500, 200, 0, 0,
             )  # fmt: skip
             yield sent(t_s + 0.03, UAV, message)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from companion.tracking.rotations import rotation
 from companion.values import (
     Cause,
     Estimate,
@@ -113,6 +114,26 @@ def test_error_beyond_the_bound_is_announced_and_never_blamed_on_a_uav(uavs: int
     assert told and "the array sees UAVs" in told[0]
     assert flight.pipeline.observing.compass.refuted == []
     assert max(flight.errors_deg().values()) < 1.0
+
+
+def test_bound_that_was_refuted_is_assumed_again_once_evidence_confirms_it() -> None:
+    """So that a second refutation is announced too."""
+    flight = ObservedFlight(uavs=4, range_m=1000.0)
+    flight.fly(3.0)
+    for _ in range(2):
+        flight.said.clear()
+        flight.mount = rotation(np.radians([0.0, 0.0, 8.0]))
+        flight.fly(3.0)
+        assert len([one for one in flight.notices() if "sees UAVs at least" in one.text]) == 1
+        assert flight.pipeline.observing.compass.is_raised
+        flight.said.clear()
+        flight.mount = np.eye(3)
+        flight.fly(4.0)
+        assert flight.pipeline.observing.compass.is_raised
+        flight.fly(8.0)
+        assert not flight.pipeline.observing.compass.is_raised
+        (told,) = [one.text for one in flight.notices() if "is assumed again" in one.text]
+        assert told.endswith("an attitude error of up to 3° is assumed again")
 
 
 @pytest.mark.parametrize("uavs", [1, 4])

@@ -53,7 +53,12 @@ STEADY_S: Final = 1.0
 """Seconds for which a connection must last before it is reported as restored."""
 REFUSED_EVERY_NS: Final = 500_000_000
 """Least time between rejections by admission, or of a receiver; each has a number of frames."""
-REFUSED_UAVS: Final = 32  # vehicles whose frames are counted apart in that time
+REFUSED_KINDS: Final = 32  # senders and reasons that are counted apart in that time
+REJECTED_PER_S: Final = 100.0
+"""Rejections of damaged or unproven frames that are passed on one by one; others are counted.
+
+Each would take as much time as a valid frame, and no sender is proven whose flood could be limited.
+"""
 RECEIVER_SHARE: Final = 0.3
 """Share of the time that messages of a receiver may take; further ones are skipped unparsed.
 
@@ -123,7 +128,8 @@ class Link:
         self._lag = lag or ArrivalLag()
         self._known_peers = known_peers or KnownPeers()
         self._newcomers = newcomers or Newcomers()
-        self._refused = Counter[str]()  # frames not admitted, by vehicle or link, not reported yet
+        self._refused = Counter[tuple[str, Reason]]()  # by vehicle or link, not passed on yet
+        self._rejections = Budget(per_s=REJECTED_PER_S, most=REJECTED_PER_S)
         self._refused_ns = 0
         self._receiver_s = Budget(per_s=RECEIVER_SHARE, most=RECEIVER_SAVED_S)
         self._skipped = 0  # messages of receivers not reported yet
@@ -297,6 +303,9 @@ class Link:
                 if msgid in CHECKED:
                     kept = self._checked(peer, item)
                     has_timesync |= msgid == TIMESYNC
+            elif not self._rejections.spend(1, item.t_ns * 1e-9):
+                self._note_refused(item.source, item.reason, item.count)
+                continue
             counted.append(item)
             checked.append(kept)
         self._peers.count(peer, counted, checked)
@@ -319,11 +328,16 @@ class Link:
                 peer.served.add(source)
             return True
         self._peers.pass_over(peer, source)
-        name, counts = str(source), self._refused
-        has_place = name in counts or len(counts) < REFUSED_UAVS
-        is_apart = rank is PeerRank.FIRST and matters and has_place
-        counts[name if is_apart else self.status.url] += 1
+        is_apart = rank is PeerRank.FIRST and matters
+        self._note_refused(str(source) if is_apart else self.status.url, Reason.NEWCOMER, 1)
         return False
+
+    def _note_refused(self, source: str, reason: Reason, count: int) -> None:
+        """Count frames that are dropped, or rejected beyond the budget; of the link at last."""
+        counts, lost = self._refused, self.status.lost
+        lost[reason] = lost.get(reason, 0) + count
+        has_place = (source, reason) in counts or len(counts) < REFUSED_KINDS
+        counts[source if has_place else self.status.url, reason] += count
 
     def _rank(self, peer: Peer, source: Source, now_ns: int) -> PeerRank:
         return self._known_peers.rank(self._name, peer.address or self._name, source, now_ns)
@@ -333,14 +347,14 @@ class Link:
         return self._rank(peer, source, now_ns) is PeerRank.FIRST
 
     def _report_refused(self, items: list[Received]) -> None:
-        """Add rejections with the numbers of frames that were not admitted, if they are due."""
+        """Add rejections with the numbers of frames that were not passed on, if they are due."""
         now_ns = self._now_ns()
         if now_ns - self._refused_ns < REFUSED_EVERY_NS:
             return
-        for source, count in self._refused.items():
-            refused = Rejection(t_ns=now_ns, source=source, reason=Reason.NEWCOMER, count=count)
-            items.append(refused)
-            self._peers.count_rejection(refused)
+        items += [
+            Rejection(t_ns=now_ns, source=source, reason=why, count=count)
+            for (source, why), count in self._refused.items()
+        ]
         self._refused.clear()
         self._refused_ns = now_ns
 

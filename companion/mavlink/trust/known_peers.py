@@ -17,12 +17,12 @@ except positions that agree with its path to ``AGREEMENT_M``. A stranger becomes
 * at once if the settings name it as a router.
 
 If two known peers contradict each other (``paths.py``), the one that was known later is a stranger
-again; its positions are used only as far as they agree with those of the other. Its attitudes and
-type are used only where the other has not brought the same message shortly before: positions that
-agree prove nothing about these. Attitudes that contradict those of the other are announced. If the
-other has become late, by its own stamps, newer attitudes are used, but none newer than it could
-ever deliver. Messages that state accuracies, fixes or the time of day (``_OF_FIRST``) are not used
-at all while the other is current, nor from a peer that has brought no position yet.
+again; its positions are used only as far as they agree with those of the other. Its attitudes are
+used only where the other has not brought any shortly before: positions that agree prove nothing
+about these. Attitudes that contradict those of the other are announced. If the other has become
+late, by its own stamps, newer attitudes are used, but none newer than it could ever deliver.
+Messages that state accuracies, fixes, a type or the time of day (``_OF_FIRST``) are not used at all
+while the other is current, nor from a peer that has brought no position yet.
 
 Stamps are used only if they are of the other's clock: another clock would look like a restart, or
 like a second vehicle. A peer that becomes more than ten seconds late is a stranger from then on, if
@@ -93,9 +93,9 @@ COMPARED_PER_S: Final = 30.0  # positions of strangers compared per sender and s
 
 STRANGER: Final = "another peer than the known one of this sender; not used until both agree"
 BROUGHT: Final = "the same message of this sender comes from the peer that was known first"
-_OF_FIRST: Final = ABOUT_ATTITUDE | {GPS_RAW_INT, EKF_STATUS_REPORT, SYSTEM_TIME}
+_OF_FIRST: Final = ABOUT_ATTITUDE | {GPS_RAW_INT, EKF_STATUS_REPORT, SYSTEM_TIME, HEARTBEAT}
 """Messages that count only from the peer believed first: nothing else confirms them."""
-BROUGHT_NS: Final = {ATTITUDE: 300_000_000, **dict.fromkeys((*_OF_FIRST, HEARTBEAT), 5_000_000_000)}
+BROUGHT_NS: Final = {ATTITUDE: 300_000_000, **dict.fromkeys(_OF_FIRST, 5_000_000_000)}
 """Messages that move bounds, and the time for which one excludes those of peers known later."""
 OVERTAKEN_MS: Final = 300
 """How late a peer that was known first must have become, and how much newer other attitudes are."""
@@ -103,7 +103,7 @@ LATE_MS: Final = 1000  # largest delay of a stranger's position that is used
 EARLY_MS: Final = 100  # stamps that are further ahead of a peer's fastest ones are from the future
 LEAD_NS: Final = 10_000_000_000  # time after which leads over a peer's fastest stamps are announced
 LATE_PEER_MS: Final = 1000  # how much newer attitudes are whose rejection is announced
-_ABOUT_SENDER: Final = frozenset({*STAMPED, *POSE, *_OF_FIRST, TIMESYNC, HEARTBEAT})
+_ABOUT_SENDER: Final = frozenset({*STAMPED, *POSE, *_OF_FIRST, TIMESYNC})
 JUDGED: Final = DECODED | _ABOUT_SENDER
 """Messages that ``refusal`` judges; it accepts all others."""
 

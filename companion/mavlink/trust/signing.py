@@ -24,14 +24,15 @@ received is dropped as a duplicate, and one that was not is merely late. Links s
 sent back to the node would carry a valid signature.
 
 **A wrong clock.** Any holder of the key may send a timestamp far ahead, and the local one follows,
-as the standard requires. Known streams continue by their own clocks. New streams on this link are
-rejected until their sender has received a frame of this node with the high timestamp, or until
-time has caught up; a replay is never accepted instead. Other links are unaffected.
+as the standard requires. Streams of other senders continue by their own clocks; those of the sender
+that is named in the frame are rejected on all links of the key, also after a restart, until time
+has caught up. New streams on this link are rejected until their sender has received a frame of this
+node with the high timestamp; a replay is never accepted instead.
 ``LinkSigning.ahead_ns`` shows it. Timestamps in the last ten years of the 48 bits (to 2104) are not
 followed, because one frame could then exhaust all timestamps.
 
-**Memory.** At most ``STREAMS_MAX`` streams are remembered. A new stream replaces the one with the
-oldest timestamp; from then on new streams must be newer than the forgotten one.
+**Memory.** At most ``STREAMS_MAX`` streams are remembered. A new stream replaces the one that has
+been silent for longest; from then on new streams must be newer than the forgotten one.
 """
 
 from collections.abc import Mapping
@@ -249,8 +250,8 @@ class LinkSigning:
 
     def _remember(self, stream: Stream, heard: ReceivedTimestamp) -> None:
         streams = self._streams
-        if stream not in streams and len(streams) >= STREAMS_MAX:
-            oldest = min(streams, key=lambda other: streams[other][0])
+        if streams.pop(stream, None) is None and len(streams) >= STREAMS_MAX:
+            oldest = next(iter(streams))  # they are in the order of their newest frames
             self._floor = max(self._floor, streams.pop(oldest)[0])
         streams[stream] = heard
         self.moves += 1

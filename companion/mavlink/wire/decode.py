@@ -217,8 +217,9 @@ def _accuracy(thousandths: int) -> float | None:
 
 
 def _gps_raw_int(frame: Frame) -> GnssStatus:
-    """Decode fix type and accuracies; the latter are extension fields, 0 if not sent."""
+    """Decode fix type, position and accuracies; these are extension fields, 0 if not sent."""
     fields = unpack(frame, attitudes.GPS_RAW_INT_FIELDS)
+    lat_1e7, lon_1e7 = fields[1:3]
     h_acc, v_acc, vel_acc = fields[11:14]
     return GnssStatus(
         t_ns=frame.t_ns,
@@ -229,6 +230,7 @@ def _gps_raw_int(frame: Frame) -> GnssStatus:
         v_acc_m=_accuracy(v_acc),
         vel_acc_mps=_accuracy(vel_acc),
         time_us=fields[0],
+        position_deg=(lat_1e7 * 1e-7, lon_1e7 * 1e-7) if lat_1e7 or lon_1e7 else None,
     )
 
 

@@ -4,6 +4,7 @@ The protocol is lines of text (rotctld(1) of hamlib): ``P AZ EL`` points, ``p`` 
 direction, ``S`` stops; answers end with ``RPRT 0``, or another number for an error.
 """
 
+import contextlib
 import math
 import re
 import socket
@@ -111,6 +112,7 @@ class Rotator(Device):
             raise DeviceError("not connected")
         ends_s = time.monotonic() + TIMEOUT_S
         try:
+            self._check_silent(self._socket)
             self._socket.settimeout(TIMEOUT_S)
             self._socket.sendall(command.encode() + b"\n")
             while not (found := re.search(rb"RPRT (-?\d{1,6})\n", self._unread)):
@@ -128,6 +130,17 @@ class Rotator(Device):
         if found[1] != b"0":
             raise DeviceError(f"rotctld rejects {command!r}: error {found[1].decode()}")
         return text.decode(errors="replace")
+
+    def _check_silent(self, connection: socket.socket) -> None:
+        """Raise ``DeviceError`` if there is more than was asked for: answers would be mixed up."""
+        connection.setblocking(False)
+        with contextlib.suppress(BlockingIOError):
+            more = connection.recv(4096)
+            if not more:
+                raise DeviceError("rotctld closed the connection")
+            self._unread += more
+        if self._unread:
+            raise DeviceError(f"rotctld sends what was not asked for: {shown(self._unread)}")
 
 
 _LIMITS: Final = ("Min Azimuth", "Max Azimuth", "Min Elevation", "Max Elevation")

@@ -22,7 +22,7 @@ from companion.mavlink.links import kernel_time, tcp, transport, udp
 from companion.mavlink.links.endpoints import Upcalls
 from companion.mavlink.links.kinds import FRAMES_AT_ONCE
 from companion.mavlink.links.peers import PEERS_MAX
-from companion.mavlink.links.transport import REFUSED_UAVS, Link
+from companion.mavlink.links.transport import REFUSED_KINDS, REJECTED_PER_S, Link
 from companion.mavlink.links.urls import LinkError, parse_link
 from companion.mavlink.trust.fair_share import Account
 from companion.mavlink.trust.newcomers import NEW_SAVED
@@ -1288,8 +1288,8 @@ def test_frames_that_are_dropped_are_counted_by_vehicle(run: Run) -> None:
             assert len(inbox.frames) == 99 + 50
             counts = {one.source: one.count for one in inbox.rejections}
             assert {one.reason for one in inbox.rejections} == {Reason.NEWCOMER}
-            apart = {f"{sysid}:1": 1 + (sysid == 60) for sysid in range(51, 51 + REFUSED_UAVS)}
-            assert counts == {**apart, link.status.url: 49 - REFUSED_UAVS}
+            apart = {f"{sysid}:1": 1 + (sysid == 60) for sysid in range(51, 51 + REFUSED_KINDS)}
+            assert counts == {**apart, link.status.url: 49 - REFUSED_KINDS}
             assert link.status.lost[Reason.NEWCOMER] == 50
             frames = {one.source.sysid: it.frames for one, it in link._newcomers._work.items()}
             assert frames == {sysid: 2 if sysid <= 50 else 1 for sysid in range(1, 100)}
@@ -1300,6 +1300,28 @@ def test_frames_that_are_dropped_are_counted_by_vehicle(run: Run) -> None:
                 link.take(("127.0.0.1", 9), frame(9, sysid=sysid, seq=9))
             gaps = {one.sysid: counts.gaps for one, counts in link.status.components.items()}
             assert gaps == {sysid: 7 if sysid <= 50 else 0 for sysid in range(1, 100)}
+
+    run(test())
+
+
+def test_flood_of_damaged_frames_is_passed_on_as_counts(run: Run) -> None:
+    """One by one they would take as much time as frames, of senders that nothing can limit."""
+    damaged = frame(1)[:-1] + b"\0"
+
+    async def test() -> None:
+        async with running("udpin:127.0.0.1:0") as (link, inbox):
+            await until_true(lambda: link.status.state == "up")
+            link._refused_ns = link._now_ns()
+            for port in range(1000):
+                link.take(("127.0.0.1", 1000 + port % 20), damaged)
+            passed_on = len(inbox.rejections)
+            assert REJECTED_PER_S <= passed_on < 300
+            assert link.status.lost[Reason.BAD_CRC] == 1000
+            link._refused_ns = -(1 << 62)
+            link.take(("127.0.0.1", 9), frame(1))
+            assert sum(one.count for one in inbox.rejections) == 1000
+            assert len(inbox.rejections) == passed_on + 1
+            assert len(inbox.frames) == 1
 
     run(test())
 

@@ -16,6 +16,7 @@ from companion.mavlink.trust.duplicate_ids import KEPT_NS
 from companion.mavlink.trust.known_peers import (
     BROUGHT,
     PROBATION_NS,
+    REBOOT_NS,
     STRANGER,
     KnownPeers,
     PeerRank,
@@ -438,9 +439,7 @@ def told(msgid: int, number: int) -> bytes:
 def test_bounds_follow_the_peer_that_was_known_first(msgid: int) -> None:
     peers = with_two_known_peers()
     true, lie = (Outgoing(Source(1, 1), msgid, told(msgid, n)) for n in (20, 21))
-    moves = msgid != HEARTBEAT  # bounds, or the clock
-    first = peers.refusal(LINK, OTHER, message(20.0, lie))  # the known one brought none yet
-    assert first == (BROUGHT if moves else None)
+    assert peers.refusal(LINK, OTHER, message(20.0, lie)) == BROUGHT
     assert peers.refusal(LINK, HOME, message(20.1, true)) is None
     assert peers.refusal(LINK, OTHER, message(24.9, lie)) == BROUGHT
     assert peers.refusal(LINK, OTHER, message(25.2, lie)) is None
@@ -582,8 +581,12 @@ def test_stamps_ahead_of_time_in_gaps_of_a_radio_are_not_used(ahead_s: float) ->
     assert not any(used)
 
 
-def test_first_peer_is_believed_after_a_gap_in_which_another_ran_ahead() -> None:
-    """Beside stamps that run ahead within the gap, those of the first peer look late."""
+@pytest.mark.parametrize("gap_s", [1.1, 11.0])
+def test_first_peer_is_believed_after_a_gap_in_which_another_ran_ahead(gap_s: float) -> None:
+    """Beside stamps that run ahead within the gap, those of the first peer look late.
+
+    After ``REBOOT_NS`` they are used, since the vehicle may have been restarted.
+    """
     peers, at_rest = KnownPeers(), Place(0.0, 0.0, 0.0, 0.0)
 
     def refused(peer: str, t_s: float, ahead_s: float = 0.0) -> str | None:
@@ -592,10 +595,12 @@ def test_first_peer_is_believed_after_a_gap_in_which_another_ran_ahead() -> None
     for number in range(120):
         assert refused(HOME, number / 10) is None
     ahead_s = [0.0, *(1.4 * number for number in range(10)), 13.0]
-    in_gap = [refused(OTHER, 13.1 + number / 100, by_s) for number, by_s in enumerate(ahead_s)]
+    to_s = 12.0 + gap_s
+    in_gap = [refused(OTHER, to_s + number / 100, by_s) for number, by_s in enumerate(ahead_s)]
     assert in_gap[0] is None  # the vehicle's radio may have another address
+    assert in_gap[2:] == [STRANGER if gap_s < REBOOT_NS / S else None] * 10
     for number in range(300):
-        t_s = 13.3 + number / 10
+        t_s = to_s + 0.2 + number / 10
         assert refused(HOME, t_s) is None
         if number % 5 == 0:
             assert refused(OTHER, t_s + 0.05, 13.0) == STRANGER

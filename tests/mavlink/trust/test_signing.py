@@ -2,7 +2,9 @@
 against the full history of accepted and sent frames."""
 
 import hashlib
+import statistics
 import struct
+import time
 from collections.abc import Callable
 
 import pytest
@@ -372,6 +374,35 @@ def test_evicted_streams_stay_rejected() -> None:
     assert all(again.refusal(frame) is Reason.REPLAYED for frame in frames[: more + 5])
     assert again.refusal(sent(NOW + STREAMS_MAX + more, stream=(1, 1, 0))) is None
     assert len(again.state(NOW_NS).streams) == STREAMS_MAX
+
+
+def test_stream_that_was_silent_for_longest_gives_way() -> None:
+    """Not the one with the oldest timestamp: its clock may be behind."""
+    ours, behind, silent = guard(), (1, 1, 0), (1, 2, 0)
+    assert ours.refusal(sent(NOW, stream=silent)) is None
+    assert ours.refusal(sent(NOW - 50 * UNITS, stream=behind)) is None
+    others = [(2 + n % 250, 1, n // 250) for n in range(STREAMS_MAX - 1)]
+    for stream in others[:-1]:
+        assert ours.refusal(sent(NOW + 1, stream=stream)) is None
+    assert ours.refusal(sent(NOW - 49 * UNITS, stream=behind)) is None
+    assert ours.refusal(sent(NOW + 1, stream=others[-1])) is None
+    kept = ours.state(NOW_NS).streams
+    assert behind in kept and silent not in kept
+
+
+def test_new_stream_costs_no_more_if_another_gives_way() -> None:
+    ours = guard()
+    streams = [(1 + n % 250, 1 + n // 250 % 250, 0) for n in range(2 * STREAMS_MAX)]
+    frames = [sent(NOW + n, stream=stream) for n, stream in enumerate(streams)]
+
+    def timed_s(some: list[Frame]) -> float:
+        begun_s = time.perf_counter()
+        assert all(ours.refusal(frame) is None for frame in some)
+        return time.perf_counter() - begun_s
+
+    filling = [timed_s(frames[n : n + 64]) for n in range(0, STREAMS_MAX, 64)]
+    giving_way = [timed_s(frames[n : n + 64]) for n in range(STREAMS_MAX, 2 * STREAMS_MAX, 64)]
+    assert statistics.median(giving_way) < 5 * statistics.median(filling)
 
 
 # --- sequences, against the rule by brute force -------------------------------------------------

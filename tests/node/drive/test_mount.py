@@ -357,6 +357,15 @@ def test_malformed_answers_are_device_errors(answers: Any, reply: bytes) -> None
     rotator.close()
 
 
+def test_answer_that_nothing_asked_for_is_a_device_error(answers: Any) -> None:
+    """It would be taken for the answer to the next command, and so on for ever."""
+    reply = b"Azimuth: 5\nElevation: 6\nRPRT 0\n"
+    rotator = Rotator("127.0.0.1", answers(2 * reply))
+    with pytest.raises(DeviceError, match="not asked for"):
+        rotator.open()
+    rotator.close()
+
+
 def test_answer_that_drips_is_given_up(answers: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("companion.node.drive.rotctld.TIMEOUT_S", 0.3)
     rotator = Rotator("127.0.0.1", answers(b"Azimuth: " + b"1" * 100_000, drips=True))

@@ -47,7 +47,7 @@ def trip(t_s: float, ahead_s: float) -> RoundTrip:
 def accuracy(t_s: float, stated_mm: int = 1) -> Frame:
     """Return the status of a receiver that states an accuracy."""
     message = dialect.MAVLink_gps_raw_int_message(
-        round(t_s * 1e6), 6, 474000000, 85500000, 550_000, 50, 50, 0, 0, 20, 0, *[stated_mm] * 3
+        round(t_s * 1e6), 6, 0, 0, 550_000, 50, 50, 0, 0, 20, 0, *[stated_mm] * 3
     )
     return sent(t_s, UAV, message)
 

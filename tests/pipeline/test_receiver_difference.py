@@ -1,0 +1,213 @@
+"""Difference between an autopilot's position and its receiver's: what is lateness, what is not."""
+
+import math
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from companion.pipeline.receiver_difference import (
+    ARRIVAL_LAG_S,
+    HELD_NS,
+    LAG_S,
+    NEAR_M,
+    NOTICE_M,
+    ReceiverDifference,
+)
+from companion.values import AltitudeDatum, GnssStatus, Report, Source
+
+S = 1_000_000_000
+METRES_PER_DEGREE = 111_195.0
+LAT_DEG, LON_DEG = 47.4, 179.9999  # the antimeridian is 7.5 m to the east
+
+
+def status(t_s: float, north_m: float = 0.0, east_m: float = 0.0, up_m: float = 0.0) -> GnssStatus:
+    lat_deg, lon_deg = place(north_m, east_m)
+    return GnssStatus(
+        t_ns=round(t_s * S),
+        source=Source(1, 1),
+        fix_type=3,
+        alt_m=500.0 + up_m,
+        h_acc_m=None,
+        v_acc_m=None,
+        vel_acc_mps=None,
+        position_deg=(lat_deg, lon_deg),
+    )
+
+
+def place(north_m: float, east_m: float) -> tuple[float, float]:
+    across = METRES_PER_DEGREE * math.cos(math.radians(LAT_DEG))
+    lon_deg = LON_DEG + east_m / across
+    return LAT_DEG + north_m / METRES_PER_DEGREE, math.remainder(lon_deg, 360.0)
+
+
+def report(
+    t_s: float,
+    place_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    velocity_mps: tuple[float, float, float] | None = (0.0, 0.0, 0.0),
+) -> Report:
+    lat_deg, lon_deg = place(*place_m[:2])
+    return Report(
+        t_ns=round(t_s * S),
+        uav="1:1",
+        source=Source(1, 1),
+        lat_deg=lat_deg,
+        lon_deg=lon_deg,
+        alt_m=500.0 + place_m[2],
+        alt_datum=AltitudeDatum.MSL,
+        relative_alt_m=None,
+        velocity_ne_mps=None if velocity_mps is None else velocity_mps[:2],
+        velocity_down_mps=None if velocity_mps is None else velocity_mps[2],
+        heading_deg=None,
+        boot_ms=0,
+        tslc_s=None,
+    )
+
+
+@given(
+    elapsed_s=st.floats(0.0, 1.0),
+    late_s=st.floats(0.0, 2.0),
+    shares=st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
+    velocity_mps=st.tuples(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0)),
+)
+def test_lateness_of_status_and_report_is_no_difference(
+    elapsed_s: float,
+    late_s: float,
+    shares: tuple[float, float, float],
+    velocity_mps: tuple[float, float],
+) -> None:
+    """A vehicle flies straight on; both messages are late, and the status is older still."""
+    north_mps, east_mps = velocity_mps
+    true_s = elapsed_s - shares[0] * late_s, -shares[1] * late_s - shares[2] * ARRIVAL_LAG_S
+    difference = ReceiverDifference()
+    difference.compare(
+        status(0.0, north_mps * true_s[1], east_mps * true_s[1]),
+        report(elapsed_s, (north_mps * true_s[0], east_mps * true_s[0], 0.0),
+               (north_mps, east_mps, 0.0)),
+        late_s,
+    )  # fmt: skip
+    assert difference.horizontal.covered_m < 0.01
+
+
+@pytest.mark.parametrize("off_m", [(0.0, 7.0), (-7.0, 0.0), (17.0 + 7.0, 0.0)])
+def test_what_lateness_does_not_explain_is_covered(off_m: tuple[float, float]) -> None:
+    """At 10 m/s northward: 7 m aside, behind, and ahead of where it may be in 1.7 s.
+
+    Then nothing shows how late the status was.
+    """
+    difference = ReceiverDifference()
+    difference.compare(status(0.0), report(0.2, (*off_m, 0.0), (10.0, 0.0, 0.0)), 0.5)
+    behind_m = 3.0 if off_m[0] < 0.0 else 0.0  # the report may be from before the status
+    assert difference.horizontal.apart_m == pytest.approx(7.0 - behind_m, abs=0.01)
+    paths_m = ((10.0 * t_s, 0.0) for t_s in (0.2 - 0.5, 0.2 + 0.5 + ARRIVAL_LAG_S))
+    farthest_m = max(math.dist(off_m, end_m) for end_m in paths_m)
+    assert difference.horizontal.covered_m == pytest.approx(farthest_m, abs=0.01)
+
+
+@pytest.mark.parametrize("lag_s", [0.0, LAG_S])
+@pytest.mark.parametrize("status_late_s", [-1.0, 0.0, 1.5, 9.0])
+def test_stamps_of_one_clock_show_how_late_each_is(status_late_s: float, lag_s: float) -> None:
+    """A status that was overtaken is older than its arrival says."""
+    difference = ReceiverDifference()
+    climb_mps, north_mps, off_m = 8.0, 15.0, 20.0
+    late = status(status_late_s)._replace(time_us=100_000_000)
+    made_s = 0.3
+    moved = (north_mps * (made_s + lag_s), 0.0, climb_mps * made_s + off_m)
+    difference.compare(
+        late,
+        report(status_late_s + 0.1, moved, (north_mps, 0.0, -climb_mps))._replace(boot_ms=100_300),
+        3.0,
+    )
+    assert difference.height.covered_m == pytest.approx(off_m, abs=0.01)
+    assert difference.horizontal.covered_m == pytest.approx(0.0, abs=0.01)
+
+
+@pytest.mark.parametrize("time_us", [0, 1_790_000_000_000_000, 111_000_000])
+def test_stamps_of_another_clock_are_not_compared(time_us: int) -> None:
+    difference = ReceiverDifference()
+    placed = report(0.4, (6.0, 0.0, 0.0), (15.0, 0.0, 0.0))._replace(boot_ms=100_000)
+    difference.compare(status(0.0)._replace(time_us=time_us), placed, 0.0)
+    assert difference.horizontal.covered_m == pytest.approx(0.0, abs=0.01)
+
+
+def test_standing_vehicle_may_be_nowhere_else() -> None:
+    difference = ReceiverDifference()
+    difference.compare(status(0.0), report(0.2, (3.0, 4.0, 0.0)), 2.0)
+    assert difference.horizontal.covered_m == pytest.approx(5.0, abs=0.01)
+    assert difference.height.covered_m == 0.0
+
+
+@pytest.mark.parametrize("climb_mps", [-6.0, 0.0, 6.0])
+def test_climb_since_the_status_is_no_difference(climb_mps: float) -> None:
+    difference = ReceiverDifference()
+    climbed = report(0.5, (0.0, 0.0, climb_mps * 0.5), (0.0, 0.0, -climb_mps))
+    difference.compare(status(0.0), climbed, 0.0)
+    assert difference.height.covered_m == pytest.approx(0.0, abs=1e-9)
+
+
+def test_report_without_velocity_is_not_compared() -> None:
+    """Some messages state none: where the vehicle was at the time of the status is unknown."""
+    difference = ReceiverDifference()
+    difference.compare(status(0.0), report(0.1, (20.0, 0.0, 20.0), None), 0.0)
+    assert difference.horizontal.covered_m == difference.height.covered_m == 0.0
+
+
+def test_position_0_0_is_none() -> None:
+    difference = ReceiverDifference()
+    nowhere = status(0.0)._replace(position_deg=None)
+    difference.compare(nowhere, report(0.1, (20.0, 0.0, 0.0)), 0.0)
+    assert not difference.is_news
+
+
+def test_difference_stays_while_the_receiver_has_no_fix() -> None:
+    difference = ReceiverDifference()
+    difference.compare(status(0.0), report(0.1, (20.0, 0.0, 0.0)), 0.0)
+    lost = status(1.0)._replace(fix_type=1)
+    difference.compare(lost, report(1.1), 0.0)
+    assert difference.compared is lost
+    assert difference.horizontal.covered_m == pytest.approx(20.0, abs=0.01)
+
+
+def test_drift_is_covered_beyond_the_largest_difference_of_valid_positions() -> None:
+    drifts, jumps = ReceiverDifference(), ReceiverDifference()
+    for metres in (20.0, 40.0, 60.0):
+        drifts.compare(status(0.0), report(0.1, (metres, 0.0, 0.0)), 0.0)
+    jumps.compare(status(0.0), report(0.1, (NEAR_M + 10.0, 0.0, 0.0)), 0.0)
+    assert drifts.horizontal.covered_m == pytest.approx(60.0, abs=0.01)
+    assert jumps.horizontal.covered_m == 0.0
+    assert jumps.announce() == [
+        "its position differs by 60 m from its GNSS receiver's; one of the two is invalid"
+    ]
+
+
+def test_difference_is_announced_once_until_it_doubles() -> None:
+    difference, told = ReceiverDifference(), list[str]()
+    for metres in range(20):
+        difference.compare(status(0.0), report(0.1, (0.0, metres + 0.6, 0.0)), 0.0)
+        if difference.is_news:
+            told += difference.announce()
+        assert not difference.is_news
+    assert [text.split(" by ")[1].split()[0] for text in told] == ["4", "8", "16"]
+    assert NOTICE_M < 4
+
+
+def test_difference_is_held_for_a_while() -> None:
+    """On another course less of it shows."""
+    difference, held_s = ReceiverDifference(), HELD_NS / S
+    difference.compare(status(0.0), report(0.1, (8.0, 0.0, 0.0)), 0.0)
+    found = []
+    for number in range(1, 30):
+        t_s = number / 2
+        difference.compare(status(t_s), report(t_s + 0.1, (1.0, 0.0, 0.0)), 0.0)
+        found.append((t_s, round(difference.horizontal.covered_m)))
+    assert {metres for t_s, metres in found if t_s <= held_s} == {8}
+    assert {metres for t_s, metres in found if t_s > 2 * held_s + 1.0} == {1}
+
+
+def test_larger_difference_is_named() -> None:
+    difference = ReceiverDifference()
+    difference.compare(status(0.0), report(0.1, (6.0, 0.0, 4.0)), 0.0)
+    assert difference.larger.text("6") == "its position differs by 6 m from its GNSS receiver's"
+    difference = ReceiverDifference()
+    difference.compare(status(1.0), report(1.1, (0.0, 0.0, 4.0)), 0.0)
+    assert difference.larger.text("4") == "its altitude differs by 4 m from its GNSS receiver's"

@@ -57,13 +57,13 @@ site: .venv/.dev
 bench: .venv/.dev
 	$(PYTEST) -q -s -m benchmark
 
-# Some 25 minutes. Floods and attacks run alone, all others two at a time.
-SOAK_BESIDE = $(addprefix tests/,live/test_all_together.py live/test_recording.py \
-    mavlink/wire/test_framing_fuzz.py server/test_contract.py pipeline/test_day.py)
+# Some 25 minutes. Floods and attacks run alone, all others two at a time, the longest first.
+SOAK_BESIDE = $(addprefix tests/,live/test_all_together.py pipeline/test_day.py \
+    server/test_contract.py live/test_recording.py mavlink/wire/test_framing_fuzz.py)
 soak: .venv/.dev
 	failed=; \
-	$(PYTEST) -q -rP -n 2 --dist worksteal -m soak --timeout=0 $(SOAK_BESIDE) || failed=1; \
-	$(PYTEST) -q -s -m soak --timeout=0 $(addprefix --ignore=,$(SOAK_BESIDE)) || failed=1; \
+	$(PYTEST) -q -rP -n 2 --maxschedchunk 1 --durations 12 -m soak --timeout=0 $(SOAK_BESIDE) || failed=1; \
+	$(PYTEST) -q -s --durations 12 -m soak --timeout=0 $(addprefix --ignore=,$(SOAK_BESIDE)) || failed=1; \
 	test -z "$$failed"
 
 # Failing inputs are in build/fuzz/TARGET/crash-…; inputs that reach new code join the corpus.

@@ -30,6 +30,7 @@ ARRIVAL_LAG_S: Final = 1.0  # the same at the arrival, if only that is known
 HELD_NS: Final = 5_000_000_000
 """Time for which a difference is held at least: less of it shows at another course or climb."""
 SAME_CLOCK_S: Final = 10.0  # longest time between two stamps of one clock
+APART_S: Final = 3.0  # longest time between a status and a report that are compared
 _METRES_PER_DEGREE: Final = 111_195.0
 
 
@@ -95,10 +96,12 @@ class ReceiverDifference:
         if status.fix_type < FIX_3D:
             return
         elapsed_s = _between_stamps_s(status, report)
-        seconds = (elapsed_s, elapsed_s + LAG_S) if elapsed_s is not None else None
-        if elapsed_s is None or seconds is None:
+        least_s, most_s = 0.0, LAG_S
+        if elapsed_s is None:
             elapsed_s = (report.t_ns - status.t_ns) * 1e-9
-            seconds = elapsed_s - late_s, elapsed_s + late_s + ARRIVAL_LAG_S
+            least_s, most_s = -late_s, late_s + ARRIVAL_LAG_S
+        if abs(elapsed_s) > APART_S:  # a vehicle that manoeuvres is elsewhere by then
+            return
         if report.velocity_down_mps is not None:
             descended_m = report.velocity_down_mps * elapsed_s
             apart_m = abs(report.alt_m - status.alt_m + descended_m)
@@ -108,6 +111,7 @@ class ReceiverDifference:
             north_m = (report.lat_deg - lat_deg) * _METRES_PER_DEGREE
             across = _METRES_PER_DEGREE * math.cos(math.radians(lat_deg))
             east_m = math.remainder(report.lon_deg - lon_deg, 360.0) * across
+            seconds = elapsed_s + least_s, elapsed_s + most_s
             least_m, most_m = _off_path_m((north_m, east_m), report.velocity_ne_mps, seconds)
             self.horizontal.note(least_m, most_m, report.t_ns)
         self.is_news = self.height.is_news or self.horizontal.is_news

@@ -485,7 +485,7 @@ class Senders:
             difference = component.difference
             if receiver is not difference.compared:
                 difference.compare(receiver, report, (report.t_ns - made_ns) * 1e-9)
-            if is_recent or component.fix.is_trusted:
+            if component.fix.is_trusted or report.t_ns - receiver.t_ns <= noise.STATED_NS:
                 off_m = difference.horizontal.covered_m
                 height_off_m = difference.height.covered_m
         known = known or self._noise_settings.default

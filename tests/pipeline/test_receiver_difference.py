@@ -152,6 +152,15 @@ def test_report_without_velocity_is_not_compared() -> None:
     assert difference.horizontal.covered_m == difference.height.covered_m == 0.0
 
 
+@pytest.mark.parametrize("boot_ms", [None, 4000, 106_000])
+def test_report_long_after_the_status_is_not_compared(boot_ms: int | None) -> None:
+    """It may have turned within a gap of its radio."""
+    difference = ReceiverDifference()
+    later = report(6.0, (20.0, 0.0, 20.0), (-15.0, 0.0, 5.0))._replace(boot_ms=boot_ms)
+    difference.compare(status(0.0)._replace(time_us=100_000_000), later, 0.0)
+    assert difference.horizontal.covered_m == difference.height.covered_m == 0.0
+
+
 def test_position_0_0_is_none() -> None:
     difference = ReceiverDifference()
     nowhere = status(0.0)._replace(position_deg=None)

@@ -17,6 +17,8 @@ NEAR_M: Final = 50.0
 
 Before an autopilot's height is valid it may be off by hundreds of metres (docs/field-notes.md 1).
 """
+RESOLUTION_M: Final = 0.05
+"""Difference by the resolution of positions, 11 mm each, and of stamps, 1 ms."""
 LAGGING_M: Final = 1.0
 """Largest difference that a lag may explain in part; of a larger one, no part is."""
 NOTICE_M: Final = 3.0  # least difference that is announced
@@ -27,6 +29,11 @@ LAG_S: Final = 0.5
 In eight logs of real and simulated vehicles 98 % were -0.05 to 0.56 s (docs/field-notes.md 1).
 """
 ARRIVAL_LAG_S: Final = 1.0  # the same at the arrival, if only that is known
+GROWTH_MPS: Final = 5.0
+"""Fastest growth of a difference that the bound follows.
+
+A report that jumps is rejected instead, or restarts the track with a notice.
+"""
 HELD_NS: Final = 5_000_000_000
 """Time for which a difference is held at least: less of it shows at another course or climb."""
 SAME_CLOCK_S: Final = 10.0  # longest time between two stamps of one clock
@@ -47,13 +54,18 @@ class Difference:
     apart_m: float = 0.0
     covered_m: float = 0.0
     noticed_m: float = NOTICE_M
+    _noted_ns: int | None = None
     _since_ns: int = 0
     _largest_m: tuple[float, float] = 0.0, 0.0  # before that time, for ``HELD_NS``, and since
 
     def note(self, apart_m: float, most_m: float, t_ns: int) -> None:
         """Note a new difference, and the largest one that the unknown lag allows."""
         is_drift = apart_m < NEAR_M or self.covered_m > NEAR_M / 2
-        covered_m = apart_m if apart_m < LAGGING_M else most_m
+        covered_m = (apart_m if apart_m < LAGGING_M else most_m) - RESOLUTION_M
+        if self._noted_ns is not None:
+            grown_m = GROWTH_MPS * (t_ns - self._noted_ns) * 1e-9
+            covered_m = min(covered_m, self.covered_m + grown_m)
+        self._noted_ns = t_ns
         before_m, since_m = self._largest_m
         if t_ns - self._since_ns > HELD_NS:
             self._since_ns, before_m, since_m = t_ns, since_m, 0.0

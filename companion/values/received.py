@@ -1,4 +1,7 @@
-"""Received values: frames, and the messages decoded from them."""
+"""Received values: frames, and the messages decoded from them.
+
+Over 300 lines: a class for each kind of message.
+"""
 
 from dataclasses import dataclass
 from typing import Annotated, Final, NamedTuple
@@ -207,7 +210,7 @@ class GnssStatus(NamedTuple):
 
     ``fix_type`` is MAVLink's GPS_FIX_TYPE, ``alt_m`` above mean sea level; accuracies are in metres
     and m/s, None if not sent. ``time_us`` counts since boot or since 1970; 0 if unknown.
-    ``position_deg`` is latitude and longitude, WGS84; None if both are 0.
+    ``position_deg``: latitude and longitude, WGS84; None if both are 0.
     """
 
     t_ns: int

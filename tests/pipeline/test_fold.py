@@ -928,7 +928,10 @@ def test_stalled_node_reaches_the_same_state(paper: list[Event]) -> None:
     ]
     assert digest_of(*estimated[0]) == digest_of(*estimated[1])
     now_ns = paper[-1].t_ns + S // 10
-    assert digest_of(busy.look(now_ns)) == digest_of(smooth.look(now_ns))
+    ours, theirs = busy.look(now_ns), smooth.look(now_ns)
+    # The width of a beam follows its bound step by step, and so has other rounding errors.
+    np.testing.assert_allclose(ours.beams.weights, theirs.beams.weights, rtol=0.0, atol=1e-14)
+    assert digest_of(replace(ours, beams=theirs.beams)) == digest_of(theirs)
     again = Pipeline(settings("5:1"))
     run(again, late)
     assert again.digest.hexdigest() == busy.digest.hexdigest()

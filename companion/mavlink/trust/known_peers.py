@@ -22,7 +22,7 @@ used only where the other has not brought any shortly before: positions that agr
 about these. Attitudes that contradict those of the other are announced. If the other has become
 late, by its own stamps, newer attitudes are used, but none newer than it could ever deliver.
 Messages that state accuracies, fixes, a type or the time of day (``_OF_FIRST``) are not used at all
-while the other is current, nor from a peer that has brought no position yet.
+while the other is current, nor, except the type, from a peer that has brought no position yet.
 
 Stamps are used only if they are of the other's clock: another clock would look like a restart, or
 like a second vehicle. A peer that becomes more than ten seconds late is a stranger from then on, if
@@ -95,6 +95,11 @@ STRANGER: Final = "another peer than the known one of this sender; not used unti
 BROUGHT: Final = "the same message of this sender comes from the peer that was known first"
 _OF_FIRST: Final = ABOUT_ATTITUDE | {GPS_RAW_INT, EKF_STATUS_REPORT, SYSTEM_TIME, HEARTBEAT}
 """Messages that count only from the peer believed first: nothing else confirms them."""
+_UNPROVEN: Final = _OF_FIRST - {HEARTBEAT}
+"""Those that count only once their peer has brought a position.
+
+A heartbeat that comes alone shows over which radio positions can be requested.
+"""
 BROUGHT_NS: Final = {ATTITUDE: 300_000_000, **dict.fromkeys(_OF_FIRST, 5_000_000_000)}
 """Messages that move bounds, and the time for which one excludes those of peers known later."""
 OVERTAKEN_MS: Final = 300
@@ -228,7 +233,7 @@ class KnownPeers:
                 if not is_router and _is_another_clock_too_soon(sender, frame):
                     return STRANGER
                 self._make_known(sender, peer, self._new(frame, is_router), frame)
-            return STRANGER if msgid in _OF_FIRST and not is_router else None
+            return STRANGER if msgid in _UNPROVEN and not is_router else None
         if msgid not in _ABOUT_SENDER and not any(msgid in one.newest for one in current):
             return None
         if msgid in OWN and self._replaces(sender, peer, current, frame):

@@ -2,7 +2,7 @@
 
 The receiver's error is bounded by its stated accuracy. The autopilot's is not: its barometer
 drifts, and its estimator may reject the receiver. The autopilot's position is therefore off by at
-most the receiver's error and this difference (docs/math.md 5).
+most the receiver's error and this difference (docs/math.md 4).
 """
 
 import math

@@ -9,8 +9,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.mavlink.wire.stamps import step_ms
-from companion.values import FIX_3D, GnssStatus, Report
+from companion.values import FIX_3D, GnssStatus, Report, Severity
 
 NEAR_M: Final = 50.0
 """Largest difference with which a drift begins; a larger one shows that a position is invalid.
@@ -19,10 +18,11 @@ Before an autopilot's height is valid it may be off by hundreds of metres (docs/
 """
 RESOLUTION_M: Final = 0.05
 """Difference by the resolution of positions, 11 mm each, and of stamps, 1 ms."""
-LAGGING_M: Final = 1.0
-"""Largest difference that a lag may explain in part; of a larger one, no part is."""
 NOTICE_M: Final = 3.0  # least difference that is announced
 NOTICE_RATIO: Final = 2.0  # increase after which it is announced again
+LEAST_ANNOUNCED_M: Final = NOTICE_M / NOTICE_RATIO
+ANNOUNCED_NS: Final = 60_000_000_000
+"""Time after a notice from which a quarter of its difference makes it forgotten."""
 LAG_S: Final = 0.5
 """Largest age of a receiver's position at the stamp of its status.
 
@@ -36,9 +36,13 @@ A report that jumps is rejected instead, or restarts the track with a notice.
 """
 HELD_NS: Final = 5_000_000_000
 """Time for which a difference is held at least: less of it shows at another course or climb."""
-SAME_CLOCK_S: Final = 10.0  # longest time between two stamps of one clock
+LATE_S: Final = 1.0  # largest lateness of a report that is compared by arrivals
 APART_S: Final = 3.0  # longest time between a status and a report that are compared
+APART_US: Final = 3_000_000  # the same in microseconds, between two stamps of one clock
 _METRES_PER_DEGREE: Final = 111_195.0
+SCALED_DEG: Final = 0.01  # change of latitude after which degrees of longitude are scaled anew
+
+Pair = tuple[float, float]
 
 
 @dataclass(slots=True, kw_only=True)
@@ -46,48 +50,54 @@ class Difference:
     """Difference of the altitudes or horizontal positions, and what follows from it.
 
     apart_m    newest difference
+    noted_ns   when it was noted; None: never
     covered_m  part of the position bound that it needs: the largest of the last ``HELD_NS``
-    noticed_m  difference that was announced last
+    largest_m  largest one to be covered since ``since_ns``, and of the time before, for ``HELD_NS``
+    announced_m     difference that was announced last, at ``announced_ns``
     """
 
     what: str
     apart_m: float = 0.0
+    noted_ns: int | None = None
     covered_m: float = 0.0
-    noticed_m: float = NOTICE_M
-    _noted_ns: int | None = None
-    _since_ns: int = 0
-    _largest_m: tuple[float, float] = 0.0, 0.0  # before that time, for ``HELD_NS``, and since
+    largest_m: tuple[float, float] = 0.0, 0.0
+    since_ns: int = 0
+    announced_m: float = LEAST_ANNOUNCED_M
+    announced_ns: int = 0
 
     def note(self, apart_m: float, most_m: float, t_ns: int) -> None:
-        """Note a new difference, and the largest one that the unknown lag allows."""
-        is_drift = apart_m < NEAR_M or self.covered_m > NEAR_M / 2
-        covered_m = (apart_m if apart_m < LAGGING_M else most_m) - RESOLUTION_M
-        if self._noted_ns is not None:
-            grown_m = GROWTH_MPS * (t_ns - self._noted_ns) * 1e-9
+        """Note a new difference, and what the bound must cover of it, besides resolution."""
+        covered_m = most_m - RESOLUTION_M
+        if self.noted_ns is not None:
+            grown_m = GROWTH_MPS * (t_ns - self.noted_ns) * 1e-9
             covered_m = min(covered_m, self.covered_m + grown_m)
-        self._noted_ns = t_ns
-        before_m, since_m = self._largest_m
-        if t_ns - self._since_ns > HELD_NS:
-            self._since_ns, before_m, since_m = t_ns, since_m, 0.0
-        self._largest_m = before_m, max(since_m, covered_m if is_drift else 0.0)
-        self.apart_m, self.covered_m = apart_m, max(self._largest_m)
+        if apart_m >= NEAR_M and self.covered_m <= NEAR_M / 2:  # no drift
+            covered_m = 0.0
+        if apart_m < self.announced_m / NOTICE_RATIO**2 and t_ns - self.announced_ns > ANNOUNCED_NS:
+            self.announced_m = LEAST_ANNOUNCED_M
+        if t_ns - self.since_ns > HELD_NS:
+            self.since_ns, self.largest_m = t_ns, (0.0, self.largest_m[0])
+        since_m, before_m = self.largest_m
+        self.largest_m = max(since_m, covered_m), before_m
+        self.apart_m, self.noted_ns, self.covered_m = apart_m, t_ns, max(self.largest_m)
 
     @property
     def is_news(self) -> bool:
         """Whether it must be announced."""
-        return self.apart_m > self.noticed_m
+        return self.apart_m > NOTICE_RATIO * self.announced_m
 
     def text(self, metres: str) -> str:
         """Return the difference in words."""
         return f"its {self.what} differs by {metres} m from its GNSS receiver's"
 
-    def announce(self) -> str:
+    def announce(self, t_ns: int) -> tuple[Severity, str]:
         """Return what must be announced, and note that it is."""
-        self.noticed_m = NOTICE_RATIO * self.apart_m
+        self.announced_m, self.announced_ns = self.apart_m, t_ns
         covered = "the position bound covers the difference"
-        is_covered = self.covered_m >= self.apart_m
+        is_covered = self.covered_m >= self.apart_m - RESOLUTION_M
         then = covered if is_covered else "one of the two is invalid"
-        return f"{self.text(f'{self.apart_m:.0f}')}; {then}"
+        severity = Severity.INFO if is_covered else Severity.WARNING
+        return severity, f"{self.text(f'{self.apart_m:.0f}')}; {then}"
 
 
 @dataclass(slots=True, kw_only=True)
@@ -101,32 +111,85 @@ class ReceiverDifference:
     height: Difference = field(default_factory=lambda: Difference(what="altitude"))
     horizontal: Difference = field(default_factory=lambda: Difference(what="position"))
     is_news: bool = False  # whether one of them must be announced
+    _scaled_deg: float = math.inf  # latitude at which a degree of longitude has ``_east_m``
+    _east_m: float = 0.0
 
-    def compare(self, status: GnssStatus, report: Report, late_s: float) -> None:
-        """Compare a status with the first report after it, which is at most ``late_s`` late."""
+    def compare(self, status: GnssStatus, report: Report, late_s: float, receiver_m: float) -> None:
+        """Compare a status with the first report after it, which is at most ``late_s`` late.
+
+        ``receiver_m`` bounds the receiver's error: of a larger difference, no part is taken for a
+        lag.
+
+        Stamps are compared, as either may have overtaken the other; arrivals if the stamps are of
+        two clocks, as of receivers that count from 1970, or if one has wrapped around.
+
+        Without further calls, as this runs for most reports.
+        """
         self.compared = status
-        if status.fix_type < FIX_3D:
+        velocity_mps, t_ns = report.velocity_ne_mps, report.t_ns
+        if status.fix_type < FIX_3D or velocity_mps is None:
             return
-        elapsed_s = _between_stamps_s(status, report)
-        least_s, most_s = 0.0, LAG_S
-        if elapsed_s is None:
-            elapsed_s = (report.t_ns - status.t_ns) * 1e-9
-            least_s, most_s = -late_s, late_s + ARRIVAL_LAG_S
-        if abs(elapsed_s) > APART_S:  # a vehicle that manoeuvres is elsewhere by then
-            return
+        stamp_us = status.time_us
+        elapsed_us = report.boot_ms * 1000 - stamp_us if stamp_us and report.boot_ms else None
+        if elapsed_us is not None and -APART_US <= elapsed_us <= APART_US:
+            elapsed_s = elapsed_us * 1e-6
+            least_s, most_s = elapsed_s, elapsed_s + LAG_S
+        else:
+            elapsed_s = (t_ns - status.t_ns) * 1e-9
+            if elapsed_s > APART_S or late_s > LATE_S:  # it may have turned, or is anywhere
+                return
+            least_s, most_s = elapsed_s - late_s, elapsed_s + late_s + ARRIVAL_LAG_S
         if report.velocity_down_mps is not None:
-            descended_m = report.velocity_down_mps * elapsed_s
-            apart_m = abs(report.alt_m - status.alt_m + descended_m)
-            self.height.note(apart_m, apart_m, report.t_ns)
-        if status.position_deg is not None and report.velocity_ne_mps is not None:
-            lat_deg, lon_deg = status.position_deg
-            north_m = (report.lat_deg - lat_deg) * _METRES_PER_DEGREE
-            across = _METRES_PER_DEGREE * math.cos(math.radians(lat_deg))
-            east_m = math.remainder(report.lon_deg - lon_deg, 360.0) * across
-            seconds = elapsed_s + least_s, elapsed_s + most_s
-            least_m, most_m = _off_path_m((north_m, east_m), report.velocity_ne_mps, seconds)
-            self.horizontal.note(least_m, most_m, report.t_ns)
-        self.is_news = self.height.is_news or self.horizontal.is_news
+            above_m, down_mps = report.alt_m - status.alt_m, report.velocity_down_mps
+            first_m, last_m = above_m + down_mps * least_s, above_m + down_mps * most_s
+            least_m, most_m = (first_m, last_m) if first_m < last_m else (last_m, first_m)
+            if least_m < 0.0:
+                least_m, most_m = (0.0 if most_m > 0.0 else -most_m), max(-least_m, most_m)
+            one, is_small = self.height, least_m < receiver_m
+            is_covered = least_m <= one.largest_m[0] + RESOLUTION_M and is_small
+            if is_covered and t_ns - one.since_ns <= HELD_NS:
+                one.apart_m, one.noted_ns = least_m, t_ns
+            else:
+                one.note(least_m, least_m if is_small else most_m, t_ns)
+        if status.position_deg is not None:
+            seconds = least_s, most_s
+            self._compare_position(status.position_deg, report, velocity_mps, seconds, receiver_m)
+        height, horizontal = self.height, self.horizontal
+        self.is_news = (
+            height.apart_m > NOTICE_RATIO * height.announced_m
+            or horizontal.apart_m > NOTICE_RATIO * horizontal.announced_m
+        )
+
+    def _compare_position(
+        self,
+        of_receiver_deg: Pair,
+        report: Report,
+        velocity_mps: Pair,
+        seconds: Pair,
+        receiver_m: float,
+    ) -> None:
+        """Note the least distance of a report from the receiver's path between two times."""
+        (lat_deg, lon_deg), (north_mps, east_mps), t_ns = of_receiver_deg, velocity_mps, report.t_ns
+        if not -SCALED_DEG < lat_deg - self._scaled_deg < SCALED_DEG:
+            self._scaled_deg = lat_deg
+            self._east_m = _METRES_PER_DEGREE * math.cos(math.radians(lat_deg))
+        east_deg = report.lon_deg - lon_deg
+        if not -180.0 <= east_deg <= 180.0:
+            east_deg -= math.copysign(360.0, east_deg)
+        north_m, east_m = (report.lat_deg - lat_deg) * _METRES_PER_DEGREE, east_deg * self._east_m
+        speed2 = north_mps * north_mps + east_mps * east_mps
+        at_s = (north_m * north_mps + east_m * east_mps) / speed2 if speed2 else 0.0
+        at_s = seconds[0] if at_s < seconds[0] else seconds[1] if at_s > seconds[1] else at_s
+        off_north_m, off_east_m = north_m - north_mps * at_s, east_m - east_mps * at_s
+        apart_m: float = (off_north_m * off_north_m + off_east_m * off_east_m) ** 0.5
+        one = self.horizontal
+        is_small = apart_m < receiver_m
+        is_covered = apart_m <= one.largest_m[0] + RESOLUTION_M and is_small
+        if is_covered and t_ns - one.since_ns <= HELD_NS:  # nearly always
+            one.apart_m, one.noted_ns = apart_m, t_ns
+            return
+        ends_m = (math.hypot(north_m - north_mps * s, east_m - east_mps * s) for s in seconds)
+        one.note(apart_m, apart_m if is_small else max(ends_m), t_ns)
 
     @property
     def larger(self) -> Difference:
@@ -134,35 +197,7 @@ class ReceiverDifference:
         is_height = self.height.covered_m >= self.horizontal.covered_m
         return self.height if is_height else self.horizontal
 
-    def announce(self) -> list[str]:
+    def announce(self, t_ns: int) -> list[tuple[Severity, str]]:
         """Return what must be announced, and note that it is."""
         self.is_news = False
-        return [one.announce() for one in (self.height, self.horizontal) if one.is_news]
-
-
-def _between_stamps_s(status: GnssStatus, report: Report) -> float | None:
-    """Return the time from a status to a report by their stamps; None if these are of two clocks.
-
-    Either may have overtaken the other on the link. Some receivers count from 1970.
-    """
-    if report.boot_ms is None or not status.time_us:
-        return None
-    elapsed_s = step_ms(report.boot_ms, status.time_us // 1000 & 0xFFFF_FFFF) * 1e-3
-    return elapsed_s if abs(elapsed_s) <= SAME_CLOCK_S else None
-
-
-def _off_path_m(
-    offset_m: tuple[float, float], velocity_mps: tuple[float, float], seconds: tuple[float, float]
-) -> tuple[float, float]:
-    """Return the least and largest distance of an offset from a path at a velocity.
-
-    ``seconds`` are the times at which the path begins and ends.
-    """
-    (north_m, east_m), (north_mps, east_mps) = offset_m, velocity_mps
-    speed2 = north_mps * north_mps + east_mps * east_mps
-    along_s = (north_m * north_mps + east_m * east_mps) / speed2 if speed2 else 0.0
-    at_s = min(max(along_s, seconds[0]), seconds[1])
-    least_m, *ends_m = (
-        math.hypot(north_m - north_mps * t_s, east_m - east_mps * t_s) for t_s in (at_s, *seconds)
-    )
-    return least_m, max(ends_m)
+        return [one.announce(t_ns) for one in (self.height, self.horizontal) if one.is_news]

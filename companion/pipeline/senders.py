@@ -78,6 +78,8 @@ STATUS_REORDER_MAX_US: Final = 30_000_000
 
 Equal to the time for which reports are remembered (``dedupe``).
 """
+STATUS_ALONE_NS: Final = 2_000_000_000
+"""Time without a newer status after which an older one is used: the receiver's clock was set."""
 KEPT_NS: Final = 3_600_000_000_000
 """Time for which a silent sender without a track is kept; each clock takes some 20 kB."""
 HEIGHT_FILTER_WEIGHT: Final = (
@@ -249,9 +251,9 @@ class Senders:
         if t_ns > component.fix.silent_ns:
             said = self._about_fix(uav, component.fix.note_silence(t_ns, before_ns), t_ns)
         if component.difference.is_news and uav in self._tracked:
-            for told in component.difference.announce():
-                text = f"{uav}: {told}"
-                notice = Notice(t_ns=t_ns, severity=Severity.INFO, subject=uav, text=text)
+            for severity, words in component.difference.announce(t_ns):
+                text = f"{uav}: {words}"
+                notice = Notice(t_ns=t_ns, severity=severity, subject=uav, text=text)
                 said = (*said, notice)
         return said
 
@@ -277,8 +279,12 @@ class Senders:
         match message:
             case GnssStatus():
                 stated_us, newest_us = message.time_us, component.stated_us
-                # An older status comes over a second, slower link.
-                is_newest = not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US
+                # An older status comes over a second, slower link, while newer ones come too.
+                is_newest = (
+                    not 0 < stated_us < newest_us <= stated_us + STATUS_REORDER_MAX_US
+                    or component.receiver is None
+                    or message.t_ns - component.receiver.t_ns > STATUS_ALONE_NS
+                )
                 # Before its first position, no peer is known to speak for the vehicle.
                 if sender is not None:
                     if frame.doubt_ns:  # others may only raise what is known here
@@ -407,12 +413,13 @@ class Senders:
             newest is None or step_ms(report.boot_ms, newest[1]) > 0 or stamp.rebooted
         ):
             sender.newest = t_ns, report.boot_ms
-        assumed = self.assumed(uav)
+        component = self._components.get(report.source) if is_own else None
+        types = () if component is None else tuple(component.types)
+        assumed = self._assumed(uav, types) if is_own else self.assumed(uav)
         lag_ns = round(assumed.lag_middle_s * 1e9)
         made_ns = stamp.oldest_ns - lag_ns
         errors: ReportNoise | None = None
         if is_own:
-            component = self._components.get(report.source)
             if (
                 component is not None
                 and component.no_position_ns is not None
@@ -484,8 +491,9 @@ class Senders:
                 component.apart_m2, apart_m = apart_m2, apart_m2**0.5
             difference = component.difference
             if receiver is not difference.compared:
-                difference.compare(receiver, report, (report.t_ns - made_ns) * 1e-9)
-            if component.fix.is_trusted or report.t_ns - receiver.t_ns <= noise.STATED_NS:
+                late_s = (report.t_ns - made_ns) * 1e-9
+                difference.compare(receiver, report, late_s, known.horizontal_m)
+            if report.t_ns - receiver.t_ns <= noise.STATED_NS or component.fix.is_trusted:
                 off_m = difference.horizontal.covered_m
                 height_off_m = difference.height.covered_m
         known = known or self._noise_settings.default
@@ -499,12 +507,12 @@ class Senders:
             time_s=time_s,
             apart_m=apart_m,
         )
+        if report.accuracy is None and not report.alt_step_m:  # nearly always
+            return made
         return self._stated_accuracy(report, made)
 
     def _stated_accuracy(self, report: Report, noise: ReportNoise) -> ReportNoise:
         """Widen bounds by what the message itself states: accuracy, and steps of height."""
-        if report.accuracy is None and not report.alt_step_m:
-            return noise
         said, factor = report.accuracy or Accuracy(), self._noise_settings.factor or 0.0
         horizontal_m = max(noise.horizontal_m, factor * (said.horizontal_m or 0.0))
         vertical_m = max(noise.vertical_m, factor * (said.vertical_m or 0.0)) + report.alt_step_m

@@ -378,6 +378,24 @@ def test_bound_grows_if_the_vehicle_restarts_in_flight_and_states_no_fix_later(
     assert largest_m(found, ENDS_S - 5.0, ENDS_S) > 100.0
 
 
+@pytest.mark.parametrize("back_s", [3.0, 18.0])
+def test_loss_is_noticed_after_the_clock_of_the_receiver_was_set_back(back_s: float) -> None:
+    """It learned the leap seconds, or another receiver is used."""
+
+    def set_back() -> Iterator[Any]:
+        for event in flight(0.45):
+            t_s = (event.t_ns - START_NS) / S if isinstance(event, Frame) else 0.0
+            if isinstance(event, Frame) and event.msgid == 24 and t_s > LOST_S - 1.0:
+                message = dialect.MAVLink(None).decode(bytearray(event.raw))
+                message.time_usec -= round(back_s * 1e6)
+                event = sent(t_s, UAV, message)  # noqa: PLW2901
+            yield event
+
+    outputs, _ = flown(set_back())
+    (told,) = notices(outputs)
+    assert 0.0 <= (told.t_ns - START_NS) / S - LOST_S < 1.6
+
+
 # --- what the estimator states in flight ----------------------------------------------------------
 
 BY_FLOW, REJECTS_GNSS = 0b0000101111, 0b1100111111 | 1 << 15

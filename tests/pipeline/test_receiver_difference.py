@@ -17,7 +17,7 @@ from companion.pipeline.receiver_difference import (
     RESOLUTION_M,
     ReceiverDifference,
 )
-from companion.values import AltitudeDatum, GnssStatus, Report, Source
+from companion.values import AltitudeDatum, GnssStatus, Report, Severity, Source
 
 S = 1_000_000_000
 METRES_PER_DEGREE = 111_195.0
@@ -67,9 +67,16 @@ def report(
     )
 
 
+RECEIVER_M = 0.9
+
+
+def compare(difference: ReceiverDifference, found: GnssStatus, made: Report, late_s: float) -> None:
+    difference.compare(found, made, late_s, RECEIVER_M)
+
+
 @given(
     elapsed_s=st.floats(0.0, 1.0),
-    late_s=st.floats(0.0, 2.0),
+    late_s=st.floats(0.0, 1.0),
     shares=st.tuples(st.floats(0.0, 1.0), st.floats(0.0, 1.0), st.floats(0.0, 1.0)),
     velocity_mps=st.tuples(st.floats(-40.0, 40.0), st.floats(-40.0, 40.0)),
 )
@@ -83,7 +90,7 @@ def test_lateness_of_status_and_report_is_no_difference(
     north_mps, east_mps = velocity_mps
     true_s = elapsed_s - shares[0] * late_s, -shares[1] * late_s - shares[2] * ARRIVAL_LAG_S
     difference = ReceiverDifference()
-    difference.compare(
+    compare(difference,
         status(0.0, north_mps * true_s[1], east_mps * true_s[1]),
         report(elapsed_s, (north_mps * true_s[0], east_mps * true_s[0], 0.0),
                (north_mps, east_mps, 0.0)),
@@ -99,7 +106,7 @@ def test_what_lateness_does_not_explain_is_covered(off_m: tuple[float, float]) -
     Then nothing shows how late the status was.
     """
     difference = ReceiverDifference()
-    difference.compare(status(0.0), report(0.2, (*off_m, 0.0), (10.0, 0.0, 0.0)), 0.5)
+    compare(difference, status(0.0), report(0.2, (*off_m, 0.0), (10.0, 0.0, 0.0)), 0.5)
     behind_m = 3.0 if off_m[0] < 0.0 else 0.0  # the report may be from before the status
     assert difference.horizontal.apart_m == pytest.approx(7.0 - behind_m, abs=0.06)
     paths_m = ((10.0 * t_s, 0.0) for t_s in (0.2 - 0.5, 0.2 + 0.5 + ARRIVAL_LAG_S))
@@ -116,11 +123,14 @@ def test_stamps_of_one_clock_show_how_late_each_is(status_late_s: float, lag_s: 
     late = status(status_late_s)._replace(time_us=100_000_000)
     made_s = 0.3
     moved = (north_mps * (made_s + lag_s), 0.0, climb_mps * made_s + off_m)
-    difference.compare(
+    compare(
+        difference,
         late,
         report(status_late_s + 0.1, moved, (north_mps, 0.0, -climb_mps))._replace(boot_ms=100_300),
         3.0,
     )
+    lagged_m = climb_mps * LAG_S
+    assert difference.height.apart_m == pytest.approx(off_m - lagged_m, abs=0.06)
     assert difference.height.covered_m == pytest.approx(off_m, abs=0.06)
     assert difference.horizontal.covered_m == pytest.approx(0.0, abs=0.06)
 
@@ -129,13 +139,13 @@ def test_stamps_of_one_clock_show_how_late_each_is(status_late_s: float, lag_s: 
 def test_stamps_of_another_clock_are_not_compared(time_us: int) -> None:
     difference = ReceiverDifference()
     placed = report(0.4, (6.0, 0.0, 0.0), (15.0, 0.0, 0.0))._replace(boot_ms=100_000)
-    difference.compare(status(0.0)._replace(time_us=time_us), placed, 0.0)
+    compare(difference, status(0.0)._replace(time_us=time_us), placed, 0.0)
     assert difference.horizontal.covered_m == pytest.approx(0.0, abs=0.06)
 
 
 def test_standing_vehicle_may_be_nowhere_else() -> None:
     difference = ReceiverDifference()
-    difference.compare(status(0.0), report(0.2, (3.0, 4.0, 0.0)), 2.0)
+    compare(difference, status(0.0), report(0.2, (3.0, 4.0, 0.0)), 0.9)
     assert difference.horizontal.covered_m == pytest.approx(5.0, abs=0.06)
     assert difference.height.covered_m == 0.0
 
@@ -144,14 +154,14 @@ def test_standing_vehicle_may_be_nowhere_else() -> None:
 def test_climb_since_the_status_is_no_difference(climb_mps: float) -> None:
     difference = ReceiverDifference()
     climbed = report(0.5, (0.0, 0.0, climb_mps * 0.5), (0.0, 0.0, -climb_mps))
-    difference.compare(status(0.0), climbed, 0.0)
+    compare(difference, status(0.0), climbed, 0.0)
     assert difference.height.covered_m == pytest.approx(0.0, abs=1e-9)
 
 
 def test_report_without_velocity_is_not_compared() -> None:
     """Some messages state none: where the vehicle was at the time of the status is unknown."""
     difference = ReceiverDifference()
-    difference.compare(status(0.0), report(0.1, (20.0, 0.0, 20.0), None), 0.0)
+    compare(difference, status(0.0), report(0.1, (20.0, 0.0, 20.0), None), 0.0)
     assert difference.horizontal.covered_m == difference.height.covered_m == 0.0
 
 
@@ -160,22 +170,38 @@ def test_report_long_after_the_status_is_not_compared(boot_ms: int | None) -> No
     """It may have turned within a gap of its radio."""
     difference = ReceiverDifference()
     later = report(6.0, (20.0, 0.0, 20.0), (-15.0, 0.0, 5.0))._replace(boot_ms=boot_ms)
-    difference.compare(status(0.0)._replace(time_us=100_000_000), later, 0.0)
+    compare(difference, status(0.0)._replace(time_us=100_000_000), later, 0.0)
+    assert difference.horizontal.covered_m == difference.height.covered_m == 0.0
+
+
+@pytest.mark.parametrize("off_m", [0.5 * RECEIVER_M, 2.0 * RECEIVER_M])
+def test_noise_of_the_receiver_is_no_reason_to_doubt_its_lag(off_m: float) -> None:
+    difference = ReceiverDifference()
+    aside = report(0.1, (2.0, off_m, 0.0), (20.0, 0.0, 0.0))._replace(boot_ms=100_100)
+    compare(difference, status(0.0)._replace(time_us=100_000_000), aside, 0.0)
+    is_noise = off_m < RECEIVER_M
+    assert (difference.horizontal.covered_m < off_m) is is_noise
+    assert (difference.horizontal.covered_m > 0.5 * 20.0 * LAG_S) is not is_noise
+
+
+def test_late_report_is_not_compared_by_arrival() -> None:
+    difference = ReceiverDifference()
+    compare(difference, status(0.0), report(0.1, (20.0, 0.0, 20.0)), 1.5)
     assert difference.horizontal.covered_m == difference.height.covered_m == 0.0
 
 
 def test_position_0_0_is_none() -> None:
     difference = ReceiverDifference()
     nowhere = status(0.0)._replace(position_deg=None)
-    difference.compare(nowhere, report(0.1, (20.0, 0.0, 0.0)), 0.0)
+    compare(difference, nowhere, report(0.1, (20.0, 0.0, 0.0)), 0.0)
     assert not difference.is_news
 
 
 def test_difference_stays_while_the_receiver_has_no_fix() -> None:
     difference = ReceiverDifference()
-    difference.compare(status(0.0), report(0.1, (20.0, 0.0, 0.0)), 0.0)
+    compare(difference, status(0.0), report(0.1, (20.0, 0.0, 0.0)), 0.0)
     lost = status(1.0)._replace(fix_type=1)
-    difference.compare(lost, report(1.1), 0.0)
+    compare(difference, lost, report(1.1), 0.0)
     assert difference.compared is lost
     assert difference.horizontal.covered_m == pytest.approx(20.0, abs=0.06)
 
@@ -183,13 +209,13 @@ def test_difference_stays_while_the_receiver_has_no_fix() -> None:
 def test_drift_is_covered_beyond_the_largest_difference_of_valid_positions() -> None:
     drifts, jumps = ReceiverDifference(), ReceiverDifference()
     for t_s in range(14):
-        drifts.compare(status(t_s), report(t_s + 0.1, (4.6 * t_s, 0.0, 0.0)), 0.0)
-    jumps.compare(status(0.0), report(0.1, (NEAR_M + 10.0, 0.0, 0.0)), 0.0)
+        compare(drifts, status(t_s), report(t_s + 0.1, (4.6 * t_s, 0.0, 0.0)), 0.0)
+    compare(jumps, status(0.0), report(0.1, (NEAR_M + 10.0, 0.0, 0.0)), 0.0)
     assert drifts.horizontal.covered_m == pytest.approx(4.6 * 13, abs=0.1)
     assert jumps.horizontal.covered_m == 0.0
-    assert jumps.announce() == [
-        "its position differs by 60 m from its GNSS receiver's; one of the two is invalid"
-    ]
+    (told,) = jumps.announce(0)
+    text = "its position differs by 60 m from its GNSS receiver's; one of the two is invalid"
+    assert told == (Severity.WARNING, text)
 
 
 def test_jump_of_a_report_is_not_covered_at_once() -> None:
@@ -198,7 +224,7 @@ def test_jump_of_a_report_is_not_covered_at_once() -> None:
     for number in range(60):
         t_s = number / 5
         jumped_m = 30.0 if t_s > 2.0 else 0.0
-        difference.compare(status(t_s), report(t_s + 0.05, (0.0, jumped_m, 0.0)), 0.0)
+        compare(difference, status(t_s), report(t_s + 0.05, (0.0, jumped_m, 0.0)), 0.0)
         covered_m.append(difference.horizontal.covered_m)
     grown_m = [after - before for before, after in pairwise(covered_m)]
     assert max(grown_m) == pytest.approx(0.2 * GROWTH_MPS)
@@ -208,9 +234,9 @@ def test_jump_of_a_report_is_not_covered_at_once() -> None:
 def test_difference_is_announced_once_until_it_doubles() -> None:
     difference, told = ReceiverDifference(), list[str]()
     for metres in range(20):
-        difference.compare(status(metres), report(metres + 0.1, (0.0, metres + 0.6, 0.0)), 0.0)
+        compare(difference, status(metres), report(metres + 0.1, (0.0, metres + 0.6, 0.0)), 0.0)
         if difference.is_news:
-            told += difference.announce()
+            told += [text for _, text in difference.announce(0)]
         assert not difference.is_news
     assert [text.split(" by ")[1].split()[0] for text in told] == ["4", "8", "16"]
     assert NOTICE_M < 4
@@ -219,20 +245,31 @@ def test_difference_is_announced_once_until_it_doubles() -> None:
 def test_difference_is_held_for_a_while() -> None:
     """On another course less of it shows."""
     difference, held_s = ReceiverDifference(), HELD_NS / S
-    difference.compare(status(0.0), report(0.1, (8.0, 0.0, 0.0)), 0.0)
+    compare(difference, status(0.0), report(0.1, (8.0, 0.0, 0.0)), 0.0)
     found = []
     for number in range(1, 30):
         t_s = number / 2
-        difference.compare(status(t_s), report(t_s + 0.1, (1.0, 0.0, 0.0)), 0.0)
+        compare(difference, status(t_s), report(t_s + 0.1, (1.0, 0.0, 0.0)), 0.0)
         found.append((t_s, round(difference.horizontal.covered_m)))
     assert {metres for t_s, metres in found if t_s <= held_s} == {8}
     assert {metres for t_s, metres in found if t_s > 2 * held_s + 1.0} == {1}
 
 
+def test_difference_that_is_gone_for_a_while_is_announced_again() -> None:
+    difference, told = ReceiverDifference(), []
+    for number in range(200):
+        t_s = number / 2
+        off_m = 20.0 if 10.0 <= t_s < 12.0 or t_s >= 90.0 else 0.5
+        compare(difference, status(t_s), report(t_s + 0.1, (0.0, off_m, 0.0)), 0.0)
+        if difference.is_news:
+            told += difference.announce(round(t_s * S))
+    assert [text.split(" by ")[1].split()[0] for _, text in told] == ["20", "20"]
+
+
 def test_larger_difference_is_named() -> None:
     difference = ReceiverDifference()
-    difference.compare(status(0.0), report(0.1, (6.0, 0.0, 4.0)), 0.0)
+    compare(difference, status(0.0), report(0.1, (6.0, 0.0, 4.0)), 0.0)
     assert difference.larger.text("6") == "its position differs by 6 m from its GNSS receiver's"
     difference = ReceiverDifference()
-    difference.compare(status(1.0), report(1.1, (0.0, 0.0, 4.0)), 0.0)
+    compare(difference, status(1.0), report(1.1, (0.0, 0.0, 4.0)), 0.0)
     assert difference.larger.text("4") == "its altitude differs by 4 m from its GNSS receiver's"

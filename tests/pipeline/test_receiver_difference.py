@@ -140,7 +140,7 @@ def test_stamps_of_another_clock_are_not_compared(time_us: int) -> None:
     difference = ReceiverDifference()
     placed = report(0.4, (6.0, 0.0, 0.0), (15.0, 0.0, 0.0))._replace(boot_ms=100_000)
     compare(difference, status(0.0)._replace(time_us=time_us), placed, 0.0)
-    assert difference.horizontal.covered_m == pytest.approx(0.0, abs=0.06)
+    assert difference.horizontal.apart_m == pytest.approx(0.0, abs=0.06)
 
 
 def test_standing_vehicle_may_be_nowhere_else() -> None:

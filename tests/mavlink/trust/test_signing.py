@@ -379,8 +379,8 @@ def test_evicted_streams_stay_rejected() -> None:
 def test_stream_that_was_silent_for_longest_gives_way() -> None:
     """Not the one with the oldest timestamp: its clock may be behind."""
     ours, behind, silent = guard(), (1, 1, 0), (1, 2, 0)
-    assert ours.refusal(sent(NOW, stream=silent)) is None
     assert ours.refusal(sent(NOW - 50 * UNITS, stream=behind)) is None
+    assert ours.refusal(sent(NOW, stream=silent)) is None
     others = [(2 + n % 250, 1, n // 250) for n in range(STREAMS_MAX - 1)]
     for stream in others[:-1]:
         assert ours.refusal(sent(NOW + 1, stream=stream)) is None

@@ -196,9 +196,10 @@ def of_beam(
                 return Blame(
                     Cause.POSITION, _without_fix(bound, evidence.dead_reckoning_s), CHECK_GNSS
                 )
-            off = evidence.receiver_difference.larger
+            difference = evidence.receiver_difference
+            off = difference.larger
             if off.covered_m > track.bound_m / 2:
-                check = CHECK_HEIGHT if off.what == "altitude" else CHECK_ESTIMATOR
+                check = CHECK_HEIGHT if off is difference.height else CHECK_ESTIMATOR
                 off_text = off.text(f"up to {off.covered_m:.0f}")
                 return Blame(Cause.POSITION, f"{bound}: {off_text}", check)
             remedy = _remedy(

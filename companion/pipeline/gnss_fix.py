@@ -127,9 +127,9 @@ class GnssFix:
         return self._notice(FixNotice.SILENT, t_ns) if is_known else None
 
     def restarted(self, *, is_in_flight: bool) -> None:
-        """Forget all fixes: the vehicle was restarted, on the ground.
+        """Note that the vehicle was restarted, which forgets all fixes on the ground.
 
-        In flight a redundant autopilot took over: whether it has a fix, its statuses will show.
+        In flight a redundant autopilot took over. Its statuses show whether it has a fix.
         """
         self.relative_ns, self.silent_ns = None, NEVER_NS
         if is_in_flight:

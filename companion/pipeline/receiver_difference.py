@@ -22,11 +22,11 @@ NOTICE_M: Final = 3.0  # least difference that is announced
 NOTICE_RATIO: Final = 2.0  # increase after which it is announced again
 LEAST_ANNOUNCED_M: Final = NOTICE_M / NOTICE_RATIO
 ANNOUNCED_NS: Final = 60_000_000_000
-"""Time after a notice from which a quarter of its difference makes it forgotten."""
+"""Time after which a notice is forgotten, if the difference has fallen to a quarter of it."""
 LAG_S: Final = 0.5
 """Largest age of a receiver's position at the stamp of its status.
 
-In eight logs of real and simulated vehicles 98 % were -0.05 to 0.56 s (docs/field-notes.md 1).
+In six logs of real and simulated vehicles 98 % were 0 to 0.46 s (docs/field-notes.md 1).
 """
 ARRIVAL_LAG_S: Final = 1.0  # the same at the arrival, if only that is known
 GROWTH_MPS: Final = 5.0
@@ -38,7 +38,7 @@ HELD_NS: Final = 5_000_000_000
 """Time for which a difference is held at least: less of it shows at another course or climb."""
 LATE_S: Final = 1.0  # largest lateness of a report that is compared by arrivals
 APART_S: Final = 3.0  # longest time between a status and a report that are compared
-APART_US: Final = 3_000_000  # the same in microseconds, between two stamps of one clock
+APART_US: Final = round(APART_S * 1e6)  # the same between two stamps of one clock
 _METRES_PER_DEGREE: Final = 111_195.0
 SCALED_DEG: Final = 0.01  # change of latitude after which degrees of longitude are scaled anew
 
@@ -49,11 +49,12 @@ Pair = tuple[float, float]
 class Difference:
     """Difference of the altitudes or horizontal positions, and what follows from it.
 
-    apart_m    newest difference
-    noted_ns   when it was noted; None: never
-    covered_m  part of the position bound that it needs: the largest of the last ``HELD_NS``
-    largest_m  largest one to be covered since ``since_ns``, and of the time before, for ``HELD_NS``
-    announced_m     difference that was announced last, at ``announced_ns``
+    what         "altitude" or "position"
+    apart_m      newest difference
+    noted_ns     arrival of the report that showed it; None: none was compared
+    covered_m    part of the position bound that it needs, held for ``HELD_NS`` at least
+    largest_m    largest such part since ``since_ns``, and in the ``HELD_NS`` before that
+    announced_m  difference that was announced last, at ``announced_ns``
     """
 
     what: str
@@ -66,7 +67,7 @@ class Difference:
     announced_ns: int = 0
 
     def note(self, apart_m: float, most_m: float, t_ns: int) -> None:
-        """Note a new difference, and what the bound must cover of it, besides resolution."""
+        """Note a new difference; ``most_m`` is the largest that the unknown lag allows."""
         covered_m = most_m - RESOLUTION_M
         if self.noted_ns is not None:
             grown_m = GROWTH_MPS * (t_ns - self.noted_ns) * 1e-9
@@ -117,13 +118,13 @@ class ReceiverDifference:
     def compare(self, status: GnssStatus, report: Report, late_s: float, receiver_m: float) -> None:
         """Compare a status with the first report after it, which is at most ``late_s`` late.
 
-        ``receiver_m`` bounds the receiver's error: of a larger difference, no part is taken for a
-        lag.
+        ``receiver_m`` is the bound on the receiver's horizontal error, and also used for heights:
+        a difference up to it counts at the most favourable lag, a larger one at the least.
 
         Stamps are compared, as either may have overtaken the other; arrivals if the stamps are of
         two clocks, as of receivers that count from 1970, or if one has wrapped around.
 
-        Without further calls, as this runs for most reports.
+        Calls are inlined, because this runs for most reports.
         """
         self.compared = status
         velocity_mps, t_ns = report.velocity_ne_mps, report.t_ns
@@ -168,7 +169,7 @@ class ReceiverDifference:
         seconds: Pair,
         receiver_m: float,
     ) -> None:
-        """Note the least distance of a report from the receiver's path between two times."""
+        """Compare a report with the receiver's path, which begins and ends at two times."""
         (lat_deg, lon_deg), (north_mps, east_mps), t_ns = of_receiver_deg, velocity_mps, report.t_ns
         if not -SCALED_DEG < lat_deg - self._scaled_deg < SCALED_DEG:
             self._scaled_deg = lat_deg

@@ -61,7 +61,7 @@ class ComponentState:
         """Forget the receiver's clock and fixes: the vehicle was restarted."""
         self.stated_us = 0
         self.has_estimator, self.position_ns = False, None
-        self.fix.restarted(is_in_flight=self.is_armed is not False)
+        self.fix.restarted(is_in_flight=self.is_in_flight)
 
     def note_estimator(self, *, knows_position: bool, t_ns: int) -> None:
         """Note a status of the estimator."""
@@ -75,13 +75,18 @@ class ComponentState:
         self.position_ns, self.no_position_ns = t_ns, None
 
     @property
+    def is_in_flight(self) -> bool:
+        """Whether it may fly: until its autopilot's heartbeat states that it is disarmed."""
+        return self.is_armed is not False
+
+    @property
     def estimates_in_flight(self) -> bool:
         """Whether its estimator's word counts for more than its receivers': in flight.
 
         It must have stated positions regularly once: a stranger in a gap of the radio of a vehicle
         that sends no such statuses could state anything.
         """
-        return self.has_estimator and self.is_armed is not False
+        return self.has_estimator and self.is_in_flight
 
     def knows_position(self, t_ns: int) -> bool:
         """Return False if the estimator states that it knows none, in flight or without a fix.
@@ -97,8 +102,8 @@ class ComponentState:
     def note_type(self, newest: AircraftType, t_ns: int, *, is_known: bool) -> None:
         """Note the type of a heartbeat; forget those of long ago.
 
-        Unless the vehicle ``is_known`` by a position, anybody may have sent it, and it may be of
-        any other type.
+        Before its first position, when no peer ``is_known``, anybody may have sent it: the vehicle
+        may be of any other type too.
         """
         since_ns = t_ns - TYPE_KEPT_NS
         kept = [

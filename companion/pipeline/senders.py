@@ -79,7 +79,7 @@ STATUS_REORDER_MAX_US: Final = 30_000_000
 Equal to the time for which reports are remembered (``dedupe``).
 """
 STATUS_ALONE_NS: Final = 2_000_000_000
-"""Time without a newer status after which an older one is used: the receiver's clock was set."""
+"""Time without a newer status after which an older one counts: the receiver's clock was set."""
 KEPT_NS: Final = 3_600_000_000_000
 """Time for which a silent sender without a track is kept; each clock takes some 20 kB."""
 HEIGHT_FILTER_WEIGHT: Final = (
@@ -415,7 +415,7 @@ class Senders:
             sender.newest = t_ns, report.boot_ms
         component = self._components.get(report.source) if is_own else None
         types = () if component is None else tuple(component.types)
-        assumed = self._assumed(uav, types) if is_own else self.assumed(uav)
+        assumed = self._assumed(uav, types)
         lag_ns = round(assumed.lag_middle_s * 1e9)
         made_ns = stamp.oldest_ns - lag_ns
         errors: ReportNoise | None = None
@@ -475,7 +475,7 @@ class Senders:
     def _errors(
         self, report: Report, component: ComponentState | None, made_ns: int, time_s: float
     ) -> ReportNoise:
-        """Return bounds on a report's errors, with its difference from the receiver's position.
+        """Return bounds on a report's errors, which cover its difference from the receiver.
 
         ``made_ns`` is the earliest node time of its measurement, ``time_s`` the largest error of
         the time that is assumed.

@@ -25,7 +25,7 @@ from companion.mavlink.trust.fair_share import Account
 from companion.mavlink.wire.decode import POSE
 from companion.mavlink.wire.foreign import ForeignSplitter
 from companion.mavlink.wire.framing import MAGIC_V2, Splitter
-from companion.values import Frame, Rejection, Source
+from companion.values import Frame, Reason, Rejection, Source
 
 PEERS_MAX: Final = 4096  # most recent peers kept: a port scan must not fill the memory
 SENDERS_MAX: Final = 16_384
@@ -207,7 +207,7 @@ class Peers:
         status, senders = self._status, peer.senders
         for item, kept in zip(found, checked or found, strict=True):
             if isinstance(item, Rejection):
-                self.count_rejection(item)
+                self.count_lost(item.reason, item.count)
                 continue
             t_ns, _, source, msgid, raw, _ = item
             if raw[0] == MAGIC_V2:
@@ -250,10 +250,10 @@ class Peers:
         if sender is not None:
             sender.due = _UNKNOWN
 
-    def count_rejection(self, refused: Rejection) -> None:
-        """Count a rejection of bytes or frames of this link."""
+    def count_lost(self, reason: Reason, count: int) -> None:
+        """Count bytes or frames of this link that are not used."""
         lost = self._status.lost
-        lost[refused.reason] = lost.get(refused.reason, 0) + refused.count
+        lost[reason] = lost.get(reason, 0) + count
 
     def _out_of_order(self, sender: _PeerSender, number: int) -> int:
         """Process an unexpected sequence number; return how many frames are missing before it."""

@@ -55,9 +55,9 @@ REFUSED_EVERY_NS: Final = 500_000_000
 """Least time between rejections by admission, or of a receiver; each has a number of frames."""
 REFUSED_KINDS: Final = 32  # senders and reasons that are counted apart in that time
 REJECTED_PER_S: Final = 100.0
-"""Rejections of damaged or unproven frames that are passed on one by one; others are counted.
+"""Rejections of damaged or badly signed frames that are passed on one by one; others are counted.
 
-Each would take as much time as a valid frame, and no sender is proven whose flood could be limited.
+Each takes as much time as a valid frame, and its sender is unknown, so that it cannot be limited.
 """
 RECEIVER_SHARE: Final = 0.3
 """Share of the time that messages of a receiver may take; further ones are skipped unparsed.
@@ -333,9 +333,12 @@ class Link:
         return False
 
     def _note_refused(self, source: str, reason: Reason, count: int) -> None:
-        """Count frames that are dropped, or rejected beyond the budget; of the link at last."""
-        counts, lost = self._refused, self.status.lost
-        lost[reason] = lost.get(reason, 0) + count
+        """Count frames that are dropped, or rejected beyond the budget.
+
+        Beyond ``REFUSED_KINDS``, they are counted for the whole link.
+        """
+        self._peers.count_lost(reason, count)
+        counts = self._refused
         has_place = (source, reason) in counts or len(counts) < REFUSED_KINDS
         counts[source if has_place else self.status.url, reason] += count
 
@@ -429,8 +432,7 @@ class Link:
     def _overflow(self, count: int) -> None:
         """Count dropped datagrams or frames; their senders are unknown."""
         self._newcomers.late()
-        lost = self.status.lost
-        lost[Reason.SOCKET_OVERFLOW] = lost.get(Reason.SOCKET_OVERFLOW, 0) + count
+        self._peers.count_lost(Reason.SOCKET_OVERFLOW, count)
         reject = Rejection(
             t_ns=self._now_ns(), source=self.status.url, reason=Reason.SOCKET_OVERFLOW, count=count
         )

@@ -132,7 +132,10 @@ class Rotator(Device):
         return text.decode(errors="replace")
 
     def _check_silent(self, connection: socket.socket) -> None:
-        """Raise ``DeviceError`` if there is more than was asked for: answers would be mixed up."""
+        """Raise ``DeviceError`` if an answer waits that belongs to no command.
+
+        It would be taken for the answer to the next one.
+        """
         connection.setblocking(False)
         with contextlib.suppress(BlockingIOError):
             more = connection.recv(4096)
@@ -140,7 +143,7 @@ class Rotator(Device):
                 raise DeviceError("rotctld closed the connection")
             self._unread += more
         if self._unread:
-            raise DeviceError(f"rotctld sends what was not asked for: {shown(self._unread)}")
+            raise DeviceError(f"rotctld sent an answer to no command: {shown(self._unread)}")
 
 
 _LIMITS: Final = ("Min Azimuth", "Max Azimuth", "Min Elevation", "Max Elevation")

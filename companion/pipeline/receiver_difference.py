@@ -39,6 +39,7 @@ HELD_NS: Final = 5_000_000_000
 LATE_S: Final = 1.0  # largest lateness of a report that is compared by arrivals
 APART_S: Final = 3.0  # longest time between a status and a report that are compared
 APART_US: Final = round(APART_S * 1e6)  # the same between two stamps of one clock
+TURN_MS: Final = 1500  # longest time between two reports whose velocities give an acceleration
 _METRES_PER_DEGREE: Final = 111_195.0
 SCALED_DEG: Final = 0.01  # change of latitude after which degrees of longitude are scaled anew
 
@@ -112,6 +113,9 @@ class ReceiverDifference:
     height: Difference = field(default_factory=lambda: Difference(what="altitude"))
     horizontal: Difference = field(default_factory=lambda: Difference(what="position"))
     is_news: bool = False  # whether one of them must be announced
+    _before: tuple[int, Pair, float] | None = None  # stamp and velocities of the report before
+    _turn_mps2: Pair = 0.0, 0.0  # acceleration by the newest two reports, north and east
+    _climb_mps2: float = 0.0  # the same, down
     _scaled_deg: float = math.inf  # latitude at which a degree of longitude has ``_east_m``
     _east_m: float = 0.0
 
@@ -119,7 +123,8 @@ class ReceiverDifference:
         """Compare a status with the first report after it, which is at most ``late_s`` late.
 
         ``receiver_m`` is the bound on the receiver's horizontal error, and also used for heights:
-        a difference up to it counts at the most favourable lag, a larger one at the least.
+        a difference up to it, and to what the vehicle's acceleration explains, counts at the most
+        favourable lag, a larger one at the least.
 
         Stamps are compared, as either may have overtaken the other; arrivals if the stamps are of
         two clocks, as of receivers that count from 1970, or if one has wrapped around.
@@ -128,10 +133,17 @@ class ReceiverDifference:
         """
         self.compared = status
         velocity_mps, t_ns = report.velocity_ne_mps, report.t_ns
-        if status.fix_type < FIX_3D or velocity_mps is None:
+        boot_ms, down_mps = report.boot_ms, report.velocity_down_mps or 0.0
+        if status.fix_type < FIX_3D or velocity_mps is None or boot_ms is None:
             return
+        before, self._before = self._before, (boot_ms, velocity_mps, down_mps)
+        if before is not None and 0 < boot_ms - before[0] <= TURN_MS:
+            per_s = 1000.0 / (boot_ms - before[0])
+            north_mps2 = (velocity_mps[0] - before[1][0]) * per_s
+            self._turn_mps2 = north_mps2, (velocity_mps[1] - before[1][1]) * per_s
+            self._climb_mps2 = (down_mps - before[2]) * per_s
         stamp_us = status.time_us
-        elapsed_us = report.boot_ms * 1000 - stamp_us if stamp_us and report.boot_ms else None
+        elapsed_us = boot_ms * 1000 - stamp_us if stamp_us and boot_ms else None
         if elapsed_us is not None and -APART_US <= elapsed_us <= APART_US:
             elapsed_s = elapsed_us * 1e-6
             least_s, most_s = elapsed_s, elapsed_s + LAG_S
@@ -141,12 +153,17 @@ class ReceiverDifference:
                 return
             least_s, most_s = elapsed_s - late_s, elapsed_s + late_s + ARRIVAL_LAG_S
         if report.velocity_down_mps is not None:
-            above_m, down_mps = report.alt_m - status.alt_m, report.velocity_down_mps
+            above_m, longest_s = (
+                report.alt_m - status.alt_m,
+                most_s if most_s > -least_s else -least_s,
+            )
+            climb_mps2 = self._climb_mps2 if self._climb_mps2 > 0.0 else -self._climb_mps2
+            explained_m = receiver_m + RESOLUTION_M + climb_mps2 / 2 * longest_s * longest_s
             first_m, last_m = above_m + down_mps * least_s, above_m + down_mps * most_s
             least_m, most_m = (first_m, last_m) if first_m < last_m else (last_m, first_m)
             if least_m < 0.0:
                 least_m, most_m = (0.0 if most_m > 0.0 else -most_m), max(-least_m, most_m)
-            one, is_small = self.height, least_m < receiver_m
+            one, is_small = self.height, least_m < explained_m
             is_covered = least_m <= one.largest_m[0] + RESOLUTION_M and is_small
             if is_covered and t_ns - one.since_ns <= HELD_NS:
                 one.apart_m, one.noted_ns = least_m, t_ns
@@ -181,10 +198,14 @@ class ReceiverDifference:
         speed2 = north_mps * north_mps + east_mps * east_mps
         at_s = (north_m * north_mps + east_m * east_mps) / speed2 if speed2 else 0.0
         at_s = seconds[0] if at_s < seconds[0] else seconds[1] if at_s > seconds[1] else at_s
-        off_north_m, off_east_m = north_m - north_mps * at_s, east_m - east_mps * at_s
+        (turn_north_mps2, turn_east_mps2), half_s2 = self._turn_mps2, at_s * at_s / 2
+        off_north_m = north_m - north_mps * at_s + turn_north_mps2 * half_s2
+        off_east_m = east_m - east_mps * at_s + turn_east_mps2 * half_s2
         apart_m: float = (off_north_m * off_north_m + off_east_m * off_east_m) ** 0.5
         one = self.horizontal
-        is_small = apart_m < receiver_m
+        longest_s = seconds[1] if seconds[1] > -seconds[0] else -seconds[0]
+        turn_mps2 = (turn_north_mps2 * turn_north_mps2 + turn_east_mps2 * turn_east_mps2) ** 0.5
+        is_small = apart_m < receiver_m + RESOLUTION_M + turn_mps2 / 2 * longest_s * longest_s
         is_covered = apart_m <= one.largest_m[0] + RESOLUTION_M and is_small
         if is_covered and t_ns - one.since_ns <= HELD_NS:  # nearly always
             one.apart_m, one.noted_ns = apart_m, t_ns

@@ -518,7 +518,7 @@ def test_estimator_that_drifts_unseen_would_exceed_the_bound() -> None:
 
 
 def test_link_that_suffers_names_the_position_that_differs() -> None:
-    outputs, _ = flown(drifting_estimator(2.0))
+    outputs, _ = flown(drifting_estimator(4.0))
     texts = [one.text for one in about(outputs, "link to")]
     assert any("its position differs by" in text for text in texts), texts
 

@@ -184,6 +184,27 @@ def test_noise_of_the_receiver_is_no_reason_to_doubt_its_lag(off_m: float) -> No
     assert (difference.horizontal.covered_m > 0.5 * 20.0 * LAG_S) is not is_noise
 
 
+def test_turn_of_an_accurate_receiver_is_no_drift() -> None:
+    """A circle at 30 m/s and 15 m/s²; the receiver is 0.2 s late, and accurate to 0.1 m."""
+    difference, covered_m = ReceiverDifference(), []
+    for number in range(1, 60):
+        stamped_s = number / 2
+        made_s = stamped_s + 0.3
+        (seen, _), (flown, (north_mps, east_mps)) = turning(stamped_s - 0.2), turning(made_s)
+        made = status(stamped_s, *seen)._replace(time_us=round(stamped_s * 1e6))
+        told = report(made_s, (*flown, 0.0), (north_mps, east_mps, 0.0))
+        difference.compare(made, told._replace(boot_ms=round(made_s * 1e3)), 0.1, 0.1)
+        covered_m.append(difference.horizontal.covered_m)
+    assert max(covered_m[25:]) < 1.0
+
+
+def turning(t_s: float) -> tuple[tuple[float, float], tuple[float, float]]:
+    """Return place and velocity on a circle."""
+    angle = t_s / 2
+    place_m = 60.0 * math.cos(angle), 60.0 * math.sin(angle)
+    return place_m, (-30.0 * math.sin(angle), 30.0 * math.cos(angle))
+
+
 def test_late_report_is_not_compared_by_arrival() -> None:
     difference = ReceiverDifference()
     compare(difference, status(0.0), report(0.1, (20.0, 0.0, 20.0)), 1.5)

@@ -9,7 +9,7 @@ import math
 from dataclasses import dataclass, field
 from typing import Final
 
-from companion.values import FIX_3D, GnssStatus, Report, Severity
+from companion.values import FIX_3D, GnssStatus, Report, ReportNoise, Severity
 
 NEAR_M: Final = 50.0
 """Largest difference with which a drift begins; a larger one shows that a position is invalid.
@@ -119,12 +119,14 @@ class ReceiverDifference:
     _scaled_deg: float = math.inf  # latitude at which a degree of longitude has ``_east_m``
     _east_m: float = 0.0
 
-    def compare(self, status: GnssStatus, report: Report, late_s: float, receiver_m: float) -> None:
+    def compare(
+        self, status: GnssStatus, report: Report, late_s: float, receiver: ReportNoise
+    ) -> None:
         """Compare a status with the first report after it, which is at most ``late_s`` late.
 
-        ``receiver_m`` is the bound on the receiver's horizontal error, and also used for heights:
-        a difference up to it, and to what the vehicle's acceleration explains, counts at the most
-        favourable lag, a larger one at the least.
+        ``receiver`` bounds the receiver's errors. A difference up to these, and to what the
+        vehicle's acceleration explains, counts at the most favourable lag, a larger one at the
+        least.
 
         Stamps are compared, as either may have overtaken the other; arrivals if the stamps are of
         two clocks, as of receivers that count from 1970, or if one has wrapped around.
@@ -158,7 +160,9 @@ class ReceiverDifference:
                 most_s if most_s > -least_s else -least_s,
             )
             climb_mps2 = self._climb_mps2 if self._climb_mps2 > 0.0 else -self._climb_mps2
-            explained_m = receiver_m + RESOLUTION_M + climb_mps2 / 2 * longest_s * longest_s
+            explained_m = (
+                receiver.vertical_m + RESOLUTION_M + climb_mps2 / 2 * longest_s * longest_s
+            )
             first_m, last_m = above_m + down_mps * least_s, above_m + down_mps * most_s
             least_m, most_m = (first_m, last_m) if first_m < last_m else (last_m, first_m)
             if least_m < 0.0:
@@ -171,6 +175,7 @@ class ReceiverDifference:
                 one.note(least_m, least_m if is_small else most_m, t_ns)
         if status.position_deg is not None:
             seconds = least_s, most_s
+            receiver_m = receiver.horizontal_m
             self._compare_position(status.position_deg, report, velocity_mps, seconds, receiver_m)
         height, horizontal = self.height, self.horizontal
         self.is_news = (

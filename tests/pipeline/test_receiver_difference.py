@@ -17,7 +17,7 @@ from companion.pipeline.receiver_difference import (
     RESOLUTION_M,
     ReceiverDifference,
 )
-from companion.values import AltitudeDatum, GnssStatus, Report, Severity, Source
+from companion.values import AltitudeDatum, GnssStatus, Report, ReportNoise, Severity, Source
 
 S = 1_000_000_000
 METRES_PER_DEGREE = 111_195.0
@@ -67,11 +67,20 @@ def report(
     )
 
 
-RECEIVER_M = 0.9
+RECEIVER_M, RECEIVER_UP_M = 0.9, 1.8
 
 
 def compare(difference: ReceiverDifference, found: GnssStatus, made: Report, late_s: float) -> None:
-    difference.compare(found, made, late_s, RECEIVER_M)
+    difference.compare(found, made, late_s, receiver(RECEIVER_M, RECEIVER_UP_M))
+
+
+def receiver(horizontal_m: float, vertical_m: float) -> ReportNoise:
+    return ReportNoise(
+        horizontal_m=horizontal_m,
+        vertical_m=vertical_m,
+        position_m=math.hypot(horizontal_m, vertical_m),
+        velocity_mps=0.3,
+    )
 
 
 @given(
@@ -184,6 +193,17 @@ def test_noise_of_the_receiver_is_no_reason_to_doubt_its_lag(off_m: float) -> No
     assert (difference.horizontal.covered_m > 0.5 * 20.0 * LAG_S) is not is_noise
 
 
+@pytest.mark.parametrize("off_m", [0.5 * RECEIVER_UP_M, 2.0 * RECEIVER_UP_M])
+def test_noise_of_the_receivers_height_is_no_reason_to_doubt_its_lag(off_m: float) -> None:
+    """A receiver's height is less accurate than its position."""
+    difference = ReceiverDifference()
+    below = report(0.1, (0.0, 0.0, -off_m), (0.0, 0.0, -8.0))._replace(boot_ms=100_100)
+    compare(difference, status(0.0)._replace(time_us=100_000_000), below, 0.0)
+    least_m, most_m = off_m + 0.1 * 8.0, off_m + (0.1 + LAG_S) * 8.0
+    expected_m = least_m if least_m < RECEIVER_UP_M + RESOLUTION_M else most_m
+    assert difference.height.covered_m == pytest.approx(expected_m, abs=0.06)
+
+
 def test_turn_of_an_accurate_receiver_is_no_drift() -> None:
     """A circle at 30 m/s and 15 m/s²; the receiver is 0.2 s late, and accurate to 0.1 m."""
     difference, covered_m = ReceiverDifference(), []
@@ -193,7 +213,9 @@ def test_turn_of_an_accurate_receiver_is_no_drift() -> None:
         (seen, _), (flown, (north_mps, east_mps)) = turning(stamped_s - 0.2), turning(made_s)
         made = status(stamped_s, *seen)._replace(time_us=round(stamped_s * 1e6))
         told = report(made_s, (*flown, 0.0), (north_mps, east_mps, 0.0))
-        difference.compare(made, told._replace(boot_ms=round(made_s * 1e3)), 0.1, 0.1)
+        difference.compare(
+            made, told._replace(boot_ms=round(made_s * 1e3)), 0.1, receiver(0.1, 0.2)
+        )
         covered_m.append(difference.horizontal.covered_m)
     assert max(covered_m[25:]) < 1.0
 

@@ -149,10 +149,14 @@ class KnownHosts:
 
 @lru_cache(maxsize=64)
 def _host_name(host: str) -> str:
-    """Return name or address of a Host header, without port, brackets and trailing dot."""
+    """Return name or address of a Host header, without port, brackets and trailing dot.
+
+    What follows brackets must be a port; otherwise the header names nothing, and "" is returned.
+    """
     name = host.strip().lower()
     if name.startswith("["):
-        return name[1:].partition("]")[0]
+        address, _, port = name[1:].partition("]")
+        return address if not port or port.startswith(":") else ""
     return name.partition(":")[0].removesuffix(".")
 
 

@@ -108,7 +108,7 @@ def test_idle_connections_do_not_block_new_ones(
         ("192.168.1.7:8080", 200), (f"{socket.gethostname()}:8080", 200), ("mast.example", 200),
         ("Mast.Example.:443", 200), ("evil.example", 421), ("evil.example:8080", 421),
         ("127.0.0.1.evil.example", 421), ("localhost.evil.example", 421), ("", 421), ("[", 421),
-        ("127.0.0.1@evil.example", 421),
+        ("127.0.0.1@evil.example", 421), ("[::1].evil.example", 421),
     ],
 )  # fmt: skip
 def test_only_known_host_names_are_answered(make_node: Any, host: str, status: int) -> None:

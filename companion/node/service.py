@@ -157,8 +157,12 @@ class Service:
         self._outlet.open()
         if self.fleet is not None:
             self.fleet.open()
-        self._recorder = self._open_recorder()
-        self._push.open()  # last: a start that fails leaves no ring without a writer
+        self._push.open()
+        try:
+            self._recorder = self._open_recorder()  # last: a start that fails leaves no recording
+        except (OSError, UserError):
+            self._push.close()  # nor a ring without a writer
+            raise
 
     async def run(
         self,

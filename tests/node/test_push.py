@@ -16,6 +16,7 @@ from support import BALLAST, HANG_S, ROOT, fill, free_port, run_async
 from companion.node import moment
 from companion.node.push import RECOVERED_AFTER, RING_RETRY_NS, Push
 from companion.node.ring import SLOT_BYTES, SLOTS, Ring
+from companion.node.service import Service
 from companion.pipeline import assembly
 from companion.settings.model import Settings
 from companion.settings.outlets import RecordSettings
@@ -149,3 +150,24 @@ def test_ring_of_a_running_service_is_not_replaced(small_disk: Path) -> None:
         Ring(path)
     assert list(small_disk.iterdir()) == [path]
     running.close()
+
+
+@pytest.mark.parametrize("fails", ["ring", "recording"])
+def test_start_that_fails_leaves_no_files(fails: str, small_disk: Path) -> None:
+    """Neither a recording without content nor a ring without a writer."""
+    ring, folder = small_disk / "ring", small_disk / "recordings"
+    if fails == "ring":
+        running = Ring(ring)
+    else:
+        folder.write_text("no folder")
+    settings = Settings().override(
+        center={"source": "5:1"},
+        records={"shared_memory": str(ring)},
+        recording={"directory": str(folder)},
+    )
+    with pytest.raises((OSError, UserError)):
+        Service(settings=settings, say=lambda _: None)
+    if fails == "ring":
+        running.close()
+        assert not folder.exists() or not list(folder.iterdir())
+    assert not ring.exists()

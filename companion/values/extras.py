@@ -1,4 +1,4 @@
-"""Optional packages, and the one-line error if such a package is not installed."""
+"""Optional packages, and the one-line error if such a package does not load."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -7,12 +7,19 @@ from companion.values.errors import UserError
 
 
 @contextmanager
-def needs(package: str, extra: str, what: str) -> Iterator[None]:
-    """Guard an import: raise ``UserError`` with the install command if a package is missing."""
+def needs(package: str, extra: str, what: str, library: str | None = None) -> Iterator[None]:
+    """Guard an import: raise ``UserError`` if a package is missing or does not load.
+
+    The error of a missing package is the install command. ``library`` is a system library without
+    which the package does not load.
+    """
     try:
         yield
-    except ModuleNotFoundError as error:
-        if error.name != package:
-            raise
-        install = f"pip install 'uav-companion-beams[{extra}]'"
-        raise UserError(f"{what} needs the package {package}: {install}") from error
+    except (Exception, SystemExit) as error:
+        if isinstance(error, ModuleNotFoundError) and error.name == package:
+            install = f"pip install 'uav-companion-beams[{extra}]'"
+            raise UserError(f"{what} needs the package {package}: {install}") from error
+        cause = str(error) or type(error).__name__
+        if library is not None and isinstance(error, OSError | AttributeError):
+            cause = f"{cause}; is {library} installed?"
+        raise UserError(f"{what} the package {package} does not load: {cause}") from error

@@ -11,7 +11,7 @@ import contextlib
 from typing import Any, Final
 
 from companion.beams.hardware.devices import ADAR1000_CHANNELS, vector_modulator
-from companion.node.drive.loop import Device, DeviceCommand, DeviceError, DeviceInput, SafeState
+from companion.node.drive.loop import Device, DeviceCommand, DeviceInput, SafeState, library_errors
 from companion.values import IntArray, UserError
 from companion.values.extras import needs
 
@@ -38,14 +38,12 @@ class Chips(Device):
         """Open the SPI devices. Raises ``UserError`` without spidev."""
         with needs("spidev", "spi", "adar1000:"):
             import spidev
-        try:
-            for bus, number in self._places:
+        for bus, number in self._places:
+            with library_errors(f"SPI {bus}.{number}"):
                 line = spidev.SpiDev()
                 line.open(bus, number)
                 line.max_speed_hz, line.mode = CLOCK_HZ, 0
-                self._lines.append(line)
-        except OSError as error:
-            raise DeviceError(f"SPI {bus}.{number}: {error.strerror or error}") from error
+            self._lines.append(line)
 
     def apply(self, command: DeviceCommand) -> None:
         """Write gain, I and Q of every channel, then send one load pulse to each chip."""
@@ -64,7 +62,7 @@ class Chips(Device):
         """Close the SPI devices."""
         lines, self._lines = self._lines, []
         for line in lines:
-            with contextlib.suppress(OSError):  # an adapter that was unplugged
+            with contextlib.suppress(Exception, SystemExit):  # an adapter that was unplugged
                 line.close()
 
     def _write(self, registers: IntArray) -> None:
@@ -80,7 +78,7 @@ class Chips(Device):
 
     def _send(self, chips: list[list[tuple[int, int, int]]]) -> None:
         """Write the registers of all chips first, then the load pulses close together."""
-        try:
+        with library_errors("SPI"):
             for place, (line, channels) in enumerate(zip(self._lines, chips, strict=True)):
                 for number, (gain, i, q) in enumerate(channels):
                     self._put(line, place, RX_GAIN + number, gain)
@@ -88,8 +86,6 @@ class Chips(Device):
                     self._put(line, place, RX_MODULATOR + 2 * number + 1, q)
             for place, line in enumerate(self._lines):
                 self._put(line, place, LOAD, LOAD_RX)
-        except OSError as error:
-            raise DeviceError(f"SPI: {error.strerror or error}") from error
 
     def _put(self, line: Any, place: int, register: int, value: int) -> None:
         line.xfer2([(place % 4) << 5 | register >> 8, register & 0xFF, value])

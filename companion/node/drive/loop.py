@@ -7,11 +7,12 @@ reports.
 Over 300 lines: the loop, and the interfaces of what it connects.
 """
 
+import contextlib
 import statistics
 import threading
 from abc import ABC, abstractmethod
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from enum import StrEnum
 from types import MappingProxyType
@@ -48,6 +49,19 @@ class DeviceInput(StrEnum):
 
 class DeviceError(Exception):
     """Failure of a device, or an unreachable device; the operation is retried."""
+
+
+@contextlib.contextmanager
+def library_errors(device: str) -> Iterator[None]:
+    """Raise ``DeviceError`` for whatever the library of a device raises, and for its exits.
+
+    Libraries raise plain exceptions, and those of their own parsing of a reply.
+    """
+    try:
+        yield
+    except (Exception, SystemExit) as error:
+        cause = error.strerror if isinstance(error, OSError) else None
+        raise DeviceError(f"{device}: {cause or str(error) or type(error).__name__}") from error
 
 
 class SourceLostError(Exception):

@@ -8,11 +8,10 @@ that of ``adi.CN0566``, where elements count from 1. Never tested on hardware: t
 pyadi-iio's class on a mock of libiio.
 """
 
-import contextlib
-from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from typing import Any, Final
 
-from companion.node.drive.loop import Device, DeviceCommand, DeviceError, DeviceInput, SafeState
+from companion.node.drive.loop import Device, DeviceCommand, DeviceInput, SafeState, library_errors
 from companion.values import IntArray, UserError
 from companion.values.extras import needs
 
@@ -36,15 +35,9 @@ class Phaser(Device):
 
     def open(self) -> None:
         """Connect to the Phaser and switch to receive. Raises ``UserError`` without pyadi-iio."""
-        try:
-            with needs("adi", "phaser", "phaser:"):
-                from adi import CN0566
-        except (ImportError, AttributeError, OSError) as error:  # libiio is missing
-            raise UserError(
-                "phaser: needs the system library libiio (Debian: apt install libiio0):"
-                f" {error or type(error).__name__}"
-            ) from error
-        with self._access():
+        with needs("adi", "phaser", "phaser:", "libiio (Debian: apt install libiio0)"):
+            from adi import CN0566
+        with self._library_errors():
             self._phaser = CN0566(uri=self._uri)
             self._phaser.configure(device_mode="rx")
         self._shown = {}
@@ -73,7 +66,7 @@ class Phaser(Device):
 
     def _set(self, wanted: dict[int, tuple[int, int, int]]) -> None:
         shown, self._shown = self._shown, {}  # unknown while it is written, and after a failure
-        with self._access():
+        with self._library_errors():
             for element, (phase, gain, attenuated) in wanted.items():
                 if shown.get(element) == (phase, gain, attenuated):
                     continue
@@ -84,14 +77,5 @@ class Phaser(Device):
             self._phaser.latch_rx_settings()
         self._shown = dict(wanted)
 
-    @contextlib.contextmanager
-    def _access(self) -> Iterator[None]:
-        """Raise ``DeviceError`` for every exception of pyadi-iio.
-
-        It raises plain exceptions, and those of its own parsing of a reply.
-        """
-        try:
-            yield
-        except Exception as error:
-            cause = str(error) or type(error).__name__
-            raise DeviceError(f"the Phaser at {self._uri}: {cause}") from error
+    def _library_errors(self) -> AbstractContextManager[None]:
+        return library_errors(f"the Phaser at {self._uri}")

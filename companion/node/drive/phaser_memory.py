@@ -36,7 +36,7 @@ class PhaserMemory(Phaser):
         kept = dict(enumerate(self._beams))
         for safe, position in POSITION_OF.items():
             kept[position] = dict.fromkeys(range(ELEMENTS), RESTING[safe])
-        with self._access():
+        with self._library_errors():
             for position, settings in kept.items():
                 for element, (phase, gain, attenuated) in settings.items():
                     one = self._phaser.elements[element + 1]
@@ -57,7 +57,7 @@ class PhaserMemory(Phaser):
 
     def _use(self, position: int) -> None:
         selected, self._position = self._position, None  # unknown after a failure
-        with self._access():
+        with self._library_errors():
             if position != selected:
                 for element in range(ELEMENTS):
                     self._phaser.elements[element + 1].rx_beam_state = position

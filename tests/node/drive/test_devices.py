@@ -4,12 +4,14 @@ recording libiio, and codes equal to those of the device's table."""
 import asyncio
 import contextlib
 import math
+import re
 import sys
 import threading
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
+from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, ClassVar
 
@@ -551,7 +553,7 @@ def test_uav_missing_from_the_device_table_is_not_applied() -> None:
 class Faulty:
     """A libiio object whose attributes all raise the same."""
 
-    def __init__(self, error: Exception) -> None:
+    def __init__(self, error: BaseException) -> None:
         object.__setattr__(self, "_error", error)
 
     def __getattr__(self, name: str) -> Any:
@@ -561,11 +563,11 @@ class Faulty:
         raise self._error
 
 
-ERRORS = [
+ERRORS: list[BaseException] = [
     OSError(5, "I/O error"), ValueError("could not convert string to float: '1.2.3'"),
     KeyError("rx_load_spi"), IndexError("list index out of range"), TypeError("NoneType"),
     UnicodeDecodeError("utf-8", b"\xff", 0, 1, "invalid start byte"), AttributeError(),
-    OverflowError("int too large"), Exception("Device not found!"),
+    OverflowError("int too large"), Exception("Device not found!"), SystemExit(1),
 ]  # fmt: skip
 
 
@@ -575,7 +577,7 @@ def test_any_error_of_pyadi_iio_is_a_device_error(
     iio: list[tuple[str, str, str]],
     flown: tuple[DeviceCommand, Any, str],
     target: str,
-    error: Exception,
+    error: BaseException,
 ) -> None:
     """While it is applied and while it is opened; then everything is written again."""
     registers = flown[0].registers
@@ -841,3 +843,67 @@ def test_texts_of_a_service_are_reported_in_one_printable_line() -> None:
     drive.step()
     assert said[1].startswith("hold: [2Jfar xxx")
     assert len(said[1]) == 200 and said[1].isprintable()
+
+
+@pytest.mark.parametrize("fails", ["SpiDev", "open", "xfer2", "close"])
+@pytest.mark.parametrize("error", ERRORS, ids=lambda error: type(error).__name__)
+def test_any_error_of_spidev_is_a_device_error(
+    spidev: dict[tuple[int, int], Chip],
+    flown: tuple[DeviceCommand, Any, str],
+    fails: str,
+    error: BaseException,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Wherever it is raised; the drive goes on."""
+
+    def fail(*_: object) -> None:
+        raise error
+
+    module: Any = sys.modules["spidev"]
+    clock, said = Ticking(), list[str]()
+    device = targets.device("adar1000:0.0,0.1", print, list)
+    drive = driven(Always(flown[0]), device, said.append, now_ns=clock.now_ns)
+    with monkeypatch.context() as patch:
+        patch.setattr(*((module, fails) if fails == "SpiDev" else (module.SpiDev, fails)), fail)
+        drive.step()
+        drive.end()
+    if fails != "close":
+        (failed,) = [text for text in said if text.startswith("the device failed: SPI")]
+        assert not failed.endswith(": ")
+    clock.t_ns += 1_000_000_000
+    drive.step()
+    assert drive.status().applied == (2 if fails == "close" else 1)
+
+
+BROKEN = [
+    ("raise ImportError('undefined symbol: x')", "undefined symbol: x"),
+    ("raise ValueError('numpy.dtype size changed')", "numpy.dtype size changed"),
+    ("import sys; sys.exit('no bus')", "no bus"),
+    ("import missing_elsewhere", "No module named 'missing_elsewhere'"),
+    ("def x(:", "invalid syntax"),
+]
+
+
+@pytest.mark.parametrize("target", ["adar1000:0.0", "phaser:ip:x"])
+@pytest.mark.parametrize(("content", "cause"), BROKEN)
+def test_package_that_does_not_load_is_an_error_of_one_line(
+    target: str, content: str, cause: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    kind = target.partition(":")[0]
+    module = {"adar1000": "spidev", "phaser": "adi"}[kind]
+    (tmp_path / f"{module}.py").write_text(content)
+    monkeypatch.syspath_prepend(str(tmp_path))
+    for name in [name for name in sys.modules if name.partition(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
+    expected = f"{kind}: the package {module} does not load: {cause}"
+    with pytest.raises(UserError, match=re.escape(expected)) as found:
+        targets.device(target, print, list).open()
+    assert "\n" not in str(found.value)
+
+
+def test_missing_libiio_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "adi.py").write_text("raise OSError('libiio.so.0: cannot open')")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "adi", raising=False)
+    with pytest.raises(UserError, match=r"cannot open; is libiio \(Debian: .*\) installed\?"):
+        targets.device("phaser:ip:x", print, list).open()

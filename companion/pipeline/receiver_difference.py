@@ -12,7 +12,7 @@ from typing import Final
 from companion.values import FIX_3D, GnssStatus, Report, ReportNoise, Severity
 
 NEAR_M: Final = 50.0
-"""Largest difference with which a drift begins; a larger one shows that a position is invalid.
+"""Largest difference with which a drift begins; one that begins larger is an invalid position.
 
 Before an autopilot's height is valid it may be off by hundreds of metres (docs/field-notes.md 1).
 """
@@ -22,7 +22,10 @@ NOTICE_M: Final = 3.0  # least difference that is announced
 NOTICE_RATIO: Final = 2.0  # increase after which it is announced again
 LEAST_ANNOUNCED_M: Final = NOTICE_M / NOTICE_RATIO
 ANNOUNCED_NS: Final = 60_000_000_000
-"""Time after which a notice is forgotten, if the difference has fallen to a quarter of it."""
+"""Time after which a notice is forgotten, if the difference has fallen to a quarter of it.
+
+Then, a difference that is not covered is announced again.
+"""
 LAG_S: Final = 0.5
 """Largest age of a receiver's position at the stamp of its status.
 
@@ -35,7 +38,9 @@ GROWTH_MPS: Final = 5.0
 A report that jumps is rejected instead, or restarts the track with a notice.
 """
 HELD_NS: Final = 5_000_000_000
-"""Time for which a difference is held at least: less of it shows at another course or climb."""
+"""Time for which a difference is held at least: less of it shows at another course.
+
+In a climb, where a lag may hide more of it than the receiver's error, it is held until after."""
 LATE_S: Final = 1.0  # largest lateness of a report that is compared by arrivals
 APART_S: Final = 3.0  # longest time between a status and a report that are compared
 APART_US: Final = round(APART_S * 1e6)  # the same between two stamps of one clock
@@ -55,7 +60,10 @@ class Difference:
     noted_ns     arrival of the report that showed it; None: none was compared
     covered_m    part of the position bound that it needs, held for ``HELD_NS`` at least
     largest_m    largest such part since ``since_ns``, and in the ``HELD_NS`` before that
+    is_invalid   whether it has not been less than ``NEAR_M`` yet
     announced_m  difference that was announced last, at ``announced_ns``
+    news_m       difference above which it must be announced again
+    says_covered whether that notice said that the bound covers it
     """
 
     what: str
@@ -64,29 +72,44 @@ class Difference:
     covered_m: float = 0.0
     largest_m: tuple[float, float] = 0.0, 0.0
     since_ns: int = 0
+    is_invalid: bool = False
     announced_m: float = LEAST_ANNOUNCED_M
     announced_ns: int = 0
+    news_m: float = NOTICE_M
+    says_covered: bool = False
 
-    def note(self, apart_m: float, most_m: float, t_ns: int) -> None:
-        """Note a new difference; ``most_m`` is the largest that the unknown lag allows."""
+    def note(self, apart_m: float, most_m: float, t_ns: int, *, ages: bool) -> None:
+        """Note a new difference; ``most_m`` is the largest that the unknown lag allows.
+
+        If it ``ages`` the largest one, that is held for another ``HELD_NS``, then forgotten.
+        """
         covered_m = most_m - RESOLUTION_M
         if self.noted_ns is not None:
             grown_m = GROWTH_MPS * (t_ns - self.noted_ns) * 1e-9
             covered_m = min(covered_m, self.covered_m + grown_m)
-        if apart_m >= NEAR_M and self.covered_m <= NEAR_M / 2:  # no drift
+        self.is_invalid = apart_m >= NEAR_M and (self.is_invalid or self.noted_ns is None)
+        if self.is_invalid:
             covered_m = 0.0
         if apart_m < self.announced_m / NOTICE_RATIO**2 and t_ns - self.announced_ns > ANNOUNCED_NS:
             self.announced_m = LEAST_ANNOUNCED_M
-        if t_ns - self.since_ns > HELD_NS:
+        if ages:
             self.since_ns, self.largest_m = t_ns, (0.0, self.largest_m[0])
         since_m, before_m = self.largest_m
         self.largest_m = max(since_m, covered_m), before_m
         self.apart_m, self.noted_ns, self.covered_m = apart_m, t_ns, max(self.largest_m)
+        self._set_news(t_ns)
+
+    def _set_news(self, t_ns: int) -> None:
+        """Set ``news_m``: twice what was announced, or less if more is not covered now."""
+        self.news_m = NOTICE_RATIO * self.announced_m
+        if self.says_covered or t_ns - self.announced_ns > ANNOUNCED_NS:
+            uncovered_m = self.covered_m + LEAST_ANNOUNCED_M
+            self.news_m = min(self.news_m, max(uncovered_m, NOTICE_M))
 
     @property
     def is_news(self) -> bool:
         """Whether it must be announced."""
-        return self.apart_m > NOTICE_RATIO * self.announced_m
+        return self.apart_m > self.news_m
 
     def text(self, metres: str) -> str:
         """Return the difference in words."""
@@ -96,9 +119,10 @@ class Difference:
         """Return what must be announced, and note that it is."""
         self.announced_m, self.announced_ns = self.apart_m, t_ns
         covered = "the position bound covers the difference"
-        is_covered = self.covered_m >= self.apart_m - RESOLUTION_M
-        then = covered if is_covered else "one of the two is invalid"
-        severity = Severity.INFO if is_covered else Severity.WARNING
+        self.says_covered = self.covered_m >= self.apart_m - RESOLUTION_M
+        self._set_news(t_ns)
+        then = covered if self.says_covered else "one of the two is invalid"
+        severity = Severity.INFO if self.says_covered else Severity.WARNING
         return severity, f"{self.text(f'{self.apart_m:.0f}')}; {then}"
 
 
@@ -169,19 +193,18 @@ class ReceiverDifference:
                 least_m, most_m = (0.0 if most_m > 0.0 else -most_m), max(-least_m, most_m)
             one, is_small = self.height, least_m < explained_m
             is_covered = least_m <= one.largest_m[0] + RESOLUTION_M and is_small
-            if is_covered and t_ns - one.since_ns <= HELD_NS:
+            hides_m = (last_m - first_m) if last_m > first_m else first_m - last_m
+            ages = t_ns - one.since_ns > HELD_NS and hides_m <= explained_m
+            if is_covered and not ages:
                 one.apart_m, one.noted_ns = least_m, t_ns
             else:
-                one.note(least_m, least_m if is_small else most_m, t_ns)
+                one.note(least_m, least_m if is_small else most_m, t_ns, ages=ages)
         if status.position_deg is not None:
             seconds = least_s, most_s
             receiver_m = receiver.horizontal_m
             self._compare_position(status.position_deg, report, velocity_mps, seconds, receiver_m)
         height, horizontal = self.height, self.horizontal
-        self.is_news = (
-            height.apart_m > NOTICE_RATIO * height.announced_m
-            or horizontal.apart_m > NOTICE_RATIO * horizontal.announced_m
-        )
+        self.is_news = height.apart_m > height.news_m or horizontal.apart_m > horizontal.news_m
 
     def _compare_position(
         self,
@@ -212,11 +235,12 @@ class ReceiverDifference:
         turn_mps2 = (turn_north_mps2 * turn_north_mps2 + turn_east_mps2 * turn_east_mps2) ** 0.5
         is_small = apart_m < receiver_m + RESOLUTION_M + turn_mps2 / 2 * longest_s * longest_s
         is_covered = apart_m <= one.largest_m[0] + RESOLUTION_M and is_small
-        if is_covered and t_ns - one.since_ns <= HELD_NS:  # nearly always
+        ages = t_ns - one.since_ns > HELD_NS
+        if is_covered and not ages:  # nearly always
             one.apart_m, one.noted_ns = apart_m, t_ns
             return
         ends_m = (math.hypot(north_m - north_mps * s, east_m - east_mps * s) for s in seconds)
-        one.note(apart_m, apart_m if is_small else max(ends_m), t_ns)
+        one.note(apart_m, apart_m if is_small else max(ends_m), t_ns, ages=ages)
 
     @property
     def larger(self) -> Difference:

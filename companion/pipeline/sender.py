@@ -4,11 +4,12 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.clock.sender_clock import SenderClock
+from companion.mavlink.clock.stamp_unit import StampUnit
 from companion.mavlink.wire.stamps import step_ms
 from companion.pipeline.gnss_fix import REGULAR_NS, GnssFix
 from companion.pipeline.receiver_difference import ReceiverDifference
 from companion.tracking.noise import STATED_NS, StatedNoise
-from companion.values import FIX_3D, GnssStatus, Reason
+from companion.values import FIX_3D, GnssStatus, Reason, Report
 
 CONFIRMED_NS: Final = 5_000_000_000
 """Largest difference between the steps of arrivals and of stamps of two reports that agree."""
@@ -61,6 +62,8 @@ class ComponentState:
         """Forget the receiver's clock and fixes: the vehicle was restarted."""
         self.stated_us = 0
         self.has_estimator, self.position_ns = False, None
+        if not self.is_in_flight:
+            self.difference = ReceiverDifference()
         self.fix.restarted(is_in_flight=self.is_in_flight)
 
     def note_estimator(self, *, knows_position: bool, t_ns: int) -> None:
@@ -144,6 +147,15 @@ class Sender:
     has_late_copies: bool = False  # whether a notice said that reports over 10 s old arrive
     first: tuple[int, int] | None = None  # arrival and stamp of an event that none confirmed yet
     newest: tuple[int, int] | None = None  # the same of the newest event that was placed
+    unit: StampUnit | None = None  # of its stamps; None: milliseconds, since all had a time
+
+    def has_other_unit(self, report: Report) -> bool:
+        """Note a report without a time; return whether stamps have another unit from now on."""
+        assert report.boot_ms is not None
+        if self.unit is None:
+            self.unit = StampUnit(report.boot_ms)
+        reading = self.clock.reading()
+        return self.unit.note_unexplained(report.t_ns, reading and reading.newest_ns)
 
     def is_known(self, now_ns: int) -> bool:
         """Return whether its clock is known here: from stamps of at most ``ANOTHER_CLOCK_NS``."""

@@ -179,7 +179,8 @@ class Senders:
         self._carrier_source = None if carrier is None else Source.parse(carrier)
         self._records = records
         self._tracked = tracked
-        self._senders = Records(lambda: Sender(clock=assembly.clock(settings)), self._is_kept)
+        self._new_clock = partial(assembly.clock, settings)
+        self._senders = Records(lambda: Sender(clock=self._new_clock()), self._is_kept)
         self._noise_settings = assembly.noise(settings)
         self._components: defaultdict[Source, ComponentState] = defaultdict(
             lambda: ComponentState(noise=StatedNoise(self._noise_settings.default))
@@ -374,23 +375,26 @@ class Senders:
 
         ``doubt_ns`` is the uncertainty of its frame's arrival: not 0 if another node shared it.
         """
-        assert report.boot_ms is not None
-        uav, t_ns = report.uav, report.t_ns
+        uav, t_ns, boot_ms = report.uav, report.t_ns, report.boot_ms
+        assert boot_ms is not None
         kind = kind_of(uav)
         is_own, is_event = kind.reports_itself, kind is UavKind.COT
         if uav not in self._senders and len(self._senders) >= RECORDS_MAX and not is_own:
             return _refused(report, Reason.TOO_MANY)  # ids can be forged in any number
         sender = self._senders[uav]
+        if sender.unit is not None:
+            boot_ms = sender.unit.milliseconds(boot_ms)
+            report = report._replace(boot_ms=boot_ms)
         refused: Reason | None = None
         switched: tuple[Notice, ...] = ()
         if doubt_ns or sender.shared is not None:
             refused, switched = self._switch(sender, report, is_shared=doubt_ns > 0)
         elif is_event:
-            refused = sender.refuses_event(t_ns, report.boot_ms)
+            refused = sender.refuses_event(t_ns, boot_ms)
         if refused is not None:
             return _refused(report, refused)
         clock = (sender.shared or sender).clock
-        stamp, said = self._stamp(clock, uav, t_ns, report.boot_ms, doubt_ns)
+        stamp, said = self._stamp(clock, uav, t_ns, boot_ms, doubt_ns)
         said = (*switched, *said)
         before_ns = sender.stamped_ns
         if not doubt_ns:
@@ -402,17 +406,11 @@ class Senders:
             )
         sender.is_shared = False
         if stamp is None:
-            said = (*said, *_late_copies(sender, clock, uav, t_ns))
-            return FrameOutcome(
-                outputs=(*said, Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)),
-                restarted=restarted,
-            )
+            return self._unplaced(sender, report, said)
         self._dedupe.set_latency(stamp.latency_s)
         newest = sender.newest
-        if is_event and (
-            newest is None or step_ms(report.boot_ms, newest[1]) > 0 or stamp.rebooted
-        ):
-            sender.newest = t_ns, report.boot_ms
+        if is_event and (newest is None or step_ms(boot_ms, newest[1]) > 0 or stamp.rebooted):
+            sender.newest = t_ns, boot_ms
         component = self._components.get(report.source) if is_own else None
         types = () if component is None else tuple(component.types)
         assumed = self._assumed(uav, types)
@@ -443,6 +441,15 @@ class Senders:
             limits=assumed.limits,
         )
         return FrameOutcome(message=placed, outputs=said, restarted=restarted, change=clock.change)
+
+    def _unplaced(self, sender: Sender, report: Report, said: tuple[Notice, ...]) -> FrameOutcome:
+        """Reject a report whose stamp fits no clock; its stamps may have another unit."""
+        uav, t_ns = report.uav, report.t_ns
+        if kind_of(uav).reports_itself and sender.has_other_unit(report):
+            sender.clock, said = self._new_clock(), (*said, _other_unit(sender, uav, t_ns))
+        late = _late_copies(sender, (sender.shared or sender).clock, uav, t_ns)
+        unused = Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)
+        return FrameOutcome(outputs=(*said, *late, unused), restarted=uav if said else None)
 
     def _switch(
         self, sender: Sender, report: Report, *, is_shared: bool
@@ -583,16 +590,20 @@ class Senders:
     def may_begin(self, report: Report, always: bool) -> bool:
         """Return whether a track may begin with this report.
 
-        Its sender's receiver, if one was received, must have a 3D fix near the report's height.
-        After ``RECEIVER_WAIT_NS`` the track begins anyway, as heights may have different
-        datums; home waits ``always``. A status that was not repeated for ``FORGOTTEN_NS`` is
-        ignored: it may be forged.
+        Its sender's receiver, if one was received, must have a 3D fix near the report's height; not
+        in flight after the loss of a fix, where a redundant autopilot takes over. After
+        ``RECEIVER_WAIT_NS`` the track begins anyway, as heights may have different datums; home
+        waits ``always``. A status that was not repeated for ``FORGOTTEN_NS`` is ignored: it may be
+        forged.
         """
         component = self._components.get(report.source)
         receiver = None if component is None else component.receiver
         if receiver is None or not kind_of(report.uav).reports_itself:
             return True
         if report.t_ns - receiver.t_ns > noise.FORGOTTEN_NS:
+            return True
+        assert component is not None
+        if component.is_in_flight and component.fix.is_trusted and not component.fix.is_certain:
             return True
         record = self._records[report.uav]
         if receiver.fix_type >= FIX_3D and abs(receiver.alt_m - report.alt_m) < NEAR_M:
@@ -719,6 +730,18 @@ def _late_copies(sender: Sender, clock: SenderClock, uav: str, t_ns: int) -> tup
         " route, or from a second vehicle with this id"
     )
     return (Notice(t_ns=t_ns, severity=Severity.WARNING, subject=uav, text=text),)
+
+
+def _other_unit(sender: Sender, uav: str, t_ns: int) -> Notice:
+    """Return a notice that the stamps of positions have another unit than before."""
+    is_other = sender.unit is not None and sender.unit.is_microseconds
+    text = f"{uav}: track restarted: its positions are stamped in milliseconds again"
+    if is_other:
+        text = (
+            f"{uav}: track restarted: its positions are stamped in microseconds, not in"
+            " milliseconds; they are converted"
+        )
+    return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=uav, text=text)
 
 
 def _shared_id(sender: Sender, uav: str, t_ns: int) -> tuple[Notice | Rejection, ...]:

@@ -74,7 +74,14 @@ LIMITS: Final = {
 ARDUPILOT_LAG_S: Final = {Airframe.COPTER: (0.019, 0.040), Airframe.AEROPLANE: (-0.033, -0.019)}
 ARDUPILOT_ANY_LAG_S: Final = (-0.033, 0.040)
 """Lag of ArduPilot's positions, any aircraft: copters and aeroplanes differ in its sign."""
+RECEIVER_LAG_S: Final = (0.0, 0.5)
+"""Lag of positions that are their GNSS receiver's, stamped when they are sent.
 
+INAV and Betaflight send such positions, and state a generic autopilot (``telemetry/mavlink.c`` of
+both). They are as old as a receiver's (docs/field-notes.md 1).
+"""
+
+_GENERIC: Final = 0  # MAV_AUTOPILOT_GENERIC
 _ARDUPILOT: Final = 3  # MAV_AUTOPILOT_ARDUPILOTMEGA
 _AIRFRAMES: Final = {
     **dict.fromkeys((2, 3, 13, 14, 15, 29, 35, 43), Airframe.COPTER),
@@ -97,6 +104,8 @@ def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
     """Return the least and largest lag of a position, s, by MAV_AUTOPILOT and kind of aircraft."""
     if autopilot == _ARDUPILOT:
         return ARDUPILOT_LAG_S.get(kind, ARDUPILOT_ANY_LAG_S)
+    if autopilot == _GENERIC and LIMITS[kind].lag_s == ANY_LAG_S:
+        return RECEIVER_LAG_S
     return LIMITS[kind].lag_s
 
 

@@ -47,7 +47,7 @@ DEAD_RECKONING_MPS2: Final = 0.5
 A tilt error of 3 degrees has this effect, and an accelerometer error of 0.05 g.
 """
 SETTLED_NS: Final = 5_000_000_000
-"""Time with a fix after which the autopilot's position is that of its receiver again."""
+"""Time in which an autopilot's position follows its receiver's, after a loss of the fix too."""
 GEOID_M: Final = 107.0
 """Largest distance between the ellipsoid and mean sea level (EGM96: -107 to 86 m).
 
@@ -102,16 +102,19 @@ class StatedNoise:
     """Noise bounds that a receiver has stated, by when each statement arrived.
 
     Statements and reports overtake each other. The statement in force when a report was made is
-    the newest one before that time, or one that arrived since. ``default`` is in force before the
-    first, and ``FORGOTTEN_NS`` after the newest; from ``STATED_NS`` on, the larger of the two.
+    the newest one before that time, or one that arrived since. One that is better than those
+    before it counts ``SETTLED_NS`` later: so long may the autopilot's position take to follow.
+    ``default`` is in force before the first, and ``FORGOTTEN_NS`` after the newest; from
+    ``STATED_NS`` on, the larger of the two.
     """
 
-    __slots__ = ("_default", "_earlier", "_newest", "_newest_ns")
+    __slots__ = ("_default", "_earlier", "_in_force", "_newest", "_newest_ns")
 
     def __init__(self, default: ReportNoise) -> None:
-        self._default = self._newest = default
+        self._default = self._newest = self._in_force = default
         self._newest_ns = 0
-        self._earlier: deque[tuple[int, ReportNoise]] = deque()  # until when each was the newest
+        self._earlier: deque[tuple[int, ReportNoise, ReportNoise]] = deque()
+        """Statements that were replaced: when, what they stated, and what was in force."""
 
     def add(self, arrival_ns: int, stated: ReportNoise, *, is_newest: bool = True) -> None:
         """Add a statement in order of arrival; ``is_newest`` is False if it was overtaken."""
@@ -119,25 +122,35 @@ class StatedNoise:
         while earlier and arrival_ns - earlier[0][0] > OVERTAKEN_NS:
             earlier.popleft()
         if len(earlier) >= STATEMENTS_MAX:
-            _, oldest = earlier.popleft()
-            earlier[0] = earlier[0][0], _larger(earlier[0][1], oldest)
-        before = self._newest
-        earlier.append((arrival_ns, before if is_newest else _larger(before, stated)))
-        if is_newest:
-            self._newest, self._newest_ns = stated, arrival_ns
+            _, *oldest = earlier.popleft()
+            at_ns, *next_oldest = earlier[0]
+            pairs = zip(next_oldest, oldest, strict=True)
+            first, second = (_larger(one, other) for one, other in pairs)
+            earlier[0] = at_ns, first, second
+        if not is_newest:
+            larger = _larger(self._newest, stated), _larger(self._in_force, stated)
+            earlier.append((arrival_ns, *larger))
+            return
+        replaced = self._newest if self._newest_ns else stated  # the default is no statement
+        earlier.append((arrival_ns, replaced, self._in_force))
+        self._newest, self._in_force, self._newest_ns = stated, stated, arrival_ns
+        for until_ns, replaced, _ in reversed(earlier):
+            if until_ns < arrival_ns - SETTLED_NS:
+                break
+            self._in_force = _larger(self._in_force, replaced)
 
     def since(self, made_ns: int) -> ReportNoise:
         """Return bounds for a report that was made no earlier than this.
 
         They are the largest of all statements that may have been in force when it was made.
         """
-        found, age_ns = self._newest, made_ns - self._newest_ns
+        found, age_ns = self._in_force, made_ns - self._newest_ns
         if age_ns > STATED_NS:
             found = self._default if age_ns > FORGOTTEN_NS else _larger(found, self._default)
-        for until_ns, stated in reversed(self._earlier):
+        for until_ns, _, in_force in reversed(self._earlier):
             if until_ns < made_ns:
                 break
-            found = _larger(found, stated)
+            found = _larger(found, in_force)
         return found
 
 

@@ -3,6 +3,7 @@
 import math
 import re
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import Any
 
 import pymavlink.dialects.v20.all as dialect
@@ -482,6 +483,27 @@ def test_bound_grows_on_if_the_vehicle_restarts_without_a_fix(back_s: float) -> 
     outputs, found = flown(restarted())
     assert about(outputs, "restarted")
     assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
+
+
+def test_takeover_without_a_fix_in_flight_is_tracked_at_once() -> None:
+    """Not as a vehicle that was switched on, whose positions may be invalid."""
+
+    def restarted() -> Iterator[Any]:
+        for event in flight(0.2):
+            t_s = (event.t_ns - START_NS) / S if isinstance(event, Frame) else 0.0
+            if isinstance(event, Frame) and event.msgid == 24:
+                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3))
+            if isinstance(event, Frame) and event.msgid == 33 and t_s > 24.0:
+                message = dialect.MAVLink(None).decode(bytearray(event.raw))
+                message.time_boot_ms -= 90_000
+                event = sent(t_s, UAV, message)  # noqa: PLW2901
+            yield event
+
+    outputs, found = flown(restarted())
+    assert about(outputs, "restarted")
+    unused = [one for one in outputs if isinstance(one, Rejection) and one.reason is Reason.NO_FIX]
+    assert unused == []
+    assert max(after - before for before, after in pairwise(sorted(found))) < 1.5
 
 
 # --- an estimator that does not follow its receiver ----------------------------------------------

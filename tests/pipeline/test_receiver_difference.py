@@ -316,3 +316,65 @@ def test_larger_difference_is_named() -> None:
     difference = ReceiverDifference()
     compare(difference, status(1.0), report(1.1, (0.0, 0.0, 4.0)), 0.0)
     assert difference.larger.text("4") == "its altitude differs by 4 m from its GNSS receiver's"
+
+
+def test_climb_hides_nothing_that_was_seen_before() -> None:
+    """RTK: a climb of 30 s, in which a lag of half a second would explain the error."""
+    difference, off_m, covered_m = ReceiverDifference(), 1.0, []
+    for number in range(100):
+        t_s, climb_mps = number / 2, 4.0 if 20 <= number < 80 else 0.0
+        climbed_m = 4.0 * (min(max(t_s, 10.0), 40.0) - 10.0)
+        made = status(t_s, up_m=climbed_m)._replace(time_us=round((t_s + 100) * 1e6))
+        placed = report(t_s, (0.0, 0.0, climbed_m + off_m), (0.0, 0.0, -climb_mps))
+        placed = placed._replace(boot_ms=round((t_s + 100) * 1e3))
+        difference.compare(made, placed, 0.1, receiver(0.05, 0.05))
+        covered_m.append(difference.height.covered_m)
+        if number == 79:
+            assert difference.height.apart_m < 0.3  # the climb hides it
+    assert min(covered_m) == pytest.approx(off_m, abs=0.06)
+
+
+def drifted(path_m: list[float]) -> tuple[ReceiverDifference, list[tuple[int, Severity, float]]]:
+    """Return the notices of differences in the plane, twice a second: when, severity, metres."""
+    difference, told = ReceiverDifference(), []
+    for number, off_m in enumerate(path_m):
+        t_s = number / 2
+        compare(difference, status(t_s), report(t_s + 0.1, (0.0, off_m, 0.0)), 0.0)
+        if difference.is_news:
+            at_ns = round(t_s * S)
+            for severity, text in difference.announce(at_ns):
+                told.append((number, severity, float(text.split(" by ")[1].split()[0])))
+    return difference, told
+
+
+def test_growth_that_the_bound_does_not_follow_is_announced() -> None:
+    """Although the notice before said that the bound covers the difference."""
+    path_m = [0.5 * n for n in range(60)] + [30.0 + 6.0 * n for n in range(8)]
+    _, told = drifted(path_m)
+    assert {severity for n, severity, _ in told if n < 60} == {Severity.INFO}
+    fast = [(n, severity) for n, severity, _ in told if n >= 60]
+    assert fast and fast[0][0] <= 62 and fast[0][1] is Severity.WARNING
+
+
+def test_difference_that_is_not_covered_is_announced_again_after_a_minute() -> None:
+    """A glitch of the receiver, a drift that the bound follows, and one that it does not."""
+    glitch = [0.0] * 20 + [90.0] * 4
+    path_m = [*glitch, *(0.3 * n for n in range(130)), *(39.0 + 6.0 * n for n in range(8))]
+    _, told = drifted(path_m)
+    late = [(n, severity) for n, severity, _ in told if n >= 154]
+    assert late and late[0][0] <= 156 and late[0][1] is Severity.WARNING
+
+
+def test_fast_drift_is_covered_once_it_ends() -> None:
+    path_m = [0.0] * 10 + [min(80.0, 6.0 * n) for n in range(60)]
+    difference, _ = drifted(path_m)
+    assert difference.horizontal.covered_m == pytest.approx(80.0, abs=0.1)
+
+
+def test_difference_after_a_loss_of_the_fix_is_covered_at_once() -> None:
+    """By what it may have grown since the last status with a fix."""
+    difference = ReceiverDifference()
+    compare(difference, status(0.0), report(0.1), 0.0)
+    compare(difference, status(20.0)._replace(fix_type=1), report(20.1, (0.0, 40.0, 0.0)), 0.0)
+    compare(difference, status(30.0), report(30.1, (0.0, 90.0, 0.0)), 0.0)
+    assert difference.horizontal.covered_m == pytest.approx(90.0, abs=0.1)

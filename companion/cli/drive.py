@@ -1,6 +1,8 @@
 """The command ``companion drive``: apply the beams of a running service to a device."""
 
+import contextlib
 import json
+import sys
 import time
 from dataclasses import asdict
 from pathlib import Path
@@ -122,8 +124,10 @@ def drive(
             output.require_output()
             output.line(json.dumps(asdict(final_status)))
 
+    printed = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()
     try:
-        interrupted = running.run_until_stopped(driven, show, seconds)
+        with printed:  # by the device's library
+            interrupted = running.run_until_stopped(driven, show, seconds)
         final_status = driven.status()
         lines.line(_text(final_status))
     finally:

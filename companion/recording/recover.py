@@ -65,6 +65,8 @@ def recover(path: Path) -> Recovered:
 
 def holds_recording(wanted: Path) -> bool:
     """Return whether a file is a finished recording, or the leftover of one, not to be replaced."""
+    if wanted.is_dir():
+        return False
     active = wanted.with_name(wanted.name + ACTIVE)
     if not active.is_file():
         return wanted.is_file()

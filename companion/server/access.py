@@ -94,6 +94,8 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
             f"{listen}: COMPANION_TOKEN is so short that it can be guessed;"
             f" give {TOKEN_MIN} or more characters, such as those of `openssl rand -hex 16`"
         )
+    if token and not token.isascii():
+        raise ListenError("COMPANION_TOKEN contains characters that HTTP does not carry; use ASCII")
     try:
         family, kind, proto, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE

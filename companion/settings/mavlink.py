@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal, Self
 from pydantic import AfterValidator, Field, ValidationInfo, field_validator, model_validator
 
 from companion.mavlink.links.urls import Scheme, parse_link
-from companion.settings.section import Section
+from companion.settings.section import FileName, Section
 from companion.values import UAV_FORMS, UserError, shown
 
 
@@ -71,7 +71,7 @@ class SigningSettings(Section):
 
     keys: dict[LinkText, str] = Field(default_factory=dict)
     allow_unsigned: tuple[LinkText, ...] = ()
-    timestamps: str = "signing-timestamps.json"
+    timestamps: FileName = "signing-timestamps.json"
 
     @field_validator("allow_unsigned")
     @classmethod

@@ -6,7 +6,7 @@ from typing import Annotated, Final, Literal
 
 from pydantic import AfterValidator, Field
 
-from companion.settings.section import Section, UavName
+from companion.settings.section import FileName, FolderName, Section, UavName
 from companion.values import UserError, shown
 
 _ADDRESS: Final = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([0-9.]+)):([0-9]{1,5})")
@@ -40,7 +40,7 @@ class RecordSettings(Section):
     """
 
     udp: Annotated[tuple[str, ...], Field(max_length=16), AfterValidator(_addresses)] = ()
-    shared_memory: str | None = None
+    shared_memory: FileName | None = None
     guaranteed: bool = False
 
 
@@ -56,7 +56,7 @@ class RecordingSettings(Section):
     The files of one run replay together to the digest of that run.
     """
 
-    directory: str | None = None
+    directory: FolderName | None = None
     weights_hz: Literal["all"] | Annotated[float, Field(ge=1e-3, le=1e6)] = 10.0
     scene_hz: Annotated[float, Field(gt=0, le=100)] = 2.0
     rotate_mb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None

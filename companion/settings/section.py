@@ -1,5 +1,6 @@
 """Base class of all sections of the settings, and the error for unusable settings."""
 
+from pathlib import Path
 from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
@@ -25,3 +26,21 @@ def _uav_id(text: str) -> str:
 
 UavName = Annotated[str, AfterValidator(_uav_id)]
 """Id of one UAV in settings; a name that no UAV can have would have no effect."""
+
+
+def _file_name(text: str) -> str:
+    if not Path(text).name:
+        raise UserError("not the name of a file; give one")
+    return text
+
+
+def _folder_name(text: str) -> str:
+    if not text:
+        raise UserError("not the name of a folder; give one, such as . for the current one")
+    return text
+
+
+FileName = Annotated[str, AfterValidator(_file_name)]
+"""Path of a file that is written."""
+FolderName = Annotated[str, AfterValidator(_folder_name)]
+"""Path of a folder that is written to."""

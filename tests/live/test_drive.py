@@ -1,6 +1,7 @@
 """Devices driven by real processes: the service's own device, and a remote one over HTTP."""
 
 import json
+import os
 import re
 import signal
 import socket
@@ -95,6 +96,21 @@ def test_drive_status_is_reported_each_second(start_node: Any, tmp_path: Path) -
     assert [one["failures"] for one in told] == [0] * len(told)
     assert told[-1]["applied"] > 5
     assert told[-1]["p99_ms"] >= told[-1]["p50_ms"] > 0
+
+
+def test_what_a_library_prints_is_not_among_the_json(tmp_path: Path) -> None:
+    (tmp_path / "spidev.py").write_text("print('SPI 1.0')\n")
+    command = [BIN / "companion", "drive", "adar1000:0.0", "--service", "http://127.0.0.1:9"]
+    done = subprocess.run(
+        [*command, "--json", "--seconds", "0.5"],
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=HANG_S,
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+    )
+    assert "SPI 1.0" in done.stderr
+    assert [line for line in done.stdout.splitlines() if not line.startswith("{")] == []
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """``companion check``: reports faults before a run, and whatever limits a site."""
 
+import contextlib
 import json
 import os
 import socket
@@ -67,6 +68,8 @@ def test_recording_folder_is_checked(tmp_path: Path) -> None:
     assert not folder.exists()
     (tmp_path / "file").write_text("")
     (tmp_path / "loop").symlink_to(tmp_path / "loop")
+    with contextlib.chdir(tmp_path):
+        assert looked(recording={"directory": "."})["recordings ."].grade is Grade.OK
     for name in ("file/recordings", "loop", "loop/x", "n" * 300 + ".mcap"):
         there = tmp_path / name
         said = looked(recording={"directory": str(there)})[f"recordings {there}"]

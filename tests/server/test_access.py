@@ -17,6 +17,11 @@ def test_public_address_requires_a_token_or_insecure_flag(token: str | None) -> 
     bind("0.0.0.0:0", token=token, insecure=True).close()
 
 
+def test_token_that_http_does_not_carry_is_an_error() -> None:
+    with pytest.raises(ListenError, match="COMPANION_TOKEN contains characters"):
+        bind("127.0.0.1:0", token="pässwörter-für-alle", insecure=False)
+
+
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.0.0.7"])
 def test_loopback_address_requires_no_token(host: str) -> None:
     bind(f"{host}:0", token=None, insecure=False).close()

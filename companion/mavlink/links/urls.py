@@ -163,7 +163,7 @@ def _suggestion(text: str) -> str:
     scheme, _, address = text.partition(":")
     if not text.isprintable():
         return ""
-    if scheme == "serial" and address:
+    if scheme == "serial" and address and not address.rpartition(":")[2].isdecimal():
         return f"; a baud rate is missing, as in {text.rstrip(':')}:57600"
     if text.startswith(("/dev/", "COM")):
         return f"; did you mean serial:{text}:57600?"

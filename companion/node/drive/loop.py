@@ -246,6 +246,7 @@ class Drive:
             if self._stop.is_set():
                 return
             self._device.apply(command)
+            self._note_success()
         except DeviceError as error:
             self._handle_failure(error)
             return
@@ -314,12 +315,18 @@ class Drive:
         if not self._open and self._now_ns() >= self._again_ns:
             self._device.open()
             self._open = True
-            self.device_error = None
-            self._say("the device is connected")
+            if self.device_error is None:
+                self._say("the device is connected")
         return self._open
 
+    def _note_success(self) -> None:
+        """Note that the device accepted something: opening it again need not show that it works."""
+        if self.device_error is not None:
+            self.device_error = None
+            self._say("the device is connected")
+
     def _handle_failure(self, error: DeviceError) -> None:
-        if self._open or not self._failures:
+        if self.device_error is None:
             self._say(f"the device failed: {error}")
         self._failures += 1
         self.device_error = str(error)
@@ -344,5 +351,6 @@ class Drive:
         if self._resting != why:
             if self._resting is None:
                 self._device.rest(self._safe)
+                self._note_success()
             self._resting = why
             self._say(f"{self._safe}: {why}")

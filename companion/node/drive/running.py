@@ -84,6 +84,6 @@ async def run_in_thread(drive: Drive) -> None:
 def _run(drive: Drive, stop: threading.Event, failed: list[BaseException]) -> None:
     try:
         drive.run(stop)
-    except Exception as error:
+    except BaseException as error:  # whatever a library raises, the caller waits for the thread
         failed.append(error)
         stop.set()

@@ -140,10 +140,25 @@ def test_link_url_error_suggests_a_correction(text: str, meant: str) -> None:
     with pytest.raises(LinkError) as caught:
         parse_link(text)
     assert str(caught.value).endswith(f"did you mean {meant}")
+
     links = re.findall(r"[a-z]+:[^ ,?]+", meant.replace("HOST", "host"))
     assert links or meant == "readsb:?"
     for link in links:
         parse_link(link)
+
+
+@pytest.mark.parametrize(
+    ("text", "is_missing"),
+    [
+        ("serial:/dev/ttyS0", True),
+        ("serial::57600", False),
+        ("serial:/dev/ttyS0:" + "9" * 20, False),
+    ],
+)
+def test_baud_rate_is_missing_only_where_there_is_none(text: str, is_missing: bool) -> None:
+    with pytest.raises(LinkError) as caught:
+        parse_link(text)
+    assert ("a baud rate is missing" in str(caught.value)) is is_missing
 
 
 def test_only_allowed_schemes_are_accepted() -> None:

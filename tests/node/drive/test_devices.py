@@ -907,3 +907,39 @@ def test_missing_libiio_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.delitem(sys.modules, "adi", raising=False)
     with pytest.raises(UserError, match=r"cannot open; is libiio \(Debian: .*\) installed\?"):
         targets.device("phaser:ip:x", print, list).open()
+
+
+class Silent(Device):
+    """Device that can be opened although nothing is there, as a gimbal behind UDP."""
+
+    takes = DeviceInput.POINTING
+
+    def __init__(self) -> None:
+        self.is_there = False
+
+    def open(self) -> None:
+        pass
+
+    def apply(self, command: DeviceCommand) -> None:
+        if not self.is_there:
+            raise DeviceError("Connection refused")
+
+    def rest(self, safe: SafeState) -> None:
+        pass
+
+    def close(self) -> None:
+        pass
+
+
+def test_device_that_only_seems_to_connect_is_announced_once(
+    flown: tuple[DeviceCommand, Any, str],
+) -> None:
+    device, clock, said = Silent(), Ticking(), list[str]()
+    drive = driven(Always(flown[0]), device, said.append, now_ns=clock.now_ns)
+    for number in range(60):
+        device.is_there = 30 <= number < 40
+        drive.step()
+        clock.t_ns += 1_100_000_000
+    failed = "the device failed: Connection refused"
+    assert said == ["the device is connected", failed, "the device is connected", failed]
+    assert drive.status().failures == 50

@@ -5,7 +5,7 @@ from typing import Annotated
 
 from pydantic import AfterValidator, BaseModel, ConfigDict
 
-from companion.values import UAV_FORMS, UserError, is_uav_id
+from companion.values import UAV_FORMS, UserError, is_uav_id, shown
 
 
 class ConfigError(UserError):
@@ -30,13 +30,13 @@ UavName = Annotated[str, AfterValidator(_uav_id)]
 
 def _file_name(text: str) -> str:
     if not Path(text).name:
-        raise UserError("not the name of a file; give one")
+        raise UserError(f"{shown(text)} is not the name of a file; give one")
     return text
 
 
 def _folder_name(text: str) -> str:
     if not text:
-        raise UserError("not the name of a folder; give one, such as . for the current one")
+        raise UserError(f"{shown(text)} is not the name of a folder; give one, such as .")
     return text
 
 

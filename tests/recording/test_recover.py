@@ -1,5 +1,6 @@
 """Recovery of a recording truncated anywhere loses at most one flush."""
 
+import contextlib
 import random
 import signal
 import subprocess
@@ -15,7 +16,7 @@ from support import HANG_S, line_of, read_metadata, rounds, started
 
 from companion.cli.main import main
 from companion.recording.reader import LogError, read_log, read_settings
-from companion.recording.recover import Recovered, recover, recover_leftovers
+from companion.recording.recover import Recovered, holds_recording, recover, recover_leftovers
 from companion.recording.writer import Writer
 from companion.values import Event, Frame, Reason, Rejection, Tick
 
@@ -347,3 +348,9 @@ def test_command_completes_all_files_that_can_be(
     lines = done.stderr.splitlines()
     assert len(lines) == 2
     assert "no.mcap.active" in lines[0] and "missing" in lines[1]
+
+
+def test_folder_is_no_recording(tmp_path: Path) -> None:
+    assert not holds_recording(tmp_path)
+    with contextlib.chdir(tmp_path):
+        assert not holds_recording(Path())

@@ -118,26 +118,31 @@ class StatedNoise:
 
     def add(self, arrival_ns: int, stated: ReportNoise, *, is_newest: bool = True) -> None:
         """Add a statement in order of arrival; ``is_newest`` is False if it was overtaken."""
-        earlier = self._earlier
-        while earlier and arrival_ns - earlier[0][0] > OVERTAKEN_NS:
-            earlier.popleft()
-        if len(earlier) >= STATEMENTS_MAX:
-            _, *oldest = earlier.popleft()
-            at_ns, *next_oldest = earlier[0]
-            pairs = zip(next_oldest, oldest, strict=True)
-            first, second = (_larger(one, other) for one, other in pairs)
-            earlier[0] = at_ns, first, second
         if not is_newest:
-            larger = _larger(self._newest, stated), _larger(self._in_force, stated)
-            earlier.append((arrival_ns, *larger))
+            one, other = self._newest, self._in_force
+            self._replaced(arrival_ns, _larger(one, stated), _larger(other, stated))
             return
-        replaced = self._newest if self._newest_ns else stated  # the default is no statement
-        earlier.append((arrival_ns, replaced, self._in_force))
-        self._newest, self._in_force, self._newest_ns = stated, stated, arrival_ns
-        for until_ns, replaced, _ in reversed(earlier):
+        before = self._newest if self._newest_ns else stated  # the default is no statement
+        in_force = _larger(stated, before)
+        for until_ns, replaced, _ in reversed(self._earlier):
             if until_ns < arrival_ns - SETTLED_NS:
                 break
-            self._in_force = _larger(self._in_force, replaced)
+            in_force = _larger(in_force, replaced)
+        if stated != self._newest or in_force != self._in_force:
+            self._replaced(arrival_ns, before, self._in_force)
+        self._newest, self._in_force, self._newest_ns = stated, in_force, arrival_ns
+
+    def _replaced(self, at_ns: int, stated: ReportNoise, in_force: ReportNoise) -> None:
+        """Note what was replaced; the oldest of too many is merged with the next."""
+        earlier = self._earlier
+        while earlier and at_ns - earlier[0][0] > OVERTAKEN_NS:
+            earlier.popleft()
+        if len(earlier) >= STATEMENTS_MAX:
+            _, oldest, oldest_in_force = earlier.popleft()
+            until_ns, next_stated, next_in_force = earlier[0]
+            in_force_then = _larger(next_in_force, oldest_in_force)
+            earlier[0] = until_ns, _larger(next_stated, oldest), in_force_then
+        earlier.append((at_ns, stated, in_force))
 
     def since(self, made_ns: int) -> ReportNoise:
         """Return bounds for a report that was made no earlier than this.

@@ -20,7 +20,7 @@ from companion.pipeline.fold import DROP_EVERY, Pipeline
 from companion.pipeline.ticks import with_ticks
 from companion.settings.center import FixedCenter
 from companion.settings.model import Settings
-from companion.tracking.noise import GEOID_M
+from companion.tracking.noise import GEOID_M, SETTLED_NS
 from companion.values import (
     Estimate,
     Event,
@@ -627,7 +627,9 @@ def test_report_overtaken_by_a_better_accuracy_keeps_the_worse_one(late_s: float
     late = position(made_s + late_s, "1:1", boot_s=100 + made_s)
     run(pipeline, [accuracy(made_s + 0.01, "1:1", 0.5, 0.5, 0.1), late])
     assert noise_of(pipeline, "1:1") == pytest.approx((15.0, 15.0, 0.6))
-    run(pipeline, [position(made_s + 2.0, "1:1")])
+    again_s = made_s + SETTLED_NS / S + 0.1  # the autopilot has followed its receiver
+    run(pipeline, [position(made_s + n, "1:1") for n in range(2, round(again_s - made_s))])
+    run(pipeline, [accuracy(again_s, "1:1", 0.5, 0.5, 0.1), position(again_s + 1.0, "1:1")])
     assert noise_of(pipeline, "1:1") == pytest.approx((1.5, 1.5, 0.3))
 
 
@@ -657,7 +659,10 @@ def test_outdated_receiver_status_is_ignored() -> None:
     run(pipeline, [late._replace(t_ns=START_NS + 51_200 * S // 1000), position(51.3, "1:1")])
     assert noise_of(pipeline, "1:1") == pytest.approx((15.0, 15.0, 0.6))
     anew = accuracy(2.0, "1:1", 1.0, 1.0, 0.1)
-    run(pipeline, [anew._replace(t_ns=START_NS + 52 * S), position(52.1, "1:1")])
+    run(pipeline, [anew._replace(t_ns=START_NS + 52 * S)])
+    run(pipeline, [position(0.1 * n, "1:1") for n in range(521, 580)])
+    again = accuracy(8.0, "1:1", 1.0, 1.0, 0.1)._replace(t_ns=START_NS + 58 * S)
+    run(pipeline, [again, position(58.1, "1:1")])
     assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
 
 
@@ -697,7 +702,10 @@ def test_receiver_status_after_a_reboot_replaces_the_old_one() -> None:
     run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4)])
     anew = accuracy(3.0, "1:1", 1.0, 1.0, 0.1)
     pipeline.step(anew._replace(t_ns=START_NS + 23_500 * S // 1000))
-    run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4, 13)])
+    run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(4, 10)])
+    again = accuracy(9.0, "1:1", 1.0, 1.0, 0.1)
+    pipeline.step(again._replace(t_ns=START_NS + 29_500 * S // 1000))
+    run(pipeline, [position(20.0 + n, "1:1", boot_s=1.0 + n) for n in range(10, 13)])
     assert pipeline.restarts["1:1"] == 1
     assert noise_of(pipeline, "1:1") == pytest.approx((3.0, 3.0, 0.3))
 

@@ -36,6 +36,16 @@ class FiniteRange(click.FloatRange):
         return float(found)
 
 
+class FolderPath(click.Path):
+    """Option that names a folder: ``click.Path`` takes nothing for the current one."""
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Return the path, or fail with the option's name."""
+        if value == "":
+            self.fail("'' is not the name of a folder", param, ctx)
+        return super().convert(value, param, ctx)
+
+
 CENTER = click.option(
     "--center",
     metavar="SRC",

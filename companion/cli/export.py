@@ -13,6 +13,7 @@ from companion.cli.console import (
     JSON,
     LATENCY,
     LOGS,
+    FolderPath,
     InterruptedByUser,
     Progress,
     log_progress,
@@ -52,7 +53,7 @@ class _ExportGroup(click.Command):
     "--out",
     metavar="DIR",
     required=True,
-    type=click.Path(path_type=Path, file_okay=False),
+    type=FolderPath(path_type=Path, file_okay=False),
     help="Folder for the tables.",
 )
 @CONFIG

@@ -9,7 +9,7 @@ from typing import Any
 
 import click
 
-from companion.cli.console import JSON, Progress, make_folder, print_truncated
+from companion.cli.console import JSON, FolderPath, Progress, make_folder, print_truncated
 from companion.cli.output import write_file
 
 
@@ -32,7 +32,7 @@ def study_output(name: str) -> Callable[[Callable[..., Studied]], Callable[..., 
     def decorate(study: Callable[..., Studied]) -> Callable[..., None]:
         @click.option(
             "--out",
-            type=click.Path(path_type=Path),
+            type=FolderPath(path_type=Path),
             metavar="DIR",
             required=True,
             help="Folder for the results.",

@@ -80,7 +80,7 @@ class Service:
     ``answering`` is set once HTTP is served. ``clock`` is this machine's unless a test provides
     another one. ``say`` gets one line for the operator per notice. Raises ``LinkError`` if a link
     cannot be opened, ``ConfigError`` for unusable settings, ``OSError`` if the recording cannot be
-    opened, ``LiveError`` if the live channels cannot be served.
+    opened, ``UserError`` if the live channels cannot be served.
     """
 
     def __init__(

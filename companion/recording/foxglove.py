@@ -17,6 +17,7 @@ from companion.recording.entries import NAMED, Encoder, Geodetic
 from companion.recording.scene import Scene
 from companion.recording.schemas import Schema
 from companion.values import Estimate, Event, Output, UserError
+from companion.values.extras import needs
 
 QUEUE_MAX: Final = 10_000  # events waiting to be sent at most
 RATE_HZ: Final = 10.0  # largest rate of tracks and weights; faster changes are not visible
@@ -24,10 +25,6 @@ LOOK_S: Final = 0.2  # time between two checks for viewers
 NAME: Final = "companion"  # name of the server in viewers
 
 _Item = tuple[Event | None, Sequence[Output]]
-
-
-class LiveError(UserError):
-    """Error of live channels that cannot be served."""
 
 
 class LiveChannels:
@@ -38,8 +35,8 @@ class LiveChannels:
         scene       draws the scene; None: no scene
         rate_hz     largest rate of tracks and weights; None: every update
 
-    Without viewers, no messages are encoded. Raises ``LiveError`` if the package is not installed
-    or the port is unavailable.
+    Without viewers, no messages are encoded. Raises ``UserError`` without the package, or if
+    the port is unavailable.
     """
 
     def __init__(
@@ -59,7 +56,7 @@ class LiveChannels:
                 name=NAME, host=host, port=port, context=self._context
             )
         except (OSError, RuntimeError) as error:
-            raise LiveError(f"server.foxglove: cannot listen on {host}:{port}: {error}") from error
+            raise UserError(f"server.foxglove: cannot listen on {host}:{port}: {error}") from error
         self.port: int = self._server.port
         self._channels: dict[str, Any] = {}
         self._announced: set[str] = set()
@@ -135,10 +132,6 @@ class LiveChannels:
 
 
 def _foxglove() -> Any:
-    try:
+    with needs("foxglove", "live", "server.foxglove"):
         import foxglove
-    except ImportError as error:
-        raise LiveError(
-            "server.foxglove needs the package foxglove-sdk; install the extra [live]"
-        ) from error
     return foxglove

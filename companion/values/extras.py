@@ -22,4 +22,5 @@ def needs(package: str, extra: str, what: str, library: str | None = None) -> It
         cause = str(error) or type(error).__name__
         if library is not None and isinstance(error, OSError | AttributeError):
             cause = f"{cause}; is {library} installed?"
-        raise UserError(f"{what} the package {package} does not load: {cause}") from error
+        unusable = f"{what} needs the package {package}, which does not load: {cause}"
+        raise UserError(unusable) from error

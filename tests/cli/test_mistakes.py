@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import struct
 import subprocess
 import urllib.request
@@ -269,6 +270,9 @@ SAYS: list[tuple[str, int, str]] = [
     ("weights good.tlog --at", 2, "Option '--at' requires an argument"),
     ("weights good.tlog --at nan", 1, "neither seconds from the start nor a time"),
     ("export . --out tables", 1, ".: is a folder; name the logs in it"),
+    ("export good.tlog --out ''", 2, "'' is not the name of a folder"),
+    ("study dt --out ''", 2, "'' is not the name of a folder"),
+    ("run --record ''", 1, "'' is not the name of a folder; give one, such as ."),
     ("export empty.tlog --out tables", 1, "empty.tlog: is empty"),
     ("export beams --out . --format oai-dbt", 2, "is a directory"),
     ("export beams --config noise.tlog --out x", 1, "noise.tlog: not TOML"),
@@ -358,7 +362,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 @pytest.mark.parametrize(("given", "status", "says"), SAYS)
 def test_command_error_is_one_line(folder: Path, given: str, status: int, says: str) -> None:
     before = sorted(folder.rglob("*"))
-    words = given.split()
+    words = shlex.split(given)
     program, words = (sitl, words[1:]) if words[0] == "sitl-replay" else (main, words)
     name = "companion" if program is main else "sitl-replay"
     done = CliRunner().invoke(program, words, prog_name=name)

@@ -895,7 +895,7 @@ def test_package_that_does_not_load_is_an_error_of_one_line(
     monkeypatch.syspath_prepend(str(tmp_path))
     for name in [name for name in sys.modules if name.partition(".")[0] == module]:
         monkeypatch.delitem(sys.modules, name)
-    expected = f"{kind}: the package {module} does not load: {cause}"
+    expected = f"{kind}: needs the package {module}, which does not load: {cause}"
     with pytest.raises(UserError, match=re.escape(expected)) as found:
         targets.device(target, print, list).open()
     assert "\n" not in str(found.value)

@@ -40,7 +40,8 @@ A report that jumps is rejected instead, or restarts the track with a notice.
 HELD_NS: Final = 5_000_000_000
 """Time for which a difference is held at least: less of it shows at another course.
 
-In a climb, where a lag may hide more of it than the receiver's error, it is held until after."""
+In a climb, where a lag may hide more of it than the receiver's error, it is held until after.
+"""
 LATE_S: Final = 1.0  # largest lateness of a report that is compared by arrivals
 APART_S: Final = 3.0  # longest time between a status and a report that are compared
 APART_US: Final = round(APART_S * 1e6)  # the same between two stamps of one clock
@@ -178,33 +179,35 @@ class ReceiverDifference:
             if elapsed_s > APART_S or late_s > LATE_S:  # it may have turned, or is anywhere
                 return
             least_s, most_s = elapsed_s - late_s, elapsed_s + late_s + ARRIVAL_LAG_S
+        seconds = least_s, most_s
         if report.velocity_down_mps is not None:
-            above_m, longest_s = (
-                report.alt_m - status.alt_m,
-                most_s if most_s > -least_s else -least_s,
-            )
-            climb_mps2 = self._climb_mps2 if self._climb_mps2 > 0.0 else -self._climb_mps2
-            explained_m = (
-                receiver.vertical_m + RESOLUTION_M + climb_mps2 / 2 * longest_s * longest_s
-            )
-            first_m, last_m = above_m + down_mps * least_s, above_m + down_mps * most_s
-            least_m, most_m = (first_m, last_m) if first_m < last_m else (last_m, first_m)
-            if least_m < 0.0:
-                least_m, most_m = (0.0 if most_m > 0.0 else -most_m), max(-least_m, most_m)
-            one, is_small = self.height, least_m < explained_m
-            is_covered = least_m <= one.largest_m[0] + RESOLUTION_M and is_small
-            hides_m = (last_m - first_m) if last_m > first_m else first_m - last_m
-            ages = t_ns - one.since_ns > HELD_NS and hides_m <= explained_m
-            if is_covered and not ages:
-                one.apart_m, one.noted_ns = least_m, t_ns
-            else:
-                one.note(least_m, least_m if is_small else most_m, t_ns, ages=ages)
+            self._compare_height(report.alt_m - status.alt_m, report, seconds, receiver.vertical_m)
         if status.position_deg is not None:
-            seconds = least_s, most_s
             receiver_m = receiver.horizontal_m
             self._compare_position(status.position_deg, report, velocity_mps, seconds, receiver_m)
         height, horizontal = self.height, self.horizontal
         self.is_news = height.apart_m > height.news_m or horizontal.apart_m > horizontal.news_m
+
+    def _compare_height(
+        self, above_m: float, report: Report, seconds: Pair, receiver_m: float
+    ) -> None:
+        """Compare a report with the receiver's height, which begins and ends at two times."""
+        (least_s, most_s), down_mps, t_ns = seconds, report.velocity_down_mps or 0.0, report.t_ns
+        longest_s = most_s if most_s > -least_s else -least_s
+        climb_mps2 = self._climb_mps2 if self._climb_mps2 > 0.0 else -self._climb_mps2
+        explained_m = receiver_m + RESOLUTION_M + climb_mps2 / 2 * longest_s * longest_s
+        first_m, last_m = above_m + down_mps * least_s, above_m + down_mps * most_s
+        low_m, high_m = (first_m, last_m) if first_m < last_m else (last_m, first_m)
+        least_m = low_m if low_m > 0.0 else -high_m if high_m < 0.0 else 0.0
+        most_m = high_m if high_m > -low_m else -low_m
+        one, is_small = self.height, least_m < explained_m
+        is_covered = least_m <= one.largest_m[0] + RESOLUTION_M and is_small
+        is_hidden = high_m - low_m > explained_m  # in a climb
+        ages = t_ns - one.since_ns > HELD_NS and not is_hidden
+        if is_covered and not ages:  # nearly always
+            one.apart_m, one.noted_ns = least_m, t_ns
+        else:
+            one.note(least_m, least_m if is_small else most_m, t_ns, ages=ages)
 
     def _compare_position(
         self,

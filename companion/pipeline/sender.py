@@ -154,8 +154,7 @@ class Sender:
         assert report.boot_ms is not None
         if self.unit is None:
             self.unit = StampUnit(report.boot_ms)
-        reading = self.clock.reading()
-        return self.unit.note_unexplained(report.t_ns, reading and reading.newest_ns)
+        return self.unit.note_unexplained(report.t_ns)
 
     def is_known(self, now_ns: int) -> bool:
         """Return whether its clock is known here: from stamps of at most ``ANOTHER_CLOCK_NS``."""

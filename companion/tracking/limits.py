@@ -77,8 +77,7 @@ ARDUPILOT_ANY_LAG_S: Final = (-0.033, 0.040)
 RECEIVER_LAG_S: Final = (0.0, 0.5)
 """Lag of positions that are their GNSS receiver's, stamped when they are sent.
 
-INAV and Betaflight send such positions, and state a generic autopilot (``telemetry/mavlink.c`` of
-both). They are as old as a receiver's (docs/field-notes.md 1).
+INAV and Betaflight send such positions, and state a generic autopilot (docs/field-notes.md 1).
 """
 
 _GENERIC: Final = 0  # MAV_AUTOPILOT_GENERIC

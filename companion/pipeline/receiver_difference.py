@@ -12,7 +12,7 @@ from typing import Final
 from companion.values import FIX_3D, GnssStatus, Report, ReportNoise, Severity
 
 NEAR_M: Final = 50.0
-"""Largest difference with which a drift begins; one that begins larger is an invalid position.
+"""Largest difference of heights with which a drift begins; one that begins larger is invalid.
 
 Before an autopilot's height is valid it may be off by hundreds of metres (docs/field-notes.md 1).
 """
@@ -61,7 +61,8 @@ class Difference:
     noted_ns     arrival of the report that showed it; None: none was compared
     covered_m    part of the position bound that it needs, held for ``HELD_NS`` at least
     largest_m    largest such part since ``since_ns``, and in the ``HELD_NS`` before that
-    is_invalid   whether it has not been less than ``NEAR_M`` yet
+    has_datum    whether it may be that of two datums, as of heights
+    is_invalid   then, whether it has not been less than ``NEAR_M`` yet
     announced_m  difference that was announced last, at ``announced_ns``
     news_m       difference above which it must be announced again
     says_covered whether that notice said that the bound covers it
@@ -73,6 +74,7 @@ class Difference:
     covered_m: float = 0.0
     largest_m: tuple[float, float] = 0.0, 0.0
     since_ns: int = 0
+    has_datum: bool = False
     is_invalid: bool = False
     announced_m: float = LEAST_ANNOUNCED_M
     announced_ns: int = 0
@@ -88,7 +90,8 @@ class Difference:
         if self.noted_ns is not None:
             grown_m = GROWTH_MPS * (t_ns - self.noted_ns) * 1e-9
             covered_m = min(covered_m, self.covered_m + grown_m)
-        self.is_invalid = apart_m >= NEAR_M and (self.is_invalid or self.noted_ns is None)
+        is_far = self.has_datum and apart_m >= NEAR_M
+        self.is_invalid = is_far and (self.is_invalid or self.noted_ns is None)
         if self.is_invalid:
             covered_m = 0.0
         if apart_m < self.announced_m / NOTICE_RATIO**2 and t_ns - self.announced_ns > ANNOUNCED_NS:
@@ -135,7 +138,7 @@ class ReceiverDifference:
     """
 
     compared: GnssStatus | None = None
-    height: Difference = field(default_factory=lambda: Difference(what="altitude"))
+    height: Difference = field(default_factory=lambda: Difference(what="altitude", has_datum=True))
     horizontal: Difference = field(default_factory=lambda: Difference(what="position"))
     is_news: bool = False  # whether one of them must be announced
     _before: tuple[int, Pair, float] | None = None  # stamp and velocities of the report before

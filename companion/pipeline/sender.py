@@ -148,6 +148,7 @@ class Sender:
     first: tuple[int, int] | None = None  # arrival and stamp of an event that none confirmed yet
     newest: tuple[int, int] | None = None  # the same of the newest event that was placed
     unit: StampUnit | None = None  # of its stamps; None: milliseconds, since all had a time
+    attitude_ms: tuple[int, int] | None = None  # arrival and stamp of a carrier's newest attitude
 
     def has_other_unit(self, report: Report) -> bool:
         """Note a report without a time; return whether stamps have another unit from now on."""

@@ -383,7 +383,7 @@ class Senders:
             return _refused(report, Reason.TOO_MANY)  # ids can be forged in any number
         sender = self._senders[uav]
         if sender.unit is not None:
-            boot_ms = sender.unit.milliseconds(boot_ms)
+            boot_ms = sender.unit.milliseconds(t_ns, boot_ms, sender.attitude_ms)
             report = report._replace(boot_ms=boot_ms)
         refused: Reason | None = None
         switched: tuple[Notice, ...] = ()
@@ -578,7 +578,7 @@ class Senders:
         carrier = str(attitude.source)
         sender = self._senders[carrier]
         stamp, said = self._stamp(sender.clock, carrier, attitude.t_ns, attitude.boot_ms)
-        sender.stamped_ns = attitude.t_ns
+        sender.stamped_ns, sender.attitude_ms = attitude.t_ns, (attitude.t_ns, attitude.boot_ms)
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
         return FrameOutcome(
             message=placed,

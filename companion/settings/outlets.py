@@ -58,7 +58,7 @@ class RecordingSettings(Section):
 
     directory: FolderName | None = None
     weights_hz: Literal["all"] | Annotated[float, Field(ge=1e-3, le=1e6)] = 10.0
-    scene_hz: Annotated[float, Field(gt=0, le=100)] = 2.0
+    scene_hz: Annotated[float, Field(ge=1e-3, le=100)] = 2.0
     rotate_mb: Annotated[float, Field(ge=0.1, le=1e6)] | None = None
     rotate_s: Annotated[float, Field(ge=1, le=1e7)] = 3600.0
 

@@ -250,15 +250,19 @@ def test_difference_stays_while_the_receiver_has_no_fix() -> None:
 
 
 def test_drift_is_covered_beyond_the_largest_difference_of_valid_positions() -> None:
-    drifts, jumps = ReceiverDifference(), ReceiverDifference()
+    drifts, jumps, away = ReceiverDifference(), ReceiverDifference(), ReceiverDifference()
     for t_s in range(14):
-        compare(drifts, status(t_s), report(t_s + 0.1, (4.6 * t_s, 0.0, 0.0)), 0.0)
-    compare(jumps, status(0.0), report(0.1, (NEAR_M + 10.0, 0.0, 0.0)), 0.0)
-    assert drifts.horizontal.covered_m == pytest.approx(4.6 * 13, abs=0.1)
-    assert jumps.horizontal.covered_m == 0.0
+        compare(drifts, status(t_s), report(t_s + 0.1, (0.0, 0.0, 4.6 * t_s)), 0.0)
+    compare(jumps, status(0.0), report(0.1, (0.0, 0.0, NEAR_M + 10.0)), 0.0)
+    compare(away, status(0.0), report(0.1, (NEAR_M + 10.0, 0.0, 0.0)), 0.0)
+    assert drifts.height.covered_m == pytest.approx(4.6 * 13, abs=0.1)
+    assert jumps.height.covered_m == 0.0
     (told,) = jumps.announce(0)
-    text = "its position differs by 60 m from its GNSS receiver's; one of the two is invalid"
+    text = "its altitude differs by 60 m from its GNSS receiver's; one of the two is invalid"
     assert told == (Severity.WARNING, text)
+    assert away.horizontal.covered_m == pytest.approx(
+        NEAR_M + 10.0, abs=0.1
+    )  # no datum explains it
 
 
 def test_jump_of_a_report_is_not_covered_at_once() -> None:

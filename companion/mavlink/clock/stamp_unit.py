@@ -1,16 +1,23 @@
 """Unit of the stamps of a vehicle's positions: milliseconds, or by some firmwares microseconds.
 
 MAVLink defines ``time_boot_ms``. Betaflight and INAV fill GLOBAL_POSITION_INT with microseconds
-(docs/field-notes.md 1); their other stamps are milliseconds.
+(docs/field-notes.md 1), which wrap around after 71.6 min; their other stamps are milliseconds.
 """
 
 from typing import Final
 
-CONFIRMED: Final = 5  # steps in a row that show another unit
+CONFIRMED: Final = 5  # stamps in a row that show another unit, at least
+LASTS_NS: Final = 1_000_000_000
+"""Time that they must span: radios deliver in bunches."""
+_WINDOW_NS: Final = 10_000_000_000  # longest such time
+_RECENT_NS: Final = 10_000_000_000
+"""Largest age of a stamp in milliseconds that shows how often microseconds have wrapped around."""
 _PER_MS: Final = 1000
 _WRAP: Final = 1 << 32
-_RATIO: Final = 2.0  # largest ratio of a step to the time between two arrivals, either way
-_STEP_NS: Final = 20_000_000, 10_000_000_000  # shortest and longest such time
+_RATIO: Final = 2.0  # largest ratio of stamps' steps to those of arrivals, either way
+
+Stamped = tuple[int, int]
+"""Arrival, ns, and a stamp."""
 
 
 class StampUnit:
@@ -21,37 +28,48 @@ class StampUnit:
 
     def __init__(self, stamp: int) -> None:
         self.is_microseconds = False
-        self._received = self._newest_us = stamp  # the newest stamp as received; without wraps
-        self._before: tuple[int, int] | None = None  # arrival and stamp of the one before
-        self._steps = 0  # steps in a row that show the other unit
-        self._count = 0  # stamps since the newest one without a time
+        self._received = stamp  # the newest stamp as received
+        self._newest_us: Stamped = 0, stamp  # without wraps
+        self._first: Stamped | None = None  # of the stamps in a row that have no time
+        self._unexplained = 0  # their number
+        self._count = 0  # stamps since the newest of them
 
-    def milliseconds(self, stamp: int) -> int:
-        """Convert a stamp; the result wraps around as milliseconds do."""
+    def milliseconds(self, arrival_ns: int, stamp: int, other: Stamped | None) -> int:
+        """Convert a stamp; the result wraps around as milliseconds do.
+
+        ``other`` is the newest of the sender's other stamps, which are milliseconds.
+        """
         self._received = stamp
         self._count += 1
         if not self.is_microseconds:
             return stamp
-        ahead_us = (stamp - self._newest_us + _WRAP // 2) % _WRAP - _WRAP // 2
-        us = max(0, self._newest_us + ahead_us)
-        self._newest_us = max(self._newest_us, us)
+        before_ns, before_us = self._newest_us
+        if other is not None and arrival_ns - other[0] <= _RECENT_NS:
+            before_ns, before_us = other[0], other[1] * _PER_MS
+        expected_us = before_us + (arrival_ns - before_ns) // 1000
+        us = expected_us + (stamp - expected_us + _WRAP // 2) % _WRAP - _WRAP // 2
+        self._newest_us = max(self._newest_us, (arrival_ns, us))
         return us // _PER_MS % _WRAP
 
     def note_unexplained(self, arrival_ns: int) -> bool:
         """Note that the newest stamp has no time; return whether the unit changed.
 
-        Steps count in a row: a stamp in between that has a time has the present unit.
+        A stamp in between that has a time has the present unit.
         """
-        before, self._before = self._before, (arrival_ns, self._received)
-        count, self._count = self._count, 0
-        if before is None or not _STEP_NS[0] <= arrival_ns - before[0] <= _STEP_NS[1]:
+        first, stamp, in_a_row = self._first, self._received, self._count <= 1
+        self._count = 0
+        if first is None or not in_a_row or arrival_ns - first[0] > _WINDOW_NS:
+            self._first, self._unexplained = (arrival_ns, stamp), 1
             return False
+        self._unexplained += 1
+        elapsed_ns = arrival_ns - first[0]
+        if self._unexplained < CONFIRMED or elapsed_ns < LASTS_NS:
+            return False
+        self._first = None
         unit_ns = 1_000_000 if self.is_microseconds else 1_000  # of the other unit
-        step_ns = (self._received - before[1]) % _WRAP * unit_ns
-        is_other = 1 / _RATIO <= step_ns / (arrival_ns - before[0]) <= _RATIO
-        self._steps = self._steps + 1 if is_other and count <= 1 else 0
-        if self._steps < CONFIRMED:
+        step_ns = (stamp - first[1]) % _WRAP * unit_ns
+        if not 1 / _RATIO <= step_ns / elapsed_ns <= _RATIO:
             return False
-        self.is_microseconds, self._steps, self._before = not self.is_microseconds, 0, None
-        self._newest_us = self._received
+        self.is_microseconds = not self.is_microseconds
+        self._newest_us = arrival_ns, stamp
         return True

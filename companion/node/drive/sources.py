@@ -16,7 +16,7 @@ from companion.beams.hardware import codebooks, tables
 from companion.beams.hardware.calibration import Calibration
 from companion.beams.hardware.devices import Beamformer
 from companion.client import Client, ServiceError
-from companion.node.drive.loop import DeviceCommand, DeviceInput, SourceLostError
+from companion.node.drive.loop import TEXT_MAX, DeviceCommand, DeviceInput, SourceLostError
 from companion.pipeline.assembly import Equipment
 from companion.pipeline.fold import Pipeline
 from companion.values import IntArray, Update, UserError, WeightFormat
@@ -192,7 +192,7 @@ def command_for(
 ) -> DeviceCommand:
     """Return the device command for the requested UAV, from an answer of the API."""
     if told["unfit"] is not None:
-        return DeviceCommand(valid_at_ns=valid_at_ns, unfit=str(told["unfit"]))
+        return DeviceCommand(valid_at_ns=valid_at_ns, unfit=str(told["unfit"])[:TEXT_MAX])
     named = {beam["uav"]: beam for beam in told["beams"]}
     uav = followed_uavs(named, wanted)
     if uav is None:

@@ -141,7 +141,7 @@ class ReceiverDifference:
     height: Difference = field(default_factory=lambda: Difference(what="altitude", has_datum=True))
     horizontal: Difference = field(default_factory=lambda: Difference(what="position"))
     is_news: bool = False  # whether one of them must be announced
-    _before: tuple[int, Pair, float] | None = None  # stamp and velocities of the report before
+    before: Report | None = None  # the report before, compared or not
     _turn_mps2: Pair = 0.0, 0.0  # acceleration by the newest two reports, north and east
     _climb_mps2: float = 0.0  # the same, down
     _scaled_deg: float = math.inf  # latitude at which a degree of longitude has ``_east_m``
@@ -166,12 +166,14 @@ class ReceiverDifference:
         boot_ms, down_mps = report.boot_ms, report.velocity_down_mps or 0.0
         if status.fix_type < FIX_3D or velocity_mps is None or boot_ms is None:
             return
-        before, self._before = self._before, (boot_ms, velocity_mps, down_mps)
-        if before is not None and 0 < boot_ms - before[0] <= TURN_MS:
-            per_s = 1000.0 / (boot_ms - before[0])
-            north_mps2 = (velocity_mps[0] - before[1][0]) * per_s
-            self._turn_mps2 = north_mps2, (velocity_mps[1] - before[1][1]) * per_s
-            self._climb_mps2 = (down_mps - before[2]) * per_s
+        before = self.before
+        if before is not None and before.velocity_ne_mps is not None and before.boot_ms is not None:
+            elapsed_ms, before_mps = boot_ms - before.boot_ms, before.velocity_ne_mps
+            if 0 < elapsed_ms <= TURN_MS:
+                per_s = 1000.0 / elapsed_ms
+                north_mps2 = (velocity_mps[0] - before_mps[0]) * per_s
+                self._turn_mps2 = north_mps2, (velocity_mps[1] - before_mps[1]) * per_s
+                self._climb_mps2 = (down_mps - (before.velocity_down_mps or 0.0)) * per_s
         stamp_us = status.time_us
         elapsed_us = boot_ms * 1000 - stamp_us if stamp_us and boot_ms else None
         if elapsed_us is not None and -APART_US <= elapsed_us <= APART_US:

@@ -500,6 +500,7 @@ class Senders:
             if receiver is not difference.compared:
                 late_s = (report.t_ns - made_ns) * 1e-9
                 difference.compare(receiver, report, late_s, known)
+            difference.before = report
             if report.t_ns - receiver.t_ns <= noise.STATED_NS or component.fix.is_trusted:
                 off_m = difference.horizontal.covered_m
                 height_off_m = difference.height.covered_m

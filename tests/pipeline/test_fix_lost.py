@@ -20,7 +20,9 @@ SPEED_MPS, RADIUS_M = 8.0, 60.0
 KNOWS_ALL, KNOWS_NO_POSITION = 0b1100111111, 0b100101  # as ArduPilot sends them
 
 
-def receiver(t_s: float, has_fix: bool, place_m: tuple[float, float] | None = None) -> Frame:
+def receiver(
+    t_s: float, has_fix: bool, place_m: tuple[float, float] | None = None, *, accuracy_mm: int = 300
+) -> Frame:
     """Return a status; of a receiver that states no position, if none is given."""
     lat_1e7 = lon_1e7 = 0
     if place_m is not None:
@@ -28,7 +30,7 @@ def receiver(t_s: float, has_fix: bool, place_m: tuple[float, float] | None = No
         lon_1e7 = round((LON + place_m[1] / M_PER_DEG / math.cos(math.radians(LAT))) * 1e7)
     message = dialect.MAVLink_gps_raw_int_message(
         round((100 + t_s) * 1e6), 6 if has_fix else 1, lat_1e7, lon_1e7, 560_000,
-        100, 100, 0, 0, 12, 0, 300, 300, 300, 0, 0,
+        100, 100, 0, 0, 12, 0, accuracy_mm, accuracy_mm, 300, 0, 0,
     )  # fmt: skip
     return sent(t_s, UAV, message)
 
@@ -520,6 +522,30 @@ def drifting_estimator(rate_mps: float, *, told: bool = True) -> Iterator[Frame 
         if n % 5 == 0 and told:
             yield receiver(t_s + 0.03, True, true_m(t_s - 0.2))
         yield Tick(START_NS + round((t_s + 0.05) * S))
+
+
+def turns(*, with_positions: bool) -> Iterator[Frame | Tick]:
+    """Return a circle at 20 m/s and 10 m/s²; of an RTK receiver few statuses arrive."""
+    for n in range(round(ENDS_S * 10)):
+        t_s, angle = n / 10, n / 20
+        place_m = 200.0 + 40.0 * math.cos(angle), 40.0 * math.sin(angle)
+        speed = -20.0 * math.sin(angle), 20.0 * math.cos(angle), 0.0
+        yield position(t_s, UAV, (*place_m, -60.0), speed, late_s=0.02)
+        if n % 25 == 0:
+            seen = angle - 0.1
+            late_m = 200.0 + 40.0 * math.cos(seen), 40.0 * math.sin(seen)
+            seen_m = late_m if with_positions else None
+            yield receiver(t_s + 0.03, True, seen_m, accuracy_mm=20)
+        yield Tick(START_NS + round((t_s + 0.05) * S))
+
+
+def test_turns_cost_little_also_where_few_statuses_arrive() -> None:
+    """The acceleration is that of the newest two reports."""
+    bounds_m = []
+    for with_positions in (False, True):
+        _, found = flown(turns(with_positions=with_positions))
+        bounds_m.append(largest_m(found, 10.0, ENDS_S))
+    assert bounds_m[1] < bounds_m[0] + 1.0
 
 
 @pytest.mark.parametrize("rate_mps", [0.05, 0.3, 2.0])

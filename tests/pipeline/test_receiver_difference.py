@@ -204,15 +204,19 @@ def test_noise_of_the_receivers_height_is_no_reason_to_doubt_its_lag(off_m: floa
     assert difference.height.covered_m == pytest.approx(expected_m, abs=0.06)
 
 
-def test_turn_of_an_accurate_receiver_is_no_drift() -> None:
+@pytest.mark.parametrize("apart_s", [0.5, 2.5])
+def test_turn_of_an_accurate_receiver_is_no_drift(apart_s: float) -> None:
     """A circle at 30 m/s and 15 m/s²; the receiver is 0.2 s late, and accurate to 0.1 m."""
     difference, covered_m = ReceiverDifference(), []
     for number in range(1, 60):
-        stamped_s = number / 2
+        stamped_s = number * apart_s
         made_s = stamped_s + 0.3
         (seen, _), (flown, (north_mps, east_mps)) = turning(stamped_s - 0.2), turning(made_s)
         made = status(stamped_s, *seen)._replace(time_us=round(stamped_s * 1e6))
         told = report(made_s, (*flown, 0.0), (north_mps, east_mps, 0.0))
+        _, (north_mps, east_mps) = turning(made_s - 0.2)
+        before = report(made_s - 0.2, velocity_mps=(north_mps, east_mps, 0.0))
+        difference.before = before._replace(boot_ms=round((made_s - 0.2) * 1e3))
         difference.compare(
             made, told._replace(boot_ms=round(made_s * 1e3)), 0.1, receiver(0.1, 0.2)
         )

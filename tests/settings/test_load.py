@@ -298,7 +298,7 @@ SCALAR = st.characters(exclude_categories=["Cs"], exclude_characters="\0")
 
 
 @given(
-    directory=st.none() | st.text(SCALAR, max_size=20),
+    directory=st.none() | st.text(SCALAR, min_size=1, max_size=20),
     urls=st.lists(st.sampled_from(LINKS), max_size=3),
     keys=st.dictionaries(st.sampled_from(LINKS), st.text(SCALAR, max_size=20)),
     deny=st.lists(st.sampled_from(["3:1", "*:190", "icao:4C*"]), max_size=2),

@@ -24,6 +24,8 @@ _PARTIAL: Final = ".recovering"
 CHANNELS_MAX: Final = 65_535
 """Limit on channels with messages, which are numbered from 1, in two bytes."""
 DAMAGED: Final = ".damaged"
+LOST_MAX: Final = 10_000
+"""Bytes of a file without a message that may be dropped with it; one with more is left."""
 
 
 class UnreadableError(LogError):
@@ -137,6 +139,8 @@ def _rewrite(path: Path, head: bytes) -> Recovered:
         whole = walk.complete and not walk.lost_bytes
         if whole and not active:
             return tally.result(path, 0, changed=False)
+        if active and not tally.has_any and walk.lost_bytes > LOST_MAX:
+            raise UnreadableError(f"{path}: no message can be recovered")
         final = free_name(final)
         (path if whole else partial).rename(final)
     finally:
@@ -153,6 +157,11 @@ class _Tally:
     def __init__(self) -> None:
         self._messages: Counter[str] = Counter()
         self._last_ns: int | None = None
+
+    @property
+    def has_any(self) -> bool:
+        """Whether there is a message."""
+        return bool(self._messages)
 
     def count(self, message: Message) -> None:
         self._messages[message.channel.topic] += 1

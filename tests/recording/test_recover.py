@@ -16,7 +16,13 @@ from support import HANG_S, line_of, read_metadata, rounds, started
 
 from companion.cli.main import main
 from companion.recording.reader import LogError, read_log, read_settings
-from companion.recording.recover import Recovered, holds_recording, recover, recover_leftovers
+from companion.recording.recover import (
+    MAGIC,
+    Recovered,
+    holds_recording,
+    recover,
+    recover_leftovers,
+)
 from companion.recording.writer import Writer
 from companion.values import Event, Frame, Reason, Rejection, Tick
 
@@ -239,7 +245,7 @@ def test_recovery_reports_the_latest_time_of_all_messages(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("seed", range(40))
-def test_flipped_bits_never_raise(
+def test_flipped_bits_lose_what_cannot_be_read(
     tmp_path: Path, recording: tuple[Path, list[Event], list[tuple[int, int]]], seed: int
 ) -> None:
     broken = bytearray(recording[0].read_bytes())
@@ -251,8 +257,13 @@ def test_flipped_bits_never_raise(
     driven = set(map(repr, recording[1]))
     before = [e for e in recovered_events(path) if not isinstance(e, Rejection)]
     assert set(map(repr, before)) <= driven
-    after = [e for e in recovered_events(recover(path).path) if not isinstance(e, Rejection)]
-    assert after == before
+    if before:
+        after = [e for e in recovered_events(recover(path).path) if not isinstance(e, Rejection)]
+        assert after == before
+    else:
+        with pytest.raises(LogError, match="no message can be recovered"):
+            recover(path)
+        assert path.read_bytes() == bytes(broken)
 
 
 def test_unfinished_files_are_recovered_and_failures_reported(
@@ -354,3 +365,16 @@ def test_folder_is_no_recording(tmp_path: Path) -> None:
     assert not holds_recording(tmp_path)
     with contextlib.chdir(tmp_path):
         assert not holds_recording(Path())
+
+
+def test_file_of_which_no_message_can_be_recovered_is_kept(tmp_path: Path) -> None:
+    """Cut within its first chunk, which holds seconds of a replay's frames."""
+    chunk = b"\x06" + (1 << 20).to_bytes(8, "little") + random.Random(3).randbytes(30_000)
+    torn = tmp_path / "a.mcap.active"
+    torn.write_bytes(MAGIC + chunk)
+    with pytest.raises(LogError, match=r"a\.mcap\.active: no message can be recovered"):
+        recover(torn)
+    assert torn.read_bytes() == MAGIC + chunk
+    (kept,) = recover_leftovers(tmp_path)
+    assert str(kept).endswith("kept as a.mcap.damaged")
+    assert names(tmp_path) == ["a.mcap.damaged"]

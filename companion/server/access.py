@@ -94,8 +94,6 @@ def bind(listen: str, *, token: str | None, insecure: bool) -> socket.socket:
             f"{listen}: COMPANION_TOKEN is so short that it can be guessed;"
             f" give {TOKEN_MIN} or more characters, such as those of `openssl rand -hex 16`"
         )
-    if token and not token.isascii():
-        raise ListenError("COMPANION_TOKEN contains characters that HTTP does not carry; use ASCII")
     try:
         family, kind, proto, _, address = socket.getaddrinfo(
             host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -277,9 +275,13 @@ async def accept(websocket: WebSocket) -> None:
 
 
 def _tokens(scope: Scope) -> list[bytes]:
-    """Return the tokens of a request, in its header or as subprotocols."""
+    """Return the tokens of a request, in its header or as subprotocols.
+
+    A header outside ASCII is Latin-1 to some clients, and UTF-8 to others (curl).
+    """
     scheme, _, credentials = Headers(scope=scope).get("authorization", "").partition(" ")
-    given = [credentials.strip().encode()] if scheme.lower() == "bearer" else []
+    text = credentials.strip()
+    given = [text.encode(), text.encode("latin-1")] if scheme.lower() == "bearer" else []
     for offered in scope.get("subprotocols", []):
         if offered.startswith(BEARER):
             given.append(_decoded(offered.removeprefix(BEARER)))

@@ -164,7 +164,7 @@ def replace_position(
 
 def receiver(at_s: float, sender: str, accuracy_m: float) -> Frame:
     message = dialect.MAVLink_gps_raw_int_message(
-        round(1e6 * (100 + at_s)), 3, 474000000, 85500000, 500000, 80, 120, 0, 65535, 12,
+        round(1e6 * (100 + at_s)), 3, 0, 0, 500000, 80, 120, 0, 65535, 12,
         h_acc=round(1e3 * accuracy_m), v_acc=round(1e3 * accuracy_m), vel_acc=300,
     )  # fmt: skip
     return sent(at_s, sender, message, seq=round(at_s * 50 + 3) % 256)

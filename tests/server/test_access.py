@@ -1,8 +1,12 @@
 """Addresses on which the server may listen, and the token that they require."""
 
+from typing import Any
+
 import pytest
+from starlette.testclient import TestClient
 
 from companion.server.access import ListenError, bind
+from companion.server.app import create_app
 
 
 @pytest.mark.parametrize("token", [None, ""])
@@ -17,9 +21,13 @@ def test_public_address_requires_a_token_or_insecure_flag(token: str | None) -> 
     bind("0.0.0.0:0", token=token, insecure=True).close()
 
 
-def test_token_that_http_does_not_carry_is_an_error() -> None:
-    with pytest.raises(ListenError, match="COMPANION_TOKEN contains characters"):
-        bind("127.0.0.1:0", token="pässwörter-für-alle", insecure=False)
+@pytest.mark.parametrize("encoding", ["utf-8", "latin-1"])
+def test_token_outside_ascii_is_accepted_in_both_encodings(make_node: Any, encoding: str) -> None:
+    token = "pässwörter-für-alle"
+    client = TestClient(create_app(make_node(flown=False), token), "http://127.0.0.1")
+    right, wrong = (f"Bearer {one}".encode(encoding) for one in (token, token[:-1] + "é"))
+    assert client.get("/v1/uavs", headers={"authorization": right}).status_code == 200
+    assert client.get("/v1/uavs", headers={"authorization": wrong}).status_code == 401
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "localhost", "127.0.0.7"])

@@ -37,7 +37,7 @@ class FiniteRange(click.FloatRange):
 
 
 class FolderPath(click.Path):
-    """Option that names a folder: ``click.Path`` takes nothing for the current one."""
+    """Option that names a folder: ``click.Path`` takes "" for the current one."""
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Return the path, or fail with the option's name."""

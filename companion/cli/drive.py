@@ -124,9 +124,10 @@ def drive(
             output.require_output()
             output.line(json.dumps(asdict(final_status)))
 
-    printed = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()
+    # What the library of a device prints is no JSON.
+    kept_apart = contextlib.redirect_stdout(sys.stderr) if as_json else contextlib.nullcontext()
     try:
-        with printed:  # by the device's library
+        with kept_apart:
             interrupted = running.run_until_stopped(driven, show, seconds)
         final_status = driven.status()
         lines.line(_text(final_status))

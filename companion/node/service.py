@@ -159,9 +159,9 @@ class Service:
             self.fleet.open()
         self._push.open()
         try:
-            self._recorder = self._open_recorder()  # last: a start that fails leaves no recording
+            self._recorder = self._open_recorder()  # last: no recording if the start fails
         except (OSError, UserError):
-            self._push.close()  # nor a ring without a writer
+            self._push.close()  # its ring would have no writer
             raise
 
     async def run(

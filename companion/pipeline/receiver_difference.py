@@ -12,7 +12,7 @@ from typing import Final
 from companion.values import FIX_3D, GnssStatus, Report, ReportNoise, Severity
 
 NEAR_M: Final = 50.0
-"""Largest difference of heights with which a drift begins; one that begins larger is invalid.
+"""Largest difference of heights that may be a drift; if it begins larger, a height is invalid.
 
 Before an autopilot's height is valid it may be off by hundreds of metres (docs/field-notes.md 1).
 """
@@ -40,7 +40,7 @@ A report that jumps is rejected instead, or restarts the track with a notice.
 HELD_NS: Final = 5_000_000_000
 """Time for which a difference is held at least: less of it shows at another course.
 
-In a climb, where a lag may hide more of it than the receiver's error, it is held until after.
+A climb in which a lag may hide more of it than the receiver's error does not count.
 """
 LATE_S: Final = 1.0  # largest lateness of a report that is compared by arrivals
 APART_S: Final = 3.0  # longest time between a status and a report that are compared
@@ -84,7 +84,7 @@ class Difference:
     def note(self, apart_m: float, most_m: float, t_ns: int, *, ages: bool) -> None:
         """Note a new difference; ``most_m`` is the largest that the unknown lag allows.
 
-        If it ``ages`` the largest one, that is held for another ``HELD_NS``, then forgotten.
+        If the largest one ``ages``, it is held for another ``HELD_NS``, then forgotten.
         """
         covered_m = most_m - RESOLUTION_M
         if self.noted_ns is not None:
@@ -159,7 +159,7 @@ class ReceiverDifference:
         Stamps are compared, as either may have overtaken the other; arrivals if the stamps are of
         two clocks, as of receivers that count from 1970, or if one has wrapped around.
 
-        Calls are inlined, because this runs for most reports.
+        Short expressions stand for calls, because this runs for most reports.
         """
         self.compared = status
         velocity_mps, t_ns = report.velocity_ne_mps, report.t_ns

@@ -4,8 +4,8 @@ from dataclasses import dataclass, field
 from typing import Final
 
 from companion.mavlink.clock.sender_clock import SenderClock
-from companion.mavlink.clock.stamp_unit import StampUnit
-from companion.mavlink.wire.stamps import step_ms
+from companion.mavlink.clock.stamp_unit import Stamped, StampUnit
+from companion.mavlink.wire.stamps import stamp_step
 from companion.pipeline.gnss_fix import REGULAR_NS, GnssFix
 from companion.pipeline.receiver_difference import ReceiverDifference
 from companion.tracking.noise import STATED_NS, StatedNoise
@@ -148,7 +148,7 @@ class Sender:
     first: tuple[int, int] | None = None  # arrival and stamp of an event that none confirmed yet
     newest: tuple[int, int] | None = None  # the same of the newest event that was placed
     unit: StampUnit | None = None  # of its stamps; None: milliseconds, since all had a time
-    attitude_ms: tuple[int, int] | None = None  # arrival and stamp of a carrier's newest attitude
+    newest_attitude: Stamped | None = None  # of a carrier
 
     def has_other_unit(self, report: Report) -> bool:
         """Note a report without a time; return whether stamps have another unit from now on."""
@@ -176,10 +176,10 @@ class Sender:
             before, self.first = self.first, (arrival_ns, boot_ms)
             if before is None:
                 return Reason.UNPLACED_STAMP
-            elapsed_ns = step_ms(boot_ms, before[1]) * 1_000_000
+            elapsed_ns = stamp_step(boot_ms, before[1]) * 1_000_000
             agrees = abs(arrival_ns - before[0] - elapsed_ns) <= CONFIRMED_NS
             return None if agrees else Reason.UNPLACED_STAMP
         if self.newest is None or arrival_ns - self.newest[0] > OUTDATED_FOR_NS:
             return None
-        is_old = step_ms(boot_ms, self.newest[1]) < -OUTDATED_MS
+        is_old = stamp_step(boot_ms, self.newest[1]) < -OUTDATED_MS
         return Reason.OUT_OF_ORDER if is_old else None

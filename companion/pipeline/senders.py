@@ -25,7 +25,7 @@ from companion.mavlink.trust.dedupe import Dedupe, LinkShare
 from companion.mavlink.trust.remote_id import RemoteIds
 from companion.mavlink.wire.attitudes import ABOUT_ATTITUDE, GPS2_RAW, gnss_heading, second_has_fix
 from companion.mavlink.wire.decode import ATTITUDE, decode
-from companion.mavlink.wire.stamps import boot_ms, step_ms
+from companion.mavlink.wire.stamps import boot_ms, stamp_step
 from companion.pipeline import assembly
 from companion.pipeline.gnss_fix import FixNotice
 from companion.pipeline.receiver_difference import NEAR_M, ReceiverDifference
@@ -383,7 +383,7 @@ class Senders:
             return _refused(report, Reason.TOO_MANY)  # ids can be forged in any number
         sender = self._senders[uav]
         if sender.unit is not None:
-            boot_ms = sender.unit.milliseconds(t_ns, boot_ms, sender.attitude_ms)
+            boot_ms = sender.unit.milliseconds(t_ns, boot_ms, sender.newest_attitude)
             report = report._replace(boot_ms=boot_ms)
         refused: Reason | None = None
         switched: tuple[Notice, ...] = ()
@@ -409,7 +409,7 @@ class Senders:
             return self._unplaced(sender, report, said)
         self._dedupe.set_latency(stamp.latency_s)
         newest = sender.newest
-        if is_event and (newest is None or step_ms(boot_ms, newest[1]) > 0 or stamp.rebooted):
+        if is_event and (newest is None or stamp_step(boot_ms, newest[1]) > 0 or stamp.rebooted):
             sender.newest = t_ns, boot_ms
         component = self._components.get(report.source) if is_own else None
         types = () if component is None else tuple(component.types)
@@ -579,7 +579,8 @@ class Senders:
         carrier = str(attitude.source)
         sender = self._senders[carrier]
         stamp, said = self._stamp(sender.clock, carrier, attitude.t_ns, attitude.boot_ms)
-        sender.stamped_ns, sender.attitude_ms = attitude.t_ns, (attitude.t_ns, attitude.boot_ms)
+        sender.stamped_ns = attitude.t_ns
+        sender.newest_attitude = attitude.t_ns, attitude.boot_ms
         placed = None if stamp is None else PlacedAttitude(attitude, stamp.sender_ns)
         return FrameOutcome(
             message=placed,
@@ -591,8 +592,8 @@ class Senders:
     def may_begin(self, report: Report, always: bool) -> bool:
         """Return whether a track may begin with this report.
 
-        Its sender's receiver, if one was received, must have a 3D fix near the report's height; not
-        in flight after the loss of a fix, where a redundant autopilot takes over. After
+        Its sender's receiver, if one was received, must have a 3D fix near the report's height. In
+        flight, after the loss of a fix, it need not: then a redundant autopilot takes over. After
         ``RECEIVER_WAIT_NS`` the track begins anyway, as heights may have different datums; home
         waits ``always``. A status that was not repeated for ``FORGOTTEN_NS`` is ignored: it may be
         forged.
@@ -736,11 +737,11 @@ def _late_copies(sender: Sender, clock: SenderClock, uav: str, t_ns: int) -> tup
 def _other_unit(sender: Sender, uav: str, t_ns: int) -> Notice:
     """Return a notice that the stamps of positions have another unit than before."""
     is_other = sender.unit is not None and sender.unit.is_microseconds
-    text = f"{uav}: track restarted: its positions are stamped in milliseconds again"
+    text = f"{uav}: track restarted: its positions have stamps in milliseconds again"
     if is_other:
         text = (
-            f"{uav}: track restarted: its positions are stamped in microseconds, not in"
-            " milliseconds; they are converted"
+            f"{uav}: track restarted: its positions have stamps in microseconds, which are"
+            " converted to milliseconds"
         )
     return Notice(t_ns=t_ns, severity=Severity.WARNING, subject=uav, text=text)
 

@@ -25,7 +25,7 @@ CHANNELS_MAX: Final = 65_535
 """Limit on channels with messages, which are numbered from 1, in two bytes."""
 DAMAGED: Final = ".damaged"
 LOST_MAX: Final = 10_000
-"""Bytes of a file without a message that may be dropped with it; one with more is left."""
+"""Most bytes that are dropped from a file of which no message is recovered; if more, it is kept."""
 
 
 class UnreadableError(LogError):
@@ -139,7 +139,7 @@ def _rewrite(path: Path, head: bytes) -> Recovered:
         whole = walk.complete and not walk.lost_bytes
         if whole and not active:
             return tally.result(path, 0, changed=False)
-        if active and not tally.has_any and walk.lost_bytes > LOST_MAX:
+        if active and not tally.messages and walk.lost_bytes > LOST_MAX:
             raise UnreadableError(f"{path}: no message can be recovered")
         final = free_name(final)
         (path if whole else partial).rename(final)
@@ -155,22 +155,17 @@ class _Tally:
     """Counts of the messages that were recovered."""
 
     def __init__(self) -> None:
-        self._messages: Counter[str] = Counter()
+        self.messages: Counter[str] = Counter()
         self._last_ns: int | None = None
 
-    @property
-    def has_any(self) -> bool:
-        """Whether there is a message."""
-        return bool(self._messages)
-
     def count(self, message: Message) -> None:
-        self._messages[message.channel.topic] += 1
+        self.messages[message.channel.topic] += 1
         self._last_ns = max(self._last_ns or 0, message.log_time_ns)
 
     def result(self, path: Path, lost_bytes: int, *, changed: bool) -> Recovered:
         return Recovered(
             path=path,
-            messages=dict(self._messages),
+            messages=dict(self.messages),
             last_ns=self._last_ns,
             lost_bytes=lost_bytes,
             changed=changed,

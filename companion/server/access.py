@@ -151,7 +151,7 @@ class KnownHosts:
 def _host_name(host: str) -> str:
     """Return name or address of a Host header, without port, brackets and trailing dot.
 
-    What follows brackets must be a port; otherwise the header names nothing, and "" is returned.
+    "" if something else than a port follows the brackets.
     """
     name = host.strip().lower()
     if name.startswith("["):

@@ -103,7 +103,7 @@ def lag_s(kind: Airframe, autopilot: int | None) -> tuple[float, float]:
     """Return the least and largest lag of a position, s, by MAV_AUTOPILOT and kind of aircraft."""
     if autopilot == _ARDUPILOT:
         return ARDUPILOT_LAG_S.get(kind, ARDUPILOT_ANY_LAG_S)
-    if autopilot == _GENERIC and LIMITS[kind].lag_s == ANY_LAG_S:
+    if autopilot == _GENERIC:
         return RECEIVER_LAG_S
     return LIMITS[kind].lag_s
 

@@ -19,8 +19,9 @@ def needs(package: str, extra: str, what: str, library: str | None = None) -> It
         if isinstance(error, ModuleNotFoundError) and error.name == package:
             install = f"pip install 'uav-companion-beams[{extra}]'"
             raise UserError(f"{what} needs the package {package}: {install}") from error
-        cause = str(error) or type(error).__name__
-        if library is not None and isinstance(error, OSError | AttributeError):
-            cause = f"{cause}; is {library} installed?"
-        unusable = f"{what} needs the package {package}, which does not load: {cause}"
-        raise UserError(unusable) from error
+        may_be_missing = library is not None and isinstance(error, OSError | AttributeError)
+        raise UserError(
+            f"{what} needs the package {package}, which does not load:"
+            f" {str(error) or type(error).__name__}"
+            + (f"; is {library} installed?" if may_be_missing else "")
+        ) from error

@@ -78,6 +78,18 @@ def test_remote_beams_are_applied_over_http_until_shutdown(start_node: Any, tmp_
     assert "no answer from the service" in err
 
 
+def ran(*words: str | Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    """Run a command to its end."""
+    return subprocess.run(
+        words,
+        capture_output=True,
+        text=True,
+        check=False,
+        timeout=HANG_S,
+        env={**os.environ, **environment},
+    )
+
+
 def test_drive_status_is_reported_each_second(start_node: Any, tmp_path: Path) -> None:
     config = tmp_path / "settings.toml"
     config.write_text(EIGHT)
@@ -85,13 +97,8 @@ def test_drive_status_is_reported_each_second(start_node: Any, tmp_path: Path) -
     with fly(node.udp_port, 30):
         node.wait_until("/v1/beams", lambda answer: len(answer["beams"]) == 4)
         command = [BIN / "companion", "drive", "none:adar1000", "--service", node.url]
-        done = subprocess.run(
-            [*command, "--json", "--seconds", "2.5"],
-            capture_output=True,
-            text=True,
-            check=True,
-            timeout=HANG_S,
-        )
+        done = ran(*command, "--json", "--seconds", "2.5")
+    assert done.returncode == 0
     told = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
     assert [one["failures"] for one in told] == [0] * len(told)
     assert told[-1]["applied"] > 5
@@ -101,14 +108,7 @@ def test_drive_status_is_reported_each_second(start_node: Any, tmp_path: Path) -
 def test_what_a_library_prints_is_not_among_the_json(tmp_path: Path) -> None:
     (tmp_path / "spidev.py").write_text("print('SPI 1.0')\n")
     command = [BIN / "companion", "drive", "adar1000:0.0", "--service", "http://127.0.0.1:9"]
-    done = subprocess.run(
-        [*command, "--json", "--seconds", "0.5"],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=HANG_S,
-        env={**os.environ, "PYTHONPATH": str(tmp_path)},
-    )
+    done = ran(*command, "--json", "--seconds", "0.5", PYTHONPATH=str(tmp_path))
     assert "SPI 1.0" in done.stderr
     assert [line for line in done.stdout.splitlines() if not line.startswith("{")] == []
 
@@ -124,13 +124,7 @@ def test_what_a_library_prints_is_not_among_the_json(tmp_path: Path) -> None:
     ],
 )
 def test_command_error_is_one_line(words: list[str], said: str) -> None:
-    done = subprocess.run(
-        [BIN / "companion", "drive", *words],
-        capture_output=True,
-        text=True,
-        check=False,
-        timeout=HANG_S,
-    )
+    done = ran(BIN / "companion", "drive", *words)
     assert done.returncode == 1
     assert said in done.stderr
     assert done.stderr.count("\n") == 1

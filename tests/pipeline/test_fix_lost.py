@@ -467,22 +467,24 @@ def test_estimator_counts_in_flight_after_gaps_of_its_statuses(mode: int | None)
     assert len(refused) == round(10 * (AGAIN_S - LOST_S))
 
 
+def taken_over(drift_mps2: float, back_s: float) -> Iterator[Any]:
+    """Return ``flight`` of an armed vehicle, whose boot clock is another one after 24 s."""
+    for event in flight(drift_mps2):
+        t_s = (event.t_ns - START_NS) / S if isinstance(event, Frame) else 0.0
+        if isinstance(event, Frame) and event.msgid == 24:
+            yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3))
+        if isinstance(event, Frame) and event.msgid == 33 and t_s > 24.0:
+            message = dialect.MAVLink(None).decode(bytearray(event.raw))
+            message.time_boot_ms -= round(back_s * 1000)
+            event = sent(t_s, UAV, message)  # noqa: PLW2901
+        yield event
+
+
 @pytest.mark.parametrize("back_s", [15.0, 40.0])
 def test_bound_grows_on_if_the_vehicle_restarts_without_a_fix(back_s: float) -> None:
     """A redundant autopilot takes over: its clock is another one."""
 
-    def restarted() -> Iterator[Any]:
-        for event in flight(0.45):
-            t_s = (event.t_ns - START_NS) / S if isinstance(event, Frame) else 0.0
-            if isinstance(event, Frame) and event.msgid == 24:
-                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3))
-            if isinstance(event, Frame) and event.msgid == 33 and t_s > 24.0:
-                message = dialect.MAVLink(None).decode(bytearray(event.raw))
-                message.time_boot_ms -= round(back_s * 1000)
-                event = sent(t_s, UAV, message)  # noqa: PLW2901
-            yield event
-
-    outputs, found = flown(restarted())
+    outputs, found = flown(taken_over(0.45, back_s))
     assert about(outputs, "restarted")
     assert [t_s for t_s, (error_m, bound_m) in found.items() if error_m > bound_m] == []
 
@@ -490,18 +492,7 @@ def test_bound_grows_on_if_the_vehicle_restarts_without_a_fix(back_s: float) -> 
 def test_takeover_without_a_fix_in_flight_is_tracked_at_once() -> None:
     """Not as a vehicle that was switched on, whose positions may be invalid."""
 
-    def restarted() -> Iterator[Any]:
-        for event in flight(0.2):
-            t_s = (event.t_ns - START_NS) / S if isinstance(event, Frame) else 0.0
-            if isinstance(event, Frame) and event.msgid == 24:
-                yield sent(t_s, UAV, dialect.MAVLink_heartbeat_message(2, 3, 128, 0, 4, 3))
-            if isinstance(event, Frame) and event.msgid == 33 and t_s > 24.0:
-                message = dialect.MAVLink(None).decode(bytearray(event.raw))
-                message.time_boot_ms -= 90_000
-                event = sent(t_s, UAV, message)  # noqa: PLW2901
-            yield event
-
-    outputs, found = flown(restarted())
+    outputs, found = flown(taken_over(0.2, 90.0))
     assert about(outputs, "restarted")
     unused = [one for one in outputs if isinstance(one, Rejection) and one.reason is Reason.NO_FIX]
     assert unused == []

@@ -79,6 +79,6 @@ def test_stamps_in_microseconds_are_converted(center: str) -> None:
     assert all(served)
     assert [one for one in errors if one[0] > one[1]] == []
     texts = [one.text for one in outputs if isinstance(one, Notice)]
-    told = [text for text in texts if "stamped in microseconds" in text]
+    told = [text for text in texts if "stamps in microseconds" in text]
     assert len(told) == (2 if center == CARRIER else 1)
     assert not any("was restarted" in text or "again" in text for text in texts)

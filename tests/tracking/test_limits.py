@@ -52,7 +52,6 @@ def test_position_lag_depends_on_airframe_and_autopilot() -> None:
     assert either[0] <= aeroplane[0] and copter[1] <= either[1]
     assert lag_s(Airframe.COPTER, 12) == lag_s(Airframe.UNKNOWN, None) == (0.0, 0.06)
     assert lag_s(Airframe.COPTER, 0) == lag_s(Airframe.AEROPLANE, 0) == (0.0, 0.5)
-    assert lag_s(Airframe.ADSB, 0) == (0.0, 0.0)
 
 
 def test_most_specific_setting_applies() -> None:

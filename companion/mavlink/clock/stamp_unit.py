@@ -6,6 +6,8 @@ MAVLink defines ``time_boot_ms``. Betaflight and INAV fill GLOBAL_POSITION_INT w
 
 from typing import Final
 
+from companion.mavlink.wire.stamps import WRAP_MS, stamp_step
+
 CONFIRMED: Final = 5  # stamps in a row that show another unit, at least
 LASTS_NS: Final = 1_000_000_000
 """Time that they must span: radios deliver in bunches."""
@@ -13,7 +15,6 @@ _WINDOW_NS: Final = 10_000_000_000  # longest such time
 _RECENT_NS: Final = 10_000_000_000
 """Largest age of a stamp in milliseconds that shows how often microseconds have wrapped around."""
 _PER_MS: Final = 1000
-_WRAP: Final = 1 << 32
 _RATIO: Final = 2.0  # largest ratio of stamps' steps to those of arrivals, either way
 
 Stamped = tuple[int, int]
@@ -43,13 +44,13 @@ class StampUnit:
         self._count += 1
         if not self.is_microseconds:
             return stamp
-        before_ns, before_us = self._newest_us
+        known_ns, known_us = self._newest_us
         if other is not None and arrival_ns - other[0] <= _RECENT_NS:
-            before_ns, before_us = other[0], other[1] * _PER_MS
-        expected_us = before_us + (arrival_ns - before_ns) // 1000
-        us = expected_us + (stamp - expected_us + _WRAP // 2) % _WRAP - _WRAP // 2
+            known_ns, known_us = other[0], other[1] * _PER_MS
+        expected_us = known_us + (arrival_ns - known_ns) // 1000
+        us = expected_us + stamp_step(stamp, expected_us)
         self._newest_us = max(self._newest_us, (arrival_ns, us))
-        return us // _PER_MS % _WRAP
+        return us // _PER_MS % WRAP_MS
 
     def note_unexplained(self, arrival_ns: int) -> bool:
         """Note that the newest stamp has no time; return whether the unit changed.
@@ -67,7 +68,7 @@ class StampUnit:
             return False
         self._first = None
         unit_ns = 1_000_000 if self.is_microseconds else 1_000  # of the other unit
-        step_ns = (stamp - first[1]) % _WRAP * unit_ns
+        step_ns = stamp_step(stamp, first[1]) * unit_ns
         if not 1 / _RATIO <= step_ns / elapsed_ns <= _RATIO:
             return False
         self.is_microseconds = not self.is_microseconds

@@ -9,7 +9,7 @@ import math
 from typing import Final
 
 from companion.mavlink.wire.decode import decode
-from companion.mavlink.wire.stamps import step_ms
+from companion.mavlink.wire.stamps import stamp_step
 from companion.values import Attitude, Frame
 
 APART_MS: Final = 150  # longest time between two stamps that are compared
@@ -22,7 +22,7 @@ def contradict(one: Frame, other: Frame) -> bool:
     first, second = decode(one), decode(other)
     if not isinstance(first, Attitude) or not isinstance(second, Attitude):
         return False
-    apart_ms = abs(step_ms(first.boot_ms, second.boot_ms))
+    apart_ms = abs(stamp_step(first.boot_ms, second.boot_ms))
     if apart_ms > APART_MS:
         return False
     apart_s = apart_ms * 1e-3

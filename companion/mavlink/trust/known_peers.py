@@ -65,7 +65,7 @@ from companion.mavlink.wire.decode import (
 )
 from companion.mavlink.wire.encode import TIMESYNC
 from companion.mavlink.wire.positions import OWN, OwnPosition, read
-from companion.mavlink.wire.stamps import STAMPED, boot_ms, step_ms
+from companion.mavlink.wire.stamps import STAMPED, boot_ms, stamp_step
 from companion.values import Frame, Source
 from companion.values.budget import Budget
 
@@ -410,7 +410,7 @@ class KnownPeers:
             if other is known or other.is_router or not other.is_recent(frame.t_ns):
                 continue
             newest = other.path.newest
-            if newest is None or step_ms(newest.boot_ms, said.boot_ms) <= RESTARTED_MS:
+            if newest is None or stamp_step(newest.boot_ms, said.boot_ms) <= RESTARTED_MS:
                 continue
             if other.stamped is None or not known.clock.had(other.stamped):
                 continue
@@ -545,7 +545,7 @@ class KnownPeers:
 
 def _ahead_ms(frame: Frame, other: Frame) -> int:
     """Return how far the stamp of a message is ahead of another one of its kind."""
-    return step_ms(boot_ms(frame), boot_ms(other))
+    return stamp_step(boot_ms(frame), boot_ms(other))
 
 
 def _is_overtaken(earlier: _Peer, same: Frame, frame: Frame) -> bool:
@@ -603,7 +603,7 @@ def _clock_off_ms(one: _Peer, frame: Frame) -> int:
             return 0
         stamped = max(timed, key=lambda m: m.t_ns)
     expected_ms = stamp_ms(stamped) + (frame.t_ns - stamped.t_ns) // 1_000_000
-    return abs(step_ms(stamp_ms(frame), expected_ms))
+    return abs(stamp_step(stamp_ms(frame), expected_ms))
 
 
 def _is_another_clock_too_soon(sender: _Sender, frame: Frame) -> bool:

@@ -4,7 +4,7 @@ from typing import Final
 
 from companion.mavlink.trust.paths import RESTARTED_MS
 from companion.mavlink.wire.positions import OWN, read
-from companion.mavlink.wire.stamps import STAMPED, boot_ms, step_ms
+from companion.mavlink.wire.stamps import STAMPED, boot_ms, stamp_step
 from companion.values import Frame
 
 DRIFT: Final = 100e-6  # largest drift of a boot clock, ten times that of a good crystal
@@ -61,7 +61,7 @@ class PeerClock:
 
 def _late_ms(fastest: Frame, frame: Frame) -> float:
     elapsed_ms = (frame.t_ns - fastest.t_ns) * 1e-6
-    return elapsed_ms * (1.0 - DRIFT) - step_ms(stamp_ms(frame), stamp_ms(fastest))
+    return elapsed_ms * (1.0 - DRIFT) - stamp_step(stamp_ms(frame), stamp_ms(fastest))
 
 
 def stamp_ms(frame: Frame) -> int:

@@ -35,7 +35,7 @@ from typing import Annotated, Final, NamedTuple
 from companion.mavlink.wire.decode import ATTITUDE
 from companion.mavlink.wire.encode import Outgoing, request_data_stream, set_message_interval
 from companion.mavlink.wire.positions import GLOBAL_POSITION_INT
-from companion.mavlink.wire.stamps import step_ms
+from companion.mavlink.wire.stamps import stamp_step
 from companion.values import Notice, Severity, Source
 from companion.values.described import DescribedEnum, Meaning
 
@@ -121,7 +121,7 @@ class ObservedRate:
     def add(self, t_ns: int, boot_ms: int) -> None:
         """Add one message. A late stamp is sorted in; a repeated stamp is ignored."""
         newest_ms = boot_ms if self._newest_ms is None else self._newest_ms
-        ahead_ms = step_ms(boot_ms, newest_ms)
+        ahead_ms = stamp_step(boot_ms, newest_ms)
         if ahead_ms <= -_LATE_MS:
             self.restarted_ns = t_ns
             self.stamps_ms.clear()

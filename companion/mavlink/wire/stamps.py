@@ -37,12 +37,15 @@ def boot_ms(frame: Frame) -> int:
     return int.from_bytes(raw[at : min(at + 4, start + raw[1])], "little")
 
 
-def step_ms(boot_ms: int, before_ms: int) -> int:
-    """Return how far a stamp is ahead of another one, ms, by the shorter way around the wrap."""
-    return (boot_ms - before_ms + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
+def stamp_step(stamp: int, before: int) -> int:
+    """Return how far a stamp of 32 bits is ahead of another one, by the shorter way around.
+
+    All are in the unit of the stamps.
+    """
+    return (stamp - before + WRAP_MS // 2) % WRAP_MS - WRAP_MS // 2
 
 
 def unwrapped_ns(boot_ms: int, near_ns: int) -> int:
     """Convert boot milliseconds to ns, unwrapped to the value nearest to ``near_ns``."""
     near_ms = near_ns // _NS_PER_MS
-    return (near_ms + step_ms(boot_ms, near_ms)) * _NS_PER_MS
+    return (near_ms + stamp_step(boot_ms, near_ms)) * _NS_PER_MS

@@ -320,7 +320,10 @@ class Drive:
         return self._open
 
     def _note_success(self) -> None:
-        """Note that the device accepted something: opening it again need not show that it works."""
+        """Report a device that works again.
+
+        That it can be opened shows nothing: over UDP it may be absent.
+        """
         if self.device_error is not None:
             self.device_error = None
             self._say("the device is connected")

@@ -84,6 +84,6 @@ async def run_in_thread(drive: Drive) -> None:
 def _run(drive: Drive, stop: threading.Event, failed: list[BaseException]) -> None:
     try:
         drive.run(stop)
-    except BaseException as error:  # whatever a library raises, the caller waits for the thread
+    except BaseException as error:  # the caller waits for the thread, whatever ended it
         failed.append(error)
         stop.set()

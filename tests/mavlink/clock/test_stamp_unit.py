@@ -49,7 +49,7 @@ def in_microseconds() -> StampUnit:
 
 @given(steps_s=STEPS_S)
 def test_steps_in_microseconds_change_the_unit(steps_s: list[float]) -> None:
-    """It stays: of the stamps after that, those of any clock in milliseconds would change it."""
+    """It does not change back at the next ones."""
     unit = StampUnit(0)
     changes = unexplained(list(accumulate(steps_s)), 1_000_000, unit)
     assert changes.count(True) == 1

@@ -444,10 +444,10 @@ class Senders:
 
     def _unplaced(self, sender: Sender, report: Report, said: tuple[Notice, ...]) -> FrameOutcome:
         """Reject a report whose stamp fits no clock; its stamps may have another unit."""
-        uav, t_ns = report.uav, report.t_ns
+        uav, t_ns, in_force = report.uav, report.t_ns, sender.shared or sender
         if kind_of(uav).reports_itself and sender.has_other_unit(report):
-            sender.clock, said = self._new_clock(), (*said, _other_unit(sender, uav, t_ns))
-        late = _late_copies(sender, (sender.shared or sender).clock, uav, t_ns)
+            in_force.clock, said = self._new_clock(), (*said, _other_unit(sender, uav, t_ns))
+        late = _late_copies(sender, in_force.clock, uav, t_ns)
         unused = Rejection(t_ns=t_ns, source=uav, reason=Reason.UNPLACED_STAMP)
         return FrameOutcome(outputs=(*said, *late, unused), restarted=uav if said else None)
 

@@ -54,8 +54,12 @@ def vehicle(source: str, t_s: float, *, is_still: bool) -> Iterator[Frame]:
         yield sent(arrives_s, source, dialect.MAVLink_system_time_message(0, boot_ms))
 
 
-@pytest.mark.parametrize("center", [CARRIER, f"{LAT},{LON},{ALT_M}"])
-def test_stamps_in_microseconds_are_converted(center: str) -> None:
+@pytest.mark.parametrize(
+    ("center", "doubt_ns"),
+    [(CARRIER, 0), (f"{LAT},{LON},{ALT_M}", 0), (f"{LAT},{LON},{ALT_M}", S // 50)],
+    ids=["carrier", "UAV", "shared by another node"],
+)
+def test_stamps_in_microseconds_are_converted(center: str, doubt_ns: int) -> None:
     """The carrier's attitudes count milliseconds beside its positions."""
     pipeline = Pipeline(Settings().override(center={"source": center}))
     outputs: list[Output] = []
@@ -64,7 +68,8 @@ def test_stamps_in_microseconds_are_converted(center: str) -> None:
         t_s = n / 10
         events = list(vehicle(CARRIER, t_s, is_still=True)) if center == CARRIER else []
         if t_s >= 3.0:  # the carrier's position is the origin
-            events += vehicle(UAV, t_s, is_still=False)
+            sent_now = vehicle(UAV, t_s, is_still=False)
+            events += [frame._replace(doubt_ns=doubt_ns) for frame in sent_now]
         for event in (*events, Tick(START_NS + round((t_s + 0.05) * S))):
             outputs += pipeline.step(event)
         update = outputs[-1] if isinstance(outputs[-1], Update) else pipeline.last_update

@@ -88,8 +88,8 @@ class Difference:
         """
         covered_m = most_m - RESOLUTION_M
         if self.noted_ns is not None:
-            grown_m = GROWTH_MPS * (t_ns - self.noted_ns) * 1e-9
-            covered_m = min(covered_m, self.covered_m + grown_m)
+            followed_m = self.covered_m + GROWTH_MPS * (t_ns - self.noted_ns) * 1e-9
+            covered_m = covered_m if covered_m < followed_m else followed_m
         is_far = self.has_datum and apart_m >= NEAR_M
         self.is_invalid = is_far and (self.is_invalid or self.noted_ns is None)
         if self.is_invalid:
@@ -107,8 +107,8 @@ class Difference:
         """Set ``news_m``: twice what was announced, or less if more is not covered now."""
         self.news_m = NOTICE_RATIO * self.announced_m
         if self.says_covered or t_ns - self.announced_ns > ANNOUNCED_NS:
-            uncovered_m = self.covered_m + LEAST_ANNOUNCED_M
-            self.news_m = min(self.news_m, max(uncovered_m, NOTICE_M))
+            uncovered_m = LEAST_ANNOUNCED_M + max(self.covered_m, LEAST_ANNOUNCED_M)
+            self.news_m = uncovered_m if uncovered_m < self.news_m else self.news_m
 
     @property
     def is_news(self) -> bool:

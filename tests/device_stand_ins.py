@@ -7,12 +7,20 @@ written goes to a file.
 import atexit
 import json
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from types import ModuleType, SimpleNamespace
 from typing import Any
 
+from companion.values import Severity
+
 Written = list[tuple[str, str, str]]
 """Device, or channel of one; attribute; value."""
+
+
+def into(texts: list[str]) -> Callable[[str, Severity], None]:
+    """A drive's ``say``: the texts of its notices."""
+    return lambda text, _severity: texts.append(text)
 
 
 class Chip:

@@ -116,7 +116,7 @@ def drive(
         update_hz=update_hz,
         safe=SafeState(on_stale),
         now_ns=time.time_ns,
-        say=printer.line,
+        say=lambda text, _severity: printer.line(text),
     )
 
     def show(final_status: "DriveStatus") -> None:

@@ -10,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Final
 
+from companion.mavlink.links.daemon_threads import in_daemon_thread
 from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.signing_store import Timestamps, key_warning, load_key
 from companion.mavlink.links.transport import Link
@@ -21,7 +22,6 @@ from companion.mavlink.voice.component import ACCEPTED_IDS, ComponentSpec, Servi
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.mavlink.voice.verdict_reports import VerdictReports
 from companion.mavlink.wire.encode import Outgoing
-from companion.node.serving import in_daemon_thread
 from companion.recording.background import STALLED_S
 from companion.settings.center import VehicleCenter, parse_center
 from companion.settings.model import Settings

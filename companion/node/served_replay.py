@@ -18,6 +18,7 @@ from itertools import chain, islice
 from pathlib import Path
 from typing import Any, Final
 
+from companion.mavlink.links.daemon_threads import in_daemon_thread
 from companion.mavlink.links.lag import ArrivalLag
 from companion.mavlink.links.peers import Peers
 from companion.mavlink.links.status import LinkStatus
@@ -30,7 +31,6 @@ from companion.node.serving import (
     RateMeter,
     Server,
     address,
-    in_daemon_thread,
     pause,
     run_until_stopped,
 )

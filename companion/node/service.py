@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any, Final
 
 import companion
+from companion.mavlink.links.daemon_threads import in_daemon_thread
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.voice.rate_watch import MessageRate
 from companion.node.clock import NodeClock
@@ -27,7 +28,7 @@ from companion.node.observations import ObservationIntake
 from companion.node.outlet import Outlet
 from companion.node.push import Push
 from companion.node.renewals import Renewals
-from companion.node.serving import NOTICES_KEPT, RateMeter, Server, in_daemon_thread, saved_at_end
+from companion.node.serving import NOTICES_KEPT, RateMeter, Server, saved_at_end
 from companion.pipeline import assembly
 from companion.pipeline.fold import Pipeline
 from companion.recording.background import STOP_MAX_S, BackgroundRecorder, Rotation
@@ -269,8 +270,8 @@ class Service:
         loop, kept = asyncio.get_running_loop(), self._settings
         uavs = kept.drive.uavs or kept.beams.priority
 
-        def say(text: str) -> None:
-            loop.call_soon_threadsafe(self._report, Severity.INFO, "drive", text)
+        def say(text: str, severity: Severity) -> None:
+            loop.call_soon_threadsafe(self._report, severity, "drive", text)
 
         try:
             centre = kept.drive.aim == "centre"

@@ -15,6 +15,7 @@ from typing import Any, Final, TypeVar
 
 import uvicorn
 
+from companion.mavlink.links.daemon_threads import in_daemon_thread
 from companion.mavlink.links.descriptors import raise_limit
 from companion.node.printing import STDERR, Printer
 from companion.node.signals import ENDS, interrupts_held, release_interrupts
@@ -39,7 +40,6 @@ served, behind all others and their answers, before anything is known of what th
 """
 CLOSE_TIMEOUT_S: Final = 2
 """Longest wait at shutdown for clients that do not read, and for unfinished downloads."""
-THREAD_RETRY_S: Final = 0.5  # time until a thread that could not be started is tried again
 DISK_WAIT_NOTICE_S: Final = 2.0  # wait for a disk at the end after which it is announced
 _waits_for_disk = threading.Event()
 """Set while the end waits for a disk: then a signal ends the process at once."""
@@ -121,34 +121,6 @@ async def pause(until: asyncio.Event, seconds: float) -> None:
     """Wait for ``seconds``, or until ``until`` is set."""
     with contextlib.suppress(TimeoutError):
         await asyncio.wait_for(until.wait(), seconds)
-
-
-async def in_daemon_thread(work: Callable[[], T], *, at_once: bool = False) -> T:
-    """Run a function on a daemon thread, which the shutdown of the service does not wait for.
-
-    The function must tolerate being cut off at any point. While the system allows no more threads,
-    the call waits until it does; with ``at_once``, the function runs on the event loop instead.
-    """
-    loop = asyncio.get_running_loop()
-    done: asyncio.Future[T] = loop.create_future()
-
-    def run() -> None:
-        try:
-            settle = partial(done.set_result, work())
-        except Exception as error:
-            settle = partial(done.set_exception, error)
-        with contextlib.suppress(RuntimeError):  # the loop is closed: no caller is waiting
-            loop.call_soon_threadsafe(lambda: None if done.done() else settle())
-
-    while True:
-        try:
-            threading.Thread(target=run, name="background", daemon=True).start()
-        except RuntimeError:  # the system allows no more threads now
-            if at_once:
-                return work()
-            await asyncio.sleep(THREAD_RETRY_S)
-        else:
-            return await done
 
 
 async def saved_at_end(

@@ -13,7 +13,7 @@ import pytest
 from support import BIN, HANG_S, read_metadata
 
 EVEN = b"\x1a3\0\0\0\0\0\0\x80" + bytes.fromhex("8D40621D58C382D690C8AC2863A7")
-ODD = b"\x1a3\0\0\0\0\0\0\x80" + bytes.fromhex("8D40621D58C38641ECC31999541A")
+ODD = b"\x1a3\0\0\0\0\0\0\x80" + bytes.fromhex("8D40621D58C38641ECC31999541A1A")  # 0x1a doubled
 
 
 def same_digest(recording: Path) -> dict[str, Any]:

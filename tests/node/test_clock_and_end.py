@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from support import BIN, HANG_S, run_async, started
 
+from companion.mavlink.links import daemon_threads
 from companion.node import serving
 from companion.recording import schemas
 from companion.recording.container import MAGIC
@@ -82,7 +83,7 @@ def test_end_needs_no_new_thread(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_work_in_the_background_waits_for_a_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     """A shortage that passes ends no service."""
-    monkeypatch.setattr(serving, "THREAD_RETRY_S", 0.0)
+    monkeypatch.setattr(daemon_threads, "THREAD_RETRY_S", 0.0)
     start, refused = threading.Thread.start, list[int]()
 
     def third(thread: threading.Thread) -> None:
@@ -92,7 +93,7 @@ def test_work_in_the_background_waits_for_a_thread(monkeypatch: pytest.MonkeyPat
         start(thread)
 
     monkeypatch.setattr(threading.Thread, "start", third)
-    assert run_async(serving.in_daemon_thread(threading.current_thread)).name == "background"
+    assert run_async(daemon_threads.in_daemon_thread(threading.current_thread)).name == "background"
     assert len(refused) == 2
 
 

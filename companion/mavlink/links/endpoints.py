@@ -130,12 +130,3 @@ def _join(
     else:
         joined = group.packed + struct.pack("@I", address[3])
         sock.setsockopt(socket.IPPROTO_IPV6, socket.IPV6_JOIN_GROUP, joined)
-
-
-async def resolved(
-    url: LinkUrl, kind: socket.SocketKind
-) -> list[tuple[socket.AddressFamily, Address]]:
-    """Return the addresses of a link's host, at least one, without blocking the event loop."""
-    loop = asyncio.get_running_loop()
-    infos = await loop.getaddrinfo(url.host, url.port, type=kind)
-    return [(family, address) for family, _, _, _, address in infos]

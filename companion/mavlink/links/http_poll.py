@@ -1,10 +1,12 @@
 """Link that polls a document over HTTP."""
 
 import asyncio
+import socket
 import ssl
 from collections.abc import Collection, Hashable
 from typing import Final
 
+from companion.mavlink.links.connecting import HostLookup, connected
 from companion.mavlink.links.endpoints import Upcalls
 from companion.mavlink.links.urls import LinkUrl
 from companion.mavlink.wire.aircraft_json import DOCUMENT_MAX
@@ -26,6 +28,7 @@ class HttpPoll:
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
         self._url = url
+        self._lookup = HostLookup(url, socket.SOCK_STREAM)
         self._upcalls = upcalls
         self._unchanged = b""  # last document of a receiver that has stopped; else empty
 
@@ -50,7 +53,7 @@ class HttpPoll:
             self._upcalls.request()
             try:
                 async with asyncio.timeout(ANSWER_S):
-                    body = await _get(self._url)
+                    body = await _get(self._url, self._lookup)
             except (ValueError, EOFError) as error:
                 raise OSError(f"malformed HTTP answer: {error}") from error
             if body != newest:
@@ -79,14 +82,22 @@ class HttpPoll:
         return 0.0
 
 
-async def _get(url: LinkUrl) -> bytes:
+async def _get(url: LinkUrl, lookup: HostLookup) -> bytes:
     """Return the body of a document (HTTP/1.0, RFC 1945: it ends where the server hangs up).
 
     Raises ``OSError`` if the document is not available, ``ValueError`` or ``EOFError`` for
     malformed HTTP.
     """
     secure = ssl.create_default_context() if url.way == "https" else None
-    reader, writer = await asyncio.open_connection(url.host, url.port, ssl=secure, limit=HEAD_MAX)
+    named = url.host if secure else None
+    sock = await connected(lookup)
+    try:
+        reader, writer = await asyncio.open_connection(
+            sock=sock, ssl=secure, server_hostname=named, limit=HEAD_MAX
+        )
+    except BaseException:
+        sock.close()
+        raise
     try:
         host = f"[{url.host}]" if ":" in url.host else url.host
         asked = (

@@ -115,7 +115,7 @@ class Timestamps:
     The event loop checks ``due`` and takes a ``snapshot``; a thread does the ``write``::
 
         if timestamps.due(now_ns):
-            await asyncio.to_thread(timestamps.write, timestamps.snapshot(now_ns))
+            await in_daemon_thread(partial(timestamps.write, timestamps.snapshot(now_ns)))
 
     Call ``close`` at the end, when no frame is received or sent any more. States of unused links
     stay in the file. Raises ``LinkError`` if the file is damaged, cannot be read or written, or is

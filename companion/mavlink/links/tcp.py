@@ -4,30 +4,20 @@ Over 300 lines: both endpoints, and the connections that they share.
 """
 
 import asyncio
-import errno
-import os
 import socket
 from collections import deque
 from collections.abc import Callable, Collection, Hashable
 from dataclasses import replace
 from typing import Final, cast
 
+from companion.mavlink.links.connecting import HostLookup, connected, notice_silence
 from companion.mavlink.links.descriptors import share
-from companion.mavlink.links.endpoints import (
-    HungUpError,
-    Upcalls,
-    address_text,
-    bound,
-    resolved,
-    settle,
-)
+from companion.mavlink.links.endpoints import HungUpError, Upcalls, address_text, bound, settle
 from companion.mavlink.links.stale_bytes import StaleBytes
 from companion.mavlink.links.urls import LinkUrl
 
 WRITE_BUFFER_BYTES: Final = 64 << 10
 """Unsent bytes of a connection beyond which further frames are dropped."""
-CONNECT_S: Final = 5.0
-"""Timeout of a connection attempt; the system's own is two minutes, with ever longer pauses."""
 CONNECTIONS_MAX: Final = 256
 """Most connections of a listening link; more are closed at once."""
 DESCRIPTORS: Final = 0.1  # ratio of the descriptors that the connections of a link may take
@@ -37,15 +27,13 @@ PIECE_BYTES: Final = 4096
 A link processes one such piece in an iteration of the event loop, of one connection after the
 other: many take no more of the processor than one. The rest waits in the system's buffers.
 """
-SILENCE_S: Final = 12
-"""Seconds without an acknowledgement after which a connection is closed."""
 
 
 class TcpOut:
     """TCP client of a link: connects to one peer."""
 
     def __init__(self, url: LinkUrl, upcalls: Upcalls) -> None:
-        self._url = url
+        self._lookup = HostLookup(url, socket.SOCK_STREAM)
         self._upcalls = upcalls
         self._stream: _Stream | None = None
 
@@ -55,7 +43,7 @@ class TcpOut:
     async def serve(self) -> None:
         """Connect and serve until the connection is lost."""
         loop = asyncio.get_running_loop()
-        sock = await _connected(self._url)
+        sock = await connected(self._lookup)
         lost: asyncio.Future[Exception] = loop.create_future()
         stream = _Stream(
             upcalls=self._upcalls, on_close=lambda _, why: settle(lost, why), order=_ReadOrder()
@@ -284,52 +272,9 @@ class _Stream(asyncio.BufferedProtocol):
 def _listening(url: LinkUrl) -> socket.socket:
     sock = bound(url, socket.SOCK_STREAM)
     try:
-        _notice_silence(sock)  # connections inherit it
+        notice_silence(sock)  # connections inherit it
         sock.listen()
     except OSError:
         sock.close()
         raise
     return sock
-
-
-async def _connected(url: LinkUrl) -> socket.socket:
-    """Connect to the first address of a host that accepts; else raise the last address's error."""
-    loop = asyncio.get_running_loop()
-    error: OSError | None = None
-    for family, address in await resolved(url, socket.SOCK_STREAM):
-        sock = socket.socket(family, socket.SOCK_STREAM)
-        try:
-            sock.setblocking(False)
-            _notice_silence(sock)
-            async with asyncio.timeout(CONNECT_S):
-                await loop.sock_connect(sock, address)
-            if sock.getsockname() != sock.getpeername():
-                return sock
-            # No program listens on this machine, and the system chose that very port for our end:
-            # a connection to itself, which would also prevent the peer from listening.
-            error = OSError(errno.ECONNREFUSED, os.strerror(errno.ECONNREFUSED))
-        except OSError as refused:
-            error = refused
-        except BaseException:
-            sock.close()
-            raise
-        sock.close()
-    assert error is not None, "a resolved name has an address"
-    raise error
-
-
-def _notice_silence(sock: socket.socket) -> None:
-    """Enable keep-alive, to detect a peer that vanished silently (RFC 9293, 3.8.4).
-
-    Without it, a connection that is only read from would never fail.
-    """
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
-    options = {
-        "TCP_KEEPIDLE": SILENCE_S // 2,
-        "TCP_KEEPINTVL": max(1, SILENCE_S // 6),
-        "TCP_KEEPCNT": 3,
-        "TCP_USER_TIMEOUT": SILENCE_S * 1000,
-    }
-    for name, value in options.items():
-        if hasattr(socket, name):  # not every system has them all
-            sock.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)

@@ -17,7 +17,8 @@ from dataclasses import dataclass, replace
 from typing import Final, cast
 
 from companion.mavlink.links import datagrams, kernel_time
-from companion.mavlink.links.endpoints import Address, Upcalls, bound, resolved, settle
+from companion.mavlink.links.connecting import HostLookup
+from companion.mavlink.links.endpoints import Address, Upcalls, bound, settle
 from companion.mavlink.links.status import LinkStatus
 from companion.mavlink.links.to_loop import SLICE_S
 from companion.mavlink.links.urls import LinkUrl
@@ -149,7 +150,7 @@ class UdpOut:
     """
 
     def __init__(self, url: LinkUrl, status: LinkStatus, upcalls: Upcalls) -> None:
-        self._url = url
+        self._lookup = HostLookup(url, socket.SOCK_DGRAM)
         self._status = status
         self._upcalls = upcalls
         self._datagrams: _Datagrams | None = None
@@ -163,7 +164,7 @@ class UdpOut:
         Raises ``OSError`` if its name is not found or there is no route.
         """
         while True:
-            family, address = (await resolved(self._url, socket.SOCK_DGRAM))[0]
+            family, address = (await self._lookup.addresses())[0]
             sock = socket.socket(family, socket.SOCK_DGRAM)
             try:
                 _prepare(sock, self._status)

@@ -20,12 +20,13 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from companion.values import IntArray, UserError, printable
+from companion.values import IntArray, Severity, UserError, printable
 
 REMEMBERED: Final = 1000  # updates whose times are kept
 LEAD_UPDATES: Final = 51  # updates whose median time is the next lead
 RETRY_NS: Final = 1_000_000_000  # time between two attempts to open a device
 SLOW_NS: Final = 5_000_000_000  # duration of an update after which it is reported
+STEADY_NS: Final = 5_000_000_000  # time without a failure after which a recovery is reported
 TEXT_MAX: Final = 200  # longest text that is reported, characters
 LATE_SHARE: Final = 0.1
 """Fraction of the update interval by which an update may be late."""
@@ -156,8 +157,8 @@ class DriveStatus:
 class Drive:
     """Loop that drives one device.
 
-    ``say`` gets a line for each change. Raises ``UserError`` for a safe state that the device does
-    not support.
+    ``say`` gets a line for each change, and its severity. Raises ``UserError`` for a safe state
+    that the device does not support.
     """
 
     def __init__(
@@ -168,7 +169,7 @@ class Drive:
         update_hz: float,
         safe: SafeState,
         now_ns: Callable[[], int],
-        say: Callable[[str], None],
+        say: Callable[[str, Severity], None],
     ) -> None:
         device.check(safe)
         self._source = source
@@ -181,7 +182,10 @@ class Drive:
         self._stop = threading.Event()
         self._again_ns = 0
         self._resting: str | None = None
+        self._reported_state = ""  # whether beams are applied, or why not
         self.device_error: str | None = None  # why the device does not work
+        self._is_failure_reported = False
+        self._works_since_ns = 0  # then, since when it has worked again
         self.service_error: str | None = None  # why the service gives no beams
         self._took_ns: deque[int] = deque(maxlen=REMEMBERED)
         self._at_ns: deque[int] = deque(maxlen=REMEMBERED)
@@ -221,7 +225,7 @@ class Drive:
             return
         if self._now_ns() - waits[0] > SLOW_NS:
             self._reported_wait = waits
-            self._say(
+            self._warn(
                 f"{waits[1]} has not answered for {SLOW_NS // 1_000_000_000} s; still waiting"
             )
 
@@ -261,11 +265,11 @@ class Drive:
             self._late += ended_ns > command.valid_at_ns + LATE_SHARE * self._period_ns
         if self._resting is not None:
             self._resting = None
-            self._say("beams are applied")
+            self._report_state("beams are applied")
 
     def report_unsafe(self) -> None:
         """Report that the device was left as it is; for calls on another thread."""
-        self._say("the device has not answered: it may not be in its safe state")
+        self._warn("the device has not answered: it may not be in its safe state")
 
     def end(self) -> None:
         """Put the device into its safe state, and close it."""
@@ -273,11 +277,11 @@ class Drive:
             try:
                 self._device.rest(self._safe)
             except DeviceError as error:
-                self._say(f"the device did not go to its safe state: {error}")
+                self._warn(f"the device did not go to its safe state: {error}")
             self._device.close()
             self._open = False
         elif self.device_error is not None:
-            self._say(f"the device did not go to its safe state: {self.device_error}")
+            self._warn(f"the device did not go to its safe state: {self.device_error}")
 
     @property
     def lead_s(self) -> float:
@@ -306,31 +310,43 @@ class Drive:
             resting=self._resting,
         )
 
-    def _say(self, text: str) -> None:
+    def _say(self, text: str, severity: Severity = Severity.INFO) -> None:
         """Report a change, with what a device or a service wrote into it, in one line."""
-        self._report(printable(" ".join(text.split()))[:TEXT_MAX])
+        self._report(printable(" ".join(text.split()))[:TEXT_MAX], severity)
+
+    def _warn(self, text: str) -> None:
+        self._say(text, Severity.WARNING)
+
+    def _report_state(self, text: str) -> None:
+        """Report what is applied, unless that is what was reported last."""
+        if text != self._reported_state:
+            self._reported_state = text
+            self._say(text)
 
     def _reached(self) -> bool:
         """Return whether the device is open; at intervals, try to open it."""
         if not self._open and self._now_ns() >= self._again_ns:
             self._device.open()
             self._open = True
-            if self.device_error is None:
+            if not self._is_failure_reported:
                 self._say("the device is connected")
         return self._open
 
     def _note_success(self) -> None:
-        """Report a device that works again.
+        """Report a device that works again, and continues to.
 
         That it can be opened shows nothing: over UDP it may be absent.
         """
         if self.device_error is not None:
-            self.device_error = None
+            self.device_error, self._works_since_ns = None, self._now_ns()
+        if self._is_failure_reported and self._now_ns() - self._works_since_ns >= STEADY_NS:
+            self._is_failure_reported = False
             self._say("the device is connected")
 
     def _handle_failure(self, error: DeviceError) -> None:
-        if self.device_error is None:
-            self._say(f"the device failed: {error}")
+        if not self._is_failure_reported:
+            self._is_failure_reported = True
+            self._warn(f"the device failed: {error}")
         self._failures += 1
         self.device_error = str(error)
         self._ask_anyway()
@@ -348,7 +364,7 @@ class Drive:
         except SourceLostError as error:
             self.service_error = str(error)
             if before != self.service_error:
-                self._say(f"no answer from the service: {error}")
+                self._warn(f"no answer from the service: {error}")
 
     def _rest(self, why: str) -> None:
         if self._resting != why:
@@ -356,4 +372,4 @@ class Drive:
                 self._device.rest(self._safe)
                 self._note_success()
             self._resting = why
-            self._say(f"{self._safe}: {why}")
+            self._report_state(f"{self._safe}: {why}")

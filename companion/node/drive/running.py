@@ -74,8 +74,9 @@ async def run_in_thread(drive: Drive) -> None:
             drive.report_wait()
     finally:
         stop.set()
-        await asyncio.to_thread(thread.join, ENDS_S)
-        if thread.is_alive():
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(ended.wait(), ENDS_S)
+        if not ended.is_set():
             drive.report_unsafe()
     if failed:
         raise failed[0]

@@ -12,6 +12,7 @@ from functools import partial
 from itertools import islice
 from typing import Any, Final
 
+from companion.mavlink.links.daemon_threads import in_daemon_thread
 from companion.mavlink.links.descriptors import are_scarce
 from companion.mavlink.links.to_loop import ToLoop
 from companion.mavlink.links.zenoh_bus import Bus, open_peer
@@ -22,7 +23,6 @@ from companion.node.fleet.config import bus_config
 from companion.node.fleet.listening import Listening
 from companion.node.fleet.messages import FleetMessageError
 from companion.node.fleet.traffic import Rate
-from companion.node.serving import in_daemon_thread
 from companion.pipeline.fleet.member import NODES_MAX, UAVS_MAX, FleetMember
 from companion.pipeline.fleet.offers import Offers
 from companion.pipeline.fleet.surroundings import Surroundings

@@ -1,4 +1,4 @@
-"""Links over a network that goes down, and peers that vanish silently.
+"""Links over a network that goes down, peers that vanish silently, and silent name servers.
 
 A separate network namespace has a loopback that a test may switch off. Without support by the
 system these tests are skipped.
@@ -14,9 +14,9 @@ from support import HANG_S, ROOT
 
 TESTS = ROOT / "tests"
 HEAD = """
-import asyncio, fcntl, socket, struct, sys
+import asyncio, contextlib, fcntl, socket, struct, subprocess, sys, tempfile, threading
 from link_support import LOOPS, frame, running, runner, until_true
-from companion.mavlink.links import tcp, transport, udp
+from companion.mavlink.links import connecting, transport, udp
 from companion.mavlink.wire.encode import heartbeat
 from companion.values import Source
 
@@ -30,18 +30,18 @@ def loopback(up):
 """
 
 
-def alone(loop: str, test: str) -> None:
-    """Run ``async def test()`` in its own network namespace, on that loop."""
+def alone(loop: str, test: str, after: str = "") -> None:
+    """Run ``async def test()`` in its own namespaces of networks and mounts, on that loop."""
     try:
         subprocess.run(
-            ("unshare", "--net", "true"), check=True, capture_output=True, timeout=HANG_S
+            ("unshare", "--net", "--mount", "true"), check=True, capture_output=True, timeout=HANG_S
         )
     except (OSError, subprocess.CalledProcessError):
         pytest.skip("the system gives no network namespace")
-    script = f"{HEAD}{test}\nrunner({loop!r})(test())\n"
+    script = f"{HEAD}{test}\nrunner({loop!r})(test())\n{after}"
     path = os.pathsep.join((str(TESTS), str(TESTS.parent)))
     done = subprocess.run(
-        ("unshare", "--net", sys.executable, "-W", "error", "-c", script),
+        ("unshare", "--net", "--mount", sys.executable, "-W", "error", "-c", script),
         env={**os.environ, "PYTHONPATH": path},
         capture_output=True,
         text=True,
@@ -93,7 +93,7 @@ def test_vanished_peer_is_detected_by_keepalive() -> None:
         "uvloop",
         """
 async def test():
-    tcp.SILENCE_S = 2
+    connecting.SILENCE_S = 2
     loopback(True)
     async with running("tcpin:127.0.0.1:5000") as (listens, heard):
         async with running("tcp:127.0.0.1:5000") as (link, inbox):
@@ -121,5 +121,68 @@ async def test():
             await asyncio.sleep(0.001)
             assert link.status.state != "up"
         assert inbox.texts == [f"link {link.url} is down: Connection refused; trying again"]
+""",
+    )
+
+
+@pytest.mark.parametrize("loop", LOOPS)
+def test_silent_name_server_delays_neither_other_links_nor_the_end(loop: str) -> None:
+    """A field network without an uplink: lookups take half a minute or more."""
+    alone(
+        loop,
+        """
+GONE = [f"tcp:gone{number}.example:5760" for number in range(6)]
+GONE += ["udpout:gone.example:5760", "readsb:http://gone.example/aircraft.json"]
+
+def lookups():
+    return sum(thread.name == "background" for thread in threading.enumerate())
+
+async def test():
+    loopback(True)
+    transport.RETRY_S, connecting.LOOKUP_S = (0.01,), 1.0
+    with tempfile.NamedTemporaryFile("w") as file:
+        file.write("nameserver 127.0.0.1\\noptions timeout:30 attempts:5\\n")
+        file.flush()
+        subprocess.run(("mount", "--bind", file.name, "/etc/resolv.conf"), check=True)
+    async with contextlib.AsyncExitStack() as stack:
+        server = stack.enter_context(socket.socket(type=socket.SOCK_DGRAM))
+        server.bind(("127.0.0.1", 53))  # and never answers
+        gone = [await stack.enter_async_context(running(url)) for url in GONE]
+        for _, inbox in gone:
+            await inbox.until_said(1)
+            assert inbox.texts[0].endswith(
+                "is down: no name server has answered for 1 s; trying again"
+            )
+        await stack.enter_async_context(running("tcpin:127.0.0.1:5000"))
+        link, _ = await stack.enter_async_context(running("tcp:localhost:5000"))
+        await until_true(lambda: link.status.state == "up")
+        assert lookups() == len(GONE), "of each name one, however often it is tried"
+""",
+        after="assert lookups() == len(GONE)",
+    )
+
+
+def test_late_answer_of_a_name_server_is_used() -> None:
+    alone(
+        "uvloop",
+        """
+async def test():
+    loopback(True)
+    transport.RETRY_S, connecting.LOOKUP_S = (0.01,), 0.05
+    answers, look_up = threading.Event(), socket.getaddrinfo
+
+    def late(host, port, **options):
+        if not options["flags"]:
+            assert answers.wait(20)
+            return look_up("127.0.0.1", port, **options)
+        return look_up(host, port, **options)
+
+    connecting.socket.getaddrinfo = late
+    async with running("tcpin:127.0.0.1:5000"):
+        async with running("tcp:gone.example:5000") as (link, inbox):
+            await inbox.until_said(1)
+            assert link.status.state == "connecting"
+            answers.set()
+            await until_true(lambda: link.status.state == "up")
 """,
     )

@@ -408,7 +408,7 @@ def test_frames_of_a_whole_log_outside_the_damage_are_found(
         false += check_found(damaged, found)
         checked += starts(damaged.data) - len(found)
     assert false <= false_alarms(checked)
-    for _ in range(300):
+    for _ in range(100):
         damage_repeatedly(rng, cut(rng, data, 20_000), cut_log, rounds=10)
 
 
@@ -561,7 +561,7 @@ def test_undamaged_frames_of_a_damaged_whole_log_are_read(
     data = shared_log(name)
     rng = random.Random(f"damaged, all of {name}")
     read_damaged_log_repeatedly(rng, data, cut_log, tmp_path / "x.tlog", rounds=5)
-    for _ in range(200):
+    for _ in range(60):
         piece = cut(rng, data, rng.choice((500, 5000, 20_000)))
         read_damaged_log_repeatedly(rng, piece, cut_log, tmp_path / "x.tlog", rounds=10)
 

@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from device_reading import parse
-from device_stand_ins import CHIPS, Chip, iio_module, spidev_module
+from device_stand_ins import CHIPS, Chip, iio_module, into, spidev_module
 from hypothesis import given
 from hypothesis import strategies as st
 from support import HANG_S, ROOT, run_async
@@ -49,7 +49,7 @@ from companion.node.drive.sources import (
 )
 from companion.pipeline import assembly
 from companion.settings.model import Settings
-from companion.values import Source, UserError, WeightFormat
+from companion.values import Severity, Source, UserError, WeightFormat
 from companion.views import beam_state, weight_formats
 
 EIGHT = Settings().override(center={"source": "5:1"}, array={"elements": 8, "frequency_hz": 10.5e9})
@@ -126,7 +126,7 @@ def test_chip_registers_radiate_the_table(
         update_hz=100.0,
         safe=SafeState.MUTE,
         now_ns=clock.now_ns,
-        say=lambda _: None,
+        say=lambda *_: None,
     )
     for n in range(1, 4):
         drive.step()
@@ -192,7 +192,7 @@ def test_missing_spi_bus_is_retried_each_second(
         update_hz=100.0,
         safe=SafeState.HOLD,
         now_ns=clock.now_ns,
-        say=said.append,
+        say=into(said),
     )
     for _ in range(300):  # three seconds
         drive.step()
@@ -304,7 +304,7 @@ def test_phaser_memory_holds_the_codebook_and_updates_select_a_beam(
         update_hz=100.0,
         safe=SafeState.MUTE,
         now_ns=Ticking().now_ns,
-        say=lambda _: None,
+        say=lambda *_: None,
     )
     drive.step()
     saved = {
@@ -464,7 +464,7 @@ def test_device_rests_once_without_beams_and_at_the_end() -> None:
         update_hz=10.0,
         safe=SafeState.MUTE,
         now_ns=clock.now_ns,
-        say=said.append,
+        say=into(said),
     )
     for _ in range(7):
         drive.step()
@@ -504,7 +504,7 @@ def test_failed_device_is_reopened_and_rests_again() -> None:
         update_hz=10.0,
         safe=SafeState.BORESIGHT,
         now_ns=clock.now_ns,
-        say=said.append,
+        say=into(said),
     )
     drive.step()
     device.fails = True
@@ -584,7 +584,7 @@ def test_any_error_of_pyadi_iio_is_a_device_error(
     assert registers is not None
     device = targets.device(target, print, lambda: [registers] * 3)
     clock, said = Ticking(), list[str]()
-    drive = driven(Always(replace(flown[0], stored=1)), device, said.append, now_ns=clock.now_ns)
+    drive = driven(Always(replace(flown[0], stored=1)), device, into(said), now_ns=clock.now_ns)
     drive.step()
     phaser = device._phaser  # type: ignore[attr-defined]
     device._phaser = SimpleNamespace(  # type: ignore[attr-defined]
@@ -631,7 +631,7 @@ BEAM_NOW = DeviceCommand(valid_at_ns=0, unfit=None, uav="1:1")
 def driven(
     source: BeamSource,
     device: Device,
-    say: Callable[[str], None],
+    say: Callable[[str, Severity], None],
     *,
     now_ns: Callable[[], int] = time.monotonic_ns,
 ) -> Drive:
@@ -666,7 +666,7 @@ def test_device_that_never_answers_is_reported_once() -> None:
             drive.report_wait()
             return super().ask(lead_s)
 
-    drive = driven(Slow(BEAM_NOW), Hanging(clock), said.append, now_ns=clock.now_ns)
+    drive = driven(Slow(BEAM_NOW), Hanging(clock), into(said), now_ns=clock.now_ns)
     drive.step()
     drive.report_wait()
     assert said == [
@@ -685,9 +685,9 @@ def test_running_drive_reports_a_device_that_hangs(monkeypatch: pytest.MonkeyPat
         def apply(self, shot: DeviceCommand) -> None:
             assert reported.wait(HANG_S)
 
-    def say(text: str) -> None:
+    def say(text: str, severity: Severity) -> None:
         said.append(text)
-        if "has not answered" in text:
+        if severity is Severity.WARNING and "has not answered" in text:
             reported.set()
 
     drive = driven(Always(BEAM_NOW), Hanging(Ticking()), say)
@@ -715,7 +715,7 @@ def test_device_that_is_left_as_it_is_is_reported(
             assert answers.wait(HANG_S)
             return super().ask(lead_s)
 
-    drive = driven(Slow(BEAM_NOW), Closing(Ticking()), said.append)
+    drive = driven(Slow(BEAM_NOW), Closing(Ticking()), into(said))
 
     if beside:
         run_async(cancelled_after(asked, drive))
@@ -734,7 +734,7 @@ def test_device_that_failed_before_the_end_is_reported() -> None:
         def apply(self, shot: DeviceCommand) -> None:
             raise DeviceError("no answer")
 
-    drive = driven(Always(BEAM_NOW), Failing(Ticking()), said.append)
+    drive = driven(Always(BEAM_NOW), Failing(Ticking()), into(said))
     drive.step()
     drive.end()
     assert said[-1] == "the device did not go to its safe state: no answer"
@@ -837,7 +837,7 @@ def test_texts_of_a_service_are_reported_in_one_printable_line() -> None:
     drive = driven(
         Always(DeviceCommand(valid_at_ns=0, unfit=unfit)),
         Recorder(Ticking()),
-        said.append,
+        into(said),
         now_ns=Ticking().now_ns,
     )
     drive.step()
@@ -862,7 +862,7 @@ def test_any_error_of_spidev_is_a_device_error(
     module: Any = sys.modules["spidev"]
     clock, said = Ticking(), list[str]()
     device = targets.device("adar1000:0.0,0.1", print, list)
-    drive = driven(Always(flown[0]), device, said.append, now_ns=clock.now_ns)
+    drive = driven(Always(flown[0]), device, into(said), now_ns=clock.now_ns)
     with monkeypatch.context() as patch:
         patch.setattr(*((module, fails) if fails == "SpiDev" else (module.SpiDev, fails)), fail)
         drive.step()
@@ -935,7 +935,7 @@ def test_device_that_only_seems_to_connect_is_announced_once(
     flown: tuple[DeviceCommand, Any, str],
 ) -> None:
     device, clock, said = Silent(), Ticking(), list[str]()
-    drive = driven(Always(flown[0]), device, said.append, now_ns=clock.now_ns)
+    drive = driven(Always(flown[0]), device, into(said), now_ns=clock.now_ns)
     for number in range(60):
         device.is_there = 30 <= number < 40
         drive.step()
@@ -943,3 +943,32 @@ def test_device_that_only_seems_to_connect_is_announced_once(
     failed = "the device failed: Connection refused"
     assert said == ["the device is connected", failed, "the device is connected", failed]
     assert drive.status().failures == 50
+
+
+class Flapping(Silent):
+    """A device that takes each second update."""
+
+    def apply(self, command: DeviceCommand) -> None:
+        self.is_there = not self.is_there
+        super().apply(command)
+
+
+@pytest.mark.parametrize("has_beams", [True, False])
+def test_device_that_fails_again_and_again_is_announced_once(
+    flown: tuple[DeviceCommand, Any, str], has_beams: bool
+) -> None:
+    """Two notices a second would displace all others."""
+    device, clock, said = Flapping(), Ticking(), list[tuple[str, Severity]]()
+    none = DeviceCommand(valid_at_ns=0, unfit="no carrier")
+    source = Always(*[flown[0], flown[0] if has_beams else none] * 60)
+    drive = driven(source, device, lambda *notice: said.append(notice), now_ns=clock.now_ns)
+    for _ in range(120):
+        drive.step()
+        clock.t_ns += 1_100_000_000
+    states = [] if has_beams else ["hold: no carrier", "beams are applied"]
+    assert [text for text, _ in said if text not in states] == [
+        "the device is connected",
+        "the device failed: Connection refused",
+    ]
+    assert dict(said)["the device failed: Connection refused"] is Severity.WARNING
+    assert drive.status().failures > 20

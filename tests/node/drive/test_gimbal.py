@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from typing import Any
 
 import pytest
+from device_stand_ins import into
 from pymavlink.dialects.v20 import all as dialect
 from support import HANG_S, rounds
 
@@ -197,7 +198,7 @@ def test_impossible_attitude_is_counted_and_reported_once(
         update_hz=10.0,
         safe=SafeState.HOLD,
         now_ns=lambda: 0,
-        say=said.append,
+        say=into(said),
     )
     drive._open = True
     for n in (1, 2):

@@ -148,7 +148,7 @@ def test_mount_error_is_half_that_of_following_reports(
         update_hz=10.0,
         safe=SafeState.HOLD,
         now_ns=clock.now_ns,
-        say=lambda _: None,
+        say=lambda *_: None,
     )
     seconds, off = 90.0, {"ours": list[float](), "rival": list[float]()}
     arrivals = over_radio(flown, seconds, np.random.default_rng(3))
